@@ -1,0 +1,59 @@
+# Needs Python >= 3.11, git and make. Everything is installed into .venv.
+PYTHON ?= python3
+JOBS ?= 2
+REPORT ?= pixmetry-report
+
+VENV := .venv
+PY := $(VENV)/bin/python
+PIP := $(PY) -m pip --disable-pip-version-check
+INSTALLED := $(VENV)/.installed
+PYTEST := $(PY) -m pytest -n $(JOBS) --dist loadfile --hypothesis-seed=0
+
+.DEFAULT_GOAL := help
+.PHONY: help install demo test slow-test study bench lint browser-test
+
+help: ## show this list
+	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1|\2/p' $(MAKEFILE_LIST) | while IFS='|' read -r target text; do printf '%-20s %s\n' "$$target" "$$text"; done
+
+install: $(INSTALLED) ## install the package into .venv
+
+demo: $(INSTALLED) ## assess the packaged example campaign and write the report
+	@$(VENV)/bin/pixmetry assess -o $(REPORT)
+
+test: $(INSTALLED)-test ## run the quick tests
+	@$(PYTEST) -m "not slow and not browser"
+
+slow-test: $(INSTALLED)-test ## run the tests that take longer
+	@$(PYTEST) -m "slow and not browser"
+
+study: $(INSTALLED)-test ## run the studies in benchmarks/
+	@$(call each,$(wildcard benchmarks/study_*.py))
+
+bench: $(INSTALLED)-test ## run the benchmarks
+	@$(call each,$(wildcard benchmarks/bench_*.py))
+
+lint: $(INSTALLED)-dev ## check style and types
+	@$(PY) -m ruff check src tests benchmarks
+	@$(PY) -m mypy
+
+browser-test: $(INSTALLED)-test $(INSTALLED)-browser ## open the report in chromium and test it
+	@command -v chromium >/dev/null || { echo "chromium is not installed (Debian: apt-get install chromium)" >&2; exit 1; }
+	@$(PYTEST) -m browser
+
+# Run scripts one after the other and stop at the first that fails.
+each = set -e; for script in $(sort $(1)); do echo "== $$script"; $(PY) $$script; done
+
+# The stamp is younger than pyproject.toml once the package is installed. An existing .venv is kept.
+$(INSTALLED): pyproject.toml
+	@command -v "$(PYTHON)" >/dev/null || { echo "$(PYTHON) was not found; name a Python >= 3.11: make PYTHON=python3.11 ..." >&2; exit 1; }
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+		{ echo "pixmetry needs Python >= 3.11 and $(PYTHON) is $$($(PYTHON) -V 2>&1); name another: make PYTHON=python3.11 ..." >&2; exit 1; }
+	@$(PY) -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv $(VENV) || \
+		{ echo "$(PYTHON) cannot make a virtual environment (Debian: apt-get install python3-venv)" >&2; exit 1; }
+	@echo "installing pixmetry into $(VENV)"
+	@$(PIP) install --quiet -e .
+	@touch $@
+
+$(INSTALLED)-%: $(INSTALLED)
+	@$(PIP) install --quiet -e '.[$*]'
+	@touch $@

@@ -1,0 +1,56 @@
+"""Time of the one-pass reductions per frame, beside plain NumPy: ``python benchmarks/bench_reductions.py [rows cols frames]``."""
+
+from __future__ import annotations
+
+import sys
+import time
+
+import numpy as np
+
+from pixmetry.experiment.stack import reduce_group
+
+
+def numpy_sums(frames: list[np.ndarray]) -> np.ndarray:
+    """The same sums with array operations."""
+    total = np.zeros(frames[0].shape, np.uint32)
+    total_sq = np.zeros(frames[0].shape, np.uint64)
+    counts = np.zeros(65536, np.int64)
+    for frame in frames:
+        wide = frame.astype(np.uint64)
+        total += frame
+        total_sq += wide * wide
+        counts += np.bincount(frame.ravel(), minlength=65536)
+        frame.sum(axis=0), frame.sum(axis=1)
+    return total
+
+
+def best_seconds(function, repeats: int = 5) -> float:
+    """Shortest of a few runs."""
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        function()
+        times.append(time.perf_counter() - start)
+    return min(times)
+
+
+def main(rows: int = 480, cols: int = 640, n_frames: int = 50) -> None:
+    """Print milliseconds per frame and per megapixel."""
+    rng = np.random.default_rng()
+    frames = [np.clip(rng.normal(2000, 23, (rows, cols)), 0, 4095).astype(np.uint16) for _ in range(n_frames)]
+    reduce_group(frames[:2], bits=12)
+    reduce_group(frames[:2], bits=12, kind="level")
+    for name, run in {
+        "stack with spectra": lambda: reduce_group(frames, bits=12),
+        "stack without spectra": lambda: reduce_group(frames, bits=12, spectra_pairs=0),
+        "level pairs with results": lambda: [
+            reduce_group(frames[i : i + 2], bits=12, kind="level").moments.summary() for i in range(0, n_frames - 1, 2)
+        ],
+        "NumPy sums alone": lambda: numpy_sums(frames),
+    }.items():
+        per_frame = best_seconds(run) / n_frames
+        print(f"{name:24s} {per_frame * 1e3:7.3f} ms/frame {per_frame / (rows * cols) * 1e9:7.3f} ns/pixel")
+
+
+if __name__ == "__main__":
+    main(*(int(a) for a in sys.argv[1:]))

@@ -1,0 +1,28 @@
+"""Campaigns: the frames taken to assess one camera, how they are read, and where results are kept."""
+
+from pixmetry.campaign.images import FrameReader, iter_frames, read_frame, write_frame
+from pixmetry.campaign.manifest import EXAMPLE, load_campaign, photons_from_irradiance, write_manifest
+from pixmetry.campaign.output import read_maps, staged_output, write_json, write_maps
+from pixmetry.campaign.provenance import InputHashes, provenance_record
+from pixmetry.campaign.records import CameraFacts, Campaign, FrameGroup, OpticsFacts
+
+__all__ = [
+    "EXAMPLE",
+    "CameraFacts",
+    "Campaign",
+    "FrameGroup",
+    "FrameReader",
+    "InputHashes",
+    "OpticsFacts",
+    "iter_frames",
+    "load_campaign",
+    "photons_from_irradiance",
+    "provenance_record",
+    "read_frame",
+    "read_maps",
+    "staged_output",
+    "write_frame",
+    "write_json",
+    "write_manifest",
+    "write_maps",
+]

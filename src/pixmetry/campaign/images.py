@@ -1,0 +1,273 @@
+"""Frames on disk: each file is read once, hashed, decoded from memory, and checked before it is used."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from pixmetry.campaign.provenance import InputHashes
+from pixmetry.campaign.records import Campaign, FrameGroup
+from pixmetry.core.errors import InputError
+from pixmetry.core.threads import imap_tiles
+
+_FORMATS = "grey PNG, TIFF or NPY with 8 or 16 bits"
+
+
+class LoadedFrame(NamedTuple):
+    """A decoded frame with the digest of its file."""
+
+    array: np.ndarray
+    sha256: str
+    size_bytes: int
+
+
+def read_frame(path: str | Path) -> np.ndarray:
+    """Read one frame.
+
+    Returns
+    -------
+    ndarray, shape (rows, cols), uint8 or uint16
+        The stored values, unchanged.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, damaged, not an image of an accepted kind, in colour, or holds several images.
+    """
+    return load_frame(Path(path)).array
+
+
+def load_frame(path: Path) -> LoadedFrame:
+    """Read one frame and the SHA-256 of its file from the same bytes; errors as in `read_frame`."""
+    try:
+        raw = path.read_bytes()
+    except FileNotFoundError:
+        raise InputError("file is missing", where=str(path), remedy="check the name") from None
+    except OSError as problem:
+        raise InputError("file cannot be read", where=str(path), value=problem.strerror, remedy="check the permissions") from None
+    return LoadedFrame(_decode(raw, path), hashlib.sha256(raw).hexdigest(), len(raw))
+
+
+def _decode(raw: bytes, path: Path) -> np.ndarray:
+    """Decode by content, not by the name's ending."""
+    decode = next((decode for magic, decode in _DECODERS if raw.startswith(magic)), None)
+    if decode is None:
+        if raw.startswith(b"\xff\xd8"):
+            remedy = "store frames without loss: JPEG removes the noise to be measured"
+            raise InputError("JPEG image", where=str(path), allowed=_FORMATS, remedy=remedy)
+        what = "file is empty" if not raw else "not an image of a known format"
+        raise InputError(what, where=str(path), allowed=_FORMATS, remedy="copy or export the frame again")
+    try:
+        array = decode(raw)
+    except InputError as problem:
+        raise InputError(problem.what, where=str(path), allowed=problem.allowed, remedy=problem.remedy) from None
+    except Exception as problem:  # every decoder has its own exceptions, and all of them mean a damaged file here
+        reason = str(problem).splitlines()[0] if str(problem) else type(problem).__name__
+        raise InputError(f"image is damaged or cut off ({reason})", where=str(path), remedy="copy or export the frame again") from None
+    if array.ndim != 2:
+        what = f"colour image ({'x'.join(map(str, array.shape))})"
+        raise InputError(what, where=str(path), allowed="one grey channel", remedy="store the sensor's raw values, not a colour picture")
+    if array.dtype not in (np.uint8, np.uint16):
+        raise InputError(f"values of type {array.dtype}", where=str(path), allowed=_FORMATS, remedy="store the camera's integer values")
+    if array.size == 0:
+        raise InputError("image has no pixels", where=str(path), remedy="export the frame again")
+    return np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("="))
+
+
+def _decode_png(raw: bytes) -> np.ndarray:
+    import imagecodecs
+
+    array: np.ndarray = imagecodecs.png_decode(raw)
+    if b"IEND" not in raw:
+        raise ValueError("end of the image is missing")
+    return array
+
+
+def _decode_tiff(raw: bytes) -> np.ndarray:
+    import tifffile
+
+    with tifffile.TiffFile(io.BytesIO(raw)) as tiff:
+        if len(tiff.pages) != 1:
+            raise InputError(f"TIFF with {len(tiff.pages)} images", allowed="one frame a file", remedy="write each frame into its own file")
+        page = tiff.pages[0]
+        # tifffile fills strips it has no bytes for with zeros; that must not pass as data
+        for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True):
+            if count <= 0 or offset <= 0 or offset + count > len(raw):
+                raise ValueError("pixel data are missing")
+        array: np.ndarray = page.asarray()
+        return array
+
+
+def _decode_npy(raw: bytes) -> np.ndarray:
+    array: np.ndarray = np.load(io.BytesIO(raw), allow_pickle=False)
+    return array
+
+
+_DECODERS: tuple[tuple[bytes, Callable[[bytes], np.ndarray]], ...] = (
+    (b"\x89PNG\r\n\x1a\n", _decode_png),
+    (b"II*\0", _decode_tiff),
+    (b"MM\0*", _decode_tiff),
+    (b"II+\0", _decode_tiff),
+    (b"MM\0+", _decode_tiff),
+    (b"\x93NUMPY", _decode_npy),
+)
+
+
+def check_frame(array: np.ndarray, where: str, *, bits: int, shape: tuple[int, int] | None = None, dtype: str | None = None) -> None:
+    """Refuse a frame that does not fit its campaign.
+
+    Parameters
+    ----------
+    array : ndarray, shape (rows, cols), uint8 or uint16
+    where : str
+        Name of the file.
+    bits : int
+        Bits of a stored value.
+    shape, dtype : optional
+        Those of the campaign's first frame.
+
+    Raises
+    ------
+    InputError
+        If size or depth differ, if an 8-bit file is declared to hold more bits, or if a value exceeds the declared bits.
+    """
+    if shape is not None and array.shape != tuple(shape):
+        what = f"frame has {array.shape[1]} x {array.shape[0]} pixels, the campaign {shape[1]} x {shape[0]} (columns x rows)"
+        raise InputError(
+            what, where=where, allowed="one size for all frames", remedy="remove the frame or use one window for the whole campaign"
+        )
+    depth = array.dtype.itemsize * 8
+    if depth < bits:
+        remedy = f"export the frames with 16 bits, or declare bits: {depth} if the camera delivered {depth}"
+        raise InputError(
+            f"{depth}-bit file, but {bits} bits are declared", where=where, allowed="16-bit files for more than 8 bits", remedy=remedy
+        )
+    if dtype is not None and array.dtype != np.dtype(dtype):
+        what = f"{depth}-bit file in a campaign of {np.dtype(dtype).itemsize * 8}-bit files"
+        raise InputError(what, where=where, allowed="one depth for all frames", remedy="export all frames in the same way")
+    highest = (1 << bits) - 1
+    if depth > bits and (found := int(array.max())) > highest:
+        raise _too_high(array, found, bits, where)
+
+
+def _too_high(array: np.ndarray, found: int, bits: int, where: str) -> InputError:
+    spare = array.dtype.itemsize * 8 - bits
+    used = int(np.bitwise_or.reduce(array, axis=None))
+    remedy = f"declare the true number of bits (at least {found.bit_length()})"
+    if used & ((1 << spare) - 1) == 0:
+        remedy = f"the values are shifted to the left by {spare} bits: store them in the lowest {bits} bits"
+    return InputError(f"value above what {bits} bits can hold", where=where, value=found, allowed=f"0 to {(1 << bits) - 1}", remedy=remedy)
+
+
+def iter_frames(
+    paths: Iterable[Path],
+    *,
+    bits: int,
+    shape: tuple[int, int] | None = None,
+    dtype: str | None = None,
+    hashes: InputHashes | None = None,
+    threads: int | None = None,
+) -> Iterator[np.ndarray]:
+    """Read frames in order, decoding ahead in threads; only a few frames (at most twice the threads) are in memory.
+
+    Parameters
+    ----------
+    paths : iterable of Path
+    bits, shape, dtype
+        As in `check_frame`, applied to every frame.
+    hashes : InputHashes, optional
+        Takes note of each file's digest.
+    threads : int, optional
+
+    Yields
+    ------
+    ndarray, shape (rows, cols), uint8 or uint16
+
+    Raises
+    ------
+    InputError
+        As in `read_frame` and `check_frame`, when the frame's turn comes.
+    """
+
+    def load(path: Path) -> tuple[Path, LoadedFrame]:
+        frame = load_frame(path)
+        check_frame(frame.array, str(path), bits=bits, shape=shape, dtype=dtype)
+        return path, frame
+
+    for path, frame in imap_tiles(load, paths, threads):
+        if hashes is not None:
+            hashes.add(path, frame.sha256, frame.size_bytes)
+        yield frame.array
+
+
+class FrameReader:
+    """Streams the frames of a campaign, checked against it, and collects the digests of the files.
+
+    Parameters
+    ----------
+    campaign : Campaign
+    threads : int, optional
+    on_frame : callable, optional
+        Called with no argument after each frame, e.g. to move a progress bar.
+    """
+
+    def __init__(self, campaign: Campaign, *, threads: int | None = None, on_frame: Callable[[], object] | None = None) -> None:
+        self.campaign, self.threads, self.on_frame = campaign, threads, on_frame
+        self.hashes = InputHashes(campaign.base)
+        for listing in (campaign.source_path, campaign.descriptor_path):
+            if listing is not None and listing.is_file():
+                self.hashes.add_file(listing)
+
+    def frames(self, group: FrameGroup) -> Iterator[np.ndarray]:
+        """Yield the frames of one group in order; errors as in `iter_frames`."""
+        c = self.campaign
+        for array in iter_frames(
+            group.paths, bits=c.bits, shape=c.frame_shape, dtype=c.frame_dtype, hashes=self.hashes, threads=self.threads
+        ):
+            yield array
+            if self.on_frame is not None:
+                self.on_frame()
+
+
+def write_frame(path: str | Path, array: np.ndarray, bits: int) -> None:
+    """Write one frame without loss, as PNG or TIFF by the name's ending; up to 8 bits as 8-bit file, else as 16-bit file.
+
+    Parameters
+    ----------
+    path : str or Path
+    array : ndarray, shape (rows, cols), integer
+    bits : int
+        Bits of a stored value, 1 to 16.
+
+    Raises
+    ------
+    InputError
+        If the array is not a grey integer image that fits into the bits, or the ending is neither ``.png`` nor ``.tif(f)``.
+    """
+    path = Path(path)
+    if array.ndim != 2 or array.dtype.kind not in "ui":
+        raise InputError(
+            "not a grey image of integers", where=str(path), value=f"{array.dtype} {array.shape}", allowed="two axes, integers"
+        )
+    if not 1 <= bits <= 16:
+        raise InputError("bits cannot be stored", where=str(path), value=bits, allowed="1 to 16")
+    if array.size and (array.min() < 0 or array.max() >= 1 << bits):
+        value = f"{array.min()} to {array.max()}"
+        raise InputError(f"values do not fit into {bits} bits", where=str(path), value=value, allowed=f"0 to {(1 << bits) - 1}")
+    stored = np.ascontiguousarray(array, dtype=np.uint8 if bits <= 8 else np.uint16)
+    ending = path.suffix.lower()
+    if ending == ".png":
+        import imagecodecs
+
+        path.write_bytes(imagecodecs.png_encode(stored, level=6))
+    elif ending in (".tif", ".tiff"):
+        import tifffile
+
+        tifffile.imwrite(path, stored, photometric="minisblack", compression="zlib", software="pixmetry")
+    else:
+        raise InputError("unknown ending of an image file", where=str(path), value=ending, allowed=".png, .tif, .tiff")

@@ -1,0 +1,203 @@
+"""Load a campaign from a YAML manifest, an EMVA 1288 descriptor, a folder with one of these, or the example that comes along."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pixmetry.campaign.emva_descriptor import decode_descriptor, is_descriptor, parse_descriptor
+from pixmetry.campaign.files import find_file, find_files
+from pixmetry.campaign.images import check_frame, read_frame
+from pixmetry.campaign.records import STACK_FRAMES, CameraFacts, Campaign, FrameGroup, OpticsFacts, check_groups
+from pixmetry.core.errors import InputError
+
+if TYPE_CHECKING:
+    from pixmetry.campaign.schema import GroupModel, ManifestModel
+
+EXAMPLE = Path(__file__).resolve().parents[1] / "data" / "emva1288-set-001-crop"
+
+_PLANCK_J_S = 6.62607015e-34  # exact, SI 2019
+_LIGHT_M_PER_S = 299792458.0  # exact
+
+
+def photons_from_irradiance(irradiance_uw_per_cm2: float, exposure_s: float, area_um2: float, wavelength_nm: float) -> float:
+    """Mean number of photons that reach one pixel in one exposure.
+
+    Notes
+    -----
+    µ_p = A t E λ / (h c), which is 50.34 · A[µm²] · t[ms] · λ[µm] · E[µW/cm²] (EMVA 1288 Release 4.0, section on the linear model).
+    """
+    energy_j = irradiance_uw_per_cm2 * 1e-2 * area_um2 * 1e-12 * exposure_s
+    return energy_j * wavelength_nm * 1e-9 / (_PLANCK_J_S * _LIGHT_M_PER_S)
+
+
+def load_campaign(path: str | Path | None = None) -> Campaign:
+    """Load a campaign and check all that can be checked without reading every frame.
+
+    Parameters
+    ----------
+    path : str or Path, optional
+        A YAML manifest, an EMVA 1288 descriptor, or a folder with one of them. Default: the example data of the package.
+
+    Returns
+    -------
+    Campaign
+
+    Raises
+    ------
+    InputError
+        If anything in the manifest, or about the files it names, makes the campaign unusable.
+    """
+    source = _find_source(EXAMPLE if path is None else Path(path))
+    try:
+        raw = source.read_bytes()
+    except OSError as problem:
+        raise InputError("file cannot be read", where=str(source), value=problem.strerror, remedy="check the permissions") from None
+    if source.suffix.lower() not in (".yaml", ".yml") and is_descriptor(decode_descriptor(raw)):
+        facts: dict[str, Any] = {"optics": OpticsFacts()}
+        parts = _from_descriptor(source, raw, None)
+    else:
+        model, lines = _read_manifest(source)
+        facts = {"optics": OpticsFacts(**model.optics.model_dump()), "notes": model.notes}
+        parts = _from_manifest(source, model, lines)
+    groups = check_groups(parts["groups"], str(source))
+    shape, dtype = _discover(groups[0].paths[0], parts)
+    return Campaign(
+        camera=parts["camera"],
+        groups=groups,
+        frame_shape=shape,
+        frame_dtype=dtype,
+        source_path=source,
+        descriptor_path=parts.get("descriptor_path"),
+        licence=parts["licence"],
+        **facts,
+    )
+
+
+def _discover(path: Path, parts: Mapping[str, Any]) -> tuple[tuple[int, int], str]:
+    """Take size and depth from the first frame; the size must be the declared one where one was declared."""
+    array = read_frame(path)
+    check_frame(array, str(path), bits=parts["camera"].bits, shape=parts.get("shape"))
+    return (array.shape[0], array.shape[1]), array.dtype.name
+
+
+def _find_source(path: Path) -> Path:
+    if path.is_file():
+        return path
+    if not path.is_dir():
+        raise InputError(
+            "no such file or folder", where=str(path), remedy="give a manifest (YAML), an EMVA 1288 descriptor or a folder with one"
+        )
+    files = sorted(p for p in path.iterdir() if p.is_file())
+    manifests = [p for p in files if p.suffix.lower() in (".yaml", ".yml")]
+    if len(manifests) > 1:
+        manifests = [p for p in manifests if re.search(rb"^schema:\s*['\"]?pixmetry/campaign", p.read_bytes(), re.MULTILINE)]
+    descriptors = [p for p in files if p.suffix.lower() == ".txt" and is_descriptor(decode_descriptor(p.read_bytes()))]
+    if len(manifests) == 1:  # a manifest may add the camera's facts to a descriptor beside it
+        text = manifests[0].read_text(encoding="utf-8", errors="replace")
+        descriptors = [p for p in descriptors if p.name not in text]
+    found = manifests + descriptors
+    if len(found) == 1:
+        return found[0]
+    names = ", ".join(p.name for p in found)
+    what = f"folder holds several campaigns ({names})" if found else "folder holds no campaign"
+    raise InputError(
+        what, where=str(path), allowed="one manifest (*.yaml) or one EMVA 1288 descriptor (*.txt)", remedy="name the file itself"
+    )
+
+
+def _read_manifest(source: Path) -> tuple[ManifestModel, Mapping[tuple[str | int, ...], int]]:
+    from pixmetry.campaign.schema import ManifestModel
+    from pixmetry.core.config import load_yaml, validate
+
+    data = load_yaml(source)
+    return validate(ManifestModel, data, str(source)), data.lines
+
+
+def _from_manifest(source: Path, model: ManifestModel, lines: Mapping[tuple[str | int, ...], int]) -> dict[str, Any]:
+    facts = model.camera.model_dump(exclude={"pitch_um"})
+    if model.camera.pitch_um is not None:
+        facts["pitch_x_um"] = facts["pitch_y_um"] = model.camera.pitch_um
+    camera = CameraFacts(**facts)
+    if model.emva_descriptor is not None:
+        where = _place(source, lines, "emva_descriptor")
+        descriptor = find_file(source.parent, model.emva_descriptor, where)
+        parts = _from_descriptor(descriptor, descriptor.read_bytes(), camera)
+        return {**parts, "descriptor_path": descriptor, "licence": model.licence or parts["licence"]}
+    groups = []
+    for i, group in enumerate(model.frames):
+        paths = find_files(source.parent, group.files, _place(source, lines, "frames", i, "files"))
+        photons = _photons(group, model, camera, _place(source, lines, "frames", i))
+        groups.append(FrameGroup(group.kind, group.exposure_s, photons, paths, group.role or _role(paths)))
+    return {"camera": camera, "groups": tuple(groups), "licence": model.licence}
+
+
+def _place(source: Path, lines: Mapping[tuple[str | int, ...], int], *loc: str | int) -> str:
+    """Name file and line; a value that came through a YAML merge has no line of its own."""
+    return f"{source}, line {lines[loc]}" if loc in lines else str(source)
+
+
+def _role(paths: tuple[Path, ...]) -> str:
+    return "stack" if len(paths) >= STACK_FRAMES else "level"
+
+
+def _photons(group: GroupModel, model: ManifestModel, camera: CameraFacts, where: str) -> float | None:
+    if group.kind == "dark":
+        return 0.0
+    irradiance = group.irradiance_uw_per_cm2 or model.optics.irradiance_uw_per_cm2
+    if group.photons is not None or irradiance is None:
+        return group.photons
+    if camera.pitch_x_um is None or camera.pitch_y_um is None or model.optics.wavelength_nm is None:
+        missing = "wavelength_nm under optics" if model.optics.wavelength_nm is None else "pitch_um under camera"
+        raise InputError("photons do not follow from the irradiance alone", where=where, remedy=f"add {missing}, or give photons")
+    return photons_from_irradiance(irradiance, group.exposure_s, camera.pitch_x_um * camera.pitch_y_um, model.optics.wavelength_nm)
+
+
+def _from_descriptor(source: Path, raw: bytes, camera: CameraFacts | None) -> dict[str, Any]:
+    descriptor = parse_descriptor(source, raw)
+    if camera is not None and camera.bits != descriptor.bits:
+        what = f"the manifest declares {camera.bits} bits, the descriptor {descriptor.bits}"
+        raise InputError(what, where=str(source), remedy="correct the one that is wrong")
+    groups = []
+    for group in descriptor.groups:
+        paths = tuple(find_file(source.parent, text, f"{source}, line {line}") for text, line in group.files)
+        groups.append(FrameGroup(group.kind, group.exposure_s, group.photons, paths, _role(paths)))
+    return {
+        "camera": camera or CameraFacts(name=source.parent.resolve().name or source.stem, bits=descriptor.bits),
+        "groups": tuple(groups),
+        "shape": (descriptor.height, descriptor.width),
+        "licence": descriptor.header,
+    }
+
+
+def write_manifest(campaign: Campaign, path: str | Path) -> None:
+    """Write a campaign as a YAML manifest; its frames must lie in or below the manifest's folder.
+
+    Raises
+    ------
+    InputError
+        If a frame lies elsewhere.
+    """
+    from dataclasses import asdict
+
+    from pixmetry.campaign.schema import CAMPAIGN_SCHEMA
+    from pixmetry.core.config import dump_yaml
+
+    base = Path(path).parent
+    frames = []
+    for group in campaign.groups:
+        outside = next((p for p in group.paths if not p.is_relative_to(base)), None)
+        if outside is not None:
+            raise InputError(
+                "frame lies outside the manifest's folder",
+                where=str(path),
+                value=outside.name,
+                remedy="write the manifest above the frames",
+            )
+        photons = group.photons if group.kind == "bright" else None
+        files = [p.relative_to(base).as_posix() for p in group.paths]
+        frames.append({"kind": group.kind, "exposure_s": group.exposure_s, "photons": photons, "role": group.role, "files": files})
+    manifest = {"schema": CAMPAIGN_SCHEMA, "camera": asdict(campaign.camera), "optics": asdict(campaign.optics), "frames": frames}
+    dump_yaml({**manifest, "licence": campaign.licence or None, "notes": campaign.notes or None}, path)

@@ -1,0 +1,61 @@
+"""The command ``pixmetry``.
+
+The group knows the name and the one-line help of each command; the command's own module is imported when it is used, so that
+``pixmetry --help`` answers at once.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+import click
+
+from pixmetry import __version__
+from pixmetry.core.errors import PixmetryError
+
+EXIT_ERROR = 2
+EXIT_INTERRUPTED = 130  # 128 + SIGINT, as a shell reports it
+
+# Each command lives in the module of its name below this package, as a click command of that name.
+COMMANDS = {
+    "assess": "Assess a camera from its frames: measure, budget, advise, and write the report.",
+    "sources": "List the error sources, or explain one of them.",
+    "simulate": "Make the frames of a camera whose errors are known.",
+    "correct": "Take out of frames what was measured in an assessment.",
+}
+
+
+class LazyGroup(click.Group):
+    """A group whose commands are imported one at a time, and whose deliberate errors are one line each."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name not in COMMANDS:
+            return None
+        return getattr(import_module(f"{__name__}.{cmd_name}"), cmd_name)
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        with formatter.section("Commands"):
+            formatter.write_dl(list(COMMANDS.items()))
+
+    def invoke(self, ctx: click.Context) -> Any:
+        try:
+            return super().invoke(ctx)
+        except PixmetryError as error:
+            click.echo(f"error: {' '.join(str(error).split())}", err=True)
+            ctx.exit(EXIT_ERROR)
+        except KeyboardInterrupt:
+            click.echo("interrupted", err=True)
+            ctx.exit(EXIT_INTERRUPTED)
+
+
+@click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 120})
+@click.version_option(__version__, "-V", "--version", prog_name="pixmetry", message="%(prog)s %(version)s")
+def main() -> None:
+    """Follow a target's light from lens to stored number.
+
+    Simulates, measures, corrects and budgets a camera's error sources, and says how sure each answer is.
+    """

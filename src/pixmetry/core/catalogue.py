@@ -1,0 +1,71 @@
+"""The catalogue: every error source there is, found by walking the stages (and entry points of other packages)."""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+from functools import cache
+from importlib.metadata import entry_points
+
+from pixmetry.core.errors import ChainError, InputError
+from pixmetry.core.source import Source
+
+STAGES = ("optics", "sensor", "electronics", "cable", "grabber", "storage", "processing")
+ENTRY_POINTS = "pixmetry.sources"
+
+
+@cache
+def catalogue() -> dict[str, Source]:
+    """All sources by id, in the order in which the light meets their stages."""
+    found: dict[str, Source] = {}
+    for stage in STAGES:
+        package = importlib.import_module(f"pixmetry.{stage}")
+        for module in sorted(pkgutil.iter_modules(package.__path__), key=lambda m: m.name):
+            if module.name.startswith("_"):
+                continue
+            source = getattr(importlib.import_module(f"pixmetry.{stage}.{module.name}"), "SOURCE", None)
+            if source is not None:
+                _add(found, source, f"pixmetry.{stage}.{module.name}", stage)
+    for point in entry_points(group=ENTRY_POINTS):
+        _add(found, point.load(), point.value, None)
+    return found
+
+
+def _add(found: dict[str, Source], source: Source, where: str, stage: str | None) -> None:
+    if not isinstance(source, Source):
+        raise ChainError("is not a Source record", where=where)
+    if source.id in found:
+        raise ChainError(f"the id {source.id} is already taken", where=where, remedy="choose another name")
+    if source.stage not in STAGES or (stage is not None and source.stage != stage):
+        raise ChainError(f"the id {source.id} does not name its stage", where=where, allowed=", ".join(STAGES))
+    found[source.id] = source
+
+
+def get_source(source_id: str) -> Source:
+    """The source of that id; ``InputError`` names the nearest ones if there is none."""
+    from difflib import get_close_matches
+
+    sources = catalogue()
+    if source_id in sources:
+        return sources[source_id]
+    near = get_close_matches(source_id, sources, n=3, cutoff=0.4) or [i for i in sources if i.endswith("." + source_id)]
+    raise InputError(
+        f"no error source is called {source_id!r}",
+        allowed=", ".join(near or sources),
+        remedy="`pixmetry sources` lists them all",
+    )
+
+
+def to_record(source: Source) -> dict[str, object]:
+    """The listing's record of a source, for people's programs."""
+    return {
+        "id": source.id,
+        "title": source.title,
+        "stage": source.stage,
+        "number": source.number,
+        "note": source.note,
+        "stars": source.stars,
+        "verbs": source.verbs,
+        "reasons": dict(source.reasons),
+        "gum_class": source.gum_class,
+    }

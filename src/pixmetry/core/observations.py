@@ -1,0 +1,188 @@
+"""Observations: what a camera's frames are reduced to, once, before anything is measured from them.
+
+Records only. They are made by ``pixmetry.experiment`` from streams of frames and read by the sources' ``measure``. All values are
+in DN of the stored frames unless the name says otherwise; variances in DN². Where temporal statistics come from pairs of frames,
+they are from differences, so what is fixed in the camera drops out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from pixmetry.core.estimates import Estimates
+
+
+@dataclass(frozen=True)
+class LevelMoments:
+    """Temporal and spatial moments at several exposure levels, each from the same small number of frames (usually two).
+
+    All arrays have shape (levels,). With F frames of M rows and N columns at a level, the temporal variances are mean squares of the
+    two-way (row, column) analysis of variance of the frame differences: ``ms_*`` are the *mean squares per pixel, per row mean and
+    per column mean*, so that E[ms_pixel] = σ²_white, E[ms_row] = σ²_row + σ²_white/N, E[ms_col] = σ²_col + σ²_white/M, and
+    E[ms_frame] = σ²_frame + σ²_row/M + σ²_col/N + σ²_white/(MN) (the variance of the frame means about their mean).
+    """
+
+    exposure_s: np.ndarray
+    photons: np.ndarray | None  # mean photons per pixel, when the irradiance is known
+    n_frames: np.ndarray
+    mean_dn: np.ndarray
+    var_total_dn2: np.ndarray  # plain temporal variance per pixel (EMVA 1288: ½⟨d²⟩ − ½⟨d⟩² for a pair)
+    ms_pixel_dn2: np.ndarray
+    ms_row_dn2: np.ndarray
+    ms_col_dn2: np.ndarray
+    ms_frame_dn2: np.ndarray
+    kurtosis_excess: np.ndarray  # of the frame differences
+    fraction_min: np.ndarray  # share of pixels at the lowest code that the camera can store
+    fraction_max: np.ndarray  # share at the highest
+    spatial_cov_dn2: np.ndarray  # spatial variance free of temporal noise: ⟨y0 y1⟩ − µ0 µ1
+
+
+@dataclass(frozen=True)
+class PhotonTransfer:
+    """A photon-transfer series: bright and dark levels of one camera at one gain and temperature."""
+
+    bright: LevelMoments
+    dark: LevelMoments
+    frame_shape: tuple[int, int]
+    bits: int
+
+
+@dataclass(frozen=True)
+class StackMoments:
+    """Moments of L frames taken at one setting (EMVA 1288 R4.0 §8): the mean image and how much noise is left in it."""
+
+    n_frames: int
+    exposure_s: float
+    mean_map_dn: np.ndarray  # shape (rows, cols), float64
+    var_map_dn2: np.ndarray  # shape (rows, cols), float32; sample variance over the frames
+    mean_dn: float
+    frame_means_dn: np.ndarray  # shape (L,), the mean of each frame
+    var_stack_dn2: float  # σ²_stack: mean over pixels of the sample variance
+    ms_pixel_dn2: float  # temporal mean squares as in LevelMoments, from the whole stack
+    ms_row_dn2: float
+    ms_col_dn2: float
+    ms_frame_dn2: float
+    fraction_min: float
+    fraction_max: float
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        return self.mean_map_dn.shape
+
+
+@dataclass(frozen=True)
+class Spectra:
+    """Power spectra of a mean image (fixed) and of frame differences (temporal), rows and columns apart.
+
+    Frequencies in cycles per pixel, ``k / N`` for k = 0 … N//2; powers in DN² as in EMVA 1288 R4.0 §8.4 (white noise of variance σ²
+    has power σ² at every frequency).
+    """
+
+    frequency_h: np.ndarray
+    fixed_h_dn2: np.ndarray
+    temporal_h_dn2: np.ndarray
+    frequency_v: np.ndarray
+    fixed_v_dn2: np.ndarray
+    temporal_v_dn2: np.ndarray
+    # two-dimensional temporal periodogram, shape (rows, cols // 2 + 1), float32, the mean over the frame pairs, zero on the axes
+    temporal_power_dn2: np.ndarray | None = None
+    n_pairs: int = 0
+
+
+@dataclass(frozen=True)
+class CodeHistogram:
+    """How often each code occurs, over all frames of a campaign (``counts``) and over its dark frames alone."""
+
+    counts: np.ndarray  # shape (2**bits,), int64
+    dark_counts: np.ndarray
+    bits: int
+    # the light levels, for the counts that an ideal converter would give; each of shape (levels,), in order of their means
+    level_means_dn: np.ndarray | None = None
+    level_vars_dn2: np.ndarray | None = None  # variance of all codes of the level, temporal and spatial
+    level_sizes: np.ndarray | None = None  # int64, number of codes of the level
+
+
+@dataclass(frozen=True)
+class CodeErrors:
+    """What a light sweep tells of the converter's codes; all arrays have one entry per tested code, or per missing code."""
+
+    codes: np.ndarray  # int64, the codes that were covered evenly enough to be tested
+    dnl_lsb: np.ndarray
+    u_dnl_lsb: np.ndarray
+    missing_codes: np.ndarray
+    missing_probability: np.ndarray  # chance that any code tested would be empty like this in a converter that has it
+    fit: Estimates  # dnl_rms_lsb; empty if fewer than two codes could be tested
+
+
+@dataclass(frozen=True)
+class DefectList:
+    """Pixels that stand out from the others; arrays have shape (defects,).
+
+    ``kind`` is one of ``hot`` and ``cold`` (dark value), ``dead`` (less than half the response), ``gain`` (response off), ``stuck``
+    (no response, no noise) and ``noisy`` (temporal noise); a pixel is listed once, under the worst of these.
+    """
+
+    row: np.ndarray
+    col: np.ndarray
+    kind: tuple[str, ...]
+    dark_excess_dn: np.ndarray
+    gain_rel: np.ndarray  # response over that of its surroundings; 1 is normal; nan without a bright stack
+    expected_false: float  # mean number of false alarms in a frame whose good pixels are Gaussian
+    shape: tuple[int, int]
+
+    def __len__(self) -> int:
+        return len(self.kind)
+
+    def mask(self) -> np.ndarray:
+        """True at each defect, shape (rows, cols)."""
+        mask = np.zeros(self.shape, dtype=bool)
+        mask[self.row, self.col] = True
+        return mask
+
+
+@dataclass(frozen=True)
+class PatternList:
+    """Sinusoidal patterns that stand out of the noise, off the two axes (row and column patterns are measured apart).
+
+    Arrays have shape (patterns,), strongest first. Frequencies in cycles per pixel along x (0 … ½) and y (−½ … ½).
+    """
+
+    moving: np.ndarray  # bool; False: at the same place in every frame
+    frequency_x: np.ndarray
+    frequency_y: np.ndarray
+    u_frequency_x: np.ndarray
+    u_frequency_y: np.ndarray
+    amplitude_dn: np.ndarray
+    u_amplitude_dn: np.ndarray
+    false_alarm_rate: float  # of the whole search
+    n_searched: int  # periodogram ordinates looked at
+    fixed_limit_dn: float  # amplitude of the weakest fixed pattern that would be found in half of all cases
+    moving_limit_dn: float  # the same for moving patterns; nan if the frames were not searched
+
+    def __len__(self) -> int:
+        return len(self.amplitude_dn)
+
+
+@dataclass(frozen=True)
+class Observations:
+    """Everything one campaign's frames were reduced to; what is not there is ``None``.
+
+    ``photon_transfer_fit`` is the joint estimate made once from ``photon_transfer`` (and the stacks), which many sources read.
+    """
+
+    photon_transfer: PhotonTransfer | None = None
+    photon_transfer_fit: Estimates | None = None
+    dark_stack: StackMoments | None = None
+    bright_stack: StackMoments | None = None
+    dark_spectra: Spectra | None = None
+    bright_spectra: Spectra | None = None
+    histogram: CodeHistogram | None = None
+    spatial_fit: Estimates | None = None
+    defects: DefectList | None = None
+    patterns: PatternList | None = None
+    code_errors: CodeErrors | None = None
+    temperature_c: float | None = None
+    notes: tuple[str, ...] = field(default_factory=tuple)

@@ -1,0 +1,167 @@
+"""What an error source is: one effect on the way from light to number, with four verbs.
+
+A module of a stage makes one ``Source`` record named ``SOURCE``; the catalogue finds it. Verbs are pure functions:
+
+* ``forward(params, signal, stream)`` returns the next ``Signal``; a source with a memory has ``forward(params, signal, stream, state)``
+  and returns ``(signal, state)``;
+* ``measure(observations)`` returns ``Estimates`` named like the parameters (a subset of them), or raises ``MeasureError``;
+* ``correct(params, signal)`` returns the signal with less of the effect;
+* ``propagate(params, probe)`` returns the ``Contribution`` to a target's position.
+
+A verb that cannot exist is given as a sentence in ``reasons`` instead.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from pixmetry.core.config import Model
+from pixmetry.core.contribution import Contribution, Probe
+from pixmetry.core.errors import ParameterError
+from pixmetry.core.estimates import Estimates
+from pixmetry.core.observations import Observations
+from pixmetry.core.random import Stream
+from pixmetry.core.signal import Kind, Signal, Windows
+
+VERBS = ("forward", "measure", "correct", "propagate")
+
+
+class Parameters(Model):
+    """Base of every source's parameters: frozen, validated, no unknown keys, no NaN or infinity."""
+
+
+def quantity(default: Any, unit: str, description: str, **bounds: Any) -> Any:
+    """A parameter with its unit, meaning and allowed range (``ge``, ``gt``, ``le``, ``lt``)."""
+    from pydantic import Field
+
+    return Field(default=default, description=description, json_schema_extra={"unit": unit}, **bounds)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Source:
+    """One error source.
+
+    Parameters
+    ----------
+    id : str
+        ``stage.name``, as in ``sensor.prnu``; the stage is the folder.
+    title, description : str
+        The effect, in a line and in a sentence or two.
+    number, stars, note : int, int, str
+        Row of the handbook's error table (0 for an effect that is not in it), its stars, its note.
+    parameters : type
+        Class of the parameters.
+    consumes : tuple of Kind
+        Kinds it accepts.
+    produces : Kind, optional
+        The kind it makes, if it converts.
+    after, before : tuple of str
+        Sources (or whole stages) that must come earlier or later in a camera.
+    essential : bool
+        A conversion without which the chain does not reach its end: it is never switched off in a budget.
+    neutral : parameters, optional
+        Values at which ``forward`` is the identity; where there are none, ``reasons["neutral"]`` says why.
+    typical, bound : parameters
+        Usual values, and the largest to expect of a sound camera: the bound enters a budget where nothing was measured.
+    context : callable, optional
+        ``context(params, windows, frame_shape) -> Windows``: the input it needs to make these windows; by default the windows.
+    near : callable, optional
+        ``near(params) -> (up, down, left, right)`` pixels that the budget's frozen mode keeps of a far context; what lies farther is
+        taken from the noise-free frame. By default the exact context is used in that mode too.
+    tail : callable, optional
+        ``tail(params)``: the largest share of a pixel's signal that reaches beyond ``near``; the frozen mode's stated error.
+    start : callable, optional
+        ``start(params)``: the state before frame 0, for a source with a memory.
+    applies_to : tuple of str
+        Kinds of camera that can have it: of ``digital``, ``analogue``, ``ccd``, ``cmos``; empty for all.
+    gum_class : str
+        Class of its contribution, see ``core.contribution``.
+    equation, typical_size : str
+        For the listing and the docs.
+    references : tuple of str
+    advice : str
+        What to do about it when it is among the largest.
+    reasons : mapping
+        For every verb that is missing (and for ``neutral``): why.
+    """
+
+    id: str
+    title: str
+    description: str
+    parameters: type[Parameters]
+    consumes: tuple[Kind, ...]
+    typical: Parameters
+    bound: Parameters
+    gum_class: str
+    equation: str
+    typical_size: str
+    references: tuple[str, ...]
+    advice: str
+    number: int = 0
+    stars: int = 0
+    note: str = ""
+    produces: Kind | None = None
+    after: tuple[str, ...] = ()
+    before: tuple[str, ...] = ()
+    essential: bool = False
+    neutral: Parameters | None = None
+    forward: Callable[..., Any] | None = None
+    measure: Callable[[Observations], Estimates] | None = None
+    correct: Callable[[Any, Signal], Signal] | None = None
+    propagate: Callable[[Any, Probe], Contribution] | None = None
+    context: Callable[[Any, Windows, tuple[int, int]], Windows] | None = None
+    near: Callable[[Any], tuple[int, int, int, int]] | None = None
+    tail: Callable[[Any], float] | None = None
+    start: Callable[[Any], Any] | None = None
+    applies_to: tuple[str, ...] = ()
+    reasons: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        silent = [v for v in VERBS if getattr(self, v) is None and not self.reasons.get(v)]
+        if silent:
+            raise ValueError(f"{self.id}: no reason given for the missing verb {', '.join(silent)}")
+        if self.neutral is None and not self.reasons.get("neutral"):
+            raise ValueError(f"{self.id}: neither neutral parameters nor the reason why there are none")
+        if (self.near is None) != (self.tail is None):
+            raise ValueError(f"{self.id}: near and tail come together")
+
+    @property
+    def stage(self) -> str:
+        """The folder of the chain that holds it."""
+        return self.id.split(".")[0]
+
+    @property
+    def verbs(self) -> dict[str, bool]:
+        """Which of the four verbs it has."""
+        return {verb: getattr(self, verb) is not None for verb in VERBS}
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Unit of every parameter."""
+        return {n: (f.json_schema_extra or {}).get("unit", "") for n, f in self.parameters.model_fields.items()}
+
+    def window_needed(self, params: Any, windows: Windows, frame_shape: tuple[int, int]) -> Windows:
+        """The input windows that it needs for these output windows."""
+        return windows if self.context is None else self.context(params, windows, frame_shape)
+
+    def make(self, values: Mapping[str, Any] | None = None, where: str = "") -> Parameters:
+        """Validated parameters from plain values; ``InputError`` says what is wrong."""
+        from pixmetry.core.config import validate
+
+        return validate(self.parameters, dict(values or {}), where or self.id)
+
+    def check_kind(self, signal: Signal) -> None:
+        """Refuse a signal of a kind that this source does not take."""
+        if signal.kind not in self.consumes:
+            raise ParameterError(
+                f"{self.id} cannot act on {signal.kind}", allowed=", ".join(self.consumes), remedy="put it elsewhere in the chain"
+            )
+
+
+def run(source: Source, params: Any, signal: Signal, stream: Stream, state: Any = None) -> tuple[Signal, Any]:
+    """Call ``forward`` of any source, with or without a memory."""
+    if source.start is None:
+        return source.forward(params, signal, stream), None
+    return source.forward(params, signal, stream, source.start(params) if state is None else state)

@@ -1,0 +1,1 @@
+"""Procedures that reduce the frames of a campaign to observations, each frame read once."""

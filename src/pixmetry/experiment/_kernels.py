@@ -1,0 +1,102 @@
+"""Scalar loops over one frame."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pixmetry.core.jit import jit
+
+
+@jit
+def accumulate_frame(frame, total, total_sq, row_sums, col_sums, counts):
+    """Add one frame to the running sums of its group, reading it once.
+
+    Parameters
+    ----------
+    frame : ndarray, shape (rows, cols), uint8 or uint16, DN
+    total : ndarray, shape (rows, cols), uint32, DN
+    total_sq : ndarray, shape (rows, cols), uint64, DN²
+    row_sums, col_sums : ndarray, shape (rows,) and (cols,), int64, DN
+        Set to the sums of this frame.
+    counts : ndarray, shape (4, codes), int64
+        Occurrences of each code. Four tables take turns because neighbouring pixels mostly hold the same few codes, and an
+        increment has to wait for the previous one of the same table entry.
+    """
+    rows, cols = frame.shape
+    fours = cols - cols % 4
+    for c in range(cols):
+        col_sums[c] = 0
+    for r in range(rows):
+        row_sum = 0
+        for c in range(cols):
+            value = int(frame[r, c])
+            row_sum += value
+            col_sums[c] += value
+            total[r, c] += value
+            total_sq[r, c] += value * value
+        row_sums[r] = row_sum
+        for c in range(0, fours, 4):
+            counts[0, frame[r, c]] += 1
+            counts[1, frame[r, c + 1]] += 1
+            counts[2, frame[r, c + 2]] += 1
+            counts[3, frame[r, c + 3]] += 1
+        for c in range(fours, cols):
+            counts[0, frame[r, c]] += 1
+
+
+@jit
+def count_codes(frame, counts):
+    """Count the codes of a frame; arguments as for :func:`accumulate_frame`."""
+    rows, cols = frame.shape
+    for r in range(rows):
+        for c in range(cols):
+            counts[c % 4, frame[r, c]] += 1
+
+
+@jit
+def count_differences(first, second, counts, zero):
+    """Count the differences ``second - first``; a difference d is counted in ``counts[c % 4, zero + d]`` (shape (4, ...), int64)."""
+    rows, cols = first.shape
+    for r in range(rows):
+        for c in range(cols):
+            counts[c % 4, zero + int(second[r, c]) - int(first[r, c])] += 1
+
+
+@jit
+def sum_maps(total, total_sq, n_frames, row_totals, col_totals):
+    """Sum the maps of a group over the pixels.
+
+    Parameters
+    ----------
+    total, total_sq : ndarray, shape (rows, cols), uint32 and uint64
+        Σ y and Σ y² over the frames.
+    n_frames : int
+    row_totals, col_totals : ndarray, shape (rows,) and (cols,), int64
+        Set to the sums of ``total`` along the rows and columns.
+
+    Returns
+    -------
+    deviations : float
+        Σ over pixels of F Σy² − (Σy)², each term an exact integer.
+    products : float
+        Σ over pixels of (Σy)² − Σy², that is of the products of different frames.
+    """
+    rows, cols = total.shape
+    f = np.uint64(n_frames)
+    deviations = products = 0.0
+    for c in range(cols):
+        col_totals[c] = 0
+    for r in range(rows):
+        row_total = 0
+        row_deviations = row_products = 0.0
+        for c in range(cols):
+            value = np.uint64(total[r, c])
+            square = value * value
+            row_total += int(total[r, c])
+            col_totals[c] += int(total[r, c])
+            row_deviations += float(f * total_sq[r, c] - square)
+            row_products += float(square - total_sq[r, c])
+        row_totals[r] = row_total
+        deviations += row_deviations
+        products += row_products
+    return deviations, products

@@ -1,0 +1,294 @@
+"""Fixed-pattern noise of a sensor from a dark and a bright stack: row, column and pixel parts, free of temporal noise and shading."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from pixmetry.core.errors import InputError, MeasureError
+from pixmetry.core.estimates import Estimates
+from pixmetry.core.observations import DefectList, StackMoments
+from pixmetry.experiment.surface import Strata, Surface, cross_strata, fill, fit_surface, residual_parts
+
+PARTS = ("pixel", "row", "col")
+METHOD = "analysis of variance of the mean maps, less temporal mean squares / L; Scheffé 1959, limits after Graybill & Wang 1980"
+
+
+@dataclass(frozen=True)
+class _MeanSquares:
+    """Independent mean squares: values, degrees of freedom, excess kurtosis of what was squared."""
+
+    values: np.ndarray
+    dof: np.ndarray
+    kurtosis: np.ndarray
+
+    def relative_variances(self) -> np.ndarray:
+        # Var(MS) = MS² (2/ν + γ₂/n), γ₂ the excess kurtosis of what was squared
+        return 2.0 / self.dof + self.kurtosis / self.dof
+
+
+def fit_spatial(
+    dark_stack: StackMoments, bright_stack: StackMoments, defects: DefectList | None = None, *, surface_degree: int = 4
+) -> Estimates:
+    """Dark-signal and photo-response non-uniformity with their row, column and pixel parts.
+
+    Parameters
+    ----------
+    dark_stack, bright_stack : StackMoments
+        Of the same exposure, the bright one evenly lit.
+    defects : DefectList, optional
+        Pixels to leave out; by default those of ``find_defects``.
+    surface_degree : int
+        Total degree of the polynomial that takes up the illumination.
+
+    Returns
+    -------
+    Estimates
+        ``dsnu_{pixel,row,col,total}_dn``, ``prnu_{pixel,row,col,total}_rel`` (0.01 is 1 %), standard deviations of the population from
+        which this sensor's pixels, rows and columns are a sample; ``shading_x_per_px``, ``shading_y_per_px`` (relative gradient at the
+        centre) and ``shading_pp_rel``. What is not significantly above zero is a 95 % upper limit.
+
+    Raises
+    ------
+    InputError
+        If the stacks differ in shape.
+    MeasureError
+        If the frames are too small for the surface, or the bright stack is not brighter.
+
+    Notes
+    -----
+    Dark map, and (bright − dark) divided by its fitted surface, are each split by a two-way analysis of variance with the degrees of
+    freedom M−1, N−1, (M−1)(N−1) less those of surface and defects. With L frames and temporal mean squares t,
+
+        σ²_pixel = MS_pixel − t_pixel/L,     σ²_row = MS_row/N − MS_pixel/N − (t_row − t_pixel/N)/L
+
+    (t_row per row mean), columns likewise. EMVA 1288 R4.0 eq. 36 takes the whole temporal variance off the pixels instead, so that
+    temporal row noise goes into s²_row and drives s²_pixel below zero. A polynomial is preferred to the high-pass filter of that release
+    since what it takes from each part is a known number of degrees of freedom; illumination with finer structure stays in the PRNU.
+    The dark map keeps its slow part: it belongs to the sensor.
+    """
+    from pixmetry.experiment.defects import find_defects
+
+    if dark_stack.shape != bright_stack.shape:
+        raise InputError("dark and bright stack differ in shape", value=bright_stack.shape, allowed=str(dark_stack.shape))
+    rows, cols = dark_stack.shape
+    if min(rows, cols) < 2 * surface_degree + 4:
+        raise MeasureError(
+            "frames are too small for the surface", value=(rows, cols), allowed=f"{2 * surface_degree + 4} rows and columns or more"
+        )
+    mask = (find_defects(dark_stack, bright_stack, surface_degree=surface_degree) if defects is None else defects).mask()
+    light = fill(bright_stack.mean_map_dn - dark_stack.mean_map_dn, mask)
+    if light.mean() <= 0:
+        raise MeasureError("the bright stack is not brighter than the dark one", value=float(light.mean()))
+    # the mask is filled in the flattened image: a hole in strong shading would be filled with a wrong level
+    surface = fit_surface(light, surface_degree)
+    surface = fit_surface(np.where(mask, surface.values, light), surface_degree)
+    if surface.values.min() <= 0:
+        raise MeasureError("the light falls to nothing within the frame", where="bright stack", remedy="light the frame evenly, or crop it")
+    dark = fill(dark_stack.mean_map_dn, mask)
+    response = fill((bright_stack.mean_map_dn - dark_stack.mean_map_dn) / surface.values, mask)
+    response = response - fit_surface(response, surface_degree).values
+    squares, covariance = _mean_squares(dark_stack, bright_stack, dark, response, mask, surface)
+    return _components(squares, covariance, dark_stack.shape, float((surface.values**-2.0).mean())).join(_shading(surface, squares))
+
+
+def _temporal(stack: StackMoments, mask: np.ndarray, weight: np.ndarray | None = None) -> Strata:
+    """Temporal mean squares per pixel over L, of the good pixels, with weights as of a mean map that is multiplied by them."""
+    good = stack.var_map_dn2[~mask].astype(float)
+    # only the white part of noisy pixels goes out with them
+    white = max(stack.ms_pixel_dn2 - (stack.var_stack_dn2 - good.mean()), 0.0)
+    rows, cols = stack.shape
+    scale_white = scale = 1.0
+    if weight is not None:
+        scale = float((weight**2).mean())
+        scale_white = float((good * weight[~mask] ** 2).mean() / good.mean()) if good.mean() > 0 else scale
+    n = stack.n_frames
+    line_row = cols * stack.ms_row_dn2 - stack.ms_pixel_dn2
+    line_col = rows * stack.ms_col_dn2 - stack.ms_pixel_dn2
+    return Strata(scale_white * white / n, (scale_white * white + scale * line_row) / n, (scale_white * white + scale * line_col) / n)
+
+
+def _mean_squares(
+    dark_stack: StackMoments, bright_stack: StackMoments, dark: np.ndarray, response: np.ndarray, mask: np.ndarray, surface: Surface
+) -> tuple[_MeanSquares, np.ndarray]:
+    """The twelve mean squares (dark map, response map, dark and bright temporal; pixel, row, column each) and their covariance."""
+    rows, cols = dark.shape
+    n_defects = int(mask.sum())
+    dof_map = np.array([(rows - 1) * (cols - 1) - n_defects, rows - 1, cols - 1], dtype=float)
+    dof_response = dof_map - [surface.n_mixed, surface.degree, surface.degree]
+    per_frame = np.array([(rows - 1) * (cols - 1), rows - 1, cols - 1], dtype=float)
+    own, other = cross_strata(dark, dark), cross_strata(response, response)
+    temporal_dark, temporal_bright = _temporal(dark_stack, mask), _temporal(bright_stack, mask, 1 / surface.values)
+    values = np.concatenate(
+        [_array(own) / dof_map, _array(other) / dof_response, _array(temporal_dark), _array(temporal_bright)],
+    )
+    dof = np.concatenate([dof_map, dof_response, per_frame * (dark_stack.n_frames - 1), per_frame * (bright_stack.n_frames - 1)])
+    kurtosis = np.zeros(12)
+    kurtosis[0], kurtosis[3] = _kurtosis(residual_parts(dark)[0], mask), _kurtosis(residual_parts(response)[0], mask)
+    squares = _MeanSquares(values, dof, kurtosis)
+    covariance = np.diag(values**2 * squares.relative_variances())
+    # the dark map enters the response too: Cov(MS_x, MS_y) = 2 c²/ν with c the covariance of x and y
+    shared = _array(cross_strata(dark, response)) / dof_response
+    for i in range(3):
+        covariance[i, 3 + i] = covariance[3 + i, i] = 2 * shared[i] ** 2 / dof_map[i]
+    return squares, covariance
+
+
+def _array(strata: Strata) -> np.ndarray:
+    return np.array([strata.pixel, strata.row, strata.col])
+
+
+def _kurtosis(residual: np.ndarray, mask: np.ndarray) -> float:
+    good = residual[~mask]
+    variance = float((good**2).mean())
+    return max(float((good**4).mean()) / variance**2 - 3.0, -1.5) if variance > 0 else 0.0
+
+
+def _components(squares: _MeanSquares, covariance: np.ndarray, shape: tuple[int, int], per_light2: float) -> Estimates:
+    rows, cols = shape
+    # rows of the matrix: pixel, row, column, total variance; columns: mean squares of pixels, rows, columns
+    split = np.array([[1.0, 0, 0], [-1 / cols, 1 / cols, 0], [-1 / rows, 0, 1 / rows]])
+    split = np.vstack([split, split.sum(axis=0)])
+    zero = np.zeros_like(split)
+    # the temporal noise of the dark map enters the response over the squared light
+    matrix = np.block([[split, zero, -split, zero], [zero, split, -split * per_light2, -split]])
+    variances, covariance_out = matrix @ squares.values, matrix @ covariance @ matrix.T
+    names = [f"dsnu_{part}_dn" for part in (*PARTS, "total")] + [f"prnu_{part}_rel" for part in (*PARTS, "total")]
+    lower, upper = _bounds(matrix, squares)
+    significant = lower > 0
+    values = np.sqrt(np.where(significant, np.maximum(variances, 0.0), upper))
+    slope = np.divide(0.5, values, out=np.zeros(8), where=values > 0)
+    own = np.diag(covariance_out)
+    terms = matrix**2 * np.diag(covariance)
+    dof = own**2 / np.maximum((terms**2 / (2 / squares.relative_variances())).sum(axis=1), 1e-300)  # Welch–Satterthwaite
+    limits = frozenset(n for n, s in zip(names, significant, strict=True) if not s)
+    return Estimates(
+        names=tuple(names),
+        values=values,
+        covariance=covariance_out * np.outer(slope, slope),
+        dof=np.maximum(dof, 1.0),
+        units=("DN",) * 4 + ("1",) * 4,
+        method=METHOD,
+        confounders=("illumination with structure finer than the fitted surface (PRNU)", "slow drift of the illumination between frames"),
+        limits=limits,
+        reasons={name: "not significantly above the temporal noise left in the mean map" for name in limits},
+    )
+
+
+def _bounds(matrix: np.ndarray, squares: _MeanSquares) -> tuple[np.ndarray, np.ndarray]:
+    """One-sided 95 % bounds of linear combinations of mean squares: modified large-sample method of Graybill & Wang (1980)."""
+    from scipy.stats import chi2
+
+    dof = 2 / squares.relative_variances()
+    above = (dof / chi2.ppf(0.05, dof) - 1) * squares.values  # how far the expectation may lie above the mean square
+    below = (1 - dof / chi2.ppf(0.95, dof)) * squares.values
+    positive, negative = np.maximum(matrix, 0.0), np.minimum(matrix, 0.0)
+    best = matrix @ squares.values
+    # a best estimate below zero is taken as zero, so that a lucky draw does not give a limit below what the data can tell
+    upper = np.maximum(best, 0.0) + np.sqrt((positive**2) @ above**2 + (negative**2) @ below**2)
+    lower = best - np.sqrt((positive**2) @ below**2 + (negative**2) @ above**2)
+    return lower, upper
+
+
+def _shading(surface: Surface, squares: _MeanSquares) -> Estimates:
+    """Gradient at the centre and peak-to-peak of the fitted illumination, relative to its mean."""
+    level = float(surface.values.mean())
+    coefficients = surface.coefficients / level
+    variances = surface.coefficient_variances(*squares.values[3:6])
+    rows, cols = surface.values.shape
+    middle_y, middle_x = _centre(surface.basis_y), _centre(surface.basis_x)
+    low, high = np.unravel_index(surface.values.argmin(), (rows, cols)), np.unravel_index(surface.values.argmax(), (rows, cols))
+    weights = {
+        "shading_x_per_px": np.outer(middle_y, surface.slopes_x),
+        "shading_y_per_px": np.outer(surface.slopes_y, middle_x),
+        "shading_pp_rel": np.outer(surface.basis_y[high[0]], surface.basis_x[high[1]])
+        - np.outer(surface.basis_y[low[0]], surface.basis_x[low[1]]),
+    }
+    w = np.array([v.ravel() for v in weights.values()])
+    covariance = (w * variances.ravel()) @ w.T
+    return Estimates(
+        names=tuple(weights),
+        values=w @ coefficients.ravel(),
+        covariance=covariance,
+        dof=np.array([squares.dof[5], squares.dof[4], min(squares.dof[4:6])]),
+        units=("1/px", "1/px", "1"),
+        method=f"least-squares polynomial of total degree {surface.degree} in bright − dark",
+        confounders=("slow non-uniformity of the sensor's response",),
+        reasons={"shading_pp_rel": "cannot be negative: without any shading it comes out at a few u"},
+    )
+
+
+def _centre(basis: np.ndarray) -> np.ndarray:
+    """Values of the basis at the centre of the grid: the mean of its two middle pixels (one pixel, if the number is odd)."""
+    n = basis.shape[0]
+    return 0.5 * (basis[(n - 1) // 2] + basis[n // 2])
+
+
+def emva_spatial(dark_stack: StackMoments, bright_stack: StackMoments) -> Estimates:
+    """The non-uniformity that EMVA 1288 defines, to be set beside :func:`fit_spatial`.
+
+    Returns
+    -------
+    Estimates
+        For dark and bright: ``s2_y``, ``s2_row``, ``s2_col``, ``s2_pixel`` in DN², which may come out negative; ``dsnu1288_dn`` and
+        ``prnu1288_rel``, a limit where the variance is negative.
+
+    Raises
+    ------
+    InputError
+        If the stacks differ in shape.
+    MeasureError
+        If the bright stack is not brighter.
+
+    Notes
+    -----
+    EMVA 1288 R4.0 eq. 33 to 42, 65 to 67, without the high-pass filter. Uncertainties from the chi-square sampling of pixels, rows and
+    columns, which the standard does not state.
+    """
+    if dark_stack.shape != bright_stack.shape:
+        raise InputError("dark and bright stack differ in shape", value=bright_stack.shape, allowed=str(dark_stack.shape))
+    light = bright_stack.mean_dn - dark_stack.mean_dn
+    if light <= 0:
+        raise MeasureError("the bright stack is not brighter than the dark one", value=light)
+    splits = {"dark": _emva_split(dark_stack), "bright": _emva_split(bright_stack)}
+    table = [
+        (f"s2_{part}_{tag}_dn2", value, u, dof, "DN²")
+        for tag, split in splits.items()
+        for part, (value, u, dof) in zip(("y", "row", "col", "pixel"), split, strict=True)
+    ]
+    dark, bright = splits["dark"][0], splits["bright"][0]
+    limits = {}
+    for name, square, u_square, dof, scale, unit in (
+        ("dsnu1288_dn", dark[0], dark[1], dark[2], 1.0, "DN"),
+        ("prnu1288_rel", bright[0] - dark[0], math.hypot(bright[1], dark[1]), bright[2], light, "1"),
+    ):
+        if square <= 0:
+            limits[name] = "variance is negative: the standard gives no value"
+        root = math.sqrt(square if square > 0 else 1.645 * u_square)
+        table.append((name, root / scale, u_square / (2 * root * scale) if root > 0 else 0.0, dof, unit))
+    return Estimates.from_rows(table, method="EMVA 1288 R4.0 eq. 33 to 42, 65 to 67", limits=frozenset(limits), reasons=limits)
+
+
+def _emva_split(stack: StackMoments) -> list[tuple[float, float, float]]:
+    """Value, u and degrees of freedom of s²_y, s²_row, s²_col and s²_pixel."""
+    m, n = stack.shape
+    image, left = stack.mean_map_dn, stack.var_stack_dn2 / stack.n_frames
+    measured = float(image.var())
+    s2_y = measured - left
+    cav = float(image.mean(axis=0).var()) - left / m
+    rav = float(image.mean(axis=1).var()) - left / n
+    d = m * n - m - n
+    row = ((m * n - n) * rav - m * (s2_y - cav)) / d
+    col = ((m * n - m) * cav - n * (s2_y - rav)) / d
+    pixel = m * n * (s2_y - cav - rav) / d
+    u_row = (rav + left / n) * math.sqrt(2 / (m - 1))
+    u_col = (cav + left / m) * math.sqrt(2 / (n - 1))
+    u_pixel = (pixel + left) * math.sqrt(2 / ((m - 1) * (n - 1)))
+    return [
+        (s2_y, math.hypot(u_row, u_col, u_pixel), m - 1.0),
+        (row, u_row, m - 1.0),
+        (col, u_col, n - 1.0),
+        (pixel, u_pixel, (m - 1.0) * (n - 1.0)),
+    ]
