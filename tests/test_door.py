@@ -162,15 +162,6 @@ def test_unknown_public_name_is_an_attribute_error() -> None:
         pixmetry.asess  # noqa: B018
 
 
-@pytest.mark.parametrize(
-    "before",
-    ["", "import pixmetry.assess; ", "from pixmetry.assess import assess; ", "from pixmetry import assess; import pixmetry.assess; "],
-)
-def test_assess_is_the_function_whatever_was_imported_first(before: str) -> None:
-    done = python(f"{before}import pixmetry; print(type(pixmetry.assess).__name__)")
-    assert done.stdout == "function\n", done.stderr
-
-
 def test_version_and_licence_are_stated_once_and_alike() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     citation = (ROOT / "CITATION.cff").read_text()

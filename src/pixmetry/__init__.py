@@ -6,9 +6,7 @@ itself costs next to nothing.
 
 from __future__ import annotations
 
-import sys
 from importlib import import_module
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
@@ -18,7 +16,7 @@ _HOMES = {
     "Estimates": "pixmetry.core.estimates",
     "PixmetryError": "pixmetry.core.errors",
     "Signal": "pixmetry.core.signal",
-    "assess": "pixmetry.assess",
+    "assess": "pixmetry.assessment",
     "catalogue": "pixmetry.core.catalogue",
     "load_camera": "pixmetry.core.camera",
     "load_campaign": "pixmetry.campaign",
@@ -27,7 +25,7 @@ _HOMES = {
 __all__ = ["Camera", "Estimates", "PixmetryError", "Signal", "__version__", "assess", "catalogue", "load_camera", "load_campaign"]
 
 if TYPE_CHECKING:
-    from pixmetry.assess import assess
+    from pixmetry.assessment import assess
     from pixmetry.campaign import load_campaign
     from pixmetry.core.camera import Camera, load_camera
     from pixmetry.core.catalogue import catalogue
@@ -46,17 +44,3 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return sorted({*globals(), *__all__})
-
-
-class _Package(ModuleType):
-    """Keeps ``pixmetry.assess`` the function after the module of the same name has been imported.
-
-    The import system binds a sub-module as an attribute of its package, which would hide a public name that is spelled alike.
-    """
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        if not (name in _HOMES and isinstance(value, ModuleType)):
-            super().__setattr__(name, value)
-
-
-sys.modules[__name__].__class__ = _Package

@@ -25,8 +25,10 @@ ALLOWED: dict[str, set[str]] = {
     "campaign": {"core"},
     "budget": {"core", "scene", "locate"},
 }
-ALLOWED["report"] = {*ALLOWED, "assess"}
-ALLOWED["assess"] = {*ALLOWED} - {"report"}
+ALLOWED["report"] = {*ALLOWED, "assessment"}  # for its types alone
+ALLOWED["assessment"] = {*ALLOWED}
+ALLOWED["simulation"] = {*ALLOWED} - {"report", "assessment", "budget"}
+ALLOWED["correction"] = ALLOWED["simulation"]
 ALLOWED["handbook"] = {*ALLOWED}
 ALLOWED["cli"] = {*ALLOWED}
 ALLOWED["__main__"] = {"cli"}

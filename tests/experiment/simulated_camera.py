@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from math import comb, erfc, exp, pi, sqrt
 
 import numpy as np
@@ -63,22 +64,20 @@ def central_moments(cumulants: np.ndarray) -> np.ndarray:
     return m
 
 
+@lru_cache(maxsize=1000)
 def stored_statistics(camera: Camera, light_dn: float, dark_e: float) -> tuple[float, float, float, float]:
-    """Exact mean above black, variance, third and fourth central moment of the unquantised stored value."""
+    """Mean above black and variance of the unquantised stored value, exact; third and fourth central moment to leading order."""
     k, electrons = camera.gain, light_dn / camera.gain + dark_e
-    x = k * electrons
-    cumulants = np.array([k**r * electrons for r in range(2, 17)])
+    x, ref = k * electrons, camera.x_ref
+    cumulants = np.array([k**r * electrons for r in range(2, 9)])
     cumulants[0] += (k * camera.dark_noise_e) ** 2
     mu = central_moments(cumulants)
-    f = np.poly1d([camera.a[2] / camera.x_ref**3, camera.a[1] / camera.x_ref**2, camera.a[0] / camera.x_ref, 1, 0])
-    g = f(np.poly1d([1.0, x])) - f(x)
-
-    def expect(poly):
-        return float(sum(c * mu[i] for i, c in enumerate(poly.c[::-1])))
-
-    shift = expect(g)
-    h = g - shift
-    return f(x) + shift, expect(h**2), expect(h**3), expect(h**4)
+    a = np.array(camera.a) / ref ** np.arange(1, 4)
+    powers = [1.0, *a]  # f = Σ powers[n−1] xⁿ; its Taylor coefficients about x
+    c = [sum(powers[n - 1] * comb(n, i) * x ** (n - i) for n in range(max(i, 1), 5)) for i in range(5)]
+    shift = sum(c[i] * mu[i] for i in range(2, 5))
+    square = sum(c[i] * c[j] * mu[i + j] for i in range(1, 5) for j in range(1, 5))
+    return c[0] + shift, square - shift**2, c[1] ** 3 * mu[3], c[1] ** 4 * mu[4]
 
 
 def clipped_normal(c: float) -> tuple[float, float, float]:
@@ -153,8 +152,8 @@ def truth(camera: Camera) -> dict[str, float]:
     }
 
 
-def random_camera(rng) -> Camera:
-    """A camera from the range that the estimator is meant for."""
+def random_camera(rng, **fixed) -> Camera:
+    """A camera from the range that the estimator is meant for; ``fixed`` fields as given."""
     while True:
         gain, noise = 10 ** rng.uniform(-2, np.log10(5)), 10 ** rng.uniform(np.log10(2), 2)
         bits = int(rng.integers(8, 15))
@@ -166,7 +165,7 @@ def random_camera(rng) -> Camera:
     exposure = 10 ** rng.uniform(-3, 0)
     shape = [(48, 64), (120, 160), (240, 320), (480, 640)][rng.integers(4)]
     row = noise * rng.uniform(0, 0.5) * (rng.random() < 0.8)
-    return Camera(
+    drawn = Camera(
         gain=gain,
         dark_noise_e=noise,
         row_noise_e=row,
@@ -181,3 +180,88 @@ def random_camera(rng) -> Camera:
         lamp=rng.choice([0.0, 1.0]) * rng.uniform(0.0002, 0.002),
         wander_dn=rng.choice([0.0, 1.0]) * 0.02 * sigma,
     )
+    return replace(drawn, **fixed)
+
+
+def reference_u(camera: Camera) -> dict[str, float]:
+    """Cramér-Rao bound of means and mean squares with all weights known, by finite differences of the exact moments.
+
+    Written on the raw pair (mean, mean square) of a level with the common lamp noise in both, not on residuals as the fit does.
+    Free: offset, light at zero exposure, slope, gain, dark noise, three coefficients, dark signal and dark variance per exposure.
+    """
+    rows, cols = camera.shape
+    n, frames = rows * cols, 2
+    row, col = (camera.gain * camera.row_noise_e) ** 2, (camera.gain * camera.column_noise_e) ** 2
+    dark_dn = camera.gain * camera.dark_current_e_per_s * camera.exposure_s
+    start = np.array([camera.offset_dn, 0.0, 1.0, camera.gain, camera.dark_noise_e, *camera.a, dark_dn, 0.0])
+    step = np.array([1e-2, 1e-5, 1e-5, camera.gain * 1e-4, camera.dark_noise_e * 1e-4, 1e-4, 1e-4, 1e-4, 1e-2, 1e-2])
+
+    def moments(p, t, bright):
+        c = replace(camera, gain=p[3], dark_noise_e=p[4], a=tuple(p[5:8]))
+        share = t / camera.exposure_s
+        light = p[2] * camera.rate_dn_per_s * (t + p[1] * camera.exposure_s) if bright else 0.0
+        mean, var, m3, m4 = stored_statistics(c, light + p[8] * share, 0.0)
+        return np.array([p[0] + mean, var + p[9] * share + 1 / 12]), m3, m4
+
+    information = np.diag([0, 1 / 0.05**2, 0, 0, 0, 100.0, 100.0, 100.0, 0, 0])  # the weak priors of the fit
+    for t in camera.times:
+        for bright in (True, False):
+            (mean, var), m3, m4 = moments(start, t, bright)
+            spread = sqrt(var + row + col)
+            if bright and 0.5 * erfc((camera.x_ref - mean) / sqrt(2) / spread) > 2e-5:
+                continue
+            jac = np.array([(moments(start + h, t, bright)[0] - moments(start - h, t, bright)[0]) for h in np.diag(step)]).T / (2 * step)
+            lamp = camera.lamp * jac[:, 2] if bright else np.zeros(2)
+            cov = np.diag([(var / n + row / rows + col / cols) / frames + camera.wander_dn**2, var**2 * (1 + 0.5 * (m4 / var**2 - 1)) / n])
+            cov[0, 1] = cov[1, 0] = m3 / (frames * n)
+            information += jac.T @ np.linalg.inv(cov + np.outer(lamp, lamp)) @ jac
+    scale = 1 / np.sqrt(np.diag(information))
+    u = scale * np.sqrt(np.diag(np.linalg.inv(information * np.outer(scale, scale))))
+    names = ("gain_dn_per_e", "dark_noise_e", "nonlinearity_a1", "nonlinearity_a2", "nonlinearity_a3")
+    return dict(zip(names, u[3:8], strict=True)) | {"responsivity_dn_per_s": u[2] * camera.rate_dn_per_s, "offset_dn": u[0]}
+
+
+def frame_moments(frames: np.ndarray, top: float) -> dict[str, float]:
+    """Mean squares of two frames, from the definition of the two-way analysis of variance."""
+    d = (frames[0] - frames[1]) / sqrt(2)
+    rows, cols = d.shape
+    by_row, by_col, all_mean = d.mean(axis=1, keepdims=True), d.mean(axis=0, keepdims=True), d.mean()
+    white = d - by_row - by_col + all_mean
+    return {
+        "n_frames": 2,
+        "mean_dn": frames.mean(),
+        "var_total_dn2": d.var(),
+        "ms_pixel_dn2": (white**2).sum() / ((rows - 1) * (cols - 1)),
+        "ms_row_dn2": ((by_row - all_mean) ** 2).sum() / (rows - 1),
+        "ms_col_dn2": ((by_col - all_mean) ** 2).sum() / (cols - 1),
+        "ms_frame_dn2": all_mean**2,
+        "kurtosis_excess": ((d - all_mean) ** 4).mean() / d.var() ** 2 - 3 if d.var() else np.nan,
+        "fraction_min": (frames <= 0).mean(),
+        "fraction_max": (frames >= top).mean(),
+        "spatial_cov_dn2": (frames[0] * frames[1]).mean() - frames[0].mean() * frames[1].mean(),
+    }
+
+
+def framed_record(camera: Camera, rng, shading: float = 0.0) -> PhotonTransfer:
+    """A record from real frames: Poisson electrons, fixed patterns, row noise, non-linearity, rounding; the lamp flickers by frame."""
+    rows, cols = camera.shape
+    y, x = np.mgrid[-1 : 1 : rows * 1j, -1 : 1 : cols * 1j]
+    fall = 1 - shading * (x**2 + y**2 + x**2 * y**2)
+    light_map = fall / fall.mean() * (1 + camera.prnu * rng.standard_normal(camera.shape))
+    light_map /= light_map.mean()
+    offset_map = camera.dsnu_dn * rng.standard_normal(camera.shape)
+    offset_map -= offset_map.mean()
+
+    def frame(t, rate):
+        light_e = rate * t * (1 + camera.lamp * rng.standard_normal()) / camera.gain
+        electrons = rng.poisson(light_e * light_map + camera.dark_current_e_per_s * t)
+        signal = camera.gain * (electrons + camera.dark_noise_e * rng.standard_normal(camera.shape))
+        lines = camera.row_noise_e * rng.standard_normal((rows, 1)) + camera.column_noise_e * rng.standard_normal((1, cols))
+        stored = camera.offset_dn + offset_map + camera.curve(signal) + camera.gain * lines
+        return np.clip(np.rint(stored), 0, camera.x_ref)
+
+    def levels(rate):
+        out = [{"exposure_s": t} | frame_moments(np.array([frame(t, rate), frame(t, rate)]), camera.x_ref) for t in camera.times]
+        return LevelMoments(photons=None, **{k: np.array([level[k] for level in out], float) for k in out[0]})
+
+    return PhotonTransfer(levels(camera.rate_dn_per_s), levels(0.0), camera.shape, camera.bits)

@@ -5,7 +5,8 @@ A module of a stage makes one ``Source`` record named ``SOURCE``; the catalogue 
 * ``forward(params, signal, stream)`` returns the next ``Signal``; a source with a memory has ``forward(params, signal, stream, state)``
   and returns ``(signal, state)``;
 * ``measure(observations)`` returns ``Estimates`` named like the parameters (a subset of them), or raises ``MeasureError``;
-* ``correct(params, signal)`` returns the signal with less of the effect;
+* ``correct(params, signal, maps)`` returns the signal with less of the effect; ``maps`` holds what was measured pixel by pixel in this
+  unit (``dark_dn``, ``prnu_rel``, ``defects``), whole frames by name, and may be empty;
 * ``propagate(params, probe)`` returns the ``Contribution`` to a target's position.
 
 A verb that cannot exist is given as a sentence in ``reasons`` instead.
@@ -17,9 +18,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 from pixmetry.core.config import Model
 from pixmetry.core.contribution import Contribution, Probe
-from pixmetry.core.errors import ParameterError
+from pixmetry.core.errors import InputError, ParameterError
 from pixmetry.core.estimates import Estimates
 from pixmetry.core.observations import Observations
 from pixmetry.core.random import Stream
@@ -109,7 +112,7 @@ class Source:
     neutral: Parameters | None = None
     forward: Callable[..., Any] | None = None
     measure: Callable[[Observations], Estimates] | None = None
-    correct: Callable[[Any, Signal], Signal] | None = None
+    correct: Callable[[Any, Signal, Mapping[str, np.ndarray]], Signal] | None = None
     propagate: Callable[[Any, Probe], Contribution] | None = None
     context: Callable[[Any, Windows, tuple[int, int]], Windows] | None = None
     near: Callable[[Any], tuple[int, int, int, int]] | None = None
@@ -165,3 +168,27 @@ def run(source: Source, params: Any, signal: Signal, stream: Stream, state: Any 
     if source.start is None:
         return source.forward(params, signal, stream), None
     return source.forward(params, signal, stream, source.start(params) if state is None else state)
+
+
+def cut_map(maps: Mapping[str, np.ndarray], name: str, signal: Signal) -> np.ndarray:
+    """Cut a measured whole-frame map to the windows of a signal, shape (n, rows, cols); ``InputError`` if it is missing or too small."""
+    if name not in maps:
+        raise InputError(
+            f"the correction needs the map {name!r}", allowed=", ".join(maps) or "none was given", remedy="assess the camera first"
+        )
+    if maps[name].shape != tuple(signal.frame_shape):
+        raise InputError(
+            f"the map {name!r} is of another frame size",
+            value=maps[name].shape,
+            allowed=str(signal.frame_shape),
+            remedy="use maps of this camera",
+        )
+    return maps[name][signal.rows[:, :, None], signal.cols[:, None, :]]
+
+
+def bounds_text(field: Any) -> str:
+    """Write a parameter's allowed range for people, e.g. ``0 to 0.3``; ``field`` is the model's field."""
+    limits = {name: getattr(m, name) for m in field.metadata for name in ("ge", "gt", "le", "lt") if getattr(m, name, None) is not None}
+    low = f"{limits['ge']:g}" if "ge" in limits else f"above {limits['gt']:g}" if "gt" in limits else ""
+    high = f"{limits['le']:g}" if "le" in limits else f"below {limits['lt']:g}" if "lt" in limits else ""
+    return f"{low} to {high}" if low and high else low and f"{low} or more" or high and f"{high} or less" or "any"

@@ -34,12 +34,13 @@ from pixmetry.experiment.photon_transfer_solve import Solution, fit_range
 __all__ = ["fit_emva_linear", "fit_photon_transfer"]
 
 SATURATED_FRACTION = 0.002  # EMVA 1288 R4.0 §6.6: saturation is the highest level with at most 0.2 % of the pixels at the top code
+ALL_SATURATED = 0.999  # then the mean is the top code that the camera stores, which may lie below 2**bits − 1
 NOT_SIGNIFICANT = 3.0  # a variance below this many u is given as a limit
 ONE_SIDED_95 = 1.6448536
 ROW_VAR, COL_VAR, SATURATION, LAMP_VAR, DARK_LIMIT = range(12, 17)
 METHOD = (
-    "joint photon-transfer fit: Poisson electrons, gain and noise before a cubic non-linearity; iterated generalised least squares on level "
-    "means and white mean squares, wander and lamp noise by REML, dof by Satterthwaite (EMVA 1288 R4.0 §6-7 for the quantities)"
+    "joint photon-transfer fit: Poisson electrons, gain and noise before a cubic non-linearity; iterated generalised least squares on "
+    "level means and white mean squares, wander and lamp noise by REML, dof by Satterthwaite (EMVA 1288 R4.0 §6-7 for the quantities)"
 )
 CONFOUNDERS = (
     "gain: charge shared between neighbouring pixels and any filter in the camera lower the variance and so the gain",
@@ -116,7 +117,9 @@ class _Rows:
         if limit:
             self.limits.add(name)
 
-    def add_root(self, name: str, unit: str, square: float, index: int, gain: float | None, what: str, reason: str = "", dof: float = 1e6) -> None:
+    def add_root(
+        self, name: str, unit: str, square: float, index: int, gain: float | None, what: str, reason: str = "", dof: float = 1e6
+    ) -> None:
         """A standard deviation from its square (parameter ``index``), in electrons if a gain is given; a limit if not significant."""
         u2 = float(np.sqrt(self.covariance[index, index]))
         limit = square < NOT_SIGNIFICANT * u2
@@ -127,7 +130,8 @@ class _Rows:
         if gain:
             gradient[GAIN] = -root / k**2
         if limit:
-            reason = f"{what} is not significant: its square is {square:.3g} with a standard uncertainty of {u2:.3g}; 95 % upper limit. {reason}".strip()
+            found = f"its square is {square:.3g} with a standard uncertainty of {u2:.3g}"
+            reason = f"{what} is not significant: {found}; 95 % upper limit. {reason}".strip()
         self.add(name, root / k, unit, gradient, reason, limit)
 
 
@@ -136,10 +140,9 @@ def _augmented(pt: PhotonTransfer, s: Solution) -> tuple[np.ndarray, np.ndarray]
     n = s.p.size
     values, cov = np.zeros(n + 5), np.zeros((n + 5, n + 5))
     values[:n], cov[:n, :n] = s.p, s.covariance
-    if pt.dark.mean_dn.size:
-        line, line_var = temporal_row_col_vars(pt.dark, pt.frame_shape)
-        values[ROW_VAR : COL_VAR + 1] = line
-        cov[ROW_VAR, ROW_VAR], cov[COL_VAR, COL_VAR] = line_var
+    line, line_var = temporal_row_col_vars(pt.dark, pt.frame_shape)
+    values[ROW_VAR : COL_VAR + 1] = line
+    cov[ROW_VAR, ROW_VAR], cov[COL_VAR, COL_VAR] = line_var
     values[LAMP_VAR], cov[LAMP_VAR, LAMP_VAR] = s.components[1], s.components_cov[1, 1]
     return values, cov
 
@@ -166,41 +169,25 @@ def _limit_factor(dof: float) -> float:
     return float(np.sqrt(dof / 2) * (dof / chi2 - 1))
 
 
-def _estimates(pt, s: Solution, d: model.Levels, light_scale: float, time_scale: float, by_exposure: bool, clipped_black: float) -> Estimates:
+def _estimates(pt: PhotonTransfer, s: Solution, d: model.Levels, axes: _Axes) -> Estimates:
     p = s.p
     values, cov = _augmented(pt, s)
     lamp_dof = float(max(d.bright.sum() - s.free[[SLOPE, A1, A1 + 1, A3, LIGHT_OFFSET]].sum(), 1))
-    saturation = _saturation(pt, s, d, light_scale, by_exposure)
+    saturation = _saturation(pt, s, d, axes)
     if saturation:
-        values[SATURATION], cov[SATURATION, SATURATION] = saturation[0], saturation[1] ** 2
+        cov[SATURATION, SATURATION] = saturation[1] ** 2
     rows = _Rows(cov)
-    gain = p[GAIN]
     extra = np.sqrt(s.components[2])
     wide = f"the variances scatter by {100 * extra:.2g} % beyond their sampling law; u is widened by that" if extra > 0 else ""
-    rows.add("gain_dn_per_e", gain, "DN/e-", {GAIN: 1.0}, wide)
-    _add_dark_noise(rows, s, d, clipped_black)
-    if pt.dark.mean_dn.size:
-        rows.add_root("row_noise_e", "e-", values[ROW_VAR], ROW_VAR, gain, "temporal row noise")
-        rows.add_root("column_noise_e", "e-", values[COL_VAR], COL_VAR, gain, "temporal column noise")
-    resolved = bool(s.free[DARK_SLOPE])
-    rows.add("offset_dn", p[OFFSET], "DN", {OFFSET: 1.0}, "" if resolved else "contains the dark signal: the dark frames have about one exposure time")
-    if resolved:
-        _add_dark_current(rows, p, time_scale)
+    rows.add("gain_dn_per_e", p[GAIN], "DN/e-", {GAIN: 1.0}, wide)
+    _add_temporal_noise(rows, s, d, values, clipped_black(pt))
+    one_time = "" if s.free[DARK_SLOPE] else "contains the dark signal: the dark frames have about one exposure time"
+    rows.add("offset_dn", p[OFFSET], "DN", {OFFSET: 1.0}, one_time)
+    if s.free[DARK_SLOPE]:
+        _add_dark_current(rows, p, axes.time_s)
     for k in range(3):
-        if s.free[A1 + k]:
-            rows.add(f"nonlinearity_a{k + 1}", p[A1 + k], "1", {A1 + k: 1.0})
-    if by_exposure:
-        rows.add("responsivity_dn_per_s", p[SLOPE] / light_scale, "DN/s", {SLOPE: 1 / light_scale})
-    if pt.bright.photons is not None:
-        light = pt.bright.exposure_s if by_exposure else pt.bright.photons
-        photons = light_scale * pt.bright.photons.sum() / light.sum()  # per unit of scaled light
-        rows.add(
-            "quantum_efficiency",
-            p[SLOPE] / (gain * photons),
-            "1",
-            {SLOPE: 1 / (gain * photons), GAIN: -p[SLOPE] / (gain**2 * photons)},
-            "u leaves out the calibration of the photon count",
-        )
+        rows.add(f"nonlinearity_a{k + 1}", p[A1 + k], "1", {A1 + k: 1.0})
+    _add_sensitivity(rows, pt, p, axes)
     rows.add_root("illumination_noise_rel", "1", s.components[1], LAMP_VAR, None, "noise of the light from level to level", dof=lamp_dof)
     if saturation:
         _add_saturation(rows, p, saturation, d.x_ref)
@@ -218,22 +205,45 @@ def _estimates(pt, s: Solution, d: model.Levels, light_scale: float, time_scale:
     )
 
 
-def _add_dark_noise(rows: _Rows, s: Solution, d: model.Levels, clipped_black: float) -> None:
-    """Dark noise, or the bound of EMVA 1288 R4.0 eq. 54 where quantisation hides it."""
-    gain, square = s.p[GAIN], s.p[DARK_VAR]
+def _add_sensitivity(rows: _Rows, pt: PhotonTransfer, p: np.ndarray, axes: _Axes) -> None:
+    """Initial slope of the signal against exposure time, and electrons per photon."""
+    if axes.by_exposure:
+        rows.add("responsivity_dn_per_s", p[SLOPE] / axes.light, "DN/s", {SLOPE: 1 / axes.light})
+    if pt.bright.photons is None:
+        return
+    known = np.isfinite(pt.bright.photons)
+    light = pt.bright.exposure_s if axes.by_exposure else pt.bright.photons
+    photons = axes.light * pt.bright.photons[known].sum() / light[known].sum()  # at a scaled light of one
+    value = p[SLOPE] / (p[GAIN] * photons)
+    gradient = {SLOPE: value / p[SLOPE], GAIN: -value / p[GAIN]}
+    rows.add("quantum_efficiency", value, "1", gradient, "u leaves out the calibration of the photon count")
+
+
+def _add_temporal_noise(rows: _Rows, s: Solution, d: model.Levels, values: np.ndarray, clipped: float) -> None:
+    """White, row and column noise, or the bound of EMVA 1288 R4.0 eq. 54 where quantisation hides them."""
+    gain = s.p[GAIN]
     dark = ~d.bright
-    if dark.any() and d.ms[dark].mean() < MINIMUM_DARK_VAR_DN2:
+    if dark.any() and d.ms[dark].mean() < model.MINIMUM_DARK_VAR_DN2:
         bound = 0.40 / gain
         rows.covariance[DARK_LIMIT, DARK_LIMIT] = bound**2 / 12
-        reason = f"the dark variance is below {MINIMUM_DARK_VAR_DN2} DN², where rounding hides it: bound 0.40/K (EMVA 1288 R4.0 eq. 54); u is of an even spread below"
-        rows.add("dark_noise_e", bound, "e-", {DARK_LIMIT: 1.0}, reason, limit=True)
+        reason = (
+            f"the dark variance is below {model.MINIMUM_DARK_VAR_DN2} DN², where rounding hides it: "
+            "bound 0.40/K (EMVA 1288 R4.0 eq. 54); u is that of an even spread below it"
+        )
+        for name in ("dark_noise_e", "row_noise_e", "column_noise_e"):
+            rows.add(name, bound, "e-", {DARK_LIMIT: 1.0}, reason, limit=True)
         return
     reason = ""
-    if clipped_black > CLIPPED_BLACK_FRACTION:
-        reason = f"{100 * clipped_black:.2g} % of the dark pixels are clipped at black: taken from the bright levels, extrapolated to zero light; raise the black level"
+    if clipped > CLIPPED_BLACK_FRACTION:
+        reason = (
+            f"{100 * clipped:.2g} % of the dark pixels are clipped at black: "
+            "taken from the levels that are not, extrapolated to zero light; raise the black level"
+        )
     elif not s.free[DARK_VAR_SLOPE]:
         reason = "contains the shot noise of the dark current at the exposure of the dark frames"
-    rows.add_root("dark_noise_e", "e-", square, DARK_VAR, gain, "dark noise", reason)
+    rows.add_root("dark_noise_e", "e-", values[DARK_VAR], DARK_VAR, gain, "dark noise", reason)
+    rows.add_root("row_noise_e", "e-", values[ROW_VAR], ROW_VAR, gain, "temporal row noise")
+    rows.add_root("column_noise_e", "e-", values[COL_VAR], COL_VAR, gain, "temporal column noise")
 
 
 def _add_dark_current(rows: _Rows, p: np.ndarray, time_scale: float) -> None:
@@ -250,7 +260,7 @@ def _add_dark_current(rows: _Rows, p: np.ndarray, time_scale: float) -> None:
 
     difference = {k: mean_row.get(k, 0.0) - var_row.get(k, 0.0) for k in {*mean_row, *var_row}}
     value, row, reason = from_mean, mean_row, ""
-    if abs(from_mean - from_var) > 3.5 * u_of(difference):
+    if abs(from_mean - from_var) > 4.5 * u_of(difference):
         value, row = from_var, var_row
         reason = f"from the dark variance: the mean ({from_mean:.4g} e-/s) contradicts it, so the black level is clamped or drifts"
     u = u_of(row)
@@ -261,16 +271,17 @@ def _add_dark_current(rows: _Rows, p: np.ndarray, time_scale: float) -> None:
     rows.add("dark_current_e_per_s", value, "e-/s", row, reason, limit)
 
 
-def _saturation(pt: PhotonTransfer, s: Solution, d: model.Levels, light_scale: float, by_exposure: bool) -> tuple[float, float, str] | None:
+def _saturation(pt: PhotonTransfer, s: Solution, d: model.Levels, axes: _Axes) -> tuple[float, float, str] | None:
     """Stored value of saturation, its standard uncertainty and what sets it; ``None`` where no level is saturated.
 
     Either the converter clips, or the brightest two levels stand still, less than a tenth of the growth that their light would give.
     """
     b = pt.bright
     if b.fraction_max.max() - pt.dark.fraction_max.max(initial=0.0) > SATURATED_FRACTION:
-        full = b.fraction_max > 0.5
+        full = b.fraction_max > ALL_SATURATED
         return (float(b.mean_dn[full].max()) if full.any() else d.x_ref), float(np.sqrt(model.QUANTISATION_DN2)), "converter"
-    light = (b.exposure_s if by_exposure else b.photons) / light_scale
+    light = b.exposure_s if b.photons is None or axes.by_exposure else b.photons
+    light = light / axes.light
     second, first = np.argsort(light, kind="stable")[-2:]
     growth, expected = abs(b.mean_dn[first] - b.mean_dn[second]), (light[first] - light[second]) * s.p[SLOPE]
     beyond = b.mean_dn[second] > d.mean[d.bright].max() and growth < 0.1 * expected
@@ -286,7 +297,8 @@ def _add_saturation(rows: _Rows, p: np.ndarray, saturation: tuple[float, float, 
     rows.add("saturation_dn", y, "DN", {SATURATION: 1.0}, f"set by the {cause}")
     gradient = {SATURATION: 1 / (slope * gain), OFFSET: -1 / (slope * gain), GAIN: -x / gain**2}
     gradient |= {A1 + k: -x * (x / x_ref) ** (k + 1) / (slope * gain) for k in range(3)}
-    note = "lower bound of the pixel's full well: the converter clips first" if cause == "converter" else "the pixels saturate below the converter's top code"
+    clips = cause == "converter"
+    note = "lower bound of the pixel's full well: the converter clips first" if clips else "the pixels saturate below the top code"
     rows.add("full_well_e", x / gain, "e-", gradient, note)
 
 

@@ -154,7 +154,10 @@ def prior_precision(pt: PhotonTransfer, d: model.Levels) -> np.ndarray:
     out[model.A1 : model.A3 + 1] = 1 / NONLINEARITY_PRIOR**2
     out[model.LIGHT_OFFSET] = 1 / LIGHT_OFFSET_PRIOR**2
     dark_var = float(d.ms[~d.bright].mean())
-    q_mean, q_var = model.rounding_error_vars(np.array(dark_var - model.QUANTISATION_DN2 + d.spatial[~d.bright].mean()))
+    spread = float(d.spatial[~d.bright].mean())
+    least = model.least_var_before_rounding(dark_var, spread)
+    q_mean, q_var = model.rounding_error_vars(np.array(least + spread))
+    q_var = q_var + (dark_var - model.QUANTISATION_DN2 - least) ** 2 / 3
     p = min(clipped_black(pt), CLIPPED_BLACK_FRACTION)
     out[model.Q_MEAN] = 1 / (q_mean + p**2 * dark_var + 1e-12)
     out[model.Q_VAR] = 1 / (q_var + (2 * p * dark_var) ** 2 + 1e-12)

@@ -149,6 +149,13 @@ def _inverse(info: np.ndarray) -> np.ndarray:
     return np.linalg.pinv(info * np.outer(scale, scale), rcond=1e-9, hermitian=True) * np.outer(scale, scale)
 
 
+def _damping(s: Solution, shift: np.ndarray) -> float:
+    """Share of a step that keeps the gain within a factor of two and the non-linearity within what the expansion carries."""
+    change = np.zeros(s.p.size)
+    change[s.free] = np.abs(shift)
+    return float(min(1.0, 0.5 * s.p[GAIN] / max(change[GAIN], 1e-300), 0.2 / max(change[A1 : A3 + 1].max(), 1e-300)))
+
+
 def _solve(d: model.Levels, prior: np.ndarray, start: np.ndarray | None = None, excess: bool = False) -> Solution:
     """Iterate parameters and variance components together until both stand still."""
     free = _free_parameters(d)
@@ -157,8 +164,7 @@ def _solve(d: model.Levels, prior: np.ndarray, start: np.ndarray | None = None, 
     s = Solution(np.where(free, p if start is None else start, 0.0), free, components, np.array([True, True, excess]))
     for iteration in range(25):
         step = _step(d, s, prior)
-        s.p[free] += step.shift
-        s.p[GAIN] = max(s.p[GAIN], 1e-6)
+        s.p[free] += step.shift * _damping(s, step.shift)
         sigma = np.sqrt(np.diag(step.normal_inv))
         score, info = _reml(step, s, prior)
         new = _update_components(s, score, info) if iteration else s.components
@@ -208,7 +214,8 @@ def fit_range(levels: model.Levels, keep: np.ndarray, prior: np.ndarray) -> tupl
         if s.chi2 < _chi2_limit(s.chi2_dof):
             return s, trial
         bright = np.flatnonzero(trial & levels.bright)
-        if bright.size <= MINIMUM_LEVELS or s.top_z > -LACK_OF_FIT_Z:
+        knee = s.top_z < -LACK_OF_FIT_Z and s.top_z**2 > 0.1 * (s.chi2 - s.chi2_dof)  # not one of many that scatter
+        if bright.size <= MINIMUM_LEVELS or not knee:
             break
         trial[bright[np.argmax(levels.light[bright])]] = False
         start = s.p

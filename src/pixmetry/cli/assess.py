@@ -1,0 +1,64 @@
+"""``pixmetry assess``: the main job."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+if TYPE_CHECKING:
+    from pixmetry.assessment import Assessment
+
+
+@click.command()
+@click.argument("campaign", required=False, type=click.Path(path_type=Path))
+@click.option(
+    "-o", "--output", type=click.Path(path_type=Path), default=Path("pixmetry-report"), show_default=True, help="Folder for the results."
+)
+@click.option("--target", default="", help="Target, e.g. disc:diameter=7,blur=0.7,peak=0.6")
+@click.option("--estimator", default="", help="Estimator, e.g. soft_threshold:sigma=3,window=13")
+@click.option("--trials", type=click.IntRange(200, 10_000_000), default=4000, show_default=True, help="Windows for each Monte Carlo.")
+@click.option("--seed", type=click.IntRange(0), default=1, show_default=True, help="Of the Monte Carlo.")
+@click.option("--threads", type=click.IntRange(1), help="Default: all processors.")
+def assess(campaign: Path | None, output: Path, target: str, estimator: str, trials: int, seed: int, threads: int | None) -> None:
+    """Assess a camera from its frames: measure, budget, advise, and write the report.
+
+    CAMPAIGN is a manifest (YAML), an EMVA 1288 descriptor file, or a folder that holds one of them; without it, the packaged example
+    (a crop of a real CCD camera's data set) is assessed. The folder of results gets report.html, results.json, maps.zarr.zip and
+    camera.yaml, the camera's digital twin for `pixmetry simulate`.
+    """
+    from pixmetry.assessment import assess as run
+    from pixmetry.cli._progress import shown_progress
+    from pixmetry.core.threads import set_threads
+
+    set_threads(threads)
+    with shown_progress() as progress:
+        assessment = run(campaign, output, target=target, estimator=estimator, trials=trials, seed=seed, progress=progress)
+    print_summary(assessment)
+    click.echo(f"report: {output / 'report.html'}")
+
+
+def print_summary(assessment: Assessment) -> None:
+    """Print the verdict and the largest contributions."""
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console(width=110, highlight=False)
+    console.print(f"\n[bold]{assessment.campaign.camera.name}[/bold]: {assessment.budget.verdict_text()}")
+    table = Table(title="Largest contributions to one target's position in one frame (k = 1)", title_justify="left")
+    for name, justify in (
+        ("source", "left"),
+        ("status", "left"),
+        ("class", "left"),
+        ("u x / px", "right"),
+        ("u y / px", "right"),
+        ("bias / px", "right"),
+    ):
+        table.add_column(name, justify=justify)
+    for row in assessment.budget.largest(8):
+        bias = max(abs(row.bias_x_px), abs(row.bias_y_px))
+        table.add_row(row.title, row.status, row.gum_class, f"{row.u_x_px:.5f}", f"{row.u_y_px:.5f}", f"{bias:.5f}")
+    console.print(table)
+    for note in assessment.observations.notes:
+        console.print(f"note: {note}")

@@ -1,0 +1,30 @@
+"""``pixmetry correct``: take out of frames what was measured."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+
+@click.command()
+@click.argument("frames", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option("--with", "results", type=click.Path(path_type=Path), required=True, help="The results.json of an assessment of this camera.")
+@click.option("-o", "--output", type=click.Path(path_type=Path), required=True, help="Folder for the corrected frames.")
+@click.option("--threads", type=click.IntRange(1), help="Default: all processors.")
+def correct(frames: tuple[Path, ...], results: Path, output: Path, threads: int | None) -> None:
+    """Take out of frames what was measured in an assessment.
+
+    FRAMES are image files, or folders of them. Dark signal, non-linearity, relative response and defects are corrected, in this order,
+    as far as the assessment measured them; what could not be corrected is listed with the reason.
+    """
+    from pixmetry.cli._progress import shown_progress
+    from pixmetry.core.threads import set_threads
+    from pixmetry.correction import correct_files
+
+    set_threads(threads)
+    with shown_progress() as progress:
+        summary = correct_files(frames, results, output, progress=progress)
+    for line in summary:
+        click.echo(line)
+    click.echo(f"corrected frames: {output}")

@@ -1,0 +1,92 @@
+"""``pixmetry sources``: the catalogue."""
+
+from __future__ import annotations
+
+import json
+
+import click
+
+
+@click.command()
+@click.argument("source_id", metavar="[ID]", required=False)
+@click.option("--json", "as_json", is_flag=True, help="For programs.")
+def sources(source_id: str | None, as_json: bool) -> None:
+    """List the error sources, or explain one of them.
+
+    Without ID: every source with its stage, the handbook's stars and note, and which of the verbs forward, measure, correct and
+    propagate it has. With ID: equation, parameters with units and ranges, sources and typical size.
+    """
+    from pixmetry.core.catalogue import catalogue, get_source, to_record
+
+    if source_id is None:
+        records = [to_record(s) for s in catalogue().values()]
+        click.echo(json.dumps(records, indent=2, ensure_ascii=False)) if as_json else _list(records)
+    else:
+        source = get_source(source_id)
+        record = to_record(source) | _details(source)
+        click.echo(json.dumps(record, indent=2, ensure_ascii=False)) if as_json else _explain(record)
+
+
+def _details(source) -> dict:
+    from pixmetry.core.source import bounds_text
+
+    return {
+        "description": source.description,
+        "equation": source.equation,
+        "parameters": [
+            {
+                "name": name,
+                "unit": source.units[name],
+                "range": bounds_text(field),
+                "typical": getattr(source.typical, name),
+                "bound": getattr(source.bound, name),
+                "description": field.description or "",
+            }
+            for name, field in source.parameters.model_fields.items()
+        ],
+        "typical_size": source.typical_size,
+        "advice": source.advice,
+        "references": list(source.references),
+    }
+
+
+def _list(records: list[dict]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title="Error sources, in the order of the light", title_justify="left")
+    for name in ("id", "title", "stars", "note", "forward", "measure", "correct", "propagate"):
+        table.add_column(name, justify="center" if name in ("forward", "measure", "correct", "propagate") else "left", no_wrap=name == "id")
+    for r in records:
+        verbs = ["yes" if r["verbs"][v] else "–" for v in ("forward", "measure", "correct", "propagate")]
+        table.add_row(r["id"], r["title"], "★" * r["stars"], r["note"], *verbs)
+    console = Console(highlight=False)
+    console.print(table)
+    console.print("A dash has a reason: `pixmetry sources ID` gives it.")
+
+
+def _explain(record: dict) -> None:
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    console = Console(highlight=False)
+    row = (
+        f"row {record['number']} of the handbook's table, {'★' * record['stars'] or 'no star'}"
+        if record["number"]
+        else "not in the handbook's table"
+    )
+    console.print(f"[bold]{escape(record['title'])}[/bold]  ({record['id']}; {row}{', ' + record['note'] if record['note'] else ''})")
+    console.print(escape(record["description"]))
+    console.print(f"\nequation      {escape(record['equation'])}")
+    console.print(f"typical size  {escape(record['typical_size'])}")
+    console.print(f"GUM class     {record['gum_class']}")
+    console.print(f"what to do    {escape(record['advice'])}\n")
+    if record["parameters"]:
+        table = Table("parameter", "unit", "range", "typical", "bound", "meaning")
+        for p in record["parameters"]:
+            table.add_row(p["name"], p["unit"], p["range"], f"{p['typical']}", f"{p['bound']}", escape(p["description"]))
+        console.print(table)
+    for verb, has in record["verbs"].items():
+        console.print(f"{verb:<12}  {'yes' if has else 'no: ' + escape(record['reasons'][verb])}")
+    console.print("\nsources: " + escape("; ".join(record["references"])))

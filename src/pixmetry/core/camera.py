@@ -1,0 +1,650 @@
+"""A camera: an ordered chain of error sources with parameters, checked when it is built, and run over frames or windows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from pixmetry.core.errors import ChainError, InputError
+from pixmetry.core.random import Grid, Streams
+from pixmetry.core.signal import Kind, Signal, Windows
+from pixmetry.core.source import Parameters, Source, run
+from pixmetry.core.threads import imap_tiles, map_tiles
+
+TILE_PIXELS = 1 << 16  # of float32: a tile and its copies stay in the second-level cache
+BAND_ROWS = 16  # tiles of whole frames are bands of a multiple of this, the largest block of a codec
+SCHEMA = "pixmetry/camera/1"
+
+
+class Scene(Protocol):
+    """What falls on the sensor: mean photons per pixel and exposure, for any windows of any frames."""
+
+    def photons(self, grid: Grid, frame_shape: tuple[int, int], exposure_s: np.ndarray, time_s: np.ndarray) -> np.ndarray:
+        """Return float32 photons, shape (n, rows, cols); ``exposure_s`` and ``time_s`` have shape (n,)."""
+
+
+@dataclass(frozen=True)
+class Element:
+    """One place in a chain: a source under a name of its own, with parameters; switched on or off."""
+
+    name: str
+    source: Source
+    params: Any
+    on: bool = True
+
+
+@dataclass(frozen=True)
+class Camera:
+    """An ordered set of sources with parameters.
+
+    Parameters
+    ----------
+    name : str
+    frame_shape : (int, int)
+        Rows and columns.
+    chain : sequence of Element
+        In the order in which the light meets them.
+    pitch_um : (float, float), optional
+        Pixel pitch in x and y.
+    exposure_s, temperature_c : float
+        The default schedule.
+    unit_seed : int
+        What this unit's fixed patterns are drawn from: another seed is another camera of the same type.
+    facts : mapping
+        Anything else that is known of it: ``interface``, ``sensor``, ``bits``, where the numbers come from.
+
+    Raises
+    ------
+    ChainError
+        If names repeat, kinds do not fit, or a declared order is broken.
+    """
+
+    name: str
+    frame_shape: tuple[int, int]
+    chain: tuple[Element, ...]
+    pitch_um: tuple[float, float] | None = None
+    exposure_s: float = 0.01
+    temperature_c: float = 20.0
+    unit_seed: int = 0
+    facts: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "chain", tuple(self.chain))
+        check_chain(self.chain, self.name)
+        if min(self.frame_shape) < 1:
+            raise ChainError("a frame has no pixels", where=self.name, value=self.frame_shape)
+
+    # ---- variants -------------------------------------------------------------------------------------------------------------
+
+    def __getitem__(self, name: str) -> Element:
+        for element in self.chain:
+            if element.name == name:
+                return element
+        raise InputError(f"{self.name} has no source named {name!r}", allowed=", ".join(e.name for e in self.chain))
+
+    def __contains__(self, name: str) -> bool:
+        return any(e.name == name for e in self.chain)
+
+    def switched(self, **kw: Any) -> Camera:
+        """Return the same camera with some sources off: ``off=names``, or all but ``on=names`` and the essential conversions."""
+        off, on = kw.get("off", ()), kw.get("on")
+        for name in (*off, *(on or ())):
+            self[name]
+        keep = (lambda e: e.source.essential or e.name in on) if on is not None else (lambda e: e.name not in off)
+        return replace(self, chain=tuple(replace(e, on=e.on and keep(e)) for e in self.chain))
+
+    def with_parameters(self, name: str, **values: Any) -> Camera:
+        """Return the same camera with some parameters of one source changed (validated)."""
+        element = self[name]
+        params = element.source.make({**element.params.model_dump(), **values}, where=f"{self.name}.{name}")
+        return replace(self, chain=tuple(replace(e, params=params) if e.name == name else e for e in self.chain))
+
+    @property
+    def active(self) -> tuple[Element, ...]:
+        """The elements that are on."""
+        return tuple(e for e in self.chain if e.on)
+
+    # ---- running --------------------------------------------------------------------------------------------------------------
+
+    def streams(self, seed: int, quiet: bool = False) -> Streams:
+        """Return the keyed randomness of one series of exposures; ``quiet``: every temporal draw at its mean."""
+        return QuietStreams(self.unit_seed, seed) if quiet else Streams(self.unit_seed, seed)
+
+    def signal(
+        self, scene: Scene, grid: Grid, exposure_s: Any = None, frame_period_s: float | None = None, temperature_c: Any = None
+    ) -> Signal:
+        """Return what falls on the sensor in these windows, as the signal at the head of the chain."""
+        n = len(grid.frame)
+        exposure = np.broadcast_to(np.asarray(self.exposure_s if exposure_s is None else exposure_s, float), (n,))
+        period = self.facts.get("frame_period_s", 0.04) if frame_period_s is None else frame_period_s
+        time = grid.frame * float(period)
+        temperature = np.broadcast_to(np.asarray(self.temperature_c if temperature_c is None else temperature_c, float), (n,))
+        photons = scene.photons(grid, self.frame_shape, exposure, time)
+        return Signal(np.ascontiguousarray(photons, np.float32), Kind.PHOTONS, grid, self.frame_shape, exposure, time, temperature)
+
+    def expose(
+        self,
+        scene: Scene,
+        frames: int | Sequence[int] = 1,
+        seed: int = 0,
+        window: tuple[int, int, int, int] | None = None,
+        threads: int | None = None,
+        quiet: bool = False,
+        **schedule: Any,
+    ) -> Signal:
+        """Expose frames, or one window ``(row0, col0, rows, cols)`` of them.
+
+        Parameters
+        ----------
+        scene : Scene
+        frames : int or sequence of int
+            How many frames from number 0, or which frame numbers.
+        seed : int
+            Of the exposures; with another one only what is temporal changes.
+        window : (int, int, int, int), optional
+            Equals the crop of the whole frame bit for bit.
+        quiet : bool
+            Every temporal draw at its mean: the expected frame of this unit.
+        **schedule
+            ``exposure_s``, ``temperature_c``, ``frame_period_s``.
+
+        Returns
+        -------
+        Signal
+            With ``data`` of shape (frames, rows, cols).
+        """
+        numbers = list(range(frames)) if isinstance(frames, int | np.integer) else [int(f) for f in frames]
+        if not numbers:
+            raise InputError("no frame is asked for", remedy="give a number of frames of at least 1")
+        parts = list(self.iter_frames(scene, numbers, seed, window, threads, quiet, **schedule))
+        return _concatenate(parts)
+
+    def iter_frames(
+        self,
+        scene: Scene,
+        frames: Iterable[int],
+        seed: int = 0,
+        window: tuple[int, int, int, int] | None = None,
+        threads: int | None = None,
+        quiet: bool = False,
+        **schedule: Any,
+    ) -> Iterator[Signal]:
+        """Expose frames one after the other, in order, with only a few in flight; see `expose`."""
+        streams = self.streams(seed, quiet)
+        rows, cols = self.frame_shape
+        r0, c0, h, w = (0, 0, rows, cols) if window is None else window
+        if not (r0 >= 0 and c0 >= 0 and h > 0 and w > 0 and r0 + h <= rows and c0 + w <= cols):
+            raise InputError("the window does not lie in the frame", value=window, allowed=f"within {rows} rows and {cols} columns")
+        numbers = [int(f) for f in frames]
+        last_memory = max((i for i, e in enumerate(self.active) if e.source.start is not None), default=-1)
+
+        def grid_of(number: int) -> Grid:
+            return Grid(np.array([number]), np.array([r0]), np.array([c0]), (h, w))
+
+        def whole(number: int) -> Signal:
+            return self._run(scene, grid_of(number), self.active, streams, schedule)
+
+        if last_memory < 0:
+            yield from imap_tiles(whole, numbers, threads)
+            return
+        yield from self._with_memory(scene, numbers, grid_of, last_memory, streams, schedule, threads)
+
+    def _with_memory(
+        self,
+        scene: Scene,
+        numbers: list[int],
+        grid_of: Any,
+        last_memory: int,
+        streams: Streams,
+        schedule: Mapping[str, Any],
+        threads: int | None,
+    ) -> Iterator[Signal]:
+        """Run frames 0, 1, 2 … in order through everything up to the last source with a memory, the rest as far as it is wanted."""
+        if numbers and (min(numbers) < 0 or numbers != sorted(set(numbers))):
+            raise InputError("a camera with a memory needs frame numbers that rise from 0", value=numbers[:5])
+        head, tail = self.active[: last_memory + 1], self.active[last_memory + 1 :]
+        first = next(i for i, e in enumerate(head) if e.source.start is not None)
+        wanted = set(numbers)
+        before = head[:first]
+
+        def prepared(number: int) -> tuple[int, list[Windows], Signal]:
+            needs = self._needs(self.active, Windows.of(grid_of(number)))
+            window = needs[first]
+            grid = Grid(np.array([number]), window.row0, window.col0, (int(window.rows[0]), int(window.cols[0])))
+            return number, needs, self._run(scene, grid, before, streams, schedule)
+
+        state: dict[str, Any] = {}
+        sequence = range(max(numbers) + 1) if numbers else range(0)
+        for number, needs, signal in imap_tiles(prepared, sequence, threads):
+            for i in range(first, len(head)):
+                element = head[i]
+                signal = signal.crop(needs[i])
+                signal, state[element.name] = run(element.source, element.params, signal, streams.of(element.name), state.get(element.name))
+            if number in wanted:
+                for i, element in enumerate(tail, start=len(head)):
+                    signal, _ = run(element.source, element.params, signal.crop(needs[i]), streams.of(element.name))
+                yield signal.crop(needs[-1])
+
+    def expose_windows(
+        self,
+        scene: Scene,
+        grid: Grid,
+        seed: int = 0,
+        mode: str = "exact",
+        background: Scene | None = None,
+        threads: int | None = None,
+        quiet: bool = False,
+        **schedule: Any,
+    ) -> np.ndarray:
+        """Expose many small windows, each of its own frame, as one batch.
+
+        Parameters
+        ----------
+        scene : Scene
+            May differ from frame to frame: one frame number per trial.
+        grid : Grid
+        mode : {"exact", "frozen"}
+            ``exact``: every source gets all the context it needs, so that each window equals the crop of its frame. ``frozen``: what
+            lies farther away than a source's ``near`` comes from the noise-free frame of ``background``, and so do frame-wide
+            quantities; far cheaper, with the truncation error that `frozen_tail` states.
+        background : Scene, optional
+            The scene far from the windows; needed by the mode ``frozen`` when a source looks beyond its window.
+
+        Returns
+        -------
+        ndarray, shape (n, rows, cols)
+        """
+        if mode not in ("exact", "frozen"):
+            raise InputError("no such mode", value=mode, allowed="exact, frozen")
+        streams = self.streams(seed, quiet)
+        frozen = self._freeze(background, schedule) if mode == "frozen" else None
+        if frozen is None and any(e.source.start is not None for e in self.active):
+            raise InputError("a source with a memory cannot be run on single windows exactly", remedy="use iter_frames, or mode='frozen'")
+        n = len(grid.frame)
+        step = max(1, TILE_PIXELS // max(1, grid.shape[0] * grid.shape[1]))
+        spans = [np.arange(a, min(a + step, n)) for a in range(0, n, step)]
+
+        def part(index: np.ndarray) -> np.ndarray:
+            sub = Grid(grid.frame[index], grid.row0[index], grid.col0[index], grid.shape)
+            return self._run(scene, sub, self.active, streams, {k: _take(v, index) for k, v in schedule.items()}, frozen).data
+
+        parts = map_tiles(part, spans, threads)
+        return np.concatenate(parts) if parts else np.zeros((0, *grid.shape), np.float32)
+
+    def frozen_tail(self) -> float:
+        """Largest share of a pixel's signal that the mode ``frozen`` takes from the noise-free frame, over all sources."""
+        return float(sum(e.source.tail(e.params) for e in self.active if e.source.tail is not None))
+
+    # ---- the walk -------------------------------------------------------------------------------------------------------------
+
+    def _needs(self, elements: Sequence[Element], windows: Windows, frozen: bool = False) -> list[Windows]:
+        """Return the input windows of every element, and the output windows as the last entry."""
+        needs = [windows]
+        for element in reversed(elements):
+            source, params = element.source, element.params
+            if frozen and source.start is not None:
+                needs.append(needs[-1])
+            elif frozen and source.near is not None:
+                needs.append(needs[-1].expand(*source.near(params), self.frame_shape))
+            else:
+                needs.append(source.window_needed(params, needs[-1], self.frame_shape))
+        return needs[::-1]
+
+    def _run(
+        self,
+        scene: Scene,
+        grid: Grid,
+        elements: Sequence[Element],
+        streams: Streams,
+        schedule: Mapping[str, Any],
+        frozen: _Frozen | None = None,
+    ) -> Signal:
+        """Render and run a batch; entries whose context has another size (at the frame's border) are run apart."""
+        needs = self._needs(elements, Windows.of(grid), frozen is not None)
+        sizes = np.stack([np.stack((w.rows, w.cols), 1) for w in needs], 1).reshape(len(grid.frame), -1)
+        if len(sizes) == 0 or (sizes == sizes[0]).all():
+            return self._run_equal(scene, grid, elements, needs, streams, schedule, frozen)
+        _, group = np.unique(sizes, axis=0, return_inverse=True)
+        parts, order = [], []
+        for g in range(group.max() + 1):
+            index = np.flatnonzero(group.ravel() == g)
+            sub = Grid(grid.frame[index], grid.row0[index], grid.col0[index], grid.shape)
+            part = {k: _take(v, index) for k, v in schedule.items()}
+            parts.append(self._run_equal(scene, sub, elements, [w.take(index) for w in needs], streams, part, frozen))
+            order.append(index)
+        return _concatenate(parts).take(np.argsort(np.concatenate(order)))
+
+    def _run_equal(
+        self,
+        scene: Scene,
+        grid: Grid,
+        elements: Sequence[Element],
+        needs: list[Windows],
+        streams: Streams,
+        schedule: Mapping[str, Any],
+        frozen: _Frozen | None,
+    ) -> Signal:
+        if len(grid.frame) == 1 and frozen is None:
+            return self._run_bands(scene, grid, elements, needs, streams, schedule)
+        signal = self.signal(scene, _grid_at(grid, needs[0]), **schedule)
+        return self._walk(signal, elements, needs, streams, frozen)
+
+    def _walk(
+        self, signal: Signal, elements: Sequence[Element], needs: list[Windows], streams: Streams, frozen: _Frozen | None = None
+    ) -> Signal:
+        """Run the elements over the windows of ``needs`` one after the other."""
+        for i, element in enumerate(elements):
+            signal = signal.crop(needs[i])
+            stream = streams.of(element.name)
+            if frozen is not None and element.name in frozen.elements:
+                signal = frozen.apply(element, signal, stream)
+            else:
+                signal, _ = run(element.source, element.params, signal, stream)
+        return signal.crop(needs[-1])
+
+    def _run_bands(
+        self,
+        scene: Scene,
+        grid: Grid,
+        elements: Sequence[Element],
+        needs: list[Windows],
+        streams: Streams,
+        schedule: Mapping[str, Any],
+    ) -> Signal:
+        """Run one large window in bands that stay in the cache, as far as the sources allow: by rows, by columns, or whole.
+
+        Sources that follow each other and allow the same kind of band are run together, band by band.
+        """
+        signal: Signal | None = None
+        at = 0
+        while at < len(elements) or signal is None:
+            axis, end = self._segment(elements, at, needs[at])
+            outer = needs[end] if end < len(elements) else needs[-1]
+            bands = _bands(outer if end > at else needs[at], axis)
+            segment = elements[at:end]
+
+            def band(windows: Windows, segment=segment, source=signal) -> Signal:
+                local = self._needs(segment, windows)
+                if source is None:
+                    part = self.signal(scene, _grid_at(grid, local[0]), **schedule)
+                else:
+                    part = source.crop(local[0])
+                return self._walk(part, segment, local, streams)
+
+            parts = map_tiles(band, bands)
+            signal = parts[0] if len(parts) == 1 else _stitch(parts, _grid_at(grid, outer if end > at else needs[at]), axis)
+            at = end
+        return signal.crop(needs[-1])
+
+    def _segment(self, elements: Sequence[Element], start: int, windows: Windows) -> tuple[int | None, int]:
+        """Return along which axis bands can be cut from element ``start`` on (0 rows, 1 columns, None whole), and how far."""
+        best: tuple[int | None, int] = (None, start + 1)
+        for axis in (0, 1):
+            probe = _bands(windows, axis, probe=True)
+            end = start
+            while end < len(elements) and all(
+                elements[end].source.window_needed(elements[end].params, p, self.frame_shape).equals(p) for p in probe
+            ):
+                end += 1
+            if end > start and (best[0] is None or end > best[1]):
+                best = (axis, end)
+        if start == len(elements):
+            return 0, start
+        return best
+
+    def _freeze(self, background: Scene | None, schedule: Mapping[str, Any]) -> _Frozen:
+        """Run the noise-free background frame once and keep what sources with a far context need of it."""
+        far = [e for e in self.active if e.source.near is not None or e.source.start is not None]
+        if not far:
+            return _Frozen({})
+        if background is None:
+            raise InputError("the mode 'frozen' needs the background scene", value=", ".join(e.name for e in far))
+        streams = self.streams(0, quiet=True)
+        rows, cols = self.frame_shape
+        grid = Grid.whole([0], (rows, cols))
+        scalars = {
+            k: (np.asarray(v).ravel()[:1] if k in ("exposure_s", "temperature_c") and v is not None else v) for k, v in schedule.items()
+        }
+        signal = self.signal(background, grid, **scalars)
+        kept: dict[str, tuple[Signal, Signal, Any]] = {}
+        for element in self.active:
+            stream = streams.of(element.name)
+            before, state = signal, None
+            if element.source.start is not None:
+                state = _settled(element, signal, stream)
+            signal, _ = run(element.source, element.params, signal, stream, state)
+            if element in far:
+                kept[element.name] = (before, signal, state)
+        return _Frozen(kept)
+
+    # ---- files ----------------------------------------------------------------------------------------------------------------
+
+    def to_record(self) -> dict[str, Any]:
+        """Return the plain record that `load_camera` reads."""
+        record: dict[str, Any] = {"schema": SCHEMA, "name": self.name, "rows": self.frame_shape[0], "cols": self.frame_shape[1]}
+        if self.pitch_um is not None:
+            record |= {"pitch_x_um": self.pitch_um[0], "pitch_y_um": self.pitch_um[1]}
+        record |= {"exposure_s": self.exposure_s, "temperature_c": self.temperature_c, "unit_seed": self.unit_seed}
+        record["facts"] = dict(self.facts)
+        record["chain"] = [
+            {"source": e.source.id, **({"name": e.name} if e.name != e.source.id else {}), **({} if e.on else {"enabled": False})}
+            | {"parameters": e.params.model_dump(mode="json")}
+            for e in self.chain
+        ]
+        return record
+
+    def save(self, path: str | Path) -> None:
+        """Write the camera as a preset (YAML)."""
+        from pixmetry.core.config import dump_yaml
+
+        dump_yaml(self.to_record(), path)
+
+
+class _Quiet:
+    """A stream whose temporal draws are at their mean; what is fixed in the unit is drawn as always."""
+
+    def __init__(self, stream: Any) -> None:
+        self._stream = stream
+
+    def __getattr__(self, name: str) -> Any:
+        if name.endswith(("_fixed", "_unit")):
+            return getattr(self._stream, name)
+        raise AttributeError(name)
+
+    def normal(self, grid: Grid, draw: int = 0) -> np.ndarray:
+        return np.zeros(grid.size, np.float32)
+
+    def normal_rows(self, grid: Grid, draw: int = 0) -> np.ndarray:
+        return np.zeros(grid.size[:2], np.float32)
+
+    def normal_cols(self, grid: Grid, draw: int = 0) -> np.ndarray:
+        return np.zeros((grid.size[0], grid.size[2]), np.float32)
+
+    def normal_frames(self, grid: Grid, draw: int = 0) -> np.ndarray:
+        return np.zeros(grid.size[0], np.float32)
+
+    def uniform(self, grid: Grid, draw: int = 0) -> np.ndarray:
+        return np.full(grid.size, 0.5, np.float32)
+
+    def uniform_frames(self, grid: Grid, draw: int = 0) -> np.ndarray:
+        return np.full(grid.size[0], 0.5, np.float32)
+
+    def poisson(self, mean: np.ndarray, grid: Grid, draw: int = 0) -> np.ndarray:
+        return np.asarray(mean, np.float32)
+
+    def add_normal(self, data: np.ndarray, grid: Grid, scale: Any, draw: int = 0) -> np.ndarray:
+        return np.asarray(data, np.float32)
+
+
+@dataclass(frozen=True)
+class QuietStreams(Streams):
+    """Streams of which every temporal draw is at its mean."""
+
+    def of(self, instance_name: str) -> Any:
+        return _Quiet(super().of(instance_name))
+
+
+@dataclass(frozen=True)
+class _Frozen:
+    """Noise-free background before and after each source with a far context, and the settled state of those with a memory."""
+
+    elements: Mapping[str, tuple[Signal, Signal, Any]]
+
+    def apply(self, element: Element, signal: Signal, stream: Any) -> Signal:
+        """Run a source on the near context, and correct for the far one by the same run on the noise-free frame."""
+        before, after, state = self.elements[element.name]
+        out, _ = run(element.source, element.params, signal, stream, state)
+        if element.source.start is not None:
+            return out
+        near = _cut(before, signal)
+        quiet, _ = run(element.source, element.params, near, stream)
+        return out.with_data(out.data + (_cut(after, signal).data - quiet.data))
+
+
+def _cut(frame: Signal, like: Signal) -> Signal:
+    """Cut the windows of one signal out of a whole frame."""
+    rows, cols = like.rows[:, :, None], like.cols[:, None, :]
+    return like.with_data(frame.data[0][rows, cols], frame.kind)
+
+
+def _settled(element: Element, signal: Signal, stream: Any, most: int = 400) -> Any:
+    """Run a source with a memory over the same frame until its state no longer changes."""
+    state = element.source.start(element.params)
+    for _ in range(most):
+        _, following = element.source.forward(element.params, signal, stream, state)
+        change = np.max(np.abs(np.asarray(following, float) - np.asarray(state, float)))
+        state = following
+        if change <= 1e-7 * np.max(np.abs(np.asarray(state, float))):
+            return state
+    raise InputError(f"{element.name} does not settle on the background", remedy="check its parameters, or use mode='exact'")
+
+
+def _take(value: Any, index: np.ndarray) -> Any:
+    return np.asarray(value)[index] if np.ndim(value) == 1 and len(value) > 1 else value
+
+
+def _grid_at(grid: Grid, windows: Windows) -> Grid:
+    return Grid(grid.frame, windows.row0, windows.col0, (int(windows.rows[0]), int(windows.cols[0])))
+
+
+def _bands(windows: Windows, axis: int | None, probe: bool = False) -> list[Windows]:
+    """Cut one window into bands along an axis, at multiples of `BAND_ROWS`; for a probe, two of the bands suffice."""
+    if axis is None:
+        return [windows]
+    r0, c0, h, w = (int(v[0]) for v in (windows.row0, windows.col0, windows.rows, windows.cols))
+    start, length, other = (r0, h, w) if axis == 0 else (c0, w, h)
+    step = max(1, TILE_PIXELS // max(1, other) // BAND_ROWS) * BAND_ROWS
+    if probe:
+        step = BAND_ROWS
+    edges = [start, *range((start // BAND_ROWS + 1) * BAND_ROWS, start + length, step), start + length]
+    pairs = list(zip(edges[:-1], edges[1:], strict=True))
+    if probe:
+        pairs = [pairs[0], pairs[len(pairs) // 2], pairs[-1]]
+    return [Windows.one(a, c0, b - a, w) if axis == 0 else Windows.one(r0, a, h, b - a) for a, b in pairs]
+
+
+def _stitch(parts: list[Signal], grid: Grid, axis: int) -> Signal:
+    return replace(parts[0], data=np.concatenate([p.data for p in parts], axis=axis + 1), grid=grid)
+
+
+def _concatenate(parts: list[Signal]) -> Signal:
+    if len(parts) == 1:
+        return parts[0]
+    grids = [p.grid for p in parts]
+    grid = Grid(*(np.concatenate([getattr(g, f) for g in grids]) for f in ("frame", "row0", "col0")), grids[0].shape)
+    joined = {f: np.concatenate([getattr(p, f) for p in parts]) for f in ("data", "exposure_s", "time_s", "temperature_c")}
+    return replace(parts[0], grid=grid, **joined)
+
+
+def check_chain(chain: Sequence[Element], where: str = "camera") -> None:
+    """Check names, kinds and declared order of a chain.
+
+    Raises
+    ------
+    ChainError
+        Naming the first two elements that do not fit together.
+    """
+    names = [e.name for e in chain]
+    for name in names:
+        if names.count(name) > 1:
+            raise ChainError(f"the name {name!r} is used twice", where=where, remedy="give each source a name of its own")
+    kind = Kind.PHOTONS
+    for i, element in enumerate(chain):
+        source = element.source
+        if not element.on:
+            continue
+        if kind not in source.consumes:
+            raise ChainError(
+                f"{element.name} cannot follow: it takes {', '.join(source.consumes)} and gets {kind}",
+                where=where,
+                remedy="change the order",
+            )
+        kind = source.produces or kind
+        for later in chain[i + 1 :]:
+            if _named(later.source, source.after) and later.on:
+                raise ChainError(f"{element.name} must come after {later.name}", where=where, remedy="change the order")
+        for earlier in chain[:i]:
+            if _named(earlier.source, source.before) and earlier.on:
+                raise ChainError(f"{element.name} must come before {earlier.name}", where=where, remedy="change the order")
+
+
+def _named(source: Source, names: tuple[str, ...]) -> bool:
+    return source.id in names or source.stage in names
+
+
+def build_camera(record: Mapping[str, Any], where: str = "camera") -> Camera:
+    """Build a camera from its plain record.
+
+    Raises
+    ------
+    InputError, ChainError
+        With the place in the record that cannot be used.
+    """
+    from pixmetry.core.camera_schema import CameraRecord
+    from pixmetry.core.catalogue import get_source
+    from pixmetry.core.config import validate
+
+    checked = validate(CameraRecord, record, where)
+    elements = []
+    for i, entry in enumerate(checked.chain):
+        source = get_source(entry.source)
+        params = source.make(entry.parameters, where=f"{where}, chain[{i}] {entry.source}")
+        elements.append(Element(entry.name or entry.source, source, params, entry.enabled))
+    pitch = None if checked.pitch_x_um is None else (checked.pitch_x_um, checked.pitch_y_um or checked.pitch_x_um)
+    return Camera(
+        checked.name,
+        (checked.rows, checked.cols),
+        tuple(elements),
+        pitch,
+        checked.exposure_s,
+        checked.temperature_c,
+        checked.unit_seed,
+        checked.facts,
+    )
+
+
+def load_camera(path: str | Path) -> Camera:
+    """Read a camera from its YAML file, or one of the presets by its name.
+
+    Raises
+    ------
+    InputError, ChainError
+        If there is no such file or preset, or it cannot be used.
+    """
+    from importlib.resources import files
+
+    from pixmetry.core.config import load_yaml
+
+    presets = {p.name.removesuffix(".yaml"): p for p in files("pixmetry.cameras").iterdir() if p.name.endswith(".yaml")}
+    if str(path) in presets:
+        path = Path(str(presets[str(path)]))
+    elif not Path(path).is_file():
+        raise InputError("no such camera file or preset", value=str(path), allowed=f"a YAML file, or one of {', '.join(sorted(presets))}")
+    return build_camera(load_yaml(path), where=str(path))
+
+
+__all__ = ["Camera", "Element", "Parameters", "Scene", "build_camera", "check_chain", "load_camera"]

@@ -1,0 +1,34 @@
+"""The record of a camera file."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from pydantic import Field
+
+from pixmetry.core.config import Model
+
+
+class ElementRecord(Model):
+    """One entry of a camera's chain."""
+
+    source: str
+    name: str | None = None
+    enabled: bool = True
+    parameters: dict[str, Any] = {}
+
+
+class CameraRecord(Model):
+    """A camera file, schema ``pixmetry/camera/1``."""
+
+    schema_: Literal["pixmetry/camera/1"] = Field(alias="schema")
+    name: str
+    rows: int = Field(ge=1, le=100_000)
+    cols: int = Field(ge=1, le=100_000)
+    pitch_x_um: float | None = Field(default=None, gt=0)
+    pitch_y_um: float | None = Field(default=None, gt=0)
+    exposure_s: float = Field(default=0.01, gt=0)
+    temperature_c: float = Field(default=20.0, gt=-273.15)
+    unit_seed: int = Field(default=0, ge=0)
+    facts: dict[str, Any] = {}
+    chain: list[ElementRecord]

@@ -1,0 +1,164 @@
+"""Correction of frames with what an assessment of their camera measured."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pixmetry.campaign import InputHashes, provenance_record, read_frame, read_maps, staged_output, write_frame, write_json
+from pixmetry.core.camera import Camera, load_camera
+from pixmetry.core.errors import InputError
+from pixmetry.core.random import Grid
+from pixmetry.core.signal import Kind, Signal
+from pixmetry.core.threads import imap_tiles
+
+IMAGES = (".png", ".tif", ".tiff", ".npy")
+ORDER = (  # backwards along the chain: the last error is taken out first
+    "storage.jpeg",
+    "grabber.adc",
+    "grabber.phase_pattern",
+    "grabber.fixed_pattern",
+    "cable.termination",
+    "sensor.dsnu",
+    "electronics.nonlinearity",
+    "sensor.prnu",
+    "sensor.defects",
+)
+
+
+def correct_signal(camera: Camera, signal: Signal, maps: Mapping[str, np.ndarray]) -> tuple[Signal, dict[str, str]]:
+    """Correct a batch of stored codes, source by source.
+
+    Parameters
+    ----------
+    camera : Camera
+        With the measured parameters (the digital twin).
+    signal : Signal
+        Codes.
+    maps : mapping of ndarray
+        Measured pixel by pixel: ``dark_dn``, ``prnu_rel``, ``defects``.
+
+    Returns
+    -------
+    Signal
+        DN above black, float32.
+    dict
+        By source, what was done, or why nothing was.
+    """
+    done: dict[str, str] = {}
+    for source_id in ORDER:
+        for element in camera.active:
+            if element.source.id != source_id or element.source.correct is None:
+                continue
+            try:
+                signal = element.source.correct(element.params, signal, maps)
+                done[element.name] = "corrected"
+            except InputError as problem:
+                done[element.name] = f"not corrected: {problem}"
+    for element in camera.active:
+        if element.source.correct is None:
+            done[element.name] = f"not corrected: {element.source.reasons['correct']}"
+    return signal, done
+
+
+def correct_files(
+    frames: Sequence[str | Path],
+    results: str | Path,
+    output: str | Path,
+    *,
+    progress: Callable[[str, int, int], None] | None = None,
+) -> list[str]:
+    """Correct image files with the results of an assessment, and write them with the black level put back.
+
+    Parameters
+    ----------
+    frames : sequence of path
+        Image files, or folders of them.
+    results : path
+        ``results.json`` of the assessment; ``camera.yaml`` and ``maps.zarr.zip`` stand beside it.
+    output : path
+        Folder for the corrected frames, 16 bit TIFF under their own names; ``correction.json`` says what was done.
+
+    Returns
+    -------
+    list of str
+        One line a source: what was done.
+
+    Raises
+    ------
+    InputError
+        If a file cannot be read, does not belong to this camera, or two frames have one name.
+    """
+    record, camera, maps = _load(Path(results))
+    files = _image_files(frames)
+    black = round(camera["grabber.adc"].params.offset_dn) if "grabber.adc" in camera else 0
+    bits = int(record["camera"]["bits"])
+    hashes = InputHashes(files[0].parent)
+    told = progress or (lambda what, step, of: None)
+    done: dict[str, str] = {}
+
+    def work(path: Path) -> tuple[Path, np.ndarray, dict[str, str]]:
+        frame = read_frame(path)
+        if frame.shape != tuple(camera.frame_shape):
+            raise InputError(
+                "frame is of another size than the camera", where=str(path), value=frame.shape, allowed=str(tuple(camera.frame_shape))
+            )
+        corrected, said = correct_signal(camera, _as_signal(frame, camera), maps)
+        return path, corrected.data[0], said
+
+    with staged_output(output) as folder:
+        for i, (path, data, said) in enumerate(imap_tiles(work, files)):
+            done = said
+            hashes.add_file(path)
+            codes = np.clip(np.rint(data + black), 0, 2**16 - 1).astype(np.uint16)
+            write_frame(folder / f"{path.stem}.tif", codes, max(bits, 9))
+            told("correcting frames", i + 1, len(files))
+        lines = [f"{name}: {text}" for name, text in done.items()]
+        write_json(
+            folder / "correction.json",
+            {"schema": "pixmetry/correction/1", "black_dn": black, "sources": done, "provenance": provenance_record(hashes)},
+        )
+    return lines
+
+
+def _load(results: Path) -> tuple[dict[str, Any], Camera, dict[str, np.ndarray]]:
+    try:
+        record = json.loads(results.read_text(encoding="utf-8"))
+    except OSError as problem:
+        raise InputError(
+            "results cannot be read", where=str(results), value=problem.strerror, remedy="name the results.json of an assessment"
+        ) from None
+    except ValueError:
+        raise InputError("is not JSON", where=str(results), remedy="name the results.json of an assessment") from None
+    if not isinstance(record, dict) or record.get("schema") != "pixmetry/results/1":
+        raise InputError("is not the result of an assessment", where=str(results), remedy="name the results.json of an assessment")
+    for name in ("camera.yaml", "maps.zarr.zip"):
+        if not (results.parent / name).is_file():
+            raise InputError(f"{name} is missing beside the results", where=str(results.parent), remedy="assess the camera again")
+    maps, _ = read_maps(results.parent / "maps.zarr.zip")
+    return record, load_camera(results.parent / "camera.yaml"), maps
+
+
+def _image_files(frames: Iterable[str | Path]) -> list[Path]:
+    files: list[Path] = []
+    for given in map(Path, frames):
+        files += sorted(p for p in given.iterdir() if p.suffix.lower() in IMAGES) if given.is_dir() else [given]
+    if not files:
+        raise InputError(
+            "no image files", where=", ".join(map(str, frames)), allowed=", ".join(IMAGES), remedy="name files or a folder of them"
+        )
+    names = [p.stem for p in files]
+    double = next((n for n in names if names.count(n) > 1), None)
+    if double is not None:
+        raise InputError("two frames have one name", value=double, remedy="correct them in two runs")
+    return files
+
+
+def _as_signal(frame: np.ndarray, camera: Camera) -> Signal:
+    one = np.ones(1)
+    grid = Grid.whole([0], frame.shape)
+    return Signal(frame[None], Kind.CODES, grid, camera.frame_shape, camera.exposure_s * one, 0 * one, camera.temperature_c * one)

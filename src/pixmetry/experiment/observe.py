@@ -1,0 +1,157 @@
+"""From the frames of a campaign to its observations, in one pass over the frames."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from pixmetry.core.errors import MeasureError
+from pixmetry.core.estimates import Estimates
+from pixmetry.core.observations import (
+    CodeErrors,
+    DefectList,
+    LevelMoments,
+    Observations,
+    PatternList,
+    PhotonTransfer,
+    Spectra,
+    StackMoments,
+)
+from pixmetry.experiment.defects import find_defects
+from pixmetry.experiment.histogram import HistogramAccumulator, code_errors
+from pixmetry.experiment.moments import LevelAccumulator, LevelSummary, level_moments
+from pixmetry.experiment.patterns import find_phase_patterns
+from pixmetry.experiment.photon_transfer_fit import fit_photon_transfer
+from pixmetry.experiment.spatial_fit import fit_spatial
+from pixmetry.experiment.stack import StackAccumulator, new_group
+
+
+@dataclass(frozen=True)
+class Group:
+    """Frames of one condition, as they come from the reader."""
+
+    kind: str  # "dark" or "bright"
+    role: str  # "level" or "stack"
+    exposure_s: float
+    photons: float | None
+    frames: Iterable[np.ndarray]
+
+
+@dataclass(frozen=True)
+class _Level:
+    summary: LevelSummary
+    exposure_s: float
+    photons: float | None
+
+
+def observe(groups: Iterable[Group], bits: int, temperature_c: float | None = None) -> Observations:
+    """Reduce all frames of a campaign, then estimate what many sources share.
+
+    Parameters
+    ----------
+    groups : iterable of Group
+        Read one after the other, each frame once; memory does not grow with their number.
+    bits : int
+        Bits per stored code.
+    temperature_c : float, optional
+
+    Returns
+    -------
+    Observations
+
+    Raises
+    ------
+    MeasureError
+        If the frames carry no photon transfer: all saturated, all black, too few levels.
+    """
+    levels: dict[str, list[_Level]] = {"dark": [], "bright": []}
+    stacks: dict[str, tuple[StackMoments, Spectra]] = {}
+    histogram = HistogramAccumulator(bits)
+    shape = None
+    for group in groups:
+        reduction = new_group(bits, group.role)
+        for frame in group.frames:
+            reduction.add(frame)
+        moments = reduction.moments
+        shape = moments.shape
+        histogram.add_counts(moments.counts, dark=group.kind == "dark", level=(group.kind, group.role, group.exposure_s, group.photons))
+        if isinstance(moments, LevelAccumulator):
+            levels[group.kind].append(_Level(moments.summary(), group.exposure_s, group.photons))
+        elif isinstance(moments, StackAccumulator) and _better(stacks.get(group.kind), moments.n_frames):
+            stack = moments.result(group.exposure_s)
+            stacks[group.kind] = (stack, reduction.spectra.result(stack.mean_map_dn))
+    notes: list[str] = []
+    dark_stack, dark_spectra = stacks.get("dark", (None, None))
+    bright_stack, bright_spectra = stacks.get("bright", (None, None))
+    counts = histogram.result()
+    transfer = _photon_transfer(levels, shape, bits)
+    fit = fit_photon_transfer(transfer, dark_stack, bright_stack)
+    defects, spatial, patterns = _spatial(dark_stack, bright_stack, dark_spectra, notes)
+    return Observations(
+        photon_transfer=transfer,
+        photon_transfer_fit=fit,
+        dark_stack=dark_stack,
+        bright_stack=bright_stack,
+        dark_spectra=dark_spectra,
+        bright_spectra=bright_spectra,
+        histogram=counts,
+        spatial_fit=spatial,
+        defects=defects,
+        patterns=patterns,
+        code_errors=_codes(counts, notes),
+        temperature_c=temperature_c,
+        notes=tuple(notes),
+    )
+
+
+def _better(kept: tuple[StackMoments, Spectra] | None, n_frames: int) -> bool:
+    return kept is None or n_frames > kept[0].n_frames
+
+
+def _photon_transfer(levels: dict[str, list[_Level]], shape: tuple[int, int] | None, bits: int) -> PhotonTransfer:
+    for kind in ("dark", "bright"):
+        if not levels[kind]:
+            raise MeasureError(
+                f"no {kind} levels of an exposure series",
+                where="photon transfer",
+                remedy=f"add {kind} groups of two frames; a group of 8 or more frames counts as a stack unless its role says 'level'",
+            )
+
+    def moments(kind: str) -> LevelMoments:
+        part = levels[kind]
+        photons = [v.photons for v in part]
+        known = None if any(v is None for v in photons) else [float(v) for v in photons if v is not None]
+        return level_moments([v.summary for v in part], [v.exposure_s for v in part], known)
+
+    assert shape is not None
+    return PhotonTransfer(moments("bright"), moments("dark"), shape, bits)
+
+
+def _spatial(
+    dark: StackMoments | None, bright: StackMoments | None, spectra: Spectra | None, notes: list[str]
+) -> tuple[DefectList | None, Estimates | None, PatternList | None]:
+    if dark is None:
+        notes.append(
+            "no stack of dark frames: DSNU, PRNU, defects and patterns are not measured (take 16 or more dark and as many bright frames)"
+        )
+        return None, None, None
+    defects = find_defects(dark, bright)
+    patterns = find_phase_patterns(dark, spectra, defects)
+    if bright is None:
+        notes.append("no stack of bright frames: DSNU and PRNU are not measured (take 16 or more at half of saturation)")
+        return defects, None, patterns
+    try:
+        return defects, fit_spatial(dark, bright, defects), patterns
+    except MeasureError as problem:
+        notes.append(f"DSNU and PRNU are not measured: {problem}")
+        return defects, None, patterns
+
+
+def _codes(counts, notes: list[str]) -> CodeErrors | None:
+    try:
+        return code_errors(counts)
+    except MeasureError as problem:
+        notes.append(f"code widths are not measured: {problem}")
+        return None

@@ -1,0 +1,127 @@
+"""Phase pattern: interference of a fixed frequency that lies over the frame as a wave, standing or moving."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from pixmetry.core.contribution import Contribution, Probe
+from pixmetry.core.errors import MeasureError
+from pixmetry.core.estimates import Estimates
+from pixmetry.core.observations import Observations, PatternList
+from pixmetry.core.random import Stream
+from pixmetry.core.signal import Kind, Signal
+from pixmetry.core.source import Parameters, Source, quantity
+
+
+class PhasePattern(Parameters):
+    """One wave over the frame."""
+
+    amplitude_dn: float = quantity(0.0, "DN", "amplitude of the wave", ge=0, le=1e3)
+    frequency_x: float = quantity(0.11, "1/px", "cycles per pixel along the row", ge=0, le=0.5)
+    frequency_y: float = quantity(0.07, "1/px", "cycles per pixel down the column", ge=-0.5, le=0.5)
+    moving: bool = quantity(True, "1", "whether its phase is another in every frame, or fixed in the unit")
+
+
+def turns(params: PhasePattern, rows: np.ndarray, cols: np.ndarray) -> np.ndarray:
+    """Phase of the wave in turns at absolute rows (n, rows) and columns (n, cols), shape (n, rows, cols)."""
+    return params.frequency_y * rows[:, :, None] + params.frequency_x * cols[:, None, :]
+
+
+def forward(params: PhasePattern, signal: Signal, stream: Stream) -> Signal:
+    """Add A sin(2π(ν_x c + ν_y r + φ)) with the phase φ of the frame."""
+    if params.amplitude_dn == 0:
+        return signal
+    phase = stream.uniform_frames(signal.grid) if params.moving else np.repeat(stream.uniform_unit(1), len(signal))
+    # sin(a + b) from the sines of rows and columns: two short vectors instead of a sine for every pixel
+    row = 2 * np.pi * (params.frequency_y * signal.rows + phase[:, None].astype(float))
+    col = 2 * np.pi * params.frequency_x * signal.cols
+    a = np.float32(params.amplitude_dn)
+    row_sin, row_cos, col_sin, col_cos = (v.astype(np.float32) for v in (np.sin(row), np.cos(row), np.sin(col), np.cos(col)))
+    wave = (a * row_sin)[:, :, None] * col_cos[:, None, :]
+    wave += (a * row_cos)[:, :, None] * col_sin[:, None, :]
+    return signal.with_data(np.add(signal.data, wave, out=wave))
+
+
+def measure(observations: Observations) -> Estimates:
+    """Read the strongest line of the two-dimensional periodogram of the dark frames; if there is none, a limit of its amplitude."""
+    found = observations.patterns
+    if found is None:
+        raise MeasureError("phase patterns need dark frames", where="grabber.phase_pattern", remedy="take a stack of at least 16")
+    if len(found) == 0:
+        return _limit(found)
+    rows = [
+        ("amplitude_dn", found.amplitude_dn[0], found.u_amplitude_dn[0], math.inf, "DN"),
+        ("frequency_x", found.frequency_x[0], found.u_frequency_x[0], math.inf, "1/px"),
+        ("frequency_y", found.frequency_y[0], found.u_frequency_y[0], math.inf, "1/px"),
+        ("moving", float(found.moving[0]), 0.0, math.inf, "1"),
+    ]
+    return Estimates.from_rows(
+        rows, method="strongest line of the two-dimensional periodogram", confounders=("a pattern of the sensor or of the light",)
+    )
+
+
+def _limit(found: PatternList) -> Estimates:
+    """One-sided 95 % limit: the amplitude A found in half of all cases plus 1.645 u, with u = A/√(2z) at a threshold of z mean powers."""
+    half = np.nanmax([found.fixed_limit_dn, found.moving_limit_dn])
+    u = float(half / math.sqrt(2 * math.log(max(found.n_searched, 1) / found.false_alarm_rate)))
+    return Estimates.from_rows(
+        [("amplitude_dn", float(half) + 1.645 * u, u, math.inf, "DN")],
+        method="search of the two-dimensional periodogram",
+        limits=frozenset({"amplitude_dn"}),
+        reasons={"amplitude_dn": "no line stands out of the noise"},
+    )
+
+
+def correct(params: PhasePattern, signal: Signal, maps: Mapping[str, np.ndarray]) -> Signal:
+    """Fit amplitude and phase of the wave to every frame at the known frequency, by least squares beside a constant, and subtract it.
+
+    What else is in the image leaks into the fit as far as it holds this frequency: give it whole frames, not windows on targets.
+    """
+    n = len(signal)
+    angle = 2 * np.pi * turns(params, signal.rows, signal.cols)
+    basis = np.stack((np.ones_like(angle), np.sin(angle), np.cos(angle))).reshape(3, n, -1)
+    data = signal.data.reshape(n, -1).astype(float)
+    out = np.empty(data.shape, np.float32)
+    for i in range(n):
+        design = basis[:, i]
+        coefficients = np.linalg.lstsq(design @ design.T, design @ data[i], rcond=None)[0]
+        out[i] = data[i] - coefficients[1:] @ design[1:]
+    return signal.with_data(out.reshape(signal.data.shape))
+
+
+def propagate(params: PhasePattern, probe: Probe) -> Contribution:
+    """Propagator P2 for a wave, averaged over its phase: u = A |Σ g e^(2πi(ν_x c + ν_y r))| / √2."""
+    n, rows, cols = probe.gx.shape
+    angle = 2 * np.pi * turns(params, np.arange(rows)[None, :], np.arange(cols)[None, :])
+    parts = probe.field(np.broadcast_to(np.cos(angle), probe.gx.shape)), probe.field(np.broadcast_to(np.sin(angle), probe.gx.shape))
+    u = tuple(params.amplitude_dn * math.sqrt(float(np.mean(parts[0][a] ** 2 + parts[1][a] ** 2)) / 2) for a in (0, 1))
+    return probe.contribution(u, "T" if params.moving else "F", model_error=0.12, method="response of the estimator to a wave of any phase")
+
+
+SOURCE = Source(
+    id="grabber.phase_pattern",
+    title="Phase pattern",
+    description="Interference from a clock or a supply beats with the sampling and lies over the frame as a wave, standing or moving.",
+    number=34,
+    stars=1,
+    note="",
+    parameters=PhasePattern,
+    consumes=(Kind.DN,),
+    after=("sensor", "electronics", "cable"),
+    before=("grabber.adc", "storage", "processing"),
+    neutral=PhasePattern(),
+    typical=PhasePattern(amplitude_dn=0.5),
+    bound=PhasePattern(amplitude_dn=1.0, frequency_x=0.05, frequency_y=0.05),
+    forward=forward,
+    measure=measure,
+    correct=correct,
+    propagate=propagate,
+    gum_class="T",
+    equation="y' = y + A sin(2π(ν_x c + ν_y r) + φ_frame)",
+    typical_size="0.04 px per DN at 0.05 cycles per pixel, 0.002 px at 0.42, on a disc of 7 px of 150 DN (centroid, window radius 6)",
+    references=("EMVA 1288 R4.0 Linear, §8.4 (spectrograms)", "A. Schuster, Terr. Magn. 3, 1898, 13 (periodogram)"),
+    advice="Find the source by its frequency and shield it, synchronise the clocks, or fit and subtract the wave in every frame.",
+)

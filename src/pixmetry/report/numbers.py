@@ -1,0 +1,103 @@
+"""Numbers as text: a value to the place that its uncertainty allows, units with their signs, lengths in px and µm."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import floor, isfinite, log10
+
+MINUS, THIN, NO_BREAK = "\u2212", "\u2009", "\u00a0"
+NONE = "\u2013"
+SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+LIMIT_DIGITS = 2  # significant digits of an upper limit, as of an uncertainty
+
+
+@dataclass(frozen=True)
+class Number:
+    """A value, its standard uncertainty and its unit as text; a power of ten common to both is in ``unit``."""
+
+    value: str
+    u: str
+    unit: str
+
+
+def decimals_of(u: float, digits: int = 2) -> int:
+    """Decimal places that leave ``digits`` significant digits of ``u`` (negative: rounded to tens, hundreds …)."""
+    # through the exponent of the rounded number, so that 0.0996 becomes 0.10 and not 0.100
+    return digits - 1 - int(f"{abs(u):.{digits - 1}e}".partition("e")[2])
+
+
+def fixed(value: float, decimals: int) -> str:
+    """A number with that many decimal places and a true minus sign."""
+    text = f"{round(value, decimals):.{max(decimals, 0)}f}"
+    return text.replace("-", MINUS) if float(text) else text.replace("-", "")
+
+
+def significant(value: float, digits: int = 3) -> str:
+    """A number with so many significant digits, without an exponent between 0.0001 and a million."""
+    if not isfinite(value):
+        return NONE
+    if value == 0:
+        return "0"
+    if not 1e-4 <= abs(value) < 1e6:
+        mantissa, _, exponent = f"{value:.{digits - 1}e}".partition("e")
+        return f"{mantissa.replace('-', MINUS)}{THIN}×{THIN}10{str(int(exponent)).translate(SUPERSCRIPT)}"
+    return fixed(value, decimals_of(value, digits))
+
+
+def uncertain(value: float, u: float, unit: str) -> Number:
+    """Value and standard uncertainty, the uncertainty to two significant digits and the value to the same place (JCGM 100, 7.2.6)."""
+    if not (isfinite(u) and u > 0):
+        return Number(significant(value, 4), NONE, pretty_unit(unit))
+    largest = max(abs(value), u)
+    power = floor(log10(largest))
+    power = 0 if -4 < power < 6 else power
+    scaled_value, scaled_u = value / 10.0**power, u / 10.0**power
+    places = decimals_of(scaled_u)
+    return Number(fixed(scaled_value, places), fixed(scaled_u, places), _with_power(unit, power))
+
+
+def limit(value: float, unit: str) -> Number:
+    """A one-sided upper limit."""
+    power = floor(log10(value)) if value > 0 else 0
+    power = 0 if -4 < power < 6 else power
+    return Number(f"<{NO_BREAK}{significant(value / 10.0**power, LIMIT_DIGITS)}", NONE, _with_power(unit, power))
+
+
+def _with_power(unit: str, power: int) -> str:
+    name = pretty_unit(unit)
+    return name if power == 0 else f"10{str(power).translate(SUPERSCRIPT)}{NO_BREAK}{name}".rstrip(NO_BREAK)
+
+
+def pretty_unit(unit: str) -> str:
+    """Unit with its typographic signs; the unit one is not written."""
+    return "" if unit == "1" else unit.replace("e-", "e⁻").replace("^2", "²").replace("um", "µm")
+
+
+def length_px(value: float) -> str:
+    """A length in pixels to two or three significant digits, never finer than a millionth."""
+    if not isfinite(value):
+        return NONE
+    if abs(value) < 5e-7:
+        return "0"
+    return fixed(value, min(max(decimals_of(value, 3 if abs(value) >= 0.1 else 2), 0), 6))
+
+
+def length_um(value_px: float, pitch_um: float | None) -> str:
+    """A length given in pixels, in µm; a dash where the pitch is unknown."""
+    return NONE if pitch_um is None else length_px(value_px * pitch_um)
+
+
+def percent(share: float) -> str:
+    """A share of one as percent: whole above ten, one decimal below, ``<0.1`` for what is less."""
+    if not isfinite(share):
+        return NONE
+    value = 100 * share
+    if 0 < value < 0.05:
+        return f"<{THIN}0.1"
+    return fixed(value, 0 if value >= 9.95 else 1)
+
+
+def signed(value: float, formatter) -> str:
+    """Format with an explicit sign."""
+    text = formatter(abs(value))
+    return text if text in {"0", NONE} else ("+" if value > 0 else MINUS) + text

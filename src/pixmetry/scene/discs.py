@@ -1,0 +1,98 @@
+"""Disc targets, blurred by the optics and integrated over each pixel; only what a window needs is rendered."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import lru_cache
+
+import numpy as np
+
+from pixmetry.core.errors import ParameterError
+from pixmetry.core.random import Grid
+from pixmetry.scene._kernels import add_discs
+from pixmetry.scene.uniform import Uniform
+
+REACH = 5.0  # blur standard deviations beyond which a disc's edge is taken as 0 (2.9e-7 of its height)
+STEP = 1 / 256  # px: spacing of the radial profile; linear interpolation is good to 1e-5 of the height down to the smallest blur
+SMALLEST_BLUR_PX = 0.05
+
+
+@lru_cache(maxsize=64)
+def radial_profile(diameter_px: float, blur_px: float) -> np.ndarray:
+    """A disc of height 1 convolved with a round Gaussian, against radius at spacing `STEP`.
+
+    The convolution at distance ρ is ∫₀^R (r/s²) exp(−(r² + ρ²)/2s²) I₀(rρ/s²) dr (polar form of the two-dimensional integral; known as
+    1 − Q₁, Marcum's function): here by the non-central χ² distribution with two degrees of freedom.
+    """
+    from scipy.stats import ncx2
+
+    radius = 0.5 * diameter_px
+    rho = np.arange(0.0, radius + REACH * blur_px + 1.0 + 2 * STEP, STEP)
+    return ncx2.cdf((radius / blur_px) ** 2, 2, np.maximum((rho / blur_px) ** 2, 1e-300))
+
+
+@dataclass(frozen=True)
+class Discs:
+    """Bright (or dark) discs on a background, standing still or with one place per frame.
+
+    Parameters
+    ----------
+    x_px, y_px : array_like, shape (k,), or (frames, k) with ``per_frame``
+        Centres in absolute pixels.
+    diameter_px, blur_px : float
+        Diameter of the sharp disc, and standard deviation of the Gaussian blur of the optics (at least 0.05 px).
+    peak_photons : float or array_like, shape (k,)
+        Height above the background, in photons per pixel and exposure (negative for a dark disc).
+    background : Uniform
+    per_frame : bool
+        The first axis of the centres is the frame number (beyond its end it repeats).
+    """
+
+    x_px: np.ndarray
+    y_px: np.ndarray
+    diameter_px: float = 7.0
+    blur_px: float = 0.7
+    peak_photons: float = 1000.0
+    background: Uniform = field(default_factory=Uniform)
+    per_frame: bool = False
+
+    def __post_init__(self) -> None:
+        for name in ("x_px", "y_px"):
+            object.__setattr__(self, name, np.atleast_1d(np.asarray(getattr(self, name), float)))
+        if self.x_px.shape != self.y_px.shape or not (np.isfinite(self.x_px).all() and np.isfinite(self.y_px).all()):
+            raise ParameterError("the centres of the discs are not usable", where="discs", allowed="finite x_px and y_px, equally many")
+        if not (0 < self.diameter_px <= 1000 and SMALLEST_BLUR_PX <= self.blur_px <= 100):
+            raise ParameterError(
+                "a disc cannot be rendered",
+                where="discs",
+                value={"diameter_px": self.diameter_px, "blur_px": self.blur_px},
+                allowed=f"diameter 0 to 1000 px, blur {SMALLEST_BLUR_PX} to 100 px",
+            )
+
+    def centres(self, frame: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Centres in each of these frames, shape (n, k) each."""
+        if self.per_frame:
+            x, y = (v.reshape(len(v), -1)[frame % len(v)] for v in (self.x_px, self.y_px))
+        else:
+            x, y = (np.broadcast_to(v.ravel(), (len(frame), v.size)) for v in (self.x_px, self.y_px))
+        return x, y
+
+    def photons(self, grid: Grid, frame_shape: tuple[int, int], exposure_s: np.ndarray, time_s: np.ndarray) -> np.ndarray:
+        """Photons per pixel, shape (n, rows, cols), float32."""
+        out = self.background.photons(grid, frame_shape, exposure_s, time_s).copy()
+        profile = radial_profile(float(self.diameter_px), float(self.blur_px))
+        outer = 0.5 * self.diameter_px + REACH * self.blur_px
+        inner = max(0.0, 0.5 * self.diameter_px - REACH * self.blur_px)
+        x, y = self.centres(grid.frame)
+        touches = (
+            (x > grid.col0[:, None] - outer - 1)
+            & (x < grid.col0[:, None] + grid.shape[1] + outer)
+            & (y > grid.row0[:, None] - outer - 1)
+            & (y < grid.row0[:, None] + grid.shape[0] + outer)
+        )
+        entry, which = np.nonzero(touches)
+        scale = self.background.photons_scale(exposure_s)
+        peak = np.broadcast_to(np.asarray(self.peak_photons, float), (x.shape[1],))[which] * scale[entry]
+        split = 1 if self.blur_px >= 0.5 else int(np.ceil(0.5 / self.blur_px))
+        add_discs(out, x[entry, which], y[entry, which], entry, grid.row0, grid.col0, profile, STEP, inner, outer, peak, split)
+        return np.maximum(out, 0, out=out)
