@@ -54,15 +54,15 @@ def _list(records: list[dict]) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    table = Table(title="Error sources, in the order of the light", title_justify="left")
-    for name in ("id", "title", "stars", "note", "forward", "measure", "correct", "propagate"):
-        table.add_column(name, justify="center" if name in ("forward", "measure", "correct", "propagate") else "left", no_wrap=name == "id")
+    table = Table(title="Error sources by stage, in the order of the light", title_justify="left", box=None, pad_edge=False)
+    for name in ("id", "title", "stars", "note", "verbs"):
+        table.add_column(name, no_wrap=name in ("id", "verbs"))
     for r in records:
-        verbs = ["yes" if r["verbs"][v] else "–" for v in ("forward", "measure", "correct", "propagate")]
-        table.add_row(r["id"], r["title"], "★" * r["stars"], r["note"], *verbs)
+        verbs = " ".join(verb[0] if has else "–" for verb, has in r["verbs"].items())
+        table.add_row(r["id"], r["title"], "★" * r["stars"], r["note"], verbs)
     console = Console(highlight=False)
     console.print(table)
-    console.print("A dash has a reason: `pixmetry sources ID` gives it.")
+    console.print("\nverbs: f forward, m measure, c correct, p propagate; a dash has its reason: `pixmetry sources ID`")
 
 
 def _explain(record: dict) -> None:

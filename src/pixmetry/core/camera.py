@@ -105,8 +105,8 @@ class Camera:
 
     @property
     def active(self) -> tuple[Element, ...]:
-        """The elements that are on."""
-        return tuple(e for e in self.chain if e.on)
+        """The elements that act on frames and are on."""
+        return tuple(e for e in self.chain if e.on and e.source.forward is not None)
 
     # ---- running --------------------------------------------------------------------------------------------------------------
 
@@ -369,10 +369,7 @@ class Camera:
 
             def band(windows: Windows, segment=segment, source=signal) -> Signal:
                 local = self._needs(segment, windows)
-                if source is None:
-                    part = self.signal(scene, _grid_at(grid, local[0]), **schedule)
-                else:
-                    part = source.crop(local[0])
+                part = source.crop(local[0]) if source else self.signal(scene, _grid_at(grid, local[0]), **schedule)
                 return self._walk(part, segment, local, streams)
 
             parts = map_tiles(band, bands)
@@ -398,11 +395,11 @@ class Camera:
 
     def _freeze(self, background: Scene | None, schedule: Mapping[str, Any]) -> _Frozen:
         """Run the noise-free background frame once and keep what sources with a far context need of it."""
-        far = [e for e in self.active if e.source.near is not None or e.source.start is not None]
+        far = [e.name for e in self.active if e.source.near is not None or e.source.start is not None]
         if not far:
             return _Frozen({})
         if background is None:
-            raise InputError("the mode 'frozen' needs the background scene", value=", ".join(e.name for e in far))
+            raise InputError("the mode 'frozen' needs the background scene", value=", ".join(far), remedy="give it as background=")
         streams = self.streams(0, quiet=True)
         rows, cols = self.frame_shape
         grid = Grid.whole([0], (rows, cols))
@@ -417,7 +414,7 @@ class Camera:
             if element.source.start is not None:
                 state = _settled(element, signal, stream)
             signal, _ = run(element.source, element.params, signal, stream, state)
-            if element in far:
+            if element.name in far:
                 kept[element.name] = (before, signal, state)
         return _Frozen(kept)
 
@@ -474,10 +471,15 @@ class _Quiet:
         return np.full(grid.size[0], 0.5, np.float32)
 
     def poisson(self, mean: np.ndarray, grid: Grid, draw: int = 0) -> np.ndarray:
-        return np.asarray(mean, np.float32)
+        return _fresh(mean, grid)
 
     def add_normal(self, data: np.ndarray, grid: Grid, scale: Any, draw: int = 0) -> np.ndarray:
-        return np.asarray(data, np.float32)
+        return _fresh(data, grid)
+
+
+def _fresh(data: np.ndarray, grid: Grid) -> np.ndarray:
+    """A copy, as every draw returns: the caller may go on in place."""
+    return np.array(np.broadcast_to(data, grid.size), np.float32)
 
 
 @dataclass(frozen=True)

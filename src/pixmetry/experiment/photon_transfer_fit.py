@@ -140,7 +140,7 @@ def _augmented(pt: PhotonTransfer, s: Solution) -> tuple[np.ndarray, np.ndarray]
     n = s.p.size
     values, cov = np.zeros(n + 5), np.zeros((n + 5, n + 5))
     values[:n], cov[:n, :n] = s.p, s.covariance
-    line, line_var = temporal_row_col_vars(pt.dark, pt.frame_shape)
+    line, line_var = temporal_row_col_vars(pt)
     values[ROW_VAR : COL_VAR + 1] = line
     cov[ROW_VAR, ROW_VAR], cov[COL_VAR, COL_VAR] = line_var
     values[LAMP_VAR], cov[LAMP_VAR, LAMP_VAR] = s.components[1], s.components_cov[1, 1]

@@ -52,14 +52,20 @@ def _append(levels: LevelMoments, stack: StackMoments | None) -> LevelMoments:
     return replace(levels, **{name: np.append(getattr(levels, name), extra[name]) for name in present})
 
 
-def temporal_row_col_vars(dark: LevelMoments, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Row and column temporal variances from the dark mean squares, DN², and the variances of these two estimates."""
-    rows, cols = shape
-    f = dark.n_frames - 1
+def temporal_row_col_vars(pt: PhotonTransfer) -> tuple[np.ndarray, np.ndarray]:
+    """Row and column temporal variances from the dark mean squares, DN², and the variances of these two estimates.
+
+    Where the dark frames are clipped at black, from the bright ones that are not clipped.
+    """
+    rows, cols = pt.frame_shape
+    dark, whole = pt.dark, pt.dark.fraction_min - pt.bright.fraction_min.min() <= CLIPPED_BLACK_FRACTION
+    if not whole.any():
+        dark, whole = pt.bright, unclipped_bright(pt)
+    f = (dark.n_frames - 1) * whole
     value, var = np.zeros(2), np.zeros(2)
     for i, (ms, groups, size) in enumerate(((dark.ms_row_dn2, rows, cols), (dark.ms_col_dn2, cols, rows))):
         dof = f * (groups - 1)
-        total = dof.sum()
+        total = max(dof.sum(), 1.0)
         line, pixel = (dof * ms).sum() / total, (dof * dark.ms_pixel_dn2).sum() / total / size
         value[i] = line - pixel
         var[i] = 2 * line**2 / total + 2 * pixel**2 / (total * (size - 1))
@@ -77,7 +83,7 @@ def levels_from(pt: PhotonTransfer, scale: float, by_exposure: bool) -> tuple[mo
     light = np.zeros(is_bright.size)
     light[is_bright] = (pt.bright.exposure_s if by_exposure else pt.bright.photons) / scale
     time_scale = float(max(both["exposure_s"].max(), 1e-12))
-    lines = np.maximum(temporal_row_col_vars(pt.dark, pt.frame_shape)[0], 0) @ [1 / rows, 1 / cols]
+    lines = np.maximum(temporal_row_col_vars(pt)[0], 0) @ [1 / rows, 1 / cols]
     black = pt.dark.mean_dn.mean()
     spatial = np.maximum(both["spatial_cov_dn2"], 0.0)
     lamp_change = np.maximum(both["ms_frame_dn2"] - both["ms_pixel_dn2"] / (rows * cols) - lines, 0)
@@ -113,11 +119,16 @@ def clipped_black(pt: PhotonTransfer) -> float:
     return float(np.max(pt.dark.fraction_min - pt.bright.fraction_min.min(), initial=0.0))
 
 
+def unclipped_bright(pt: PhotonTransfer) -> np.ndarray:
+    """Bright levels without pixels at either end, but for those that always are (stuck and hot ones)."""
+    stuck, hot = pt.bright.fraction_min.min(), pt.dark.fraction_max.max(initial=0.0)
+    return (pt.bright.fraction_max - hot <= USABLE_FRACTION) & (pt.bright.fraction_min - stuck <= USABLE_FRACTION)
+
+
 def usable_levels(pt: PhotonTransfer, d: model.Levels) -> np.ndarray:
     """Levels that are clipped at neither end and lie below the knee of the variance curve, shape (levels,), bool."""
-    stuck, hot = pt.bright.fraction_min.min(), pt.dark.fraction_max.max(initial=0.0)
-    bright_ok = (pt.bright.fraction_max - hot <= USABLE_FRACTION) & (pt.bright.fraction_min - stuck <= USABLE_FRACTION)
-    keep = np.concatenate([pt.dark.fraction_min - stuck <= CLIPPED_BLACK_FRACTION, bright_ok])
+    stuck = pt.bright.fraction_min.min()
+    keep = np.concatenate([pt.dark.fraction_min - stuck <= CLIPPED_BLACK_FRACTION, unclipped_bright(pt)])
     at = np.flatnonzero(d.bright & keep)
     at = at[np.argsort(d.light[at], kind="stable")]
     if at.size:
@@ -154,10 +165,10 @@ def prior_precision(pt: PhotonTransfer, d: model.Levels) -> np.ndarray:
     out[model.A1 : model.A3 + 1] = 1 / NONLINEARITY_PRIOR**2
     out[model.LIGHT_OFFSET] = 1 / LIGHT_OFFSET_PRIOR**2
     dark_var = float(d.ms[~d.bright].mean())
-    spread = float(d.spatial[~d.bright].mean())
-    least = model.least_var_before_rounding(dark_var, spread)
-    q_mean, q_var = model.rounding_error_vars(np.array(least + spread))
-    q_var = q_var + (dark_var - model.QUANTISATION_DN2 - least) ** 2 / 3
+    total = dark_var + float(d.spatial[~d.bright].mean())  # rounding shares its error between frames and pixels
+    least = model.least_var_before_rounding(total)
+    q_mean, q_var = model.rounding_error_vars(np.array(least))
+    q_var = q_var + (total - model.QUANTISATION_DN2 - least) ** 2 / 3
     p = min(clipped_black(pt), CLIPPED_BLACK_FRACTION)
     out[model.Q_MEAN] = 1 / (q_mean + p**2 * dark_var + 1e-12)
     out[model.Q_VAR] = 1 / (q_var + (2 * p * dark_var) ** 2 + 1e-12)

@@ -107,14 +107,14 @@ def rounding_error_vars(var: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return 0.5 * (damp / np.pi) ** 2, 0.5 * ((4 * var + 1 / np.pi**2) * damp) ** 2
 
 
-def least_var_before_rounding(var_dn2: float, spread_dn2: float) -> float:
+def least_var_before_rounding(var_dn2: float) -> float:
     """Smallest variance before rounding that can look like ``var_dn2`` after it, at the worst sub-code phase.
 
     Two codes that toggle show up to 0.25 DN² however small the noise, so the 1/12 rule is not safe near the bound of EMVA 1288 eq. 54.
     """
     v = np.linspace(0, 1, 501)
-    excess = (4 * v + 1 / np.pi**2) * np.exp(-2 * np.pi**2 * (v + spread_dn2))
-    at_most = v + QUANTISATION_DN2 + np.where(v + spread_dn2 < 0.05, 0.25 - QUANTISATION_DN2, excess)
+    excess = (4 * v + 1 / np.pi**2) * np.exp(-2 * np.pi**2 * v)
+    at_most = v + QUANTISATION_DN2 + np.where(v < 0.05, 0.25 - QUANTISATION_DN2, excess)
     return float(v[np.argmax(at_most >= var_dn2)]) if var_dn2 < 1 else var_dn2 - QUANTISATION_DN2
 
 
@@ -127,7 +127,7 @@ def linearise(p: np.ndarray, d: Levels) -> Linearised:
     x_pred = p[SLOPE] * light + dark_x
 
     def noise(x):
-        return np.maximum(p[DARK_VAR], 0) + p[GAIN] * (x - dark_x) + p[DARK_VAR_SLOPE] * d.time
+        return p[DARK_VAR] + p[GAIN] * (x - dark_x) + p[DARK_VAR_SLOPE] * d.time
 
     _, f1_pred, _, _ = transfer(x_pred, a, x_ref)
     spread = d.spatial / f1_pred**2

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from pixmetry.core.errors import MeasureError
 from pixmetry.experiment import photon_transfer_model as model
 from pixmetry.experiment.photon_transfer_levels import MINIMUM_LEVELS, NONLINEARITY_PRIOR
 from pixmetry.experiment.photon_transfer_model import (
@@ -64,7 +65,8 @@ def _start(d: model.Levels, free: np.ndarray) -> tuple[np.ndarray, float]:
         p[DARK_SLOPE], p[OFFSET] = np.polyfit(d.time[dark], d.mean[dark], 1)
         wander = float(np.var(d.mean[dark] - p[OFFSET] - p[DARK_SLOPE] * d.time[dark])) + 1e-12
     else:
-        p[OFFSET] = d.mean[dark].mean() if dark.any() else np.polyfit(h, y, 1)[1]
+        low = h <= np.median(h)
+        p[OFFSET] = d.mean[dark].mean() if dark.any() else np.polyfit(h[low], y[low], 1)[1]
     y = y - p[OFFSET] - p[DARK_SLOPE] * d.time[d.bright]
     weight = 1 / np.sqrt(d.ms[d.bright] / d.pixels + (1e-3 * y) ** 2 + wander)
     slope = np.sum(weight**2 * h * y) / np.sum(weight**2 * h**2)
@@ -72,8 +74,8 @@ def _start(d: model.Levels, free: np.ndarray) -> tuple[np.ndarray, float]:
     design = np.stack([u, u**2, u**3, u**4], axis=1) * d.x_ref * weight[:, None]
     ridge = np.diag([0, *[1 / NONLINEARITY_PRIOR] * 3])
     c = np.linalg.lstsq(np.vstack([design, ridge]), np.concatenate([y * weight, np.zeros(4)]), rcond=None)[0]
-    p[SLOPE] = slope * c[0]
-    p[A1 : A3 + 1] = c[1:] / c[0] ** np.arange(2, 5)
+    bend = c[1:] / c[0] ** np.arange(2, 5)
+    p[SLOPE], p[A1 : A3 + 1] = (slope * c[0], bend) if np.abs(bend).max() < 0.5 else (slope, 0.0)
     x = p[SLOPE] * h
     bent = model.transfer(x, p[A1 : A3 + 1], d.x_ref)[1] ** 2
     ms = (d.ms[d.bright] - model.QUANTISATION_DN2) / bent
@@ -162,7 +164,7 @@ def _solve(d: model.Levels, prior: np.ndarray, start: np.ndarray | None = None, 
     p, wander = _start(d, free)
     components = np.array([wander, 1e-6, 1e-5 if excess else 0.0])
     s = Solution(np.where(free, p if start is None else start, 0.0), free, components, np.array([True, True, excess]))
-    for iteration in range(25):
+    for iteration in range(40):
         step = _step(d, s, prior)
         s.p[free] += step.shift * _damping(s, step.shift)
         sigma = np.sqrt(np.diag(step.normal_inv))
@@ -173,6 +175,9 @@ def _solve(d: model.Levels, prior: np.ndarray, start: np.ndarray | None = None, 
         if still and np.all(np.abs(step.shift) < 1e-3 * sigma):
             break
     step = _step(d, s, prior)
+    if not np.all(np.abs(step.shift) < 0.5 * np.sqrt(np.diag(step.normal_inv))):
+        what = "the fit does not settle: the levels do not follow a camera with a smooth, nearly linear response"
+        raise MeasureError(what, where="photon transfer", remedy="leave out spoilt levels; raise the black level")
     _, info = _reml(step, s, prior)
     return _finish(d, s, step, info)
 

@@ -1,0 +1,260 @@
+"""Monte Carlo: what sources of a camera do to a target's position, from many exposures of windows; one function for every source."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from pixmetry.budget.probe import Facts, Target, background_of, facts_of, offset_dn, resolve, scene_of, window_side
+from pixmetry.core.camera import Camera
+from pixmetry.core.errors import ChainError, InputError
+from pixmetry.core.random import Grid, Streams
+from pixmetry.locate.estimators import Estimator
+
+UNIT_STRIDE = 1_000_003  # between the unit seeds of cameras of one type
+
+
+@dataclass(frozen=True)
+class Axis:
+    """Shift along one axis in px, with standard errors of the Monte Carlo.
+
+    ``u`` is the standard deviation of all shifts of all units about their mean; its two independent parts are ``temporal``, from frame to frame of
+    one target at one place, and ``fixed``, from place to place and unit to unit.
+    """
+
+    bias: float
+    u: float
+    temporal: float
+    fixed: float
+    se_bias: float
+    se_u: float
+    se_temporal: float
+    se_fixed: float
+
+
+@dataclass(frozen=True)
+class MonteCarlo:
+    """Result of a Monte Carlo over units, places (with phases) and frames."""
+
+    x: Axis
+    y: Axis
+    names: tuple[str, ...]
+    units: int
+    places: int
+    frames: int
+    lost: int  # trials in which no target was found, left out together with their place
+    mode: str
+    frozen_tail: float  # largest share of a pixel's signal that the mode `frozen` takes from the noise-free frame
+
+    @property
+    def trials(self) -> int:
+        """Number of exposed windows."""
+        return self.units * self.places * self.frames
+
+    @property
+    def total_px(self) -> float:
+        """Root mean square over x and y of random part and bias together."""
+        return float(np.sqrt(0.5 * sum(a.u**2 + a.bias**2 for a in (self.x, self.y))))
+
+    @property
+    def se_total_px(self) -> float:
+        """Standard error of `total_px`."""
+        if self.total_px == 0:
+            return 0.0
+        return float(np.sqrt(sum((a.u * a.se_u) ** 2 + (a.bias * a.se_bias) ** 2 for a in (self.x, self.y))) / (2 * self.total_px))
+
+
+@dataclass
+class Trials:
+    """The design of a Monte Carlo: which target, at which places, in how many units and frames; the same for every set of sources.
+
+    Positions that were found are kept, so that the chain that all are compared with is run once.
+
+    Parameters
+    ----------
+    camera : Camera
+    target : Target
+    estimator : Estimator
+    facts : Facts
+    trials : int
+        Windows to expose, at least; rounded up to whole units, places and frames.
+    units : int
+        Cameras of this type.
+    frames : int
+        Frames of each target at each place, at least 2 to tell temporal from fixed.
+    mode : {"frozen", "exact"}
+    seed : int
+    """
+
+    camera: Camera
+    target: Target
+    estimator: Estimator
+    facts: Facts
+    trials: int = 2048
+    units: int = 8
+    frames: int = 2
+    mode: str = "frozen"
+    seed: int = 0
+    _found: dict[tuple[bool, ...], tuple[np.ndarray, np.ndarray]] = field(default_factory=dict, repr=False)
+
+    def __post_init__(self) -> None:
+        if self.units < 1 or self.frames < 1 or self.trials < 1:
+            raise InputError("a Monte Carlo needs trials", value=(self.trials, self.units, self.frames), allowed="1 or more of each")
+        self.side = window_side(self.estimator)
+        if min(self.camera.frame_shape) < self.side:
+            raise InputError("the frame is smaller than the window", value=self.camera.frame_shape, allowed=f"{self.side} × {self.side} px")
+        self.places = max(2, -(-self.trials // (self.units * self.frames)))
+        self.located = resolve(self.estimator, self.target, self.facts)
+        draws = Streams(self.seed, self.seed).of("budget.places").uniform_unit(4 * self.units * self.places).astype(float)
+        row, col, self.dx, self.dy = draws.reshape(4, self.units, self.places)
+        self.dx, self.dy = self.dx - 0.5, self.dy - 0.5
+        self.row0 = np.floor(row * (self.camera.frame_shape[0] - self.side + 1)).astype(np.int64)
+        self.col0 = np.floor(col * (self.camera.frame_shape[1] - self.side + 1)).astype(np.int64)
+
+    def true_shift(self) -> tuple[np.ndarray, np.ndarray]:
+        """True positions from the window's middle pixel, shape (units, places, frames)."""
+        shape = (self.units, self.places, self.frames)
+        return tuple(np.broadcast_to(v[:, :, None], shape) for v in (self.dx, self.dy))
+
+    def positions(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+        """Positions found in the frames of a variant of the camera, from the window's middle pixel, shape (units, places, frames)."""
+        key = tuple(e.on for e in camera.chain)
+        if key not in self._found:
+            parts = [self._unit(replace(camera, unit_seed=camera.unit_seed + UNIT_STRIDE * k), k) for k in range(self.units)]
+            self._found[key] = tuple(np.stack(p) for p in zip(*parts, strict=True))
+        return self._found[key]
+
+    def _unit(self, camera: Camera, unit: int) -> tuple[np.ndarray, np.ndarray]:
+        n, middle = self.places * self.frames, self.side // 2
+        row0, col0 = (np.repeat(v[unit], self.frames) for v in (self.row0, self.col0))
+        x, y = (np.repeat(v[unit], self.frames) + middle for v in (self.dx, self.dy))
+        scene = scene_of(self.target, self.facts, x + col0, y + row0)
+        windows = camera.expose_windows(
+            scene,
+            Grid(np.arange(n), row0, col0, (self.side, self.side)),
+            seed=self.seed + UNIT_STRIDE * unit,
+            mode=self.mode,
+            background=background_of(self.target, self.facts),
+            exposure_s=self.facts.exposure_s,
+            temperature_c=self.facts.temperature_c,
+        )
+        x_hat, y_hat = replace(self.located, background_dn=self.located.background_dn + offset_dn(camera)).locate(windows)
+        return tuple((v - middle).reshape(self.places, self.frames) for v in (x_hat, y_hat))
+
+    def compare(self, names: Iterable[str], with_it: Camera, without: Camera | None) -> MonteCarlo:
+        """Shift of the positions in one variant of the camera against those in another, or (None) against the truth."""
+        found = self.positions(with_it)
+        reference = self.true_shift() if without is None else self.positions(without)
+        shift = [a - b for a, b in zip(found, reference, strict=True)]
+        lost = int(np.isnan(shift[0]).sum())
+        x, y = (_axis(s) for s in shift)
+        tail = with_it.frozen_tail() if self.mode == "frozen" else 0.0
+        return MonteCarlo(x, y, tuple(names), self.units, self.places, self.frames, lost, self.mode, tail)
+
+    def of(self, only: Iterable[str] | None = None, off: Iterable[str] | None = None) -> MonteCarlo:
+        """What some sources do: alone on an otherwise perfect chain (``only``), or as they are missed in the whole chain (``off``).
+
+        With neither, what the whole camera and the estimator do against the truth.
+        """
+        if only is None and off is None:
+            return self.compare([e.name for e in self.camera.active], self.camera, None)
+        if only is not None and off is not None:
+            raise InputError("either only or off", remedy="leave one of them out")
+        if off is not None:
+            off = tuple(off)
+            return self.compare(off, self.camera, self.camera.switched(off=off))
+        only = tuple(only)
+        helpers = helpers_of(self.camera, only)
+        return self.compare(only, self.camera.switched(on=(*only, *helpers)), self.camera.switched(on=helpers))
+
+
+def helpers_of(camera: Camera, names: Iterable[str]) -> tuple[str, ...]:
+    """Conversions that some sources need to be run at all although they are not essential: a source of stored codes needs a converter."""
+    names = tuple(names)
+    try:
+        camera.switched(on=names)
+    except ChainError:
+        return tuple(e.name for e in camera.chain if e.source.produces is not None and e.name not in names and not e.source.essential)
+    return ()
+
+
+def monte_carlo(
+    camera: Camera,
+    target: Target,
+    estimator: Estimator,
+    *,
+    only: Iterable[str] | None = None,
+    off: Iterable[str] | None = None,
+    trials: int = 2048,
+    units: int = 8,
+    frames: int = 2,
+    mode: str = "frozen",
+    seed: int = 0,
+    facts: Facts | None = None,
+) -> MonteCarlo:
+    """Shift of a target by some sources of a camera, or by all of it.
+
+    Targets fall evenly on the pixel and on the sensor; several units of the camera see each its own places, and each place is exposed
+    more than once. With and without the sources the same random numbers are drawn, so that only what the sources do is seen.
+
+    Parameters
+    ----------
+    camera : Camera
+    target : Target
+    estimator : Estimator
+    only, off : iterable of str, optional
+        Names in the chain: these alone against the bare conversions, or the camera against itself without these. With neither, the whole
+        camera against the truth; the estimator's own error is then part of it.
+    trials, units, frames : int
+        Windows in all, cameras of this type, frames of each place.
+    mode : {"frozen", "exact"}
+        See `Camera.expose_windows`.
+    seed : int
+    facts : Facts, optional
+        By default those that the camera tells.
+
+    Returns
+    -------
+    MonteCarlo
+
+    References
+    ----------
+    JCGM 101:2008 (propagation of distributions by a Monte Carlo method).
+    """
+    facts = facts_of(camera, target) if facts is None else facts
+    return Trials(camera, target, estimator, facts, trials, units, frames, mode, seed).of(only, off)
+
+
+def _axis(shift: np.ndarray) -> Axis:
+    """Bias and random parts of shifts (units, places, frames), and their standard errors.
+
+    Nested analysis of variance, each place of each unit a group: temporal variance is the mean of the groups' sample variances; fixed
+    variance that of the groups' means less temporal/frames. Standard errors are those of means over groups, which asks nothing of the
+    distribution; that of the bias is from the scatter of the units' means where that is the larger.
+    """
+    units, places, frames = shift.shape
+    keep = np.isfinite(shift).all(axis=2)
+    if keep.sum() < 2:
+        return Axis(*(float("nan"),) * 8)
+    groups = shift[keep]
+    n = len(groups)
+    means = groups.mean(axis=1)
+    bias = float(means.mean())
+    temporal = groups.var(axis=1, ddof=1) if frames > 1 else np.zeros(n)
+    between = (means - bias) ** 2 * n / (n - 1)
+    fixed = between - temporal / frames
+    se_bias = np.sqrt(between.mean() / n)
+    of_units = [row[good].mean() for row, good in zip(shift.mean(axis=2), keep, strict=True) if good.any()]
+    if len(of_units) > 1:
+        se_bias = max(se_bias, np.std(of_units, ddof=1) / np.sqrt(len(of_units)))
+    roots = [_root(v) for v in (fixed + temporal, temporal, fixed)]
+    return Axis(bias, *(r[0] for r in roots), float(se_bias), *(r[1] for r in roots))
+
+
+def _root(variances: np.ndarray) -> tuple[float, float]:
+    """Standard deviation from unbiased estimates of a variance, one a group, and its standard error; 0 where they are negative."""
+    mean, error = float(variances.mean()), float(variances.std(ddof=1) / np.sqrt(len(variances)))
+    u = np.sqrt(max(mean, 0.0))
+    return float(u), float(error / (2 * u)) if u > np.sqrt(error) else float(np.sqrt(error))

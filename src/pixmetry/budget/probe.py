@@ -1,0 +1,256 @@
+"""The target of a budget, the camera's numbers that it needs, and the noise-free probe through which each source acts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+
+from pixmetry.core.camera import Camera
+from pixmetry.core.contribution import Probe
+from pixmetry.core.errors import InputError
+from pixmetry.core.random import Grid
+from pixmetry.core.signal import Kind
+from pixmetry.locate.estimators import Estimator, split_text
+from pixmetry.scene.discs import Discs
+from pixmetry.scene.uniform import Uniform
+
+WINDOW_PX = 24  # side of the windows that are exposed; the estimator's own lies in their middle
+PHASES = 8  # per axis
+
+
+@dataclass(frozen=True)
+class Target:
+    """A disc on a background.
+
+    Parameters
+    ----------
+    kind : {"disc"}
+    diameter_px, blur_px : float
+        Diameter of the sharp disc, standard deviation of the optical blur.
+    peak_rel, background_rel : float
+        Height of the disc above the background, and the background, as parts of the saturation above black.
+    """
+
+    kind: str = "disc"
+    diameter_px: float = 7.0
+    blur_px: float = 0.7
+    peak_rel: float = 0.6
+    background_rel: float = 0.02
+
+    def __post_init__(self) -> None:
+        if self.kind != "disc":
+            raise InputError("no such target", value=self.kind, allowed="disc")
+        if not (0.5 <= self.diameter_px <= 200 and 0.05 <= self.blur_px <= 20):
+            raise InputError(
+                "the target's size cannot be used", value=(self.diameter_px, self.blur_px), allowed="diameter 0.5 to 200 px, blur 0.05 to 20 px"
+            )
+        if not (self.peak_rel > 0 and self.background_rel >= 0 and self.peak_rel + self.background_rel <= 1):
+            raise InputError(
+                "the target does not fit between black and saturation",
+                value={"peak": self.peak_rel, "background": self.background_rel},
+                allowed="peak above 0, background from 0, together at most 1",
+            )
+
+    def describe(self) -> str:
+        """Say it in words."""
+        return (
+            f"{self.kind} of {self.diameter_px:g} px, blur {self.blur_px:g} px, {100 * self.peak_rel:g} % of saturation "
+            f"on a background of {100 * self.background_rel:g} %"
+        )
+
+
+def parse_target(text: str) -> Target:
+    """Read a target from ``disc:key=value,…``, as in ``disc:diameter=7,blur=0.7,peak=0.6,background=0.02``.
+
+    Raises
+    ------
+    InputError
+        If name, key or value cannot be used.
+    """
+    keys = {"diameter": "diameter_px", "blur": "blur_px", "peak": "peak_rel", "background": "background_rel"}
+    kind, values = split_text(text, keys, "target")
+    return Target(kind=kind, **values)
+
+
+@dataclass(frozen=True)
+class Facts:
+    """The camera's numbers that a budget needs.
+
+    Parameters
+    ----------
+    dn_per_photon, gain_dn_per_e : float
+        Linear response to a photon and to an electron.
+    saturation_dn : float
+        Above black.
+    noise_dn : float
+        Standard deviation of a pixel on the target's background, temporal and fixed.
+    bits : int
+    exposure_s, temperature_c : float
+    frame_shape : (int, int)
+    """
+
+    dn_per_photon: float
+    gain_dn_per_e: float
+    saturation_dn: float
+    noise_dn: float
+    bits: int
+    exposure_s: float
+    temperature_c: float
+    frame_shape: tuple[int, int]
+
+
+def facts_of(camera: Camera, target: Target, known: Mapping[str, Any] | None = None) -> Facts:
+    """Read these numbers off a camera's chain; what is given in ``known`` goes before.
+
+    Notes
+    -----
+    The linear response is that of the essential conversions alone. Saturation is the smaller of full well and converter's range. The noise
+    is the scatter over 128 windows of the background through the whole chain, without what lies beyond four standard deviations.
+
+    Raises
+    ------
+    InputError
+        If a name in ``known`` is not one of them, or the camera does not tell gain or saturation.
+    """
+    known = dict(known or {})
+    unknown = set(known) - {f.name for f in fields(Facts)}
+    if unknown:
+        raise InputError("not a fact that a budget uses", value=sorted(unknown), allowed=", ".join(f.name for f in fields(Facts)))
+    response = known.get("dn_per_photon") or _response(camera)
+    gain = known.get("gain_dn_per_e") or _parameter(camera, "gain_dn_per_e")
+    if gain is None:
+        raise InputError("the camera does not tell its gain", where=camera.name, remedy="give gain_dn_per_e among the facts")
+    bits = known.get("bits") or _parameter(camera, "bits") or camera.facts.get("bits") or 8
+    saturation = known.get("saturation_dn") or camera.facts.get("saturation_dn") or _saturation(camera, gain, int(bits))
+    background = target.background_rel * saturation / response
+    noise = known.get("noise_dn")
+    if noise is None:
+        noise = _noise(camera, background)
+    return Facts(
+        dn_per_photon=float(response),
+        gain_dn_per_e=float(gain),
+        saturation_dn=float(saturation),
+        noise_dn=float(noise),
+        bits=int(bits),
+        exposure_s=float(known.get("exposure_s") or camera.exposure_s),
+        temperature_c=float(known.get("temperature_c", camera.temperature_c)),
+        frame_shape=tuple(known.get("frame_shape") or camera.frame_shape),
+    )
+
+
+def scene_of(target: Target, facts: Facts, x_px: np.ndarray, y_px: np.ndarray) -> Discs:
+    """One target a frame: frame k has its centre at ``(x_px[k], y_px[k])``."""
+    scale = facts.saturation_dn / facts.dn_per_photon
+    return Discs(
+        x_px=np.asarray(x_px, float)[:, None],
+        y_px=np.asarray(y_px, float)[:, None],
+        diameter_px=target.diameter_px,
+        blur_px=target.blur_px,
+        peak_photons=target.peak_rel * scale,
+        background=background_of(target, facts),
+        per_frame=True,
+    )
+
+
+def background_of(target: Target, facts: Facts) -> Uniform:
+    """The target's background alone."""
+    return Uniform(target.background_rel * facts.saturation_dn / facts.dn_per_photon)
+
+
+def window_side(estimator: Estimator) -> int:
+    """Side of the windows that hold the estimator's square and what its neighbours need."""
+    return max(WINDOW_PX, estimator.window + 11)
+
+
+def resolve(estimator: Estimator, target: Target, facts: Facts) -> Estimator:
+    """The estimator for this target's background and noise."""
+    return estimator.resolved(target.background_rel * facts.saturation_dn, facts.noise_dn)
+
+
+def make_probe(facts: Facts, target: Target, estimator: Estimator, phases: int = PHASES) -> Probe:
+    """Render the target noise-free at a lattice of ``phases`` × ``phases`` places within the pixel and see it through the estimator.
+
+    Raises
+    ------
+    InputError
+        If the target does not stand above the threshold.
+    """
+    side = window_side(estimator)
+    estimator = resolve(estimator, target, facts)
+    if estimator.threshold_dn is not None and estimator.threshold_dn >= target.peak_rel * facts.saturation_dn:
+        raise InputError(
+            "the target does not stand above the threshold",
+            value=f"{target.peak_rel * facts.saturation_dn:.3g} DN against {estimator.threshold_dn:.3g} DN",
+            remedy="take a brighter target or a lower threshold",
+        )
+    lattice = (np.arange(phases) + 0.5) / phases - 0.5
+    dx, dy = (v.ravel() for v in np.meshgrid(lattice, lattice))
+    x, y = side // 2 + dx, side // 2 + dy
+    n = len(x)
+    zero = np.zeros(n, np.int64)
+    grid = Grid(np.arange(n), zero, zero, (side, side))
+    photons = scene_of(target, facts, x, y).photons(grid, (side, side), np.full(n, facts.exposure_s), np.zeros(n))
+    signal = photons.astype(float) * facts.dn_per_photon
+    x_hat, y_hat = estimator.locate(signal)
+    gx, gy = estimator.gradient(signal)
+    return Probe(
+        signal_dn=signal,
+        background_dn=target.background_rel * facts.saturation_dn,
+        x_px=x,
+        y_px=y,
+        x_hat_px=x_hat,
+        y_hat_px=y_hat,
+        gx=gx,
+        gy=gy,
+        gain_dn_per_e=facts.gain_dn_per_e,
+        exposure_s=facts.exposure_s,
+        temperature_c=facts.temperature_c,
+        bits=facts.bits,
+        frame_shape=facts.frame_shape,
+    )
+
+
+def offset_dn(camera: Camera) -> float:
+    """The black level that the chain adds: that of its converter, if it is on."""
+    return float(sum(getattr(e.params, "offset_dn", 0.0) for e in camera.active if e.source.produces is Kind.CODES))
+
+
+def _parameter(camera: Camera, name: str) -> Any:
+    return next((getattr(e.params, name) for e in camera.chain if hasattr(e.params, name)), None)
+
+
+def _response(camera: Camera) -> float:
+    """DN per photon of the essential conversions."""
+    bare = camera.switched(on=())
+    level = 1000.0
+    out = [float(bare.expose(Uniform(v), window=(0, 0, 1, 1), quiet=True).data[0, 0, 0]) for v in (0.0, level)]
+    if not out[1] > out[0]:
+        raise InputError("the camera does not answer to light", where=camera.name, remedy="check its chain")
+    return (out[1] - out[0]) / level
+
+
+def _saturation(camera: Camera, gain_dn_per_e: float, bits: int) -> float:
+    well = _parameter(camera, "full_well_e")
+    converters = [e for e in camera.chain if e.source.produces is Kind.CODES]
+    limits = [] if well is None else [well * gain_dn_per_e]
+    if converters or "bits" in camera.facts:
+        limits.append(2**bits - 1 - max(0.0, sum(getattr(e.params, "offset_dn", 0.0) for e in converters)))
+    if not limits:
+        raise InputError("the camera does not tell where it saturates", where=camera.name, remedy="give saturation_dn among the facts")
+    return float(min(limits))
+
+
+def _noise(camera: Camera, background_photons: float, windows: int = 128) -> float:
+    side = min(16, *camera.frame_shape)
+    scene = Uniform(background_photons)
+    step = np.arange(windows)
+    row0 = (step * 0.6180339887 % 1 * (camera.frame_shape[0] - side + 1)).astype(np.int64)
+    col0 = (step * 0.7548776662 % 1 * (camera.frame_shape[1] - side + 1)).astype(np.int64)
+    data = camera.expose_windows(scene, Grid(step, row0, col0, (side, side)), mode="frozen", background=scene).astype(float)
+    residual = (data - data.mean(axis=(1, 2), keepdims=True)).ravel()
+    for _ in range(4):
+        residual = residual[np.abs(residual) <= 4 * residual.std() + 1e-12]
+    return float(residual.std())

@@ -1,0 +1,100 @@
+"""Automatic gain control: the gain of each frame follows the brightness of the one before."""
+
+from __future__ import annotations
+
+import numpy as np
+from pydantic import model_validator
+
+from pixmetry.core.contribution import Contribution, Probe
+from pixmetry.core.errors import ParameterError
+from pixmetry.core.random import Stream
+from pixmetry.core.signal import Kind, Signal, Windows
+from pixmetry.core.source import Parameters, Source, quantity
+
+DARKEST_DN = 1e-6  # a frame without light asks for all the gain there is
+
+
+class Agc(Parameters):
+    """A loop that is linear in decibels."""
+
+    target_dn: float = quantity(100.0, "DN", "mean of the whole frame above black that it aims at", gt=0, le=1e9)
+    kappa: float = quantity(0.0, "1", "part of the deviation in decibels that one frame removes; 0 locks the gain", ge=0, le=1)
+    lowest_db: float = quantity(0.0, "dB", "lowest gain", ge=-40, le=0)
+    highest_db: float = quantity(32.0, "dB", "highest gain", ge=0, le=80)
+
+    @model_validator(mode="after")
+    def _settles(self) -> Agc:
+        if 0 < self.kappa < 0.02:
+            raise ParameterError("the loop would take hundreds of frames to settle", value=self.kappa, allowed="0, or 0.02 to 1")
+        return self
+
+
+def start(params: Agc) -> float:
+    """Gain before frame 0."""
+    return 1.0
+
+
+def following(params: Agc, gain: float, mean_dn: float) -> float:
+    """Gain of the next frame, from the gain of this one and the mean that it gave."""
+    wanted = gain * (params.target_dn / max(mean_dn, DARKEST_DN)) ** params.kappa
+    return float(np.clip(wanted, 10 ** (params.lowest_db / 20), 10 ** (params.highest_db / 20)))
+
+
+def forward(params: Agc, signal: Signal, stream: Stream, state: float) -> tuple[Signal, float]:
+    """Multiply frame by frame by the gain and move it on; over windows, which do not know the frame's mean, it stays as it is."""
+    if params.kappa == 0:
+        return signal, state
+    if signal.data.shape[1:] != tuple(signal.frame_shape):
+        return signal.with_data(signal.data * np.float32(state)), state
+    data = np.empty_like(signal.data, np.float32)
+    for i, frame in enumerate(signal.data):
+        np.multiply(frame, np.float32(state), out=data[i])
+        state = following(params, state, float(data[i].mean(dtype=np.float64)))
+    return signal.with_data(data), state
+
+
+def context(params: Agc, windows: Windows, frame_shape: tuple[int, int]) -> Windows:
+    """The whole frame: its mean sets the gain."""
+    return windows.full_frame(frame_shape) if params.kappa else windows
+
+
+def propagate(params: Agc, probe: Probe) -> Contribution:
+    """First order in the logarithm of the gain.
+
+    A common factor moves no centroid. It does move an estimator with a threshold in DN, for which a gain g is a threshold T/g: the shift
+    is ln g times the response to the signal's own shape, with g that of a steady frame as bright as the background.
+    """
+    if params.kappa == 0:
+        return probe.contribution((0.0, 0.0), "F", method="the gain is locked")
+    steady = following(params.model_copy(update={"kappa": 1.0}), 1.0, probe.background_dn)
+    dx, dy = probe.field(np.log(steady) * probe.signal_dn)
+    return probe.from_shifts(dx, dy, "F", model_error=1.0, method="linear response of the estimator to the logarithm of the gain")
+
+
+SOURCE = Source(
+    id="electronics.agc",
+    title="Automatic gain control",
+    description="The gain follows the scene from frame to frame: grey values, noise and what a fixed threshold cuts off change with it.",
+    number=22,
+    stars=3,
+    parameters=Agc,
+    consumes=(Kind.DN,),
+    after=("sensor",),
+    before=("cable", "grabber", "storage"),
+    neutral=Agc(),
+    typical=Agc(kappa=0.3, highest_db=16.0),
+    bound=Agc(kappa=0.3, highest_db=32.0),
+    forward=forward,
+    propagate=propagate,
+    context=context,
+    start=start,
+    gum_class="F",
+    equation="g(t+1) = g(t) (y_target/⟨y(t)⟩)^κ,  within the limits",
+    typical_size="no shift for a centroid; a hard threshold of fixed DN goes from 0.03 to 0.09 px",
+    references=("K. J. Åström, R. M. Murray, Feedback Systems, Princeton 2008 (first-order discrete loop)",),
+    advice="Switch it off.",
+    reasons={
+        "measure": "needs a sequence in which part of the scene changes: frames of steady light do not move the gain",
+        "correct": "the gain of each frame is not in the frame; lock it, or set the threshold relative to the target's peak",
+    },
+)

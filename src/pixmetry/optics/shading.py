@@ -1,0 +1,111 @@
+"""Lens shading and uneven light: a smooth factor over the frame, which pulls every target towards its brighter side."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from pixmetry.core.contribution import Contribution, Probe
+from pixmetry.core.errors import MeasureError
+from pixmetry.core.estimates import Estimates
+from pixmetry.core.observations import Observations
+from pixmetry.core.random import Stream
+from pixmetry.core.signal import Kind, Signal
+from pixmetry.core.source import Parameters, Source, quantity
+
+SMALLEST_FACTOR = 1e-3  # a frame cannot be darker than dark, and the correction divides by this
+
+
+class Shading(Parameters):
+    """A tilted paraboloid about the frame's centre, whose mean over the frame is 1."""
+
+    gradient_x_per_px: float = quantity(0.0, "1/px", "gradient along x at the centre of the frame, relative to the mean light", ge=-0.1, le=0.1)
+    gradient_y_per_px: float = quantity(0.0, "1/px", "gradient along y at the centre of the frame, relative to the mean light", ge=-0.1, le=0.1)
+    corner_rel: float = quantity(0.0, "1", "loss from the centre to the corners, relative to the mean light; grows with the square of the radius", ge=0, le=0.95)
+
+
+def curvature_per_px2(params: Shading, frame_shape: tuple[int, int]) -> float:
+    """Loss per squared distance from the centre, so that a corner pixel loses ``corner_rel``."""
+    radius2 = ((frame_shape[0] - 1) ** 2 + (frame_shape[1] - 1) ** 2) / 4
+    return params.corner_rel / radius2 if radius2 else 0.0
+
+
+def factor(params: Shading, signal: Signal) -> np.ndarray:
+    """Relative light in every pixel, shape (n, rows, cols), float32; its mean over the frame is 1 unless it is cut off just above 0."""
+    loss = curvature_per_px2(params, signal.frame_shape)
+    rows, cols = signal.frame_shape
+    y, x = signal.rows - (rows - 1) / 2, signal.cols - (cols - 1) / 2
+    centre = 1 + loss * (rows**2 + cols**2 - 2) / 12  # the mean of x² over n pixels about their centre is (n² − 1)/12
+    along_y = (centre + y * (params.gradient_y_per_px - loss * y)).astype(np.float32)
+    along_x = (x * (params.gradient_x_per_px - loss * x)).astype(np.float32)
+    return np.maximum(along_y[:, :, None] + along_x[:, None, :], np.float32(SMALLEST_FACTOR))
+
+
+def forward(params: Shading, signal: Signal, stream: Stream) -> Signal:
+    """Multiply the light by the factor."""
+    return signal.with_data(signal.data * factor(params, signal))
+
+
+def measure(observations: Observations) -> Estimates:
+    """Read the gradient at the centre from the smooth surface through the flat-field stack."""
+    fit = observations.spatial_fit
+    if fit is None or "shading_x_per_px" not in fit:
+        raise MeasureError(
+            "shading needs a stack of bright frames and one of dark frames", where="optics.shading", remedy="take at least 16 of each"
+        )
+    return fit.select({"gradient_x_per_px": "shading_x_per_px", "gradient_y_per_px": "shading_y_per_px"})
+
+
+def correct(params: Shading, signal: Signal, maps: Mapping[str, np.ndarray]) -> Signal:
+    """Divide by the factor that the parameters give; it needs no map."""
+    return signal.with_data(signal.data / factor(params, signal))
+
+
+def propagate(params: Shading, probe: Probe) -> Contribution:
+    """Propagator P3: a relative ramp g moves a centroid by g⟨x²⟩.
+
+    The gradient at the centre gives the bias; the slope of the quadratic part, whose mean over the frame is zero and whose root mean
+    square is 2·loss·size/√12, gives the spread over targets anywhere on the frame.
+    """
+    rows, cols = probe.signal_dn.shape[1:]
+    ramp_x = (np.arange(cols) - probe.x_px[:, None])[:, None, :] * probe.signal_dn
+    ramp_y = (np.arange(rows) - probe.y_px[:, None])[:, :, None] * probe.signal_dn
+    (xx, yx), (xy, yy) = probe.field(ramp_x), probe.field(ramp_y)
+    slopes = 2 * curvature_per_px2(params, probe.frame_shape) * np.array(probe.frame_shape) / np.sqrt(12)
+    gx, gy = params.gradient_x_per_px, params.gradient_y_per_px
+    dx, dy = gx * xx + gy * xy, gx * yx + gy * yy
+    spread_x = np.sqrt(np.var(dx) + np.mean((slopes[1] * xx) ** 2 + (slopes[0] * xy) ** 2))
+    spread_y = np.sqrt(np.var(dy) + np.mean((slopes[1] * yx) ** 2 + (slopes[0] * yy) ** 2))
+    return Contribution(
+        u_x_px=float(spread_x),
+        u_y_px=float(spread_y),
+        bias_x_px=float(np.mean(dx)),
+        bias_y_px=float(np.mean(dy)),
+        gum_class="G",
+        model_error=0.15,
+        method="linear response of the estimator to a relative ramp; slope of the quadratic part: rms over the frame",
+    )
+
+
+SOURCE = Source(
+    id="optics.shading",
+    title="Lens shading and uneven light",
+    description="The light falls off smoothly over the frame; the gradient across a target pulls its centre to the brighter side.",
+    number=54,
+    parameters=Shading,
+    consumes=(Kind.PHOTONS,),
+    before=("sensor",),
+    neutral=Shading(),
+    typical=Shading(gradient_x_per_px=2e-4, gradient_y_per_px=1e-4, corner_rel=0.2),
+    bound=Shading(gradient_x_per_px=1e-3, gradient_y_per_px=1e-3, corner_rel=0.4),
+    forward=forward,
+    measure=measure,
+    correct=correct,
+    propagate=propagate,
+    gum_class="G",
+    equation="µ' = µ (1 + g_x (x − x_c) + g_y (y − y_c) − k (r² − ⟨r²⟩)/r_corner²);  Δx = g ⟨x²⟩",
+    typical_size="0.004 to 0.011 px for 0.1 to 0.3 % per px on a disc of 7 px (centroid)",
+    references=("ISO 17957:2015 (shading)", "JCGM 100:2008, 5.1.2"),
+    advice="Light the object evenly, stop the lens down, and divide by a flat field.",
+)

@@ -1,0 +1,170 @@
+"""The table of measured camera values beside the linear rule of EMVA 1288."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from pixmetry.core.errors import PixmetryError
+from pixmetry.core.estimates import Estimate, Estimates
+from pixmetry.core.observations import Observations
+from pixmetry.experiment.spatial_fit import emva_spatial
+from pixmetry.report.numbers import NONE, Number, limit, significant, uncertain
+
+PERCENT, PER_1000_PX = (100.0, "%"), (1e5, "%/1000 px")
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """How one estimate is shown: its name in words, the name of the standard's value beside it, factor and unit of the display."""
+
+    title: str
+    standard: str = ""
+    display: tuple[float, str] | None = None
+
+
+@dataclass(frozen=True)
+class Row:
+    """A row of the table, all as text."""
+
+    title: str
+    name: str
+    number: Number
+    dof: str
+    standard: str
+    reason: str
+
+
+TRANSFER = {
+    "gain_dn_per_e": Quantity("System gain K", "gain_dn_per_e"),
+    "quantum_efficiency": Quantity("Quantum efficiency", "quantum_efficiency", PERCENT),
+    "responsivity_dn_per_s": Quantity("Signal rate of this series, at zero signal"),
+    "offset_dn": Quantity("Black level"),
+    "dark_noise_e": Quantity("Dark noise, white", "dark_noise_e"),
+    "row_noise_e": Quantity("Row noise, temporal"),
+    "column_noise_e": Quantity("Column noise, temporal"),
+    "dark_current_e_per_s": Quantity("Dark current"),
+    "saturation_dn": Quantity("Saturation, stored value", "saturation_dn"),
+    "full_well_e": Quantity("Saturation, electrons", "saturation_e"),
+    "nonlinearity_a1": Quantity("Non-linearity a₁, at the top code", "", PERCENT),
+    "nonlinearity_a2": Quantity("Non-linearity a₂, at the top code", "", PERCENT),
+    "nonlinearity_a3": Quantity("Non-linearity a₃, at the top code", "", PERCENT),
+    "illumination_noise_rel": Quantity("Noise of the light, level to level", "", PERCENT),
+}
+SPATIAL = {
+    "dsnu_total_dn": Quantity("DSNU, total", "dsnu1288_dn"),
+    "dsnu_pixel_dn": Quantity("DSNU, pixels"),
+    "dsnu_row_dn": Quantity("DSNU, rows"),
+    "dsnu_col_dn": Quantity("DSNU, columns"),
+    "prnu_total_rel": Quantity("PRNU, total", "prnu1288_rel", PERCENT),
+    "prnu_pixel_rel": Quantity("PRNU, pixels", "", PERCENT),
+    "prnu_row_rel": Quantity("PRNU, rows", "", PERCENT),
+    "prnu_col_rel": Quantity("PRNU, columns", "", PERCENT),
+    "shading_x_per_px": Quantity("Shading, gradient in x", "", PER_1000_PX),
+    "shading_y_per_px": Quantity("Shading, gradient in y", "", PER_1000_PX),
+    "shading_pp_rel": Quantity("Shading, peak to peak", "", PERCENT),
+}
+STANDARD_ONLY = {
+    "snr_max": "Largest signal-to-noise ratio",
+    "dynamic_range": "Dynamic range",
+    "threshold_e": "Absolute sensitivity threshold",
+    "threshold_photons": "Absolute sensitivity threshold",
+    "saturation_photons": "Saturation, photons",
+}
+
+
+def table(seen: Observations, standard: Estimates) -> dict[str, list[Row]]:
+    """Rows by heading, in the order in which a data sheet gives them."""
+    beside = standard.join(_spatial_standard(seen))
+    groups = {
+        "Photon transfer": _rows(seen.photon_transfer_fit, TRANSFER, beside),
+        "Fixed pattern": _rows(seen.spatial_fit, SPATIAL, beside),
+        "Converter, defects, patterns": [*_codes(seen), *_defects(seen), *_patterns(seen)],
+        "By EMVA 1288 alone": [
+            Row(title, name, Number(NONE, NONE, ""), "", _standard_text(beside, name, None), "")
+            for name, title in STANDARD_ONLY.items()
+            if name in beside
+        ],
+    }
+    return {heading: rows for heading, rows in groups.items() if rows}
+
+
+def _spatial_standard(seen: Observations) -> Estimates:
+    if seen.dark_stack is None or seen.bright_stack is None:
+        return Estimates.empty()
+    try:
+        return emva_spatial(seen.dark_stack, seen.bright_stack)
+    except PixmetryError:
+        return Estimates.empty()
+
+
+def _rows(found: Estimates | None, shown: Mapping[str, Quantity], beside: Estimates) -> list[Row]:
+    if found is None:
+        return []
+    others = {e.name: Quantity(e.name) for e in found if e.name not in shown}
+    return [_row(found[name], quantity, beside) for name, quantity in (shown | others).items() if name in found]
+
+
+def _row(e: Estimate, quantity: Quantity, beside: Estimates) -> Row:
+    scale, unit = quantity.display or (1.0, e.unit)
+    number = limit(e.value * scale, unit) if e.kind == "upper_limit" else uncertain(e.value * scale, e.u * scale, unit)
+    standard = _standard_text(beside, quantity.standard, quantity.display) if quantity.standard in beside else ""
+    return Row(quantity.title, e.name, number, _dof(e.dof), standard, e.reason)
+
+
+def _standard_text(beside: Estimates, name: str, display: tuple[float, str] | None) -> str:
+    e = beside[name]
+    scale, unit = display or (1.0, e.unit)
+    if e.kind == "upper_limit":
+        return "negative" if e.value <= 0 else _joined(limit(e.value * scale, unit))
+    return _joined(uncertain(e.value * scale, e.u * scale, unit))
+
+
+def _joined(number: Number) -> str:
+    spread = "" if number.u == NONE else f" ± {number.u}"
+    return f"{number.value}{spread} {number.unit}".strip()
+
+
+def _dof(dof: float) -> str:
+    return "∞" if not np.isfinite(dof) or dof >= 1e6 else significant(dof, 2 if dof < 10 else 3)
+
+
+def _codes(seen: Observations) -> list[Row]:
+    found = seen.code_errors
+    if found is None:
+        return []
+    rows = _rows(found.fit, {"dnl_rms_lsb": Quantity("Differential non-linearity, rms")}, Estimates.empty())
+    worst = f"{len(found.codes)} codes tested"
+    if len(found.dnl_lsb):
+        k = int(np.argmax(np.abs(found.dnl_lsb)))
+        worst += f"; the widest departure is code {found.codes[k]}, {significant(float(found.dnl_lsb[k]), 2)} LSB"
+    return [*rows, _count("Missing codes", "missing_codes", len(found.missing_codes), worst)]
+
+
+def _defects(seen: Observations) -> list[Row]:
+    if seen.defects is None:
+        return []
+    kinds = {kind: seen.defects.kind.count(kind) for kind in sorted(set(seen.defects.kind))}
+    words = ", ".join(f"{n} {kind}" for kind, n in kinds.items())
+    words += f"{'; ' if words else ''}{significant(seen.defects.expected_false, 2)} false alarms expected"
+    return [_count("Defect pixels", "defects", len(seen.defects), words)]
+
+
+def _patterns(seen: Observations) -> list[Row]:
+    found = seen.patterns
+    if found is None:
+        return []
+    rows = [_count("Periodic patterns found", "patterns", len(found), f"among {found.n_searched} places of the spectrum")]
+    for k in range(min(len(found), 3)):
+        where = f"at {found.frequency_x[k]:.4f}, {found.frequency_y[k]:.4f} cycles/px, {'moving' if found.moving[k] else 'fixed'}"
+        amplitude = uncertain(float(found.amplitude_dn[k]), float(found.u_amplitude_dn[k]), "DN")
+        rows.append(Row(f"Pattern {k + 1}, amplitude", f"pattern_{k + 1}", amplitude, "", "", where))
+    words = "amplitude that would be found in half of all cases"
+    rows.append(Row("Fixed pattern, weakest to be found", "fixed_limit_dn", limit(found.fixed_limit_dn, "DN"), "", "", words))
+    return rows
+
+
+def _count(title: str, name: str, count: int, reason: str) -> Row:
+    return Row(title, name, Number(str(count), NONE, ""), "", "", reason)

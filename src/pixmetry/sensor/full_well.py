@@ -1,0 +1,82 @@
+"""Full well: a pixel holds only so many electrons; above that it answers no more light."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pixmetry.core.contribution import Contribution, Probe
+from pixmetry.core.errors import MeasureError
+from pixmetry.core.estimates import Estimates
+from pixmetry.core.observations import Observations
+from pixmetry.core.random import Stream
+from pixmetry.core.signal import Kind, Signal
+from pixmetry.core.source import Parameters, Source, quantity
+
+UNLIMITED_E = 1e9
+
+
+class FullWell(Parameters):
+    """Capacity of a pixel and how softly it is reached."""
+
+    full_well_e: float = quantity(20_000.0, "e-", "most electrons that a pixel holds", gt=1, le=UNLIMITED_E)
+    knee_rel: float = quantity(0.0, "1", "part of the capacity below the top in which the response bends; 0 clips hard", ge=0, lt=1)
+
+
+def response_e(params: FullWell, electrons: np.ndarray) -> np.ndarray:
+    """Electrons held of those that arrived, in the dtype given: a straight line up to the knee, then an exponential approach."""
+    top = params.full_well_e
+    if params.knee_rel == 0:
+        return np.minimum(electrons, electrons.dtype.type(top))
+    room = params.knee_rel * top
+    above = np.maximum(electrons - (top - room), 0)
+    return (electrons - above - room * np.expm1(-above / room)).astype(electrons.dtype)
+
+
+def forward(params: FullWell, signal: Signal, stream: Stream) -> Signal:
+    """Hold what fits; the rest is lost here (``sensor.blooming`` is for charge that spills into the neighbours)."""
+    return signal.with_data(response_e(params, signal.data))
+
+
+def measure(observations: Observations) -> Estimates:
+    """Read the saturation of the photon transfer in electrons; where the converter clips first it is a lower bound, and says so."""
+    fit = observations.photon_transfer_fit
+    if fit is None or "full_well_e" not in fit:
+        raise MeasureError(
+            "full well needs a photon-transfer series up to saturation",
+            where="sensor.full_well",
+            remedy="add levels until the mean stands still",
+        )
+    return fit.select(["full_well_e"])
+
+
+def propagate(params: FullWell, probe: Probe) -> Contribution:
+    """Propagator P4 to first order: the field that the clipping takes off; nothing below the knee."""
+    gain = probe.gain_dn_per_e
+    electrons = probe.signal_dn / gain
+    if electrons.max() <= params.full_well_e * (1 - params.knee_rel):
+        return probe.contribution((0.0, 0.0), "F", method="the target stays below the full well")
+    dx, dy = probe.field(gain * (response_e(params, electrons) - electrons))
+    return probe.from_shifts(dx, dy, "F", model_error=0.5, method="linear response of the estimator to the charge that is clipped")
+
+
+SOURCE = Source(
+    id="sensor.full_well",
+    title="Full well",
+    description="Electrons beyond the capacity of a pixel are lost; the top of a bright target becomes flat.",
+    parameters=FullWell,
+    consumes=(Kind.ELECTRONS,),
+    after=("sensor.shot_noise",),
+    before=("sensor.charge_transfer",),
+    neutral=FullWell(full_well_e=UNLIMITED_E),
+    typical=FullWell(),
+    bound=FullWell(knee_rel=0.2),
+    forward=forward,
+    measure=measure,
+    propagate=propagate,
+    gum_class="F",
+    equation="n' = min(n, F);  with a knee k: n' = s + kF (1 − e^(−(n − s)/kF)) above s = (1 − k) F",
+    typical_size="below 0.005 px for a target 1.5 × over the full well, without blooming",
+    references=("EMVA 1288 R4.0 Linear, §6.6", "J. R. Janesick, Photon Transfer, SPIE Press 2007, ch. 5"),
+    advice="Lower the exposure until the target peaks at 80 % of saturation.",
+    reasons={"correct": "the electrons are lost: flag saturated pixels, or fit them as 'at least the full well'"},
+)

@@ -1,0 +1,271 @@
+"""What every error source of the catalogue keeps, whatever it models."""
+
+from __future__ import annotations
+
+import re
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from catalogue.support import NAME, SHAPE, Amplitude, Texture, camera_with, kind_of, make_source, truth_maps
+from pixmetry.core import camera as camera_module
+from pixmetry.core.camera import Camera, Element
+from pixmetry.core.catalogue import catalogue
+from pixmetry.core.contribution import AVERAGES
+from pixmetry.core.errors import InputError
+from pixmetry.core.random import Grid
+from pixmetry.core.signal import Kind
+from pixmetry.core.source import Source
+
+SOURCES = catalogue()
+SCENE = Texture()
+every_source = pytest.mark.parametrize("source", SOURCES.values(), ids=SOURCES.keys())
+IN_FRAMES = {i: s for i, s in SOURCES.items() if s.forward is not None}
+every_forward = pytest.mark.parametrize("source", IN_FRAMES.values(), ids=IN_FRAMES.keys())
+corners = [
+    (0, 0, 9, 7),
+    (SHAPE[0] - 9, SHAPE[1] - 7, 9, 7),
+    (0, SHAPE[1] - 5, 12, 5),
+    (SHAPE[0] - 3, 0, 3, 21),
+    (17, 22, 11, 13),
+    (30, 41, 1, 1),
+]
+
+
+@cache
+def whole(source_id: str) -> np.ndarray:
+    """Three frames of the smallest camera around a source, with its typical parameters."""
+    return camera_with(SOURCES[source_id]).expose(SCENE, 3, seed=11).data
+
+
+def has_memory(source: Source) -> bool:
+    return source.start is not None
+
+
+@every_forward
+def test_neutral_parameters_change_nothing(source: Source) -> None:
+    if source.neutral is None:
+        pytest.skip(source.reasons["neutral"])
+    camera = camera_with(source, source.neutral)
+    assert np.array_equal(camera.expose(SCENE, 2).data, camera.switched(off=[NAME]).expose(SCENE, 2).data)
+
+
+@every_forward
+def test_typical_and_bound_parameters_change_something(source: Source) -> None:
+    scenes = [SCENE] if kind_of(source) is Kind.CODES else [SCENE, Texture(30.0), Texture(2000.0)]  # the last one fills the wells
+    for params in (source.typical, source.bound):
+        camera = camera_with(source, params)
+        assert any(not np.array_equal(camera.expose(s, 2).data, camera.switched(off=[NAME]).expose(s, 2).data) for s in scenes)
+
+
+@every_forward
+def test_the_input_is_not_touched_and_the_output_is_of_the_kind_declared(source: Source) -> None:
+    camera = camera_with(source)
+    signal = camera.switched(off=[NAME]).expose(SCENE, 2)
+    signal.data.setflags(write=False)
+    before = signal.data.copy()
+    for streams in (camera.streams(0), camera.streams(0, quiet=True)):
+        extra = () if source.start is None else (source.start(source.typical),)
+        result = source.forward(source.typical, signal, streams.of(NAME), *extra)
+        out = result if source.start is None else result[0]
+        assert np.array_equal(signal.data, before)
+        assert out.kind == (source.produces or signal.kind)
+        assert out.data.shape == signal.data.shape
+        assert out.data.dtype == (np.uint16 if out.kind is Kind.CODES else np.float32)
+        assert np.isfinite(out.data).all()
+        assert not np.shares_memory(out.data, signal.data) or np.array_equal(out.data, before)
+
+
+@every_forward
+def test_darkness_and_strong_light_give_finite_numbers(source: Source) -> None:
+    for mean in (0.0, 1.0) + (() if kind_of(source) is Kind.CODES else (1e4,)):
+        out = camera_with(source).expose(Texture(mean), 1).data
+        assert np.isfinite(out).all()
+
+
+@every_forward
+@pytest.mark.parametrize("window", corners)
+def test_a_window_equals_the_crop(source: Source, window: tuple[int, int, int, int]) -> None:
+    r, c, h, w = window
+    got = camera_with(source).expose(SCENE, 3, seed=11, window=window).data
+    assert np.array_equal(got, whole(source.id)[:, r : r + h, c : c + w])
+
+
+@every_forward
+def test_windows_in_one_batch_equal_windows_one_by_one_and_the_crops(source: Source) -> None:
+    if has_memory(source):
+        pytest.skip("single windows of a source with a memory are refused in this mode")
+    camera = camera_with(source)
+    frame, row, col = np.array([0, 2, 1, 0, 2, 1]), np.array([0, 37, 5, 20, 37, 0]), np.array([0, 53, 17, 53, 0, 30])
+    batch = camera.expose_windows(SCENE, Grid(frame, row, col, (11, 11)), seed=11)
+    for i, (f, r, c) in enumerate(zip(frame, row, col, strict=True)):
+        one = camera.expose_windows(SCENE, Grid(frame[i : i + 1], row[i : i + 1], col[i : i + 1], (11, 11)), seed=11)
+        assert np.array_equal(batch[i], one[0])
+        assert np.array_equal(batch[i], whole(source.id)[f, r : r + 11, c : c + 11])
+
+
+@every_forward
+def test_threads_and_tiles_do_not_matter(source: Source, monkeypatch: pytest.MonkeyPatch) -> None:
+    camera = camera_with(source)
+    monkeypatch.setattr(camera_module, "TILE_PIXELS", 16 * SHAPE[1])
+    for threads in (1, 2):
+        assert np.array_equal(camera.expose(SCENE, 3, seed=11, threads=threads).data, whole(source.id))
+
+
+@every_forward
+def test_some_frames_equal_the_slice_of_the_sequence(source: Source) -> None:
+    camera = camera_with(source)
+    sequence = camera.expose(SCENE, 6, seed=11).data
+    assert np.array_equal(camera.expose(SCENE, [3, 4], seed=11).data, sequence[3:5])
+    assert np.array_equal(whole(source.id), sequence[:3])
+
+
+class Recorder:
+    """A noise source of amplitude 0 that keeps what it draws, by frame and row."""
+
+    def __init__(self, id: str, kind: Kind) -> None:
+        self.drawn: dict[tuple[int, int], np.ndarray] = {}
+
+        def forward(params: Amplitude, signal: Any, stream: Any) -> Any:
+            noise = stream.normal(signal.grid)
+            for i, frame in enumerate(signal.grid.frame):
+                for j, row in enumerate(signal.rows[i]):
+                    self.drawn[int(frame), int(row)] = noise[i, j]
+            return signal.with_data((signal.data + params.scale * noise).astype(signal.data.dtype))
+
+        self.source = make_source(id, forward, (kind,), parameters=Amplitude)
+        self.element = Element(id, self.source, Amplitude())
+
+
+@every_forward
+def test_switching_it_off_changes_no_draw_of_others_nor_they_its_own(source: Source) -> None:
+    """Sharp: the very numbers that a noise source before it and one after it draw, and its own output, bit for bit."""
+    first, last = (
+        Recorder(f"{source.stage}.recorder_{name}", kind)
+        for name, kind in (("a", kind_of(source)), ("b", source.produces or kind_of(source)))
+    )
+    alone = camera_with(source)
+    full = camera_with(source, before=[first.element], after=[last.element])
+    assert np.array_equal(full.expose(SCENE, 3, seed=11).data, alone.expose(SCENE, 3, seed=11).data)
+    drawn = [dict(r.drawn) for r in (first, last)]
+    for recorder in (first, last):
+        recorder.drawn.clear()
+    if source.produces is None:
+        full.switched(off=[NAME]).expose(SCENE, 3, seed=11)
+    else:
+        camera_with(source, before=[first.element]).switched(off=[NAME]).expose(SCENE, 3, seed=11)
+        drawn[1] = {}
+    for recorder, before in zip((first, last), drawn, strict=True):
+        assert recorder.drawn.keys() == before.keys()
+        assert all(np.array_equal(recorder.drawn[k], v) for k, v in before.items())
+
+
+@every_forward
+def test_exposures_and_units_are_told_apart(source: Source) -> None:
+    """Another exposure seed leaves the quiet frame alone; the same seeds give the same bits again."""
+    camera = camera_with(source)
+    quiet = camera.expose(SCENE, 2, seed=1, quiet=True).data
+    assert np.array_equal(quiet, camera.expose(SCENE, 2, seed=2, quiet=True).data)
+    assert np.array_equal(camera.expose(SCENE, 3, seed=11).data, whole(source.id))
+
+
+def numbers(source: Source) -> list[str]:
+    return [n for n, f in source.parameters.model_fields.items() if f.annotation in (int, float)]
+
+
+@every_source
+def test_numbers_out_of_range_are_refused_with_the_range(source: Source) -> None:
+    for name in numbers(source):
+        for limit in source.parameters.model_fields[name].metadata:
+            for attribute, beyond in (("ge", -1), ("gt", 0), ("le", 1), ("lt", 0)):
+                bound = getattr(limit, attribute, None)
+                if bound is None:
+                    continue
+                with pytest.raises(InputError) as caught:
+                    source.make({name: bound + beyond * max(1.0, abs(bound)) if beyond else bound})
+                assert name in str(caught.value) and "allowed" in str(caught.value)
+                assert bound in [float(n) for n in re.findall(r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?", caught.value.allowed)]
+
+
+@every_source
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), "7 px"])
+def test_what_is_no_finite_number_is_refused(source: Source, value: Any) -> None:
+    for name in numbers(source):
+        with pytest.raises(InputError, match=name):
+            source.make({name: value})
+
+
+@every_source
+def test_unknown_keys_are_refused(source: Source) -> None:
+    with pytest.raises(InputError, match="no_such_key"):
+        source.make({"no_such_key": 1})
+
+
+@every_source
+def test_the_record_is_complete(source: Source) -> None:
+    for name in ("title", "description", "equation", "typical_size", "advice"):
+        assert getattr(source, name).strip(), f"{source.id} lacks its {name}"
+    assert source.references and all(r.strip() for r in source.references)
+    assert source.gum_class in AVERAGES
+    assert 0 <= source.stars <= 5
+    assert source.parameters.__doc__
+    for name, info in source.parameters.model_fields.items():
+        assert info.description, f"{source.id}: {name} has no description"
+        assert source.units[name], f"{source.id}: {name} has no unit"
+        if info.annotation in (int, float):
+            assert info.metadata, f"{source.id}: {name} has no range"
+    for verb, reason in source.reasons.items():
+        assert len(reason) > 10 and (verb == "neutral" or getattr(source, verb) is None), f"{source.id}: {verb}"
+    for verb in ("forward", "measure", "correct", "propagate", "context"):
+        function = getattr(source, verb)
+        assert function is None or function.__doc__ or verb == "context", f"{source.id}: {verb} has no docstring"
+
+
+@every_source
+def test_parameters_survive_the_camera_file(source: Source) -> None:
+    for params in (source.typical, source.bound):
+        assert source.make(params.model_dump(mode="json")) == params
+
+
+@every_forward
+def test_correct_lowers_the_error_of_forward(source: Source) -> None:
+    """The root mean square over a gently uneven frame, with the true parameters and noise-free maps of the unit."""
+    if source.correct is None:
+        pytest.skip(source.reasons["correct"])
+    camera, scene = camera_with(source, shape=(96, 128)), Texture(contrast=0.01)
+    signal = camera.switched(off=[NAME]).expose(scene, 4)
+    out = camera.expose(scene, 4)
+    untouched = out.data.copy()
+    corrected = source.correct(source.typical, out, truth_maps(source, source.typical, camera.frame_shape))
+    assert np.array_equal(out.data, untouched)
+    assert corrected.data.shape == out.data.shape and np.isfinite(corrected.data).all()
+
+    def error(data: np.ndarray) -> float:
+        return float(np.sqrt(np.mean((data.astype(float) - signal.data) ** 2)))
+
+    assert error(corrected.data) < 0.9 * error(out.data)
+
+
+@every_forward
+@settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_any_window_of_any_frame_equals_the_crop(source: Source, data: st.DataObject) -> None:
+    rows, cols = data.draw(st.integers(1, 40), "rows"), data.draw(st.integers(1, 40), "cols")
+    camera = camera_with(source, shape=(rows, cols))
+    r, c = data.draw(st.integers(0, rows - 1), "row"), data.draw(st.integers(0, cols - 1), "col")
+    h, w = data.draw(st.integers(1, rows - r), "height"), data.draw(st.integers(1, cols - c), "width")
+    frame = data.draw(st.integers(0, 3 if has_memory(source) else 10**6), "frame")
+    full = camera.expose(SCENE, [frame], seed=3).data[0]
+    assert np.array_equal(camera.expose(SCENE, [frame], seed=3, window=(r, c, h, w)).data[0], full[r : r + h, c : c + w])
+
+
+def test_every_source_has_a_camera_that_can_hold_it() -> None:
+    assert len(SOURCES) > 0
+    for source in SOURCES.values():
+        assert isinstance(camera_with(source), Camera)
+        assert set(source.consumes) <= set(Kind)
+        source.parameters()

@@ -1,0 +1,99 @@
+"""What each source predicts for a target's position against Monte Carlo through its own ``forward``.
+
+The target is a disc of 7 px under a blur of 0.7 px, 150 DN high on a background of 10 DN, anywhere in a frame of 480 × 640 pixels, in a
+window of 21 × 21 pixels; the estimator is the centroid of what stands above 20 DN. Target and estimator are written here, apart from
+those of the package. With the source on and off the same targets are seen; the shifts are the differences.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from catalogue.support import NAME, Flat, Targets, camera_with, kind_of, lead_in, probe_of, soft_centroid, to_dn
+from pixmetry.core.camera import Camera
+from pixmetry.core.catalogue import catalogue
+from pixmetry.core.contribution import Contribution
+from pixmetry.core.random import Grid
+from pixmetry.core.signal import Kind
+from pixmetry.core.source import Parameters, Source
+
+SHAPE, SIZE, THRESHOLD_DN, BACKGROUND_DN = (480, 640), 21, 20.0, 10.0
+UNITS, TARGETS = 32, 40
+# Quantile of Student's t with UNITS − 1 degrees of freedom for a false failure in 1e-6 of two-sided tests is 6.06; means of squares over 40
+# targets are not quite normal, so it is rounded up. The standard deviation of a normal shift is then known to 14 %.
+QUANTILE = 7.0
+CASES = {i: s for i, s in catalogue().items() if s.forward is not None and s.propagate is not None}
+
+
+@cache
+def scene() -> Targets:
+    """One target per frame number, at random places; the places are the same for all sources."""
+    rng = np.random.default_rng(20)
+    n = UNITS * TARGETS
+    half = SIZE // 2 + 1
+    return Targets(rng.uniform(half, SHAPE[1] - 1 - half, n), rng.uniform(half, SHAPE[0] - 1 - half, n), background_dn=BACKGROUND_DN)
+
+
+def windows(unit: int) -> Grid:
+    frames = np.arange(unit * TARGETS, (unit + 1) * TARGETS)
+    targets = scene()
+    row, col = (np.rint(v[frames]).astype(int) - SIZE // 2 for v in (targets.y_px, targets.x_px))
+    return Grid(frames, row, col, (SIZE, SIZE))
+
+
+def exposed(camera: Camera, scene: object, unit: int, quiet: bool = False) -> np.ndarray:
+    """Windows of one unit of this type of camera; a source with a memory has settled on the background."""
+    mode = "exact" if all(e.source.start is None for e in camera.active) else "frozen"
+    camera = replace(camera, unit_seed=unit)
+    return camera.expose_windows(scene, windows(unit), seed=unit, mode=mode, background=Flat(BACKGROUND_DN), quiet=quiet).astype(float)
+
+
+def located(camera: Camera) -> np.ndarray:
+    """Centres of every target of every unit in window coordinates, shape (units, targets, 2).
+
+    The threshold cuts off the same light in any camera: it is put at the level to which the camera brings a uniform field.
+    """
+    level = float(np.median(exposed(camera, Flat(THRESHOLD_DN), 0, quiet=True)))
+    return np.stack([np.stack(soft_centroid(exposed(camera, scene(), unit), level), axis=1) for unit in range(UNITS)])
+
+
+@cache
+def located_without(kind: Kind) -> np.ndarray:
+    """The same with ideal conversions alone, up to a kind."""
+    return located(Camera("ideal", SHAPE, tuple(lead_in(kind))))
+
+
+def predicted(source: Source, params: Parameters) -> Contribution:
+    """The contribution for the same targets, of which the first 64 stand for all sub-pixel phases."""
+    off = camera_with(source, shape=SHAPE).switched(off=[NAME])
+    kind = off.expose(Flat(0.0), window=(0, 0, 1, 1)).kind
+    targets = scene()
+    grids = [windows(u) for u in range(2)]
+    data = np.concatenate([to_dn(source, off.expose_windows(targets, g), kind) for g in grids])[:64]
+    frame, row0, col0 = (np.concatenate([getattr(g, f) for g in grids])[:64] for f in ("frame", "row0", "col0"))
+    probe = probe_of(data, targets.x_px[frame] - col0, targets.y_px[frame] - row0, THRESHOLD_DN, BACKGROUND_DN, SHAPE)
+    return source.propagate(params, probe)
+
+
+@pytest.mark.parametrize("which", ["typical", "bound"])
+@pytest.mark.parametrize("source", CASES.values(), ids=CASES.keys())
+def test_propagate_agrees_with_monte_carlo(source: Source, which: str) -> None:
+    params = getattr(source, which)
+    shifts = located(camera_with(source, params, shape=SHAPE)) - located_without(kind_of(source))
+    contribution = predicted(source, params)
+    for axis, u, bias in ((0, contribution.u_x_px, contribution.bias_x_px), (1, contribution.u_y_px, contribution.bias_y_px)):
+        of_unit = shifts[:, :, axis].mean(axis=1)
+        mean, u_mean = of_unit.mean(), of_unit.std(ddof=1) / np.sqrt(UNITS)
+        squares = ((shifts[:, :, axis] - mean) ** 2).mean(axis=1)
+        spread = np.sqrt(squares.mean())
+        u_spread = squares.std(ddof=1) / np.sqrt(UNITS) / (2 * spread) if spread > 0 else 0.0
+        found = f"Monte Carlo {spread:.5f} ± {u_spread:.5f}, bias {mean:.5f} ± {u_mean:.5f}"
+        text = f"{source.id} {which} axis {axis}: predicted {u:.5f}, bias {bias:.5f}; {found}"
+        print(text)
+        assert abs(spread - u) <= max(contribution.model_error * u, contribution.floor_px) + QUANTILE * u_spread, text
+        size = max(abs(bias), u)
+        assert abs(mean - bias) <= max(contribution.model_error * size, contribution.floor_px) + QUANTILE * u_mean, text

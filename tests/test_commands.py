@@ -1,0 +1,223 @@
+"""The commands as a user types them: what works, and one clear error for each kind of bad input."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import imagecodecs
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from pixmetry.campaign import load_campaign, read_frame
+from pixmetry.cli import main
+from pixmetry.core.camera import load_camera
+
+CAMERA = """\
+schema: pixmetry/camera/1
+name: test camera
+rows: 64
+cols: 96
+pitch_x_um: 5.0
+pitch_y_um: 5.0
+chain:
+- source: sensor.quantum_efficiency
+  parameters: {quantum_efficiency: 0.5}
+- source: sensor.prnu
+  parameters: {pixel_std_rel: 0.02}
+- source: sensor.shot_noise
+- source: sensor.full_well
+  parameters: {full_well_e: 15000}
+- source: sensor.dsnu
+  parameters: {pixel_std_e: 12}
+- source: electronics.amplifier_noise
+  parameters: {white_e: 8}
+- source: electronics.gain
+  parameters: {gain_dn_per_e: 0.2}
+- source: grabber.adc
+  parameters: {bits: 12, offset_dn: 40}
+"""
+SERIES = """\
+schema: pixmetry/scene/1
+photon_transfer: {levels: 14, brightest_photons: 36000, longest_exposure_s: 0.02, stack_frames: 24}
+"""
+DISCS = """\
+schema: pixmetry/scene/1
+uniform: {level_photons: 300}
+discs: {lattice_px: 24, peak_photons: 14000}
+"""
+
+
+def run(*arguments: object) -> Result:
+    return CliRunner().invoke(main, [str(a) for a in arguments])
+
+
+def refused(result: Result, *words: str) -> None:
+    assert result.exit_code == 2, result.output
+    assert "Traceback" not in result.output
+    lines = [line for line in result.output.splitlines() if line.startswith("error: ")]
+    assert len(lines) == 1, result.output
+    for word in words:
+        assert word in lines[0], result.output
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A camera, its scenes, a simulated campaign and its assessment."""
+    folder = tmp_path_factory.mktemp("commands")
+    for name, text in (("camera.yaml", CAMERA), ("series.yaml", SERIES), ("discs.yaml", DISCS)):
+        (folder / name).write_text(text)
+    done = run("simulate", folder / "camera.yaml", folder / "series.yaml", "-o", folder / "campaign", "--format", "png")
+    assert done.exit_code == 0, done.output
+    done = run("assess", folder / "campaign", "-o", folder / "result", "--trials", 400)
+    assert done.exit_code == 0, done.output
+    return folder
+
+
+def test_an_assessment_writes_everything_and_recovers_the_camera(folder: Path) -> None:
+    names = {p.name for p in (folder / "result").iterdir()}
+    assert {"report.html", "results.json", "maps.zarr.zip", "camera.yaml"} <= names
+    record = json.loads((folder / "result" / "results.json").read_text())
+    found = {e["name"]: e for e in record["photon_transfer"]["estimates"]}
+    for name, truth in (("gain_dn_per_e", 0.2), ("dark_noise_e", 8.0), ("offset_dn", 40.0)):
+        # |z| < 6 fails by chance once in 1e8 for Gaussian, and once in 1e5 for ten degrees of freedom; seed of the frames is fixed
+        assert abs(found[name]["value"] - truth) < 6 * found[name]["u"], name
+    assert record["budget"]["rows"]
+
+
+def test_the_twin_makes_frames_like_the_real_ones(folder: Path) -> None:
+    twin = load_camera(folder / "result" / "camera.yaml")
+    assert twin["electronics.gain"].params.gain_dn_per_e == pytest.approx(0.2, rel=0.03)
+    done = run("simulate", folder / "result" / "camera.yaml", folder / "series.yaml", "-o", folder / "again", "--seed", 9)
+    assert done.exit_code == 0, done.output
+    for kind in ("dark", "bright"):
+        first, second = (load_campaign(folder / name).stack(kind) for name in ("campaign", "again"))
+        one, two = (np.stack([read_frame(p) for p in g.paths]).astype(float) for g in (first, second))
+        assert two.mean() == pytest.approx(one.mean(), rel=0.02)
+        assert two.var(axis=0).mean() == pytest.approx(one.var(axis=0).mean(), rel=0.05)
+        assert two.mean(axis=0).std() == pytest.approx(one.mean(axis=0).std(), rel=0.1)
+
+
+def test_a_corrected_frame_is_flatter(folder: Path) -> None:
+    result = folder / "result" / "results.json"
+    flat = load_campaign(folder / "campaign").stack("bright").paths[:12]
+    done = run("correct", *flat, "--with", result, "-o", folder / "flat")
+    assert done.exit_code == 0, done.output
+    before = np.mean([read_frame(p) for p in flat], axis=0)
+    after = np.mean([read_frame(p) for p in (folder / "flat").glob("*.tif")], axis=0)
+    assert after.std() < 0.5 * before.std()
+    said = json.loads((folder / "flat" / "correction.json").read_text())["sources"]
+    assert said["sensor.prnu"] == "corrected"
+    assert "not corrected" in said["sensor.shot_noise"]
+
+
+def test_discs_come_with_their_truth(folder: Path) -> None:
+    done = run("simulate", folder / "camera.yaml", folder / "discs.yaml", "-n", 2, "-o", folder / "discs")
+    assert done.exit_code == 0, done.output
+    truth = json.loads((folder / "discs" / "truth.json").read_text())
+    assert len(truth["targets"]) == 2 * 4
+    assert len(list((folder / "discs" / "frames").iterdir())) == 2
+
+
+def test_the_catalogue_as_json() -> None:
+    records = json.loads(run("sources", "--json").output)
+    by_id = {r["id"]: r for r in records}
+    assert len(by_id) == len(records) >= 19
+    noise = by_id["sensor.shot_noise"]
+    assert noise["verbs"] == {"forward": True, "measure": False, "correct": False, "propagate": True}
+    for record in records:
+        assert {"id", "title", "stage", "note", "stars", "verbs", "reasons"} <= set(record)
+        assert all(record["reasons"][v] for v, has in record["verbs"].items() if not has)
+    for source_id in by_id:
+        shown = run("sources", source_id)
+        assert shown.exit_code == 0
+        assert "equation" in shown.output
+
+
+def write_campaign(folder: Path, frames: dict[str, list[np.ndarray]], bits: int = 12) -> Path:
+    """A campaign of 16-bit PNG files; keys are ``kind exposure_s``."""
+    lines = ["schema: pixmetry/campaign/1", f"camera: {{name: bad, bits: {bits}}}", "frames:"]
+    for group, images in frames.items():
+        kind, exposure = group.split()
+        names = []
+        for i, image in enumerate(images):
+            names.append(f"{kind}_{exposure}_{i}.png")
+            (folder / names[-1]).write_bytes(imagecodecs.png_encode(image.astype(np.uint16)))
+        lines.append(f"- {{kind: {kind}, exposure_s: {exposure}, files: [{', '.join(names)}]}}")
+    path = folder / "campaign.yaml"
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def levels(bright) -> dict[str, list[np.ndarray]]:
+    """Six levels with two frames each, dark ones with noise, bright ones from ``bright(k)``."""
+    noise = np.random.default_rng(4)
+    dark = {f"dark {k / 100}": [np.rint(noise.normal(40, 3, (32, 48))) for _ in range(2)] for k in range(1, 7)}
+    return dark | {f"bright {k / 100}": [bright(k) for _ in range(2)] for k in range(1, 7)}
+
+
+@pytest.mark.parametrize(
+    ("bright", "words"),
+    [
+        (lambda k: np.full((32, 48), 4095), ("saturated",)),
+        (lambda k: np.zeros((32, 48)), ("black",)),
+        (lambda k: np.full((32, 48), 300 * k), ("noise",)),
+    ],
+    ids=["all saturated", "all black", "no noise"],
+)
+def test_frames_that_carry_no_photon_transfer_are_refused(tmp_path: Path, bright, words) -> None:
+    refused(run("assess", write_campaign(tmp_path, levels(bright)), "-o", tmp_path / "out"), *words)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("assess", "nowhere.yaml"), ("nowhere.yaml",)),
+        (("assess", "--target", "square:side=3"), ("square", "disc")),
+        (("assess", "--target", "disc:diameter=-1"), ("diameter",)),
+        (("assess", "--target", "disc:diameter=nan"), ("diameter",)),
+        (("assess", "--estimator", "guess"), ("guess", "soft_threshold")),
+        (("sources", "sensor.prun"), ("sensor.prun", "sensor.prnu")),
+        (("simulate", "nocamera.yaml", "scene.yaml", "-o", "x"), ("nocamera.yaml",)),
+        (("correct", "a.png", "--with", "nothing.json", "-o", "x"), ("nothing.json",)),
+    ],
+    ids=lambda v: " ".join(v) if isinstance(v, tuple) else None,
+)
+def test_bad_arguments_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments, words) -> None:
+    monkeypatch.chdir(tmp_path)
+    refused(run(*arguments), *words)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (("white_e: 8", "white_e: -8"), ("white_e", "0")),
+        (("white_e: 8", "white_dn: 8"), ("white_dn", "white_e")),
+        (("white_e: 8", "white_e: .nan"), ("white_e",)),
+        (("sensor.dsnu", "sensor.dnsu"), ("sensor.dnsu", "sensor.dsnu")),
+        (("rows: 64", "rows: 64\nrows: 65"), ("rows",)),
+        (("- source: sensor.shot_noise\n", ""), ()),
+    ],
+    ids=str,
+)
+def test_a_bad_camera_is_refused(tmp_path: Path, change, words) -> None:
+    assert change[0] in CAMERA
+    (tmp_path / "camera.yaml").write_text(CAMERA.replace(*change))
+    (tmp_path / "scene.yaml").write_text(DISCS)
+    done = run("simulate", tmp_path / "camera.yaml", tmp_path / "scene.yaml", "-o", tmp_path / "out")
+    if words:
+        refused(done, *words)
+        assert not (tmp_path / "out").exists()
+    else:  # a camera without shot noise is a camera
+        assert done.exit_code == 0, done.output
+
+
+def test_a_folder_with_other_files_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("mine")
+    (tmp_path / "camera.yaml").write_text(CAMERA)
+    (tmp_path / "scene.yaml").write_text(DISCS)
+    refused(run("simulate", tmp_path / "camera.yaml", tmp_path / "scene.yaml", "-o", tmp_path), "notes.txt")
+    assert (tmp_path / "notes.txt").read_text() == "mine"
