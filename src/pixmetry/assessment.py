@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from pixmetry.budget.budget import Budget, compute_budget
+from pixmetry.budget.budget import compute_budget
+from pixmetry.budget.probe import Target, parse_target
 from pixmetry.campaign import Campaign, FrameReader, InputHashes, load_campaign, provenance_record, staged_output, write_json, write_maps
 from pixmetry.core.camera import Camera, Element
 from pixmetry.core.catalogue import catalogue
@@ -18,8 +18,10 @@ from pixmetry.core.estimates import Estimates
 from pixmetry.core.observations import Observations
 from pixmetry.experiment.emva_linear import fit_emva_linear
 from pixmetry.experiment.observe import Group, observe
+from pixmetry.locate.estimators import Estimator, parse_estimator
+from pixmetry.report.page import write_report
+from pixmetry.results import Assessment
 
-RESULTS_SCHEMA = "pixmetry/results/1"
 DIGITAL_CHAIN = (  # what dark and bright frames can tell of a camera, in the order of the light
     "optics.shading",
     "sensor.quantum_efficiency",
@@ -39,107 +41,6 @@ DIGITAL_CHAIN = (  # what dark and bright frames can tell of a camera, in the or
 LIMIT_RMS = np.sqrt(1 / 3)  # rms of a quantity that is spread evenly between 0 and its upper limit, over that limit
 
 Progress = Callable[[str, int, int], None]
-
-
-@dataclass(frozen=True)
-class Assessment:
-    """All that one campaign told of its camera.
-
-    Parameters
-    ----------
-    campaign : Campaign
-    observations : Observations
-    estimates : dict of Estimates
-        By source, named like its parameters.
-    unmeasured : dict of str
-        By source, why this campaign could not measure it.
-    standard : Estimates
-        The linear rule of EMVA 1288 beside ours.
-    camera : Camera
-        The digital twin.
-    budget : Budget
-    provenance : dict
-    """
-
-    campaign: Campaign
-    observations: Observations
-    estimates: dict[str, Estimates]
-    unmeasured: dict[str, str]
-    standard: Estimates
-    camera: Camera
-    budget: Budget
-    provenance: dict[str, Any]
-
-    def to_record(self) -> dict[str, Any]:
-        """Return the plain record of ``results.json``."""
-        fit = self.observations.photon_transfer_fit
-        facts = self.campaign.camera
-        return {
-            "schema": RESULTS_SCHEMA,
-            "camera": {
-                "name": facts.name,
-                "bits": facts.bits,
-                "rows": self.campaign.frame_shape[0],
-                "cols": self.campaign.frame_shape[1],
-                "pitch_x_um": facts.pitch_x_um,
-                "pitch_y_um": facts.pitch_y_um,
-                "interface": facts.interface,
-                "sensor": facts.sensor,
-            },
-            "estimates": {source: e.to_records() for source, e in self.estimates.items()},
-            "unmeasured": self.unmeasured,
-            "photon_transfer": {
-                "estimates": fit.to_records(),
-                "names": list(fit.names),
-                "covariance": fit.covariance.tolist(),
-                "confounders": list(fit.confounders),
-            },
-            "spatial": self.observations.spatial_fit.to_records() if self.observations.spatial_fit is not None else [],
-            "emva1288_linear": self.standard.to_records(),
-            "budget": self.budget.to_record(),
-            "notes": list(self.observations.notes),
-            "provenance": self.provenance,
-        }
-
-    def maps(self) -> dict[str, np.ndarray]:
-        """Return what was measured pixel by pixel: ``dark_dn`` above black, ``prnu_rel``, ``defects``."""
-        seen, fit = self.observations, self.observations.photon_transfer_fit
-        maps: dict[str, np.ndarray] = {}
-        if seen.dark_stack is not None:
-            maps["dark_dn"] = (seen.dark_stack.mean_map_dn - fit["offset_dn"].value).astype(np.float32)
-        if seen.defects is not None:
-            maps["defects"] = seen.defects.mask().astype(np.uint8)
-        if seen.dark_stack is not None and seen.bright_stack is not None and seen.spatial_fit is not None:
-            maps["prnu_rel"] = _response_map(seen).astype(np.float32)
-        return maps
-
-    def write(self, directory: str | Path) -> Path:
-        """Write report, results, maps and the twin into a folder, whole or not at all; return the path of the report."""
-        from pixmetry.report.page import write_report
-
-        with staged_output(directory) as folder:
-            write_json(folder / "results.json", self.to_record())
-            write_maps(folder / "maps.zarr.zip", self.maps(), {"camera": self.campaign.camera.name})
-            self.camera.save(folder / "camera.yaml")
-            write_report(self, folder / "report.html")
-        return Path(directory) / "report.html"
-
-
-def _response_map(seen: Observations) -> np.ndarray:
-    """Relative response with the illumination's slow part taken out, shrunk to what is known of it.
-
-    A map averaged over L frames still holds noise of variance t/L. What is predicted best from it is the map times
-    s²/(s² + t/L) (the linear predictor of least variance), s² from the split of the stack.
-    """
-    from pixmetry.experiment.surface import fill, fit_surface
-
-    bright, dark, mask = seen.bright_stack, seen.dark_stack, seen.defects.mask()
-    light = fill(bright.mean_map_dn - dark.mean_map_dn, mask)
-    surface = fit_surface(light, 4).values
-    relative = light / surface - 1.0
-    noise = (bright.ms_pixel_dn2 / bright.n_frames + dark.ms_pixel_dn2 / dark.n_frames) / float(surface.mean()) ** 2
-    fixed = max(float(relative.var()) - noise, 0.0)
-    return 1.0 + relative * (fixed / (fixed + noise))
 
 
 def assess(
@@ -180,25 +81,44 @@ def assess(
     InputError, MeasureError
         If a file or the campaign cannot be used, or the frames do not carry a photon transfer.
     """
-    from pixmetry.budget.probe import parse_estimator, parse_target
-
-    what_target, what_estimator = parse_target(target), parse_estimator(estimator)
+    what_target = parse_target(target) if target else Target()
+    what_estimator = parse_estimator(estimator) if estimator else Estimator()
     frames = campaign if isinstance(campaign, Campaign) else load_campaign(campaign)
     told = progress or (lambda what, done, of: None)
     hashes, seen = observe_campaign(frames, told, threads)
     estimates, unmeasured = measure_sources(seen)
     camera = digital_twin(frames, estimates, seen)
+    steps = len(camera.active) + len(catalogue()) + 2
+    done = itertools.count(1)
     budget = compute_budget(
-        camera, estimates, frames.camera, what_target, what_estimator, trials=trials, seed=seed, progress=told, unmeasured=unmeasured
+        camera,
+        estimates,
+        None,
+        what_target,
+        what_estimator,
+        trials=trials,
+        seed=seed,
+        progress=lambda _: told("computing the budget", min(next(done), steps - 1), steps),
     )
+    told("computing the budget", steps, steps)
     record = provenance_record(hashes, seed=seed, libraries=("numpy", "scipy", "numba"))
     standard = fit_emva_linear(seen.photon_transfer)
     assessment = Assessment(frames, seen, estimates, unmeasured, standard, camera, budget, record)
     if output is not None:
         told("writing the report", 0, 1)
-        assessment.write(output)
+        write_results(assessment, output)
         told("writing the report", 1, 1)
     return assessment
+
+
+def write_results(assessment: Assessment, directory: str | Path) -> Path:
+    """Write report, results, maps and the twin into a folder, whole or not at all; return the path of the report."""
+    with staged_output(directory) as folder:
+        write_json(folder / "results.json", assessment.to_record())
+        write_maps(folder / "maps.zarr.zip", assessment.maps(), {"camera": assessment.campaign.camera.name})
+        assessment.camera.save(folder / "camera.yaml")
+        write_report(assessment, folder / "report.html")
+    return Path(directory) / "report.html"
 
 
 def observe_campaign(campaign: Campaign, progress: Progress, threads: int | None = None) -> tuple[InputHashes, Observations]:
@@ -270,6 +190,7 @@ def digital_twin(campaign: Campaign, estimates: dict[str, Estimates], observatio
         temperature_c=20.0 if facts.temperature_c is None else facts.temperature_c,
         facts={
             "interface": facts.interface,
+            **({} if facts.sensor is None else {"sensor": facts.sensor}),
             "bits": campaign.bits,
             "source": f"assessed from {campaign.source_path.name}",
             "photons": "photons" if photons_known else "electrons: no photon count was given, the quantum efficiency is set to 1",

@@ -25,10 +25,10 @@ ALLOWED: dict[str, set[str]] = {
     "campaign": {"core"},
     "budget": {"core", "scene", "locate"},
 }
-ALLOWED["report"] = {*ALLOWED, "assessment"}  # for its types alone
-ALLOWED["assessment"] = {*ALLOWED}
-ALLOWED["simulation"] = {*ALLOWED} - {"report", "assessment", "budget"}
-ALLOWED["correction"] = ALLOWED["simulation"]
+ALLOWED["simulation"] = ALLOWED["correction"] = {"core", "scene", "campaign"}
+ALLOWED["results"] = {"core", "campaign", "experiment", "budget"}
+ALLOWED["report"] = {"core", "campaign", "experiment", "budget", "results"}
+ALLOWED["assessment"] = {"core", "campaign", "experiment", "budget", "results", "report"}
 ALLOWED["handbook"] = {*ALLOWED}
 ALLOWED["cli"] = {*ALLOWED}
 ALLOWED["__main__"] = {"cli"}

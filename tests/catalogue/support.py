@@ -33,7 +33,7 @@ class Amplitude(Parameters):
 def make_source(id: str, forward: Any, consumes: tuple[Kind, ...], **kw: Any) -> Source:
     """A source for tests with the least that a record must hold."""
     parameters = kw.pop("parameters", Nothing)
-    why = dict.fromkeys(("measure", "correct", "propagate", "neutral"), "a source for tests")
+    why = dict.fromkeys(("forward", "measure", "correct", "propagate", "neutral"), "a source for tests")
     text = dict.fromkeys(("title", "description", "equation", "typical_size", "advice"), "a source for tests")
     return Source(
         id=id,

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from source_signals import flat, signal, spot_probe, stream
 
 from pixmetry.core.errors import InputError
 from pixmetry.core.signal import Kind
 from pixmetry.electronics.agc import SOURCE, Agc, start
+from source_signals import flat, signal, spot_probe, stream
 
 SHAPE = (20, 30)
 

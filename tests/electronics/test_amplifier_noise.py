@@ -7,11 +7,11 @@ import math
 import numpy as np
 import pytest
 from scipy import stats
-from source_signals import ALPHA, K_DN_PER_E, Z, fitted, flat, spot_probe, stream
 
 from pixmetry.core.errors import MeasureError
 from pixmetry.core.observations import Observations
 from pixmetry.electronics.amplifier_noise import SOURCE, AmplifierNoise
+from source_signals import ALPHA, K_DN_PER_E, Z, fitted, flat, spot_probe, stream
 
 
 def test_normal_with_the_given_standard_deviation():

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from source_signals import Z, fitted, flat, signal, stream
 
 from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.core.observations import Observations
 from pixmetry.core.signal import Kind
 from pixmetry.electronics.gain import SOURCE
 from pixmetry.sensor.shot_noise import SOURCE as SHOT
+from source_signals import Z, fitted, flat, signal, stream
 
 
 def test_electrons_become_dn():

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from source_signals import centroid, centroid_probe, fitted, signal, spot_probe, spots, stream
 
 from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.core.observations import Observations
 from pixmetry.core.signal import Kind
 from pixmetry.electronics.nonlinearity import SOURCE, Nonlinearity
+from source_signals import centroid, centroid_probe, fitted, signal, spot_probe, spots, stream
 
 BENT = Nonlinearity(a1=-0.05, a2=0.08, a3=-0.1, reference_dn=1000.0)
 
@@ -27,12 +27,16 @@ def test_rises_far_beyond_its_range():
     assert (np.diff(out) > 0).all()
 
 
-@pytest.mark.parametrize(
-    "values", [{"a1": -0.6}, {"a3": -0.3}, {"a1": 0.9, "a2": -0.9}, {"a1": 0.9, "a2": 0.9, "a3": 1.0, "reference_dn": -1}]
-)
+@pytest.mark.parametrize("values", [{"a1": -0.6}, {"a2": -0.22}, {"a3": -0.13}, {"a1": 0.9, "a2": -0.9}, {"reference_dn": -1}])
 def test_a_response_that_falls_is_refused(values):
     with pytest.raises(InputError):
         SOURCE.make(values)
+
+
+@pytest.mark.parametrize("values", [{"a1": -0.39}, {"a2": -0.21}, {"a3": -0.127}])
+def test_one_that_still_rises_up_to_its_end_is_taken(values):
+    """The slope 1 + 2a₁w, 1 + 3a₂w², 1 + 4a₃w³ reaches zero at w = 1.25 for a = −0.4, −0.2133, −0.128."""
+    assert SOURCE.make(values)
 
 
 def test_inverse_is_exact():

@@ -7,11 +7,11 @@ import math
 import numpy as np
 import pytest
 from scipy import stats
-from source_signals import ALPHA, centroid_probe, fitted, flat, stream
 
 from pixmetry.core.errors import MeasureError
 from pixmetry.core.observations import Observations
 from pixmetry.electronics.row_noise import SOURCE, RowNoise
+from source_signals import ALPHA, centroid_probe, fitted, flat, stream
 
 SHAPE = (300, 400)
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from source_signals import centroid_probe, spots
 
 from pixmetry.core.contribution import Probe
 from pixmetry.processing.threshold import SOURCE
+from source_signals import centroid_probe, spots
 
 
 def hard_threshold_probe(sigma: float, threshold: float, n: int) -> Probe:

@@ -6,13 +6,13 @@ import math
 
 import numpy as np
 import pytest
-from source_signals import K_DN_PER_E, Z, fitted, flat, spot_probe, stream
 
 from pixmetry.core.errors import MeasureError
 from pixmetry.core.observations import Observations
 from pixmetry.core.signal import Kind
 from pixmetry.sensor.dark_current import SOURCE, DarkCurrent, mean_e
 from pixmetry.sensor.shot_noise import SOURCE as SHOT
+from source_signals import K_DN_PER_E, Z, fitted, flat, spot_probe, stream
 
 
 def test_doubles_every_eight_kelvin_and_grows_with_time():

@@ -7,13 +7,13 @@ import math
 import numpy as np
 import pytest
 from scipy import stats
-from source_signals import ALPHA, K_DN_PER_E, centroid, fitted, flat, signal, spot_probe, spots, stream
 
 from pixmetry.core.errors import MeasureError
 from pixmetry.core.observations import DefectList, Observations
 from pixmetry.experiment.defects import find_defects
 from pixmetry.experiment.stack import StackAccumulator
 from pixmetry.sensor.defects import SOURCE, Defects
+from source_signals import ALPHA, K_DN_PER_E, centroid, fitted, flat, signal, spot_probe, spots, stream
 
 
 def test_shares_and_excess_follow_their_laws():
@@ -101,6 +101,15 @@ def test_one_pixel_moves_a_centroid_by_v_d_over_s():
     error[12, 15] = 50.0
     total = probe.signal_dn.sum()
     assert probe.field(error)[0][0] == pytest.approx(50 * (15 - probe.x_hat_px[0]) / total)
+
+
+def test_mean_square_of_the_excess_is_that_of_a_log_normal():
+    """The second moment from SciPy, for a spread at which the square of the mean would be 2.7 times too small."""
+    probe = spot_probe(n=4)
+    square = stats.lognorm.moment(2, s=1.0, scale=500.0)
+    expected = probe.white(K_DN_PER_E * math.sqrt(1e-3 * square))
+    got = SOURCE.propagate(Defects(hot_fraction=1e-3, hot_median_e=500.0, hot_sigma_log=1.0), probe)
+    assert (got.u_x_px, got.u_y_px) == pytest.approx(expected, rel=1e-9)
 
 
 def test_root_mean_square_shift_over_units():

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from source_signals import K_DN_PER_E, centroid, fitted, signal, spot_probe, stream
 
 from pixmetry.core.errors import MeasureError
 from pixmetry.core.observations import Observations
 from pixmetry.sensor.full_well import SOURCE, FullWell, response_e
+from source_signals import K_DN_PER_E, centroid, fitted, signal, spot_probe, stream
 
 
 def test_hard_top_is_a_minimum():
@@ -36,7 +36,7 @@ def test_below_the_full_well_nothing_moves():
 
 
 def test_shift_of_a_clipped_spot():
-    """The true shift of a centroid is that of the lost charge over what is left: first order times S/S′, computed from the clipped image."""
+    """The true shift of a centroid is that of the lost charge over what is left: first order times S/S′, from the clipped image."""
     probe = spot_probe(sigma=0.6, n=32)
     params = FullWell(full_well_e=9000)
     got = SOURCE.propagate(params, probe)

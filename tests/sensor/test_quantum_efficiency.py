@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from source_signals import fitted, signal, stream
 
 from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.core.observations import Observations
 from pixmetry.core.signal import Kind
 from pixmetry.sensor.quantum_efficiency import SOURCE
+from source_signals import fitted, signal, stream
 
 
 def test_photons_become_electrons():

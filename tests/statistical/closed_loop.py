@@ -181,7 +181,12 @@ def _unit_maps(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     extra = sum(
         camera[name].source.forward(camera[name].params, still, streams.of(name)).data[0].astype(float) for name in ("sensor.dsnu", "sensor.defects")
     )
-    return shade, response, extra
+    room = min(camera["sensor.full_well"].params.full_well_e, _top_dn(camera) / camera["electronics.gain"].params.gain_dn_per_e)
+    return shade, response, np.minimum(extra, room)
+
+
+def _top_dn(camera: Camera) -> float:
+    return camera["grabber.adc"].params.top - camera["grabber.adc"].params.offset_dn
 
 
 # ---- measuring and scoring ---------------------------------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 if TYPE_CHECKING:
-    from pixmetry.assessment import Assessment
+    from pixmetry.results import Assessment
 
 
 @click.command()
@@ -45,20 +45,19 @@ def print_summary(assessment: Assessment) -> None:
     from rich.table import Table
 
     console = Console(width=110, highlight=False)
-    console.print(f"\n[bold]{assessment.campaign.camera.name}[/bold]: {assessment.budget.verdict_text()}")
-    table = Table(title="Largest contributions to one target's position in one frame (k = 1)", title_justify="left")
-    for name, justify in (
-        ("source", "left"),
-        ("status", "left"),
-        ("class", "left"),
-        ("u x / px", "right"),
-        ("u y / px", "right"),
-        ("bias / px", "right"),
-    ):
-        table.add_column(name, justify=justify)
-    for row in assessment.budget.largest(8):
-        bias = max(abs(row.bias_x_px), abs(row.bias_y_px))
-        table.add_row(row.title, row.status, row.gum_class, f"{row.u_x_px:.5f}", f"{row.u_y_px:.5f}", f"{bias:.5f}")
+    console.print(f"\n[bold]{assessment.campaign.camera.name}[/bold]: {assessment.verdict_text()}\n")
+    table = Table(
+        title="Largest contributions to a target's position in one frame, k = 1, px", title_justify="left", box=None, pad_edge=False
+    )
+    for name in ("source", "status", "class", "u in x", "u in y", "bias", "share"):
+        table.add_column(name, justify="left" if name in ("source", "status", "class") else "right")
+    for row in [r for r in assessment.budget.of_status("measured", "modelled") if r.contribution is not None][:8]:
+        c = row.contribution
+        bias = max(abs(c.bias_x_px), abs(c.bias_y_px))
+        table.add_row(row.title, row.status, c.gum_class, *(f"{v:.5f}" for v in (c.u_x_px, c.u_y_px, bias)), f"{100 * row.share:.0f} %")
     console.print(table)
+    worst = assessment.budget.with_accepted[0].total_px
+    accepted = [r.title for r in assessment.budget.of_status("accepted") if r.contribution is not None and r.total_px > 0]
+    console.print(f"\nAccepted, not measured: {', '.join(accepted)}; all of them at the catalogue's bound: {worst:.2g} px.")
     for note in assessment.observations.notes:
-        console.print(f"note: {note}")
+        console.print(f"Note: {note}")

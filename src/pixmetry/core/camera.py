@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 
+from pixmetry.core._camera_kernels import cut_windows
 from pixmetry.core.errors import ChainError, InputError
 from pixmetry.core.random import Grid, Streams
 from pixmetry.core.signal import Kind, Signal, Windows
@@ -16,6 +17,7 @@ from pixmetry.core.source import Parameters, Source, run
 from pixmetry.core.threads import imap_tiles, map_tiles
 
 TILE_PIXELS = 1 << 16  # of float32: a tile and its copies stay in the second-level cache
+BATCH_PIXELS = 1 << 19  # of the small windows that are run as one batch: enough that the calls cost little beside the work
 BAND_ROWS = 16  # tiles of whole frames are bands of a multiple of this, the largest block of a codec
 SCHEMA = "pixmetry/camera/1"
 
@@ -174,35 +176,30 @@ class Camera:
         **schedule: Any,
     ) -> Iterator[Signal]:
         """Expose frames one after the other, in order, with only a few in flight; see `expose`."""
-        streams = self.streams(seed, quiet)
         rows, cols = self.frame_shape
         r0, c0, h, w = (0, 0, rows, cols) if window is None else window
         if not (r0 >= 0 and c0 >= 0 and h > 0 and w > 0 and r0 + h <= rows and c0 + w <= cols):
             raise InputError("the window does not lie in the frame", value=window, allowed=f"within {rows} rows and {cols} columns")
         numbers = [int(f) for f in frames]
+        if any(np.size(v) > 1 for v in schedule.values()):
+            raise InputError("a series has one schedule for all its frames", value=", ".join(schedule), remedy="expose frame by frame")
+        task = _Task(scene, self.streams(seed, quiet), schedule, threads)
         last_memory = max((i for i, e in enumerate(self.active) if e.source.start is not None), default=-1)
 
         def grid_of(number: int) -> Grid:
             return Grid(np.array([number]), np.array([r0]), np.array([c0]), (h, w))
 
         def whole(number: int) -> Signal:
-            return self._run(scene, grid_of(number), self.active, streams, schedule)
+            return self._run(task, grid_of(number), self.active)
 
-        if last_memory < 0:
+        if last_memory >= 0:
+            yield from self._with_memory(task, numbers, grid_of, last_memory)
+        elif len(numbers) == 1:  # the threads share the bands of the frame
+            yield whole(numbers[0])
+        else:
             yield from imap_tiles(whole, numbers, threads)
-            return
-        yield from self._with_memory(scene, numbers, grid_of, last_memory, streams, schedule, threads)
 
-    def _with_memory(
-        self,
-        scene: Scene,
-        numbers: list[int],
-        grid_of: Any,
-        last_memory: int,
-        streams: Streams,
-        schedule: Mapping[str, Any],
-        threads: int | None,
-    ) -> Iterator[Signal]:
+    def _with_memory(self, task: _Task, numbers: list[int], grid_of: Callable[[int], Grid], last_memory: int) -> Iterator[Signal]:
         """Run frames 0, 1, 2 … in order through everything up to the last source with a memory, the rest as far as it is wanted."""
         if numbers and (min(numbers) < 0 or numbers != sorted(set(numbers))):
             raise InputError("a camera with a memory needs frame numbers that rise from 0", value=numbers[:5])
@@ -215,19 +212,16 @@ class Camera:
             needs = self._needs(self.active, Windows.of(grid_of(number)))
             window = needs[first]
             grid = Grid(np.array([number]), window.row0, window.col0, (int(window.rows[0]), int(window.cols[0])))
-            return number, needs, self._run(scene, grid, before, streams, schedule)
+            return number, needs, self._run(task, grid, before)
 
         state: dict[str, Any] = {}
         sequence = range(max(numbers) + 1) if numbers else range(0)
-        for number, needs, signal in imap_tiles(prepared, sequence, threads):
-            for i in range(first, len(head)):
-                element = head[i]
-                signal = signal.crop(needs[i])
-                signal, state[element.name] = run(element.source, element.params, signal, streams.of(element.name), state.get(element.name))
+        for number, needs, signal in imap_tiles(prepared, sequence, task.threads):
+            for element, needed in zip(head[first:], needs[first:], strict=False):
+                name, stream = element.name, task.streams.of(element.name)
+                signal, state[name] = run(element.source, element.params, signal.crop(needed), stream, state.get(name))
             if number in wanted:
-                for i, element in enumerate(tail, start=len(head)):
-                    signal, _ = run(element.source, element.params, signal.crop(needs[i]), streams.of(element.name))
-                yield signal.crop(needs[-1])
+                yield self._walk(task, signal, tail, needs[len(head) :])
 
     def expose_windows(
         self,
@@ -260,20 +254,21 @@ class Camera:
         """
         if mode not in ("exact", "frozen"):
             raise InputError("no such mode", value=mode, allowed="exact, frozen")
-        streams = self.streams(seed, quiet)
         frozen = self._freeze(background, schedule) if mode == "frozen" else None
         if frozen is None and any(e.source.start is not None for e in self.active):
             raise InputError("a source with a memory cannot be run on single windows exactly", remedy="use iter_frames, or mode='frozen'")
-        n = len(grid.frame)
-        step = max(1, TILE_PIXELS // max(1, grid.shape[0] * grid.shape[1]))
-        spans = [np.arange(a, min(a + step, n)) for a in range(0, n, step)]
+        task = _Task(scene, self.streams(seed, quiet), schedule, threads, frozen)
+        step = max(1, BATCH_PIXELS // max(1, grid.shape[0] * grid.shape[1]))
+        groups = _equal_sizes(self._needs(self.active, Windows.of(grid), frozen is not None))
+        spans = [group[a : a + step] for group in groups for a in range(0, len(group), step)]
 
         def part(index: np.ndarray) -> np.ndarray:
-            sub = Grid(grid.frame[index], grid.row0[index], grid.col0[index], grid.shape)
-            return self._run(scene, sub, self.active, streams, {k: _take(v, index) for k, v in schedule.items()}, frozen).data
+            return self._run(task.take(index), _sub_grid(grid, index), self.active).data
 
         parts = map_tiles(part, spans, threads)
-        return np.concatenate(parts) if parts else np.zeros((0, *grid.shape), np.float32)
+        if not parts:
+            return np.zeros((0, *grid.shape), np.float32)
+        return np.concatenate(parts)[np.argsort(np.concatenate(spans))] if len(groups) > 1 else np.concatenate(parts)
 
     def frozen_tail(self) -> float:
         """Largest share of a pixel's signal that the mode ``frozen`` takes from the noise-free frame, over all sources."""
@@ -294,67 +289,31 @@ class Camera:
                 needs.append(source.window_needed(params, needs[-1], self.frame_shape))
         return needs[::-1]
 
-    def _run(
-        self,
-        scene: Scene,
-        grid: Grid,
-        elements: Sequence[Element],
-        streams: Streams,
-        schedule: Mapping[str, Any],
-        frozen: _Frozen | None = None,
-    ) -> Signal:
+    def _run(self, task: _Task, grid: Grid, elements: Sequence[Element]) -> Signal:
         """Render and run a batch; entries whose context has another size (at the frame's border) are run apart."""
-        needs = self._needs(elements, Windows.of(grid), frozen is not None)
-        sizes = np.stack([np.stack((w.rows, w.cols), 1) for w in needs], 1).reshape(len(grid.frame), -1)
-        if len(sizes) == 0 or (sizes == sizes[0]).all():
-            return self._run_equal(scene, grid, elements, needs, streams, schedule, frozen)
-        _, group = np.unique(sizes, axis=0, return_inverse=True)
-        parts, order = [], []
-        for g in range(group.max() + 1):
-            index = np.flatnonzero(group.ravel() == g)
-            sub = Grid(grid.frame[index], grid.row0[index], grid.col0[index], grid.shape)
-            part = {k: _take(v, index) for k, v in schedule.items()}
-            parts.append(self._run_equal(scene, sub, elements, [w.take(index) for w in needs], streams, part, frozen))
-            order.append(index)
+        needs = self._needs(elements, Windows.of(grid), task.frozen is not None)
+        order = _equal_sizes(needs)
+        if len(order) == 1:
+            return self._run_equal(task, grid, elements, needs)
+        parts = [self._run_equal(task.take(i), _sub_grid(grid, i), elements, [w.take(i) for w in needs]) for i in order]
         return _concatenate(parts).take(np.argsort(np.concatenate(order)))
 
-    def _run_equal(
-        self,
-        scene: Scene,
-        grid: Grid,
-        elements: Sequence[Element],
-        needs: list[Windows],
-        streams: Streams,
-        schedule: Mapping[str, Any],
-        frozen: _Frozen | None,
-    ) -> Signal:
-        if len(grid.frame) == 1 and frozen is None:
-            return self._run_bands(scene, grid, elements, needs, streams, schedule)
-        signal = self.signal(scene, _grid_at(grid, needs[0]), **schedule)
-        return self._walk(signal, elements, needs, streams, frozen)
+    def _run_equal(self, task: _Task, grid: Grid, elements: Sequence[Element], needs: list[Windows]) -> Signal:
+        if len(grid.frame) == 1 and task.frozen is None:
+            return self._run_bands(task, grid, elements, needs)
+        return self._walk(task, self.signal(task.scene, _grid_at(grid, needs[0]), **task.schedule), elements, needs)
 
-    def _walk(
-        self, signal: Signal, elements: Sequence[Element], needs: list[Windows], streams: Streams, frozen: _Frozen | None = None
-    ) -> Signal:
+    def _walk(self, task: _Task, signal: Signal, elements: Sequence[Element], needs: list[Windows]) -> Signal:
         """Run the elements over the windows of ``needs`` one after the other."""
-        for i, element in enumerate(elements):
-            signal = signal.crop(needs[i])
-            stream = streams.of(element.name)
-            if frozen is not None and element.name in frozen.elements:
-                signal = frozen.apply(element, signal, stream)
+        for element, needed in zip(elements, needs, strict=False):
+            stream = task.streams.of(element.name)
+            if task.frozen is not None and element.name in task.frozen.elements:
+                signal = task.frozen.apply(element, signal.crop(needed), stream)
             else:
-                signal, _ = run(element.source, element.params, signal, stream)
+                signal, _ = run(element.source, element.params, signal.crop(needed), stream)
         return signal.crop(needs[-1])
 
-    def _run_bands(
-        self,
-        scene: Scene,
-        grid: Grid,
-        elements: Sequence[Element],
-        needs: list[Windows],
-        streams: Streams,
-        schedule: Mapping[str, Any],
-    ) -> Signal:
+    def _run_bands(self, task: _Task, grid: Grid, elements: Sequence[Element], needs: list[Windows]) -> Signal:
         """Run one large window in bands that stay in the cache, as far as the sources allow: by rows, by columns, or whole.
 
         Sources that follow each other and allow the same kind of band are run together, band by band.
@@ -363,19 +322,17 @@ class Camera:
         at = 0
         while at < len(elements) or signal is None:
             axis, end = self._segment(elements, at, needs[at])
-            outer = needs[end] if end < len(elements) else needs[-1]
-            bands = _bands(outer if end > at else needs[at], axis)
             segment = elements[at:end]
 
-            def band(windows: Windows, segment=segment, source=signal) -> Signal:
+            def band(windows: Windows, segment: Sequence[Element] = segment, source: Signal | None = signal) -> Signal:
                 local = self._needs(segment, windows)
-                part = source.crop(local[0]) if source else self.signal(scene, _grid_at(grid, local[0]), **schedule)
-                return self._walk(part, segment, local, streams)
+                part = source.crop(local[0]) if source is not None else self.signal(task.scene, _grid_at(grid, local[0]), **task.schedule)
+                return self._walk(task, part, segment, local)
 
-            parts = map_tiles(band, bands)
-            signal = parts[0] if len(parts) == 1 else _stitch(parts, _grid_at(grid, outer if end > at else needs[at]), axis)
+            parts = map_tiles(band, _bands(needs[end], axis), task.threads)
+            signal = parts[0] if len(parts) == 1 else _stitch(parts, _grid_at(grid, needs[end]), axis or 0)
             at = end
-        return signal.crop(needs[-1])
+        return signal
 
     def _segment(self, elements: Sequence[Element], start: int, windows: Windows) -> tuple[int | None, int]:
         """Return along which axis bands can be cut from element ``start`` on (0 rows, 1 columns, None whole), and how far."""
@@ -439,6 +396,21 @@ class Camera:
         from pixmetry.core.config import dump_yaml
 
         dump_yaml(self.to_record(), path)
+
+
+@dataclass(frozen=True)
+class _Task:
+    """What all parts of one run share."""
+
+    scene: Scene
+    streams: Streams
+    schedule: Mapping[str, Any]
+    threads: int | None = None
+    frozen: _Frozen | None = None
+
+    def take(self, index: np.ndarray) -> _Task:
+        """The task of some windows of the batch: values that are given window by window are picked."""
+        return replace(self, schedule={k: np.asarray(v)[index] if np.size(v) > 1 else v for k, v in self.schedule.items()})
 
 
 class _Quiet:
@@ -509,8 +481,8 @@ class _Frozen:
 
 def _cut(frame: Signal, like: Signal) -> Signal:
     """Cut the windows of one signal out of a whole frame."""
-    rows, cols = like.rows[:, :, None], like.cols[:, None, :]
-    return like.with_data(frame.data[0][rows, cols], frame.kind)
+    data = cut_windows(np.ascontiguousarray(frame.data[0], np.float32), like.grid.row0, like.grid.col0, *like.data.shape[1:])
+    return like.with_data(data, frame.kind)
 
 
 def _settled(element: Element, signal: Signal, stream: Any, most: int = 400) -> Any:
@@ -525,8 +497,17 @@ def _settled(element: Element, signal: Signal, stream: Any, most: int = 400) -> 
     raise InputError(f"{element.name} does not settle on the background", remedy="check its parameters, or use mode='exact'")
 
 
-def _take(value: Any, index: np.ndarray) -> Any:
-    return np.asarray(value)[index] if np.ndim(value) == 1 and len(value) > 1 else value
+def _sub_grid(grid: Grid, index: np.ndarray) -> Grid:
+    return Grid(grid.frame[index], grid.row0[index], grid.col0[index], grid.shape)
+
+
+def _equal_sizes(needs: list[Windows]) -> list[np.ndarray]:
+    """Positions of the batch whose windows have the same sizes all along the chain, group by group."""
+    sizes = np.stack([v for w in needs for v in (w.rows, w.cols)], 1)
+    if (sizes == sizes[:1]).all():
+        return [np.arange(len(sizes))] if len(sizes) else []
+    group = np.unique(sizes, axis=0, return_inverse=True)[1].ravel()
+    return [np.flatnonzero(group == g) for g in range(group.max() + 1)]
 
 
 def _grid_at(grid: Grid, windows: Windows) -> Grid:
@@ -556,10 +537,16 @@ def _stitch(parts: list[Signal], grid: Grid, axis: int) -> Signal:
 def _concatenate(parts: list[Signal]) -> Signal:
     if len(parts) == 1:
         return parts[0]
-    grids = [p.grid for p in parts]
-    grid = Grid(*(np.concatenate([getattr(g, f) for g in grids]) for f in ("frame", "row0", "col0")), grids[0].shape)
-    joined = {f: np.concatenate([getattr(p, f) for p in parts]) for f in ("data", "exposure_s", "time_s", "temperature_c")}
-    return replace(parts[0], grid=grid, **joined)
+
+    def joined(name: str) -> np.ndarray:
+        return np.concatenate([getattr(p if name in _ARRAYS else p.grid, name) for p in parts])
+
+    grid = Grid(joined("frame"), joined("row0"), joined("col0"), parts[0].grid.shape)
+    data, exposure_s, time_s, temperature_c = (joined(name) for name in _ARRAYS)
+    return Signal(data, parts[0].kind, grid, parts[0].frame_shape, exposure_s, time_s, temperature_c)
+
+
+_ARRAYS = ("data", "exposure_s", "time_s", "temperature_c")  # of a signal, one entry per window
 
 
 def check_chain(chain: Sequence[Element], where: str = "camera") -> None:
@@ -641,7 +628,7 @@ def load_camera(path: str | Path) -> Camera:
 
     from pixmetry.core.config import load_yaml
 
-    presets = {p.name.removesuffix(".yaml"): p for p in files("pixmetry.cameras").iterdir() if p.name.endswith(".yaml")}
+    presets = {p.name.removesuffix(".yaml"): p for p in (files("pixmetry") / "cameras").iterdir() if p.name.endswith(".yaml")}
     if str(path) in presets:
         path = Path(str(presets[str(path)]))
     elif not Path(path).is_file():

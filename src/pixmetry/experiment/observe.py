@@ -21,6 +21,7 @@ from pixmetry.core.observations import (
 )
 from pixmetry.experiment.defects import find_defects
 from pixmetry.experiment.histogram import HistogramAccumulator, code_errors
+from pixmetry.experiment.linearity import Linearity
 from pixmetry.experiment.moments import LevelAccumulator, LevelSummary, level_moments
 from pixmetry.experiment.patterns import find_phase_patterns
 from pixmetry.experiment.photon_transfer_fit import fit_photon_transfer
@@ -88,7 +89,7 @@ def observe(groups: Iterable[Group], bits: int, temperature_c: float | None = No
     counts = histogram.result()
     transfer = _photon_transfer(levels, shape, bits)
     fit = fit_photon_transfer(transfer, dark_stack, bright_stack)
-    defects, spatial, patterns = _spatial(dark_stack, bright_stack, dark_spectra, notes)
+    defects, spatial, patterns = _spatial(dark_stack, bright_stack, dark_spectra, Linearity.of(fit, bits), notes)
     return Observations(
         photon_transfer=transfer,
         photon_transfer_fit=fit,
@@ -130,7 +131,7 @@ def _photon_transfer(levels: dict[str, list[_Level]], shape: tuple[int, int] | N
 
 
 def _spatial(
-    dark: StackMoments | None, bright: StackMoments | None, spectra: Spectra | None, notes: list[str]
+    dark: StackMoments | None, bright: StackMoments | None, spectra: Spectra | None, linearity: Linearity, notes: list[str]
 ) -> tuple[DefectList | None, Estimates | None, PatternList | None]:
     if dark is None:
         notes.append(
@@ -143,7 +144,7 @@ def _spatial(
         notes.append("no stack of bright frames: DSNU and PRNU are not measured (take 16 or more at half of saturation)")
         return defects, None, patterns
     try:
-        return defects, fit_spatial(dark, bright, defects), patterns
+        return defects, fit_spatial(dark, bright, defects, linearity=linearity, patterns=patterns), patterns
     except MeasureError as problem:
         notes.append(f"DSNU and PRNU are not measured: {problem}")
         return defects, None, patterns

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.core.estimates import Estimates
-from pixmetry.core.observations import DefectList, StackMoments
+from pixmetry.core.observations import DefectList, PatternList, StackMoments
+from pixmetry.experiment.linearity import Linearity
+from pixmetry.experiment.photon_transfer_model import QUANTISATION_DN2
 from pixmetry.experiment.surface import Strata, Surface, cross_strata, fill, fit_surface, residual_parts
 
 PARTS = ("pixel", "row", "col")
@@ -30,7 +32,13 @@ class _MeanSquares:
 
 
 def fit_spatial(
-    dark_stack: StackMoments, bright_stack: StackMoments, defects: DefectList | None = None, *, surface_degree: int = 4
+    dark_stack: StackMoments,
+    bright_stack: StackMoments,
+    defects: DefectList | None = None,
+    *,
+    surface_degree: int = 4,
+    linearity: Linearity | None = None,
+    patterns: PatternList | None = None,
 ) -> Estimates:
     """Dark-signal and photo-response non-uniformity with their row, column and pixel parts.
 
@@ -42,6 +50,11 @@ def fit_spatial(
         Pixels to leave out; by default those of ``find_defects``.
     surface_degree : int
         Total degree of the polynomial that takes up the illumination.
+    linearity : Linearity, optional
+        Of this camera: the maps are straightened with it before they are compared. A bent response shows a contrast of the light
+        x f'(x)/f(x) times as large; at half of the range that is 1 % for a₁ = 0.02.
+    patterns : PatternList, optional
+        Fixed waves to take out of the dark map: they are no property of single pixels.
 
     Returns
     -------
@@ -68,6 +81,9 @@ def fit_spatial(
     temporal row noise goes into s²_row and drives s²_pixel below zero. A polynomial is preferred to the high-pass filter of that release
     since what it takes from each part is a known number of degrees of freedom; illumination with finer structure stays in the PRNU.
     The dark map keeps its slow part: it belongs to the sensor.
+
+    Rounding: where the temporal noise σ is small, the mean code follows an offset with the slope 1 + 2e^(−2π²σ²) cos 2πx at the unknown
+    phase x within a code (first harmonic; Widrow and Kollár, Quantization Noise, ch. 5); u of the DSNU holds that.
     """
     from pixmetry.experiment.defects import find_defects
 
@@ -79,6 +95,9 @@ def fit_spatial(
             "frames are too small for the surface", value=(rows, cols), allowed=f"{2 * surface_degree + 4} rows and columns or more"
         )
     mask = (find_defects(dark_stack, bright_stack, surface_degree=surface_degree) if defects is None else defects).mask()
+    stored_dn, dither_dn2 = bright_stack.mean_dn, max(dark_stack.ms_pixel_dn2 - QUANTISATION_DN2, 0.0)
+    if linearity is not None:
+        dark_stack, bright_stack = linearity.straight_stack(dark_stack), linearity.straight_stack(bright_stack)
     light = fill(bright_stack.mean_map_dn - dark_stack.mean_map_dn, mask)
     if light.mean() <= 0:
         raise MeasureError("the bright stack is not brighter than the dark one", value=float(light.mean()))
@@ -88,10 +107,49 @@ def fit_spatial(
     if surface.values.min() <= 0:
         raise MeasureError("the light falls to nothing within the frame", where="bright stack", remedy="light the frame evenly, or crop it")
     dark = fill(dark_stack.mean_map_dn, mask)
+    if patterns is not None:
+        dark = without_fixed_waves(dark, patterns)
     response = fill((bright_stack.mean_map_dn - dark_stack.mean_map_dn) / surface.values, mask)
     response = response - fit_surface(response, surface_degree).values
     squares, covariance = _mean_squares(dark_stack, bright_stack, dark, response, mask, surface)
-    return _components(squares, covariance, dark_stack.shape, float((surface.values**-2.0).mean())).join(_shading(surface, squares))
+    components = _components(squares, covariance, dark_stack.shape, float((surface.values**-2.0).mean()))
+    result = _with_rounding(components, dither_dn2).join(_shading(surface, squares))
+    return result if linearity is None else _with_common_scale(result, linearity.contrast_u_rel(stored_dn))
+
+
+def _with_common_scale(e: Estimates, u_rel: float) -> Estimates:
+    """Add the relative uncertainty that all contrasts of the light have in common."""
+    contrast = np.array([0.0 if name.startswith("dsnu") else 1.0 for name in e.names]) * e.values * u_rel
+    covariance = e.covariance + np.outer(contrast, contrast)
+    # Welch–Satterthwaite with a scale whose own u is known
+    dof = e.dof * np.divide(np.diag(covariance), np.diag(e.covariance), out=np.ones(len(e)), where=np.diag(e.covariance) > 0) ** 2
+    return replace(e, covariance=covariance, dof=dof)
+
+
+def _with_rounding(e: Estimates, dither_dn2: float) -> Estimates:
+    """Add what rounding at an unknown phase does to the DSNU: to all variances by their slope, to the pixels by the wave itself."""
+    damp = math.exp(-2 * math.pi**2 * dither_dn2)
+    total2 = e["dsnu_total_dn"].value ** 2
+    slope = 2 * damp * math.exp(-2 * math.pi**2 * total2)
+    extra = np.zeros(len(e))
+    for i, name in enumerate(e.names):
+        if name.startswith("dsnu"):
+            wave2 = min((damp / math.pi) ** 2, (2 * damp) ** 2 * total2) / 2 if name in ("dsnu_pixel_dn", "dsnu_total_dn") else 0.0
+            u_square = math.hypot(2 * slope * e.values[i] ** 2 / math.sqrt(2), wave2)
+            extra[i] = u_square / (2 * e.values[i]) if e.values[i] > 0 else 0.0
+    return replace(e, covariance=e.covariance + np.diag(extra**2))
+
+
+def without_fixed_waves(image: np.ndarray, patterns: PatternList) -> np.ndarray:
+    """The image less its fixed waves: least squares of sine and cosine at the frequencies found, beside a constant."""
+    rows, cols = image.shape
+    y, x = np.arange(rows) - (rows - 1) / 2, np.arange(cols) - (cols - 1) / 2
+    for k in np.flatnonzero(~patterns.moving):
+        phase = 2 * np.pi * (patterns.frequency_y[k] * y[:, None] + patterns.frequency_x[k] * x[None, :])
+        design = np.stack([np.ones(image.size), np.cos(phase).ravel(), np.sin(phase).ravel()])
+        c = np.linalg.solve(design @ design.T, design @ image.ravel())
+        image = image - (c[1:] @ design[1:]).reshape(image.shape)
+    return image
 
 
 def _temporal(stack: StackMoments, mask: np.ndarray, weight: np.ndarray | None = None) -> Strata:

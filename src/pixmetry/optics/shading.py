@@ -14,15 +14,16 @@ from pixmetry.core.random import Stream
 from pixmetry.core.signal import Kind, Signal
 from pixmetry.core.source import Parameters, Source, quantity
 
+PLACES = 24  # along each side of the frame, for the spread over it
 SMALLEST_FACTOR = 1e-3  # a frame cannot be darker than dark, and the correction divides by this
 
 
 class Shading(Parameters):
     """A tilted paraboloid about the frame's centre, whose mean over the frame is 1."""
 
-    gradient_x_per_px: float = quantity(0.0, "1/px", "gradient along x at the centre of the frame, relative to the mean light", ge=-0.1, le=0.1)
-    gradient_y_per_px: float = quantity(0.0, "1/px", "gradient along y at the centre of the frame, relative to the mean light", ge=-0.1, le=0.1)
-    corner_rel: float = quantity(0.0, "1", "loss from the centre to the corners, relative to the mean light; grows with the square of the radius", ge=0, le=0.95)
+    gradient_x_per_px: float = quantity(0.0, "1/px", "gradient along x at the frame's centre, over the mean light", ge=-0.1, le=0.1)
+    gradient_y_per_px: float = quantity(0.0, "1/px", "gradient along y at the frame's centre, over the mean light", ge=-0.1, le=0.1)
+    corner_rel: float = quantity(0.0, "1", "loss from the centre to the corners (as r²), over the mean light", ge=0, le=0.95)
 
 
 def curvature_per_px2(params: Shading, frame_shape: tuple[int, int]) -> float:
@@ -62,29 +63,31 @@ def correct(params: Shading, signal: Signal, maps: Mapping[str, np.ndarray]) -> 
     return signal.with_data(signal.data / factor(params, signal))
 
 
-def propagate(params: Shading, probe: Probe) -> Contribution:
-    """Propagator P3: a relative ramp g moves a centroid by g⟨x²⟩.
+def relative_gradients(params: Shading, frame_shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Gradient over the light itself, along x and y (1/px), at `PLACES` × `PLACES` places spread evenly over the frame."""
+    rows, cols = frame_shape
+    loss = curvature_per_px2(params, frame_shape)
+    even = (np.arange(PLACES) + 0.5) / PLACES - 0.5
+    y, x = np.meshgrid(even * rows, even * cols, indexing="ij")
+    slope_x, slope_y = params.gradient_x_per_px - 2 * loss * x, params.gradient_y_per_px - 2 * loss * y
+    light = 1 + params.gradient_x_per_px * x + params.gradient_y_per_px * y - loss * (x**2 + y**2 - (rows**2 + cols**2 - 2) / 12)
+    light = np.maximum(light, SMALLEST_FACTOR)
+    return (slope_x / light).ravel(), (slope_y / light).ravel()
 
-    The gradient at the centre gives the bias; the slope of the quadratic part, whose mean over the frame is zero and whose root mean
-    square is 2·loss·size/√12, gives the spread over targets anywhere on the frame.
-    """
+
+def propagate(params: Shading, probe: Probe) -> Contribution:
+    """Propagator P3: a relative ramp g moves a centroid by g⟨x²⟩; mean and spread over targets anywhere on the frame."""
     rows, cols = probe.signal_dn.shape[1:]
     ramp_x = (np.arange(cols) - probe.x_px[:, None])[:, None, :] * probe.signal_dn
     ramp_y = (np.arange(rows) - probe.y_px[:, None])[:, :, None] * probe.signal_dn
     (xx, yx), (xy, yy) = probe.field(ramp_x), probe.field(ramp_y)
-    slopes = 2 * curvature_per_px2(params, probe.frame_shape) * np.array(probe.frame_shape) / np.sqrt(12)
-    gx, gy = params.gradient_x_per_px, params.gradient_y_per_px
-    dx, dy = gx * xx + gy * xy, gx * yx + gy * yy
-    spread_x = np.sqrt(np.var(dx) + np.mean((slopes[1] * xx) ** 2 + (slopes[0] * xy) ** 2))
-    spread_y = np.sqrt(np.var(dy) + np.mean((slopes[1] * yx) ** 2 + (slopes[0] * yy) ** 2))
-    return Contribution(
-        u_x_px=float(spread_x),
-        u_y_px=float(spread_y),
-        bias_x_px=float(np.mean(dx)),
-        bias_y_px=float(np.mean(dy)),
-        gum_class="G",
+    gx, gy = (g[:, None] for g in relative_gradients(params, probe.frame_shape))
+    return probe.from_shifts(
+        gx * xx + gy * xy,
+        gx * yx + gy * yy,
+        "G",
         model_error=0.15,
-        method="linear response of the estimator to a relative ramp; slope of the quadratic part: rms over the frame",
+        method="linear response of the estimator to the relative gradient, at places all over the frame",
     )
 
 

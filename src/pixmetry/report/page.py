@@ -9,7 +9,7 @@ from pixmetry import __version__
 from pixmetry.report.numbers import significant
 
 if TYPE_CHECKING:
-    from pixmetry.assessment import Assessment
+    from pixmetry.results import Assessment
 
 TRANSFER = ("transfer", "linearity", "snr")
 
@@ -49,7 +49,7 @@ def _content(assessment: Assessment) -> dict[str, Any]:
 
     seen = assessment.observations
     pictures = all_pictures(seen, assessment.standard, assessment.maps())
-    return budget_content(assessment.budget, assessment.campaign.camera, assessment.unmeasured) | {
+    return budget_content(assessment.budget, assessment.unmeasured) | {
         "version": __version__,
         "name": assessment.campaign.camera.name,
         "facts": _facts(assessment),

@@ -81,9 +81,17 @@ def context(params: ChargeTransfer, windows: Windows, frame_shape: tuple[int, in
     return windows.full_rows(frame_shape) if params.serial_cti else windows
 
 
+def _deferred_share(params: ChargeTransfer, loss: float) -> float:
+    """Share of a packet that falls behind on the longest way to the output."""
+    return -math.expm1(LONGEST_STEPS * params.phases * math.log1p(-loss))
+
+
 def _reach_px(params: ChargeTransfer) -> int:
-    """Pixels after which less than `NEAR_SHARE` of deferred charge is still under way, with trails stretched by half."""
-    stay = 1 - 1 / (1.5 * params.trail_px)
+    """Pixels after which less than `NEAR_SHARE` of deferred charge is still under way, with the trail of the longest way."""
+    loss = max(params.parallel_cti, params.serial_cti)
+    if not loss:
+        return 0
+    stay = 1 - _deferred_share(params, loss) / (LONGEST_STEPS * params.phases * loss * params.trail_px)
     return math.ceil(math.log(NEAR_SHARE) / math.log(stay))
 
 
@@ -95,8 +103,7 @@ def near(params: ChargeTransfer) -> tuple[int, int, int, int]:
 
 def tail(params: ChargeTransfer) -> float:
     """Share of a packet far from the output that trails beyond `near`."""
-    losses = sum(-math.expm1(LONGEST_STEPS * params.phases * math.log1p(-loss)) for loss in (params.parallel_cti, params.serial_cti))
-    return NEAR_SHARE * losses
+    return NEAR_SHARE * (_deferred_share(params, params.parallel_cti) + _deferred_share(params, params.serial_cti))
 
 
 def propagate(params: ChargeTransfer, probe: Probe) -> Contribution:

@@ -1,0 +1,50 @@
+"""What to do about the largest contributions, and what it would bring."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from pixmetry.budget.combine import Combined
+from pixmetry.core.catalogue import get_source
+
+MOST = 5
+
+
+@dataclass(frozen=True)
+class Advice:
+    """What to do about one source: measure it if it was only accepted, else lower it.
+
+    ``combined_px`` is the combined total now, ``removed_px`` and ``halved_px`` what it would be without this contribution and with half of it.
+    """
+
+    name: str
+    source_id: str
+    title: str
+    status: str
+    text: str
+    total_px: float
+    combined_px: float
+    removed_px: float
+    halved_px: float
+
+
+def advise(rows: Sequence[Any], verdict: Combined, everything: Combined, most: int = MOST) -> tuple[Advice, ...]:
+    """Advice for the largest of the rows that a combined total rests on.
+
+    The gain is told within the total that the row belongs to: for an accepted source, the one with everything accepted at its bound.
+    """
+    chosen = sorted((r for r in rows if r.contribution is not None and r.status != "not applicable" and r.total_px > 0), key=lambda r: -r.total_px)
+    return tuple(_advice(r, (everything if r.status == "accepted" else verdict).total_px) for r in chosen[:most])
+
+
+def _advice(row: Any, combined_px: float) -> Advice:
+    text = get_source(row.source_id).advice
+    if row.status == "accepted":
+        text = f"Not measured: taken at the largest to expect. {text}"
+    removed = row.without_px
+    halved = float(np.sqrt(removed**2 + 0.25 * (combined_px**2 - removed**2)))
+    return Advice(row.name, row.source_id, row.title, row.status, text, row.total_px, combined_px, removed, halved)

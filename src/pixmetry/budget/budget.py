@@ -1,0 +1,313 @@
+"""The budget: every source's contribution to a target's position, ranked, combined, and checked by Monte Carlo."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from pixmetry.budget.advice import Advice, advise
+from pixmetry.budget.combine import Combined, combine
+from pixmetry.budget.monte_carlo import MonteCarlo, Trials
+from pixmetry.budget.parameters import applies, base_of, u_of_total, with_estimates
+from pixmetry.budget.probe import Facts, Target, facts_of, make_probe, resolve
+from pixmetry.core.camera import Camera
+from pixmetry.core.catalogue import catalogue
+from pixmetry.core.contribution import Contribution
+from pixmetry.core.estimates import Estimates
+from pixmetry.core.source import Source
+from pixmetry.locate.estimators import Estimator
+
+SCHEMA = "pixmetry/budget/1"
+ESTIMATOR_ITSELF = "processing.threshold"
+DECIDED = ("measured", "modelled")
+FRAMES = (1, 4, 16, 64)
+
+
+@dataclass(frozen=True)
+class BudgetRow:
+    """One source in the budget.
+
+    Parameters
+    ----------
+    name, source_id, title : str
+        Name in the camera's chain (or the source's id), and the source.
+    status : {"measured", "modelled", "accepted", "not applicable"}
+        Its parameters were estimated in this campaign; it is known without (from the camera's description, or it has no parameters); the
+        campaign could not tell, and it is taken at the largest to expect of a sound camera; such a camera cannot have it.
+    contribution : Contribution, optional
+    u_of_total_px : float
+        Uncertainty of the contribution's total that comes of its parameters' uncertainty.
+    monte_carlo : MonteCarlo, optional
+        The same by simulation.
+    share : float
+        Part of the square of the combined total that it belongs to (with everything accepted, for what is accepted).
+    without_px : float
+        Combined total if it were gone.
+    reason : str
+        Why there is no contribution, or how its status came about.
+    """
+
+    name: str
+    source_id: str
+    title: str
+    status: str
+    contribution: Contribution | None = None
+    u_of_total_px: float = 0.0
+    monte_carlo: MonteCarlo | None = None
+    share: float = 0.0
+    without_px: float = 0.0
+    reason: str = ""
+
+    @property
+    def total_px(self) -> float:
+        """Root mean square over x and y of random part and bias."""
+        return 0.0 if self.contribution is None else self.contribution.total_px
+
+
+@dataclass(frozen=True)
+class Interaction:
+    """Everything at once against the root sum of squares of everything alone, both by Monte Carlo, in px."""
+
+    together: MonteCarlo
+    sum_px: float
+    se_sum_px: float
+
+    @property
+    def difference_px(self) -> float:
+        """What the sources do together beyond what they do alone."""
+        return self.together.total_px - self.sum_px
+
+    @property
+    def se_px(self) -> float:
+        """Standard error of the difference; the two are taken as independent."""
+        return float(np.hypot(self.together.se_total_px, self.se_sum_px))
+
+
+@dataclass(frozen=True)
+class Budget:
+    """All rows, largest first, and what they come to.
+
+    ``verdicts`` combines what is measured and modelled, for one frame and for means over several; ``with_accepted`` adds everything that was
+    accepted, at its bound. Totals are k = 1.
+    """
+
+    camera: str
+    target: Target
+    estimator: Estimator
+    facts: Facts
+    pitch_um: tuple[float, float] | None
+    rows: tuple[BudgetRow, ...]
+    verdicts: tuple[Combined, ...]
+    with_accepted: tuple[Combined, ...]
+    advice: tuple[Advice, ...]
+    interaction: Interaction | None = None
+
+    @property
+    def verdict(self) -> Combined:
+        """One target in one frame, from what is measured and modelled."""
+        return self.verdicts[0]
+
+    def of_status(self, *status: str) -> tuple[BudgetRow, ...]:
+        """The rows of a status, largest first."""
+        return tuple(r for r in self.rows if r.status in status)
+
+    def um(self, combined: Combined) -> tuple[float, float] | None:
+        """Totals in x and y in µm on the sensor, if the pitch is known."""
+        if self.pitch_um is None:
+            return None
+        return combined.total_x_px * self.pitch_um[0], combined.total_y_px * self.pitch_um[1]
+
+    def to_record(self) -> dict[str, Any]:
+        """Return a plain record for JSON; numbers that do not exist are None."""
+        return {
+            "schema": SCHEMA,
+            "camera": self.camera,
+            "target": asdict(self.target),
+            "estimator": asdict(self.estimator),
+            "facts": asdict(self.facts),
+            "pitch_um": None if self.pitch_um is None else list(self.pitch_um),
+            "rows": [_row_record(r) for r in self.rows],
+            "verdicts": [_combined_record(self, c) for c in self.verdicts],
+            "with_accepted": [_combined_record(self, c) for c in self.with_accepted],
+            "advice": [asdict(a) for a in self.advice],
+            "interaction": None
+            if self.interaction is None
+            else {
+                "together": _monte_carlo_record(self.interaction.together),
+                "sum_px": self.interaction.sum_px,
+                "se_sum_px": self.interaction.se_sum_px,
+                "difference_px": self.interaction.difference_px,
+                "se_px": self.interaction.se_px,
+            },
+        }
+
+
+def compute_budget(
+    camera: Camera,
+    estimates_by_source: Mapping[str, Estimates] | None = None,
+    known_facts: Mapping[str, Any] | None = None,
+    target: Target | None = None,
+    estimator: Estimator | None = None,
+    *,
+    accepted: Collection[str] = (),
+    frames: Sequence[int] = FRAMES,
+    trials: int = 2048,
+    units: int = 8,
+    seed: int = 0,
+    progress: Callable[[str], None] | None = None,
+) -> Budget:
+    """Budget of a target's position in one camera.
+
+    Parameters
+    ----------
+    camera : Camera
+        Its chain is what is known of it: a source in the chain counts as modelled with the parameters it has there.
+    estimates_by_source : mapping of str to Estimates, optional
+        By name in the chain or id of the source: what the campaign measured; it replaces parameters of the chain.
+    known_facts : mapping, optional
+        Fields of `Facts` that go before what the chain tells.
+    target : Target, optional
+        By default a disc of 7 px.
+    estimator : Estimator, optional
+        By default a soft threshold of three standard deviations in 13 × 13 px.
+    accepted : collection of str
+        Names in the chain that are there without being known: taken at their bound.
+    frames : sequence of int
+        Numbers of frames to combine for; the first is the verdict's.
+    trials, units, seed : int
+        Of each Monte Carlo; ``trials=0`` leaves them out.
+    progress : callable, optional
+        Called with the name of what is being done.
+
+    Returns
+    -------
+    Budget
+    """
+    target, estimator = target or Target(), estimator or Estimator()
+    estimates_by_source = dict(estimates_by_source or {})
+    say = progress or (lambda text: None)
+    say("camera")
+    camera = _as_measured(camera, estimates_by_source)
+    facts = facts_of(camera, target, known_facts)
+    probe = make_probe(facts, target, estimator)
+    rows = []
+    for name, source in _sources(camera):
+        say(name)
+        rows.append(_row(name, source, camera, estimates_by_source.get(name), name in accepted, probe))
+    interaction = None
+    if trials:
+        design = Trials(camera, target, estimator, facts, trials, units, seed=seed)
+        rows = [_simulated(row, design, camera, say) for row in rows]
+        say("all sources together")
+        interaction = _interaction(rows, design)
+    rows, verdicts, everything = _combined(rows, frames)
+    return Budget(
+        camera.name,
+        target,
+        resolve(estimator, target, facts),
+        facts,
+        camera.pitch_um,
+        tuple(rows),
+        verdicts,
+        everything,
+        advise(rows, verdicts[0], everything[0]),
+        interaction,
+    )
+
+
+def _sources(camera: Camera) -> list[tuple[str, Source]]:
+    """What has a row: the chain, then what the catalogue has beyond it."""
+    named = [(e.name, e.source) for e in camera.active]
+    there = {source.id for _, source in named}
+    return named + [(i, s) for i, s in catalogue().items() if i not in there]
+
+
+def _as_measured(camera: Camera, estimates_by_source: dict[str, Estimates]) -> Camera:
+    """Put the estimates into the chain; the mapping is keyed by name in the chain afterwards."""
+    chain = []
+    for element in camera.chain:
+        estimates = estimates_by_source.get(element.name, estimates_by_source.get(element.source.id))
+        if estimates is not None and len(estimates):
+            estimates_by_source[element.name] = estimates
+            element = replace(element, params=with_estimates(element.source, element.params, estimates))
+        chain.append(element)
+    return replace(camera, chain=tuple(chain))
+
+
+def _row(name: str, source: Source, camera: Camera, estimates: Estimates | None, at_bound: bool, probe: Any) -> BudgetRow:
+    head = BudgetRow(name, source.id, source.title, "")
+    if not applies(source, camera.facts):
+        return replace(head, status="not applicable", reason=f"only in a camera that is {' or '.join(source.applies_to)}")
+    measured = estimates is not None and len(estimates) > 0
+    present = any(e.name == name for e in camera.active)
+    if measured:
+        status, params = "measured", base_of(source, camera, name)
+        params = params if present else with_estimates(source, params, estimates)
+        reason = estimates.method
+    elif (present and not at_bound) or not source.parameters.model_fields:
+        status, params, reason = "modelled", base_of(source, camera, name), "from the description of the camera" if present else ""
+    else:
+        status, params = "accepted", source.bound
+        reason = source.reasons.get("measure", "not measured in this campaign")
+    if source.propagate is None:
+        return replace(head, status=status, reason=source.reasons["propagate"])
+    contribution = source.propagate(params, probe)
+    u = u_of_total(source, params, estimates, probe) if measured else 0.0
+    return replace(head, status=status, contribution=contribution, u_of_total_px=u, reason=reason)
+
+
+def _simulated(row: BudgetRow, design: Trials, camera: Camera, say: Callable[[str], None]) -> BudgetRow:
+    """Add the Monte Carlo to a row that the chain can simulate with the parameters of the row."""
+    if row.contribution is None or row.status not in DECIDED:
+        return row
+    if row.source_id == ESTIMATOR_ITSELF:
+        return replace(row, monte_carlo=design.compare([row.name], camera.switched(on=()), None))
+    if row.name not in camera or not camera[row.name].on:
+        return row
+    say(f"Monte Carlo: {row.name}")
+    return replace(row, monte_carlo=design.of(only=[row.name]))
+
+
+def _interaction(rows: Sequence[BudgetRow], design: Trials) -> Interaction:
+    alone = [r.monte_carlo for r in rows if r.monte_carlo is not None]
+    total = float(np.sqrt(sum(m.total_px**2 for m in alone)))
+    error = float(np.sqrt(sum((m.total_px * m.se_total_px) ** 2 for m in alone)) / total) if total else 0.0
+    return Interaction(design.of(), total, error)
+
+
+def _combined(rows: Sequence[BudgetRow], frames: Sequence[int]) -> tuple[list[BudgetRow], tuple[Combined, ...], tuple[Combined, ...]]:
+    """Combine, give each row its share and what is left without it, and sort by size."""
+    groups = {"decided": DECIDED, "all": (*DECIDED, "accepted")}
+    there = {k: [r for r in rows if r.status in s and r.contribution is not None] for k, s in groups.items()}
+    results = {k: tuple(combine([r.contribution for r in v], frames=n) for n in frames) for k, v in there.items()}
+    done = []
+    for row in rows:
+        group = "decided" if row.status in DECIDED else "all"
+        if row.contribution is not None and row.status in groups["all"]:
+            rest = combine([r.contribution for r in there[group] if r is not row], frames=frames[0]).total_px
+            whole = results[group][0].total_px
+            row = replace(row, share=1 - (rest / whole) ** 2 if whole else 0.0, without_px=rest)
+        done.append(row)
+    return sorted(done, key=lambda r: -r.total_px), results["decided"], results["all"]
+
+
+def _row_record(row: BudgetRow) -> dict[str, Any]:
+    record = {k: getattr(row, k) for k in ("name", "source_id", "title", "status", "u_of_total_px", "share", "without_px", "reason", "total_px")}
+    record["contribution"] = None if row.contribution is None else asdict(row.contribution)
+    record["monte_carlo"] = None if row.monte_carlo is None else _monte_carlo_record(row.monte_carlo)
+    return record
+
+
+def _monte_carlo_record(result: MonteCarlo) -> dict[str, Any]:
+    record = asdict(result) | {"total_px": result.total_px, "se_total_px": result.se_total_px, "names": list(result.names)}
+    for axis in ("x", "y"):
+        record[axis] = {k: (v if np.isfinite(v) else None) for k, v in record[axis].items()}
+    return {k: (None if isinstance(v, float) and not np.isfinite(v) else v) for k, v in record.items()}
+
+
+def _combined_record(budget: Budget, combined: Combined) -> dict[str, Any]:
+    um = budget.um(combined)
+    return asdict(combined) | {"total_px": combined.total_px, "total_um": None if um is None else list(um)}

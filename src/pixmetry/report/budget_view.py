@@ -1,0 +1,282 @@
+"""The budget as the page shows it: verdict, ladder of frames, largest contributions with advice, table of all sources, sum and check."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import groupby
+from typing import Any
+
+import numpy as np
+
+from pixmetry.budget.budget import DECIDED, Budget, BudgetRow, Interaction
+from pixmetry.budget.combine import Combined
+from pixmetry.budget.monte_carlo import MonteCarlo
+from pixmetry.budget.probe import PHASES
+from pixmetry.core.catalogue import STAGES, get_source
+from pixmetry.core.contribution import AVERAGES
+from pixmetry.report.numbers import NONE, decimals_of, fixed, length_px, length_um, percent, signed
+
+CLASSES = {
+    "T": "random in time, pixel by pixel",
+    "Tr": "random in time, common to a row",
+    "F": "fixed in the sensor",
+    "G": "smooth geometry",
+    "D": "drift",
+    "O": "object and light",
+}
+CLASS_RULES = (
+    "Classes say what averaging does. T and Tr change from frame to frame: their variance falls as 1/n with n frames, and again with the "
+    "number of targets. F stays the same in every frame and changes from place to place: more frames do not help, more targets do. G, D and O "
+    "(smooth geometry, drift, object and light) fall with neither. Uncorrelated contributions add as squares, x and y apart; a bias that is not "
+    "corrected adds as its square and is lowered by no number of frames (JCGM 100:2008, 5.1.2 and F.2.4.5)."
+)
+NAMED = 6  # accepted sources that the verdict names
+
+
+@dataclass(frozen=True)
+class Length:
+    """A length as text, in px and (where the pitch is known) in µm; ``axis`` is x or y."""
+
+    px: str
+    um: str
+    axis: str = ""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The first section's texts and numbers."""
+
+    first: list[Length]
+    second: list[Length]
+    shares: str
+    accepted: str
+    target: str
+    estimator: str
+    places: str
+    ladder: list[dict[str, Any]]
+
+
+def budget_content(budget: Budget, unmeasured: Mapping[str, str]) -> dict[str, Any]:
+    """Everything that the page says of the budget."""
+    top, longest_px = _top(budget)
+    return {
+        "verdict": _verdict(budget),
+        "pitch_known": budget.pitch_um is not None,
+        "top": top,
+        "scale": _text(longest_px, budget.pitch_um),
+        "sources": _sources(budget, unmeasured),
+        "unit_note": "px",
+        "mc_note": _monte_carlo_note(budget),
+        "sums": _sums(budget),
+        "interaction": "No Monte Carlo was asked for." if budget.interaction is None else _interaction(budget.interaction),
+        "class_rules": CLASS_RULES,
+    }
+
+
+def _length(value_px: float, pitch_um: tuple[float, float] | None, axis: str) -> Length:
+    pitch = None if pitch_um is None else pitch_um["xy".index(axis)]
+    return Length(length_px(value_px), "" if pitch is None else length_um(value_px, pitch), axis)
+
+
+def _text(value_px: float, pitch_um: tuple[float, float] | None) -> str:
+    """A length that belongs to no axis; in µm only where the pitch is the same in both."""
+    square = pitch_um is not None and pitch_um[0] == pitch_um[1]
+    return f"{length_px(value_px)} px" + (f" = {length_um(value_px, pitch_um[0])} µm" if square and pitch_um else "")
+
+
+def _both(combined: Combined, pitch_um: tuple[float, float] | None) -> list[Length]:
+    return [_length(combined.total_x_px, pitch_um, "x"), _length(combined.total_y_px, pitch_um, "y")]
+
+
+def _there(budget: Budget, *status: str) -> list[BudgetRow]:
+    return [r for r in budget.of_status(*status) if r.contribution is not None]
+
+
+def _verdict(budget: Budget) -> Verdict:
+    pitch = budget.pitch_um
+    ladder = [
+        {"label": f"{a.frames} frame{'' if a.frames == 1 else 's'}", "cells": [*_both(a, pitch), *_both(b, pitch)]}
+        for a, b in zip(budget.verdicts, budget.with_accepted, strict=True)
+    ]
+    return Verdict(
+        first=_both(budget.verdict, pitch),
+        second=_both(budget.with_accepted[0], pitch),
+        shares=_shares(_there(budget, *DECIDED)),
+        accepted=_accepted(_there(budget, "accepted")),
+        target=budget.target.describe(),
+        estimator=budget.estimator.describe(),
+        places=f"Averaged over {PHASES} × {PHASES} places of the target within a pixel.",
+        ladder=ladder,
+    )
+
+
+def _shares(rows: list[BudgetRow]) -> str:
+    """How the square of the verdict divides into what averages over frames, what does not, and bias."""
+    parts = np.zeros(3)
+    for row in rows:
+        c = row.contribution
+        assert c is not None
+        parts[0 if AVERAGES[c.gum_class][0] else 1] += c.u_x_px**2 + c.u_y_px**2
+        parts[2] += c.bias_x_px**2 + c.bias_y_px**2
+    if parts.sum() == 0:
+        return "Nothing that was measured moves this target."
+    random, fixed_part, bias = (percent(v) for v in parts / parts.sum())
+    return (
+        f"Of the square of this, {random} % is random in time and falls with more frames; the rest is systematic and does not: {fixed_part} % is "
+        f"fixed in the camera and changes from place to place, {bias} % is bias."
+    )
+
+
+def _accepted(rows: list[BudgetRow]) -> str:
+    rows = [r for r in rows if r.total_px > 0]
+    if not rows:
+        return "Nothing was left to be accepted."
+    names = ", ".join(r.title.lower() if not r.title[:2].isupper() else r.title for r in rows[:NAMED])
+    more = f" and {len(rows) - NAMED} smaller" if len(rows) > NAMED else ""
+    return f"That adds the largest that is to be expected of a sound camera for {len(rows)} source{'s' * (len(rows) > 1)}: {names}{more}."
+
+
+def _top(budget: Budget) -> tuple[list[dict[str, Any]], float]:
+    """The largest contributions with their advice, and the length in px that the longest bar stands for."""
+    rows = {r.name: r for r in budget.rows}
+    chosen = [(a, rows[a.name]) for a in budget.advice]
+    longest = max((abs(v) for _, r in chosen for v in _components(r)), default=0.0)
+    entries = []
+    for advice, row in chosen:
+        c = row.contribution
+        assert c is not None
+        status = "accepted at its bound" if row.status == "accepted" else row.status
+        entries.append(
+            {
+                "title": row.title,
+                "chip": f"class {c.gum_class}: {CLASSES[c.gum_class]} · {status}",
+                "bars": [
+                    _bar("x", c.u_x_px, c.bias_x_px, longest, budget.pitch_um),
+                    _bar("y", c.u_y_px, c.bias_y_px, longest, budget.pitch_um),
+                ],
+                "advice": advice.text,
+                "gain": _gain(advice),
+            }
+        )
+    return entries, longest
+
+
+def _components(row: BudgetRow) -> tuple[float, ...]:
+    c = row.contribution
+    return () if c is None else (c.u_x_px, c.u_y_px, c.bias_x_px, c.bias_y_px)
+
+
+def _bar(axis: str, u: float, bias: float, longest: float, pitch_um: tuple[float, float] | None) -> dict[str, str]:
+    pitch = None if pitch_um is None else pitch_um["xy".index(axis)]
+    text = f"u {length_px(u)} px, bias {signed(bias, length_px)} px"
+    if pitch is not None:
+        text += f" ({length_px(u * pitch)}, {signed(bias * pitch, length_px)} µm)"
+    width = [f"{100 * abs(v) / longest:.1f}" if longest else "0" for v in (u, bias)]
+    return {"axis": axis, "random": width[0], "bias": width[1], "text": text}
+
+
+def _gain(advice: Any) -> str:
+    whole = "the total with everything accepted" if advice.status == "accepted" else "the total"
+    now, gone, half = (length_px(v) for v in (advice.combined_px, advice.removed_px, advice.halved_px))
+    less = percent(1 - advice.removed_px / advice.combined_px) if advice.combined_px else NONE
+    return f"without it {whole} would fall from {now} to {gone} px ({less} % less), with half of it to {half} px (root mean square of x and y)."
+
+
+def _monte_carlo_note(budget: Budget) -> str:
+    done = next((r.monte_carlo for r in budget.rows if r.monte_carlo is not None), None)
+    if done is None:
+        return "no Monte Carlo was made."
+    return (
+        f"Monte Carlo with its standard error, from {done.trials} exposed windows a source ({done.units} cameras of this type, {done.places} places, "
+        f"{done.frames} frames each), for what the simulated camera holds."
+    )
+
+
+def _sources(budget: Budget, unmeasured: Mapping[str, str]) -> list[tuple[str, list[dict[str, str]]]]:
+    def place(row: BudgetRow) -> int:
+        return STAGES.index(row.source_id.split(".")[0])
+
+    ordered = sorted(budget.rows, key=lambda r: (place(r), -r.total_px))
+    return [(STAGES[k].capitalize(), [_source(r, unmeasured) for r in rows]) for k, rows in groupby(ordered, place)]
+
+
+def _source(row: BudgetRow, unmeasured: Mapping[str, str]) -> dict[str, str]:
+    source = get_source(row.source_id)
+    c, mc = row.contribution, row.monte_carlo
+    counts = c is not None and row.status != "not applicable"
+    return {
+        "id": row.name if row.name == row.source_id else f"{row.source_id} ({row.name})",
+        "title": row.title,
+        "number": f"{source.number} {'★' * source.stars}".strip() if source.number else NONE,
+        "status": row.status,
+        "gum_class": c.gum_class if c is not None else source.gum_class,
+        "x": length_px(float(np.hypot(c.u_x_px, c.bias_x_px))) if counts and c else NONE,
+        "y": length_px(float(np.hypot(c.u_y_px, c.bias_y_px))) if counts and c else NONE,
+        "mc_x": NONE if mc is None else _with_error(mc.x),
+        "mc_y": NONE if mc is None else _with_error(mc.y),
+        "share": f"{percent(row.share)} %" if counts else NONE,
+        "reason": _reason(row, unmeasured),
+    }
+
+
+def _with_error(axis: Any) -> str:
+    """Total of one axis of a Monte Carlo and its standard error."""
+    total = float(np.hypot(axis.u, axis.bias))
+    if not np.isfinite(total):
+        return NONE
+    error = float(np.hypot(axis.u * axis.se_u, axis.bias * axis.se_bias) / total) if total else 0.0
+    if error <= 0:
+        return length_px(total)
+    places = min(max(decimals_of(error, 1), 0), 6)
+    return f"{fixed(total, places)} ± {fixed(error, places)}"
+
+
+def _reason(row: BudgetRow, unmeasured: Mapping[str, str]) -> str:
+    if row.status == "measured" and row.contribution is not None:
+        return f"known to ± {percent(row.u_of_total_px / row.total_px)} %" if row.u_of_total_px > 0 and row.total_px > 0 else ""
+    if row.status == "accepted":
+        return unmeasured.get(row.source_id, row.reason)
+    return row.reason
+
+
+def _sums(budget: Budget) -> list[dict[str, Any]]:
+    pitch, v = budget.pitch_um, budget.verdict
+
+    def row(label: str, x: float, y: float, strong: bool = False) -> dict[str, Any]:
+        return {"label": label, "x": _length(x, pitch, "x"), "y": _length(y, pitch, "y"), "strong": strong}
+
+    rows = [
+        row("Standard uncertainties, analytic", v.u_x_px, v.u_y_px),
+        row("Biases, analytic", v.bias_x_px, v.bias_y_px),
+        row("Sum of all measured and modelled, analytic", v.total_x_px, v.total_y_px, True),
+    ]
+    alone = [r.monte_carlo for r in budget.rows if r.monte_carlo is not None]
+    if alone:
+        rows.append(row("Each source alone by Monte Carlo, added as squares", _sum_of(alone, "x"), _sum_of(alone, "y")))
+    if budget.interaction is not None:
+        together = [budget.interaction.together]
+        rows.append(row("One Monte Carlo with all sources on", _sum_of(together, "x"), _sum_of(together, "y"), True))
+    every = budget.with_accepted[0]
+    return [*rows, row("With everything accepted at its bound, analytic", every.total_x_px, every.total_y_px)]
+
+
+def _sum_of(results: list[MonteCarlo], axis: str) -> float:
+    return float(np.sqrt(sum(getattr(m, axis).u ** 2 + getattr(m, axis).bias ** 2 for m in results)))
+
+
+def _interaction(found: Interaction) -> str:
+    difference, se = found.difference_px, found.se_px
+    places = min(max(decimals_of(se, 2), 0), 7) if se > 0 else 6
+    told = f"{fixed(difference, places)} ± {fixed(se, places)} px"
+    if abs(difference) <= 2 * se:
+        verdict = "which is within two standard errors: no interaction is seen, and the squares may be added"
+    elif difference > 0:
+        verdict = "more than two standard errors: the sources act on each other, and the simulation with all of them is the one to trust"
+    else:
+        verdict = "less by more than two standard errors: the sources partly cancel or mask each other, and the sum is on the safe side"
+    lost = f" In {found.together.lost} of {found.together.trials} windows no target was found." if found.together.lost else ""
+    return (
+        f"All sources at once give {length_px(found.together.total_px)} px (root mean square of x and y), each alone and added as squares "
+        f"{length_px(found.sum_px)} px. The interaction is the difference, {told}, {verdict}.{lost}"
+    )
