@@ -159,8 +159,7 @@ def measure_sources(observations: Observations) -> tuple[dict[str, Estimates], d
 def digital_twin(campaign: Campaign, estimates: dict[str, Estimates], observations: Observations) -> Camera:
     """Build the camera that makes frames like the real ones, from what was measured.
 
-    An upper limit enters by the rms of an even spread between 0 and the limit. Without a photon count the quantum efficiency is 1, and a
-    scene's photons are electrons.
+    What the campaign only bounds is left out. Without a photon count the quantum efficiency is 1, and a scene's photons are electrons.
     """
     facts, elements = campaign.camera, []
     given = {
@@ -199,5 +198,6 @@ def digital_twin(campaign: Campaign, estimates: dict[str, Estimates], observatio
 
 
 def best_values(estimates: Estimates) -> dict[str, float]:
-    """Return values for a simulation: estimates as they are, upper limits by their rms."""
-    return {e.name: e.value * (LIMIT_RMS if e.kind == "upper_limit" else 1.0) for e in estimates}
+    """Return values for a simulation: estimates as they are; of what is not significant nothing, but for a dark noise hidden by rounding."""
+    hidden = {"white_e"}  # the rms of an even spread up to its limit
+    return {e.name: e.value if e.kind == "value" else e.value * LIMIT_RMS * (e.name in hidden) for e in estimates}

@@ -125,7 +125,7 @@ def _draw(rng: np.random.Generator, quick: bool) -> tuple[dict[str, dict[str, fl
         traits.add("phase pattern")
         values["grabber.phase_pattern"] = {
             "amplitude_dn": gain * noise * rng.uniform(0.1, 0.5), "frequency_x": rng.uniform(0.05, 0.45),
-            "frequency_y": rng.uniform(-0.45, 0.45), "moving": bool(rng.random() < 0.5),
+            "frequency_y": rng.choice([-1, 1]) * rng.uniform(0.05, 0.45), "moving": bool(rng.random() < 0.5),
         }  # fmt: skip
     if rng.random() < 0.15:
         traits.add("DNL")

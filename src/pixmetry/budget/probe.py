@@ -71,6 +71,8 @@ def parse_target(text: str) -> Target:
         If name, key or value cannot be used.
     """
     keys = {"diameter": "diameter_px", "blur": "blur_px", "peak": "peak_rel", "background": "background_rel"}
+    if text.partition(":")[0].strip() != "disc":
+        raise InputError("no such target", value=text, allowed="disc, as in disc:diameter=7,blur=0.7,peak=0.6,background=0.02")
     kind, values = split_text(text, keys, "target")
     return Target(kind=kind, **values)
 

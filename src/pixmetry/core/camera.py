@@ -17,7 +17,7 @@ from pixmetry.core.source import Parameters, Source, run
 from pixmetry.core.threads import imap_tiles, map_tiles
 
 TILE_PIXELS = 1 << 16  # of float32: a tile and its copies stay in the second-level cache
-BATCH_PIXELS = 1 << 19  # of the small windows that are run as one batch: enough that the calls cost little beside the work
+BATCH_PIXELS = 1 << 18  # of the small windows that are run as one batch: enough that the calls cost little beside the work
 BAND_ROWS = 16  # tiles of whole frames are bands of a multiple of this, the largest block of a codec
 SCHEMA = "pixmetry/camera/1"
 
@@ -566,6 +566,8 @@ def check_chain(chain: Sequence[Element], where: str = "camera") -> None:
         source = element.source
         if not element.on:
             continue
+        if source.forward is None:
+            raise ChainError(f"{element.name} cannot stand in a camera: {source.reasons['forward']}", where=where, remedy="take it out")
         if kind not in source.consumes:
             raise ChainError(
                 f"{element.name} cannot follow: it takes {', '.join(source.consumes)} and gets {kind}",

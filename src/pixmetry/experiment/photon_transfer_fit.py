@@ -21,9 +21,11 @@ from pixmetry.experiment.emva_linear import fit_emva_linear
 from pixmetry.experiment.photon_transfer_levels import (
     CLIPPED_BLACK_FRACTION,
     clipped_black,
+    core_spread_dn2,
     levels_from,
     light_scale,
     prior_precision,
+    refuse_dead_series,
     temporal_row_col_vars,
     usable_levels,
     with_stacks,
@@ -82,9 +84,10 @@ def fit_photon_transfer(pt: PhotonTransfer, dark_stack: StackMoments | None = No
     MeasureError
         No dark level, no known light, or fewer than four levels between black and saturation.
     """
+    refuse_dead_series(pt)
     scale, by_exposure = light_scale(pt.bright)
     series = with_stacks(pt, dark_stack, bright_stack if by_exposure else None)
-    levels, time_scale = levels_from(series, scale, by_exposure)
+    levels, time_scale = levels_from(series, scale, by_exposure, core_spread_dn2(dark_stack))
     solution, keep = fit_range(levels, usable_levels(series, levels), prior_precision(series, levels))
     if solution.p[GAIN] < 3 * np.sqrt(solution.covariance[GAIN, GAIN]):
         what = "the temporal variance does not grow with the mean, so the gain is not resolved"
@@ -135,16 +138,36 @@ class _Rows:
         self.add(name, root / k, unit, gradient, reason, limit)
 
 
-def _augmented(pt: PhotonTransfer, s: Solution) -> tuple[np.ndarray, np.ndarray]:
+def _augmented(pt: PhotonTransfer, s: Solution, d: model.Levels) -> tuple[np.ndarray, np.ndarray]:
     """Parameters of the fit and the quantities beside it, with their covariance."""
     n = s.p.size
     values, cov = np.zeros(n + 5), np.zeros((n + 5, n + 5))
+    dark = ~d.bright
     values[:n], cov[:n, :n] = s.p, s.covariance
     line, line_var = temporal_row_col_vars(pt)
     values[ROW_VAR : COL_VAR + 1] = line
+    total = float((d.ms + d.dither)[dark].mean()) if dark.any() else 1.0
+    slope = 2 * np.exp(-2 * np.pi**2 * model.least_var_before_rounding(total))  # by which rounding may stretch an offset, at most
+    slope /= np.sqrt(2)
+    line_var = line_var + (2 * slope * line) ** 2
     cov[ROW_VAR, ROW_VAR], cov[COL_VAR, COL_VAR] = line_var
+    if s.free[DARK_SLOPE]:
+        _add_rounding_of_slopes(cov, s, total)
     values[LAMP_VAR], cov[LAMP_VAR, LAMP_VAR] = s.components[1], s.components_cov[1, 1]
     return values, cov
+
+
+def _add_rounding_of_slopes(cov: np.ndarray, s: Solution, total_dn2: float) -> None:
+    """Widen the slopes of the dark mean and variance by what rounding does to them while the mean moves within a code.
+
+    The error of a mean is (e/π) sin 2πx and that of a variance (4v + 1/π²) e cos 2πx, e = exp(−2π²v) (first harmonic, as in
+    ``rounding_error_vars``): over a rise r of the mean they change by at most 2π r of their amplitude, and never by more than twice it.
+    """
+    least = model.least_var_before_rounding(total_dn2)
+    rise = 2 * np.pi * abs(s.p[DARK_SLOPE])
+    change = np.sqrt(model.rounding_error_vars(np.array(least))) * min(rise, 2.0)
+    for at, extra in zip((DARK_SLOPE, DARK_VAR_SLOPE), change, strict=True):
+        cov[at, at] += float(extra) ** 2
 
 
 def _effective_dof(s: Solution, rows: np.ndarray, cov: np.ndarray, lamp_dof: float) -> np.ndarray:
@@ -171,7 +194,7 @@ def _limit_factor(dof: float) -> float:
 
 def _estimates(pt: PhotonTransfer, s: Solution, d: model.Levels, axes: _Axes) -> Estimates:
     p = s.p
-    values, cov = _augmented(pt, s)
+    values, cov = _augmented(pt, s, d)
     lamp_dof = float(max(d.bright.sum() - s.free[[SLOPE, A1, A1 + 1, A3, LIGHT_OFFSET]].sum(), 1))
     saturation = _saturation(pt, s, d, axes)
     if saturation:

@@ -72,8 +72,19 @@ def temporal_row_col_vars(pt: PhotonTransfer) -> tuple[np.ndarray, np.ndarray]:
     return value, var
 
 
-def levels_from(pt: PhotonTransfer, scale: float, by_exposure: bool) -> tuple[model.Levels, float]:
-    """All levels, dark ones first, in the form that the model takes, and the scale of the time axis (s)."""
+def core_spread_dn2(dark_stack: StackMoments | None) -> float:
+    """Variance of the core of the dark map, by quartiles: a few hot pixels dither nothing; zero without a stack."""
+    if dark_stack is None:
+        return 0.0
+    low, high = np.percentile(dark_stack.mean_map_dn, [25, 75])
+    return float(((high - low) / 1.349) ** 2)
+
+
+def levels_from(pt: PhotonTransfer, scale: float, by_exposure: bool, dark_spread_dn2: float = 0.0) -> tuple[model.Levels, float]:
+    """All levels, dark ones first, in the form that the model takes, and the scale of the time axis (s).
+
+    ``dark_spread_dn2`` is the variance of the dark signal over the pixels, as far as it is known to be that of most of them.
+    """
     if pt.dark.mean_dn.size == 0:
         raise MeasureError("no dark level", where="photon transfer", remedy="take two or more dark frames at the same gain and exposure")
     rows, cols = pt.frame_shape
@@ -86,6 +97,7 @@ def levels_from(pt: PhotonTransfer, scale: float, by_exposure: bool) -> tuple[mo
     lines = np.maximum(temporal_row_col_vars(pt)[0], 0) @ [1 / rows, 1 / cols]
     black = pt.dark.mean_dn.mean()
     spatial = np.maximum(both["spatial_cov_dn2"], 0.0)
+    dither = np.maximum(spatial - spatial[~is_bright].mean(), 0.0) * is_bright + dark_spread_dn2
     lamp_change = np.maximum(both["ms_frame_dn2"] - both["ms_pixel_dn2"] / (rows * cols) - lines, 0)
     levels = model.Levels(
         bright=is_bright,
@@ -99,6 +111,8 @@ def levels_from(pt: PhotonTransfer, scale: float, by_exposure: bool) -> tuple[mo
         ms_dof=(both["n_frames"] - 1) * (rows - 1) * (cols - 1),
         kurtosis=np.full(is_bright.size, np.nan),
         leak=np.where(is_bright, lamp_change * spatial / np.maximum(both["mean_dn"] - black, 1.0) ** 2, 0.0),
+        dither=dither,
+        coherence=float(np.exp(-2 * np.pi**2 * np.var(pt.dark.mean_dn))),
         pixels=rows * cols,
         x_ref=float(2**pt.bits - 1),
     )
@@ -123,6 +137,20 @@ def unclipped_bright(pt: PhotonTransfer) -> np.ndarray:
     """Bright levels without pixels at either end, but for those that always are (stuck and hot ones)."""
     stuck, hot = pt.bright.fraction_min.min(), pt.dark.fraction_max.max(initial=0.0)
     return (pt.bright.fraction_max - hot <= USABLE_FRACTION) & (pt.bright.fraction_min - stuck <= USABLE_FRACTION)
+
+
+def refuse_dead_series(pt: PhotonTransfer) -> None:
+    """Refuse a series of which no estimate can be made, with the plain reason."""
+    what = remedy = ""
+    if (pt.bright.fraction_max > 0.5).all():
+        what, remedy = "all bright frames are saturated", "shorten the exposure or dim the light"
+    elif (pt.bright.fraction_min > 0.5).all():
+        what, remedy = "all bright frames are black", "check lamp, shutter and exposure"
+    elif not pt.bright.var_total_dn2.any():
+        what = "the frames of each level are identical: there is no temporal noise to measure"
+        remedy = "list frames that were taken one after the other, not copies, averages or synthetic frames"
+    if what:
+        raise MeasureError(what, where="photon transfer", remedy=remedy)
 
 
 def usable_levels(pt: PhotonTransfer, d: model.Levels) -> np.ndarray:
@@ -165,10 +193,10 @@ def prior_precision(pt: PhotonTransfer, d: model.Levels) -> np.ndarray:
     out[model.A1 : model.A3 + 1] = 1 / NONLINEARITY_PRIOR**2
     out[model.LIGHT_OFFSET] = 1 / LIGHT_OFFSET_PRIOR**2
     dark_var = float(d.ms[~d.bright].mean())
-    total = dark_var + float(d.spatial[~d.bright].mean())  # rounding shares its error between frames and pixels
+    total = dark_var + float(d.dither[~d.bright].mean())  # rounding shares its error between frames and pixels
     least = model.least_var_before_rounding(total)
     q_mean, q_var = model.rounding_error_vars(np.array(least))
-    q_var = q_var + (total - model.QUANTISATION_DN2 - least) ** 2 / 3
+    q_mean, q_var = d.coherence**2 * q_mean, d.coherence**2 * (q_var + (total - model.QUANTISATION_DN2 - least) ** 2 / 3)
     p = min(clipped_black(pt), CLIPPED_BLACK_FRACTION)
     out[model.Q_MEAN] = 1 / (q_mean + p**2 * dark_var + 1e-12)
     out[model.Q_VAR] = 1 / (q_var + (2 * p * dark_var) ** 2 + 1e-12)

@@ -12,7 +12,7 @@ The shared additive error of the mean makes the two observations of a level corr
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -42,13 +42,15 @@ class Levels:
     ms_dof: np.ndarray
     kurtosis: np.ndarray
     leak: np.ndarray  # bound on what lamp changes between the frames put into ms through the spatial pattern, DN²
+    dither: np.ndarray  # variance over the pixels that, beside the noise, shares out the rounding, DN²
+    coherence: float  # of the rounding errors of the dark levels: 1 where their means lie at one phase within a code
     pixels: int
     x_ref: float
 
     def subset(self, keep: np.ndarray) -> Levels:
         """The levels where ``keep`` is True."""
-        per_level = (name for name in self.__dataclass_fields__ if name not in ("pixels", "x_ref"))
-        return Levels(**{name: getattr(self, name)[keep] for name in per_level}, pixels=self.pixels, x_ref=self.x_ref)
+        per_level = (name for name in self.__dataclass_fields__ if name not in ("coherence", "pixels", "x_ref"))
+        return replace(self, **{name: getattr(self, name)[keep] for name in per_level})
 
 
 @dataclass(frozen=True)
@@ -161,10 +163,11 @@ def linearise(p: np.ndarray, d: Levels) -> Linearised:
     poisson = np.maximum(x - dark_x, 0)
     safe = np.maximum(ms_pred, 1e-3)
     kurt = np.where(np.isnan(d.kurtosis), f1**4 * p[GAIN] ** 3 * poisson / safe**2, d.kurtosis)
-    q_mean, q_ms = rounding_error_vars(safe - QUANTISATION_DN2 + d.spatial)
-    v_mean = d.row_col_var + safe / (d.n_frames * d.pixels) + bright * q_mean
+    q_mean, q_ms = rounding_error_vars(safe - QUANTISATION_DN2 + d.dither)
+    own = bright + dark * (1 - d.coherence**2)  # the rest of the dark levels' rounding is common: Q_MEAN, Q_VAR
+    v_mean = d.row_col_var + safe / (d.n_frames * d.pixels) + own * q_mean
     skew = f1**3 * p[GAIN] ** 2 * poisson / (d.n_frames * d.pixels)  # covariance of a sample mean and variance: µ₃/n
-    v_ms = safe**2 * (2 + kurt * (d.n_frames - 1) / d.n_frames) / d.ms_dof + bright * q_ms + d.leak**2 / 12
+    v_ms = safe**2 * (2 + kurt * (d.n_frames - 1) / d.n_frames) / d.ms_dof + own * q_ms + d.leak**2 / 12
     v_ms = v_ms + g**2 * v_mean - 2 * g * skew
     return Linearised(residual, jac, v_mean, v_ms, skew - g * v_mean, g, bright * (f1 * poisson) ** 2, x, ms_pred)
 

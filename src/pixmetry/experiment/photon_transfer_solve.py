@@ -27,6 +27,7 @@ from pixmetry.experiment.photon_transfer_model import (
     SLOPE,
 )
 
+UNDAMPED = 8  # iterations before the variance components move by half steps
 LACK_OF_FIT_Z = 3.0902323  # normal quantile of a false alarm of 0.1 %
 
 
@@ -170,6 +171,8 @@ def _solve(d: model.Levels, prior: np.ndarray, start: np.ndarray | None = None, 
         sigma = np.sqrt(np.diag(step.normal_inv))
         score, info = _reml(step, s, prior)
         new = _update_components(s, score, info) if iteration else s.components
+        if iteration >= UNDAMPED:  # a component at its bound may go to and fro
+            new = 0.5 * (new + s.components)
         still = iteration > 1 and np.all(np.abs(new - s.components) <= 2e-3 * s.components + 1e-12)
         s.components = new
         if still and np.all(np.abs(step.shift) < 1e-3 * sigma):

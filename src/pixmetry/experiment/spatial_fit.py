@@ -11,7 +11,7 @@ from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.core.estimates import Estimates
 from pixmetry.core.observations import DefectList, PatternList, StackMoments
 from pixmetry.experiment.linearity import Linearity
-from pixmetry.experiment.photon_transfer_model import QUANTISATION_DN2
+from pixmetry.experiment.photon_transfer_model import least_var_before_rounding
 from pixmetry.experiment.surface import Strata, Surface, cross_strata, fill, fit_surface, residual_parts
 
 PARTS = ("pixel", "row", "col")
@@ -95,7 +95,7 @@ def fit_spatial(
             "frames are too small for the surface", value=(rows, cols), allowed=f"{2 * surface_degree + 4} rows and columns or more"
         )
     mask = (find_defects(dark_stack, bright_stack, surface_degree=surface_degree) if defects is None else defects).mask()
-    stored_dn, dither_dn2 = bright_stack.mean_dn, max(dark_stack.ms_pixel_dn2 - QUANTISATION_DN2, 0.0)
+    stored_dn, dither_dn2 = bright_stack.mean_dn, least_var_before_rounding(dark_stack.ms_pixel_dn2)
     if linearity is not None:
         dark_stack, bright_stack = linearity.straight_stack(dark_stack), linearity.straight_stack(bright_stack)
     light = fill(bright_stack.mean_map_dn - dark_stack.mean_map_dn, mask)
