@@ -16,7 +16,7 @@ from pixmetry.core import camera as camera_module
 from pixmetry.core.camera import Camera, Element
 from pixmetry.core.catalogue import catalogue
 from pixmetry.core.contribution import AVERAGES
-from pixmetry.core.errors import InputError
+from pixmetry.core.errors import ChainError, InputError
 from pixmetry.core.random import Grid
 from pixmetry.core.signal import Kind
 from pixmetry.core.source import Source
@@ -263,9 +263,12 @@ def test_any_window_of_any_frame_equals_the_crop(source: Source, data: st.DataOb
     assert np.array_equal(camera.expose(SCENE, [frame], seed=3, window=(r, c, h, w)).data[0], full[r : r + h, c : c + w])
 
 
-def test_every_source_has_a_camera_that_can_hold_it() -> None:
-    assert len(SOURCES) > 0
-    for source in SOURCES.values():
+@every_source
+def test_it_stands_in_a_camera_or_says_why_not(source: Source) -> None:
+    source.parameters()  # every parameter has a default
+    assert source.consumes and set(source.consumes) <= set(Kind)
+    if source.forward is not None:
         assert isinstance(camera_with(source), Camera)
-        assert set(source.consumes) <= set(Kind)
-        source.parameters()
+        return
+    with pytest.raises(ChainError, match=re.escape(source.reasons["forward"])):
+        camera_with(source)

@@ -93,7 +93,7 @@ def test_kinds_that_do_not_fit_are_refused() -> None:
 
 
 def test_a_declared_order_that_is_broken_is_refused_both_ways() -> None:
-    early = Element("early", make_source("sensor.e", None, (Kind.ELECTRONS,), before=("sensor.shot_noise",)), Nothing())
+    early = Element("early", make_source("sensor.e", lambda p, s, t: s, (Kind.ELECTRONS,), before=("sensor.shot_noise",)), Nothing())
     late = Element("late", make_source("sensor.l", lambda p, s, t: s, (Kind.ELECTRONS,), after=("cable",)), Nothing())
     with pytest.raises(ChainError, match="early must come before shot"):
         camera(TO_ELECTRONS, SHOT, early)
@@ -271,9 +271,10 @@ def test_parameters_are_validated_when_they_are_changed() -> None:
         chain.with_parameters("prnu", pixel_std_rel=-1)
 
 
-def test_a_source_that_acts_in_the_estimator_is_passed_over() -> None:
+def test_a_source_that_does_not_act_on_frames_is_refused() -> None:
     estimator = Element("estimator", make_source("processing.e", None, (Kind.ELECTRONS,)), Nothing())
-    assert np.array_equal(camera(TO_ELECTRONS, estimator).expose(SCENE).data, camera(TO_ELECTRONS).expose(SCENE).data)
+    with pytest.raises(ChainError, match="estimator cannot stand in a camera: a source for tests"):
+        camera(TO_ELECTRONS, estimator)
 
 
 def test_the_quiet_frame_is_the_mean_of_many() -> None:

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pixmetry.report.numbers import THIN, length_px, limit, percent, significant, signed, uncertain
+from pixmetry.report.numbers import THIN, length_mpx, length_px, limit, percent, significant, signed, uncertain
 
 MINUS = "\u2212"
 
@@ -31,7 +31,7 @@ def test_value_and_uncertainty_end_at_the_same_place_and_are_rounded_there(ratio
     shift = Decimal(10) ** power(got.unit)
     exact = Decimal(u)
     place = Decimal(10) ** (exact.adjusted() - 1)
-    if exact.quantize(place) >= 100 * place:  # 0.0996 becomes 0.10
+    if exact > Decimal("99.49999") * place:  # 0.0996 becomes 0.10
         place *= 10
     assert abs(plain(got.u) * shift - exact) <= place * Decimal("0.500001")
     assert abs(plain(got.value) * shift - Decimal(value)) <= place * Decimal("0.500001")
@@ -61,7 +61,17 @@ def test_a_limit_says_less_than() -> None:
 
 
 @pytest.mark.parametrize(
-    ("value", "text"), [(0.0, "0"), (0.012345, "0.012"), (0.12345, "0.123"), (12.345, "12.3"), (1e-8, "0"), (float("nan"), "–"), (3e-6, "0.000003")]
+    ("value", "text"),
+    [
+        (0.0, "0"),
+        (0.012345, "0.012"),
+        (0.12345, "0.123"),
+        (12.345, "12.3"),
+        (0.000123, "0.00012"),
+        (0.0000123, "0.00001"),
+        (1e-8, f"<{THIN}0.00001"),
+        (float("nan"), "–"),
+    ],
 )
 def test_lengths(value: float, text: str) -> None:
     assert length_px(value) == text
@@ -70,5 +80,6 @@ def test_lengths(value: float, text: str) -> None:
 def test_small_and_signed_numbers() -> None:
     assert significant(3.2e-7, 2) == f"3.2{THIN}×{THIN}10⁻⁷"
     assert signed(-0.02, length_px) == MINUS + "0.020"
-    assert signed(0.0, length_px) == "0"
+    assert signed(0.0, length_px) == signed(-1e-7, length_px) == "0"
+    assert (length_mpx(0.00363), length_mpx(0.0000363), length_mpx(1e-6)) == ("3.6", "0.04", f"<{THIN}0.01")
     assert (percent(0.4567), percent(0.0456), percent(0.0001), percent(0.0)) == ("46", "4.6", f"<{THIN}0.1", "0.0")

@@ -14,6 +14,7 @@ from pixmetry.experiment.moments import check_frame
 
 CORE_SIGMAS = 2.0  # a level is used this many of its standard deviations around its mean
 MIN_SIGMA_DN = 1.5  # a narrower level does not cover its codes evenly enough for a smooth expectation
+MIN_TEMPORAL_SIGMA_DN = 4.0  # a fixed pattern of few pixels makes structure of the width of the temporal noise, which the window must follow
 HALF_WINDOW = 6  # codes on each side from which the smooth part of the expectation is taken
 FALSE_ALARM = 1e-6  # that any code at all is wrongly called missing
 
@@ -127,22 +128,23 @@ def code_errors(histogram: CodeHistogram, min_expected: float = 100.0) -> CodeEr
 
     Notes
     -----
-    DNL_k = n_k / e_k − 1 (IEEE Std 1241, code density test), where e_k is the Gaussian expectation times the mean of n/e over the
-    ``HALF_WINDOW`` neighbours on each side: light that is not quite Gaussian changes n/e slowly, and a symmetric mean follows it up to
-    its curvature. Non-linearity that changes more slowly than the window is therefore not seen. u(DNL_k)² = (1 + 1/W)/e_k.
+    DNL_k = n_k / e_k − 1 (IEEE Std 1241, code density test), where e_k is the Gaussian expectation times what a polynomial of degree 4
+    through n/e of the ``HALF_WINDOW`` neighbours on each side gives at k (Savitzky & Golay 1964, without the point itself): light that is
+    not quite Gaussian changes n/e slowly, and the polynomial follows it. Non-linearity that changes more slowly than the window is
+    therefore not seen. u(DNL_k)² = 1/e_k + Σ h_j²/e_(k+j) with the weights h_j.
     A code that never occurs is missing if its Poisson probability exp(−e_k), times the number of codes tested, is below 1e-6.
     """
     ideal, usable = expected_counts(histogram)
-    window = np.r_[np.ones(HALF_WINDOW), 0.0, np.ones(HALF_WINDOW)]
+    weights = _neighbour_weights()
     n = histogram.counts.astype(float)
-    around_n = np.convolve(n, window, mode="same")
-    around_ideal = np.convolve(ideal, window, mode="same")
-    full = np.convolve(usable.astype(float), window, mode="same") == 2 * HALF_WINDOW
-    expected = ideal * np.divide(around_n, around_ideal, out=np.zeros_like(n), where=around_ideal > 0)
+    ratio = np.divide(n, ideal, out=np.zeros_like(n), where=ideal > 0)
+    full = np.convolve(usable.astype(float), weights != 0, mode="same") == 2 * HALF_WINDOW
+    expected = ideal * np.maximum(np.convolve(ratio, weights, mode="same"), 0.0)
+    of_neighbours = np.convolve(np.divide(1, expected, out=np.zeros_like(n), where=expected > 0), weights**2, mode="same")
     tested = np.flatnonzero(usable & full & (expected >= min_expected))
     e = expected[tested]
     dnl = n[tested] / e - 1.0 if tested.size else np.zeros(0)
-    variance = (1 + 1 / (2 * HALF_WINDOW)) / e
+    variance = 1 / e + of_neighbours[tested]
     probability = np.minimum(np.exp(-e) * max(tested.size, 1), 1.0)
     missing = (n[tested] == 0) & (probability < FALSE_ALARM)
     return CodeErrors(
@@ -155,16 +157,31 @@ def code_errors(histogram: CodeHistogram, min_expected: float = 100.0) -> CodeEr
     )
 
 
+def _neighbour_weights() -> np.ndarray:
+    """Weights with which the neighbours of a code predict it: least squares of a polynomial of degree 4, shape (2·HALF_WINDOW + 1,)."""
+    j = np.arange(-HALF_WINDOW, HALF_WINDOW + 1)
+    design = np.stack([j**0, j**2, j**4], axis=1)[j != 0].astype(float)
+    weights = np.zeros(j.size)
+    weights[j != 0] = design @ np.linalg.inv(design.T @ design)[:, 0]
+    return weights
+
+
 def _rms_dnl(dnl: np.ndarray, variance: np.ndarray) -> Estimates:
-    """RMS of the true DNL: the excess of the scatter over its counting noise, with chi-square sampling of both."""
-    window = 1 + 1 / (2 * HALF_WINDOW)  # the neighbours' own DNL adds to the scatter
+    """RMS of the true DNL: the excess of the scatter over its counting noise, with chi-square sampling of both.
+
+    The neighbours' own DNL adds to the scatter. Thresholds are taken as displaced one by one, so that a wide code has narrow neighbours:
+    the widths have a correlation of −1/2 with the next.
+    """
+    h = _neighbour_weights()
+    response = -h + (np.arange(h.size) == HALF_WINDOW)
+    window = float(response @ response - response[1:] @ response[:-1])
     weights = 1 / variance
     weights /= weights.sum()
     square = float(weights @ (dnl**2 - variance)) / window
 
     def u_square(true: float) -> float:
-        # the neighbours share windows: the scatter is correlated only at second order in 1/W, which is left out
-        return math.sqrt(2 * float(weights**2 @ (true * window + variance) ** 2)) / window
+        # 1.5 = 1 + 2ρ² for widths that are correlated with the next by ρ = −1/2
+        return math.sqrt(2 * float(weights**2 @ (math.sqrt(1.5) * true * window + variance) ** 2)) / window
 
     u = u_square(max(square, 0.0))
     name, method = "dnl_rms_lsb", "excess scatter of code counts over their expectation; IEEE Std 1241 code density test"

@@ -20,7 +20,7 @@ from pixmetry.core.observations import (
     StackMoments,
 )
 from pixmetry.experiment.defects import find_defects
-from pixmetry.experiment.histogram import HistogramAccumulator, code_errors
+from pixmetry.experiment.histogram import MIN_TEMPORAL_SIGMA_DN, HistogramAccumulator, code_errors
 from pixmetry.experiment.linearity import Linearity
 from pixmetry.experiment.moments import LevelAccumulator, LevelSummary, level_moments
 from pixmetry.experiment.patterns import find_phase_patterns
@@ -69,7 +69,7 @@ def observe(groups: Iterable[Group], bits: int, temperature_c: float | None = No
     """
     levels: dict[str, list[_Level]] = {"dark": [], "bright": []}
     stacks: dict[str, tuple[StackMoments, Spectra]] = {}
-    histogram = HistogramAccumulator(bits)
+    histogram, sweep = HistogramAccumulator(bits), HistogramAccumulator(bits)
     shape = None
     for group in groups:
         reduction = new_group(bits, group.role)
@@ -77,7 +77,10 @@ def observe(groups: Iterable[Group], bits: int, temperature_c: float | None = No
             reduction.add(frame)
         moments = reduction.moments
         shape = moments.shape
-        histogram.add_counts(moments.counts, dark=group.kind == "dark", level=(group.kind, group.role, group.exposure_s, group.photons))
+        level = (group.kind, group.role, group.exposure_s, group.photons)
+        histogram.add_counts(moments.counts, dark=group.kind == "dark", level=level)
+        if moments.n_frames > 1 and moments.mean_squares().pixel_dn2 > MIN_TEMPORAL_SIGMA_DN**2:
+            sweep.add_counts(moments.counts, level=level)
         if isinstance(moments, LevelAccumulator):
             levels[group.kind].append(_Level(moments.summary(), group.exposure_s, group.photons))
         elif isinstance(moments, StackAccumulator) and _better(stacks.get(group.kind), moments.n_frames):
@@ -86,10 +89,10 @@ def observe(groups: Iterable[Group], bits: int, temperature_c: float | None = No
     notes: list[str] = []
     dark_stack, dark_spectra = stacks.get("dark", (None, None))
     bright_stack, bright_spectra = stacks.get("bright", (None, None))
-    counts = histogram.result()
     transfer = _photon_transfer(levels, shape, bits)
-    fit = fit_photon_transfer(transfer, dark_stack, bright_stack)
-    defects, spatial, patterns = _spatial(dark_stack, bright_stack, dark_spectra, Linearity.of(fit, bits), notes)
+    codes = _codes(sweep.result(), notes)
+    fit = fit_photon_transfer(transfer, dark_stack, bright_stack, _dnl_lsb(codes))
+    defects, spatial, patterns = _spatial(dark_stack, bright_stack, dark_spectra, Linearity.of(fit, bits), _dnl_lsb(codes), notes)
     return Observations(
         photon_transfer=transfer,
         photon_transfer_fit=fit,
@@ -97,11 +100,11 @@ def observe(groups: Iterable[Group], bits: int, temperature_c: float | None = No
         bright_stack=bright_stack,
         dark_spectra=dark_spectra,
         bright_spectra=bright_spectra,
-        histogram=counts,
+        histogram=histogram.result(),
         spatial_fit=spatial,
         defects=defects,
         patterns=patterns,
-        code_errors=_codes(counts, notes),
+        code_errors=codes,
         temperature_c=temperature_c,
         notes=tuple(notes),
     )
@@ -131,7 +134,7 @@ def _photon_transfer(levels: dict[str, list[_Level]], shape: tuple[int, int] | N
 
 
 def _spatial(
-    dark: StackMoments | None, bright: StackMoments | None, spectra: Spectra | None, linearity: Linearity, notes: list[str]
+    dark: StackMoments | None, bright: StackMoments | None, spectra: Spectra | None, linearity: Linearity, dnl_lsb: float, notes: list[str]
 ) -> tuple[DefectList | None, Estimates | None, PatternList | None]:
     if dark is None:
         notes.append(
@@ -144,10 +147,17 @@ def _spatial(
         notes.append("no stack of bright frames: DSNU and PRNU are not measured (take 16 or more at half of saturation)")
         return defects, None, patterns
     try:
-        return defects, fit_spatial(dark, bright, defects, linearity=linearity, patterns=patterns), patterns
+        return defects, fit_spatial(dark, bright, defects, linearity=linearity, patterns=patterns, dnl_lsb=dnl_lsb), patterns
     except MeasureError as problem:
         notes.append(f"DSNU and PRNU are not measured: {problem}")
         return defects, None, patterns
+
+
+def _dnl_lsb(codes: CodeErrors | None) -> float:
+    """Standard deviation of the code widths; 0 where it is not significant."""
+    if codes is None or "dnl_rms_lsb" not in codes.fit or codes.fit.limits:
+        return 0.0
+    return codes.fit["dnl_rms_lsb"].value
 
 
 def _codes(counts, notes: list[str]) -> CodeErrors | None:

@@ -61,7 +61,9 @@ class _Axes:
     by_exposure: bool
 
 
-def fit_photon_transfer(pt: PhotonTransfer, dark_stack: StackMoments | None = None, bright_stack: StackMoments | None = None) -> Estimates:
+def fit_photon_transfer(
+    pt: PhotonTransfer, dark_stack: StackMoments | None = None, bright_stack: StackMoments | None = None, dnl_lsb: float = 0.0
+) -> Estimates:
     """Gain, noise, linearity, dark current and saturation of a camera from a photon-transfer series.
 
     Parameters
@@ -70,6 +72,9 @@ def fit_photon_transfer(pt: PhotonTransfer, dark_stack: StackMoments | None = No
         Bright and dark levels; the light is known from the exposure time or, at constant exposure, from the photons.
     dark_stack, bright_stack : StackMoments, optional
         Further frames, not contained in ``pt``; they enter as one more level each. The bright stack is used where light goes by exposure.
+    dnl_lsb : float
+        Standard deviation of the converter's code widths, if it is known: means and variances of narrow levels depend on the few codes
+        that they touch.
 
     Returns
     -------
@@ -87,7 +92,7 @@ def fit_photon_transfer(pt: PhotonTransfer, dark_stack: StackMoments | None = No
     refuse_dead_series(pt)
     scale, by_exposure = light_scale(pt.bright)
     series = with_stacks(pt, dark_stack, bright_stack if by_exposure else None)
-    levels, time_scale = levels_from(series, scale, by_exposure, core_spread_dn2(dark_stack))
+    levels, time_scale = levels_from(series, scale, by_exposure, core_spread_dn2(dark_stack), dnl_lsb)
     solution, keep = fit_range(levels, usable_levels(series, levels), prior_precision(series, levels))
     if solution.p[GAIN] < 3 * np.sqrt(solution.covariance[GAIN, GAIN]):
         what = "the temporal variance does not grow with the mean, so the gain is not resolved"
@@ -146,26 +151,24 @@ def _augmented(pt: PhotonTransfer, s: Solution, d: model.Levels) -> tuple[np.nda
     values[:n], cov[:n, :n] = s.p, s.covariance
     line, line_var = temporal_row_col_vars(pt)
     values[ROW_VAR : COL_VAR + 1] = line
-    total = float((d.ms + d.dither)[dark].mean()) if dark.any() else 1.0
-    slope = 2 * np.exp(-2 * np.pi**2 * model.least_var_before_rounding(total))  # by which rounding may stretch an offset, at most
-    slope /= np.sqrt(2)
-    line_var = line_var + (2 * slope * line) ** 2
+    dither = float(d.dither[dark].mean()) if dark.any() else 0.0
+    white = model.least_var_before_rounding(dither + (float(d.ms[dark].mean()) if dark.any() else 1.0)) - dither
+    # what rounding and code widths stretch in common is no scatter of the lines
+    line_var = line_var + 4 * model.slope_error_var(white, dither, d.dnl_lsb) * line**2
     cov[ROW_VAR, ROW_VAR], cov[COL_VAR, COL_VAR] = line_var
     if s.free[DARK_SLOPE]:
-        _add_rounding_of_slopes(cov, s, total)
+        _add_rounding_of_slopes(cov, s, model.rounding_error_vars(np.array(white), dither, d.dnl_lsb))
     values[LAMP_VAR], cov[LAMP_VAR, LAMP_VAR] = s.components[1], s.components_cov[1, 1]
     return values, cov
 
 
-def _add_rounding_of_slopes(cov: np.ndarray, s: Solution, total_dn2: float) -> None:
-    """Widen the slopes of the dark mean and variance by what rounding does to them while the mean moves within a code.
+def _add_rounding_of_slopes(cov: np.ndarray, s: Solution, converter_vars: tuple[np.ndarray, np.ndarray]) -> None:
+    """Widen the slopes of the dark mean and variance by what the converter does to them while the mean moves over its codes.
 
-    The error of a mean is (e/π) sin 2πx and that of a variance (4v + 1/π²) e cos 2πx, e = exp(−2π²v) (first harmonic, as in
-    ``rounding_error_vars``): over a rise r of the mean they change by at most 2π r of their amplitude, and never by more than twice it.
+    Its errors are waves of one code: over a rise r of the mean they change by at most 2π r of their amplitude, and never by more than
+    twice it.
     """
-    least = model.least_var_before_rounding(total_dn2)
-    rise = 2 * np.pi * abs(s.p[DARK_SLOPE])
-    change = np.sqrt(model.rounding_error_vars(np.array(least))) * min(rise, 2.0)
+    change = np.sqrt(converter_vars) * min(2 * np.pi * abs(s.p[DARK_SLOPE]), 2.0)
     for at, extra in zip((DARK_SLOPE, DARK_VAR_SLOPE), change, strict=True):
         cov[at, at] += float(extra) ** 2
 

@@ -80,7 +80,7 @@ def core_spread_dn2(dark_stack: StackMoments | None) -> float:
     return float(((high - low) / 1.349) ** 2)
 
 
-def levels_from(pt: PhotonTransfer, scale: float, by_exposure: bool, dark_spread_dn2: float = 0.0) -> tuple[model.Levels, float]:
+def levels_from(pt: PhotonTransfer, scale: float, by_exposure: bool, dark_spread_dn2: float = 0.0, dnl_lsb: float = 0.0) -> tuple[model.Levels, float]:
     """All levels, dark ones first, in the form that the model takes, and the scale of the time axis (s).
 
     ``dark_spread_dn2`` is the variance of the dark signal over the pixels, as far as it is known to be that of most of them.
@@ -112,6 +112,7 @@ def levels_from(pt: PhotonTransfer, scale: float, by_exposure: bool, dark_spread
         kurtosis=np.full(is_bright.size, np.nan),
         leak=np.where(is_bright, lamp_change * spatial / np.maximum(both["mean_dn"] - black, 1.0) ** 2, 0.0),
         dither=dither,
+        dnl_lsb=dnl_lsb,
         coherence=float(np.exp(-2 * np.pi**2 * np.var(pt.dark.mean_dn))),
         pixels=rows * cols,
         x_ref=float(2**pt.bits - 1),
@@ -193,9 +194,10 @@ def prior_precision(pt: PhotonTransfer, d: model.Levels) -> np.ndarray:
     out[model.A1 : model.A3 + 1] = 1 / NONLINEARITY_PRIOR**2
     out[model.LIGHT_OFFSET] = 1 / LIGHT_OFFSET_PRIOR**2
     dark_var = float(d.ms[~d.bright].mean())
-    total = dark_var + float(d.dither[~d.bright].mean())  # rounding shares its error between frames and pixels
+    dither = float(d.dither[~d.bright].mean())
+    total = dark_var + dither  # rounding shares its error between frames and pixels
     least = model.least_var_before_rounding(total)
-    q_mean, q_var = model.rounding_error_vars(np.array(least))
+    q_mean, q_var = model.rounding_error_vars(np.array(max(least - dither, 0.0)), dither, d.dnl_lsb)
     q_mean, q_var = d.coherence**2 * q_mean, d.coherence**2 * (q_var + (total - model.QUANTISATION_DN2 - least) ** 2 / 3)
     p = min(clipped_black(pt), CLIPPED_BLACK_FRACTION)
     out[model.Q_MEAN] = 1 / (q_mean + p**2 * dark_var + 1e-12)

@@ -43,13 +43,14 @@ class Levels:
     kurtosis: np.ndarray
     leak: np.ndarray  # bound on what lamp changes between the frames put into ms through the spatial pattern, DN²
     dither: np.ndarray  # variance over the pixels that, beside the noise, shares out the rounding, DN²
+    dnl_lsb: float  # standard deviation of the converter's code widths
     coherence: float  # of the rounding errors of the dark levels: 1 where their means lie at one phase within a code
     pixels: int
     x_ref: float
 
     def subset(self, keep: np.ndarray) -> Levels:
         """The levels where ``keep`` is True."""
-        per_level = (name for name in self.__dataclass_fields__ if name not in ("coherence", "pixels", "x_ref"))
+        per_level = (name for name in self.__dataclass_fields__ if name not in ("dnl_lsb", "coherence", "pixels", "x_ref"))
         return replace(self, **{name: getattr(self, name)[keep] for name in per_level})
 
 
@@ -100,13 +101,27 @@ def signal_from_mean(stored: np.ndarray, a: np.ndarray, x_ref: float, correction
     return x
 
 
-def rounding_error_vars(var: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Variance, over the unknown sub-code phase, of what rounding does to a mean and to a variance beyond the 1/12 rule.
+def rounding_error_vars(var: np.ndarray, dither: np.ndarray | float = 0.0, dnl_lsb: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """Variance, over what is not known of the converter, of its error of a mean and of a variance beyond the 1/12 rule.
 
-    First harmonic of the rounding error of a normal value of variance ``var`` (Widrow and Kollár, Quantization Noise, ch. 5).
+    ``var`` is the temporal variance, ``dither`` that over the pixels. With equal steps the sub-code phase is unknown: first harmonic of
+    the rounding error of a normal value (Widrow and Kollár, Quantization Noise, ch. 5). Thresholds that are displaced one by one, by a
+    variance dnl²/2, move a mean by Σ e_k φ(u_k)/σ and a variance by Σ 2 e_k u_k φ(u_k), u_k = (T_k − µ)/σ; over many thresholds Σ φ² and Σ u²φ²
+    are σ/(2√π) and σ/(4√π).
     """
-    damp = np.exp(-2 * np.pi**2 * np.maximum(var, 0))
-    return 0.5 * (damp / np.pi) ** 2, 0.5 * ((4 * var + 1 / np.pi**2) * damp) ** 2
+    total = np.maximum(var, 0) + dither
+    damp = np.exp(-2 * np.pi**2 * total)
+    sigma = np.sqrt(np.maximum(total, QUANTISATION_DN2))
+    displaced = 0.5 * dnl_lsb**2 / np.sqrt(np.pi)
+    mean = 0.5 * (damp / np.pi) ** 2 + displaced / (2 * sigma)
+    return mean, 0.5 * ((4 * total + 1 / np.pi**2) * damp) ** 2 + displaced * np.maximum(var, 0) / sigma
+
+
+def slope_error_var(var: float, dither: float = 0.0, dnl_lsb: float = 0.0) -> float:
+    """Variance of the converter's local slope for values of this variance, about 1: the derivative of its error of a mean."""
+    total = max(var, 0.0) + dither
+    sigma = np.sqrt(max(total, QUANTISATION_DN2))
+    return float(2 * np.exp(-4 * np.pi**2 * total) + 0.5 * dnl_lsb**2 / (4 * np.sqrt(np.pi) * sigma**3))
 
 
 def least_var_before_rounding(var_dn2: float) -> float:
@@ -163,7 +178,7 @@ def linearise(p: np.ndarray, d: Levels) -> Linearised:
     poisson = np.maximum(x - dark_x, 0)
     safe = np.maximum(ms_pred, 1e-3)
     kurt = np.where(np.isnan(d.kurtosis), f1**4 * p[GAIN] ** 3 * poisson / safe**2, d.kurtosis)
-    q_mean, q_ms = rounding_error_vars(safe - QUANTISATION_DN2 + d.dither)
+    q_mean, q_ms = rounding_error_vars(safe - QUANTISATION_DN2, d.dither, d.dnl_lsb)
     own = bright + dark * (1 - d.coherence**2)  # the rest of the dark levels' rounding is common: Q_MEAN, Q_VAR
     v_mean = d.row_col_var + safe / (d.n_frames * d.pixels) + own * q_mean
     skew = f1**3 * p[GAIN] ** 2 * poisson / (d.n_frames * d.pixels)  # covariance of a sample mean and variance: µ₃/n

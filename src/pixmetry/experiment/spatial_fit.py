@@ -11,7 +11,7 @@ from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.core.estimates import Estimates
 from pixmetry.core.observations import DefectList, PatternList, StackMoments
 from pixmetry.experiment.linearity import Linearity
-from pixmetry.experiment.photon_transfer_model import least_var_before_rounding
+from pixmetry.experiment.photon_transfer_model import least_var_before_rounding, rounding_error_vars, slope_error_var
 from pixmetry.experiment.surface import Strata, Surface, cross_strata, fill, fit_surface, residual_parts
 
 PARTS = ("pixel", "row", "col")
@@ -39,6 +39,7 @@ def fit_spatial(
     surface_degree: int = 4,
     linearity: Linearity | None = None,
     patterns: PatternList | None = None,
+    dnl_lsb: float = 0.0,
 ) -> Estimates:
     """Dark-signal and photo-response non-uniformity with their row, column and pixel parts.
 
@@ -55,6 +56,8 @@ def fit_spatial(
         x f'(x)/f(x) times as large; at half of the range that is 1 % for a₁ = 0.02.
     patterns : PatternList, optional
         Fixed waves to take out of the dark map: they are no property of single pixels.
+    dnl_lsb : float
+        Standard deviation of the converter's code widths.
 
     Returns
     -------
@@ -83,7 +86,8 @@ def fit_spatial(
     The dark map keeps its slow part: it belongs to the sensor.
 
     Rounding: where the temporal noise σ is small, the mean code follows an offset with the slope 1 + 2e^(−2π²σ²) cos 2πx at the unknown
-    phase x within a code (first harmonic; Widrow and Kollár, Quantization Noise, ch. 5); u of the DSNU holds that.
+    phase x within a code (first harmonic; Widrow and Kollár, Quantization Noise, ch. 5), and codes of unequal width bend it likewise; u
+    of the DSNU holds that.
     """
     from pixmetry.experiment.defects import find_defects
 
@@ -113,7 +117,7 @@ def fit_spatial(
     response = response - fit_surface(response, surface_degree).values
     squares, covariance = _mean_squares(dark_stack, bright_stack, dark, response, mask, surface)
     components = _components(squares, covariance, dark_stack.shape, float((surface.values**-2.0).mean()))
-    result = _with_rounding(components, dither_dn2).join(_shading(surface, squares))
+    result = _with_rounding(components, dither_dn2, dnl_lsb).join(_shading(surface, squares))
     return result if linearity is None else _with_common_scale(result, linearity.contrast_u_rel(stored_dn))
 
 
@@ -126,16 +130,16 @@ def _with_common_scale(e: Estimates, u_rel: float) -> Estimates:
     return replace(e, covariance=covariance, dof=dof)
 
 
-def _with_rounding(e: Estimates, dither_dn2: float) -> Estimates:
+def _with_rounding(e: Estimates, white_dn2: float, dnl_lsb: float) -> Estimates:
     """Add what rounding at an unknown phase does to the DSNU: to all variances by their slope, to the pixels by the wave itself."""
-    damp = math.exp(-2 * math.pi**2 * dither_dn2)
     total2 = e["dsnu_total_dn"].value ** 2
-    slope = 2 * damp * math.exp(-2 * math.pi**2 * total2)
+    slope2 = slope_error_var(white_dn2, total2, dnl_lsb)  # common to all pixels
+    own2 = min(float(rounding_error_vars(np.array(white_dn2), 0.0, dnl_lsb)[0]), slope_error_var(white_dn2, 0.0, dnl_lsb) * total2)
     extra = np.zeros(len(e))
     for i, name in enumerate(e.names):
         if name.startswith("dsnu"):
-            wave2 = min((damp / math.pi) ** 2, (2 * damp) ** 2 * total2) / 2 if name in ("dsnu_pixel_dn", "dsnu_total_dn") else 0.0
-            u_square = math.hypot(2 * slope * e.values[i] ** 2 / math.sqrt(2), wave2)
+            wave2 = own2 if name in ("dsnu_pixel_dn", "dsnu_total_dn") else 0.0
+            u_square = math.hypot(2 * math.sqrt(slope2) * e.values[i] ** 2, wave2)
             extra[i] = u_square / (2 * e.values[i]) if e.values[i] > 0 else 0.0
     return replace(e, covariance=e.covariance + np.diag(extra**2))
 

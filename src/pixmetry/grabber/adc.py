@@ -102,25 +102,26 @@ def correct(params: Adc, signal: Signal, maps: Mapping[str, np.ndarray]) -> Sign
 
 
 def propagate(params: Adc, probe: Probe) -> Contribution:
-    """Rounding and code widths as white noise (P1); slope, bend and the ends of the range as the field that they add (P2).
+    """Rounding and code widths as white noise (P1); bend and the ends of the range as the field that they add (P2).
 
     A threshold displaced by d adds d² to the mean square error of a signal that is spread evenly over its codes. Hence 1/12 for equal
-    steps, dnl²/2 for displacements of variance dnl²/2, and two of (1/2)² for each missing code.
+    steps, dnl²/2 for displacements of variance dnl²/2, and two of (1/2)² for each missing code. A slope common to all codes moves no
+    target, and the black level is known.
     """
     variance = 1 / 12 + params.dnl_std_lsb**2 / 2 + (0.5 / params.missing_every if params.missing_every else 0.0)
     level = probe.signal_dn * (1 + params.gain_error_rel) + params.offset_dn
     stored = np.clip(level - bend(params, level), 0, params.top)
-    dx, dy = probe.field(stored - params.offset_dn - probe.signal_dn)
-    white = probe.white(math.sqrt(variance))
+    dx, dy = probe.field((stored - level) / (1 + params.gain_error_rel))
+    white = probe.white(math.sqrt(variance) / (1 + params.gain_error_rel))
     return Contribution(
         u_x_px=math.hypot(white[0], float(np.std(dx))),
         u_y_px=math.hypot(white[1], float(np.std(dy))),
         bias_x_px=float(np.mean(dx)),
         bias_y_px=float(np.mean(dy)),
         gum_class="F",
-        model_error=0.35,
-        floor_px=1e-3,
-        method="white noise of 1/12 + DNL²/2 LSB², and the response of the estimator to slope, bend and ends of the range",
+        model_error=0.25,
+        floor_px=3e-4,
+        method="white noise of 1/12 + DNL²/2 LSB², and the response of the estimator to bend and ends of the range",
     )
 
 

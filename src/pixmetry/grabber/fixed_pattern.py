@@ -132,7 +132,7 @@ def propagate(params: FixedPattern, probe: Probe) -> Contribution:
         bias_x_px=float(settle[0].mean()),
         bias_y_px=float(settle[1].mean()),
         gum_class="F",
-        model_error=0.15,
+        model_error=0.3,
         method="response of the estimator to the ramp of the rows, the pattern of the columns and white grain, over all places",
     )
 

@@ -15,7 +15,7 @@ from pixmetry.budget.monte_carlo import MonteCarlo
 from pixmetry.budget.probe import PHASES
 from pixmetry.core.catalogue import STAGES, get_source
 from pixmetry.core.contribution import AVERAGES
-from pixmetry.report.numbers import NONE, decimals_of, fixed, length_px, length_um, percent, signed
+from pixmetry.report.numbers import NONE, decimals_of, fixed, length_mpx, length_px, length_um, percent, signed
 
 CLASSES = {
     "T": "random in time, pixel by pixel",
@@ -66,10 +66,9 @@ def budget_content(budget: Budget, unmeasured: Mapping[str, str]) -> dict[str, A
         "top": top,
         "scale": _text(longest_px, budget.pitch_um),
         "sources": _sources(budget, unmeasured),
-        "unit_note": "px",
         "mc_note": _monte_carlo_note(budget),
         "sums": _sums(budget),
-        "interaction": "No Monte Carlo was asked for." if budget.interaction is None else _interaction(budget.interaction),
+        "interaction": "No Monte Carlo was asked for." if budget.interaction is None else _interaction(budget.interaction, budget.verdict.total_px),
         "class_rules": CLASS_RULES,
     }
 
@@ -178,7 +177,7 @@ def _bar(axis: str, u: float, bias: float, longest: float, pitch_um: tuple[float
 
 def _gain(advice: Any) -> str:
     whole = "the total with everything accepted" if advice.status == "accepted" else "the total"
-    now, gone, half = (length_px(v) for v in (advice.combined_px, advice.removed_px, advice.halved_px))
+    now, gone, half = (length_px(v, 3) for v in (advice.combined_px, advice.removed_px, advice.halved_px))
     less = percent(1 - advice.removed_px / advice.combined_px) if advice.combined_px else NONE
     return f"without it {whole} would fall from {now} to {gone} px ({less} % less), with half of it to {half} px (root mean square of x and y)."
 
@@ -211,33 +210,38 @@ def _source(row: BudgetRow, unmeasured: Mapping[str, str]) -> dict[str, str]:
         "number": f"{source.number} {'★' * source.stars}".strip() if source.number else NONE,
         "status": row.status,
         "gum_class": c.gum_class if c is not None else source.gum_class,
-        "x": length_px(float(np.hypot(c.u_x_px, c.bias_x_px))) if counts and c else NONE,
-        "y": length_px(float(np.hypot(c.u_y_px, c.bias_y_px))) if counts and c else NONE,
+        "x": length_mpx(float(np.hypot(c.u_x_px, c.bias_x_px))) if counts and c else NONE,
+        "y": length_mpx(float(np.hypot(c.u_y_px, c.bias_y_px))) if counts and c else NONE,
         "mc_x": NONE if mc is None else _with_error(mc.x),
         "mc_y": NONE if mc is None else _with_error(mc.y),
         "share": f"{percent(row.share)} %" if counts else NONE,
+        "known": _known(row),
         "reason": _reason(row, unmeasured),
     }
 
 
 def _with_error(axis: Any) -> str:
-    """Total of one axis of a Monte Carlo and its standard error."""
+    """Total of one axis of a Monte Carlo and its standard error, in thousandths of a pixel."""
     total = float(np.hypot(axis.u, axis.bias))
     if not np.isfinite(total):
         return NONE
-    error = float(np.hypot(axis.u * axis.se_u, axis.bias * axis.se_bias) / total) if total else 0.0
-    if error <= 0:
-        return length_px(total)
-    places = min(max(decimals_of(error, 1), 0), 6)
-    return f"{fixed(total, places)} ± {fixed(error, places)}"
+    error = 1000 * float(np.hypot(axis.u * axis.se_u, axis.bias * axis.se_bias) / total) if total else 0.0
+    if error < 0.005:
+        return length_mpx(total)
+    places = min(max(decimals_of(error, 1), 0), 2)
+    return f"{fixed(1000 * total, places)} ± {fixed(error, places)}"
 
 
 def _reason(row: BudgetRow, unmeasured: Mapping[str, str]) -> str:
-    if row.status == "measured" and row.contribution is not None:
-        return f"known to ± {percent(row.u_of_total_px / row.total_px)} %" if row.u_of_total_px > 0 and row.total_px > 0 else ""
-    if row.status == "accepted":
-        return unmeasured.get(row.source_id, row.reason)
-    return row.reason
+    """Why something is missing; nothing where all is there."""
+    if row.status in DECIDED and row.contribution is not None:
+        return ""
+    return unmeasured.get(row.source_id, row.reason) if row.status == "accepted" else row.reason
+
+
+def _known(row: BudgetRow) -> str:
+    """Relative uncertainty of a measured contribution that comes of its parameters."""
+    return f"± {percent(row.u_of_total_px / row.total_px)} %" if row.u_of_total_px > 0 and row.total_px > 0 else ""
 
 
 def _sums(budget: Budget) -> list[dict[str, Any]]:
@@ -265,10 +269,9 @@ def _sum_of(results: list[MonteCarlo], axis: str) -> float:
     return float(np.sqrt(sum(getattr(m, axis).u ** 2 + getattr(m, axis).bias ** 2 for m in results)))
 
 
-def _interaction(found: Interaction) -> str:
+def _interaction(found: Interaction, analytic_px: float) -> str:
     difference, se = found.difference_px, found.se_px
-    places = min(max(decimals_of(se, 2), 0), 7) if se > 0 else 6
-    told = f"{fixed(difference, places)} ± {fixed(se, places)} px"
+    places = min(max(decimals_of(se, 2), 0), 6) if se > 0 else 6
     if abs(difference) <= 2 * se:
         verdict = "which is within two standard errors: no interaction is seen, and the squares may be added"
     elif difference > 0:
@@ -277,6 +280,7 @@ def _interaction(found: Interaction) -> str:
         verdict = "less by more than two standard errors: the sources partly cancel or mask each other, and the sum is on the safe side"
     lost = f" In {found.together.lost} of {found.together.trials} windows no target was found." if found.together.lost else ""
     return (
-        f"All sources at once give {length_px(found.together.total_px)} px (root mean square of x and y), each alone and added as squares "
-        f"{length_px(found.sum_px)} px. The interaction is the difference, {told}, {verdict}.{lost}"
+        f"All sources at once give {fixed(found.together.total_px, places)} ± {fixed(found.together.se_total_px, places)} px (root mean square of x and "
+        f"y), each alone and added as squares {fixed(found.sum_px, places)} ± {fixed(found.se_sum_px, places)} px. The interaction is the difference, "
+        f"{fixed(difference, places)} ± {fixed(se, places)} px, {verdict}. The analytic sum is {fixed(analytic_px, places)} px.{lost}"
     )

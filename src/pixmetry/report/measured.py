@@ -69,8 +69,8 @@ SPATIAL = {
 STANDARD_ONLY = {
     "snr_max": "Largest signal-to-noise ratio",
     "dynamic_range": "Dynamic range",
-    "threshold_e": "Absolute sensitivity threshold",
-    "threshold_photons": "Absolute sensitivity threshold",
+    "threshold_e": "Absolute sensitivity threshold, electrons",
+    "threshold_photons": "Absolute sensitivity threshold, photons",
     "saturation_photons": "Saturation, photons",
 }
 
@@ -83,7 +83,7 @@ def table(seen: Observations, standard: Estimates) -> dict[str, list[Row]]:
         "Fixed pattern": _rows(seen.spatial_fit, SPATIAL, beside),
         "Converter, defects, patterns": [*_codes(seen), *_defects(seen), *_patterns(seen)],
         "By EMVA 1288 alone": [
-            Row(title, name, Number(NONE, NONE, ""), "", _standard_text(beside, name, None), "")
+            Row(title, name, Number("", NONE, ""), "", _standard_text(beside, name, None), "")
             for name, title in STANDARD_ONLY.items()
             if name in beside
         ],
@@ -128,7 +128,7 @@ def _joined(number: Number) -> str:
 
 
 def _dof(dof: float) -> str:
-    return "∞" if not np.isfinite(dof) or dof >= 1e6 else significant(dof, 2 if dof < 10 else 3)
+    return "∞" if not np.isfinite(dof) or dof >= 1e6 else significant(dof, 2 if dof < 100 else 3)
 
 
 def _codes(seen: Observations) -> list[Row]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from math import floor, isfinite, log10
 
@@ -73,13 +74,24 @@ def pretty_unit(unit: str) -> str:
     return "" if unit == "1" else unit.replace("e-", "e⁻").replace("^2", "²").replace("um", "µm")
 
 
-def length_px(value: float) -> str:
-    """A length in pixels to two or three significant digits, never finer than a millionth."""
+def length_px(value: float, digits: int = 2) -> str:
+    """A length in pixels to so many significant digits (one more from 0.1 on), never finer than a hundred-thousandth."""
+    return _length(value, digits + (abs(value) >= 0.1), 5)
+
+
+def length_mpx(value_px: float) -> str:
+    """A length in thousandths of a pixel, never finer than a hundredth of that."""
+    return _length(1000 * value_px, 2, 2)
+
+
+def _length(value: float, digits: int, most_places: int) -> str:
     if not isfinite(value):
         return NONE
-    if abs(value) < 5e-7:
+    if value == 0:
         return "0"
-    return fixed(value, min(max(decimals_of(value, 3 if abs(value) >= 0.1 else 2), 0), 6))
+    if abs(value) < 0.5 * 10.0**-most_places:
+        return f"<{THIN}{10.0**-most_places:.{most_places}f}"
+    return fixed(value, min(max(decimals_of(value, digits), 0), most_places))
 
 
 def length_um(value_px: float, pitch_um: float | None) -> str:
@@ -94,10 +106,12 @@ def percent(share: float) -> str:
     value = 100 * share
     if 0 < value < 0.05:
         return f"<{THIN}0.1"
-    return fixed(value, 0 if value >= 9.95 else 1)
+    return fixed(value, 0 if abs(value) >= 9.95 else 1)
 
 
-def signed(value: float, formatter) -> str:
-    """Format with an explicit sign."""
+def signed(value: float, formatter: Callable[[float], str]) -> str:
+    """Format with an explicit sign; what is too small to be shown is 0."""
     text = formatter(abs(value))
-    return text if text in {"0", NONE} else ("+" if value > 0 else MINUS) + text
+    if text == NONE:
+        return text
+    return "0" if text == "0" or text.startswith("<") else ("+" if value > 0 else MINUS) + text

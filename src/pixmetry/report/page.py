@@ -6,12 +6,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pixmetry import __version__
+from pixmetry.core.catalogue import get_source
 from pixmetry.report.numbers import significant
 
 if TYPE_CHECKING:
+    from pixmetry.core.estimates import Estimates
     from pixmetry.results import Assessment
 
-TRANSFER = ("transfer", "linearity", "snr")
+TRANSFER = ("transfer", "linearity", "snr", "dark-codes")
 
 
 def write_report(assessment: Assessment, path: str | Path) -> Path:
@@ -53,7 +55,7 @@ def _content(assessment: Assessment) -> dict[str, Any]:
         "version": __version__,
         "name": assessment.campaign.camera.name,
         "facts": _facts(assessment),
-        "transfer": [pictures[name] for name in TRANSFER],
+        "transfer": [pictures[name] for name in TRANSFER if name in pictures],
         "noise": [p for name, p in pictures.items() if name not in TRANSFER],
         "values": table(seen, assessment.standard),
         "notes": _notes(assessment),
@@ -77,7 +79,7 @@ def _facts(assessment: Assessment) -> list[tuple[str, str]]:
     return [
         ("Frame", f"{cols} × {rows} pixels, {facts.bits} bits"),
         ("Pixel pitch", pitch),
-        ("Interface, sensor", f"{facts.interface}, {(facts.sensor or 'not given').upper() if facts.sensor else 'sensor not given'}"),
+        ("Interface, sensor", f"{facts.interface}, {facts.sensor.upper() if facts.sensor else 'sensor not given'}"),
         ("Temperature", temperature),
         ("Frames read", f"{dark} dark, {bright} bright"),
         ("Assessed (UTC)", assessment.provenance["time_utc"].replace("T", " ")[:16]),
@@ -89,18 +91,30 @@ def _notes(assessment: Assessment) -> list[str]:
     return [*own, *assessment.observations.notes]
 
 
-def _sets(assessment: Assessment) -> list[Any]:
+def _shared(assessment: Assessment) -> list[Estimates]:
+    """The estimates that many sources read."""
     seen = assessment.observations
-    sets = [seen.photon_transfer_fit, seen.spatial_fit, *assessment.estimates.values(), assessment.standard]
-    return [s for s in sets if s is not None]
+    return [s for s in (seen.photon_transfer_fit, seen.spatial_fit) if s is not None]
 
 
 def _confounders(assessment: Assessment) -> list[str]:
-    return list(dict.fromkeys(c for s in _sets(assessment) for c in s.confounders))
+    """What the shared estimates could be mistaken for, then what each source adds to that."""
+    shared = [c for s in _shared(assessment) for c in s.confounders]
+    own = [
+        f"{get_source(source_id).title}: {c}" for source_id, s in assessment.estimates.items() for c in s.confounders if c not in shared
+    ]
+    return list(dict.fromkeys([*shared, *own]))
 
 
 def _methods(assessment: Assessment) -> list[str]:
-    return list(dict.fromkeys(part for s in _sets(assessment) for part in s.method.split("; ", 1) if part))
+    """Each method once; that of a source only where it is not made of a shared one."""
+    shared = [s.method for s in (*_shared(assessment), assessment.standard)]
+    own = [
+        f"{get_source(source_id).title}: {s.method}"
+        for source_id, s in assessment.estimates.items()
+        if s.method and not any(m in s.method or s.method in m for m in shared)
+    ]
+    return list(dict.fromkeys([*shared, *own]))
 
 
 def _provenance(record: dict[str, Any]) -> list[tuple[str, str]]:
@@ -111,5 +125,5 @@ def _provenance(record: dict[str, Any]) -> list[tuple[str, str]]:
         ("Libraries", libraries),
         ("Platform", record["platform"]),
         ("Seed of the Monte Carlo", "none" if record["seed"] is None else str(record["seed"])),
-        ("Time (UTC)", record["time_utc"]),
+        ("Time (UTC)", record["time_utc"].replace("T", " ").removesuffix("+00:00")),
     ]

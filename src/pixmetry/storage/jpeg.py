@@ -112,8 +112,8 @@ def propagate(params: Jpeg, probe: Probe) -> Contribution:
         bias_x_px=float(np.mean(dx)),
         bias_y_px=float(np.mean(dy)),
         gum_class="F",
-        model_error=0.4,
-        floor_px=1e-3,
+        model_error=0.25 if params.quality >= 50 else 0.45,  # coarse steps change the target beyond first order
+        floor_px=5e-4,
         method="response of the estimator to the rounding of the block coefficients, over all places of the block raster",
     )
 

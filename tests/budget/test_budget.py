@@ -1,0 +1,154 @@
+"""The budget as a whole: status of each row, ranking, gains, limits, uncertainty of the uncertainties, and the record."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+from budget.cameras import camera, element
+
+from pixmetry.budget import compute_budget, make_probe
+from pixmetry.budget.parameters import applies
+from pixmetry.budget.probe import Target, facts_of
+from pixmetry.core.catalogue import catalogue, get_source
+from pixmetry.core.errors import InputError
+from pixmetry.core.estimates import Estimates
+from pixmetry.locate.estimators import Estimator
+
+KNOWN = {"noise_dn": 0.6}
+
+
+def small_camera():
+    return camera(
+        element("sensor.prnu", pixel_std_rel=0.005),
+        element("electronics.amplifier_noise", white_e=40.0),
+        facts={"saturation_dn": 200.0, "bits": 8, "interface": "digital", "sensor": "cmos"},
+        pitch_um=(8.0, 4.0),
+    )
+
+
+def prnu(value: float, u: float, **kw) -> dict[str, Estimates]:
+    return {"sensor.prnu": Estimates.from_rows([("pixel_std_rel", value, u, 100.0, "1")], **kw)}
+
+
+def row(budget, name):
+    return next(r for r in budget.rows if r.name == name)
+
+
+def test_status_of_each_source() -> None:
+    budget = compute_budget(small_camera(), prnu(0.008, 0.0004), KNOWN, trials=0)
+    assert {r.source_id for r in budget.rows} == set(catalogue())
+    assert row(budget, "sensor.prnu").status == "measured"
+    assert row(budget, "electronics.amplifier_noise").status == "modelled"
+    assert row(budget, "processing.threshold").status == "modelled"
+    assert row(budget, "sensor.dsnu").status == "accepted"
+    assert row(budget, "cable.termination").status == "not applicable"
+    assert row(budget, "cable.termination").contribution is None
+    assert all(r.reason for r in budget.rows if r.contribution is None)
+
+
+def test_the_verdict_is_the_root_sum_of_squares_of_what_is_decided() -> None:
+    budget = compute_budget(small_camera(), prnu(0.008, 0.0004), KNOWN, trials=0)
+    decided = [r.total_px**2 for r in budget.of_status("measured", "modelled")]
+    accepted = [r.total_px**2 for r in budget.of_status("accepted")]
+    assert budget.verdict.total_px == pytest.approx(math.sqrt(sum(decided)))
+    assert budget.with_accepted[0].total_px == pytest.approx(math.sqrt(sum(decided) + sum(accepted)))
+    assert sum(r.share for r in budget.of_status("measured", "modelled")) == pytest.approx(1.0)
+    totals = [r.total_px for r in budget.rows]
+    assert totals == sorted(totals, reverse=True)
+    x_um, y_um = budget.um(budget.verdict)
+    assert x_um == pytest.approx(8 * budget.verdict.total_x_px) and y_um == pytest.approx(4 * budget.verdict.total_y_px)
+
+
+def test_frames_lower_only_the_temporal_part() -> None:
+    budget = compute_budget(small_camera(), None, KNOWN, trials=0, frames=(1, 4, 10**12))
+    names = ("electronics.amplifier_noise", "sensor.shot_noise", "sensor.prnu")  # light has its shot noise, named in the chain or not
+    noise, shot, fixed = (row(budget, name).total_px for name in names)
+    one, four, many = (v.total_px**2 for v in budget.verdicts)
+    assert one - four == pytest.approx(0.75 * (noise**2 + shot**2))
+    assert one - many == pytest.approx(noise**2 + shot**2, rel=1e-6) and many > fixed**2
+
+
+def test_the_estimate_replaces_the_cameras_parameter_and_its_uncertainty_propagates() -> None:
+    """PRNU's contribution is proportional to its standard deviation, so the relative uncertainties are equal."""
+    budget = compute_budget(small_camera(), prnu(0.008, 0.0004), KNOWN, trials=0)
+    before = row(compute_budget(small_camera(), None, KNOWN, trials=0), "sensor.prnu")
+    got = row(budget, "sensor.prnu")
+    assert got.total_px == pytest.approx(before.total_px * 0.008 / 0.005)
+    assert got.u_of_total_px == pytest.approx(got.total_px * 0.0004 / 0.008, rel=1e-6)
+    assert before.u_of_total_px == 0
+
+
+def test_an_upper_limit_enters_as_a_rectangular_distribution() -> None:
+    """A value that may be anywhere from 0 to L has the root mean square L/√3; checked against numbers spread over it."""
+    limit = 0.012
+    got = row(compute_budget(small_camera(), prnu(limit, 0.001, limits=frozenset({"pixel_std_rel"})), KNOWN, trials=0), "sensor.prnu")
+    cam = small_camera()
+    probe = make_probe(facts_of(cam, Target(), KNOWN), Target(), Estimator())
+    spread = (np.arange(1000) + 0.5) / 1000 * limit
+    source = get_source("sensor.prnu")
+    unit = source.propagate(source.make({"pixel_std_rel": limit}), probe).total_px / limit
+    assert got.total_px == pytest.approx(unit * math.sqrt((spread**2).mean()), rel=1e-5)
+
+
+def test_covariance_between_parameters_counts() -> None:
+    """Two parameters of one source, fully correlated: with equal slopes the uncertainty is that of their sum, not of its quadrature."""
+    names, values = ("row_e", "column_e"), np.array([5.0, 5.0])
+
+    def u(rho: float) -> float:
+        cov = 0.04 * np.array([[1, rho], [rho, 1]])
+        measured = {"electronics.row_noise": Estimates(names, values, cov, np.full(2, 99.0), ("e-", "e-"))}
+        return row(compute_budget(small_camera(), measured, KNOWN, trials=0), "electronics.row_noise").u_of_total_px
+
+    assert u(0.999999) / u(0.0) == pytest.approx(math.sqrt(2), rel=1e-3)
+    assert u(-0.999999) < 1e-2 * u(0.0)
+
+
+def test_advice_names_the_largest_and_tells_the_gain() -> None:
+    budget = compute_budget(small_camera(), None, KNOWN, trials=0)
+    assert len(budget.advice) == 5
+    assert [a.name for a in budget.advice] == [r.name for r in budget.rows][:5]
+    for advice in budget.advice:
+        whole = budget.with_accepted[0] if advice.status == "accepted" else budget.verdict
+        assert advice.combined_px == whole.total_px
+        assert advice.removed_px == pytest.approx(math.sqrt(whole.total_px**2 - advice.total_px**2), rel=1e-6)
+        assert advice.removed_px <= advice.halved_px <= advice.combined_px and advice.text
+    forced = compute_budget(small_camera(), None, KNOWN, trials=0, accepted=["sensor.prnu"])
+    assert row(forced, "sensor.prnu").status == "accepted"
+
+
+def test_monte_carlo_stands_beside_and_independent_sources_do_not_interact() -> None:
+    """White noise and PRNU: together they are their root sum of squares. False alarm 1e-6, and 4 % of the total beyond that."""
+    said = []
+    budget = compute_budget(small_camera(), None, KNOWN, trials=4096, progress=said.append)
+    for name in ("sensor.prnu", "electronics.amplifier_noise", "processing.threshold"):
+        r = row(budget, name)
+        error = 5 * r.monte_carlo.se_total_px + r.contribution.model_error * r.total_px + r.contribution.floor_px
+        assert abs(r.monte_carlo.total_px - r.total_px) < error
+    together = budget.interaction
+    assert abs(together.difference_px) < 4.9 * together.se_px + 0.04 * together.sum_px
+    assert together.se_px < 0.05 * together.sum_px
+    assert any("Monte Carlo" in text for text in said)
+
+
+def test_the_record_is_plain_and_complete() -> None:
+    record = compute_budget(small_camera(), prnu(0.008, 0.0004), KNOWN, trials=256).to_record()
+    again = json.loads(json.dumps(record, allow_nan=False))
+    assert again["schema"] == "pixmetry/budget/1" and len(again["rows"]) == len(catalogue())
+    assert again["verdicts"][0]["total_um"] is not None and again["interaction"]["together"]["x"]["u"] > 0
+    assert again["estimator"]["threshold_dn"] == pytest.approx(1.8)
+
+
+def test_a_parameter_that_the_source_does_not_have_is_refused() -> None:
+    wrong = {"sensor.prnu": Estimates.from_rows([("sensitivity", 1.0, 0.1, 9.0, "1")])}
+    with pytest.raises(InputError, match="sensitivity"):
+        compute_budget(small_camera(), wrong, KNOWN, trials=0)
+
+
+def test_applies_reads_interface_and_sensor() -> None:
+    source = get_source("cable.termination")
+    assert applies(source, {"interface": "analogue"}) and not applies(source, {"interface": "digital"})
+    assert applies(source, {})  # not told: it may be there
+    assert applies(get_source("sensor.prnu"), {"interface": "digital", "sensor": "cmos"})

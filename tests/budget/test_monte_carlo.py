@@ -1,0 +1,172 @@
+"""The Monte Carlo and the probe against closed forms and simulations written another way."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from budget.cameras import ETA, GAIN_DN_PER_E, camera, element
+
+from pixmetry.budget.monte_carlo import Trials, _axis, monte_carlo
+from pixmetry.budget.probe import Facts, Target, facts_of, make_probe, parse_target, resolve
+from pixmetry.core.errors import InputError
+from pixmetry.locate.estimators import Estimator
+
+WHITE_E = 60.0
+Z = 4.9  # of a normal variable: two-sided false-alarm rate 1e-6
+TARGET = Target(peak_rel=0.75, background_rel=0.025)
+SEED = int(np.random.SeedSequence().entropy % 2**31)  # any will do: tolerances are those of the statistics
+
+
+def noisy() -> object:
+    return camera(element("electronics.amplifier_noise", white_e=WHITE_E))
+
+
+def facts(cam, noise_dn: float = 0.6) -> Facts:
+    return facts_of(cam, TARGET, {"noise_dn": noise_dn})
+
+
+def test_facts_are_those_of_the_chain() -> None:
+    got = facts_of(noisy(), TARGET)
+    assert got.dn_per_photon == pytest.approx(ETA * GAIN_DN_PER_E, rel=1e-6)
+    assert (got.gain_dn_per_e, got.saturation_dn, got.bits) == (GAIN_DN_PER_E, 200.0, 8)
+    # 128 windows of 256 pixels, a mean taken from each, cut at 4σ (takes 0.05 % off): u = 1/√(2·32768) = 0.4 %
+    assert got.noise_dn == pytest.approx(WHITE_E * GAIN_DN_PER_E, rel=Z * 0.004 + 0.003)
+    assert facts_of(camera(adc=True, facts={}), TARGET).saturation_dn == 255 - 8
+    with pytest.raises(InputError, match="facts|fact"):
+        facts_of(noisy(), TARGET, {"noise": 1.0})
+
+
+def test_white_noise_has_the_closed_form() -> None:
+    """Plain centroid over w × w pixels: u = σ √(w²(w² − 1)/12)/S with S the disc's light, π R² A. Smallest error seen: 3.5 %."""
+    cam, law = noisy(), Estimator("centroid", window=15)
+    total = math.pi * 3.5**2 * TARGET.peak_rel * 200.0
+    u = WHITE_E * GAIN_DN_PER_E * math.sqrt(225 * 224 / 12) / total
+    got = monte_carlo(cam, TARGET, law, only=["electronics.amplifier_noise"], trials=20_000, facts=facts(cam), seed=SEED)
+    for axis in (got.x, got.y):
+        assert abs(axis.u / u - 1) < Z / math.sqrt(2 * got.trials) + 0.005  # 0.5 %: the light that ends outside of the square, and phase
+        assert abs(axis.temporal / u - 1) < Z / math.sqrt(got.trials) + 0.005
+        assert abs(axis.bias) < Z * u / math.sqrt(got.trials)
+        assert axis.fixed < math.sqrt(Z * u**2 / math.sqrt(got.trials / 2))  # its variance is zero within Z standard errors
+        assert axis.se_u == pytest.approx(u / math.sqrt(2 * got.trials), rel=0.3)
+        assert axis.se_bias == pytest.approx(u / math.sqrt(got.trials), rel=1.5)
+
+
+def test_what_is_fixed_shows_as_fixed_and_agrees_with_the_linear_response() -> None:
+    """PRNU of 1 %: no difference between frames; 8192 places. The propagator's own error is stated as 12 %, here 3 % are allowed."""
+    cam = camera(element("sensor.prnu", pixel_std_rel=0.01))
+    probe = make_probe(facts(cam), TARGET, Estimator())
+    got = monte_carlo(cam, TARGET, Estimator(), only=["sensor.prnu"], trials=8192, facts=facts(cam), seed=SEED)
+    assert got.x.temporal == 0 and got.y.temporal == 0
+    for axis, u in zip((got.x, got.y), probe.white(0.01 * probe.signal_dn), strict=True):
+        assert abs(axis.fixed / u - 1) < 0.03 + Z / math.sqrt(2 * got.units * got.places)
+
+
+def test_nested_analysis_of_variance_separates_what_was_put_in() -> None:
+    """Shifts made by NumPy with known parts; false alarm 1e-6 per comparison, by the standard errors that it states itself (with 10 % to them)."""
+    rng = np.random.default_rng()
+    shape = (12, 2000, 3)
+    shift = 0.5 + rng.normal(0, 0.3, shape[:2])[:, :, None] + rng.normal(0, 0.2, shape)
+    got = _axis(shift)
+    for value, error, truth in (
+        (got.bias, got.se_bias, 0.5),
+        (got.u, got.se_u, math.hypot(0.3, 0.2)),
+        (got.temporal, got.se_temporal, 0.2),
+        (got.fixed, got.se_fixed, 0.3),
+    ):
+        assert error < 0.02 * truth and abs(value - truth) < 1.1 * Z * error
+    assert got.se_temporal == pytest.approx(0.2 / math.sqrt(2 * 2 * 24_000), rel=0.05)
+
+
+def test_a_bias_that_belongs_to_the_unit_widens_the_error_of_the_mean() -> None:
+    """Eight units, each with an offset of its own: the standard error is that of eight values, not of 16 000."""
+    rng = np.random.default_rng()
+    offset = np.linspace(-1, 1, 8)
+    got = _axis(offset[:, None, None] + rng.normal(0, 0.01, (8, 1000, 2)))
+    assert got.se_bias == pytest.approx(offset.std(ddof=1) / math.sqrt(8), rel=0.01)
+    assert got.fixed == pytest.approx(offset.std(), rel=0.01)
+
+
+def test_lost_targets_are_counted_and_left_out() -> None:
+    shift = np.zeros((2, 5, 2))
+    shift[0, 1, 1] = np.nan
+    assert _axis(shift).u == 0 and _axis(shift).bias == 0
+    assert math.isnan(_axis(np.full((2, 3, 2), np.nan)).u)
+
+
+def test_the_estimator_itself_against_the_truth() -> None:
+    """Without any source, the whole camera's error is the S-curve that the probe shows on its lattice (fixed; u within 8 %, three lattices)."""
+    cam = camera()
+    law, target = Estimator(sigma=40.0), Target(diameter_px=4.0, blur_px=0.5, peak_rel=0.7)
+    known = facts_of(cam, target, {"noise_dn": 1.0})
+    got = monte_carlo(cam, target, law, trials=4096, facts=known, seed=SEED)
+    probe = make_probe(known, target, law, phases=24)
+    u = np.std(probe.x_hat_px - probe.x_px)
+    assert u > 5e-4 and got.x.temporal == 0
+    assert abs(got.x.u / u - 1) < 0.08
+
+
+def test_a_source_of_codes_is_compared_on_a_converter() -> None:
+    cam = camera(adc=True)
+    got = monte_carlo(cam, TARGET, Estimator(), only=["grabber.adc"], trials=4096, facts=facts(cam, 1.0), seed=SEED)
+    probe = make_probe(facts(cam, 1.0), TARGET, Estimator())
+    assert abs(got.x.u / probe.white(math.sqrt(1 / 12))[0] - 1) < 0.15  # rounding is not quite white: pixels of the flat top agree
+
+
+def test_the_same_seed_gives_the_same_and_another_one_does_not() -> None:
+    cam = noisy()
+    runs = [monte_carlo(cam, TARGET, Estimator(), trials=64, facts=facts(cam), seed=s).x for s in (1, 1, 2)]
+    assert runs[0] == runs[1] != runs[2]
+
+
+def test_off_equals_only_when_there_is_one_source() -> None:
+    cam = noisy()
+    design = Trials(cam, TARGET, Estimator(), facts(cam), trials=64)
+    assert design.of(off=["electronics.amplifier_noise"]).x == design.of(only=["electronics.amplifier_noise"]).x
+    with pytest.raises(InputError):
+        design.of(only=[], off=[])
+    with pytest.raises(InputError, match="no source named"):
+        design.of(only=["nothing"])
+
+
+def test_places_cover_sensor_and_pixel() -> None:
+    """Kolmogorov–Smirnov of 4096 uniform numbers each, at 1e-6: shifts of 0.04 of the range are seen."""
+    from scipy.stats import kstest
+
+    cam = noisy()
+    design = Trials(cam, TARGET, Estimator(), facts(cam), trials=8192, units=8, seed=SEED)
+    assert design.dx.shape == (8, 512) and design.row0.min() >= 0 and design.row0.max() <= 96 - 24 and design.col0.max() <= 128 - 24
+    for values in (design.dx + 0.5, design.dy + 0.5):
+        assert kstest(values.ravel(), "uniform").pvalue > 1e-6
+    assert {0, 96 - 24} <= set(design.row0.ravel().tolist())
+
+
+def test_probe_is_the_target_through_the_estimator() -> None:
+    cam = noisy()
+    probe = make_probe(facts(cam), TARGET, Estimator())
+    assert probe.signal_dn.shape == (64, 24, 24) and probe.background_dn == pytest.approx(5.0)
+    total = (probe.signal_dn - probe.background_dn).sum(axis=(1, 2))
+    assert np.allclose(total, math.pi * 3.5**2 * 150.0, rtol=2e-4)
+    x = ((probe.signal_dn - probe.background_dn) * np.arange(24)).sum(axis=(1, 2)) / total
+    assert np.allclose(x, probe.x_px, atol=2e-4)
+    law = resolve(Estimator(), TARGET, facts(cam))
+    assert law.threshold_dn == pytest.approx(1.8) and law.background_dn == pytest.approx(5.0)
+    assert np.array_equal(law.locate(probe.signal_dn)[0], probe.x_hat_px)
+    with pytest.raises(InputError, match="threshold"):
+        make_probe(facts(cam), TARGET, Estimator(sigma=None, threshold_dn=1000.0))
+
+
+REFUSED = ["square", "disc:diameter=0", "disc:peak=2", "disc:peak=x", "disc:size=3", "disc:background=-0.1", "disc:peak"]
+
+
+@pytest.mark.parametrize("text", REFUSED)
+def test_parse_target_refuses(text: str) -> None:
+    with pytest.raises(InputError) as refused:
+        parse_target(text)
+    assert refused.value.allowed or refused.value.remedy
+
+
+def test_parse_target() -> None:
+    assert parse_target("disc:diameter=5,blur=0.5,peak=0.4,background=0.1") == Target("disc", 5.0, 0.5, 0.4, 0.1)
+    assert parse_target("disc") == Target()
