@@ -28,7 +28,7 @@ ALLOWED: dict[str, set[str]] = {
 ALLOWED["simulation"] = ALLOWED["correction"] = {"core", "scene", "campaign"}
 ALLOWED["results"] = {"core", "campaign", "experiment", "budget"}
 ALLOWED["report"] = {"core", "campaign", "experiment", "budget", "results"}
-ALLOWED["assessment"] = {"core", "campaign", "experiment", "budget", "results", "report"}
+ALLOWED["assessment"] = {"core", "campaign", "experiment", "locate", "budget", "results", "report"}
 ALLOWED["handbook"] = {*ALLOWED}
 ALLOWED["cli"] = {*ALLOWED}
 ALLOWED["__main__"] = {"cli"}

@@ -7,8 +7,8 @@ import math
 
 import numpy as np
 import pytest
-from budget.cameras import camera, element
 
+from budget.cameras import camera, element
 from pixmetry.budget import compute_budget, make_probe
 from pixmetry.budget.parameters import applies
 from pixmetry.budget.probe import Target, facts_of

@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 import pytest
-from budget.cameras import ETA, GAIN_DN_PER_E, camera, element
 
+from budget.cameras import ETA, GAIN_DN_PER_E, camera, element
 from pixmetry.budget.monte_carlo import Trials, _axis, monte_carlo
 from pixmetry.budget.probe import Facts, Target, facts_of, make_probe, parse_target, resolve
 from pixmetry.core.errors import InputError
@@ -64,7 +64,7 @@ def test_what_is_fixed_shows_as_fixed_and_agrees_with_the_linear_response() -> N
 
 
 def test_nested_analysis_of_variance_separates_what_was_put_in() -> None:
-    """Shifts made by NumPy with known parts; false alarm 1e-6 per comparison, by the standard errors that it states itself (with 10 % to them)."""
+    """Shifts made by NumPy with known parts; false alarm 1e-6 per comparison, by the standard errors that it states itself (and 10 %)."""
     rng = np.random.default_rng()
     shape = (12, 2000, 3)
     shift = 0.5 + rng.normal(0, 0.3, shape[:2])[:, :, None] + rng.normal(0, 0.2, shape)
@@ -96,7 +96,7 @@ def test_lost_targets_are_counted_and_left_out() -> None:
 
 
 def test_the_estimator_itself_against_the_truth() -> None:
-    """Without any source, the whole camera's error is the S-curve that the probe shows on its lattice (fixed; u within 8 %, three lattices)."""
+    """Without any source, the whole camera's error is the S-curve that the probe shows on a lattice of 24 × 24 phases; u within 8 %."""
     cam = camera()
     law, target = Estimator(sigma=40.0), Target(diameter_px=4.0, blur_px=0.5, peak_rel=0.7)
     known = facts_of(cam, target, {"noise_dn": 1.0})

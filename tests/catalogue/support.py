@@ -90,7 +90,7 @@ def camera_with(
     return Camera("test", shape, (*lead_in(kind_of(source)), *before, element, *after), **kw)
 
 
-def to_dn(source: Source, data: np.ndarray, kind: Kind) -> np.ndarray:
+def to_dn(data: np.ndarray, kind: Kind) -> np.ndarray:
     """Bring the output of a chain to DN by the ideal conversions."""
     factor = {Kind.PHOTONS: ETA * K_DN_PER_E, Kind.ELECTRONS: K_DN_PER_E, Kind.DN: 1.0, Kind.CODES: 1.0}
     return data.astype(float) * factor[kind]
@@ -202,6 +202,7 @@ def probe_of(windows_dn: np.ndarray, x: np.ndarray, y: np.ndarray, threshold: fl
         temperature_c=20.0,
         bits=8,
         frame_shape=shape,
+        locate=lambda changed_dn: soft_centroid(changed_dn, threshold),
     )
 
 

@@ -240,6 +240,31 @@ def test_frozen_and_exact_mode_differ_by_no_more_than_the_stated_tail() -> None:
     assert np.abs(exact - without).max() > 50 * np.abs(frozen - exact).max()  # the effect itself is far larger than what frozen loses
 
 
+def test_frozen_mode_takes_the_far_part_from_the_background() -> None:
+    """Half of what lies 10 px to the left is added, of which a near context of 3 px sees nothing: on the background itself it is exact."""
+
+    def forward(params: Amplitude, signal: Any, stream: Any) -> Any:
+        late = signal.data[:, :, np.maximum(np.arange(signal.data.shape[2]) - 10, 0)]
+        return signal.with_data(signal.data + np.float32(0.5) * late)
+
+    far = {"context": lambda p, w, f: w.full_rows(f), "near": lambda p: (0, 0, 3, 0), "tail": lambda p: 0.5}
+    chain = camera(TO_ELECTRONS, TO_DN, Element("far", make_source("electronics.far", forward, (Kind.DN,), **far), Nothing()))
+    scene = Texture()
+    grid = Grid(np.zeros(3), [0, 20, 61], [5, 40, 81], (9, 9))
+    exact, frozen = (chain.expose_windows(scene, grid, mode=m, background=scene) for m in ("exact", "frozen"))
+    assert np.allclose(frozen, exact, rtol=1e-5)
+    assert chain.frozen_tail() == 0.5
+
+
+def test_quiet_draws_are_arrays_of_their_own() -> None:
+    """A source may go on in place with what a draw gave it."""
+    grid, data = Grid.whole([0, 1], (3, 4)), np.ones((2, 3, 4), np.float32)
+    quiet = camera().streams(0, quiet=True).of("any")
+    for drawn in (quiet.poisson(data, grid), quiet.add_normal(data, grid, 3.0), quiet.add_normal(data[:1], grid, 3.0)):
+        assert np.array_equal(drawn, data) and not np.shares_memory(drawn, data)
+        assert drawn.flags.writeable
+
+
 def test_frozen_mode_is_exact_without_far_context() -> None:
     chain = camera(PRNU_ELEMENT, TO_ELECTRONS, SHOT, TO_DN)
     grid = Grid([0, 1], [0, 61], [5, 82], (9, 8))

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pixmetry.report.numbers import THIN, length_mpx, length_px, limit, percent, significant, signed, uncertain
+from pixmetry.report.numbers import THIN, length_mpx, length_px, limit, percent, signed, significant, uncertain
 
 MINUS = "\u2212"
 

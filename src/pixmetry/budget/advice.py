@@ -18,7 +18,8 @@ MOST = 5
 class Advice:
     """What to do about one source: measure it if it was only accepted, else lower it.
 
-    ``combined_px`` is the combined total now, ``removed_px`` and ``halved_px`` what it would be without this contribution and with half of it.
+    ``combined_px`` is the combined total now, ``removed_px`` and ``halved_px`` what it would be without this
+    contribution and with half of it.
     """
 
     name: str
@@ -37,7 +38,7 @@ def advise(rows: Sequence[Any], verdict: Combined, everything: Combined, most: i
 
     The gain is told within the total that the row belongs to: for an accepted source, the one with everything accepted at its bound.
     """
-    chosen = sorted((r for r in rows if r.contribution is not None and r.status != "not applicable" and r.total_px > 0), key=lambda r: -r.total_px)
+    chosen = sorted((r for r in rows if r.contribution is not None and r.total_px > 0), key=lambda r: -r.total_px)
     return tuple(_advice(r, (everything if r.status == "accepted" else verdict).total_px) for r in chosen[:most])
 
 

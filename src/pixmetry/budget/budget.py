@@ -90,8 +90,8 @@ class Interaction:
 class Budget:
     """All rows, largest first, and what they come to.
 
-    ``verdicts`` combines what is measured and modelled, for one frame and for means over several; ``with_accepted`` adds everything that was
-    accepted, at its bound. Totals are k = 1.
+    ``verdicts`` combines what is measured and modelled, for one frame and for means over several; ``with_accepted`` adds everything that
+    was accepted, at its bound. Totals are k = 1.
     """
 
     camera: str
@@ -295,7 +295,8 @@ def _combined(rows: Sequence[BudgetRow], frames: Sequence[int]) -> tuple[list[Bu
 
 
 def _row_record(row: BudgetRow) -> dict[str, Any]:
-    record = {k: getattr(row, k) for k in ("name", "source_id", "title", "status", "u_of_total_px", "share", "without_px", "reason", "total_px")}
+    names = ("name", "source_id", "title", "status", "u_of_total_px", "share", "without_px", "reason", "total_px")
+    record = {k: getattr(row, k) for k in names}
     record["contribution"] = None if row.contribution is None else asdict(row.contribution)
     record["monte_carlo"] = None if row.monte_carlo is None else _monte_carlo_record(row.monte_carlo)
     return record

@@ -45,8 +45,8 @@ def combine(contributions: Iterable[Contribution], frames: int = 1, targets: int
     -----
     u² = Σ u_i²/(frames if its class averages over frames)/(targets if it averages over targets), x and y apart (JCGM 100:2008, 5.1.2;
     uncorrelated contributions). No number of frames lowers a bias. A bias that is not corrected, and whose sign another camera would have
-    the other way, enters as the root sum of squares with the others: b² = Σ b_i², and the total is √(u² + b²) (cf. JCGM 100:2008, F.2.4.5, which
-    would rather have it corrected; that is what the advice says too).
+    the other way, enters as the root sum of squares with the others: b² = Σ b_i², and the total is √(u² + b²) (cf. JCGM 100:2008,
+    F.2.4.5, which would rather have it corrected; that is what the advice says too).
 
     Raises
     ------

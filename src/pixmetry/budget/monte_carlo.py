@@ -20,8 +20,8 @@ UNIT_STRIDE = 1_000_003  # between the unit seeds of cameras of one type
 class Axis:
     """Shift along one axis in px, with standard errors of the Monte Carlo.
 
-    ``u`` is the standard deviation of all shifts of all units about their mean; its two independent parts are ``temporal``, from frame to frame of
-    one target at one place, and ``fixed``, from place to place and unit to unit.
+    ``u`` is the standard deviation of all shifts of all units about their mean; its two independent parts are ``temporal``, from frame to
+    frame of one target at one place, and ``fixed``, from place to place and unit to unit.
     """
 
     bias: float

@@ -51,7 +51,8 @@ def covariance_of(estimates: Estimates) -> np.ndarray:
 def u_of_total(source: Source, params: Any, estimates: Estimates, probe: Probe) -> float:
     """Standard uncertainty of a contribution's total in px that comes of the parameters' uncertainty.
 
-    First-order propagation (JCGM 100:2008, 5.2.2) with derivatives by central differences over ± u, one-sided where the model allows no other side.
+    First-order propagation (JCGM 100:2008, 5.2.2) with derivatives by central differences over ± u, one-sided where the
+    model allows no other side.
     """
     covariance = covariance_of(estimates)
     slopes = np.zeros(len(estimates))

@@ -45,7 +45,9 @@ class Target:
             raise InputError("no such target", value=self.kind, allowed="disc")
         if not (0.5 <= self.diameter_px <= 200 and 0.05 <= self.blur_px <= 20):
             raise InputError(
-                "the target's size cannot be used", value=(self.diameter_px, self.blur_px), allowed="diameter 0.5 to 200 px, blur 0.05 to 20 px"
+                "the target's size cannot be used",
+                value=(self.diameter_px, self.blur_px),
+                allowed="diameter 0.5 to 200 px, blur 0.05 to 20 px",
             )
         if not (self.peak_rel > 0 and self.background_rel >= 0 and self.peak_rel + self.background_rel <= 1):
             raise InputError(
@@ -212,6 +214,7 @@ def make_probe(facts: Facts, target: Target, estimator: Estimator, phases: int =
         temperature_c=facts.temperature_c,
         bits=facts.bits,
         frame_shape=facts.frame_shape,
+        locate=estimator.locate,
     )
 
 

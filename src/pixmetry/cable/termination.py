@@ -78,14 +78,14 @@ def tail(params: Termination) -> float:
 
 
 def propagate(params: Termination, probe: Probe) -> Contribution:
-    """Propagator P5, the first moment of the echo series: Δx = ρτ/(1 − ρ) for a full window; here, the field it adds to the window."""
+    """The target with its echoes seen by the estimator; for a centroid over everything it is the first moment, Δx = ρτ/(1 − ρ)."""
     if params.ghost == 0.0:
         return Contribution(u_x_px=0.0, u_y_px=0.0, gum_class="G", method="no echo")
     ghosted = add_ghosts(
         np.ascontiguousarray(probe.signal_dn - probe.background_dn, np.float32), params.ghost, params.delay_px, echoes(params)
     )
-    dx, dy = probe.field(ghosted + probe.background_dn - probe.signal_dn)
-    return probe.from_shifts(dx, dy, "G", model_error=0.15, method="linear response of the estimator to the echoes")
+    dx, dy = probe.moved(ghosted + probe.background_dn)
+    return probe.from_shifts(dx, dy, "G", model_error=0.1, method="the estimator on the target with its echoes")
 
 
 SOURCE = Source(

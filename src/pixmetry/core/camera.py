@@ -107,8 +107,8 @@ class Camera:
 
     @property
     def active(self) -> tuple[Element, ...]:
-        """The elements that act on frames and are on."""
-        return tuple(e for e in self.chain if e.on and e.source.forward is not None)
+        """The elements that are on."""
+        return tuple(e for e in self.chain if e.on)
 
     # ---- running --------------------------------------------------------------------------------------------------------------
 
@@ -487,9 +487,10 @@ def _cut(frame: Signal, like: Signal) -> Signal:
 
 def _settled(element: Element, signal: Signal, stream: Any, most: int = 400) -> Any:
     """Run a source with a memory over the same frame until its state no longer changes."""
-    state = element.source.start(element.params)
+    source: Any = element.source
+    state = source.start(element.params)
     for _ in range(most):
-        _, following = element.source.forward(element.params, signal, stream, state)
+        _, following = source.forward(element.params, signal, stream, state)
         change = np.max(np.abs(np.asarray(following, float) - np.asarray(state, float)))
         state = following
         if change <= 1e-7 * np.max(np.abs(np.asarray(state, float))):

@@ -7,6 +7,7 @@ common to a row: over frames; ``F`` fixed in the sensor, changes with the sub-pi
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -68,6 +69,8 @@ class Probe:
     gain_dn_per_e, exposure_s, temperature_c, bits : float
         Of the camera under which the target is seen.
     frame_shape : (int, int)
+    locate : callable, optional
+        The estimator itself, (p, rows, cols) DN to x and y in window coordinates, for changes that are too large for its gradient.
     """
 
     signal_dn: np.ndarray
@@ -83,6 +86,7 @@ class Probe:
     temperature_c: float
     bits: int
     frame_shape: tuple[int, int]
+    locate: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]] | None = None
 
     def white(self, sigma_dn: np.ndarray | float) -> tuple[float, float]:
         """u_x, u_y from independent errors of standard deviation ``sigma_dn`` (scalar or per pixel) in every pixel."""
@@ -104,6 +108,13 @@ class Probe:
     def field(self, error_dn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Shift in x and y, shape (p,), from a given error field (p, rows, cols) or (rows, cols) in DN (first order)."""
         return tuple((g * error_dn).sum(axis=(1, 2)) for g in (self.gx, self.gy))
+
+    def moved(self, signal_dn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Shift in x and y, shape (p,), when the signal becomes this one; by the estimator itself, or to first order if it is not given."""
+        if self.locate is None:
+            return self.field(signal_dn - self.signal_dn)
+        x, y = self.locate(signal_dn)
+        return x - self.x_hat_px, y - self.y_hat_px
 
     def contribution(self, u: tuple[float, float], gum_class: str, **kw: object) -> Contribution:
         """Shorthand for a contribution without bias."""

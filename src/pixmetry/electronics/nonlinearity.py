@@ -86,9 +86,9 @@ def correct(params: Nonlinearity, signal: Signal, maps: Mapping[str, np.ndarray]
 
 
 def propagate(params: Nonlinearity, probe: Probe) -> Contribution:
-    """Propagator P4 to first order: the bent signal less the straight one. A symmetric target has no bias, only an S-curve."""
-    dx, dy = probe.field(response_dn(params, probe.signal_dn) - probe.signal_dn)
-    return probe.from_shifts(dx, dy, "F", model_error=0.3, method="linear response of the estimator to the deviation from a straight line")
+    """Propagator P4: the bent signal seen by the estimator. A symmetric target has no bias, only an S-curve."""
+    dx, dy = probe.moved(response_dn(params, probe.signal_dn))
+    return probe.from_shifts(dx, dy, "F", model_error=0.3, method="the estimator on the bent signal")
 
 
 SOURCE = Source(

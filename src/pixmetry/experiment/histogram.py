@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -10,11 +11,12 @@ from pixmetry.core.errors import MeasureError
 from pixmetry.core.estimates import Estimates
 from pixmetry.core.observations import CodeErrors, CodeHistogram
 from pixmetry.experiment._kernels import count_codes
-from pixmetry.experiment.moments import check_frame
+from pixmetry.experiment.moments import LevelSummary, check_frame
 
+CLEAR_SIGMAS = 5.0  # from the mean of a level of the sweep to the brightest mean
 CORE_SIGMAS = 2.0  # a level is used this many of its standard deviations around its mean
 MIN_SIGMA_DN = 1.5  # a narrower level does not cover its codes evenly enough for a smooth expectation
-MIN_TEMPORAL_SIGMA_DN = 4.0  # a fixed pattern of few pixels makes structure of the width of the temporal noise, which the window must follow
+MIN_TEMPORAL_SIGMA_DN = 2.5  # a fixed pattern of few pixels makes structure of the width of the temporal noise, which the window must follow
 HALF_WINDOW = 6  # codes on each side from which the smooth part of the expectation is taken
 FALSE_ALARM = 1e-6  # that any code at all is wrongly called missing
 
@@ -74,6 +76,24 @@ class HistogramAccumulator:
         )
 
 
+def sweep_histogram(levels: Sequence[LevelSummary], bits: int) -> CodeHistogram:
+    """The counts of those bright levels of an exposure series that cover their codes smoothly.
+
+    Left out are levels of little temporal noise, since their few thousand pixels stand at fixed places within the codes, and levels that
+    reach up to the brightest mean, where a full well may pile pixels up. Dark frames and stacks show the same pixels at the same codes
+    again and again, so they do not belong here.
+    """
+    accumulator = HistogramAccumulator(bits)
+    codes = np.arange(2**bits)
+    ceiling = max((level.mean_dn for level in levels), default=0.0)
+    for number, level in enumerate(levels):
+        share = level.counts / level.counts.sum()
+        spread = math.sqrt(float(share @ (codes - level.mean_dn) ** 2))
+        if level.squares.pixel_dn2 > MIN_TEMPORAL_SIGMA_DN**2 and level.mean_dn + CLEAR_SIGMAS * spread < ceiling:
+            accumulator.add_counts(level.counts, level=number)
+    return accumulator.result()
+
+
 def expected_counts(histogram: CodeHistogram) -> tuple[np.ndarray, np.ndarray]:
     """Counts that an ideal converter would give for Gaussian light levels, and the codes near enough to a level to be tested.
 
@@ -128,10 +148,11 @@ def code_errors(histogram: CodeHistogram, min_expected: float = 100.0) -> CodeEr
 
     Notes
     -----
-    DNL_k = n_k / e_k − 1 (IEEE Std 1241, code density test), where e_k is the Gaussian expectation times what a polynomial of degree 4
-    through n/e of the ``HALF_WINDOW`` neighbours on each side gives at k (Savitzky & Golay 1964, without the point itself): light that is
-    not quite Gaussian changes n/e slowly, and the polynomial follows it. Non-linearity that changes more slowly than the window is
-    therefore not seen. u(DNL_k)² = 1/e_k + Σ h_j²/e_(k+j) with the weights h_j.
+    DNL_k = (n_k − e_k) / m_k (IEEE Std 1241, code density test), where e_k is the Gaussian expectation times what a polynomial of degree 4
+    through the ratio of counts to it of the ``HALF_WINDOW`` neighbours on each side gives at k (Savitzky & Golay 1964, without the point
+    itself): light that is not quite Gaussian changes that ratio slowly, and the polynomial follows it. Non-linearity that changes more
+    slowly than the window is therefore not seen. m_k is the plain mean of the ratio over the window, times the expectation: it scatters
+    less than e_k, by which a quotient would be biased. u(DNL_k)² = 1/m_k + Σ h_j²/m_(k+j) with the weights h_j.
     A code that never occurs is missing if its Poisson probability exp(−e_k), times the number of codes tested, is below 1e-6.
     """
     ideal, usable = expected_counts(histogram)
@@ -140,11 +161,12 @@ def code_errors(histogram: CodeHistogram, min_expected: float = 100.0) -> CodeEr
     ratio = np.divide(n, ideal, out=np.zeros_like(n), where=ideal > 0)
     full = np.convolve(usable.astype(float), weights != 0, mode="same") == 2 * HALF_WINDOW
     expected = ideal * np.maximum(np.convolve(ratio, weights, mode="same"), 0.0)
-    of_neighbours = np.convolve(np.divide(1, expected, out=np.zeros_like(n), where=expected > 0), weights**2, mode="same")
-    tested = np.flatnonzero(usable & full & (expected >= min_expected))
+    level = ideal * np.convolve(ratio, np.full(weights.size, 1 / weights.size), mode="same")
+    of_neighbours = np.convolve(np.divide(1, level, out=np.zeros_like(n), where=level > 0), weights**2, mode="same")
+    tested = np.flatnonzero(usable & full & (ideal >= min_expected) & (expected > 0))
     e = expected[tested]
-    dnl = n[tested] / e - 1.0 if tested.size else np.zeros(0)
-    variance = 1 / e + of_neighbours[tested]
+    dnl = (n[tested] - e) / level[tested]
+    variance = 1 / level[tested] + of_neighbours[tested]
     probability = np.minimum(np.exp(-e) * max(tested.size, 1), 1.0)
     missing = (n[tested] == 0) & (probability < FALSE_ALARM)
     return CodeErrors(

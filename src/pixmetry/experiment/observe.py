@@ -20,7 +20,7 @@ from pixmetry.core.observations import (
     StackMoments,
 )
 from pixmetry.experiment.defects import find_defects
-from pixmetry.experiment.histogram import MIN_TEMPORAL_SIGMA_DN, HistogramAccumulator, code_errors
+from pixmetry.experiment.histogram import HistogramAccumulator, code_errors, sweep_histogram
 from pixmetry.experiment.linearity import Linearity
 from pixmetry.experiment.moments import LevelAccumulator, LevelSummary, level_moments
 from pixmetry.experiment.patterns import find_phase_patterns
@@ -69,7 +69,7 @@ def observe(groups: Iterable[Group], bits: int, temperature_c: float | None = No
     """
     levels: dict[str, list[_Level]] = {"dark": [], "bright": []}
     stacks: dict[str, tuple[StackMoments, Spectra]] = {}
-    histogram, sweep = HistogramAccumulator(bits), HistogramAccumulator(bits)
+    histogram, sweep = HistogramAccumulator(bits), []
     shape = None
     for group in groups:
         reduction = new_group(bits, group.role)
@@ -79,10 +79,10 @@ def observe(groups: Iterable[Group], bits: int, temperature_c: float | None = No
         shape = moments.shape
         level = (group.kind, group.role, group.exposure_s, group.photons)
         histogram.add_counts(moments.counts, dark=group.kind == "dark", level=level)
-        if moments.n_frames > 1 and moments.mean_squares().pixel_dn2 > MIN_TEMPORAL_SIGMA_DN**2:
-            sweep.add_counts(moments.counts, level=level)
         if isinstance(moments, LevelAccumulator):
             levels[group.kind].append(_Level(moments.summary(), group.exposure_s, group.photons))
+            if group.kind == "bright":
+                sweep.append(levels["bright"][-1].summary)
         elif isinstance(moments, StackAccumulator) and _better(stacks.get(group.kind), moments.n_frames):
             stack = moments.result(group.exposure_s)
             stacks[group.kind] = (stack, reduction.spectra.result(stack.mean_map_dn))
@@ -90,7 +90,7 @@ def observe(groups: Iterable[Group], bits: int, temperature_c: float | None = No
     dark_stack, dark_spectra = stacks.get("dark", (None, None))
     bright_stack, bright_spectra = stacks.get("bright", (None, None))
     transfer = _photon_transfer(levels, shape, bits)
-    codes = _codes(sweep.result(), notes)
+    codes = _codes(sweep_histogram(sweep, bits), notes)
     fit = fit_photon_transfer(transfer, dark_stack, bright_stack, _dnl_lsb(codes))
     defects, spatial, patterns = _spatial(dark_stack, bright_stack, dark_spectra, Linearity.of(fit, bits), _dnl_lsb(codes), notes)
     return Observations(

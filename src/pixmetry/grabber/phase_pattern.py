@@ -100,8 +100,10 @@ def propagate(params: PhasePattern, probe: Probe) -> Contribution:
     n, rows, cols = probe.gx.shape
     angle = 2 * np.pi * turns(params, np.arange(rows)[None, :], np.arange(cols)[None, :])
     parts = probe.field(np.broadcast_to(np.cos(angle), probe.gx.shape)), probe.field(np.broadcast_to(np.sin(angle), probe.gx.shape))
-    u = tuple(params.amplitude_dn * math.sqrt(float(np.mean(parts[0][a] ** 2 + parts[1][a] ** 2)) / 2) for a in (0, 1))
-    return probe.contribution(u, "T" if params.moving else "F", model_error=0.12, method="response of the estimator to a wave of any phase")
+    ux, uy = (params.amplitude_dn * math.sqrt(float(np.mean(parts[0][a] ** 2 + parts[1][a] ** 2)) / 2) for a in (0, 1))
+    return probe.contribution(
+        (ux, uy), "T" if params.moving else "F", model_error=0.12, method="response of the estimator to a wave of any phase"
+    )
 
 
 SOURCE = Source(

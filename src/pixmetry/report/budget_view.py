@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from pixmetry.budget.budget import DECIDED, Budget, BudgetRow, Interaction
+from pixmetry.budget.budget import DECIDED, Budget, BudgetRow
 from pixmetry.budget.combine import Combined
 from pixmetry.budget.monte_carlo import MonteCarlo
 from pixmetry.budget.probe import PHASES
 from pixmetry.core.catalogue import STAGES, get_source
 from pixmetry.core.contribution import AVERAGES
-from pixmetry.report.numbers import NONE, decimals_of, fixed, length_mpx, length_px, length_um, percent, signed
+from pixmetry.report.numbers import NONE, THIN, decimals_of, fixed, length_mpx, length_px, length_um, percent, signed
 
 CLASSES = {
     "T": "random in time, pixel by pixel",
@@ -26,10 +26,10 @@ CLASSES = {
     "O": "object and light",
 }
 CLASS_RULES = (
-    "Classes say what averaging does. T and Tr change from frame to frame: their variance falls as 1/n with n frames, and again with the "
-    "number of targets. F stays the same in every frame and changes from place to place: more frames do not help, more targets do. G, D and O "
-    "(smooth geometry, drift, object and light) fall with neither. Uncorrelated contributions add as squares, x and y apart; a bias that is not "
-    "corrected adds as its square and is lowered by no number of frames (JCGM 100:2008, 5.1.2 and F.2.4.5)."
+    "Classes say what averaging does. T and Tr change from frame to frame: their variance falls as 1/n with n frames, and again with "
+    "the number of targets. F stays the same in every frame and changes from place to place: more frames do not help, more targets do. "
+    "G, D and O (smooth geometry, drift, object and light) fall with neither. Uncorrelated contributions add as squares, x and y apart; "
+    "a bias that is not corrected adds as its square and is lowered by no number of frames (JCGM 100:2008, 5.1.2 and F.2.4.5)."
 )
 NAMED = 6  # accepted sources that the verdict names
 
@@ -68,7 +68,7 @@ def budget_content(budget: Budget, unmeasured: Mapping[str, str]) -> dict[str, A
         "sources": _sources(budget, unmeasured),
         "mc_note": _monte_carlo_note(budget),
         "sums": _sums(budget),
-        "interaction": "No Monte Carlo was asked for." if budget.interaction is None else _interaction(budget.interaction, budget.verdict.total_px),
+        "interaction": _interaction(budget),
         "class_rules": CLASS_RULES,
     }
 
@@ -122,8 +122,8 @@ def _shares(rows: list[BudgetRow]) -> str:
         return "Nothing that was measured moves this target."
     random, fixed_part, bias = (percent(v) for v in parts / parts.sum())
     return (
-        f"Of the square of this, {random} % is random in time and falls with more frames; the rest is systematic and does not: {fixed_part} % is "
-        f"fixed in the camera and changes from place to place, {bias} % is bias."
+        f"Of the square of this, {random} % is random in time and falls with more frames; the rest is systematic and does not: "
+        f"{fixed_part} % is fixed in the camera and changes from place to place, {bias} % is bias."
     )
 
 
@@ -167,28 +167,31 @@ def _components(row: BudgetRow) -> tuple[float, ...]:
 
 
 def _bar(axis: str, u: float, bias: float, longest: float, pitch_um: tuple[float, float] | None) -> dict[str, str]:
+    """Bar lengths in percent of the longest, and the two numbers as text."""
     pitch = None if pitch_um is None else pitch_um["xy".index(axis)]
-    text = f"u {length_px(u)} px, bias {signed(bias, length_px)} px"
-    if pitch is not None:
-        text += f" ({length_px(u * pitch)}, {signed(bias * pitch, length_px)} µm)"
-    width = [f"{100 * abs(v) / longest:.1f}" if longest else "0" for v in (u, bias)]
-    return {"axis": axis, "random": width[0], "bias": width[1], "text": text}
+
+    def text(px: str, um: str) -> str:
+        return f"{px} px" + (f" ({um} µm)" if pitch is not None and px != "0" else "")
+
+    width = [f"{max(100 * abs(v) / longest, 0.2):.1f}" if v else "0" for v in (u, bias)]
+    shift = text(signed(bias, length_px), signed(bias * (pitch or 0.0), length_px))
+    return {"axis": axis, "random": width[0], "bias": width[1], "u": text(length_px(u), length_um(u, pitch)), "shift": shift}
 
 
 def _gain(advice: Any) -> str:
     whole = "the total with everything accepted" if advice.status == "accepted" else "the total"
     now, gone, half = (length_px(v, 3) for v in (advice.combined_px, advice.removed_px, advice.halved_px))
     less = percent(1 - advice.removed_px / advice.combined_px) if advice.combined_px else NONE
-    return f"without it {whole} would fall from {now} to {gone} px ({less} % less), with half of it to {half} px (root mean square of x and y)."
+    return f"without it {whole} would fall from {now} to {gone} px ({less} % less), with half of it to {half} px (rms of x and y)."
 
 
 def _monte_carlo_note(budget: Budget) -> str:
     done = next((r.monte_carlo for r in budget.rows if r.monte_carlo is not None), None)
     if done is None:
-        return "no Monte Carlo was made."
+        return "No Monte Carlo was made."
     return (
-        f"Monte Carlo with its standard error, from {done.trials} exposed windows a source ({done.units} cameras of this type, {done.places} places, "
-        f"{done.frames} frames each), for what the simulated camera holds."
+        f"Monte Carlo with its standard error, from {done.trials} exposed windows a source ({done.units} cameras of this type, "
+        f"{done.places} places, {done.frames} frames each), for what the simulated camera holds."
     )
 
 
@@ -241,7 +244,10 @@ def _reason(row: BudgetRow, unmeasured: Mapping[str, str]) -> str:
 
 def _known(row: BudgetRow) -> str:
     """Relative uncertainty of a measured contribution that comes of its parameters."""
-    return f"± {percent(row.u_of_total_px / row.total_px)} %" if row.u_of_total_px > 0 and row.total_px > 0 else ""
+    if row.u_of_total_px <= 0 or row.total_px <= 0:
+        return ""
+    share = row.u_of_total_px / row.total_px
+    return f"± {percent(share)} %" if share <= 1 else f">{THIN}100 %"
 
 
 def _sums(budget: Budget) -> list[dict[str, Any]]:
@@ -269,18 +275,26 @@ def _sum_of(results: list[MonteCarlo], axis: str) -> float:
     return float(np.sqrt(sum(getattr(m, axis).u ** 2 + getattr(m, axis).bias ** 2 for m in results)))
 
 
-def _interaction(found: Interaction, analytic_px: float) -> str:
+def _interaction(budget: Budget) -> str:
+    """Everything at once against everything alone, and whether the difference can be told from chance."""
+    found, analytic_px = budget.interaction, budget.verdict.total_px
+    if found is None:
+        return "No Monte Carlo was made."
     difference, se = found.difference_px, found.se_px
     places = min(max(decimals_of(se, 2), 0), 6) if se > 0 else 6
     if abs(difference) <= 2 * se:
         verdict = "which is within two standard errors: no interaction is seen, and the squares may be added"
     elif difference > 0:
-        verdict = "more than two standard errors: the sources act on each other, and the simulation with all of them is the one to trust"
+        verdict = "more than two standard errors: the sources act on each other; trust the simulation with all of them"
     else:
-        verdict = "less by more than two standard errors: the sources partly cancel or mask each other, and the sum is on the safe side"
+        verdict = "less by more than two standard errors: the sources partly cancel, and the sum is on the safe side"
     lost = f" In {found.together.lost} of {found.together.trials} windows no target was found." if found.together.lost else ""
+
+    def px(value: float) -> str:
+        return fixed(value, places)
+
     return (
-        f"All sources at once give {fixed(found.together.total_px, places)} ± {fixed(found.together.se_total_px, places)} px (root mean square of x and "
-        f"y), each alone and added as squares {fixed(found.sum_px, places)} ± {fixed(found.se_sum_px, places)} px. The interaction is the difference, "
-        f"{fixed(difference, places)} ± {fixed(se, places)} px, {verdict}. The analytic sum is {fixed(analytic_px, places)} px.{lost}"
+        f"All sources at once give {px(found.together.total_px)} ± {px(found.together.se_total_px)} px (rms of x and y), each alone and "
+        f"added as squares {px(found.sum_px)} ± {px(found.se_sum_px)} px. The interaction is the difference, {px(difference)} "
+        f"± {px(se)} px, {verdict}. The analytic sum is {px(analytic_px)} px.{lost}"
     )

@@ -17,15 +17,16 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 # Each hue is drawn in its light-page value and replaced by a style variable, so that a dark page can lighten it.
-# Blue, vermilion, green, amber: told apart with any common colour vision (Okabe and Ito 2008); lines differ in dash or marker too.
+# Blue, vermilion, amber: told apart with any common colour vision (Okabe and Ito 2008); lines differ in dash or marker too.
 INK, SOFT, GRID = "#1a1d21", "#5b626b", "#d9dde2"
-BLUE, RED, GREEN, AMBER = "#0067a5", "#c44e00", "#007a5a", "#a87400"
-VARIABLES = {INK: "ink", SOFT: "soft", GRID: "grid", BLUE: "blue", RED: "red", GREEN: "green", AMBER: "amber"}
+BLUE, RED, AMBER = "#0067a5", "#c44e00", "#a87400"
+VARIABLES = {INK: "ink", SOFT: "soft", GRID: "grid", BLUE: "blue", RED: "red", AMBER: "amber"}
 WIDTH_IN = 3.7  # of a figure that fills a phone, and half of a sheet
 DENSE = 1500  # points in a line from which it is stored as pixels
 MAP_SIDE = 224  # pixels of a map thumbnail
-STYLE: dict[str, Any] = {
+STYLE: Any = {
     "svg.fonttype": "none",
+    "svg.hashsalt": "pixmetry",  # the same figure gives the same file
     "font.family": ["DejaVu Sans"],  # sets the space; the page sets the type
     "font.size": 7.5,
     "axes.titlesize": 7.5,
@@ -73,10 +74,10 @@ def canvas(height_in: float, **kw: Any) -> Iterator[tuple[Figure, Any]]:
     """An empty figure in the report's style, and its axes (``kw`` as of ``Figure.subplots``)."""
     import matplotlib
     from matplotlib.figure import Figure
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
 
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(WIDTH_IN, height_in), layout="constrained")
-        figure.get_layout_engine().set(w_pad=0.03, h_pad=0.03)
+        figure = Figure(figsize=(WIDTH_IN, height_in), layout=ConstrainedLayoutEngine(w_pad=0.03, h_pad=0.03))
         yield figure, figure.subplots(**kw)
 
 
@@ -115,8 +116,8 @@ def _palette_png(encoded: str) -> str:
     """The same picture with 96 colours where it is opaque: less than half the bytes."""
     from PIL import Image
 
-    image = Image.open(io.BytesIO(base64.b64decode(encoded)))
-    if image.mode == "RGBA" and image.getextrema()[3][0] == 255:
+    image: Image.Image = Image.open(io.BytesIO(base64.b64decode(encoded)))
+    if image.mode == "RGBA" and image.getchannel("A").getextrema() == (255, 255):
         image = image.convert("RGB").quantize(96, dither=Image.Dither.NONE)
     out = io.BytesIO()
     image.save(out, format="PNG", optimize=True)

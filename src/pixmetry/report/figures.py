@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from pixmetry.core.estimates import Estimates
-from pixmetry.core.observations import Observations, Spectra
-from pixmetry.experiment.photon_transfer_levels import light_scale
+from pixmetry.core.observations import CodeHistogram, Observations, PhotonTransfer, Spectra
+from pixmetry.experiment.photon_transfer_levels import USABLE_FRACTION, light_scale
 from pixmetry.experiment.photon_transfer_model import QUANTISATION_DN2, signal_from_mean, stored_moments
-from pixmetry.report.drawing import AMBER, BLUE, GREEN, INK, RED, SOFT, Picture, canvas, draw_map, line, picture, plain_log
+from pixmetry.report.drawing import AMBER, BLUE, INK, RED, SOFT, Picture, canvas, draw_map, line, picture, plain_log
 from pixmetry.report.numbers import significant
 
 LIMIT_RMS = np.sqrt(1 / 3)  # rms of an even spread between 0 and an upper limit, over that limit
@@ -52,23 +52,30 @@ def _size(fit: Estimates | None, name: str) -> float:
     return fit[name].value * (LIMIT_RMS if name in fit.limits else 1.0)
 
 
+def _series(seen: Observations) -> tuple[PhotonTransfer, Estimates]:
+    """The photon-transfer series and its fit, which every assessment has."""
+    assert seen.photon_transfer is not None and seen.photon_transfer_fit is not None
+    return seen.photon_transfer, seen.photon_transfer_fit
+
+
 def _top(seen: Observations) -> float:
     """Mean above black of saturation, or of the brightest level."""
-    fit = seen.photon_transfer_fit
-    level = fit["saturation_dn"].value if "saturation_dn" in fit else float(seen.photon_transfer.bright.mean_dn.max())
+    pt, fit = _series(seen)
+    level = fit["saturation_dn"].value if "saturation_dn" in fit else float(pt.bright.mean_dn.max())
     return level - fit["offset_dn"].value
 
 
 def _unsaturated(seen: Observations) -> np.ndarray:
     """Bright levels below the peak of the variance and without pixels at the top code."""
-    bright = seen.photon_transfer.bright
-    peak = bright.mean_dn[np.argmax(bright.var_total_dn2)]
-    return (bright.mean_dn <= peak) & (bright.fraction_max <= max(2e-5, float(seen.photon_transfer.dark.fraction_max.max(initial=0.0))))
+    pt, _ = _series(seen)
+    peak = pt.bright.mean_dn[np.argmax(pt.bright.var_total_dn2)]
+    stuck = float(pt.dark.fraction_max.max(initial=0.0))  # hot pixels are at the top code in the dark already
+    return (pt.bright.mean_dn <= peak) & (pt.bright.fraction_max <= max(USABLE_FRACTION, stuck))
 
 
 def variance_against_mean(seen: Observations, standard: Estimates) -> Picture:
     """Photon-transfer curve with the joint fit and the standard's line, and what the fit leaves."""
-    pt, fit = seen.photon_transfer, seen.photon_transfer_fit
+    pt, fit = _series(seen)
     curve, good = Curve.of(fit, pt.bits), _unsaturated(seen)
     mean, var = pt.bright.mean_dn - curve.offset_dn, pt.bright.ms_pixel_dn2
     x = np.linspace(0, curve.signal(np.array([mean[good].max()]))[0], 200)
@@ -105,17 +112,18 @@ def variance_against_mean(seen: Observations, standard: Estimates) -> Picture:
 
 def _light_as_signal(seen: Observations) -> np.ndarray:
     """What a straight camera would give for each bright level, DN above black."""
-    fit, bright = seen.photon_transfer_fit, seen.photon_transfer.bright
-    if light_scale(bright)[1]:
+    pt, fit = _series(seen)
+    bright = pt.bright
+    if bright.photons is None or light_scale(bright)[1]:
         return fit["responsivity_dn_per_s"].value * bright.exposure_s
     return fit["quantum_efficiency"].value * fit["gain_dn_per_e"].value * bright.photons
 
 
 def nonlinearity(seen: Observations) -> Picture:
     """Means against a straight line, in percent of the line, with the fitted curve."""
-    fit, bright = seen.photon_transfer_fit, seen.photon_transfer.bright
-    curve, light = Curve.of(fit, seen.photon_transfer.bits), _light_as_signal(seen)
-    mean = bright.mean_dn - curve.offset_dn
+    pt, fit = _series(seen)
+    curve, light = Curve.of(fit, pt.bits), _light_as_signal(seen)
+    mean = pt.bright.mean_dn - curve.offset_dn
     use = _unsaturated(seen) & (mean >= 0.05 * _top(seen)) & (mean <= 0.95 * _top(seen))
     use = use if use.sum() >= 3 else _unsaturated(seen)
     order = np.argsort(light[use])
@@ -133,8 +141,8 @@ def nonlinearity(seen: Observations) -> Picture:
         axes.legend(loc="best")
         alt = f"Deviation of the mean from a straight line against the mean; the fitted curve departs by at most {significant(worst, 2)} %."
         caption = (
-            f"Non-linearity. The best straight line from 5 % to 95 % of saturation is taken away; the fitted curve departs from it by at most "
-            f"{significant(worst, 2)} %. Points that scatter about the curve are noise of the lamp from level to level."
+            "Non-linearity. The best straight line from 5 % to 95 % of saturation is taken away; the fitted curve departs from it by at "
+            f"most {significant(worst, 2)} %. Points that scatter about the curve are noise of the lamp from level to level."
         )
         return picture(figure, "linearity", alt, caption)
 
@@ -148,7 +156,7 @@ def _off_line(light: np.ndarray, mean: np.ndarray) -> np.ndarray:
 
 def signal_to_noise(seen: Observations) -> Picture:
     """Signal-to-noise ratio of one pixel against its electrons, with the two limits that no camera passes."""
-    pt, fit, spatial = seen.photon_transfer, seen.photon_transfer_fit, seen.spatial_fit
+    (pt, fit), spatial = _series(seen), seen.spatial_fit
     curve, good = Curve.of(fit, pt.bits), _unsaturated(seen)
     mean = pt.bright.mean_dn[good] - curve.offset_dn
     lit = mean > 0
@@ -177,7 +185,7 @@ def signal_to_noise(seen: Observations) -> Picture:
         axes.legend(loc="lower right")
         best = significant(float((electrons / noise)[-1]), 3)
         alt = f"Signal-to-noise ratio against electrons on logarithmic axes; {best} at saturation.{words}"
-        caption = f"Signal-to-noise ratio of one pixel. Dark noise bends it off the ideal line on the left; at saturation it is {best}.{words}"
+        caption = f"Signal-to-noise ratio of one pixel. Dark noise bends it off the ideal line; at saturation it is {best}.{words}"
         return picture(figure, "snr", alt, caption)
 
 
@@ -205,8 +213,8 @@ def spectra(found: Spectra, kind: str, fixed_frames: int, unit_dn: float, unit: 
         what = f"Spatial spectra of the {kind} frames, along x and y: temporal noise of one frame and the mean of {fixed_frames} frames."
         share = "" if unit == "DN" else f" in {unit} of the signal"
         caption = (
-            f"{kind.capitalize()} frames: noise by spatial frequency{share}. A flat line is white noise; a single peak is a stripe pattern; a rise "
-            "towards zero is shading. The red line above the dotted one is fixed pattern, which averaging does not lower."
+            f"{kind.capitalize()} frames: noise by spatial frequency{share}. A flat line is white noise; a single peak is a stripe "
+            "pattern; a rise towards zero is shading. The red line above the dotted one is fixed pattern, which averaging does not lower."
         )
         return picture(figure, f"spectrum-{kind}", what, caption)
 
@@ -223,9 +231,9 @@ def map_picture(values: np.ndarray, name: str, title: str, unit: str, words: str
         return picture(figure, name, alt, f"{title}. {words}{blocks} Colours run from the 1st to the 99th percentile.")
 
 
-def dark_codes(seen: Observations) -> Picture:
+def dark_codes(histogram: CodeHistogram) -> Picture:
     """Histogram of all dark codes beside the normal law of the same spread."""
-    counts = np.asarray(seen.histogram.dark_counts, float)
+    counts = np.asarray(histogram.dark_counts, float)
     present = np.flatnonzero(counts)
     codes = np.arange(present[0], present[-1] + 1)
     mean = float((codes * counts[codes]).sum() / counts.sum())
@@ -259,17 +267,17 @@ def all_pictures(seen: Observations, standard: Estimates, maps: Mapping[str, np.
     if seen.dark_spectra is not None and seen.dark_stack is not None:
         made.append(spectra(seen.dark_spectra, "dark", seen.dark_stack.n_frames, 1.0, "DN"))
     if seen.bright_spectra is not None and seen.bright_stack is not None:
-        level = seen.bright_stack.mean_dn - seen.photon_transfer_fit["offset_dn"].value
+        level = seen.bright_stack.mean_dn - _series(seen)[1]["offset_dn"].value
         made.append(spectra(seen.bright_spectra, "bright", seen.bright_stack.n_frames, level / 100, "%"))
     if "dark_dn" in maps and seen.dark_stack is not None:
         stack = seen.dark_stack
         left = significant(np.sqrt(stack.ms_pixel_dn2 / stack.n_frames), 2)
-        words = f"Mean of {stack.n_frames} dark frames above black. It still holds temporal noise of {left} DN rms; what is beyond that is fixed."
+        words = f"Mean of {stack.n_frames} dark frames above black. It still holds temporal noise of {left} DN rms; the rest is fixed."
         made.append(map_picture(maps["dark_dn"], "map-dark", "Dark signal, pixel by pixel (DSNU)", "DN", words))
     if "prnu_rel" in maps:
         words = "Relative to the surroundings: slow change of the light and remaining temporal noise are taken out. Division takes it away."
         values = 100 * (np.asarray(maps["prnu_rel"], float) - 1)
         made.append(map_picture(values, "map-prnu", "Response, pixel by pixel (PRNU)", "%", words))
     if seen.histogram is not None and seen.histogram.dark_counts.sum() > 0:
-        made.append(dark_codes(seen))
+        made.append(dark_codes(seen.histogram))
     return {p.name: p for p in made}

@@ -104,7 +104,7 @@ def _rows(found: Estimates | None, shown: Mapping[str, Quantity], beside: Estima
     if found is None:
         return []
     others = {e.name: Quantity(e.name) for e in found if e.name not in shown}
-    return [_row(found[name], quantity, beside) for name, quantity in (shown | others).items() if name in found]
+    return [_row(found[name], quantity, beside) for name, quantity in {**shown, **others}.items() if name in found]
 
 
 def _row(e: Estimate, quantity: Quantity, beside: Estimates) -> Row:

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pixmetry import __version__
-from pixmetry.core.catalogue import get_source
 from pixmetry.report.numbers import significant
 
 if TYPE_CHECKING:
@@ -73,7 +72,7 @@ def _facts(assessment: Assessment) -> list[tuple[str, str]]:
     rows, cols = campaign.frame_shape
     pitch = "not given"
     if facts.pitch_x_um is not None:
-        pitch = f"{significant(facts.pitch_x_um)} × {significant(facts.pitch_y_um or facts.pitch_x_um)} µm"
+        pitch = f"{facts.pitch_x_um:g} × {facts.pitch_y_um or facts.pitch_x_um:g} µm"
     dark, bright = (sum(len(g.paths) for g in campaign.groups if g.kind == kind) for kind in ("dark", "bright"))
     temperature = "not given" if facts.temperature_c is None else f"{significant(facts.temperature_c)} °C"
     return [
@@ -99,15 +98,17 @@ def _shared(assessment: Assessment) -> list[Estimates]:
 
 def _confounders(assessment: Assessment) -> list[str]:
     """What the shared estimates could be mistaken for, then what each source adds to that."""
+    from pixmetry.core.catalogue import get_source
+
     shared = [c for s in _shared(assessment) for c in s.confounders]
-    own = [
-        f"{get_source(source_id).title}: {c}" for source_id, s in assessment.estimates.items() for c in s.confounders if c not in shared
-    ]
+    own = [f"{get_source(source_id).title}: {c}" for source_id, s in assessment.estimates.items() for c in s.confounders if c not in shared]
     return list(dict.fromkeys([*shared, *own]))
 
 
 def _methods(assessment: Assessment) -> list[str]:
     """Each method once; that of a source only where it is not made of a shared one."""
+    from pixmetry.core.catalogue import get_source
+
     shared = [s.method for s in (*_shared(assessment), assessment.standard)]
     own = [
         f"{get_source(source_id).title}: {s.method}"

@@ -115,7 +115,7 @@ def propagate(params: ChargeTransfer, probe: Probe) -> Contribution:
     shifts = []
     for serial in (False, True):
         one = params.model_copy(update={"parallel_cti": 0.0} if serial else {"serial_cti": 0.0})
-        shifts.append(probe.field(_added_dn(one, probe)))
+        shifts.append(probe.moved(probe.signal_dn + _added_dn(one, probe)))
     (px, py), (sx, sy) = shifts
     u = [float(np.sqrt(np.var(p + s) + (p.mean() ** 2 + s.mean() ** 2) / 3)) for p, s in ((px, sx), (py, sy))]
     return Contribution(
@@ -125,7 +125,7 @@ def propagate(params: ChargeTransfer, probe: Probe) -> Contribution:
         bias_y_px=float(np.mean(py + sy)),
         gum_class="G",
         model_error=0.15,
-        method="linear response of the estimator to the deferred charge, for a target anywhere on the frame",
+        method="the estimator on the target with its deferred charge, for a target anywhere on the frame",
     )
 
 

@@ -50,13 +50,13 @@ def measure(observations: Observations) -> Estimates:
 
 
 def propagate(params: FullWell, probe: Probe) -> Contribution:
-    """Propagator P4 to first order: the field that the clipping takes off; nothing below the knee."""
+    """Propagator P4: the clipped target seen by the estimator; nothing below the knee."""
     gain = probe.gain_dn_per_e
     electrons = probe.signal_dn / gain
     if electrons.max() <= params.full_well_e * (1 - params.knee_rel):
         return probe.contribution((0.0, 0.0), "F", method="the target stays below the full well")
-    dx, dy = probe.field(gain * (response_e(params, electrons) - electrons))
-    return probe.from_shifts(dx, dy, "F", model_error=0.5, method="linear response of the estimator to the charge that is clipped")
+    dx, dy = probe.moved(gain * response_e(params, electrons))
+    return probe.from_shifts(dx, dy, "F", model_error=0.5, method="the estimator on the clipped target")
 
 
 SOURCE = Source(

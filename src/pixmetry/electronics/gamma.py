@@ -1,0 +1,168 @@
+"""Gamma: a camera set to the power curve that a television tube wants."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from pixmetry.core.contribution import Contribution, Probe
+from pixmetry.core.errors import MeasureError
+from pixmetry.core.estimates import Estimates
+from pixmetry.core.observations import Observations
+from pixmetry.core.random import Stream
+from pixmetry.core.signal import Kind, Signal
+from pixmetry.core.source import Parameters, Source, quantity
+
+LOWEST, HIGHEST = 0.3, 1.0  # exponents that a camera can be set to
+DARKEST, BRIGHTEST = 0.1, 0.8  # of the brightest level above black: the levels that are compared with a power curve
+LEVELS = 6  # at least, for the three numbers of a curve
+LIGHT_RATIO = 2.0  # at least, between the brightest and the darkest of them
+STRAIGHT = 0.1  # an exponent that is nearer to 1 is a linear camera's, and the rest its non-linearity
+
+
+class Gamma(Parameters):
+    """The setting, and the signal that it leaves as it is."""
+
+    gamma: float = quantity(1.0, "1", "exponent of the curve: 1 is linear, 0.45 the usual setting other than that", ge=LOWEST, le=HIGHEST)
+    full_scale_dn: float = quantity(4095.0, "DN", "signal above black at which the curve meets the straight line", gt=0, le=1e9)
+
+
+def curve_dn(x_dn: np.ndarray, gamma: float, full_scale_dn: float) -> np.ndarray:
+    """Apply the power curve, odd about black so that noise below black stays below; shape and dtype as given."""
+    number = x_dn.dtype.type
+    return np.copysign(number(full_scale_dn) * np.power(np.abs(x_dn) * number(1 / full_scale_dn), number(gamma)), x_dn)
+
+
+def forward(params: Gamma, signal: Signal, stream: Stream) -> Signal:
+    """Bend the response; a gamma of 1 leaves the very same bits."""
+    return signal if params.gamma == 1 else signal.with_data(curve_dn(signal.data, params.gamma, params.full_scale_dn))
+
+
+def correct(params: Gamma, signal: Signal, maps: Mapping[str, np.ndarray]) -> Signal:
+    """Undo the curve by its inverse, the power 1/γ, in float64."""
+    if params.gamma == 1:
+        return signal
+    linear = curve_dn(signal.data.astype(np.float64), 1 / params.gamma, params.full_scale_dn)
+    return signal.with_data(linear.astype(np.float32))
+
+
+def measure(observations: Observations) -> Estimates:
+    """Read the exponent from the level means: y = b + c light^γ, by least squares with b free.
+
+    With b free, dark signal and the curve's steep start do not bend the result. To u is added what changes if b is the mean of the dark
+    frames instead (then γ is the slope of ln y against ln light). An exponent near 1 is reported as 1 with the difference in its u: what
+    is left is `electronics.nonlinearity`'s, and would be counted twice. The full scale cannot be told from the gain: y = (c f^(1/γ − 1))^γ.
+    """
+    light, signal = _levels(observations)
+    value, u = _exponent(light, signal)
+    reasons = {}
+    if abs(value - 1) < STRAIGHT:
+        reasons["gamma"] = f"the means follow an exponent of {value:.4g}: the setting is linear, the rest is counted as non-linearity"
+        value, u = 1.0, float(np.hypot(u, value - 1))
+    if not LOWEST <= value <= HIGHEST:
+        raise MeasureError(
+            "the response is no curve of a gamma setting",
+            where="electronics.gamma",
+            value=round(value, 3),
+            allowed=f"an exponent of {LOWEST:g} to {HIGHEST + STRAIGHT:g}",
+            remedy="check that the lamp's light is proportional to the exposure",
+        )
+    return Estimates.from_rows(
+        [("gamma", value, u, float(len(light) - 3), "1")],
+        method="power law with a free offset through the level means, least squares (linearity data of EMVA 1288 R4.0 Linear, §6.7)",
+        confounders=("a lamp whose light is not proportional to exposure looks like a camera with gamma",),
+        reasons=reasons,
+    )
+
+
+def _levels(observations: Observations) -> tuple[np.ndarray, np.ndarray]:
+    """Light and mean above black of the levels that can be used, each as part of its largest; shape (levels,)."""
+    transfer = observations.photon_transfer
+    if transfer is None:
+        raise MeasureError(
+            "gamma needs a photon-transfer series of known light", where="electronics.gamma", remedy="take ten light levels or more"
+        )
+    bright = transfer.bright
+    known = bright.photons is not None and bool(np.isfinite(bright.photons).all())
+    light = np.asarray(bright.photons if known else bright.exposure_s, float)
+    signal = bright.mean_dn - transfer.dark.mean_dn.mean()
+    signal = signal / max(float(signal.max(initial=0.0)), 1e-9)
+    keep = (signal > DARKEST) & (signal < BRIGHTEST) & (light > 0)
+    light, signal = light[keep], signal[keep]
+    if len(light) < LEVELS or light.max() < LIGHT_RATIO * light.min():
+        raise MeasureError(
+            "too few light levels to tell a power curve from a straight line",
+            where="electronics.gamma",
+            value=len(light),
+            allowed=f"{LEVELS} or more between {DARKEST:.0%} and {BRIGHTEST:.0%} of the brightest, light in a ratio of {LIGHT_RATIO:g}",
+            remedy="take ten light levels or more in about equal steps",
+        )
+    return light / light.max(), signal
+
+
+def _exponent(light: np.ndarray, signal: np.ndarray) -> tuple[float, float]:
+    """Exponent and its standard uncertainty, of residuals and of the black level."""
+    from scipy.optimize import minimize_scalar
+
+    def line(gamma: float) -> tuple[np.ndarray, np.ndarray]:
+        columns = np.stack([np.ones_like(light), light**gamma], axis=1)
+        found = np.linalg.lstsq(columns, signal, rcond=None)[0]
+        return found, signal - columns @ found
+
+    def squares(gamma: float) -> float:
+        return float((line(gamma)[1] ** 2).sum())
+
+    gamma = float(minimize_scalar(squares, bounds=(0.05, 3.0), method="bounded", options={"xatol": 1e-7}).x)
+    (_, slope), residual = line(gamma)
+    jacobian = np.stack([np.ones_like(light), light**gamma, slope * light**gamma * np.log(light)], axis=1)
+    covariance = np.linalg.inv(jacobian.T @ jacobian) * (residual**2).sum() / (len(light) - 3)
+    through_black = float(np.polyfit(np.log(light), np.log(signal), 1)[0])
+    return gamma, float(np.hypot(np.sqrt(covariance[2, 2]), through_black - gamma))
+
+
+def propagate(params: Gamma, probe: Probe) -> Contribution:
+    """Propagator P4 for an estimator whose threshold and scale follow the light.
+
+    The curve changes a target by far more than a first order bears, but most of that is a new scale and a new black: they move no centroid.
+    With T the darkest signal that the estimator answers to, x − T becomes g(x) − g(T); brought back to the same sum over the pixels that it
+    answers to, the difference is the error field. For a centroid above a soft threshold this is exact: Σ(g − g_T)(x_i − x̂)/Σ(g − g_T).
+    Squared and hard laws are not told from it in a probe and can be off by as much as the contribution: hence the model error of 1.
+    """
+    x = np.asarray(probe.signal_dn, float)
+    seen = (probe.gx != 0) | (probe.gy != 0)
+    darkest = np.array(x[seen].min() if seen.any() else probe.background_dn)
+    above = np.where(seen, x - darkest, 0.0)
+    bent = curve_dn(x, params.gamma, params.full_scale_dn) - curve_dn(darkest, params.gamma, params.full_scale_dn)
+    bent = np.where(seen, bent, 0.0)
+    before, after = (v.sum(axis=(1, 2), keepdims=True) for v in (above, bent))
+    scale = np.divide(before, after, out=np.zeros_like(before), where=after > 0)
+    dx, dy = probe.field(bent * scale - above)
+    method = "linear response of the estimator to the bent signal, scaled back; its threshold follows the light"
+    return probe.from_shifts(dx, dy, "F", model_error=1.0, method=method)
+
+
+SOURCE = Source(
+    id="electronics.gamma",
+    title="Gamma",
+    description="The camera is set to a power curve for display: edges grow, noise in the dark is raised, that in the light lowered.",
+    number=23,
+    stars=3,
+    note="Note 5",
+    parameters=Gamma,
+    consumes=(Kind.DN,),
+    after=("sensor", "electronics.agc", "electronics.nonlinearity"),
+    before=("cable", "grabber", "storage"),
+    neutral=Gamma(),
+    typical=Gamma(gamma=0.45),
+    bound=Gamma(gamma=0.45),
+    forward=forward,
+    measure=measure,
+    correct=correct,
+    propagate=propagate,
+    gum_class="F",
+    equation="y = y_max (x/y_max)^γ,  γ = 0.45 or 1",
+    typical_size="0.0017 px for 0.45 on a disc of 7 px, if the threshold follows the light",
+    references=("ITU-R BT.709-6, item 1.2 (exponent 0.45)", "EMVA 1288 R4.0 Linear, §6.7 (linearity error)"),
+    advice="Set the camera to gamma 1; if that cannot be, apply the inverse curve before anything else.",
+)
