@@ -5,13 +5,15 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from pixmetry.budget.budget import compute_budget
+from pixmetry.budget.parameters import applies
 from pixmetry.budget.probe import Target, parse_target
 from pixmetry.campaign import Campaign, FrameReader, InputHashes, load_campaign, provenance_record, staged_output, write_json, write_maps
-from pixmetry.core.camera import Camera, Element
+from pixmetry.core.camera import Camera, Element, in_order
 from pixmetry.core.catalogue import catalogue
 from pixmetry.core.errors import MeasureError
 from pixmetry.core.estimates import Estimates
@@ -22,22 +24,6 @@ from pixmetry.locate.estimators import Estimator, parse_estimator
 from pixmetry.report.page import write_report
 from pixmetry.results import Assessment
 
-DIGITAL_CHAIN = (  # what dark and bright frames can tell of a camera, in the order of the light
-    "optics.shading",
-    "sensor.quantum_efficiency",
-    "sensor.prnu",
-    "sensor.dark_current",
-    "sensor.defects",
-    "sensor.shot_noise",
-    "sensor.full_well",
-    "sensor.dsnu",
-    "electronics.amplifier_noise",
-    "electronics.row_noise",
-    "electronics.gain",
-    "electronics.nonlinearity",
-    "grabber.phase_pattern",
-    "grabber.adc",
-)
 LIMIT_RMS = np.sqrt(1 / 3)  # rms of a quantity that is spread evenly between 0 and its upper limit, over that limit
 
 Progress = Callable[[str, int, int], None]
@@ -161,21 +147,18 @@ def digital_twin(campaign: Campaign, estimates: dict[str, Estimates], observatio
 
     What the campaign only bounds is left out. Without a photon count the quantum efficiency is 1, and a scene's photons are electrons.
     """
-    facts, elements = campaign.camera, []
-    given = {
-        "electronics.nonlinearity": {"reference_dn": float(2**campaign.bits - 1)},
-        "grabber.adc": {"bits": campaign.bits},
-        "sensor.quantum_efficiency": {"quantum_efficiency": 1.0},
-    }
+    facts = campaign.camera
+    told = {"interface": facts.interface, **({} if facts.sensor is None else {"sensor": facts.sensor})}
+    known: dict[str, Any] = {"bits": campaign.bits, "reference_dn": float(2**campaign.bits - 1), "quantum_efficiency": 1.0}
     if facts.temperature_c is not None:
-        given["sensor.dark_current"] = {"reference_temperature_c": facts.temperature_c}
-    always = ("sensor.shot_noise", *given)
-    for source_id in DIGITAL_CHAIN:
-        source = catalogue()[source_id]
-        if source_id not in estimates and source_id not in always:
+        known["reference_temperature_c"] = facts.temperature_c
+    elements = []
+    for source in in_order(s for s in catalogue().values() if s.forward is not None and applies(s, told)):
+        fields = source.parameters.model_fields
+        if source.id not in estimates and fields and not set(fields) & (set(known) - {"reference_temperature_c"}):
             continue
-        values = given.get(source_id, {}) | best_values(estimates.get(source_id, Estimates.empty()))
-        elements.append(Element(source_id, source, source.make(values, where=f"digital twin, {source_id}")))
+        values = {k: v for k, v in known.items() if k in fields} | best_values(estimates.get(source.id, Estimates.empty()))
+        elements.append(Element(source.id, source, source.make(values, where=f"digital twin, {source.id}")))
     pitch = None if facts.pitch_x_um is None else (facts.pitch_x_um, facts.pitch_y_um or facts.pitch_x_um)
     stack = observations.bright_stack
     exposure = stack.exposure_s if stack is not None else float(np.median(observations.photon_transfer.bright.exposure_s))
@@ -188,8 +171,7 @@ def digital_twin(campaign: Campaign, estimates: dict[str, Estimates], observatio
         exposure_s=exposure,
         temperature_c=20.0 if facts.temperature_c is None else facts.temperature_c,
         facts={
-            "interface": facts.interface,
-            **({} if facts.sensor is None else {"sensor": facts.sensor}),
+            **told,
             "bits": campaign.bits,
             "source": f"assessed from {campaign.source_path.name}",
             "photons": "photons" if photons_known else "electrons: no photon count was given, the quantum efficiency is set to 1",

@@ -17,17 +17,7 @@ from pixmetry.core.signal import Kind, Signal
 from pixmetry.core.threads import imap_tiles
 
 IMAGES = (".png", ".tif", ".tiff", ".npy")
-ORDER = (  # backwards along the chain: the last error is taken out first
-    "storage.jpeg",
-    "grabber.adc",
-    "grabber.phase_pattern",
-    "grabber.fixed_pattern",
-    "cable.termination",
-    "sensor.dsnu",
-    "electronics.nonlinearity",
-    "sensor.prnu",
-    "sensor.defects",
-)
+NOT_THE_CAMERA = ("optics",)  # light and lens of the campaign are not those of the frames to correct
 
 
 def correct_signal(camera: Camera, signal: Signal, maps: Mapping[str, np.ndarray]) -> tuple[Signal, dict[str, str]]:
@@ -50,18 +40,18 @@ def correct_signal(camera: Camera, signal: Signal, maps: Mapping[str, np.ndarray
         By source, what was done, or why nothing was.
     """
     done: dict[str, str] = {}
-    for source_id in ORDER:
-        for element in camera.active:
-            if element.source.id != source_id or element.source.correct is None:
-                continue
+    for element in reversed(camera.active):  # the last error is taken out first
+        source = element.source
+        if source.stage in NOT_THE_CAMERA:
+            done[element.name] = "not corrected: the light and lens of the campaign are not those of these frames"
+        elif source.correct is None:
+            done[element.name] = f"not corrected: {source.reasons['correct']}"
+        else:
             try:
-                signal = element.source.correct(element.params, signal, maps)
+                signal = source.correct(element.params, signal, maps)
                 done[element.name] = "corrected"
             except InputError as problem:
                 done[element.name] = f"not corrected: {problem}"
-    for element in camera.active:
-        if element.source.correct is None:
-            done[element.name] = f"not corrected: {element.source.reasons['correct']}"
     return signal, done
 
 

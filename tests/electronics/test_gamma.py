@@ -15,8 +15,8 @@ from pixmetry.electronics.gamma import SOURCE, Gamma
 from pixmetry.sensor.shot_noise import SOURCE as SHOT
 from source_signals import ALPHA, K_DN_PER_E, Z, centroid_probe, flat, signal, spots, stream
 
-TV = Gamma(gamma=0.45, full_scale_dn=1000.0)
-ROOT = Gamma(gamma=0.5, full_scale_dn=1000.0)
+TV = Gamma(gamma=0.45, reference_dn=1000.0)
+ROOT = Gamma(gamma=0.5, reference_dn=1000.0)
 
 
 def bent(params: Gamma, x) -> np.ndarray:
@@ -90,7 +90,7 @@ def series(params: Gamma, levels: int = 20, light=None, photons: bool = False) -
     rng = np.random.default_rng()
 
     def mean_dn(part: float) -> float:
-        electrons = SHOT.forward(SHOT.typical, flat(part * params.full_scale_dn / K_DN_PER_E, (64, 64), n=2), stream())
+        electrons = SHOT.forward(SHOT.typical, flat(part * params.reference_dn / K_DN_PER_E, (64, 64), n=2), stream())
         x = electrons.data * K_DN_PER_E + 0.05 + 0.1 * rng.standard_normal(electrons.data.shape)
         y = SOURCE.forward(params, signal(x, Kind.DN), stream()).data.astype(float)
         return float(np.clip(np.rint(y + 400), 0, 4095).mean())
@@ -108,7 +108,7 @@ def series(params: Gamma, levels: int = 20, light=None, photons: bool = False) -
 @pytest.mark.parametrize("gamma", [0.45, 0.7, 1.0])
 def test_exponent_is_found_again(gamma, photons):
     """Within its own u, by Student's t at 1e-6; u is small enough to tell the two settings apart, and no error above 0.1 would pass."""
-    got = SOURCE.measure(series(Gamma(gamma=gamma, full_scale_dn=3600.0), photons=photons))["gamma"]
+    got = SOURCE.measure(series(Gamma(gamma=gamma, reference_dn=3600.0), photons=photons))["gamma"]
     assert got.unit == "1"
     assert got.u < 0.02
     assert abs(got.value - gamma) < min(student.isf(ALPHA / 2, got.dof) * got.u, 0.1)
@@ -117,7 +117,7 @@ def test_exponent_is_found_again(gamma, photons):
 
 def test_a_linear_camera_with_a_bend_is_measured_as_linear_and_says_so():
     """2 % of non-linearity belong to another source: the value is exactly 1, and the difference is in its u."""
-    clean = series(Gamma(full_scale_dn=3600.0)).photon_transfer
+    clean = series(Gamma(reference_dn=3600.0)).photon_transfer
     above = clean.bright.mean_dn - 400
     curved = LevelMoments(**{**clean.bright.__dict__, "mean_dn": 400 + above * (1 - 0.02 * above / 3600)})
     got = SOURCE.measure(Observations(photon_transfer=PhotonTransfer(curved, clean.dark, (64, 64), 12)))["gamma"]
@@ -139,13 +139,13 @@ def test_series_that_do_not_tell_are_refused_with_a_remedy():
 def test_light_that_does_not_go_with_the_exposure_is_refused():
     """Light as the square of the exposure makes an exponent of 2."""
     parts = np.linspace(0.2, 1, 20)
-    transfer = series(Gamma(full_scale_dn=3600.0), light=parts**2).photon_transfer
+    transfer = series(Gamma(reference_dn=3600.0), light=parts**2).photon_transfer
     bright = LevelMoments(**{**transfer.bright.__dict__, "exposure_s": parts})
     with pytest.raises(MeasureError, match="no curve"):
         SOURCE.measure(Observations(photon_transfer=PhotonTransfer(bright, transfer.dark, (64, 64), 12)))
 
 
-@pytest.mark.parametrize("values", [{"gamma": 0.2}, {"gamma": 1.1}, {"full_scale_dn": 0}])
+@pytest.mark.parametrize("values", [{"gamma": 0.2}, {"gamma": 1.1}, {"reference_dn": 0}])
 def test_settings_that_no_camera_has_are_refused(values):
     with pytest.raises(InputError):
         SOURCE.make(values)

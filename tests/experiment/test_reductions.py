@@ -202,9 +202,10 @@ def test_ideal_converter_shows_no_code_errors():
 
 def test_recovers_differential_non_linearity_and_missing_codes():
     rng = np.random.default_rng()
-    truth = rng.normal(0, 0.15, 256).clip(-0.6, 0.6)
-    truth[[100, 150]] = -1.0
-    edges = np.cumsum(1.0 + truth) - 0.5
+    edges = np.arange(256) + 0.5 + rng.normal(0, 0.15 / math.sqrt(2), 256)  # upper edge of each code
+    for missing in (100, 150):
+        edges[missing - 1 : missing + 1] = edges[missing - 1 : missing + 1].mean()
+    truth = np.diff(edges, prepend=-0.5) - 1.0
     result = code_errors(sweep(edges[:-1], np.arange(25.0, 226.0, 4.0), 40000, rng).result())
     assert result.missing_codes.tolist() == [100, 150]
     assert (result.missing_probability < 1e-6).all()

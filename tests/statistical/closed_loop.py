@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy import stats
 
-from pixmetry.assessment import DIGITAL_CHAIN, measure_sources
+from pixmetry.assessment import measure_sources
 from pixmetry.core.camera import Camera, Element
 from pixmetry.core.catalogue import catalogue
 from pixmetry.core.errors import MeasureError, PixmetryError
@@ -31,6 +31,22 @@ from pixmetry.sensor import prnu
 from pixmetry.simulation import expose_group, plan_series
 from statistical.reference_u import Reference, photon_transfer_u, spatial_u
 
+DIGITAL_CHAIN = (  # what dark and bright frames can tell of a camera, in the order of the light
+    "optics.shading",
+    "sensor.quantum_efficiency",
+    "sensor.prnu",
+    "sensor.dark_current",
+    "sensor.defects",
+    "sensor.shot_noise",
+    "sensor.full_well",
+    "sensor.dsnu",
+    "electronics.amplifier_noise",
+    "electronics.row_noise",
+    "electronics.gain",
+    "electronics.nonlinearity",
+    "grabber.phase_pattern",
+    "grabber.adc",
+)
 SHAPES = ((64, 96), (96, 128), (120, 160), (240, 320))
 SHARES = (0.4, 0.3, 0.2, 0.1)
 RESOLVED = 6.0

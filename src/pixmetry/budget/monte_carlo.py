@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from pixmetry.budget.probe import Facts, Target, background_of, facts_of, offset_dn, resolve, scene_of, window_side
+from pixmetry.budget.probe import Facts, Target, background_of, facts_of, resolve, scene_of, window_side
 from pixmetry.core.camera import Camera
 from pixmetry.core.errors import ChainError, InputError
 from pixmetry.core.random import Grid, Streams
@@ -140,8 +140,19 @@ class Trials:
             exposure_s=self.facts.exposure_s,
             temperature_c=self.facts.temperature_c,
         )
-        x_hat, y_hat = replace(self.located, background_dn=self.located.background_dn + offset_dn(camera)).locate(windows)
+        x_hat, y_hat = self._as_seen(camera).locate(windows)
         return tuple((v - middle).reshape(self.places, self.frames) for v in (x_hat, y_hat))
+
+    def _as_seen(self, camera: Camera) -> Estimator:
+        """Return the estimator with background and threshold as this variant of the camera shows them.
+
+        Who locates targets takes both from the frame, so they follow what the camera does to the light: black level, gain, a curve. Each is
+        the mean of windows of that light, without what lies beyond four standard deviations.
+        """
+        lit = self.located.threshold_dn or 0.0
+        levels = [_level(camera, self.facts, self.target, self.side, light_dn) for light_dn in (0.0, lit)]
+        threshold = None if self.located.threshold_dn is None else levels[1] - levels[0]
+        return replace(self.located, background_dn=levels[0], threshold_dn=threshold, sigma=None)
 
     def compare(self, names: Iterable[str], with_it: Camera, without: Camera | None) -> MonteCarlo:
         """Shift of the positions in one variant of the camera against those in another, or (None) against the truth."""
@@ -225,6 +236,26 @@ def monte_carlo(
     """
     facts = facts_of(camera, target) if facts is None else facts
     return Trials(camera, target, estimator, facts, trials, units, frames, mode, seed).of(only, off)
+
+
+def _level(camera: Camera, facts: Facts, target: Target, side: int, above_dn: float, windows: int = 32) -> float:
+    """Grey value of uniform light that lies ``above_dn`` (linear) above the target's background."""
+    background = background_of(target, facts)
+    light = replace(background, level_photons=background.level_photons + above_dn / facts.dn_per_photon)
+    step = np.arange(windows)
+    row0 = (step * 0.6180339887 % 1 * (camera.frame_shape[0] - side + 1)).astype(np.int64)
+    col0 = (step * 0.7548776662 % 1 * (camera.frame_shape[1] - side + 1)).astype(np.int64)
+    data = camera.expose_windows(
+        light,
+        Grid(step, row0, col0, (side, side)),
+        mode="frozen",
+        background=background,
+        exposure_s=facts.exposure_s,
+        temperature_c=facts.temperature_c,
+    ).astype(float)
+    middle = float(np.median(data))
+    near = np.abs(data - middle) <= 4 * data.std()
+    return float(data[near].mean())
 
 
 def _axis(shift: np.ndarray) -> Axis:

@@ -218,11 +218,6 @@ def make_probe(facts: Facts, target: Target, estimator: Estimator, phases: int =
     )
 
 
-def offset_dn(camera: Camera) -> float:
-    """The black level that the chain adds: that of its converter, if it is on."""
-    return float(sum(getattr(e.params, "offset_dn", 0.0) for e in camera.active if e.source.produces is Kind.CODES))
-
-
 def _parameter(camera: Camera, name: str) -> Any:
     return next((getattr(e.params, name) for e in camera.chain if hasattr(e.params, name)), None)
 

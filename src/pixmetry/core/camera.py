@@ -13,7 +13,7 @@ from pixmetry.core._camera_kernels import cut_windows
 from pixmetry.core.errors import ChainError, InputError
 from pixmetry.core.random import Grid, Streams
 from pixmetry.core.signal import Kind, Signal, Windows
-from pixmetry.core.source import Parameters, Source, run
+from pixmetry.core.source import Source, run
 from pixmetry.core.threads import imap_tiles, map_tiles
 
 TILE_PIXELS = 1 << 16  # of float32: a tile and its copies stay in the second-level cache
@@ -584,6 +584,35 @@ def check_chain(chain: Sequence[Element], where: str = "camera") -> None:
                 raise ChainError(f"{element.name} must come before {earlier.name}", where=where, remedy="change the order")
 
 
+def in_order(sources: Iterable[Source]) -> list[Source]:
+    """Sort sources into an order in which a camera takes them: by stage, then by their kinds and their ``after`` and ``before``.
+
+    Raises
+    ------
+    ChainError
+        If they have no such order.
+    """
+    from pixmetry.core.catalogue import STAGES
+
+    left, done = list(sources), []
+
+    def must_wait(source: Source, other: Source) -> bool:
+        """Whether ``source`` comes after ``other``."""
+        if source.stage != other.stage:
+            return STAGES.index(source.stage) > STAGES.index(other.stage)
+        converts = other.produces is not None and other.produces in source.consumes and not set(source.consumes) & set(other.consumes)
+        would_not_be_taken = source.produces is not None and source.produces not in other.consumes
+        return converts or would_not_be_taken or _named(other, source.after) or _named(source, other.before)
+
+    while left:
+        free = next((s for s in left if not any(must_wait(s, o) for o in left if o is not s)), None)
+        if free is None:
+            raise ChainError("these sources have no order", value=[s.id for s in left], remedy="check their after and before")
+        left.remove(free)
+        done.append(free)
+    return done
+
+
 def _named(source: Source, names: tuple[str, ...]) -> bool:
     return source.id in names or source.stage in names
 
@@ -639,4 +668,4 @@ def load_camera(path: str | Path) -> Camera:
     return build_camera(load_yaml(path), where=str(path))
 
 
-__all__ = ["Camera", "Element", "Parameters", "Scene", "build_camera", "check_chain", "load_camera"]
+__all__ = ["Camera", "Element", "Scene", "build_camera", "check_chain", "in_order", "load_camera"]

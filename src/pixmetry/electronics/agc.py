@@ -59,16 +59,8 @@ def context(params: Agc, windows: Windows, frame_shape: tuple[int, int]) -> Wind
 
 
 def propagate(params: Agc, probe: Probe) -> Contribution:
-    """First order in the logarithm of the gain.
-
-    A common factor moves no centroid. It does move an estimator with a threshold in DN, for which a gain g is a threshold T/g: the shift
-    is ln g times the response to the signal's own shape, with g that of a steady frame as bright as the background.
-    """
-    if params.kappa == 0:
-        return probe.contribution((0.0, 0.0), "F", method="the gain is locked")
-    steady = following(params.model_copy(update={"kappa": 1.0}), 1.0, probe.background_dn)
-    dx, dy = probe.field(np.log(steady) * probe.signal_dn)
-    return probe.from_shifts(dx, dy, "F", model_error=1.0, method="linear response of the estimator to the logarithm of the gain")
+    """A common factor moves no centroid whose background and threshold are taken from the same frame; noise grows with the gain as the signal does."""
+    return probe.contribution((0.0, 0.0), "F", method="a common factor, which background and threshold follow")
 
 
 SOURCE = Source(
@@ -90,7 +82,7 @@ SOURCE = Source(
     start=start,
     gum_class="F",
     equation="g(t+1) = g(t) (y_target/⟨y(t)⟩)^κ,  within the limits",
-    typical_size="no shift for a centroid; a hard threshold of fixed DN goes from 0.03 to 0.09 px",
+    typical_size="no shift where the threshold follows the frame; with a hard threshold of fixed DN from 0.03 to 0.09 px",
     references=("K. J. Åström, R. M. Murray, Feedback Systems, Princeton 2008 (first-order discrete loop)",),
     advice="Switch it off.",
     reasons={

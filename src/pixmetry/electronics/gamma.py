@@ -25,25 +25,25 @@ class Gamma(Parameters):
     """The setting, and the signal that it leaves as it is."""
 
     gamma: float = quantity(1.0, "1", "exponent of the curve: 1 is linear, 0.45 the usual setting other than that", ge=LOWEST, le=HIGHEST)
-    full_scale_dn: float = quantity(4095.0, "DN", "signal above black at which the curve meets the straight line", gt=0, le=1e9)
+    reference_dn: float = quantity(4095.0, "DN", "signal above black at which the curve meets the straight line", gt=0, le=1e9)
 
 
-def curve_dn(x_dn: np.ndarray, gamma: float, full_scale_dn: float) -> np.ndarray:
+def curve_dn(x_dn: np.ndarray, gamma: float, reference_dn: float) -> np.ndarray:
     """Apply the power curve, odd about black so that noise below black stays below; shape and dtype as given."""
     number = x_dn.dtype.type
-    return np.copysign(number(full_scale_dn) * np.power(np.abs(x_dn) * number(1 / full_scale_dn), number(gamma)), x_dn)
+    return np.copysign(number(reference_dn) * np.power(np.abs(x_dn) * number(1 / reference_dn), number(gamma)), x_dn)
 
 
 def forward(params: Gamma, signal: Signal, stream: Stream) -> Signal:
     """Bend the response; a gamma of 1 leaves the very same bits."""
-    return signal if params.gamma == 1 else signal.with_data(curve_dn(signal.data, params.gamma, params.full_scale_dn))
+    return signal if params.gamma == 1 else signal.with_data(curve_dn(signal.data, params.gamma, params.reference_dn))
 
 
 def correct(params: Gamma, signal: Signal, maps: Mapping[str, np.ndarray]) -> Signal:
     """Undo the curve by its inverse, the power 1/γ, in float64."""
     if params.gamma == 1:
         return signal
-    linear = curve_dn(signal.data.astype(np.float64), 1 / params.gamma, params.full_scale_dn)
+    linear = curve_dn(signal.data.astype(np.float64), 1 / params.gamma, params.reference_dn)
     return signal.with_data(linear.astype(np.float32))
 
 
@@ -133,7 +133,7 @@ def propagate(params: Gamma, probe: Probe) -> Contribution:
     seen = (probe.gx != 0) | (probe.gy != 0)
     darkest = np.array(x[seen].min() if seen.any() else probe.background_dn)
     above = np.where(seen, x - darkest, 0.0)
-    bent = curve_dn(x, params.gamma, params.full_scale_dn) - curve_dn(darkest, params.gamma, params.full_scale_dn)
+    bent = curve_dn(x, params.gamma, params.reference_dn) - curve_dn(darkest, params.gamma, params.reference_dn)
     bent = np.where(seen, bent, 0.0)
     before, after = (v.sum(axis=(1, 2), keepdims=True) for v in (above, bent))
     scale = np.divide(before, after, out=np.zeros_like(before), where=after > 0)

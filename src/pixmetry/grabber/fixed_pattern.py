@@ -154,6 +154,7 @@ SOURCE = Source(
     forward=forward,
     measure=measure,
     propagate=propagate,
+    applies_to=("analogue",),
     gum_class="F",
     equation="y' = y + B e^(−r/r_s) + a ([c mod p = 0] − 1/p) + s n_rc",
     typical_size="0.035 px for a ramp of 0.2 DN a row under a disc of 7 px of 150 DN (centroid, window radius 6)",

@@ -272,7 +272,7 @@ def all_pictures(seen: Observations, standard: Estimates, maps: Mapping[str, np.
     if "dark_dn" in maps and seen.dark_stack is not None:
         stack = seen.dark_stack
         left = significant(np.sqrt(stack.ms_pixel_dn2 / stack.n_frames), 2)
-        words = f"Mean of {stack.n_frames} dark frames above black. It still holds temporal noise of {left} DN rms; the rest is fixed."
+        words = f"Mean of {stack.n_frames} dark frames above black. A pixel still holds {left} DN rms of temporal noise; the rest is fixed."
         made.append(map_picture(maps["dark_dn"], "map-dark", "Dark signal, pixel by pixel (DSNU)", "DN", words))
     if "prnu_rel" in maps:
         words = "Relative to the surroundings: slow change of the light and remaining temporal noise are taken out. Division takes it away."

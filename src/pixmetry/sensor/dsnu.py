@@ -83,7 +83,7 @@ SOURCE = Source(
     number=15,
     parameters=Dsnu,
     consumes=(Kind.ELECTRONS,),
-    after=("sensor.shot_noise",),
+    after=("sensor.shot_noise", "sensor.full_well", "sensor.charge_transfer"),
     neutral=Dsnu(),
     typical=Dsnu(pixel_std_e=3.0, row_std_e=0.5, col_std_e=0.5),
     bound=Dsnu(pixel_std_e=15.0, row_std_e=3.0, col_std_e=3.0),
