@@ -59,21 +59,11 @@ def test_a_loop_that_never_settles_is_refused():
         SOURCE.make({"kappa": 0.001})
 
 
-def test_a_centroid_does_not_move_with_the_gain_and_a_fixed_threshold_does():
-    probe = spot_probe()
-    assert SOURCE.propagate(SOURCE.typical, probe).total_px < 1e-9
-    # a soft threshold T that is not scaled: its centroid of max(I − T, 0) by finite differences of the gain
-    threshold, step = 40.0, 1e-4
-    image = spot_probe(sigma=0.6).signal_dn
+def test_a_common_factor_does_not_move_a_centroid_whose_threshold_follows_it():
+    assert SOURCE.propagate(SOURCE.bound, spot_probe()).total_px == 0.0
+    image, threshold = spot_probe(sigma=0.6).signal_dn, 40.0
+    for gain in (0.5, 7.0):
+        weight, plain = np.maximum(gain * image - gain * threshold, 0), np.maximum(image - threshold, 0)
+        found, before = (((w.sum(axis=1) * np.arange(25)).sum(axis=1) / w.sum(axis=(1, 2))) for w in (weight, plain))
+        np.testing.assert_allclose(found, before, atol=1e-12)
 
-    def position(gain: float) -> np.ndarray:
-        weight = np.maximum(gain * image - threshold, 0)
-        return (weight.sum(axis=1) * np.arange(25)).sum(axis=1) / weight.sum(axis=(1, 2))
-
-    weight = np.maximum(image - threshold, 0)
-    share = (weight > 0) / weight.sum(axis=(1, 2), keepdims=True)
-    gx = share * (np.arange(25) - position(1.0)[:, None, None])
-    thresholded = type(probe)(**{**probe.__dict__, "signal_dn": image, "gx": gx, "gy": 0 * gx, "background_dn": 10.0})
-    params = Agc(target_dn=10.0 * np.exp(step), kappa=0.3)  # the steady gain over the background is e^step
-    got = SOURCE.propagate(params, thresholded)
-    assert got.u_x_px == pytest.approx(np.std(position(np.exp(step)) - position(1.0)), rel=0.01)

@@ -9,7 +9,7 @@ import numpy as np
 from pixmetry.core.contribution import Contribution, Probe
 from pixmetry.core.errors import MeasureError
 from pixmetry.core.estimates import Estimates
-from pixmetry.core.observations import Observations
+from pixmetry.core.observations import Observations, PatternList
 from pixmetry.core.random import Stream
 from pixmetry.core.signal import Kind, Signal
 from pixmetry.core.source import Parameters, Source, quantity
@@ -33,26 +33,28 @@ def measure(observations: Observations) -> Estimates:
         raise MeasureError(
             "amplifier noise needs a photon-transfer series with dark frames", where="electronics.amplifier_noise", remedy="take dark pairs"
         )
-    return _without_moving_waves(fit.select({"white_e": "dark_noise_e"}), fit["gain_dn_per_e"].value, observations)
+    noise = fit.select({"white_e": "dark_noise_e"})
+    found = observations.patterns
+    if found is None or observations.photon_transfer is None or not found.moving.any() or noise.limits:
+        return noise
+    return _without_moving_waves(noise, fit["gain_dn_per_e"].value, found, observations.photon_transfer.dark.n_frames)
 
 
-def _without_moving_waves(noise: Estimates, gain: float, observations: Observations) -> Estimates:
+def _without_moving_waves(noise: Estimates, gain: float, found: PatternList, n_frames: np.ndarray) -> Estimates:
     """Take the variance A²/2 of moving waves off: to the fit they are white noise.
 
     Two frames of phases φ differ by A²/2·(1 − cos Δφ) in their variance, so over N levels it scatters by A²/2·√(N/2)/Σ(F − 1).
     """
-    found, transfer = observations.patterns, observations.photon_transfer
-    if found is None or transfer is None or not found.moving.any() or noise.limits:
-        return noise
     amplitude, u_amplitude = found.amplitude_dn[found.moving] / gain, found.u_amplitude_dn[found.moving] / gain
-    free = float((transfer.dark.n_frames - 1).sum())
-    scatter = float((amplitude**4).sum()) * len(transfer.dark.n_frames) / (8 * free**2)
+    free = float((n_frames - 1).sum())
+    scatter = float((amplitude**4).sum()) * len(n_frames) / (8 * free**2)
     square = noise.values[0] ** 2 - float((amplitude**2).sum()) / 2
     u_square = np.sqrt((2 * noise.values[0]) ** 2 * noise.covariance[0, 0] + scatter + float(((amplitude * u_amplitude) ** 2).sum()))
     if square < 3 * u_square:
         limit = float(np.sqrt(max(square, 0.0) + 1.645 * u_square))
         reason = {"white_e": "the noise of the dark frames is that of moving waves; 95 % upper limit"}
-        return replace(noise, values=np.array([limit]), covariance=np.array([[(u_square / (2 * limit)) ** 2]]), limits=frozenset({"white_e"}), reasons=reason)
+        covariance = np.array([[(u_square / (2 * limit)) ** 2]])
+        return replace(noise, values=np.array([limit]), covariance=covariance, limits=frozenset({"white_e"}), reasons=reason)
     value = float(np.sqrt(square))
     return replace(noise, values=np.array([value]), covariance=np.array([[(u_square / (2 * value)) ** 2]]))
 

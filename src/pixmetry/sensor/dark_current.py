@@ -52,19 +52,10 @@ def measure(observations: Observations) -> Estimates:
 
 
 def propagate(params: DarkCurrent, probe: Probe) -> Contribution:
-    """Propagator P1 with white noise of K√µ_d, and P2 for the pedestal K·µ_d where the estimator does not take a background off."""
+    """Propagator P1 with white noise of K√µ_d; the pedestal itself comes off with the background."""
     dark_e = float(mean_e(params, probe.exposure_s, probe.temperature_c))
-    white = probe.white(probe.gain_dn_per_e * np.sqrt(dark_e))
-    dx, dy = probe.field(np.full(probe.signal_dn.shape, probe.gain_dn_per_e * dark_e))
-    return Contribution(
-        u_x_px=float(np.hypot(white[0], np.std(dx))),
-        u_y_px=float(np.hypot(white[1], np.std(dy))),
-        bias_x_px=float(np.mean(dx)),
-        bias_y_px=float(np.mean(dy)),
-        gum_class="T",
-        model_error=0.12,
-        method="linear response of the estimator to white noise of variance K²µ_d and to the pedestal K·µ_d",
-    )
+    u = probe.white(probe.gain_dn_per_e * np.sqrt(dark_e))
+    return probe.contribution(u, "T", model_error=0.12, method="linear response of the estimator to white noise of variance K²µ_d")
 
 
 SOURCE = Source(
