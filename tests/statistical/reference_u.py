@@ -119,7 +119,8 @@ def photon_transfer_u(r: Reference) -> dict[str, float]:
             g[at] = value
         return float(np.sqrt(g @ covariance @ g))
 
-    line = _line_u(r)
+    line, lit = _line_u(r), bright > 0
+    level_var = (var / n + row / r.shape[0] + col / r.shape[1]) / frames
     k_rel = u({3: 1 / k})
     return {
         "gain": u({3: 1.0}),
@@ -131,15 +132,17 @@ def photon_transfer_u(r: Reference) -> dict[str, float]:
         "slope_rel": u({2: 1 / start[2]}),
         "efficiency_rel": u({2: 1 / start[2], 3: -1 / k}),
         "dark_e": u({8: 1 / k, 3: -start[8] / k**2}),
-        "lamp_rel": _lamp_u(r, int(bright.sum())),
+        "lamp_rel": _lamp_u(r, level_var[lit], (f1 * k * r.light_e * share)[lit]),
         "row_e": float(np.hypot(line[0], r.row_e * k_rel)),
         "column_e": float(np.hypot(line[1], r.column_e * k_rel)),
     }
 
 
-def _lamp_u(r: Reference, levels: int) -> float:
-    """Sampling of the lamp's standard deviation over the lit levels, five parameters less; the smallest that could be seen where it is 0."""
-    return max(r.lamp_rel, 1e-5) / np.sqrt(2 * max(levels - 5, 1))
+def _lamp_u(r: Reference, v_mean: np.ndarray, light_dn: np.ndarray) -> float:
+    """Bound of the lamp's standard deviation from the scatter of the lit levels' means, five of them spent on the curve."""
+    relative = v_mean / light_dn**2 + r.lamp_rel**2
+    u2 = 1 / np.sqrt(0.5 * (relative**-2.0).sum() * max(1 - 5 / light_dn.size, 0.1))
+    return float(u2 / (2 * max(r.lamp_rel, np.sqrt(u2))))
 
 
 def _line_u(r: Reference) -> tuple[float, float]:

@@ -142,7 +142,7 @@ def _spatial(
         )
         return None, None, None
     defects = find_defects(dark, bright)
-    patterns = find_phase_patterns(dark, spectra, defects)
+    patterns = find_phase_patterns(dark, spectra, defects, dnl_lsb=dnl_lsb)
     if bright is None:
         notes.append("no stack of bright frames: DSNU and PRNU are not measured (take 16 or more at half of saturation)")
         return defects, None, patterns

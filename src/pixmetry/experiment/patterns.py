@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from pixmetry.core.observations import DefectList, PatternList, Spectra, StackMoments
+from pixmetry.experiment.photon_transfer_levels import core_spread_dn2
+from pixmetry.experiment.photon_transfer_model import slope_error_var, white_before_rounding
 from pixmetry.experiment.spectra import periodogram
 from pixmetry.experiment.surface import fill
 
@@ -28,7 +30,12 @@ class _Line:
 
 
 def find_phase_patterns(
-    dark_stack: StackMoments, dark_spectra: Spectra | None = None, defects: DefectList | None = None, *, false_alarm_rate: float = 1e-6
+    dark_stack: StackMoments,
+    dark_spectra: Spectra | None = None,
+    defects: DefectList | None = None,
+    *,
+    false_alarm_rate: float = 1e-6,
+    dnl_lsb: float = 0.0,
 ) -> PatternList:
     """Search the whole frequency plane for lines.
 
@@ -42,6 +49,8 @@ def find_phase_patterns(
         Pixels to leave out: one hot pixel fills the whole plane.
     false_alarm_rate : float
         Chance that the whole search of white or smoothly coloured noise finds anything.
+    dnl_lsb : float
+        Standard deviation of the converter's code widths.
 
     Returns
     -------
@@ -53,7 +62,8 @@ def find_phase_patterns(
     A periodogram ordinate of noise is exponentially distributed about the noise floor (Schuster 1898), the mean of P of them as
     χ²_2P/2P. The floor is the median of 32 × 32 ordinates; for its own scatter the threshold is that of F(2P, 2P·n_eff), with n_eff
     = n ln²2, the information that a median of n exponentials holds about their mean. Rows and columns are taken out first, so the axes
-    are not searched, nor are ``LOW_BINS`` around zero. u of a fixed frequency is the Cramér–Rao bound of a single tone.
+    are not searched, nor are ``LOW_BINS`` around zero. u of a fixed frequency is the Cramér–Rao bound of a single tone. u of an amplitude
+    holds that rounding of little noise, and codes of unequal width, stretch it.
     """
     image = fill(dark_stack.mean_map_dn, defects.mask()) if defects is not None else dark_stack.mean_map_dn
     image = image - image.mean(axis=1, keepdims=True) - image.mean(axis=0, keepdims=True) + image.mean()
@@ -67,6 +77,8 @@ def find_phase_patterns(
         moving, moving_limit = _moving_lines(temporal.astype(float), dark_spectra.n_pairs, image.shape[1], searched, rate)
         lines = [line for line in lines if not _is_leftover(line, moving, dark_stack.n_frames, image.shape)] + moving
     lines.sort(key=lambda line: -line.amplitude_dn)
+    spread = core_spread_dn2(dark_stack)
+    stretch = slope_error_var(white_before_rounding(dark_stack.ms_pixel_dn2, spread), spread, dnl_lsb)
 
     def column(name: str, dtype: type = float) -> np.ndarray:
         return np.array([getattr(line, name) for line in lines], dtype=dtype)
@@ -78,7 +90,7 @@ def find_phase_patterns(
         u_frequency_x=column("u_frequency_x"),
         u_frequency_y=column("u_frequency_y"),
         amplitude_dn=column("amplitude_dn"),
-        u_amplitude_dn=column("u_amplitude_dn"),
+        u_amplitude_dn=np.hypot(column("u_amplitude_dn"), math.sqrt(stretch) * column("amplitude_dn")),
         false_alarm_rate=false_alarm_rate,
         n_searched=searches * int(searched.sum()),
         fixed_limit_dn=fixed_limit,

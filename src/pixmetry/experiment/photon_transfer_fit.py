@@ -152,7 +152,7 @@ def _augmented(pt: PhotonTransfer, s: Solution, d: model.Levels) -> tuple[np.nda
     line, line_var = temporal_row_col_vars(pt)
     values[ROW_VAR : COL_VAR + 1] = line
     dither = float(d.dither[dark].mean()) if dark.any() else 0.0
-    white = model.least_var_before_rounding(dither + (float(d.ms[dark].mean()) if dark.any() else 1.0)) - dither
+    white = model.white_before_rounding(float(d.ms[dark].mean()) if dark.any() else 1.0, dither)
     # what rounding and code widths stretch in common is no scatter of the lines
     line_var = line_var + 4 * model.slope_error_var(white, dither, d.dnl_lsb) * line**2
     cov[ROW_VAR, ROW_VAR], cov[COL_VAR, COL_VAR] = line_var

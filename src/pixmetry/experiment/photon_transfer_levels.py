@@ -197,7 +197,7 @@ def prior_precision(pt: PhotonTransfer, d: model.Levels) -> np.ndarray:
     dither = float(d.dither[~d.bright].mean())
     total = dark_var + dither  # rounding shares its error between frames and pixels
     least = model.least_var_before_rounding(total)
-    q_mean, q_var = model.rounding_error_vars(np.array(max(least - dither, 0.0)), dither, d.dnl_lsb)
+    q_mean, q_var = model.rounding_error_vars(np.array(model.white_before_rounding(dark_var, dither)), dither, d.dnl_lsb)
     q_mean, q_var = d.coherence**2 * q_mean, d.coherence**2 * (q_var + (total - model.QUANTISATION_DN2 - least) ** 2 / 3)
     p = min(clipped_black(pt), CLIPPED_BLACK_FRACTION)
     out[model.Q_MEAN] = 1 / (q_mean + p**2 * dark_var + 1e-12)

@@ -135,6 +135,11 @@ def least_var_before_rounding(var_dn2: float) -> float:
     return float(v[np.argmax(at_most >= var_dn2)]) if var_dn2 < 1 else var_dn2 - QUANTISATION_DN2
 
 
+def white_before_rounding(ms_dn2: float, dither_dn2: float) -> float:
+    """Smallest temporal variance that can lie behind a mean square, where the pixels lie spread over the codes by ``dither_dn2``."""
+    return max(least_var_before_rounding(ms_dn2 + dither_dn2) - dither_dn2, 0.0)
+
+
 def linearise(p: np.ndarray, d: Levels) -> Linearised:
     """Residuals, Jacobian (leading order) and covariance parts at the parameters ``p``."""
     a, x_ref = p[A1 : A3 + 1], d.x_ref

@@ -11,7 +11,8 @@ from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.core.estimates import Estimates
 from pixmetry.core.observations import DefectList, PatternList, StackMoments
 from pixmetry.experiment.linearity import Linearity
-from pixmetry.experiment.photon_transfer_model import least_var_before_rounding, rounding_error_vars, slope_error_var
+from pixmetry.experiment.photon_transfer_levels import core_spread_dn2
+from pixmetry.experiment.photon_transfer_model import rounding_error_vars, slope_error_var, white_before_rounding
 from pixmetry.experiment.surface import Strata, Surface, cross_strata, fill, fit_surface, residual_parts
 
 PARTS = ("pixel", "row", "col")
@@ -99,7 +100,7 @@ def fit_spatial(
             "frames are too small for the surface", value=(rows, cols), allowed=f"{2 * surface_degree + 4} rows and columns or more"
         )
     mask = (find_defects(dark_stack, bright_stack, surface_degree=surface_degree) if defects is None else defects).mask()
-    stored_dn, dither_dn2 = bright_stack.mean_dn, least_var_before_rounding(dark_stack.ms_pixel_dn2)
+    stored_dn, dither_dn2 = bright_stack.mean_dn, white_before_rounding(dark_stack.ms_pixel_dn2, core_spread_dn2(dark_stack))
     if linearity is not None:
         dark_stack, bright_stack = linearity.straight_stack(dark_stack), linearity.straight_stack(bright_stack)
     light = fill(bright_stack.mean_map_dn - dark_stack.mean_map_dn, mask)
