@@ -14,7 +14,7 @@ from pixmetry.core.camera import Camera, load_camera
 from pixmetry.core.errors import InputError
 from pixmetry.core.signal import Kind
 from pixmetry.scene.discs import Discs
-from pixmetry.scene.files import SceneModel, SeriesModel, build_scene, read_scene
+from pixmetry.scene.files import SceneModel, SeriesModel, background_of, build_scene, read_scene
 from pixmetry.scene.uniform import Uniform
 
 FORMATS = ("tiff", "png")
@@ -138,7 +138,7 @@ def _write_series(
 
     assert model.photon_transfer is not None
     groups = plan_series(model.photon_transfer)
-    light = build_scene(model, camera.frame_shape)
+    light = background_of(model)
     total, done, entries = sum(g.count for g in groups), 0, []
     for g in groups:
         files = []

@@ -60,4 +60,5 @@ def combine(contributions: Iterable[Contribution], frames: int = 1, targets: int
         over_frames, over_targets = AVERAGES[c.gum_class]
         n = (frames if over_frames else 1) * (targets if over_targets else 1)
         squares += np.array([c.u_x_px**2 / n, c.u_y_px**2 / n, c.bias_x_px**2, c.bias_y_px**2])
-    return Combined(*(float(v) for v in np.sqrt(squares)), frames, targets)
+    u_x, u_y, bias_x, bias_y = (float(v) for v in np.sqrt(squares))
+    return Combined(u_x, u_y, bias_x, bias_y, frames, targets)

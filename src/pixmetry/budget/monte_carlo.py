@@ -116,14 +116,14 @@ class Trials:
     def true_shift(self) -> tuple[np.ndarray, np.ndarray]:
         """True positions from the window's middle pixel, shape (units, places, frames)."""
         shape = (self.units, self.places, self.frames)
-        return tuple(np.broadcast_to(v[:, :, None], shape) for v in (self.dx, self.dy))
+        return np.broadcast_to(self.dx[:, :, None], shape), np.broadcast_to(self.dy[:, :, None], shape)
 
     def positions(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
         """Positions found in the frames of a variant of the camera, from the window's middle pixel, shape (units, places, frames)."""
         key = tuple(e.on for e in camera.chain)
         if key not in self._found:
             parts = [self._unit(replace(camera, unit_seed=camera.unit_seed + UNIT_STRIDE * k), k) for k in range(self.units)]
-            self._found[key] = tuple(np.stack(p) for p in zip(*parts, strict=True))
+            self._found[key] = np.stack([x for x, _ in parts]), np.stack([y for _, y in parts])
         return self._found[key]
 
     def _unit(self, camera: Camera, unit: int) -> tuple[np.ndarray, np.ndarray]:
@@ -141,7 +141,8 @@ class Trials:
             temperature_c=self.facts.temperature_c,
         )
         x_hat, y_hat = self._as_seen(camera).locate(windows)
-        return tuple((v - middle).reshape(self.places, self.frames) for v in (x_hat, y_hat))
+        shape = (self.places, self.frames)
+        return (x_hat - middle).reshape(shape), (y_hat - middle).reshape(shape)
 
     def _as_seen(self, camera: Camera) -> Estimator:
         """Return the estimator with background and threshold as this variant of the camera shows them.
@@ -280,8 +281,8 @@ def _axis(shift: np.ndarray) -> Axis:
     of_units = [row[good].mean() for row, good in zip(shift.mean(axis=2), keep, strict=True) if good.any()]
     if len(of_units) > 1:
         se_bias = max(se_bias, np.std(of_units, ddof=1) / np.sqrt(len(of_units)))
-    roots = [_root(v) for v in (fixed + temporal, temporal, fixed)]
-    return Axis(bias, *(r[0] for r in roots), float(se_bias), *(r[1] for r in roots))
+    (u, se_u), (temporal_u, se_temporal), (fixed_u, se_fixed) = (_root(v) for v in (fixed + temporal, temporal, fixed))
+    return Axis(bias, u, temporal_u, fixed_u, float(se_bias), se_u, se_temporal, se_fixed)
 
 
 def _root(variances: np.ndarray) -> tuple[float, float]:

@@ -360,7 +360,7 @@ class Camera:
         streams = self.streams(0, quiet=True)
         rows, cols = self.frame_shape
         grid = Grid.whole([0], (rows, cols))
-        scalars = {
+        scalars: dict[str, Any] = {
             k: (np.asarray(v).ravel()[:1] if k in ("exposure_s", "temperature_c") and v is not None else v) for k, v in schedule.items()
         }
         signal = self.signal(background, grid, **scalars)

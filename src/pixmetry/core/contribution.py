@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -91,7 +92,8 @@ class Probe:
     def white(self, sigma_dn: np.ndarray | float) -> tuple[float, float]:
         """u_x, u_y from independent errors of standard deviation ``sigma_dn`` (scalar or per pixel) in every pixel."""
         var = np.broadcast_to(np.asarray(sigma_dn, float) ** 2, self.gx.shape)
-        return tuple(float(np.sqrt((g**2 * var).sum(axis=(1, 2)).mean())) for g in (self.gx, self.gy))
+        u_x, u_y = (float(np.sqrt((g**2 * var).sum(axis=(1, 2)).mean())) for g in (self.gx, self.gy))
+        return u_x, u_y
 
     def rows(self, sigma_dn: np.ndarray | float) -> tuple[float, float]:
         """u_x, u_y from errors common to each row; ``sigma_dn`` scalar, or per pixel for one that scales with the signal."""
@@ -103,11 +105,12 @@ class Probe:
 
     def _lines(self, sigma_dn: np.ndarray | float, axis: int) -> tuple[float, float]:
         weight = np.broadcast_to(np.asarray(sigma_dn, float), self.gx.shape)
-        return tuple(float(np.sqrt(((g * weight).sum(axis=axis) ** 2).sum(axis=1).mean())) for g in (self.gx, self.gy))
+        u_x, u_y = (float(np.sqrt(((g * weight).sum(axis=axis) ** 2).sum(axis=1).mean())) for g in (self.gx, self.gy))
+        return u_x, u_y
 
     def field(self, error_dn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Shift in x and y, shape (p,), from a given error field (p, rows, cols) or (rows, cols) in DN (first order)."""
-        return tuple((g * error_dn).sum(axis=(1, 2)) for g in (self.gx, self.gy))
+        return (self.gx * error_dn).sum(axis=(1, 2)), (self.gy * error_dn).sum(axis=(1, 2))
 
     def moved(self, signal_dn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Shift in x and y, shape (p,), when the signal becomes this one; by the estimator itself, or to first order if it is not given."""
@@ -116,11 +119,11 @@ class Probe:
         x, y = self.locate(signal_dn)
         return x - self.x_hat_px, y - self.y_hat_px
 
-    def contribution(self, u: tuple[float, float], gum_class: str, **kw: object) -> Contribution:
+    def contribution(self, u: tuple[float, float], gum_class: str, **kw: Any) -> Contribution:
         """Shorthand for a contribution without bias."""
         return Contribution(u_x_px=u[0], u_y_px=u[1], gum_class=gum_class, **kw)
 
-    def from_shifts(self, dx: np.ndarray, dy: np.ndarray, gum_class: str, **kw: object) -> Contribution:
+    def from_shifts(self, dx: np.ndarray, dy: np.ndarray, gum_class: str, **kw: Any) -> Contribution:
         """Contribution from shifts at each phase: their mean is the bias, their scatter the uncertainty."""
         return Contribution(
             u_x_px=float(np.std(dx)),

@@ -143,7 +143,8 @@ class Source:
     @property
     def units(self) -> dict[str, str]:
         """Unit of every parameter."""
-        return {n: (f.json_schema_extra or {}).get("unit", "") for n, f in self.parameters.model_fields.items()}
+        extras: dict[str, Any] = {n: f.json_schema_extra or {} for n, f in self.parameters.model_fields.items()}
+        return {n: extra.get("unit", "") for n, extra in extras.items()}
 
     def window_needed(self, params: Any, windows: Windows, frame_shape: tuple[int, int]) -> Windows:
         """The input windows that it needs for these output windows."""

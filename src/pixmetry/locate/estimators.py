@@ -136,7 +136,8 @@ class Estimator:
         middle = [side // 2 for side in shape[1:]]
         if any(m - half < 0 or m + half >= side for m, side in zip(middle, shape[1:], strict=True)):
             raise InputError("the estimator's window does not fit", value=shape[1:], allowed=f"at least {self.window} × {self.window} px")
-        return tuple(slice(m - half, m + half + 1) for m in middle)
+        rows, cols = (slice(m - half, m + half + 1) for m in middle)
+        return rows, cols
 
 
 def parse_estimator(text: str) -> Estimator:
@@ -148,9 +149,10 @@ def parse_estimator(text: str) -> Estimator:
         If name, key or value cannot be used.
     """
     name, values = split_text(text, {"sigma": "sigma", "threshold": "threshold_dn", "window": "window"}, "estimator")
-    if "window" in values:
-        values["window"] = int(values["window"]) if values["window"] == int(values["window"]) else values["window"]
-    return Estimator(name=name, **values)
+    window = values.pop("window", 13)
+    if window != int(window):
+        raise InputError("the estimator's window is not a whole number", where="estimator", value=window, allowed="an odd number of pixels")
+    return Estimator(name=name, window=int(window), **values)
 
 
 def split_text(text: str, keys: dict[str, str], where: str) -> tuple[str, dict[str, float]]:

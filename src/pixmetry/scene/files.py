@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 from pydantic import Field
 
 from pixmetry.core.config import Model, load_yaml, validate
@@ -56,9 +57,14 @@ class SceneModel(Model):
     photon_transfer: SeriesModel | None = None
 
 
+def background_of(model: SceneModel) -> Uniform:
+    """The uniform field of a checked record; dark where it has none."""
+    return Uniform(**model.uniform.model_dump()) if model.uniform is not None else Uniform()
+
+
 def build_scene(model: SceneModel, frame_shape: tuple[int, int]) -> Uniform | Discs:
     """Build the scene of a checked record for a frame of this size."""
-    background = Uniform(**model.uniform.model_dump()) if model.uniform is not None else Uniform()
+    background = background_of(model)
     if model.discs is None:
         return background
     discs = model.discs
@@ -71,7 +77,7 @@ def build_scene(model: SceneModel, frame_shape: tuple[int, int]) -> Uniform | Di
                 # an irrational part of a pixel, so that all places within the pixel occur
                 x.append(half + j * discs.lattice_px + (0.6180339887 * i) % 1 - 0.5)
                 y.append(half + i * discs.lattice_px + (0.6180339887 * j) % 1 - 0.5)
-    return Discs(x, y, discs.diameter_px, discs.blur_px, discs.peak_photons, background)
+    return Discs(np.array(x), np.array(y), discs.diameter_px, discs.blur_px, discs.peak_photons, background)
 
 
 def read_scene(source: str | Path | Mapping[str, Any]) -> SceneModel:
