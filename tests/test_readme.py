@@ -43,8 +43,9 @@ def test_the_printed_example_is_what_the_program_says(tmp_path: Path) -> None:
 
     from pixmetry.cli import main
 
-    said = CliRunner().invoke(main, ["assess", "-o", str(tmp_path / "pixmetry-report")]).output.replace(f"{tmp_path}/", "").split()
-    shown = blocks("text")[0].split()
+    said = CliRunner().invoke(main, ["assess", "-o", str(tmp_path / "pixmetry-report")]).output
+    # what is accepted changes with every new source
+    said, shown = (text.partition("Accepted")[0].split() for text in (said, blocks("text")[0]))
     assert len(shown) == len(said)
     for one, other in zip(shown, said, strict=True):
         if re.fullmatch(r"\d+\.\d+", one):

@@ -1,13 +1,14 @@
 """Random cameras, simulated through the whole chain, measured blind, and the score of every estimate against the truth.
 
-A camera has a key: the same key is the same camera with the same noise. ``run_camera`` returns one ``Score`` a quantity; ``summarise`` turns
-the scores of many cameras into one line a quantity; ``failures`` says which of these contradict their stated uncertainty.
+A camera has a key: the same key is the same camera with the same noise. ``run_camera`` returns one ``Score`` a quantity; ``summarise``
+turns the scores of many cameras into one line a quantity; ``failures`` says which of these contradict their stated uncertainty.
 
-A quantity that cannot be negative is reported as a value where it stands out of the noise and as a 95 % limit elsewhere. That choice is made
-from the data, so values of small quantities are a selected lot, and so are limits. By the truth, not by the data, cameras are therefore
-put into two classes: *resolved* (truth at least ``RESOLVED`` times the reference uncertainty), where every estimate must follow its
-distribution, and *near zero*, where only a miss counts: a limit below the truth, or a value whose 90 % interval does not hold it.
-Coefficients of the non-linearity that short or noisy series leave to their prior are counted in the same way.
+A quantity that cannot be negative is reported as a value where it stands out of the noise and as a 95 % limit elsewhere. That
+choice is made from the data, so values of small quantities are a selected lot, and so are limits. By the truth, not by the data,
+cameras are therefore put into two classes: *resolved* (truth at least ``RESOLVED`` times the reference uncertainty), where every
+estimate must follow its distribution, and *near zero*, where only a miss counts: a limit below the truth, or a value whose 90 %
+interval does not hold it. Coefficients of the non-linearity that short or noisy series leave to their prior are counted in the
+same way.
 """
 
 from __future__ import annotations
@@ -51,6 +52,7 @@ DIGITAL_CHAIN = (  # what dark and bright frames can tell of a camera, in the or
 SHAPES = ((64, 96), (96, 128), (120, 160), (240, 320))
 SHARES = (0.4, 0.3, 0.2, 0.1)
 RESOLVED = 6.0
+COUNTS = ("sensor.defects.hot_fraction", "sensor.defects.dead_fraction")  # whole numbers of pixels have no smooth distribution
 INFORMED = 0.03  # coefficients that the data tell less well follow the prior of 0 ± 0.1, not the data
 CAN_BE_ZERO = (
     "sensor.dsnu.", "sensor.prnu.", "electronics.row_noise.", "sensor.dark_current.", "lamp noise", "grabber.phase_pattern.amplitude",
@@ -109,7 +111,11 @@ def _draw(rng: np.random.Generator, quick: bool) -> tuple[dict[str, dict[str, fl
     """Parameters of every source, by source, the exposure series, lamp noise, and what is special about the camera."""
     traits: set[str] = set()
     while True:
-        bits, gain, noise = int(rng.integers(8, 15)), float(10 ** rng.uniform(np.log10(0.02), np.log10(4))), float(10 ** rng.uniform(0.3, 1.954))
+        bits, gain, noise = (
+            int(rng.integers(8, 15)),
+            float(10 ** rng.uniform(np.log10(0.02), np.log10(4))),
+            float(10 ** rng.uniform(0.3, 1.954)),
+        )
         dsnu = noise * _some(rng, 0.8, 0.1, 0.8)
         offset = 2 + rng.uniform(4, 8) * gain * float(np.hypot(noise, dsnu))
         if gain * noise > 0.25 and offset < 0.2 * 2**bits and (2**bits - offset) / gain > 400:
@@ -120,19 +126,35 @@ def _draw(rng: np.random.Generator, quick: bool) -> tuple[dict[str, dict[str, fl
     efficiency = float(rng.uniform(0.2, 0.9))
     exposure = float(10 ** rng.uniform(-2, 0))
     corner = _some(rng, 0.7, 0.02, 0.2)
-    values["optics.shading"] = {"corner_rel": corner, "gradient_x_per_px": rng.uniform(-3e-4, 3e-4), "gradient_y_per_px": rng.uniform(-3e-4, 3e-4)}
+    values["optics.shading"] = {
+        "corner_rel": corner,
+        "gradient_x_per_px": rng.uniform(-3e-4, 3e-4),
+        "gradient_y_per_px": rng.uniform(-3e-4, 3e-4),
+    }
     values["sensor.quantum_efficiency"] = {"quantum_efficiency": efficiency}
     pixel = float(rng.uniform(0.003, 0.02))
-    values["sensor.prnu"] = {"pixel_std_rel": pixel, "row_std_rel": pixel * _some(rng, 0.6, 0.05, 0.4), "col_std_rel": pixel * _some(rng, 0.6, 0.05, 0.4)}
+    values["sensor.prnu"] = {
+        "pixel_std_rel": pixel,
+        "row_std_rel": pixel * _some(rng, 0.6, 0.05, 0.4),
+        "col_std_rel": pixel * _some(rng, 0.6, 0.05, 0.4),
+    }
     values["sensor.dark_current"] = {"rate_e_per_s": min(_some(rng, 0.7, 1, 500), 0.02 * top_e / exposure)}
     if rng.random() < 0.15:
         traits.add("hot pixels")
-        values["sensor.defects"] = {"hot_fraction": 10 ** rng.uniform(-3.5, -2.7), "hot_median_e": noise * rng.uniform(15, 60), "hot_sigma_log": 0.3}
+        values["sensor.defects"] = {
+            "hot_fraction": 10 ** rng.uniform(-3.5, -2.7),
+            "hot_median_e": min(noise * rng.uniform(15, 60), 0.15 * top_e),
+            "hot_sigma_log": 0.3,
+        }
     well_clips = rng.random() < 0.5
     full_well = top_e * float(rng.uniform(0.4, 0.85) if well_clips else rng.uniform(1.2, 3))
     values["sensor.full_well"] = {"full_well_e": full_well}
     traits.add("well clips" if well_clips else "converter clips")
-    values["sensor.dsnu"] = {"pixel_std_e": dsnu, "row_std_e": dsnu * _some(rng, 0.6, 0.05, 0.4), "col_std_e": dsnu * _some(rng, 0.6, 0.05, 0.4)}
+    values["sensor.dsnu"] = {
+        "pixel_std_e": dsnu,
+        "row_std_e": dsnu * _some(rng, 0.6, 0.05, 0.4),
+        "col_std_e": dsnu * _some(rng, 0.6, 0.05, 0.4),
+    }
     values["electronics.amplifier_noise"] = {"white_e": noise}
     values["electronics.row_noise"] = {"row_e": noise * _some(rng, 0.7, 0.02, 0.4), "column_e": noise * _some(rng, 0.5, 0.02, 0.4)}
     values["electronics.gain"] = {"gain_dn_per_e": gain}
@@ -184,6 +206,9 @@ def _truth(camera: Camera, series: SeriesModel, lamp_rel: float, traits: set[str
     truth["lamp noise"] = lamp_rel
     if camera["grabber.phase_pattern"].params.amplitude_dn == 0:
         del truth["grabber.phase_pattern.frequency_x"], truth["grabber.phase_pattern.frequency_y"]
+    if "hot pixels" not in traits:
+        del truth["sensor.defects.hot_median_e"], truth["sensor.defects.hot_sigma_log"]
+    del truth["sensor.defects.dead_gain_rel"]
     return truth
 
 
@@ -197,7 +222,8 @@ def _unit_maps(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     shade = shading.factor(camera["optics.shading"].params, still)[0].astype(float)
     response = prnu.response(camera["sensor.prnu"].params, grid, streams.of("sensor.prnu"))[0].astype(float)
     extra = sum(
-        camera[name].source.forward(camera[name].params, still, streams.of(name)).data[0].astype(float) for name in ("sensor.dsnu", "sensor.defects")
+        camera[name].source.forward(camera[name].params, still, streams.of(name)).data[0].astype(float)
+        for name in ("sensor.dsnu", "sensor.defects")
     )
     room = min(camera["sensor.full_well"].params.full_well_e, _top_dn(camera) / camera["electronics.gain"].params.gain_dn_per_e)
     return shade, response, np.minimum(extra, room)
@@ -256,8 +282,8 @@ def score(case: Case, found: dict[str, Estimate]) -> list[Score]:
         dof = min(e.dof, 1e9)
         p = float(stats.t.cdf((e.value - true) / e.u, dof)) if e.u > 0 else float("nan")
         u_ref = reference.get(name, float("nan"))
-        resolved = true >= RESOLVED * u_ref if name.startswith(CAN_BE_ZERO) and np.isfinite(u_ref) else not name.startswith(CAN_BE_ZERO) or true > 0
-        if name.startswith("electronics.nonlinearity.") and u_ref > INFORMED:
+        resolved = true > (RESOLVED * u_ref if np.isfinite(u_ref) else 0) or not name.startswith(CAN_BE_ZERO)
+        if name.startswith(COUNTS) or name.startswith("electronics.nonlinearity.") and u_ref > INFORMED:
             resolved = False
         held = true <= e.value if e.kind == "upper_limit" else 0.05 <= p <= 0.95
         scores.append(Score(label, e.kind, resolved, p, bool(held), (e.value - true) / true if true else 0.0, e.u / u_ref, case.traits))
@@ -272,16 +298,27 @@ def reference_u(case: Case) -> dict[str, float]:
     adc, dsnu, fixed = c["grabber.adc"].params, c["sensor.dsnu"].params, c["sensor.prnu"].params
     efficiency = case.truth["sensor.quantum_efficiency.quantum_efficiency"]
     reference = Reference(
-        shape=c.frame_shape, levels=series.levels, frames=series.frames_per_level, stack_frames=series.stack_frames, stack_rel=series.stack_rel,
-        bits=adc.bits, offset_dn=adc.offset_dn, gain=gain, dark_noise_e=c["electronics.amplifier_noise"].params.white_e,
-        row_e=row.row_e, column_e=row.column_e, a=(bend.a1, bend.a2, bend.a3),
+        shape=c.frame_shape,
+        levels=series.levels,
+        frames=series.frames_per_level,
+        stack_frames=series.stack_frames,
+        stack_rel=series.stack_rel,
+        bits=adc.bits,
+        offset_dn=adc.offset_dn,
+        gain=gain,
+        dark_noise_e=c["electronics.amplifier_noise"].params.white_e,
+        row_e=row.row_e,
+        column_e=row.column_e,
+        a=(bend.a1, bend.a2, bend.a3),
         light_e=efficiency * series.brightest_photons * float(shade.mean()),
         dark_e=c["sensor.dark_current"].params.rate_e_per_s * series.longest_exposure_s,
-        full_well_e=c["sensor.full_well"].params.full_well_e, brightest_rel=float(shade.max() / shade.mean()) * (1 + 4 * fixed.pixel_std_rel),
-        lamp_rel=case.lamp_rel, dsnu_e=(dsnu.pixel_std_e, dsnu.row_std_e, dsnu.col_std_e),
+        full_well_e=c["sensor.full_well"].params.full_well_e,
+        brightest_rel=float(shade.max() / shade.mean()) * (1 + 4 * fixed.pixel_std_rel),
+        lamp_rel=case.lamp_rel,
+        dsnu_e=(dsnu.pixel_std_e, dsnu.row_std_e, dsnu.col_std_e),
         prnu_rel=(fixed.pixel_std_rel, fixed.row_std_rel, fixed.col_std_rel),
         spread_rel=float(np.hypot(shade.std() / shade.mean(), fixed.pixel_std_rel)),
-    )  # fmt: skip
+    )
     u = photon_transfer_u(reference)
     out = {
         "electronics.gain.gain_dn_per_e": u["gain"],
@@ -365,7 +402,9 @@ def failures(lines: Iterable[Line], rate: float, excluded: Iterable[str] = ()) -
     for line in lines:
         for what in ("p_uniform", "p_mean", "p_scatter", "p_missed"):
             if getattr(line, what) < each:
-                found.append(f"{line.name}: {what} = {getattr(line, what):.1e} (mean z {line.mean_z:+.2f}, std z {line.std_z:.2f}, n {line.n})")
+                found.append(
+                    f"{line.name}: {what} = {getattr(line, what):.1e} (mean z {line.mean_z:+.2f}, std z {line.std_z:.2f}, n {line.n})"
+                )
     return found
 
 

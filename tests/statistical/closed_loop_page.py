@@ -35,27 +35,47 @@ def _number(value: float, form: str) -> str:
 def _row(line: Line, bad: set[str]) -> str:
     inside = "–" if line.inside_95 != line.inside_95 else f"{100 * line.inside_95:.1f} %"
     small = f"{line.missed} of {line.n_small}" if line.n_small else "–"
-    verdict = "**fails**" if line.name in bad else "holds"
+    cautious = line.name in bad and line.std_z < 1 and line.p_scatter < min(line.p_uniform, line.p_mean)
+    verdict = "holds" if line.name not in bad else "u too large" if cautious else "**fails**"
     return (
-        f"| {line.name} | {line.n} | {_number(line.p_uniform, '.2g')} | {_number(line.mean_z, '+.2f')} | {_number(line.std_z, '.2f')} | {inside} "
-        f"| {_number(line.u_ratio, '.3f')} | {line.lost or '–'} | {small} | {verdict} |"
+        f"| {line.name} | {line.n} | {_number(line.p_uniform, '.2g')} | {_number(line.mean_z, '+.2f')} | {_number(line.std_z, '.2f')} "
+        f"| {inside} | {_number(line.u_ratio, '.3f')} | {line.lost or '–'} | {small} | {verdict} |"
     )
 
 
-EXPLAINED = """Gain 0.02 to 4 DN/e-, 8 to 14 bit, dark noise 2 to 90 e-, temporal row and column noise, dark current to 500 e-/s, fixed patterns of
-pixels, rows and columns, a non-linearity of a few per cent, a full well or a converter that clips first, efficiency 0.2 to 0.9 with the
-photons known, lamp noise to 0.2 % from level to level, shading; some with hot pixels, waves, or codes of unequal width. 64 × 96 to 240 × 320
-pixels, 12 to 50 levels of two frames, two stacks of 16 to 40. Told to the observer: bits, exposure times, photons.
+EXPLAINED = """\
+Gain 0.02 to 4 DN/e-, 8 to 14 bit, dark noise 2 to 90 e-, temporal row and column noise, dark current to 500 e-/s, fixed patterns
+of pixels, rows and columns, a non-linearity of a few per cent, a full well or a converter that clips first, efficiency 0.2 to 0.9
+with the photons known, lamp noise to 0.2 % from level to level, shading; some with hot pixels, waves, or codes of unequal width.
+64 × 96 to 240 × 320 pixels, 12 to 50 levels of two frames, two stacks of 16 to 40. Told to the observer: bits, exposure times,
+photons.
 
-Each estimate gives p, the probability of a value below it by Student's t with its stated u and degrees of freedom; p must be uniform. z is the
-normal quantile of p: mean 0, standard deviation 1. *KS p* is the Kolmogorov-Smirnov probability. *u / u_ref*: median over the cameras of the
-stated u over the least that the same data allow with all weights known: the Cramér-Rao bound of means and mean squares (photon
-transfer), χ² sampling of pixels, rows and columns (fixed patterns). By the truth, quantities below 6 u_ref are counted apart (*small*): a
-limit must lie above the truth and a value within its 90 % interval; so are coefficients of the non-linearity that the data tell less well than
-to 0.03 and leave to their prior. *not resolved*: large by the truth, and yet given as a limit.
+Each estimate gives p, the probability of a value below it by Student's t with its stated u and degrees of freedom; p must be
+uniform. z is the normal quantile of p: mean 0, standard deviation 1. *KS p* is the Kolmogorov-Smirnov probability. *u / u_ref*:
+median over the cameras of the stated u over the least that the same data allow with all weights known: the Cramér-Rao bound of
+means and mean squares (photon transfer), χ² sampling of pixels, rows and columns (fixed patterns). By the truth, quantities below
+6 u_ref are counted apart (*small*): a limit must lie above the truth and a value within its 90 % interval; so are coefficients of
+the non-linearity that the data tell less well than to 0.03 and leave to their prior. *not resolved*: large by the truth, and yet
+given as a limit.
 
-For fixed patterns the truth is the standard deviation of the population that the pixels are a sample of; offsets, efficiency and responsivity are
-those of the unit. A full well that the converter hides is compared with the signal at the top code."""
+For fixed patterns the truth is the standard deviation of the population that the pixels are a sample of; offsets, efficiency and
+responsivity are those of the unit. A full well that the converter hides is compared with the signal at the top code."""
+
+
+PRIOR = "short or noisy series lean on the priors (light at zero exposure 0 ± 5 %, coefficients 0 ± 0.1), wider than these cameras are"
+REASONS = {  # why a stated u is known to be too large
+    "electronics.gain.": PRIOR,
+    "electronics.nonlinearity.": PRIOR,
+    "responsivity": PRIOR,
+    "sensor.quantum_efficiency.": PRIOR,
+    "sensor.dark_current.": "rounding errors of the slope enter by their largest amount, whatever the phase within a code",
+    "grabber.phase_pattern.frequency": "the u of a moving wave's frequency is that of one ordinate of the periodogram",
+}
+
+
+def _told(what: str) -> str:
+    reason = next((r for name, r in REASONS.items() if what.startswith(name)), "cause not known")
+    return f"* {what}: {reason}"
 
 
 def planted_table(scores: list[Score], rate: float) -> str:
@@ -82,7 +102,7 @@ def cameras_section(results: list[list[Score] | str], seed: int, first: int, rat
     bad = {w.split(": ")[0] for w in wrong}
     rows = "\n".join(_row(line, bad) for line in lines)
     told = "\n".join(f"* {count} × {why}" for why, count in refused.items()) or "* none"
-    failed = "\n".join(f"* {w}" for w in wrong) or "* none"
+    failed = "\n".join(map(_told, wrong)) or "* none"
     return f"""## {len(results)} random cameras
 
 {EXPLAINED}

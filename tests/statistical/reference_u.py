@@ -179,7 +179,11 @@ def spatial_u(r: Reference, gain_rel_u: float) -> dict[str, float]:
         u2 = squares * np.sqrt(2 / np.array([(rows - 1) * (cols - 1), rows - 1, cols - 1]))
         u2[1:] = np.hypot(u2[1:], u2[0] / np.array([cols, rows]))
         u = u2 / (2 * np.sqrt(np.maximum(var, u2)))
-        unit, names = (k, ("pixel_std_e", "row_std_e", "col_std_e")) if source == "sensor.dsnu" else (1.0, ("pixel_std_rel", "row_std_rel", "col_std_rel"))
+        unit, names = (
+            (k, ("pixel_std_e", "row_std_e", "col_std_e"))
+            if source == "sensor.dsnu"
+            else (1.0, ("pixel_std_rel", "row_std_rel", "col_std_rel"))
+        )
         for name, value, s in zip(names, u / unit, np.array(std) / unit, strict=True):
             out[f"{source}.{name}"] = float(np.hypot(value, s * rel))
     return out

@@ -16,7 +16,7 @@ from pixmetry.experiment.moments import LevelSummary, check_frame
 CLEAR_SIGMAS = 5.0  # from the mean of a level of the sweep to the brightest mean
 CORE_SIGMAS = 2.0  # a level is used this many of its standard deviations around its mean
 MIN_SIGMA_DN = 1.5  # a narrower level does not cover its codes evenly enough for a smooth expectation
-MIN_TEMPORAL_SIGMA_DN = 2.5  # a fixed pattern of few pixels makes structure of the width of the temporal noise, which the window must follow
+MIN_TEMPORAL_SIGMA_DN = 2.5  # a fixed pattern makes structure of the width of the temporal noise, which the window must follow
 HALF_WINDOW = 8  # codes on each side from which the smooth part of the expectation is taken
 FALSE_ALARM = 1e-6  # that any code at all is wrongly called missing
 

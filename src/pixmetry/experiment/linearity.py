@@ -42,7 +42,12 @@ class Linearity:
         scaled = {name: getattr(stack, name) / middle for name in ("ms_pixel_dn2", "ms_row_dn2", "ms_col_dn2", "ms_frame_dn2")}
         var_map = stack.var_map_dn2 / slope2.astype(np.float32)
         return replace(
-            stack, mean_map_dn=mean_map, mean_dn=float(mean_map.mean()), var_map_dn2=var_map, var_stack_dn2=float(var_map.mean(dtype=float)), **scaled
+            stack,
+            mean_map_dn=mean_map,
+            mean_dn=float(mean_map.mean()),
+            var_map_dn2=var_map,
+            var_stack_dn2=float(var_map.mean(dtype=float)),
+            **scaled,
         )
 
     def contrast_u_rel(self, stored_dn: float) -> float:

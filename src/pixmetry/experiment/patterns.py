@@ -229,15 +229,27 @@ def _leak(distance: int, period: int) -> float:
     return 1.0 if distance <= 1 else 1 / (distance - 0.5) ** 2
 
 
+def _between_ordinates(below: float, peak: float, above: float) -> tuple[float, float]:
+    """How far a tone lies from its highest ordinate, in ordinates, and the share of its power that three ordinates hold.
+
+    Power sinc²(k − δ) at the distance k: the two highest give δ = r/(1 + r) with r² their ratio (Rife & Vincent 1970).
+    """
+    root = math.sqrt(max(above, below, 0.0) / peak) if peak > 0 else 0.0
+    shift = min(root / (1 + root), 0.5)
+    share = float((np.sinc(np.arange(-1, 2) - shift) ** 2).sum())
+    return (shift if above >= below else -shift), share
+
+
 def _moving_line(excess: np.ndarray, row: int, col: int, floor: float, pairs: int, shape: tuple[int, int]) -> _Line:
     rows, cols = shape
     near_rows = (row + np.arange(-1, 2)) % rows
     near_cols = np.arange(max(col - 1, 1), min(col + 2, excess.shape[1]))
     near = excess[np.ix_(near_rows, near_cols)]
-    weight = np.maximum(near, 0.0)
-    frequency_x = float(weight.sum(axis=0) @ near_cols / weight.sum() / cols)
-    frequency_y = _signed(row + float(weight.sum(axis=1) @ np.arange(-1, 2) / weight.sum()), rows)
-    total = max(float(near.sum()), floor)
+    of_cols = {int(k): float(v) for k, v in zip(near_cols - col, near.sum(axis=0), strict=True)}
+    shift_x, share_x = _between_ordinates(of_cols.get(-1, 0.0), of_cols[0], of_cols.get(1, 0.0))
+    shift_y, share_y = _between_ordinates(*near.sum(axis=1).tolist())
+    frequency_x, frequency_y = (col + shift_x) / cols, _signed(row + shift_y, rows)
+    total = max(float(near.sum()) / (share_x * share_y), floor)
     size = rows * cols
     amplitude = 2 * math.sqrt(total / size)
     # arbitrary phases: the power of a pair's difference scatters by half its mean squared; noise adds 2·signal·floor + 9 floor²

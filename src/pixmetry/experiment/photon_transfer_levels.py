@@ -80,7 +80,9 @@ def core_spread_dn2(dark_stack: StackMoments | None) -> float:
     return float(((high - low) / 1.349) ** 2)
 
 
-def levels_from(pt: PhotonTransfer, scale: float, by_exposure: bool, dark_spread_dn2: float = 0.0, dnl_lsb: float = 0.0) -> tuple[model.Levels, float]:
+def levels_from(
+    pt: PhotonTransfer, scale: float, by_exposure: bool, dark_spread_dn2: float = 0.0, dnl_lsb: float = 0.0
+) -> tuple[model.Levels, float]:
     """All levels, dark ones first, in the form that the model takes, and the scale of the time axis (s).
 
     ``dark_spread_dn2`` is the variance of the dark signal over the pixels, as far as it is known to be that of most of them.

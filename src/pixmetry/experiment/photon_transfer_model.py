@@ -106,8 +106,8 @@ def rounding_error_vars(var: np.ndarray, dither: np.ndarray | float = 0.0, dnl_l
 
     ``var`` is the temporal variance, ``dither`` that over the pixels. With equal steps the sub-code phase is unknown: first harmonic of
     the rounding error of a normal value (Widrow and Kollár, Quantization Noise, ch. 5). Thresholds that are displaced one by one, by a
-    variance dnl²/2, move a mean by Σ e_k φ(u_k)/σ and a variance by Σ 2 e_k u_k φ(u_k), u_k = (T_k − µ)/σ; over many thresholds Σ φ² and Σ u²φ²
-    are σ/(2√π) and σ/(4√π).
+    variance dnl²/2, move a mean by Σ e_k φ(u_k)/σ and a variance by Σ 2 e_k u_k φ(u_k), u_k = (T_k − µ)/σ; over many thresholds Σ φ²
+    and Σ u²φ² are σ/(2√π) and σ/(4√π).
     """
     total = np.maximum(var, 0) + dither
     damp = np.exp(-2 * np.pi**2 * total)

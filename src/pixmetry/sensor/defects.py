@@ -14,6 +14,7 @@ from pixmetry.core.random import Grid, Stream
 from pixmetry.core.signal import Kind, Signal
 from pixmetry.core.source import Parameters, Source, cut_map, quantity
 
+FEWEST = 10  # hot pixels, for the distribution of their excess
 NEIGHBOURS = [(dr, dc) for dr in (-1, 0, 1) for dc in (-1, 0, 1) if (dr, dc) != (0, 0)]
 
 
@@ -68,7 +69,7 @@ def measure(observations: Observations) -> Estimates:
 
     hot = kind == "hot"
     add_share("hot_fraction", int(hot.sum()))
-    if hot.sum() >= 3:
+    if hot.sum() >= FEWEST:  # fewer tell a spread only to a factor, and not by Student's t
         rows += _excess_rows(found.dark_excess_dn[hot], None if fit is None or "gain_dn_per_e" not in fit else fit["gain_dn_per_e"])
     if observations.bright_stack is not None or np.isfinite(found.gain_rel).any():
         rows += _dead_rows(found, kind, add_share)
