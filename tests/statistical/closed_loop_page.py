@@ -64,11 +64,10 @@ responsivity are those of the unit. A full well that the converter hides is comp
 
 PRIOR = "short or noisy series lean on the priors (light at zero exposure 0 ± 5 %, coefficients 0 ± 0.1), wider than these cameras are"
 REASONS = {  # why a stated u is known to be too large
-    "electronics.gain.": PRIOR,
+    "electronics.gain.": "cause not found; it is so for well and badly known coefficients alike",
     "electronics.nonlinearity.": PRIOR,
     "responsivity": PRIOR,
-    "sensor.quantum_efficiency.": PRIOR,
-    "sensor.dark_current.": "rounding errors of the slope enter by their largest amount, whatever the phase within a code",
+    "sensor.dark_current.": "not examined; probably rounding errors of the slope enter by their largest amount",
     "grabber.phase_pattern.frequency": "the u of a moving wave's frequency is that of one ordinate of the periodogram",
 }
 
