@@ -8,6 +8,7 @@ from pathlib import Path
 import imagecodecs
 import numpy as np
 import pytest
+import tifffile
 from click.testing import CliRunner, Result
 
 from pixmetry.campaign import load_campaign, read_frame
@@ -106,8 +107,10 @@ def test_a_corrected_frame_is_flatter(folder: Path) -> None:
     done = run("correct", *flat, "--with", result, "-o", folder / "flat")
     assert done.exit_code == 0, done.output
     before = np.mean([read_frame(p) for p in flat], axis=0)
-    after = np.mean([read_frame(p) for p in (folder / "flat").glob("*.tif")], axis=0)
+    after = np.mean([tifffile.imread(p) for p in (folder / "flat").glob("*.tif")], axis=0)
+    assert after.dtype == np.float32
     assert after.std() < 0.5 * before.std()
+    assert after.mean() == pytest.approx(before.mean() - 40.0, rel=0.02)
     said = json.loads((folder / "flat" / "correction.json").read_text())["sources"]
     assert said["sensor.prnu"] == "corrected"
     assert "not corrected" in said["sensor.shot_noise"]

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 
 from pixmetry.budget.budget import compute_budget
-from pixmetry.budget.parameters import applies
+from pixmetry.budget.parameters import applies, with_estimates
 from pixmetry.budget.probe import Target, parse_target
 from pixmetry.campaign import Campaign, FrameReader, InputHashes, load_campaign, provenance_record, staged_output, write_json, write_maps
 from pixmetry.core.camera import Camera, Element, in_order
 from pixmetry.core.catalogue import catalogue
-from pixmetry.core.errors import MeasureError
+from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.core.estimates import Estimates
 from pixmetry.core.observations import Observations
 from pixmetry.experiment.emva_linear import fit_emva_linear
@@ -38,7 +38,6 @@ def assess(
     trials: int = 4000,
     seed: int = 1,
     progress: Progress | None = None,
-    threads: int | None = None,
 ) -> Assessment:
     """Assess a camera from its dark and bright frames.
 
@@ -56,7 +55,6 @@ def assess(
         Of the Monte Carlo.
     progress : callable, optional
         Called with (what, done, of).
-    threads : int, optional
 
     Returns
     -------
@@ -71,7 +69,7 @@ def assess(
     what_estimator = parse_estimator(estimator) if estimator else Estimator()
     frames = campaign if isinstance(campaign, Campaign) else load_campaign(campaign)
     told = progress or (lambda what, done, of: None)
-    hashes, seen = observe_campaign(frames, told, threads)
+    hashes, seen = observe_campaign(frames, told)
     estimates, unmeasured = measure_sources(seen)
     camera = digital_twin(frames, estimates, seen)
     steps = len(camera.active) + len(catalogue()) + 2
@@ -82,6 +80,7 @@ def assess(
         None,
         what_target,
         what_estimator,
+        accepted=[e.name for e in camera.active if e.name in unmeasured and e.source.measure is not None],
         trials=trials,
         seed=seed,
         progress=lambda _: told("computing the budget", min(next(done), steps - 1), steps),
@@ -107,7 +106,7 @@ def write_results(assessment: Assessment, directory: str | Path) -> Path:
     return Path(directory) / "report.html"
 
 
-def observe_campaign(campaign: Campaign, progress: Progress, threads: int | None = None) -> tuple[InputHashes, Observations]:
+def observe_campaign(campaign: Campaign, progress: Progress) -> tuple[InputHashes, Observations]:
     """Read every frame once and reduce it."""
     done = 0
 
@@ -116,7 +115,7 @@ def observe_campaign(campaign: Campaign, progress: Progress, threads: int | None
         done += 1
         progress("reading frames", done, campaign.frame_count)
 
-    reader = FrameReader(campaign, threads=threads, on_frame=on_frame)
+    reader = FrameReader(campaign, on_frame=on_frame)
 
     def groups() -> Iterator[Group]:
         for g in campaign.groups:
@@ -136,8 +135,10 @@ def measure_sources(observations: Observations) -> tuple[dict[str, Estimates], d
             unmeasured[source.id] = source.reasons["measure"]
             continue
         try:
-            estimates[source.id] = source.measure(observations)
-        except MeasureError as problem:
+            found = source.measure(observations)
+            with_estimates(source, source.typical, found)  # outside the model's range it is no measurement of this effect
+            estimates[source.id] = found
+        except (MeasureError, InputError) as problem:
             unmeasured[source.id] = str(problem)
     return estimates, unmeasured
 

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from pixmetry.campaign import InputHashes, provenance_record, read_frame, read_maps, staged_output, write_frame, write_json
+from pixmetry.campaign import InputHashes, provenance_record, read_frame, read_maps, staged_output, write_json
+from pixmetry.campaign.images import check_frame
 from pixmetry.core.camera import Camera, load_camera
 from pixmetry.core.errors import InputError
 from pixmetry.core.random import Grid
@@ -62,7 +63,7 @@ def correct_files(
     *,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> list[str]:
-    """Correct image files with the results of an assessment, and write them with the black level put back.
+    """Correct image files with the results of an assessment.
 
     Parameters
     ----------
@@ -71,7 +72,8 @@ def correct_files(
     results : path
         ``results.json`` of the assessment; ``camera.yaml`` and ``maps.zarr.zip`` stand beside it.
     output : path
-        Folder for the corrected frames, 16 bit TIFF under their own names; ``correction.json`` says what was done.
+        Folder for the corrected frames, under their own names as TIFF of 32-bit floats in DN above black (rounding them again would add
+        noise, and clipping at black would cut it in half); ``correction.json`` says what was done.
 
     Returns
     -------
@@ -81,22 +83,19 @@ def correct_files(
     Raises
     ------
     InputError
-        If a file cannot be read, does not belong to this camera, or two frames have one name.
+        If a file cannot be read, has not the size and depth of this camera's frames, or two frames have one name.
     """
+    from tifffile import imwrite
+
     record, camera, maps = _load(Path(results))
     files = _image_files(frames)
-    black = round(camera["grabber.adc"].params.offset_dn) if "grabber.adc" in camera else 0
-    bits = int(record["camera"]["bits"])
     hashes = InputHashes(files[0].parent)
     told = progress or (lambda what, step, of: None)
     done: dict[str, str] = {}
 
     def work(path: Path) -> tuple[Path, np.ndarray, dict[str, str]]:
         frame = read_frame(path)
-        if frame.shape != tuple(camera.frame_shape):
-            raise InputError(
-                "frame is of another size than the camera", where=str(path), value=frame.shape, allowed=str(tuple(camera.frame_shape))
-            )
+        check_frame(frame, str(path), bits=int(record["camera"]["bits"]), shape=tuple(camera.frame_shape))
         corrected, said = correct_signal(camera, _as_signal(frame, camera), maps)
         return path, corrected.data[0], said
 
@@ -104,13 +103,12 @@ def correct_files(
         for i, (path, data, said) in enumerate(imap_tiles(work, files)):
             done = said
             hashes.add_file(path)
-            codes = np.clip(np.rint(data + black), 0, 2**16 - 1).astype(np.uint16)
-            write_frame(folder / f"{path.stem}.tif", codes, max(bits, 9))
+            imwrite(folder / f"{path.stem}.tif", data.astype(np.float32))
             told("correcting frames", i + 1, len(files))
         lines = [f"{name}: {text}" for name, text in done.items()]
         write_json(
             folder / "correction.json",
-            {"schema": "pixmetry/correction/1", "black_dn": black, "sources": done, "provenance": provenance_record(hashes)},
+            {"schema": "pixmetry/correction/1", "unit": "DN above black", "sources": done, "provenance": provenance_record(hashes)},
         )
     return lines
 

@@ -150,6 +150,7 @@ def _write_series(
         entry = {"kind": g.kind, "role": g.role, "exposure_s": g.exposure_s, "files": files}
         entries.append(entry | ({"photons": g.photons} if g.kind == "bright" else {}))
     facts: dict[str, Any] = {"name": camera.name, "bits": bits, "interface": camera.facts.get("interface", "digital")}
+    facts |= {"temperature_c": camera.temperature_c} | ({"sensor": camera.facts["sensor"]} if "sensor" in camera.facts else {})
     if camera.pitch_um is not None:
         facts |= {"pitch_x_um": camera.pitch_um[0], "pitch_y_um": camera.pitch_um[1]}
     dump_yaml({"schema": SERIES_SCHEMA, "camera": facts, "frames": entries}, folder / "campaign.yaml")

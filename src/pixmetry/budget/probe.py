@@ -182,6 +182,14 @@ def make_probe(facts: Facts, target: Target, estimator: Estimator, phases: int =
     InputError
         If the target does not stand above the threshold.
     """
+    needed = target.diameter_px + 4 * target.blur_px
+    if estimator.window < needed:
+        raise InputError(
+            "the target does not fit into the estimator's window",
+            value=f"{target.describe()} in {estimator.window} px",
+            allowed=f"a window of {int(np.ceil(needed)) // 2 * 2 + 1} px or more",
+            remedy="give a larger window, as in --estimator soft_threshold:window=25",
+        )
     side = window_side(estimator)
     estimator = resolve(estimator, target, facts)
     if estimator.threshold_dn is not None and estimator.threshold_dn >= target.peak_rel * facts.saturation_dn:

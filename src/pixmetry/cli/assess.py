@@ -59,5 +59,9 @@ def print_summary(assessment: Assessment) -> None:
     worst = assessment.budget.with_accepted[0].total_px
     accepted = [r.title for r in assessment.budget.of_status("accepted") if r.contribution is not None and r.total_px > 0]
     console.print(f"\nAccepted, not measured: {', '.join(accepted)}; all of them at the catalogue's bound: {worst:.2g} px.")
+    together = assessment.budget.interaction
+    if together is not None:
+        at_once = together.together
+        console.print(f"Monte Carlo with all that is measured and modelled at once: {at_once.total_px:.2g} ± {at_once.se_total_px:.1g} px.")
     for note in assessment.observations.notes:
         console.print(f"Note: {note}")

@@ -184,7 +184,7 @@ class Camera:
         if any(np.size(v) > 1 for v in schedule.values()):
             raise InputError("a series has one schedule for all its frames", value=", ".join(schedule), remedy="expose frame by frame")
         task = _Task(scene, self.streams(seed, quiet), schedule, threads)
-        last_memory = max((i for i, e in enumerate(self.active) if e.source.start is not None), default=-1)
+        last_memory = max((i for i, e in enumerate(self.active) if _remembers(e)), default=-1)
 
         def grid_of(number: int) -> Grid:
             return Grid(np.array([number]), np.array([r0]), np.array([c0]), (h, w))
@@ -204,7 +204,7 @@ class Camera:
         if numbers and (min(numbers) < 0 or numbers != sorted(set(numbers))):
             raise InputError("a camera with a memory needs frame numbers that rise from 0", value=numbers[:5])
         head, tail = self.active[: last_memory + 1], self.active[last_memory + 1 :]
-        first = next(i for i, e in enumerate(head) if e.source.start is not None)
+        first = next(i for i, e in enumerate(head) if _remembers(e))
         wanted = set(numbers)
         before = head[:first]
 
@@ -255,7 +255,7 @@ class Camera:
         if mode not in ("exact", "frozen"):
             raise InputError("no such mode", value=mode, allowed="exact, frozen")
         frozen = self._freeze(background, schedule) if mode == "frozen" else None
-        if frozen is None and any(e.source.start is not None for e in self.active):
+        if frozen is None and any(_remembers(e) for e in self.active):
             raise InputError("a source with a memory cannot be run on single windows exactly", remedy="use iter_frames, or mode='frozen'")
         task = _Task(scene, self.streams(seed, quiet), schedule, threads, frozen)
         step = max(1, BATCH_PIXELS // max(1, grid.shape[0] * grid.shape[1]))
@@ -281,7 +281,7 @@ class Camera:
         needs = [windows]
         for element in reversed(elements):
             source, params = element.source, element.params
-            if frozen and source.start is not None:
+            if frozen and _remembers(element):
                 needs.append(needs[-1])
             elif frozen and source.near is not None:
                 needs.append(needs[-1].expand(*source.near(params), self.frame_shape))
@@ -352,7 +352,7 @@ class Camera:
 
     def _freeze(self, background: Scene | None, schedule: Mapping[str, Any]) -> _Frozen:
         """Run the noise-free background frame once and keep what sources with a far context need of it."""
-        far = [e.name for e in self.active if e.source.near is not None or e.source.start is not None]
+        far = [e.name for e in self.active if e.source.near is not None or _remembers(e)]
         if not far:
             return _Frozen({})
         if background is None:
@@ -368,7 +368,7 @@ class Camera:
         for element in self.active:
             stream = streams.of(element.name)
             before, state = signal, None
-            if element.source.start is not None:
+            if _remembers(element):
                 state = _settled(element, signal, stream)
             signal, _ = run(element.source, element.params, signal, stream, state)
             if element.name in far:
@@ -415,6 +415,8 @@ class _Task:
 
 class _Quiet:
     """A stream whose temporal draws are at their mean; what is fixed in the unit is drawn as always."""
+
+    quiet = True
 
     def __init__(self, stream: Any) -> None:
         self._stream = stream
@@ -472,7 +474,7 @@ class _Frozen:
         """Run a source on the near context, and correct for the far one by the same run on the noise-free frame."""
         before, after, state = self.elements[element.name]
         out, _ = run(element.source, element.params, signal, stream, state)
-        if element.source.start is not None:
+        if _remembers(element):
             return out
         near = _cut(before, signal)
         quiet, _ = run(element.source, element.params, near, stream)
@@ -483,6 +485,11 @@ def _cut(frame: Signal, like: Signal) -> Signal:
     """Cut the windows of one signal out of a whole frame."""
     data = cut_windows(np.ascontiguousarray(frame.data[0], np.float32), like.grid.row0, like.grid.col0, *like.data.shape[1:])
     return like.with_data(data, frame.kind)
+
+
+def _remembers(element: Element) -> bool:
+    """Whether a source has a memory with these parameters."""
+    return element.source.start is not None and element.source.start(element.params) is not None
 
 
 def _settled(element: Element, signal: Signal, stream: Any, most: int = 400) -> Any:

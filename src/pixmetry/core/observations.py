@@ -7,7 +7,7 @@ they are from differences, so what is fixed in the camera drops out.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
@@ -161,6 +161,11 @@ class PatternList:
     n_searched: int  # periodogram ordinates looked at
     fixed_limit_dn: float  # amplitude of the weakest fixed pattern that would be found in half of all cases
     moving_limit_dn: float  # the same for moving patterns; nan if the frames were not searched
+
+    def strongest(self) -> PatternList:
+        """The strongest alone (or none): the one that the budget has a row for; the others stay in the noise that they make."""
+        arrays = {f.name: getattr(self, f.name) for f in fields(self)}
+        return replace(self, **{name: value[:1] for name, value in arrays.items() if isinstance(value, np.ndarray)})
 
     def __len__(self) -> int:
         return len(self.amplitude_dn)

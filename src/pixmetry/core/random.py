@@ -95,6 +95,7 @@ class Stream:
     unit_seed: int
     exposure_seed: int
     name: str
+    quiet = False  # True where every temporal draw is at its mean: an effect whose mean is not that of its draw's mean asks for it
 
     def normal(self, grid: Grid, draw: int = 0) -> NDArray[np.float32]:
         """Return standard normal numbers, shape (n, rows, cols), new in every frame."""

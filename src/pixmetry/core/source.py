@@ -76,7 +76,7 @@ class Source:
     tail : callable, optional
         ``tail(params)``: the largest share of a pixel's signal that reaches beyond ``near``; the frozen mode's stated error.
     start : callable, optional
-        ``start(params)``: the state before frame 0, for a source with a memory.
+        ``start(params)``: the state before frame 0, for a source with a memory; None where it has none with these parameters.
     applies_to : tuple of str
         Kinds of camera that can have it: of ``digital``, ``analogue``, ``ccd``, ``cmos``; empty for all.
     gum_class : str

@@ -29,9 +29,9 @@ class Agc(Parameters):
         return self
 
 
-def start(params: Agc) -> float:
-    """Gain before frame 0."""
-    return 1.0
+def start(params: Agc) -> float | None:
+    """Gain before frame 0; none where it is locked."""
+    return 1.0 if params.kappa else None
 
 
 def following(params: Agc, gain: float, mean_dn: float) -> float:
@@ -40,7 +40,7 @@ def following(params: Agc, gain: float, mean_dn: float) -> float:
     return float(np.clip(wanted, 10 ** (params.lowest_db / 20), 10 ** (params.highest_db / 20)))
 
 
-def forward(params: Agc, signal: Signal, stream: Stream, state: float) -> tuple[Signal, float]:
+def forward(params: Agc, signal: Signal, stream: Stream, state: float | None) -> tuple[Signal, float | None]:
     """Multiply frame by frame by the gain and move it on; over windows, which do not know the frame's mean, it stays as it is."""
     if params.kappa == 0:
         return signal, state
@@ -59,7 +59,7 @@ def context(params: Agc, windows: Windows, frame_shape: tuple[int, int]) -> Wind
 
 
 def propagate(params: Agc, probe: Probe) -> Contribution:
-    """A common factor moves no centroid whose background and threshold are taken from the same frame; noise grows with the gain as the signal does."""
+    """A common factor moves no centroid whose background and threshold follow it; noise grows with the gain as the signal does."""
     return probe.contribution((0.0, 0.0), "F", method="a common factor, which background and threshold follow")
 
 

@@ -34,7 +34,7 @@ def measure(observations: Observations) -> Estimates:
             "amplifier noise needs a photon-transfer series with dark frames", where="electronics.amplifier_noise", remedy="take dark pairs"
         )
     noise = fit.select({"white_e": "dark_noise_e"})
-    found = observations.patterns
+    found = None if observations.patterns is None else observations.patterns.strongest()
     if found is None or observations.photon_transfer is None or not found.moving.any() or noise.limits:
         return noise
     return _without_moving_waves(noise, fit["gain_dn_per_e"].value, found, observations.photon_transfer.dark.n_frames)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -12,6 +11,7 @@ from pixmetry.core.errors import InputError
 from pixmetry.core.random import Stream
 from pixmetry.core.signal import Kind, Signal
 from pixmetry.core.source import Parameters, Source, quantity
+from pixmetry.core.waves import shift_per_dn, wave, without_wave
 
 
 class SupplyPickup(Parameters):
@@ -44,24 +44,19 @@ def forward(params: SupplyPickup, signal: Signal, stream: Stream) -> Signal:
         return signal
     nu_x, nu_y = turns_per_px(params)
     start = (params.frequency_hz * signal.time_s) % 1.0 + float(stream.uniform_unit(1)[0])
-    # sin(a + b) from the sines of rows and columns: two short vectors instead of a sine for every pixel
-    row = 2 * np.pi * ((nu_y * signal.rows) % 1.0 + start[:, None])
-    col = 2 * np.pi * ((nu_x * signal.cols) % 1.0)
-    a = np.float32(params.amplitude_dn)
-    row_sin, row_cos, col_sin, col_cos = (v.astype(np.float32) for v in (np.sin(row), np.cos(row), np.sin(col), np.cos(col)))
-    wave = (a * row_sin)[:, :, None] * col_cos[:, None, :]
-    wave += (a * row_cos)[:, :, None] * col_sin[:, None, :]
-    return signal.with_data(np.add(signal.data, wave, out=wave))
+    added = wave(signal, nu_x, nu_y, start)
+    added *= np.float32(params.amplitude_dn)
+    return signal.with_data(np.add(signal.data, added, out=added))
 
 
 def correct(params: SupplyPickup, signal: Signal, maps: Mapping[str, np.ndarray]) -> Signal:
-    """Fit amplitude and phase at the known frequency to every frame, by least squares beside a constant, and subtract the sinusoid.
+    """Fit amplitude and phase at the known frequency to every frame, beside a constant, and subtract the sinusoid.
 
-    With z = exp(2πi(ν_x c + ν_y r)) = z_r z_c all sums are products of a row's and a column's: the normal equations of (1, Re z, Im z)
-    need only N, Σz, Σz² and Σyz. Amplitude and phase are fitted, for neither is that of the frames to correct. What the image itself
-    holds at this frequency goes too: give it whole frames. A frame that shows less than a whole period cannot tell the sinusoid
-    from a gradient of the light, and is refused.
+    Amplitude and phase are fitted, for neither is that of the frames to correct. A frame that shows less than a whole period cannot
+    tell the sinusoid from a gradient of the light, and is refused.
     """
+    if params.amplitude_dn == 0:
+        return signal
     rows, cols = signal.data.shape[1:]
     nu_x, nu_y = seen_per_px(params)
     if abs(nu_x) * cols < 1 and abs(nu_y) * rows < 1:
@@ -72,24 +67,7 @@ def correct(params: SupplyPickup, signal: Signal, maps: Mapping[str, np.ndarray]
             allowed="one period or more in x or in y",
             remedy="give whole frames, or average frames over a beat of supply and frame period",
         )
-    row, col = np.exp(2j * np.pi * nu_y * signal.rows), np.exp(2j * np.pi * nu_x * signal.cols)
-    out = np.empty(signal.data.shape, np.float32)
-    size = rows * cols
-    for i in range(len(signal)):
-        mean = float(signal.data[i].mean(dtype=float))
-        data = signal.data[i] - mean
-        first, second = row[i].sum() * col[i].sum(), (row[i] ** 2).sum() * (col[i] ** 2).sum()
-        normal = [
-            [size, first.real, first.imag],
-            [first.real, (size + second.real) / 2, second.imag / 2],
-            [first.imag, second.imag / 2, (size - second.real) / 2],
-        ]
-        product = row[i] @ (data @ col[i])
-        _, in_phase, quadrature = np.linalg.lstsq(normal, [data.sum(dtype=float), product.real, product.imag], rcond=1e-9)[0]
-        # Re and Im of z: a cos + b sin = Re((a − ib) z)
-        wave = np.outer((in_phase - 1j * quadrature) * row[i], col[i]).real
-        out[i] = signal.data[i] - wave
-    return signal.with_data(out)
+    return signal.with_data(without_wave(signal, nu_x, nu_y))
 
 
 def propagate(params: SupplyPickup, probe: Probe) -> Contribution:
@@ -98,11 +76,7 @@ def propagate(params: SupplyPickup, probe: Probe) -> Contribution:
     The phase at a target is arbitrary, by φ0 and by the target's place. Whether it is a new one in the next frame depends on the
     fraction of f × frame period, to 1/(number of frames); one that stands still does not average, so the class is F.
     """
-    rows, cols = probe.gx.shape[1:]
-    nu_x, nu_y = seen_per_px(params)
-    angle = 2 * np.pi * (nu_y * np.arange(rows)[:, None] + nu_x * np.arange(cols)[None, :])
-    cosine, sine = probe.field(np.cos(angle)), probe.field(np.sin(angle))
-    ux, uy = (params.amplitude_dn * math.sqrt(float(np.mean(cosine[a] ** 2 + sine[a] ** 2)) / 2) for a in (0, 1))
+    ux, uy = (params.amplitude_dn * u for u in shift_per_dn(probe, *seen_per_px(params)))
     return probe.contribution((ux, uy), "F", model_error=0.12, method="response of the estimator to a sinusoid of any phase")
 
 

@@ -14,6 +14,7 @@ from pixmetry.core.observations import Observations, PatternList
 from pixmetry.core.random import Stream
 from pixmetry.core.signal import Kind, Signal
 from pixmetry.core.source import Parameters, Source, quantity
+from pixmetry.core.waves import shift_per_dn, wave, without_wave
 
 
 class PhasePattern(Parameters):
@@ -25,24 +26,14 @@ class PhasePattern(Parameters):
     moving: bool = quantity(True, "1", "whether its phase is another in every frame, or fixed in the unit")
 
 
-def turns(params: PhasePattern, rows: np.ndarray, cols: np.ndarray) -> np.ndarray:
-    """Phase of the wave in turns at absolute rows (n, rows) and columns (n, cols), shape (n, rows, cols)."""
-    return params.frequency_y * rows[:, :, None] + params.frequency_x * cols[:, None, :]
-
-
 def forward(params: PhasePattern, signal: Signal, stream: Stream) -> Signal:
     """Add A sin(2π(ν_x c + ν_y r + φ)) with the phase φ of the frame."""
-    if params.amplitude_dn == 0:
+    if params.amplitude_dn == 0 or (params.moving and stream.quiet):  # over the phases of all frames the mean is 0
         return signal
     phase = stream.uniform_frames(signal.grid) if params.moving else np.repeat(stream.uniform_unit(1), len(signal))
-    # sin(a + b) from the sines of rows and columns: two short vectors instead of a sine for every pixel
-    row = 2 * np.pi * (params.frequency_y * signal.rows + phase[:, None].astype(float))
-    col = 2 * np.pi * params.frequency_x * signal.cols
-    a = np.float32(params.amplitude_dn)
-    row_sin, row_cos, col_sin, col_cos = (v.astype(np.float32) for v in (np.sin(row), np.cos(row), np.sin(col), np.cos(col)))
-    wave = (a * row_sin)[:, :, None] * col_cos[:, None, :]
-    wave += (a * row_cos)[:, :, None] * col_sin[:, None, :]
-    return signal.with_data(np.add(signal.data, wave, out=wave))
+    added = wave(signal, params.frequency_x, params.frequency_y, phase)
+    added *= np.float32(params.amplitude_dn)
+    return signal.with_data(np.add(signal.data, added, out=added))
 
 
 def measure(observations: Observations) -> Estimates:
@@ -70,8 +61,13 @@ def _limit(found: PatternList) -> Estimates:
     """One-sided 95 % limit: the amplitude A found in half of all cases plus 1.645 u, with u = A/√(2z) at a threshold of z mean powers."""
     half = np.nanmax([found.fixed_limit_dn, found.moving_limit_dn])
     u = float(half / math.sqrt(2 * math.log(max(found.n_searched, 1) / found.false_alarm_rate)))
+    worst = SOURCE.bound  # the frequency of a wave that was not found is not known
     return Estimates.from_rows(
-        [("amplitude_dn", float(half) + 1.645 * u, u, math.inf, "DN")],
+        [
+            ("amplitude_dn", float(half) + 1.645 * u, u, math.inf, "DN"),
+            ("frequency_x", worst.frequency_x, 0.0, math.inf, "1/px"),
+            ("frequency_y", worst.frequency_y, 0.0, math.inf, "1/px"),
+        ],
         method="search of the two-dimensional periodogram",
         limits=frozenset({"amplitude_dn"}),
         reasons={"amplitude_dn": "no line stands out of the noise"},
@@ -79,28 +75,15 @@ def _limit(found: PatternList) -> Estimates:
 
 
 def correct(params: PhasePattern, signal: Signal, maps: Mapping[str, np.ndarray]) -> Signal:
-    """Fit amplitude and phase of the wave to every frame at the known frequency, by least squares beside a constant, and subtract it.
-
-    What else is in the image leaks into the fit as far as it holds this frequency: give it whole frames, not windows on targets.
-    """
-    n = len(signal)
-    angle = 2 * np.pi * turns(params, signal.rows, signal.cols)
-    basis = np.stack((np.ones_like(angle), np.sin(angle), np.cos(angle))).reshape(3, n, -1)
-    data = signal.data.reshape(n, -1).astype(float)
-    out = np.empty(data.shape, np.float32)
-    for i in range(n):
-        design = basis[:, i]
-        coefficients = np.linalg.lstsq(design @ design.T, design @ data[i], rcond=None)[0]
-        out[i] = data[i] - coefficients[1:] @ design[1:]
-    return signal.with_data(out.reshape(signal.data.shape))
+    """Fit amplitude and phase of the wave to every frame at the known frequency, beside a constant, and subtract it."""
+    if params.amplitude_dn == 0:
+        return signal
+    return signal.with_data(without_wave(signal, params.frequency_x, params.frequency_y))
 
 
 def propagate(params: PhasePattern, probe: Probe) -> Contribution:
-    """Propagator P2 for a wave, averaged over its phase: u = A |Σ g e^(2πi(ν_x c + ν_y r))| / √2."""
-    n, rows, cols = probe.gx.shape
-    angle = 2 * np.pi * turns(params, np.arange(rows)[None, :], np.arange(cols)[None, :])
-    parts = probe.field(np.broadcast_to(np.cos(angle), probe.gx.shape)), probe.field(np.broadcast_to(np.sin(angle), probe.gx.shape))
-    ux, uy = (params.amplitude_dn * math.sqrt(float(np.mean(parts[0][a] ** 2 + parts[1][a] ** 2)) / 2) for a in (0, 1))
+    """Propagator P2 for a wave, averaged over its phase."""
+    ux, uy = (params.amplitude_dn * u for u in shift_per_dn(probe, params.frequency_x, params.frequency_y))
     return probe.contribution(
         (ux, uy), "T" if params.moving else "F", model_error=0.12, method="response of the estimator to a wave of any phase"
     )

@@ -39,14 +39,19 @@ def forward(params: FullWell, signal: Signal, stream: Stream) -> Signal:
 
 def measure(observations: Observations) -> Estimates:
     """Read the saturation of the photon transfer in electrons; where the converter clips first it is a lower bound, and says so."""
-    fit = observations.photon_transfer_fit
-    if fit is None or "full_well_e" not in fit:
-        raise MeasureError(
-            "full well needs a photon-transfer series up to saturation",
-            where="sensor.full_well",
-            remedy="add levels until the mean stands still",
-        )
-    return fit.select(["full_well_e"])
+    fit, transfer = observations.photon_transfer_fit, observations.photon_transfer
+    if fit is not None and "full_well_e" in fit:
+        return fit.select(["full_well_e"])
+    if fit is None or transfer is None:
+        raise MeasureError("full well needs a photon-transfer series", where="sensor.full_well", remedy="add levels up to saturation")
+    gain, offset = fit["gain_dn_per_e"], fit["offset_dn"]
+    brightest = float(transfer.bright.mean_dn.max() - offset.value) / gain.value
+    u = float(np.hypot(brightest * gain.u, offset.u) / gain.value)
+    return Estimates.from_rows(
+        [("full_well_e", brightest, u, gain.dof, "e-")],
+        method="brightest level of the photon transfer",
+        reasons={"full_well_e": "lower bound: no level is saturated; add levels until the mean stands still"},
+    )
 
 
 def propagate(params: FullWell, probe: Probe) -> Contribution:

@@ -97,15 +97,19 @@ def block_error(image_dn: np.ndarray, quality: int) -> np.ndarray:
 
 
 def propagate(params: Jpeg, probe: Probe) -> Contribution:
-    """Propagator P2 with the rounding of the target's own coefficients, the block raster at each of its 64 places; and of whole codes."""
+    """Propagator P2 with the rounding of the target's own coefficients, the block raster at each of its 64 places; and of whole codes.
+
+    The codec takes 8 bits: a camera of more is brought to 8 bits first.
+    """
+    scale = 2.0 ** (8 - max(probe.bits, 8))
     shifts = []
     for row in range(BLOCK):
         for col in range(BLOCK):
-            image = np.pad(probe.signal_dn, ((0, 0), (row, 0), (col, 0)), mode="edge")
+            image = np.pad(scale * probe.signal_dn, ((0, 0), (row, 0), (col, 0)), mode="edge")
             error = block_error(np.rint(image), params.quality)[:, row:, col:]
-            shifts.append(probe.field(error))
+            shifts.append(probe.field(error / scale))
     dx, dy = (np.concatenate([s[a] for s in shifts]) for a in (0, 1))
-    rounding = probe.white(np.sqrt(1 / 12))  # the decoder gives whole codes
+    rounding = probe.white(np.sqrt(1 / 12) / scale)  # the decoder gives whole codes
     return Contribution(
         u_x_px=float(np.hypot(np.std(dx), rounding[0])),
         u_y_px=float(np.hypot(np.std(dy), rounding[1])),
