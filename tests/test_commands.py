@@ -225,3 +225,33 @@ def test_a_folder_with_other_files_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "scene.yaml").write_text(DISCS)
     refused(run("simulate", tmp_path / "camera.yaml", tmp_path / "scene.yaml", "-o", tmp_path), "notes.txt")
     assert (tmp_path / "notes.txt").read_text() == "mine"
+
+
+def test_the_frames_of_a_campaign_are_never_replaced_by_its_results(folder: Path, tmp_path: Path) -> None:
+    before = sorted(p.name for p in (folder / "campaign").rglob("*"))
+    refused(run("assess", folder / "campaign", "-o", folder / "campaign"), "simulation", "another folder")
+    refused(run("simulate", folder / "camera.yaml", folder / "discs.yaml", "-o", folder / "result"), "assessment")
+    assert sorted(p.name for p in (folder / "campaign").rglob("*")) == before
+    assert (folder / "result" / "results.json").is_file()
+    again = run("assess", folder / "campaign", "-o", folder / "result", "--trials", 400)
+    assert again.exit_code == 0, again.output
+
+
+def test_a_copied_frame_is_found(folder: Path, tmp_path: Path) -> None:
+    import shutil
+
+    shutil.copytree(folder / "campaign", tmp_path / "campaign")
+    first, second = load_campaign(tmp_path / "campaign").levels("bright")[3].paths[:2]
+    shutil.copy(first, second)
+    refused(run("assess", tmp_path / "campaign", "-o", tmp_path / "out"), "identical", "bright")
+
+
+def test_values_that_do_not_fill_their_bits_are_noted(folder: Path, tmp_path: Path) -> None:
+    import shutil
+
+    shutil.copytree(folder / "campaign", tmp_path / "campaign")
+    manifest = tmp_path / "campaign" / "campaign.yaml"
+    manifest.write_text(manifest.read_text().replace("bits: 12", "bits: 16"))
+    done = run("assess", manifest, "-o", tmp_path / "out", "--trials", 400)
+    assert done.exit_code == 0, done.output
+    assert "bits: 12" in " ".join(done.output.split())

@@ -12,7 +12,7 @@ import numpy as np
 from pixmetry.budget.budget import compute_budget
 from pixmetry.budget.parameters import applies, with_estimates
 from pixmetry.budget.probe import Target, parse_target
-from pixmetry.campaign import Campaign, FrameReader, InputHashes, load_campaign, provenance_record, staged_output, write_json, write_maps
+from pixmetry.campaign import Campaign, check_output, FrameReader, InputHashes, load_campaign, provenance_record, staged_output, write_json, write_maps
 from pixmetry.core.camera import Camera, Element, in_order
 from pixmetry.core.catalogue import catalogue
 from pixmetry.core.errors import InputError, MeasureError
@@ -24,6 +24,7 @@ from pixmetry.locate.estimators import Estimator, parse_estimator
 from pixmetry.report.page import write_report
 from pixmetry.results import Assessment
 
+KIND = "assessment"
 LIMIT_RMS = np.sqrt(1 / 3)  # rms of a quantity that is spread evenly between 0 and its upper limit, over that limit
 
 Progress = Callable[[str, int, int], None]
@@ -65,6 +66,8 @@ def assess(
     InputError, MeasureError
         If a file or the campaign cannot be used, or the frames do not carry a photon transfer.
     """
+    if output is not None:
+        check_output(output, KIND)  # before the work, not after it
     what_target = parse_target(target) if target else Target()
     what_estimator = parse_estimator(estimator) if estimator else Estimator()
     frames = campaign if isinstance(campaign, Campaign) else load_campaign(campaign)
@@ -98,7 +101,7 @@ def assess(
 
 def write_results(assessment: Assessment, directory: str | Path) -> Path:
     """Write report, results, maps and the twin into a folder, whole or not at all; return the path of the report."""
-    with staged_output(directory) as folder:
+    with staged_output(directory, KIND) as folder:
         write_json(folder / "results.json", assessment.to_record())
         write_maps(folder / "maps.zarr.zip", assessment.maps(), {"camera": assessment.campaign.camera.name})
         assessment.camera.save(folder / "camera.yaml")

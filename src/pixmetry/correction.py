@@ -49,8 +49,9 @@ def correct_signal(camera: Camera, signal: Signal, maps: Mapping[str, np.ndarray
             done[element.name] = f"not corrected: {source.reasons['correct']}"
         else:
             try:
-                signal = source.correct(element.params, signal, maps)
-                done[element.name] = "corrected"
+                corrected = source.correct(element.params, signal, maps)
+                done[element.name] = "nothing to correct" if corrected is signal else "corrected"
+                signal = corrected
             except InputError as problem:
                 done[element.name] = f"not corrected: {problem}"
     return signal, done
@@ -99,7 +100,7 @@ def correct_files(
         corrected, said = correct_signal(camera, _as_signal(frame, camera), maps)
         return path, corrected.data[0], said
 
-    with staged_output(output) as folder:
+    with staged_output(output, "correction") as folder:
         for i, (path, data, said) in enumerate(imap_tiles(work, files)):
             done = said
             hashes.add_file(path)

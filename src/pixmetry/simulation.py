@@ -108,7 +108,7 @@ def simulate(
     kinds = [e.source.produces for e in camera.active if e.source.produces is not None]
     if not kinds or kinds[-1] is not Kind.CODES:
         raise InputError(f"{camera.name} makes no codes", remedy="add grabber.adc to its chain")
-    with staged_output(output) as folder:
+    with staged_output(output, "simulation") as folder:
         (folder / "frames").mkdir()
         bits = next(e.params.bits for e in camera.active if e.source.id == "grabber.adc")
         truth: dict[str, Any] = {"schema": "pixmetry/truth/1", "seed": seed, "unit_seed": camera.unit_seed}

@@ -23,13 +23,13 @@ def content(folder: Path) -> dict[str, str]:
 
 
 def make(folder: Path, text: str = "first") -> None:
-    with staged_output(folder) as stage:
+    with staged_output(folder, "assessment") as stage:
         (stage / "results.json").write_text(text, encoding="utf-8")
 
 
 def test_result_appears_whole_and_replaces_the_old_one(tmp_path: Path) -> None:
     target = tmp_path / "below" / "result"
-    with staged_output(target) as stage:
+    with staged_output(target, "assessment") as stage:
         (stage / "results.json").write_text("first", encoding="utf-8")
         (stage / "old-only.txt").write_text("x", encoding="utf-8")
         assert not target.exists()
@@ -45,7 +45,7 @@ def test_an_interruption_leaves_the_old_result_or_nothing(problem: type[BaseExce
     for before in ({}, {"results.json": "first"}):
         if before:
             make(target)
-        with pytest.raises(problem), staged_output(target) as stage:
+        with pytest.raises(problem), staged_output(target, "assessment") as stage:
             (stage / "results.json").write_text("half", encoding="utf-8")
             raise problem
         assert [p.name for p in tmp_path.iterdir()] == (["result"] if before else [])
@@ -62,7 +62,7 @@ def test_a_failed_swap_puts_the_old_result_back(tmp_path: Path, monkeypatch: pyt
             raise OSError("no space left")
         replace(source, goal)
 
-    with pytest.raises(OSError, match="no space"), staged_output(target) as stage:
+    with pytest.raises(OSError, match="no space"), staged_output(target, "assessment") as stage:
         (stage / "results.json").write_text("second", encoding="utf-8")
         monkeypatch.setattr(os, "replace", lambda a, b: replace(a, b) if str(b).endswith(".json") else failing(a, b))
     assert content(target) == {"results.json": "first"}
@@ -76,7 +76,7 @@ def test_what_a_killed_run_left_is_cleaned_by_the_next(tmp_path: Path) -> None:
     script = f"""
         import os, signal
         from pixmetry.campaign.output import staged_output
-        with staged_output({str(target)!r}) as stage:
+        with staged_output({str(target)!r}, "assessment") as stage:
             (stage / "results.json").write_text("half")
             os.kill(os.getpid(), signal.SIGKILL)
     """
@@ -95,7 +95,7 @@ def test_a_result_set_aside_by_a_killed_run_comes_back(tmp_path: Path) -> None:
     gone = subprocess.Popen([sys.executable, "-c", ""])
     gone.wait()
     os.replace(target, tmp_path / f"result.partial-{_host()}-{gone.pid}-0123abcd.old")
-    with pytest.raises(RuntimeError), staged_output(target):
+    with pytest.raises(RuntimeError), staged_output(target, "assessment"):
         raise RuntimeError
     assert content(target) == {"results.json": "first"}
 
@@ -118,7 +118,7 @@ def test_folders_with_other_files_are_refused_and_kept(tmp_path: Path) -> None:
         make(target, "second")
     assert content(target) == {"results.json": "first", "chapter.tex": "years of work"}
     (target / "chapter.tex").unlink()
-    with pytest.raises(InputError, match="late.txt"), staged_output(target):
+    with pytest.raises(InputError, match="late.txt"), staged_output(target, "assessment"):
         (target / "late.txt").write_text("came meanwhile", encoding="utf-8")
     assert content(target) == {"results.json": "first", "late.txt": "came meanwhile"}
     (target / "late.txt").unlink()

@@ -2,7 +2,7 @@
 
 from pixmetry.campaign.images import FrameReader, iter_frames, read_frame, write_frame
 from pixmetry.campaign.manifest import EXAMPLE, load_campaign, photons_from_irradiance, write_manifest
-from pixmetry.campaign.output import read_maps, staged_output, write_json, write_maps
+from pixmetry.campaign.output import check_output, read_maps, staged_output, write_json, write_maps
 from pixmetry.campaign.provenance import InputHashes, provenance_record
 from pixmetry.campaign.records import CameraFacts, Campaign, FrameGroup, OpticsFacts
 
@@ -14,6 +14,7 @@ __all__ = [
     "FrameReader",
     "InputHashes",
     "OpticsFacts",
+    "check_output",
     "iter_frames",
     "load_campaign",
     "photons_from_irradiance",

@@ -23,7 +23,7 @@ _SYSTEM_FILES = {".DS_Store", "Thumbs.db", "desktop.ini"}  # file managers leave
 
 
 @contextmanager
-def staged_output(directory: str | Path) -> Iterator[Path]:
+def staged_output(directory: str | Path, kind: str) -> Iterator[Path]:
     """Write a folder of results so that it appears whole or not at all.
 
     Inside the ``with`` block, files go into a temporary folder beside the wanted one; when the block ends well, the folders are
@@ -32,7 +32,9 @@ def staged_output(directory: str | Path) -> Iterator[Path]:
     Parameters
     ----------
     directory : str or Path
-        The wanted folder. If it exists it must be empty or hold nothing but files of an earlier result.
+        The wanted folder. If it exists it must be empty or hold nothing but files of an earlier result of the same kind.
+    kind : str
+        What is written, in a word (``"assessment"``): a result of another kind is never replaced, for it may be the input.
 
     Yields
     ------
@@ -45,18 +47,19 @@ def staged_output(directory: str | Path) -> Iterator[Path]:
         If the folder holds other files, or cannot be made.
     """
     target = Path(os.path.realpath(directory))
+    check_output(target, kind)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         _clean_stale(target)
-        _refuse_foreign(target)
+        check_output(target, kind)
         partial = target.with_name(f"{target.name}.partial-{_host()}-{os.getpid()}-{secrets.token_hex(4)}")
         partial.mkdir()
     except OSError as problem:
         raise InputError("folder cannot be written", where=str(directory), value=problem.strerror, remedy="choose another folder") from None
     try:
         yield partial
-        write_json(partial / MARKER, {"schema": OUTPUT_SCHEMA, "files": sorted(p.name for p in partial.iterdir())})
-        _refuse_foreign(target)  # somebody may have put a file there in the meantime
+        write_json(partial / MARKER, {"schema": OUTPUT_SCHEMA, "kind": kind, "files": sorted(p.name for p in partial.iterdir())})
+        check_output(target, kind)  # somebody may have put a file there in the meantime
         _swap(partial, target)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
@@ -75,28 +78,39 @@ def _swap(partial: Path, target: Path) -> None:
     shutil.rmtree(old, ignore_errors=True)
 
 
-def _refuse_foreign(target: Path) -> None:
-    """Refuse a folder in which something would be lost that no earlier run of pixmetry wrote."""
+def check_output(directory: str | Path, kind: str) -> None:
+    """Refuse a folder in which something would be lost that no earlier run of the same kind wrote.
+
+    Raises
+    ------
+    InputError
+        If it is a file, or holds other files or a result of another kind.
+    """
+    target = Path(os.path.realpath(directory))
     if not target.exists():
         return
     if not target.is_dir():
         raise InputError("is a file, not a folder", where=str(target), remedy="choose another folder for the results")
     names = {p.name for p in target.iterdir()}
-    foreign = sorted(names - _own_files(target) - _SYSTEM_FILES)
+    own, there = _own_files(target)
+    if own and there != kind:
+        raise InputError(f"folder holds the result of another command ({there})", where=str(target), remedy="choose another folder")
+    foreign = sorted(names - own - _SYSTEM_FILES)
     if foreign:
         shown = ", ".join(foreign[:3]) + (", ..." if len(foreign) > 3 else "")
         remedy = "choose another folder, or move these files away"
         raise InputError(f"folder holds files that are not results of pixmetry ({shown})", where=str(target), remedy=remedy)
 
 
-def _own_files(target: Path) -> set[str]:
+def _own_files(target: Path) -> tuple[set[str], str]:
+    """Names of the files that the marker lists, and the kind of result."""
     try:
         marker = json.loads((target / MARKER).read_text(encoding="utf-8"))
         if marker["schema"].startswith("pixmetry/output/"):
-            return {MARKER, *marker["files"]}
+            return {MARKER, *marker["files"]}, str(marker["kind"])
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         pass  # no marker, or not one of ours
-    return set()
+    return set(), ""
 
 
 def _host() -> str:

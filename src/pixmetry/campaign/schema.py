@@ -12,6 +12,7 @@ from pixmetry.core.errors import InputError
 CAMPAIGN_SCHEMA = "pixmetry/campaign/1"
 
 Positive = Annotated[float, Field(gt=0)]
+Pitch = Annotated[float, Field(ge=0.1, le=1000)]  # µm
 Names = Annotated[
     tuple[Annotated[str, Field(min_length=1)], ...], Field(min_length=1), BeforeValidator(lambda v: (v,) if isinstance(v, str) else v)
 ]
@@ -22,9 +23,9 @@ class CameraModel(Model):
 
     name: str
     bits: Annotated[int, Field(ge=1, le=16)]
-    pitch_um: Positive | None = None
-    pitch_x_um: Positive | None = None
-    pitch_y_um: Positive | None = None
+    pitch_um: Pitch | None = None
+    pitch_x_um: Pitch | None = None
+    pitch_y_um: Pitch | None = None
     interface: Literal["digital", "analogue"] = "digital"
     sensor: Literal["ccd", "cmos"] | None = None
     temperature_c: Annotated[float, Field(ge=-273.15)] | None = None

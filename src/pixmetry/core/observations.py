@@ -132,6 +132,9 @@ class DefectList:
     gain_rel: np.ndarray  # response over that of its surroundings; 1 is normal; nan without a bright stack
     expected_false: float  # mean number of false alarms in a frame whose good pixels are Gaussian
     shape: tuple[int, int]
+    dark_limit_dn: float = float("nan")  # dark excess at which half of the pixels would be found
+    dark_sigma_dn: float = float("nan")  # scatter of the good pixels' dark values
+    gain_sigma_rel: float = float("nan")  # scatter of their response
 
     def __len__(self) -> int:
         return len(self.kind)

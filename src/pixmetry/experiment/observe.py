@@ -83,10 +83,12 @@ def observe(groups: Iterable[Group], bits: int, temperature_c: float | None = No
             levels[group.kind].append(_Level(moments.summary(), group.exposure_s, group.photons))
             if group.kind == "bright":
                 sweep.append(levels["bright"][-1].summary)
+                _refuse_copies(levels["bright"][-1], bits)
         elif isinstance(moments, StackAccumulator) and _better(stacks.get(group.kind), moments.n_frames):
             stack = moments.result(group.exposure_s)
             stacks[group.kind] = (stack, reduction.spectra.result(stack.mean_map_dn))
-    notes: list[str] = []
+    counts = histogram.result()
+    notes = _code_notes(counts)
     dark_stack, dark_spectra = stacks.get("dark", (None, None))
     bright_stack, bright_spectra = stacks.get("bright", (None, None))
     transfer = _photon_transfer(levels, shape, bits)
@@ -100,7 +102,7 @@ def observe(groups: Iterable[Group], bits: int, temperature_c: float | None = No
         bright_stack=bright_stack,
         dark_spectra=dark_spectra,
         bright_spectra=bright_spectra,
-        histogram=histogram.result(),
+        histogram=counts,
         spatial_fit=spatial,
         defects=defects,
         patterns=patterns,
@@ -108,6 +110,30 @@ def observe(groups: Iterable[Group], bits: int, temperature_c: float | None = No
         temperature_c=temperature_c,
         notes=tuple(notes),
     )
+
+
+def _refuse_copies(level: _Level, bits: int) -> None:
+    """Refuse a bright level whose frames are the same picture; at either end of the codes frames may be alike."""
+    between = 0 < level.summary.mean_dn < 2**bits - 1
+    ends = (level.summary.counts[0] + level.summary.counts[-1]) / level.summary.counts.sum()
+    if between and ends < 0.5 and level.summary.squares.total_dn2 == 0:
+        raise MeasureError(
+            f"the frames of a level are identical (bright, exposure {level.exposure_s:g} s): there is no temporal noise to measure",
+            where="photon transfer",
+            remedy="list frames that were taken one after the other, not copies, averages or synthetic frames",
+        )
+
+
+def _code_notes(histogram: CodeHistogram) -> list[str]:
+    """What the codes themselves tell of a wrong or shifted number of bits."""
+    used = np.flatnonzero(histogram.counts)
+    step, highest = int(np.gcd.reduce(used)), int(used.max())
+    fitting = max(highest.bit_length(), 1)
+    if step > 1 and step & (step - 1) == 0:
+        return [f"all values are multiples of {step}: the data seem to be shifted left; gain and noise are in steps of the file, not of the converter"]
+    if fitting < histogram.bits:
+        return [f"no value is above {highest} although {histogram.bits} bits are declared: if the camera has fewer, write bits: {fitting}"]
+    return []
 
 
 def _better(kept: tuple[StackMoments, Spectra] | None, n_frames: int) -> bool:

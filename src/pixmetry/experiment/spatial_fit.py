@@ -16,6 +16,7 @@ from pixmetry.experiment.photon_transfer_model import rounding_error_vars, slope
 from pixmetry.experiment.surface import Strata, Surface, cross_strata, fill, fit_surface, residual_parts
 
 PARTS = ("pixel", "row", "col")
+NOT_ROUND = 3.0  # curvatures along x and y that differ by more than this many u belong to a light that is not round
 METHOD = "analysis of variance of the mean maps, less temporal mean squares / L; Scheffé 1959, limits after Graybill & Wang 1980"
 
 
@@ -51,7 +52,7 @@ def fit_spatial(
     defects : DefectList, optional
         Pixels to leave out; by default those of ``find_defects``.
     surface_degree : int
-        Total degree of the polynomial that takes up the illumination.
+        Total degree of the polynomial that takes up the illumination, 2 or more.
     linearity : Linearity, optional
         Of this camera: the maps are straightened with it before they are compared. A bent response shows a contrast of the light
         x f'(x)/f(x) times as large; at half of the range that is 1 % for a₁ = 0.02.
@@ -65,7 +66,8 @@ def fit_spatial(
     Estimates
         ``dsnu_{pixel,row,col,total}_dn``, ``prnu_{pixel,row,col,total}_rel`` (0.01 is 1 %), standard deviations of the population from
         which this sensor's pixels, rows and columns are a sample; ``shading_x_per_px``, ``shading_y_per_px`` (relative gradient at the
-        centre) and ``shading_pp_rel``. What is not significantly above zero is a 95 % upper limit.
+        centre), ``shading_corner_rel`` (loss from the centre to the corners as r², over the mean light; negative where the corners are
+        brighter) and ``shading_pp_rel``. A non-uniformity that is not significantly above zero is a 95 % upper limit.
 
     Raises
     ------
@@ -256,31 +258,61 @@ def _bounds(matrix: np.ndarray, squares: _MeanSquares) -> tuple[np.ndarray, np.n
 
 
 def _shading(surface: Surface, squares: _MeanSquares) -> Estimates:
-    """Gradient at the centre and peak-to-peak of the fitted illumination, relative to its mean."""
+    """Gradient at the centre, peak-to-peak and loss towards the corners of the fitted illumination, relative to its mean."""
     level = float(surface.values.mean())
     coefficients = surface.coefficients / level
     variances = surface.coefficient_variances(*squares.values[3:6])
     rows, cols = surface.values.shape
     middle_y, middle_x = _centre(surface.basis_y), _centre(surface.basis_x)
+    along_x, along_y = _paraboloid(surface)
     low, high = np.unravel_index(surface.values.argmin(), (rows, cols)), np.unravel_index(surface.values.argmax(), (rows, cols))
     weights = {
         "shading_x_per_px": np.outer(middle_y, surface.slopes_x),
         "shading_y_per_px": np.outer(surface.slopes_y, middle_x),
         "shading_pp_rel": np.outer(surface.basis_y[high[0]], surface.basis_x[high[1]])
         - np.outer(surface.basis_y[low[0]], surface.basis_x[low[1]]),
+        "shading_corner_rel": along_x + along_y,
     }
     w = np.array([v.ravel() for v in weights.values()])
     covariance = (w * variances.ravel()) @ w.T
+    covariance[-1, -1] += _not_round_var(along_x, along_y, coefficients, variances)
     return Estimates(
         names=tuple(weights),
         values=w @ coefficients.ravel(),
         covariance=covariance,
-        dof=np.array([squares.dof[5], squares.dof[4], min(squares.dof[4:6])]),
-        units=("1/px", "1/px", "1"),
+        dof=np.array([squares.dof[5], squares.dof[4], min(squares.dof[4:6]), min(squares.dof[4:6])]),
+        units=("1/px", "1/px", "1", "1"),
         method=f"least-squares polynomial of total degree {surface.degree} in bright − dark",
         confounders=("slow non-uniformity of the sensor's response",),
         reasons={"shading_pp_rel": "cannot be negative: without any shading it comes out at a few u"},
     )
+
+
+def _paraboloid(surface: Surface) -> tuple[np.ndarray, np.ndarray]:
+    """Weights of the coefficients whose sum is the loss to the corners: the shares of the terms x² and y², each of shape (degree + 1,) * 2.
+
+    The surface is projected on q = −(r² − ⟨r²⟩)/r²_corner over the frame's pixels. q has only these two terms, and is orthogonal to all
+    others of the surface, so this is the least-squares fit of the paraboloid to the light itself.
+    """
+    rows, cols = surface.values.shape
+    y, x = np.arange(rows) - (rows - 1) / 2, np.arange(cols) - (cols - 1) / 2
+    corner2 = x[0] ** 2 + y[0] ** 2
+    along_x, along_y = np.zeros(surface.coefficients.shape), np.zeros(surface.coefficients.shape)
+    along_x[0, 2] = -math.sqrt(rows) * np.sign(surface.basis_y[0, 0]) * (surface.basis_x[:, 2] @ x**2) / corner2
+    along_y[2, 0] = -math.sqrt(cols) * np.sign(surface.basis_x[0, 0]) * (surface.basis_y[:, 2] @ y**2) / corner2
+    whole = along_x[0, 2] ** 2 + along_y[2, 0] ** 2
+    return along_x / whole, along_y / whole
+
+
+def _not_round_var(along_x: np.ndarray, along_y: np.ndarray, coefficients: np.ndarray, variances: np.ndarray) -> float:
+    """Weighted variance of the curvatures along x and y about their mean, where they differ by more than chance.
+
+    One number for both is then too small for one axis and too large for the other.
+    """
+    share = float(along_x[0, 2] ** 2 / (along_x[0, 2] ** 2 + along_y[2, 0] ** 2))  # weight of the x axis; the other has the rest
+    apart = along_x / share - along_y / (1 - share)
+    difference2 = float((apart * coefficients).sum()) ** 2
+    return share * (1 - share) * difference2 if difference2 > NOT_ROUND**2 * float((apart**2 * variances).sum()) else 0.0
 
 
 def _centre(basis: np.ndarray) -> np.ndarray:

@@ -23,7 +23,9 @@ class Shading(Parameters):
 
     gradient_x_per_px: float = quantity(0.0, "1/px", "gradient along x at the frame's centre, over the mean light", ge=-0.1, le=0.1)
     gradient_y_per_px: float = quantity(0.0, "1/px", "gradient along y at the frame's centre, over the mean light", ge=-0.1, le=0.1)
-    corner_rel: float = quantity(0.0, "1", "loss from the centre to the corners (as r²), over the mean light", ge=0, le=0.95)
+    corner_rel: float = quantity(
+        0.0, "1", "loss from the centre to the corners (as r²), over the mean light; negative: brighter corners", ge=-0.95, le=0.95
+    )
 
 
 def curvature_per_px2(params: Shading, frame_shape: tuple[int, int]) -> float:
@@ -49,13 +51,14 @@ def forward(params: Shading, signal: Signal, stream: Stream) -> Signal:
 
 
 def measure(observations: Observations) -> Estimates:
-    """Read the gradient at the centre from the smooth surface through the flat-field stack."""
+    """Read gradient at the centre and loss to the corners from the smooth surface through the flat-field stack."""
     fit = observations.spatial_fit
     if fit is None or "shading_x_per_px" not in fit:
         raise MeasureError(
             "shading needs a stack of bright frames and one of dark frames", where="optics.shading", remedy="take at least 16 of each"
         )
-    return fit.select({"gradient_x_per_px": "shading_x_per_px", "gradient_y_per_px": "shading_y_per_px"})
+    names = {"gradient_x_per_px": "shading_x_per_px", "gradient_y_per_px": "shading_y_per_px", "corner_rel": "shading_corner_rel"}
+    return fit.select(names)
 
 
 def correct(params: Shading, signal: Signal, maps: Mapping[str, np.ndarray]) -> Signal:
