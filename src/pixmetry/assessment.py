@@ -184,6 +184,6 @@ def digital_twin(campaign: Campaign, estimates: dict[str, Estimates], observatio
 
 
 def best_values(estimates: Estimates) -> dict[str, float]:
-    """Return values for a simulation: estimates as they are; of what is not significant nothing, but for a dark noise hidden by rounding."""
+    """Return values for a simulation: estimates as they are; nothing of what is not significant, but for dark noise that rounding hides."""
     hidden = {"white_e"}  # the rms of an even spread up to its limit
     return {e.name: e.value if e.kind == "value" else e.value * LIMIT_RMS * (e.name in hidden) for e in estimates}

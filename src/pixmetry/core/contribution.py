@@ -1,8 +1,8 @@
 """How an error source reaches a target's position: the linear response of an estimator, and the contribution that comes of it.
 
-Classes, by what averages a contribution: ``T`` temporal, pixel by pixel or frame by frame: over frames and targets; ``Tr`` temporal,
-common to a row: over both, for other rows have other draws; ``F`` fixed in the sensor, changes with the sub-pixel phase or the place on the sensor: over targets;
-``G`` smooth geometric mapping: by neither, self-calibration absorbs part; ``D`` drift: by neither; ``O`` object and illumination.
+Classes, by what averages a contribution: ``T`` temporal, pixel by pixel or frame by frame, and ``Tr`` temporal, common to a row: over
+frames and targets; ``F`` fixed, changes with the sub-pixel phase or the place on the sensor: over targets; ``G`` smooth geometric
+mapping: by neither, self-calibration absorbs part; ``D`` drift: by neither; ``O`` object and illumination: by neither.
 """
 
 from __future__ import annotations

@@ -7,10 +7,12 @@ they are from differences, so what is fixed in the camera drops out.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
+from pixmetry.core.errors import MeasureError
 from pixmetry.core.estimates import Estimates
 
 
@@ -194,3 +196,17 @@ class Observations:
     code_errors: CodeErrors | None = None
     temperature_c: float | None = None
     notes: tuple[str, ...] = field(default_factory=tuple)
+
+    def fitted(self, names: Mapping[str, str], what: str, *, where: str, remedy: str) -> Estimates:
+        """Take a source's parameters ``{parameter: fitted name}`` out of the joint fit that holds the first of them, with their covariance.
+
+        Raises
+        ------
+        MeasureError
+            With ``what``, ``where`` and ``remedy``, if no fit holds it.
+        """
+        first = next(iter(names.values()))
+        for fit in (self.photon_transfer_fit, self.spatial_fit):
+            if fit is not None and first in fit:
+                return fit.select(names)
+        raise MeasureError(what, where=where, remedy=remedy)

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 
 from pixmetry.core.contribution import Contribution, Probe
-from pixmetry.core.errors import MeasureError
 from pixmetry.core.estimates import Estimates
 from pixmetry.core.observations import Observations, PatternList
 from pixmetry.core.random import Stream
@@ -28,16 +27,18 @@ def forward(params: AmplifierNoise, signal: Signal, stream: Stream) -> Signal:
 
 def measure(observations: Observations) -> Estimates:
     """Read the white dark noise of the photon transfer, free of quantisation and of row and column noise."""
-    fit = observations.photon_transfer_fit
-    if fit is None or "dark_noise_e" not in fit:
-        raise MeasureError(
-            "amplifier noise needs a photon-transfer series with dark frames", where="electronics.amplifier_noise", remedy="take dark pairs"
-        )
-    noise = fit.select({"white_e": "dark_noise_e"})
+    noise = observations.fitted(
+        {"white_e": "dark_noise_e"},
+        "amplifier noise needs a photon-transfer series with dark frames",
+        where="electronics.amplifier_noise",
+        remedy="take dark pairs",
+    )
     found = None if observations.patterns is None else observations.patterns.strongest()
     if found is None or observations.photon_transfer is None or not found.moving.any() or noise.limits:
         return noise
-    return _without_moving_waves(noise, fit["gain_dn_per_e"].value, found, observations.photon_transfer.dark.n_frames)
+    return _without_moving_waves(
+        noise, observations.photon_transfer_fit["gain_dn_per_e"].value, found, observations.photon_transfer.dark.n_frames
+    )
 
 
 def _without_moving_waves(noise: Estimates, gain: float, found: PatternList, n_frames: np.ndarray) -> Estimates:

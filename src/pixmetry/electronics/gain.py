@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from pixmetry.core.errors import MeasureError
 from pixmetry.core.estimates import Estimates
 from pixmetry.core.observations import Observations
 from pixmetry.core.random import Stream
@@ -25,12 +24,12 @@ def forward(params: Gain, signal: Signal, stream: Stream) -> Signal:
 
 def measure(observations: Observations) -> Estimates:
     """Read the gain from the photon transfer: the slope of temporal variance against mean."""
-    fit = observations.photon_transfer_fit
-    if fit is None or "gain_dn_per_e" not in fit:
-        raise MeasureError(
-            "the gain needs a photon-transfer series", where="electronics.gain", remedy="take pairs at ten light levels or more"
-        )
-    return fit.select(["gain_dn_per_e"])
+    return observations.fitted(
+        {"gain_dn_per_e": "gain_dn_per_e"},
+        "the gain needs a photon-transfer series",
+        where="electronics.gain",
+        remedy="take pairs at ten light levels or more",
+    )
 
 
 SOURCE = Source(

@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import model_validator
 
 from pixmetry.core.contribution import Contribution, Probe
-from pixmetry.core.errors import MeasureError, ParameterError
+from pixmetry.core.errors import ParameterError
 from pixmetry.core.estimates import Estimates
 from pixmetry.core.observations import Observations
 from pixmetry.core.random import Stream
@@ -60,14 +60,12 @@ def forward(params: Nonlinearity, signal: Signal, stream: Stream) -> Signal:
 
 def measure(observations: Observations) -> Estimates:
     """Read the coefficients from the joint fit to means and variances; its w is 1 at the largest code."""
-    fit = observations.photon_transfer_fit
-    if fit is None or "nonlinearity_a1" not in fit:
-        raise MeasureError(
-            "non-linearity needs a photon-transfer series of known light",
-            where="electronics.nonlinearity",
-            remedy="take ten light levels or more",
-        )
-    return fit.select({f"a{k}": f"nonlinearity_a{k}" for k in (1, 2, 3)})
+    return observations.fitted(
+        {f"a{k}": f"nonlinearity_a{k}" for k in (1, 2, 3)},
+        "non-linearity needs a photon-transfer series of known light",
+        where="electronics.nonlinearity",
+        remedy="take ten light levels or more",
+    )
 
 
 def correct(params: Nonlinearity, signal: Signal, maps: Mapping[str, np.ndarray]) -> Signal:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from pixmetry.core.contribution import Contribution, Probe
-from pixmetry.core.errors import MeasureError
 from pixmetry.core.estimates import Estimates
 from pixmetry.core.observations import Observations
 from pixmetry.core.random import Stream
@@ -31,12 +30,12 @@ def forward(params: RowNoise, signal: Signal, stream: Stream) -> Signal:
 
 def measure(observations: Observations) -> Estimates:
     """Read the temporal row and column variance of dark pairs, less what white noise gives to a mean of a line."""
-    fit = observations.photon_transfer_fit
-    if fit is None or "row_noise_e" not in fit:
-        raise MeasureError(
-            "row noise needs a photon-transfer series with dark frames", where="electronics.row_noise", remedy="take dark pairs"
-        )
-    return fit.select({"row_e": "row_noise_e", "column_e": "column_noise_e"})
+    return observations.fitted(
+        {"row_e": "row_noise_e", "column_e": "column_noise_e"},
+        "row noise needs a photon-transfer series with dark frames",
+        where="electronics.row_noise",
+        remedy="take dark pairs",
+    )
 
 
 def propagate(params: RowNoise, probe: Probe) -> Contribution:

@@ -20,7 +20,7 @@ from pixmetry.report.numbers import NONE, THIN, decimals_of, fixed, length_mpx, 
 CLASSES = {
     "T": "random in time, pixel by pixel",
     "Tr": "random in time, common to a row",
-    "F": "fixed, differs from place to place",
+    "F": "fixed pattern",
     "G": "smooth geometry",
     "D": "drift",
     "O": "object and light",

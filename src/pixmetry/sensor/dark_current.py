@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 
 from pixmetry.core.contribution import Contribution, Probe
-from pixmetry.core.errors import MeasureError
 from pixmetry.core.estimates import Estimates
 from pixmetry.core.observations import Observations
 from pixmetry.core.random import Stream
@@ -37,14 +36,12 @@ def forward(params: DarkCurrent, signal: Signal, stream: Stream) -> Signal:
 
 def measure(observations: Observations) -> Estimates:
     """Read the slope of the dark signal against exposure time from the photon transfer (EMVA 1288 R4.0 §7)."""
-    fit = observations.photon_transfer_fit
-    if fit is None or "dark_current_e_per_s" not in fit:
-        raise MeasureError(
-            "dark current needs dark frames at several exposure times",
-            where="sensor.dark_current",
-            remedy="take dark frames at six exposure times or more, the longest as long as the camera allows",
-        )
-    estimates = fit.select({"rate_e_per_s": "dark_current_e_per_s"})
+    estimates = observations.fitted(
+        {"rate_e_per_s": "dark_current_e_per_s"},
+        "dark current needs dark frames at several exposure times",
+        where="sensor.dark_current",
+        remedy="take dark frames at six exposure times or more, the longest as long as the camera allows",
+    )
     if observations.temperature_c is None:
         return estimates
     note = f"{estimates.reasons.get('rate_e_per_s', '')} holds at a sensor temperature of {observations.temperature_c:g} °C".strip()

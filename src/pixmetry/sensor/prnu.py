@@ -7,7 +7,6 @@ from collections.abc import Mapping
 import numpy as np
 
 from pixmetry.core.contribution import Contribution, Probe
-from pixmetry.core.errors import MeasureError
 from pixmetry.core.estimates import Estimates
 from pixmetry.core.observations import Observations
 from pixmetry.core.random import Grid, Stream
@@ -40,12 +39,12 @@ def forward(params: Prnu, signal: Signal, stream: Stream) -> Signal:
 
 def measure(observations: Observations) -> Estimates:
     """Read the split of the flat-field stack: rows, columns and pixels, shading and temporal noise taken out."""
-    fit = observations.spatial_fit
-    if fit is None or "prnu_pixel_rel" not in fit:
-        raise MeasureError(
-            "PRNU needs a stack of bright frames and one of dark frames", where="sensor.prnu", remedy="take at least 16 of each"
-        )
-    return fit.select({"pixel_std_rel": "prnu_pixel_rel", "row_std_rel": "prnu_row_rel", "col_std_rel": "prnu_col_rel"})
+    return observations.fitted(
+        {"pixel_std_rel": "prnu_pixel_rel", "row_std_rel": "prnu_row_rel", "col_std_rel": "prnu_col_rel"},
+        "PRNU needs a stack of bright frames and one of dark frames",
+        where="sensor.prnu",
+        remedy="take at least 16 of each",
+    )
 
 
 def correct(params: Prnu, signal: Signal, maps: Mapping[str, np.ndarray]) -> Signal:

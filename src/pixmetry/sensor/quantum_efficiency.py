@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from pixmetry.core.errors import MeasureError
 from pixmetry.core.estimates import Estimates
 from pixmetry.core.observations import Observations
 from pixmetry.core.random import Stream
@@ -25,14 +24,12 @@ def forward(params: QuantumEfficiency, signal: Signal, stream: Stream) -> Signal
 
 def measure(observations: Observations) -> Estimates:
     """Read the ratio of responsivity to gain from the photon transfer; it needs the photons per pixel of each level."""
-    fit = observations.photon_transfer_fit
-    if fit is None or "quantum_efficiency" not in fit:
-        raise MeasureError(
-            "quantum efficiency needs a photon-transfer series of known irradiance",
-            where="sensor.quantum_efficiency",
-            remedy="give the photons per pixel of each level, from a calibrated photodiode",
-        )
-    return fit.select(["quantum_efficiency"])
+    return observations.fitted(
+        {"quantum_efficiency": "quantum_efficiency"},
+        "quantum efficiency needs a photon-transfer series of known irradiance",
+        where="sensor.quantum_efficiency",
+        remedy="give the photons per pixel of each level, from a calibrated photodiode",
+    )
 
 
 SOURCE = Source(
