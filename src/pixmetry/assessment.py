@@ -12,7 +12,17 @@ import numpy as np
 from pixmetry.budget.budget import compute_budget
 from pixmetry.budget.parameters import applies, with_estimates
 from pixmetry.budget.probe import Target, parse_target
-from pixmetry.campaign import Campaign, check_output, FrameReader, InputHashes, load_campaign, provenance_record, staged_output, write_json, write_maps
+from pixmetry.campaign import (
+    Campaign,
+    FrameReader,
+    InputHashes,
+    check_output,
+    load_campaign,
+    provenance_record,
+    staged_output,
+    write_json,
+    write_maps,
+)
 from pixmetry.core.camera import Camera, Element, in_order
 from pixmetry.core.catalogue import catalogue
 from pixmetry.core.errors import InputError, MeasureError

@@ -18,7 +18,6 @@ LOWEST, HIGHEST = 0.3, 1.0  # exponents that a camera can be set to
 DARKEST, BRIGHTEST = 0.1, 0.8  # of the brightest level above black: the levels that are compared with a power curve
 LEVELS = 6  # at least, for the three numbers of a curve
 LIGHT_RATIO = 2.0  # at least, between the brightest and the darkest of them
-STRAIGHT = 0.1  # an exponent that is nearer to 1 is a linear camera's, and the rest its non-linearity
 
 
 class Gamma(Parameters):
@@ -48,48 +47,41 @@ def correct(params: Gamma, signal: Signal, maps: Mapping[str, np.ndarray]) -> Si
 
 
 def measure(observations: Observations) -> Estimates:
-    """Read the exponent from the level means: y = b + c light^γ, by least squares with b free.
+    """Give a gamma of 1, with how well the level means agree with it once the measured non-linearity is taken out.
 
-    With b free, dark signal and the curve's steep start do not bend the result. To u is added what changes if b is the mean of the dark
-    frames instead (then γ is the slope of ln y against ln light). An exponent near 1 is reported as 1 with the difference in its u: what
-    is left is `electronics.nonlinearity`'s, and would be counted twice. The full scale cannot be told from the gain: y = (c f^(1/γ − 1))^γ.
+    Light and dark show one curve: what bend there is `electronics.nonlinearity` holds, and it must not be counted twice. The photon
+    transfer refuses a curve that a gamma setting makes. The agreement is δ of mean = b + c light^(1 + δ), of first order in δ.
     """
-    light, signal = _levels(observations)
-    value, u = _exponent(light, signal)
-    reasons = {}
-    if abs(value - 1) < STRAIGHT:
-        reasons["gamma"] = f"the means follow an exponent of {value:.4g}: the setting is linear, the rest is counted as non-linearity"
-        value, u = 1.0, float(np.hypot(u, value - 1))
-    if not LOWEST <= value <= HIGHEST:
-        raise MeasureError(
-            "the response is no curve of a gamma setting",
-            where="electronics.gamma",
-            value=round(value, 3),
-            allowed=f"an exponent of {LOWEST:g} to {HIGHEST + STRAIGHT:g}",
-            remedy="check that the lamp's light is proportional to the exposure",
-        )
+    light, signal = _straight_levels(observations)
+    design = np.stack([np.ones_like(light), light, light * np.log(light)], axis=1)
+    found = np.linalg.lstsq(design, signal, rcond=None)[0]
+    variance = float(((signal - design @ found) ** 2).sum()) / (light.size - 3)
+    delta = float(found[2] / found[1])
+    u_delta = float(np.sqrt(np.linalg.inv(design.T @ design)[2, 2] * variance) / abs(found[1]))
     return Estimates.from_rows(
-        [("gamma", value, u, float(len(light) - 3), "1")],
-        method="power law with a free offset through the level means, least squares (linearity data of EMVA 1288 R4.0 Linear, §6.7)",
+        [("gamma", 1.0, float(np.hypot(delta, u_delta)), float(light.size - 3), "1")],
+        method="level means, straightened by the measured non-linearity, against a power law with a free offset, least squares",
         confounders=("a lamp whose light is not proportional to exposure looks like a camera with gamma",),
-        reasons=reasons,
+        reasons={"gamma": f"the bend of the response is held by electronics.nonlinearity; beyond it the exponent is {1 + delta:.4g}"},
     )
 
 
-def _levels(observations: Observations) -> tuple[np.ndarray, np.ndarray]:
-    """Light and mean above black of the levels that can be used, each as part of its largest; shape (levels,)."""
+def _straight_levels(observations: Observations) -> tuple[np.ndarray, np.ndarray]:
+    """Light and straightened mean above black of the levels that can be used, each as part of its largest; shape (levels,)."""
+    bend = observations.fitted(
+        {f"a{k}": f"nonlinearity_a{k}" for k in (1, 2, 3)},
+        "gamma needs a photon-transfer series of known light",
+        where="electronics.gamma",
+        remedy="take ten light levels or more",
+    )
     transfer = observations.photon_transfer
-    if transfer is None:
-        raise MeasureError(
-            "gamma needs a photon-transfer series of known light", where="electronics.gamma", remedy="take ten light levels or more"
-        )
     bright = transfer.bright
     known = bright.photons is not None and bool(np.isfinite(bright.photons).all())
     light = np.asarray(bright.photons if known else bright.exposure_s, float)
-    signal = bright.mean_dn - transfer.dark.mean_dn.mean()
-    signal = signal / max(float(signal.max(initial=0.0)), 1e-9)
-    keep = (signal > DARKEST) & (signal < BRIGHTEST) & (light > 0)
-    light, signal = light[keep], signal[keep]
+    stored = bright.mean_dn - transfer.dark.mean_dn.mean()
+    share = stored / max(float(stored.max(initial=0.0)), 1e-9)
+    keep = (share > DARKEST) & (share < BRIGHTEST) & (light > 0)
+    light, stored = light[keep], stored[keep]
     if len(light) < LEVELS or light.max() < LIGHT_RATIO * light.min():
         raise MeasureError(
             "too few light levels to tell a power curve from a straight line",
@@ -98,27 +90,10 @@ def _levels(observations: Observations) -> tuple[np.ndarray, np.ndarray]:
             allowed=f"{LEVELS} or more between {DARKEST:.0%} and {BRIGHTEST:.0%} of the brightest, light in a ratio of {LIGHT_RATIO:g}",
             remedy="take ten light levels or more in about equal steps",
         )
-    return light / light.max(), signal
-
-
-def _exponent(light: np.ndarray, signal: np.ndarray) -> tuple[float, float]:
-    """Exponent and its standard uncertainty, of residuals and of the black level."""
-    from scipy.optimize import minimize_scalar
-
-    def line(gamma: float) -> tuple[np.ndarray, np.ndarray]:
-        columns = np.stack([np.ones_like(light), light**gamma], axis=1)
-        found = np.linalg.lstsq(columns, signal, rcond=None)[0]
-        return found, signal - columns @ found
-
-    def squares(gamma: float) -> float:
-        return float((line(gamma)[1] ** 2).sum())
-
-    gamma = float(minimize_scalar(squares, bounds=(0.05, 3.0), method="bounded", options={"xatol": 1e-7}).x)
-    (_, slope), residual = line(gamma)
-    jacobian = np.stack([np.ones_like(light), light**gamma, slope * light**gamma * np.log(light)], axis=1)
-    covariance = np.linalg.inv(jacobian.T @ jacobian) * (residual**2).sum() / (len(light) - 3)
-    through_black = float(np.polyfit(np.log(light), np.log(signal), 1)[0])
-    return gamma, float(np.hypot(np.sqrt(covariance[2, 2]), through_black - gamma))
+    a1, a2, a3 = bend.values
+    w = np.linspace(0, 1.25, 5001)
+    signal = np.interp(stored / (2**transfer.bits - 1), w * (1 + w * (a1 + w * (a2 + w * a3))), w)
+    return light / light.max(), signal / signal.max()
 
 
 def propagate(params: Gamma, probe: Probe) -> Contribution:

@@ -12,6 +12,7 @@ from pixmetry.experiment.surface import fill, fit_surface
 
 KINDS = ("stuck", "dead", "hot", "cold", "gain", "noisy")  # worst first
 COARSE_DN = 0.02  # largest error of a mean code above which a converter counts as coarse for its noise
+COARSE_CLIP_DN = 2.0  # codes that lie about by rounding are good ones
 MAD_TO_SIGMA = 1.482602218505602  # 1/Φ⁻¹(¾)
 
 
@@ -20,18 +21,18 @@ def robust_sigma(values: np.ndarray, floor: float = 0.0) -> float:
     return max(MAD_TO_SIGMA * float(np.median(np.abs(values - np.median(values)))), floor)
 
 
-def _without_lines(image: np.ndarray, clip: float = 0.0) -> np.ndarray:
-    """The image less the medians of its columns and rows, which defects hardly move; less means of clipped values if ``clip`` is given.
+def _without_lines(image: np.ndarray, least_clip: float = 0.0) -> np.ndarray:
+    """The image less the means of its columns and rows, deviations clipped at four robust σ (``least_clip`` at least) for that.
 
-    The median of coarse codes is itself a code; a mean is not, and a defect moves it by no more than clip/N.
+    Medians alone would do less well: pixels near the middle draw them along, so that the core looks narrower than the tails are, and
+    the median of coarse codes is itself a code. A defect moves a clipped mean by no more than the clip over the number of pixels.
     """
-    if not clip:
-        residual = image - np.median(image, axis=0)[None, :]
-        return residual - np.median(residual, axis=1)[:, None]
-    core = np.clip(image - np.median(image), -clip, clip)
-    residual = image - core.mean(axis=0)[None, :]
-    core = core - core.mean(axis=0)[None, :]
-    return residual - core.mean(axis=1)[:, None] - np.median(image)
+    residual = image - np.median(image, axis=0)[None, :]
+    residual = residual - np.median(residual, axis=1)[:, None]
+    clip = max(4 * robust_sigma(residual), least_clip)
+    for axis in (0, 1):
+        residual = residual - np.clip(residual, -clip, clip).mean(axis=axis, keepdims=True)
+    return residual
 
 
 def find_defects(
@@ -60,8 +61,8 @@ def find_defects(
 
     Notes
     -----
-    Each map is taken less the medians of its rows and columns and divided by 1.4826 × the median absolute deviation, so that row and
-    column patterns are not called defects. Noise is tested on the cube root of the sample variance, which is close to Gaussian for any
+    Each map is taken less the clipped means of its rows and columns, so that row and column patterns are not called defects, and divided
+    by 1.4826 × the median absolute deviation. Noise is tested on the cube root of the sample variance, which is close to Gaussian for any
     number of frames (Wilson & Hilferty 1931). A map averaged over L frames has steps of 1/L: its σ is not taken below 1/(L√12).
 
     Where the temporal noise is small against a code (σ below about 0.4 DN), mean codes do not follow the signal: two pixels of the
@@ -77,7 +78,7 @@ def find_defects(
     threshold = float(norm.isf(expected_false / (tests * shape[0] * shape[1])))
     rounding = rounding_error_dn(dark_stack)
     coarse = rounding > COARSE_DN
-    dark = _without_lines(dark_stack.mean_map_dn, 2.0 if coarse else 0.0)
+    dark = _without_lines(dark_stack.mean_map_dn, COARSE_CLIP_DN if coarse else 0.0)
     sigma = robust_sigma(dark, 1 / (dark_stack.n_frames * np.sqrt(12)))
     if coarse:
         sigma = max(sigma, _core_of_codes_dn(dark_stack.mean_map_dn))

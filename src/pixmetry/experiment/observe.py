@@ -11,6 +11,7 @@ from pixmetry.core.errors import MeasureError
 from pixmetry.core.estimates import Estimates
 from pixmetry.core.observations import (
     CodeErrors,
+    CodeHistogram,
     DefectList,
     LevelMoments,
     Observations,
@@ -27,6 +28,9 @@ from pixmetry.experiment.patterns import find_phase_patterns
 from pixmetry.experiment.photon_transfer_fit import fit_photon_transfer
 from pixmetry.experiment.spatial_fit import fit_spatial
 from pixmetry.experiment.stack import StackAccumulator, new_group
+
+EQUAL_EXPOSURE = 0.01  # relative; clocks round
+SATURATED_FRACTION = 0.002  # EMVA 1288 R4.0 §6.6
 
 
 @dataclass(frozen=True)
@@ -47,13 +51,19 @@ class _Level:
     photons: float | None
 
 
+@dataclass(frozen=True)
+class _Stack:
+    moments: StackMoments
+    spectra: Spectra
+
+
 def observe(groups: Iterable[Group], bits: int, temperature_c: float | None = None) -> Observations:
     """Reduce all frames of a campaign, then estimate what many sources share.
 
     Parameters
     ----------
     groups : iterable of Group
-        Read one after the other, each frame once; memory does not grow with their number.
+        Read one after the other, each frame once; memory grows with the number of stacks of different exposures, not with that of frames.
     bits : int
         Bits per stored code.
     temperature_c : float, optional
@@ -68,7 +78,7 @@ def observe(groups: Iterable[Group], bits: int, temperature_c: float | None = No
         If the frames carry no photon transfer: all saturated, all black, too few levels.
     """
     levels: dict[str, list[_Level]] = {"dark": [], "bright": []}
-    stacks: dict[str, tuple[StackMoments, Spectra]] = {}
+    stacks: dict[str, dict[float, _Stack]] = {"dark": {}, "bright": {}}
     histogram, sweep = HistogramAccumulator(bits), []
     shape = None
     for group in groups:
@@ -84,16 +94,24 @@ def observe(groups: Iterable[Group], bits: int, temperature_c: float | None = No
             if group.kind == "bright":
                 sweep.append(levels["bright"][-1].summary)
                 _refuse_copies(levels["bright"][-1], bits)
-        elif isinstance(moments, StackAccumulator) and _better(stacks.get(group.kind), moments.n_frames):
-            stack = moments.result(group.exposure_s)
-            stacks[group.kind] = (stack, reduction.spectra.result(stack.mean_map_dn))
+        elif isinstance(moments, StackAccumulator):
+            kept = stacks[group.kind].get(group.exposure_s)
+            if kept is None or moments.n_frames > kept.moments.n_frames:
+                stack = moments.result(group.exposure_s)
+                stacks[group.kind][group.exposure_s] = _Stack(stack, reduction.spectra.result(stack.mean_map_dn))
     counts = histogram.result()
     notes = _code_notes(counts)
-    dark_stack, dark_spectra = stacks.get("dark", (None, None))
-    bright_stack, bright_spectra = stacks.get("bright", (None, None))
+    dark, bright = _pair(list(stacks["dark"].values()), list(stacks["bright"].values()))
+    dark_stack, bright_stack = (None if s is None else s.moments for s in (dark, bright))
     transfer = _photon_transfer(levels, shape, bits)
     codes = _codes(sweep_histogram(sweep, bits), notes)
     fit = fit_photon_transfer(transfer, dark_stack, bright_stack, _dnl_lsb(codes))
+    if dark and not bright:
+        notes.append("no stack of bright frames: DSNU and PRNU are not measured (take 16 or more at half of saturation)")
+    if dark and bright and not _same_exposure(dark, bright):
+        notes.append(_unpaired(dark, bright))
+        bright = bright_stack = None  # a dark map of another exposure holds another dark current: their difference is not the light's
+    dark_spectra, bright_spectra = (None if s is None else s.spectra for s in (dark, bright))
     defects, spatial, patterns = _spatial(dark_stack, bright_stack, dark_spectra, Linearity.of(fit, bits), _dnl_lsb(codes), notes)
     return Observations(
         photon_transfer=transfer,
@@ -130,14 +148,43 @@ def _code_notes(histogram: CodeHistogram) -> list[str]:
     step, highest = int(np.gcd.reduce(used)), int(used.max())
     fitting = max(highest.bit_length(), 1)
     if step > 1 and step & (step - 1) == 0:
-        return [f"all values are multiples of {step}: the data seem to be shifted left; gain and noise are in steps of the file, not of the converter"]
+        shifted = f"all values are multiples of {step}: the data seem to be shifted left"
+        return [f"{shifted}; gain and noise are in steps of the file, not of the converter"]
     if fitting < histogram.bits:
         return [f"no value is above {highest} although {histogram.bits} bits are declared: if the camera has fewer, write bits: {fitting}"]
     return []
 
 
-def _better(kept: tuple[StackMoments, Spectra] | None, n_frames: int) -> bool:
-    return kept is None or n_frames > kept[0].n_frames
+def _pair(dark: list[_Stack], bright: list[_Stack]) -> tuple[_Stack | None, _Stack | None]:
+    """Choose the dark and the bright stack that belong together: of equal or nearest exposure.
+
+    Of several such pairs one that is not saturated, then the longest exposure, then the most frames. With stacks of one kind only, the
+    one of the most frames.
+    """
+    if not dark or not bright:
+        most = [max(part, key=lambda s: (s.moments.n_frames, s.moments.exposure_s), default=None) for part in (dark, bright)]
+        return most[0], most[1]
+
+    def rank(pair: tuple[_Stack, _Stack]) -> tuple[float, bool, float, int]:
+        d, b = pair[0].moments, pair[1].moments
+        saturated = b.fraction_max - d.fraction_max > SATURATED_FRACTION
+        gap = 0.0 if _same_exposure(*pair) else abs(np.log(max(d.exposure_s, 1e-9) / max(b.exposure_s, 1e-9)))
+        return gap, saturated, -b.exposure_s, -min(d.n_frames, b.n_frames)
+
+    return min(((d, b) for d in dark for b in bright), key=rank)
+
+
+def _same_exposure(dark: _Stack, bright: _Stack) -> bool:
+    one, other = dark.moments.exposure_s, bright.moments.exposure_s
+    return abs(one - other) <= EQUAL_EXPOSURE * max(one, other)
+
+
+def _unpaired(dark: _Stack, bright: _Stack) -> str:
+    one, other = dark.moments.exposure_s, bright.moments.exposure_s
+    return (
+        f"no dark stack has the exposure of a bright one (nearest: dark {one:g} s, bright {other:g} s): DSNU, PRNU, shading and the "
+        f"response of single pixels are not measured (take 16 or more dark frames at {other:g} s)"
+    )
 
 
 def _photon_transfer(levels: dict[str, list[_Level]], shape: tuple[int, int] | None, bits: int) -> PhotonTransfer:
@@ -170,7 +217,6 @@ def _spatial(
     defects = find_defects(dark, bright)
     patterns = find_phase_patterns(dark, spectra, defects, dnl_lsb=dnl_lsb)
     if bright is None:
-        notes.append("no stack of bright frames: DSNU and PRNU are not measured (take 16 or more at half of saturation)")
         return defects, None, patterns
     try:
         return defects, fit_spatial(dark, bright, defects, linearity=linearity, patterns=patterns, dnl_lsb=dnl_lsb), patterns

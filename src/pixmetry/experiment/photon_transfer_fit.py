@@ -25,6 +25,7 @@ from pixmetry.experiment.photon_transfer_levels import (
     levels_from,
     light_scale,
     prior_precision,
+    refuse_curved,
     refuse_dead_series,
     temporal_row_col_vars,
     usable_levels,
@@ -87,16 +88,21 @@ def fit_photon_transfer(
     Raises
     ------
     MeasureError
-        No dark level, no known light, or fewer than four levels between black and saturation.
+        No dark level, no known light, fewer than four levels between black and saturation, or a response like that of a gamma setting.
     """
     refuse_dead_series(pt)
     scale, by_exposure = light_scale(pt.bright)
     series = with_stacks(pt, dark_stack, bright_stack if by_exposure else None)
     levels, time_scale = levels_from(series, scale, by_exposure, core_spread_dn2(dark_stack), dnl_lsb)
-    solution, keep = fit_range(levels, usable_levels(series, levels), prior_precision(series, levels))
-    if solution.p[GAIN] < 3 * np.sqrt(solution.covariance[GAIN, GAIN]):
-        what = "the temporal variance does not grow with the mean, so the gain is not resolved"
-        raise MeasureError(what, where="photon transfer", remedy="use a higher analogue gain, larger frames or more levels")
+    refuse_curved(series, levels)
+    try:
+        solution, keep = fit_range(levels, usable_levels(series, levels), prior_precision(series, levels))
+        if solution.p[GAIN] < 3 * np.sqrt(solution.covariance[GAIN, GAIN]):
+            what = "the temporal variance does not grow with the mean, so the gain is not resolved"
+            raise MeasureError(what, where="photon transfer", remedy="use a higher analogue gain, larger frames or more levels")
+    except MeasureError:
+        refuse_curved(series, levels, failed=True)  # the plainer reason, if there is one
+        raise
     return _estimates(series, solution, levels.subset(keep), _Axes(scale, time_scale, by_exposure))
 
 
@@ -326,5 +332,3 @@ def _add_saturation(rows: _Rows, p: np.ndarray, saturation: tuple[float, float, 
     clips = cause == "converter"
     note = "lower bound of the pixel's full well: the converter clips first" if clips else "the pixels saturate below the top code"
     rows.add("full_well_e", x / gain, "e-", gradient, note)
-
-

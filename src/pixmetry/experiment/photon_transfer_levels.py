@@ -15,6 +15,10 @@ CLIPPED_BLACK_FRACTION = 0.005  # EMVA 1288 R4.0 §6.1: at most 0.5 % of the dar
 MINIMUM_LEVELS = 4
 NONLINEARITY_PRIOR = 0.1
 LIGHT_OFFSET_PRIOR = 0.05
+STRONGLY_CURVED, CURVED = 0.85, 0.95  # exponents of the response: below the first it is refused, below the second if it is a power curve
+POWER_CURVE = 0.25  # a power law that leaves less than this share of the squares that a cubic with one parameter more leaves
+CURVE_LEVELS = 6
+CURVE_DARKEST, CURVE_BRIGHTEST = 0.1, 0.8  # of the brightest level above black: the levels that tell the exponent
 
 
 def light_scale(bright: LevelMoments) -> tuple[float, bool]:
@@ -154,6 +158,50 @@ def refuse_dead_series(pt: PhotonTransfer) -> None:
         remedy = "list frames that were taken one after the other, not copies, averages or synthetic frames"
     if what:
         raise MeasureError(what, where="photon transfer", remedy=remedy)
+
+
+def refuse_curved(pt: PhotonTransfer, d: model.Levels, failed: bool = False) -> None:
+    """Refuse a response like that of a gamma setting: level means that grow as a power of the light with an exponent well below 1.
+
+    A power curve starts with an infinite slope, which no polynomial follows: the gain that came out would depend on the levels chosen.
+    Where the fit has ``failed`` anyway, a smaller bend of any shape is its reason.
+    """
+    exponent, u, is_power = response_exponent(pt, d)
+    if exponent + 3 * u < (CURVED if failed or is_power else STRONGLY_CURVED):
+        raise MeasureError(
+            "the camera's response is strongly curved, as with a gamma setting: the level means grow as a power of the light",
+            where="photon transfer",
+            value=f"exponent {exponent:.2f}",
+            allowed="about 1, a straight line",
+            remedy="set the camera's gamma to 1 and switch off contrast curves; check that the light is proportional to the exposure",
+        )
+
+
+def response_exponent(pt: PhotonTransfer, d: model.Levels) -> tuple[float, float, bool]:
+    """Exponent γ of mean = b + c light^γ by least squares, its standard uncertainty, and whether this fits far better than a cubic.
+
+    The black level b is free, so that dark current and the curve's start do not bend the result. Too few levels: (1, inf, False).
+    """
+    from scipy.optimize import minimize_scalar
+
+    unclipped = np.concatenate([np.zeros(pt.dark.mean_dn.size, bool), unclipped_bright(pt)])
+    above = d.mean - d.mean[~d.bright].mean()
+    share = above / max(float(above.max()), 1e-9)
+    at = unclipped & (share > CURVE_DARKEST) & (share < CURVE_BRIGHTEST) & (d.light > 0)
+    if at.sum() < CURVE_LEVELS or d.light[at].max() < 2 * d.light[at].min():
+        return 1.0, np.inf, False
+    light, signal = d.light[at] / d.light[at].max(), share[at]
+
+    def line(*columns: np.ndarray) -> tuple[np.ndarray, float]:
+        design = np.stack([np.ones_like(light), *columns], axis=1)
+        found = np.linalg.lstsq(design, signal, rcond=None)[0]
+        return found, float(((signal - design @ found) ** 2).sum())
+
+    gamma = float(minimize_scalar(lambda g: line(light**g)[1], bounds=(0.05, 3.0), method="bounded", options={"xatol": 1e-7}).x)
+    found, squares = line(light**gamma)
+    jacobian = np.stack([np.ones_like(light), light**gamma, found[1] * light**gamma * np.log(light)], axis=1)
+    u = float(np.sqrt(np.linalg.pinv(jacobian.T @ jacobian)[2, 2] * squares / (light.size - 3)))
+    return gamma, u, squares < POWER_CURVE * line(light, light**2, light**3)[1]
 
 
 def usable_levels(pt: PhotonTransfer, d: model.Levels) -> np.ndarray:

@@ -275,7 +275,11 @@ def _shading(surface: Surface, squares: _MeanSquares) -> Estimates:
     }
     w = np.array([v.ravel() for v in weights.values()])
     covariance = (w * variances.ravel()) @ w.T
-    covariance[-1, -1] += _not_round_var(along_x, along_y, coefficients, variances)
+    not_round = _not_round_var(along_x, along_y, coefficients, variances)
+    covariance[-1, -1] += not_round
+    reasons = {"shading_pp_rel": "cannot be negative: without any shading it comes out at a few u"}
+    if not_round:
+        reasons["shading_corner_rel"] = "the light falls off differently along x and y: u holds the difference"
     return Estimates(
         names=tuple(weights),
         values=w @ coefficients.ravel(),
@@ -284,7 +288,7 @@ def _shading(surface: Surface, squares: _MeanSquares) -> Estimates:
         units=("1/px", "1/px", "1", "1"),
         method=f"least-squares polynomial of total degree {surface.degree} in bright − dark",
         confounders=("slow non-uniformity of the sensor's response",),
-        reasons={"shading_pp_rel": "cannot be negative: without any shading it comes out at a few u"},
+        reasons=reasons,
     )
 
 

@@ -7,7 +7,6 @@ from collections.abc import Mapping
 import numpy as np
 
 from pixmetry.core.contribution import Contribution, Probe
-from pixmetry.core.errors import MeasureError
 from pixmetry.core.estimates import Estimates
 from pixmetry.core.observations import Observations
 from pixmetry.core.random import Stream
@@ -52,13 +51,12 @@ def forward(params: Shading, signal: Signal, stream: Stream) -> Signal:
 
 def measure(observations: Observations) -> Estimates:
     """Read gradient at the centre and loss to the corners from the smooth surface through the flat-field stack."""
-    fit = observations.spatial_fit
-    if fit is None or "shading_x_per_px" not in fit:
-        raise MeasureError(
-            "shading needs a stack of bright frames and one of dark frames", where="optics.shading", remedy="take at least 16 of each"
-        )
-    names = {"gradient_x_per_px": "shading_x_per_px", "gradient_y_per_px": "shading_y_per_px", "corner_rel": "shading_corner_rel"}
-    return fit.select(names)
+    return observations.fitted(
+        {"gradient_x_per_px": "shading_x_per_px", "gradient_y_per_px": "shading_y_per_px", "corner_rel": "shading_corner_rel"},
+        "shading needs a stack of bright frames and one of dark frames of the same exposure",
+        where="optics.shading",
+        remedy="take at least 16 of each",
+    )
 
 
 def correct(params: Shading, signal: Signal, maps: Mapping[str, np.ndarray]) -> Signal:

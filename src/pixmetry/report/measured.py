@@ -64,6 +64,7 @@ SPATIAL = {
     "prnu_col_rel": Quantity("PRNU, columns", "", PERCENT),
     "shading_x_per_px": Quantity("Shading, gradient in x", "", PER_1000_PX),
     "shading_y_per_px": Quantity("Shading, gradient in y", "", PER_1000_PX),
+    "shading_corner_rel": Quantity("Shading, loss to the corners", "", PERCENT),
     "shading_pp_rel": Quantity("Shading, peak to peak", "", PERCENT),
 }
 STANDARD_ONLY = {
