@@ -2,8 +2,8 @@
 
 Usage: python benchmarks/bench_memory.py [CAMPAIGN]   (default: a simulated campaign of 640 x 480 px, 12 bit)
 
-Each case runs in a process of its own; what is printed is its peak resident memory as the operating system counts it. The imports are those of
-a whole assessment, compiled kernels included: an assessment of frames of 64 x 48 px.
+Each case runs in a process of its own; what is printed is its peak resident memory as the operating system counts it. The imports
+are those of a whole assessment, compiled kernels included: an assessment of frames of 64 x 48 px.
 """
 
 from __future__ import annotations
@@ -17,7 +17,12 @@ from pixmetry.campaign import load_campaign, write_manifest
 from pixmetry.core.camera import build_camera, load_camera
 from pixmetry.simulation import simulate
 
-ASSESS = "import sys, resource; from pixmetry import assess; assess(sys.argv[1], sys.argv[2]); print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)"
+ASSESS = """
+import resource, sys
+from pixmetry import assess
+assess(sys.argv[1], sys.argv[2])
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
+"""
 
 
 def peak_mb(campaign: Path, folder: Path) -> float:

@@ -1,7 +1,8 @@
 """The mode `frozen` of the budget against the mode `exact`, target by target, on a chain with charge transfer and a badly terminated cable.
 
-Both see the same targets with the same random numbers. What `frozen` leaves out is the far context's deviation from the noise-free background, of
-which at most the stated share (`Camera.frozen_tail`) reaches a pixel. By the estimator's gradient that moves a target by at most
+Both see the same targets with the same random numbers. What `frozen` leaves out is the far context's deviation from the noise-free
+background, of which at most the stated share (`Camera.frozen_tail`) reaches a pixel. By the estimator's gradient that moves a target by at
+most
 
     share × Σ|g_i| × (largest deviation of the far signal, here eight standard deviations of the noise).
 """

@@ -96,7 +96,7 @@ def correct_files(
 
     def work(path: Path) -> tuple[Path, np.ndarray, dict[str, str]]:
         frame = read_frame(path)
-        check_frame(frame, str(path), bits=int(record["camera"]["bits"]), shape=tuple(camera.frame_shape))
+        check_frame(frame, str(path), bits=int(record["camera"]["bits"]), shape=camera.frame_shape)
         corrected, said = correct_signal(camera, _as_signal(frame, camera), maps)
         return path, corrected.data[0], said
 

@@ -66,4 +66,3 @@ def test_a_common_factor_does_not_move_a_centroid_whose_threshold_follows_it():
         weight, plain = np.maximum(gain * image - gain * threshold, 0), np.maximum(image - threshold, 0)
         found, before = (((w.sum(axis=1) * np.arange(25)).sum(axis=1) / w.sum(axis=(1, 2))) for w in (weight, plain))
         np.testing.assert_allclose(found, before, atol=1e-12)
-

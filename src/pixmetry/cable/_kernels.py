@@ -9,7 +9,7 @@ from pixmetry.core.jit import jit
 
 @jit
 def add_ghosts(data, rho, delay_px, count):
-    """Return (1 − ρ) Σ ρ^k y(x − kτ) along the rows; the held pixel value is linear between pixels, and the first pixel goes on to the left."""
+    """Return (1 − ρ) Σ ρ^k y(x − kτ) along the rows; y is linear between pixels, and the first pixel goes on to the left."""
     n, rows, cols = data.shape
     out = np.empty_like(data)
     weight = np.empty(count + 1, np.float64)

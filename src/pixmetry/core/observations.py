@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 import numpy as np
 
@@ -169,8 +170,9 @@ class PatternList:
 
     def strongest(self) -> PatternList:
         """The strongest alone (or none): the one that the budget has a row for; the others stay in the noise that they make."""
-        arrays = {f.name: getattr(self, f.name) for f in fields(self)}
-        return replace(self, **{name: value[:1] for name, value in arrays.items() if isinstance(value, np.ndarray)})
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        first: dict[str, Any] = {name: value[:1] for name, value in values.items() if isinstance(value, np.ndarray)}
+        return replace(self, **first)
 
     def __len__(self) -> int:
         return len(self.amplitude_dn)

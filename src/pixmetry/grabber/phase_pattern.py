@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -61,7 +62,7 @@ def _limit(found: PatternList) -> Estimates:
     """One-sided 95 % limit: the amplitude A found in half of all cases plus 1.645 u, with u = A/√(2z) at a threshold of z mean powers."""
     half = np.nanmax([found.fixed_limit_dn, found.moving_limit_dn])
     u = float(half / math.sqrt(2 * math.log(max(found.n_searched, 1) / found.false_alarm_rate)))
-    worst = SOURCE.bound  # the frequency of a wave that was not found is not known
+    worst: Any = SOURCE.bound  # the frequency of a wave that was not found is not known
     return Estimates.from_rows(
         [
             ("amplitude_dn", float(half) + 1.645 * u, u, math.inf, "DN"),

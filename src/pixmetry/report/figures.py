@@ -174,7 +174,15 @@ def signal_to_noise(seen: Observations) -> Picture:
             limit = f"1/PRNU = {significant(1 / prnu, 2)}"
             axes.axhline(1 / prnu, color=AMBER, linewidth=0.8, linestyle="-.", label=limit)
             words = f" Uncorrected, fixed patterns hold it below {limit}."
-        axes.plot(mean[var > 0] / curve.gain, mean[var > 0] / np.sqrt(var[var > 0]), "o", color=INK, markerfacecolor="none", markeredgewidth=0.7, label="measured")
+        axes.plot(
+            mean[var > 0] / curve.gain,
+            mean[var > 0] / np.sqrt(var[var > 0]),
+            "o",
+            color=INK,
+            markerfacecolor="none",
+            markeredgewidth=0.7,
+            label="measured",
+        )
         axes.set_xscale("log")
         axes.set_yscale("log")
         axes.set_ylim(bottom=max(0.03, float((electrons / noise)[0])))

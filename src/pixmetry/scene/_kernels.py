@@ -17,9 +17,9 @@ WEIGHTS = 0.5 * np.array([5.0 / 9.0, 8.0 / 9.0, 5.0 / 9.0])
 def add_discs(out, x, y, entry, row0, col0, profile, step, inner, outer, peak, split):
     """Add discs to windows in place.
 
-    ``entry[k]`` is the window that disc ``k`` falls into, ``(x[k], y[k])`` its centre in absolute pixels, ``peak[k]`` its height. ``profile`` is
-    the blurred disc against radius, at spacing ``step``; it is 1 inside ``inner`` and 0 outside ``outer``. A pixel is integrated on
-    ``split`` × ``split`` cells of 3 × 3 Gauss–Legendre nodes.
+    ``entry[k]`` is the window that disc ``k`` falls into, ``(x[k], y[k])`` its centre in absolute pixels, ``peak[k]`` its height.
+    ``profile`` is the blurred disc against radius, at spacing ``step``; it is 1 inside ``inner`` and 0 outside ``outer``. A pixel is
+    integrated on ``split`` × ``split`` cells of 3 × 3 Gauss–Legendre nodes.
     """
     rows, cols = out.shape[1], out.shape[2]
     half = 0.7072  # from the centre of a pixel to its corner
