@@ -28,6 +28,7 @@ def test_the_python_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
 
 def test_the_yaml_examples_are_valid(tmp_path: Path) -> None:
+    assert len(blocks("yaml")) == 3
     for i, text in enumerate(blocks("yaml")):
         path = tmp_path / f"{i}.yaml"
         path.write_text(text)

@@ -35,7 +35,6 @@ from pixmetry.report.page import write_report
 from pixmetry.results import Assessment
 
 KIND = "assessment"
-LIMIT_RMS = np.sqrt(1 / 3)  # rms of a quantity that is spread evenly between 0 and its upper limit, over that limit
 
 Progress = Callable[[str, int, int], None]
 
@@ -196,4 +195,4 @@ def digital_twin(campaign: Campaign, estimates: dict[str, Estimates], observatio
 def best_values(estimates: Estimates) -> dict[str, float]:
     """Return values for a simulation: estimates as they are; nothing of what is not significant, but for dark noise that rounding hides."""
     hidden = {"white_e"}  # the rms of an even spread up to its limit
-    return {e.name: e.value if e.kind == "value" else e.value * LIMIT_RMS * (e.name in hidden) for e in estimates}
+    return {e.name: e.representative if e.kind == "value" or e.name in hidden else 0.0 for e in estimates}

@@ -105,7 +105,8 @@ def test_a_declared_order_that_is_broken_is_refused_both_ways() -> None:
 
 
 def test_what_is_switched_off_is_not_checked() -> None:
-    camera(TO_ELECTRONS, SHOT, Element("off", IDEAL[Kind.DN], Nothing(), on=False))
+    built = camera(TO_ELECTRONS, SHOT, Element("off", IDEAL[Kind.DN], Nothing(), on=False))
+    assert [e.name for e in built.chain if not e.on] == ["off"]
 
 
 def test_a_frame_without_pixels_and_a_window_outside_are_refused() -> None:

@@ -65,7 +65,7 @@ def test_symmetric_targets_have_an_s_curve_and_no_bias():
 
 
 def test_wide_targets_do_not_move():
-    assert SOURCE.propagate(SOURCE.bound, spot_probe(sigma=2.0)).u_px < 1e-5
+    assert SOURCE.propagate(SOURCE.bound, spot_probe(sigma=2.0)).total_px < 1e-5
 
 
 def test_measured_from_the_joint_fit():

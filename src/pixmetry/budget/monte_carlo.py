@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from pixmetry.budget.probe import Facts, Target, background_of, facts_of, resolve, scene_of, window_side
+from pixmetry.budget.probe import Facts, Target, background_of, facts_of, resolve, scene_of, spread_windows, window_side
 from pixmetry.core.camera import Camera
 from pixmetry.core.errors import ChainError, InputError
 from pixmetry.core.random import Grid, Streams
@@ -243,12 +243,10 @@ def _level(camera: Camera, facts: Facts, target: Target, side: int, above_dn: fl
     """Grey value of uniform light that lies ``above_dn`` (linear) above the target's background."""
     background = background_of(target, facts)
     light = replace(background, level_photons=background.level_photons + above_dn / facts.dn_per_photon)
-    step = np.arange(windows)
-    row0 = (step * 0.6180339887 % 1 * (camera.frame_shape[0] - side + 1)).astype(np.int64)
-    col0 = (step * 0.7548776662 % 1 * (camera.frame_shape[1] - side + 1)).astype(np.int64)
+    grid = spread_windows(camera.frame_shape, side, windows)
     data = camera.expose_windows(
         light,
-        Grid(step, row0, col0, (side, side)),
+        grid,
         mode="frozen",
         background=background,
         exposure_s=facts.exposure_s,

@@ -34,7 +34,7 @@ def with_estimates(source: Source, base: Any, estimates: Estimates) -> Any:
     for e in estimates:
         if e.name not in source.parameters.model_fields:
             raise InputError(f"{e.name} is no parameter of {source.id}", allowed=", ".join(source.parameters.model_fields))
-        values[e.name] = e.value / np.sqrt(3) if e.kind == "upper_limit" else e.value
+        values[e.name] = e.representative
     return source.make({**base.model_dump(), **values}, where=source.id)
 
 

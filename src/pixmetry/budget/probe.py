@@ -251,13 +251,19 @@ def _saturation(camera: Camera, gain_dn_per_e: float, bits: int) -> float:
     return float(min(limits))
 
 
+def spread_windows(frame_shape: tuple[int, int], side: int, count: int) -> Grid:
+    """Square windows of frames 0, 1, 2 … spread evenly over the frame (additive recurrence with irrational steps)."""
+    step = np.arange(count)
+    row0 = (step * 0.6180339887 % 1 * (frame_shape[0] - side + 1)).astype(np.int64)
+    col0 = (step * 0.7548776662 % 1 * (frame_shape[1] - side + 1)).astype(np.int64)
+    return Grid(step, row0, col0, (side, side))
+
+
 def _noise(camera: Camera, background_photons: float, windows: int = 128) -> float:
     side = min(16, *camera.frame_shape)
     scene = Uniform(background_photons)
-    step = np.arange(windows)
-    row0 = (step * 0.6180339887 % 1 * (camera.frame_shape[0] - side + 1)).astype(np.int64)
-    col0 = (step * 0.7548776662 % 1 * (camera.frame_shape[1] - side + 1)).astype(np.int64)
-    data = camera.expose_windows(scene, Grid(step, row0, col0, (side, side)), mode="frozen", background=scene).astype(float)
+    grid = spread_windows(camera.frame_shape, side, windows)
+    data = camera.expose_windows(scene, grid, mode="frozen", background=scene).astype(float)
     residual = (data - data.mean(axis=(1, 2), keepdims=True)).ravel()
     for _ in range(4):
         residual = residual[np.abs(residual) <= 4 * residual.std() + 1e-12]

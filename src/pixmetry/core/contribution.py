@@ -41,11 +41,6 @@ class Contribution:
     method: str = ""
 
     @property
-    def u_px(self) -> float:
-        """Root mean square of the standard uncertainties in x and y."""
-        return float(np.sqrt(0.5 * (self.u_x_px**2 + self.u_y_px**2)))
-
-    @property
     def total_px(self) -> float:
         """Root mean square over x and y of random part and bias together."""
         return float(np.sqrt(0.5 * (self.u_x_px**2 + self.u_y_px**2 + self.bias_x_px**2 + self.bias_y_px**2)))

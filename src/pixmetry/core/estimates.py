@@ -28,6 +28,11 @@ class Estimate:
     kind: str = "value"
     reason: str = ""
 
+    @property
+    def representative(self) -> float:
+        """The value to calculate with: of an upper limit L the root mean square L/√3 of an even spread between 0 and L."""
+        return self.value / 3**0.5 if self.kind == "upper_limit" else self.value
+
 
 @dataclass(frozen=True)
 class Estimates:

@@ -171,10 +171,6 @@ class Stream:
         """
         return self._poisson(self._key("exposure", "poisson", draw), mean, grid)
 
-    def poisson_fixed(self, mean: ArrayLike, grid: Grid, draw: int = 0) -> NDArray[np.float32]:
-        """Return Poisson numbers like `poisson`, fixed in the unit."""
-        return self._poisson(self._key("unit", "poisson", draw), mean, _still(grid))
-
     def add_normal(self, data: ArrayLike, grid: Grid, scale: ArrayLike, draw: int = 0) -> NDArray[np.float32]:
         """Return ``data + scale * self.normal(grid, draw)`` in one pass.
 

@@ -22,7 +22,7 @@ import numpy as np
 
 from pixmetry.core.config import Model
 from pixmetry.core.contribution import Contribution, Probe
-from pixmetry.core.errors import InputError, ParameterError
+from pixmetry.core.errors import InputError
 from pixmetry.core.estimates import Estimates
 from pixmetry.core.observations import Observations
 from pixmetry.core.random import Stream
@@ -155,13 +155,6 @@ class Source:
         from pixmetry.core.config import validate
 
         return validate(self.parameters, dict(values or {}), where or self.id)
-
-    def check_kind(self, signal: Signal) -> None:
-        """Refuse a signal of a kind that this source does not take."""
-        if signal.kind not in self.consumes:
-            raise ParameterError(
-                f"{self.id} cannot act on {signal.kind}", allowed=", ".join(self.consumes), remedy="put it elsewhere in the chain"
-            )
 
 
 def run(source: Source, params: Any, signal: Signal, stream: Stream, state: Any = None) -> tuple[Signal, Any]:

@@ -20,6 +20,7 @@ from pixmetry.core.observations import (
     Spectra,
     StackMoments,
 )
+from pixmetry.core.threads import single_threaded_blas
 from pixmetry.experiment.defects import find_defects
 from pixmetry.experiment.histogram import HistogramAccumulator, code_errors, sweep_histogram
 from pixmetry.experiment.linearity import Linearity
@@ -105,14 +106,16 @@ def observe(groups: Iterable[Group], bits: int, temperature_c: float | None = No
     dark_stack, bright_stack = (None if s is None else s.moments for s in (dark, bright))
     transfer = _photon_transfer(levels, shape, bits)
     codes = _codes(sweep_histogram(sweep, bits), notes)
-    fit = fit_photon_transfer(transfer, dark_stack, bright_stack, _dnl_lsb(codes))
+    with single_threaded_blas():
+        fit = fit_photon_transfer(transfer, dark_stack, bright_stack, _dnl_lsb(codes))
     if dark and not bright:
         notes.append("no stack of bright frames: DSNU and PRNU are not measured (take 16 or more at half of saturation)")
     if dark and bright and not _same_exposure(dark, bright):
         notes.append(_unpaired(dark, bright))
         bright = bright_stack = None  # a dark map of another exposure holds another dark current: their difference is not the light's
     dark_spectra, bright_spectra = (None if s is None else s.spectra for s in (dark, bright))
-    defects, spatial, patterns = _spatial(dark_stack, bright_stack, dark_spectra, Linearity.of(fit, bits), _dnl_lsb(codes), notes)
+    with single_threaded_blas():
+        defects, spatial, patterns = _spatial(dark_stack, bright_stack, dark_spectra, Linearity.of(fit, bits), _dnl_lsb(codes), notes)
     return Observations(
         photon_transfer=transfer,
         photon_transfer_fit=fit,

@@ -14,8 +14,6 @@ from pixmetry.experiment.photon_transfer_model import QUANTISATION_DN2, signal_f
 from pixmetry.report.drawing import AMBER, BLUE, INK, RED, SOFT, Picture, canvas, draw_map, line, picture, plain_log
 from pixmetry.report.numbers import significant
 
-LIMIT_RMS = np.sqrt(1 / 3)  # rms of an even spread between 0 and an upper limit, over that limit
-
 
 @dataclass(frozen=True)
 class Curve:
@@ -49,7 +47,7 @@ def _size(fit: Estimates | None, name: str) -> float:
     """A value; of an upper limit its rms; 0 where it was not measured."""
     if fit is None or name not in fit:
         return 0.0
-    return fit[name].value * (LIMIT_RMS if name in fit.limits else 1.0)
+    return fit[name].representative
 
 
 def _series(seen: Observations) -> tuple[PhotonTransfer, Estimates]:
