@@ -11,6 +11,7 @@ import numpy as np
 
 from pixmetry.core.camera import Camera, Element
 from pixmetry.core.contribution import Probe
+from pixmetry.core.light import Points
 from pixmetry.core.random import Grid
 from pixmetry.core.signal import Kind
 from pixmetry.core.source import Parameters, Source
@@ -70,16 +71,18 @@ IDEAL = {
     Kind.DN: make_source("grabber.ideal_adc", _to_codes, (Kind.DN,), produces=Kind.CODES),
 }
 ORDER = (Kind.PHOTONS, Kind.ELECTRONS, Kind.DN, Kind.CODES)
+SAMPLED = {Kind.LIGHT: Kind.PHOTONS, Kind.VIDEO: Kind.DN}  # what the camera makes of a kind that is not sampled yet
 
 
 def lead_in(kind: Kind) -> list[Element]:
     """Ideal conversions from photons up to a kind."""
+    kind = SAMPLED.get(kind, kind)
     return [Element(IDEAL[k].id, IDEAL[k], Nothing()) for k in ORDER[: ORDER.index(kind)]]
 
 
 def kind_of(source: Source) -> Kind:
     """The earliest kind that a source takes."""
-    return next(k for k in ORDER if k in source.consumes)
+    return next(k for k in (Kind.LIGHT, *ORDER, Kind.VIDEO) if k in source.consumes)
 
 
 def camera_with(
@@ -93,7 +96,7 @@ def camera_with(
 def to_dn(data: np.ndarray, kind: Kind) -> np.ndarray:
     """Bring the output of a chain to DN by the ideal conversions."""
     factor = {Kind.PHOTONS: ETA * K_DN_PER_E, Kind.ELECTRONS: K_DN_PER_E, Kind.DN: 1.0, Kind.CODES: 1.0}
-    return data.astype(float) * factor[kind]
+    return data.astype(float) * factor[SAMPLED.get(kind, kind)]
 
 
 @dataclass(frozen=True)
@@ -102,6 +105,11 @@ class Texture:
 
     mean_dn: float = 110.0
     contrast: float = 0.8
+    moving = True
+
+    def radiance(self, at: Points) -> np.ndarray:
+        wave = np.sin(0.31 * at.y_px + 0.7 * (at.frame % 7)) * np.cos(0.23 * at.x_px)
+        return self.mean_dn / (ETA * K_DN_PER_E) * (1 + self.contrast * wave)
 
     def photons(self, grid: Grid, frame_shape: tuple[int, int], exposure_s: np.ndarray, time_s: np.ndarray) -> np.ndarray:
         rows = grid.row0[:, None, None] + np.arange(grid.shape[0])[:, None]
@@ -115,6 +123,9 @@ class Flat:
     """The same light everywhere, in DN of the ideal camera."""
 
     level_dn: float
+
+    def radiance(self, at: Points) -> np.ndarray:
+        return np.full(at.x_px.shape, self.level_dn / (ETA * K_DN_PER_E))
 
     def photons(self, grid: Grid, frame_shape: tuple[int, int], exposure_s: np.ndarray, time_s: np.ndarray) -> np.ndarray:
         return np.full(grid.size, self.level_dn / (ETA * K_DN_PER_E), np.float32)
@@ -157,6 +168,13 @@ class Targets:
     y_px: np.ndarray
     peak_dn: float = 150.0
     background_dn: float = 10.0
+    moving = True
+    smooth_px = 0.7
+
+    def radiance(self, at: Points) -> np.ndarray:
+        radius, height = _profile()
+        r = np.hypot(at.x_px - self.x_px[at.frame], at.y_px - self.y_px[at.frame])
+        return (self.background_dn + self.peak_dn * np.interp(r, radius, height, right=0.0)) / (ETA * K_DN_PER_E)
 
     def photons(self, grid: Grid, frame_shape: tuple[int, int], exposure_s: np.ndarray, time_s: np.ndarray) -> np.ndarray:
         out = np.full(grid.size, self.background_dn, float)

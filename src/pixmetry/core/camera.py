@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from pixmetry.core._camera_kernels import cut_windows
+from pixmetry.core.conversions import Link, conversion, linked
 from pixmetry.core.errors import ChainError, InputError
+from pixmetry.core.light import Light, Scene
 from pixmetry.core.random import Grid, Streams
-from pixmetry.core.signal import Kind, Signal, Windows
+from pixmetry.core.signal import Clock, Kind, Signal, Windows
 from pixmetry.core.source import Source, run
 from pixmetry.core.threads import imap_tiles, map_tiles
 
@@ -20,13 +23,6 @@ TILE_PIXELS = 1 << 16  # of float32: a tile and its copies stay in the second-le
 BATCH_PIXELS = 1 << 18  # of the small windows that are run as one batch: enough that the calls cost little beside the work
 BAND_ROWS = 16  # tiles of whole frames are bands of a multiple of this, the largest block of a codec
 SCHEMA = "pixmetry/camera/1"
-
-
-class Scene(Protocol):
-    """What falls on the sensor: mean photons per pixel and exposure, for any windows of any frames."""
-
-    def photons(self, grid: Grid, frame_shape: tuple[int, int], exposure_s: np.ndarray, time_s: np.ndarray) -> np.ndarray:
-        """Return float32 photons, shape (n, rows, cols); ``exposure_s`` and ``time_s`` have shape (n,)."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +49,11 @@ class Camera:
     pitch_um : (float, float), optional
         Pixel pitch in x and y.
     exposure_s, temperature_c : float
-        The default schedule.
+        The default schedule; the temperature is that of the sensor when it has settled.
+    warm_up_k, warm_up_s : float
+        How much colder the sensor is at time 0, and the time constant with which it warms up.
+    pixel_clock_hz, line_period_s : float
+        Of the read-out; CCIR unless told otherwise.
     unit_seed : int
         What this unit's fixed patterns are drawn from: another seed is another camera of the same type.
     facts : mapping
@@ -73,6 +73,10 @@ class Camera:
     temperature_c: float = 20.0
     unit_seed: int = 0
     facts: Mapping[str, Any] = field(default_factory=dict)
+    warm_up_k: float = 0.0
+    warm_up_s: float = 1800.0
+    pixel_clock_hz: float = 14.1875e6
+    line_period_s: float = 64e-6
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "chain", tuple(self.chain))
@@ -110,6 +114,16 @@ class Camera:
         """The elements that are on."""
         return tuple(e for e in self.chain if e.on)
 
+    @cached_property
+    def links(self) -> tuple[Link, ...]:
+        """The running chain: the elements that are on, and the conversions between them."""
+        return linked(self.active, self.frame_shape, self.pixel_clock_hz)
+
+    @property
+    def output_shape(self) -> tuple[int, int]:
+        """Rows and columns of the frames that it puts out; a grabber's may differ from the sensor's."""
+        return self.links[-1].shape_out if self.links else self.frame_shape
+
     # ---- running --------------------------------------------------------------------------------------------------------------
 
     def streams(self, seed: int, quiet: bool = False) -> Streams:
@@ -124,9 +138,17 @@ class Camera:
         exposure = np.broadcast_to(np.asarray(self.exposure_s if exposure_s is None else exposure_s, float), (n,))
         period = self.facts.get("frame_period_s", 0.04) if frame_period_s is None else frame_period_s
         time = grid.frame * float(period)
-        temperature = np.broadcast_to(np.asarray(self.temperature_c if temperature_c is None else temperature_c, float), (n,))
-        photons = scene.photons(grid, self.frame_shape, exposure, time)
-        return Signal(np.ascontiguousarray(photons, np.float32), Kind.PHOTONS, grid, self.frame_shape, exposure, time, temperature)
+        if temperature_c is None:
+            temperature = self.temperature_c - self.warm_up_k * np.exp(-time / self.warm_up_s)
+        else:
+            temperature = np.broadcast_to(np.asarray(temperature_c(time) if callable(temperature_c) else temperature_c, float), (n,))
+        clock = Clock(self.pixel_clock_hz, self.line_period_s)
+        if self.links and Kind.LIGHT in self.links[0].source.consumes:
+            light = Light(scene, grid, self.frame_shape, exposure, time)
+            nothing = np.broadcast_to(np.float32(0), grid.size)
+            return Signal(nothing, Kind.LIGHT, grid, self.frame_shape, exposure, time, temperature, clock, light)
+        photons = np.ascontiguousarray(scene.photons(grid, self.frame_shape, exposure, time), np.float32)
+        return Signal(photons, Kind.PHOTONS, grid, self.frame_shape, exposure, time, temperature, clock)
 
     def expose(
         self,
@@ -152,7 +174,7 @@ class Camera:
         quiet : bool
             Every temporal draw at its mean: the expected frame of this unit.
         **schedule
-            ``exposure_s``, ``temperature_c``, ``frame_period_s``.
+            ``exposure_s``, ``temperature_c`` (a number, or a function of time), ``frame_period_s``.
 
         Returns
         -------
@@ -176,7 +198,7 @@ class Camera:
         **schedule: Any,
     ) -> Iterator[Signal]:
         """Expose frames one after the other, in order, with only a few in flight; see `expose`."""
-        rows, cols = self.frame_shape
+        rows, cols = self.output_shape
         r0, c0, h, w = (0, 0, rows, cols) if window is None else window
         if not (r0 >= 0 and c0 >= 0 and h > 0 and w > 0 and r0 + h <= rows and c0 + w <= cols):
             raise InputError("the window does not lie in the frame", value=window, allowed=f"within {rows} rows and {cols} columns")
@@ -184,13 +206,13 @@ class Camera:
         if any(np.size(v) > 1 for v in schedule.values()):
             raise InputError("a series has one schedule for all its frames", value=", ".join(schedule), remedy="expose frame by frame")
         task = _Task(scene, self.streams(seed, quiet), schedule, threads)
-        last_memory = max((i for i, e in enumerate(self.active) if _remembers(e)), default=-1)
+        last_memory = max((i for i, e in enumerate(self.links) if e.remembers), default=-1)
 
         def grid_of(number: int) -> Grid:
             return Grid(np.array([number]), np.array([r0]), np.array([c0]), (h, w))
 
         def whole(number: int) -> Signal:
-            return self._run(task, grid_of(number), self.active)
+            return self._run(task, grid_of(number), self.links)
 
         if last_memory >= 0:
             yield from self._with_memory(task, numbers, grid_of, last_memory)
@@ -203,13 +225,13 @@ class Camera:
         """Run frames 0, 1, 2 … in order through everything up to the last source with a memory, the rest as far as it is wanted."""
         if numbers and (min(numbers) < 0 or numbers != sorted(set(numbers))):
             raise InputError("a camera with a memory needs frame numbers that rise from 0", value=numbers[:5])
-        head, tail = self.active[: last_memory + 1], self.active[last_memory + 1 :]
-        first = next(i for i, e in enumerate(head) if _remembers(e))
+        head, tail = self.links[: last_memory + 1], self.links[last_memory + 1 :]
+        first = next(i for i, e in enumerate(head) if e.remembers)
         wanted = set(numbers)
         before = head[:first]
 
         def prepared(number: int) -> tuple[int, list[Windows], Signal]:
-            needs = self._needs(self.active, Windows.of(grid_of(number)))
+            needs = self._needs(self.links, Windows.of(grid_of(number)))
             window = needs[first]
             grid = Grid(np.array([number]), window.row0, window.col0, (int(window.rows[0]), int(window.cols[0])))
             return number, needs, self._run(task, grid, before)
@@ -255,15 +277,15 @@ class Camera:
         if mode not in ("exact", "frozen"):
             raise InputError("no such mode", value=mode, allowed="exact, frozen")
         frozen = self._freeze(background, schedule) if mode == "frozen" else None
-        if frozen is None and any(_remembers(e) for e in self.active):
+        if frozen is None and any(e.remembers for e in self.links):
             raise InputError("a source with a memory cannot be run on single windows exactly", remedy="use iter_frames, or mode='frozen'")
         task = _Task(scene, self.streams(seed, quiet), schedule, threads, frozen)
         step = max(1, BATCH_PIXELS // max(1, grid.shape[0] * grid.shape[1]))
-        groups = _equal_sizes(self._needs(self.active, Windows.of(grid), frozen is not None))
+        groups = _equal_sizes(self._needs(self.links, Windows.of(grid), frozen is not None))
         spans = [group[a : a + step] for group in groups for a in range(0, len(group), step)]
 
         def part(index: np.ndarray) -> np.ndarray:
-            return self._run(task.take(index), _sub_grid(grid, index), self.active).data
+            return self._run(task.take(index), _sub_grid(grid, index), self.links).data
 
         parts = map_tiles(part, spans, threads)
         if not parts:
@@ -272,24 +294,24 @@ class Camera:
 
     def frozen_tail(self) -> float:
         """Largest share of a pixel's signal that the mode ``frozen`` takes from the noise-free frame, over all sources."""
-        return float(sum(e.source.tail(e.params) for e in self.active if e.source.tail is not None))
+        return float(sum(e.source.tail(e.params) for e in self.links if e.far))
 
     # ---- the walk -------------------------------------------------------------------------------------------------------------
 
-    def _needs(self, elements: Sequence[Element], windows: Windows, frozen: bool = False) -> list[Windows]:
+    def _needs(self, elements: Sequence[Link], windows: Windows, frozen: bool = False) -> list[Windows]:
         """Return the input windows of every element, and the output windows as the last entry."""
         needs = [windows]
         for element in reversed(elements):
             source, params = element.source, element.params
-            if frozen and _remembers(element):
+            if frozen and element.remembers:
                 needs.append(needs[-1])
-            elif frozen and source.near is not None:
-                needs.append(needs[-1].expand(*source.near(params), self.frame_shape))
+            elif frozen and element.far:
+                needs.append(element.nearby(needs[-1]))
             else:
-                needs.append(source.window_needed(params, needs[-1], self.frame_shape))
+                needs.append(source.window_needed(params, needs[-1], element.shape))
         return needs[::-1]
 
-    def _run(self, task: _Task, grid: Grid, elements: Sequence[Element]) -> Signal:
+    def _run(self, task: _Task, grid: Grid, elements: Sequence[Link]) -> Signal:
         """Render and run a batch; entries whose context has another size (at the frame's border) are run apart."""
         needs = self._needs(elements, Windows.of(grid), task.frozen is not None)
         order = _equal_sizes(needs)
@@ -298,12 +320,12 @@ class Camera:
         parts = [self._run_equal(task.take(i), _sub_grid(grid, i), elements, [w.take(i) for w in needs]) for i in order]
         return _concatenate(parts).take(np.argsort(np.concatenate(order)))
 
-    def _run_equal(self, task: _Task, grid: Grid, elements: Sequence[Element], needs: list[Windows]) -> Signal:
+    def _run_equal(self, task: _Task, grid: Grid, elements: Sequence[Link], needs: list[Windows]) -> Signal:
         if len(grid.frame) == 1 and task.frozen is None:
             return self._run_bands(task, grid, elements, needs)
         return self._walk(task, self.signal(task.scene, _grid_at(grid, needs[0]), **task.schedule), elements, needs)
 
-    def _walk(self, task: _Task, signal: Signal, elements: Sequence[Element], needs: list[Windows]) -> Signal:
+    def _walk(self, task: _Task, signal: Signal, elements: Sequence[Link], needs: list[Windows]) -> Signal:
         """Run the elements over the windows of ``needs`` one after the other."""
         for element, needed in zip(elements, needs, strict=False):
             stream = task.streams.of(element.name)
@@ -313,7 +335,7 @@ class Camera:
                 signal, _ = run(element.source, element.params, signal.crop(needed), stream)
         return signal.crop(needs[-1])
 
-    def _run_bands(self, task: _Task, grid: Grid, elements: Sequence[Element], needs: list[Windows]) -> Signal:
+    def _run_bands(self, task: _Task, grid: Grid, elements: Sequence[Link], needs: list[Windows]) -> Signal:
         """Run one large window in bands that stay in the cache, as far as the sources allow: by rows, by columns, or whole.
 
         Sources that follow each other and allow the same kind of band are run together, band by band.
@@ -324,7 +346,7 @@ class Camera:
             axis, end = self._segment(elements, at, needs[at])
             segment = elements[at:end]
 
-            def band(windows: Windows, segment: Sequence[Element] = segment, source: Signal | None = signal) -> Signal:
+            def band(windows: Windows, segment: Sequence[Link] = segment, source: Signal | None = signal) -> Signal:
                 local = self._needs(segment, windows)
                 part = source.crop(local[0]) if source is not None else self.signal(task.scene, _grid_at(grid, local[0]), **task.schedule)
                 return self._walk(task, part, segment, local)
@@ -334,14 +356,14 @@ class Camera:
             at = end
         return signal
 
-    def _segment(self, elements: Sequence[Element], start: int, windows: Windows) -> tuple[int | None, int]:
+    def _segment(self, elements: Sequence[Link], start: int, windows: Windows) -> tuple[int | None, int]:
         """Return along which axis bands can be cut from element ``start`` on (0 rows, 1 columns, None whole), and how far."""
         best: tuple[int | None, int] = (None, start + 1)
         for axis in (0, 1):
             probe = _bands(windows, axis, probe=True)
             end = start
             while end < len(elements) and all(
-                elements[end].source.window_needed(elements[end].params, p, self.frame_shape).equals(p) for p in probe
+                _same_span(elements[end].source.window_needed(elements[end].params, p, elements[end].shape), p, axis) for p in probe
             ):
                 end += 1
             if end > start and (best[0] is None or end > best[1]):
@@ -352,7 +374,7 @@ class Camera:
 
     def _freeze(self, background: Scene | None, schedule: Mapping[str, Any]) -> _Frozen:
         """Run the noise-free background frame once and keep what sources with a far context need of it."""
-        far = [e.name for e in self.active if e.source.near is not None or _remembers(e)]
+        far = [e.name for e in self.links if e.far or e.remembers]
         if not far:
             return _Frozen({})
         if background is None:
@@ -365,10 +387,10 @@ class Camera:
         }
         signal = self.signal(background, grid, **scalars)
         kept: dict[str, tuple[Signal, Signal, Any]] = {}
-        for element in self.active:
+        for element in self.links:
             stream = streams.of(element.name)
             before, state = signal, None
-            if _remembers(element):
+            if element.remembers:
                 state = _settled(element, signal, stream)
             signal, _ = run(element.source, element.params, signal, stream, state)
             if element.name in far:
@@ -383,6 +405,8 @@ class Camera:
         if self.pitch_um is not None:
             record |= {"pitch_x_um": self.pitch_um[0], "pitch_y_um": self.pitch_um[1]}
         record |= {"exposure_s": self.exposure_s, "temperature_c": self.temperature_c, "unit_seed": self.unit_seed}
+        optional = ("warm_up_k", "warm_up_s", "pixel_clock_hz", "line_period_s")
+        record |= {n: getattr(self, n) for n in optional if getattr(self, n) != type(self).__dataclass_fields__[n].default}
         record["facts"] = dict(self.facts)
         record["chain"] = [
             {"source": e.source.id, **({"name": e.name} if e.name != e.source.id else {}), **({} if e.on else {"enabled": False})}
@@ -470,11 +494,11 @@ class _Frozen:
 
     elements: Mapping[str, tuple[Signal, Signal, Any]]
 
-    def apply(self, element: Element, signal: Signal, stream: Any) -> Signal:
+    def apply(self, element: Link, signal: Signal, stream: Any) -> Signal:
         """Run a source on the near context, and correct for the far one by the same run on the noise-free frame."""
         before, after, state = self.elements[element.name]
         out, _ = run(element.source, element.params, signal, stream, state)
-        if _remembers(element):
+        if element.remembers:
             return out
         near = _cut(before, signal)
         quiet, _ = run(element.source, element.params, near, stream)
@@ -487,12 +511,7 @@ def _cut(frame: Signal, like: Signal) -> Signal:
     return like.with_data(data, frame.kind)
 
 
-def _remembers(element: Element) -> bool:
-    """Whether a source has a memory with these parameters."""
-    return element.source.start is not None and element.source.start(element.params) is not None
-
-
-def _settled(element: Element, signal: Signal, stream: Any, most: int = 400) -> Any:
+def _settled(element: Link, signal: Signal, stream: Any, most: int = 400) -> Any:
     """Run a source with a memory over the same frame until its state no longer changes."""
     source: Any = element.source
     state = source.start(element.params)
@@ -520,6 +539,12 @@ def _equal_sizes(needs: list[Windows]) -> list[np.ndarray]:
 
 def _grid_at(grid: Grid, windows: Windows) -> Grid:
     return Grid(grid.frame, windows.row0, windows.col0, (int(windows.rows[0]), int(windows.cols[0])))
+
+
+def _same_span(needed: Windows, given: Windows, axis: int) -> bool:
+    """Whether a source needs just the rows (axis 0) or columns (axis 1) that it makes."""
+    names = ("row0", "rows") if axis == 0 else ("col0", "cols")
+    return all(np.array_equal(getattr(needed, f), getattr(given, f)) for f in names)
 
 
 def _bands(windows: Windows, axis: int | None, probe: bool = False) -> list[Windows]:
@@ -550,8 +575,7 @@ def _concatenate(parts: list[Signal]) -> Signal:
         return np.concatenate([getattr(p if name in _ARRAYS else p.grid, name) for p in parts])
 
     grid = Grid(joined("frame"), joined("row0"), joined("col0"), parts[0].grid.shape)
-    data, exposure_s, time_s, temperature_c = (joined(name) for name in _ARRAYS)
-    return Signal(data, parts[0].kind, grid, parts[0].frame_shape, exposure_s, time_s, temperature_c)
+    return replace(parts[0], grid=grid, **{name: joined(name) for name in _ARRAYS})
 
 
 _ARRAYS = ("data", "exposure_s", "time_s", "temperature_c")  # of a signal, one entry per window
@@ -569,13 +593,17 @@ def check_chain(chain: Sequence[Element], where: str = "camera") -> None:
     for name in names:
         if names.count(name) > 1:
             raise ChainError(f"the name {name!r} is used twice", where=where, remedy="give each source a name of its own")
-    kind = Kind.PHOTONS
+    first = next((e.source for e in chain if e.on), None)
+    kind = Kind.LIGHT if first is not None and Kind.LIGHT in first.consumes else Kind.PHOTONS
     for i, element in enumerate(chain):
         source = element.source
         if not element.on:
             continue
         if source.forward is None:
             raise ChainError(f"{element.name} cannot stand in a camera: {source.reasons['forward']}", where=where, remedy="take it out")
+        step = conversion(kind, source.consumes)
+        if step is not None:
+            kind = step.produces
         if kind not in source.consumes:
             raise ChainError(
                 f"{element.name} cannot follow: it takes {', '.join(source.consumes)} and gets {kind}",
@@ -652,6 +680,10 @@ def build_camera(record: Mapping[str, Any], where: str = "camera") -> Camera:
         checked.temperature_c,
         checked.unit_seed,
         checked.facts,
+        checked.warm_up_k,
+        checked.warm_up_s,
+        checked.pixel_clock_hz,
+        checked.line_period_s,
     )
 
 

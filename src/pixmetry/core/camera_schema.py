@@ -29,6 +29,10 @@ class CameraRecord(Model):
     pitch_y_um: float | None = Field(default=None, gt=0)
     exposure_s: float = Field(default=0.01, gt=0)
     temperature_c: float = Field(default=20.0, gt=-273.15)
+    warm_up_k: float = Field(default=0.0, ge=-200, le=200)
+    warm_up_s: float = Field(default=1800.0, gt=0)
+    pixel_clock_hz: float = Field(default=14.1875e6, gt=0, le=1e12)
+    line_period_s: float = Field(default=64e-6, gt=0)
     unit_seed: int = Field(default=0, ge=0)
     facts: dict[str, Any] = {}
     chain: list[ElementRecord]

@@ -7,6 +7,8 @@ from enum import StrEnum
 
 import numpy as np
 
+from pixmetry.core.light import Light
+from pixmetry.core.line import Line
 from pixmetry.core.random import Grid
 
 
@@ -15,11 +17,17 @@ class Kind(StrEnum):
 
     ``PHOTONS`` mean photons per pixel and exposure; ``ELECTRONS`` charge (mean before, a sample after the shot noise); ``DN`` the
     analogue signal in units of the converter's step, black at 0; ``CODES`` stored whole numbers.
+
+    Two kinds are functions that are not sampled yet: ``LIGHT``, a scene as pixels will look at it (`core.light`), before ``PHOTONS``; and
+    ``VIDEO``, the line signal in time (`core.line`), between ``DN`` of the pixels and ``DN`` of the samples. The camera samples them at the
+    first source that takes numbers.
     """
 
+    LIGHT = "light"
     PHOTONS = "photons"
     ELECTRONS = "electrons"
     DN = "dn"
+    VIDEO = "video"
     CODES = "codes"
 
 
@@ -79,6 +87,14 @@ class Windows:
 
 
 @dataclass(frozen=True)
+class Clock:
+    """How a camera reads out: pixel clock, and time from line to line of one field (CCIR unless told otherwise)."""
+
+    pixel_hz: float = 14.1875e6
+    line_s: float = 64e-6
+
+
+@dataclass(frozen=True)
 class Signal:
     """A batch of windows at one point of the chain. It is never changed in place.
 
@@ -93,6 +109,12 @@ class Signal:
         Rows and columns of the whole frame.
     exposure_s, time_s, temperature_c : ndarray, shape (n,), float64
         Exposure time, time of the exposure's start in the sequence, and sensor temperature.
+    clock : Clock
+        The camera's read-out.
+    light : Light
+        Of the kind ``LIGHT`` (whose data hold nothing).
+    line : Line
+        Of the kind ``VIDEO`` (whose data are the pixels that the line holds one after the other).
     """
 
     data: np.ndarray
@@ -102,6 +124,9 @@ class Signal:
     exposure_s: np.ndarray
     time_s: np.ndarray
     temperature_c: np.ndarray
+    clock: Clock = Clock()
+    light: Light | None = None
+    line: Line | None = None
 
     def __len__(self) -> int:
         return len(self.data)
@@ -125,11 +150,26 @@ class Signal:
         """The same windows with new numbers (and, where the source converts, a new kind)."""
         return replace(self, data=data, kind=self.kind if kind is None else kind)
 
+    def with_light(self, light: Light) -> Signal:
+        """The same windows with the scene looked at in another way."""
+        return replace(self, light=light)
+
+    def with_line(self, line: Line) -> Signal:
+        """The same pixels with another line signal made of them."""
+        return replace(self, line=line)
+
     def take(self, index: np.ndarray) -> Signal:
         """The windows at some positions of the batch."""
         grid = Grid(self.grid.frame[index], self.grid.row0[index], self.grid.col0[index], self.grid.shape)
         return Signal(
-            self.data[index], self.kind, grid, self.frame_shape, self.exposure_s[index], self.time_s[index], self.temperature_c[index]
+            self.data[index],
+            self.kind,
+            grid,
+            self.frame_shape,
+            self.exposure_s[index],
+            self.time_s[index],
+            self.temperature_c[index],
+            self.clock,
         )
 
     def crop(self, windows: Windows) -> Signal:

@@ -75,6 +75,15 @@ class Source:
         taken from the noise-free frame. By default the exact context is used in that mode too.
     tail : callable, optional
         ``tail(params)``: the largest share of a pixel's signal that reaches beyond ``near``; the frozen mode's stated error.
+    reshape : callable, optional
+        ``reshape(params, frame_shape)``: rows and columns of the frame that it puts out, if they differ from those that it takes.
+    place : callable, optional
+        ``place(params, x_px, y_px, frame_shape)``: where points of its input frame lie in its output frame, if it moves whole pixels.
+        (Sources of ``light`` and ``video`` need none: the camera follows their maps.)
+    truth : callable, optional
+        ``truth(params, signal, stream)``: what it does in this unit and these frames, as named arrays: maps (rows, cols) of the unit,
+        masks, shifts (n, rows) of every row; ``signal`` is a batch of whole frames of the kind that it takes, of which only the grid, times and
+        sizes count.
     start : callable, optional
         ``start(params)``: the state before frame 0, for a source with a memory; None where it has none with these parameters.
     applies_to : tuple of str
@@ -117,6 +126,9 @@ class Source:
     context: Callable[[Any, Windows, tuple[int, int]], Windows] | None = None
     near: Callable[[Any], tuple[int, int, int, int]] | None = None
     tail: Callable[[Any], float] | None = None
+    reshape: Callable[[Any, tuple[int, int]], tuple[int, int]] | None = None
+    place: Callable[[Any, np.ndarray, np.ndarray, tuple[int, int]], tuple[np.ndarray, np.ndarray]] | None = None
+    truth: Callable[[Any, Signal, Stream], Mapping[str, np.ndarray]] | None = None
     start: Callable[[Any], Any] | None = None
     applies_to: tuple[str, ...] = ()
     reasons: Mapping[str, str] = field(default_factory=dict)

@@ -1,0 +1,236 @@
+"""The conversions that a camera puts into its chain by itself: looking at the scene, holding pixels on the line, sampling the line."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from pixmetry.core.errors import ChainError
+from pixmetry.core.line import Line
+from pixmetry.core.random import Grid, Stream
+from pixmetry.core.signal import Kind, Signal, Windows
+from pixmetry.core.source import Parameters, Source, run
+
+
+@dataclass(frozen=True)
+class Link:
+    """One step of a running chain: an element that is on, or a conversion; ``shape`` is that of the frames that it takes."""
+
+    name: str
+    source: Source
+    params: Any
+    shape: tuple[int, int]
+
+    @property
+    def shape_out(self) -> tuple[int, int]:
+        """Rows and columns of the frames that it makes."""
+        return self.shape if self.source.reshape is None else self.source.reshape(self.params, self.shape)
+
+    @property
+    def far(self) -> bool:
+        """Whether it looks farther than the mode ``frozen`` follows it; of the line's sources, only their sampling does."""
+        return self.source.near is not None and Kind.VIDEO not in self.source.consumes or self.source is SAMPLE
+
+    def nearby(self, windows: Windows) -> Windows:
+        """The input windows of the mode ``frozen``."""
+        reach = self.source.near(self.params)
+        if self.source is SAMPLE:
+            return self.params.pixels_of(windows, self.shape).expand(*reach, self.shape)
+        return windows.expand(*reach, self.shape)
+
+    @property
+    def remembers(self) -> bool:
+        """Whether it has a memory with these parameters."""
+        return self.source.start is not None and self.source.start(self.params) is not None
+
+
+class Nothing(Parameters):
+    """No parameters."""
+
+
+@dataclass(frozen=True)
+class LineSources:
+    """Parameters of the sampling: the sources of the line signal before it, and the camera's pixel clock."""
+
+    links: tuple[Link, ...]
+    pixel_hz: float
+
+    def line(self) -> Line:
+        """The line as it is without any draw, for its geometry."""
+        zero = np.zeros(1)
+        grid = Grid(np.zeros(1, np.int64), np.zeros(1, np.int64), np.zeros(1, np.int64), (1, 1))
+        signal = Signal(np.zeros((1, 1, 1), np.float32), Kind.VIDEO, grid, (1, 1), zero, zero, zero, line=Line(self.pixel_hz, self.pixel_hz))
+        for link in self.links:
+            signal, _ = run(link.source, link.params, replace(signal, frame_shape=link.shape), QUIET)
+        return signal.line
+
+
+    def pixels_of(self, windows: Windows, frame_shape: tuple[int, int]) -> Windows:
+        """The pixels at which the samples of some windows look."""
+        line = self.line()
+        first = np.floor(line.pixels(windows.col0.astype(float))).astype(np.int64)
+        last = np.ceil(line.pixels((windows.col0 + windows.cols - 1).astype(float))).astype(np.int64)
+        first, last = np.clip(first, 0, frame_shape[1] - 1), np.clip(last, 0, frame_shape[1] - 1)
+        return Windows(windows.row0, first, windows.rows, last - first + 1)
+
+
+class _Zeros:
+    """A stream of zeros, for what a chain does without chance."""
+
+    quiet = True
+
+    def __getattr__(self, name: str) -> Any:
+        if name.endswith("unit"):
+            return lambda count, draw=0: np.zeros(count, np.float32)
+        if name.startswith("add"):
+            return lambda data, grid, scale, draw=0: np.broadcast_to(np.asarray(data, np.float32), grid.size).copy()
+        sizes = {"rows": slice(0, 2), "cols": slice(0, 3, 2), "frames": slice(0, 1)}
+        part = next((s for key, s in sizes.items() if key in name), slice(0, 3))
+        return lambda grid, draw=0: np.zeros(grid.size[part], np.float32)
+
+
+QUIET: Any = _Zeros()
+
+
+def _look(params: Nothing, signal: Signal, stream: Stream) -> Signal:
+    return replace(signal, data=signal.light.photons(), kind=Kind.PHOTONS, light=None)
+
+
+def _hold(params: Nothing, signal: Signal, stream: Stream) -> Signal:
+    return replace(signal, kind=Kind.VIDEO, line=Line(signal.clock.pixel_hz, signal.clock.pixel_hz))
+
+
+def _sample(params: LineSources, signal: Signal, stream: Stream) -> Signal:
+    line = signal.line
+    if line.plain:
+        return replace(signal, kind=Kind.DN, line=None)
+    samples = line.samples or signal.frame_shape[1]
+    grid, width = signal.grid, signal.data.shape[2]
+    if width == signal.frame_shape[1]:
+        col0, cols = np.zeros_like(grid.col0), samples
+    else:  # a part of the row: the samples that look at it
+        col0 = np.ceil(line.placed(grid.col0.astype(float)) - 1e-9).astype(np.int64)
+        last = np.floor(line.placed((grid.col0 + width - 1).astype(float)) + 1e-9).astype(np.int64)
+        col0, last = np.clip(col0, 0, samples - 1), np.clip(last, 0, samples - 1)
+        cols = int((last - col0).min()) + 1
+    data = line.read(signal.data, grid.col0, col0, cols)
+    out = Grid(grid.frame, grid.row0, col0, (grid.shape[0], cols))
+    for noise in line.noise:
+        data = data + noise(out)
+    shape = (signal.frame_shape[0], samples)
+    return replace(signal, data=np.asarray(data, np.float32), kind=Kind.DN, line=None, grid=out, frame_shape=shape)
+
+
+def _sample_context(params: LineSources, windows: Windows, frame_shape: tuple[int, int]) -> Windows:
+    """Whole rows, unless the samples are the pixels; anything to the left may still be on the line."""
+    return windows if _line(params).plain else windows.full_rows(frame_shape)
+
+
+def _sample_near(params: LineSources) -> tuple[int, int, int, int]:
+    reaches = [link.source.near(link.params) for link in params.links if link.source.near is not None]
+    left, right = (sum(r[i] for r in reaches) for i in (2, 3))
+    return 0, 0, left + 1, right + 1
+
+
+def _sample_tail(params: LineSources) -> float:
+    return float(sum(link.source.tail(link.params) for link in params.links if link.source.tail is not None))
+
+
+def _sample_reshape(params: LineSources, frame_shape: tuple[int, int]) -> tuple[int, int]:
+    return frame_shape[0], _line(params).samples or frame_shape[1]
+
+
+def _sample_place(params: LineSources, x: np.ndarray, y: np.ndarray, frame_shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    return _line(params).placed(x), y
+
+
+def _line(params: LineSources) -> Line:
+    return params.line()
+
+
+def _conversion(id: str, title: str, consumes: Kind, produces: Kind, forward: Any, **kw: Any) -> Source:
+    why = dict.fromkeys(("measure", "correct", "propagate", "neutral"), "a conversion that belongs to every chain")
+    return Source(
+        id=id,
+        title=title,
+        description=title,
+        parameters=Nothing,
+        consumes=(consumes,),
+        produces=produces,
+        typical=Nothing(),
+        bound=Nothing(),
+        gum_class="F",
+        equation="",
+        typical_size="",
+        references=(),
+        advice="",
+        essential=True,
+        forward=forward,
+        reasons=why,
+        **kw,
+    )
+
+
+LOOK = _conversion("core.look", "pixels look at the scene", Kind.LIGHT, Kind.PHOTONS, _look)
+HOLD = _conversion("core.hold", "pixels are held on the line", Kind.DN, Kind.VIDEO, _hold)
+SAMPLE = _conversion(
+    "core.sample",
+    "the line is sampled",
+    Kind.VIDEO,
+    Kind.DN,
+    _sample,
+    context=_sample_context,
+    near=_sample_near,
+    tail=_sample_tail,
+    reshape=_sample_reshape,
+    place=_sample_place,
+)
+STEPS = {(Kind.LIGHT, Kind.PHOTONS): LOOK, (Kind.DN, Kind.VIDEO): HOLD, (Kind.VIDEO, Kind.DN): SAMPLE}
+
+
+def conversion(kind: Kind, consumes: tuple[Kind, ...]) -> Source | None:
+    """The conversion that a chain needs between a kind and a source; None if it needs none, or there is none."""
+    if kind in consumes:
+        return None
+    return next((STEPS[kind, k] for k in consumes if (kind, k) in STEPS), None)
+
+
+def linked(elements: Any, frame_shape: tuple[int, int], pixel_hz: float) -> tuple[Link, ...]:
+    """The running chain of elements that are on, with the conversions between them; it ends with numbers.
+
+    Raises
+    ------
+    ChainError
+        If a source cannot take what the one before it makes.
+    """
+    links: list[Link] = []
+    kind = Kind.LIGHT if elements and Kind.LIGHT in elements[0].source.consumes else Kind.PHOTONS
+    shape, on_line = frame_shape, []
+
+    def add(name: str, source: Source, params: Any) -> None:
+        nonlocal kind, shape
+        link = Link(name, source, params, shape)
+        links.append(link)
+        if source.consumes == (Kind.VIDEO,) and source is not SAMPLE:
+            on_line.append(link)
+        kind, shape = source.produces or kind, link.shape_out
+
+    def convert(source: Source) -> None:
+        params = LineSources(tuple(on_line), pixel_hz) if source is SAMPLE else Nothing()
+        on_line.clear()
+        add(f"{source.id} {len(links)}", source, params)
+
+    for element in elements:
+        step = conversion(kind, element.source.consumes)
+        if step is not None:
+            convert(step)
+        if kind not in element.source.consumes:
+            raise ChainError(
+                f"{element.name} cannot follow: it takes {', '.join(element.source.consumes)} and gets {kind}", remedy="change the order"
+            )
+        add(element.name, element.source, element.params)
+    if kind in (Kind.LIGHT, Kind.VIDEO):
+        convert(LOOK if kind is Kind.LIGHT else SAMPLE)
+    return tuple(links)

@@ -1,0 +1,395 @@
+"""Light before it is sampled: a scene seen through optics, by pixels of some shape, at some times.
+
+The sources in front of the pixel grid do not work on numbers. They change how the scene is looked at: where a pixel looks (distortion,
+tilt, drift), with which spread (lens, diffuser, pixel aperture), and when (exposure, fields, rolling shutter). ``Light`` collects that; the
+camera samples it once, at the first source that takes photons. So a pixel's value is an integral over the scene itself, whatever the order
+and number of those sources, and nothing is interpolated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Protocol
+
+import numpy as np
+
+from pixmetry.core._camera_kernels import decimate
+from pixmetry.core.errors import InputError
+from pixmetry.core.random import Grid
+
+FINE = 4  # cells per pixel and axis of the raster on which a tabulated point spread is applied
+GAUSS = {  # nodes and weights on (-1/2, 1/2): Gauss–Legendre
+    1: (np.zeros(1), np.ones(1)),
+    2: (np.array([-0.28867513459481287, 0.28867513459481287]), np.array([0.5, 0.5])),
+    3: (np.array([-0.3872983346207417, 0.0, 0.3872983346207417]), np.array([5.0, 8.0, 5.0]) / 18),
+}
+HERMITE = (np.array([-1.7320508075688772, 0.0, 1.7320508075688772]), np.array([1.0, 4.0, 1.0]) / 6)  # of a normal with deviation 1
+
+Pull = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+
+
+class Scene(Protocol):
+    """What falls on the sensor plane.
+
+    Only ``photons`` is needed by a camera without sources in front of its pixels; with such sources, ``radiance`` is. ``moving`` tells
+    whether it depends on time or frame number.
+    """
+
+    def photons(self, grid: Grid, frame_shape: tuple[int, int], exposure_s: np.ndarray, time_s: np.ndarray) -> np.ndarray:
+        """Photons of full square pixels, float32, shape (n, rows, cols); ``exposure_s`` and ``time_s`` have shape (n,)."""
+
+    # def radiance(self, at: Points) -> np.ndarray: ...
+    # def detailed(self, at: Points, reach_px: float) -> np.ndarray: ...   (optional)
+    # moving: bool
+
+
+@dataclass(frozen=True)
+class Points:
+    """Points at which a scene is asked for its light.
+
+    Parameters
+    ----------
+    x_px, y_px : ndarray, float64, any shape
+        In the scene's plane, in pixels of the ideal camera: pixel (0, 0) is the centre of the top-left pixel.
+    time_s, exposure_s : ndarray, of that shape (broadcast)
+        When, and the length of the exposure that the answer belongs to.
+    frame : ndarray of int, of that shape (broadcast)
+    blur_px : float
+        Standard deviation of a Gaussian with which the light is spread; the scene adds it to its own.
+    frame_shape : (int, int)
+    """
+
+    x_px: np.ndarray
+    y_px: np.ndarray
+    time_s: np.ndarray
+    exposure_s: np.ndarray
+    frame: np.ndarray
+    blur_px: float
+    frame_shape: tuple[int, int]
+
+    def take(self, index: Any) -> Points:
+        """Return some of the points, as flat arrays."""
+        parts = (np.broadcast_to(v, self.x_px.shape)[index] for v in (self.x_px, self.y_px, self.time_s, self.exposure_s, self.frame))
+        return Points(*parts, self.blur_px, self.frame_shape)  # type: ignore[call-arg]
+
+    def shifted(self, dx: Any, dy: Any) -> Points:
+        """Return the points moved by so much."""
+        return replace(self, x_px=self.x_px + dx, y_px=self.y_px + dy)
+
+
+@dataclass(frozen=True)
+class Light:
+    """A scene and how it is looked at. Made by the camera; sources return changed copies.
+
+    Parameters
+    ----------
+    scene : Scene
+    grid : Grid
+        Windows in pixels of the sensor.
+    frame_shape : (int, int)
+    exposure_s, time_s : ndarray, shape (n,)
+        Length and start of each exposure.
+    pulls : tuple of callables
+        Coordinate maps in the order in which the light meets them. Each takes the place of a point after it and returns the place before
+        it, ``(x, y) -> (x, y)``, arrays of shape (n, rows, cols) or broadcast to it.
+    blur_px2 : float
+        Variance of the Gaussian spread.
+    varying : tuple of callables
+        ``(x, y) -> px²``: variances of Gaussian spreads that change over the sensor; should be smaller than the pixel.
+    dots : (dx, dy, weight), arrays of shape (k,)
+        A spread made of a few points, such as a birefringent plate's.
+    kernel : ndarray, shape (2 m + 1, 2 m + 1), optional
+        A point spread on a raster of ``FINE`` cells per pixel, of sum 1, row by row from the top.
+    aperture_px : (float, float)
+        Width and height of the light-sensitive box in the middle of the pixel.
+    sensitivity : float
+        Photons counted over those that fall on the aperture's mean density times one pixel.
+    moments_s, weights : ndarray, shape (n, rows or 1, m)
+        When each row looks, and with which share of the light; by default once, in the middle of the exposure.
+    """
+
+    scene: Any
+    grid: Grid
+    frame_shape: tuple[int, int]
+    exposure_s: np.ndarray
+    time_s: np.ndarray
+    pulls: tuple[Pull, ...] = ()
+    blur_px2: float = 0.0
+    varying: tuple[Callable[[np.ndarray, np.ndarray], np.ndarray], ...] = ()
+    dots: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+    kernel: np.ndarray | None = None
+    aperture_px: tuple[float, float] = (1.0, 1.0)
+    sensitivity: float = 1.0
+    moments_s: np.ndarray | None = None
+    weights: np.ndarray | None = None
+
+    # ---- what sources do --------------------------------------------------------------------------------------------------------
+
+    def moved(self, pull: Pull) -> Light:
+        """Return the light after a coordinate map: ``pull`` takes places after it to places before it."""
+        return replace(self, pulls=(*self.pulls, pull))
+
+    def blurred(self, variance_px2: float) -> Light:
+        """Return the light after a Gaussian spread."""
+        return replace(self, blur_px2=self.blur_px2 + float(variance_px2))
+
+    def blurred_by_place(self, variance_px2: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> Light:
+        """Return the light after a small Gaussian spread whose variance depends on the place ``(x, y)`` on the sensor."""
+        return replace(self, varying=(*self.varying, variance_px2))
+
+    def spread(self, dx_px: np.ndarray, dy_px: np.ndarray, weight: np.ndarray) -> Light:
+        """Return the light after a spread into a few points, of weights that sum to 1."""
+        dx, dy, w = (np.atleast_1d(np.asarray(v, float)) for v in (dx_px, dy_px, weight))
+        if self.dots is not None:
+            dx = (self.dots[0][:, None] + dx).ravel()
+            dy = (self.dots[1][:, None] + dy).ravel()
+            w = (self.dots[2][:, None] * w).ravel()
+        return replace(self, dots=(dx, dy, w))
+
+    def convolved(self, kernel: np.ndarray) -> Light:
+        """Return the light after a tabulated point spread: odd sides, ``FINE`` cells per pixel."""
+        new = np.asarray(kernel, float)
+        if new.ndim != 2 or not all(s % 2 for s in new.shape) or not np.isfinite(new).all() or new.sum() <= 0:
+            raise InputError("a point spread cannot be used", value=new.shape, allowed="a finite array with odd sides and a positive sum")
+        new = new / new.sum()
+        if self.kernel is not None:
+            from scipy.signal import convolve2d
+
+            new = convolve2d(self.kernel, new)
+        return replace(self, kernel=new)
+
+    def seen_at(self, moments_s: np.ndarray, weights: np.ndarray) -> Light:
+        """Return the light with other times of looking; arrays of shape (n, rows or 1, m)."""
+        return replace(self, moments_s=moments_s, weights=weights)
+
+    @property
+    def moments(self) -> tuple[np.ndarray, np.ndarray]:
+        """Times and weights, shape (n, rows or 1, m) each."""
+        if self.moments_s is None:
+            middle = (self.time_s + 0.5 * self.exposure_s)[:, None, None]
+            return middle, np.ones_like(middle)
+        return self.moments_s, self.weights
+
+    @property
+    def moving(self) -> bool:
+        """Whether the scene depends on time."""
+        return bool(getattr(self.scene, "moving", False))
+
+    # ---- geometry ---------------------------------------------------------------------------------------------------------------
+
+    def pulled(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Places in the scene's plane at which places on the sensor look."""
+        for pull in reversed(self.pulls):
+            x, y = pull(x, y)
+        return x, y
+
+    def placed(self, x: np.ndarray, y: np.ndarray, tolerance_px: float = 1e-9) -> tuple[np.ndarray, np.ndarray]:
+        """Places on the sensor at which points of the scene's plane are seen, the inverse of `pulled`; shape (n, k, 1).
+
+        Newton's method with derivatives by differences; points that are seen nowhere become NaN.
+        """
+        u, v = np.array(x, float), np.array(y, float)
+        if not self.pulls:
+            return u, v
+        step = 0.25
+        for _ in range(50):
+            fx, fy = self.pulled(u, v)
+            ex, ey = fx - x, fy - y
+            (ax, ay), (bx, by) = self.pulled(u + step, v), self.pulled(u, v + step)
+            jxx, jyx, jxy, jyy = (ax - fx) / step, (ay - fy) / step, (bx - fx) / step, (by - fy) / step
+            det = jxx * jyy - jxy * jyx
+            du, dv = (ex * jyy - ey * jxy) / det, (ey * jxx - ex * jyx) / det
+            u, v = u - du, v - dv
+            if np.nanmax(np.abs([du, dv])) < tolerance_px:
+                return u, v
+        fx, fy = self.pulled(u, v)
+        lost = ~(np.hypot(fx - x, fy - y) < 1e-6)
+        return np.where(lost, np.nan, u), np.where(lost, np.nan, v)
+
+    # ---- sampling ---------------------------------------------------------------------------------------------------------------
+
+    @property
+    def plain(self) -> bool:
+        """Whether full pixels look at the scene directly, in the middle of the exposure."""
+        return (
+            not (self.pulls or self.blur_px2 or self.varying)
+            and self.dots is None
+            and self.kernel is None
+            and self.aperture_px == (1.0, 1.0)
+            and self.sensitivity == 1.0
+            and self.moments_s is None
+        )
+
+    def photons(self) -> np.ndarray:
+        """Mean photons of every pixel, float32, shape (n, rows, cols)."""
+        if self.plain:
+            return np.ascontiguousarray(self.scene.photons(self.grid, self.frame_shape, self.exposure_s, self.time_s), np.float32)
+        if not hasattr(self.scene, "radiance"):
+            raise InputError(
+                f"the scene {type(self.scene).__name__} cannot be seen through optics",
+                allowed="scenes that give their light at any point (`radiance`)",
+                remedy="switch the camera's optical sources off, or take another scene",
+            )
+        times, weights = self.moments
+        if not self.moving:  # the light is the same at all times
+            total = weights.sum(axis=2, keepdims=True)
+            out = self._at(times.mean(axis=2)[:, :1], slice(None)) * total
+        else:
+            out = self._moving(times, weights)
+        return np.maximum(out * self.sensitivity, 0.0).astype(np.float32)
+
+    def _moving(self, times: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        n, rows, cols = self.grid.size
+        out = np.zeros((n, rows, cols))
+        if self.kernel is None or times.shape[1] == 1:
+            for k in range(times.shape[2]):
+                out += weights[:, :, k, None] * self._at(times[:, :, k], slice(None))
+            return out
+        # a raster is shared by rows that look at the same times
+        offset = np.round(times - self.time_s[:, None, None], 12)
+        _, group = np.unique(offset.transpose(1, 0, 2).reshape(rows, -1), axis=0, return_inverse=True)
+        for g in range(group.max() + 1):
+            at = np.flatnonzero(group.ravel() == g)
+            block = slice(int(at[0]), int(at[-1]) + 1)
+            for k in range(times.shape[2]):
+                seen = self._at(times[:, at[:1], k], block)
+                out[:, at] += weights[:, at, k, None] * seen[:, at - at[0]]
+        return out
+
+    def _at(self, time_s: np.ndarray, block: slice) -> np.ndarray:
+        """Mean light of some rows of pixels at a time of shape (n, rows or 1)."""
+        rows = np.arange(self.grid.shape[0])[block]
+        y = (self.grid.row0[:, None] + rows).astype(float)[:, :, None]
+        x = (self.grid.col0[:, None] + np.arange(self.grid.shape[1])).astype(float)[:, None, :]
+        time = time_s[:, :, None]
+        if self.kernel is None:
+            return self._averaged(x, y, time, self.aperture_px)
+        mask = self._mask
+        m = mask.shape[0] // 2, mask.shape[1] // 2
+        fine_y, fine_x = (_refined(v, axis, reach) for v, axis, reach in ((y, 1, m[0]), (x, 2, m[1])))
+        fine = self._averaged(fine_x, fine_y, time[:, :1], (1 / FINE, 1 / FINE))
+        return decimate(np.ascontiguousarray(fine, np.float64), mask, FINE, len(rows), self.grid.shape[1])
+
+    @cached_property
+    def _mask(self) -> np.ndarray:
+        """The point spread and the pixel aperture on the fine raster: the weight of every cell around a pixel's centre.
+
+        A pixel's centre lies on a corner of four cells, so the sides are even. The cells hold means over themselves; the box that this
+        adds is taken out again to second order.
+        """
+        from scipy.signal import convolve2d
+
+        box = np.outer(_box(self.aperture_px[1]), _box(self.aperture_px[0]))
+        mask = convolve2d(self.kernel, box)
+        mask = np.pad(mask, 1)
+        laplacian = (
+            np.roll(mask, 1, 0) + np.roll(mask, -1, 0) + np.roll(mask, 1, 1) + np.roll(mask, -1, 1) - 4 * mask
+        )
+        return np.ascontiguousarray((mask - laplacian / 24)[::-1, ::-1])
+
+    def _averaged(self, x: np.ndarray, y: np.ndarray, time: np.ndarray, cell: tuple[float, float]) -> np.ndarray:
+        """Light averaged over a cell about every point, through all spreads but the tabulated one."""
+        n = len(self.grid.frame)
+        shape = (n, y.shape[1], x.shape[2])
+        x, y = np.broadcast_to(x, shape), np.broadcast_to(y, shape)
+        sd = np.sqrt(sum(np.broadcast_to(v(x, y), shape) for v in self.varying)) if self.varying else None
+        per_window = (self.exposure_s[:, None, None], self.grid.frame[:, None, None])
+        px, py = self.pulled(x, y)
+        if self.pulls:
+            px, py = np.broadcast_to(px, shape), np.broadcast_to(py, shape)
+        centre = Points(px, py, np.broadcast_to(time, shape), *(np.broadcast_to(v, shape) for v in per_window), np.sqrt(self.blur_px2), self.frame_shape)
+        dots = self.dots or (np.zeros(1), np.zeros(1), np.ones(1))
+        detailed = getattr(self.scene, "detailed", None)
+        busy = np.ones(shape, bool) if detailed is None else detailed(centre, self._reach(0.5 * np.hypot(*cell), dots))
+        out = np.empty(shape)
+        if not busy.all():
+            out[~busy] = self.scene.radiance(centre.take(~busy))
+        if busy.any():
+            ux, uy = x[busy], y[busy]
+            some = centre.take(busy)
+            total = np.zeros(len(ux))
+            spread = None if sd is None else sd[busy]
+            stride = _Strides(busy, self)
+            for dx, dy, w in self._nodes(cell, dots, spread):
+                qx, qy = stride.pulled(ux + dx, uy + dy)
+                total += w * self.scene.radiance(replace(some, x_px=qx, y_px=qy))
+            out[busy] = total
+        return out
+
+    def _nodes(self, cell: tuple[float, float], dots: Any, spread: Any) -> Iterator[tuple[Any, Any, Any]]:
+        """Offsets and weights that stand for the aperture, the dots and the spread that varies."""
+        fine = max(float(getattr(self.scene, "smooth_px", 0.0)) ** 2 + self.blur_px2, 1e-4) ** 0.5
+        axes = []
+        for size in cell:
+            parts = max(1, int(np.ceil(size / (2.0 * fine))))
+            nodes, weights = GAUSS[3]
+            start = (np.arange(parts) + 0.5) / parts - 0.5
+            axes.append((size * (start[:, None] + nodes / parts).ravel(), np.tile(weights / parts, parts)))
+        hermite = [(0.0, 1.0)] if spread is None else list(zip(*HERMITE, strict=True))
+        for ox, oy, ow in zip(*dots, strict=True):
+            for ax, aw in zip(*axes[0], strict=True):
+                for ay, bw in zip(*axes[1], strict=True):
+                    for hx, hw in hermite:
+                        for hy, gw in hermite:
+                            sx, sy = (0.0, 0.0) if spread is None else (hx * spread, hy * spread)
+                            yield ax + sx - ox, ay + sy - oy, ow * aw * bw * hw * gw
+
+    def _reach(self, cell_px: float, dots: tuple[np.ndarray, np.ndarray, np.ndarray]) -> np.ndarray:
+        """How far in the scene's plane a cell looks, shape (n, 1, 1).
+
+        From a few places all over the frame, not from the window: whether a cell is taken to be uniform must not depend on the window.
+        """
+        rows, cols = self.frame_shape
+        y, x = np.linspace(0, rows - 1, 9)[None, :, None], np.linspace(0, cols - 1, 9)[None, None, :]
+        shape = (len(self.grid.frame), 9, 9)
+        x, y = np.broadcast_to(x, shape), np.broadcast_to(y, shape)
+        reach = np.full((shape[0], 1, 1), cell_px + float(np.hypot(dots[0], dots[1]).max()))
+        if self.varying:
+            variance = np.broadcast_to(sum(v(x, y) for v in self.varying), shape)
+            reach = reach + 2.0 * np.sqrt(variance.max(axis=(1, 2), keepdims=True))
+        if self.pulls:
+            at, right, down = (np.broadcast_arrays(*self.pulled(u, v)) for u, v in ((x, y), (x + 1, y), (x, y + 1)))
+            longest = np.maximum(*(np.hypot(b[0] - at[0], b[1] - at[1]) for b in (right, down)))
+            reach = reach * np.maximum(1.0, 1.5 * longest.reshape(len(longest), -1).max(axis=1))[:, None, None]
+        return reach
+
+
+class _Strides:
+    """Maps scattered points of a batch through coordinate maps that hold one value per window."""
+
+    def __init__(self, busy: np.ndarray, light: Light) -> None:
+        self.light = light
+        self.counts = busy.reshape(len(busy), -1).sum(axis=1)
+
+    def pulled(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        if not self.light.pulls:
+            return x, y
+        n, widest = len(self.counts), int(self.counts.max())
+        if n == 1:
+            px, py = self.light.pulled(x[None, :, None], y[None, :, None])
+            return np.broadcast_to(px, (1, len(x), 1)).ravel(), np.broadcast_to(py, (1, len(x), 1)).ravel()
+        inside = np.arange(widest) < self.counts[:, None]
+        padded = [np.zeros((n, widest)) for _ in range(2)]
+        for pad, v in zip(padded, (x, y), strict=True):
+            pad[inside] = v
+        px, py = self.light.pulled(padded[0][:, :, None], padded[1][:, :, None])
+        return tuple(np.broadcast_to(p, (n, widest, 1))[:, :, 0][inside] for p in (px, py))  # type: ignore[return-value]
+
+
+def _refined(v: np.ndarray, axis: int, reach: int) -> np.ndarray:
+    """Centres of the fine cells around whole pixels along an axis, with a margin of ``reach`` cells."""
+    first = v.take([0], axis=axis)
+    count = v.shape[axis] * FINE + 2 * reach - FINE
+    at = (np.arange(count) - reach + 0.5) / FINE
+    return first + (at[None, :, None] if axis == 1 else at[None, None, :])
+
+
+def _box(width_px: float) -> np.ndarray:
+    """A box of this width on the fine raster, centred on a corner between cells: an even number of weights of sum 1."""
+    half = 0.5 * width_px * FINE
+    count = int(np.ceil(half - 1e-12))
+    edge = np.clip(half - np.arange(count), 0.0, 1.0)
+    both = np.concatenate([edge[::-1], edge])
+    return both / both.sum()
