@@ -18,22 +18,21 @@ from pixmetry.core.catalogue import catalogue
 from pixmetry.core.contribution import AVERAGES
 from pixmetry.core.errors import ChainError, InputError
 from pixmetry.core.random import Grid
-from pixmetry.core.signal import Kind
-from pixmetry.core.source import Source
+from pixmetry.core.signal import Kind, Signal
+from pixmetry.core.source import Source, run
 
 SOURCES = catalogue()
 SCENE = Texture()
 every_source = pytest.mark.parametrize("source", SOURCES.values(), ids=SOURCES.keys())
 IN_FRAMES = {i: s for i, s in SOURCES.items() if s.forward is not None}
 every_forward = pytest.mark.parametrize("source", IN_FRAMES.values(), ids=IN_FRAMES.keys())
-corners = [
-    (0, 0, 9, 7),
-    (SHAPE[0] - 9, SHAPE[1] - 7, 9, 7),
-    (0, SHAPE[1] - 5, 12, 5),
-    (SHAPE[0] - 3, 0, 3, 21),
-    (17, 22, 11, 13),
-    (30, 41, 1, 1),
-]
+corners = [(0, 0, 9, 7), (-9, -7, 9, 7), (0, -5, 12, 5), (-3, 0, 3, 21), (17, 22, 11, 13), (20, 31, 1, 1)]  # negative: from the far side
+
+
+def within(window: tuple[int, int, int, int], shape: tuple[int, int]) -> tuple[int, int, int, int]:
+    """The window in a frame of this shape."""
+    r, c, h, w = window
+    return r % shape[0], c % shape[1], h, w
 
 
 @cache
@@ -62,10 +61,20 @@ def test_typical_and_bound_parameters_change_something(source: Source) -> None:
         assert any(not np.array_equal(camera.expose(s, 2).data, camera.switched(off=[NAME]).expose(s, 2).data) for s in scenes)
 
 
+def met_by(source: Source, camera: Camera) -> Signal:
+    """Two whole frames as the source meets them."""
+    signal = camera.signal(SCENE, Grid.whole([0, 1], SHAPE))
+    for link in camera.links:
+        if link.name == NAME:
+            return signal
+        signal, _ = run(link.source, link.params, signal, camera.streams(0).of(link.name))
+    raise AssertionError
+
+
 @every_forward
 def test_the_input_is_not_touched_and_the_output_is_of_the_kind_declared(source: Source) -> None:
     camera = camera_with(source)
-    signal = camera.switched(off=[NAME]).expose(SCENE, 2)
+    signal = met_by(source, camera)
     signal.data.setflags(write=False)
     before = signal.data.copy()
     for streams in (camera.streams(0), camera.streams(0, quiet=True)):
@@ -74,7 +83,7 @@ def test_the_input_is_not_touched_and_the_output_is_of_the_kind_declared(source:
         out = result if source.start is None else result[0]
         assert np.array_equal(signal.data, before)
         assert out.kind == (source.produces or signal.kind)
-        assert out.data.shape == signal.data.shape
+        assert source.reshape is not None or out.data.shape == signal.data.shape
         assert out.data.dtype == (np.uint16 if out.kind is Kind.CODES else np.float32)
         assert np.isfinite(out.data).all()
         assert not np.shares_memory(out.data, signal.data) or np.array_equal(out.data, before)
@@ -90,8 +99,9 @@ def test_darkness_and_strong_light_give_finite_numbers(source: Source) -> None:
 @every_forward
 @pytest.mark.parametrize("window", corners)
 def test_a_window_equals_the_crop(source: Source, window: tuple[int, int, int, int]) -> None:
-    r, c, h, w = window
-    got = camera_with(source).expose(SCENE, 3, seed=11, window=window).data
+    camera = camera_with(source)
+    r, c, h, w = within(window, camera.output_shape)
+    got = camera.expose(SCENE, 3, seed=11, window=(r, c, h, w)).data
     assert np.array_equal(got, whole(source.id)[:, r : r + h, c : c + w])
 
 
@@ -100,7 +110,9 @@ def test_windows_in_one_batch_equal_windows_one_by_one_and_the_crops(source: Sou
     if has_memory(source):
         pytest.skip("single windows of a source with a memory are refused in this mode")
     camera = camera_with(source)
-    frame, row, col = np.array([0, 2, 1, 0, 2, 1]), np.array([0, 37, 5, 20, 37, 0]), np.array([0, 53, 17, 53, 0, 30])
+    rows, cols = camera.output_shape
+    frame, row = np.array([0, 2, 1, 0, 2, 1]), np.array([0, rows - 11, 5, rows // 3, rows - 11, 0])
+    col = np.array([0, cols - 11, 17, cols - 11, 0, cols // 2 - 2])
     batch = camera.expose_windows(SCENE, Grid(frame, row, col, (11, 11)), seed=11)
     for i, (f, r, c) in enumerate(zip(frame, row, col, strict=True)):
         one = camera.expose_windows(SCENE, Grid(frame[i : i + 1], row[i : i + 1], col[i : i + 1], (11, 11)), seed=11)
@@ -256,11 +268,27 @@ def test_correct_lowers_the_error_of_forward(source: Source) -> None:
 def test_any_window_of_any_frame_equals_the_crop(source: Source, data: st.DataObject) -> None:
     rows, cols = data.draw(st.integers(1, 40), "rows"), data.draw(st.integers(1, 40), "cols")
     camera = camera_with(source, shape=(rows, cols))
+    rows, cols = camera.output_shape
     r, c = data.draw(st.integers(0, rows - 1), "row"), data.draw(st.integers(0, cols - 1), "col")
     h, w = data.draw(st.integers(1, rows - r), "height"), data.draw(st.integers(1, cols - c), "width")
     frame = data.draw(st.integers(0, 3 if has_memory(source) else 10**6), "frame")
     full = camera.expose(SCENE, [frame], seed=3).data[0]
     assert np.array_equal(camera.expose(SCENE, [frame], seed=3, window=(r, c, h, w)).data[0], full[r : r + h, c : c + w])
+
+
+@every_forward
+def test_what_it_tells_of_itself_is_finite_and_fits_the_frame(source: Source) -> None:
+    if source.truth is None:
+        return
+    camera = camera_with(source)
+    told = camera.truth(frame=1, seed=11)[NAME]
+    link = next(e for e in camera.links if e.name == NAME)
+    assert told
+    for name, values in told.items():
+        assert np.isfinite(values).all(), name
+        assert values.shape[-2:] in (link.shape, link.shape_out) or values.shape[-1] in (*link.shape, *link.shape_out), (name, values.shape)
+    again = camera.truth(frame=1, seed=11)[NAME]
+    assert all(np.array_equal(v, again[n]) for n, v in told.items())
 
 
 @every_source

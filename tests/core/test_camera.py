@@ -141,7 +141,7 @@ def test_bands_stitched_together_equal_the_frame_walked_as_a_whole(tile: int, le
     chain = camera(*LONG[:length])
     grid = Grid.whole([4], SHAPE)
     signal = chain.signal(SCENE, grid)
-    for element in chain.chain:
+    for element in chain.links:
         signal = element.source.forward(element.params, signal, chain.streams(3).of(element.name))
     monkeypatch.setattr(camera_module, "TILE_PIXELS", tile)
     for threads in (1, 2):

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from pixmetry.core._camera_kernels import cut_windows
-from pixmetry.core.conversions import Link, conversion, linked
+from pixmetry.core.conversions import LOOK, Link, conversion, linked, look
 from pixmetry.core.errors import ChainError, InputError
 from pixmetry.core.light import Light, Scene
 from pixmetry.core.random import Grid, Streams
@@ -133,7 +133,7 @@ class Camera:
     def signal(
         self, scene: Scene, grid: Grid, exposure_s: Any = None, frame_period_s: float | None = None, temperature_c: Any = None
     ) -> Signal:
-        """Return what falls on the sensor in these windows, as the signal at the head of the chain."""
+        """Return the scene as the camera's pixels would look at it in these windows: the signal at the head of the chain."""
         n = len(grid.frame)
         exposure = np.broadcast_to(np.asarray(self.exposure_s if exposure_s is None else exposure_s, float), (n,))
         period = self.facts.get("frame_period_s", 0.04) if frame_period_s is None else frame_period_s
@@ -142,13 +142,10 @@ class Camera:
             temperature = self.temperature_c - self.warm_up_k * np.exp(-time / self.warm_up_s)
         else:
             temperature = np.broadcast_to(np.asarray(temperature_c(time) if callable(temperature_c) else temperature_c, float), (n,))
+        light = Light(scene, grid, self.frame_shape, exposure, time)
+        nothing = np.broadcast_to(np.float32(0), grid.size)
         clock = Clock(self.pixel_clock_hz, self.line_period_s)
-        if self.links and Kind.LIGHT in self.links[0].source.consumes:
-            light = Light(scene, grid, self.frame_shape, exposure, time)
-            nothing = np.broadcast_to(np.float32(0), grid.size)
-            return Signal(nothing, Kind.LIGHT, grid, self.frame_shape, exposure, time, temperature, clock, light)
-        photons = np.ascontiguousarray(scene.photons(grid, self.frame_shape, exposure, time), np.float32)
-        return Signal(photons, Kind.PHOTONS, grid, self.frame_shape, exposure, time, temperature, clock)
+        return Signal(nothing, Kind.LIGHT, grid, self.frame_shape, exposure, time, temperature, clock, light)
 
     def expose(
         self,
@@ -205,7 +202,7 @@ class Camera:
         numbers = [int(f) for f in frames]
         if any(np.size(v) > 1 for v in schedule.values()):
             raise InputError("a series has one schedule for all its frames", value=", ".join(schedule), remedy="expose frame by frame")
-        task = _Task(scene, self.streams(seed, quiet), schedule, threads)
+        task = _Task(scene, self.streams(seed, quiet), schedule, threads, rendered={} if len(numbers) > 1 else None)
         last_memory = max((i for i, e in enumerate(self.links) if e.remembers), default=-1)
 
         def grid_of(number: int) -> Grid:
@@ -329,7 +326,9 @@ class Camera:
         """Run the elements over the windows of ``needs`` one after the other."""
         for element, needed in zip(elements, needs, strict=False):
             stream = task.streams.of(element.name)
-            if task.frozen is not None and element.name in task.frozen.elements:
+            if element.source is LOOK:
+                signal = task.look(signal)
+            elif task.frozen is not None and element.name in task.frozen.elements:
                 signal = task.frozen.apply(element, signal.crop(needed), stream)
             else:
                 signal, _ = run(element.source, element.params, signal.crop(needed), stream)
@@ -397,6 +396,54 @@ class Camera:
                 kept[element.name] = (before, signal, state)
         return _Frozen(kept)
 
+    # ---- geometry -------------------------------------------------------------------------------------------------------------
+
+    def true_positions(
+        self, x_px: Any, y_px: Any, frame: int = 0, seed: int = 0, exposure_s: float | None = None, **schedule: Any
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return where points of the scene's plane lie in a frame that the camera puts out.
+
+        Every geometric effect of that frame counts: distortion, tilt, drift, pixel clock, offsets. What moves a measured centre by spreading
+        light or signal (a low-pass, echoes, charge left behind), and what moves single rows, does not: that is the error.
+
+        Parameters
+        ----------
+        x_px, y_px : array_like, shape (k,)
+            In pixels of the ideal camera.
+        frame, seed : int
+            Of the exposure.
+        **schedule
+            As for `expose`.
+
+        Returns
+        -------
+        x_px, y_px : ndarray, shape (k,)
+            NaN for points that are seen nowhere.
+        """
+        x, y = (np.atleast_1d(np.asarray(v, float)) for v in (x_px, y_px))
+        streams = self.streams(seed)
+        signal = self.signal(_NoScene(), Grid(np.array([frame]), np.zeros(1), np.zeros(1), (1, 1)), exposure_s, **schedule)
+        for link in self.links:
+            if Kind.LIGHT in link.source.consumes and link.source is not LOOK:
+                signal, _ = run(link.source, link.params, signal, streams.of(link.name))
+            elif link.source is LOOK:
+                x, y = (v[0, :, 0] for v in signal.light.placed(x[None, :, None], y[None, :, None]))
+            elif link.source.place is not None:
+                x, y = link.source.place(link.params, x, y, link.shape)
+        return x, y
+
+    def truth(self, frame: int = 0, seed: int = 0, **schedule: Any) -> dict[str, dict[str, np.ndarray]]:
+        """Return what the sources did in one frame, by the name of the source: maps, masks, shifts of rows (see `Source.truth`)."""
+        told: dict[str, dict[str, np.ndarray]] = {}
+        streams = self.streams(seed)
+        for link in self.links:
+            if link.source.truth is None:
+                continue
+            grid = Grid.whole([frame], link.shape)
+            signal = self.signal(_NoScene(), grid, **schedule)
+            told[link.name] = dict(link.source.truth(link.params, replace(signal, frame_shape=link.shape), streams.of(link.name)))
+        return told
+
     # ---- files ----------------------------------------------------------------------------------------------------------------
 
     def to_record(self) -> dict[str, Any]:
@@ -431,10 +478,30 @@ class _Task:
     schedule: Mapping[str, Any]
     threads: int | None = None
     frozen: _Frozen | None = None
+    rendered: dict[Any, tuple[bytes, np.ndarray]] | None = None  # photons of the windows of one frame, for scenes that stand still
+
+    def look(self, signal: Signal) -> Signal:
+        """Sample the light, or take what was sampled for an earlier frame that saw the same."""
+        mark = None if self.rendered is None else signal.light.fingerprint()
+        if mark is None:
+            return look(signal)
+        grid = signal.grid
+        key = (grid.row0.tobytes(), grid.col0.tobytes(), grid.shape)
+        kept = self.rendered.get(key)
+        if kept is None or kept[0] != mark:
+            kept = self.rendered[key] = (mark, look(signal).data)
+            kept[1].setflags(write=False)
+        return look(signal, kept[1])
 
     def take(self, index: np.ndarray) -> _Task:
         """The task of some windows of the batch: values that are given window by window are picked."""
         return replace(self, schedule={k: np.asarray(v)[index] if np.size(v) > 1 else v for k, v in self.schedule.items()})
+
+
+class _NoScene:
+    """Nothing to see: for questions of geometry."""
+
+    moving = False
 
 
 class _Quiet:
@@ -593,8 +660,7 @@ def check_chain(chain: Sequence[Element], where: str = "camera") -> None:
     for name in names:
         if names.count(name) > 1:
             raise ChainError(f"the name {name!r} is used twice", where=where, remedy="give each source a name of its own")
-    first = next((e.source for e in chain if e.on), None)
-    kind = Kind.LIGHT if first is not None and Kind.LIGHT in first.consumes else Kind.PHOTONS
+    kind = Kind.LIGHT
     for i, element in enumerate(chain):
         source = element.source
         if not element.on:
@@ -606,7 +672,7 @@ def check_chain(chain: Sequence[Element], where: str = "camera") -> None:
             kind = step.produces
         if kind not in source.consumes:
             raise ChainError(
-                f"{element.name} cannot follow: it takes {', '.join(source.consumes)} and gets {kind}",
+                f"{element.name} cannot follow: it takes {', '.join(source.consumes)} and gets {Kind.PHOTONS if kind is Kind.LIGHT else kind}",
                 where=where,
                 remedy="change the order",
             )

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from pixmetry.core.errors import ChainError
 from pixmetry.core.line import Line
 from pixmetry.core.random import Grid, Stream
 from pixmetry.core.signal import Kind, Signal, Windows
@@ -94,8 +93,13 @@ class _Zeros:
 QUIET: Any = _Zeros()
 
 
+def look(signal: Signal, photons: np.ndarray | None = None) -> Signal:
+    """The light as numbers: sampled, or given by somebody who has sampled it."""
+    return replace(signal, data=signal.light.photons() if photons is None else photons, kind=Kind.PHOTONS, light=None)
+
+
 def _look(params: Nothing, signal: Signal, stream: Stream) -> Signal:
-    return replace(signal, data=signal.light.photons(), kind=Kind.PHOTONS, light=None)
+    return look(signal)
 
 
 def _hold(params: Nothing, signal: Signal, stream: Stream) -> Signal:
@@ -198,15 +202,9 @@ def conversion(kind: Kind, consumes: tuple[Kind, ...]) -> Source | None:
 
 
 def linked(elements: Any, frame_shape: tuple[int, int], pixel_hz: float) -> tuple[Link, ...]:
-    """The running chain of elements that are on, with the conversions between them; it ends with numbers.
-
-    Raises
-    ------
-    ChainError
-        If a source cannot take what the one before it makes.
-    """
+    """The running chain of a checked camera: the elements that are on, with the conversions between them; it ends with numbers."""
     links: list[Link] = []
-    kind = Kind.LIGHT if elements and Kind.LIGHT in elements[0].source.consumes else Kind.PHOTONS
+    kind: Kind = Kind.LIGHT
     shape, on_line = frame_shape, []
 
     def add(name: str, source: Source, params: Any) -> None:
@@ -226,10 +224,6 @@ def linked(elements: Any, frame_shape: tuple[int, int], pixel_hz: float) -> tupl
         step = conversion(kind, element.source.consumes)
         if step is not None:
             convert(step)
-        if kind not in element.source.consumes:
-            raise ChainError(
-                f"{element.name} cannot follow: it takes {', '.join(element.source.consumes)} and gets {kind}", remedy="change the order"
-            )
         add(element.name, element.source, element.params)
     if kind in (Kind.LIGHT, Kind.VIDEO):
         convert(LOOK if kind is Kind.LIGHT else SAMPLE)

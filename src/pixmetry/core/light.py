@@ -210,6 +210,27 @@ class Light:
 
     # ---- sampling ---------------------------------------------------------------------------------------------------------------
 
+    def fingerprint(self) -> bytes | None:
+        """What tells whether two exposures of the same windows see the same; None if the scene may change.
+
+        Coordinate maps are compared at 81 places of the frame: smooth maps that agree there to the last bit are the same.
+        """
+        if getattr(self.scene, "moving", True):
+            return None
+        parts = [self.exposure_s, self.moments[1], np.array([self.blur_px2, self.sensitivity, *self.aperture_px])]
+        parts += [*(self.dots or ()), *([] if self.kernel is None else [self.kernel])]
+        if self.pulls or self.varying:
+            x, y = self._lattice()
+            parts += [np.asarray(v, float) for v in (*self.pulled(x, y), *(f(x, y) for f in self.varying))]
+        return b"|".join(np.ascontiguousarray(p).tobytes() for p in parts)
+
+    def _lattice(self) -> tuple[np.ndarray, np.ndarray]:
+        """A few places all over the frame, shape (n, 9, 9) each."""
+        rows, cols = self.frame_shape
+        y, x = np.linspace(0, rows - 1, 9)[None, :, None], np.linspace(0, cols - 1, 9)[None, None, :]
+        shape = (len(self.grid.frame), 9, 9)
+        return np.broadcast_to(x, shape), np.broadcast_to(y, shape)
+
     @property
     def plain(self) -> bool:
         """Whether full pixels look at the scene directly, in the middle of the exposure."""
@@ -341,10 +362,8 @@ class Light:
 
         From a few places all over the frame, not from the window: whether a cell is taken to be uniform must not depend on the window.
         """
-        rows, cols = self.frame_shape
-        y, x = np.linspace(0, rows - 1, 9)[None, :, None], np.linspace(0, cols - 1, 9)[None, None, :]
-        shape = (len(self.grid.frame), 9, 9)
-        x, y = np.broadcast_to(x, shape), np.broadcast_to(y, shape)
+        x, y = self._lattice()
+        shape = x.shape
         reach = np.full((shape[0], 1, 1), cell_px + float(np.hypot(dots[0], dots[1]).max()))
         if self.varying:
             variance = np.broadcast_to(sum(v(x, y) for v in self.varying), shape)
