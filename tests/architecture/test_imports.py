@@ -27,7 +27,8 @@ ALLOWED: dict[str, set[str]] = {
 }
 ALLOWED["simulation"] = ALLOWED["correction"] = {"core", "scene", "campaign"}
 ALLOWED["results"] = {"core", "campaign", "experiment", "budget"}
-ALLOWED["report"] = {"core", "campaign", "experiment", "budget", "results"}
+ALLOWED["chain"] = {"core", "scene"}
+ALLOWED["report"] = {"core", "campaign", "experiment", "budget", "results", "chain"}
 ALLOWED["assessment"] = {"core", "campaign", "experiment", "locate", "budget", "results", "report"}
 ALLOWED["handbook"] = {*ALLOWED}
 ALLOWED["cli"] = {*ALLOWED}

@@ -106,6 +106,7 @@ class Texture:
     mean_dn: float = 110.0
     contrast: float = 0.8
     moving = True
+    smooth_px = 2.0
 
     def radiance(self, at: Points) -> np.ndarray:
         wave = np.sin(0.31 * at.y_px + 0.7 * (at.frame % 7)) * np.cos(0.23 * at.x_px)

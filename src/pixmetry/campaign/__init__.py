@@ -2,7 +2,7 @@
 
 from pixmetry.campaign.images import FrameReader, iter_frames, read_frame, write_frame
 from pixmetry.campaign.manifest import EXAMPLE, load_campaign, photons_from_irradiance, write_manifest
-from pixmetry.campaign.output import check_output, read_maps, staged_output, write_json, write_maps
+from pixmetry.campaign.output import check_output, read_maps, staged_output, write_json, write_maps, write_page
 from pixmetry.campaign.provenance import InputHashes, provenance_record
 from pixmetry.campaign.records import CameraFacts, Campaign, FrameGroup, OpticsFacts
 
@@ -26,4 +26,5 @@ __all__ = [
     "write_json",
     "write_manifest",
     "write_maps",
+    "write_page",
 ]

@@ -102,6 +102,32 @@ def check_output(directory: str | Path, kind: str) -> None:
         raise InputError(f"folder holds files that are not results of pixmetry ({shown})", where=str(target), remedy=remedy)
 
 
+def write_page(path: str | Path, text: str) -> Path:
+    """Write one HTML page so that it appears whole or not at all; only a page of pixmetry is ever replaced.
+
+    Raises
+    ------
+    InputError
+        If there is something else of that name, or it cannot be written.
+    """
+    target = Path(path)
+    try:
+        if target.is_dir():
+            raise InputError("is a folder, not a file", where=str(target), remedy="name the page, such as page.html")
+        if target.exists() and b'content="pixmetry ' not in target.read_bytes()[:2000]:
+            raise InputError("file exists and is no page of pixmetry", where=str(target), remedy="choose another name")
+        target.parent.mkdir(parents=True, exist_ok=True)
+        partial = target.with_name(f".{target.name}.partial-{os.getpid()}-{secrets.token_hex(4)}")
+        try:
+            partial.write_text(text, encoding="utf-8")
+            os.replace(partial, target)
+        finally:
+            partial.unlink(missing_ok=True)
+    except OSError as problem:
+        raise InputError("page cannot be written", where=str(target), value=problem.strerror, remedy="choose another place") from None
+    return target
+
+
 def _own_files(target: Path) -> tuple[set[str], str]:
     """Names of the files that the marker lists, and the kind of result."""
     try:

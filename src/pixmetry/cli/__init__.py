@@ -22,6 +22,7 @@ COMMANDS = {
     "assess": "Assess a camera from its frames: measure, budget, advise, and write the report.",
     "sources": "List the error sources, or explain one of them.",
     "simulate": "Make the frames of a camera whose errors are known.",
+    "chain": "Walk one target through a camera, source by source, on one page.",
     "correct": "Take out of frames what was measured in an assessment.",
 }
 

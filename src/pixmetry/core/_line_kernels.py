@@ -1,4 +1,4 @@
-"""Kernels of the video line: a held staircase through filters and echoes, read at any time."""
+"""Kernels of the video line: a held staircase through filters and echoes, read at any time; and numbers that are alike from row to row."""
 
 from __future__ import annotations
 
@@ -8,54 +8,68 @@ from pixmetry.core.jit import jit
 
 
 @jit
-def read_line(data, first, black, poles, steps, direct, delays, amplitudes, times, out):
-    """Read every row of a staircase at some times, in place of ``out``.
+def read_line(data, first, black, step, table, delays, amplitudes, at, late, length, out):
+    """Read every row of a staircase at some times, into ``out``.
 
     Parameters
     ----------
     data : float32, (n, rows, cols)
         Levels that are held for one pixel period each; pixel ``first[i]`` is the first one of window ``i``.
+    first : int64, (n,)
     black : float64
         Level before the first and after the last pixel.
-    poles, steps : complex128, (k,)
-        The filter's response to a unit step is direct + Σ steps (exp(poles t) − 1), times in pixel periods.
+    step : float64, (k, k + 1)
+        The filter's state at the end of a pixel's hold, from that at its beginning and the pixel's level.
+    table : float64, (m + 1, k + 1, 4)
+        Weights of the state and of the level in what comes out a part of a period later: Taylor coefficients about m + 1 parts.
     delays, amplitudes : float64, (e,)
         Echoes, the signal itself among them, in pixel periods.
-    times : float64, (n, rows, m)
-        When to read, in pixel periods; 0 is the beginning of pixel 0's hold.
-    out : float32, (n, rows, m)
+    at, late : float64, (n, samples) and (n, rows)
+        Every row is read at ``at - late``, in pixel periods from the beginning of pixel 0's hold.
+    length : int
+        Periods from the first pixel for which a state is needed.
+    out : float32, (n, rows, samples)
     """
     n, rows, cols = data.shape
-    k, count = len(poles), times.shape[2]
-    whole = np.exp(poles)
-    state = np.zeros((cols + 1, k), np.complex128)  # of every pole at the beginning of every pixel's hold
+    k, samples, nodes = len(step), at.shape[1], table.shape[0] - 1
+    state = np.zeros((length + 1, k + 1))  # at the beginning of every period; the last column holds the level of the period
     for i in range(n):
         for r in range(rows):
-            for p in range(k):
-                z = 0.0 + 0.0j
-                for c in range(cols):
-                    state[c, p] = z
-                    z = whole[p] * z + steps[p] * (whole[p] - 1.0) * (data[i, r, c] - black)
-                state[cols, p] = z
-            last = np.nan
-            decay = np.empty(k, np.complex128)
-            for j in range(count):
-                total = 0.0
+            for c in range(cols):
+                state[c, k] = np.float64(data[i, r, c]) - black
+            for c in range(length):
+                for p in range(k):
+                    total = 0.0
+                    for q in range(k + 1):
+                        total += step[p, q] * state[c, q]
+                    state[c + 1, p] = total
+            for j in range(samples):
+                time = at[i, j] - late[i, r]
+                value = 0.0
                 for e in range(len(delays)):
-                    t = times[i, r, j] - delays[e] - first[i]
-                    if t < 0.0:
+                    t = time - delays[e]
+                    whole = np.floor(t)
+                    c = int(whole) - first[i]
+                    if c < 0:
                         continue
-                    at = int(np.floor(t))
-                    if at > cols:
-                        at = cols
-                    part = t - at
-                    if part != last:
-                        for p in range(k):
-                            decay[p] = np.exp(poles[p] * part)
-                        last = part
-                    level = data[i, r, at] - black if at < cols else 0.0
-                    value = direct * level
-                    for p in range(k):
-                        value += (decay[p] * state[at, p] + steps[p] * (decay[p] - 1.0) * level).real
-                    total += amplitudes[e] * value
-                out[i, r, j] = black + total
+                    part = t - whole
+                    node = int(part * nodes + 0.5)
+                    d = part - node / nodes
+                    total = 0.0
+                    for q in range(k + 1):
+                        w = table[node, q]
+                        total += (((w[3] * d + w[2]) * d + w[1]) * d + w[0]) * state[c, q]
+                    value += amplitudes[e] * total
+                out[i, r, j] = black + value
+
+
+@jit
+def moving_sum(white, weights, stride, out):
+    """Σ_k weights[k] white[i, r + stride (m − 1 − k)] for every row r, always in the same order of adding; float64 in, (n, rows) out."""
+    m = len(weights)
+    for i in range(out.shape[0]):
+        for r in range(out.shape[1]):
+            total = 0.0
+            for k in range(m):
+                total += weights[k] * white[i, r + stride * (m - 1 - k)]
+            out[i, r] = total

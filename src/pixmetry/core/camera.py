@@ -399,7 +399,7 @@ class Camera:
     # ---- geometry -------------------------------------------------------------------------------------------------------------
 
     def true_positions(
-        self, x_px: Any, y_px: Any, frame: int = 0, seed: int = 0, exposure_s: float | None = None, **schedule: Any
+        self, x_px: Any, y_px: Any, frame: int = 0, seed: int = 0, layout_only: bool = False, **schedule: Any
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return where points of the scene's plane lie in a frame that the camera puts out.
 
@@ -412,6 +412,8 @@ class Camera:
             In pixels of the ideal camera.
         frame, seed : int
             Of the exposure.
+        layout_only : bool
+            Only how the frame is laid out counts (clock of the samples, offsets, fields), not what bends the image.
         **schedule
             As for `expose`.
 
@@ -422,11 +424,11 @@ class Camera:
         """
         x, y = (np.atleast_1d(np.asarray(v, float)) for v in (x_px, y_px))
         streams = self.streams(seed)
-        signal = self.signal(_NoScene(), Grid(np.array([frame]), np.zeros(1), np.zeros(1), (1, 1)), exposure_s, **schedule)
+        signal = self.signal(_NoScene(), Grid(np.array([frame]), np.zeros(1), np.zeros(1), (1, 1)), **schedule)
         for link in self.links:
             if Kind.LIGHT in link.source.consumes and link.source is not LOOK:
                 signal, _ = run(link.source, link.params, signal, streams.of(link.name))
-            elif link.source is LOOK:
+            elif link.source is LOOK and not layout_only:
                 x, y = (v[0, :, 0] for v in signal.light.placed(x[None, :, None], y[None, :, None]))
             elif link.source.place is not None:
                 x, y = link.source.place(link.params, x, y, link.shape)

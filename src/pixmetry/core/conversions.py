@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from pixmetry.core.line import Line
 from pixmetry.core.random import Grid, Stream
-from pixmetry.core.signal import Kind, Signal, Windows
+from pixmetry.core.signal import Clock, Kind, Signal, Windows
 from pixmetry.core.source import Parameters, Source, run
 
 
@@ -56,23 +57,36 @@ class LineSources:
     links: tuple[Link, ...]
     pixel_hz: float
 
+    @cached_property
     def line(self) -> Line:
-        """The line as it is without any draw, for its geometry."""
+        """The line as it is without any draw, for its geometry; made once, whatever the number of windows."""
         zero = np.zeros(1)
         grid = Grid(np.zeros(1, np.int64), np.zeros(1, np.int64), np.zeros(1, np.int64), (1, 1))
-        signal = Signal(np.zeros((1, 1, 1), np.float32), Kind.VIDEO, grid, (1, 1), zero, zero, zero, line=Line(self.pixel_hz, self.pixel_hz))
+        data, clock, line = np.zeros((1, 1, 1), np.float32), Clock(self.pixel_hz), Line(self.pixel_hz, self.pixel_hz)
+        signal = Signal(data, Kind.VIDEO, grid, (1, 1), zero, zero, zero, clock, line=line)
         for link in self.links:
             signal, _ = run(link.source, link.params, replace(signal, frame_shape=link.shape), QUIET)
         return signal.line
 
-
     def pixels_of(self, windows: Windows, frame_shape: tuple[int, int]) -> Windows:
         """The pixels at which the samples of some windows look."""
-        line = self.line()
-        first = np.floor(line.pixels(windows.col0.astype(float))).astype(np.int64)
-        last = np.ceil(line.pixels((windows.col0 + windows.cols - 1).astype(float))).astype(np.int64)
+        first = np.floor(self.line.pixels(windows.col0.astype(float))).astype(np.int64)
+        last = np.ceil(self.line.pixels((windows.col0 + windows.cols - 1).astype(float))).astype(np.int64)
         first, last = np.clip(first, 0, frame_shape[1] - 1), np.clip(last, 0, frame_shape[1] - 1)
         return Windows(windows.row0, first, windows.rows, last - first + 1)
+
+    def samples_at(self, grid: Grid, frame_shape: tuple[int, int]) -> Grid:
+        """The samples that look at a batch of windows of pixels; at the ends of the row, all that look beyond.
+
+        Windows of one size may be seen by different numbers of samples: all get as many as the one with most.
+        """
+        line, cols = self.line, grid.shape[1]
+        samples = line.samples or frame_shape[1]
+        first = np.ceil(line.placed(grid.col0.astype(float)) - 1e-9).astype(np.int64)
+        last = np.floor(line.placed((grid.col0 + cols - 1).astype(float)) + 1e-9).astype(np.int64)
+        first = np.clip(np.where(grid.col0 == 0, 0, first), 0, samples - 1)
+        last = np.clip(np.where(grid.col0 + cols == frame_shape[1], samples - 1, last), first, samples - 1)
+        return Grid(grid.frame, grid.row0, first, (grid.shape[0], int((last - first).max(initial=0)) + 1))
 
 
 class _Zeros:
@@ -110,26 +124,22 @@ def _sample(params: LineSources, signal: Signal, stream: Stream) -> Signal:
     line = signal.line
     if line.plain:
         return replace(signal, kind=Kind.DN, line=None)
-    samples = line.samples or signal.frame_shape[1]
-    grid, width = signal.grid, signal.data.shape[2]
-    if width == signal.frame_shape[1]:
-        col0, cols = np.zeros_like(grid.col0), samples
-    else:  # a part of the row: the samples that look at it
-        col0 = np.ceil(line.placed(grid.col0.astype(float)) - 1e-9).astype(np.int64)
-        last = np.floor(line.placed((grid.col0 + width - 1).astype(float)) + 1e-9).astype(np.int64)
-        col0, last = np.clip(col0, 0, samples - 1), np.clip(last, 0, samples - 1)
-        cols = int((last - col0).min()) + 1
-    data = line.read(signal.data, grid.col0, col0, cols)
-    out = Grid(grid.frame, grid.row0, col0, (grid.shape[0], cols))
-    for noise in line.noise:
-        data = data + noise(out)
-    shape = (signal.frame_shape[0], samples)
-    return replace(signal, data=np.asarray(data, np.float32), kind=Kind.DN, line=None, grid=out, frame_shape=shape)
+    grid = params.samples_at(signal.grid, signal.frame_shape)
+    data = line.read(signal.data, signal.grid.col0, grid)
+    shape = (signal.frame_shape[0], line.samples or signal.frame_shape[1])
+    return replace(signal, data=data, kind=Kind.DN, line=line if line.noise else None, grid=grid, frame_shape=shape)
+
+
+def _add_noise(params: Nothing, signal: Signal, stream: Stream) -> Signal:
+    data = signal.data
+    for noise in signal.line.noise:
+        data = data + noise(signal.grid)
+    return replace(signal, data=np.asarray(data, np.float32), line=None)
 
 
 def _sample_context(params: LineSources, windows: Windows, frame_shape: tuple[int, int]) -> Windows:
     """Whole rows, unless the samples are the pixels; anything to the left may still be on the line."""
-    return windows if _line(params).plain else windows.full_rows(frame_shape)
+    return windows if params.line.plain else windows.full_rows(frame_shape)
 
 
 def _sample_near(params: LineSources) -> tuple[int, int, int, int]:
@@ -143,15 +153,11 @@ def _sample_tail(params: LineSources) -> float:
 
 
 def _sample_reshape(params: LineSources, frame_shape: tuple[int, int]) -> tuple[int, int]:
-    return frame_shape[0], _line(params).samples or frame_shape[1]
+    return frame_shape[0], params.line.samples or frame_shape[1]
 
 
 def _sample_place(params: LineSources, x: np.ndarray, y: np.ndarray, frame_shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    return _line(params).placed(x), y
-
-
-def _line(params: LineSources) -> Line:
-    return params.line()
+    return params.line.placed(x), y
 
 
 def _conversion(id: str, title: str, consumes: Kind, produces: Kind, forward: Any, **kw: Any) -> Source:
@@ -191,6 +197,7 @@ SAMPLE = _conversion(
     reshape=_sample_reshape,
     place=_sample_place,
 )
+NOISE = _conversion("core.line_noise", "noise of the line joins its samples", Kind.DN, Kind.DN, _add_noise)
 STEPS = {(Kind.LIGHT, Kind.PHOTONS): LOOK, (Kind.DN, Kind.VIDEO): HOLD, (Kind.VIDEO, Kind.DN): SAMPLE}
 
 
@@ -219,6 +226,8 @@ def linked(elements: Any, frame_shape: tuple[int, int], pixel_hz: float) -> tupl
         params = LineSources(tuple(on_line), pixel_hz) if source is SAMPLE else Nothing()
         on_line.clear()
         add(f"{source.id} {len(links)}", source, params)
+        if source is SAMPLE and params.line.noise:  # a step of its own: a noise-free run of the sampling has none
+            add(f"{NOISE.id} {len(links)}", NOISE, Nothing())
 
     for element in elements:
         step = conversion(kind, element.source.consumes)

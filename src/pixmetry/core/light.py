@@ -19,7 +19,7 @@ from pixmetry.core._camera_kernels import decimate
 from pixmetry.core.errors import InputError
 from pixmetry.core.random import Grid
 
-FINE = 4  # cells per pixel and axis of the raster on which a tabulated point spread is applied
+FINE = 4  # points per pixel and axis of the raster on which a tabulated point spread is applied
 GAUSS = {  # nodes and weights on (-1/2, 1/2): Gauss–Legendre
     1: (np.zeros(1), np.ones(1)),
     2: (np.array([-0.28867513459481287, 0.28867513459481287]), np.array([0.5, 0.5])),
@@ -101,13 +101,15 @@ class Light:
     dots : (dx, dy, weight), arrays of shape (k,)
         A spread made of a few points, such as a birefringent plate's.
     kernel : ndarray, shape (2 m + 1, 2 m + 1), optional
-        A point spread on a raster of ``FINE`` cells per pixel, of sum 1, row by row from the top.
+        A point spread on a raster of ``FINE`` points per pixel, of sum 1, row by row from the top.
     aperture_px : (float, float)
         Width and height of the light-sensitive box in the middle of the pixel.
     sensitivity : float
         Photons counted over those that fall on the aperture's mean density times one pixel.
     moments_s, weights : ndarray, shape (n, rows or 1, m)
         When each row looks, and with which share of the light; by default once, in the middle of the exposure.
+    jitter_px : (dx, dy), arrays of shape (n, rows, cols), optional
+        Where each pixel lies, less its place on the grid.
     """
 
     scene: Any
@@ -124,6 +126,7 @@ class Light:
     sensitivity: float = 1.0
     moments_s: np.ndarray | None = None
     weights: np.ndarray | None = None
+    jitter_px: tuple[np.ndarray, np.ndarray] | None = None
 
     # ---- what sources do --------------------------------------------------------------------------------------------------------
 
@@ -149,7 +152,7 @@ class Light:
         return replace(self, dots=(dx, dy, w))
 
     def convolved(self, kernel: np.ndarray) -> Light:
-        """Return the light after a tabulated point spread: odd sides, ``FINE`` cells per pixel."""
+        """Return the light after a tabulated point spread: odd sides, ``FINE`` points per pixel."""
         new = np.asarray(kernel, float)
         if new.ndim != 2 or not all(s % 2 for s in new.shape) or not np.isfinite(new).all() or new.sum() <= 0:
             raise InputError("a point spread cannot be used", value=new.shape, allowed="a finite array with odd sides and a positive sum")
@@ -163,6 +166,11 @@ class Light:
     def seen_at(self, moments_s: np.ndarray, weights: np.ndarray) -> Light:
         """Return the light with other times of looking; arrays of shape (n, rows or 1, m)."""
         return replace(self, moments_s=moments_s, weights=weights)
+
+    def jittered(self, dx_px: np.ndarray, dy_px: np.ndarray) -> Light:
+        """Return the light with every pixel moved by an amount of its own; arrays of shape (n, rows, cols), added to those before."""
+        before = (0.0, 0.0) if self.jitter_px is None else self.jitter_px
+        return replace(self, jitter_px=(before[0] + np.asarray(dx_px, float), before[1] + np.asarray(dy_px, float)))
 
     @property
     def moments(self) -> tuple[np.ndarray, np.ndarray]:
@@ -241,11 +249,12 @@ class Light:
             and self.aperture_px == (1.0, 1.0)
             and self.sensitivity == 1.0
             and self.moments_s is None
+            and self.jitter_px is None
         )
 
     def photons(self) -> np.ndarray:
         """Mean photons of every pixel, float32, shape (n, rows, cols)."""
-        if self.plain:
+        if self.plain and hasattr(self.scene, "photons"):
             return np.ascontiguousarray(self.scene.photons(self.grid, self.frame_shape, self.exposure_s, self.time_s), np.float32)
         if not hasattr(self.scene, "radiance"):
             raise InputError(
@@ -286,29 +295,24 @@ class Light:
         x = (self.grid.col0[:, None] + np.arange(self.grid.shape[1])).astype(float)[:, None, :]
         time = time_s[:, :, None]
         if self.kernel is None:
+            if self.jitter_px is not None:
+                x, y = x + self.jitter_px[0][:, block], y + self.jitter_px[1][:, block]
             return self._averaged(x, y, time, self.aperture_px)
-        mask = self._mask
+        mask = self._mask if self.jitter_px is None else np.pad(self._mask, 2)
         m = mask.shape[0] // 2, mask.shape[1] // 2
         fine_y, fine_x = (_refined(v, axis, reach) for v, axis, reach in ((y, 1, m[0]), (x, 2, m[1])))
-        fine = self._averaged(fine_x, fine_y, time[:, :1], (1 / FINE, 1 / FINE))
-        return decimate(np.ascontiguousarray(fine, np.float64), mask, FINE, len(rows), self.grid.shape[1])
+        fine = self._averaged(fine_x, fine_y, time[:, :1], self.aperture_px)
+        fine, size = np.ascontiguousarray(fine, np.float64), (FINE, len(rows), self.grid.shape[1])
+        seen = decimate(fine, mask, *size)
+        if self.jitter_px is not None:  # to first order: all pixels share one raster
+            seen += self.jitter_px[0][:, block] * decimate(fine, _slope(mask, 1), *size)
+            seen += self.jitter_px[1][:, block] * decimate(fine, _slope(mask, 0), *size)
+        return seen
 
     @cached_property
     def _mask(self) -> np.ndarray:
-        """The point spread and the pixel aperture on the fine raster: the weight of every cell around a pixel's centre.
-
-        A pixel's centre lies on a corner of four cells, so the sides are even. The cells hold means over themselves; the box that this
-        adds is taken out again to second order.
-        """
-        from scipy.signal import convolve2d
-
-        box = np.outer(_box(self.aperture_px[1]), _box(self.aperture_px[0]))
-        mask = convolve2d(self.kernel, box)
-        mask = np.pad(mask, 1)
-        laplacian = (
-            np.roll(mask, 1, 0) + np.roll(mask, -1, 0) + np.roll(mask, 1, 1) + np.roll(mask, -1, 1) - 4 * mask
-        )
-        return np.ascontiguousarray((mask - laplacian / 24)[::-1, ::-1])
+        """Weights of the raster about a pixel's centre: what a point gives to its right, a pixel takes from its left."""
+        return np.ascontiguousarray(self.kernel[::-1, ::-1])
 
     def _averaged(self, x: np.ndarray, y: np.ndarray, time: np.ndarray, cell: tuple[float, float]) -> np.ndarray:
         """Light averaged over a cell about every point, through all spreads but the tabulated one."""
@@ -398,17 +402,14 @@ class _Strides:
 
 
 def _refined(v: np.ndarray, axis: int, reach: int) -> np.ndarray:
-    """Centres of the fine cells around whole pixels along an axis, with a margin of ``reach`` cells."""
+    """Points of the fine raster about whole pixels along an axis, pixel centres among them, with a margin of ``reach`` points."""
     first = v.take([0], axis=axis)
-    count = v.shape[axis] * FINE + 2 * reach - FINE
-    at = (np.arange(count) - reach + 0.5) / FINE
+    count = (v.shape[axis] - 1) * FINE + 2 * reach + 1
+    at = (np.arange(count) - reach) / FINE
     return first + (at[None, :, None] if axis == 1 else at[None, None, :])
 
 
-def _box(width_px: float) -> np.ndarray:
-    """A box of this width on the fine raster, centred on a corner between cells: an even number of weights of sum 1."""
-    half = 0.5 * width_px * FINE
-    count = int(np.ceil(half - 1e-12))
-    edge = np.clip(half - np.arange(count), 0.0, 1.0)
-    both = np.concatenate([edge[::-1], edge])
-    return both / both.sum()
+def _slope(mask: np.ndarray, axis: int) -> np.ndarray:
+    """The mask under which the raster's derivative per pixel is seen: differences of fourth order; the mask's rim of two cells is 0."""
+    one, two = (np.roll(mask, k, axis) - np.roll(mask, -k, axis) for k in (1, 2))
+    return FINE * (8 * one - two) / 12

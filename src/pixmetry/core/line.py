@@ -2,24 +2,34 @@
 
 The sources between a camera's output and the converter of a frame grabber do not work on numbers. They change the continuous signal:
 filters (poles and zeros), echoes, and when it is sampled (clock, delay of each row). ``Line`` collects that; the camera samples it once, at the
-first source that takes DN. The staircase has an exact answer through any filter of that kind (a sum of exponentials between its steps), so
-nothing is interpolated and nothing is filtered at the pixel rate.
+first source that takes DN. The staircase has an exact answer through any filter of that kind, so nothing is interpolated and nothing is
+filtered at the pixel rate.
+
+Filters and echoes are linear and do not change in time, so their order does not matter. A delay of a whole row may be exchanged with
+them too; a delay that changes along the line may as far as it changes little over the duration of an impulse response.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
-from pixmetry.core._line_kernels import read_line
+from pixmetry.core._line_kernels import moving_sum, read_line
+from pixmetry.core.contribution import Contribution, Probe
 from pixmetry.core.errors import ParameterError
+from pixmetry.core.random import Grid
 
 SMALLEST_ECHO = 1e-7
-APART = 1e-6  # relative: repeated poles are moved apart by this
+NODES_PER_RATE = 80  # of the table, for each unit of ‖A‖: what Taylor's third order leaves is (1/160)⁴/24 = 6e-11
+MOST_NODES = 1 << 16
 
 Warp = Callable[[np.ndarray], np.ndarray]
+Rows = Callable[[Grid], np.ndarray]
+Filter = tuple[np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -30,54 +40,54 @@ class Line:
     ----------
     pixel_clock_hz : float
         Each pixel is held for one period of it.
+    sample_clock_hz : float
+        Clock of the sampling; sample k is taken at ``start_s + (k + ½)/sample_clock_hz`` of the line.
     filters : tuple of (zeros, poles)
         In rad/s, complex in conjugate pairs, poles in the left half-plane; each has gain 1 at frequency 0.
     echo_delay_s, echo_amplitude : ndarray, shape (e,)
         All paths of the signal, the direct one among them.
-    sample_clock_hz : float
-        Clock of the sampling; sample k is taken at ``start_s + (k + ½)/sample_clock_hz`` of the line.
     start_s : float
     samples : int, optional
         Samples per row; by default one for each pixel.
-    delay_s : tuple of ndarray, shape (n, rows) or broadcast
-        Delays of the signal row by row: jitter, drift.
+    delays : tuple of callables
+        ``(grid) -> s``, shape (n, rows) or broadcast to it: delays of the signal row by row (jitter, drift) in the rows of a grid.
     warps : tuple of callables
-        ``(time_s) -> s``: further delays of the signal that change along the line; arrays of shape (n, rows or 1, samples), of the sampling
-        times from the first pixel's beginning.
+        ``(time_s) -> s``: further delays, which change along the line, at sampling times of shape (n, 1, samples).
     noise : tuple of callables
-        ``(grid) -> array (n, rows, samples)``, added to the samples, in DN.
+        ``(grid) -> DN``, shape (n, rows, samples): added to the samples.
     black_dn : float
         Level before the first and after the last pixel.
     """
 
     pixel_clock_hz: float
     sample_clock_hz: float
-    filters: tuple[tuple[np.ndarray, np.ndarray], ...] = ()
+    filters: tuple[Filter, ...] = ()
     echo_delay_s: np.ndarray | None = None
     echo_amplitude: np.ndarray | None = None
     start_s: float = 0.0
     samples: int | None = None
-    delay_s: tuple[np.ndarray, ...] = ()
+    delays: tuple[Rows, ...] = ()
     warps: tuple[Warp, ...] = ()
-    noise: tuple[Callable[..., np.ndarray], ...] = ()
+    noise: tuple[Rows, ...] = ()
     black_dn: float = 0.0
 
     # ---- what sources do --------------------------------------------------------------------------------------------------------
 
-    def filtered(self, zeros: np.ndarray, poles: np.ndarray) -> Line:
+    def filtered(self, zeros: Any, poles: Any) -> Line:
         """Return the line after an analogue filter of gain 1 at frequency 0; zeros and poles in rad/s.
 
         Raises
         ------
         ParameterError
-            If the filter is unstable, improper, or blocks a constant level.
+            If the filter is unstable, improper, not real, or blocks a constant level.
         """
-        z, p = (np.atleast_1d(np.asarray(v, complex)) for v in (zeros, poles))
-        if len(p) == 0 or len(z) > len(p) or (p.real >= 0).any() or (np.abs(z) == 0).any():
-            raise ParameterError("the filter cannot be used", where="line", allowed="stable, as many poles as zeros or more, passing 0 Hz")
+        z, p = (np.asarray(v, complex).reshape(-1) for v in (zeros, poles))
+        real = all(np.allclose(np.sort_complex(v), np.sort_complex(v.conj())) for v in (z, p))
+        if not real or len(p) == 0 or len(z) > len(p) or (p.real >= 0).any() or (z == 0).any():
+            raise ParameterError("the filter cannot be used", where="line", allowed="real, stable, not more zeros than poles, passing 0 Hz")
         return replace(self, filters=(*self.filters, (z, p)))
 
-    def echoed(self, delay_s: np.ndarray, amplitude: np.ndarray) -> Line:
+    def echoed(self, delay_s: Any, amplitude: Any) -> Line:
         """Return the line after several paths of these delays and amplitudes."""
         d, a = (np.atleast_1d(np.asarray(v, float)) for v in (delay_s, amplitude))
         if self.echo_delay_s is not None:
@@ -91,15 +101,20 @@ class Line:
         """Return the line sampled by another clock."""
         return replace(self, sample_clock_hz=float(sample_clock_hz), start_s=float(start_s), samples=int(samples))
 
-    def delayed(self, delay_s: np.ndarray) -> Line:
-        """Return the line with rows that come later by so much, shape (n, rows) or broadcast to it."""
-        return replace(self, delay_s=(*self.delay_s, np.asarray(delay_s, float)))
+    def delayed(self, delay_s: Rows | np.ndarray) -> Line:
+        """Return the line with rows that come later by so much: a function of the grid, or an array of one value per window, shape (n, 1)."""
+        if callable(delay_s):
+            return replace(self, delays=(*self.delays, delay_s))
+        one = np.asarray(delay_s, float)
+        if one.ndim != 2 or one.shape[1] != 1:
+            raise ParameterError("a delay cannot be used", value=one.shape, where="line", allowed="a function of the grid, or shape (n, 1)")
+        return replace(self, delays=(*self.delays, lambda grid: one))
 
     def warped(self, warp: Warp) -> Line:
         """Return the line with a delay that changes along it."""
         return replace(self, warps=(*self.warps, warp))
 
-    def with_noise(self, noise: Callable[..., np.ndarray]) -> Line:
+    def with_noise(self, noise: Rows) -> Line:
         """Return the line with noise that is added to its samples."""
         return replace(self, noise=(*self.noise, noise))
 
@@ -109,60 +124,62 @@ class Line:
     def plain(self) -> bool:
         """Whether sampling gives the pixels back as they are."""
         return (
-            not (self.filters or self.delay_s or self.warps or self.noise)
+            not (self.filters or self.delays or self.warps or self.noise)
             and self.echo_delay_s is None
             and self.sample_clock_hz == self.pixel_clock_hz
             and self.start_s == 0.0
             and self.samples is None
         )
 
-    def times(self, n: int, rows: int, col0: np.ndarray, cols: int) -> np.ndarray:
-        """Times at which the signal is read, in s from the beginning of pixel 0, shape (n, rows, cols)."""
-        at = self.start_s + (col0[:, None, None] + np.arange(cols) + 0.5) / self.sample_clock_hz
-        late = np.zeros((n, rows, 1))
-        for delay in self.delay_s:
-            late = late + np.broadcast_to(delay, (n, rows))[:, :, None]
-        total = np.broadcast_to(at - late, (n, rows, cols))
+    def times(self, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
+        """Times at which the samples of a grid are read, in s from the beginning of pixel 0: of every sample, (n, samples), less that of every row, (n, rows)."""
+        n, rows, cols = grid.size
+        at = self.start_s + (grid.col0[:, None, None] + np.arange(cols) + 0.5) / self.sample_clock_hz
+        read = at
         for warp in self.warps:
-            total = total - warp(at)
-        return np.ascontiguousarray(np.broadcast_to(total, (n, rows, cols)))
+            read = read - warp(at)
+        late = np.zeros((n, rows))
+        for delay in self.delays:
+            late = late + delay(grid)
+        return np.ascontiguousarray(np.broadcast_to(read, (n, 1, cols))[:, 0]), late
 
-    def read(self, data: np.ndarray, first_col: np.ndarray, col0: np.ndarray, cols: int) -> np.ndarray:
-        """Read rows of pixels; ``data`` is float32 (n, rows, pixels) from pixel ``first_col`` on, the result (n, rows, cols) from ``col0``."""
-        n, rows, _ = data.shape
-        poles, steps, direct = self.step_response()
-        period = 1.0 / self.pixel_clock_hz
-        delays = np.zeros(1) if self.echo_delay_s is None else np.asarray(self.echo_delay_s / period)
-        amplitudes = np.ones(1) if self.echo_amplitude is None else np.asarray(self.echo_amplitude)
-        out = np.empty((n, rows, cols), np.float32)
-        times = self.times(n, rows, np.asarray(col0), cols) / period
+    def read(self, data: np.ndarray, first_col: np.ndarray, grid: Grid) -> np.ndarray:
+        """Read rows of pixels.
+
+        Parameters
+        ----------
+        data : ndarray, shape (n, rows, pixels), float32, DN
+            Pixels from ``first_col`` on, shape (n,); what lies outside is black.
+        grid : Grid
+            Of the samples, with the rows of the data.
+
+        Returns
+        -------
+        ndarray, shape (n, rows, samples), float32, DN
+        """
+        step, table = response(tuple((z.tobytes(), p.tobytes()) for z, p in self.filters), self.pixel_clock_hz)
+        delays = np.zeros(1) if self.echo_delay_s is None else self.echo_delay_s * self.pixel_clock_hz
+        amplitudes = np.ones(1) if self.echo_amplitude is None else self.echo_amplitude
+        out = np.empty(grid.size, np.float32)
+        if out.size == 0:
+            return out
+        at, late = (t * self.pixel_clock_hz for t in self.times(grid))
+        first = np.asarray(first_col, np.int64)
+        latest = float((at.max(axis=1) - late.min(axis=1) - first).max() - delays.min())
+        length = max(data.shape[2], int(np.floor(latest)) + 1)
         read_line(
-            np.ascontiguousarray(data, np.float32), np.asarray(first_col, np.float64), self.black_dn, poles, steps, direct, delays, amplitudes,
-            times, out,
-        )
+            np.ascontiguousarray(data, np.float32), first, self.black_dn, step, table, np.ascontiguousarray(delays, float),
+            np.ascontiguousarray(amplitudes, float), at, late, length, out,
+        )  # fmt: skip
         return out
 
-    def step_response(self) -> tuple[np.ndarray, np.ndarray, float]:
-        """All filters as one: poles p (per pixel period) and weights s with step response d + Σ s (e^(p t) − 1).
-
-        H(s) = d + Σ r/(s − p) by partial fractions, so a unit step gives d + Σ (r/p)(e^(pt) − 1).
-        """
-        if not self.filters:
-            return np.zeros(0, complex), np.zeros(0, complex), 1.0
-        zeros = np.concatenate([z for z, _ in self.filters]) / self.pixel_clock_hz
-        poles = np.concatenate([p for _, p in self.filters]) / self.pixel_clock_hz
-        for i in range(len(poles)):
-            while i and np.min(np.abs(poles[:i] - poles[i])) < APART * np.abs(poles[i]):
-                poles[i] *= 1 + 3 * APART
-        gain = np.prod(-poles) / np.prod(-zeros) if len(zeros) else np.prod(-poles)
-        residues = np.array(
-            [
-                gain * np.prod(p - zeros) / np.prod([p - q for j, q in enumerate(poles) if j != i])
-                for i, p in enumerate(poles)
-            ]
-        )
-        direct = float(gain.real) if len(zeros) == len(poles) else 0.0
-        return np.ascontiguousarray(poles), np.ascontiguousarray(residues / poles), direct
+    @property
+    def delay_s(self) -> float:
+        """First moment of the impulse response of filters and echoes: how much later the centroid of anything comes."""
+        total = sum(group_delay_s(z, p) for z, p in self.filters)
+        if self.echo_delay_s is not None:
+            total += float((self.echo_delay_s * self.echo_amplitude).sum() / self.echo_amplitude.sum())
+        return total
 
     def placed(self, x: np.ndarray) -> np.ndarray:
         """Columns of the samples at which places on the pixel grid are seen (delays of rows and of filters are errors, not geometry)."""
@@ -171,3 +188,115 @@ class Line:
     def pixels(self, col: np.ndarray) -> np.ndarray:
         """Place on the pixel grid at which a sample looks, the inverse of `placed`."""
         return ((col + 0.5) / self.sample_clock_hz + self.start_s) * self.pixel_clock_hz - 0.5
+
+
+def group_delay_s(zeros: Any, poles: Any) -> float:
+    """Group delay of a filter at frequency 0 in s, −H'(0)/H(0) = Σ 1/z − Σ 1/p."""
+    z, p = (np.asarray(v, complex).reshape(-1) for v in (zeros, poles))
+    return float((1 / z).sum().real - (1 / p).sum().real)
+
+
+def reach_px(zeros: Any, poles: Any, share: float, pixel_hz: float = 14.1875e6) -> int:
+    """Pixels until what is left of a filter's step response has fallen below ``share`` of it.
+
+    From the slowest pole: its mode falls as e^(−|Re p| t), with room for the size that several equal poles may give it.
+    """
+    slowest = float(-np.asarray(poles).real.max()) / pixel_hz
+    return int(np.ceil((np.log(1 / share) + 2.5 * len(np.atleast_1d(poles))) / slowest)) + 1
+
+
+def correlated_rows(white: np.ndarray, weights: np.ndarray, stride: int = 1) -> np.ndarray:
+    """Moving sum down the rows of white numbers that begin ``stride·(len(weights) − 1)`` rows above the first row wanted; (n, rows)."""
+    out = np.empty((len(white), white.shape[1] - stride * (len(weights) - 1)))
+    moving_sum(np.ascontiguousarray(white, np.float64), np.ascontiguousarray(weights, np.float64), stride, out)
+    return out
+
+
+def through_line(line: Line, probe: Probe, gum_class: str = "G", **kw: Any) -> Contribution:
+    """Contribution of filters and echoes: the probe's windows are held on the line, background all around, and the estimator looks again."""
+    n, rows, cols = probe.signal_dn.shape
+    zero = np.zeros(n, np.int64)
+    grid = Grid(zero, zero, zero, (rows, cols))
+    seen = line.read(probe.signal_dn - probe.background_dn, zero, grid) + probe.background_dn
+    return probe.from_shifts(*probe.moved(seen.astype(float)), gum_class, method="the estimator on the target after the line", **kw)
+
+
+# ---- filters as state spaces ----------------------------------------------------------------------------------------------------
+
+
+@lru_cache(maxsize=64)
+def response(filters: tuple[tuple[bytes, bytes], ...], pixel_hz: float) -> tuple[np.ndarray, np.ndarray]:
+    """State step over one pixel period and table of read-outs of filters in a row, as `read_line` takes them.
+
+    With x' = A x + B u, y = C x + D u and a level u that is held, (x, u) becomes e^(M t)(x, u) with M = [[A, B], [0, 0]]
+    (C. F. Van Loan, IEEE Trans. Autom. Control 23, 1978, 395). Equal poles need no care of their own.
+    """
+    from scipy.linalg import expm
+
+    a, b, c, d = _cascade([section for z, p in filters for section in _sections(_scaled(z, pixel_hz), _scaled(p, pixel_hz))])
+    k = len(a)
+    m = np.zeros((k + 1, k + 1))
+    m[:k, :k], m[:k, k] = a, b
+    rate = float(np.linalg.norm(a, 2)) if k else 0.0
+    nodes = 1 << max(6, int(np.ceil(np.log2(max(NODES_PER_RATE * rate, 1.0)))))
+    if nodes > MOST_NODES:
+        raise ParameterError("a filter is faster than a thousandth of a pixel", where="line", remedy="leave it out: it does nothing")
+    powers = np.eye(k + 1)[None]
+    while len(powers) < nodes:
+        powers = np.concatenate([powers, powers @ expm(m * (len(powers) / nodes))])
+    whole = expm(m)
+    out = np.concatenate([powers, whole[None]])
+    weights = np.append(c, d) @ out
+    terms = [weights]
+    for order in (1, 2, 3):
+        terms.append(terms[-1] @ m / order)
+    return np.ascontiguousarray(whole[:k]), np.ascontiguousarray(np.stack(terms, axis=2))
+
+
+def _scaled(raw: bytes, pixel_hz: float) -> np.ndarray:
+    return np.frombuffer(raw, complex) / pixel_hz
+
+
+Section = tuple[np.ndarray, np.ndarray, np.ndarray, float]
+
+
+def _cascade(sections: list[Section]) -> Section:
+    """One state space of several in a row."""
+    a, b, c, d = np.zeros((0, 0)), np.zeros(0), np.zeros(0), 1.0
+    for a2, b2, c2, d2 in sections:
+        a = np.block([[a, np.zeros((len(a), len(a2)))], [np.outer(b2, c), a2]])
+        b, c, d = np.append(b, b2 * d), np.append(d2 * c, c2), d2 * d
+    return a, b, c, d
+
+
+def _sections(zeros: np.ndarray, poles: np.ndarray) -> list[Section]:
+    """Sections of first and second order of gain 1 at frequency 0; zeros go with poles two by two, one that is left over with what is free."""
+    pole_pairs, pole = _paired(poles)
+    zero_pairs, zero = _paired(zeros)
+    numerators = [(-(1 / z[0] + 1 / z[1]).real, (1 / (z[0] * z[1])).real) for z in zero_pairs]
+    single = [] if zero is None else [-1 / zero]
+    made = []
+    for i, (p, q) in enumerate(pole_pairs):
+        n1, n2 = numerators[i] if i < len(numerators) else (single.pop(), 0.0) if single and pole is None else (0.0, 0.0)
+        made.append(_second_order((p * q).real, -(p + q).real, n1, n2))
+    if pole is not None:
+        n1 = single.pop() if single else 0.0
+        made.append((np.array([[pole]]), np.array([-pole]), np.array([1 + n1 * pole]), -n1 * pole))
+    return made
+
+
+def _second_order(w2: float, damping: float, n1: float, n2: float) -> Section:
+    """(1 + n1 s + n2 s²) w2/(s² + damping s + w2) with the states y and y'/ω of the part without numerator."""
+    w = np.sqrt(w2)
+    a = np.array([[0.0, w], [-w, -damping]])
+    return a, np.array([0.0, w]), np.array([1 - n2 * w2, n1 * w - n2 * damping * w]), n2 * w2
+
+
+def _paired(roots: np.ndarray) -> tuple[list[tuple[complex, complex]], float | None]:
+    """Roots two by two: conjugates together, then the real ones, of which one may be left over."""
+    near_real = np.abs(roots.imag) <= 1e-12 * np.abs(roots)
+    upper = roots[~near_real & (roots.imag > 0)]
+    real = np.sort(roots[near_real].real)
+    pairs = [(complex(r), complex(r.conjugate())) for r in upper]
+    pairs += [(complex(a), complex(b)) for a, b in zip(real[0::2], real[1::2], strict=False)]
+    return pairs, float(real[-1]) if len(real) % 2 else None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -14,15 +15,30 @@ from pixmetry.core.signal import Kind, Signal
 from pixmetry.core.source import Parameters, Source, quantity
 
 
+TAIL = 3.0  # standard deviation of the rare wide part over that of the common one
+
+
 class AmplifierNoise(Parameters):
-    """White Gaussian noise, referred to the electrons at the sense node."""
+    """White noise, referred to the electrons at the sense node."""
 
     white_e: float = quantity(0.0, "e-", "standard deviation in every pixel", ge=0, le=1e5)
+    tail_share: float = quantity(0.0, "1", "share of the values that come from a normal law three times as wide; 0 is Gaussian", ge=0, le=0.5)
+    clock_ratio: float = quantity(1.0, "1", "pixel clock over the one for which white_e holds: the bandwidth follows it", gt=0, le=1e3)
+
+
+def deviation_e(params: AmplifierNoise) -> float:
+    """Standard deviation at the clock in use: the noise of a white band grows as the root of its width."""
+    return params.white_e * math.sqrt(params.clock_ratio)
 
 
 def forward(params: AmplifierNoise, signal: Signal, stream: Stream) -> Signal:
-    """Add independent normal noise to every pixel."""
-    return signal.with_data(stream.add_normal(signal.data, signal.grid, params.white_e))
+    """Add independent noise to every pixel: normal, or (1 − ε) N(0, s²) + ε N(0, 9 s²) with s² (1 + 8 ε) the whole variance."""
+    scale = deviation_e(params)
+    if params.tail_share == 0 or scale == 0:
+        return signal.with_data(stream.add_normal(signal.data, signal.grid, scale))
+    narrow = np.float32(scale / math.sqrt(1 + (TAIL**2 - 1) * params.tail_share))
+    wide = stream.uniform(signal.grid) < np.float32(params.tail_share)
+    return signal.with_data(stream.add_normal(signal.data, signal.grid, np.where(wide, np.float32(TAIL) * narrow, narrow)))
 
 
 def measure(observations: Observations) -> Estimates:
@@ -62,7 +78,7 @@ def _without_moving_waves(noise: Estimates, gain: float, found: PatternList, n_f
 
 def propagate(params: AmplifierNoise, probe: Probe) -> Contribution:
     """Propagator P1 with the same standard deviation in every pixel."""
-    u = probe.white(probe.gain_dn_per_e * params.white_e)
+    u = probe.white(probe.gain_dn_per_e * deviation_e(params))
     return probe.contribution(u, "T", model_error=0.12, method="linear response of the estimator to white noise")
 
 
@@ -83,7 +99,7 @@ SOURCE = Source(
     measure=measure,
     propagate=propagate,
     gum_class="T",
-    equation="n' = n + σ_d z,  z ~ N(0, 1)",
+    equation="n' = n + σ_d √(f/f_ref) z,  z ~ N(0, 1), or (1 − ε) N(0, s²) + ε N(0, 9 s²)",
     typical_size="0.004 px for 88 e- on a disc of 7 px at 15 000 electrons; with the shot noise 0.0057 px",
     references=("EMVA 1288 R4.0 Linear, §2.2 and §6.5", "J. R. Janesick, Photon Transfer, SPIE Press 2007, ch. 11"),
     advice="Read out more slowly, use more light, or average N frames (1/√N).",

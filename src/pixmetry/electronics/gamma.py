@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Literal
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from pixmetry.core.source import Parameters, Source, quantity
 LOWEST, HIGHEST = 0.3, 1.0  # exponents that a camera can be set to
 DARKEST, BRIGHTEST = 0.1, 0.8  # of the brightest level above black: the levels that are compared with a power curve
 LEVELS = 6  # at least, for the three numbers of a curve
+TOE = 0.018  # share of the reference below which a curve for television is a straight line
 LIGHT_RATIO = 2.0  # at least, between the brightest and the darkest of them
 
 
@@ -25,24 +27,52 @@ class Gamma(Parameters):
 
     gamma: float = quantity(1.0, "1", "exponent of the curve: 1 is linear, 0.45 the usual setting other than that", ge=LOWEST, le=HIGHEST)
     reference_dn: float = quantity(4095.0, "DN", "signal above black at which the curve meets the straight line", gt=0, le=1e9)
+    toe: Literal["none", "bt709"] = quantity("none", "1", "bt709: straight below 0.018 of the reference, as in television cameras")
 
 
-def curve_dn(x_dn: np.ndarray, gamma: float, reference_dn: float) -> np.ndarray:
-    """Apply the power curve, odd about black so that noise below black stays below; shape and dtype as given."""
+def shape(gamma: float, toe: str) -> tuple[float, float]:
+    """Return α and the slope of the toe: y = α x^γ − (α − 1) above the toe, slope · x in it.
+
+    Value and slope are continuous at the joint β: α = 1/(1 − (1 − γ) β^γ), slope = α γ β^(γ−1). For γ = 0.45 these are 1.09914 and
+    4.507, which ITU-R BT.709 prints as 1.099 and 4.5.
+    """
+    if toe == "none":
+        return 1.0, 0.0
+    alpha = 1 / (1 - (1 - gamma) * TOE**gamma)
+    return alpha, alpha * gamma * TOE ** (gamma - 1)
+
+
+def curve_dn(x_dn: np.ndarray, gamma: float, reference_dn: float, toe: str = "none") -> np.ndarray:
+    """Apply the curve, odd about black so that noise below black stays below; shape and dtype as given."""
     number = x_dn.dtype.type
-    return np.copysign(number(reference_dn) * np.power(np.abs(x_dn) * number(1 / reference_dn), number(gamma)), x_dn)
+    share = np.abs(x_dn) * number(1 / reference_dn)
+    y = np.power(share, number(gamma))
+    if toe != "none":
+        alpha, slope = shape(gamma, toe)
+        y = np.where(share < TOE, number(slope) * share, number(alpha) * y - number(alpha - 1))
+    return np.copysign(number(reference_dn) * y, x_dn)
+
+
+def straight_dn(y_dn: np.ndarray, gamma: float, reference_dn: float, toe: str) -> np.ndarray:
+    """Undo `curve_dn`, in float64."""
+    alpha, slope = shape(gamma, toe)
+    share = np.abs(y_dn) / reference_dn
+    x = np.power((share + (alpha - 1)) / alpha, 1 / gamma)
+    if toe != "none":
+        x = np.where(share < slope * TOE, share / slope, x)
+    return np.copysign(reference_dn * x, y_dn)
 
 
 def forward(params: Gamma, signal: Signal, stream: Stream) -> Signal:
     """Bend the response; a gamma of 1 leaves the very same bits."""
-    return signal if params.gamma == 1 else signal.with_data(curve_dn(signal.data, params.gamma, params.reference_dn))
+    return signal if params.gamma == 1 else signal.with_data(curve_dn(signal.data, params.gamma, params.reference_dn, params.toe))
 
 
 def correct(params: Gamma, signal: Signal, maps: Mapping[str, np.ndarray]) -> Signal:
-    """Undo the curve by its inverse, the power 1/γ, in float64."""
+    """Undo the curve by its inverse, in float64."""
     if params.gamma == 1:
         return signal
-    linear = curve_dn(signal.data.astype(np.float64), 1 / params.gamma, params.reference_dn)
+    linear = straight_dn(signal.data.astype(np.float64), params.gamma, params.reference_dn, params.toe)
     return signal.with_data(linear.astype(np.float32))
 
 
@@ -108,7 +138,7 @@ def propagate(params: Gamma, probe: Probe) -> Contribution:
     seen = (probe.gx != 0) | (probe.gy != 0)
     darkest = np.array(x[seen].min() if seen.any() else probe.background_dn)
     above = np.where(seen, x - darkest, 0.0)
-    bent = curve_dn(x, params.gamma, params.reference_dn) - curve_dn(darkest, params.gamma, params.reference_dn)
+    bent = curve_dn(x, params.gamma, params.reference_dn, params.toe) - curve_dn(darkest, params.gamma, params.reference_dn, params.toe)
     bent = np.where(seen, bent, 0.0)
     before, after = (v.sum(axis=(1, 2), keepdims=True) for v in (above, bent))
     scale = np.divide(before, after, out=np.zeros_like(before), where=after > 0)
@@ -136,8 +166,8 @@ SOURCE = Source(
     correct=correct,
     propagate=propagate,
     gum_class="F",
-    equation="y = y_max (x/y_max)^γ,  γ = 0.45 or 1",
+    equation="y = y_max (x/y_max)^γ,  γ = 0.45 or 1;  bt709: y/y_max = 1.099 (x/y_max)^γ − 0.099, below 0.018 4.5 x/y_max",
     typical_size="0.0017 px for 0.45 on a disc of 7 px, if the threshold follows the light",
-    references=("ITU-R BT.709-6, item 1.2 (exponent 0.45)", "EMVA 1288 R4.0 Linear, §6.7 (linearity error)"),
+    references=("ITU-R BT.709-6, item 1.2 (exponent 0.45, toe)", "EMVA 1288 R4.0 Linear, §6.7 (linearity error)"),
     advice="Set the camera to gamma 1; if that cannot be, apply the inverse curve before anything else.",
 )

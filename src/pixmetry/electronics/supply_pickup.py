@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 
 from pixmetry.core.contribution import Contribution, Probe
 from pixmetry.core.errors import InputError
-from pixmetry.core.random import Stream
+from pixmetry.core.random import Grid, Stream
 from pixmetry.core.signal import Kind, Signal
 from pixmetry.core.source import Parameters, Source, quantity
 from pixmetry.core.waves import shift_per_dn, wave, without_wave
@@ -21,6 +23,8 @@ class SupplyPickup(Parameters):
     frequency_hz: float = quantity(235.01e3, "Hz", "frequency of mains or switching supply", ge=1, le=5e6)
     line_time_us: float = quantity(64.0, "µs", "from the first pixel of a row to that of the next", gt=0, le=1e5)
     pixel_time_ns: float = quantity(67.8, "ns", "from pixel to pixel within a row; 0 where a row is read at once", ge=0, le=1e6)
+    scan: Literal["progressive", "interlaced"] = quantity("progressive", "1", "order of the rows; interlaced: even rows, then odd ones")
+    field_lines: float = quantity(312.5, "1", "line times from the start of the first field to that of the second", gt=0, le=1e6)
 
 
 def turns_per_px(params: SupplyPickup) -> tuple[float, float]:
@@ -34,8 +38,31 @@ def seen_per_px(params: SupplyPickup) -> tuple[float, float]:
     return nu_x - round(nu_x), nu_y - round(nu_y)
 
 
+def fields(params: SupplyPickup, signal: Signal) -> list[tuple[slice, Signal, float]]:
+    """Split windows into what is read without a jump: rows of the window, these rows as a signal numbered by field line, turns at its start.
+
+    Of an interlaced frame, row R is line R // 2 of field R % 2. Windows that start on rows of different parity do not come here together.
+    """
+    if params.scan == "progressive":
+        return [(slice(None), signal, 0.0)]
+    out = []
+    for first in range(min(2, signal.data.shape[1])):
+        row = signal.grid.row0 + first
+        data = signal.data[:, first::2]
+        grid = Grid(signal.grid.frame, row // 2, signal.grid.col0, data.shape[1:])
+        jump = params.frequency_hz * params.line_time_us * 1e-6 * params.field_lines * float(row[0] % 2)
+        out.append((slice(first, None, 2), replace(signal, data=data, grid=grid), jump))
+    return out
+
+
+def by_parity(params: SupplyPickup, signal: Signal) -> list[np.ndarray]:
+    """Positions in the batch of windows that are run together: all, or those that start on even and on odd rows."""
+    odd = signal.grid.row0 % 2 if params.scan == "interlaced" else np.zeros_like(signal.grid.row0)
+    return [index for index in (np.flatnonzero(odd == parity) for parity in (0, 1)) if index.size]
+
+
 def forward(params: SupplyPickup, signal: Signal, stream: Stream) -> Signal:
-    """Add A sin(2π f t + φ0) with t = t_frame + r t_line + c t_pixel.
+    """Add A sin(2π f t + φ0) with t = t_frame + r t_line + c t_pixel, r the line of the field where the scan is interlaced.
 
     Whole turns are taken off in float64 before the sine: at 5 MHz, 10⁶ frames of 40 ms leave 3e-5 of a turn to rounding. The phase
     φ0 is the unit's. From frame to frame the wave moves on by the fraction of f × frame period: none, and it stands still.
@@ -43,8 +70,11 @@ def forward(params: SupplyPickup, signal: Signal, stream: Stream) -> Signal:
     if params.amplitude_dn == 0:
         return signal
     nu_x, nu_y = turns_per_px(params)
-    start = (params.frequency_hz * signal.time_s) % 1.0 + float(stream.uniform_unit(1)[0])
-    added = wave(signal, nu_x, nu_y, start)
+    added = np.empty(signal.data.shape, np.float32)
+    for index in by_parity(params, signal):
+        for rows, field, jump in fields(params, signal.take(index)):
+            start = (params.frequency_hz * field.time_s) % 1.0 + float(stream.uniform_unit(1)[0]) + jump % 1.0
+            added[index, rows] = wave(field, nu_x, nu_y, start)
     added *= np.float32(params.amplitude_dn)
     return signal.with_data(np.add(signal.data, added, out=added))
 
@@ -59,15 +89,20 @@ def correct(params: SupplyPickup, signal: Signal, maps: Mapping[str, np.ndarray]
         return signal
     rows, cols = signal.data.shape[1:]
     nu_x, nu_y = seen_per_px(params)
-    if abs(nu_x) * cols < 1 and abs(nu_y) * rows < 1:
+    lines = rows if params.scan == "progressive" else rows // 2
+    if abs(nu_x) * cols < 1 and abs(nu_y) * lines < 1:
         raise InputError(
             "these windows show less than one period of the supply's frequency",
             where="electronics.supply_pickup",
-            value=f"{abs(nu_x) * cols:.2g} of a period in x, {abs(nu_y) * rows:.2g} in y",
+            value=f"{abs(nu_x) * cols:.2g} of a period in x, {abs(nu_y) * lines:.2g} in y",
             allowed="one period or more in x or in y",
             remedy="give whole frames, or average frames over a beat of supply and frame period",
         )
-    return signal.with_data(without_wave(signal, nu_x, nu_y))
+    out = np.empty(signal.data.shape, np.float32)
+    for index in by_parity(params, signal):
+        for rows, field, _ in fields(params, signal.take(index)):
+            out[index, rows] = without_wave(field, nu_x, nu_y)
+    return signal.with_data(out)
 
 
 def propagate(params: SupplyPickup, probe: Probe) -> Contribution:
@@ -76,8 +111,24 @@ def propagate(params: SupplyPickup, probe: Probe) -> Contribution:
     The phase at a target is arbitrary, by φ0 and by the target's place. Whether it is a new one in the next frame depends on the
     fraction of f × frame period, to 1/(number of frames); one that stands still does not average, so the class is F.
     """
-    ux, uy = (params.amplitude_dn * u for u in shift_per_dn(probe, *seen_per_px(params)))
+    if params.scan == "interlaced":
+        ux, uy = (params.amplitude_dn * u for u in interlaced_shift_per_dn(params, probe))
+    else:
+        ux, uy = (params.amplitude_dn * u for u in shift_per_dn(probe, *seen_per_px(params)))
     return probe.contribution((ux, uy), "F", model_error=0.12, method="response of the estimator to a sinusoid of any phase")
+
+
+def interlaced_shift_per_dn(params: SupplyPickup, probe: Probe) -> tuple[float, float]:
+    """The same with the phases of two interlaced fields, for windows that start on even and on odd rows alike."""
+    nu_x, nu_y = turns_per_px(params)
+    rows, cols = probe.gx.shape[1:]
+    squares = np.zeros(2)
+    for parity in (0, 1):
+        row = np.arange(rows) + parity
+        phase = nu_y * (row // 2 + params.field_lines * (row % 2))
+        z = np.exp(2j * np.pi * (phase[:, None] + nu_x * np.arange(cols)))
+        squares += [np.mean(np.abs((g * z).sum(axis=(1, 2))) ** 2) / 4 for g in (probe.gx, probe.gy)]
+    return float(np.sqrt(squares[0])), float(np.sqrt(squares[1]))
 
 
 SOURCE = Source(
@@ -99,7 +150,7 @@ SOURCE = Source(
     correct=correct,
     propagate=propagate,
     gum_class="F",
-    equation="y' = y + A sin(2π f (t_frame + r t_line + c t_pixel) + φ0)",
+    equation="y' = y + A sin(2π f (t_frame + r t_line + c t_pixel) + φ0);  interlaced: row R is line r = R div 2 of field R mod 2",
     typical_size="0.013 px per DN at 0.05 cycles per pixel in x and in y, 0.0011 px at 0.42, on a disc of 7 px of 150 DN (soft threshold)",
     references=(
         "EMVA 1288 R4.0 Linear, §8.4 (spectrograms show periodic disturbances)",

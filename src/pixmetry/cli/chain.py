@@ -1,0 +1,26 @@
+"""``pixmetry chain``: one target through a camera, source by source."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+
+@click.command()
+@click.argument("camera")
+@click.argument("scene", type=click.Path(path_type=Path))
+@click.option("-o", "--output", type=click.Path(path_type=Path, dir_okay=False), required=True, help="The page (HTML).")
+@click.option("--target", type=click.IntRange(0), help="Number of the scene's target; by default the one nearest to the middle.")
+@click.option("--frame", type=click.IntRange(0), default=0, show_default=True, help="Number of the frame in the sequence.")
+@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Of the exposures.")
+def chain(camera: str, scene: Path, output: Path, target: int | None, frame: int, seed: int) -> None:
+    """Walk one target through the chain of a camera.
+
+    CAMERA is a camera file or the name of a preset; SCENE is a scene file. The page shows the image and its profiles after every source, how far
+    the target's centre has moved so far, and which source moved it.
+    """
+    from pixmetry.chain import walk
+    from pixmetry.report.chain_page import write_chain_page
+
+    click.echo(f"page: {write_chain_page(walk(camera, scene, target=target, frame=frame, seed=seed), output)}")

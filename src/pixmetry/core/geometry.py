@@ -1,0 +1,51 @@
+"""What sources that move the image have in common: the frame's centre, the shifts that a map makes, and their contribution."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from pixmetry.core.contribution import Contribution, Probe
+from pixmetry.core.light import Pull
+from pixmetry.core.signal import Signal
+
+PLACES = 24  # along each side of the frame, for the spread over it
+
+
+def frame_centre(frame_shape: tuple[int, int]) -> tuple[float, float]:
+    """Column and row of the frame's centre."""
+    return (frame_shape[1] - 1) / 2, (frame_shape[0] - 1) / 2
+
+
+def corner_px(frame_shape: tuple[int, int], aspect: float = 1.0) -> float:
+    """Distance of the outer pixels' centres in the corners from the frame's centre, in pixels along x; ``aspect``: height over width."""
+    x, y = frame_centre(frame_shape)
+    return float(np.hypot(x, aspect * y)) or 1.0
+
+
+def image_shift(pull: Pull, signal: Signal) -> dict[str, np.ndarray]:
+    """How far a coordinate map displaces the image at every pixel: ``shift_x_px`` and ``shift_y_px``, shape (n, rows, cols)."""
+    x, y = signal.cols[:, None, :].astype(float), signal.rows[:, :, None].astype(float)
+    seen_x, seen_y = pull(x, y)
+    return {"shift_x_px": np.broadcast_to(x - seen_x, signal.grid.size), "shift_y_px": np.broadcast_to(y - seen_y, signal.grid.size)}
+
+
+def map_shifts(pull: Pull, probe: Probe) -> tuple[np.ndarray, np.ndarray]:
+    """Displacements of targets at `PLACES` × `PLACES` places, wherever the target's window fits into the frame; flat arrays."""
+    axes = []
+    for side, size in zip(probe.frame_shape, probe.signal_dn.shape[1:], strict=True):
+        margin = min(size // 2 + 1, (side - 1) / 2)
+        axes.append(margin + (np.arange(PLACES) + 0.5) / PLACES * (side - 1 - 2 * margin))
+    y, x = (v[None] for v in np.meshgrid(*axes, indexing="ij"))
+    u, v = x, y
+    for _ in range(4):  # the displacement belongs to the place at which the target is seen
+        seen_x, seen_y = pull(u, v)
+        u, v = u + x - seen_x, v + y - seen_y
+    return (u - x).ravel(), (v - y).ravel()
+
+
+def map_contribution(pull: Pull, probe: Probe, gum_class: str = "G", **kw: Any) -> Contribution:
+    """Contribution of a coordinate map to a target anywhere in the frame, before any calibration (propagator P6, first term)."""
+    text: dict[str, Any] = {"model_error": 0.12, "method": "displacement of targets all over the frame, before calibration"} | kw
+    return probe.from_shifts(*map_shifts(pull, probe), gum_class, **text)

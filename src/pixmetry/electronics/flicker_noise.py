@@ -1,0 +1,106 @@
+"""Flicker noise: the 1/f noise of the output amplifier, along the pixels in the order in which they are read."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from pixmetry.core.contribution import Contribution, Probe
+from pixmetry.core.random import Grid, Stream
+from pixmetry.core.signal import Kind, Signal
+from pixmetry.core.source import Parameters, Source, quantity
+from pixmetry.electronics._kernels import add_interpolated
+
+VARIANCE = 2 / 3  # of straight lines between independent nodes of variance 1, on average over the places between them
+
+
+class FlickerNoise(Parameters):
+    """Noise whose power density goes as 1/f over a number of octaves below the corner; beyond, it falls off as 1/f⁴."""
+
+    rms_e: float = quantity(0.0, "e-", "root mean square over all octaves", ge=0, le=1e5)
+    corner_rel: float = quantity(0.1, "1", "frequency up to which it goes as 1/f, over the pixel clock", gt=0, le=0.5)
+    octaves: int = quantity(16, "1", "octaves of 1/f below the corner; slower than the lowest, the density is level", ge=1, le=32)
+    line_px: float = quantity(908.0, "px", "pixel clocks from the start of a row to that of the next; at least the row's pixels", ge=0, le=1e6)
+
+
+def periods_px(params: FlickerNoise) -> np.ndarray:
+    """Distance of the nodes in every octave, in pixel clocks.
+
+    The sum over the octaves P_k of P_k sinc⁴(f P_k), the density of lines between independent nodes, is 1/f within 0.4 % of a common
+    factor, 1/(ln 2 · ∫ … ) apart, as far as there are octaves on both sides.
+    """
+    return 0.5 / params.corner_rel * 2.0 ** np.arange(params.octaves)
+
+
+def forward(params: FlickerNoise, signal: Signal, stream: Stream) -> Signal:
+    """Add the noise: in every octave, straight lines between keyed normal nodes whose raster starts anywhere in each frame.
+
+    A pixel looks up the nodes by its own time, so a window is the crop of its frame.
+    """
+    if params.rms_e == 0 or stream.quiet:
+        return signal
+    data = np.array(signal.data, np.float32)
+    n, rows, cols = data.shape
+    scale = params.rms_e / math.sqrt(VARIANCE * params.octaves)
+    clocks = max(params.line_px, float(signal.frame_shape[1]))
+    first = (signal.rows * clocks + signal.grid.col0[:, None]).ravel()  # time of each row's first pixel
+    lines = data.reshape(n * rows, cols)
+    frame = np.repeat(signal.grid.frame, rows)
+    for k, period in enumerate(periods_px(params)):
+        start = np.repeat(stream.uniform_frames(signal.grid, k).astype(float), rows)
+        node = np.floor(first / period + start)
+        count = int(cols / period) + 3
+        grid = Grid(frame, np.zeros_like(frame), node.astype(np.int64), (1, count))
+        add_interpolated(stream.normal(grid, k)[:, 0], first / period + start - node, 1.0 / period, scale, lines)
+    return signal.with_data(data)
+
+
+def covariance(params: FlickerNoise, lag_px: np.ndarray) -> np.ndarray:
+    """Covariance in e-² at lags in pixel clocks: per octave the cubic B-spline, a triangle with itself, over its value 2/3 at 0."""
+    u = np.abs(np.asarray(lag_px, float))
+    out = np.zeros_like(u)
+    for period in periods_px(params):
+        v = np.minimum(u / period, 2.0)
+        out += np.where(v < 1, 1 - 1.5 * v**2 + 0.75 * v**3, 0.25 * (2 - v) ** 3)
+    return params.rms_e**2 / params.octaves * out
+
+
+def propagate(params: FlickerNoise, probe: Probe) -> Contribution:
+    """Propagator P1 with the covariance of the window's pixels at their times of read-out: u² = gᵀ C g."""
+    rows, cols = probe.gx.shape[1:]
+    clocks = max(params.line_px, float(probe.frame_shape[1]))
+    time = (np.arange(rows)[:, None] * clocks + np.arange(cols)).ravel()
+    matrix = covariance(params, time[:, None] - time) * probe.gain_dn_per_e**2
+    flat = (g.reshape(len(g), -1) for g in (probe.gx, probe.gy))
+    u = tuple(float(np.sqrt(np.mean(np.einsum("pi,pi->p", g @ matrix, g)))) for g in flat)
+    return probe.contribution((u[0], u[1]), "T", model_error=0.12, method="linear response of the estimator to 1/f noise along the read-out")
+
+
+SOURCE = Source(
+    id="electronics.flicker_noise",
+    title="Flicker noise",
+    description="The 1/f noise of the output amplifier runs along the rows: neighbours in a row share it, rows differ in their mean.",
+    number=0,
+    note="1/f noise: a successor of the amplifier noise of row 18",
+    parameters=FlickerNoise,
+    consumes=(Kind.ELECTRONS,),
+    after=("sensor",),
+    neutral=FlickerNoise(),
+    typical=FlickerNoise(rms_e=10.0),
+    bound=FlickerNoise(rms_e=60.0, corner_rel=0.2),
+    forward=forward,
+    propagate=propagate,
+    gum_class="T",
+    equation="n' = n + ζ(t),  t = r t_line + c t_pixel,  S_ζ(f) ∝ 1/f from f_c/2^octaves to f_c",
+    typical_size="0.02 px in y for 1 DN rms on a disc of 7 px: more than white noise, for the pixels of a row share it",
+    references=(
+        "R. F. Voss, J. Clarke, J. Acoust. Soc. Am. 63(1), 1978 (1/f noise as a sum of slow and fast ones)",
+        "J. R. Janesick, Photon Transfer, SPIE Press 2007, ch. 11 (1/f noise and correlated double sampling)",
+    ),
+    advice="Use correlated double sampling with a short interval; clamp every row on its optically black pixels.",
+    reasons={
+        "measure": "later: needs the spectrum of dark rows along the read-out; the photon transfer holds it as white and row noise",
+        "correct": "noise cannot be undone; the part common to a row goes with optically black columns",
+    },
+)

@@ -1,0 +1,108 @@
+"""Natural and mechanical vignetting: light falls off from the optical axis as cos⁴ of the field angle and as the pupil is cut."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from pixmetry.core.contribution import Contribution, Probe
+from pixmetry.core.geometry import PLACES, corner_px, frame_centre
+from pixmetry.core.random import Stream
+from pixmetry.core.signal import Kind, Signal
+from pixmetry.core.source import Parameters, Source, quantity
+
+
+class Vignetting(Parameters):
+    """The fall-off about the optical axis, where the factor is 1."""
+
+    cos_power: float = quantity(0.0, "1", "power of the field angle's cosine; 4 for a simple lens, less for a retrofocus one", ge=0, le=8)
+    principal_distance_mm: float = quantity(25.0, "mm", "distance of the exit pupil, under which the field angle is seen", gt=0, le=10000)
+    pupil_shift_rel: float = quantity(
+        0.0, "1", "shift of the lens's two limiting openings against each other in the frame's corners, over their diameter", ge=0, le=0.9
+    )
+    centre_x_px: float = quantity(0.0, "px", "optical axis less the frame's centre, along x", ge=-1000, le=1000)
+    centre_y_px: float = quantity(0.0, "px", "optical axis less the frame's centre, along y", ge=-1000, le=1000)
+    pitch_x_um: float = quantity(8.6, "µm", "pixel pitch along x", gt=0, le=100)
+    pitch_y_um: float = quantity(8.3, "µm", "pixel pitch along y", gt=0, le=100)
+
+
+def overlap(shift: np.ndarray) -> np.ndarray:
+    """Common area of two circles whose centres are so many diameters apart, over the area of one."""
+    s = np.minimum(shift, 1.0)
+    return 2 / np.pi * (np.arccos(s) - s * np.sqrt(1 - s * s))
+
+
+def factor(params: Vignetting, x_px: np.ndarray, y_px: np.ndarray, frame_shape: tuple[int, int]) -> np.ndarray:
+    """Relative light at some places, 1 on the optical axis; float64."""
+    x0, y0 = frame_centre(frame_shape)
+    x = (x_px - x0 - params.centre_x_px) * params.pitch_x_um / 1000
+    y = (y_px - y0 - params.centre_y_px) * params.pitch_y_um / 1000
+    r2 = x * x + y * y
+    out = (1 + r2 / params.principal_distance_mm**2) ** (-0.5 * params.cos_power)
+    if params.pupil_shift_rel:
+        corner_mm = corner_px(frame_shape, params.pitch_y_um / params.pitch_x_um) * params.pitch_x_um / 1000
+        out = out * overlap(params.pupil_shift_rel * np.sqrt(r2) / corner_mm)
+    return out
+
+
+def _frame(params: Vignetting, signal: Signal) -> np.ndarray:
+    light = factor(params, signal.cols[:, None, :], signal.rows[:, :, None], signal.frame_shape)
+    return np.maximum(light, 1e-3).astype(np.float32)  # cut off just above 0: the correction divides by it
+
+
+def forward(params: Vignetting, signal: Signal, stream: Stream) -> Signal:
+    """Multiply the light by the factor."""
+    return signal.with_data(signal.data * _frame(params, signal))
+
+
+def correct(params: Vignetting, signal: Signal, maps: Mapping[str, np.ndarray]) -> Signal:
+    """Divide by the factor that the parameters give; it needs no map."""
+    return signal.with_data(signal.data / _frame(params, signal))
+
+
+def truth(params: Vignetting, signal: Signal, stream: Stream) -> Mapping[str, np.ndarray]:
+    """Relative light of every pixel, shape (rows, cols)."""
+    return {"light_rel": _frame(params, signal)[0]}
+
+
+def propagate(params: Vignetting, probe: Probe) -> Contribution:
+    """Propagator P3: a relative ramp g moves a centroid by g⟨x²⟩; mean and spread over targets anywhere on the frame."""
+    rows, cols = probe.signal_dn.shape[1:]
+    ramp_x = (np.arange(cols) - probe.x_px[:, None])[:, None, :] * probe.signal_dn
+    ramp_y = (np.arange(rows) - probe.y_px[:, None])[:, :, None] * probe.signal_dn
+    (xx, yx), (xy, yy) = probe.field(ramp_x), probe.field(ramp_y)
+    even = (np.arange(PLACES) + 0.5) / PLACES
+    y, x = np.meshgrid(even * probe.frame_shape[0] - 0.5, even * probe.frame_shape[1] - 0.5, indexing="ij")
+    log = [np.log(factor(params, x + dx, y + dy, probe.frame_shape)) for dx, dy in ((0.5, 0), (-0.5, 0), (0, 0.5), (0, -0.5))]
+    gx, gy = ((a - b).ravel()[:, None] for a, b in ((log[0], log[1]), (log[2], log[3])))
+    return probe.from_shifts(
+        gx * xx + gy * xy,
+        gx * yx + gy * yy,
+        "G",
+        model_error=0.15,
+        method="linear response of the estimator to the relative gradient, at places all over the frame",
+    )
+
+
+SOURCE = Source(
+    id="optics.vignetting",
+    title="Vignetting",
+    description="Away from the optical axis the lens passes less light; the gradient across a target pulls its centre inwards.",
+    parameters=Vignetting,
+    consumes=(Kind.PHOTONS,),
+    before=("sensor",),
+    neutral=Vignetting(),
+    typical=Vignetting(cos_power=4.0, principal_distance_mm=25.0, pupil_shift_rel=0.1),
+    bound=Vignetting(cos_power=4.0, principal_distance_mm=8.0, pupil_shift_rel=0.2),
+    forward=forward,
+    correct=correct,
+    truth=truth,
+    propagate=propagate,
+    gum_class="G",
+    equation="µ' = µ cos⁴θ · (2/π)(acos s − s √(1 − s²)),  tan θ = r/c,  s = s_corner r/r_corner;  Δx = g ⟨x²⟩",
+    typical_size="0.004 to 0.011 px for 0.1 to 0.3 % per px on a disc of 7 px (centroid)",
+    references=("ISO 17957:2015 (shading)", "M. Reiss, The cos⁴ law of illumination, JOSA 35 (1945) 283–288"),
+    advice="Stop the lens down, take one with a longer focal length, or divide by a flat field.",
+    reasons={"measure": "a flat field shows only all shading together: optics.shading measures that"},
+)
