@@ -16,22 +16,40 @@ _HOMES = {
     "Estimates": "pixmetry.core.estimates",
     "PixmetryError": "pixmetry.core.errors",
     "Signal": "pixmetry.core.signal",
+    "add_source_file": "pixmetry.core.catalogue",
     "assess": "pixmetry.assessment",
     "catalogue": "pixmetry.core.catalogue",
     "load_camera": "pixmetry.core.camera",
     "load_campaign": "pixmetry.campaign",
+    "simulate": "pixmetry.simulation",
+    "walk": "pixmetry.chain",
 }
 
-__all__ = ["Camera", "Estimates", "PixmetryError", "Signal", "__version__", "assess", "catalogue", "load_camera", "load_campaign"]
+__all__ = [
+    "Camera",
+    "Estimates",
+    "PixmetryError",
+    "Signal",
+    "__version__",
+    "add_source_file",
+    "assess",
+    "catalogue",
+    "load_camera",
+    "load_campaign",
+    "simulate",
+    "walk",
+]
 
 if TYPE_CHECKING:
     from pixmetry.assessment import assess
     from pixmetry.campaign import load_campaign
     from pixmetry.core.camera import Camera, load_camera
-    from pixmetry.core.catalogue import catalogue
+    from pixmetry.chain import walk
+    from pixmetry.core.catalogue import add_source_file, catalogue
     from pixmetry.core.errors import PixmetryError
     from pixmetry.core.estimates import Estimates
     from pixmetry.core.signal import Signal
+    from pixmetry.simulation import simulate
 
 
 def __getattr__(name: str) -> Any:

@@ -55,8 +55,21 @@ class LazyGroup(click.Group):
 
 @click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 120})
 @click.version_option(__version__, "-V", "--version", prog_name="pixmetry", message="%(prog)s %(version)s")
-def main() -> None:
+@click.option(
+    "--source-file",
+    "source_files",
+    multiple=True,
+    type=click.Path(),
+    metavar="FILE",
+    help="A Python file with an error source of your own; it is run. May be given several times.",
+)
+def main(source_files: tuple[str, ...]) -> None:
     """Follow a target's light from lens to stored number.
 
     Simulates, measures, corrects and budgets a camera's error sources, and says how sure each answer is.
     """
+    if source_files:
+        from pixmetry.core.catalogue import add_source_file
+
+        for path in source_files:
+            add_source_file(path)

@@ -700,12 +700,16 @@ def in_order(sources: Iterable[Source]) -> list[Source]:
     left, done = list(sources), []
 
     def must_wait(source: Source, other: Source) -> bool:
-        """Whether ``source`` comes after ``other``."""
+        """Whether ``source`` comes after ``other``: as they say themselves, else by stage, else by their kinds."""
+        if _named(other, source.after) or _named(source, other.before):
+            return True
+        if _named(source, other.after) or _named(other, source.before):
+            return False
         if source.stage != other.stage:
             return STAGES.index(source.stage) > STAGES.index(other.stage)
         converts = other.produces is not None and other.produces in source.consumes and not set(source.consumes) & set(other.consumes)
         would_not_be_taken = source.produces is not None and source.produces not in other.consumes
-        return converts or would_not_be_taken or _named(other, source.after) or _named(source, other.before)
+        return converts or would_not_be_taken
 
     while left:
         free = next((s for s in left if not any(must_wait(s, o) for o in left if o is not s)), None)

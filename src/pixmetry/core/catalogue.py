@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import importlib
+import importlib.machinery
+import importlib.util
 import pkgutil
+import sys
 from functools import cache
 from importlib.metadata import entry_points
+from pathlib import Path
 
 from pixmetry.core.errors import ChainError, InputError
 from pixmetry.core.source import Source
@@ -29,6 +33,36 @@ def catalogue() -> dict[str, Source]:
     for point in entry_points(group=ENTRY_POINTS):
         _add(found, point.load(), point.value, None)
     return found
+
+
+def add_source_file(path: str | Path) -> Source:
+    """Add the source of a Python file of one's own to the catalogue of this process; the file is run.
+
+    Raises
+    ------
+    InputError
+        If there is no such file, it cannot be run, or holds no ``SOURCE``.
+    ChainError
+        If its id is taken or names no stage.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError("no such file", where=str(path), remedy="name a Python file that holds a SOURCE")
+    name = f"pixmetry_source_{path.stem}"
+    spec = importlib.util.spec_from_loader(name, importlib.machinery.SourceFileLoader(name, str(path)))
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # models look up their module while they are made
+    try:
+        spec.loader.exec_module(module)
+    except Exception as problem:
+        raise InputError(f"the file cannot be run: {type(problem).__name__}: {problem}", where=str(path)) from problem
+    if not isinstance(getattr(module, "SOURCE", None), Source):
+        raise InputError("the file holds no Source record named SOURCE", where=str(path), remedy="see docs/adding-a-source.md")
+    known = catalogue().get(module.SOURCE.id)
+    if known is not None and getattr(known.forward, "__module__", "") == name:
+        del catalogue()[module.SOURCE.id]  # the same file once more
+    _add(catalogue(), module.SOURCE, str(path), None)
+    return module.SOURCE
 
 
 def _add(found: dict[str, Source], source: Source, where: str, stage: str | None) -> None:

@@ -1,9 +1,9 @@
 """The video line: the staircase of held pixels as a function of time, through filters and echoes, until a clock samples it.
 
-The sources between a camera's output and the converter of a frame grabber do not work on numbers. They change the continuous signal:
-filters (poles and zeros), echoes, and when it is sampled (clock, delay of each row). ``Line`` collects that; the camera samples it once, at the
-first source that takes DN. The staircase has an exact answer through any filter of that kind, so nothing is interpolated and nothing is
-filtered at the pixel rate.
+The sources between a camera's output and the converter of a frame grabber do not work on numbers. They change the continuous
+signal: filters (poles and zeros), echoes, and when it is sampled (clock, delay of each row). ``Line`` collects that; the camera
+samples it once, at the first source that takes DN. The staircase has an exact answer through any filter of that kind, so nothing is
+interpolated and nothing is filtered at the pixel rate.
 
 Filters and echoes are linear and do not change in time, so their order does not matter. A delay of a whole row may be exchanged with
 them too; a delay that changes along the line may as far as it changes little over the duration of an impulse response.
@@ -82,8 +82,7 @@ class Line:
             If the filter is unstable, improper, not real, or blocks a constant level.
         """
         z, p = (np.asarray(v, complex).reshape(-1) for v in (zeros, poles))
-        real = all(np.allclose(np.sort_complex(v), np.sort_complex(v.conj())) for v in (z, p))
-        if not real or len(p) == 0 or len(z) > len(p) or (p.real >= 0).any() or (z == 0).any():
+        if not (_real(z) and _real(p)) or len(p) == 0 or len(z) > len(p) or (p.real >= 0).any() or (z == 0).any():
             raise ParameterError("the filter cannot be used", where="line", allowed="real, stable, not more zeros than poles, passing 0 Hz")
         return replace(self, filters=(*self.filters, (z, p)))
 
@@ -102,7 +101,7 @@ class Line:
         return replace(self, sample_clock_hz=float(sample_clock_hz), start_s=float(start_s), samples=int(samples))
 
     def delayed(self, delay_s: Rows | np.ndarray) -> Line:
-        """Return the line with rows that come later by so much: a function of the grid, or an array of one value per window, shape (n, 1)."""
+        """Return the line with rows that come later by so much: a function of the grid, or one value per window, shape (n, 1)."""
         if callable(delay_s):
             return replace(self, delays=(*self.delays, delay_s))
         one = np.asarray(delay_s, float)
@@ -132,7 +131,10 @@ class Line:
         )
 
     def times(self, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
-        """Times at which the samples of a grid are read, in s from the beginning of pixel 0: of every sample, (n, samples), less that of every row, (n, rows)."""
+        """Times at which the samples of a grid are read, in s from the beginning of pixel 0.
+
+        That of every sample, shape (n, samples), less the delay of every row, shape (n, rows).
+        """
         n, rows, cols = grid.size
         at = self.start_s + (grid.col0[:, None, None] + np.arange(cols) + 0.5) / self.sample_clock_hz
         read = at
@@ -213,7 +215,7 @@ def correlated_rows(white: np.ndarray, weights: np.ndarray, stride: int = 1) -> 
 
 
 def through_line(line: Line, probe: Probe, gum_class: str = "G", **kw: Any) -> Contribution:
-    """Contribution of filters and echoes: the probe's windows are held on the line, background all around, and the estimator looks again."""
+    """Contribution of filters and echoes: the probe's windows are held on the line, with background all around, and seen again."""
     n, rows, cols = probe.signal_dn.shape
     zero = np.zeros(n, np.int64)
     grid = Grid(zero, zero, zero, (rows, cols))
@@ -253,6 +255,11 @@ def response(filters: tuple[tuple[bytes, bytes], ...], pixel_hz: float) -> tuple
     return np.ascontiguousarray(whole[:k]), np.ascontiguousarray(np.stack(terms, axis=2))
 
 
+def _real(roots: np.ndarray) -> bool:
+    """Whether complex roots come in conjugate pairs: their polynomial is real."""
+    return not roots.any() or bool(np.abs(np.poly(roots / np.abs(roots).max()).imag).max() < 1e-9)
+
+
 def _scaled(raw: bytes, pixel_hz: float) -> np.ndarray:
     return np.frombuffer(raw, complex) / pixel_hz
 
@@ -270,7 +277,7 @@ def _cascade(sections: list[Section]) -> Section:
 
 
 def _sections(zeros: np.ndarray, poles: np.ndarray) -> list[Section]:
-    """Sections of first and second order of gain 1 at frequency 0; zeros go with poles two by two, one that is left over with what is free."""
+    """Sections of first and second order of gain 1 at frequency 0; zeros go with poles two by two, a last one with what is free."""
     pole_pairs, pole = _paired(poles)
     zero_pairs, zero = _paired(zeros)
     numerators = [(-(1 / z[0] + 1 / z[1]).real, (1 / (z[0] * z[1])).real) for z in zero_pairs]

@@ -27,8 +27,8 @@ class FlickerNoise(Parameters):
 def periods_px(params: FlickerNoise) -> np.ndarray:
     """Distance of the nodes in every octave, in pixel clocks.
 
-    The sum over the octaves P_k of P_k sinc⁴(f P_k), the density of lines between independent nodes, is 1/f within 0.4 % of a common
-    factor, 1/(ln 2 · ∫ … ) apart, as far as there are octaves on both sides.
+    Straight lines between independent nodes P apart have the density P sinc⁴(f P), up to a factor; its sum over octaves of P is 1/f
+    within 0.4 %, as far as there are octaves on both sides.
     """
     return 0.5 / params.corner_rel * 2.0 ** np.arange(params.octaves)
 

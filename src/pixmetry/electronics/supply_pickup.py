@@ -55,10 +55,13 @@ def fields(params: SupplyPickup, signal: Signal) -> list[tuple[slice, Signal, fl
     return out
 
 
-def by_parity(params: SupplyPickup, signal: Signal) -> list[np.ndarray]:
-    """Positions in the batch of windows that are run together: all, or those that start on even and on odd rows."""
-    odd = signal.grid.row0 % 2 if params.scan == "interlaced" else np.zeros_like(signal.grid.row0)
-    return [index for index in (np.flatnonzero(odd == parity) for parity in (0, 1)) if index.size]
+def split(params: SupplyPickup, signal: Signal) -> list[tuple[np.ndarray | slice, slice, Signal, float]]:
+    """Split a batch into parts that are read without a jump: windows of the batch, and what `fields` gives for these."""
+    if params.scan == "progressive":
+        return [(slice(None), *part) for part in fields(params, signal)]
+    odd = signal.grid.row0 % 2
+    groups = [index for index in (np.flatnonzero(odd == parity) for parity in (0, 1)) if index.size]
+    return [(index, *part) for index in groups for part in fields(params, signal.take(index))]
 
 
 def forward(params: SupplyPickup, signal: Signal, stream: Stream) -> Signal:
@@ -71,10 +74,9 @@ def forward(params: SupplyPickup, signal: Signal, stream: Stream) -> Signal:
         return signal
     nu_x, nu_y = turns_per_px(params)
     added = np.empty(signal.data.shape, np.float32)
-    for index in by_parity(params, signal):
-        for rows, field, jump in fields(params, signal.take(index)):
-            start = (params.frequency_hz * field.time_s) % 1.0 + float(stream.uniform_unit(1)[0]) + jump % 1.0
-            added[index, rows] = wave(field, nu_x, nu_y, start)
+    phase = float(stream.uniform_unit(1)[0])
+    for index, rows, field, jump in split(params, signal):
+        added[index, rows] = wave(field, nu_x, nu_y, (params.frequency_hz * field.time_s) % 1.0 + phase + jump % 1.0)
     added *= np.float32(params.amplitude_dn)
     return signal.with_data(np.add(signal.data, added, out=added))
 
@@ -99,9 +101,8 @@ def correct(params: SupplyPickup, signal: Signal, maps: Mapping[str, np.ndarray]
             remedy="give whole frames, or average frames over a beat of supply and frame period",
         )
     out = np.empty(signal.data.shape, np.float32)
-    for index in by_parity(params, signal):
-        for rows, field, _ in fields(params, signal.take(index)):
-            out[index, rows] = without_wave(field, nu_x, nu_y)
+    for index, rows, field, _ in split(params, signal):
+        out[index, rows] = without_wave(field, nu_x, nu_y)
     return signal.with_data(out)
 
 

@@ -98,11 +98,10 @@ def _picture(number: int, step: Step) -> Picture:
         if step.error is not None:
             left.plot([x + step.error[0]], [y + step.error[1]], "x", color=RED, markersize=5, markeredgewidth=1.0)
         r, c = (int(np.clip(np.rint(v) - o, 0, n - 1)) for v, o, n in ((y, row0, rows), (x, col0, cols)))
-        right.step(np.arange(cols) + col0 - x, step.image[r], where="mid", color=BLUE, label="row")
-        right.step(np.arange(rows) + row0 - y, step.image[:, c], where="mid", color=RED, linestyle=(0, (3, 1.5)), label="column")
+        right.step(np.arange(cols) + col0 - x, step.image[r], where="mid", color=BLUE)
+        right.step(np.arange(rows) + row0 - y, step.image[:, c], where="mid", color=RED, linestyle=(0, (3, 1.5)))
         right.set_xlabel("px from the true centre")
         right.set_ylabel(step.unit)
-        right.legend(loc="upper right", handlelength=1.6, borderpad=0.1)
         low, high = float(step.image.min()), float(step.image.max())
         alt = f"{step.title}: image of {cols} by {rows} pixels from {significant(low)} to {significant(high)} {step.unit}, and its profiles"
         return picture(figure, f"step-{number}", alt, "")

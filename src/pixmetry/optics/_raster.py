@@ -1,0 +1,54 @@
+"""Point spreads on the fine raster of the light, made from their transfer functions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from pixmetry.core.light import FINE
+
+Transfer = Callable[[np.ndarray, np.ndarray], np.ndarray]
+BAND = FINE / 2  # cycles per pixel: the raster's own limit
+BLEND = 0.5  # cycles per pixel on both sides of it
+
+
+def kernel_of(transfer: Transfer, half_cells: int, alone: bool = True) -> np.ndarray:
+    """The point spread of a transfer function, as the weights of cells; shape (2 half_cells + 1,) * 2, sum 1.
+
+    Parameters
+    ----------
+    transfer : callable
+        ``(fx, fy)`` in cycles per pixel, arrays -> ``∬ PSF exp(−2πi (fx x + fy y))``, 1 at 0.
+    half_cells : int
+    alone : bool
+        Whether it will be the light's only tabulated spread: the light then takes the box of a cell out of it once, to second order,
+        and this is made good here.
+
+    Notes
+    -----
+    The transfer function is sampled at multiples of 1/side and kept there exactly; what the spread has beyond the side is folded back
+    into it (so that none of it is lost or lent to the core). Up to `BAND` − `BLEND` cycles per pixel the raster has the transfer
+    function itself; around `BAND` it goes over smoothly into the periods of the raster.
+    """
+    side = 2 * half_cells + 1
+    f = np.fft.fftfreq(side, 1 / FINE)
+    spectrum = np.zeros((side, side), complex)
+    for px in (-FINE, 0, FINE):  # periods of the raster
+        for py in (-FINE, 0, FINE):
+            wx, wy = _share(f + px), _share(f + py)
+            iy, ix = np.nonzero(wy)[0], np.nonzero(wx)[0]
+            if len(ix) and len(iy):
+                fy, fx = np.meshgrid(f[iy] + py, f[ix] + px, indexing="ij")
+                spectrum[np.ix_(iy, ix)] += wy[iy][:, None] * wx[ix] * transfer(fx, fy)
+    if alone:
+        c = np.cos(2 * np.pi * f / FINE)
+        spectrum /= 1 + (4 - 2 * c[:, None] - 2 * c) / 24
+    kernel = np.fft.fftshift(np.fft.ifft2(spectrum).real)
+    return kernel / kernel.sum()
+
+
+def _share(f: np.ndarray) -> np.ndarray:
+    """Weight of a frequency: 1 below the band's limit, 0 above it, blended over it; the weights of all periods sum to 1."""
+    t = np.clip((np.abs(f) - BAND + BLEND) / (2 * BLEND), 0.0, 1.0)
+    return np.cos(0.5 * np.pi * t) ** 2

@@ -1,0 +1,76 @@
+"""Optical low-pass filter (diffuser) before the sensor: each image point is spread into a few, or frosted into a round spot."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Literal
+
+import numpy as np
+
+from pixmetry.core.random import Stream
+from pixmetry.core.signal import Kind, Signal
+from pixmetry.core.source import Parameters, Source, quantity
+
+
+class OpticalLowPass(Parameters):
+    """Birefringent plates, which split a point by a distance along x and along y, or a frosted plate."""
+
+    model: Literal["birefringent", "frosted"] = quantity("birefringent", "name", "two or four points, or a round Gaussian spot")
+    separation_x_px: float = quantity(0.0, "px", "distance of the two images along x (birefringent)", ge=0, le=10)
+    separation_y_px: float = quantity(0.0, "px", "distance of the two images along y (birefringent)", ge=0, le=10)
+    sigma_px: float = quantity(0.0, "px", "standard deviation of the spot along each axis (frosted)", ge=0, le=10)
+
+
+def separation_um(thickness_um: float, n_ordinary: float = 1.5443, n_extraordinary: float = 1.5534) -> float:
+    """Distance of the two images behind a uniaxial plate cut at 45°: t (n_e² − n_o²)/(n_e² + n_o²); by default of quartz at 589 nm."""
+    o2, e2 = n_ordinary**2, n_extraordinary**2
+    return thickness_um * abs(e2 - o2) / (e2 + o2)
+
+
+def dots(params: OpticalLowPass) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Places of the images about the point and their weights: 1, 2 or 4 of them."""
+    x, y = (np.array([-0.5, 0.5]) * d if d else np.zeros(1) for d in (params.separation_x_px, params.separation_y_px))
+    dy, dx = (v.ravel() for v in np.meshgrid(y, x, indexing="ij"))
+    return dx, dy, np.full(dx.size, 1 / dx.size)
+
+
+def forward(params: OpticalLowPass, signal: Signal, stream: Stream) -> Signal:
+    """Spread the light."""
+    if params.model == "frosted":
+        return signal.with_light(signal.light.blurred(params.sigma_px**2)) if params.sigma_px else signal
+    if not (params.separation_x_px or params.separation_y_px):
+        return signal
+    return signal.with_light(signal.light.spread(*dots(params)))
+
+
+def truth(params: OpticalLowPass, signal: Signal, stream: Stream) -> Mapping[str, np.ndarray]:
+    """Variance that it adds to the spread along x and y, in px²; shape (2,)."""
+    if params.model == "frosted":
+        return {"variance_px2": np.full(2, params.sigma_px**2)}
+    return {"variance_px2": np.array([params.separation_x_px**2, params.separation_y_px**2]) / 4}
+
+
+SOURCE = Source(
+    id="optics.olpf",
+    title="Optical low-pass filter (diffuser)",
+    description="A plate before the sensor spreads each image point over about a pixel, so that finer detail than the pixels is not aliased.",
+    number=1,
+    parameters=OpticalLowPass,
+    consumes=(Kind.LIGHT,),
+    before=("sensor",),
+    neutral=OpticalLowPass(),
+    typical=OpticalLowPass(separation_x_px=1.0, separation_y_px=1.0),
+    bound=OpticalLowPass(separation_x_px=1.5, separation_y_px=1.5),
+    forward=forward,
+    truth=truth,
+    gum_class="F",
+    equation="PSF = ¼ Σ δ(x ± d_x/2, y ± d_y/2),  MTF = |cos(π d_x ν_x) cos(π d_y ν_y)|,  d = t (n_e² − n_o²)/(n_e² + n_o²)",
+    typical_size="none by itself (symmetric); widens the spread by d²/4 px² and removes the error of an undersampled target",
+    references=("J. E. Greivenkamp, Color dependent optical prefilter, Applied Optics 29 (1990) 676–684", "ISO 12233:2023 (SFR)"),
+    advice="Fit one, defocus slightly, or stop down, if targets are sharper than about 0.5 px and less than 3 px wide.",
+    reasons={
+        "measure": "later: needs the slanted-edge experiment (the zero of the cosine at 1/(2 d))",
+        "correct": "a symmetric spread moves no centre; frames are not deconvolved",
+        "propagate": "later: it only changes how much a target is undersampled, which needs its spread before the plate",
+    },
+)

@@ -1,0 +1,78 @@
+"""Temporal noise reduction: each frame is mixed with the last one that was put out."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pixmetry.core.contribution import Contribution, Probe
+from pixmetry.core.random import Stream
+from pixmetry.core.signal import Kind, Signal
+from pixmetry.core.source import Parameters, Source, quantity
+from pixmetry.processing._codes import bits_of_camera, stored
+
+
+class TemporalNoiseReduction(Parameters):
+    """The recursive filter's weight."""
+
+    alpha: float = quantity(0.0, "1", "share of the frame before in the new one", ge=0, le=0.98)
+    bits: int = bits_of_camera()
+
+
+def start(params: TemporalNoiseReduction) -> float | None:
+    """No frame yet; none at all where nothing is kept."""
+    return float("nan") if params.alpha else None
+
+
+def forward(params: TemporalNoiseReduction, signal: Signal, stream: Stream, state: np.ndarray | float | None) -> tuple[Signal, object]:
+    """y = α y_before + (1 − α) x pixel by pixel; the camera keeps y unrounded (float64, shape (rows, cols)). The first frame is x."""
+    if params.alpha == 0:
+        return signal, state
+    kept = np.asarray(state, float)
+    out = np.empty(signal.data.shape, np.uint16)
+    whole = kept.ndim == 2 and kept.shape == tuple(signal.frame_shape) != signal.data.shape[1:]
+    for i, frame in enumerate(signal.data):
+        if whole:  # windows on targets in the mode that freezes what lies around
+            before = kept[np.ix_(signal.rows[i], signal.cols[i])]
+            out[i] = stored(params.alpha * before + (1 - params.alpha) * frame, params.bits)
+            continue
+        now = frame.astype(float)
+        kept = now if kept.ndim == 0 else params.alpha * kept + (1 - params.alpha) * now
+        out[i] = stored(kept, params.bits)
+    return signal.with_data(out), kept
+
+
+def lag_s(params: TemporalNoiseReduction, frame_period_s: float) -> float:
+    """Mean age of the light in a frame that is put out: Σ k (1 − α) α^k frames = α/(1 − α) frames."""
+    return params.alpha / (1 - params.alpha) * frame_period_s
+
+
+def propagate(params: TemporalNoiseReduction, probe: Probe) -> Contribution:
+    """A target at rest does not move; one of velocity v is seen `lag_s` behind, which the object's motion decides."""
+    return probe.contribution((0.0, 0.0), "O", method="none for a target at rest; v α/(1 − α) frame periods behind for a moving one")
+
+
+SOURCE = Source(
+    id="processing.temporal_noise_reduction",
+    title="Temporal noise reduction",
+    description="A recursive filter over the frames lowers the noise of what rests, and drags a tail behind what moves.",
+    number=0,
+    note="successor 55",
+    parameters=TemporalNoiseReduction,
+    consumes=(Kind.CODES,),
+    after=("sensor", "electronics", "cable", "grabber", "processing.defect_correction"),
+    before=("storage", "processing.sharpening"),
+    neutral=TemporalNoiseReduction(),
+    typical=TemporalNoiseReduction(alpha=0.5),
+    bound=TemporalNoiseReduction(alpha=0.8),
+    forward=forward,
+    start=start,
+    gum_class="O",
+    equation="y(t) = α y(t − 1) + (1 − α) x(t);  noise √((1 − α)/(1 + α));  lag v α/(1 − α) T_f",
+    typical_size="one frame's motion at α = 0.5; four frames' at 0.8",
+    references=("A. V. Oppenheim, R. W. Schafer, Discrete-Time Signal Processing, Pearson 2010, §5.1 (group delay of a recursive filter)",),
+    advice="Switch it off; average frames afterwards, where the motion is known.",
+    reasons={
+        "measure": "later: needs the correlation of the noise of successive frames of a steady scene: it is α",
+        "correct": "x = (y − α y_before)/(1 − α) needs the whole sequence without a gap",
+    },
+)
