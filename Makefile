@@ -7,10 +7,11 @@ VENV := .venv
 PY := $(VENV)/bin/python
 PIP := $(PY) -m pip --disable-pip-version-check
 INSTALLED := $(VENV)/.installed
+ORACLES := .venv-oracles
 PYTEST := $(PY) -m pytest -n $(JOBS) --dist loadfile --hypothesis-seed=0
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test slow-test study bench lint browser-test
+.PHONY: help install demo test slow-test oracles study bench lint browser-test
 
 help: ## show this list
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1|\2/p' $(MAKEFILE_LIST) | while IFS='|' read -r target text; do printf '%-20s %s\n' "$$target" "$$text"; done
@@ -21,10 +22,13 @@ demo: $(INSTALLED) ## assess the packaged example campaign and write the report
 	@$(VENV)/bin/pixmetry assess -o $(REPORT)
 
 test: $(INSTALLED)-test ## run the quick tests
-	@$(PYTEST) -m "not slow and not browser"
+	@$(PYTEST) -m "not slow and not browser and not oracle"
 
 slow-test: $(INSTALLED)-test ## run the tests that take longer
 	@$(PYTEST) -m "slow and not browser"
+
+oracles: $(INSTALLED)-test $(ORACLES)/.installed ## compare with other people's programs (Python 3.11 or 3.12)
+	@$(PYTEST) -m oracle -rP
 
 study: $(INSTALLED)-test ## run the studies in benchmarks/
 	@$(call each,$(wildcard benchmarks/study_*.py))
@@ -56,4 +60,11 @@ $(INSTALLED): pyproject.toml
 
 $(INSTALLED)-%: $(INSTALLED)
 	@$(PIP) install --quiet -e '.[$*]'
+	@touch $@
+
+# What the oracles need (an older NumPy, other licences) never meets the package: an environment of its own.
+$(ORACLES)/.installed: scripts/oracles/requirements.txt
+	@echo "installing the oracles into $(ORACLES)"
+	@$(PY) -m venv $(ORACLES)
+	@$(ORACLES)/bin/python -m pip --disable-pip-version-check install --quiet --only-binary=:all: -r $<
 	@touch $@

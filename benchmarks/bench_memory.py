@@ -1,9 +1,10 @@
-"""Peak memory of an assessment: the interpreter with its imports, a campaign, and the same campaign with ten times the frames.
+"""Peak memory above the imports: of exposures of one megapixel, and of an assessment; each also with ten times the frames.
 
 Usage: python benchmarks/bench_memory.py [CAMPAIGN]   (default: a simulated campaign of 640 x 480 px, 12 bit)
 
-Each case runs in a process of its own; what is printed is its peak resident memory as the operating system counts it. The imports
-are those of a whole assessment, compiled kernels included: an assessment of frames of 64 x 48 px.
+Each case runs in a process of its own, on two threads; what is printed is the peak of its resident memory as Linux counts it. The imports
+are those of the same work on frames of 64 x 48 px, compiled kernels included. Goals: 60 MB for the exposures of a megapixel camera,
+whatever their number; 40 MB for the assessment.
 """
 
 from __future__ import annotations
@@ -18,17 +19,50 @@ from pixmetry.core.camera import build_camera, load_camera
 from pixmetry.simulation import simulate
 
 ASSESS = """
-import resource, sys
+import sys
 from pixmetry import assess
 assess(sys.argv[1], sys.argv[2])
-print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
 """
+EXPOSE = """
+import sys
+from dataclasses import replace
+sys.path.insert(0, sys.argv[1])
+from bench_detection import Element, Uniform, camera, get_source
+side, frames, extra = int(sys.argv[2]), int(sys.argv[3]), sys.argv[4:]
+plain = camera((side, side))
+chain = list(plain.chain)
+for name in extra:
+    at = next(i for i, e in enumerate(chain) if e.name == ("sensor.dsnu" if name.startswith("sensor.") else "grabber.adc"))
+    chain.insert(at, Element(name, get_source(name), get_source(name).typical))
+for signal in replace(plain, chain=tuple(chain)).iter_frames(Uniform(1000.0), range(frames), threads=2):
+    pass
+"""
+# The peak of this process alone: getrusage also counts what the parent held before the new program was loaded.
+PEAK = """
+print(next(line for line in open("/proc/self/status") if line.startswith("VmHWM")).split()[1])
+"""
+EXTRAS = {
+    "detection chain": (),
+    "and charge transfer": ("sensor.charge_transfer",),
+    "and charge transfer, cable": ("sensor.charge_transfer", "cable.termination"),
+    "and charge transfer, gain control": ("sensor.charge_transfer", "electronics.agc"),
+}
 
 
-def peak_mb(campaign: Path, folder: Path) -> float:
-    """Peak resident memory of an assessment in MB."""
-    done = subprocess.run([sys.executable, "-c", ASSESS, str(campaign), str(folder / "report")], capture_output=True, text=True, check=True)
-    return float(done.stdout.split()[-1])
+def peak_mb(program: str, *arguments: object) -> float:
+    """Peak resident memory of a program in MB."""
+    command = [sys.executable, "-c", program + PEAK, *map(str, arguments)]
+    return float(subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()[-1]) / 1024
+
+
+def exposures() -> None:
+    """Print the peaks of exposing frames of 1024 x 1024 px."""
+    here = Path(__file__).parent
+    for label, extra in EXTRAS.items():
+        peak_mb(EXPOSE, here, 64, 8, *extra)  # compiles what is not yet compiled
+        base = peak_mb(EXPOSE, here, 64, 8, *extra)
+        peaks = [peak_mb(EXPOSE, here, 1024, frames, *extra) - base for frames in (20, 200)]
+        print(f"{label:<36} imports {base:6.1f} MB   20 frames {peaks[0]:+6.1f} MB   200 frames {peaks[1]:+6.1f} MB")
 
 
 def simulated(folder: Path, rows: int, cols: int, levels: int, stack: int) -> Path:
@@ -60,20 +94,22 @@ def times_ten(campaign: Path) -> Path:
     return path
 
 
-def main() -> None:
+def assessments() -> None:
+    """Print the peaks of assessing campaigns."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         tiny = simulated(folder / "tiny", 48, 64, 12, 16)
-        peak_mb(tiny, folder)  # compiles what is not yet compiled
-        base = peak_mb(tiny, folder)
+        peak_mb(ASSESS, tiny, folder / "report")  # compiles what is not yet compiled
+        base = peak_mb(ASSESS, tiny, folder / "report")
         campaign = Path(sys.argv[1]) if len(sys.argv) > 1 else simulated(folder / "real", 480, 640, 50, 50)
-        print(f"interpreter with its imports   {base:7.1f} MB")
-        once = peak_mb(campaign, folder)
+        print(f"assessment: imports            {base:7.1f} MB")
+        once = peak_mb(ASSESS, campaign, folder / "report")
         print(f"campaign                       {once:7.1f} MB   {once - base:+.1f}")
         if len(sys.argv) == 1:
-            ten = peak_mb(times_ten(campaign), folder)
+            ten = peak_mb(ASSESS, times_ten(campaign), folder / "report")
             print(f"ten times the frames           {ten:7.1f} MB   {ten - base:+.1f}")
 
 
 if __name__ == "__main__":
-    main()
+    exposures()
+    assessments()

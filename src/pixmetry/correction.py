@@ -96,7 +96,7 @@ def correct_files(
 
     def work(path: Path) -> tuple[Path, np.ndarray, dict[str, str]]:
         frame = read_frame(path)
-        check_frame(frame, str(path), bits=int(record["camera"]["bits"]), shape=camera.frame_shape)
+        check_frame(frame, str(path), bits=int(record["camera"]["bits"]), shape=camera.output_shape)
         corrected, said = correct_signal(camera, _as_signal(frame, camera), maps)
         return path, corrected.data[0], said
 
@@ -150,4 +150,4 @@ def _image_files(frames: Iterable[str | Path]) -> list[Path]:
 def _as_signal(frame: np.ndarray, camera: Camera) -> Signal:
     one = np.ones(1)
     grid = Grid.whole([0], frame.shape)
-    return Signal(frame[None], Kind.CODES, grid, camera.frame_shape, camera.exposure_s * one, 0 * one, camera.temperature_c * one)
+    return Signal(frame[None], Kind.CODES, grid, camera.output_shape, camera.exposure_s * one, 0 * one, camera.temperature_c * one)

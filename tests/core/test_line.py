@@ -112,16 +112,36 @@ def test_a_warp_is_a_delay_that_grows_along_the_line() -> None:
 @pytest.mark.parametrize("name", FILTERS)
 def test_a_target_comes_later_by_the_group_delay(name: str) -> None:
     zeros, poles = FILTERS[name]
-    line = Line(F, F).filtered(zeros, poles)
-    x = np.arange(900)
-    target = 100 * np.exp(-0.5 * ((x - 60) / 3.0) ** 2)
-    seen = sampled(line, target)
-    shift = (seen * x).sum() / seen.sum() - 60
+    fine = 64
+    line = Line(F, F).filtered(zeros, poles).clocked(fine * F, 0.0, fine * 600)
+    target = 100 * np.exp(-0.5 * ((np.arange(600) - 60) / 3.0) ** 2)
+    seen, x = sampled(line, target), (np.arange(fine * 600) + 0.5) / fine - 0.5
     w, delay = 1e3, group_delay_s(zeros, poles)
     h = [np.prod([1 - s / z for z in zeros]) / np.prod([1 - s / p for p in poles]) for s in (1j * w, -1j * w)]
-    assert delay == pytest.approx(-(np.angle(h[0]) - np.angle(h[1])) / (2 * w), rel=1e-6)
-    assert shift == pytest.approx(delay * F, abs=2e-4)  # the hold is centred; a smooth target shows no more of the sampling
+    assert delay == pytest.approx(-(np.angle(h[0]) - np.angle(h[1])) / (2 * w), rel=1e-5)
+    assert (seen * x).sum() / seen.sum() - 60 == pytest.approx(delay * F, rel=2e-4, abs=2e-4)
     assert line.delay_s == delay
+
+
+@pytest.mark.parametrize(
+    ("poles_mhz", "centroid_px", "mid_hold_px"),
+    [([-6], 0.376, 0.28), ([-4], 0.564, 0.50), (5, 0.903, 0.90), (3, 1.505, 1.50)],
+    ids=["RC 6 MHz", "RC 4 MHz", "Butterworth-3 5 MHz", "Butterworth-3 3 MHz"],
+)
+def test_published_delays_of_low_pass_filters(poles_mhz: object, centroid_px: float, mid_hold_px: float) -> None:
+    """At 14.1875 MHz: τ, 2/ω_c; a staircase sampled in the middle of its pixels shows 1/(2 sinh(1/(2τ))) for the RC filter."""
+    poles = np.array(poles_mhz) if isinstance(poles_mhz, list) else poles_mhz * np.exp(2j * np.pi * np.array([1 / 3, 1 / 2, 2 / 3]))
+    line = Line(F, F).filtered([], 2e6 * np.pi * poles)
+    target, x = 100 * np.exp(-0.5 * ((np.arange(400) - 60) / 3.0) ** 2), np.arange(400)
+    seen = sampled(line, target)
+    shift = (seen * x).sum() / seen.sum() - 60
+    assert line.delay_s * F == pytest.approx(centroid_px, abs=6e-4)
+    assert shift == pytest.approx(mid_hold_px, abs=0.015)  # as published, to two digits; exactly: Σ (1 − s(n + ½)), s by SciPy
+    scaled = 2e6 * np.pi * poles / F
+    _, rise = sps.step(sps.ZerosPolesGain([], scaled, np.prod(-scaled).real), T=np.arange(0, 40, 0.5))
+    assert shift == pytest.approx((1 - rise[1::2]).sum(), abs=2e-5)
+    if len(poles) == 1:
+        assert shift == pytest.approx(0.5 / np.sinh(0.5 / (line.delay_s * F)), rel=1e-5)
 
 
 def test_a_part_of_the_row_is_read_as_in_the_whole_where_the_rest_is_black() -> None:
@@ -173,11 +193,13 @@ def jittered(s, stream):
 
 
 def noisy(s, stream):
-    return s.line.with_noise(lambda grid: stream.normal(grid))
+    return s.line.with_noise(lambda grid, line: stream.normal(grid))
 
 
-RINGING = on_line("electronics.ringing", lambda s, _: s.line.filtered(*FILTERS["ringing"]), near=lambda p: (0, 0, 60, 0), tail=lambda p: 1e-4)
+REACH = {"near": lambda p: (0, 0, 60, 0), "tail": lambda p: 1e-4}
+RINGING = on_line("electronics.ringing", lambda s, _: s.line.filtered(*FILTERS["ringing"]), **REACH)
 CLOCK = on_line("grabber.clock", lambda s, _: s.line.clocked(10e6, 100e-9, 50))
+CLOCK_320 = on_line("grabber.clock", lambda s, _: s.line.clocked(10e6, 100e-9, 230))
 JITTER = on_line("grabber.jitter", jittered, near=lambda p: (0, 0, 3, 3), tail=lambda p: 0.0)
 NOISE = on_line("storage.noise", noisy)
 SHAPE = (48, 64)
@@ -231,11 +253,11 @@ def test_geometry_of_the_sampling_is_made_once(monkeypatch: pytest.MonkeyPatch) 
 
 def test_the_near_context_suffices_and_noise_is_not_taken_out_again() -> None:
     """The mode `frozen` on a ringing line: noise and jitter stay, and what is left out is below the stated share of the signal."""
-    camera = video_camera(RINGING, JITTER, NOISE, shape=(96, 320))
-    rows, cols = np.repeat([0, 30, 85], 4), np.tile([0, 100, 250, 309], 3)
+    camera = video_camera(RINGING, JITTER, CLOCK_320, NOISE, shape=(96, 320))
+    rows, cols = np.repeat([0, 30, 85], 4), np.tile([0, 70, 150, 219], 3)
     grid = Grid(np.arange(12), rows, cols, (11, 11))
     exact = camera.expose_windows(Texture(), grid, seed=4)
     frozen = camera.expose_windows(Texture(), grid, seed=4, mode="frozen", background=Flat(110.0))
     assert np.abs(frozen - exact).max() < 200 * camera.frozen_tail()
-    quiet = video_camera(RINGING, JITTER, shape=(96, 320)).expose_windows(Texture(), grid, seed=4)
+    quiet = video_camera(RINGING, JITTER, CLOCK_320, shape=(96, 320)).expose_windows(Texture(), grid, seed=4)
     assert 0.8 < np.std(exact - quiet) < 1.2

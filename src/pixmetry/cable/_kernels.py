@@ -1,4 +1,4 @@
-"""Kernels of the cable: rows of the video line and their echoes."""
+"""Kernels of the cable: taking echoes out of rows of pixels."""
 
 from __future__ import annotations
 
@@ -8,43 +8,25 @@ from pixmetry.core.jit import jit
 
 
 @jit
-def add_ghosts(data, rho, delay_px, count):
-    """Return (1 − ρ) Σ ρ^k y(x − kτ) along the rows; y is linear between pixels, and the first pixel goes on to the left."""
+def remove_echoes(data, delays, amplitudes):
+    """Return the held pixels x with y(c) = Σ a_k x(⌊c + ½ − d_k⌋), black before the first: from the left, pixel by pixel.
+
+    ``data`` is float32 (n, rows, cols), sampled in the middle of every pixel; delays in pixel periods, rising from 0.
+    """
     n, rows, cols = data.shape
     out = np.empty_like(data)
-    weight = np.empty(count + 1, np.float64)
-    whole = np.empty(count + 1, np.int64)
-    part = np.empty(count + 1, np.float64)
-    for k in range(count + 1):
-        shift = k * delay_px
-        whole[k] = int(np.floor(shift))
-        part[k] = shift - whole[k]
-        weight[k] = (1.0 - rho) * rho**k
+    back = np.empty(len(delays), np.int64)
+    own = 0.0
+    for k in range(len(delays)):
+        back[k] = -int(np.floor(0.5 - delays[k]))
+        if back[k] == 0:
+            own += amplitudes[k]
     for i in range(n):
         for r in range(rows):
             for c in range(cols):
-                total = 0.0
-                for k in range(count + 1):
-                    a = max(c - whole[k], 0)
-                    b = max(a - 1, 0)
-                    total += weight[k] * ((1.0 - part[k]) * data[i, r, a] + part[k] * data[i, r, b])
-                rest = rho ** (count + 1)
-                out[i, r, c] = total + rest * data[i, r, 0]
-    return out
-
-
-@jit
-def remove_ghosts(data, rho, delay_px):
-    """Return x with x(c) = (y(c) − ρ y(c − τ)) / (1 − ρ), which undoes the whole echo series."""
-    n, rows, cols = data.shape
-    out = np.empty_like(data)
-    whole = int(np.floor(delay_px))
-    part = delay_px - whole
-    for i in range(n):
-        for r in range(rows):
-            for c in range(cols):
-                a = max(c - whole, 0)
-                b = max(a - 1, 0)
-                late = (1.0 - part) * data[i, r, a] + part * data[i, r, b]
-                out[i, r, c] = (data[i, r, c] - rho * late) / (1.0 - rho)
+                late = 0.0
+                for k in range(len(delays)):
+                    if 0 < back[k] <= c:
+                        late += amplitudes[k] * np.float64(out[i, r, c - back[k]])
+                out[i, r, c] = (np.float64(data[i, r, c]) - late) / own
     return out

@@ -8,11 +8,12 @@ import unicodedata
 from functools import lru_cache
 from pathlib import Path
 
+from pixmetry.campaign.zarr_frames import is_entry
 from pixmetry.core.errors import InputError
 
 
 def find_file(base: Path, text: str, where: str) -> Path:
-    """Find one file by its name relative to a folder.
+    """Find one file by its name relative to a folder (or one entry of a Zarr store of frames, ``frames.zarr/7``).
 
     Backslashes separate folders as slashes do, and where no name fits exactly, one that differs in upper and lower case fits.
 
@@ -40,7 +41,7 @@ def find_file(base: Path, text: str, where: str) -> Path:
 
 def _find(base: Path, text: str, where: str) -> Path:
     path = base / text  # an exact name first: on Linux a backslash may be part of it
-    if path.is_file():
+    if path.is_file() or is_entry(path):
         return path
     parts = text.replace("\\", "/").split("/")
     path = Path("/") if parts[0] == "" else base

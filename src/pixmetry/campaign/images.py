@@ -12,6 +12,7 @@ import numpy as np
 
 from pixmetry.campaign.provenance import InputHashes
 from pixmetry.campaign.records import Campaign, FrameGroup
+from pixmetry.campaign.zarr_frames import is_entry, read_entry
 from pixmetry.core.errors import InputError
 from pixmetry.core.threads import imap_tiles
 
@@ -44,6 +45,9 @@ def read_frame(path: str | Path) -> np.ndarray:
 
 def load_frame(path: Path) -> LoadedFrame:
     """Read one frame and the SHA-256 of its file from the same bytes; errors as in `read_frame`."""
+    if is_entry(path):
+        array, sha256, size = read_entry(path)
+        return LoadedFrame(_checked(array, path), sha256, size)
     try:
         raw = path.read_bytes()
     except FileNotFoundError:
@@ -69,6 +73,10 @@ def _decode(raw: bytes, path: Path) -> np.ndarray:
     except Exception as problem:  # every decoder has its own exceptions, and all of them mean a damaged file here
         reason = str(problem).splitlines()[0] if str(problem) else type(problem).__name__
         raise InputError(f"image is damaged or cut off ({reason})", where=str(path), remedy="copy or export the frame again") from None
+    return _checked(array, path)
+
+
+def _checked(array: np.ndarray, path: Path) -> np.ndarray:
     if array.ndim != 2:
         what = f"colour image ({'x'.join(map(str, array.shape))})"
         raise InputError(what, where=str(path), allowed="one grey channel", remedy="store the sensor's raw values, not a colour picture")

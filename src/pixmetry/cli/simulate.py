@@ -13,19 +13,65 @@ import click
 @click.option("-n", "--frames", type=click.IntRange(1), default=1, show_default=True, help="How many frames of the scene.")
 @click.option("-o", "--output", type=click.Path(path_type=Path), required=True, help="Folder for the frames.")
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Of the exposures; another seed, other temporal noise.")
-@click.option("--format", "image_format", type=click.Choice(["tiff", "png"]), default="tiff", show_default=True)
+@click.option(
+    "--format",
+    "image_format",
+    type=click.Choice(["tiff", "png", "zarr"]),
+    default="tiff",
+    show_default=True,
+    help="An image file for each frame, or one Zarr array for all.",
+)
+@click.option("--truth", is_flag=True, help="Write truth.zarr too: what every source did in this unit and in every frame.")
+@click.option(
+    "--set",
+    "settings",
+    multiple=True,
+    metavar="NAME.PARAMETER=VALUE",
+    help="Change a parameter of a source of the camera, or a value of the camera itself (exposure_s=0.02, unit_seed=7). May be repeated.",
+)
+@click.option("--off", multiple=True, metavar="NAME", help="Switch a source of the camera off. May be repeated.")
+@click.option("--window", metavar="ROW,COL,ROWS,COLS", help="Write only this part of the frames: first row and column, rows, columns.")
 @click.option("--threads", type=click.IntRange(1), help="Default: all processors.")
-def simulate(camera: str, scene: Path, frames: int, output: Path, seed: int, image_format: str, threads: int | None) -> None:
+def simulate(
+    camera: str,
+    scene: Path,
+    frames: int,
+    output: Path,
+    seed: int,
+    image_format: str,
+    truth: bool,
+    settings: tuple[str, ...],
+    off: tuple[str, ...],
+    window: str | None,
+    threads: int | None,
+) -> None:
     """Make the frames of a camera whose errors are known.
 
     CAMERA is a camera file (such as the camera.yaml of an assessment) or the name of a preset; SCENE is a scene file: a uniform field,
-    discs, or a whole photon-transfer series, which `pixmetry assess` reads.
+    targets, or a whole photon-transfer series, which `pixmetry assess` reads. The folder gets the frames, truth.json with the place
+    of every target in every frame, and camera.yaml: the camera with the changes of --set and --off.
     """
     from pixmetry.cli._progress import shown_progress
+    from pixmetry.core.overrides import parse_overrides
     from pixmetry.core.threads import set_threads
+    from pixmetry.simulation import parse_window
     from pixmetry.simulation import simulate as run
 
     set_threads(threads)
+    changes = parse_overrides(settings)
+    part = None if window is None else parse_window(window)
     with shown_progress() as progress:
-        folder = run(camera, scene, output, frames=frames, seed=seed, image_format=image_format, progress=progress)
+        folder = run(
+            camera,
+            scene,
+            output,
+            frames=frames,
+            seed=seed,
+            image_format=image_format,
+            truth=truth,
+            overrides=changes,
+            off=off,
+            window=part,
+            progress=progress,
+        )
     click.echo(f"frames: {folder}")

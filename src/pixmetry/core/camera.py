@@ -350,8 +350,8 @@ class Camera:
                 part = source.crop(local[0]) if source is not None else self.signal(task.scene, _grid_at(grid, local[0]), **task.schedule)
                 return self._walk(task, part, segment, local)
 
-            parts = map_tiles(band, _bands(needs[end], axis), task.threads)
-            signal = parts[0] if len(parts) == 1 else _stitch(parts, _grid_at(grid, needs[end]), axis or 0)
+            parts = imap_tiles(band, _bands(needs[end], axis), task.threads)
+            signal = _stitch(parts, _grid_at(grid, needs[end]), axis or 0)
             at = end
         return signal
 
@@ -632,8 +632,19 @@ def _bands(windows: Windows, axis: int | None, probe: bool = False) -> list[Wind
     return [Windows.one(a, c0, b - a, w) if axis == 0 else Windows.one(r0, a, h, b - a) for a, b in pairs]
 
 
-def _stitch(parts: list[Signal], grid: Grid, axis: int) -> Signal:
-    return replace(parts[0], data=np.concatenate([p.data for p in parts], axis=axis + 1), grid=grid)
+def _stitch(parts: Iterable[Signal], grid: Grid, axis: int) -> Signal:
+    """Join bands along an axis; each is let go of as soon as it is copied, so that few of them exist at a time."""
+    whole: Signal | None = None
+    at = 0
+    for part in parts:
+        if part.data.shape == grid.size:
+            return part
+        if whole is None:
+            whole = replace(part, data=np.empty(grid.size, part.data.dtype), grid=grid)
+        place = slice(at, at + part.data.shape[axis + 1])
+        whole.data[(slice(None), place) if axis == 0 else (slice(None), slice(None), place)] = part.data
+        at = place.stop
+    return whole
 
 
 def _concatenate(parts: list[Signal]) -> Signal:

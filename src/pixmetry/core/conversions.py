@@ -127,14 +127,7 @@ def _sample(params: LineSources, signal: Signal, stream: Stream) -> Signal:
     grid = params.samples_at(signal.grid, signal.frame_shape)
     data = line.read(signal.data, signal.grid.col0, grid)
     shape = (signal.frame_shape[0], line.samples or signal.frame_shape[1])
-    return replace(signal, data=data, kind=Kind.DN, line=line if line.noise else None, grid=grid, frame_shape=shape)
-
-
-def _add_noise(params: Nothing, signal: Signal, stream: Stream) -> Signal:
-    data = signal.data
-    for noise in signal.line.noise:
-        data = data + noise(signal.grid)
-    return replace(signal, data=np.asarray(data, np.float32), line=None)
+    return replace(signal, data=data, kind=Kind.DN, line=None, grid=grid, frame_shape=shape)
 
 
 def _sample_context(params: LineSources, windows: Windows, frame_shape: tuple[int, int]) -> Windows:
@@ -197,7 +190,6 @@ SAMPLE = _conversion(
     reshape=_sample_reshape,
     place=_sample_place,
 )
-NOISE = _conversion("core.line_noise", "noise of the line joins its samples", Kind.DN, Kind.DN, _add_noise)
 STEPS = {(Kind.LIGHT, Kind.PHOTONS): LOOK, (Kind.DN, Kind.VIDEO): HOLD, (Kind.VIDEO, Kind.DN): SAMPLE}
 
 
@@ -226,8 +218,6 @@ def linked(elements: Any, frame_shape: tuple[int, int], pixel_hz: float) -> tupl
         params = LineSources(tuple(on_line), pixel_hz) if source is SAMPLE else Nothing()
         on_line.clear()
         add(f"{source.id} {len(links)}", source, params)
-        if source is SAMPLE and params.line.noise:  # a step of its own: a noise-free run of the sampling has none
-            add(f"{NOISE.id} {len(links)}", NOISE, Nothing())
 
     for element in elements:
         step = conversion(kind, element.source.consumes)

@@ -1,7 +1,8 @@
-"""What sources that move the image have in common: the frame's centre, the shifts that a map makes, and their contribution."""
+"""What sources that depend on the place have in common: the frame's centre, shifts and ramps over the frame, and their contributions."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -49,3 +50,17 @@ def map_contribution(pull: Pull, probe: Probe, gum_class: str = "G", **kw: Any) 
     """Contribution of a coordinate map to a target anywhere in the frame, before any calibration (propagator P6, first term)."""
     text: dict[str, Any] = {"model_error": 0.12, "method": "displacement of targets all over the frame, before calibration"} | kw
     return probe.from_shifts(*map_shifts(pull, probe), gum_class, **text)
+
+
+def ramp_contribution(factor: Callable[[np.ndarray, np.ndarray], np.ndarray], probe: Probe) -> Contribution:
+    """Contribution of a factor ``(x, y) -> light`` that changes slowly over the frame (P3: a ramp g moves a centroid by g⟨x²⟩)."""
+    rows, cols = probe.signal_dn.shape[1:]
+    ramp_x = (np.arange(cols) - probe.x_px[:, None])[:, None, :] * probe.signal_dn
+    ramp_y = (np.arange(rows) - probe.y_px[:, None])[:, :, None] * probe.signal_dn
+    (xx, yx), (xy, yy) = probe.field(ramp_x), probe.field(ramp_y)
+    even = (np.arange(PLACES) + 0.5) / PLACES
+    y, x = np.meshgrid(even * probe.frame_shape[0] - 0.5, even * probe.frame_shape[1] - 0.5, indexing="ij")
+    right, left, down, up = (np.log(factor(x + dx, y + dy)) for dx, dy in ((0.5, 0), (-0.5, 0), (0, 0.5), (0, -0.5)))
+    gx, gy = (right - left).ravel()[:, None], (down - up).ravel()[:, None]
+    method = "linear response of the estimator to the relative gradient, at places all over the frame"
+    return probe.from_shifts(gx * xx + gy * xy, gx * yx + gy * yy, "G", model_error=0.15, method=method)

@@ -41,7 +41,8 @@ class Scene(Protocol):
         """Photons of full square pixels, float32, shape (n, rows, cols); ``exposure_s`` and ``time_s`` have shape (n,)."""
 
     # def radiance(self, at: Points) -> np.ndarray: ...
-    # def detailed(self, at: Points, reach_px: float) -> np.ndarray: ...   (optional)
+    # def averaged(self, at: Points, width_px, height_px) -> np.ndarray: ...   (optional: over an upright box about each point)
+    # def detailed(self, at: Points, reach_px: np.ndarray) -> np.ndarray: ...   (optional)
     # moving: bool
 
 
@@ -337,19 +338,37 @@ class Light:
             total = np.zeros(len(ux))
             spread = None if sd is None else sd[busy]
             stride = _Strides(busy, self)
-            for dx, dy, w in self._nodes(cell, dots, spread):
+            exact = getattr(self.scene, "averaged", None)
+            parts = 0 if exact is None else self._parts()
+            for dx, dy, w in self._nodes(cell, dots, spread, parts):
                 qx, qy = stride.pulled(ux + dx, uy + dy)
-                total += w * self.scene.radiance(replace(some, x_px=qx, y_px=qy))
+                at = replace(some, x_px=qx, y_px=qy)
+                if exact is None:
+                    total += w * self.scene.radiance(at)
+                else:
+                    total += w * exact(at, *stride.size(ux + dx, uy + dy, cell[0] / parts, cell[1] / parts))
             out[busy] = total
         return out
 
-    def _nodes(self, cell: tuple[float, float], dots: Any, spread: Any) -> Iterator[tuple[Any, Any, Any]]:
-        """Offsets and weights that stand for the aperture, the dots and the spread that varies."""
+    def _parts(self) -> int:
+        """Into how many parts a cell is cut along each side for a scene that averages over upright boxes.
+
+        One, unless the coordinate maps turn or shear the cell; then enough that the parts, upright themselves, stand for it.
+        """
+        if not self.pulls:
+            return 1
+        x, y = self._lattice()
+        at, right, down = (np.broadcast_arrays(*self.pulled(u, v)) for u, v in ((x, y), (x + 1, y), (x, y + 1)))
+        turn = max(float(np.abs(right[1] - at[1]).max()), float(np.abs(down[0] - at[0]).max()))
+        return 1 if turn < 1e-6 else int(np.clip(np.ceil(30.0 * np.sqrt(turn)), 3, 12))
+
+    def _nodes(self, cell: tuple[float, float], dots: Any, spread: Any, boxes: int = 0) -> Iterator[tuple[Any, Any, Any]]:
+        """Offsets and weights that stand for the aperture, the dots and the spread that varies; or the aperture cut into ``boxes``²."""
         fine = max(float(getattr(self.scene, "smooth_px", 0.0)) ** 2 + self.blur_px2, 1e-4) ** 0.5
         axes = []
         for size in cell:
-            parts = max(1, int(np.ceil(size / (2.0 * fine))))
-            nodes, weights = GAUSS[3]
+            parts = boxes or max(1, int(np.ceil(size / (2.0 * fine))))
+            nodes, weights = GAUSS[1 if boxes else 3]
             start = (np.arange(parts) + 0.5) / parts - 0.5
             axes.append((size * (start[:, None] + nodes / parts).ravel(), np.tile(weights / parts, parts)))
         hermite = [(0.0, 1.0)] if spread is None else list(zip(*HERMITE, strict=True))
@@ -399,6 +418,14 @@ class _Strides:
             pad[inside] = v
         px, py = self.light.pulled(padded[0][:, :, None], padded[1][:, :, None])
         return tuple(np.broadcast_to(p, (n, widest, 1))[:, :, 0][inside] for p in (px, py))  # type: ignore[return-value]
+
+    def size(self, x: np.ndarray, y: np.ndarray, width: float, height: float) -> tuple[Any, Any]:
+        """Width and height in the scene's plane of a box about each point."""
+        if not self.light.pulls:
+            return np.float64(width), np.float64(height)
+        across = self.pulled(x + 0.5 * width, y)[0] - self.pulled(x - 0.5 * width, y)[0]
+        along = self.pulled(x, y + 0.5 * height)[1] - self.pulled(x, y - 0.5 * height)[1]
+        return np.abs(across), np.abs(along)
 
 
 def _refined(v: np.ndarray, axis: int, reach: int) -> np.ndarray:

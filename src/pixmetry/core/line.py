@@ -21,14 +21,16 @@ import numpy as np
 from pixmetry.core._line_kernels import moving_sum, read_line
 from pixmetry.core.contribution import Contribution, Probe
 from pixmetry.core.errors import ParameterError
-from pixmetry.core.random import Grid
+from pixmetry.core.random import Grid, Stream
 
 SMALLEST_ECHO = 1e-7
+CUT = 1e-7  # of the weights of a row's predecessors
 NODES_PER_RATE = 80  # of the table, for each unit of ‖A‖: what Taylor's third order leaves is (1/160)⁴/24 = 6e-11
 MOST_NODES = 1 << 16
 
 Warp = Callable[[np.ndarray], np.ndarray]
 Rows = Callable[[Grid], np.ndarray]
+Noise = Callable[[Grid, "Line"], np.ndarray]
 Filter = tuple[np.ndarray, np.ndarray]
 
 
@@ -54,7 +56,7 @@ class Line:
     warps : tuple of callables
         ``(time_s) -> s``: further delays, which change along the line, at sampling times of shape (n, 1, samples).
     noise : tuple of callables
-        ``(grid) -> DN``, shape (n, rows, samples): added to the samples.
+        ``(grid, line) -> DN``, shape (n, rows, samples): added to the samples; the line is the one that is read.
     black_dn : float
         Level before the first and after the last pixel.
     """
@@ -68,7 +70,7 @@ class Line:
     samples: int | None = None
     delays: tuple[Rows, ...] = ()
     warps: tuple[Warp, ...] = ()
-    noise: tuple[Rows, ...] = ()
+    noise: tuple[Noise, ...] = ()
     black_dn: float = 0.0
 
     # ---- what sources do --------------------------------------------------------------------------------------------------------
@@ -113,7 +115,7 @@ class Line:
         """Return the line with a delay that changes along it."""
         return replace(self, warps=(*self.warps, warp))
 
-    def with_noise(self, noise: Rows) -> Line:
+    def with_noise(self, noise: Noise) -> Line:
         """Return the line with noise that is added to its samples."""
         return replace(self, noise=(*self.noise, noise))
 
@@ -173,6 +175,8 @@ class Line:
             np.ascontiguousarray(data, np.float32), first, self.black_dn, step, table, np.ascontiguousarray(delays, float),
             np.ascontiguousarray(amplitudes, float), at, late, length, out,
         )  # fmt: skip
+        for noise in self.noise:
+            out += noise(grid, self)
         return out
 
     @property
@@ -181,6 +185,16 @@ class Line:
         total = sum(group_delay_s(z, p) for z, p in self.filters)
         if self.echo_delay_s is not None:
             total += float((self.echo_delay_s * self.echo_amplitude).sum() / self.echo_amplitude.sum())
+        return total
+
+    def gain(self, frequency_hz: np.ndarray, first: int = 0) -> np.ndarray:
+        """Gain of the filters from the given one on at some frequencies, |H(2πif)|."""
+        s = 2j * np.pi * np.asarray(frequency_hz, float)
+        total = np.ones(s.shape)
+        for zeros, poles in self.filters[first:]:
+            for roots, sign in ((zeros, 1), (poles, -1)):
+                for root in roots:
+                    total = total * np.abs(1 - s / root) ** sign
         return total
 
     def placed(self, x: np.ndarray) -> np.ndarray:
@@ -207,11 +221,42 @@ def reach_px(zeros: Any, poles: Any, share: float, pixel_hz: float = 14.1875e6) 
     return int(np.ceil((np.log(1 / share) + 2.5 * len(np.atleast_1d(poles))) / slowest)) + 1
 
 
+def alike_rows(stream: Stream, grid: Grid, length_rows: float, stride: int = 1, draw: int = 0) -> np.ndarray:
+    """Normal numbers of the rows of a grid that are alike over ``length_rows``: correlation e^(−|Δ|/length), shape (n, rows).
+
+    A first-order autoregression as the moving sum of keyed numbers that it is, cut where its weights have fallen to 1e-7 (stationary:
+    the rows above the frame have numbers too); so any window gets the same. With a stride of 2 each field has its own.
+    """
+    rho = np.exp(-1.0 / length_rows)
+    weights = rho ** np.arange(int(np.ceil(np.log(CUT) / np.log(rho))) + 1)
+    above = stride * (len(weights) - 1)
+    wide = Grid(grid.frame, grid.row0 - above, grid.col0, (grid.shape[0] + above, grid.shape[1]))
+    return correlated_rows(stream.normal_rows(wide, draw), weights / np.sqrt((weights**2).sum()), stride)
+
+
 def correlated_rows(white: np.ndarray, weights: np.ndarray, stride: int = 1) -> np.ndarray:
     """Moving sum down the rows of white numbers that begin ``stride·(len(weights) − 1)`` rows above the first row wanted; (n, rows)."""
     out = np.empty((len(white), white.shape[1] - stride * (len(weights) - 1)))
     moving_sum(np.ascontiguousarray(white, np.float64), np.ascontiguousarray(weights, np.float64), stride, out)
     return out
+
+
+def row_response(probe: Probe) -> np.ndarray:
+    """Shift of the estimated x per pixel of delay of each row of the probe, shape (p, rows).
+
+    To first order in the delay: a row that comes late by δ changes by −δ ∂I/∂x. What stands above a threshold in the row keeps its sum, so
+    that y does not move but for aliasing.
+    """
+    return -(probe.gx * np.gradient(probe.signal_dn, axis=2)).sum(axis=2)
+
+
+def u_from_row_delays(probe: Probe, white_px: float, alike_px: float, length_rows: float, stride: int) -> float:
+    """u of x from delays of the rows: independent ones, and ones that are alike over some rows of a field (P7 with covariance)."""
+    each = row_response(probe)
+    apart = np.arange(each.shape[1])[:, None] - np.arange(each.shape[1])
+    alike = np.where(apart % stride == 0, np.exp(-np.abs(apart) / stride / length_rows), 0.0)
+    cov = white_px**2 * np.eye(len(apart)) + alike_px**2 * alike
+    return float(np.sqrt(np.einsum("pr,rs,ps->p", each, cov, each).mean()))
 
 
 def through_line(line: Line, probe: Probe, gum_class: str = "G", **kw: Any) -> Contribution:

@@ -8,6 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from pixmetry.core.errors import ParameterError
+
+FIRST_NM, LAST_NM = 300.0, 1200.0
 WAVELENGTH_NM = np.arange(300.0, 1201.0, 20.0)
 ABSORPTION_PER_CM = np.array(
     [1.77e6, 1.30e6, 1.10e6, 1.04e6, 3.13e5, 9.30e4, 5.27e4, 3.07e4, 1.95e4, 1.44e4, 1.11e4, 8800.0, 7050.0, 5780.0, 4880.0]
@@ -29,3 +32,17 @@ def absorption_per_um(wavelength_nm: np.ndarray | float) -> np.ndarray:
 def refractive_index(wavelength_nm: np.ndarray | float) -> np.ndarray:
     """Real part of the refractive index at 300 K."""
     return np.interp(wavelength_nm, WAVELENGTH_NM, REFRACTIVE_INDEX)
+
+
+def absorption_per_cm(wavelength_nm: np.ndarray | float) -> np.ndarray:
+    """Absorption coefficient at 300 K in 1/cm, within the table only.
+
+    Raises
+    ------
+    ParameterError
+        If a wavelength is outside 300 nm to 1200 nm.
+    """
+    wavelength = np.asarray(wavelength_nm, float)
+    if not ((wavelength >= FIRST_NM) & (wavelength <= LAST_NM)).all():
+        raise ParameterError("no absorption of silicon is known at this wavelength", value=wavelength_nm, allowed="300 nm to 1200 nm")
+    return absorption_per_um(wavelength) * 1e4

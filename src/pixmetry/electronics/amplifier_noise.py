@@ -14,7 +14,6 @@ from pixmetry.core.random import Stream
 from pixmetry.core.signal import Kind, Signal
 from pixmetry.core.source import Parameters, Source, quantity
 
-
 TAIL = 3.0  # standard deviation of the rare wide part over that of the common one
 
 

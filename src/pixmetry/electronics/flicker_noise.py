@@ -24,13 +24,17 @@ class FlickerNoise(Parameters):
     line_px: float = quantity(908.0, "px", "pixel clocks from the start of a row to that of the next; at least the row's pixels", ge=0, le=1e6)
 
 
-def periods_px(params: FlickerNoise) -> np.ndarray:
-    """Distance of the nodes in every octave, in pixel clocks.
+def octaves(params: FlickerNoise) -> list[tuple[float, float]]:
+    """Distance of the nodes in pixel clocks, and share of the variance, of every octave.
 
     Straight lines between independent nodes P apart have the density P sinc⁴(f P), up to a factor; its sum over octaves of P is 1/f
-    within 0.4 %, as far as there are octaves on both sides.
+    within 0.4 %, as far as there are octaves on both sides. The fastest counts twice: to low frequencies it is what all faster ones
+    would be together, P/2 + P/4 + … = P. So the density is right within 0.1 dB up to a quarter of the corner, 1 dB at half of it.
     """
-    return 0.5 / params.corner_rel * 2.0 ** np.arange(params.octaves)
+    shares = np.ones(params.octaves)
+    shares[0] = 2.0
+    periods = 0.5 / params.corner_rel * 2.0 ** np.arange(params.octaves)
+    return [(float(p), float(s)) for p, s in zip(periods, shares / shares.sum(), strict=True)]
 
 
 def forward(params: FlickerNoise, signal: Signal, stream: Stream) -> Signal:
@@ -42,16 +46,16 @@ def forward(params: FlickerNoise, signal: Signal, stream: Stream) -> Signal:
         return signal
     data = np.array(signal.data, np.float32)
     n, rows, cols = data.shape
-    scale = params.rms_e / math.sqrt(VARIANCE * params.octaves)
     clocks = max(params.line_px, float(signal.frame_shape[1]))
     first = (signal.rows * clocks + signal.grid.col0[:, None]).ravel()  # time of each row's first pixel
     lines = data.reshape(n * rows, cols)
     frame = np.repeat(signal.grid.frame, rows)
-    for k, period in enumerate(periods_px(params)):
+    for k, (period, share) in enumerate(octaves(params)):
         start = np.repeat(stream.uniform_frames(signal.grid, k).astype(float), rows)
         node = np.floor(first / period + start)
         count = int(cols / period) + 3
         grid = Grid(frame, np.zeros_like(frame), node.astype(np.int64), (1, count))
+        scale = params.rms_e * math.sqrt(share / VARIANCE)
         add_interpolated(stream.normal(grid, k)[:, 0], first / period + start - node, 1.0 / period, scale, lines)
     return signal.with_data(data)
 
@@ -60,10 +64,10 @@ def covariance(params: FlickerNoise, lag_px: np.ndarray) -> np.ndarray:
     """Covariance in e-² at lags in pixel clocks: per octave the cubic B-spline, a triangle with itself, over its value 2/3 at 0."""
     u = np.abs(np.asarray(lag_px, float))
     out = np.zeros_like(u)
-    for period in periods_px(params):
+    for period, share in octaves(params):
         v = np.minimum(u / period, 2.0)
-        out += np.where(v < 1, 1 - 1.5 * v**2 + 0.75 * v**3, 0.25 * (2 - v) ** 3)
-    return params.rms_e**2 / params.octaves * out
+        out += share * np.where(v < 1, 1 - 1.5 * v**2 + 0.75 * v**3, 0.25 * (2 - v) ** 3)
+    return params.rms_e**2 * out
 
 
 def propagate(params: FlickerNoise, probe: Probe) -> Contribution:
@@ -93,7 +97,7 @@ SOURCE = Source(
     propagate=propagate,
     gum_class="T",
     equation="n' = n + ζ(t),  t = r t_line + c t_pixel,  S_ζ(f) ∝ 1/f from f_c/2^octaves to f_c",
-    typical_size="0.02 px in y for 1 DN rms on a disc of 7 px: more than white noise, for the pixels of a row share it",
+    typical_size="0.009 px in y and 0.002 px in x per DN rms on a disc of 7 px (white noise: 0.004 px): the pixels of a row share it",
     references=(
         "R. F. Voss, J. Clarke, J. Acoust. Soc. Am. 63(1), 1978 (1/f noise as a sum of slow and fast ones)",
         "J. R. Janesick, Photon Transfer, SPIE Press 2007, ch. 11 (1/f noise and correlated double sampling)",

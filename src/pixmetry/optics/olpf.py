@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Literal
 
 import numpy as np
@@ -43,17 +42,10 @@ def forward(params: OpticalLowPass, signal: Signal, stream: Stream) -> Signal:
     return signal.with_light(signal.light.spread(*dots(params)))
 
 
-def truth(params: OpticalLowPass, signal: Signal, stream: Stream) -> Mapping[str, np.ndarray]:
-    """Variance that it adds to the spread along x and y, in px²; shape (2,)."""
-    if params.model == "frosted":
-        return {"variance_px2": np.full(2, params.sigma_px**2)}
-    return {"variance_px2": np.array([params.separation_x_px**2, params.separation_y_px**2]) / 4}
-
-
 SOURCE = Source(
     id="optics.olpf",
     title="Optical low-pass filter (diffuser)",
-    description="A plate before the sensor spreads each image point over about a pixel, so that finer detail than the pixels is not aliased.",
+    description="A plate before the sensor spreads each image point over about a pixel, so that finer detail is not aliased.",
     number=1,
     parameters=OpticalLowPass,
     consumes=(Kind.LIGHT,),
@@ -62,7 +54,6 @@ SOURCE = Source(
     typical=OpticalLowPass(separation_x_px=1.0, separation_y_px=1.0),
     bound=OpticalLowPass(separation_x_px=1.5, separation_y_px=1.5),
     forward=forward,
-    truth=truth,
     gum_class="F",
     equation="PSF = ¼ Σ δ(x ± d_x/2, y ± d_y/2),  MTF = |cos(π d_x ν_x) cos(π d_y ν_y)|,  d = t (n_e² − n_o²)/(n_e² + n_o²)",
     typical_size="none by itself (symmetric); widens the spread by d²/4 px² and removes the error of an undersampled target",

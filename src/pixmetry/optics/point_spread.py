@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from functools import lru_cache
 from typing import Literal
 
@@ -11,9 +10,9 @@ import numpy as np
 from pixmetry.core.errors import ParameterError
 from pixmetry.core.light import FINE
 from pixmetry.core.random import Stream
+from pixmetry.core.raster import kernel_of
 from pixmetry.core.signal import Kind, Signal
 from pixmetry.core.source import Parameters, Source, quantity
-from pixmetry.optics._raster import kernel_of
 
 NODES = 40  # of each integral over the common part of two pupils: 1e-6 for a wave of aberration (root mean square)
 
@@ -35,7 +34,9 @@ class PointSpread(Parameters):
     spherical_waves: float = quantity(0.0, "waves", "Zernike 6ρ⁴ − 6ρ² + 1, times √5", ge=-3, le=3)
     reach_px: float = quantity(4.0, "px", "half side of the table; the light beyond it is folded back into it (diffraction)", ge=1, le=12)
     table: tuple[tuple[float, ...], ...] = quantity(
-        (), "1", "mean density of the spread in square cells, rows from the top, odd sides; the middle one is the ideal image point (measured)"
+        (),
+        "1",
+        "mean density of the spread in square cells, rows from the top, odd sides; the middle one is the ideal image point (measured)",
     )
     table_step_px: float = quantity(0.25, "px", "side of the table's cells (measured)", gt=0.01, le=0.5)
 
@@ -101,7 +102,7 @@ def _check_table(params: PointSpread) -> None:
 
 @lru_cache(maxsize=32)
 def kernel(params: PointSpread, alone: bool = True) -> np.ndarray:
-    """The spread on the light's fine raster, see `_raster.kernel_of`."""
+    """The spread on the light's fine raster, see `core.raster`."""
     if params.model == "diffraction":
         return kernel_of(lambda fx, fy: transfer(params, fx, fy), int(round(params.reach_px * FINE)), alone)
     _check_table(params)
@@ -117,17 +118,6 @@ def forward(params: PointSpread, signal: Signal, stream: Stream) -> Signal:
     return signal.with_light(light.convolved(kernel(params, light.kernel is None)))
 
 
-def truth(params: PointSpread, signal: Signal, stream: Stream) -> Mapping[str, np.ndarray]:
-    """Modulation transfer along x and y at 0, 0.05 … 1 cycles per pixel, shape (21,)."""
-    f, zero = np.linspace(0, 1, 21), np.zeros(21)
-    along = {
-        "gaussian": lambda a, b: np.exp(-2 * (np.pi * params.sigma_px * np.hypot(a, b)) ** 2),
-        "diffraction": lambda a, b: transfer(params, a, b),
-        "measured": lambda a, b: table_transfer(params, a, b),
-    }[params.model]
-    return {"mtf_x": np.abs(along(f, zero)), "mtf_y": np.abs(along(zero, f))}
-
-
 SOURCE = Source(
     id="optics.point_spread",
     title="Point spread of the lens",
@@ -140,10 +130,9 @@ SOURCE = Source(
     typical=PointSpread(sigma_px=0.6),
     bound=PointSpread(sigma_px=1.5),
     forward=forward,
-    truth=truth,
     gum_class="F",
     equation="OTF(ν) = (1/π) ∬ exp 2πi (W(p − λNν) − W(p + λNν)) dp;  clear: (2/π)(acos s − s √(1 − s²)), s = λNν",
-    typical_size="periodic error of amplitude OTF(1)/π on a point target under full pixels: 0.08 px at f/4 with 3.45 µm, < 1e-5 px at σ = 0.8 px",
+    typical_size="periodic error OTF(1)/π of a point under full pixels: 0.08 px at f/4 with 3.45 µm, 1e-6 px at σ = 0.8 px",
     references=(
         "H. H. Hopkins, The frequency response of a defocused optical system, Proc. R. Soc. A 231 (1955) 91–103",
         "R. J. Noll, Zernike polynomials and atmospheric turbulence, JOSA 66 (1976) 207–211",

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from pixmetry.core.contribution import Contribution, Probe
-from pixmetry.core.geometry import PLACES, corner_px, frame_centre
+from pixmetry.core.geometry import corner_px, frame_centre, ramp_contribution
 from pixmetry.core.random import Stream
 from pixmetry.core.signal import Kind, Signal
 from pixmetry.core.source import Parameters, Source, quantity
@@ -68,21 +68,7 @@ def truth(params: Vignetting, signal: Signal, stream: Stream) -> Mapping[str, np
 
 def propagate(params: Vignetting, probe: Probe) -> Contribution:
     """Propagator P3: a relative ramp g moves a centroid by g⟨x²⟩; mean and spread over targets anywhere on the frame."""
-    rows, cols = probe.signal_dn.shape[1:]
-    ramp_x = (np.arange(cols) - probe.x_px[:, None])[:, None, :] * probe.signal_dn
-    ramp_y = (np.arange(rows) - probe.y_px[:, None])[:, :, None] * probe.signal_dn
-    (xx, yx), (xy, yy) = probe.field(ramp_x), probe.field(ramp_y)
-    even = (np.arange(PLACES) + 0.5) / PLACES
-    y, x = np.meshgrid(even * probe.frame_shape[0] - 0.5, even * probe.frame_shape[1] - 0.5, indexing="ij")
-    log = [np.log(factor(params, x + dx, y + dy, probe.frame_shape)) for dx, dy in ((0.5, 0), (-0.5, 0), (0, 0.5), (0, -0.5))]
-    gx, gy = ((a - b).ravel()[:, None] for a, b in ((log[0], log[1]), (log[2], log[3])))
-    return probe.from_shifts(
-        gx * xx + gy * xy,
-        gx * yx + gy * yy,
-        "G",
-        model_error=0.15,
-        method="linear response of the estimator to the relative gradient, at places all over the frame",
-    )
+    return ramp_contribution(lambda x, y: factor(params, x, y, probe.frame_shape), probe)
 
 
 SOURCE = Source(

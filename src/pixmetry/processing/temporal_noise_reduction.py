@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from pixmetry.core.contribution import Contribution, Probe
 from pixmetry.core.random import Stream
 from pixmetry.core.signal import Kind, Signal
 from pixmetry.core.source import Parameters, Source, quantity
@@ -46,11 +45,6 @@ def lag_s(params: TemporalNoiseReduction, frame_period_s: float) -> float:
     return params.alpha / (1 - params.alpha) * frame_period_s
 
 
-def propagate(params: TemporalNoiseReduction, probe: Probe) -> Contribution:
-    """A target at rest does not move; one of velocity v is seen `lag_s` behind, which the object's motion decides."""
-    return probe.contribution((0.0, 0.0), "O", method="none for a target at rest; v α/(1 − α) frame periods behind for a moving one")
-
-
 SOURCE = Source(
     id="processing.temporal_noise_reduction",
     title="Temporal noise reduction",
@@ -73,6 +67,7 @@ SOURCE = Source(
     advice="Switch it off; average frames afterwards, where the motion is known.",
     reasons={
         "measure": "later: needs the correlation of the noise of successive frames of a steady scene: it is α",
+        "propagate": "a target at rest does not move, and the shift of a moving one, v α/(1 − α) T_f, hangs on a motion no probe knows",
         "correct": "x = (y − α y_before)/(1 − α) needs the whole sequence without a gap",
     },
 )

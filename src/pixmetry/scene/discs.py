@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from functools import lru_cache
+from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache
+from typing import Any
 
 import numpy as np
 
 from pixmetry.core.errors import ParameterError
+from pixmetry.core.light import Points
 from pixmetry.core.random import Grid
 from pixmetry.scene._kernels import add_discs
+from pixmetry.scene.motion import Motion
+from pixmetry.scene.shapes import Shapes
 from pixmetry.scene.uniform import Uniform
 
 REACH = 5.0  # blur standard deviations beyond which a disc's edge is taken as 0 (2.9e-7 of its height)
@@ -96,3 +100,65 @@ class Discs:
         split = 1 if self.blur_px >= 0.5 else int(np.ceil(0.5 / self.blur_px))
         add_discs(out, x[entry, which], y[entry, which], entry, grid.row0, grid.col0, profile, STEP, inner, outer, peak, split)
         return np.maximum(out, 0, out=out)
+
+    @property
+    def moving(self) -> bool:
+        """Whether the centres change from frame to frame."""
+        return self.per_frame
+
+    @property
+    def smooth_px(self) -> float:
+        """Blur of its own."""
+        return self.blur_px
+
+    def radiance(self, at: Points) -> np.ndarray:
+        """Photons per pixel at points, float64."""
+        return self.averaged(at, np.float64(0), np.float64(0))
+
+    def averaged(self, at: Points, width_px: np.ndarray, height_px: np.ndarray) -> np.ndarray:
+        """The same, averaged over an upright box of this size about each point."""
+        exposure = np.broadcast_to(np.asarray(at.exposure_s, float), at.x_px.shape)
+        scale = self.background.photons_scale(exposure.ravel()).reshape(exposure.shape)
+        width, height = (np.broadcast_to(v, at.x_px.shape) for v in (width_px, height_px))
+        out = self.background.radiance(at)
+        for shapes, which in self._seen(at):
+            out[which] += scale[which] * shapes.sums(at.take(which), width[which], height[which], False)[0]
+        return np.maximum(out, 0.0)
+
+    def detailed(self, at: Points, reach_px: np.ndarray) -> np.ndarray:
+        """Where an edge may be seen within a reach of each point."""
+        out, reach = np.zeros(at.x_px.shape, bool), np.broadcast_to(reach_px, at.x_px.shape)
+        for shapes, which in self._seen(at):
+            out[which] = shapes.detailed(at.take(which), reach[which])
+        return out
+
+    def targets(self, time_s: float = 0.0, frame: int = 0) -> list[dict[str, Any]]:
+        """True places of the discs in a frame."""
+        x, y = self.centres(np.array([frame]))
+        return [{"kind": "disc", "x_px": float(a), "y_px": float(b), "diameter_px": self.diameter_px} for a, b in zip(x[0], y[0], strict=True)]
+
+    def layer(self, motion: Motion) -> Shapes:
+        """The discs of one frame without their background, as shapes that move."""
+        x, y = self.centres(np.zeros(1, np.int64))
+        told = [{"kind": "disc", "x_px": float(a), "y_px": float(b), "diameter_px": self.diameter_px} for a, b in zip(x[0], y[0], strict=True)]
+        return replace(self._shapes(x, y, motion), told=told)
+
+    def _seen(self, at: Points) -> list[tuple[Shapes, np.ndarray]]:
+        """Discs with the points that see them; one disc a frame is a disc that moves."""
+        if not self.per_frame:
+            return [(self._shapes(*self.centres(np.zeros(1, np.int64))), np.ones(at.x_px.shape, bool))]
+        if self.x_px.reshape(len(self.x_px), -1).shape[1] == 1:
+            return [(self._one, np.ones(at.x_px.shape, bool))]
+        frame = np.broadcast_to(at.frame, at.x_px.shape)
+        return [(self._shapes(*self.centres(np.array([f]))), frame == f) for f in np.unique(frame)]
+
+    @cached_property
+    def _one(self) -> Shapes:
+        zero = np.zeros((1, 1))
+        return self._shapes(zero, zero, Motion(table_px=np.stack([self.x_px.ravel(), self.y_px.ravel()], axis=1)))
+
+    def _shapes(self, x: np.ndarray, y: np.ndarray, motion: Motion | None = None) -> Shapes:
+        radius, zero = np.full(x.size, 0.5 * self.diameter_px), np.zeros(x.size)
+        oval = np.stack([x.ravel(), y.ravel(), radius, zero, zero, radius], axis=1)
+        peak = np.broadcast_to(np.asarray(self.peak_photons, float), x.size)
+        return Shapes.of_ovals(oval, peak, self.blur_px, motion or Motion())

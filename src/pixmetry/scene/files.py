@@ -2,59 +2,43 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
-from pydantic import Field
 
-from pixmetry.core.config import Model, load_yaml, validate
-from pixmetry.core.errors import InputError
+from pixmetry.core.config import load_yaml, validate
+from pixmetry.core.errors import InputError, ParameterError
+from pixmetry.scene import outlines
 from pixmetry.scene.discs import Discs
+from pixmetry.scene.lighting import Lighting
+from pixmetry.scene.motion import STILL, Motion
+from pixmetry.scene.outlines import Outline
+from pixmetry.scene.picture import Layer, Picture
+from pixmetry.scene.plates import Pose, chessboard, dot_plate
+from pixmetry.scene.schema import SceneModel, SeriesModel
+from pixmetry.scene.shapes import Shapes, Sine
+from pixmetry.scene.speckle import Speckle
 from pixmetry.scene.uniform import Uniform
 
+__all__ = ["SCHEMA", "SceneModel", "SeriesModel", "background_of", "build_scene", "read_scene"]
+
 SCHEMA = "pixmetry/scene/1"
+SHOWN = ("uniform", "discs", "targets", "plate", "spot", "photon_transfer")
 
-
-class UniformModel(Model):
-    """A uniform field."""
-
-    level_photons: float = Field(ge=0, le=1e9)
-    gradient_x_per_px: float = Field(default=0.0, ge=-0.01, le=0.01)
-    gradient_y_per_px: float = Field(default=0.0, ge=-0.01, le=0.01)
-    reference_exposure_s: float | None = Field(default=None, gt=0)
-
-
-class DiscsModel(Model):
-    """Discs, placed one by one or on a lattice whose rows and columns are not whole pixels apart."""
-
-    x_px: list[float] = []
-    y_px: list[float] = []
-    lattice_px: float | None = Field(default=None, ge=4)
-    diameter_px: float = Field(default=7.0, gt=0, le=1000)
-    blur_px: float = Field(default=0.7, ge=0.05, le=100)
-    peak_photons: float = Field(default=1000.0, ge=-1e9, le=1e9)
-
-
-class SeriesModel(Model):
-    """A photon-transfer campaign: exposure levels of a uniform field up to the brightest, dark frames, and two stacks."""
-
-    levels: int = Field(default=50, ge=4, le=1000)
-    frames_per_level: int = Field(default=2, ge=2, le=7)
-    brightest_photons: float = Field(gt=0, le=1e9)
-    longest_exposure_s: float = Field(default=0.01, gt=0, le=1e4)
-    stack_frames: int = Field(default=50, ge=8, le=10000)
-    stack_rel: float = Field(default=0.5, gt=0, lt=1)
-
-
-class SceneModel(Model):
-    """A scene file, schema ``pixmetry/scene/1``."""
-
-    schema_: Literal["pixmetry/scene/1"] = Field(alias="schema")
-    uniform: UniformModel | None = None
-    discs: DiscsModel | None = None
-    photon_transfer: SeriesModel | None = None
+DRAWN: dict[str, Callable[[Any], Outline | list[Outline]]] = {
+    "disc": lambda t: outlines.disc(t.x_px, t.y_px, t.diameter_px, t.peak_photons),
+    "ellipse": lambda t: outlines.ellipse(t.x_px, t.y_px, t.width_px, t.height_px, t.angle_deg, t.peak_photons),
+    "ring": lambda t: outlines.ring(t.x_px, t.y_px, t.diameter_px, t.inner_px, t.peak_photons),
+    "cross": lambda t: outlines.cross(t.x_px, t.y_px, t.size_px, t.width_px, t.angle_deg, t.peak_photons),
+    "line": lambda t: outlines.line(t.x_px, t.y_px, t.length_px, t.width_px, t.angle_deg, t.peak_photons),
+    "wire": lambda t: outlines.line(t.x_px, t.y_px, t.length_px, t.width_px, t.angle_deg, t.peak_photons, "wire"),
+    "edge": lambda t: outlines.edge(t.x_px, t.y_px, t.angle_deg, t.peak_photons),
+    "star": lambda t: outlines.star(t.x_px, t.y_px, t.diameter_px, t.sectors, t.inner_px, t.angle_deg, t.peak_photons),
+    "bars": lambda t: outlines.bars(t.x_px, t.y_px, t.period_px, t.count, t.length_px, t.angle_deg, t.duty_rel, t.peak_photons),
+    "steps": lambda t: outlines.step_chart(t.x_px, t.y_px, t.patch_px, t.levels_photons, t.columns, t.gap_px, t.angle_deg),
+}
 
 
 def background_of(model: SceneModel) -> Uniform:
@@ -62,11 +46,31 @@ def background_of(model: SceneModel) -> Uniform:
     return Uniform(**model.uniform.model_dump()) if model.uniform is not None else Uniform()
 
 
-def build_scene(model: SceneModel, frame_shape: tuple[int, int]) -> Uniform | Discs:
-    """Build the scene of a checked record for a frame of this size."""
+def build_scene(model: SceneModel, frame_shape: tuple[int, int]) -> Uniform | Discs | Picture:
+    """Build the scene of a checked record for a frame of this size.
+
+    Raises
+    ------
+    InputError
+        If parts of it do not fit together.
+    """
     background = background_of(model)
-    if model.discs is None:
-        return background
+    layered = bool(model.targets) or any(v is not None for v in (model.plate, model.spot, model.motion, model.lighting))
+    if not layered:
+        return background if model.discs is None else _discs(model, frame_shape, background)
+    try:
+        motion = STILL if model.motion is None else Motion(**model.motion.model_dump())
+        layers = [*_targets(model, motion), *_plate(model, motion, frame_shape), *_spot(model, motion)]
+        if model.discs is not None:
+            layers += [_discs(model, frame_shape, Uniform()).layer(motion)]
+        return Picture(tuple(layers), background, _lighting(model, frame_shape))
+    except ParameterError as problem:
+        raise InputError(
+            problem.what, where=problem.where or "scene", value=problem.value, allowed=problem.allowed, remedy=problem.remedy
+        ) from None
+
+
+def _discs(model: SceneModel, frame_shape: tuple[int, int], background: Uniform) -> Discs:
     discs = model.discs
     x, y = list(discs.x_px), list(discs.y_px)
     if discs.lattice_px is not None:
@@ -80,6 +84,49 @@ def build_scene(model: SceneModel, frame_shape: tuple[int, int]) -> Uniform | Di
     return Discs(np.array(x), np.array(y), discs.diameter_px, discs.blur_px, discs.peak_photons, background)
 
 
+def _targets(model: SceneModel, motion: Motion) -> list[Layer]:
+    layers: list[Layer] = []
+    for still in (True, False):
+        moves = STILL if still else motion
+        some = [t for t in model.targets if t.still is still]
+        drawn = [DRAWN[t.kind](t) for t in some if t.kind != "sine"]
+        flat = [o for d in drawn for o in (d if isinstance(d, list) else [d])]
+        if flat:
+            layers.append(Shapes.of(flat, model.blur_px, moves))
+        layers += [
+            Sine(t.period_px, t.angle_deg, t.phase_deg, t.mean_photons, t.contrast_rel, model.blur_px, moves) for t in some if t.kind == "sine"
+        ]
+    return layers
+
+
+def _plate(model: SceneModel, motion: Motion, frame_shape: tuple[int, int]) -> Sequence[Layer]:
+    plate = model.plate
+    if plate is None:
+        return []
+    given = {k: v for k, v in plate.pose.model_dump().items() if v is not None}
+    middle = {"principal_x_px": 0.5 * (frame_shape[1] - 1), "principal_y_px": 0.5 * (frame_shape[0] - 1)}
+    pose, moves = Pose(**(middle | given)), STILL if plate.still else motion
+    if plate.kind == "dots":
+        return [dot_plate(pose, plate.rows, plate.columns, plate.pitch_mm, plate.diameter_mm, plate.peak_photons, model.blur_px, moves)]
+    return [chessboard(pose, plate.rows, plate.columns, plate.square_mm, plate.peak_photons, model.blur_px, moves)]
+
+
+def _spot(model: SceneModel, motion: Motion) -> Sequence[Layer]:
+    spot = model.spot
+    if spot is None:
+        return []
+    finest = spot.wavelength_um * spot.f_number / spot.pitch_um
+    same = spot.model_dump(include={"x_px", "y_px", "radius_px", "peak_photons", "profile", "seed", "frames_each"})
+    return [Speckle(**same, lambda_n_px=finest, contrast=spot.contrast_rel, motion=STILL if spot.still else motion)]
+
+
+def _lighting(model: SceneModel, frame_shape: tuple[int, int]) -> Lighting | None:
+    if model.lighting is None:
+        return None
+    given = {k: v for k, v in model.lighting.model_dump().items() if v is not None}
+    return Lighting(**({"x_px": 0.5 * (frame_shape[1] - 1), "y_px": 0.5 * (frame_shape[0] - 1)} | given))
+
+
 def read_scene(source: str | Path | Mapping[str, Any]) -> SceneModel:
     """Read and check a scene file or record.
 
@@ -90,10 +137,12 @@ def read_scene(source: str | Path | Mapping[str, Any]) -> SceneModel:
     """
     where = "scene" if isinstance(source, Mapping) else str(source)
     model = validate(SceneModel, source if isinstance(source, Mapping) else load_yaml(source), where)
-    if model.uniform is None and model.discs is None and model.photon_transfer is None:
-        raise InputError("the scene shows nothing", where=where, allowed="uniform, discs or photon_transfer", remedy="give one of them")
+    if not any(getattr(model, part) for part in SHOWN):
+        raise InputError("the scene shows nothing", where=where, allowed=", ".join(SHOWN), remedy="give one of them")
     if model.discs is not None and len(model.discs.x_px) != len(model.discs.y_px):
         raise InputError("x_px and y_px of the discs differ in number", where=where, remedy="give both for each disc")
-    if model.photon_transfer is not None and model.discs is not None:
-        raise InputError("a photon-transfer series has no discs", where=where, remedy="make two scenes")
+    if model.photon_transfer is not None:
+        other = [part for part in ("discs", "targets", "plate", "spot", "motion", "lighting") if getattr(model, part)]
+        if other:
+            raise InputError(f"a photon-transfer series has no {', '.join(other)}", where=where, remedy="make two scenes")
     return model

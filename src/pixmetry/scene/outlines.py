@@ -40,7 +40,7 @@ class Outline:
         return float(x.min()), float(y.min()), float(x.max()), float(y.max())
 
 
-def polygon(x_px: ArrayLike, y_px: ArrayLike, height_photons: float, **target: object) -> Outline:
+def polygon(x_px: ArrayLike, y_px: ArrayLike, height_photons: float, /, **target: object) -> Outline:
     """A shape with straight sides, from its corners in order (either way round)."""
     x, y = np.asarray(x_px, float), np.asarray(y_px, float)
     if x.shape != y.shape or x.ndim != 1 or len(x) < 3 or not (np.isfinite(x).all() and np.isfinite(y).all()):
@@ -62,19 +62,30 @@ def _lines(x1: np.ndarray, y1: np.ndarray, x2: np.ndarray, y2: np.ndarray) -> np
 
 def arcs(oval: np.ndarray, start_rad: float, end_rad: float) -> np.ndarray:
     """Segments of an elliptic arc c + u cos t + v sin t, cut where it turns in x or in y."""
-    cx, cy, ux, uy, vx, vy = oval
+    ux, uy, vx, vy = oval[2:]
     low, high = min(start_rad, end_rad), max(start_rad, end_rad)
-    turns = np.array([np.arctan2(vx, ux), np.arctan2(vy, uy)])[:, None] + np.pi * np.arange(-8, 9)
-    cuts = np.unique(turns.ravel())
+    cuts = np.unique(np.array([np.arctan2(vx, ux), np.arctan2(vy, uy)])[:, None] + np.pi * np.arange(-8, 9))
     t = np.concatenate([[low], cuts[(cuts > low + 1e-12) & (cuts < high - 1e-12)], [high]])
-    if end_rad < start_rad:
-        t = t[::-1]
-    x, y = cx + ux * np.cos(t) + vx * np.sin(t), cy + uy * np.cos(t) + vy * np.sin(t)
-    out = np.zeros((len(t) - 1, SEGMENT))
+    t = t[::-1] if end_rad < start_rad else t
+    return _arcs(np.broadcast_to(oval, (len(t) - 1, 6)), t[:-1], t[1:])
+
+
+def whole_ovals(ovals: np.ndarray) -> np.ndarray:
+    """Segments of many ellipses, four of each; shape (k, 4, 13)."""
+    ux, uy, vx, vy = ovals[:, 2:].T
+    t = np.stack([np.arctan2(vx, ux), np.arctan2(vy, uy)], axis=1) % np.pi
+    t = np.sort(np.concatenate([t, t + np.pi], axis=1), axis=1)
+    t = np.concatenate([t, t[:, :1] + 2 * np.pi], axis=1)
+    return _arcs(np.repeat(ovals, 4, axis=0), t[:, :-1].ravel(), t[:, 1:].ravel()).reshape(-1, 4, SEGMENT)
+
+
+def _arcs(ovals: np.ndarray, t1: np.ndarray, t2: np.ndarray) -> np.ndarray:
+    out = np.zeros((len(t1), SEGMENT))
     out[:, 0] = 1.0
-    out[:, 1:7] = oval
-    out[:, 7], out[:, 8] = t[:-1], t[1:]
-    out[:, 9], out[:, 10], out[:, 11], out[:, 12] = x[:-1], y[:-1], x[1:], y[1:]
+    out[:, 1:7] = ovals
+    out[:, 7], out[:, 8] = t1, t2
+    for column, t in ((9, t1), (11, t2)):
+        out[:, column : column + 2] = ovals[:, :2] + ovals[:, 2:4] * np.cos(t)[:, None] + ovals[:, 4:] * np.sin(t)[:, None]
     return out
 
 
@@ -95,7 +106,7 @@ def from_oval(oval: np.ndarray, height_photons: float, **target: object) -> Outl
     if oval[2] * oval[5] - oval[3] * oval[4] < 0:
         oval[4:] = -oval[4:]
     told = {"kind": "ellipse", "x_px": float(oval[0]), "y_px": float(oval[1])} | dict(target)
-    return Outline(arcs(oval, 0.0, 2 * np.pi), float(height_photons), oval, told)
+    return Outline(whole_ovals(oval[None])[0], float(height_photons), oval, told)
 
 
 def ellipse(x_px: float, y_px: float, width_px: float, height_px: float, angle_deg: float = 0.0, height_photons: float = 1000.0) -> Outline:

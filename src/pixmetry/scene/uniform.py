@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import numpy as np
 
 from pixmetry.core.errors import ParameterError
+from pixmetry.core.light import Points
 from pixmetry.core.random import Grid
 
 
@@ -28,6 +30,8 @@ class Uniform:
     gradient_x_per_px: float = 0.0
     gradient_y_per_px: float = 0.0
     reference_exposure_s: float | None = None
+    moving: ClassVar[bool] = False
+    smooth_px: ClassVar[float] = 100.0
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.level_photons) and self.level_photons >= 0):
@@ -52,3 +56,22 @@ class Uniform:
         return (self.level_photons * self.photons_scale(exposure_s)).astype(np.float32)[:, None, None] * np.broadcast_to(
             self.photons_map(grid, frame_shape), grid.size
         )
+
+    def radiance(self, at: Points) -> np.ndarray:
+        """Photons per pixel at points; no blur changes a slope."""
+        exposure = np.broadcast_to(np.asarray(at.exposure_s, float), at.x_px.shape)
+        x, y = at.x_px - 0.5 * (at.frame_shape[1] - 1), at.y_px - 0.5 * (at.frame_shape[0] - 1)
+        field = np.maximum(1 + self.gradient_x_per_px * x + self.gradient_y_per_px * y, 0)
+        return self.level_photons * self.photons_scale(exposure.ravel()).reshape(exposure.shape) * field
+
+    def averaged(self, at: Points, width_px: np.ndarray, height_px: np.ndarray) -> np.ndarray:
+        """The same, averaged over boxes."""
+        return self.radiance(at)
+
+    def detailed(self, at: Points, reach_px: np.ndarray) -> np.ndarray:
+        """Nowhere."""
+        return np.zeros(at.x_px.shape, bool)
+
+    def targets(self, time_s: float = 0.0, frame: int = 0) -> list[dict[str, Any]]:
+        """None."""
+        return []

@@ -1,13 +1,18 @@
 """Charge transfer inefficiency of a CCD: each transfer leaves a little behind, which arrives with the pixels that follow.
 
-The register lies before row 0 and its output before column 0: row r takes r + 1 steps down its column, column c takes c + 1 steps along
-the register, each of so many phases. Deferred charge appears farther from the output, at higher rows and columns.
+The register lies before row 0 and its output before column 0, at the top left corner: row r takes r + 1 steps down its column, and after
+that column c takes c + 1 steps along the register, each of so many phases. Deferred charge appears farther from the output, at higher
+rows and columns; what trails beyond the last of them leaves the frame.
+
+Two models may act together: a fixed share left behind in every transfer, and traps, of which a packet fills those in its own volume, so
+that the loss depends on the signal and on the packets that went before.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from typing import Literal
 
 import numpy as np
 
@@ -16,11 +21,12 @@ from pixmetry.core.errors import ParameterError
 from pixmetry.core.random import Stream
 from pixmetry.core.signal import Kind, Signal, Windows
 from pixmetry.core.source import Parameters, Source, quantity
-from pixmetry.sensor._kernels import transfer_lines
+from pixmetry.sensor._charge_kernels import pass_traps, transfer_columns, transfer_packets, transfer_rows
 
 ITERATIONS = 5
 LONGEST_STEPS = 4096  # pixels to the output that the stated tail allows for
 NEAR_SHARE = 1e-3  # of the deferred charge, may come from beyond the near context
+SMALL_E = 1000.0  # packet for which the stated tail of traps holds
 
 
 class ChargeTransfer(Parameters):
@@ -32,23 +38,62 @@ class ChargeTransfer(Parameters):
     trail_px: float = quantity(1.0, "px", "mean distance by which charge left behind is late", ge=1, le=50)
     beta: float = quantity(1.0, "1", "lost charge grows with the packet to this power; below 1 small packets lose more", gt=0, le=1)
     reference_e: float = quantity(10_000.0, "e-", "packet at which the inefficiency is as given", gt=0, le=1e7)
+    fast_traps_per_px: float = quantity(0.0, "1", "traps in the whole volume of a pixel that release soon", ge=0, le=1000)
+    fast_release_px: float = quantity(1.0, "px", "time constant of their release, in steps of one pixel", ge=0.1, le=1000)
+    slow_traps_per_px: float = quantity(0.0, "1", "traps in the whole volume of a pixel that release late", ge=0, le=1000)
+    slow_release_px: float = quantity(10.0, "px", "time constant of their release, in steps of one pixel", ge=0.1, le=1000)
+    fill_beta: float = quantity(0.5, "1", "a packet fills the share (x / trap_well_e)^fill_beta of a pixel's volume", gt=0, le=1)
+    trap_well_e: float = quantity(100_000.0, "e-", "packet that fills the whole volume", gt=0, le=1e7)
+    traps_along: Literal["columns", "register", "both"] = quantity("columns", "1", "transfers in which the traps act")
+
+    @property
+    def traps(self) -> bool:
+        """Whether there are any."""
+        return self.fast_traps_per_px + self.slow_traps_per_px > 0
+
+    @property
+    def in_columns(self) -> bool:
+        """Whether charge is lost down the columns."""
+        return self.parallel_cti > 0 or (self.traps and self.traps_along != "register")
+
+    @property
+    def in_register(self) -> bool:
+        """Whether charge is lost along the register."""
+        return self.serial_cti > 0 or (self.traps and self.traps_along != "columns")
 
 
 def _move(params: ChargeTransfer, data: np.ndarray, row0: np.ndarray, col0: np.ndarray) -> np.ndarray:
-    """Parallel transfer first, then serial."""
+    """Parallel transfer first, then serial; in each the fixed share, then the traps."""
     data = np.ascontiguousarray(data, np.float32)
-    tail = (params.trail_px, params.beta, params.reference_e)
-    if params.parallel_cti:
-        data = transfer_lines(data, row0, params.phases, params.parallel_cti, *tail)
-    if params.serial_cti:
-        turned = np.ascontiguousarray(data.swapaxes(1, 2))
-        data = np.ascontiguousarray(transfer_lines(turned, col0, params.phases, params.serial_cti, *tail).swapaxes(1, 2))
+    if params.in_columns:
+        if params.parallel_cti and params.beta == 1:
+            data = transfer_columns(data, row0, params.phases, params.parallel_cti, params.trail_px)
+        packets, traps = params.parallel_cti > 0 and params.beta != 1, params.traps and params.traps_along != "register"
+        if packets or traps:
+            turned = np.ascontiguousarray(data.swapaxes(1, 2))
+            data = np.ascontiguousarray(_along_rows(params, turned, row0, params.parallel_cti if packets else 0.0, traps).swapaxes(1, 2))
+    if params.in_register:
+        if params.serial_cti and params.beta == 1:
+            data = transfer_rows(data, col0, params.phases, params.serial_cti, params.trail_px)
+        packets = params.serial_cti > 0 and params.beta != 1
+        data = _along_rows(params, data, col0, params.serial_cti if packets else 0.0, params.traps and params.traps_along != "columns")
+    return data
+
+
+def _along_rows(params: ChargeTransfer, data: np.ndarray, first: np.ndarray, loss: float, traps: bool) -> np.ndarray:
+    """What depends on the size of the packets, along the last axis."""
+    if loss:
+        data = transfer_packets(data, first, params.phases, loss, params.trail_px, params.beta, params.reference_e)
+    if traps:
+        species = ((params.fast_traps_per_px, params.fast_release_px), (params.slow_traps_per_px, params.slow_release_px))
+        density, release = np.array([s for s in species if s[0] > 0]).T
+        data = pass_traps(data, first, np.ascontiguousarray(density), np.ascontiguousarray(release), params.fill_beta, params.trap_well_e)
     return data
 
 
 def forward(params: ChargeTransfer, signal: Signal, stream: Stream) -> Signal:
     """Transfer all packets to the output; charge is kept, but for what trails beyond the last row and column."""
-    if not params.parallel_cti and not params.serial_cti:
+    if not params.in_columns and not params.in_register:
         return signal
     return signal.with_data(_move(params, signal.data, signal.grid.row0, signal.grid.col0))
 
@@ -61,12 +106,12 @@ def correct(params: ChargeTransfer, signal: Signal, maps: Mapping[str, np.ndarra
     ParameterError
         If the loss depends on the packet and the signal is not in electrons.
     """
-    if params.beta != 1 and signal.kind != Kind.ELECTRONS:
+    if (params.beta != 1 or params.traps) and signal.kind != Kind.ELECTRONS:
         raise ParameterError(
             "a loss that depends on the packet needs a signal in electrons", value=str(signal.kind), remedy="divide by the gain"
         )
     y = signal.data.astype(np.float32)
-    if not params.parallel_cti and not params.serial_cti:
+    if not params.in_columns and not params.in_register:
         return signal.with_data(y)
     x = y
     for _ in range(ITERATIONS):
@@ -76,9 +121,9 @@ def correct(params: ChargeTransfer, signal: Signal, maps: Mapping[str, np.ndarra
 
 def context(params: ChargeTransfer, windows: Windows, frame_shape: tuple[int, int]) -> Windows:
     """The whole column, and the whole row if the register loses charge."""
-    if params.parallel_cti:
+    if params.in_columns:
         windows = windows.full_columns(frame_shape)
-    return windows.full_rows(frame_shape) if params.serial_cti else windows
+    return windows.full_rows(frame_shape) if params.in_register else windows
 
 
 def _deferred_share(params: ChargeTransfer, loss: float) -> float:
@@ -89,21 +134,26 @@ def _deferred_share(params: ChargeTransfer, loss: float) -> float:
 def _reach_px(params: ChargeTransfer) -> int:
     """Pixels after which less than `NEAR_SHARE` of deferred charge is still under way, with the trail of the longest way."""
     loss = max(params.parallel_cti, params.serial_cti)
-    if not loss:
-        return 0
-    stay = 1 - _deferred_share(params, loss) / (LONGEST_STEPS * params.phases * loss * params.trail_px)
-    return math.ceil(math.log(NEAR_SHARE) / math.log(stay))
+    reach = 0.0
+    if loss:
+        stay = 1 - _deferred_share(params, loss) / (LONGEST_STEPS * params.phases * loss * params.trail_px)
+        reach = math.log(NEAR_SHARE) / math.log(stay) if stay > 0 else 1.0
+    slowest = [t for n, t in ((params.fast_traps_per_px, params.fast_release_px), (params.slow_traps_per_px, params.slow_release_px)) if n]
+    return math.ceil(max([reach, *(-t * math.log(NEAR_SHARE) for t in slowest)]))
 
 
 def near(params: ChargeTransfer) -> tuple[int, int, int, int]:
     """Pixels above and to the left from which trails come."""
     reach = _reach_px(params)
-    return (reach if params.parallel_cti else 0, 0, reach if params.serial_cti else 0, 0)
+    return (reach if params.in_columns else 0, 0, reach if params.in_register else 0, 0)
 
 
 def tail(params: ChargeTransfer) -> float:
-    """Share of a packet far from the output that trails beyond `near`."""
-    return NEAR_SHARE * (_deferred_share(params, params.parallel_cti) + _deferred_share(params, params.serial_cti))
+    """Share of a packet far from the output that trails beyond `near`; of traps, for a packet of `SMALL_E` after empty pixels."""
+    filled = (SMALL_E / params.trap_well_e) ** params.fill_beta if params.trap_well_e > SMALL_E else 1.0
+    density = params.fast_traps_per_px + params.slow_traps_per_px
+    trapped = min(LONGEST_STEPS * density * filled / SMALL_E, 1.0) * (2 if params.traps_along == "both" else 1)
+    return NEAR_SHARE * (_deferred_share(params, params.parallel_cti) + _deferred_share(params, params.serial_cti) + trapped)
 
 
 def propagate(params: ChargeTransfer, probe: Probe) -> Contribution:
@@ -114,7 +164,7 @@ def propagate(params: ChargeTransfer, probe: Probe) -> Contribution:
     """
     shifts = []
     for serial in (False, True):
-        one = params.model_copy(update={"parallel_cti": 0.0} if serial else {"serial_cti": 0.0})
+        one = _only(params, serial)
         shifts.append(probe.moved(probe.signal_dn + _added_dn(one, probe)))
     (px, py), (sx, sy) = shifts
     u = [float(np.sqrt(np.var(p + s) + (p.mean() ** 2 + s.mean() ** 2) / 3)) for p, s in ((px, sx), (py, sy))]
@@ -127,6 +177,15 @@ def propagate(params: ChargeTransfer, probe: Probe) -> Contribution:
         model_error=0.15,
         method="the estimator on the target with its deferred charge, for a target anywhere on the frame",
     )
+
+
+def _only(params: ChargeTransfer, serial: bool) -> ChargeTransfer:
+    """The losses along the register alone, or down the columns alone."""
+    change: dict[str, float | str] = {"parallel_cti": 0.0} if serial else {"serial_cti": 0.0}
+    here, there = ("register", "columns") if serial else ("columns", "register")
+    if params.traps_along == there:
+        change |= {"fast_traps_per_px": 0.0, "slow_traps_per_px": 0.0}
+    return params.model_copy(update=change | {"traps_along": here})
 
 
 def _added_dn(params: ChargeTransfer, probe: Probe) -> np.ndarray:
@@ -163,11 +222,12 @@ SOURCE = Source(
     tail=tail,
     applies_to=("ccd",),
     gum_class="G",
-    equation="retained (1 − ε)^n, deferred into the following pixels;  mean shift Δ = n ε ⟨k⟩",
+    equation="arrives j px late: (1 − ε)^n (1, nε, n(n + 1)ε²/2, …), mean n ε ⟨k⟩;  traps: caught n ρ (x/w)^β, released as e^(−k/τ)",
     typical_size="0.0075 px after 752 transfers at 1e-5; 92 % of the charge is left after 8192",
     references=(
         "J. R. Janesick, Scientific Charge-Coupled Devices, SPIE Press 2001, ch. 5",
         "R. Massey et al., MNRAS 401, 371, 2010 (trails and their iterative removal)",
+        "R. Massey et al., MNRAS 439, 887, 2014 (traps filled up to the height of the packet)",
     ),
     advice="Clock more slowly, keep a background of some hundred electrons, and correct with the measured inefficiency.",
     reasons={"measure": "needs overscan pixels, or one target at many distances from the output: dark and flat frames do not carry it"},

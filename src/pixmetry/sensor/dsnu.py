@@ -35,6 +35,12 @@ def forward(params: Dsnu, signal: Signal, stream: Stream) -> Signal:
     return signal.with_data(data)
 
 
+def truth(params: Dsnu, signal: Signal, stream: Stream) -> Mapping[str, np.ndarray]:
+    """Offset of every pixel of the unit, in electrons."""
+    one = signal.take(np.array([0]))
+    return {"dsnu_e": forward(params, one.with_data(np.zeros(one.grid.size, np.float32)), stream).data[0]}
+
+
 def measure(observations: Observations) -> Estimates:
     """Read the split of the dark stack and divide by the gain; u by JCGM 102 (6.2.1.3), gain and split taken as independent."""
     spatial, transfer = observations.spatial_fit, observations.photon_transfer_fit
@@ -88,6 +94,7 @@ SOURCE = Source(
     typical=Dsnu(pixel_std_e=3.0, row_std_e=0.5, col_std_e=0.5),
     bound=Dsnu(pixel_std_e=15.0, row_std_e=3.0, col_std_e=3.0),
     forward=forward,
+    truth=truth,
     measure=measure,
     correct=correct,
     propagate=propagate,

@@ -81,11 +81,13 @@ def forward(params: Exposure, signal: Signal, stream: Stream) -> Signal:
 
 
 def truth(params: Exposure, signal: Signal, stream: Stream) -> Mapping[str, np.ndarray]:
-    """The time that a target's centre belongs to, and the standard deviation in time of the light about it, shape (n,) each."""
+    """The time that a target's centre belongs to, and the standard deviation in time of the light about it, shape (n, rows) each."""
     times, weights = rule(params.model_copy(update={"nodes": max(params.nodes, 2)}))
     mean = float(weights @ times)
     spread = float(np.sqrt(weights @ (times - mean) ** 2))
-    return {"mean_time_s": signal.time_s + mean * signal.exposure_s, "spread_s": spread * signal.exposure_s}
+    rows = np.ones(signal.frame_shape[0])
+    start, length = signal.time_s[:, None] * rows, signal.exposure_s[:, None] * rows
+    return {"mean_time_s": start + mean * length, "spread_s": spread * length}
 
 
 SOURCE = Source(

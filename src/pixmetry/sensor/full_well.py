@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from pixmetry.core.contribution import Contribution, Probe
 from pixmetry.core.errors import MeasureError
 from pixmetry.core.estimates import Estimates
 from pixmetry.core.observations import Observations
-from pixmetry.core.random import Stream
+from pixmetry.core.random import Grid, Stream
 from pixmetry.core.signal import Kind, Signal
 from pixmetry.core.source import Parameters, Source, quantity
 
@@ -20,13 +22,22 @@ class FullWell(Parameters):
 
     full_well_e: float = quantity(20_000.0, "e-", "most electrons that a pixel holds", gt=1, le=UNLIMITED_E)
     knee_rel: float = quantity(0.0, "1", "part of the capacity below the top in which the response bends; 0 clips hard", ge=0, lt=1)
+    spread_rel: float = quantity(0.0, "1", "relative standard deviation of the capacity over the pixels of a unit", ge=0, le=0.2)
 
 
-def response_e(params: FullWell, electrons: np.ndarray) -> np.ndarray:
+def capacity_e(params: FullWell, grid: Grid, stream: Stream) -> np.ndarray | float:
+    """Capacity of every pixel, shape (n, rows, cols), or the one number that all have."""
+    if params.spread_rel == 0:
+        return params.full_well_e
+    spread = np.float32(params.spread_rel) * stream.normal_fixed(grid)
+    return np.float32(params.full_well_e) * np.maximum(1 + spread, np.float32(1e-3))
+
+
+def response_e(params: FullWell, electrons: np.ndarray, capacity: np.ndarray | float | None = None) -> np.ndarray:
     """Electrons held of those that arrived, in the dtype given: a straight line up to the knee, then an exponential approach."""
-    top = params.full_well_e
+    top = params.full_well_e if capacity is None else capacity
     if params.knee_rel == 0:
-        return np.minimum(electrons, electrons.dtype.type(top))
+        return np.minimum(electrons, np.asarray(top, electrons.dtype))
     room = params.knee_rel * top
     above = np.maximum(electrons - (top - room), 0)
     return (electrons - above - room * np.expm1(-above / room)).astype(electrons.dtype)
@@ -34,7 +45,13 @@ def response_e(params: FullWell, electrons: np.ndarray) -> np.ndarray:
 
 def forward(params: FullWell, signal: Signal, stream: Stream) -> Signal:
     """Hold what fits; the rest is lost here (``sensor.blooming`` is for charge that spills into the neighbours)."""
-    return signal.with_data(response_e(params, signal.data))
+    return signal.with_data(response_e(params, signal.data, capacity_e(params, signal.grid, stream)))
+
+
+def truth(params: FullWell, signal: Signal, stream: Stream) -> Mapping[str, np.ndarray]:
+    """Capacity of every pixel of the unit."""
+    one = signal.take(np.array([0]))
+    return {"full_well_e": np.broadcast_to(np.float32(capacity_e(params, one.grid, stream)), one.grid.size)[0].copy()}
 
 
 def measure(observations: Observations) -> Estimates:
@@ -55,7 +72,7 @@ def measure(observations: Observations) -> Estimates:
 
 
 def propagate(params: FullWell, probe: Probe) -> Contribution:
-    """Propagator P4: the clipped target seen by the estimator; nothing below the knee."""
+    """Propagator P4: the target clipped at the mean capacity, seen by the estimator; nothing below the knee."""
     gain = probe.gain_dn_per_e
     electrons = probe.signal_dn / gain
     if electrons.max() <= params.full_well_e * (1 - params.knee_rel):
@@ -76,6 +93,7 @@ SOURCE = Source(
     typical=FullWell(),
     bound=FullWell(knee_rel=0.2),
     forward=forward,
+    truth=truth,
     measure=measure,
     propagate=propagate,
     gum_class="F",

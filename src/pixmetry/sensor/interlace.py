@@ -83,7 +83,10 @@ SOURCE = Source(
     gum_class="O",
     equation="row r looks at t + t_field (r mod 2);  v t_field = x_second − x_first;  mid-time t + t_exp/2 + t_field/2",
     typical_size="fields 1 px apart at 50 px/s; a disc of 7 px falls apart at 350 px/s; the centre of the frame keeps within 0.003 px",
-    references=("ITU-R BT.470 (625 lines, 50 fields)", "C. Poynton, Digital Video and HD, 2nd ed., Morgan Kaufmann 2012, ch. 8 (interlaced scanning)"),
+    references=(
+        "ITU-R BT.470 (625 lines, 50 fields)",
+        "C. Poynton, Digital Video and HD, 2nd ed., Morgan Kaufmann 2012 (interlaced scanning)",
+    ),
     advice="Take a progressive camera; or locate in each field by itself and give it the field's own time; or flash once for both fields.",
     reasons={
         "measure": "needs images of a moving target: the difference of its centres in both fields over the field period is its speed",

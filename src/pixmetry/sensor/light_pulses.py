@@ -68,8 +68,8 @@ SOURCE = Source(
     gum_class="O",
     equation="field 1: (1 − a) L(t_e − δt/2) + a ∫L;  field 2: (1 − a) L(t_e + δt/2) + a ∫L;  fields lie v δt apart",
     typical_size="0.05 px between the fields at 50 px/s and 1 ms, 0.35 px at 350 px/s",
-    references=("M. Raffel et al., Particle Image Velocimetry, Springer 2018, ch. 3 (two pulses astride the transfer)",),
-    advice="Bring the pulses as near as the field transfer allows, and keep steady light out by a filter that passes only the pulses' colour.",
+    references=("M. Raffel et al., Particle Image Velocimetry, Springer 2018 (two pulses astride the transfer)",),
+    advice="Bring the pulses as near as the field transfer allows, and keep steady light out by a filter for the pulses' colour.",
     reasons={
         "measure": "needs images of a moving target: the centres of the fields still differ by v δt",
         "correct": "needs the speed of every target; locate in each field by itself instead",

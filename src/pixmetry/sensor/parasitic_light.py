@@ -16,7 +16,9 @@ from pixmetry.core.source import Parameters, Source, quantity
 class ParasiticLight(Parameters):
     """Sensitivity of the closed store, and how long each row waits."""
 
-    sensitivity_rel: float = quantity(0.0, "1", "of the store over that of the photodiode (the reciprocal of the shutter's efficiency)", ge=0, le=0.1)
+    sensitivity_rel: float = quantity(
+        0.0, "1", "of the store over that of the photodiode (the reciprocal of the shutter's efficiency)", ge=0, le=0.1
+    )
     wait_s: float = quantity(50e-6, "s", "from the end of the exposure to the read-out of the first row", ge=0, le=1)
     row_time_s: float = quantity(10e-6, "s", "from the read-out of one row to that of the next", ge=0, le=0.01)
     first_row: Literal["top", "bottom"] = quantity("top", "1", "the row that is read first")
@@ -59,7 +61,7 @@ def truth(params: ParasiticLight, signal: Signal, stream: Stream) -> Mapping[str
 SOURCE = Source(
     id="sensor.parasitic_light",
     title="Parasitic light sensitivity",
-    description="The stores of a global shutter gather stray light until they are read: a gradient along the rows, and ghosts of what moves.",
+    description="The stores of a global shutter gather stray light until they are read: a gradient over the rows, and ghosts.",
     note="successor of frame-transfer smear",
     parameters=ParasiticLight,
     consumes=(Kind.LIGHT,),
@@ -75,7 +77,7 @@ SOURCE = Source(
     gum_class="F",
     equation="I(r) = E t_exp + PLS E (t_wait + r t_row)",
     typical_size="28 % from the first to the last row at 1/700, 20 ms of read-out and 0.1 ms of exposure: 0.0005 px on a disc of 7 px",
-    references=("S. Lauxtermann et al., IISW 2007, Comparison of global shutter pixels", "EMVA 1288 R4.0 (camera with a global shutter)"),
+    references=("S. Lauxtermann et al., Int. Image Sensor Workshop 2007 (comparison of global shutter pixels)",),
     advice="Light the scene by a strobe only, or expose longer.",
     reasons={
         "measure": "needs frames of the shortest exposure under steady light: their slope along the rows",

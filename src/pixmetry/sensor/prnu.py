@@ -37,6 +37,11 @@ def forward(params: Prnu, signal: Signal, stream: Stream) -> Signal:
     return signal.with_data(signal.data * response(params, signal.grid, stream))
 
 
+def truth(params: Prnu, signal: Signal, stream: Stream) -> Mapping[str, np.ndarray]:
+    """Relative response of every pixel of the unit."""
+    return {"prnu_rel": response(params, signal.take(np.array([0])).grid, stream)[0]}
+
+
 def measure(observations: Observations) -> Estimates:
     """Read the split of the flat-field stack: rows, columns and pixels, shading and temporal noise taken out."""
     return observations.fitted(
@@ -77,6 +82,7 @@ SOURCE = Source(
     typical=Prnu(pixel_std_rel=0.01, row_std_rel=0.002, col_std_rel=0.002),
     bound=Prnu(pixel_std_rel=0.02, row_std_rel=0.004, col_std_rel=0.004),
     forward=forward,
+    truth=truth,
     measure=measure,
     correct=correct,
     propagate=propagate,

@@ -17,11 +17,13 @@ class TriggerJitter(Parameters):
 
     latency_s: float = quantity(0.0, "s", "constant part", ge=-10, le=10)
     jitter_s: float = quantity(0.0, "s", "standard deviation from frame to frame", ge=0, le=1)
-    clock_error_rel: float = quantity(0.0, "1", "rate at which the delay grows with time: the clock of the time stamps runs slow", ge=-0.01, le=0.01)
+    clock_error_rel: float = quantity(
+        0.0, "1", "rate at which the delay grows with time: the clock of the time stamps runs slow", ge=-0.01, le=0.01
+    )
 
 
 def delay_s(params: TriggerJitter, signal: Signal, stream: Stream) -> np.ndarray:
-    """Delay of every frame, shape (n,), float64."""
+    """Delay of every frame, shape (n,)."""
     delay = params.latency_s + params.clock_error_rel * signal.time_s
     return delay + params.jitter_s * stream.normal_frames(signal.grid) if params.jitter_s else delay
 
@@ -34,14 +36,14 @@ def forward(params: TriggerJitter, signal: Signal, stream: Stream) -> Signal:
 
 
 def truth(params: TriggerJitter, signal: Signal, stream: Stream) -> Mapping[str, np.ndarray]:
-    """Delay of every frame, shape (n,)."""
-    return {"delay_s": delay_s(params, signal, stream)}
+    """Delay of every row, the same in all of a frame, shape (n, rows)."""
+    return {"delay_s": delay_s(params, signal, stream)[:, None] * np.ones(signal.frame_shape[0])}
 
 
 SOURCE = Source(
     id="sensor.trigger_jitter",
     title="Trigger and time-stamp jitter",
-    description="The exposure begins later than its time stamp says, by a constant, a drift and a random part; a moving target is elsewhere.",
+    description="The exposure begins later than its time stamp says, by a constant, a drift and a random part; what moves is elsewhere.",
     note="successor of line jitter in digital cameras",
     parameters=TriggerJitter,
     consumes=(Kind.LIGHT,),
@@ -54,7 +56,7 @@ SOURCE = Source(
     gum_class="O",
     equation="t' = t + t_latency + ε t + σ_t n;  shift v (t' − t)",
     typical_size="0.0005 px at 50 px/s and 10 µs; 0.05 px where a computer's clock gives the time to 1 ms",
-    references=("IEEE 1588-2019 (precision time protocol)", "GigE Vision 2.0, §4.5 (time stamps)"),
+    references=("IEEE 1588-2019 (precision time protocol)", "GigE Vision 2.0 (time stamps)"),
     advice="Trigger in hardware, take the camera's time stamp rather than the computer's, and keep clocks together by PTP.",
     reasons={
         "measure": "needs a moving target of known path, or a clock of light-emitting diodes in the image",

@@ -1,0 +1,61 @@
+"""Frames in a Zarr store: ``frames.zarr/7`` names entry 7 of its array ``frames`` [frame, row, column]."""
+
+from __future__ import annotations
+
+import hashlib
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pixmetry.core.errors import InputError
+
+ARRAY = "frames"
+
+
+def is_entry(path: Path) -> bool:
+    """Tell whether a path names an entry of a Zarr store that there is."""
+    return path.name.isdigit() and path.parent.suffix.lower() == ".zarr" and path.parent.is_dir()
+
+
+def read_entry(path: Path) -> tuple[np.ndarray, str, int]:
+    """Read one frame, the SHA-256 of its values (row by row, low byte first), and their size in bytes.
+
+    Raises
+    ------
+    InputError
+        If the store holds no such array or entry, or is damaged or incomplete.
+    """
+    store = path.parent
+    try:
+        frames = _frames(store, (store / ARRAY / "zarr.json").stat().st_mtime_ns)
+    except OSError:
+        raise InputError("no array of frames", where=str(store), allowed=f"a Zarr v3 store with the array {ARRAY!r}") from None
+    if int(path.name) >= frames.shape[0]:
+        raise InputError("the store has no such frame", where=str(store), value=int(path.name), allowed=f"0 to {frames.shape[0] - 1}")
+    try:
+        values = np.asarray(frames[int(path.name)])
+    except Exception as problem:  # every codec has its own exceptions, and all of them mean a damaged store here
+        reason = str(problem).splitlines()[0] if str(problem) else type(problem).__name__
+        raise InputError(f"frame is damaged ({reason})", where=str(path), remedy="copy or make the store again") from None
+    raw = np.ascontiguousarray(values, values.dtype.newbyteorder("<")).tobytes()
+    return values, hashlib.sha256(raw).hexdigest(), len(raw)
+
+
+@lru_cache(maxsize=8)
+def _frames(store: Path, modified_ns: int) -> Any:
+    """Open the array; what is not stored would be read as zeros, so everything must be there."""
+    import zarr
+    from zarr.storage import LocalStore
+
+    try:
+        frames = zarr.open_array(LocalStore(store, read_only=True), path=ARRAY, mode="r", zarr_format=3)
+        complete = frames.nchunks_initialized == frames.nchunks
+    except (ValueError, KeyError, TypeError) as problem:
+        raise InputError(f"not a store of frames ({problem})", where=str(store), remedy="copy or make the store again") from None
+    if frames.ndim != 3:
+        raise InputError("the array of frames has other axes", where=str(store), value=frames.shape, allowed="frame, row, column")
+    if not complete:
+        raise InputError("frames are missing in the store", where=str(store), remedy="copy or make the store again, empty chunks included")
+    return frames

@@ -1,0 +1,38 @@
+"""Kernels of the clamp: the droop of an AC-coupled line between two clamp pulses, and its inverse."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pixmetry.core.jit import jit
+
+
+@jit
+def droop(data, loss, half):
+    """Return y with y(t) = x(t) − s(t), s' = (x − s)/τ, s = 0 at the first pixel, in the middle of every pixel; float32 (n, rows, cols).
+
+    ``loss`` is 1 − e^(−T/τ) for a pixel of duration T, ``half`` 1 − e^(−T/2τ).
+    """
+    out = np.empty_like(data)
+    for i in range(data.shape[0]):
+        for r in range(data.shape[1]):
+            s = 0.0
+            for c in range(data.shape[2]):
+                above = np.float64(data[i, r, c]) - s
+                out[i, r, c] = above * (1.0 - half)
+                s += loss * above
+    return out
+
+
+@jit
+def undroop(data, loss, half):
+    """Return x of `droop` from y, from left to right."""
+    out = np.empty_like(data)
+    for i in range(data.shape[0]):
+        for r in range(data.shape[1]):
+            s = 0.0
+            for c in range(data.shape[2]):
+                above = np.float64(data[i, r, c]) / (1.0 - half)
+                out[i, r, c] = above + s
+                s += loss * above
+    return out

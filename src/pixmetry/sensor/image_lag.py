@@ -1,0 +1,79 @@
+"""Image lag: charge that the transfer to the sense node leaves behind comes with the next frame."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pixmetry.core.random import Stream
+from pixmetry.core.signal import Kind, Signal
+from pixmetry.core.source import Parameters, Source, quantity
+
+
+class ImageLag(Parameters):
+    """What stays in the photodiode."""
+
+    lag_rel: float = quantity(0.0, "1", "share of the charge that stays behind", ge=0, le=0.9)
+    pocket_e: float = quantity(0.0, "e-", "most that a potential pocket holds back beside that", ge=0, le=1e6)
+    pocket_fill_e: float = quantity(100.0, "e-", "charge at which the pocket is 63 % full", gt=0, le=1e6)
+
+
+def left_behind(params: ImageLag, charge: np.ndarray) -> np.ndarray:
+    """Charge that stays, in electrons; never more than there is."""
+    left = params.lag_rel * charge
+    if params.pocket_e:
+        left = left - params.pocket_e * np.expm1(-np.maximum(charge, 0) / params.pocket_fill_e)
+    return np.minimum(left, np.maximum(charge, 0)).astype(np.float32)
+
+
+def start(params: ImageLag) -> np.ndarray | None:
+    """Nothing is held before frame 0; no memory where nothing stays behind."""
+    return np.zeros((1, 1), np.float32) if params.lag_rel or params.pocket_e else None
+
+
+def forward(params: ImageLag, signal: Signal, stream: Stream, state: np.ndarray | None) -> tuple[Signal, np.ndarray | None]:
+    """Add what the frame before left, and keep what this one leaves.
+
+    Frames that follow each other come as whole frames or as one window each time; many windows at once belong to no sequence and see the
+    state of the whole frame that they are given.
+    """
+    if state is None or not (params.lag_rel or params.pocket_e):
+        return signal, state
+    if len(signal) > 1 and signal.data.shape[1:] != tuple(signal.frame_shape):
+        held = state if state.size == 1 else state[signal.rows[:, :, None], signal.cols[:, None, :]]
+        charge = signal.data + held
+        return signal.with_data(charge - left_behind(params, charge)), state
+    if len(signal) == 1 and state.size > 1 and state.shape != signal.data.shape[1:]:
+        state = state[signal.rows[0][:, None], signal.cols[0][None, :]]
+    out = np.empty_like(signal.data)
+    for i, frame in enumerate(signal.data):
+        charge = frame + state
+        state = left_behind(params, charge)
+        np.subtract(charge, state, out=out[i])
+    return signal.with_data(out), state
+
+
+SOURCE = Source(
+    id="sensor.image_lag",
+    title="Image lag",
+    description="A part of the charge stays in the photodiode and appears in the next frame: a moving target drags a ghost behind it.",
+    note="Note 16 (in time instead of along the register)",
+    parameters=ImageLag,
+    consumes=(Kind.ELECTRONS,),
+    after=("sensor.shot_noise", "sensor.full_well", "sensor.blooming"),
+    before=("sensor.charge_transfer", "sensor.read_out", "electronics"),
+    neutral=ImageLag(),
+    typical=ImageLag(lag_rel=0.01),
+    bound=ImageLag(lag_rel=0.05, pocket_e=20.0),
+    forward=forward,
+    start=start,
+    gum_class="O",
+    equation="q_out(t) = q(t) + h(t−1) − h(t);  h(t) = λ (q(t) + h(t−1)) + p (1 − e^(−q/p0))",
+    typical_size="a target that moves v px a frame is λ v/(1 − λ) behind while its ghost lies in the window: 0.01 px at 1 % and 1 px",
+    references=("E. R. Fossum, D. B. Hondongwa, IEEE J. Electron Devices Soc. 2(3), 33, 2014 (pinned photodiodes, lag)",),
+    advice="Leave a dark frame between exposures, or move the target slowly against its size.",
+    reasons={
+        "measure": "needs dark frames straight after bright ones: the first of them shows what stayed behind",
+        "correct": "needs the sequence from its first frame on, without a gap",
+        "propagate": "needs the target's speed, which a probe does not hold; a target that stands still is not moved",
+    },
+)

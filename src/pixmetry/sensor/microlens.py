@@ -1,0 +1,79 @@
+"""Microlenses: light that arrives aslant is lost in part, the more the farther from the angle that they are made for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from pixmetry.core.contribution import Contribution, Probe
+from pixmetry.core.geometry import corner_px, frame_centre, ramp_contribution
+from pixmetry.core.random import Stream
+from pixmetry.core.signal import Kind, Signal
+from pixmetry.core.source import Parameters, Source, quantity
+
+
+class Microlens(Parameters):
+    """Acceptance about the chief ray. The tangents of both angles grow in proportion to the distance from the frame's centre."""
+
+    chief_ray_deg: float = quantity(0.0, "deg", "of the lens's chief ray in the frame's corners; 0: telecentric", ge=0, le=60)
+    design_ray_deg: float = quantity(0.0, "deg", "angle for which the microlenses are shifted in the frame's corners", ge=0, le=60)
+    acceptance_deg: float = quantity(20.0, "deg", "standard deviation of the response against angle", ge=3, le=90)
+    aspect: float = quantity(0.965, "1", "pitch along y over pitch along x", ge=0.2, le=5)
+
+
+def factor(params: Microlens, x_px: np.ndarray, y_px: np.ndarray, frame_shape: tuple[int, int]) -> np.ndarray:
+    """Relative response at some places, 1 where the ray comes as designed; float64."""
+    x0, y0 = frame_centre(frame_shape)
+    r = np.hypot(x_px - x0, params.aspect * (y_px - y0)) / corner_px(frame_shape, params.aspect)
+    chief, design = (np.arctan(np.tan(np.radians(a)) * r) for a in (params.chief_ray_deg, params.design_ray_deg))
+    return np.exp(-0.5 * ((chief - design) / np.radians(params.acceptance_deg)) ** 2)
+
+
+def _frame(params: Microlens, signal: Signal) -> np.ndarray:
+    light = factor(params, signal.cols[:, None, :].astype(float), signal.rows[:, :, None].astype(float), signal.frame_shape)
+    return np.maximum(light, 1e-3).astype(np.float32)  # cut off just above 0: the correction divides by it
+
+
+def forward(params: Microlens, signal: Signal, stream: Stream) -> Signal:
+    """Multiply the light by the response."""
+    return signal.with_data(signal.data * _frame(params, signal))
+
+
+def correct(params: Microlens, signal: Signal, maps: Mapping[str, np.ndarray]) -> Signal:
+    """Divide by the response that the parameters give; it needs no map."""
+    return signal.with_data(signal.data / _frame(params, signal))
+
+
+def truth(params: Microlens, signal: Signal, stream: Stream) -> Mapping[str, np.ndarray]:
+    """Relative response of every pixel, shape (rows, cols)."""
+    return {"light_rel": _frame(params, signal)[0]}
+
+
+def propagate(params: Microlens, probe: Probe) -> Contribution:
+    """Propagator P3: a relative ramp g moves a centroid by g⟨x²⟩; mean and spread over targets anywhere on the frame."""
+    return ramp_contribution(lambda x, y: factor(params, x, y, probe.frame_shape), probe)
+
+
+SOURCE = Source(
+    id="sensor.microlens",
+    title="Microlenses and the chief ray's angle",
+    description="Microlenses gather light onto the sensitive area, but less where the chief ray comes at another angle than designed.",
+    number=5,
+    parameters=Microlens,
+    consumes=(Kind.PHOTONS,),
+    before=("sensor.dark_current", "sensor.shot_noise"),
+    neutral=Microlens(),
+    typical=Microlens(chief_ray_deg=12.0, design_ray_deg=5.0, acceptance_deg=15.0),
+    bound=Microlens(chief_ray_deg=20.0, design_ray_deg=0.0, acceptance_deg=15.0),
+    forward=forward,
+    correct=correct,
+    truth=truth,
+    propagate=propagate,
+    gum_class="G",
+    equation="µ' = µ exp(−(θ − θ_design)²/(2 θ₀²)),  tan θ = tan θ_corner · r/r_corner;  Δx = g ⟨x²⟩",
+    typical_size="0.0036 px for a gradient of 0.1 % per px on a disc of 7 px (centroid)",
+    references=("P. B. Catrysse, B. A. Wandell, Optical efficiency of image sensor pixels, JOSA A 19 (2002) 1610–1620", "EMVA 1288 R4.0"),
+    advice="Take a lens whose exit pupil suits the sensor; calibrate and flat-field at the working aperture.",
+    reasons={"measure": "a flat field shows only all shading together: optics.shading measures that"},
+)
