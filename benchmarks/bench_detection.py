@@ -3,7 +3,7 @@
 One frame of 1024 × 1024 px, uint16, two threads, from light to code: photo response, dark current, shot noise, full well, dark
 non-uniformity, read noise, gain, converter. Beside it plain NumPy with one generator (PCG64) and the same physics, in two forms: with one
 Poisson draw of light and dark electrons together, and with one draw for each. Its maps of the unit are drawn beforehand; ours come from the
-keyed generator. Every repeat runs all of them one after the other; the ratio is the median of the ratios of single repeats.
+keyed generator, in every frame anew. Every repeat runs all of them one after the other; a ratio is the median of those of the repeats.
 """
 
 from __future__ import annotations
@@ -102,11 +102,9 @@ def main() -> None:
             REPEATS,
         )
         t["series"] /= FRAMES
-        ms = {name: 1e3 * float(np.median(values)) for name, values in t.items()}
-        ratio, ratio2 = (float(np.median(t["series"] / t[name])) for name in ("merged", "separate"))
-        print(
-            f"{level:8.0f} e {ms['series']:10.1f} {ms['single']:10.1f} {ms['merged']:8.1f} {ms['separate']:8.1f} {ratio:8.3f} {ratio2:15.3f}"
-        )
+        ms = [1e3 * float(np.median(t[name])) for name in ("series", "single", "merged", "separate")]
+        ratios = [float(np.median(t["series"] / t[name])) for name in ("merged", "separate")]
+        print(f"{level:8.0f} e {ms[0]:10.1f} {ms[1]:10.1f} {ms[2]:8.1f} {ms[3]:8.1f} {ratios[0]:8.3f} {ratios[1]:15.3f}")
 
 
 if __name__ == "__main__":

@@ -14,9 +14,11 @@ from collections.abc import Callable
 
 import numpy as np
 
+from pixmetry.cable.termination import echoes
 from pixmetry.core.camera import Camera, Element
 from pixmetry.core.catalogue import get_source
 from pixmetry.core.random import Grid
+from pixmetry.core.signal import Clock
 from pixmetry.core.threads import set_threads
 from pixmetry.locate.estimators import Estimator
 from pixmetry.scene.discs import REACH, STEP, Discs, radial_profile
@@ -173,13 +175,11 @@ class InNumpy:
 
     @staticmethod
     def echo(data: np.ndarray, s) -> np.ndarray:
-        """The series of echoes."""
-        out, k = np.zeros_like(data), 0
-        while abs(s.ghost) ** k > 1e-7:
-            whole, part = divmod(k * s.delay_px, 1)
-            a = np.maximum(np.arange(data.shape[2]) - int(whole), 0)
-            out += np.float32((1 - s.ghost) * s.ghost**k) * ((1 - part) * data[:, :, a] + part * data[:, :, np.maximum(a - 1, 0)])
-            k += 1
+        """The series of echoes of held pixels, read in the middle of each."""
+        out, cols = np.zeros_like(data), np.arange(data.shape[2])
+        for delay_s, amplitude in zip(*echoes(s), strict=True):
+            back = -int(np.floor(0.5 - delay_s * Clock.pixel_hz))
+            out += np.float32(amplitude) * data[:, :, np.maximum(cols - back, 0)]
         return out
 
 

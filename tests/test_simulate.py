@@ -216,7 +216,7 @@ def _drift(params: Shift, signal: Any, stream: Any) -> Any:
 
 def _tell(params: Shift, signal: Any, stream: Any) -> dict[str, np.ndarray]:
     rows = signal.grid.shape[0]
-    alternating = np.full((rows, 3), signal.grid.frame[0] // 2)
+    alternating = np.full((rows, 3), 5 + signal.grid.frame[0] // 2)
     return {
         "dx_px": params.dx_px_per_s * signal.time_s,
         "of_rows_px": signal.grid.frame[:, None] + np.arange(rows) / 100,
@@ -287,7 +287,7 @@ def test_what_sources_tell_is_stored_once_or_frame_by_frame(tmp_path: Path) -> N
     assert np.allclose(told["of_rows_px"][:], np.arange(5)[:, None] + np.arange(64) / 100) and told["of_rows_px"].chunks == (1, 64)
     want = camera.streams(3).of("drift").normal_fixed(Grid.whole([0], (64, 72)))[0]
     assert np.array_equal(told["of_unit"][:], want) and told["of_unit"].attrs["one_per"] == "unit"
-    assert np.array_equal(told["changes_later"][:, 0, 0], [0, 0, 1, 1, 2]) and told["changes_later"].shape == (5, 64, 3)
+    assert np.array_equal(told["changes_later"][:, 0, 0], [5, 5, 6, 6, 7]) and told["changes_later"].shape == (5, 64, 3)
     assert np.array_equal(group["frames/frame"][:], range(5)) and np.allclose(group["frames/time_s"][:], 0.5 * np.arange(5))
     assert truth_of(tmp_path)["targets"] == []
 

@@ -18,7 +18,7 @@ from source_signals import ALPHA, flat, signal, spot_probe, stream
 
 
 def test_amplifier_noise_of_heavy_tails_is_the_mixture_and_keeps_its_deviation():
-    """Kolmogorov–Smirnov at 1e-6 over 400 000 pixels against the mixture's own law; 0.5 % of the pixels in the wrong part would be caught."""
+    """Kolmogorov–Smirnov at 1e-6 over 400 000 pixels against the mixture's own law; 0.5 % in the wrong part would be caught."""
     share, sigma = 0.05, 8.0
     noise = amplifier_noise.forward(AmplifierNoise(white_e=sigma, tail_share=share), flat(0.0, (500, 800)), stream()).data.ravel()
     narrow = sigma / math.sqrt((1 - share) + 9 * share)
@@ -50,7 +50,7 @@ def bent(x) -> np.ndarray:
 
 
 def test_gamma_with_a_toe_is_the_curve_of_bt_709():
-    """ITU-R BT.709-6, item 1.2 with its rounded constants: 1.099 L^0.45 − 0.099 from 0.018 on, 4.5 L below. They are off by up to 0.0003."""
+    """ITU-R BT.709-6, item 1.2 with its rounded constants: 1.099 L^0.45 − 0.099 from 0.018 on, 4.5 L below. They are up to 0.0003 off."""
     light = np.concatenate([np.linspace(0, 0.018, 50, endpoint=False), np.linspace(0.018, 1, 200)])
     want = np.where(light < 0.018, 4.5 * light, 1.099 * light**0.45 - 0.099)
     assert bent(1000 * light) == pytest.approx(want, abs=4e-4)

@@ -10,10 +10,10 @@ from source_signals import Z, flat, stream
 
 
 def test_density_goes_as_one_over_f():
-    """Periodogram (SciPy) of 48 read-outs of 65 536 pixels: −10 dB per decade within 0.5 dB, over 2.1 decades; at 1e-6 the fit is known to 0.2 dB.
+    """Periodogram (SciPy) of 48 read-outs of 65 536 pixels: −10 dB per decade within 0.5 dB, over 2.1 decades.
 
-    And no band of an octave departs from the line by more than its own scatter and 0.1 dB: a construction with steps of 2^k pixels that
-    are held, not joined by lines, has ripples of 0.4 dB.
+    At 1e-6 the fit is known to 0.2 dB. No band of an octave departs from the line by more than its own scatter and 0.1 dB: a
+    construction with steps of 2^k pixels that are held, not joined by lines, has ripples of 0.4 dB.
     """
     from scipy.signal import periodogram
 

@@ -7,6 +7,8 @@ import pytest
 from scipy.integrate import quad
 
 from catalogue.support import Flat
+from pixmetry.core.camera import Camera, Element
+from pixmetry.core.random import Grid
 from pixmetry.optics.flicker import SOURCE, Flicker, mean_light, shares
 from pixmetry.sensor import exposure, light_pulses, parasitic_light, rolling_shutter
 from pixmetry.sensor.exposure import Exposure
@@ -69,6 +71,14 @@ def test_an_exposure_of_a_whole_period_sees_no_flicker_and_a_short_one_all_of_it
         assert image == pytest.approx(np.full(image.shape, STEADY * expected), rel=1e-5)
 
 
+def test_frames_of_a_still_scene_differ_in_brightness_as_the_lamp_beats_with_them() -> None:
+    lamp, length = Flicker(depth_rel=0.5, frequency_hz=103.0, phase_rad=0.2), 2e-3
+    frames = chain((SOURCE, lamp), exposure_s=length).expose(Flat(50.0), 4).data
+    expected = [STEADY * integrated(lamp, 0.04 * k, length) for k in range(4)]
+    assert frames.mean(axis=(1, 2)) == pytest.approx(expected, rel=1e-5)
+    assert np.ptp(frames) > 0.2 * STEADY
+
+
 def test_flicker_weights_the_path_of_a_moving_target() -> None:
     """The centre is ∫ v t E(t) dt / ∫ E(t) dt."""
     lamp, v, length = Flicker(depth_rel=0.8, frequency_hz=25.0, phase_rad=0.4), 100.0, 0.02
@@ -80,8 +90,6 @@ def test_flicker_weights_the_path_of_a_moving_target() -> None:
 
 def test_two_lamps_multiply_in_short_looks() -> None:
     one, two = Flicker(depth_rel=0.3, phase_rad=1.0), Flicker(depth_rel=0.5, frequency_hz=77.0, phase_rad=-0.5)
-    from pixmetry.core.camera import Camera, Element
-
     camera = Camera("test", (4, 4), (Element("a", SOURCE, one), Element("b", SOURCE, two)), exposure_s=1e-6)
     image = camera.expose(Flat(50.0), [3]).data[0]
     assert image == pytest.approx(np.full((4, 4), STEADY * lamp_at(0.12, one) * lamp_at(0.12, two)), rel=1e-3)
@@ -100,8 +108,6 @@ def test_pulses_are_instants_and_a_waiting_store_adds_its_own_looks() -> None:
 
 def test_looks_of_a_shutter_share_its_time_without_gaps() -> None:
     camera = chain((exposure.SOURCE, Exposure(nodes=7)))
-    from pixmetry.core.random import Grid
-
     signal = camera.signal(Steady(), Grid.whole([2], (3, 3)), exposure_s=0.01)
     light = exposure.forward(Exposure(nodes=7), signal, None).light
     begin, end = shares(light)

@@ -37,7 +37,7 @@ def test_ramps_of_grey_light_come_back_exactly(method, pattern):
 @pytest.mark.parametrize("method", ["bilinear", "malvar"])
 @pytest.mark.parametrize("pattern", PATTERNS)
 def test_even_colours_come_back_exactly_up_to_the_corners_on_any_phase(method, pattern):
-    """The bilinear filling of a plane of one colour per channel is that plane; so is the other one's where colours are equal at all places."""
+    """Where every channel has one level, all its neighbours do, and all Laplacians vanish."""
     level = {"R": 40, "G": 80, "B": 120}
     whole = masks(pattern, (13, 12))
     image = sum(level[c] * whole[c] for c in "RGB")
@@ -110,10 +110,11 @@ def test_overshoot_is_held_at_the_ends_of_the_range():
         assert np.all(got[:, :6] == 0) and np.all(got[:, 13:] == 255)
 
 
-def shifts(diameter: float, method: str, output: str, n: int = 300) -> float:
-    rng = np.random.default_rng()
+def shifts(diameter: float, method: str, output: str, n: int = 17) -> float:
+    """Deviation of the error in x over a raster of n × n places in the pattern of two by two."""
+    place = 2 * (np.arange(n) + 0.5) / n - 1
     out = []
-    for x, y in rng.uniform(-1, 1, (n, 2)):
+    for x, y in ((x, y) for x in place for y in place):
         image = np.rint(16 * disc(x, y, diameter))  # 12 bits: rounding does not count
         got = filled(image, method=method, output=output, bits=12) / 16
         out.append(soft_centroid(got, 8.0)[0] - x)
@@ -124,13 +125,14 @@ def shifts(diameter: float, method: str, output: str, n: int = 300) -> float:
 def test_shift_of_discs_after_bilinear_filling(diameter, low, high):
     """Grey discs of 150 DN on black under a blur of 0.7 px, centroid of what stands above 8 DN in a window of radius 9 px, luminance.
 
-    The numbers on record are for this case; 300 places give a deviation to 4 %, at 1e-6 to 20 %, which is granted on both sides.
+    The numbers on record are for this case, at 200 random places: they are known to 5 % or so, and 15 % are granted on both sides.
     """
-    assert 0.8 * low < shifts(diameter, "bilinear", "luma") < 1.2 * high
+    assert 0.85 * low < shifts(diameter, "bilinear", "luma") < 1.15 * high
 
 
 def test_one_colour_alone_is_worse_than_the_luminance():
-    assert 0.012 < shifts(3, "bilinear", "red") < 0.03
+    """On record: up to 0.022 px in the red plane, for discs of 10 px."""
+    assert shifts(10, "bilinear", "red") == pytest.approx(0.022, rel=0.1)
 
 
 def test_weights_have_the_sum_1_at_every_place():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,8 +11,8 @@ from scipy.ndimage import gaussian_filter
 from scipy.special import erfc
 
 from pixmetry.processing.sharpening import Sharpening, forward, propagate
-from processing.code_frames import codes
-from source_signals import Z, spot_probe, stream
+from processing.code_frames import codes, disc, soft_centroid
+from source_signals import Z, centroid_probe, spot_probe, stream
 
 
 def sharpened(image: np.ndarray, **kw) -> np.ndarray:
@@ -65,3 +66,23 @@ def test_a_spot_within_the_range_has_no_bias():
     assert (got.u_x_px, got.bias_x_px) == (0.0, 0.0)
     wide = propagate(Sharpening(amount=0.5), spot_probe(sigma=3.0))
     assert abs(wide.bias_x_px) < 1e-3
+
+
+def test_predicted_shifts_are_those_of_sharpened_codes():
+    """Discs of 3 px on a background of 160 codes of 12 bits, whose undershoot is held at black; centroid above 320, at six places."""
+    x, y = np.array([-0.4, -0.2, -0.1, 0.1, 0.3, 0.5]), np.array([0.2, -0.3, 0.4, 0.0, -0.1, 0.3])
+    images = np.stack([160 + 16 * disc(a, b, 3.0) for a, b in zip(x, y, strict=True)])
+    params = Sharpening(amount=2.0, sigma_px=1.5, bits=12)
+
+    def located(frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        found = np.array([soft_centroid(f, 320.0) for f in frames])
+        return found[:, 0] + 12, found[:, 1] + 12
+
+    probe = replace(centroid_probe(images, x + 12, y + 12), locate=located)
+    probe = replace(probe, **dict(zip(("x_hat_px", "y_hat_px"), located(images), strict=True)), gx=0 * probe.gx, gy=0 * probe.gy)
+    seen = located(forward(params, codes(np.rint(images)), stream()).data.astype(float))
+    dx, dy = (after - before for after, before in zip(seen, located(images), strict=True))
+    got = propagate(params, probe)
+    assert (got.u_x_px, got.u_y_px) == (pytest.approx(dx.std(), abs=3e-4), pytest.approx(dy.std(), abs=3e-4))
+    assert (got.bias_x_px, got.bias_y_px) == (pytest.approx(dx.mean(), abs=3e-4), pytest.approx(dy.mean(), abs=3e-4))
+    assert dx.std() > 0.003

@@ -10,7 +10,7 @@ import pytest
 from pixmetry.core.errors import MeasureError
 from pixmetry.core.observations import Observations
 from pixmetry.core.signal import Kind
-from pixmetry.sensor.dark_current import SOURCE, DarkCurrent, mean_e
+from pixmetry.sensor.dark_current import SOURCE, DarkCurrent, mean_e, warming
 from pixmetry.sensor.shot_noise import SOURCE as SHOT
 from source_signals import K_DN_PER_E, Z, fitted, flat, spot_probe, stream
 
@@ -62,3 +62,40 @@ def test_shift_is_that_of_white_noise():
 def test_electrons_stay_electrons():
     assert SOURCE.forward(SOURCE.typical, flat(1.0, (2, 2)), stream()).kind is Kind.ELECTRONS
     assert np.array_equal(SOURCE.forward(SOURCE.neutral, flat(7.0, (2, 2)), stream()).data, np.full((1, 2, 2), 7, np.float32))
+
+
+def test_half_the_gap_doubles_in_nine_and_a_half_kelvin():
+    """Rise of temperature that doubles it at 20 °C: 9.46 K by E_g/2 alone, 8.84 K with T^1.5, by bisection of the formula itself."""
+    k, t = 8.617333e-5, 293.15
+    for power, expected in ((0.0, 9.46), (1.5, 8.84)):
+        low, high = 1.0, 30.0
+        for _ in range(60):
+            rise = (low + high) / 2
+            grown = ((t + rise) / t) ** power * math.exp(1.12 / (2 * k) * (1 / t - 1 / (t + rise)))
+            low, high = (rise, high) if grown < 2 else (low, rise)
+        assert rise == pytest.approx(expected, abs=0.03)
+    assert warming(DarkCurrent(law="gap"), 20.0 + rise) == pytest.approx(2, rel=1e-4)
+    assert warming(DarkCurrent(law="gap", gap_ev=1.2), 20.0 + rise) > 2.08
+
+
+def test_spread_of_the_rates_is_log_normal_about_the_same_mean():
+    """Kolmogorov–Smirnov of the logarithm and the mean rate, 1e-6 each; catches 2 % of the mean. The Poisson draw comes after it."""
+    from scipy import stats
+
+    params, one = DarkCurrent(rate_e_per_s=50.0, spread_log=0.6), stream()
+    frames = flat(0.0, (500, 500), n=2, exposure_s=2.0)
+    out = SOURCE.forward(params, frames, one).data.astype(float)
+    assert np.array_equal(out[0], out[1])
+    assert abs(out[0].mean() / 100 - 1) < Z * math.sqrt(math.expm1(0.36) / out[0].size) + 1e-6
+    assert stats.kstest((np.log(out[0].ravel() / 100) + 0.18) / 0.6, "norm").pvalue > 1e-6
+    drawn = SHOT.forward(SHOT.typical, SOURCE.forward(params, frames, one), stream()).data.astype(float)
+    pair = ((drawn[1] - drawn[0]) ** 2).mean() / 2  # temporal variance is the mean, fixed pattern is not in it
+    assert abs(pair / out[0].mean() - 1) < Z * math.sqrt((2 + 3 * math.exp(0.36)) / out[0].size)
+    assert SOURCE.truth(params, frames, one)["dark_current_e_per_s"] == pytest.approx(out[0] / 2, rel=1e-5)
+
+
+def test_glow_falls_off_from_its_corner_and_grows_with_time_alone():
+    params = DarkCurrent(glow_e_per_s=100.0, glow_reach_px=10.0, glow_corner="bottom right")
+    out = SOURCE.forward(params, flat(0.0, (30, 40), n=2, exposure_s=[1.0, 3.0], temperature_c=[20.0, 60.0]), stream()).data
+    assert out[0, 29, 39] == pytest.approx(100) and out[0, 26, 35] == pytest.approx(100 * math.exp(-0.5))
+    assert out[1] == pytest.approx(3 * out[0])

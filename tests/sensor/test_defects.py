@@ -85,7 +85,7 @@ def test_counted_blind_through_stacks(dark_e: float, params: Defects):
         count = got[f"{name}_fraction"].value * where.size
         assert where.sum() - hidden - 4 <= count <= where.sum() + 4, name
     for name, value in params.model_dump().items():
-        if name.endswith("_fraction") or getattr(params, name.split("_")[0] + "_fraction") == 0:
+        if name.endswith("_fraction") or getattr(params, name.split("_")[0] + "_fraction", 0) == 0:
             continue
         chance = value / np.sqrt(2 * truth["gain"].sum()) if name == "gain_std_rel" else 0.0
         assert abs(got[name].value - value) < 6 * math.hypot(got[name].u, chance), name
@@ -231,3 +231,72 @@ def test_behind_a_threshold_the_estimator_itself_is_asked():
             square[axis] += share * (shift**2).mean(axis=3).sum(axis=(1, 2)).mean()
     got = SOURCE.propagate(params, probe)
     assert (got.u_x_px, got.u_y_px) == pytest.approx(tuple(np.sqrt(square)), rel=0.03)
+
+
+def test_blinking_is_a_stationary_telegraph_signal():
+    """Share on, correlation e^-k of the chain after k frames, and the same for frames far on; 1e-6, catches 10 % of the memory.
+
+    After one frame a pixel keeps its level with probability 1 − 1/n, else it is drawn anew: correlation (1 − 1/n)^k.
+    """
+    params, pixels = Defects(blinking_fraction=0.1, blinking_e=300.0, blinking_on=0.3, blinking_frames=5.0), (300, 400)
+    one, frames = stream(), 24
+    out = SOURCE.forward(params, flat(50.0, pixels, n=frames), one).data.reshape(frames, -1)
+    blinking = SOURCE.truth(params, flat(0.0, pixels), one)["blinking"].ravel()
+    assert (out[:, ~blinking] == 50).all()
+    on = (out[:, blinking] > 50).astype(float)
+    assert set(np.unique(out)) == {np.float32(50), np.float32(350)}
+    n = on.shape[1]
+    assert abs(on[-1].mean() - 0.3) < 4.8917 * math.sqrt(0.21 / n)
+    for k in (1, 4):
+        found = ((on[-1] - 0.3) * (on[-1 - k] - 0.3)).mean() / 0.21
+        assert abs(found - 0.8**k) < 4.8917 * 1.6 / math.sqrt(n)
+    alone = SOURCE.forward(params, flat(50.0, pixels, n=frames).take(np.array([17])), one).data.ravel()
+    assert np.array_equal(alone, out[17])
+
+
+def test_columns_clusters_stuck_and_listed_pixels():
+    params = Defects(
+        column_fraction=0.05, column_gain_rel=0.5, column_e=10.0, cluster_fraction=0.002, cluster_radius_px=2.0, stuck_fraction=0.002,
+        stuck_e=77.0, listed=((3, 4, 0.0, 0.0), (199, 299, 1.0, 5000.0), (500, 2, 0.0, 0.0)),
+    )  # fmt: skip
+    one, frames = stream(), flat(1000.0, (200, 300), n=2)
+    out, told = SOURCE.forward(params, frames, one).data, SOURCE.truth(params, frames, one)
+    assert np.array_equal(out[0], out[1])
+    assert out[0, 3, 4] == 0 and out[0, 199, 299] >= 5000 and told["listed"].sum() == 2
+    assert (out[0][told["cluster"] & ~told["listed"]] == 0).all()
+    here = told["column"] & ~told["cluster"] & ~told["listed"]
+    assert set(np.unique(out[0][here])) <= {np.float32(510), np.float32(48.5)}  # good and stuck ones in a defect column
+    rest = ~(told["column"] | told["cluster"] | told["listed"])
+    assert (out[0][rest & told["stuck"]] == 77).all() and (out[0][rest & ~told["stuck"]] == 1000).all()
+    columns = told["column"].all(axis=0)
+    assert np.array_equal(columns, told["column"].any(axis=0)) and stats.binom.cdf(columns.sum(), 300, 0.05) > ALPHA / 2
+    seeds = 1 - (1 - 0.002) ** 13  # pixels within two of the centre
+    assert abs(told["cluster"].mean() - seeds) < 4.8917 * math.sqrt(seeds * 13 / told["cluster"].size)
+
+
+def test_list_of_known_defects_is_checked():
+    from pixmetry.core.errors import InputError
+
+    assert SOURCE.make({"listed": [[1, 2, 0.0, 10.0]]}).listed == ((1, 2, 0.0, 10.0),)
+    for wrong in ([[-1, 2, 0.0, 0.0]], [[1, 2, -0.5, 0.0]], [[1, 2, 0.0]]):
+        with pytest.raises(InputError, match="listed"):
+            SOURCE.make({"listed": wrong})
+
+
+def test_shift_by_a_dead_column_and_by_clusters():
+    """Root mean square over columns (clusters) of the shift when one of them is dark, from the images themselves."""
+    probe = spot_probe(n=4)
+    centres = [(r, c) for r in range(-1, 26) for c in range(-1, 26)]
+    groups = {"column": [(slice(None), slice(c, c + 1)) for c in range(25)]}
+    groups["cluster"] = [(slice(max(r - 1, 0), r + 2), slice(max(c - 1, 0), c + 2)) for r, c in centres]
+    for name, params in (
+        ("column", Defects(column_fraction=1e-3)),
+        ("cluster", Defects(cluster_fraction=1e-4, cluster_radius_px=1.5, cluster_gain_rel=0.0)),
+    ):
+        got, square = SOURCE.propagate(params, probe), 0.0
+        for p in range(4):
+            for group in groups[name]:
+                error = np.zeros((25, 25))
+                error[group] = -probe.signal_dn[p][group]
+                square += 1e-3 * (probe.gx[p] * error).sum() ** 2 / 4 if name == "column" else 1e-4 * (probe.gx[p] * error).sum() ** 2 / 4
+        assert got.u_x_px == pytest.approx(math.sqrt(square), rel=1e-6)

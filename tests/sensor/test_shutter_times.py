@@ -57,6 +57,8 @@ def test_field_integration_sums_each_row_and_the_next() -> None:
     single = chain((interlace.SOURCE, Interlace()), shape=(33, 40)).expose(spot).data[0].astype(float)
     summed = chain((interlace.SOURCE, Interlace(integration="field")), shape=(33, 40)).expose(spot).data[0].astype(float)
     assert summed[:-1] == pytest.approx(single[:-1] + single[1:], rel=2e-4, abs=1e-3)
+    x, y = chain((interlace.SOURCE, Interlace(integration="field")), shape=(33, 40)).true_positions([20.3], [15.2])
+    assert moments(summed)[:2] == pytest.approx((float(x[0]), float(y[0])), abs=1e-3)
     moved = chain((interlace.SOURCE, Interlace(integration="field")), exposure_s=0.01).expose(Spot(20.0, 15.0, 50.0)).data[0]
     even, odd = field_centres(moved)
     assert odd - even == pytest.approx(1.0, abs=1e-3)

@@ -191,7 +191,7 @@ def _camera(values: dict[str, dict[str, float]], shape: tuple[int, int], series:
 
 def _truth(camera: Camera, series: SeriesModel, lamp_rel: float, traits: set[str]) -> dict[str, float]:
     """Parameters by ``source.parameter``; means over the frame as this unit has them, standard deviations as of its population."""
-    truth = {f"{e.name}.{k}": float(v) for e in camera.chain for k, v in e.params.model_dump().items() if not isinstance(v, str)}
+    truth = {f"{e.name}.{k}": float(v) for e in camera.chain for k, v in e.params.model_dump().items() if isinstance(v, int | float)}
     shade, response, extra_e = _unit_maps(camera)
     gain = camera["electronics.gain"].params.gain_dn_per_e
     adc, bend = camera["grabber.adc"].params, camera["electronics.nonlinearity"].params

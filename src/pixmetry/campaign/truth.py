@@ -103,12 +103,7 @@ class TruthWriter:
 
 def targets_of(scene: Any, time_s: float, frame: int) -> list[dict[str, Any]]:
     """What a scene tells of its targets at a time: records with ``x_px`` and ``y_px`` in the scene's plane; none if it has none."""
-    if hasattr(scene, "targets"):
-        return [dict(t) for t in scene.targets(time_s, frame)]
-    if hasattr(scene, "centres"):
-        x, y = scene.centres(np.array([frame]))
-        return [{"kind": "disc", "x_px": float(a), "y_px": float(b)} for a, b in zip(x[0], y[0], strict=True)]
-    return []
+    return [dict(t) for t in scene.targets(time_s, frame)] if hasattr(scene, "targets") else []
 
 
 def _places(seen: Sequence[Mapping[str, Any]]) -> list[tuple[str, str]]:

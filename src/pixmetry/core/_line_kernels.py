@@ -31,35 +31,39 @@ def read_line(data, first, black, step, table, delays, amplitudes, at, late, len
     out : float32, (n, rows, samples)
     """
     n, rows, cols = data.shape
-    k, samples, nodes = len(step), at.shape[1], table.shape[0] - 1
-    state = np.zeros((length + 1, k + 1))  # at the beginning of every period; the last column holds the level of the period
+    k, samples, nodes, paths = len(step), at.shape[1], table.shape[0] - 1, len(delays)
+    # At the beginning of every period: the filter's state and, in the last column, the level of the period. Row 0 is before the first pixel.
+    state = np.zeros((length + 2, k + 1))
+    place = np.empty((samples, paths), np.int64)  # which period a sample sees through each path, and with which weights
+    weight = np.empty((samples, paths, k + 1))
     for i in range(n):
         for r in range(rows):
+            if r == 0 or late[i, r] != late[i, r - 1]:
+                for j in range(samples):
+                    for e in range(paths):
+                        t = at[i, j] - late[i, r] - delays[e]
+                        whole = np.floor(t)
+                        place[j, e] = max(int(whole) - first[i], -1) + 1
+                        part = t - whole
+                        node = int(part * nodes + 0.5)
+                        d = part - node / nodes
+                        for q in range(k + 1):
+                            c0, c1, c2, c3 = table[node, q, 0], table[node, q, 1], table[node, q, 2], table[node, q, 3]
+                            weight[j, e, q] = amplitudes[e] * (((c3 * d + c2) * d + c1) * d + c0)
             for c in range(cols):
-                state[c, k] = np.float64(data[i, r, c]) - black
-            for c in range(length):
+                state[c + 1, k] = np.float64(data[i, r, c]) - black
+            for c in range(1, length + 1):
                 for p in range(k):
                     total = 0.0
                     for q in range(k + 1):
                         total += step[p, q] * state[c, q]
                     state[c + 1, p] = total
             for j in range(samples):
-                time = at[i, j] - late[i, r]
                 value = 0.0
-                for e in range(len(delays)):
-                    t = time - delays[e]
-                    whole = np.floor(t)
-                    c = int(whole) - first[i]
-                    if c < 0:
-                        continue
-                    part = t - whole
-                    node = int(part * nodes + 0.5)
-                    d = part - node / nodes
-                    total = 0.0
+                for e in range(paths):
+                    c = place[j, e]
                     for q in range(k + 1):
-                        w = table[node, q]
-                        total += (((w[3] * d + w[2]) * d + w[1]) * d + w[0]) * state[c, q]
-                    value += amplitudes[e] * total
+                        value += weight[j, e, q] * state[c, q]
                 out[i, r, j] = black + value
 
 

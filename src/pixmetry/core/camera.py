@@ -749,11 +749,13 @@ def build_camera(record: Mapping[str, Any], where: str = "camera") -> Camera:
 
     checked = validate(CameraRecord, record, where)
     elements = []
+    pitch = None if checked.pitch_x_um is None else (checked.pitch_x_um, checked.pitch_y_um or checked.pitch_x_um)
+    known = {} if pitch is None else {"pitch_x_um": pitch[0], "pitch_y_um": pitch[1], "pitch_um": pitch[0]}  # the camera's own, unless a source says otherwise
     for i, entry in enumerate(checked.chain):
         source = get_source(entry.source)
-        params = source.make(entry.parameters, where=f"{where}, chain[{i}] {entry.source}")
+        own = {name: value for name, value in known.items() if name in source.parameters.model_fields}
+        params = source.make(own | entry.parameters, where=f"{where}, chain[{i}] {entry.source}")
         elements.append(Element(entry.name or entry.source, source, params, entry.enabled))
-    pitch = None if checked.pitch_x_um is None else (checked.pitch_x_um, checked.pitch_y_um or checked.pitch_x_um)
     return Camera(
         checked.name,
         (checked.rows, checked.cols),

@@ -48,7 +48,9 @@ def map_shifts(pull: Pull, probe: Probe) -> tuple[np.ndarray, np.ndarray]:
 
 def map_contribution(pull: Pull, probe: Probe, gum_class: str = "G", **kw: Any) -> Contribution:
     """Contribution of a coordinate map to a target anywhere in the frame, before any calibration (propagator P6, first term)."""
-    text: dict[str, Any] = {"model_error": 0.12, "method": "displacement of targets all over the frame, before calibration"} | kw
+    method = "displacement of targets all over the frame, before calibration"
+    # the floor: a displaced target has another phase in the pixel, and the estimator another periodic error
+    text: dict[str, Any] = {"model_error": 0.12, "floor_px": 2e-3, "method": method} | kw
     return probe.from_shifts(*map_shifts(pull, probe), gum_class, **text)
 
 

@@ -13,17 +13,15 @@ BAND = FINE / 2  # cycles per pixel: the raster's own limit
 BLEND = 0.5  # cycles per pixel on both sides of it
 
 
-def kernel_of(transfer: Transfer, half_cells: int, alone: bool = True) -> np.ndarray:
-    """The point spread of a transfer function, as the weights of cells; shape (2 half_cells + 1,) * 2, sum 1.
+def kernel_of(transfer: Transfer, half_cells: int) -> np.ndarray:
+    """The point spread of a transfer function at the points of the raster; shape (2 half_cells + 1,) * 2, sum 1.
 
     Parameters
     ----------
     transfer : callable
         ``(fx, fy)`` in cycles per pixel, arrays -> ``∬ PSF exp(−2πi (fx x + fy y))``, 1 at 0.
     half_cells : int
-    alone : bool
-        Whether it will be the light's only tabulated spread: the light then takes the box of a cell out of it once, to second order,
-        and this is made good here.
+        Points on each side of the middle one.
 
     Notes
     -----
@@ -41,9 +39,6 @@ def kernel_of(transfer: Transfer, half_cells: int, alone: bool = True) -> np.nda
             if len(ix) and len(iy):
                 fy, fx = np.meshgrid(f[iy] + py, f[ix] + px, indexing="ij")
                 spectrum[np.ix_(iy, ix)] += wy[iy][:, None] * wx[ix] * transfer(fx, fy)
-    if alone:
-        c = np.cos(2 * np.pi * f / FINE)
-        spectrum /= 1 + (4 - 2 * c[:, None] - 2 * c) / 24
     kernel = np.fft.fftshift(np.fft.ifft2(spectrum).real)
     return kernel / kernel.sum()
 

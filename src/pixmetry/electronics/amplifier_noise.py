@@ -21,7 +21,7 @@ class AmplifierNoise(Parameters):
     """White noise, referred to the electrons at the sense node."""
 
     white_e: float = quantity(0.0, "e-", "standard deviation in every pixel", ge=0, le=1e5)
-    tail_share: float = quantity(0.0, "1", "share of the values that come from a normal law three times as wide; 0 is Gaussian", ge=0, le=0.5)
+    tail_share: float = quantity(0.0, "1", "share of the values from a normal law three times as wide; 0: Gaussian", ge=0, le=0.5)
     clock_ratio: float = quantity(1.0, "1", "pixel clock over the one for which white_e holds: the bandwidth follows it", gt=0, le=1e3)
 
 

@@ -21,7 +21,7 @@ class FlickerNoise(Parameters):
     rms_e: float = quantity(0.0, "e-", "root mean square over all octaves", ge=0, le=1e5)
     corner_rel: float = quantity(0.1, "1", "frequency up to which it goes as 1/f, over the pixel clock", gt=0, le=0.5)
     octaves: int = quantity(16, "1", "octaves of 1/f below the corner; slower than the lowest, the density is level", ge=1, le=32)
-    line_px: float = quantity(908.0, "px", "pixel clocks from the start of a row to that of the next; at least the row's pixels", ge=0, le=1e6)
+    line_px: float = quantity(908.0, "px", "pixel clocks from row to row; at least the row's pixels", ge=0, le=1e6)
 
 
 def octaves(params: FlickerNoise) -> list[tuple[float, float]]:
@@ -78,7 +78,7 @@ def propagate(params: FlickerNoise, probe: Probe) -> Contribution:
     matrix = covariance(params, time[:, None] - time) * probe.gain_dn_per_e**2
     flat = (g.reshape(len(g), -1) for g in (probe.gx, probe.gy))
     u = tuple(float(np.sqrt(np.mean(np.einsum("pi,pi->p", g @ matrix, g)))) for g in flat)
-    return probe.contribution((u[0], u[1]), "T", model_error=0.12, method="linear response of the estimator to 1/f noise along the read-out")
+    return probe.contribution((u[0], u[1]), "T", model_error=0.12, method="linear response of the estimator to noise along the read-out")
 
 
 SOURCE = Source(

@@ -39,7 +39,7 @@ def seen_per_px(params: SupplyPickup) -> tuple[float, float]:
 
 
 def fields(params: SupplyPickup, signal: Signal) -> list[tuple[slice, Signal, float]]:
-    """Split windows into what is read without a jump: rows of the window, these rows as a signal numbered by field line, turns at its start.
+    """Split windows into what is read without a jump: rows of the window, these as a signal numbered by field line, turns at its start.
 
     Of an interlaced frame, row R is line R // 2 of field R % 2. Windows that start on rows of different parity do not come here together.
     """

@@ -20,7 +20,7 @@ class TelegraphNoise(Parameters):
     share: float = quantity(0.0, "1", "share of the pixels that have it", ge=0, le=0.5)
     amplitude_e: float = quantity(10.0, "e-", "mean over these pixels of the step between neighbouring levels; exponential", ge=0, le=1e5)
     occupancy: float = quantity(0.5, "1", "share of the time in which a trap is filled", gt=0, lt=1)
-    memory_frames: float = quantity(0.0, "1", "frames in which the correlation of a trap's state falls to 1/e; 0: new in every frame", ge=0, le=1000)
+    memory_frames: float = quantity(0.0, "1", "frames after which a state's correlation is 1/e; 0: new in every frame", ge=0, le=1000)
     levels: Literal["two", "three", "cds"] = quantity(
         "two", "1", "one trap; two traps alike; or the difference of two samples in a frame, correlated double sampling: −a, 0, a"
     )
@@ -29,7 +29,8 @@ class TelegraphNoise(Parameters):
 
 def affected(params: TelegraphNoise, grid: Grid, stream: Stream) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Window, row and column (in the window) of the pixels that have a trap."""
-    return np.nonzero(stream.uniform_fixed(grid) < np.float32(params.share))
+    i, r, c = np.nonzero(stream.uniform_fixed(grid) < np.float32(params.share))
+    return i, r, c
 
 
 def steps_e(params: TelegraphNoise, single: Grid, stream: Stream) -> np.ndarray:

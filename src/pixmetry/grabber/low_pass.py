@@ -82,7 +82,7 @@ def propagate(params: LowPass, probe: Probe) -> Contribution:
 SOURCE = Source(
     id="grabber.low_pass",
     title="Low-pass filter",
-    description="A filter against aliasing delays the line and smears edges to the right; under a threshold bright and faint targets differ.",
+    description="A filter against aliasing delays the line and smears edges to the right; under a threshold bright and faint targets part.",
     number=27,
     stars=3,
     note="Note 6",

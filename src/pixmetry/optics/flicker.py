@@ -81,14 +81,21 @@ class LampLight(Light):
         """Pixels must ask the lamps."""
         return False
 
+    def fingerprint(self) -> bytes | None:
+        """What tells whether two exposures see the same: the lamps' light is part of it."""
+        return self._lit().fingerprint()
+
     def photons(self) -> np.ndarray:
         """Mean photons of every pixel, float32, shape (n, rows, cols)."""
+        return self._lit().photons()
+
+    def _lit(self) -> Light:
         times, weights = self.moments
         begin, end = shares(self)
         for lamp in self.lamps:
             weights = weights * mean_light(lamp, begin, end)
         steady = Light(**{name: getattr(self, name) for name in Light.__dataclass_fields__})
-        return steady.seen_at(times, weights).photons()
+        return steady.seen_at(times, weights)
 
 
 def forward(params: Flicker, signal: Signal, stream: Stream) -> Signal:

@@ -101,13 +101,13 @@ def _check_table(params: PointSpread) -> None:
 
 
 @lru_cache(maxsize=32)
-def kernel(params: PointSpread, alone: bool = True) -> np.ndarray:
+def kernel(params: PointSpread) -> np.ndarray:
     """The spread on the light's fine raster, see `core.raster`."""
     if params.model == "diffraction":
-        return kernel_of(lambda fx, fy: transfer(params, fx, fy), int(round(params.reach_px * FINE)), alone)
+        return kernel_of(lambda fx, fy: transfer(params, fx, fy), int(round(params.reach_px * FINE)))
     _check_table(params)
     half = 0.5 * params.table_step_px * max(len(params.table), len(params.table[0]))
-    return kernel_of(lambda fx, fy: table_transfer(params, fx, fy), int(np.ceil(half * FINE)) + 4, alone)
+    return kernel_of(lambda fx, fy: table_transfer(params, fx, fy), int(np.ceil(half * FINE)) + 2 * FINE)
 
 
 def forward(params: PointSpread, signal: Signal, stream: Stream) -> Signal:
@@ -115,7 +115,7 @@ def forward(params: PointSpread, signal: Signal, stream: Stream) -> Signal:
     light = signal.light
     if params.model == "gaussian":
         return signal.with_light(light.blurred(params.sigma_px**2)) if params.sigma_px else signal
-    return signal.with_light(light.convolved(kernel(params, light.kernel is None)))
+    return signal.with_light(light.convolved(kernel(params)))
 
 
 SOURCE = Source(

@@ -37,7 +37,7 @@ def filter_by_place(codes, row0, col0, weights, top):
 
 @jit
 def blur(codes, weights):
-    """Symmetric separable filter, float64 (n, rows, cols); codes : uint16 with a border of m; weights : float64 (m + 1,), from the middle."""
+    """Symmetric separable filter, float64 (n, rows, cols); codes : uint16 with a border of m; weights : float64 (m + 1,)."""
     m = weights.size - 1
     n, rows, cols = codes.shape[0], codes.shape[1] - 2 * m, codes.shape[2] - 2 * m
     out = np.empty((n, rows, cols), np.float64)
@@ -69,6 +69,37 @@ def _sort(values, count):
         values[b + 1] = v
 
 
+@jit(forceinline=True)
+def _order(values, a, b):
+    low, high = min(values[a], values[b]), max(values[a], values[b])
+    values[a], values[b] = low, high
+
+
+@jit(forceinline=True)
+def _middle_of_nine(v):
+    """Median of nine values by 19 exchanges (J. L. Smith, XCell 23, 1996); it ends up in place 4."""
+    _order(v, 1, 2)
+    _order(v, 4, 5)
+    _order(v, 7, 8)
+    _order(v, 0, 1)
+    _order(v, 3, 4)
+    _order(v, 6, 7)
+    _order(v, 1, 2)
+    _order(v, 4, 5)
+    _order(v, 7, 8)
+    _order(v, 0, 3)
+    _order(v, 5, 8)
+    _order(v, 4, 7)
+    _order(v, 3, 6)
+    _order(v, 1, 4)
+    _order(v, 2, 5)
+    _order(v, 4, 7)
+    _order(v, 4, 2)
+    _order(v, 6, 4)
+    _order(v, 4, 2)
+    return v[4]
+
+
 @jit
 def median(codes, m):
     """Median of the square of 2 m + 1 pixels about each pixel; codes : uint16 with a border of m."""
@@ -82,8 +113,11 @@ def median(codes, m):
                 for a in range(size):
                     for b in range(size):
                         values[a * size + b] = codes[i, r + a, c + b]
-                _sort(values, size * size)
-                out[i, r, c] = values[(size * size) // 2]
+                if size == 3:
+                    out[i, r, c] = _middle_of_nine(values)
+                else:
+                    _sort(values, size * size)
+                    out[i, r, c] = values[(size * size) // 2]
     return out
 
 

@@ -18,7 +18,7 @@ OFF = 65535
 class DefectCorrection(Parameters):
     """When a pixel is taken for a defect."""
 
-    threshold_dn: int = quantity(OFF, "DN", "by how much it must exceed the highest, or miss the lowest, neighbour; 65535: never", ge=0, le=OFF)
+    threshold_dn: int = quantity(OFF, "DN", "by how much it exceeds the highest, or misses the lowest, neighbour; 65535: off", ge=0, le=OFF)
     mosaic: Literal["none", "bayer"] = quantity("none", "1", "neighbours of the same colour lie two pixels away in a colour mosaic")
 
 

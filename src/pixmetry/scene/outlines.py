@@ -111,7 +111,7 @@ def from_oval(oval: np.ndarray, height_photons: float, **target: object) -> Outl
 
 def ellipse(x_px: float, y_px: float, width_px: float, height_px: float, angle_deg: float = 0.0, height_photons: float = 1000.0) -> Outline:
     """An ellipse of two full axes; the first is turned by ``angle_deg`` from x towards y (downwards)."""
-    return from_oval(oval_of(x_px, y_px, width_px, height_px, angle_deg), height_photons, width_px=width_px, axis_px=height_px, angle_deg=angle_deg)
+    return from_oval(oval_of(x_px, y_px, width_px, height_px, angle_deg), height_photons, width_px=width_px, height_px=height_px, angle_deg=angle_deg)
 
 
 def disc(x_px: float, y_px: float, diameter_px: float, height_photons: float = 1000.0) -> Outline:

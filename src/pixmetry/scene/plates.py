@@ -120,7 +120,7 @@ def dot_plate(
     px, py = pose.seen(x, y)
     told = [
         {"kind": "dot", "x_px": float(a), "y_px": float(b), "ellipse_x_px": float(o[0]), "ellipse_y_px": float(o[1]), "row": int(r), "column": int(c)}
-        | {"x_mm": float(mx), "y_mm": float(my), "width_px": float(2 * np.hypot(*o[2:4])), "axis_px": float(2 * np.hypot(*o[4:]))}
+        | {"x_mm": float(mx), "y_mm": float(my), "width_px": float(2 * np.hypot(*o[2:4])), "height_px": float(2 * np.hypot(*o[4:]))}
         for a, b, o, r, c, mx, my in zip(px, py, ovals, i, j, x, y, strict=True)
     ]
     return Shapes.of_ovals(ovals, np.full(x.size, float(height_photons)), blur_px, motion, told)

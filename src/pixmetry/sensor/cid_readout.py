@@ -23,7 +23,7 @@ class CidReadout(Parameters):
     floor_std_e: float = quantity(0.0, "e-", "slow (1/f) noise that all reads of a pixel share", ge=0, le=1e5)
     row_crosstalk: float = quantity(0.0, "1", "share of the mean of its row that joins a pixel", ge=0, le=0.2)
     col_crosstalk: float = quantity(0.0, "1", "share of the mean of its column that joins a pixel", ge=0, le=0.2)
-    residual: float = quantity(0.0, "1", "share of the charge that the injection into the substrate leaves for the next frame", ge=0, le=0.5)
+    residual: float = quantity(0.0, "1", "share of the charge that clearing by injection leaves for the next frame", ge=0, le=0.5)
 
 
 def noise_e(params: CidReadout) -> float:
@@ -119,15 +119,15 @@ def propagate(params: CidReadout, probe: Probe) -> Contribution:
 SOURCE = Source(
     id="sensor.cid_readout",
     title="Read-out of a charge injection device",
-    description="Pixels are read without loss as often as one likes; long electrodes are noisy and talk across, and clearing leaves a rest.",
+    description="Pixels are read without loss as often as wanted; long electrodes are noisy and talk across, and clearing leaves a rest.",
     note="Section 3.2",
     parameters=CidReadout,
     consumes=(Kind.ELECTRONS,),
     after=("sensor.shot_noise", "sensor.full_well"),
     before=("electronics",),
     neutral=CidReadout(),
-    typical=CidReadout(reads=16, read_std_e=200.0, floor_std_e=20.0, row_crosstalk=1e-3, col_crosstalk=1e-3),
-    bound=CidReadout(reads=1, read_std_e=600.0, floor_std_e=20.0, row_crosstalk=0.01, col_crosstalk=0.01, residual=0.01),
+    typical=CidReadout(reads=16, read_std_e=200.0, floor_std_e=20.0, row_crosstalk=5e-3, col_crosstalk=5e-3),
+    bound=CidReadout(reads=16, read_std_e=600.0, floor_std_e=50.0, row_crosstalk=0.02, col_crosstalk=0.02, residual=0.01),
     forward=forward,
     start=start,
     context=context,

@@ -12,7 +12,7 @@ from pixmetry.core.random import Stream
 from pixmetry.core.signal import Kind, Signal
 from pixmetry.core.source import Parameters, Source, quantity
 
-FINE = 2000  # points on which a profile's moments are taken
+PARTS, POINTS = 50, 40  # of the exposure, and of each part, on which a profile's moments are taken
 
 
 class Exposure(Parameters):
@@ -21,7 +21,9 @@ class Exposure(Parameters):
     profile: Literal["box", "trapezoid", "exponential", "gaussian"] = quantity(
         "box", "1", "a shutter that is open or closed, one that opens and closes slowly, a strobe that decays, a pulse"
     )
-    nodes: int = quantity(1, "1", "looks at a moving scene; 1 looks once, at the mean time", ge=1, le=64)
+    nodes: int = quantity(
+        1, "1", "looks at a moving scene: 1 at the mean time; for 0.1 % of the peak, 1 and one more per blur radius of path", ge=1, le=64
+    )
     ramp_rel: float = quantity(0.1, "1", "share of the exposure in which a trapezoid rises, and falls", gt=0, le=0.5)
     decay_rel: float = quantity(0.2, "1", "time constant of the decay, over the exposure", gt=0.01, le=100)
     width_rel: float = quantity(0.1, "1", "standard deviation of the pulse in the middle, over the exposure", gt=0.01, le=100)
@@ -57,8 +59,8 @@ def _rule(params: Exposure) -> tuple[np.ndarray, np.ndarray]:
 
 def _profile(params: Exposure) -> tuple[np.ndarray, np.ndarray]:
     """The profile in fine weighted points, by Gauss and Legendre between its corners."""
-    corners = [0.0, params.ramp_rel, 1 - params.ramp_rel, 1.0] if params.profile == "trapezoid" else np.linspace(0, 1, 11)
-    u, v = np.polynomial.legendre.leggauss(FINE // (len(corners) - 1))
+    corners = np.unique([*np.linspace(0, 1, PARTS + 1), params.ramp_rel, 1 - params.ramp_rel])
+    u, v = np.polynomial.legendre.leggauss(POINTS)
     ends = zip(corners[:-1], corners[1:], strict=True)
     t, w = (np.concatenate(part) for part in zip(*((a + (b - a) * (0.5 + 0.5 * u), (b - a) * v) for a, b in ends), strict=True))
     if params.profile == "trapezoid":

@@ -66,16 +66,16 @@ def pull_of(params: InfraredDiffusion, frame_shape: tuple[int, int]) -> Pull:
 
 
 @lru_cache(maxsize=32)
-def kernel(params: InfraredDiffusion, alone: bool = True) -> np.ndarray:
+def kernel(params: InfraredDiffusion) -> np.ndarray:
     """The spread on the light's fine raster, see `core.raster`."""
-    return kernel_of(lambda fx, fy: transfer(params, fx, fy), int(round(params.reach_px * FINE)), alone)
+    return kernel_of(lambda fx, fy: transfer(params, fx, fy), int(round(params.reach_px * FINE)))
 
 
 def forward(params: InfraredDiffusion, signal: Signal, stream: Stream) -> Signal:
     """Spread the light as the charge spreads, and move it along the slanting ray."""
     light = signal.light
     if params.diffusion_length_um:
-        light = light.convolved(kernel(params, light.kernel is None))
+        light = light.convolved(kernel(params))
     if params.chief_ray_deg:
         light = light.moved(pull_of(params, signal.frame_shape))
     return signal.with_light(light)

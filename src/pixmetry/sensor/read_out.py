@@ -116,7 +116,7 @@ SOURCE = Source(
     place=place,
     gum_class="F",
     equation="woven, swapped: row r ← row r XOR 1;  field f: row k ← row 2k + f, or the sum of rows 2k + f and 2k + f + 1",
-    typical_size="spot of σ = 0.8 px: 0.13 px periodic in fields of alternate lines, 0.027 px of summed lines, below 0.0001 px in the frame",
+    typical_size="spot of σ 0.8 px: 0.13 px periodic in fields of alternate lines, 0.027 px of summed lines, below 0.0001 px in the frame",
     references=(
         "ITU-R BT.470 (625 lines, 50 fields)",
         "B. F. Alexander, K. C. Ng, Opt. Eng. 30(9), 1320, 1991 (periodic error of centroids)",

@@ -164,7 +164,7 @@ def propagate(params: Tape, probe: Probe) -> Contribution:
     noise = [float(np.sqrt((np.apply_along_axis(np.convolve, 2, g, taps) ** 2).sum(axis=(1, 2)).mean())) for g in (probe.gx, probe.gy)]
     return Contribution(
         u_x_px=float(np.sqrt(noise[0] ** 2 + rows**2 + step.var() + smear.u_x_px**2)), u_y_px=float(np.hypot(noise[1], smear.u_y_px)),
-        bias_x_px=smear.bias_x_px + float(step.mean()), bias_y_px=smear.bias_y_px, gum_class="Tr", model_error=0.3,
+        bias_x_px=smear.bias_x_px + float(step.mean()), bias_y_px=smear.bias_y_px, gum_class="Tr", model_error=0.4,
         method="noise of the tape's spectrum, delays of the rows, and the target after its bandwidth; dropouts are outliers apart",
     )  # fmt: skip
 

@@ -1,0 +1,143 @@
+"""Point spreads: transfer functions in closed form, the periodic error of a point, coma's centre, a table."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from light_scenes import Spot, camera, centroids, first_harmonic, transfer
+from pixmetry.core.errors import ParameterError
+from pixmetry.optics import point_spread
+from pixmetry.optics.point_spread import SOURCE, PointSpread
+from pixmetry.sensor.pixel_aperture import SOURCE as APERTURE
+from pixmetry.sensor.pixel_aperture import PixelAperture
+
+
+def clear(f: np.ndarray, wavelength_um: float, f_number: float, pitch_um: float) -> np.ndarray:
+    s = np.minimum(f * wavelength_um * f_number / pitch_um, 1)
+    return 2 / np.pi * (np.arccos(s) - s * np.sqrt(1 - s * s))
+
+
+@pytest.mark.parametrize("f", [0.1, 0.3, 0.5, 0.8])
+def test_a_gaussian_has_a_gaussian_transfer(f):
+    h = transfer(f, 0.0, (SOURCE, PointSpread(sigma_px=0.4)))
+    assert h == pytest.approx(np.exp(-2 * (np.pi * 0.4 * f) ** 2) * np.sinc(f), abs=2e-5)
+
+
+def test_the_transfer_of_a_clear_pupil_is_known():
+    """f/4, 550 nm, 3.45 µm: 0.247 at one cycle per pixel."""
+    f = np.linspace(0, 1.7, 18)
+    got = point_spread.transfer(PointSpread(model="diffraction"), f * 0.6, f * 0.8)
+    assert np.abs(got - clear(f, 0.55, 4.0, 3.45)).max() < 1e-10
+    assert got[0] == pytest.approx(1)
+    assert clear(np.array([1.0]), 0.55, 4.0, 3.45)[0] == pytest.approx(0.247, abs=5e-4)
+
+
+def test_the_transfer_of_an_aberrated_pupil_is_that_of_a_brute_force_pupil():
+    """Autocorrelation of the pupil function on a raster, by FFT: another way to the same integral."""
+    params = PointSpread(
+        model="diffraction", defocus_waves=0.2, astigmatism_waves=0.1, oblique_astigmatism_waves=-0.07, coma_x_waves=0.15, spherical_waves=0.1
+    )
+    n = 256
+    x = (np.arange(2 * n) - n + 0.5) / (n / 2)
+    x, y = np.meshgrid(x, x)
+    inside = np.clip((1 - np.hypot(x, y)) * n / 2 + 0.5, 0, 1)
+    pupil = inside * np.exp(2j * np.pi * point_spread.wave_aberration(params, x, y))
+    auto = np.fft.ifft2(np.abs(np.fft.fft2(pupil)) ** 2)
+    auto /= auto[0, 0]
+    for i, j in ((20, 0), (0, 50), (60, 30), (100, -20)):  # shifts in cells of 2/n radii
+        s = np.array([i, j]) * 2 / n
+        fx, fy = s * 3.45 / (2 * 0.55 * 4)
+        assert point_spread.transfer(params, np.array(fx), np.array(fy)) == pytest.approx(auto[j, i].conj(), abs=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("fx", "fy", "error"), [(2 / 8.25, 0.0, 3e-4), (0.0, 4 / 8.25, 3e-4), (5 / 8.25, 3 / 8.25, 3e-4), (0.3, 0.0, 4e-3), (0.9, 0.1, 4e-3)]
+)
+def test_an_image_shows_the_transfer_of_pupil_and_pixel(fx, fy, error):
+    """Exact at multiples of one cycle per side of the table (33/4 px); between them the folded far tail shows."""
+    params = PointSpread(model="diffraction", coma_x_waves=0.1, defocus_waves=0.1)
+    expected = point_spread.transfer(params, np.array(fx), np.array(fy)) * np.sinc(fx) * np.sinc(fy)
+    assert transfer(fx, fy, (SOURCE, params)) == pytest.approx(expected, abs=error)
+
+
+@pytest.mark.parametrize("f", [0.3, 0.7, 1.3])
+def test_a_lens_sharper_than_the_raster_is_still_right_where_pixels_see(f):
+    """f/2.8 on 8.6 µm passes 5.6 cycles per pixel, more than the raster has."""
+    params = PointSpread(model="diffraction", f_number=2.8, pitch_x_um=8.6, pitch_y_um=8.6)
+    expected = clear(np.array(f), 0.55, 2.8, 8.6) * np.sinc(f)
+    assert transfer(f, 0.0, (SOURCE, params)) == pytest.approx(expected, abs=2e-3)
+
+
+def test_a_point_under_full_pixels_errs_by_the_transfer_at_one_cycle_over_pi():
+    phase = np.arange(8) / 8
+    spot = Spot(12 + phase, np.full(8, 12.0), sigma=0.06)
+    x, _ = centroids(camera((25, 25), (SOURCE, PointSpread(model="diffraction"))).expose(spot, 8).data)
+    blunt = np.exp(-2 * (np.pi * 0.06) ** 2)
+    assert abs(first_harmonic(x - 12 - phase, phase)) == pytest.approx(0.2473 / np.pi * blunt, rel=0.01)
+    assert 0.2473 / np.pi == pytest.approx(0.079, abs=5e-4)
+
+
+@pytest.mark.parametrize(("sigma", "expected"), [(0.6, -3.7e-3), (0.8, -2.6e-5)])
+def test_periodic_error_of_a_gaussian_spot_sampled_at_points(sigma, expected):
+    assert scurve(sigma, 0.05) == pytest.approx(expected, rel=0.03)
+
+
+@pytest.mark.parametrize(("sigma", "expected"), [(0.4, -1.35e-2), (0.5, -2.29e-3), (0.6, -2.6e-4), (0.8, -1.0e-6)])
+def test_periodic_error_of_a_gaussian_spot_under_full_pixels(sigma, expected):
+    """|H'(1)|/(πH(0)) = exp(−2π²σ²)/π; the light's quadrature over a pixel adds up to 6e-5 px of its own."""
+    assert expected == pytest.approx(-np.exp(-2 * (np.pi * sigma) ** 2) / np.pi, rel=0.05)
+    assert scurve(sigma, 1.0) == pytest.approx(-np.exp(-2 * (np.pi * sigma) ** 2) / np.pi, rel=0.01, abs=6e-5)
+
+
+def scurve(sigma: float, width: float) -> float:
+    """Amplitude of the periodic error of a spot, half of whose variance is the lens's."""
+    phase = np.arange(8) / 8
+    spot = Spot(10 + phase, np.full(8, 10.0), sigma=sigma / np.sqrt(2))
+    chain = ((SOURCE, PointSpread(sigma_px=sigma / np.sqrt(2))), (APERTURE, PixelAperture(width_x_px=width, width_y_px=width)))
+    x, _ = centroids(camera((21, 21), *chain).expose(spot, 8).data)
+    return first_harmonic(x - 10 - phase, phase)
+
+
+def test_coma_moves_the_centre_by_the_mean_slope_of_the_wave():
+    """⟨∂W/∂p⟩ over the pupil is √8 c for Noll's coma, and a ray of slope ∂W/∂p lands at 2λN ∂W/∂p."""
+    c, wide = 0.05, PointSpread(model="diffraction", coma_x_waves=0.05, coma_y_waves=-0.03)
+    f = 1e-4
+    for axis, coefficient in ((0, c), (1, -0.03)):
+        h = point_spread.transfer(wide, np.array(f * (axis == 0)), np.array(f * (axis == 1)))
+        assert -np.angle(h) / (2 * np.pi * f) == pytest.approx(2 * 0.55 * 4 / 3.45 * np.sqrt(8) * coefficient, rel=1e-3)
+    spot = Spot(np.array([12.0]), np.array([12.0]), sigma=0.8)
+    frame = camera((25, 25), (SOURCE, PointSpread(model="diffraction", coma_x_waves=0.1, reach_px=6))).expose(spot).data
+    x, y = centroids(frame)
+    assert 0.1 < x[0] - 12 < 2 * 0.55 * 4 / 3.45 * np.sqrt(8) * 0.1  # the fold of the far tail takes some of it back
+    assert y[0] == pytest.approx(12, abs=1e-6)
+
+
+def test_a_table_of_a_gaussian_is_that_gaussian():
+    step, sigma = 0.1, 0.7
+    at = (np.arange(81) - 40) * step
+    line = np.exp(-0.5 * (at / sigma) ** 2)
+    table = tuple(tuple(row) for row in np.outer(line, line))
+    params = PointSpread(model="measured", table=table, table_step_px=step)
+    for f in (0.2, 0.5, 0.9):
+        expected = np.exp(-2 * (np.pi * sigma * f) ** 2) * np.sinc(f) * np.sinc(f * step)
+        assert transfer(f, 0.0, (SOURCE, params)) == pytest.approx(expected, abs=1e-3)
+
+
+def test_a_table_off_its_middle_shifts_the_image():
+    table = ((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, 0.0))
+    spot = Spot(np.array([8.0]), np.array([8.0]), sigma=1.0)
+    x, y = centroids(camera((17, 17), (SOURCE, PointSpread(model="measured", table=table, table_step_px=0.5))).expose(spot).data)
+    assert (x[0], y[0]) == pytest.approx((8.5, 8.0), abs=2e-3)
+
+
+def test_light_is_kept():
+    spot = Spot(np.array([14.3]), np.array([13.6]), sigma=0.5)
+    for params in (PointSpread(sigma_px=0.7), PointSpread(model="diffraction", spherical_waves=0.2)):
+        assert camera((29, 29), (SOURCE, params)).expose(spot).data.sum() == pytest.approx(1e4, rel=1e-4)
+
+
+@pytest.mark.parametrize("table", [(), ((1.0, 2.0),), ((1.0,), (1.0, 2.0, 3.0), (1.0,)), ((0.0,),)])
+def test_a_useless_table_is_refused(table):
+    with pytest.raises(ParameterError, match="table"):
+        camera((9, 9), (SOURCE, PointSpread(model="measured", table=table))).expose(Spot(np.array([4.0]), np.array([4.0]), 1.0))
