@@ -242,7 +242,7 @@ def wandering(speed: float) -> Camera:
         _border,
         (Kind.DN,),
         reshape=lambda params, shape: (shape[0] + 2, shape[1] + 7),
-        place=lambda params, x, y, shape: (x + 7, y + 2),
+        place=lambda params, x, y, shape, frame: (x + 7, y + 2),
         context=lambda params, windows, shape: Windows.of(Grid.whole(np.zeros(len(windows.row0), np.int64), shape)),
     )
     settings = {"sensor.quantum_efficiency": {"quantum_efficiency": 1.0}, "electronics.gain": {"gain_dn_per_e": 0.2}}

@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from pixmetry.campaign import InputHashes, provenance_record, read_frame, read_maps, staged_output, write_json
-from pixmetry.campaign.images import check_frame
+from pixmetry.campaign import InputHashes, provenance_record, read_maps, staged_output, write_json
+from pixmetry.campaign.images import LoadedFrame, check_frame, load_frame
+from pixmetry.campaign.zarr_frames import entries
 from pixmetry.core.camera import Camera, load_camera
 from pixmetry.core.errors import InputError
 from pixmetry.core.random import Grid
@@ -69,7 +70,7 @@ def correct_files(
     Parameters
     ----------
     frames : sequence of path
-        Image files, or folders of them.
+        Image files, folders of them, stores (``frames.zarr``) or single frames of a store (``frames.zarr/7``).
     results : path
         ``results.json`` of the assessment; ``camera.yaml`` and ``maps.zarr.zip`` stand beside it.
     output : path
@@ -94,16 +95,17 @@ def correct_files(
     told = progress or (lambda what, step, of: None)
     done: dict[str, str] = {}
 
-    def work(path: Path) -> tuple[Path, np.ndarray, dict[str, str]]:
-        frame = read_frame(path)
+    def work(path: Path) -> tuple[Path, LoadedFrame, np.ndarray, dict[str, str]]:
+        loaded = load_frame(path)
+        frame = loaded.array
         check_frame(frame, str(path), bits=int(record["camera"]["bits"]), shape=camera.output_shape)
         corrected, said = correct_signal(camera, _as_signal(frame, camera), maps)
-        return path, corrected.data[0], said
+        return path, loaded, corrected.data[0], said
 
     with staged_output(output, "correction") as folder:
-        for i, (path, data, said) in enumerate(imap_tiles(work, files)):
+        for i, (path, loaded, data, said) in enumerate(imap_tiles(work, files)):
             done = said
-            hashes.add_file(path)
+            hashes.add(path, loaded.sha256, loaded.size_bytes)
             imwrite(folder / f"{path.stem}.tif", data.astype(np.float32))
             told("correcting frames", i + 1, len(files))
         lines = [f"{name}: {text}" for name, text in done.items()]
@@ -135,7 +137,10 @@ def _load(results: Path) -> tuple[dict[str, Any], Camera, dict[str, np.ndarray]]
 def _image_files(frames: Iterable[str | Path]) -> list[Path]:
     files: list[Path] = []
     for given in map(Path, frames):
-        files += sorted(p for p in given.iterdir() if p.suffix.lower() in IMAGES) if given.is_dir() else [given]
+        if given.is_dir():
+            files += entries(given) or sorted(p for p in given.iterdir() if p.suffix.lower() in IMAGES)
+        else:
+            files.append(given)
     if not files:
         raise InputError(
             "no image files", where=", ".join(map(str, frames)), allowed=", ".join(IMAGES), remedy="name files or a folder of them"

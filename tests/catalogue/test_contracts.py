@@ -137,7 +137,7 @@ def test_some_frames_equal_the_slice_of_the_sequence(source: Source) -> None:
 
 
 class Recorder:
-    """A noise source of amplitude 0 that keeps what it draws, by frame and row."""
+    """A noise source of amplitude 0 that keeps what it draws, by frame and row; bands of columns are put together."""
 
     def __init__(self, id: str, kind: Kind) -> None:
         self.drawn: dict[tuple[int, int], np.ndarray] = {}
@@ -146,7 +146,8 @@ class Recorder:
             noise = stream.normal(signal.grid)
             for i, frame in enumerate(signal.grid.frame):
                 for j, row in enumerate(signal.rows[i]):
-                    self.drawn[int(frame), int(row)] = noise[i, j]
+                    line = self.drawn.setdefault((int(frame), int(row)), np.full(signal.frame_shape[1], np.nan, np.float32))
+                    line[signal.cols[i]] = noise[i, j]
             return signal.with_data((signal.data + params.scale * noise).astype(signal.data.dtype))
 
         self.source = make_source(id, forward, (kind,), parameters=Amplitude)
@@ -173,7 +174,7 @@ def test_switching_it_off_changes_no_draw_of_others_nor_they_its_own(source: Sou
         drawn[1] = {}
     for recorder, before in zip((first, last), drawn, strict=True):
         assert recorder.drawn.keys() == before.keys()
-        assert all(np.array_equal(recorder.drawn[k], v) for k, v in before.items())
+        assert all(np.array_equal(recorder.drawn[k], v, equal_nan=True) for k, v in before.items())
 
 
 @every_forward

@@ -357,3 +357,20 @@ def test_windows_widened_to_blocks_stay_in_the_frame() -> None:
     assert [int(v[0]) for v in (wide.row0, wide.col0, wide.rows, wide.cols)] == [8, 64, 16, 24]
     wide = Windows.one(66, 85, 1, 1).aligned(8, 8, (70, 90))
     assert [int(v[0]) for v in (wide.row0, wide.col0, wide.rows, wide.cols)] == [64, 80, 6, 8]
+
+
+def test_the_whole_catalogue_has_an_order() -> None:
+    """Tape is of the stage of storage, yet plays before the grabber; in-camera processing comes before the codecs."""
+    from pixmetry.core.camera import in_order
+    from pixmetry.core.catalogue import catalogue
+
+    names = [s.id for s in in_order([s for s in catalogue().values() if s.forward is not None])]
+    assert len(names) == sum(s.forward is not None for s in catalogue().values())
+    for first, then in (
+        ("optics.point_spread", "sensor.quantum_efficiency"),
+        ("cable.termination", "storage.tape"),
+        ("storage.tape", "grabber.sampling_clock"),
+        ("grabber.adc", "processing.demosaic"),
+        ("processing.demosaic", "storage.jpeg"),
+    ):
+        assert names.index(first) < names.index(then)

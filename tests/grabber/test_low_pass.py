@@ -23,7 +23,7 @@ def test_the_magnitude_is_that_of_the_textbook_filter(order: int) -> None:
     for kind, design in (
         ("butterworth", sps.butter(order, corner, analog=True)),
         ("bessel", sps.bessel(order, corner, analog=True, norm="mag")),
-        ("rc", (1.0, np.poly(-np.ones(order) / 1.0 * corner) / corner**order)),
+        ("rc", ([1.0], np.poly(-np.ones(order) * corner) / corner**order)),
     ):
         params = LowPass(kind=kind, order=order, cutoff_mhz=5.0)
         np.testing.assert_allclose(gain(params), np.abs(sps.freqs(*design, w)[1]), rtol=1e-6)

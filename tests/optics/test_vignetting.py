@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pixmetry.core.signal import Kind
-from pixmetry.optics.vignetting import SOURCE, Vignetting, overlap
+from pixmetry.optics.vignetting import SOURCE, Vignetting, factor, overlap
 from source_signals import centroid, centroid_probe, flat, signal, spots, stream
 
 SHAPE = (101, 201)
@@ -47,8 +47,6 @@ def test_propagation_is_what_a_gaussian_spot_feels():
     rng = np.random.default_rng(5)
     x0, y0 = rng.integers(12, 400 - 13, 400), rng.integers(12, 300 - 13, 400)
     tiles = spots(np.full(400, 12.0), np.full(400, 12.0), sigma=sigma)
-    from pixmetry.optics.vignetting import factor
-
     cols, rows = x0[:, None, None] + np.arange(-12, 13), y0[:, None, None] + np.arange(-12, 13)[:, None]
     dx, dy = (c - 12 for c in centroid(tiles * factor(params, cols, rows, shape)))
     probe = centroid_probe(tiles[:1], np.array([12.0]), np.array([12.0]), shape)

@@ -218,7 +218,7 @@ def test_bars_have_the_fundamental_of_a_square_wave() -> None:
 
 
 def test_a_star_has_the_local_contrast_of_its_frequency() -> None:
-    """Round a circle of radius r, N sectors are N / 2πr cycles a pixel; the blur takes exp(−2π²s²ν²) of the fundamental, curvature (s/r)²."""
+    """Round a circle of radius r, N sectors are ν = N / 2πr; the blur takes exp(−2π²s²ν²) of the fundamental, curvature (s/r)²."""
     star = Shapes.of(outlines.star(0.0, 0.0, 300.0, 36, 0.0, 0.0, 1.0), 1.0)
     turn = 2 * np.pi * np.arange(3600) / 3600
     for radius in (25.0, 40.0, 80.0):
@@ -236,7 +236,12 @@ def test_a_chessboard_of_two_halves_is_an_edge_of_the_whole() -> None:
 
 
 def test_windows_and_points_equal_the_frame() -> None:
-    shapes = [outlines.disc(11.3, 12.4, 7.0), outlines.edge(20.0, 20.0), *outlines.star(25.0, 25.0, 20.0, 9), outlines.cross(X0, Y0, 20, 3, 20)]
+    shapes = [
+        outlines.disc(11.3, 12.4, 7.0),
+        outlines.edge(20.0, 20.0),
+        *outlines.star(25.0, 25.0, 20.0, 9),
+        outlines.cross(X0, Y0, 20, 3, 20),
+    ]
     for blur in (0.0, 0.1, 0.7):
         scene = Picture((Shapes.of(shapes, blur), Sine(7.0, 30.0)), Uniform(10.0, 1e-3))
         zero, exposure = np.zeros(1), np.full(1, 0.01)

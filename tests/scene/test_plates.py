@@ -55,7 +55,9 @@ def test_eccentricity_of_the_plainest_perspective() -> None:
         truth = -kappa * radius**2 / (1 - (kappa * radius) ** 2)
         assert oval[0] == pytest.approx(truth, rel=1e-9)
         assert oval[1] == pytest.approx(0.0, abs=1e-12)
-    assert circle_images(np.array([[1.0, 0, 0], [0, 1, 0], [0.002, 0, 1]]), np.zeros(1), np.zeros(1), np.full(1, 3.5))[0, 0] == pytest.approx(-0.0245, abs=1e-4)
+    assert circle_images(np.array([[1.0, 0, 0], [0, 1, 0], [0.002, 0, 1]]), np.zeros(1), np.zeros(1), np.full(1, 3.5))[
+        0, 0
+    ] == pytest.approx(-0.0245, abs=1e-4)
 
 
 def test_the_image_of_a_dot_has_its_centre_of_gravity_at_the_ellipse() -> None:

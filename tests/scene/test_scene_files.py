@@ -84,12 +84,38 @@ DISC = {"targets": [{"kind": "disc", "x_px": 20.3, "y_px": 18.7, "diameter_px": 
         ({"plate": {"kind": "dots", "rows": 2, "columns": 2, "diameter_mm": 3}}, "pose.*missing"),
         ({"plate": {"kind": "lines"}}, "dots, chessboard"),
         (
-            {"plate": {"kind": "dots", "rows": 9, "columns": 9, "pitch_mm": 50, "diameter_mm": 3, "pose": {"principal_distance_px": 900, "z_mm": 100, "phi_deg": 60}}},
+            {
+                "plate": {
+                    "kind": "dots",
+                    "rows": 9,
+                    "columns": 9,
+                    "pitch_mm": 50,
+                    "diameter_mm": 3,
+                    "pose": {"principal_distance_px": 900, "z_mm": 100, "phi_deg": 60},
+                }
+            },
             "behind the camera",
         ),
         ({"spot": {"x_px": 1, "y_px": 1, "radius_px": 5, "peak_photons": 1, "wavelength_um": 0.6, "f_number": 8}}, "pitch_um.*missing"),
-        ({"spot": {"x_px": 1, "y_px": 1, "radius_px": 900, "peak_photons": 1, "wavelength_um": 0.6, "f_number": 2, "pitch_um": 9}}, "too large"),
-        ({"spot": {"x_px": 1, "y_px": 1, "radius_px": 9, "peak_photons": 1, "wavelength_um": 0.6, "f_number": 8, "pitch_um": 9, "contrast_rel": 0.05}}, "contrast"),
+        (
+            {"spot": {"x_px": 1, "y_px": 1, "radius_px": 900, "peak_photons": 1, "wavelength_um": 0.6, "f_number": 2, "pitch_um": 9}},
+            "too large",
+        ),
+        (
+            {
+                "spot": {
+                    "x_px": 1,
+                    "y_px": 1,
+                    "radius_px": 9,
+                    "peak_photons": 1,
+                    "wavelength_um": 0.6,
+                    "f_number": 8,
+                    "pitch_um": 9,
+                    "contrast_rel": 0.05,
+                }
+            },
+            "contrast",
+        ),
         ({**DISC, "photon_transfer": {"brightest_photons": 10}}, "has no targets"),
         ({"motion": {"velocity_px_per_s": [1, 1]}}, "shows nothing"),
     ],
@@ -102,9 +128,9 @@ def test_a_scene_that_cannot_be_used_is_refused_with_the_reason(record, words: s
 
 def test_a_mistake_in_a_target_names_its_line(tmp_path: Path) -> None:
     path = tmp_path / "scene.yaml"
-    path.write_text("schema: pixmetry/scene/1\ntargets:\n  - {kind: disc, x_px: 1, y_px: 1, diameter_px: 7}\n  - {kind: ring, x_px: 1, y_px: 2}\n")
+    path.write_text(
+        "schema: pixmetry/scene/1\ntargets:\n  - {kind: disc, x_px: 1, y_px: 1, diameter_px: 7}\n  - {kind: ring, x_px: 1, y_px: 2}\n"
+    )
     with pytest.raises(InputError, match="line 4") as caught:
         read_scene(path)
     assert "missing" in str(caught.value)
-
-

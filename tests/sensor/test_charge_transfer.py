@@ -138,3 +138,119 @@ def test_handbook_numbers():
     for steps, phases, shift in ((752, 1, 0.0075), (2048, 4, 0.0819)):
         out = impulse(steps - 1, 100, ChargeTransfer(parallel_cti=1e-5, phases=phases))
         assert (out * np.arange(101)).sum() / out.sum() == pytest.approx(shift, abs=1e-4)
+
+
+@pytest.mark.parametrize("trail", [1.0, 2.5])
+def test_delays_follow_their_law_exactly(trail):
+    """Shares that arrive 0, 1, 2, … pixels late: n geometric sums, by convolution of their laws one after the other."""
+    n, loss, length = 40, 0.005, 60
+    waits = np.zeros(length)
+    waits[1:] = (1 / trail) * (1 - 1 / trail) ** np.arange(length - 1)
+    one = np.zeros(length)  # one transfer: falls behind again and again, each time for a geometric time
+    power = np.eye(1, length)[0]
+    for k in range(12):
+        one += (1 - loss) * loss**k * power
+        power = np.convolve(power, waits)[:length]
+    law = np.eye(1, length)[0]
+    for _ in range(n):
+        law = np.convolve(law, one)[:length]
+    out = impulse(n - 1, length - 1, ChargeTransfer(parallel_cti=loss, trail_px=trail))
+    assert out / 10_000 == pytest.approx(law, abs=2e-7)
+    if trail == 1:
+        assert out[:3] / 10_000 == pytest.approx((1 - loss) ** n * np.array([1, n * loss, n * (n + 1) / 2 * loss**2]), rel=1e-5)
+
+
+def test_register_and_columns_do_the_same_and_columns_come_first():
+    data = np.random.default_rng().uniform(0, 5000, (2, 40, 40))
+    for extra in ({}, {"beta": 0.6}):
+        down = SOURCE.forward(ChargeTransfer(parallel_cti=2e-3, **extra), signal(data), stream()).data
+        along = SOURCE.forward(ChargeTransfer(serial_cti=2e-3, **extra), signal(data.swapaxes(1, 2)), stream()).data
+        assert along.swapaxes(1, 2) == pytest.approx(down, rel=1e-6)
+        both = SOURCE.forward(ChargeTransfer(parallel_cti=2e-3, serial_cti=1e-3, **extra), signal(data), stream()).data
+        after = SOURCE.forward(ChargeTransfer(serial_cti=1e-3, **extra), signal(down), stream()).data
+        assert np.array_equal(both, after)
+
+
+def test_least_of_the_stated_range_keeps_next_to_nothing():
+    """0.9995^(2048·4) = 1.7 %, 0.99999^(2048) = 97.97 %."""
+    assert impulse(2047, 40, ChargeTransfer(parallel_cti=5e-4, phases=4))[0] / 10_000 == pytest.approx(0.0166, abs=1e-4)
+    assert impulse(2047, 40, ChargeTransfer(parallel_cti=1e-5))[0] / 10_000 == pytest.approx(0.9797, abs=1e-4)
+
+
+def over_traps(column: np.ndarray, density: list[float], release: list[float], beta: float, well: float) -> np.ndarray:
+    """Every packet over every pixel's traps one after the other; the traps of a pixel in 4000 heights, each full or less."""
+    packets, height = column.astype(float).copy(), (np.arange(4000) + 0.5) / 4000
+    for pixel in range(len(column)):
+        full = np.zeros((len(density), len(height)))
+        for r in range(pixel, len(column)):
+            for s, (rho, tau) in enumerate(zip(density, release, strict=True)):
+                freed = full[s] * -np.expm1(-1 / tau)
+                full[s] -= freed
+                packets[r] += rho * freed.mean()
+            inside = height < (max(packets[r], 0) / well) ** beta
+            for s, rho in enumerate(density):
+                packets[r] -= rho * (1 - full[s][inside]).sum() / len(height)
+                full[s][inside] = 1.0
+    return packets
+
+
+@pytest.mark.parametrize(
+    ("density", "release"), [([0.5], [4.0]), ([0.6, 0.3], [1.0, 8.0])], ids=["one species", "fast and slow"]
+)
+def test_traps_agree_with_every_packet_over_every_pixel(density, release):
+    """Within 2 % of what is moved, in columns with single packets, steps and random ones."""
+    rng = np.random.default_rng()
+    columns = np.zeros((70, 4))
+    columns[10, 0], columns[40, 0] = 20_000, 5000
+    columns[30:50, 1] = 8000
+    columns[:, 2] = rng.uniform(500, 20_000, 70)
+    columns[:, 3], columns[35, 3] = 300, 30_000
+    params = ChargeTransfer(
+        fast_traps_per_px=density[0] if len(density) > 1 else 0, fast_release_px=release[0], slow_traps_per_px=density[-1],
+        slow_release_px=release[-1], fill_beta=0.6, trap_well_e=50_000,
+    )  # fmt: skip
+    out = SOURCE.forward(params, signal(columns[None]), stream()).data[0].astype(float)
+    for c in range(4):
+        expected = over_traps(columns[:, c], density, release, 0.6, 50_000)
+        moved = np.abs(expected - columns[:, c]).max()
+        assert moved > 1
+        assert np.abs(out[:, c] - expected).max() < 0.02 * moved + 2e-3, c
+
+
+def test_traps_keep_the_charge_and_trail_exponentially():
+    data = np.zeros((1, 400, 1))
+    data[0, 50] = 10_000
+    params = ChargeTransfer(slow_traps_per_px=1.0, slow_release_px=10.0)
+    out = SOURCE.forward(params, signal(data), stream()).data[0, :, 0].astype(float)
+    caught = 51 * (10_000 / 100_000) ** 0.5
+    assert out.sum() == pytest.approx(10_000, rel=1e-6)
+    assert 10_000 - out[50] == pytest.approx(caught, rel=1e-3)
+    k = np.arange(1, 15)  # farther on the trail's own small packets have been caught again
+    assert out[51:65] == pytest.approx(caught * (1 - np.exp(-0.1)) * np.exp(-0.1 * (k - 1)), rel=0.03)
+
+
+def test_a_background_fills_the_traps():
+    """Behind packets that keep the traps full a target loses less: the fat zero."""
+    data = np.zeros((1, 300, 2))
+    data[0, :, 1] = 500
+    data[0, 200, :] += 3000
+    out = SOURCE.forward(ChargeTransfer(slow_traps_per_px=2.0), signal(data), stream()).data[0].astype(float)
+    lost = data[0, 200] - out[200]
+    assert lost[1] < 0.75 * lost[0]
+
+
+def test_traps_never_take_more_than_there_is():
+    data = np.abs(np.random.default_rng().normal(0, 20, (1, 500, 20)))
+    out = SOURCE.forward(ChargeTransfer(slow_traps_per_px=50.0, traps_along="both"), signal(data), stream()).data
+    assert out.min() >= -1e-4 and out.sum() < data.sum() * (1 + 1e-6)
+
+
+def test_traps_are_undone_by_the_inversion_and_reach_as_far_as_stated():
+    params = ChargeTransfer(slow_traps_per_px=1.0, fast_traps_per_px=1.0, traps_along="both")
+    scene = signal(np.random.default_rng().uniform(500, 5000, (1, 200, 150)))
+    moved = SOURCE.forward(params, scene, stream())
+    assert np.abs(moved.data - scene.data).max() > 10
+    assert np.abs(SOURCE.correct(params, moved, {}).data - scene.data).max() < 0.2
+    assert near(params)[0] == near(params)[2] == 70  # 10 px · ln 1000
+    windows = Windows.one(10, 20, 5, 6)
+    assert SOURCE.window_needed(ChargeTransfer(slow_traps_per_px=1.0), windows, (100, 200)).equals(Windows.one(0, 20, 100, 6))

@@ -35,7 +35,7 @@ def test_periodic_error_of_a_small_spot(params: ReadOut, amplitude: float) -> No
     out = forward(params, signal(spots_y(y)), stream()).data[:, :, 0].astype(float)
     found = (out * np.arange(out.shape[1])).sum(axis=1) / out.sum(axis=1)
     pitch = 40 // out.shape[1]
-    error = pitch * (found - place(params, 0 * y, y, (40, 1))[1])
+    error = pitch * (found - place(params, 0 * y, y, (40, 1), 0)[1])
     spectrum = 2 * np.abs(np.fft.rfft(error)) / len(y)
     assert abs(error.mean()) < 1e-3
     assert spectrum[1] == pytest.approx(amplitude, abs=3e-4 if amplitude else 1e-4)

@@ -19,6 +19,13 @@ def is_entry(path: Path) -> bool:
     return path.name.isdigit() and path.parent.suffix.lower() == ".zarr" and path.parent.is_dir()
 
 
+def entries(store: Path) -> list[Path]:
+    """Name all frames of a Zarr store; none if the folder is not one."""
+    if store.suffix.lower() != ".zarr" or not store.is_dir():
+        return []
+    return [store / str(i) for i in range(_opened(store).shape[0])]
+
+
 def read_entry(path: Path) -> tuple[np.ndarray, str, int]:
     """Read one frame, the SHA-256 of its values (row by row, low byte first), and their size in bytes.
 
@@ -28,10 +35,7 @@ def read_entry(path: Path) -> tuple[np.ndarray, str, int]:
         If the store holds no such array or entry, or is damaged or incomplete.
     """
     store = path.parent
-    try:
-        frames = _frames(store, (store / ARRAY / "zarr.json").stat().st_mtime_ns)
-    except OSError:
-        raise InputError("no array of frames", where=str(store), allowed=f"a Zarr v3 store with the array {ARRAY!r}") from None
+    frames = _opened(store)
     if int(path.name) >= frames.shape[0]:
         raise InputError("the store has no such frame", where=str(store), value=int(path.name), allowed=f"0 to {frames.shape[0] - 1}")
     try:
@@ -41,6 +45,13 @@ def read_entry(path: Path) -> tuple[np.ndarray, str, int]:
         raise InputError(f"frame is damaged ({reason})", where=str(path), remedy="copy or make the store again") from None
     raw = np.ascontiguousarray(values, values.dtype.newbyteorder("<")).tobytes()
     return values, hashlib.sha256(raw).hexdigest(), len(raw)
+
+
+def _opened(store: Path) -> Any:
+    try:
+        return _frames(store, (store / ARRAY / "zarr.json").stat().st_mtime_ns)
+    except OSError:
+        raise InputError("no array of frames", where=str(store), allowed=f"a Zarr v3 store with the array {ARRAY!r}") from None
 
 
 @lru_cache(maxsize=8)

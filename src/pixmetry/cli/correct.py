@@ -15,9 +15,9 @@ import click
 def correct(frames: tuple[Path, ...], results: Path, output: Path, threads: int | None) -> None:
     """Take out of frames what was measured in an assessment.
 
-    FRAMES are image files, or folders of them. Dark signal, non-linearity, relative response and defects are corrected, in this order,
-    as far as the assessment measured them; what could not be corrected is listed with the reason. The corrected frames are TIFF files of
-    32-bit floats in DN above black.
+    FRAMES are image files, folders of them, or Zarr stores of frames. Dark signal, non-linearity, relative response and defects are
+    corrected, in this order, as far as the assessment measured them; what could not be corrected is listed with the reason. The corrected
+    frames are TIFF files of 32-bit floats in DN above black.
     """
     from pixmetry.cli._progress import shown_progress
     from pixmetry.core.threads import set_threads

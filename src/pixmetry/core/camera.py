@@ -431,7 +431,7 @@ class Camera:
             elif link.source is LOOK and not layout_only:
                 x, y = (v[0, :, 0] for v in signal.light.placed(x[None, :, None], y[None, :, None]))
             elif link.source.place is not None:
-                x, y = link.source.place(link.params, x, y, link.shape)
+                x, y = link.source.place(link.params, x, y, link.shape, frame)
         return x, y
 
     def truth(self, frame: int = 0, seed: int = 0, **schedule: Any) -> dict[str, dict[str, np.ndarray]]:
@@ -698,8 +698,11 @@ def check_chain(chain: Sequence[Element], where: str = "camera") -> None:
                 raise ChainError(f"{element.name} must come before {earlier.name}", where=where, remedy="change the order")
 
 
+RANK = {Kind.LIGHT: 0, Kind.PHOTONS: 1, Kind.ELECTRONS: 2, Kind.DN: 3, Kind.VIDEO: 3, Kind.CODES: 4}  # in which a chain goes through them
+
+
 def in_order(sources: Iterable[Source]) -> list[Source]:
-    """Sort sources into an order in which a camera takes them: by stage, then by their kinds and their ``after`` and ``before``.
+    """Sort sources into an order in which a camera takes them: by their kinds, their ``after`` and ``before``, and their stages.
 
     Raises
     ------
@@ -711,7 +714,10 @@ def in_order(sources: Iterable[Source]) -> list[Source]:
     left, done = list(sources), []
 
     def must_wait(source: Source, other: Source) -> bool:
-        """Whether ``source`` comes after ``other``: as they say themselves, else by stage, else by their kinds."""
+        """Whether ``source`` comes after ``other``: by what they take, else as they say, else by stage."""
+        ranks = [[RANK[kind] for kind in s.consumes] for s in (source, other)]
+        if min(ranks[0]) > max(ranks[1]) or max(ranks[0]) < min(ranks[1]):
+            return min(ranks[0]) > max(ranks[1])
         if _named(other, source.after) or _named(source, other.before):
             return True
         if _named(source, other.after) or _named(other, source.before):

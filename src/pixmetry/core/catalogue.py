@@ -14,7 +14,7 @@ from pathlib import Path
 from pixmetry.core.errors import ChainError, InputError
 from pixmetry.core.source import Source
 
-STAGES = ("optics", "sensor", "electronics", "cable", "grabber", "storage", "processing")
+STAGES = ("optics", "sensor", "electronics", "cable", "grabber", "processing", "storage")
 ENTRY_POINTS = "pixmetry.sources"
 
 

@@ -149,7 +149,9 @@ def _sample_reshape(params: LineSources, frame_shape: tuple[int, int]) -> tuple[
     return frame_shape[0], params.line.samples or frame_shape[1]
 
 
-def _sample_place(params: LineSources, x: np.ndarray, y: np.ndarray, frame_shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+def _sample_place(
+    params: LineSources, x: np.ndarray, y: np.ndarray, frame_shape: tuple[int, int], frame: int
+) -> tuple[np.ndarray, np.ndarray]:
     return params.line.placed(x), y
 
 

@@ -321,11 +321,11 @@ class Light:
         shape = (n, y.shape[1], x.shape[2])
         x, y = np.broadcast_to(x, shape), np.broadcast_to(y, shape)
         sd = np.sqrt(sum(np.broadcast_to(v(x, y), shape) for v in self.varying)) if self.varying else None
-        per_window = (self.exposure_s[:, None, None], self.grid.frame[:, None, None])
         px, py = self.pulled(x, y)
         if self.pulls:
             px, py = np.broadcast_to(px, shape), np.broadcast_to(py, shape)
-        centre = Points(px, py, np.broadcast_to(time, shape), *(np.broadcast_to(v, shape) for v in per_window), np.sqrt(self.blur_px2), self.frame_shape)
+        when, exposure, frame = (np.broadcast_to(v, shape) for v in (time, self.exposure_s[:, None, None], self.grid.frame[:, None, None]))
+        centre = Points(px, py, when, exposure, frame, np.sqrt(self.blur_px2), self.frame_shape)
         dots = self.dots or (np.zeros(1), np.zeros(1), np.ones(1))
         detailed = getattr(self.scene, "detailed", None)
         busy = np.ones(shape, bool) if detailed is None else detailed(centre, self._reach(0.5 * np.hypot(*cell), dots))

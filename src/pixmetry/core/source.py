@@ -78,7 +78,8 @@ class Source:
     reshape : callable, optional
         ``reshape(params, frame_shape)``: rows and columns of the frame that it puts out, if they differ from those that it takes.
     place : callable, optional
-        ``place(params, x_px, y_px, frame_shape)``: where points of its input frame lie in its output frame, if it moves whole pixels.
+        ``place(params, x_px, y_px, frame_shape, frame)``: where points of its input frame, of that number, lie in its output frame, if it
+        moves whole pixels.
         (Sources of ``light`` and ``video`` need none: the camera follows their maps.)
     truth : callable, optional
         ``truth(params, signal, stream)``: what it does in this unit and these frames, as named arrays: maps (rows, cols) of the unit,
@@ -127,7 +128,7 @@ class Source:
     near: Callable[[Any], tuple[int, int, int, int]] | None = None
     tail: Callable[[Any], float] | None = None
     reshape: Callable[[Any, tuple[int, int]], tuple[int, int]] | None = None
-    place: Callable[[Any, np.ndarray, np.ndarray, tuple[int, int]], tuple[np.ndarray, np.ndarray]] | None = None
+    place: Callable[[Any, np.ndarray, np.ndarray, tuple[int, int], int], tuple[np.ndarray, np.ndarray]] | None = None
     truth: Callable[[Any, Signal, Stream], Mapping[str, np.ndarray]] | None = None
     start: Callable[[Any], Any] | None = None
     applies_to: tuple[str, ...] = ()

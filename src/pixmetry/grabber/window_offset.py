@@ -33,7 +33,9 @@ def reshape(params: WindowOffset, frame_shape: tuple[int, int]) -> tuple[int, in
     return params.rows or frame_shape[0], params.cols or frame_shape[1]
 
 
-def place(params: WindowOffset, x: np.ndarray, y: np.ndarray, frame_shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+def place(
+    params: WindowOffset, x: np.ndarray, y: np.ndarray, frame_shape: tuple[int, int], frame: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Where points of the image lie in what is stored."""
     row, col = params.first
     return x - col, y - row

@@ -4,7 +4,7 @@ The box and the Gaussian make a weight that is a product, k_w(x) k_h(y). With F 
 integral over the shape into ∮ F(x − x0) k_h(y − y0) dy along its outline: exact for every shape, blur and size of the box, at the cost of
 a short integral over the few pieces of the outline that pass near the box. What passes to the right of it is known in closed form.
 
-A segment is a row of ``SEGMENT`` numbers: kind (0 straight, 1 elliptic arc), cx, cy, ux, uy, vx, vy, t1, t2, then its two ends x1, y1, x2, y2.
+A segment is a row of ``SEGMENT`` numbers: kind (0 straight, 1 elliptic arc), cx, cy, ux, uy, vx, vy, t1, t2, and its ends x1, y1, x2, y2.
 A point of it is c + u t, or c + u cos t + v sin t; along it, x and y rise or fall throughout.
 """
 
@@ -140,11 +140,15 @@ def panel(seg, ta, tb, x0, y0, w, h, s, lit, sums):
 
 @jit
 def beyond(seg, ta, tb, y0, h, s, lit, sums):
-    """Add what passes to the right of the box."""
+    """Add what passes to the right of the box. At the reach all is seen, so that an inside is 1 and an outside 0."""
+    reach = 0.5 * h + REACH * s
+    limit = reach * (1.0 - 1e-9)
     ya, yb = place(seg, 1, ta) - y0, place(seg, 1, tb) - y0
-    sums[0] += share(yb, h, s) - share(ya, h, s)
+    above = 1.0 if yb >= limit else (0.0 if yb <= -limit else share(yb, h, s))
+    below = 1.0 if ya >= limit else (0.0 if ya <= -limit else share(ya, h, s))
+    sums[0] += above - below
     if lit:
-        sums[2] += moment(yb, h, s) - moment(ya, h, s)
+        sums[2] += moment(min(reach, max(-reach, yb)), h, s) - moment(min(reach, max(-reach, ya)), h, s)
 
 
 @jit
@@ -246,7 +250,7 @@ def around(oval, count, x0, y0, w, h, s, lit, sums):
 
 @jit
 def add_oval(out, oval, count, height, row0, col0, dx, dy, r1, r2, c1, c2, s):
-    """Add an ellipse to pixels (r1 … r2, c1 … c2) of a window; its weights are products of one that sees the row and one that sees the column."""
+    """Add an ellipse to pixels (r1 … r2, c1 … c2) of a window; a weight is the product of one of the row and one of the column."""
     across = np.empty((2, count, c2 - c1 + 1))
     down = np.empty((count, 2))
     lit = out.shape[0] > 1
@@ -301,8 +305,8 @@ def extent(segments, first, last, y0, reach):
 def add_shapes(out, row0, col0, dx, dy, segments, start, height, box, oval, count, s):
     """Add shapes to full pixels of windows: ``out`` has shape (n, 1, rows, cols), or (n, 3, …) with the first moments along x and y.
 
-    Shape k has the segments ``start[k]`` to ``start[k + 1]``, the height ``height[k]`` and lies within ``box[k]``; where ``count[k]`` is not 0
-    it is the ellipse ``oval[k]``. The shapes of window i are displaced by ``dx[i], dy[i]``.
+    Shape k has the segments ``start[k]`` to ``start[k + 1]``, the height ``height[k]`` and lies within ``box[k]``; where ``count[k]`` is
+    not 0 it is the ellipse ``oval[k]``. The shapes of window i are displaced by ``dx[i], dy[i]``.
     """
     rows, cols = out.shape[2], out.shape[3]
     lit = out.shape[1] > 1

@@ -7,6 +7,7 @@ from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from pixmetry.core.errors import ParameterError
 from pixmetry.core.light import Points
@@ -115,7 +116,7 @@ class Discs:
         """Photons per pixel at points, float64."""
         return self.averaged(at, np.float64(0), np.float64(0))
 
-    def averaged(self, at: Points, width_px: np.ndarray, height_px: np.ndarray) -> np.ndarray:
+    def averaged(self, at: Points, width_px: ArrayLike, height_px: ArrayLike) -> np.ndarray:
         """The same, averaged over an upright box of this size about each point."""
         exposure = np.broadcast_to(np.asarray(at.exposure_s, float), at.x_px.shape)
         scale = self.background.photons_scale(exposure.ravel()).reshape(exposure.shape)
@@ -125,7 +126,7 @@ class Discs:
             out[which] += scale[which] * shapes.sums(at.take(which), width[which], height[which], False)[0]
         return np.maximum(out, 0.0)
 
-    def detailed(self, at: Points, reach_px: np.ndarray) -> np.ndarray:
+    def detailed(self, at: Points, reach_px: ArrayLike) -> np.ndarray:
         """Where an edge may be seen within a reach of each point."""
         out, reach = np.zeros(at.x_px.shape, bool), np.broadcast_to(reach_px, at.x_px.shape)
         for shapes, which in self._seen(at):
@@ -135,13 +136,13 @@ class Discs:
     def targets(self, time_s: float = 0.0, frame: int = 0) -> list[dict[str, Any]]:
         """True places of the discs in a frame."""
         x, y = self.centres(np.array([frame]))
-        return [{"kind": "disc", "x_px": float(a), "y_px": float(b), "diameter_px": self.diameter_px} for a, b in zip(x[0], y[0], strict=True)]
+        places = zip(x[0], y[0], strict=True)
+        return [{"kind": "disc", "x_px": float(a), "y_px": float(b), "diameter_px": self.diameter_px} for a, b in places]
 
     def layer(self, motion: Motion) -> Shapes:
         """The discs of one frame without their background, as shapes that move."""
         x, y = self.centres(np.zeros(1, np.int64))
-        told = [{"kind": "disc", "x_px": float(a), "y_px": float(b), "diameter_px": self.diameter_px} for a, b in zip(x[0], y[0], strict=True)]
-        return replace(self._shapes(x, y, motion), told=told)
+        return replace(self._shapes(x, y, motion), told=self.targets())
 
     def _seen(self, at: Points) -> list[tuple[Shapes, np.ndarray]]:
         """Discs with the points that see them; one disc a frame is a disc that moves."""

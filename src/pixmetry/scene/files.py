@@ -94,7 +94,9 @@ def _targets(model: SceneModel, motion: Motion) -> list[Layer]:
         if flat:
             layers.append(Shapes.of(flat, model.blur_px, moves))
         layers += [
-            Sine(t.period_px, t.angle_deg, t.phase_deg, t.mean_photons, t.contrast_rel, model.blur_px, moves) for t in some if t.kind == "sine"
+            Sine(t.period_px, t.angle_deg, t.phase_deg, t.mean_photons, t.contrast_rel, model.blur_px, moves)
+            for t in some
+            if t.kind == "sine"
         ]
     return layers
 

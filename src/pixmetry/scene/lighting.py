@@ -1,4 +1,4 @@
-"""How brightly a flat surface looks to the camera from place to place: lamp, direction of view, and what the surface does with the light."""
+"""How brightly a flat surface looks to the camera from place to place: lamp, direction of view, and kind of surface."""
 
 from __future__ import annotations
 
@@ -63,10 +63,14 @@ class Lighting:
         usable = self.lamp_px[2] > 0 and self.camera_distance_px > 0 and max(abs(self.tilt_x_deg), abs(self.tilt_y_deg)) < 89
         if not usable or not (self.lobe_gain >= 0 and self.lobe_exponent > 0 and self.lobe_width_deg > 0):
             raise ParameterError(
-                "a lighting cannot be used", where="lighting", allowed="lamp and camera in front of the surface (z above 0), tilt below 89°, a lobe of some size"
+                "a lighting cannot be used",
+                where="lighting",
+                allowed="lamp and camera in front of the surface (z above 0), tilt below 89°, lobe_gain 0 or more, a lobe of some width",
             )
         if self.surface != "gradient" and self._brightness(np.zeros(1), np.zeros(1))[0] <= 0:
-            raise ParameterError("the lamp stands behind the surface", where="lighting.lamp_px", value=self.lamp_px, remedy="tilt the surface less")
+            raise ParameterError(
+                "the lamp stands behind the surface", where="lighting.lamp_px", value=self.lamp_px, remedy="tilt the surface less"
+            )
 
     def factor(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """The factor at places on the image plane."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from pixmetry.core.errors import ParameterError
 
@@ -47,7 +48,7 @@ class Motion:
         """Whether nothing moves."""
         return self.table_px is None and not any((*self.velocity_px_per_s, *self.acceleration_px_per_s2, *self.amplitude_px))
 
-    def offset(self, time_s: np.ndarray, frame: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def offset(self, time_s: ArrayLike, frame: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """Displacement in x and y, in pixels, at these times of these frames."""
         t = np.asarray(time_s, float)
         swing = np.sin(2 * np.pi * self.frequency_hz * t + np.deg2rad(self.phase_deg))

@@ -111,7 +111,9 @@ def from_oval(oval: np.ndarray, height_photons: float, **target: object) -> Outl
 
 def ellipse(x_px: float, y_px: float, width_px: float, height_px: float, angle_deg: float = 0.0, height_photons: float = 1000.0) -> Outline:
     """An ellipse of two full axes; the first is turned by ``angle_deg`` from x towards y (downwards)."""
-    return from_oval(oval_of(x_px, y_px, width_px, height_px, angle_deg), height_photons, width_px=width_px, height_px=height_px, angle_deg=angle_deg)
+    return from_oval(
+        oval_of(x_px, y_px, width_px, height_px, angle_deg), height_photons, width_px=width_px, height_px=height_px, angle_deg=angle_deg
+    )
 
 
 def disc(x_px: float, y_px: float, diameter_px: float, height_photons: float = 1000.0) -> Outline:
@@ -140,7 +142,9 @@ def line(
 ) -> Outline:
     """A straight line of some length and width about its middle, ``angle_deg`` from x towards y; a wire is a thin one, bright or dark."""
     if not (0 < length_px <= 2 * FAR_PX and 0 < width_px <= 2 * FAR_PX):
-        raise ParameterError("a line cannot be used", where="line", value=(length_px, width_px), allowed=f"length and width 0 to {2 * FAR_PX:g} px")
+        raise ParameterError(
+            "a line cannot be used", where="line", value=(length_px, width_px), allowed=f"length and width 0 to {2 * FAR_PX:g} px"
+        )
     a, b = 0.5 * length_px, 0.5 * width_px
     x, y = _turned(x_px, y_px, angle_deg, [-a, a, a, -a], [-b, -b, b, b])
     told = {"kind": kind, "x_px": float(x_px), "y_px": float(y_px), "angle_deg": float(angle_deg), "width_px": float(width_px)}
@@ -159,17 +163,28 @@ def cross(x_px: float, y_px: float, size_px: float, width_px: float, angle_deg: 
 
 
 def edge(x_px: float, y_px: float, angle_deg: float = 5.0, height_photons: float = 1000.0) -> Outline:
-    """A straight edge through a point: what lies to the right of it is bright; ``angle_deg`` turns it from the y axis (towards −x below)."""
+    """A straight edge through a point: bright to the right of it; ``angle_deg`` turns it from the y axis (towards −x below)."""
     x, y = _turned(x_px, y_px, angle_deg, [0, FAR_PX, FAR_PX, 0], [-FAR_PX, -FAR_PX, FAR_PX, FAR_PX])
     return polygon(x, y, height_photons, kind="edge", x_px=float(x_px), y_px=float(y_px), angle_deg=float(angle_deg))
 
 
 def star(
-    x_px: float, y_px: float, diameter_px: float, sectors: int, inner_px: float = 0.0, angle_deg: float = 0.0, height_photons: float = 1000.0
+    x_px: float,
+    y_px: float,
+    diameter_px: float,
+    sectors: int,
+    inner_px: float = 0.0,
+    angle_deg: float = 0.0,
+    height_photons: float = 1000.0,
 ) -> list[Outline]:
     """A Siemens star: as many bright sectors as dark gaps, from the inner to the outer diameter; the first begins at ``angle_deg``."""
     if not (2 <= sectors <= 720 and 0 <= inner_px < diameter_px <= 1e5):
-        raise ParameterError("a star cannot be used", where="star", value=(sectors, inner_px, diameter_px), allowed="2 to 720 sectors, inner below outer diameter")
+        raise ParameterError(
+            "a star cannot be used",
+            where="star",
+            value=(sectors, inner_px, diameter_px),
+            allowed="2 to 720 sectors, inner below outer diameter",
+        )
     parts = []
     outer = oval_of(x_px, y_px, diameter_px, diameter_px)
     for k in range(sectors):
@@ -187,11 +202,20 @@ def star(
 
 
 def bars(
-    x_px: float, y_px: float, period_px: float, count: int, length_px: float, angle_deg: float = 0.0, duty: float = 0.5, height_photons: float = 1000.0
+    x_px: float,
+    y_px: float,
+    period_px: float,
+    count: int,
+    length_px: float,
+    angle_deg: float = 0.0,
+    duty: float = 0.5,
+    height_photons: float = 1000.0,
 ) -> list[Outline]:
     """A grating of bright bars about its middle; its lines are turned by ``angle_deg`` from the y axis."""
     if not (0 < period_px <= 1e5 and 1 <= count <= 10000 and 0 < duty < 1):
-        raise ParameterError("a grating cannot be used", where="bars", value=(period_px, count, duty), allowed="period above 0, 1 to 10000 bars, duty 0 to 1")
+        raise ParameterError(
+            "a grating cannot be used", where="bars", value=(period_px, count, duty), allowed="period above 0, 1 to 10000 bars, duty 0 to 1"
+        )
     parts = []
     for k in range(count):
         x, y = _turned(x_px, y_px, angle_deg, (k - 0.5 * (count - 1)) * period_px, 0.0)

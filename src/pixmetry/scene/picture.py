@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from pixmetry.core.light import Points
 from pixmetry.core.random import Grid
@@ -18,13 +19,15 @@ from pixmetry.scene.uniform import Uniform
 class Layer(Protocol):
     """Part of a scene: see `Shapes` for what each method gives."""
 
-    moving: Any
-    smooth_px: Any
-    own_light: Any  # whether the scene's lighting does not act on it
-
+    @property
+    def moving(self) -> bool: ...
+    @property
+    def smooth_px(self) -> float: ...
+    @property
+    def own_light(self) -> bool: ...  # whether the scene's lighting does not act on it
     def render(self, grid: Grid, frame_shape: tuple[int, int], time_s: np.ndarray, exposure_s: np.ndarray, lit: bool) -> np.ndarray: ...
-    def sums(self, at: Points, width_px: np.ndarray, height_px: np.ndarray, lit: bool) -> np.ndarray: ...
-    def detailed(self, at: Points, reach_px: np.ndarray) -> np.ndarray: ...
+    def sums(self, at: Points, width_px: ArrayLike, height_px: ArrayLike, lit: bool) -> np.ndarray: ...
+    def detailed(self, at: Points, reach_px: ArrayLike) -> np.ndarray: ...
     def targets(self, time_s: float, frame: int) -> list[dict[str, Any]]: ...
 
 
@@ -77,7 +80,7 @@ class Picture:
         """Light at points after the blur, float64."""
         return self.averaged(at, np.float64(0), np.float64(0))
 
-    def averaged(self, at: Points, width_px: np.ndarray, height_px: np.ndarray) -> np.ndarray:
+    def averaged(self, at: Points, width_px: ArrayLike, height_px: ArrayLike) -> np.ndarray:
         """Light after the blur, averaged over an upright box of this size about each point."""
         lit = self.lighting is not None
         total, own = np.zeros((3 if lit else 1, *at.x_px.shape)), np.zeros(at.x_px.shape)
@@ -99,7 +102,7 @@ class Picture:
         factor, along_x, along_y = self.lighting.with_slopes(at.x_px, at.y_px)
         return factor * total[0] + along_x * total[1] + along_y * total[2]
 
-    def detailed(self, at: Points, reach_px: np.ndarray) -> np.ndarray:
+    def detailed(self, at: Points, reach_px: ArrayLike) -> np.ndarray:
         """Where the light may vary by more than a slope within a reach of each point."""
         found = np.zeros(at.x_px.shape, bool)
         for layer in self.layers:

@@ -16,8 +16,8 @@ from pixmetry.scene.shapes import Shapes
 class Pose:
     """Where a plate stands before the camera.
 
-    The camera looks along z, x to the right and y down. A point X of the plate (X, Y, 0) lies at R X + t, with R = Rz(κ) Ry(φ) Rx(ω), and is
-    seen at principal point + c (x/z, y/z).
+    The camera looks along z, x to the right and y down. A point X of the plate (X, Y, 0) lies at R X + t, with R = Rz(κ) Ry(φ) Rx(ω), and
+    is seen at principal point + c (x/z, y/z).
 
     Parameters
     ----------
@@ -110,8 +110,13 @@ def dot_plate(
     `Shapes.targets` gives of each dot the image of its centre (x_px, y_px) and the centre of its ellipse (ellipse_x_px, ellipse_y_px): they
     differ by the eccentricity of perspective.
     """
-    if not (rows >= 1 and columns >= 1 and rows * columns <= 1_000_000 and 0 < diameter_mm and (pitch_mm > 0)):
-        raise ParameterError("a dot plate cannot be used", where="plate", value=(rows, columns, pitch_mm, diameter_mm), allowed="1 to 1e6 dots, pitch and diameter above 0")
+    if not (rows >= 1 and columns >= 1 and rows * columns <= 1_000_000 and diameter_mm > 0 and pitch_mm > 0):
+        raise ParameterError(
+            "a dot plate cannot be used",
+            where="plate",
+            value=(rows, columns, pitch_mm, diameter_mm),
+            allowed="1 to 1e6 dots, pitch and diameter above 0",
+        )
     j, i = (v.ravel() for v in np.meshgrid(np.arange(columns), np.arange(rows)))
     x, y = (j - 0.5 * (columns - 1)) * pitch_mm, (i - 0.5 * (rows - 1)) * pitch_mm
     reach = 0.5 * diameter_mm
@@ -119,8 +124,9 @@ def dot_plate(
     ovals = circle_images(pose.homography, x, y, np.full(x.size, reach))
     px, py = pose.seen(x, y)
     told = [
-        {"kind": "dot", "x_px": float(a), "y_px": float(b), "ellipse_x_px": float(o[0]), "ellipse_y_px": float(o[1]), "row": int(r), "column": int(c)}
-        | {"x_mm": float(mx), "y_mm": float(my), "width_px": float(2 * np.hypot(*o[2:4])), "height_px": float(2 * np.hypot(*o[4:]))}
+        {"kind": "dot", "x_px": float(a), "y_px": float(b), "ellipse_x_px": float(o[0]), "ellipse_y_px": float(o[1])}
+        | {"width_px": float(2 * np.hypot(*o[2:4])), "height_px": float(2 * np.hypot(*o[4:]))}
+        | {"row": int(r), "column": int(c), "x_mm": float(mx), "y_mm": float(my)}
         for a, b, o, r, c, mx, my in zip(px, py, ovals, i, j, x, y, strict=True)
     ]
     return Shapes.of_ovals(ovals, np.full(x.size, float(height_photons)), blur_px, motion, told)
@@ -131,7 +137,12 @@ def chessboard(
 ) -> Shapes:
     """A plate of bright and dark squares about its middle, the first (top left) bright; targets are the inner corners."""
     if not (rows >= 2 and columns >= 2 and rows * columns <= 1_000_000 and square_mm > 0):
-        raise ParameterError("a chessboard cannot be used", where="plate", value=(rows, columns, square_mm), allowed="2 or more rows and columns, square above 0")
+        raise ParameterError(
+            "a chessboard cannot be used",
+            where="plate",
+            value=(rows, columns, square_mm),
+            allowed="2 or more rows and columns, square above 0",
+        )
     across, down = (np.arange(columns + 1) - 0.5 * columns) * square_mm, (np.arange(rows + 1) - 0.5 * rows) * square_mm
     x, y = pose.seen(*np.meshgrid(across, down))
 
@@ -141,10 +152,10 @@ def chessboard(
 
     outlines = [square(r, c) for r in range(rows) for c in range(columns) if (r + c) % 2 == 0]
     told = [
-        {"kind": "corner", "x_px": float(x[r, c]), "y_px": float(y[r, c]), "row": r - 1, "column": c - 1, "x_mm": float(across[c]), "y_mm": float(down[r])}
+        {"kind": "corner", "x_px": float(x[r, c]), "y_px": float(y[r, c]), "row": r - 1, "column": c - 1}
+        | {"x_mm": float(across[c]), "y_mm": float(down[r])}
         for r in range(1, rows)
         for c in range(1, columns)
     ]
     made = Shapes.of(outlines, blur_px, motion)
     return Shapes(made.segments, made.start, made.height_photons, made.oval, blur_px, motion, told)
-

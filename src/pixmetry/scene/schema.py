@@ -157,7 +157,9 @@ def _of_kind(kinds: Mapping[str, type[Model]], data: Any, what: str) -> Model:
     if isinstance(data, Model):
         return data
     if not isinstance(data, Mapping):
-        raise InputError(f"a {what} holds no keys", allowed="kind: … and its other keys", remedy=f"write `kind: {next(iter(kinds))}` and its keys")
+        raise InputError(
+            f"a {what} holds no keys", allowed="kind: … and its other keys", remedy=f"write `kind: {next(iter(kinds))}` and its keys"
+        )
     if data.get("kind") not in kinds:
         problem = f"no such kind of {what}" if "kind" in data else f"a {what} lacks its kind"
         raise InputError(problem, value=data.get("kind"), allowed=", ".join(kinds), remedy="write `kind: …`")

@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from pixmetry.core.errors import ParameterError
 from pixmetry.core.light import Points
@@ -60,7 +61,15 @@ class Shapes:
         start = np.concatenate([[0], np.cumsum([len(o.segments) for o in outlines])]).astype(np.int64)
         segments = np.concatenate([o.segments for o in outlines]) if outlines else np.zeros((0, kernels.SEGMENT))
         oval = np.array([np.full(6, np.nan) if o.oval is None else o.oval for o in outlines]).reshape(-1, 6)
-        return cls(segments, start, np.array([o.height_photons for o in outlines], float), oval, blur_px, motion, [o.target for o in outlines if o.target])
+        return cls(
+            segments,
+            start,
+            np.array([o.height_photons for o in outlines], float),
+            oval,
+            blur_px,
+            motion,
+            [o.target for o in outlines if o.target],
+        )
 
     @classmethod
     def of_ovals(
@@ -108,7 +117,7 @@ class Shapes:
         return self._sets[s]
 
     def render(self, grid: Grid, frame_shape: tuple[int, int], time_s: np.ndarray, exposure_s: np.ndarray, lit: bool) -> np.ndarray:
-        """Light of full pixels at a time of each window, float64, shape (n, 1, rows, cols); with ``lit`` also its first moments, (n, 3, …)."""
+        """Light of full pixels at a time of each window, shape (n, 1, rows, cols); with ``lit`` also its first moments, (n, 3, …)."""
         out = np.zeros((len(grid.frame), 3 if lit else 1, *grid.shape))
         dx, dy = (np.ascontiguousarray(np.broadcast_to(v, time_s.shape), float) for v in self.motion.offset(time_s, grid.frame))
         kernels.add_shapes(out, grid.row0, grid.col0, dx, dy, *self._arrays(max(self.blur_px, SHARP_PX)))
@@ -122,7 +131,7 @@ class Shapes:
             x, y = at.x_px - dx, at.y_px - dy
         return np.ascontiguousarray(x, float).ravel(), np.ascontiguousarray(y, float).ravel()
 
-    def sums(self, at: Points, width_px: np.ndarray, height_px: np.ndarray, lit: bool) -> np.ndarray:
+    def sums(self, at: Points, width_px: ArrayLike, height_px: ArrayLike, lit: bool) -> np.ndarray:
         """Light averaged over a box about each point, shape (1, …); with ``lit`` also its first moments along x and y, (3, …)."""
         x, y = self._points(at)
         out = np.zeros((3 if lit else 1, x.size))
@@ -131,7 +140,7 @@ class Shapes:
         kernels.at_points(out, x, y, w, h, _side(x, y), *self._arrays(s))
         return out.reshape(-1, *at.x_px.shape)
 
-    def detailed(self, at: Points, reach_px: np.ndarray) -> np.ndarray:
+    def detailed(self, at: Points, reach_px: ArrayLike) -> np.ndarray:
         """Where an outline may pass within this reach and the blur's."""
         x, y = self._points(at)
         out = np.zeros(x.size, bool)
@@ -176,7 +185,9 @@ class Sine:
     def __post_init__(self) -> None:
         if not (0.1 <= self.period_px <= 1e6 and self.mean_photons >= 0 and 0 <= self.contrast <= 1 and 0 <= self.blur_px <= 100):
             raise ParameterError(
-                "a sine grating cannot be used", where="sine", allowed="period 0.1 to 1e6 px, mean 0 or more, contrast 0 to 1, blur 0 to 100 px"
+                "a sine grating cannot be used",
+                where="sine",
+                allowed="period 0.1 to 1e6 px, mean 0 or more, contrast 0 to 1, blur 0 to 100 px",
             )
 
     @property
@@ -189,7 +200,7 @@ class Sine:
         """Scale of its finest detail: a sinusoid is as smooth as a Gaussian of this deviation."""
         return max(self.blur_px, self.period_px / 8)
 
-    def sums(self, at: Points, width_px: np.ndarray, height_px: np.ndarray, lit: bool) -> np.ndarray:
+    def sums(self, at: Points, width_px: ArrayLike, height_px: ArrayLike, lit: bool) -> np.ndarray:
         """Light averaged over boxes, and its first moments; see `Shapes.sums`."""
         dx, dy = self.motion.offset(at.time_s, at.frame)
         k = 2 * np.pi / self.period_px
@@ -208,7 +219,7 @@ class Sine:
         at = pixel_points(grid, frame_shape, time_s, exposure_s)
         return self.sums(at, np.float64(1), np.float64(1), lit).swapaxes(0, 1)
 
-    def detailed(self, at: Points, reach_px: np.ndarray) -> np.ndarray:
+    def detailed(self, at: Points, reach_px: ArrayLike) -> np.ndarray:
         """Everywhere."""
         return np.ones(at.x_px.shape, bool)
 
@@ -217,14 +228,15 @@ class Sine:
         return []
 
 
-def _passed(k: float, width_px: np.ndarray, variance_px2: float) -> tuple[np.ndarray, np.ndarray]:
+def _passed(k: float, width_px: ArrayLike, variance_px2: float) -> tuple[np.ndarray, np.ndarray]:
     """Transform of a box of unit area blurred by a Gaussian at the angular frequency ``k``, and its derivative."""
-    a = 0.5 * k * np.asarray(width_px, float)
+    width = np.asarray(width_px, float)
+    a = 0.5 * k * width
     sinc = np.sinc(a / np.pi)
     small = np.abs(a) < 1e-4
     slope = np.where(small, -a / 3, (np.cos(a) - sinc) / np.where(small, 1.0, a))
     gauss = np.exp(-0.5 * k * k * variance_px2)
-    return sinc * gauss, (0.5 * width_px * slope - k * variance_px2 * sinc) * gauss
+    return sinc * gauss, (0.5 * width * slope - k * variance_px2 * sinc) * gauss
 
 
 def pixel_points(grid: Grid, frame_shape: tuple[int, int], time_s: np.ndarray, exposure_s: np.ndarray) -> Points:
@@ -232,5 +244,5 @@ def pixel_points(grid: Grid, frame_shape: tuple[int, int], time_s: np.ndarray, e
     y = (grid.row0[:, None] + np.arange(grid.shape[0]))[:, :, None]
     x = (grid.col0[:, None] + np.arange(grid.shape[1]))[:, None, :]
     parts = (x, y, *(np.asarray(v)[:, None, None] for v in (time_s, exposure_s)))
-    spread = [np.broadcast_to(np.asarray(v, float), grid.size) for v in parts]
-    return Points(*spread, np.broadcast_to(grid.frame[:, None, None], grid.size), 0.0, frame_shape)  # type: ignore[call-arg]
+    x, y, time, exposure = (np.broadcast_to(np.asarray(v, float), grid.size) for v in parts)
+    return Points(x, y, time, exposure, np.broadcast_to(grid.frame[:, None, None], grid.size), 0.0, frame_shape)

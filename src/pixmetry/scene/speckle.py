@@ -7,6 +7,7 @@ from functools import cached_property, lru_cache
 from typing import Any, ClassVar, Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from pixmetry.core.errors import ParameterError
 from pixmetry.core.light import Points
@@ -18,7 +19,7 @@ OVERSAMPLING = 6  # raster steps per period of the finest detail of the intensit
 LARGEST_RASTER = 4096
 MARGIN = 8.0  # periods of the finest detail around the spot
 SMALL_RASTER = 1024  # of which more realisations and boxes are kept
-BOX_STEP = 0.02  # boxes whose sides differ by less (relative) are taken as one: a map that stretches would ask for a new field at each pixel
+BOX_STEP = 0.02  # boxes whose sides differ by less (relative) are one: under a map that stretches, every pixel would have its own field
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,8 @@ class Speckle:
     own_light: ClassVar[bool] = True  # a laser does not need the scene's lamp
 
     def __post_init__(self) -> None:
-        usable = np.isfinite([self.x_px, self.y_px]).all() and 0 < self.radius_px and 0.02 <= self.lambda_n_px <= 100 and self.peak_photons >= 0
+        usable = np.isfinite([self.x_px, self.y_px]).all() and self.radius_px > 0 and 0.02 <= self.lambda_n_px <= 100
+        usable = usable and self.peak_photons >= 0
         if not usable or self.frames_each < 0 or not (self.contrast == 0 or 0.1 <= self.contrast <= 1):
             raise ParameterError(
                 "a laser spot cannot be used",
@@ -125,7 +127,7 @@ class Speckle:
             return self.peak_photons * np.maximum(ifft2(fft2(spot) * fft2(spread)).real / share, 0.0)
         out = np.zeros_like(spot)
         for k, weight in enumerate(_weights(self.contrast)):
-            grid = Grid(np.array([realisation]), np.zeros(1), np.zeros(1), spot.shape)
+            grid = Grid.whole([realisation], spot.shape)
             phase = 2 * np.pi * Stream(0, self.seed, "scene.speckle").uniform(grid, k)[0].astype(float)
             field = ifft2(fft2(np.sqrt(spot) * np.exp(1j * phase)) * pupil)
             out += weight * (field.real**2 + field.imag**2)
@@ -135,7 +137,7 @@ class Speckle:
         kept = _many if self.side <= SMALL_RASTER else _few
         return kept(_Frozen(self), realisation, width_px, height_px, blur_px)
 
-    def sums(self, at: Points, width_px: np.ndarray, height_px: np.ndarray, lit: bool) -> np.ndarray:
+    def sums(self, at: Points, width_px: ArrayLike, height_px: ArrayLike, lit: bool) -> np.ndarray:
         """Light averaged over a box about each point, shape (1 or 3, …); see `Shapes.sums`."""
         from scipy.ndimage import map_coordinates
 
@@ -163,11 +165,11 @@ class Speckle:
         """Light of full pixels, shape (n, 1 or 3, rows, cols)."""
         return self.sums(pixel_points(grid, frame_shape, time_s, exposure_s), np.float64(1), np.float64(1), lit).swapaxes(0, 1)
 
-    def detailed(self, at: Points, reach_px: np.ndarray) -> np.ndarray:
+    def detailed(self, at: Points, reach_px: ArrayLike) -> np.ndarray:
         """Where the spot has light."""
         dx, dy = self.motion.offset(at.time_s, at.frame)
         far = np.maximum(np.abs(at.x_px - dx - self.x_px), np.abs(at.y_px - dy - self.y_px))
-        return np.broadcast_to(far <= self.half_px + reach_px + self.step_px, at.x_px.shape)
+        return np.broadcast_to(far <= self.half_px + np.asarray(reach_px) + self.step_px, at.x_px.shape)
 
     def targets(self, time_s: float, frame: int) -> list[dict[str, Any]]:
         """The middle of the spot."""

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from pixmetry.core.errors import ParameterError
 from pixmetry.core.light import Points
@@ -64,11 +65,11 @@ class Uniform:
         field = np.maximum(1 + self.gradient_x_per_px * x + self.gradient_y_per_px * y, 0)
         return self.level_photons * self.photons_scale(exposure.ravel()).reshape(exposure.shape) * field
 
-    def averaged(self, at: Points, width_px: np.ndarray, height_px: np.ndarray) -> np.ndarray:
+    def averaged(self, at: Points, width_px: ArrayLike, height_px: ArrayLike) -> np.ndarray:
         """The same, averaged over boxes."""
         return self.radiance(at)
 
-    def detailed(self, at: Points, reach_px: np.ndarray) -> np.ndarray:
+    def detailed(self, at: Points, reach_px: ArrayLike) -> np.ndarray:
         """Nowhere."""
         return np.zeros(at.x_px.shape, bool)
 

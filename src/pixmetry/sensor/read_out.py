@@ -77,12 +77,13 @@ def reshape(params: ReadOut, frame_shape: tuple[int, int]) -> tuple[int, int]:
     return (max(1, frame_shape[0] // 2), frame_shape[1]) if params.mode == "field" else frame_shape
 
 
-def place(params: ReadOut, x: np.ndarray, y: np.ndarray, frame_shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Where a place of the frame lies in the field (of alternating fields, in the mean of both: they differ by half a line)."""
+def place(
+    params: ReadOut, x: np.ndarray, y: np.ndarray, frame_shape: tuple[int, int], frame: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where a place of the frame lies in the field that this frame number holds."""
     if params.mode != "field":
         return x, y
-    first = {"even": 0.0, "odd": 1.0, "alternating": 0.5}[params.field]
-    return x, 0.5 * (y - first - (0.5 if params.lines == "summed" else 0.0))
+    return x, 0.5 * (y - int(fields(params, np.array([frame]))[0]) - (0.5 if params.lines == "summed" else 0.0))
 
 
 def truth(params: ReadOut, signal: Signal, stream: Stream) -> Mapping[str, np.ndarray]:

@@ -1,0 +1,101 @@
+"""Speed of charge transfer at 1024 × 1024, one thread: ``python benchmarks/bench_charge_transfer.py [PYTHON_WITH_ARCTICPY]``.
+
+Prints milliseconds a frame, and the ratio to other implementations of the same operation: the fixed share by NumPy, one shifted image
+for every pixel of delay; the traps by arcticpy, which needs NumPy 1 and so an interpreter of its own (``pip install arcticpy``, with the
+headers of the GNU Scientific Library). There every packet passes every pixel's traps if ``express`` is 0, with
+``empty_traps_for_first_transfers``; that is what is computed here. Larger numbers of passes are its approximations; they are timed too.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from pixmetry.core.random import Grid, Streams
+from pixmetry.core.signal import Kind, Signal
+from pixmetry.sensor.charge_transfer import SOURCE, ChargeTransfer
+
+SIDE = 1024
+EXACT_COLUMNS = 8  # of arcticpy's exact mode, whose time goes with their number
+LINEAR = ChargeTransfer(parallel_cti=1e-5, serial_cti=1e-5)
+TRAPS = ChargeTransfer(slow_traps_per_px=1.0, slow_release_px=10.0, fill_beta=0.5, trap_well_e=1e5)
+BASELINE = """
+import json, sys, time
+import arcticpy as ac, numpy as np
+side, exact = int(sys.argv[1]), int(sys.argv[2])
+image = np.random.default_rng(1).poisson(1000, (side, side)).astype(float)
+ccd = ac.CCD(full_well_depth=1e5, well_fill_power=0.5)
+traps = [ac.TrapInstantCapture(density=1.0, release_timescale=10.0)]
+def run(columns, **kw):
+    part, times = image[:, :columns].copy(), []
+    for _ in range(1 if columns < side else 3):
+        start = time.perf_counter()
+        out = ac.add_cti(part, parallel_ccd=ccd, parallel_traps=traps, verbosity=0, **kw)
+        times.append(time.perf_counter() - start)
+    return min(times) * side / columns, out
+roe = ac.ROE(empty_traps_for_first_transfers=True)
+true_s, true = run(exact, parallel_roe=roe, parallel_express=0)
+times = {f"express {e}": run(side, parallel_roe=ac.ROE(), parallel_express=e)[0] for e in (1, 5)}
+print(json.dumps({"times": {"exact": true_s} | times, "image": image[:, :exact].tolist(), "out": true.tolist()}))
+"""
+
+
+def best_s(action: Callable[[], object], rounds: int = 5) -> float:
+    """Return the shortest of several runs, after one that compiles."""
+    action()
+    times = []
+    for _ in range(rounds):
+        start = time.perf_counter()
+        action()
+        times.append(time.perf_counter() - start)
+    return min(times)
+
+
+def frame(image: np.ndarray) -> Signal:
+    """One whole frame of electrons."""
+    one = np.ones(1)
+    return Signal(np.float32(image[None]), Kind.ELECTRONS, Grid.whole([0], image.shape), image.shape, 0.01 * one, 0 * one, 20 * one)
+
+
+def by_numpy(image: np.ndarray, loss: float, delays: int = 5) -> np.ndarray:
+    """Both directions, negative binomial shares as whole shifted images."""
+    for axis in (0, 1):
+        n = (np.arange(SIDE) + 1.0).reshape((-1, 1) if axis == 0 else (1, -1))
+        share, out = (1 - loss) ** n, np.zeros_like(image)
+        for j in range(delays):
+            moved = share * image
+            out[(slice(j, None),) if axis == 0 else (slice(None), slice(j, None))] += (
+                moved[: SIDE - j] if axis == 0 else moved[:, : SIDE - j]
+            )
+            share = share * loss * (n + j) / (j + 1)
+        image = out
+    return image
+
+
+def main() -> None:
+    """Time both models."""
+    stream, image = Streams(1, 2).of("bench"), np.random.default_rng(1).poisson(1000, (SIDE, SIDE)).astype(float)
+    signal = frame(image)
+    linear = best_s(lambda: SOURCE.forward(LINEAR, signal, stream))
+    other = best_s(lambda: by_numpy(image, 1e-5), 3)
+    apart = np.abs(SOURCE.forward(LINEAR, signal, stream).data[0] - by_numpy(image, 1e-5)).max()
+    print(f"fixed share, both directions {1e3 * linear:8.1f} ms   NumPy {1e3 * other:8.1f} ms   ratio {linear / other:.3f}")
+    print(f"    largest difference {apart:.1e} e-")
+    traps = best_s(lambda: SOURCE.forward(TRAPS, signal, stream))
+    print(f"traps, one species, columns  {1e3 * traps:8.1f} ms")
+    if len(sys.argv) > 1:
+        answer = json.loads(subprocess.check_output([sys.argv[1], "-c", BASELINE, str(SIDE), str(EXACT_COLUMNS)]))
+        for name, seconds in answer["times"].items():
+            print(f"    arcticpy {name:<12} {1e3 * seconds:10.1f} ms   ratio {traps / seconds:.4f}")
+        part, theirs = np.array(answer["image"]), np.array(answer["out"])
+        ours = SOURCE.forward(TRAPS, frame(part), stream).data[0]
+        print(f"    largest difference {np.abs(ours - theirs).max():.3f} e- of {np.abs(theirs - part).max():.3f} e- moved")
+
+
+if __name__ == "__main__":
+    main()

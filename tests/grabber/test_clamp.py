@@ -1,0 +1,71 @@
+"""The clamp: droop against SciPy's high-pass, published swings of clipped spots, and noise of the rows."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import signal as sps
+
+from pixmetry.core.signal import Kind
+from pixmetry.grabber.clamp import SOURCE, Clamp
+from source_signals import Z, flat, signal, stream
+
+
+def clamped(params: Clamp, data: np.ndarray, **kw: object) -> np.ndarray:
+    return SOURCE.forward(params, signal(data, Kind.DN, **kw), stream()).data.astype(float)
+
+
+def test_the_droop_is_an_analogue_high_pass() -> None:
+    """s/(s + 1/τ) by `lsim` on the held pixels, read in their middle; τ from what is left at the end of the line."""
+    row = np.random.default_rng(2).uniform(0, 200, 100).astype(np.float32)
+    tau = -100 / np.log(1 - 0.3)
+    t = np.arange(801) / 8
+    _, y, _ = sps.lsim(([1.0, 0.0], [1.0, 1 / tau]), np.append(np.repeat(row, 8), row[-1]).astype(float), t, interp=False)
+    got = clamped(Clamp(droop_rel=0.3), row[None, None])[0, 0]
+    np.testing.assert_allclose(got, y[4::8][:100], rtol=2e-5, atol=2e-4)
+
+
+def test_a_constant_level_has_lost_the_stated_share_at_the_end_of_the_line() -> None:
+    got = clamped(Clamp(droop_rel=0.2), np.full((1, 2, 1000), 100.0))[0, 0]
+    assert got[-1] == pytest.approx(80.0, rel=1e-3) and got[0] == pytest.approx(100.0, rel=2e-4)
+
+
+def test_a_bright_bar_leaves_a_dark_streak_to_its_right_only() -> None:
+    row = np.zeros(400)
+    row[100:200] = 200.0
+    got = clamped(Clamp(droop_rel=0.05), row[None, None])[0, 0]
+    assert (got[:100] == 0).all()
+    assert got[200] == pytest.approx(-200 * (1 - 0.95 ** (100 / 400)), rel=2e-3)
+    assert (np.diff(got[200:]) > 0).all()
+
+
+def test_the_correction_undoes_droop_offset_and_drift() -> None:
+    row = np.random.default_rng(3).uniform(0, 200, (2, 3, 80))
+    params = Clamp(offset_dn=-4.0, drift_dn_per_k=0.3, droop_rel=0.2)
+    out = SOURCE.forward(params, signal(row, Kind.DN, temperature_c=[15.0, 31.0]), stream())
+    np.testing.assert_allclose(SOURCE.correct(params, out, {}).data, row, atol=1e-3)
+
+
+def test_black_follows_the_temperature() -> None:
+    got = clamped(Clamp(offset_dn=2.0, drift_dn_per_k=-0.5, reference_c=25.0), np.zeros((2, 1, 4)), temperature_c=[25.0, 31.0])
+    np.testing.assert_allclose(got[:, 0, 0], [2.0, -1.0])
+
+
+def test_noise_is_common_to_a_row_and_new_in_every_frame() -> None:
+    out = SOURCE.forward(Clamp(noise_dn=0.5), flat(10.0, (300, 6), n=4, kind=Kind.DN), stream()).data.astype(float) - 10
+    assert (np.ptp(out, axis=2) < 1e-5).all()
+    rows = out[:, :, 0]
+    assert rows.var() == pytest.approx(0.25, rel=Z * np.sqrt(2 / rows.size) * 1.05)
+    assert abs(np.corrcoef(rows[0], rows[1])[0, 1]) < Z / np.sqrt(300)
+
+
+def test_published_swing_of_a_spot_whose_foot_is_cut_off() -> None:
+    """Gaussian spot, σ = 1.5 px, 150 DN, black 6 DN below code 0, 41 samples a row: amplitude 0.0075 px over the pixel, 0.0004 at 4 DN."""
+    phase = np.linspace(-1.5, 1.5, 500)
+    x = np.arange(41) - 20.0
+    spots = 150 * np.exp(-0.5 * ((x - phase[:, None]) / 1.5) ** 2)
+    for offset, amplitude in ((-6.0, 0.0075), (-4.0, 0.0004), (-10.0, 0.002)):
+        cut = np.maximum(clamped(Clamp(offset_dn=offset), spots[None])[0], 0.0)
+        error = (cut * x).sum(axis=1) / cut.sum(axis=1) - phase
+        found = 2 * np.abs((error * np.exp(2j * np.pi * phase)).mean())
+        assert found == pytest.approx(amplitude, abs=3e-4), offset
