@@ -54,10 +54,12 @@ def centre(rows: np.ndarray) -> np.ndarray:
 
 
 def standard_probe(half: int = 6) -> Probe:
-    """Discs of 7 px and 150 DN under a blur of 0.7 px, without background, seen by the plain centroid in a window of ± ``half`` px."""
+    """Discs of 7 px and 150 DN under a blur of 0.7 px, without background, seen by the plain centroid within a radius of ``half`` px."""
     at = (np.arange(8) + 0.5) / 8 - 0.5
     x, y = at, at[::-1] * 0.7
     tiles = np.array([150 * disc_tile(a, b) for a, b in zip(x, y, strict=True)])
     cut = tiles.shape[1] // 2 - half
     windows = tiles[:, cut : cut + 2 * half + 1, cut : cut + 2 * half + 1]
-    return probe_of(windows, half + x, half + y, -1e-9, 0.0, (582, 752))
+    radius = np.hypot(np.arange(2 * half + 1)[:, None] - half - y[:, None, None], np.arange(2 * half + 1) - half - x[:, None, None])
+    probe = probe_of(windows * (radius <= half), half + x, half + y, -1e-9, 0.0, (582, 752))
+    return replace(probe, gx=probe.gx * (radius <= half), gy=probe.gy * (radius <= half))

@@ -17,7 +17,7 @@ def shifts(params: ClockWarmUp, time_s: float = 0.0) -> np.ndarray:
     out = []
     for c in COLUMNS:
         before = video(row_of(bump(c, 752, 4.0)), smooth=True, time_s=time_s)
-        out.append(centre(sampled(SOURCE.forward(params, before, None)))[0, 0] - centre(sampled(before))[0, 0])
+        out.append((centre(sampled(SOURCE.forward(params, before, None), 8)) - centre(sampled(before, 8)))[0, 0] / 8)
     return np.array(out)
 
 

@@ -54,8 +54,8 @@ def test_rows_move_by_the_truth() -> None:
     params, draws = LineJitter(white_ns=20.0, loop_ns=10.0), stream()
     before = video(np.broadcast_to(bump(60.0, 120, 3.0), (2, 40, 120)), smooth=True)
     told = truth(params, before, draws)["row_shift_px"]
-    moved = centre(sampled(SOURCE.forward(params, before, draws))) - centre(sampled(before))
-    np.testing.assert_allclose(moved, told, atol=2e-3)
+    moved = (centre(sampled(SOURCE.forward(params, before, draws), 8)) - centre(sampled(before, 8))) / 8
+    np.testing.assert_allclose(moved, told, atol=1e-3)
 
 
 def test_published_size_of_20_ns() -> None:
@@ -65,7 +65,7 @@ def test_published_size_of_20_ns() -> None:
     weight = probe.signal_dn.sum(axis=2)
     n_eff = weight.sum(axis=1) ** 2 / (weight**2).sum(axis=1)
     np.testing.assert_allclose(n_eff, 7.07, atol=0.03)
-    assert propagate(LineJitter(white_ns=20.0), probe).u_x_px == pytest.approx(0.376 * 0.284, rel=0.01)
+    assert propagate(LineJitter(white_ns=20.0), probe).u_x_px == pytest.approx(0.376 * 0.284, rel=0.02)
     assert propagate(LineJitter(white_ns=20.0), probe).u_y_px == 0.0
 
 

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from pixmetry.core.errors import ParameterError
 from pixmetry.core.light import Points
 from pixmetry.core.random import Grid
-from pixmetry.scene._kernels import add_discs
+from pixmetry.scene._kernels import add_discs, see_discs
 from pixmetry.scene.motion import Motion
 from pixmetry.scene.shapes import Shapes
 from pixmetry.scene.uniform import Uniform
@@ -20,6 +20,7 @@ from pixmetry.scene.uniform import Uniform
 REACH = 5.0  # blur standard deviations beyond which a disc's edge is taken as 0 (2.9e-7 of its height)
 STEP = 1 / 256  # px: spacing of the radial profile; linear interpolation is good to 1e-5 of the height down to the smallest blur
 SMALLEST_BLUR_PX = 0.05
+FEW = 8  # discs in a frame that every point looks at, rather than at those near it
 
 
 @lru_cache(maxsize=64)
@@ -122,9 +123,29 @@ class Discs:
         scale = self.background.photons_scale(exposure.ravel()).reshape(exposure.shape)
         width, height = (np.broadcast_to(v, at.x_px.shape) for v in (width_px, height_px))
         out = self.background.radiance(at)
+        blur = float(np.hypot(self.blur_px, at.blur_px))
+        if self._count <= FEW and max(np.max(width, initial=0.0), np.max(height, initial=0.0)) <= 2 * blur:
+            return np.maximum(out + scale * self._few(at, width, height, blur), 0.0)
         for shapes, which in self._seen(at):
             out[which] += scale[which] * shapes.sums(at.take(which), width[which], height[which], False)[0]
         return np.maximum(out, 0.0)
+
+    @property
+    def _count(self) -> int:
+        """How many discs there are in a frame."""
+        return self.x_px.size // (len(self.x_px) if self.per_frame else 1)
+
+    def _few(self, at: Points, width: np.ndarray, height: np.ndarray, blur_px: float) -> np.ndarray:
+        """Light of a few discs by their radial profile."""
+        count = self._count
+        cx, cy = (np.ascontiguousarray(v.reshape(-1, count)) for v in (self.x_px, self.y_px))
+        row = np.broadcast_to(at.frame, at.x_px.shape).ravel() % len(cx)
+        peak = np.array(np.broadcast_to(np.asarray(self.peak_photons, float), count))
+        out = np.zeros(at.x_px.size)
+        outer = 0.5 * self.diameter_px + REACH * blur_px
+        place = (np.ascontiguousarray(v, float).ravel() for v in (at.x_px, at.y_px, width, height))
+        see_discs(out, *place, row, cx, cy, peak, radial_profile(float(self.diameter_px), blur_px), STEP, outer, blur_px)
+        return out.reshape(at.x_px.shape)
 
     def detailed(self, at: Points, reach_px: ArrayLike) -> np.ndarray:
         """Where an edge may be seen within a reach of each point."""
@@ -148,7 +169,7 @@ class Discs:
         """Discs with the points that see them; one disc a frame is a disc that moves."""
         if not self.per_frame:
             return [(self._shapes(*self.centres(np.zeros(1, np.int64))), np.ones(at.x_px.shape, bool))]
-        if self.x_px.reshape(len(self.x_px), -1).shape[1] == 1:
+        if self._count == 1:
             return [(self._one, np.ones(at.x_px.shape, bool))]
         frame = np.broadcast_to(at.frame, at.x_px.shape)
         return [(self._shapes(*self.centres(np.array([f]))), frame == f) for f in np.unique(frame)]
