@@ -35,9 +35,8 @@ def test_the_transfer_of_a_clear_pupil_is_known():
 
 def test_the_transfer_of_an_aberrated_pupil_is_that_of_a_brute_force_pupil():
     """Autocorrelation of the pupil function on a raster, by FFT: another way to the same integral."""
-    params = PointSpread(
-        model="diffraction", defocus_waves=0.2, astigmatism_waves=0.1, oblique_astigmatism_waves=-0.07, coma_x_waves=0.15, spherical_waves=0.1
-    )
+    even = {"defocus_waves": 0.2, "astigmatism_waves": 0.1, "oblique_astigmatism_waves": -0.07, "spherical_waves": 0.1}
+    params = PointSpread(model="diffraction", coma_x_waves=0.15, **even)
     n = 256
     x = (np.arange(2 * n) - n + 0.5) / (n / 2)
     x, y = np.meshgrid(x, x)

@@ -16,7 +16,7 @@ from pixmetry.sensor.pixel_pitch import PixelPitch
 from source_signals import stream
 
 
-@pytest.mark.parametrize(("width", "f", "known"), [(1.0, 1.5, -0.21), (0.5, 1.0, 0.64), (0.5, 1.5, 0.30), (0.5, 2.0, 0.0), (0.8, 0.5, None)])
+@pytest.mark.parametrize(("width", "f", "known"), [(1.0, 1.5, -0.21), (0.5, 1.0, 0.64), (0.5, 1.5, 0.3), (0.5, 2.0, 0.0), (0.8, 0.5, None)])
 def test_the_transfer_of_an_aperture_is_a_sinc(width, f, known):
     along_x = transfer(f, 0.0, (APERTURE, PixelAperture(width_x_px=width, width_y_px=0.3)))
     along_y = transfer(0.0, f, (APERTURE, PixelAperture(width_x_px=0.3, width_y_px=width)))
@@ -27,7 +27,7 @@ def test_the_transfer_of_an_aperture_is_a_sinc(width, f, known):
 
 @pytest.mark.parametrize(("sigma", "ratio"), [(0.2, 1.9), (0.3, 3.2), (0.4, 5.2), (0.5, 7.9), (0.6, 11.0)])
 def test_a_narrow_aperture_multiplies_the_periodic_error(sigma, ratio):
-    """Against pixels integrated by the error function; a = 0.4 over full fill. The light's quadrature over a pixel errs by up to 2.5e-4 px."""
+    """Against pixels integrated by the error function: a = 0.4 over full fill. The light's quadrature errs by up to 2.5e-4 px."""
     phase = np.arange(16) / 16
     exact = {}
     for a in (0.4, 1.0):

@@ -38,7 +38,7 @@ def places_mm(params: Tilt, x: np.ndarray, y: np.ndarray, frame_shape: tuple[int
     x0, y0 = frame_centre(frame_shape)
     a, b = (x - x0) * params.pitch_x_um / 1000, (y - y0) * params.pitch_y_um / 1000
     r = rotation(params)
-    return tuple(r[i, 0] * a + r[i, 1] * b for i in range(3))  # type: ignore[return-value]
+    return tuple(r[i, 0] * a + r[i, 1] * b for i in range(3))
 
 
 def pull_of(params: Tilt, frame_shape: tuple[int, int]) -> Pull:

@@ -14,7 +14,7 @@ from pixmetry.core.signal import Clock, Kind, Signal, Windows
 from pixmetry.core.source import Parameters, Source, quantity
 
 SHARE_BEYOND = 1e-4  # of a step, beyond the near context
-TAPS = 24  # samples to either side over which the noise is alike
+PERIODS = 6  # of the bandwidth, to either side, over which the noise is alike
 BESSEL_3 = np.array([-1.32267580, -1.04740916 + 0.99926444j, -1.04740916 - 0.99926444j])  # poles for −3 dB at 1 rad/s
 
 
@@ -68,8 +68,9 @@ def _taps(bandwidth_hz: float, sample_hz: float, filters: tuple[tuple[bytes, byt
     """
     f = (np.arange(2000) + 0.5) / 2000 * bandwidth_hz
     line = Line(1.0, 1.0, tuple((np.frombuffer(z, complex), np.frombuffer(p, complex)) for z, p in filters))
-    k = np.arange(-TAPS, TAPS + 1)
-    wave = np.sin(2 * np.pi * f[:, None] * k / sample_hz) * np.cos(0.5 * np.pi * k / (TAPS + 1)) ** 2
+    most = int(np.ceil(PERIODS * sample_hz / bandwidth_hz))
+    k = np.arange(-most, most + 1)
+    wave = np.sin(2 * np.pi * f[:, None] * k / sample_hz) * np.cos(0.5 * np.pi * k / (most + 1)) ** 2
     plain, seen = (np.asarray(w @ wave) for w in (f, f * line.gain(f)))
     return seen / np.sqrt((plain**2).sum())
 
@@ -79,7 +80,7 @@ def noise_dn(params: Tape, grid: Grid, line: Line, behind: int, stream: Stream) 
     filters = tuple((z.tobytes(), p.tobytes()) for z, p in line.filters[behind:])
     taps = _taps(params.bandwidth_mhz * 1e6, line.sample_clock_hz, filters)
     rows, cols = grid.shape
-    white = stream.normal(Grid(grid.frame, grid.row0, grid.col0 - TAPS, (rows, cols + 2 * TAPS)), draw=2)
+    white = stream.normal(Grid(grid.frame, grid.row0, grid.col0 - len(taps) // 2, (rows, cols + len(taps) - 1)), draw=2)
     total = np.zeros(grid.size, np.float32)
     for j, weight in enumerate(params.noise_dn * params.grown * taps):
         if weight:
