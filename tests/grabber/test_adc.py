@@ -110,3 +110,21 @@ def test_measure_takes_black_level_and_code_widths_where_they_are() -> None:
 def test_a_converter_without_any_code_is_refused() -> None:
     with pytest.raises((InputError, ValueError), match="every code would be missing"):
         Adc(missing_every=1)
+
+
+def test_hysteresis_puts_the_thresholds_higher_while_the_line_rises() -> None:
+    """A triangle: the same level gives a lower code on the way up than on the way down, by the hysteresis."""
+    up = np.arange(0, 100, 0.25)
+    both = np.concatenate([up, up[::-1]])
+    codes = convert(Adc(hysteresis_lsb=3.0), both).astype(float)
+    rising, falling = codes[1 : len(up)], codes[len(up) + 1 :][::-1]
+    assert (falling[20:-20] - rising[20 : len(falling) - 20]).mean() == pytest.approx(3.0, abs=0.3)
+    assert np.array_equal(convert(Adc(hysteresis_lsb=3.0), np.full(9, 80.25))[1:], np.full(8, 80))
+
+
+def test_black_and_slope_drift_with_temperature() -> None:
+    drift = {"offset_drift_dn_per_k": 0.5, "gain_drift_per_k": 1e-3, "reference_temperature_c": 30.0}
+    params = Adc(bits=12, offset_dn=50.0, gain_error_rel=0.1, **drift)
+    data = np.full((2, 1, 3), [0.0, 1000.0, 2000.0])
+    codes = forward(params, signal(data, Kind.DN, temperature_c=[30.0, 40.0]), stream()).data[:, 0]
+    assert codes.tolist() == [[50, 1150, 2250], [55, 1166, 2277]]

@@ -47,7 +47,7 @@ def test_the_correction_undoes_droop_offset_and_drift() -> None:
 
 
 def test_black_follows_the_temperature() -> None:
-    got = clamped(Clamp(offset_dn=2.0, drift_dn_per_k=-0.5, reference_c=25.0), np.zeros((2, 1, 4)), temperature_c=[25.0, 31.0])
+    got = clamped(Clamp(offset_dn=2.0, drift_dn_per_k=-0.5, reference_temperature_c=25.0), np.zeros((2, 1, 4)), temperature_c=[25.0, 31.0])
     np.testing.assert_allclose(got[:, 0, 0], [2.0, -1.0])
 
 

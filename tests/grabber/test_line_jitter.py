@@ -60,7 +60,7 @@ def test_rows_move_by_the_truth() -> None:
 
 def test_published_size_of_20_ns() -> None:
     """20 ns are 0.284 px at 14.1875 MHz; T7, plain centroid, window radius 6, background 0: n_eff = 7.07, u = 0.376 σ."""
-    assert 20e-9 * PIXEL_HZ == pytest.approx(0.284, abs=5e-4)
+    assert pytest.approx(0.284, abs=5e-4) == 20e-9 * PIXEL_HZ
     probe = standard_probe()
     weight = probe.signal_dn.sum(axis=2)
     n_eff = weight.sum(axis=1) ** 2 / (weight**2).sum(axis=1)

@@ -87,3 +87,10 @@ def test_without_a_line_there_is_a_limit_above_what_would_be_found_in_half_of_al
     assert 0.05 < found["amplitude_dn"].value < 0.08  # 0.05 (1 + 1.645/√(2 ln 10^10)) = 0.0621
     with pytest.raises(MeasureError, match="dark frames"):
         measure(Observations())
+
+
+def test_a_steady_advance_tells_the_absolute_frequency() -> None:
+    """Fixed in the unit, and a quarter of a turn on from frame to frame."""
+    params = PARAMS.model_copy(update={"moving": False, "turns_per_frame": 0.25})
+    phases = np.angle([np.fft.fft2(f)[-5, 12] for f in wave(params, 5)]) / (2 * np.pi)
+    np.testing.assert_allclose(np.diff(phases) % 1, 0.25, atol=1e-4)

@@ -17,6 +17,7 @@ from pixmetry.core.camera import Camera
 from pixmetry.core.catalogue import catalogue
 from pixmetry.core.contribution import Contribution
 from pixmetry.core.estimates import Estimates
+from pixmetry.core.signal import Kind
 from pixmetry.core.source import Source
 from pixmetry.locate.estimators import Estimator
 
@@ -34,7 +35,7 @@ class BudgetRow:
     ----------
     name, source_id, title : str
         Name in the camera's chain (or the source's id), and the source.
-    status : {"measured", "modelled", "accepted", "not applicable"}
+    status : {"measured", "modelled", "accepted", "not applicable", "left to calibration"}
         Its parameters were estimated in this campaign; it is known without (from the camera's description, or it has no parameters); the
         campaign could not tell, and it is taken at the largest to expect of a sound camera; such a camera cannot have it.
     contribution : Contribution, optional
@@ -218,6 +219,9 @@ def compute_budget(
     )
 
 
+CALIBRATED = "in front of the pixels: frames without targets do not carry it; a calibration with targets does"
+
+
 def _sources(camera: Camera) -> list[tuple[str, Source]]:
     """What has a row: the chain, then what the catalogue has beyond it."""
     named = [(e.name, e.source) for e in camera.active]
@@ -243,6 +247,10 @@ def _row(name: str, source: Source, camera: Camera, estimates: Estimates | None,
         return replace(head, status="not applicable", reason=f"only in a camera that is {' or '.join(source.applies_to)}")
     measured = estimates is not None and len(estimates) > 0
     present = any(e.name == name for e in camera.active)
+    if source.option and not (present or measured):
+        return replace(head, status="not applicable", reason=f"only in a camera with {source.option}")
+    if Kind.LIGHT in source.consumes and not (present or measured):
+        return replace(head, status="left to calibration", reason=CALIBRATED)
     if measured:
         status, params = "measured", base_of(source, camera, name)
         params = params if present else with_estimates(source, params, estimates)

@@ -117,6 +117,7 @@ SOURCE = Source(
     near=near,
     tail=tail,
     applies_to=("analogue",),
+    option="a T-piece or a second termination",
     gum_class="G",
     equation="y' = T [y + T' Γ_e Σ_k (Γ' Γ_e)^k y(t − (k+1)τ)],  T = 2Y_0/(Y_0 + Y_L + Y_b),  T' = 2Y_b/(Y_0 + Y_L + Y_b),  Γ' = T' − 1",
     typical_size="level 2/3 when terminated twice; an open stub of matched cable moves a target by τ/4: 0.036 px per metre at 14.19 MHz",

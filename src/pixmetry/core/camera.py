@@ -584,6 +584,10 @@ def _settled(element: Link, signal: Signal, stream: Any, most: int = 400) -> Any
     """Run a source with a memory over the same frame until its state no longer changes."""
     source: Any = element.source
     state = source.start(element.params)
+    try:
+        np.asarray(state, float)
+    except TypeError:
+        raise InputError(f"{element.name} has no state that it settles to", remedy="switch it off: it needs whole sequences") from None
     for _ in range(most):
         _, following = source.forward(element.params, signal, stream, state)
         change = np.max(np.abs(np.asarray(following, float) - np.asarray(state, float)))

@@ -353,14 +353,20 @@ class Light:
     def _parts(self) -> int:
         """Into how many parts a cell is cut along each side for a scene that averages over upright boxes.
 
-        One, unless the coordinate maps turn or shear the cell; then enough that the parts, upright themselves, stand for it.
+        One, unless the coordinate maps turn or shear the cell; then enough that the parts, upright themselves, stand for it to 1e-4 of an
+        edge. A shear changes the second moment of the cell, a turn only the fourth, so blurred light needs fewer.
         """
         if not self.pulls:
             return 1
         x, y = self._lattice()
         at, right, down = (np.broadcast_arrays(*self.pulled(u, v)) for u, v in ((x, y), (x + 1, y), (x, y + 1)))
-        turn = max(float(np.abs(right[1] - at[1]).max()), float(np.abs(down[0] - at[0]).max()))
-        return 1 if turn < 1e-6 else int(np.clip(np.ceil(30.0 * np.sqrt(turn)), 3, 12))
+        tilt_x, tilt_y = right[1] - at[1], down[0] - at[0]
+        shear, turn = float(np.abs(tilt_x + tilt_y).max()), 0.5 * float(np.abs(tilt_x - tilt_y).max())
+        blur2 = float(getattr(self.scene, "smooth_px", 0.0)) ** 2 + self.blur_px2
+        spread2 = blur2 + 1.0 / 12.0
+        parts = np.sqrt(100.0 * shear / spread2)
+        parts = max(parts, (2.0 * turn / spread2**2) ** 0.25 if blur2 > 0.04 else 30.0 * np.sqrt(max(turn, shear)))
+        return int(np.clip(np.ceil(parts - 1e-3), 1, 12))
 
     def _nodes(self, cell: tuple[float, float], dots: Any, spread: Any, boxes: int = 0) -> Iterator[tuple[Any, Any, Any]]:
         """Offsets and weights that stand for the aperture, the dots and the spread that varies; or the aperture cut into ``boxes``²."""

@@ -89,6 +89,9 @@ class Source:
         ``start(params)``: the state before frame 0, for a source with a memory; None where it has none with these parameters.
     applies_to : tuple of str
         Kinds of camera that can have it: of ``digital``, ``analogue``, ``ccd``, ``cmos``; empty for all.
+    option : str
+        What a camera must have for this source to be in it, where most have not: ``a colour mosaic``. A budget counts it only where the camera's
+        chain holds it.
     gum_class : str
         Class of its contribution, see ``core.contribution``.
     equation, typical_size : str
@@ -132,6 +135,7 @@ class Source:
     truth: Callable[[Any, Signal, Stream], Mapping[str, np.ndarray]] | None = None
     start: Callable[[Any], Any] | None = None
     applies_to: tuple[str, ...] = ()
+    option: str = ""
     reasons: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

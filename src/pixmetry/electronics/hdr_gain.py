@@ -113,6 +113,7 @@ SOURCE = Source(
     correct=correct,
     propagate=propagate,
     applies_to=("cmos",),
+    option="several gains in one frame",
     gum_class="F",
     equation="y = x below s;  above: (1 + m + m_col) x + o + noise, in steps of the ratio;  knee: s + (1 + m)(x − s)",
     typical_size="below 0.002 px for 2 % of mismatch on a disc of 7 px",

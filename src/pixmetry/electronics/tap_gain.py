@@ -110,6 +110,7 @@ SOURCE = Source(
     correct=correct,
     propagate=propagate,
     truth=truth,
+    option="several output amplifiers",
     gum_class="F",
     equation="y = x (1 ± Δg/2 ± Δg_oe/2 + g1 x/x_ref)",
     typical_size="(D/3π) Δg = 0.74 px · Δg for a border through a disc of 7 px: 0.007 px for 1 %",

@@ -13,7 +13,7 @@ from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.core.estimates import Estimates
 from pixmetry.core.observations import Observations
 from pixmetry.core.random import Stream
-from pixmetry.core.signal import Kind, Signal
+from pixmetry.core.signal import Kind, Signal, Windows
 from pixmetry.core.source import Parameters, Source, quantity
 from pixmetry.grabber._kernels import quantise_at, quantise_ideal
 
@@ -28,6 +28,10 @@ class Adc(Parameters):
     inl_cycles: float = quantity(1.0, "1", "periods of that bend over the range", ge=0, le=64)
     dnl_std_lsb: float = quantity(0.0, "LSB", "standard deviation of the code widths, fixed in the unit", ge=0, le=2)
     missing_every: int = quantity(0, "1", "every so many codes one is missing; 0: none is", ge=0, le=65536)
+    hysteresis_lsb: float = quantity(0.0, "LSB", "by how much thresholds lie higher while the line rises than while it falls", ge=0, le=16)
+    offset_drift_dn_per_k: float = quantity(0.0, "DN/K", "change of the black level with temperature", ge=-10, le=10)
+    gain_drift_per_k: float = quantity(0.0, "1/K", "relative change of the slope with temperature", ge=-0.01, le=0.01)
+    reference_temperature_c: float = quantity(20.0, "°C", "temperature at which offset and slope are as given", ge=-60, le=100)
 
     @field_validator("missing_every")
     @classmethod
@@ -69,15 +73,31 @@ def thresholds(params: Adc, stream: Stream) -> np.ndarray:
     return np.maximum.accumulate(level)
 
 
+def context(params: Adc, windows: Windows, frame_shape: tuple[int, int]) -> Windows:
+    """The sample before, if the thresholds depend on it."""
+    return windows.expand(0, 0, 1, 0, frame_shape) if params.hysteresis_lsb else windows
+
+
 def forward(params: Adc, signal: Signal, stream: Stream) -> Signal:
     """Lift black to the offset and count the thresholds that are reached; with equal steps, floor(v + 1/2): halves go up."""
     data = np.ascontiguousarray(signal.data, np.float32)
     factor = 1.0 + params.gain_error_rel
+    if params.hysteresis_lsb:
+        data = data - np.float32(0.5 * params.hysteresis_lsb / factor) * np.sign(np.diff(data, axis=2, prepend=np.float32(0)))
+    if params.offset_drift_dn_per_k or params.gain_drift_per_k:
+        data = _drifted(params, data, signal.temperature_c)
     if params.equal_steps:
         codes = quantise_ideal(data, factor, params.offset_dn, float(params.top))
     else:
         codes = quantise_at(data, factor, params.offset_dn, thresholds(params, stream))
     return signal.with_data(codes, Kind.CODES)
+
+
+def _drifted(params: Adc, data: np.ndarray, temperature_c: np.ndarray) -> np.ndarray:
+    """Data of which the converter at the reference temperature makes what it makes of the true ones at theirs."""
+    warmer = (temperature_c - params.reference_temperature_c)[:, None, None]
+    added = params.offset_drift_dn_per_k * warmer / (1 + params.gain_error_rel)
+    return data * (1 + params.gain_drift_per_k * warmer).astype(np.float32) + added.astype(np.float32)
 
 
 def measure(observations: Observations) -> Estimates:
@@ -102,7 +122,7 @@ def correct(params: Adc, signal: Signal, maps: Mapping[str, np.ndarray]) -> Sign
 
 
 def propagate(params: Adc, probe: Probe) -> Contribution:
-    """Rounding and code widths as white noise (P1); bend and the ends of the range as the field that they add (P2).
+    """Rounding and code widths as white noise (P1); bend, hysteresis and the ends of the range as the field that they add (P2).
 
     A threshold displaced by d adds d² to the mean square error of a signal that is spread evenly over its codes. Hence 1/12 for equal
     steps, dnl²/2 for displacements of variance dnl²/2, and two of (1/2)² for each missing code. A slope common to all codes moves no
@@ -110,7 +130,8 @@ def propagate(params: Adc, probe: Probe) -> Contribution:
     """
     variance = 1 / 12 + params.dnl_std_lsb**2 / 2 + (0.5 / params.missing_every if params.missing_every else 0.0)
     level = probe.signal_dn * (1 + params.gain_error_rel) + params.offset_dn
-    stored = np.clip(level - bend(params, level), 0, params.top)
+    rising = np.sign(np.diff(probe.signal_dn, axis=2, prepend=probe.background_dn))
+    stored = np.clip(level - bend(params, level) - 0.5 * params.hysteresis_lsb * rising, 0, params.top)
     dx, dy = probe.field((stored - level) / (1 + params.gain_error_rel))
     white = probe.white(math.sqrt(variance) / (1 + params.gain_error_rel))
     return Contribution(
@@ -143,6 +164,7 @@ SOURCE = Source(
     measure=measure,
     correct=correct,
     propagate=propagate,
+    context=context,
     gum_class="F",
     equation="code = #{k : T_k ≤ (1 + g) y + b},  T_k = k − 1/2 + A sin(2πm k/2^bits) + (s_DNL/√2) n_k;  σ² = 1/12 + s_DNL²/2",
     typical_size="0.003 px at 8 bit on a disc of 7 px of 150 DN (centroid)",

@@ -21,12 +21,12 @@ class Clamp(Parameters):
     offset_dn: float = quantity(0.0, "DN", "level that black is brought to; what is below code 0 is cut off later", ge=-1e4, le=1e4)
     noise_dn: float = quantity(0.0, "DN", "standard deviation of that level from line to line", ge=0, le=1e3)
     drift_dn_per_k: float = quantity(0.0, "DN/K", "how it changes with temperature", ge=-100, le=100)
-    reference_c: float = quantity(20.0, "°C", "temperature at which it is the offset", ge=-60, le=100)
+    reference_temperature_c: float = quantity(20.0, "°C", "temperature at which it is the offset", ge=-60, le=100)
     droop_rel: float = quantity(0.0, "1", "share of a constant level that the AC coupling has lost at the end of the line", ge=0, le=0.9)
 
     def black(self, temperature_c: np.ndarray) -> np.ndarray:
         """Mean level of black in DN at some temperatures."""
-        return self.offset_dn + self.drift_dn_per_k * (np.asarray(temperature_c, float) - self.reference_c)
+        return self.offset_dn + self.drift_dn_per_k * (np.asarray(temperature_c, float) - self.reference_temperature_c)
 
     def losses(self, cols: int) -> tuple[float, float]:
         """Shares lost over a pixel and over half of one: (1 − droop)^(1/cols) is left after each of the line's pixels."""

@@ -25,13 +25,14 @@ class PhasePattern(Parameters):
     frequency_x: float = quantity(0.11, "1/px", "cycles per pixel along the row", ge=0, le=0.5)
     frequency_y: float = quantity(0.07, "1/px", "cycles per pixel down the column", ge=-0.5, le=0.5)
     moving: bool = quantity(True, "1", "whether its phase is another in every frame, or fixed in the unit")
+    turns_per_frame: float = quantity(0.0, "1", "steady advance of a fixed phase from frame to frame, in turns", ge=-0.5, le=0.5)
 
 
 def forward(params: PhasePattern, signal: Signal, stream: Stream) -> Signal:
     """Add A sin(2π(ν_x c + ν_y r + φ)) with the phase φ of the frame."""
     if params.amplitude_dn == 0 or (params.moving and stream.quiet):  # over the phases of all frames the mean is 0
         return signal
-    phase = stream.uniform_frames(signal.grid) if params.moving else np.repeat(stream.uniform_unit(1), len(signal))
+    phase = stream.uniform_frames(signal.grid) if params.moving else stream.uniform_unit(1) + params.turns_per_frame * signal.grid.frame % 1
     added = wave(signal, params.frequency_x, params.frequency_y, phase)
     added *= np.float32(params.amplitude_dn)
     return signal.with_data(np.add(signal.data, added, out=added))

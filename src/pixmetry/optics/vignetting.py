@@ -85,6 +85,7 @@ SOURCE = Source(
     correct=correct,
     truth=truth,
     propagate=propagate,
+    option="shading that is given by its optical data; what is measured is in optics.shading",
     gum_class="G",
     equation="µ' = µ cos⁴θ · (2/π)(acos s − s √(1 − s²)),  tan θ = r/c,  s = s_corner r/r_corner;  Δx = g ⟨x²⟩",
     typical_size="0.004 to 0.011 px for 0.1 to 0.3 % per px on a disc of 7 px (centroid)",

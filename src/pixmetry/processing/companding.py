@@ -81,6 +81,7 @@ SOURCE = Source(
     bound=Companding(law="truncated", bits=12),
     forward=forward,
     propagate=propagate,
+    option="fewer bits on the way than in the converter",
     gum_class="F",
     equation="y = T⁻¹(round T(x)),  T = (2^b − 1)(x/x_max)^γ,  γ = 1 or 1/2",
     typical_size="below 0.001 px where the steps stay below the noise",

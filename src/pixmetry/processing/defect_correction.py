@@ -61,6 +61,7 @@ SOURCE = Source(
     bound=DefectCorrection(threshold_dn=0),
     forward=forward,
     context=context,
+    option="defect correction in the camera",
     gum_class="F",
     equation="y = median of the 8 neighbours if x > max + T or x < min − T, else x",
     typical_size="none on a disc of 7 px; a target of one pixel vanishes, one of 2 px is shifted by up to 0.3 px",

@@ -130,6 +130,7 @@ SOURCE = Source(
     forward=forward,
     propagate=propagate,
     context=context,
+    option="a colour mosaic",
     gum_class="F",
     equation="y = Σ w_place(Δr, Δc) g_colour x",
     typical_size="bilinear 0.008–0.015 px at D = 3 px, 0.005–0.008 at 5, 0.002–0.005 at 7 to 10; red plane up to 0.022 px",

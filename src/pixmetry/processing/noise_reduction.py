@@ -67,6 +67,7 @@ SOURCE = Source(
     bound=NoiseReduction(method="bilateral", radius_px=2, sigma_px=1.5, range_dn=20.0),
     forward=forward,
     context=context,
+    option="noise reduction in the camera",
     gum_class="F",
     equation="y = median, Σ w x, or Σ w(Δr) w(Δx) x / Σ w(Δr) w(Δx) of the pixels around",
     typical_size="0.01 to 0.1 px on targets of 3 px or less; a pixel that stands alone vanishes",

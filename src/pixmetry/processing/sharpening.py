@@ -81,6 +81,7 @@ SOURCE = Source(
     forward=forward,
     propagate=propagate,
     context=context,
+    option="sharpening in the camera",
     gum_class="F",
     equation="y = x + a (x − G_σ ∗ x);  overshoot at a step of height h: a h (1 − w_0)/2 beside it",
     typical_size="0.01 to 0.1 px on targets of 3 px or less, through clipping and the threshold",

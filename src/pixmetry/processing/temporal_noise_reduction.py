@@ -60,6 +60,7 @@ SOURCE = Source(
     bound=TemporalNoiseReduction(alpha=0.8),
     forward=forward,
     start=start,
+    option="noise reduction in the camera",
     gum_class="O",
     equation="y(t) = α y(t − 1) + (1 − α) x(t);  noise √((1 − α)/(1 + α));  lag v α/(1 − α) T_f",
     typical_size="one frame's motion at α = 0.5; four frames' at 0.8",

@@ -206,7 +206,7 @@ def _sources(budget: Budget, unmeasured: Mapping[str, str]) -> list[tuple[str, l
 def _source(row: BudgetRow, unmeasured: Mapping[str, str]) -> dict[str, str]:
     source = get_source(row.source_id)
     c, mc = row.contribution, row.monte_carlo
-    counts = c is not None and row.status != "not applicable"
+    counts = c is not None and row.status not in ("not applicable", "left to calibration")
     return {
         "id": row.name if row.name == row.source_id else f"{row.source_id} ({row.name})",
         "title": row.title,

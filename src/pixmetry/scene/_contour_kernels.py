@@ -25,7 +25,8 @@ PANEL = 2.5  # standard deviations of blur along the outline for one panel of fi
 MOST_PANELS = 16
 _Z = np.arange(-LIMIT * PER, LIMIT * PER + 2) / PER
 CDF = np.array([0.5 * math.erfc(-z / math.sqrt(2.0)) for z in _Z])
-PDF = np.exp(-0.5 * _Z**2) / math.sqrt(2.0 * math.pi) / PER  # per entry, as the cubic wants it
+PDF = np.exp(-0.5 * _Z**2) / math.sqrt(2.0 * math.pi) / PER  # slopes of the cubic, per entry
+RAMP = _Z * CDF + PDF * PER
 ROOT = 1.0 / math.sqrt(2.0 * math.pi)
 NODES = np.array([0.04691007703066802, 0.23076534494715845, 0.5, 0.7692346550528415, 0.953089922969332])  # Gauss–Legendre on (0, 1)
 WEIGHTS = np.array([0.11846344252809454, 0.23931433524968324, 0.28444444444444444, 0.23931433524968324, 0.11846344252809454])
@@ -35,17 +36,15 @@ STEPS = np.array([-5.0, -2.5, 0.0, 2.5, 5.0])  # break points about a side of th
 @jit
 def cdf(z):
     """Distribution function of the normal distribution."""
-    if z <= -6.0:
+    if z <= -LIMIT:
         return 0.0
-    if z >= 6.0:
+    if z >= LIMIT:
         return 1.0
-    at = (z + 6.0) * 64.0
+    at = (z + LIMIT) * PER
     j = int(at)
     f = at - j
-    a, b = CDF[j], CDF[j + 1]
-    rise = b - a
-    p, q = PDF[j] - rise, PDF[j + 1] - rise
-    return a + f * rise + f * (1.0 - f) * ((1.0 - f) * p - f * q)
+    rise = CDF[j + 1] - CDF[j]
+    return CDF[j] + f * rise + f * (1.0 - f) * ((1.0 - f) * (PDF[j] - rise) - f * (PDF[j + 1] - rise))
 
 
 @jit
@@ -57,15 +56,23 @@ def pdf(z):
 @jit
 def ramp(z):
     """Integral of `cdf`."""
-    return 0.0 if z <= -6.0 else (z if z >= 6.0 else z * cdf(z) + pdf(z))
+    if z <= -LIMIT:
+        return 0.0
+    if z >= LIMIT:
+        return z
+    at = (z + LIMIT) * PER
+    j = int(at)
+    f = at - j
+    rise = RAMP[j + 1] - RAMP[j]
+    return RAMP[j] + f * rise + f * (1.0 - f) * ((1.0 - f) * (CDF[j] / PER - rise) - f * (CDF[j + 1] / PER - rise))
 
 
 @jit
 def bowl(z):
     """Integral of `ramp`."""
-    if z <= -6.0:
+    if z <= -LIMIT:
         return 0.0
-    return 0.5 * (z * z + 1.0) if z >= 6.0 else 0.5 * ((z * z + 1.0) * cdf(z) + z * pdf(z))
+    return 0.5 * (z * z + 1.0) if z >= LIMIT else 0.5 * ((z * z + 1.0) * cdf(z) + z * pdf(z))
 
 
 @jit

@@ -50,16 +50,20 @@ class Motion:
 
     def offset(self, time_s: ArrayLike, frame: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """Displacement in x and y, in pixels, at these times of these frames."""
-        t = np.asarray(time_s, float)
-        swing = np.sin(2 * np.pi * self.frequency_hz * t + np.deg2rad(self.phase_deg))
-        both = [
-            v * t + 0.5 * a * t**2 + amplitude * swing
-            for v, a, amplitude in zip(self.velocity_px_per_s, self.acceleration_px_per_s2, self.amplitude_px, strict=True)
-        ]
+        t, number = np.asarray(time_s, float), np.asarray(frame)
+        return self._along(0, t, number), self._along(1, t, number)
+
+    def _along(self, axis: int, t: np.ndarray, frame: np.ndarray) -> np.ndarray:
+        out: np.ndarray = np.float64(0)  # what is 0 is not computed at millions of points
+        if self.velocity_px_per_s[axis]:
+            out = out + self.velocity_px_per_s[axis] * t
+        if self.acceleration_px_per_s2[axis]:
+            out = out + 0.5 * self.acceleration_px_per_s2[axis] * t**2
+        if self.amplitude_px[axis]:
+            out = out + self.amplitude_px[axis] * np.sin(2 * np.pi * self.frequency_hz * t + np.deg2rad(self.phase_deg))
         if self.table_px is not None:
-            at = self.table_px[np.asarray(frame) % len(self.table_px)]
-            both = [b + at[..., i] for i, b in enumerate(both)]
-        return both[0], both[1]
+            out = out + self.table_px[:, axis][frame % len(self.table_px)]
+        return np.broadcast_to(out, np.broadcast_shapes(t.shape, frame.shape))
 
 
 STILL = Motion()

@@ -65,7 +65,9 @@ def forward(params: Defects, signal: Signal, stream: Stream) -> Signal:
     if any(p.shares.values()):
         lot = stream.uniform_fixed(signal.grid)
         for kind, (low, high) in _bands(p).items():
-            i, r, c = np.nonzero((lot >= low) & (lot < high)) if high > low else ([], [], [])
+            if low == high:
+                continue
+            i, r, c = np.nonzero((lot >= low) & (lot < high))
             if len(i):
                 single = Grid(signal.grid.frame[i], signal.rows[i, r], signal.cols[i, c], (1, 1))
                 data[i, r, c] = CHANGES[kind](p, data[i, r, c], single, stream)

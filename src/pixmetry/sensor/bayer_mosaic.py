@@ -93,6 +93,7 @@ SOURCE = Source(
     correct=correct,
     propagate=propagate,
     truth=truth,
+    option="a colour mosaic",
     gum_class="F",
     equation="µ' = µ τ_colour(row mod 2, col mod 2)",
     typical_size="0.01 px unbalanced on a disc of 7 px; none for a grey scene once the colours are balanced",

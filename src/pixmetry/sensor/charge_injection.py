@@ -97,6 +97,7 @@ SOURCE = Source(
     forward=forward,
     truth=truth,
     propagate=propagate,
+    option="a reset of its own at every pixel",
     gum_class="T",
     equation="σ = √(kTC)/q;  pattern −a e^(−t/τ);  with double sampling √2 σ_inj and a e^(−t/τ) (1 − e^(−1/2τ))",
     typical_size="40 e- for 10 fF at 300 K: 0.002 px on a disc of 7 px at 15 000 electrons",

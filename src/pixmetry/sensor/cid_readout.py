@@ -133,6 +133,7 @@ SOURCE = Source(
     context=context,
     correct=correct,
     propagate=propagate,
+    option="a charge injection device",
     gum_class="T",
     equation="σ² = σ_read²/N + σ_floor²;  y = q + κ_r ⟨q⟩_row + κ_c ⟨q⟩_col;  q(t) joined by r q(t−1)",
     typical_size="0.003 px for 16 reads of 200 e- on a disc of 7 px at 15 000 electrons",

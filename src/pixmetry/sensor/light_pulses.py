@@ -65,6 +65,7 @@ SOURCE = Source(
     forward=forward,
     truth=truth,
     applies_to=("analogue", "ccd"),
+    option="pulsed light",
     gum_class="O",
     equation="field 1: (1 − a) L(t_e − δt/2) + a ∫L;  field 2: (1 − a) L(t_e + δt/2) + a ∫L;  fields lie v δt apart",
     typical_size="0.05 px between the fields at 50 px/s and 1 ms, 0.35 px at 350 px/s",

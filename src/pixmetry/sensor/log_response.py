@@ -93,6 +93,7 @@ SOURCE = Source(
     forward=forward,
     truth=truth,
     applies_to=("cmos",),
+    option="a logarithmic response",
     gum_class="F",
     equation="y = a + b ln(1 + x/c),  b = n kT/q · gain;  lin-log: linear up to a knee, then logarithmic with the same slope",
     typical_size="a spread of a by 1–3 % of a decade is 2.3–7 % of the light: 0.005–0.016 px on a disc of 7 px (linearised)",

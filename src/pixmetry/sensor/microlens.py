@@ -70,6 +70,7 @@ SOURCE = Source(
     correct=correct,
     truth=truth,
     propagate=propagate,
+    option="shading that is given by its optical data; what is measured is in optics.shading",
     gum_class="G",
     equation="µ' = µ exp(−(θ − θ_design)²/(2 θ₀²)),  tan θ = tan θ_corner · r/r_corner;  Δx = g ⟨x²⟩",
     typical_size="0.0036 px for a gradient of 0.1 % per px on a disc of 7 px (centroid)",

@@ -75,6 +75,7 @@ SOURCE = Source(
     forward=forward,
     truth=truth,
     propagate=propagate,
+    option="a stabilised sensor",
     gum_class="D",
     equation="x' = R(ρ_f) x + t_f,  ρ_f and t_f new in every frame",
     typical_size="0.1 to 10 px, common to all targets of a frame",

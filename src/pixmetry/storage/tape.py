@@ -191,6 +191,7 @@ SOURCE = Source(
     near=near,
     tail=tail,
     applies_to=("analogue",),
+    option="a video tape recorder",
     gum_class="Tr",
     equation="y' = (h ∗ y)(t − δ_r) + n,  S_n(f) ∝ f² up to B,  δ_r = s_w n_r + s_l a_l + step;  variances × generations",
     typical_size="errors of 0.04 px grow by 1.4 (3 DN, 0.1 px) to 2.2 times (4 DN, 0.2 px); neighbouring lines that err alike are worse",

@@ -190,6 +190,7 @@ SOURCE = Source(
     forward=forward,
     context=context,
     start=start,
+    option="compressed video",
     gum_class="F",
     equation="F' = q round((F − P)/q) + P of every coefficient of the difference to the prediction P;  q = 2^((QP − 4)/6) DN at 8 bits",
     typical_size="errors of q/√12 = 2.6 DN at QP 23; a change below about q from frame to frame is not stored at all",
