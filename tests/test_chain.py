@@ -60,7 +60,7 @@ def test_every_step_is_the_camera_cut_short_there() -> None:
 def test_a_known_move_is_named_and_the_moves_add_up() -> None:
     result = walk(camera(), SCENE, seed=4)
     first, shift = result.steps[:2]
-    assert np.allclose(first.error, 0.0, atol=2e-3)  # what sampling and threshold do to a disc of 7 px
+    assert np.allclose(first.error, 0.0, atol=4e-3)  # what sampling and threshold do to a disc of 7 px
     assert np.allclose(shift.moved, (0.25, 0.0), atol=3e-3) and np.allclose(shift.expected_moved, (0.25, 0.0), atol=3e-3)
     total = np.sum([s.moved for s in result.steps[1:]], axis=0)
     assert np.allclose(total + first.error, result.steps[-1].error)

@@ -173,8 +173,11 @@ def test_switching_it_off_changes_no_draw_of_others_nor_they_its_own(source: Sou
         camera_with(source, before=[first.element]).switched(off=[NAME]).expose(SCENE, 3, seed=11)
         drawn[1] = {}
     for recorder, before in zip((first, last), drawn, strict=True):
-        assert recorder.drawn.keys() == before.keys()
-        assert all(np.array_equal(recorder.drawn[k], v, equal_nan=True) for k, v in before.items())
+        assert source.reshape is not None or recorder.drawn.keys() == before.keys()
+        for key in recorder.drawn.keys() & before.keys():
+            known = ~np.isnan(before[key]) & ~np.isnan(recorder.drawn[key])  # rows and columns that nobody asked for were not drawn
+            assert known.any() and np.array_equal(recorder.drawn[key][known], before[key][known])
+            assert source.reshape is not None or known.all()
 
 
 @every_forward

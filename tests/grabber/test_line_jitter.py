@@ -28,9 +28,12 @@ def test_moments_of_the_two_kinds() -> None:
 
 @pytest.mark.parametrize("interlaced", [True, False])
 def test_the_loop_carries_on_within_a_field(interlaced: bool) -> None:
-    """Correlation e^(−k/L) at k lines of the field, and none between fields."""
-    found = delays_ns(LineJitter(loop_ns=1.0, loop_rows=5.0, interlaced=interlaced))
-    u = Z * 1.5 / np.sqrt(N * 6)  # rows within 10 lines of each other count once
+    """Correlation e^(−k/L) at k lines of the field, and none between fields.
+
+    Products of unit variance numbers, alike over (1 + ρ²)/(1 − ρ²) = 5.1 rows; L off by a fifth would change the one at 4 lines by 0.07.
+    """
+    found = delays_ns(LineJitter(loop_ns=1.0, loop_rows=5.0, interlaced=interlaced), n=4000)
+    u = Z * np.sqrt(2 * 5.1 / (4000 * (ROWS - 8)))
     for lag in (1, 2, 3, 8):
         got = (found[:, lag:] * found[:, :-lag]).mean()
         expected = (np.exp(-lag / 2 / 5) if lag % 2 == 0 else 0.0) if interlaced else np.exp(-lag / 5)

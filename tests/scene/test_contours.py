@@ -315,3 +315,12 @@ def test_sharp_shapes_through_a_coordinate_map_are_integrated_over_the_moved_pix
             width, height = pull(u + half, v)[0] - pull(u - half, v)[0], pull(u, v + half)[1] - pull(u, v - half)[1]
             truth += scene.averaged(points(*pull(u, v)), width, height) / n**2
     np.testing.assert_allclose(light.photons()[0], truth, atol=0.15)
+
+
+@pytest.mark.parametrize("size", [0.02, 0.25, 0.5, 1.0, 1.39, 1.6])
+def test_a_few_discs_by_their_profile_are_the_discs_by_their_outline(size: float) -> None:
+    """Every number of nodes, and the outline itself for boxes wider than twice the blur."""
+    discs, shapes = Discs([X0], [Y0], 7.0, 0.7, 1.0), Shapes.of([outlines.disc(X0, Y0, 7.0, 1.0)], 0.7)
+    y, x = np.indices(SHAPE)
+    at = points(x, y)
+    np.testing.assert_allclose(discs.averaged(at, size, size), shapes.sums(at, size, size, False)[0], atol=1e-4 if size > 0.6 else 4e-5)

@@ -569,9 +569,9 @@ class _Frozen:
         out, _ = run(element.source, element.params, signal, stream, state)
         if element.remembers:
             return out
-        near = _cut(before, signal)
+        near = replace(_cut(before, signal), line=before.line)
         quiet, _ = run(element.source, element.params, near, stream)
-        return out.with_data(out.data + (_cut(after, signal).data - quiet.data))
+        return out.with_data(out.data + (_cut(after, out).data - quiet.data))
 
 
 def _cut(frame: Signal, like: Signal) -> Signal:

@@ -30,16 +30,16 @@ def kernel_of(transfer: Transfer, half_cells: int) -> np.ndarray:
     function itself; around `BAND` it goes over smoothly into the periods of the raster.
     """
     side = 2 * half_cells + 1
-    f = np.fft.fftfreq(side, 1 / FINE)
-    spectrum = np.zeros((side, side), complex)
-    for px in (-FINE, 0, FINE):  # periods of the raster
-        for py in (-FINE, 0, FINE):
-            wx, wy = _share(f + px), _share(f + py)
-            iy, ix = np.nonzero(wy)[0], np.nonzero(wx)[0]
-            if len(ix) and len(iy):
-                fy, fx = np.meshgrid(f[iy] + py, f[ix] + px, indexing="ij")
+    f_x, f_y = np.fft.rfftfreq(side, 1 / FINE), np.fft.fftfreq(side, 1 / FINE)  # the other half is the conjugate
+    spectrum = np.zeros((f_y.size, f_x.size), complex)
+    for period_x in (-FINE, 0, FINE):  # of the raster
+        for period_y in (-FINE, 0, FINE):
+            wx, wy = _share(f_x + period_x), _share(f_y + period_y)
+            ix, iy = np.flatnonzero(wx), np.flatnonzero(wy)
+            if ix.size and iy.size:
+                fy, fx = np.meshgrid(f_y[iy] + period_y, f_x[ix] + period_x, indexing="ij")
                 spectrum[np.ix_(iy, ix)] += wy[iy][:, None] * wx[ix] * transfer(fx, fy)
-    kernel = np.fft.fftshift(np.fft.ifft2(spectrum).real)
+    kernel = np.fft.fftshift(np.fft.irfft2(spectrum, s=(side, side)))
     return kernel / kernel.sum()
 
 

@@ -83,7 +83,8 @@ def forward(params: Adc, signal: Signal, stream: Stream) -> Signal:
     data = np.ascontiguousarray(signal.data, np.float32)
     factor = 1.0 + params.gain_error_rel
     if params.hysteresis_lsb:
-        data = data - np.float32(0.5 * params.hysteresis_lsb / factor) * np.sign(np.diff(data, axis=2, prepend=np.float32(0)))
+        rising = np.sign(np.diff(data, axis=2, prepend=np.float32(0)))
+        data = (data - np.float32(0.5 * params.hysteresis_lsb / factor) * rising).astype(np.float32)
     if params.offset_drift_dn_per_k or params.gain_drift_per_k:
         data = _drifted(params, data, signal.temperature_c)
     if params.equal_steps:
@@ -157,7 +158,7 @@ SOURCE = Source(
     consumes=(Kind.DN,),
     produces=Kind.CODES,
     after=("sensor", "electronics", "cable"),
-    before=("storage", "processing"),
+    before=("storage.jpeg", "storage.video_codec", "processing"),
     typical=Adc(bits=8, offset_dn=5.0, dnl_std_lsb=0.2, inl_amplitude_lsb=0.3),
     bound=Adc(bits=8, offset_dn=16.0, dnl_std_lsb=0.5, inl_amplitude_lsb=1.0),
     forward=forward,

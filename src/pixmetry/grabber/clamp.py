@@ -92,7 +92,7 @@ SOURCE = Source(
     parameters=Clamp,
     consumes=(Kind.DN,),
     after=("sensor", "electronics", "cable"),
-    before=("grabber.adc", "storage", "processing"),
+    before=("grabber.adc", "processing"),
     neutral=Clamp(),
     typical=Clamp(offset_dn=-3.0, noise_dn=0.3, drift_dn_per_k=0.05, droop_rel=0.01),
     bound=Clamp(offset_dn=-6.0, noise_dn=1.0, drift_dn_per_k=0.2, droop_rel=0.03),

@@ -72,7 +72,7 @@ def tail(params: ClockWarmUp) -> float:
 def propagate(params: ClockWarmUp, probe: Probe) -> Contribution:
     """The shift in frame 0, at the usual pixel clock: its mean over all columns, and its scatter over them."""
     cols = probe.frame_shape[1]
-    shift = shift_s(params, (np.arange(cols) + 0.5) / Clock.pixel_hz, 0.0) * Clock.pixel_hz
+    shift = shift_s(params, (np.arange(cols) + 0.5) / Clock.pixel_hz, np.zeros(1)) * Clock.pixel_hz
     return Contribution(
         u_x_px=float(shift.std()), u_y_px=0.0, bias_x_px=float(shift.mean()), gum_class="D", model_error=0.15, floor_px=0.01,
         method="shift of the samples in frame 0 over all columns",

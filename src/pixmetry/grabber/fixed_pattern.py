@@ -147,7 +147,7 @@ SOURCE = Source(
     parameters=FixedPattern,
     consumes=(Kind.DN,),
     after=("sensor", "electronics", "cable"),
-    before=("grabber.adc", "storage", "processing"),
+    before=("grabber.adc", "processing"),
     neutral=FixedPattern(),
     typical=FixedPattern(settling_dn=4.0, settling_rows=20.0, column_step_dn=0.3, random_std_dn=0.3),
     bound=FixedPattern(settling_dn=8.0, settling_rows=30.0, column_step_dn=1.0, random_std_dn=1.0),

@@ -101,7 +101,7 @@ SOURCE = Source(
     parameters=PhasePattern,
     consumes=(Kind.DN,),
     after=("sensor", "electronics", "cable"),
-    before=("grabber.adc", "storage", "processing"),
+    before=("grabber.adc", "processing"),
     neutral=PhasePattern(),
     typical=PhasePattern(amplitude_dn=0.5),
     bound=PhasePattern(amplitude_dn=1.0, frequency_x=0.05, frequency_y=0.05),

@@ -88,7 +88,7 @@ SOURCE = Source(
     parameters=WindowOffset,
     consumes=(Kind.DN,),
     after=("sensor", "electronics", "cable"),
-    before=("grabber.adc", "storage", "processing"),
+    before=("grabber.adc", "processing"),
     neutral=WindowOffset(),
     typical=WindowOffset(row_offset=6, row_increment=4, col_offset=3, inactive_rows=2),
     bound=WindowOffset(row_offset=-8, row_increment=4, col_offset=-5, inactive_rows=4),

@@ -75,7 +75,7 @@ def transfer(params: PointSpread, fx: np.ndarray, fy: np.ndarray) -> np.ndarray:
         px, py = cx[:, None] * u - cy[:, None] * v[:, None], cy[:, None] * u + cx[:, None] * v[:, None]
         dx, dy = 0.5 * sx[at][:, None], 0.5 * sy[at][:, None]
         phase = wave_aberration(params, px - dx, py - dy) - wave_aberration(params, px + dx, py + dy)
-        total += w * 0.5 * np.pi * cosine * height * half * (np.exp(2j * np.pi * phase) @ weight)
+        total += w * 0.5 * np.pi * cosine * height * half * (np.exp(2j * np.pi * phase) * weight).sum(axis=1)
     out[at] = total / np.pi
     return out.reshape(np.shape(fx))
 

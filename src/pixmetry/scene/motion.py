@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -54,7 +55,7 @@ class Motion:
         return self._along(0, t, number), self._along(1, t, number)
 
     def _along(self, axis: int, t: np.ndarray, frame: np.ndarray) -> np.ndarray:
-        out: np.ndarray = np.float64(0)  # what is 0 is not computed at millions of points
+        out: Any = np.float64(0)  # what is 0 is not computed at millions of points
         if self.velocity_px_per_s[axis]:
             out = out + self.velocity_px_per_s[axis] * t
         if self.acceleration_px_per_s2[axis]:

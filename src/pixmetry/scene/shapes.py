@@ -105,16 +105,18 @@ class Shapes:
 
     def _arrays(self, s: float) -> tuple:
         """What the kernels take for a blur ``s``."""
-        if s not in self._sets:
+        found = self._sets.get(s)
+        if found is None:
             total = (self.oval[:, 2:] ** 2).sum(axis=1)
             cross = self.oval[:, 2] * self.oval[:, 5] - self.oval[:, 3] * self.oval[:, 4]
             longer = np.sqrt(0.5 * (total + np.sqrt(np.maximum(total**2 - 4 * cross**2, 0.0))))
             count = np.maximum(np.ceil(2 * np.pi * longer / s), 12.0)
             count = np.where(count <= MOST_NODES, count, 0.0).astype(np.int64)  # NaN compares false: no ellipse
-            if len(self._sets) > 8:
+            found = (self.segments, self.start, self.height_photons, self.box, np.nan_to_num(self.oval), count, s)
+            if len(self._sets) > 8:  # threads may do this at once: what they make is the same
                 self._sets.clear()
-            self._sets[s] = (self.segments, self.start, self.height_photons, self.box, np.nan_to_num(self.oval), count, s)
-        return self._sets[s]
+            self._sets[s] = found
+        return found
 
     def render(self, grid: Grid, frame_shape: tuple[int, int], time_s: np.ndarray, exposure_s: np.ndarray, lit: bool) -> np.ndarray:
         """Light of full pixels at a time of each window, shape (n, 1, rows, cols); with ``lit`` also its first moments, (n, 3, …)."""

@@ -16,9 +16,9 @@ from pixmetry.scene.motion import STILL, Motion
 from pixmetry.scene.shapes import pixel_points
 
 OVERSAMPLING = 6  # raster steps per period of the finest detail of the intensity; splines of fifth order are good to 4e-5 of it
-LARGEST_RASTER = 4096
+LARGEST_RASTER = 2048
 MARGIN = 8.0  # periods of the finest detail around the spot
-SMALL_RASTER = 1024  # of which more realisations and boxes are kept
+SMALL_RASTER = 512  # of which more realisations and boxes are kept
 BOX_STEP = 0.02  # boxes whose sides differ by less (relative) are one: under a map that stretches, every pixel would have its own field
 
 
@@ -28,7 +28,7 @@ class Speckle:
 
     The amplitude √I exp(iφ), φ independent from place to place, passes a round pupil, which cuts it off at the frequency 1/(2 λN); the
     intensity is its square (fully developed speckle, contrast 1: Goodman, Speckle Phenomena in Optics, ch. 3). A smaller contrast is a sum
-    of independent patterns.
+    of independent patterns, 1/C² of them.
 
     The field is made once for each realisation on a raster about the spot and belongs to the spot, so windows do not change it.
 
@@ -203,7 +203,7 @@ def _splines(frozen: _Frozen, realisation: int, width_px: float, height_px: floa
     return spline_filter(seen, order=5, mode="mirror")
 
 
-_many, _few = lru_cache(maxsize=24)(_splines), lru_cache(maxsize=2)(_splines)
+_many, _few = lru_cache(maxsize=24)(_splines), lru_cache(maxsize=3)(_splines)
 
 
 def _weights(contrast: float) -> np.ndarray:
