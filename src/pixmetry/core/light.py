@@ -25,7 +25,9 @@ GAUSS = {  # nodes and weights on (-1/2, 1/2): Gauss–Legendre
     2: (np.array([-0.28867513459481287, 0.28867513459481287]), np.array([0.5, 0.5])),
     3: (np.array([-0.3872983346207417, 0.0, 0.3872983346207417]), np.array([5.0, 8.0, 5.0]) / 18),
 }
-HERMITE = (np.array([-1.7320508075688772, 0.0, 1.7320508075688772]), np.array([1.0, 4.0, 1.0]) / 6)  # of a normal with deviation 1
+LEVEL_PX2 = 0.02  # a spread that varies over the sensor is interpolated between variances so far apart
+
+SMALL_TURN = 3e-4  # rad: a pixel turned by less is taken as upright; its corners move by 2e-4 px
 
 Pull = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
@@ -336,17 +338,22 @@ class Light:
             ux, uy = x[busy], y[busy]
             some = centre.take(busy)
             total = np.zeros(len(ux))
-            spread = None if sd is None else sd[busy]
-            stride = _Strides(busy, self)
             exact = getattr(self.scene, "averaged", None)
             parts = 0 if exact is None else self._parts()
-            for dx, dy, w in self._nodes(cell, dots, spread, parts):
-                qx, qy = stride.pulled(ux + dx, uy + dy)
-                at = replace(some, x_px=qx, y_px=qy)
-                if exact is None:
-                    total += w * self.scene.radiance(at)
-                else:
-                    total += w * exact(at, *stride.size(ux + dx, uy + dy, cell[0] / parts, cell[1] / parts))
+            nodes = list(self._nodes(cell, dots, parts))
+            places = _Places(busy, self)
+            size = None if exact is None else places.size(ux, uy, cell[0] / parts, cell[1] / parts)
+            levels = [
+                (mine, share, replace(some if mine is None else some.take(mine), blur_px=np.sqrt(self.blur_px2 + variance)))
+                for mine, share, variance in _levels(None if sd is None else sd[busy] ** 2)
+            ]
+            for dx, dy, w in nodes:
+                qx, qy = places.pulled(ux + dx, uy + dy)
+                for mine, share, points in levels:
+                    every = slice(None) if mine is None else mine
+                    at = replace(points, x_px=qx[every], y_px=qy[every])
+                    seen = self.scene.radiance(at) if exact is None else exact(at, *(v if np.ndim(v) == 0 else v[every] for v in size))
+                    total[every] += w * share * seen
             out[busy] = total
         return out
 
@@ -368,23 +375,19 @@ class Light:
         parts = max(parts, (2.0 * turn / spread2**2) ** 0.25 if blur2 > 0.04 else 30.0 * np.sqrt(max(turn, shear)))
         return int(np.clip(np.ceil(parts - 1e-3), 1, 12))
 
-    def _nodes(self, cell: tuple[float, float], dots: Any, spread: Any, boxes: int = 0) -> Iterator[tuple[Any, Any, Any]]:
-        """Offsets and weights that stand for the aperture, the dots and the spread that varies; or the aperture cut into ``boxes``²."""
+    def _nodes(self, cell: tuple[float, float], dots: Any, boxes: int = 0) -> Iterator[tuple[float, float, float]]:
+        """Offsets and weights that stand for the aperture and the dots; or for the dots and the aperture cut into ``boxes``²."""
         fine = max(float(getattr(self.scene, "smooth_px", 0.0)) ** 2 + self.blur_px2, 1e-4) ** 0.5
         axes = []
         for size in cell:
-            parts = boxes or max(1, int(np.ceil(size / (2.0 * fine))))
+            parts = boxes or max(1, int(np.ceil(size / fine)))
             nodes, weights = GAUSS[1 if boxes else 3]
             start = (np.arange(parts) + 0.5) / parts - 0.5
             axes.append((size * (start[:, None] + nodes / parts).ravel(), np.tile(weights / parts, parts)))
-        hermite = [(0.0, 1.0)] if spread is None else list(zip(*HERMITE, strict=True))
         for ox, oy, ow in zip(*dots, strict=True):
             for ax, aw in zip(*axes[0], strict=True):
                 for ay, bw in zip(*axes[1], strict=True):
-                    for hx, hw in hermite:
-                        for hy, gw in hermite:
-                            sx, sy = (0.0, 0.0) if spread is None else (hx * spread, hy * spread)
-                            yield ax + sx - ox, ay + sy - oy, ow * aw * bw * hw * gw
+                    yield ax - ox, ay - oy, ow * aw * bw
 
     def _reach(self, cell_px: float, dots: tuple[np.ndarray, np.ndarray, np.ndarray]) -> np.ndarray:
         """How far in the scene's plane a cell looks, shape (n, 1, 1).
@@ -404,7 +407,25 @@ class Light:
         return reach
 
 
-class _Strides:
+def _levels(variance: np.ndarray | None) -> Iterator[tuple[np.ndarray | None, Any, float]]:
+    """The levels of variance between which points with a spread of their own lie: which points, with what share, and the level.
+
+    Light is nearly linear in the variance of a small spread (its second derivative is a quarter of the fourth in place), so two looks at
+    neighbouring levels stand for all between.
+    """
+    if variance is None:
+        yield None, 1.0, 0.0
+        return
+    at = variance / LEVEL_PX2
+    below = np.floor(at).astype(np.int64)
+    for level in np.unique(np.concatenate([below, below + 1])):
+        share = 1.0 - np.abs(at - level)
+        mine = np.flatnonzero(share > 0)
+        if len(mine):
+            yield mine, share[mine], float(level) * LEVEL_PX2
+
+
+class _Places:
     """Maps scattered points of a batch through coordinate maps that hold one value per window."""
 
     def __init__(self, busy: np.ndarray, light: Light) -> None:
