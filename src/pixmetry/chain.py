@@ -39,7 +39,7 @@ class Step:
     error, expected_error : (float, float) or None
         Centre found less the true one in px: in this frame, and as expected. None where there is no target to be seen.
     moved, expected_moved : (float, float) or None
-        What this source added to them.
+        What this source added to them, in pixels of its own frame.
     """
 
     name: str
@@ -106,11 +106,14 @@ def walk(
         scene = build_scene(read_scene(scene), camera.frame_shape)
     chosen = _choose(scene, camera, target, frame)
     half = int(np.ceil(0.5 * chosen["size_px"])) + MARGIN_PX
+    former = (1.0, 1.0)
     pairs = zip(_images(camera, scene, frame, seed, False), _images(camera, scene, frame, seed, True), strict=True)
     steps: list[Step] = []
     for (link, position, signal), (_, _, quiet) in pairs:
-        prefix = replace(camera, chain=_prefix(camera, position))
-        x, y = (float(v[0]) for v in prefix.true_positions(chosen["x_px"], chosen["y_px"], frame, seed, layout_only=True))
+        prefix = replace(camera, chain=camera.active[:position])
+        beside = [[chosen[axis], chosen[axis] + 1.0] for axis in ("x_px", "y_px")]
+        (x, x1), (y, y1) = (v.tolist() for v in prefix.true_positions(*beside, frame, seed, layout_only=True))
+        scale = (x1 - x, y1 - y)  # pixels of this frame for one of the scene
         window = _window(signal, x, y, half)
         image, expected = (_cut(s, window) for s in (signal, quiet))
         found = [_centre(v, x - window[1], y - window[0]) if chosen["found"] else None for v in (image, expected)]
@@ -128,10 +131,11 @@ def walk(
                 reference=(x, y),
                 error=error[0],
                 expected_error=error[1],
-                moved=_difference(error[0], before.error if before else None),
-                expected_moved=_difference(error[1], before.expected_error if before else None),
+                moved=_added(error[0], before.error if before else None, scale, former),
+                expected_moved=_added(error[1], before.expected_error if before else None, scale, former),
             )
         )
+        former = scale
     return Walk(camera, chosen, frame, seed, tuple(steps))
 
 
@@ -151,10 +155,6 @@ def _choose(scene: Any, camera: Camera, target: int | None, frame: int) -> dict[
     one = offered[target]
     size = float(min(one.get("size_px") or one.get("diameter_px") or 12.0, 200.0))
     return {**one, "number": target, "size_px": size, "found": True}
-
-
-def _prefix(camera: Camera, position: int) -> tuple[Any, ...]:
-    return camera.active[:position]
 
 
 def _images(camera: Camera, scene: Any, frame: int, seed: int, quiet: bool) -> Iterator[tuple[Link | None, int, Signal]]:
@@ -235,5 +235,8 @@ def _centre(image: np.ndarray, x: float, y: float) -> tuple[float, float] | None
     return best
 
 
-def _difference(a: tuple[float, float] | None, b: tuple[float, float] | None) -> tuple[float, float] | None:
-    return None if a is None or b is None else (a[0] - b[0], a[1] - b[1])
+def _added(now: Any, before: Any, scale: tuple[float, float], former: tuple[float, float]) -> tuple[float, float] | None:
+    """What came on top of an error that was already there, carried into a frame of another pixel size."""
+    if now is None or before is None:
+        return None
+    return now[0] - before[0] * scale[0] / former[0], now[1] - before[1] * scale[1] / former[1]

@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from catalogue.support import NAME, SHAPE, Amplitude, Texture, camera_with, kind_of, make_source, truth_maps
-from pixmetry.core import camera as camera_module
+from pixmetry.core import bands
 from pixmetry.core.camera import Camera, Element
 from pixmetry.core.catalogue import catalogue
 from pixmetry.core.contribution import AVERAGES
@@ -123,7 +123,7 @@ def test_windows_in_one_batch_equal_windows_one_by_one_and_the_crops(source: Sou
 @every_forward
 def test_threads_and_tiles_do_not_matter(source: Source, monkeypatch: pytest.MonkeyPatch) -> None:
     camera = camera_with(source)
-    monkeypatch.setattr(camera_module, "TILE_PIXELS", 16 * SHAPE[1])
+    monkeypatch.setattr(bands, "TILE_PIXELS", 16 * SHAPE[1])
     for threads in (1, 2):
         assert np.array_equal(camera.expose(SCENE, 3, seed=11, threads=threads).data, whole(source.id))
 

@@ -11,7 +11,7 @@ import pytest
 from catalogue.support import IDEAL, Amplitude, Flat, Nothing, Texture, lead_in, make_source
 from pixmetry.cable.termination import SOURCE as TERMINATION
 from pixmetry.cable.termination import Termination
-from pixmetry.core import camera as camera_module
+from pixmetry.core import bands
 from pixmetry.core.camera import Camera, Element, build_camera, load_camera
 from pixmetry.core.errors import ChainError, InputError
 from pixmetry.core.random import Grid
@@ -143,7 +143,7 @@ def test_bands_stitched_together_equal_the_frame_walked_as_a_whole(tile: int, le
     signal = chain.signal(SCENE, grid)
     for element in chain.links:
         signal = element.source.forward(element.params, signal, chain.streams(3).of(element.name))
-    monkeypatch.setattr(camera_module, "TILE_PIXELS", tile)
+    monkeypatch.setattr(bands, "TILE_PIXELS", tile)
     for threads in (1, 2):
         got = chain.expose(SCENE, [4], seed=3, threads=threads)
         assert np.array_equal(got.data, signal.data) and got.kind == signal.kind
@@ -166,7 +166,7 @@ def test_a_batch_of_windows_equals_the_crops_of_its_frames(monkeypatch: pytest.M
     n = 40
     frame, row, col = rng.integers(0, 3, n), rng.choice([0, 1, 30, 60, 61], n), rng.integers(0, 82, n)
     for tile in (1, 9 * 8 * 7, 1 << 30):
-        monkeypatch.setattr(camera_module, "TILE_PIXELS", tile)
+        monkeypatch.setattr(bands, "TILE_PIXELS", tile)
         got = chain.expose_windows(SCENE, Grid(frame, row, col, (9, 8)), seed=3)
         want = [frames[f, r : r + 9, c : c + 8] for f, r, c in zip(frame, row, col, strict=True)]
         assert np.array_equal(got, want)
@@ -327,7 +327,7 @@ def test_a_camera_survives_its_file(tmp_path: Path) -> None:
         {"source": "sensor.prnu", "parameters": {"pixel_std_rel": 0.02}},
         {"source": "sensor.prnu", "name": "more", "enabled": False, "parameters": {}},
     ]
-    record = {"schema": camera_module.SCHEMA, "name": "c", "rows": 8, "cols": 9, "pitch_x_um": 5.0, "unit_seed": 4, "chain": chain}
+    record = {"schema": "pixmetry/camera/1", "name": "c", "rows": 8, "cols": 9, "pitch_x_um": 5.0, "unit_seed": 4, "chain": chain}
     first = build_camera(record)
     assert first.pitch_um == (5.0, 5.0)
     first.save(tmp_path / "c.yaml")

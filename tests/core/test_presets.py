@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from catalogue.support import Texture
-from pixmetry.core import camera as camera_module
+from pixmetry.core import bands
 from pixmetry.core.camera import Camera, load_camera
 from pixmetry.core.random import Grid
 
@@ -59,7 +59,7 @@ def test_a_preset_makes_the_same_bits_however_it_is_cut(name: str, monkeypatch: 
         r, c, h, w = window
         assert np.array_equal(camera.expose(SCENE, 4, seed=5, window=window).data, whole[:, r : r + h, c : c + w])
     assert np.array_equal(camera.expose(SCENE, [2, 3], seed=5).data, whole[2:])
-    monkeypatch.setattr(camera_module, "TILE_PIXELS", 16 * SMALL[1])
+    monkeypatch.setattr(bands, "TILE_PIXELS", 16 * SMALL[1])
     for threads in (1, 2):
         assert np.array_equal(camera.expose(SCENE, 4, seed=5, threads=threads).data, whole)
     if not any(link.remembers for link in camera.links):

@@ -14,13 +14,33 @@ import click
 @click.option("--target", type=click.IntRange(0), help="Number of the scene's target; by default the one nearest to the middle.")
 @click.option("--frame", type=click.IntRange(0), default=0, show_default=True, help="Number of the frame in the sequence.")
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Of the exposures.")
-def chain(camera: str, scene: Path, output: Path, target: int | None, frame: int, seed: int) -> None:
+@click.option(
+    "--set",
+    "settings",
+    multiple=True,
+    metavar="NAME.PARAMETER=VALUE",
+    help="Change a parameter of a source of the camera, or a value of the camera itself. May be repeated.",
+)
+@click.option("--off", multiple=True, metavar="NAME", help="Switch a source of the camera off. May be repeated.")
+def chain(
+    camera: str,
+    scene: Path,
+    output: Path,
+    target: int | None,
+    frame: int,
+    seed: int,
+    settings: tuple[str, ...],
+    off: tuple[str, ...],
+) -> None:
     """Walk one target through the chain of a camera.
 
     CAMERA is a camera file or the name of a preset; SCENE is a scene file. The page shows the image and its profiles after every source, how far
     the target's centre has moved so far, and which source moved it.
     """
     from pixmetry.chain import walk
+    from pixmetry.core.camera import load_camera
+    from pixmetry.core.overrides import changed_camera, parse_overrides
     from pixmetry.report.chain_page import write_chain_page
 
-    click.echo(f"page: {write_chain_page(walk(camera, scene, target=target, frame=frame, seed=seed), output)}")
+    changed = changed_camera(load_camera(camera), parse_overrides(settings), off)
+    click.echo(f"page: {write_chain_page(walk(changed, scene, target=target, frame=frame, seed=seed), output)}")

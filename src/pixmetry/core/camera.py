@@ -10,29 +10,20 @@ from typing import Any
 
 import numpy as np
 
-from pixmetry.core._camera_kernels import cut_windows
-from pixmetry.core.conversions import LOOK, Link, conversion, linked, look
+from pixmetry.core.bands import cut_bands, find_segment, stitch
+from pixmetry.core.camera_files import build_camera, load_camera, to_record
+from pixmetry.core.chain_order import Element, check_chain, in_order
+from pixmetry.core.conversions import LOOK, Link, linked, look
 from pixmetry.core.errors import ChainError, InputError
+from pixmetry.core.frozen import Frozen, freeze
 from pixmetry.core.light import Light, Scene
+from pixmetry.core.quiet import QuietStreams
 from pixmetry.core.random import Grid, Streams
 from pixmetry.core.signal import Clock, Kind, Signal, Windows
-from pixmetry.core.source import Source, run
+from pixmetry.core.source import run
 from pixmetry.core.threads import imap_tiles, map_tiles
 
-TILE_PIXELS = 1 << 16  # of float32: a tile and its copies stay in the second-level cache
 BATCH_PIXELS = 1 << 18  # of the small windows that are run as one batch: enough that the calls cost little beside the work
-BAND_ROWS = 16  # tiles of whole frames are bands of a multiple of this, the largest block of a codec
-SCHEMA = "pixmetry/camera/1"
-
-
-@dataclass(frozen=True)
-class Element:
-    """One place in a chain: a source under a name of its own, with parameters; switched on or off."""
-
-    name: str
-    source: Source
-    params: Any
-    on: bool = True
 
 
 @dataclass(frozen=True)
@@ -273,7 +264,7 @@ class Camera:
         """
         if mode not in ("exact", "frozen"):
             raise InputError("no such mode", value=mode, allowed="exact, frozen")
-        frozen = self._freeze(background, schedule) if mode == "frozen" else None
+        frozen = freeze(self, background, schedule) if mode == "frozen" else None
         if frozen is None and any(e.remembers for e in self.links):
             raise InputError("a source with a memory cannot be run on single windows exactly", remedy="use iter_frames, or mode='frozen'")
         task = _Task(scene, self.streams(seed, quiet), schedule, threads, frozen)
@@ -342,7 +333,7 @@ class Camera:
         signal: Signal | None = None
         at = 0
         while at < len(elements) or signal is None:
-            axis, end = self._segment(elements, at, needs[at])
+            axis, end = find_segment(elements, at, needs[at])
             segment = elements[at:end]
 
             def band(windows: Windows, segment: Sequence[Link] = segment, source: Signal | None = signal) -> Signal:
@@ -350,51 +341,10 @@ class Camera:
                 part = source.crop(local[0]) if source is not None else self.signal(task.scene, _grid_at(grid, local[0]), **task.schedule)
                 return self._walk(task, part, segment, local)
 
-            parts = imap_tiles(band, _bands(needs[end], axis), task.threads)
-            signal = _stitch(parts, _grid_at(grid, needs[end]), axis or 0)
+            parts = imap_tiles(band, cut_bands(needs[end], axis), task.threads)
+            signal = stitch(parts, _grid_at(grid, needs[end]), axis or 0)
             at = end
         return signal
-
-    def _segment(self, elements: Sequence[Link], start: int, windows: Windows) -> tuple[int | None, int]:
-        """Return along which axis bands can be cut from element ``start`` on (0 rows, 1 columns, None whole), and how far."""
-        best: tuple[int | None, int] = (None, start + 1)
-        for axis in (0, 1):
-            probe = _bands(windows, axis, probe=True)
-            end = start
-            while end < len(elements) and all(
-                _same_span(elements[end].source.window_needed(elements[end].params, p, elements[end].shape), p, axis) for p in probe
-            ):
-                end += 1
-            if end > start and (best[0] is None or end > best[1]):
-                best = (axis, end)
-        if start == len(elements):
-            return 0, start
-        return best
-
-    def _freeze(self, background: Scene | None, schedule: Mapping[str, Any]) -> _Frozen:
-        """Run the noise-free background frame once and keep what sources with a far context need of it."""
-        far = [e.name for e in self.links if e.far or e.remembers]
-        if not far:
-            return _Frozen({})
-        if background is None:
-            raise InputError("the mode 'frozen' needs the background scene", value=", ".join(far), remedy="give it as background=")
-        streams = self.streams(0, quiet=True)
-        rows, cols = self.frame_shape
-        grid = Grid.whole([0], (rows, cols))
-        scalars: dict[str, Any] = {
-            k: (np.asarray(v).ravel()[:1] if k in ("exposure_s", "temperature_c") and v is not None else v) for k, v in schedule.items()
-        }
-        signal = self.signal(background, grid, **scalars)
-        kept: dict[str, tuple[Signal, Signal, Any]] = {}
-        for element in self.links:
-            stream = streams.of(element.name)
-            before, state = signal, None
-            if element.remembers:
-                state = _settled(element, signal, stream)
-            signal, _ = run(element.source, element.params, signal, stream, state)
-            if element.name in far:
-                kept[element.name] = (before, signal, state)
-        return _Frozen(kept)
 
     # ---- geometry -------------------------------------------------------------------------------------------------------------
 
@@ -450,19 +400,7 @@ class Camera:
 
     def to_record(self) -> dict[str, Any]:
         """Return the plain record that `load_camera` reads."""
-        record: dict[str, Any] = {"schema": SCHEMA, "name": self.name, "rows": self.frame_shape[0], "cols": self.frame_shape[1]}
-        if self.pitch_um is not None:
-            record |= {"pitch_x_um": self.pitch_um[0], "pitch_y_um": self.pitch_um[1]}
-        record |= {"exposure_s": self.exposure_s, "temperature_c": self.temperature_c, "unit_seed": self.unit_seed}
-        optional = ("warm_up_k", "warm_up_s", "pixel_clock_hz", "line_period_s")
-        record |= {n: getattr(self, n) for n in optional if getattr(self, n) != type(self).__dataclass_fields__[n].default}
-        record["facts"] = dict(self.facts)
-        record["chain"] = [
-            {"source": e.source.id, **({"name": e.name} if e.name != e.source.id else {}), **({} if e.on else {"enabled": False})}
-            | {"parameters": e.params.model_dump(mode="json")}
-            for e in self.chain
-        ]
-        return record
+        return to_record(self)
 
     def save(self, path: str | Path) -> None:
         """Write the camera as a preset (YAML)."""
@@ -479,7 +417,7 @@ class _Task:
     streams: Streams
     schedule: Mapping[str, Any]
     threads: int | None = None
-    frozen: _Frozen | None = None
+    frozen: Frozen | None = None
     rendered: dict[Any, tuple[bytes, np.ndarray]] | None = None  # photons of the windows of one frame, for scenes that stand still
 
     def look(self, signal: Signal) -> Signal:
@@ -506,97 +444,6 @@ class _NoScene:
     moving = False
 
 
-class _Quiet:
-    """A stream whose temporal draws are at their mean; what is fixed in the unit is drawn as always."""
-
-    quiet = True
-
-    def __init__(self, stream: Any) -> None:
-        self._stream = stream
-
-    def __getattr__(self, name: str) -> Any:
-        if name.endswith(("_fixed", "_unit")):
-            return getattr(self._stream, name)
-        raise AttributeError(name)
-
-    def normal(self, grid: Grid, draw: int = 0) -> np.ndarray:
-        return np.zeros(grid.size, np.float32)
-
-    def normal_rows(self, grid: Grid, draw: int = 0) -> np.ndarray:
-        return np.zeros(grid.size[:2], np.float32)
-
-    def normal_cols(self, grid: Grid, draw: int = 0) -> np.ndarray:
-        return np.zeros((grid.size[0], grid.size[2]), np.float32)
-
-    def normal_frames(self, grid: Grid, draw: int = 0) -> np.ndarray:
-        return np.zeros(grid.size[0], np.float32)
-
-    def uniform(self, grid: Grid, draw: int = 0) -> np.ndarray:
-        return np.full(grid.size, 0.5, np.float32)
-
-    def uniform_frames(self, grid: Grid, draw: int = 0) -> np.ndarray:
-        return np.full(grid.size[0], 0.5, np.float32)
-
-    def poisson(self, mean: np.ndarray, grid: Grid, draw: int = 0) -> np.ndarray:
-        return _fresh(mean, grid)
-
-    def add_normal(self, data: np.ndarray, grid: Grid, scale: Any, draw: int = 0) -> np.ndarray:
-        return _fresh(data, grid)
-
-
-def _fresh(data: np.ndarray, grid: Grid) -> np.ndarray:
-    """A copy, as every draw returns: the caller may go on in place."""
-    return np.array(np.broadcast_to(data, grid.size), np.float32)
-
-
-@dataclass(frozen=True)
-class QuietStreams(Streams):
-    """Streams of which every temporal draw is at its mean."""
-
-    def of(self, instance_name: str) -> Any:
-        return _Quiet(super().of(instance_name))
-
-
-@dataclass(frozen=True)
-class _Frozen:
-    """Noise-free background before and after each source with a far context, and the settled state of those with a memory."""
-
-    elements: Mapping[str, tuple[Signal, Signal, Any]]
-
-    def apply(self, element: Link, signal: Signal, stream: Any) -> Signal:
-        """Run a source on the near context, and correct for the far one by the same run on the noise-free frame."""
-        before, after, state = self.elements[element.name]
-        out, _ = run(element.source, element.params, signal, stream, state)
-        if element.remembers:
-            return out
-        near = replace(_cut(before, signal), line=before.line)
-        quiet, _ = run(element.source, element.params, near, stream)
-        return out.with_data(out.data + (_cut(after, out).data - quiet.data))
-
-
-def _cut(frame: Signal, like: Signal) -> Signal:
-    """Cut the windows of one signal out of a whole frame."""
-    data = cut_windows(np.ascontiguousarray(frame.data[0], np.float32), like.grid.row0, like.grid.col0, *like.data.shape[1:])
-    return like.with_data(data, frame.kind)
-
-
-def _settled(element: Link, signal: Signal, stream: Any, most: int = 400) -> Any:
-    """Run a source with a memory over the same frame until its state no longer changes."""
-    source: Any = element.source
-    state = source.start(element.params)
-    try:
-        np.asarray(state, float)
-    except TypeError:
-        raise InputError(f"{element.name} has no state that it settles to", remedy="switch it off: it needs whole sequences") from None
-    for _ in range(most):
-        _, following = source.forward(element.params, signal, stream, state)
-        change = np.max(np.abs(np.asarray(following, float) - np.asarray(state, float)))
-        state = following
-        if change <= 1e-7 * np.max(np.abs(np.asarray(state, float))):
-            return state
-    raise InputError(f"{element.name} does not settle on the background", remedy="check its parameters, or use mode='exact'")
-
-
 def _sub_grid(grid: Grid, index: np.ndarray) -> Grid:
     return Grid(grid.frame[index], grid.row0[index], grid.col0[index], grid.shape)
 
@@ -614,43 +461,6 @@ def _grid_at(grid: Grid, windows: Windows) -> Grid:
     return Grid(grid.frame, windows.row0, windows.col0, (int(windows.rows[0]), int(windows.cols[0])))
 
 
-def _same_span(needed: Windows, given: Windows, axis: int) -> bool:
-    """Whether a source needs just the rows (axis 0) or columns (axis 1) that it makes."""
-    names = ("row0", "rows") if axis == 0 else ("col0", "cols")
-    return all(np.array_equal(getattr(needed, f), getattr(given, f)) for f in names)
-
-
-def _bands(windows: Windows, axis: int | None, probe: bool = False) -> list[Windows]:
-    """Cut one window into bands along an axis, at multiples of `BAND_ROWS`; for a probe, two of the bands suffice."""
-    if axis is None:
-        return [windows]
-    r0, c0, h, w = (int(v[0]) for v in (windows.row0, windows.col0, windows.rows, windows.cols))
-    start, length, other = (r0, h, w) if axis == 0 else (c0, w, h)
-    step = max(1, TILE_PIXELS // max(1, other) // BAND_ROWS) * BAND_ROWS
-    if probe:
-        step = BAND_ROWS
-    edges = [start, *range((start // BAND_ROWS + 1) * BAND_ROWS, start + length, step), start + length]
-    pairs = list(zip(edges[:-1], edges[1:], strict=True))
-    if probe:
-        pairs = [pairs[0], pairs[len(pairs) // 2], pairs[-1]]
-    return [Windows.one(a, c0, b - a, w) if axis == 0 else Windows.one(r0, a, h, b - a) for a, b in pairs]
-
-
-def _stitch(parts: Iterable[Signal], grid: Grid, axis: int) -> Signal:
-    """Join bands along an axis; each is let go of as soon as it is copied, so that few of them exist at a time."""
-    whole: Signal | None = None
-    at = 0
-    for part in parts:
-        if part.data.shape == grid.size:
-            return part
-        if whole is None:
-            whole = replace(part, data=np.empty(grid.size, part.data.dtype), grid=grid)
-        place = slice(at, at + part.data.shape[axis + 1])
-        whole.data[(slice(None), place) if axis == 0 else (slice(None), slice(None), place)] = part.data
-        at = place.stop
-    return whole
-
-
 def _concatenate(parts: list[Signal]) -> Signal:
     if len(parts) == 1:
         return parts[0]
@@ -663,143 +473,6 @@ def _concatenate(parts: list[Signal]) -> Signal:
 
 
 _ARRAYS = ("data", "exposure_s", "time_s", "temperature_c")  # of a signal, one entry per window
-
-
-def check_chain(chain: Sequence[Element], where: str = "camera") -> None:
-    """Check names, kinds and declared order of a chain.
-
-    Raises
-    ------
-    ChainError
-        Naming the first two elements that do not fit together.
-    """
-    names = [e.name for e in chain]
-    for name in names:
-        if names.count(name) > 1:
-            raise ChainError(f"the name {name!r} is used twice", where=where, remedy="give each source a name of its own")
-    kind = Kind.LIGHT
-    for i, element in enumerate(chain):
-        source = element.source
-        if not element.on:
-            continue
-        if source.forward is None:
-            raise ChainError(f"{element.name} cannot stand in a camera: {source.reasons['forward']}", where=where, remedy="take it out")
-        step = conversion(kind, source.consumes)
-        if step is not None:
-            kind = step.produces
-        if kind not in source.consumes:
-            raise ChainError(
-                f"{element.name} cannot follow: it takes {', '.join(source.consumes)} and gets {Kind.PHOTONS if kind is Kind.LIGHT else kind}",
-                where=where,
-                remedy="change the order",
-            )
-        kind = source.produces or kind
-        for later in chain[i + 1 :]:
-            if _named(later.source, source.after) and later.on:
-                raise ChainError(f"{element.name} must come after {later.name}", where=where, remedy="change the order")
-        for earlier in chain[:i]:
-            if _named(earlier.source, source.before) and earlier.on:
-                raise ChainError(f"{element.name} must come before {earlier.name}", where=where, remedy="change the order")
-
-
-RANK = {Kind.LIGHT: 0, Kind.PHOTONS: 1, Kind.ELECTRONS: 2, Kind.DN: 3, Kind.VIDEO: 3, Kind.CODES: 4}  # in which a chain goes through them
-
-
-def in_order(sources: Iterable[Source]) -> list[Source]:
-    """Sort sources into an order in which a camera takes them: by their kinds, their ``after`` and ``before``, and their stages.
-
-    Raises
-    ------
-    ChainError
-        If they have no such order.
-    """
-    from pixmetry.core.catalogue import STAGES
-
-    left, done = list(sources), []
-
-    def must_wait(source: Source, other: Source) -> bool:
-        """Whether ``source`` comes after ``other``: by what they take, else as they say, else by stage."""
-        ranks = [[RANK[kind] for kind in s.consumes] for s in (source, other)]
-        if min(ranks[0]) > max(ranks[1]) or max(ranks[0]) < min(ranks[1]):
-            return min(ranks[0]) > max(ranks[1])
-        if _named(other, source.after) or _named(source, other.before):
-            return True
-        if _named(source, other.after) or _named(other, source.before):
-            return False
-        if source.stage != other.stage:
-            return STAGES.index(source.stage) > STAGES.index(other.stage)
-        converts = other.produces is not None and other.produces in source.consumes and not set(source.consumes) & set(other.consumes)
-        would_not_be_taken = source.produces is not None and source.produces not in other.consumes
-        return converts or would_not_be_taken
-
-    while left:
-        free = next((s for s in left if not any(must_wait(s, o) for o in left if o is not s)), None)
-        if free is None:
-            raise ChainError("these sources have no order", value=[s.id for s in left], remedy="check their after and before")
-        left.remove(free)
-        done.append(free)
-    return done
-
-
-def _named(source: Source, names: tuple[str, ...]) -> bool:
-    return source.id in names or source.stage in names
-
-
-def build_camera(record: Mapping[str, Any], where: str = "camera") -> Camera:
-    """Build a camera from its plain record.
-
-    Raises
-    ------
-    InputError, ChainError
-        With the place in the record that cannot be used.
-    """
-    from pixmetry.core.camera_schema import CameraRecord
-    from pixmetry.core.catalogue import get_source
-    from pixmetry.core.config import validate
-
-    checked = validate(CameraRecord, record, where)
-    elements = []
-    pitch = None if checked.pitch_x_um is None else (checked.pitch_x_um, checked.pitch_y_um or checked.pitch_x_um)
-    known = {} if pitch is None else {"pitch_x_um": pitch[0], "pitch_y_um": pitch[1], "pitch_um": pitch[0]}  # the camera's own, unless a source says otherwise
-    for i, entry in enumerate(checked.chain):
-        source = get_source(entry.source)
-        own = {name: value for name, value in known.items() if name in source.parameters.model_fields}
-        params = source.make(own | entry.parameters, where=f"{where}, chain[{i}] {entry.source}")
-        elements.append(Element(entry.name or entry.source, source, params, entry.enabled))
-    return Camera(
-        checked.name,
-        (checked.rows, checked.cols),
-        tuple(elements),
-        pitch,
-        checked.exposure_s,
-        checked.temperature_c,
-        checked.unit_seed,
-        checked.facts,
-        checked.warm_up_k,
-        checked.warm_up_s,
-        checked.pixel_clock_hz,
-        checked.line_period_s,
-    )
-
-
-def load_camera(path: str | Path) -> Camera:
-    """Read a camera from its YAML file, or one of the presets by its name.
-
-    Raises
-    ------
-    InputError, ChainError
-        If there is no such file or preset, or it cannot be used.
-    """
-    from importlib.resources import files
-
-    from pixmetry.core.config import load_yaml
-
-    presets = {p.name.removesuffix(".yaml"): p for p in (files("pixmetry") / "cameras").iterdir() if p.name.endswith(".yaml")}
-    if str(path) in presets:
-        path = Path(str(presets[str(path)]))
-    elif not Path(path).is_file():
-        raise InputError("no such camera file or preset", value=str(path), allowed=f"a YAML file, or one of {', '.join(sorted(presets))}")
-    return build_camera(load_yaml(path), where=str(path))
 
 
 __all__ = ["Camera", "Element", "Scene", "build_camera", "check_chain", "in_order", "load_camera"]

@@ -77,7 +77,6 @@ SOURCE = Source(
     title="Column noise",
     description="The amplifiers and converters at the foot of the columns wander: vertical stripes that a dark frame of yesterday leaves.",
     number=0,
-    note="successor 52",
     parameters=ColumnNoise,
     consumes=(Kind.DN,),
     after=("sensor", "electronics.gain"),

@@ -86,7 +86,6 @@ SOURCE = Source(
     title="Flicker noise",
     description="The 1/f noise of the output amplifier runs along the rows: neighbours in a row share it, rows differ in their mean.",
     number=0,
-    note="1/f noise: a successor of the amplifier noise of row 18",
     parameters=FlickerNoise,
     consumes=(Kind.ELECTRONS,),
     after=("sensor",),

@@ -100,7 +100,6 @@ SOURCE = Source(
     id="electronics.hdr_gain",
     title="Stitching of two gains",
     description="Bright pixels are read at a low gain and scaled up: at the switch the signal jumps, above it noise and columns differ.",
-    note="modern cameras",
     parameters=HdrGain,
     consumes=(Kind.DN,),
     after=("sensor", "electronics.gain"),

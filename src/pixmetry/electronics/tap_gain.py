@@ -98,7 +98,6 @@ SOURCE = Source(
     title="Gain of the taps",
     description="Parts of the frame that go through different amplifiers differ in gain: steps at the borders, stripes of odd columns.",
     number=19,
-    note="non-uniform gain",
     parameters=TapGain,
     consumes=(Kind.DN,),
     after=("sensor", "electronics.gain"),

@@ -107,7 +107,6 @@ SOURCE = Source(
     title="Random telegraph noise",
     description="Single traps in the first transistor of some pixels catch and free one electron: the pixel blinks between a few levels.",
     number=0,
-    note="successor 57",
     parameters=TelegraphNoise,
     consumes=(Kind.ELECTRONS,),
     after=("sensor",),

@@ -97,7 +97,6 @@ SOURCE = Source(
     description="Interference from a clock or a supply beats with the sampling and lies over the frame as a wave, standing or moving.",
     number=34,
     stars=1,
-    note="",
     parameters=PhasePattern,
     consumes=(Kind.DN,),
     after=("sensor", "electronics", "cable"),

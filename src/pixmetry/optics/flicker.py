@@ -118,7 +118,6 @@ SOURCE = Source(
     id="optics.flicker",
     title="Flicker of the light",
     description="Light that changes at 100 Hz or at a dimmer's frequency gives unequal frames, and bands under a rolling shutter.",
-    note="successor of supply pick-up",
     parameters=Flicker,
     consumes=(Kind.LIGHT,),
     before=("sensor",),

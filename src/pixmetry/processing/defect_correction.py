@@ -51,7 +51,6 @@ SOURCE = Source(
     title="Defect correction",
     description="Single bright or dark pixels are replaced by the median of their neighbours: also the peak of a target of one pixel.",
     number=17,
-    note="successor 56: the correction as a source of error",
     parameters=DefectCorrection,
     consumes=(Kind.CODES,),
     after=("sensor", "electronics", "cable", "grabber"),

@@ -119,7 +119,6 @@ SOURCE = Source(
     title="Demosaicing",
     description="Two of three colours of every pixel come from its neighbours, in another way at each of four places: targets shift.",
     number=0,
-    note="successor 53",
     parameters=Demosaic,
     consumes=(Kind.CODES,),
     after=("sensor", "electronics", "cable", "grabber", "processing.defect_correction"),

@@ -57,7 +57,6 @@ SOURCE = Source(
     title="Spatial noise reduction",
     description="Noise is smoothed; so are small targets, and what a filter does to an edge depends on the noise on it.",
     number=0,
-    note="successor 56",
     parameters=NoiseReduction,
     consumes=(Kind.CODES,),
     after=("sensor", "electronics", "cable", "grabber", "processing.defect_correction"),

@@ -70,7 +70,6 @@ SOURCE = Source(
     title="Sharpening",
     description="Edges get a rim that is too bright inside and too dark outside; noise grows, and neighbours share it.",
     number=0,
-    note="successor 56",
     parameters=Sharpening,
     consumes=(Kind.CODES,),
     after=("sensor", "electronics", "cable", "grabber", "processing.noise_reduction"),

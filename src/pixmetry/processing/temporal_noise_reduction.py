@@ -50,7 +50,6 @@ SOURCE = Source(
     title="Temporal noise reduction",
     description="A recursive filter over the frames lowers the noise of what rests, and drags a tail behind what moves.",
     number=0,
-    note="successor 55",
     parameters=TemporalNoiseReduction,
     consumes=(Kind.CODES,),
     after=("sensor", "electronics", "cable", "grabber", "processing.defect_correction"),

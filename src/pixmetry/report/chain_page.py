@@ -84,7 +84,7 @@ def _card(number: int, step: Step, has_target: bool) -> dict[str, Any]:
 
 
 def _picture(number: int, step: Step) -> Picture:
-    """The window with the true and the found centre, and the row and column through the true one."""
+    """The window with the true and the found centre, and the row and column through the found one."""
     col0, row0 = step.origin
     rows, cols = step.image.shape
     extent = (col0 - 0.5, col0 + cols - 0.5, row0 + rows - 0.5, row0 - 0.5)
@@ -97,7 +97,8 @@ def _picture(number: int, step: Step) -> Picture:
         left.plot([x], [y], "+", color=BLUE, markersize=7, markeredgewidth=1.0)
         if step.error is not None:
             left.plot([x + step.error[0]], [y + step.error[1]], "x", color=RED, markersize=5, markeredgewidth=1.0)
-        r, c = (int(np.clip(np.rint(v) - o, 0, n - 1)) for v, o, n in ((y, row0, rows), (x, col0, cols)))
+        dx, dy = step.error or (0.0, 0.0)
+        r, c = (int(np.clip(np.rint(v) - o, 0, n - 1)) for v, o, n in ((y + dy, row0, rows), (x + dx, col0, cols)))
         right.step(np.arange(cols) + col0 - x, step.image[r], where="mid", color=BLUE)
         right.step(np.arange(rows) + row0 - y, step.image[:, c], where="mid", color=RED, linestyle=(0, (3, 1.5)))
         right.set_xlabel("px from the true centre")
@@ -121,6 +122,7 @@ def _path(walk: Walk) -> Picture:
             axes.plot(seen, at, color=colour, marker=marker, linestyle="none", label=f"{name}, this frame")
         axes.set_yticks(at, [s.name for s in steps], color=INK, fontsize=6.5)
         axes.invert_yaxis()
+        axes.locator_params(axis="x", nbins=5)
         axes.set_xlabel("centre found less true centre / px")
         figure.legend(loc="outside upper center", ncols=2, handlelength=2)
         last = steps[-1]

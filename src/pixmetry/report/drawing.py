@@ -102,7 +102,7 @@ def _slim(svg: str, name: str, alt: str) -> str:
     for colour, variable in VARIABLES.items():
         svg = svg.replace(colour, f"var(--{variable})")
     svg = re.sub(r"'DejaVu Sans'(, [^;\"]+)?", "var(--sans)", svg)
-    svg = re.sub(r"(\d+\.\d{2})\d+", r"\1", svg)
+    svg = re.sub(r"<[^>]*>", lambda tag: re.sub(r"(\d+\.\d{2})\d+", r"\1", tag[0]), svg)  # coordinates, not the labels between tags
     svg = re.sub(r'href="data:image/png;base64,([^"]+)"', lambda m: f'href="{_palette_png(m[1])}"', svg)
     return re.sub(r">\s+<", "><", re.sub(r"\s*\n\s*", " ", svg))
 

@@ -62,7 +62,6 @@ SOURCE = Source(
     id="sensor.parasitic_light",
     title="Parasitic light sensitivity",
     description="The stores of a global shutter gather stray light until they are read: a gradient over the rows, and ghosts.",
-    note="successor of frame-transfer smear",
     parameters=ParasiticLight,
     consumes=(Kind.LIGHT,),
     after=("sensor.exposure",),

@@ -102,7 +102,7 @@ SOURCE = Source(
     title="Read-out modes of a progressive sensor",
     description="Both fields of one exposure may be woven in the wrong order, which swaps the rows of every pair; single fields have half "
     "the rows, so small targets show a larger periodic error.",
-    note="section 3.2",
+    note="Section 3.2",
     parameters=ReadOut,
     consumes=(Kind.ELECTRONS,),
     after=("sensor.shot_noise", "sensor.full_well", "sensor.blooming"),

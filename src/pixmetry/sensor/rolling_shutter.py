@@ -54,7 +54,6 @@ SOURCE = Source(
     id="sensor.rolling_shutter",
     title="Rolling shutter",
     description="Rows are exposed one after the other; a moving target is sheared and stretched, and flickering light becomes bands.",
-    note="successor of interlacing",
     parameters=RollingShutter,
     consumes=(Kind.LIGHT,),
     after=("sensor.exposure",),

@@ -44,7 +44,6 @@ SOURCE = Source(
     id="sensor.trigger_jitter",
     title="Trigger and time-stamp jitter",
     description="The exposure begins later than its time stamp says, by a constant, a drift and a random part; what moves is elsewhere.",
-    note="successor of line jitter in digital cameras",
     parameters=TriggerJitter,
     consumes=(Kind.LIGHT,),
     after=("sensor.exposure", "sensor.interlace", "sensor.light_pulses", "sensor.rolling_shutter", "sensor.parasitic_light"),

@@ -128,7 +128,6 @@ SOURCE = Source(
     description="The cosine coefficients of 8 × 8 blocks are rounded; targets shift by where they lie in their block.",
     number=35,
     stars=1,
-    note="",
     parameters=Jpeg,
     consumes=(Kind.CODES,),
     after=("sensor", "electronics", "cable", "grabber"),

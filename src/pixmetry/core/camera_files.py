@@ -1,0 +1,80 @@
+"""Cameras as plain records and YAML files: written, read, built."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pixmetry.core.chain_order import Element
+from pixmetry.core.errors import InputError
+
+if TYPE_CHECKING:
+    from pixmetry.core.camera import Camera
+
+SCHEMA = "pixmetry/camera/1"
+
+
+def to_record(camera: Camera) -> dict[str, Any]:
+    """Return the plain record that `load_camera` reads."""
+    record: dict[str, Any] = {"schema": SCHEMA, "name": camera.name, "rows": camera.frame_shape[0], "cols": camera.frame_shape[1]}
+    if camera.pitch_um is not None:
+        record |= {"pitch_x_um": camera.pitch_um[0], "pitch_y_um": camera.pitch_um[1]}
+    record |= {"exposure_s": camera.exposure_s, "temperature_c": camera.temperature_c, "unit_seed": camera.unit_seed}
+    optional = ("warm_up_k", "warm_up_s", "pixel_clock_hz", "line_period_s")
+    record |= {n: getattr(camera, n) for n in optional if getattr(camera, n) != type(camera).__dataclass_fields__[n].default}
+    record["facts"] = dict(camera.facts)
+    record["chain"] = [
+        {"source": e.source.id, **({"name": e.name} if e.name != e.source.id else {}), **({} if e.on else {"enabled": False})}
+        | {"parameters": e.params.model_dump(mode="json")}
+        for e in camera.chain
+    ]
+    return record
+
+
+def build_camera(record: Mapping[str, Any], where: str = "camera") -> Camera:
+    """Build a camera from its plain record.
+
+    Raises
+    ------
+    InputError, ChainError
+        With the place in the record that cannot be used.
+    """
+    from pixmetry.core.camera import Camera
+    from pixmetry.core.camera_schema import CameraRecord
+    from pixmetry.core.catalogue import get_source
+    from pixmetry.core.config import validate
+
+    checked = validate(CameraRecord, record, where)
+    elements = []
+    pitch = None if checked.pitch_x_um is None else (checked.pitch_x_um, checked.pitch_y_um or checked.pitch_x_um)
+    # the camera's own pitch, unless a source says otherwise
+    known = {} if pitch is None else {"pitch_x_um": pitch[0], "pitch_y_um": pitch[1], "pitch_um": pitch[0]}
+    for i, entry in enumerate(checked.chain):
+        source = get_source(entry.source)
+        own = {name: value for name, value in known.items() if name in source.parameters.model_fields}
+        params = source.make(own | entry.parameters, where=f"{where}, chain[{i}] {entry.source}")
+        elements.append(Element(entry.name or entry.source, source, params, entry.enabled))
+    same = ("exposure_s", "temperature_c", "unit_seed", "facts", "warm_up_k", "warm_up_s", "pixel_clock_hz", "line_period_s")
+    settings = {name: getattr(checked, name) for name in same}
+    return Camera(checked.name, (checked.rows, checked.cols), tuple(elements), pitch, **settings)
+
+
+def load_camera(path: str | Path) -> Camera:
+    """Read a camera from its YAML file, or one of the presets by its name.
+
+    Raises
+    ------
+    InputError, ChainError
+        If there is no such file or preset, or it cannot be used.
+    """
+    from importlib.resources import files
+
+    from pixmetry.core.config import load_yaml
+
+    presets = {p.name.removesuffix(".yaml"): p for p in (files("pixmetry") / "cameras").iterdir() if p.name.endswith(".yaml")}
+    if str(path) in presets:
+        path = Path(str(presets[str(path)]))
+    elif not Path(path).is_file():
+        raise InputError("no such camera file or preset", value=str(path), allowed=f"a YAML file, or one of {', '.join(sorted(presets))}")
+    return build_camera(load_yaml(path), where=str(path))

@@ -1,0 +1,102 @@
+"""The order of a chain: which sources may follow each other, and how to sort them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from pixmetry.core.conversions import conversion
+from pixmetry.core.errors import ChainError
+from pixmetry.core.signal import Kind
+from pixmetry.core.source import Source
+
+
+@dataclass(frozen=True)
+class Element:
+    """One place in a chain: a source under a name of its own, with parameters; switched on or off."""
+
+    name: str
+    source: Source
+    params: Any
+    on: bool = True
+
+
+def check_chain(chain: Sequence[Element], where: str = "camera") -> None:
+    """Check names, kinds and declared order of a chain.
+
+    Raises
+    ------
+    ChainError
+        Naming the first two elements that do not fit together.
+    """
+    names = [e.name for e in chain]
+    for name in names:
+        if names.count(name) > 1:
+            raise ChainError(f"the name {name!r} is used twice", where=where, remedy="give each source a name of its own")
+    kind = Kind.LIGHT
+    for i, element in enumerate(chain):
+        source = element.source
+        if not element.on:
+            continue
+        if source.forward is None:
+            raise ChainError(f"{element.name} cannot stand in a camera: {source.reasons['forward']}", where=where, remedy="take it out")
+        step = conversion(kind, source.consumes)
+        if step is not None:
+            kind = step.produces
+        if kind not in source.consumes:
+            raise ChainError(
+                f"{element.name} cannot follow: it takes {', '.join(source.consumes)} and gets {Kind.PHOTONS if kind is Kind.LIGHT else kind}",
+                where=where,
+                remedy="change the order",
+            )
+        kind = source.produces or kind
+        for later in chain[i + 1 :]:
+            if _named(later.source, source.after) and later.on:
+                raise ChainError(f"{element.name} must come after {later.name}", where=where, remedy="change the order")
+        for earlier in chain[:i]:
+            if _named(earlier.source, source.before) and earlier.on:
+                raise ChainError(f"{element.name} must come before {earlier.name}", where=where, remedy="change the order")
+
+
+RANK = {Kind.LIGHT: 0, Kind.PHOTONS: 1, Kind.ELECTRONS: 2, Kind.DN: 3, Kind.VIDEO: 3, Kind.CODES: 4}  # in which a chain goes through them
+
+
+def in_order(sources: Iterable[Source]) -> list[Source]:
+    """Sort sources into an order in which a camera takes them: by their kinds, their ``after`` and ``before``, and their stages.
+
+    Raises
+    ------
+    ChainError
+        If they have no such order.
+    """
+    from pixmetry.core.catalogue import STAGES
+
+    left, done = list(sources), []
+
+    def must_wait(source: Source, other: Source) -> bool:
+        """Whether ``source`` comes after ``other``: by what they take, else as they say, else by stage."""
+        ranks = [[RANK[kind] for kind in s.consumes] for s in (source, other)]
+        if min(ranks[0]) > max(ranks[1]) or max(ranks[0]) < min(ranks[1]):
+            return min(ranks[0]) > max(ranks[1])
+        if _named(other, source.after) or _named(source, other.before):
+            return True
+        if _named(source, other.after) or _named(other, source.before):
+            return False
+        if source.stage != other.stage:
+            return STAGES.index(source.stage) > STAGES.index(other.stage)
+        converts = other.produces is not None and other.produces in source.consumes and not set(source.consumes) & set(other.consumes)
+        would_not_be_taken = source.produces is not None and source.produces not in other.consumes
+        return converts or would_not_be_taken
+
+    while left:
+        free = next((s for s in left if not any(must_wait(s, o) for o in left if o is not s)), None)
+        if free is None:
+            raise ChainError("these sources have no order", value=[s.id for s in left], remedy="check their after and before")
+        left.remove(free)
+        done.append(free)
+    return done
+
+
+def _named(source: Source, names: tuple[str, ...]) -> bool:
+    return source.id in names or source.stage in names

@@ -1,0 +1,86 @@
+"""The mode ``frozen``: windows in which all that lies far away comes from a noise-free frame that is run once."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pixmetry.core._camera_kernels import cut_windows
+from pixmetry.core.conversions import Link
+from pixmetry.core.errors import InputError
+from pixmetry.core.light import Scene
+from pixmetry.core.random import Grid
+from pixmetry.core.signal import Signal
+from pixmetry.core.source import run
+
+if TYPE_CHECKING:
+    from pixmetry.core.camera import Camera
+
+
+@dataclass(frozen=True)
+class Frozen:
+    """Noise-free background before and after each source with a far context, and the settled state of those with a memory."""
+
+    elements: Mapping[str, tuple[Signal, Signal, Any]]
+
+    def apply(self, element: Link, signal: Signal, stream: Any) -> Signal:
+        """Run a source on the near context, and correct for the far one by the same run on the noise-free frame."""
+        before, after, state = self.elements[element.name]
+        out, _ = run(element.source, element.params, signal, stream, state)
+        if element.remembers:
+            return out
+        near = replace(_cut(before, signal), line=before.line)
+        quiet, _ = run(element.source, element.params, near, stream)
+        return out.with_data(out.data + (_cut(after, out).data - quiet.data))
+
+
+def _cut(frame: Signal, like: Signal) -> Signal:
+    """Cut the windows of one signal out of a whole frame."""
+    data = cut_windows(np.ascontiguousarray(frame.data[0], np.float32), like.grid.row0, like.grid.col0, *like.data.shape[1:])
+    return like.with_data(data, frame.kind)
+
+
+def _settled(element: Link, signal: Signal, stream: Any, most: int = 400) -> Any:
+    """Run a source with a memory over the same frame until its state no longer changes."""
+    source: Any = element.source
+    state = source.start(element.params)
+    try:
+        np.asarray(state, float)
+    except TypeError:
+        raise InputError(f"{element.name} has no state that it settles to", remedy="switch it off: it needs whole sequences") from None
+    for _ in range(most):
+        _, following = source.forward(element.params, signal, stream, state)
+        change = np.max(np.abs(np.asarray(following, float) - np.asarray(state, float)))
+        state = following
+        if change <= 1e-7 * np.max(np.abs(np.asarray(state, float))):
+            return state
+    raise InputError(f"{element.name} does not settle on the background", remedy="check its parameters, or use mode='exact'")
+
+
+def freeze(camera: Camera, background: Scene | None, schedule: Mapping[str, Any]) -> Frozen:
+    """Run the noise-free background frame once and keep what sources with a far context need of it."""
+    far = [e.name for e in camera.links if e.far or e.remembers]
+    if not far:
+        return Frozen({})
+    if background is None:
+        raise InputError("the mode 'frozen' needs the background scene", value=", ".join(far), remedy="give it as background=")
+    streams = camera.streams(0, quiet=True)
+    rows, cols = camera.frame_shape
+    grid = Grid.whole([0], (rows, cols))
+    scalars: dict[str, Any] = {
+        k: (np.asarray(v).ravel()[:1] if k in ("exposure_s", "temperature_c") and v is not None else v) for k, v in schedule.items()
+    }
+    signal = camera.signal(background, grid, **scalars)
+    kept: dict[str, tuple[Signal, Signal, Any]] = {}
+    for element in camera.links:
+        stream = streams.of(element.name)
+        before, state = signal, None
+        if element.remembers:
+            state = _settled(element, signal, stream)
+        signal, _ = run(element.source, element.params, signal, stream, state)
+        if element.name in far:
+            kept[element.name] = (before, signal, state)
+    return Frozen(kept)
