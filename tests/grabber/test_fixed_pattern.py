@@ -33,6 +33,17 @@ def test_rows_settle_and_columns_alternate_about_zero() -> None:
     assert wide[:4].tolist() == [11.5, 9.5, 9.5, 9.5] and wide.mean() == pytest.approx(10.0)
 
 
+def test_in_fields_it_settles_line_by_line() -> None:
+    """Row 2 l + f is line l of its field: a line takes 64 µs, so in a frame of two fields the level falls half as fast from row to row."""
+    fields = FixedPattern(settling_dn=4.0, settling_rows=12.0, interlaced=True)
+    out = forward(fields, flat(10.0, (60, 8), kind=Kind.DN), stream()).data[0, :, 0] - 10
+    each = 4 * np.exp(-np.arange(30) * 64e-6 / (6 * 64e-6))  # 12 rows are 6 lines of a field
+    np.testing.assert_allclose(out[0::2], each, atol=2e-5)
+    np.testing.assert_array_equal(out[1::2], out[0::2])
+    part = forward(fields, flat(10.0, (7, 8), kind=Kind.DN, row0=11, frame_shape=(60, 8)), stream()).data[0, :, 0] - 10
+    np.testing.assert_array_equal(part, out[11:18])
+
+
 def test_grain_is_fixed_and_of_the_size_given() -> None:
     """40 000 pixels know their standard deviation to 0.35 %."""
     out = forward(FixedPattern(random_std_dn=0.8), flat(10.0, (200, 200), n=2, kind=Kind.DN), stream()).data

@@ -20,16 +20,38 @@ def cut_windows(frame, row0, col0, rows, cols):
 
 @jit
 def decimate(fine, mask, step, rows, cols):
-    """Return the sums of ``fine`` under the mask at every ``step``-th cell, shape (n, rows, cols)."""
-    n = fine.shape[0]
-    out = np.empty((n, rows, cols), np.float64)
-    height, width = mask.shape
+    """Return the sums of ``fine`` under the mask at every ``step``-th cell, shape (n, rows, cols).
+
+    Every row of ``fine`` is split into its ``step`` phases, in which the cells that neighbouring sums take lie side by side.
+    """
+    n, height, width = fine.shape[0], mask.shape[0], mask.shape[1]
+    out = np.zeros((n, rows, cols), np.float64)
+    taps = -(-width // step)
+    padded = np.zeros((height, taps * step), np.float64)
+    padded[:, :width] = mask
+    phases = np.zeros((step, cols + taps), np.float64)
     for i in range(n):
-        for r in range(rows):
-            for c in range(cols):
-                total = 0.0
-                for a in range(height):
-                    for b in range(width):
-                        total += mask[a, b] * fine[i, r * step + a, c * step + b]
-                out[i, r, c] = total
+        for line in range((rows - 1) * step + height):
+            for phase in range(step):
+                for c in range(min(cols + taps, (fine.shape[2] - phase + step - 1) // step)):
+                    phases[phase, c] = fine[i, line, c * step + phase]
+            for r in range(max(0, -((height - 1 - line) // step)), min(rows, line // step + 1)):
+                for tap in range(taps):
+                    _add_taps(out[i, r], phases, tap, padded[line - r * step, tap * step : (tap + 1) * step])
     return out
+
+
+@jit
+def _add_taps(out, phases, first, weights):
+    """Add to every sum one cell of each phase, the ``first`` of them to sum 0."""
+    end = first + len(out)
+    if len(weights) == 4:  # side by side, so that the sums are loaded and stored once for all four
+        w0, w1, w2, w3 = weights[0], weights[1], weights[2], weights[3]
+        p0, p1, p2, p3 = phases[0, first:end], phases[1, first:end], phases[2, first:end], phases[3, first:end]
+        for c in range(len(out)):
+            out[c] = out[c] + w0 * p0[c] + w1 * p1[c] + w2 * p2[c] + w3 * p3[c]
+        return
+    for phase in range(len(weights)):
+        weight, cells = weights[phase], phases[phase, first:end]
+        for c in range(len(out)):
+            out[c] += weight * cells[c]

@@ -354,7 +354,8 @@ class Camera:
         """Return where points of the scene's plane lie in a frame that the camera puts out.
 
         Every geometric effect of that frame counts: distortion, tilt, drift, pixel clock, offsets. What moves a measured centre by spreading
-        light or signal (a low-pass, echoes, charge left behind), and what moves single rows, does not: that is the error.
+        light or signal (a low-pass, echoes, charge left behind), and what delays rows (jitter, the warm-up of a grabber), does not: that is
+        the error.
 
         Parameters
         ----------

@@ -11,6 +11,7 @@ from pixmetry.core.errors import ChainError
 from pixmetry.core.signal import Kind
 from pixmetry.core.source import Source
 
+RANK = {Kind.LIGHT: 0, Kind.PHOTONS: 1, Kind.ELECTRONS: 2, Kind.DN: 3, Kind.VIDEO: 3, Kind.CODES: 4}  # in which a chain goes through them
 
 @dataclass(frozen=True)
 class Element:
@@ -52,14 +53,11 @@ def check_chain(chain: Sequence[Element], where: str = "camera") -> None:
             )
         kind = source.produces or kind
         for later in chain[i + 1 :]:
-            if _named(later.source, source.after) and later.on:
+            if _named(later.source, source.after) and later.on and not _by_kind(source, later.source):
                 raise ChainError(f"{element.name} must come after {later.name}", where=where, remedy="change the order")
         for earlier in chain[:i]:
-            if _named(earlier.source, source.before) and earlier.on:
+            if _named(earlier.source, source.before) and earlier.on and not _by_kind(source, earlier.source):
                 raise ChainError(f"{element.name} must come before {earlier.name}", where=where, remedy="change the order")
-
-
-RANK = {Kind.LIGHT: 0, Kind.PHOTONS: 1, Kind.ELECTRONS: 2, Kind.DN: 3, Kind.VIDEO: 3, Kind.CODES: 4}  # in which a chain goes through them
 
 
 def in_order(sources: Iterable[Source]) -> list[Source]:
@@ -76,9 +74,8 @@ def in_order(sources: Iterable[Source]) -> list[Source]:
 
     def must_wait(source: Source, other: Source) -> bool:
         """Whether ``source`` comes after ``other``: by what they take, else as they say, else by stage."""
-        ranks = [[RANK[kind] for kind in s.consumes] for s in (source, other)]
-        if min(ranks[0]) > max(ranks[1]) or max(ranks[0]) < min(ranks[1]):
-            return min(ranks[0]) > max(ranks[1])
+        if _by_kind(source, other):
+            return _by_kind(source, other) > 0
         if _named(other, source.after) or _named(source, other.before):
             return True
         if _named(source, other.after) or _named(other, source.before):
@@ -96,6 +93,12 @@ def in_order(sources: Iterable[Source]) -> list[Source]:
         left.remove(free)
         done.append(free)
     return done
+
+
+def _by_kind(source: Source, other: Source) -> int:
+    """1 if what they take leaves ``source`` only places after ``other``, -1 before it, 0 if both ways are open."""
+    mine, others = ([RANK[kind] for kind in s.consumes] for s in (source, other))
+    return (min(mine) > max(others)) - (max(mine) < min(others))
 
 
 def _named(source: Source, names: tuple[str, ...]) -> bool:

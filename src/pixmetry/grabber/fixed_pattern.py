@@ -17,15 +17,17 @@ class FixedPattern(Parameters):
     """What the grabber adds to every frame alike."""
 
     settling_dn: float = quantity(0.0, "DN", "error of the black level in row 0", ge=-1e3, le=1e3)
-    settling_rows: float = quantity(10.0, "rows", "rows over which it falls to 1/e", gt=0.1, le=1e4)
+    settling_rows: float = quantity(10.0, "rows", "rows of the frame over which it falls to 1/e", gt=0.1, le=1e4)
+    interlaced: bool = quantity(False, "1", "whether even and odd rows are two fields, in each of which it settles line by line (2 rows)")
     column_step_dn: float = quantity(0.0, "DN", "height of one column in every period over the others", ge=-1e3, le=1e3)
     column_period: int = quantity(2, "px", "period of the columns' pattern, as the number of converters that take turns", ge=2, le=64)
     random_std_dn: float = quantity(0.0, "DN", "standard deviation of the fixed grain from pixel to pixel", ge=0, le=1e3)
 
 
 def settling(params: FixedPattern, rows: np.ndarray) -> np.ndarray:
-    """Error of the black level in DN at absolute rows: B e^(−r/r_s)."""
-    return params.settling_dn * np.exp(-np.asarray(rows, float) / params.settling_rows)
+    """Error of the black level in DN at absolute rows: B e^(−r/r_s); in fields both rows of a pair are the same line."""
+    line = np.asarray(rows) // 2 * 2 if params.interlaced else np.asarray(rows)
+    return params.settling_dn * np.exp(-line.astype(float) / params.settling_rows)
 
 
 def channel(params: FixedPattern, cols: np.ndarray) -> np.ndarray:
@@ -119,13 +121,16 @@ def _fit_step(profile: np.ndarray) -> Estimates:
 def propagate(params: FixedPattern, probe: Probe) -> Contribution:
     """Settling (P2) for a target anywhere in the frame, the columns' pattern at each of its phases, the grain as white noise (P1)."""
     n, rows, cols = probe.gx.shape
-    field = np.broadcast_to(settling(params, np.arange(rows))[:, None], (n, rows, cols))
     first_rows = np.arange(max(probe.frame_shape[0] - rows, 0) + 1)
-    fall = np.exp(-first_rows / params.settling_rows)
-    settle = [np.mean(shift) * fall for shift in probe.field(field)]
-    step = [probe.field(np.broadcast_to(channel(params, np.arange(cols) + k), (n, rows, cols))) for k in range(params.column_period)]
+    step = 2 if params.interlaced else 1
+    settle = np.empty((2, len(first_rows)))
+    for begin in range(step):
+        field = np.broadcast_to(settling(params, np.arange(rows) + begin)[:, None], (n, rows, cols))
+        fall = np.exp(-(first_rows[begin::step] - begin) / params.settling_rows)
+        settle[:, begin::step] = [np.mean(shift) * fall for shift in probe.field(field)]
+    stripes = [probe.field(np.broadcast_to(channel(params, np.arange(cols) + k), (n, rows, cols))) for k in range(params.column_period)]
     grain = probe.white(params.random_std_dn)
-    u = [np.sqrt(np.var(settle[a]) + np.mean([s[a] ** 2 for s in step]) + grain[a] ** 2) for a in (0, 1)]
+    u = [np.sqrt(np.var(settle[a]) + np.mean([s[a] ** 2 for s in stripes]) + grain[a] ** 2) for a in (0, 1)]
     return Contribution(
         u_x_px=float(u[0]),
         u_y_px=float(u[1]),
@@ -156,7 +161,7 @@ SOURCE = Source(
     propagate=propagate,
     applies_to=("analogue",),
     gum_class="F",
-    equation="y' = y + B e^(−r/r_s) + a ([c mod p = 0] − 1/p) + s n_rc",
+    equation="y' = y + B e^(−r/r_s) + a ([c mod p = 0] − 1/p) + s n_rc;  interlaced: 2 (r div 2) in place of r",
     typical_size="0.035 px for a ramp of 0.2 DN a row under a disc of 7 px of 150 DN (centroid, window radius 6)",
     references=("EMVA 1288 R4.0 Linear, §8.2 (row, column and pixel parts)",),
     advice="Leave out the first lines, subtract a mean dark frame of the same grabber, or subtract the background around each target.",
