@@ -9,11 +9,13 @@ import time
 from collections.abc import Callable
 
 import numpy as np
+from goals import verdict
 
 from pixmetry.core.random import Grid, Streams
 
 SHAPE = (512, 512)
 FRAMES = 16
+GOAL = 1.0
 
 
 def best_s(action: Callable[[], object], rounds: int = 7) -> float:
@@ -27,15 +29,17 @@ def best_s(action: Callable[[], object], rounds: int = 7) -> float:
     return min(times)
 
 
-def report(label: str, count: int, ours: Callable[[], object], theirs: Callable[[np.random.Generator], object]) -> None:
-    """Print one line: our rate, then NumPy's with the ratio to it."""
+def report(label: str, count: int, ours: Callable[[], object], theirs: Callable[[np.random.Generator], object]) -> float:
+    """Print one line: our rate, then NumPy's with the ratio to it; return the least ratio of the rates."""
     rate = count / best_s(ours) / 1e6
-    line = f"{label:<28}{rate:8.0f} M/s"
+    line, ratios = f"{label:<28}{rate:8.0f} M/s", []
     for bits in (np.random.SFC64, np.random.Philox):
         generator = np.random.Generator(bits(1))
         reference = count / best_s(lambda generator=generator: theirs(generator), 3) / 1e6
         line += f"   {bits.__name__} {reference:5.0f} M/s (x{rate / reference:.1f})"
+        ratios.append(rate / reference)
     print(line)
+    return min(ratios)
 
 
 def main() -> None:
@@ -44,12 +48,15 @@ def main() -> None:
     grid = Grid.whole(range(FRAMES), SHAPE)
     count = int(np.prod(grid.size))
     data = np.ones(grid.size, np.float32)
-    report("normal", count, lambda: stream.normal(grid), lambda g: g.standard_normal(grid.size, np.float32))
+    normal = report("normal", count, lambda: stream.normal(grid), lambda g: g.standard_normal(grid.size, np.float32))
     report("uniform", count, lambda: stream.uniform(grid), lambda g: g.random(grid.size, np.float32))
     report("add_normal", count, lambda: stream.add_normal(data, grid, 2.0), lambda g: data + 2 * g.standard_normal(grid.size, np.float32))
+    poisson = []
     for mean in (0.1, 2.0, 5.0, 10.0, 100.0, 1e4, 1e6):
-        means = np.full(grid.size, mean, np.float32)
-        report(f"poisson, mean {mean:g}", count, lambda means=means: stream.poisson(means, grid), lambda g, means=means: g.poisson(means))
+        means, label = np.full(grid.size, mean, np.float32), f"poisson, mean {mean:g}"
+        poisson.append(report(label, count, lambda means=means: stream.poisson(means, grid), lambda g, means=means: g.poisson(means)))
+    verdict("rate of normal numbers over NumPy's faster generator", normal, GOAL, at_least=True)
+    verdict("rate of Poisson numbers over NumPy's, at the worst mean", min(poisson), GOAL, at_least=True)
     windows = Grid(np.arange(64), np.arange(64) * 7, np.arange(64) * 5, (24, 24))
     means = np.full(windows.size, 500, np.float32)
     one = Grid.whole([0], (1, 1))

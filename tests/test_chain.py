@@ -76,6 +76,12 @@ def test_the_target_can_be_chosen_and_a_wrong_one_is_refused() -> None:
         walk(camera(), SCENE, frame=-1)
 
 
+def test_a_target_out_of_sight_is_refused() -> None:
+    scene = {"schema": "pixmetry/scene/1", "targets": [{"kind": "disc", "x_px": 5000, "y_px": 40, "diameter_px": 7}]}
+    with pytest.raises(InputError, match="outside of the frame"):
+        walk(camera(), scene)
+
+
 def test_a_later_frame_of_a_camera_with_a_memory() -> None:
     full = camera()
     agc = get_source("electronics.agc")

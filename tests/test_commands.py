@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import imagecodecs
@@ -14,6 +15,7 @@ from click.testing import CliRunner, Result
 from pixmetry.campaign import load_campaign, read_frame
 from pixmetry.cli import main
 from pixmetry.core.camera import load_camera
+from pixmetry.core.catalogue import catalogue
 
 CAMERA = """\
 schema: pixmetry/camera/1
@@ -156,6 +158,17 @@ def test_the_catalogue_as_json() -> None:
         shown = run("sources", source_id)
         assert shown.exit_code == 0
         assert "equation" in shown.output
+
+
+def test_parameters_can_be_read_on_a_narrow_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No name is cut, for it is typed again in --set; and choices are named."""
+    monkeypatch.setenv("COLUMNS", "80")
+    for source_id, source in catalogue().items():
+        shown = run("sources", source_id).output
+        assert [name for name in source.parameters.model_fields if name not in shown] == [], source_id
+    assert re.search(r"first_field +1 +even, odd", run("sources", "sensor.interlace").output)
+    assert re.search(r"interlaced +1 +true, false", run("sources", "grabber.line_jitter").output)
+    assert "…" not in run("sources").output
 
 
 def write_campaign(folder: Path, frames: dict[str, list[np.ndarray]], bits: int = 12) -> Path:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -336,3 +337,78 @@ def test_the_python_call_refuses_like_the_command(tmp_path: Path) -> None:
         with pytest.raises(InputError):
             simulate(camera, SCENE, tmp_path / "out", **wrong)
     assert list(tmp_path.iterdir()) == []
+
+
+# ---- what a user may get wrong ------------------------------------------------------------------------------------------------
+
+
+def test_the_truth_lists_targets_in_the_order_of_the_file(tmp_path: Path) -> None:
+    kinds = [(10.0, False), (30.0, True), (50.0, False), (70.0, True)]
+    targets = [{"kind": "disc", "x_px": x, "y_px": 20.0, "diameter_px": 5, "still": still} for x, still in kinds]
+    scene = {"schema": "pixmetry/scene/1", "targets": targets, "motion": {"velocity_px_per_s": [100, 0]}}
+    device = replace(load_camera("imx264_like"), frame_shape=(40, 80))
+    simulate(device, scene, tmp_path / "out", frames=2)
+    told = json.loads((tmp_path / "out" / "truth.json").read_text())["targets"]
+    first = [t["scene_x_px"][0] if isinstance(t["scene_x_px"], list) else t["scene_x_px"] for t in told]
+    assert np.allclose(first, [10.5, 30.0, 50.5, 70.0])  # 100 px/s and the middle of 10 ms
+
+
+def test_a_series_tells_the_temperature_at_which_it_was_taken(folder: Path) -> None:
+    done(run(folder, "--set", "warm_up_k=20", "--set", "warm_up_s=1000", "--set", "temperature_c=40", scene="series.yaml"))
+    frames = json.loads((folder / "out" / "truth.json").read_text())["frames"]
+    campaign = load_campaign(folder / "out")
+    assert campaign.camera.temperature_c == pytest.approx(np.mean([f["temperature_c"] for f in frames]), abs=1e-3)
+    assert campaign.camera.temperature_c < 21  # the whole series is taken in seconds
+
+
+def test_a_wrong_target_names_its_scene_file(folder: Path) -> None:
+    (folder / "ring.yaml").write_text(
+        "schema: pixmetry/scene/1\ntargets: [{kind: ring, x_px: 5, y_px: 9, diameter_px: 7, inner_px: 9}]\n"
+    )
+    for command in ("simulate", "chain"):
+        result = CliRunner().invoke(main, [command, str(folder / "camera.yaml"), str(folder / "ring.yaml"), "-o", str(folder / "out")])
+        assert result.exit_code == 2 and "ring.yaml: ring.inner_px" in result.output
+
+
+def test_a_scene_pair_that_is_one_number_is_explained(folder: Path) -> None:
+    (folder / "scene.yaml").write_text(SCENE_FILE + "motion: {velocity_px_per_s: 5}\n")
+    result = run(folder)
+    assert result.exit_code == 2 and "brackets" in result.output and "line 4" in result.output
+
+
+def test_an_unknown_source_names_its_place_in_the_camera_file(folder: Path) -> None:
+    (folder / "camera.yaml").write_text(CAMERA.replace("sensor.prnu", "sensor.pnru"))
+    result = run(folder)
+    assert result.exit_code == 2 and "camera.yaml, chain[1]" in result.output and "--source-file" in result.output
+
+
+def test_a_setting_without_a_parameter_is_explained(folder: Path) -> None:
+    result = run(folder, "--set", "sensor.prnu=3")
+    assert result.exit_code == 2 and "sensor.prnu.PARAMETER=VALUE" in result.output
+
+
+def test_a_folder_of_a_scene_is_no_campaign(folder: Path) -> None:
+    done(run(folder))
+    with pytest.raises(InputError, match="no campaign") as caught:
+        load_campaign(folder / "out")
+    assert "photon_transfer" in caught.value.remedy
+
+
+def test_a_full_disk_is_one_line_and_leaves_the_old_frames(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    done(run(folder))
+    before = sorted(p.name for p in folder.rglob("*"))
+
+    def full(*_: object, **__: object) -> str:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("pixmetry.simulation.FrameWriter.write", full)
+    result = run(folder, "-n", 3)
+    assert result.exit_code == 2 and result.output == "error: No space left on device; to do: make room, or choose another folder\n"
+    assert sorted(p.name for p in folder.rglob("*")) == before
+
+
+@pytest.mark.parametrize(("name", "words"), [("x" * 300, "shorter name"), ("c\udcff", "no UTF-8")])
+def test_names_that_a_disk_or_a_record_cannot_hold_are_one_line(folder: Path, name: str, words: str) -> None:
+    result = run(folder, output=name)
+    assert result.exit_code == 2 and result.output.count("\n") == 1 and words in result.output
+    assert not [p for p in folder.iterdir() if "partial" in p.name]

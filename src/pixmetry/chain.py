@@ -103,8 +103,9 @@ def walk(
     if isinstance(scene, str | Path | Mapping):
         from pixmetry.scene.files import build_scene, read_scene
 
-        scene = build_scene(read_scene(scene), camera.frame_shape)
-    chosen = _choose(scene, camera, target, frame)
+        where = "scene" if isinstance(scene, Mapping) else str(scene)
+        scene = build_scene(read_scene(scene), camera.frame_shape, where)
+    chosen = _choose(scene, camera, target, frame, seed)
     half = int(np.ceil(0.5 * chosen["size_px"])) + MARGIN_PX
     former = (1.0, 1.0)
     pairs = zip(_images(camera, scene, frame, seed, False), _images(camera, scene, frame, seed, True), strict=True)
@@ -139,7 +140,7 @@ def walk(
     return Walk(camera, chosen, frame, seed, tuple(steps))
 
 
-def _choose(scene: Any, camera: Camera, target: int | None, frame: int) -> dict[str, Any]:
+def _choose(scene: Any, camera: Camera, target: int | None, frame: int, seed: int) -> dict[str, Any]:
     """The target to follow: its place and size in the scene's plane."""
     rows, cols = camera.frame_shape
     exposed = camera.signal(scene, Grid(np.array([frame]), np.zeros(1), np.zeros(1), (1, 1)))
@@ -153,6 +154,13 @@ def _choose(scene: Any, camera: Camera, target: int | None, frame: int) -> dict[
     if target is None:
         target = int(np.argmin([np.hypot(t["x_px"] - 0.5 * (cols - 1), t["y_px"] - 0.5 * (rows - 1)) for t in offered]))
     one = offered[target]
+    (x,), (y,) = camera.true_positions(one["x_px"], one["y_px"], frame, seed)
+    out_rows, out_cols = camera.output_shape
+    if not (-0.5 <= x <= out_cols - 0.5 and -0.5 <= y <= out_rows - 0.5):
+        place = f"x {one['x_px']:g}, y {one['y_px']:g} px"
+        allowed = f"a place that a frame of {out_cols} x {out_rows} pixels shows"
+        remedy = "choose another with --target, or move it"
+        raise InputError(f"target {target} lies outside of the frame", value=place, allowed=allowed, remedy=remedy)
     size = float(min(one.get("size_px") or one.get("diameter_px") or 12.0, 200.0))
     return {**one, "number": target, "size_px": size, "found": True}
 

@@ -135,7 +135,7 @@ def simulate(
     if image_format not in FORMATS:
         raise InputError("no such image format", value=image_format, allowed=", ".join(FORMATS))
     bits = stored_bits(device)
-    parts = _series(model, frames, overrides) if model.photon_transfer is not None else _sequence(device, model, frames)
+    parts = _series(model, frames, overrides) if model.photon_transfer is not None else _sequence(device, model, frames, scene)
     shape = _checked_window(device, window)[2:]
     with staged_output(output, "simulation") as folder:
         count = sum(len(p.numbers) for p in parts)
@@ -149,7 +149,8 @@ def simulate(
                 notes.add(files[-1][-1], part.scene, signal, **part.schedule)
                 told("exposing frames", len(notes.frames), count)
         if model.photon_transfer is not None:
-            _write_manifest(device, bits, parts, files, folder)
+            temperature_c = float(np.mean([f["temperature_c"] for f in notes.frames]))  # not the settled one while a camera warms up
+            _write_manifest(device, bits, round(temperature_c, 3), parts, files, folder)
         changed = {"overrides": dict(overrides or {}), "off": list(off)}
         inputs = _hashes(camera, scene)
         write_json(folder / "truth.json", notes.record() | changed | {"provenance": provenance_record(inputs, seed=seed)})
@@ -199,10 +200,11 @@ def _checked_window(camera: Camera, window: Window | None) -> Window:
     return row0, col0, h, w
 
 
-def _sequence(camera: Camera, model: SceneModel, frames: int) -> list[_Part]:
+def _sequence(camera: Camera, model: SceneModel, frames: int, source: Any) -> list[_Part]:
     if frames < 1:
         raise InputError("no frame is asked for", value=frames, allowed="1 or more")
-    return [_Part(build_scene(model, camera.frame_shape), range(frames), "frame", {})]
+    where = str(source) if isinstance(source, str | Path) else "scene"
+    return [_Part(build_scene(model, camera.frame_shape, where), range(frames), "frame", {})]
 
 
 def _series(model: SceneModel, frames: int, overrides: Mapping[str, Any] | None) -> list[_Part]:
@@ -220,11 +222,13 @@ def _series(model: SceneModel, frames: int, overrides: Mapping[str, Any] | None)
     return parts
 
 
-def _write_manifest(camera: Camera, bits: int, parts: Sequence[_Part], files: Sequence[Sequence[str]], folder: Path) -> None:
+def _write_manifest(
+    camera: Camera, bits: int, temperature_c: float, parts: Sequence[_Part], files: Sequence[Sequence[str]], folder: Path
+) -> None:
     from pixmetry.core.config import dump_yaml
 
     facts: dict[str, Any] = {"name": camera.name, "bits": bits, "interface": camera.facts.get("interface", "digital")}
-    facts |= {"temperature_c": camera.temperature_c} | ({"sensor": camera.facts["sensor"]} if "sensor" in camera.facts else {})
+    facts |= {"temperature_c": temperature_c} | ({"sensor": camera.facts["sensor"]} if "sensor" in camera.facts else {})
     if camera.pitch_um is not None:
         facts |= {"pitch_x_um": camera.pitch_um[0], "pitch_y_um": camera.pitch_um[1]}
     entries = [dict(p.entry or {}) | {"files": list(names)} for p, names in zip(parts, files, strict=True)]

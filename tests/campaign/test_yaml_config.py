@@ -45,7 +45,7 @@ def refused(text: str, tmp_path: Path) -> str:
         ("parts:\n\t- exposure_s: 1\n", ["line 2", "tab"]),
         ("parts: [{exposure_s: 1}", ["not valid YAML"]),
         ("- 1\n- 2\n", ["keys with values"]),
-        ("parts: 3\n", ["'parts' cannot be used", "tuple"]),
+        ("parts: 3\n", ["'parts' is not a list", "brackets"]),
         ("", ["'parts' is missing"]),
         ("1: 2\n", ["1"]),
         ("parts: [3]", ["'parts.1' holds no keys", "exposure_s, irradiance_uw_per_cm2, gain"]),

@@ -13,9 +13,12 @@ from pixmetry.cable.termination import SOURCE as TERMINATION
 from pixmetry.cable.termination import Termination
 from pixmetry.core import bands
 from pixmetry.core.camera import Camera, Element, build_camera, load_camera
+from pixmetry.core.catalogue import get_source
 from pixmetry.core.errors import ChainError, InputError
 from pixmetry.core.random import Grid
 from pixmetry.core.signal import Kind, Windows
+from pixmetry.grabber.clamp import SOURCE as CLAMP
+from pixmetry.grabber.clamp import Clamp
 from pixmetry.sensor.charge_transfer import SOURCE as CHARGE_TRANSFER
 from pixmetry.sensor.charge_transfer import ChargeTransfer
 from pixmetry.sensor.prnu import SOURCE as PRNU
@@ -255,6 +258,50 @@ def test_frozen_mode_takes_the_far_part_from_the_background() -> None:
     exact, frozen = (chain.expose_windows(scene, grid, mode=m, background=scene) for m in ("exact", "frozen"))
     assert np.allclose(frozen, exact, rtol=1e-5)
     assert chain.frozen_tail() == 0.5
+
+
+def test_frozen_mode_keeps_the_noise_and_the_drift_of_a_source_that_looks_far() -> None:
+    """A clamp looks along the row for its droop, and adds noise of the row and a drift with temperature: of these nothing is far."""
+    clamp = Clamp(noise_dn=1.0, droop_rel=0.01, drift_dn_per_k=0.5)
+    chain = camera(TO_ELECTRONS, TO_DN, Element("clamp", CLAMP, clamp), shape=(40, 200), warm_up_k=10.0, warm_up_s=0.1)
+    grid = Grid(np.arange(8), np.arange(4, 12), np.arange(55, 63), (9, 9))
+    exact, frozen = (chain.expose_windows(Flat(50.0), grid, seed=3, mode=m, background=Flat(50.0)) for m in ("exact", "frozen"))
+    assert exact.mean(axis=2).std(axis=1).min() > 0.3 and np.ptp(exact.mean(axis=(1, 2))) > 1
+    assert np.allclose(frozen, exact, atol=1e-4)
+
+
+def test_the_schedule_of_the_frozen_mode() -> None:
+    """A function of time is as good as a number; exposures that differ have no one background."""
+    chain = camera(TO_ELECTRONS, CTI, TO_DN, shape=(40, 50))
+    grid = Grid(np.arange(2), np.array([5, 6]), np.array([5, 6]), (9, 9))
+    given: dict[str, Any] = {"grid": grid, "mode": "frozen", "background": SCENE}
+    same = chain.expose_windows(SCENE, **given, temperature_c=25.0)
+    assert np.array_equal(chain.expose_windows(SCENE, **given, temperature_c=lambda t: 25.0 + 0 * t), same)
+    assert np.array_equal(chain.expose_windows(SCENE, **given, exposure_s=np.full(2, 0.01)), same)
+    with pytest.raises(InputError, match="one schedule"):
+        chain.expose_windows(SCENE, **given, exposure_s=np.array([0.01, 0.02]))
+
+
+@pytest.mark.parametrize(("row", "col", "shape"), [(-1, 0, (9, 9)), (0, 82, (9, 9)), (62, 0, (9, 9)), (0, 0, (0, 5))])
+def test_windows_outside_the_frame_are_refused(row: int, col: int, shape: tuple[int, int]) -> None:
+    chain = camera(TO_ELECTRONS, CTI, TO_DN)
+    for mode in ("exact", "frozen"):
+        with pytest.raises(InputError, match="does not lie in the frame"):
+            chain.expose_windows(SCENE, Grid(np.zeros(1), [row], [col], shape), mode=mode, background=SCENE)
+
+
+@pytest.mark.parametrize("exposure", [-0.01, float("nan"), float("inf")])
+def test_exposure_times_that_are_none_are_refused(exposure: float) -> None:
+    with pytest.raises(InputError, match="exposure"):
+        camera(TO_ELECTRONS).expose(SCENE, exposure_s=exposure)
+
+
+def test_an_order_that_the_kinds_leave_no_choice_about_is_not_asked_for() -> None:
+    """Vignetting comes before the sensor, in photons; the sensor's pixels have their shape before there are photons."""
+    chain = [Element(i, get_source(i), get_source(i).typical) for i in ("sensor.pixel_aperture", "optics.vignetting", "sensor.quantum_efficiency")]
+    assert Camera("with vignetting", SHAPE, chain).expose(SCENE).data.shape == (1, *SHAPE)
+    with pytest.raises(ChainError, match="must come"):
+        camera(TO_ELECTRONS, Element("shot", SHOT_NOISE, ShotNoise()), Element("dark", get_source("sensor.dark_current"), Nothing()))
 
 
 def test_quiet_draws_are_arrays_of_their_own() -> None:

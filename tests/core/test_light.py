@@ -15,6 +15,10 @@ from pixmetry.core.light import FINE, Light, Points
 from pixmetry.core.random import Grid
 from pixmetry.core.signal import Kind
 from pixmetry.core.source import Parameters
+from pixmetry.scene.outlines import line
+from pixmetry.scene.picture import Picture
+from pixmetry.scene.shapes import Shapes
+from pixmetry.scene.uniform import Uniform
 
 SHAPE = (20, 24)
 
@@ -160,6 +164,21 @@ def test_windows_threads_and_frames_of_a_bent_camera_are_the_same_bits() -> None
         grid = Grid(np.array([2, 0]), np.array([3, 0]), np.array([4, 17]), (6, 6))
         batch = camera.expose_windows(scene, grid)
         assert np.array_equal(batch[0], whole[2, 3:9, 4:10]) and np.array_equal(batch[1], whole[0, 0:6, 17:23])
+
+
+def _turn(params: Bend, signal: object, stream: object) -> object:
+    angle = 0.004 * signal.grid.frame[:, None, None]
+    return signal.with_light(signal.light.moved(lambda x, y: (x * np.cos(angle) + y * np.sin(angle), y * np.cos(angle) - x * np.sin(angle))))
+
+
+def test_windows_of_one_batch_do_not_know_of_each_other() -> None:
+    """Frame by frame the image is turned more: into how many parts a pixel is cut for it must not follow the frame turned most."""
+    camera = Camera("turning", SHAPE, (Element(NAME, make_source("optics.turn", _turn, (Kind.LIGHT,), parameters=Bend), Bend()),))
+    scene = Picture([Shapes.of([line(14.0, 12.0, 20.0, 3.0, 10.0, 4000.0)])], Uniform(1000.0))
+    grid = Grid(np.array([0, 1, 2, 4]), np.array([4, 4, 5, 6]), np.array([5, 5, 6, 7]), (9, 9))
+    batch = camera.expose_windows(scene, grid)
+    for seen, frame, r, c in zip(batch, grid.frame, grid.row0, grid.col0, strict=True):
+        assert np.array_equal(seen, camera.expose(scene, [int(frame)]).data[0, r : r + 9, c : c + 9])
 
 
 def test_a_scene_that_stands_still_is_rendered_once() -> None:

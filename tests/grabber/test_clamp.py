@@ -69,3 +69,45 @@ def test_published_swing_of_a_spot_whose_foot_is_cut_off() -> None:
         error = (cut * x).sum(axis=1) / cut.sum(axis=1) - phase
         found = 2 * np.abs((error * np.exp(2j * np.pi * phase)).mean())
         assert found == pytest.approx(amplitude, abs=3e-4), offset
+
+
+@pytest.mark.parametrize("interlaced", [False, True])
+def test_a_slow_clamp_hands_its_error_on_to_the_next_line(interlaced: bool) -> None:
+    """Lines one after the other in time as one high-pass whose state loses 70 % between them, by matrix exponentials of `lsim`'s system."""
+    frame = np.random.default_rng(4).uniform(0, 200, (8, 60)).astype(np.float32)
+    params = Clamp(droop_rel=0.4, restored_rel=0.7, interlaced=interlaced)
+    tau = -60 / np.log(1 - 0.4)
+    want = np.empty(frame.shape)
+    for rows in ((range(0, 8, 2), range(1, 8, 2)) if interlaced else (range(8),)):
+        state = 0.0
+        for r in rows:
+            t = np.arange(481) / 8
+            held = np.append(np.repeat(frame[r], 8), frame[r, -1]).astype(float)
+            system = tuple(np.array([[v]]) for v in (-1 / tau, 1 / tau, -1.0, 1.0))
+            _, y, x = sps.lsim(system, held, t, state, interp=False)
+            want[r] = y[4::8][:60]
+            state = 0.3 * float(np.ravel(x)[-1])
+    out = SOURCE.forward(params, signal(frame[None], Kind.DN), stream())
+    np.testing.assert_allclose(out.data[0], want, rtol=3e-5, atol=3e-4)
+    np.testing.assert_allclose(SOURCE.correct(params, out, {}).data[0], frame, atol=1e-3)
+    assert np.abs(clamped(Clamp(droop_rel=0.4), frame[None])[0] - want)[2:].max() > 3
+
+
+def test_a_bright_target_leaves_a_shadow_on_the_lines_below_it() -> None:
+    frame = np.zeros((20, 100))
+    frame[4:6, 40:60] = 200.0
+    got = clamped(Clamp(droop_rel=0.1, restored_rel=0.5), frame[None])[0]
+    assert (got[:4] == 0).all()
+    ends = got[:, -1]
+    assert (ends[6:] < 0).all()
+    assert ends[8] / ends[6] == pytest.approx(0.5 * 0.9, rel=0.02)  # half is restored, a tenth of the rest decays along the line
+
+
+def test_noise_of_a_slow_clamp_is_alike_from_line_to_line_of_a_field() -> None:
+    """b_l = (1 − k) b_(l−1) + k n_l: correlation 1 − k between lines of a field, none between fields; 400 frames of 150 lines a field."""
+    params = Clamp(noise_dn=0.5, restored_rel=0.4)
+    b = SOURCE.forward(params, flat(0.0, (300, 1), n=400, kind=Kind.DN), stream()).data[:, :, 0].astype(float) / 0.5
+    u = np.sqrt((1 + 0.36) / (1 - 0.36) * 2 / b.size)  # of a mean product, Bartlett's formula
+    assert (b**2).mean() == pytest.approx(1, abs=Z * u)
+    for lag, want in ((1, 0.0), (2, 0.6), (4, 0.36), (5, 0.0)):
+        assert (b[:, lag:] * b[:, :-lag]).mean() == pytest.approx(want, abs=Z * u), lag

@@ -103,23 +103,19 @@ class Trials:
         if self.units < 1 or self.frames < 1 or self.trials < 1:
             raise InputError("a Monte Carlo needs trials", value=(self.trials, self.units, self.frames), allowed="1 or more of each")
         self.side = window_side(self.estimator)
-        if min(self.camera.frame_shape) < self.side:
-            raise InputError("the frame is smaller than the window", value=self.camera.frame_shape, allowed=f"{self.side} × {self.side} px")
+        shape = self.camera.output_shape
+        if min(shape) < self.side:
+            raise InputError("the frame is smaller than the window", value=shape, allowed=f"{self.side} × {self.side} px")
         self.places = max(2, -(-self.trials // (self.units * self.frames)))
         self.located = resolve(self.estimator, self.target, self.facts)
         draws = Streams(self.seed, self.seed).of("budget.places").uniform_unit(4 * self.units * self.places).astype(float)
         row, col, self.dx, self.dy = draws.reshape(4, self.units, self.places)
         self.dx, self.dy = self.dx - 0.5, self.dy - 0.5
-        self.row0 = np.floor(row * (self.camera.frame_shape[0] - self.side + 1)).astype(np.int64)
-        self.col0 = np.floor(col * (self.camera.frame_shape[1] - self.side + 1)).astype(np.int64)
+        self.row0 = np.floor(row * (shape[0] - self.side + 1)).astype(np.int64)
+        self.col0 = np.floor(col * (shape[1] - self.side + 1)).astype(np.int64)
 
-    def true_shift(self) -> tuple[np.ndarray, np.ndarray]:
-        """True positions from the window's middle pixel, shape (units, places, frames)."""
-        shape = (self.units, self.places, self.frames)
-        return np.broadcast_to(self.dx[:, :, None], shape), np.broadcast_to(self.dy[:, :, None], shape)
-
-    def positions(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-        """Positions found in the frames of a variant of the camera, from the window's middle pixel, shape (units, places, frames)."""
+    def errors(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+        """Positions found in the frames of a variant of the camera less the true ones, in pixels of the sensor, shape (units, places, frames)."""
         key = tuple(e.on for e in camera.chain)
         if key not in self._found:
             parts = [self._unit(replace(camera, unit_seed=camera.unit_seed + UNIT_STRIDE * k), k) for k in range(self.units)]
@@ -128,9 +124,12 @@ class Trials:
 
     def _unit(self, camera: Camera, unit: int) -> tuple[np.ndarray, np.ndarray]:
         n, middle = self.places * self.frames, self.side // 2
-        row0, col0 = (np.repeat(v[unit], self.frames) for v in (self.row0, self.col0))
-        x, y = (np.repeat(v[unit], self.frames) + middle for v in (self.dx, self.dy))
-        scene = scene_of(self.target, self.facts, x + col0, y + row0)
+        shown = [np.repeat(first[unit] + middle + part[unit], self.frames) for first, part in ((self.col0, self.dx), (self.row0, self.dy))]
+        places = [(at - start) / step for at, (start, step) in zip(shown, _layout(self.camera), strict=True)]
+        belongs = camera.layout(*places, np.arange(n))
+        last = [size - self.side for size in camera.output_shape[::-1]]
+        col0, row0 = (np.clip(np.rint(at).astype(np.int64) - middle, 0, most) for at, most in zip(belongs, last, strict=True))
+        scene = scene_of(self.target, self.facts, *places)
         windows = camera.expose_windows(
             scene,
             Grid(np.arange(n), row0, col0, (self.side, self.side)),
@@ -140,9 +139,10 @@ class Trials:
             exposure_s=self.facts.exposure_s,
             temperature_c=self.facts.temperature_c,
         )
-        x_hat, y_hat = self._as_seen(camera).locate(windows)
-        shape = (self.places, self.frames)
-        return (x_hat - middle).reshape(shape), (y_hat - middle).reshape(shape)
+        found = self._as_seen(camera).locate(windows)
+        parts = zip(found, (col0, row0), belongs, _layout(camera), strict=True)
+        dx, dy = (((hat + first - at) / step).reshape(self.places, self.frames) for hat, first, at, (_, step) in parts)
+        return dx, dy
 
     def _as_seen(self, camera: Camera) -> Estimator:
         """Return the estimator with background and threshold as this variant of the camera shows them.
@@ -157,9 +157,9 @@ class Trials:
 
     def compare(self, names: Iterable[str], with_it: Camera, without: Camera | None) -> MonteCarlo:
         """Shift of the positions in one variant of the camera against those in another, or (None) against the truth."""
-        found = self.positions(with_it)
-        reference = self.true_shift() if without is None else self.positions(without)
-        shift = [a - b for a, b in zip(found, reference, strict=True)]
+        shift = self.errors(with_it)
+        if without is not None:
+            shift = tuple(a - b for a, b in zip(shift, self.errors(without), strict=True))
         lost = int(np.isnan(shift[0]).sum())
         x, y = (_axis(s) for s in shift)
         tail = with_it.frozen_tail() if self.mode == "frozen" else 0.0
@@ -239,11 +239,16 @@ def monte_carlo(
     return Trials(camera, target, estimator, facts, trials, units, frames, mode, seed).of(only, off)
 
 
+def _layout(camera: Camera) -> list[tuple[float, float]]:
+    """Place of the sensor's pixel (0, 0) in frame 0 as it is put out, and pixels of the frame for one of the sensor; for x and y."""
+    return [(float(start), float(end - start)) for start, end in camera.layout([0.0, 1.0], [0.0, 1.0])]
+
+
 def _level(camera: Camera, facts: Facts, target: Target, side: int, above_dn: float, windows: int = 32) -> float:
     """Grey value of uniform light that lies ``above_dn`` (linear) above the target's background."""
     background = background_of(target, facts)
     light = replace(background, level_photons=background.level_photons + above_dn / facts.dn_per_photon)
-    grid = spread_windows(camera.frame_shape, side, windows)
+    grid = spread_windows(camera.output_shape, side, windows)
     data = camera.expose_windows(
         light,
         grid,

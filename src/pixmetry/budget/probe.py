@@ -260,9 +260,9 @@ def spread_windows(frame_shape: tuple[int, int], side: int, count: int) -> Grid:
 
 
 def _noise(camera: Camera, background_photons: float, windows: int = 128) -> float:
-    side = min(16, *camera.frame_shape)
+    side = min(16, *camera.output_shape)
     scene = Uniform(background_photons)
-    grid = spread_windows(camera.frame_shape, side, windows)
+    grid = spread_windows(camera.output_shape, side, windows)
     data = camera.expose_windows(scene, grid, mode="frozen", background=scene).astype(float)
     residual = (data - data.mean(axis=(1, 2), keepdims=True)).ravel()
     for _ in range(4):

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from pixmetry.cable._kernels import remove_echoes
+from pixmetry.cable._skin import skin_filter, time_scale_s
 from pixmetry.core.contribution import Contribution, Probe
 from pixmetry.core.line import SMALLEST_ECHO, Line, through_line
 from pixmetry.core.random import Stream
@@ -15,6 +16,7 @@ from pixmetry.core.signal import Clock, Kind, Signal
 from pixmetry.core.source import Parameters, Source, quantity
 
 DELAY_S_PER_M = 2 / (0.66 * 299_792_458.0)  # there and back, at 0.66 of the speed of light
+MOST_NEAR = 256  # pixels to the left that the frozen mode follows
 
 
 class Termination(Parameters):
@@ -24,7 +26,8 @@ class Termination(Parameters):
     line_ohm: float = quantity(75.0, "Ω", "characteristic impedance of the cable", gt=10, le=300)
     source_ohm: float = quantity(75.0, "Ω", "output impedance of the camera", gt=0, le=1e4)
     load_ohm: float = quantity(75.0, "Ω", "input impedance of the grabber", gt=0, le=1e6)
-    loss_db: float = quantity(0.0, "dB", "attenuation over one way", ge=0, le=20)
+    loss_db: float = quantity(0.0, "dB", "attenuation over one way, alike at all frequencies", ge=0, le=20)
+    skin_db: float = quantity(0.0, "dB", "attenuation over one way at 5 MHz that grows as the root of the frequency", ge=0, le=3)
 
     @property
     def ghost(self) -> float:
@@ -50,14 +53,25 @@ def echoes(params: Termination) -> tuple[np.ndarray, np.ndarray]:
 
 
 def forward(params: Termination, signal: Signal, stream: Stream) -> Signal:
-    """Add the whole series of echoes, (1 − ρ) Σ ρ^k y(t − kτ): a patch of constant light keeps its level."""
-    if abs(params.ghost) < 1e-12:
-        return signal
-    return signal.with_line(signal.line.echoed(*echoes(params)))
+    """Add the whole series of echoes, (1 − ρ) Σ ρ^k y(t − kτ): a patch of constant light keeps its level.
+
+    The skin effect acts on all of it once; what an echo loses of its high frequencies on its further ways is not counted.
+    """
+    line = _through(params, signal.line)
+    return signal if line is signal.line else signal.with_line(line)
+
+
+def _through(params: Termination, line: Line) -> Line:
+    if abs(params.ghost) >= 1e-12:
+        line = line.echoed(*echoes(params))
+    return line.filtered(*skin_filter(params.skin_db)) if params.skin_db else line
 
 
 def correct(params: Termination, signal: Signal, maps: Mapping[str, np.ndarray]) -> Signal:
-    """Take the echoes out from left to right: exact for pixels that were held on the line and sampled by their own clock."""
+    """Take the echoes out from left to right: exact for pixels that were held on the line and sampled by their own clock.
+
+    The skin effect stays.
+    """
     if abs(params.ghost) < 1e-12:
         return signal
     delay, amplitude = echoes(params)
@@ -66,14 +80,19 @@ def correct(params: Termination, signal: Signal, maps: Mapping[str, np.ndarray])
 
 
 def near(params: Termination) -> tuple[int, int, int, int]:
-    """Pixels of the usual clock to the left until the echoes have fallen below 1e-4."""
+    """Pixels of the usual clock to the left until the echoes have fallen below 1e-4; with a skin effect, whose tail is long, the most."""
+    if params.skin_db:
+        return 0, 0, MOST_NEAR, 0
     rho = abs(params.ghost)
     count = 0 if rho < 1e-4 else math.ceil(math.log(1e-4) / math.log(rho))
-    return (0, 0, min(math.ceil(count * params.delay_s * Clock.pixel_hz) + 1, 256), 0)
+    return (0, 0, min(math.ceil(count * params.delay_s * Clock.pixel_hz) + 1, MOST_NEAR), 0)
 
 
 def tail(params: Termination) -> float:
-    """Sum of the echoes that come from farther left than `near`."""
+    """Sum of the echoes that come from farther left than `near`, and what the skin effect still lacks of a step there."""
+    if params.skin_db:
+        lacks = math.erf(0.5 * math.sqrt(time_scale_s(params.skin_db) * Clock.pixel_hz / MOST_NEAR))
+        return lacks + tail(params.model_copy(update={"skin_db": 0.0}))
     if abs(params.ghost) < 1e-12:
         return 0.0
     first = math.floor((near(params)[2] - 1) / max(params.delay_s * Clock.pixel_hz, 1e-9)) + 1
@@ -82,9 +101,10 @@ def tail(params: Termination) -> float:
 
 def propagate(params: Termination, probe: Probe) -> Contribution:
     """The target with its echoes, at the usual pixel clock; for a centroid over everything it is the first moment, Δx = ρτ/(1 − ρ)."""
-    if abs(params.ghost) < 1e-12:
+    line = Line(Clock.pixel_hz, Clock.pixel_hz)
+    if _through(params, line) is line:
         return Contribution(u_x_px=0.0, u_y_px=0.0, gum_class="G", method="no echo")
-    return through_line(Line(Clock.pixel_hz, Clock.pixel_hz).echoed(*echoes(params)), probe)
+    return through_line(_through(params, line), probe)
 
 
 SOURCE = Source(
@@ -108,7 +128,7 @@ SOURCE = Source(
     tail=tail,
     applies_to=("analogue",),
     gum_class="G",
-    equation="y' = (1 − ρ) Σ_k ρ^k y(t − kτ),  ρ = Γ_S Γ_L e^(−2αL),  τ = 2L/(0.66 c)",
+    equation="y' = (1 − ρ) Σ_k ρ^k y(t − kτ),  ρ = Γ_S Γ_L e^(−2αL),  τ = 2L/(0.66 c);  skin effect: e^(−√(sT))",
     typical_size="0.030 px for 5 m of 50 Ω cable between 75 Ω ends at 14.19 MHz",
     references=("D. M. Pozar, Microwave Engineering, 4th ed., §2.3 (reflection on a terminated line)",),
     advice="Use 75 Ω cable with 75 Ω at both ends, short, without T-pieces; or a digital camera.",

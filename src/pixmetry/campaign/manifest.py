@@ -83,6 +83,10 @@ def _discover(path: Path, parts: Mapping[str, Any]) -> tuple[tuple[int, int], st
     return (array.shape[0], array.shape[1]), array.dtype.name
 
 
+def _has_schema(path: Path, what: str) -> bool:
+    return re.search(rb"^schema:\s*['\"]?pixmetry/" + what.encode(), path.read_bytes(), re.MULTILINE) is not None
+
+
 def _find_source(path: Path) -> Path:
     if path.is_file():
         return path
@@ -92,8 +96,9 @@ def _find_source(path: Path) -> Path:
         )
     files = sorted(p for p in path.iterdir() if p.is_file())
     manifests = [p for p in files if p.suffix.lower() in (".yaml", ".yml")]
-    if len(manifests) > 1:
-        manifests = [p for p in manifests if re.search(rb"^schema:\s*['\"]?pixmetry/campaign", p.read_bytes(), re.MULTILINE)]
+    cameras = [p for p in manifests if _has_schema(p, "camera")]
+    if len(manifests) > 1 or cameras:
+        manifests = [p for p in manifests if _has_schema(p, "campaign")]
     descriptors = [p for p in files if p.suffix.lower() == ".txt" and is_descriptor(decode_descriptor(p.read_bytes()))]
     if len(manifests) == 1:  # a manifest may add the camera's facts to a descriptor beside it
         text = manifests[0].read_text(encoding="utf-8", errors="replace")
@@ -101,6 +106,13 @@ def _find_source(path: Path) -> Path:
     found = manifests + descriptors
     if len(found) == 1:
         return found[0]
+    if cameras and not found:
+        raise InputError(
+            "folder holds a camera, but no campaign",
+            where=str(path),
+            allowed="dark and bright frames of a uniform field, with their manifest",
+            remedy="simulate a scene with photon_transfer (docs/scenes.md), which writes campaign.yaml too",
+        )
     names = ", ".join(p.name for p in found)
     what = f"folder holds several campaigns ({names})" if found else "folder holds no campaign"
     raise InputError(

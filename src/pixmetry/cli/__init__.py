@@ -6,6 +6,7 @@ The group knows the name and the one-line help of each command; the command's ow
 
 from __future__ import annotations
 
+import errno
 from importlib import import_module
 from typing import Any
 
@@ -16,6 +17,7 @@ from pixmetry.core.errors import PixmetryError
 
 EXIT_ERROR = 2
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as a shell reports it
+_OS_REMEDIES = {errno.ENOSPC: "make room, or choose another folder", errno.ENAMETOOLONG: "choose a shorter name"}
 
 # Each command lives in the module of its name below this package, as a click command of that name.
 COMMANDS = {
@@ -47,6 +49,18 @@ class LazyGroup(click.Group):
             return super().invoke(ctx)
         except PixmetryError as error:
             click.echo(f"error: {' '.join(str(error).split())}", err=True)
+            ctx.exit(EXIT_ERROR)
+        except OSError as problem:
+            if problem.errno in (None, errno.EPIPE):  # click knows what to do about a closed pipe
+                raise
+            where = f"{problem.filename}: " if problem.filename else ""
+            remedy = _OS_REMEDIES.get(problem.errno, "check the path and its permissions, or choose another")
+            click.echo(f"error: {where}{problem.strerror}; to do: {remedy}", err=True)
+            ctx.exit(EXIT_ERROR)
+        except UnicodeEncodeError as problem:
+            if "surrogates" not in problem.reason:
+                raise
+            click.echo("error: a path holds bytes that are no UTF-8; to do: rename the file or folder", err=True)
             ctx.exit(EXIT_ERROR)
         except KeyboardInterrupt:
             click.echo("interrupted", err=True)

@@ -6,6 +6,8 @@ import json
 
 import click
 
+ROOM_FOR_NOTES = 110  # columns of a terminal
+
 
 @click.command()
 @click.argument("source_id", metavar="[ID]", required=False)
@@ -54,13 +56,15 @@ def _list(records: list[dict]) -> None:
     from rich.console import Console
     from rich.table import Table
 
+    console = Console(highlight=False)
     table = Table(title="Error sources by stage, in the order of the light", title_justify="left", box=None, pad_edge=False)
-    for name in ("id", "title", "stars", "note", "verbs"):
+    names = ["id", "title", "stars", "note", "verbs"] if console.width >= ROOM_FOR_NOTES else ["id", "title", "stars", "verbs"]
+    for name in names:
         table.add_column(name, no_wrap=name in ("id", "verbs"))
     for r in records:
         verbs = " ".join(verb[0] if has else "–" for verb, has in r["verbs"].items())
-        table.add_row(r["id"], r["title"], "★" * r["stars"], r["note"], verbs)
-    console = Console(highlight=False)
+        cells = r | {"stars": "★" * r["stars"], "verbs": verbs}
+        table.add_row(*(cells[name] for name in names))
     console.print(table)
     console.print("\nverbs: f forward, m measure, c correct, p propagate; a dash has its reason: `pixmetry sources ID`")
 
@@ -83,10 +87,12 @@ def _explain(record: dict) -> None:
     console.print(f"GUM class     {record['gum_class']}")
     console.print(f"what to do    {escape(record['advice'])}\n")
     if record["parameters"]:
-        table = Table("parameter", "unit", "range", "typical", "bound", "meaning")
+        table = Table(box=None, pad_edge=False)
+        for name in ("parameter", "unit", "range", "typical", "bound", "meaning"):
+            table.add_column(name, no_wrap=name == "parameter", overflow="fold")  # names are typed again in --set: never cut
         for p in record["parameters"]:
             table.add_row(p["name"], p["unit"], p["range"], f"{p['typical']}", f"{p['bound']}", escape(p["description"]))
-        console.print(table)
+        console.print(table, "")
     for verb, has in record["verbs"].items():
         console.print(f"{verb:<12}  {'yes' if has else 'no: ' + escape(record['reasons'][verb])}")
     console.print("\nsources: " + escape("; ".join(record["references"])))

@@ -127,6 +127,8 @@ class Camera:
         """Return the scene as the camera's pixels would look at it in these windows: the signal at the head of the chain."""
         n = len(grid.frame)
         exposure = np.broadcast_to(np.asarray(self.exposure_s if exposure_s is None else exposure_s, float), (n,))
+        if not (np.isfinite(exposure) & (exposure >= 0)).all():
+            raise InputError("the exposure time cannot be used", where="exposure_s", value=exposure_s, allowed="0 or more, in s")
         period = self.facts.get("frame_period_s", 0.04) if frame_period_s is None else frame_period_s
         time = grid.frame * float(period)
         if temperature_c is None:
@@ -193,8 +195,8 @@ class Camera:
         numbers = [int(f) for f in frames]
         if any(np.size(v) > 1 for v in schedule.values()):
             raise InputError("a series has one schedule for all its frames", value=", ".join(schedule), remedy="expose frame by frame")
-        task = _Task(scene, self.streams(seed, quiet), schedule, threads, rendered={} if len(numbers) > 1 else None)
         last_memory = max((i for i, e in enumerate(self.links) if e.remembers), default=-1)
+        task = _Task(scene, self.streams(seed, quiet), schedule, threads, rendered={} if len(numbers) > 1 or last_memory >= 0 else None)
 
         def grid_of(number: int) -> Grid:
             return Grid(np.array([number]), np.array([r0]), np.array([c0]), (h, w))
@@ -264,6 +266,10 @@ class Camera:
         """
         if mode not in ("exact", "frozen"):
             raise InputError("no such mode", value=mode, allowed="exact, frozen")
+        rows, cols = self.output_shape
+        last_row, last_col = grid.row0 + grid.shape[0], grid.col0 + grid.shape[1]
+        if min(grid.shape) < 1 or (grid.row0 < 0).any() or (grid.col0 < 0).any() or (last_row > rows).any() or (last_col > cols).any():
+            raise InputError("a window does not lie in the frame", value=grid.shape, allowed=f"within {rows} rows and {cols} columns")
         frozen = freeze(self, background, schedule) if mode == "frozen" else None
         if frozen is None and any(e.remembers for e in self.links):
             raise InputError("a source with a memory cannot be run on single windows exactly", remedy="use iter_frames, or mode='frozen'")
@@ -373,15 +379,28 @@ class Camera:
         x_px, y_px : ndarray, shape (k,)
             NaN for points that are seen nowhere.
         """
+        if layout_only:
+            return self.layout(x_px, y_px, frame)
         x, y = (np.atleast_1d(np.asarray(v, float)) for v in (x_px, y_px))
         streams = self.streams(seed)
-        signal = self.signal(_NoScene(), Grid(np.array([frame]), np.zeros(1), np.zeros(1), (1, 1)), **schedule)
+        signal = self.signal(_NOTHING, Grid.whole([frame], (1, 1)), **schedule)
         for link in self.links:
             if Kind.LIGHT in link.source.consumes and link.source is not LOOK:
                 signal, _ = run(link.source, link.params, signal, streams.of(link.name))
-            elif link.source is LOOK and not layout_only:
+            elif link.source is LOOK:
                 x, y = (v[0, :, 0] for v in signal.light.placed(x[None, :, None], y[None, :, None]))
             elif link.source.place is not None:
+                x, y = link.source.place(link.params, x, y, link.shape, frame)
+        return x, y
+
+    def layout(self, x_px: Any, y_px: Any, frame: Any = 0) -> tuple[np.ndarray, np.ndarray]:
+        """Return where places on the pixel grid belong in the frames that are put out: clock of the samples, offsets, fields.
+
+        ``frame`` is a number, or one for each place; see `true_positions`.
+        """
+        x, y = (np.atleast_1d(np.asarray(v, float)) for v in (x_px, y_px))
+        for link in self.links:
+            if link.source.place is not None:
                 x, y = link.source.place(link.params, x, y, link.shape, frame)
         return x, y
 
@@ -393,7 +412,7 @@ class Camera:
             if link.source.truth is None:
                 continue
             grid = Grid.whole([frame], link.shape)
-            signal = self.signal(_NoScene(), grid, **schedule)
+            signal = self.signal(_NOTHING, grid, **schedule)
             told[link.name] = dict(link.source.truth(link.params, replace(signal, frame_shape=link.shape), streams.of(link.name)))
         return told
 
@@ -443,6 +462,9 @@ class _NoScene:
     """Nothing to see: for questions of geometry."""
 
     moving = False
+
+
+_NOTHING: Any = _NoScene()
 
 
 def _sub_grid(grid: Grid, index: np.ndarray) -> Grid:

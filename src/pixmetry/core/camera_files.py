@@ -51,7 +51,7 @@ def build_camera(record: Mapping[str, Any], where: str = "camera") -> Camera:
     # the camera's own pitch, unless a source says otherwise
     known = {} if pitch is None else {"pitch_x_um": pitch[0], "pitch_y_um": pitch[1], "pitch_um": pitch[0]}
     for i, entry in enumerate(checked.chain):
-        source = get_source(entry.source)
+        source = get_source(entry.source, f"{where}, chain[{i}]")
         own = {name: value for name, value in known.items() if name in source.parameters.model_fields}
         params = source.make(own | entry.parameters, where=f"{where}, chain[{i}] {entry.source}")
         elements.append(Element(entry.name or entry.source, source, params, entry.enabled))

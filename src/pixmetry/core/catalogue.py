@@ -75,8 +75,8 @@ def _add(found: dict[str, Source], source: Source, where: str, stage: str | None
     found[source.id] = source
 
 
-def get_source(source_id: str) -> Source:
-    """The source of that id; ``InputError`` names the nearest ones if there is none."""
+def get_source(source_id: str, where: str = "") -> Source:
+    """The source of that id; ``InputError`` names the nearest ones if there is none, and ``where`` it was asked for."""
     from difflib import get_close_matches
 
     sources = catalogue()
@@ -85,8 +85,9 @@ def get_source(source_id: str) -> Source:
     near = get_close_matches(source_id, sources, n=3, cutoff=0.4) or [i for i in sources if i.endswith("." + source_id)]
     raise InputError(
         f"no error source is called {source_id!r}",
+        where=where,
         allowed=", ".join(near or sources),
-        remedy="`pixmetry sources` lists them all",
+        remedy="`pixmetry sources` lists them all; one of your own needs `pixmetry --source-file FILE` before the command",
     )
 
 

@@ -34,7 +34,7 @@ def check_chain(chain: Sequence[Element], where: str = "camera") -> None:
     names = [e.name for e in chain]
     for name in names:
         if names.count(name) > 1:
-            raise ChainError(f"the name {name!r} is used twice", where=where, remedy="give each source a name of its own")
+            raise ChainError(f"the name {name!r} is used twice", where=where, remedy="delete one, or give it another `name: …`")
     kind = Kind.LIGHT
     for i, element in enumerate(chain):
         source = element.source

@@ -178,6 +178,9 @@ def _explain(model: type[BaseModel], error: Any, lines: Mapping[tuple[str | int,
     if kind in ("model_type", "dict_type"):
         keys = ", ".join(_keys_at(model, loc))
         return InputError(f"'{name}' holds no keys", where=where, allowed=keys, remedy=f"write `key: value` lines below `{loc[-1]}:`")
+    if kind in ("tuple_type", "list_type"):
+        remedy = "write it in brackets, such as [0, 1], or with one `- …` line for each entry"
+        return InputError(f"'{name}' is not a list", where=where, value=error["input"], allowed="a list", remedy=remedy)
     message = error["msg"][0].lower() + error["msg"][1:]
     value = error["input"] if isinstance(error["input"], str | int | float | bool) else None
     return InputError(f"'{name}' cannot be used", where=where, value=value, allowed=message.replace("input should be ", ""))

@@ -86,7 +86,8 @@ class LineSources:
         last = np.floor(line.placed((grid.col0 + cols - 1).astype(float)) + 1e-9).astype(np.int64)
         first = np.clip(np.where(grid.col0 == 0, 0, first), 0, samples - 1)
         last = np.clip(np.where(grid.col0 + cols == frame_shape[1], samples - 1, last), first, samples - 1)
-        return Grid(grid.frame, grid.row0, first, (grid.shape[0], int((last - first).max(initial=0)) + 1))
+        count = int((last - first).max(initial=0)) + 1
+        return Grid(grid.frame, grid.row0, np.minimum(first, samples - count), (grid.shape[0], count))
 
 
 class _Zeros:

@@ -12,7 +12,7 @@ from pixmetry.core._camera_kernels import cut_windows
 from pixmetry.core.conversions import Link
 from pixmetry.core.errors import InputError
 from pixmetry.core.light import Scene
-from pixmetry.core.random import Grid
+from pixmetry.core.random import Grid, Streams
 from pixmetry.core.signal import Signal
 from pixmetry.core.source import run
 
@@ -22,9 +22,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Frozen:
-    """Noise-free background before and after each source with a far context, and the settled state of those with a memory."""
+    """Noise-free background before and after each source with a far context, and the settled state of those with a memory.
+
+    ``streams`` are those of the background: with every temporal draw at its mean.
+    """
 
     elements: Mapping[str, tuple[Signal, Signal, Any]]
+    streams: Streams
 
     def apply(self, element: Link, signal: Signal, stream: Any) -> Signal:
         """Run a source on the near context, and correct for the far one by the same run on the noise-free frame."""
@@ -32,15 +36,23 @@ class Frozen:
         out, _ = run(element.source, element.params, signal, stream, state)
         if element.remembers:
             return out
-        near = replace(_cut(before, signal), line=before.line)
-        quiet, _ = run(element.source, element.params, near, stream)
+        quiet, _ = run(element.source, element.params, _cut(before, signal), self.streams.of(element.name))
         return out.with_data(out.data + (_cut(after, out).data - quiet.data))
 
 
 def _cut(frame: Signal, like: Signal) -> Signal:
-    """Cut the windows of one signal out of a whole frame."""
-    data = cut_windows(np.ascontiguousarray(frame.data[0], np.float32), like.grid.row0, like.grid.col0, *like.data.shape[1:])
-    return like.with_data(data, frame.kind)
+    """Cut the windows of one signal out of a whole frame; number, times and temperature stay those of the frame."""
+    grid = like.grid
+    data = cut_windows(np.ascontiguousarray(frame.data[0], np.float32), grid.row0, grid.col0, *grid.shape)
+    same = np.zeros(len(like), np.int64)
+    return replace(
+        frame,
+        data=data,
+        grid=Grid(frame.grid.frame[same], grid.row0, grid.col0, grid.shape),
+        exposure_s=frame.exposure_s[same],
+        time_s=frame.time_s[same],
+        temperature_c=frame.temperature_c[same],
+    )
 
 
 def _settled(element: Link, signal: Signal, stream: Any, most: int = 400) -> Any:
@@ -64,16 +76,13 @@ def freeze(camera: Camera, background: Scene | None, schedule: Mapping[str, Any]
     """Run the noise-free background frame once and keep what sources with a far context need of it."""
     far = [e.name for e in camera.links if e.far or e.remembers]
     if not far:
-        return Frozen({})
+        return Frozen({}, camera.streams(0, quiet=True))
     if background is None:
         raise InputError("the mode 'frozen' needs the background scene", value=", ".join(far), remedy="give it as background=")
     streams = camera.streams(0, quiet=True)
     rows, cols = camera.frame_shape
     grid = Grid.whole([0], (rows, cols))
-    scalars: dict[str, Any] = {
-        k: (np.asarray(v).ravel()[:1] if k in ("exposure_s", "temperature_c") and v is not None else v) for k, v in schedule.items()
-    }
-    signal = camera.signal(background, grid, **scalars)
+    signal = camera.signal(background, grid, **{name: _one(name, value) for name, value in schedule.items()})
     kept: dict[str, tuple[Signal, Signal, Any]] = {}
     for element in camera.links:
         stream = streams.of(element.name)
@@ -83,4 +92,11 @@ def freeze(camera: Camera, background: Scene | None, schedule: Mapping[str, Any]
         signal, _ = run(element.source, element.params, signal, stream, state)
         if element.name in far:
             kept[element.name] = (before, signal, state)
-    return Frozen(kept)
+    return Frozen(kept, streams)
+
+
+def _one(name: str, value: Any) -> Any:
+    """The value of the schedule that all windows have."""
+    if np.size(value) > 1 and len(np.unique(value)) > 1:
+        raise InputError("the mode 'frozen' has one schedule for all windows", value=name, remedy="expose them group by group")
+    return np.ravel(value)[:1] if np.size(value) > 1 else value

@@ -27,8 +27,6 @@ GAUSS = {  # nodes and weights on (-1/2, 1/2): Gauss–Legendre
 }
 LEVEL_PX2 = 0.02  # a spread that varies over the sensor is interpolated between variances so far apart
 
-SMALL_TURN = 3e-4  # rad: a pixel turned by less is taken as upright; its corners move by 2e-4 px
-
 Pull = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
@@ -335,45 +333,62 @@ class Light:
         if not busy.all():
             out[~busy] = self.scene.radiance(centre.take(~busy))
         if busy.any():
-            ux, uy = x[busy], y[busy]
-            some = centre.take(busy)
-            total = np.zeros(len(ux))
-            exact = getattr(self.scene, "averaged", None)
-            parts = 0 if exact is None else self._parts()
-            nodes = list(self._nodes(cell, dots, parts))
-            places = _Places(busy, self)
-            size = None if exact is None else places.size(ux, uy, cell[0] / parts, cell[1] / parts)
-            levels = [
-                (mine, share, replace(some if mine is None else some.take(mine), blur_px=np.sqrt(self.blur_px2 + variance)))
-                for mine, share, variance in _levels(None if sd is None else sd[busy] ** 2)
-            ]
-            for dx, dy, w in nodes:
-                qx, qy = places.pulled(ux + dx, uy + dy)
-                for mine, share, points in levels:
-                    every = slice(None) if mine is None else mine
-                    at = replace(points, x_px=qx[every], y_px=qy[every])
-                    seen = self.scene.radiance(at) if exact is None else exact(at, *(v if np.ndim(v) == 0 else v[every] for v in size))
-                    total[every] += w * share * seen
-            out[busy] = total
+            parts = self._parts()
+            for count in np.unique(parts):  # frame by frame, as the maps may turn: the windows of a batch do not know of each other
+                mine = busy & (parts == count)[:, None, None]
+                if mine.any():
+                    variance = None if sd is None else sd[mine] ** 2
+                    out[mine] = self._summed(mine, x[mine], y[mine], centre.take(mine), variance, cell, dots, int(count))
         return out
 
-    def _parts(self) -> int:
-        """Into how many parts a cell is cut along each side for a scene that averages over upright boxes.
+    def _summed(
+        self,
+        which: np.ndarray,
+        x: np.ndarray,
+        y: np.ndarray,
+        centre: Points,
+        variance: np.ndarray | None,
+        cell: tuple[float, float],
+        dots: tuple[np.ndarray, np.ndarray, np.ndarray],
+        parts: int,
+    ) -> np.ndarray:
+        """Light averaged over a cell about the points ``which`` of the batch; the cell is cut into ``parts`` along each side."""
+        exact = getattr(self.scene, "averaged", None)
+        places, total = _Places(which, self), np.zeros(len(x))
+        size = None if exact is None else places.size(x, y, cell[0] / parts, cell[1] / parts)
+        levels = [
+            (mine, share, replace(centre if mine is None else centre.take(mine), blur_px=np.sqrt(self.blur_px2 + level)))
+            for mine, share, level in _levels(variance)
+        ]
+        for dx, dy, w in self._nodes(cell, dots, parts):
+            qx, qy = places.pulled(x + dx, y + dy)
+            for mine, share, points in levels:
+                every = slice(None) if mine is None else mine
+                at = replace(points, x_px=qx[every], y_px=qy[every])
+                seen = self.scene.radiance(at) if exact is None else exact(at, *(v if np.ndim(v) == 0 else v[every] for v in size))
+                total[every] += w * share * seen
+        return total
+
+    def _parts(self) -> np.ndarray:
+        """Into how many parts a cell is cut along each side for a scene that averages over upright boxes (0 for other scenes), shape (n,).
 
         One, unless the coordinate maps turn or shear the cell; then enough that the parts, upright themselves, stand for it to 1e-4 of an
         edge. A shear changes the second moment of the cell, a turn only the fourth, so blurred light needs fewer.
         """
+        n = len(self.grid.frame)
+        if not hasattr(self.scene, "averaged"):
+            return np.zeros(n, np.int64)
         if not self.pulls:
-            return 1
+            return np.ones(n, np.int64)
         x, y = self._lattice()
         at, right, down = (np.broadcast_arrays(*self.pulled(u, v)) for u, v in ((x, y), (x + 1, y), (x, y + 1)))
         tilt_x, tilt_y = right[1] - at[1], down[0] - at[0]
-        shear, turn = float(np.abs(tilt_x + tilt_y).max()), 0.5 * float(np.abs(tilt_x - tilt_y).max())
+        shear, turn = np.abs(tilt_x + tilt_y).max(axis=(1, 2)), 0.5 * np.abs(tilt_x - tilt_y).max(axis=(1, 2))
         blur2 = float(getattr(self.scene, "smooth_px", 0.0)) ** 2 + self.blur_px2
         spread2 = blur2 + 1.0 / 12.0
-        parts = np.sqrt(100.0 * shear / spread2)
-        parts = max(parts, (2.0 * turn / spread2**2) ** 0.25 if blur2 > 0.04 else 30.0 * np.sqrt(max(turn, shear)))
-        return int(np.clip(np.ceil(parts - 1e-3), 1, 12))
+        turned = (2.0 * turn / spread2**2) ** 0.25 if blur2 > 0.04 else 30.0 * np.sqrt(np.maximum(turn, shear))
+        parts = np.maximum(np.sqrt(100.0 * shear / spread2), turned)
+        return np.clip(np.ceil(parts - 1e-3), 1, 12).astype(np.int64)
 
     def _nodes(self, cell: tuple[float, float], dots: Any, boxes: int = 0) -> Iterator[tuple[float, float, float]]:
         """Offsets and weights that stand for the aperture and the dots; or for the dots and the aperture cut into ``boxes``²."""

@@ -73,7 +73,7 @@ def changed_camera(camera: Camera, overrides: Mapping[str, Any] | None = None, o
     for key, value in (overrides or {}).items():
         name, _, parameter = key.rpartition(".")
         if name:
-            by_source.setdefault(_known(camera, name), {})[parameter] = value
+            by_source.setdefault(_known(camera, name, parameter), {})[parameter] = value
         else:
             own[key] = value
     for name, values in by_source.items():
@@ -84,7 +84,7 @@ def changed_camera(camera: Camera, overrides: Mapping[str, Any] | None = None, o
     return _with_own(camera, own).switched(off=names)
 
 
-def _known(camera: Camera, name: str) -> str:
+def _known(camera: Camera, name: str, parameter: str = "") -> str:
     if name in camera:
         return name
     there = [e.name for e in camera.chain]
@@ -98,6 +98,9 @@ def _known(camera: Camera, name: str) -> str:
             remedy=f"add `- source: {name}` to the chain in the camera file",
         )
     near = get_close_matches(name, there, n=1, cutoff=0.6)
+    if parameter and f"{name}.{parameter}" in there:
+        remedy = f"write {name}.{parameter}.PARAMETER=VALUE; `pixmetry sources` explains the parameters"
+        raise InputError(f"{name}.{parameter} is a source, not a parameter", remedy=remedy)
     remedy = f"did you mean {near[0]}?" if near else "use a name of the chain, or of the camera's own values without a point"
     raise InputError(f"{camera.name} has no source named {name!r}", allowed=", ".join(there), remedy=remedy)
 

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal, get_args, get_origin
 
 import numpy as np
 
@@ -198,7 +198,11 @@ def cut_map(maps: Mapping[str, np.ndarray], name: str, signal: Signal) -> np.nda
 
 
 def bounds_text(field: Any) -> str:
-    """Write a parameter's allowed range for people, e.g. ``0 to 0.3``; ``field`` is the model's field."""
+    """Write a parameter's allowed range for people, e.g. ``0 to 0.3`` or ``even, odd``; ``field`` is the model's field."""
+    if field.annotation is bool:
+        return "true, false"
+    if get_origin(field.annotation) is Literal:
+        return ", ".join(str(v) for v in get_args(field.annotation))
     limits = {name: getattr(m, name) for m in field.metadata for name in ("ge", "gt", "le", "lt") if getattr(m, name, None) is not None}
     low = f"{limits['ge']:g}" if "ge" in limits else f"above {limits['gt']:g}" if "gt" in limits else ""
     high = f"{limits['le']:g}" if "le" in limits else f"below {limits['lt']:g}" if "lt" in limits else ""

@@ -29,6 +29,9 @@ class Adc(Parameters):
     dnl_std_lsb: float = quantity(0.0, "LSB", "standard deviation of the code widths, fixed in the unit", ge=0, le=2)
     missing_every: int = quantity(0, "1", "every so many codes one is missing; 0: none is", ge=0, le=65536)
     hysteresis_lsb: float = quantity(0.0, "LSB", "by how much thresholds lie higher while the line rises than while it falls", ge=0, le=16)
+    aperture_jitter_rel: float = quantity(
+        0.0, "1", "scatter of the moment of sampling, over the sampling period: seen on slopes along the row", ge=0, le=0.1
+    )
     offset_drift_dn_per_k: float = quantity(0.0, "DN/K", "change of the black level with temperature", ge=-10, le=10)
     gain_drift_per_k: float = quantity(0.0, "1/K", "relative change of the slope with temperature", ge=-0.01, le=0.01)
     reference_temperature_c: float = quantity(20.0, "°C", "temperature at which offset and slope are as given", ge=-60, le=100)
@@ -74,14 +77,17 @@ def thresholds(params: Adc, stream: Stream) -> np.ndarray:
 
 
 def context(params: Adc, windows: Windows, frame_shape: tuple[int, int]) -> Windows:
-    """The sample before, if the thresholds depend on it."""
-    return windows.expand(0, 0, 1, 0, frame_shape) if params.hysteresis_lsb else windows
+    """The sample before, if the thresholds depend on it; the neighbours that give the slope, if the moment of sampling jitters."""
+    right = 1 if params.aperture_jitter_rel else 0
+    return windows.expand(0, 0, 1, right, frame_shape) if params.hysteresis_lsb or right else windows
 
 
 def forward(params: Adc, signal: Signal, stream: Stream) -> Signal:
     """Lift black to the offset and count the thresholds that are reached; with equal steps, floor(v + 1/2): halves go up."""
     data = np.ascontiguousarray(signal.data, np.float32)
     factor = 1.0 + params.gain_error_rel
+    if params.aperture_jitter_rel:
+        data = stream.add_normal(data, signal.grid, params.aperture_jitter_rel * np.abs(slope(data)))
     if params.hysteresis_lsb:
         rising = np.sign(np.diff(data, axis=2, prepend=np.float32(0)))
         data = (data - np.float32(0.5 * params.hysteresis_lsb / factor) * rising).astype(np.float32)
@@ -92,6 +98,11 @@ def forward(params: Adc, signal: Signal, stream: Stream) -> Signal:
     else:
         codes = quantise_at(data, factor, params.offset_dn, thresholds(params, stream))
     return signal.with_data(codes, Kind.CODES)
+
+
+def slope(data: np.ndarray) -> np.ndarray:
+    """Slope along the row per sample, by central differences; shape and dtype of the data."""
+    return np.gradient(data, axis=2) if data.shape[2] > 1 else np.zeros_like(data)
 
 
 def _drifted(params: Adc, data: np.ndarray, temperature_c: np.ndarray) -> np.ndarray:
@@ -134,7 +145,8 @@ def propagate(params: Adc, probe: Probe) -> Contribution:
     rising = np.sign(np.diff(probe.signal_dn, axis=2, prepend=probe.background_dn))
     stored = np.clip(level - bend(params, level) - 0.5 * params.hysteresis_lsb * rising, 0, params.top)
     dx, dy = probe.field((stored - level) / (1 + params.gain_error_rel))
-    white = probe.white(math.sqrt(variance) / (1 + params.gain_error_rel))
+    jitter = params.aperture_jitter_rel * slope(probe.signal_dn) * (1 + params.gain_error_rel)
+    white = probe.white(np.sqrt(variance + jitter**2) / (1 + params.gain_error_rel))
     return Contribution(
         u_x_px=math.hypot(white[0], float(np.std(dx))),
         u_y_px=math.hypot(white[1], float(np.std(dy))),
@@ -167,7 +179,7 @@ SOURCE = Source(
     propagate=propagate,
     context=context,
     gum_class="F",
-    equation="code = #{k : T_k ≤ (1 + g) y + b},  T_k = k − 1/2 + A sin(2πm k/2^bits) + (s_DNL/√2) n_k;  σ² = 1/12 + s_DNL²/2",
+    equation="code = #{k : T_k ≤ (1 + g) y + b},  T_k = k − 1/2 + A sin(2πm k/2^bits) + (s_DNL/√2) n_k;  σ² = 1/12 + s_DNL²/2 + (j dy/dc)²",
     typical_size="0.003 px at 8 bit on a disc of 7 px of 150 DN (centroid)",
     references=("IEEE Std 1241-2010, §4 (code transition levels, DNL, INL)", "EMVA 1288 R4.0 Linear, §2.2 (σ_q² = 1/12)"),
     advice="Use the whole range of the converter, let at least 0.5 DN of noise dither it, or take one of more bits.",

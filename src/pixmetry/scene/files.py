@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -46,8 +47,8 @@ def background_of(model: SceneModel) -> Uniform:
     return Uniform(**model.uniform.model_dump()) if model.uniform is not None else Uniform()
 
 
-def build_scene(model: SceneModel, frame_shape: tuple[int, int]) -> Uniform | Discs | Picture:
-    """Build the scene of a checked record for a frame of this size.
+def build_scene(model: SceneModel, frame_shape: tuple[int, int], where: str = "scene") -> Uniform | Discs | Picture:
+    """Build the scene of a checked record for a frame of this size; ``where`` is its file, for messages.
 
     Raises
     ------
@@ -65,9 +66,8 @@ def build_scene(model: SceneModel, frame_shape: tuple[int, int]) -> Uniform | Di
             layers += [_discs(model, frame_shape, Uniform()).layer(motion)]
         return Picture(tuple(layers), background, _lighting(model, frame_shape))
     except ParameterError as problem:
-        raise InputError(
-            problem.what, where=problem.where or "scene", value=problem.value, allowed=problem.allowed, remedy=problem.remedy
-        ) from None
+        place = ": ".join(part for part in (where, problem.where) if part)
+        raise InputError(problem.what, where=place, value=problem.value, allowed=problem.allowed, remedy=problem.remedy) from None
 
 
 def _discs(model: SceneModel, frame_shape: tuple[int, int], background: Uniform) -> Discs:
@@ -86,9 +86,8 @@ def _discs(model: SceneModel, frame_shape: tuple[int, int], background: Uniform)
 
 def _targets(model: SceneModel, motion: Motion) -> list[Layer]:
     layers: list[Layer] = []
-    for still in (True, False):
-        moves = STILL if still else motion
-        some = [t for t in model.targets if t.still is still]
+    for still, group in groupby(model.targets, key=lambda t: bool(t.still)):  # the truth lists the targets in the order of the file
+        moves, some = STILL if still else motion, list(group)
         drawn = [DRAWN[t.kind](t) for t in some if t.kind != "sine"]
         flat = [o for d in drawn for o in (d if isinstance(d, list) else [d])]
         if flat:

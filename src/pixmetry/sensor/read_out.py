@@ -83,7 +83,7 @@ def place(
     """Where a place of the frame lies in the field that this frame number holds."""
     if params.mode != "field":
         return x, y
-    return x, 0.5 * (y - int(fields(params, np.array([frame]))[0]) - (0.5 if params.lines == "summed" else 0.0))
+    return x, 0.5 * (y - fields(params, np.asarray(frame)) - (0.5 if params.lines == "summed" else 0.0))
 
 
 def truth(params: ReadOut, signal: Signal, stream: Stream) -> Mapping[str, np.ndarray]:
