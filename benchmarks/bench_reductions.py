@@ -10,7 +10,6 @@ from goals import verdict
 
 from pixmetry.experiment.stack import reduce_group
 
-
 GOAL = 1.0
 
 

@@ -370,6 +370,12 @@ def test_a_wrong_target_names_its_scene_file(folder: Path) -> None:
         assert result.exit_code == 2 and "ring.yaml: ring.inner_px" in result.output
 
 
+def test_swapped_files_are_told_by_their_schema(folder: Path) -> None:
+    for command in (["simulate", "scene.yaml", "camera.yaml"], ["simulate", "camera.yaml", "camera.yaml"]):
+        result = CliRunner().invoke(main, [command[0], *(str(folder / name) for name in command[1:]), "-o", str(folder / "out")])
+        assert result.exit_code == 2 and "a file of another kind" in result.output and "to do: name a file of that schema" in result.output
+
+
 def test_a_scene_pair_that_is_one_number_is_explained(folder: Path) -> None:
     (folder / "scene.yaml").write_text(SCENE_FILE + "motion: {velocity_px_per_s: 5}\n")
     result = run(folder)

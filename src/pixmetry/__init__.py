@@ -43,8 +43,8 @@ __all__ = [
 if TYPE_CHECKING:
     from pixmetry.assessment import assess
     from pixmetry.campaign import load_campaign
-    from pixmetry.core.camera import Camera, load_camera
     from pixmetry.chain import walk
+    from pixmetry.core.camera import Camera, load_camera
     from pixmetry.core.catalogue import add_source_file, catalogue
     from pixmetry.core.errors import PixmetryError
     from pixmetry.core.estimates import Estimates

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from pixmetry.core.camera import Camera, load_camera
-from pixmetry.core.conversions import HOLD, LOOK, SAMPLE, Link, LineSources, look
+from pixmetry.core.conversions import HOLD, LOOK, SAMPLE, LineSources, Link, look
 from pixmetry.core.errors import InputError
 from pixmetry.core.random import Grid
 from pixmetry.core.signal import Kind, Signal
@@ -72,9 +72,7 @@ class Walk:
         return sorted(moved, key=lambda s: -np.hypot(*s.moved))
 
 
-def walk(
-    camera: str | Path | Camera, scene: Any, *, target: int | None = None, frame: int = 0, seed: int = 0, frame_period_s: float | None = None
-) -> Walk:
+def walk(camera: str | Path | Camera, scene: Any, *, target: int | None = None, frame: int = 0, seed: int = 0) -> Walk:
     """Follow one target through a camera.
 
     Parameters
@@ -112,8 +110,8 @@ def walk(
     steps: list[Step] = []
     for (link, position, signal), (_, _, quiet) in pairs:
         prefix = replace(camera, chain=camera.active[:position])
-        beside = [[chosen[axis], chosen[axis] + 1.0] for axis in ("x_px", "y_px")]
-        (x, x1), (y, y1) = (v.tolist() for v in prefix.true_positions(*beside, frame, seed, layout_only=True))
+        beside_x, beside_y = ([chosen[axis], chosen[axis] + 1.0] for axis in ("x_px", "y_px"))
+        (x, x1), (y, y1) = (v.tolist() for v in prefix.layout(beside_x, beside_y, frame))
         scale = (x1 - x, y1 - y)  # pixels of this frame for one of the scene
         window = _window(signal, x, y, half)
         image, expected = (_cut(s, window) for s in (signal, quiet))
@@ -143,7 +141,7 @@ def walk(
 def _choose(scene: Any, camera: Camera, target: int | None, frame: int, seed: int) -> dict[str, Any]:
     """The target to follow: its place and size in the scene's plane."""
     rows, cols = camera.frame_shape
-    exposed = camera.signal(scene, Grid(np.array([frame]), np.zeros(1), np.zeros(1), (1, 1)))
+    exposed = camera.signal(scene, Grid(np.array([frame]), np.zeros(1, int), np.zeros(1, int), (1, 1)))
     time = float(exposed.time_s[0] + 0.5 * exposed.exposure_s[0])
     offered = list(scene.targets(time, frame)) if hasattr(scene, "targets") else []
     if target is not None and not 0 <= target < len(offered):
@@ -171,7 +169,7 @@ def _images(camera: Camera, scene: Any, frame: int, seed: int, quiet: bool) -> I
     states: dict[str, Any] = {}
     if any(link.remembers for link in camera.links):
         for number in range(frame):
-            for link, signal, _ in _run(camera, scene, number, streams, states):
+            for _ in _run(camera, scene, number, streams, states):
                 pass
     first = camera.signal(scene, Grid.whole([frame], camera.frame_shape))
     yield None, 0, look(first)

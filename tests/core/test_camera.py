@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from pixmetry.core import bands
 from pixmetry.core.camera import Camera, Element, build_camera, load_camera
 from pixmetry.core.catalogue import get_source
 from pixmetry.core.errors import ChainError, InputError
+from pixmetry.core.overrides import changed_camera
 from pixmetry.core.random import Grid
 from pixmetry.core.signal import Kind, Windows
 from pixmetry.grabber.clamp import SOURCE as CLAMP
@@ -219,6 +221,15 @@ def test_frozen_mode_settles_a_memory_on_the_background() -> None:
     assert np.allclose(got, 30.0 + 10.0, atol=1e-3)
 
 
+def test_whole_frames_in_one_batch_of_the_frozen_mode_are_no_sequence() -> None:
+    lag = get_source("sensor.image_lag")
+    chain = camera(TO_ELECTRONS, Element("lag", lag, lag.typical), shape=(6, 7))
+    given: dict[str, Any] = {"mode": "frozen", "background": Flat(30.0)}
+    batch = chain.expose_windows(SCENE, Grid.whole([0, 1, 2], (6, 7)), **given)
+    for number, seen in enumerate(batch):
+        assert np.array_equal(seen, chain.expose_windows(SCENE, Grid.whole([number], (6, 7)), **given)[0])
+
+
 # ---- frozen against exact ------------------------------------------------------------------------------------------------------------
 
 
@@ -298,7 +309,8 @@ def test_exposure_times_that_are_none_are_refused(exposure: float) -> None:
 
 def test_an_order_that_the_kinds_leave_no_choice_about_is_not_asked_for() -> None:
     """Vignetting comes before the sensor, in photons; the sensor's pixels have their shape before there are photons."""
-    chain = [Element(i, get_source(i), get_source(i).typical) for i in ("sensor.pixel_aperture", "optics.vignetting", "sensor.quantum_efficiency")]
+    ids = ("sensor.pixel_aperture", "optics.vignetting", "sensor.quantum_efficiency")
+    chain = [Element(i, get_source(i), get_source(i).typical) for i in ids]
     assert Camera("with vignetting", SHAPE, chain).expose(SCENE).data.shape == (1, *SHAPE)
     with pytest.raises(ChainError, match="must come"):
         camera(TO_ELECTRONS, Element("shot", SHOT_NOISE, ShotNoise()), Element("dark", get_source("sensor.dark_current"), Nothing()))
@@ -385,6 +397,19 @@ def test_a_camera_survives_its_file(tmp_path: Path) -> None:
         load_camera(tmp_path / "none.yaml")
     with pytest.raises(InputError, match=r"chain\[0\].*pixel_std_rel"):
         build_camera(record | {"chain": [{"source": "sensor.prnu", "parameters": {"pixel_std_rel": -1}}]})
+
+
+def test_sources_that_have_the_cameras_pitch_follow_it() -> None:
+    chain = [
+        {"source": "sensor.tilt"},
+        {"source": "sensor.unflatness", "parameters": {"pitch_x_um": 7.0}},
+        {"source": "sensor.quantum_efficiency"},
+    ]
+    record = {"schema": "pixmetry/camera/1", "name": "c", "rows": 8, "cols": 9, "pitch_x_um": 5.0, "chain": chain}
+    made = changed_camera(build_camera(record), {"pitch_x_um": 6.0})
+    assert made.pitch_um == (6.0, 5.0)
+    assert made == replace(build_camera(record | {"pitch_x_um": 6.0, "pitch_y_um": 5.0}), name="c")
+    assert made["sensor.tilt"].params.pitch_x_um == 6.0 and made["sensor.unflatness"].params.pitch_x_um == 7.0
 
 
 # ---- signals -------------------------------------------------------------------------------------------------------------------------

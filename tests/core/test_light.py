@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from scipy.special import erf
 
-from catalogue.support import NAME, Texture, make_source
+from catalogue.support import IDEAL, NAME, Texture, make_source
+from pixmetry.core._camera_kernels import decimate
 from pixmetry.core.camera import Camera, Element
 from pixmetry.core.errors import ChainError, InputError
 from pixmetry.core.light import FINE, Light, Points
@@ -95,8 +96,19 @@ def test_a_one_sided_spread_goes_to_the_right_side() -> None:
     assert np.abs(there.convolved(kernel).photons() - light(Spot(sd_px=0.8, y_px=10.6)).photons()).max() < 1e-4
 
 
+@pytest.mark.parametrize(("height", "width"), [(1, 1), (3, 5), (4, 4), (33, 35)])
+@pytest.mark.parametrize("step", [1, 3, FINE])
+def test_decimation_is_the_sum_under_the_mask_at_every_step(height: int, width: int, step: int) -> None:
+    rng = np.random.default_rng(height + step)
+    rows, cols = 6, 7
+    fine, mask = rng.normal(size=(2, (rows - 1) * step + height, (cols - 1) * step + width)), rng.normal(size=(height, width))
+    places = np.lib.stride_tricks.sliding_window_view(fine, mask.shape, axis=(1, 2))[:, ::step, ::step]
+    assert np.allclose(decimate(fine, mask, step, rows, cols), (places * mask).sum(axis=(3, 4)), rtol=0, atol=1e-12)
+
+
 def test_dots_are_the_mean_of_shifted_images_and_compose() -> None:
-    two = light(Spot()).spread(np.array([-0.5, 0.5]), np.zeros(2), np.full(2, 0.5)).spread(np.zeros(2), np.array([-0.3, 0.3]), np.full(2, 0.5))
+    half = np.full(2, 0.5)
+    two = light(Spot()).spread(np.array([-0.5, 0.5]), np.zeros(2), half).spread(np.zeros(2), np.array([-0.3, 0.3]), half)
     expected = np.mean([exact(Spot(x_px=11.3 + a, y_px=9.6 + b), 0.0) for a in (-0.5, 0.5) for b in (-0.3, 0.3)], axis=0)
     assert np.allclose(two.photons()[0], expected, atol=1e-6)
 
@@ -168,7 +180,8 @@ def test_windows_threads_and_frames_of_a_bent_camera_are_the_same_bits() -> None
 
 def _turn(params: Bend, signal: object, stream: object) -> object:
     angle = 0.004 * signal.grid.frame[:, None, None]
-    return signal.with_light(signal.light.moved(lambda x, y: (x * np.cos(angle) + y * np.sin(angle), y * np.cos(angle) - x * np.sin(angle))))
+    cos, sin = np.cos(angle), np.sin(angle)
+    return signal.with_light(signal.light.moved(lambda x, y: (x * cos + y * sin, y * cos - x * sin)))
 
 
 def test_windows_of_one_batch_do_not_know_of_each_other() -> None:
@@ -203,11 +216,11 @@ def test_true_positions_follow_the_geometry() -> None:
     camera = Camera("bent", SHAPE, (Element(NAME, BEND, Bend()),))
     x, y = camera.true_positions([11.3], [9.6], frame=3)
     assert x[0] == pytest.approx((11.3 - 0.03) / 1.001, abs=1e-8) and y[0] == pytest.approx(9.6)
-    assert camera.true_positions([11.3], [9.6], frame=3, layout_only=True)[0][0] == 11.3
+    assert camera.layout([11.3], [9.6], frame=3)[0][0] == 11.3
 
 
 def test_light_sources_stand_before_the_pixels_and_need_a_scene_with_radiance() -> None:
-    to_electrons = make_source("sensor.to_electrons", lambda p, s, _: s.with_data(s.data, Kind.ELECTRONS), (Kind.PHOTONS,), produces=Kind.ELECTRONS)
+    to_electrons = IDEAL[Kind.PHOTONS]
     with pytest.raises(ChainError, match="takes light and gets electrons"):
         Camera("wrong", SHAPE, (Element("e", to_electrons, to_electrons.typical), Element(NAME, BEND, Bend())))
 

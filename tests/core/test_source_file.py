@@ -42,9 +42,8 @@ def test_the_documented_source_works_from_a_file(example: Path) -> None:
 
 
 def test_the_command_takes_the_file(example: Path) -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "pixmetry", "--source-file", str(example), "sources", "electronics.fan_noise"], capture_output=True, text=True
-    )
+    command = [sys.executable, "-m", "pixmetry", "--source-file", str(example), "sources", "electronics.fan_noise"]
+    done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0 and "Fan noise" in done.stdout
 
 

@@ -115,7 +115,7 @@ class Trials:
         self.col0 = np.floor(col * (shape[1] - self.side + 1)).astype(np.int64)
 
     def errors(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-        """Positions found in the frames of a variant of the camera less the true ones, in pixels of the sensor, shape (units, places, frames)."""
+        """Positions found in the frames of a variant of the camera less the true ones: px of the sensor, (units, places, frames)."""
         key = tuple(e.on for e in camera.chain)
         if key not in self._found:
             parts = [self._unit(replace(camera, unit_seed=camera.unit_seed + UNIT_STRIDE * k), k) for k in range(self.units)]
@@ -125,11 +125,11 @@ class Trials:
     def _unit(self, camera: Camera, unit: int) -> tuple[np.ndarray, np.ndarray]:
         n, middle = self.places * self.frames, self.side // 2
         shown = [np.repeat(first[unit] + middle + part[unit], self.frames) for first, part in ((self.col0, self.dx), (self.row0, self.dy))]
-        places = [(at - start) / step for at, (start, step) in zip(shown, _layout(self.camera), strict=True)]
-        belongs = camera.layout(*places, np.arange(n))
+        x, y = ((at - start) / step for at, (start, step) in zip(shown, _layout(self.camera), strict=True))
+        belongs = camera.layout(x, y, np.arange(n))
         last = [size - self.side for size in camera.output_shape[::-1]]
         col0, row0 = (np.clip(np.rint(at).astype(np.int64) - middle, 0, most) for at, most in zip(belongs, last, strict=True))
-        scene = scene_of(self.target, self.facts, *places)
+        scene = scene_of(self.target, self.facts, x, y)
         windows = camera.expose_windows(
             scene,
             Grid(np.arange(n), row0, col0, (self.side, self.side)),

@@ -34,8 +34,8 @@ def chain(
 ) -> None:
     """Walk one target through the chain of a camera.
 
-    CAMERA is a camera file or the name of a preset; SCENE is a scene file. The page shows the image and its profiles after every source, how far
-    the target's centre has moved so far, and which source moved it.
+    CAMERA is a camera file or the name of a preset; SCENE is a scene file. The page shows the image and its profiles after every
+    source, how far the target's centre has moved so far, and which source moved it.
     """
     from pixmetry.chain import walk
     from pixmetry.core.camera import load_camera

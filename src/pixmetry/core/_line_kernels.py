@@ -32,7 +32,7 @@ def read_line(data, first, black, step, table, delays, amplitudes, at, late, len
     """
     n, rows, cols = data.shape
     k, samples, nodes, paths = len(step), at.shape[1], table.shape[0] - 1, len(delays)
-    # At the beginning of every period: the filter's state and, in the last column, the level of the period. Row 0 is before the first pixel.
+    # At the beginning of every period: the filter's state, and in the last column the level of the period. Row 0: before the first pixel.
     state = np.zeros((length + 2, k + 1))
     place = np.empty((samples, paths), np.int64)  # which period a sample sees through each path, and with which weights
     weight = np.empty((samples, paths, k + 1))

@@ -354,14 +354,12 @@ class Camera:
 
     # ---- geometry -------------------------------------------------------------------------------------------------------------
 
-    def true_positions(
-        self, x_px: Any, y_px: Any, frame: int = 0, seed: int = 0, layout_only: bool = False, **schedule: Any
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def true_positions(self, x_px: Any, y_px: Any, frame: int = 0, seed: int = 0, **schedule: Any) -> tuple[np.ndarray, np.ndarray]:
         """Return where points of the scene's plane lie in a frame that the camera puts out.
 
-        Every geometric effect of that frame counts: distortion, tilt, drift, pixel clock, offsets. What moves a measured centre by spreading
-        light or signal (a low-pass, echoes, charge left behind), and what delays rows (jitter, the warm-up of a grabber), does not: that is
-        the error.
+        Every geometric effect of that frame counts: distortion, tilt, drift, pixel clock, offsets. What moves a measured centre by
+        spreading light or signal (a low-pass, echoes, charge left behind), and what delays rows (jitter, the warm-up of a grabber), does
+        not: that is the error.
 
         Parameters
         ----------
@@ -369,8 +367,6 @@ class Camera:
             In pixels of the ideal camera.
         frame, seed : int
             Of the exposure.
-        layout_only : bool
-            Only how the frame is laid out counts (clock of the samples, offsets, fields), not what bends the image.
         **schedule
             As for `expose`.
 
@@ -379,8 +375,6 @@ class Camera:
         x_px, y_px : ndarray, shape (k,)
             NaN for points that are seen nowhere.
         """
-        if layout_only:
-            return self.layout(x_px, y_px, frame)
         x, y = (np.atleast_1d(np.asarray(v, float)) for v in (x_px, y_px))
         streams = self.streams(seed)
         signal = self.signal(_NOTHING, Grid.whole([frame], (1, 1)), **schedule)
@@ -492,7 +486,8 @@ def _concatenate(parts: list[Signal]) -> Signal:
         return np.concatenate([getattr(p if name in _ARRAYS else p.grid, name) for p in parts])
 
     grid = Grid(joined("frame"), joined("row0"), joined("col0"), parts[0].grid.shape)
-    return replace(parts[0], grid=grid, **{name: joined(name) for name in _ARRAYS})
+    arrays: dict[str, Any] = {name: joined(name) for name in _ARRAYS}
+    return replace(parts[0], grid=grid, **arrays)
 
 
 _ARRAYS = ("data", "exposure_s", "time_s", "temperature_c")  # of a signal, one entry per window

@@ -32,6 +32,11 @@ def to_record(camera: Camera) -> dict[str, Any]:
     return record
 
 
+def pitch_values(pitch_um: tuple[float, float] | None) -> dict[str, float]:
+    """What sources that know the pixel pitch take from their camera, by the names of their parameters."""
+    return {} if pitch_um is None else {"pitch_x_um": pitch_um[0], "pitch_y_um": pitch_um[1], "pitch_um": pitch_um[0]}
+
+
 def build_camera(record: Mapping[str, Any], where: str = "camera") -> Camera:
     """Build a camera from its plain record.
 
@@ -48,8 +53,7 @@ def build_camera(record: Mapping[str, Any], where: str = "camera") -> Camera:
     checked = validate(CameraRecord, record, where)
     elements = []
     pitch = None if checked.pitch_x_um is None else (checked.pitch_x_um, checked.pitch_y_um or checked.pitch_x_um)
-    # the camera's own pitch, unless a source says otherwise
-    known = {} if pitch is None else {"pitch_x_um": pitch[0], "pitch_y_um": pitch[1], "pitch_um": pitch[0]}
+    known = pitch_values(pitch)  # unless a source says otherwise
     for i, entry in enumerate(checked.chain):
         source = get_source(entry.source, f"{where}, chain[{i}]")
         own = {name: value for name, value in known.items() if name in source.parameters.model_fields}

@@ -46,8 +46,9 @@ def check_chain(chain: Sequence[Element], where: str = "camera") -> None:
         if step is not None:
             kind = step.produces
         if kind not in source.consumes:
+            given = Kind.PHOTONS if kind is Kind.LIGHT else kind
             raise ChainError(
-                f"{element.name} cannot follow: it takes {', '.join(source.consumes)} and gets {Kind.PHOTONS if kind is Kind.LIGHT else kind}",
+                f"{element.name} cannot follow: it takes {', '.join(source.consumes)} and gets {given}",
                 where=where,
                 remedy="change the order",
             )

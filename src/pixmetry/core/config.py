@@ -142,14 +142,20 @@ def validate(model: type[AnyModel], data: Mapping[str, Any], where: str = "") ->
     Raises
     ------
     InputError
-        With the most telling of the problems (an unknown key first: it often is what makes another one missing).
+        With the most telling of the problems: a file of another kind first, then an unknown key, which often is what makes another one
+        missing.
     """
     try:
         return model.model_validate(dict(data))
     except ValidationError as problem:
-        errors = sorted(problem.errors(include_url=False), key=lambda e: (e["type"] != "extra_forbidden", e["type"] == "missing"))
+        problems = problem.errors(include_url=False)
+        errors = sorted(problems, key=lambda e: (not _of_schema(e), e["type"] != "extra_forbidden", e["type"] == "missing"))
         lines = getattr(data, "lines", {})
         raise _explain(model, errors[0], lines, where) from None
+
+
+def _of_schema(error: Any) -> bool:
+    return error["loc"] == ("schema",) and error["type"] == "literal_error"
 
 
 def _explain(model: type[BaseModel], error: Any, lines: Mapping[tuple[str | int, ...], int], where: str) -> InputError:
@@ -158,6 +164,9 @@ def _explain(model: type[BaseModel], error: Any, lines: Mapping[tuple[str | int,
     where = f"{where}, line {line}" if line else where
     name = ".".join(str(part + 1 if isinstance(part, int) else part) for part in loc)
     kind = error["type"]
+    if _of_schema(error):
+        allowed = error["ctx"]["expected"]
+        return InputError("a file of another kind", where=where, value=error["input"], allowed=allowed, remedy="name a file of that schema")
     if kind == "extra_forbidden":
         return _unknown_key(str(loc[-1]), name, _keys_at(model, loc[:-1]), where)
     if kind == "missing":

@@ -33,6 +33,9 @@ class Frozen:
     def apply(self, element: Link, signal: Signal, stream: Any) -> Signal:
         """Run a source on the near context, and correct for the far one by the same run on the noise-free frame."""
         before, after, state = self.elements[element.name]
+        if element.remembers and len(signal) > 1 and signal.data.shape[1:] == tuple(signal.frame_shape):  # else they would be a sequence
+            parts = [self.apply(element, signal.take(np.array([i])), stream).data for i in range(len(signal))]
+            return signal.with_data(np.concatenate(parts), element.source.produces)
         out, _ = run(element.source, element.params, signal, stream, state)
         if element.remembers:
             return out

@@ -459,7 +459,8 @@ class _Places:
         for pad, v in zip(padded, (x, y), strict=True):
             pad[inside] = v
         px, py = self.light.pulled(padded[0][:, :, None], padded[1][:, :, None])
-        return tuple(np.broadcast_to(p, (n, widest, 1))[:, :, 0][inside] for p in (px, py))  # type: ignore[return-value]
+        u, v = (np.broadcast_to(p, (n, widest, 1))[:, :, 0][inside] for p in (px, py))
+        return u, v
 
     def size(self, x: np.ndarray, y: np.ndarray, width: float, height: float) -> tuple[Any, Any]:
         """Width and height in the scene's plane of a box about each point."""

@@ -8,6 +8,7 @@ from difflib import get_close_matches
 from typing import Any
 
 from pixmetry.core.camera import Camera
+from pixmetry.core.camera_files import pitch_values
 from pixmetry.core.catalogue import catalogue
 from pixmetry.core.errors import InputError
 
@@ -128,4 +129,11 @@ def _with_own(camera: Camera, values: dict[str, Any]) -> Camera:
     checked = validate(CameraRecord, {**record, "chain": [], **values}, camera.name)
     pitch = None if checked.pitch_x_um is None else (checked.pitch_x_um, checked.pitch_y_um or checked.pitch_x_um)
     whole: dict[str, Any] = {"frame_shape": (checked.rows, checked.cols), "pitch_um": pitch}
-    return replace(camera, **whole, **{name: getattr(checked, name) for name in same})
+    changed = replace(camera, **whole, **{name: getattr(checked, name) for name in same})
+    before, after = pitch_values(camera.pitch_um), pitch_values(pitch)
+    for element in camera.chain:  # sources that had the camera's pitch follow it
+        own = element.params.model_dump()
+        moved = {name: after[name] for name in before if name in own and own[name] == before[name] != after.get(name, before[name])}
+        if moved:
+            changed = changed.with_parameters(element.name, **moved)
+    return changed

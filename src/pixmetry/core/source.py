@@ -83,15 +83,15 @@ class Source:
         (Sources of ``light`` and ``video`` need none: the camera follows their maps.)
     truth : callable, optional
         ``truth(params, signal, stream)``: what it does in this unit and these frames, as named arrays: maps (rows, cols) of the unit,
-        masks, shifts (n, rows) of every row; ``signal`` is a batch of whole frames of the kind that it takes, of which only the grid, times and
-        sizes count.
+        masks, shifts (n, rows) of every row; ``signal`` is a batch of whole frames of the kind that it takes, of which only the grid, times
+        and sizes count.
     start : callable, optional
         ``start(params)``: the state before frame 0, for a source with a memory; None where it has none with these parameters.
     applies_to : tuple of str
         Kinds of camera that can have it: of ``digital``, ``analogue``, ``ccd``, ``cmos``; empty for all.
     option : str
-        What a camera must have for this source to be in it, where most have not: ``a colour mosaic``. A budget counts it only where the camera's
-        chain holds it.
+        What a camera must have for this source to be in it, where most have not: ``a colour mosaic``. A budget counts it only where the
+        camera's chain holds it.
     gum_class : str
         Class of its contribution, see ``core.contribution``.
     equation, typical_size : str

@@ -112,7 +112,11 @@ def expected_counts(histogram: CodeHistogram) -> tuple[np.ndarray, np.ndarray]:
 
     means, variances, sizes = histogram.level_means_dn, histogram.level_vars_dn2, histogram.level_sizes
     if means is None or variances is None or sizes is None:
-        raise MeasureError("the histogram holds no light levels", remedy="add frames with their level")
+        raise MeasureError(
+            "no light level covers its codes evenly",
+            allowed=f"bright levels with a temporal noise above {MIN_TEMPORAL_SIGMA_DN:g} DN, clear of saturation",
+            remedy="add such levels; a camera as quiet as this has none, and loses nothing but this value",
+        )
     edges = np.arange(2**histogram.bits + 1) - 0.5
     expected, usable = np.zeros(edges.size - 1), np.zeros(edges.size - 1, dtype=bool)
     top = edges[-1]

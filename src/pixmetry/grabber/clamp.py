@@ -109,6 +109,7 @@ def propagate(params: Clamp, probe: Probe) -> Contribution:
     return Contribution(
         u_x_px=float(np.hypot(u[0], dx.std())), u_y_px=float(np.hypot(u[1], dy.std())), bias_x_px=float(dx.mean()),
         bias_y_px=float(dy.mean()), gum_class="Tr", model_error=0.2, method="offsets common to a row, and the field of the droop",
+        floor_px=4e-4 if params.droop_rel and params.restored_rel < 1 else 2e-4,  # the background settles over the first lines
     )  # fmt: skip
 
 

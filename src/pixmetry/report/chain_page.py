@@ -45,7 +45,10 @@ def _content(walk: Walk) -> dict[str, Any]:
         "total": _pair(last.error) if found else None,
         "total_expected": _pair(last.expected_error) if found and last.expected_error is not None else None,
         "lost": walk.target["found"] and not found,
-        "movers": [{"title": s.title, "name": s.name, "moved": _pair(s.moved), "expected": _pair(s.expected_moved)} for s in walk.movers()[:SHOWN]],
+        "movers": [
+            {"title": s.title, "name": s.name, "moved": _pair(s.moved), "expected": _pair(s.expected_moved)}
+            for s in walk.movers()[:SHOWN]
+        ],
         "path": _path(walk) if walk.target["found"] else None,
         "steps": [_card(i, s, walk.target["found"]) for i, s in enumerate(walk.steps)],
     }
@@ -132,6 +135,6 @@ def _path(walk: Walk) -> Picture:
             figure,
             "path",
             alt,
-            "How far the target's centre has moved after each source. Lines: as expected of this unit, every temporal draw at its mean; marks: "
-            "in this frame.",
+            "How far the target's centre has moved after each source. Lines: as expected of this unit, every temporal draw at its mean; "
+            "marks: in this frame.",
         )

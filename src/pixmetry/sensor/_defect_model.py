@@ -34,7 +34,9 @@ class Defects(Parameters):
     blinking_fraction: float = quantity(0.0, "1", "share of pixels whose dark charge jumps between two levels", ge=0, le=MOST)
     blinking_e: float = quantity(100.0, "e-", "what a blinking pixel has more on its upper level", ge=0, le=1e6)
     blinking_on: float = quantity(0.5, "1", "share of the frames in which it is on its upper level", gt=0, lt=1)
-    blinking_frames: float = quantity(10.0, "1", "frames after which it has forgotten its level: correlation e^-1", ge=1, le=1000)
+    blinking_frames: float = quantity(
+        10.0, "1", "frames, on average, from one draw of its level to the next: correlation (1 − 1/frames)^k", ge=1, le=1000
+    )
     stuck_fraction: float = quantity(0.0, "1", "share of pixels that hold the same charge whatever the light", ge=0, le=MOST)
     stuck_e: float = quantity(10_000.0, "e-", "charge of a stuck pixel", ge=0, le=1e7)
     column_fraction: float = quantity(0.0, "1", "share of defect columns", ge=0, le=MOST)

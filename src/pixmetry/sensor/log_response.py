@@ -26,6 +26,7 @@ class LogResponse(Parameters):
     knee_e: float = quantity(0.0, "e-", "lin-log: light up to which the response is linear", ge=0, le=1e7)
     offset_dn: float = quantity(0.0, "DN", "mean of a, the dark signal", ge=-1e5, le=1e5)
     offset_std_dn: float = quantity(0.0, "DN", "standard deviation of a over the pixels", ge=0, le=1e5)
+    noise_dn: float = quantity(0.0, "DN", "temporal noise of pixel and read-out, alike at all levels, standard deviation", ge=0, le=1e4)
     slope_std_rel: float = quantity(0.0, "1", "relative standard deviation of b over the pixels", ge=0, le=0.3)
     foot_std_rel: float = quantity(0.0, "1", "relative standard deviation of c over the pixels", ge=0, le=0.3)
 
@@ -64,10 +65,13 @@ def response_dn(params: LogResponse, electrons: np.ndarray, b_dn: np.ndarray | f
 
 
 def forward(params: LogResponse, signal: Signal, stream: Stream) -> Signal:
-    """Turn electrons into DN; it stands where ``electronics.gain`` does in a linear camera."""
+    """Turn electrons into DN; it stands where ``electronics.gain`` does in a linear camera.
+
+    Its own noise comes behind the logarithm: ahead of it, amplifier noise in electrons would be largest in the dark.
+    """
     b = slope_dn(params, signal.temperature_c).astype(np.float32)[:, None, None]
     data = response_dn(params, signal.data, b, pixels_of(params, signal.grid, stream))
-    return signal.with_data(data.astype(np.float32), Kind.DN)
+    return signal.with_data(stream.add_normal(data.astype(np.float32), signal.grid, params.noise_dn), Kind.DN)
 
 
 def truth(params: LogResponse, signal: Signal, stream: Stream) -> Mapping[str, np.ndarray]:
@@ -88,14 +92,14 @@ SOURCE = Source(
     essential=True,
     after=("optics", "sensor.shot_noise"),
     before=("electronics",),
-    typical=LogResponse(offset_std_dn=1.8, slope_std_rel=0.01, foot_std_rel=0.05),
-    bound=LogResponse(offset_std_dn=6.0, slope_std_rel=0.03, foot_std_rel=0.2),
+    typical=LogResponse(offset_std_dn=1.8, slope_std_rel=0.01, foot_std_rel=0.05, noise_dn=0.3),
+    bound=LogResponse(offset_std_dn=6.0, slope_std_rel=0.03, foot_std_rel=0.2, noise_dn=1.0),
     forward=forward,
     truth=truth,
     applies_to=("cmos",),
     option="a logarithmic response",
     gum_class="F",
-    equation="y = a + b ln(1 + x/c),  b = n kT/q · gain;  lin-log: linear up to a knee, then logarithmic with the same slope",
+    equation="y = a + b ln(1 + x/c) + noise,  b = n kT/q · gain;  lin-log: linear up to a knee, then logarithmic with the same slope",
     typical_size="a spread of a by 1–3 % of a decade is 2.3–7 % of the light: 0.005–0.016 px on a disc of 7 px (linearised)",
     references=(
         "D. Joseph, S. Collins, IEEE Trans. Instrum. Meas. 51(5), 996, 2002 (a, b, c of every pixel)",

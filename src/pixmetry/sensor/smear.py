@@ -31,7 +31,9 @@ class Smear(Parameters):
     rows: Literal["all", "passed"] = quantity(
         "all", "1", "continuous operation: charge has passed all rows of its column; after a flush: only those between it and the store"
     )
-    store: Literal["below", "above"] = quantity("below", "1", "the side of the store: below means that the last row is nearest to it")
+    store: Literal["below", "above"] = quantity(
+        "below", "1", "side of the store: below, the last row is nearest to it; above, row 0, as in sensor.charge_transfer"
+    )
 
 
 def share(params: Smear, signal: Signal) -> np.ndarray:
