@@ -14,7 +14,7 @@ from pixmetry.core.camera import Camera, Element
 from pixmetry.core.errors import ChainError, InputError
 from pixmetry.core.light import FINE, Light, Points
 from pixmetry.core.random import Grid
-from pixmetry.core.signal import Kind
+from pixmetry.core.signal import Kind, Signal
 from pixmetry.core.source import Parameters
 from pixmetry.scene.outlines import line
 from pixmetry.scene.picture import Picture
@@ -217,6 +217,20 @@ def test_true_positions_follow_the_geometry() -> None:
     x, y = camera.true_positions([11.3], [9.6], frame=3)
     assert x[0] == pytest.approx((11.3 - 0.03) / 1.001, abs=1e-8) and y[0] == pytest.approx(9.6)
     assert camera.layout([11.3], [9.6], frame=3)[0][0] == 11.3
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_point_that_is_seen_nowhere_has_no_place() -> None:
+    """x − 0.01 x² has its greatest value, 25, at 50: what lies beyond is not in the image."""
+
+    def forward(params: Bend, signal: Signal, stream: object) -> Signal:
+        return signal.with_light(signal.light.moved(lambda x, y: (x - 0.01 * x**2, y)))
+
+    fold = make_source("optics.fold", forward, (Kind.LIGHT,), parameters=Bend)
+    camera = Camera("folded", SHAPE, (Element(NAME, fold, Bend()),))
+    x, y = camera.true_positions([24.0, 26.0, 9.0], [3.0, 4.0, 5.0])
+    assert x[[0, 2]] == pytest.approx([40.0, 10.0]) and np.isnan(x[1]) and y[0] == pytest.approx(3.0)
+    assert np.isnan(camera.true_positions([26.0], [4.0])[0]).all()
 
 
 def test_light_sources_stand_before_the_pixels_and_need_a_scene_with_radiance() -> None:

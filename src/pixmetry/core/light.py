@@ -203,18 +203,19 @@ class Light:
         if not self.pulls:
             return u, v
         step = 0.25
-        for _ in range(50):
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # of points that are seen nowhere
+            for _ in range(50):
+                fx, fy = self.pulled(u, v)
+                ex, ey = fx - x, fy - y
+                (ax, ay), (bx, by) = self.pulled(u + step, v), self.pulled(u, v + step)
+                jxx, jyx, jxy, jyy = (ax - fx) / step, (ay - fy) / step, (bx - fx) / step, (by - fy) / step
+                det = jxx * jyy - jxy * jyx
+                du, dv = (ex * jyy - ey * jxy) / det, (ey * jxx - ex * jyx) / det
+                u, v = u - du, v - dv
+                if not (np.abs([du, dv]) >= tolerance_px).any():
+                    return u, v
             fx, fy = self.pulled(u, v)
-            ex, ey = fx - x, fy - y
-            (ax, ay), (bx, by) = self.pulled(u + step, v), self.pulled(u, v + step)
-            jxx, jyx, jxy, jyy = (ax - fx) / step, (ay - fy) / step, (bx - fx) / step, (by - fy) / step
-            det = jxx * jyy - jxy * jyx
-            du, dv = (ex * jyy - ey * jxy) / det, (ey * jxx - ex * jyx) / det
-            u, v = u - du, v - dv
-            if np.nanmax(np.abs([du, dv])) < tolerance_px:
-                return u, v
-        fx, fy = self.pulled(u, v)
-        lost = ~(np.hypot(fx - x, fy - y) < 1e-6)
+            lost = ~(np.hypot(fx - x, fy - y) < 1e-6)
         return np.where(lost, np.nan, u), np.where(lost, np.nan, v)
 
     # ---- sampling ---------------------------------------------------------------------------------------------------------------
