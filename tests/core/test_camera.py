@@ -109,6 +109,21 @@ def test_a_declared_order_that_is_broken_is_refused_both_ways() -> None:
     camera(TO_ELECTRONS, cable, late)
 
 
+def test_steps_on_codes_of_fewer_bits_than_the_converter_makes_are_refused() -> None:
+    """They would take all brighter codes for the highest."""
+    dcs = load_camera("dcs420_like")
+    for name in ("processing.demosaic", "processing.companding"):
+        with pytest.raises(ChainError, match=rf"{name} takes codes of fewer bits than grabber.adc makes"):
+            dcs.with_parameters(name, bits=10)
+    with pytest.raises(ChainError, match="fewer bits"):
+        dcs.with_parameters("grabber.adc", bits=14)
+    dcs.with_parameters("processing.companding", bits=14)
+    every = {"grabber.adc.bits": 14, "processing.demosaic.bits": 14, "processing.companding.bits": 14}
+    assert changed_camera(dcs, every)["grabber.adc"].params.bits == 14
+    with pytest.raises(ChainError, match="fewer bits"):
+        changed_camera(dcs, {"grabber.adc.bits": 14})
+
+
 def test_what_is_switched_off_is_not_checked() -> None:
     built = camera(TO_ELECTRONS, SHOT, Element("off", IDEAL[Kind.DN], Nothing(), on=False))
     assert [e.name for e in built.chain if not e.on] == ["off"]

@@ -212,6 +212,17 @@ def test_a_scene_that_stands_still_is_rendered_once() -> None:
     assert all(np.array_equal(f, first[0]) for f in frames)
 
 
+def test_pixels_that_move_from_frame_to_frame_are_not_rendered_once() -> None:
+    def forward(params: Bend, signal: Signal, stream: object) -> Signal:
+        shift = np.broadcast_to(0.1 * signal.grid.frame[:, None, None], signal.grid.size)
+        return signal.with_light(signal.light.jittered(shift, 0 * shift))
+
+    camera = Camera("shaken", SHAPE, (Element(NAME, make_source("optics.shaken", forward, (Kind.LIGHT,), parameters=Bend), Bend()),))
+    frames = camera.expose(Spot(), 3, threads=1).data
+    assert all(np.array_equal(frames[k], camera.expose(Spot(), [k]).data[0]) for k in range(3))
+    assert np.abs(frames[2] - frames[0]).max() > 0.05
+
+
 def test_true_positions_follow_the_geometry() -> None:
     camera = Camera("bent", SHAPE, (Element(NAME, BEND, Bend()),))
     x, y = camera.true_positions([11.3], [9.6], frame=3)

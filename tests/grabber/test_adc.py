@@ -9,8 +9,8 @@ from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.core.estimates import Estimates
 from pixmetry.core.observations import CodeErrors, Observations
 from pixmetry.core.random import Stream
-from pixmetry.core.signal import Kind
-from pixmetry.grabber.adc import Adc, correct, forward, measure, thresholds
+from pixmetry.core.signal import Kind, Windows
+from pixmetry.grabber.adc import SOURCE, Adc, correct, forward, measure, thresholds
 from source_signals import Z, signal, stream
 
 
@@ -144,3 +144,14 @@ def test_a_jittering_moment_of_sampling_is_noise_on_slopes_only() -> None:
     assert (out.std(axis=0) / want.std(axis=0))[steep] == pytest.approx(np.ones(steep.sum()), abs=1.3 * Z / np.sqrt(rows))
     flat_part = forward(params, signal(np.full((1, 50, 50), 7.0), Kind.DN), stream()).data
     assert (flat_part == 30_007).all()
+
+
+def test_a_window_of_jittered_samples_is_the_crop() -> None:
+    params, unit = Adc(bits=16, offset_dn=1000.0, aperture_jitter_rel=0.05, hysteresis_lsb=1.0), stream()
+    frame = np.random.default_rng(6).uniform(0, 5000, (1, 6, 30)).astype(np.float32)
+    whole = forward(params, signal(frame, Kind.DN), unit).data
+    for col0, cols in ((0, 1), (7, 5), (29, 1)):
+        need = SOURCE.window_needed(params, Windows.one(2, col0, 3, cols), (6, 30))
+        left, right = int(need.col0[0]), int(need.col0[0] + need.cols[0])
+        part = forward(params, signal(frame[:, 2:5, left:right], Kind.DN, row0=2, col0=left, frame_shape=(6, 30)), unit).data
+        assert np.array_equal(part[:, :, col0 - left : col0 - left + cols], whole[:, 2:5, col0 : col0 + cols])

@@ -13,8 +13,9 @@ def cut_windows(frame, row0, col0, rows, cols):
     out = np.empty((len(row0), rows, cols), frame.dtype)
     for i in range(len(row0)):
         for r in range(rows):
+            line = frame[row0[i] + r, col0[i] : col0[i] + cols]
             for c in range(cols):
-                out[i, r, c] = frame[row0[i] + r, col0[i] + c]
+                out[i, r, c] = line[c]
     return out
 
 

@@ -34,16 +34,21 @@ def read_line(data, first, black, step, table, delays, amplitudes, at, late, len
     k, samples, nodes, paths = len(step), at.shape[1], table.shape[0] - 1, len(delays)
     # At the beginning of every period: the filter's state, and in the last column the level of the period. Row 0: before the first pixel.
     state = np.zeros((length + 2, k + 1))
-    place = np.empty((samples, paths), np.int64)  # which period a sample sees through each path, and with which weights
+    place = np.empty((paths, samples), np.int64)  # which period a sample sees through each path, and with which weights
     weight = np.empty((samples, paths, k + 1))
+    even = np.empty(paths, np.bool_)  # whether these periods follow each other
     for i in range(n):
         for r in range(rows):
             if r == 0 or late[i, r] != late[i, r - 1]:
-                for j in range(samples):
-                    for e in range(paths):
+                for e in range(paths):
+                    even[e] = True
+                    for j in range(samples):
                         t = at[i, j] - late[i, r] - delays[e]
                         whole = np.floor(t)
-                        place[j, e] = max(int(whole) - first[i], -1) + 1
+                        place[e, j] = max(int(whole) - first[i], -1) + 1
+                        even[e] = even[e] and (j == 0 or place[e, j] == place[e, j - 1] + 1)
+                        if k == 0:  # every path has the weight of its amplitude
+                            continue
                         part = t - whole
                         node = int(part * nodes + 0.5)
                         d = part - node / nodes
@@ -52,6 +57,9 @@ def read_line(data, first, black, step, table, delays, amplitudes, at, late, len
                             weight[j, e, q] = amplitudes[e] * (((c3 * d + c2) * d + c1) * d + c0)
             for c in range(cols):
                 state[c + 1, k] = np.float64(data[i, r, c]) - black
+            if k == 0:
+                sum_echoes(state[:, 0], place, even, amplitudes, black, out[i, r])
+                continue
             for c in range(1, length + 1):
                 for p in range(k):
                     total = 0.0
@@ -61,10 +69,26 @@ def read_line(data, first, black, step, table, delays, amplitudes, at, late, len
             for j in range(samples):
                 value = 0.0
                 for e in range(paths):
-                    c = place[j, e]
+                    c = place[e, j]
                     for q in range(k + 1):
                         value += weight[j, e, q] * state[c, q]
                 out[i, r, j] = black + value
+
+
+@jit
+def sum_echoes(level, place, even, amplitudes, black, out):
+    """Write the sum of levels through all paths, for a line without filters."""
+    sums = np.zeros(len(out))
+    for e in range(len(place)):
+        a, p = amplitudes[e], place[e, 0]
+        if even[e]:
+            for j in range(len(out)):
+                sums[j] += a * level[p + j]
+        else:
+            for j in range(len(out)):
+                sums[j] += a * level[place[e, j]]
+    for j in range(len(out)):
+        out[j] = black + sums[j]
 
 
 @jit

@@ -467,10 +467,12 @@ def _sub_grid(grid: Grid, index: np.ndarray) -> Grid:
 
 def _equal_sizes(needs: list[Windows]) -> list[np.ndarray]:
     """Positions of the batch whose windows have the same sizes all along the chain, group by group."""
-    sizes = np.stack([v for w in needs for v in (w.rows, w.cols)], 1)
-    if (sizes == sizes[:1]).all():
-        return [np.arange(len(sizes))] if len(sizes) else []
-    group = np.unique(sizes, axis=0, return_inverse=True)[1].ravel()
+    sizes = np.stack([v for w in needs for v in (w.rows, w.cols)])
+    if not sizes.shape[1]:
+        return []
+    group = np.zeros(sizes.shape[1], np.int64)
+    for differ in {v.tobytes(): v for v in sizes if (v != v[0]).any()}.values():  # most elements take the same windows as the one before
+        group = np.unique(group * (differ.max() + 1) + differ, return_inverse=True)[1].ravel()
     return [np.flatnonzero(group == g) for g in range(group.max() + 1)]
 
 

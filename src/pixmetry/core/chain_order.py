@@ -59,6 +59,26 @@ def check_chain(chain: Sequence[Element], where: str = "camera") -> None:
         for earlier in chain[:i]:
             if _named(earlier.source, source.before) and earlier.on and not _by_kind(source, earlier.source):
                 raise ChainError(f"{element.name} must come before {earlier.name}", where=where, remedy="change the order")
+    _check_bits([e for e in chain if e.on], where)
+
+
+def _check_bits(chain: Sequence[Element], where: str) -> None:
+    """Refuse steps on codes that would cut off all codes but the lowest, because they are told of fewer bits than the converter has."""
+    converter: Element | None = None
+    for element in chain:
+        bits = getattr(element.params, "bits", None)
+        if bits is None:
+            continue
+        if element.source.produces is Kind.CODES:
+            converter = element
+        elif converter is not None and bits < converter.params.bits:
+            raise ChainError(
+                f"{element.name} takes codes of fewer bits than {converter.name} makes",
+                value=bits,
+                allowed=f"{converter.params.bits} or more",
+                where=where,
+                remedy=f"set {element.name}.bits",
+            )
 
 
 def in_order(sources: Iterable[Source]) -> list[Source]:

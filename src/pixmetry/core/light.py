@@ -72,12 +72,19 @@ class Points:
 
     def take(self, index: Any) -> Points:
         """Return some of the points, as flat arrays."""
-        parts = (np.broadcast_to(v, self.x_px.shape)[index] for v in (self.x_px, self.y_px, self.time_s, self.exposure_s, self.frame))
-        return Points(*parts, self.blur_px, self.frame_shape)  # type: ignore[call-arg]
+        x, y = self.x_px[index], np.broadcast_to(self.y_px, self.x_px.shape)[index]
+        time, exposure, frame = (_taken(v, self.x_px.shape, index, x.shape) for v in (self.time_s, self.exposure_s, self.frame))
+        return Points(x, y, time, exposure, frame, self.blur_px, self.frame_shape)
 
     def shifted(self, dx: Any, dy: Any) -> Points:
         """Return the points moved by so much."""
         return replace(self, x_px=self.x_px + dx, y_px=self.y_px + dy)
+
+
+def _taken(values: np.ndarray, shape: tuple[int, ...], index: Any, taken: tuple[int, ...]) -> np.ndarray:
+    """Values at an index into an array of that shape; one value for all stays one value in memory."""
+    one = np.size(values) > 0 and not any(s for s, size in zip(values.strides, values.shape, strict=True) if size > 1)
+    return np.broadcast_to(values[(0,) * values.ndim], taken) if one else np.broadcast_to(values, shape)[index]
 
 
 @dataclass(frozen=True)
@@ -228,7 +235,7 @@ class Light:
         if getattr(self.scene, "moving", True):
             return None
         parts = [self.exposure_s, self.moments[1], np.array([self.blur_px2, self.sensitivity, *self.aperture_px])]
-        parts += [*(self.dots or ()), *([] if self.kernel is None else [self.kernel])]
+        parts += [*(self.dots or ()), *([] if self.kernel is None else [self.kernel]), *(self.jitter_px or ())]
         if self.pulls or self.varying:
             x, y = self._lattice()
             parts += [np.asarray(v, float) for v in (*self.pulled(x, y), *(f(x, y) for f in self.varying))]
@@ -320,11 +327,10 @@ class Light:
         """Light averaged over a cell about every point, through all spreads but the tabulated one."""
         n = len(self.grid.frame)
         shape = (n, y.shape[1], x.shape[2])
+        # x is one row of columns and y one column of rows, unless pixels are moved one by one: what depends on one of them stays cheap
+        sd = np.sqrt(np.broadcast_to(sum(v(x, y) for v in self.varying), shape)) if self.varying else None
+        px, py = (np.broadcast_to(v, shape) for v in self.pulled(x, y))
         x, y = np.broadcast_to(x, shape), np.broadcast_to(y, shape)
-        sd = np.sqrt(sum(np.broadcast_to(v(x, y), shape) for v in self.varying)) if self.varying else None
-        px, py = self.pulled(x, y)
-        if self.pulls:
-            px, py = np.broadcast_to(px, shape), np.broadcast_to(py, shape)
         when, exposure, frame = (np.broadcast_to(v, shape) for v in (time, self.exposure_s[:, None, None], self.grid.frame[:, None, None]))
         centre = Points(px, py, when, exposure, frame, np.sqrt(self.blur_px2), self.frame_shape)
         dots = self.dots or (np.zeros(1), np.zeros(1), np.ones(1))

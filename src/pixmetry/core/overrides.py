@@ -77,10 +77,15 @@ def changed_camera(camera: Camera, overrides: Mapping[str, Any] | None = None, o
             by_source.setdefault(_known(camera, name, parameter), {})[parameter] = value
         else:
             own[key] = value
-    for name, values in by_source.items():
+    for name in by_source:
         if not camera[name].on:
             raise InputError(f"{name} is switched off in {camera.name}", remedy="set `enabled: true` for it in the camera file")
-        camera = camera.with_parameters(name, **values)
+    changed = {
+        name: camera[name].source.make({**camera[name].params.model_dump(), **values}, where=f"{camera.name}.{name}")
+        for name, values in by_source.items()
+    }
+    if changed:  # all at once: some only fit together
+        camera = replace(camera, chain=tuple(replace(e, params=changed.get(e.name, e.params)) for e in camera.chain))
     names = [_known(camera, name) for name in off]
     return _with_own(camera, own).switched(off=names)
 

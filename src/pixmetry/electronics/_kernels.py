@@ -15,8 +15,16 @@ def add_interpolated(nodes, place, step, scale, out):
     """
     n, cols = out.shape
     for i in range(n):
-        for c in range(cols):
-            at = place[i] + c * step
-            j = int(at)
-            part = at - j
-            out[i, c] += np.float32(scale * (np.float64(nodes[i, j]) * (1.0 - part) + np.float64(nodes[i, j + 1]) * part))
+        c = 0
+        while c < cols:  # from node to node
+            j = int(place[i] + c * step)
+            end = min(cols, max(c + 1, int((j + 1 - place[i]) / step)))
+            while end > c + 1 and int(place[i] + (end - 1) * step) > j:
+                end -= 1
+            while end < cols and int(place[i] + end * step) == j:
+                end += 1
+            low, high = np.float64(nodes[i, j]), np.float64(nodes[i, j + 1])
+            for k in range(c, end):
+                part = place[i] + k * step - j
+                out[i, k] += np.float32(scale * (low * (1.0 - part) + high * part))
+            c = end

@@ -22,16 +22,24 @@ def filter_by_place(codes, row0, col0, weights, top):
     size = weights.shape[2]
     n, rows, cols = codes.shape[0], codes.shape[1] - size + 1, codes.shape[2] - size + 1
     out = np.empty((n, rows, cols), np.uint16)
+    sums = np.empty(cols + 1, np.float64)
     for i in range(n):
         for r in range(rows):
+            here, there = weights[(row0[i] + r) % 2, col0[i] % 2], weights[(row0[i] + r) % 2, (col0[i] + 1) % 2]
+            sums[:] = 0.0
+            for a in range(size):
+                for b in range(size):
+                    w0, w1 = here[a, b], there[a, b]
+                    if w0 == 0.0 and w1 == 0.0:
+                        continue
+                    line = codes[i, r + a, b : b + cols]
+                    for pair in range(cols // 2):
+                        sums[2 * pair] += w0 * np.float64(line[2 * pair])
+                        sums[2 * pair + 1] += w1 * np.float64(line[2 * pair + 1])
+                    if cols % 2:
+                        sums[cols - 1] += w0 * np.float64(line[cols - 1])
             for c in range(cols):
-                w = weights[(row0[i] + r) % 2, (col0[i] + c) % 2]
-                total = 0.0
-                for a in range(size):
-                    for b in range(size):
-                        if w[a, b] != 0.0:
-                            total += w[a, b] * np.float64(codes[i, r + a, c + b])
-                out[i, r, c] = _code(total, top)
+                out[i, r, c] = _code(sums[c], top)
     return out
 
 

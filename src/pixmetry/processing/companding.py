@@ -43,7 +43,7 @@ def forward(params: Companding, signal: Signal, stream: Stream) -> Signal:
     if params.law == "off":
         return signal
     entries = table(params)
-    return signal.with_data(entries[np.minimum(signal.data, len(entries) - 1)])
+    return signal.with_data(np.take(entries, signal.data, mode="clip"))
 
 
 def step_dn(params: Companding, level_dn: np.ndarray) -> np.ndarray:

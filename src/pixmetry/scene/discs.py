@@ -165,14 +165,18 @@ class Discs:
         x, y = self.centres(np.zeros(1, np.int64))
         return replace(self._shapes(x, y, motion), told=self.targets())
 
-    def _seen(self, at: Points) -> list[tuple[Shapes, np.ndarray]]:
+    def _seen(self, at: Points) -> list[tuple[Shapes, Any]]:
         """Discs with the points that see them; one disc a frame is a disc that moves."""
         if not self.per_frame:
-            return [(self._shapes(*self.centres(np.zeros(1, np.int64))), np.ones(at.x_px.shape, bool))]
+            return [(self._still, ...)]
         if self._count == 1:
-            return [(self._one, np.ones(at.x_px.shape, bool))]
+            return [(self._one, ...)]
         frame = np.broadcast_to(at.frame, at.x_px.shape)
         return [(self._shapes(*self.centres(np.array([f]))), frame == f) for f in np.unique(frame)]
+
+    @cached_property
+    def _still(self) -> Shapes:
+        return self._shapes(*self.centres(np.zeros(1, np.int64)))
 
     @cached_property
     def _one(self) -> Shapes:

@@ -61,6 +61,8 @@ class Uniform:
     def radiance(self, at: Points) -> np.ndarray:
         """Photons per pixel at points; no blur changes a slope."""
         exposure = np.broadcast_to(np.asarray(at.exposure_s, float), at.x_px.shape)
+        if not (self.gradient_x_per_px or self.gradient_y_per_px):
+            return self.level_photons * self.photons_scale(exposure.ravel()).reshape(exposure.shape)
         x, y = at.x_px - 0.5 * (at.frame_shape[1] - 1), at.y_px - 0.5 * (at.frame_shape[0] - 1)
         field = np.maximum(1 + self.gradient_x_per_px * x + self.gradient_y_per_px * y, 0)
         return self.level_photons * self.photons_scale(exposure.ravel()).reshape(exposure.shape) * field

@@ -144,7 +144,8 @@ def pass_traps(data, first, traps_per_px, release_px, fill_beta, well_e):
                     x += trapped[s] - kept
                     trapped[s] = kept
                 if x > 0.0:
-                    volume = min((x / well_e) ** fill_beta, 1.0)
+                    share = x / well_e
+                    volume = min(np.sqrt(share) if fill_beta == 0.5 else share**fill_beta, 1.0)
                     volume = min(volume, x / (density * crossed))
                     found[:] = 0.0
                     low = 0.0
