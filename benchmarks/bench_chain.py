@@ -2,8 +2,8 @@
 
 Exposes frames of a camera (a file or the name of a preset; by default the detection chain of bench_detection.py) on one thread and prints
 the milliseconds of processor time that each element of the running chain takes, conversions between the kinds included. Then the whole
-on one and on two threads, by the clock on the wall. Between the elements the scene is made, and bands are cut and joined. The scene is the
-one of bench_presets.py, a hundred discs. It has no goal of its own but to find what sticks out: the goals are in bench_detection.py and
+on one and on two threads, by the clock on the wall. Between the elements bands are cut and joined. The scene is the one of
+bench_presets.py, a hundred discs. It has no goal of its own but to find what sticks out: the goals are in bench_detection.py and
 bench_presets.py.
 """
 
@@ -20,6 +20,7 @@ from bench_presets import scene_of
 
 from pixmetry.core import camera as running
 from pixmetry.core.camera import Camera, load_camera
+from pixmetry.core.conversions import look
 from pixmetry.core.source import run
 from pixmetry.core.threads import set_threads
 
@@ -36,13 +37,19 @@ def timed_elements(chosen: Camera, frames: range) -> Counter[str]:
         spent[source.id] += time.thread_time() - start
         return result
 
-    running.run = measured
+    def looking(*of):
+        start = time.thread_time()
+        result = look(*of)
+        spent["core.look"] += time.thread_time() - start
+        return result
+
+    running.run, running.look = measured, looking
     try:
         start = time.thread_time()
         exposed_s(chosen, frames, 1)
         spent["between them"] = time.thread_time() - start - sum(spent.values())
     finally:
-        running.run = run
+        running.run, running.look = run, look
     return spent
 
 

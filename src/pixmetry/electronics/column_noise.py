@@ -76,7 +76,6 @@ SOURCE = Source(
     id="electronics.column_noise",
     title="Column noise",
     description="The amplifiers and converters at the foot of the columns wander: vertical stripes that a dark frame of yesterday leaves.",
-    number=0,
     parameters=ColumnNoise,
     consumes=(Kind.DN,),
     after=("sensor", "electronics.gain"),

@@ -85,7 +85,6 @@ SOURCE = Source(
     id="electronics.flicker_noise",
     title="Flicker noise",
     description="The 1/f noise of the output amplifier runs along the rows: neighbours in a row share it, rows differ in their mean.",
-    number=0,
     parameters=FlickerNoise,
     consumes=(Kind.ELECTRONS,),
     after=("sensor",),

@@ -49,7 +49,6 @@ SOURCE = Source(
     id="electronics.row_noise",
     title="Temporal row and column noise",
     description="The reference of each row (or column) amplifier moves from frame to frame, so a whole line goes up or down.",
-    number=51,
     parameters=RowNoise,
     consumes=(Kind.ELECTRONS,),
     after=("sensor",),

@@ -106,7 +106,6 @@ SOURCE = Source(
     id="electronics.telegraph_noise",
     title="Random telegraph noise",
     description="Single traps in the first transistor of some pixels catch and free one electron: the pixel blinks between a few levels.",
-    number=0,
     parameters=TelegraphNoise,
     consumes=(Kind.ELECTRONS,),
     after=("sensor",),

@@ -96,7 +96,6 @@ SOURCE = Source(
     id="optics.shading",
     title="Lens shading and uneven light",
     description="The light falls off smoothly over the frame; the gradient across a target pulls its centre to the brighter side.",
-    number=54,
     parameters=Shading,
     consumes=(Kind.PHOTONS,),
     before=("sensor",),

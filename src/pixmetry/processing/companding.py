@@ -70,7 +70,6 @@ SOURCE = Source(
     id="processing.companding",
     title="Companding and transport in fewer bits",
     description="Codes of 12 bits travel as 8 and are spread again: many codes never occur, and rounding is done twice.",
-    number=0,
     parameters=Companding,
     consumes=(Kind.CODES,),
     after=("sensor", "electronics", "cable", "grabber"),

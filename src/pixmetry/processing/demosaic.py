@@ -118,7 +118,6 @@ SOURCE = Source(
     id="processing.demosaic",
     title="Demosaicing",
     description="Two of three colours of every pixel come from its neighbours, in another way at each of four places: targets shift.",
-    number=0,
     parameters=Demosaic,
     consumes=(Kind.CODES,),
     after=("sensor", "electronics", "cable", "grabber", "processing.defect_correction"),

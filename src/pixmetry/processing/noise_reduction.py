@@ -56,7 +56,6 @@ SOURCE = Source(
     id="processing.noise_reduction",
     title="Spatial noise reduction",
     description="Noise is smoothed; so are small targets, and what a filter does to an edge depends on the noise on it.",
-    number=0,
     parameters=NoiseReduction,
     consumes=(Kind.CODES,),
     after=("sensor", "electronics", "cable", "grabber", "processing.defect_correction"),

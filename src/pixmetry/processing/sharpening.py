@@ -69,7 +69,6 @@ SOURCE = Source(
     id="processing.sharpening",
     title="Sharpening",
     description="Edges get a rim that is too bright inside and too dark outside; noise grows, and neighbours share it.",
-    number=0,
     parameters=Sharpening,
     consumes=(Kind.CODES,),
     after=("sensor", "electronics", "cable", "grabber", "processing.noise_reduction"),

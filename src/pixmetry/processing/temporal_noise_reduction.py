@@ -49,7 +49,6 @@ SOURCE = Source(
     id="processing.temporal_noise_reduction",
     title="Temporal noise reduction",
     description="A recursive filter over the frames lowers the noise of what rests, and drags a tail behind what moves.",
-    number=0,
     parameters=TemporalNoiseReduction,
     consumes=(Kind.CODES,),
     after=("sensor", "electronics", "cable", "grabber", "processing.defect_correction"),

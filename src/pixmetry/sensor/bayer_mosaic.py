@@ -82,7 +82,6 @@ SOURCE = Source(
     id="sensor.bayer_mosaic",
     title="Colour filter mosaic",
     description="Pixels of three colours answer even a grey scene differently: a chequered gain that balancing takes out.",
-    number=0,
     parameters=BayerMosaic,
     consumes=(Kind.PHOTONS,),
     before=("sensor.quantum_efficiency", "sensor.dark_current", "sensor.shot_noise"),

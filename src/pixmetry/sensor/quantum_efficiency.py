@@ -66,7 +66,6 @@ SOURCE = Source(
     id="sensor.quantum_efficiency",
     title="Quantum efficiency",
     description="Only a share of the photons becomes electrons that depends on the wavelength; it sets the shot noise of a light level.",
-    number=43,
     note="Note 14",
     parameters=QuantumEfficiency,
     consumes=(Kind.PHOTONS,),

@@ -29,7 +29,6 @@ SOURCE = Source(
     id="sensor.shot_noise",
     title="Photon shot noise",
     description="The number of electrons in a pixel follows Poisson's law; dark electrons share in it.",
-    number=48,
     note="Figure 3.20",
     parameters=ShotNoise,
     consumes=(Kind.ELECTRONS,),
