@@ -261,3 +261,18 @@ def test_the_near_context_suffices_and_noise_is_not_taken_out_again() -> None:
     assert np.abs(frozen - exact).max() < 200 * camera.frozen_tail()
     quiet = video_camera(RINGING, JITTER, CLOCK_320, shape=(96, 320)).expose_windows(Texture(), grid, seed=4)
     assert 0.8 < np.std(exact - quiet) < 1.2
+
+
+def test_true_positions_follow_the_clock_as_it_warms_up() -> None:
+    """Samples that look at the place, by the exact staircase: the column whose reading time is that of the pixel's middle."""
+    from pixmetry.core.camera import load_camera
+
+    camera = load_camera("pulnix_tm6cn_epix_512")
+    clock = camera["grabber.clock_warm_up"].params
+    x = np.array([50.0, 376.0, 700.0])
+    for frame, period in ((0, 60.0), (10, 60.0), (90, 60.0)):
+        seen, _ = camera.true_positions(x, np.full(3, 300.0), frame=frame, frame_period_s=period)
+        bent, _ = camera.switched(off=["grabber.clock_warm_up"]).true_positions(x, np.full(3, 300.0), frame=frame, frame_period_s=period)
+        scale = clock.scale_error_rel * np.exp(-frame * period / clock.scale_tau_s)
+        lock = clock.lock_us * 1e-6 * 10e6  # samples between the lock and the first pixel
+        assert np.allclose(seen - bent, (bent + 0.5 + lock) * scale, atol=1e-6)

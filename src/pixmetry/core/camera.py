@@ -13,7 +13,7 @@ import numpy as np
 from pixmetry.core.bands import cut_bands, find_segment, stitch
 from pixmetry.core.camera_files import build_camera, load_camera, to_record
 from pixmetry.core.chain_order import Element, check_chain, in_order
-from pixmetry.core.conversions import LOOK, Link, linked, look
+from pixmetry.core.conversions import LOOK, SAMPLE, Link, linked, look
 from pixmetry.core.errors import ChainError, InputError
 from pixmetry.core.frozen import Frozen, freeze
 from pixmetry.core.light import Light, Scene
@@ -357,9 +357,9 @@ class Camera:
     def true_positions(self, x_px: Any, y_px: Any, frame: int = 0, seed: int = 0, **schedule: Any) -> tuple[np.ndarray, np.ndarray]:
         """Return where points of the scene's plane lie in a frame that the camera puts out.
 
-        Every geometric effect of that frame counts: distortion, tilt, drift, pixel clock, offsets. What moves a measured centre by
-        spreading light or signal (a low-pass, echoes, charge left behind), and what delays rows (jitter, the warm-up of a grabber), does
-        not: that is the error.
+        Every geometric effect of that frame counts: distortion, tilt, drift, the clock of the samples and its warm-up, offsets. What
+        moves a measured centre by spreading light or signal (a low-pass, echoes, charge left behind), and what moves single rows
+        (jitter), does not: that is the error.
 
         Parameters
         ----------
@@ -383,6 +383,8 @@ class Camera:
                 signal, _ = run(link.source, link.params, signal, streams.of(link.name))
             elif link.source is LOOK:
                 x, y = (v[0, :, 0] for v in signal.light.placed(x[None, :, None], y[None, :, None]))
+            elif link.source is SAMPLE:
+                x = link.params.line_at(signal).placed(x, warped=True)
             elif link.source.place is not None:
                 x, y = link.source.place(link.params, x, y, link.shape, frame)
         return x, y

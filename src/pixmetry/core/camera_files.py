@@ -37,6 +37,13 @@ def pitch_values(pitch_um: tuple[float, float] | None) -> dict[str, float]:
     return {} if pitch_um is None else {"pitch_x_um": pitch_um[0], "pitch_y_um": pitch_um[1], "pitch_um": pitch_um[0]}
 
 
+def clock_values(record: Any) -> dict[str, float]:
+    """What sources that know the read-out's clock take from their camera, where its file states one."""
+    told = record.model_fields_set
+    values = {"line_time_us": 1e6 * record.line_period_s} if "line_period_s" in told else {}
+    return values | ({"pixel_time_ns": 1e9 / record.pixel_clock_hz} if "pixel_clock_hz" in told else {})
+
+
 def build_camera(record: Mapping[str, Any], where: str = "camera") -> Camera:
     """Build a camera from its plain record.
 
@@ -53,7 +60,7 @@ def build_camera(record: Mapping[str, Any], where: str = "camera") -> Camera:
     checked = validate(CameraRecord, record, where)
     elements = []
     pitch = None if checked.pitch_x_um is None else (checked.pitch_x_um, checked.pitch_y_um or checked.pitch_x_um)
-    known = pitch_values(pitch)  # unless a source says otherwise
+    known = pitch_values(pitch) | clock_values(checked)  # unless a source says otherwise
     for i, entry in enumerate(checked.chain):
         source = get_source(entry.source, f"{where}, chain[{i}]")
         own = {name: value for name, value in known.items() if name in source.parameters.model_fields}

@@ -10,7 +10,7 @@ import numpy as np
 
 from pixmetry.core.line import Line
 from pixmetry.core.random import Grid, Stream
-from pixmetry.core.signal import Clock, Kind, Signal, Windows
+from pixmetry.core.signal import Kind, Signal, Windows
 from pixmetry.core.source import Parameters, Source, run
 
 
@@ -61,9 +61,12 @@ class LineSources:
     def line(self) -> Line:
         """The line as it is without any draw, for its geometry; made once, whatever the number of windows."""
         zero = np.zeros(1)
-        grid = Grid(np.zeros(1, np.int64), np.zeros(1, np.int64), np.zeros(1, np.int64), (1, 1))
-        data, clock, line = np.zeros((1, 1, 1), np.float32), Clock(self.pixel_hz), Line(self.pixel_hz, self.pixel_hz)
-        signal = Signal(data, Kind.VIDEO, grid, (1, 1), zero, zero, zero, clock, line=line)
+        return self.line_at(Signal(np.zeros((1, 1, 1), np.float32), Kind.DN, Grid.whole([0], (1, 1)), (1, 1), zero, zero, zero))
+
+    def line_at(self, signal: Signal) -> Line:
+        """The line without any draw at the time and temperature of a signal."""
+        line = Line(self.pixel_hz, self.pixel_hz)
+        signal = replace(signal, kind=Kind.VIDEO, clock=replace(signal.clock, pixel_hz=self.pixel_hz), line=line)
         for link in self.links:
             signal, _ = run(link.source, link.params, replace(signal, frame_shape=link.shape), QUIET)
         return signal.line

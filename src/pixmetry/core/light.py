@@ -25,6 +25,7 @@ GAUSS = {  # nodes and weights on (-1/2, 1/2): Gauss–Legendre
     2: (np.array([-0.28867513459481287, 0.28867513459481287]), np.array([0.5, 0.5])),
     3: (np.array([-0.3872983346207417, 0.0, 0.3872983346207417]), np.array([5.0, 8.0, 5.0]) / 18),
 }
+RASTER_POINTS = 1 << 17  # of that raster, looked at together
 LEVEL_PX2 = 0.02  # a spread that varies over the sensor is interpolated between variances so far apart
 
 Pull = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
@@ -310,8 +311,11 @@ class Light:
         mask = self._mask if self.jitter_px is None else np.pad(self._mask, 2)
         m = mask.shape[0] // 2, mask.shape[1] // 2
         fine_y, fine_x = (_refined(v, axis, reach) for v, axis, reach in ((y, 1, m[0]), (x, 2, m[1])))
-        fine = self._averaged(fine_x, fine_y, time[:, :1], self.aperture_px)
-        fine, size = np.ascontiguousarray(fine, np.float64), (FINE, len(rows), self.grid.shape[1])
+        fine, size = np.empty((len(fine_y), fine_y.shape[1], fine_x.shape[2])), (FINE, len(rows), self.grid.shape[1])
+        step = max(1, RASTER_POINTS // (len(fine_x) * fine_x.shape[2]))
+        for first in range(0, fine.shape[1], step):  # the looking takes several times the memory of what is seen
+            some = slice(first, first + step)
+            fine[:, some] = self._averaged(fine_x, fine_y[:, some], time[:, :1], self.aperture_px)
         seen = decimate(fine, mask, *size)
         if self.jitter_px is not None:  # to first order: all pixels share one raster
             seen += self.jitter_px[0][:, block] * decimate(fine, _slope(mask, 1), *size)

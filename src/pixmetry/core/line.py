@@ -199,9 +199,16 @@ class Line:
                     total = total * np.abs(1 - s / root) ** sign
         return total
 
-    def placed(self, x: np.ndarray) -> np.ndarray:
-        """Columns of the samples at which places on the pixel grid are seen (delays of rows and of filters are errors, not geometry)."""
-        return ((x + 0.5) / self.pixel_clock_hz - self.start_s) * self.sample_clock_hz - 0.5
+    def placed(self, x: np.ndarray, warped: bool = False) -> np.ndarray:
+        """Columns of the samples at which places on the pixel grid are seen.
+
+        Delays of rows and of filters are errors, not geometry. With ``warped``, delays that change along the line count (those of the first window).
+        """
+        due = (np.asarray(x, float) + 0.5) / self.pixel_clock_hz
+        at = due
+        for _ in range(30 if warped and self.warps else 0):  # each turn is nearer by the share that a delay grows along the line
+            at = due + sum(np.broadcast_to(warp(at[None, None, :]), (1, 1, len(at)))[0, 0] for warp in self.warps)
+        return (at - self.start_s) * self.sample_clock_hz - 0.5
 
     def pixels(self, col: np.ndarray) -> np.ndarray:
         """Place on the pixel grid at which a sample looks, the inverse of `placed`."""
