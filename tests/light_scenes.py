@@ -73,6 +73,8 @@ class Line:
 class Flat:
     """The same light everywhere."""
 
+    smooth_px = 100.0  # no detail that would need many points in a pixel
+
     def radiance(self, at: Points) -> np.ndarray:
         return np.full(at.x_px.shape, MEAN)
 

@@ -124,6 +124,7 @@ class Flat:
     """The same light everywhere, in DN of the ideal camera."""
 
     level_dn: float
+    smooth_px = 100.0  # no detail that would need many points in a pixel
 
     def radiance(self, at: Points) -> np.ndarray:
         return np.full(at.x_px.shape, self.level_dn / (ETA * K_DN_PER_E))

@@ -28,6 +28,9 @@ GAUSS = {  # nodes and weights on (-1/2, 1/2): Gauss–Legendre
 RASTER_POINTS = 1 << 17  # of that raster, looked at together
 LEVEL_PX2 = 0.02  # a spread that varies over the sensor is interpolated between variances so far apart
 
+USUAL_SMOOTH_PX = 0.5  # of a scene that does not say over which length its light changes
+MOST_PARTS = 16  # into which a pixel is cut along each side, for a scene that is sharp and has no averages of its own
+
 Pull = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
@@ -45,6 +48,7 @@ class Scene(Protocol):
     # def averaged(self, at: Points, width_px, height_px) -> np.ndarray: ...   (optional: over an upright box about each point)
     # def detailed(self, at: Points, reach_px: np.ndarray) -> np.ndarray: ...   (optional)
     # moving: bool
+    # smooth_px: float, over which its light changes; 0 for sharp edges (then `averaged(at, width_px, height_px)` is wanted)
 
 
 @dataclass(frozen=True)
@@ -403,10 +407,10 @@ class Light:
 
     def _nodes(self, cell: tuple[float, float], dots: Any, boxes: int = 0) -> Iterator[tuple[float, float, float]]:
         """Offsets and weights that stand for the aperture and the dots; or for the dots and the aperture cut into ``boxes``²."""
-        fine = max(float(getattr(self.scene, "smooth_px", 0.0)) ** 2 + self.blur_px2, 1e-4) ** 0.5
+        fine = (float(getattr(self.scene, "smooth_px", USUAL_SMOOTH_PX)) ** 2 + self.blur_px2) ** 0.5
         axes = []
         for size in cell:
-            parts = boxes or max(1, int(np.ceil(size / fine)))
+            parts = boxes or max(1, int(np.ceil(size / max(fine, size / MOST_PARTS))))
             nodes, weights = GAUSS[1 if boxes else 3]
             start = (np.arange(parts) + 0.5) / parts - 0.5
             axes.append((size * (start[:, None] + nodes / parts).ravel(), np.tile(weights / parts, parts)))

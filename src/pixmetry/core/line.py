@@ -202,7 +202,8 @@ class Line:
     def placed(self, x: np.ndarray, warped: bool = False) -> np.ndarray:
         """Columns of the samples at which places on the pixel grid are seen.
 
-        Delays of rows and of filters are errors, not geometry. With ``warped``, delays that change along the line count (those of the first window).
+        Delays of rows and of filters are errors, not geometry. With ``warped``, delays that change along the line count: those of the
+        first window.
         """
         due = (np.asarray(x, float) + 0.5) / self.pixel_clock_hz
         at = due
