@@ -58,7 +58,7 @@ def test_any_window_of_it_is_the_crop() -> None:
 
 
 def test_a_target_is_found_where_geometry_and_delays_put_it() -> None:
-    """Group delays of all filters and echoes, in samples of the grabber, and the stretch of the warm-up."""
+    """The geometry, with the stretch of the warm-up in it, and the group delays of all filters and echoes, in samples of the grabber."""
     quiet = {i: v for i, v in CHAIN.items() if i not in ("grabber.phase_pattern", "grabber.fixed_pattern", "grabber.clamp")}
     camera = chain(quiet)
     x, y = np.array([60.3, 90.7, 120.1]), np.array([40.0, 50.4, 45.7])
@@ -66,12 +66,13 @@ def test_a_target_is_found_where_geometry_and_delays_put_it() -> None:
     background = camera.expose(Flat(0.0), 1, quiet=True).data.astype(float)
     told_x, told_y = camera.true_positions(x, y)
     delay_px = 14.1875e6 * delay_of_the_line()
-    late = delay_px + (x + 0.5 + 10.5e-6 * 14.1875e6) * 0.002
+    stretched = (x + 0.5 + 10.5e-6 * 14.1875e6) * 0.002 * 10 / 14.1875
+    assert told_x == pytest.approx(camera.layout(x, y)[0] + stretched, abs=1e-3)
     for i in range(3):
         light = np.maximum(frames[i] - background[0] - 1.0, 0.0)
         found_x = (light.sum(axis=0) * np.arange(100)).sum() / light.sum()
         found_y = (light.sum(axis=1) * np.arange(64)).sum() / light.sum()
-        assert found_x == pytest.approx(told_x[i] + late[i] * 10 / 14.1875, abs=0.03)
+        assert found_x == pytest.approx(told_x[i] + delay_px * 10 / 14.1875, abs=0.03)
         assert found_y == pytest.approx(told_y[i], abs=0.02)
 
 
