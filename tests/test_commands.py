@@ -276,6 +276,7 @@ def test_a_copied_frame_is_found(folder: Path, tmp_path: Path) -> None:
     first, second = load_campaign(tmp_path / "campaign").levels("bright")[3].paths[:2]
     shutil.copy(first, second)
     refused(run("assess", tmp_path / "campaign", "-o", tmp_path / "out"), "identical", "bright")
+    assert not (tmp_path / "out").exists()
 
 
 def test_values_that_do_not_fill_their_bits_are_noted(folder: Path, tmp_path: Path) -> None:

@@ -213,7 +213,7 @@ def _centre(image: np.ndarray, x: float, y: float) -> tuple[float, float] | None
 
     Of the connected regions, the one that lies nearest to the place. None if nothing stands out.
     """
-    from scipy.ndimage import label
+    from scipy.ndimage import center_of_mass, label
 
     border = np.concatenate([image[0], image[-1], image[1:-1, 0], image[1:-1, -1]])
     background = float(np.median(border))
@@ -229,16 +229,10 @@ def _centre(image: np.ndarray, x: float, y: float) -> tuple[float, float] | None
         return None
     regions, count = label(height > LEVEL * abs(peak))
     weight = np.maximum(height - LEVEL * abs(peak), 0.0)
-    rows, cols = np.arange(image.shape[0])[:, None], np.arange(image.shape[1])
-    best, nearest = None, np.inf
-    for k in range(1, count + 1):
-        part = np.where(regions == k, weight, 0.0)
-        total = part.sum()
-        cx, cy = float((part * cols).sum() / total), float((part * rows).sum() / total)
-        distance = np.hypot(cx - x, cy - y) / np.sqrt((regions == k).sum())
-        if distance < nearest:
-            best, nearest = (cx, cy), distance
-    return best
+    centres = np.array(center_of_mass(weight, regions, range(1, count + 1)))[:, ::-1]
+    distance = np.hypot(*(centres - (x, y)).T) / np.sqrt(np.bincount(regions.ravel())[1:])  # in sizes of the region
+    best = centres[np.argmin(distance)]
+    return float(best[0]), float(best[1])
 
 
 def _added(now: Any, before: Any, scale: tuple[float, float], former: tuple[float, float]) -> tuple[float, float] | None:

@@ -12,7 +12,7 @@ from pixmetry.optics import spectral_filter
 from pixmetry.optics.lateral_colour import SOURCE as COLOUR
 from pixmetry.optics.lateral_colour import LateralColour
 from pixmetry.optics.olpf import SOURCE as OLPF
-from pixmetry.optics.olpf import OpticalLowPass, separation_um
+from pixmetry.optics.olpf import OpticalLowPass
 from pixmetry.optics.spectral_filter import SOURCE as FILTER
 from pixmetry.optics.spectral_filter import SpectralFilter
 
@@ -27,10 +27,6 @@ def test_the_transfer_of_birefringent_plates_is_a_cosine(fx, fy):
 def test_a_frosted_plate_is_a_gaussian():
     expected = np.exp(-2 * (np.pi * 0.5 * 0.4) ** 2) * np.sinc(0.4)
     assert transfer(0.4, 0.0, (OLPF, OpticalLowPass(model="frosted", sigma_px=0.5))) == pytest.approx(expected, abs=1e-4)
-
-
-def test_a_quartz_plate_splits_by_six_thousandths_of_its_thickness():
-    assert separation_um(1000.0) == pytest.approx(5.9, abs=0.05)
 
 
 def test_what_passes_is_the_integral_over_the_spectrum():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from pixmetry.processing.temporal_noise_reduction import TemporalNoiseReduction, forward, lag_s, start
+from pixmetry.processing.temporal_noise_reduction import TemporalNoiseReduction, forward, start
 from processing.code_frames import codes
 from source_signals import Z, centroid, spots, stream
 
@@ -31,7 +31,6 @@ def test_a_moving_spot_lags_by_its_velocity_times_alpha_over_one_less_alpha(alph
     out = filtered(frames, alpha)
     last = centroid(out[-1:])[0][0]
     assert x[-1] - last == pytest.approx(v * alpha / (1 - alpha), abs=2e-3)
-    assert v / 0.04 * lag_s(TemporalNoiseReduction(alpha=alpha), 0.04) == pytest.approx(v * alpha / (1 - alpha))
 
 
 def test_noise_falls_and_frames_become_alike():

@@ -79,7 +79,7 @@ def test_slanting_rays_shift_the_image_outwards():
 
 
 def test_microlenses_answer_by_the_angle_from_their_design():
-    params = Microlens(chief_ray_deg=25, design_ray_deg=10, acceptance_deg=12, aspect=1.0)
+    params = Microlens(chief_ray_deg=25, design_ray_deg=10, acceptance_deg=12)
     light = LENS.forward(params, flat(1.0, (1, 201), kind=Kind.PHOTONS), stream()).data[0, 0]
     assert light[100] == 1
     assert light[200] == pytest.approx(np.exp(-0.5 * (15 / 12) ** 2), rel=1e-6)

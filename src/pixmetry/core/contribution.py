@@ -118,11 +118,13 @@ class Probe:
         """Shorthand for a contribution without bias."""
         return Contribution(u_x_px=u[0], u_y_px=u[1], gum_class=gum_class, **kw)
 
-    def from_shifts(self, dx: np.ndarray, dy: np.ndarray, gum_class: str, **kw: Any) -> Contribution:
-        """Contribution from shifts at each phase: their mean is the bias, their scatter the uncertainty."""
+    def from_shifts(
+        self, dx: np.ndarray, dy: np.ndarray, gum_class: str, beside: tuple[float, float] = (0.0, 0.0), **kw: Any
+    ) -> Contribution:
+        """Contribution from shifts at each phase: their mean is the bias, their scatter the uncertainty, with that of ``beside`` (x, y)."""
         return Contribution(
-            u_x_px=float(np.std(dx)),
-            u_y_px=float(np.std(dy)),
+            u_x_px=float(np.hypot(np.std(dx), beside[0])),
+            u_y_px=float(np.hypot(np.std(dy), beside[1])),
             bias_x_px=float(np.mean(dx)),
             bias_y_px=float(np.mean(dy)),
             gum_class=gum_class,

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from pixmetry.core.line import Line
+from pixmetry.core.quiet import QuietStreams
 from pixmetry.core.random import Grid, Stream
 from pixmetry.core.signal import Kind, Signal, Windows
 from pixmetry.core.source import Parameters, Source, run
@@ -64,11 +65,11 @@ class LineSources:
         return self.line_at(Signal(np.zeros((1, 1, 1), np.float32), Kind.DN, Grid.whole([0], (1, 1)), (1, 1), zero, zero, zero))
 
     def line_at(self, signal: Signal) -> Line:
-        """The line without any draw at the time and temperature of a signal."""
+        """The line at the time and temperature of a signal, every draw at its mean."""
         line = Line(self.pixel_hz, self.pixel_hz)
         signal = replace(signal, kind=Kind.VIDEO, clock=replace(signal.clock, pixel_hz=self.pixel_hz), line=line)
         for link in self.links:
-            signal, _ = run(link.source, link.params, replace(signal, frame_shape=link.shape), QUIET)
+            signal, _ = run(link.source, link.params, replace(signal, frame_shape=link.shape), QuietStreams(0, 0).of(link.name))
         return signal.line
 
     def pixels_of(self, windows: Windows, frame_shape: tuple[int, int]) -> Windows:
@@ -91,24 +92,6 @@ class LineSources:
         last = np.clip(np.where(grid.col0 + cols == frame_shape[1], samples - 1, last), first, samples - 1)
         count = int((last - first).max(initial=0)) + 1
         return Grid(grid.frame, grid.row0, np.minimum(first, samples - count), (grid.shape[0], count))
-
-
-class _Zeros:
-    """A stream of zeros, for what a chain does without chance."""
-
-    quiet = True
-
-    def __getattr__(self, name: str) -> Any:
-        if name.endswith("unit"):
-            return lambda count, draw=0: np.zeros(count, np.float32)
-        if name.startswith("add"):
-            return lambda data, grid, scale, draw=0: np.broadcast_to(np.asarray(data, np.float32), grid.size).copy()
-        sizes = {"rows": slice(0, 2), "cols": slice(0, 3, 2), "frames": slice(0, 1)}
-        part = next((s for key, s in sizes.items() if key in name), slice(0, 3))
-        return lambda grid, draw=0: np.zeros(grid.size[part], np.float32)
-
-
-QUIET: Any = _Zeros()
 
 
 def look(signal: Signal, photons: np.ndarray | None = None) -> Signal:

@@ -54,6 +54,32 @@ def map_contribution(pull: Pull, probe: Probe, gum_class: str = "G", **kw: Any) 
     return probe.from_shifts(*map_shifts(pull, probe), gum_class, **text)
 
 
+def factor_verbs(factor: Callable[[Any, np.ndarray, np.ndarray, tuple[int, int]], np.ndarray]) -> dict[str, Any]:
+    """The verbs of a source that multiplies the light by ``factor(params, x_px, y_px, frame_shape)``, at most about 1."""
+
+    def over_frame(params: Any, signal: Signal) -> np.ndarray:
+        light = factor(params, signal.cols[:, None, :].astype(float), signal.rows[:, :, None].astype(float), signal.frame_shape)
+        return np.maximum(light, 1e-3).astype(np.float32)  # cut off just above 0: the correction divides by it
+
+    def forward(params: Any, signal: Signal, stream: Any) -> Signal:
+        """Multiply the light by the factor."""
+        return signal.with_data(signal.data * over_frame(params, signal))
+
+    def correct(params: Any, signal: Signal, maps: Any) -> Signal:
+        """Divide by the factor that the parameters give; it needs no map."""
+        return signal.with_data(signal.data / over_frame(params, signal))
+
+    def truth(params: Any, signal: Signal, stream: Any) -> dict[str, np.ndarray]:
+        """Relative light of every pixel, shape (rows, cols)."""
+        return {"light_rel": over_frame(params, signal)[0]}
+
+    def propagate(params: Any, probe: Probe) -> Contribution:
+        """Propagator P3: a relative ramp g moves a centroid by g⟨x²⟩; mean and spread over targets anywhere on the frame."""
+        return ramp_contribution(lambda x, y: factor(params, x, y, probe.frame_shape), probe)
+
+    return {"forward": forward, "correct": correct, "truth": truth, "propagate": propagate}
+
+
 def ramp_contribution(factor: Callable[[np.ndarray, np.ndarray], np.ndarray], probe: Probe) -> Contribution:
     """Contribution of a factor ``(x, y) -> light`` that changes slowly over the frame (P3: a ramp g moves a centroid by g⟨x²⟩)."""
     rows, cols = probe.signal_dn.shape[1:]

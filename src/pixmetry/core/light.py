@@ -22,7 +22,6 @@ from pixmetry.core.random import Grid
 FINE = 4  # points per pixel and axis of the raster on which a tabulated point spread is applied
 GAUSS = {  # nodes and weights on (-1/2, 1/2): Gauss–Legendre
     1: (np.zeros(1), np.ones(1)),
-    2: (np.array([-0.28867513459481287, 0.28867513459481287]), np.array([0.5, 0.5])),
     3: (np.array([-0.3872983346207417, 0.0, 0.3872983346207417]), np.array([5.0, 8.0, 5.0]) / 18),
 }
 RASTER_POINTS = 1 << 17  # of that raster, looked at together
@@ -80,10 +79,6 @@ class Points:
         x, y = self.x_px[index], np.broadcast_to(self.y_px, self.x_px.shape)[index]
         time, exposure, frame = (_taken(v, self.x_px.shape, index, x.shape) for v in (self.time_s, self.exposure_s, self.frame))
         return Points(x, y, time, exposure, frame, self.blur_px, self.frame_shape)
-
-    def shifted(self, dx: Any, dy: Any) -> Points:
-        """Return the points moved by so much."""
-        return replace(self, x_px=self.x_px + dx, y_px=self.y_px + dy)
 
 
 def _taken(values: np.ndarray, shape: tuple[int, ...], index: Any, taken: tuple[int, ...]) -> np.ndarray:
@@ -395,11 +390,9 @@ class Light:
             return np.zeros(n, np.int64)
         if not self.pulls:
             return np.ones(n, np.int64)
-        x, y = self._lattice()
-        at, right, down = (np.broadcast_arrays(*self.pulled(u, v)) for u, v in ((x, y), (x + 1, y), (x, y + 1)))
-        tilt_x, tilt_y = right[1] - at[1], down[0] - at[0]
+        (_, tilt_x), (tilt_y, _) = self._pixel_steps()
         shear, turn = np.abs(tilt_x + tilt_y).max(axis=(1, 2)), 0.5 * np.abs(tilt_x - tilt_y).max(axis=(1, 2))
-        blur2 = float(getattr(self.scene, "smooth_px", 0.0)) ** 2 + self.blur_px2
+        blur2 = self._smooth_px2
         spread2 = blur2 + 1.0 / 12.0
         turned = (2.0 * turn / spread2**2) ** 0.25 if blur2 > 0.04 else 30.0 * np.sqrt(np.maximum(turn, shear))
         parts = np.maximum(np.sqrt(100.0 * shear / spread2), turned)
@@ -407,7 +400,7 @@ class Light:
 
     def _nodes(self, cell: tuple[float, float], dots: Any, boxes: int = 0) -> Iterator[tuple[float, float, float]]:
         """Offsets and weights that stand for the aperture and the dots; or for the dots and the aperture cut into ``boxes``²."""
-        fine = (float(getattr(self.scene, "smooth_px", USUAL_SMOOTH_PX)) ** 2 + self.blur_px2) ** 0.5
+        fine = self._smooth_px2**0.5
         axes = []
         for size in cell:
             parts = boxes or max(1, int(np.ceil(size / max(fine, size / MOST_PARTS))))
@@ -418,6 +411,17 @@ class Light:
             for ax, aw in zip(*axes[0], strict=True):
                 for ay, bw in zip(*axes[1], strict=True):
                     yield ax - ox, ay - oy, ow * aw * bw
+
+    @property
+    def _smooth_px2(self) -> float:
+        """Variance of the Gaussian that the scene is smooth like, with the spread that it is seen through."""
+        return float(getattr(self.scene, "smooth_px", USUAL_SMOOTH_PX)) ** 2 + self.blur_px2
+
+    def _pixel_steps(self) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
+        """How far, in x and y of the scene, the next pixel to the right and the next one below look, all over the frame; (n, 9, 9) each."""
+        x, y = self._lattice()
+        at, right, down = (np.broadcast_arrays(*self.pulled(u, v)) for u, v in ((x, y), (x + 1, y), (x, y + 1)))
+        return (right[0] - at[0], right[1] - at[1]), (down[0] - at[0], down[1] - at[1])
 
     def _reach(self, cell_px: float, dots: tuple[np.ndarray, np.ndarray, np.ndarray]) -> np.ndarray:
         """How far in the scene's plane a cell looks, shape (n, 1, 1).
@@ -431,8 +435,7 @@ class Light:
             variance = np.broadcast_to(sum(v(x, y) for v in self.varying), shape)
             reach = reach + 2.0 * np.sqrt(variance.max(axis=(1, 2), keepdims=True))
         if self.pulls:
-            at, right, down = (np.broadcast_arrays(*self.pulled(u, v)) for u, v in ((x, y), (x + 1, y), (x, y + 1)))
-            longest = np.maximum(*(np.hypot(b[0] - at[0], b[1] - at[1]) for b in (right, down)))
+            longest = np.maximum(*(np.hypot(*step) for step in self._pixel_steps()))
             reach = reach * np.maximum(1.0, 1.5 * longest.reshape(len(longest), -1).max(axis=1))[:, None, None]
         return reach
 

@@ -106,11 +106,9 @@ def propagate(params: Clamp, probe: Probe) -> Contribution:
     target = np.ascontiguousarray(probe.signal_dn - probe.background_dn, np.float32)
     slope = -loss * probe.background_dn * (np.arange(target.shape[2]) - probe.x_px[:, None])
     dx, dy = probe.field(droop(target, loss, half, *params.carry) - target.astype(float) + slope[:, None, :])
-    return Contribution(
-        u_x_px=float(np.hypot(u[0], dx.std())), u_y_px=float(np.hypot(u[1], dy.std())), bias_x_px=float(dx.mean()),
-        bias_y_px=float(dy.mean()), gum_class="Tr", model_error=0.2, method="offsets common to a row, and the field of the droop",
-        floor_px=4e-4 if params.droop_rel and params.restored_rel < 1 else 2e-4,  # the background settles over the first lines
-    )  # fmt: skip
+    method = "offsets common to a row, and the field of the droop"
+    floor_px = 4e-4 if params.droop_rel and params.restored_rel < 1 else 2e-4  # the background settles over the first lines
+    return probe.from_shifts(dx, dy, "Tr", beside=u, model_error=0.2, floor_px=floor_px, method=method)
 
 
 def _noise(params: Clamp, probe: Probe) -> tuple[float, float]:

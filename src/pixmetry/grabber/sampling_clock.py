@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pixmetry.core.random import Stream
-from pixmetry.core.signal import Clock, Kind, Signal
+from pixmetry.core.signal import Kind, Signal
 from pixmetry.core.source import Parameters, Source, quantity
 
 
@@ -21,17 +21,6 @@ def forward(params: SamplingClock, signal: Signal, stream: Stream) -> Signal:
         return signal
     clock_hz = params.clock_mhz * 1e6 or signal.clock.pixel_hz
     return signal.with_line(signal.line.clocked(clock_hz, params.start_ns * 1e-9, params.samples or signal.frame_shape[1]))
-
-
-def pixels_seen(params: SamplingClock, cols: int, pixel_hz: float = Clock.pixel_hz) -> float:
-    """How many of the camera's pixels a row of samples spans."""
-    return (params.samples or cols) * pixel_hz / (params.clock_mhz * 1e6 or pixel_hz)
-
-
-def alias_frequency(params: SamplingClock, pixel_hz: float = Clock.pixel_hz) -> float:
-    """Frequency in cycles per sample at which the camera's pixel clock shows in the image, |f_pixel/f_s − m|."""
-    ratio = pixel_hz / (params.clock_mhz * 1e6 or pixel_hz)
-    return abs(ratio - round(ratio))
 
 
 SOURCE = Source(

@@ -26,19 +26,12 @@ class CoverGlass(Parameters):
     pitch_y_um: float = quantity(8.3, "µm", "pixel pitch along y", gt=0, le=100)
 
 
-def inward_um(params: CoverGlass, tangent: np.ndarray) -> np.ndarray:
-    """How much nearer to the axis a chief ray of this tan θ lands than without the plate.
-
-    The plate draws it in by t (tan θ − tan θ'), sin θ = n sin θ'. Focusing moves the sensor back by t (1 − 1/n), which gives back
-    what is in proportion to tan θ.
-    """
-    n2 = params.index**2
-    within = tangent / np.sqrt(n2 + (n2 - 1) * tangent**2)
-    return params.thickness_um * (tangent / params.index - within)
-
-
 def pull_of(params: CoverGlass, frame_shape: tuple[int, int]) -> Pull:
-    """The map from places behind the plate to those without it, by Newton's method in tan θ = r/c."""
+    """The map from places behind the plate to those without it, by Newton's method in tan θ = r/c.
+
+    The plate draws a chief ray in by t (tan θ − tan θ'), sin θ = n sin θ'. Focusing moves the sensor back by t (1 − 1/n), which gives
+    back what is in proportion to tan θ; so a place moves in by t (tan θ/n − tan θ/√(n² + (n² − 1) tan² θ)).
+    """
     x0, y0 = frame_centre(frame_shape)
     c_um, n, n2 = 1000 * params.principal_distance_mm, params.index, params.index**2
     part = params.thickness_um / c_um

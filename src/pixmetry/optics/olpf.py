@@ -12,18 +12,15 @@ from pixmetry.core.source import Parameters, Source, quantity
 
 
 class OpticalLowPass(Parameters):
-    """Birefringent plates, which split a point by a distance along x and along y, or a frosted plate."""
+    """Birefringent plates, which split a point by a distance along x and along y, or a frosted plate.
+
+    A plate of thickness t, cut at 45°, splits by t (n_e² − n_o²)/(n_e² + n_o²): quartz by 0.0059 t.
+    """
 
     model: Literal["birefringent", "frosted"] = quantity("birefringent", "name", "two or four points, or a round Gaussian spot")
     separation_x_px: float = quantity(0.0, "px", "distance of the two images along x (birefringent)", ge=0, le=10)
     separation_y_px: float = quantity(0.0, "px", "distance of the two images along y (birefringent)", ge=0, le=10)
     sigma_px: float = quantity(0.0, "px", "standard deviation of the spot along each axis (frosted)", ge=0, le=10)
-
-
-def separation_um(thickness_um: float, n_ordinary: float = 1.5443, n_extraordinary: float = 1.5534) -> float:
-    """Distance of the two images behind a uniaxial plate cut at 45°: t (n_e² − n_o²)/(n_e² + n_o²); by default of quartz at 589 nm."""
-    o2, e2 = n_ordinary**2, n_extraordinary**2
-    return thickness_um * abs(e2 - o2) / (e2 + o2)
 
 
 def dots(params: OpticalLowPass) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 
-from pixmetry.core.contribution import Contribution, Probe
-from pixmetry.core.geometry import corner_px, frame_centre, ramp_contribution
-from pixmetry.core.random import Stream
-from pixmetry.core.signal import Kind, Signal
+from pixmetry.core.geometry import corner_px, factor_verbs, frame_centre
+from pixmetry.core.signal import Kind
 from pixmetry.core.source import Parameters, Source, quantity
 
 
@@ -46,31 +42,6 @@ def factor(params: Vignetting, x_px: np.ndarray, y_px: np.ndarray, frame_shape: 
     return out
 
 
-def _frame(params: Vignetting, signal: Signal) -> np.ndarray:
-    light = factor(params, signal.cols[:, None, :], signal.rows[:, :, None], signal.frame_shape)
-    return np.maximum(light, 1e-3).astype(np.float32)  # cut off just above 0: the correction divides by it
-
-
-def forward(params: Vignetting, signal: Signal, stream: Stream) -> Signal:
-    """Multiply the light by the factor."""
-    return signal.with_data(signal.data * _frame(params, signal))
-
-
-def correct(params: Vignetting, signal: Signal, maps: Mapping[str, np.ndarray]) -> Signal:
-    """Divide by the factor that the parameters give; it needs no map."""
-    return signal.with_data(signal.data / _frame(params, signal))
-
-
-def truth(params: Vignetting, signal: Signal, stream: Stream) -> Mapping[str, np.ndarray]:
-    """Relative light of every pixel, shape (rows, cols)."""
-    return {"light_rel": _frame(params, signal)[0]}
-
-
-def propagate(params: Vignetting, probe: Probe) -> Contribution:
-    """Propagator P3: a relative ramp g moves a centroid by g⟨x²⟩; mean and spread over targets anywhere on the frame."""
-    return ramp_contribution(lambda x, y: factor(params, x, y, probe.frame_shape), probe)
-
-
 SOURCE = Source(
     id="optics.vignetting",
     title="Vignetting",
@@ -81,10 +52,7 @@ SOURCE = Source(
     neutral=Vignetting(),
     typical=Vignetting(cos_power=4.0, principal_distance_mm=25.0, pupil_shift_rel=0.1),
     bound=Vignetting(cos_power=4.0, principal_distance_mm=8.0, pupil_shift_rel=0.2),
-    forward=forward,
-    correct=correct,
-    truth=truth,
-    propagate=propagate,
+    **factor_verbs(factor),
     option="shading that is given by its optical data; what is measured is in optics.shading",
     gum_class="G",
     equation="µ' = µ cos⁴θ · (2/π)(acos s − s √(1 − s²)),  tan θ = r/c,  s = s_corner r/r_corner;  Δx = g ⟨x²⟩",

@@ -102,12 +102,11 @@ def propagate(params: Demosaic, probe: Probe) -> Contribution:
             shifts.append(probe.moved(np.einsum("prcab,rcab->prc", views, place)))
     dx, dy = (np.concatenate([s[a] for s in shifts]) for a in (0, 1))
     rounding = probe.white(np.sqrt(1 / 12))
-    return Contribution(
-        u_x_px=float(np.hypot(np.std(dx), rounding[0])),
-        u_y_px=float(np.hypot(np.std(dy), rounding[1])),
-        bias_x_px=float(np.mean(dx)),
-        bias_y_px=float(np.mean(dy)),
-        gum_class="F",
+    return probe.from_shifts(
+        dx,
+        dy,
+        "F",
+        beside=rounding,
         model_error=0.15,
         floor_px=5e-4,
         method="the estimator on the filled-in mosaic, over its four places",

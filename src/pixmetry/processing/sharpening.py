@@ -53,12 +53,11 @@ def propagate(params: Sharpening, probe: Probe) -> Contribution:
         padded = np.lib.stride_tricks.sliding_window_view(padded, full.size, axis=axis) @ full
     dx, dy = probe.moved(np.clip(x + params.amount * (x - padded), 0, 2**params.bits - 1))
     rounding = probe.white(math.sqrt(1 / 12)) if params.amount else (0.0, 0.0)
-    return Contribution(
-        u_x_px=float(np.hypot(np.std(dx), rounding[0])),
-        u_y_px=float(np.hypot(np.std(dy), rounding[1])),
-        bias_x_px=float(np.mean(dx)),
-        bias_y_px=float(np.mean(dy)),
-        gum_class="F",
+    return probe.from_shifts(
+        dx,
+        dy,
+        "F",
+        beside=rounding,
         model_error=0.15,
         floor_px=5e-4,
         method="the estimator on the sharpened target",

@@ -40,11 +40,6 @@ def forward(params: TemporalNoiseReduction, signal: Signal, stream: Stream, stat
     return signal.with_data(out), kept
 
 
-def lag_s(params: TemporalNoiseReduction, frame_period_s: float) -> float:
-    """Mean age of the light in a frame that is put out: Σ k (1 − α) α^k frames = α/(1 − α) frames."""
-    return params.alpha / (1 - params.alpha) * frame_period_s
-
-
 SOURCE = Source(
     id="processing.temporal_noise_reduction",
     title="Temporal noise reduction",

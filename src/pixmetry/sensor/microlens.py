@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 
-from pixmetry.core.contribution import Contribution, Probe
-from pixmetry.core.geometry import corner_px, frame_centre, ramp_contribution
-from pixmetry.core.random import Stream
-from pixmetry.core.signal import Kind, Signal
+from pixmetry.core.geometry import corner_px, factor_verbs, frame_centre
+from pixmetry.core.signal import Kind
 from pixmetry.core.source import Parameters, Source, quantity
 
 
@@ -19,40 +15,17 @@ class Microlens(Parameters):
     chief_ray_deg: float = quantity(0.0, "deg", "of the lens's chief ray in the frame's corners; 0: telecentric", ge=0, le=60)
     design_ray_deg: float = quantity(0.0, "deg", "angle for which the microlenses are shifted in the frame's corners", ge=0, le=60)
     acceptance_deg: float = quantity(20.0, "deg", "standard deviation of the response against angle", ge=3, le=90)
-    aspect: float = quantity(0.965, "1", "pitch along y over pitch along x", ge=0.2, le=5)
+    pitch_x_um: float = quantity(8.6, "µm", "pixel pitch along x", gt=0, le=100)
+    pitch_y_um: float = quantity(8.3, "µm", "pixel pitch along y", gt=0, le=100)
 
 
 def factor(params: Microlens, x_px: np.ndarray, y_px: np.ndarray, frame_shape: tuple[int, int]) -> np.ndarray:
     """Relative response at some places, 1 where the ray comes as designed; float64."""
     x0, y0 = frame_centre(frame_shape)
-    r = np.hypot(x_px - x0, params.aspect * (y_px - y0)) / corner_px(frame_shape, params.aspect)
+    aspect = params.pitch_y_um / params.pitch_x_um
+    r = np.hypot(x_px - x0, aspect * (y_px - y0)) / corner_px(frame_shape, aspect)
     chief, design = (np.arctan(np.tan(np.radians(a)) * r) for a in (params.chief_ray_deg, params.design_ray_deg))
     return np.exp(-0.5 * ((chief - design) / np.radians(params.acceptance_deg)) ** 2)
-
-
-def _frame(params: Microlens, signal: Signal) -> np.ndarray:
-    light = factor(params, signal.cols[:, None, :].astype(float), signal.rows[:, :, None].astype(float), signal.frame_shape)
-    return np.maximum(light, 1e-3).astype(np.float32)  # cut off just above 0: the correction divides by it
-
-
-def forward(params: Microlens, signal: Signal, stream: Stream) -> Signal:
-    """Multiply the light by the response."""
-    return signal.with_data(signal.data * _frame(params, signal))
-
-
-def correct(params: Microlens, signal: Signal, maps: Mapping[str, np.ndarray]) -> Signal:
-    """Divide by the response that the parameters give; it needs no map."""
-    return signal.with_data(signal.data / _frame(params, signal))
-
-
-def truth(params: Microlens, signal: Signal, stream: Stream) -> Mapping[str, np.ndarray]:
-    """Relative response of every pixel, shape (rows, cols)."""
-    return {"light_rel": _frame(params, signal)[0]}
-
-
-def propagate(params: Microlens, probe: Probe) -> Contribution:
-    """Propagator P3: a relative ramp g moves a centroid by g⟨x²⟩; mean and spread over targets anywhere on the frame."""
-    return ramp_contribution(lambda x, y: factor(params, x, y, probe.frame_shape), probe)
 
 
 SOURCE = Source(
@@ -66,10 +39,7 @@ SOURCE = Source(
     neutral=Microlens(),
     typical=Microlens(chief_ray_deg=12.0, design_ray_deg=5.0, acceptance_deg=15.0),
     bound=Microlens(chief_ray_deg=20.0, design_ray_deg=0.0, acceptance_deg=15.0),
-    forward=forward,
-    correct=correct,
-    truth=truth,
-    propagate=propagate,
+    **factor_verbs(factor),
     option="shading that is given by its optical data; what is measured is in optics.shading",
     gum_class="G",
     equation="µ' = µ exp(−(θ − θ_design)²/(2 θ₀²)),  tan θ = tan θ_corner · r/r_corner;  Δx = g ⟨x²⟩",

@@ -110,12 +110,11 @@ def propagate(params: Jpeg, probe: Probe) -> Contribution:
             shifts.append(probe.field(error / scale))
     dx, dy = (np.concatenate([s[a] for s in shifts]) for a in (0, 1))
     rounding = probe.white(np.sqrt(1 / 12) / scale)  # the decoder gives whole codes
-    return Contribution(
-        u_x_px=float(np.hypot(np.std(dx), rounding[0])),
-        u_y_px=float(np.hypot(np.std(dy), rounding[1])),
-        bias_x_px=float(np.mean(dx)),
-        bias_y_px=float(np.mean(dy)),
-        gum_class="F",
+    return probe.from_shifts(
+        dx,
+        dy,
+        "F",
+        beside=rounding,
         model_error=0.25 if params.quality >= 50 else 0.45,  # coarse steps change the target beyond first order
         floor_px=5e-4,
         method="response of the estimator to the rounding of the block coefficients, over all places of the block raster",
