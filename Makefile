@@ -11,7 +11,7 @@ ORACLES := .venv-oracles
 PYTEST := $(PY) -m pytest -n $(JOBS) --dist loadfile --hypothesis-seed=0
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test slow-test oracles study bench lint browser-test
+.PHONY: help install demo test oracles study bench lint browser-test
 
 help: ## show this list
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1|\2/p' $(MAKEFILE_LIST) | while IFS='|' read -r target text; do printf '%-20s %s\n' "$$target" "$$text"; done
@@ -22,10 +22,7 @@ demo: $(INSTALLED) ## assess the packaged example campaign and write the report
 	@$(VENV)/bin/pixmetry assess -o $(REPORT)
 
 test: $(INSTALLED)-test ## run the quick tests
-	@$(PYTEST) -m "not slow and not browser and not oracle"
-
-slow-test: $(INSTALLED)-test ## run the tests that take longer
-	@$(PYTEST) -m "slow and not browser"
+	@$(PYTEST) -m "not browser and not oracle"
 
 oracles: $(INSTALLED)-test $(ORACLES)/.installed ## compare with other people's programs (Python 3.11 or 3.12)
 	@$(PYTEST) -m oracle -rP

@@ -37,7 +37,7 @@ def main() -> None:
     found = {}
     for mode in ("exact", "frozen"):
         trials = Trials(camera, target, estimator, facts, trials=400, units=2, frames=2, mode=mode, seed=3)
-        found[mode] = trials.positions(camera)
+        found[mode] = trials.errors(camera)
     probe = make_probe(facts, target, estimator)
     deviation_dn = 8 * np.sqrt(facts.noise_dn**2 + facts.gain_dn_per_e * target.peak_rel * facts.saturation_dn)
     for axis, name, gradient in ((0, "x", probe.gx), (1, "y", probe.gy)):
