@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pixmetry.core.errors import InputError
-from pixmetry.locate._kernels import CENTROID, HARD, SOFT, SQUARED, locate_windows
+from pixmetry.location._kernels import CENTROID, HARD, SOFT, SQUARED, locate_windows
 
 LAWS = {"centroid": CENTROID, "squared_centroid": SQUARED, "soft_threshold": SOFT, "hard_threshold": HARD}
 THRESHOLDED = ("soft_threshold", "hard_threshold")
