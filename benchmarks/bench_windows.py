@@ -21,7 +21,7 @@ from pixmetry.core.catalogue import get_source
 from pixmetry.core.random import Grid
 from pixmetry.core.signal import Clock
 from pixmetry.core.threads import set_threads
-from pixmetry.locate.estimators import Estimator
+from pixmetry.location.estimators import Estimator
 from pixmetry.scene.discs import REACH, STEP, Discs, radial_profile
 from pixmetry.scene.uniform import Uniform
 

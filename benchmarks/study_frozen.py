@@ -15,7 +15,7 @@ from pixmetry.budget.monte_carlo import Trials
 from pixmetry.budget.probe import Target, facts_of, make_probe
 from pixmetry.core.camera import Camera, Element, in_order
 from pixmetry.core.catalogue import catalogue
-from pixmetry.locate.estimators import Estimator
+from pixmetry.location.estimators import Estimator
 
 SETTINGS = {
     "sensor.quantum_efficiency": {"quantum_efficiency": 0.5},

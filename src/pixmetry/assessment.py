@@ -30,7 +30,7 @@ from pixmetry.core.estimates import Estimates
 from pixmetry.core.observations import Observations
 from pixmetry.experiment.emva_linear import fit_emva_linear
 from pixmetry.experiment.observe import Group, observe
-from pixmetry.locate.estimators import Estimator, parse_estimator
+from pixmetry.location.estimators import Estimator, parse_estimator
 from pixmetry.report.page import write_report
 from pixmetry.results import Assessment
 

@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from pixmetry.campaign import InputHashes, provenance_record, read_maps, staged_output, write_json
-from pixmetry.campaign.images import LoadedFrame, check_frame, load_frame
-from pixmetry.campaign.zarr_frames import entries
+from pixmetry.campaign.images import LoadedFrame, check_frame, load_frame, picture_files
 from pixmetry.core.camera import Camera, load_camera
 from pixmetry.core.errors import InputError
 from pixmetry.core.random import Grid
 from pixmetry.core.signal import Kind, Signal
 from pixmetry.core.threads import imap_tiles
 
-IMAGES = (".png", ".tif", ".tiff", ".npy")
 NOT_THE_CAMERA = ("optics",)  # light and lens of the campaign are not those of the frames to correct
 
 
@@ -90,7 +88,7 @@ def correct_files(
     from tifffile import imwrite
 
     record, camera, maps = _load(Path(results))
-    files = _image_files(frames)
+    files = _named_once(picture_files(frames))
     hashes = InputHashes(files[0].parent)
     told = progress or (lambda what, step, of: None)
     done: dict[str, str] = {}
@@ -134,17 +132,7 @@ def _load(results: Path) -> tuple[dict[str, Any], Camera, dict[str, np.ndarray]]
     return record, load_camera(results.parent / "camera.yaml"), maps
 
 
-def _image_files(frames: Iterable[str | Path]) -> list[Path]:
-    files: list[Path] = []
-    for given in map(Path, frames):
-        if given.is_dir():
-            files += entries(given) or sorted(p for p in given.iterdir() if p.suffix.lower() in IMAGES)
-        else:
-            files.append(given)
-    if not files:
-        raise InputError(
-            "no image files", where=", ".join(map(str, frames)), allowed=", ".join(IMAGES), remedy="name files or a folder of them"
-        )
+def _named_once(files: list[Path]) -> list[Path]:
     names = [p.stem for p in files]
     double = next((n for n in names if names.count(n) > 1), None)
     if double is not None:

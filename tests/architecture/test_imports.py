@@ -15,7 +15,7 @@ import pytest
 
 SRC = Path(__file__).resolve().parents[2] / "src" / "pixmetry"
 STAGES = ("scene", "optics", "sensor", "electronics", "cable", "grabber", "storage", "processing")
-MEASURING = {"experiment", "locate", "calibrate"}
+MEASURING = {"experiment", "location", "calibrate"}
 
 # What each part may import besides itself. A part that is not listed here fails the test: say where it belongs.
 ALLOWED: dict[str, set[str]] = {
@@ -23,13 +23,16 @@ ALLOWED: dict[str, set[str]] = {
     **{stage: {"core"} for stage in STAGES},
     **{part: {"core"} for part in MEASURING},
     "campaign": {"core"},
-    "budget": {"core", "scene", "locate"},
+    "budget": {"core", "scene", "location"},
 }
 ALLOWED["simulation"] = ALLOWED["correction"] = {"core", "scene", "campaign"}
 ALLOWED["results"] = {"core", "campaign", "experiment", "budget"}
 ALLOWED["chain"] = {"core", "scene"}
-ALLOWED["report"] = {"core", "campaign", "experiment", "budget", "results", "chain"}
-ALLOWED["assessment"] = {"core", "campaign", "experiment", "locate", "budget", "results", "report"}
+ALLOWED["camera_noise"] = {"core", "scene", "location"}
+ALLOWED["located"] = {"core", "location"}
+ALLOWED["report"] = {"core", "campaign", "experiment", "budget", "results", "chain", "located"}
+ALLOWED["locating"] = {"core", "campaign", "location", "located", "camera_noise", "report"}
+ALLOWED["assessment"] = {"core", "campaign", "experiment", "location", "budget", "results", "report"}
 ALLOWED["handbook"] = {*ALLOWED}
 ALLOWED["cli"] = {*ALLOWED}
 ALLOWED["__main__"] = {"cli"}
@@ -205,7 +208,7 @@ def test_a_planted_wrong_import_is_caught(module: str, line: str) -> None:
     ("module", "line"),
     [
         ("pixmetry.sensor.prnu", "import numpy as np\nfrom pixmetry.core.signal import Signal\nfrom . import _kernels"),
-        ("pixmetry.budget.propagate", "from pixmetry.scene import targets\nfrom pixmetry.locate import centroid"),
+        ("pixmetry.budget.propagate", "from pixmetry.scene import targets\nfrom pixmetry.location import centroid"),
         ("pixmetry.core.provenance", "from pixmetry import __version__"),
     ],
 )

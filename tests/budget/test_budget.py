@@ -15,7 +15,7 @@ from pixmetry.budget.probe import Target, facts_of
 from pixmetry.core.catalogue import catalogue, get_source
 from pixmetry.core.errors import InputError
 from pixmetry.core.estimates import Estimates
-from pixmetry.locate.estimators import Estimator
+from pixmetry.location.estimators import Estimator
 
 KNOWN = {"noise_dn": 0.6}
 

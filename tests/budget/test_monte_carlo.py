@@ -11,7 +11,7 @@ from budget.cameras import ETA, GAIN_DN_PER_E, camera, element
 from pixmetry.budget.monte_carlo import Trials, _axis, monte_carlo
 from pixmetry.budget.probe import Facts, Target, facts_of, make_probe, parse_target, resolve
 from pixmetry.core.errors import InputError
-from pixmetry.locate.estimators import Estimator
+from pixmetry.location.estimators import Estimator
 
 WHITE_E = 60.0
 Z = 4.9  # of a normal variable: two-sided false-alarm rate 1e-6

@@ -10,7 +10,7 @@ from scipy.integrate import quad
 from scipy.special import erf
 
 from pixmetry.core.errors import InputError
-from pixmetry.locate.estimators import LAWS, Estimator, parse_estimator
+from pixmetry.location.estimators import LAWS, Estimator, parse_estimator
 
 SIDE = 24
 AXIS = np.arange(SIDE, dtype=float)

@@ -18,7 +18,7 @@ from pixmetry.core.contribution import Contribution
 from pixmetry.core.observations import Observations
 from pixmetry.experiment.emva_linear import fit_emva_linear
 from pixmetry.experiment.observe import Group, observe
-from pixmetry.locate.estimators import Estimator
+from pixmetry.location.estimators import Estimator
 from pixmetry.results import Assessment
 
 GAIN, NOISE_E, OFFSET, BITS, SHAPE = 0.25, 12.0, 40.0, 12, (96, 120)

@@ -19,7 +19,7 @@ from pixmetry.core.contribution import Contribution
 from pixmetry.core.estimates import Estimates
 from pixmetry.core.signal import Kind
 from pixmetry.core.source import Source
-from pixmetry.locate.estimators import Estimator
+from pixmetry.location.estimators import Estimator
 
 SCHEMA = "pixmetry/budget/1"
 ESTIMATOR_ITSELF = "processing.threshold"

@@ -11,7 +11,7 @@ from pixmetry.budget.probe import Facts, Target, background_of, facts_of, resolv
 from pixmetry.core.camera import Camera
 from pixmetry.core.errors import ChainError, InputError
 from pixmetry.core.random import Grid, Streams
-from pixmetry.locate.estimators import Estimator
+from pixmetry.location.estimators import Estimator
 
 UNIT_STRIDE = 1_000_003  # between the unit seeds of cameras of one type
 

@@ -13,7 +13,7 @@ from pixmetry.core.contribution import Probe
 from pixmetry.core.errors import InputError
 from pixmetry.core.random import Grid
 from pixmetry.core.signal import Kind
-from pixmetry.locate.estimators import Estimator, split_text
+from pixmetry.location.estimators import Estimator, split_text
 from pixmetry.scene.discs import Discs
 from pixmetry.scene.uniform import Uniform
 

@@ -12,11 +12,15 @@ import numpy as np
 
 from pixmetry.campaign.provenance import InputHashes
 from pixmetry.campaign.records import Campaign, FrameGroup
-from pixmetry.campaign.zarr_frames import is_entry, read_entry
+from pixmetry.campaign.zarr_frames import entries, is_entry, read_entry
 from pixmetry.core.errors import InputError
 from pixmetry.core.threads import imap_tiles
 
 _FORMATS = "grey PNG, TIFF or NPY with 8 or 16 bits"
+_JPEG = b"\xff\xd8"
+ENDINGS = (".png", ".tif", ".tiff", ".npy")
+PICTURE_ENDINGS = (*ENDINGS, ".jpg", ".jpeg")
+CHANNELS = {"red": 0, "green": 1, "blue": 2}
 
 
 class LoadedFrame(NamedTuple):
@@ -48,32 +52,90 @@ def load_frame(path: Path) -> LoadedFrame:
     if is_entry(path):
         array, sha256, size = read_entry(path)
         return LoadedFrame(_checked(array, path), sha256, size)
+    raw = _read_bytes(path)
+    return LoadedFrame(_checked(_decoded(raw, path), path), hashlib.sha256(raw).hexdigest(), len(raw))
+
+
+def read_picture(path: str | Path, channel: str | None = None) -> np.ndarray:
+    """Read a picture to measure positions in: as `read_frame`, and also JPEG, floats, and one channel of a colour image.
+
+    Parameters
+    ----------
+    path : str or Path
+    channel : {"red", "green", "blue"}, optional
+        Which one of a colour image; ignored for a grey one.
+
+    Returns
+    -------
+    ndarray, shape (rows, cols), uint8, uint16 or float32
+
+    Raises
+    ------
+    InputError
+        As in `read_frame`, or if the image is in colour and no channel is named.
+    """
+    path = Path(path)
+    if channel is not None and channel not in CHANNELS:
+        raise InputError("no such channel", value=channel, allowed=", ".join(CHANNELS))
+    array = read_entry(path)[0] if is_entry(path) else _decoded(_read_bytes(path), path, lossy=True)
+    if array.ndim == 3 and array.shape[2] in (3, 4):
+        if channel is None:
+            what = f"colour image ({'x'.join(map(str, array.shape))})"
+            remedy = "name the channel to measure in (--channel green), or store the sensor's raw values"
+            raise InputError(what, where=str(path), allowed="one grey channel", remedy=remedy)
+        array = array[:, :, CHANNELS[channel]]
+    if array.dtype.kind == "f" and array.ndim == 2:
+        return np.ascontiguousarray(array, np.float32)
+    return _checked(array, path)
+
+
+def picture_files(frames: Iterable[str | Path], endings: tuple[str, ...] = ENDINGS) -> list[Path]:
+    """Name the image files meant by files, folders of them, and Zarr stores of frames.
+
+    Raises
+    ------
+    InputError
+        If there are none.
+    """
+    given, files = [Path(f) for f in frames], []
+    for path in given:
+        if path.is_dir():
+            files += entries(path) or sorted(p for p in path.iterdir() if p.suffix.lower() in endings)
+        else:
+            files.append(path)
+    if not files:
+        where = ", ".join(map(str, given))
+        raise InputError("no image files", where=where, allowed=", ".join(endings), remedy="name files or a folder of them")
+    return files
+
+
+def _read_bytes(path: Path) -> bytes:
     try:
-        raw = path.read_bytes()
+        return path.read_bytes()
     except FileNotFoundError:
         raise InputError("file is missing", where=str(path), remedy="check the name") from None
     except OSError as problem:
         raise InputError("file cannot be read", where=str(path), value=problem.strerror, remedy="check the permissions") from None
-    return LoadedFrame(_decode(raw, path), hashlib.sha256(raw).hexdigest(), len(raw))
 
 
-def _decode(raw: bytes, path: Path) -> np.ndarray:
+def _decoded(raw: bytes, path: Path, lossy: bool = False) -> np.ndarray:
     """Decode by content, not by the name's ending."""
     decode = next((decode for magic, decode in _DECODERS if raw.startswith(magic)), None)
+    if lossy and raw.startswith(_JPEG):
+        decode = _decode_jpeg
     if decode is None:
-        if raw.startswith(b"\xff\xd8"):
+        if raw.startswith(_JPEG):
             remedy = "store frames without loss: JPEG removes the noise to be measured"
             raise InputError("JPEG image", where=str(path), allowed=_FORMATS, remedy=remedy)
         what = "file is empty" if not raw else "not an image of a known format"
         raise InputError(what, where=str(path), allowed=_FORMATS, remedy="copy or export the frame again")
     try:
-        array = decode(raw)
+        return decode(raw)
     except InputError as problem:
         raise InputError(problem.what, where=str(path), allowed=problem.allowed, remedy=problem.remedy) from None
     except Exception as problem:  # every decoder has its own exceptions, and all of them mean a damaged file here
         reason = str(problem).splitlines()[0] if str(problem) else type(problem).__name__
         raise InputError(f"image is damaged or cut off ({reason})", where=str(path), remedy="copy or export the frame again") from None
-    return _checked(array, path)
 
 
 def _checked(array: np.ndarray, path: Path) -> np.ndarray:
@@ -109,6 +171,13 @@ def _decode_tiff(raw: bytes) -> np.ndarray:
                 raise ValueError("pixel data are missing")
         array: np.ndarray = page.asarray()
         return array
+
+
+def _decode_jpeg(raw: bytes) -> np.ndarray:
+    import imagecodecs
+
+    array: np.ndarray = imagecodecs.jpeg_decode(raw)
+    return array
 
 
 def _decode_npy(raw: bytes) -> np.ndarray:
