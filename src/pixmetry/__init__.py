@@ -21,6 +21,7 @@ _HOMES = {
     "catalogue": "pixmetry.core.catalogue",
     "load_camera": "pixmetry.core.camera",
     "load_campaign": "pixmetry.campaign",
+    "locate": "pixmetry.locating",
     "simulate": "pixmetry.simulation",
     "walk": "pixmetry.chain",
 }
@@ -36,6 +37,7 @@ __all__ = [
     "catalogue",
     "load_camera",
     "load_campaign",
+    "locate",
     "simulate",
     "walk",
 ]
@@ -49,6 +51,7 @@ if TYPE_CHECKING:
     from pixmetry.core.errors import PixmetryError
     from pixmetry.core.estimates import Estimates
     from pixmetry.core.signal import Signal
+    from pixmetry.locating import locate
     from pixmetry.simulation import simulate
 
 

@@ -25,6 +25,8 @@ COMMANDS = {
     "sources": "List the error sources, or explain one of them.",
     "simulate": "Make the frames of a camera whose errors are known.",
     "chain": "Walk one target through a camera, source by source, on one page.",
+    "locate": "Measure where targets or lines are, with a covariance.",
+    "bound": "Say how well a target can be located, what estimators give, and what limits them.",
     "correct": "Take out of frames what was measured in an assessment.",
 }
 

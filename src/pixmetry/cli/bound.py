@@ -1,0 +1,183 @@
+"""``pixmetry bound``: what is possible for a target, what estimators give, and what limits them."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import click
+
+KINDS = ("disc", "ellipse", "ring", "spot", "line", "edge")
+NOISE_KEYS = {"read": "read_dn", "gain": "slope_dn", "prnu": "pattern_rel", "dsnu": "pattern_dn", "black": "black_dn", "bits": "bits"}
+SIZES = {
+    "radius": "radius_px",
+    "inner_radius": "inner_radius_px",
+    "semi_major": "semi_major_px",
+    "semi_minor": "semi_minor_px",
+    "angle": "angle_deg",
+    "width": "width_px",
+    "length": "length_px",
+}
+
+
+@click.command()
+@click.option("--kind", type=click.Choice(KINDS), default="disc", show_default=True)
+@click.option("--radius", type=float, help="Of a disc or ring, px.")
+@click.option("--inner-radius", type=float, help="Of a ring, px.")
+@click.option("--semi-major", type=float, help="Of an ellipse, px.")
+@click.option("--semi-minor", type=float, help="Of an ellipse, px.")
+@click.option("--angle", type=float, help="Of an ellipse's long axis, of a line or edge, degrees from x towards y.")
+@click.option("--width", type=float, help="Of a line, px; by default a thin line, as wide as its blur.")
+@click.option("--length", type=float, help="Of a line or edge, px.")
+@click.option("--blur", type=float, required=True, help="Standard deviation of the edge or spot, without the pixel, px.")
+@click.option("--amplitude", type=float, required=True, help="Grey values above the surround; negative for a dark target.")
+@click.option("--background", type=float, default=0.0, show_default=True, help="Grey value of the surround above the camera's black.")
+@click.option("--noise", metavar="KEY=NUMBER,…", help=f"Noise in grey values: {', '.join(NOISE_KEYS)}; as in read=1.5,gain=0.01,bits=8.")
+@click.option("--camera", metavar="FILE|PRESET", help="A camera file or preset whose noise, bits, pitch and aperture are taken.")
+@click.option("--no-rounding", is_flag=True, help="Grey values are not whole numbers.")
+@click.option("--unknowns", default="shape", show_default=True, help="position, light, shape, planes, or names of parameters.")
+@click.option("--estimator", default="template", show_default=True, help="Whose limits are wanted; another name lists all.")
+@click.option("--frames", type=click.IntRange(1), default=1, show_default=True, help="Frames that are averaged.")
+@click.option("--aperture", type=float, help="Side of the pixel's sensitive square, px; by default the camera's, or 1.")
+@click.option("--window", type=int, help="Side of the window, odd, px; by default as far as the target reaches.")
+@click.option("--phases", type=int, default=5, show_default=True, help="Places within the pixel, along x and along y.")
+@click.option("--light-on", type=click.Choice(["surface", "image"]), default="surface", show_default=True, help="Where falling light acts.")
+@click.option("--json", "as_json", is_flag=True, help="For programs.")
+def bound(
+    kind: str,
+    blur: float,
+    amplitude: float,
+    background: float,
+    noise: str | None,
+    camera: str | None,
+    no_rounding: bool,
+    unknowns: str,
+    estimator: str,
+    frames: int,
+    aperture: float | None,
+    window: int | None,
+    phases: int,
+    light_on: str,
+    as_json: bool,
+    **sizes: float | None,
+) -> None:
+    """Say how well a target can be located: the Cramér–Rao bound, estimators beside it, and what limits them.
+
+    Uncertainties are standard deviations of one coordinate in pixels, the mean over places within the pixel; in µm too if the camera
+    tells its pitch. Example: pixmetry bound --radius 3.5 --blur 0.7 --amplitude 150 --background 10 --camera imx264_like
+    """
+    from pixmetry.core.errors import InputError
+    from pixmetry.location.bound import possible
+
+    if noise and camera:
+        raise InputError("the noise is given twice", where="--noise, --camera", remedy="give one of them")
+    model, settings, about = _of_camera(camera, no_rounding) if camera else _of_text(noise or "read=1.5", no_rounding)
+    given = {SIZES[name]: value for name, value in sizes.items() if value is not None}
+    parameters = given | {"blur_px": blur, "amplitude_dn": amplitude, "background_dn": model.black_dn + background}
+    settings["aperture_px"] = settings["aperture_px"] if aperture is None else aperture
+    result = possible(
+        kind,
+        parameters,
+        model,
+        unknowns,
+        estimator=estimator,
+        frames=frames,
+        window_px=window,
+        phases=phases,
+        light_on=light_on,
+        rounded=not no_rounding,
+        aperture_px=settings["aperture_px"],
+        pattern_dn=settings["pattern_dn"],
+    )
+    if as_json:
+        click.echo(json.dumps(result.to_record() | {"aperture_px": settings["aperture_px"]} | about, indent=2, ensure_ascii=False))
+    else:
+        _show(result, about)
+
+
+def _of_text(text: str, no_rounding: bool) -> tuple[Any, dict[str, float], dict[str, Any]]:
+    """Noise model, settings and facts from ``key=number,…``."""
+    from pixmetry.core.errors import InputError
+    from pixmetry.location.estimators import split_text
+    from pixmetry.location.information import ROUNDING_DN2
+    from pixmetry.location.noise import NoiseModel
+
+    _, values = split_text(":" + text, NOISE_KEYS, "--noise")
+    if not values.get("read_dn", 1.5) >= 0:
+        raise InputError("the read noise cannot be used", where="--noise", value=values["read_dn"], allowed="0 or more")
+    bits = values.pop("bits", None)
+    if bits is not None and (bits != int(bits) or not 1 <= bits <= 32):
+        raise InputError("the bits cannot be used", where="--noise", value=bits, allowed="1 to 32")
+    read, pattern = values.pop("read_dn", 0.0), values.pop("pattern_dn", 0.0)
+    ends = {} if bits is None else {"low_dn": 0.0, "high_dn": 2.0 ** int(bits) - 1}
+    rest: dict[str, Any] = {**values, **ends}
+    model = NoiseModel(read**2 + (0.0 if no_rounding else ROUNDING_DN2), **rest)
+    return model, {"aperture_px": 1.0, "pattern_dn": pattern}, {"camera": None, "pitch_um": None}
+
+
+def _of_camera(name: str, no_rounding: bool) -> tuple[Any, dict[str, float], dict[str, Any]]:
+    """The same from a camera file or preset."""
+    from dataclasses import replace
+
+    from pixmetry.core.camera import load_camera
+    from pixmetry.location.camera_noise import camera_noise
+    from pixmetry.location.information import ROUNDING_DN2
+
+    camera = load_camera(name)
+    read = camera_noise(camera)
+    model = replace(read.model, constant_dn2=read.model.constant_dn2 - ROUNDING_DN2) if no_rounding else read.model
+    about = {"camera": camera.name, "pitch_um": read.pitch_um, "counted": list(read.counted), "not_counted": list(read.left_out)}
+    return model, {"aperture_px": read.aperture_px, "pattern_dn": read.pattern_dn}, about
+
+
+def _show(result: Any, about: dict[str, Any]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console(highlight=False)
+    size = ", ".join(f"{n.removesuffix('_px')} {v:g}" for n, v in result.parameters.items() if v and n.endswith("_px") and "per" not in n)
+    console.print(
+        f"{result.kind} of {size} px, {result.parameters['amplitude_dn']:g} grey values over {result.parameters['background_dn']:g}; "
+        f"{result.frames} frame{'s' if result.frames > 1 else ''}, window {result.window_px} px",
+        soft_wrap=True,
+    )
+    console.print(f"noise: {result.noise}\n", markup=False, soft_wrap=True)
+    micro = _micrometres(about["pitch_um"])
+
+    table = Table(title="What is possible (Cramér–Rao bound of one coordinate)", title_justify="left", box=None, pad_edge=False)
+    for column in ("unknown", "px", "px by phase", *(["µm"] if micro else [])):
+        table.add_column(column, no_wrap=column != "unknown")
+    for name, b in result.bounds.items():
+        label = {"asked": f"asked: {', '.join(b.unknowns)}", "position": "place alone"}.get(name, f"… {name} too")
+        least, mean, greatest = b.place_px
+        table.add_row(label, f"{mean:.3g}", f"{least:.3g} … {greatest:.3g}", *([micro(mean)] if micro else []))
+    for name, value in result.closed_forms_px.items():
+        table.add_row(f"closed form: {name}", f"{value:.3g}", "", *([micro(value)] if micro else []))
+    console.print(table, "")
+
+    table = Table(title="What estimators give", title_justify="left", box=None, pad_edge=False)
+    for column in ("estimator", "px", "noise", "S-curve", "× bound", *(["µm"] if micro else []), "with"):
+        table.add_column(column, no_wrap=column != "with")
+    for p in result.predictions:
+        row = [p.name, f"{p.u_px:.3g}", f"{p.noise_px:.3g}", f"{p.s_curve_px:.1g}", f"{p.u_px / result.u_px:.2f}"]
+        table.add_row(*row, *([micro(p.u_px)] if micro else []), p.detail)
+    console.print(table, "")
+
+    console.print(f"What limits {result.chosen.name} (shares of its variance)")
+    for limit in result.limits:
+        if limit.share < 5e-4:
+            continue
+        console.print(f"  {limit.share:6.1%}  {limit.cause}")
+    console.print("")
+    for text in (*result.advice, *result.statements):
+        console.print(f"· {text}", soft_wrap=True)
+    if about.get("not_counted"):
+        console.print(f"· of {about['camera']} not counted: {', '.join(about['not_counted'])}", soft_wrap=True)
+
+
+def _micrometres(pitch_um: tuple[float, float] | None) -> Any:
+    """How to write pixels in µm, or in nm where that is less; None without a pitch."""
+    if pitch_um is None:
+        return None
+    pitch = (0.5 * (pitch_um[0] ** 2 + pitch_um[1] ** 2)) ** 0.5
+    return lambda px: f"{px * pitch:.3g} µm" if px * pitch >= 0.1 else f"{1000 * px * pitch:.3g} nm"

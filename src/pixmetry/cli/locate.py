@@ -1,0 +1,98 @@
+"""``pixmetry locate``: positions of targets and lines with their covariance."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+KINDS = ("disc", "ellipse", "ring", "spot", "line", "edge", "cross", "chessboard", "coded")
+
+
+@click.command()
+@click.argument("images", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option("--kind", type=click.Choice(KINDS), default="disc", show_default=True, help="What is to be found.")
+@click.option("--estimator", default="auto", show_default=True, metavar="NAME", help="How it is measured; 'list' shows what there is.")
+@click.option(
+    "-o", "--output", type=click.Path(path_type=Path), help="The table: .csv, .parquet or .json. Default: CSV to standard output."
+)
+@click.option("--overlay", type=click.Path(path_type=Path), help="A PNG that shows what was found; a folder if there are several images.")
+@click.option(
+    "--polarity", type=click.Choice(["auto", "bright", "dark"]), default="auto", show_default=True, help="Of targets on their ground."
+)
+@click.option(
+    "--grid",
+    metavar="COLSxROWS",
+    help="Pattern of a plate: inner corners of a chessboard, dots of a plate; 'any' numbers the dots of a plate of unknown size.",
+)
+@click.option(
+    "--noise",
+    metavar="WHAT",
+    help="Noise model: a camera (preset, camera.yaml), or constant=2.3,slope=0.01,black=16 in DN. Default: from the image.",
+)
+@click.option("--bits", type=click.IntRange(1, 16), help="Bits of a stored value, which say where it saturates. Default: from the image.")
+@click.option(
+    "--aperture", type=click.FloatRange(0, 1), default=1.0, show_default=True, help="Side of the pixel's light-sensitive square in pixels."
+)
+@click.option(
+    "--light-on",
+    type=click.Choice(["surface", "image"]),
+    default="surface",
+    show_default=True,
+    help="Where light that falls off across a target acts.",
+)
+@click.option("--channel", type=click.Choice(["red", "green", "blue"]), help="Channel of colour images.")
+@click.option("--threads", type=click.IntRange(1), help="Default: all processors.")
+def locate(
+    images: tuple[Path, ...],
+    kind: str,
+    estimator: str,
+    output: Path | None,
+    overlay: Path | None,
+    polarity: str,
+    grid: str | None,
+    noise: str | None,
+    bits: int | None,
+    aperture: float,
+    light_on: str,
+    channel: str | None,
+    threads: int | None,
+) -> None:
+    """Measure where targets or lines are, with a covariance.
+
+    IMAGES are files (PNG, TIFF, NPY, JPEG), folders of them, or Zarr stores of frames. Bright and dark targets are found without tuning.
+    Positions count from the centre of the top-left pixel, x to the right, y down.
+    """
+    from pixmetry.cli._progress import shown_progress
+    from pixmetry.core.threads import set_threads
+    from pixmetry.locating import estimators, locate_files
+
+    if estimator == "list":
+        for name, text in estimators(kind).items():
+            click.echo(f"{name:<24} {text}")
+        return
+    set_threads(threads)
+    with shown_progress() as progress:
+        table = locate_files(
+            images,
+            output,
+            kind=kind,
+            estimator=estimator,
+            overlay=overlay,
+            polarity=polarity,
+            grid=grid,
+            noise=noise,
+            bits=bits,
+            aperture_px=aperture,
+            light_on=light_on,
+            channel=channel,
+            progress=progress,
+        )
+    if output is None:
+        click.echo(table.to_csv(), nl=False)
+    for image in table.images:
+        click.echo(f"{image['name']}: {image['targets']} found; {image['estimator']}: {image['reason']}", err=output is None)
+    if output is not None:
+        click.echo(f"table: {output}")
+    if overlay is not None:
+        click.echo(f"overlay: {overlay}", err=output is None)

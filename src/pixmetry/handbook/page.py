@@ -1,0 +1,50 @@
+"""A page of the handbook: Markdown with figures beside it as SVG files of their own."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from pixmetry.report.drawing import Picture, escape
+
+WIDTH_PX = 560
+# The colours of the report's figures, light and dark, with a ground of their own, so that they can be read on any page.
+STYLE = (
+    "svg{--ground:#fff;--ink:#1a1d21;--soft:#5b626b;--grid:#d9dde2;--blue:#0067a5;--red:#c44e00;--amber:#a87400;"
+    "--sans:system-ui,-apple-system,'Segoe UI',Roboto,'Noto Sans','Liberation Sans',Arial,sans-serif;background:var(--ground)}"
+    "@media(prefers-color-scheme:dark){svg{--ground:#14171b;--ink:#e8eaed;--soft:#a5adb8;--grid:#333a43;--blue:#5fb3ea;--red:#f4915a;"
+    "--amber:#dfb046}}"
+)
+
+
+@dataclass(frozen=True)
+class Page:
+    """Text in Markdown, and its figures."""
+
+    name: str
+    text: str
+    pictures: tuple[Picture, ...] = ()
+
+    def files(self) -> dict[str, str]:
+        """What it is made of: file name and content."""
+        return {f"{self.name}.md": self.text, **{f"{p.name}.svg": standalone(p) for p in self.pictures}}
+
+
+def standalone(shown: Picture) -> str:
+    """A picture of the report as a file of its own: with a size, a name space, colours and a ground."""
+    head, rest = shown.svg.split(">", 1)
+    left, top, width, height = (float(v) for v in head.split('viewBox="')[1].split('"')[0].split())
+    size = f'xmlns="http://www.w3.org/2000/svg" width="{WIDTH_PX}" height="{WIDTH_PX * height / width:.0f}"'
+    ground = f'<rect x="{left:g}" y="{top:g}" width="{width:g}" height="{height:g}" style="fill: var(--ground)"/>'
+    return f"{head.replace('<svg', f'<svg {size}', 1)}><style>{STYLE}</style>{ground}{rest}\n"
+
+
+def show(shown: Picture) -> str:
+    """A figure and its caption in a page's text."""
+    return f'<img src="{shown.name}.svg" width="{WIDTH_PX}" alt="{escape(shown.alt)}">\n\n*{shown.caption}*\n'
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[object]], numbers_from: int = 1) -> str:
+    """A table in Markdown; columns from ``numbers_from`` on stand right."""
+    rule = ["---"] * min(numbers_from, len(head)) + ["---:"] * (len(head) - numbers_from)
+    return "\n".join("| " + " | ".join(str(cell) for cell in row) + " |" for row in (head, rule, *rows)) + "\n"

@@ -1,0 +1,148 @@
+"""The noise of a frame from the frame itself: what is left of it where fitted templates are flat."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from pixmetry.core.errors import MeasureError
+from pixmetry.location.noise import NoiseModel
+from pixmetry.location.targets import Targets
+from pixmetry.location.template_fit import KINDS, Windows, run_fit
+
+ROUNDING_DN2 = 1 / 12
+MOST_TARGETS = 64
+EDGE_PX = 0.05  # misplacement of an edge that a template may have: where it would matter, a pixel says nothing about noise
+LEVELS = 16
+LEAST_PIXELS = 30  # for the variance of a level
+CLEAR_SIGMA = 4.0  # by which the variance must rise with the level for the slope to count (3e-5 by chance)
+OUTLIER_SIGMA = 4.0
+KEPT = 0.998872  # variance that a normal distribution keeps when values beyond 4 standard deviations are left out
+
+
+def noise_from_image(
+    frame: np.ndarray,
+    targets: Targets,
+    kind: str = "disc",
+    *,
+    low_dn: float = -math.inf,
+    high_dn: float = math.inf,
+    aperture_px: float = 1.0,
+    threads: int | None = None,
+) -> NoiseModel:
+    """Measure variance against grey level from the residuals of a first fit.
+
+    Parameters
+    ----------
+    frame : ndarray, shape (rows, cols), uint8, uint16 or float32
+    targets : Targets
+        At most 64 of them are used, spread over the list.
+    kind : {"disc", "ellipse", "ring", "spot"}
+    low_dn, high_dn : float
+        Ends of the scale, where they are known.
+    aperture_px : float
+    threads : int, optional
+
+    Returns
+    -------
+    NoiseModel
+        Of origin "image". The slope is 0 unless it stands 4 standard deviations clear. Rounding is part of the measured variance, which
+        is not below 1/12 DN² for integer frames. The ends of the scale are those of an integer type, or 2^b − 1 where values pile up there.
+
+    Raises
+    ------
+    MeasureError
+        If there is no target to measure at.
+
+    Notes
+    -----
+    Only pixels where the template is so flat that an edge misplaced by 0.05 px shifts them by less than half the noise are used, so that a
+    blur or shape that the template does not have is not taken for noise. A squared residual is divided by 1 minus its leverage
+    J (JᵀWJ)⁻¹Jᵀ W; values beyond 4 standard deviations are left out.
+    """
+    if not len(targets):
+        raise MeasureError("no target to measure the noise at", where="noise_from_image", remedy="give a noise model")
+    part = targets[np.unique(np.linspace(0, len(targets) - 1, min(len(targets), MOST_TARGETS)).round().astype(int))]
+    whole = frame.dtype.kind == "u"
+    least = ROUNDING_DN2 if whole else (1e-6 * float(np.median(np.abs(part.amplitude_dn)))) ** 2 + 1e-12
+    first = max(float(np.median(part.sigma_dn)) ** 2, least)
+    low, high = scale_of(frame)
+    low, high = max(low, low_dn), min(high, high_dn)
+    guess = NoiseModel(first, low_dn=low, high_dn=high, origin="image")
+    for _ in range(2):  # the second time with better weights, and a better idea of which pixels are flat
+        level, residual = _flat_residuals(frame, part, guess, kind, aperture_px, threads)
+        guess = _fitted(level, residual, guess, least)
+    return guess
+
+
+def scale_of(frame: np.ndarray) -> tuple[float, float]:
+    """Lower and upper end of the scale of a frame's grey values."""
+    if frame.dtype.kind != "u":
+        return -math.inf, math.inf
+    high = float(np.iinfo(frame.dtype).max)
+    top = int(frame.max())
+    if frame.dtype.itemsize > 1 and top > 255 and (top & (top + 1)) == 0 and np.count_nonzero(frame == top) >= 3:
+        high = float(top)
+    return 0.0, high
+
+
+def _flat_residuals(
+    frame: np.ndarray, targets: Targets, noise: NoiseModel, kind: str, aperture_px: float, threads: int | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Levels and residuals, divided by √(1 − leverage), of pixels where the template is flat."""
+    from pixmetry.location._template_kernels import residuals
+
+    windows = Windows.of(frame, targets, noise, kind, KINDS.index(kind), aperture_px, True, False)
+    fitted = run_fit(windows, np.arange(len(targets)), windows.start, False, False, False, threads)
+    good = np.flatnonzero(fitted.at_rest)
+    return residuals(
+        frame, windows.code, fitted.parameters, good, windows.start, windows.half, windows.outer, windows.reach, windows.near_start,
+        windows.near_index, windows.numbers, aperture_px, EDGE_PX, 0.5,
+    )  # fmt: skip
+
+
+def _fitted(level: np.ndarray, residual: np.ndarray, guess: NoiseModel, least: float) -> NoiseModel:
+    """Constant, and slope if it is clear, of the variance of residuals against level."""
+    sigma = np.sqrt(guess.variance_dn2(level))
+    inside = (level > guess.low_dn + 2.5 * sigma) & (level < guess.high_dn - 2.5 * sigma)  # else the scale cuts the noise
+    level, residual = level[inside], residual[inside]
+    if len(level) < LEAST_PIXELS:
+        return guess
+    # levels of equal width hold the top and the background apart, however few pixels either has
+    edges = np.linspace(level.min(), level.max() + 1e-9, LEVELS + 1)
+    bins = np.digitize(level, edges) - 1
+    rows = [
+        (level[bins == k].mean(), *_variance(residual[bins == k])) for k in range(LEVELS) if np.count_nonzero(bins == k) >= LEAST_PIXELS
+    ]
+    if not rows:
+        return replace(guess, constant_dn2=max(_variance(residual)[0], least))
+    s, v, n = np.array(rows).T
+    black = float(s.min())
+    constant, slope = max(float(np.average(v, weights=n)), least), 0.0
+    for _ in range(3):
+        w = n / (2 * (constant + slope * (s - black)) ** 2)
+        design = np.stack([np.ones_like(s), s - black])
+        if len(s) < 2:
+            break
+        covariance = np.linalg.pinv((design * w) @ design.T)
+        a, b = covariance @ (design * w) @ v
+        # the spread of the levels about the line counts too
+        excess = max(1.0, float((w * (v - a - b * (s - black)) ** 2).sum()) / max(len(s) - 2, 1))
+        if b > CLEAR_SIGMA * math.sqrt(covariance[1, 1] * excess) and a > 0.0:
+            constant, slope = max(a, least), float(b)
+        else:
+            constant, slope = max(float((w * v).sum() / w.sum()), least), 0.0
+    return replace(guess, constant_dn2=float(constant), slope_dn=slope, black_dn=black if slope else 0.0)
+
+
+def _variance(values: np.ndarray) -> tuple[float, int]:
+    """Mean square without outliers, and how many values it is of."""
+    kept = values
+    for _ in range(4):
+        sigma = math.sqrt(float(np.mean(kept**2)) / (KEPT if len(kept) < len(values) else 1.0))
+        kept = values[np.abs(values) <= max(OUTLIER_SIGMA * sigma, 1e-300)]
+        if not len(kept):
+            return 0.0, 1
+    return float(np.mean(kept**2)) / KEPT, len(kept)

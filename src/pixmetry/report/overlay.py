@@ -1,0 +1,145 @@
+"""What was located, drawn over its image."""
+
+from __future__ import annotations
+
+import os
+import secrets
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from pixmetry.core.errors import InputError
+from pixmetry.located import ORIGIN, Located
+
+CLEAN, FLAGGED, CROSS = "#00b4d8", "#ff9f1c", "#ff2e63"
+STRIP_IN = 0.42  # of text under the image
+DPI = 100
+WANTED_PX = 1600  # small images are enlarged towards this
+MOST_ZOOM = 6
+
+
+def overlay_names(overlay: str | Path | None, images: Sequence[Path]) -> list[Path | None]:
+    """Name the picture of each image: the file itself for one, files in a folder for several.
+
+    Raises
+    ------
+    InputError
+        If one file is named for several images, the ending is not ``.png``, or two images would have the same picture.
+    """
+    if overlay is None:
+        return [None] * len(images)
+    target = Path(overlay)
+    is_file = target.suffix.lower() == ".png"
+    if len(images) == 1 and is_file:
+        if target.is_dir():
+            raise InputError("is a folder", where=str(target), remedy="name the picture, such as found.png")
+        return [target]
+    if is_file:
+        raise InputError("one picture for several images", where=str(target), remedy="name a folder")
+    if target.suffix or target.is_file():
+        raise InputError("a picture is written as PNG", where=str(target), allowed="a name that ends in .png, or a folder")
+    names = [p.stem if not p.name.isdigit() else f"{p.parent.stem}-{p.name}" for p in images]
+    double = next((n for n in names if names.count(n) > 1), None)
+    if double is not None:
+        raise InputError("two images would have one picture", value=double, remedy="draw them in two runs")
+    return [target / f"{name}-located.png" for name in names]
+
+
+def write_overlay(path: str | Path, frame: np.ndarray, table: Located) -> Path:
+    """Draw the outlines, centres or lines of a table over its frame and write a PNG.
+
+    Parameters
+    ----------
+    path : str or Path
+        A file there is replaced.
+    frame : ndarray, shape (rows, cols)
+    table : Located
+        Of this frame.
+
+    Raises
+    ------
+    InputError
+        If it cannot be written.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    rows, cols = frame.shape
+    zoom = int(np.clip(WANTED_PX // max(rows, cols), 1, MOST_ZOOM))
+    width, height = max(cols * zoom / DPI, 4.0), rows * zoom / DPI
+    figure = Figure(figsize=(width, height + STRIP_IN), dpi=DPI, facecolor="white")
+    FigureCanvasAgg(figure)
+    axes = figure.add_axes((0.0, STRIP_IN / (height + STRIP_IN), cols * zoom / DPI / width, height / (height + STRIP_IN)))
+    low, high = np.percentile(frame, [0.5, 99.5])
+    axes.imshow(frame, cmap="gray", vmin=low, vmax=max(high, low + 1), interpolation="nearest")
+    axes.set_axis_off()
+    _marks(axes, table, zoom)
+    axes.set(xlim=(-0.5, cols - 0.5), ylim=(rows - 0.5, -0.5))
+    flagged = int((table.flags != 0).sum()) if len(table) else 0
+    text = f"{len(table)} of kind {table.kind}, {flagged} flagged (orange)    {ORIGIN}"
+    figure.text(0.01, 0.5 * STRIP_IN / (height + STRIP_IN), text, fontsize=8, va="center")
+    target = Path(path)
+    partial = target.with_name(f".{target.stem}.partial-{os.getpid()}-{secrets.token_hex(4)}.png")
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            figure.savefig(partial, metadata={"Software": "pixmetry"})
+            os.replace(partial, target)
+        finally:
+            partial.unlink(missing_ok=True)
+    except OSError as problem:
+        raise InputError("picture cannot be written", where=str(target), value=problem.strerror, remedy="choose another place") from None
+    return target
+
+
+def _marks(axes, table: Located, zoom: int) -> None:
+    from matplotlib.collections import EllipseCollection, LineCollection
+
+    good = np.isfinite(table.x_px) & np.isfinite(table.y_px)
+    if not good.any():
+        return
+    x, y = table.x_px[good], table.y_px[good]
+    colours = np.where(table.flags[good] != 0, FLAGGED, CLEAN)
+    arm = 3.0 / zoom
+    if "length_px" in table.columns and "angle_deg" in table.columns:
+        angle, half = np.deg2rad(table.angle_deg[good]), 0.5 * table.length_px[good]
+        along = np.stack([half * np.cos(angle), half * np.sin(angle)], axis=1)
+        middle = np.stack([x, y], axis=1)
+        axes.add_collection(LineCollection(np.stack([middle - along, middle + along], axis=1), colors=list(colours), linewidths=1.2))
+    else:
+        major, minor, angle = _axes_of(table, good)
+        shown = np.isfinite(major)
+        if shown.any():
+            axes.add_collection(
+                EllipseCollection(
+                    2 * major[shown],
+                    2 * minor[shown],
+                    angle[shown],
+                    units="xy",
+                    offsets=np.stack([x, y], axis=1)[shown],
+                    transOffset=axes.transData,
+                    facecolors="none",
+                    edgecolors=list(colours[shown]),
+                    linewidths=1.0,
+                )
+            )
+    level, upright = np.array([[-arm, 0.0], [arm, 0.0]]), np.array([[0.0, -arm], [0.0, arm]])
+    middle = np.stack([x, y], axis=1)[:, None, :]
+    axes.add_collection(LineCollection(np.concatenate([middle + level, middle + upright]), colors=CROSS, linewidths=0.8))
+    if len(x) <= 500 and "code" in table.columns:
+        for xi, yi, code in zip(x, y, table.code[good], strict=True):
+            if code >= 0:
+                axes.annotate(str(int(code)), (xi, yi), (6, -6), textcoords="offset points", color=CROSS, fontsize=8)
+
+
+def _axes_of(table: Located, good: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Semi axes and angle of what is drawn around each target; NaN where the table tells no size."""
+    columns = table.columns
+    nothing = np.full(int(good.sum()), np.nan)
+    if "semi_major_px" in columns:
+        return columns["semi_major_px"][good], columns["semi_minor_px"][good], columns.get("angle_deg", nothing * 0)[good]
+    for name in ("radius_px", "outer_radius_px", "sigma_px"):
+        if name in columns:
+            return columns[name][good], columns[name][good], np.zeros_like(nothing)
+    return nothing, nothing, nothing

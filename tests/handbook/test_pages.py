@@ -1,0 +1,80 @@
+"""The pages in docs/handbook are what the experiments give now, and they can be read."""
+
+from __future__ import annotations
+
+import re
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import pytest
+
+from pixmetry.handbook.page import Page, table
+from pixmetry.handbook.pages import all_pages
+
+FOLDER = Path(__file__).resolve().parents[2] / "docs" / "handbook"
+NUMBER = re.compile(r"[−-]?\d+(?:\.\d+)?")
+
+
+def differences(written: str, now: str) -> list[str]:
+    """Words that differ, and numbers that differ by more than three units of their last digit or 1 %."""
+    if NUMBER.split(written) != NUMBER.split(now):
+        return ["the words differ"]
+    wrong = []
+    for old, new in zip(NUMBER.findall(written), NUMBER.findall(now), strict=True):
+        a, b = (float(v.replace("−", "-")) for v in (old, new))
+        digits = max(len(v.partition(".")[2]) for v in (old, new))
+        if abs(a - b) > max(3.1 * 10.0**-digits, 0.01 * abs(b)) or (digits == 0 and a != b):
+            wrong.append(f"{old} is written, {new} is found")
+    return wrong
+
+
+@pytest.fixture(scope="module")
+def pages() -> dict[str, Page]:
+    return {page.name: page for page in all_pages()}
+
+
+@pytest.mark.parametrize("name", ["index", "threshold", "offset"])
+def test_the_page_is_what_the_script_writes(name: str, pages: dict[str, Page]) -> None:
+    wrong = differences((FOLDER / f"{name}.md").read_text(encoding="utf-8"), pages[name].text)
+    assert not wrong, f"run make handbook: {wrong[:5]}"
+    for picture in pages[name].pictures:
+        assert f'<img src="{picture.name}.svg"' in pages[name].text
+        stored = (FOLDER / f"{picture.name}.svg").read_text(encoding="utf-8")
+        label = re.search(r'aria-label="([^"]*)"', stored)
+        assert label is not None and not differences(label[1], re.search(r'aria-label="([^"]*)"', picture.svg)[1])
+
+
+def test_there_are_no_other_files(pages: dict[str, Page]) -> None:
+    wanted = {name for page in pages.values() for name in page.files()}
+    assert {path.name for path in FOLDER.iterdir()} == wanted
+
+
+def test_figures_stand_alone_and_hold_no_date(pages: dict[str, Page]) -> None:
+    for page in pages.values():
+        for name, content in page.files().items():
+            if not name.endswith(".svg"):
+                continue
+            root = ET.fromstring(content)
+            assert root.tag == "{http://www.w3.org/2000/svg}svg" and int(root.get("width", 0)) > 300
+            used = set(re.findall(r"var\(--(\w+)\)", content))
+            assert used <= set(re.findall(r"--(\w+):", content))
+            assert "dc:date" not in content and len(content) < 120_000
+
+
+def test_links_lead_somewhere(pages: dict[str, Page]) -> None:
+    for page in pages.values():
+        for target in re.findall(r"\]\(([^)#]+)\)", page.text):
+            assert (FOLDER / target).exists(), target
+
+
+def test_a_table_is_as_wide_as_its_head() -> None:
+    text = table(["a", "b"], [[1, 2], ["x", "y"]])
+    assert text == "| a | b |\n| --- | ---: |\n| 1 | 2 |\n| x | y |\n"
+
+
+def test_planted_changes_are_seen() -> None:
+    assert not differences("it is 0.0302 px at −6", "it is 0.0303 px at −6")
+    assert differences("it is 0.0302 px", "it is 0.0312 px")
+    assert differences("it is 0.030 px", "it was 0.030 px")
+    assert differences("800 targets", "801 targets")
+    assert differences("−0.03 px", "0.03 px")

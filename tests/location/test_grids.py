@@ -1,0 +1,191 @@
+"""Rows and columns of dots on plates seen in perspective and through distorting lenses, with dots missing and others between."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from pixmetry.core.errors import InputError
+from pixmetry.location.grids import eight_bit, find_circle_grid, order_grid
+
+
+def plate(rng, rows: int, cols: int, *, asymmetric=False, tilt_deg=40.0, turn=None, distortion=0.1, missing=0.0, clutter=0):
+    """Places of dots and their rows and columns in random order; row −1 for clutter."""
+    j, i = (a.ravel() for a in np.meshgrid(np.arange(cols), np.arange(rows)))
+    plane = np.stack([2.0 * j + i % 2 if asymmetric else 1.0 * j, 1.0 * i])
+    plane = (plane - plane.mean(axis=1, keepdims=True)) / np.ptp(plane, axis=1).max()
+
+    def turned(angle: float) -> np.ndarray:
+        c, s = np.cos(angle), np.sin(angle)
+        return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+
+    towards, tilt = rng.uniform(0, 2 * np.pi), np.radians(tilt_deg)
+    lean = np.array([[1, 0, 0], [0, np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), np.cos(tilt)]])
+    about = rng.uniform(-np.pi, np.pi) if turn is None else turn
+    x, y, z = turned(-towards) @ lean @ turned(towards) @ turned(about) @ np.stack([*plane, np.zeros(rows * cols)])
+    x, y = x / (z + 1.4), y / (z + 1.4)
+    factor = 1 + distortion * (x * x + y * y)
+    keep = rng.random(rows * cols) >= missing
+    x, y, i, j = 1500 * (x * factor)[keep] + 1000, 1500 * (y * factor)[keep] + 1000, i[keep], j[keep]
+    x, y = (np.concatenate([v, rng.uniform(v.min(), v.max(), clutter)]) for v in (x, y))
+    i, j = (np.concatenate([v, np.full(clutter, -1)]) for v in (i, j))
+    order = rng.permutation(len(x))
+    return x[order], y[order], i[order], j[order]
+
+
+def agreeing(grid, i: np.ndarray, j: np.ndarray, asymmetric=False) -> int:
+    """How many dots have the right row and column, up to a turn of the plate by quarters and a shift."""
+    both = grid.placed & (i >= 0)
+    true = np.stack([i, 2 * j + i % 2 if asymmetric else j], axis=1)[both]
+    found = np.stack([grid.row, 2 * grid.col + grid.row % 2 if asymmetric else grid.col], axis=1)[both]
+    turns = ([[1, 0], [0, 1]], [[0, 1], [-1, 0]], [[-1, 0], [0, -1]], [[0, -1], [1, 0]])
+    return max(np.unique(true - found @ np.array(t).T, axis=0, return_counts=True)[1].max(initial=0) for t in turns)
+
+
+@pytest.mark.parametrize("asymmetric", [False, True])
+def test_orders_plates_in_any_pose(asymmetric: bool) -> None:
+    """30 plates of 5 × 5 to 30 × 30 dots, tilted up to 55°, distorted by −30 … +20 % at the corner, 3 % missing, 8 dots of clutter."""
+    rng = np.random.default_rng()
+    right = total = 0
+    for _ in range(30):
+        rows, cols = rng.integers(5, 31, 2)
+        x, y, i, j = plate(
+            rng, rows, cols, asymmetric=asymmetric, tilt_deg=rng.uniform(0, 55), distortion=rng.uniform(-0.3, 0.2), missing=0.03, clutter=8
+        )
+        grid = order_grid(x, y, asymmetric=asymmetric)
+        cells = np.stack([grid.row, grid.col], axis=1)[grid.placed]
+        assert len(np.unique(cells, axis=0)) == len(cells) and len(grid) == len(x)
+        right, total = right + agreeing(grid, i, j, asymmetric), total + (i >= 0).sum()
+    assert right > 0.95 * total  # one plate in some hundred is so oblique that it is numbered along a diagonal
+
+
+def test_every_dot_of_a_whole_plate_has_its_own_cell() -> None:
+    rng = np.random.default_rng()
+    x, y, i, j = plate(rng, 40, 60, tilt_deg=30, turn=0.2)
+    grid = order_grid(x, y)
+    assert (grid.rows, grid.cols) == (40, 60) and grid.placed.all()
+    assert (grid.row == i).all() and (grid.col == j).all()  # rows down, columns to the right
+    turned = order_grid(-y, x)
+    assert (turned.rows, turned.cols) == (60, 40) and (turned.row == j).all() and (turned.col == 39 - i).all()
+
+
+def test_clutter_between_the_dots_is_left_out() -> None:
+    rng = np.random.default_rng()
+    x, y, i, j = plate(rng, 20, 25, tilt_deg=20, turn=0.0)
+    between = 0.5 * (x[(i == 7) & (j == 9)] + x[(i == 8) & (j == 10)]), 0.5 * (y[(i == 7) & (j == 9)] + y[(i == 8) & (j == 10)])
+    grid = order_grid(np.append(x, between[0]), np.append(y, between[1]))
+    assert grid.placed[:-1].all() and not grid.placed[-1] and grid.row[-1] == grid.col[-1] == -1
+
+
+def test_a_dot_that_is_out_of_place_is_an_outlier() -> None:
+    rng = np.random.default_rng()
+    x, y, i, j = plate(rng, 15, 15, tilt_deg=10, turn=0.0, distortion=0.0)
+    wrong = np.flatnonzero((i == 7) & (j == 7))[0]
+    step = np.hypot(x[(i == 7) & (j == 8)] - x[wrong], y[(i == 7) & (j == 8)] - y[wrong])[0]
+    x[wrong] += 0.25 * step
+    grid = order_grid(x, y)
+    assert not grid.placed[wrong] and grid.placed.sum() == 224
+
+
+def test_gaps_are_counted() -> None:
+    """A missing row and column do not shift the numbers beyond them."""
+    rng = np.random.default_rng()
+    x, y, i, j = plate(rng, 16, 20, tilt_deg=35, turn=0.1)
+    keep = (i != 6) & (j != 12)
+    grid = order_grid(x[keep], y[keep])
+    assert grid.placed.all() and (grid.row == i[keep]).all() and (grid.col == j[keep]).all() and (grid.rows, grid.cols) == (16, 20)
+
+
+def test_the_pattern_settles_what_the_dots_leave_open() -> None:
+    rng = np.random.default_rng()
+    x, y, i, j = plate(rng, 6, 9, tilt_deg=0, turn=np.pi / 2 - 0.1)
+    free, named = order_grid(x, y), order_grid(x, y, pattern=(9, 6))
+    assert (free.rows, free.cols) == (9, 6) and (named.rows, named.cols) == (6, 9) and not named.message
+    assert "9 × 6" not in free.message and "not 5 × 5" in order_grid(x, y, pattern=(5, 5)).message
+    x, y, i, j = plate(rng, 11, 4, asymmetric=True, tilt_deg=20, turn=rng.uniform(-3, 3))
+    grid = order_grid(x, y, asymmetric=True)  # an odd number of rows tells the top from the bottom
+    assert (grid.row == i).all() and (grid.col == j).all() and (grid.rows, grid.cols) == (11, 4)
+
+
+def test_twenty_thousand_dots() -> None:
+    rng = np.random.default_rng()
+    x, y, i, j = plate(rng, 125, 160, tilt_deg=30, turn=0.05, missing=0.02, clutter=20)
+    assert agreeing(order_grid(x, y), i, j) > 0.999 * (i >= 0).sum()
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 3])
+def test_too_few_dots_are_said_to_be_too_few(count: int) -> None:
+    grid = order_grid(np.arange(count) * 7.0, np.arange(count) ** 2 * 1.0)
+    assert grid.message and not grid.placed.any() and len(grid) == count
+
+
+def test_odd_inputs_have_an_outcome() -> None:
+    rng = np.random.default_rng()
+    for x, y in (
+        (np.zeros(9), np.zeros(9)),  # all in one place
+        (np.arange(9.0), np.zeros(9)),  # a line
+        (rng.uniform(0, 100, 5), rng.uniform(0, 100, 5)),
+        (np.full(6, np.nan), np.full(6, np.nan)),
+    ):
+        grid = order_grid(x, y)
+        assert len(grid) == len(x) and grid.row.shape == grid.col.shape == x.shape
+    square = order_grid(np.array([0, 10, 0, 10.0]), np.array([0, 0, 10, 10.0]))
+    assert square.row.tolist() == [0, 0, 1, 1] and square.col.tolist() == [0, 1, 0, 1]
+    x, y, i, j = plate(rng, 5, 6, tilt_deg=10, turn=0.0)
+    grid = order_grid(np.append(x, np.nan), np.append(y, 3.0))
+    assert (grid.row[:-1] == i).all() and grid.row[-1] == -1
+    with pytest.raises(InputError, match="one length"):
+        order_grid(np.zeros(3), np.zeros(4))
+
+
+def drawn_circles(rng, rows: int, cols: int, asymmetric: bool, bright: bool) -> tuple[np.ndarray, np.ndarray]:
+    fine = 4
+    true = np.array([(30 + (2 * j + i % 2 if asymmetric else 2 * j) * 12.0, 30 + i * (12.0 if asymmetric else 24.0)) for i in range(rows) for j in range(cols)])
+    true += [1.5, 0.5] + true[:, ::-1] * [0.05, -0.04] + [0, 20]
+    height, width = (np.ceil(true.max(axis=0)).astype(int) + 30)[::-1]
+    down, across = ((np.arange(n * fine) + 0.5) / fine - 0.5 for n in (height, width))
+    disc = np.zeros((height * fine, width * fine))
+    for x, y in true:
+        disc = np.maximum(disc, (across - x) ** 2 + (down[:, None] - y) ** 2 < 36)
+    clean = gaussian_filter(disc, 0.8 * fine).reshape(height, fine, width, fine).mean(axis=(1, 3))
+    return (40 + 150 * (clean if bright else 1 - clean) + rng.normal(0, 1.5, clean.shape)), true
+
+
+@pytest.mark.parametrize("asymmetric", [False, True])
+@pytest.mark.parametrize("bright", [False, True])
+def test_a_named_pattern_is_found_in_the_frame_and_ordered_alike_among_targets(asymmetric: bool, bright: bool) -> None:
+    rng = np.random.default_rng()
+    rows, cols = (11, 4) if asymmetric else (5, 7)
+    picture, true = drawn_circles(rng, rows, cols, asymmetric, bright)
+    for frame in (np.rint(picture).astype(np.uint8), np.rint(picture * 100).astype(np.uint16), (picture / 300).astype(np.float32)):
+        grid = find_circle_grid(frame, (cols, rows), symmetric=not asymmetric)
+        assert not grid.message and (grid.rows, grid.cols) == (rows, cols)
+        nearest = np.hypot(grid.x_px[:, None] - true[:, 0], grid.y_px[:, None] - true[:, 1])
+        assert nearest.min(axis=1).max() < 3 and sorted(nearest.argmin(axis=1)) == list(range(rows * cols))
+    among = order_grid(*true[::-1].T, pattern=(cols, rows), asymmetric=asymmetric)
+    assert not among.message and (among.row * cols + among.col == np.arange(rows * cols)[::-1]).all()
+
+
+def test_a_pattern_that_is_not_there() -> None:
+    flat = np.full((60, 60), 9, np.uint16)
+    for grid in (
+        find_circle_grid(flat, (4, 5)),
+        find_circle_grid(flat, (4, 5), symmetric=False),
+        find_circle_grid(np.random.default_rng().integers(0, 255, (80, 80)).astype(np.uint8), (4, 5)),
+        find_circle_grid(np.zeros((1, 1), np.float32), (4, 5)),
+    ):
+        assert grid.message and not len(grid)
+    with pytest.raises(InputError, match="2 × 2"):
+        find_circle_grid(flat, (1, 5))
+
+
+def test_eight_bits_keep_what_matters() -> None:
+    rng = np.random.default_rng()
+    frame = rng.integers(0, 256, (50, 60)).astype(np.uint8)
+    assert eight_bit(frame) is frame
+    wide = (frame.astype(np.uint16) + 20) * 200
+    assert np.abs(eight_bit(wide).astype(int) - frame).max() <= 2
+    assert np.abs(eight_bit(frame.astype(np.float32) * 1e-6 - 1e-4).astype(int) - frame).max() <= 2
+    assert eight_bit(np.full((5, 5), 7.5, np.float32)).dtype == np.uint8
+    assert np.ptp(eight_bit(np.where(np.arange(5000).reshape(50, 100) == 77, 4000, 12).astype(np.uint16))) > 200
