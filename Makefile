@@ -11,7 +11,7 @@ ORACLES := .venv-oracles
 PYTEST := $(PY) -m pytest -n $(JOBS) --dist loadfile --hypothesis-seed=0
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test oracles study bench lint browser-test
+.PHONY: help install demo test oracles study bench handbook lint browser-test
 
 help: ## show this list
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1|\2/p' $(MAKEFILE_LIST) | while IFS='|' read -r target text; do printf '%-20s %s\n' "$$target" "$$text"; done
@@ -32,6 +32,9 @@ study: $(INSTALLED)-test ## run the studies in benchmarks/
 
 bench: $(INSTALLED)-test ## run the benchmarks
 	@$(call each,$(wildcard benchmarks/bench_*.py))
+
+handbook: $(INSTALLED) ## run the handbook's experiments and write docs/handbook
+	@$(PY) scripts/make_handbook.py
 
 lint: $(INSTALLED)-dev ## check style and types
 	@$(PY) -m ruff check src tests benchmarks

@@ -27,7 +27,7 @@ from pixmetry.core.threads import set_threads
 from pixmetry.locating import locate
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
-from location import rendered  # noqa: E402
+from location import line_frames, rendered  # noqa: E402
 
 NOISE_DN, EDGE_S, AMPLITUDE_DN = 1.5, 0.757, 170.0
 BACKGROUND_DN = {False: 10.0, True: 180.0}  # bright discs, dark discs
@@ -176,15 +176,15 @@ def alone(frame: Frame, count: int) -> np.ndarray:
 
 def stages(frame: Frame, repeats: int) -> None:
     """Detection alone, the fit alone."""
-    from pixmetry.location.template import fit_template, noise_from_image
-
     from pixmetry.location.detection import detect, select
+    from pixmetry.location.image_noise import noise_from_image
+    from pixmetry.location.template import fit_template
 
     found = detect(frame.image)
     targets = found.targets[select(found.targets, "disc")]
-    noise = noise_from_image(frame.image, targets)
+    noise = noise_from_image(frame.image, targets, "disc")
     print(f"detection alone       {1e3 * best_s(lambda: detect(frame.image), repeats):8.1f} ms")
-    print(f"noise from the image  {1e3 * best_s(lambda: noise_from_image(frame.image, targets), repeats):8.1f} ms")
+    print(f"noise from the image  {1e3 * best_s(lambda: noise_from_image(frame.image, targets, 'disc'), repeats):8.1f} ms")
     fit_s = best_s(lambda: fit_template(frame.image, targets, noise, "disc", threads=THREADS), repeats)
     print(f"template fits alone   {1e3 * fit_s:8.1f} ms, {len(targets) / fit_s:.0f} targets/s")
 
@@ -198,6 +198,27 @@ def many(rng: np.random.Generator) -> None:
         score = Score(seconds=[seconds])
         score.add(frame, *program(frame.image, False))
         print(score.line(f"20 000 targets: {name}"))
+
+
+def lines(rng: np.random.Generator, repeats: int) -> tuple[float, float, float]:
+    """Lines a second of the template alone, and the rms error of its offsets and of the row-wise squared centroid's over the bound."""
+    from pixmetry.location.line_detection import find_lines
+    from pixmetry.location.lines import line_positions
+    from pixmetry.location.noise import NoiseModel
+
+    bars = line_frames.Bars(width=1.0, blur=1.0)
+    frame = line_frames.make_lines(rng, 400, (2600, 2600), bars)
+    found, noise = find_lines(frame.image), NoiseModel(NOISE_DN**2 + 1 / 12)
+    fit_s = best_s(lambda: line_positions(frame.image, found, noise, estimator="template", threads=THREADS), repeats)
+    whole_s = best_s(lambda: locate(frame.image, kind="line", estimator="template", threads=THREADS), 2)
+    print(f"{len(found)} lines of {bars.length:g} px: template alone {len(found) / fit_s:.0f} lines/s; whole frame {1e3 * whole_s:.0f} ms")
+    least = np.mean([bars.least_offset_var(angle) for angle in frame.angle_deg[:40]])
+    over = []
+    for name in ("template", "row_squared_centroid"):
+        error, _, false = line_frames.offsets(frame, locate(frame.image, kind="line", estimator=name, threads=THREADS))
+        over.append(float(np.sqrt(np.mean(error**2) / least)))
+        print(f"lines, {name}: {len(error)} of {len(frame.x)} found, {false} false, {over[-1]:.2f} × the bound of {np.sqrt(least):.5f} px")
+    return len(found) / fit_s, over[0], over[1]
 
 
 def main() -> None:
@@ -233,6 +254,7 @@ def main() -> None:
     print()
     stages(frames[0], args.repeats)
     many(rng)
+    lines_per_s, line_template, line_rows = lines(rng, args.repeats)
     print()
     verdict("discs missed", sum(s.wanted - s.found for s in (ours["template"], ours["soft_threshold"])), 0)
     verdict("false discs", sum(s.false for s in (ours["template"], ours["soft_threshold"])), 0)
@@ -241,6 +263,9 @@ def main() -> None:
     verdict("template, whole frame", 1e3 * min(ours["template"].seconds), 60, " ms")
     for name in CENTROIDS:
         verdict(f"{name}, whole frame", 1e3 * min(ours[name].seconds), 15, " ms")
+    verdict("line template", lines_per_s, 5000, " lines/s", at_least=True)
+    verdict("line template over the bound", line_template, 1.05)
+    verdict("row-wise squared centroid of lines over the bound", line_rows, 1.2)
 
 
 if __name__ == "__main__":

@@ -1,14 +1,14 @@
-"""The noise model of a camera for locating: read off its own forward model, so that it holds for every chain of sources."""
+"""What a camera adds to a grey value: read off its own forward model, so that it holds for every chain of sources."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
 from pixmetry.core.camera import Camera
 from pixmetry.core.errors import InputError
-from pixmetry.location.noise import NoiseModel
+from pixmetry.location.noise import ROUNDING_DN2, NoiseModel
 from pixmetry.scene.uniform import Uniform
 
 SIDE = 64  # pixels of the window that is looked at
@@ -17,20 +17,37 @@ LEVELS = 8
 MOST_PHOTONS = 1e9
 
 
-def noise_of_camera(camera: Camera) -> NoiseModel:
-    """Measure a simulated camera's temporal variance against its mean grey value, its black level and where its scale ends.
+@dataclass(frozen=True)
+class CameraNoise:
+    """What a camera adds to a grey value.
 
-    Uniform fields of rising brightness are exposed; a straight line through mean and temporal variance (EMVA 1288, photon transfer) is
-    fitted up to 80 % of the range, weighted by the sampling errors of the variances.
+    Parameters
+    ----------
+    model : NoiseModel
+        Temporal noise of a pixel and the spread of the sensitivities; of origin "camera".
+    pattern_dn : float
+        Standard deviation of the fixed offsets from pixel to pixel (DSNU); not in the model.
+    aperture_px : float
+        Side of the square that has the area of the pixel's sensitive part.
+    pitch_um : (float, float) or None
+    """
+
+    model: NoiseModel
+    pattern_dn: float
+    aperture_px: float
+    pitch_um: tuple[float, float] | None
+
+
+def camera_noise(camera: Camera) -> CameraNoise:
+    """Measure a simulated camera's variance against its mean grey value, its patterns, its black level and where its scale ends.
+
+    Uniform fields of rising brightness are exposed at the middle of the frame; a straight line through mean and temporal variance
+    (EMVA 1288, photon transfer) is fitted up to 80 % of the range, weighted by the sampling errors of the variances. Noise that is common
+    to a row counts as if it were independent in every pixel. Good to about a hundredth.
 
     Parameters
     ----------
     camera : Camera
-
-    Returns
-    -------
-    NoiseModel
-        With ``origin="camera"``; rounding is in the constant, fixed patterns are not in it.
 
     Raises
     ------
@@ -49,23 +66,38 @@ def noise_of_camera(camera: Camera) -> NoiseModel:
     black, high = float(dark.mean()), float(np.median(top))
     if high - black < 1.0:
         raise InputError(f"camera {camera.name} does not answer to light", remedy="name another camera, or give the noise in DN")
-    scale = _photons_for(exposed, black, high)
-    stacks = [dark, *(exposed(scale * k / LEVELS) for k in range(1, LEVELS + 1))]
-    level = np.array([s.mean() for s in stacks]) - black
-    variance = np.array([s.var(axis=0, ddof=1).mean() for s in stacks])
-    slope, constant = np.polyfit(level, variance, 1, w=1 / np.maximum(variance, 1e-12))
-    slope = max(float(slope), 0.0)
-    low = float(dark.min()) if np.median(dark) == dark.min() else 0.0
-    return NoiseModel(max(float(constant), 1 / 12), slope, black_dn=black, low_dn=low, high_dn=high, origin="camera")
-
-
-def _photons_for(exposed: Callable[..., np.ndarray], black: float, high: float) -> float:
-    """Find the light that takes the mean grey value to 80 % of its range, to about a tenth."""
     low, up, wanted = 0.01, MOST_PHOTONS, black + 0.8 * (high - black)
     while up / low > 1.1:
         middle = float(np.sqrt(low * up))
-        if exposed(middle, 1).mean() < wanted:
-            low = middle
-        else:
-            up = middle
-    return low
+        low, up = (middle, up) if exposed(middle, 1).mean() < wanted else (low, middle)
+    stacks = [dark, *(exposed(low * k / LEVELS) for k in range(1, LEVELS + 1))]
+    level = np.array([s.mean() for s in stacks]) - black
+    variance = np.array([s.var(axis=0, ddof=1).mean() for s in stacks])
+    slope, constant = np.polyfit(level, variance, 1, w=1 / np.maximum(variance, ROUNDING_DN2))
+    offsets = _pattern_dn2(dark)
+    sensitivities = max(_pattern_dn2(stacks[-1]) - offsets, 0.0) / level[-1] ** 2
+    model = NoiseModel(
+        max(float(constant), ROUNDING_DN2),
+        max(float(slope), 0.0),
+        float(np.sqrt(sensitivities)),
+        black_dn=black,
+        low_dn=float(dark.min()) if np.median(dark) == dark.min() else 0.0,
+        high_dn=high,
+        origin="camera",
+    )
+    return CameraNoise(model, float(np.sqrt(offsets)), _aperture_px(camera), camera.pitch_um)
+
+
+def _pattern_dn2(stack: np.ndarray) -> float:
+    """Variance of the mean image about its plane, less what the temporal noise leaves in it."""
+    mean = stack.mean(axis=0)
+    mean = mean - mean.mean(axis=1, keepdims=True) - mean.mean(axis=0, keepdims=True) + mean.mean()
+    return max(float(mean.var() - stack.var(axis=0, ddof=1).mean() / len(stack)), 0.0)
+
+
+def _aperture_px(camera: Camera) -> float:
+    """Of the source that has it; 1 where the camera has none."""
+    for element in camera.active:
+        if element.source.id == "sensor.pixel_aperture":
+            return float(np.sqrt(element.params.width_x_px * element.params.width_y_px))
+    return 1.0

@@ -14,9 +14,8 @@ from pixmetry.core.camera import Camera, load_camera
 from pixmetry.core.errors import InputError
 from pixmetry.core.threads import imap_tiles
 from pixmetry.located import LAST, Located, checked_table_name, joined
-from pixmetry.location.estimators import split_text
-from pixmetry.location.noise import NoiseModel
-from pixmetry.location.targets import Positions, Targets
+from pixmetry.location.noise import ROUNDING_DN2, NoiseModel, parse_noise
+from pixmetry.location.targets import Flag, Positions, Targets
 
 FITS = {
     "template": "least squares with the target's own shape, integrated over the pixel; at the Cramér–Rao bound",
@@ -46,16 +45,7 @@ AUTO = {"auto": "chooses one of these by size, sampling, noise and gradient, and
 SPOTS = ("disc", "ellipse", "ring", "spot")
 FEW_ELECTRONS = 50.0  # at a target's peak: below, the errors of a grey value are visibly no normal ones
 TILTED = 0.93  # ratio of the axes below which discs are fitted as ellipses
-NOISE_KEYS = {
-    "constant": "constant_dn2",
-    "slope": "slope_dn",
-    "pattern": "pattern_rel",
-    "black": "black_dn",
-    "low": "low_dn",
-    "high": "high_dn",
-}
-ROUNDING_DN2 = 1 / 12
-PILED = 20  # pixels of one value at the top of an image before it is asked whether they were cut off there
+PILED = 10  # pixels in 4 of one value at the top of an image before it is asked whether they were cut off there
 LARGE_PX = 2.0  # radius from which that ratio can be told from a look at the region
 
 
@@ -104,8 +94,8 @@ def locate(
     grid : "COLSxROWS", (cols, rows) or "any", optional
         Inner corners of a chessboard; or number the dots of a plate (columns ``grid_col``, ``grid_row``).
     noise : NoiseModel, Camera, path, or str, optional
-        What weights the fits and fills the covariances: a model, a camera (preset, ``camera.yaml``), or ``"constant=…,slope=…,black=…"``
-        in DN. By default it is measured in the image.
+        What weights the fits and fills the covariances: a model, a camera (preset, ``camera.yaml``), or ``"read=…,gain=…,black=…"``
+        (see `parse_noise`). By default it is measured in the image.
     bits : int, optional
         Bits of a stored value; its greatest value is where the scale saturates. By default told from the image.
     aperture_px : float
@@ -252,17 +242,24 @@ def scale_ends(frame: np.ndarray, bits: int | None, noise: NoiseModel | None) ->
     if noise is not None and np.isfinite(noise.high_dn):
         return max(0.0, noise.low_dn), noise.high_dn
     top = int(frame.max())
-    low = 0.0
-    if any(top == (1 << n) - 1 for n in (8, 10, 12, 14, 16)):
-        return low, float(top)
-    piled = int(np.count_nonzero(frame == top))
-    if piled >= PILED and piled > 3 * int(np.count_nonzero((frame >= max(top - 3, 0)) & (frame < top))) and frame.min() < top:
-        return low, float(top)
-    return low, float("inf")
+    if any(top == (1 << n) - 1 for n in (8, 10, 12, 14, 16)) or _cut_off_at(frame, top):
+        return 0.0, float(top)
+    return 0.0, float("inf")
+
+
+def _cut_off_at(frame: np.ndarray, top: int) -> bool:
+    """Whether far more pixels have the greatest value than the few values below it, in an image that has noise."""
+    part = frame[::2, ::2]
+    piled = int(np.count_nonzero(part == top))
+    if piled < PILED or piled <= 3 * int(np.count_nonzero(part >= max(top - 3, 0))) - 3 * piled:
+        return False
+    usual = int(np.median(part[::4, ::4]))
+    without_noise = usual > 0 and np.count_nonzero(part[::4, ::4] == usual) > 0.5 * part[::4, ::4].size
+    return top > int(part.min()) and not without_noise
 
 
 def noise_model(noise: NoiseModel | Camera | str | Path | None) -> NoiseModel | None:
-    """Return the noise model that is meant: a model, a camera, the name of one, or ``"constant=…,slope=…,black=…"``; None stays None.
+    """Return the noise model that is meant: a model, a camera, the name of one, or ``"read=…,gain=…,black=…"``; None stays None.
 
     Raises
     ------
@@ -274,14 +271,11 @@ def noise_model(noise: NoiseModel | Camera | str | Path | None) -> NoiseModel | 
     if not isinstance(noise, Camera):
         text = str(noise)
         if "=" in text:
-            _, values = split_text(":" + text, NOISE_KEYS, "noise")
-            if "constant_dn2" not in values:
-                raise InputError("the variance without light is missing", where="noise", value=text, allowed="constant=…[,slope=…,black=…]")
-            return NoiseModel(**values)
+            return parse_noise(text)[0]
         noise = load_camera(text)
-    from pixmetry.camera_noise import noise_of_camera
+    from pixmetry.camera_noise import camera_noise
 
-    return noise_of_camera(noise)
+    return camera_noise(noise).model
 
 
 @dataclass(frozen=True)
@@ -360,7 +354,7 @@ def chosen_estimator(kind: str, targets: Targets, noise: NoiseModel) -> tuple[st
     if not len(targets):
         return "template", kind, "no target was found"
     height = float(np.median(np.abs(targets.amplitude_dn)))
-    large = targets.semi_major_px > LARGE_PX
+    large = (targets.semi_major_px > LARGE_PX) & ((targets.flags & Flag.BORDER) == 0)
     flat = float(np.median((targets.semi_minor_px / targets.semi_major_px)[large])) if large.any() else 1.0
     shape, why = kind, "at the Cramér–Rao bound for every size and noise"
     if kind == "disc" and flat < TILTED:
@@ -379,12 +373,13 @@ def _lines(task: Task) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         found = find_edges(task.frame, noise=task.noise, threads=task.threads)
     else:
         found = find_lines(task.frame, polarity=task.polarity, noise=task.noise, threads=task.threads)
-    noise = _noise_for(task, "line", found.sigma_dn)
+    noise = _noise_for(task, task.kind, found.sigma_dn)
     estimator, reason = ("template", FITS["template"]) if task.estimator == "auto" else (task.estimator, "as was asked for")
     if task.kind == "cross":
-        from pixmetry.location.crosses import cross_positions
+        from pixmetry.location.crosses import cross_positions, crossings
 
-        positions = cross_positions(task.frame, found, noise, aperture_px=task.aperture_px, threads=task.threads)
+        crosses = crossings(found, task.frame.shape)
+        positions = cross_positions(task.frame, crosses, noise, aperture_px=task.aperture_px, threads=task.threads)
     else:
         from pixmetry.location.lines import line_positions
 
@@ -435,7 +430,7 @@ _WORK = {"line": _lines, "edge": _lines, "cross": _lines, "chessboard": _chessbo
 
 
 def _noise_for(task: Task, kind: str, targets: Targets | np.ndarray) -> NoiseModel:
-    """The noise model that was given, with the scale's ends; else what the image tells: at the targets, or beside them (standard deviations)."""
+    """The noise model that was given, with the scale's ends; else what the image tells, at targets or by standard deviations beside them."""
     if task.noise is not None:
         return replace(task.noise, low_dn=max(task.low_dn, task.noise.low_dn), high_dn=min(task.high_dn, task.noise.high_dn))
     if isinstance(targets, Targets) and len(targets):

@@ -52,9 +52,12 @@ def test_follows_the_surface_whatever_stands_on_it(name: str, contrast: float, d
 
 @pytest.mark.parametrize("noise", [0.5, 1.5, 8.0])
 def test_noise_holds_the_rounding(noise: float) -> None:
-    """Per tile some 190 pixels, 256 tiles: the median of their standard deviations is good to 0.4 %; 5 % are 12 of these."""
+    """Per tile some 190 pixels, 256 tiles: the median of their standard deviations is good to 0.4 %.
+
+    Clipping at three of them is 5 % off for rounded values of 0.5 DN, and the edges of targets add 2 %: 8 % is what is allowed.
+    """
     found = background(stored(100.3 + 0 * X + squares(80), noise))
-    assert np.median(found.sigma_dn) == pytest.approx(math.sqrt(noise**2 + 1 / 12), rel=0.05)
+    assert np.median(found.sigma_dn) == pytest.approx(math.sqrt(noise**2 + 1 / 12), rel=0.08)
 
 
 def test_noise_is_the_whole_of_correlated_noise() -> None:
@@ -113,7 +116,7 @@ def test_does_not_climb_a_target_that_fills_tiles(contrast: float) -> None:
     """Radius 100: a dozen tiles lie inside. Light falls off beneath it."""
     light = 90 + 0.05 * X
     found = background(stored(light + contrast * (np.hypot(X - 260, Y - 240) < 100), 1.5))
-    assert np.abs(found.image() - light).max() < 2.5
+    assert np.abs(found.image() - light).max() < 1.5
 
 
 def test_slopes_are_those_of_the_values() -> None:

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, norm, poisson
 
+from pixmetry.camera_noise import camera_noise
 from pixmetry.core.camera import load_camera
 from pixmetry.core.errors import InputError
 from pixmetry.location import closed_bounds as closed
 from pixmetry.location.bound import bound, frames_worth, possible
-from pixmetry.location.camera_noise import camera_noise
 from pixmetry.location.fisher import pixel_noise
 from pixmetry.location.information import information_per_dn2, kept_rounding_dn2
 from pixmetry.location.noise import NoiseModel
@@ -381,31 +381,19 @@ def test_template_fits_reach_what_is_predicted() -> None:
 
 
 def test_a_preset_tells_its_noise() -> None:
+    """Its parameters, to what 12 frames a level tell: variance 2 %, gain 2 %, patterns 10 %."""
     read = camera_noise(load_camera("imx264_like"))
-    assert read.model.slope_dn == 0.38 and read.model.high_dn == 4095 and read.pitch_um == (3.45, 3.45)
-    dark = 2.3**2 + 0.2**2 + 2.0 * 0.01  # amplifier, row noise, dark electrons
-    assert read.model.constant_dn2 == pytest.approx(0.38**2 * dark + 1 / 12, rel=1e-6)
-    assert read.model.black_dn == pytest.approx(32 + 0.38 * 0.02, rel=1e-6)
-    assert read.pattern_dn == pytest.approx(0.38 * 1.2) and read.left_out == ()
+    model, dark = read.model, 2.3**2 + 0.2**2 + 2.0 * 0.01  # amplifier, row noise, dark electrons
+    assert read.pitch_um == (3.45, 3.45) and read.aperture_px == 1.0 and model.origin == "camera"
+    assert model.constant_dn2 == pytest.approx(0.38**2 * dark + 1 / 12, rel=0.03)
+    assert model.slope_dn == pytest.approx(0.38, rel=0.03) and model.black_dn == pytest.approx(32, abs=0.1)
+    assert model.high_dn == pytest.approx(32 + 0.38 * 10400, rel=0.01)  # the full well, which ends the scale before the converter does
+    assert read.pattern_dn == pytest.approx(0.38 * 1.2, rel=0.15) and model.pattern_rel == pytest.approx(0.005, rel=0.2)
 
 
-def test_the_noise_of_a_camera_is_that_of_its_frames() -> None:
-    """Dark pairs of a preset without fixed patterns, 2 × 20 000 pixels: catches 7 % of the variance at 1e-6."""
-    from pixmetry.scene.uniform import Uniform
-
-    camera = load_camera("imx264_like")
-    for level in (0.0, 3000.0):
-        a, b = (camera.expose(Uniform(level), [n], seed=5, window=(10, 10, 100, 200)).data[0].astype(float) for n in (0, 1))
-        model = camera_noise(camera).model
-        row = 2 * (0.2 * 0.38) ** 2  # common to a row: it does not average over the pixels of a row, but is small here
-        told = model.variance_dn2(a.mean()) - (model.pattern_rel * (a.mean() - model.black_dn)) ** 2
-        assert ((a - b).var() / 2 - row) == pytest.approx(told, rel=4.9 * np.sqrt(2 / 20000) + 0.02)
-
-
-def test_cameras_that_tell_too_little() -> None:
-    with pytest.raises(InputError, match="no gain"):
-        camera_noise(load_camera("cmos_log_fuga15"))
-    assert "processing.demosaic" in camera_noise(load_camera("dcs420_like")).left_out
+def test_a_camera_with_a_logarithmic_response_has_a_noise_too() -> None:
+    """It has no gain in DN per electron, and its variance does not rise with the light."""
+    assert camera_noise(load_camera("cmos_log_fuga15")).model.slope_dn < 0.01
 
 
 @pytest.mark.parametrize(

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from location import coverage, line_frames, rendered
-from location.coverage import Case
+from location import coverage_cells, line_frames, rendered
+from location.coverage_cells import Case
 from pixmetry.locating import locate
 from pixmetry.location.targets import Flag
 
@@ -39,29 +39,29 @@ def rng() -> np.random.Generator:
 
 @pytest.mark.parametrize("case", CELLS, ids=str)
 def test_errors_over_uncertainties_are_standard_normal(case: Case, rng: np.random.Generator):
-    outcomes = coverage.collect_all(coverage.make_frame(case, rng, 225), rng, EXACT, draws=2)
+    outcomes = coverage_cells.collect_all(coverage_cells.make_frame(case, rng, 225), rng, EXACT, draws=2)
     for name, out in outcomes.items():
         assert out.missed == out.false == out.unsure == 0, name
-        assert coverage.departures(out.z, RATE / len(EXACT)) == [], name
+        assert coverage_cells.departures(out.z, RATE / len(EXACT)) == [], name
 
 
 @pytest.mark.parametrize("case", CELLS[:4], ids=str)
 def test_thresholds_and_operators_cover(case: Case, rng: np.random.Generator):
     """Of 900 coordinates, at least as many within 1 u and 2 u as promised; 61 % for 68.3 % and 91 % for 95.4 % would be caught."""
-    for name, out in coverage.collect_all(coverage.make_frame(case, rng, 225), rng, COVERING, draws=2).items():
+    for name, out in coverage_cells.collect_all(coverage_cells.make_frame(case, rng, 225), rng, COVERING, draws=2).items():
         assert out.missed == out.false == 0, name
-        assert coverage.under_covered(out.z, RATE / len(COVERING)) == [], name
+        assert coverage_cells.under_covered(out.z, RATE / len(COVERING)) == [], name
 
 
 def test_the_judge_sees_planted_errors(rng: np.random.Generator):
     z = rng.normal(size=900)
-    assert coverage.departures(z, RATE) == []
-    assert coverage.departures(z + 0.4, RATE) != []
-    assert coverage.departures(1.3 * z, RATE) != []
-    assert coverage.departures(0.75 * z, RATE) != []
-    assert coverage.departures(np.sqrt(2) * np.sin(rng.uniform(0, 2 * np.pi, 900)), RATE) != []
-    assert coverage.under_covered(z, RATE) == [] and coverage.under_covered(0.5 * z, RATE) == []
-    assert coverage.under_covered(1.4 * z, RATE) != []
+    assert coverage_cells.departures(z, RATE) == []
+    assert coverage_cells.departures(z + 0.4, RATE) != []
+    assert coverage_cells.departures(1.3 * z, RATE) != []
+    assert coverage_cells.departures(0.75 * z, RATE) != []
+    assert coverage_cells.departures(np.sqrt(2) * np.sin(rng.uniform(0, 2 * np.pi, 900)), RATE) != []
+    assert coverage_cells.under_covered(z, RATE) == [] and coverage_cells.under_covered(0.5 * z, RATE) == []
+    assert coverage_cells.under_covered(1.4 * z, RATE) != []
 
 
 @pytest.mark.parametrize("dark", [False, True])
@@ -83,8 +83,8 @@ def test_reference_frame(dark: bool, rng: np.random.Generator):
     bound = np.mean([least(r) for r in radius[:100]])
     allowed = 1 + stats.norm.isf(RATE / 2) / np.sqrt(2 * 2 * len(x))
     for name, goal in (("template", 1.05), ("soft_threshold", 1.25)):
-        out = coverage.Outcome()
-        coverage.add(out, locate(image, estimator=name), coverage.Frame(Case(radius=3.0), mean, x, y))
+        out = coverage_cells.Outcome()
+        coverage_cells.add(out, locate(image, estimator=name), coverage_cells.Frame(Case(radius=3.0), mean, x, y))
         assert out.missed == out.false == 0
         assert out.rms_over(bound) < goal * allowed, name
 
@@ -92,9 +92,9 @@ def test_reference_frame(dark: bool, rng: np.random.Generator):
 @pytest.mark.parametrize(("radius", "blur"), [(1.0, 0.3), (1.5, 0.5), (4.0, 0.3), (8.0, 1.0)])
 def test_template_has_no_phase_error(radius: float, blur: float, rng: np.random.Generator):
     """At a noise of .05 DN the mean of a tenth of the phase is uncertain by less than .0001 px; the goal is .001 px."""
-    out = coverage.collect(coverage.make_frame(Case(radius=radius, blur=blur, read_dn=0.05, bits=None), rng, 400), rng, "template")
+    out = coverage_cells.collect(coverage_cells.make_frame(Case(radius=radius, blur=blur, read_dn=0.05, bits=None), rng, 400), rng, "template")
     assert out.missed == out.false == 0
-    mean, error = coverage.phase_bias(out)
+    mean, error = coverage_cells.phase_bias(out)
     assert error.max() < 1e-4
     assert np.abs(mean).max() < 0.001
 
@@ -103,29 +103,29 @@ def test_template_has_no_phase_error(radius: float, blur: float, rng: np.random.
 def test_light_that_falls_off_leaves_no_bias(light_on: str, rng: np.random.Generator):
     """Ten per cent across the disc, both readings; the mean of 400 is uncertain by .0001 px, a centroid is off by .05 px."""
     case = Case(light=(0.1 / 8, 0.0), light_on=light_on, read_dn=0.5)
-    frame = coverage.make_frame(case, rng, 400)
-    out = coverage.collect(frame, rng, "template", light_on=light_on)
+    frame = coverage_cells.make_frame(case, rng, 400)
+    out = coverage_cells.collect(frame, rng, "template", light_on=light_on)
     assert np.abs(out.errors.mean(axis=1)).max() < 0.001
-    assert coverage.departures(out.z, RATE) == []
-    assert abs(coverage.collect(frame, rng, "centroid").errors[0].mean()) > 0.03
+    assert coverage_cells.departures(out.z, RATE) == []
+    assert abs(coverage_cells.collect(frame, rng, "centroid").errors[0].mean()) > 0.03
 
 
 def test_sloping_background_costs_little(rng: np.random.Generator):
     case = Case(slope=(0.25, 0.0), background=400.0, bits=12)
-    out = coverage.collect(coverage.make_frame(case, rng, 400), rng, "template")
+    out = coverage_cells.collect(coverage_cells.make_frame(case, rng, 400), rng, "template")
     assert out.missed == out.false == 0
     assert out.rms_over(case.least_var()) < 1.6
-    assert coverage.departures(out.z, RATE) == []
+    assert coverage_cells.departures(out.z, RATE) == []
 
 
 @pytest.mark.parametrize("amplitude", [250.0, 400.0])
 def test_saturated_tops_leave_no_bias(amplitude: float, rng: np.random.Generator):
     """In all and in each tenth of the phase, within 5.3 standard errors (1e-6 for 11 means, about .001 px); each is flagged."""
-    frame = coverage.make_frame(Case(amplitude=amplitude), rng, 400)
-    out = coverage.collect(frame, rng, "template")
+    frame = coverage_cells.make_frame(Case(amplitude=amplitude), rng, 400)
+    out = coverage_cells.collect(frame, rng, "template")
     assert out.missed == out.false == 0
-    assert coverage.departures(out.z, RATE) == []
-    mean, error = coverage.phase_bias(out)
+    assert coverage_cells.departures(out.z, RATE) == []
+    mean, error = coverage_cells.phase_bias(out)
     assert np.abs(mean / error).max() < 5.3
     assert (locate(frame.exposed(rng)).flags & int(Flag.SATURATED)).all()
 
@@ -139,4 +139,4 @@ def test_lines(name: str, goal: float, rng: np.random.Generator):
     assert len(error) == 150 and false == 0
     least = np.mean([bars.least_offset_var(a) for a in frame.angle_deg[:10]])
     assert np.sqrt(np.mean(error**2) / least) < goal * (1 + stats.norm.isf(RATE / 2) / np.sqrt(2 * 150))
-    assert coverage.departures(error / np.sqrt(var), RATE) == []
+    assert coverage_cells.departures(error / np.sqrt(var), RATE) == []

@@ -167,7 +167,7 @@ def test_finds_both_polarities_at_once() -> None:
 
 
 @pytest.mark.parametrize(
-    "least, most, count, side, blur", [(1, 1.5, 300, 400, 0.5), (2, 6, 60, 500, 2.5), (90, 100, 4, 800, 0.7), (95, 100, 1, 300, 1.0)]
+    "least, most, count, side, blur", [(1, 1.5, 300, 400, 0.5), (2, 6, 60, 500, 2.5), (90, 100, 4, 800, 0.7), (95, 100, 1, 420, 1.0)]
 )
 def test_finds_small_and_large_ones(least: float, most: float, count: int, side: int, blur: float) -> None:
     light, truth = discs((side, side), count, least, most, blur)

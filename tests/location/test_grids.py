@@ -141,7 +141,8 @@ def test_odd_inputs_have_an_outcome() -> None:
 
 def drawn_circles(rng, rows: int, cols: int, asymmetric: bool, bright: bool) -> tuple[np.ndarray, np.ndarray]:
     fine = 4
-    true = np.array([(30 + (2 * j + i % 2 if asymmetric else 2 * j) * 12.0, 30 + i * (12.0 if asymmetric else 24.0)) for i in range(rows) for j in range(cols)])
+    i, j = (a.ravel() for a in np.indices((rows, cols)))
+    true = 30 + 12.0 * np.stack([2 * j + i % 2 * asymmetric, i * (1 if asymmetric else 2)], axis=1)
     true += [1.5, 0.5] + true[:, ::-1] * [0.05, -0.04] + [0, 20]
     height, width = (np.ceil(true.max(axis=0)).astype(int) + 30)[::-1]
     down, across = ((np.arange(n * fine) + 0.5) / fine - 0.5 for n in (height, width))

@@ -317,8 +317,8 @@ def test_rows_tell_of_jitter() -> None:
     jitter = rng.normal(0, 0.15, n)
     cols = np.arange(48)
     true = 24.0 + 0.01 * (np.arange(n) - 200) + jitter
-    frame = np.stack([brute("gaussian", dict(angle_deg=90.0, amplitude_dn=150.0, background_dn=10.0, sigma_px=1.5), np.zeros(1), cols - x)[0]
-                      for x in true])
+    q = dict(angle_deg=90.0, amplitude_dn=150.0, background_dn=10.0, sigma_px=1.5)
+    frame = np.stack([brute("gaussian", q, np.zeros(1), cols - x)[0] for x in true])
     image = stored(frame, rng)
     for estimator in ROW_ESTIMATORS:
         rows = line_rows(image, find_lines(image), WHITE, estimator=estimator)
@@ -341,10 +341,10 @@ def cross_frame(x: float, y: float, first: float, second: float, width: float, u
 
 
 def test_crosses_have_true_covariances() -> None:
-    """Sums and unions, thin and wide, at any angle of 40° or more; whitened errors of 100 crosses."""
+    """Sums and unions, thin and wide, at any angle of 40° or more; whitened errors of 60 crosses."""
     rng = np.random.default_rng()
     z, height = [], 100.0
-    for k in range(100):
+    for k in range(60):
         x, y = 50 + rng.uniform(-2, 2, 2)
         first = rng.uniform(-90, 90)
         second = first + rng.uniform(40, 140)

@@ -52,7 +52,10 @@ def test_a_clipped_line_has_the_error_of_poissons_sum(clip: float) -> None:
 
 @pytest.mark.parametrize(
     ("sigma", "clip", "signed"),
-    [(0.6, 0, {1: -0.00371}), (1.5, 6, {1: -0.00748, 2: -0.00113, 3: 0.00045}), (1.5, 10, {1: 0.00196}), (1.5, 15, {1: 0.01516}), (1.5, 30, {1: -0.02563})],
+    [
+        (0.6, 0, {1: -0.00371}), (1.5, 6, {1: -0.00748, 2: -0.00113, 3: 0.00045}), (1.5, 10, {1: 0.00196}), (1.5, 15, {1: 0.01516}),
+        (1.5, 30, {1: -0.02563}),
+    ],
 )
 def test_signed_sines_of_a_clipped_line(sigma: float, clip: float, signed: dict[int, float]) -> None:
     """Values of the Poisson sum, −2 S_k/∫h, to the last digit given (and the second order of the division by the sum)."""
@@ -78,11 +81,11 @@ def test_a_line_with_the_black_level_six_too_low() -> None:
 
 
 def test_a_hard_threshold_on_a_gaussian_without_noise() -> None:
-    """Clarke's Fig 3.10 for a Gaussian of 1.5 and 150, point-sampled, 21 × 21 window: the published simulation, 800 phases, to 12 %."""
+    """Clarke's Fig 3.10 for a Gaussian of 1.5 and 150 averaged over the pixel, 21 × 21 window: a simulation of 800 phases, to 12 %."""
     spot = lambda dx, dy: 150 * np.exp(-(dx**2 + dy**2) / (2 * 1.5**2))  # noqa: E731
     for threshold, rms in ((10, 0.014), (20, 0.028), (30, 0.045), (50, 0.065), (70, 0.074), (90, 0.106)):
         law = Estimator("hard_threshold", window=21, threshold_dn=threshold)
-        got = s_curve(law, spot, phases_x=28, phases_y=28, aperture_px=0, window_px=23, rounded=True)
+        got = s_curve(law, spot, phases_x=28, phases_y=28, window_px=23, rounded=True)
         assert math.hypot(*got.rms_px) / math.sqrt(2) == pytest.approx(rms, rel=0.12)
 
 

@@ -76,18 +76,18 @@ def held_out(positions: Positions | Targets, grid: Grid, use: np.ndarray, rng: n
 
 
 def published_residuals(folder: Path, positions: Positions | Targets, grid: Grid, use: np.ndarray) -> np.ndarray:
-    """Residuals of a homography fitted to the places that the published coefficients undistort (x_u = c + (x − c) Σ k_i r^i), in pixels."""
+    """Residuals x, y with the published coefficients, x = c + u Σ k_i |u|^i, u being a homography of (column, row) fitted to all dots."""
     numbers = [float(line.split(":")[1]) for line in (folder / COEFFICIENTS).read_text().splitlines() if ":" in line]
     (cx, cy), k = numbers[:2], numbers[2:]
-    dx, dy = positions.x_px[use] - cx, positions.y_px[use] - cy
-    factor = np.polyval(k[::-1], np.hypot(dx, dy))
-    x, y, col, row = dx * factor, dy * factor, grid.col[use] - 42.0, grid.row[use] - 27.0
+    x, y, col, row = positions.x_px[use], positions.y_px[use], grid.col[use] - 42.0, grid.row[use] - 27.0
     design = np.column_stack([col, row, np.ones_like(col)])
-    start = np.concatenate([*np.linalg.lstsq(design, np.column_stack([x, y]), rcond=None)[0].T, [0, 0]])
+    start = np.concatenate([*np.linalg.lstsq(design, np.column_stack([x - cx, y - cy]), rcond=None)[0].T, [0, 0]])
 
     def residual(h: np.ndarray) -> np.ndarray:
         w = h[6] * col + h[7] * row + 1
-        return np.concatenate([(h[0] * col + h[1] * row + h[2]) / w - x, (h[3] * col + h[4] * row + h[5]) / w - y])
+        u, v = (h[0] * col + h[1] * row + h[2]) / w, (h[3] * col + h[4] * row + h[5]) / w
+        factor = np.polyval(k[::-1], np.hypot(u, v))
+        return np.concatenate([cx + u * factor - x, cy + v * factor - y])
 
     return least_squares(residual, start, x_scale=[15, 1, 1, 1, 15, 1, 1e-4, 1e-4]).fun.reshape(2, -1).T
 

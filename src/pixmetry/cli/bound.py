@@ -8,7 +8,6 @@ from typing import Any
 import click
 
 KINDS = ("disc", "ellipse", "ring", "spot", "line", "edge")
-NOISE_KEYS = {"read": "read_dn", "gain": "slope_dn", "prnu": "pattern_rel", "dsnu": "pattern_dn", "black": "black_dn", "bits": "bits"}
 SIZES = {
     "radius": "radius_px",
     "inner_radius": "inner_radius_px",
@@ -32,7 +31,7 @@ SIZES = {
 @click.option("--blur", type=float, required=True, help="Standard deviation of the edge or spot, without the pixel, px.")
 @click.option("--amplitude", type=float, required=True, help="Grey values above the surround; negative for a dark target.")
 @click.option("--background", type=float, default=0.0, show_default=True, help="Grey value of the surround above the camera's black.")
-@click.option("--noise", metavar="KEY=NUMBER,…", help=f"Noise in grey values: {', '.join(NOISE_KEYS)}; as in read=1.5,gain=0.01,bits=8.")
+@click.option("--noise", metavar="KEY=NUMBER,…", help="Noise in DN: read, gain, prnu, dsnu, black, bits; as in read=1.5,gain=0.01,bits=8.")
 @click.option("--camera", metavar="FILE|PRESET", help="A camera file or preset whose noise, bits, pitch and aperture are taken.")
 @click.option("--no-rounding", is_flag=True, help="Grey values are not whole numbers.")
 @click.option("--unknowns", default="shape", show_default=True, help="position, light, shape, planes, or names of parameters.")
@@ -97,21 +96,9 @@ def bound(
 
 def _of_text(text: str, no_rounding: bool) -> tuple[Any, dict[str, float], dict[str, Any]]:
     """Noise model, settings and facts from ``key=number,…``."""
-    from pixmetry.core.errors import InputError
-    from pixmetry.location.estimators import split_text
-    from pixmetry.location.information import ROUNDING_DN2
-    from pixmetry.location.noise import NoiseModel
+    from pixmetry.location.noise import parse_noise
 
-    _, values = split_text(":" + text, NOISE_KEYS, "--noise")
-    if not values.get("read_dn", 1.5) >= 0:
-        raise InputError("the read noise cannot be used", where="--noise", value=values["read_dn"], allowed="0 or more")
-    bits = values.pop("bits", None)
-    if bits is not None and (bits != int(bits) or not 1 <= bits <= 32):
-        raise InputError("the bits cannot be used", where="--noise", value=bits, allowed="1 to 32")
-    read, pattern = values.pop("read_dn", 0.0), values.pop("pattern_dn", 0.0)
-    ends = {} if bits is None else {"low_dn": 0.0, "high_dn": 2.0 ** int(bits) - 1}
-    rest: dict[str, Any] = {**values, **ends}
-    model = NoiseModel(read**2 + (0.0 if no_rounding else ROUNDING_DN2), **rest)
+    model, pattern = parse_noise(text, not no_rounding)
     return model, {"aperture_px": 1.0, "pattern_dn": pattern}, {"camera": None, "pitch_um": None}
 
 
@@ -119,15 +106,14 @@ def _of_camera(name: str, no_rounding: bool) -> tuple[Any, dict[str, float], dic
     """The same from a camera file or preset."""
     from dataclasses import replace
 
+    from pixmetry.camera_noise import camera_noise
     from pixmetry.core.camera import load_camera
-    from pixmetry.location.camera_noise import camera_noise
-    from pixmetry.location.information import ROUNDING_DN2
+    from pixmetry.location.noise import ROUNDING_DN2
 
     camera = load_camera(name)
     read = camera_noise(camera)
-    model = replace(read.model, constant_dn2=read.model.constant_dn2 - ROUNDING_DN2) if no_rounding else read.model
-    about = {"camera": camera.name, "pitch_um": read.pitch_um, "counted": list(read.counted), "not_counted": list(read.left_out)}
-    return model, {"aperture_px": read.aperture_px, "pattern_dn": read.pattern_dn}, about
+    model = replace(read.model, constant_dn2=max(read.model.constant_dn2 - ROUNDING_DN2, 0.0)) if no_rounding else read.model
+    return model, {"aperture_px": read.aperture_px, "pattern_dn": read.pattern_dn}, {"camera": camera.name, "pitch_um": read.pitch_um}
 
 
 def _show(result: Any, about: dict[str, Any]) -> None:
@@ -171,8 +157,6 @@ def _show(result: Any, about: dict[str, Any]) -> None:
     console.print("")
     for text in (*result.advice, *result.statements):
         console.print(f"· {text}", soft_wrap=True)
-    if about.get("not_counted"):
-        console.print(f"· of {about['camera']} not counted: {', '.join(about['not_counted'])}", soft_wrap=True)
 
 
 def _micrometres(pitch_um: tuple[float, float] | None) -> Any:

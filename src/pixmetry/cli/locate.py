@@ -28,7 +28,7 @@ KINDS = ("disc", "ellipse", "ring", "spot", "line", "edge", "cross", "chessboard
 @click.option(
     "--noise",
     metavar="WHAT",
-    help="Noise model: a camera (preset, camera.yaml), or constant=2.3,slope=0.01,black=16 in DN. Default: from the image.",
+    help="Noise model: a camera (preset, camera.yaml), or read=1.5,gain=0.01,black=16 in DN. Default: from the image.",
 )
 @click.option("--bits", type=click.IntRange(1, 16), help="Bits of a stored value, which say where it saturates. Default: from the image.")
 @click.option(

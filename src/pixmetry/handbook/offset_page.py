@@ -164,7 +164,10 @@ def _claims() -> str:
         ],
         ["the error is systematic", "yes; no averaging takes it away, only the line's moving through whole pixels"],
         ["no such error with the background above zero", "yes, if the background is subtracted; if not, it pulls the centroid (see below)"],
-        ["best setting: just below the first step of the converter", "for centroids of the grey values as they are, yes; not otherwise (see below)"],
+        [
+            "best setting: just below the first step of the converter",
+            "for centroids of the grey values as they are, yes; not otherwise (see below)",
+        ],
     ]
     return table(["the chapter", "here"], rows, 2)
 

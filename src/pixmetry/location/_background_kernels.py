@@ -15,6 +15,7 @@ KEPT = 1.0 / 0.97334  # variance of a normal distribution over that of its part 
 ROUNDS = 4
 HALVINGS = 16
 MANY = 0.25  # share of a tile's pixels at an end of the scale from which on its background is taken as clipped there
+SWEEPS = 30  # of relaxation, over what is filled in
 SUM_FREELY = {"reassoc", "nsz"}  # a clipped sum is not sensitive to the order of its terms, and four times as fast in any order
 
 
@@ -176,7 +177,7 @@ def settle(offset, plausible, jump):
     """Tell background from targets that fill whole tiles, and fill in the background under these.
 
     ``offset`` is how far the tiles lie from a smooth surface; it is background where it is small, and next to background where it goes on
-    from there without a jump, level or straight. The rest is filled in from the outside. In place.
+    from there without a jump, level or straight. The rest is filled in from the outside, and made as even as its rim. In place.
     """
     rows, cols = offset.shape
     known = plausible & (np.abs(offset) < jump)
@@ -193,6 +194,7 @@ def settle(offset, plausible, jump):
                 if plausible[r, c] and not known[r, c] and goes_on(offset, known, r, c, jump):
                     known[r, c] = changed = True
     left = rows * cols - np.count_nonzero(known)
+    filled = ~known
     while left > 0:
         before = known.copy()
         for r in range(rows):
@@ -203,6 +205,14 @@ def settle(offset, plausible, jump):
                         offset[r, c] = value
                         known[r, c] = True
                         left -= 1
+    for _ in range(SWEEPS):
+        for r in range(rows):
+            for c in range(cols):
+                across, down = 0 < c < cols - 1, 0 < r < rows - 1
+                if filled[r, c] and (across or down):
+                    total = offset[r, c - 1] + offset[r, c + 1] if across else 0.0
+                    total += offset[r - 1, c] + offset[r + 1, c] if down else 0.0
+                    offset[r, c] = total / (2.0 * across + 2.0 * down)
 
 
 @jit

@@ -8,6 +8,8 @@ its derivative with respect to any parameter θ of the outline (u, v), is an int
 with G the integral of g. On a smooth closed outline equal steps converge exponentially, so that a few points of it, each of which reaches
 a few rows and columns, give F and all its derivatives exactly. The blur follows from the heat equation, ∂F/∂σ = σ ∇²F.
 
+Points are drawn in single precision, which is better than the tables.
+
 Images of a shape: 0 is F, 1 and 2 its derivatives by the centre's x and y, then those by the parameters of the outline and by the blur;
 where light that falls off over the shape is asked for, two more hold its first moments about the pixel (`draw`) or the centre.
 """
@@ -23,9 +25,10 @@ from pixmetry.core.jit import jit
 DISC, ELLIPSE, RING, SPOT = 0, 1, 2, 3
 SHAPES = np.array([1, 3, 2, 0])  # parameters of the outline
 REACH = 4.25  # standard deviations of the blur beyond which it is taken as 0 (1.1e-5 of the height of an edge)
-STEP = 1.2  # standard deviations of the blur between points of the outline: what is left is 2 exp(−2π²/STEP²) = 2e-6
+STEP = 1.3  # standard deviations of the blur between points of the outline: what is left is 2 exp(−2π²/STEP²) = 2e-5
 LEAST_POINTS = 16
-PHASES = 6.0  # entries of a table per standard deviation: cubic interpolation of g is good to 3e-6
+PAD = 4  # columns to either side of a window that may be drawn to
+PHASES = 5.0  # entries of a table per standard deviation: cubic interpolation of g is good to 6e-6
 THIN = 0.005  # a box narrower than this share of the blur is a point (error 1e-6)
 LIMIT = 6.0  # of the normal distribution's table, in standard deviations
 PER = 64  # entries of it per standard deviation: cubic interpolation is good to 2e-10
@@ -57,61 +60,81 @@ def pdf(z):
 
 
 @jit
+def both(z):
+    """`cdf` and `pdf`."""
+    if z <= -LIMIT:
+        return 0.0, 0.0
+    if z >= LIMIT:
+        return 1.0, 0.0
+    at = (z + LIMIT) * PER
+    j = int(at)
+    f = at - j
+    e = 1.0 - f
+    ca, cb, pa, pb = CDF[j], CDF[j + 1], PDF[j], PDF[j + 1]
+    rise, fall = cb - ca, pb - pa
+    za = (j - LIMIT * PER) / PER
+    zb = za + 1.0 / PER
+    c = ca + f * rise + f * e * (e * (pa / PER - rise) - f * (pb / PER - rise))
+    return c, pa + f * fall + f * e * (e * (-za * pa / PER - fall) - f * (-zb * pb / PER - fall))
+
+
+@jit
 def reach_px(blur, aperture):
     """Whole pixels to either side that a point of the outline reaches."""
     return int(math.ceil(0.5 * aperture + REACH * blur))
 
 
 @jit
-def fill_table(table, phases, half, blur, aperture):
-    """Fill G, g, g', g'', first moment m of g below z, and m' = z g at z = phase − offset, offset −half + 1 … half.
-
-    ``table`` has shape (at least phases + 1, 6, at least 2 half); it is filled up with 0 to a whole number of eight offsets, which is
-    returned.
-    """
-    width = (2 * half + 7) // 8 * 8
-    thin = aperture < THIN * blur
-    for m in range(phases + 1):
-        for j in range(2 * half):
-            z = m / phases - (j - half + 1)
-            if thin:
-                t = z / blur
-                g = pdf(t) / blur
-                table[m, 0, j] = cdf(t)
-                table[m, 1, j] = g
-                table[m, 2, j] = -t / blur * g
-                table[m, 3, j] = (t * t - 1.0) / (blur * blur) * g
-                table[m, 4, j] = -blur * blur * g
-                table[m, 5, j] = z * g
-                continue
-            a, b = (z + 0.5 * aperture) / blur, (z - 0.5 * aperture) / blur
-            ca, cb, pa, pb = cdf(a), cdf(b), pdf(a), pdf(b)
-            g = (ca - cb) / aperture
-            total = blur / aperture * (a * ca + pa - b * cb - pb)
-            bowl = 0.5 * blur * blur / aperture * ((a * a + 1.0) * ca + a * pa - (b * b + 1.0) * cb - b * pb)
-            table[m, 0, j] = total
-            table[m, 1, j] = g
-            table[m, 2, j] = (pa - pb) / (aperture * blur)
-            table[m, 3, j] = (b * pb - a * pa) / (aperture * blur * blur)
-            table[m, 4, j] = z * total - bowl
-            table[m, 5, j] = z * g
-        for j in range(2 * half, width):
-            for q in range(6):
-                table[m, q, j] = 0.0
-    return width
+def block_count(half):
+    """Blocks of eight offsets that a reach takes."""
+    return (2 * half + 7) // 8
 
 
 @jit
-def look_up(out, row, table, quantity, slope, phases, f, width):
-    """Interpolate a quantity of the table at phase f by cubics, all offsets at once."""
+def fill_table(table, phases, half, blur, aperture):
+    """Fill G, g, g', g'', the first moment m of g below z, and m' = z g at z = phase − offset, offset −half + 1, −half + 2, ….
+
+    ``table`` has shape (at least phases + 1, blocks · 48): block after block of eight offsets, in each these six, one after the other, so
+    that a quantity's slope is the next one.
+    """
+    thin = aperture < THIN * blur
+    inv, narrow = 1.0 / blur, 0.5 * aperture
+    spread = 0.0 if thin else 1.0 / aperture
+    for m in range(phases + 1):
+        row = table[m]
+        b = (m / phases + half - 1 + narrow) * inv
+        cb, pb = both(b)
+        for j in range(8 * block_count(half)):
+            z = m / phases - (j - half + 1)
+            at = (j >> 3) * 48 + (j & 7)
+            if thin:
+                t = z * inv
+                g = pdf(t) * inv
+                row[at], row[at + 8], row[at + 16] = cdf(t), g, -t * inv * g
+                row[at + 24], row[at + 32], row[at + 40] = (t * t - 1.0) * inv * inv * g, -blur * blur * g, z * g
+                continue
+            if aperture == 1.0:
+                a, ca, pa = b, cb, pb
+            else:
+                a = (z + narrow) * inv
+                ca, pa = both(a)
+            b = (z - narrow) * inv
+            cb, pb = both(b)
+            g = (ca - cb) * spread
+            total = blur * spread * (a * ca + pa - b * cb - pb)
+            bowl = 0.5 * blur * blur * spread * ((a * a + 1.0) * ca + a * pa - (b * b + 1.0) * cb - b * pb)
+            row[at], row[at + 8], row[at + 16] = total, g, (pa - pb) * spread * inv
+            row[at + 24], row[at + 32], row[at + 40] = (b * pb - a * pa) * spread * inv * inv, z * total - bowl, z * g
+
+
+@jit
+def cubic(phases, f):
+    """First of the two entries of a table about phase f, and the weights of both and of their slopes."""
     at = f * phases
     m = min(int(at), phases - 1)
     t = at - m
-    h = 1.0 / phases
     b = t * t * (3.0 - 2.0 * t)
-    c, d = t * (1.0 - t) * (1.0 - t) * h, -t * t * (1.0 - t) * h
-    for j in range(width):
-        out[row, j] = (1.0 - b) * table[m, quantity, j] + b * table[m + 1, quantity, j] + c * table[m, slope, j] + d * table[m + 1, slope, j]
+    return m, np.float32(1.0 - b), np.float32(b), np.float32(t * (1.0 - t) * (1.0 - t) / phases), np.float32(-t * t * (1.0 - t) / phases)
 
 
 @jit
@@ -154,118 +177,116 @@ def point_count(longest, blur):
     return max(LEAST_POINTS, int(math.ceil(2.0 * math.pi * longest / (STEP * blur))))
 
 
-@jit
-def eight(rows, k, first):
-    """Eight values of row k, to be kept in registers."""
-    return (
-        rows[k, first], rows[k, first + 1], rows[k, first + 2], rows[k, first + 3], rows[k, first + 4], rows[k, first + 5],
-        rows[k, first + 6], rows[k, first + 7],
-    )  # fmt: skip
-
-
 @jit(**FUSED)
-def add_eight(flat, at, c, a):
-    """Add c · a to eight neighbouring values."""
-    at = np.uint64(at)  # an index that cannot be negative lets the compiler use its vector instructions
-    flat[at] += c * a[0]
-    flat[at + np.uint64(1)] += c * a[1]
-    flat[at + np.uint64(2)] += c * a[2]
-    flat[at + np.uint64(3)] += c * a[3]
-    flat[at + np.uint64(4)] += c * a[4]
-    flat[at + np.uint64(5)] += c * a[5]
-    flat[at + np.uint64(6)] += c * a[6]
-    flat[at + np.uint64(7)] += c * a[7]
+def draw_outline(planes, images, points, count, shapes, blur, aperture, light, gx, gy, table, across, down, parts):
+    """Add an outline to the planes; plane 0 gets the difference of F from row to row. (gx, gy) is the light's slope per pixel.
 
-
-@jit(**FUSED)
-def add_two_eights(flat, at, c, a, d, b):
-    """Add c · a + d · b to eight neighbouring values."""
-    at = np.uint64(at)
-    flat[at] += c * a[0] + d * b[0]
-    flat[at + np.uint64(1)] += c * a[1] + d * b[1]
-    flat[at + np.uint64(2)] += c * a[2] + d * b[2]
-    flat[at + np.uint64(3)] += c * a[3] + d * b[3]
-    flat[at + np.uint64(4)] += c * a[4] + d * b[4]
-    flat[at + np.uint64(5)] += c * a[5] + d * b[5]
-    flat[at + np.uint64(6)] += c * a[6] + d * b[6]
-    flat[at + np.uint64(7)] += c * a[7] + d * b[7]
-
-
-@jit
-def draw_outline(images, points, count, shapes, blur, aperture, light, gx, gy, table, across, down):
-    """Add an outline to the images; image 0 gets the difference of F from row to row. (gx, gy) is the light's slope per pixel."""
+    ``planes`` has shape (rows, (`PAD` + columns + `PAD`) · 8), the planes of a pixel side by side: F, x, y, outline …, blur. With ``light``
+    the first moments about the pixel go to the last two images.
+    """
     half = reach_px(blur, aperture)
     phases = phase_count(blur)
-    width = fill_table(table, phases, half, blur, aperture)
+    blocks = block_count(half)
+    fill_table(table, phases, half, blur, aperture)
     n = 2 * half
-    rows, cols = images.shape[1], images.shape[2]
-    plane = rows * cols
-    flat = images.reshape(images.size)
+    rows, cols = planes.shape[0], planes.shape[1] // 8
+    zero = np.float32(0.0)
+    one, two, three = parts[0], parts[1], parts[2]
+    last = np.uint64(3 + shapes)
+    parts[:] = zero
     for k in range(count):
         u, v, du, dv = points[k, 0], points[k, 1], points[k, 2], points[k, 3]
-        left, top = int(math.floor(u)) - half + 1, int(math.floor(v)) - half + 1
-        if left >= cols or left + width <= 0 or top >= rows:
+        left, top = int(math.floor(u)) - half + 1 + PAD, int(math.floor(v)) - half + 1
+        if left >= cols or left + 8 * blocks <= 0 or top >= rows:
             continue
         fu, fv = u - math.floor(u), v - math.floor(v)
-        look_up(across, 0, table, 1, 2, phases, fu, width)
-        look_up(across, 1, table, 2, 3, phases, fu, width)
-        look_up(down, 0, table, 1, 2, phases, fv, width)
-        look_up(down, 1, table, 2, 3, phases, fv, width)
-        look_up(down, 2, table, 0, 1, phases, fv, width)
-        if light:
-            look_up(across, 2, table, 4, 5, phases, fu, width)
-            look_up(down, 3, table, 4, 5, phases, fv, width)
+        # constant numbers of turns, and indices that cannot be negative, let the compiler use its vector instructions
+        mu, ua, ub, uc, ud = cubic(phases, fu)
+        mv, va, vb, vc, vd = cubic(phases, fv)
+        ku, kv = np.uint64(mu), np.uint64(mv)
+        lu, lv = ku + np.uint64(1), kv + np.uint64(1)
+        for block in range(blocks):
+            k1, at = np.uint64(block), np.uint64(48 * block)
+            for i in range(40):
+                q = at + np.uint64(i)
+                d = q + np.uint64(8)
+                across[k1, np.uint64(i)] = ua * table[ku, q] + ub * table[lu, q] + uc * table[ku, d] + ud * table[lu, d]
+            for i in range(40):
+                q = at + np.uint64(i)
+                d = q + np.uint64(8)
+                down[k1, np.uint64(i)] = va * table[kv, q] + vb * table[lv, q] + vc * table[kv, d] + vd * table[lv, d]
         shine = 1.0 + gx * (u - points[count, 0]) + gy * (v - points[count, 1])
-        for first in range(0, width, 8):
-            column = left + first
-            if column >= cols or column + 8 <= 0:
+        x1, y1 = np.float32(shine * dv), np.float32(-shine * du)
+        s1, s2, s3 = np.float32(shine * points[k, 4]), np.float32(shine * points[k, 5]), np.float32(shine * points[k, 6])
+        b0, b1, b2 = np.float32(-blur * (gx * dv - gy * du)), np.float32(blur * shine * dv), np.float32(-blur * shine * du)
+        f3 = np.float32(du)
+        for block in range(blocks):
+            first = left + 8 * block
+            if first >= cols or first + 8 <= 0:
                 continue
-            shift = 0  # where the window ends, the eight are moved and filled up with 0
-            if column < 0 or column + 8 > cols:
-                shift = -column if column < 0 else cols - 8 - column
-            a, b = shifted(across, 0, first, shift), shifted(across, 1, first, shift)
-            m = shifted(across, 2, first, shift) if light else a
-            column += shift
-            above = 1.0
+            row = np.uint64(block)
+            if first < 0 or first + 8 > cols:
+                for i in range(8):
+                    if not 0 <= first + i < cols:
+                        across[row, 8 + i] = across[row, 16 + i] = zero
+            if shapes == 1:
+                for i in range(8):
+                    g, slope, at = across[row, np.uint64(8 + i)], across[row, np.uint64(16 + i)], np.uint64(8 * i)
+                    one[at + np.uint64(1)], one[at + np.uint64(2)], one[at + np.uint64(3)], three[at] = x1 * g, y1 * g, s1 * g, f3 * g
+                    one[at + np.uint64(4)], two[at + np.uint64(4)] = b0 * g + b1 * slope, b2 * g
+            else:
+                for i in range(8):
+                    g, slope, at = across[row, np.uint64(8 + i)], across[row, np.uint64(16 + i)], np.uint64(8 * i)
+                    one[at + np.uint64(1)], one[at + np.uint64(2)], three[at] = x1 * g, y1 * g, f3 * g
+                    one[at + np.uint64(3)], one[at + np.uint64(4)] = s1 * g, s2 * g
+                    if shapes == 3:
+                        one[at + np.uint64(5)] = s3 * g
+                    one[at + last], two[at + last] = b0 * g + b1 * slope, b2 * g
+            start = 8 * min(max(first, 0), cols - 8)
+            if start != 8 * first:
+                slide(parts, start // 8 - first)
+            above = np.float32(1.0)
             for j in range(n + 1):
-                below = down[2, j] if j < n else 0.0
-                fall = du * (above - below)
-                above = below
                 r = top + j
                 if r >= rows:
                     break
-                add_eight(flat, max(r, 0) * cols + column, fall, a)  # F of row 0 is the sum of all differences above it
-                if j == n or r < 0:
-                    continue
-                at = plane + r * cols + column
-                g, g1 = down[0, j], down[1, j]
-                add_eight(flat, at, shine * g * dv, a)
-                add_eight(flat, at + plane, -shine * g * du, a)
-                for s in range(shapes):
-                    add_eight(flat, at + (2 + s) * plane, shine * g * points[k, 4 + s], a)
-                c0, c1 = blur * (-shine * g1 * du - g * (gx * dv - gy * du)), blur * shine * g * dv
-                add_two_eights(flat, at + (2 + shapes) * plane, c0, a, c1, b)
-                if light:
-                    add_eight(flat, at + (7 + shapes) * plane, g * dv, m)
-                    add_eight(flat, at + (8 + shapes) * plane, -down[3, j] * du, a)
+                below = down[j >> 3, j & 7] if j < n else zero
+                fall = above - below
+                above = below
+                g, slope = zero, zero
+                if j < n and r >= 0:
+                    g, slope = down[j >> 3, 8 + (j & 7)], down[j >> 3, 16 + (j & 7)]
+                # F of row 0 sums what is above it
+                to, at = np.uint64(max(r, 0)), np.uint64(start)
+                for i in range(64):
+                    planes[to, at + np.uint64(i)] += g * one[i] + slope * two[i] + fall * three[i]
+                if light and j < n and r >= 0:
+                    moment = down[j >> 3, 32 + (j & 7)]
+                    for i in range(8):
+                        c = first + i - PAD
+                        if 0 <= c < images.shape[2]:
+                            images[8 + shapes, r, c] += g * dv * across[block, 32 + i]
+                            images[9 + shapes, r, c] -= moment * du * across[block, 8 + i]
 
 
 @jit
-def shifted(rows, k, first, shift):
-    """Eight values of row k such that, written ``shift`` further on, each stays where it was; those that fall out are left out."""
-    if shift == 0:
-        return eight(rows, k, first)
-    return (
-        one(rows, k, first, shift, 0), one(rows, k, first, shift, 1), one(rows, k, first, shift, 2), one(rows, k, first, shift, 3),
-        one(rows, k, first, shift, 4), one(rows, k, first, shift, 5), one(rows, k, first, shift, 6), one(rows, k, first, shift, 7),
-    )  # fmt: skip
+def slide(parts, by):
+    """Move eight pixels of the parts, so that each stays where it was when they are written ``by`` pixels further on."""
+    for k in range(3):
+        for i in range(64) if by > 0 else range(63, -1, -1):
+            parts[k, i] = parts[k, i + 8 * by] if 0 <= i + 8 * by < 64 else np.float32(0.0)
 
 
 @jit
-def one(rows, k, first, shift, j):
-    """Value j of eight that have been shifted."""
-    i = j + shift
-    return rows[k, first + i] if 0 <= i < 8 else 0.0
+def spread_planes(planes, images, count):
+    """Write the planes as images, F summed over the rows."""
+    for r in range(images.shape[1]):
+        for c in range(images.shape[2]):
+            at = 8 * (c + PAD)
+            before = images[0, r - 1, c] if r > 0 else 0.0
+            images[0, r, c] = before + planes[r, at]
+            for j in range(1, count):
+                images[j, r, c] = planes[r, at + j]
 
 
 @jit
@@ -303,26 +324,50 @@ def spot_profile(out, centre, s, aperture):
 
 
 @jit
-def draw(images, kind, p, aperture, light, surface, points, table, across, down):
+def draw(images, planes, kind, p, aperture, light, surface, points, table, across, down, parts):
     """Fill the images of a shape with centre (p[0], p[1]) in their own pixels; the last 4 of ``p`` are the planes of background and light.
 
     ``surface``: the light falls off over the shape, before the blur; its slopes then enter the derivatives by the outline and the blur.
     """
     shapes = SHAPES[kind]
-    images[: 4 + shapes] = 0.0
     if light:
         images[8 + shapes : 10 + shapes] = 0.0
     if kind == SPOT:
         draw_spot(images, p, aperture)
-    else:
-        gx, gy = (p[shapes + 7], p[shapes + 8]) if light and surface else (0.0, 0.0)
-        for inner in range(2 if kind == RING else 1):
-            count = outline(points, kind, inner == 1, p)
-            points[count, 0], points[count, 1] = p[0], p[1]
-            draw_outline(images, points, count, shapes, p[2 + shapes], aperture, light and surface, gx, gy, table, across, down)
-        for r in range(1, images.shape[1]):
-            for c in range(images.shape[2]):
-                images[0, r, c] += images[0, r - 1, c]
+        return
+    draw_planes(images, planes, kind, p, aperture, light and surface, points, table, across, down, parts)
+    spread_planes(planes, images, 4 + shapes)
+
+
+@jit
+def draw_planes(images, planes, kind, p, aperture, light, points, table, across, down, parts):
+    """Draw all outlines of a shape; see `draw_outline`."""
+    shapes = SHAPES[kind]
+    planes[:] = np.float32(0.0)
+    gx, gy = (p[shapes + 7], p[shapes + 8]) if light else (0.0, 0.0)
+    for inner in range(2 if kind == RING else 1):
+        count = outline(points, kind, inner == 1, p)
+        points[count, 0], points[count, 1] = p[0], p[1]
+        draw_outline(planes, images, points, count, shapes, p[2 + shapes], aperture, light, gx, gy, table, across, down, parts)
+
+
+@jit
+def draw_plain(images, planes, kind, p, aperture, points, table, across, down, parts):
+    """`draw` and `complete` in one, where neither background nor light have a slope among the unknowns."""
+    k = SHAPES[kind] + 3
+    if kind == SPOT:
+        draw(images, planes, kind, p, aperture, False, False, points, table, across, down, parts)
+        complete(images, kind, p, False, False)
+        return
+    draw_planes(images, planes, kind, p, aperture, False, points, table, across, down, parts)
+    amplitude, background = p[k], p[k + 1]
+    for r in range(images.shape[1]):
+        for c in range(images.shape[2]):
+            at = 8 * (c + PAD)
+            f = planes[r, at] + (images[k + 1, r - 1, c] if r > 0 else 0.0)
+            images[k + 1, r, c], images[0, r, c], images[k + 2, r, c] = f, background + amplitude * f, 1.0
+            for j in range(1, k + 1):
+                images[j, r, c] = amplitude * planes[r, at + j]
 
 
 @jit

@@ -10,7 +10,8 @@ from pixmetry.core.jit import jit
 from pixmetry.location._line_kernels import LEAST_SIGMA, LEAST_WIDTH, RESTLESS, SHARED, SINGULAR, covered
 from pixmetry.location._profile_kernels import BAR, ROOT, clipped, invert, step
 
-# Unknowns: the crossing against the candidate's, the angles, background, heights, blurs, widths, what the overlap adds, background's slopes.
+# Unknowns: the crossing against the candidate's, the angles, background, heights, blurs, widths, what the overlap adds, and the slopes
+# of the background.
 X, Y, ANGLE_1, ANGLE_2, BACKGROUND, HEIGHT_1, HEIGHT_2, SIGMA_1, SIGMA_2, WIDTH_1, WIDTH_2, OVERLAP, SLOPE_X, SLOPE_Y = range(14)
 UNKNOWNS = 14
 MOST_PASSES = 40
@@ -132,9 +133,9 @@ def cross_trial(p, change, active, count, arm, trial):
     size, reach = 1.0, 0.5 * (min(p[SIGMA_1], p[SIGMA_2]) + 0.5)
     for j in range(count):
         k, most = active[j], np.inf
-        if k == X or k == Y:
+        if k in (X, Y):
             most = reach
-        elif k == ANGLE_1 or k == ANGLE_2:
+        elif k in (ANGLE_1, ANGLE_2):
             most = reach / max(arm, 1.0)
         elif SIGMA_1 <= k <= WIDTH_2:
             most = 0.5 * p[k]
@@ -164,7 +165,7 @@ def cross_descend(section, p, angles, arm, aperture, noise, pixels, n, weight, f
             k = active[j]
             damped[j, j] *= 1.0 + damping
             pull[j] = right[j]
-            least = LEAST_SIGMA if k == SIGMA_1 or k == SIGMA_2 else LEAST_WIDTH if k == WIDTH_1 or k == WIDTH_2 else -np.inf
+            least = LEAST_SIGMA if k in (SIGMA_1, SIGMA_2) else LEAST_WIDTH if k in (WIDTH_1, WIDTH_2) else -np.inf
             if p[k] <= least and right[j] < 0.0:
                 damped[j, :] = 0.0
                 damped[:, j] = 0.0
@@ -197,7 +198,10 @@ def cross_descend(section, p, angles, arm, aperture, noise, pixels, n, weight, f
 
 
 @jit
-def fit_crosses(frame, first, stop, section, slopes, aperture, noise, crossing, angles, arms, reach, cores, lines, begin, start, found, covariances, told):
+def fit_crosses(
+    frame, first, stop, section, slopes, aperture, noise, crossing, angles, arms, reach, cores, lines, begin, start, found, covariances,
+    told,
+):
     """Fit crosses ``first`` to ``stop``.
 
     ``lines``: places and cores of all lines, indices of those near each cross, and the two that make it. ``section``, shape (n,).
@@ -210,13 +214,14 @@ def fit_crosses(frame, first, stop, section, slopes, aperture, noise, crossing, 
         found[i], covariances[i], told[i] = np.nan, np.nan, np.nan
         room = int(2.2 * (reach[i, 0] + 1) * (arms[i, 1] - arms[i, 0] + 4) + 2.2 * (reach[i, 1] + 1) * (arms[i, 3] - arms[i, 2] + 4)) + 64
         pixels = np.empty((room, 3))
+        a, b = begin[i], begin[i + 1]
         n, met = cross_gather(
-            frame, crossing[i], angles[i], arms[i], reach[i], cores[i], places, spoil, near, begin[i], begin[i + 1], pairs[i], noise[5], noise[4], pixels
+            frame, crossing[i], angles[i], arms[i], reach[i], cores[i], places, spoil, near, a, b, pairs[i], noise[5], noise[4], pixels
         )
         p = start[i].copy()
         count = 0
         for k in range(UNKNOWNS):
-            if ((k == WIDTH_1 or k == WIDTH_2) and section[i] != BAR) or (k >= SLOPE_X and not slopes):
+            if (k in (WIDTH_1, WIDTH_2) and section[i] != BAR) or (k >= SLOPE_X and not slopes):
                 continue
             active[count] = k
             count += 1
@@ -231,7 +236,7 @@ def fit_crosses(frame, first, stop, section, slopes, aperture, noise, crossing, 
         kept = 0
         for j in range(count):  # what is held at its least is no unknown
             k = active[j]
-            held = ((k == SIGMA_1 or k == SIGMA_2) and p[k] <= LEAST_SIGMA) or ((k == WIDTH_1 or k == WIDTH_2) and p[k] <= LEAST_WIDTH)
+            held = (k in (SIGMA_1, SIGMA_2) and p[k] <= LEAST_SIGMA) or (k in (WIDTH_1, WIDTH_2) and p[k] <= LEAST_WIDTH)
             if not held:
                 active[kept] = k
                 kept += 1

@@ -7,6 +7,8 @@ import math
 import numpy as np
 
 from pixmetry.core.jit import jit
+from pixmetry.location._line_kernels import gather
+from pixmetry.location._profile_kernels import BAR, EDGE, GAUSSIAN, profile
 
 FIELDS = 5  # of a point: signal over noise, shift in x and in y from the pixel's centre, direction, strength
 TURN = 0.5  # most change of direction from point to point, rad
@@ -207,7 +209,10 @@ def parabola(t, d, n, curved, out):
 
 @jit
 def pieces(x, y, start, least, tolerance, most_turn, found):
-    """Cut chains into stretches that a parabola fits; rows of ``found``: x, y, angle, curvature, least, greatest place, chain. Their number."""
+    """Cut chains into stretches that a parabola fits; return their number.
+
+    Rows of ``found``: x, y, angle, curvature, least and greatest place along, chain.
+    """
     count = 0
     first_of, last_of = np.empty(256, np.int64), np.empty(256, np.int64)
     fit = np.empty(3)
@@ -348,7 +353,7 @@ def describe(frame, kind, state, scale, total, hits):
 
 @jit
 def follow(frame, kind, state, most_turn):
-    """Follow a line or edge both ways as far as it goes, and lay it anew through where it passes; ``state`` in place. False if it is none."""
+    """Follow a line or edge both ways as far as it goes, and lay it anew through where it passes, in place; False if it is none."""
     rows, cols = frame.shape
     room = int(2 * math.hypot(rows, cols)) + 64
     strong, middle, aside, smooth = np.empty(room), np.empty(room), np.empty(room), np.empty(room)
@@ -480,12 +485,41 @@ def good_share(frame, kind, state):
 
 
 @jit
-def refine(frame, kind, states, scales, first, stop, most_turn, good):
-    """Describe and follow lines or edges; ``good`` tells which are any."""
+def strength(frame, kind, state):
+    """Return the amplitude that a least-squares fit of the line's section and a background gives, over its standard deviation."""
+    c, s = math.cos(state[2]), math.sin(state[2])
+    a, b = max(abs(c), abs(s)), min(abs(c), abs(s))
+    blur = math.hypot(state[8], 0.2887)
+    reach = 0.5 * state[9] + 3.0 * blur + 1.0 if kind == LINE else 2.0 * blur + 1.5
+    section = EDGE if kind == STEP else BAR if state[9] > 0.0 else GAUSSIAN
+    length = state[5] - state[4]
+    room = int((2.0 * reach + 2.0) * (length + 2.0) * 1.5 + 8.0 * (reach + length)) + 64
+    x, y, value = np.empty(room), np.empty(room), np.empty(room)
+    place = np.array([state[0], state[1], state[2], state[4], state[5], state[3]])
+    none, nobody = np.zeros((1, 6)), np.zeros(1, np.int64)
+    n, _ = gather(frame, place, reach, 0, none, none[0], nobody, 0, 0, 1e30, -1e30, x, y, value)
+    sums = np.zeros(4)
+    for i in range(n):
+        t = c * x[i] + s * y[i]
+        p = profile(section, c * y[i] - s * x[i] - 0.5 * state[3] * t * t, state[8], max(state[9], 0.1), a, b)[0]
+        sums[0] += p
+        sums[1] += p * p
+        sums[2] += value[i] - state[6]
+        sums[3] += p * (value[i] - state[6])
+    if n < 9:
+        return 0.0
+    energy = sums[1] - sums[0] * sums[0] / n
+    return (sums[3] - sums[0] * sums[2] / n) / math.sqrt(max(energy, 1e-12)) / max(state[10], 1e-9)
+
+
+@jit
+def refine(frame, kind, states, scales, first, stop, most_turn, strengths):
+    """Describe and follow lines or edges; ``strengths`` tells their amplitudes over their standard deviations, 0 for what is no line."""
     total, hits = np.empty(SAMPLES), np.empty(SAMPLES)
     for i in range(first, stop):
         describe(frame, kind, states[i], scales[i], total, hits)
-        good[i] = math.isfinite(states[i, 7]) and states[i, 7] != 0.0 and follow(frame, kind, states[i], most_turn)
-        if good[i]:
+        if math.isfinite(states[i, 7]) and states[i, 7] != 0.0 and follow(frame, kind, states[i], most_turn):
             describe(frame, kind, states[i], scales[i], total, hits)
-            good[i] = math.isfinite(states[i, 7]) and good_share(frame, kind, states[i]) > LEAST_SHARE
+            if math.isfinite(states[i, 7]) and good_share(frame, kind, states[i]) > LEAST_SHARE:
+                found = strength(frame, kind, states[i])
+                strengths[i] = abs(found) if found * states[i, 7] > 0.0 else 0.0

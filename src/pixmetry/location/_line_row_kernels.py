@@ -43,7 +43,9 @@ def weigh(law, q, v):
 
 @jit
 def predicted_row(law, section, p, a, b, slope, at, first, count, noise, sign, pedestal, out):
-    """Fill ``out`` with what a row's pixels hold on average: value, variance, weight, its variance and slope; return Σ weight and Σ weight·x.
+    """Fill ``out`` with what a row's pixels hold on average: value, variance, weight, its variance, its slope, and the pixel's variance.
+
+    Return Σ weight and Σ weight·x.
 
     ``slope``: how the distance across grows along the row; the line crosses it at ``at``. For an edge the values are steps from one pixel
     to the next, ``sign`` times.
@@ -72,24 +74,15 @@ def predicted_row(law, section, p, a, b, slope, at, first, count, noise, sign, p
 def predicted_variance(law, section, at, first, count, out, total):
     """Return the variance of a row's position and its change per DN of background (propagator P1 about the line's own place)."""
     var, by_background = 0.0, 0.0
-    if section != EDGE:
-        for k in range(count):
-            x = first + k - at
-            var += out[k, 3] * x * x
-            by_background -= out[k, 4] * x
-        return var / (total * total), by_background / total
-    for k in range(count):  # a pixel is in two differences
-        here = out[k, 4] * (first + k - 0.5 - at) if k > 0 else 0.0
-        following = out[k + 1, 4] * (first + k + 0.5 - at) if k < count - 1 else 0.0
-        v = out[k, 5] if k > 0 else out[1, 1] - out[1, 5]
-        var += (here - following) ** 2 * v
-    if law == SQUARED:
-        for k in range(1, count):
-            x = first + k - 0.5 - at
-            var += 2.0 * (out[k, 1] * x) ** 2
-            if k < count - 1:
-                var += 4.0 * x * (x + 1.0) * out[k, 5] ** 2
-    return var / (total * total), 0.0
+    begin, middle = (1, 0.5) if section == EDGE else (0, 0.0)
+    for k in range(begin, count):
+        x = first + k - middle - at
+        var += out[k, 3] * x * x
+        by_background -= out[k, 4] * x
+        if section == EDGE and k < count - 1:  # two steps share a pixel
+            shared = -out[k, 5] * out[k, 4] * out[k + 1, 4] + (2.0 * out[k, 5] ** 2 if law == SQUARED else 0.0)
+            var += 2.0 * x * (x + 1.0) * shared
+    return max(var, 0.0) / (total * total), 0.0 if section == EDGE else by_background / total
 
 
 @jit

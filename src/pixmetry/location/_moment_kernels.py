@@ -16,6 +16,7 @@ X, Y, MAJOR, MINOR, ANGLE, REACH, MARGIN, INNER, OUTER, SIGN, THRESHOLD, SPREAD,
 C00, C01, C02, C11, C12, C22 = range(15, 21)
 EXCESS, AMPLITUDE = 21, 22
 COLUMNS = 23
+SHARP_PX = 0.6  # blur, pixel included, below which the pixel's square shape matters
 SUMS = {"reassoc", "contract", "nsz"}  # sums may be taken in any order, so that they fill the vector registers
 
 
@@ -45,7 +46,7 @@ def chord(p, q, r, dy):
 
 @jit
 def limit_margins(record, start, index):
-    """Shrink windows so that they end halfway to the light of the nearest neighbour; return how far light is from each half-height edge."""
+    """Return how far a window may reach beyond each half-height edge: a little less than halfway to that of the nearest neighbour."""
     n = record.shape[0]
     free = np.full(n, np.inf)
     for i in range(n):
@@ -58,13 +59,13 @@ def limit_margins(record, start, index):
                 own = apart / math.sqrt(p * dx * dx + 2 * q * dx * dy + r * dy * dy)
                 p, q, r = quadratic_form(record[j, MAJOR], record[j, MINOR], record[j, ANGLE])
                 other = apart / math.sqrt(p * dx * dx + 2 * q * dx * dy + r * dy * dy)
-                free[i] = min(free[i], 0.5 * (apart - own - other))
+                free[i] = min(free[i], 0.42 * (apart - own - other))
     return free
 
 
 @jit
 def list_holes(record, i, start, index, holes):
-    """Write the ellipses that are not background around target i: its own light and that of each neighbour within reach; return how many."""
+    """Write the ellipses that are not background around target i: its own light and its neighbours'; return how many."""
     holes[0, 0], holes[0, 1] = record[i, X], record[i, Y]
     reach = record[i, INNER]
     holes[0, 2], holes[0, 3], holes[0, 4] = quadratic_form(record[i, MAJOR] + reach, record[i, MINOR] + reach, record[i, ANGLE])
@@ -127,6 +128,19 @@ def fit_ground(frame, record, i, holes, count, cuts, noise, clip):
         rn, ru, ruu, rd, rdu, rdd = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         for part in range(found + 1):
             end = right if part == found else min(cuts[part, 0] - 1, right)
+            if clip <= 0.0 and end >= at:  # all count, and the sums without data are known
+                many = float(end - at + 1)
+                centre = 0.5 * (at + end) - x0
+                rn += many
+                ru += many * centre
+                ruu += many * centre * centre + many * (many * many - 1.0) / 12.0
+                for col in range(at, end + 1):
+                    u = col - x0
+                    d = frame[row, col] - base - gx * col
+                    rd += d
+                    rdu += d * u
+                    rdd += d * d
+                end = at - 1
             for col in range(at, end + 1):
                 u = col - x0
                 d = frame[row, col] - base - gx * col
@@ -155,7 +169,9 @@ def fit_ground(frame, record, i, holes, count, cuts, noise, clip):
     k00, k01, k02 = m11 * m22 - suv * suv, suv * sv - su * m22, su * suv - m11 * sv
     det = m00 * k00 + su * k01 + sv * k02
     k11, k12, k22 = m00 * m22 - sv * sv, su * sv - m00 * suv, m00 * m11 - su * su
-    d0, d1, d2 = (k00 * sd + k01 * sdu + k02 * sdv) / det, (k01 * sd + k11 * sdu + k12 * sdv) / det, (k02 * sd + k12 * sdu + k22 * sdv) / det
+    d0 = (k00 * sd + k01 * sdu + k02 * sdv) / det
+    d1 = (k01 * sd + k11 * sdu + k12 * sdv) / det
+    d2 = (k02 * sd + k12 * sdu + k22 * sdv) / det
     chi2 = max(sdd - d0 * sd - d1 * sdu - d2 * sdv, 0.0) / variance / max(n - 3.0, 1.0)
     record[i, LEVEL], record[i, SLOPE_X], record[i, SLOPE_Y] = level + d0, gx + d1, gy + d2
     factor = variance * max(1.0, chi2 if n > 20.0 else 1.0) / det
@@ -287,7 +303,7 @@ def moment_of(frame, record, i, law, noise, sums, result):
     furthest = record[i, MINOR] + record[i, MARGIN]
     at_rest = False
     result[:] = np.nan
-    for _ in range(12):
+    for turn in range(16):
         window_sums(frame, record, i, law, cx, cy, noise, sums)
         if not sums[0] > 0.0:
             return False
@@ -298,8 +314,11 @@ def moment_of(frame, record, i, law, noise, sums, result):
         if abs(mx) + abs(my) < 1e-3 or (abs(mx) + abs(my)) * sums[0] < 0.05 * math.sqrt(sums[12] + sums[14]):
             at_rest = True
             break
-        cx, cy = cx + mx, cy + my
-    at_rest = at_rest or (abs(mx) + abs(my)) * sums[0] < 0.3 * math.sqrt(sums[12] + sums[14])
+        if turn < 15:
+            step = 1.0 if turn < 4 else 0.5
+            cx, cy = cx + step * mx, cy + step * my
+    # a centroid of a window that lies off by less than the noise is still one
+    at_rest = at_rest or (abs(mx) + abs(my)) * sums[0] < math.sqrt(sums[12] + sums[14])
     total = sums[0]
     result[0], result[1] = cx + mx, cy + my
     result[2] = (sums[12] - 2 * mx * sums[10] + mx * mx * sums[9]) / total**2
@@ -387,6 +406,7 @@ def windowed_of(frame, record, i, noise, weights, result):
         if abs(mx) + abs(my) < 2e-4 or (abs(mx) + abs(my)) * min(jxx, jyy) < 0.02 * math.sqrt(nxx + nyy):
             at_rest = True
             break
+    at_rest = at_rest or (abs(mx) + abs(my)) * min(jxx, jyy) < math.sqrt(nxx + nyy)
     ixx, ixy, iyy = jyy / det, -jxy / det, jxx / det
     result[0], result[1] = cx, cy
     result[2] = ixx * ixx * nxx + 2 * ixx * ixy * nxy + ixy * ixy * nyy
@@ -474,6 +494,17 @@ def best_thresholds(shape, first, stop, law, multiples, noise, nodes, weights, s
             if phase + random < least:
                 least = phase + random
                 out[i, 0], out[i, 1], out[i, 2] = multiples[m], phase, excess / deviation**2
+        if shape[i, 1] < SHARP_PX:
+            # the square pixel counts: the phases of a radius and of one a quarter of a pixel larger, where S-curves of one cycle swing over
+            pair = 0.0
+            for size in range(2):
+                pair += square_pixel_variance(
+                    shape[i, 0] + 0.25 * size, shape[i, 1], law, out[i, 0] * deviation, amplitude, sign, level, noise,
+                    shape[i, 5], shape[i, 6], nodes, weights, step,
+                )  # fmt: skip
+            out[i, 1] = pair
+        if law in (SQUARED, WINDOWED):
+            out[i, 1] *= 0.5  # the mean over radii; a threshold's depends on the outline so finely that the most is taken
 
 
 @jit
@@ -482,7 +513,7 @@ def phase_and_noise(profile, law, threshold, amplitude, sign, level, noise, spre
 
     With h(r) the mean of f at a radius, noise included, Poisson's sum gives an error of 2 S(q) sin(2π k·c) k/|k| / ∫h for each pair ±k of
     the lattice's frequencies, q = |k|, S(q) = ∫ x h sin(2πqx) = −(1/q) ∫ h'(r) r² J2(2πqr) dr. S swings with the radius like a cosine; the
-    modulus of J2 + iY2 in its place is the most that it can be near this radius.
+    modulus of J2 + iY2 in its place is the most that it can be near this radius. The pixel counts as a part of a Gaussian blur.
     """
     n = profile.shape[0]
     mean = np.empty(n)
@@ -491,7 +522,7 @@ def phase_and_noise(profile, law, threshold, amplitude, sign, level, noise, spre
         r = (j + 0.5) * step
         ring = r * step
         value = amplitude * profile[j]
-        if law == SOFT or law == HARD:
+        if law in (SOFT, HARD):
             v = max(variance_at(level + sign * value, noise), 1e-12)
             s = math.sqrt(v)
             z = (value - threshold) / s
@@ -526,3 +557,82 @@ def phase_and_noise(profile, law, threshold, amplitude, sign, level, noise, spre
         variance += 0.125 * many[k] * (re * re + im * im) / (math.pi * shells[k] * max(total - pull, 1e-300)) ** 2
     random = exact / (4.0 * math.pi * total * total) if total > 0.0 else np.inf
     return variance, math.pi * (exact - linear), random
+
+
+@jit(inline="always")
+def mean_response(value, radius2, law, threshold, sign, level, noise, spread):
+    """Mean of f over the noise at a mean grey value; for the Gaussian window times its weight."""
+    if law == SQUARED:
+        return value * value
+    if law == WINDOWED:
+        return value * math.exp(-0.5 * radius2 / (spread * spread))
+    s = math.sqrt(max(variance_at(level + sign * value, noise), 1e-12))
+    z = (value - threshold) / s
+    if z > 8.0:
+        share, density = 1.0, 0.0
+    elif z < -8.0:
+        return 0.0
+    else:
+        share, density = 0.5 * math.erfc(-z * 0.7071067811865476), 0.3989422804014327 * math.exp(-0.5 * z * z)
+    h = s * (z * share + density)
+    return h + threshold * share if law == HARD else h
+
+
+@jit
+def square_pixel_variance(radius, blur, law, threshold, amplitude, sign, level, noise, window, spread, nodes, weights, step):
+    """Variance over the phase along x of a disc averaged over square pixels: S(k) = ∬ x h sin(2πk x) cos(2πl y) on a grid of eighths."""
+    optical = math.sqrt(max(blur * blur - 1.0 / 12.0, 0.01))
+    n = int(window / step) + 1
+    wide = n + 4
+    profile = np.empty(int(1.5 * wide) + 2)
+    disc_profile(radius, optical, nodes, weights, step, profile)
+    sharp, flat = np.empty((wide, wide)), np.empty((wide, n))
+    for a in range(wide):
+        for b in range(wide):
+            place = math.sqrt(float(a * a + b * b)) - 0.5
+            j = int(max(place, 0.0))
+            part = max(place, 0.0) - j
+            sharp[a, b] = profile[j] + part * (profile[j + 1] - profile[j])
+    for a in range(wide):
+        for b in range(n):
+            total = 0.5 * (sharp[a, abs(b - 4)] + sharp[a, b + 4])
+            for m in range(-3, 4):
+                total += sharp[a, abs(b + m)]
+            flat[a, b] = 0.125 * total
+    top = 0.0
+    area, sums = 0.0, np.zeros((3, 4))
+    waves = np.empty((4, 8, 2))
+    for k in range(4):
+        for j in range(8):
+            waves[k, j, 0], waves[k, j, 1] = math.sin(0.25 * math.pi * k * j), math.cos(0.25 * math.pi * k * j)
+    for a in range(n):
+        r1, r2, r3, line = 0.0, 0.0, 0.0, 0.0
+        for b in range(n):
+            value = 0.5 * (flat[abs(a - 4), b] + flat[a + 4, b])
+            for m in range(-3, 4):
+                value += flat[abs(a + m), b]
+            value *= 0.125
+            if a == 0 and b == 0:
+                top = value
+            radius2 = float(a * a + b * b) * step * step
+            if radius2 > window * window:
+                break
+            h = mean_response(amplitude * value / top, radius2, law, threshold, sign, level, noise, spread)
+            times = 1.0 if b == 0 else 2.0
+            line += times * h * (1.0 - radius2 / (2.0 * spread * spread) if law == WINDOWED else 1.0)
+            x = 2.0 * b * step * h
+            r1 += x * waves[1, b % 8, 0]
+            r2 += x * waves[2, b % 8, 0]
+            r3 += x * waves[3, b % 8, 0]
+        times = 1.0 if a == 0 else 2.0
+        area += times * line
+        for ky in range(4):
+            w = times * waves[ky, a % 8, 1]
+            sums[0, ky] += w * r1
+            sums[1, ky] += w * r2
+            sums[2, ky] += w * r3
+    variance = 0.0
+    for kx in range(3):
+        for ky in range(4):
+            variance += (0.5 if ky == 0 else 1.0) * (2.0 * sums[kx, ky] / area) ** 2
+    return variance

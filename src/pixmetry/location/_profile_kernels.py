@@ -21,6 +21,8 @@ NEAR = 4.5  # standard deviations from an end of the scale within which clipping
 _Z = np.arange(-LIMIT * PER, LIMIT * PER + 2) / PER
 CDF = np.array([0.5 * math.erfc(-z / math.sqrt(2.0)) for z in _Z])
 PDF = np.exp(-0.5 * _Z**2) / math.sqrt(2.0 * math.pi) / PER  # slopes of the cubic, per entry
+BELL = PDF * PER
+BEND = -_Z * BELL / PER
 ROOT = 1.0 / math.sqrt(2.0 * math.pi)
 
 
@@ -36,6 +38,24 @@ def cdf(z):
     f = at - j
     rise = CDF[j + 1] - CDF[j]
     return CDF[j] + f * rise + f * (1.0 - f) * ((1.0 - f) * (PDF[j] - rise) - f * (PDF[j + 1] - rise))
+
+
+@jit
+def both(z):
+    """Distribution function and density of the normal distribution."""
+    if z <= -LIMIT:
+        return 0.0, 0.0
+    if z >= LIMIT:
+        return 1.0, 0.0
+    at = (z + LIMIT) * PER
+    j = int(at)
+    f = at - j
+    g = 1.0 - f
+    rise, climb = CDF[j + 1] - CDF[j], BELL[j + 1] - BELL[j]
+    return (
+        CDF[j] + f * rise + f * g * (g * (PDF[j] - rise) - f * (PDF[j + 1] - rise)),
+        BELL[j] + f * climb + f * g * (g * (BEND[j] - climb) - f * (BEND[j + 1] - climb)),
+    )
 
 
 @jit
@@ -62,7 +82,8 @@ def step(d, s, a, b):
             return 1.0, 0.0, 0.0, 0.0
         if z < -LIMIT:
             return 0.0, 0.0, 0.0, 0.0
-        cz, cy, fz, fy = cdf(z), cdf(y), pdf(z), pdf(y)
+        cz, fz = both(z)
+        cy, fy = both(y)
         return s * (z * cz + fz - y * cy - fy) / a, (cz - cy) / a, (fz - fy) / (s * a), (y * fy - z * fz) / (s * s * a)
     if d - 0.5 * (a + b) > LIMIT * s:
         return 1.0, 0.0, 0.0, 0.0
@@ -72,7 +93,7 @@ def step(d, s, a, b):
     for k in range(4):
         sign = 1.0 if k == 0 or k == 3 else -1.0
         z = (d + (0.5 * a if k < 2 else -0.5 * a) + (0.5 * b if k % 2 == 0 else -0.5 * b)) / s
-        c, f = cdf(z), pdf(z)
+        c, f = both(z)
         e0 += sign * 0.5 * ((z * z + 1.0) * c + z * f)
         e1 += sign * (z * c + f)
         e2 += sign * c

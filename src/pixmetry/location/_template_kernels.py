@@ -7,19 +7,35 @@ import math
 import numpy as np
 
 from pixmetry.core.jit import jit
-from pixmetry.location._contour_template_kernels import ELLIPSE, RING, SHAPES, SPOT, cdf, complete, draw, pdf, phase_count, point_count, reach_px
+from pixmetry.location._contour_template_kernels import (
+    ELLIPSE,
+    PAD,
+    RING,
+    SHAPES,
+    SPOT,
+    block_count,
+    cdf,
+    complete,
+    draw,
+    draw_plain,
+    pdf,
+    phase_count,
+    point_count,
+    reach_px,
+)
 
 MOST = 12  # parameters
 STEPS = 40
-NEARLY = 0.04  # expected fall of χ² at which a step is the last but one: no parameter moves by more than 0.2 of its uncertainty
-AT_REST = 0.01  # the same of the last step, whose error is far smaller than itself
+AT_REST = 0.004  # fall of χ² that the next step would bring when a step is the last: no parameter would move by more than 0.06 of its u
 PATIENCE = 6  # steps after which only the place must be at rest, and χ² hardly fall any more
 HARDLY = 0.5
 LEAST_BLUR_PX = 0.1
 LEAST_RADIUS_PX = 0.2
 SMALL = 2.0  # half axis over blur below which they can hardly be told apart
 VAGUE = 0.5  # relative standard deviation at which radius and blur are held where the image does not tell them apart
+LEAST_SHARE = 0.05  # of the variance that clipping leaves: pixels far beyond the end, which say nothing, must not gain weight
 CLIP = 6.0  # standard deviations from the scale's ends within which clipping is looked at
+LEAST_BACKGROUND = 0.01  # electrons, where their likelihood is used: there are no negative ones
 LEAST_ELECTRONS = 1e-3  # below it a pixel is as good as dark
 MOST_ELECTRONS = 60.0  # of a reading, from which it is as good as a shifted Poisson number
 PER_E = 8.0  # entries of the efficiency per unit of log(electrons)
@@ -73,7 +89,7 @@ def clipped(level, variance, slope, low, high):
     a, b = (low - level) / s, (high - level) / s
     if a < -CLIP and b > CLIP:
         return level, variance, 1.0
-    a, b = min(max(a, -40.0), 40.0), min(max(b, -40.0), 40.0)
+    a, b = max(a, -1e6), min(b, 1e6)  # where the scale has no end
     ca, cb, pa, pb = cdf(a), cdf(b), pdf(a), pdf(b)
     below = s * (a * ca + pa)  # E max(low − value, 0)
     above = s * (pb - b * (1.0 - cb))  # E max(value − high, 0)
@@ -86,12 +102,12 @@ def clipped(level, variance, slope, low, high):
     if b < CLIP:
         second += variance * b * b * (1.0 - cb)
     shift = mean - level
-    return mean, max(second - shift * shift, 1e-3 * variance), inside + (pa - pb) * slope / (2.0 * s)
+    return mean, max(second - shift * shift, LEAST_SHARE * variance), inside + (pa - pb) * slope / (2.0 * s)
 
 
 @jit
 def electrons_expected(d, mean, sigma):
-    """Expected number of electrons behind a reading d = n + noise, in electrons, where n is Poisson with this mean, and −2 ln likelihood."""
+    """Expected number of electrons n behind a reading d = n + noise, where n is Poisson with this mean, and −2 ln likelihood of d."""
     first = max(0, int(math.floor(d - 6.0 * sigma)))
     last = max(first, int(math.ceil(d + 6.0 * sigma)))
     fall = 0.5 / (sigma * sigma)
@@ -122,12 +138,12 @@ def plain_weights(mean, data, mask, weight, residual, w):
 
 
 @jit
-def weigh(images, data, mask, weight, kept, residual, noise, efficiency):
-    """Set the weights and the residuals at the mean that the images hold; return χ², and twice what a better fit makes smaller, now and next.
+def weigh(images, data, mask, weight, kept, residual, noise, efficiency, least, most):
+    """Set the weights and residuals at the mean that the images hold; return χ², and what a better fit makes smaller, for now and for next.
 
     A weight is 1/variance of the mean. Where the scale ends, the mean and its derivatives become those of the clipped value. What shrinks
     is χ² with the ``kept`` weights. With an ``efficiency`` it is −2 ln likelihood; where a reading has few electrons its weight is then its
-    exact information, and the residual its score over that.
+    exact information, and the residual its score over that. No mean is known to be outside ``least`` … ``most``.
     """
     constant, slope, pattern, black, low, high = noise[0], noise[1], noise[2], noise[3], noise[4], noise[5]
     chi2, before, after = 0.0, 0.0, 0.0
@@ -137,16 +153,11 @@ def weigh(images, data, mask, weight, kept, residual, noise, efficiency):
     ended = low > -math.inf or high < math.inf
     sigma_e = s / slope if slope > 0.0 else 0.0
     exact = len(efficiency) > 0 and slope > 0.0
-    if level_free:
-        least, most = math.inf, -math.inf
-        for r in range(data.shape[0]):
-            for c in range(data.shape[1]):
-                least, most = min(least, images[0, r, c]), max(most, images[0, r, c])
-        if not ended or (lowest < least and most < highest):
-            size = data.size
-            mean, w, d = images[0].reshape(size), weight.reshape(size), residual.reshape(size)
-            chi2 = plain_weights(mean, data.reshape(size), mask.reshape(size), w, d, 1.0 / constant)
-            return chi2, chi2, chi2
+    if level_free and (not ended or (lowest < least and most < highest)):
+        size = data.size
+        mean, w, d = images[0].reshape(size), weight.reshape(size), residual.reshape(size)
+        chi2 = plain_weights(mean, data.reshape(size), mask.reshape(size), w, d, 1.0 / constant)
+        return chi2, chi2, chi2
     for r in range(data.shape[0]):
         for c in range(data.shape[1]):
             if mask[r, c] == 0.0:
@@ -191,11 +202,21 @@ def weigh(images, data, mask, weight, kept, residual, noise, efficiency):
 
 
 @jit
-def normal_equations(images, residual, weight, used, count, normal, gradient, scratch):
-    """Fill JᵀWJ and JᵀW · residual for the ``used`` parameters; the images hold the derivatives."""
+def mean_range(kind, p):
+    """Least and greatest mean that a template without planes can have; with planes anything."""
+    k = SHAPES[kind] + 3
+    if p[k + 2] != 0.0 or p[k + 3] != 0.0 or p[k + 4] != 0.0 or p[k + 5] != 0.0:
+        return -math.inf, math.inf
+    margin = 1e-4 * abs(p[k])
+    return min(p[k + 1], p[k + 1] + p[k]) - margin, max(p[k + 1], p[k + 1] + p[k]) + margin
+
+
+@jit
+def normal_equations(images, residual, weight, used, first, count, normal, gradient, scratch):
+    """Fill JᵀWJ and JᵀW · residual for the ``used`` parameters, from the ``first`` on; the images hold the derivatives."""
     size = weight.size
     w, d = weight.reshape(size), residual.reshape(size)
-    for a in range(count):
+    for a in range(first, count):
         column = images[1 + used[a]].reshape(size)
         for i in range(size):
             scratch[i] = w[i] * column[i]
@@ -311,8 +332,8 @@ def moments(kind, p, step, out):
 
 
 @jit
-def move(kind, p, step, used, count, full, figures, out):
-    """Take a step; blur and radii stay above what can be drawn, and change by at most a third.
+def move(kind, p, step, used, count, darkest, full, figures, out):
+    """Take a step; blur and radii stay above what can be drawn, and change by at most a third, the background not below the ``darkest``.
 
     Of a shape smaller than its blur the image tells little more than the light and the second moment. A step then changes these by what it
     says to first order, so that it follows the curved valley along which radius, blur and amplitude make up for each other.
@@ -339,17 +360,24 @@ def move(kind, p, step, used, count, full, figures, out):
         if figures[0] > 0.25 * area:
             out[3 + s] = light / figures[0]
     out[2 + s] = max(out[2 + s], LEAST_BLUR_PX)
+    out[4 + s] = max(out[4 + s], darkest)
 
 
 @jit
-def pin(kind, p, step, used, count, normal, gradient):
-    """Take blur and radii that would fall below their least values out of the equations; True if there are such."""
+def pin(kind, p, step, used, count, darkest, normal, gradient):
+    """Take blur, radii and background that would fall below their least values out of the equations; True if there are such."""
     s = SHAPES[kind]
     found = False
     for a in range(count):
         j = used[a]
-        least = LEAST_BLUR_PX if j == 2 + s else LEAST_RADIUS_PX
-        if (j == 2 + s or (2 <= j < 2 + min(s, 2))) and p[j] <= least and step[a] < 0.0:
+        least = -math.inf
+        if j == 4 + s:
+            least = darkest
+        elif j == 2 + s:
+            least = LEAST_BLUR_PX
+        elif 2 <= j < 2 + min(s, 2):
+            least = LEAST_RADIUS_PX
+        if p[j] <= least and step[a] < 0.0:
             for b in range(normal.shape[0]):
                 normal[a, b] = normal[b, a] = 0.0
             normal[a, a], gradient[a] = 1e18, 0.0
@@ -388,6 +416,21 @@ def falls_with(normal, gradient, chosen, small, right, step, factor):
 
 
 @jit
+def add_planes(images, p, count):
+    """Derivatives by the slopes of background and light, where these are 0.
+
+    Light on the surface differs from light on the image, which this is, by a shift, which is among the unknowns.
+    """
+    for r in range(images.shape[1]):
+        dy = r - p[1]
+        for c in range(images.shape[2]):
+            dx = c - p[0]
+            light = p[count - 2] * images[count - 1, r, c]
+            images[count + 1, r, c], images[count + 2, r, c] = dx * images[count, r, c], dy * images[count, r, c]
+            images[count + 3, r, c], images[count + 4, r, c] = dx * light, dy * light
+
+
+@jit
 def test_planes(normal, gradient, count, small, right, step, factor, quality):
     """Expected falls of χ² with a plane of the background (2), of the light (3) and with both (4)."""
     chosen = np.arange(count + 4)
@@ -404,9 +447,9 @@ def fit(
 ):
     """Fit the template to the targets ``which``, whose windows `cut_out` has packed.
 
-    ``start``: n × parameters; ``home``: n × 2 or more, the places that the windows are about. ``free``: which of them are unknown, the same for all. ``test``: whether to test planes that are not free.
-    Results: ``out`` (parameters), ``variance`` of each, ``covariance`` of x and y, and ``quality``: 0 χ², 2 to 4 the expected falls of χ²
-    with planes, 5 steps taken (negative: not at rest).
+    ``start``: n × parameters; ``home``: n × 2 or more, the places that the windows are about. ``free``: which parameters are unknown, the
+    base and perhaps planes. ``test``: whether to test planes, none of which is free then. Results: ``out`` (parameters), ``variance`` of
+    each, ``covariance`` of x and y, and ``quality``: 0 χ², 2 to 4 the expected falls of χ² with planes, 5 steps (negative: not at rest).
     """
     parameters = start.shape[1]
     s = SHAPES[kind]
@@ -417,12 +460,13 @@ def fit(
         longest = max(longest, longest_px(kind, start[i]))
         broadest = max(broadest, start[i, 2 + s])
     largest, broadest = 2.0 * longest + 2.0, 2.5 * broadest + 0.5
-    widest = (2 * reach_px(broadest, aperture) + 7) // 8 * 8
+    blocks = block_count(reach_px(broadest, aperture))
+    store_planes = np.empty(side * 8 * ((side + 7) // 8 * 8 + 2 * PAD), np.float32)
     store, store_residual, scratch = np.empty((parameters + 1) * most), np.empty(most), np.empty(most)
     store_weight, store_kept = np.empty(most), np.empty(most)
     points = np.empty((point_count(largest, LEAST_BLUR_PX) + 1, 7))
-    table = np.empty((phase_count(LEAST_BLUR_PX) + 2, 6, widest))
-    across, down = np.empty((3, widest)), np.empty((4, widest))
+    table = np.empty((phase_count(LEAST_BLUR_PX) + 2, 48 * blocks), np.float32)
+    across, down, parts = np.empty((blocks, 40), np.float32), np.empty((blocks, 40), np.float32), np.empty((3, 64), np.float32)
     normal, small, factor = np.empty((MOST, MOST)), np.empty((MOST, MOST)), np.empty((MOST, MOST))
     gradient, step, right, column = np.empty(MOST), np.empty(MOST), np.empty(MOST), np.empty(MOST)
     p, trial, begin = np.empty(parameters), np.empty(parameters), np.empty(parameters)
@@ -430,6 +474,8 @@ def fit(
     used = np.flatnonzero(free)
     count = len(used)
     every = np.arange(parameters)
+    light = free[parameters - 1]
+    darkest = noise[3] + LEAST_BACKGROUND * noise[1] if len(efficiency) > 0 else -math.inf
     for w in range(len(which)):
         i = which[w]
         side = 2 * half[i] + 1
@@ -446,9 +492,8 @@ def fit(
         begin[1] -= row0
         p[:] = begin
         trial[:] = begin
-        chi2, merit, strained, damping, falls, steps = math.inf, math.inf, 0.0, 0.0, math.inf, 0
-        last, at_rest = False, False
-        light = free[parameters - 1]
+        chi2, merit, strained, damping, falls, steps = math.inf, math.inf, 0.0, 0.0, 0.0, 0
+        at_rest = False
         kept[:] = 0.0
         out[i], variance[i], covariance[i] = math.nan, math.nan, math.nan
         quality[i, 0], quality[i, 2:5], quality[i, 5] = math.nan, 0.0, -1.0
@@ -458,41 +503,43 @@ def fit(
             steps += 1
             good = allowed(kind, trial, begin, largest, broadest)
             if good:
-                draw(images, kind, trial, aperture, light, surface, points, table, across, down)
-                complete(images, kind, trial, light, surface)
-                squares, before, after = weigh(images, values, seen, weight, kept, residual, noise, efficiency)
+                planes = store_planes[: side * 8 * (wide + 2 * PAD)].reshape(side, 8 * (wide + 2 * PAD))
+                if light or free[parameters - 4]:
+                    draw(images, planes, kind, trial, aperture, light, surface, points, table, across, down, parts)
+                    complete(images, kind, trial, light, surface)
+                else:
+                    draw_plain(images, planes, kind, trial, aperture, points, table, across, down, parts)
+                squares, before, after = weigh(images, values, seen, weight, kept, residual, noise, efficiency, *mean_range(kind, trial))
                 held = strain(kind, trial, begin)
-                good = falls < AT_REST or before + held <= merit + strained + 1e-4 * chi2 + 0.02  # the template is not smoother than this
+                good = before + held <= merit + strained + 1e-4 * chi2 + 0.02  # the template is not smoother than this
             if good:
                 p[:] = trial
                 chi2, merit, strained = squares, after, held
                 kept, weight = weight, kept
-                if last and test:
-                    normal_equations(images, residual, kept, every, parameters, normal, gradient, scratch)
-                else:
-                    normal_equations(images, residual, kept, used, count, normal, gradient, scratch)
+                normal_equations(images, residual, kept, used, 0, count, normal, gradient, scratch)
                 hold(kind, p, begin, used, count, normal, gradient)
                 damping = 0.0 if damping < 1e-3 else 0.1 * damping
             else:
-                last = False
                 damping = max(10.0 * damping, 1e-2)
                 if damping > 1e8:
                     break
             if not solve(count, normal, gradient, damping, step, factor):
                 break
-            if pin(kind, p, step, used, count, normal, gradient) and not solve(count, normal, gradient, damping, step, factor):
+            if pin(kind, p, step, used, count, darkest, normal, gradient) and not solve(count, normal, gradient, damping, step, factor):
                 break
-            falls = dot(step[:count], gradient[:count])
-            move(kind, p, step, used, count, full, figures, trial)
+            fell, falls = falls, dot(step[:count], gradient[:count])
+            if steps > PATIENCE and falls > 0.25 * fell:  # to and fro: half a step lands between
+                for a in range(count):
+                    step[a] *= 0.5
+            move(kind, p, step, used, count, darkest, full, figures, trial)
             if good and (damping == 0.0 or (steps > PATIENCE and damping < 0.05)):
-                calm = falls < AT_REST
-                if steps > PATIENCE and falls < HARDLY and not calm:
-                    calm = place_covariance(count, normal, right, column, factor, figures) and place_at_rest(step, figures)
-                if calm and (last or not test):
-                    at_rest = True
+                # steps shrink by a like factor each time, or faster: what the next one will bring is known before it is made
+                next_falls = falls * min(1.0, falls / fell)
+                at_rest = next_falls < AT_REST
+                if steps > PATIENCE and falls < HARDLY and not at_rest:
+                    at_rest = place_covariance(count, normal, right, column, factor, figures) and place_at_rest(step, figures)
+                if at_rest:
                     break
-                last = calm or falls < NEARLY
-                light = free[parameters - 1] or (test and last)
         if math.isinf(chi2):
             continue
         out[i] = trial if at_rest else p
@@ -509,12 +556,14 @@ def fit(
                 if a < 2:
                     covariance[i, a], covariance[i, 1 + a] = step[0], step[1]
         if test:
+            add_planes(images, p, count)
+            normal_equations(images, residual, kept, every, count, parameters, normal, gradient, scratch)
             test_planes(normal, gradient, count, small, right, step, factor, quality[i])
 
 
 @jit
 def residuals(frame, kind, parameters, which, home, half, outer, reach, near_start, near_index, noise, aperture, edge, share):
-    """Return levels and residuals over √(1 − leverage) of the pixels where a shift by ``edge`` px moves the mean by less than ``share`` σ."""
+    """Return levels and residuals/√(1 − leverage) of the pixels where a shift by ``edge`` px moves the mean by less than ``share`` σ."""
     s = SHAPES[kind]
     count = s + 5
     used = np.arange(count)
@@ -533,15 +582,16 @@ def residuals(frame, kind, parameters, which, home, half, outer, reach, near_sta
         wide = (side + 7) // 8 * 8
         data, mask = np.empty(side * wide, np.float32), np.empty(side * wide, np.float32)
         one = which[w : w + 1]
-        cut_out(frame, home, half, outer, reach, near_start, near_index, noise[4], noise[5], one, np.zeros(1, np.int64), data, mask, quality)
+        place = np.zeros(1, np.int64)
+        cut_out(frame, home, half, outer, reach, near_start, near_index, noise[4], noise[5], one, place, data, mask, quality)
         p = parameters[i].copy()
         p[0] -= int(round(home[i, 0])) - half[i]
         p[1] -= int(round(home[i, 1])) - half[i]
         images = mean_images(kind, p, side, side, aperture, True)
         weight, residual, kept = np.empty((side, wide)), np.empty((side, wide)), np.zeros((side, wide))
         values, seen = data.reshape(side, wide), mask.reshape(side, wide)
-        weigh(images, values, seen, weight, kept, residual, noise, np.empty(0))
-        normal_equations(images, residual, weight, used, count, normal, gradient, np.empty(side * wide))
+        weigh(images, values, seen, weight, kept, residual, noise, np.empty(0), *mean_range(kind, p))
+        normal_equations(images, residual, weight, used, 0, count, normal, gradient, np.empty(side * wide))
         inverse[:] = 0.0
         for a in range(count):
             gradient[:count] = 0.0
@@ -567,10 +617,13 @@ def residuals(frame, kind, parameters, which, home, half, outer, reach, near_sta
 def mean_images(kind, p, rows, cols, aperture, surface):
     """Mean and derivatives by all parameters of a window whose first pixel is (0, 0); shape (parameters + 1, rows, cols + padding)."""
     s = SHAPES[kind]
-    images = np.zeros((s + 10, rows, (cols + 7) // 8 * 8))
+    wide = (cols + 7) // 8 * 8
+    images = np.zeros((s + 10, rows, wide))
+    planes = np.empty((rows, 8 * (wide + 2 * PAD)), np.float32)
     points = np.empty((point_count(longest_px(kind, p), p[2 + s]) + 1, 7))
-    widest = (2 * reach_px(p[2 + s], aperture) + 7) // 8 * 8
-    table = np.empty((phase_count(p[2 + s]) + 1, 6, widest))
-    draw(images, kind, p, aperture, True, surface, points, table, np.empty((3, widest)), np.empty((4, widest)))
+    blocks = block_count(reach_px(p[2 + s], aperture))
+    table = np.empty((phase_count(p[2 + s]) + 1, 48 * blocks), np.float32)
+    across, down, parts = np.empty((blocks, 40), np.float32), np.empty((blocks, 40), np.float32), np.empty((3, 64), np.float32)
+    draw(images, planes, kind, p, aperture, True, surface, points, table, across, down, parts)
     complete(images, kind, p, True, surface)
     return images

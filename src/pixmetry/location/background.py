@@ -90,12 +90,14 @@ def background(frame: np.ndarray, *, low_dn: float = -math.inf, high_dn: float =
     low, high, grain = scale_of(frame, low_dn, high_dn)
     edge_row, edge_col = (np.linspace(0, side, max(1, round(side / TILE_PX)) + 1).round().astype(np.int64) for side in frame.shape)
     bands = bands_of(len(edge_row) - 1, threads)
-    median, noise, end, *lone = _in_bands(tile_levels, bands, threads, frame, edge_row, edge_col, low, high, np.float32(grain / 4))
+    median, noise, end, lone, lit, light = _in_bands(
+        tile_levels, bands, threads, frame, edge_row, edge_col, low, high, np.float32(grain / 4)
+    )
     floor = grain / math.sqrt(12)
     for side, at in ((-1, low), (1, high)):
         cut = end == side
         if cut.any():
-            away, sigma = before_clipping(*(a[cut] for a in lone), grain / 2 if frame.dtype.kind == "u" else 0.0)
+            away, sigma = before_clipping(lone[cut], lit[cut], light[cut], grain / 2 if frame.dtype.kind == "u" else 0.0)
             median[cut], noise[cut] = at - side * away, sigma
     noise = np.maximum(noise, floor)
     typical = float(np.median(noise))

@@ -1,8 +1,9 @@
 """Coded targets: a disc in a ring of twelve segments, each printed or not, that number the target.
 
-The scheme is that of C.-T. Schneider and K. Sinnreich, "Optical 3-D measurement systems for quality control in industry", Int. Archives of
-Photogrammetry and Remote Sensing XXIX-B5, 56 (1992): the ring is read as a cyclic binary word, and the number is the least of its rotations,
-so that a target needs no upright position. Here the printed segments are even in number, so one misread segment never makes another code.
+The scheme is that of C.-T. Schneider and K. Sinnreich, "Optical 3-D measurement systems for quality control in industry", Int. Archives
+of Photogrammetry and Remote Sensing XXIX-B5, 56 (1992): the ring is read as a cyclic binary word, and the number is the least of its
+rotations, so that a target needs no upright position. Here the printed segments are even in number, so that one misread segment never
+makes another code.
 """
 
 from __future__ import annotations
@@ -35,8 +36,8 @@ class Codes:
     number : ndarray of int
         Number of the code, −1 where there is none or it cannot be trusted.
     margin : ndarray
-        How clearly the least clear segment was read: 1 when it has the full grey value of the disc or of the background, 0 half-way between.
-        NaN where the ring leaves the frame.
+        How clearly the least clear segment was read: 1 when it has the full grey value of the disc or of the background, 0 half-way
+        between. NaN where the ring leaves the frame.
     """
 
     number: np.ndarray
@@ -133,7 +134,7 @@ def read_codes(
 def ring_members(
     x_px: np.ndarray, y_px: np.ndarray, semi_major_px: np.ndarray, semi_minor_px: np.ndarray, angle_deg: np.ndarray, number: np.ndarray
 ) -> np.ndarray:
-    """Which targets are segments of another target's ring, boolean, shape (n,): those whose centre lies between a decoded disc and its ring's end.
+    """Which targets are segments of another one's ring, boolean, shape (n,): those that lie between a decoded disc and its ring's end.
 
     Parameters
     ----------
@@ -188,15 +189,17 @@ def code_svg(number: int, disc_mm: float = 10.0, *, bits: int = BITS, bright: bo
             first, last = 2 * np.pi * bit / bits, 2 * np.pi * (bit + 1) / bits
             (x0, y0), (x1, y1) = ((np.cos(t), np.sin(t)) for t in (first, last))
             shapes.append(
-                f'<path d="M{inner * x0:.6f} {inner * y0:.6f}L{outer * x0:.6f} {outer * y0:.6f}A{outer:.6g} {outer:.6g} 0 0 1 '
-                f'{outer * x1:.6f} {outer * y1:.6f}L{inner * x1:.6f} {inner * y1:.6f}A{inner:.6g} {inner:.6g} 0 0 0 {inner * x0:.6f} {inner * y0:.6f}Z"/>'
+                f'<path d="M{inner * x0:.6f} {inner * y0:.6f}L{outer * x0:.6f} {outer * y0:.6f}'
+                f"A{outer:.6g} {outer:.6g} 0 0 1 {outer * x1:.6f} {outer * y1:.6f}L{inner * x1:.6f} {inner * y1:.6f}"
+                f'A{inner:.6g} {inner:.6g} 0 0 0 {inner * x0:.6f} {inner * y0:.6f}Z"/>'
             )
     if label:
-        shapes.append(f'<text x="{-0.96 * half:.6g}" y="{0.96 * half:.6g}" font-family="sans-serif" font-size="{0.4 * r:.6g}">{number}</text>')
-    size = 2 * half
+        corner = f'x="{-0.96 * half:.6g}" y="{0.96 * half:.6g}"'
+        shapes.append(f'<text {corner} font-family="sans-serif" font-size="{0.4 * r:.6g}">{number}</text>')
+    size, edge = f"{2 * half:.6g}", f"{-half:.6g}"
     return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" width="{size:.6g}mm" height="{size:.6g}mm" viewBox="{-half:.6g} {-half:.6g} {size:.6g} {size:.6g}">'
-        f'<title>coded target {number} of {bits} segments</title><rect x="{-half:.6g}" y="{-half:.6g}" width="{size:.6g}" height="{size:.6g}" '
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{size}mm" height="{size}mm" viewBox="{edge} {edge} {size} {size}">'
+        f'<title>coded target {number} of {bits} segments</title><rect x="{edge}" y="{edge}" width="{size}" height="{size}" '
         f'fill="{paper}"/><g fill="{ink}">{"".join(shapes)}</g></svg>\n'
     )
 

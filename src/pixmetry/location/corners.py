@@ -20,6 +20,7 @@ PLANES = {"never": 0, "always": 1, "auto": 2}
 PLANES_SIGNIFICANT = 23.5  # fall of χ² with 4 unknowns more that noise alone causes once in 1e4
 POOR_FIT_SIGMA = 6.0
 OUTSIDE_PX = 1e6  # where a start that is not a number is put
+LEAST_SQUARE_PX = 4
 CHUNK = 64
 
 
@@ -52,7 +53,9 @@ def find_chessboard(frame: np.ndarray, inner_corners: tuple[int, int]) -> Grid:
 
     cols, rows = (int(n) for n in inner_corners)
     if min(cols, rows) < 3:
-        raise InputError("too few corners to know a chessboard by", where="pattern", value=(cols, rows), allowed="3 × 3 inner corners or more")
+        raise InputError("too few corners to know a board by", where="pattern", value=(cols, rows), allowed="3 × 3 inner corners or more")
+    if min(frame.shape) < LEAST_SQUARE_PX * (min(cols, rows) + 1):  # OpenCV stops with an assertion
+        return no_grid(f"the frame is too small for {cols} × {rows} inner corners", rows, cols)
     grey = eight_bit(frame)
     found, corners = cv2.findChessboardCornersSB(grey, (cols, rows), flags=cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE)
     if not found:
@@ -143,8 +146,8 @@ def corner_positions(
     law[0] = max(law[0], 1e-12)  # a noise model without noise still weights all pixels alike
 
     def fit(start: int) -> None:
-        stop = min(start + CHUNK, n)
-        kernels.fit_corners(frame, x, y, reach, PLANES[planes], float(aperture_px), law, start, stop, found, covariance, chi2, counts, states)
+        results = (start, min(start + CHUNK, n), found, covariance, chi2, counts, states)
+        kernels.fit_corners(frame, x, y, reach, PLANES[planes], float(aperture_px), law, *results)
 
     map_tiles(fit, range(0, n, CHUNK), threads)
     return _positions(x, y, reach, found, covariance, chi2, counts, states)

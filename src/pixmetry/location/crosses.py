@@ -13,7 +13,7 @@ from pixmetry.location import _line_kernels as whole
 from pixmetry.location._profile_kernels import BAR, GAUSSIAN
 from pixmetry.location.line_candidates import LineCandidates
 from pixmetry.location.line_detection import find_lines
-from pixmetry.location.lines import DEG, LEAST_BLUR_PX, PIXEL, fit_template, noise_numbers
+from pixmetry.location.lines import DEG, LEAST_BLUR_PX, PIXEL, Fit, fit_template, noise_numbers
 from pixmetry.location.noise import NoiseModel
 from pixmetry.location.targets import Flag, Positions
 
@@ -150,7 +150,7 @@ def cross_positions(
     return _cross_record(candidates, crossing, angles, found, covariances, told, sections)
 
 
-def _start_places(fit: object, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _start_places(fit: Fit, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Intersections of the fitted lines, curved ones by two steps, and their directions there."""
     p, places = np.nan_to_num(fit.values), fit.places
     angle = places[:, 2] + p[:, whole.ANGLE]
@@ -161,8 +161,8 @@ def _start_places(fit: object, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarra
         ends = []
         for line, t in ((a, t1), (b, t2)):
             bend, here = p[line, whole.CURVE], angle[line]
-            at = x[line] + np.cos(here) * t - np.sin(here) * 0.5 * bend * t * t, y[line] + np.sin(here) * t + np.cos(here) * 0.5 * bend * t * t
-            ends.append((*at, here + bend * t))
+            c, s, sag = np.cos(here), np.sin(here), 0.5 * bend * t * t
+            ends.append((x[line] + c * t - s * sag, y[line] + s * t + c * sag, here + bend * t))
         (x1, y1, d1), (x2, y2, d2) = ends
         turn = np.sin(d2 - d1)
         t1 = t1 + ((x2 - x1) * np.sin(d2) - (y2 - y1) * np.cos(d2)) / turn
@@ -170,7 +170,7 @@ def _start_places(fit: object, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return np.stack([x1, y1], axis=1), np.stack([d1, d2], axis=1)
 
 
-def _start_values(fit: object, pairs: np.ndarray, sections: np.ndarray) -> np.ndarray:
+def _start_values(fit: Fit, pairs: np.ndarray, sections: np.ndarray) -> np.ndarray:
     p = fit.values[pairs]  # (n, 2, …)
     start = np.zeros((len(pairs), kernels.UNKNOWNS))
     start[:, kernels.BACKGROUND] = p[:, :, whole.BACKGROUND].mean(axis=1)
@@ -186,7 +186,7 @@ def _start_values(fit: object, pairs: np.ndarray, sections: np.ndarray) -> np.nd
     return start
 
 
-def _arms(fit: object, pairs: np.ndarray, crossing: np.ndarray, angles: np.ndarray, arm_px: float) -> np.ndarray:
+def _arms(fit: Fit, pairs: np.ndarray, crossing: np.ndarray, angles: np.ndarray, arm_px: float) -> np.ndarray:
     """Least and greatest place along the first and along the second line, from the crossing, shape (n, 4)."""
     out = []
     for side in range(2):
@@ -197,7 +197,7 @@ def _arms(fit: object, pairs: np.ndarray, crossing: np.ndarray, angles: np.ndarr
     return np.stack(out, axis=1)
 
 
-def _near(fit: object, crossing: np.ndarray, reach_px: float) -> tuple[np.ndarray, np.ndarray]:
+def _near(fit: Fit, crossing: np.ndarray, reach_px: float) -> tuple[np.ndarray, np.ndarray]:
     """Which lines come within reach of each crossing."""
     place = fit.places
     c, s = np.cos(place[:, 2]), np.sin(place[:, 2])

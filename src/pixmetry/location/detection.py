@@ -10,11 +10,12 @@ import numpy as np
 from pixmetry.core.errors import InputError
 from pixmetry.core.threads import map_tiles
 from pixmetry.location.background import Background, background, bands_of, scale_of
-from pixmetry.location.targets import Targets
+from pixmetry.location.targets import Flag, Targets
 
 POLARITIES = ("auto", "bright", "dark")
 KINDS = ("disc", "ellipse", "ring", "spot")
 LARGEST_RATIO = 3.2  # of the axes of a disc seen at 70°, 2.9, and some noise
+CUT_FILL = 0.1  # by which segments of a disc are less full than the disc
 THRESHOLD_SIGMA = 4.0
 LEAST_AREA_PX = 3
 BEYOND_DN = 1e30  # no grey value is so far from the background
@@ -144,11 +145,12 @@ def select(targets: Regions, kind: str) -> np.ndarray:
     -----
     A disc, ellipse or spot is full: its fill is 1 up to its pixels and its noise, where a square has 0.955, a triangle 0.83 and two equal
     discs that touch 0.89. Seen at up to 70° from the normal, a disc is an ellipse of axes 1 : 2.9. A ring has a hole, and its moments and
-    area give an outer ellipse that has the size of its box.
+    area give an outer ellipse that has the size of its box. What the frame's border cuts may be a segment of a disc, less full.
     """
     if kind not in KINDS:
         raise InputError("no such kind", value=kind, allowed=", ".join(KINDS))
-    full = targets.fill > _least_fill(targets)
+    cut = (targets.flags & Flag.BORDER) != 0
+    full = targets.fill > _least_fill(targets) - np.where(cut, CUT_FILL, 0.0)
     slim = targets.semi_major_px > LARGEST_RATIO * targets.semi_minor_px
     shaped = _fits_box(targets) & ~slim
     return shaped & ~full & (targets.holes > 0) if kind == "ring" else shaped & full

@@ -32,8 +32,8 @@ def efficiency(sigma_e: float) -> np.ndarray:
 
     References
     ----------
-    D. L. Snyder, C. W. Helstrom, A. D. Lanterman, M. Faisal, R. L. White, J. Opt. Soc. Am. A 12(2), 272 (1995), for the likelihood of Poisson
-    numbers with normal read noise. F. Huang et al., Nature Methods 10, 653 (2013), for the shifted Poisson number.
+    D. L. Snyder, C. W. Helstrom, A. D. Lanterman, M. Faisal, R. L. White, J. Opt. Soc. Am. A 12(2), 272 (1995), for the likelihood of
+    Poisson numbers with normal read noise. F. Huang et al., Nature Methods 10, 653 (2013), for the shifted Poisson number.
     """
     if sigma_e > GAUSSIAN_FROM_E:
         return np.empty(0)

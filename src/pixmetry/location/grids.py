@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -121,7 +121,8 @@ def find_circle_grid(frame: np.ndarray, pattern: tuple[int, int], *, symmetric: 
     Returns
     -------
     Grid
-        Rough places (mostly to 0.1 px, but OpenCV leaves some of noisy pictures off by 1 or 2 px) in the pattern's order; empty with a message where no such grid was seen.
+        Rough places in the pattern's order (mostly to 0.1 px, but in noisy pictures OpenCV leaves some off by 1 or 2 px); empty with a
+        message where no such grid was seen.
 
     Raises
     ------
@@ -160,10 +161,10 @@ def _opencv_circles(picture: np.ndarray, cols: int, rows: int, symmetric: bool) 
     import cv2
 
     flags = cv2.CALIB_CB_SYMMETRIC_GRID if symmetric else cv2.CALIB_CB_ASYMMETRIC_GRID
-    settings = cv2.SimpleBlobDetector_Params()
+    settings = cv2.SimpleBlobDetector_Params()  # type: ignore[attr-defined]
     settings.minArea, settings.maxArea = 12.0, max(12.0, picture.size / (2.0 * cols * rows))
     settings.minDistBetweenBlobs, settings.filterByConvexity, settings.filterByInertia = 3.0, False, False
-    detector = cv2.SimpleBlobDetector_create(settings)
+    detector = cv2.SimpleBlobDetector_create(settings)  # type: ignore[attr-defined]
     for extra in (0, cv2.CALIB_CB_CLUSTERING):
         try:
             found, centres = cv2.findCirclesGrid(picture, (cols, rows), flags=flags | extra, blobDetector=detector)
@@ -193,7 +194,8 @@ def _seeds(place: np.ndarray, tree: object) -> list[tuple[int, np.ndarray]]:
     k = min(NEIGHBOURS, len(place) - 1)
     around = tree.query(place, k=k + 1)[1][:, 1:]  # type: ignore[attr-defined]
     middle = np.median(place, axis=0)
-    good, fair = [], []
+    good: list[tuple[int, np.ndarray]] = []
+    fair: list[tuple[int, np.ndarray]] = []
     for dot in np.argsort(((place - middle) ** 2).sum(axis=1))[: max(400, len(place) // 10)]:
         steps = place[around[dot]] - place[dot]
         length = np.hypot(*steps.T)

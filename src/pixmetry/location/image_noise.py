@@ -8,11 +8,10 @@ from dataclasses import replace
 import numpy as np
 
 from pixmetry.core.errors import MeasureError
-from pixmetry.location.noise import NoiseModel
+from pixmetry.location.noise import ROUNDING_DN2, NoiseModel
 from pixmetry.location.targets import Targets
 from pixmetry.location.template_fit import KINDS, Windows, run_fit
 
-ROUNDING_DN2 = 1 / 12
 MOST_TARGETS = 64
 EDGE_PX = 0.05  # misplacement of an edge that a template may have: where it would matter, a pixel says nothing about noise
 LEVELS = 16

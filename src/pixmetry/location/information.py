@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from pixmetry.core.errors import InputError
-from pixmetry.location.noise import NoiseModel
+from pixmetry.location.noise import ROUNDING_DN2, NoiseModel
 
-ROUNDING_DN2 = 1 / 12
 DITHERED_DN = 0.4  # noise from which on rounding acts as further noise of 1/12 DN² (to 5 % of the variance at this noise, 1e-3 at 0.5 DN)
 CODES_AT_ENDS_DN = 2.0  # noise up to which the codes near the ends of the scale are taken one by one; above, 0.4 % of the information
 LEAST_NOISE_DN = 0.01  # below, grey values tell of a mean only where it crosses a threshold: there is a region of places, no variance

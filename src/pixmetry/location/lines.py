@@ -238,7 +238,9 @@ def _positions(fit: Fit, candidates: LineCandidates, frame_shape: tuple[int, int
     return placed(fit.places, p[:, kernels.OFFSET], angle, cov[:, kernels.OFFSET, kernels.OFFSET], more, _flags(fit, candidates, more))
 
 
-def placed(places: np.ndarray, offset: np.ndarray, angle: np.ndarray, variance: np.ndarray, more: dict[str, Any], flags: np.ndarray) -> Positions:
+def placed(
+    places: np.ndarray, offset: np.ndarray, angle: np.ndarray, variance: np.ndarray, more: dict[str, Any], flags: np.ndarray
+) -> Positions:
     """Positions of lines from their offsets against the places where they were looked for."""
     s, c = np.sin(angle), np.cos(angle)
     x, y = places[:, 0] - s * offset, places[:, 1] + c * offset

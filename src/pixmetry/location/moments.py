@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import lru_cache
 
 import numpy as np
@@ -13,7 +14,10 @@ from pixmetry.location import _moment_kernels as k
 from pixmetry.location.noise import NoiseModel
 from pixmetry.location.targets import Flag, Positions, Targets
 
-LAWS = {"centroid": k.CENTROID, "squared_centroid": k.SQUARED, "soft_threshold": k.SOFT, "hard_threshold": k.HARD, "windowed_centroid": k.WINDOWED}
+LAWS = {
+    "centroid": k.CENTROID, "squared_centroid": k.SQUARED, "soft_threshold": k.SOFT, "hard_threshold": k.HARD,
+    "windowed_centroid": k.WINDOWED,
+}  # fmt: skip
 MARGINS = {"centroid": 3.0, "squared_centroid": 3.0, "soft_threshold": 3.5, "hard_threshold": 3.5, "windowed_centroid": 4.0}
 MULTIPLES = np.array([2.0, 2.5, 3.0, 3.5, 4.0, 5.0, 7.0])  # thresholds to choose from, in standard deviations of the background's noise
 STEP_PX = 0.125
@@ -39,7 +43,7 @@ def moment_positions(frame: np.ndarray, targets: Targets, noise: NoiseModel, nam
     -------
     Positions
         ``more`` has amplitude_dn, background_dn, semi_major_px, semi_minor_px, angle_deg, blur_px, s_curve_px, threshold_dn (NaN without
-        one) and background_px, the number of pixels of the background's fit.
+        one). NOT_CONVERGED is flagged where no light is left or the estimate runs away; x and y are then NaN.
 
     Raises
     ------
@@ -56,8 +60,8 @@ def moment_positions(frame: np.ndarray, targets: Targets, noise: NoiseModel, nam
     References
     ----------
     M. R. Shortis, T. A. Clarke, T. Short, Proc. SPIE 2350, 239 (1994), compare these laws. H. C. van Assen, M. Egmont-Petersen,
-    J. H. C. Reiber, IEEE Trans. Image Processing 11(12), 1379 (2002), for the variance. E. Bertin, S. Arnouts, A&AS 117, 393 (1996), and the
-    manual of SExtractor (XWIN_IMAGE) for the windowed centroid.
+    J. H. C. Reiber, IEEE Trans. Image Processing 11(12), 1379 (2002), for the variance. E. Bertin, S. Arnouts, A&AS 117, 393 (1996), and
+    the manual of SExtractor (XWIN_IMAGE) for the windowed centroid.
     """
     if name not in LAWS:
         raise InputError("no such law of moments", value=name, allowed=", ".join(LAWS))
@@ -81,12 +85,12 @@ class Prepared:
         self.amplitude = np.zeros(len(record))
         self.radius = self.blur = self.amplitude
 
-    def over(self, function: object, threads: int | None) -> None:
+    def over(self, function: Callable[[int, int], None], threads: int | None) -> None:
         """Call ``function(first, stop)`` for slices of the targets."""
         run_slices(function, len(self.record), threads)
 
 
-def run_slices(function, n: int, threads: int | None) -> None:  # type: ignore[no-untyped-def]
+def run_slices(function: Callable[[int, int], None], n: int, threads: int | None) -> None:
     """Call ``function(first, stop)`` for slices that cover 0 … n, on threads."""
     pieces = max(1, min(n // 16, 2 * (thread_count() if threads is None else threads)))
     ends = np.linspace(0, n, pieces + 1).astype(int)
@@ -105,12 +109,14 @@ def prepare(frame: np.ndarray, targets: Targets, noise: NoiseModel, *, margin: f
     n = len(targets)
     record = np.zeros((n, k.COLUMNS))
     major, minor = np.maximum(targets.semi_major_px, 0.5), np.maximum(targets.semi_minor_px, 0.5)
-    blur = np.clip(targets.blur_px, 0.3, np.maximum(minor / 1.1774, 0.3))  # at most that of a Gaussian spot of this width
+    # a rough blur of one small target may be off by half; the lens is common to all. At most that of a Gaussian spot of this width
+    common = 0.85 * np.median(targets.blur_px[np.isfinite(targets.blur_px)]) if np.isfinite(targets.blur_px).any() else 0.3
+    blur = np.clip(np.maximum(targets.blur_px, common), 0.3, np.maximum(minor / 1.1774, 0.3))
     usable = np.isfinite(targets.x_px + targets.y_px + major + minor + blur + targets.amplitude_dn + targets.background_dn)
     for column, values in (
         (k.X, targets.x_px), (k.Y, targets.y_px), (k.MAJOR, major), (k.MINOR, minor), (k.ANGLE, np.deg2rad(targets.angle_deg)),
-        (k.REACH, 4 * blur), (k.AMPLITUDE, np.abs(targets.amplitude_dn)), (k.SIGN, np.sign(targets.amplitude_dn)), (k.LEVEL, targets.background_dn),
-        (k.SLOPE_X, targets.background_x_dn_per_px), (k.SLOPE_Y, targets.background_y_dn_per_px),
+        (k.REACH, 4 * blur), (k.AMPLITUDE, np.abs(targets.amplitude_dn)), (k.SIGN, np.sign(targets.amplitude_dn)),
+        (k.LEVEL, targets.background_dn), (k.SLOPE_X, targets.background_x_dn_per_px), (k.SLOPE_Y, targets.background_y_dn_per_px),
     ):  # fmt: skip
         record[:, column] = np.where(usable, values, 1.0)
     wanted = margin * blur
@@ -121,7 +127,7 @@ def prepare(frame: np.ndarray, targets: Targets, noise: NoiseModel, *, margin: f
     half_x, half_y = np.hypot(major * np.cos(turn), minor * np.sin(turn)), np.hypot(major * np.sin(turn), minor * np.cos(turn))
     rows, cols = frame.shape
     edge = 0.5 + np.minimum(
-        np.minimum(targets.x_px - half_x, cols - 1 - targets.x_px - half_x), np.minimum(targets.y_px - half_y, rows - 1 - targets.y_px - half_y)
+        np.minimum(targets.x_px, cols - 1 - targets.x_px) - half_x, np.minimum(targets.y_px, rows - 1 - targets.y_px) - half_y
     )
     free = k.limit_margins(record, start, index)
     flags = targets.flags.astype(np.uint32)
@@ -142,7 +148,7 @@ def positions(
     """Put together what the kernels found; ``result``: x, y, var x, cov, var y, relative standard deviation of the weights' sum."""
     record = work.record
     lost = ~at_rest | ~work.usable
-    result[~work.usable] = np.nan
+    result[lost] = np.nan
     flags = work.flags | np.where(lost, np.uint32(Flag.NOT_CONVERGED), np.uint32(0))
     random = np.sqrt(0.5 * (result[:, 2] + result[:, 4]))
     flags = flags | np.where(s_curve_px > random, np.uint32(Flag.UNDER_SAMPLED), np.uint32(0))
@@ -160,7 +166,7 @@ def positions(
 
 
 def classes(radius: np.ndarray, blur: np.ndarray, contrast: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Sort targets into classes of like radius (15 %), blur (20 %) and amplitude over noise (50 %); return class of each, and one of each."""
+    """Sort targets into classes of like radius (15 %), blur (20 %) and contrast (50 %); return the class of each and one of each."""
     cell = np.zeros(len(radius), np.int64)
     for values, ratio in ((radius, 1.15), (blur, 1.2), (contrast, 1.5)):
         cell = cell * 512 + np.floor(np.log(np.maximum(values, 1e-6)) / math.log(ratio)).astype(np.int64)
@@ -207,7 +213,8 @@ def _centroid_phase_variance(radius: np.ndarray, blur: np.ndarray) -> np.ndarray
     for order in (1, 2, 3):
         z = 2 * math.pi * order * radius
         disc = np.minimum(1.0, 2 * np.sqrt(2 / (math.pi * z)) / z)
-        total += 0.5 * (disc * np.exp(-2 * math.pi**2 * order**2 * optical) / (math.pi * order)) ** 2
+        # the mean over the swings with the radius is half of the envelope
+        total += 0.25 * (disc * np.exp(-2 * math.pi**2 * order**2 * optical) / (math.pi * order)) ** 2
     return total
 
 

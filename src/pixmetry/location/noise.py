@@ -7,6 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from pixmetry.core.errors import InputError
+from pixmetry.location.estimators import split_text
+
+ROUNDING_DN2 = 1 / 12  # variance of rounding to whole numbers
+KEYS = {"read": "read_dn", "gain": "slope_dn", "prnu": "pattern_rel", "dsnu": "pattern_dn", "black": "black_dn", "bits": "bits"}
 
 
 @dataclass(frozen=True)
@@ -67,3 +71,32 @@ class NoiseModel:
         if self.pattern_rel:
             text += f", sensitivities ±{self.pattern_rel:.2%}"
         return text
+
+
+def parse_noise(text: str, rounded: bool = True) -> tuple[NoiseModel, float]:
+    """Read a noise model from ``key=number,…``, as in ``read=1.5,gain=0.01,black=16,bits=8``.
+
+    ``read`` is the standard deviation without light in DN, without rounding; ``gain`` is K in DN per electron; ``prnu`` and ``dsnu`` are the
+    spreads of sensitivities (relative) and offsets (DN); ``black`` is the grey value without light; ``bits`` say where the scale ends.
+
+    Returns
+    -------
+    NoiseModel
+        Rounding (1/12 DN²) added to the constant if the values are ``rounded``.
+    float
+        ``dsnu`` in DN, which is not in the model.
+
+    Raises
+    ------
+    InputError
+        If a key or number cannot be used.
+    """
+    _, values = split_text(":" + text, KEYS, "noise")
+    read, pattern, bits = values.pop("read_dn", 0.0), values.pop("pattern_dn", 0.0), values.pop("bits", None)
+    if read < 0:
+        raise InputError("the read noise cannot be used", where="noise", value=read, allowed="0 or more")
+    if bits is not None and (bits != int(bits) or not 1 <= bits <= 32):
+        raise InputError("the bits cannot be used", where="noise", value=bits, allowed="1 to 32")
+    if bits is not None:
+        values |= {"low_dn": 0.0, "high_dn": 2.0 ** int(bits) - 1}
+    return NoiseModel(read**2 + (ROUNDING_DN2 if rounded else 0.0), **values), pattern

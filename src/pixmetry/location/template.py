@@ -8,7 +8,7 @@ from pixmetry.core.errors import InputError
 from pixmetry.location.image_noise import noise_from_image
 from pixmetry.location.noise import NoiseModel
 from pixmetry.location.targets import Flag, Positions, Targets
-from pixmetry.location.template_fit import KINDS, Windows, run_fit
+from pixmetry.location.template_fit import KINDS, Fitted, Windows, run_fit
 
 __all__ = ["KINDS", "LIGHT_ON", "PARAMETERS", "PLANES", "choose_planes", "fit_template", "model", "noise_from_image"]
 
@@ -27,6 +27,7 @@ DROP_FALL = 5.99  # fall by 2 unknowns that chance exceeds once in 20
 MEDIAN_FALL = {2: (1.386, 2.0), 4: (3.357, 3.19)}  # median of χ² with 2 or 4 degrees, and its standard deviation times √n
 POOL = 20  # targets from which their falls are also looked at together
 POOLED_SIGMA = 5.0
+MEDIAN_WORTH = 3.0  # of a noncentral χ² with 2 degrees and a noncentrality of 2
 POOR_SIGMA = 5.5
 FAINT_SHARE = 0.15  # of the blur: uncertainty from which the covariance of first order is too small
 SHARP_PX = 0.3  # blur below which a template's position begins to depend on the exact shape of the pixel
@@ -126,7 +127,8 @@ def fit_template(
     -----
     "auto" takes a plane in by the fall of χ² that it would bring: for a single target where chance brings it once in 1000; for all of them
     where the median fall of at least 20 targets stands 5 standard deviations above that of chance (3e-7). Falls are divided by the median
-    χ² per degree of freedom where that exceeds 1. A slope too small to be seen, which shifts the position by up to about two standard
+    χ² per degree of freedom where that exceeds 1. Planes of many targets stay only if they take more bias from the places than they add noise
+    (`worth_it`). A slope too small to be seen, which shifts the position by up to about two standard
     uncertainties, is not in the covariance of a single target.
 
     References
@@ -152,9 +154,19 @@ def fit_template(
     if auto:
         on_ground, on_light = choose_planes(result.falls, result.chi2_per_dof, background_plane, light_plane)
         start = np.where(result.at_rest[:, None], result.parameters, windows.start)
-        for ground, light in ((True, False), (False, True), (True, True)):
+        for ground, light in ((True, True), (True, False), (False, True)):  # what one does not believe is left to the next
             again = np.flatnonzero((on_ground == ground) & (on_light == light))
-            result = result.put(again, run_fit(windows, again, start, ground, light, False, threads)) if len(again) else result
+            if not len(again):
+                continue
+            sloped = run_fit(windows, again, start, ground, light, False, threads)
+            if len(again) >= POOL:
+                real_ground, real_light = believable(targets, windows.noise, sloped, again)
+                if not worth_it(result, sloped, again):
+                    real_ground = real_light = False
+                on_ground[again], on_light[again] = ground and real_ground, light and real_light
+                if (ground and not real_ground) or (light and not real_light):
+                    continue
+            result = result.put(again, sloped)
     return _positions(kind, targets, result, on_ground, on_light, windows.noise)
 
 
@@ -184,6 +196,43 @@ def choose_planes(
     on_ground = any_ & ((need_ground > needed) | ((need_light <= needed) & (ground >= light)))
     on_light = any_ & ((need_light > needed) | ((need_ground <= needed) & (light > ground)))
     return on_ground, on_light
+
+
+def believable(targets: Targets, noise: NoiseModel, sloped: Fitted, which: np.ndarray) -> tuple[bool, bool]:
+    """Whether the slopes that many fits found are those of the ground around the targets, as the map of the background has it.
+
+    A background that slopes under targets does so between them. Light that falls off over dark targets falls off over their bright ground,
+    in the same proportion. A halo that a lens, a coder or a sharpening filter puts on one side of every target does neither.
+    """
+    good = which[sloped.at_rest[which]]
+    if len(good) < POOL:
+        return True, True
+    there = np.stack([targets.background_x_dn_per_px[good], targets.background_y_dn_per_px[good]], axis=1)
+    bright = np.maximum(targets.background_dn[good] - max(noise.black_dn, 0.0), 0.0)[:, None]
+    ground, light = sloped.parameters[good, -4:-2], sloped.parameters[good, -2:] * bright
+    u = np.sqrt(np.nan_to_num(sloped.variance[good, -4:]))
+    dark = np.median(bright[:, 0] + targets.amplitude_dn[good]) < 0.5 * np.median(bright)  # the ground is what has the light
+
+    def agrees(slope: np.ndarray, uncertainty: np.ndarray) -> bool:
+        return bool(np.median(np.abs(slope - there)) < 0.5 * np.median(np.abs(slope)) + np.median(uncertainty))
+
+    return agrees(ground, u[:, :2]), not dark or agrees(light, u[:, 2:] * bright)
+
+
+def worth_it(plain: Fitted, sloped: Fitted, which: np.ndarray) -> bool:
+    """Whether planes take more bias from the places of many targets than they add noise to them.
+
+    With Δ the shift of a place and V the rise of its covariance that the planes bring, Δᵀ V⁻¹ Δ is 2 on average where there was no bias, and
+    4 where bias² is as large as the added variance. Grey values that are not as the template has them (coders, sharpening) bring a fall of
+    χ² by planes that move nothing but the noise.
+    """
+    dx, dy = (sloped.parameters[which, k] - plain.parameters[which, k] for k in (0, 1))
+    xx, xy, yy = (np.where(sloped.at_rest[which], (sloped.covariance - plain.covariance)[which, k], np.nan) for k in range(3))
+    size = xx * yy - xy * xy
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / size
+    ratio = ratio[np.isfinite(ratio) & (size > 0) & (xx > 0)]
+    return bool(len(ratio)) and float(np.median(ratio)) > MEDIAN_WORTH
 
 
 def _significant(fall: np.ndarray, good: np.ndarray, degrees: int) -> np.ndarray:

@@ -165,7 +165,6 @@ def run_fit(
 
     map_tiles(piece, range(0, len(which), CHUNK), threads)
     dof = quality[:, 1] - free.sum()
-    return Fitted(
-        parameters, variance, covariance, quality[:, 0] / np.maximum(dof, 1), dof, quality[:, 2:5], np.abs(quality[:, 5]), quality[:, 5] > 0,
-        quality[:, 6] > 0, quality[:, 7], quality[:, 8],
-    )  # fmt: skip
+    reduced, steps = quality[:, 0] / np.maximum(dof, 1), quality[:, 5]
+    cut, top, bottom = quality[:, 6] > 0, quality[:, 7], quality[:, 8]
+    return Fitted(parameters, variance, covariance, reduced, dof, quality[:, 2:5], np.abs(steps), steps > 0, cut, top, bottom)

@@ -1,0 +1,272 @@
+"""``pixmetry.locate`` and its command: what comes out for every kind of target and of bad input."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import pixmetry
+from location import rendered
+from pixmetry.cli import main
+from pixmetry.core.errors import InputError
+from pixmetry.located import LOCATED_SCHEMA, ORIGIN
+from pixmetry.locating import FITS, MOMENTS, OPERATORS, estimators, scale_ends
+from pixmetry.location.targets import Flag
+
+SHAPE = (120, 160)
+Z_1E6 = 5.0  # |z| of the larger of a dozen coordinates, each beyond it with 6e-7
+
+
+def frame_of(seed: int = 0, amplitude: float = 150.0, background: float = 20.0, bits: int = 8, read_dn: float = 1.5) -> tuple:
+    """Six discs at random places, and where they are."""
+    rng = np.random.default_rng(seed)
+    x, y = np.array([20.0, 60, 110, 30, 75, 130]) + rng.uniform(-0.5, 0.5, 6), np.array([25.0, 30, 20, 85, 90, 80]) + rng.uniform(-0.5, 0.5, 6)
+    radius = np.array([3.0, 5, 8, 4, 6, 7])
+    images = []
+    for place in zip(x, y, radius, strict=True):
+        at = rendered.window(place[0], place[1], place[2] + 6, SHAPE)
+        images.append((at, rendered.disc(*place, 0.7, at)))
+    mean = rendered.planted(SHAPE, background, np.full(6, amplitude), images)
+    return rendered.expose(mean, rng, read_dn=read_dn, bits=bits), x, y
+
+
+def matched(table: pixmetry.located.Located, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Errors over their standard deviations, shape (2, n); every target is found once."""
+    assert len(table) == len(x)
+    order = [int(np.argmin(np.hypot(table.x_px - a, table.y_px - b))) for a, b in zip(x, y, strict=True)]
+    assert sorted(order) == list(range(len(x)))
+    return np.array([(table.x_px[order] - x) / np.sqrt(table.var_x_px2[order]), (table.y_px[order] - y) / np.sqrt(table.var_y_px2[order])])
+
+
+@pytest.mark.parametrize("estimator", ["auto", *FITS, *MOMENTS, *OPERATORS])
+@pytest.mark.parametrize("amplitude", [150.0, -150.0])
+def test_every_estimator_finds_all_discs_within_its_own_uncertainty(estimator: str, amplitude: float) -> None:
+    """Origin included: half a pixel would be 30 standard deviations or more."""
+    frame, x, y = frame_of(amplitude=amplitude, background=20.0 if amplitude > 0 else 200.0)
+    table = pixmetry.locate(frame, estimator=estimator)
+    assert np.abs(matched(table, x, y)).max() < Z_1E6
+    assert (np.sign(table.amplitude_dn) == np.sign(amplitude)).all()
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.float32, np.float64, np.int32])
+def test_every_type_of_grey_values(kind: type) -> None:
+    frame, x, y = frame_of()
+    assert np.abs(matched(pixmetry.locate(frame.astype(kind)), x, y)).max() < Z_1E6
+
+
+def test_both_polarities_at_once_and_one_alone() -> None:
+    bright, x, y = frame_of(background=100.0, amplitude=100.0)
+    dark, _, _ = frame_of(background=100.0, amplitude=-80.0)
+    frame = np.concatenate([bright, dark])
+    assert pixmetry.locate(frame).images[0]["polarity"] == "both" and len(pixmetry.locate(frame)) == 12
+    assert len(pixmetry.locate(frame, polarity="dark")) == 6 and (pixmetry.locate(frame, polarity="bright").y_px < 120).all()
+
+
+def test_a_colder_image_has_the_same_positions() -> None:
+    """Adding a constant and transposing change nothing but what they must."""
+    frame, _, _ = frame_of()
+    table, turned = pixmetry.locate(frame), pixmetry.locate(np.ascontiguousarray(frame.T))
+    order = [int(np.argmin(np.hypot(turned.x_px - b, turned.y_px - a))) for a, b in zip(table.x_px, table.y_px, strict=True)]
+    assert np.abs(turned.y_px[order] - table.x_px).max() < 1e-4 and np.abs(turned.x_px[order] - table.y_px).max() < 1e-4
+    shifted = pixmetry.locate(frame + np.uint8(7))
+    assert np.abs(shifted.x_px - table.x_px).max() < 1e-4
+
+
+def test_any_number_of_threads_gives_the_same_bits() -> None:
+    frame, _, _ = frame_of()
+    one, two = (pixmetry.locate(frame, threads=n) for n in (1, 2))
+    assert all(np.array_equal(one[name], two[name], equal_nan=one[name].dtype.kind == "f") for name in one.columns)
+
+
+def test_a_saturated_top_is_flagged_and_unbiased() -> None:
+    frame, x, y = frame_of(amplitude=400.0)
+    table = pixmetry.locate(frame)
+    assert all(int(f) & Flag.SATURATED for f in table.flags)
+    assert np.abs(matched(table, x, y)).max() < Z_1E6 and np.sqrt(table.var_x_px2).max() < 0.02
+
+
+def test_an_image_without_noise_is_not_taken_for_saturated() -> None:
+    frame, x, y = frame_of(read_dn=1e-9)
+    table = pixmetry.locate(frame)
+    assert not (table.flags & Flag.SATURATED).any()
+    assert np.hypot(table.x_px - table.x_px, 0).max() == 0 and np.abs(matched(table, x, y)).max() < Z_1E6
+
+
+def test_the_top_of_twelve_bits_in_sixteen_is_seen() -> None:
+    values = np.random.default_rng(1).normal(1000, 30, (200, 200)).round().clip(0, None).astype(np.uint16)
+    values[50:80, 50:80] = 3000
+    values[100:130, 20:60] = np.random.default_rng(2).normal(2990, 30, (30, 40)).round().clip(None, 3000)
+    assert scale_ends(values, None, None) == (0.0, 3000.0)
+    values[values == 3000] = np.random.default_rng(3).normal(3000, 30, int((values == 3000).sum())).round()
+    assert scale_ends(values, None, None) == (0.0, np.inf) and scale_ends(values, 12, None) == (0.0, 4095.0)
+
+
+def test_a_disc_that_the_border_cuts_is_told() -> None:
+    frame, _, _ = frame_of()
+    table = pixmetry.locate(frame[:, : int(frame.shape[1] - 29)])  # through the last disc
+    cut = table.x_px > 125
+    assert cut.sum() == 1 and all(int(f) & Flag.BORDER for f in table.flags[cut])
+
+
+def test_an_estimator_that_is_asked_for_is_taken_and_auto_says_why() -> None:
+    frame, _, _ = frame_of()
+    assert set(pixmetry.locate(frame, estimator="centroid").estimator) == {"centroid"}
+    assert "Cramér–Rao" in pixmetry.locate(frame).images[0]["reason"]
+
+
+@pytest.mark.parametrize("kind", ["disc", "ellipse", "ring", "spot", "line", "edge", "cross", "coded"])
+@pytest.mark.parametrize(
+    "frame",
+    [
+        np.full((90, 100), 7, np.uint8),
+        np.full((90, 100), 255, np.uint8),
+        np.zeros((90, 100), np.uint16),
+        np.full((90, 100), 0.25),
+        np.array([[3]], np.uint8),
+        np.array([[3, 200]], np.uint8),
+        np.random.default_rng(5).normal(100, 3, (300, 300)).round().astype(np.uint8),
+    ],
+    ids=["constant", "saturated", "black", "constant float", "one pixel", "two pixels", "noise"],
+)
+def test_where_there_is_nothing_nothing_is_found(frame: np.ndarray, kind: str) -> None:
+    table = pixmetry.locate(frame, kind=kind)
+    assert len(table) == 0 and "no " in table.images[0]["reason"] and {"x_px", "var_x_px2", "flags"} <= set(table.columns)
+
+
+@pytest.mark.parametrize(
+    ("frame", "text"),
+    [
+        (np.zeros((9, 9, 3), np.uint8), "colour"),
+        (np.zeros((4, 9, 9), np.uint8), "not a grey image"),
+        (np.zeros((0, 9)), "not a grey image"),
+        (np.full((9, 9), np.nan), "81 pixels are not finite, the first in row 0, column 0"),
+        (np.zeros((9, 9), complex), "real numbers"),
+        (np.array([["a"]]), "real numbers"),
+    ],
+    ids=["rgb", "stack", "empty", "nan", "complex", "text"],
+)
+def test_frames_that_cannot_be_used(frame: np.ndarray, text: str) -> None:
+    with pytest.raises(InputError, match=text):
+        pixmetry.locate(frame)
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"kind": "blob"}, "no such kind"),
+        ({"estimator": "best"}, "no such estimator"),
+        ({"kind": "edge", "estimator": "centroid"}, "no such estimator for kind edge"),
+        ({"polarity": "grey"}, "polarity"),
+        ({"kind": "chessboard"}, "size of the chessboard"),
+        ({"kind": "chessboard", "grid": "9by6"}, "COLSxROWS"),
+        ({"kind": "line", "grid": "9x6"}, "no grid"),
+        ({"aperture_px": 2.0}, "aperture"),
+        ({"light_on": "moon"}, "light"),
+        ({"noise": "read=-1"}, "noise"),
+        ({"noise": "loudness=1"}, "loudness"),
+        ({"noise": "no_such_camera"}, "no such camera"),
+    ],
+)
+def test_options_that_cannot_be_used(options: dict, text: str) -> None:
+    with pytest.raises(InputError, match=text):
+        pixmetry.locate(frame_of()[0], **options)
+
+
+# ---- the command ----------------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def image(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    from pixmetry.campaign import write_frame
+
+    path = tmp_path_factory.mktemp("images") / "discs.png"
+    write_frame(path, frame_of()[0], 8)
+    return path
+
+
+def run(*arguments: object) -> str:
+    result = CliRunner().invoke(main, ["locate", *map(str, arguments)])
+    assert result.exit_code == 0, result.output
+    return result.stdout
+
+
+def refused(*arguments: object) -> str:
+    result = CliRunner().invoke(main, ["locate", *map(str, arguments)])
+    assert result.exit_code == 2 and result.output.count("\n") == 1, result.output
+    return result.output
+
+
+def test_one_table_in_three_formats(image: Path, tmp_path: Path) -> None:
+    import pyarrow.parquet
+
+    for ending in ("csv", "json", "parquet"):
+        run(image, "-o", tmp_path / f"table.{ending}")
+    lines = (tmp_path / "table.csv").read_text().splitlines()
+    rows = list(csv.DictReader(line for line in lines if not line.startswith("#")))
+    record = json.loads((tmp_path / "table.json").read_text())
+    table = pyarrow.parquet.read_table(tmp_path / "table.parquet")
+    assert ORIGIN in lines[0] and record["origin"] == ORIGIN and table.schema.metadata[b"origin"].decode() == ORIGIN
+    assert record["schema"] == LOCATED_SCHEMA and len(rows) == len(record["targets"]) == table.num_rows == 6
+    for i in range(6):
+        assert float(rows[i]["x_px"]) == pytest.approx(record["targets"][i]["x_px"], abs=1e-6) == table["x_px"][i].as_py()
+    assert rows[0]["image"] == "discs.png" and rows[0]["noise_model"] == "image" and record["images"][0]["targets"] == 6
+
+
+def test_the_table_goes_to_standard_output(image: Path) -> None:
+    assert run(image).splitlines()[0].startswith("# pixmetry")
+
+
+def test_several_images_and_their_pictures(image: Path, tmp_path: Path) -> None:
+    from pixmetry.campaign import write_frame
+
+    write_frame(tmp_path / "in" / "a.png" if (tmp_path / "in").mkdir() is None else "", frame_of(1)[0], 8)
+    write_frame(tmp_path / "in" / "b.tif", frame_of(2)[0], 8)
+    run(tmp_path / "in", image, "-o", tmp_path / "all.json", "--overlay", tmp_path / "found")
+    record = json.loads((tmp_path / "all.json").read_text())
+    assert [i["name"] for i in record["images"]] == ["a.png", "b.tif", "discs.png"] and len(record["targets"]) == 18
+    pictures = sorted(p.name for p in (tmp_path / "found").iterdir())
+    assert pictures == ["a-located.png", "b-located.png", "discs-located.png"]
+
+
+def test_a_picture_shows_what_was_found(image: Path, tmp_path: Path) -> None:
+    import imagecodecs
+
+    run(image, "-o", tmp_path / "t.csv", "--overlay", tmp_path / "found.png")
+    drawn = imagecodecs.png_decode((tmp_path / "found.png").read_bytes())[:, :, :3].astype(int)
+    assert drawn.shape[0] > 120 and (np.abs(drawn - drawn.mean(axis=2, keepdims=True)).max(axis=2) > 60).sum() > 200  # coloured marks
+
+
+def test_colour_and_jpeg_are_read(tmp_path: Path) -> None:
+    import imagecodecs
+
+    frame, x, y = frame_of()
+    (tmp_path / "grey.jpg").write_bytes(imagecodecs.jpeg_encode(frame, level=95))
+    (tmp_path / "colour.png").write_bytes(imagecodecs.png_encode(np.dstack([frame // 2, frame, 255 - frame])))
+    run(tmp_path / "grey.jpg", "-o", tmp_path / "grey.json")
+    assert "--channel" in refused(tmp_path / "colour.png", "-o", tmp_path / "t.json")
+    run(tmp_path / "colour.png", "-o", tmp_path / "t.json", "--channel", "green")
+    found = json.loads((tmp_path / "t.json").read_text())["targets"]
+    assert len(found) == len(x) and min(abs(t["x_px"] - x[0]) for t in found) < 0.05
+
+
+def test_what_cannot_be_written_is_refused_before_any_work(image: Path, tmp_path: Path) -> None:
+    (tmp_path / "mine.csv").write_text("a,b\n1,2\n")
+    assert "no table of positions" in refused(image, "-o", tmp_path / "mine.csv")
+    assert (tmp_path / "mine.csv").read_text() == "a,b\n1,2\n"
+    assert "unknown ending" in refused(image, "-o", tmp_path / "table.xls")
+    assert "one picture for several" in refused(image, image, "--overlay", tmp_path / "one.png")
+
+
+def test_a_file_that_cannot_be_used_is_named_and_nothing_is_written(image: Path, tmp_path: Path) -> None:
+    (tmp_path / "broken.png").write_bytes(b"\x89PNG\r\n\x1a\n")
+    assert "broken.png" in refused(image, tmp_path / "broken.png", "-o", tmp_path / "t.csv")
+    assert "missing" in refused(tmp_path / "none.png", "-o", tmp_path / "t.csv") and not (tmp_path / "t.csv").exists()
+
+
+def test_the_estimators_are_listed(image: Path) -> None:
+    assert all(name in run(image, "--estimator", "list", "--kind", "line") for name in estimators("line"))
