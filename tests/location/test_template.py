@@ -155,7 +155,7 @@ def test_errors_follow_their_own_covariance(kind: str, p: list[float], sigma: fl
     found = fit_template(image, targets, NoiseModel(sigma**2 + 1 / 12), kind)
     assert not (found.flags & Flag.NOT_CONVERGED).any()
     assert_normal(errors(found, x, y))
-    assert np.median(found.more["chi2_per_dof"]) == pytest.approx(1, abs=0.08)
+    assert np.median(found.more["chi2_per_dof"]) == pytest.approx(1, abs=0.15)  # rounding of little noise is not 1/12 at every level
 
 
 @pytest.mark.parametrize("likelihood", ["least_squares", "poisson_gaussian"])

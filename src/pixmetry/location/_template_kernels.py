@@ -562,10 +562,12 @@ def fit(
 
 
 @jit
-def residuals(frame, kind, parameters, which, home, half, outer, reach, near_start, near_index, noise, aperture, edge, share):
-    """Return levels and residuals/√(1 − leverage) of the pixels where a shift by ``edge`` px moves the mean by less than ``share`` σ."""
-    s = SHAPES[kind]
-    count = s + 5
+def residuals(frame, kind, parameters, slopes, which, home, half, outer, reach, near_start, near_index, noise, aperture, edge, share):
+    """Return levels and residuals/√(1 − leverage) of the pixels where a shift by ``edge`` px moves the mean by less than ``share`` σ.
+
+    The first ``slopes`` parameters of the planes were among the unknowns.
+    """
+    count = SHAPES[kind] + 5 + slopes
     used = np.arange(count)
     most = 0
     for w in range(len(which)):

@@ -8,10 +8,13 @@ from dataclasses import replace
 import numpy as np
 
 from pixmetry.core.errors import MeasureError
+from pixmetry.core.threads import map_tiles
 from pixmetry.location.noise import ROUNDING_DN2, NoiseModel
 from pixmetry.location.targets import Targets
 from pixmetry.location.template_fit import KINDS, Windows, run_fit
 
+PIECES = 4  # of the work
+LEAST_SLOPED_PX = 2.0
 MOST_TARGETS = 64
 EDGE_PX = 0.05  # misplacement of an edge that a template may have: where it would matter, a pixel says nothing about noise
 LEVELS = 16
@@ -70,8 +73,9 @@ def noise_from_image(
     low, high = scale_of(frame)
     low, high = max(low, low_dn), min(high, high_dn)
     guess = NoiseModel(first, low_dn=low, high_dn=high, origin="image")
+    start = None
     for _ in range(2):  # the second time with better weights, and a better idea of which pixels are flat
-        level, residual = _flat_residuals(frame, part, guess, kind, aperture_px, threads)
+        level, residual, start = _flat_residuals(frame, part, guess, kind, aperture_px, threads, start)
         guess = _fitted(level, residual, guess, least)
     return guess
 
@@ -88,18 +92,32 @@ def scale_of(frame: np.ndarray) -> tuple[float, float]:
 
 
 def _flat_residuals(
-    frame: np.ndarray, targets: Targets, noise: NoiseModel, kind: str, aperture_px: float, threads: int | None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Levels and residuals, divided by √(1 − leverage), of pixels where the template is flat."""
+    frame: np.ndarray,
+    targets: Targets,
+    noise: NoiseModel,
+    kind: str,
+    aperture_px: float,
+    threads: int | None,
+    start: np.ndarray | None,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Levels and residuals, divided by √(1 − leverage), of pixels where the template is flat; and the parameters of the fit."""
     from pixmetry.location._template_kernels import residuals
 
     windows = Windows.of(frame, targets, noise, kind, KINDS.index(kind), aperture_px, True, False)
-    fitted = run_fit(windows, np.arange(len(targets)), windows.start, False, False, False, threads)
-    good = np.flatnonzero(fitted.at_rest)
-    return residuals(
-        frame, windows.code, fitted.parameters, good, windows.start, windows.half, windows.outer, windows.reach, windows.near_start,
-        windows.near_index, windows.numbers, aperture_px, EDGE_PX, 0.5,
-    )  # fmt: skip
+    first = windows.start if start is None else start
+    # planes, so that light or a ground that slopes is not taken for noise; small targets cannot tell them from the rest
+    ground = bool(np.median(targets.semi_minor_px) > LEAST_SLOPED_PX)
+    light = ground and kind != "spot"
+    fitted = run_fit(windows, np.arange(len(targets)), first, ground, light, False, threads)
+    slopes = 2 * ground + 2 * light
+    about = windows.start, windows.half, windows.outer, windows.reach, windows.near_start, windows.near_index, windows.numbers
+
+    def piece(good: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return residuals(frame, windows.code, fitted.parameters, slopes, good, *about, aperture_px, EDGE_PX, 0.5)
+
+    pieces = map_tiles(piece, np.array_split(np.flatnonzero(fitted.at_rest), PIECES), threads)
+    level, residual = (np.concatenate(values) for values in zip(*pieces, strict=True))
+    return level, residual, np.where(fitted.at_rest[:, None], fitted.parameters, windows.start)
 
 
 def _fitted(level: np.ndarray, residual: np.ndarray, guess: NoiseModel, least: float) -> NoiseModel:

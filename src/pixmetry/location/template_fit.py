@@ -14,7 +14,7 @@ from pixmetry.location.targets import Targets
 KINDS = ("disc", "ellipse", "ring", "spot")  # in the order of the kernels' codes
 REACH = 3.5  # standard deviations of the edge, the pixel included, up to which pixels around a target are used
 NEAR = 3.2  # the same within which a pixel is a neighbour's
-CHUNK = 64  # targets in one piece of work
+CHUNK = 64  # targets in one piece of work, at most
 
 
 @dataclass(frozen=True)
@@ -153,8 +153,10 @@ def run_fit(
     parameters, variance, covariance = np.full((n, count), np.nan), np.full((n, count), np.nan), np.full((n, 3), np.nan)
     quality = np.full((n, 9), np.nan)
 
+    chunk = min(CHUNK, max(8, len(which) // 8))
+
     def piece(first: int) -> None:
-        part = which[first : first + CHUNK]
+        part = which[first : first + chunk]
         side = 2 * w.half[part] + 1
         place = np.concatenate([[0], np.cumsum(side * ((side + 7) // 8 * 8))])
         data, mask = np.empty(place[-1], np.float32), np.empty(place[-1], np.float32)
@@ -163,7 +165,7 @@ def run_fit(
         settings = w.numbers, w.efficiency, w.aperture_px, w.surface
         fit(w.code, start, free, test, w.start, w.half, part, place, data, mask, *settings, parameters, variance, covariance, quality)
 
-    map_tiles(piece, range(0, len(which), CHUNK), threads)
+    map_tiles(piece, range(0, len(which), chunk), threads)
     dof = quality[:, 1] - free.sum()
     reduced, steps = quality[:, 0] / np.maximum(dof, 1), quality[:, 5]
     cut, top, bottom = quality[:, 6] > 0, quality[:, 7], quality[:, 8]
