@@ -70,7 +70,6 @@ def test_every_kind_of_target(words: tuple[str, ...]) -> None:
         ((*TARGET, "--noise", "read=0"), "no bound without noise"),
         ((*TARGET, "--noise", "read=1", "--camera", "imx264_like"), "given twice"),
         ((*TARGET, "--camera", "nowhere"), "no such camera"),
-        ((*TARGET, "--camera", "cmos_log_fuga15"), "no gain"),
         ((*TARGET, "--unknowns", "colour"), "no such parameter"),
         ((*TARGET, "--estimator", "best"), "allowed: template, template_unweighted"),
         (("--radius", "3.5", "--blur", "0.7", "--amplitude", "0"), "amplitude_dn cannot be used"),

@@ -26,7 +26,7 @@ class CameraNoise:
     model : NoiseModel
         Temporal noise of a pixel and the spread of the sensitivities; of origin "camera".
     pattern_dn : float
-        Standard deviation of the fixed offsets from pixel to pixel (DSNU); not in the model.
+        Standard deviation of the fixed offsets from pixel to pixel (DSNU), without those common to a row or column; not in the model.
     aperture_px : float
         Side of the square that has the area of the pixel's sensitive part.
     pitch_um : (float, float) or None
@@ -89,10 +89,12 @@ def camera_noise(camera: Camera) -> CameraNoise:
 
 
 def _pattern_dn2(stack: np.ndarray) -> float:
-    """Variance of the mean image about its plane, less what the temporal noise leaves in it."""
+    """Variance of the mean image without the means of its rows and columns, less what the temporal noise leaves in it."""
     mean = stack.mean(axis=0)
     mean = mean - mean.mean(axis=1, keepdims=True) - mean.mean(axis=0, keepdims=True) + mean.mean()
-    return max(float(mean.var() - stack.var(axis=0, ddof=1).mean() / len(stack)), 0.0)
+    rows, cols = mean.shape
+    spread = (mean**2).sum() / max((rows - 1) * (cols - 1), 1)
+    return max(float(spread - stack.var(axis=0, ddof=1).mean() / len(stack)), 0.0)
 
 
 def _aperture_px(camera: Camera) -> float:

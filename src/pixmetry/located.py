@@ -59,6 +59,11 @@ class Located:
         return f"<Located: {len(self)} of kind {self.kind} in {len(self.images)} image{'s' * (len(self.images) != 1)}>"
 
     @property
+    def more(self) -> dict[str, np.ndarray]:
+        """The columns, so that a table can be given where `pixmetry.location.targets.Positions` are wanted."""
+        return self.columns
+
+    @property
     def flag_words(self) -> list[str]:
         """The flags of each target in words."""
         words = {int(f): Flag(int(f)).words() for f in np.unique(self.flags)}
@@ -187,11 +192,11 @@ def joined(tables: Sequence[Located]) -> Located:
     columns = {}
     for name in names:
         kinds = {t.columns[name].dtype.kind for t in tables if name in t.columns}
-        empty: Any = np.nan if kinds <= {"f"} else "" if kinds <= {"U"} else -1
+        empty: Any = np.nan if "f" in kinds else "" if kinds <= {"U"} else -1
         columns[name] = np.concatenate([t.columns[name] if name in t.columns else np.full(len(t), empty) for t in tables])
     return Located(columns, tables[0].kind, tuple(image for t in tables for image in t.images))
 
 
 def _short(value: Any) -> Any:
-    """As many digits as a position needs: a millionth of a pixel, and nine digits of anything else."""
+    """Ten digits of a number: a millionth of a pixel in every frame."""
     return "" if value is None else f"{value:.10g}" if isinstance(value, float) else value

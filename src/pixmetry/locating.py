@@ -41,7 +41,7 @@ ROWS = {
     "row_soft_threshold": "centroid above a threshold of each row (or column), then a straight line through them",
     "row_template": "a profile fitted to each row (or column), then a straight line through them",
 }
-AUTO = {"auto": "chooses one of these by size, sampling, noise and gradient, and says why"}
+AUTO = {"auto": "chooses shape and likelihood of the template by what the image shows, and says why"}
 SPOTS = ("disc", "ellipse", "ring", "spot")
 FEW_ELECTRONS = 50.0  # at a target's peak: below, the errors of a grey value are visibly no normal ones
 TILTED = 0.93  # ratio of the axes below which discs are fitted as ellipses
@@ -226,6 +226,8 @@ def checked_frame(frame: np.ndarray, name: str = "frame") -> np.ndarray:
         return np.ascontiguousarray(array, array.dtype.newbyteorder("="))
     if array.dtype.kind in "bui" and (array.dtype.kind == "b" or (array.min() >= 0 and array.max() < 1 << 16)):
         return np.ascontiguousarray(array, np.uint16)
+    if array.dtype.kind == "f" and array.dtype.itemsize > 4 and np.abs(array).max() > np.finfo(np.float32).max:
+        raise InputError("grey values are too large", where=name, value=float(np.abs(array).max()), allowed="up to 3e38 (single precision)")
     return np.ascontiguousarray(array, np.float32)
 
 
@@ -234,11 +236,21 @@ def scale_ends(frame: np.ndarray, bits: int | None, noise: NoiseModel | None) ->
 
     Without bits, an integer image is taken to end at the greatest value of 8, 10, 12, 14 or 16 bits if it reaches it, or at its own
     greatest value if far more pixels have this one than the few values below: they were cut off there.
+
+    Raises
+    ------
+    InputError
+        If there are no such bits, or the image has more.
     """
     if frame.dtype.kind == "f":
         return (-np.inf, np.inf) if noise is None else (noise.low_dn, noise.high_dn)
     if bits is not None:
-        return 0.0, float((1 << bits) - 1)
+        if bits not in range(1, 17):
+            raise InputError("the bits of a value cannot be used", where="bits", value=bits, allowed="1 to 16")
+        high = float((1 << int(bits)) - 1)
+        if frame.max() > high:
+            raise InputError("grey values that have more bits", where="bits", value=int(frame.max()), allowed=f"up to {high:.0f}")
+        return 0.0, high
     if noise is not None and np.isfinite(noise.high_dn):
         return max(0.0, noise.low_dn), noise.high_dn
     top = int(frame.max())
@@ -286,7 +298,7 @@ class Task:
     kind: str
     estimator: str
     polarity: str
-    grid: tuple[int, int] | str | None
+    grid: Any  # (cols, rows), "any" or None
     noise: NoiseModel | None
     low_dn: float
     high_dn: float
@@ -299,13 +311,15 @@ def _spots(task: Task) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Targets that are regions: discs, ellipses, rings, spots, with or without a code, on a plate or not."""
     from pixmetry.location.detection import detect, select
 
-    found = detect(task.frame, polarity=task.polarity, high_dn=task.high_dn, low_dn=task.low_dn)
+    found = detect(task.frame, polarity=task.polarity, high_dn=task.high_dn, low_dn=task.low_dn, threads=task.threads)
     shape = "ellipse" if task.kind == "coded" else task.kind
     targets = found.targets[select(found.targets, shape)]
+    estimator, reason = task.estimator, "as was asked for"
+    if estimator == "auto":
+        shape, why = seen_shape(shape, targets)  # first, for the noise is what another shape than the targets' own does not explain
     noise = _noise_for(task, shape, targets)
-    estimator, shape, reason = (
-        chosen_estimator(shape, targets, noise) if task.estimator == "auto" else (task.estimator, shape, "as was asked for")
-    )
+    if estimator == "auto":
+        estimator, reason = chosen_estimator(targets, noise, why)
     positions = measured(task, targets, noise, estimator, shape)
     columns = _columns(positions, estimator if shape == task.kind else f"{estimator} ({shape})", noise)
     notes = _notes(estimator, reason, noise, found.polarity if len(targets) else "none found")
@@ -345,24 +359,27 @@ def measured(task: Task, targets: Targets, noise: NoiseModel, estimator: str, sh
     return operator_positions(task.frame, targets, noise, estimator, threads=task.threads)
 
 
-def chosen_estimator(kind: str, targets: Targets, noise: NoiseModel) -> tuple[str, str, str]:
-    """Choose estimator and shape for the targets of one frame, and say why.
+def seen_shape(kind: str, targets: Targets) -> tuple[str, str]:
+    """Choose the shape of the template for the targets of one frame, and say why: discs that are seen tilted are ellipses."""
+    large = (targets.semi_major_px > LARGE_PX) & ((targets.flags & Flag.BORDER) == 0)
+    flat = float(np.median((targets.semi_minor_px / targets.semi_major_px)[large])) if large.any() else 1.0
+    if kind == "disc" and flat < TILTED:
+        return "ellipse", f"the discs are seen as ellipses, axes 1 : {flat:.2f}"
+    return kind, "at the Cramér–Rao bound for every size and noise"
+
+
+def chosen_estimator(targets: Targets, noise: NoiseModel, why: str) -> tuple[str, str]:
+    """Choose the estimator for the targets of one frame, and say why; ``why`` is what `seen_shape` says.
 
     The template is at the Cramér–Rao bound for every size and noise (that is what the other rules would trade for speed), so what is to
     be chosen is its shape and its likelihood.
     """
     if not len(targets):
-        return "template", kind, "no target was found"
-    height = float(np.median(np.abs(targets.amplitude_dn)))
-    large = (targets.semi_major_px > LARGE_PX) & ((targets.flags & Flag.BORDER) == 0)
-    flat = float(np.median((targets.semi_minor_px / targets.semi_major_px)[large])) if large.any() else 1.0
-    shape, why = kind, "at the Cramér–Rao bound for every size and noise"
-    if kind == "disc" and flat < TILTED:
-        shape, why = "ellipse", f"the discs are seen as ellipses, axes 1 : {flat:.2f}"
-    electrons = height / noise.slope_dn if noise.slope_dn else np.inf
+        return "template", "no target was found"
+    electrons = float(np.median(np.abs(targets.amplitude_dn))) / noise.slope_dn if noise.slope_dn else np.inf
     if electrons < FEW_ELECTRONS:
-        return "poisson_gaussian", shape, f"{electrons:.0f} electrons at the peak: grey values are not normally distributed; {why}"
-    return "template", shape, why
+        return "poisson_gaussian", f"{electrons:.0f} electrons at the peak: grey values are not normally distributed; {why}"
+    return "template", why
 
 
 def _lines(task: Task) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
@@ -416,12 +433,21 @@ def _chessboard(task: Task) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     from pixmetry.location.corners import chessboard_reach_px, corner_positions, find_chessboard
 
     found = find_chessboard(task.frame, task.grid)
-    noise = _noise_for(task, "corner", background(task.frame, low_dn=task.low_dn).sigma_dn.ravel())
+    noise = _noise_for(task, "corner", background(task.frame, low_dn=task.low_dn, high_dn=task.high_dn, threads=task.threads).sigma_dn)
     reach = chessboard_reach_px(found) if len(found) else 0.0
-    positions = corner_positions(
-        task.frame, found.x_px, found.y_px, noise, reach_px=reach, aperture_px=task.aperture_px, threads=task.threads
-    )
-    columns = _columns(_with_variance_factor(positions, noise), "template", noise)
+
+    def place() -> Positions:
+        return corner_positions(
+            task.frame, found.x_px, found.y_px, noise, reach_px=reach, aperture_px=task.aperture_px, threads=task.threads
+        )
+
+    positions = place()
+    chi2 = positions.more["chi2_per_dof"]
+    if noise.origin == "image" and np.isfinite(chi2).any():
+        # the background's noise has the board's edges in it: the residuals of a first fit know better
+        noise = replace(noise, constant_dn2=noise.constant_dn2 * float(np.nanmedian(chi2)))
+        positions = place()
+    columns = _columns(positions, "template", noise)
     reason = found.message or "two crossing edges, integrated over the pixel; at the Cramér–Rao bound"
     return _placed(columns, found), _notes("template", reason, noise, "none found" if found.message else "both")
 
@@ -430,7 +456,7 @@ _WORK = {"line": _lines, "edge": _lines, "cross": _lines, "chessboard": _chessbo
 
 
 def _noise_for(task: Task, kind: str, targets: Targets | np.ndarray) -> NoiseModel:
-    """The noise model that was given, with the scale's ends; else what the image tells, at targets or by standard deviations beside them."""
+    """The noise model that was given, with the scale's ends; else what the image tells, at targets or by the spread beside them."""
     if task.noise is not None:
         return replace(task.noise, low_dn=max(task.low_dn, task.noise.low_dn), high_dn=min(task.high_dn, task.noise.high_dn))
     if isinstance(targets, Targets) and len(targets):
@@ -487,7 +513,9 @@ def _placed(columns: dict[str, np.ndarray], grid: Any) -> dict[str, np.ndarray]:
 def _grid_size(grid: str | tuple[int, int] | None, kind: str) -> tuple[int, int] | str | None:
     if kind == "chessboard" and grid is None:
         raise InputError("the size of the chessboard is missing", where="grid", allowed="COLSxROWS of its inner corners, such as 9x6")
-    if grid is None or grid == "any":
+    if grid is not None and kind not in (*SPOTS, "chessboard"):
+        raise InputError(f"targets of kind {kind} stand in no grid", where="grid", allowed="disc, ellipse, ring, spot, chessboard")
+    if grid is None or (grid == "any" and kind != "chessboard"):
         return grid
     size = tuple(grid.lower().split("x")) if isinstance(grid, str) else tuple(grid)
     try:
@@ -495,7 +523,6 @@ def _grid_size(grid: str | tuple[int, int] | None, kind: str) -> tuple[int, int]
     except (TypeError, ValueError):
         cols = rows = 0
     if cols < 2 or rows < 2:
-        raise InputError("not the size of a grid", where="grid", value=grid, allowed="COLSxROWS, such as 9x6, both at least 2; or any")
-    if kind not in (*SPOTS, "chessboard"):
-        raise InputError(f"targets of kind {kind} stand in no grid", where="grid", allowed="disc, ellipse, ring, spot, chessboard")
+        allowed = "COLSxROWS, such as 9x6, both at least 2" + ("" if kind == "chessboard" else "; or any")
+        raise InputError("not the size of a grid", where="grid", value=grid, allowed=allowed)
     return cols, rows

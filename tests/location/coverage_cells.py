@@ -177,7 +177,7 @@ def add(out: Outcome, table, frame: Frame, tree: cKDTree | None = None) -> None:
     order = np.flatnonzero(near)[np.argsort(distance[near])]
     order = order[np.unique(index[order], return_index=True)[1]]
     rows = np.flatnonzero(good)[order]
-    out.false += len(table.x_px) - len(rows)
+    out.false += int(good.sum()) - len(rows)
     unsure = (np.asarray(table.flags)[rows] & int(UNSURE)) != 0
     out.unsure += int(unsure.sum())
     rows, true = rows[~unsure], index[order][~unsure]

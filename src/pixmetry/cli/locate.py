@@ -10,7 +10,7 @@ KINDS = ("disc", "ellipse", "ring", "spot", "line", "edge", "cross", "chessboard
 
 
 @click.command()
-@click.argument("images", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.argument("images", nargs=-1, type=click.Path(path_type=Path))
 @click.option("--kind", type=click.Choice(KINDS), default="disc", show_default=True, help="What is to be found.")
 @click.option("--estimator", default="auto", show_default=True, metavar="NAME", help="How it is measured; 'list' shows what there is.")
 @click.option(
@@ -71,6 +71,8 @@ def locate(
         for name, text in estimators(kind).items():
             click.echo(f"{name:<24} {text}")
         return
+    if not images:
+        raise click.UsageError("no image is named; pixmetry locate --help shows what can be")
     set_threads(threads)
     with shown_progress() as progress:
         table = locate_files(

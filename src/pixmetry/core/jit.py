@@ -65,7 +65,7 @@ class Kernel:
         return (self._dispatcher or self.dispatcher)(*[_plain(a) if isinstance(a, np.ndarray) else a for a in args])
 
 
-def jit(function: Callable[..., Any] | None = None, **options: Any) -> Any:
+def jit(function: Callable[..., Any] | None = None, /, **options: Any) -> Any:
     """Mark a function as a kernel.
 
     Parameters

@@ -16,12 +16,12 @@ import math
 import numpy as np
 
 from pixmetry.core.jit import jit
+from pixmetry.location._profile_kernels import clipped, invert
 
 NODE, REST = 240.0**-0.25, 1.0 / 12.0 - 240.0**-0.5  # for an aperture of 1 px: ±NODE, NODE⁴ = 1/240, NODE² + REST = 1/12
 SHARP_NODE, SHARP_WEIGHT, SHARP_REST = 0.345832000, 0.318902969, 0.007051891  # ±NODE with this weight and 0 with what is left
 SHARP_PX = 0.5  # blur, in pixels of aperture, below which three are taken
 FAR = 5.0  # in standard deviations: beyond, a step is ±1 to 6e-7
-CLIP = 6.0  # standard deviations from the scale's ends within which clipping is looked at
 LEAST_BLUR_PX = 0.05
 SMALL_STEP = 1e-5  # squared length of a step in standard errors at which a fit is at rest
 MOST_STEPS = 60
@@ -117,58 +117,15 @@ def pixel(x, y, p, unknowns, aperture, d):
 
 
 @jit
-def _clipped(mean, variance, low, high):
-    """Mean and variance of a normal variable that is held between low and high, and the slope of that mean."""
-    sigma = math.sqrt(variance)
-    below, above = (low - mean) / sigma, (high - mean) / sigma
-    if below < -CLIP and above > CLIP:
-        return mean, variance, 1.0
-    at_low, at_high = 0.5 * math.erfc(-below * 0.7071067811865476), 0.5 * math.erfc(above * 0.7071067811865476)
-    inside = 1.0 - at_low - at_high
-    edge_low, edge_high = 0.3989422804014327 * math.exp(-0.5 * below * below), 0.3989422804014327 * math.exp(-0.5 * above * above)
-    low_part, high_part = 0.0, 0.0
-    low_square, high_square = 0.0, 0.0
-    if below > -CLIP:
-        low_part, low_square = below * at_low, below * below * at_low + below * edge_low
-    if above < CLIP:
-        high_part, high_square = above * at_high, above * above * at_high - above * edge_high
-    first = low_part + high_part + edge_low - edge_high
-    second = low_square + high_square + inside
-    return mean + sigma * first, max(variance * (second - first * first), 1e-2 * variance), max(inside, 1e-6)
-
-
-@jit
-def _solve(matrix, n, right, inverse):
-    """Cholesky solution in place of ``right``, and the inverse if ``inverse`` has the room; False if not positive definite."""
-    factor = np.zeros((n, n))
+def _solve(matrix, n, right, inverse, step):
+    """Put matrix⁻¹ right into ``step`` and matrix⁻¹ into ``inverse``; False if the matrix is not positive definite."""
+    if not invert(matrix, n, inverse):
+        return False
     for i in range(n):
-        for j in range(i + 1):
-            total = matrix[i, j]
-            for k in range(j):
-                total -= factor[i, k] * factor[j, k]
-            if i == j:
-                if not total > 1e-14 * matrix[i, i]:
-                    return False
-                factor[i, i] = math.sqrt(total)
-            else:
-                factor[i, j] = total / factor[j, j]
-    for i in range(n):
-        total = right[i]
-        for k in range(i):
-            total -= factor[i, k] * right[k]
-        right[i] = total / factor[i, i]
-    for i in range(n - 1, -1, -1):
-        total = right[i]
-        for k in range(i + 1, n):
-            total -= factor[k, i] * right[k]
-        right[i] = total / factor[i, i]
-    if inverse.shape[0] >= n:
-        unit = np.zeros(n)
-        for column in range(n):
-            unit[:] = 0.0
-            unit[column] = 1.0
-            _solve(matrix, n, unit, inverse[:0])
-            inverse[:n, column] = unit
+        total = 0.0
+        for k in range(n):
+            total += inverse[i, k] * right[k]
+        step[i] = total
     return True
 
 
@@ -183,9 +140,7 @@ def normal_equations(values, xs, ys, count, p, unknowns, aperture, noise, kept, 
     right[:] = 0.0
     for i in range(count):
         level = pixel(xs[i] - p[0], ys[i] - p[1], p, unknowns, aperture, d)
-        light = max(level - noise[3], 0.0)
-        variance = noise[0] + noise[1] * light + (noise[2] * light) ** 2
-        mean, variance, slope = _clipped(level, variance, noise[4], noise[5])
+        mean, variance, slope = clipped(level, noise[0], noise[1], noise[2], noise[3], noise[4], noise[5])
         weight, residual = 1.0 / variance, values[i] - mean
         weights[i] = weight
         chi2 += residual * residual * weight
@@ -257,8 +212,7 @@ def _descend(values, xs, ys, count, p, unknowns, aperture, noise, reach, inverse
     for _turn in range(MOST_STEPS):
         for i in range(unknowns):
             matrix[i, i] *= 1.0 + damping
-            step[i] = right[i]
-        solved = _solve(matrix, unknowns, step, matrix[:0])
+        solved = _solve(matrix, unknowns, right, inverse, step)
         length = 0.0
         for i in range(unknowns):
             matrix[i, i] /= 1.0 + damping
@@ -290,7 +244,7 @@ def _descend(values, xs, ys, count, p, unknowns, aperture, noise, reach, inverse
         matrix[:, :] = trial_matrix
         right[:] = trial_right
         damping = 0.1 * damping if damping > 1e-7 else 0.0
-    solved = _solve(matrix, unknowns, right.copy(), inverse)
+    solved = invert(matrix, unknowns, inverse)
     return chi2, at_rest and solved
 
 
@@ -299,8 +253,7 @@ def _promised_fall(values, xs, ys, count, p, aperture, noise):
     """Fall of χ² that one step with all unknowns promises from p."""
     matrix, right, step, d, weights = np.zeros((ALL, ALL)), np.zeros(ALL), np.zeros(ALL), np.zeros(ALL), np.zeros(count)
     normal_equations(values, xs, ys, count, p, ALL, aperture, noise, weights, weights, matrix, right, d)
-    step[:] = right
-    if not _solve(matrix, ALL, step, matrix[:0]):
+    if not _solve(matrix, ALL, right, np.empty((ALL, ALL)), step):
         return math.inf
     return float((step * right).sum())
 

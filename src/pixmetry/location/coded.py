@@ -24,6 +24,7 @@ INSIDE = slice(2, SAMPLES - 2)  # of them, those away from the segment's ends
 RING_RADII, QUIET_RADIUS, OUTER_RADIUS = (2.3, 2.5, 2.7), 1.5, 3.5
 LEAST_MARGIN = 0.3
 MOST_OUTSIDE = 0.4  # of the disc's contrast: more is not quiet
+NOWHERE_PX = -1e6  # where targets without a position are put
 CHUNK = 128
 
 
@@ -145,7 +146,7 @@ def ring_members(
     """
     from scipy.spatial import cKDTree
 
-    place = np.stack([x_px, y_px], axis=1)
+    place = np.nan_to_num(np.stack([x_px, y_px], axis=1), nan=NOWHERE_PX)
     member = np.zeros(len(place), bool)
     tree = cKDTree(place)
     for i in np.flatnonzero(number >= 0):

@@ -10,7 +10,7 @@ from pixmetry.core.errors import InputError
 from pixmetry.core.threads import map_tiles
 from pixmetry.location import _corner_kernels as kernels
 from pixmetry.location.grids import Grid, eight_bit, no_grid
-from pixmetry.location.noise import NoiseModel
+from pixmetry.location.noise import NoiseModel, noise_numbers
 from pixmetry.location.targets import Flag, Positions
 
 REACH_PX = 10.0  # the blurred edges are straight over this length even through strongly distorting lenses
@@ -139,11 +139,7 @@ def corner_positions(
     n = len(x)
     found, covariance = np.full((n, kernels.ALL), np.nan), np.full((n, 3), np.nan)
     chi2, counts, states = np.full(n, np.nan), np.zeros(n, np.int64), np.zeros(n, np.int64)
-    law = np.array([getattr(noise, k) for k in ("constant_dn2", "slope_dn", "pattern_rel", "black_dn", "low_dn", "high_dn")])
-    if frame.dtype.kind == "u":  # the scale of whole numbers ends at the latest where their type does
-        law[4], law[5] = max(law[4], 0.0), min(law[5], float(np.iinfo(frame.dtype).max))
-    law = np.append(law, PLANES_SIGNIFICANT)
-    law[0] = max(law[0], 1e-12)  # a noise model without noise still weights all pixels alike
+    law = np.append(noise_numbers(noise, frame.dtype), PLANES_SIGNIFICANT)
 
     def fit(start: int) -> None:
         results = (start, min(start + CHUNK, n), found, covariance, chi2, counts, states)
@@ -203,8 +199,7 @@ def _positions(
 def _directions_deg(found: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Directions of the two edges in the order in which the squares from the first to the second, turning x to y, are bright."""
     first, second = np.degrees(found[:, 2]) - 90, np.degrees(found[:, 3]) - 90
-    span = (second - first) % 180
     # half-way from the first to the second, the product of the distances has the sign of −sin² of half the span: dark for contrast > 0
     swap = found[:, 6] > 0
-    first, second = np.where(swap, second, first), np.where(swap, first + 0 * span, second)
+    first, second = np.where(swap, second, first), np.where(swap, first, second)
     return (first + 90) % 180 - 90, (second + 90) % 180 - 90

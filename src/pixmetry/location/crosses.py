@@ -13,8 +13,8 @@ from pixmetry.location import _line_kernels as whole
 from pixmetry.location._profile_kernels import BAR, GAUSSIAN
 from pixmetry.location.line_candidates import LineCandidates
 from pixmetry.location.line_detection import find_lines
-from pixmetry.location.lines import DEG, LEAST_BLUR_PX, PIXEL, Fit, fit_template, noise_numbers
-from pixmetry.location.noise import NoiseModel
+from pixmetry.location.lines import DEG, LEAST_BLUR_PX, PIXEL, Fit, fit_template
+from pixmetry.location.noise import NoiseModel, noise_numbers
 from pixmetry.location.targets import Flag, Positions
 
 LEAST_ANGLE_DEG = 15.0

@@ -114,20 +114,6 @@ class Ellipses:
         return cls(conics[:, 0], conics[:, 1], axes[:, 1], axes[:, 0], angle, covariance)
 
     @classmethod
-    def of_axes(cls, parameters: np.ndarray, covariance: np.ndarray) -> Ellipses:
-        """From x, y, half axes and angle in degrees, shape (n, 5), with the covariance of these, shape (n, 5, 5)."""
-        a, b = parameters[:, 2], parameters[:, 3]
-        turn, twist = _turn(parameters[:, 4]), np.deg2rad(a**2 - b**2)
-        jacobian = np.zeros((len(a), 5, 5))
-        jacobian[:, 0, 0] = jacobian[:, 1, 1] = 1.0
-        for k, (i, j) in enumerate(((0, 0), (0, 1), (1, 1)), 2):
-            jacobian[:, k, 2] = 2 * a * turn[:, i, 0] * turn[:, j, 0]
-            jacobian[:, k, 3] = 2 * b * turn[:, i, 1] * turn[:, j, 1]
-            jacobian[:, k, 4] = twist * (turn[:, i, 0] * turn[:, j, 1] + turn[:, i, 1] * turn[:, j, 0])
-        x, y, _, _, angle = parameters.T
-        return cls(x, y, a, b, angle, jacobian @ covariance @ jacobian.swapaxes(1, 2))
-
-    @classmethod
     def of(cls, positions: Positions) -> Ellipses:
         """From a template fit of ellipses, with the covariance of the outline that goes with that of the places.
 

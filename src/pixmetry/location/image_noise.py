@@ -9,9 +9,10 @@ import numpy as np
 
 from pixmetry.core.errors import MeasureError
 from pixmetry.core.threads import map_tiles
+from pixmetry.location.background import scale_of
 from pixmetry.location.noise import ROUNDING_DN2, NoiseModel
 from pixmetry.location.targets import Targets
-from pixmetry.location.template_fit import KINDS, Windows, run_fit
+from pixmetry.location.template_fit import KINDS, Windows, run_fit, with_second_start
 
 PIECES = 4  # of the work
 LEAST_SLOPED_PX = 2.0
@@ -51,7 +52,7 @@ def noise_from_image(
     -------
     NoiseModel
         Of origin "image". The slope is 0 unless it stands 4 standard deviations clear. Rounding is part of the measured variance, which
-        is not below 1/12 DN² for integer frames. The ends of the scale are those of an integer type, or 2^b − 1 where values pile up there.
+        is not below 1/12 DN² for integer frames. The scale ends where it was said to, at the latest where an integer type does.
 
     Raises
     ------
@@ -70,25 +71,13 @@ def noise_from_image(
     whole = frame.dtype.kind == "u"
     least = ROUNDING_DN2 if whole else (1e-6 * float(np.median(np.abs(part.amplitude_dn)))) ** 2 + 1e-12
     first = max(float(np.median(part.sigma_dn)) ** 2, least)
-    low, high = scale_of(frame)
-    low, high = max(low, low_dn), min(high, high_dn)
+    low, high, _ = scale_of(frame, low_dn, high_dn)
     guess = NoiseModel(first, low_dn=low, high_dn=high, origin="image")
     start = None
     for _ in range(2):  # the second time with better weights, and a better idea of which pixels are flat
         level, residual, start = _flat_residuals(frame, part, guess, kind, aperture_px, threads, start)
         guess = _fitted(level, residual, guess, least)
     return guess
-
-
-def scale_of(frame: np.ndarray) -> tuple[float, float]:
-    """Lower and upper end of the scale of a frame's grey values."""
-    if frame.dtype.kind != "u":
-        return -math.inf, math.inf
-    high = float(np.iinfo(frame.dtype).max)
-    top = int(frame.max())
-    if frame.dtype.itemsize > 1 and top > 255 and (top & (top + 1)) == 0 and np.count_nonzero(frame == top) >= 3:
-        high = float(top)
-    return 0.0, high
 
 
 def _flat_residuals(
@@ -109,6 +98,7 @@ def _flat_residuals(
     ground = bool(np.median(targets.semi_minor_px) > LEAST_SLOPED_PX)
     light = ground and kind != "spot"
     fitted = run_fit(windows, np.arange(len(targets)), first, ground, light, False, threads)
+    fitted = with_second_start(windows, targets, fitted, (ground, light, False), threads)
     slopes = 2 * ground + 2 * light
     about = windows.start, windows.half, windows.outer, windows.reach, windows.near_start, windows.near_index, windows.numbers
 

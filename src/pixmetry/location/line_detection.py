@@ -9,6 +9,7 @@ import numpy as np
 from pixmetry.core.errors import InputError
 from pixmetry.core.threads import map_tiles
 from pixmetry.location import _line_detect_kernels as kernels
+from pixmetry.location.background import scale_of
 from pixmetry.location.line_candidates import LineCandidates
 from pixmetry.location.noise import NoiseModel
 from pixmetry.location.targets import Flag
@@ -22,7 +23,6 @@ MOST_TURN = 0.35  # rad: what turns more over its length is no line
 TOLERANCE_PX = 1.0
 STRONGER = 3.0  # times as high: such lines leave traces beside them
 BLOCK = 32  # px, for the map of the noise
-LEAST_NOISE_DN = 0.2887  # of rounding
 
 
 def find_lines(
@@ -96,7 +96,8 @@ def _find(
     if min(frame.shape) < 8:
         return LineCandidates.of(x1_px=np.zeros(0))
     light = np.ascontiguousarray(frame, np.float32)
-    sigma = _noise_map(light, noise)
+    grain = scale_of(frame, -math.inf, math.inf)[2]
+    sigma = _noise_map(light, noise, max(grain, 1e-30) / math.sqrt(12))
     points, scale = _points(light, sigma, kind, polarity, threads)
     ratio = points[:, :, 0].ravel()
     seeds = np.flatnonzero(ratio > SEED_SIGMA)
@@ -114,8 +115,9 @@ def _find(
     return _candidates(_once(states, kind, light), kind, frame)
 
 
-def _noise_map(light: np.ndarray, noise: NoiseModel | None) -> np.ndarray:
-    """Standard deviation of the noise at every pixel: of the model at the smoothed grey value, or by blocks of the frame.
+def _noise_map(light: np.ndarray, noise: NoiseModel | None, least_dn: float) -> np.ndarray:
+    """Standard deviation of the noise at every pixel: of the model at the smoothed grey value, or by blocks of the frame and not
+    below ``least_dn``, that of rounding.
 
     J. Immerkær, Computer Vision and Image Understanding 64(2), 300 (1996): a mask that planes and edges along the grid do not pass; here
     its median by blocks instead of the mean, which lines and edges raise.
@@ -130,7 +132,7 @@ def _noise_map(light: np.ndarray, noise: NoiseModel | None) -> np.ndarray:
     tall, wide = min(BLOCK, light.shape[0]), min(BLOCK, light.shape[1])
     blocks = rough[: rows * tall, : cols * wide].reshape(rows, tall, cols, wide)
     block = 1.4826 * np.median(blocks, axis=(1, 3)).astype(np.float32)
-    block = np.maximum(block, max(0.7 * float(np.median(block)), LEAST_NOISE_DN)).astype(np.float32)
+    block = np.maximum(block, max(0.7 * float(np.median(block)), least_dn)).astype(np.float32)
     if min(block.shape) > 2:
         block = cv2.medianBlur(block, 3)
     return cv2.resize(block, light.shape[::-1], interpolation=cv2.INTER_LINEAR)

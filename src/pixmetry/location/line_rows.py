@@ -11,8 +11,8 @@ from pixmetry.core.threads import map_tiles
 from pixmetry.location import _line_kernels as whole
 from pixmetry.location import _line_row_kernels as kernels
 from pixmetry.location.line_candidates import LineCandidates
-from pixmetry.location.lines import CHUNK, ROW_ESTIMATORS, Fit, fit_template, noise_numbers, oriented, placed
-from pixmetry.location.noise import NoiseModel
+from pixmetry.location.lines import CHUNK, ROW_ESTIMATORS, Fit, fit_template, oriented, placed
+from pixmetry.location.noise import NoiseModel, noise_numbers
 from pixmetry.location.targets import Flag, Positions
 
 LAWS = {

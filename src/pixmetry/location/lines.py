@@ -13,7 +13,7 @@ from pixmetry.core.threads import map_tiles
 from pixmetry.location import _line_kernels as kernels
 from pixmetry.location._profile_kernels import BAR, EDGE, GAUSSIAN
 from pixmetry.location.line_candidates import LineCandidates, near_lines, stretches
-from pixmetry.location.noise import NoiseModel
+from pixmetry.location.noise import NoiseModel, noise_numbers
 from pixmetry.location.targets import Flag, Positions
 
 SECTIONS = {"edge": EDGE, "gaussian": GAUSSIAN, "bar": BAR}
@@ -204,14 +204,6 @@ def fit_template(
 
     map_tiles(part, range(0, len(places), CHUNK), threads)
     return fit
-
-
-def noise_numbers(noise: NoiseModel, dtype: np.dtype) -> np.ndarray:
-    """Constant, slope, pattern, black, low and high of a noise model as the kernels want them; the scale of an integer type ends it too."""
-    low, high = max(noise.low_dn, -1e30), min(noise.high_dn, 1e30)
-    if np.issubdtype(dtype, np.integer):
-        low, high = max(low, float(np.iinfo(dtype).min)), min(high, float(np.iinfo(dtype).max))
-    return np.array([max(noise.constant_dn2, 1e-6), noise.slope_dn, noise.pattern_rel, noise.black_dn, low, high])
 
 
 def _positions(fit: Fit, candidates: LineCandidates, frame_shape: tuple[int, int]) -> Positions:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -10,6 +11,8 @@ from pixmetry.core.errors import InputError
 from pixmetry.location.estimators import split_text
 
 ROUNDING_DN2 = 1 / 12  # variance of rounding to whole numbers
+BEYOND_DN = 1e30  # an end of the scale that is never met
+LEAST_DN2 = 1e-12  # a noise model without noise still weights all pixels alike
 KEYS = {"read": "read_dn", "gain": "slope_dn", "prnu": "pattern_rel", "dsnu": "pattern_dn", "black": "black_dn", "bits": "bits"}
 
 
@@ -73,11 +76,19 @@ class NoiseModel:
         return text
 
 
+def noise_numbers(noise: NoiseModel, dtype: np.dtype) -> np.ndarray:
+    """Constant, slope, pattern, black, low and high of a noise model as kernels want them; the scale of an integer type ends it too."""
+    low, high = max(noise.low_dn, -BEYOND_DN), min(noise.high_dn, BEYOND_DN)
+    if np.issubdtype(dtype, np.integer):
+        low, high = max(low, float(np.iinfo(dtype).min)), min(high, float(np.iinfo(dtype).max))
+    return np.array([max(noise.constant_dn2, LEAST_DN2), noise.slope_dn, noise.pattern_rel, noise.black_dn, low, high])
+
+
 def parse_noise(text: str, rounded: bool = True) -> tuple[NoiseModel, float]:
     """Read a noise model from ``key=number,…``, as in ``read=1.5,gain=0.01,black=16,bits=8``.
 
-    ``read`` is the standard deviation without light in DN, without rounding; ``gain`` is K in DN per electron; ``prnu`` and ``dsnu`` are the
-    spreads of sensitivities (relative) and offsets (DN); ``black`` is the grey value without light; ``bits`` say where the scale ends.
+    ``read`` is the standard deviation without light in DN, without rounding; ``gain`` is K in DN per electron; ``prnu`` and ``dsnu`` are
+    the spreads of sensitivities (relative) and offsets (DN); ``black`` is the grey value without light; ``bits`` say where the scale ends.
 
     Returns
     -------
@@ -99,4 +110,5 @@ def parse_noise(text: str, rounded: bool = True) -> tuple[NoiseModel, float]:
         raise InputError("the bits cannot be used", where="noise", value=bits, allowed="1 to 32")
     if bits is not None:
         values |= {"low_dn": 0.0, "high_dn": 2.0 ** int(bits) - 1}
-    return NoiseModel(read**2 + (ROUNDING_DN2 if rounded else 0.0), **values), pattern
+    told: dict[str, Any] = dict(values)
+    return NoiseModel(read**2 + (ROUNDING_DN2 if rounded else 0.0), **told), pattern

@@ -6,12 +6,13 @@ import numpy as np
 
 from pixmetry.core.errors import InputError
 from pixmetry.location import _operator_kernels as o
-from pixmetry.location._moment_kernels import COLUMNS, MARGIN
+from pixmetry.location._moment_kernels import ANGLE, COLUMNS, MAJOR, MARGIN, MINOR, REACH
 from pixmetry.location.moments import LARGEST_PX, Prepared, class_means, classes, positions, prepare, run_slices
 from pixmetry.location.noise import NoiseModel
 from pixmetry.location.targets import Positions, Targets
 
 OPERATORS = {"perimeter": o.PERIMETER, "forstner": o.FORSTNER, "ellipse_edges": o.ELLIPSE_EDGES, "gaussian": o.GAUSSIAN}
+ASTRAY_PX = 1.0
 MARGINS = {"perimeter": 3.0, "forstner": 3.0, "ellipse_edges": 3.0, "gaussian": 4.0}
 
 
@@ -44,7 +45,8 @@ def operator_positions(frame: np.ndarray, targets: Targets, noise: NoiseModel, n
     -----
     The covariance is that of the pixels' noise and the background's plane through the operator's slopes by pixel; of the perimeter, which
     has none, through the chance of each pixel to be taken over the threshold. The variance over the sub-pixel phase is added: that of the
-    operator itself on noise-free images of targets of like size, blur and shape, the largest over half a pixel of sizes.
+    operator itself on noise-free images of targets of like size, blur and shape, the largest over half a pixel of sizes,
+    on pixels that are sensitive on their whole square.
 
     References
     ----------
@@ -56,19 +58,19 @@ def operator_positions(frame: np.ndarray, targets: Targets, noise: NoiseModel, n
         raise InputError("no such operator", value=name, allowed=", ".join(OPERATORS))
     operator, n = OPERATORS[name], len(targets)
     work = prepare(frame, targets, noise, margin=MARGINS[name], threads=threads)
-    s_curve = np.sqrt(_phase_variance(work, targets, operator, threads))
+    s_curve = np.sqrt(_phase_variance(work, operator, threads))
     result, at_rest = np.full((n, 6), np.nan), np.zeros(n, bool)
     work.over(lambda a, b: o.operators(frame, work.record, a, b, operator, work.noise, result, at_rest), threads)
-    result[~at_rest] = np.nan
+    # a fit that has left its target found something else
+    lost = ~(np.hypot(result[:, 0] - targets.x_px, result[:, 1] - targets.y_px) < ASTRAY_PX + 0.25 * targets.semi_minor_px)
+    result[lost], at_rest[lost] = np.nan, False
     return positions(work, targets, result, at_rest, s_curve)
 
 
-def _phase_variance(work: Prepared, targets: Targets, operator: int, threads: int | None) -> np.ndarray:
+def _phase_variance(work: Prepared, operator: int, threads: int | None) -> np.ndarray:
     record = work.record
     if not len(record):
         return np.zeros(0)
-    from pixmetry.location._moment_kernels import ANGLE, MAJOR, MINOR, REACH
-
     aspect = record[:, MAJOR] / record[:, MINOR]
     # an ellipse that is nearly a circle has no direction
     turn = np.where(aspect > 1.1, np.floor(np.rad2deg(record[:, ANGLE]) / 15.0) + 20.0, 1.0)

@@ -8,7 +8,7 @@ from pixmetry.core.errors import InputError
 from pixmetry.location.image_noise import noise_from_image
 from pixmetry.location.noise import NoiseModel
 from pixmetry.location.targets import Flag, Positions, Targets
-from pixmetry.location.template_fit import KINDS, Fitted, Windows, run_fit
+from pixmetry.location.template_fit import KINDS, Fitted, Windows, run_fit, with_second_start
 
 __all__ = ["KINDS", "LIGHT_ON", "PARAMETERS", "PLANES", "choose_planes", "fit_template", "model", "noise_from_image"]
 
@@ -151,6 +151,7 @@ def fit_template(
     auto = "auto" in (background_plane, light_plane)
     on_ground, on_light = np.full(len(targets), background_plane is True), np.full(len(targets), light_plane is True)
     result = run_fit(windows, everyone, windows.start, on_ground[:1].any() and not auto, on_light[:1].any() and not auto, auto, threads)
+    result = with_second_start(windows, targets, result, (on_ground[:1].any() and not auto, on_light[:1].any() and not auto, auto), threads)
     if auto:
         on_ground, on_light = choose_planes(result.falls, result.chi2_per_dof, background_plane, light_plane)
         start = np.where(result.at_rest[:, None], result.parameters, windows.start)

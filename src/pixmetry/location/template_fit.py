@@ -14,6 +14,8 @@ from pixmetry.location.targets import Targets
 KINDS = ("disc", "ellipse", "ring", "spot")  # in the order of the kernels' codes
 REACH = 3.5  # standard deviations of the edge, the pixel included, up to which pixels around a target are used
 NEAR = 3.2  # the same within which a pixel is a neighbour's
+SMALL_PX, SHARP_PX, FAR_TOO_LARGE = 2.5, 0.3, 2.0  # size, blur and χ² per degree of freedom of a second start
+BLUR = -7  # place of the blur among the parameters
 CHUNK = 64  # targets in one piece of work, at most
 
 
@@ -170,3 +172,23 @@ def run_fit(
     reduced, steps = quality[:, 0] / np.maximum(dof, 1), quality[:, 5]
     cut, top, bottom = quality[:, 6] > 0, quality[:, 7], quality[:, 8]
     return Fitted(parameters, variance, covariance, reduced, dof, quality[:, 2:5], np.abs(steps), steps > 0, cut, top, bottom)
+
+
+def with_second_start(
+    windows: Windows, targets: Targets, result: Fitted, options: tuple[bool, bool, bool], threads: int | None
+) -> Fitted:
+    """Fit small targets whose residuals are far too large once more, from a sharp edge, and keep the better fit.
+
+    A disc of a pixel's size can pass for a far smaller and higher one with more blur; between the two lies a ridge of χ².
+    """
+    if KINDS[windows.code] not in ("disc", "ellipse"):
+        return result
+    small = np.sqrt(targets.semi_major_px * targets.semi_minor_px) < SMALL_PX
+    again = np.flatnonzero(small & ~(result.at_rest & (result.chi2_per_dof < FAR_TOO_LARGE)))
+    if not len(again):
+        return result
+    start = windows.start.copy()
+    start[again, BLUR] = SHARP_PX
+    other = run_fit(windows, again, start, *options, threads)
+    better = again[other.at_rest[again] & ~(result.at_rest[again] & (result.chi2_per_dof[again] <= other.chi2_per_dof[again]))]
+    return result.put(better, other) if len(better) else result

@@ -66,13 +66,13 @@ def write_overlay(path: str | Path, frame: np.ndarray, table: Located) -> Path:
     from matplotlib.figure import Figure
 
     rows, cols = frame.shape
-    zoom = int(np.clip(WANTED_PX // max(rows, cols), 1, MOST_ZOOM))
+    zoom = int(np.clip(-(-WANTED_PX // max(rows, cols)), 1, MOST_ZOOM))
     width, height = max(cols * zoom / DPI, 4.0), rows * zoom / DPI
     figure = Figure(figsize=(width, height + STRIP_IN), dpi=DPI, facecolor="white")
     FigureCanvasAgg(figure)
     axes = figure.add_axes((0.0, STRIP_IN / (height + STRIP_IN), cols * zoom / DPI / width, height / (height + STRIP_IN)))
     low, high = np.percentile(frame, [0.5, 99.5])
-    axes.imshow(frame, cmap="gray", vmin=low, vmax=max(high, low + 1), interpolation="nearest")
+    axes.imshow(frame, cmap="gray", vmin=low, vmax=high if high > low else low + 1, interpolation="nearest")
     axes.set_axis_off()
     _marks(axes, table, zoom)
     axes.set(xlim=(-0.5, cols - 0.5), ylim=(rows - 0.5, -0.5))
@@ -101,15 +101,17 @@ def _marks(axes, table: Located, zoom: int) -> None:
         return
     x, y = table.x_px[good], table.y_px[good]
     colours = np.where(table.flags[good] != 0, FLAGGED, CLEAN)
-    arm = 3.0 / zoom
+    arm, ink = 3.0 / zoom, CROSS
     if "length_px" in table.columns and "angle_deg" in table.columns:
         angle, half = np.deg2rad(table.angle_deg[good]), 0.5 * table.length_px[good]
         along = np.stack([half * np.cos(angle), half * np.sin(angle)], axis=1)
         middle = np.stack([x, y], axis=1)
-        axes.add_collection(LineCollection(np.stack([middle - along, middle + along], axis=1), colors=list(colours), linewidths=1.2))
+        axes.add_collection(LineCollection(list(np.stack([middle - along, middle + along], axis=1)), colors=list(colours), linewidths=1.2))
     else:
         major, minor, angle = _axes_of(table, good)
         shown = np.isfinite(major)
+        if not shown.any():  # nothing to draw around them: the cross alone shows place and flags
+            arm, ink = 7.0 / zoom, list(np.tile(colours, 2))
         if shown.any():
             axes.add_collection(
                 EllipseCollection(
@@ -126,7 +128,7 @@ def _marks(axes, table: Located, zoom: int) -> None:
             )
     level, upright = np.array([[-arm, 0.0], [arm, 0.0]]), np.array([[0.0, -arm], [0.0, arm]])
     middle = np.stack([x, y], axis=1)[:, None, :]
-    axes.add_collection(LineCollection(np.concatenate([middle + level, middle + upright]), colors=CROSS, linewidths=0.8))
+    axes.add_collection(LineCollection(list(np.concatenate([middle + level, middle + upright])), colors=ink, linewidths=0.8 if ink == CROSS else 1.4))
     if len(x) <= 500 and "code" in table.columns:
         for xi, yi, code in zip(x, y, table.code[good], strict=True):
             if code >= 0:
@@ -139,7 +141,7 @@ def _axes_of(table: Located, good: np.ndarray) -> tuple[np.ndarray, np.ndarray, 
     nothing = np.full(int(good.sum()), np.nan)
     if "semi_major_px" in columns:
         return columns["semi_major_px"][good], columns["semi_minor_px"][good], columns.get("angle_deg", nothing * 0)[good]
-    for name in ("radius_px", "outer_radius_px", "sigma_px"):
+    for name in ("radius_px", "sigma_px"):
         if name in columns:
             return columns[name][good], columns[name][good], np.zeros_like(nothing)
     return nothing, nothing, nothing
