@@ -125,6 +125,10 @@ def locate(
         raise InputError("light cannot act there", where="light_on", value=light_on, allowed="surface, image")
     if not 0 <= aperture_px <= 1:
         raise InputError("the pixel's aperture cannot be used", where="aperture_px", value=aperture_px, allowed="0 to 1 pixel")
+    if aperture_px < 1 and (estimator in OPERATORS or (estimator in MOMENTS and kind != "line")):
+        remedy = "take the template, whose model has the aperture"
+        raise InputError(f"the uncertainty of {estimator} is known for pixels without gaps only", where="aperture_px", value=aperture_px,
+                         allowed="1", remedy=remedy)  # fmt: skip
     image = checked_frame(frame, name)
     model = noise_model(noise)
     low, high = scale_ends(image, bits, model)
@@ -329,7 +333,7 @@ def _spots(task: Task) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         from pixmetry.location.grids import order_grid
 
         placed = order_grid(positions.x_px, positions.y_px, pattern=None if task.grid == "any" else task.grid)
-        columns = _placed(columns, placed)
+        columns = _beside(columns, grid_col=placed.col, grid_row=placed.row)
         notes["grid"] = placed.message or f"{placed.cols} x {placed.rows}, {int(placed.placed.sum())} of {len(positions)} targets placed"
     return columns, notes
 
@@ -449,7 +453,8 @@ def _chessboard(task: Task) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         positions = place()
     columns = _columns(positions, "template", noise)
     reason = found.message or "two crossing edges, integrated over the pixel; at the Cramér–Rao bound"
-    return _placed(columns, found), _notes("template", reason, noise, "none found" if found.message else "both")
+    columns = _beside(columns, grid_col=found.col, grid_row=found.row)
+    return columns, _notes("template", reason, noise, "none found" if found.message else "both")
 
 
 _WORK = {"line": _lines, "edge": _lines, "cross": _lines, "chessboard": _chessboard}
@@ -463,7 +468,13 @@ def _noise_for(task: Task, kind: str, targets: Targets | np.ndarray) -> NoiseMod
         from pixmetry.location.image_noise import noise_from_image
 
         return noise_from_image(
-            task.frame, targets, kind, low_dn=task.low_dn, high_dn=task.high_dn, aperture_px=task.aperture_px, threads=task.threads
+            task.frame,
+            targets,
+            kind,
+            low_dn=task.low_dn,
+            high_dn=task.high_dn,
+            aperture_px=task.aperture_px,
+            threads=task.threads,
         )
     least = ROUNDING_DN2 if task.frame.dtype.kind == "u" else 1e-12
     sigma = 0.0 if isinstance(targets, Targets) or not len(targets) else float(np.median(targets))
@@ -491,23 +502,21 @@ def _notes(estimator: str, reason: str, noise: NoiseModel, polarity: str) -> dic
 
 
 def _coded(task: Task, positions: Positions, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The columns with each target's code, without the segments of the rings."""
+    """The columns with each target's code, without the segments of the rings; a target that was lost has the code −1."""
     from pixmetry.location.coded import read_codes, ring_members
 
-    more = positions.more
-    shape = positions.x_px, positions.y_px, more["semi_major_px"], more["semi_minor_px"], more["angle_deg"]
-    codes = read_codes(task.frame, *shape, more["amplitude_dn"], threads=task.threads)
-    whole = ~ring_members(*shape, codes.number)
-    columns = {name: values[whole] for name, values in columns.items()}
-    last = {name: columns.pop(name) for name in LAST}
-    columns["target"] = np.arange(int(whole.sum()))
-    return {**columns, "code": codes.number[whole], "code_margin": codes.margin[whole], **last}
+    x, y, more = positions.x_px, positions.y_px, positions.more
+    major, minor, angle = more["semi_major_px"], more["semi_minor_px"], more["angle_deg"]
+    codes = read_codes(task.frame, x, y, major, minor, angle, more["amplitude_dn"], threads=task.threads)
+    whole = ~ring_members(x, y, major, minor, angle, codes.number)
+    columns = {name: values[whole] for name, values in columns.items()} | {"target": np.arange(int(whole.sum()))}
+    return _beside(columns, code=codes.number[whole], code_margin=codes.margin[whole])
 
 
-def _placed(columns: dict[str, np.ndarray], grid: Any) -> dict[str, np.ndarray]:
-    """The columns with the place of each target in a grid before the last three."""
+def _beside(columns: dict[str, np.ndarray], **more: np.ndarray) -> dict[str, np.ndarray]:
+    """The columns with some more before the last three."""
     first = {name: values for name, values in columns.items() if name not in LAST}
-    return {**first, "grid_col": grid.col, "grid_row": grid.row, **{name: columns[name] for name in LAST}}
+    return {**first, **more, **{name: columns[name] for name in LAST}}
 
 
 def _grid_size(grid: str | tuple[int, int] | None, kind: str) -> tuple[int, int] | str | None:

@@ -41,7 +41,7 @@ def noise_from_image(
     ----------
     frame : ndarray, shape (rows, cols), uint8, uint16 or float32
     targets : Targets
-        At most 64 of them are used, spread over the list.
+        All there are, for what belongs to a neighbour is left out; at most 64 of them are used, spread over the list.
     kind : {"disc", "ellipse", "ring", "spot"}
     low_dn, high_dn : float
         Ends of the scale, where they are known.
@@ -67,7 +67,8 @@ def noise_from_image(
     """
     if not len(targets):
         raise MeasureError("no target to measure the noise at", where="noise_from_image", remedy="give a noise model")
-    part = targets[np.unique(np.linspace(0, len(targets) - 1, min(len(targets), MOST_TARGETS)).round().astype(int))]
+    which = np.unique(np.linspace(0, len(targets) - 1, min(len(targets), MOST_TARGETS)).round().astype(int))
+    part = targets[which]
     whole = frame.dtype.kind == "u"
     least = ROUNDING_DN2 if whole else (1e-6 * float(np.median(np.abs(part.amplitude_dn)))) ** 2 + 1e-12
     first = max(float(np.median(part.sigma_dn)) ** 2, least)
@@ -75,7 +76,7 @@ def noise_from_image(
     guess = NoiseModel(first, low_dn=low, high_dn=high, origin="image")
     start = None
     for _ in range(2):  # the second time with better weights, and a better idea of which pixels are flat
-        level, residual, start = _flat_residuals(frame, part, guess, kind, aperture_px, threads, start)
+        level, residual, start = _flat_residuals(frame, targets, which, guess, kind, aperture_px, threads, start)
         guess = _fitted(level, residual, guess, least)
     return guess
 
@@ -83,6 +84,7 @@ def noise_from_image(
 def _flat_residuals(
     frame: np.ndarray,
     targets: Targets,
+    which: np.ndarray,
     noise: NoiseModel,
     kind: str,
     aperture_px: float,
@@ -95,10 +97,10 @@ def _flat_residuals(
     windows = Windows.of(frame, targets, noise, kind, KINDS.index(kind), aperture_px, True, False)
     first = windows.start if start is None else start
     # planes, so that light or a ground that slopes is not taken for noise; small targets cannot tell them from the rest
-    ground = bool(np.median(targets.semi_minor_px) > LEAST_SLOPED_PX)
+    ground = bool(np.median(targets.semi_minor_px[which]) > LEAST_SLOPED_PX)
     light = ground and kind != "spot"
-    fitted = run_fit(windows, np.arange(len(targets)), first, ground, light, False, threads)
-    fitted = with_second_start(windows, targets, fitted, (ground, light, False), threads)
+    fitted = run_fit(windows, which, first, ground, light, False, threads)
+    fitted = with_second_start(windows, targets, which, fitted, (ground, light, False), threads)
     slopes = 2 * ground + 2 * light
     about = windows.start, windows.half, windows.outer, windows.reach, windows.near_start, windows.near_index, windows.numbers
 

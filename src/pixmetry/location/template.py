@@ -127,14 +127,15 @@ def fit_template(
     -----
     "auto" takes a plane in by the fall of χ² that it would bring: for a single target where chance brings it once in 1000; for all of them
     where the median fall of at least 20 targets stands 5 standard deviations above that of chance (3e-7). Falls are divided by the median
-    χ² per degree of freedom where that exceeds 1. Planes of many targets stay only if they take more bias from the places than they add noise
-    (`worth_it`). A slope too small to be seen, which shifts the position by up to about two standard
+    χ² per degree of freedom where that exceeds 1. Planes of many targets stay only if they take more bias from the places than they add
+    noise (`worth_it`), and if the ground around the targets has them too (`believable`). A slope too
+    small to be seen, which shifts the position by up to about two standard
     uncertainties, is not in the covariance of a single target.
 
     References
     ----------
-    W. Förstner, Int. Arch. Photogrammetry 24-III, 176 (1982) and A. W. Gruen, S. Afr. J. Photogrammetry 14(3), 175 (1985), for least-squares
-    matching. D. L. Snyder et al., J. Opt. Soc. Am. A 12(2), 272 (1995); F. Huang et al., Nature Methods 10, 653 (2013).
+    W. Förstner, Int. Arch. Photogrammetry 24-III, 176 (1982) and A. W. Gruen, S. Afr. J. Photogrammetry 14(3), 175 (1985), for
+    least-squares matching. D. L. Snyder et al., J. Opt. Soc. Am. A 12(2), 272 (1995); F. Huang et al., Nature Methods 10, 653 (2013).
     """
     _check(kind, light_on, aperture_px)
     if likelihood not in LIKELIHOODS:
@@ -146,12 +147,14 @@ def fit_template(
         if light_plane is True:
             raise InputError("light that falls off over a Gaussian spot cannot be told from a shift of it", allowed="light_plane=False")
         light_plane = False
-    windows = Windows.of(frame, targets, noise, kind, KINDS.index(kind), aperture_px, light_on == "surface", likelihood == "poisson_gaussian")
+    surface, exact = light_on == "surface", likelihood == "poisson_gaussian"
+    windows = Windows.of(frame, targets, noise, kind, KINDS.index(kind), aperture_px, surface, exact)
     everyone = np.arange(len(targets))
     auto = "auto" in (background_plane, light_plane)
     on_ground, on_light = np.full(len(targets), background_plane is True), np.full(len(targets), light_plane is True)
-    result = run_fit(windows, everyone, windows.start, on_ground[:1].any() and not auto, on_light[:1].any() and not auto, auto, threads)
-    result = with_second_start(windows, targets, result, (on_ground[:1].any() and not auto, on_light[:1].any() and not auto, auto), threads)
+    options = (background_plane is True and not auto, light_plane is True and not auto, auto)
+    result = run_fit(windows, everyone, windows.start, *options, threads)
+    result = with_second_start(windows, targets, everyone, result, options, threads)
     if auto:
         on_ground, on_light = choose_planes(result.falls, result.chi2_per_dof, background_plane, light_plane)
         start = np.where(result.at_rest[:, None], result.parameters, windows.start)
@@ -168,7 +171,7 @@ def fit_template(
                 if (ground and not real_ground) or (light and not real_light):
                     continue
             result = result.put(again, sloped)
-    return _positions(kind, targets, result, on_ground, on_light, windows.noise)
+    return _positions(kind, targets, result, on_ground, on_light)
 
 
 def choose_planes(
@@ -223,9 +226,9 @@ def believable(targets: Targets, noise: NoiseModel, sloped: Fitted, which: np.nd
 def worth_it(plain: Fitted, sloped: Fitted, which: np.ndarray) -> bool:
     """Whether planes take more bias from the places of many targets than they add noise to them.
 
-    With Δ the shift of a place and V the rise of its covariance that the planes bring, Δᵀ V⁻¹ Δ is 2 on average where there was no bias, and
-    4 where bias² is as large as the added variance. Grey values that are not as the template has them (coders, sharpening) bring a fall of
-    χ² by planes that move nothing but the noise.
+    With Δ the shift of a place and V the rise of its covariance that the planes bring, Δᵀ V⁻¹ Δ is 2 on average where there was no bias,
+    and 4 where bias² is as large as the added variance. Grey values that are not as the template has them (coders, sharpening) bring a
+    fall of χ² by planes that move nothing but the noise.
     """
     dx, dy = (sloped.parameters[which, k] - plain.parameters[which, k] for k in (0, 1))
     xx, xy, yy = (np.where(sloped.at_rest[which], (sloped.covariance - plain.covariance)[which, k], np.nan) for k in range(3))
@@ -267,7 +270,7 @@ def _check_shape(kind: str, p: np.ndarray) -> None:
         raise InputError(f"a {kind} that cannot be drawn", value=names, allowed="sizes and blur above 0, an outline that encloses an area")
 
 
-def _positions(kind, targets, result, on_ground, on_light, noise) -> Positions:  # type: ignore[no-untyped-def]
+def _positions(kind: str, targets: Targets, result: Fitted, on_ground: np.ndarray, on_light: np.ndarray) -> Positions:
     names = (*PARAMETERS[kind], *PLANES)
     p, u = result.parameters, np.sqrt(result.variance)
     more = {name: p[:, j] for j, name in enumerate(names) if j > 1 and not name.startswith("shape_")}
@@ -292,4 +295,5 @@ def _positions(kind, targets, result, on_ground, on_light, noise) -> Positions: 
         (Flag.FAINT, worst > FAINT_SHARE * np.hypot(more["blur_px"], 0.29)),
     ):
         flags[where] |= np.uint32(flag)
-    return Positions(p[:, 0].copy(), p[:, 1].copy(), *result.covariance.T.copy(), flags, more)
+    var_x, cov_xy, var_y = result.covariance.T.copy()
+    return Positions(p[:, 0].copy(), p[:, 1].copy(), var_x, cov_xy, var_y, flags, more)

@@ -175,7 +175,7 @@ def run_fit(
 
 
 def with_second_start(
-    windows: Windows, targets: Targets, result: Fitted, options: tuple[bool, bool, bool], threads: int | None
+    windows: Windows, targets: Targets, which: np.ndarray, result: Fitted, options: tuple[bool, bool, bool], threads: int | None
 ) -> Fitted:
     """Fit small targets whose residuals are far too large once more, from a sharp edge, and keep the better fit.
 
@@ -184,7 +184,7 @@ def with_second_start(
     if KINDS[windows.code] not in ("disc", "ellipse"):
         return result
     small = np.sqrt(targets.semi_major_px * targets.semi_minor_px) < SMALL_PX
-    again = np.flatnonzero(small & ~(result.at_rest & (result.chi2_per_dof < FAR_TOO_LARGE)))
+    again = which[(small & ~(result.at_rest & (result.chi2_per_dof < FAR_TOO_LARGE)))[which]]
     if not len(again):
         return result
     start = windows.start.copy()

@@ -101,7 +101,7 @@ def _marks(axes, table: Located, zoom: int) -> None:
         return
     x, y = table.x_px[good], table.y_px[good]
     colours = np.where(table.flags[good] != 0, FLAGGED, CLEAN)
-    arm, ink = 3.0 / zoom, CROSS
+    arm, ink, width = 3.0 / zoom, [CROSS], 0.8
     if "length_px" in table.columns and "angle_deg" in table.columns:
         angle, half = np.deg2rad(table.angle_deg[good]), 0.5 * table.length_px[good]
         along = np.stack([half * np.cos(angle), half * np.sin(angle)], axis=1)
@@ -111,7 +111,7 @@ def _marks(axes, table: Located, zoom: int) -> None:
         major, minor, angle = _axes_of(table, good)
         shown = np.isfinite(major)
         if not shown.any():  # nothing to draw around them: the cross alone shows place and flags
-            arm, ink = 7.0 / zoom, list(np.tile(colours, 2))
+            arm, ink, width = 7.0 / zoom, list(np.tile(colours, 2)), 1.4
         if shown.any():
             axes.add_collection(
                 EllipseCollection(
@@ -128,7 +128,7 @@ def _marks(axes, table: Located, zoom: int) -> None:
             )
     level, upright = np.array([[-arm, 0.0], [arm, 0.0]]), np.array([[0.0, -arm], [0.0, arm]])
     middle = np.stack([x, y], axis=1)[:, None, :]
-    axes.add_collection(LineCollection(list(np.concatenate([middle + level, middle + upright])), colors=ink, linewidths=0.8 if ink == CROSS else 1.4))
+    axes.add_collection(LineCollection(list(np.concatenate([middle + level, middle + upright])), colors=ink, linewidths=width))
     if len(x) <= 500 and "code" in table.columns:
         for xi, yi, code in zip(x, y, table.code[good], strict=True):
             if code >= 0:
