@@ -115,6 +115,19 @@ def test_a_disc_that_the_border_cuts_is_told() -> None:
     assert cut.sum() == 1 and all(int(f) & Flag.BORDER for f in table.flags[cut])
 
 
+@pytest.mark.parametrize("angle_deg", [0.0, 35.0, 45.0])
+@pytest.mark.parametrize("size", [(20.0, 3.5), (24.0, 5.0), (60.0, 3.0)])
+def test_short_and_thick_crosses_are_found_or_not_but_never_an_error(angle_deg: float, size: tuple[float, float]) -> None:
+    at = rendered.window(50.3, 49.8, 48)
+    arms = [rendered.bar(50.3, 49.8, angle_deg + turn, *size, 0.7, at) for turn in (0.0, 90.0)]
+    mean = np.full((100, 100), 20.0)
+    mean[at[0][0] : at[0][-1] + 1, at[1][0] : at[1][-1] + 1] += 150 * np.maximum(*arms)
+    table = pixmetry.locate(rendered.expose(mean, np.random.default_rng(1), read_dn=1.5), kind="cross")
+    good = [i for i in range(len(table)) if np.isfinite(table.var_x_px2[i])]
+    assert all(np.hypot(table.x_px[i] - 50.3, table.y_px[i] - 49.8) < 0.1 for i in good)
+    assert good or size[0] < 60
+
+
 def test_coded_targets_are_told_apart_and_placed_as_well_as_others() -> None:
     """Sixteen of them, tilted by 45°; rings are no targets. (Rings near the discs pass for noise there: u is up to 2.5 times too large.)"""
     from location.test_coded import drawn, view

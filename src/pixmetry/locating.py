@@ -44,7 +44,8 @@ ROWS = {
 AUTO = {"auto": "chooses shape and likelihood of the template by what the image shows, and says why"}
 SPOTS = ("disc", "ellipse", "ring", "spot")
 FEW_ELECTRONS = 50.0  # at a target's peak: below, the errors of a grey value are visibly no normal ones
-TILTED = 0.93  # ratio of the axes below which discs are fitted as ellipses
+FAINTEST = 0.05  # height of lines and edges over that of the frame's strongest
+TILTED = 0.91  # ratio of the axes below which discs are fitted as ellipses
 PILED = 10  # pixels in 4 of one value at the top of an image before it is asked whether they were cut off there
 LARGE_PX = 2.0  # radius from which that ratio can be told from a look at the region
 
@@ -344,12 +345,15 @@ def measured(task: Task, targets: Targets, noise: NoiseModel, estimator: str, sh
         from pixmetry.location.template import fit_template
 
         likelihood = "least_squares" if estimator == "template" else estimator
+        planes: Any = False if task.kind == "coded" else "auto"  # the rings would pass for slopes
         return fit_template(
             task.frame,
             targets,
             noise,
             shape,
             likelihood=likelihood,
+            background_plane=planes,
+            light_plane=planes,
             light_on=task.light_on,
             aperture_px=task.aperture_px,
             threads=task.threads,
@@ -394,6 +398,8 @@ def _lines(task: Task) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         found = find_edges(task.frame, noise=task.noise, threads=task.threads)
     else:
         found = find_lines(task.frame, polarity=task.polarity, noise=task.noise, threads=task.threads)
+    height = np.abs(found.amplitude_dn)
+    found = found[height >= FAINTEST * height.max(initial=0.0)]  # beside a strong one, what a coder or a halo draws is no line
     noise = _noise_for(task, task.kind, found.sigma_dn)
     estimator, reason = ("template", FITS["template"]) if task.estimator == "auto" else (task.estimator, "as was asked for")
     if task.kind == "cross":

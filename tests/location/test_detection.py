@@ -388,3 +388,14 @@ def test_refuses_what_cannot_be_meant() -> None:
             detect(frame, **wrong)
     with pytest.raises(InputError):
         select(detect(frame).targets, "star")
+
+
+def test_a_noise_map_that_falls_steeply_to_the_border_does_not_fall_below_zero() -> None:
+    """Continued bilinearly to the border it did, and the search down from each top had no end."""
+    rng = np.random.default_rng(3)
+    frame = rng.normal(215, 1, (64, 320))
+    frame[:, 64:256] += rng.normal(0, 6, (64, 192))
+    frame[:, 256:] = 219
+    frame[20:40, 150:153] = 20
+    found = detect(np.clip(np.rint(frame), 0, 255).astype(np.uint8), low_dn=0.0, high_dn=255.0)
+    assert len(found.targets) < 40

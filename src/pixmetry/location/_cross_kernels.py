@@ -15,6 +15,7 @@ from pixmetry.location._profile_kernels import BAR, ROOT, clipped, invert, step
 X, Y, ANGLE_1, ANGLE_2, BACKGROUND, HEIGHT_1, HEIGHT_2, SIGMA_1, SIGMA_2, WIDTH_1, WIDTH_2, OVERLAP, SLOPE_X, SLOPE_Y = range(14)
 UNKNOWNS = 14
 MOST_PASSES = 40
+MOST_ROOM = 1 << 24  # pixels
 
 
 @jit
@@ -212,7 +213,10 @@ def fit_crosses(
     active = np.empty(UNKNOWNS, np.int64)
     for i in range(first, stop):
         found[i], covariances[i], told[i] = np.nan, np.nan, np.nan
-        room = int(2.2 * (reach[i, 0] + 1) * (arms[i, 1] - arms[i, 0] + 4) + 2.2 * (reach[i, 1] + 1) * (arms[i, 3] - arms[i, 2] + 4)) + 64
+        first_arm, second_arm = max(arms[i, 1] - arms[i, 0], 0.0), max(arms[i, 3] - arms[i, 2], 0.0)
+        room = int(2.2 * (reach[i, 0] + 1) * (first_arm + 4) + 2.2 * (reach[i, 1] + 1) * (second_arm + 4)) + 64
+        if not 0 < room < MOST_ROOM:  # a line of the two was lost in its own fit
+            continue
         pixels = np.empty((room, 3))
         a, b = begin[i], begin[i + 1]
         n, met = cross_gather(

@@ -12,6 +12,7 @@ from pixmetry.location._detect_kernels import RUN, doubled, group_runs, join_run
 
 STRETCH = 32  # pixels over which the background is taken as straight
 PROMINENT = 1.4  # height of a summit over that of the saddle to a higher one, for both to be targets
+LEAST_LEVEL = 1e-9  # DN
 STEP = 0.5**0.25  # from one level to the next below
 SOLID = 20  # pixels from which on two outliers among them are not believed
 GROWTHS = 5  # of the window in which a faint target is looked for
@@ -333,7 +334,7 @@ def measure_regions(frame, nodes, least, row_scale, col_scale, runs, start, firs
             continue
         n = heights(frame, nodes, row_scale, col_scale, region, height)
         most, top = top_of(region, height)
-        low = map_at(least, row_scale, col_scale, float(region[0, 1]), float(region[0, 0]))[0]
+        low = max(map_at(least, row_scale, col_scale, float(region[0, 1]), float(region[0, 0]))[0], LEAST_LEVEL)
         if most < SEED * low:
             continue
         born = found
