@@ -33,6 +33,7 @@ def noise_from_image(
     low_dn: float = -math.inf,
     high_dn: float = math.inf,
     aperture_px: float = 1.0,
+    most: int = MOST_TARGETS,
     threads: int | None = None,
 ) -> NoiseModel:
     """Measure variance against grey level from the residuals of a first fit.
@@ -41,11 +42,13 @@ def noise_from_image(
     ----------
     frame : ndarray, shape (rows, cols), uint8, uint16 or float32
     targets : Targets
-        All there are, for what belongs to a neighbour is left out; at most 64 of them are used, spread over the list.
+        All there are, for what belongs to a neighbour is left out.
     kind : {"disc", "ellipse", "ring", "spot"}
     low_dn, high_dn : float
         Ends of the scale, where they are known.
     aperture_px : float
+    most : int
+        Targets that are used, spread over the list.
     threads : int, optional
 
     Returns
@@ -67,34 +70,33 @@ def noise_from_image(
     """
     if not len(targets):
         raise MeasureError("no target to measure the noise at", where="noise_from_image", remedy="give a noise model")
-    which = np.unique(np.linspace(0, len(targets) - 1, min(len(targets), MOST_TARGETS)).round().astype(int))
+    which = np.unique(np.linspace(0, len(targets) - 1, min(len(targets), most)).round().astype(int))
     part = targets[which]
     whole = frame.dtype.kind == "u"
     least = ROUNDING_DN2 if whole else (1e-6 * float(np.median(np.abs(part.amplitude_dn)))) ** 2 + 1e-12
     first = max(float(np.median(part.sigma_dn)) ** 2, least)
     low, high, _ = scale_of(frame, low_dn, high_dn)
     guess = NoiseModel(first, low_dn=low, high_dn=high, origin="image")
-    start = None
+    start, windows = None, Windows.of(frame, targets, guess, kind, KINDS.index(kind), aperture_px, True, False)
     for _ in range(2):  # the second time with better weights, and a better idea of which pixels are flat
-        level, residual, start = _flat_residuals(frame, targets, which, guess, kind, aperture_px, threads, start)
+        level, residual, start = _flat_residuals(windows, targets, which, guess, kind, threads, start)
         guess = _fitted(level, residual, guess, least)
     return guess
 
 
 def _flat_residuals(
-    frame: np.ndarray,
+    windows: Windows,
     targets: Targets,
     which: np.ndarray,
     noise: NoiseModel,
     kind: str,
-    aperture_px: float,
     threads: int | None,
     start: np.ndarray | None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Levels and residuals, divided by √(1 − leverage), of pixels where the template is flat; and the parameters of the fit."""
     from pixmetry.location._template_kernels import residuals
 
-    windows = Windows.of(frame, targets, noise, kind, KINDS.index(kind), aperture_px, True, False)
+    windows = replace(windows, noise=noise)
     first = windows.start if start is None else start
     # planes, so that light or a ground that slopes is not taken for noise; small targets cannot tell them from the rest
     ground = bool(np.median(targets.semi_minor_px[which]) > LEAST_SLOPED_PX)
@@ -105,7 +107,7 @@ def _flat_residuals(
     about = windows.start, windows.half, windows.outer, windows.reach, windows.near_start, windows.near_index, windows.numbers
 
     def piece(good: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return residuals(frame, windows.code, fitted.parameters, slopes, good, *about, aperture_px, EDGE_PX, 0.5)
+        return residuals(windows.frame, windows.code, fitted.parameters, slopes, good, *about, windows.aperture_px, EDGE_PX, 0.5)
 
     pieces = map_tiles(piece, np.array_split(np.flatnonzero(fitted.at_rest), PIECES), threads)
     level, residual = (np.concatenate(values) for values in zip(*pieces, strict=True))
