@@ -34,7 +34,6 @@ OPERATORS = {
     "forstner": "intersection of the gradients' lines (Förstner operator)",
     "perimeter": "average of the points of the perimeter",
 }
-FITTED = ("auto", *FITS)  # what is worth the time for a good noise model
 ROWS = {
     "template": "the whole line by least squares, integrated over the pixel; at the Cramér–Rao bound",
     "row_squared_centroid": "squared centroid of each row (or column), then a straight line through them",
@@ -481,7 +480,6 @@ def _noise_for(task: Task, kind: str, targets: Targets | np.ndarray) -> NoiseMod
             low_dn=task.low_dn,
             high_dn=task.high_dn,
             aperture_px=task.aperture_px,
-            most=64 if task.estimator in FITTED else 24,
             threads=task.threads,
         )
     least = ROUNDING_DN2 if task.frame.dtype.kind == "u" else 1e-12

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ POOR_FIT_SIGMA = 6.0
 OUTSIDE_PX = 1e6  # where a start that is not a number is put
 LEAST_SQUARE_PX = 4
 CHUNK = 64
+OTHER_STARTS_PX = ((0.8, 0.0), (-0.8, 0.0), (0.0, 0.8), (0.0, -0.8))
 
 
 def find_chessboard(frame: np.ndarray, inner_corners: tuple[int, int]) -> Grid:
@@ -136,16 +138,23 @@ def corner_positions(
         raise InputError("no such choice of planes", value=planes, allowed=", ".join(PLANES))
     x, y = (np.clip(np.nan_to_num(np.ascontiguousarray(v, float).ravel(), nan=-OUTSIDE_PX), -OUTSIDE_PX, OUTSIDE_PX) for v in (x_px, y_px))
     reach = default_reach_px(x, y) if reach_px is None else np.broadcast_to(np.asarray(reach_px, float), x.shape).copy()
-    n = len(x)
-    found, covariance = np.full((n, kernels.ALL), np.nan), np.full((n, 3), np.nan)
-    chi2, counts, states = np.full(n, np.nan), np.zeros(n, np.int64), np.zeros(n, np.int64)
     law = np.append(noise_numbers(noise, frame.dtype), PLANES_SIGNIFICANT)
 
-    def fit(start: int) -> None:
-        results = (start, min(start + CHUNK, n), found, covariance, chi2, counts, states)
-        kernels.fit_corners(frame, x, y, reach, PLANES[planes], float(aperture_px), law, *results)
+    def fit(part: np.ndarray, dx: float, dy: float) -> None:
+        n = len(part)
+        from_x, from_y, within = x[part] + dx, y[part] + dy, reach[part]
+        own = (np.full((n, kernels.ALL), np.nan), np.full((n, 3), np.nan), np.full(n, np.nan), np.zeros(n, np.int64), np.zeros(n, np.int64))
+        kernels.fit_corners(frame, from_x, from_y, within, PLANES[planes], float(aperture_px), law, 0, n, *own)
+        for whole, values in zip(results, own, strict=True):
+            whole[part] = values
 
-    map_tiles(fit, range(0, n, CHUNK), threads)
+    n = len(x)
+    results = (np.full((n, kernels.ALL), np.nan), np.full((n, 3), np.nan), np.full(n, np.nan), np.zeros(n, np.int64), np.zeros(n, np.int64))
+    states = results[4]
+    for dx, dy in ((0.0, 0.0), *OTHER_STARTS_PX):  # one fit in a thousand does not come to rest from where it began
+        lost = np.flatnonzero((states & 1) == 0)
+        map_tiles(partial(fit, dx=dx, dy=dy), [lost[i : i + CHUNK] for i in range(0, len(lost), CHUNK)], threads)
+    found, covariance, chi2, counts, states = results
     return _positions(x, y, reach, found, covariance, chi2, counts, states)
 
 

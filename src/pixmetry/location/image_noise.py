@@ -33,7 +33,6 @@ def noise_from_image(
     low_dn: float = -math.inf,
     high_dn: float = math.inf,
     aperture_px: float = 1.0,
-    most: int = MOST_TARGETS,
     threads: int | None = None,
 ) -> NoiseModel:
     """Measure variance against grey level from the residuals of a first fit.
@@ -42,13 +41,12 @@ def noise_from_image(
     ----------
     frame : ndarray, shape (rows, cols), uint8, uint16 or float32
     targets : Targets
-        All there are, for what belongs to a neighbour is left out.
+        All there are, for what belongs to a neighbour is left out; at most 64 of them, spread over
+        the list, are fitted.
     kind : {"disc", "ellipse", "ring", "spot"}
     low_dn, high_dn : float
         Ends of the scale, where they are known.
     aperture_px : float
-    most : int
-        Targets that are used, spread over the list.
     threads : int, optional
 
     Returns
@@ -70,7 +68,7 @@ def noise_from_image(
     """
     if not len(targets):
         raise MeasureError("no target to measure the noise at", where="noise_from_image", remedy="give a noise model")
-    which = np.unique(np.linspace(0, len(targets) - 1, min(len(targets), most)).round().astype(int))
+    which = np.unique(np.linspace(0, len(targets) - 1, min(len(targets), MOST_TARGETS)).round().astype(int))
     part = targets[which]
     whole = frame.dtype.kind == "u"
     least = ROUNDING_DN2 if whole else (1e-6 * float(np.median(np.abs(part.amplitude_dn)))) ** 2 + 1e-12
