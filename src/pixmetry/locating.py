@@ -126,10 +126,10 @@ def locate(
         raise InputError("light cannot act there", where="light_on", value=light_on, allowed="surface, image")
     if not 0 <= aperture_px <= 1:
         raise InputError("the pixel's aperture cannot be used", where="aperture_px", value=aperture_px, allowed="0 to 1 pixel")
-    if aperture_px < 1 and (estimator in OPERATORS or (estimator in MOMENTS and kind != "line")):
+    if aperture_px < 1 and (estimator in OPERATORS or estimator in MOMENTS):
+        what = f"the uncertainty of {estimator} is known for pixels without gaps only"
         remedy = "take the template, whose model has the aperture"
-        raise InputError(f"the uncertainty of {estimator} is known for pixels without gaps only", where="aperture_px", value=aperture_px,
-                         allowed="1", remedy=remedy)  # fmt: skip
+        raise InputError(what, where="aperture_px", value=aperture_px, allowed="1", remedy=remedy)
     image = checked_frame(frame, name)
     model = noise_model(noise)
     low, high = scale_ends(image, bits, model)

@@ -7,7 +7,8 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from pixmetry.core.errors import InputError
-from pixmetry.location.grids import eight_bit, find_circle_grid, order_grid
+from pixmetry.location.detection import detect
+from pixmetry.location.grids import eight_bit, order_grid
 
 
 def plate(rng, rows: int, cols: int, *, asymmetric=False, tilt_deg=40.0, turn=None, distortion=0.1, missing=0.0, clutter=0):
@@ -160,25 +161,13 @@ def test_a_named_pattern_is_found_in_the_frame_and_ordered_alike_among_targets(a
     rows, cols = (11, 4) if asymmetric else (5, 7)
     picture, true = drawn_circles(rng, rows, cols, asymmetric, bright)
     for frame in (np.rint(picture).astype(np.uint8), np.rint(picture * 100).astype(np.uint16), (picture / 300).astype(np.float32)):
-        grid = find_circle_grid(frame, (cols, rows), symmetric=not asymmetric)
-        assert not grid.message and (grid.rows, grid.cols) == (rows, cols)
-        nearest = np.hypot(grid.x_px[:, None] - true[:, 0], grid.y_px[:, None] - true[:, 1])
-        assert nearest.min(axis=1).max() < 3 and sorted(nearest.argmin(axis=1)) == list(range(rows * cols))
+        targets = detect(frame).targets
+        grid = order_grid(targets.x_px, targets.y_px, pattern=(cols, rows), asymmetric=asymmetric)
+        assert not grid.message and grid.placed.all() and (grid.rows, grid.cols) == (rows, cols)
+        order = np.argsort(grid.row * cols + grid.col)
+        assert np.hypot(grid.x_px[order] - true[:, 0], grid.y_px[order] - true[:, 1]).max() < 0.5
     among = order_grid(*true[::-1].T, pattern=(cols, rows), asymmetric=asymmetric)
     assert not among.message and (among.row * cols + among.col == np.arange(rows * cols)[::-1]).all()
-
-
-def test_a_pattern_that_is_not_there() -> None:
-    flat = np.full((60, 60), 9, np.uint16)
-    for grid in (
-        find_circle_grid(flat, (4, 5)),
-        find_circle_grid(flat, (4, 5), symmetric=False),
-        find_circle_grid(np.random.default_rng().integers(0, 255, (80, 80)).astype(np.uint8), (4, 5)),
-        find_circle_grid(np.zeros((1, 1), np.float32), (4, 5)),
-    ):
-        assert grid.message and not len(grid)
-    with pytest.raises(InputError, match="2 × 2"):
-        find_circle_grid(flat, (1, 5))
 
 
 def test_eight_bits_keep_what_matters() -> None:

@@ -21,6 +21,7 @@ import math
 import numpy as np
 
 from pixmetry.core.jit import jit
+from pixmetry.location._normal_kernels import both, cdf, pdf
 
 DISC, ELLIPSE, RING, SPOT = 0, 1, 2, 3
 SHAPES = np.array([1, 3, 2, 0])  # parameters of the outline
@@ -30,52 +31,7 @@ LEAST_POINTS = 16
 PAD = 4  # columns to either side of a window that may be drawn to
 PHASES = 5.0  # entries of a table per standard deviation: cubic interpolation of g is good to 6e-6
 THIN = 0.005  # a box narrower than this share of the blur is a point (error 1e-6)
-LIMIT = 6.0  # of the normal distribution's table, in standard deviations
-PER = 64  # entries of it per standard deviation: cubic interpolation is good to 2e-10
-_Z = np.arange(-LIMIT * PER, LIMIT * PER + 2) / PER
-CDF = np.array([0.5 * math.erfc(-z / math.sqrt(2.0)) for z in _Z])
-PDF = np.exp(-0.5 * _Z**2) / math.sqrt(2.0 * math.pi)
-ROOT = 1.0 / math.sqrt(2.0 * math.pi)
 FUSED = {"fastmath": {"contract"}}
-
-
-@jit
-def cdf(z):
-    """Distribution function of the normal distribution."""
-    if z <= -LIMIT:
-        return 0.0
-    if z >= LIMIT:
-        return 1.0
-    at = (z + LIMIT) * PER
-    j = int(at)
-    f = at - j
-    rise = CDF[j + 1] - CDF[j]
-    return CDF[j] + f * rise + f * (1.0 - f) * ((1.0 - f) * (PDF[j] / PER - rise) - f * (PDF[j + 1] / PER - rise))
-
-
-@jit
-def pdf(z):
-    """Density of the normal distribution."""
-    return 0.0 if abs(z) > LIMIT else ROOT * math.exp(-0.5 * z * z)
-
-
-@jit
-def both(z):
-    """`cdf` and `pdf`."""
-    if z <= -LIMIT:
-        return 0.0, 0.0
-    if z >= LIMIT:
-        return 1.0, 0.0
-    at = (z + LIMIT) * PER
-    j = int(at)
-    f = at - j
-    e = 1.0 - f
-    ca, cb, pa, pb = CDF[j], CDF[j + 1], PDF[j], PDF[j + 1]
-    rise, fall = cb - ca, pb - pa
-    za = (j - LIMIT * PER) / PER
-    zb = za + 1.0 / PER
-    c = ca + f * rise + f * e * (e * (pa / PER - rise) - f * (pb / PER - rise))
-    return c, pa + f * fall + f * e * (e * (-za * pa / PER - fall) - f * (-zb * pb / PER - fall))
 
 
 @jit

@@ -8,7 +8,8 @@ import numpy as np
 
 from pixmetry.core.jit import jit
 from pixmetry.location._line_kernels import LEAST_SIGMA, LEAST_WIDTH, RESTLESS, SHARED, SINGULAR, covered
-from pixmetry.location._profile_kernels import BAR, ROOT, clipped, invert, step
+from pixmetry.location._normal_kernels import ROOT
+from pixmetry.location._profile_kernels import BAR, clipped, invert, step
 
 # Unknowns: the crossing against the candidate's, the angles, background, heights, blurs, widths, what the overlap adds, and the slopes
 # of the background.

@@ -8,7 +8,8 @@ import numpy as np
 
 from pixmetry.core.jit import jit
 from pixmetry.location._line_kernels import ACROSS, ALONG, AMPLITUDE, ANGLE, BACKGROUND, CURVE, OFFSET, SIGMA, TAPER, WIDTH, covered
-from pixmetry.location._profile_kernels import BAR, EDGE, cdf, clipped, invert, pdf, profile
+from pixmetry.location._normal_kernels import cdf, pdf
+from pixmetry.location._profile_kernels import BAR, EDGE, clipped, invert, profile
 
 CENTROID, SQUARED, SOFT, TEMPLATE = 0, 1, 2, 3
 THRESHOLD = 3.0  # of the soft threshold, in standard deviations of the noise

@@ -88,16 +88,3 @@ def line_shot(blur_px: float, electrons_per_row: float, length_px: float, apertu
 def edge_read(blur_px: float, amplitude: float, sigma_edge: float, length_px: float, aperture_px: float = 1.0) -> float:
     """Offset of a straight edge of height A over n rows, noise σ_e at half height: σ_e/A · √(2√π s_a/n)."""
     return float(sigma_edge / abs(amplitude) * np.sqrt(2 * np.sqrt(np.pi) * with_pixel(blur_px, aperture_px) / length_px))
-
-
-def top_hat_centroids(radius_px: float, window_px: float, amplitude_e: float, read_e: float) -> tuple[float, float]:
-    """Centroid and squared centroid of a top-hat disc of A electrons per pixel, in a round window of radius ρ.
-
-    Notes
-    -----
-    u_c² = (σ_r²(ρ/R)⁴ + A)/(4πA²) and u_sq² = (σ_r² + A)/(πA²), with the background subtracted: propagation of the noise of the pixels
-    through the estimators, sums over the disc as integrals.
-    """
-    plain = (read_e**2 * (window_px / radius_px) ** 4 + amplitude_e) / (4 * np.pi * amplitude_e**2)
-    squared = (read_e**2 + amplitude_e) / (np.pi * amplitude_e**2)
-    return float(np.sqrt(plain)), float(np.sqrt(squared))

@@ -164,12 +164,6 @@ def select(targets: Regions, kind: str) -> np.ndarray:
     return shaped & ~full & (targets.holes > 0) if kind == "ring" else shaped & full
 
 
-def elongated(targets: Regions) -> np.ndarray:
-    """Return a mask of the targets that can be lines, alone or crossing each other; shape (n,), bool."""
-    thin = (targets.fill < 0.5) & ~_fits_box(targets)
-    return (targets.semi_major_px > 4 * targets.semi_minor_px) | thin
-
-
 def neighbours(targets: Targets, reach_px: float) -> tuple[np.ndarray, np.ndarray]:
     """Find for each target the others whose boxes come within reach.
 

@@ -107,45 +107,6 @@ def order_grid(
     return Grid(x, y, row, col, *extent, message)
 
 
-def find_circle_grid(frame: np.ndarray, pattern: tuple[int, int], *, symmetric: bool = True) -> Grid:
-    """Find a circle pattern of known size with OpenCV. Among targets that are already located, `order_grid` does it.
-
-    Parameters
-    ----------
-    frame : ndarray, shape (rows, cols), uint8, uint16 or float32
-    pattern : (int, int)
-        Columns and rows.
-    symmetric : bool
-        False for the pattern whose every other row is shifted by half a step.
-
-    Returns
-    -------
-    Grid
-        Rough places in the pattern's order (mostly to 0.1 px, but in noisy pictures OpenCV leaves some off by 1 or 2 px); empty with a
-        message where no such grid was seen.
-
-    Raises
-    ------
-    InputError
-        If the pattern has fewer than 2 columns or rows.
-
-    Notes
-    -----
-    OpenCV's blob detector looks for dark circles and, where they make no grid, for bright ones.
-    """
-    cols, rows = (int(n) for n in pattern)
-    if min(cols, rows) < 2:
-        raise InputError("too small to be a grid", where="pattern", value=(cols, rows), allowed="2 × 2 or more")
-    grey = eight_bit(frame)
-    for picture in (grey, 255 - grey):
-        place = _opencv_circles(picture, cols, rows, symmetric)
-        if place is not None:
-            row, col = np.divmod(np.arange(rows * cols), cols)
-            return Grid(place[:, 0], place[:, 1], row, col, rows, cols)
-    kind = "circle grid" if symmetric else "asymmetric circle grid"
-    return no_grid(f"no {kind} of {cols} × {rows} was found", rows, cols)
-
-
 def eight_bit(frame: np.ndarray) -> np.ndarray:
     """Return a frame as uint8 for finders that take nothing else: between its 0.1 and 99.9 % quantiles. uint8 comes back as it is."""
     if frame.dtype == np.uint8:
@@ -155,24 +116,6 @@ def eight_bit(frame: np.ndarray) -> np.ndarray:
         low, high = frame.min(), frame.max()
     scale = 255.0 / max(float(high) - float(low), float(np.finfo(np.float32).tiny))
     return np.clip((frame.astype(np.float64) - float(low)) * scale, 0, 255).astype(np.uint8)
-
-
-def _opencv_circles(picture: np.ndarray, cols: int, rows: int, symmetric: bool) -> np.ndarray | None:
-    import cv2
-
-    flags = cv2.CALIB_CB_SYMMETRIC_GRID if symmetric else cv2.CALIB_CB_ASYMMETRIC_GRID
-    settings = cv2.SimpleBlobDetector_Params()  # type: ignore[attr-defined]
-    settings.minArea, settings.maxArea = 12.0, max(12.0, picture.size / (2.0 * cols * rows))
-    settings.minDistBetweenBlobs, settings.filterByConvexity, settings.filterByInertia = 3.0, False, False
-    detector = cv2.SimpleBlobDetector_create(settings)  # type: ignore[attr-defined]
-    for extra in (0, cv2.CALIB_CB_CLUSTERING):
-        try:
-            found, centres = cv2.findCirclesGrid(picture, (cols, rows), flags=flags | extra, blobDetector=detector)
-        except cv2.error:  # its graph search gives up on some candidates with an assertion
-            continue
-        if found:
-            return np.asarray(centres, float).reshape(-1, 2)
-    return None
 
 
 def _grow_best(place: np.ndarray) -> np.ndarray:

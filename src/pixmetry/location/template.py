@@ -129,8 +129,7 @@ def fit_template(
     where the median fall of at least 20 targets stands 5 standard deviations above that of chance (3e-7). Falls are divided by the median
     χ² per degree of freedom where that exceeds 1. Planes of many targets stay only if they take more bias from the places than they add
     noise (`worth_it`), and if the ground around the targets has them too (`believable`). A slope too
-    small to be seen, which shifts the position by up to about two standard
-    uncertainties, is not in the covariance of a single target.
+    small to be seen, which shifts the position by up to about two standard uncertainties, is not in the covariance of a single target.
 
     References
     ----------
