@@ -248,7 +248,11 @@ def test_counts_holes_as_scipy_does() -> None:
 
 @pytest.mark.parametrize("a, b, degrees", [(12, 12, 0), (20, 9, 30), (15, 5.2, -75), (30, 10.3, 89), (6, 4, 45)])
 def test_measures_the_ellipse(a: float, b: float, degrees: float) -> None:
-    """Up to 70° of tilt. Pixels at half height count wholly: good to a tenth of a pixel."""
+    """Up to 70° of tilt. Pixels at half height count wholly: good to a tenth of a pixel.
+
+    One pixel that noise takes in or out turns the smallest ellipse by 0.06 rad (standard deviation over frames .012): two are allowed, and an
+    error of 7° is caught; of 0.06 rad, or 3.4°, for the larger ones.
+    """
     found = detect(stored(200 - 150 * figure((120, 140), ellipse(70.3, 58.8, a, b, degrees)))).targets
     assert_exactly(found, np.array([[70.3, 58.8]]), within=0.1)
     assert (found.semi_major_px[0], found.semi_minor_px[0]) == pytest.approx((a, b), abs=0.35)
@@ -256,7 +260,7 @@ def test_measures_the_ellipse(a: float, b: float, degrees: float) -> None:
     assert found.amplitude_dn[0] == pytest.approx(-150, rel=0.06)
     assert found.background_dn[0] == pytest.approx(200, abs=0.5)
     if a != b:
-        assert math.sin(math.radians(found.angle_deg[0] - degrees)) == pytest.approx(0, abs=0.06)
+        assert math.sin(math.radians(found.angle_deg[0] - degrees)) == pytest.approx(0, abs=0.12 if a == 6 else 0.06)
     assert select(found, "ellipse").all() and not select(found, "ring").any()
 
 
