@@ -250,8 +250,8 @@ def test_counts_holes_as_scipy_does() -> None:
 def test_measures_the_ellipse(a: float, b: float, degrees: float) -> None:
     """Up to 70° of tilt. Pixels at half height count wholly: good to a tenth of a pixel.
 
-    One pixel that noise takes in or out turns the smallest ellipse by 0.06 rad (standard deviation over frames .012): two are allowed, and an
-    error of 7° is caught; of 0.06 rad, or 3.4°, for the larger ones.
+    One pixel that noise takes in or out turns the smallest ellipse by 0.06 rad (standard deviation over frames .012): two are allowed,
+    and an error of 7° is caught; of 0.06 rad, or 3.4°, for the larger ones.
     """
     found = detect(stored(200 - 150 * figure((120, 140), ellipse(70.3, 58.8, a, b, degrees)))).targets
     assert_exactly(found, np.array([[70.3, 58.8]]), within=0.1)
