@@ -76,7 +76,7 @@ def noise_from_image(
     low, high, _ = scale_of(frame, low_dn, high_dn)
     guess = NoiseModel(first, low_dn=low, high_dn=high, origin="image")
     start, windows = None, Windows.of(frame, targets, guess, kind, KINDS.index(kind), aperture_px, True, False)
-    for _ in range(2):  # the second time with better weights, and a better idea of which pixels are flat
+    for _ in range(2):  # each time with better weights, and a better idea of which pixels are flat
         level, residual, start = _flat_residuals(windows, targets, which, guess, kind, threads, start)
         guess = _fitted(level, residual, guess, least)
     return guess
@@ -128,22 +128,20 @@ def _fitted(level: np.ndarray, residual: np.ndarray, guess: NoiseModel, least: f
     if not rows:
         return replace(guess, constant_dn2=max(_variance(residual)[0], least))
     s, v, n = np.array(rows).T
-    black = float(s.min())
-    constant, slope = max(float(np.average(v, weights=n)), least), 0.0
-    for _ in range(3):
-        w = n / (2 * (constant + slope * (s - black)) ** 2)
-        design = np.stack([np.ones_like(s), s - black])
-        if len(s) < 2:
-            break
+    black, flat = float(s.min()), max(float(np.average(v, weights=n)), least)
+    if len(s) < 2:
+        return replace(guess, constant_dn2=flat, slope_dn=0.0, black_dn=0.0)
+    design, expected = np.stack([np.ones_like(s), s - black]), np.maximum(v, least)
+    for _ in range(4):
+        w = n / (2 * expected**2)
         covariance = np.linalg.pinv((design * w) @ design.T)
         a, b = covariance @ (design * w) @ v
-        # the spread of the levels about the line counts too
-        excess = max(1.0, float((w * (v - a - b * (s - black)) ** 2).sum()) / max(len(s) - 2, 1))
-        if b > CLEAR_SIGMA * math.sqrt(covariance[1, 1] * excess) and a > 0.0:
-            constant, slope = max(a, least), float(b)
-        else:
-            constant, slope = max(float((w * v).sum() / w.sum()), least), 0.0
-    return replace(guess, constant_dn2=float(constant), slope_dn=slope, black_dn=black if slope else 0.0)
+        expected = np.maximum(a + b * (s - black), least)
+    # the spread of the levels about the line counts too
+    excess = max(1.0, float((w * (v - a - b * (s - black)) ** 2).sum()) / max(len(s) - 2, 1))
+    if b > CLEAR_SIGMA * math.sqrt(covariance[1, 1] * excess) and a > 0.0:
+        return replace(guess, constant_dn2=max(float(a), least), slope_dn=float(b), black_dn=black)
+    return replace(guess, constant_dn2=flat, slope_dn=0.0, black_dn=0.0)
 
 
 def _variance(values: np.ndarray) -> tuple[float, int]:
