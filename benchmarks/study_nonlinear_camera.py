@@ -23,7 +23,8 @@ from scipy import stats  # noqa: E402
 
 from pixmetry.core.camera import build_camera  # noqa: E402
 from pixmetry.core.observations import PhotonTransfer  # noqa: E402
-from pixmetry.experiment.emva_linear import fit_emva_linear  # noqa: E402
+from pixmetry.emva.evaluate import standard_values  # noqa: E402
+from pixmetry.emva.records import Measurement  # noqa: E402
 from pixmetry.experiment.moments import LevelAccumulator, level_moments  # noqa: E402
 from pixmetry.experiment.photon_transfer_fit import fit_photon_transfer  # noqa: E402
 from pixmetry.scene.files import SeriesModel  # noqa: E402
@@ -60,7 +61,7 @@ def camera_record(rows: int, cols: int, unit_seed: int) -> dict:
 
 
 def measure_one(job: tuple[int, int, int]) -> np.ndarray:
-    """Value, u and dof of each quantity, and the gain by the linear rule, shape (len(NAMES) + 1, 3)."""
+    """Value, u and dof of each quantity, and the gain by the standard's line, shape (len(NAMES) + 1, 3)."""
     rows, cols, seed = job
     camera = build_camera(camera_record(rows, cols, seed))
     top_e = (2**BITS - 1 - OFFSET_DN) / GAIN
@@ -74,7 +75,7 @@ def measure_one(job: tuple[int, int, int]) -> np.ndarray:
             groups[g.kind].append((level.summary(), g.exposure_s))
     moments = {kind: level_moments([s for s, _ in part], [t for _, t in part]) for kind, part in groups.items()}
     record = PhotonTransfer(moments["bright"], moments["dark"], (rows, cols), BITS)
-    fit, line = fit_photon_transfer(record), fit_emva_linear(record)["gain_dn_per_e"]
+    fit, line = fit_photon_transfer(record), standard_values(Measurement(record), "3.1").values["K"]
     return np.array([(fit[n].value, fit[n].u, fit[n].dof) for n in NAMES] + [(line.value, line.u, line.dof)])
 
 

@@ -70,7 +70,9 @@ def test_every_command_answers_help(name: str) -> None:
 def test_unknown_command_is_a_usage_error() -> None:
     result = CliRunner().invoke(cli.main, ["asess"])
     assert result.exit_code == 2
-    assert "No such command 'asess'" in result.stderr
+    assert result.stderr == "error: No such command 'asess'; to do: see `main --help`\n"
+    result = CliRunner().invoke(cli.main, ["--nope"])
+    assert result.exit_code == 2 and result.stderr == "error: No such option '--nope'; to do: see `main --help`\n"
 
 
 @pytest.fixture

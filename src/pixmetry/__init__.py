@@ -19,6 +19,10 @@ _HOMES = {
     "add_source_file": "pixmetry.core.catalogue",
     "assess": "pixmetry.assessment",
     "catalogue": "pixmetry.core.catalogue",
+    "check_limits": "pixmetry.comparing",
+    "compare": "pixmetry.comparing",
+    "compare_fleet": "pixmetry.comparing",
+    "emva1288": "pixmetry.datasheets",
     "load_camera": "pixmetry.core.camera",
     "load_campaign": "pixmetry.campaign",
     "locate": "pixmetry.locating",
@@ -35,6 +39,10 @@ __all__ = [
     "add_source_file",
     "assess",
     "catalogue",
+    "check_limits",
+    "compare",
+    "compare_fleet",
+    "emva1288",
     "load_camera",
     "load_campaign",
     "locate",
@@ -46,11 +54,13 @@ if TYPE_CHECKING:
     from pixmetry.assessment import assess
     from pixmetry.campaign import load_campaign
     from pixmetry.chain import walk
+    from pixmetry.comparing import check_limits, compare, compare_fleet
     from pixmetry.core.camera import Camera, load_camera
     from pixmetry.core.catalogue import add_source_file, catalogue
     from pixmetry.core.errors import PixmetryError
     from pixmetry.core.estimates import Estimates
     from pixmetry.core.signal import Signal
+    from pixmetry.datasheets import emva1288
     from pixmetry.locating import locate
     from pixmetry.simulation import simulate
 

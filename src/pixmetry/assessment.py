@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,8 @@ from pixmetry.core.catalogue import catalogue
 from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.core.estimates import Estimates
 from pixmetry.core.observations import Observations
-from pixmetry.experiment.emva_linear import fit_emva_linear
+from pixmetry.emva.evaluate import standard_values
+from pixmetry.emva.records import Measurement, Results
 from pixmetry.experiment.observe import Group, observe
 from pixmetry.location.estimators import Estimator, parse_estimator
 from pixmetry.report.page import write_report
@@ -82,6 +84,7 @@ def assess(
     frames = campaign if isinstance(campaign, Campaign) else load_campaign(campaign)
     told = progress or (lambda what, done, of: None)
     hashes, seen = observe_campaign(frames, told)
+    standard = by_the_standard(frames, seen)
     estimates, unmeasured = measure_sources(seen)
     camera = digital_twin(frames, estimates, seen)
     steps = len(camera.active) + len(catalogue()) + 2
@@ -99,7 +102,6 @@ def assess(
     )
     told("computing the budget", steps, steps)
     record = provenance_record(hashes, seed=seed, libraries=("numpy", "scipy", "numba"))
-    standard = fit_emva_linear(seen.photon_transfer)
     assessment = Assessment(frames, seen, estimates, unmeasured, standard, camera, budget, record)
     if output is not None:
         told("writing the report", 0, 1)
@@ -122,21 +124,32 @@ def observe_campaign(campaign: Campaign, progress: Progress) -> tuple[InputHashe
     """Read every frame once and reduce it."""
     done = 0
 
-    def on_frame() -> None:
+    def on_frames(count: int) -> None:
         nonlocal done
-        done += 1
+        done += count
         progress("reading frames", done, campaign.frame_count)
 
-    reader = FrameReader(campaign, on_frame=on_frame)
+    reader = FrameReader(campaign)
 
     def groups() -> Iterator[Group]:
         for g in campaign.groups:
-            yield Group(g.kind, g.role, g.exposure_s, g.photons, reader.frames(g))
+            yield Group(g.kind, g.role, g.exposure_s, g.photons, [partial(reader.fetch, path) for path in g.paths])
 
-    seen = observe(groups(), campaign.bits, campaign.camera.temperature_c)
+    seen = observe(groups(), campaign.bits, campaign.camera.temperature_c, on_frames=on_frames)
     for path in {campaign.source_path, campaign.descriptor_path} - {None}:
         reader.hashes.add_file(path)
     return reader.hashes, seen
+
+
+def by_the_standard(campaign: Campaign, observations: Observations) -> Results:
+    """What EMVA 1288 says of the same frames, to stand beside: Release 3.1, which takes the images as they are.
+
+    Release 4.0 filters the slow part of the patterns out, and would not speak of the same quantity as the estimates beside it.
+    """
+    pitch_x_um, pitch_y_um = campaign.camera.pitch_x_um, campaign.camera.pitch_y_um
+    area = None if pitch_x_um is None or pitch_y_um is None else pitch_x_um * pitch_y_um
+    seen = Measurement(observations.photon_transfer, observations.dark_stack, observations.bright_stack, pixel_area_um2=area)
+    return standard_values(seen, "3.1")
 
 
 def measure_sources(observations: Observations) -> tuple[dict[str, Estimates], dict[str, str]]:

@@ -12,6 +12,8 @@ from pixmetry.campaign import Campaign
 from pixmetry.core.camera import Camera
 from pixmetry.core.estimates import Estimates
 from pixmetry.core.observations import Observations
+from pixmetry.emva.formats import value_record
+from pixmetry.emva.records import Results
 
 RESULTS_SCHEMA = "pixmetry/results/1"
 
@@ -28,8 +30,8 @@ class Assessment:
         By source, named like its parameters.
     unmeasured : dict of str
         By source, why this campaign could not measure it.
-    standard : Estimates
-        The linear rule of EMVA 1288 beside ours.
+    standard : Results
+        The values of EMVA 1288 beside ours.
     camera : Camera
         The digital twin.
     budget : Budget
@@ -40,7 +42,7 @@ class Assessment:
     observations: Observations
     estimates: dict[str, Estimates]
     unmeasured: dict[str, str]
-    standard: Estimates
+    standard: Results
     camera: Camera
     budget: Budget
     provenance: dict[str, Any]
@@ -70,7 +72,11 @@ class Assessment:
                 "confounders": list(fit.confounders),
             },
             "spatial": self.observations.spatial_fit.to_records() if self.observations.spatial_fit is not None else [],
-            "emva1288_linear": self.standard.to_records(),
+            "emva1288": {
+                "release": self.standard.release,
+                "results": {key: value_record(value) for key, value in self.standard.values.items()},
+                "notes": list(self.standard.notes),
+            },
             "budget": self.budget.to_record(),
             "notes": list(self.observations.notes),
             "provenance": self.provenance,

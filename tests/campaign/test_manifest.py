@@ -118,10 +118,9 @@ def test_a_stack_may_share_its_exposure_with_a_level(tmp_path: Path) -> None:
     text = HEAD + FRAMES + "  - {kind: bright, exposure_s: 0.01, photons: 1000, files: 's_*.png'}\n"
     campaign = load_campaign(put_campaign(tmp_path, text))
     assert len(campaign.levels("bright")) == 1
-    stack = campaign.stack("bright")
-    assert stack is not None
+    (stack,) = campaign.stacks("bright")
     assert [p.name for p in stack.paths] == [f"s_{i}.PNG" for i in range(11)]  # natural order, either case of the ending
-    assert campaign.stack("dark") is None
+    assert campaign.stacks("dark") == ()
 
 
 def test_stacks_serve_as_levels_where_there_are_no_others(tmp_path: Path) -> None:
@@ -185,8 +184,7 @@ def test_example_is_the_whole_set() -> None:
     assert [len(campaign.levels(kind)) for kind in ("dark", "bright")] == [50, 50]
     assert {len(g.paths) for kind in ("dark", "bright") for g in campaign.levels(kind)} == {2}
     for kind in ("dark", "bright"):
-        stack = campaign.stack(kind)
-        assert stack is not None
+        (stack,) = campaign.stacks(kind)
         assert (len(stack.paths), stack.exposure_s) == (50, 0.00516)
     first, last = campaign.levels("bright")[0], campaign.levels("bright")[-1]
     assert (first.exposure_s, first.photons, last.exposure_s, last.photons) == (40e-6, 120.0, 14.02e-3, 42137.0)

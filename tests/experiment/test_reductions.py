@@ -13,11 +13,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
+from experiment.reductions import reduced
 from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.experiment.histogram import HistogramAccumulator, code_errors
 from pixmetry.experiment.moments import LevelAccumulator, level_moments
 from pixmetry.experiment.spectra import SpectraAccumulator
-from pixmetry.experiment.stack import StackAccumulator, new_group, reduce_group
+from pixmetry.experiment.stack import StackAccumulator, new_group
 
 ALPHA = 1e-6
 
@@ -77,7 +78,7 @@ def test_pair_reduces_to_the_standard():
     """EMVA 1288 R4.0 eq. 18 and 32, and the kurtosis of SciPy, on one pair."""
     frames = random_frames((2, 31, 45))
     y0, y1 = frames.astype(float)
-    level = level_moments([reduce_group(frames, bits=12, kind="level").moments.summary()], [0.01], [123.0], code_max=4000)
+    level = level_moments([reduced(frames, bits=12, kind="level").moments.summary()], [0.01], [123.0], code_max=4000)
     d = y1 - y0
     assert level.var_total_dn2[0] == pytest.approx(0.5 * (d**2).mean() - 0.5 * d.mean() ** 2, rel=1e-12)
     assert level.spatial_cov_dn2[0] == pytest.approx((y0 * y1).mean() - y0.mean() * y1.mean(), rel=1e-9)
@@ -89,16 +90,13 @@ def test_pair_reduces_to_the_standard():
 
 
 @pytest.mark.parametrize("kind", ["level", "stack"])
-def test_same_bits_for_any_order_and_split(kind):
+def test_same_bits_for_any_order(kind):
     frames = random_frames((9, 24, 37))
-    whole = reduce_group(frames, bits=12, kind=kind, spectra_pairs=4)
-    order = np.random.default_rng().permutation(9)
-    parts = [new_group(12, kind, 4) for _ in range(3)]
-    for place, index in enumerate(order):
-        parts[place % 3].add(frames[index], int(index))
-    parts[1].merge(parts[2])
-    parts[0].merge(parts[1])
-    one, other = whole.moments, parts[0].moments
+    whole = reduced(frames, bits=12, kind=kind, spectra_pairs=4)
+    shuffled = new_group(12, kind, 4)
+    for index in np.random.default_rng().permutation(9):
+        shuffled.add(frames[index], int(index))
+    one, other = whole.moments, shuffled.moments
     assert one.mean_squares() == other.mean_squares()
     assert np.array_equal(one.counts, other.counts)
     assert np.array_equal(one.frame_means_dn(), other.frame_means_dn())
@@ -107,7 +105,7 @@ def test_same_bits_for_any_order_and_split(kind):
         assert one.kurtosis_excess() == other.kurtosis_excess()
     else:
         mean_map = one.mean_map_dn()
-        a, b = whole.spectra.result(mean_map), parts[0].spectra.result(mean_map)
+        a, b = whole.spectra.result(mean_map), shuffled.spectra.result(mean_map)
         assert a.n_pairs == b.n_pairs == 4
         assert np.array_equal(a.temporal_h_dn2, b.temporal_h_dn2) and np.array_equal(a.temporal_power_dn2, b.temporal_power_dn2)
 
@@ -173,7 +171,7 @@ def test_white_noise_has_its_variance_as_power():
     """Mean of the temporal power over frequencies off zero: relative SE √(2/(pairs·M·N)) = 0.36 %; errors above 2.6 % are caught."""
     rng = np.random.default_rng()
     rows, cols, sigma = 100, 200, 7.0
-    group = reduce_group((np.rint(rng.normal(500, sigma, (rows, cols))).astype(np.uint16) for _ in range(16)), bits=12)
+    group = reduced((np.rint(rng.normal(500, sigma, (rows, cols))).astype(np.uint16) for _ in range(16)), bits=12)
     got = group.spectra.result(group.moments.mean_map_dn())
     power = got.temporal_power_dn2[1:, 1:-1].mean()
     assert abs(power / (sigma**2 + 1 / 12) - 1) < stats.norm.isf(ALPHA / 2) * math.sqrt(2 / (8 * rows * (cols - 2)))
@@ -218,13 +216,12 @@ def test_recovers_differential_non_linearity_and_missing_codes():
 
 def test_histogram_counts_dark_frames_and_levels():
     frames = random_frames((4, 11, 13), np.uint8, 200)
-    one, other = HistogramAccumulator(8), HistogramAccumulator(8)
-    one.add(frames[0], dark=True, level="a")
-    one.add(frames[1], level="b")
-    other.add(frames[2], level="b")
-    other.add(frames[3])
-    one.merge(other)
-    got = one.result()
+    histogram = HistogramAccumulator(8)
+    histogram.add(frames[0], dark=True, level="a")
+    histogram.add(frames[1], level="b")
+    histogram.add(frames[2], level="b")
+    histogram.add(frames[3])
+    got = histogram.result()
     assert np.array_equal(got.counts, np.bincount(frames.ravel(), minlength=256))
     assert np.array_equal(got.dark_counts, np.bincount(frames[0].ravel(), minlength=256))
     want = sorted([(frames[0].mean(), frames[0].var()), (frames[1:3].mean(), frames[1:3].var())])

@@ -16,7 +16,8 @@ from pixmetry.campaign.records import CameraFacts, Campaign, FrameGroup, OpticsF
 from pixmetry.core.catalogue import get_source
 from pixmetry.core.contribution import Contribution
 from pixmetry.core.observations import Observations
-from pixmetry.experiment.emva_linear import fit_emva_linear
+from pixmetry.emva.evaluate import standard_values
+from pixmetry.emva.records import Measurement
 from pixmetry.experiment.observe import Group, observe
 from pixmetry.location.estimators import Estimator
 from pixmetry.results import Assessment
@@ -115,7 +116,7 @@ def assessment(pitch_um: float | None = PITCH_UM, with_stacks: bool = True) -> A
         observations=seen,
         estimates={"electronics.gain": fit.select(["gain_dn_per_e"])},
         unmeasured={"storage.jpeg": "the files do not tell how strongly they were compressed"},
-        standard=fit_emva_linear(seen.photon_transfer),
+        standard=standard_values(Measurement(seen.photon_transfer, seen.dark_stack, seen.bright_stack), "3.1"),
         camera=None,
         budget=budget(pitch_um),
         provenance=record,

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pixmetry.campaign.png import SIGNATURE, PlainPng
 from pixmetry.campaign.provenance import InputHashes
 from pixmetry.campaign.records import Campaign, FrameGroup
 from pixmetry.campaign.zarr_frames import entries, is_entry, read_entry
@@ -47,13 +48,16 @@ def read_frame(path: str | Path) -> np.ndarray:
     return load_frame(Path(path)).array
 
 
-def load_frame(path: Path) -> LoadedFrame:
+def load_frame(path: Path, plain_png: PlainPng | None = None) -> LoadedFrame:
     """Read one frame and the SHA-256 of its file from the same bytes; errors as in `read_frame`."""
     if is_entry(path):
         array, sha256, size = read_entry(path)
         return LoadedFrame(_checked(array, path), sha256, size)
     raw = _read_bytes(path)
-    return LoadedFrame(_checked(_decoded(raw, path), path), hashlib.sha256(raw).hexdigest(), len(raw))
+    array = plain_png.decode(raw) if plain_png is not None and raw.startswith(SIGNATURE) else None
+    if array is None:
+        array = _checked(_decoded(raw, path), path)
+    return LoadedFrame(array, hashlib.sha256(raw).hexdigest(), len(raw))
 
 
 def read_picture(path: str | Path, channel: str | None = None) -> np.ndarray:
@@ -186,7 +190,7 @@ def _decode_npy(raw: bytes) -> np.ndarray:
 
 
 _DECODERS: tuple[tuple[bytes, Callable[[bytes], np.ndarray]], ...] = (
-    (b"\x89PNG\r\n\x1a\n", _decode_png),
+    (SIGNATURE, _decode_png),
     (b"II*\0", _decode_tiff),
     (b"MM\0*", _decode_tiff),
     (b"II+\0", _decode_tiff),
@@ -247,7 +251,6 @@ def iter_frames(
     bits: int,
     shape: tuple[int, int] | None = None,
     dtype: str | None = None,
-    hashes: InputHashes | None = None,
     threads: int | None = None,
 ) -> Iterator[np.ndarray]:
     """Read frames in order, decoding ahead in threads; only a few frames (at most twice the threads) are in memory.
@@ -257,8 +260,6 @@ def iter_frames(
     paths : iterable of Path
     bits, shape, dtype
         As in `check_frame`, applied to every frame.
-    hashes : InputHashes, optional
-        Takes note of each file's digest.
     threads : int, optional
 
     Yields
@@ -270,16 +271,14 @@ def iter_frames(
     InputError
         As in `read_frame` and `check_frame`, when the frame's turn comes.
     """
+    plain_png = PlainPng()
 
-    def load(path: Path) -> tuple[Path, LoadedFrame]:
-        frame = load_frame(path)
-        check_frame(frame.array, str(path), bits=bits, shape=shape, dtype=dtype)
-        return path, frame
+    def load(path: Path) -> np.ndarray:
+        array = load_frame(path, plain_png).array
+        check_frame(array, str(path), bits=bits, shape=shape, dtype=dtype)
+        return array
 
-    for path, frame in imap_tiles(load, paths, threads):
-        if hashes is not None:
-            hashes.add(path, frame.sha256, frame.size_bytes)
-        yield frame.array
+    return imap_tiles(load, paths, threads)
 
 
 class FrameReader:
@@ -289,26 +288,26 @@ class FrameReader:
     ----------
     campaign : Campaign
     threads : int, optional
-    on_frame : callable, optional
-        Called with no argument after each frame, e.g. to move a progress bar.
     """
 
-    def __init__(self, campaign: Campaign, *, threads: int | None = None, on_frame: Callable[[], object] | None = None) -> None:
-        self.campaign, self.threads, self.on_frame = campaign, threads, on_frame
+    def __init__(self, campaign: Campaign, *, threads: int | None = None) -> None:
+        self.campaign, self.threads = campaign, threads
         self.hashes = InputHashes(campaign.base)
+        self._plain_png = PlainPng()
         for listing in (campaign.source_path, campaign.descriptor_path):
             if listing is not None and listing.is_file():
                 self.hashes.add_file(listing)
 
+    def fetch(self, path: Path) -> np.ndarray:
+        """Read one frame in the calling thread, and take note of its digest; errors as in `iter_frames`."""
+        c, frame = self.campaign, load_frame(path, self._plain_png)
+        check_frame(frame.array, str(path), bits=c.bits, shape=c.frame_shape, dtype=c.frame_dtype)
+        self.hashes.add(path, frame.sha256, frame.size_bytes)
+        return frame.array
+
     def frames(self, group: FrameGroup) -> Iterator[np.ndarray]:
-        """Yield the frames of one group in order; errors as in `iter_frames`."""
-        c = self.campaign
-        for array in iter_frames(
-            group.paths, bits=c.bits, shape=c.frame_shape, dtype=c.frame_dtype, hashes=self.hashes, threads=self.threads
-        ):
-            yield array
-            if self.on_frame is not None:
-                self.on_frame()
+        """Yield the frames of one group in order, decoding ahead in threads; errors as in `iter_frames`."""
+        return imap_tiles(self.fetch, group.paths, self.threads)
 
 
 def write_frame(path: str | Path, array: np.ndarray, bits: int) -> None:

@@ -8,6 +8,7 @@ import re
 import sys
 from collections.abc import Sequence
 from datetime import UTC, datetime
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +40,10 @@ class InputHashes:
         self.add(path, hashlib.sha256(raw).hexdigest(), len(raw))
 
     def _name(self, path: Path) -> str:
-        return path.relative_to(self.base).as_posix() if path.is_relative_to(self.base) else path.name
+        try:
+            return path.relative_to(self.base).as_posix()
+        except ValueError:
+            return path.name
 
     def __len__(self) -> int:
         return len(self._records)
@@ -69,19 +73,24 @@ def provenance_record(
     libraries : sequence of str
         Installed packages whose versions are recorded.
     """
-    from importlib.metadata import version
-
     return {
         "schema": PROVENANCE_SCHEMA,
         "pixmetry": __version__,
         "python": platform.python_version(),
-        "libraries": {name: version(name) for name in libraries},
+        "libraries": {name: _version(name) for name in libraries},
         "platform": f"{platform.system()} {platform.machine()}",
         "time_utc": datetime.now(UTC).isoformat(timespec="seconds"),
         "command": [_without_folder(part) for part in (sys.argv if command is None else command)],
         "seed": seed,
         "inputs": [] if inputs is None else inputs.records(),
     }
+
+
+@cache
+def _version(name: str) -> str:
+    from importlib.metadata import version
+
+    return version(name)
 
 
 def _without_folder(argument: str) -> str:

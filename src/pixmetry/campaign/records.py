@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from pixmetry.core.errors import InputError
+from pixmetry.core.errors import InputError, MeasureError
 
 STACK_FRAMES = 8  # from this many frames on, a group is a stack: its mean image serves the spatial measurements
 KINDS = ("dark", "bright")
@@ -24,6 +26,7 @@ class CameraFacts:
     sensor: str | None = None  # "ccd" or "cmos"
     temperature_c: float | None = None
     pixel_clock_mhz: float | None = None
+    cfa: str | None = None  # colour filter of a mosaic: the colours of pixels (0,0), (0,1), (1,0), (1,1), e.g. "RGGB"
 
 
 @dataclass(frozen=True)
@@ -112,6 +115,23 @@ class Campaign:
         """Number of frames in all groups."""
         return sum(len(group.paths) for group in self.groups)
 
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """Every file that the campaign is read from."""
+        listings = tuple(path for path in (self.source_path, self.descriptor_path) if path is not None)
+        return (*listings, *(path for group in self.groups for path in group.paths))
+
+    @contextmanager
+    def named_in_errors(self) -> Iterator[None]:
+        """Name the campaign in errors about its frames that name no file: of several campaigns one must know which."""
+        try:
+            yield
+        except (InputError, MeasureError) as problem:
+            if any(str(path) in problem.where for path in self.files):
+                raise
+            where = ": ".join(filter(None, (str(self.source_path), problem.where)))
+            raise type(problem)(problem.what, where=where, value=problem.value, allowed=problem.allowed, remedy=problem.remedy) from None
+
     def levels(self, kind: str) -> tuple[FrameGroup, ...]:
         """Return the groups of the photon-transfer series, by rising exposure; where there are only stacks, these."""
         groups = tuple(g for g in self.groups if g.kind == kind)
@@ -120,13 +140,6 @@ class Campaign:
     def stacks(self, kind: str) -> tuple[FrameGroup, ...]:
         """Return the groups with many frames, by rising exposure."""
         return tuple(g for g in self.groups if g.kind == kind and g.role == "stack")
-
-    def stack(self, kind: str) -> FrameGroup | None:
-        """Return the one stack to use: the longest; of dark ones the longest among those with the exposure of the bright stack."""
-        stacks = self.stacks(kind)
-        bright = self.stack("bright") if kind == "dark" else None
-        same = tuple(g for g in stacks if bright is not None and g.exposure_s == bright.exposure_s)
-        return max(same or stacks, key=lambda g: len(g.paths), default=None)
 
 
 def check_groups(groups: tuple[FrameGroup, ...], where: str) -> tuple[FrameGroup, ...]:

@@ -30,6 +30,7 @@ class CameraModel(Model):
     sensor: Literal["ccd", "cmos"] | None = None
     temperature_c: Annotated[float, Field(ge=-273.15)] | None = None
     pixel_clock_mhz: Positive | None = None
+    cfa: Literal["RGGB", "BGGR", "GRBG", "GBRG"] | None = None
 
     @model_validator(mode="after")
     def _one_pitch(self) -> CameraModel:

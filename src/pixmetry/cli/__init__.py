@@ -22,12 +22,14 @@ _OS_REMEDIES = {errno.ENOSPC: "make room, or choose another folder", errno.ENAME
 # Each command lives in the module of its name below this package, as a click command of that name.
 COMMANDS = {
     "assess": "Assess a camera from its frames: measure, budget, advise, and write the report.",
+    "emva1288": "Test a camera by EMVA 1288: the data sheet, with uncertainties.",
     "sources": "List the error sources, or explain one of them.",
     "simulate": "Make the frames of a camera whose errors are known.",
     "chain": "Walk one target through a camera, source by source, on one page.",
     "locate": "Measure where targets or lines are, with a covariance.",
     "bound": "Say how well a target can be located, what estimators give, and what limits them.",
     "correct": "Take out of frames what was measured in an assessment.",
+    "compare": "Say what changed between two measurements, who stands out of a fleet, and what keeps its limits.",
 }
 
 
@@ -46,9 +48,17 @@ class LazyGroup(click.Group):
         with formatter.section("Commands"):
             formatter.write_dl(list(COMMANDS.items()))
 
+    def make_context(self, *args: Any, **kwargs: Any) -> click.Context:
+        try:
+            return super().make_context(*args, **kwargs)
+        except click.UsageError as problem:
+            raise _told(problem) from None
+
     def invoke(self, ctx: click.Context) -> Any:
         try:
             return super().invoke(ctx)
+        except click.UsageError as problem:
+            raise _told(problem) from None
         except PixmetryError as error:
             click.echo(f"error: {' '.join(str(error).split())}", err=True)
             ctx.exit(EXIT_ERROR)
@@ -67,6 +77,16 @@ class LazyGroup(click.Group):
         except KeyboardInterrupt:
             click.echo("interrupted", err=True)
             ctx.exit(EXIT_INTERRUPTED)
+
+
+def _told(problem: click.UsageError) -> Exception:
+    """Print a mistake in the arguments in one line; what is left to raise."""
+    if isinstance(problem, click.exceptions.NoArgsIsHelpError):
+        return problem
+    name = problem.ctx.command_path if problem.ctx else "pixmetry"
+    message = " ".join(problem.format_message().split()).rstrip(".")
+    click.echo(f"error: {message}; to do: see `{name} --help`", err=True)
+    return click.exceptions.Exit(EXIT_ERROR)
 
 
 @click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 120})

@@ -72,7 +72,7 @@ def locate(
             click.echo(f"{name:<24} {text}")
         return
     if not images:
-        raise click.UsageError("no image is named; pixmetry locate --help shows what can be")
+        raise click.UsageError("no image is named")
     set_threads(threads)
     with shown_progress() as progress:
         table = locate_files(

@@ -169,6 +169,9 @@ def _explain(model: type[BaseModel], error: Any, lines: Mapping[tuple[str | int,
         return InputError("a file of another kind", where=where, value=error["input"], allowed=allowed, remedy="name a file of that schema")
     if kind == "extra_forbidden":
         return _unknown_key(str(loc[-1]), name, _keys_at(model, loc[:-1]), where)
+    if kind == "invalid_key":
+        remedy = f"put quotes around it; if a decimal comma stands before it, write a point: 0.{error['input']}"
+        return InputError("a key that is no text", where=where, value=error["input"], allowed="a text", remedy=remedy)
     if kind == "missing":
         return InputError(f"'{name}' is missing", where=where, remedy=f"add `{loc[-1]}: ...`")
     if kind == "finite_number":
@@ -177,6 +180,8 @@ def _explain(model: type[BaseModel], error: Any, lines: Mapping[tuple[str | int,
         )
     if kind in ("float_parsing", "float_type", "int_parsing", "int_type"):
         remedy = "write the number alone; its unit is in the name of the key" if isinstance(error["input"], str) else "give one number"
+        if re.fullmatch(r"[+-]?\d*,\d+", str(error["input"])):
+            remedy = f"write the decimal point as a point: {error['input'].replace(',', '.')}"
         return InputError(f"'{name}' is not a number", where=where, value=error["input"], allowed="a number", remedy=remedy)
     if kind == "value_error":
         cause = error["ctx"]["error"]

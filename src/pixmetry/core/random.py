@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+from numpy.random import Generator, Philox
 from numpy.typing import ArrayLike, NDArray
 
 from pixmetry.core import _random_kernels as kernels
@@ -242,3 +243,8 @@ def _filled(values: ArrayLike, grid: Grid) -> NDArray[np.float32]:
 def _key(seed: int, life: str, name: str, kind: str, draw: int) -> np.uint64:
     text = "\0".join([str(int(seed)), life, kind, str(int(draw)), name])
     return np.uint64(int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest(), "little"))
+
+
+def generator(seed: int, name: str) -> Generator:
+    """A generator for draws that have no place on a sensor, such as those of a result's uncertainty; of its own for each seed and name."""
+    return Generator(Philox(key=int(_key(seed, "result", name, "", 0))))

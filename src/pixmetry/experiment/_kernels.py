@@ -54,15 +54,6 @@ def count_codes(frame, counts):
 
 
 @jit
-def count_differences(first, second, counts, zero):
-    """Count the differences ``second - first``; a difference d is counted in ``counts[c % 4, zero + d]`` (shape (4, ...), int64)."""
-    rows, cols = first.shape
-    for r in range(rows):
-        for c in range(cols):
-            counts[c % 4, zero + int(second[r, c]) - int(first[r, c])] += 1
-
-
-@jit
 def sum_maps(total, total_sq, n_frames, row_totals, col_totals):
     """Sum the maps of a group over the pixels.
 
@@ -100,3 +91,59 @@ def sum_maps(total, total_sq, n_frames, row_totals, col_totals):
         deviations += row_deviations
         products += row_products
     return deviations, products
+
+
+@jit
+def sum_pair(first, second, row_sums, col_sums):
+    """Sum the powers of the difference d = y1 − y0 of two frames, and y0 y1, exactly.
+
+    Parameters
+    ----------
+    first, second : ndarray, shape (rows, cols), uint8 or uint16, DN
+    row_sums, col_sums : ndarray, shape (2, rows) and (2, cols), int64, DN
+        Set to the sums of the frames.
+
+    Returns
+    -------
+    products, squares : int
+        Σ y0 y1 and Σ d².
+    cubes, fourths : tuple of int
+        Σ d³ and Σ d⁴ as (high, low), to be read as 2³² · high + low.
+    """
+    rows, cols = first.shape
+    low_half = np.int64(0xFFFFFFFF)
+    products = squares = cubes_high = cubes_low = fourths_high = fourths_low = np.int64(0)
+    for c in range(cols):
+        col_sums[0, c] = col_sums[1, c] = 0
+    for r in range(rows):
+        row_0 = row_1 = np.int64(0)
+        for c in range(cols):
+            y0, y1 = np.int64(first[r, c]), np.int64(second[r, c])
+            row_0 += y0
+            row_1 += y1
+            col_sums[0, c] += y0
+            col_sums[1, c] += y1
+            products += y0 * y1
+        row_sums[0, r], row_sums[1, r] = row_0, row_1
+        for c in range(cols):
+            d = np.int64(second[r, c]) - np.int64(first[r, c])
+            square = d * d
+            squares += square
+            cube = d * square  # within ± 2**48
+            cubes_high += cube >> np.int64(32)
+            cubes_low += cube & low_half
+            fourth = np.uint64(square) * np.uint64(square)  # below 2**64
+            fourths_high += np.int64(fourth >> np.uint64(32))
+            fourths_low += np.int64(fourth & np.uint64(0xFFFFFFFF))
+    return products, squares, (cubes_high, cubes_low), (fourths_high, fourths_low)
+
+
+@jit
+def sum_squares(values):
+    """Sum the squares of integers from 0 to 2³² − 1 exactly: (high, low), to be read as 2³² · high + low."""
+    high = low = np.int64(0)
+    for value in values:
+        square = np.uint64(value) * np.uint64(value)
+        high += np.int64(square >> np.uint64(32))
+        low += np.int64(square & np.uint64(0xFFFFFFFF))
+    return high, low

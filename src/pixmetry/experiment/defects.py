@@ -8,7 +8,7 @@ from pixmetry.core.errors import InputError
 from pixmetry.core.observations import DefectList, StackMoments
 from pixmetry.experiment.photon_transfer_levels import core_spread_dn2
 from pixmetry.experiment.photon_transfer_model import QUANTISATION_DN2, white_before_rounding
-from pixmetry.experiment.surface import fill, fit_surface
+from pixmetry.experiment.surface import fill, fit_surface, median
 
 KINDS = ("stuck", "dead", "hot", "cold", "gain", "noisy")  # worst first
 COARSE_DN = 0.02  # largest error of a mean code above which a converter counts as coarse for its noise
@@ -18,7 +18,7 @@ MAD_TO_SIGMA = 1.482602218505602  # 1/Φ⁻¹(¾)
 
 def robust_sigma(values: np.ndarray, floor: float = 0.0) -> float:
     """Standard deviation of the Gaussian core, from the median absolute deviation."""
-    return max(MAD_TO_SIGMA * float(np.median(np.abs(values - np.median(values)))), floor)
+    return max(MAD_TO_SIGMA * float(median(np.abs(values - median(values)))), floor)
 
 
 def _without_lines(image: np.ndarray, least_clip: float = 0.0) -> np.ndarray:
@@ -27,11 +27,11 @@ def _without_lines(image: np.ndarray, least_clip: float = 0.0) -> np.ndarray:
     Medians alone would do less well: pixels near the middle draw them along, so that the core looks narrower than the tails are, and
     the median of coarse codes is itself a code. A defect moves a clipped mean by no more than the clip over the number of pixels.
     """
-    residual = image - np.median(image, axis=0)[None, :]
-    residual = residual - np.median(residual, axis=1)[:, None]
+    residual = image - median(image, axis=0)[None, :]
+    residual -= median(residual, axis=1)[:, None]
     clip = max(4 * robust_sigma(residual), least_clip)
     for axis in (0, 1):
-        residual = residual - np.clip(residual, -clip, clip).mean(axis=axis, keepdims=True)
+        residual -= np.clip(residual, -clip, clip).mean(axis=axis, keepdims=True)
     return residual
 
 
@@ -90,7 +90,7 @@ def find_defects(
     gain, gain_sigma = np.full(shape, np.nan), float("nan")
     if bright_stack is not None:
         own = np.where(noisy, np.hypot(own, np.sqrt(bright_stack.var_map_dn2 / bright_stack.n_frames)), 0.0)
-        gain, gain_z, gain_sigma = _response(dark_stack, bright_stack, surface_degree, threshold, own)
+        gain, gain_z, gain_sigma = _response(dark_stack, bright_stack, surface_degree, threshold, own, rounding)
         found["dead"] = (gain < 0.5) & (gain_z < -threshold)
         found["gain"] = (np.abs(gain_z) > threshold) & ~found["dead"]
         still = (dark_stack.var_map_dn2 == 0) & (bright_stack.var_map_dn2 == 0)
@@ -132,7 +132,7 @@ def _core_of_codes_dn(mean_map: np.ndarray) -> float:
     """Width of a Gaussian of which the pixels half a code above and half a code below the commonest one are these shares."""
     from scipy.stats import norm
 
-    code = np.rint(np.median(mean_map))
+    code = np.rint(median(mean_map))
     # half a pixel at least, for a share of which there is none
     shares = [max(float(np.mean(beyond > 0.5)), 0.5 / mean_map.size) for beyond in (mean_map - code, code - mean_map)]
     return 1.0 / float(max(norm.isf(shares).sum(), 0.5))
@@ -145,27 +145,27 @@ def _beyond(deviation: np.ndarray, slack: float) -> np.ndarray:
 
 def _noise_z(stack: StackMoments, coarse: bool) -> np.ndarray:
     root = np.cbrt(stack.var_map_dn2.astype(float))
-    median = float(np.median(root))
+    middle = float(median(root))
     if coarse:  # a pixel at the edge of a code toggles: up to ¼ DN² without any noise, else by the first harmonic
         white = _white_dn2(stack)
         edge = 0.25 + white if white < 0.05 else white + QUANTISATION_DN2 + (4 * white + 1 / np.pi**2) * np.exp(-2 * np.pi**2 * white)
-        median = max(median, float(np.cbrt(edge)))
+        middle = max(middle, float(np.cbrt(edge)))
     # never narrower than the sampling of a variance on L − 1 degrees of freedom
-    theory = median * np.sqrt(2 / (9 * (stack.n_frames - 1)))
-    sigma = max(MAD_TO_SIGMA * float(np.median(np.abs(root - np.median(root)))), theory)
-    return (root - median) / sigma if sigma > 0 else np.zeros(stack.shape)
+    theory = middle * np.sqrt(2 / (9 * (stack.n_frames - 1)))
+    sigma = max(robust_sigma(root), theory)
+    return (root - middle) / sigma if sigma > 0 else np.zeros(stack.shape)
 
 
 def _response(
-    dark: StackMoments, bright: StackMoments, degree: int, threshold: float, own_dn: np.ndarray
+    dark: StackMoments, bright: StackMoments, degree: int, threshold: float, own_dn: np.ndarray, rounding_dn: float
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Response over that of the smooth surface, how many robust σ it is off 1, and that σ; fitted again without what stood out."""
     light = bright.mean_map_dn - dark.mean_map_dn
-    level = float(np.median(light))
+    level = float(median(light))
     if level <= 0:
         raise InputError("the bright stack is not brighter than the dark one", value=level, allowed="a median difference above 0 DN")
     floor = np.hypot(1 / dark.n_frames, 1 / bright.n_frames) / np.sqrt(12) / level
-    slack = 2 * (rounding_error_dn(dark) + rounding_error_dn(bright)) / level
+    slack = 2 * (rounding_dn + rounding_error_dn(bright)) / level
     mask = np.zeros(light.shape, dtype=bool)
     for _ in range(2):
         relative = light / fit_surface(fill(light, mask), degree).values

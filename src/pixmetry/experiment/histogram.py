@@ -53,12 +53,6 @@ class HistogramAccumulator:
             sums = np.array([n, int(counts @ codes), int(counts @ codes**2)], dtype=object)
             self._levels[level] = self._levels.get(level, 0) + sums
 
-    def merge(self, other: HistogramAccumulator) -> None:
-        """Add what another accumulator has gathered."""
-        self._counts += other._counts
-        for level, sums in other._levels.items():
-            self._levels[level] = self._levels.get(level, 0) + sums
-
     def result(self) -> CodeHistogram:
         """The counts, and mean, variance and number of pixels of each light level."""
         sums = list(self._levels.values())

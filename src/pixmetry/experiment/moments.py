@@ -14,7 +14,7 @@ import numpy as np
 
 from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.core.observations import LevelMoments
-from pixmetry.experiment._kernels import accumulate_frame, count_differences, sum_maps
+from pixmetry.experiment._kernels import accumulate_frame, count_codes, sum_maps, sum_pair, sum_squares
 
 MAX_FRAMES = 65536  # so that the sum of 16-bit codes fits 32 bits
 
@@ -115,35 +115,9 @@ class FrameMoments:
         if index in self._frame_sums or len(self._frame_sums) == MAX_FRAMES:
             raise InputError("frame index used twice, or too many frames in a group", value=index, allowed=f"up to {MAX_FRAMES} frames")
         accumulate_frame(frame, self._total, self._total_sq, self._rows, self._cols, self._counts)
-        rows = self._rows.tolist()  # Python integers: their squares cannot overflow
-        self._frame_sums[index] = sum(rows)
-        self._row_squares += sum(v * v for v in rows)
-        self._col_squares += sum(v * v for v in self._cols.tolist())
-
-    def merge(self, other: FrameMoments) -> None:
-        """Add what another accumulator of the same group has gathered.
-
-        Raises
-        ------
-        InputError
-            If kind, shape or bits differ, or a frame is in both.
-        """
-        if other._shape is None:
-            return
-        if self._shape is None:
-            self._allocate(other._shape)
-        if (type(other), other._shape, other.bits) != (type(self), self._shape, self.bits):
-            raise InputError(
-                "accumulators of different groups cannot be merged", value=(other._shape, other.bits), allowed=str((self._shape, self.bits))
-            )
-        if self._frame_sums.keys() & other._frame_sums.keys():
-            raise InputError("a frame index is in both accumulators", value=sorted(self._frame_sums.keys() & other._frame_sums.keys())[:3])
-        self._frame_sums |= other._frame_sums
-        self._total += other._total
-        self._total_sq += other._total_sq
-        self._counts += other._counts
-        self._row_squares += other._row_squares
-        self._col_squares += other._col_squares
+        self._frame_sums[index] = int(self._rows.sum())
+        self._row_squares += _joined(sum_squares(self._rows))
+        self._col_squares += _joined(sum_squares(self._cols))
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -207,8 +181,7 @@ class FrameMoments:
         """
         self._need(2)
         f, (m, n) = self.n_frames, self.shape
-        if m < 2 or n < 2:
-            raise MeasureError("frames are too small for rows and columns to be told apart", value=self.shape, allowed="2 x 2 or more")
+        _need_rows_and_cols(self.shape)
         deviations, _ = sum_maps(self._total, self._total_sq, f, self._rows, self._cols)
         row_totals, col_totals = self._rows.tolist(), self._cols.tolist()
         frame_sums = list(self._frame_sums.values())
@@ -216,36 +189,23 @@ class FrameMoments:
         frames = f * sum(v * v for v in frame_sums) - grand * grand
         rows = f * self._row_squares - sum(v * v for v in row_totals)
         cols = f * self._col_squares - sum(v * v for v in col_totals)
-        ss_all = deviations / f
-        ss_frame = frames / (f * m * n)
-        ss_row = (m * rows - frames) / (f * m * n)
-        ss_col = (n * cols - frames) / (f * m * n)
-        dof = (f - 1) * (m - 1) * (n - 1)
-        return MeanSquares(
-            pixel_dn2=max((ss_all - ss_frame - ss_row - ss_col) / dof, 0.0),
-            row_dn2=ss_row / (n * (f - 1) * (m - 1)),
-            col_dn2=ss_col / (m * (f - 1) * (n - 1)),
-            frame_dn2=ss_frame / (m * n * (f - 1)),
-            total_dn2=max((ss_all - ss_frame) / (m * n * (f - 1)), 0.0),
-        )
+        return _mean_squares(f, (m, n), deviations, frames, rows, cols)
 
     def spatial_covariance_dn2(self) -> float:
         """Spatial variance free of temporal noise, DN²: ⟨y_f y_g⟩ − µ_f µ_g averaged over all pairs f ≠ g (EMVA 1288 R4.0 eq. 32)."""
         self._need(2)
         f, size = self.n_frames, self.shape[0] * self.shape[1]
         _, products = sum_maps(self._total, self._total_sq, f, self._rows, self._cols)
-        grand = sum(self._frame_sums.values())
-        cross_means = (grand * grand - sum(v * v for v in self._frame_sums.values())) / (size * size)
-        return (products / size - cross_means) / (f * (f - 1))
+        return _covariance(list(self._frame_sums.values()), size, products)
 
 
 class LevelAccumulator(FrameMoments):
-    """The two or few frames of one exposure level: moments, and the histogram of the differences of frames 2k and 2k + 1."""
+    """The two or few frames of one exposure level: moments, and the kurtosis of the differences of frames 2k and 2k + 1."""
 
     def __init__(self, bits: int) -> None:
         super().__init__(bits)
         self._waiting: dict[int, tuple[int, np.ndarray]] = {}
-        self._differences = np.zeros((4, 2 ** (bits + 1)), np.int64)
+        self._powers = DifferencePowers()
 
     def add(self, frame: np.ndarray, index: int | None = None) -> None:
         """Add one frame; see :meth:`FrameMoments.add`."""
@@ -259,25 +219,12 @@ class LevelAccumulator(FrameMoments):
             return
         other_index, other = self._waiting.pop(index // 2)
         first, second = (other, frame) if other_index < index else (frame, other)
-        count_differences(first, second, self._differences, 2**self.bits)
-
-    def merge(self, other: FrameMoments) -> None:
-        """Add what another accumulator of the same level has gathered; see :meth:`FrameMoments.merge`."""
-        super().merge(other)
-        if isinstance(other, LevelAccumulator):
-            self._differences += other._differences
-            for index, frame in other._waiting.values():
-                self._pair(index, frame)
+        self._powers += _PairSums.of(first, second).powers
 
     def kurtosis_excess(self) -> float:
         """Excess kurtosis of the frame differences (0 for Gaussian noise, and where all differences are equal)."""
         self._need(2)
-        counts = self._differences.sum(axis=0)
-        d = np.flatnonzero(counts) - float(2**self.bits)
-        weights = counts[counts > 0] / counts.sum()
-        d -= weights @ d
-        variance = weights @ d**2
-        return float(weights @ d**4 / variance**2 - 3.0) if variance > 0 else 0.0
+        return self._powers.kurtosis_excess()
 
     def summary(self) -> LevelSummary:
         """What the level contributes to a series; the maps can then be dropped."""
@@ -289,6 +236,114 @@ class LevelAccumulator(FrameMoments):
             counts=self.counts,
             spatial_cov_dn2=self.spatial_covariance_dn2(),
         )
+
+
+@dataclass(frozen=True)
+class DifferencePowers:
+    """Exact sums over pixels of the powers 0 to 4 of frame differences."""
+
+    sums: tuple[int, int, int, int, int] = (0, 0, 0, 0, 0)
+
+    def __add__(self, other: DifferencePowers) -> DifferencePowers:
+        n, s1, s2, s3, s4 = (a + b for a, b in zip(self.sums, other.sums, strict=True))
+        return DifferencePowers((n, s1, s2, s3, s4))
+
+    def kurtosis_excess(self) -> float:
+        """m₄/m₂² − 3 of the central moments; 0 where all differences are equal."""
+        n, s1, s2, s3, s4 = self.sums
+        variance = n * s2 - s1 * s1  # n² m₂
+        fourth = n**3 * s4 - 4 * n * n * s1 * s3 + 6 * n * s1 * s1 * s2 - 3 * s1**4  # n⁴ m₄
+        return fourth / variance**2 - 3.0 if variance > 0 else 0.0
+
+
+@dataclass(frozen=True)
+class _PairSums:
+    """Exact sums of two frames y0, y1 and their difference."""
+
+    row_sums: np.ndarray  # shape (2, rows)
+    col_sums: np.ndarray  # shape (2, cols)
+    frame_sums: list[int]
+    products: int  # Σ y0 y1
+    powers: DifferencePowers
+
+    @classmethod
+    def of(cls, first: np.ndarray, second: np.ndarray) -> _PairSums:
+        rows, cols = np.empty((2, first.shape[0]), np.int64), np.empty((2, first.shape[1]), np.int64)
+        products, squares, cubes, fourths = sum_pair(first, second, rows, cols)
+        frames = rows.sum(axis=1).tolist()
+        powers = (first.size, frames[1] - frames[0], squares, _joined(cubes), _joined(fourths))
+        return cls(rows, cols, frames, products, DifferencePowers(powers))
+
+
+def summarize_pair(first: np.ndarray, second: np.ndarray, bits: int) -> LevelSummary:
+    """Reduce a level of two frames; the same as with a ``LevelAccumulator``, to the bit, but without maps.
+
+    Parameters
+    ----------
+    first, second : ndarray, shape (rows, cols), uint8 or uint16, DN
+    bits : int
+        Bits per stored code.
+
+    Raises
+    ------
+    InputError
+        If the frames differ in shape, are not stored codes, or hold codes above the stated bits.
+    MeasureError
+        With fewer than two rows or columns.
+    """
+    first = check_frame(first, bits)
+    second = check_frame(second, bits, first.shape)
+    sums, shape = _PairSums.of(first, second), first.shape
+    _need_rows_and_cols(shape)
+    counts = np.zeros((4, 2**bits), np.int64)
+    count_codes(first, counts)
+    count_codes(second, counts)
+    # with two frames F Σ y² − (Σ y)² is the square of the difference
+    frames = (sums.frame_sums[1] - sums.frame_sums[0]) ** 2
+    rows, cols = (_joined(sum_squares(np.abs(part[1] - part[0]))) for part in (sums.row_sums, sums.col_sums))
+    return LevelSummary(
+        n_frames=2,
+        mean_dn=float((np.array(sums.frame_sums, dtype=float) / first.size).mean()),
+        squares=_mean_squares(2, shape, float(sums.powers.sums[2]), frames, rows, cols),
+        kurtosis_excess=sums.powers.kurtosis_excess(),
+        counts=counts.sum(axis=0),
+        spatial_cov_dn2=_covariance(sums.frame_sums, first.size, 2.0 * sums.products),
+    )
+
+
+def _joined(halves: tuple[int, int]) -> int:
+    """An exact sum that a kernel gives in two halves."""
+    high, low = halves
+    return (int(high) << 32) + int(low)
+
+
+def _need_rows_and_cols(shape: tuple[int, ...]) -> None:
+    if min(shape) < 2:
+        raise MeasureError("frames are too small for rows and columns to be told apart", value=shape, allowed="2 x 2 or more")
+
+
+def _mean_squares(f: int, shape: tuple[int, int], deviations: float, frames: int, rows: int, cols: int) -> MeanSquares:
+    """From F Σ (value)² − (Σ value)² over the F frames, summed over pixels, for the frame sums, over the row sums and column sums."""
+    m, n = shape
+    ss_all = deviations / f
+    ss_frame = frames / (f * m * n)
+    ss_row = (m * rows - frames) / (f * m * n)
+    ss_col = (n * cols - frames) / (f * m * n)
+    dof = (f - 1) * (m - 1) * (n - 1)
+    return MeanSquares(
+        pixel_dn2=max((ss_all - ss_frame - ss_row - ss_col) / dof, 0.0),
+        row_dn2=ss_row / (n * (f - 1) * (m - 1)),
+        col_dn2=ss_col / (m * (f - 1) * (n - 1)),
+        frame_dn2=ss_frame / (m * n * (f - 1)),
+        total_dn2=max((ss_all - ss_frame) / (m * n * (f - 1)), 0.0),
+    )
+
+
+def _covariance(frame_sums: list[int], size: int, products: float) -> float:
+    """Spatial covariance of different frames from Σ over pixels of (Σ y)² − Σ y² and the frame sums."""
+    f, grand = len(frame_sums), sum(frame_sums)
+    cross_means = (grand * grand - sum(v * v for v in frame_sums)) / (size * size)
+    return (products / size - cross_means) / (f * (f - 1))
 
 
 def level_moments(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,10 +13,8 @@ from pixmetry.core.observations import (
     CodeErrors,
     CodeHistogram,
     DefectList,
-    LevelMoments,
     Observations,
     PatternList,
-    PhotonTransfer,
     Spectra,
     StackMoments,
 )
@@ -24,32 +22,14 @@ from pixmetry.core.threads import single_threaded_blas
 from pixmetry.experiment.defects import find_defects
 from pixmetry.experiment.histogram import HistogramAccumulator, code_errors, sweep_histogram
 from pixmetry.experiment.linearity import Linearity
-from pixmetry.experiment.moments import LevelAccumulator, LevelSummary, level_moments
+from pixmetry.experiment.moments import LevelSummary
+from pixmetry.experiment.one_pass import Group, Level, photon_transfer, reduce_groups, refuse_copies
 from pixmetry.experiment.patterns import find_phase_patterns
 from pixmetry.experiment.photon_transfer_fit import fit_photon_transfer
 from pixmetry.experiment.spatial_fit import fit_spatial
-from pixmetry.experiment.stack import StackAccumulator, new_group
+from pixmetry.experiment.stack import StackAccumulator, choose_stacks, same_exposure
 
-EQUAL_EXPOSURE = 0.01  # relative; clocks round
-SATURATED_FRACTION = 0.002  # EMVA 1288 R4.0 §6.6
-
-
-@dataclass(frozen=True)
-class Group:
-    """Frames of one condition, as they come from the reader."""
-
-    kind: str  # "dark" or "bright"
-    role: str  # "level" or "stack"
-    exposure_s: float
-    photons: float | None
-    frames: Iterable[np.ndarray]
-
-
-@dataclass(frozen=True)
-class _Level:
-    summary: LevelSummary
-    exposure_s: float
-    photons: float | None
+__all__ = ["Group", "observe"]
 
 
 @dataclass(frozen=True)
@@ -58,7 +38,14 @@ class _Stack:
     spectra: Spectra
 
 
-def observe(groups: Iterable[Group], bits: int, temperature_c: float | None = None) -> Observations:
+def observe(
+    groups: Iterable[Group],
+    bits: int,
+    temperature_c: float | None = None,
+    *,
+    threads: int | None = None,
+    on_frames: Callable[[int], object] | None = None,
+) -> Observations:
     """Reduce all frames of a campaign, then estimate what many sources share.
 
     Parameters
@@ -68,6 +55,10 @@ def observe(groups: Iterable[Group], bits: int, temperature_c: float | None = No
     bits : int
         Bits per stored code.
     temperature_c : float, optional
+    threads : int, optional
+        The results have the same bits for any number of them.
+    on_frames : callable, optional
+        Called with the number of frames that were done since the last call.
 
     Returns
     -------
@@ -78,39 +69,35 @@ def observe(groups: Iterable[Group], bits: int, temperature_c: float | None = No
     MeasureError
         If the frames carry no photon transfer: all saturated, all black, too few levels.
     """
-    levels: dict[str, list[_Level]] = {"dark": [], "bright": []}
+    levels: dict[str, list[Level]] = {"dark": [], "bright": []}
     stacks: dict[str, dict[float, _Stack]] = {"dark": {}, "bright": {}}
-    histogram, sweep = HistogramAccumulator(bits), []
+    histogram = HistogramAccumulator(bits)
     shape = None
-    for group in groups:
-        reduction = new_group(bits, group.role)
-        for frame in group.frames:
-            reduction.add(frame)
-        moments = reduction.moments
-        shape = moments.shape
-        level = (group.kind, group.role, group.exposure_s, group.photons)
-        histogram.add_counts(moments.counts, dark=group.kind == "dark", level=level)
-        if isinstance(moments, LevelAccumulator):
-            levels[group.kind].append(_Level(moments.summary(), group.exposure_s, group.photons))
-            if group.kind == "bright":
-                sweep.append(levels["bright"][-1].summary)
-                _refuse_copies(levels["bright"][-1], bits)
-        elif isinstance(moments, StackAccumulator):
+    for group, [(sums, found)] in reduce_groups(groups, bits, threads=threads, on_frames=on_frames):
+        shape = found
+        condition = (group.kind, group.role, group.exposure_s, group.photons)
+        if isinstance(sums, LevelSummary):
+            histogram.add_counts(sums.counts, dark=group.kind == "dark", level=condition)
+            refuse_copies(group, sums, bits)
+            levels[group.kind].append(Level(sums, group.exposure_s, group.photons))
+        elif isinstance(sums.moments, StackAccumulator) and sums.spectra is not None:
+            histogram.add_counts(sums.moments.counts, dark=group.kind == "dark", level=condition)
             kept = stacks[group.kind].get(group.exposure_s)
-            if kept is None or moments.n_frames > kept.moments.n_frames:
-                stack = moments.result(group.exposure_s)
-                stacks[group.kind][group.exposure_s] = _Stack(stack, reduction.spectra.result(stack.mean_map_dn))
+            if kept is None or sums.moments.n_frames > kept.moments.n_frames:
+                stack = sums.moments.result(group.exposure_s)
+                stacks[group.kind][group.exposure_s] = _Stack(stack, sums.spectra.result(stack.mean_map_dn))
     counts = histogram.result()
     notes = _code_notes(counts)
+    sweep = [level.summary for level in levels["bright"]]
     dark, bright = _pair(list(stacks["dark"].values()), list(stacks["bright"].values()))
     dark_stack, bright_stack = (None if s is None else s.moments for s in (dark, bright))
-    transfer = _photon_transfer(levels, shape, bits)
+    transfer = photon_transfer(levels["dark"], levels["bright"], shape, bits)
     codes = _codes(sweep_histogram(sweep, bits), notes)
     with single_threaded_blas():
         fit = fit_photon_transfer(transfer, dark_stack, bright_stack, _dnl_lsb(codes))
     if dark and not bright:
         notes.append("no stack of bright frames: DSNU and PRNU are not measured (take 16 or more at half of saturation)")
-    if dark and bright and not _same_exposure(dark, bright):
+    if dark and bright and not same_exposure(dark.moments, bright.moments):
         notes.append(_unpaired(dark, bright))
         bright = bright_stack = None  # a dark map of another exposure holds another dark current: their difference is not the light's
     dark_spectra, bright_spectra = (None if s is None else s.spectra for s in (dark, bright))
@@ -133,18 +120,6 @@ def observe(groups: Iterable[Group], bits: int, temperature_c: float | None = No
     )
 
 
-def _refuse_copies(level: _Level, bits: int) -> None:
-    """Refuse a bright level whose frames are the same picture; at either end of the codes frames may be alike."""
-    between = 0 < level.summary.mean_dn < 2**bits - 1
-    ends = (level.summary.counts[0] + level.summary.counts[-1]) / level.summary.counts.sum()
-    if between and ends < 0.5 and level.summary.squares.total_dn2 == 0:
-        raise MeasureError(
-            f"the frames of a level are identical (bright, exposure {level.exposure_s:g} s): there is no temporal noise to measure",
-            where="photon transfer",
-            remedy="list frames that were taken one after the other, not copies, averages or synthetic frames",
-        )
-
-
 def _code_notes(histogram: CodeHistogram) -> list[str]:
     """What the codes themselves tell of a wrong or shifted number of bits."""
     used = np.flatnonzero(histogram.counts)
@@ -159,27 +134,9 @@ def _code_notes(histogram: CodeHistogram) -> list[str]:
 
 
 def _pair(dark: list[_Stack], bright: list[_Stack]) -> tuple[_Stack | None, _Stack | None]:
-    """Choose the dark and the bright stack that belong together: of equal or nearest exposure.
-
-    Of several such pairs one that is not saturated, then the longest exposure, then the most frames. With stacks of one kind only, the
-    one of the most frames.
-    """
-    if not dark or not bright:
-        most = [max(part, key=lambda s: (s.moments.n_frames, s.moments.exposure_s), default=None) for part in (dark, bright)]
-        return most[0], most[1]
-
-    def rank(pair: tuple[_Stack, _Stack]) -> tuple[float, bool, float, int]:
-        d, b = pair[0].moments, pair[1].moments
-        saturated = b.fraction_max - d.fraction_max > SATURATED_FRACTION
-        gap = 0.0 if _same_exposure(*pair) else abs(np.log(max(d.exposure_s, 1e-9) / max(b.exposure_s, 1e-9)))
-        return gap, saturated, -b.exposure_s, -min(d.n_frames, b.n_frames)
-
-    return min(((d, b) for d in dark for b in bright), key=rank)
-
-
-def _same_exposure(dark: _Stack, bright: _Stack) -> bool:
-    one, other = dark.moments.exposure_s, bright.moments.exposure_s
-    return abs(one - other) <= EQUAL_EXPOSURE * max(one, other)
+    """Choose the dark and the bright stack that belong together."""
+    d, b = choose_stacks([s.moments for s in dark], [s.moments for s in bright])
+    return None if d is None else dark[d], None if b is None else bright[b]
 
 
 def _unpaired(dark: _Stack, bright: _Stack) -> str:
@@ -188,25 +145,6 @@ def _unpaired(dark: _Stack, bright: _Stack) -> str:
         f"no dark stack has the exposure of a bright one (nearest: dark {one:g} s, bright {other:g} s): DSNU, PRNU, shading and the "
         f"response of single pixels are not measured (take 16 or more dark frames at {other:g} s)"
     )
-
-
-def _photon_transfer(levels: dict[str, list[_Level]], shape: tuple[int, int] | None, bits: int) -> PhotonTransfer:
-    for kind in ("dark", "bright"):
-        if not levels[kind]:
-            raise MeasureError(
-                f"no {kind} levels of an exposure series",
-                where="photon transfer",
-                remedy=f"add {kind} groups of two frames; a group of 8 or more frames counts as a stack unless its role says 'level'",
-            )
-
-    def moments(kind: str) -> LevelMoments:
-        part = levels[kind]
-        photons = [v.photons for v in part]
-        known = None if any(v is None for v in photons) else [float(v) for v in photons if v is not None]
-        return level_moments([v.summary for v in part], [v.exposure_s for v in part], known)
-
-    assert shape is not None
-    return PhotonTransfer(moments("bright"), moments("dark"), shape, bits)
 
 
 def _spatial(

@@ -1,8 +1,7 @@
 """Joint estimate of gain, dark noise, non-linearity and their companions from a photon-transfer series.
 
-``fit_emva_linear`` is the rule of EMVA 1288 R4.0: ordinary least squares through the origin, linear camera. ``fit_photon_transfer`` fits
-all means and white mean squares together by iterated generalised least squares, with the non-linearity free, the additive wander of the
-black level and the lamp noise as variance components by restricted maximum likelihood (REML; Patterson & Thompson 1971), and
+All means and white mean squares are fitted together by iterated generalised least squares, with the non-linearity free, the additive
+wander of the black level and the lamp noise as variance components by restricted maximum likelihood (REML; Patterson & Thompson 1971), and
 effective degrees of freedom by Satterthwaite's rule (JCGM 100 G.4). The reference that it is compared with is the Cramér-Rao bound of the
 same model with every weight and variance component known: no unbiased estimator that has to find the non-linearity does better.
 """
@@ -17,7 +16,6 @@ from pixmetry.core.errors import MeasureError
 from pixmetry.core.estimates import Estimates
 from pixmetry.core.observations import PhotonTransfer, StackMoments
 from pixmetry.experiment import photon_transfer_model as model
-from pixmetry.experiment.emva_linear import fit_emva_linear
 from pixmetry.experiment.photon_transfer_levels import (
     CLIPPED_BLACK_FRACTION,
     clipped_black,
@@ -33,8 +31,6 @@ from pixmetry.experiment.photon_transfer_levels import (
 )
 from pixmetry.experiment.photon_transfer_model import A1, A3, DARK_SLOPE, DARK_VAR, DARK_VAR_SLOPE, GAIN, LIGHT_OFFSET, OFFSET, SLOPE
 from pixmetry.experiment.photon_transfer_solve import Solution, fit_range
-
-__all__ = ["fit_emva_linear", "fit_photon_transfer"]
 
 SATURATED_FRACTION = 0.002  # EMVA 1288 R4.0 §6.6: saturation is the highest level with at most 0.2 % of the pixels at the top code
 ALL_SATURATED = 0.999  # then the mean is the top code that the camera stores, which may lie below 2**bits − 1

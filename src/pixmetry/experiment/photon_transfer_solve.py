@@ -98,10 +98,18 @@ class _Step:
     shift: np.ndarray
 
 
+def _unsettled() -> MeasureError:
+    what = "the fit does not settle: the levels do not follow a camera with a smooth, nearly linear response"
+    return MeasureError(what, where="photon transfer", remedy="leave out spoilt levels; raise the black level")
+
+
 def _step(d: model.Levels, s: Solution, prior: np.ndarray) -> _Step:
-    lin = model.linearise(s.p, d)
+    with np.errstate(all="ignore"):  # a trial step may lead anywhere
+        lin = model.linearise(s.p, d)
+        vi = model.inverse_blocks(lin, s.components)
+    if not (np.isfinite(lin.residual).all() and np.isfinite(lin.jacobian).all() and np.isfinite(vi).all()):
+        raise _unsettled()
     jac = lin.jacobian[:, s.free]
-    vi = model.inverse_blocks(lin, s.components)
     vij = vi @ jac
     precision = prior[s.free]
     normal = jac.T @ vij + np.diag(precision)
@@ -179,8 +187,7 @@ def _solve(d: model.Levels, prior: np.ndarray, start: np.ndarray | None = None, 
             break
     step = _step(d, s, prior)
     if not np.all(np.abs(step.shift) < 0.5 * np.sqrt(np.diag(step.normal_inv))):
-        what = "the fit does not settle: the levels do not follow a camera with a smooth, nearly linear response"
-        raise MeasureError(what, where="photon transfer", remedy="leave out spoilt levels; raise the black level")
+        raise _unsettled()
     _, info = _reml(step, s, prior)
     return _finish(d, s, step, info)
 

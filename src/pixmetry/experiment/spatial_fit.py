@@ -42,6 +42,7 @@ def fit_spatial(
     linearity: Linearity | None = None,
     patterns: PatternList | None = None,
     dnl_lsb: float = 0.0,
+    this_sensor: bool = False,
 ) -> Estimates:
     """Dark-signal and photo-response non-uniformity with their row, column and pixel parts.
 
@@ -60,12 +61,16 @@ def fit_spatial(
         Fixed waves to take out of the dark map: they are no property of single pixels.
     dnl_lsb : float
         Standard deviation of the converter's code widths.
+    this_sensor : bool
+        What the non-uniformities are to stand for. False: the population from which this sensor's pixels, rows and columns are a sample;
+        u then holds the scatter from sensor to sensor. True: the pattern that this sensor has; u tells how the value would scatter if
+        the same sensor were measured again. The values are the same.
 
     Returns
     -------
     Estimates
-        ``dsnu_{pixel,row,col,total}_dn``, ``prnu_{pixel,row,col,total}_rel`` (0.01 is 1 %), standard deviations of the population from
-        which this sensor's pixels, rows and columns are a sample; ``shading_x_per_px``, ``shading_y_per_px`` (relative gradient at the
+        ``dsnu_{pixel,row,col,total}_dn``, ``prnu_{pixel,row,col,total}_rel`` (0.01 is 1 %), standard deviations;
+        ``shading_x_per_px``, ``shading_y_per_px`` (relative gradient at the
         centre), ``shading_corner_rel`` (loss from the centre to the corners as r², over the mean light; negative where the corners are
         brighter) and ``shading_pp_rel``. A non-uniformity that is not significantly above zero is a 95 % upper limit.
 
@@ -118,7 +123,7 @@ def fit_spatial(
         dark = without_fixed_waves(dark, patterns)
     response = fill((bright_stack.mean_map_dn - dark_stack.mean_map_dn) / surface.values, mask)
     response = response - fit_surface(response, surface_degree).values
-    squares, covariance = _mean_squares(dark_stack, bright_stack, dark, response, mask, surface)
+    squares, covariance = _mean_squares(dark_stack, bright_stack, dark, response, mask, surface, this_sensor)
     components = _components(squares, covariance, dark_stack.shape, float((surface.values**-2.0).mean()))
     result = _with_rounding(components, dither_dn2, dnl_lsb).join(_shading(surface, squares))
     return result if linearity is None else _with_common_scale(result, linearity.contrast_u_rel(stored_dn))
@@ -176,9 +181,19 @@ def _temporal(stack: StackMoments, mask: np.ndarray, weight: np.ndarray | None =
 
 
 def _mean_squares(
-    dark_stack: StackMoments, bright_stack: StackMoments, dark: np.ndarray, response: np.ndarray, mask: np.ndarray, surface: Surface
+    dark_stack: StackMoments,
+    bright_stack: StackMoments,
+    dark: np.ndarray,
+    response: np.ndarray,
+    mask: np.ndarray,
+    surface: Surface,
+    this_sensor: bool,
 ) -> tuple[_MeanSquares, np.ndarray]:
-    """The twelve mean squares (dark map, response map, dark and bright temporal; pixel, row, column each) and their covariance."""
+    """The twelve mean squares (dark map, response map, dark and bright temporal; pixel, row, column each) and their covariance.
+
+    Of a given pattern with mean square S, noise of mean square t gives Var(MS) = (4 S t + 2 t²)/ν = 2 (MS² − S²)/ν with MS = S + t; the
+    mean product of two maps goes alike. Drawn anew, pattern and noise give 2 MS²/ν and the pattern's kurtosis.
+    """
     rows, cols = dark.shape
     n_defects = int(mask.sum())
     dof_map = np.array([(rows - 1) * (cols - 1) - n_defects, rows - 1, cols - 1], dtype=float)
@@ -193,11 +208,19 @@ def _mean_squares(
     kurtosis = np.zeros(12)
     kurtosis[0], kurtosis[3] = _kurtosis(residual_parts(dark)[0], mask), _kurtosis(residual_parts(response)[0], mask)
     squares = _MeanSquares(values, dof, kurtosis)
-    covariance = np.diag(values**2 * squares.relative_variances())
+    variances = values**2 * squares.relative_variances()
     # the dark map enters the response too: Cov(MS_x, MS_y) = 2 c²/ν with c the covariance of x and y
     shared = _array(cross_strata(dark, response)) / dof_response
+    common = 2 * shared**2 / dof_map
+    if this_sensor:
+        per_light, noise_dark = 1 / surface.values, values[6:9]
+        noise = np.concatenate([noise_dark, values[9:] + noise_dark * float((per_light**2).mean())])
+        fixed = np.maximum(values[:6] - noise, 0.0)
+        variances[:6] = 2 * (values[:6] ** 2 - fixed**2) / dof[:6]
+        common = 2 * (shared**2 - (shared + noise_dark * float(per_light.mean())) ** 2) / dof_map
+    covariance = np.diag(variances)
     for i in range(3):
-        covariance[i, 3 + i] = covariance[3 + i, i] = 2 * shared[i] ** 2 / dof_map[i]
+        covariance[i, 3 + i] = covariance[3 + i, i] = common[i]
     return squares, covariance
 
 
@@ -207,8 +230,9 @@ def _array(strata: Strata) -> np.ndarray:
 
 def _kurtosis(residual: np.ndarray, mask: np.ndarray) -> float:
     good = residual[~mask]
-    variance = float((good**2).mean())
-    return max(float((good**4).mean()) / variance**2 - 3.0, -1.5) if variance > 0 else 0.0
+    squares = good * good
+    variance = float(squares.mean())
+    return max(float((squares * squares).mean()) / variance**2 - 3.0, -1.5) if variance > 0 else 0.0
 
 
 def _components(squares: _MeanSquares, covariance: np.ndarray, shape: tuple[int, int], per_light2: float) -> Estimates:
@@ -323,71 +347,3 @@ def _centre(basis: np.ndarray) -> np.ndarray:
     """Values of the basis at the centre of the grid: the mean of its two middle pixels (one pixel, if the number is odd)."""
     n = basis.shape[0]
     return 0.5 * (basis[(n - 1) // 2] + basis[n // 2])
-
-
-def emva_spatial(dark_stack: StackMoments, bright_stack: StackMoments) -> Estimates:
-    """The non-uniformity that EMVA 1288 defines, to be set beside :func:`fit_spatial`.
-
-    Returns
-    -------
-    Estimates
-        For dark and bright: ``s2_y``, ``s2_row``, ``s2_col``, ``s2_pixel`` in DN², which may come out negative; ``dsnu1288_dn`` and
-        ``prnu1288_rel``, a limit where the variance is negative.
-
-    Raises
-    ------
-    InputError
-        If the stacks differ in shape.
-    MeasureError
-        If the bright stack is not brighter.
-
-    Notes
-    -----
-    EMVA 1288 R4.0 eq. 33 to 42, 65 to 67, without the high-pass filter. Uncertainties from the chi-square sampling of pixels, rows and
-    columns, which the standard does not state.
-    """
-    if dark_stack.shape != bright_stack.shape:
-        raise InputError("dark and bright stack differ in shape", value=bright_stack.shape, allowed=str(dark_stack.shape))
-    light = bright_stack.mean_dn - dark_stack.mean_dn
-    if light <= 0:
-        raise MeasureError("the bright stack is not brighter than the dark one", value=light)
-    splits = {"dark": _emva_split(dark_stack), "bright": _emva_split(bright_stack)}
-    table = [
-        (f"s2_{part}_{tag}_dn2", value, u, dof, "DN²")
-        for tag, split in splits.items()
-        for part, (value, u, dof) in zip(("y", "row", "col", "pixel"), split, strict=True)
-    ]
-    dark, bright = splits["dark"][0], splits["bright"][0]
-    limits = {}
-    for name, square, u_square, dof, scale, unit in (
-        ("dsnu1288_dn", dark[0], dark[1], dark[2], 1.0, "DN"),
-        ("prnu1288_rel", bright[0] - dark[0], math.hypot(bright[1], dark[1]), bright[2], light, "1"),
-    ):
-        if square <= 0:
-            limits[name] = "variance is negative: the standard gives no value"
-        root = math.sqrt(square if square > 0 else 1.645 * u_square)
-        table.append((name, root / scale, u_square / (2 * root * scale) if root > 0 else 0.0, dof, unit))
-    return Estimates.from_rows(table, method="EMVA 1288 R4.0 eq. 33 to 42, 65 to 67", limits=frozenset(limits), reasons=limits)
-
-
-def _emva_split(stack: StackMoments) -> list[tuple[float, float, float]]:
-    """Value, u and degrees of freedom of s²_y, s²_row, s²_col and s²_pixel."""
-    m, n = stack.shape
-    image, left = stack.mean_map_dn, stack.var_stack_dn2 / stack.n_frames
-    measured = float(image.var())
-    s2_y = measured - left
-    cav = float(image.mean(axis=0).var()) - left / m
-    rav = float(image.mean(axis=1).var()) - left / n
-    d = m * n - m - n
-    row = ((m * n - n) * rav - m * (s2_y - cav)) / d
-    col = ((m * n - m) * cav - n * (s2_y - rav)) / d
-    pixel = m * n * (s2_y - cav - rav) / d
-    u_row = (rav + left / n) * math.sqrt(2 / (m - 1))
-    u_col = (cav + left / m) * math.sqrt(2 / (n - 1))
-    u_pixel = (pixel + left) * math.sqrt(2 / ((m - 1) * (n - 1)))
-    return [
-        (s2_y, math.hypot(u_row, u_col, u_pixel), m - 1.0),
-        (row, u_row, m - 1.0),
-        (col, u_col, n - 1.0),
-        (pixel, u_pixel, (m - 1.0) * (n - 1.0)),
-    ]

@@ -84,13 +84,6 @@ class SpectraAccumulator:
         self._power = power if self._power is None else self._power + power
         self.n_pairs += pairs
 
-    def merge(self, other: SpectraAccumulator) -> None:
-        """Add what another accumulator of the same group has gathered."""
-        if other._power is not None:
-            self._accumulate(other._power, other.n_pairs)
-        for pair, frame in other._waiting.items():
-            self._pair(pair, frame)
-
     def result(self, mean_map_dn: np.ndarray) -> Spectra:
         """Spectra of the fixed pattern (from the mean map of the whole stack) and of the temporal noise of one frame.
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 
@@ -11,6 +12,9 @@ from pixmetry.core.errors import InputError
 from pixmetry.core.observations import StackMoments
 from pixmetry.experiment.moments import FrameMoments, LevelAccumulator
 from pixmetry.experiment.spectra import SpectraAccumulator
+
+EQUAL_EXPOSURE = 0.01  # relative; clocks round
+SATURATED_FRACTION = 0.002  # EMVA 1288 R4.0 §6.6
 
 
 class StackAccumulator(FrameMoments):
@@ -68,12 +72,6 @@ class GroupReduction:
         if self.spectra is not None:
             self.spectra.add(frame, index)
 
-    def merge(self, other: GroupReduction) -> None:
-        """Add what another reduction of the same group has gathered."""
-        self.moments.merge(other.moments)
-        if self.spectra is not None and other.spectra is not None:
-            self.spectra.merge(other.spectra)
-
 
 def new_group(bits: int, kind: str, spectra_pairs: int = 8) -> GroupReduction:
     """Empty accumulators for a group: ``kind`` is ``"level"`` (few frames of an exposure series) or ``"stack"`` (many)."""
@@ -84,31 +82,50 @@ def new_group(bits: int, kind: str, spectra_pairs: int = 8) -> GroupReduction:
     raise InputError("no such kind of group", where="kind", value=kind, allowed="level, stack")
 
 
-def reduce_group(
-    frames: Iterable[np.ndarray | tuple[int, np.ndarray]], *, bits: int, kind: str = "stack", spectra_pairs: int = 8
-) -> GroupReduction:
-    """Reduce the frames of one group in one pass.
+class Candidate(Protocol):
+    """What a stack is chosen by."""
 
-    Parameters
-    ----------
-    frames : iterable of ndarray, or of (index, ndarray)
-        Shape (rows, cols), uint8 or uint16. With indices, several threads can each reduce a part and the parts be merged, with the same
-        bits as one pass.
-    bits : int
-        Bits per stored code.
-    kind : {"stack", "level"}
-    spectra_pairs : int
-        Frame pairs of a stack that enter the temporal spectra.
+    @property
+    def exposure_s(self) -> float:
+        """Exposure time."""
 
-    Raises
-    ------
-    InputError
-        If frames differ in shape, are not stored codes, or an index comes twice.
+    @property
+    def n_frames(self) -> int:
+        """Number of frames."""
+
+    @property
+    def mean_dn(self) -> float:
+        """Mean of all pixels."""
+
+    @property
+    def fraction_max(self) -> float:
+        """Share of the pixels at the highest code."""
+
+
+def same_exposure(one: Candidate, other: Candidate) -> bool:
+    """Tell whether two stacks have the same exposure time."""
+    return abs(one.exposure_s - other.exposure_s) <= EQUAL_EXPOSURE * max(one.exposure_s, other.exposure_s)
+
+
+def choose_stacks(dark: Sequence[Candidate], bright: Sequence[Candidate]) -> tuple[int | None, int | None]:
+    """Choose the dark and the bright stack that belong together: of equal or nearest exposure.
+
+    Of several such pairs one that is not saturated, then the longest exposure, the most frames, the most light. With stacks of one kind
+    only, the one of the most frames.
+
+    Returns
+    -------
+    tuple
+        Their places in the sequences; None where there is none.
     """
-    group = new_group(bits, kind, spectra_pairs)
-    for item in frames:
-        if isinstance(item, tuple):
-            group.add(item[1], item[0])
-        else:
-            group.add(item)
-    return group
+    if not dark or not bright:
+        most = [max(range(len(part)), key=lambda i: (part[i].n_frames, part[i].exposure_s), default=None) for part in (dark, bright)]
+        return most[0], most[1]
+
+    def rank(pair: tuple[int, int]) -> tuple[float, bool, float, int, float]:
+        d, b = dark[pair[0]], bright[pair[1]]
+        saturated = b.fraction_max - d.fraction_max > SATURATED_FRACTION
+        gap = 0.0 if same_exposure(d, b) else abs(float(np.log(max(d.exposure_s, 1e-9) / max(b.exposure_s, 1e-9))))
+        return gap, saturated, -b.exposure_s, -min(d.n_frames, b.n_frames), -b.mean_dn
+
+    return min(((d, b) for d in range(len(dark)) for b in range(len(bright))), key=rank)

@@ -95,7 +95,6 @@ def _slim(svg: str, name: str, alt: str) -> str:
     view = re.search(r'viewBox="([^"]+)"', svg)
     assert view is not None
     head = f'<svg class="figure" role="img" aria-label="{escape(alt)}" viewBox="{view[1]}" xmlns:xlink="http://www.w3.org/1999/xlink">'
-    svg = re.sub(r"<svg[^>]*>", head, svg, count=1)
     used = set(re.findall(r'(?:url\(|href=")#([^)"]+)', svg))
     svg = re.sub(r' id="([^"]+)"', lambda m: f' id="{name}-{m[1]}"' if m[1] in used else "", svg)
     svg = re.sub(r'(url\(|href=")#', rf"\g<1>#{name}-", svg)
@@ -103,6 +102,7 @@ def _slim(svg: str, name: str, alt: str) -> str:
         svg = svg.replace(colour, f"var(--{variable})")
     svg = re.sub(r"'DejaVu Sans'(, [^;\"]+)?", "var(--sans)", svg)
     svg = re.sub(r"<[^>]*>", lambda tag: re.sub(r"(\d+\.\d{2})\d+", r"\1", tag[0]), svg)  # coordinates, not the labels between tags
+    svg = head + svg[svg.index(">") + 1 :]  # last, so that its words keep all their digits
     svg = re.sub(r'href="data:image/png;base64,([^"]+)"', lambda m: f'href="{_palette_png(m[1])}"', svg)
     return re.sub(r">\s+<", "><", re.sub(r"\s*\n\s*", " ", svg))
 
@@ -125,17 +125,18 @@ def _palette_png(encoded: str) -> str:
 
 
 def plain_log(axis: Any) -> None:
-    """Label a logarithmic axis with plain numbers: powers of ten, or 1, 2, 5 where it spans few decades."""
+    """Label a logarithmic axis: 1, 2, 5 where it spans few decades, else powers of ten, all plain or all with an exponent."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     from pixmetry.report.numbers import SUPERSCRIPT
 
     low, high = axis.get_view_interval()
     decades = np.log10(high / low)
+    plain = decades < 2 or (low > 2e-4 and high < 5e5)
 
     def label(value: float, _: object) -> str:
         exponent = round(np.log10(value))
-        return f"{value:g}" if abs(exponent) <= 3 or decades < 2 else f"10{str(exponent).translate(SUPERSCRIPT)}"
+        return f"{value:g}" if plain else f"10{str(exponent).translate(SUPERSCRIPT)}"
 
     axis.set_major_locator(LogLocator(subs=(1, 2, 5) if decades < 2 else (1,), numticks=7 if decades >= 2 else 12))
     axis.set_major_formatter(FuncFormatter(label))

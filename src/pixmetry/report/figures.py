@@ -9,6 +9,8 @@ import numpy as np
 
 from pixmetry.core.estimates import Estimates
 from pixmetry.core.observations import CodeHistogram, Observations, PhotonTransfer, Spectra
+from pixmetry.emva.records import Results
+from pixmetry.emva.temporal import linearity_line
 from pixmetry.experiment.photon_transfer_levels import USABLE_FRACTION, light_scale
 from pixmetry.experiment.photon_transfer_model import QUANTISATION_DN2, signal_from_mean, stored_moments
 from pixmetry.report.drawing import AMBER, BLUE, INK, RED, SOFT, Picture, canvas, draw_map, line, picture, plain_log
@@ -71,14 +73,14 @@ def _unsaturated(seen: Observations) -> np.ndarray:
     return (pt.bright.mean_dn <= peak) & (pt.bright.fraction_max <= max(USABLE_FRACTION, stuck))
 
 
-def variance_against_mean(seen: Observations, standard: Estimates) -> Picture:
+def variance_against_mean(seen: Observations, standard: Results) -> Picture:
     """Photon-transfer curve with the joint fit and the standard's line, and what the fit leaves."""
     pt, fit = _series(seen)
     curve, good = Curve.of(fit, pt.bits), _unsaturated(seen)
     mean, var = pt.bright.mean_dn - curve.offset_dn, pt.bright.ms_pixel_dn2
     x = np.linspace(0, curve.signal(np.array([mean[good].max()]))[0], 200)
     fit_mean, fit_var = curve.moments(x)
-    slope, dark = standard["gain_dn_per_e"], standard["dark_noise_dn"]
+    slope, dark = standard.values["K"], standard.values["sigma_y_dark"]
     with canvas(3.5, nrows=2, sharex=True, height_ratios=[3, 1.2]) as (figure, (top, low)):
         top.plot(mean[good], var[good], "o", color=INK, markerfacecolor="none", markeredgewidth=0.7, label="measured")
         top.plot(mean[~good], var[~good], "x", color=SOFT, markeredgewidth=0.7, label="saturated, not used")
@@ -147,9 +149,8 @@ def nonlinearity(seen: Observations) -> Picture:
 
 def _off_line(light: np.ndarray, mean: np.ndarray) -> np.ndarray:
     """Deviation in percent from the line of least relative squares (EMVA 1288 R4.0, section 6.7)."""
-    design = np.stack([np.ones_like(light), light], axis=1) / mean[:, None]
-    coefficient = np.linalg.lstsq(design, np.ones_like(mean), rcond=None)[0]
-    return 100 * (mean / (coefficient[0] + coefficient[1] * light) - 1)
+    last = np.array(light.size - 1)
+    return linearity_line(light, mean, last, last)["relative_deviation"]
 
 
 def signal_to_noise(seen: Observations) -> Picture:
@@ -267,7 +268,7 @@ def dark_codes(histogram: CodeHistogram) -> Picture:
         return picture(figure, "dark-codes", alt, caption)
 
 
-def all_pictures(seen: Observations, standard: Estimates, maps: Mapping[str, np.ndarray]) -> dict[str, Picture]:
+def all_pictures(seen: Observations, standard: Results, maps: Mapping[str, np.ndarray]) -> dict[str, Picture]:
     """Every figure that these observations can give, by name."""
     made = [variance_against_mean(seen, standard), nonlinearity(seen), signal_to_noise(seen)]
     if seen.dark_spectra is not None and seen.dark_stack is not None:

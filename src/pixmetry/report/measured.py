@@ -1,4 +1,4 @@
-"""The table of measured camera values beside the linear rule of EMVA 1288."""
+"""The table of measured camera values beside those of EMVA 1288."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pixmetry.core.errors import PixmetryError
 from pixmetry.core.estimates import Estimate, Estimates
 from pixmetry.core.observations import Observations
-from pixmetry.experiment.spatial_fit import emva_spatial
+from pixmetry.emva.records import Results
+from pixmetry.report.emva_content import say
 from pixmetry.report.numbers import NONE, Number, limit, significant, uncertain
 
 PERCENT, PER_1000_PX = (100.0, "%"), (1e5, "%/1000 px")
@@ -18,7 +18,7 @@ PERCENT, PER_1000_PX = (100.0, "%"), (1e5, "%/1000 px")
 
 @dataclass(frozen=True)
 class Quantity:
-    """How one estimate is shown: its name in words, the name of the standard's value beside it, factor and unit of the display."""
+    """How one estimate is shown: its name in words, the key of the standard's value beside it, factor and unit of the display."""
 
     title: str
     standard: str = ""
@@ -38,27 +38,27 @@ class Row:
 
 
 TRANSFER = {
-    "gain_dn_per_e": Quantity("System gain K", "gain_dn_per_e"),
-    "quantum_efficiency": Quantity("Quantum efficiency", "quantum_efficiency", PERCENT),
+    "gain_dn_per_e": Quantity("System gain K", "K"),
+    "quantum_efficiency": Quantity("Quantum efficiency", "QE", PERCENT),
     "responsivity_dn_per_s": Quantity("Signal rate of this series, at zero signal"),
     "offset_dn": Quantity("Black level"),
-    "dark_noise_e": Quantity("Dark noise, white", "dark_noise_e"),
+    "dark_noise_e": Quantity("Dark noise, white", "sigma_d"),
     "row_noise_e": Quantity("Row noise, temporal"),
     "column_noise_e": Quantity("Column noise, temporal"),
     "dark_current_e_per_s": Quantity("Dark current"),
-    "saturation_dn": Quantity("Saturation, stored value", "saturation_dn"),
-    "full_well_e": Quantity("Saturation, electrons", "saturation_e"),
+    "saturation_dn": Quantity("Saturation, stored value"),
+    "full_well_e": Quantity("Saturation, electrons", "u_e_sat"),
     "nonlinearity_a1": Quantity("Non-linearity a₁, at the top code", "", PERCENT),
     "nonlinearity_a2": Quantity("Non-linearity a₂, at the top code", "", PERCENT),
     "nonlinearity_a3": Quantity("Non-linearity a₃, at the top code", "", PERCENT),
     "illumination_noise_rel": Quantity("Noise of the light, level to level", "", PERCENT),
 }
 SPATIAL = {
-    "dsnu_total_dn": Quantity("DSNU, total", "dsnu1288_dn"),
+    "dsnu_total_dn": Quantity("DSNU, total", "DSNU1288_DN"),
     "dsnu_pixel_dn": Quantity("DSNU, pixels"),
     "dsnu_row_dn": Quantity("DSNU, rows"),
     "dsnu_col_dn": Quantity("DSNU, columns"),
-    "prnu_total_rel": Quantity("PRNU, total", "prnu1288_rel", PERCENT),
+    "prnu_total_rel": Quantity("PRNU, total", "PRNU1288", PERCENT),
     "prnu_pixel_rel": Quantity("PRNU, pixels", "", PERCENT),
     "prnu_row_rel": Quantity("PRNU, rows", "", PERCENT),
     "prnu_col_rel": Quantity("PRNU, columns", "", PERCENT),
@@ -68,64 +68,38 @@ SPATIAL = {
     "shading_pp_rel": Quantity("Shading, peak to peak", "", PERCENT),
 }
 STANDARD_ONLY = {
-    "snr_max": "Largest signal-to-noise ratio",
-    "dynamic_range": "Dynamic range",
-    "threshold_e": "Absolute sensitivity threshold, electrons",
-    "threshold_photons": "Absolute sensitivity threshold, photons",
-    "saturation_photons": "Saturation, photons",
+    "SNR_max": "Largest signal-to-noise ratio",
+    "DR": "Dynamic range",
+    "u_e_min": "Absolute sensitivity threshold, electrons",
+    "u_p_min": "Absolute sensitivity threshold, photons",
+    "u_p_sat": "Saturation, photons",
 }
 
 
-def table(seen: Observations, standard: Estimates) -> dict[str, list[Row]]:
+def table(seen: Observations, standard: Results) -> dict[str, list[Row]]:
     """Rows by heading, in the order in which a data sheet gives them."""
-    beside = standard.join(_spatial_standard(seen))
     groups = {
-        "Photon transfer": _rows(seen.photon_transfer_fit, TRANSFER, beside),
-        "Fixed pattern": _rows(seen.spatial_fit, SPATIAL, beside),
+        "Photon transfer": _rows(seen.photon_transfer_fit, TRANSFER, standard),
+        "Fixed pattern": _rows(seen.spatial_fit, SPATIAL, standard),
         "Converter, defects, patterns": [*_codes(seen), *_defects(seen), *_patterns(seen)],
         "By EMVA 1288 alone": [
-            Row(title, name, Number("", NONE, ""), "", _standard_text(beside, name, None), "")
-            for name, title in STANDARD_ONLY.items()
-            if name in beside
+            Row(title, key, Number("", NONE, ""), "", said, "") for key, title in STANDARD_ONLY.items() if (said := say(standard, key))
         ],
     }
     return {heading: rows for heading, rows in groups.items() if rows}
 
 
-def _spatial_standard(seen: Observations) -> Estimates:
-    if seen.dark_stack is None or seen.bright_stack is None:
-        return Estimates.empty()
-    try:
-        return emva_spatial(seen.dark_stack, seen.bright_stack)
-    except PixmetryError:
-        return Estimates.empty()
-
-
-def _rows(found: Estimates | None, shown: Mapping[str, Quantity], beside: Estimates) -> list[Row]:
+def _rows(found: Estimates | None, shown: Mapping[str, Quantity], standard: Results | None = None) -> list[Row]:
     if found is None:
         return []
     others = {e.name: Quantity(e.name) for e in found if e.name not in shown}
-    return [_row(found[name], quantity, beside) for name, quantity in {**shown, **others}.items() if name in found]
+    return [_row(found[name], quantity, standard) for name, quantity in {**shown, **others}.items() if name in found]
 
 
-def _row(e: Estimate, quantity: Quantity, beside: Estimates) -> Row:
+def _row(e: Estimate, quantity: Quantity, standard: Results | None) -> Row:
     scale, unit = quantity.display or (1.0, e.unit)
     number = limit(e.value * scale, unit) if e.kind == "upper_limit" else uncertain(e.value * scale, e.u * scale, unit)
-    standard = _standard_text(beside, quantity.standard, quantity.display) if quantity.standard in beside else ""
-    return Row(quantity.title, e.name, number, _dof(e.dof), standard, e.reason)
-
-
-def _standard_text(beside: Estimates, name: str, display: tuple[float, str] | None) -> str:
-    e = beside[name]
-    scale, unit = display or (1.0, e.unit)
-    if e.kind == "upper_limit":
-        return "negative" if e.value <= 0 else _joined(limit(e.value * scale, unit))
-    return _joined(uncertain(e.value * scale, e.u * scale, unit))
-
-
-def _joined(number: Number) -> str:
-    spread = "" if number.u == NONE else f" ± {number.u}"
-    return f"{number.value}{spread} {number.unit}".strip()
+    return Row(quantity.title, e.name, number, _dof(e.dof), "" if standard is None else say(standard, quantity.standard), e.reason)
 
 
 def _dof(dof: float) -> str:
@@ -136,7 +110,7 @@ def _codes(seen: Observations) -> list[Row]:
     found = seen.code_errors
     if found is None:
         return []
-    rows = _rows(found.fit, {"dnl_rms_lsb": Quantity("Differential non-linearity, rms")}, Estimates.empty())
+    rows = _rows(found.fit, {"dnl_rms_lsb": Quantity("Differential non-linearity, rms")})
     worst = f"{len(found.codes)} codes tested"
     if len(found.dnl_lsb):
         k = int(np.argmax(np.abs(found.dnl_lsb)))

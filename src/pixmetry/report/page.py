@@ -109,7 +109,7 @@ def _methods(assessment: Assessment) -> list[str]:
     """Each method once; that of a source only where it is not made of a shared one."""
     from pixmetry.core.catalogue import get_source
 
-    shared = [s.method for s in (*_shared(assessment), assessment.standard)]
+    shared = [*(s.method for s in _shared(assessment)), assessment.standard.values["K"].method]
     own = [
         f"{get_source(source_id).title}: {s.method}"
         for source_id, s in assessment.estimates.items()

@@ -1,0 +1,244 @@
+"""``pixmetry compare``: what changed, in units of its uncertainty; who stands out; what is within its limits."""
+
+from __future__ import annotations
+
+import json
+import re
+from math import isnan
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from rich.console import Console
+
+    from pixmetry.comparing import Comparison, Fleet
+    from pixmetry.emva.conformity import Checked
+    from pixmetry.emva.records import Value
+
+EXIT_DIFFERENT = 1
+SCHEMA = "pixmetry/compared/1"
+MARK = re.compile(rb'\s*\{\s*"schema":\s*"pixmetry/compared/')  # how an earlier comparison begins
+QUIET = ("same", "equal", "setting")
+LARGEST = 3  # so many of the differences that are not significant are shown
+
+
+@click.command()
+@click.argument("files", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option("--limits", type=click.Path(path_type=Path), help="A file of limits (YAML): what each file must keep.")
+@click.option("--level", type=float, default=0.95, show_default=True, help="Confidence over all values together.")
+@click.option("--same-light", is_flag=True, help="Both were measured with one calibration of the light.")
+@click.option("--all", "everything", is_flag=True, help="Show what is the same, too.")
+@click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write the comparison for programs.")
+def compare(files: tuple[Path, ...], limits: Path | None, level: float, same_light: bool, everything: bool, json_file: Path | None) -> None:
+    """Say what changed between two measurements of one camera, or which camera of a fleet stands out.
+
+    FILES are data sheets of EMVA 1288 (JSON or XML), or assessments (results.json or its folder): two are compared with each other,
+    three and more each with the fleet's median; with --limits one is enough. Exit status: 0 all the same and within limits; 1 something
+    changed, stands out, fails or is undecided; 2 an error.
+    """
+    from rich.console import Console
+
+    from pixmetry.campaign.staged_files import Output, check_files, write_together
+    from pixmetry.comparing import check_limits, compare_fleet
+    from pixmetry.comparing import compare as compare_two
+    from pixmetry.core.errors import InputError
+
+    if len(files) == 1 and limits is None:
+        raise InputError("one file cannot be compared", where=str(files[0]), remedy="name a second one, or --limits")
+    if same_light and len(files) != 2:
+        raise InputError("is for two files", where="--same-light", remedy="leave it away")
+    written = [] if json_file is None else [Output(json_file, MARK)]
+    check_files(written, files)  # before the work
+    console = Console(width=116, highlight=False)
+    record: dict[str, Any] = {"schema": SCHEMA}
+    good = True
+    if len(files) > 1:
+        result = compare_two(*files, level=level, same_light=same_light) if len(files) == 2 else compare_fleet(files, level=level)
+        print_comparison(result, console, everything)
+        record["comparison"] = result.to_record()
+        good = result.same
+    if limits is not None:
+        from pixmetry.emva.conformity import load_limits
+
+        given = load_limits(limits)
+        checked = {str(path): check_limits(path, given) for path in files}
+        for name, rows in checked.items():
+            print_limits(name, rows, console)
+        record["limits"] = [_limit_record(name, row) for name, rows in checked.items() for row in rows]
+        good = good and all(row.judgement.verdict == "pass" for rows in checked.values() for row in rows)
+    text = json.dumps(record, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+    write_together(written, [text.encode()] * len(written), files)
+    if not good:
+        click.get_current_context().exit(EXIT_DIFFERENT)
+
+
+def print_comparison(result: Comparison | Fleet, console: Console, everything: bool = False) -> None:
+    """Print a comparison of two, or of a fleet.
+
+    Parameters
+    ----------
+    result : Comparison or Fleet
+    console : rich.console.Console
+    everything : bool
+        Show also what is the same.
+    """
+    from pixmetry.comparing import Comparison
+
+    if isinstance(result, Comparison):
+        _print_pair(result, console, everything)
+    else:
+        _print_fleet(result, console, everything)
+    for note in result.notes:
+        console.print(f"Note: {note}", markup=False, soft_wrap=True)
+
+
+def _print_pair(result: Comparison, console: Console, everything: bool) -> None:
+    from rich.markup import escape
+    from rich.table import Table
+
+    from pixmetry.report.numbers import pretty_unit, signed, significant
+
+    for letter, name in zip("AB", result.names, strict=True):
+        console.print(f"{letter}: {name}", markup=False, soft_wrap=True)
+    judged = sorted((row for row in result.of("same") if row.p < 1), key=lambda row: -abs(row.in_u))
+    near = [row.key for row in judged if abs(row.in_u) >= 0.05][:LARGEST]
+    rows = [row for row in result.rows if everything or row.verdict not in QUIET or (row.verdict == "same" and row.key in near)]
+    table = Table(box=None, pad_edge=False)
+    for name in ("key", "unit", "A", "B", "B − A", "in u", "verdict"):
+        numeric = name in ("A", "B", "B − A", "in u")
+        table.add_column(name, justify="right" if numeric else "left", no_wrap=numeric or name == "key", overflow="fold")
+    for row in rows:
+        counts = not row.p >= 1  # not a value below an upper limit
+        change = signed(row.difference, lambda x: significant(x, 2)) if row.difference and counts else ""
+        in_u = signed(row.in_u, lambda x: f"{x:.1f}") if counts and not isnan(row.in_u) else ""
+        verdict = f"{row.verdict}: {row.reason}" if row.reason else row.verdict
+        texts = (_named(row.key, row.channel), pretty_unit(row.unit), _shown(row.a), _shown(row.b), change, in_u, verdict)
+        table.add_row(*map(escape, texts))
+    if rows:
+        console.print(table)
+    words = {word: word for word in ("changed", "differs", "undecided", "only A", "only B")}
+    words |= {"same": "the same within u", "equal": "equal as numbers", "setting": "places in the series, not judged"}
+    numbers = {verdict: len(result.of(verdict)) for verdict in words}
+    console.print("; ".join(f"{n} {words[verdict]}" for verdict, n in numbers.items() if n) + ".", soft_wrap=True)
+    if result.decisions:
+        chance = f"{100 * (1 - result.level):.3g} %"
+        console.print(
+            f"{result.decisions} decisions, judged together: a chance of at most {chance} that any “changed” is false.", soft_wrap=True
+        )
+
+
+def _print_fleet(result: Fleet, console: Console, everything: bool) -> None:
+    from rich.markup import escape
+    from rich.table import Table
+
+    from pixmetry.report.numbers import pretty_unit, signed, significant
+
+    table = Table(box=None, pad_edge=False)
+    for name in ("key", "unit", "median", "spread", "u", "farthest", "in spreads", "stands out"):
+        numeric = name in ("median", "spread", "u", "in spreads")
+        table.add_column(name, justify="right" if numeric else "left", no_wrap=numeric, overflow="fold")
+    names = _last_parts(result.names)
+    for row in result.rows:
+        out = [name for name, far in zip(names, row.stands_out, strict=True) if far]
+        if not out and not everything:
+            continue
+        far = max(range(len(row.scores)), key=lambda i: -1 if isnan(row.scores[i]) else abs(row.scores[i]))  # noqa: B023
+        numbers = [significant(row.median, 4), significant(row.spread, 2), significant(row.u, 2)]
+        score = signed(row.scores[far], lambda x: f"{x:.1f}")
+        texts = (_named(row.key, row.channel), pretty_unit(row.unit), *numbers, names[far], score, ", ".join(out) or "no")
+        table.add_row(*map(escape, texts))
+    if table.row_count:
+        console.print(table)
+    odd = sum(any(row.stands_out) for row in result.rows)
+    chance = f"{100 * (1 - result.level):.3g} %"
+    console.print(
+        f"{len(result.names)} cameras, {len(result.rows)} values; in {odd} of them a camera stands out "
+        f"(of cameras of one kind, any would with a chance of at most {chance}).",
+        soft_wrap=True,
+    )
+
+
+def _last_parts(names: Sequence[str]) -> list[str]:
+    """Paths without what is not needed to tell them apart."""
+    parts = [Path(name).parts for name in names]
+    for n in range(1, max(map(len, parts), default=0)):
+        short = ["/".join(p[-n:]) for p in parts]
+        if len(set(short)) == len(set(names)):
+            return short
+    return list(names)
+
+
+def print_limits(name: str, rows: Sequence[Checked], console: Console) -> None:
+    """Print which values of a file keep their limits."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    from pixmetry.report.numbers import pretty_unit, significant
+
+    table = Table(title=escape(f"Limits: {name}"), title_justify="left", box=None, pad_edge=False)
+    for column in ("key", "unit", "value", "limits", "accepted", "conforms with", "verdict"):
+        table.add_column(column, no_wrap=column in ("value", "limits", "accepted"), overflow="fold")
+    for row in rows:
+        judgement = row.judgement
+        conforms = "–" if isnan(judgement.probability) else f"{100 * judgement.probability:.2f} %"
+        verdict = f"{judgement.verdict}: {judgement.reason}" if judgement.reason else judgement.verdict
+        limits, accepted = (_interval(*pair, significant) for pair in ((row.lower, row.upper), judgement.acceptance))
+        texts = (_named(row.key, row.channel), pretty_unit(row.value.unit), _shown(row.value), limits, accepted, conforms, verdict)
+        table.add_row(*map(escape, texts))
+    console.print(table)
+
+
+def _interval(lower: float, upper: float, number: Any) -> str:
+    if isnan(lower):
+        return "none"
+    if lower == float("-inf"):
+        return f"≤ {number(upper, 4)}"
+    return f"≥ {number(lower, 4)}" if upper == float("inf") else f"{number(lower, 4)} … {number(upper, 4)}"
+
+
+def _named(key: str, channel: str) -> str:
+    from pixmetry.emva.records import MONO
+
+    return key if channel == MONO else f"{key} [{channel}]"
+
+
+def _shown(value: Value | None) -> str:
+    """A value with its uncertainty, as far as the uncertainty lets its digits go."""
+    from pixmetry.report.numbers import decimals_of, fixed, significant
+
+    if value is None or isnan(value.value):
+        return "–"
+    if value.is_limit:
+        return f"< {significant(value.value, 2)}"
+    if value.is_lower_limit:
+        return f"> {significant(value.value, 3)}"
+    if not value.u > 0:
+        return significant(value.value, 7)
+    if not 1e-4 <= abs(value.value) < 1e6:
+        return f"{significant(value.value, 3)} ± {significant(value.u, 2)}"
+    places = decimals_of(value.u)
+    return f"{fixed(value.value, places)} ± {fixed(value.u, places)}"
+
+
+def _limit_record(name: str, row: Checked) -> dict[str, Any]:
+    from pixmetry.emva.formats import plain, value_record
+
+    judgement = row.judgement
+    return {
+        "file": name,
+        "channel": row.channel,
+        "key": row.key,
+        "verdict": judgement.verdict,
+        "reason": judgement.reason,
+        "rule": judgement.rule,
+        "min": None if row.lower == float("-inf") else row.lower,
+        "max": None if row.upper == float("inf") else row.upper,
+        "probability": plain(judgement.probability),
+        "guard_band": plain(judgement.guard_band),
+        "acceptance": plain(judgement.acceptance),
+        **value_record(row.value),
+    }

@@ -1,0 +1,287 @@
+"""What changed between two measurements of one camera, in units of its uncertainty; and which camera of a fleet stands out.
+
+Differences are judged together: with the confidence ``level`` (0.95), the chance that anything at all is called changed where nothing
+has changed is 1 - level (5 %), by Holm's procedure (1979), which holds whatever the correlation of the values. Keys that say the same
+thing in another unit (K and 1/K, DR in dB) are one decision.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pixmetry.core.errors import InputError
+from pixmetry.emva.differences import Difference, Subject, decided, difference_of, family, holm
+from pixmetry.emva.fleet import FleetRow, fleet_chance, fleet_row
+from pixmetry.emva.formats import SCHEMA, is_xml, number_of, parse_json, plain, read_bytes, read_sheet, sheet_of_record, value_record
+from pixmetry.emva.records import MONO, DataSheet, Value
+
+if TYPE_CHECKING:
+    from pixmetry.emva.conformity import Checked, Limits
+
+JUDGED_FLEET = 5  # cameras; among 4 it takes 50 spreads to stand out of 35 values, among 3 more than 1000
+ASSESSMENT_SCHEMA = "pixmetry/results/1"
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Two files beside each other."""
+
+    names: tuple[str, str]
+    kind: str
+    level: float
+    rows: tuple[Difference, ...]
+    decisions: int  # how many were judged together
+    notes: tuple[str, ...] = ()
+
+    def of(self, *verdicts: str) -> tuple[Difference, ...]:
+        """Rows with one of these verdicts."""
+        return tuple(row for row in self.rows if row.verdict in verdicts)
+
+    @property
+    def same(self) -> bool:
+        """Whether nothing changed and nothing was left open."""
+        return not self.of("changed", "differs", "undecided", "only A", "only B")
+
+    def to_record(self) -> dict[str, Any]:
+        """Return the plain record for JSON."""
+        rows = []
+        for row in self.rows:
+            numbers = {"difference": row.difference, "u": row.u, "dof": row.dof, "in_u": row.in_u, "p": row.p}
+            sides = {side: value_record(value) if value else None for side, value in (("a", row.a), ("b", row.b))}
+            head = {"channel": row.channel, "key": row.key, "unit": row.unit, "verdict": row.verdict, "reason": row.reason}
+            rows.append(head | {name: plain(float(number)) for name, number in numbers.items()} | sides)
+        return _head("pixmetry/comparison/1", self) | {"decisions": self.decisions, "rows": rows}
+
+
+@dataclass(frozen=True)
+class Fleet:
+    """Three or more cameras beside each other."""
+
+    names: tuple[str, ...]
+    kind: str
+    level: float
+    rows: tuple[FleetRow, ...]
+    notes: tuple[str, ...] = ()
+
+    @property
+    def same(self) -> bool:
+        """Whether no camera stands out."""
+        return not any(any(row.stands_out) for row in self.rows)
+
+    def to_record(self) -> dict[str, Any]:
+        """Return the plain record for JSON."""
+        rows = [plain({name: getattr(row, name) for name in FleetRow.__dataclass_fields__}) for row in self.rows]
+        return _head("pixmetry/fleet/1", self) | {"rows": rows}
+
+
+def _head(schema: str, result: Comparison | Fleet) -> dict[str, Any]:
+    names, notes = list(result.names), list(result.notes)
+    return {"schema": schema, "names": names, "kind": result.kind, "level": result.level, "same": result.same, "notes": notes}
+
+
+def load(source: DataSheet | str | Path, name: str = "") -> Subject:
+    """Read what is to be compared: a data sheet, its file, or the results of an assessment or their folder.
+
+    Raises
+    ------
+    InputError
+        If it is none of these.
+    """
+    if isinstance(source, DataSheet):
+        return _of_sheet(source, name or str(source.camera.get("name") or "data sheet"))
+    path = Path(source)
+    if path.is_dir():
+        if not (path / "results.json").is_file():
+            raise InputError("folder without results.json", where=str(path), remedy="name a data sheet, or the folder of an assessment")
+        path = path / "results.json"
+    name, raw = name or str(source), read_bytes(path)
+    if is_xml(raw):
+        return _of_sheet(read_sheet(path), name)
+    record = parse_json(raw, str(path))
+    if record.get("schema") == ASSESSMENT_SCHEMA:
+        return _of_assessment(record, name, str(path))
+    if record.get("schema") != SCHEMA:
+        what, found = "neither a data sheet nor an assessment", record.get("schema", "no schema")
+        raise InputError(what, where=str(path), value=found, allowed=f"{SCHEMA}, {ASSESSMENT_SCHEMA}", remedy="check the file")
+    return _of_sheet(sheet_of_record(record, str(path)), name)
+
+
+def _of_sheet(sheet: DataSheet, name: str) -> Subject:
+    values = {(result.channel, key): value for result in sheet.results for key, value in result.values.items()}
+    release = sheet.results[0].release if sheet.results else ""
+    known = number_of(sheet.conditions.get("photons_u_rel"), f"{name}: photons_u_rel")
+    return Subject(name, "data sheet", release, sheet.camera, values, {}, 0.0 if math.isnan(known) else known)
+
+
+def _of_assessment(record: Mapping[str, Any], name: str, where: str) -> Subject:
+    values: dict[tuple[str, str], Value] = {}
+    try:
+        for source, estimates in record["estimates"].items():
+            for e in estimates:
+                dof = math.inf if e["dof"] is None else float(e["dof"])
+                limit = e["kind"] == "upper_limit"
+                value = Value(float(e["value"]), float(e["u"]), dof, e["unit"], e["method"], e["reason"], limit)
+                values[MONO, f"{source}.{e['name']}"] = value
+        budget = record["budget"]
+        worth = ((budget["target"], budget["estimator"]["name"]), float(budget["verdicts"][0]["total_px"]))
+        return Subject(name, "assessment", "", dict(record["camera"]), values, dict(record["unmeasured"]), worth=worth)
+    except (KeyError, IndexError, TypeError, AttributeError, ValueError):
+        raise InputError("damaged results of an assessment", where=where, remedy="make the assessment again") from None
+
+
+def compare(
+    a: DataSheet | str | Path, b: DataSheet | str | Path, *, level: float = 0.95, same_light: bool = False, names: Sequence[str] = ("", "")
+) -> Comparison:
+    """Say what changed between two measurements, in units of its uncertainty.
+
+    Parameters
+    ----------
+    a, b : DataSheet, str or Path
+        Two data sheets (or their JSON or XML files), or the results of two assessments (``results.json`` or their folder).
+        The two measurements are taken as independent.
+    level : float
+        Confidence over all values together: with 0.95 there is a chance of at most 5 % that anything is called changed if nothing did.
+    same_light : bool
+        Both were measured with one calibration of the light: what its uncertainty ``photons_u_rel`` adds to the values that are counted
+        in photons is common to both and is taken off.
+    names : two str
+        What to call them.
+
+    Returns
+    -------
+    Comparison
+
+    Raises
+    ------
+    InputError
+        If a file cannot be read, or the two have nothing in common.
+
+    Notes
+    -----
+    The difference over its uncertainty is compared with Student's distribution, its degrees of freedom by Welch and Satterthwaite
+    (JCGM 100, G.4). Where one side is a one-sided upper limit, only a value above that limit counts, by as much as it is above.
+    """
+    _check_level(level)
+    one, two = load(a, names[0]), load(b, names[1])
+    if one.kind != two.kind:
+        raise InputError(f"{one.name} is a {one.kind} and {two.name} a {two.kind}", remedy="compare two of one kind")
+    channels = {channel for channel, _ in one.values} & {channel for channel, _ in two.values}
+    if not channels:
+        raise InputError("no channel in common", where=f"{one.name}, {two.name}", remedy="compare sheets with the same colours")
+    keys = [place for place in {**one.values, **two.values} if place[0] in channels]
+    rows = [difference_of(place, one, two, same_light) for place in keys]
+    changed, decisions = holm([row.p for row in rows], [family(row.channel, row.key) for row in rows], 1 - level)
+    rows = [decided(row, place in changed) for place, row in enumerate(rows)]
+    notes = _notes((one, two))
+    if all(row.verdict in ("same", "equal") and not row.difference > 0 and not row.difference < 0 for row in rows):
+        notes.append("all values are identical: two copies of one measurement")
+    return Comparison((one.name, two.name), one.kind, level, tuple(rows), decisions, tuple(notes))
+
+
+def _check_level(level: float) -> None:
+    if not 0.5 <= level < 1:
+        raise InputError("not a level of confidence", where="level", value=level, allowed="0.5 up to below 1", remedy="take 0.95")
+
+
+def _notes(subjects: Sequence[Subject], passed_over: frozenset[str] = frozenset()) -> list[str]:
+    """What the reader must know before believing the rest."""
+    notes = []
+    releases = list(dict.fromkeys(s.release or "not stated" for s in subjects))
+    if len(releases) > 1:
+        notes.append(f"releases differ ({', '.join(releases)}): differences of definition count as changes")
+    for field in sorted({name for s in subjects for name in s.camera} - passed_over):
+        values = [str(s.camera[field]) for s in subjects if s.camera.get(field) is not None]
+        if len(values) == len(subjects) and len(set(values)) > 1:
+            notes.append(f"{field} differs: {', '.join(dict.fromkeys(values))}")
+    channels = [{channel for channel, _ in s.values} for s in subjects]
+    rest = sorted(set().union(*channels) - channels[0].intersection(*channels))
+    if rest:
+        notes.append(f"left out, as not all have them: channels {', '.join(rest)}")
+    if all(s.worth for s in subjects) and len({str(s.worth[0]) for s in subjects}) == 1:
+        notes.append(f"a coordinate of one target in one frame is worth {', '.join(f'{s.worth[1]:.3g}' for s in subjects)} px (k = 1)")
+    return notes
+
+
+def compare_fleet(sources: Iterable[DataSheet | str | Path], *, level: float = 0.95, names: Sequence[str] | None = None) -> Fleet:
+    """Hold each camera of a fleet against the fleet.
+
+    Parameters
+    ----------
+    sources : iterable of DataSheet, str or Path
+        At least three; as for `compare`.
+    level : float
+        Confidence over all values and cameras together: with 0.95 there is a chance of at most 5 % that any camera is said to stand out
+        from a fleet whose values are normally distributed.
+    names : sequence of str, optional
+
+    Returns
+    -------
+    Fleet
+
+    Raises
+    ------
+    InputError
+        If a file cannot be read, the kinds differ, there are fewer than three, or they have no channel in common.
+
+    Notes
+    -----
+    The spread is the distance from the median within which three quarters of the cameras lie, over 1.15 as for a normal distribution:
+    up to a quarter of them may be odd without hiding each other. It is at least the median of the uncertainties; a camera whose own
+    uncertainty is larger than that is judged with the difference added. How far a camera of a normal fleet of this size lies from the
+    median in units of such a spread is drawn once, from a keyed stream; then Holm over all values and cameras.
+    """
+    _check_level(level)
+    sources = list(sources)
+    if len(sources) < 3:
+        raise InputError("a fleet has three cameras or more", value=len(sources), remedy="compare two of them with each other")
+    subjects = [load(source, name) for source, name in zip(sources, names or [""] * len(sources), strict=True)]
+    kinds = list(dict.fromkeys(s.kind for s in subjects))
+    if len(kinds) > 1:
+        raise InputError(f"files of several kinds: {', '.join(kinds)}", remedy="compare files of one kind")
+    channels = [{channel for channel, _ in s.values} for s in subjects]
+    common = channels[0].intersection(*channels)
+    if not common:
+        raise InputError("no channel in common", remedy="compare sheets with the same colours")
+    places = dict.fromkeys(place for s in subjects for place in s.values if place[0] in common and not place[1].startswith("index_"))
+    rows = [row for place in places if (row := fleet_row(place, subjects)) is not None]
+    flat = [(i, j, score) for i, row in enumerate(rows) for j, score in enumerate(row.scores)]
+    p = [fleet_chance(sum(map(math.isfinite, rows[i].values)), score) for i, _, score in flat]
+    families = [(*family(rows[i].channel, rows[i].key), j) for i, j, _ in flat]
+    found, _ = holm(p, families, 1 - level)
+    out = {(flat[at][0], flat[at][1]) for at in found}
+    rows = [replace(row, stands_out=tuple((i, j) in out for j in range(len(subjects)))) for i, row in enumerate(rows)]
+    notes = _notes(subjects, frozenset({"name", "serial"}))
+    if len(subjects) < JUDGED_FLEET:
+        few = f"{len(subjects)} cameras hardly tell their own spread, so that only a gross outlier would stand out"
+        notes.append(f"{few}: name {JUDGED_FLEET} or more")
+    return Fleet(tuple(s.name for s in subjects), kinds[0], level, tuple(rows), tuple(notes))
+
+
+def check_limits(source: DataSheet | str | Path, limits: Limits | str | Path) -> tuple[Checked, ...]:
+    """Hold the values of one camera against limits; each key in every channel.
+
+    Parameters
+    ----------
+    source : DataSheet, str or Path
+        As for `compare`.
+    limits : Limits, str or Path
+        A file of limits (YAML), or what `pixmetry.emva.conformity.load_limits` read of it.
+
+    Returns
+    -------
+    tuple of Checked
+        ``key``, ``channel``, ``value``, and in ``judgement`` the ``verdict``: ``"pass"``, ``"fail"`` or ``"undecided"``.
+
+    Raises
+    ------
+    InputError
+        If a file cannot be read, a key does not exist, or a unit is missing or another one.
+    """
+    from pixmetry.emva.conformity import Limits, check, load_limits
+
+    given = limits if isinstance(limits, Limits) else load_limits(limits)
+    return check(load(source).values, given)

@@ -1,0 +1,264 @@
+"""Why a value is missing, a limit, or not what it seems, in words; and notes on a whole measurement."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from pixmetry.emva.curved import REASON as CURVED
+from pixmetry.emva.dark_noise import DarkNoise
+from pixmetry.emva.formulas import Formulas, Spread, Values
+from pixmetry.emva.general import general_curve, general_notes
+from pixmetry.emva.keys import KEYS, key_of
+from pixmetry.emva.linear_model import FAILS
+from pixmetry.emva.records import Measurement, Series, Value
+from pixmetry.emva.rules import EQUAL_EXPOSURE, ONE_SIDED_95, PTC_LIMIT_PERCENT, SATURATED_FRACTION
+from pixmetry.emva.series import MINIMUM_EXPOSURES, count_exposures, exposure_varies, light_of, without_dark
+from pixmetry.emva.temporal import dark_line
+from pixmetry.experiment.stack import same_exposure
+
+SWEPT_SHARE = 0.01  # of the slope of the response
+WANTED_LEVELS, WANTED_DARK_LEVELS = 50, 6  # R4.0 §6.5, §7.1
+BOUNDED_BY_DARK_NOISE = ("sigma_y_dark", "sigma_d", "u_p_min", "u_p_min_area", "u_e_min", "u_e_min_area")
+DARK_PATTERN = ("DSNU1288", "DSNU1288_DN", "DSNU1288_row", "DSNU1288_col", "DSNU1288_pixel", "general_DSNU")
+GENERAL_ON_DARK_NOISE = ("general_u_p_min", "general_DR", "general_DR_dB")
+ON_DARK_LEVELS = (
+    "K",
+    "inverse_K",
+    "R",
+    "QE",
+    "u_e_sat",
+    "SNR_",
+    "inverse_SNR",
+    "DR",
+    "PTC",
+    "LE",
+    "general_",
+    "PRNU1288",
+)  # how they begin
+ON_DARK_VARIANCE = tuple(key for key in ON_DARK_LEVELS if key not in ("R", "LE"))
+IN_PHOTONS = ("QE", "u_p_min", "u_p_min_area", "u_p_sat", "u_p_sat_area", "general_u_p_min", "general_u_p_sat", "general_DSNU")
+
+
+@dataclass(frozen=True)
+class Case:
+    """One measurement by one release: what was found, before it is put into words."""
+
+    m: Measurement
+    formulas: Formulas
+    measured: Values
+    squares: Values
+    spread: Spread
+    noise: DarkNoise
+
+
+def is_bound(key: str) -> bool:
+    """Whether a value is an upper limit where the dark noise is one."""
+    return key in BOUNDED_BY_DARK_NOISE
+
+
+def is_blind(key: str, case: Case) -> bool:
+    """Whether the dark frames, clipped at black, tell nothing of a value; the reference implementation gives it all the same."""
+    dark = is_bound(key) or key.startswith("DR") or key in DARK_PATTERN + GENERAL_ON_DARK_NOISE or KEYS[key].section == "dark_current"
+    return dark and case.noise.blind and case.formulas.release != "reference"
+
+
+def lifted(key: str, formulas: Formulas, measured: Values) -> float:
+    """What the square behind a root lacks because temporal row and column noise was taken for a pattern (in the square's unit).
+
+    Before release 4.0 all temporal noise is taken off as if it were white: (σ²_row + σ²_col)/L too much goes off the pixels.
+    """
+    if formulas.release == "4.0" or not key.endswith("_pixel") or formulas.stacks is None:
+        return 0.0
+    dark, bright = (float(np.maximum(s.vector[6:], 0.0).sum()) / s.n_frames for s in formulas.stacks)
+    if key.startswith("DSNU"):
+        return dark / float(measured["K"]) ** 2
+    light = float(formulas.stacks[1].vector[0] - formulas.stacks[0].vector[0])
+    return max(bright - dark, 0.0) * (100 / light) ** 2
+
+
+def reason_for(key: str, case: Case) -> str:
+    """What the reader should know about one value; empty where there is nothing to say."""
+    m, formulas, measured, squares, spread = case.m, case.formulas, case.measured, case.squares, case.spread
+    section, dark_s = KEYS[key].section, formulas.series.dark_exposure_s
+    if section in formulas.missing:
+        return formulas.missing[section]
+    if formulas.curved and key not in measured:
+        return CURVED
+    if key in IN_PHOTONS and m.transfer.bright.photons is None:
+        return "the photons of the levels are not known"
+    if key == "R" and light_of(formulas.series) is None:
+        return "neither photons nor exposure tell the light of the levels"
+    if key == "R" and m.transfer.bright.photons is None:
+        return "per second of exposure: the photons of the levels are not known"
+    if key.endswith("_area") and m.pixel_area_um2 is None:
+        return "the pixel's area is not known"
+    value = float(measured[key]) if key in measured else math.nan
+    if case.noise.clipped and (is_bound(key) or key in DARK_PATTERN or section == "dark_current" or key.startswith(ON_DARK_LEVELS)):
+        return _clipped(key, case)
+    if section == "dark_current":
+        return _dark_current(key, formulas, value)
+    if key in squares and float(squares[key]) < 0:
+        return _negative(key, formulas, float(squares[key]))
+    if case.noise.below and (is_bound(key) or key.startswith("DR")):
+        return _hidden_noise(key, case)
+    if case.noise.hidden and key in DARK_PATTERN:
+        unlimited = formulas.curved and not key.endswith("_DN")
+        return _hidden_pattern("reference" if unlimited else formulas.release)
+    if section == "linearity" and math.isnan(value):
+        if light_of(formulas.series) is None:
+            return "neither photons nor exposure tell the light of the levels"
+        return "fewer than three levels between 5 and 95 % of saturation"
+    if key == "PTC_linearity" and math.isnan(value):
+        return "too few levels for a local slope"
+    if key in ("u_p_sat", "u_p_sat_area"):
+        return _step_of_levels(formulas, measured)
+    if key in squares and float(squares[key]) < ONE_SIDED_95 * spread.u_square[key]:
+        return "its square is not significantly above zero: hardly any pattern stands out of the temporal noise that is left"
+    if case.noise.hidden and key.startswith(ON_DARK_VARIANCE):
+        return (
+            f"the dark variance ({case.noise.var_dn2:.2g} DN²) is hidden by quantisation, which bends variance and mean of dark "
+            "levels: it may be off by more than u; raise the camera's gain"
+        )
+    if key.startswith(ON_DARK_LEVELS) and section != "spatial" and bool(without_dark(formulas.series.exposure_s, dark_s).any()):
+        return (
+            f"no dark level has the bright levels' exposure: that of {_nearest_text(formulas.series.exposure_s, dark_s)} stands for it "
+            "as it is, dark current and all, which u does not hold"
+        )
+    shift = spread.shift.get(key, 0.0)
+    if 2 * abs(shift) > spread.u.get(key, 0.0) > 0 and not key.startswith("index_"):
+        moved = f"{shift:+.2g}".replace("-", "−")
+        return f"noise alone moves it by {moved}: an extreme or absolute value of noisy levels; u holds that"
+    return ""
+
+
+def _dark_current(key: str, formulas: Formulas, value: float) -> str:
+    if math.isnan(value):
+        found = count_exposures(formulas.series.dark_exposure_s)
+        return f"dark levels of three or more exposures are needed (found: {found})"
+    if value < 0 and key.startswith("u_I_var"):
+        return f"the dark variance falls with exposure, slope {value:.3g}, within its noise or by drift; 95 % upper limit".replace("-", "−")
+    if value < 0:
+        return "the dark mean falls with exposure: a clamp that follows the dark current, or drift"
+    return ""
+
+
+def _negative(key: str, formulas: Formulas, square: float) -> str:
+    """The cause of a negative variance, from the temporal row and column noise that the stack shows."""
+    behind = f"the variance behind it is negative ({square:.3g} in {key_of(key).unit} squared)".replace("-", "−")
+    if formulas.release == "4.0" or not key.endswith("_pixel"):
+        return f"{behind}: no pattern stands out of the temporal noise that is left; 95 % upper limit"
+    assert formulas.stacks is not None
+    stack = formulas.stacks[0 if key.startswith("DSNU") else 1]
+    row, col = stack.vector[6:]
+    return (
+        f"{behind}: temporal noise common to a row ({row:.3g} DN²) or a column ({col:.3g} DN²) stays in the mean of "
+        f"{stack.n_frames} frames, is taken for a fixed pattern of rows and columns, and off the pixels; 95 % upper limit with "
+        "that put back"
+    )
+
+
+def _clipped(key: str, case: Case) -> str:
+    """Black is cut off: what the dark frames show is brighter and calmer than the camera is."""
+    what = f"{100 * case.noise.black:.3g} % of the dark pixels are at the lowest code"
+    if is_blind(key, case):
+        return f"{what}: noise and pattern below it are not seen; raise the offset"
+    return f"{what}: the dark mean is too high, dark noise and pattern are too small: off by more than u; raise the offset"
+
+
+def _hidden_noise(key: str, case: Case) -> str:
+    if case.formulas.release == "reference":
+        return "the dark variance lies below 0.24 DN², where quantisation covers it; computed with 0.24 DN²"
+    bound = "a lower bound" if key.startswith("DR") else "an upper limit"
+    if case.noise.hidden:
+        return f"the dark variance lies below 0.24 DN², where quantisation covers it: {bound} (eq. 54)"
+    found = f"{case.noise.var_dn2:.2g} ± {case.noise.u_dn2:.2g} DN²".replace("-", "−")
+    return f"the dark variance at zero exposure ({found}) does not stand out of its u and the 0.24 DN² of quantisation: {bound}"
+
+
+def _hidden_pattern(release: str) -> str:
+    what = "the temporal dark noise is too small to carry the pattern over the steps of quantisation, which show it too large or too small"
+    return what if release == "reference" else f"{what}: 95 % upper limit"
+
+
+def _nearest_text(bright_s: np.ndarray, dark_s: np.ndarray) -> str:
+    at = int(np.argmax(without_dark(bright_s, dark_s)))
+    return f"{dark_s[np.abs(dark_s - bright_s[at]).argmin()]:.4g} s beside {bright_s[at]:.4g} s"
+
+
+def _step_of_levels(formulas: Formulas, measured: Values) -> str:
+    photons = formulas.series.photons
+    at = int(measured["index_u_ysat"])
+    if photons is None or at + 1 >= photons.size:
+        return "the last level of the series"
+    step = float(f"{photons[at + 1] - photons[at]:.4g}")
+    return f"a level of the series; the next is {step:.10g} photons brighter, which u does not hold"
+
+
+def ends_early(formulas: Formulas, measured: Values) -> bool:
+    """Whether the last level of the series, still below saturation, stands for it."""
+    at = int(measured.get("index_u_ysat", -1))
+    return at == formulas.series.mean_dn.size - 1 and bool(formulas.series.fraction_max[at] < SATURATED_FRACTION / 2)
+
+
+def notes_of(case: Case, values: dict[str, Value], linear: str) -> tuple[str, ...]:
+    """What the reader should know about the measurement as a whole; ``linear`` is what ``linear_model`` says of it."""
+    m, formulas, measured = case.m, case.formulas, case.measured
+    series, notes = formulas.series, []
+    if linear == FAILS:
+        departure = values["PTC_linearity"].value
+        notes.append(
+            f"the photon transfer's slope departs from K by {departure:.1f} % (more than {PTC_LIMIT_PERCENT:g} %): the Linear model does "
+            "not hold for this camera; use the General values and those with the suffix _nonlinear"
+        )
+    if formulas.curved:
+        notes.append(CURVED)
+    sat = int(measured.get("index_u_ysat", -1))
+    if ends_early(formulas, measured):
+        notes.append("the series ends before saturation: capacity, SNR_max and DR are lower limits, from its last level")
+    if formulas.release == "4.0" and 0 <= sat < series.mean_dn.size - 1 and series.fraction_max[sat + 1] <= SATURATED_FRACTION:
+        notes.append("the full well lies below the top code: saturation is taken at the maximum of the photon transfer curve")
+    if case.noise.clipped:
+        notes.append("more than 0.5 % of the dark pixels are at the lowest code: raise the offset (R4.0 §6.5)")
+    if series.mean_dn.size < WANTED_LEVELS:
+        notes.append(f"{series.mean_dn.size} bright levels, the standard asks for {WANTED_LEVELS} (R4.0 §6.5)")
+    if exposure_varies(series.exposure_s) and count_exposures(series.dark_exposure_s) < WANTED_DARK_LEVELS:
+        notes.append(f"dark levels of fewer than {WANTED_DARK_LEVELS} exposures (R4.0 §7.1)")
+    if not _paired(series.exposure_s, series.dark_exposure_s):
+        several = count_exposures(series.dark_exposure_s) >= MINIMUM_EXPOSURES
+        taken = "on straight lines through" if several else "from"
+        notes.append(f"not every bright level has a dark one of its exposure: dark values are taken {taken} the others")
+    if formulas.stacks is not None and m.dark_stack is not None and m.bright_stack is not None:
+        one, other = m.dark_stack.exposure_s, m.bright_stack.exposure_s
+        if not same_exposure(m.dark_stack, m.bright_stack):
+            notes.append(f"the stacks differ in exposure (dark {one:g} s, bright {other:g} s): their dark signals differ too")
+    if formulas.release == "4.0" and "general" not in formulas.missing:
+        notes += general_notes(series)
+        if formulas.curved and exposure_varies(series.exposure_s):
+            notes += _swept_dark_current(series)
+    return tuple(notes)
+
+
+def _swept_dark_current(series: Series) -> tuple[str, ...]:
+    """How far the dark current, which grows with a swept exposure, bends the response that a curved camera shows.
+
+    Of y = f(N + D t) − f(D t) over the photons, the second term takes the slope of the dark mean off that of f at constant exposure.
+    """
+    curve, slope = general_curve(series), float(dark_line(series)[1])
+    if "photons" not in curve or math.isnan(slope):
+        return ()
+    last = int(np.argmax(series.photons))
+    share = slope * series.exposure_s[last] / float(curve["photons"][-1]) / float(curve["slope"][-1])
+    if not abs(share) > SWEPT_SHARE:
+        return ()
+    return (
+        f"the exposure was swept, and the dark signal with it: a response that bends makes the slope of the brightest level up to "
+        f"{100 * abs(share):.2g} % too {'small' if share > 0 else 'large'}, and with it the General values; sweep the light instead",
+    )
+
+
+def _paired(bright_s: np.ndarray, dark_s: np.ndarray) -> bool:
+    gap = np.abs(dark_s[None] - bright_s[:, None]).min(axis=1)
+    return bool(np.all(gap <= EQUAL_EXPOSURE * np.maximum(bright_s, 1e-15)))
