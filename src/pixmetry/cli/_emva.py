@@ -208,24 +208,14 @@ def print_sheet(sheet: DataSheet, console: Console) -> None:
     size = f"{camera['cols']} x {camera['rows']} pixels, {camera['bits']} bits"
     release = content.release_title(sheet.results[0].release)
     console.print(f"\n{camera['name']}: {size}, EMVA 1288 {release}\n", markup=False, soft_wrap=True)
-    console.print(_verdict(sheet) + "\n", markup=False, soft_wrap=True)
+    for line in content.document_lines(sheet.results):
+        console.print(line.replace(content.NO_BREAK, " ") + "\n", markup=False, soft_wrap=True)
     for results in sheet.results:
         if len(sheet.results) > 1:
             console.print(f"Channel {results.channel}\n", markup=False)
         _print_values(results, content.methods_of(sheet), console)
     for note in content.notes_of(sheet):
         console.print(f"Note: {note}", markup=False, soft_wrap=True)
-
-
-def _verdict(sheet: DataSheet) -> str:
-    """Which document of the standard holds for the camera: where its channels differ, the one that the most bent of them needs."""
-    from pixmetry.emva.linear_model import CURVED, FAILS, HOLDS, OPEN, UNKNOWN, linear_model
-    from pixmetry.report.emva_content import document
-
-    order = (HOLDS, UNKNOWN, OPEN, FAILS, CURVED)
-    decisive = max(sheet.results, key=lambda results: order.index(linear_model(results)))
-    text = document(decisive)
-    return text if len(sheet.results) == 1 else f"{text.removesuffix('.')} (channel {decisive.channel})."
 
 
 def _print_values(results: Results, methods: list[str], console: Console) -> None:

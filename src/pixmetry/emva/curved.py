@@ -16,6 +16,7 @@ REASON = (
     "response or gamma; use the General values, which need no linear camera"
 )
 LEAST_LEVELS = 4  # a line, and what is left of it
+TELLING_LEVELS = 8  # with fewer, the scatter about a line is not known well enough to say much
 FALSE_ALARM = 1e-3
 BELOW_DARK = 0.2  # of the dark variance, which all levels may share with its error
 LEAST_GROWTH = 0.1  # of the slope that a line through black has
@@ -43,7 +44,7 @@ def is_curved(series: Series) -> bool:
     if not used.any():
         return False
     darker = used & (signal <= FIT_RANGE * signal[used].max())
-    used = darker if darker.sum() >= LEAST_LEVELS else used
+    used = darker if darker.sum() >= TELLING_LEVELS else used
     y, v = signal[used], excess[used]
     if y.size < LEAST_LEVELS or not np.ptp(y) > 0:
         return False

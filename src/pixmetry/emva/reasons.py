@@ -217,7 +217,8 @@ def notes_of(case: Case, values: dict[str, Value], linear: str) -> tuple[str, ..
         notes.append(CURVED)
     sat = int(measured.get("index_u_ysat", -1))
     if ends_early(formulas, measured):
-        notes.append("the series ends before saturation: capacity, SNR_max and DR are lower limits, from its last level")
+        given = "printed as they are, and are lower bounds" if formulas.release == "reference" else "lower limits, from its last level"
+        notes.append(f"the series ends before saturation: capacity, SNR_max and DR are {given}")
     if formulas.release == "4.0" and 0 <= sat < series.mean_dn.size - 1 and series.fraction_max[sat + 1] <= SATURATED_FRACTION:
         notes.append("the full well lies below the top code: saturation is taken at the maximum of the photon transfer curve")
     if case.noise.clipped:
