@@ -221,7 +221,6 @@ def _results(m: Measurement, release: str, bootstrap: int) -> Results:
     from pixmetry.emva.evaluate import bootstrap_u, evaluate
 
     found = evaluate(m, release)
-    found = replace(found, notes=tuple(dict.fromkeys((*m.notes, *found.notes))), channel=m.channel)
     if not bootstrap:
         return found
     values = dict(found.values)

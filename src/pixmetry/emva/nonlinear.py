@@ -9,7 +9,6 @@ import numpy as np
 
 from pixmetry.core.errors import PixmetryError
 from pixmetry.core.estimates import Estimates
-from pixmetry.core.observations import StackMoments
 from pixmetry.core.threads import single_threaded_blas
 from pixmetry.emva.keys import NONLINEAR, key_of
 from pixmetry.emva.records import Measurement, Value
@@ -18,8 +17,8 @@ from pixmetry.experiment.linearity import Linearity
 from pixmetry.experiment.photon_transfer_fit import fit_photon_transfer
 from pixmetry.experiment.photon_transfer_model import QUANTISATION_DN2
 from pixmetry.experiment.spatial_fit import fit_spatial
+from pixmetry.experiment.stack import same_exposure
 
-EQUAL_EXPOSURE = 0.01  # relative; clocks round
 NOISE_PARTS = ("dark_noise_e", "row_noise_e", "column_noise_e")
 SPATIAL_KEYS = {
     **{f"DSNU1288{tag}": f"dsnu_{part}_dn" for tag, part in (("", "total"), ("_row", "row"), ("_col", "col"), ("_pixel", "pixel"))},
@@ -151,7 +150,7 @@ def _spatial(m: Measurement, fit: Estimates, dnl_lsb: float) -> tuple[dict[str, 
     missing = "DSNU and PRNU are not measured with the non-linearity taken into account: "
     if dark is None or bright is None:
         return {}, (f"{missing}they need a stack of dark frames and one of bright frames",)
-    if not _same_exposure(dark, bright):
+    if not same_exposure(dark, bright):
         return {}, (f"{missing}the stacks differ in exposure, dark {dark.exposure_s:g} s, bright {bright.exposure_s:g} s",)
     try:
         defects = find_defects(dark, bright)
@@ -171,8 +170,3 @@ def _spatial(m: Measurement, fit: Estimates, dnl_lsb: float) -> tuple[dict[str, 
         out.add(key, value, gradient, is_limit=e.kind == "upper_limit", reason=e.reason)
     notes = (f"DSNU1288{NONLINEAR} and PRNU1288{NONLINEAR}, with their parts, leave out {len(defects)} defect pixels",)
     return out.values, notes if len(defects) else ()
-
-
-def _same_exposure(dark: StackMoments, bright: StackMoments) -> bool:
-    one, other = dark.exposure_s, bright.exposure_s
-    return abs(one - other) <= EQUAL_EXPOSURE * max(one, other)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from pixmetry.emva.records import Series
+from pixmetry.emva.rules import SATURATED_FRACTION
 
-SATURATED_FRACTION = 0.002  # at the top code: EMVA 1288 R4.0 Linear §6.6
 SATURATED_DEVIATE = 2.24  # 1.25 % of the pixels on a plateau below it: about there the variance is largest, which is what ends a 3.1 series
 SEEN_FRACTION, SEEN_DEVIATE = 0.01, 2.24  # a little more shows hardly in mean and variance; draws choose among these levels
 FLAT = 0.1  # of the steepest rise of the response over the logarithm of the light
