@@ -188,7 +188,7 @@ def test_a_mosaic_camera_is_looked_at_and_planned_for_phase_by_phase(tmp_path: P
     assert run(path, "--bayer", "RGGB", "--json", tmp_path / "a.json").exit_code == 0
     for source, more in ((path, ["--bayer", "RGGB"]), (tmp_path / "a.json", [])):
         done = run("--plan", source, "--u-gain", 0.5, *more, "--manifest", source.with_suffix(".plan.yaml"))
-        assert done.exit_code == 0 and "saturates first, Gr" in done.output, done.output
+        assert done.exit_code == 0 and re.search("saturates first, G[rb]", done.output), done.output  # which green is chance
         assert "cfa: RGGB" in source.with_suffix(".plan.yaml").read_text()
     sheet = read_sheet(tmp_path / "a.json")
     assert (camera_from_sheet(sheet, "B").rows, camera_from_sheet(sheet, "B").cols) == (SHAPE[0] // 2, SHAPE[1] // 2)
