@@ -98,7 +98,7 @@ def test_reference_frame(dark: bool, rng: np.random.Generator):
 
 @pytest.mark.parametrize(("radius", "blur"), [(1.0, 0.3), (1.5, 0.5), (4.0, 0.3), (8.0, 1.0)])
 def test_template_has_no_phase_error(radius: float, blur: float, rng: np.random.Generator):
-    """At a noise of .05 DN the mean of a tenth of the phase is uncertain by about .0001 px, more in a tenth with few targets; the goal is .001 px."""
+    """At a noise of .05 DN the mean of a tenth of the phase is uncertain by some .0001 px; the goal is .001 px."""
     frame = coverage_cells.make_frame(Case(radius=radius, blur=blur, read_dn=0.05, bits=None), rng, 400)
     out = coverage_cells.collect(frame, rng, "template")
     assert out.missed == out.false == 0

@@ -1,0 +1,154 @@
+"""The camera models point by point: Brown's polynomial with affinity and shear, in both directions, with its derivatives.
+
+Interior parameters are a row of `INTERIOR` numbers: c, xp, yp, b1, b2, p1, p2, k1 … k5. Length units are those of the image plane:
+millimetres, or pixels where no pitch is known; ``mx``, ``my`` are their number per pixel.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pixmetry.core.jit import jit
+
+INTERIOR = 12
+IMAGE_TO_OBJECT, OBJECT_TO_IMAGE = 0, 1
+NEWTON_STEPS = 30
+
+
+@jit
+def corrected(a, b, q, slopes):
+    """Brown's polynomial at (a, b), with affinity and shear; ``slopes`` takes d(a', b')/d(a, b), flat of 4.
+
+    a' = a (1 + b1 + radial) + b2 b + p1 (r² + 2 a²) + 2 p2 a b;  b' = b (1 + radial) + p2 (r² + 2 b²) + 2 p1 a b.
+    """
+    b1, b2, p1, p2 = q[3], q[4], q[5], q[6]
+    r2 = a * a + b * b
+    radial = r2 * (q[7] + r2 * (q[8] + r2 * (q[9] + r2 * (q[10] + r2 * q[11]))))
+    slope = q[7] + r2 * (2.0 * q[8] + r2 * (3.0 * q[9] + r2 * (4.0 * q[10] + r2 * 5.0 * q[11])))  # d radial / d r²
+    slopes[0] = 1.0 + b1 + radial + 2.0 * a * a * slope + 6.0 * p1 * a + 2.0 * p2 * b
+    slopes[1] = b2 + 2.0 * a * b * slope + 2.0 * p1 * b + 2.0 * p2 * a
+    slopes[2] = 2.0 * a * b * slope + 2.0 * p2 * a + 2.0 * p1 * b
+    slopes[3] = 1.0 + radial + 2.0 * b * b * slope + 6.0 * p2 * b + 2.0 * p1 * a
+    ideal_a = a * (1.0 + b1 + radial) + b2 * b + p1 * (r2 + 2.0 * a * a) + 2.0 * p2 * a * b
+    ideal_b = b * (1.0 + radial) + p2 * (r2 + 2.0 * b * b) + 2.0 * p1 * a * b
+    return ideal_a, ideal_b
+
+
+@jit
+def uncorrected(ideal_a, ideal_b, a, b, q, slopes):
+    """The place (a, b) whose polynomial is (ideal_a, ideal_b), by Newton's method from a first guess; NaN where there is none."""
+    scale = 1e-13 * (1.0 + abs(ideal_a) + abs(ideal_b))
+    for _ in range(NEWTON_STEPS):
+        fa, fb = corrected(a, b, q, slopes)
+        fa -= ideal_a
+        fb -= ideal_b
+        det = slopes[0] * slopes[3] - slopes[1] * slopes[2]
+        if not det > 1e-6:
+            break
+        da = (fa * slopes[3] - fb * slopes[1]) / det
+        db = (fb * slopes[0] - fa * slopes[2]) / det
+        a -= da
+        b -= db
+        if abs(da) + abs(db) < scale:
+            corrected(a, b, q, slopes)
+            return a, b
+    return np.nan, np.nan
+
+
+@jit
+def image_point(u, v, q, direction, mx, my, guess_x, guess_y, by_direction, by_interior):
+    """Image of the direction (u, v) = (X/Z, Y/Z), in pixels.
+
+    ``guess_x``, ``guess_y``: pixels near which it lies (NaN if not known). ``by_direction`` takes d(x, y)/d(u, v), shape (2, 2);
+    ``by_interior`` takes d(x, y)/d q, shape (2, INTERIOR).
+    """
+    c, b1, b2, p1, p2 = q[0], q[3], q[4], q[5], q[6]
+    slopes = np.empty(4)
+    if direction == IMAGE_TO_OBJECT:
+        ideal_a, ideal_b = c * u, c * v
+        a = ideal_a if np.isnan(guess_x) else (guess_x - q[1]) * mx
+        b = ideal_b if np.isnan(guess_y) else (guess_y - q[2]) * my
+        a, b = uncorrected(ideal_a, ideal_b, a, b, q, slopes)
+        det = slopes[0] * slopes[3] - slopes[1] * slopes[2]
+        # inverse of d ideal / d image, in pixels
+        i00, i01, i10, i11 = slopes[3] / det / mx, -slopes[1] / det / mx, -slopes[2] / det / my, slopes[0] / det / my
+        by_direction[0, 0], by_direction[0, 1] = c * i00, c * i01
+        by_direction[1, 0], by_direction[1, 1] = c * i10, c * i11
+        by_interior[0, 0], by_interior[1, 0] = i00 * u + i01 * v, i10 * u + i11 * v
+        by_interior[0, 1], by_interior[1, 1] = 1.0, 0.0
+        by_interior[0, 2], by_interior[1, 2] = 0.0, 1.0
+        by_interior[0, 3], by_interior[1, 3] = -i00 * a, -i10 * a
+        by_interior[0, 4], by_interior[1, 4] = -i00 * b, -i10 * b
+        r2 = a * a + b * b
+        da, db = r2 + 2.0 * a * a, 2.0 * a * b
+        by_interior[0, 5], by_interior[1, 5] = -(i00 * da + i01 * db), -(i10 * da + i11 * db)
+        da, db = 2.0 * a * b, r2 + 2.0 * b * b
+        by_interior[0, 6], by_interior[1, 6] = -(i00 * da + i01 * db), -(i10 * da + i11 * db)
+        power = r2
+        for k in range(7, INTERIOR):
+            by_interior[0, k], by_interior[1, k] = -power * (i00 * a + i01 * b), -power * (i10 * a + i11 * b)
+            power *= r2
+        return q[1] + a / mx, q[2] + b / my
+
+    r2 = u * u + v * v
+    radial = r2 * (q[7] + r2 * (q[8] + r2 * (q[9] + r2 * (q[10] + r2 * q[11]))))
+    slope = q[7] + r2 * (2.0 * q[8] + r2 * (3.0 * q[9] + r2 * (4.0 * q[10] + r2 * 5.0 * q[11])))
+    a = u * (1.0 + radial) + p1 * (r2 + 2.0 * u * u) + 2.0 * p2 * u * v
+    b = v * (1.0 + radial) + p2 * (r2 + 2.0 * v * v) + 2.0 * p1 * u * v
+    au = 1.0 + radial + 2.0 * u * u * slope + 6.0 * p1 * u + 2.0 * p2 * v
+    av = 2.0 * u * v * slope + 2.0 * p1 * v + 2.0 * p2 * u
+    bu = 2.0 * u * v * slope + 2.0 * p2 * u + 2.0 * p1 * v
+    bv = 1.0 + radial + 2.0 * v * v * slope + 6.0 * p2 * v + 2.0 * p1 * u
+    fx, fy, skew = c * (1.0 + b1) / mx, c / my, c * b2 / mx
+    by_direction[0, 0], by_direction[0, 1] = fx * au + skew * bu, fx * av + skew * bv
+    by_direction[1, 0], by_direction[1, 1] = fy * bu, fy * bv
+    by_interior[0, 0], by_interior[1, 0] = ((1.0 + b1) * a + b2 * b) / mx, b / my
+    by_interior[0, 1], by_interior[1, 1] = 1.0, 0.0
+    by_interior[0, 2], by_interior[1, 2] = 0.0, 1.0
+    by_interior[0, 3], by_interior[1, 3] = c * a / mx, 0.0
+    by_interior[0, 4], by_interior[1, 4] = c * b / mx, 0.0
+    da, db = r2 + 2.0 * u * u, 2.0 * u * v
+    by_interior[0, 5], by_interior[1, 5] = fx * da + skew * db, fy * db
+    da, db = 2.0 * u * v, r2 + 2.0 * v * v
+    by_interior[0, 6], by_interior[1, 6] = fx * da + skew * db, fy * db
+    power = r2
+    for k in range(7, INTERIOR):
+        by_interior[0, k], by_interior[1, k] = power * (fx * u + skew * v), power * fy * v
+        power *= r2
+    return q[1] + fx * a + skew * b, q[2] + fy * b
+
+
+@jit
+def image_points(u, v, q, direction, mx, my):
+    """Images of many directions, with derivatives: x, y of shape (n,), (n, 2, 2) by direction, (n, 2, INTERIOR) by interior."""
+    n = len(u)
+    x, y = np.empty(n), np.empty(n)
+    by_direction, by_interior = np.empty((n, 2, 2)), np.empty((n, 2, INTERIOR))
+    for i in range(n):
+        x[i], y[i] = image_point(u[i], v[i], q, direction, mx, my, np.nan, np.nan, by_direction[i], by_interior[i])
+    return x, y, by_direction, by_interior
+
+
+@jit
+def directions(x, y, q, direction, mx, my):
+    """Directions (X/Z, Y/Z) in which pixels look, with derivatives: u, v of shape (n,), (n, 2, 2) by the pixel; NaN where there is none."""
+    n = len(x)
+    u, v, by_pixel = np.empty(n), np.empty(n), np.empty((n, 2, 2))
+    slopes, plain = np.empty(4), q.copy()
+    plain[3] = plain[4] = 0.0  # affinity and shear act after the polynomial where it goes from object to image
+    for i in range(n):
+        a, b = (x[i] - q[1]) * mx / q[0], (y[i] - q[2]) * my / q[0]
+        if direction == IMAGE_TO_OBJECT:
+            u[i], v[i] = corrected(a * q[0], b * q[0], q, slopes)
+            u[i] /= q[0]
+            v[i] /= q[0]
+            by_pixel[i, 0, 0], by_pixel[i, 0, 1] = slopes[0] * mx / q[0], slopes[1] * my / q[0]
+            by_pixel[i, 1, 0], by_pixel[i, 1, 1] = slopes[2] * mx / q[0], slopes[3] * my / q[0]
+        else:
+            a = (a - q[4] * b) / (1.0 + q[3])
+            u[i], v[i] = uncorrected(a, b, a, b, plain, slopes)
+            det = slopes[0] * slopes[3] - slopes[1] * slopes[2]
+            ax, ay, by = mx / q[0] / (1.0 + q[3]), -q[4] * my / q[0] / (1.0 + q[3]), my / q[0]
+            by_pixel[i, 0, 0], by_pixel[i, 0, 1] = slopes[3] / det * ax, (slopes[3] * ay - slopes[1] * by) / det
+            by_pixel[i, 1, 0], by_pixel[i, 1, 1] = -slopes[2] / det * ax, (slopes[0] * by - slopes[2] * ay) / det
+    return u, v, by_pixel
