@@ -17,13 +17,14 @@ from pixmetry.core.camera import Camera
 from pixmetry.core.catalogue import catalogue
 from pixmetry.core.contribution import Contribution
 from pixmetry.core.estimates import Estimates
+from pixmetry.core.observations import CameraGeometry
 from pixmetry.core.signal import Kind
 from pixmetry.core.source import Source
 from pixmetry.location.estimators import Estimator
 
 SCHEMA = "pixmetry/budget/1"
 ESTIMATOR_ITSELF = "processing.threshold"
-DECIDED = ("measured", "modelled")
+DECIDED = ("measured", "modelled", "calibrated")
 FRAMES = (1, 4, 16, 64)
 
 
@@ -35,9 +36,10 @@ class BudgetRow:
     ----------
     name, source_id, title : str
         Name in the camera's chain (or the source's id), and the source.
-    status : {"measured", "modelled", "accepted", "not applicable", "left to calibration"}
-        Its parameters were estimated in this campaign; it is known without (from the camera's description, or it has no parameters); the
-        campaign could not tell, and it is taken at the largest to expect of a sound camera; such a camera cannot have it.
+    status : {"measured", "modelled", "calibrated", "accepted", "not applicable", "left to calibration"}
+        Its parameters were estimated in this campaign; it is known without (from the camera's description, or it has no parameters);
+        positions are corrected for it by a calibration, and what that leaves counts; the campaign could not tell, and it is taken at the
+        largest to expect of a sound camera; such a camera cannot have it; only a calibration with targets can tell.
     contribution : Contribution, optional
     u_of_total_px : float
         Uncertainty of the contribution's total that comes of its parameters' uncertainty.
@@ -153,6 +155,7 @@ def compute_budget(
     target: Target | None = None,
     estimator: Estimator | None = None,
     *,
+    geometry: CameraGeometry | None = None,
     accepted: Collection[str] = (),
     frames: Sequence[int] = FRAMES,
     trials: int = 2048,
@@ -174,6 +177,8 @@ def compute_budget(
         By default a disc of 7 px.
     estimator : Estimator, optional
         By default a soft threshold of three standard deviations in 13 × 13 px.
+    geometry : CameraGeometry, optional
+        Of a calibration with which positions are corrected: in place of the displacements that it takes up stands what it leaves.
     accepted : collection of str
         Names in the chain that are there without being known: taken at their bound.
     frames : sequence of int
@@ -192,12 +197,17 @@ def compute_budget(
     say = progress or (lambda text: None)
     say("camera")
     camera = _as_measured(camera, estimates_by_source)
+    if geometry is not None:
+        camera = camera.switched(off=[e.name for e in camera.active if e.source.id in TAKEN_UP])
     facts = facts_of(camera, target, known_facts)
     probe = make_probe(facts, target, estimator)
     rows = []
     for name, source in _sources(camera):
         say(name)
-        rows.append(_row(name, source, camera, estimates_by_source.get(name), name in accepted, probe))
+        if geometry is not None and source.id in TAKEN_UP:
+            rows.append(_calibrated(name, source, geometry))
+        else:
+            rows.append(_row(name, source, camera, estimates_by_source.get(name), name in accepted, probe))
     interaction = None
     if trials:
         design = Trials(camera, target, estimator, facts, trials, units, seed=seed)
@@ -219,6 +229,8 @@ def compute_budget(
     )
 
 
+LENS = "optics.distortion"  # its row carries what the calibration leaves
+TAKEN_UP = (LENS, "optics.cover_glass", "sensor.affinity", "sensor.pixel_pitch", "sensor.tilt")  # smooth, and the same in every image
 CALIBRATED = "in front of the pixels: frames without targets do not carry it; a calibration with targets does"
 
 
@@ -265,6 +277,16 @@ def _row(name: str, source: Source, camera: Camera, estimates: Estimates | None,
     contribution = source.propagate(params, probe)
     u = u_of_total(source, params, estimates, probe) if measured else 0.0
     return replace(head, status=status, contribution=contribution, u_of_total_px=u, reason=reason)
+
+
+def _calibrated(name: str, source: Source, geometry: CameraGeometry) -> BudgetRow:
+    """What a calibration leaves, in the row of the lens; the other sources that it takes up are in there."""
+    head = BudgetRow(name, source.id, source.title, "calibrated")
+    if source.id != LENS:
+        return replace(head, reason=f"taken up by the {geometry.origin}; what is left stands in the row of {catalogue()[LENS].title}")
+    u_x, u_y = np.hypot(geometry.u_x_px, geometry.left_x_px), np.hypot(geometry.u_y_px, geometry.left_y_px)
+    method = f"what the {geometry.origin} leaves: the uncertainty of a corrected place over the frame, and systematic residuals"
+    return replace(head, contribution=Contribution(float(u_x), float(u_y), "G", model_error=0.2, method=method), reason=method)
 
 
 def _simulated(row: BudgetRow, design: Trials, camera: Camera, say: Callable[[str], None]) -> BudgetRow:

@@ -7,7 +7,7 @@ they are from differences, so what is fixed in the camera drops out.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
@@ -179,6 +179,36 @@ class PatternList:
 
 
 @dataclass(frozen=True)
+class CameraGeometry:
+    """What a calibration with targets found of a camera's geometry, and what it left over.
+
+    Parameters
+    ----------
+    lens : Estimates
+        ``k1_per_mm2``, ``k2_per_mm4``, ``k3_per_mm6``, ``p1_per_mm``, ``p2_per_mm`` (distorted to ideal places), ``centre_x_px``,
+        ``centre_y_px`` (principal point less the frame's centre), ``b1``, ``b2`` (of an image that the lens has distorted before),
+        ``principal_distance_mm``, ``pitch_x_um``, ``pitch_y_um``.
+    u_x_px, u_y_px : float
+        Root mean square over the frame of the uncertainty of a corrected place, from the covariance of the parameters, without what a
+        rotation of the camera takes up.
+    left_x_px, left_y_px : float
+        Systematic part of the calibration's residuals: what they are beyond the noise of its image coordinates.
+    dof : float
+        Redundancy of the adjustment.
+    origin : str
+        Where it comes from.
+    """
+
+    lens: Estimates
+    u_x_px: float
+    u_y_px: float
+    left_x_px: float
+    left_y_px: float
+    dof: float
+    origin: str
+
+
+@dataclass(frozen=True)
 class Observations:
     """Everything one campaign's frames were reduced to; what is not there is ``None``.
 
@@ -197,6 +227,7 @@ class Observations:
     patterns: PatternList | None = None
     code_errors: CodeErrors | None = None
     temperature_c: float | None = None
+    geometry: CameraGeometry | None = None
     notes: tuple[str, ...] = field(default_factory=tuple)
 
     def fitted(self, names: Mapping[str, str], what: str, *, where: str, remedy: str) -> Estimates:
@@ -212,3 +243,16 @@ class Observations:
             if fit is not None and first in fit:
                 return fit.select(names)
         raise MeasureError(what, where=where, remedy=remedy)
+
+    def calibrated(self, names: Mapping[str, str] | Iterable[str], *, where: str) -> Estimates:
+        """Take a source's parameters out of the calibrated geometry, with their covariance.
+
+        Raises
+        ------
+        MeasureError
+            If there is no calibration.
+        """
+        if self.geometry is None:
+            remedy = "calibrate the camera with images of targets and give the calibration"
+            raise MeasureError("needs a calibrated geometry; dark and bright frames show no targets", where=where, remedy=remedy)
+        return self.geometry.lens.select(names)

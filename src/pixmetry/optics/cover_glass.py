@@ -86,7 +86,7 @@ SOURCE = Source(
     references=("M. Born, E. Wolf, Principles of Optics, 7th ed. 1999, §1.5 (law of refraction)",),
     advice="Calibrate with the glass in place: K1 takes up nearly all of it.",
     reasons={
-        "measure": "later: needs a self-calibrating bundle; it is part of the radial distortion",
+        "measure": "a calibration takes it up in the radial distortion and cannot tell it apart",
         "correct": "a frame is not resampled: positions are corrected instead, by the calibration",
     },
 )

@@ -10,8 +10,10 @@ import numpy as np
 
 from pixmetry.core.contribution import Contribution, Probe
 from pixmetry.core.errors import ParameterError
+from pixmetry.core.estimates import Estimates
 from pixmetry.core.geometry import frame_centre, image_shift, map_contribution
 from pixmetry.core.light import Pull
+from pixmetry.core.observations import Observations
 from pixmetry.core.random import Stream
 from pixmetry.core.signal import Kind, Signal
 from pixmetry.core.source import Parameters, Source, quantity
@@ -107,6 +109,14 @@ def propagate(params: Distortion, probe: Probe) -> Contribution:
     return map_contribution(pull_of(params, probe.frame_shape), probe)
 
 
+MEASURED = ("k1_per_mm2", "k2_per_mm4", "k3_per_mm6", "p1_per_mm", "p2_per_mm", "centre_x_px", "centre_y_px", "pitch_x_um", "pitch_y_um")
+
+
+def measure(observations: Observations) -> Estimates:
+    """Read the polynomial from a calibration with targets."""
+    return observations.calibrated(MEASURED, where="optics.distortion")
+
+
 _BOUND: dict[str, Any] = {"k1_per_mm2": -1.5e-3, "k2_per_mm4": 2e-5, "p1_per_mm": 5e-5, "p2_per_mm": -5e-5}
 
 SOURCE = Source(
@@ -130,8 +140,8 @@ SOURCE = Source(
         "A. E. Conrady, Decentred lens-systems, MNRAS 79 (1919) 384–390",
     ),
     advice="Calibrate the camera with targets all over the image, and correct every position.",
+    measure=measure,
     reasons={
-        "measure": "later: needs images of a test field and a self-calibrating bundle, or of straight lines",
         "correct": "a frame is not resampled: positions are corrected instead, by the calibration",
     },
 )

@@ -7,8 +7,10 @@ from collections.abc import Mapping
 import numpy as np
 
 from pixmetry.core.contribution import Contribution, Probe
+from pixmetry.core.estimates import Estimates
 from pixmetry.core.geometry import frame_centre, image_shift, map_contribution
 from pixmetry.core.light import Pull
+from pixmetry.core.observations import Observations
 from pixmetry.core.random import Stream
 from pixmetry.core.signal import Kind, Signal
 from pixmetry.core.source import Parameters, Source, quantity
@@ -25,6 +27,11 @@ def pull_of(params: Affinity, frame_shape: tuple[int, int]) -> Pull:
     """The map from places in the sheared image to ideal ones; the frame's centre stays."""
     x0, y0 = frame_centre(frame_shape)
     return lambda x, y: (x0 + ((x - x0) - params.b2 * (y - y0)) / (1 + params.b1), y + 0 * x)
+
+
+def measure(observations: Observations) -> Estimates:
+    """Read both from a calibration with targets."""
+    return observations.calibrated(("b1", "b2"), where="sensor.affinity")
 
 
 def forward(params: Affinity, signal: Signal, stream: Stream) -> Signal:
@@ -64,8 +71,8 @@ SOURCE = Source(
         "C. S. Fraser, Digital camera self-calibration, ISPRS J. 52 (1997) 149–159",
     ),
     advice="Let the calibration estimate both, with images rolled by 90°.",
+    measure=measure,
     reasons={
-        "measure": "later: needs a self-calibrating bundle with rolled images",
         "correct": "a frame is not resampled: positions are corrected instead, by the calibration",
     },
 )

@@ -69,7 +69,7 @@ SOURCE = Source(
     references=("J. G. Fryer, Camera calibration, in Atkinson (ed.), Close Range Photogrammetry and Machine Vision, 1996",),
     advice="Take both pitches from the data sheet, and let the calibration estimate the ratio of the scales.",
     reasons={
-        "measure": "later: needs a test field of known shape and a self-calibrating bundle",
+        "measure": "a calibration finds the ratio of the pitches, as affinity; their size is that of the principal distance",
         "correct": "a frame is not resampled: positions are multiplied by the true pitch instead",
     },
 )

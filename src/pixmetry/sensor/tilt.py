@@ -101,7 +101,7 @@ SOURCE = Source(
     ),
     advice="Calibrate: principal point and principal distance take up nearly all of it. Shim the sensor if one side is out of focus.",
     reasons={
-        "measure": "later: needs a self-calibrating bundle, or the focus over the frame from slanted edges",
+        "measure": "a calibration takes it up in the principal point and cannot tell it apart; the focus over the frame can",
         "correct": "a frame is not resampled: positions are corrected instead, by the calibration",
     },
 )

@@ -116,7 +116,7 @@ SOURCE = Source(
     references=("C. S. Fraser, Digital camera self-calibration, ISPRS J. 52 (1997) 149–159", "VDI/VDE 2634-1"),
     advice="Measure the surface apart, take a lens that is telecentric on the image side, or roll the camera in the calibration.",
     reasons={
-        "measure": "later: needs a self-calibrating bundle with rolled images, or a height map measured apart",
+        "measure": "needs a height map measured apart; what a calibration sees of it is in the residual grid",
         "correct": "a frame is not resampled: positions are corrected instead, from the height map",
     },
 )

@@ -1,0 +1,87 @@
+"""A calibrated camera in the parameters of the error sources: they draw the image as the calibration sees it, and are as uncertain."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pixmetry.budget.budget import LENS, TAKEN_UP, compute_budget
+from pixmetry.calibration.geometry import geometry_of
+from pixmetry.calibration.model import CameraModel, Sensor
+from pixmetry.core.camera import load_camera
+from pixmetry.core.errors import InputError, MeasureError
+from pixmetry.core.observations import Observations
+from pixmetry.optics import distortion
+from pixmetry.sensor import affinity
+
+SENSOR = Sensor(752, 582, 8.6, 8.3)
+SHAPE = (582, 752)
+NAMES = ("c", "xp", "yp", "b1", "b2", "p1", "p2", "k1", "k2", "k3")
+PHOTOGRAMMETRIC = CameraModel.of(
+    SENSOR, c=8.0, xp=371.2, yp=297.5, b1=2e-3, b2=-1e-3, p1=3e-5, p2=-4e-5, k1=1e-3, k2=-2e-5, k3=1e-7
+)  # 4 % of distortion in the corners
+VISION = CameraModel.of(SENSOR, "object_to_image", c=8.0, xp=371.2, yp=297.5, b1=2e-3, b2=-1e-3, p1=2e-4, p2=-3e-4, k1=-0.05, k2=0.03)
+MODELS = pytest.mark.parametrize("model", [PHOTOGRAMMETRIC, VISION], ids=["photogrammetric", "vision"])
+
+
+def through_the_sources(seen: Observations, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Ideal places as the two sources' own maps have them: first the sheared image, then the lens."""
+    sheared = affinity.SOURCE.make({e.name: e.value for e in affinity.measure(seen)})
+    lens = distortion.SOURCE.make({e.name: e.value for e in distortion.measure(seen)})
+    return distortion.pull_of(lens, SHAPE)(*affinity.pull_of(sheared, SHAPE)(x, y))
+
+
+@MODELS
+def test_the_sources_look_where_the_calibrated_camera_looks(model: CameraModel) -> None:
+    geometry = geometry_of(model, NAMES, np.zeros((10, 10)))
+    seen = Observations(geometry=geometry)
+    x, y = (v.ravel() for v in np.meshgrid(np.linspace(0, 751, 12), np.linspace(0, 581, 12)))
+    ideal_x, ideal_y = through_the_sources(seen, x, y)
+    c, cx, cy = (geometry.lens[n].value for n in ("principal_distance_mm", "centre_x_px", "centre_y_px"))
+    u, v = model.direction_of(x, y)
+    np.testing.assert_allclose(ideal_x, 375.5 + cx + c / 8.6e-3 * u, atol=0.02)
+    np.testing.assert_allclose(ideal_y, 290.5 + cy + c / 8.3e-3 * v, atol=0.02)
+
+
+@MODELS
+def test_the_covariance_goes_along(model: CameraModel, rng: np.random.Generator) -> None:
+    """The spread of a thousand cameras, each turned into sources apart, against the propagated covariance: 20 % at 6 standard errors."""
+    scale = 1e-3 * np.array([1, 100, 100, 0.1, 0.1, 0.1, 0.1, 0.1, 0.01, 0.001])
+    scale[5:] *= 0.01 if model is PHOTOGRAMMETRIC else 1
+    mixing = np.eye(10) + 0.3 * rng.normal(size=(10, 10))
+    covariance = scale[:, None] * (mixing @ mixing.T) * scale
+    lens = geometry_of(model, NAMES, covariance).lens
+    draws = rng.multivariate_normal([model[n] for n in NAMES], covariance, size=1000, method="cholesky")
+    few = [geometry_of(model.with_values(**dict(zip(NAMES, row, strict=True))), (), np.zeros((0, 0))).lens.values for row in draws]
+    ratio = np.std(few, axis=0, ddof=1)[:10] / lens.u[:10]
+    assert np.abs(ratio - 1).max() < 6 / np.sqrt(2 * 999) + 0.05, dict(zip(lens.names, ratio, strict=False))
+
+
+def test_what_the_sources_cannot_hold_is_refused() -> None:
+    with pytest.raises(InputError, match="pitch"):
+        geometry_of(CameraModel.of(Sensor(752, 582), c=930.0), (), np.zeros((0, 0)))
+    with pytest.raises(InputError, match="cannot hold"):
+        geometry_of(PHOTOGRAMMETRIC.with_values(k5=1e-8), (), np.zeros((0, 0)))
+    with pytest.raises(MeasureError, match="calibrated geometry"):
+        distortion.measure(Observations())
+
+
+def test_a_budget_counts_what_the_calibration_leaves() -> None:
+    """In place of tens of pixels of distortion; the sources that it takes up count once."""
+    camera = load_camera("pulnix_tm6cn")
+    bare = compute_budget(camera, trials=0)
+    geometry = geometry_of(
+        PHOTOGRAMMETRIC, NAMES, np.zeros((10, 10)), dof=500, u_px=(0.003, 0.004), left_px=(0.02, 0.0), origin="calibration of today"
+    )
+    seen = Observations(geometry=geometry)
+    estimates = {LENS: distortion.measure(seen), "sensor.affinity": affinity.measure(seen)}
+    budget = compute_budget(camera, estimates, geometry=geometry, trials=0)
+    rows = {r.source_id: r for r in budget.rows}
+    assert {rows[i].status for i in TAKEN_UP} == {"calibrated"}
+    assert [rows[i].contribution is None for i in TAKEN_UP] == [False, True, True, True, True]
+    left = rows[LENS].contribution
+    assert left.u_x_px == pytest.approx(np.hypot(0.003, 0.02)) and left.u_y_px == 0.004 and left.gum_class == "G"
+    alone = {r.source_id: r.total_px for r in bare.rows if r.status in ("measured", "modelled")}
+    gone = sum(alone.get(i, 0.0) ** 2 for i in TAKEN_UP)
+    assert budget.verdict.total_px**2 == pytest.approx(bare.verdict.total_px**2 - gone + left.total_px**2, rel=0.2)
+    assert rows[LENS].share > 0.1
