@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from pixmetry.budget.budget import LENS, TAKEN_UP, compute_budget
+from pixmetry.budget.budget import compute_budget
+from pixmetry.calibrated import calibrated_camera
 from pixmetry.calibration.geometry import geometry_of
 from pixmetry.calibration.model import CameraModel, Sensor
 from pixmetry.core.camera import load_camera
 from pixmetry.core.errors import InputError, MeasureError
-from pixmetry.core.observations import Observations
+from pixmetry.core.observations import AFFINITY, LENS, TAKEN_UP, Observations
 from pixmetry.optics import distortion
 from pixmetry.sensor import affinity
 
@@ -57,6 +60,32 @@ def test_the_covariance_goes_along(model: CameraModel, rng: np.random.Generator)
     assert np.abs(ratio - 1).max() < 6 / np.sqrt(2 * 999) + 0.05, dict(zip(lens.names, ratio, strict=False))
 
 
+@pytest.mark.parametrize("preset", ["pulnix_tm6cn", "pulnix_tm6cn_epix_512", "imx264_like", "sony_xc8500_progressive"])
+def test_a_preset_takes_the_calibration_over(preset: str, tmp_path: Path) -> None:
+    """What it had of lens, affinity and what a calibration takes up with them is replaced; the file keeps all of it."""
+    camera = load_camera(preset)
+    rows, cols = camera.frame_shape
+    sensor = Sensor(cols, rows, *camera.pitch_um)
+    geometry = geometry_of(CameraModel.of(sensor, c=12.0, b1=1e-4, k1=-3e-4, p1=1e-5), (), np.zeros((0, 0)), origin="calibration of today")
+    calibrated_camera(camera, geometry).save(tmp_path / "camera.yaml")
+    again = load_camera(tmp_path / "camera.yaml")
+    assert again[LENS].params.k1_per_mm2 == pytest.approx(-3e-4, rel=1e-3)
+    assert again[AFFINITY].params.b1 == pytest.approx(-1e-4, rel=0.02)  # to first order
+    assert not {e.source.id for e in again.active} & set(TAKEN_UP[2:])
+    assert "calibration of today" in again.facts["calibration"] and again.facts["principal_distance_mm"] == pytest.approx(12, rel=1e-3)
+    others = [e.name for e in camera.chain if e.source.id not in TAKEN_UP]
+    assert [e.name for e in again.chain if e.source.id not in TAKEN_UP] == others
+    assert calibrated_camera(again, geometry).to_record() == again.to_record()  # once more changes nothing
+    corner = again.true_positions([5.0], [5.0])
+    assert np.abs(np.subtract(corner, camera.true_positions([5.0], [5.0]))).max() > 0.5
+
+
+def test_a_calibration_of_another_sensor_is_refused() -> None:
+    model = CameraModel.of(Sensor(640, 480, 3.45, 3.45), c=12.0)
+    with pytest.raises(InputError, match="another pixel pitch"):
+        calibrated_camera(load_camera("pulnix_tm6cn"), geometry_of(model, (), np.zeros((0, 0))))
+
+
 def test_what_the_sources_cannot_hold_is_refused() -> None:
     with pytest.raises(InputError, match="pitch"):
         geometry_of(CameraModel.of(Sensor(752, 582), c=930.0), (), np.zeros((0, 0)))
@@ -74,7 +103,7 @@ def test_a_budget_counts_what_the_calibration_leaves() -> None:
         PHOTOGRAMMETRIC, NAMES, np.zeros((10, 10)), dof=500, u_px=(0.003, 0.004), left_px=(0.02, 0.0), origin="calibration of today"
     )
     seen = Observations(geometry=geometry)
-    estimates = {LENS: distortion.measure(seen), "sensor.affinity": affinity.measure(seen)}
+    estimates = {LENS: distortion.measure(seen), AFFINITY: affinity.measure(seen)}
     budget = compute_budget(camera, estimates, geometry=geometry, trials=0)
     rows = {r.source_id: r for r in budget.rows}
     assert {rows[i].status for i in TAKEN_UP} == {"calibrated"}

@@ -17,7 +17,7 @@ from pixmetry.core.camera import Camera
 from pixmetry.core.catalogue import catalogue
 from pixmetry.core.contribution import Contribution
 from pixmetry.core.estimates import Estimates
-from pixmetry.core.observations import CameraGeometry
+from pixmetry.core.observations import LENS, TAKEN_UP, CameraGeometry
 from pixmetry.core.signal import Kind
 from pixmetry.core.source import Source
 from pixmetry.location.estimators import Estimator
@@ -229,8 +229,6 @@ def compute_budget(
     )
 
 
-LENS = "optics.distortion"  # its row carries what the calibration leaves
-TAKEN_UP = (LENS, "optics.cover_glass", "sensor.affinity", "sensor.pixel_pitch", "sensor.tilt")  # smooth, and the same in every image
 CALIBRATED = "in front of the pixels: frames without targets do not carry it; a calibration with targets does"
 
 

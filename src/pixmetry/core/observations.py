@@ -178,6 +178,10 @@ class PatternList:
         return len(self.amplitude_dn)
 
 
+LENS, AFFINITY = "optics.distortion", "sensor.affinity"
+TAKEN_UP = (LENS, AFFINITY, "optics.cover_glass", "sensor.pixel_pitch", "sensor.tilt")  # by a calibration, in the first two
+
+
 @dataclass(frozen=True)
 class CameraGeometry:
     """What a calibration with targets found of a camera's geometry, and what it left over.
