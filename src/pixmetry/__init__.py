@@ -18,6 +18,7 @@ _HOMES = {
     "Signal": "pixmetry.core.signal",
     "add_source_file": "pixmetry.core.catalogue",
     "assess": "pixmetry.assessment",
+    "calibrate": "pixmetry.calibrating",
     "catalogue": "pixmetry.core.catalogue",
     "check_limits": "pixmetry.comparing",
     "compare": "pixmetry.comparing",
@@ -26,6 +27,7 @@ _HOMES = {
     "load_camera": "pixmetry.core.camera",
     "load_campaign": "pixmetry.campaign",
     "locate": "pixmetry.locating",
+    "read_calibration": "pixmetry.calibration_record",
     "simulate": "pixmetry.simulation",
     "walk": "pixmetry.chain",
 }
@@ -38,6 +40,7 @@ __all__ = [
     "__version__",
     "add_source_file",
     "assess",
+    "calibrate",
     "catalogue",
     "check_limits",
     "compare",
@@ -46,12 +49,15 @@ __all__ = [
     "load_camera",
     "load_campaign",
     "locate",
+    "read_calibration",
     "simulate",
     "walk",
 ]
 
 if TYPE_CHECKING:
     from pixmetry.assessment import assess
+    from pixmetry.calibrating import calibrate
+    from pixmetry.calibration_record import read_calibration
     from pixmetry.campaign import load_campaign
     from pixmetry.chain import walk
     from pixmetry.comparing import check_limits, compare, compare_fleet

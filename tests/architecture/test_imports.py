@@ -15,7 +15,7 @@ import pytest
 
 SRC = Path(__file__).resolve().parents[2] / "src" / "pixmetry"
 STAGES = ("scene", "optics", "sensor", "electronics", "cable", "grabber", "storage", "processing")
-MEASURING = {"experiment", "location", "calibrate"}
+MEASURING = {"experiment", "location", "calibration"}
 
 # What each part may import besides itself. A part that is not listed here fails the test: say where it belongs.
 ALLOWED: dict[str, set[str]] = {
@@ -34,9 +34,18 @@ ALLOWED["datasheets"] = {"core", "campaign", "emva", "datasheet_files"}
 ALLOWED["dark_currents"] = {"core", "campaign", "emva", "datasheet_files", "datasheets"}
 ALLOWED["preflights"] = {"campaign", "experiment", "emva"}
 ALLOWED["comparing"] = {"core", "campaign", "emva"}
+ALLOWED["calibration"] = {"core", "location"}
+ALLOWED["calibration_numbering"] = {"calibration"}
+ALLOWED["calibration_targets"] = {"core", "campaign", "location", "located", "locating", "calibration_numbering"}
+ALLOWED["calibration_images"] = {"core", "campaign", "calibration", "location", "locating", "calibration_numbering", "calibration_targets"}
+ALLOWED["calibration_project"] = {"core", "campaign", "calibration", "calibration_images"}
+ALLOWED["calibration_record"] = {"core", "calibration"}
+ALLOWED["calibration_files"] = {"core", "campaign", "calibration", "calibration_record", "report"}
+ALLOWED["calibrated"] = {"core"}
+ALLOWED["calibrating"] = {"core", "campaign", "calibration", "calibration_project", "calibration_record", "calibration_files"}
 ALLOWED["camera_noise"] = {"core", "scene", "location"}
 ALLOWED["located"] = {"core", "location"}
-ALLOWED["report"] = {"core", "campaign", "experiment", "budget", "results", "chain", "located", "emva"}
+ALLOWED["report"] = {"core", "campaign", "experiment", "budget", "results", "chain", "located", "emva", "calibration"}
 ALLOWED["locating"] = {"core", "campaign", "location", "located", "camera_noise", "report"}
 ALLOWED["assessment"] = {"core", "campaign", "experiment", "location", "budget", "results", "report", "emva"}
 ALLOWED["handbook"] = {*ALLOWED}

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from pixmetry.calibration.model import CameraModel
+from pixmetry.calibration.model import NAMES, CameraModel
 
 SCALE, SHIFT = 6, 7  # places of the per-image x-scale and x-shift behind the six of the pose
 PER_IMAGE = 8
@@ -194,9 +194,9 @@ class Adjustment:
 
     def interior_covariance(self, index: int = 0) -> tuple[tuple[str, ...], np.ndarray]:
         """Names of the estimated parameters of a camera and their covariance."""
-        head = f"{self.network.cameras[index].name}:"
-        rows = [i for i, name in enumerate(self.free_columns) if name.startswith(head)]
-        return tuple(self.free_columns[i][len(head) :] for i in rows), self.covariance[np.ix_(rows, rows)]
+        own = {f"{self.network.cameras[index].name}:{name}": name for name in NAMES}  # an image or a point may have the camera's name
+        rows = [i for i, name in enumerate(self.free_columns) if name in own]
+        return tuple(own[self.free_columns[i]] for i in rows), self.covariance[np.ix_(rows, rows)]
 
 
 @dataclass(frozen=True)

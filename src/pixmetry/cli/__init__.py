@@ -27,6 +27,7 @@ COMMANDS = {
     "simulate": "Make the frames of a camera whose errors are known.",
     "chain": "Walk one target through a camera, source by source, on one page.",
     "locate": "Measure where targets or lines are, with a covariance.",
+    "calibrate": "Calibrate a camera from images of a test field or a table of image coordinates: lens, uncertainties, report.",
     "bound": "Say how well a target can be located, what estimators give, and what limits them.",
     "correct": "Take out of frames what was measured in an assessment.",
     "compare": "Say what changed between two measurements, who stands out of a fleet, and what keeps its limits.",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pixmetry.handbook import offset_page, threshold_page
+from pixmetry.handbook import line_jitter_page, offset_page, threshold_page
 from pixmetry.handbook.page import Page, table
 
 INDEX = """# The handbook's experiments, made again
@@ -20,6 +20,7 @@ are found less true; grey values are those of 8 bits.
 EXPERIMENTS = (
     ("Note 8, Fig 3.10", "threshold", "Thresholds", "why a threshold spoils a centroid, and what to take in its place"),
     ("Note 13, Figs 3.13 to 3.17", "offset", "Black below zero", "why lines wander when the converter cuts off their feet"),
+    ("Note 19, Table 3.2", "line-jitter", "Line jitter", "whether the residuals of straight lines tell how steadily a grabber samples"),
 )
 
 
@@ -27,7 +28,7 @@ def all_pages() -> list[Page]:
     """Run every experiment; the front page comes first."""
     rows = [[where, f"[{title}]({name}.md)", what] for where, name, title, what in EXPERIMENTS]
     index = Page("index", INDEX.format(pages=table(["chapter", "page", "what it shows"], rows, 3)))
-    return [index, threshold_page.page(), offset_page.page()]
+    return [index, threshold_page.page(), offset_page.page(), line_jitter_page.page()]
 
 
 def write(folder: Path) -> list[Path]:

@@ -1,0 +1,179 @@
+"""Origin, directions and scale of a network: which of the seven are given, and inner constraints for those that are not.
+
+A similarity moves a point by t + θ × (X − m) + s (X − m) about a middle m. Control coordinates and scale bars hold some combinations of the
+seven parameters; along the others the image coordinates say nothing, and the datum is chosen so that the points that carry it stay, in the
+mean, where they were before (K. R. Koch, Parameter Estimation and Hypothesis Testing in Linear Models, 1999, 3.3; W. Baarda, S-transformations
+and criterion matrices, 1973). A covariance in any datum is brought to that one by Q' = S Q Sᵀ with S = I − G (Bᵀ G)⁻¹ Bᵀ: G is the null space
+and B the same restricted to the points that carry the datum.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pixmetry.calibration.bundle_layout import Layout
+from pixmetry.calibration.network import State
+
+GIVEN = 1e-8  # relative singular value above which control holds a direction
+ALIGN_STEPS = 50
+
+
+@dataclass(frozen=True)
+class Datum:
+    """The datum of a network.
+
+    Parameters
+    ----------
+    middle : ndarray, shape (3,)
+    size : float
+        Root mean square distance of the points from their middle: the generators are made free of units by it.
+    missing : int
+        How many of the seven parameters nothing gives.
+    carriers : ndarray of int
+        Points that carry the datum then.
+    start : ndarray, shape (carriers, 3)
+        Where they stay in the mean.
+    text : str
+    """
+
+    middle: np.ndarray
+    size: float
+    missing: int
+    carriers: np.ndarray
+    start: np.ndarray
+    text: str
+
+
+def datum_of(layout: Layout, start: State) -> Datum:
+    """Which parameters of the datum are missing, and who carries them."""
+    network = layout.network
+    there = layout.determined
+    middle = start.xyz[there].mean(axis=0)
+    size = float(np.sqrt(((start.xyz[there] - middle) ** 2).sum(axis=1).mean())) or 1.0
+    plain = Datum(middle, size, 0, np.zeros(0, np.int64), np.zeros((0, 3)), "")
+    singular = np.linalg.svd(_held_directions(layout, start, plain), compute_uv=False)
+    missing = 7 - int((singular > GIVEN * max(1.0, singular.max(initial=0.0))).sum())
+    movable = there & np.isinf(network.u_xyz).all(axis=1)
+    named = np.flatnonzero(movable & np.isfinite(network.xyz).all(axis=1))
+    # three points that are not in line carry any datum; fewer named ones do not
+    carriers = named if len(named) >= 3 and _spread(network.xyz[named]) > GIVEN else np.flatnonzero(movable)
+    at = network.xyz[carriers] if carriers is named else start.xyz[carriers]
+    datum = replace(plain, missing=missing, carriers=carriers, start=at)
+    return replace(datum, text=_text(layout, datum, carriers is named))
+
+
+def generators(points: np.ndarray, datum: Datum) -> np.ndarray:
+    """Motion of points (n, 3) by each of the seven parameters: shift, rotation, scale, shape (n, 3, 7)."""
+    r = (points - datum.middle) / datum.size
+    out = np.zeros((len(points), 3, 7))
+    out[:, 0, 0] = out[:, 1, 1] = out[:, 2, 2] = 1.0
+    out[:, 1, 3], out[:, 2, 3] = -r[:, 2], r[:, 1]
+    out[:, 0, 4], out[:, 2, 4] = r[:, 2], -r[:, 0]
+    out[:, 0, 5], out[:, 1, 5] = -r[:, 1], r[:, 0]
+    out[:, :, 6] = r
+    return out
+
+
+def null_space(layout: Layout, state: State, datum: Datum) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Motions that change no observation: of the reduced unknowns (m, d), of the points (points, 3, d), and as (7, d) parameters."""
+    m, d = len(layout.columns), datum.missing
+    if d == 0:
+        return np.zeros((m, 0)), np.zeros((len(state.xyz), 3, 0)), np.zeros((7, 0))
+    basis = np.linalg.svd(_held_directions(layout, state, datum))[2][7 - d :].T
+    points = np.zeros((len(state.xyz), 3, d))
+    there = layout.determined
+    points[there] = generators(state.xyz[there], datum) @ basis
+    points[layout.held] = 0.0
+    reduced = np.zeros((m, d))
+    for i in np.flatnonzero(layout.image_col >= 0):
+        at = layout.image_col[i]
+        reduced[at : at + 3] = -state.rotation[i] @ basis[3:6] / datum.size
+        reduced[at + 3 : at + 6] = generators(state.position[i : i + 1], datum)[0] @ basis
+    for j in np.flatnonzero(layout.point_col >= 0):
+        reduced[layout.point_col[j] : layout.point_col[j] + 3] = points[j]
+    return reduced, points, basis
+
+
+def carried(layout: Layout, points: np.ndarray, datum: Datum) -> tuple[np.ndarray, np.ndarray]:
+    """B: the null space of the points that carry the datum, as parts of the reduced unknowns (m, d) and of all points (points, 3, d)."""
+    of_points = np.zeros_like(points)
+    of_points[datum.carriers] = points[datum.carriers]
+    reduced = np.zeros((len(layout.columns), points.shape[2]))
+    for j in np.flatnonzero(layout.point_col >= 0):
+        reduced[layout.point_col[j] : layout.point_col[j] + 3] = of_points[j]
+    return reduced, of_points
+
+
+def aligned(layout: Layout, state: State, datum: Datum) -> State:
+    """The state moved along the null space so that its carriers stay, in the mean, at their start."""
+    if datum.missing == 0:
+        return state
+    from scipy.linalg import expm
+
+    for _ in range(ALIGN_STEPS):
+        basis = np.linalg.svd(_held_directions(layout, state, datum))[2][7 - datum.missing :].T
+        G = (generators(state.xyz[datum.carriers], datum) @ basis).reshape(-1, datum.missing)
+        gap = (datum.start - state.xyz[datum.carriers]).ravel()
+        step = basis @ np.linalg.lstsq(G, gap, rcond=None)[0]
+        turn = step[3:6] / datum.size
+        largest = max(np.abs(turn).max(), abs(step[6]) / datum.size, 1e-300)
+        step *= min(1.0, 0.5 / largest)
+        state = _moved(state, step, datum, expm)
+        if np.abs(step).max() < 1e-12 * datum.size:
+            break
+    return state
+
+
+def _moved(state: State, step: np.ndarray, datum: Datum, expm) -> State:
+    """The state after the similarity whose generator is ``step``; what it leaves at rest, it leaves there exactly."""
+    t, turn, scale = step[:3], step[3:6] / datum.size, step[6] / datum.size
+    field = np.zeros((4, 4))
+    field[:3, :3] = np.array([[0, -turn[2], turn[1]], [turn[2], 0, -turn[0]], [-turn[1], turn[0], 0]]) + scale * np.eye(3)
+    field[:3, 3] = t
+    whole = expm(field)
+    A, shift = whole[:3, :3], whole[:3, 3] + datum.middle
+    R = A / np.cbrt(np.linalg.det(A))
+    return replace(
+        state,
+        xyz=(state.xyz - datum.middle) @ A.T + shift,
+        position=(state.position - datum.middle) @ A.T + shift,
+        rotation=state.rotation @ R.T,
+    )
+
+
+def _held_directions(layout: Layout, state: State, datum: Datum) -> np.ndarray:
+    """What the seven parameters do to control coordinates and bars, shape (held, 7); its null space is what is missing."""
+    rows = [np.zeros((1, 7))]
+    control = layout.determined[:, None] & ~np.isinf(layout.network.u_xyz)
+    some = np.flatnonzero(control.any(axis=1))
+    rows.append(generators(state.xyz[some], datum)[control[some]])
+    if len(layout.bars):
+        rows.append(np.eye(7)[6:])
+    held = np.concatenate(rows)
+    return held if len(held) <= 7 else np.linalg.qr(held, mode="r")
+
+
+def _spread(points: np.ndarray) -> float:
+    """Second singular value over the first: 0 where points are in line."""
+    singular = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return float(singular[1] / singular[0]) if singular[0] > 0 else 0.0
+
+
+def _text(layout: Layout, datum: Datum, named: bool) -> str:
+    u = layout.network.u_xyz[layout.determined]
+    fixed, weighted = int((u == 0).any(axis=1).sum()), int(((u > 0) & np.isfinite(u)).any(axis=1).sum())
+    parts = []
+    if fixed:
+        parts.append(f"{fixed} fixed points")
+    if weighted:
+        parts.append(f"{weighted} points with weights")
+    if len(layout.bars):
+        parts.append(f"{len(layout.bars)} scale bars")
+    if datum.missing:
+        scale = " and the scale" if datum.missing == 7 else ""
+        what = "the origin, the directions" + scale if datum.missing >= 6 else f"{datum.missing} of the seven parameters of the datum"
+        start = "given" if named else "start"
+        parts.append(f"inner constraints on the {start} coordinates of {len(datum.carriers)} points for {what}")
+    return "; ".join(parts)

@@ -1,0 +1,167 @@
+"""What the reader of a calibration must know, in sentences, most important first."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+
+from pixmetry.calibration.eccentric import Eccentricity
+from pixmetry.calibration.network import Adjustment, Finding, Network
+
+ORDER = (  # of kinds, among findings of the same level; what is not named here comes between the two parts
+    "start", "determination", "correlation", "gross_scale_bar", "gross_control_point", "x_scale_drift", "x_shift", "flatness", "field",
+    "known_uncertainty", "eccentricity", "f_test", "gross_error", None, "significance", "variance_components", "residual_grid", "hold_out",
+    "datum", "adjustment",
+)  # fmt: skip
+SIGNIFICANT = 0.05
+RARE = 0.001  # level of tests that were not asked for
+CORRELATED = 0.995
+NOTEWORTHY_PX = 0.002  # an eccentricity of this size is worth a sentence
+NAMED = 5
+RADIAL = frozenset(("k1", "k2", "k3", "k4", "k5"))
+
+
+def in_order(findings: Iterable[Finding]) -> tuple[Finding, ...]:
+    """Warnings first; then by what matters most for the result. The same sentence is said once."""
+    rank = {kind: i for i, kind in enumerate(ORDER)}
+    unique = dict.fromkeys(findings)
+    return tuple(sorted(unique, key=lambda f: (f.level != "warning", rank.get(f.kind, rank[None]))))
+
+
+def findings_of(adjustment: Adjustment, tests: Mapping[str, Any]) -> list[Finding]:
+    """What the records of one adjustment say."""
+    found = [
+        *known_findings(tests["known"], adjustment.network.unit),
+        *parameter_findings(tests["parameters"]),
+        *f_test_findings(tests["f_test"]),
+        *gross_error_findings(tests["gross_errors"], adjustment),
+        *drift_findings(tests["images"], adjustment),
+        Finding("datum", f"Datum: {adjustment.datum}."),
+    ]
+    return found + [Finding("adjustment", note if note.endswith(".") else f"{note}.") for note in adjustment.notes]
+
+
+def parameter_findings(parameters: list[dict[str, Any]]) -> list[Finding]:
+    """Parameters that are not significant, and pairs that cannot be told apart."""
+    found = []
+    for camera in dict.fromkeys(p["camera"] for p in parameters):
+        mine = [p for p in parameters if p["camera"] == camera]
+        weak = [f"{p['name']} (p = {p['p_zero']:.2f})" for p in mine if p["p_zero"] is not None and p["p_zero"] > SIGNIFICANT]
+        if weak:
+            text = f"{camera}: not significantly different from 0 are {', '.join(weak)}."
+            advice = "Leave them out, one at a time, unless other calibrations of this camera need them."
+            found.append(Finding("significance", text, advice))
+        for a, b, r in _pairs(mine):
+            text = f"{camera}: {a} and {b} are wholly correlated (r = {r:+.4f}); only their sum effect is determined."
+            found.append(Finding("correlation", text, f"Fix one of {a} and {b}, or add images that part them.", "warning"))
+    return found
+
+
+def _pairs(parameters: list[dict[str, Any]]) -> list[tuple[str, str, float]]:
+    """Pairs with a correlation of almost 1; radial terms among themselves are always close."""
+    pairs = {}
+    for p in parameters:
+        strongest = p["strongest"]
+        if strongest is None or abs(strongest["r"]) < CORRELATED or {p["name"], strongest["with"]} <= RADIAL:
+            continue
+        pairs[frozenset((p["name"], strongest["with"]))] = (p["name"], strongest["with"], strongest["r"])
+    return list(pairs.values())
+
+
+def f_test_findings(f_tests: Mapping[str, dict[str, Any]]) -> list[Finding]:
+    """Cameras whose x is noisier than y."""
+    found = []
+    for camera, record in f_tests.items():
+        if record["p_px"] < RARE:
+            advice = "Look for what acts along lines: line jitter, the grabber's clock, or motion."
+            found.append(Finding("f_test", f"{camera}: {record['text']}.", advice, "warning"))
+    return found
+
+
+def gross_error_findings(errors: list[dict[str, Any]], adjustment: Adjustment) -> list[Finding]:
+    """Image points that were left out."""
+    if not errors:
+        return []
+    total = len(errors) + int(adjustment.used.sum())
+    names = [f"{e['point']} in {e['image']} ({np.hypot(e['error_x_px'], e['error_y_px']):.2g} px)" for e in errors[:NAMED]]
+    more = " …" if len(errors) > NAMED else ""
+    noun = "image point was left out as a gross error" if len(errors) == 1 else "image points were left out as gross errors"
+    text = f"{len(errors)} {noun}, of {total}: {', '.join(names)}{more}."
+    many = len(errors) > 0.05 * total
+    advice = "Check how targets are located and named: so many are not single mistakes." if many else "Look at these targets in the images."
+    return [Finding("gross_error", text, advice, "warning" if many else "note")]
+
+
+def known_findings(known: Mapping[str, Any], unit: str) -> list[Finding]:
+    """Bars and control points that the network contradicts."""
+    found = []
+    for name, noun in (("scale_bars", "scale bar"), ("control_points", "control point")):
+        record = known[name]
+        for gross in record["gross"][:NAMED]:
+            text = f"The {noun} {gross['name']} does not agree with the network: it seems wrong by {gross['error']:+.4g} {unit}"
+            text += f" (test {gross['statistic']:.1f}, critical {gross['critical']:.1f})."
+            doubt = "with so few it cannot be said which is wrong, and they weigh less now"
+            said = "it was left out" if gross["left_out"] else doubt
+            advice = f"Check its value, its unit and the names of its points; {said}."
+            found.append(Finding(f"gross_{noun.replace(' ', '_')}", text, advice, "warning"))
+        group = record["group"]
+        if group and group["p"] < RARE and not record["gross"]:
+            text = f"The {noun}s scatter {np.sqrt(group['factor']):.2g} times as much as their stated uncertainties say."
+            level = "warning" if group["factor"] > 1 else "note"
+            found.append(Finding("known_uncertainty", text, "State their uncertainties anew.", level))
+    return found
+
+
+def drift_findings(images: list[dict[str, Any]], adjustment: Adjustment) -> list[Finding]:
+    """What the images' own x-scales and x-shifts say, where they were estimated."""
+    from scipy import stats
+
+    found = []
+    for key, unit, factor in (("x_scale", "ppm", 1e6), ("x_shift_px", "px", 1.0)):
+        for camera in dict.fromkeys(i["camera"] for i in images):
+            mine = [i for i in images if i["camera"] == camera and i[key] is not None and i[f"u_{key}"]]
+            if len(mine) < 2:
+                continue
+            value, u = (np.array([i[name] for i in mine]) for name in (key, f"u_{key}"))
+            p = stats.f.sf((value**2 / u**2).sum() / (len(mine) - 1), len(mine) - 1, adjustment.dof)
+            low, high, middle = value.min() * factor, value.max() * factor, float(np.median(u)) * factor
+            spread = f"from {low:+.3g} to {high:+.3g} {unit} (u of one: {middle:.2g} {unit})"
+            if p < SIGNIFICANT:
+                text = f"{camera}: the images' {_words(key)} run {spread}, p = {p:.2g}: they are needed."
+                found.append(Finding(_kind(key), text))
+            else:
+                text = f"{camera}: the images' {_words(key)} are not significant ({spread}, p = {p:.2g})."
+                found.append(Finding("significance", text, f"Calibrate without them ({key.removesuffix('_px')} in per_image)."))
+    return found
+
+
+def _words(key: str) -> str:
+    return "x-scales" if key == "x_scale" else "x-shifts"
+
+
+def _kind(key: str) -> str:
+    return "x_scale_drift" if key == "x_scale" else "x_shift"
+
+
+def eccentricity_findings(measured: Network, found: Eccentricity) -> list[Finding]:
+    """What was corrected, and what could not be."""
+    out = []
+    if found.possible_px > NOTEWORTHY_PX:
+        text = f"Targets of known size but unknown normal were not corrected for eccentricity; it could reach {found.possible_px:.3g} px."
+        level = "warning" if found.possible_px**2 > float(np.median(measured.covariance_px2[:, [0, 2]])) else "note"
+        out.append(Finding("eccentricity", text, "Give the normals of the targets.", level))
+    if found.largest_px > NOTEWORTHY_PX:
+        count = int(found.corrected.sum())
+        out.append(Finding("eccentricity", f"{count} image points were corrected for eccentricity, by up to {found.largest_px:.3g} px."))
+    return out
+
+
+def hold_out_findings(record: Mapping[str, Any]) -> list[Finding]:
+    """Images left out that fit much worse than those of the fit."""
+    one = record.get("free") or record.get("fixed")
+    if not one or one["left_out_rms_px"] < 1.5 * one["fit_rms_px"]:
+        return []
+    text = f"Images left out of the fit show {one['left_out_rms_px']:.3g} px, those in it {one['fit_rms_px']:.3g} px (rms)."
+    return [Finding("hold_out", text, "Take more images or fewer parameters.", "warning")]

@@ -1,0 +1,329 @@
+"""Start values of a bundle adjustment, from nothing but the network.
+
+A test field that is known, or known roughly, poses the images by itself: the principal distance comes from homographies where it is plane,
+from the start values, or from a search for the one that explains the images best. Otherwise, and where that fails, the images are oriented
+relative to each other (`pixmetry.calibration.free_start`) and brought to the object's frame afterwards.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from pixmetry.calibration.free_start import best_free, common_points, without_lens
+from pixmetry.calibration.network import Network, State
+from pixmetry.calibration.planar_start import homography, plane_coordinates, principal_distance
+from pixmetry.calibration.reconstruction import FINE, Reconstruction
+from pixmetry.calibration.resection import FEWEST, FLAT, fitted, thickness
+from pixmetry.core.errors import InputError, MeasureError
+from pixmetry.core.threads import single_threaded_blas
+
+TRIED_IMAGES = 12  # by which principal distances are compared
+FINE_STEPS = (1.25, 0.8, 1.0, 1.6, 0.63, 2.0, 0.5, 2.6, 0.4, 3.3, 4.2, 5.3, 6.6, 8.5)  # principal distances, in widths of the frame
+FITS = 0.3  # of FINE, as an rms: what a start from known points must reach
+TIE = 3  # points that join two parts of a network
+ENOUGH = 0.7  # of the images that must get a pose
+REACH = 0.1  # rms distance from control, in units of its extent, at which coordinates do not belong to the images
+
+
+def start_values(network: Network) -> tuple[Network, State]:
+    """Start values of all unknowns.
+
+    Parameters
+    ----------
+    network : Network
+        Principal distances of 0 in its cameras are searched for.
+
+    Returns
+    -------
+    network : Network
+        With the principal distances that were found in its cameras.
+    state : State
+        NaN: images that could not be posed, points that fewer than two of them see.
+
+    Raises
+    ------
+    InputError
+        If known coordinates fit the images only mirrored.
+    MeasureError
+        If most of the images cannot be posed; says which, and how many points they share with the others.
+    """
+    _check_distances(network)
+    interior = np.stack([camera.values for camera in network.cameras])
+    with single_threaded_blas():
+        work = _from_known_points(network, interior)
+        if work is None:
+            work = _from_images(network, interior)
+        if work.posed.sum() < len(work.posed):
+            _join_rest(work)
+    _check_posed(work)
+    cameras = tuple(replace(camera, values=row) for camera, row in zip(network.cameras, work.interior, strict=True))
+    state = work.state()
+    fixed = np.where((network.u_xyz == 0) & np.isfinite(network.xyz), network.xyz, state.xyz)
+    return replace(network, cameras=cameras), replace(state, xyz=fixed)
+
+
+def _check_distances(network: Network) -> None:
+    for camera in network.cameras:
+        if not camera.free[0] and not camera.values[0] > 0:
+            remedy = "give the principal distance, or leave it free"
+            raise InputError("the principal distance is held fixed, but is not given", where=camera.name, remedy=remedy)
+
+
+def _from_known_points(network: Network, interior: np.ndarray) -> Reconstruction | None:
+    """Poses from points that are known, or roughly known; None where there are not enough, or they do not fit."""
+    given = np.isfinite(network.xyz).all(axis=1)
+    fixed = given & np.isfinite(network.u_xyz).all(axis=1)
+    for control in (fixed, given) if (given & ~fixed).any() else (fixed,):
+        work = _resected(network, interior, control)
+        if work is not None:
+            return work
+    return None
+
+
+def _resected(network: Network, interior: np.ndarray, control: np.ndarray) -> Reconstruction | None:
+    seen = np.bincount(network.image[control[network.point]], minlength=len(network.images))
+    images = np.flatnonzero(seen >= FEWEST + 2)
+    if len(images) < min(2, len(network.images)) or thickness(network.xyz[control])[1] < 1e-3:
+        return None
+    work = Reconstruction(network, interior, control)
+    for camera in range(len(network.cameras)):
+        mine = images[network.camera_of[images] == camera]
+        mine = mine[np.argsort(-seen[mine], kind="stable")]
+        if len(mine):
+            _search_distance(work, camera, mine[:: max(1, len(mine) // TRIED_IMAGES)][:TRIED_IMAGES])
+    fits = _fits(work)
+    if not fits:
+        _check_mirrored(network, interior, control, images)
+        return None
+    work.grow()
+    rough = control & ~np.isfinite(network.u_xyz).all(axis=1)
+    if rough.any():  # coordinates that are only start values have done their part
+        work.control = control & ~rough
+        work.triangulate()
+        work.judge()
+        work.adjust()
+        work.grow()
+        _to_object(work)
+    return work
+
+
+def _fits(work: Reconstruction) -> bool:
+    images = np.flatnonzero(work.posed)
+    rough = ~np.isfinite(work.network.u_xyz[work.control]).all()
+    return bool(len(images) and np.sqrt(work.cost(images)) < (2 if rough else 1) * FITS * FINE * work.width)
+
+
+def _search_distance(work: Reconstruction, camera: int, images: np.ndarray) -> None:
+    """Pose some images of a camera with the principal distance that explains them best, and refine it."""
+    model = work.network.cameras[camera]
+    width = model.sensor.cols * model.sensor.per_px[0]
+    given = model.values[0]
+    from_planes = _distance_from_planes(work, camera, images)
+    tries = [given] if given > 0 and not model.free[0] else [c for c in (from_planes, given) if c > 0] + [s * width for s in FINE_STEPS]
+    best, least = None, np.inf
+    for c in tries:
+        trial = work.copy()
+        trial.interior[camera] = model.values if c == given else without_lens(work.network, trial.interior)[camera]
+        trial.interior[camera, 0] = c
+        trial.look()
+        trial.spread_px = np.inf  # anything may be wrong as yet
+        for image in images:
+            trial.resect(int(image))
+        trial.judge()
+        cost = trial.cost(images)
+        if cost < least:
+            best, least = trial, cost
+    if best is None or not best.posed[images].any():
+        return
+    best.adjust(rounds=3)
+    for _ in range(2):  # with a better lens: the images that did not fit, and the other answer where a plane has two
+        for image in images:
+            best.resect(int(image))
+        best.judge()
+        best.adjust(rounds=3)
+    work.__dict__.update(best.__dict__)
+
+
+def _distance_from_planes(work: Reconstruction, camera: int, images: np.ndarray) -> float:
+    network = work.network
+    model = network.cameras[camera]
+    if thickness(network.xyz[work.control])[0] > FLAT:
+        return 0.0
+    plane = np.full((len(network.points), 2), np.nan)
+    plane[work.control] = plane_coordinates(network.xyz[work.control])
+    mx, my = model.sensor.per_px
+    found = []
+    for image in images:
+        rows = work.rows[image][work.control[network.point[work.rows[image]]]]
+        if len(rows) >= FEWEST:
+            places = np.column_stack([(network.x_px[rows] - model.values[1]) * mx, (network.y_px[rows] - model.values[2]) * my])
+            found.append(homography(plane[network.point[rows]], places))
+    c = principal_distance(found) if found else np.nan
+    return float(c) if np.isfinite(c) else 0.0
+
+
+def _check_mirrored(network: Network, interior: np.ndarray, control: np.ndarray, images: np.ndarray) -> None:
+    """Whether the images fit known points with one axis turned over (a plane fits either way)."""
+    if thickness(network.xyz[control])[0] < FLAT:
+        return
+    rows = np.array([camera.sensor.rows for camera in network.cameras])[network.camera_of[network.image]]
+    turned = Reconstruction(replace(network, y_px=rows - 1 - network.y_px), interior, control)
+    for camera in range(len(network.cameras)):
+        mine = images[network.camera_of[images] == camera][:TRIED_IMAGES]
+        if len(mine):
+            _search_distance(turned, camera, mine)
+    if _fits(turned):
+        raise InputError(
+            "image and object coordinates fit only mirrored", where="image coordinates", value="y counted downwards",
+            allowed="x to the right and y down in the image, a right-handed frame in the object",
+            remedy="say that y counts upwards in the table of image coordinates, or turn one axis of the object over",
+        )  # fmt: skip
+
+
+def _from_images(network: Network, interior: np.ndarray) -> Reconstruction:
+    work = best_free(network, interior, np.ones(len(network.images), bool))
+    if work is None:
+        raise _not_oriented(network, np.zeros(len(network.images), bool))
+    _grow_cameras(work)
+    _to_object(work)
+    return work
+
+
+def _grow_cameras(work: Reconstruction) -> None:
+    """Grow to all images; cameras that did not take part in the beginning are searched for on the points that stand by then."""
+    network = work.network
+    work.grow()
+    for camera in range(len(network.cameras)):
+        mine = np.flatnonzero(network.camera_of == camera)
+        if work.posed[mine].any() or not len(mine):
+            continue
+        known = np.isfinite(work.xyz[network.point, 0])
+        seen = np.bincount(network.image[known], minlength=len(network.images))
+        mine = mine[np.argsort(-seen[mine], kind="stable")][:TRIED_IMAGES]
+        _search_distance(work, camera, mine[seen[mine] >= FEWEST + 2])
+    work.grow()
+
+
+def _join_rest(work: Reconstruction) -> None:
+    """Orient the images that are left by themselves and join them at the points that both parts hold."""
+    network = work.network
+    left = ~work.posed
+    if left.sum() < 3 or work.control.any():
+        return
+    rest = best_free(replace(network, cameras=_held(network, work)), work.interior, left)
+    if rest is None:
+        return
+    rest.network = network
+    both = np.isfinite(rest.xyz[:, 0]) & np.isfinite(work.xyz[:, 0])
+    if both.sum() < TIE:
+        return
+    scale, rotation, shift, away = fitted(rest.xyz[both], work.xyz[both])
+    extent = np.linalg.norm(np.nanstd(work.xyz, axis=0))
+    if not np.median(away) < 0.02 * extent:
+        return
+    moved(rest, scale, rotation, shift)
+    new = rest.posed & left
+    work.rotation[new], work.position[new] = rest.rotation[new], rest.position[new]
+    work.triangulate()
+    work.judge()
+    work.grow()
+
+
+def _held(network: Network, work: Reconstruction) -> tuple:
+    """Cameras whose principal distance is known by now."""
+    return tuple(
+        replace(camera, values=row, free=np.zeros(len(row), bool)) if row[0] > 0 else camera
+        for camera, row in zip(network.cameras, work.interior, strict=True)
+    )
+
+
+def moved(work: Reconstruction, scale: float, rotation: np.ndarray, shift: np.ndarray) -> None:
+    """Bring poses and points to another frame."""
+    work.position = scale * work.position @ rotation.T + shift
+    work.xyz = scale * work.xyz @ rotation.T + shift
+    work.rotation = work.rotation @ rotation.T
+
+
+def _to_object(work: Reconstruction) -> None:
+    """Bring a free reconstruction to control, nominal coordinates, bars, or a frame of its own."""
+    network = work.network
+    known = np.isfinite(work.xyz[:, 0])
+    given = known & np.isfinite(network.xyz).all(axis=1)
+    control = given & np.isfinite(network.u_xyz).all(axis=1)
+    use = control if control.sum() >= 3 else given
+    if use.sum() >= 3 and thickness(network.xyz[use])[1] > 1e-3:
+        scale, rotation, shift, away = fitted(work.xyz[use], network.xyz[use])
+        extent = np.linalg.norm(np.std(network.xyz[use], axis=0))
+        if control.sum() >= 3 and np.median(away) > REACH * extent:
+            raise _does_not_fit(work, use)
+        moved(work, scale, rotation, shift)
+    else:
+        _own_frame(work, known)
+    if control.sum() < 2:
+        _scaled(work)
+
+
+def _does_not_fit(work: Reconstruction, use: np.ndarray) -> Exception:
+    network = work.network
+    mirror = np.array([1.0, 1.0, -1.0])
+    away = fitted(work.xyz[use] * mirror, network.xyz[use])[3]
+    extent = np.linalg.norm(np.std(network.xyz[use], axis=0))
+    if thickness(network.xyz[use])[0] > FLAT and np.median(away) < 0.3 * REACH * extent:
+        return InputError(
+            "image and object coordinates fit only mirrored", where="object points",
+            allowed="x to the right and y down in the image, a right-handed frame in the object",
+            remedy="say that y counts upwards in the table of image coordinates, or turn one axis of the object over",
+        )  # fmt: skip
+    return MeasureError(
+        "the images agree with each other, but not with the known coordinates", where="object points",
+        value=f"{np.median(away):.3g} {network.unit} apart at {use.sum()} points",
+        remedy="compare the names of the points in both tables, the order of the coordinates' columns, and their unit",
+    )  # fmt: skip
+
+
+def _own_frame(work: Reconstruction, known: np.ndarray) -> None:
+    """Origin in the middle of the points, z along their least extent towards the images, size from the mean base."""
+    posed = work.posed
+    middle = np.median(work.xyz[known], axis=0)
+    axes = np.linalg.svd(work.xyz[known] - middle, full_matrices=False)[2]
+    z = axes[2] * (np.sign(axes[2] @ (work.position[posed].mean(axis=0) - middle)) or 1.0)
+    rotation = np.stack([axes[0], np.cross(z, axes[0]), z])
+    base = np.sqrt(2 * np.sum(np.var(work.position[posed], axis=0)))
+    scale = 1.0 / float(base) if base > 0 else 1.0
+    moved(work, scale, rotation, -scale * rotation @ middle)
+
+
+def _scaled(work: Reconstruction) -> None:
+    """The size that bars ask for, about the middle of the points."""
+    bars = work.network.bars
+    if not len(bars):
+        return
+    there = np.linalg.norm(work.xyz[bars.start] - work.xyz[bars.end], axis=1)
+    good = np.isfinite(there) & (there > 0)
+    if good.any():
+        middle = np.nanmean(work.xyz, axis=0)
+        scale = float(np.median(bars.length[good] / there[good]))
+        moved(work, scale, np.eye(3), (1 - scale) * middle)
+
+
+def _check_posed(work: Reconstruction) -> None:
+    posed = work.posed
+    if posed.sum() < max(1, ENOUGH * len(posed)):
+        raise _not_oriented(work.network, posed)
+
+
+def _not_oriented(network: Network, posed: np.ndarray) -> MeasureError:
+    common = common_points(network)
+    np.fill_diagonal(common, 0)
+    left = np.flatnonzero(~posed)
+    best = common[left].max(axis=1)
+    worst = left[np.argsort(best, kind="stable")][:5]
+    names = ", ".join(f"{network.images[i]} (at most {int(common[i].max())} points in common with another image)" for i in worst)
+    remedy = "check the points' names and the size of the frame, give a start value of c or rough coordinates of some points"
+    if np.median(best) < 8:
+        remedy = "take images that share at least 8 points with others, from sides that differ by 10° to 90°"
+    what = f"{len(left)} of {len(posed)} images cannot be oriented"
+    return MeasureError(what, where="start values", value=names, remedy=remedy)
+

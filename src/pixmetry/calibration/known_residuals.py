@@ -1,0 +1,143 @@
+"""Scale bars and control points: does the network contradict what was known beforehand?
+
+What is contradicted most is taken out and the others are tested again (in closed form: conditioning on its residual), so that one wrong
+bar is not followed by the others that it has dragged along. The unit of the tests is the sigma0 of the image coordinates alone.
+
+References
+----------
+W. Baarda, A testing procedure for use in geodetic networks (1968).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from pixmetry.calibration.network import Adjustment
+from pixmetry.calibration.snooping import LEAST_REDUNDANCY
+from pixmetry.calibration.variance_components import image_sigma0
+
+
+@dataclass(frozen=True)
+class Known:
+    """Residuals of what was known beforehand.
+
+    Parameters
+    ----------
+    name : tuple of str
+    index : ndarray of int, shape (m,)
+        Number of the bar; 3 × number of the point + number of the axis.
+    value, residual, u : ndarray, shape (m,)
+        Known value; known less computed; standard uncertainty a priori.
+    cofactor : ndarray, shape (m, m)
+        Of the residuals, for unit weight 1; correlations between control points are neglected.
+    """
+
+    name: tuple[str, ...]
+    index: np.ndarray
+    value: np.ndarray
+    residual: np.ndarray
+    u: np.ndarray
+    cofactor: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.name)
+
+    @property
+    def redundancy(self) -> np.ndarray:
+        """Redundancy numbers, 0 … 1."""
+        return np.clip(np.diag(self.cofactor) / self.u**2, 0.0, 1.0)
+
+
+def bar_residuals(adjustment: Adjustment, *, a_priori: bool = False) -> Known:
+    """Residuals of the scale bars whose ends are determined; ``a_priori``: the covariance of the adjustment is without sigma0²."""
+    network, bars = adjustment.network, adjustment.network.bars
+    between = adjustment.state.xyz[bars.end] - adjustment.state.xyz[bars.start]
+    length = np.linalg.norm(between, axis=1)
+    there = np.flatnonzero(np.isfinite(length))
+    places = {name: i for i, name in enumerate(adjustment.free_columns)}
+    slopes = np.zeros((len(there), len(places)))
+    for row, i in enumerate(there):
+        for point, sign in ((bars.start[i], -1.0), (bars.end[i], 1.0)):
+            for axis in range(3):
+                place = places.get(f"{network.points[point]}:{'XYZ'[axis]}")
+                if place is not None:
+                    slopes[row, place] += sign * between[i, axis] / length[i]
+    unit = 1.0 if a_priori else adjustment.sigma0**2
+    touched = np.flatnonzero(slopes.any(axis=0))
+    spread = slopes[:, touched] @ adjustment.covariance[np.ix_(touched, touched)] @ slopes[:, touched].T / unit
+    names = tuple(f"{network.points[bars.start[i]]}–{network.points[bars.end[i]]}" for i in there)
+    u = bars.u[there]
+    return Known(names, there, bars.length[there], bars.length[there] - length[there], u, np.diag(u**2) - spread)
+
+
+def control_residuals(adjustment: Adjustment, *, a_priori: bool = False) -> Known:
+    """Residuals of the coordinates of points that are known with an uncertainty."""
+    network, unit = adjustment.network, 1.0 if a_priori else adjustment.sigma0**2
+    variance = np.diagonal(adjustment.point_covariance, axis1=1, axis2=2) / unit
+    there = np.isfinite(network.u_xyz) & (network.u_xyz > 0) & np.isfinite(network.xyz) & np.isfinite(variance)
+    names = tuple(f"{network.points[k]} {'XYZ'[axis]}" for k, axis in zip(*np.nonzero(there), strict=True))
+    value, u = network.xyz[there], network.u_xyz[there]
+    return Known(names, np.flatnonzero(there), value, value - adjustment.state.xyz[there], u, np.diag(u**2 - variance[there]))
+
+
+def contradicted(known: Known, sigma0: float, dof: float, false_alarms: float = 0.01) -> list[dict[str, Any]]:
+    """What the network contradicts, worst first: ``name``, ``residual``, ``error`` (estimated), ``statistic`` (of a normal test) and
+    ``critical``.
+
+    Parameters
+    ----------
+    known : Known
+    sigma0, dof : float
+        Of the image coordinates alone (`image_sigma0`).
+    false_alarms : float
+        Right ones that may be expected to be named; the level of each test is this over their number.
+    """
+    from scipy import stats
+
+    if not len(known):
+        return []
+    critical = float(stats.t.isf(false_alarms / len(known) / 2, max(dof, 1.0)))
+    v, q, out = known.residual.copy(), known.cofactor.copy(), []
+    for _ in range(len(known)):
+        testable = np.diag(q) > LEAST_REDUNDANCY * known.u**2
+        w = np.where(testable, np.abs(v), 0.0) / np.sqrt(np.where(testable, np.diag(q), 1.0)) / sigma0
+        worst = int(np.argmax(w))
+        if not w[worst] > critical:
+            break
+        error = v[worst] * known.u[worst] ** 2 / q[worst, worst]
+        out.append(
+            {
+                "name": known.name[worst],
+                "residual": float(known.residual[worst]),
+                "error": float(error),
+                "statistic": float(w[worst]),
+                "critical": critical,
+            }
+        )
+        column = q[:, worst] / q[worst, worst]
+        v, q = v - column * v[worst], q - np.outer(column, q[worst])
+        v[worst] = 0.0
+        q[worst, :] = q[:, worst] = 0.0
+    return out
+
+
+def group_record(adjustment: Adjustment, known: Known) -> dict[str, Any] | None:
+    """Variance factor of a group (squared errors over squared stated uncertainties) and how surely it is not 1; None without redundancy.
+
+    Returns
+    -------
+    dict
+        ``factor``, ``dof``, ``p`` (two-sided F-test against the image coordinates), ``n``.
+    """
+    from scipy import stats
+
+    dof = float(known.redundancy.sum())
+    if dof < 0.5:
+        return None
+    sigma0, dof_images = image_sigma0(adjustment)
+    factor = float((known.residual**2 / known.u**2).sum() / dof / sigma0**2)
+    tail = stats.f.sf(factor, dof, dof_images)
+    return {"factor": factor, "dof": dof, "p": float(2 * min(tail, 1 - tail)), "n": len(known)}

@@ -1,0 +1,88 @@
+"""Plain records of an adjustment that stands: what report, files and findings are made of."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from pixmetry.calibration.known_residuals import bar_residuals, control_residuals, group_record
+from pixmetry.calibration.network import Adjustment
+
+
+def all_records(
+    adjustment: Adjustment, alpha: float, gross_known: Mapping[str, list[dict[str, Any]]], *, a_priori: bool = False
+) -> dict[str, Any]:
+    """The records that follow from one adjustment alone (with redundancy numbers and covariance).
+
+    Parameters
+    ----------
+    adjustment : Adjustment
+    alpha : float
+        Level at which image points were tested for gross errors.
+    gross_known : mapping
+        Bars and control points that were contradicted.
+    a_priori : bool
+        Whether the covariances of the adjustment are without sigma0².
+    """
+    from pixmetry.calibration import curves, quality
+    from pixmetry.calibration.patterns import residual_patterns
+    from pixmetry.calibration.snooping import gross_error_records
+
+    return {
+        "parameters": quality.parameter_records(adjustment),
+        "parameter_groups": quality.group_records(adjustment),
+        "vision": quality.vision_records(adjustment),
+        "correlations": quality.correlation_records(adjustment),
+        "correlations_with_poses": quality.pose_correlations(adjustment),
+        "residuals": quality.residual_records(adjustment),
+        "f_test": quality.f_test_records(adjustment),
+        "gross_errors": gross_error_records(adjustment, alpha),
+        "patterns": residual_patterns(adjustment),
+        "images": quality.image_records(adjustment),
+        "curves": curves.distortion_curves(adjustment),
+        "projection": curves.projection_maps(adjustment),
+        "network": network_record(adjustment, a_priori=a_priori),
+        "known": known_record(adjustment, gross_known, a_priori=a_priori),
+    }
+
+
+def network_record(adjustment: Adjustment, *, a_priori: bool = False) -> dict[str, Any]:
+    """Sizes of the network: ``images``, ``points`` (determined), ``observations`` (image points used), ``redundancy``, ``rays_per_point``
+    (mean, with ``rays_least`` and ``rays_most``), ``datum``, ``unit``, ``sigma0``, ``scale_bars``."""
+    network, state, used = adjustment.network, adjustment.state, adjustment.used
+    rays = np.bincount(network.point[used], minlength=len(network.points))
+    rays = rays[rays > 0]
+    bars = bar_residuals(adjustment, a_priori=a_priori)
+    return {
+        "images": int(np.isfinite(state.position).all(axis=1).sum()),
+        "points": int(np.isfinite(state.xyz).all(axis=1).sum()),
+        "observations": int(used.sum()),
+        "redundancy": adjustment.dof,
+        "sigma0": adjustment.sigma0,
+        "rays_per_point": float(rays.mean()),
+        "rays_least": int(rays.min()),
+        "rays_most": int(rays.max()),
+        "datum": adjustment.datum,
+        "unit": network.unit,
+        "scale_bars": [
+            {
+                "name": bars.name[i],
+                "length": float(bars.value[i]),
+                "u": float(bars.u[i]),
+                "residual": float(bars.residual[i]),
+                "redundancy": float(bars.redundancy[i]),
+            }
+            for i in range(len(bars))
+        ],
+    }
+
+
+def known_record(
+    adjustment: Adjustment, gross: Mapping[str, list[dict[str, Any]]], *, a_priori: bool = False
+) -> dict[str, dict[str, Any]]:
+    """Bars and weighted control points against the network: for each ``group`` (variance factor, None without redundancy) and ``gross``."""
+    groups = {"scale_bars": bar_residuals, "control_points": control_residuals}
+    known = {name: residuals(adjustment, a_priori=a_priori) for name, residuals in groups.items()}
+    return {name: {"group": group_record(adjustment, k), "gross": list(gross[name])} for name, k in known.items()}

@@ -1,0 +1,207 @@
+"""Pose of one image from known points, and points from posed images: the two steps by which start values grow.
+
+Both work on directions (u, v) = (X/Z, Y/Z), so that any lens model stands behind them. Poses come from OpenCV's solvers: P3P inside a
+RANSAC (Ke & Roumeliotis 2017) against mislabelled points, SQPnP (Terzakis & Lourakis 2020) and, for plane fields, both answers of IPPE
+(Collins & Bartoli 2014); the one that fits best is refined.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+FEWEST = 4  # points from which an image is posed: three determine it, a fourth selects among the answers
+FLAT = 0.02  # thickness by extent below which points count as a plane
+RIGHT_SHARE = 0.6  # of an image's points that must fit
+SMALLEST_SPREAD = 1 - np.cos(np.deg2rad(1.5))  # of rays to a point: 1.5° between two of them
+
+
+class Pose(NamedTuple):
+    """R (X − X₀), which of the points fit within the tolerance, and the mean of min(error, tolerance)², of directions."""
+
+    rotation: np.ndarray
+    position: np.ndarray
+    fits: np.ndarray
+    cost: float
+
+
+def thickness(xyz: np.ndarray) -> tuple[float, float]:
+    """Smallest and middle extent of points, relative to the largest: (0, …) for a plane, (0, 0) for a line."""
+    if len(xyz) < 2:
+        return 0.0, 0.0
+    values = np.linalg.svd(xyz - xyz.mean(axis=0), compute_uv=False)
+    values = np.pad(values, (0, 3 - len(values)))
+    return (values[2] / values[0], values[1] / values[0]) if values[0] > 0 else (0.0, 0.0)
+
+
+def pose(uv: np.ndarray, xyz: np.ndarray, tolerance: float) -> Pose | None:
+    """Pose of an image; None if there is none that enough points agree with.
+
+    Parameters
+    ----------
+    uv : ndarray, shape (n, 2)
+        Directions of the image points.
+    xyz : ndarray, shape (n, 3)
+    tolerance : float
+        Error of a direction, beyond which a point counts as wrong.
+    """
+    import cv2
+
+    good = np.isfinite(uv).all(axis=1) & np.isfinite(xyz).all(axis=1)
+    if good.sum() < FEWEST:
+        return None
+    middle = xyz[good].mean(axis=0)
+    size = float(np.sqrt(np.mean((xyz[good] - middle) ** 2))) or 1.0
+    there, seen = (xyz[good] - middle) / size, np.ascontiguousarray(uv[good])
+    flat, line = thickness(there)
+    if line < 1e-3:
+        return None
+    inside, candidates = np.ones(len(seen), bool), []
+    eye = np.eye(3)
+    try:
+        found, turn, shift, chosen = cv2.solvePnPRansac(
+            there, seen, eye, None, iterationsCount=300, reprojectionError=tolerance, confidence=0.9999, flags=cv2.SOLVEPNP_AP3P
+        )
+        if found and chosen is not None and len(chosen) >= FEWEST:
+            candidates.append((turn, shift))
+            inside[:] = False
+            inside[chosen.ravel()] = True
+        solvers = [cv2.SOLVEPNP_SQPNP] + ([cv2.SOLVEPNP_IPPE] if flat < FLAT else [])
+        for solver in solvers:
+            _, turns, shifts, _ = cv2.solvePnPGeneric(there[inside], seen[inside], eye, None, flags=solver)
+            candidates += list(zip(turns, shifts, strict=True))
+    except cv2.error:
+        pass  # a degenerate sample; the other solvers' answers stand
+    best = None
+    for turn, shift in candidates:
+        answer = _refined(there, seen, turn, shift, tolerance)
+        if answer is not None and (best is None or answer.cost < best.cost):
+            best = answer
+    if best is None or best.fits.sum() < max(FEWEST, RIGHT_SHARE * len(seen)):
+        return None
+    fits = np.zeros(len(uv), bool)
+    fits[good] = best.fits
+    return Pose(best.rotation, middle + size * best.position, fits, best.cost)
+
+
+def _refined(xyz: np.ndarray, uv: np.ndarray, turn: np.ndarray, shift: np.ndarray, tolerance: float) -> Pose | None:
+    import cv2
+
+    answer = _judged(xyz, uv, turn, shift, tolerance)
+    for _ in range(3):
+        if answer is None or answer.fits.sum() < FEWEST:
+            return answer
+        turn, shift = turn.copy(), shift.copy()
+        try:
+            cv2.solvePnPRefineLM(xyz[answer.fits], uv[answer.fits], np.eye(3), None, turn, shift)
+        except cv2.error:
+            return answer
+        new = _judged(xyz, uv, turn, shift, tolerance)
+        if new is None or not new.cost < 0.999 * answer.cost:
+            return answer if new is None or new.cost > answer.cost else new
+        answer = new
+    return answer
+
+
+def _judged(xyz: np.ndarray, uv: np.ndarray, turn: np.ndarray, shift: np.ndarray, tolerance: float) -> Pose | None:
+    import cv2
+
+    if not (np.isfinite(turn).all() and np.isfinite(shift).all()):
+        return None
+    rotation = cv2.Rodrigues(turn)[0]
+    camera = xyz @ rotation.T + shift.ravel()
+    with np.errstate(all="ignore"):
+        error2 = np.sum((camera[:, :2] / camera[:, 2:] - uv) ** 2, axis=1)
+    error2 = np.where((camera[:, 2] > 0) & np.isfinite(error2), np.minimum(error2, tolerance**2), tolerance**2)
+    return Pose(rotation, -rotation.T @ shift.ravel(), error2 < tolerance**2, float(error2.mean()))
+
+
+def rays(uv: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    """Unit vectors in the object's frame of directions (n, 2) with the rotations (n, 3, 3) of their images."""
+    camera = np.column_stack([uv, np.ones(len(uv))])
+    camera /= np.linalg.norm(camera, axis=1, keepdims=True)
+    return np.einsum("nji,nj->ni", rotation, camera)
+
+
+def intersect(origin: np.ndarray, ray: np.ndarray, point: np.ndarray, points: int, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
+    """Points where rays meet, wrong rays weighted down.
+
+    Minimises Σ w |(I − d dᵀ)(X − o)|²/distance² for each point.
+
+    Parameters
+    ----------
+    origin, ray : ndarray, shape (n, 3)
+        Projection centres and unit vectors; NaN takes no part.
+    point : ndarray of int, shape (n,)
+    points : int
+        Number of points.
+    tolerance : float
+        Angle (rad) about which a ray begins to count as wrong.
+
+    Returns
+    -------
+    xyz : ndarray, shape (points, 3)
+        NaN where fewer than two rays meet, or too parallel ones.
+    fits : ndarray of bool, shape (n,)
+        Rays that pass within three tolerances, with the point before the camera.
+    """
+    good = np.isfinite(origin).all(axis=1) & np.isfinite(ray).all(axis=1)
+    rows = np.flatnonzero(good)
+    o, d, p = origin[rows], ray[rows], point[rows]
+    middle = o.mean(axis=0) if len(o) else np.zeros(3)
+    o = o - middle
+    xyz, fits = np.full((points, 3), np.nan), np.zeros(len(point), bool)
+    if len(rows) == 0:
+        return xyz, fits
+    weight, found = np.ones(len(rows)), np.zeros(points, bool)
+    across = np.eye(3) - d[:, :, None] * d[:, None, :]
+    for _ in range(6):
+        normal = _summed(p, points, weight[:, None] * across.reshape(-1, 9)).reshape(-1, 3, 3)
+        right = _summed(p, points, weight[:, None] * np.einsum("nij,nj->ni", across, o))
+        total = np.bincount(p, weight, points)
+        values = np.linalg.eigvalsh(normal)
+        found = (np.bincount(p, weight > 0, points) >= 2) & (values[:, 0] > SMALLEST_SPREAD * np.minimum(1.0, total / 2) * values[:, 2] / 2)
+        solved = np.full((points, 3), np.nan)
+        solved[found] = np.linalg.solve(normal[found], right[found][:, :, None])[:, :, 0]
+        away = solved[p] - o
+        depth = np.einsum("ni,ni->n", away, d)
+        with np.errstate(all="ignore"):
+            angle = np.linalg.norm(away - depth[:, None] * d, axis=1) / np.abs(depth)
+            weight = np.where(depth > 0, (1 / depth**2) / (1 + (angle / tolerance) ** 2), 0.0)
+        mean = np.bincount(p, np.nan_to_num(weight), points) / np.maximum(np.bincount(p, minlength=points), 1)
+        weight = np.nan_to_num(weight / np.where(mean > 0, mean, 1.0)[p])
+    near = found[p] & (depth > 0) & (angle < 3 * tolerance)
+    count = np.bincount(p[near], minlength=points)
+    xyz[count >= 2] = solved[count >= 2] + middle
+    fits[rows] = near & (count >= 2)[p]
+    return xyz, fits
+
+
+def _summed(index: np.ndarray, size: int, values: np.ndarray) -> np.ndarray:
+    return np.stack([np.bincount(index, column, size) for column in values.T], axis=1)
+
+
+def similarity(source: np.ndarray, target: np.ndarray, weight: np.ndarray, *, scaled: bool = True) -> tuple[float, np.ndarray, np.ndarray]:
+    """Scale, rotation and shift that take points to others in least squares: target = scale · R source + shift.
+
+    S. Umeyama, IEEE PAMI 13 (1991) 376–380.
+    """
+    w = weight / weight.sum()
+    a, b = source - w @ source, target - w @ target
+    left, values, right = np.linalg.svd((b * w[:, None]).T @ a)
+    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
+    rotation = (left * sign) @ right
+    scale = float((values * sign).sum() / (w @ (a**2).sum(axis=1))) if scaled else 1.0
+    return scale, rotation, w @ target - scale * rotation @ (w @ source)
+
+
+def fitted(source: np.ndarray, target: np.ndarray, *, scaled: bool = True) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
+    """`similarity` by iteratively reweighted least squares against wrong points, with the distances that remain."""
+    weight = np.ones(len(source))
+    for _ in range(15):
+        scale, rotation, shift = similarity(source, target, weight, scaled=scaled)
+        left = np.linalg.norm(target - scale * source @ rotation.T - shift, axis=1)
+        spread = max(1.5 * float(np.median(left)), 1e-12 * float(np.abs(target).max()), 1e-300)
+        weight = 1 / (1 + (left / spread) ** 2)
+    return scale, rotation, shift, left

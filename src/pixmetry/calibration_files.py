@@ -1,0 +1,132 @@
+"""The files of a calibration: a folder with the report, all numbers as JSON, and tables of points, poses and residuals."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pixmetry.calibration.network import Calibration
+from pixmetry.calibration_record import PIXELS, json_text
+from pixmetry.campaign.output import check_output, staged_output
+
+KIND = "calibration"
+
+
+def check_folder(folder: str | Path) -> None:
+    """Refuse a folder in which something else than an earlier calibration would be lost; before any work is done.
+
+    Raises
+    ------
+    InputError
+        If it is a file, or holds other files.
+    """
+    check_output(folder, KIND)
+
+
+def write_results(calibration: Calibration, folder: str | Path) -> Path:
+    """Write the folder of results, whole or not at all; an earlier calibration in it is replaced.
+
+    Raises
+    ------
+    InputError
+        If it holds other files, or cannot be written.
+    """
+    from pixmetry.report.calibration_page import write_page
+
+    with staged_output(folder, KIND) as place:
+        for name, text in TEXTS.items():
+            (place / name).write_text(text(calibration), encoding="utf-8", newline="\n")
+        write_page(calibration, place / "report.html")
+    return Path(folder)
+
+
+def points_csv(calibration: Calibration) -> str:
+    """Object points with their uncertainties; a table that a project can name as its points."""
+    a = calibration.adjustment
+    c = a.point_covariance
+    used = np.bincount(a.network.point[a.used], minlength=len(a.network.points))
+    columns = {
+        "point": a.network.points,
+        **dict(zip("XYZ", a.state.xyz.T, strict=True)),
+        **{f"u_{axis}": np.sqrt(c[:, k, k]) for k, axis in enumerate("XYZ")},
+        **{f"cov_{'XYZ'[i]}{'XYZ'[j]}": c[:, i, j] for i, j in ((0, 1), (0, 2), (1, 2))},
+        "images": used,
+    }
+    return _csv([f"unit {a.network.unit}; datum: {a.datum}"], columns)
+
+
+def poses_csv(calibration: Calibration) -> str:
+    """Projection centres and rotations of the images with their uncertainties."""
+    a = calibration.adjustment
+    network, state = a.network, a.state
+    u = dict(zip(a.free_columns, np.sqrt(np.maximum(np.diag(a.covariance), 0.0)), strict=True))
+
+    def of(name: str) -> list[float]:
+        return [float(u.get(f"{image}:{name}", np.nan)) for image in network.images]
+
+    columns: dict[str, Any] = {
+        "image": network.images,
+        "camera": [network.cameras[k].name for k in network.camera_of],
+        **{f"{axis}0": state.position[:, k] for k, axis in enumerate("XYZ")},
+        **{f"r{i + 1}{j + 1}": state.rotation[:, i, j] for i in range(3) for j in range(3)},
+        **{f"u_{axis}0": of(f"{axis}0") for axis in "XYZ"},
+        **{f"u_{axis}_rad": of(axis) for axis in ("rx", "ry", "rz")},
+    }
+    if "x_scale" in network.per_image:
+        columns |= {"x_scale": state.x_scale, "u_x_scale": of("x_scale")}
+    if "x_shift" in network.per_image:
+        columns |= {"x_shift_px": state.x_shift_px, "u_x_shift_px": of("x_shift")}
+    text = "a point X is seen at R (X - X0), R by rows, z forwards, x to the right, y down; u of rotations about the camera's axes"
+    return _csv([f"unit {network.unit}; datum: {a.datum}", text], columns)
+
+
+def residuals_csv(calibration: Calibration) -> str:
+    """Image coordinates with their residuals; a table that a project can name as its observations."""
+    a = calibration.adjustment
+    network = a.network
+    columns: dict[str, Any] = {
+        "image": [network.images[k] for k in network.image],
+        "point": [network.points[k] for k in network.point],
+        "x_px": network.x_px,
+        "y_px": network.y_px,
+        "var_x_px2": network.covariance_px2[:, 0],
+        "cov_xy_px2": network.covariance_px2[:, 1],
+        "var_y_px2": network.covariance_px2[:, 2],
+        "residual_x_px": a.residual_px[:, 0],
+        "residual_y_px": a.residual_px[:, 1],
+        "used": a.used.astype(int),
+    }
+    if a.redundancy is not None:
+        columns |= {"redundancy_x": a.redundancy[:, 0], "redundancy_y": a.redundancy[:, 1]}
+    return _csv([f"{PIXELS}; residual: measured less computed; image coordinates of centres, without eccentricity; variances as they were used"], columns)
+
+
+# A new text file of the results needs a line here.
+TEXTS: dict[str, Callable[[Calibration], str]] = {
+    "calibration.json": json_text,
+    "points.csv": points_csv,
+    "poses.csv": poses_csv,
+    "residuals.csv": residuals_csv,
+}
+
+
+def _csv(comments: Iterable[str], columns: Mapping[str, Any]) -> str:
+    text = io.StringIO()
+    for line in comments:
+        text.write(f"# {line}\n")
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(zip(*(_texts(values) for values in columns.values()), strict=True))
+    return text.getvalue()
+
+
+def _texts(values: Any) -> list[Any]:
+    """Ten digits of a number, empty where there is none."""
+    plain = values.tolist() if isinstance(values, np.ndarray) else values
+    return [("" if math.isnan(v) else f"{v:.10g}") if isinstance(v, float) else v for v in plain]

@@ -1,0 +1,63 @@
+"""Targets located and identified in pictures of a test field, as the image coordinates of a network."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from pixmetry.calibration.model import CameraModel
+from pixmetry.calibration.network import Finding
+from pixmetry.calibration_project.coordinates import Measured, image_facts
+from pixmetry.calibration_project.points import Known
+from pixmetry.calibration_project.schema import PicturesModel
+from pixmetry.calibration_project.tables import Table
+
+Progress = Callable[[str, int, int], None]
+
+
+def located(
+    wanted: PicturesModel, files: Sequence[Path], camera: CameraModel, images: Table | None, progress: Progress | None
+) -> tuple[CameraModel, Measured, Known, tuple[Finding, ...]]:
+    """Locate the targets of a test field in pictures.
+
+    Parameters
+    ----------
+    wanted : PicturesModel
+    files : sequence of Path
+    camera : CameraModel
+        Its frame takes the size of the pictures.
+    images : Table, optional
+        Time of each picture, by the name of its file.
+    progress : callable, optional
+
+    Returns
+    -------
+    tuple
+        The camera, what was measured, what the test field's description says of its points, and what was found on the way.
+
+    Raises
+    ------
+    InputError, MeasureError
+        If pictures cannot be read, or too few of them show the test field.
+    """
+    from pixmetry.calibration_images import observations_of
+
+    found = observations_of(files, wanted.kind, **wanted.model_dump(exclude={"files", "kind"}), progress=progress)
+    camera_of, time_s = image_facts(images, found.images, [camera], lambda name: name)
+    network = found.network(_of_size(camera, *found.sizes[0]))
+    seen = Measured(
+        images=found.images,
+        points=found.points,
+        camera_of=camera_of,
+        time_s=time_s,
+        **{name: getattr(network, name) for name in ("image", "point", "x_px", "y_px", "covariance_px2", "covariance_known")},
+    )
+    return network.cameras[0], seen, Known(network.xyz, network.u_xyz, network.diameter, network.normal), found.findings
+
+
+def _of_size(camera: CameraModel, cols: int, rows: int) -> CameraModel:
+    """The camera with the size of its pictures; a principal point that was not given stays in the middle of the frame."""
+    before, sensor = camera.sensor.centre, replace(camera.sensor, cols=cols, rows=rows)
+    middle = {name: new for name, old, new in zip(("xp", "yp"), before, sensor.centre, strict=True) if camera[name] == old}
+    return replace(camera, sensor=sensor).with_values(**middle)

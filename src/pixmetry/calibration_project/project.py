@@ -1,0 +1,222 @@
+"""Read a project: the YAML file, the tables and pictures that it names, and all that can be checked before an adjustment."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pixmetry.calibration.model import NAMES, TEN, CameraModel, Sensor
+from pixmetry.calibration.network import Finding, Network
+from pixmetry.calibration_project.coordinates import ImageCoordinates, Measured, measured
+from pixmetry.calibration_project.pictures import located
+from pixmetry.calibration_project.points import Known, known_points, scale_bars
+from pixmetry.calibration_project.reader import Reader
+from pixmetry.calibration_project.schema import PROJECT_SCHEMA, CameraEntry, ProjectModel
+from pixmetry.calibration_project.tables import Table, first_few
+from pixmetry.core.config import Settings, load_yaml, validate
+from pixmetry.core.errors import InputError
+
+Progress = Callable[[str, int, int], None]
+FIELD_OF = {"fixed": "fixed", "free": "free"}  # what `known` says about the test field; else images left out of the fit decide
+
+
+@dataclass(frozen=True)
+class Project:
+    """A project as it was read.
+
+    Parameters
+    ----------
+    name : str
+    source : Path or None
+        None: pictures alone.
+    network : Network
+    options : dict
+        What was given of `pixmetry.calibration.solve.Options`.
+    inputs : tuple of Path
+        All files that were read.
+    findings : tuple of Finding
+        What was noticed in the tables.
+    """
+
+    name: str
+    source: Path | None
+    network: Network
+    options: dict[str, Any]
+    inputs: tuple[Path, ...]
+    findings: tuple[Finding, ...] = ()
+
+    @property
+    def folder(self) -> Path:
+        """What file names count from."""
+        return Path() if self.source is None else self.source.parent
+
+
+def load_project(path: str | Path, progress: Progress | None = None) -> Project:
+    """Read a project file and everything that it names.
+
+    Parameters
+    ----------
+    path : path
+        A YAML file of the schema ``pixmetry/calibration/1``.
+    progress : callable, optional
+        Called with (what, done, of) while targets are located in pictures.
+
+    Raises
+    ------
+    InputError
+        If a file is missing, or anything in one of them cannot be used.
+    """
+    source = Path(path)
+    settings = _one_camera_or_many(load_yaml(source))
+    return _project(validate(ProjectModel, settings, str(source)), Reader(source, settings.lines), progress)
+
+
+def project_of_pictures(
+    files: Sequence[str | Path], camera: Mapping[str, Any], plate: Mapping[str, Any], progress: Progress | None = None
+) -> Project:
+    """A project of pictures of one camera alone.
+
+    Parameters
+    ----------
+    files : sequence of path
+        Names, patterns or folders.
+    camera, plate : mapping
+        Keys of the project's ``cameras`` and ``pictures``.
+    progress : callable, optional
+
+    Raises
+    ------
+    InputError
+        As from `load_project`.
+    """
+    pictures = {"files": [str(file) for file in files], **plate}
+    model = validate(ProjectModel, {"schema": PROJECT_SCHEMA, "cameras": [camera], "pictures": pictures})
+    return _project(model, Reader(None, {}), progress)
+
+
+def _project(model: ProjectModel, reader: Reader, progress: Progress | None) -> Project:
+    cameras = tuple(_camera(entry, reader, k) for k, entry in enumerate(model.cameras))
+    images, points = reader.table("images", model.images), reader.table("points", model.points)
+    findings: tuple[Finding, ...] = ()
+    plate = None
+    if model.pictures is not None:
+        files = reader.pictures(model.pictures.files)
+        camera, seen, plate, findings = located(model.pictures, files, cameras[0], images, progress)
+        cameras = (camera,)
+    else:
+        table = reader.table("observations", model.observations)
+        assert table is not None and model.observations is not None
+        given = ImageCoordinates(**model.image_coordinates.model_dump())
+        seen = measured(table, images, cameras, given, model.observations.u_px)
+    known = plate if points is None and plate is not None else known_points(points, seen.points, *_trust(model))
+    known = _with_target(known, model)
+    bars = scale_bars(reader.bars(model), seen.points, known)
+    network = network_of(cameras, seen, known, bars=bars, per_image=model.per_image, scale_origin_px=model.scale_origin_px, unit=model.unit)
+    return Project(model.name, reader.source, network, _options(model), tuple(reader.files), (*findings, *_unseen(known, points)))
+
+
+def _trust(model: ProjectModel) -> tuple[str | None, float | None]:
+    return (None, None) if model.points is None else (model.points.known, model.points.u)
+
+
+def network_of(cameras: Sequence[CameraModel], seen: Measured, known: Known, **more: Any) -> Network:
+    """Put together what was measured and what is known."""
+    return Network(
+        cameras=tuple(cameras),
+        images=seen.images,
+        camera_of=seen.camera_of,
+        points=seen.points,
+        x_px=seen.x_px,
+        y_px=seen.y_px,
+        image=seen.image,
+        point=seen.point,
+        covariance_px2=seen.covariance_px2,
+        xyz=known.xyz,
+        u_xyz=known.u_xyz,
+        time_s=seen.time_s,
+        diameter=known.diameter,
+        normal=known.normal,
+        covariance_known=seen.covariance_known,
+        **more,
+    )
+
+
+def _one_camera_or_many(settings: Settings) -> Settings:
+    """`cameras: {...}` as a list of one, with its lines."""
+    if isinstance(settings.get("cameras"), dict):
+        settings["cameras"] = [settings["cameras"]]
+        settings.lines = {
+            ("cameras", 0, *loc[1:]) if loc[0] == "cameras" and len(loc) > 1 else loc: line for loc, line in settings.lines.items()
+        }
+    return settings
+
+
+def _camera(entry: CameraEntry, reader: Reader, k: int) -> CameraModel:
+    """Start values of one camera; c is 0 where it is not known."""
+    cols, rows = entry.cols, entry.rows
+    pitch = (entry.pitch_x_um or entry.pitch_um, entry.pitch_y_um or entry.pitch_um)
+    if entry.camera is not None:
+        cols, rows, pitch = _grid_of(entry, reader, k, pitch)
+    sensor = Sensor(cols or 1, rows or 1, *pitch)  # the size of pictures is told by themselves
+    values = {name: getattr(entry, name) for name in NAMES[3:]}
+    values |= {name: value for name, value in (("xp", entry.xp_px), ("yp", entry.yp_px)) if value is not None}
+    c = entry.c_mm if entry.c_mm is not None else entry.c_px * sensor.per_px[0] if entry.c_px is not None else 0.0
+    return CameraModel.of(sensor, entry.direction, TEN if entry.free is None else entry.free, entry.name, c=c, **values)
+
+
+def _grid_of(
+    entry: CameraEntry, reader: Reader, k: int, pitch: tuple[float | None, float | None]
+) -> tuple[int, int, tuple[float | None, float | None]]:
+    """Size and pitch of a preset or a camera file; what the project says itself goes first."""
+    from pixmetry.core.camera import load_camera
+
+    name = str(entry.camera)
+    beside = reader.folder / name
+    try:
+        camera = load_camera(beside if beside.is_file() else name)
+    except InputError as problem:
+        where = problem.where if beside.is_file() else reader.where("cameras", k, "camera")
+        raise InputError(problem.what, where=where, value=problem.value or name, allowed=problem.allowed, remedy=problem.remedy) from None
+    if beside.is_file():
+        reader.files.append(beside)
+    rows, cols = camera.output_shape
+    return entry.cols or cols, entry.rows or rows, pitch if pitch[0] is not None else camera.pitch_um or (None, None)
+
+
+def _with_target(known: Known, model: ProjectModel) -> Known:
+    """Size and normal of all targets where the table of points does not say them."""
+    target = model.target
+    if target is None:
+        return known
+    n = len(known.xyz)
+    diameter, normal = known.diameter, known.normal
+    if target.diameter is not None:
+        own = np.full(n, np.nan) if diameter is None else diameter
+        diameter = np.where(np.isfinite(own), own, target.diameter)
+    if target.normal is not None:
+        wanted = np.array(target.normal) / np.linalg.norm(target.normal)
+        own = np.full((n, 3), np.nan) if normal is None else normal
+        normal = np.where(np.isfinite(own), own, wanted)
+    return replace(known, diameter=diameter, normal=normal)
+
+
+def _options(model: ProjectModel) -> dict[str, Any]:
+    given = {name: value for name, value in model.options.model_dump().items() if value is not None}
+    known = model.points.known if model.points is not None else None
+    if "field" not in given and known in FIELD_OF:
+        given["field"] = FIELD_OF[known]
+    if model.target is not None:
+        given["target"] = model.target.shape
+    return given
+
+
+def _unseen(known: Known, points: Table | None) -> tuple[Finding, ...]:
+    if points is None or not known.unseen:
+        return ()
+    n = len(known.unseen)
+    text = f"{n} of {len(points)} object points {'is' if n == 1 else 'are'} seen in no image: {first_few(known.unseen)}."
+    return (Finding("unseen_points", text, "If they should be, compare their names in both tables."),)

@@ -1,0 +1,202 @@
+"""The keys of a calibration's project file, and what each may hold."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator, Field, model_validator
+
+from pixmetry.core.config import Model
+from pixmetry.core.errors import InputError
+
+PROJECT_SCHEMA = "pixmetry/calibration/1"
+PARAMETERS = ("c", "xp", "yp", "b1", "b2", "p1", "p2", "k1", "k2", "k3", "k4", "k5")
+
+Positive = Annotated[float, Field(gt=0)]
+Size = Annotated[int, Field(ge=1, le=1_000_000)]
+Pitch = Annotated[float, Field(gt=0, lt=1000)]  # µm
+# names of points and images may look like numbers
+Name = Annotated[str, Field(min_length=1), BeforeValidator(lambda v: str(v) if isinstance(v, int) and not isinstance(v, bool) else v)]
+
+
+def _listed(value: Any) -> Any:
+    """``c, xp, yp`` as well as ``[c, xp, yp]``."""
+    return tuple(part for part in value.replace(",", " ").split() if part != "none") if isinstance(value, str) else value
+
+
+def _table(value: Any) -> Any:
+    """``points.csv`` as well as ``{table: points.csv}``."""
+    return {"table": value} if isinstance(value, str) else value
+
+
+def _one(value: Any) -> Any:
+    return (value,) if isinstance(value, str) else value
+
+
+class CameraEntry(Model):
+    """One camera: its pixel grid, start values, and what is estimated of it."""
+
+    name: Name = "camera"
+    camera: str | None = None
+    cols: Size | None = None
+    rows: Size | None = None
+    pitch_um: Pitch | None = None
+    pitch_x_um: Pitch | None = None
+    pitch_y_um: Pitch | None = None
+    direction: Literal["image_to_object", "object_to_image"] = "image_to_object"
+    c_mm: Positive | None = None
+    c_px: Positive | None = None
+    xp_px: float | None = None
+    yp_px: float | None = None
+    b1: float = 0.0
+    b2: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+    k1: float = 0.0
+    k2: float = 0.0
+    k3: float = 0.0
+    k4: float = 0.0
+    k5: float = 0.0
+    free: Annotated[tuple[Literal[PARAMETERS], ...] | None, BeforeValidator(_listed)] = None  # type: ignore[valid-type]
+
+    @model_validator(mode="after")
+    def _agrees(self) -> CameraEntry:
+        if self.pitch_um is not None and (self.pitch_x_um is not None or self.pitch_y_um is not None):
+            raise InputError("pitch is given twice", allowed="pitch_um, or pitch_x_um with pitch_y_um", remedy="delete one of them")
+        if (self.pitch_x_um is None) != (self.pitch_y_um is None):
+            what, allowed = "pitch is known in one direction only", "pitch_x_um and pitch_y_um"
+            raise InputError(what, allowed=allowed, remedy="add the other, or use pitch_um")
+        if self.c_mm is not None and self.c_px is not None:
+            raise InputError("the principal distance is given twice", allowed="c_mm or c_px", remedy="delete one of them")
+        pitched = self.camera is not None or self.pitch_um is not None or self.pitch_x_um is not None
+        if self.c_mm is not None and not pitched:
+            raise InputError("c_mm, but no pitch", allowed="c_mm with pitch_um, or c_px", remedy="add `pitch_um: ...`, or give c_px")
+        if self.c_mm is None and self.c_px is None and self.free is not None and "c" not in self.free:
+            raise InputError("c is to be held, but has no value", remedy="give c_mm or c_px, or add c to `free`")
+        if (self.cols is None) != (self.rows is None):
+            raise InputError("the size of the frame is incomplete", allowed="cols and rows", remedy="add the other")
+        return self
+
+
+class TableModel(Model):
+    """A table in a file beside the project."""
+
+    table: str
+    columns: tuple[Name, ...] | dict[str, Name] | None = None
+
+
+class ObservationsModel(TableModel):
+    """Image coordinates: image, point, x, y."""
+
+    u_px: Positive | None = None
+
+
+class PointsModel(TableModel):
+    """Object points: point, X, Y, Z."""
+
+    known: Literal["nominal", "fixed", "free", "weighted"] | None = None
+    u: Positive | None = None
+
+
+class PicturesModel(Model):
+    """Images in which targets are located."""
+
+    files: Annotated[tuple[str, ...], Field(min_length=1), BeforeValidator(_one)]
+    kind: Literal["chessboard", "dots", "coded", "squares"] = "chessboard"
+    grid: str | None = None
+    pitch: Positive | tuple[Positive, Positive] | None = None
+    side: Positive | None = None
+    diameter: Positive | None = None
+    polarity: Literal["auto", "bright", "dark"] = "auto"
+    channel: Literal["red", "green", "blue"] | None = None
+    noise: str | None = None
+
+
+class ImageCoordinatesModel(Model):
+    """Unit and origin of the image coordinates of the table."""
+
+    unit: Literal["px", "mm", "um"] | None = None
+    origin: Literal["first_pixel", "corner", "centre"] | None = None
+    y: Literal["down", "up"] | None = None
+
+
+class TargetModel(Model):
+    """Size and shape of targets whose centre of area was measured."""
+
+    shape: Literal["circle", "square"] = "circle"
+    diameter: Positive | None = None
+    normal: tuple[float, float, float] | None = None
+
+    @model_validator(mode="after")
+    def _direction(self) -> TargetModel:
+        if self.normal is not None and not any(self.normal):
+            raise InputError("a normal without direction", allowed="three numbers, not all 0", remedy="write [0, 0, 1] for a plane z = 0")
+        return self
+
+
+class BarModel(Model):
+    """A known distance."""
+
+    from_: Annotated[Name, Field(alias="from")]
+    to: Name
+    length: Positive
+    u: Positive
+
+
+class OptionsModel(Model):
+    """How the calibration is done."""
+
+    field: Literal["auto", "fixed", "free"] | None = None
+    loss: Literal["huber", "cauchy", "none"] | None = None
+    loss_scale: Positive | None = None
+    snoop: bool | None = None
+    false_alarms: Annotated[float, Field(gt=0, lt=100)] | None = None
+    variance_components: bool | None = None
+    eccentricity: bool | None = None
+    folds: Annotated[int, Field(ge=0)] | None = None
+    residual_grid: bool | None = None
+    a_priori: bool | None = None
+    max_iterations: Annotated[int, Field(ge=1)] | None = None
+
+
+class ProjectModel(Model):
+    """A calibration: cameras, image coordinates or pictures, and what is known of the object."""
+
+    schema_: Annotated[Literal["pixmetry/calibration/1"], Field(alias="schema")]
+    name: str = ""
+    unit: Literal["mm", "cm", "m", "um", "inch"] = "mm"
+    cameras: Annotated[tuple[CameraEntry, ...], Field(min_length=1)]
+    observations: Annotated[ObservationsModel | None, BeforeValidator(_table)] = None
+    pictures: PicturesModel | None = None
+    image_coordinates: ImageCoordinatesModel = ImageCoordinatesModel()
+    images: Annotated[TableModel | None, BeforeValidator(_table)] = None
+    points: Annotated[PointsModel | None, BeforeValidator(_table)] = None
+    target: TargetModel | None = None
+    scale_bars: tuple[BarModel, ...] = ()
+    scale_bars_table: Annotated[TableModel | None, BeforeValidator(_table)] = None
+    per_image: Annotated[tuple[Literal["x_scale", "x_shift"], ...], BeforeValidator(_listed)] = ()
+    scale_origin_px: float = 0.0
+    options: OptionsModel = OptionsModel()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _not_empty(cls, data: Any) -> Any:
+        if not data:
+            raise InputError("the project is empty", remedy=f"begin with `schema: {PROJECT_SCHEMA}`, then cameras and observations")
+        return data
+
+    @model_validator(mode="after")
+    def _one_source(self) -> ProjectModel:
+        if (self.observations is None) == (self.pictures is None):
+            what = "no image coordinates" if self.pictures is None else "image coordinates from two sources"
+            remedy = "add one of them" if self.pictures is None else "delete one of them"
+            raise InputError(what, allowed="observations (a table) or pictures (images of targets)", remedy=remedy)
+        if self.pictures is not None and len(self.cameras) > 1:
+            remedy = "write one project for each camera, or locate first and give a table of image coordinates"
+            raise InputError("pictures of several cameras", allowed="pictures of one camera", remedy=remedy)
+        names = [camera.name for camera in self.cameras]
+        if len(set(names)) < len(names):
+            raise InputError("two cameras of one name", value=", ".join(names), allowed="each name once", remedy="name them")
+        if self.observations is not None and any(c.cols is None and c.camera is None for c in self.cameras):
+            raise InputError("the size of the frame is missing", where="cameras", allowed="cols and rows", remedy="add them to the camera")
+        return self

@@ -1,0 +1,68 @@
+"""``pixmetry calibrate``: cameras from pictures of a test field, or from a table of image coordinates."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+KINDS = ("chessboard", "dots", "coded", "squares")
+OPTIONS = ("field", "loss", "folds", "residual_grid", "snoop", "a_priori")
+
+
+@click.command()
+@click.argument("sources", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="PROJECT.yaml|IMAGES…")
+@click.option(
+    "-o", "--output", type=click.Path(path_type=Path), default=Path("pixmetry-calibration"), show_default=True, help="For the results."
+)
+@click.option("--kind", type=click.Choice(KINDS), help="Test field in the images. Default: chessboard.")
+@click.option("--grid", metavar="COLSxROWS", help="Inner corners of a chessboard, or dots of a plate, such as 9x6.")
+@click.option("--pitch-mm", type=click.FloatRange(0, min_open=True), help="Spacing of corners or dots.")
+@click.option("--side-mm", type=click.FloatRange(0, min_open=True), help="Side of separate squares.")
+@click.option("--diameter-mm", type=click.FloatRange(0, min_open=True), help="Of dots; corrects the eccentricity of their images.")
+@click.option("--polarity", type=click.Choice(["auto", "bright", "dark"]), help="Of targets on their ground. Default: auto.")
+@click.option("--channel", type=click.Choice(["red", "green", "blue"]), help="Channel of colour images.")
+@click.option("--noise", metavar="WHAT", help="Noise model of the images, as of `pixmetry locate`. Default: from each image.")
+@click.option("--pixel-um", type=click.FloatRange(0, min_open=True), help="Pitch of the pixels; without it, lengths are in pixels.")
+@click.option("--c-mm", type=click.FloatRange(0, min_open=True), help="Start value of the principal distance.")
+@click.option(
+    "--direction",
+    type=click.Choice(["image_to_object", "object_to_image"]),
+    help="What the distortion takes to what: photogrammetry's corrections, or vision's (as OpenCV). Default: image_to_object.",
+)
+@click.option("--free", metavar="NAMES", help="Parameters to estimate, such as c,xp,yp,k1,k2. Default: c,xp,yp,b1,b2,p1,p2,k1,k2,k3.")
+@click.option("--per-image", metavar="NAMES", help="Also for each image: x_scale, x_shift, or both.")
+@click.option("--field", type=click.Choice(["auto", "fixed", "free"]), help="Trust the field's coordinates, estimate them, or find out.")
+@click.option("--loss", type=click.Choice(["huber", "cauchy", "none"]), help="Of the first pass, before gross errors are looked for.")
+@click.option("--folds", type=click.IntRange(0), help="Parts into which images are left out of the fit in turn; 0: none.")
+@click.option("--residual-grid", is_flag=True, default=None, help="Make a correction grid of what the parameters leave over.")
+@click.option("--no-snoop", "snoop", is_flag=True, flag_value=False, default=None, help="Do not look for gross errors.")
+@click.option("--a-priori", is_flag=True, default=None, help="Take the given uncertainties of image coordinates as true.")
+@click.option("--json", is_flag=True, help="Print the cameras for programs instead of a summary.")
+@click.option("--threads", type=click.IntRange(1), help="Default: all processors.")
+def calibrate(sources: tuple[Path, ...], output: Path, json: bool, threads: int | None, **given: Any) -> None:
+    """Calibrate cameras, with the uncertainty of everything that is estimated.
+
+    The argument is a project file (YAML), which names tables of image coordinates or images with targets; or images of a flat test field
+    themselves (files or folders). The folder of results gets report.html, calibration.json, points.csv, poses.csv and residuals.csv.
+    """
+    from pixmetry.calibrating import calibrate as run
+    from pixmetry.cli._progress import shown_progress
+    from pixmetry.core.threads import set_threads
+
+    set_threads(threads)
+    options = {name: given.pop(name) for name in OPTIONS}
+    options = {name: value for name, value in options.items() if value is not None}
+    with shown_progress() as progress:
+        calibration = run(sources, output, options=options, progress=progress, **given)
+    report = output / "report.html"
+    if json:
+        from pixmetry.calibration_record import cameras_text
+
+        click.echo(cameras_text(calibration, str(report)))
+        return
+    from pixmetry.report.calibration_text import summary_text
+
+    click.echo(summary_text(calibration).rstrip("\n"))
+    click.echo(f"report: {report}")

@@ -1,0 +1,138 @@
+"""Left-out images: their poses against SciPy's optimiser, their residuals against leaving one out by hand."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import optimize, stats
+from scipy.spatial.transform import Rotation
+
+from calibration.adjusted import NOISE_PX, adjusted, measured_again, shifted
+from calibration.networks import image_of, predicted, simulate
+from pixmetry.calibration.bundle import adjust
+from pixmetry.calibration.hold_out import LeftOut, hold_out_record, left_out, resect, subset
+from pixmetry.core.errors import InputError
+
+RATE = 1e-6
+
+
+def even_noise(rng, exact):
+    """Noise of one length in all directions: no residual is so large that a robust weight falls below 1."""
+    angle = rng.uniform(0, 2 * np.pi, len(exact))
+    return NOISE_PX * np.sqrt(2) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+
+def posed_by_scipy(network, state, i, used):
+    """Residuals of one image after its pose alone was fitted, by SciPy and the other projection."""
+    rows = np.flatnonzero(used & (network.image == i))
+    measured = np.stack([network.x_px[rows], network.y_px[rows]], axis=1)
+    size = np.linalg.norm(state.position[i])
+
+    def residual(step):
+        rotation = Rotation.from_rotvec(step[:3]).as_matrix() @ state.rotation[i]
+        x, y, _ = image_of(
+            network.cameras[0], state.interior[0], rotation, state.position[i] + step[3:] * size, state.xyz[network.point[rows]]
+        )
+        return (measured - np.stack([x, y], axis=1)).ravel()
+
+    return rows, optimize.least_squares(residual, np.zeros(6), xtol=1e-15, ftol=1e-15, gtol=1e-15, x_scale="jac").fun.reshape(-1, 2)
+
+
+def test_pose_is_that_of_scipy(rng):
+    simulated = simulate(rng, images=5, points=40, known="fixed")
+    exact = predicted(simulated.network, simulated.truth)
+    network = shifted(measured_again(rng, simulated, exact, 0.0), *even_noise(rng, exact).T)
+    start = replace(simulated.truth, position=simulated.truth.position * 1.01)
+    used = np.ones(len(network), bool)
+    found, residual = resect(network, start, used)
+    for i in range(5):
+        rows, expected = posed_by_scipy(network, simulated.truth, i, used)
+        np.testing.assert_allclose(residual[rows], expected, atol=1e-6)
+    assert np.abs(found.position - simulated.truth.position).max() < 1.0
+    np.testing.assert_allclose(predicted(network, found) + residual, np.stack([network.x_px, network.y_px], axis=1), atol=1e-7)
+
+
+def test_gross_error_does_not_move_the_pose(rng):
+    """Without noise, one point off by 20 px: the pose is exact and the error stays whole."""
+    simulated = simulate(rng, images=4, points=30, known="fixed")
+    exact = predicted(simulated.network, simulated.truth)
+    wrong = np.zeros(len(exact))
+    wrong[7] = 20.0
+    network = shifted(measured_again(rng, simulated, exact, 0.0), wrong)
+    _, residual = resect(network, simulated.truth, np.ones(len(network), bool))
+    assert residual[7, 0] == pytest.approx(20.0, abs=1e-3)
+    assert np.abs(np.delete(residual, 7, axis=0)).max() < 1e-3
+
+
+def test_own_x_scale_is_fitted_too(rng):
+    simulated = simulate(rng, images=4, points=40, known="fixed", per_image=("x_scale", "x_shift"))
+    network = measured_again(rng, simulated, noise_px=0.0)
+    start = replace(simulated.truth, x_scale=np.zeros(4), x_shift_px=np.zeros(4))
+    found, residual = resect(network, start, np.ones(len(network), bool))
+    np.testing.assert_allclose(found.x_scale, simulated.truth.x_scale, atol=1e-9)
+    assert np.abs(residual).max() < 1e-6
+
+
+def test_left_out_is_leaving_one_out_by_hand(rng):
+    """As many folds as images, points fixed: the same residuals as from an adjustment of the others and SciPy's pose."""
+    simulated = simulate(rng, images=6, points=50, known="fixed")
+    exact = predicted(simulated.network, simulated.truth)
+    network = shifted(measured_again(rng, simulated, exact, 0.0), *even_noise(rng, exact).T)
+    used = rng.random(len(network)) > 0.05
+    whole = adjusted(network, simulated, used=used)
+    found = left_out(whole, folds=20)
+    assert found.folds == 6 and np.array_equal(np.isfinite(found.residual_px).all(axis=1), used)
+    np.testing.assert_array_equal(found.fit_px[used], whole.residual_px[used])
+    rest = np.arange(6) != 3
+    part, start, kept = subset(network, simulated.truth, rest)
+    without = adjust(part, start, used=used[kept])
+    state = replace(simulated.truth, interior=without.state.interior)
+    rows, expected = posed_by_scipy(network, state, 3, used)
+    np.testing.assert_allclose(found.residual_px[rows], expected, atol=2e-6)
+
+
+def test_subset_keeps_names_and_coordinates(rng):
+    simulated = simulate(rng, images=6, points=20, cameras=2)
+    network = replace(simulated.network, time_s=np.arange(6.0))
+    keep = np.array([True, False, True, True, False, True])
+    part, state, kept = subset(network, simulated.truth, keep)
+    assert part.images == tuple(np.array(network.images)[keep]) and list(part.time_s) == [0, 2, 3, 5] and list(part.camera_of) == [0, 0, 1, 1]
+    np.testing.assert_allclose(predicted(part, state), predicted(network, simulated.truth)[kept])
+    assert [part.images[i] for i in part.image] == [network.images[i] for i in network.image[kept]]
+
+
+@pytest.mark.parametrize("known", ["fixed", "free"])
+def test_stat_left_out_is_a_little_worse_than_the_noise(rng, known):
+    """Of a right model: left-out mean square above the fit's and below 1.7 times the noise's; the fit's as its redundancy says."""
+    simulated = simulate(rng, images=16, points=60, known=known)
+    whole = adjusted(measured_again(rng, simulated), simulated)
+    found = left_out(whole)
+    record = hold_out_record(found) if known == "fixed" else hold_out_record(None, found)
+    rms = record[known]
+    assert rms["fit_rms_px"] < rms["left_out_rms_px"] < 1.3 * NOISE_PX
+    low, high = NOISE_PX**2 * stats.chi2.ppf([RATE / 2, 1 - RATE / 2], whole.dof)
+    assert low < rms["fit_rms_px"] ** 2 * 2 * len(whole.network) < high
+    assert record["p"] is None and record["folds"] == 5 and f"{rms['left_out_rms_px']:.4f} px in images left out" in record["text"]
+
+
+def test_record_compares_on_common_points_and_by_image(rng):
+    """50 images whose residuals fall by a fifth: p as of SciPy's paired test; a point that only one of the two has does not count."""
+    image = np.repeat(np.arange(50), 10)
+    first = rng.standard_normal((500, 2))
+    second = 0.8 * first * rng.uniform(0.9, 1.1, (500, 2))
+    second[0] = np.nan
+    record = hold_out_record(LeftOut(first, first, image, 5), LeftOut(second, second, image, 5))
+    assert record["fixed"]["left_out_rms_px"] == pytest.approx(np.sqrt(np.mean(first[1:] ** 2)))
+    a, b = (np.array([np.sum(v[1:][image[1:] == i] ** 2) for i in range(50)]) for v in (first, second))
+    assert record["p"] == pytest.approx(stats.ttest_rel(np.log(b), np.log(a), alternative="less").pvalue)
+    with pytest.raises(ValueError, match="neither"):
+        hold_out_record(None)
+
+
+def test_too_few_images(rng):
+    simulated = simulate(rng, images=4, points=60, cameras=2, known="fixed")
+    found = adjusted(simulated.network, simulated)
+    with pytest.raises(InputError, match="2 images"):
+        left_out(found)

@@ -1,0 +1,245 @@
+"""The whole way from image coordinates to a calibration: against simulated truth, and each thing that a reader must be told."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from calibration.networks import image_of, predicted, simulate
+from pixmetry.calibration.model import NAMES
+from pixmetry.calibration.network import Calibration, ScaleBars
+from pixmetry.calibration.solve import Options, calibrate_network
+from pixmetry.core.errors import ParameterError
+
+RATE = 1e-6  # false failures of each statistical test
+QUICK = Options(folds=0)
+
+
+def distance(calibration: Calibration, simulated, camera: int = 0) -> tuple[float, float]:
+    """Mahalanobis distance² of a camera's parameters from the truth, and what χ² exceeds once in 10⁶ (5 % more for what is not linear)."""
+    names, covariance = calibration.adjustment.interior_covariance(camera)
+    places = [NAMES.index(name) for name in names]
+    off = calibration.adjustment.state.interior[camera, places] - simulated.truth.interior[camera, places]
+    return float(off @ np.linalg.solve(covariance, off)), 1.05 * stats.chi2.isf(RATE, len(names))
+
+
+def kinds(calibration: Calibration, level: str | None = None) -> list[str]:
+    return [f.kind for f in calibration.findings if level is None or f.level == level]
+
+
+def measured_anew(rng, simulated, **other):
+    """The network measured again, with something else in the truth."""
+    x, y = (predicted(simulated.network, replace(simulated.truth, **other)) + 0.04 * rng.normal(size=(len(simulated.network), 2))).T
+    return replace(simulated.network, x_px=x, y_px=y)
+
+
+@pytest.mark.parametrize("kind", [{}, {"known": "fixed", "field": "plane"}, {"known": "partly"}, {"images": 24, "cameras": 2}])
+def test_recovers_cameras_and_planted_gross_errors_from_image_coordinates_alone(rng, kind):
+    """All ten parameters within their covariance; the gross errors and no more than 2 others are out (0.01 expected)."""
+    simulated = simulate(rng, **{"images": 16, "points": 60, "gross_share": 0.01, "gross_px": 20.0, **kind})
+    calibration = calibrate_network(simulated.network, QUICK)
+    for camera in range(len(simulated.network.cameras)):
+        found, limit = distance(calibration, simulated, camera)
+        assert found < limit
+    out = ~calibration.adjustment.used
+    assert (simulated.gross & ~out).sum() == 0 and (out & ~simulated.gross).sum() < 3
+    assert "gross_error" in kinds(calibration)
+    assert len(calibration.tests["gross_errors"]) == out.sum()
+    assert calibration.adjustment.sigma0 == pytest.approx(1.0, abs=0.01)
+
+
+def test_records_hold_what_report_and_files_are_made_of(rng):
+    simulated = simulate(rng, images=12, points=40)
+    words: list[str] = []
+    calibration = calibrate_network(simulated.network, Options(residual_grid=True), simulated.truth, words.append)
+    expected = {
+        "parameters", "vision", "correlations", "correlations_with_poses", "residuals", "f_test", "variance_components", "gross_errors",
+        "hold_out", "patterns", "images", "curves", "projection", "network", "known", "parameter_groups", "residual_grid",
+    }  # fmt: skip
+    assert expected == set(calibration.tests)
+    assert words[0] == "checking the network" and words[-1] == "testing the result"
+    network = calibration.tests["network"]
+    assert network["observations"] == calibration.adjustment.used.sum() and network["rays_per_point"] == pytest.approx(12, abs=0.1)
+    assert [bar["length"] for bar in network["scale_bars"]] == simulated.network.bars.length.tolist()
+    assert calibration.provenance["options"]["false_alarms"] == 0.01
+    assert calibration.tests["hold_out"]["fixed"] is None and calibration.tests["hold_out"]["free"]["left_out_rms_px"] < 0.06
+    assert "datum" in kinds(calibration)
+
+
+def test_a_board_that_is_not_flat_is_set_free(rng):
+    """A peak of 2 mm on 1000 mm; the parameters stay within their covariance only with free points."""
+    simulated = simulate(rng, images=16, points=70, field="plane", known="fixed", bars=0)
+    bent = simulated.truth.xyz.copy()
+    bent[:, 2] += 2.0 * np.sin(np.pi * (bent[:, 0] / 1000 + 0.5))
+    network = measured_anew(rng, simulated, xyz=bent)
+    calibration = calibrate_network(network)
+    field, held = calibration.tests["field"], calibration.tests["hold_out"]
+    assert field["verdict"] == "free" and np.isinf(calibration.adjustment.network.u_xyz).all()
+    assert held["free"]["left_out_rms_px"] < 0.5 * held["fixed"]["left_out_rms_px"]
+    assert calibration.findings[0].kind == "flatness" and "not flat" in calibration.findings[0].text
+    assert calibration.tests["residuals"]["camera"]["rms_x_px"] < 0.05
+    found, limit = distance(calibration, simulated)
+    assert found < limit
+    kept = calibrate_network(network, Options(field="fixed", folds=0))
+    assert (kept.adjustment.network.u_xyz == 0).all() and distance(kept, simulated)[0] > found
+    free = calibrate_network(network, Options(field="free", folds=0))
+    np.testing.assert_allclose(free.adjustment.state.interior, calibration.adjustment.state.interior, rtol=1e-3, atol=1e-4)
+
+
+def test_a_flat_board_is_kept(rng):
+    simulated = simulate(rng, images=14, points=60, field="plane", known="fixed", bars=0)
+    calibration = calibrate_network(simulated.network, start=simulated.truth)
+    assert calibration.tests["field"]["verdict"] == "fixed" and "flatness" not in kinds(calibration, "warning")
+
+
+def test_a_drifting_clock_is_named_and_its_scales_bring_the_residuals_back_to_noise(rng):
+    """A line that grows by 0.2 % over 20 images."""
+    simulated = simulate(rng, images=20, points=60)
+    drift = 2e-3 * np.linspace(-0.5, 0.5, 20)
+    network = replace(measured_anew(rng, simulated, x_scale=drift), time_s=60.0 * np.arange(20))
+    without = calibrate_network(network, QUICK, simulated.truth)
+    assert without.findings[0].kind == "x_scale_drift" and without.findings[0].level == "warning"
+    assert without.tests["variance_components"]["camera"]["sigma_x_px"] > 0.05
+    with_scales = calibrate_network(network, Options(folds=0, per_image=("x_scale",)), simulated.truth)
+    record = with_scales.tests["variance_components"]["camera"]
+    z = stats.norm.isf(RATE / 2)
+    for axis in "xy":
+        assert record[f"sigma_{axis}_px"] == pytest.approx(0.04, abs=z * record[f"u_sigma_{axis}_px"])
+    assert "x_scale_drift" not in kinds(with_scales, "warning") and "x_scale_drift" in kinds(with_scales, "note")
+    images = with_scales.tests["images"]
+    off = np.array([(i["x_scale"] - d) / i["u_x_scale"] for i, d in zip(images, drift, strict=True)])
+    assert np.abs(off).max() < stats.norm.isf(RATE / 40)
+    assert distance(with_scales, simulated)[0] < distance(with_scales, simulated)[1]
+
+
+def test_scales_that_nobody_needs_are_called_so(rng):
+    simulated = simulate(rng, images=14, points=50)
+    calibration = calibrate_network(simulated.network, Options(folds=0, per_image=("x_scale", "x_shift")), simulated.truth)
+    named = [f for f in calibration.findings if f.kind in ("significance", "x_scale_drift", "x_shift") and "images'" in f.text]
+    assert len(named) == 2
+    assert all((f.kind == "significance") == ("not significant" in f.text) for f in named)
+
+
+def area_centres(simulated, diameter: float) -> np.ndarray:
+    """Centres of area of the images of circles in the plane z = 0, from polygons of 720 corners, shape (n, 2)."""
+    network, truth = simulated.network, simulated.truth
+    t = 2 * np.pi * np.arange(720) / 720
+    rim = diameter / 2 * np.column_stack([np.cos(t), np.sin(t), 0 * t])
+    out = np.empty((len(network), 2))
+    for i in range(len(network.images)):
+        rows = np.flatnonzero(network.image == i)
+        places = (truth.xyz[network.point[rows]][:, None, :] + rim).reshape(-1, 3)
+        x, y, _ = image_of(network.cameras[0], truth.interior[0], truth.rotation[i], truth.position[i], places)
+        x, y = x.reshape(len(rows), -1), y.reshape(len(rows), -1)
+        x0, y0 = x.mean(axis=1), y.mean(axis=1)
+        x, y = x - x0[:, None], y - y0[:, None]
+        xn, yn = np.roll(x, -1, axis=1), np.roll(y, -1, axis=1)
+        cross = x * yn - xn * y
+        area = 3 * cross.sum(axis=1)
+        out[rows] = np.column_stack([x0 + ((x + xn) * cross).sum(axis=1) / area, y0 + ((y + yn) * cross).sum(axis=1) / area])
+    return out
+
+
+def test_large_circles_are_corrected_for_their_eccentricity(rng):
+    """Circles of 100 mm on a board of 1000 mm: several tenths of a pixel, which go into the parameters unless they are corrected."""
+    simulated = simulate(rng, images=16, points=60, field="plane", known="fixed", bars=0)
+    x, y = (area_centres(simulated, 100.0) + 0.04 * rng.normal(size=(len(simulated.network), 2))).T
+    network = replace(simulated.network, x_px=x, y_px=y, diameter=np.full(60, 100.0))
+    calibration = calibrate_network(network, QUICK)
+    found, limit = distance(calibration, simulated)
+    assert found < limit
+    record = calibration.tests["eccentricity"]
+    centres = predicted(network, simulated.truth)
+    assert record["largest_px"] == pytest.approx(np.hypot(*(area_centres(simulated, 100.0) - centres).T).max(), rel=0.01)
+    assert "eccentricity" in kinds(calibration, "note")
+    off = np.column_stack([calibration.adjustment.network.x_px - x, calibration.adjustment.network.y_px - y])
+    missed = off - (centres - area_centres(simulated, 100.0))
+    assert np.sqrt(np.mean(missed**2)) < 2e-3 and np.abs(missed).max() < 0.05  # the largest where circles reach beyond all points
+    plain = calibrate_network(network, Options(folds=0, eccentricity=False))
+    assert distance(plain, simulated)[0] > 3 * limit and "eccentricity" not in plain.tests
+
+
+def test_circles_without_normals_are_left_and_their_possible_shift_is_told(rng):
+    simulated = simulate(rng, images=12, points=40)
+    network = replace(simulated.network, diameter=np.full(40, 60.0))
+    calibration = calibrate_network(network, QUICK, simulated.truth)
+    said = [f for f in calibration.findings if f.kind == "eccentricity"]
+    assert len(said) == 1 and said[0].level == "warning" and "not corrected" in said[0].text
+    np.testing.assert_array_equal(calibration.adjustment.network.x_px, network.x_px)
+
+
+def test_a_guessed_covariance_gives_the_same_as_the_right_one(rng):
+    """Bars beside image coordinates that are said to be good to 1 px, without a covariance: the weights find themselves."""
+    simulated = simulate(rng, images=14, points=50)
+    guess = replace(simulated.network, covariance_px2=np.tile([1.0, 0.0, 1.0], (len(simulated.network), 1)), covariance_known=False)
+    for options in (QUICK, replace(QUICK, variance_components=False)):
+        right, guessed = (calibrate_network(n, options, simulated.truth).adjustment for n in (simulated.network, guess))
+        u = np.sqrt(np.diag(right.interior_covariance()[1]))
+        moved = (guessed.state.interior - right.state.interior)[0, right.network.cameras[0].free]
+        assert (np.abs(moved) < 0.05 * u).all()
+        np.testing.assert_allclose(np.sqrt(np.diag(guessed.interior_covariance()[1])), u, rtol=0.05)
+
+
+def test_a_wrong_bar_is_the_first_thing_said(rng):
+    simulated = simulate(rng, images=14, points=50, bars=4)
+    bars = simulated.network.bars
+    network = replace(simulated.network, bars=ScaleBars(bars.start, bars.end, bars.length + [2.0, 0, 0, 0], bars.u))
+    calibration = calibrate_network(network, QUICK, simulated.truth)
+    first = calibration.findings[0]
+    assert first.kind == "gross_scale_bar" and network.points[bars.start[0]] in first.text and "left out" in first.advice
+    assert calibration.tests["known"]["scale_bars"]["gross"][0]["error"] == pytest.approx(2.0, abs=0.5)
+    assert len(calibration.adjustment.network.bars) == 3 and calibration.adjustment.used.sum() > len(network) - 3
+    found, limit = distance(calibration, simulated)
+    assert found < limit
+
+
+def test_two_bars_that_contradict_each_other_are_both_doubted(rng):
+    simulated = simulate(rng, images=14, points=50, bars=2)
+    bars = simulated.network.bars
+    network = replace(simulated.network, bars=ScaleBars(bars.start, bars.end, bars.length + [5.0, 0], bars.u))
+    calibration = calibrate_network(network, QUICK, simulated.truth)
+    assert calibration.findings[0].kind == "gross_scale_bar" and "cannot be said" in calibration.findings[0].advice
+    assert (calibration.adjustment.network.bars.u > 1).all() and calibration.adjustment.used.sum() > len(network) - 3
+    found, limit = distance(calibration, simulated)
+    assert found < limit
+
+
+def test_a_wrong_control_point_is_set_free(rng):
+    simulated = simulate(rng, images=14, points=50, bars=0)
+    u = np.full((50, 3), np.inf)
+    u[:8] = 0.05
+    xyz = np.where(np.isfinite(u), simulated.truth.xyz + 0.05 * rng.normal(size=u.shape), np.nan)
+    xyz[3, 1] += 5.0
+    calibration = calibrate_network(replace(simulated.network, xyz=xyz, u_xyz=u), QUICK, simulated.truth)
+    assert calibration.findings[0].kind == "gross_control_point" and simulated.network.points[3] in calibration.findings[0].text
+    assert np.isinf(calibration.adjustment.network.u_xyz[3]).all() and calibration.adjustment.used.sum() > len(simulated.network) - 3
+    found, limit = distance(calibration, simulated)
+    assert found < limit
+
+
+def test_not_significant_and_wholly_correlated_parameters_are_named(rng):
+    """k4 is 0; p1 and p2, b1 and b2 are not."""
+    simulated = simulate(rng, images=14, points=60)
+    camera = simulated.network.cameras[0]
+    network = replace(simulated.network, cameras=(replace(camera, free=camera.free | np.isin(NAMES, ["k4"])),))
+    calibration = calibrate_network(network, QUICK, simulated.truth)
+    p = next(r["p_zero"] for r in calibration.tests["parameters"] if r["name"] == "k4")
+    said = " ".join(f.text for f in calibration.findings if f.kind == "significance")
+    assert ("k4" in said) == (p > 0.05)
+
+
+@pytest.mark.parametrize("snoop", [True, False])
+def test_without_snooping_gross_errors_stay(rng, snoop):
+    simulated = simulate(rng, images=10, points=40, gross_share=0.01, gross_px=5.0)
+    calibration = calibrate_network(simulated.network, replace(QUICK, snoop=snoop), simulated.truth)
+    assert (~calibration.adjustment.used)[simulated.gross].all() == snoop
+
+
+def test_options_that_cannot_be_used_are_refused():
+    for wrong in ({"field": "flat"}, {"loss": "l1"}, {"target": "cross"}, {"per_image": ("y_scale",)}, {"loss_scale": 0.0},
+                  {"false_alarms": 0.0}, {"folds": 1}):  # fmt: skip
+        with pytest.raises(ParameterError, match=next(iter(wrong))):
+            Options(**wrong)

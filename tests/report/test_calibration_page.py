@@ -1,0 +1,429 @@
+"""The page of a calibration: numbers against the records, figures against geometry done by hand, structure against the rules of HTML."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pixmetry.calibration.model import Sensor
+from pixmetry.calibration.network import Adjustment, Calibration, Finding
+from pixmetry.core.errors import InputError
+from pixmetry.report.calibration_figures import (
+    MOST_IN_SMALL,
+    MOST_VECTORS,
+    Residuals,
+    arrows,
+    cell_means,
+    chain,
+    draw_vectors,
+    enlargement,
+    even_choice,
+    image_order,
+    round_number,
+)
+from pixmetry.report.calibration_page import render, write_page
+from pixmetry.report.calibration_plots import bin_means, short
+from pixmetry.report.calibration_space import ellipse, field_map, largest_axis, plan_views, pyramids, seen_from, shown_points
+from pixmetry.report.calibration_tables import gross_errors, parameters, scale_bars
+from pixmetry.report.calibration_text import p_text, projection_levels, sentence, summary_text, typeset, worth
+from report import calibrations
+from report.test_page import Page
+
+LIMIT_BYTES = 5_000_000
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    """Another seed every time; it is printed when a test fails."""
+    seed = np.random.SeedSequence().entropy
+    print(f"seed {seed}")
+    return np.random.default_rng(seed)
+
+
+@pytest.fixture(scope="module")
+def whole() -> Calibration:
+    return calibrations.full(np.random.default_rng())
+
+
+@pytest.fixture(scope="module")
+def source(whole: Calibration) -> str:
+    return render(whole)
+
+
+@pytest.fixture(scope="module")
+def page(source: str) -> Page:
+    return Page(source)
+
+
+def plain(text: str) -> str:
+    """With ordinary spaces, as a `Page` gives its words."""
+    return " ".join(text.split())
+
+
+def with_tests(calibration: Calibration, **records: Any) -> Calibration:
+    return replace(calibration, tests={**calibration.tests, **records})
+
+
+def with_residuals(calibration: Calibration, x_px: float, y_px: float) -> Calibration:
+    """Only what every adjustment has, with residuals of the same size everywhere."""
+    v = calibration.adjustment.residual_px
+    return Calibration(replace(calibration.adjustment, residual_px=np.broadcast_to([x_px, y_px], v.shape).copy()))
+
+
+def residuals(x: np.ndarray, y: np.ndarray, dx: np.ndarray, dy: np.ndarray, image: np.ndarray | None = None) -> Residuals:
+    return Residuals(x, y, dx, dy, np.zeros(len(x), int) if image is None else image, Sensor(1000, 800))
+
+
+def test_the_verdict_comes_first_in_px_and_um(whole: Calibration) -> None:
+    """0.03 and 0.05 px of 5.5 µm pixels are 0.165 and 0.275 µm."""
+    text = worth(with_residuals(whole, 0.03, -0.05), 0).replace("\u00a0", " ")
+    assert "0.030 px (0.165 µm) rms in x and 0.050 px (0.275 µm) in y" in text
+    few = calibrations.full(np.random.default_rng(), images=2)
+    found = Page(render(with_residuals(few, 0.03, -0.05)))
+    assert found.headings[1][1].startswith("1What the calibration is worth")
+    assert "x 0.030 px = 0.165 µm y 0.050 px = 0.275 µm" in found.text
+
+
+def test_projection_uncertainty_in_the_middle_and_in_the_worst_corner() -> None:
+    u = np.full((5, 7), 9.0)
+    u[2, 3], u[0, 0], u[0, -1], u[-1, 0], u[-1, -1] = 0.01, 0.02, 0.03, np.nan, 0.04
+    assert projection_levels({"u_px": u}) == (0.01, 0.04)
+    assert projection_levels({"u_px": np.full((5, 7), np.nan)}) is None
+
+
+def test_every_record_is_on_the_page(whole: Calibration, page: Page) -> None:
+    text = page.text
+    for finding in whole.findings:
+        assert plain(typeset(finding.text)) in text and finding.advice in text
+    assert whole.tests["f_test"]["camera"]["text"] in text
+    dof = [f"{whole.tests['residuals']['camera'][key]:.0f}" for key in ("dof_x", "dof_y")]
+    assert f"in px² 1.31 {dof[0]} and {dof[1]} 1.12 0.00020" in text
+    assert f"in µm² 1.31 {dof[0]} and {dof[1]} 1.12 0.00020" in text
+    assert "Affinity B1 1.200" in text and "from the middle" in text
+    assert "fx 1458.36 ± 0.21" in text
+    assert "radial K1, K2, K3 512 3 and" in text
+    assert "camera: c img_014.tif: Z0 0.97" in text
+    assert "points as given 0.081 0.092 points free 0.039 0.044" in text
+    assert "xp +1.81 0.110 16.5" in text
+    assert "x residuals follow the sub-pixel phase 0.012 ± 0.0011 3.0 × 10⁻⁶ As by sensor.pixel_aperture." in text
+    assert "1003 image points were corrected for the eccentricity of circular targets, by at most 0.023 px." in text
+    assert whole.adjustment.datum in text
+    assert "image_coordinates.csv" in text and "pixmetry calibrate project.yaml" in text and "field = auto" in text
+
+
+def test_gross_errors_are_listed_worst_first(whole: Calibration) -> None:
+    one = dict(whole.tests["gross_errors"][0])
+    records = [{**one, "image": "mild", "statistic": 40.0}, {**one, "image": "awful", "statistic": 900.0}]
+    assert [row[0] for row in gross_errors(records)] == ["awful", "mild"]
+    few = calibrations.full(np.random.default_rng(), images=3)
+    assert "No gross error was found." in Page(render(with_tests(few, gross_errors=[]))).text
+
+
+def test_a_parameter_that_is_not_significant_says_so(whole: Calibration) -> None:
+    records = [dict(r) for r in whole.tests["parameters"]]
+    records[3] |= {"value": 1e-5, "u": 2e-5, "p_zero": 0.62}
+    changed = with_tests(whole, parameters=records)
+    row = next(r for r in parameters(changed, 0) if r["symbol"] == "B1")
+    assert [row[key] for key in ("value", "u", "unit", "p")] == ["1.0", "± 2.0", "10⁻⁵", "0.62, not significant"]
+    assert re.search(r"B1 +1\.0 ± 2\.0 +10⁻⁵ +not significant", summary_text(changed))
+
+
+def test_a_parameter_held_fixed_is_shown_without_u(whole: Calibration) -> None:
+    adjustment = whole.adjustment
+    camera = adjustment.network.cameras[0]
+    free = camera.free.copy()
+    free[4] = False
+    network = replace(adjustment.network, cameras=(replace(camera, free=free),))
+    columns = tuple(name for name in adjustment.free_columns if not name.endswith(":b2"))
+    keep = [i for i, name in enumerate(adjustment.free_columns) if not name.endswith(":b2")]
+    fixed = replace(adjustment, network=network, free_columns=columns, covariance=adjustment.covariance[np.ix_(keep, keep)])
+    row = next(r for r in parameters(Calibration(fixed), 0) if r["symbol"] == "B2")
+    assert [plain(row[key]) for key in ("value", "u", "p")] == ["\u22123.000 × 10⁻⁵", "held fixed", ""]
+    assert "fixed" in summary_text(Calibration(fixed))
+
+
+@pytest.mark.parametrize(
+    ("make", "pitch_um", "cameras"),
+    [(calibrations.bare, 5.5, 1), (calibrations.bare, None, 2), (calibrations.full, None, 1), (calibrations.full, 5.5, 2)],
+)
+def test_the_page_is_whole_for_every_kind(rng: np.random.Generator, make: Any, pitch_um: float | None, cameras: int) -> None:
+    calibration = make(rng, pitch_um=pitch_um, cameras=cameras, images=4 * cameras, points=49, plane=cameras == 2)
+    text = render(calibration)
+    found = Page(text)
+    assert found.open == []
+    ids = [attrs["id"] for _, attrs in found.elements if "id" in attrs]
+    assert len(ids) == len(set(ids))
+    depth = [int(tag[1]) for tag in re.findall(r"<(h[1-6])", text)]
+    assert depth[0] == 1 and depth.count(1) == 1 and all(b <= a + 1 for a, b in zip(depth, depth[1:], strict=False))
+    words = f" {found.text} ".lower()
+    for bad in (" nan", "none ", "inf ", "array(", "{", "}"):
+        assert bad not in words.replace("none was found", ""), bad
+    if pitch_um is None:
+        assert "µm" not in found.text
+    for k in range(cameras):
+        assert calibration.adjustment.network.cameras[k].name in found.text
+    numbers = [int(n) for n in re.findall(r'<span class="no">(\d)</span>', text)]
+    assert numbers == list(range(1, len(numbers) + 1))
+    assert all(href.startswith("data:") for href in re.findall(r'(?:src|href)="([^"#]+)"', text))
+
+
+def test_without_covariance_nothing_is_claimed(rng: np.random.Generator) -> None:
+    plain = calibrations.bare(rng, covariance=False, images=4)
+    text = Page(render(plain)).text
+    assert "The uncertainty of the parameters was not computed." in text
+    assert "±" not in text[text.index("Principal distance") : text.index("Residuals are measured")]
+    none: Any = None
+    nothing = Calibration(replace(plain.adjustment, covariance=none, point_covariance=none))
+    assert "The uncertainty of the points was not computed." in Page(render(nothing)).text
+    assert "nan" not in summary_text(nothing)
+
+
+def test_fixed_points_have_no_ellipsoids(rng: np.random.Generator) -> None:
+    plain = calibrations.bare(rng, plane=True, images=4)
+    assert plan_views(plain.adjustment) == []
+    assert "All points were held at their given coordinates." in Page(render(plain)).text
+
+
+def test_images_and_points_that_are_not_determined_are_left_out(rng: np.random.Generator) -> None:
+    plain = calibrations.bare(rng)
+    adjustment, state = plain.adjustment, plain.adjustment.state
+    position, rotation, xyz = state.position.copy(), state.rotation.copy(), state.xyz.copy()
+    position[2], rotation[2], xyz[7] = np.nan, np.nan, np.nan
+    residual, covariance = adjustment.residual_px.copy(), adjustment.point_covariance.copy()
+    out = (adjustment.network.image == 2) | (adjustment.network.point == 7)
+    residual[out], covariance[7] = np.nan, np.nan
+    changed = replace(
+        adjustment,
+        state=replace(state, position=position, rotation=rotation, xyz=xyz),
+        residual_px=residual,
+        used=adjustment.used & ~out,
+        point_covariance=covariance,
+    )
+    text = Page(render(Calibration(changed))).text
+    assert "1 point is not determined" in text and "nan" not in text.lower()
+    assert len(Residuals.of(changed, 0)) == int((adjustment.used & ~out).sum())
+
+
+def test_a_camera_without_used_coordinates_says_so(rng: np.random.Generator) -> None:
+    plain = calibrations.bare(rng, cameras=2, images=6)
+    adjustment = plain.adjustment
+    second = adjustment.network.camera_of[adjustment.network.image] == 1
+    text = Page(render(Calibration(replace(adjustment, used=adjustment.used & ~second)))).text
+    assert text.count("No image coordinate of this camera took part.") == 1
+
+
+def test_names_from_outside_are_only_text(rng: np.random.Generator) -> None:
+    plain = calibrations.full(rng, images=4)
+    bad = '<script>alert("x")</script>'
+    network = replace(plain.adjustment.network, images=(bad, *plain.adjustment.network.images[1:]))
+    findings = (Finding("start", f"Image {bad} was left out.", "", "warning"),)
+    images = [{**r, "image": network.images[k]} for k, r in enumerate(plain.tests["images"])]
+    changed = replace(with_tests(plain, images=images), adjustment=replace(plain.adjustment, network=network), findings=findings)
+    assert "<script" not in render(changed)
+
+
+def test_many_images_and_points_stay_small(rng: np.random.Generator) -> None:
+    big = calibrations.full(rng, images=300, points=3000, visibility=0.05)
+    text = render(big)
+    assert 1_000_000 < len(text.encode()) < LIMIT_BYTES
+    found = Page(text)
+    assert "Table of the 300 images" in found.text
+    assert f"{len(even_choice(np.arange(int(big.adjustment.used.sum())), MOST_VECTORS))} of them are drawn" in found.text
+    # every image is drawn: its name stands over its small figure
+    assert all(f">{name}</text>" in text for name in big.adjustment.network.images)
+    assert "data:image/png;base64," in text
+
+
+def test_a_page_is_written_whole_and_nothing_else_is_replaced(whole: Calibration, tmp_path: Path, source: str) -> None:
+    path = write_page(whole, tmp_path / "report.html")
+    assert path.read_text(encoding="utf-8") == source  # also: it is the same every time
+    path.write_text("mine")
+    with pytest.raises(InputError):
+        write_page(calibrations.bare(np.random.default_rng(), images=2), path)
+
+
+def test_an_arrow_is_its_vector_enlarged(rng: np.random.Generator) -> None:
+    x, y = rng.uniform(0, 800, (2, 40))
+    dx, dy = rng.normal(0, 0.05, (2, 40))
+    sensor = Sensor(1000, 800)
+    from matplotlib.figure import Figure
+
+    axes = Figure().subplots()
+    factor = draw_vectors(axes, x, y, dx, dy, sensor)
+    drawn = axes.lines[1].get_xydata().reshape(40, 6, 2)
+    np.testing.assert_allclose(drawn[:, 0], np.column_stack([x, y]))
+    np.testing.assert_allclose(drawn[:, 1] - drawn[:, 0], factor * np.column_stack([dx, dy]))
+    # both barbs go back from the tip by the same angle
+    along, left, right = drawn[:, 1] - drawn[:, 0], drawn[:, 2] - drawn[:, 1], drawn[:, 4] - drawn[:, 1]
+    np.testing.assert_allclose((along * left).sum(axis=1), (along * right).sum(axis=1))
+    assert ((along * left).sum(axis=1) < 0).all()
+    # the key has the length that its text says
+    key = axes.lines[2].get_xdata()[1] * (axes.get_xlim()[1] - axes.get_xlim()[0])
+    said = re.match(r"([\d.]+) px, drawn ([\d.]+) times", axes.texts[0].get_text())
+    assert said is not None and float(said[2]) == factor
+    assert key == pytest.approx(factor * float(said[1]))
+    assert axes.get_ylim()[0] > axes.get_ylim()[1]  # y goes down
+
+
+def test_enlargement_is_round_and_puts_long_vectors_at_a_share_of_the_frame(rng: np.random.Generator) -> None:
+    size = 10 ** rng.uniform(-6, 3)
+    angle, length = rng.uniform(0, 2 * np.pi, 500), size * rng.rayleigh(1.0, 500)
+    factor, key = enlargement(length * np.cos(angle), length * np.sin(angle), 1000.0)
+    long = np.percentile(length, 95) * factor / 1000
+    assert 0.06 / 2.5 < long <= 0.06 * (1 + 1e-9)
+    assert 0.6 < key / np.percentile(length, 95) <= 1.5 * (1 + 1e-9)
+    for value in (factor, key):
+        assert round(value / 10.0 ** np.floor(np.log10(value) + 1e-9)) in (1, 2, 5)
+    assert enlargement(np.zeros(3), np.zeros(3), 100.0) == (1.0, 1.0)
+    assert [round_number(v) for v in (0.019, 0.02, 4.99, 5.0, 9.9, 1000.0)] == pytest.approx([0.01, 0.02, 2, 5, 5, 1000])
+
+
+def test_cell_means_are_those_of_a_loop(rng: np.random.Generator) -> None:
+    n = 900
+    r = residuals(rng.uniform(-0.5, 999.5, n), rng.uniform(-0.5, 799.5, n), *rng.normal(0, 1, (2, n)))
+    means = cell_means(r)
+    cell = float(means["cell_px"])
+    expected = []
+    for row in range(int(800 / cell) + 1):
+        for col in range(int(1000 / cell) + 1):
+            inside = [
+                i
+                for i in range(n)
+                if col * cell - 0.5 <= r.x[i] < (col + 1) * cell - 0.5 and row * cell - 0.5 <= r.y[i] < (row + 1) * cell - 0.5
+            ]
+            if len(inside) >= 4:
+                expected.append([np.mean(v[inside]) for v in (r.x, r.y, r.dx, r.dy)] + [len(inside)])
+    found = np.column_stack([means[key] for key in ("x", "y", "dx", "dy", "n")])
+    order, order_expected = np.argsort(found[:, 0] + 1e4 * found[:, 1]), np.argsort([e[0] + 1e4 * e[1] for e in expected])
+    np.testing.assert_allclose(found[order], np.array(expected)[order_expected])
+
+
+def test_images_are_ordered_by_their_rms(rng: np.random.Generator) -> None:
+    image = np.repeat([4, 1, 9], [5, 50, 20])
+    size = np.repeat([0.2, 0.1, 0.3], [5, 50, 20])
+    r = residuals(*rng.uniform(0, 800, (2, 75)), size, -size, image)
+    assert image_order(r).tolist() == [9, 4, 1]
+
+
+def test_bin_means_and_their_uncertainty(rng: np.random.Generator) -> None:
+    at, value = rng.uniform(0, 4, 300), rng.normal(0, 1, 300)
+    at = np.where(at < 1, at + 1, at)  # nothing in the first bin
+    bins = bin_means(at, value, np.array([0.0, 1.0, 2.0, 4.0]))
+    assert len(bins.at) == 2
+    for k, (low, high) in enumerate(((1.0, 2.0), (2.0, 4.0))):
+        v = value[(at >= low) & (at < high)]
+        assert bins.mean[k] == pytest.approx(v.mean())
+        assert bins.u[k] == pytest.approx(v.std(ddof=1) / np.sqrt(len(v)))
+
+
+def test_an_even_choice_holds_no_more_than_asked() -> None:
+    for n in (1, 249, 250, 251, 999, 5000):
+        chosen = even_choice(np.arange(n), MOST_IN_SMALL)
+        assert len(chosen) <= MOST_IN_SMALL and (len(chosen) == n or len(chosen) > MOST_IN_SMALL / 2)
+        assert len(np.unique(np.diff(chosen))) <= 1
+
+
+def test_chained_lines_have_gaps() -> None:
+    line = chain(np.array([1.0, 2.0]), np.array([3.0, 4.0]))
+    np.testing.assert_array_equal(line, [1, 3, np.nan, 2, 4, np.nan])
+    x, _ = arrows(np.zeros(2), np.zeros(2), np.ones(2), np.zeros(2), 3.0)
+    assert np.nanmax(x) == 3.0 and np.isnan(x).sum() == 2
+
+
+def test_a_standard_ellipse_is_where_the_quadratic_form_is_one(rng: np.random.Generator) -> None:
+    half = rng.normal(0, 1, (2, 2))
+    covariance = half @ half.T + 0.01 * np.eye(2)
+    outline = ellipse(covariance)
+    np.testing.assert_allclose(np.einsum("in,ij,jn->n", outline, np.linalg.inv(covariance), outline), 1.0)
+
+
+def test_largest_axis_and_which_ellipses_are_drawn(rng: np.random.Generator) -> None:
+    size = rng.uniform(1, 2, 900)
+    covariance = size[:, None, None] ** 2 * np.diag([0.5, 1.0, 0.2])
+    covariance[3] = np.nan
+    covariance[5] = 0.0
+    found = largest_axis(covariance)
+    good = np.setdiff1d(np.arange(900), [3, 5])
+    np.testing.assert_allclose(found[good], size[good])
+    assert np.isnan(found[3]) and found[5] == 0
+    shown = shown_points(found)
+    assert len(shown) == len(set(shown.tolist())) <= 250 and not {3, 5} & set(shown.tolist())
+    assert set(np.argsort(-np.nan_to_num(found))[:25].tolist()) <= set(shown.tolist())
+
+
+def test_views_keep_lengths_across_the_line_of_sight(rng: np.random.Generator) -> None:
+    azimuth, elevation = rng.uniform(-180, 180), rng.uniform(-80, 80)
+    view = seen_from(azimuth, elevation)
+    np.testing.assert_allclose(view @ view.T, np.eye(2), atol=1e-12)
+    assert view[1, 2] > 0 and view[0, 2] == 0  # Z is up
+    a, e = np.radians([azimuth, elevation])
+    towards = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+    np.testing.assert_allclose(np.cross(view[0], view[1]), towards, atol=1e-12)
+
+
+def test_pyramids_stand_at_the_cameras_and_open_where_they_look(rng: np.random.Generator) -> None:
+    adjustment = calibrations.bare(rng).adjustment
+    edges = pyramids(adjustment, np.array([3]), 10.0)
+    apex, corners = edges[:4, 0], edges[:4, 1]
+    np.testing.assert_allclose(apex, np.broadcast_to(adjustment.state.position[3], (4, 3)))
+    np.testing.assert_allclose(np.linalg.norm(corners - apex, axis=1), 10.0)
+    local = (corners - apex) @ adjustment.state.rotation[3].T
+    assert (local[:, 2] > 0).all()
+    fx, fy = adjustment.camera(0).c_px
+    np.testing.assert_allclose(np.abs(local[:, 0] / local[:, 2]), 1280 / 2 / fx)
+    np.testing.assert_allclose(np.abs(local[:, 1] / local[:, 2]), 1024 / 2 / fy)
+
+
+def test_the_field_is_drawn_in_its_own_axes(rng: np.random.Generator) -> None:
+    """A board in the XZ plane: without its axes all its points would lie on one line."""
+    adjustment = calibrations.bare(rng).adjustment
+    xyz = np.column_stack([rng.uniform(0, 100, 30), np.zeros(30), rng.uniform(0, 60, 30)])
+    points = {"names": [], "xyz": xyz, "dx": np.zeros(30), "dy": np.zeros(30), "dz": rng.normal(0, 1, 30)}
+    points["axes"] = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    picture = field_map(adjustment, points)
+    assert picture is not None and "30 points" in picture.alt and ">Z / mm</text>" in picture.svg
+    assert field_map(adjustment, {**points, "dz": np.full(30, np.nan)}) is None
+
+
+def test_scale_bars_are_measured_less_adjusted(whole: Calibration) -> None:
+    rows = scale_bars(whole)
+    assert [row[3:] for row in rows] == [["+0.013", "1.3"], ["\u22120.0040", "\u22120.4"]] or rows[0][3] == "+0.012"
+    assert rows[0][0] == "P1 – P9"
+
+
+def test_words() -> None:
+    assert [p_text(p) for p in (None, float("nan"), 0.0, 1e-7, 0.0123, 0.5)] == ["–", "–", "<\u200910⁻⁶", "<\u200910⁻⁶", "0.012", "0.50"]
+    assert typeset("moved by -1.25 px, +3 px (p = 1.5e-10), a-b and 2-3") == (
+        "moved by \u22121.25 px, +3 px (p = 1.5\u2009×\u200910⁻¹⁰), a-b and 2-3"
+    )
+    assert [sentence(t) for t in ("", "x is noisier", "variance of x.")] == ["", "x is noisier.", "Variance of x."]
+    assert [short(r) for r in (0.974, -0.974, -0.999, 0.05)] == [".97", "\u2212.97", "\u22121.00", ".05"]
+
+
+def test_the_summary_fits_a_terminal(whole: Calibration) -> None:
+    text = summary_text(whole)
+    assert max(len(line) for line in text.splitlines()) <= 100
+    assert "\u00a0" not in text and "\u2009" not in text
+    assert worth(whole, 0).replace("\u00a0", " ") in " ".join(text.split())
+    assert all(f.text in " ".join(text.split()) for f in whole.findings)
+    for name in ("c", "xp", "yp", "B1", "B2", "P1", "P2", "K1", "K2", "K3"):
+        assert re.search(rf"^  {name} +[\u2212\d.]+ ± [\d.]+", text, re.M)
+
+
+def test_sigma0_says_what_it_is_compared_with(whole: Calibration) -> None:
+    known: Adjustment = replace(whole.adjustment, network=replace(whole.adjustment.network, covariance_known=True))
+    assert "1 would mean" in summary_text(Calibration(known))
+    assert "no covariance of the image coordinates was given" in " ".join(summary_text(whole).split())
+
+
+def test_importing_the_page_loads_neither_matplotlib_nor_jinja() -> None:
+    heavy = ("matplotlib", "jinja2", "scipy", "numba")
+    code = f"import sys, pixmetry.report.calibration_page; print([m for m in {heavy} if m in sys.modules])"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip() == "[]"

@@ -1,0 +1,362 @@
+"""``pixmetry calibrate`` as a user types it: from a project to a folder of results, read back; and one clear error for bad input."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import json
+import os
+import re
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+from scipy.stats import chi2
+
+import pixmetry
+from calibration.networks import Simulated, simulate
+from pixmetry.calibration.model import NAMES
+from pixmetry.calibration.network import Calibration, Network
+from pixmetry.calibration_files import TEXTS, write_results
+from pixmetry.calibration_project.schema import ProjectModel
+from pixmetry.calibration_record import packed, read_calibration, unpacked
+from pixmetry.cli import main
+from pixmetry.core.config import load_yaml, validate
+from pixmetry.core.errors import InputError
+from report.calibrations import full
+from test_calibration_images import COLS, FOCAL, ROWS, View, chessboard
+
+DOCS = Path(__file__).resolve().parents[1] / "docs" / "calibrating.md"
+SOURCE = Path(pixmetry.__file__).parent
+FALSE_FAILURE = 1e-6
+FILES = {"report.html", "calibration.json", "points.csv", "poses.csv", "residuals.csv"}
+
+
+def run(*arguments: object) -> Result:
+    return CliRunner().invoke(main, ["calibrate", *(str(a) for a in arguments)])
+
+
+def refused(result: Result, *words: str) -> None:
+    assert result.exit_code == 2, result.output
+    assert "Traceback" not in result.output
+    lines = [line for line in result.output.splitlines() if line.startswith("error: ")]
+    assert len(lines) == 1, result.output
+    for word in words:
+        assert word in lines[0], result.output
+
+
+def table(path: Path, header: str, *columns: object) -> None:
+    rows = zip(*columns, strict=True)
+    path.write_text("\n".join([header, *(",".join(v if isinstance(v, str) else f"{v:.12g}" for v in row) for row in rows)]) + "\n")
+
+
+def project(folder: Path, network: Network, more: str = "", mm: bool = False) -> Path:
+    """A network as the project and tables that a user would write."""
+    sensor = network.cameras[0].sensor
+    assert sensor.pitch_x_um is not None and sensor.pitch_y_um is not None
+    names = [network.images[i] for i in network.image], [network.points[p] for p in network.point]
+    x, y, header = network.x_px, network.y_px, "image,point,x_px,y_px"
+    if mm:  # from the middle of the frame, y up
+        header = header.replace("px", "mm")
+        x = (x - (sensor.cols - 1) / 2) * sensor.pitch_x_um / 1000
+        y = ((sensor.rows - 1) / 2 - y) * sensor.pitch_y_um / 1000
+    table(folder / "observations.csv", header, *names, x, y)
+    bars = network.bars
+    ends = [[network.points[p] for p in end] for end in (bars.start, bars.end)]
+    table(folder / "bars.csv", "from,to,length,u", *ends, bars.length, bars.u)
+    path = folder / "project.yaml"
+    path.write_text(
+        "schema: pixmetry/calibration/1\nname: a test\n"
+        f"cameras: {{cols: {sensor.cols}, rows: {sensor.rows}, pitch_um: {sensor.pitch_x_um}, c_mm: 8}}\n"
+        f"observations: {{table: observations.csv, u_px: {float(np.sqrt(network.covariance_px2[0, 0]))!r}}}\n"
+        f"scale_bars_table: bars.csv\n{more}"
+    )
+    return path
+
+
+@pytest.fixture(scope="module")
+def simulated() -> Simulated:
+    seed = np.random.SeedSequence().entropy
+    print(f"seed {seed}")
+    return simulate(np.random.default_rng(seed), images=12, points=40, bars=2)
+
+
+@pytest.fixture(scope="module")
+def done(simulated: Simulated, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Result]:
+    folder = tmp_path_factory.mktemp("calibrate")
+    path = project(folder, simulated.network)
+    return folder, path, run(path, "-o", folder / "result")
+
+
+def test_a_project_gives_a_folder_of_results(done: tuple[Path, Path, Result]) -> None:
+    folder, _, result = done
+    assert result.exit_code == 0, result.output
+    assert {p.name for p in (folder / "result").iterdir() if not p.name.startswith(".")} == FILES
+    assert f"report: {folder / 'result' / 'report.html'}" in result.output
+    assert "<!DOCTYPE html>" in (folder / "result" / "report.html").read_text()[:200]
+
+
+def test_the_camera_covers_its_truth(done: tuple[Path, Path, Result], simulated: Simulated) -> None:
+    """Mahalanobis distance of ten parameters against chi²; a wrong sign, unit or order of them would be hundreds of sigma."""
+    stored = read_calibration(done[0] / "result")
+    names, covariance = stored.interior_covariance()
+    at = [NAMES.index(name) for name in names]
+    off = (stored.cameras[0].values - simulated.truth.interior[0])[at]
+    # sigma0 of about 700 degrees of freedom is known to 3 %, so F and chi² hardly differ
+    assert len(names) == 10 and off @ np.linalg.solve(covariance, off) < 1.5 * chi2.isf(FALSE_FAILURE, 10)
+    assert 0.7 < stored.sigma0 < 1.35
+
+
+def test_millimetres_with_y_up_give_the_same_camera(done: tuple[Path, Path, Result], simulated: Simulated, tmp_path: Path) -> None:
+    calibration = pixmetry.calibrate(project(tmp_path, simulated.network, mm=True))
+    stored = read_calibration(done[0] / "result")
+    u = np.sqrt(np.diag(stored.interior_covariance()[1]))
+    off = (calibration.adjustment.state.interior[0] - stored.cameras[0].values)[:10]
+    assert np.abs(off / u).max() < 1e-3  # the last digits of the table
+
+
+def test_a_network_in_python_gives_the_same(done: tuple[Path, Path, Result], simulated: Simulated) -> None:
+    calibration = pixmetry.calibrate(simulated.network)
+    stored = read_calibration(done[0] / "result")
+    u = np.sqrt(np.diag(stored.interior_covariance()[1]))
+    assert np.abs((calibration.adjustment.state.interior[0] - stored.cameras[0].values)[:10] / u).max() < 1e-3
+
+
+def test_where_it_comes_from_is_told(done: tuple[Path, Path, Result]) -> None:
+    folder, path, _ = done
+    about = read_calibration(folder / "result").provenance
+    digests = {record["name"]: record["sha256"] for record in about["inputs"]}
+    assert digests == {p.name: hashlib.sha256(p.read_bytes()).hexdigest() for p in (path, folder / "observations.csv", folder / "bars.csv")}
+    assert about["pixmetry"] == pixmetry.__version__ and about["options"]["loss"] == "huber" and about["name"] == "a test"
+    assert str(folder) not in (folder / "result" / "calibration.json").read_text()
+
+
+def test_results_are_input_again(done: tuple[Path, Path, Result], simulated: Simulated, tmp_path: Path) -> None:
+    """The tables of points and residuals as the points and observations of another project: held points, the same camera."""
+    folder = done[0]
+    text = done[1].read_text().replace("{table: observations.csv", f"{{table: {folder}/result/residuals.csv")
+    text = re.sub(r"scale_bars_table: .*\n", f"points: {{table: {folder}/result/points.csv, known: weighted}}\n", text)
+    (tmp_path / "again.yaml").write_text(text)
+    again = pixmetry.calibrate(tmp_path / "again.yaml")
+    stored = read_calibration(folder / "result")
+    u = np.sqrt(np.diag(stored.interior_covariance()[1]))
+    assert np.abs((again.adjustment.state.interior[0] - stored.cameras[0].values)[:10] / u).max() < 1
+
+
+def test_fewer_parameters_and_terms_of_images(simulated: Simulated, tmp_path: Path) -> None:
+    path = project(tmp_path, simulated.network)
+    result = run(path, "-o", tmp_path / "r", "--free", "c,xp,yp,k1,k2", "--per-image", "x_scale", "--folds", 0, "--json")
+    assert result.exit_code == 0, result.output
+    told = json.loads(result.output)
+    (camera,) = told["cameras"]
+    assert camera["covariance"]["names"] == ["c", "xp", "yp", "k1", "k2"] and told["report"].endswith("report.html")
+    stored = read_calibration(tmp_path / "r")
+    assert any(name.endswith(":x_scale") for name in stored.columns) and "hold_out" not in stored.tests
+    with (tmp_path / "r" / "poses.csv").open() as file:
+        rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
+    assert len(rows) == 12 and all(float(row["u_x_scale"]) > 0 for row in rows)
+
+
+def test_an_earlier_result_is_replaced_and_nothing_else(done: tuple[Path, Path, Result], simulated: Simulated, tmp_path: Path) -> None:
+    path = project(tmp_path, simulated.network)
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "a.jpg").write_text("x")
+    refused(run(path, "-o", tmp_path / "photos"), "a.jpg", "choose another folder")
+    assert {p.name for p in (tmp_path / "photos").iterdir()} == {"a.jpg"}
+    again = path.read_text().replace("{table: observations.csv", "{table: result/residuals.csv")
+    (done[0] / "again.yaml").write_text(again)
+    refused(run(done[0] / "again.yaml", "-o", done[0] / "result"), "holds a file of the project", "residuals.csv")
+
+
+def test_pictures_of_a_board_alone(tmp_path: Path) -> None:
+    """Drawn without distortion by a pinhole of known focal length; u is that of the located corners with sigma0."""
+    rng = np.random.default_rng()
+    for k, (roll, tilt_x, tilt_y) in enumerate([(3, 0, 8), (85, 25, -10), (4, -28, 8), (178, 12, 30), (2, -10, -32), (-88, 20, 24)]):
+        frame = View((3.0, 2.0), 11.5, roll, tilt_x, tilt_y).frame(chessboard(7, 5), rng)
+        np.save(tmp_path / f"board_{k}.npy", frame)
+    options = ("--kind", "chessboard", "--grid", "7x5", "--pitch-mm", 20, "--free", "c,xp,yp", "--direction", "object_to_image")
+    result = run(*sorted(tmp_path.glob("*.npy")), *options, "-o", tmp_path / "r")
+    assert result.exit_code == 0, result.output
+    stored = read_calibration(tmp_path / "r")
+    names, covariance = stored.interior_covariance()
+    off = stored.cameras[0].values[:3] - [FOCAL, (COLS - 1) / 2, (ROWS - 1) / 2]
+    # 4.9 for chance, 2.1 for a drawing of 16 samples a pixel; u is 0.05 px in c and 0.025 px in xp, yp
+    assert names == ("c", "xp", "yp") and np.abs(off / np.sqrt(np.diag(covariance))).max() < 7
+    assert np.sqrt(np.diag(covariance)).max() < 0.2
+    assert stored.images == tuple(f"board_{k}.npy" for k in range(6)) and len(stored.points) == 35
+    assert np.allclose(np.ptp(stored.xyz, axis=0)[:2], [120, 80], rtol=1e-3)
+
+
+# --- files, from a calibration made by hand ---------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def by_hand() -> Calibration:
+    found = full(np.random.default_rng())
+    lower = np.tril(found.adjustment.covariance)  # symmetric to the last bit, as what is stored
+    return replace(found, adjustment=replace(found.adjustment, covariance=lower + np.tril(lower, -1).T))
+
+
+def test_inverse_read_after_write(by_hand: Calibration, tmp_path: Path) -> None:
+    a = by_hand.adjustment
+    write_results(by_hand, tmp_path / "r")
+    for path in (tmp_path / "r", tmp_path / "r" / "calibration.json"):
+        stored = read_calibration(path)
+        assert stored.images == a.network.images and stored.points == a.network.points and stored.columns == a.free_columns
+        for found, true in (
+            (stored.cameras[0].values, a.state.interior[0]),
+            (stored.rotation, a.state.rotation),
+            (stored.position, a.state.position),
+            (stored.xyz, a.state.xyz),
+            (stored.covariance, a.covariance),
+            (stored.point_covariance, a.point_covariance),
+        ):
+            assert np.allclose(found, true, rtol=1e-12, atol=0, equal_nan=True)
+        names, covariance = stored.interior_covariance()
+        assert names == a.interior_covariance()[0] and np.allclose(covariance, a.interior_covariance()[1], rtol=1e-12)
+        assert [f.text for f in stored.findings] == [f.text for f in by_hand.findings]
+        assert (stored.sigma0, stored.dof, stored.datum) == (a.sigma0, a.dof, a.datum)
+
+
+def test_any_symmetric_matrix_comes_back_bit_for_bit() -> None:
+    half = np.random.default_rng().normal(size=(7, 7)) * 10.0 ** np.arange(-12, 9, 3)
+    matrix = half + half.T
+    assert np.array_equal(unpacked(json.loads(json.dumps(packed(matrix)))), matrix)
+
+
+def test_an_image_a_point_and_a_camera_of_one_name(by_hand: Calibration, tmp_path: Path) -> None:
+    """Photos are numbered, so are points and cameras: the camera's covariance holds its own parameters only."""
+    a = by_hand.adjustment
+    network = replace(
+        a.network,
+        cameras=(replace(a.network.cameras[0], name="1"),),
+        images=("1", *a.network.images[1:]),
+        points=("1", *a.network.points[1:]),
+    )
+    columns = tuple(re.sub("^camera:", "1:", name) for name in a.free_columns) + ("1:rx", "1:X")
+    covariance = np.eye(len(columns))
+    covariance[: len(a.covariance), : len(a.covariance)] = a.covariance
+    renamed = replace(by_hand, adjustment=replace(a, network=network, free_columns=columns, covariance=covariance))
+    write_results(renamed, tmp_path / "r")
+    assert read_calibration(tmp_path / "r").interior_covariance()[0] == a.interior_covariance()[0]
+
+
+def test_numbers_that_are_not_finite_stay_strict_json(by_hand: Calibration) -> None:
+    a = by_hand.adjustment
+    xyz = a.state.xyz.copy()
+    xyz[3] = np.nan
+    lost = replace(by_hand, adjustment=replace(a, state=replace(a.state, xyz=xyz)), tests={**by_hand.tests, "x": np.inf})
+    record = json.loads(TEXTS["calibration.json"](lost), parse_constant=lambda name: pytest.fail(name))
+    assert record["points"]["xyz"][3] == [None] * 3 and record["tests"]["x"] is None
+    assert TEXTS["points.csv"](lost).splitlines()[5].startswith(f"{a.network.points[3]},,,,")
+
+
+@pytest.mark.parametrize("text", ["", "{}", '{"schema": "pixmetry/results/1"}', '{"schema": "pixmetry/calibration-result/1"}', "[1]"])
+def test_another_file_is_no_calibration(tmp_path: Path, text: str) -> None:
+    (tmp_path / "calibration.json").write_text(text)
+    with pytest.raises(InputError, match="calibration") as caught:
+        read_calibration(tmp_path)
+    assert "calibration.json" in str(caught.value) and "to do" in str(caught.value)
+    with pytest.raises(InputError, match="cannot be read"):
+        read_calibration(tmp_path / "none.json")
+
+
+# --- bad input --------------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ((), ("PROJECT.yaml|IMAGES", "calibrate --help")),
+        (("none.yaml",), ("none.yaml", "cannot be read")),
+        (("none.png", "--grid", "9x6", "--pitch-mm", "25"), ("none.png", "missing")),
+        (("empty.yaml",), ("empty.yaml", "the project is empty", "schema: pixmetry/calibration/1")),
+        (("campaign.yaml",), ("campaign.yaml, line 1", "a file of another kind", "pixmetry/calibration/1")),
+        (("good.yaml", "a.png"), ("good.yaml", "one project, or pictures")),
+        (("good.yaml", "--grid", "9x6"), ("grid", "has no meaning with a project file")),
+        (("good.yaml", "--free", "c,f"), ("free", "'f'", "k5")),
+        (("good.yaml", "--free", "xp,yp"), ("c of camera 'camera' is to be held",)),
+        (("good.yaml", "--per-image", "y_scale"), ("per_image", "x_shift")),
+        (("good.yaml", "--field", "wrong"), ("--field", "auto")),
+        (("good.yaml", "--folds", "1"), ("folds", "2 and more")),
+        (("good.yaml", "-o", "good.yaml"), ("good.yaml", "is a file")),
+    ],
+)
+def test_bad_input_is_told_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], words: tuple[str, ...]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "empty.yaml").write_text("")
+    (tmp_path / "campaign.yaml").write_text("schema: pixmetry/campaign/1\n")
+    (tmp_path / "good.yaml").write_text("schema: pixmetry/calibration/1\ncameras: {cols: 64, rows: 48}\nobservations: o.csv\n")
+    (tmp_path / "o.csv").write_text("image,point,x_px,y_px\na,1,2,3\n")
+    before = sorted(tmp_path.iterdir())
+    refused(run(*arguments), *words)
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_one_image_is_not_a_network(tmp_path: Path, simulated: Simulated) -> None:
+    network = simulated.network
+    one = network.image == 0
+    alone = replace(network, x_px=network.x_px[one], y_px=network.y_px[one], image=network.image[one], point=network.point[one])
+    path = project(tmp_path, alone)
+    result = run(path, "-o", tmp_path / "r")
+    refused(result, "image")
+    assert not (tmp_path / "r").exists()
+
+
+# --- the page of documentation ----------------------------------------------------------------------------------------------------
+
+
+def test_the_projects_of_the_page_are_valid(tmp_path: Path) -> None:
+    blocks = re.findall(r"^```yaml\n(.*?)^```", DOCS.read_text(), re.M | re.S)
+    assert len(blocks) == 3
+    for text in blocks:
+        (tmp_path / "p.yaml").write_text(text)
+        data = load_yaml(tmp_path / "p.yaml")
+        if isinstance(data["cameras"], dict):
+            data["cameras"] = [data["cameras"]]
+        validate(ProjectModel, data, "docs")
+
+
+def test_the_page_names_every_key_and_no_other() -> None:
+    def keys(model: type, head: str = "") -> set[str]:
+        found: set[str] = set()
+        for name, field in model.model_fields.items():
+            key = f"{head}{field.alias or name}"
+            inner = [part for part in re.findall(r"schema\.(\w+)", repr(field.annotation))]
+            found |= {key} | (keys(getattr(sys.modules[model.__module__], inner[0]), f"{key}.") if inner else set())
+        return found
+
+    section = DOCS.read_text().partition("## Every key")[2].partition("## Columns")[0]
+    told = {key for row in re.findall(r"^\| (`.*?) \|", section, re.M) for key in re.findall(r"`([a-z0-9_.]+)`", row)}
+    told |= set(re.findall(r"or `([a-z0-9_.]+)` with", section)) | set(re.findall(r"with `([a-z0-9_.]+)`", section))
+    allowed = keys(ProjectModel)
+    assert told == allowed, told ^ allowed
+
+
+def test_the_messages_of_the_page_are_those_of_the_program() -> None:
+    section = DOCS.read_text().partition("## What the messages mean")[2]
+    messages = re.findall(r"^\| `(.*?)` \|", section, re.M)
+    files = [SOURCE / "calibrating.py", SOURCE / "core" / "config.py"]
+    files += [path for part in ("calibration_project", "campaign") for path in (SOURCE / part).glob("*.py")]
+    text = " ".join(path.read_text() for path in files)
+    assert len(messages) > 15
+    for message in messages:
+        pattern = ".{1,60}".join(re.escape(part) for part in re.split("…", message))
+        assert re.search(pattern, text), message
+
+
+def test_the_door_stays_open(tmp_path: Path) -> None:
+    """`pixmetry calibrate --help` loads none of the heavy libraries."""
+    code = (
+        "import atexit, sys\nsys.argv = ['pixmetry', 'calibrate', '--help']\n"
+        "atexit.register(lambda: print('MODULES', *sys.modules))\n"
+        "from pixmetry.cli import main; main()"
+    )
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, env=os.environ.copy()).stdout
+    assert not {"numpy", "numba", "pydantic", "scipy"} & set(said.partition("MODULES")[2].split())

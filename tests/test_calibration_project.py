@@ -1,0 +1,282 @@
+"""Project files and tables: the network that they mean, whatever unit, origin or delimiter, and one clear error for each mistake."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pixmetry.calibration.network import Network
+from pixmetry.calibration_project import load_project
+from pixmetry.core.errors import InputError
+
+COLS, ROWS, PITCH_UM = 640, 480, (5.0, 6.0)
+PLACES = {
+    ("a", "1"): (100.25, 50.5),
+    ("a", "2"): (600.0, 50.0),
+    ("b", "1"): (20.0, 470.0),
+    ("b", "2"): (319.5, 239.5),
+    ("b", "7"): (0.0, 479.0),
+}
+Form = Callable[[float, float], tuple[float, ...]]
+CAMERA = f"cameras: {{cols: {COLS}, rows: {ROWS}, pitch_x_um: {PITCH_UM[0]}, pitch_y_um: {PITCH_UM[1]}, c_mm: 8}}\n"
+
+
+def write(folder: Path, project: str, **tables: str) -> Path:
+    for name, text in tables.items():
+        (folder / f"{name}.csv").write_text(text)
+    path = folder / "project.yaml"
+    path.write_text(f"schema: pixmetry/calibration/1\n{project}")
+    return path
+
+
+def rows(header: str = "image,point,x_px,y_px", form: Form = lambda x, y: (x, y), mark: str = ",") -> str:
+    lines = [mark.join([image, point, *(f"{v:.9f}" for v in form(x, y))]) for (image, point), (x, y) in PLACES.items()]
+    return "\n".join([header.replace(",", mark), *lines]) + "\n"
+
+
+def network(folder: Path, project: str, **tables: str) -> Network:
+    return load_project(write(folder, CAMERA + project, **tables)).network
+
+
+def places(found: Network) -> dict[tuple[str, str], tuple[float, float]]:
+    names = [(found.images[i], found.points[p]) for i, p in zip(found.image, found.point, strict=True)]
+    return dict(zip(names, zip(found.x_px.tolist(), found.y_px.tolist(), strict=True), strict=True))
+
+
+def same_places(found: Network) -> bool:
+    return all(np.allclose(places(found)[key], at, atol=1e-6) for key, at in PLACES.items()) and len(found) == len(PLACES)
+
+
+def refused(folder: Path, project: str, *words: str, **tables: str) -> InputError:
+    with pytest.raises(InputError) as caught:
+        load_project(write(folder, project, **tables))
+    for word in words:
+        assert word in str(caught.value), str(caught.value)
+    return caught.value
+
+
+@pytest.mark.parametrize("mark", [",", ";", "\t", "  ", ", "])
+def test_any_delimiter_comments_and_blank_lines(tmp_path: Path, mark: str) -> None:
+    text = "# from another program\n\n" + rows(mark=mark).replace("\nb", "\n# the second image\n\nb", 1)
+    assert same_places(network(tmp_path, "observations: o.csv\n", o=text))
+
+
+MM = tuple(p / 1000 for p in PITCH_UM)
+
+
+@pytest.mark.parametrize(
+    ("coordinates", "header", "form"),
+    [
+        # each form written out by hand from where the origin is
+        ("{}", "x_px,y_px", lambda x, y: (x, y)),
+        ("{y: up}", "x_px,y_px", lambda x, y: (x, 479 - y)),
+        ("{origin: corner}", "x_px,y_px", lambda x, y: (x + 0.5, y + 0.5)),
+        ("{origin: corner, y: up}", "x_px,y_px", lambda x, y: (x + 0.5, 479.5 - y)),
+        ("{origin: centre}", "x_px,y_px", lambda x, y: (x - 319.5, y - 239.5)),
+        ("{}", "x_mm,y_mm", lambda x, y: ((x - 319.5) * MM[0], (239.5 - y) * MM[1])),
+        ("{unit: mm, origin: centre, y: up}", "x_mm,y_mm", lambda x, y: ((x - 319.5) * MM[0], (239.5 - y) * MM[1])),
+        ("{y: down}", "x_mm,y_mm", lambda x, y: ((x - 319.5) * MM[0], (y - 239.5) * MM[1])),
+        ("{origin: corner, y: down}", "x_mm,y_mm", lambda x, y: ((x + 0.5) * MM[0], (y + 0.5) * MM[1])),
+        ("{}", "x_um,y_um", lambda x, y: ((x - 319.5) * 1000 * MM[0], (239.5 - y) * 1000 * MM[1])),
+    ],
+)
+def test_any_unit_and_origin(tmp_path: Path, coordinates: str, header: str, form: Form) -> None:
+    table = rows(f"image,point,{header}", form)
+    assert same_places(network(tmp_path, f"observations: o.csv\nimage_coordinates: {coordinates}\n", o=table))
+
+
+def test_columns_by_their_names_or_their_order(tmp_path: Path) -> None:
+    theirs = rows("photo,id,col,row")
+    assert same_places(
+        network(tmp_path, "observations: {table: o.csv, columns: {image: photo, point: id, x_px: col, y_px: row}}\n", o=theirs)
+    )
+    bare = rows("", lambda x, y: (7.0, x, y)).strip() + "\n"
+    assert same_places(network(tmp_path, "observations: {table: o.csv, columns: [image, point, '-', x_px, y_px]}\n", o=bare))
+
+
+def test_covariances_in_pixels_and_millimetres(tmp_path: Path) -> None:
+    px = network(tmp_path, "observations: o.csv\n", o=rows("image,point,x_px,y_px,u_x_px,u_y_px", lambda x, y: (x, y, 0.03, 0.05)))
+    assert np.allclose(px.covariance_px2, [9e-4, 0, 25e-4]) and px.covariance_known
+    header = "image,point,x_mm,y_mm,var_x_mm2,cov_xy_mm2,var_y_mm2"
+    mm = network(tmp_path, "observations: o.csv\n", o=rows(header, lambda x, y: (0.1, 0.2, 1e-8, 5e-9, 4e-8)))
+    # y turns round, so the covariance does; 5 µm and 6 µm a pixel
+    assert np.allclose(mm.covariance_px2, [1e-8 / 25e-6, -5e-9 / 30e-6, 4e-8 / 36e-6])
+    told = network(tmp_path, "observations: {table: o.csv, u_px: 0.04}\n", o=rows())
+    assert np.allclose(told.covariance_px2, [16e-4, 0, 16e-4]) and told.covariance_known
+    assert not network(tmp_path, "observations: o.csv\n", o=rows()).covariance_known
+
+
+POINTS = "point X Y Z\n7 1 2 3\n1 0 0 0\n2 10 0 0.5\n9 5 5 5\n"
+
+
+@pytest.mark.parametrize(
+    ("known", "u", "field"),
+    [
+        ("known: fixed", 0.0, "fixed"),
+        ("known: free", np.inf, "free"),
+        ("known: nominal", 0.0, None),
+        ("u: 0.02", 0.02, None),
+    ],
+)
+def test_what_is_known_of_points(tmp_path: Path, known: str, u: float, field: str | None) -> None:
+    path = write(tmp_path, CAMERA + f"observations: o.csv\npoints: {{table: p.csv, {known}}}\n", o=rows(), p=POINTS)
+    project = load_project(path)
+    at = dict(zip(project.network.points, project.network.xyz.tolist(), strict=True))
+    assert at == {"1": [0, 0, 0], "2": [10, 0, 0.5], "7": [1, 2, 3]}
+    assert (project.network.u_xyz == u).all() and project.options.get("field") == field
+    assert "9" in project.findings[0].text
+
+
+def test_weighted_points_are_fixed_free_or_between(tmp_path: Path) -> None:
+    points = "point,X,Y,Z,u_X,u_Y,u_Z\n1,0,0,0,0,0,0\n2,1,0,0,0.1,0.1,0.2\n7,0,1,0,,,\n"
+    found = network(tmp_path, "observations: o.csv\npoints: p.csv\n", o=rows(), p=points)
+    u = dict(zip(found.points, found.u_xyz.tolist(), strict=True))
+    assert u == {"1": [0, 0, 0], "2": [0.1, 0.1, 0.2], "7": [np.inf] * 3}
+
+
+def test_bars_targets_and_terms_of_images(tmp_path: Path) -> None:
+    project = (
+        "observations: o.csv\npoints: {table: p.csv, known: free}\nscale_bars:\n- {from: 1, to: 2, length: 10.01, u: 0.002}\n"
+        "scale_bars_table: b.csv\ntarget: {diameter: 0.5, normal: [0, 0, 2]}\nper_image: x_scale, x_shift\nunit: m\n"
+    )
+    points = "point,X,Y,Z,diameter\n1,0,0,0,\n2,10,0,0,0.7\n"
+    found = network(tmp_path, project, o=rows(), p=points, b="from;to;length;u\n2;7;3.5;0.01\n")
+    names = np.array(found.points)
+    bars = zip(names[found.bars.start], names[found.bars.end], found.bars.length, found.bars.u, strict=True)
+    assert [tuple(bar) for bar in bars] == [("1", "2", 10.01, 0.002), ("2", "7", 3.5, 0.01)]
+    assert dict(zip(found.points, found.diameter, strict=True)) == {"1": 0.5, "2": 0.7, "7": 0.5}
+    assert (found.normal == [0, 0, 1]).all() and found.per_image == ("x_scale", "x_shift") and found.unit == "m"
+
+
+def test_several_cameras_and_times(tmp_path: Path) -> None:
+    cameras = (
+        "cameras:\n- {name: left, cols: 640, rows: 480, c_px: 900, free: 'c, xp, yp'}\n"
+        "- {name: right, cols: 800, rows: 480, direction: object_to_image, k1: -0.2}\n"
+    )
+    images = "image,camera,time_s\nb,left,2.5\na,right,1\nunused,left,0\n"
+    found = load_project(write(tmp_path, cameras + "observations: o.csv\nimages: i.csv\n", o=rows(), i=images)).network
+    assert found.images == ("a", "b") and found.camera_of.tolist() == [1, 0] and found.time_s is not None
+    assert found.time_s.tolist() == [1.0, 2.5]
+    left, right = found.cameras
+    assert left["c"] == 900 and left.free.sum() == 3 and right["c"] == 0 and right["k1"] == -0.2 and right["xp"] == 399.5
+    assert (left.direction, right.direction) == ("image_to_object", "object_to_image")
+
+
+def test_a_camera_by_name_brings_its_pixels(tmp_path: Path) -> None:
+    found = load_project(write(tmp_path, "cameras: {camera: imx264_like}\nobservations: o.csv\n", o=rows())).network
+    sensor = found.cameras[0].sensor
+    assert (sensor.cols, sensor.rows) == (2448, 2048) and sensor.pitch_x_um == pytest.approx(3.45)
+
+
+def test_a_table_of_located_targets_is_one_of_observations(tmp_path: Path) -> None:
+    """What `pixmetry locate` writes, with a column for the names of points."""
+    header = "image,target,x_px,y_px,var_x_px2,cov_xy_px2,var_y_px2,radius_px,u_radius_px,code,flags"
+    text = f"# pixmetry located\n{header}\na,0,1.5,2.5,0.01,0.001,0.02,3,0.1,17,border|faint\n"
+    found = network(tmp_path, "observations: {table: o.csv, columns: {point: code}}\n", o=text)
+    assert found.points == ("17",) and np.allclose(found.covariance_px2, [0.01, 0.001, 0.02])
+
+
+GOOD = CAMERA + "observations: o.csv\n"
+
+
+@pytest.mark.parametrize(
+    ("project", "words"),
+    [
+        ("", ("project.yaml", "'cameras' is missing")),
+        (CAMERA, ("observations", "pictures", "to do")),
+        (GOOD + "observation: x.csv\n", ("line 4", "unknown key 'observation'", "did you mean `observations`?")),
+        (GOOD.replace("c_mm: 8", "c: 8"), ("line 2", "'cameras.1.c'", "c_mm")),
+        (GOOD.replace("c_mm: 8", "c_mm: '8 mm'"), ("line 2", "not a number", "8 mm")),
+        (GOOD.replace("c_mm: 8", "c_mm: .nan"), ("line 2", "c_mm")),
+        (GOOD.replace("c_mm: 8", "free: [c, f]"), ("line 2", "free")),
+        (GOOD.replace("c_mm: 8", "free: [xp, yp]"), ("c is to be held", "c_mm or c_px")),
+        ("cameras: {cols: 640, rows: 480, c_mm: 8}\nobservations: o.csv\n", ("c_mm, but no pitch", "pitch_um")),
+        ("cameras: {cols: 640}\nobservations: o.csv\n", ("line 2", "cols and rows")),
+        ("cameras: {c_px: 800}\nobservations: o.csv\n", ("size of the frame is missing", "cols and rows")),
+        ("cameras: {camera: no_such}\nobservations: o.csv\n", ("line 2", "no_such")),
+        (CAMERA + "observations: missing.csv\n", ("line 3", "'missing.csv' is missing", "to do")),
+        (GOOD + "points: {table: o.csv}\n", ("o.csv", "'X' is missing", "X, Y, Z")),
+        (GOOD + "unit: furlong\n", ("line 4", "unit", "inch")),
+        (GOOD + "scale_bars:\n- {from: 1, to: 2, length: 10 mm, u: 0.1}\n", ("line 5", "length")),
+        (GOOD + "scale_bars:\n- {from: 1, to: 2, length: 10}\n", ("line 5", "u' is missing")),
+        (GOOD + "scale_bars:\n- {from: 1, to: 2, length: 10, u: 1}\n- {from: 1, to: 99, length: 1, u: 1}\n", ("line 6", "'99'", "1, 2, 7")),
+        (GOOD + "scale_bars:\n- {from: 1, to: 1, length: 10, u: 1}\n", ("line 5", "itself")),
+        (GOOD + "options: {losses: huber}\n", ("line 4", "losses", "loss")),
+        (GOOD + "pictures: {files: a.png}\n", ("two sources",)),
+        (GOOD + "per_image: [y_scale]\n", ("line 4", "per_image", "x_scale")),
+        (GOOD + "image_coordinates: {unit: mm}\n", ("in px, the project says mm", "o.csv")),
+        (GOOD + "target: {normal: [0, 0, 0]}\n", ("normal without direction",)),
+        (GOOD.replace("cameras: {", "cameras: {name: x, ") + "images: o.csv\n", ("listed twice", "o.csv, lines 2 and 3")),
+    ],
+)
+def test_a_mistake_in_the_project_is_told(tmp_path: Path, project: str, words: tuple[str, ...]) -> None:
+    refused(tmp_path, project, *words, o=rows())
+
+
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        ("", ("empty",)),
+        ("# nothing\n\n", ("empty",)),
+        ("image,point,x_px,y_px\n", ("no row",)),
+        (rows().partition("\n")[2], ("line 1", "no header", "columns:")),
+        (rows("image,point,x_px,y"), ("'y_px' is missing", "image, point, x_px, y", "write `y_px` for `y`")),
+        (rows("image,name,x_px,y_px"), ("'point' is missing",)),
+        (rows("image,point,x,y"), ("no image coordinates", "x_mm and y_mm", "image, point, x, y")),
+        (rows("image,point,x_px,x_px"), ("line 1", "two columns")),
+        (rows() + "c,1,12.5\n", ("line 7", "a row of 3 values")),
+        (rows() + "c,1,12.5,x\n", ("line 7", "'y_px' is not a number", "'x'")),
+        (rows() + "c,1,12.5,\n", ("line 7", "'y_px' is empty")),
+        (rows() + "c,1,nan,3\n", ("line 7", "x_px", "finite")),
+        (rows() + "c,,1,3\n", ("line 7", "'point' is empty")),
+        (rows(mark=";") + "c;1;12,5;3\n", ("line 7", "12.5", "point")),
+        (rows() + "a,1,12.5,3\n", ("lines 2 and 7", "'1' is measured twice in image 'a'")),
+        (rows() + "c,1,640.0,3000\n", ("line 7", "outside of the frame of 640 x 480", "origin")),
+        (rows("image,point,x_px,y_mm"), ("several units",)),
+        (rows("image,point,x_px,y_px,u_x_px,u_y_px", lambda x, y: (x, y, 0.1, 0.0)), ("line 2", "u_y_px", "above 0")),
+        (rows("image,point,x_px,y_px,u_x", lambda x, y: (x, y, 0.1)), ("u_x", "unknown kind", "u_x_px")),
+        (rows("image,point,x_px,y_px,var_x_px2,cov_xy_px2,var_y_px2", lambda x, y: (x, y, 1, 1, 1)), ("line 2", "determinant")),
+    ],
+)
+def test_a_mistake_in_a_table_is_told(tmp_path: Path, table: str, words: tuple[str, ...]) -> None:
+    refused(tmp_path, GOOD, "o.csv", *words, o=table)
+
+
+@pytest.mark.parametrize(
+    ("points", "more", "words"),
+    [
+        ("point,X,Y,Z\n1,0,0,0\n1,1,1,1\n", "", ("lines 2 and 3", "'1' is listed twice")),
+        ("point,X,Y,Z\n1,0,inf,0\n", "", ("line 2", "finite")),
+        ("point,X,Y,Z\nP1,0,0,0\n", "", ("no point of the table is seen", "1, 2, 7")),
+        ("point,X,Y,Z,u_X,u_Y,u_Z\n1,0,0,0,-1,0,0\n", "", ("line 2", "u_X", "at least 0")),
+        ("point,X,Y,Z,u_X\n1,0,0,0,1\n", "", ("'u_Y' is missing",)),
+        ("point,X,Y,Z\n1,0,0,0\n", "", ("how well", "known: fixed", "nominal", "free", "to do: add")),
+        ("point,X,Y,Z\n1,0,,0\n", "known: free", ("line 2", "some of its coordinates")),
+        ("point,X,Y,Z\n1,0,0,0\n", "known: weighted", ("no uncertainty", "u_X, u_Y, u_Z")),
+        ("point,X,Y,Z\n1,0,0,0\n", "known: fixed, u: 0.1", ("known: weighted",)),
+        ("point,X,Y,Z,normal_x,normal_y,normal_z\n1,0,0,0,0,0,0\n", "known: fixed", ("line 2", "direction")),
+        ("point,X,Y,Z,diameter\n1,0,0,0,-4\n", "known: fixed", ("line 2", "diameter")),
+        ("point,X,Y,Z\n1,0,0,0\n2,0.01,0,0\n", "known: nominal", ("project.yaml, line 5", "0.01 apart", "unit of the points")),
+    ],
+)
+def test_a_mistake_about_points_is_told(tmp_path: Path, points: str, more: str, words: tuple[str, ...]) -> None:
+    bars = "scale_bars: [{from: 1, to: 2, length: 10, u: 0.1}]\n"
+    refused(tmp_path, GOOD + f"points: {{table: p.csv, {more}}}\n{bars}", *words, o=rows(), p=points)
+
+
+@pytest.mark.parametrize(
+    ("images", "words"),
+    [
+        ("image,camera\na,left\n", ("'b' is not in the table of images", "o.csv, line 4")),
+        ("image,camera\na,left\nb,middle\n", ("i.csv, line 3", "'middle'", "left, right")),
+        ("image\na\nb\n", ("'camera' is missing",)),
+        ("image,camera,time_s\na,left,1\nb,left,\n", ("line 3", "time_s")),
+    ],
+)
+def test_a_mistake_about_images_is_told(tmp_path: Path, images: str, words: tuple[str, ...]) -> None:
+    cameras = "cameras:\n- {name: left, cols: 640, rows: 480}\n- {name: right, cols: 640, rows: 480}\n"
+    refused(tmp_path, cameras + "observations: o.csv\nimages: i.csv\n", *words, o=rows(), i=images)
+    refused(tmp_path, cameras + "observations: o.csv\n", "which image is of which", o=rows())
