@@ -228,7 +228,6 @@ def test_corners_of_squares_cover_their_truth(rng: np.random.Generator) -> None:
     assert np.abs(d).max() < 0.3
     var_x, cov, var_y = seen.covariance_px2.T
     mahalanobis = (var_y * d[:, 0] ** 2 - 2 * cov * d[:, 0] * d[:, 1] + var_x * d[:, 1] ** 2) / (var_x * var_y - cov**2)
-    print("M", mahalanobis.mean() / 2, np.sqrt(var_x.mean()))
     assert 0.66 < mahalanobis.mean() / 2 < 1.34
 
 

@@ -88,6 +88,12 @@ def test_any_unit_and_origin(tmp_path: Path, coordinates: str, header: str, form
     assert same_places(network(tmp_path, f"observations: o.csv\nimage_coordinates: {coordinates}\n", o=table))
 
 
+def test_upper_and_lower_case_of_columns_do_not_matter(tmp_path: Path) -> None:
+    points = "Point,x,y,z,U_x,u_y,u_Z\n1,1,2,3,0.1,0.2,0.3\n"
+    found = network(tmp_path, "observations: o.csv\npoints: p.csv\n", o=rows("Image,POINT,X_px,Y_PX"), p=points)
+    assert same_places(found) and found.xyz[0].tolist() == [1, 2, 3] and found.u_xyz[0].tolist() == [0.1, 0.2, 0.3]
+
+
 def test_columns_by_their_names_or_their_order(tmp_path: Path) -> None:
     theirs = rows("photo,id,col,row")
     assert same_places(
@@ -118,7 +124,7 @@ POINTS = "point X Y Z\n7 1 2 3\n1 0 0 0\n2 10 0 0.5\n9 5 5 5\n"
         ("known: fixed", 0.0, "fixed"),
         ("known: free", np.inf, "free"),
         ("known: nominal", 0.0, None),
-        ("u: 0.02", 0.02, None),
+        ("u: 0.02", 0.02, "fixed"),
     ],
 )
 def test_what_is_known_of_points(tmp_path: Path, known: str, u: float, field: str | None) -> None:
@@ -131,7 +137,7 @@ def test_what_is_known_of_points(tmp_path: Path, known: str, u: float, field: st
 
 
 def test_weighted_points_are_fixed_free_or_between(tmp_path: Path) -> None:
-    points = "point,X,Y,Z,u_X,u_Y,u_Z\n1,0,0,0,0,0,0\n2,1,0,0,0.1,0.1,0.2\n7,0,1,0,,,\n"
+    points = "point,X,Y,Z,u_X,u_Y,u_Z\n7,0,1,0,,,\n8,0,0,0,5,5,5\n2,1,0,0,0.1,0.1,0.2\n1,0,0,0,0,0,0\n"
     found = network(tmp_path, "observations: o.csv\npoints: p.csv\n", o=rows(), p=points)
     u = dict(zip(found.points, found.u_xyz.tolist(), strict=True))
     assert u == {"1": [0, 0, 0], "2": [0.1, 0.1, 0.2], "7": [np.inf] * 3}
@@ -163,6 +169,11 @@ def test_several_cameras_and_times(tmp_path: Path) -> None:
     left, right = found.cameras
     assert left["c"] == 900 and left.free.sum() == 3 and right["c"] == 0 and right["k1"] == -0.2 and right["xp"] == 399.5
     assert (left.direction, right.direction) == ("image_to_object", "object_to_image")
+
+
+def test_a_principal_distance_in_pixels_is_along_x(tmp_path: Path) -> None:
+    found = load_project(write(tmp_path, CAMERA.replace("c_mm: 8", "c_px: 1600") + "observations: o.csv\n", o=rows())).network
+    assert found.cameras[0]["c"] == pytest.approx(8.0)  # 1600 pixels of 5 µm
 
 
 def test_a_camera_by_name_brings_its_pixels(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -28,7 +29,7 @@ from pixmetry.core.camera import Camera, Element, in_order
 from pixmetry.core.catalogue import catalogue
 from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.core.estimates import Estimates
-from pixmetry.core.observations import Observations
+from pixmetry.core.observations import CameraGeometry, Observations
 from pixmetry.emva.evaluate import standard_values
 from pixmetry.emva.records import Measurement, Results
 from pixmetry.experiment.observe import Group, observe
@@ -47,6 +48,7 @@ def assess(
     *,
     target: str = "",
     estimator: str = "",
+    calibration: str | Path | CameraGeometry | None = None,
     trials: int = 4000,
     seed: int = 1,
     progress: Progress | None = None,
@@ -61,6 +63,8 @@ def assess(
         Folder for ``report.html``, ``results.json``, ``maps.zarr.zip`` and ``camera.yaml``.
     target, estimator : str
         As on the command line, e.g. ``"disc:diameter=7,blur=0.7,peak=0.6"`` and ``"soft_threshold:sigma=3,window=13"``.
+    calibration : path or CameraGeometry, optional
+        A ``calibration.json`` of the camera, with which positions are corrected: its uncertainty and what it leaves over enter the budget.
     trials : int
         Windows for each Monte Carlo of the budget.
     seed : int
@@ -82,8 +86,12 @@ def assess(
     what_target = parse_target(target) if target else Target()
     what_estimator = parse_estimator(estimator) if estimator else Estimator()
     frames = campaign if isinstance(campaign, Campaign) else load_campaign(campaign)
+    geometry = None if calibration is None else _geometry_for(frames, calibration)
     told = progress or (lambda what, done, of: None)
     hashes, seen = observe_campaign(frames, told)
+    seen = replace(seen, geometry=geometry)
+    if isinstance(calibration, str | Path):
+        hashes.add_file(Path(calibration))
     standard = by_the_standard(frames, seen)
     estimates, unmeasured = measure_sources(seen)
     camera = digital_twin(frames, estimates, seen)
@@ -95,6 +103,7 @@ def assess(
         None,
         what_target,
         what_estimator,
+        geometry=geometry,
         accepted=[e.name for e in camera.active if e.name in unmeasured and e.source.measure is not None],
         trials=trials,
         seed=seed,
@@ -108,6 +117,19 @@ def assess(
         write_results(assessment, output)
         told("writing the report", 1, 1)
     return assessment
+
+
+def _geometry_for(campaign: Campaign, calibration: str | Path | CameraGeometry) -> CameraGeometry:
+    """The calibrated geometry of a campaign's camera; refused where the pitches say that it is another camera's."""
+    from pixmetry.calibrated import calibrated_geometry
+
+    geometry, facts = calibrated_geometry(calibration), campaign.camera
+    theirs = tuple(geometry.lens[n].value for n in ("pitch_x_um", "pitch_y_um"))
+    ours = None if facts.pitch_x_um is None else (facts.pitch_x_um, facts.pitch_y_um or facts.pitch_x_um)
+    if ours is not None and not np.allclose(theirs, ours, rtol=1e-6):
+        remedy = "give the calibration of this camera"
+        raise InputError("a calibration with another pixel pitch", where=str(calibration), value=theirs, allowed=str(ours), remedy=remedy)
+    return geometry
 
 
 def write_results(assessment: Assessment, directory: str | Path) -> Path:

@@ -1,15 +1,64 @@
-"""A camera with the geometry that a calibration found: its preset takes the lens and the affinity over."""
+"""A calibration in use: what it says of a camera's geometry, and the preset that takes lens and affinity over."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
+from pixmetry.calibration.geometry import geometry_of
+from pixmetry.calibration.network import Calibration
+from pixmetry.calibration_record import StoredCalibration, read_calibration
 from pixmetry.core.camera import Camera, Element
 from pixmetry.core.catalogue import get_source
 from pixmetry.core.errors import InputError
 from pixmetry.core.observations import AFFINITY, LENS, TAKEN_UP, CameraGeometry, Observations
+
+
+def calibrated_geometry(
+    calibration: str | Path | StoredCalibration | Calibration | CameraGeometry, camera: str | None = None
+) -> CameraGeometry:
+    """What a calibration says of one camera, in the parameters of the error sources.
+
+    The systematic part of its residuals is what they have beyond the noise that the image coordinates came with. Where these came without
+    their noise it cannot be told apart, and the residuals count in full.
+
+    Parameters
+    ----------
+    calibration : path, StoredCalibration, Calibration or CameraGeometry
+        A ``calibration.json``, or what was read or calibrated.
+    camera : str, optional
+        Name of the camera; may be left out if there is one.
+
+    Returns
+    -------
+    CameraGeometry
+
+    Raises
+    ------
+    InputError
+        If the calibration cannot be read, has no such camera, or was made without a pixel pitch.
+    """
+    if isinstance(calibration, CameraGeometry):
+        return calibration
+    if isinstance(calibration, str | Path):
+        calibration = read_calibration(calibration)
+    if isinstance(calibration, Calibration):
+        adjusted = calibration.adjustment
+        models = tuple(adjusted.camera(k) for k in range(len(adjusted.network.cameras)))
+        covariances = [adjusted.interior_covariance(k) for k in range(len(models))]
+    else:
+        adjusted, models = calibration, calibration.cameras
+        covariances = [calibration.interior_covariance(k) for k in range(len(models))]
+    names = [m.name for m in models]
+    if camera is None and len(names) > 1 or camera is not None and camera not in names:
+        raise InputError("which camera of the calibration is not clear", value=camera, allowed=", ".join(names))
+    k = 0 if camera is None else names.index(camera)
+    record, grid = calibration.tests["residuals"][names[k]], calibration.tests["projection"][names[k]]
+    left = [np.sqrt(max(record[f"rms_{a}_px"] ** 2 - (record.get(f"noise_{a}_px") or 0.0) ** 2, 0.0)) for a in "xy"]
+    u = float(np.sqrt(np.nanmean(np.asarray(grid["u_px"], float) ** 2)))
+    return geometry_of(models[k], *covariances[k], dof=adjusted.dof, u_px=(u, u), left_px=(float(left[0]), float(left[1])))
 
 
 def calibrated_camera(camera: Camera, geometry: CameraGeometry) -> Camera:

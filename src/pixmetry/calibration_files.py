@@ -104,7 +104,8 @@ def residuals_csv(calibration: Calibration) -> str:
     }
     if a.redundancy is not None:
         columns |= {"redundancy_x": a.redundancy[:, 0], "redundancy_y": a.redundancy[:, 1]}
-    return _csv([f"{PIXELS}; residual: measured less computed; image coordinates of centres, without eccentricity; variances as they were used"], columns)
+    text = "residual: measured less computed; image coordinates of centres, without eccentricity; variances as they were used"
+    return _csv([PIXELS, text], columns)
 
 
 # A new text file of the results needs a line here.

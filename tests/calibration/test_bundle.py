@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from calibration.networks import disturbed, predicted, simulate
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from calibration.networks import disturbed, predicted, simulate
 from pixmetry.calibration import bundle_covariance, bundle_system
 from pixmetry.calibration.bundle import adjust
 from pixmetry.calibration.network import Network, ScaleBars, State
@@ -131,7 +132,7 @@ CASES = {
     "weighted control": (dict(bars=0), {j: (0.05, 0.02, 0.1) for j in range(4)}),
     "one weighted point and one height": (dict(bars=1), {2: (0.03, 0.05, 0.0), 7: (inf, inf, 0.1)}),
     "one fixed point": (dict(bars=0), {3: (0.0, 0.0, 0.0)}),
-    "three cameras": (dict(bars=1, cameras=3, images=9), None),
+    "three cameras": (dict(bars=1, cameras=3, images=12), None),
     "per image": (dict(bars=2, per_image=("x_scale", "x_shift"), cameras=2, images=10), None),
     "object to image": (dict(bars=2, direction="object_to_image"), None),
 }  # fmt: skip
@@ -202,7 +203,7 @@ def _interior(free) -> list[str]:
     return [("c", "xp", "yp", "b1", "b2", "p1", "p2", "k1", "k2", "k3", "k4", "k5")[i] for i in free]
 
 
-def _close(found: np.ndarray, expected: np.ndarray, tolerance: float = 1e-4) -> None:
+def _close(found: np.ndarray, expected: np.ndarray, tolerance: float = 1e-3) -> None:
     """Covariances, each element against the standard deviations that it joins."""
     u = np.sqrt(np.diagonal(expected))
     assert (np.abs(found - expected) <= tolerance * np.outer(u, u) + 1e-300).all()
@@ -355,3 +356,15 @@ def test_stops_where_it_is_told_to(rng):
     assert early.iterations == 1 and early.notes and early.covariance.shape == (0, 0)
     with pytest.raises(MeasureError, match="no minimum"):
         adjust(simulated.network, start, max_iterations=1)
+
+
+def test_no_matrix_of_points_by_points(rng):
+    """3000 points: their joint covariance would take 648 MB."""
+    simulated = simulate(rng, images=8, points=3000)
+    start = disturbed(rng, simulated)
+    adjust(simulated.network, start)
+    tracemalloc.start()
+    adjust(simulated.network, start, redundancy=True)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 60e6

@@ -108,9 +108,10 @@ def turned_away(error: np.ndarray, interior, direction, u, v) -> np.ndarray:
 
 
 def test_stat_projection_map_covers_repeated_calibrations(rng):
-    """120 calibrations of one network: squared errors of the projection over the map's variance average to 1, raw and without rotation.
+    """120 calibrations of one network: squared errors of the projection over the map's variance average to 1: raw, without rotation,
+    and in the middle, where hardly anything is left without it.
 
-    Each of the 120 means has one degree of freedom or more, so their mean is held against χ² of 120. Uncertainties wrong by 35 % would be
+    Each of the 120 values has one degree of freedom or more, so their mean is held against χ² of 120. Uncertainties wrong by 35 % would be
     caught, and the raw map taken for the other (fivefold) at once.
     """
     simulated = simulate(rng, images=8, points=40)
@@ -124,8 +125,9 @@ def test_stat_projection_map_covers_repeated_calibrations(rng):
         error = np.stack(distorted(found.state.interior[0], SENSOR, "image_to_object", u, v), axis=1) - aim
         row = [error, turned_away(error, truth, "image_to_object", u, v)]
         maps = record["u_raw_px"], record["u_px"]
-        ratios.append([np.mean(np.sum(e**2, axis=1) / (2 * m.ravel() ** 2)) for e, m in zip(row, maps, strict=True)])
+        z2 = [np.sum(e**2, axis=1) / (2 * m.ravel() ** 2) for e, m in zip(row, maps, strict=True)]
+        ratios.append([z2[0].mean(), z2[1].mean(), z2[1][len(u) // 2]])
     assert record["u_px"].shape == (7, 9) and (record["u_px"] < record["u_raw_px"]).all()
-    low, high = stats.chi2.ppf([RATE / 4, 1 - RATE / 4], 120) / 120
+    low, high = stats.chi2.ppf([RATE / 6, 1 - RATE / 6], 120) / 120
     mean = np.mean(ratios, axis=0)
     assert ((mean > low) & (mean < high)).all(), mean

@@ -11,17 +11,12 @@ from scipy.spatial.transform import Rotation
 
 from calibration.adjusted import NOISE_PX, adjusted, measured_again, shifted
 from calibration.networks import image_of, predicted, simulate
+from pixmetry.calibration import hold_out
 from pixmetry.calibration.bundle import adjust
 from pixmetry.calibration.hold_out import LeftOut, hold_out_record, left_out, resect, subset
 from pixmetry.core.errors import InputError
 
 RATE = 1e-6
-
-
-def even_noise(rng, exact):
-    """Noise of one length in all directions: no residual is so large that a robust weight falls below 1."""
-    angle = rng.uniform(0, 2 * np.pi, len(exact))
-    return NOISE_PX * np.sqrt(2) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
 def posed_by_scipy(network, state, i, used):
@@ -40,10 +35,11 @@ def posed_by_scipy(network, state, i, used):
     return rows, optimize.least_squares(residual, np.zeros(6), xtol=1e-15, ftol=1e-15, gtol=1e-15, x_scale="jac").fun.reshape(-1, 2)
 
 
-def test_pose_is_that_of_scipy(rng):
+def test_pose_is_that_of_scipy(rng, monkeypatch):
+    """Least squares: robust weights are off."""
+    monkeypatch.setattr(hold_out, "TUNING", np.inf)
     simulated = simulate(rng, images=5, points=40, known="fixed")
-    exact = predicted(simulated.network, simulated.truth)
-    network = shifted(measured_again(rng, simulated, exact, 0.0), *even_noise(rng, exact).T)
+    network = measured_again(rng, simulated)
     start = replace(simulated.truth, position=simulated.truth.position * 1.01)
     used = np.ones(len(network), bool)
     found, residual = resect(network, start, used)
@@ -75,11 +71,11 @@ def test_own_x_scale_is_fitted_too(rng):
     assert np.abs(residual).max() < 1e-6
 
 
-def test_left_out_is_leaving_one_out_by_hand(rng):
-    """As many folds as images, points fixed: the same residuals as from an adjustment of the others and SciPy's pose."""
+def test_left_out_is_leaving_one_out_by_hand(rng, monkeypatch):
+    """As many folds as images, points fixed, least squares: residuals as from an adjustment of the others and SciPy's pose."""
+    monkeypatch.setattr(hold_out, "TUNING", np.inf)
     simulated = simulate(rng, images=6, points=50, known="fixed")
-    exact = predicted(simulated.network, simulated.truth)
-    network = shifted(measured_again(rng, simulated, exact, 0.0), *even_noise(rng, exact).T)
+    network = measured_again(rng, simulated)
     used = rng.random(len(network)) > 0.05
     whole = adjusted(network, simulated, used=used)
     found = left_out(whole, folds=20)
@@ -98,7 +94,8 @@ def test_subset_keeps_names_and_coordinates(rng):
     network = replace(simulated.network, time_s=np.arange(6.0))
     keep = np.array([True, False, True, True, False, True])
     part, state, kept = subset(network, simulated.truth, keep)
-    assert part.images == tuple(np.array(network.images)[keep]) and list(part.time_s) == [0, 2, 3, 5] and list(part.camera_of) == [0, 0, 1, 1]
+    assert part.images == tuple(np.array(network.images)[keep])
+    assert list(part.time_s) == [0, 2, 3, 5] and list(part.camera_of) == [0, 0, 1, 1]
     np.testing.assert_allclose(predicted(part, state), predicted(network, simulated.truth)[kept])
     assert [part.images[i] for i in part.image] == [network.images[i] for i in network.image[kept]]
 

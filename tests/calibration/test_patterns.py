@@ -44,7 +44,8 @@ def test_added_term_is_what_an_adjustment_with_it_finds(rng, known):
     names, covariance = full.interior_covariance()
     u = np.sqrt(covariance[names.index("b1"), names.index("b1")])
     squares = [part.sigma0**2 * part.dof for part in (without, full)]
-    assert term.values[0] == pytest.approx(full.camera()["b1"], abs=0.03 * u) and np.sqrt(term.covariance[0, 0]) == pytest.approx(u, rel=0.01)
+    assert term.values[0] == pytest.approx(full.camera()["b1"], abs=0.03 * u)
+    assert np.sqrt(term.covariance[0, 0]) == pytest.approx(u, rel=0.01)
     assert term.f == pytest.approx((squares[0] - squares[1]) / full.sigma0**2, rel=0.02, abs=0.02)
     assert term.p == pytest.approx(stats.f.sf(term.f, 1, full.dof), rel=1e-6)
 
@@ -195,4 +196,15 @@ def test_findings_come_with_a_source_of_the_catalogue():
     ]
     findings = pattern_findings(made)
     assert [f.kind for f in findings] == ["radius", "phase_x"] and findings[0].text == "radius (as by optics.distortion)"
-    assert findings[0].advice == "Do this."
+    assert findings[0].advice == "Do this." and {f.level for f in findings} == {"warning"}
+
+
+def test_drift_makes_its_shadows_notes():
+    made = [
+        {"name": name, "camera": "a", "p": p, "significant": True, "text": name, "source": MEANING[name][1], "advice": "do this"}
+        for p, name in enumerate([*MEANING][::-1])
+    ]
+    findings = pattern_findings(made)
+    kinds = ["x_scale_drift", "x_scale_drift", "image_rms", "principal_distance_trend", "principal_point_trend"]
+    assert [f.kind for f in findings] == kinds
+    assert [f.level for f in findings] == ["warning", "warning", "note", "note", "note"] and "shadow" in findings[2].advice

@@ -35,8 +35,8 @@ def by_hand(residual: np.ndarray, covariance_px2: np.ndarray, redundancy: np.nda
     covariance = matrix * np.outer(u, u)
     used = np.ones(n, bool)
     return Adjustment(
-        network, state, used, residual, np.ones(n), 1.0, 2 * n - 5, columns, covariance, np.zeros((n, 3, 3)), redundancy, None, "fixed", 1, ()
-    )
+        network, state, used, residual, np.ones(n), 1.0, 2 * n - 5, columns, covariance, np.zeros((n, 3, 3)), redundancy, None, "", 1, ()
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize(("ratio", "p"), [(1.279, 0.036), (1.373, 0.010)])
@@ -56,8 +56,8 @@ def test_f_test_against_the_incomplete_beta_function(rng):
 def test_unit_of_the_f_test_follows_the_pitch(rng):
     """Equal in px, pitches 8.6 and 8.3 µm: the ratio in µm² is their ratio squared."""
     residual = np.repeat([[0.04, 0.04], [-0.04, -0.04]], 200, axis=0)
-    record = quality.f_test_records(by_hand(residual, np.tile([0.0016, 0, 0.0016], (400, 1)), np.ones((400, 2)), Sensor(500, 500, 8.6, 8.3)))
-    record = record["camera"]
+    made = by_hand(residual, np.tile([0.0016, 0, 0.0016], (400, 1)), np.ones((400, 2)), Sensor(500, 500, 8.6, 8.3))
+    record = quality.f_test_records(made)["camera"]
     assert record["ratio_px2"] == pytest.approx(1) and record["p_px"] == pytest.approx(0.5)
     assert record["ratio_um2"] == pytest.approx((8.6 / 8.3) ** 2) and record["p_um"] < record["p_px"]
     assert record["dof_x"] == record["dof_y"] == pytest.approx(400) and record["side"] == "x noisier than y"

@@ -12,7 +12,7 @@ from calibration.networks import image_of, predicted, simulate
 from pixmetry.calibration.model import NAMES
 from pixmetry.calibration.network import Calibration, ScaleBars
 from pixmetry.calibration.solve import Options, calibrate_network
-from pixmetry.core.errors import ParameterError
+from pixmetry.core.errors import InputError, MeasureError, ParameterError
 
 RATE = 1e-6  # false failures of each statistical test
 QUICK = Options(folds=0)
@@ -67,6 +67,9 @@ def test_records_hold_what_report_and_files_are_made_of(rng):
     assert calibration.provenance["options"]["false_alarms"] == 0.01
     assert calibration.tests["hold_out"]["fixed"] is None and calibration.tests["hold_out"]["free"]["left_out_rms_px"] < 0.06
     assert "datum" in kinds(calibration)
+    residuals = calibration.tests["residuals"]["camera"]
+    for axis in "xy":  # the noise was given rightly: nothing is left over
+        assert residuals[f"rms_{axis}_px"] == pytest.approx(residuals[f"noise_{axis}_px"], rel=5 / np.sqrt(2 * residuals[f"dof_{axis}"]))
 
 
 def test_a_board_that_is_not_flat_is_set_free(rng):
@@ -121,6 +124,22 @@ def test_scales_that_nobody_needs_are_called_so(rng):
     named = [f for f in calibration.findings if f.kind in ("significance", "x_scale_drift", "x_shift") and "images'" in f.text]
     assert len(named) == 2
     assert all((f.kind == "significance") == ("not significant" in f.text) for f in named)
+
+
+def test_an_x_shift_that_is_not_determined_is_named_with_its_image(rng):
+    """Straight before a board, a shift of the image is a shift of the camera, but for the distortion that goes with it."""
+    straight = dict.fromkeys(NAMES[3:10], 0.0)
+    simulated = simulate(rng, images=10, points=60, field="plane", known="fixed", bars=0, interior=straight)
+    truth = simulated.truth
+    rotation, position = truth.rotation.copy(), truth.position.copy()
+    rotation[3], position[3] = np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 1800.0]
+    truth = replace(truth, rotation=rotation, position=position)
+    camera = replace(simulated.network.cameras[0], free=np.isin(NAMES, ["c", "xp", "yp"]))
+    measured = measured_anew(rng, simulated, rotation=rotation, position=position)
+    network = replace(measured, per_image=("x_scale", "x_shift"), cameras=(camera,))
+    with pytest.raises(MeasureError, match="x_shift of image IMG_0004: .*leave x_shift out"):
+        calibrate_network(network, QUICK, truth)
+    assert calibrate_network(replace(network, per_image=("x_scale",)), QUICK, truth).adjustment.used.sum() > len(network) - 3
 
 
 def area_centres(simulated, diameter: float) -> np.ndarray:
@@ -205,6 +224,40 @@ def test_two_bars_that_contradict_each_other_are_both_doubted(rng):
     assert (calibration.adjustment.network.bars.u > 1).all() and calibration.adjustment.used.sum() > len(network) - 3
     found, limit = distance(calibration, simulated)
     assert found < limit
+
+
+def test_a_bar_in_other_units_is_left_out_or_refused(rng):
+    simulated = simulate(rng, images=12, points=40, bars=3)
+    bars = simulated.network.bars
+    inch = ScaleBars(bars.start, bars.end, bars.length / [25.4, 1, 1], bars.u)
+    calibration = calibrate_network(replace(simulated.network, bars=inch), QUICK)
+    assert calibration.findings[0].kind == "gross_scale_bar" and len(calibration.adjustment.network.bars) == 2
+    assert distance(calibration, simulated)[0] < distance(calibration, simulated)[1]
+    two = ScaleBars(*(values[:2] for values in (inch.start, inch.end, inch.length, inch.u)))
+    with pytest.raises(InputError, match="scale bars contradict"):
+        calibrate_network(replace(simulated.network, bars=two), QUICK, simulated.truth)
+
+
+def test_a_wrong_fixed_point_is_set_free_and_its_images_stay(rng):
+    """3 mm, some 5 px in every image of it."""
+    simulated = simulate(rng, images=12, points=50, known="fixed", bars=0)
+    xyz = simulated.network.xyz.copy()
+    xyz[7, 0] += 3.0
+    calibration = calibrate_network(replace(simulated.network, xyz=xyz), QUICK)
+    first = calibration.findings[0]
+    assert first.kind == "gross_control_point" and f" {simulated.network.points[7]} " in first.text
+    assert np.isinf(calibration.adjustment.network.u_xyz[7]).all() and (calibration.adjustment.network.u_xyz[:7] == 0).all()
+    assert calibration.tests["known"]["control_points"]["gross"][0]["error"] == pytest.approx(3.0, abs=0.3)
+    assert calibration.adjustment.used.sum() > len(simulated.network) - 3
+    assert distance(calibration, simulated)[0] < distance(calibration, simulated)[1]
+
+
+def test_exact_image_coordinates_are_no_trouble(rng):
+    simulated = simulate(rng, images=10, points=40, noise_px=1e-9)
+    network = replace(simulated.network, covariance_px2=np.tile([0.01, 0.0, 0.01], (len(simulated.network), 1)))
+    calibration = calibrate_network(network, QUICK)
+    assert calibration.adjustment.used.all()
+    np.testing.assert_allclose(calibration.adjustment.state.interior, simulated.truth.interior, rtol=1e-3, atol=1e-4)
 
 
 def test_a_wrong_control_point_is_set_free(rng):

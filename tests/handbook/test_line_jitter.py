@@ -12,7 +12,9 @@ from scipy.stats import chi2, norm
 from pixmetry.calibration.plumb_line import calibrate_lines
 from pixmetry.calibration.row_jitter import RowVariance, Sampling
 from pixmetry.handbook import line_jitter as experiment
-from pixmetry.handbook.line_jitter import AVERAGED, JITTERS_NS, LENSES, PIXEL_NS, VIEWS, key, stored
+from pixmetry.handbook import line_jitter_frames as frames
+from pixmetry.handbook.line_jitter import JITTERS_NS, PIXEL_NS, key, stored
+from pixmetry.handbook.line_jitter_frames import AVERAGED, LENSES, VIEWS
 
 RATE = 1e-6
 QUICK = (1, 0, 2)
@@ -53,9 +55,9 @@ def test_one_pair_of_frames_tells_the_jitter(run, again) -> None:
 
 def test_the_grabber_shifts_rows_by_what_was_drawn() -> None:
     """Two frames that differ only in the jitter, against the truth of the chain: gain within 3 %, hardly anything else in between."""
-    camera, scene, seed = experiment.camera_of(QUICK, 5.0), experiment.scene_of(QUICK, False), 77
-    both = (camera, experiment.camera_of(QUICK, 0.0))
-    shaken, still = (experiment.locate(c.expose(scene, 1, seed, threads=1, temperature_c=40.0).data[0], False) for c in both)
+    camera, scene, seed = frames.camera_of(QUICK, 5.0), frames.scene_of(QUICK, False), 77
+    both = (camera, frames.camera_of(QUICK, 0.0))
+    shaken, still = (frames.locate(c.expose(scene, 1, seed, threads=1, temperature_c=40.0).data[0], False) for c in both)
     told = camera.truth(0, seed)["grabber.line_jitter"]["row_shift_px"][0]
     rows = shaken.y_px[0].astype(int)
     drawn = -np.mean([told[rows + k] for k in (-1, 0, 1)], axis=0)
@@ -126,13 +128,13 @@ def test_the_bow_of_the_sensor_is_taken_for_a_lens() -> None:
     """With a flat sensor K1 is the lens' own, within 5 u; the chain's bow shifts it by several."""
     found = {}
     for flat in (False, True):
-        camera = experiment.camera_of(QUICK, 0.0)
+        camera = frames.camera_of(QUICK, 0.0)
         camera = camera.switched(off=["sensor.unflatness"]) if flat else camera
-        frames = [camera.expose(experiment.scene_of(QUICK, k == 1), 1, 5 + k, threads=1, temperature_c=40.0).data[0] for k in (0, 1)]
-        pair = [experiment.locate(frame, k == 1) for k, frame in enumerate(frames)]
+        shown = [camera.expose(frames.scene_of(QUICK, k == 1), 1, 5 + k, threads=1, temperature_c=40.0).data[0] for k in (0, 1)]
+        pair = [frames.locate(frame, k == 1) for k, frame in enumerate(shown)]
         x, y = (np.concatenate([getattr(p, name).ravel() for p in pair]) for name in ("x_px", "y_px"))
         wire, image = np.tile(np.repeat(np.arange(8), 80), 2), np.repeat([0, 1], 640)
-        found[flat] = calibrate_lines(x, y, wire, image, experiment.sensor()).estimates["k1_per_mm2"]
+        found[flat] = calibrate_lines(x, y, wire, image, frames.sensor()).estimates["k1_per_mm2"]
     true = LENSES[QUICK[2]]["k1_per_mm2"]
     assert abs(found[True].value - true) < norm.isf(RATE / 2) * found[True].u
     assert true - found[False].value > 5 * found[False].u

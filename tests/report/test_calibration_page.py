@@ -403,7 +403,8 @@ def test_words() -> None:
     assert typeset("moved by -1.25 px, +3 px (p = 1.5e-10), a-b and 2-3") == (
         "moved by \u22121.25 px, +3 px (p = 1.5\u2009×\u200910⁻¹⁰), a-b and 2-3"
     )
-    assert [sentence(t) for t in ("", "x is noisier", "variance of x.")] == ["", "x is noisier.", "Variance of x."]
+    texts = ("", "x is noisier", "variance of x.", "left: c moved")
+    assert [sentence(t) for t in texts] == ["", "x is noisier.", "Variance of x.", "left: c moved."]
     assert [short(r) for r in (0.974, -0.974, -0.999, 0.05)] == [".97", "\u2212.97", "\u22121.00", ".05"]
 
 

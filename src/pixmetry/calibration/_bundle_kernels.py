@@ -20,8 +20,8 @@ SUMS = {"contract", "reassoc", "nsz"}  # sums in any order
 
 @jit
 def linearise(
-    x, y, whiten, image, point, camera_of, interior, direction, per_px, free, rotation, position, x_scale, x_shift, origin, extra, xyz, held,
-    residual, jacobian,
+    x, y, whiten, image, point, camera_of, interior, direction, per_px, free, rotation, position, x_scale, x_shift, origin, extra, xyz,
+    held, residual, jacobian,
 ):
     """Whitened residuals (n, 2) and Jacobian (n, 2, q) at a state; NaN and 0 where a point has no image.
 
@@ -202,28 +202,29 @@ def condense(jacobian, weight, image, first, camera_of, camera_col, camera_count
 
 
 @jit
-def subtract(S, row, col, A, B, rows, cols):
-    """S[row :, col :] -= Aᵀ B for A (3, rows) and B (3, cols)."""
-    for a in range(rows):
-        z0, z1, z2 = A[0, a], A[1, a], A[2, a]
-        for b in range(cols):
-            S[row + a, col + b] -= z0 * B[0, b] + z1 * B[1, b] + z2 * B[2, b]
-
-
-@jit
 def reduce_pairs(of_images, of_cameras, by_image, image, point, first, image_col, S):
     """Subtract Z Zᵀ from the rows of the images, pair of image points by pair; image after image, so that its rows stay at hand."""
     poses, interior = of_images.shape[2], of_cameras.shape[2]
     for i in by_image:
         row, j = image_col[image[i]], point[i]
-        subtract(S, row, 0, of_images[i], of_cameras[j], poses, interior)
+        for a in range(poses):
+            z0, z1, z2 = of_images[i, 0, a], of_images[i, 1, a], of_images[i, 2, a]
+            for b in range(interior):
+                S[row + a, b] -= z0 * of_cameras[j, 0, b] + z1 * of_cameras[j, 1, b] + z2 * of_cameras[j, 2, b]
         for k in range(first[j], first[j + 1]):
             if image[k] > image[i]:
                 break
-            if poses == 6:  # a number that the compiler knows
-                subtract(S, row, image_col[image[k]], of_images[i], of_images[k], 6, 6)
+            col = image_col[image[k]]
+            if poses == 6:  # loops of a length that the compiler knows take half the time
+                for a in range(6):
+                    z0, z1, z2 = of_images[i, 0, a], of_images[i, 1, a], of_images[i, 2, a]
+                    for b in range(6):
+                        S[row + a, col + b] -= z0 * of_images[k, 0, b] + z1 * of_images[k, 1, b] + z2 * of_images[k, 2, b]
             else:
-                subtract(S, row, image_col[image[k]], of_images[i], of_images[k], poses, poses)
+                for a in range(poses):
+                    z0, z1, z2 = of_images[i, 0, a], of_images[i, 1, a], of_images[i, 2, a]
+                    for b in range(poses):
+                        S[row + a, col + b] -= z0 * of_images[k, 0, b] + z1 * of_images[k, 1, b] + z2 * of_images[k, 2, b]
 
 
 @jit
@@ -302,10 +303,16 @@ def quadratic(of_images, by_image, image, point, first, image_col, Q, of_cameras
             if image[k] > image[i]:
                 break
             col, share = image_col[image[k]], (0.5 if image[k] == image[i] else 1.0)
-            if poses == 6:
-                product(Q, row, col, of_images[k], share, 6, g)
-            else:
-                product(Q, row, col, of_images[k], share, poses, g)
+            for a in range(poses):
+                s0, s1, s2 = 0.0, 0.0, 0.0
+                for b in range(poses):
+                    q = share * Q[row + a, col + b]
+                    s0 += q * of_images[k, 0, b]
+                    s1 += q * of_images[k, 1, b]
+                    s2 += q * of_images[k, 2, b]
+                g[0, a] += s0
+                g[1, a] += s1
+                g[2, a] += s2
         for c in range(3):
             for d in range(3):
                 total = 0.0
@@ -315,18 +322,28 @@ def quadratic(of_images, by_image, image, point, first, image_col, Q, of_cameras
 
 
 @jit(fastmath=SUMS)
-def product(Q, row, col, B, share, poses, g):
-    """Add ``share`` B Q[row :, col :]ᵀ to g (3, poses)."""
-    for a in range(poses):
-        s0, s1, s2 = 0.0, 0.0, 0.0
-        for b in range(poses):
-            q = Q[row + a, col + b]
-            s0 += q * B[0, b]
-            s1 += q * B[1, b]
-            s2 += q * B[2, b]
-        g[0, a] += share * s0
-        g[1, a] += share * s1
-        g[2, a] += share * s2
+def products(which, of_images, of_cameras, image, first, image_col, Q, G):
+    """Write Zᵀ Q of the points ``which`` into ``G`` (3 points, unknowns), for the unknowns of cameras and of images that see the point."""
+    poses, interior = of_images.shape[2], of_cameras.shape[2]
+    for n in range(len(which)):
+        j = which[n]
+        for i in range(first[j] - 1, first[j + 1]):
+            begin, rows = (0, interior) if i < first[j] else (image_col[image[i]], poses)
+            for a in range(rows):
+                row = Q[begin + a]
+                s0, s1, s2 = 0.0, 0.0, 0.0
+                for b in range(interior):
+                    s0 += row[b] * of_cameras[j, 0, b]
+                    s1 += row[b] * of_cameras[j, 1, b]
+                    s2 += row[b] * of_cameras[j, 2, b]
+                for k in range(first[j], first[j + 1]):
+                    col = image_col[image[k]]
+                    for b in range(poses):
+                        q = row[col + b]
+                        s0 += q * of_images[k, 0, b]
+                        s1 += q * of_images[k, 1, b]
+                        s2 += q * of_images[k, 2, b]
+                G[3 * n, begin + a], G[3 * n + 1, begin + a], G[3 * n + 2, begin + a] = s0, s1, s2
 
 
 @jit
@@ -335,7 +352,7 @@ def residual_cofactors(
 ):
     """2 × 2 matrices J Qxx Jᵀ of whitened image coordinates, shape (n, 3) for xx, xy, yy, in units of their own weight.
 
-    ``place[i]``: row block of its point in ``G`` = Z Q (3 points, unknowns), −1 where the point is not eliminated and −2 to pass it over.
+    ``place[i]``: row block of its point in ``G`` = Zᵀ Q (3 points, unknowns), −1 where the point is not eliminated and −2 to pass it over.
     """
     each = camera_count.max()
     p = jacobian.shape[2] - 3

@@ -20,6 +20,7 @@ import numpy as np
 from pixmetry.calibration.network import PER_IMAGE, SCALE, SHIFT, Adjustment, Network, State
 
 RIDGE = 1e-11  # on a unit diagonal: carries the directions that no observation sees (the datum), moves no other
+OFTEN = 0.1  # share of the images that see a point above which dense products are faster
 WEAKEST = 1e-6  # share of a term that must be left when the estimated parameters have taken theirs
 
 
@@ -130,8 +131,15 @@ class AddedTerms:
         self._cameras, self._points = self._designs(network, state, d)
         self._factorise(network, state)
 
-    def test(self, terms: Any) -> Terms:
-        """Test terms, given by their derivatives: an array of shape (m, 2, k), or a sparse matrix of shape (2 m, k) (x, y, x, y, …).
+    def test(self, terms: Any, combinations: np.ndarray | None = None) -> Terms:
+        """Test terms, given by their derivatives.
+
+        Parameters
+        ----------
+        terms : ndarray, shape (m, 2, k), or sparse matrix, shape (2 m, k)
+            Rows of the latter: x, y, x, y, ….
+        combinations : ndarray, shape (k, j), optional
+            Test and estimate only these combinations of them.
 
         Raises
         ------
@@ -141,13 +149,12 @@ class AddedTerms:
         from scipy import sparse, stats
 
         if not sparse.issparse(terms):
-            terms = sparse.csr_matrix(np.asarray(terms, float).reshape(2 * len(self.rows), -1))
-        size = np.sqrt(np.maximum(np.asarray(terms.multiply(terms).sum(axis=0)).ravel(), 1e-300))  # of each term, for the sake of round-off
-        white = (self._blocks @ terms.multiply(1 / size)).tocsr()
-        full = (white.T @ white).toarray()
+            terms = np.asarray(terms, float).reshape(2 * len(self.rows), -1)
+        white = self._blocks @ terms
+        full, b = _dense(white.T @ white), white.T @ self._residual
         left = full - self._taken(white)
-        b = white.T @ self._residual
-        total = self.adjustment.sigma0**2 * self.adjustment.dof
+        if combinations is not None:
+            full, left, b = combinations.T @ full @ combinations, combinations.T @ left @ combinations, combinations.T @ b
         lengths = np.sqrt(np.diag(full))
         lengths[lengths == 0] = 1.0  # a term that no observation sees is dropped below
         values, vectors = np.linalg.eigh(left / np.outer(lengths, lengths))
@@ -157,10 +164,9 @@ class AddedTerms:
         fall, dof = float(b @ found), self.adjustment.dof - k
         if k == 0 or dof < 1:
             return Terms(np.zeros(len(b)), np.full(left.shape, np.nan), 0.0, 1.0, 0, float(dof), 0.0, np.nan)
-        variance = max((total - fall) / dof, 1e-300)
-        covariance = inverse / np.outer(size, size) * variance
+        variance = max((self.adjustment.sigma0**2 * self.adjustment.dof - fall) / dof, 1e-300)
         f = fall / k / variance
-        return Terms(found / size, covariance, f, float(stats.f.sf(f, k, dof)), k, float(dof), fall, variance)
+        return Terms(found, inverse * variance, f, float(stats.f.sf(f, k, dof)), k, float(dof), fall, variance)
 
     def whitened_squares(self) -> np.ndarray:
         """Weighted square of the residual of each of the rows, shape (m,)."""
@@ -214,7 +220,8 @@ class AddedTerms:
         self._point_inverse = _inverse_of_blocks(in_points[self._alone][:, self._alone])
         self._cross = (alone.T @ self._kept).tocsr()
         self._alone_design = alone
-        reduced = (self._kept.T @ self._kept - self._cross.T @ (self._point_inverse @ self._cross)).toarray()
+        cross = self._cross.toarray() if self._cross.nnz > OFTEN * np.prod(self._cross.shape) else self._cross
+        reduced = (self._kept.T @ self._kept).toarray() - _dense(cross.T @ (self._point_inverse @ cross))
         first = self._cameras.shape[1]
         reduced[first:, first:] += (in_points - self._points.T @ self._points)[self._joined][:, self._joined].toarray()
         diagonal = np.asarray(self._kept.multiply(self._kept).sum(axis=0)).ravel()
@@ -230,9 +237,13 @@ class AddedTerms:
 
         by_point = self._alone_design.T @ white
         over_points = self._point_inverse @ by_point
-        right = (self._kept.T @ white - self._cross.T @ over_points).toarray() * self._scale[:, None]
+        right = _dense(self._kept.T @ white - self._cross.T @ over_points) * self._scale[:, None]
         half = linalg.solve_triangular(self._factor[0], right, lower=True)
-        return (by_point.T @ over_points).toarray() + half.T @ half
+        return _dense(by_point.T @ over_points) + half.T @ half
+
+
+def _dense(matrix: Any) -> np.ndarray:
+    return matrix if isinstance(matrix, np.ndarray) else matrix.toarray()
 
 
 def _stacked(entries: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:

@@ -21,7 +21,7 @@ from pixmetry.calibration.network import Adjustment, Network, State
 from pixmetry.core.errors import InputError
 from pixmetry.core.threads import single_threaded_blas
 
-SMALL = 1e-2  # largest (step / standard deviation)², over all unknowns, of a last step, and
+SMALL = 1e-3  # largest (step / standard deviation)², over all unknowns, of a last step, and
 LEFT, LEFT_ROBUST = 1e-6, 1e-4  # what the step after it would have
 ROUNDING = 1e-14  # the same per image coordinate, in a priori weights: residuals that are nought
 DAMPING_START, DAMPING_LEAST, DAMPING_MOST = 1e-4, 1e-7, 1e8
@@ -223,7 +223,7 @@ def _result(
         sigma0=sigma0,
         dof=dof,
         free_columns=layout.columns,
-        covariance=np.zeros((0, 0)) if found is None else factor * found.reduced,
+        covariance=np.zeros((0, 0)) if found is None else np.multiply(found.reduced, factor, out=found.reduced),
         point_covariance=np.full((len(network.points), 3, 3), np.nan) if found is None else factor * found.points,
         redundancy=numbers,
         residual_covariance_px2=variances,

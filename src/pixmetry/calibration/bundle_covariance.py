@@ -13,7 +13,18 @@ import numpy as np
 
 from pixmetry.calibration import _bundle_kernels as kernels
 from pixmetry.calibration.bundle_layout import Layout
-from pixmetry.calibration.bundle_system import BLOCK_POINTS, Linearised, Solved, condensed, dense, equations, point_roots, reduce, regularise, rows_of
+from pixmetry.calibration.bundle_system import (
+    BLOCK_POINTS,
+    Linearised,
+    Solved,
+    condensed,
+    dense,
+    equations,
+    point_roots,
+    reduce,
+    regularise,
+    rows_of,
+)
 from pixmetry.calibration.datum import Datum, carried, null_space
 from pixmetry.calibration.model import NAMES
 from pixmetry.calibration.network import Network, State
@@ -71,23 +82,21 @@ def cofactors(layout: Layout, datum: Datum, now: Linearised, solved: Solved, res
     Q = _inverse(layout, datum, now, solved)
     points = np.full((len(layout.point_col), 3, 3), np.nan)
     own = np.empty((len(layout.x), 3)) if residuals else None
-    at, L = layout.eliminated, solved.root
-    if residuals or dense(layout):
-        for begin in range(0, len(at), BLOCK_POINTS):
-            which = at[begin : begin + BLOCK_POINTS]
+    at, whole = layout.eliminated, dense(layout)
+    if not whole:
+        points[at] = _gathered(layout, solved, Q)[at]
+    for begin in range(0, len(at) if whole or residuals else 0, BLOCK_POINTS):
+        which = at[begin : begin + BLOCK_POINTS]
+        if whole:
             Z = rows_of(layout, solved.Z, which)
             G = Z @ Q
             inner = G.reshape(len(which), 3, -1) @ np.swapaxes(Z.reshape(len(which), 3, -1), 1, 2)
-            points[which] = np.swapaxes(L[which], 1, 2) @ (np.eye(3) + inner) @ L[which]
-            if own is not None:
-                _residuals(layout, now, solved, which, points, Q, G, own)
-    else:
-        of_images, of_cameras = solved.Z
-        n = of_cameras.shape[2]
-        half = 0.5 * (of_cameras @ Q[:n, :n]) @ np.swapaxes(of_cameras, 1, 2)
-        kernels.quadratic(of_images, layout.by_image, layout.image, layout.point, layout.first, layout.image_col, Q, of_cameras, half)
-        inner = half + np.swapaxes(half, 1, 2)
-        points[at] = (np.swapaxes(L, 1, 2) @ (np.eye(3) + inner) @ L)[at]
+            points[which] = _with_own(solved.root[which], inner)
+        else:
+            G = np.empty((3 * len(which), len(Q)))
+            kernels.products(which, *solved.Z, layout.image, layout.first, layout.image_col, Q, G)
+        if own is not None:
+            _residuals(layout, now, solved, which, points, Q, G, own)
     joined = np.flatnonzero(layout.point_col >= 0)
     if own is not None:
         others = np.setdiff1d(np.flatnonzero(layout.determined), at)
@@ -100,6 +109,20 @@ def cofactors(layout: Layout, datum: Datum, now: Linearised, solved: Solved, res
     held = layout.held & layout.determined[:, None]
     points[held[:, :, None] | held[:, None, :]] = 0.0
     return Cofactors(Q, points, own)
+
+
+def _gathered(layout: Layout, solved: Solved, Q: np.ndarray) -> np.ndarray:
+    """Cofactors of the eliminated points, from those parts of Q that they touch."""
+    of_images, of_cameras = solved.Z
+    n = of_cameras.shape[2]
+    half = 0.5 * (of_cameras @ Q[:n, :n]) @ np.swapaxes(of_cameras, 1, 2)
+    kernels.quadratic(of_images, layout.by_image, layout.image, layout.point, layout.first, layout.image_col, Q, of_cameras, half)
+    return _with_own(solved.root, half + np.swapaxes(half, 1, 2))
+
+
+def _with_own(root: np.ndarray, inner: np.ndarray) -> np.ndarray:
+    """V⁻¹ + V⁻¹ Wᵀ Q W V⁻¹ from L⁻¹ and Zᵀ Q Z."""
+    return np.swapaxes(root, 1, 2) @ (np.eye(3) + inner) @ root
 
 
 def _inverse(layout: Layout, datum: Datum, now: Linearised, solved: Solved) -> np.ndarray:
@@ -137,6 +160,8 @@ def _in_datum(
     """S-transformation of the cofactors to the stated datum: Q − X − Xᵀ with X = G ((BᵀG)⁻¹ Bᵀ Q − ½ K Gᵀ)."""
     if datum.missing == 0:
         return Q, points
+    from scipy.linalg.blas import dgemm
+
     G, G_points, _ = null_space(layout, now.state, datum)
     B, B_points = carried(layout, G_points, datum)
     common = (now.jacobian, now.weight, *layout.incidence)
@@ -149,9 +174,8 @@ def _in_datum(
     out = layout.point_col == kernels.ELIMINATED
     product = np.linalg.inv(np.einsum("jad,jae->de", B_points, G_points))
     K = product @ (B.T @ QB + np.einsum("jad,jae->de", B_points[out], QB_points[out])) @ product.T
-    X = G @ (product @ QB.T - 0.5 * K @ G.T)
-    Q -= X
-    Q -= X.T
+    half = product @ QB.T - 0.5 * K @ G.T
+    Q = dgemm(-1.0, np.hstack([G, half.T]), np.vstack([half, G.T]), beta=1.0, c=Q.T, overwrite_c=1).T
     X_points = G_points @ (product @ np.swapaxes(QB_points, 1, 2) - 0.5 * K @ np.swapaxes(G_points, 1, 2))
     return Q, points - X_points - np.swapaxes(X_points, 1, 2)
 
@@ -199,16 +223,27 @@ def weak_direction(columns: tuple[str, ...], covariance: np.ndarray, network: Ne
     u = np.sqrt(np.maximum(np.diagonal(covariance), 1e-300))
     correlation = covariance / np.outer(u, u)
     direction = eigsh(correlation, k=1, which="LA", v0=np.ones(len(u)))[1][:, 0] if len(u) > 2 else np.ones(len(u))
-    groups = _groups(names, direction, network)
-    labels = list(groups)
-    means = np.array([np.where(np.isin(np.arange(len(u)), rows), 1.0 / len(rows), 0.0) for rows in groups.values()])
+    alone, share, kinds = _groups(names, direction, network)
+    own, common = _worst_pair(alone, covariance), _worst_pair(kinds, covariance)
+    if common is None or (own is not None and (share > ALONE or 1 - abs(own.correlation) < 0.1 * (1 - abs(common.correlation)))):
+        return own
+    return common
+
+
+def _worst_pair(groups: dict[str, list[int]], covariance: np.ndarray) -> WeakDirection | None:
+    """The two groups whose means are most correlated."""
+    if len(groups) < 2:
+        return None
+    means = np.zeros((len(groups), len(covariance)))
+    for row, members in zip(means, groups.values(), strict=True):
+        row[members] = 1 / len(members)
     of_groups = means @ covariance @ means.T
-    spread = np.sqrt(np.maximum(np.diagonal(of_groups), 1e-300))
-    pairs = np.abs(np.tril(of_groups / np.outer(spread, spread), -1))
-    a, b = np.unravel_index(np.argmax(pairs), pairs.shape) if len(labels) > 1 else (0, 0)
-    r = float(np.clip(of_groups[a, b] / (spread[a] * spread[b]), -1, 1))
-    text = f"{labels[b]} with {labels[a]} (correlation {r:+.6f})" if a != b else labels[a]
-    return WeakDirection((labels[b], labels[a]), r, (float(spread[b]), float(spread[a])), text)
+    u = np.sqrt(np.maximum(np.diagonal(of_groups), 1e-300))
+    r = np.clip(of_groups / np.outer(u, u), -1, 1)
+    a, b = np.unravel_index(np.argmax(np.abs(np.tril(r, -1))), r.shape)
+    labels = list(groups)
+    text = f"{labels[b]} with {labels[a]} (correlation {r[a, b]:+.6f})"
+    return WeakDirection((labels[b], labels[a]), float(r[a, b]), (float(u[b]), float(u[a])), text)
 
 
 def _along_axes(columns: tuple[str, ...], covariance: np.ndarray, network: Network, state: State) -> tuple[list[str], np.ndarray]:
@@ -226,9 +261,9 @@ def _along_axes(columns: tuple[str, ...], covariance: np.ndarray, network: Netwo
     return names, covariance
 
 
-def _groups(names: list[str], direction: np.ndarray, network: Network) -> dict[str, list[int]]:
-    """Rows of the parameters to be paired: where the weak direction is one image or point alone, its own; else interior parameters one by
-    one and, kind by kind, those of all images of a camera together."""
+def _groups(names: list[str], direction: np.ndarray, network: Network) -> tuple[dict[str, list[int]], float, dict[str, list[int]]]:
+    """Rows of the parameters to be paired: those of the one image or point with the largest share in the weak direction, and that share;
+    interior parameters one by one and, kind by kind, those of all images of a camera together."""
     several = len(network.cameras) > 1
     camera_of = {name: network.cameras[k].name for name, k in zip(network.images, network.camera_of, strict=True)}
     owners = []
@@ -236,18 +271,17 @@ def _groups(names: list[str], direction: np.ndarray, network: Network) -> dict[s
         head, _, kind = name.rpartition(":")
         owners.append(("camera" if kind in NAMES else "point" if kind in "XYZ" else "image", head, kind))
     share: dict[tuple[str, str], float] = {}
-    for (what, head, _), part in zip(owners, direction, strict=True):
-        share[what, head] = share.get((what, head), 0.0) + float(part) ** 2
-    what, alone = max(share, key=lambda owner: share[owner])
-    if what != "camera" and share[what, alone] > ALONE:
-        return {f"{kind} of {what} {alone}": [i] for i, (w, head, kind) in enumerate(owners) if (w, head) == (what, alone)}
     groups: dict[str, list[int]] = {}
-    for i, (what, head, kind) in enumerate(owners):
-        if what == "camera":
+    for i, ((what, head, kind), part) in enumerate(zip(owners, direction, strict=True)):
+        if what != "camera":
+            share[what, head] = share.get((what, head), 0.0) + float(part) ** 2
+        else:
             groups[f"{kind} of {head}" if several else kind] = [i]
-        elif what == "image" and kind not in ("x_scale", "x_shift"):  # the mean of those is nought
+        if what == "image" and kind not in ("x_scale", "x_shift"):  # the mean of those is nought
             groups.setdefault(f"the {kind} of all images" + (f" of {camera_of[head]}" if several else ""), []).append(i)
-    return groups
+    what, most = max(share, key=lambda owner: share[owner])
+    alone = {f"{kind} of {what} {most}": [i] for i, (w, head, kind) in enumerate(owners) if (w, head) == (what, most)}
+    return alone, share[what, most], groups
 
 
 def residual_cofactors_px2(layout: Layout, now: Linearised, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from pixmetry.calibration._bundle_kernels import ELIMINATED, HELD
 from pixmetry.calibration.model import CODES, NAMES
-from pixmetry.calibration.network import SCALE, SHIFT, Network, ScaleBars, State
+from pixmetry.calibration.network import Network, ScaleBars, State
 from pixmetry.core.errors import InputError, MeasureError
 
 POSE = ("rx", "ry", "rz", "X0", "Y0", "Z0")
@@ -47,6 +47,9 @@ class Layout:
         Between determined points.
     constraints : ndarray, shape (constraints, unknowns)
         Rows of unit length whose product with the reduced unknowns stays 0.
+    direction, per_px : ndarray, shape (cameras,), (cameras, 2)
+        Of the distortion; length units per pixel.
+    notes : tuple of str
     """
 
     network: Network
@@ -70,9 +73,9 @@ class Layout:
     prior: np.ndarray
     bars: ScaleBars
     constraints: np.ndarray
+    direction: np.ndarray
+    per_px: np.ndarray
     notes: tuple[str, ...] = ()
-    direction: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
-    per_px: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
 
     @property
     def determined(self) -> np.ndarray:
@@ -120,7 +123,8 @@ def layout_of(network: Network, start: State, used: np.ndarray | None) -> Layout
     known = image_there[network.image] & point_there[network.point]
     known &= np.isfinite(network.x_px) & np.isfinite(network.y_px)
     if not (take & known).any():
-        raise MeasureError("no image coordinates are left to adjust", where="bundle adjustment", remedy="give start values for images and points")
+        remedy = "give start values for images and points"
+        raise MeasureError("no image coordinates are left to adjust", where="bundle adjustment", remedy=remedy)
     order = np.flatnonzero(known)
     order = order[np.lexsort((network.image[order], network.point[order]))].astype(np.int64)
     point = network.point[order].astype(np.int64)
@@ -204,8 +208,6 @@ def _determined(network: Network, take: np.ndarray, images: np.ndarray, points: 
 def _images(network: Network, there: np.ndarray, at: int, columns: list[str]) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
     """Columns of the images; append their names."""
     more = [name for name in ("x_scale", "x_shift") if name in network.per_image]
-    places = {"x_scale": SCALE, "x_shift": SHIFT}
-    assert all(places[name] >= len(POSE) for name in more)
     each = len(POSE) + len(more)
     image_col = np.full(len(network.images), -1, np.int64)
     image_col[there] = at + each * np.arange(there.sum())

@@ -57,9 +57,9 @@ def linearise(layout: Layout, state: State, loss: Loss) -> Linearised:
     free = layout.free[:, : int(layout.camera_count.max())]
     residual, jacobian = np.empty((n, 2)), np.empty((n, 2, free.shape[1] + 6 + int((layout.extra >= 0).sum()) + 3))
     kernels.linearise(
-        layout.x, layout.y, layout.whiten, layout.image, layout.point, layout.camera_of, state.interior, layout.direction, layout.per_px, free,
-        state.rotation, state.position, state.x_scale, state.x_shift_px, float(layout.network.scale_origin_px), layout.extra, state.xyz,
-        layout.held, residual, jacobian,
+        layout.x, layout.y, layout.whiten, layout.image, layout.point, layout.camera_of, state.interior, layout.direction, layout.per_px,
+        free, state.rotation, state.position, state.x_scale, state.x_shift_px, float(layout.network.scale_origin_px), layout.extra,
+        state.xyz, layout.held, residual, jacobian,
     )  # fmt: skip
     valid = np.isfinite(residual).all(axis=1)
     residual[~valid] = 0.0

@@ -117,11 +117,13 @@ def _check_bars(network: Network) -> list[Finding]:
     ratio = float(np.median(bars.length[given] / there[given]))
     if abs(np.log(ratio)) <= BAR_RATIO:
         return findings
-    known = [name for factor, name in UNITS.items() if abs(abs(np.log(ratio)) - np.log(factor)) < BAR_RATIO]
-    if known or np.isfinite(network.u_xyz).all(axis=1).sum() >= 2:
-        what = f"bars and coordinates of the points are not in one unit ({known[0]}?)" if known else "bars contradict the known coordinates"
+    units = [name for factor, name in UNITS.items() if abs(abs(np.log(ratio)) - np.log(factor)) < BAR_RATIO]
+    if units or np.isfinite(network.u_xyz).all(axis=1).sum() >= 2:
+        what = "bars contradict the known coordinates"
+        if units:
+            what = f"bars and coordinates of the points are not in one unit ({units[0]}?)"
         value = f"bar length by distance between the points {ratio:.4g}"
-        raise InputError(what, where="scale bars", value=value, allowed="about 1", remedy="give both in the same unit, and check the bars' points")
+        raise InputError(what, where="scale bars", value=value, allowed="about 1", remedy="use one unit, and check the bars' points")
     text = f"scale bars are {ratio:.3g} times as long as the approximate coordinates say"
     return [*findings, Finding("bar_ratio", text, "the bars decide; check their points and lengths", "warning")]
 
@@ -281,7 +283,7 @@ def _check_camera(adjustment: Adjustment, k: int) -> list[Finding]:
     if u["c"] is not None:
         r = _median([_correlation(adjustment, f"{camera.name}:c", i, 2) for i in images])
         if abs(r) > SAME and u["c"] > POOR_C * c:
-            value = f"u(c)/c = {u['c'] / c:.2g}, correlation of c with the distances {r:+.5f}"
+            value = f"u(c)/c = {u['c'] / c:.2g}, correlation of c with the distances {r:+.6f}"
             remedy = "add images tilted by 30° to 60° against the plane, or points that differ in depth"
             if u["c"] > 25 * POOR_C * c:
                 raise MeasureError("the principal distance is not determined", where=camera.name, value=value, remedy=remedy)

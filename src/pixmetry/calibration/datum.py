@@ -1,10 +1,10 @@
 """Origin, directions and scale of a network: which of the seven are given, and inner constraints for those that are not.
 
-A similarity moves a point by t + θ × (X − m) + s (X − m) about a middle m. Control coordinates and scale bars hold some combinations of the
-seven parameters; along the others the image coordinates say nothing, and the datum is chosen so that the points that carry it stay, in the
-mean, where they were before (K. R. Koch, Parameter Estimation and Hypothesis Testing in Linear Models, 1999, 3.3; W. Baarda, S-transformations
-and criterion matrices, 1973). A covariance in any datum is brought to that one by Q' = S Q Sᵀ with S = I − G (Bᵀ G)⁻¹ Bᵀ: G is the null space
-and B the same restricted to the points that carry the datum.
+A similarity moves a point by t + θ × (X − m) + s (X − m) about a middle m. Control coordinates and scale bars hold some combinations of
+the seven parameters; along the others the image coordinates say nothing, and the datum is chosen so that the points that carry it stay, in
+the mean, where they were before (K. R. Koch, Parameter Estimation and Hypothesis Testing in Linear Models, 1999, 3.3). A covariance in any
+datum is brought to that one by Q' = S Q Sᵀ with S = I − G (Bᵀ G)⁻¹ Bᵀ: G is the null space and B the same restricted to the points that
+carry the datum (W. Baarda, S-transformations and criterion matrices, 1973).
 """
 
 from __future__ import annotations
@@ -87,10 +87,10 @@ def null_space(layout: Layout, state: State, datum: Datum) -> tuple[np.ndarray, 
     points[there] = generators(state.xyz[there], datum) @ basis
     points[layout.held] = 0.0
     reduced = np.zeros((m, d))
-    for i in np.flatnonzero(layout.image_col >= 0):
-        at = layout.image_col[i]
-        reduced[at : at + 3] = -state.rotation[i] @ basis[3:6] / datum.size
-        reduced[at + 3 : at + 6] = generators(state.position[i : i + 1], datum)[0] @ basis
+    there = np.flatnonzero(layout.image_col >= 0)
+    rows = layout.image_col[there][:, None] + np.arange(3)
+    reduced[rows] = -state.rotation[there] @ basis[3:6] / datum.size
+    reduced[rows + 3] = generators(state.position[there], datum) @ basis
     for j in np.flatnonzero(layout.point_col >= 0):
         reduced[layout.point_col[j] : layout.point_col[j] + 3] = points[j]
     return reduced, points, basis
@@ -116,7 +116,7 @@ def aligned(layout: Layout, state: State, datum: Datum) -> State:
         basis = np.linalg.svd(_held_directions(layout, state, datum))[2][7 - datum.missing :].T
         G = (generators(state.xyz[datum.carriers], datum) @ basis).reshape(-1, datum.missing)
         gap = (datum.start - state.xyz[datum.carriers]).ravel()
-        step = basis @ np.linalg.lstsq(G, gap, rcond=None)[0]
+        step = basis @ np.linalg.solve(G.T @ G, G.T @ gap)
         turn = step[3:6] / datum.size
         largest = max(np.abs(turn).max(), abs(step[6]) / datum.size, 1e-300)
         step *= min(1.0, 0.5 / largest)

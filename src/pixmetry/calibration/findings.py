@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from pixmetry.calibration.eccentric import Eccentricity
 from pixmetry.calibration.network import Adjustment, Finding, Network
 
 ORDER = (  # of kinds, among findings of the same level; what is not named here comes between the two parts
-    "start", "determination", "correlation", "gross_scale_bar", "gross_control_point", "x_scale_drift", "x_shift", "flatness", "field",
+    "start", "determination", "correlation", "flatness", "x_scale_drift", "gross_scale_bar", "gross_control_point", "x_shift", "field",
     "known_uncertainty", "eccentricity", "f_test", "gross_error", None, "significance", "variance_components", "residual_grid", "hold_out",
     "datum", "adjustment",
 )  # fmt: skip
@@ -20,6 +21,7 @@ RARE = 0.001  # level of tests that were not asked for
 CORRELATED = 0.995
 NOTEWORTHY_PX = 0.002  # an eccentricity of this size is worth a sentence
 NAMED = 5
+MOST_PATTERNS = 5
 RADIAL = frozenset(("k1", "k2", "k3", "k4", "k5"))
 
 
@@ -41,6 +43,17 @@ def findings_of(adjustment: Adjustment, tests: Mapping[str, Any]) -> list[Findin
         Finding("datum", f"Datum: {adjustment.datum}."),
     ]
     return found + [Finding("adjustment", note if note.endswith(".") else f"{note}.") for note in adjustment.notes]
+
+
+def in_the_shadow(patterns: Iterable[Finding]) -> list[Finding]:
+    """The findings on patterns in the residuals, no more than a few; beside a drift of the x-scale the others can be its shadow."""
+    found = list(patterns)
+    drift = [f for f in found if f.kind == "x_scale_drift"]
+    others = [f for f in found if f.kind != "x_scale_drift"][: MOST_PATTERNS - len(drift)]
+    if drift:
+        advice = "Look at it again with an x-scale for each image, whose want can look like this."
+        others = [replace(f, advice=advice, level="note") for f in others]
+    return drift + others
 
 
 def parameter_findings(parameters: list[dict[str, Any]]) -> list[Finding]:
@@ -158,9 +171,9 @@ def eccentricity_findings(measured: Network, found: Eccentricity) -> list[Findin
     return out
 
 
-def hold_out_findings(record: Mapping[str, Any]) -> list[Finding]:
-    """Images left out that fit much worse than those of the fit."""
-    one = record.get("free") or record.get("fixed")
+def hold_out_findings(record: Mapping[str, Any], *, free: bool) -> list[Finding]:
+    """Images left out that fit much worse than those of the fit, in the adjustment that stands: with the field's points free or not."""
+    one = record.get("free" if free else "fixed")
     if not one or one["left_out_rms_px"] < 1.5 * one["fit_rms_px"]:
         return []
     text = f"Images left out of the fit show {one['left_out_rms_px']:.3g} px, those in it {one['fit_rms_px']:.3g} px (rms)."

@@ -17,6 +17,7 @@ from pixmetry.calibration.resection import intersect, rays
 
 DISTANCES = (1.25, 2.1, 0.8, 3.6, 0.5, 6.0)  # principal distances to try, in widths of the frame
 FEWEST_COMMON = 6  # points of a pair: five give its relative orientation
+ENOUGH_COMMON = 30  # more of them make a pair no better
 PAIRS = 6  # pairs to try
 WEIGHED = 250  # pairs whose parallax is looked at
 TRIAL_IMAGES = 7  # images by which a start is judged
@@ -38,7 +39,7 @@ def good_pairs(network: Network, allowed: np.ndarray) -> list[tuple[int, int]]:
     common = common_points(network)
     same_camera = network.camera_of[:, None] == network.camera_of
     common = np.where(allowed[:, None] & allowed, common, 0)
-    rank = np.triu(np.minimum(common, 60) * np.where(same_camera, 1.0, 0.5), 1)
+    rank = np.triu(np.minimum(common, 2 * ENOUGH_COMMON) * np.where(same_camera, 1.0, 0.5), 1)
     order = np.argsort(-rank, axis=None, kind="stable")
     order = order[rank.ravel()[order] > 0]
     if len(order) > WEIGHED:  # not always those of the same few images
@@ -48,7 +49,7 @@ def good_pairs(network: Network, allowed: np.ndarray) -> list[tuple[int, int]]:
     value = []
     for i, j in zip(first, second, strict=True):
         a, b = shared(network, int(i), int(j))
-        value.append(_parallax(network, a, b) * np.sqrt(rank[i, j]) if len(a) >= FEWEST_COMMON else 0.0)
+        value.append(_parallax(network, a, b) * min(rank[i, j], ENOUGH_COMMON) if len(a) >= FEWEST_COMMON else 0.0)
     best = [k for k in np.argsort(-np.array(value), kind="stable") if value[k] > 0]
     chosen: list[tuple[int, int]] = []
     for k in best:  # each image twice at most, so that one bad image does not spoil all
@@ -158,8 +159,14 @@ def best_free(network: Network, interior: np.ndarray, allowed: np.ndarray) -> Re
     if (plain != interior).any():  # a lens that was given is believed first
         starts.insert(0, np.column_stack([distances[0], interior[:, 1:]]))
     order = [(k, row) for k in range(min(2, len(pairs))) for row in starts] + [(k, row) for k in range(2, len(pairs)) for row in starts[:3]]
-    for k, values in order:
+    for number, (k, values) in enumerate(order):
+        if best is not None and number == len(starts):  # one pair has been tried with all: is the best of it on its way down?
+            best.settle()
+            least, convincing = _value(best)
+            if convincing:
+                break
         work = Reconstruction(network, values, no_control)
+        work.allowed[:] = allowed
         if not seed(work, *pairs[k]):
             continue
         work.grow(limit=min(TRIAL_IMAGES, int(allowed.sum())))

@@ -22,6 +22,7 @@ from pixmetry.core.threads import single_threaded_blas
 TRIED_IMAGES = 12  # by which principal distances are compared
 FINE_STEPS = (1.25, 0.8, 1.0, 1.6, 0.63, 2.0, 0.5, 2.6, 0.4, 3.3, 4.2, 5.3, 6.6, 8.5)  # principal distances, in widths of the frame
 FITS = 0.3  # of FINE, as an rms: what a start from known points must reach
+JOINS = 0.02  # rms distance at the points that join two parts, in units of the extent
 TIE = 3  # points that join two parts of a network
 ENOUGH = 0.7  # of the images that must get a pose
 REACH = 0.1  # rms distance from control, in units of its extent, at which coordinates do not belong to the images
@@ -55,8 +56,12 @@ def start_values(network: Network) -> tuple[Network, State]:
         work = _from_known_points(network, interior)
         if work is None:
             work = _from_images(network, interior)
-        if work.posed.sum() < len(work.posed):
-            _join_rest(work)
+        if not work.control.any():
+            while work.posed.sum() < len(work.posed) and _join_rest(work):
+                pass
+            work.mend()
+            work.settle()
+            _to_object(work)
     _check_posed(work)
     cameras = tuple(replace(camera, values=row) for camera, row in zip(network.cameras, work.interior, strict=True))
     state = work.state()
@@ -105,7 +110,6 @@ def _resected(network: Network, interior: np.ndarray, control: np.ndarray) -> Re
         work.judge()
         work.adjust()
         work.grow()
-        _to_object(work)
     return work
 
 
@@ -187,7 +191,6 @@ def _from_images(network: Network, interior: np.ndarray) -> Reconstruction:
     if work is None:
         raise _not_oriented(network, np.zeros(len(network.images), bool))
     _grow_cameras(work)
-    _to_object(work)
     return work
 
 
@@ -206,29 +209,37 @@ def _grow_cameras(work: Reconstruction) -> None:
     work.grow()
 
 
-def _join_rest(work: Reconstruction) -> None:
-    """Orient the images that are left by themselves and join them at the points that both parts hold."""
+def _join_rest(work: Reconstruction) -> bool:
+    """Orient images that are left by themselves and join them to the others; whether some could be.
+
+    What holds both parts together are points that both have, and images of the one that can be posed in the other.
+    """
     network = work.network
     left = ~work.posed
-    if left.sum() < 3 or work.control.any():
-        return
+    if left.sum() < 3:
+        return False
     rest = best_free(replace(network, cameras=_held(network, work)), work.interior, left)
     if rest is None:
-        return
-    rest.network = network
-    both = np.isfinite(rest.xyz[:, 0]) & np.isfinite(work.xyz[:, 0])
-    if both.sum() < TIE:
-        return
-    scale, rotation, shift, away = fitted(rest.xyz[both], work.xyz[both])
-    extent = np.linalg.norm(np.nanstd(work.xyz, axis=0))
-    if not np.median(away) < 0.02 * extent:
-        return
+        return False
+    rest.grow()
+    rest.allowed[:] = True
+    rest.grow(limit=int(rest.posed.sum()) + TIE)
+    points = np.isfinite(rest.xyz[:, 0]) & np.isfinite(work.xyz[:, 0])
+    images = rest.posed & work.posed
+    source = np.concatenate([rest.xyz[points], rest.position[images]])
+    target = np.concatenate([work.xyz[points], work.position[images]])
+    if len(source) < TIE or thickness(source)[1] < 1e-3:
+        return False
+    scale, rotation, shift, away = fitted(source, target)
+    if not np.median(away) < JOINS * np.linalg.norm(np.nanstd(work.xyz, axis=0)):
+        return False
     moved(rest, scale, rotation, shift)
     new = rest.posed & left
     work.rotation[new], work.position[new] = rest.rotation[new], rest.position[new]
     work.triangulate()
     work.judge()
     work.grow()
+    return bool(new.any())
 
 
 def _held(network: Network, work: Reconstruction) -> tuple:

@@ -1,8 +1,9 @@
 """Scale bars and control points before they may pull at a network: image coordinates are tested without them, then they by the network.
 
 A wrong bar with a small stated uncertainty is stronger than the image coordinates of its ends, and data snooping would throw these out.
-So gross errors in the images are looked for with bars and control points that hardly weigh; then the known observations get their
-weights, and the worst is left out and the network adjusted again as long as one is contradicted (Baarda's w-test).
+So gross errors in the images are looked for without bars, and with control points that hardly weigh; then the known observations get their
+weights, and the worst is left out and the network adjusted again as long as one is contradicted (Baarda's w-test). A fixed point most of
+whose image points are gross errors is a wrong point: it is set free, and they take part again.
 """
 
 from __future__ import annotations
@@ -13,13 +14,17 @@ from typing import Any
 import numpy as np
 
 from pixmetry.calibration.known_residuals import Known, bar_residuals, contradicted, control_residuals
-from pixmetry.calibration.network import Adjustment, Network, ScaleBars
-from pixmetry.calibration.snooping import Adjust
+from pixmetry.calibration.network import Adjustment, Network, ScaleBars, State
+from pixmetry.calibration.snooping import Adjust, finest_factor
 from pixmetry.calibration.variance_components import image_sigma0, scaled
+from pixmetry.core.errors import InputError
 
-LOOSE = 0.05  # uncertainty, as a part of a bar's length or of the field's extent, with which nothing pulls at the image coordinates
+LOOSE = 0.05  # uncertainty, as a part of the field's extent, with which a control point does not pull at the image coordinates
 INSEPARABLE = 0.99  # correlation of two residuals from which on it cannot be said which of the two is wrong
 LEAST_CONTROL = 4  # points that must stay for one to be left out
+ABSURD = 0.1  # a bar that is wrong by such a part of its length, as one in other units, is out before any adjustment with it
+LEAST_RAYS = 3  # rejected rays that condemn a fixed point, where they are more than half
+MOST_WRONG = 0.2  # part of the fixed points that can be wrong one by one
 MOST = 20
 
 
@@ -45,19 +50,19 @@ def has_known(network: Network) -> bool:
 
 
 def loosened(network: Network) -> Network:
-    """The network with bars and uncertain control points that hardly weigh."""
-    bars, weighted = network.bars, np.isfinite(network.u_xyz) & (network.u_xyz > 0)
+    """The network without bars, and with uncertain control points that hardly weigh."""
+    weighted = np.isfinite(network.u_xyz) & (network.u_xyz > 0)
     known = network.xyz[np.isfinite(network.xyz).all(axis=1)]
     extent = float(np.ptp(known, axis=0).max()) if len(known) else 0.0
-    return replace(
-        network,
-        bars=replace(bars, u=np.maximum(bars.u, LOOSE * bars.length)),
-        u_xyz=np.where(weighted, np.maximum(network.u_xyz, LOOSE * extent), network.u_xyz),
-    )
+    u_xyz = np.where(weighted, np.maximum(network.u_xyz, LOOSE * extent), network.u_xyz)
+    return replace(network, bars=ScaleBars.none(), u_xyz=u_xyz)
 
 
-def check_known(network: Network, clean: Adjustment, adjust: Adjust) -> CheckedKnown:
+def check_known(network: Network, clean: Adjustment, adjust: Adjust) -> tuple[CheckedKnown, State]:
     """Leave out bars and control points that the network contradicts.
+
+    The network comes back with image coordinates weighted as the loosened one says, beside which bars and control points have their place;
+    the state is that of the adjustment with them.
 
     Parameters
     ----------
@@ -66,13 +71,19 @@ def check_known(network: Network, clean: Adjustment, adjust: Adjust) -> CheckedK
         Of the `loosened` network, without gross errors in the images.
     adjust : callable
         `bundle.adjust`, or the same with some options chosen; with a posteriori covariances.
+
+    Raises
+    ------
+    InputError
+        If two bars differ by far and nothing tells which of them is wrong.
     """
     sigma0, dof = image_sigma0(clean)
-    weights = scaled(network, np.full((len(network.cameras), 2), sigma0**2))  # from now on sigma0 of the image coordinates is 1
-    checked = CheckedKnown(weights)
-    state = clean.state
+    size = max(sigma0**2, finest_factor(network))
+    weights = scaled(network, np.full((len(network.cameras), 2), size))  # from now on sigma0 of the image coordinates is 1
+    checked, state = _without_absurd(CheckedKnown(weights), clean.state)
     for _ in range(MOST):
         adjustment = adjust(checked.network, state, used=clean.used, redundancy=True)
+        state = adjustment.state
         bars, control = bar_residuals(adjustment), control_residuals(adjustment)
         worst = [(k, found[0]) for k in (bars, control) if (found := contradicted(k, 1.0, dof))]
         if not worst:
@@ -81,7 +92,66 @@ def check_known(network: Network, clean: Adjustment, adjust: Adjust) -> CheckedK
         checked = _without(checked, known, record, is_bar=known is bars)
         if not checked.gross["scale_bars" if known is bars else "control_points"][-1]["left_out"]:
             break
-    return replace(checked, network=replace(checked.network, covariance_px2=network.covariance_px2))
+    return checked, state
+
+
+def _without_absurd(checked: CheckedKnown, state: State) -> tuple[CheckedKnown, State]:
+    """Leave out bars in other units than most, or between other points: no adjustment could start with them. Bring the rest to scale."""
+    bars = checked.network.bars
+    if not len(bars):
+        return checked, state
+    computed = np.linalg.norm(state.xyz[bars.end] - state.xyz[bars.start], axis=1)
+    ratio = bars.length / computed
+    scale = 1.0
+    if not np.isfinite(checked.network.u_xyz).any() and np.isfinite(ratio).any():
+        scale = float(np.nanmedian(ratio))
+        state = replace(state, xyz=scale * state.xyz, position=scale * state.position)
+    bad = np.flatnonzero(np.abs(ratio / scale - 1) > ABSURD)
+    if len(bad) and np.isinf(checked.network.u_xyz).all() and len(bars) < 3:
+        found = f"lengths over computed ones: {ratio[0]:.6g}, {ratio[1]:.6g}"
+        raise InputError("the two scale bars contradict each other", where="scale bars", value=found, remedy="check their units and points")
+    records = []
+    for i in bad:
+        name = f"{checked.network.points[bars.start[i]]}–{checked.network.points[bars.end[i]]}"
+        error = float(bars.length[i] - scale * computed[i])
+        limit = {"statistic": float(abs(error) / bars.u[i]), "critical": float(ABSURD * bars.length[i] / bars.u[i])}
+        records.append({"name": name, "residual": error, "error": error, **limit, "left_out": True})
+    kept = np.setdiff1d(np.arange(len(bars)), bad)
+    network = replace(checked.network, bars=ScaleBars(bars.start[kept], bars.end[kept], bars.length[kept], bars.u[kept]))
+    return CheckedKnown(network, {**checked.gross, "scale_bars": records}), state
+
+
+def wrong_fixed(network: Network, adjustment: Adjustment) -> np.ndarray:
+    """Fixed points most of whose image points were rejected, as indices; none if they are so many that it is the field that is wrong."""
+    size = len(network.points)
+    rays = np.bincount(network.point, minlength=size)
+    out = rays - np.bincount(network.point[adjustment.used], minlength=size)
+    fixed = (network.u_xyz == 0).all(axis=1)
+    wrong = np.flatnonzero(fixed & (out >= LEAST_RAYS) & (2 * out > rays))
+    return wrong if len(wrong) <= MOST_WRONG * fixed.sum() else wrong[:0]
+
+
+def set_free(network: Network, points: np.ndarray) -> Network:
+    """The network with some points free; their coordinates stay as start values."""
+    u = network.u_xyz.copy()
+    u[points] = np.inf
+    return replace(network, u_xyz=u)
+
+
+def wrong_fixed_records(adjustment: Adjustment, points: np.ndarray) -> list[dict[str, Any]]:
+    """How far points that were set free lie from where they were said to be; statistic and critical value of a χ² test, as its root."""
+    from scipy import stats
+
+    network, records = adjustment.network, []
+    critical = float(np.sqrt(stats.chi2.isf(0.01 / len(network.points), 3)))
+    for k in points:
+        off, covariance = network.xyz[k] - adjustment.state.xyz[k], adjustment.point_covariance[k]
+        if np.isfinite(covariance).all():
+            size = float(np.linalg.norm(off))
+            statistic = float(np.sqrt(off @ np.linalg.solve(covariance, off)))
+            limit = {"statistic": statistic, "critical": critical}
+            records.append({"name": network.points[k], "residual": size, "error": size, **limit, "left_out": True})
+    return records
 
 
 def _without(checked: CheckedKnown, known: Known, record: dict[str, Any], *, is_bar: bool) -> CheckedKnown:

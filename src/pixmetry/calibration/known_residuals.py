@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from pixmetry.calibration.network import Adjustment
-from pixmetry.calibration.snooping import LEAST_REDUNDANCY
+from pixmetry.calibration.snooping import LEAST_REDUNDANCY, finest_factor
 from pixmetry.calibration.variance_components import image_sigma0
 
 
@@ -138,6 +138,6 @@ def group_record(adjustment: Adjustment, known: Known) -> dict[str, Any] | None:
     if dof < 0.5:
         return None
     sigma0, dof_images = image_sigma0(adjustment)
-    factor = float((known.residual**2 / known.u**2).sum() / dof / sigma0**2)
+    factor = float((known.residual**2 / known.u**2).sum() / dof / max(sigma0**2, finest_factor(adjustment.network)))
     tail = stats.f.sf(factor, dof, dof_images)
     return {"factor": factor, "dof": dof, "p": float(2 * min(tail, 1 - tail)), "n": len(known)}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -92,7 +93,7 @@ class LineFit:
         """Derivatives of the corrected positions by the free parameters, shape (n, 2, p)."""
         a, b = ((v - o) * m for v, o, m in zip((self.x, self.y), self.q[1:3], self.per_px, strict=True))
         r2, zero = a * a + b * b, np.zeros_like(a)
-        known = {
+        known: dict[str, Any] = {
             "xp": -slopes[:, :, 0].T,
             "yp": -slopes[:, :, 1].T,
             "b1": (a, zero),
@@ -155,23 +156,27 @@ class LineFit:
     def solve(self) -> None:
         """Iterate until the conditions hold as well as they can."""
         cost = np.inf
-        for _ in range(STEPS):
-            with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # of lines that do not tell: said below
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # where the lines do not tell; that is said below
+            for _ in range(STEPS):
                 self.linear()
-            self.iterations += 1
-            step = -self.inverse() @ (self.a_left.T @ (self.weight * self.f_left))
-            turn = -(self.f_slope + self.a_slope @ step)
-            self.q[self.columns] += step
-            self.theta += turn
-            self.rho += self.f_mean + self.a_mean @ step + self.middle * turn
-            if not np.isfinite(self.corrected()[0]).all():
-                refuse(self.weakest())
-            left = self.f_left + self.a_left @ step
-            self.x, self.y = self.table.x - self.pull[0] * left, self.table.y - self.pull[1] * left
-            before, cost = cost, float(self.weight @ left**2)
-            if abs(before - cost) <= 1e-12 * cost + 1e-300:
-                break
-        self.linear()
+                self.iterations += 1
+                before, cost = cost, self._step()
+                if abs(before - cost) <= 1e-12 * cost + 1e-300:
+                    break
+            self.linear()
+
+    def _step(self) -> float:
+        """One step of Gauss and Newton; returns the sum of squares that it promises."""
+        step = -self.inverse() @ (self.a_left.T @ (self.weight * self.f_left))
+        turn = -(self.f_slope + self.a_slope @ step)
+        self.q[self.columns] += step
+        self.theta += turn
+        self.rho += self.f_mean + self.a_mean @ step + self.middle * turn
+        left = self.f_left + self.a_left @ step
+        self.x, self.y = self.table.x - self.pull[0] * left, self.table.y - self.pull[1] * left
+        if not np.isfinite(self.corrected()[0]).all():
+            refuse(self.weakest())
+        return float(self.weight @ left**2)
 
     def leverage(self) -> np.ndarray:
         """Share of each position's variance that the fit takes up, were its weight that of a used one; shape (n,)."""
@@ -216,6 +221,7 @@ def adjust_lines(fit: LineFit, loss: str, loss_scale: float, reject: bool) -> No
     fit.table.used[:] = True
     if reject and loss != "none":
         fit.table.used[:] = np.abs(fit.statistics()) < critical_value(len(fit.table.x))
+        _check_lines(fit.table)
     fit.factor[:] = 1.0
     _snoop(fit, reject)
 
@@ -232,7 +238,8 @@ def _check_directions(theta: np.ndarray, free: list[str]) -> None:
         refuse(lost)
 
 
-def refuse(names: list[str]) -> None:
+def refuse(names: Sequence[str]) -> None:
+    """Say which parameters the lines do not determine."""
     raise MeasureError(
         "the lines do not determine the parameters",
         where="plumb lines",
@@ -278,7 +285,13 @@ def _snoop(fit: LineFit, reject: bool) -> None:
         if not (back | out).any():
             return
         table.used[:] = (table.used | back) & ~out
-        few = table.sums(table.used.astype(float)) < 3
-        if few.any():
-            key = table.keys[int(np.argmax(few))]
-            raise MeasureError("hardly a position lies on the line", where=f"image {key[0]}, line {key[1]}", remedy="measure it anew")
+        _check_lines(table)
+    fit.solve()
+
+
+def _check_lines(table: LineTable) -> None:
+    few = table.sums(table.used.astype(float)) < 3
+    if few.any():
+        image, line = table.keys[int(np.argmax(few))]
+        remedy = "leave it out, or measure it anew"
+        raise MeasureError("hardly a position lies on the line", where=f"image {image}, line {line}", remedy=remedy)

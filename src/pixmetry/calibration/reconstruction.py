@@ -8,7 +8,7 @@ import numpy as np
 
 from pixmetry.calibration.model import NAMES, TEN
 from pixmetry.calibration.network import Network, ScaleBars, State
-from pixmetry.calibration.resection import FEWEST, intersect, pose, rays
+from pixmetry.calibration.resection import FEWEST, RIGHT_SHARE, intersect, pose, rays
 from pixmetry.core.errors import MeasureError
 
 COARSE = 0.03  # of the frame's width: what may count as the same place while neither principal distance nor distortion are known
@@ -21,6 +21,10 @@ BY_IMAGES = (  # what may be free with so many images and image points of them
 )  # fmt: skip
 BY_KNOWN = ((1, 16, ("c",)), (1, 40, ("c", "k1")), (2, 100, CENTRED), (5, 240, TEN))  # the same with known points
 MANY_IMAGES = 24  # that determine the interior parameters well enough to go on with
+MOST, QUANTILE = 0.93, 1.81  # share of the residuals that are taken for right, and the normal distribution's quantile of it
+PULLING = 0.001  # of the frame's width: largest scale of residuals that comes from those beyond the median
+MENDING = 2  # rounds of posing anew
+SETTLING, SETTLED_PX = 5, 0.2  # rounds of adjustment while residuals are larger
 FARTHEST = 0.25  # of the frame: how far a principal point may move off its middle
 PLAUSIBLE = (0.15, 60.0)  # principal distances, in widths of the frame
 
@@ -46,7 +50,8 @@ class Reconstruction:
         self.rows = np.split(order, np.searchsorted(network.image[order], np.arange(1, images)))
         self.camera = network.camera_of[network.image]
         self.width = float(max(camera.sensor.cols for camera in network.cameras))
-        self.spread_px = COARSE * self.width / 8
+        self.spread_px = self.scale_px = COARSE * self.width / 8
+        self.allowed = np.ones(images, bool)  # which images are posed
         self.adjusted = 0  # images that had a pose when it was last adjusted
         self.look()
 
@@ -54,7 +59,7 @@ class Reconstruction:
         """One that can go its own way."""
         new = object.__new__(Reconstruction)
         new.__dict__.update(self.__dict__)
-        for name in ("interior", "rotation", "position", "xyz", "good", "uv"):
+        for name in ("interior", "rotation", "position", "xyz", "good", "uv", "allowed"):
             setattr(new, name, getattr(self, name).copy())
         return new
 
@@ -123,7 +128,11 @@ class Reconstruction:
         size = np.abs(error[known & self.good])
         if len(size):
             self.spread_px = max(SMALLEST_PX, 1.4826 * float(np.nanmedian(size)))
-        limit = max(WRONG * self.spread_px, FINE * self.width / 2)
+            # parts that do not fit each other yet are many small groups of large residuals: they must go on pulling
+            rest = float(np.quantile(np.nan_to_num(np.abs(error[known]), nan=self.width), MOST))
+            self.scale_px = max(self.spread_px, min(rest / QUANTILE, PULLING * self.width))
+        misfit = self.scale_px > 3 * self.spread_px
+        limit = max(WRONG * self.spread_px, COARSE * self.width if misfit else FINE * self.width / 2)
         with np.errstate(invalid="ignore"):
             self.good[known] = np.max(np.abs(error[known]), axis=1) < limit  # NaN: behind the camera, or beyond the lens
 
@@ -175,7 +184,7 @@ class Reconstruction:
         cameras, camera_of = np.unique(self.network.camera_of[images], return_inverse=True)
         models = tuple(replace(self.network.cameras[k], free=self.network.cameras[k].free & np.isin(NAMES, names)) for k in cameras)
         control = self.control[points][:, None]
-        variance = self.spread_px**2
+        variance = self.scale_px**2
         part = replace(
             self.network, cameras=models, images=tuple(self.network.images[i] for i in images), camera_of=camera_of,
             points=tuple(self.network.points[j] for j in points), x_px=self.network.x_px[rows], y_px=self.network.y_px[rows],
@@ -231,6 +240,34 @@ class Reconstruction:
         if self.adjusted < self.posed.sum():
             self._adjust_and_judge()
 
+    def mend(self) -> None:
+        """Pose images anew in which many points do not fit, once the others stand."""
+        for _ in range(MENDING):
+            known = self.posed[self.network.image] & np.isfinite(self.uv[:, 0])
+            number = np.bincount(self.network.image[known], minlength=len(self.posed))
+            fitting = np.bincount(self.network.image[known & self.good], minlength=len(self.posed))
+            poor = self.posed & (fitting < RIGHT_SHARE * number)
+            if not poor.any() or poor.sum() > 0.5 * self.posed.sum():
+                return
+            self.rotation[poor], self.position[poor] = np.nan, np.nan
+            self.good[poor[self.network.image]] = True
+            self.adjusted = 0
+            self.triangulate()
+            self.judge()
+            self.grow()
+
+    def settle(self) -> None:
+        """Adjust on while residuals fall: long lenses and shallow networks come down slowly."""
+        for _ in range(SETTLING):
+            before = self.spread_px
+            if before < SETTLED_PX:
+                return
+            self.adjust(rounds=1, iterations=40)
+            self.triangulate()
+            self.judge()
+            if self.spread_px > 0.95 * before:
+                return
+
     def _next_adjustment(self) -> float:
         """Number of images at which to adjust again: seldom once there are enough of them for the interior parameters."""
         return (1.4 if self.adjusted < MANY_IMAGES else 3.0) * self.adjusted
@@ -246,7 +283,7 @@ class Reconstruction:
         """Pose the images that see most of the known points; how many could be."""
         known = np.isfinite(self.xyz[self.network.point, 0]) & np.isfinite(self.uv[:, 0])
         count = np.bincount(self.network.image[known], minlength=len(self.posed))
-        count[self.posed] = 0
+        count[self.posed | ~self.allowed] = 0
         count[list(failed)] = 0
         count[self.interior[self.network.camera_of, 0] <= 0] = 0
         order = [int(i) for i in np.argsort(-count, kind="stable") if count[i] >= max(fewest, 0.5 * count.max())]
@@ -259,6 +296,8 @@ class Reconstruction:
         return new
 
     def state(self) -> State:
-        """All that is known."""
+        """All that is known; of the points, those that two rays agree on."""
+        rays_of = np.bincount(self.network.point[self.good & self.posed[self.network.image]], minlength=len(self.xyz))
+        self.xyz[~self.control & (rays_of < 2)] = np.nan
         zero = np.zeros(len(self.posed))
         return State(self.interior, self.rotation, self.position, zero, zero.copy(), self.xyz)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from pixmetry.calibration.known_residuals import bar_residuals, control_residuals, group_record
-from pixmetry.calibration.network import Adjustment
+from pixmetry.calibration.network import Adjustment, Network
 
 
 def all_records(
@@ -46,6 +46,26 @@ def all_records(
         "network": network_record(adjustment, a_priori=a_priori),
         "known": known_record(adjustment, gross_known, a_priori=a_priori),
     }
+
+
+def variance_factors(network: Network, given: Network) -> dict[str, dict[str, float]]:
+    """By camera ``factor_x`` and ``factor_y``, by which the variances of the image coordinates given were multiplied."""
+    out = {}
+    for k, camera in enumerate(network.cameras):
+        rows = np.flatnonzero(network.camera_of[network.image] == k)[:1]
+        ratio = (network.covariance_px2[rows] / np.where(given.covariance_px2[rows] == 0, 1.0, given.covariance_px2[rows])).sum(axis=0)
+        out[camera.name] = {"factor_x": float(ratio[0]), "factor_y": float(ratio[2])}
+    return out
+
+
+def add_noise(residuals: dict[str, dict[str, Any]], adjustment: Adjustment, given: Network) -> None:
+    """Add ``noise_x_px``, ``noise_y_px``: rms of residuals by the covariance given alone, √(Σ r s² / n); None where it was a guess."""
+    for k, camera in enumerate(given.cameras):
+        rows = adjustment.used & (given.camera_of[given.image] == k)
+        noise: list[float | None] = [None, None]
+        if given.covariance_known and rows.any():
+            noise = np.sqrt(np.mean(adjustment.redundancy[rows] * given.covariance_px2[rows][:, [0, 2]], axis=0)).tolist()
+        residuals[camera.name] |= {"noise_x_px": noise[0], "noise_y_px": noise[1]}
 
 
 def network_record(adjustment: Adjustment, *, a_priori: bool = False) -> dict[str, Any]:

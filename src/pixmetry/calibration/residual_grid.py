@@ -104,12 +104,14 @@ def _roughness(shape: tuple[int, int]) -> Any:
     return sum(part.T @ part for part in parts).toarray()
 
 
-def _solved(hats: Any, v: np.ndarray, roughness: np.ndarray, penalty: float) -> tuple[np.ndarray, np.ndarray]:
-    """Values at the nodes, shape (nodes, 2), and the inverse of the penalised normal matrix."""
+def _solved(hats: Any, v: np.ndarray, roughness: np.ndarray, penalty: float) -> tuple[np.ndarray, Any]:
+    """Values at the nodes, shape (nodes, 2), and the Cholesky factor of the penalised normal matrix."""
+    from scipy import linalg
+
     # the part of 1e-6 keeps nodes defined that no point comes near, at 0
     normal = (hats.T @ hats).toarray() + penalty * roughness + 1e-6 * np.eye(len(roughness))
-    inverse = np.linalg.inv(normal)
-    return inverse @ (hats.T @ v), inverse
+    factor = linalg.cho_factor(normal, lower=True, overwrite_a=True)
+    return linalg.cho_solve(factor, hats.T @ v), factor
 
 
 def _left_out(hats: Any, v: np.ndarray, roughness: np.ndarray, penalty: float, fold: np.ndarray) -> np.ndarray:
@@ -133,7 +135,10 @@ def _fall(before: np.ndarray, after: np.ndarray, image: np.ndarray) -> float:
 
 
 def _fitted(hats: Any, v: np.ndarray, roughness: np.ndarray, penalty: float, shape: tuple[int, int]) -> dict[str, Any]:
-    values, inverse = _solved(hats, v, roughness, penalty)
+    from scipy import linalg
+
+    values, factor = _solved(hats, v, roughness, penalty)
+    inverse = linalg.cho_solve(factor, np.eye(len(values)))
     taken = np.einsum("ij,ji->", inverse, (hats.T @ hats).toarray())  # effective number of values an axis
     sigma2 = np.sum((v - hats @ values) ** 2) / max(2 * (len(v) - taken), 1.0)
     grid = (shape[1], shape[0])

@@ -25,6 +25,7 @@ import numpy as np
 from pixmetry.calibration.network import Adjustment, Network, State
 
 LEAST_REDUNDANCY = 0.01  # below it, in a direction, an error of an image point would not show in its residual
+FINEST_PX = 1e-4  # no image coordinate is better: what lies below is no error, and weights stay within what numbers hold
 KEPT = 0.5  # part of the points of an image, and of the images of a point, that the robust pass leaves at least
 ROBUST_SHARE = 0.6  # redundancy over observations from which on the spread of the middle half is taken for that of all
 MEDIAN = 2 * np.log(2)  # of χ² with two degrees of freedom
@@ -69,7 +70,8 @@ def statistics(adjustment: Adjustment) -> tuple[np.ndarray, np.ndarray]:
     share, axes = np.linalg.eigh(np.where(good[:, None, None], cofactor, np.eye(2)))
     along = np.einsum("nji,nj->ni", axes, np.where(good[:, None], white, 0.0))
     scaled = np.where(share > LEAST_REDUNDANCY, along / np.maximum(share, LEAST_REDUNDANCY), 0.0)
-    statistic = np.where(good, (scaled * along).sum(axis=1) / adjustment.sigma0**2, np.nan)
+    variance = max(adjustment.sigma0**2, finest_factor(adjustment.network))
+    statistic = np.where(good, (scaled * along).sum(axis=1) / variance, np.nan)
     error = (root @ np.einsum("nij,nj->ni", axes, scaled)[:, :, None])[:, :, 0]
     error = np.where(adjustment.used[:, None], error, adjustment.residual_px)
     return statistic, np.where(good[:, None], error, np.nan)
@@ -79,6 +81,11 @@ def critical_values(alpha: float, dof: int) -> tuple[float, float]:
     """Critical values of T for a point that takes part, and for one that does not (see the head of this module)."""
     inside = dof * (1 - alpha ** (2 / (dof - 2))) if dof > 2 else np.inf
     return inside, dof * (alpha ** (-2 / dof) - 1)
+
+
+def finest_factor(network: Network) -> float:
+    """Variance factor of the best image coordinates that there can be."""
+    return FINEST_PX**2 / float(network.covariance_px2[:, [0, 2]].mean())
 
 
 def remove_gross_errors(
@@ -189,7 +196,7 @@ def _without_large(robust: Adjustment, alpha: float) -> np.ndarray:
     variance = float(np.median(square[used])) / MEDIAN / share if share > ROBUST_SHARE else robust.sigma0**2
     left = np.bincount(network.image[used], minlength=len(network.images)), np.bincount(network.point[used], minlength=len(network.points))
     least = [np.ceil(KEPT * count) for count in left]
-    above = np.flatnonzero(square > -2 * np.log(alpha) * variance)
+    above = np.flatnonzero(square > -2 * np.log(alpha) * max(variance, finest_factor(network)))
     for i in above[np.argsort(-square[above])]:
         j, k = network.image[i], network.point[i]
         if left[0][j] > least[0][j] and left[1][k] > least[1][k]:

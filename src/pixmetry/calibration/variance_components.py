@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from pixmetry.calibration.network import Adjustment, Network
-from pixmetry.calibration.snooping import Adjust
+from pixmetry.calibration.snooping import Adjust, finest_factor
 
 LEAST_DOF = 10.0  # redundancy below which a group does not get a factor of its own
 ITERATIONS = 10
@@ -89,14 +89,15 @@ def estimate_components(adjustment: Adjustment, adjust: Adjust, *, by_axis: bool
         For x and y of each camera; else one factor for all image coordinates.
     """
     total = np.ones((len(adjustment.network.cameras), 2))
-    for iteration in range(1, ITERATIONS + 1):  # noqa: B007
-        factor, dof, estimated = factors(adjustment, by_axis=by_axis)
+    factor, dof, estimated = factors(adjustment, by_axis=by_axis)
+    iterations = 0
+    while iterations < ITERATIONS and (np.abs(factor - 1) > CLOSE * np.sqrt(2 / np.maximum(dof, 1.0))).any():
+        iterations += 1
         total *= factor
         network = scaled(adjustment.network, factor)
         adjustment = adjust(network, adjustment.state, used=adjustment.used, redundancy=True)
-        if (np.abs(factor - 1) < CLOSE * np.sqrt(2 / np.maximum(dof, 1.0))).all():
-            break
-    return Components(adjustment, total, dof, relative_u(adjustment), estimated, iteration)
+        factor, dof, estimated = factors(adjustment, by_axis=by_axis)
+    return Components(adjustment, total, dof, relative_u(adjustment), estimated, iterations)
 
 
 def relative_u(adjustment: Adjustment) -> np.ndarray:
@@ -126,10 +127,11 @@ def factors(adjustment: Adjustment, *, by_axis: bool = True) -> tuple[np.ndarray
     camera = network.camera_of[network.image]
     squares, dof = (np.stack([np.bincount(camera, a[:, i], minlength=shape[0]) for i in (0, 1)], axis=1) for a in (part, redundancy))
     common = squares.sum() / dof.sum() if dof.sum() >= LEAST_DOF and squares.sum() > 0 else 1.0
+    least = finest_factor(network)
     if not by_axis:
-        return np.full(shape, common), dof, np.zeros(shape, bool)
+        return np.full(shape, max(common, least)), dof, np.zeros(shape, bool)
     estimated = (dof >= LEAST_DOF) & (squares > 0)
-    return np.where(estimated, squares / np.maximum(dof, LEAST_DOF), common), dof, estimated
+    return np.maximum(np.where(estimated, squares / np.maximum(dof, LEAST_DOF), common), least), dof, estimated
 
 
 def weighted_squares(adjustment: Adjustment) -> np.ndarray:

@@ -12,6 +12,8 @@ from pixmetry.calibration_project.tables import Table, first_few, index_of_names
 from pixmetry.core.errors import InputError
 
 MM_PER = {"mm": 1.0, "um": 1e-3}
+UNITS = ("px", "mm", "um")
+UNCERTAINTIES = tuple(f"{kind}_{axis}" for kind in ("u", "var", "sigma") for axis in "xy") + ("cov_xy",)  # how such columns begin
 GUESS_PX = 0.05  # standard deviation of an image coordinate about which nothing is said; only the ratios of weights count then
 OUTSIDE = 0.01  # of the frame's sides: how far outside of it a target's centre may be
 
@@ -63,6 +65,7 @@ def measured(
     InputError
         If a column is missing, a value cannot be used, a point is measured twice in an image, or a place is outside of the frame.
     """
+    table = table.spelled("image", "point", *(f"{axis}_{unit}" for axis in "xy" for unit in UNITS))
     unit = _unit(table, given)
     table.need("image", "point", f"x_{unit}", f"y_{unit}")
     image, image_names = _numbered(table.texts("image"))
@@ -82,7 +85,7 @@ def measured(
 
 def _unit(table: Table, given: ImageCoordinates) -> str:
     """px, mm or um: what the names of the columns say, or the project where both are there."""
-    there = [unit for unit in ("px", "mm", "um") if f"x_{unit}" in table or f"y_{unit}" in table]
+    there = [unit for unit in UNITS if f"x_{unit}" in table or f"y_{unit}" in table]
     if given.unit in there or (given.unit is not None and not there):
         return given.unit
     if not there:
@@ -140,6 +143,7 @@ def image_facts(
             what = "several cameras, but no table that says which image is of which"
             raise InputError(what, where=where(names[0]), remedy="add `images: images.csv` with the columns image, camera")
         return np.zeros(len(names), np.int64), None
+    images = images.spelled("image", "camera", "time_s")
     images.need("image", *(["camera"] if len(cameras) > 1 else []))
     rows = index_of_names(images, "image")
     missing = next((name for name in names if name not in rows), None)
@@ -217,7 +221,7 @@ def _covariance(table: Table, unit: str, per_px: np.ndarray, sign: float, u_px: 
             out[:, 0] = (table.numbers(f"u_x_{name}", above=0) / scale[:, 0]) ** 2
             out[:, 2] = (table.numbers(f"u_y_{name}", above=0) / scale[:, 1]) ** 2
             return out, True
-    lost = next((name for name in table.columns if name.startswith(("u_x", "u_y", "var_x", "var_y", "cov_xy", "sigma_x", "sigma_y"))), None)
+    lost = next((name for name in table.columns if name.lower().startswith(UNCERTAINTIES)), None)
     if lost is not None:
         allowed = f"u_x_{unit} with u_y_{unit}, or var_x_{unit}2 with var_y_{unit}2 and cov_xy_{unit}2"
         remedy = "rename it, or leave it out with `columns:`"

@@ -46,6 +46,7 @@ def known_points(table: Table | None, names: Sequence[str], known: str | None, u
     n = len(names)
     if table is None:
         return Known(np.full((n, 3), np.nan), np.full((n, 3), np.inf), None, None)
+    table = table.spelled("point", "X", "Y", "Z", "u_X", "u_Y", "u_Z", "diameter", "normal_x", "normal_y", "normal_z")
     table.need("point", "X", "Y", "Z")
     rows = index_of_names(table, "point")
     at = np.array([rows.get(name, -1) for name in names])
@@ -123,6 +124,7 @@ def scale_bars(tables: Sequence[Table], names: Sequence[str], known: Known | Non
     index = {name: k for k, name in enumerate(names)}
     parts: list[Mapping[str, np.ndarray]] = []
     for table in tables:
+        table = table.spelled("from", "to", "length", "u")
         table.need("from", "to", "length", "u")
         ends = {}
         for end in ("from", "to"):

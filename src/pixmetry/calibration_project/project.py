@@ -21,7 +21,7 @@ from pixmetry.core.config import Settings, load_yaml, validate
 from pixmetry.core.errors import InputError
 
 Progress = Callable[[str, int, int], None]
-FIELD_OF = {"fixed": "fixed", "free": "free"}  # what `known` says about the test field; else images left out of the fit decide
+FIELD_OF = {"fixed": "fixed", "weighted": "fixed", "free": "free"}  # what `known` says; of nominal points images left out decide
 
 
 @dataclass(frozen=True)
@@ -206,9 +206,9 @@ def _with_target(known: Known, model: ProjectModel) -> Known:
 
 def _options(model: ProjectModel) -> dict[str, Any]:
     given = {name: value for name, value in model.options.model_dump().items() if value is not None}
-    known = model.points.known if model.points is not None else None
-    if "field" not in given and known in FIELD_OF:
-        given["field"] = FIELD_OF[known]
+    known = None if model.points is None else model.points.known or "weighted"
+    if known in FIELD_OF:
+        given = {"field": FIELD_OF[known], **given}
     if model.target is not None:
         given["target"] = model.target.shape
     return given

@@ -30,7 +30,7 @@ class Reader:
     def where(self, *loc: str | int) -> str:
         """The project with the line of a key."""
         line = next((self.lines[loc[:n]] for n in range(len(loc), 0, -1) if loc[:n] in self.lines), None)
-        return ".".join(map(str, loc)) if self.source is None else f"{self.source}, line {line}" if line else str(self.source)
+        return "pictures" if self.source is None else f"{self.source}, line {line}" if line else str(self.source)
 
     def table(self, key: str, wanted: TableModel | None) -> Table | None:
         """The table that stands under a key of the project."""
@@ -45,8 +45,9 @@ class Reader:
         found: list[Path] = []
         for k, name in enumerate(names):
             where = self.where("pictures", "files", k)
-            folder = self.folder / name
-            found += picture_files([folder], PICTURE_ENDINGS) if folder.is_dir() else find_files(self.folder, [name], where)
+            path = self.folder / name
+            base = Path(path.anchor) if Path(name).is_absolute() else self.folder  # patterns count from a folder
+            found += picture_files([path], PICTURE_ENDINGS) if path.is_dir() else find_files(base, [str(path.relative_to(base))], where)
         self.files += found
         return found
 

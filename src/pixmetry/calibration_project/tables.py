@@ -44,6 +44,12 @@ class Table:
         """File and line of a row."""
         return f"{self.source}, line {self.lines[row]}"
 
+    def spelled(self, *names: str) -> Table:
+        """The same table, with columns of these names that were written in other upper and lower case."""
+        lower = {name.lower(): name for name in names if name not in self.columns}
+        renamed = {name: lower.pop(name.lower(), name) if name not in names else name for name in self.columns}
+        return Table(self.source, {renamed[name]: values for name, values in self.columns.items()}, self.lines)
+
     def need(self, *names: str) -> None:
         """Refuse a table without these columns.
 

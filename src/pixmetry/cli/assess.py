@@ -18,10 +18,20 @@ if TYPE_CHECKING:
 )
 @click.option("--target", default="", help="Target, e.g. disc:diameter=7,blur=0.7,peak=0.6")
 @click.option("--estimator", default="", help="Estimator, e.g. soft_threshold:sigma=3,window=13")
+@click.option("--calibration", type=click.Path(path_type=Path), help="Its calibration.json, with which positions are corrected.")
 @click.option("--trials", type=click.IntRange(200, 10_000_000), default=4000, show_default=True, help="Windows for each Monte Carlo.")
 @click.option("--seed", type=click.IntRange(0), default=1, show_default=True, help="Of the Monte Carlo.")
 @click.option("--threads", type=click.IntRange(1), help="Default: all processors.")
-def assess(campaign: Path | None, output: Path, target: str, estimator: str, trials: int, seed: int, threads: int | None) -> None:
+def assess(
+    campaign: Path | None,
+    output: Path,
+    target: str,
+    estimator: str,
+    calibration: Path | None,
+    trials: int,
+    seed: int,
+    threads: int | None,
+) -> None:
     """Assess a camera from its frames: measure, budget, advise, and write the report.
 
     CAMPAIGN is a manifest (YAML), an EMVA 1288 descriptor file, or a folder that holds one of them; without it, the packaged example
@@ -34,7 +44,9 @@ def assess(campaign: Path | None, output: Path, target: str, estimator: str, tri
 
     set_threads(threads)
     with shown_progress() as progress:
-        assessment = run(campaign, output, target=target, estimator=estimator, trials=trials, seed=seed, progress=progress)
+        assessment = run(
+            campaign, output, target=target, estimator=estimator, calibration=calibration, trials=trials, seed=seed, progress=progress
+        )
     print_summary(assessment)
     click.echo(f"report: {output / 'report.html'}")
 
@@ -44,6 +56,8 @@ def print_summary(assessment: Assessment) -> None:
     from rich.console import Console
     from rich.table import Table
 
+    from pixmetry.budget.budget import DECIDED
+
     console = Console(width=110, highlight=False)
     console.print(f"\n[bold]{assessment.campaign.camera.name}[/bold]: {assessment.verdict_text()}\n")
     table = Table(
@@ -51,7 +65,7 @@ def print_summary(assessment: Assessment) -> None:
     )
     for name in ("source", "status", "class", "u in x", "u in y", "bias", "share"):
         table.add_column(name, justify="left" if name in ("source", "status", "class") else "right")
-    for row in [r for r in assessment.budget.of_status("measured", "modelled") if r.contribution is not None][:8]:
+    for row in [r for r in assessment.budget.of_status(*DECIDED) if r.contribution is not None][:8]:
         c = row.contribution
         bias = max(abs(c.bias_x_px), abs(c.bias_y_px))
         table.add_row(row.title, row.status, c.gum_class, *(f"{v:.5f}" for v in (c.u_x_px, c.u_y_px, bias)), f"{100 * row.share:.0f} %")

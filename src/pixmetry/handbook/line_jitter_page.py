@@ -7,8 +7,8 @@ import numpy as np
 from pixmetry.calibration.line_residuals import AxisResiduals, compare_axes
 from pixmetry.calibration.row_jitter import Sampling, jitter_from_axes
 from pixmetry.core.estimates import Estimates
-from pixmetry.handbook import line_jitter as experiment
-from pixmetry.handbook.line_jitter import AVERAGED, FRAMES, LENSES, LINES, PIXEL_NS, POSITIONS, VIEWS, Level, stored
+from pixmetry.handbook.line_jitter import FRAMES, PIXEL_NS, Level, stored
+from pixmetry.handbook.line_jitter_frames import AVERAGED, LENSES, LINES, POSITIONS, PRESET, VIEWS
 from pixmetry.handbook.page import Page, show, table
 from pixmetry.report.drawing import AMBER, BLUE, INK, RED, SOFT, Picture, canvas, picture
 from pixmetry.report.numbers import fixed, significant, uncertain
@@ -189,9 +189,9 @@ rows (columns) next to each other. Each pair of frames is calibrated by its plum
 K1, K2, P1 and P2 of Brown's polynomial. The residuals along x, from the upright wires, are compared with those along y, from the lying
 ones. Jitter acts on x only, so the camera is its own control.
 
-Everything runs through the whole chain of `{experiment.PRESET}`: lens distortion (K1 from
-{min(lens["k1_per_mm2"] for lens in LENSES):g} to {max(lens["k1_per_mm2"] for lens in LENSES):g} /mm², centres some pixels off), a sensor
-that is not quite flat, interlaced read-out, noise, fixed patterns, video amplifier, cable, clamp, 8 bits. Only the grabber's own jitter is
+Everything runs through the whole chain of `{PRESET}`: lens distortion (K1
+{", ".join(significant(lens["k1_per_mm2"], 2) for lens in LENSES)} /mm², centres some pixels off), a sensor that is not
+quite flat, interlaced read-out, noise, fixed patterns, video amplifier, cable, clamp, 8 bits. Only the grabber's own jitter is
 replaced by {", ".join(f"{level.jitter_ns:g}" for level in run.levels)} ns, independent from row to row. Why the grabber that is driven by
 the camera's pixel clock? The chapter's 0.341 µm are its 1/25 pixel only if a pixel of the image is 8.5 µm wide, as on the sensor (8.6 µm);
 with a clock of 10 MHz it would be 12.2 µm wide.
@@ -207,9 +207,9 @@ In the form of the chapter's Table 3.2 (it has 0.341 µm, 1/25 pixel in x and 0.
 {show(pictures[1])}
 "Noise alone" is what the estimator states for the pixels' noise. Even without jitter more than that is left: sensitivities and offsets
 that differ from pixel to pixel, and what four lens parameters do not describe. Yet it is six times less than the chapter's residuals. Its
-lines were a few pixels wide, unevenly lit and ringing, and we do not know how many rows it averaged and by which estimator. Its y residuals
-at least are no line jitter, and jitter that would explain its x residuals alone, some {_needed_ns():.1f} ns here, would make x several times
-as large as y.
+lines were a few pixels wide, unevenly lit and ringing, and we do not know how many rows it averaged and by which estimator. Its y
+residuals at least are no line jitter, and jitter that would explain its x residuals alone, some {_needed_ns():.1f} ns here, would make x
+several times as large as y.
 
 Not everything is left in the residuals. K1 is found {1e5 * off:.1f}·10⁻⁵ /mm² below the lens' own on average (u of one pair about
 {1e5 * u_k1:.1f}·10⁻⁵): light that falls aslant on a bowed sensor lands beside its place, and lines cannot tell that from a lens. P1 and P2
@@ -225,9 +225,10 @@ as dof/(1 + 2 Σ ρ²). The most careful takes one for each line, {none.x.lines}
 light or blur.
 
 {_test_table()}
-Without jitter, x is still worse than y by a tenth of the variance: the pixel and the video amplifier blur x more. With all positions as
-independent this comes out as "significant", and so would any cause that has nothing to do with jitter. With one degree of freedom a line
-(critical value {fixed(none.f_test["critical_95"]["lines"], 2)}) it does not; 1 ns does. And the unit matters where pixels are not square:
+Without jitter, x is still worse than y by a tenth of the variance, since pixel and video amplifier blur x more. With all positions taken
+for independent, which their correlations nearly allow, this is significant: a real difference, but none of jitter (see below). A test
+with many degrees of freedom finds any difference, whatever it is from. With one degree of freedom a line (critical value
+{fixed(none.f_test["critical_95"]["lines"], 2)}) it is not significant, and 1 ns is. The unit matters, too, where pixels are not square:
 equal in pixels is not equal in micrometres.
 
 The chapter's own numbers, tested so: {fixed(test["ratio_px2"], 3)} in px² (p = {fixed(test["p_px"]["lines"], 3)}),
@@ -238,15 +239,15 @@ So "not to be seen" holds for the size, not for the test.
 
 ## The jitter in nanoseconds
 
-A position is the mean of {AVERAGED} rows, which shake independently: its jitter is that of a row over √{AVERAGED}. And a delay does not
-move the line by as much: the amplifier's steps have not settled when the grabber samples them, so that a delay of one pixel moves the
-position by {", ".join(fixed(g, 2) for g in run.gains)} pixels (wires near, farther, far; found by shearing a frame without noise by a
-known delay). With both, three ways lead to the jitter:
+A position is the mean of {AVERAGED} rows, which shake independently: its jitter is that of a row over √{AVERAGED}. And a delay moves
+the line by more than its own length: the amplifier's steps are still rising when the grabber samples them, so that a delay of one pixel
+moves the position by {", ".join(fixed(g, 2) for g in run.gains)} pixels (wires near, farther, far; found by shearing a frame without
+noise by a known delay). With both, three ways lead to the jitter:
 
 - **x against y**: the difference of the variances, with the ratio of noise that the estimator states for x and y; one degree of freedom a
   line for the noise.
 - **Rows of one frame**: a row crosses all eight wires and takes them along together. What the eight residuals of a row share is jitter,
-  what they do not share is not (one-way analysis of variance). It needs no lying wires.
+  what they do not share is not (one-way analysis of variance). It needs no lying wires, and each frame is one for itself.
 - **{FRAMES} frames** of one view: the same, less the mean of the frames, so that fixed patterns do not count.
 
 {_jitter_table()}
@@ -264,8 +265,8 @@ nothing at any level, as it must.
   the rest together.
 - Sample with the camera's pixel clock, average frames, or take a digital camera.
 
-Run in full with `{COMMAND}` ({len(VIEWS) * 2 * len(run.levels)} frames, about two minutes of one core), which stores the numbers that
-`scripts/make_handbook.py` writes here; run again, both give the same.
+Run in full with `{COMMAND}` ({len(VIEWS) * 2 * len(run.levels)} frames and the repeated ones, about two minutes of one core), which stores
+the numbers that `scripts/make_handbook.py` writes here; run again, both give the same.
 """
     return Page("line-jitter", text, pictures)
 

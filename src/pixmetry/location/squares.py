@@ -150,7 +150,7 @@ def square_corners(
     Returns
     -------
     Positions
-        4 n corners, square by square; NaN with the flag NOT_CONVERGED where a side was not found or the corner is farther than 3 px from
+        4 n corners, square by square; NaN with the flag NOT_CONVERGED where a corner did not come to rest or lies farther than 3 px from
         where it was expected. In ``more``: chi2_per_dof (the larger of the two sides).
 
     Notes

@@ -70,7 +70,7 @@ def _content(calibration: Calibration) -> dict[str, Any]:
         "name": str(calibration.provenance.get("name") or ", ".join(c.name for c in net.cameras)),
         "facts": tables.network_facts(calibration),
         "sigma0": sigma0_text(calibration),
-        "findings": [replace(f, text=typeset(f.text), advice=typeset(f.advice)) for f in calibration.findings],
+        "findings": [replace(f, text=typeset(sentence(f.text)), advice=typeset(sentence(f.advice))) for f in calibration.findings],
         "tested": bool(tests),
         "cameras": cameras,
         "poses": [(_full(r["a"]), _full(r["b"]), fixed(r["r"], 2)) for r in tests.get("correlations_with_poses") or ()],
@@ -211,6 +211,8 @@ def _field(field: Mapping[str, Any]) -> dict[str, Any]:
     if field.get("shape") == "plane" and field.get("rms_in_plane") is not None:
         inside = f"{significant(float(field['rms_in_plane']), 2)} {unit}"
         text = f"The points leave their best plane by {' and '.join(sizes)}, and lie {inside} rms off in it{said}."
+    if sizes and field.get("u"):
+        text += f" Their own uncertainty (k = 1) makes {significant(float(field['u']), 2)} {unit} rms of the former."
     return {"verdict": verdict, "text": text, "moved": tables.moved(field)}
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pixmetry.report.calibration_figures import LEAST_IN_CELL, MOST_VECTORS, Residuals, colour_bar, even_choice, finished, frame_height
-from pixmetry.report.drawing import BLUE, INK, RED, SOFT, WIDTH_IN, Picture, canvas
+from pixmetry.report.drawing import BLUE, INK, RED, SOFT, WIDTH_IN, Picture, canvas, plain_log
 from pixmetry.report.numbers import MINUS, significant, uncertain
 
 if TYPE_CHECKING:
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from pixmetry.calibration.model import Sensor
 
 COVER_95 = 1.96
+WIDE_RANGE = 6.0  # of a map, from which its colours are logarithmic
 MOST_DOTS = 20_000  # in a scatter of residuals
 DARK_TEXT, LIGHT_TEXT = "#101010", "#fefefe"  # on coloured cells, which do not change with the page's theme
 
@@ -167,15 +168,18 @@ def projection_map(p: Mapping[str, Any], sensor: Sensor, name: str) -> Picture:
     x, y = np.asarray(p["x_px"], float), np.asarray(p["y_px"], float)
     half_x, half_y = (float(np.ptp(v)) / max(len(v) - 1, 1) / 2 for v in (x, y))
     extent = (x.min() - half_x, x.max() + half_x, y.max() + half_y, y.min() - half_y)
+    wide = float(np.nanmax(u)) > WIDE_RANGE * float(np.nanmin(u)) > 0
     with canvas(frame_height(sensor, 1.15) - 0.2) as (figure, axes):
-        image = axes.imshow(1000 * u, cmap="cividis", extent=extent, interpolation="none", vmin=0)
+        image = axes.imshow(1000 * u, cmap="cividis", extent=extent, interpolation="none", norm="log" if wide else "linear")
         axes.grid(False)
         axes.set_xlabel("x / px")
         axes.set_ylabel("y / px")
-        colour_bar(figure, axes, image, "u / 10⁻³ px")
+        bar = colour_bar(figure, axes, image, "u / 10⁻³ px")
+        if wide:
+            plain_log(bar.yaxis)
         caption = (
-            "Projection uncertainty: standard uncertainty (root of the sum of both axes' squares) with which the calibration "
-            "tells where a direction is imaged; what a rotation of the camera would take up is fitted out. Where no image point lay, it is "
+            "Projection uncertainty: standard uncertainty of an image coordinate (mean of x and y) with which the calibration tells "
+            "where a direction is imaged; what a rotation of the camera would take up is fitted out. Where no image point lay, it is "
             "extrapolated by the model."
         )
         alt = f"Projection uncertainty over the sensor, {significant(float(np.nanmin(u)), 2)} to {significant(float(np.nanmax(u)), 2)} px"

@@ -85,7 +85,7 @@ def _network_view(adjustment: Adjustment, points: np.ndarray, extent: float, num
         azimuth, elevation = SIDES[number]
         caption = (
             f"The network from azimuth {azimuth:.0f}°, elevation {elevation:.0f}°, without perspective. The axes are "
-            f"{significant(length)} {net.unit} long" + ("; thick lines are scale bars." if len(net.bars) else ".")
+            f"{significant(length, 1)} {net.unit} long" + ("; thick lines are scale bars." if len(net.bars) else ".")
         ).replace("-", "\u2212")
         alt = f"{int(oriented.sum())} images as pyramids, {len(points)} points and {len(net.bars)} scale bars, side {number + 1} of 2"
         return finished(figure, f"network-{number + 1}", alt, caption)
@@ -188,6 +188,7 @@ def field_map(adjustment: Adjustment, points: Mapping[str, Any]) -> Picture | No
         axes.set_aspect("equal", adjustable="datalim")
         axes.set_xlabel(f"{names[0]} / {net.unit}")
         axes.set_ylabel(f"{names[1]} / {net.unit}")
+        axes.set_axisbelow(True)
         length_key(axes, factor, key, net.unit)
         colour_bar(figure, axes, dots, f"height / {net.unit}")
         low, high = significant(float(dz.min()), 2), significant(float(dz.max()), 2)

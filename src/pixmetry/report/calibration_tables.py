@@ -167,13 +167,16 @@ def hold_out(found: Mapping[str, Any] | None) -> list[list[str]]:
 
 
 def moved(field: Mapping[str, Any]) -> list[list[str]]:
-    """By how much interior parameters moved when the field was set free, beside their formal u."""
+    """By how much interior parameters moved when the field was set free, beside their formal u; by camera where there are several."""
+    cameras = field.get("cameras") or {}
+    records = list(cameras.items()) if len(cameras) > 1 else [("", field)]
     rows = []
-    for key in ("xp", "yp", "c"):
-        shift, u = field.get(f"moved_{key}_px"), field.get(f"u_{key}_px")
-        if shift is not None:
-            ratio = NONE if not u else fixed(abs(shift) / u, 1)
-            rows.append([symbol(key), signed(shift, length_px), px(u), ratio])
+    for name, record in records:
+        for key in ("xp", "yp", "c"):
+            shift, u = record.get(f"moved_{key}_px"), record.get(f"u_{key}_px")
+            if shift is not None:
+                ratio = NONE if not u else fixed(abs(shift) / u, 1)
+                rows.append([f"{name}: {symbol(key)}" if name else symbol(key), signed(shift, length_px), px(u), ratio])
     return rows
 
 

@@ -50,10 +50,10 @@ def typeset(text: str) -> str:
 
 
 def sentence(text: str) -> str:
-    """A text with a capital at its beginning, unless that is a symbol, and a full stop at its end."""
+    """A text with a capital at its beginning, unless that is a symbol or a name, and a full stop at its end."""
     if not text:
         return ""
-    first = text[0] if text[1:2] == " " else text[0].upper()
+    first = text[0] if text[1:2] == " " or text.split()[0].endswith(":") else text[0].upper()
     return f"{first}{text[1:].rstrip('.')}."
 
 
@@ -160,7 +160,7 @@ def summary_text(calibration: Calibration) -> str:
         lines += _parameter_lines(calibration, k)
     for finding in calibration.findings:
         mark = "Warning" if finding.level == "warning" else "Note"
-        lines += ["", f"{mark}: {finding.text}"]
+        lines += ["", f"{mark}: {sentence(finding.text)}"]
         if finding.advice:
             lines.append(f"  To do: {finding.advice}")
     return "\n".join(part for line in lines for part in _folded(line)).replace(NO_BREAK, " ").replace(THIN, " ")

@@ -1,0 +1,133 @@
+"""Gross errors, weights and eccentricity hang together: they are found in turn until none of them changes anything."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from pixmetry.calibration.eccentric import Eccentricity, eccentricity, without_eccentricity
+from pixmetry.calibration.network import Adjustment, Network, State
+from pixmetry.calibration.options import Options
+from pixmetry.core.errors import MeasureError
+
+Progress = Callable[[str], None]
+LOOPS = 12
+CLOSE_PX = 1e-4  # an eccentricity that moves by less has converged
+ALIKE = 1.3  # weights that change by less, x against y or camera against camera, need no new search for gross errors
+
+
+@dataclass(frozen=True)
+class Settled:
+    """A network whose gross errors, weights and eccentricities do not change any more.
+
+    Parameters
+    ----------
+    measured : Network
+        With its weights; its image coordinates are those measured, without correction.
+    adjustment : Adjustment
+        Of the corrected image coordinates.
+    shift : Eccentricity
+    components : dict
+        Records of the variance components; empty if they were not estimated.
+    gross_known : dict
+        Bars and control points that were left out.
+    """
+
+    measured: Network
+    adjustment: Adjustment
+    shift: Eccentricity
+    components: dict[str, Any]
+    gross_known: dict[str, Any]
+
+
+def adjust_with(options: Options) -> Callable[..., Adjustment]:
+    """`bundle.adjust` with what the options say of every adjustment."""
+    from pixmetry.calibration.bundle import adjust
+
+    return partial(adjust, max_iterations=options.max_iterations, a_priori=options.a_priori)
+
+
+def settle(measured: Network, state: State, options: Options, say: Progress, used: np.ndarray | None = None) -> Settled:
+    """Repeat the search for gross errors, the variance components and the eccentricity until none of them changes anything."""
+    from pixmetry.calibration.known_checks import set_free, wrong_fixed, wrong_fixed_records
+
+    loss: str = options.loss if used is None else "none"
+    freed = np.zeros(0, int)
+    components: dict[str, Any] = {}
+    used = np.ones(len(measured), bool) if used is None else used
+    shift = _shift(measured, state, options)
+    measured, state, used, loss, gross_known = _checked_known(measured, shift, state, used, loss, options, say)
+    for loop in range(1, LOOPS + 1):
+        say(f"adjusting, round {loop}")
+        adjustment = _without_gross_errors(without_eccentricity(measured, shift), state, used, loss, options)
+        wrong = wrong_fixed(measured, adjustment) if options.snoop else freed[:0]
+        if len(wrong):
+            measured, used, freed = set_free(measured, wrong), adjustment.used | np.isin(measured.point, wrong), np.append(freed, wrong)
+            adjustment = _without_gross_errors(without_eccentricity(measured, shift), adjustment.state, used, "none", options)
+        adjustment, step, components = _weighted(adjustment, options, components)
+        measured = replace(measured, covariance_px2=adjustment.network.covariance_px2)
+        again = _shift(measured, adjustment.state, options)
+        moved = float(np.abs(again.shift_px - shift.shift_px).max(initial=0.0))
+        still = (adjustment.used == used).all() and moved < CLOSE_PX and step.max() < ALIKE * step.min()
+        used, state, loss = adjustment.used, adjustment.state, "none"
+        if still:
+            break
+        shift = again
+    gross_known = {**gross_known, "control_points": [*gross_known["control_points"], *wrong_fixed_records(adjustment, freed)]}
+    return Settled(measured, adjustment, shift, components, gross_known)
+
+
+def _checked_known(
+    measured: Network, shift: Eccentricity, state: State, used: np.ndarray, loss: str, options: Options, say: Progress
+) -> tuple[Network, State, np.ndarray, str, dict[str, Any]]:
+    """The network without bars and control points that it contradicts, and what its image points without them are worth."""
+    from pixmetry.calibration.known_checks import CheckedKnown, check_known, has_known, loosened
+
+    if not (options.snoop and has_known(measured)):
+        return measured, state, used, loss, CheckedKnown(measured).gross
+    say("testing scale bars and control points")
+    try:
+        clean = _without_gross_errors(without_eccentricity(loosened(measured), shift), state, used, loss, replace(options, a_priori=False))
+    except MeasureError:  # the network hangs on them
+        return measured, state, used, loss, CheckedKnown(measured).gross
+    checked, state = check_known(without_eccentricity(measured, shift), clean, adjust_with(replace(options, a_priori=False)))
+    measured = replace(measured, bars=checked.network.bars, u_xyz=checked.network.u_xyz)
+    if options.variance_components or not measured.covariance_known:
+        measured = replace(measured, covariance_px2=checked.network.covariance_px2)
+    return measured, state, clean.used, "none", checked.gross
+
+
+def _shift(measured: Network, state: State, options: Options) -> Eccentricity:
+    return eccentricity(measured if options.eccentricity else replace(measured, diameter=None), state, options.target)
+
+
+def _without_gross_errors(network: Network, state: State, used: np.ndarray, loss: str, options: Options) -> Adjustment:
+    from pixmetry.calibration.snooping import remove_gross_errors
+
+    adjust = adjust_with(options)
+    if not options.snoop:
+        return adjust(network, state, used=used, redundancy=True)
+    return remove_gross_errors(
+        network, state, adjust, used=used, loss=loss, loss_scale=options.loss_scale, false_alarms=options.false_alarms
+    ).adjustment
+
+
+def _weighted(adjustment: Adjustment, options: Options, before: dict[str, Any]) -> tuple[Adjustment, np.ndarray, dict[str, Any]]:
+    """The adjustment with estimated weights, by how much they changed, and records, whose iterations go on from those before.
+
+    If weights are not to be estimated, a guessed covariance still gets its size, for bars beside it.
+    """
+    from pixmetry.calibration.variance_components import estimate_components
+
+    one = np.ones((len(adjustment.network.cameras), 2))
+    if not options.variance_components and adjustment.network.covariance_known:
+        return adjustment, one, {}
+    found = estimate_components(adjustment, adjust_with(options), by_axis=options.variance_components)
+    records = found.records() if options.variance_components else {}
+    for name, record in records.items():
+        record["iterations"] += before.get(name, {"iterations": 0})["iterations"]
+    return found.adjustment, found.factor, records

@@ -1,0 +1,62 @@
+"""A calibration enters an assessment: the digital twin gets the lens, the budget what the calibration leaves."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from calibration.networks import simulate
+from pixmetry import assess, load_camera
+from pixmetry.calibrated import calibrated_geometry
+from pixmetry.calibration.geometry import geometry_of
+from pixmetry.calibration.model import CameraModel, Sensor
+from pixmetry.calibration.solve import Options, calibrate_network
+from pixmetry.calibration_files import write_results
+from pixmetry.campaign import load_campaign
+from pixmetry.cli import main
+from pixmetry.core.errors import InputError
+from pixmetry.core.observations import LENS
+
+PITCH = (8.3, 8.3)
+
+
+def test_a_file_of_a_calibration_enters_twin_report_and_budget(tmp_path: Path) -> None:
+    rng = np.random.default_rng(5)  # what is tested does not depend on the draw
+    sensor = Sensor(780, 582, *PITCH)
+    simulated = simulate(rng, images=12, points=60, sensor=sensor, interior={"k1": -2e-3})
+    calibration = calibrate_network(simulated.network, Options(folds=0))
+    write_results(calibration, tmp_path / "calibration")
+    file = tmp_path / "calibration" / "calibration.json"
+    ran = CliRunner().invoke(main, ["assess", "-o", str(tmp_path / "out"), "--trials", "200", "--calibration", str(file)])
+    assert ran.exit_code == 0, ran.output
+    assert "calibrated" in ran.output and "Lens distortion" in ran.output
+    twin = load_camera(tmp_path / "out" / "camera.yaml")
+    assert twin[LENS].params.k1_per_mm2 == pytest.approx(-2e-3, rel=0.1)
+    assert "calibration.json" in (tmp_path / "out" / "results.json").read_text()
+    geometry, again = calibrated_geometry(file), calibrated_geometry(calibration)
+    np.testing.assert_allclose(geometry.lens.values, again.lens.values, rtol=1e-9, atol=1e-12)
+    assert 0.002 < geometry.u_x_px < 0.3  # twelve images of .04 px: well in the middle, badly in the corners
+    report = (tmp_path / "out" / "report.html").read_text()
+    assert 'class="status calibrated"' in report
+
+
+def test_what_is_left_over_counts_in_the_verdict() -> None:
+    model = CameraModel.of(Sensor(780, 582, *PITCH), c=12.0, k1=-1e-3)
+    fine, poor = (geometry_of(model, (), np.zeros((0, 0)), left_px=(left, left)) for left in (0.0, 0.05))
+    totals = [assess(calibration=g, trials=200).budget.verdict.total_px for g in (fine, poor)]
+    assert totals[1] == pytest.approx(np.hypot(totals[0], 0.05), rel=0.02)
+
+
+def test_the_calibration_of_another_camera_is_refused(tmp_path: Path) -> None:
+    geometry = geometry_of(CameraModel.of(Sensor(780, 582, 2.2, 2.2), c=12.0), (), np.zeros((0, 0)))
+    campaign = load_campaign(None)
+    campaign = replace(campaign, camera=replace(campaign.camera, pitch_x_um=8.3, pitch_y_um=8.3))
+    with pytest.raises(InputError, match="another pixel pitch"):
+        assess(campaign, calibration=geometry, trials=200)
+    (tmp_path / "calibration.json").write_text("{}")
+    ran = CliRunner().invoke(main, ["assess", "--calibration", str(tmp_path / "calibration.json"), "-o", str(tmp_path / "out")])
+    assert ran.exit_code == 2 and ran.output.count("\n") == 1 and not (tmp_path / "out").exists()
