@@ -368,3 +368,39 @@ def test_no_matrix_of_points_by_points(rng):
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 60e6
+
+
+def test_one_image_of_known_points_gets_its_pose_only(rng):
+    simulated = simulate(rng, images=5, points=20, known="fixed", bars=0)
+    network, truth = simulated.network, simulated.truth
+    known = replace(network.cameras[0], free=np.zeros(12, bool), values=truth.interior[0])
+    start = replace(disturbed(rng, simulated), interior=truth.interior)
+    found = adjust(replace(network, cameras=(known,)), start, used=network.image == 2, a_priori=True)
+    assert found.free_columns == tuple(f"{network.images[2]}:{name}" for name in ("rx", "ry", "rz", "X0", "Y0", "Z0"))
+    assert found.dof == 2 * found.used.sum() - 6 and np.isnan(found.state.position[[0, 1, 3, 4]]).all()
+    turn = Rotation.from_matrix(found.state.rotation[2] @ truth.rotation[2].T).as_rotvec()
+    off = np.concatenate([turn, found.state.position[2] - truth.position[2]])
+    assert off @ np.linalg.solve(found.covariance, off) < chi2.isf(RATE, 6)
+    weak = bundle_covariance.weak_direction(found.free_columns, found.covariance, found.network, found.state)
+    assert all(name.endswith(f"of image {network.images[2]}") for name in weak.parameters) and abs(weak.correlation) > 0.5
+
+
+def test_without_noise_the_truth_comes_out(rng):
+    simulated = simulate(rng, images=8, points=30, noise_px=1e-9, known="partly", bars=0)
+    network = replace(simulated.network, covariance_px2=np.tile([1.0, 0.0, 1.0], (len(simulated.network), 1)))
+    found = adjust(network, disturbed(rng, simulated))
+    assert found.sigma0 < 1e-7
+    np.testing.assert_allclose(found.state.xyz, simulated.truth.xyz, atol=1e-5)
+    np.testing.assert_allclose(found.state.interior[0, :3], simulated.truth.interior[0, :3], atol=1e-4)
+
+
+def test_a_start_in_another_datum_is_moved_to_the_given_one(rng):
+    simulated = simulate(rng, images=8, points=30, known="rough", bars=0)
+    start, network = disturbed(rng, simulated), simulated.network
+    turn = Rotation.from_rotvec(rng.uniform(-1, 1, 3)).as_matrix()
+    moved = replace(
+        start, xyz=3 * start.xyz @ turn.T + 100, position=3 * start.position @ turn.T + 100, rotation=start.rotation @ turn.T
+    )
+    here, there = adjust(network, start), adjust(network, moved)
+    np.testing.assert_allclose(there.state.xyz, here.state.xyz, atol=1e-4)
+    _stays_in_the_mean(there.state.xyz, network.xyz)

@@ -179,7 +179,8 @@ def test_drift_of_the_clock_is_named_and_gone_when_estimated(rng):
     network = shifted(measured_again(rng, simulated, exact), stretch[simulated.network.image] * exact[:, 0])
     found = adjusted(network, simulated)
     findings = pattern_findings(residual_patterns(found))
-    assert findings[0].kind == "x_scale_drift" and findings[0].level == "warning" and "grabber.clock_warm_up" in findings[0].text
+    drift = [finding for finding in findings if finding.kind == "x_scale_drift"]
+    assert len(drift) == 2 and all("grabber.clock_warm_up" in finding.text and finding.level == "warning" for finding in drift)
     assert found.sigma0 > 1.3
     settled = adjusted(replace(network, per_image=("x_scale",)), simulated)
     left = by_name(settled)
@@ -197,14 +198,3 @@ def test_findings_come_with_a_source_of_the_catalogue():
     findings = pattern_findings(made)
     assert [f.kind for f in findings] == ["radius", "phase_x"] and findings[0].text == "radius (as by optics.distortion)"
     assert findings[0].advice == "Do this." and {f.level for f in findings} == {"warning"}
-
-
-def test_drift_makes_its_shadows_notes():
-    made = [
-        {"name": name, "camera": "a", "p": p, "significant": True, "text": name, "source": MEANING[name][1], "advice": "do this"}
-        for p, name in enumerate([*MEANING][::-1])
-    ]
-    findings = pattern_findings(made)
-    kinds = ["x_scale_drift", "x_scale_drift", "image_rms", "principal_distance_trend", "principal_point_trend"]
-    assert [f.kind for f in findings] == kinds
-    assert [f.level for f in findings] == ["warning", "warning", "note", "note", "note"] and "shadow" in findings[2].advice

@@ -1,8 +1,8 @@
 """Start values: networks of many kinds come out posed, from nothing but their image coordinates.
 
 What stands beside them is the truth of an independent simulator. The networks drawn anew in each run are strong ones; the weak ones have
-a seed of their own, since some draw of them will fall apart. A residual
-three times the noise, or a principal distance 2 % off, would be seen.
+a seed of their own, since some draw of them will fall apart. A residual three
+times the noise, or a principal distance 2 % off, would be seen.
 """
 
 from __future__ import annotations

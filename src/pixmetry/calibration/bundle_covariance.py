@@ -130,7 +130,7 @@ def _inverse(layout: Layout, datum: Datum, now: Linearised, solved: Solved) -> n
     from scipy.linalg.lapack import dpotri
 
     lower = dpotri(solved.factor, lower=0, overwrite_c=1)[0].T
-    if np.diagonal(lower).max() > SINGULAR:
+    if not np.diagonal(lower).max() < SINGULAR:
         raise_weak(layout, datum, now, "the unknowns are not determined")
     kernels.scaled_whole(lower, solved.scale)
     if len(layout.constraints):

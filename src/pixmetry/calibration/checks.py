@@ -279,7 +279,7 @@ def _check_camera(adjustment: Adjustment, k: int) -> list[Finding]:
     network, camera = adjustment.network, adjustment.network.cameras[k]
     u = {name: _u(adjustment, f"{camera.name}:{name}") for name in ("c", "xp", "yp")}
     c, width, findings = adjustment.state.interior[k, 0], camera.sensor.cols, []
-    images = np.flatnonzero((network.camera_of == k) & np.isfinite(adjustment.state.position[:, 0]))
+    images = [int(i) for i in np.flatnonzero((network.camera_of == k) & np.isfinite(adjustment.state.position[:, 0]))]
     if u["c"] is not None:
         r = _median([_correlation(adjustment, f"{camera.name}:c", i, 2) for i in images])
         if abs(r) > SAME and u["c"] > POOR_C * c:

@@ -18,7 +18,7 @@ from pixmetry.calibration.resection import intersect, rays
 DISTANCES = (1.25, 2.1, 0.8, 3.6, 0.5, 6.0)  # principal distances to try, in widths of the frame
 FEWEST_COMMON = 6  # points of a pair: five give its relative orientation
 ENOUGH_COMMON = 30  # more of them make a pair no better
-PAIRS = 6  # pairs to try
+PAIRS, LISTED = 6, 24  # pairs to try at a time, and at all
 WEIGHED = 250  # pairs whose parallax is looked at
 TRIAL_IMAGES = 7  # images by which a start is judged
 CONVINCING_PX = 0.25  # median residual at which no further start is tried
@@ -56,7 +56,7 @@ def good_pairs(network: Network, allowed: np.ndarray) -> list[tuple[int, int]]:
         pair = int(first[k]), int(second[k])
         if all(sum(image in other for other in chosen) < 2 for image in pair):
             chosen.append(pair)
-    return chosen[:PAIRS]
+    return chosen[:LISTED]
 
 
 def shared(network: Network, i: int, j: int) -> tuple[np.ndarray, np.ndarray]:
@@ -148,9 +148,12 @@ def without_lens(network: Network, interior: np.ndarray) -> np.ndarray:
     return np.where(free, 0.0, interior)
 
 
-def best_free(network: Network, interior: np.ndarray, allowed: np.ndarray) -> Reconstruction | None:
-    """The start that explains the image coordinates best, grown to a few images; None if no pair can be oriented."""
-    pairs = good_pairs(network, allowed)
+def best_free(network: Network, interior: np.ndarray, allowed: np.ndarray, first: int = 0) -> Reconstruction | None:
+    """The start that explains the image coordinates best, grown to a few images; None if no pair can be oriented.
+
+    ``first`` is the pair to begin with, in the order of `good_pairs`.
+    """
+    pairs = good_pairs(network, allowed)[first : first + PAIRS]
     distances = start_distances(network)
     best, least = None, np.inf
     no_control = np.zeros(len(network.points), bool)

@@ -23,6 +23,7 @@ TRIED_IMAGES = 12  # by which principal distances are compared
 FINE_STEPS = (1.25, 0.8, 1.0, 1.6, 0.63, 2.0, 0.5, 2.6, 0.4, 3.3, 4.2, 5.3, 6.6, 8.5)  # principal distances, in widths of the frame
 FITS = 0.3  # of FINE, as an rms: what a start from known points must reach
 JOINS = 0.02  # rms distance at the points that join two parts, in units of the extent
+BEGINNINGS = (0, 1, 2, 4, 8, 14)  # pairs to begin with, one after the other while most images get no pose
 TIE = 3  # points that join two parts of a network
 ENOUGH = 0.7  # of the images that must get a pose
 REACH = 0.1  # rms distance from control, in units of its extent, at which coordinates do not belong to the images
@@ -61,6 +62,7 @@ def start_values(network: Network) -> tuple[Network, State]:
                 pass
             work.mend()
             work.settle()
+            work.mend()
             _to_object(work)
     _check_posed(work)
     cameras = tuple(replace(camera, values=row) for camera, row in zip(network.cameras, work.interior, strict=True))
@@ -187,11 +189,19 @@ def _check_mirrored(network: Network, interior: np.ndarray, control: np.ndarray,
 
 
 def _from_images(network: Network, interior: np.ndarray) -> Reconstruction:
-    work = best_free(network, interior, np.ones(len(network.images), bool))
-    if work is None:
+    best: Reconstruction | None = None
+    for first in BEGINNINGS:
+        work = best_free(network, interior, np.ones(len(network.images), bool), first)
+        if work is None:
+            continue
+        _grow_cameras(work)
+        if best is None or work.posed.sum() > best.posed.sum():
+            best = work
+        if best.posed.mean() >= ENOUGH:
+            break
+    if best is None:
         raise _not_oriented(network, np.zeros(len(network.images), bool))
-    _grow_cameras(work)
-    return work
+    return best
 
 
 def _grow_cameras(work: Reconstruction) -> None:

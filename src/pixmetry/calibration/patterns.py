@@ -18,7 +18,6 @@ FIELD_NODES = (6, 5)  # of a piecewise linear field, along x and y
 LONGEST_WAVE = 0.25  # of the frame; what is longer is a curve
 BINS_PER_PX = 4
 DRIFT = ("x_scale_trend", "x_scale_by_image")
-MOST_FINDINGS = 5
 MANY = 200  # a test needs so many image points of a camera
 
 # what is seen; the error source in the catalogue; what to do
@@ -141,23 +140,16 @@ def _of_cameras(adjustment: Adjustment) -> list[dict[str, Any]]:
 
 
 def pattern_findings(records: list[dict[str, Any]]) -> tuple[Finding, ...]:
-    """A warning for each significant pattern, the surest first, five at most.
-
-    A drifting x-scale comes before all others and makes them notes: the adjustment spreads it over everything else that it may move.
-    """
+    """A warning for each significant pattern, the surest first."""
     several = len({record["camera"] for record in records}) > 1
-    seen = [record for record in records if record["significant"]]
-    drifting = {record["camera"] for record in seen if record["name"] in DRIFT}
     out = []
-    for record in sorted(seen, key=lambda r: (r["name"] not in DRIFT, r["p"])):
-        shadow = record["camera"] in drifting and record["name"] not in DRIFT
+    for record in sorted((r for r in records if r["significant"]), key=lambda r: r["p"]):
         where = f"{record['camera']}: " if several else ""
-        source = f" (as by {record['source']})" if record["source"] and not shadow else ""
-        advice = "Look again once each image has its x-scale: it may be the shadow of its drift" if shadow else record["advice"]
+        source = f" (as by {record['source']})" if record["source"] else ""
         kind = "x_scale_drift" if record["name"] in DRIFT else record["name"]
-        text = f"{where}{record['text']}{source}"
-        out.append(Finding(kind, text, f"{advice[0].upper()}{advice[1:]}.", "note" if shadow else "warning"))
-    return tuple(out[:MOST_FINDINGS])
+        advice = record["advice"][0].upper() + record["advice"][1:] + "."
+        out.append(Finding(kind, f"{where}{record['text']}{source}", advice, "warning"))
+    return tuple(out)
 
 
 def _tests(seen: _Seen) -> Iterator[dict[str, Any]]:

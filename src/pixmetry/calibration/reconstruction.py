@@ -23,6 +23,7 @@ BY_KNOWN = ((1, 16, ("c",)), (1, 40, ("c", "k1")), (2, 100, CENTRED), (5, 240, T
 MANY_IMAGES = 24  # that determine the interior parameters well enough to go on with
 MOST, QUANTILE = 0.93, 1.81  # share of the residuals that are taken for right, and the normal distribution's quantile of it
 PULLING = 0.001  # of the frame's width: largest scale of residuals that comes from those beyond the median
+OUTSTANDING = 8.0  # median residual of an image, in spreads, at which its pose is doubted
 MENDING = 2  # rounds of posing anew
 SETTLING, SETTLED_PX = 5, 0.2  # rounds of adjustment while residuals are larger
 FARTHEST = 0.25  # of the frame: how far a principal point may move off its middle
@@ -241,12 +242,12 @@ class Reconstruction:
             self._adjust_and_judge()
 
     def mend(self) -> None:
-        """Pose images anew in which many points do not fit, once the others stand."""
+        """Pose images anew in which many points do not fit, once the others stand: in a long lens a pose can be the mirrored one."""
         for _ in range(MENDING):
             known = self.posed[self.network.image] & np.isfinite(self.uv[:, 0])
             number = np.bincount(self.network.image[known], minlength=len(self.posed))
             fitting = np.bincount(self.network.image[known & self.good], minlength=len(self.posed))
-            poor = self.posed & (fitting < RIGHT_SHARE * number)
+            poor = self.posed & ((fitting < RIGHT_SHARE * number) | (self._typical_errors() > OUTSTANDING * self.spread_px))
             if not poor.any() or poor.sum() > 0.5 * self.posed.sum():
                 return
             self.rotation[poor], self.position[poor] = np.nan, np.nan
@@ -255,6 +256,12 @@ class Reconstruction:
             self.triangulate()
             self.judge()
             self.grow()
+
+    def _typical_errors(self) -> np.ndarray:
+        """Median residual of each image, px."""
+        error = np.hypot(*self.residuals().T)
+        inside = [error[rows][np.isfinite(error[rows])] for rows in self.rows]
+        return np.array([np.median(values) if len(values) else 0.0 for values in inside])
 
     def settle(self) -> None:
         """Adjust on while residuals fall: long lenses and shallow networks come down slowly."""

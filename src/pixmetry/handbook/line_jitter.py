@@ -29,6 +29,32 @@ PIXEL_NS = 1e9 / 14.1875e6
 STORED = Path(__file__).with_name("line_jitter.json")
 
 
+@dataclass(frozen=True)
+class View:
+    """What one pair of frames left over.
+
+    Parameters
+    ----------
+    axes : dict of AxisResiduals
+        Residuals of the upright lines ("x") and of the lying ones ("y").
+    rows, columns : RowVariance
+        What the upright lines have in common in a row, and, as a check, the lying ones in a column, where jitter has no part.
+    stated_px2 : (float, float)
+        Mean variance of a position by its estimator's own statement, upright and lying.
+    k1_per_mm2 : (float, float)
+        Found, with its standard uncertainty.
+    rejected : int
+        Positions left out as gross errors.
+    """
+
+    axes: dict[str, AxisResiduals]
+    rows: RowVariance
+    columns: RowVariance
+    stated_px2: tuple[float, float]
+    k1_per_mm2: tuple[float, float]
+    rejected: int
+
+
 def residuals(view: tuple[int, int, int], jitter_ns: float) -> tuple[PlumbLineResult, np.ndarray, np.ndarray]:
     """One pair: expose, locate, calibrate.
 

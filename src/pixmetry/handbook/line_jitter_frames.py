@@ -164,29 +164,3 @@ def sensor() -> Sensor:
     """Pixel grid of the camera."""
     camera = preset()
     return Sensor(camera.frame_shape[1], camera.frame_shape[0], *camera.pitch_um)
-
-
-@dataclass(frozen=True)
-class View:
-    """What one pair of frames left over.
-
-    Parameters
-    ----------
-    axes : dict of AxisResiduals
-        Residuals of the upright lines ("x") and of the lying ones ("y").
-    rows, columns : RowVariance
-        What the upright lines have in common in a row, and, as a check, the lying ones in a column, where jitter has no part.
-    stated_px2 : (float, float)
-        Mean variance of a position by its estimator's own statement, upright and lying.
-    k1_per_mm2 : (float, float)
-        Found, with its standard uncertainty.
-    rejected : int
-        Positions left out as gross errors.
-    """
-
-    axes: dict[str, AxisResiduals]
-    rows: RowVariance
-    columns: RowVariance
-    stated_px2: tuple[float, float]
-    k1_per_mm2: tuple[float, float]
-    rejected: int
