@@ -314,7 +314,7 @@ def test_one_image_is_not_a_network(tmp_path: Path, simulated: Simulated) -> Non
 
 def test_the_projects_of_the_page_are_valid(tmp_path: Path) -> None:
     blocks = re.findall(r"^```yaml\n(.*?)^```", DOCS.read_text(), re.M | re.S)
-    assert len(blocks) == 3
+    assert len(blocks) == 4
     for text in blocks:
         (tmp_path / "p.yaml").write_text(text)
         data = load_yaml(tmp_path / "p.yaml")
@@ -339,10 +339,20 @@ def test_the_page_names_every_key_and_no_other() -> None:
     assert told == allowed, told ^ allowed
 
 
+def test_the_example_of_other_programs_runs(by_hand: Calibration, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_results(by_hand, "result")
+    (code,) = [block for block in re.findall(r"^```python\n(.*?)^```", DOCS.read_text(), re.M | re.S) if "exchange" in block]
+    names: dict[str, object] = {}
+    exec(compile(code, "docs", "exec"), names)
+    assert (tmp_path / "camera.yaml").is_file() and names["other"].largest_px < 0.5  # type: ignore[attr-defined]
+
+
 def test_the_messages_of_the_page_are_those_of_the_program() -> None:
     section = DOCS.read_text().partition("## What the messages mean")[2]
     messages = re.findall(r"^\| `(.*?)` \|", section, re.M)
-    files = [SOURCE / "calibrating.py", SOURCE / "core" / "config.py"]
+    files = [SOURCE / "calibrating.py", SOURCE / "core" / "config.py", SOURCE / "calibration" / "exchange.py"]
+    files += sorted((SOURCE / "calibration").glob("plumb_line*.py"))
     files += [path for part in ("calibration_project", "campaign") for path in (SOURCE / part).glob("*.py")]
     text = " ".join(path.read_text() for path in files)
     assert len(messages) > 15

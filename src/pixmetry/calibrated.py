@@ -21,8 +21,8 @@ def calibrated_geometry(
 ) -> CameraGeometry:
     """What a calibration says of one camera, in the parameters of the error sources.
 
-    The systematic part of its residuals is what they have beyond the noise that the image coordinates came with. Where these came without
-    their noise it cannot be told apart, and the residuals count in full.
+    What it leaves over is what its residuals have in common at one place of the frame (`pixmetry.calibration.geometry.systematic_rest`):
+    the noise of the targets is no error of the camera.
 
     Parameters
     ----------
@@ -46,19 +46,21 @@ def calibrated_geometry(
         calibration = read_calibration(calibration)
     if isinstance(calibration, Calibration):
         adjusted = calibration.adjustment
-        models = tuple(adjusted.camera(k) for k in range(len(adjusted.network.cameras)))
+        models, dof = tuple(adjusted.camera(k) for k in range(len(adjusted.network.cameras))), adjusted.dof
         covariances = [adjusted.interior_covariance(k) for k in range(len(models))]
     else:
-        adjusted, models = calibration, calibration.cameras
+        models, dof = calibration.cameras, calibration.dof
         covariances = [calibration.interior_covariance(k) for k in range(len(models))]
     names = [m.name for m in models]
     if camera is None and len(names) > 1 or camera is not None and camera not in names:
         raise InputError("which camera of the calibration is not clear", value=camera, allowed=", ".join(names))
     k = 0 if camera is None else names.index(camera)
     record, grid = calibration.tests["residuals"][names[k]], calibration.tests["projection"][names[k]]
-    left = [np.sqrt(max(record[f"rms_{a}_px"] ** 2 - (record.get(f"noise_{a}_px") or 0.0) ** 2, 0.0)) for a in "xy"]
+    left = float(record["systematic_x_px"]), float(record["systematic_y_px"])
+    sensor = models[k].sensor
+    origin = f"calibration of {names[k]}, {sensor.cols} × {sensor.rows} px"
     u = float(np.sqrt(np.nanmean(np.asarray(grid["u_px"], float) ** 2)))
-    return geometry_of(models[k], *covariances[k], dof=adjusted.dof, u_px=(u, u), left_px=(float(left[0]), float(left[1])))
+    return geometry_of(models[k], *covariances[k], dof=dof, u_px=(u, u), left_px=left, origin=origin)
 
 
 def calibrated_camera(camera: Camera, geometry: CameraGeometry) -> Camera:

@@ -1,7 +1,8 @@
-"""Calibrating: from a project, a network or pictures of a test field to calibrated cameras, with a folder of results."""
+"""Calibrating: from a project, a network or pictures of a test field or of lines to calibrated cameras, with a folder of results."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
@@ -10,25 +11,28 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pixmetry.calibration.model import NAMES
-from pixmetry.calibration.network import Calibration, Network
-from pixmetry.calibration_files import check_folder, write_results
+from pixmetry.calibration.network import Calibration, Finding, Network
+from pixmetry.calibration_files import check_folder, write_line_results, write_results
 from pixmetry.calibration_record import StoredCalibration, read_calibration
 from pixmetry.campaign.provenance import InputHashes, provenance_record
-from pixmetry.core.errors import InputError
+from pixmetry.core.camera import Camera
+from pixmetry.core.errors import InputError, PixmetryError
 
 if TYPE_CHECKING:
     from pixmetry.calibration_project import Project
+    from pixmetry.line_calibration import LineCalibration
 
 __all__ = ["StoredCalibration", "calibrate", "read_calibration"]
 
 Progress = Callable[[str, int, int], None]
 PROJECT_ENDINGS = (".yaml", ".yml")
 # What is said with pictures, and the keys of a project's ``cameras`` and ``pictures`` that mean the same.
-CAMERA_KEYS = {"direction": "direction", "pixel_um": "pitch_um", "c_mm": "c_mm", "c_px": "c_px"}
+CAMERA_KEYS = {"camera": "camera", "direction": "direction", "pixel_um": "pitch_um", "c_mm": "c_mm", "c_px": "c_px"}
 PICTURE_KEYS = {
     **{name: name for name in ("kind", "grid", "polarity", "channel", "noise")},
     **{f"{name}_mm": name for name in ("pitch", "side", "diameter")},
 }
+LINE_OPTIONS = {"loss": "loss", "loss_scale": "loss_scale", "snoop": "reject"}  # those of straight lines, and what they are called there
 LIBRARIES = ("numpy", "scipy", "numba", "opencv-python-headless")
 
 
@@ -41,7 +45,7 @@ def calibrate(
     options: Mapping[str, Any] | None = None,
     progress: Progress | None = None,
     **pictures: Any,
-) -> Calibration:
+) -> Calibration | LineCalibration:
     """Calibrate one or several cameras.
 
     Parameters
@@ -49,7 +53,8 @@ def calibrate(
     source : path, Network, or sequence of paths
         A project file (YAML), a network that was put together in Python, or pictures of a test field (files, patterns, folders).
     output : path, optional
-        Folder for ``report.html``, ``calibration.json``, ``points.csv``, ``poses.csv`` and ``residuals.csv``.
+        Folder for ``report.html``, ``calibration.json``, ``points.csv``, ``poses.csv`` and ``residuals.csv`` (of straight lines without
+        points and poses), and ``camera.yaml`` where a preset is named (``camera-NAME.yaml`` of several cameras).
     free : sequence of str, optional
         Interior parameters to estimate, out of c, xp, yp, b1, b2, p1, p2, k1 … k5, in place of what the project says.
     per_image : sequence of str, optional
@@ -59,13 +64,14 @@ def calibrate(
     progress : callable, optional
         Called with (what, done, of).
     **pictures
-        For pictures: ``kind`` ("chessboard", "dots", "coded" or "squares"), ``grid`` ("9x6"), ``pitch_mm`` (spacing of the targets),
-        ``side_mm``, ``diameter_mm`` (of squares and dots), ``polarity``, ``channel``, ``noise``; and of the camera: ``direction``,
-        ``pixel_um`` (pitch of the pixels), ``c_mm`` or ``c_px``.
+        For pictures: ``kind`` ("chessboard", "dots", "coded", "squares" or "lines"), ``grid`` ("9x6"), ``pitch_mm`` (spacing of the
+        targets), ``side_mm``, ``diameter_mm`` (of squares and dots), ``polarity``, ``channel``, ``noise``; and of the camera: ``camera``
+        (a preset or camera file, which brings the pitch), ``direction``, ``pixel_um`` (pitch of the pixels), ``c_mm`` or ``c_px``.
 
     Returns
     -------
-    Calibration
+    Calibration or LineCalibration
+        The latter from straight lines.
 
     Raises
     ------
@@ -86,15 +92,89 @@ def calibrate(
         network, given = project.network, project.options
         if output is not None:
             _refuse_inputs(Path(output), project)
+    if project is not None and project.lines is not None:
+        return _from_lines(project, output, free, per_image, {**given, **(options or {})}, _steps(told))
     network = _changed(network, free, per_image)
     chosen = _options({**given, **(options or {})})
     step = _steps(told)
-    calibration = _with_origin(calibrate_network(network, chosen, progress=step), project, chosen)
+    calibration = calibrate_network(network, chosen, progress=step)
+    cameras, missing = _camera_files(calibration, project)
+    about = {field.name: getattr(chosen, field.name) for field in fields(chosen)}
+    findings = (*calibration.findings, *missing, *(project.findings if project is not None else ()))
+    calibration = replace(calibration, findings=findings, provenance={**calibration.provenance, **_origin(project, about)})
     if output is not None:
         step("writing the results")
-        write_results(calibration, output)
+        write_results(calibration, output, cameras)
     step("")
     return calibration
+
+
+def _from_lines(
+    project: Project,
+    output: str | Path | None,
+    free: Sequence[str] | str | None,
+    per_image: Sequence[str] | str | None,
+    options: Mapping[str, Any],
+    step: Callable[[str], None],
+) -> LineCalibration:
+    """Calibrate from straight lines."""
+    from pixmetry.calibration.plumb_line import calibrate_lines
+    from pixmetry.line_calibration import LineCalibration
+
+    wrong = "per_image" if per_image else next((name for name in options if name not in LINE_OPTIONS), None)
+    if wrong is not None:
+        remedy = "leave it away"
+        raise InputError("has no meaning with straight lines", where=wrong, allowed=", ".join(("free", *LINE_OPTIONS)), remedy=remedy)
+    seen, (model,) = project.lines, project.network.cameras
+    assert seen is not None
+    wanted = _listed(free) if free is not None else tuple(name for name, used in zip(NAMES, model.free, strict=True) if used)
+    settings = {LINE_OPTIONS[name]: value for name, value in options.items()}
+    step("adjusting the lines")
+    found = calibrate_lines(
+        seen.x_px, seen.y_px, seen.line, seen.image, model.sensor, free=wanted, u_px=seen.covariance_px2, start=model, **settings
+    )
+    told = tuple(
+        Finding("camera_file", f"No camera.yaml is written for '{name}': straight lines do not tell the principal distance.", advice)
+        for name, advice in ((model.name, "Calibrate with a test field; its project can start from this calibration.json."),)
+        if name in project.presets
+    )
+    calibration = LineCalibration(
+        result=found, **{name: getattr(seen, name) for name in ("image", "line", "x_px", "y_px")},
+        findings=(*found.findings, *project.findings, *told), provenance=_origin(project, {**dict(options), "free": ", ".join(wanted)}),
+    )  # fmt: skip
+    if output is not None:
+        step("writing the results")
+        write_line_results(calibration, output)
+    step("")
+    return calibration
+
+
+def _camera_files(calibration: Calibration, project: Project | None) -> tuple[dict[str, Camera], list[Finding]]:
+    """Presets with what was calibrated, by the names of their files; and why one is missing."""
+    from pixmetry.calibrated import calibrated_camera, calibrated_geometry
+    from pixmetry.calibration_project.presets import stored_grid
+
+    made: dict[str, Camera] = {}
+    findings = []
+    presets = {} if project is None else project.presets
+    for name, preset in presets.items():
+        file = "camera.yaml"
+        if len(calibration.adjustment.network.cameras) > 1:
+            file = f"camera-{re.sub(r'[^A-Za-z0-9._-]+', '_', name)}.yaml"
+        try:
+            changed = stored_grid(preset).changed
+            if changed:
+                what = f"the calibrated pixels are not those of the sensor, for {changed}"
+                remedy = "use calibration.json as it is: the lens of a camera file stands before the grabber, on the sensor's pixels"
+                raise InputError(what, remedy=remedy)
+            if file in made:
+                raise InputError(f"{file} is the name of two files", remedy="give the cameras names that differ in letters and digits")
+            made[file] = calibrated_camera(preset, calibrated_geometry(calibration, name))
+        except PixmetryError as problem:
+            found = f" ({problem.value})" if problem.value is not None else ""
+            text = f"No {file} is written for '{name}': {problem.what}{found}."
+            findings.append(Finding("camera_file", text, f"{problem.remedy[:1].upper()}{problem.remedy[1:]}."))
+    return made, findings
 
 
 def _steps(told: Progress) -> Callable[[str], None]:
@@ -183,15 +263,13 @@ def _options(given: Mapping[str, Any]) -> Any:
     return Options(**given)
 
 
-def _with_origin(calibration: Calibration, project: Project | None, options: Any) -> Calibration:
-    """The calibration with the digests of its inputs, versions and options."""
-    hashes, findings = None, calibration.findings
-    about: dict[str, Any] = {"options": {field.name: getattr(options, field.name) for field in fields(options)}}
+def _origin(project: Project | None, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Digests of the inputs, versions and options."""
+    hashes, about = None, dict[str, Any](options=dict(options))
     if project is not None:
         hashes = InputHashes(project.folder)
         for path in project.inputs:
             hashes.add_file(path)
-        findings = (*findings, *project.findings)
         about |= {"name": project.name, "project": project.source.name if project.source is not None else None}
-    record = provenance_record(hashes, libraries=LIBRARIES)
-    return replace(calibration, findings=findings, provenance={**calibration.provenance, **record, **about})
+        about |= {"presets": {name: camera.name for name, camera in project.presets.items()}} if project.presets else {}
+    return {**provenance_record(hashes, libraries=LIBRARIES), **about}

@@ -12,8 +12,10 @@ from typing import Any
 import numpy as np
 
 from pixmetry.calibration.network import Calibration
-from pixmetry.calibration_record import PIXELS, json_text
+from pixmetry.calibration_record import PIXELS, json_text, lines_json
 from pixmetry.campaign.output import check_output, staged_output
+from pixmetry.core.camera import Camera
+from pixmetry.line_calibration import LineCalibration
 
 KIND = "calibration"
 
@@ -29,8 +31,15 @@ def check_folder(folder: str | Path) -> None:
     check_output(folder, KIND)
 
 
-def write_results(calibration: Calibration, folder: str | Path) -> Path:
+def write_results(calibration: Calibration, folder: str | Path, cameras: Mapping[str, Camera] | None = None) -> Path:
     """Write the folder of results, whole or not at all; an earlier calibration in it is replaced.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    folder : path
+    cameras : mapping of str to Camera, optional
+        Further files, for `pixmetry simulate`.
 
     Raises
     ------
@@ -42,6 +51,19 @@ def write_results(calibration: Calibration, folder: str | Path) -> Path:
     with staged_output(folder, KIND) as place:
         for name, text in TEXTS.items():
             (place / name).write_text(text(calibration), encoding="utf-8", newline="\n")
+        write_page(calibration, place / "report.html")
+        for name, camera in (cameras or {}).items():
+            camera.save(place / name)
+    return Path(folder)
+
+
+def write_line_results(calibration: LineCalibration, folder: str | Path) -> Path:
+    """The same for a calibration from straight lines."""
+    from pixmetry.report.lines_page import write_page
+
+    with staged_output(folder, KIND) as place:
+        (place / "calibration.json").write_text(lines_json(calibration), encoding="utf-8", newline="\n")
+        (place / "residuals.csv").write_text(line_residuals_csv(calibration), encoding="utf-8", newline="\n")
         write_page(calibration, place / "report.html")
     return Path(folder)
 
@@ -106,6 +128,23 @@ def residuals_csv(calibration: Calibration) -> str:
         columns |= {"redundancy_x": a.redundancy[:, 0], "redundancy_y": a.redundancy[:, 1]}
     text = "residual: measured less computed; image coordinates of centres, without eccentricity; variances as they were used"
     return _csv([PIXELS, text], columns)
+
+
+def line_residuals_csv(calibration: LineCalibration) -> str:
+    """Positions on lines with their residuals across them; a table that a project can name as its lines."""
+    result = calibration.result
+    columns: dict[str, Any] = {
+        "image": calibration.image.tolist(),
+        "line": calibration.line.tolist(),
+        "x_px": calibration.x_px,
+        "y_px": calibration.y_px,
+        "axis": [result.lines[k]["axis"] for k in result.line_of],
+        "residual_px": result.residual_px,
+        **({} if result.residual_um is None else {"residual_um": result.residual_um}),
+        "used": result.used.astype(int),
+        "redundancy": result.redundancy,
+    }
+    return _csv([PIXELS, "residual: across the line, towards +x (axis x: the line tells about x) or +y"], columns)
 
 
 # A new text file of the results needs a line here.

@@ -6,10 +6,10 @@ import base64
 import json
 import math
 import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, is_dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -17,9 +17,12 @@ from pixmetry.calibration.model import NAMES, CameraModel, Sensor
 from pixmetry.calibration.network import Calibration, Finding
 from pixmetry.core.config import read_text
 from pixmetry.core.errors import InputError
+from pixmetry.line_calibration import LineCalibration
 
 RESULT_SCHEMA = "pixmetry/calibration-result/1"
+LINES_SCHEMA = "pixmetry/line-calibration-result/1"
 PIXELS = "pixel (0, 0) is the centre of the top-left pixel, x to the right, y down"
+T = TypeVar("T")
 SHORT = 130  # characters of a record that stands on one line
 
 
@@ -120,8 +123,28 @@ def _record(calibration: Calibration) -> dict[str, Any]:
 
 
 def _camera_record(calibration: Calibration, k: int) -> dict[str, Any]:
-    model = calibration.adjustment.camera(k)
-    names, covariance = calibration.adjustment.interior_covariance(k)
+    return camera_record(calibration.adjustment.camera(k), *calibration.adjustment.interior_covariance(k))
+
+
+def lines_json(calibration: LineCalibration) -> str:
+    """All numbers of a calibration from straight lines as strict JSON."""
+    result = calibration.result
+    record = {
+        "schema": LINES_SCHEMA,
+        "conventions": f"{PIXELS}; residuals are across the lines; covariances are a posteriori; c is 0 where it was not given",
+        "cameras": [camera_record(result.camera, result.free, result.estimates.covariance)],
+        "sigma_px": result.sigma_px,
+        "iterations": result.iterations,
+        **result.to_record(),
+        "curves": calibration.curves(),
+        "findings": [asdict(finding) for finding in calibration.findings],
+        "provenance": calibration.provenance,
+    }
+    return _json(_plain(record)) + "\n"
+
+
+def camera_record(model: CameraModel, names: tuple[str, ...], covariance: np.ndarray) -> dict[str, Any]:
+    """One camera with the covariance of what was estimated of it."""
     u = dict(zip(names, np.sqrt(np.diag(covariance)), strict=True))
     return {
         "name": model.name,
@@ -164,6 +187,15 @@ def read_calibration(path: str | Path) -> StoredCalibration:
     InputError
         If there is no such file, or it is something else.
     """
+    return _read(path, (RESULT_SCHEMA,), _stored)
+
+
+def stored_cameras(path: str | Path) -> tuple[CameraModel, ...]:
+    """Read the cameras alone, also of a calibration from straight lines (whose c is 0 unless it was given); raises likewise."""
+    return _read(path, (RESULT_SCHEMA, LINES_SCHEMA), lambda record: tuple(_camera(camera) for camera in record["cameras"]))
+
+
+def _read(path: str | Path, schemas: tuple[str, ...], made: Callable[[Mapping[str, Any]], T]) -> T:
     file = Path(path) / "calibration.json" if Path(path).is_dir() else Path(path)
     text = read_text(file)
     try:
@@ -171,11 +203,13 @@ def read_calibration(path: str | Path) -> StoredCalibration:
         schema = record["schema"]
     except (ValueError, KeyError, TypeError):
         schema = None
-    if schema != RESULT_SCHEMA:
+    if schema not in schemas:
         remedy = "name the calibration.json that `pixmetry calibrate` wrote, or its folder"
-        raise InputError("not a calibration", where=str(file), value=schema, allowed=RESULT_SCHEMA, remedy=remedy)
+        if schema == LINES_SCHEMA:
+            remedy = "lines do not tell the whole camera: calibrate with a test field (its project can `start_from` this file)"
+        raise InputError("not a calibration", where=str(file), value=schema, allowed=" or ".join(schemas), remedy=remedy)
     try:
-        return _stored(record)
+        return made(record)
     except (KeyError, TypeError, ValueError, zlib.error) as problem:
         what = f"a damaged calibration ({problem})"
         raise InputError(what, where=str(file), remedy="calibrate again") from None
@@ -244,8 +278,11 @@ def _json(value: Any, indent: str = "") -> str:
     return f"{left}\n{inner}" + f",\n{inner}".join(parts) + f"\n{indent}{right}"
 
 
-def cameras_text(calibration: Calibration, report: str = "") -> str:
+def cameras_text(calibration: Calibration | LineCalibration, report: str = "") -> str:
     """The cameras alone, with what was found, as strict JSON."""
-    record = _record(calibration)
-    names = ("schema", "unit", "datum", "sigma0", "dof", "cameras", "findings")
+    names: tuple[str, ...] = ("schema", "unit", "datum", "sigma0", "dof", "cameras", "findings")
+    if isinstance(calibration, LineCalibration):
+        record, names = json.loads(lines_json(calibration)), ("schema", "cameras", "axes", "f_test", "findings")
+    else:
+        record = _record(calibration)
     return _json(_plain({**{name: record[name] for name in names}, "report": report or None}))

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from calibration.networks import disturbed, predicted, simulate
-from pixmetry.calibration import bundle_covariance, bundle_system
+from pixmetry.calibration import bundle, bundle_covariance, bundle_system
 from pixmetry.calibration.bundle import adjust
 from pixmetry.calibration.network import Network, ScaleBars, State
 from pixmetry.core.errors import InputError, MeasureError
@@ -298,6 +298,22 @@ def test_what_cannot_be_determined_is_left_out(rng):
     assert np.isnan(found.point_covariance[lost]).all() and found.dof > 0
 
 
+def test_weighted_points_that_no_image_sees_change_nothing(rng):
+    simulated = simulate(rng, images=8, points=30, known="partly", bars=0)
+    network, start = simulated.network, disturbed(rng, simulated)
+    known = np.flatnonzero(np.isfinite(network.xyz[:, 0]))
+    network = replace(network, u_xyz=np.where(np.isfinite(network.xyz), 0.1, np.inf))
+    unseen = network.point == known[0]
+    columns = {name: getattr(network, name)[~unseen] for name in ("x_px", "y_px", "image", "point", "covariance_px2")}
+    xyz = start.xyz.copy()
+    xyz[known[0]] = np.nan
+    found = adjust(replace(network, **columns), replace(start, xyz=xyz))
+    same = adjust(network, start, used=~unseen)
+    np.testing.assert_allclose(found.state.interior, same.state.interior, rtol=1e-6, atol=1e-9)
+    np.testing.assert_array_equal(found.state.xyz[known[0]], network.xyz[known[0]])
+    assert f"{len(known) - 1} points with weights" in found.datum
+
+
 def test_rays_that_hardly_meet_do_not_determine_a_point(rng):
     """A point seen from one place only: two images with the same projection centre."""
     simulated = simulate(rng, images=8, points=30, bars=2)
@@ -356,6 +372,29 @@ def test_stops_where_it_is_told_to(rng):
     assert early.iterations == 1 and early.notes and early.covariance.shape == (0, 0)
     with pytest.raises(MeasureError, match="no minimum"):
         adjust(simulated.network, start, max_iterations=1)
+
+
+@pytest.mark.parametrize("field", ["plane", "volume"])
+def test_a_long_lens_with_a_wrong_start_comes_down_quickly(field, rng):
+    """From the bottom of the valley at a principal distance 5 % wrong; c is four widths of the frame. Plain damped steps take up to 40."""
+    lens = {"c": 4 * 2048 * 0.00345, "k1": 1e-4, "k2": 0.0, "k3": 0.0}
+    simulated = simulate(rng, images=12, points=60, field=field, interior=lens)
+    network, start = simulated.network, disturbed(rng, simulated, 0.003)
+    start.interior[:, 0] = 1.05 * simulated.truth.interior[:, 0]
+    held = replace(network.cameras[0], free=np.zeros(12, bool))
+    valley = adjust(replace(network, cameras=(held,)), start, covariance=False)
+    found = adjust(network, valley.state)
+    assert valley.sigma0 > 3 > 1.4 > found.sigma0 and found.iterations <= 15
+
+
+def test_a_turn_round_the_object_keeps_the_distance(rng):
+    """A shift of the projection centre together with the turn that keeps a point in view moves it on the circle about that point."""
+    at, middle = rng.standard_normal((2, 3))
+    rotation = Rotation.random(rng=rng).as_matrix()
+    axis = rng.uniform(-0.5, 0.5, 3)  # in the frame of the object
+    shift, turn = np.cross(axis, at - middle), -rotation @ axis
+    there = at + bundle._along_arc(rotation[None], turn[None], shift[None])[0]
+    np.testing.assert_allclose(there, middle + Rotation.from_rotvec(axis).apply(at - middle), atol=1e-12)
 
 
 def test_no_matrix_of_points_by_points(rng):

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from pixmetry.budget.budget import compute_budget
 from pixmetry.calibrated import calibrated_camera
-from pixmetry.calibration.geometry import geometry_of
+from pixmetry.calibration.geometry import geometry_of, systematic_rest
 from pixmetry.calibration.model import CameraModel, Sensor
 from pixmetry.core.camera import load_camera
 from pixmetry.core.errors import InputError, MeasureError
@@ -114,3 +115,15 @@ def test_a_budget_counts_what_the_calibration_leaves() -> None:
     gone = sum(alone.get(i, 0.0) ** 2 for i in TAKEN_UP)
     assert budget.verdict.total_px**2 == pytest.approx(bare.verdict.total_px**2 - gone + left.total_px**2, rel=0.2)
     assert rows[LENS].share > 0.1
+
+
+def test_the_systematic_rest_is_found_beside_noise(rng: np.random.Generator) -> None:
+    """A pattern of .02 px in x under noise of .05 px; y has noise only. 20 000 residuals in 80 cells: found to 4 se of 9 %."""
+    n, sensor = 20_000, Sensor(800, 640)
+    x, y = rng.uniform(0, 799, n), rng.uniform(0, 639, n)
+    pattern = 0.02 * np.sqrt(2) * np.sign(np.sin(2 * np.pi * x / 160)) * (x < 400)  # half of the frame, ± by cells of 80 px
+    network = SimpleNamespace(cameras=(CameraModel.of(sensor),), camera_of=np.zeros(1, int), image=np.zeros(n, int), x_px=x, y_px=y)
+    residual = rng.normal(0, 0.05, (n, 2))
+    residual[:, 0] += pattern
+    rest = systematic_rest(SimpleNamespace(network=network, used=np.ones(n, bool), residual_px=residual))
+    assert rest[0] == pytest.approx(0.02, rel=0.36) and rest[1] < 0.004  # noise alone: (between − within)/250 is below 4e-6 at 6 se

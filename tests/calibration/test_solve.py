@@ -260,6 +260,78 @@ def test_exact_image_coordinates_are_no_trouble(rng):
     np.testing.assert_allclose(calibration.adjustment.state.interior, simulated.truth.interior, rtol=1e-3, atol=1e-4)
 
 
+@pytest.mark.parametrize("fixed", [4, 8])
+def test_a_wrong_one_of_few_fixed_points_is_named_and_image_points_stay(rng, fixed):
+    """2 mm, several px, beside free points; with four it cannot be left out. Right ones are left in peace."""
+    simulated = simulate(rng, images=14, points=60, bars=0)
+    u = np.where(np.arange(60)[:, None] < fixed, 0.0, np.full((60, 3), np.inf))
+    xyz = np.where(u == 0, simulated.truth.xyz, np.nan)
+    right = calibrate_network(replace(simulated.network, xyz=xyz, u_xyz=u))
+    assert "gross_control_point" not in kinds(right) and right.tests["hold_out"]
+    assert ((right.adjustment.network.u_xyz == 0).all(axis=1).sum() == fixed) and right.adjustment.used.sum() > len(simulated.network) - 3
+    xyz[0, 2] += 2.0
+    wrong = calibrate_network(replace(simulated.network, xyz=xyz, u_xyz=u), QUICK)
+    assert wrong.findings[0].kind == "gross_control_point" and f" {simulated.network.points[0]} " in wrong.findings[0].text
+    assert wrong.adjustment.used.sum() > len(simulated.network) - 3
+    assert (wrong.adjustment.network.u_xyz == 0).all(axis=1).sum() == fixed - 1
+    found, limit = distance(wrong, simulated)
+    assert found < limit
+
+
+def test_points_of_two_rays_that_contradict_each_other_are_named_with_their_bars(rng):
+    """Five of ten points with two rays, one of them 7 px off; a bar ends at one."""
+    simulated = simulate(rng, images=12, points=60, bars=2)
+    network, bars = simulated.network, simulated.network.bars
+    few = np.append(bars.start[0], np.setdiff1d(np.arange(60), np.concatenate([bars.start, bars.end]))[:9])
+    rays = [np.flatnonzero(network.point == k) for k in few]
+    kept = np.setdiff1d(np.arange(len(network)), np.concatenate([r[2:] for r in rays]))
+    x, y = network.x_px.copy(), network.y_px.copy()
+    for r in rays[:5]:
+        x[r[0]] += 5.0
+        y[r[0]] += 5.0
+    rows = {"x_px": x, "y_px": y, **{n: getattr(network, n) for n in ("image", "point", "covariance_px2")}}
+    calibration = calibrate_network(replace(network, **{n: values[kept] for n, values in rows.items()}), QUICK)
+    lost = np.isnan(calibration.adjustment.state.xyz).any(axis=1)
+    said = [f for f in calibration.findings if f.kind == "lost_points"]
+    assert len(said) == (1 if lost.any() else 0)
+    if lost.any():  # errors along the epipolar line of a pair cannot be seen
+        assert said[0].level == "warning" and all(network.points[k] in said[0].text for k in np.flatnonzero(lost)[:5])
+        assert ("1 of 2 scale bars" in said[0].text) == lost[bars.start[0]]
+
+
+def test_a_priori_covariances_are_taken_as_they_are(rng):
+    """Twice the noise is stated: uncertainties are twice as large as by the residuals."""
+    simulated = simulate(rng, images=12, points=40)
+    network = replace(simulated.network, covariance_px2=4 * simulated.network.covariance_px2)
+    taken, estimated = (calibrate_network(network, Options(folds=0, a_priori=a), simulated.truth) for a in (True, False))
+    u = [np.sqrt(np.diag(c.adjustment.interior_covariance()[1])) for c in (taken, estimated)]
+    np.testing.assert_allclose(u[0] / u[1], 2.0, rtol=0.2)
+    assert "variance_components" not in taken.tests and (taken.adjustment.network.covariance_px2 == network.covariance_px2).all()
+    assert estimated.tests["variance_components"]["camera"]["factor_x"] == pytest.approx(0.25, rel=0.4)
+
+
+def test_one_bad_image_is_named_and_no_drift_is_made_of_it(rng):
+    """One image with five times the noise of the others and a bend of its own."""
+    simulated = simulate(rng, images=13, points=54, field="plane", known="fixed", bars=0)
+    network = simulated.network
+    bad = network.image == 7
+    more = rng.normal(size=(len(network), 2)) * 0.2
+    x = network.x_px + bad * (more[:, 0] + 0.1 * np.sin(network.x_px / 150))
+    calibration = calibrate_network(replace(network, x_px=x, y_px=network.y_px + bad * more[:, 1]), QUICK)
+    first = calibration.findings[0]
+    assert first.kind == "bad_images" and network.images[7] in first.text and "leave it out" in first.advice
+    assert not {"x_scale_drift", "x_scale_by_image", "x_shift_by_image"} & set(kinds(calibration))
+
+
+def test_a_camera_that_is_held_is_no_trouble(rng):
+    simulated = simulate(rng, images=10, points=40)
+    truth = simulated.truth.interior[0]
+    camera = replace(simulated.network.cameras[0], values=truth.copy(), free=np.zeros(len(NAMES), bool))
+    calibration = calibrate_network(replace(simulated.network, cameras=(camera,)), QUICK)
+    np.testing.assert_array_equal(calibration.adjustment.state.interior[0], truth)
+    assert calibration.tests["parameters"] == []
+
+
 def test_a_wrong_control_point_is_set_free(rng):
     simulated = simulate(rng, images=14, points=50, bars=0)
     u = np.full((50, 3), np.inf)

@@ -95,6 +95,22 @@ def test_scale_and_frame(rng: np.random.Generator):
     assert (state.position[:, 2] > np.max(state.xyz[:, 2])).mean() > 0.5  # z towards the images
 
 
+@pytest.mark.parametrize("control", ["one", "one and bars", "two", "two, weighted", "in line"])
+def test_control_that_leaves_the_frame_open_in_part(control: str, rng: np.random.Generator):
+    """The start has the control points where they are, so that the adjustment has nothing left to turn."""
+    simulated = simulate(rng, images=12, points=60, field="plane", bars=2 if "bars" in control else 0, c_known=False)
+    network, truth = simulated.network, simulated.truth
+    some = [7] if control.startswith("one") else [7, 8] if control.startswith("two") else [0, 1, 2]
+    xyz, u = network.xyz.copy(), network.u_xyz.copy()
+    xyz[some], u[some] = truth.xyz[some], 0.1 if "weighted" in control else 0.0
+    network, state = start_values(replace(network, xyz=xyz, u_xyz=u))
+    result = adjust(network, state)
+    assert result.sigma0 < 1.3 and result.iterations <= 8
+    np.testing.assert_allclose(result.state.xyz[some], truth.xyz[some], atol=0.5 if "weighted" in control else 1e-9)
+    size = np.ptp(result.state.xyz, axis=0).max() / np.ptp(truth.xyz, axis=0).max()
+    assert control == "one" or 0.5 < size < 2
+
+
 def test_same_answer_twice(rng: np.random.Generator):
     network = simulate(rng, images=12, points=60, **DIRTY).network
     one, other = start_values(network)[1], start_values(network)[1]

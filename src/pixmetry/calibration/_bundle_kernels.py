@@ -135,6 +135,28 @@ def normals(residual, jacobian, weight, image, first, camera_of, camera_col, cam
 
 
 @jit
+def gradients(residual, jacobian, weight, image, first, camera_of, camera_col, camera_count, image_col, point_col, g, h):
+    """Add the right sides alone: g of the reduced unknowns, h (points, 3) of the eliminated points."""
+    each = camera_count.max()
+    p = jacobian.shape[2] - 3
+    for j in range(len(first) - 1):
+        for i in range(first[j], first[j + 1]):
+            r0, r1 = weight[i] * residual[i, 0], weight[i] * residual[i, 1]
+            k = camera_of[image[i]]
+            row0, row1 = jacobian[i, 0], jacobian[i, 1]
+            for a in range(camera_count[k]):
+                g[camera_col[k] + a] += row0[a] * r0 + row1[a] * r1
+            for a in range(each, p):
+                g[image_col[image[i]] + a - each] += row0[a] * r0 + row1[a] * r1
+            for a in range(3):
+                value = row0[p + a] * r0 + row1[p + a] * r1
+                if point_col[j] >= 0:
+                    g[point_col[j] + a] += value
+                elif point_col[j] == ELIMINATED:
+                    h[j, a] += value
+
+
+@jit
 def roots(V, point_col, root):
     """L⁻¹ of V = L Lᵀ for the eliminated points; returns for each the smallest ratio of a pivot to its diagonal."""
     pivot = np.ones(len(V))

@@ -196,6 +196,11 @@ class AddedTerms:
             columns = np.repeat(column + image * len(kinds) + place, 2)
             entries.append((pair.ravel(), columns, d.by_image[rows, :, kind].ravel()))
         total = column + len(network.images) * len(kinds)
+        # x-scales and x-shifts of a camera were estimated with mean 0: as observations of their sum
+        seen = np.isin(np.arange(len(network.images)), image)
+        mine = [np.flatnonzero(seen & (network.camera_of == k)) for k in range(len(network.cameras))]
+        places = [place for place, kind in enumerate(kinds) if kind in (SCALE, SHIFT)]
+        self._summing_to_zero = [column + images * len(kinds) + place for images in mine for place in places if len(images)]
         by_camera = sparse.csr_matrix(_stacked(entries), shape=(2 * m, total))
         by_point = np.where((network.u_xyz[point] > 0)[:, None, :], d.by_point[rows], 0.0)
         columns = np.broadcast_to(3 * point[:, None, None] + np.arange(3), by_point.shape)
@@ -224,6 +229,8 @@ class AddedTerms:
         reduced = (self._kept.T @ self._kept).toarray() - _dense(cross.T @ (self._point_inverse @ cross))
         first = self._cameras.shape[1]
         reduced[first:, first:] += (in_points - self._points.T @ self._points)[self._joined][:, self._joined].toarray()
+        for columns in self._summing_to_zero:
+            reduced[np.ix_(columns, columns)] += np.diag(reduced)[columns].mean()
         diagonal = np.asarray(self._kept.multiply(self._kept).sum(axis=0)).ravel()
         diagonal[diagonal == 0] = 1.0  # of images and points without observations
         self._scale = 1 / np.sqrt(diagonal)

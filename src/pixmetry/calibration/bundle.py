@@ -1,10 +1,11 @@
 """Self-calibrating bundle adjustment: all cameras, images and points at once, by least squares.
 
-Gauss–Newton steps, damped after Levenberg and Marquardt where one would raise the cost. Points are eliminated (D. C. Brown, The bundle
-adjustment: progress and prospects, Int. Arch. Photogrammetry 21 (1976)), so that the system to be solved holds the interior parameters, the
-images and the points that scale bars join. It is brought to a unit diagonal. Where control does not fix the datum, H Hᵀ of the missing
-similarity parameters makes it regular; this changes no residual. A robust loss is least squares with weights anew in each iteration (P. W.
-Holland and R. E. Welsch, Commun. Statist. A 6 (1977) 813–827).
+Gauss–Newton steps, on arcs for the cameras; where a step would not lower the cost as it should, it gets its second-order term, and where
+that does not help, it is damped after Levenberg and Marquardt: the valleys of long lenses and flat fields are narrow and bent. Points are
+eliminated (D. C. Brown, The bundle adjustment: progress and prospects, Int. Arch. Photogrammetry 21 (1976)), so that the system to be
+solved holds the interior parameters, the images and the points that scale bars join. It is brought to a unit diagonal. Where control does
+not fix the datum, H Hᵀ of the missing similarity parameters makes it regular; this changes no residual. A robust loss is least squares with
+weights anew in each iteration (P. W. Holland and R. E. Welsch, Commun. Statist. A 6 (1977) 813–827).
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import numpy as np
 
 from pixmetry.calibration.bundle_covariance import Cofactors, cofactors, raise_weak, residual_cofactors_px2
 from pixmetry.calibration.bundle_layout import Layout, layout_of, without
-from pixmetry.calibration.bundle_system import LOSSES, Linearised, Loss, Solved, cost, equations, linearise, point_roots, solve
+from pixmetry.calibration.bundle_system import LOSSES, Linearised, Loss, Solved, bent, cost, equations, linearise, point_roots, solve
 from pixmetry.calibration.datum import Datum, aligned, datum_of
 from pixmetry.calibration.network import Adjustment, Network, State
 from pixmetry.core.errors import InputError
@@ -24,8 +25,10 @@ from pixmetry.core.threads import single_threaded_blas
 SMALL = 1e-3  # largest (step / standard deviation)², over all unknowns, of a last step, and
 LEFT, LEFT_ROBUST = 1e-6, 1e-4  # what the step after it would have
 ROUNDING = 1e-14  # the same per image coordinate, in a priori weights: residuals that are nought
-DAMPING_START, DAMPING_LEAST, DAMPING_MOST = 1e-4, 1e-7, 1e8
+DAMPING_START, DAMPING_LEAST, DAMPING_MOST = 1e-6, 1e-7, 1e8
 NEAR = 0.01  # share of the cost below which a step is one of the last
+STRAIGHT = 0.5  # share of the predicted gain below which the way is bent, and a step with its second-order term is tried
+PART = 0.1  # of a step, over which its bend is measured
 MEET = 1e-11  # least pivot of a point's equations: the square of the angle at which its rays meet
 
 
@@ -39,7 +42,7 @@ def adjust(
     redundancy: bool = False,
     covariance: bool = True,
     a_priori: bool = False,
-    max_iterations: int = 50,
+    max_iterations: int = 100,
 ) -> Adjustment:
     """Adjust a network.
 
@@ -115,19 +118,33 @@ def _moved(layout: Layout, state: State, solved: Solved) -> State:
     """The state after a step."""
     interior, rotation, position = state.interior.copy(), state.rotation.copy(), state.position.copy()
     x_scale, x_shift, xyz = state.x_scale.copy(), state.x_shift_px.copy(), state.xyz + solved.points
+    joined = np.flatnonzero(layout.point_col >= 0)
+    xyz[joined] += np.where(layout.held[joined], 0.0, solved.step[layout.point_col[joined][:, None] + np.arange(3)])
     for k in range(len(layout.free)):
         count = layout.camera_count[k]
         interior[k, layout.free[k, :count]] += solved.step[layout.camera_col[k] : layout.camera_col[k] + count]
     there = np.flatnonzero(layout.image_col >= 0)
     at = layout.image_col[there]
-    rotation[there] = _turns(solved.step[at[:, None] + np.arange(3)]) @ rotation[there]
-    position[there] += solved.step[at[:, None] + np.arange(3, 6)]
+    turn, shift = solved.step[at[:, None] + np.arange(3)], solved.step[at[:, None] + np.arange(3, 6)]
+    position[there] += _along_arc(rotation[there], turn, shift)
+    rotation[there] = _turns(turn) @ rotation[there]
     for place, values in zip(layout.extra, (x_scale, x_shift), strict=True):
         if place >= 0:
             values[there] += solved.step[at + place]
-    joined = np.flatnonzero(layout.point_col >= 0)
-    xyz[joined] += np.where(layout.held[joined], 0.0, solved.step[layout.point_col[joined][:, None] + np.arange(3)])
     return State(interior, rotation, position, x_scale, x_shift, xyz)
+
+
+def _along_arc(rotation: np.ndarray, turn: np.ndarray, shift: np.ndarray) -> np.ndarray:
+    """Shifts of projection centres, bent as a screw motion bends them: a camera that turns with its object in view goes round the object,
+    not along the tangent (the exponential map of SE(3): F. Dellaert, M. Kaess, Factor Graphs for Robot Perception (2017), chapter 6).
+
+    Rᵀ J R shift, with J = 1 − (1 − cos θ)/θ² [w]× + (θ − sin θ)/θ³ [w]×².
+    """
+    angle = np.maximum(np.linalg.norm(turn, axis=1), 1e-4)[:, None]  # below it the factors have their limits but for 1e-9
+    along = np.einsum("nij,nj->ni", rotation, shift)
+    across = np.cross(turn, along)
+    bent = along - (1 - np.cos(angle)) / angle**2 * across + (angle - np.sin(angle)) / angle**3 * np.cross(turn, across)
+    return np.einsum("nji,nj->ni", rotation, bent)
 
 
 def _turns(w: np.ndarray) -> np.ndarray:
@@ -143,25 +160,50 @@ def _iterate(
     """Step until the last one is small; gives the equations of that step, their solution (None: it was not reached), and what is after."""
     dof = max(1, _dof(layout, datum))
     tolerance = LEFT if loss.kind == "none" else LEFT_ROBUST
-    damping, costs, before = 0.0, [now.cost], 0.0
+    damping, costs, before, placed = 0.0, [now.cost], 0.0, True
+    near = datum.missing < 6  # then the state is aligned step by step: only small motions leave what is held as it is
     for _ in range(most):
         solved = solve(layout, datum, now, damping, work)
         if solved is not None:
             if solved.gain < NEAR * now.cost:
+                near = True
                 loss = replace(loss, unit=now.unit)  # weights by a scale that goes on moving need not settle
             last = _is_last(solved.gain, before, now.cost / dof, tolerance, ROUNDING * len(layout.x))
-            after = linearise(layout, aligned(layout, _moved(layout, now.state, solved), datum), loss)
+            after = _after(layout, datum, now, solved, loss, near)
+            if not last and now.cost - after.cost < STRAIGHT * solved.gain:
+                other = _after(layout, datum, now, bent(layout, now, solved, _bend(layout, now, solved, loss)), loss, near)
+                after = other if _better(layout, now, other, last) and not other.cost > after.cost else after
             if _better(layout, now, after, last):
                 costs.append(after.cost)
-                if last and damping == 0.0:
+                if last and placed and damping == 0.0:
                     return now, solved, after, costs
                 before = solved.gain if damping == 0.0 else 0.0
-                now, damping = after, 0.0 if last or damping < DAMPING_LEAST else damping / 10
+                kept = (now.cost - after.cost) / solved.gain if solved.gain > 0 else 1.0
+                damping *= max(0.1, 1 - (2 * min(kept, 1.0) - 1) ** 3)
+                now, placed = after, near
+                if last or damping < DAMPING_LEAST:
+                    damping = 0.0
                 continue
         damping = max(10 * damping, DAMPING_START)
         if damping > DAMPING_MOST:
             raise_weak(layout, datum, now, f"no minimum was found: after {len(costs) - 1} steps none lowers the cost")
     return now, None, now, costs
+
+
+def _after(layout: Layout, datum: Datum, now: Linearised, solved: Solved, loss: Loss, align: bool) -> Linearised:
+    state = _moved(layout, now.state, solved)
+    return linearise(layout, aligned(layout, state, datum) if align else state, loss)
+
+
+def _bend(layout: Layout, now: Linearised, solved: Solved, loss: Loss) -> np.ndarray:
+    """Second derivative of the residuals along a step, by differences; 0 where a point loses its image."""
+    ahead, behind = (linearise(layout, _moved(layout, now.state, _part(solved, part)), loss) for part in (PART, -PART))
+    second = (ahead.residual - 2 * now.residual + behind.residual) / PART**2
+    return np.where((now.valid & ahead.valid & behind.valid)[:, None], second, 0.0)
+
+
+def _part(solved: Solved, share: float) -> Solved:
+    return replace(solved, step=share * solved.step, points=share * solved.points)
 
 
 def _is_last(gain: float, before: float, variance: float, tolerance: float, rounding: float) -> bool:

@@ -143,7 +143,7 @@ def layout_of(network: Network, start: State, used: np.ndarray | None) -> Layout
     image_col, extra, constraints = _images(network, image_there, int(count.sum()), columns)
     bars, point_col = _points(network, point_there, held, len(columns), columns)
     with np.errstate(divide="ignore"):
-        prior = np.where(held, 0.0, 1.0 / network.u_xyz**2)
+        prior = np.where(held | ~point_there[:, None], 0.0, 1.0 / network.u_xyz**2)
     return Layout(
         network=network,
         order=order,
@@ -168,7 +168,15 @@ def layout_of(network: Network, start: State, used: np.ndarray | None) -> Layout
         constraints=np.array([np.pad(row, (0, len(columns) - len(row))) for row in constraints]).reshape(-1, len(columns)),
         direction=np.array([CODES[camera.direction] for camera in network.cameras], np.int64),
         per_px=np.array([camera.sensor.per_px for camera in network.cameras], float),
+        notes=_lost_bars(network, point_there),
     )
+
+
+def _lost_bars(network: Network, there: np.ndarray) -> tuple[str, ...]:
+    b = network.bars
+    lost = np.flatnonzero(~(there[b.start] & there[b.end]))
+    names = ", ".join(f"{network.points[b.start[k]]}–{network.points[b.end[k]]}" for k in lost)
+    return (f"scale bars take no part, because an end of them is not determined: {names}",) if len(lost) else ()
 
 
 def without(layout: Layout, start: State, points: np.ndarray) -> Layout:
@@ -179,7 +187,8 @@ def without(layout: Layout, start: State, points: np.ndarray) -> Layout:
     used[layout.order[layout.used]] = True
     names = ", ".join(layout.network.points[j] for j in points[:5]) + (" …" if len(points) > 5 else "")
     note = f"{len(points)} points are not determined, as their rays hardly meet at an angle: {names}"
-    return replace(layout_of(layout.network, replace(start, xyz=xyz), used), notes=(*layout.notes, note))
+    rest = layout_of(layout.network, replace(start, xyz=xyz), used)
+    return replace(rest, notes=(*rest.notes, note))
 
 
 def _check(network: Network) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -61,7 +61,7 @@ def linearise(layout: Layout, state: State, loss: Loss) -> Linearised:
         free, state.rotation, state.position, state.x_scale, state.x_shift_px, float(layout.network.scale_origin_px), layout.extra,
         state.xyz, layout.held, residual, jacobian,
     )  # fmt: skip
-    valid = np.isfinite(residual).all(axis=1)
+    valid = np.asarray(np.isfinite(residual).all(axis=1))
     residual[~valid] = 0.0
     loss_weight, unit = _loss_weight(residual, layout.used & valid, loss)
     weight = np.where(layout.used & valid, loss_weight, 0.0)
@@ -138,11 +138,8 @@ def reduce(layout: Layout, Z: tuple[np.ndarray, np.ndarray], h: np.ndarray, root
     from scipy.linalg.blas import dsyrk
 
     of_images, of_cameras = Z
-    t = np.einsum("jab,jb->ja", root, h)
     n = of_cameras.shape[2]
-    g[:n] -= np.einsum("jcm,jc->m", of_cameras, t)
-    pulls = np.einsum("icm,ic->im", of_images, t[layout.point])
-    np.subtract.at(g, layout.image_col[layout.image][:, None] + np.arange(layout.per_image), pulls)
+    _reduce_right(layout, Z, h, root, g)
     if dense(layout):
         for at in range(0, len(layout.eliminated), BLOCK_POINTS):
             rows = rows_of(layout, Z, layout.eliminated[at : at + BLOCK_POINTS])
@@ -150,6 +147,15 @@ def reduce(layout: Layout, Z: tuple[np.ndarray, np.ndarray], h: np.ndarray, root
         return
     S[:n, :n] -= np.tensordot(of_cameras, of_cameras, axes=([0, 1], [0, 1]))
     kernels.reduce_pairs(of_images, of_cameras, layout.by_image, layout.image, layout.point, layout.first, layout.image_col, S)
+
+
+def _reduce_right(layout: Layout, Z: tuple[np.ndarray, np.ndarray], h: np.ndarray, root: np.ndarray, g: np.ndarray) -> None:
+    """Eliminate the points from the right side g, in place."""
+    of_images, of_cameras = Z
+    t = np.einsum("jab,jb->ja", root, h)
+    g[: of_cameras.shape[2]] -= np.einsum("jcm,jc->m", of_cameras, t)
+    pulls = np.einsum("icm,ic->im", of_images, t[layout.point])
+    np.subtract.at(g, layout.image_col[layout.image][:, None] + np.arange(layout.per_image), pulls)
 
 
 def rows_of(layout: Layout, Z: tuple[np.ndarray, np.ndarray], which: np.ndarray) -> np.ndarray:
@@ -167,7 +173,7 @@ def dense(layout: Layout) -> bool:
 
 def solve(layout: Layout, datum: Datum, now: Linearised, damping: float, work: np.ndarray) -> Solved | None:
     """The step; None where the damped system is singular."""
-    from scipy.linalg.lapack import dpotrf, dpotrs
+    from scipy.linalg.lapack import dpotrf
 
     g, V, h = equations(layout, now, work)
     i, m = np.arange(3), np.arange(len(work))
@@ -185,17 +191,39 @@ def solve(layout: Layout, datum: Datum, now: Linearised, damping: float, work: n
     factor, info = dpotrf(work.T, lower=0, overwrite_a=1, clean=0)
     if info:
         return None
+    step, points = _answer(layout, now, factor, scale, root, right, h)
+    return Solved(step, points, float(g @ step + (h * points).sum()), factor, scale, root, Z)
+
+
+def bent(layout: Layout, now: Linearised, solved: Solved, second: np.ndarray) -> Solved:
+    """The step with its second-order term: half of what cancels ``second``, the second derivative of the residuals along the step.
+
+    M. K. Transtrum, J. P. Sethna, Improvements to the Levenberg–Marquardt algorithm (2012), arXiv:1201.5885: geodesic acceleration.
+    """
+    g, h = np.zeros(len(solved.step)), np.zeros_like(solved.points)
+    kernels.gradients(second, now.jacobian, now.weight, *layout.incidence, layout.point_col, g, h)
+    _reduce_right(layout, solved.Z, h, solved.root, g)
+    step, points = _answer(layout, now, solved.factor, solved.scale, solved.root, g, h)
+    return replace(solved, step=solved.step + step / 2, points=solved.points + points / 2)
+
+
+def _answer(
+    layout: Layout, now: Linearised, factor: np.ndarray, scale: np.ndarray, root: np.ndarray, right: np.ndarray, h: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Reduced unknowns and points for a right side whose points are eliminated."""
+    from scipy.linalg.lapack import dpotrs
+
     step = dpotrs(factor, right * scale, lower=0)[0]
     if len(layout.constraints):
         C = layout.constraints * scale
         away = dpotrs(factor, C.T, lower=0)[0]
         step -= away @ np.linalg.solve(C @ away, C @ step)
     step *= scale
-    points = np.zeros((len(V), 3, 1))
+    points = np.zeros((*h.shape, 1))
     kernels.point_steps(now.jacobian, now.weight, *layout.incidence, layout.point_col, root, h[:, :, None], step[:, None], points)
     points = points[:, :, 0]
     points[layout.held] = 0.0
-    return Solved(step, points, float(g @ step + (h * points).sum()), factor, scale, root, Z)
+    return step, points
 
 
 def regularise(layout: Layout, datum: Datum, state: State, S: np.ndarray, scale: np.ndarray) -> None:

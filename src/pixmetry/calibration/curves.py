@@ -140,7 +140,7 @@ def _slopes(camera: CameraModel, names: tuple[str, ...], u: np.ndarray, v: np.nd
     turned[:, 0] = np.stack([-u * v, 1 + u * u, -v], axis=1)
     turned[:, 1] = np.stack([-(1 + v * v), u * v, u], axis=1)
     by_parameter = by_interior[:, :, [NAMES.index(name) for name in names]]
-    return by_parameter.reshape(-1, len(names)), np.einsum("nij,njk->nik", by_direction, turned).reshape(-1, 3)
+    return by_parameter.reshape(2 * len(u), len(names)), np.einsum("nij,njk->nik", by_direction, turned).reshape(-1, 3)
 
 
 def _coordinate_u(slopes: np.ndarray, covariance: np.ndarray) -> np.ndarray:

@@ -116,7 +116,7 @@ def aligned(layout: Layout, state: State, datum: Datum) -> State:
         basis = np.linalg.svd(_held_directions(layout, state, datum))[2][7 - datum.missing :].T
         G = (generators(state.xyz[datum.carriers], datum) @ basis).reshape(-1, datum.missing)
         gap = (datum.start - state.xyz[datum.carriers]).ravel()
-        step = basis @ np.linalg.solve(G.T @ G, G.T @ gap)
+        step = basis @ np.linalg.lstsq(G, gap, rcond=None)[0]
         turn = step[3:6] / datum.size
         largest = max(np.abs(turn).max(), abs(step[6]) / datum.size, 1e-300)
         step *= min(1.0, 0.5 / largest)

@@ -21,6 +21,7 @@ from pixmetry.core.errors import InputError
 
 GRID = 33  # places along each side of the frame at which two models are compared
 EXACT_PX = 1e-9
+STORAGES = (".yaml", ".yml", ".xml", ".json")  # endings of files of OpenCV's FileStorage
 OPENCV = ("c", "xp", "yp", "b1", "p1", "p2", "k1", "k2", "k3")  # what its five coefficients hold
 COLMAP: dict[str, tuple[str, ...]] = {  # by name: our parameters that it holds, besides c, xp and yp
     "SIMPLE_PINHOLE": (),
@@ -129,8 +130,8 @@ def write_opencv(model: CameraModel, path: str | Path, tolerance_px: float = 0.0
     import cv2
 
     target = Path(path)
-    if target.suffix.lower() not in (".yaml", ".yml", ".xml", ".json"):
-        raise InputError("not a file of OpenCV's storage", where=str(target), allowed=".yaml, .yml, .xml, .json")
+    if target.suffix.lower() not in STORAGES:
+        raise InputError("not a file of OpenCV's storage", where=str(target), allowed=", ".join(STORAGES))
     form = opencv_form(model, tolerance_px)
     storage = cv2.FileStorage(target.suffix.lower(), cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
     storage.write("image_width", int(form["image_size"][0]))
@@ -162,7 +163,7 @@ def read_opencv(path: str | Path, pitch_um: tuple[float, float] | None = None) -
     source = Path(path)
     try:
         storage = cv2.FileStorage(str(source), cv2.FILE_STORAGE_READ)
-    except cv2.error:
+    except (cv2.error, SystemError):  # the latter is what its constructor makes of the former
         storage = None
     if storage is None or not storage.isOpened():
         raise InputError("not a file of OpenCV's storage", where=str(source), allowed="YAML, XML or JSON as cv2.FileStorage writes it")
@@ -278,5 +279,10 @@ def _held(model: CameraModel, names: tuple[str, ...], tolerance_px: float, who: 
     about = [f"{who} has no place for {', '.join(lost)}"] if lost else []
     if model.direction == "image_to_object":
         about.append(f"{who} distorts from object to image, this model corrects from image to object")
-    remedy = f"allow it with tolerance_px={form.largest_px:.2g}, or calibrate with direction object_to_image and these parameters only"
+    enough = np.ceil(100 * form.largest_px / (step := 10.0 ** np.floor(np.log10(form.largest_px)))) / 100 * step  # three digits, upwards
+    kept = ",".join(n for n in names if n in ("c", "xp", "yp") or model[n])
+    remedy = (
+        f"allow it with tolerance_px={enough:.3g} (on the command line --may-lose-px {enough:.3g}), or calibrate with direction "
+        f"object_to_image and free {kept}"
+    )
     raise InputError(f"{'; '.join(about)}: up to {form.largest_px:.2g} px would be lost", where=model.name, remedy=remedy)

@@ -9,8 +9,10 @@ import numpy as np
 
 from pixmetry.calibration.hold_out import hold_out_record, left_out
 from pixmetry.calibration.network import Adjustment, Finding, Network
+from pixmetry.calibration.quality import p_words
 from pixmetry.core.errors import InputError, MeasureError
 
+LEAST_FIELD = 6  # fixed points: with fewer there is little to tell of a field
 FLAT = 1e-3  # nominal coordinates are those of a plane if their least extent is below this share of the largest
 PLACES = {"c": 0, "xp": 1, "yp": 2}
 
@@ -75,6 +77,8 @@ def check_field(fixed: Adjustment, folds: int = 5, seed: int = 0, level: float =
     nominal = (network.u_xyz == 0).all(axis=1) & np.isin(np.arange(len(network.points)), network.point)
     if nominal.sum() < 4:
         raise InputError("no test field with given coordinates", where="field", value=int(nominal.sum()), allowed="4 fixed points")
+    if nominal.sum() < LEAST_FIELD:
+        return _kept(fixed, f"{int(nominal.sum())} points are too few to contradict each other", {})
     released = replace(network, u_xyz=np.where(nominal[:, None], np.inf, network.u_xyz))
     try:
         free = adjust(released, fixed.state, used=fixed.used, redundancy=fixed.redundancy is not None)
@@ -182,7 +186,7 @@ def _text(record: dict[str, Any], held: dict[str, Any], level: float) -> str:
     unit, plane = record["unit"], record["shape"] == "plane"
     numbers = f"rms {record['rms']:.3g} {unit} (of which {record['u']:.2g} may be noise), peak {record['peak']:.3g} {unit}"
     left = f"{held['fixed']['left_out_rms_px']:.4f} px with the points as given and {held['free']['left_out_rms_px']:.4f} px with them free"
-    judged = f"images left out of the fit show {left} (p = {held['p']:.2g}); F = {record['f']:.3g}, p = {record['p']:.2g}"
+    judged = f"images left out of the fit show {left} ({p_words(held['p'])}); F = {record['f']:.3g}, {p_words(record['p'])}"
     if record["verdict"] == "fixed":
         return f"The given coordinates of the test field stand: {judged}, not both below {level:g}."
     if plane:

@@ -10,32 +10,38 @@ import numpy as np
 
 from pixmetry.calibration.eccentric import Eccentricity
 from pixmetry.calibration.network import Adjustment, Finding, Network
+from pixmetry.calibration.quality import p_words
 
 ORDER = (  # of kinds, among findings of the same level; what is not named here comes between the two parts
-    "start", "determination", "correlation", "flatness", "x_scale_drift", "gross_scale_bar", "gross_control_point", "x_shift", "field",
-    "known_uncertainty", "eccentricity", "f_test", "gross_error", None, "significance", "variance_components", "residual_grid", "hold_out",
-    "datum", "adjustment",
+    "start", "determination", "x_scale_drift", "bad_images", "correlation", "flatness", "lost_points", "gross_scale_bar",
+    "gross_control_point", "x_shift", "field", "known_uncertainty", "eccentricity", "f_test", "gross_error", None, "significance",
+    "variance_components", "residual_grid", "hold_out", "datum", "adjustment",
 )  # fmt: skip
 SIGNIFICANT = 0.05
 RARE = 0.001  # level of tests that were not asked for
 CORRELATED = 0.995
 NOTEWORTHY_PX = 0.002  # an eccentricity of this size is worth a sentence
 NAMED = 5
-MOST_PATTERNS = 5
+LEAST_NOTES = 2
+MOST_PATTERNS = 4
+MOST = 8  # findings in all, unless there are more warnings
 RADIAL = frozenset(("k1", "k2", "k3", "k4", "k5"))
 
 
 def in_order(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """Warnings first; then by what matters most for the result. The same sentence is said once."""
+    """Warnings first; then by what matters most for the result, notes no more than a few. The same sentence is said once."""
     rank = {kind: i for i, kind in enumerate(ORDER)}
     unique = dict.fromkeys(findings)
-    return tuple(sorted(unique, key=lambda f: (f.level != "warning", rank.get(f.kind, rank[None]))))
+    ordered = sorted(unique, key=lambda f: (f.level != "warning", rank.get(f.kind, rank[None])))
+    warnings = sum(f.level == "warning" for f in ordered)
+    return tuple(ordered[: max(MOST, warnings + LEAST_NOTES)])
 
 
 def findings_of(adjustment: Adjustment, tests: Mapping[str, Any]) -> list[Finding]:
     """What the records of one adjustment say."""
     found = [
         *known_findings(tests["known"], adjustment.network.unit),
+        *lost_findings(adjustment),
         *parameter_findings(tests["parameters"]),
         *f_test_findings(tests["f_test"]),
         *gross_error_findings(tests["gross_errors"], adjustment),
@@ -46,14 +52,23 @@ def findings_of(adjustment: Adjustment, tests: Mapping[str, Any]) -> list[Findin
 
 
 def in_the_shadow(patterns: Iterable[Finding]) -> list[Finding]:
-    """The findings on patterns in the residuals, no more than a few; beside a drift of the x-scale the others can be its shadow."""
+    """The findings on patterns in the residuals, the further ones in one sentence; beside a drift of the x-scale all others are further."""
+    from pixmetry.calibration.patterns import MEANING
+
     found = list(patterns)
     drift = [f for f in found if f.kind == "x_scale_drift"]
-    others = [f for f in found if f.kind != "x_scale_drift"][: MOST_PATTERNS - len(drift)]
-    if drift:
-        advice = "Look at it again with an x-scale for each image, whose want can look like this."
-        others = [replace(f, advice=advice, level="note") for f in others]
-    return drift + others
+    bad = [replace(f, level="note" if drift else f.level) for f in found if f.kind == "bad_images"]
+    others = [f for f in found if f.kind not in ("x_scale_drift", "bad_images")]
+    shown = 0 if drift else MOST_PATTERNS
+    out = [*drift, *bad, *others[:shown]]
+    if len(others) > shown:
+        what = "; ".join(dict.fromkeys(MEANING[f.kind][0] for f in others[shown:]))
+        if drift:
+            text = f"There are other patterns, which the drift of the x-scale alone can make: {what}."
+            out.append(Finding("pattern", text, "Look at them again with an x-scale for each image."))
+        else:
+            out.append(Finding("pattern", f"Residuals show further patterns, less surely: {what}.", "See to the others first."))
+    return out
 
 
 def parameter_findings(parameters: list[dict[str, Any]]) -> list[Finding]:
@@ -63,8 +78,9 @@ def parameter_findings(parameters: list[dict[str, Any]]) -> list[Finding]:
         mine = [p for p in parameters if p["camera"] == camera]
         weak = [f"{p['name']} (p = {p['p_zero']:.2f})" for p in mine if p["p_zero"] is not None and p["p_zero"] > SIGNIFICANT]
         if weak:
-            text = f"{camera}: not significantly different from 0 are {', '.join(weak)}."
-            advice = "Leave them out, one at a time, unless other calibrations of this camera need them."
+            verb = "is" if len(weak) == 1 else "are"
+            text = f"{camera}: {', '.join(weak)} {verb} not significantly different from 0."
+            advice = f"Leave {'it out' if len(weak) == 1 else 'them out, one at a time'}, unless other calibrations of this camera need it."
             found.append(Finding("significance", text, advice))
         for a, b, r in _pairs(mine):
             text = f"{camera}: {a} and {b} are wholly correlated (r = {r:+.4f}); only their sum effect is determined."
@@ -107,6 +123,23 @@ def gross_error_findings(errors: list[dict[str, Any]], adjustment: Adjustment) -
     return [Finding("gross_error", text, advice, "warning" if many else "note")]
 
 
+def lost_findings(adjustment: Adjustment) -> list[Finding]:
+    """Points that two images or more see, of which nothing is left: of two rays that contradict each other none can be said to be right."""
+    network = adjustment.network
+    rays = np.bincount(network.point, minlength=len(network.points))
+    lost = np.flatnonzero((rays >= 2) & ~np.isfinite(adjustment.state.xyz).all(axis=1))
+    if not len(lost):
+        return []
+    named = ", ".join(network.points[k] for k in lost[:NAMED]) + (" …" if len(lost) > NAMED else "")
+    few, verb = ("1 point", "is") if len(lost) == 1 else (f"{len(lost)} points", "are")
+    text = f"{few} that two images or more see {verb} not determined: {named}. Too few image points are left that agree with each other"
+    ends = np.isin(network.bars.start, lost) | np.isin(network.bars.end, lost)
+    if ends.any():
+        text += f"; with them go {ends.sum()} of {len(ends)} scale bars"
+    advice = "Look at these points in their images: with two rays it cannot be told which of them is wrong; a third would tell."
+    return [Finding("lost_points", f"{text}.", advice, "warning")]
+
+
 def known_findings(known: Mapping[str, Any], unit: str) -> list[Finding]:
     """Bars and control points that the network contradicts."""
     found = []
@@ -142,10 +175,10 @@ def drift_findings(images: list[dict[str, Any]], adjustment: Adjustment) -> list
             low, high, middle = value.min() * factor, value.max() * factor, float(np.median(u)) * factor
             spread = f"from {low:+.3g} to {high:+.3g} {unit} (u of one: {middle:.2g} {unit})"
             if p < SIGNIFICANT:
-                text = f"{camera}: the images' {_words(key)} run {spread}, p = {p:.2g}: they are needed."
+                text = f"{camera}: the images' {_words(key)} run {spread}, {p_words(p)}: they are needed."
                 found.append(Finding(_kind(key), text))
             else:
-                text = f"{camera}: the images' {_words(key)} are not significant ({spread}, p = {p:.2g})."
+                text = f"{camera}: the images' {_words(key)} are not significant ({spread}, {p_words(p)})."
                 found.append(Finding("significance", text, f"Calibrate without them ({key.removesuffix('_px')} in per_image)."))
     return found
 

@@ -9,10 +9,12 @@ from __future__ import annotations
 import numpy as np
 
 from pixmetry.calibration.model import CameraModel
+from pixmetry.calibration.network import Adjustment
 from pixmetry.core.errors import InputError
 from pixmetry.core.estimates import Estimates
 from pixmetry.core.observations import CameraGeometry
 
+CELLS = (10, 8)  # of the frame, in which residuals have something in common or not
 GRID = 25  # places along each side of the frame
 LARGEST_PX = 0.05  # two models that differ by more are not the same camera
 LENS = ("p1_per_mm", "p2_per_mm", "k1_per_mm2", "k2_per_mm4", "k3_per_mm6")
@@ -107,3 +109,28 @@ def _fitted(model: CameraModel) -> tuple[np.ndarray, float]:
     start[:5] = model["c"], model["xp"] - x0, model["yp"] - y0, sign * model["b1"], sign * model["b2"] * my / mx
     fit = least_squares(misses, start / scale, xtol=1e-14, ftol=1e-14, gtol=1e-14)
     return fit.x * scale, float(np.hypot(*misses(fit.x).reshape(2, -1)).max())
+
+
+def systematic_rest(adjustment: Adjustment, index: int = 0) -> tuple[float, float]:
+    """What the residuals of a camera have in common at one place of the frame, in x and y, px: a standard deviation over the frame.
+
+    The component between cells of the frame in a one-way analysis of variance with random effects (Searle, Casella, McCulloch, Variance
+    Components, 1992, 3.6); 0 where the cells differ no more than noise makes them. Noise of single points is no error of the camera.
+    """
+    network = adjustment.network
+    sensor = network.cameras[index].sensor
+    own = adjustment.used & (network.camera_of[network.image] == index)
+    col = np.clip(network.x_px[own] / sensor.cols * CELLS[0], 0, CELLS[0] - 1).astype(int)
+    row = np.clip(network.y_px[own] / sensor.rows * CELLS[1], 0, CELLS[1] - 1).astype(int)
+    _, cell, counts = np.unique(row * CELLS[0] + col, return_inverse=True, return_counts=True)
+    n, cells = len(cell), len(counts)
+    if cells < 2 or n <= cells:
+        return 0.0, 0.0
+    per_cell = (n - (counts**2).sum() / n) / (cells - 1)
+    rest = []
+    for v in adjustment.residual_px[own].T:
+        means = np.bincount(cell, v) / counts
+        between = (counts * (means - v.mean()) ** 2).sum() / (cells - 1)
+        within = ((v - means[cell]) ** 2).sum() / (n - cells)
+        rest.append(float(np.sqrt(max(between - within, 0.0) / per_cell)))
+    return rest[0], rest[1]

@@ -9,6 +9,7 @@ import numpy as np
 
 from pixmetry.calibration.added_terms import derivatives, whitening
 from pixmetry.calibration.network import SCALE, SHIFT, Adjustment, Network, State
+from pixmetry.calibration.quality import p_words
 from pixmetry.core.errors import InputError
 
 STEPS = 30
@@ -232,7 +233,7 @@ def hold_out_record(fixed: LeftOut | None, free: LeftOut | None = None) -> dict[
             words.append(f"{name}: {record['fit_rms_px']:.4f} px in the fit, {record['left_out_rms_px']:.4f} px in images left out")
     text = f"{'; '.join(words)} ({given[0].folds} folds; rms of a coordinate)"
     if p is not None:
-        text += f"; p = {p:.2g} for the fall of the latter"
+        text += f"; {p_words(p)} for the fall of the latter"
     return {"fixed": fixed_record, "free": free_record, "folds": given[0].folds, "p": p, "text": text}
 
 

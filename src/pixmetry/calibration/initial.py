@@ -15,7 +15,7 @@ from pixmetry.calibration.free_start import best_free, common_points, without_le
 from pixmetry.calibration.network import Network, State
 from pixmetry.calibration.planar_start import homography, plane_coordinates, principal_distance
 from pixmetry.calibration.reconstruction import FINE, Reconstruction
-from pixmetry.calibration.resection import FEWEST, FLAT, fitted, thickness
+from pixmetry.calibration.resection import FEWEST, FLAT, fitted, similarity, thickness
 from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.core.threads import single_threaded_blas
 
@@ -274,7 +274,8 @@ def _to_object(work: Reconstruction) -> None:
     given = known & np.isfinite(network.xyz).all(axis=1)
     control = given & np.isfinite(network.u_xyz).all(axis=1)
     use = control if control.sum() >= 3 else given
-    if use.sum() >= 3 and thickness(network.xyz[use])[1] > 1e-3:
+    use_all = use.sum() >= 3 and thickness(network.xyz[use])[1] > 1e-3
+    if use_all:
         scale, rotation, shift, away = fitted(work.xyz[use], network.xyz[use])
         extent = np.linalg.norm(np.std(network.xyz[use], axis=0))
         if control.sum() >= 3 and np.median(away) > REACH * extent:
@@ -284,6 +285,8 @@ def _to_object(work: Reconstruction) -> None:
         _own_frame(work, known)
     if control.sum() < 2:
         _scaled(work)
+    if control.any() and not use_all:
+        _to_few(work, control)
 
 
 def _does_not_fit(work: Reconstruction, use: np.ndarray) -> Exception:
@@ -314,6 +317,15 @@ def _own_frame(work: Reconstruction, known: np.ndarray) -> None:
     base = np.sqrt(2 * np.sum(np.var(work.position[posed], axis=0)))
     scale = 1.0 / float(base) if base > 0 else 1.0
     moved(work, scale, rotation, -scale * rotation @ middle)
+
+
+def _to_few(work: Reconstruction, control: np.ndarray) -> None:
+    """To control that is one point, or lies in line: what it leaves open stays as it is."""
+    source, target = work.xyz[control], work.network.xyz[control]
+    if len(source) == 1:
+        moved(work, 1.0, np.eye(3), (target - source)[0])
+    else:
+        moved(work, *similarity(source, target, np.ones(len(source))))
 
 
 def _scaled(work: Reconstruction) -> None:

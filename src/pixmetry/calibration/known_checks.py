@@ -22,6 +22,7 @@ from pixmetry.core.errors import InputError
 LOOSE = 0.05  # uncertainty, as a part of the field's extent, with which a control point does not pull at the image coordinates
 INSEPARABLE = 0.99  # correlation of two residuals from which on it cannot be said which of the two is wrong
 LEAST_CONTROL = 4  # points that must stay for one to be left out
+CONTROL_SHARE = 0.5  # of the points; more fixed ones are a test field
 ABSURD = 0.1  # a bar that is wrong by such a part of its length, as one in other units, is out before any adjustment with it
 LEAST_RAYS = 3  # rejected rays that condemn a fixed point, where they are more than half
 MOST_WRONG = 0.2  # part of the fixed points that can be wrong one by one
@@ -45,13 +46,38 @@ class CheckedKnown:
 
 
 def has_known(network: Network) -> bool:
-    """Whether there are bars or control points with an uncertainty."""
-    return len(network.bars) > 0 or bool((np.isfinite(network.u_xyz) & (network.u_xyz > 0)).any())
+    """Whether there are bars or control points that can be tested."""
+    return len(network.bars) > 0 or bool((np.isfinite(network.u_xyz) & (network.u_xyz > 0)).any() or few_fixed(network).any())
+
+
+def weighted_instead(network: Network, clean: Adjustment) -> Network:
+    """The network with the few points that are fixed given an uncertainty, that of one image of them: so they are tested."""
+    fixed = few_fixed(network)
+    if not fixed.any():
+        return network
+    state, rows = clean.state, clean.used & fixed[network.point]
+    distance = np.linalg.norm(state.xyz[network.point[rows]] - state.position[network.image[rows]], axis=1)
+    c_px = np.array([np.mean(clean.camera(k).c_px) for k in range(len(network.cameras))])[network.camera_of[network.image[rows]]]
+    u = float(np.median(clean.sigma0 * np.sqrt(clean.network.covariance_px2[rows, 0]) * distance / c_px))
+    return replace(network, u_xyz=np.where(fixed[:, None], u, network.u_xyz))
+
+
+def fixed_again(network: Network, before: Network, weighted: Network) -> np.ndarray:
+    """u_xyz of a checked network, with those points fixed that had been so before and that nothing contradicts."""
+    same = (network.u_xyz == weighted.u_xyz).all(axis=1) & few_fixed(before)
+    return np.where(same[:, None], before.u_xyz, network.u_xyz)
+
+
+def few_fixed(network: Network) -> np.ndarray:
+    """Fixed points, shape (points,), where they are control beside points that are free, and enough to contradict each other."""
+    fixed = (network.u_xyz == 0).all(axis=1)
+    seen = np.bincount(network.point, minlength=len(network.points)) > 1
+    return fixed if LEAST_CONTROL <= fixed.sum() < CONTROL_SHARE * seen.sum() else np.zeros_like(fixed)
 
 
 def loosened(network: Network) -> Network:
-    """The network without bars, and with uncertain control points that hardly weigh."""
-    weighted = np.isfinite(network.u_xyz) & (network.u_xyz > 0)
+    """The network without bars, and with control points that hardly weigh."""
+    weighted = np.isfinite(network.u_xyz) & ((network.u_xyz > 0) | few_fixed(network)[:, None])
     known = network.xyz[np.isfinite(network.xyz).all(axis=1)]
     extent = float(np.ptp(known, axis=0).max()) if len(known) else 0.0
     u_xyz = np.where(weighted, np.maximum(network.u_xyz, LOOSE * extent), network.u_xyz)

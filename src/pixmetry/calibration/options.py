@@ -33,7 +33,8 @@ class Options:
     false_alarms : float
         Number of good image points that may be expected to be rejected in one adjustment, above 0.
     variance_components : bool
-        Estimate the standard deviations of x and of y of each camera, and weigh by them.
+        Estimate the standard deviations of x and of y of each camera, and weigh by them: what image coordinates scatter beyond covariances
+        that they came with is added to these; smaller or guessed ones are multiplied.
     eccentricity : bool
         Correct the images of targets whose size is known.
     target : {"circle", "square"}
@@ -45,7 +46,8 @@ class Options:
     residual_grid : bool
         Make a correction grid of what the parameters leave over.
     a_priori : bool
-        Take the covariance of the image coordinates as true: do not scale uncertainties by sigma0.
+        Take the covariance that the image coordinates came with as true: no variance components, and uncertainties are not scaled by
+        sigma0.
     max_iterations : int
         Of one adjustment.
 

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from pixmetry.calibration.added_terms import AddedTerms, Terms
+from pixmetry.calibration.added_terms import AddedTerms, Terms, whitening
 from pixmetry.calibration.network import Adjustment, Finding
-from pixmetry.calibration.quality import redundancy_of
+from pixmetry.calibration.quality import p_words, redundancy_of
+from pixmetry.core.errors import MeasureError
 from pixmetry.core.threads import single_threaded_blas
 
 HATS = 8  # nodes of a piecewise linear curve
@@ -18,6 +19,12 @@ FIELD_NODES = (6, 5)  # of a piecewise linear field, along x and y
 LONGEST_WAVE = 0.25  # of the frame; what is longer is a curve
 BINS_PER_PX = 4
 DRIFT = ("x_scale_trend", "x_scale_by_image")
+WORST = 5.0  # times the median rms: what a rejected image point counts at most
+OUTSTANDING = 2.5  # times the median rms of the images: such an image is looked at by itself
+RARE = 0.001
+ALIKE = 0.001  # level at which images differ, but for one of them
+FEW_OF = 3  # they are no more than one image in so many
+NAMED = 5
 MANY = 200  # a test needs so many image points of a camera
 
 # what is seen; the error source in the catalogue; what to do
@@ -39,9 +46,21 @@ MEANING = {
         "grabber.sampling_clock",
         "sample with the camera's pixel clock, or correct by a residual grid",
     ),
-    "wave_xx": ("x residuals are periodic along the row", "grabber.phase_pattern", "average images, or remove the interference"),
-    "wave_xy": ("x residuals are periodic down the column", "grabber.line_jitter", "compare the fields; average images"),
-    "wave_yy": ("y residuals are periodic down the column", "sensor.pixel_geometry", "average over more rows: use larger targets"),
+    "wave_xx": (
+        "x residuals are periodic along the row",
+        "grabber.phase_pattern",
+        "average images, or remove the interference; look at the targets if the period is theirs",
+    ),
+    "wave_xy": (
+        "x residuals are periodic down the column",
+        "grabber.line_jitter",
+        "compare the fields; average images; look at the targets if the period is theirs",
+    ),
+    "wave_yy": (
+        "y residuals are periodic down the column",
+        "sensor.pixel_geometry",
+        "use larger targets; look at how they are located if the period is theirs",
+    ),
     "phase_x": (
         "x residuals follow the sub-pixel phase",
         "sensor.pixel_aperture",
@@ -66,6 +85,19 @@ MEANING = {
         "wait until the camera is warm, and lock the lens",
     ),
     "image_rms": ("residuals are larger in some images than in others", "", "look at the worst images: focus, movement, light"),
+}
+
+SOURCES = {  # in words
+    "optics.distortion": "lens distortion beyond the terms that were estimated",
+    "sensor.unflatness": "a sensor that is not flat",
+    "sensor.pixel_geometry": "pixels, lens or board that are irregular on a small scale",
+    "grabber.line_jitter": "lines that a frame grabber does not start at one place",
+    "grabber.sampling_clock": "samples that are not evenly spaced along a line",
+    "grabber.phase_pattern": "interference that the sampling clock brings in",
+    "sensor.pixel_aperture": "pixels that are coarse for the images of the targets",
+    "grabber.clock_warm_up": "a frame grabber whose clock warms up",
+    "sensor.mount_drift": "a sensor or lens that moves while it warms up",
+    "sensor.thermal_expansion": "a camera that expands while it warms up",
 }
 
 
@@ -105,9 +137,11 @@ def residual_patterns(adjustment: Adjustment, level: float = 0.01) -> list[dict[
     list of dict
         ``name``, ``camera``, ``amplitude_px``, ``u_px`` (None where the amplitude is an rms over several terms, with the part that noise
         alone makes taken off), ``p``, ``level``, ``significant``, ``source`` (of the catalogue of error sources), ``text``, ``advice``.
-        ``x_scale_by_image`` and ``x_shift_by_image`` also hold ``images``, ``values`` and ``u``; waves hold ``period_px``. Amplitudes:
+        ``x_scale_by_image`` and ``x_shift_by_image`` also hold ``images``, ``values`` and ``u``, and ``alone``: the one image that differs
+        from all others, if it is one; waves hold ``period_px``. Amplitudes:
         of waves and phases their own; of trends the change from the first image to the last, at the edge of the frame; of curves, fields
-        and images the rms of what the residuals show of them; of ``image_rms`` the largest rms of an image.
+        and images the rms of what the residuals show of them; of ``image_rms`` the largest rms of an image, and if few images stand out
+        their names, ``images_out``, with ``rms_px`` and ``times_median``.
     """
     with single_threaded_blas():
         out = _of_cameras(adjustment)
@@ -116,9 +150,27 @@ def residual_patterns(adjustment: Adjustment, level: float = 0.01) -> list[dict[
         significant = bool(record["p"] < level / len(out))
         number = f"{record['amplitude_px']:.4f} px" if record["u_px"] is None else f"{record['amplitude_px']:.4f} ± {record['u_px']:.4f} px"
         period = f", period {record['period_px']:.3g} px" if "period_px" in record else ""
-        text = f"{what}: {number}{period}, p = {record['p']:.2g}" if significant else f"not seen: {what} (p = {record['p']:.2g})"
+        if record.get("alone"):
+            what, source = f"{what}, but only that of {record['alone']} from all others", ""
+            advice = "look at this image: focus, movement, light, names of points"
+        text = f"{what}: {number}{period}, {p_words(record['p'])}" if significant else f"not seen: {what} ({p_words(record['p'])})"
         record |= {"level": level / len(out), "significant": significant, "source": source, "text": text, "advice": advice}
     return out
+
+
+def patterns_without_bad_images(adjustment: Adjustment, adjust: Callable[..., Adjustment]) -> list[dict[str, Any]]:
+    """`residual_patterns`; if few images stand out by their residuals, those of an adjustment without them, but for ``image_rms``."""
+    found = residual_patterns(adjustment)
+    bad = [name for r in found if r["significant"] for name in r.get("images_out", ())]
+    if not bad:
+        return found
+    network = adjustment.network
+    used = adjustment.used & ~np.isin(network.image, np.flatnonzero(np.isin(network.images, bad)))
+    try:
+        again = residual_patterns(adjust(network, adjustment.state, used=used, redundancy=True))
+    except MeasureError:  # the network hangs on them
+        return found
+    return [*(r for r in again if r["name"] != "image_rms"), *(r for r in found if r["name"] == "image_rms")]
 
 
 def _of_cameras(adjustment: Adjustment) -> list[dict[str, Any]]:
@@ -145,11 +197,25 @@ def pattern_findings(records: list[dict[str, Any]]) -> tuple[Finding, ...]:
     out = []
     for record in sorted((r for r in records if r["significant"]), key=lambda r: r["p"]):
         where = f"{record['camera']}: " if several else ""
-        source = f" (as by {record['source']})" if record["source"] else ""
-        kind = "x_scale_drift" if record["name"] in DRIFT else record["name"]
+        source = f" (as from {SOURCES[record['source']]}: {record['source']})" if record["source"] else ""
+        if record.get("images_out"):
+            out.append(_bad_images(record, where))
+            continue
+        kind = "x_scale_drift" if record["name"] in DRIFT and not record.get("alone") else record["name"]
         advice = record["advice"][0].upper() + record["advice"][1:] + "."
         out.append(Finding(kind, f"{where}{record['text']}{source}", advice, "warning"))
     return tuple(out)
+
+
+def _bad_images(record: dict[str, Any], where: str) -> Finding:
+    found = list(zip(record["images_out"], record["rms_px"], record["times_median"], strict=True))
+    named = ", ".join(f"{name} ({rms:.2g} px, {times:.1f} times the middle one)" for name, rms, times in found[:NAMED])
+    more = " …" if len(found) > NAMED else ""
+    few = "1 image has residuals" if len(found) == 1 else f"{len(found)} images have residuals"
+    text = f"{where}{few} much larger than the others: {named}{more}. Patterns in the residuals were sought without"
+    it = "it" if len(found) == 1 else "them"
+    advice = f"Look at {it}: focus, movement, light, names of points; leave {it} out if nothing mends {it}."
+    return Finding("bad_images", f"{text} {it}.", advice, "warning")
 
 
 def _tests(seen: _Seen) -> Iterator[dict[str, Any]]:
@@ -279,7 +345,29 @@ def _by_image(seen: _Seen, name: str, images: np.ndarray, x: np.ndarray) -> dict
     u = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", contrasts, found.covariance, contrasts), 0.0))
     names = [seen.adjustment.network.images[i] for i in images]
     amplitude, values = _visible(seen, found, columns), contrasts @ found.values
-    return {"name": name, "amplitude_px": amplitude, "u_px": None, "p": found.p, "images": names, "values": values, "u": u}
+    record = {"name": name, "amplitude_px": amplitude, "u_px": None, "p": found.p, "images": names, "values": values, "u": u}
+    alone = int(np.argmax(np.abs(values) / np.maximum(u, 1e-300)))
+    return {**record, "alone": names[alone] if _alone(values, u, alone, found.dof) else None}
+
+
+def _alone(values: np.ndarray, u: np.ndarray, one: int, dof: float) -> bool:
+    """Whether the images other than one do not differ among themselves."""
+    from scipy import stats
+
+    rest = np.delete(np.arange(len(values)), one)
+    weight = 1 / np.maximum(u[rest], 1e-300) ** 2
+    off = values[rest] - weight @ values[rest] / weight.sum()
+    return bool(len(rest) > 1 and stats.f.sf(weight @ off**2 / (len(rest) - 1), len(rest) - 1, dof) > ALIKE)
+
+
+def _rejected(seen: _Seen, most: float) -> tuple[np.ndarray, np.ndarray]:
+    """By image of the network: weighted squares of rejected image points, no coordinate more than so much, squared, and their number."""
+    network = seen.adjustment.network
+    rows = ~seen.adjustment.used & np.isfinite(seen.adjustment.residual_px).all(axis=1)
+    rows &= network.camera_of[network.image] == seen.camera
+    white = np.einsum("nij,nj->ni", whitening(network.covariance_px2[rows]), seen.adjustment.residual_px[rows])
+    squares, count = np.minimum(white**2, most**2).sum(axis=1), np.full(rows.sum(), 2.0)
+    return tuple(np.bincount(network.image[rows], values, len(network.images)) for values in (squares, count))
 
 
 def _image_rms(seen: _Seen, images: np.ndarray) -> dict[str, Any]:
@@ -297,4 +385,15 @@ def _image_rms(seen: _Seen, images: np.ndarray) -> dict[str, Any]:
     correction = 1 + (np.sum(1 / dof) - 1 / dof.sum()) / (3 * (len(dof) - 1)) if len(dof) > 1 else 1.0
     px2 = seen.adjustment.network.covariance_px2[seen.terms.rows[seen.mine]][:, [0, 2]].mean()
     p = float(stats.chi2.sf(statistic / correction, len(dof) - 1)) if len(dof) > 1 else 1.0
-    return {"name": "image_rms", "amplitude_px": float(np.sqrt((total / dof).max() * px2)), "u_px": None, "p": p}
+    record = {"name": "image_rms", "amplitude_px": float(np.sqrt((total / dof).max() * px2)), "u_px": None, "p": p}
+    middle = float(np.median(np.sqrt(total / dof)))
+    total, dof = (part + more[images[good]] for part, more in zip((total, dof), _rejected(seen, WORST * middle), strict=True))
+    rms = np.sqrt(total / dof)
+    out = np.flatnonzero(rms > OUTSTANDING * middle)
+    rest = np.setdiff1d(np.arange(len(dof)), out)
+    out = out[stats.f.sf(rms[out] ** 2 / (total[rest].sum() / dof[rest].sum()), dof[out], dof[rest].sum()) < RARE / len(dof)]
+    if 0 < len(out) <= len(dof) / FEW_OF:
+        out = out[np.argsort(-rms[out])]
+        names = [seen.adjustment.network.images[i] for i in images[good][out]]
+        record |= {"images_out": names, "rms_px": (rms[out] * np.sqrt(px2)).tolist(), "times_median": (rms[out] / middle).tolist()}
+    return record

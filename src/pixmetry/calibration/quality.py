@@ -177,6 +177,11 @@ def residual_records(adjustment: Adjustment) -> dict[str, dict[str, Any]]:
     return out
 
 
+def p_words(p: float) -> str:
+    """A probability for a sentence: below a millionth only a bound, for no test is exact so far out."""
+    return "p < 1e-6" if p < 1e-6 else f"p = {p:.2g}"
+
+
 def f_test(variance_x: float, variance_y: float, dof_x: float, dof_y: float) -> tuple[float, float, float]:
     """One-sided F-test whether x is noisier than y.
 
@@ -231,11 +236,13 @@ def f_test_records(adjustment: Adjustment, dof: dict[str, tuple[float, float]] |
 
 
 def _f_text(record: dict[str, Any], critical: float) -> str:
-    text = f"variance of x over that of y: {record['ratio_px2']:.3f} in px² (p = {record['p_px']:.3g})"
+    text = f"variance of x over that of y: {record['ratio_px2']:.3f} in px² ({p_words(record['p_px'])})"
     if record["ratio_um2"] is not None:
-        text += f", {record['ratio_um2']:.3f} in µm² (p = {record['p_um']:.3g})"
+        text += f", {record['ratio_um2']:.3f} in µm² ({p_words(record['p_um'])})"
     dof = f"{record['dof_x']:.0f} and {record['dof_y']:.0f} degrees of freedom"
     verdict = "x is noisier than y" if record["p_px"] < SIGNIFICANT else "x is not significantly noisier than y"
+    if record["p_px"] > 1 - SIGNIFICANT:
+        verdict = "y is noisier than x"
     return f"{text}; one-sided, {dof}, critical at 95 %: {critical:.3f}; in px, {verdict}"
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from pixmetry.calibration.geometry import systematic_rest
 from pixmetry.calibration.known_residuals import bar_residuals, control_residuals, group_record
 from pixmetry.calibration.network import Adjustment, Network
 
@@ -27,7 +28,8 @@ def all_records(
         Whether the covariances of the adjustment are without sigma0².
     """
     from pixmetry.calibration import curves, quality
-    from pixmetry.calibration.patterns import residual_patterns
+    from pixmetry.calibration.bundle import adjust
+    from pixmetry.calibration.patterns import patterns_without_bad_images
     from pixmetry.calibration.snooping import gross_error_records
 
     return {
@@ -39,7 +41,7 @@ def all_records(
         "residuals": quality.residual_records(adjustment),
         "f_test": quality.f_test_records(adjustment),
         "gross_errors": gross_error_records(adjustment, alpha),
-        "patterns": residual_patterns(adjustment),
+        "patterns": patterns_without_bad_images(adjustment, adjust),
         "images": quality.image_records(adjustment),
         "curves": curves.distortion_curves(adjustment),
         "projection": curves.projection_maps(adjustment),
@@ -48,24 +50,16 @@ def all_records(
     }
 
 
-def variance_factors(network: Network, given: Network) -> dict[str, dict[str, float]]:
-    """By camera ``factor_x`` and ``factor_y``, by which the variances of the image coordinates given were multiplied."""
-    out = {}
-    for k, camera in enumerate(network.cameras):
-        rows = np.flatnonzero(network.camera_of[network.image] == k)[:1]
-        ratio = (network.covariance_px2[rows] / np.where(given.covariance_px2[rows] == 0, 1.0, given.covariance_px2[rows])).sum(axis=0)
-        out[camera.name] = {"factor_x": float(ratio[0]), "factor_y": float(ratio[2])}
-    return out
-
-
 def add_noise(residuals: dict[str, dict[str, Any]], adjustment: Adjustment, given: Network) -> None:
-    """Add ``noise_x_px``, ``noise_y_px``: rms of residuals by the covariance given alone, √(Σ r s² / n); None where it was a guess."""
+    """Add ``noise_x_px``, ``noise_y_px``: rms of residuals by the covariance given alone, √(Σ r s² / n), None where it was a guess;
+    and ``systematic_x_px``, ``systematic_y_px``: see `geometry.systematic_rest`."""
     for k, camera in enumerate(given.cameras):
         rows = adjustment.used & (given.camera_of[given.image] == k)
         noise: list[float | None] = [None, None]
         if given.covariance_known and rows.any():
             noise = np.sqrt(np.mean(adjustment.redundancy[rows] * given.covariance_px2[rows][:, [0, 2]], axis=0)).tolist()
-        residuals[camera.name] |= {"noise_x_px": noise[0], "noise_y_px": noise[1]}
+        rest = systematic_rest(adjustment, k)
+        residuals[camera.name] |= {"noise_x_px": noise[0], "noise_y_px": noise[1], "systematic_x_px": rest[0], "systematic_y_px": rest[1]}
 
 
 def network_record(adjustment: Adjustment, *, a_priori: bool = False) -> dict[str, Any]:

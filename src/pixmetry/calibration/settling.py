@@ -17,7 +17,8 @@ from pixmetry.core.errors import MeasureError
 Progress = Callable[[str], None]
 LOOPS = 12
 CLOSE_PX = 1e-4  # an eccentricity that moves by less has converged
-ALIKE = 1.3  # weights that change by less, x against y or camera against camera, need no new search for gross errors
+UNEQUAL = 2.0  # ratio of given variances from which on it matters what is added to them
+ALIKE = 1.3  # weights that change by less, one image coordinate against another, need no new search for gross errors
 
 
 @dataclass(frozen=True)
@@ -35,6 +36,8 @@ class Settled:
         Records of the variance components; empty if they were not estimated.
     gross_known : dict
         Bars and control points that were left out.
+    given_px2 : ndarray, shape (n, 3)
+        Covariances of the image coordinates before they were weighted.
     """
 
     measured: Network
@@ -42,6 +45,7 @@ class Settled:
     shift: Eccentricity
     components: dict[str, Any]
     gross_known: dict[str, Any]
+    given_px2: np.ndarray
 
 
 def adjust_with(options: Options) -> Callable[..., Adjustment]:
@@ -51,15 +55,29 @@ def adjust_with(options: Options) -> Callable[..., Adjustment]:
     return partial(adjust, max_iterations=options.max_iterations, a_priori=options.a_priori)
 
 
-def settle(measured: Network, state: State, options: Options, say: Progress, used: np.ndarray | None = None) -> Settled:
-    """Repeat the search for gross errors, the variance components and the eccentricity until none of them changes anything."""
+def settle(measured: Network, state: State, options: Options, say: Progress, before: Settled | None = None) -> Settled:
+    """Repeat the search for gross errors, the variance components and the eccentricity until none of them changes anything.
+
+    Parameters
+    ----------
+    measured : Network
+    state : State
+        Start values.
+    options : Options
+    say : callable
+    before : Settled, optional
+        The same image coordinates, settled already with other points: where to go on.
+    """
     from pixmetry.calibration.known_checks import set_free, wrong_fixed, wrong_fixed_records
 
-    loss: str = options.loss if used is None else "none"
+    loss: str = options.loss if before is None else "none"
+    given_px2 = measured.covariance_px2 if before is None else before.given_px2
     freed = np.zeros(0, int)
     components: dict[str, Any] = {}
-    used = np.ones(len(measured), bool) if used is None else used
+    used = np.ones(len(measured), bool) if before is None else before.adjustment.used
     shift = _shift(measured, state, options)
+    if before is None:
+        measured = _first_weights(measured, shift, state, options)
     measured, state, used, loss, gross_known = _checked_known(measured, shift, state, used, loss, options, say)
     for loop in range(1, LOOPS + 1):
         say(f"adjusting, round {loop}")
@@ -68,7 +86,7 @@ def settle(measured: Network, state: State, options: Options, say: Progress, use
         if len(wrong):
             measured, used, freed = set_free(measured, wrong), adjustment.used | np.isin(measured.point, wrong), np.append(freed, wrong)
             adjustment = _without_gross_errors(without_eccentricity(measured, shift), adjustment.state, used, "none", options)
-        adjustment, step, components = _weighted(adjustment, options, components)
+        adjustment, step, components = _weighted(adjustment, given_px2, options, components)
         measured = replace(measured, covariance_px2=adjustment.network.covariance_px2)
         again = _shift(measured, adjustment.state, options)
         moved = float(np.abs(again.shift_px - shift.shift_px).max(initial=0.0))
@@ -78,14 +96,37 @@ def settle(measured: Network, state: State, options: Options, say: Progress, use
             break
         shift = again
     gross_known = {**gross_known, "control_points": [*gross_known["control_points"], *wrong_fixed_records(adjustment, freed)]}
-    return Settled(measured, adjustment, shift, components, gross_known)
+    return Settled(measured, adjustment, shift, components, gross_known, given_px2)
+
+
+def _as_given(network: Network, options: Options) -> bool:
+    """Whether the covariances of the image coordinates stay as they came."""
+    return network.covariance_known and (options.a_priori or not options.variance_components)
+
+
+def _first_weights(measured: Network, shift: Eccentricity, state: State, options: Options) -> Network:
+    """The network with what its image coordinates scatter beyond covariances that differ from point to point, from the middle half of the
+    residuals: else the best of them would weigh so much that gross errors are taken for good, and good points for gross errors."""
+    from pixmetry.calibration.known_checks import loosened
+    from pixmetry.calibration.variance_components import robust_sizes, same_weights
+
+    variance = measured.covariance_px2[:, [0, 2]]
+    unequal = measured.covariance_known and (np.ptp(np.log(variance), axis=0) > np.log(UNEQUAL)).any()
+    if _as_given(measured, options) or not unequal:
+        return measured
+    alike = same_weights(loosened(without_eccentricity(measured, shift)))
+    try:
+        first = adjust_with(options)(alike, state, loss=options.loss, loss_scale=options.loss_scale, covariance=False)
+    except MeasureError:  # it hangs on bars or control points
+        return measured
+    return robust_sizes(first, measured.covariance_px2).of(measured, measured.covariance_px2)
 
 
 def _checked_known(
     measured: Network, shift: Eccentricity, state: State, used: np.ndarray, loss: str, options: Options, say: Progress
 ) -> tuple[Network, State, np.ndarray, str, dict[str, Any]]:
     """The network without bars and control points that it contradicts, and what its image points without them are worth."""
-    from pixmetry.calibration.known_checks import CheckedKnown, check_known, has_known, loosened
+    from pixmetry.calibration.known_checks import CheckedKnown, check_known, fixed_again, has_known, loosened, weighted_instead
 
     if not (options.snoop and has_known(measured)):
         return measured, state, used, loss, CheckedKnown(measured).gross
@@ -94,9 +135,10 @@ def _checked_known(
         clean = _without_gross_errors(without_eccentricity(loosened(measured), shift), state, used, loss, replace(options, a_priori=False))
     except MeasureError:  # the network hangs on them
         return measured, state, used, loss, CheckedKnown(measured).gross
-    checked, state = check_known(without_eccentricity(measured, shift), clean, adjust_with(replace(options, a_priori=False)))
-    measured = replace(measured, bars=checked.network.bars, u_xyz=checked.network.u_xyz)
-    if options.variance_components or not measured.covariance_known:
+    weighted = weighted_instead(measured, clean)
+    checked, state = check_known(without_eccentricity(weighted, shift), clean, adjust_with(replace(options, a_priori=False)))
+    measured = replace(measured, bars=checked.network.bars, u_xyz=fixed_again(checked.network, measured, weighted))
+    if not _as_given(measured, options):
         measured = replace(measured, covariance_px2=checked.network.covariance_px2)
     return measured, state, clean.used, "none", checked.gross
 
@@ -116,18 +158,20 @@ def _without_gross_errors(network: Network, state: State, used: np.ndarray, loss
     ).adjustment
 
 
-def _weighted(adjustment: Adjustment, options: Options, before: dict[str, Any]) -> tuple[Adjustment, np.ndarray, dict[str, Any]]:
+def _weighted(
+    adjustment: Adjustment, given_px2: np.ndarray, options: Options, before: dict[str, Any]
+) -> tuple[Adjustment, np.ndarray, dict[str, Any]]:
     """The adjustment with estimated weights, by how much they changed, and records, whose iterations go on from those before.
 
     If weights are not to be estimated, a guessed covariance still gets its size, for bars beside it.
     """
     from pixmetry.calibration.variance_components import estimate_components
 
-    one = np.ones((len(adjustment.network.cameras), 2))
-    if not options.variance_components and adjustment.network.covariance_known:
-        return adjustment, one, {}
-    found = estimate_components(adjustment, adjust_with(options), by_axis=options.variance_components)
+    if _as_given(adjustment.network, options):
+        return adjustment, np.ones(1), {}
+    found = estimate_components(adjustment, adjust_with(options), by_axis=options.variance_components, given_px2=given_px2)
     records = found.records() if options.variance_components else {}
     for name, record in records.items():
         record["iterations"] += before.get(name, {"iterations": 0})["iterations"]
-    return found.adjustment, found.factor, records
+    step = found.adjustment.network.covariance_px2[:, [0, 2]] / adjustment.network.covariance_px2[:, [0, 2]]
+    return found.adjustment, step, records

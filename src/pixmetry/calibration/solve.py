@@ -121,19 +121,20 @@ def _least_tilted(network: Network, state: State) -> str:
 
 def _checked_field(settled: Settled, options: Options, say: Progress) -> tuple[Settled, dict[str, Any], list[Finding]]:
     """Fixed points against free ones, with images left out of the fit; without fixed points to test, only images left out."""
-    from pixmetry.calibration.field_check import check_field
+    from pixmetry.calibration.field_check import LEAST_FIELD, check_field
 
     if options.folds == 0:
         return settled, {}, []
     say("leaving images out of the fit")
     fixed = (settled.measured.u_xyz == 0).all(axis=1).sum()
-    if options.field != "auto" or fixed < 4:
+    if options.field != "auto" or fixed < LEAST_FIELD:
         return settled, _held_out(settled, options), []
     check = check_field(settled.adjustment, options.folds)
     tests = {"field": check.field, **({"hold_out": check.hold_out} if check.hold_out else {})}
     if check.verdict == "free":
         say("adjusting with the points of the field free")
-        again = settle(_released(settled.measured), check.adjustment.state, options, say, check.adjustment.used)
+        before = replace(settled, adjustment=check.adjustment)
+        again = settle(_released(settled.measured), check.adjustment.state, options, say, before)
         gross = {kind: [*settled.gross_known[kind], *again.gross_known[kind]] for kind in again.gross_known}
         settled = replace(again, gross_known=gross)
     return settled, tests, list(check.findings)
@@ -154,15 +155,14 @@ def _is_free(network: Network) -> bool:
 
 
 def _records(settled: Settled, given: Network, options: Options) -> dict[str, Any]:
-    from pixmetry.calibration.records import add_noise, all_records, variance_factors
+    from pixmetry.calibration.records import add_noise, all_records
 
     tests = all_records(
         settled.adjustment, options.false_alarms / len(settled.measured), settled.gross_known, a_priori=options.a_priori
     )
     add_noise(tests["residuals"], settled.adjustment, given)
     if settled.components:
-        found = variance_factors(settled.measured, given)
-        tests["variance_components"] = {name: {**record, **found[name]} for name, record in settled.components.items()}
+        tests["variance_components"] = settled.components
     if settled.shift.corrected.any() or settled.shift.possible_px:
         tests["eccentricity"] = {
             "corrected": int(settled.shift.corrected.sum()),

@@ -17,7 +17,12 @@ Progress = Callable[[str, int, int], None]
 
 
 def located(
-    wanted: PicturesModel, files: Sequence[Path], camera: CameraModel, images: Table | None, progress: Progress | None
+    wanted: PicturesModel,
+    files: Sequence[Path],
+    camera: CameraModel,
+    images: Table | None,
+    progress: Progress | None,
+    check: Callable[[tuple[int, int]], None],
 ) -> tuple[CameraModel, Measured, Known, tuple[Finding, ...]]:
     """Locate the targets of a test field in pictures.
 
@@ -30,6 +35,8 @@ def located(
     images : Table, optional
         Time of each picture, by the name of its file.
     progress : callable, optional
+    check : callable
+        Called with (cols, rows) of the pictures; refuses what is not the size that was expected.
 
     Returns
     -------
@@ -44,8 +51,9 @@ def located(
     from pixmetry.calibration_images import observations_of
 
     found = observations_of(files, wanted.kind, **wanted.model_dump(exclude={"files", "kind"}), progress=progress)
+    check(found.sizes[0])
     camera_of, time_s = image_facts(images, found.images, [camera], lambda name: name)
-    network = found.network(_of_size(camera, *found.sizes[0]))
+    network = found.network(of_size(camera, *found.sizes[0]))
     seen = Measured(
         images=found.images,
         points=found.points,
@@ -56,7 +64,7 @@ def located(
     return network.cameras[0], seen, Known(network.xyz, network.u_xyz, network.diameter, network.normal), found.findings
 
 
-def _of_size(camera: CameraModel, cols: int, rows: int) -> CameraModel:
+def of_size(camera: CameraModel, cols: int, rows: int) -> CameraModel:
     """The camera with the size of its pictures; a principal point that was not given stays in the middle of the frame."""
     before, sensor = camera.sensor.centre, replace(camera.sensor, cols=cols, rows=rows)
     middle = {name: new for name, old, new in zip(("xp", "yp"), before, sensor.centre, strict=True) if camera[name] == old}

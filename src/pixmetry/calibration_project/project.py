@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pixmetry.calibration.model import NAMES, TEN, CameraModel, Sensor
+from pixmetry.calibration.model import CameraModel
 from pixmetry.calibration.network import Finding, Network
+from pixmetry.calibration_project.cameras import Described, described
 from pixmetry.calibration_project.coordinates import ImageCoordinates, Measured, measured
-from pixmetry.calibration_project.pictures import located
+from pixmetry.calibration_project.pictures import located, of_size
 from pixmetry.calibration_project.points import Known, known_points, scale_bars
 from pixmetry.calibration_project.reader import Reader
-from pixmetry.calibration_project.schema import PROJECT_SCHEMA, CameraEntry, ProjectModel
+from pixmetry.calibration_project.schema import PROJECT_SCHEMA, ProjectModel
+from pixmetry.calibration_project.straight_lines import LinePositions, lines_of_pictures, lines_of_table
 from pixmetry.calibration_project.tables import Table, first_few
+from pixmetry.core.camera import Camera
 from pixmetry.core.config import Settings, load_yaml, validate
-from pixmetry.core.errors import InputError
 
 Progress = Callable[[str, int, int], None]
 FIELD_OF = {"fixed": "fixed", "weighted": "fixed", "free": "free"}  # what `known` says; of nominal points images left out decide
@@ -34,12 +36,17 @@ class Project:
     source : Path or None
         None: pictures alone.
     network : Network
+        Without observations where it is about straight lines.
     options : dict
         What was given of `pixmetry.calibration.solve.Options`.
     inputs : tuple of Path
         All files that were read.
     findings : tuple of Finding
         What was noticed in the tables.
+    presets : dict
+        By the names of cameras that have one.
+    lines : LinePositions or None
+        Positions on straight lines, where there are no points.
     """
 
     name: str
@@ -48,6 +55,8 @@ class Project:
     options: dict[str, Any]
     inputs: tuple[Path, ...]
     findings: tuple[Finding, ...] = ()
+    presets: Mapping[str, Camera] = field(default_factory=dict)
+    lines: LinePositions | None = None
 
     @property
     def folder(self) -> Path:
@@ -99,13 +108,20 @@ def project_of_pictures(
 
 
 def _project(model: ProjectModel, reader: Reader, progress: Progress | None) -> Project:
-    cameras = tuple(_camera(entry, reader, k) for k, entry in enumerate(model.cameras))
+    told = tuple(described(entry, reader, k, model.straight) for k, entry in enumerate(model.cameras))
+    presets = {one.model.name: one.preset for one in told if one.preset is not None}
+    about: dict[str, Any] = {"name": model.name, "source": reader.source, "presets": presets}
+    if model.straight:
+        camera, lines, findings = _lines(model, reader, told[0], progress)
+        options = {name: value for name, value in model.options.model_dump().items() if value is not None}
+        network = _no_points(camera)
+        return Project(network=network, options=options, inputs=tuple(reader.files), findings=findings, lines=lines, **about)
+    cameras = tuple(one.model for one in told)
     images, points = reader.table("images", model.images), reader.table("points", model.points)
-    findings: tuple[Finding, ...] = ()
-    plate = None
+    plate, findings = None, ()
     if model.pictures is not None:
         files = reader.pictures(model.pictures.files)
-        camera, seen, plate, findings = located(model.pictures, files, cameras[0], images, progress)
+        camera, seen, plate, findings = located(model.pictures, files, cameras[0], images, progress, told[0].check)
         cameras = (camera,)
     else:
         table = reader.table("observations", model.observations)
@@ -116,7 +132,27 @@ def _project(model: ProjectModel, reader: Reader, progress: Progress | None) -> 
     known = _with_target(known, model)
     bars = scale_bars(reader.bars(model), seen.points, known)
     network = network_of(cameras, seen, known, bars=bars, per_image=model.per_image, scale_origin_px=model.scale_origin_px, unit=model.unit)
-    return Project(model.name, reader.source, network, _options(model), tuple(reader.files), (*findings, *_unseen(known, points)))
+    findings = (*findings, *_unseen(known, points))
+    return Project(network=network, options=_options(model), inputs=tuple(reader.files), findings=findings, **about)
+
+
+def _lines(
+    model: ProjectModel, reader: Reader, told: Described, progress: Progress | None
+) -> tuple[CameraModel, LinePositions, tuple[Finding, ...]]:
+    """Positions on straight lines, and the camera with the size of its frame."""
+    if model.pictures is not None:
+        lines, size, findings = lines_of_pictures(model.pictures, reader.pictures(model.pictures.files), progress)
+        told.check(size)
+        return of_size(told.model, *size), lines, findings
+    table = reader.table("lines", model.lines)
+    assert table is not None and model.lines is not None
+    given = ImageCoordinates(**model.image_coordinates.model_dump())
+    return told.model, lines_of_table(table, told.model, given, model.lines.u_px), ()
+
+
+def _no_points(camera: CameraModel) -> Network:
+    none, index = np.zeros(0), np.zeros(0, np.int64)
+    return Network((camera,), (), index, (), none, none, index, index, np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)))
 
 
 def _trust(model: ProjectModel) -> tuple[str | None, float | None]:
@@ -153,38 +189,6 @@ def _one_camera_or_many(settings: Settings) -> Settings:
             ("cameras", 0, *loc[1:]) if loc[0] == "cameras" and len(loc) > 1 else loc: line for loc, line in settings.lines.items()
         }
     return settings
-
-
-def _camera(entry: CameraEntry, reader: Reader, k: int) -> CameraModel:
-    """Start values of one camera; c is 0 where it is not known."""
-    cols, rows = entry.cols, entry.rows
-    pitch = (entry.pitch_x_um or entry.pitch_um, entry.pitch_y_um or entry.pitch_um)
-    if entry.camera is not None:
-        cols, rows, pitch = _grid_of(entry, reader, k, pitch)
-    sensor = Sensor(cols or 1, rows or 1, *pitch)  # the size of pictures is told by themselves
-    values = {name: getattr(entry, name) for name in NAMES[3:]}
-    values |= {name: value for name, value in (("xp", entry.xp_px), ("yp", entry.yp_px)) if value is not None}
-    c = entry.c_mm if entry.c_mm is not None else entry.c_px * sensor.per_px[0] if entry.c_px is not None else 0.0
-    return CameraModel.of(sensor, entry.direction, TEN if entry.free is None else entry.free, entry.name, c=c, **values)
-
-
-def _grid_of(
-    entry: CameraEntry, reader: Reader, k: int, pitch: tuple[float | None, float | None]
-) -> tuple[int, int, tuple[float | None, float | None]]:
-    """Size and pitch of a preset or a camera file; what the project says itself goes first."""
-    from pixmetry.core.camera import load_camera
-
-    name = str(entry.camera)
-    beside = reader.folder / name
-    try:
-        camera = load_camera(beside if beside.is_file() else name)
-    except InputError as problem:
-        where = problem.where if beside.is_file() else reader.where("cameras", k, "camera")
-        raise InputError(problem.what, where=where, value=problem.value or name, allowed=problem.allowed, remedy=problem.remedy) from None
-    if beside.is_file():
-        reader.files.append(beside)
-    rows, cols = camera.output_shape
-    return entry.cols or cols, entry.rows or rows, pitch if pitch[0] is not None else camera.pitch_um or (None, None)
 
 
 def _with_target(known: Known, model: ProjectModel) -> Known:

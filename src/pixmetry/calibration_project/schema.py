@@ -12,6 +12,8 @@ from pixmetry.core.errors import InputError
 PROJECT_SCHEMA = "pixmetry/calibration/1"
 PARAMETERS = ("c", "xp", "yp", "b1", "b2", "p1", "p2", "k1", "k2", "k3", "k4", "k5")
 
+LINE_OPTIONS = ("options.loss", "options.loss_scale", "options.snoop")  # those that mean something for straight lines
+
 Positive = Annotated[float, Field(gt=0)]
 Size = Annotated[int, Field(ge=1, le=1_000_000)]
 Pitch = Annotated[float, Field(gt=0, lt=1000)]  # µm
@@ -38,6 +40,7 @@ class CameraEntry(Model):
 
     name: Name = "camera"
     camera: str | None = None
+    start_from: str | None = None
     cols: Size | None = None
     rows: Size | None = None
     pitch_um: Pitch | None = None
@@ -68,11 +71,9 @@ class CameraEntry(Model):
             raise InputError(what, allowed=allowed, remedy="add the other, or use pitch_um")
         if self.c_mm is not None and self.c_px is not None:
             raise InputError("the principal distance is given twice", allowed="c_mm or c_px", remedy="delete one of them")
-        pitched = self.camera is not None or self.pitch_um is not None or self.pitch_x_um is not None
+        pitched = self.camera is not None or self.start_from is not None or self.pitch_um is not None or self.pitch_x_um is not None
         if self.c_mm is not None and not pitched:
             raise InputError("c_mm, but no pitch", allowed="c_mm with pitch_um, or c_px", remedy="add `pitch_um: ...`, or give c_px")
-        if self.c_mm is None and self.c_px is None and self.free is not None and "c" not in self.free:
-            raise InputError("c is to be held, but has no value", remedy="give c_mm or c_px, or add c to `free`")
         if (self.cols is None) != (self.rows is None):
             raise InputError("the size of the frame is incomplete", allowed="cols and rows", remedy="add the other")
         return self
@@ -98,11 +99,17 @@ class PointsModel(TableModel):
     u: Positive | None = None
 
 
+class LinesModel(TableModel):
+    """Positions on straight lines: image, line, x, y."""
+
+    u_px: Positive | None = None
+
+
 class PicturesModel(Model):
     """Images in which targets are located."""
 
     files: Annotated[tuple[str, ...], Field(min_length=1), BeforeValidator(_one)]
-    kind: Literal["chessboard", "dots", "coded", "squares"] = "chessboard"
+    kind: Literal["chessboard", "dots", "coded", "squares", "lines"] = "chessboard"
     grid: str | None = None
     pitch: Positive | tuple[Positive, Positive] | None = None
     side: Positive | None = None
@@ -110,6 +117,14 @@ class PicturesModel(Model):
     polarity: Literal["auto", "bright", "dark"] = "auto"
     channel: Literal["red", "green", "blue"] | None = None
     noise: str | None = None
+
+    @model_validator(mode="after")
+    def _plate(self) -> PicturesModel:
+        given = next((key for key in ("grid", "pitch", "side", "diameter") if getattr(self, key) is not None), None)
+        if self.kind == "lines" and given is not None:
+            what = f"`{given}` has no meaning with straight lines"
+            raise InputError(what, allowed="files, kind, polarity, channel, noise", remedy="delete it, or name another kind")
+        return self
 
 
 class ImageCoordinatesModel(Model):
@@ -168,6 +183,7 @@ class ProjectModel(Model):
     cameras: Annotated[tuple[CameraEntry, ...], Field(min_length=1)]
     observations: Annotated[ObservationsModel | None, BeforeValidator(_table)] = None
     pictures: PicturesModel | None = None
+    lines: Annotated[LinesModel | None, BeforeValidator(_table)] = None
     image_coordinates: ImageCoordinatesModel = ImageCoordinatesModel()
     images: Annotated[TableModel | None, BeforeValidator(_table)] = None
     points: Annotated[PointsModel | None, BeforeValidator(_table)] = None
@@ -185,18 +201,46 @@ class ProjectModel(Model):
             raise InputError("the project is empty", remedy=f"begin with `schema: {PROJECT_SCHEMA}`, then cameras and observations")
         return data
 
+    @property
+    def straight(self) -> bool:
+        """Whether it is about straight lines, not about points."""
+        return self.lines is not None or (self.pictures is not None and self.pictures.kind == "lines")
+
     @model_validator(mode="after")
     def _one_source(self) -> ProjectModel:
-        if (self.observations is None) == (self.pictures is None):
-            what = "no image coordinates" if self.pictures is None else "image coordinates from two sources"
-            remedy = "add one of them" if self.pictures is None else "delete one of them"
-            raise InputError(what, allowed="observations (a table) or pictures (images of targets)", remedy=remedy)
+        given = [source for source in (self.observations, self.pictures, self.lines) if source is not None]
+        if len(given) != 1:
+            what = "image coordinates from two sources" if given else "no image coordinates"
+            allowed = "observations (a table), lines (a table) or pictures (images of targets)"
+            raise InputError(what, allowed=allowed, remedy="delete one of them" if given else "add one of them")
         if self.pictures is not None and len(self.cameras) > 1:
             remedy = "write one project for each camera, or locate first and give a table of image coordinates"
             raise InputError("pictures of several cameras", allowed="pictures of one camera", remedy=remedy)
         names = [camera.name for camera in self.cameras]
         if len(set(names)) < len(names):
             raise InputError("two cameras of one name", value=", ".join(names), allowed="each name once", remedy="name them")
-        if self.observations is not None and any(c.cols is None and c.camera is None for c in self.cameras):
+        if self.pictures is None and any(c.cols is None and c.camera is None and c.start_from is None for c in self.cameras):
             raise InputError("the size of the frame is missing", where="cameras", allowed="cols and rows", remedy="add them to the camera")
+        return self
+
+    @model_validator(mode="after")
+    def _held(self) -> ProjectModel:
+        for camera in self.cameras:
+            told = camera.c_mm is not None or camera.c_px is not None or camera.start_from is not None
+            if not told and not self.straight and camera.free is not None and "c" not in camera.free:
+                raise InputError("c is to be held, but has no value", remedy="give c_mm or c_px, or add c to `free`")
+        return self
+
+    @model_validator(mode="after")
+    def _lines_alone(self) -> ProjectModel:
+        if not self.straight:
+            return self
+        if len(self.cameras) > 1:
+            raise InputError("straight lines of several cameras", allowed="one camera", remedy="write one project for each camera")
+        given = [*self.model_fields_set, *(f"options.{name}" for name in self.options.model_fields_set)]
+        allowed = ("schema_", "name", "cameras", "lines", "pictures", "image_coordinates", "options", *LINE_OPTIONS)
+        wrong = next((key for key in given if key not in allowed), None)
+        if wrong is not None:
+            what = f"`{wrong}` has no meaning with straight lines"
+            raise InputError(what, allowed="cameras, image_coordinates, options.loss, options.snoop", remedy="delete it")
         return self

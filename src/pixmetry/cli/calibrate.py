@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-KINDS = ("chessboard", "dots", "coded", "squares")
+KINDS = ("chessboard", "dots", "coded", "squares", "lines")
 OPTIONS = ("field", "loss", "folds", "residual_grid", "snoop", "a_priori")
 
 
@@ -24,6 +24,7 @@ OPTIONS = ("field", "loss", "folds", "residual_grid", "snoop", "a_priori")
 @click.option("--polarity", type=click.Choice(["auto", "bright", "dark"]), help="Of targets on their ground. Default: auto.")
 @click.option("--channel", type=click.Choice(["red", "green", "blue"]), help="Channel of colour images.")
 @click.option("--noise", metavar="WHAT", help="Noise model of the images, as of `pixmetry locate`. Default: from each image.")
+@click.option("--camera", metavar="PRESET|FILE", help="Of the images: brings size and pitch; results get its camera.yaml with the lens.")
 @click.option("--pixel-um", type=click.FloatRange(0, min_open=True), help="Pitch of the pixels; without it, lengths are in pixels.")
 @click.option("--c-mm", type=click.FloatRange(0, min_open=True), help="Start value of the principal distance.")
 @click.option(
@@ -39,30 +40,71 @@ OPTIONS = ("field", "loss", "folds", "residual_grid", "snoop", "a_priori")
 @click.option("--residual-grid", is_flag=True, default=None, help="Make a correction grid of what the parameters leave over.")
 @click.option("--no-snoop", "snoop", is_flag=True, flag_value=False, default=None, help="Do not look for gross errors.")
 @click.option("--a-priori", is_flag=True, default=None, help="Take the given uncertainties of image coordinates as true.")
+@click.option("--opencv", type=click.Path(path_type=Path), metavar="FILE", help="Also for OpenCV: .yaml, .xml or .json.")
+@click.option("--colmap", type=click.Path(path_type=Path), metavar="FILE", help="Also for COLMAP: cameras.txt.")
+@click.option(
+    "--may-lose-px", type=click.FloatRange(0), default=0.0, show_default=True, help="What these two may lose anywhere in the frame."
+)
 @click.option("--json", is_flag=True, help="Print the cameras for programs instead of a summary.")
 @click.option("--threads", type=click.IntRange(1), help="Default: all processors.")
-def calibrate(sources: tuple[Path, ...], output: Path, json: bool, threads: int | None, **given: Any) -> None:
+def calibrate(
+    sources: tuple[Path, ...],
+    output: Path,
+    opencv: Path | None,
+    colmap: Path | None,
+    may_lose_px: float,
+    json: bool,
+    threads: int | None,
+    **given: Any,
+) -> None:
     """Calibrate cameras, with the uncertainty of everything that is estimated.
 
     The argument is a project file (YAML), which names tables of image coordinates or images with targets; or images of a flat test field
-    themselves (files or folders). The folder of results gets report.html, calibration.json, points.csv, poses.csv and residuals.csv.
+    or of straight lines themselves (files or folders). The folder of results gets report.html, calibration.json, residuals.csv and, but
+    of lines, points.csv and poses.csv. What OpenCV or COLMAP have no place for is not dropped in silence: the results are written, the
+    export is refused.
     """
     from pixmetry.calibrating import calibrate as run
+    from pixmetry.calibration_exports import check_exports, write_exports
     from pixmetry.cli._progress import shown_progress
     from pixmetry.core.threads import set_threads
 
     set_threads(threads)
+    check_exports(opencv, colmap, output, sources)
     options = {name: given.pop(name) for name in OPTIONS}
     options = {name: value for name, value in options.items() if value is not None}
     with shown_progress() as progress:
         calibration = run(sources, output, options=options, progress=progress, **given)
     report = output / "report.html"
+    click.echo(_told(calibration, report, json))
+    if opencv is not None or colmap is not None:
+        for sentence in write_exports(_models(calibration), opencv, colmap, may_lose_px):
+            click.echo(sentence, err=json)
+
+
+def _told(calibration: Any, report: Path, json: bool) -> str:
+    """What is printed: a summary for people, or the cameras for programs."""
+    from pixmetry.line_calibration import LineCalibration
+
     if json:
         from pixmetry.calibration_record import cameras_text
 
-        click.echo(cameras_text(calibration, str(report)))
-        return
-    from pixmetry.report.calibration_text import summary_text
+        return cameras_text(calibration, str(report))
+    if isinstance(calibration, LineCalibration):
+        from pixmetry.report.lines_text import summary_text as lines_text
 
-    click.echo(summary_text(calibration).rstrip("\n"))
-    click.echo(f"report: {report}")
+        text = lines_text(calibration)
+    else:
+        from pixmetry.report.calibration_text import summary_text
+
+        text = summary_text(calibration)
+    return f"{text.rstrip()}\nreport: {report}"
+
+
+def _models(calibration: Any) -> list[Any]:
+    from pixmetry.line_calibration import LineCalibration
+
+    if isinstance(calibration, LineCalibration):
+        return [calibration.camera()]
+    adjusted = calibration.adjustment
+    return [adjusted.camera(k) for k in range(len(adjusted.network.cameras))]

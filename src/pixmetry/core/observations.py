@@ -196,7 +196,7 @@ class CameraGeometry:
         Root mean square over the frame of the uncertainty of a corrected place, from the covariance of the parameters, without what a
         rotation of the camera takes up.
     left_x_px, left_y_px : float
-        Systematic part of the calibration's residuals: what they are beyond the noise of its image coordinates.
+        Systematic part of the calibration's residuals: what they have in common at one place of the frame.
     dof : float
         Redundancy of the adjustment.
     origin : str

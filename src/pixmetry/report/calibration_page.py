@@ -93,7 +93,7 @@ def _content(calibration: Calibration) -> dict[str, Any]:
         "unit": net.unit,
         "datum": adjustment.datum,
         "notes": [n for n in adjustment.notes if not any(n.rstrip(".") in f.text for f in calibration.findings)],
-        **_provenance(calibration.provenance),
+        **provenance_rows(calibration.provenance),
     }
 
 
@@ -109,7 +109,7 @@ def _camera(calibration: Calibration, k: int) -> dict[str, Any]:
         "worth": worth(calibration, k),
         "verdict": [(axis, length_px(found[f"rms_{axis}_px"]), _um(found.get(f"rms_{axis}_um"))) for axis in "xy"] if found["n"] else [],
         "levels": levels and [length_px(v) for v in levels],
-        "facts": _camera_facts(model),
+        "facts": camera_facts(model),
         "direction": DIRECTIONS[model.direction],
         "parameters": parameters,
         "known": any(r["u"].startswith("±") for r in parameters),
@@ -132,7 +132,8 @@ def _full(name: str) -> str:
     return f"{owner}: {symbol(parameter)}" if owner else symbol(parameter)
 
 
-def _camera_facts(model: Any) -> str:
+def camera_facts(model: Any) -> str:
+    """Size and pitch of a camera's pixels in a sentence."""
     sensor = model.sensor
     if sensor.pitch_x_um is None:
         return f"{sensor.cols} × {sensor.rows} pixels, pixel pitch not given: lengths in the image are in px."
@@ -232,7 +233,8 @@ def _eccentricity(found: Mapping[str, Any] | None) -> str:
     )
 
 
-def _provenance(record: Mapping[str, Any]) -> dict[str, Any]:
+def provenance_rows(record: Mapping[str, Any]) -> dict[str, Any]:
+    """What both pages of calibrations tell about their origin."""
     libraries = ", ".join(f"{name} {version}" for name, version in (record.get("libraries") or {}).items())
     options = ", ".join(f"{key} = {value}" for key, value in (record.get("options") or {}).items())
     command = record.get("command") or ""

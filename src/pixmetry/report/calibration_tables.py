@@ -133,7 +133,7 @@ def gross_errors(records: Sequence[Mapping[str, Any]]) -> list[list[str]]:
 
 def patterns(records: Sequence[Mapping[str, Any]], several: bool) -> list[dict[str, Any]]:
     """Patterns that were looked for in the residuals, the surest first; with the camera where there are several."""
-    from pixmetry.calibration.patterns import MEANING
+    from pixmetry.calibration.patterns import MEANING, SOURCES
 
     rows = []
     for r in sorted(records, key=lambda r: 1.0 if r.get("p") is None else r["p"]):
@@ -141,7 +141,8 @@ def patterns(records: Sequence[Mapping[str, Any]], several: bool) -> list[dict[s
         title = f"{r['camera']}: {what}" if several and r.get("camera") else sentence(what).rstrip(".")
         found, u = bool(r.get("significant")), r.get("u_px")
         amplitude = px(r.get("amplitude_px")) + (f" ± {px(u)}" if u is not None else "")
-        advice = " ".join(part for part in (f"As by {source}." if found and source else "", sentence(r.get("advice") or "")) if part)
+        why = f"As from {SOURCES[source]} ({source})." if found and source else ""
+        advice = " ".join(part for part in (why, sentence(r.get("advice") or "")) if part)
         rows.append({"title": title, "amplitude": amplitude, "p": p_text(r.get("p")), "found": found, "advice": advice})
     return sorted(rows, key=lambda r: not r["found"])
 

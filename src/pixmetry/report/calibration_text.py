@@ -114,8 +114,13 @@ def worth(calibration: Calibration, camera: int) -> str:
 
 
 def sigma0_text(calibration: Calibration) -> str:
-    """What sigma0 says of the image coordinates."""
+    """By how much the image coordinates scatter, beside what was stated of them."""
     adjustment = calibration.adjustment
+    models = adjustment.network.cameras
+    parts = [(model.name, record_of(calibration, "variance_components", model.name)) for model in models]
+    found = [(f"{name}: " if len(models) > 1 else "", record) for name, record in parts if record and np.isfinite(record["sigma_x_px"])]
+    if found:
+        return " ".join(sentence(f"{name}{_scatter(record, known=adjustment.network.covariance_known)}") for name, record in found)
     value = significant(adjustment.sigma0, 3)
     if adjustment.network.covariance_known:
         return f"σ₀ = {value} with {adjustment.dof} degrees of freedom: 1 would mean that the image coordinates scatter as was stated."
@@ -123,6 +128,22 @@ def sigma0_text(calibration: Calibration) -> str:
         f"σ₀ = {value} with {adjustment.dof} degrees of freedom; no covariance of the image coordinates was given, so the scale of "
         "their weights comes from the residuals."
     )
+
+
+def _scatter(record: Mapping[str, Any], *, known: bool) -> str:
+    text = f"image coordinates scatter by {_with_u(record, 'x')} in x and {_with_u(record, 'y')} in y"
+    if record.get("common"):
+        text += " (estimated in common: the images do not agree on a difference)"
+    if not known:
+        return f"{text}, by their residuals: no covariance of the image coordinates was given"
+    if "given_x_px" not in record:
+        return text
+    return f"{text}; stated were {length_px(record['given_x_px'])}{NO_BREAK}px and {length_px(record['given_y_px'])}{NO_BREAK}px"
+
+
+def _with_u(record: Mapping[str, Any], axis: str) -> str:
+    number = uncertain(record[f"sigma_{axis}_px"], record[f"u_sigma_{axis}_px"], "px")
+    return f"{number.value}{NO_BREAK}px" if number.u == NONE else f"({number.value} ± {number.u}){NO_BREAK}px"
 
 
 def parameter_records(calibration: Calibration, camera: int) -> list[dict[str, Any]]:
@@ -163,10 +184,11 @@ def summary_text(calibration: Calibration) -> str:
         lines += ["", f"{mark}: {sentence(finding.text)}"]
         if finding.advice:
             lines.append(f"  To do: {finding.advice}")
-    return "\n".join(part for line in lines for part in _folded(line)).replace(NO_BREAK, " ").replace(THIN, " ")
+    return "\n".join(part for line in lines for part in folded(line)).replace(NO_BREAK, " ").replace(THIN, " ")
 
 
-def _folded(line: str) -> list[str]:
+def folded(line: str) -> list[str]:
+    """A line as lines of the terminal, indented like its beginning."""
     indent = " " * (len(line) - len(line.lstrip()) + 2)
     return textwrap.wrap(line, COLUMNS, subsequent_indent=indent, break_long_words=False) or [""]
 
