@@ -64,7 +64,8 @@ def assess(
     target, estimator : str
         As on the command line, e.g. ``"disc:diameter=7,blur=0.7,peak=0.6"`` and ``"soft_threshold:sigma=3,window=13"``.
     calibration : path or CameraGeometry, optional
-        A ``calibration.json`` of the camera, with which positions are corrected: its uncertainty and what it leaves over enter the budget.
+        Results of `pixmetry calibrate` for the camera (the folder, or its ``calibration.json``), with which positions are corrected: their
+        uncertainty and what is left over enter the budget. One in pixels takes the pitch from the campaign.
     trials : int
         Windows for each Monte Carlo of the budget.
     seed : int
@@ -86,12 +87,16 @@ def assess(
     what_target = parse_target(target) if target else Target()
     what_estimator = parse_estimator(estimator) if estimator else Estimator()
     frames = campaign if isinstance(campaign, Campaign) else load_campaign(campaign)
+    if isinstance(calibration, str | Path):
+        from pixmetry.calibration_record import calibration_file
+
+        calibration = calibration_file(calibration)
     geometry = None if calibration is None else _geometry_for(frames, calibration)
     told = progress or (lambda what, done, of: None)
     hashes, seen = observe_campaign(frames, told)
     seen = replace(seen, geometry=geometry)
-    if isinstance(calibration, str | Path):
-        hashes.add_file(Path(calibration))
+    if isinstance(calibration, Path):
+        hashes.add_file(calibration)
     standard = by_the_standard(frames, seen)
     estimates, unmeasured = measure_sources(seen)
     camera = digital_twin(frames, estimates, seen)
@@ -123,9 +128,10 @@ def _geometry_for(campaign: Campaign, calibration: str | Path | CameraGeometry) 
     """The calibrated geometry of a campaign's camera; refused where the pitches say that it is another camera's."""
     from pixmetry.calibrated import calibrated_geometry
 
-    geometry, facts = calibrated_geometry(calibration), campaign.camera
-    theirs = tuple(geometry.lens[n].value for n in ("pitch_x_um", "pitch_y_um"))
+    facts = campaign.camera
     ours = None if facts.pitch_x_um is None else (facts.pitch_x_um, facts.pitch_y_um or facts.pitch_x_um)
+    geometry = calibrated_geometry(calibration, pitch_um=ours)
+    theirs = tuple(geometry.lens[n].value for n in ("pitch_x_um", "pitch_y_um"))
     if ours is not None and not np.allclose(theirs, ours, rtol=1e-6):
         remedy = "give the calibration of this camera"
         raise InputError("a calibration with another pixel pitch", where=str(calibration), value=theirs, allowed=str(ours), remedy=remedy)

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from pixmetry.calibration.geometry import geometry_of
+from pixmetry.calibration.model import NAMES, CameraModel
 from pixmetry.calibration.network import Calibration
 from pixmetry.calibration_record import StoredCalibration, read_calibration
 from pixmetry.core.camera import Camera, Element
@@ -17,7 +18,9 @@ from pixmetry.core.observations import AFFINITY, LENS, TAKEN_UP, CameraGeometry,
 
 
 def calibrated_geometry(
-    calibration: str | Path | StoredCalibration | Calibration | CameraGeometry, camera: str | None = None
+    calibration: str | Path | StoredCalibration | Calibration | CameraGeometry,
+    camera: str | None = None,
+    pitch_um: tuple[float, float] | None = None,
 ) -> CameraGeometry:
     """What a calibration says of one camera, in the parameters of the error sources.
 
@@ -30,6 +33,8 @@ def calibrated_geometry(
         A ``calibration.json``, or what was read or calibrated.
     camera : str, optional
         Name of the camera; may be left out if there is one.
+    pitch_um : (float, float), optional
+        Of the pixels, for a calibration that was made in pixels.
 
     Returns
     -------
@@ -38,7 +43,7 @@ def calibrated_geometry(
     Raises
     ------
     InputError
-        If the calibration cannot be read, has no such camera, or was made without a pixel pitch.
+        If the calibration cannot be read, has no such camera, or there is no pixel pitch.
     """
     if isinstance(calibration, CameraGeometry):
         return calibration
@@ -56,11 +61,44 @@ def calibrated_geometry(
         raise InputError("which camera of the calibration is not clear", value=camera, allowed=", ".join(names))
     k = 0 if camera is None else names.index(camera)
     record, grid = calibration.tests["residuals"][names[k]], calibration.tests["projection"][names[k]]
+    if not record["n"]:
+        raise InputError("no image coordinate of this camera took part", where=names[k], remedy="calibrate it, or name another camera")
     left = float(record["systematic_x_px"]), float(record["systematic_y_px"])
     sensor = models[k].sensor
     origin = f"calibration of {names[k]}, {sensor.cols} × {sensor.rows} px"
     u = float(np.sqrt(np.nanmean(np.asarray(grid["u_px"], float) ** 2)))
-    return geometry_of(models[k], *covariances[k], dof=dof, u_px=(u, u), left_px=left, origin=origin)
+    model, (estimated, covariance) = models[k], covariances[k]
+    if sensor.pitch_x_um is None:
+        if pitch_um is None:
+            remedy = "calibrate with pitch_um, or say in the campaign what the pitch of its camera is"
+            raise InputError("a calibration in pixels, and the pixel pitch is not known", where=model.name, remedy=remedy)
+        model, covariance = with_pitch(model, estimated, covariance, pitch_um)
+    return geometry_of(model, estimated, covariance, dof=dof, u_px=(u, u), left_px=left, origin=origin)
+
+
+def with_pitch(
+    model: CameraModel, names: tuple[str, ...], covariance: np.ndarray, pitch_um: tuple[float, float]
+) -> tuple[CameraModel, np.ndarray]:
+    """A model in pixels and the covariance of some of its parameters with lengths in mm; the camera sees what it saw.
+
+    Raises
+    ------
+    InputError
+        If the pixels are not square: radial distortion in pixels then is none in mm.
+    """
+    x, y = pitch_um
+    if not np.isclose(x, y, rtol=1e-6):
+        what, remedy = "a calibration in pixels that are not square", "calibrate with pitch_x_um and pitch_y_um"
+        raise InputError(what, where=model.name, value=f"{x:g} × {y:g} µm", allowed="square pixels", remedy=remedy)
+    mm, power = x / 1000, np.zeros(len(NAMES))
+    power[0] = 1
+    if model.direction == "image_to_object":
+        power[NAMES.index("p1") : NAMES.index("p2") + 1] = -1
+        power[NAMES.index("k1") :] = -2 * np.arange(1, len(NAMES) - NAMES.index("k1") + 1)
+    factor = mm**power
+    own = factor[[NAMES.index(name) for name in names]]
+    changed = replace(model, sensor=replace(model.sensor, pitch_x_um=x, pitch_y_um=y), values=model.values * factor)
+    return changed, covariance * np.outer(own, own)
 
 
 def calibrated_camera(camera: Camera, geometry: CameraGeometry) -> Camera:

@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from pixmetry.calibration.control import control_of
 from pixmetry.calibration.model import NAMES, CameraModel, Sensor
 from pixmetry.calibration.network import Calibration, Finding
 from pixmetry.core.config import read_text
@@ -113,12 +114,27 @@ def _record(calibration: Calibration) -> dict[str, Any]:
             "xyz": state.xyz,
             "covariance": a.point_covariance.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]],  # XX, XY, XZ, YY, YZ, ZZ
         },
+        "control_points": _control_record(calibration),
         "covariance": {"columns": a.free_columns, **packed(a.covariance)},
         "findings": [asdict(finding) for finding in calibration.findings],
         "notes": a.notes,
         "tests": calibration.tests,
         "grids": calibration.grids,
         "provenance": calibration.provenance,
+    }
+
+
+def _control_record(calibration: Calibration) -> dict[str, Any]:
+    """Coordinates that were given with an uncertainty, given less adjusted, and that over the uncertainty."""
+    control = control_of(calibration.adjustment)
+    names = calibration.adjustment.network.points
+    return {
+        "point": [names[k] for k in control.point],
+        "axis": ["XYZ"[k] for k in control.axis],
+        "given": control.given,
+        "u": control.u,
+        "residual": control.residual,
+        "ratio": control.ratio,
     }
 
 
@@ -195,8 +211,13 @@ def stored_cameras(path: str | Path) -> tuple[CameraModel, ...]:
     return _read(path, (RESULT_SCHEMA, LINES_SCHEMA), lambda record: tuple(_camera(camera) for camera in record["cameras"]))
 
 
+def calibration_file(path: str | Path) -> Path:
+    """The file with the numbers, of a folder of results or named itself."""
+    return Path(path) / "calibration.json" if Path(path).is_dir() else Path(path)
+
+
 def _read(path: str | Path, schemas: tuple[str, ...], made: Callable[[Mapping[str, Any]], T]) -> T:
-    file = Path(path) / "calibration.json" if Path(path).is_dir() else Path(path)
+    file = calibration_file(path)
     text = read_text(file)
     try:
         record = json.loads(text)

@@ -437,9 +437,7 @@ def test_a_start_in_another_datum_is_moved_to_the_given_one(rng):
     simulated = simulate(rng, images=8, points=30, known="rough", bars=0)
     start, network = disturbed(rng, simulated), simulated.network
     turn = Rotation.from_rotvec(rng.uniform(-1, 1, 3)).as_matrix()
-    moved = replace(
-        start, xyz=3 * start.xyz @ turn.T + 100, position=3 * start.position @ turn.T + 100, rotation=start.rotation @ turn.T
-    )
+    moved = replace(start, xyz=3 * start.xyz @ turn.T + 100, position=3 * start.position @ turn.T + 100, rotation=start.rotation @ turn.T)
     here, there = adjust(network, start), adjust(network, moved)
     np.testing.assert_allclose(there.state.xyz, here.state.xyz, atol=1e-4)
     _stays_in_the_mean(there.state.xyz, network.xyz)

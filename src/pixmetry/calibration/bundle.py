@@ -170,15 +170,17 @@ def _iterate(
                 loss = replace(loss, unit=now.unit)  # weights by a scale that goes on moving need not settle
             last = _is_last(solved.gain, before, now.cost / dof, tolerance, ROUNDING * len(layout.x))
             after = _after(layout, datum, now, solved, loss, near)
-            if not last and now.cost - after.cost < STRAIGHT * solved.gain:
+            fall = _fall(layout, now, after)
+            if not last and fall < STRAIGHT * solved.gain:
                 other = _after(layout, datum, now, bent(layout, now, solved, _bend(layout, now, solved, loss)), loss, near)
-                after = other if _better(layout, now, other, last) and not other.cost > after.cost else after
-            if _better(layout, now, after, last):
+                if _fall(layout, now, other) > fall:
+                    after, fall = other, _fall(layout, now, other)
+            if fall >= -now.cost * (1e-6 if last else 1e-12) - ROUNDING:
                 costs.append(after.cost)
                 if last and placed and damping == 0.0:
                     return now, solved, after, costs
                 before = solved.gain if damping == 0.0 else 0.0
-                kept = (now.cost - after.cost) / solved.gain if solved.gain > 0 else 1.0
+                kept = fall / solved.gain if solved.gain > 0 else 1.0
                 damping *= max(0.1, 1 - (2 * min(kept, 1.0) - 1) ** 3)
                 now, placed = after, near
                 if last or damping < DAMPING_LEAST:
@@ -216,12 +218,12 @@ def _is_last(gain: float, before: float, variance: float, tolerance: float, roun
     return gain <= rounding or (gain <= SMALL * variance and following <= tolerance * variance)
 
 
-def _better(layout: Layout, now: Linearised, after: Linearised, small: bool) -> bool:
-    """Whether no image point was lost and the cost, with the weights as they were, did not rise beyond rounding."""
+def _fall(layout: Layout, now: Linearised, after: Linearised) -> float:
+    """By how much the cost fell, with the weights as they were; −inf if an image point was lost."""
     if (now.valid & ~after.valid).any():
-        return False
-    then = cost(layout, after.state, after.residual, now.weight)
-    return bool(then <= now.cost * (1 + (1e-6 if small else 1e-12)) + ROUNDING)
+        return -np.inf
+    fall = now.cost - cost(layout, after.state, after.residual, now.weight)
+    return fall if np.isfinite(fall) else -np.inf
 
 
 def _dof(layout: Layout, datum: Datum) -> int:

@@ -13,6 +13,7 @@ from pixmetry.calibration.network import State
 
 LOSSES = ("none", "huber", "cauchy")
 BLOCK_POINTS = 256
+MOST_BENT = 0.3  # size of a second-order term, relative to its step: beyond, the series says nothing
 DENSE_GAIN = 16.0  # a multiplication in a matrix product takes this share of the time of one that is gathered
 
 
@@ -204,7 +205,9 @@ def bent(layout: Layout, now: Linearised, solved: Solved, second: np.ndarray) ->
     kernels.gradients(second, now.jacobian, now.weight, *layout.incidence, layout.point_col, g, h)
     _reduce_right(layout, solved.Z, h, solved.root, g)
     step, points = _answer(layout, now, solved.factor, solved.scale, solved.root, g, h)
-    return replace(solved, step=solved.step + step / 2, points=solved.points + points / 2)
+    length, along = np.linalg.norm(step / solved.scale) / 2, np.linalg.norm(solved.step / solved.scale)
+    share = 0.5 if length < MOST_BENT * along else 0.0
+    return replace(solved, step=solved.step + share * step, points=solved.points + share * points)
 
 
 def _answer(

@@ -152,7 +152,7 @@ def _held_directions(layout: Layout, state: State, datum: Datum) -> np.ndarray:
     if len(layout.bars):
         rows.append(np.eye(7)[6:])
     held = np.concatenate(rows)
-    return held if len(held) <= 7 else np.linalg.qr(held, mode="r")
+    return held if len(held) <= 7 else np.asarray(np.linalg.qr(held, mode="r"))
 
 
 def _spread(points: np.ndarray) -> float:

@@ -359,4 +359,3 @@ def _not_oriented(network: Network, posed: np.ndarray) -> MeasureError:
         remedy = "take images that share at least 8 points with others, from sides that differ by 10° to 90°"
     what = f"{len(left)} of {len(posed)} images cannot be oriented"
     return MeasureError(what, where="start values", value=names, remedy=remedy)
-

@@ -121,6 +121,26 @@ def check_known(network: Network, clean: Adjustment, adjust: Adjust) -> tuple[Ch
     return checked, state
 
 
+def without_absurd_control(network: Network, state: State) -> tuple[Network, list[dict[str, Any]]]:
+    """The network without weighted control points that lie far from where most of the others put them, such as those with swapped names;
+    and their records."""
+    from pixmetry.calibration.resection import fitted
+
+    control = np.isfinite(network.u_xyz).all(axis=1) & (network.u_xyz > 0).any(axis=1)
+    rows = np.flatnonzero(control & np.isfinite(state.xyz).all(axis=1))
+    if len(rows) <= LEAST_CONTROL:
+        return network, []
+    away = fitted(state.xyz[rows], network.xyz[rows])[3]
+    limit = ABSURD * float(np.ptp(network.xyz[rows], axis=0).max())
+    bad = np.flatnonzero(away > limit)
+    if not len(bad) or len(rows) - len(bad) < LEAST_CONTROL:
+        return network, []
+    size = {"critical": limit, "left_out": True}
+    measured = [(network.points[rows[i]], float(away[i])) for i in bad]
+    records = [{"name": name, "residual": off, "error": off, "statistic": off, **size} for name, off in measured]
+    return set_free(network, rows[bad]), records
+
+
 def _without_absurd(checked: CheckedKnown, state: State) -> tuple[CheckedKnown, State]:
     """Leave out bars in other units than most, or between other points: no adjustment could start with them. Bring the rest to scale."""
     bars = checked.network.bars

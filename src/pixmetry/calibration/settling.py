@@ -126,21 +126,30 @@ def _checked_known(
     measured: Network, shift: Eccentricity, state: State, used: np.ndarray, loss: str, options: Options, say: Progress
 ) -> tuple[Network, State, np.ndarray, str, dict[str, Any]]:
     """The network without bars and control points that it contradicts, and what its image points without them are worth."""
-    from pixmetry.calibration.known_checks import CheckedKnown, check_known, fixed_again, has_known, loosened, weighted_instead
+    from pixmetry.calibration.known_checks import (
+        CheckedKnown,
+        check_known,
+        fixed_again,
+        has_known,
+        loosened,
+        weighted_instead,
+        without_absurd_control,
+    )
 
     if not (options.snoop and has_known(measured)):
         return measured, state, used, loss, CheckedKnown(measured).gross
+    measured, absurd = without_absurd_control(measured, state)
     say("testing scale bars and control points")
     try:
         clean = _without_gross_errors(without_eccentricity(loosened(measured), shift), state, used, loss, replace(options, a_priori=False))
     except MeasureError:  # the network hangs on them
-        return measured, state, used, loss, CheckedKnown(measured).gross
+        return measured, state, used, loss, {**CheckedKnown(measured).gross, "control_points": absurd}
     weighted = weighted_instead(measured, clean)
     checked, state = check_known(without_eccentricity(weighted, shift), clean, adjust_with(replace(options, a_priori=False)))
     measured = replace(measured, bars=checked.network.bars, u_xyz=fixed_again(checked.network, measured, weighted))
     if not _as_given(measured, options):
         measured = replace(measured, covariance_px2=checked.network.covariance_px2)
-    return measured, state, clean.used, "none", checked.gross
+    return measured, state, clean.used, "none", {**checked.gross, "control_points": [*absurd, *checked.gross["control_points"]]}
 
 
 def _shift(measured: Network, state: State, options: Options) -> Eccentricity:

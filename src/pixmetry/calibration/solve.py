@@ -71,6 +71,7 @@ def _as_asked(network: Network, options: Options) -> Network:
 def _started(network: Network, start: State | None, options: Options, say: Progress) -> tuple[Network, State]:
     """Start values; where they had to be found, improved with few interior parameters and none of the images' own."""
     from pixmetry.calibration.initial import start_values
+    from pixmetry.calibration.known_checks import without_absurd_control
 
     if start is not None:
         return network, start
@@ -79,7 +80,7 @@ def _started(network: Network, start: State | None, options: Options, say: Progr
     few = [replace(camera, free=camera.free & np.isin(NAMES, FEW)) for camera in network.cameras]
     loss = "huber" if options.loss == "none" and options.snoop else options.loss
     try:
-        part = replace(network, cameras=tuple(few), per_image=())
+        part = replace(without_absurd_control(network, state)[0], cameras=tuple(few), per_image=())
         return network, adjust_with(options)(part, state, loss=loss, loss_scale=options.loss_scale, covariance=False).state
     except MeasureError:
         return network, state  # the adjustment of all parameters says what is not determined

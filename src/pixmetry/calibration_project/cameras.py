@@ -16,6 +16,7 @@ from pixmetry.core.camera import Camera, load_camera
 from pixmetry.core.errors import InputError
 
 Pitch = tuple[float | None, float | None]
+MIRRORED = ("b2", "p2")  # with y the other way round they change their sign, in both directions of the distortion; yp is a place
 
 
 @dataclass(frozen=True)
@@ -55,8 +56,19 @@ class Described:
             raise InputError(what, where=where or self.where, value=f"{size[0]} x {size[1]} pixels", allowed=allowed, remedy=remedy)
 
 
-def described(entry: CameraEntry, reader: Reader, k: int, straight: bool = False) -> Described:
-    """Read what a project says of a camera; ``straight``: it is calibrated from straight lines.
+def described(entry: CameraEntry, reader: Reader, k: int, *, straight: bool = False, upwards: bool = False) -> Described:
+    """Read what a project says of a camera.
+
+    Parameters
+    ----------
+    entry : CameraEntry
+    reader : Reader
+    k : int
+        Its number in the project.
+    straight : bool
+        It is calibrated from straight lines.
+    upwards : bool
+        Its image coordinates have y up: so the signs of B2 and P2 are meant.
 
     Raises
     ------
@@ -79,7 +91,7 @@ def described(entry: CameraEntry, reader: Reader, k: int, straight: bool = False
         remedy = "add `pitch_um: ...`, or give c_px"
         raise InputError("c_mm, but no pitch", where=where, allowed="c_mm with pitch_um, or c_px", remedy=remedy)
     sensor = Sensor(cols or 1, rows or 1, *pitch)  # the size of pictures is told by themselves
-    out = Described(_model(entry, sensor, start, straight), preset, start, where)
+    out = Described(_model(entry, sensor, start, straight, upwards), preset, start, where)
     if cols is not None:
         out.check((sensor.cols, sensor.rows), what="the project says")
     if not straight and not out.model["c"] > 0 and not out.model.free[0]:
@@ -87,11 +99,12 @@ def described(entry: CameraEntry, reader: Reader, k: int, straight: bool = False
     return out
 
 
-def _model(entry: CameraEntry, sensor: Sensor, start: CameraModel | None, straight: bool) -> CameraModel:
+def _model(entry: CameraEntry, sensor: Sensor, start: CameraModel | None, straight: bool, upwards: bool) -> CameraModel:
     given = entry.model_fields_set
     direction = entry.direction if start is None or "direction" in given else None
     based = CameraModel.of(sensor, entry.direction) if start is None else on_sensor(start, sensor, direction)
     values = {name: getattr(entry, name) for name in NAMES[3:] if name in given}
+    values |= {name: -values[name] for name in MIRRORED if upwards and name in values}
     values |= {name: value for name, value in (("xp", entry.xp_px), ("yp", entry.yp_px)) if value is not None}
     c = entry.c_mm if entry.c_mm is not None else entry.c_px * sensor.per_px[0] if entry.c_px is not None else based["c"]
     all_values = dict(zip(NAMES, based.values.tolist(), strict=True)) | values | {"c": c}

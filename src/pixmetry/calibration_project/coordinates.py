@@ -16,6 +16,7 @@ UNITS = ("px", "mm", "um")
 UNCERTAINTIES = tuple(f"{kind}_{axis}" for kind in ("u", "var", "sigma") for axis in "xy") + ("cov_xy",)  # how such columns begin
 GUESS_PX = 0.05  # standard deviation of an image coordinate about which nothing is said; only the ratios of weights count then
 OUTSIDE = 0.01  # of the frame's sides: how far outside of it a target's centre may be
+MOST_OUTSIDE = 0.2  # of a camera's image coordinates: fewer are gross errors, more come from another frame, unit or origin
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,8 @@ def measured(
     Raises
     ------
     InputError
-        If a column is missing, a value cannot be used, a point is measured twice in an image, or a place is outside of the frame.
+        If a column is missing, a value cannot be used, a point is measured twice in an image, or more than a fifth of a camera's places
+        are outside of its frame.
     """
     table = table.spelled("image", "point", *(f"{axis}_{unit}" for axis in "xy" for unit in UNITS))
     unit = _unit(table, given)
@@ -74,13 +76,26 @@ def measured(
     camera_of, time_s = image_facts(images, image_names, cameras, lambda name: table.where(table.columns["image"].index(name)))
     camera = camera_of[image]
     x, y = table.numbers(f"x_{unit}"), table.numbers(f"y_{unit}")
-    sign = -1.0 if (given.y or ("down" if unit == "px" else "up")) == "up" else 1.0
+    sign = -1.0 if upwards(table, given) else 1.0
     per_px = np.array([_units_per_px(model, unit, table) for model in cameras])[camera]
     start = np.array([_origin(model, given.origin or ("first_pixel" if unit == "px" else "centre"), sign) for model in cameras])[camera]
     x_px, y_px = start[:, 0] + x / per_px[:, 0], start[:, 1] + sign * y / per_px[:, 1]
-    _refuse_outside(table, x_px, y_px, cameras, camera, given)
+    _refuse_outside(table, x_px, y_px, cameras, camera)
     covariance, known = _covariance(table, unit, per_px, sign, u_px)
     return Measured(image_names, point_names, camera_of, time_s, image, point, x_px, y_px, covariance, known)
+
+
+def upwards(table: Table, given: ImageCoordinates) -> bool:
+    """Whether y of a table runs upwards: as the project says, else as is usual in its unit.
+
+    Raises
+    ------
+    InputError
+        If the table has no image coordinates, or in several units.
+    """
+    if given.y is not None:
+        return given.y == "up"
+    return _unit(table.spelled(*(f"{axis}_{unit}" for axis in "xy" for unit in UNITS)), given) != "px"
 
 
 def _unit(table: Table, given: ImageCoordinates) -> str:
@@ -177,25 +192,28 @@ def _origin(model: CameraModel, origin: str, sign: float) -> tuple[float, float]
     if origin == "centre":
         return model.sensor.centre
     x, y = (0.0, 0.0 if sign > 0 else model.sensor.rows - 1.0)
-    return (x, y) if origin == "first_pixel" else (x - 0.5, y - 0.5 * sign)
+    first = {"first_pixel": 0.0, "corner": 0.5, "one": 1.0}[origin]  # what the centre of the first pixel is called
+    return x - first, y - first * sign
 
 
-def _refuse_outside(
-    table: Table, x_px: np.ndarray, y_px: np.ndarray, cameras: Sequence[CameraModel], camera: np.ndarray, given: ImageCoordinates
-) -> None:
+def _refuse_outside(table: Table, x_px: np.ndarray, y_px: np.ndarray, cameras: Sequence[CameraModel], camera: np.ndarray) -> None:
+    """Refuse coordinates that are not of these frames; a few are gross errors, which the adjustment looks for."""
     size = np.array([(model.sensor.cols, model.sensor.rows) for model in cameras], dtype=float)[camera]
     place = np.stack([x_px, y_px], axis=1) + 0.5
     outside = ((place < -OUTSIDE * size) | (place > (1 + OUTSIDE) * size)).any(axis=1)
-    if outside.any():
-        row = int(np.flatnonzero(outside)[0])
+    for k in range(len(cameras)):
+        bad = np.flatnonzero(outside & (camera == k))
+        if len(bad) <= MOST_OUTSIDE * np.sum(camera == k):
+            continue
+        row = int(bad[0])
         cols, rows = size[row].astype(int)
-        many = f", one of {int(outside.sum())}" if outside.sum() > 1 else ""
+        many = f", one of {len(bad)}" if len(bad) > 1 else ""
         raise InputError(
             f"outside of the frame of {cols} x {rows} pixels{many}",
             where=table.where(row),
             value=f"x {x_px[row]:.2f} px, y {y_px[row]:.2f} px from the centre of the top-left pixel",
             allowed=f"x up to {cols - 0.5}, y up to {rows - 0.5}",
-            remedy="check cols and rows of the camera, and unit, origin and y under image_coordinates",
+            remedy="check cols, rows and pitch of the camera, and unit, origin and y under image_coordinates",
         )
 
 

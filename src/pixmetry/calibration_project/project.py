@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from pixmetry.calibration.model import CameraModel
+from pixmetry.calibration.model import CameraModel, Sensor
 from pixmetry.calibration.network import Finding, Network
 from pixmetry.calibration_project.cameras import Described, described
-from pixmetry.calibration_project.coordinates import ImageCoordinates, Measured, measured
+from pixmetry.calibration_project.coordinates import ImageCoordinates, Measured, measured, upwards
 from pixmetry.calibration_project.pictures import located, of_size
 from pixmetry.calibration_project.points import Known, known_points, scale_bars
 from pixmetry.calibration_project.reader import Reader
@@ -108,11 +108,14 @@ def project_of_pictures(
 
 
 def _project(model: ProjectModel, reader: Reader, progress: Progress | None) -> Project:
-    told = tuple(described(entry, reader, k, model.straight) for k, entry in enumerate(model.cameras))
+    given = ImageCoordinates(**model.image_coordinates.model_dump())
+    table = reader.table("lines", model.lines) if model.straight else reader.table("observations", model.observations)
+    up = given.y == "up" if table is None else upwards(table, given)
+    told = tuple(described(entry, reader, k, straight=model.straight, upwards=up) for k, entry in enumerate(model.cameras))
     presets = {one.model.name: one.preset for one in told if one.preset is not None}
     about: dict[str, Any] = {"name": model.name, "source": reader.source, "presets": presets}
     if model.straight:
-        camera, lines, findings = _lines(model, reader, told[0], progress)
+        camera, lines, findings = _lines(model, reader, table, given, told[0], progress)
         options = {name: value for name, value in model.options.model_dump().items() if value is not None}
         network = _no_points(camera)
         return Project(network=network, options=options, inputs=tuple(reader.files), findings=findings, lines=lines, **about)
@@ -124,30 +127,37 @@ def _project(model: ProjectModel, reader: Reader, progress: Progress | None) -> 
         camera, seen, plate, findings = located(model.pictures, files, cameras[0], images, progress, told[0].check)
         cameras = (camera,)
     else:
-        table = reader.table("observations", model.observations)
         assert table is not None and model.observations is not None
-        given = ImageCoordinates(**model.image_coordinates.model_dump())
         seen = measured(table, images, cameras, given, model.observations.u_px)
     known = plate if points is None and plate is not None else known_points(points, seen.points, *_trust(model))
     known = _with_target(known, model)
     bars = scale_bars(reader.bars(model), seen.points, known)
     network = network_of(cameras, seen, known, bars=bars, per_image=model.per_image, scale_origin_px=model.scale_origin_px, unit=model.unit)
-    findings = (*findings, *_unseen(known, points))
+    findings = (*findings, *_unseen(known, points), *_without_images(network))
     return Project(network=network, options=_options(model), inputs=tuple(reader.files), findings=findings, **about)
 
 
 def _lines(
-    model: ProjectModel, reader: Reader, told: Described, progress: Progress | None
+    model: ProjectModel, reader: Reader, table: Table | None, given: ImageCoordinates, told: Described, progress: Progress | None
 ) -> tuple[CameraModel, LinePositions, tuple[Finding, ...]]:
     """Positions on straight lines, and the camera with the size of its frame."""
     if model.pictures is not None:
         lines, size, findings = lines_of_pictures(model.pictures, reader.pictures(model.pictures.files), progress)
         told.check(size)
         return of_size(told.model, *size), lines, findings
-    table = reader.table("lines", model.lines)
     assert table is not None and model.lines is not None
-    given = ImageCoordinates(**model.image_coordinates.model_dump())
-    return told.model, lines_of_table(table, told.model, given, model.lines.u_px), ()
+    lines = lines_of_table(table, told.model, given, model.lines.u_px)
+    return told.model, lines, _outside(lines, told.model.sensor)
+
+
+def _outside(lines: LinePositions, sensor: Sensor) -> tuple[Finding, ...]:
+    (x0, y0), half = sensor.centre, (sensor.cols / 2, sensor.rows / 2)
+    bad = np.flatnonzero((np.abs(lines.x_px - x0) > half[0]) | (np.abs(lines.y_px - y0) > half[1]))
+    if not len(bad):
+        return ()
+    first = f"({lines.x_px[bad[0]]:.1f}, {lines.y_px[bad[0]]:.1f}) of line {lines.line[bad[0]]} in {lines.image[bad[0]]}"
+    text = f"{len(bad)} of {len(lines)} positions lie outside of the frame of {sensor.cols} × {sensor.rows} px, such as {first}."
+    return (Finding("outside_frame", text, "Check the size of the frame and these positions.", "warning"),)
 
 
 def _no_points(camera: CameraModel) -> Network:
@@ -216,6 +226,13 @@ def _options(model: ProjectModel) -> dict[str, Any]:
     if model.target is not None:
         given["target"] = model.target.shape
     return given
+
+
+def _without_images(network: Network) -> tuple[Finding, ...]:
+    names = [camera.name for k, camera in enumerate(network.cameras) if not np.any(network.camera_of == k)]
+    text = "has no image: its values are those that were given."
+    advice = "Name it in the table of images, or delete it."
+    return tuple(Finding("camera_without_images", f"Camera '{name}' {text}", advice, "warning") for name in names)
 
 
 def _unseen(known: Known, points: Table | None) -> tuple[Finding, ...]:

@@ -131,7 +131,7 @@ class ImageCoordinatesModel(Model):
     """Unit and origin of the image coordinates of the table."""
 
     unit: Literal["px", "mm", "um"] | None = None
-    origin: Literal["first_pixel", "corner", "centre"] | None = None
+    origin: Literal["first_pixel", "corner", "centre", "one"] | None = None
     y: Literal["down", "up"] | None = None
 
 
@@ -196,9 +196,11 @@ class ProjectModel(Model):
 
     @model_validator(mode="before")
     @classmethod
-    def _not_empty(cls, data: Any) -> Any:
+    def _of_a_schema(cls, data: Any) -> Any:
         if not data:
             raise InputError("the project is empty", remedy=f"begin with `schema: {PROJECT_SCHEMA}`, then cameras and observations")
+        if "schema" not in data:
+            raise InputError("'schema' is missing", remedy=f"begin with `schema: {PROJECT_SCHEMA}`")
         return data
 
     @property

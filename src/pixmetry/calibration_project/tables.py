@@ -160,6 +160,8 @@ def read_table(path: Path, columns: Sequence[str] | Mapping[str, str] | None = N
         if len(row) != len(header):
             what = f"a row of {len(row)} values where the header names {len(header)}"
             remedy = "add what is missing, or put names that hold blanks or commas in quotes"
+            if any(_DECIMAL_COMMA.fullmatch(value) for value in dict(lines)[line].split()):
+                remedy = "write decimal points as points: commas part the columns"
             raise InputError(what, where=f"{source}, line {line}", allowed=", ".join(header), remedy=remedy)
     values = zip(*(row for _, row in rows), strict=True)
     return Table(source, {name: list(v) for name, v in zip(header, values, strict=True) if name != IGNORED}, [n for n, _ in rows])

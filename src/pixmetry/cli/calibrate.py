@@ -63,6 +63,8 @@ def calibrate(
     or of straight lines themselves (files or folders). The folder of results gets report.html, calibration.json, residuals.csv and, but
     of lines, points.csv and poses.csv. What OpenCV or COLMAP have no place for is not dropped in silence: the results are written, the
     export is refused.
+
+    Every key of a project file and every message: docs/calibrating.md.
     """
     from pixmetry.calibrating import calibrate as run
     from pixmetry.calibration_exports import check_exports, write_exports

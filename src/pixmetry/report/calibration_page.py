@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pixmetry import __version__
+from pixmetry.calibration.model import NAMES
 from pixmetry.report import calibration_tables as tables
+from pixmetry.report.calibration_control import control_points
 from pixmetry.report.calibration_text import (
     DIRECTIONS,
     projection_levels,
@@ -25,6 +27,7 @@ from pixmetry.report.calibration_text import (
 from pixmetry.report.numbers import NONE, fixed, length_px, significant
 
 if TYPE_CHECKING:
+    from pixmetry.calibration.model import CameraModel
     from pixmetry.calibration.network import Calibration
     from pixmetry.report.calibration_figures import Residuals
     from pixmetry.report.drawing import Picture
@@ -90,6 +93,7 @@ def _content(calibration: Calibration) -> dict[str, Any]:
         "undetermined": int(np.sum(~np.isfinite(adjustment.state.xyz).all(axis=1))),
         "all_fixed": bool(len(net.u_xyz) and np.all(net.u_xyz == 0)),
         "bars": tables.scale_bars(calibration),
+        "control": control_points(calibration),
         "unit": net.unit,
         "datum": adjustment.datum,
         "notes": [n for n in adjustment.notes if not any(n.rstrip(".") in f.text for f in calibration.findings)],
@@ -102,6 +106,8 @@ def _camera(calibration: Calibration, k: int) -> dict[str, Any]:
     model = calibration.adjustment.camera(k)
     found = residual_record(calibration, k)
     levels = projection_levels(record_of(calibration, "projection", model.name))
+    if levels is not None and not any(levels):
+        levels = None  # nothing was estimated of this camera
     test = record_of(calibration, "f_test", model.name) or {}
     parameters = tables.parameters(calibration, k)
     return {
@@ -152,11 +158,11 @@ def _pictures(calibration: Calibration, k: int) -> dict[str, Any]:
     r = over.Residuals.of(adjustment, k)
     out: dict[str, Any] = {"matrix": [], "lens": [], "sensor": [], "plots": [], "worst": [], "sheets": [], "undrawn": 0}
     correlations = record_of(calibration, "correlations", model.name)
-    if correlations is not None:
+    if correlations is not None and len(correlations["names"]) > 1:
         out["matrix"] = [plots.correlation_map(correlations["names"], correlations["matrix"], name)]
     curves, projection = record_of(calibration, "curves", model.name), record_of(calibration, "projection", model.name)
-    out["lens"] = plots.curve_pictures(curves, model.direction, name) if curves is not None else []
-    if projection is not None:
+    out["lens"] = plots.curve_pictures(_bent(curves, model), model.direction, name) if curves is not None else []
+    if projection is not None and np.nanmax(np.asarray(projection["u_px"], float), initial=0.0) > 0:
         out["lens"].append(plots.projection_map(projection, model.sensor, name))
     if len(r):
         out["sensor"] = [over.residual_vectors(r, name), over.mean_vectors(r, name)]
@@ -170,6 +176,15 @@ def _pictures(calibration: Calibration, k: int) -> dict[str, Any]:
         out["plots"].append(plots.by_image(records, name))
     out["sensor"] = [p for p in out["sensor"] if p is not None]
     return out | {"thinned": bool(len(r)) and int(np.bincount(r.image).max()) > over.MOST_IN_SMALL}
+
+
+def _bent(curves: Mapping[str, Any], model: CameraModel) -> dict[str, Any]:
+    """Curves without those of terms that are 0 and were not estimated."""
+    held = {name for name, free, value in zip(NAMES, model.free, model.values, strict=True) if not free and not value}
+    straight = {"tangential"} if {"p1", "p2"} <= held else set()
+    if {name for name in NAMES if name[0] == "k"} <= held:
+        straight |= {"radial", "balanced"}
+    return {key: None if key in straight else value for key, value in curves.items()}
 
 
 def _sheets(calibration: Calibration, r: Residuals, name: str) -> dict[str, Any]:
