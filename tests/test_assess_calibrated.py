@@ -11,7 +11,7 @@ from click.testing import CliRunner
 
 from calibration.networks import simulate
 from pixmetry import assess, load_camera
-from pixmetry.calibrated import calibrated_geometry
+from pixmetry.calibrated import calibrated_geometry, with_pitch
 from pixmetry.calibration.geometry import geometry_of
 from pixmetry.calibration.model import CameraModel, Sensor
 from pixmetry.calibration.solve import Options, calibrate_network
@@ -31,7 +31,7 @@ def test_a_file_of_a_calibration_enters_twin_report_and_budget(tmp_path: Path) -
     calibration = calibrate_network(simulated.network, Options(folds=0))
     write_results(calibration, tmp_path / "calibration")
     file = tmp_path / "calibration" / "calibration.json"
-    ran = CliRunner().invoke(main, ["assess", "-o", str(tmp_path / "out"), "--trials", "200", "--calibration", str(file)])
+    ran = CliRunner().invoke(main, ["assess", "-o", str(tmp_path / "out"), "--trials", "200", "--calibration", str(file.parent)])
     assert ran.exit_code == 0, ran.output
     assert "calibrated" in ran.output and "Lens distortion" in ran.output
     twin = load_camera(tmp_path / "out" / "camera.yaml")
@@ -60,3 +60,43 @@ def test_the_calibration_of_another_camera_is_refused(tmp_path: Path) -> None:
     (tmp_path / "calibration.json").write_text("{}")
     ran = CliRunner().invoke(main, ["assess", "--calibration", str(tmp_path / "calibration.json"), "-o", str(tmp_path / "out")])
     assert ran.exit_code == 2 and ran.output.count("\n") == 1 and not (tmp_path / "out").exists()
+
+
+def test_another_folder_is_no_calibration(tmp_path: Path) -> None:
+    ran = CliRunner().invoke(main, ["assess", "--calibration", str(tmp_path), "-o", str(tmp_path / "out")])
+    assert ran.exit_code == 2 and ran.output.count("\n") == 1 and "calibration.json" in ran.output and not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("direction", ["image_to_object", "object_to_image"])
+def test_a_calibration_in_pixels_takes_a_pitch_and_sees_the_same(direction: str) -> None:
+    lens = {"p1": 1e-6, "p2": -2e-6, "k1": -1e-8, "k2": 2e-14, "k3": 1e-20, "k4": 1e-26, "k5": -1e-32}
+    if direction == "object_to_image":
+        lens = {name: value * 800.0 ** (1 if name[0] == "p" else 2 * int(name[1])) for name, value in lens.items()}
+    names = ("c", "xp", "yp", "b1", "b2", *lens)
+    model = CameraModel.of(Sensor(780, 582), direction, names, c=800.0, xp=380.0, yp=300.0, b1=1e-3, b2=-2e-3, **lens)
+    rng = np.random.default_rng()
+    root = rng.normal(0, 1, (12, 12)) * np.where(model.values, 1e-3 * np.abs(model.values), 1)[:, None]
+    covariance = root @ root.T
+    changed, scaled = with_pitch(model, names, covariance, PITCH)
+    assert changed.sensor.pitch_x_um == PITCH[0] and changed["c"] == pytest.approx(800 * 0.0083)
+    u, v = rng.uniform(-0.4, 0.4, 20), rng.uniform(-0.3, 0.3, 20)
+    (x, y, _, before), (x_mm, y_mm, _, after) = model.projected(u, v), changed.projected(u, v)
+    np.testing.assert_allclose((x_mm, y_mm), (x, y), atol=1e-8)
+    spread, same = (np.einsum("nij,jk,nik->ni", j, c, j) for j, c in ((before, covariance), (after, scaled)))
+    np.testing.assert_allclose(same, spread, rtol=1e-7)
+
+
+def test_a_pitch_of_the_campaign_stands_in_where_the_calibration_has_none() -> None:
+    simulated = simulate(np.random.default_rng(6), images=12, points=60, sensor=Sensor(780, 582, *PITCH))
+    net = simulated.network
+    (camera,) = net.cameras
+    in_px = replace(net, cameras=(CameraModel.of(Sensor(780, 582), camera.direction, c=camera["c"] / 0.0083),))
+    calibration = calibrate_network(in_px, Options(folds=0))
+    found = calibrated_geometry(calibration, pitch_um=PITCH)
+    expected = calibrated_geometry(calibrate_network(net, Options(folds=0)))
+    np.testing.assert_allclose(found.lens.values, expected.lens.values, rtol=1e-3, atol=1e-6)
+    np.testing.assert_allclose(found.u_x_px, expected.u_x_px, rtol=1e-2)
+    with pytest.raises(InputError, match="pixel pitch is not known.*campaign"):
+        calibrated_geometry(calibration)
+    with pytest.raises(InputError, match="not square"):
+        calibrated_geometry(calibration, pitch_um=(8.6, 8.3))

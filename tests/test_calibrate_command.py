@@ -19,6 +19,7 @@ from scipy.stats import chi2
 
 import pixmetry
 from calibration.networks import Simulated, simulate
+from pixmetry.calibrated import calibrated_geometry
 from pixmetry.calibration.model import NAMES
 from pixmetry.calibration.network import Calibration, Network
 from pixmetry.calibration_files import TEXTS, write_results
@@ -310,6 +311,87 @@ def test_one_image_is_not_a_network(tmp_path: Path, simulated: Simulated) -> Non
 
 
 # --- the page of documentation ----------------------------------------------------------------------------------------------------
+
+
+def test_one_blunder_outside_of_the_frame_is_a_gross_error(simulated: Simulated, tmp_path: Path) -> None:
+    net = simulated.network
+    x = net.x_px.copy()
+    x[7] = net.cameras[0].sensor.cols + 60
+    result = run(project(tmp_path, replace(net, x_px=x)), "-o", tmp_path / "r")
+    assert result.exit_code == 0, result.output
+    record = json.loads((tmp_path / "r" / "calibration.json").read_text())
+    gross = {(r["image"], r["point"]) for r in record["tests"]["gross_errors"]}
+    assert (net.images[net.image[7]], net.points[net.point[7]]) in gross
+    assert "outside_frame" in {f["kind"] for f in record["findings"]}
+
+
+def words_of(report: Path) -> str:
+    text = re.sub(r"<(style|svg)\b.*?</\1>", " ", report.read_text(), flags=re.S)
+    return " ".join(re.sub(r"<[^>]*>", " ", text).split())
+
+
+@pytest.mark.filterwarnings("error::UserWarning")
+def test_a_camera_of_which_nothing_is_estimated(simulated: Simulated, tmp_path: Path) -> None:
+    keys = dict(zip(NAMES[3:10], simulated.truth.interior[0][3:10], strict=True))
+    c, xp, yp = simulated.truth.interior[0][:3]
+    held = f"c_mm: {c}, xp_px: {xp}, yp_px: {yp}, free: none, " + ", ".join(f"{name}: {value!r}" for name, value in keys.items())
+    path = project(tmp_path, simulated.network)
+    path.write_text(path.read_text().replace("c_mm: 8", held.replace("np.float64(", "").replace(")", "")))
+    result = run(path, "-o", tmp_path / "r")
+    assert result.exit_code == 0, result.output
+    record = json.loads((tmp_path / "r" / "calibration.json").read_text())
+    (camera,) = record["cameras"]
+    assert all(p["u"] == 0 and not p["free"] for p in camera["parameters"]) and camera["covariance"]["names"] == []
+    assert np.allclose([p["value"] for p in camera["parameters"]], simulated.truth.interior[0], rtol=1e-9)
+    page = words_of(tmp_path / "r" / "report.html")
+    assert page.count("held fixed") == len(keys) + 3 and "in the corners" not in page and "Correlations" not in page
+
+
+@pytest.mark.filterwarnings("error::UserWarning")
+def test_a_camera_that_no_image_names(simulated: Simulated, tmp_path: Path) -> None:
+    path = project(tmp_path, simulated.network)
+    two = re.sub(r"cameras: \{(.*)\}", r"cameras: [{name: A, \1}, {name: B, \1}]\nimages: images.csv", path.read_text())
+    path.write_text(two)
+    table(tmp_path / "images.csv", "image,camera", simulated.network.images, ["A"] * len(simulated.network.images))
+    result = run(path, "-o", tmp_path / "r")
+    assert result.exit_code == 0 and "Camera 'B' has no image" in result.output
+    record = json.loads((tmp_path / "r" / "calibration.json").read_text())
+    assert record["cameras"][1]["covariance"]["names"] == []
+    page = words_of(tmp_path / "r" / "report.html")
+    assert "No image coordinate of this camera took part" in page
+    with pytest.raises(InputError, match="took part"):
+        calibrated_geometry(tmp_path / "r", "B")
+    assert calibrated_geometry(tmp_path / "r", "A").u_x_px > 0
+
+
+def test_control_points_are_listed_given_less_adjusted(simulated: Simulated, tmp_path: Path) -> None:
+    rng = np.random.default_rng(8)  # what is tested does not depend on the draw
+    truth, names = simulated.truth.xyz, simulated.network.points
+    given = truth[:12] + rng.normal(0, 0.02, (12, 3))  # better than is stated: no other one is left out
+    given[3, 0] += 5.0
+    table(tmp_path / "control.csv", "point,X,Y,Z,u_X,u_Y,u_Z", names[:12], *given.T, *np.full((3, 12), 0.05))
+    path = project(tmp_path, simulated.network, "points: control.csv\n")
+    result = run(path, "-o", tmp_path / "r")
+    assert result.exit_code == 0, result.output
+    record = json.loads((tmp_path / "r" / "calibration.json").read_text())
+    found = {name: xyz for name, xyz in zip(record["points"]["name"], record["points"]["xyz"], strict=True)}
+    control = record["control_points"]
+    assert names[3] not in control["point"] and len(control["point"]) == 33 and set(control["u"]) == {0.05}
+    for k, (name, axis) in enumerate(zip(control["point"], control["axis"], strict=True)):
+        expected = given[names.index(name), "XYZ".index(axis)] - found[name]["XYZ".index(axis)]
+        assert control["residual"][k] == pytest.approx(expected, abs=1e-9)
+        assert control["ratio"][k] == pytest.approx(expected / 0.05, abs=1e-7)
+    page = words_of(tmp_path / "r" / "report.html")
+    assert "Control points" in page and f"{names[0]} X" in page and re.search(rf"{names[3]}( X)? \(left out\)", page)
+
+
+def test_colour_images_of_a_project_are_told_which_key_is_meant(tmp_path: Path) -> None:
+    import cv2
+
+    cv2.imwrite(str(tmp_path / "a.png"), np.random.default_rng().integers(0, 255, (60, 80, 3), np.uint8))
+    path = tmp_path / "p.yaml"
+    path.write_text("schema: pixmetry/calibration/1\ncameras: {}\npictures: {files: a.png, grid: 5x4, pitch: 1}\n")
+    refused(run(path, "-o", tmp_path / "r"), "`channel: green` under `pictures`")
 
 
 def test_the_projects_of_the_page_are_valid(tmp_path: Path) -> None:

@@ -156,6 +156,7 @@ def test_another_size_than_the_presets_is_refused(tmp_path: Path) -> None:
     (tmp_path / "p.yaml").write_text(
         f"schema: pixmetry/calibration/1\ncameras: {{camera: {PRESET}, cols: 640, rows: 480}}\nobservations: o.csv\n"
     )
+    (tmp_path / "o.csv").write_text("image,point,x_px,y_px\na,1,2,3\n")
     refused(run(tmp_path / "p.yaml", "-o", tmp_path / "r"), "640 x 480", "782 x 582", "line 2")
     wires = with_wires(tmp_path / "wires.npy", generator(), (400, 300))
     refused(run(wires, "--kind", "lines", "--camera", PRESET, "-o", tmp_path / "r"), "400 x 300", "782 x 582")
@@ -461,12 +462,23 @@ def test_what_has_no_meaning_with_lines_is_told(tmp_path: Path, more: str, argum
     assert not (tmp_path / "r").exists()
 
 
+def test_a_stray_position_outside_of_the_frame_is_told_and_rejected(tmp_path: Path) -> None:
+    positions = lines(generator())
+    positions["x_px"][7] = 5000
+    assert run(line_project(tmp_path, positions), "-o", tmp_path / "r").exit_code == 0
+    record = json.loads((tmp_path / "r" / "calibration.json").read_text())
+    (told,) = [f["text"] for f in record["findings"] if f["kind"] == "outside_frame"]
+    assert told.startswith("1 of") and "(5000.0," in told
+    rows = [line for line in (tmp_path / "r" / "residuals.csv").read_text().splitlines() if not line.startswith("#")]
+    assert rows[8].split(",")[rows[0].split(",").index("used")] == "0"
+
+
 def test_mistakes_in_tables_and_pictures_of_lines_are_told(tmp_path: Path) -> None:
     positions = lines(generator(), n=5, count=3)
     path = line_project(tmp_path, positions, header="image,wire,x_px,y_px")
     refused(run(path, "-o", tmp_path / "r"), "lines.csv", "'line' is missing")
-    positions["x_px"][7] = 5000
-    refused(run(line_project(tmp_path, positions), "-o", tmp_path / "r"), "lines.csv, line 9", "outside of the frame")
+    positions["x_px"][::3] = 5000
+    refused(run(line_project(tmp_path, positions), "-o", tmp_path / "r"), "lines.csv, line 2", "outside of the frame")
     np.save(tmp_path / "dark.npy", np.random.default_rng().integers(90, 110, (120, 160)).astype(np.uint8))
     dark = (tmp_path / "dark.npy", "--kind", "lines", "-o", tmp_path / "r")
     refused(run(*dark), "no line is found")

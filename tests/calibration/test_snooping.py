@@ -52,6 +52,22 @@ def test_stat_good_points_are_alarms_as_often_as_stated(rng):
     assert abs(alarms - alpha * total) < Z * np.sqrt(1.1 * alpha * (1 - alpha) * total)
 
 
+def unlisted(records, adjustment) -> np.ndarray:
+    """Points whose rays are out without a record, one entry a ray."""
+    network = adjustment.network
+    assert all(np.isfinite([v for v in r.values() if isinstance(v, float)]).all() and r["statistic"] > r["critical"] for r in records)
+    listed = {(r["image"], r["point"]) for r in records}
+    names = [(network.images[i], network.points[k]) for i, k in zip(network.image, network.point, strict=True)]
+    assert not any(name in listed and used for name, used in zip(names, adjustment.used, strict=True))
+    return np.array([k for k, name, used in zip(network.point, names, adjustment.used, strict=True) if not used and name not in listed], int)
+
+
+def assert_every_ray_left_out_is_listed(records, adjustment) -> None:
+    """But for the last one of a point that has lost the others: nothing speaks against it."""
+    points = unlisted(records, adjustment)
+    assert len(set(points.tolist())) == len(points) and np.isnan(adjustment.state.xyz[points]).all()
+
+
 @pytest.mark.parametrize("gross_px", [5.0, 20.0, 500.0])
 @pytest.mark.parametrize("kind", [{}, {"known": "fixed", "field": "plane"}, {"images": 30, "points": 120, "visibility": 0.3}])
 def test_recovers_gross_errors_and_their_sizes(rng, gross_px, kind):
@@ -65,7 +81,9 @@ def test_recovers_gross_errors_and_their_sizes(rng, gross_px, kind):
     hit = rng.choice(n, n // 100, replace=False)
     planted[hit] = gross_px * np.column_stack([np.cos(angle), np.sin(angle)])[hit]
     network = replace(simulated.network, x_px=simulated.network.x_px + planted[:, 0], y_px=simulated.network.y_px + planted[:, 1])
-    adjustment = remove_gross_errors(network, disturbed(rng, simulated, 0.005), adjust, false_alarms=0.01).adjustment
+    snooped = remove_gross_errors(network, disturbed(rng, simulated, 0.005), adjust, false_alarms=0.01)
+    adjustment = snooped.adjustment
+    assert_every_ray_left_out_is_listed(gross_error_records(adjustment, snooped.alpha, snooped.rejected), adjustment)
     statistic, error = statistics(adjustment)
     determined = np.isfinite(statistic)  # a point on one ray is not
     out, gross = ~adjustment.used & determined, planted.any(axis=1)
@@ -78,6 +96,41 @@ def test_recovers_gross_errors_and_their_sizes(rng, gross_px, kind):
     spread = adjustment.residual_covariance_px2[found][:, [0, 1, 1, 2]].reshape(-1, 2, 2)
     distance = np.einsum("ni,nij,nj->", off, np.linalg.inv(spread), off)
     assert 0.9 * stats.chi2.isf(1 - RATE / 2, 2 * len(found)) < distance < 1.1 * stats.chi2.isf(RATE / 2, 2 * len(found))
+
+
+def test_rays_of_points_that_nothing_is_left_of_are_listed(rng):
+    """Points of two rays, one of them 50 px off along no epipolar line in particular: at least one of 20 such pairs is seen."""
+    simulated = simulate(rng, images=14, points=60)
+    network = simulated.network
+    two = np.concatenate([rng.permutation(np.flatnonzero(network.point == k))[:2] for k in range(20)])
+    kept = np.sort(np.append(two, np.flatnonzero(network.point >= 20)))
+    x, y = network.x_px.copy(), network.y_px.copy()
+    x[two[::2]] += 50.0
+    y[two[::2]] -= 50.0
+    rows = {"x_px": x, "y_px": y, **{n: getattr(network, n) for n in ("image", "point", "covariance_px2")}}
+    network = replace(network, bars=ScaleBars.none(), **{n: values[kept] for n, values in rows.items()})
+    start = disturbed(rng, simulated, 0.005)
+    snooped = remove_gross_errors(network, start, adjust)
+    records = gross_error_records(snooped.adjustment, snooped.alpha, snooped.rejected)
+    assert_every_ray_left_out_is_listed(records, snooped.adjustment)
+    lost = {network.points[k] for k in np.flatnonzero(np.isnan(snooped.adjustment.state.xyz).any(axis=1))}
+    assert lost and lost == {r["point"] for r in records if r["point"] in {network.points[k] for k in range(20)}}
+    assert len(gross_error_records(snooped.adjustment, snooped.alpha)) < len(records)  # that is all that is known of them
+
+
+def test_exchanged_names_are_called_so(rng):
+    """Two names of an image exchanged; a third point there is off by itself."""
+    simulated = simulate(rng, images=10, points=40)
+    network = simulated.network
+    a, b, c = rng.permutation(np.flatnonzero(network.image == 3))[:3]
+    point, x = network.point.copy(), network.x_px.copy()
+    point[[a, b]] = point[[b, a]]
+    x[c] += 300.0
+    network = replace(network, point=point, x_px=x)
+    snooped = remove_gross_errors(network, simulated.truth, adjust)
+    said = {r["point"]: r["swapped_with"] for r in gross_error_records(snooped.adjustment, snooped.alpha, snooped.rejected)}
+    first, second, alone = (network.points[point[i]] for i in (a, b, c))
+    assert said[first] == second and said[second] == first and said[alone] is None
 
 
 def test_estimated_error_is_that_of_prediction_without_the_point(rng):

@@ -165,19 +165,21 @@ def area_centres(simulated, diameter: float) -> np.ndarray:
 def test_large_circles_are_corrected_for_their_eccentricity(rng):
     """Circles of 100 mm on a board of 1000 mm: several tenths of a pixel, which go into the parameters unless they are corrected."""
     simulated = simulate(rng, images=16, points=60, field="plane", known="fixed", bars=0)
-    x, y = (area_centres(simulated, 100.0) + 0.04 * rng.normal(size=(len(simulated.network), 2))).T
+    area = area_centres(simulated, 100.0)
+    x, y = (area + 0.04 * rng.normal(size=area.shape)).T
     network = replace(simulated.network, x_px=x, y_px=y, diameter=np.full(60, 100.0))
     calibration = calibrate_network(network, QUICK)
     found, limit = distance(calibration, simulated)
     assert found < limit
     record = calibration.tests["eccentricity"]
-    centres = predicted(network, simulated.truth)
-    assert record["largest_px"] == pytest.approx(np.hypot(*(area_centres(simulated, 100.0) - centres).T).max(), rel=0.01)
+    shift = area - predicted(network, simulated.truth)
+    assert record["largest_px"] == pytest.approx(np.hypot(*shift.T).max(), rel=0.01)
     assert "eccentricity" in kinds(calibration, "note")
     off = np.column_stack([calibration.adjustment.network.x_px - x, calibration.adjustment.network.y_px - y])
-    missed = off - (centres - area_centres(simulated, 100.0))
+    missed = off + shift
     assert np.sqrt(np.mean(missed**2)) < 2e-3 and np.abs(missed).max() < 0.05  # the largest where circles reach beyond all points
-    plain = calibrate_network(network, Options(folds=0, eccentricity=False))
+    x, y = (area_centres(simulated, 200.0) + 0.04 * rng.normal(size=(len(network), 2))).T
+    plain = calibrate_network(replace(network, x_px=x, y_px=y), Options(folds=0, eccentricity=False), simulated.truth)
     assert distance(plain, simulated)[0] > 3 * limit and "eccentricity" not in plain.tests
 
 
@@ -313,7 +315,10 @@ def test_points_of_two_rays_that_contradict_each_other_are_named_with_their_bars
     assert len(said) == (1 if lost.any() else 0)
     if lost.any():  # errors along the epipolar line of a pair cannot be seen
         assert said[0].level == "warning" and all(network.points[k] in said[0].text for k in np.flatnonzero(lost)[:5])
-        assert ("1 of 2 scale bars" in said[0].text) == lost[bars.start[0]]
+        gone = int((lost[bars.start] | lost[bars.end]).sum())
+        assert (f"{gone} of 2 scale bars" in said[0].text) == (gone > 0)
+    out = ~calibration.adjustment.used
+    assert len(calibration.tests["gross_errors"]) >= out.sum() - lost.sum()  # the ray that is left of a point is none
 
 
 def test_a_priori_covariances_are_taken_as_they_are(rng):
@@ -325,6 +330,30 @@ def test_a_priori_covariances_are_taken_as_they_are(rng):
     np.testing.assert_allclose(u[0] / u[1], 2.0, rtol=0.2)
     assert "variance_components" not in taken.tests and (taken.adjustment.network.covariance_px2 == network.covariance_px2).all()
     assert estimated.tests["variance_components"]["camera"]["factor_x"] == pytest.approx(0.25, rel=0.4)
+
+
+def test_the_uncertainty_of_the_scale_is_that_of_the_bar_whatever_is_stated_of_the_images(rng):
+    """One bar, known to 0.5 %, and image covariances that are 10 times too large or too small (in standard deviations)."""
+    simulated = simulate(rng, images=10, points=40, bars=1)
+    bars = simulated.network.bars
+    loose = replace(simulated.network, bars=replace(bars, u=0.005 * bars.length))
+    options = Options(folds=0, variance_components=False)
+    for factor in (10.0, 0.1):
+        network = replace(loose, covariance_px2=factor**2 * loose.covariance_px2)
+        calibration = calibrate_network(network, options, simulated.truth)
+        adjustment = calibration.adjustment
+        names = [f"{network.points[k]}:{axis}" for k in (bars.start[0], bars.end[0]) for axis in "XYZ"]
+        places = [adjustment.free_columns.index(name) for name in names]
+        along = adjustment.state.xyz[bars.end[0]] - adjustment.state.xyz[bars.start[0]]
+        slopes = np.append(-along, along) / np.linalg.norm(along)
+        u = np.sqrt(slopes @ adjustment.covariance[np.ix_(places, places)] @ slopes)
+        assert u == pytest.approx(0.005 * bars.length[0], rel=0.01)
+        record = calibration.tests["variance_components"]["camera"]
+        assert record["factor_x"] == record["factor_y"] == pytest.approx(factor**-2, rel=0.5)
+        kept = calibrate_network(network, replace(options, a_priori=True), simulated.truth)
+        assert "variance_components" not in kept.tests
+    alone = calibrate_network(replace(network, bars=ScaleBars.none()), options, simulated.truth)
+    assert alone.adjustment.sigma0 > 5 and "variance_components" not in alone.tests
 
 
 def test_one_bad_image_is_named_and_no_drift_is_made_of_it(rng):
@@ -358,6 +387,24 @@ def test_a_wrong_control_point_is_set_free(rng):
     calibration = calibrate_network(replace(simulated.network, xyz=xyz, u_xyz=u), QUICK, simulated.truth)
     assert calibration.findings[0].kind == "gross_control_point" and simulated.network.points[3] in calibration.findings[0].text
     assert np.isinf(calibration.adjustment.network.u_xyz[3]).all() and calibration.adjustment.used.sum() > len(simulated.network) - 3
+    found, limit = distance(calibration, simulated)
+    assert found < limit
+
+
+@pytest.mark.parametrize("bars", [0, 2])
+def test_understated_uncertainties_of_control_are_called_that(rng, bars):
+    """0.002 mm is stated of ten control points that are off by 0.05 mm; one of them by 5 mm, which is a gross error all the same."""
+    simulated = simulate(rng, images=14, points=50, bars=bars)
+    u = np.where(np.arange(50)[:, None] < 10, 0.002, np.full((50, 3), np.inf))
+    xyz = np.where(np.isfinite(u), simulated.truth.xyz + 0.05 * rng.normal(size=u.shape), np.nan)
+    xyz[4, 0] += 5.0
+    calibration = calibrate_network(replace(simulated.network, xyz=xyz, u_xyz=u), QUICK, simulated.truth)
+    said = {f.kind: f for f in calibration.findings if f.level == "warning"}
+    assert "control points miss the network by about" in said["known_uncertainty"].text
+    record = calibration.tests["known"]["control_points"]
+    assert 10 < record["understated"] < 60 and [r["name"].split()[0] for r in record["gross"]] == [simulated.network.points[4]]
+    kept = np.isfinite(calibration.adjustment.network.u_xyz[:10]).all(axis=1)
+    assert kept.sum() == 9 and not kept[4]
     found, limit = distance(calibration, simulated)
     assert found < limit
 

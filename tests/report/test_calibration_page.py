@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pixmetry.calibration.model import Sensor
+from pixmetry.calibration.model import NAMES, Sensor
 from pixmetry.calibration.network import Adjustment, Calibration, Finding
 from pixmetry.core.errors import InputError
 from pixmetry.report.calibration_figures import (
@@ -133,6 +133,35 @@ def test_a_parameter_that_is_not_significant_says_so(whole: Calibration) -> None
     row = next(r for r in parameters(changed, 0) if r["symbol"] == "B1")
     assert [row[key] for key in ("value", "u", "unit", "p")] == ["1.0", "± 2.0", "10⁻⁵", "0.62, not significant"]
     assert re.search(r"B1 +1\.0 ± 2\.0 +10⁻⁵ +not significant", summary_text(changed))
+
+
+def test_for_which_y_the_signs_are_is_said_for_each_camera(page: Page) -> None:
+    assert page.text.count("B2 and P2 are for y down. For y up both change their sign") == 1
+
+
+def test_a_curve_of_terms_that_are_not_there_is_not_drawn(whole: Calibration) -> None:
+    """Two curves of ten parameters; without P none tangential, without K none radial; held at a value they are drawn."""
+    adjustment = whole.adjustment
+    (camera,) = adjustment.network.cameras
+
+    def kinds(held: tuple[str, ...], *, zero: bool) -> list[bool]:
+        values = adjustment.state.interior.copy()
+        values[0, np.isin(NAMES, held)] = 0.0 if zero else 1e-6
+        network = replace(adjustment.network, cameras=(replace(camera, free=camera.free & ~np.isin(NAMES, held)),))
+        changed = replace(adjustment, network=network, state=replace(adjustment.state, interior=values))
+        text = render(replace(whole, adjustment=changed))
+        return [f"{kind} correction against the radius" in text for kind in ("radial", "tangential")]
+
+    k, p = tuple(f"k{i}" for i in range(1, 6)), ("p1", "p2")
+    assert kinds((), zero=False) == [True, True] and kinds(p, zero=False) == [True, True]
+    assert kinds(p, zero=True) == [True, False] and kinds(k, zero=True) == [False, True]
+
+
+def test_a_long_table_says_that_it_scrolls(whole: Calibration) -> None:
+    records = whole.tests["gross_errors"]
+    many = [{**records[0], "point": f"P{i}"} for i in range(30)]
+    assert "The table scrolls." in Page(render(with_tests(whole, gross_errors=many))).text
+    assert "The table scrolls." not in Page(render(with_tests(whole, gross_errors=many[:5]))).text
 
 
 def test_a_parameter_held_fixed_is_shown_without_u(whole: Calibration) -> None:

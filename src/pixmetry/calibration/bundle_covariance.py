@@ -52,6 +52,9 @@ class Cofactors:
     residuals: np.ndarray | None
 
 
+SAME = 0.999  # correlation from which two parameters cannot be told apart
+
+
 @dataclass(frozen=True)
 class WeakDirection:
     """The two groups of parameters that a network separates worst.
@@ -202,7 +205,14 @@ def raise_weak(layout: Layout, datum: Datum, now: Linearised, what: str) -> NoRe
     covariance = (vectors / (np.maximum(values, 0.0) + RIDGE)) @ vectors.T * np.outer(scale, scale)
     weak = weak_direction(layout.columns, covariance, layout.network, now.state)
     remedy = "add images that are tilted and rolled against each other, hold one of these parameters fixed, or give control points"
-    raise MeasureError(f"{what}; weakest: {weak.text}", where="bundle adjustment", remedy=remedy)
+    if len(layout.network.images) < 3:
+        free = int(layout.network.cameras[0].free.sum())
+        remedy = f"two images seldom carry {free} interior parameters: hold some of them, or add images"
+    cause = f"weakest: {weak.text}"
+    if abs(weak.correlation) > SAME:
+        cause = f"{weak.parameters[0]} is not determined: it cannot be told from {weak.parameters[1]} (correlation {weak.correlation:+.6f})"
+        what, cause = cause, what
+    raise MeasureError(f"{what}; {cause}", where="bundle adjustment", remedy=remedy)
 
 
 def weak_direction(columns: tuple[str, ...], covariance: np.ndarray, network: Network, state: State) -> WeakDirection:

@@ -52,9 +52,17 @@ def check_network(network: Network) -> tuple[Finding, ...]:
     _check_one_image(network, usable)
     _check_ties(network, usable, findings)
     if len(seldom):
-        text = f"{len(seldom)} points are seen in one image only and take no part: {_named(network.points, seldom)}"
+        text = f"{many(len(seldom), 'point')} seen in one image only, without a part in the adjustment: {_named(network.points, seldom)}"
         findings.append(Finding("single_points", text, "take them from a second image, or give their coordinates"))
+    if not len(network.bars) and not np.isfinite(network.xyz).all(axis=1).any():
+        text = f"nothing says how large the object is: lengths are in mean distances between the images, not in {network.unit}"
+        findings.append(Finding("no_scale", text, "give a scale bar, or the coordinates of two points", "warning"))
     return tuple(findings)
+
+
+def many(count: int, word: str) -> str:
+    """``1 image``, ``5 images``."""
+    return f"{count} {word}" if count == 1 else f"{count} {word}s"
 
 
 def _named(names: tuple[str, ...], which: np.ndarray) -> str:
@@ -88,7 +96,7 @@ def _check_frames(network: Network) -> list[Finding]:
             remedy = "check the size of the frame, the unit and the origin of the image coordinates"
             raise InputError(f"{out.mean():.0%} of them lie outside of the frame", where=where, value=extent, allowed=frame, remedy=remedy)
         if out.any():
-            text = f"{out.sum()} image points of {camera.name} lie outside of the frame: {extent} in {cols} × {lines} px"
+            text = f"{many(int(out.sum()), 'image point')} of {camera.name} outside of the frame: {extent} in {cols} × {lines} px"
             findings.append(Finding("outside_frame", text, "check the size of the frame and these points", "warning"))
     return findings
 
@@ -148,7 +156,7 @@ def _usable(network: Network, findings: list[Finding]) -> tuple[np.ndarray, np.n
         usable[few + lines] = False
     for which, reason in ((few, f"fewer than {FEWEST} usable points"), (lines, "all its points on one line")):
         if which:
-            text = f"{len(which)} images are left out, each with {reason}: {_named(network.images, np.array(which))}"
+            text = f"{many(len(which), 'image')} left out, each with {reason}: {_named(network.images, np.array(which))}"
             advice = f"an image needs {FEWEST} points, better 12, spread over its frame"
             findings.append(Finding("images_left_out", text, advice, "warning"))
     if not usable.any():
@@ -160,8 +168,12 @@ def _usable(network: Network, findings: list[Finding]) -> tuple[np.ndarray, np.n
 
 
 def _on_line(network: Network, rows: np.ndarray) -> bool:
-    places = np.column_stack([network.x_px[rows], network.y_px[rows], np.zeros(len(rows))])
-    return len(rows) > 2 and thickness(places)[1] < LINE
+    x, y = network.x_px[rows], network.y_px[rows]
+    if len(rows):
+        sensor = network.cameras[network.camera_of[network.image[rows[0]]]].sensor
+        inside = (np.abs(2 * x - sensor.cols) < 2 * sensor.cols) & (np.abs(2 * y - sensor.rows) < 2 * sensor.rows)
+        x, y = x[inside], y[inside]  # one that lies a million pixels off draws all others on a line
+    return len(x) > 2 and thickness(np.column_stack([x, y, np.zeros(len(x))]))[1] < LINE
 
 
 def _check_field(network: Network) -> None:
@@ -210,7 +222,7 @@ def _check_ties(network: Network, usable: np.ndarray, findings: list[Finding]) -
         remedy = "take images that see both, check the names of the points, or calibrate the groups one by one"
         raise MeasureError("the network falls apart", where="network", value=text, allowed=allowed, remedy=remedy)
     alone = np.concatenate(groups[1:])
-    text = f"{len(alone)} images share fewer than {TIE} points with any other: {_named(network.images, alone)}"
+    text = f"{many(len(alone), 'image')} with fewer than {TIE} points in common with any other: {_named(network.images, alone)}"
     findings.append(Finding("images_left_out", text, "take images that overlap, or check the names of the points", "warning"))
 
 
@@ -250,14 +262,14 @@ def check_determined(adjustment: Adjustment) -> tuple[Finding, ...]:
 
 
 def left_out(network: Network, state: State) -> list[Finding]:
-    """Images without a pose."""
-    missing = np.flatnonzero(~np.isfinite(state.position[:, 0]))
+    """Images without a pose, though they have enough points."""
+    count = np.bincount(network.image[np.isfinite(state.xyz[network.point, 0])], minlength=len(network.images))
+    missing = np.flatnonzero(~np.isfinite(state.position[:, 0]) & (count >= FEWEST))
     if not len(missing):
         return []
-    count = np.bincount(network.image[np.isfinite(state.xyz[network.point, 0])], minlength=len(network.images))
     names = ", ".join(f"{network.images[i]} ({count[i]} points)" for i in missing[:NAMED])
     more = f" and {len(missing) - NAMED} more" if len(missing) > NAMED else ""
-    text = f"{len(missing)} images could not be posed and take no part: {names}{more}"
+    text = f"{many(len(missing), 'image')} without a pose, and so without a part in the adjustment: {names}{more}"
     return [Finding("images_left_out", text, "check the names of their points, or give them more points that other images see", "warning")]
 
 
@@ -271,7 +283,7 @@ def _both_sides(network: Network, state: State) -> list[Finding]:
     fewer = posed[side == (side.mean() < 0.5)]
     if not len(fewer) or len(fewer) == len(posed):
         return []
-    text = f"{len(fewer)} images seem to see the plane of the points from behind: {_named(network.images, fewer)}"
+    text = f"the plane of the points seems to be seen from behind in {many(len(fewer), 'image')}: {_named(network.images, fewer)}"
     return [Finding("both_sides", text, "if it is not made of glass, these images are mirrored or their points misnamed", "warning")]
 
 

@@ -203,6 +203,6 @@ def _moved_words(record: dict[str, Any]) -> str:
     words = []
     for name, what in (("xp", "the principal point by {} px in x"), ("yp", "{} px in y"), ("c", "the principal distance by {} px")):
         u = record[f"u_{name}_px"]
-        moved = what.format(f"{record[f'moved_{name}_px']:+.2f}")
+        moved = what.format(f"{round(record[f'moved_{name}_px'], 2) + 0.0:+.2f}")  # + 0.0: no minus before nought
         words.append(moved if u is None else f"{moved} (formal u {u:.2f} px)")
     return ", ".join(words)

@@ -117,10 +117,20 @@ def gross_error_findings(errors: list[dict[str, Any]], adjustment: Adjustment) -
     names = [f"{e['point']} in {e['image']} ({np.hypot(e['error_x_px'], e['error_y_px']):.2g} px)" for e in errors[:NAMED]]
     more = " …" if len(errors) > NAMED else ""
     noun = "image point was left out as a gross error" if len(errors) == 1 else "image points were left out as gross errors"
-    text = f"{len(errors)} {noun}, of {total}: {', '.join(names)}{more}."
+    text = f"{len(errors)} {noun}, of {total}: {', '.join(names)}{more}.{_swapped_names(errors)}"
     many = len(errors) > 0.05 * total
-    advice = "Check how targets are located and named: so many are not single mistakes." if many else "Look at these targets in the images."
+    advice = "Look at these targets in the images, and at their names."
+    if many:
+        advice = "Check how targets are located and named: so many are not single mistakes."
     return [Finding("gross_error", text, advice, "warning" if many else "note")]
+
+
+def _swapped_names(errors: list[dict[str, Any]]) -> str:
+    pairs = dict.fromkeys((e["image"], *sorted((e["point"], e["swapped_with"]))) for e in errors if e["swapped_with"] is not None)
+    if not pairs:
+        return ""
+    named = "; ".join(f"{a} and {b} in {image}" for image, a, b in list(pairs)[:NAMED]) + ("; …" if len(pairs) > NAMED else "")
+    return f" Names seem to be exchanged: {named}."
 
 
 def lost_findings(adjustment: Adjustment) -> list[Finding]:
@@ -152,8 +162,11 @@ def known_findings(known: Mapping[str, Any], unit: str) -> list[Finding]:
             said = "it was left out" if gross["left_out"] else doubt
             advice = f"Check its value, its unit and the names of its points; {said}."
             found.append(Finding(f"gross_{noun.replace(' ', '_')}", text, advice, "warning"))
-        group = record["group"]
-        if group and group["p"] < RARE and not record["gross"]:
+        group, factor = record["group"], record.get("understated")
+        if factor:
+            text = f"The {noun}s miss the network by about {factor:.2g} times what their stated uncertainties say; they were raised by this."
+            found.append(Finding("known_uncertainty", text, "State their uncertainties anew.", "warning"))
+        elif group and group["p"] < RARE and not record["gross"]:
             text = f"The {noun}s scatter {np.sqrt(group['factor']):.2g} times as much as their stated uncertainties say."
             level = "warning" if group["factor"] > 1 else "note"
             found.append(Finding("known_uncertainty", text, "State their uncertainties anew.", level))

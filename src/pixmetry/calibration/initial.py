@@ -343,7 +343,8 @@ def _scaled(work: Reconstruction) -> None:
 
 def _check_posed(work: Reconstruction) -> None:
     posed = work.posed
-    if posed.sum() < max(1, ENOUGH * len(posed)):
+    measured = np.isin(np.arange(len(posed)), work.network.image)  # an image without any point is nobody's failure
+    if posed.sum() < max(1, ENOUGH * measured.sum()):
         raise _not_oriented(work.network, posed)
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from pixmetry.calibration.known_residuals import Known, bar_residuals, contradicted, control_residuals
 from pixmetry.calibration.network import Adjustment, Network, ScaleBars, State
 from pixmetry.calibration.snooping import Adjust, finest_factor
-from pixmetry.calibration.variance_components import image_sigma0, scaled
+from pixmetry.calibration.variance_components import MEDIAN_SQUARE, image_sigma0, scaled
 from pixmetry.core.errors import InputError
 
 LOOSE = 0.05  # uncertainty, as a part of the field's extent, with which a control point does not pull at the image coordinates
@@ -26,6 +26,7 @@ CONTROL_SHARE = 0.5  # of the points; more fixed ones are a test field
 ABSURD = 0.1  # a bar that is wrong by such a part of its length, as one in other units, is out before any adjustment with it
 LEAST_RAYS = 3  # rejected rays that condemn a fixed point, where they are more than half
 MOST_WRONG = 0.2  # part of the fixed points that can be wrong one by one
+MANY_WRONG = 1 / 3  # of the control points: it is rather their uncertainties that are wrong
 MOST = 20
 
 
@@ -38,16 +39,22 @@ class CheckedKnown:
     network : Network
     gross : dict
         By ``scale_bars`` and ``control_points``: records as of `contradicted`, with ``left_out``; where it is False, the uncertainties of
-        all bars were raised to the size of the contradiction.
+        all bars were raised to the size of the contradiction. ``understated``: the ``factor`` by which those of all control points were
+        raised instead, if so.
     """
 
     network: Network
-    gross: dict[str, list[dict[str, Any]]] = field(default_factory=lambda: {"scale_bars": [], "control_points": []})
+    gross: dict[str, list[dict[str, Any]]] = field(default_factory=lambda: {"scale_bars": [], "control_points": [], "understated": []})
 
 
 def has_known(network: Network) -> bool:
     """Whether there are bars or control points that can be tested."""
-    return len(network.bars) > 0 or bool((np.isfinite(network.u_xyz) & (network.u_xyz > 0)).any() or few_fixed(network).any())
+    return has_stated(network) or bool(few_fixed(network).any())
+
+
+def has_stated(network: Network) -> bool:
+    """Whether there are bars, or points with a stated uncertainty."""
+    return len(network.bars) > 0 or bool((np.isfinite(network.u_xyz) & (network.u_xyz > 0)).any())
 
 
 def weighted_instead(network: Network, clean: Adjustment) -> Network:
@@ -84,8 +91,9 @@ def loosened(network: Network) -> Network:
     return replace(network, bars=ScaleBars.none(), u_xyz=u_xyz)
 
 
-def check_known(network: Network, clean: Adjustment, adjust: Adjust) -> tuple[CheckedKnown, State]:
-    """Leave out bars and control points that the network contradicts.
+def check_known(network: Network, clean: Adjustment, adjust: Adjust, *, stated: bool = True) -> tuple[CheckedKnown, State]:
+    """Leave out bars and control points that the network contradicts; where these would be many, see whether their uncertainties are only
+    stated too small.
 
     The network comes back with image coordinates weighted as the loosened one says, beside which bars and control points have their place;
     the state is that of the adjustment with them.
@@ -97,6 +105,8 @@ def check_known(network: Network, clean: Adjustment, adjust: Adjust) -> tuple[Ch
         Of the `loosened` network, without gross errors in the images.
     adjust : callable
         `bundle.adjust`, or the same with some options chosen; with a posteriori covariances.
+    stated : bool
+        Whether the uncertainties of control points are those that they came with.
 
     Raises
     ------
@@ -107,6 +117,22 @@ def check_known(network: Network, clean: Adjustment, adjust: Adjust) -> tuple[Ch
     size = max(sigma0**2, finest_factor(network))
     weights = scaled(network, np.full((len(network.cameras), 2), size))  # from now on sigma0 of the image coordinates is 1
     checked, state = _without_absurd(CheckedKnown(weights), clean.state)
+    left, at = _without_contradicted(checked, state, clean, adjust, dof)
+    out = len(left.gross["control_points"])
+    control = np.isfinite(weights.u_xyz) & (weights.u_xyz > 0)
+    if not stated or out <= MANY_WRONG * control.any(axis=1).sum():
+        return left, at
+    factor = _understatement(weights, clean)
+    raised = replace(weights, u_xyz=np.where(control, factor * weights.u_xyz, weights.u_xyz))
+    again, after = _without_contradicted(replace(checked, network=replace(checked.network, u_xyz=raised.u_xyz)), state, clean, adjust, dof)
+    if 2 * len(again.gross["control_points"]) > out:
+        return left, at  # with larger uncertainties they are wrong all the same
+    return replace(again, gross={**again.gross, "understated": [{"factor": factor}]}), after
+
+
+def _without_contradicted(
+    checked: CheckedKnown, state: State, clean: Adjustment, adjust: Adjust, dof: float
+) -> tuple[CheckedKnown, State]:
     for _ in range(MOST):
         adjustment = adjust(checked.network, state, used=clean.used, redundancy=True)
         state = adjustment.state
@@ -119,6 +145,13 @@ def check_known(network: Network, clean: Adjustment, adjust: Adjust) -> tuple[Ch
         if not checked.gross["scale_bars" if known is bars else "control_points"][-1]["left_out"]:
             break
     return checked, state
+
+
+def _understatement(network: Network, clean: Adjustment) -> float:
+    """What control points miss over what was stated, where they hardly pull at the network: from the middle of their coordinates."""
+    known = control_residuals(clean)
+    ratio = known.residual / network.u_xyz.ravel()[known.index]
+    return float(np.sqrt(np.median(ratio**2) / MEDIAN_SQUARE * len(ratio) / max(len(ratio) - 7, 1)))
 
 
 def without_absurd_control(network: Network, state: State) -> tuple[Network, list[dict[str, Any]]]:

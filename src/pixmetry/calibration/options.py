@@ -69,7 +69,7 @@ class Options:
     folds: int = 5
     residual_grid: bool = False
     a_priori: bool = False
-    max_iterations: int = 50
+    max_iterations: int = 100
 
     def __post_init__(self) -> None:
         for name, choices in CHOICES.items():

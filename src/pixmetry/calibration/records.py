@@ -10,10 +10,16 @@ import numpy as np
 from pixmetry.calibration.geometry import systematic_rest
 from pixmetry.calibration.known_residuals import bar_residuals, control_residuals, group_record
 from pixmetry.calibration.network import Adjustment, Network
+from pixmetry.calibration.snooping import Rejected
 
 
 def all_records(
-    adjustment: Adjustment, alpha: float, gross_known: Mapping[str, list[dict[str, Any]]], *, a_priori: bool = False
+    adjustment: Adjustment,
+    alpha: float,
+    gross_known: Mapping[str, list[dict[str, Any]]],
+    rejected: Rejected | None = None,
+    *,
+    a_priori: bool = False,
 ) -> dict[str, Any]:
     """The records that follow from one adjustment alone (with redundancy numbers and covariance).
 
@@ -24,6 +30,8 @@ def all_records(
         Level at which image points were tested for gross errors.
     gross_known : mapping
         Bars and control points that were contradicted.
+    rejected : Rejected, optional
+        Why image points were rejected.
     a_priori : bool
         Whether the covariances of the adjustment are without sigma0².
     """
@@ -40,7 +48,7 @@ def all_records(
         "correlations_with_poses": quality.pose_correlations(adjustment),
         "residuals": quality.residual_records(adjustment),
         "f_test": quality.f_test_records(adjustment),
-        "gross_errors": gross_error_records(adjustment, alpha),
+        "gross_errors": gross_error_records(adjustment, alpha, rejected),
         "patterns": patterns_without_bad_images(adjustment, adjust),
         "images": quality.image_records(adjustment),
         "curves": curves.distortion_curves(adjustment),
@@ -96,7 +104,11 @@ def network_record(adjustment: Adjustment, *, a_priori: bool = False) -> dict[st
 def known_record(
     adjustment: Adjustment, gross: Mapping[str, list[dict[str, Any]]], *, a_priori: bool = False
 ) -> dict[str, dict[str, Any]]:
-    """Bars and weighted control points against the network: for each ``group`` (variance factor, None without redundancy) and ``gross``."""
+    """Bars and weighted control points against the network: for each ``group`` (variance factor, None without redundancy) and ``gross``; of
+    control points also ``understated``: by how much their uncertainties were raised, or None."""
     groups = {"scale_bars": bar_residuals, "control_points": control_residuals}
     known = {name: residuals(adjustment, a_priori=a_priori) for name, residuals in groups.items()}
-    return {name: {"group": group_record(adjustment, k), "gross": list(gross[name])} for name, k in known.items()}
+    record: dict[str, dict[str, Any]]
+    record = {name: {"group": group_record(adjustment, k), "gross": list(gross[name])} for name, k in known.items()}
+    record["control_points"]["understated"] = next((r["factor"] for r in gross.get("understated", ())), None)
+    return record

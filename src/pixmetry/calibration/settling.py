@@ -12,6 +12,7 @@ import numpy as np
 from pixmetry.calibration.eccentric import Eccentricity, eccentricity, without_eccentricity
 from pixmetry.calibration.network import Adjustment, Network, State
 from pixmetry.calibration.options import Options
+from pixmetry.calibration.snooping import Rejected
 from pixmetry.core.errors import MeasureError
 
 Progress = Callable[[str], None]
@@ -38,6 +39,7 @@ class Settled:
         Bars and control points that were left out.
     given_px2 : ndarray, shape (n, 3)
         Covariances of the image coordinates before they were weighted.
+    rejected : Rejected
     """
 
     measured: Network
@@ -46,6 +48,7 @@ class Settled:
     components: dict[str, Any]
     gross_known: dict[str, Any]
     given_px2: np.ndarray
+    rejected: Rejected
 
 
 def adjust_with(options: Options) -> Callable[..., Adjustment]:
@@ -72,20 +75,21 @@ def settle(measured: Network, state: State, options: Options, say: Progress, bef
 
     loss: str = options.loss if before is None else "none"
     given_px2 = measured.covariance_px2 if before is None else before.given_px2
+    rejected = Rejected.none(len(measured)) if before is None else before.rejected
     freed = np.zeros(0, int)
     components: dict[str, Any] = {}
     used = np.ones(len(measured), bool) if before is None else before.adjustment.used
     shift = _shift(measured, state, options)
     if before is None:
         measured = _first_weights(measured, shift, state, options)
-    measured, state, used, loss, gross_known = _checked_known(measured, shift, state, used, loss, options, say)
+    measured, state, used, loss, gross_known = _checked_known(measured, shift, state, used, loss, options, say, rejected)
     for loop in range(1, LOOPS + 1):
         say(f"adjusting, round {loop}")
-        adjustment = _without_gross_errors(without_eccentricity(measured, shift), state, used, loss, options)
+        adjustment = _without_gross_errors(without_eccentricity(measured, shift), state, used, loss, options, rejected)
         wrong = wrong_fixed(measured, adjustment) if options.snoop else freed[:0]
         if len(wrong):
             measured, used, freed = set_free(measured, wrong), adjustment.used | np.isin(measured.point, wrong), np.append(freed, wrong)
-            adjustment = _without_gross_errors(without_eccentricity(measured, shift), adjustment.state, used, "none", options)
+            adjustment = _without_gross_errors(without_eccentricity(measured, shift), adjustment.state, used, "none", options, rejected)
         adjustment, step, components = _weighted(adjustment, given_px2, options, components)
         measured = replace(measured, covariance_px2=adjustment.network.covariance_px2)
         again = _shift(measured, adjustment.state, options)
@@ -96,12 +100,18 @@ def settle(measured: Network, state: State, options: Options, say: Progress, bef
             break
         shift = again
     gross_known = {**gross_known, "control_points": [*gross_known["control_points"], *wrong_fixed_records(adjustment, freed)]}
-    return Settled(measured, adjustment, shift, components, gross_known, given_px2)
+    return Settled(measured, adjustment, shift, components, gross_known, given_px2, rejected)
 
 
 def _as_given(network: Network, options: Options) -> bool:
-    """Whether the covariances of the image coordinates stay as they came."""
-    return network.covariance_known and (options.a_priori or not options.variance_components)
+    """Whether the covariances of the image coordinates stay as they came.
+
+    Beside scale bars or control points, which stand as they were stated, they do not: sigma0² would scale the uncertainties of all alike.
+    """
+    from pixmetry.calibration.known_checks import has_stated
+
+    estimated = options.variance_components or has_stated(network)
+    return network.covariance_known and (options.a_priori or not estimated)
 
 
 def _first_weights(measured: Network, shift: Eccentricity, state: State, options: Options) -> Network:
@@ -112,7 +122,7 @@ def _first_weights(measured: Network, shift: Eccentricity, state: State, options
 
     variance = measured.covariance_px2[:, [0, 2]]
     unequal = measured.covariance_known and (np.ptp(np.log(variance), axis=0) > np.log(UNEQUAL)).any()
-    if _as_given(measured, options) or not unequal:
+    if options.a_priori or not (options.variance_components and unequal):
         return measured
     alike = same_weights(loosened(without_eccentricity(measured, shift)))
     try:
@@ -123,12 +133,20 @@ def _first_weights(measured: Network, shift: Eccentricity, state: State, options
 
 
 def _checked_known(
-    measured: Network, shift: Eccentricity, state: State, used: np.ndarray, loss: str, options: Options, say: Progress
+    measured: Network,
+    shift: Eccentricity,
+    state: State,
+    used: np.ndarray,
+    loss: str,
+    options: Options,
+    say: Progress,
+    rejected: Rejected,
 ) -> tuple[Network, State, np.ndarray, str, dict[str, Any]]:
     """The network without bars and control points that it contradicts, and what its image points without them are worth."""
     from pixmetry.calibration.known_checks import (
         CheckedKnown,
         check_known,
+        few_fixed,
         fixed_again,
         has_known,
         loosened,
@@ -141,11 +159,13 @@ def _checked_known(
     measured, absurd = without_absurd_control(measured, state)
     say("testing scale bars and control points")
     try:
-        clean = _without_gross_errors(without_eccentricity(loosened(measured), shift), state, used, loss, replace(options, a_priori=False))
+        loose = without_eccentricity(loosened(measured), shift)
+        clean = _without_gross_errors(loose, state, used, loss, replace(options, a_priori=False), rejected)
     except MeasureError:  # the network hangs on them
         return measured, state, used, loss, {**CheckedKnown(measured).gross, "control_points": absurd}
     weighted = weighted_instead(measured, clean)
-    checked, state = check_known(without_eccentricity(weighted, shift), clean, adjust_with(replace(options, a_priori=False)))
+    stated = not few_fixed(measured).any()
+    checked, state = check_known(without_eccentricity(weighted, shift), clean, adjust_with(replace(options, a_priori=False)), stated=stated)
     measured = replace(measured, bars=checked.network.bars, u_xyz=fixed_again(checked.network, measured, weighted))
     if not _as_given(measured, options):
         measured = replace(measured, covariance_px2=checked.network.covariance_px2)
@@ -156,15 +176,16 @@ def _shift(measured: Network, state: State, options: Options) -> Eccentricity:
     return eccentricity(measured if options.eccentricity else replace(measured, diameter=None), state, options.target)
 
 
-def _without_gross_errors(network: Network, state: State, used: np.ndarray, loss: str, options: Options) -> Adjustment:
+def _without_gross_errors(
+    network: Network, state: State, used: np.ndarray, loss: str, options: Options, rejected: Rejected
+) -> Adjustment:
     from pixmetry.calibration.snooping import remove_gross_errors
 
     adjust = adjust_with(options)
     if not options.snoop:
         return adjust(network, state, used=used, redundancy=True)
-    return remove_gross_errors(
-        network, state, adjust, used=used, loss=loss, loss_scale=options.loss_scale, false_alarms=options.false_alarms
-    ).adjustment
+    how = {"loss": loss, "loss_scale": options.loss_scale, "false_alarms": options.false_alarms}
+    return remove_gross_errors(network, state, adjust, used=used, rejected=rejected, **how).adjustment
 
 
 def _weighted(
@@ -172,14 +193,14 @@ def _weighted(
 ) -> tuple[Adjustment, np.ndarray, dict[str, Any]]:
     """The adjustment with estimated weights, by how much they changed, and records, whose iterations go on from those before.
 
-    If weights are not to be estimated, a guessed covariance still gets its size, for bars beside it.
+    If weights are not to be estimated, all image coordinates together still get a factor, for bars beside them, or where they are guessed.
     """
     from pixmetry.calibration.variance_components import estimate_components
 
     if _as_given(adjustment.network, options):
         return adjustment, np.ones(1), {}
     found = estimate_components(adjustment, adjust_with(options), by_axis=options.variance_components, given_px2=given_px2)
-    records = found.records() if options.variance_components else {}
+    records = found.records() if options.variance_components or adjustment.network.covariance_known else {}
     for name, record in records.items():
         record["iterations"] += before.get(name, {"iterations": 0})["iterations"]
     step = found.adjustment.network.covariance_px2[:, [0, 2]] / adjustment.network.covariance_px2[:, [0, 2]]

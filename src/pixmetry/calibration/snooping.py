@@ -17,7 +17,7 @@ W. Baarda, A testing procedure for use in geodetic networks (1968); A. J. Pope, 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -29,9 +29,42 @@ FINEST_PX = 1e-4  # no image coordinate is better: what lies below is no error, 
 KEPT = 0.5  # part of the points of an image, and of the images of a point, that the robust pass leaves at least
 ROBUST_SHARE = 0.6  # redundancy over observations from which on the spread of the middle half is taken for that of all
 MEDIAN = 2 * np.log(2)  # of χ² with two degrees of freedom
+SWAPPED_PX = 3.0  # as near, two image points lie where the other one should be, if their names are exchanged
 PASSES = 30
 RETURNS = 5
 Adjust = Callable[..., Adjustment]
+
+
+@dataclass(frozen=True)
+class Rejected:
+    """What image points were rejected for, at that time; NaN: not rejected, or back again. Written to as points go and come.
+
+    Where a point is left with one ray, neither can be tested any more, and this is all that is known.
+
+    Parameters
+    ----------
+    statistic, critical : ndarray, shape (n,)
+    residual_px, error_px : ndarray, shape (n, 2)
+    """
+
+    statistic: np.ndarray
+    critical: np.ndarray
+    residual_px: np.ndarray
+    error_px: np.ndarray
+
+    @classmethod
+    def none(cls, n: int) -> Rejected:
+        """Nothing was rejected."""
+        return cls(np.full(n, np.nan), np.full(n, np.nan), np.full((n, 2), np.nan), np.full((n, 2), np.nan))
+
+    def note(self, rows: np.ndarray, **values: Any) -> None:
+        """Remember values of some rows; their names are those of the fields, and they are given for all rows."""
+        for name, value in values.items():
+            getattr(self, name)[rows] = np.broadcast_to(value, getattr(self, name).shape)[rows]
+
+    def forget(self, rows: np.ndarray) -> None:
+        """These rows take part again."""
+        self.note(rows, **{f.name: np.nan for f in fields(self)})
 
 
 @dataclass(frozen=True)
@@ -45,11 +78,13 @@ class Snooped:
         Level of each test.
     passes : int
         Adjustments that this took.
+    rejected : Rejected
     """
 
     adjustment: Adjustment
     alpha: float
     passes: int
+    rejected: Rejected
 
 
 def statistics(adjustment: Adjustment) -> tuple[np.ndarray, np.ndarray]:
@@ -97,6 +132,7 @@ def remove_gross_errors(
     loss: str = "huber",
     loss_scale: float = 2.5,
     false_alarms: float = 0.01,
+    rejected: Rejected | None = None,
 ) -> Snooped:
     """Adjust, and leave out image points with gross errors.
 
@@ -115,14 +151,18 @@ def remove_gross_errors(
         Of the robust adjustment; ``"none"``: without it.
     false_alarms : float
         Good image points that may be expected to be rejected; the level of each test is this over their number.
+    rejected : Rejected, optional
+        Of earlier searches in the same image points; it is gone on with.
     """
     used = np.ones(len(network), bool) if used is None else used.copy()
+    rejected = rejected or Rejected.none(len(network))
+    rejected.forget(used)
     alpha = false_alarms / max(len(network), 1)
     passes, state = 0, start
     if loss != "none":
         robust = adjust(network, start, loss=loss, loss_scale=loss_scale, used=used, covariance=False)
-        used, state, passes = _without_large(robust, alpha), robust.state, 1
-    adjustment, done = _reject(network, state, adjust, used, alpha)
+        used, state, passes = _without_large(robust, alpha, rejected), robust.state, 1
+    adjustment, done = _reject(network, state, adjust, used, alpha, rejected)
     passes += done
     barred = np.zeros(len(network), bool)
     for _ in range(RETURNS):
@@ -130,42 +170,73 @@ def remove_gross_errors(
         if not back.any():
             break
         barred |= back  # whoever is rejected a second time stays out
-        adjustment, done = _reject(network, adjustment.state, adjust, adjustment.used | back, alpha)
+        rejected.forget(back)
+        adjustment, done = _reject(network, adjustment.state, adjust, adjustment.used | back, alpha, rejected)
         passes += done
-    return Snooped(adjustment, alpha, passes)
+    return Snooped(adjustment, alpha, passes, rejected)
 
 
-def gross_error_records(adjustment: Adjustment, alpha: float) -> list[dict[str, Any]]:
-    """The image points that are out, largest statistic first: names, residual and estimated error in px, statistic and critical value."""
+def gross_error_records(adjustment: Adjustment, alpha: float, rejected: Rejected | None = None) -> list[dict[str, Any]]:
+    """The image points that are out, largest statistic first: names, residual and estimated error in px, statistic and critical value, and
+    ``swapped_with``: the point of the same image that it seems to have exchanged its name with, or None.
+
+    Where nothing can be tested any more, for a point has too few rays left, the values are those of the time of rejection.
+    """
     network = adjustment.network
     statistic, error = statistics(adjustment)
-    _, critical = critical_values(alpha, adjustment.dof)
+    residual, critical = adjustment.residual_px, np.full(len(network), critical_values(alpha, adjustment.dof)[1])
+    if rejected is not None:
+        then = ~np.isfinite(statistic)
+        statistic, critical = np.where(then, rejected.statistic, statistic), np.where(then, rejected.critical, critical)
+        residual, error = (
+            np.where(then[:, None], old, new) for old, new in ((rejected.residual_px, residual), (rejected.error_px, error))
+        )
     out = np.flatnonzero(~adjustment.used & np.isfinite(statistic))
+    swapped = _swapped(network, out, residual)
     return [
         {
             "image": network.images[network.image[i]],
             "point": network.points[network.point[i]],
-            "residual_x_px": float(adjustment.residual_px[i, 0]),
-            "residual_y_px": float(adjustment.residual_px[i, 1]),
+            "residual_x_px": float(residual[i, 0]),
+            "residual_y_px": float(residual[i, 1]),
             "error_x_px": float(error[i, 0]),
             "error_y_px": float(error[i, 1]),
             "statistic": float(statistic[i]),
-            "critical": critical,
+            "critical": float(critical[i]),
+            "swapped_with": network.points[network.point[swapped[i]]] if i in swapped else None,
         }
         for i in out[np.argsort(-statistic[out])]
     ]
 
 
-def _reject(network: Network, state: State, adjust: Adjust, used: np.ndarray, alpha: float) -> tuple[Adjustment, int]:
+def _swapped(network: Network, out: np.ndarray, residual_px: np.ndarray) -> dict[int, int]:
+    """Pairs of rejected rows, both ways, each of which was measured where the other one should be."""
+    from scipy.spatial import KDTree
+
+    measured, pairs = np.column_stack([network.x_px, network.y_px]), {}
+    for image in np.unique(network.image[out]):
+        rows = out[network.image[out] == image]
+        nearest = KDTree((measured - residual_px)[rows]).query(measured[rows], distance_upper_bound=SWAPPED_PX)[1]
+        for i, j in enumerate(nearest):
+            if i != j < len(rows) and nearest[j] == i:
+                pairs[int(rows[i])] = int(rows[j])
+    return pairs
+
+
+def _reject(
+    network: Network, state: State, adjust: Adjust, used: np.ndarray, alpha: float, rejected: Rejected
+) -> tuple[Adjustment, int]:
     done, worst = 0, np.zeros(1, int)
     while len(worst) and done < PASSES:
         done += 1
         adjustment = adjust(network, state, used=used, redundancy=True)
-        statistic, _ = statistics(adjustment)
+        statistic, error = statistics(adjustment)
         inside, _ = critical_values(alpha, adjustment.dof)
         worst = _one_each(network, np.where(adjustment.used, statistic, 0.0), inside)
         used, state = adjustment.used.copy(), adjustment.state
-        used[worst] = False
+        if done < PASSES:
+            used[worst] = False
+            rejected.note(worst, statistic=statistic, critical=inside, residual_px=adjustment.residual_px, error_px=error)
     return adjustment, done
 
 
@@ -186,7 +257,7 @@ def _one_each(network: Network, statistic: np.ndarray, critical: float) -> np.nd
     return np.array(rows, int)
 
 
-def _without_large(robust: Adjustment, alpha: float) -> np.ndarray:
+def _without_large(robust: Adjustment, alpha: float, rejected: Rejected) -> np.ndarray:
     """Which image points stay after a robust adjustment: those within the critical value."""
     network, used = robust.network, robust.used.copy()
     white = (np.linalg.inv(_roots(network.covariance_px2)) @ robust.residual_px[:, :, None])[:, :, 0]
@@ -196,13 +267,16 @@ def _without_large(robust: Adjustment, alpha: float) -> np.ndarray:
     variance = float(np.median(square[used])) / MEDIAN / share if share > ROBUST_SHARE else robust.sigma0**2
     left = np.bincount(network.image[used], minlength=len(network.images)), np.bincount(network.point[used], minlength=len(network.points))
     least = [np.ceil(KEPT * count) for count in left]
-    above = np.flatnonzero(square > -2 * np.log(alpha) * max(variance, finest_factor(network)))
+    variance, critical = max(variance, finest_factor(network)), -2 * np.log(alpha)
+    above = np.flatnonzero(square > critical * variance)
     for i in above[np.argsort(-square[above])]:
         j, k = network.image[i], network.point[i]
         if left[0][j] > least[0][j] and left[1][k] > least[1][k]:
             used[i] = False
             left[0][j] -= 1
             left[1][k] -= 1
+    out = robust.used & ~used
+    rejected.note(out, statistic=square / variance, critical=critical, residual_px=robust.residual_px, error_px=robust.residual_px)
     return used
 
 

@@ -158,9 +158,8 @@ def _is_free(network: Network) -> bool:
 def _records(settled: Settled, given: Network, options: Options) -> dict[str, Any]:
     from pixmetry.calibration.records import add_noise, all_records
 
-    tests = all_records(
-        settled.adjustment, options.false_alarms / len(settled.measured), settled.gross_known, a_priori=options.a_priori
-    )
+    alpha = options.false_alarms / len(settled.measured)
+    tests = all_records(settled.adjustment, alpha, settled.gross_known, settled.rejected, a_priori=options.a_priori)
     add_noise(tests["residuals"], settled.adjustment, given)
     if settled.components:
         tests["variance_components"] = settled.components

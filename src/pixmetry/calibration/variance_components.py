@@ -61,6 +61,8 @@ class Components:
     u_factor : ndarray, shape (cameras, 2)
         Relative standard uncertainty of Σ v (P v) / Σ r.
     iterations : int
+    by_axis : bool
+        Whether x and y were asked for by themselves.
     """
 
     adjustment: Adjustment
@@ -70,16 +72,18 @@ class Components:
     dof: np.ndarray
     u_factor: np.ndarray
     iterations: int
+    by_axis: bool = True
 
     def records(self) -> dict[str, dict[str, Any]]:
         """By camera, for x and y: ``sigma_x_px`` with ``u_sigma_x_px`` and ``given_x_px`` (rms over its image points; the latter: before),
         ``beyond_x_px`` with ``u_beyond_x_px`` (added to what was given; None where a factor was estimated instead), ``factor_x``,
-        ``dof_x``, ``estimated_x``; and ``common``: whether x and y have one size."""
+        ``dof_x``, ``estimated_x``; and ``common``: whether x and y have one size (``by_axis``: though two were asked for)."""
         network, used = self.adjustment.network, self.adjustment.used
         out: dict[str, dict[str, Any]] = {}
         for k, camera in enumerate(network.cameras):
             rows = used & (network.camera_of[network.image] == k)
             record: dict[str, Any] = {"iterations": self.iterations, "common": bool(self.group[k, 0] == self.group[k, 1])}
+            record["by_axis"] = self.by_axis
             for axis, name in enumerate("xy"):
                 one = _record(network.covariance_px2[rows, 2 * axis], self.given_px2[rows, 2 * axis], self, (k, axis))
                 record |= {key.replace("_x", f"_{name}"): value for key, value in one.items()}
@@ -143,20 +147,20 @@ def estimate_components(
     adjust : callable
         `bundle.adjust`, or the same with some options chosen.
     by_axis : bool
-        For x and y of each camera; else one size for all image coordinates.
+        For x and y of each camera; else one factor for all image coordinates, whose ratios stay as they were given.
     given_px2 : ndarray, shape (n, 3), optional
         Covariances that the image coordinates came with; default: those of the adjustment.
     """
     given = adjustment.network.covariance_px2 if given_px2 is None else given_px2
     group = groups(adjustment, given) if by_axis else np.zeros((len(adjustment.network.cameras), 2), int)
-    sizes, factor, dof = estimated_sizes(adjustment, given, group)
+    sizes, factor, dof = estimated_sizes(adjustment, given, group, adds=by_axis)
     iterations = 0
     while iterations < ITERATIONS and (np.abs(factor - 1) > CLOSE * np.sqrt(2 / np.maximum(dof, 1.0))).any():
         iterations += 1
         network = sizes.of(adjustment.network, given)
         adjustment = adjust(network, adjustment.state, used=adjustment.used, redundancy=True)
-        sizes, factor, dof = estimated_sizes(adjustment, given, group)
-    return Components(adjustment, given, sizes, group, dof, relative_u(adjustment, group), iterations)
+        sizes, factor, dof = estimated_sizes(adjustment, given, group, adds=by_axis)
+    return Components(adjustment, given, sizes, group, dof, relative_u(adjustment, group), iterations, by_axis)
 
 
 def groups(adjustment: Adjustment, given_px2: np.ndarray) -> np.ndarray:
@@ -192,7 +196,9 @@ def _axes_differ(adjustment: Adjustment, variance_px2: np.ndarray, camera: int) 
     return bool(stats.ttest_1samp(ratio, 0.0).pvalue < RARE)
 
 
-def estimated_sizes(adjustment: Adjustment, given_px2: np.ndarray, group: np.ndarray) -> tuple[Sizes, np.ndarray, np.ndarray]:
+def estimated_sizes(
+    adjustment: Adjustment, given_px2: np.ndarray, group: np.ndarray, *, adds: bool = True
+) -> tuple[Sizes, np.ndarray, np.ndarray]:
     """One step: the sizes with which the residuals, if they stayed as they are, would agree with their redundancy numbers.
 
     Parameters
@@ -201,6 +207,8 @@ def estimated_sizes(adjustment: Adjustment, given_px2: np.ndarray, group: np.nda
     given_px2 : ndarray, shape (n, 3)
     group : ndarray of int, shape (cameras, 2)
         A group with too little redundancy gets the size of all image points.
+    adds : bool
+        Whether anything may be added to given variances; else they are multiplied.
 
     Returns
     -------
@@ -220,7 +228,7 @@ def estimated_sizes(adjustment: Adjustment, given_px2: np.ndarray, group: np.nda
             return 1.0, 0.0, False, 1.0
         ratio = max(float((v / now[mine]).sum()) / dof, least_now)
         factor = float((v / s).sum()) / dof
-        if network.covariance_known and factor > 1:
+        if adds and network.covariance_known and factor > 1:
             return 1.0, added_variance(v, s, dof), True, ratio
         return max(factor, least), 0.0, False, ratio
 
@@ -228,11 +236,11 @@ def estimated_sizes(adjustment: Adjustment, given_px2: np.ndarray, group: np.nda
     found = {int(g): (mine, *size(mine)) for g in np.unique(group) for mine in [of == g]}
     enough = {g: r[mine].sum() >= LEAST_DOF and squares[mine].sum() > 0 for g, (mine, *_) in found.items()}
     chosen = [[found[g][1:] if enough[g] else common for g in row] for row in group.tolist()]
-    factor, added, adds, ratio = (np.array([[one[i] for one in row] for row in chosen]) for i in range(4))
+    factor, added, summed, ratio = (np.array([[one[i] for one in row] for row in chosen]) for i in range(4))
     estimated = np.array([[bool(enough[g]) for g in row] for row in group.tolist()])
     camera = network.camera_of[network.image[used]]
     dof = np.stack([np.bincount(camera, r[:, axis], minlength=len(group)) for axis in (0, 1)], axis=1)
-    return Sizes(factor, added, adds.astype(bool), estimated), ratio, dof
+    return Sizes(factor, added, summed.astype(bool), estimated), ratio, dof
 
 
 def robust_sizes(adjustment: Adjustment, given_px2: np.ndarray) -> Sizes:

@@ -85,7 +85,8 @@ def read_picture(path: str | Path, channel: str | None = None) -> np.ndarray:
     if array.ndim == 3 and array.shape[2] in (3, 4):
         if channel is None:
             what = f"colour image ({'x'.join(map(str, array.shape))})"
-            remedy = "name the channel to measure in (`--channel green`; in a project `channel: green` under `pictures`), or store the sensor's raw values"
+            keys = "`--channel green`; in a project `channel: green` under `pictures`"
+            remedy = f"name the channel to measure in ({keys}), or store the sensor's raw values"
             raise InputError(what, where=str(path), allowed="one grey channel", remedy=remedy)
         array = array[:, :, CHANNELS[channel]]
     if array.dtype.kind == "f" and array.ndim == 2:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 )
 @click.option("--target", default="", help="Target, e.g. disc:diameter=7,blur=0.7,peak=0.6")
 @click.option("--estimator", default="", help="Estimator, e.g. soft_threshold:sigma=3,window=13")
-@click.option("--calibration", type=click.Path(path_type=Path), help="Results of `pixmetry calibrate` (folder or its calibration.json): positions are corrected.")
+@click.option("--calibration", type=click.Path(path_type=Path), help="Results of `pixmetry calibrate`: positions are corrected.")
 @click.option("--trials", type=click.IntRange(200, 10_000_000), default=4000, show_default=True, help="Windows for each Monte Carlo.")
 @click.option("--seed", type=click.IntRange(0), default=1, show_default=True, help="Of the Monte Carlo.")
 @click.option("--threads", type=click.IntRange(1), help="Default: all processors.")

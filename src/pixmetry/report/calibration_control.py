@@ -18,7 +18,7 @@ def control_points(calibration: Calibration) -> list[list[str]]:
     rows = [_left_out(record) for record in _gross(calibration) if record.get("left_out")]
     for k in range(len(control)):
         number = uncertain(float(control.given[k]), float(control.u[k]), network.unit)
-        name = f"{network.points[control.point[k]]}, {'XYZ'[control.axis[k]]}"
+        name = f"{network.points[control.point[k]]} {'XYZ'[control.axis[k]]}"
         rows.append([name, number.value, f"± {number.u}", _two_digits(control.residual[k]), fixed(float(control.ratio[k]), 1)])
     return rows
 

@@ -132,7 +132,7 @@ def sigma0_text(calibration: Calibration) -> str:
 
 def _scatter(record: Mapping[str, Any], *, known: bool) -> str:
     text = f"image coordinates scatter by {_with_u(record, 'x')} in x and {_with_u(record, 'y')} in y"
-    if record.get("common"):
+    if record.get("common") and record.get("by_axis", True):
         text += " (estimated in common: the images do not agree on a difference)"
     if not known:
         return f"{text}, by their residuals: no covariance of the image coordinates was given"
