@@ -34,6 +34,7 @@ def test_a_file_of_a_calibration_enters_twin_report_and_budget(tmp_path: Path) -
     ran = CliRunner().invoke(main, ["assess", "-o", str(tmp_path / "out"), "--trials", "200", "--calibration", str(file.parent)])
     assert ran.exit_code == 0, ran.output
     assert "calibrated" in ran.output and "Lens distortion" in ran.output
+    assert "780 × 582 pixels, the frames have 160 × 160" in " ".join(ran.output.split())
     twin = load_camera(tmp_path / "out" / "camera.yaml")
     assert twin[LENS].params.k1_per_mm2 == pytest.approx(-2e-3, rel=0.1)
     assert "calibration.json" in (tmp_path / "out" / "results.json").read_text()

@@ -94,7 +94,8 @@ def assess(
     geometry = None if calibration is None else _geometry_for(frames, calibration)
     told = progress or (lambda what, done, of: None)
     hashes, seen = observe_campaign(frames, told)
-    seen = replace(seen, geometry=geometry)
+    told_of_frames = _other_frames(calibration, seen) if isinstance(calibration, Path) else ()
+    seen = replace(seen, geometry=geometry, notes=(*seen.notes, *told_of_frames))
     if isinstance(calibration, Path):
         hashes.add_file(calibration)
     standard = by_the_standard(frames, seen)
@@ -136,6 +137,17 @@ def _geometry_for(campaign: Campaign, calibration: str | Path | CameraGeometry) 
         remedy = "give the calibration of this camera"
         raise InputError("a calibration with another pixel pitch", where=str(calibration), value=theirs, allowed=str(ours), remedy=remedy)
     return geometry
+
+
+def _other_frames(calibration: Path, seen: Observations) -> tuple[str, ...]:
+    """A note where the frames are not of the size that was calibrated: a window of them, or another camera's."""
+    from pixmetry.calibration_record import stored_cameras
+
+    stack, sensor = seen.bright_stack or seen.dark_stack, stored_cameras(calibration)[0].sensor
+    if stack is None or stack.shape == (sensor.rows, sensor.cols):
+        return ()
+    sizes = f"{sensor.cols} × {sensor.rows} pixels, the frames have {stack.shape[1]} × {stack.shape[0]}"
+    return (f"The calibration is of {sizes}: it holds for a window of that camera's frames, not for another camera or binned pixels.",)
 
 
 def write_results(assessment: Assessment, directory: str | Path) -> Path:

@@ -57,9 +57,10 @@ def unlisted(records, adjustment) -> np.ndarray:
     network = adjustment.network
     assert all(np.isfinite([v for v in r.values() if isinstance(v, float)]).all() and r["statistic"] > r["critical"] for r in records)
     listed = {(r["image"], r["point"]) for r in records}
-    names = [(network.images[i], network.points[k]) for i, k in zip(network.image, network.point, strict=True)]
-    assert not any(name in listed and used for name, used in zip(names, adjustment.used, strict=True))
-    return np.array([k for k, name, used in zip(network.point, names, adjustment.used, strict=True) if not used and name not in listed], int)
+    names = zip((network.images[i] for i in network.image), (network.points[k] for k in network.point), strict=True)
+    has_record = np.array([name in listed for name in names])
+    assert not (has_record & adjustment.used).any()
+    return network.point[~adjustment.used & ~has_record]
 
 
 def assert_every_ray_left_out_is_listed(records, adjustment) -> None:

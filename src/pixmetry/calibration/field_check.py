@@ -10,6 +10,7 @@ import numpy as np
 from pixmetry.calibration.hold_out import hold_out_record, left_out
 from pixmetry.calibration.network import Adjustment, Finding, Network
 from pixmetry.calibration.quality import p_words
+from pixmetry.calibration.resection import similarity
 from pixmetry.core.errors import InputError, MeasureError
 
 LEAST_FIELD = 6  # fixed points: with fewer there is little to tell of a field
@@ -112,17 +113,6 @@ def _given_coordinates(fixed: Adjustment, free: Adjustment) -> tuple[float, tupl
     dof = (fixed.dof - free.dof, free.dof)
     f = max(squares[0] - squares[1], 0.0) / dof[0] / (squares[1] / dof[1])
     return float(f), dof, float(stats.f.sf(f, *dof))
-
-
-def similarity(points: np.ndarray, onto: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Scale s, rotation R and shift t with least squares of s R x + t − y (Umeyama, IEEE PAMI 13 (1991) 376–380)."""
-    centre, aim = points.mean(axis=0), onto.mean(axis=0)
-    a, b = points - centre, onto - aim
-    left, values, right = np.linalg.svd(b.T @ a)
-    turn = np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
-    rotation = left @ turn @ right
-    scale = float((values * np.diag(turn)).sum() / (a**2).sum())
-    return scale, rotation, aim - scale * rotation @ centre
 
 
 def _axes(nominal: np.ndarray) -> tuple[np.ndarray, bool]:

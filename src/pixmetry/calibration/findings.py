@@ -164,7 +164,7 @@ def known_findings(known: Mapping[str, Any], unit: str) -> list[Finding]:
             found.append(Finding(f"gross_{noun.replace(' ', '_')}", text, advice, "warning"))
         group, factor = record["group"], record.get("understated")
         if factor:
-            text = f"The {noun}s miss the network by about {factor:.2g} times what their stated uncertainties say; they were raised by this."
+            text = f"The {noun}s miss the network by about {factor:.2g} times their stated uncertainties, which were raised by this."
             found.append(Finding("known_uncertainty", text, "State their uncertainties anew.", "warning"))
         elif group and group["p"] < RARE and not record["gross"]:
             text = f"The {noun}s scatter {np.sqrt(group['factor']):.2g} times as much as their stated uncertainties say."

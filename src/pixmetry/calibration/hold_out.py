@@ -9,7 +9,7 @@ import numpy as np
 
 from pixmetry.calibration.added_terms import derivatives, whitening
 from pixmetry.calibration.network import SCALE, SHIFT, Adjustment, Network, State
-from pixmetry.calibration.quality import p_words
+from pixmetry.calibration.quality import p_fall, p_words
 from pixmetry.core.errors import InputError
 
 STEPS = 30
@@ -226,7 +226,9 @@ def hold_out_record(fixed: LeftOut | None, free: LeftOut | None = None) -> dict[
         raise ValueError("neither fixed nor free")
     common = np.logical_and.reduce([np.isfinite(part.residual_px).all(axis=1) for part in given])
     fixed_record, free_record = (None if part is None else _rms_record(part, common) for part in (fixed, free))
-    p = None if fixed is None or free is None else _fall(fixed, free, common)
+    p = None
+    if fixed is not None and free is not None:
+        p = p_fall(fixed.residual_px[common], free.residual_px[common], fixed.image[common])
     words = []
     for name, record in (("points as given", fixed_record), ("points free", free_record)):
         if record is not None:
@@ -240,12 +242,3 @@ def hold_out_record(fixed: LeftOut | None, free: LeftOut | None = None) -> dict[
 def _rms_record(part: LeftOut, common: np.ndarray) -> dict[str, float]:
     fit, left = (float(np.sqrt(np.mean(values[common] ** 2))) for values in (part.fit_px, part.residual_px))
     return {"fit_rms_px": fit, "left_out_rms_px": left}
-
-
-def _fall(fixed: LeftOut, free: LeftOut, common: np.ndarray) -> float:
-    from scipy import stats
-
-    sums = [np.bincount(fixed.image[common], np.sum(part.residual_px[common] ** 2, axis=1)) for part in (fixed, free)]
-    present = np.bincount(fixed.image[common]) > 0
-    change = np.log(sums[1][present] / sums[0][present])
-    return float(stats.ttest_1samp(change, 0.0, alternative="less").pvalue)

@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from pixmetry.calibration.known_residuals import Known, bar_residuals, contradicted, control_residuals
+from pixmetry.calibration.known_residuals import Known, bar_residuals, contradicted, control_residuals, group_record
 from pixmetry.calibration.network import Adjustment, Network, ScaleBars, State
 from pixmetry.calibration.snooping import Adjust, finest_factor
-from pixmetry.calibration.variance_components import MEDIAN_SQUARE, image_sigma0, scaled
+from pixmetry.calibration.variance_components import image_sigma0, scaled
 from pixmetry.core.errors import InputError
 
 LOOSE = 0.05  # uncertainty, as a part of the field's extent, with which a control point does not pull at the image coordinates
@@ -26,6 +26,7 @@ CONTROL_SHARE = 0.5  # of the points; more fixed ones are a test field
 ABSURD = 0.1  # a bar that is wrong by such a part of its length, as one in other units, is out before any adjustment with it
 LEAST_RAYS = 3  # rejected rays that condemn a fixed point, where they are more than half
 MOST_WRONG = 0.2  # part of the fixed points that can be wrong one by one
+WIDE = 2.0  # times what they seem to be, uncertainties are taken until gross errors are out
 MANY_WRONG = 1 / 3  # of the control points: it is rather their uncertainties that are wrong
 MOST = 20
 
@@ -117,22 +118,23 @@ def check_known(network: Network, clean: Adjustment, adjust: Adjust, *, stated: 
     size = max(sigma0**2, finest_factor(network))
     weights = scaled(network, np.full((len(network.cameras), 2), size))  # from now on sigma0 of the image coordinates is 1
     checked, state = _without_absurd(CheckedKnown(weights), clean.state)
-    left, at = _without_contradicted(checked, state, clean, adjust, dof)
-    out = len(left.gross["control_points"])
-    control = np.isfinite(weights.u_xyz) & (weights.u_xyz > 0)
+    left, adjustment = _without_contradicted(checked, state, clean, adjust, dof)
+    out, control = len(left.gross["control_points"]), np.isfinite(weights.u_xyz) & (weights.u_xyz > 0)
     if not stated or out <= MANY_WRONG * control.any(axis=1).sum():
-        return left, at
-    factor = _understatement(weights, clean)
-    raised = replace(weights, u_xyz=np.where(control, factor * weights.u_xyz, weights.u_xyz))
-    again, after = _without_contradicted(replace(checked, network=replace(checked.network, u_xyz=raised.u_xyz)), state, clean, adjust, dof)
-    if 2 * len(again.gross["control_points"]) > out:
-        return left, at  # with larger uncertainties they are wrong all the same
-    return replace(again, gross={**again.gross, "understated": [{"factor": factor}]}), after
+        return left, adjustment.state
+    factor = WIDE * _understatement(weights, clean)
+    again, adjustment = _without_contradicted(_raised(checked, factor), adjustment.state, clean, adjust, dof)
+    group = group_record(adjustment, control_residuals(adjustment))
+    if 2 * len(again.gross["control_points"]) > out or group is None:
+        return left, adjustment.state  # with larger uncertainties they are wrong all the same
+    better = float(np.sqrt(group["factor"]))
+    gross = {**again.gross, "understated": [{"factor": factor * better}]}
+    return replace(_raised(again, better), gross=gross), adjustment.state
 
 
 def _without_contradicted(
     checked: CheckedKnown, state: State, clean: Adjustment, adjust: Adjust, dof: float
-) -> tuple[CheckedKnown, State]:
+) -> tuple[CheckedKnown, Adjustment]:
     for _ in range(MOST):
         adjustment = adjust(checked.network, state, used=clean.used, redundancy=True)
         state = adjustment.state
@@ -144,14 +146,24 @@ def _without_contradicted(
         checked = _without(checked, known, record, is_bar=known is bars)
         if not checked.gross["scale_bars" if known is bars else "control_points"][-1]["left_out"]:
             break
-    return checked, state
+    return checked, adjustment
+
+
+def _raised(checked: CheckedKnown, factor: float) -> CheckedKnown:
+    u = checked.network.u_xyz
+    return replace(checked, network=replace(checked.network, u_xyz=np.where(np.isfinite(u), factor * u, u)))
 
 
 def _understatement(network: Network, clean: Adjustment) -> float:
-    """What control points miss over what was stated, where they hardly pull at the network: from the middle of their coordinates."""
-    known = control_residuals(clean)
-    ratio = known.residual / network.u_xyz.ravel()[known.index]
-    return float(np.sqrt(np.median(ratio**2) / MEDIAN_SQUARE * len(ratio) / max(len(ratio) - 7, 1)))
+    """What the middle one of the control points is off by, where they hardly pull at the network, over what was stated."""
+    from scipy import stats
+
+    from pixmetry.calibration.resection import fitted
+
+    stated = np.isfinite(network.u_xyz).all(axis=1) & (network.u_xyz > 0).all(axis=1)
+    rows = np.flatnonzero(stated & np.isfinite(clean.state.xyz).all(axis=1))
+    away = fitted(clean.state.xyz[rows], network.xyz[rows])[3]
+    return float(np.sqrt(np.median(away**2 / np.mean(network.u_xyz[rows] ** 2, axis=1)) / stats.chi2.median(3)))
 
 
 def without_absurd_control(network: Network, state: State) -> tuple[Network, list[dict[str, Any]]]:

@@ -182,6 +182,21 @@ def p_words(p: float) -> str:
     return "p < 1e-6" if p < 1e-6 else f"p = {p:.2g}"
 
 
+def p_fall(before: np.ndarray, after: np.ndarray, image: np.ndarray) -> float:
+    """How often chance alone lets residuals fall so much: one-sided t-test on the logarithms of the images' mean squares, paired.
+
+    Parameters
+    ----------
+    before, after : ndarray, shape (n, 2)
+    image : ndarray of int, shape (n,)
+    """
+    from scipy import stats
+
+    sums = [np.bincount(image, np.sum(part**2, axis=1)) for part in (before, after)]
+    present = sums[0] > 0
+    return float(stats.ttest_1samp(np.log(sums[1][present] / sums[0][present]), 0.0, alternative="less").pvalue)
+
+
 def f_test(variance_x: float, variance_y: float, dof_x: float, dof_y: float) -> tuple[float, float, float]:
     """One-sided F-test whether x is noisier than y.
 

@@ -14,6 +14,7 @@ import numpy as np
 FEWEST = 4  # points from which an image is posed: three determine it, a fourth selects among the answers
 FLAT = 0.02  # thickness by extent below which points count as a plane
 RIGHT_SHARE = 0.6  # of an image's points that must fit
+TRIPLES = 30  # of points, one of which is right with near certainty while no more than a third of the points is wrong
 SMALLEST_SPREAD = 1 - np.cos(np.deg2rad(1.5))  # of rays to a point: 1.5° between two of them
 
 
@@ -182,12 +183,14 @@ def _summed(index: np.ndarray, size: int, values: np.ndarray) -> np.ndarray:
     return np.stack([np.bincount(index, column, size) for column in values.T], axis=1)
 
 
-def similarity(source: np.ndarray, target: np.ndarray, weight: np.ndarray, *, scaled: bool = True) -> tuple[float, np.ndarray, np.ndarray]:
+def similarity(
+    source: np.ndarray, target: np.ndarray, weight: np.ndarray | None = None, *, scaled: bool = True
+) -> tuple[float, np.ndarray, np.ndarray]:
     """Scale, rotation and shift that take points to others in least squares: target = scale · R source + shift.
 
     S. Umeyama, IEEE PAMI 13 (1991) 376–380.
     """
-    w = weight / weight.sum()
+    w = np.full(len(source), 1 / len(source)) if weight is None else weight / weight.sum()
     a, b = source - w @ source, target - w @ target
     left, values, right = np.linalg.svd((b * w[:, None]).T @ a)
     sign = np.array([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
@@ -197,11 +200,24 @@ def similarity(source: np.ndarray, target: np.ndarray, weight: np.ndarray, *, sc
 
 
 def fitted(source: np.ndarray, target: np.ndarray, *, scaled: bool = True) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
-    """`similarity` by iteratively reweighted least squares against wrong points, with the distances that remain."""
-    weight = np.ones(len(source))
+    """`similarity` by iteratively reweighted least squares against wrong points, and the distances that remain.
+
+    It begins with all points or with three, whatever leaves the least median: far points with exchanged names would turn all of them.
+    """
+    from pixmetry.core.random import generator
+
+    starts, rng = [np.ones(len(source))], generator(0, "similarity")
+    if len(source) > 3:
+        starts += [np.isin(np.arange(len(source)), rng.choice(len(source), 3, replace=False)).astype(float) for _ in range(TRIPLES)]
+    weight = min(starts, key=lambda start: float(np.median(_distances(source, target, similarity(source, target, start, scaled=scaled)))))
     for _ in range(15):
         scale, rotation, shift = similarity(source, target, weight, scaled=scaled)
-        left = np.linalg.norm(target - scale * source @ rotation.T - shift, axis=1)
+        left = _distances(source, target, (scale, rotation, shift))
         spread = max(1.5 * float(np.median(left)), 1e-12 * float(np.abs(target).max()), 1e-300)
         weight = 1 / (1 + (left / spread) ** 2)
     return scale, rotation, shift, left
+
+
+def _distances(source: np.ndarray, target: np.ndarray, by: tuple[float, np.ndarray, np.ndarray]) -> np.ndarray:
+    scale, rotation, shift = by
+    return np.linalg.norm(target - scale * source @ rotation.T - shift, axis=1)

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from pixmetry.calibration.network import Adjustment, Network
+from pixmetry.calibration.quality import p_fall
 from pixmetry.core.threads import single_threaded_blas
 
 POINTS_PER_NODE = 12  # more nodes than the data carry alone: the penalty smooths, and bilinear cells stay small
@@ -62,7 +63,7 @@ def residual_grids(
         with single_threaded_blas():
             left = {penalty: _left_out(hats, v, roughness, penalty, fold) for penalty in PENALTIES}
         penalty = min(PENALTIES, key=lambda value: float(np.sum(left[value] ** 2)))
-        p = _fall(v, left[penalty], image)
+        p = min(1.0, len(PENALTIES) * p_fall(v, left[penalty], image))  # over all smoothings tried (Bonferroni)
         if p < LEVEL:
             record = _fitted(hats, v, roughness, penalty, shape)
             rms = {"rms_without_px": float(np.sqrt(np.mean(v**2))), "rms_with_px": float(np.sqrt(np.mean(left[penalty] ** 2)))}
@@ -122,16 +123,6 @@ def _left_out(hats: Any, v: np.ndarray, roughness: np.ndarray, penalty: float, f
         values, _ = _solved(hats[~mine], v[~mine], roughness, penalty)
         out[mine] = v[mine] - hats[mine] @ values
     return out
-
-
-def _fall(before: np.ndarray, after: np.ndarray, image: np.ndarray) -> float:
-    """One-sided t-test of the images' mean squares, paired, on their logarithms; over all smoothings tried (Bonferroni)."""
-    from scipy import stats
-
-    sums = [np.bincount(image, np.sum(part**2, axis=1)) for part in (before, after)]
-    present = sums[0] > 0
-    change = np.log(sums[1][present] / sums[0][present])
-    return float(min(1.0, len(PENALTIES) * stats.ttest_1samp(change, 0.0, alternative="less").pvalue))
 
 
 def _fitted(hats: Any, v: np.ndarray, roughness: np.ndarray, penalty: float, shape: tuple[int, int]) -> dict[str, Any]:

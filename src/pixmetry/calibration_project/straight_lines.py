@@ -57,9 +57,7 @@ def lines_of_table(table: Table, camera: CameraModel, given: ImageCoordinates, u
     line, image = table.texts("line"), table.texts("image")
     numbered = {**table.columns, "point": [str(row) for row in range(len(table))]}  # every row is a point of its own
     seen = measured(Table(table.source, numbered, table.lines), None, [camera], given, u_px)
-    return LinePositions(
-        np.array(image), np.array(line), seen.x_px, seen.y_px, seen.covariance_px2 if seen.covariance_known else None
-    )
+    return LinePositions(np.array(image), np.array(line), seen.x_px, seen.y_px, seen.covariance_px2 if seen.covariance_known else None)
 
 
 def lines_of_pictures(
