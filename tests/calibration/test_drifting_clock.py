@@ -1,6 +1,6 @@
 """A frame grabber that warms up, end to end: frames of a plate through the chain, located, and calibrated with a scale of x per image.
 
-Twelve views within an hour after switching on; the sampling clock is 0.71 % off at first and settles with a time constant of 820 s, locked
+Eight views within an hour after switching on; the sampling clock is 0.71 % off at first and settles with a time constant of 820 s, locked
 10.5 µs before the first sample (grabber.clock_warm_up). The oracle is the source that made the frames.
 """
 
@@ -22,10 +22,10 @@ from pixmetry.scene.plates import Pose, dot_plate
 from pixmetry.scene.uniform import Uniform
 
 ERROR, TAU_S, LOCK_US = 0.0071, 820.0, 10.5
-TIMES_S = np.linspace(0, 3600, 12)
+TIMES_S = np.linspace(0, 3600, 8)
 TILTS = ((25, 0, 0), (-25, 0, 90), (0, 25, 0), (0, -25, 90), (20, 20, 45), (-20, 20, 180), (20, -20, 270), (12, 12, 90))
 SAMPLE_PX = 1.41875  # pixels of the camera per sample at 10 MHz
-SIDE, PITCH_MM, DOT_MM = 11, 18.0, 5.0
+SIDE, PITCH_MM, DOT_MM = 9, 22.0, 5.0
 STEPS = (np.arange(SIDE) - SIDE // 2) * PITCH_MM
 FIELD = np.column_stack([*(v.ravel() for v in np.meshgrid(STEPS, STEPS)), np.zeros(SIDE**2)])
 
@@ -72,7 +72,7 @@ def test_without_a_scale_per_image_the_report_names_the_pattern(network: Network
 
 
 def test_with_one_the_residuals_are_noise_and_the_clock_is_found(network: Network) -> None:
-    """Scales against those of the clock: χ² of 12 images less one, failing by chance once in a million; an error of 5 u is seen.
+    """Scales against those of the clock: χ² of the images less one, failing by chance once in a million; an error of 5 u is seen.
 
     The uncertainty of a target by its own covariance is right to 20 % (the chain has errors that are not noise: fields, dark signal).
     """

@@ -369,13 +369,29 @@ def test_one_bad_image_is_named_and_no_drift_is_made_of_it(rng):
     assert not {"x_scale_drift", "x_scale_by_image", "x_shift_by_image"} & set(kinds(calibration))
 
 
-def test_a_camera_that_is_held_is_no_trouble(rng):
+@pytest.mark.filterwarnings("error")
+def test_a_camera_that_is_held_and_one_without_images_are_no_trouble(rng, tmp_path):
+    """Through records, page, file and summary; for the second camera nothing is said but that it took no part."""
+    from pixmetry.calibration_record import json_text, read_calibration
+    from pixmetry.report.calibration_page import render
+    from pixmetry.report.calibration_text import summary_text
+
     simulated = simulate(rng, images=10, points=40)
     truth = simulated.truth.interior[0]
     camera = replace(simulated.network.cameras[0], values=truth.copy(), free=np.zeros(len(NAMES), bool))
-    calibration = calibrate_network(replace(simulated.network, cameras=(camera,)), QUICK)
+    spare = replace(simulated.network.cameras[0], name="spare")
+    calibration = calibrate_network(replace(simulated.network, cameras=(camera, spare)), Options(residual_grid=True))
     np.testing.assert_array_equal(calibration.adjustment.state.interior[0], truth)
-    assert calibration.tests["parameters"] == []
+    assert calibration.tests["parameters"] == [] and calibration.tests["residuals"]["spare"]["n"] == 0
+    assert (calibration.tests["projection"]["camera"]["u_px"] == 0).all()
+    said = summary_text(calibration)
+    assert said.count("fixed") == len(NAMES) - 2 and "is imaged" not in said  # k4 and k5 are 0
+    assert "spare: No image coordinate of this camera took part." in said
+    assert "No image coordinate of this camera took part" in render(calibration)
+    path = tmp_path / "calibration.json"
+    path.write_text(json_text(calibration), encoding="utf-8")
+    stored = read_calibration(path)
+    np.testing.assert_array_equal(stored.cameras[0].values, truth)
 
 
 def test_a_wrong_control_point_is_set_free(rng):

@@ -298,7 +298,7 @@ def _check_camera(adjustment: Adjustment, k: int) -> list[Finding]:
             value = f"u(c)/c = {u['c'] / c:.2g}, correlation of c with the distances {r:+.6f}"
             remedy = "add images tilted by 30° to 60° against the plane, or points that differ in depth"
             if u["c"] > 25 * POOR_C * c:
-                raise MeasureError("the principal distance is not determined", where=camera.name, value=value, remedy=remedy)
+                raise MeasureError("the principal distance c is not determined", where=camera.name, value=value, remedy=remedy)
             text = f"the principal distance of {camera.name} is badly determined: {value}"
             findings.append(Finding("correlation", text, remedy, "warning"))
     for name, axis in (("xp", 0), ("yp", 1)):

@@ -34,7 +34,8 @@ class Options:
         Number of good image points that may be expected to be rejected in one adjustment, above 0.
     variance_components : bool
         Estimate the standard deviations of x and of y of each camera, and weigh by them: what image coordinates scatter beyond covariances
-        that they came with is added to these; smaller or guessed ones are multiplied.
+        that they came with is added to these; smaller or guessed ones are multiplied. Without it, covariances keep their ratios; beside
+        scale bars or control points, which stand as stated, they get one common factor.
     eccentricity : bool
         Correct the images of targets whose size is known.
     target : {"circle", "square"}

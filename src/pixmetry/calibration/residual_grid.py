@@ -7,12 +7,11 @@ decided by images that were left out of the fit.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from pixmetry.calibration.network import Adjustment, Network
+from pixmetry.calibration.network import Adjustment
 from pixmetry.calibration.quality import p_fall
 from pixmetry.core.threads import single_threaded_blas
 
@@ -155,13 +154,16 @@ def at(grid: dict[str, Any], x_px: np.ndarray, y_px: np.ndarray) -> tuple[np.nda
     return dx, dy
 
 
-def without_grid(network: Network, grids: dict[str, dict[str, Any]]) -> Network:
-    """The network with its image coordinates corrected by the grids of its cameras."""
-    x, y = network.x_px.copy(), network.y_px.copy()
-    for k, camera in enumerate(network.cameras):
-        if camera.name in grids:
-            rows = network.camera_of[network.image] == k
-            dx, dy = at(grids[camera.name], network.x_px[rows], network.y_px[rows])
-            x[rows] -= dx
-            y[rows] -= dy
-    return replace(network, x_px=x, y_px=y)
+def corrected(grid: dict[str, Any], x_px: np.ndarray, y_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Image coordinates corrected by the grid of their camera, as they were measured less what the grid says: what the parameters of the
+    camera then stand for.
+
+    Parameters
+    ----------
+    grid : dict
+        As from `residual_grids`, or out of ``grids`` of a calibration, stored or not.
+    x_px, y_px : ndarray
+        Of one shape.
+    """
+    dx, dy = at(grid, x_px, y_px)
+    return np.asarray(x_px, float) - dx, np.asarray(y_px, float) - dy

@@ -40,6 +40,7 @@ class Settled:
     given_px2 : ndarray, shape (n, 3)
         Covariances of the image coordinates before they were weighted.
     rejected : Rejected
+        What image points that are out were rejected for.
     """
 
     measured: Network
@@ -184,8 +185,10 @@ def _without_gross_errors(
     adjust = adjust_with(options)
     if not options.snoop:
         return adjust(network, state, used=used, redundancy=True)
-    how = {"loss": loss, "loss_scale": options.loss_scale, "false_alarms": options.false_alarms}
-    return remove_gross_errors(network, state, adjust, used=used, rejected=rejected, **how).adjustment
+    scale, alarms = options.loss_scale, options.false_alarms
+    return remove_gross_errors(
+        network, state, adjust, used=used, loss=loss, loss_scale=scale, false_alarms=alarms, rejected=rejected
+    ).adjustment
 
 
 def _weighted(

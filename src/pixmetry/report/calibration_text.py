@@ -85,7 +85,7 @@ def projection_levels(projection: Mapping[str, Any] | None) -> tuple[float, floa
         return None
     u = np.asarray(projection["u_px"], float)
     middle, corners = u[u.shape[0] // 2, u.shape[1] // 2], u[[0, 0, -1, -1], [0, -1, 0, -1]]
-    if not (np.isfinite(middle) and np.isfinite(corners).any()):
+    if not (np.isfinite(middle) and np.isfinite(corners).any()) or not np.nanmax(u) > 0:  # 0: nothing of the camera was estimated
         return None
     return float(middle), float(np.nanmax(corners))
 
@@ -133,7 +133,7 @@ def sigma0_text(calibration: Calibration) -> str:
 def _scatter(record: Mapping[str, Any], *, known: bool) -> str:
     text = f"image coordinates scatter by {_with_u(record, 'x')} in x and {_with_u(record, 'y')} in y"
     if record.get("common") and record.get("by_axis", True):
-        text += " (estimated in common: the images do not agree on a difference)"
+        text += " (estimated in common: the images do not agree that x and y differ)"
     if not known:
         return f"{text}, by their residuals: no covariance of the image coordinates was given"
     if "given_x_px" not in record:
