@@ -1,13 +1,12 @@
-"""The line-jitter experiment of the handbook in full: 54 frames for each of five jitters; stores what docs/handbook/line-jitter.md shows.
+"""The line-jitter experiment of the handbook in full: 54 frames for each of five jitters.
 
-python benchmarks/study_line_jitter.py [FILE]
+``python benchmarks/study_line_jitter.py`` prints it; with ``--store`` it also replaces the numbers that docs/handbook/line-jitter.md shows.
 """
 
 from __future__ import annotations
 
 import sys
 import time
-from pathlib import Path
 
 from pixmetry.handbook import line_jitter
 
@@ -16,8 +15,8 @@ def main() -> None:
     """Run, print the residual table and the jitters found, and store them."""
     start = time.process_time(), time.perf_counter()
     experiment = line_jitter.run(progress=lambda text: print(f"  {text} … {time.perf_counter() - start[1]:.0f} s", flush=True))
-    path = Path(sys.argv[1]) if len(sys.argv) > 1 else line_jitter.STORED
-    line_jitter.write(experiment, path)
+    if "--store" in sys.argv[1:]:
+        line_jitter.write(experiment, line_jitter.STORED)
     print(f"gain of a delay: {', '.join(f'{g:.3f}' for g in experiment.gains)}")
     for level in experiment.levels:
         test = level.f_test
@@ -26,7 +25,7 @@ def main() -> None:
         for way, found in level.jitters(experiment.gain).items():
             e = found["jitter_ns"]
             print(f"    {way:9s} {'below ' if e.kind == 'upper_limit' else ''}{e.value:.3f} ns, u {e.u:.3f} ns {e.reason}")
-    print(f"{time.process_time() - start[0]:.0f} s of one core, {time.perf_counter() - start[1]:.0f} s; {path}")
+    print(f"{time.process_time() - start[0]:.0f} s of one core, {time.perf_counter() - start[1]:.0f} s")
 
 
 if __name__ == "__main__":

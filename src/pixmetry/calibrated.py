@@ -30,7 +30,7 @@ def calibrated_geometry(
     Parameters
     ----------
     calibration : path, StoredCalibration, Calibration or CameraGeometry
-        A ``calibration.json``, or what was read or calibrated.
+        A ``calibration.json`` or the folder that holds it, or what was read or calibrated.
     camera : str, optional
         Name of the camera; may be left out if there is one.
     pitch_um : (float, float), optional
@@ -58,7 +58,8 @@ def calibrated_geometry(
         covariances = [calibration.interior_covariance(k) for k in range(len(models))]
     names = [m.name for m in models]
     if camera is None and len(names) > 1 or camera is not None and camera not in names:
-        raise InputError("which camera of the calibration is not clear", value=camera, allowed=", ".join(names))
+        remedy = "name it from Python: assess(…, calibration=calibrated_geometry(file, NAME))"
+        raise InputError("which camera of the calibration is not clear", value=camera, allowed=", ".join(names), remedy=remedy)
     k = 0 if camera is None else names.index(camera)
     record, grid = calibration.tests["residuals"][names[k]], calibration.tests["projection"][names[k]]
     if not record["n"]:

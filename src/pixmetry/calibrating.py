@@ -227,7 +227,8 @@ def _refuse_pictures(pictures: Mapping[str, Any], what: str) -> None:
 
 
 def _listed(names: Sequence[str] | str) -> tuple[str, ...]:
-    return tuple(names.replace(",", " ").split()) if isinstance(names, str) else tuple(names)
+    listed = tuple(names.replace(",", " ").split()) if isinstance(names, str) else tuple(names)
+    return tuple(name for name in listed if name != "none")
 
 
 def _changed(network: Network, free: Sequence[str] | str | None, per_image: Sequence[str] | str | None) -> Network:

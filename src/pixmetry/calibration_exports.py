@@ -66,6 +66,7 @@ def write_exports(models: Iterable[CameraModel], opencv: Path | None, colmap: Pa
     if unknown is not None:
         remedy = "calibrate with a test field, or give c_mm or c_px"
         raise InputError("cannot be exported without a principal distance, which straight lines do not tell", where=unknown, remedy=remedy)
+    places = _opencv_places(cameras, opencv)
     lines, told = [], []
     for k, model in enumerate(cameras):
         if opencv is not None:
@@ -76,13 +77,22 @@ def write_exports(models: Iterable[CameraModel], opencv: Path | None, colmap: Pa
             told.append(_sentence(colmap, f"{model.name} as camera {k + 1}, {kind}", lost))
     if colmap is not None:
         colmap.write_text(f"{COLMAP_HEAD}# Number of cameras: {len(cameras)}\n{''.join(lines)}", encoding="utf-8", newline="\n")
-    for model in cameras if opencv is not None else ():
-        assert opencv is not None
-        own = re.sub(r"[^A-Za-z0-9._-]+", "_", model.name)
-        path = opencv if len(cameras) == 1 else opencv.with_name(f"{opencv.stem}-{own}{opencv.suffix}")
+    for model, path in zip(cameras, places, strict=False):
         write_opencv(model, path, may_lose_px)
         told.append(_sentence(path, f"{model.name} for OpenCV", converted(model, "object_to_image", OPENCV).largest_px))
     return told
+
+
+def _opencv_places(cameras: list[CameraModel], opencv: Path | None) -> list[Path]:
+    """The file of each camera; of several, its name stands before the ending."""
+    if opencv is None or len(cameras) == 1:
+        return [] if opencv is None else [opencv]
+    owns = [re.sub(r"[^A-Za-z0-9._-]+", "_", model.name) for model in cameras]
+    twice = next((own for own in owns if owns.count(own) > 1), None)
+    if twice is not None:
+        remedy = "give the cameras names that differ in letters and digits"
+        raise InputError("would be the file of two cameras", where=f"{opencv.stem}-{twice}{opencv.suffix}", remedy=remedy)
+    return [opencv.with_name(f"{opencv.stem}-{own}{opencv.suffix}") for own in owns]
 
 
 def _simplest(model: CameraModel) -> tuple[str, float]:

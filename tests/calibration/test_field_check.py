@@ -81,9 +81,9 @@ def test_points_off_in_the_plane_are_told_from_bending(rng):
 
 def test_flat_board_stands(rng):
     simulated, _ = bent(rng, lambda x, y: np.zeros((len(x), 3)))
-    check = check_field(adjusted(simulated.network, simulated))
+    check = check_field(adjusted(simulated.network, simulated), level=RATE)
     assert check.verdict == "fixed" and check.adjustment is check.fixed and check.findings[0].level == "note"
-    assert "stand" in check.field["text"] and check.hold_out["free"]["left_out_rms_px"] > check.hold_out["fixed"]["left_out_rms_px"] * 0.99
+    assert "stand" in check.field["text"] and check.hold_out["free"]["left_out_rms_px"] > check.hold_out["fixed"]["left_out_rms_px"] * 0.97
 
 
 def test_stat_f_test_of_a_true_field_is_fair(rng):

@@ -57,7 +57,7 @@ def test_photon_transfer_bends_and_neighbours_are_correlated():
     assert abs(out.var() / (mean * (own**2 + 4 * side**2)) - 1) < Z * math.sqrt(2 / n) + 1e-3
     pair = (out[:, :, 1:] * out[:, :, :-1]).mean()
     assert abs(pair - mean * 2 * own * side) < Z * mean / math.sqrt(n) + 0.002 * pair
-    assert out.var() == pytest.approx(mean - loss * mean**2, rel=0.01)
+    assert out.var() == pytest.approx(mean - loss * mean**2, rel=0.013)  # 5 a² = 0.8 % beyond the first order, and Z √(2/n)
 
 
 def test_inversion_brings_the_charge_back_in_electrons_only():

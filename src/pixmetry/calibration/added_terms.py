@@ -128,7 +128,7 @@ class AddedTerms:
         self._white = whitening(network.covariance_px2[self.rows]) * np.sqrt(adjustment.weight[self.rows])[:, None, None]
         self._residual = self._whitened(adjustment.residual_px[self.rows])
         d = derivatives(network, state)
-        self._cameras, self._points = self._designs(network, state, d)
+        self._cameras, self._points = self._designs(network, d)
         self._factorise(network, state)
 
     def test(self, terms: Any, combinations: np.ndarray | None = None) -> Terms:
@@ -175,7 +175,7 @@ class AddedTerms:
     def _whitened(self, values: np.ndarray) -> np.ndarray:
         return np.einsum("nij,nj->ni", self._white, values).ravel()
 
-    def _designs(self, network: Network, state: State, d: Derivatives) -> tuple[Any, Any]:
+    def _designs(self, network: Network, d: Derivatives) -> tuple[Any, Any]:
         """Whitened derivatives by cameras and images, and by points, as sparse matrices of 2 m rows."""
         from scipy import sparse
 
@@ -198,9 +198,9 @@ class AddedTerms:
         total = column + len(network.images) * len(kinds)
         # x-scales and x-shifts of a camera were estimated with mean 0: as observations of their sum
         seen = np.isin(np.arange(len(network.images)), image)
-        mine = [np.flatnonzero(seen & (network.camera_of == k)) for k in range(len(network.cameras))]
+        by_owner = [np.flatnonzero(seen & (network.camera_of == k)) for k in range(len(network.cameras))]
         places = [place for place, kind in enumerate(kinds) if kind in (SCALE, SHIFT)]
-        self._summing_to_zero = [column + images * len(kinds) + place for images in mine for place in places if len(images)]
+        self._summing_to_zero = [column + images * len(kinds) + place for images in by_owner for place in places if len(images)]
         by_camera = sparse.csr_matrix(_stacked(entries), shape=(2 * m, total))
         by_point = np.where((network.u_xyz[point] > 0)[:, None, :], d.by_point[rows], 0.0)
         columns = np.broadcast_to(3 * point[:, None, None] + np.arange(3), by_point.shape)

@@ -228,8 +228,9 @@ class Calibration:
     findings : tuple of Finding
         What the reader must know, most important first.
     tests : mapping
-        Plain records by name: ``f_test``, ``variance_components``, ``gross_errors``, ``hold_out``, ``flatness``, ``patterns``,
-        ``correlations``, ``significance`` …; see the modules that make them.
+        Plain records by name: ``parameters``, ``vision``, ``correlations``, ``residuals``, ``f_test``, ``variance_components``,
+        ``gross_errors``, ``hold_out``, ``field``, ``patterns``, ``images``, ``curves``, ``projection``, ``network``, ``known`` …; see
+        `pixmetry.calibration.records` and the modules that it calls.
     grids : mapping
         Residual correction grids by camera name.
     provenance : mapping

@@ -367,7 +367,8 @@ def _rejected(seen: _Seen, most: float) -> tuple[np.ndarray, np.ndarray]:
     rows &= network.camera_of[network.image] == seen.camera
     white = np.einsum("nij,nj->ni", whitening(network.covariance_px2[rows]), seen.adjustment.residual_px[rows])
     squares, count = np.minimum(white**2, most**2).sum(axis=1), np.full(rows.sum(), 2.0)
-    return tuple(np.bincount(network.image[rows], values, len(network.images)) for values in (squares, count))
+    image, images = network.image[rows], len(network.images)
+    return np.bincount(image, squares, images), np.bincount(image, count, images)
 
 
 def _image_rms(seen: _Seen, images: np.ndarray) -> dict[str, Any]:

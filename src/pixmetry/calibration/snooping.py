@@ -76,14 +76,11 @@ class Snooped:
     adjustment : Adjustment
     alpha : float
         Level of each test.
-    passes : int
-        Adjustments that this took.
     rejected : Rejected
     """
 
     adjustment: Adjustment
     alpha: float
-    passes: int
     rejected: Rejected
 
 
@@ -158,12 +155,11 @@ def remove_gross_errors(
     rejected = rejected or Rejected.none(len(network))
     rejected.forget(used)
     alpha = false_alarms / max(len(network), 1)
-    passes, state = 0, start
+    state = start
     if loss != "none":
         robust = adjust(network, start, loss=loss, loss_scale=loss_scale, used=used, covariance=False)
-        used, state, passes = _without_large(robust, alpha, rejected), robust.state, 1
-    adjustment, done = _reject(network, state, adjust, used, alpha, rejected)
-    passes += done
+        used, state = _without_large(robust, alpha, rejected), robust.state
+    adjustment = _reject(network, state, adjust, used, alpha, rejected)
     barred = np.zeros(len(network), bool)
     for _ in range(RETURNS):
         back = _passing(adjustment, alpha) & ~barred
@@ -171,9 +167,8 @@ def remove_gross_errors(
             break
         barred |= back  # whoever is rejected a second time stays out
         rejected.forget(back)
-        adjustment, done = _reject(network, adjustment.state, adjust, adjustment.used | back, alpha, rejected)
-        passes += done
-    return Snooped(adjustment, alpha, passes, rejected)
+        adjustment = _reject(network, adjustment.state, adjust, adjustment.used | back, alpha, rejected)
+    return Snooped(adjustment, alpha, rejected)
 
 
 def gross_error_records(adjustment: Adjustment, alpha: float, rejected: Rejected | None = None) -> list[dict[str, Any]]:
@@ -225,7 +220,7 @@ def _swapped(network: Network, out: np.ndarray, residual_px: np.ndarray) -> dict
 
 def _reject(
     network: Network, state: State, adjust: Adjust, used: np.ndarray, alpha: float, rejected: Rejected
-) -> tuple[Adjustment, int]:
+) -> Adjustment:
     done, worst = 0, np.zeros(1, int)
     while len(worst) and done < PASSES:
         done += 1
@@ -237,7 +232,7 @@ def _reject(
         if done < PASSES:
             used[worst] = False
             rejected.note(worst, statistic=statistic, critical=inside, residual_px=adjustment.residual_px, error_px=error)
-    return adjustment, done
+    return adjustment
 
 
 def _passing(adjustment: Adjustment, alpha: float) -> np.ndarray:

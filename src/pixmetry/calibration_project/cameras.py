@@ -88,7 +88,7 @@ def described(entry: CameraEntry, reader: Reader, k: int, *, straight: bool = Fa
         pitch = pitch if pitch[0] is not None else (start.sensor.pitch_x_um, start.sensor.pitch_y_um)
     where = reader.where("cameras", k)
     if entry.c_mm is not None and pitch[0] is None:
-        remedy = "add `pitch_um: ...`, or give c_px"
+        remedy = "add `pitch_um: ...` (--pixel-um), or give c_px"
         raise InputError("c_mm, but no pitch", where=where, allowed="c_mm with pitch_um, or c_px", remedy=remedy)
     sensor = Sensor(cols or 1, rows or 1, *pitch)  # the size of pictures is told by themselves
     out = Described(_model(entry, sensor, start, straight, upwards), preset, start, where)

@@ -73,7 +73,8 @@ class CameraEntry(Model):
             raise InputError("the principal distance is given twice", allowed="c_mm or c_px", remedy="delete one of them")
         pitched = self.camera is not None or self.start_from is not None or self.pitch_um is not None or self.pitch_x_um is not None
         if self.c_mm is not None and not pitched:
-            raise InputError("c_mm, but no pitch", allowed="c_mm with pitch_um, or c_px", remedy="add `pitch_um: ...`, or give c_px")
+            remedy = "add `pitch_um: ...` (--pixel-um), or give c_px"
+            raise InputError("c_mm, but no pitch", allowed="c_mm with pitch_um, or c_px", remedy=remedy)
         if (self.cols is None) != (self.rows is None):
             raise InputError("the size of the frame is incomplete", allowed="cols and rows", remedy="add the other")
         return self
@@ -168,7 +169,7 @@ class OptionsModel(Model):
     false_alarms: Annotated[float, Field(gt=0, lt=100)] | None = None
     variance_components: bool | None = None
     eccentricity: bool | None = None
-    folds: Annotated[int, Field(ge=0)] | None = None
+    folds: Literal[0] | Annotated[int, Field(ge=2)] | None = None
     residual_grid: bool | None = None
     a_priori: bool | None = None
     max_iterations: Annotated[int, Field(ge=1)] | None = None
@@ -218,6 +219,9 @@ class ProjectModel(Model):
         if self.pictures is not None and len(self.cameras) > 1:
             remedy = "write one project for each camera, or locate first and give a table of image coordinates"
             raise InputError("pictures of several cameras", allowed="pictures of one camera", remedy=remedy)
+        if self.pictures is not None and "image_coordinates" in self.model_fields_set:
+            what = "image_coordinates have no meaning with pictures, whose coordinates are pixmetry's own"
+            raise InputError(what, allowed="with observations or lines from a table", remedy="delete it")
         names = [camera.name for camera in self.cameras]
         if len(set(names)) < len(names):
             raise InputError("two cameras of one name", value=", ".join(names), allowed="each name once", remedy="name them")
@@ -244,5 +248,5 @@ class ProjectModel(Model):
         wrong = next((key for key in given if key not in allowed), None)
         if wrong is not None:
             what = f"`{wrong}` has no meaning with straight lines"
-            raise InputError(what, allowed="cameras, image_coordinates, options.loss, options.snoop", remedy="delete it")
+            raise InputError(what, allowed=", ".join(allowed[1:]), remedy="delete it")
         return self

@@ -26,6 +26,7 @@ OPTIONS = ("field", "loss", "folds", "residual_grid", "snoop", "a_priori")
 @click.option("--noise", metavar="WHAT", help="Noise model of the images, as of `pixmetry locate`. Default: from each image.")
 @click.option("--camera", metavar="PRESET|FILE", help="Of the images: brings size and pitch; results get its camera.yaml with the lens.")
 @click.option("--pixel-um", type=click.FloatRange(0, min_open=True), help="Pitch of the pixels; without it, lengths are in pixels.")
+@click.option("--c-px", type=click.FloatRange(0, min_open=True), help="Start value of the principal distance in pixels.")
 @click.option("--c-mm", type=click.FloatRange(0, min_open=True), help="Start value of the principal distance.")
 @click.option(
     "--direction",
@@ -75,6 +76,8 @@ def calibrate(
     check_exports(opencv, colmap, output, sources)
     options = {name: given.pop(name) for name in OPTIONS}
     options = {name: value for name, value in options.items() if value is not None}
+    if given["camera"] is not None:
+        check_exports(opencv, colmap, output, (*sources, Path(given["camera"])))
     with shown_progress() as progress:
         calibration = run(sources, output, options=options, progress=progress, **given)
     report = output / "report.html"

@@ -13,7 +13,8 @@ The chapter on image sensors of the [handbook](../conventions.md) shows by simul
 again, with all their conditions told, pixmetry's estimators at work, and what the numbers say beside what the chapter says.
 
 {pages}
-The numbers are written by `make handbook` and are the same each time: every draw has its key. Positions and errors are in pixels; errors
+The numbers are written by `make handbook` (those of line jitter, which take minutes, by `benchmarks/study_line_jitter.py`) and are the
+same each time: every draw has its key. Positions and errors are in pixels; errors
 are found less true; grey values are those of 8 bits.
 """
 
