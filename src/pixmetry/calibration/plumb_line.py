@@ -149,7 +149,10 @@ def calibrate_lines(
         If the lines do not determine what is free.
     """
     model = _start(sensor, start, free, loss)
-    fit = LineFit(LineTable.of(x_px, y_px, line, image, u_px), model, free)
+    table = LineTable.of(x_px, y_px, line, image, u_px)
+    x, y = np.asarray(x_px, float), np.asarray(y_px, float)
+    table.inside[:] = (np.abs(x - (sensor.cols - 1) / 2) <= 0.55 * sensor.cols) & (np.abs(y - (sensor.rows - 1) / 2) <= 0.55 * sensor.rows)
+    fit = LineFit(table, model, free)
     adjust_lines(fit, loss, loss_scale, reject)
     return _result(fit, model, free)
 

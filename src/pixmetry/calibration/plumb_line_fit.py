@@ -24,6 +24,7 @@ class LineTable:
     def __init__(self, x: np.ndarray, y: np.ndarray, keys: list[tuple[Any, Any]], line_of: np.ndarray, covariance: np.ndarray) -> None:
         self.x, self.y, self.keys, self.line_of, self.covariance = x, y, keys, line_of, covariance
         self.used = np.ones(len(x), bool)
+        self.inside = np.ones(len(x), bool)  # of the frame: what lies outside of it never takes part, where the polynomial means nothing
 
     @classmethod
     def of(cls, x_px: ArrayLike, y_px: ArrayLike, line: ArrayLike, image: ArrayLike, u_px: ArrayLike | None) -> LineTable:
@@ -218,9 +219,9 @@ def adjust_lines(fit: LineFit, loss: str, loss_scale: float, reject: bool) -> No
     _check_directions(fit.theta, fit.names)
     if loss != "none":
         _robust(fit, loss, loss_scale)
-    fit.table.used[:] = True
+    fit.table.used[:] = fit.table.inside
     if reject and loss != "none":
-        fit.table.used[:] = np.abs(fit.statistics()) < critical_value(len(fit.table.x))
+        fit.table.used[:] = fit.table.inside & (np.abs(fit.statistics()) < critical_value(len(fit.table.x)))
         _check_lines(fit.table)
     fit.factor[:] = 1.0
     _snoop(fit, reject)
@@ -278,7 +279,7 @@ def _snoop(fit: LineFit, reject: bool) -> None:
         if not reject:
             return
         z = np.abs(fit.statistics())
-        back = ~table.used & (z < critical) & (turn < PASSES // 2)
+        back = ~table.used & table.inside & (z < critical) & (turn < PASSES // 2)
         worst = np.zeros(len(table.keys))
         np.maximum.at(worst, table.line_of[table.used], z[table.used])
         out = table.used & (z > critical) & (z == worst[table.line_of])
