@@ -267,12 +267,10 @@ def test_images_that_fail_are_named_with_a_reason(rng: np.random.Generator) -> N
         observations_of([frames[0], empty, frames[1]], "chessboard", grid="7x6", pitch=1.0)
 
 
-def test_table_has_a_row_for_each_coordinate(rng: np.random.Generator) -> None:
+def test_each_dot_has_its_coordinates_and_their_covariance(rng: np.random.Generator) -> None:
     views = of_board(5, 4, 11.0, (0.0,))
     seen = observations_of([views[0].frame(dots(5, 4), rng)], "dots", grid="any", pitch=(2.0, 3.0), least_images=1)
-    table = seen.table()
-    assert list(table) == ["image", "point", "x_px", "y_px", "var_x_px2", "cov_xy_px2", "var_y_px2"]
-    assert len(table["image"]) == 20 and (table["var_x_px2"] > 0).all()
+    assert len(seen.x_px) == 20 and (seen.covariance_px2[:, [0, 2]] > 0).all()
     assert tuple(seen.xyz[seen.points.index("3/4")]) == (8.0, 9.0, 0.0)
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pixmetry.calibration.model import NAMES
-from pixmetry.calibration.network import Calibration, Finding, Network
+from pixmetry.calibration.network import PER_IMAGE_NAMES, Calibration, Finding, Network
 from pixmetry.calibration_files import check_folder, write_line_results, write_results
 from pixmetry.calibration_record import StoredCalibration, read_calibration
 from pixmetry.campaign.provenance import InputHashes, provenance_record
@@ -242,7 +242,7 @@ def _changed(network: Network, free: Sequence[str] | str | None, per_image: Sequ
         mask = np.isin(NAMES, wanted)
         network = replace(network, cameras=tuple(replace(model, free=mask.copy()) for model in network.cameras))
     if per_image is not None:
-        network = replace(network, per_image=_checked(per_image, ("x_scale", "x_shift"), "per_image"))
+        network = replace(network, per_image=_checked(per_image, PER_IMAGE_NAMES, "per_image"))
     return network
 
 

@@ -68,12 +68,6 @@ class ImageObservations:
     def __len__(self) -> int:
         return len(self.x_px)
 
-    def table(self) -> dict[str, np.ndarray]:
-        """Columns of a table, a row an image coordinate: image, point, x_px, y_px and the three of the covariance."""
-        images, points = np.array(self.images), np.array(self.points)
-        columns = {"image": images[self.image], "point": points[self.point], "x_px": self.x_px, "y_px": self.y_px}
-        return columns | dict(zip(("var_x_px2", "cov_xy_px2", "var_y_px2"), self.covariance_px2.T, strict=True))
-
     def network(self, camera: CameraModel, unit: str = "mm") -> Network:
         """The network of these observations by one camera: the board's coordinates are held fixed, coded targets are free."""
         return Network(

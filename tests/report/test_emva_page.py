@@ -30,7 +30,8 @@ from pixmetry.report.emva_content import (
 )
 from pixmetry.report.emva_facts import facts
 from pixmetry.report.emva_figures import MARGINS_IN, STRETCHES, fill, outline, time_of
-from pixmetry.report.emva_page import _share_styles, all_plots, render
+from pixmetry.report.emva_page import all_plots, render
+from pixmetry.report.templates import share_styles
 from report import emva_sheets
 from report.emva_sheets import K, results, sheet
 from report.test_page import Page
@@ -378,7 +379,7 @@ def test_shared_styles_can_be_put_back() -> None:
         '<style>a{}</style><svg class="figure"><path style="fill: none"/><g style="a: b"/>'
         '<text style="a: b" transform="rotate(-0 1 2)"/></svg>'
     )
-    shared = _share_styles(page)
+    shared = share_styles(page)
     rules = dict(re.findall(r"\.(s\d+)\{([^}]*)\}", shared))
     body = shared[shared.index("<svg") :]
     assert 'style="' not in body

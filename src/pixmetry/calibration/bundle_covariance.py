@@ -27,7 +27,7 @@ from pixmetry.calibration.bundle_system import (
 )
 from pixmetry.calibration.datum import Datum, carried, null_space
 from pixmetry.calibration.model import NAMES
-from pixmetry.calibration.network import Network, State
+from pixmetry.calibration.network import PER_IMAGE_NAMES, Network, State
 from pixmetry.core.errors import MeasureError
 
 SINGULAR = 1e10  # variance inflation at which a system counts as singular
@@ -287,7 +287,7 @@ def _groups(names: list[str], direction: np.ndarray, network: Network) -> tuple[
             share[what, head] = share.get((what, head), 0.0) + float(part) ** 2
         else:
             groups[f"{kind} of {head}" if several else kind] = [i]
-        if what == "image" and kind not in ("x_scale", "x_shift"):  # the mean of those is nought
+        if what == "image" and kind not in PER_IMAGE_NAMES:  # the mean of those is nought
             groups.setdefault(f"the {kind} of all images" + (f" of {camera_of[head]}" if several else ""), []).append(i)
     what, most = max(share, key=lambda owner: share[owner])
     alone = {f"{kind} of {what} {most}": [i] for i, (w, head, kind) in enumerate(owners) if (w, head) == (what, most)}

@@ -8,7 +8,7 @@ import numpy as np
 
 from pixmetry.calibration._bundle_kernels import ELIMINATED, HELD
 from pixmetry.calibration.model import CODES, NAMES
-from pixmetry.calibration.network import Network, ScaleBars, State
+from pixmetry.calibration.network import PER_IMAGE_NAMES, Network, ScaleBars, State
 from pixmetry.core.errors import InputError, MeasureError
 
 POSE = ("rx", "ry", "rz", "X0", "Y0", "Z0")
@@ -100,7 +100,7 @@ class Layout:
     @property
     def per_image(self) -> int:
         """Unknowns of an image."""
-        return len(POSE) + len([name for name in ("x_scale", "x_shift") if name in self.network.per_image])
+        return len(POSE) + len([name for name in PER_IMAGE_NAMES if name in self.network.per_image])
 
 
 def layout_of(network: Network, start: State, used: np.ndarray | None) -> Layout:
@@ -216,13 +216,13 @@ def _determined(network: Network, take: np.ndarray, images: np.ndarray, points: 
 
 def _images(network: Network, there: np.ndarray, at: int, columns: list[str]) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
     """Columns of the images; append their names."""
-    more = [name for name in ("x_scale", "x_shift") if name in network.per_image]
+    more = [name for name in PER_IMAGE_NAMES if name in network.per_image]
     each = len(POSE) + len(more)
     image_col = np.full(len(network.images), -1, np.int64)
     image_col[there] = at + each * np.arange(there.sum())
     for i in np.flatnonzero(there):
         columns += [f"{network.images[i]}:{name}" for name in (*POSE, *more)]
-    extra = np.array([len(POSE) + more.index(name) if name in more else -1 for name in ("x_scale", "x_shift")], np.int64)
+    extra = np.array([len(POSE) + more.index(name) if name in more else -1 for name in PER_IMAGE_NAMES], np.int64)
     constraints = []
     for k in range(len(network.cameras)):
         of_camera = image_col[there & (network.camera_of == k)]

@@ -77,7 +77,7 @@ def geometry_of(
         (*UNITS, "µm", "µm"),
         method=f"calibration with targets ({origin})",
     )
-    return CameraGeometry(lens, *u_px, *left_px, float(dof), origin)
+    return CameraGeometry(lens, *u_px, *left_px, origin)
 
 
 def _fitted(model: CameraModel) -> tuple[np.ndarray, float]:

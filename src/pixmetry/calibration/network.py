@@ -12,6 +12,7 @@ from pixmetry.calibration.model import NAMES, CameraModel
 
 SCALE, SHIFT = 6, 7  # places of the per-image x-scale and x-shift behind the six of the pose
 PER_IMAGE = 8
+PER_IMAGE_NAMES = ("x_scale", "x_shift")
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from pixmetry.calibration.network import PER_IMAGE_NAMES
 from pixmetry.core.errors import ParameterError
 
 CHOICES = {
@@ -12,7 +13,6 @@ CHOICES = {
     "loss": ("none", "huber", "cauchy"),
     "target": ("circle", "square"),
 }
-PER_IMAGE_NAMES = ("x_scale", "x_shift")
 
 
 @dataclass(frozen=True)

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 
 from pixmetry.calibration.model import NAMES, CameraModel
-from pixmetry.calibration.network import Adjustment
+from pixmetry.calibration.network import PER_IMAGE_NAMES, Adjustment
 
 GROUPS = {"radial": ("k1", "k2", "k3", "k4", "k5"), "tangential": ("p1", "p2"), "affinity": ("b1", "b2")}
 TESTED = tuple(name for names in GROUPS.values() for name in names)  # 0 means something for these, not for c, xp and yp
 VISION = ("fx", "fy", "skew", "cx", "cy")
 SIGNIFICANT = 0.05
-POSE = ("rx", "ry", "rz", "X0", "Y0", "Z0", "x_scale", "x_shift")
+POSE = ("rx", "ry", "rz", "X0", "Y0", "Z0", *PER_IMAGE_NAMES)
 
 
 def parameter_records(adjustment: Adjustment) -> list[dict[str, Any]]:

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from pixmetry.calibration.model import NAMES
-from pixmetry.calibration.network import Calibration, Finding, Network, State
-from pixmetry.calibration.options import PER_IMAGE_NAMES, Options
+from pixmetry.calibration.network import PER_IMAGE_NAMES, Calibration, Finding, Network, State
+from pixmetry.calibration.options import Options
 from pixmetry.calibration.settling import Progress, Settled, adjust_with, settle
 from pixmetry.core.errors import InputError, MeasureError
 

@@ -6,11 +6,11 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
 
+from pixmetry.calibration.model import NAMES
 from pixmetry.core.config import Model
 from pixmetry.core.errors import InputError
 
 PROJECT_SCHEMA = "pixmetry/calibration/1"
-PARAMETERS = ("c", "xp", "yp", "b1", "b2", "p1", "p2", "k1", "k2", "k3", "k4", "k5")
 
 LINE_OPTIONS = ("options.loss", "options.loss_scale", "options.snoop")  # those that mean something for straight lines
 
@@ -60,7 +60,7 @@ class CameraEntry(Model):
     k3: float = 0.0
     k4: float = 0.0
     k5: float = 0.0
-    free: Annotated[tuple[Literal[PARAMETERS], ...] | None, BeforeValidator(_listed)] = None  # type: ignore[valid-type]
+    free: Annotated[tuple[Literal[NAMES], ...] | None, BeforeValidator(_listed)] = None  # type: ignore[valid-type]
 
     @model_validator(mode="after")
     def _agrees(self) -> CameraEntry:

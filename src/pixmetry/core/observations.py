@@ -197,8 +197,6 @@ class CameraGeometry:
         rotation of the camera takes up.
     left_x_px, left_y_px : float
         Systematic part of the calibration's residuals: what they have in common at one place of the frame.
-    dof : float
-        Redundancy of the adjustment.
     origin : str
         Where it comes from.
     """
@@ -208,7 +206,6 @@ class CameraGeometry:
     u_y_px: float
     left_x_px: float
     left_y_px: float
-    dof: float
     origin: str
 
 

@@ -25,6 +25,7 @@ from pixmetry.report.calibration_text import (
     worth,
 )
 from pixmetry.report.numbers import NONE, fixed, length_px, significant
+from pixmetry.report.templates import filled, share_styles
 
 if TYPE_CHECKING:
     from pixmetry.calibration.model import CameraModel
@@ -52,14 +53,7 @@ def write_page(calibration: Calibration, path: str | Path) -> Path:
 
 def render(calibration: Calibration) -> str:
     """Return the page of a calibration as text."""
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
-    from pixmetry.report.emva_page import _share_styles
-
-    environment = Environment(
-        loader=PackageLoader("pixmetry.report", "."), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    return _share_styles(environment.get_template("calibration.html.jinja").render(**_content(calibration)))
+    return share_styles(filled("calibration.html.jinja", _content(calibration)))
 
 
 def _content(calibration: Calibration) -> dict[str, Any]:

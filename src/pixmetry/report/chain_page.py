@@ -10,6 +10,7 @@ import numpy as np
 from pixmetry import __version__
 from pixmetry.report.drawing import BLUE, INK, RED, SOFT, Picture, canvas, picture
 from pixmetry.report.numbers import NONE, length_px, significant
+from pixmetry.report.templates import filled
 
 if TYPE_CHECKING:
     from pixmetry.chain import Step, Walk
@@ -26,12 +27,7 @@ def write_chain_page(walk: Walk, path: str | Path) -> Path:
 
 def render(walk: Walk) -> str:
     """Return the page as text."""
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
-    environment = Environment(
-        loader=PackageLoader("pixmetry.report", "."), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    return environment.get_template("chain.html.jinja").render(**_content(walk))
+    return filled("chain.html.jinja", _content(walk))
 
 
 def _content(walk: Walk) -> dict[str, Any]:

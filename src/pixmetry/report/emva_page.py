@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 from pixmetry import __version__
 from pixmetry.report import emva_content as content
 from pixmetry.report.emva_facts import facts, provenance
+from pixmetry.report.templates import filled, share_styles
 
 if TYPE_CHECKING:
     from pixmetry.emva.records import DataSheet, Results
@@ -20,12 +20,7 @@ PLOT_HEIGHT_IN = 2.4
 
 def render(sheet: DataSheet) -> str:
     """Return the page of a data sheet as text."""
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
-    environment = Environment(
-        loader=PackageLoader("pixmetry.report", "."), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    return _share_styles(environment.get_template("emva.html.jinja").render(**_content(sheet)))
+    return share_styles(filled("emva.html.jinja", _content(sheet)))
 
 
 def _content(sheet: DataSheet) -> dict[str, Any]:
@@ -98,18 +93,3 @@ def _picture(plot: Plot, number: int) -> Picture:
         figure.set_layout_engine("none")
         fill(plot, axes, (0, 0, WIDTH_IN, PLOT_HEIGHT_IN))
         return picture(figure, f"p{number}", f"{plot.title}. {plot.alt}", plot.caption)
-
-
-def _share_styles(page: str) -> str:
-    """Name the styles that the figures repeat once for the whole page: half of its bytes."""
-    names: dict[str, str] = {}
-
-    def named(found: re.Match[str]) -> str:
-        return f' class="{names.setdefault(found[1], f"s{len(names)}")}"'
-
-    def slim(svg: re.Match[str]) -> str:
-        text = re.sub(r' transform="rotate\(-?0 [^"]*"', "", svg[0])
-        return re.sub(r' style="([^"]*)"', named, text)
-
-    page = re.sub(r'<svg class="figure".*?</svg>', slim, page, flags=re.S)
-    return page.replace("</style>", "".join(f".{name}{{{style}}}\n" for style, name in names.items()) + "</style>", 1)

@@ -16,6 +16,7 @@ from pixmetry.report.calibration_plots import correlation_map, curve_pictures
 from pixmetry.report.calibration_text import DIRECTIONS, sentence, typeset
 from pixmetry.report.drawing import BLUE, RED, SOFT, Picture, canvas
 from pixmetry.report.numbers import fixed, length_px, significant
+from pixmetry.report.templates import filled, share_styles
 
 if TYPE_CHECKING:
     from pixmetry.line_calibration import LineCalibration
@@ -32,14 +33,7 @@ def write_page(calibration: LineCalibration, path: str | Path) -> Path:
 
 def render(calibration: LineCalibration) -> str:
     """Return the page as text."""
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
-    from pixmetry.report.emva_page import _share_styles
-
-    environment = Environment(
-        loader=PackageLoader("pixmetry.report", "."), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    return _share_styles(environment.get_template("lines.html.jinja").render(**_content(calibration)))
+    return share_styles(filled("lines.html.jinja", _content(calibration)))
 
 
 def _content(calibration: LineCalibration) -> dict[str, Any]:

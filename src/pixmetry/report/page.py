@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from pixmetry import __version__
 from pixmetry.report.numbers import significant
+from pixmetry.report.templates import filled
 
 if TYPE_CHECKING:
     from pixmetry.core.estimates import Estimates
@@ -35,12 +36,7 @@ def write_report(assessment: Assessment, path: str | Path) -> Path:
 
 def render(assessment: Assessment) -> str:
     """Return the page of an assessment as text."""
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
-    environment = Environment(
-        loader=PackageLoader("pixmetry.report", "."), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    return environment.get_template("page.html.jinja").render(**_content(assessment))
+    return filled("page.html.jinja", _content(assessment))
 
 
 def _content(assessment: Assessment) -> dict[str, Any]:
