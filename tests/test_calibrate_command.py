@@ -23,6 +23,7 @@ from pixmetry.calibrated import calibrated_geometry
 from pixmetry.calibration.model import NAMES
 from pixmetry.calibration.network import Calibration, Network
 from pixmetry.calibration_files import TEXTS, write_results
+from pixmetry.calibration_project import load_project
 from pixmetry.calibration_project.schema import ProjectModel
 from pixmetry.calibration_record import packed, read_calibration, unpacked
 from pixmetry.cli import main
@@ -137,11 +138,13 @@ def test_where_it_comes_from_is_told(done: tuple[Path, Path, Result]) -> None:
 
 
 def test_results_are_input_again(done: tuple[Path, Path, Result], simulated: Simulated, tmp_path: Path) -> None:
-    """The tables of points and residuals as the points and observations of another project: held points, the same camera."""
+    """The tables of points, poses and residuals as points, images and observations of another project: held points, the same camera."""
     folder = done[0]
     text = done[1].read_text().replace("{table: observations.csv", f"{{table: {folder}/result/residuals.csv")
-    text = re.sub(r"scale_bars_table: .*\n", f"points: {{table: {folder}/result/points.csv, known: weighted}}\n", text)
+    tables = f"points: {{table: {folder}/result/points.csv, known: weighted}}\nimages: {folder}/result/poses.csv\n"
+    text = re.sub(r"scale_bars_table: .*\n", tables, text)
     (tmp_path / "again.yaml").write_text(text)
+    assert load_project(tmp_path / "again.yaml").network.poses.given.all()
     again = pixmetry.calibrate(tmp_path / "again.yaml")
     stored = read_calibration(folder / "result")
     u = np.sqrt(np.diag(stored.interior_covariance()[1]))

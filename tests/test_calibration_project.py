@@ -296,6 +296,54 @@ def test_a_mistake_about_images_is_told(tmp_path: Path, images: str, words: tupl
     refused(tmp_path, cameras + "observations: o.csv\n", "which image is of which", o=rows())
 
 
+MATRIX = ",".join(f"r{i}{j}" for i in "123" for j in "123")
+
+
+def of_angles(omega: float, phi: float, kappa: float) -> np.ndarray:
+    """Kraus's matrix from the camera (y up, looking along -z) to the object, written out element by element."""
+    (so, sp, sk), (co, cp, ck) = np.sin([omega, phi, kappa]), np.cos([omega, phi, kappa])
+    return np.array([
+        [cp * ck, -cp * sk, sp],
+        [co * sk + so * sp * ck, co * ck - so * sp * sk, -so * cp],
+        [so * sk - co * sp * ck, so * ck + co * sp * sk, co * cp],
+    ])  # fmt: skip
+
+
+def test_start_poses_by_angles_or_matrices(tmp_path: Path) -> None:
+    angles = np.array([0.3, -0.7, 2.1])
+    expected = (of_angles(*angles) @ np.diag([1.0, -1.0, -1.0])).T  # to a camera that looks along +z with y down
+    for unit, factor in (("deg", np.degrees(1)), ("gon", 200 / np.pi), ("rad", 1.0)):
+        row = ",".join(f"{v:.12f}" for v in angles * factor)
+        images = f"image,OMEGA_{unit},phi_{unit},kappa_{unit},X0,Y0,Z0,time_s\nb,{row},1,-2,30.5,0\na,,,,,,,1\n"
+        poses = network(tmp_path, "observations: o.csv\nimages: i.csv\n", o=rows(), i=images).poses
+        assert poses is not None and poses.given.tolist() == [False, True]
+        np.testing.assert_allclose(poses.rotation[1], expected, atol=1e-10)
+        assert poses.position[1].tolist() == [1, -2, 30.5]
+    row = ",".join(f"{v:.5f}" for v in expected.ravel())  # rounded, and still a rotation
+    images = f"image,X0,Y0,Z0,{MATRIX}\na,1,2,3,{row}\nb,1,2,3,{row}\n"
+    found = network(tmp_path, "observations: o.csv\nimages: i.csv\n", o=rows(), i=images).poses
+    assert found is not None
+    np.testing.assert_allclose(found.rotation[0], expected, atol=2e-5)
+    np.testing.assert_allclose(found.rotation[0] @ found.rotation[0].T, np.eye(3), atol=1e-14)
+    assert network(tmp_path, "observations: o.csv\nimages: i.csv\n", o=rows(), i="image\na\nb\n").poses is None
+
+
+@pytest.mark.parametrize(
+    ("images", "words"),
+    [
+        ("image,X0,Y0,Z0\na,1,2,3\nb,1,2,3\n", ("'omega_deg' is missing",)),
+        ("image,X0,Y0,Z0,omega_deg,phi_deg\na,1,2,3,4,5\nb,1,2,3,4,5\n", ("'kappa_deg' is missing",)),
+        ("image,omega_deg,phi_deg,kappa_deg\na,1,2,3\nb,1,2,3\n", ("'X0' is missing",)),
+        ("image,X0,Y0,Z0,omega_deg,phi_deg,kappa_rad\na,1,2,3,4,5,6\nb,1,2,3,4,5,6\n", ("told twice", "kappa_rad")),
+        ("image,X0,Y0,Z0,omega_deg,phi_deg,kappa_deg\na,1,2,3,4,5,6\nb,1,,3,4,5,6\n", ("line 3", "some of its values")),
+        (f"image,X0,Y0,Z0,{MATRIX}\na,1,2,3,1,0,0,0,1,0,0,0,1\nb,1,2,3,1,0,0,0,1,0,0,0,-1\n", ("line 3", "mirror", "looks along +z")),
+        (f"image,X0,Y0,Z0,{MATRIX}\na,1,2,3,1,0,0,0,1,0,0,.1,1\nb,1,2,3,1,0,0,0,1,0,0,0,1\n", ("line 2", "no rotation")),
+    ],
+)
+def test_a_mistake_about_start_poses_is_told(tmp_path: Path, images: str, words: tuple[str, ...]) -> None:
+    refused(tmp_path, GOOD + "images: i.csv\n", *words, o=rows(), i=images)
+
+
 def test_decimal_commas_are_named_where_they_part_columns(tmp_path: Path) -> None:
     project = CAMERA + "observations: {table: o.csv, columns: [image, point, x_px, y_px]}\n"
     refused(tmp_path, project, "line 1", "3 values", "write decimal points as points", o="a 1 12,5 30,25\na 2 13,5 31,5\n")

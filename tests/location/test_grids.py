@@ -46,9 +46,13 @@ def agreeing(grid, i: np.ndarray, j: np.ndarray, asymmetric=False) -> int:
 
 @pytest.mark.parametrize("asymmetric", [False, True])
 def test_orders_plates_in_any_pose(asymmetric: bool) -> None:
-    """30 plates of 5 × 5 to 30 × 30 dots, tilted up to 55°, distorted by −30 … +20 % at the corner, 3 % missing, 8 dots of clutter."""
+    """30 plates of 5 × 5 to 30 × 30 dots, tilted up to 55°, distorted by −30 … +20 % at the corner, 3 % missing, 8 dots of clutter.
+
+    One plate in a thousand is so oblique that it is numbered along a diagonal: four of 30 are by chance once in 10⁷ runs; a share of 30 %
+    would be caught with 99 %. Of the others some 1 in 20 000 dots is left out.
+    """
     rng = np.random.default_rng()
-    right = total = 0
+    right = total = wrong_plates = 0
     for _ in range(30):
         rows, cols = rng.integers(5, 31, 2)
         x, y, i, j = plate(
@@ -57,8 +61,13 @@ def test_orders_plates_in_any_pose(asymmetric: bool) -> None:
         grid = order_grid(x, y, asymmetric=asymmetric)
         cells = np.stack([grid.row, grid.col], axis=1)[grid.placed]
         assert len(np.unique(cells, axis=0)) == len(cells) and len(grid) == len(x)
-        right, total = right + agreeing(grid, i, j, asymmetric), total + (i >= 0).sum()
-    assert right > 0.95 * total  # one plate in some hundred is so oblique that it is numbered along a diagonal
+        agree, dots = agreeing(grid, i, j, asymmetric), (i >= 0).sum()
+        if agree < 0.6 * dots:
+            wrong_plates += 1
+        else:
+            right, total = right + agree, total + dots
+    assert wrong_plates <= 3
+    assert right > 0.99 * total
 
 
 def test_every_dot_of_a_whole_plate_has_its_own_cell() -> None:

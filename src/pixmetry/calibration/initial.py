@@ -1,8 +1,9 @@
 """Start values of a bundle adjustment, from nothing but the network.
 
-A test field that is known, or known roughly, poses the images by itself: the principal distance comes from homographies where it is plane,
-from the start values, or from a search for the one that explains the images best. Otherwise, and where that fails, the images are oriented
-relative to each other (`pixmetry.calibration.free_start`) and brought to the object's frame afterwards.
+Poses that were given come first (`pixmetry.calibration.posed_start`). A test field that is known, or known roughly, poses the images by
+itself: the principal distance comes from homographies where it is plane, from the start values, or from a search for the one that explains
+the images best. Otherwise, and where that fails, the images are oriented relative to each other (`pixmetry.calibration.free_start`) and
+brought to the object's frame afterwards.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import numpy as np
 from pixmetry.calibration.free_start import best_free, common_points, without_lens
 from pixmetry.calibration.network import Network, State
 from pixmetry.calibration.planar_start import homography, plane_coordinates, principal_distance
+from pixmetry.calibration.posed_start import from_poses
 from pixmetry.calibration.reconstruction import FINE, Reconstruction
 from pixmetry.calibration.resection import FEWEST, FLAT, fitted, similarity, thickness
 from pixmetry.core.errors import InputError, MeasureError
@@ -54,7 +56,9 @@ def start_values(network: Network) -> tuple[Network, State]:
     _check_distances(network)
     interior = np.stack([camera.values for camera in network.cameras])
     with single_threaded_blas():
-        work = _from_known_points(network, interior)
+        work = posed = from_poses(network, interior)
+        if work is None:
+            work = _from_known_points(network, interior)
         if work is None:
             work = _from_images(network, interior)
         if not work.control.any():
@@ -63,7 +67,7 @@ def start_values(network: Network) -> tuple[Network, State]:
             work.mend()
             work.settle()
             work.mend()
-            _to_object(work)
+            _to_object(work, framed=posed is not None)
     _check_posed(work)
     cameras = tuple(replace(camera, values=row) for camera, row in zip(network.cameras, work.interior, strict=True))
     state = work.state()
@@ -267,8 +271,8 @@ def moved(work: Reconstruction, scale: float, rotation: np.ndarray, shift: np.nd
     work.rotation = work.rotation @ rotation.T
 
 
-def _to_object(work: Reconstruction) -> None:
-    """Bring a free reconstruction to control, nominal coordinates, bars, or a frame of its own."""
+def _to_object(work: Reconstruction, *, framed: bool) -> None:
+    """Bring a free reconstruction to control, nominal coordinates, bars, or, unless it has one (``framed``), a frame of its own."""
     network = work.network
     known = np.isfinite(work.xyz[:, 0])
     given = known & np.isfinite(network.xyz).all(axis=1)
@@ -281,7 +285,7 @@ def _to_object(work: Reconstruction) -> None:
         if control.sum() >= 3 and np.median(away) > REACH * extent:
             raise _does_not_fit(work, use)
         moved(work, scale, rotation, shift)
-    else:
+    elif not framed:
         _own_frame(work, known)
     if control.sum() < 2:
         _scaled(work)
@@ -355,8 +359,8 @@ def _not_oriented(network: Network, posed: np.ndarray) -> MeasureError:
     best = common[left].max(axis=1)
     worst = left[np.argsort(best, kind="stable")][:5]
     names = ", ".join(f"{network.images[i]} (at most {int(common[i].max())} points in common with another image)" for i in worst)
-    remedy = "check the points' names and the size of the frame, give a start value of c or rough coordinates of some points"
+    remedy = "check the points' names and the size of the frame, give a start value of c, rough coordinates of some points or rough poses"
     if np.median(best) < 8:
-        remedy = "take images that share at least 8 points with others, from sides that differ by 10° to 90°"
+        remedy = "take images that share at least 8 points with others, from sides that differ by 10° to 90°, or give rough poses"
     what = f"{len(left)} of {len(posed)} images cannot be oriented"
     return MeasureError(what, where="start values", value=names, remedy=remedy)

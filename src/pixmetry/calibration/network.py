@@ -42,6 +42,25 @@ class ScaleBars:
 
 
 @dataclass(frozen=True)
+class Poses:
+    """Start values of the poses of images, as in `State`; NaN where there are none. Their frame need not be that of the points.
+
+    Parameters
+    ----------
+    rotation : ndarray, shape (images, 3, 3)
+    position : ndarray, shape (images, 3)
+    """
+
+    rotation: np.ndarray
+    position: np.ndarray
+
+    @property
+    def given(self) -> np.ndarray:
+        """Which images have one."""
+        return np.isfinite(self.position[:, 0]) & np.isfinite(self.rotation[:, 0, 0])
+
+
+@dataclass(frozen=True)
 class Network:
     """Everything that is known before an adjustment. Nothing in it is changed by one.
 
@@ -80,6 +99,8 @@ class Network:
         Of the object.
     covariance_known : bool
         Whether ``covariance_px2`` came with the data, or is a guess (then only its ratios count).
+    poses : Poses, optional
+        Start values, where there are any; otherwise they are found.
     """
 
     cameras: tuple[CameraModel, ...]
@@ -101,6 +122,7 @@ class Network:
     normal: np.ndarray | None = None
     unit: str = "mm"
     covariance_known: bool = False
+    poses: Poses | None = None
 
     def __len__(self) -> int:
         return len(self.x_px)

@@ -46,6 +46,7 @@ def calibrate_network(
     """
     from pixmetry.calibration.checks import check_network
     from pixmetry.calibration.findings import in_order
+    from pixmetry.calibration.posed_start import pose_findings
     from pixmetry.calibration.residual_grid import residual_grids
 
     say = progress or (lambda text: None)
@@ -53,6 +54,7 @@ def calibrate_network(
     say("checking the network")
     findings = list(check_network(measured))
     measured, state = _started(measured, start, options, say)
+    measured = replace(measured, poses=None)  # they have done their part
     settled = _settled(_released(measured) if options.field == "free" else measured, state, options, say)
     settled, tests, more = _checked_field(settled, options, say)
     say("testing the result")
@@ -60,6 +62,7 @@ def calibrate_network(
     if options.residual_grid:
         tests["residual_grid"] = residual_grids(settled.adjustment)
     findings += [*more, *_findings(settled, tests)]
+    findings += pose_findings(network, settled.adjustment.state)
     grids = tests.get("residual_grid", {})
     return Calibration(settled.adjustment, in_order(findings), tests, grids, {"options": asdict(options)})
 

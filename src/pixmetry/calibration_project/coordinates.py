@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from pixmetry.calibration.model import CameraModel
+from pixmetry.calibration.network import Poses
+from pixmetry.calibration_project.poses import start_poses
 from pixmetry.calibration_project.tables import Table, first_few, index_of_names
 from pixmetry.core.errors import InputError
 
@@ -38,6 +40,7 @@ class Measured:
         Names in the order in which they come.
     camera_of : ndarray of int, shape (images,)
     time_s : ndarray, shape (images,), or None
+    poses : Poses or None
     image, point : ndarray of int, shape (n,)
     x_px, y_px : ndarray, shape (n,)
     covariance_px2 : ndarray, shape (n, 3)
@@ -48,6 +51,7 @@ class Measured:
     points: tuple[str, ...]
     camera_of: np.ndarray
     time_s: np.ndarray | None
+    poses: Poses | None
     image: np.ndarray
     point: np.ndarray
     x_px: np.ndarray
@@ -73,7 +77,7 @@ def measured(
     image, image_names = _numbered(table.texts("image"))
     point, point_names = _numbered(table.texts("point"))
     _refuse_twice(table, image, point, len(point_names))
-    camera_of, time_s = image_facts(images, image_names, cameras, lambda name: table.where(table.columns["image"].index(name)))
+    camera_of, time_s, poses = image_facts(images, image_names, cameras, lambda name: table.where(table.columns["image"].index(name)))
     camera = camera_of[image]
     x, y = table.numbers(f"x_{unit}"), table.numbers(f"y_{unit}")
     sign = -1.0 if upwards(table, given) else 1.0
@@ -82,7 +86,7 @@ def measured(
     x_px, y_px = start[:, 0] + x / per_px[:, 0], start[:, 1] + sign * y / per_px[:, 1]
     _refuse_outside(table, x_px, y_px, cameras, camera)
     covariance, known = _covariance(table, unit, per_px, sign, u_px)
-    return Measured(image_names, point_names, camera_of, time_s, image, point, x_px, y_px, covariance, known)
+    return Measured(image_names, point_names, camera_of, time_s, poses, image, point, x_px, y_px, covariance, known)
 
 
 def upwards(table: Table, given: ImageCoordinates) -> bool:
@@ -145,8 +149,8 @@ def _refuse_twice(table: Table, image: np.ndarray, point: np.ndarray, points: in
 
 def image_facts(
     images: Table | None, names: Sequence[str], cameras: Sequence[CameraModel], where: Callable[[str], str]
-) -> tuple[np.ndarray, np.ndarray | None]:
-    """Camera and time of each image, from a table with ``image`` and, of several cameras, ``camera``; ``time_s`` if it is there.
+) -> tuple[np.ndarray, np.ndarray | None, Poses | None]:
+    """Camera, time and start pose of each image, from a table with ``image`` and, of several cameras, ``camera``; the rest if it is there.
 
     Raises
     ------
@@ -157,7 +161,7 @@ def image_facts(
         if len(cameras) > 1:
             what = "several cameras, but no table that says which image is of which"
             raise InputError(what, where=where(names[0]), remedy="add `images: images.csv` with the columns image, camera")
-        return np.zeros(len(names), np.int64), None
+        return np.zeros(len(names), np.int64), None, None
     images = images.spelled("image", "camera", "time_s")
     images.need("image", *(["camera"] if len(cameras) > 1 else []))
     rows = index_of_names(images, "image")
@@ -175,7 +179,10 @@ def image_facts(
             remedy = "correct the name, or add the camera"
             raise InputError(f"no camera '{told[wrong]}'", where=images.where(wrong), allowed=first_few(by_name), remedy=remedy)
         camera_of = np.array([by_name[told[row]] for row in row_of], dtype=np.int64)
-    return camera_of, images.numbers("time_s")[row_of] if "time_s" in images else None
+    poses = start_poses(images)
+    if poses is not None:
+        poses = Poses(poses.rotation[row_of], poses.position[row_of])
+    return camera_of, images.numbers("time_s")[row_of] if "time_s" in images else None, poses
 
 
 def _units_per_px(model: CameraModel, unit: str, table: Table) -> tuple[float, float]:

@@ -33,7 +33,7 @@ def located(
     camera : CameraModel
         Its frame takes the size of the pictures.
     images : Table, optional
-        Time of each picture, by the name of its file.
+        Time and start pose of each picture, by the name of its file.
     progress : callable, optional
     check : callable
         Called with (cols, rows) of the pictures; refuses what is not the size that was expected.
@@ -52,13 +52,14 @@ def located(
 
     found = observations_of(files, wanted.kind, **wanted.model_dump(exclude={"files", "kind"}), progress=progress)
     check(found.sizes[0])
-    camera_of, time_s = image_facts(images, found.images, [camera], lambda name: name)
+    camera_of, time_s, poses = image_facts(images, found.images, [camera], lambda name: name)
     network = found.network(of_size(camera, *found.sizes[0]))
     seen = Measured(
         images=found.images,
         points=found.points,
         camera_of=camera_of,
         time_s=time_s,
+        poses=poses,
         **{name: getattr(network, name) for name in ("image", "point", "x_px", "y_px", "covariance_px2", "covariance_known")},
     )
     return network.cameras[0], seen, Known(network.xyz, network.u_xyz, network.diameter, network.normal), found.findings

@@ -187,6 +187,7 @@ def network_of(cameras: Sequence[CameraModel], seen: Measured, known: Known, **m
         diameter=known.diameter,
         normal=known.normal,
         covariance_known=seen.covariance_known,
+        poses=seen.poses,
         **more,
     )
 

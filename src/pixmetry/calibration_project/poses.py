@@ -1,0 +1,81 @@
+"""Start values of poses from a table of images: projection centres with rotation matrices, or with angles of photogrammetry."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pixmetry.calibration.network import Poses
+from pixmetry.calibration_project.tables import Table
+from pixmetry.core.errors import InputError
+
+CENTRE = ("X0", "Y0", "Z0")
+MATRIX = tuple(f"r{i}{j}" for i in "123" for j in "123")
+ANGLES = ("omega", "phi", "kappa")
+RAD_PER = {"deg": np.pi / 180, "gon": np.pi / 200, "rad": 1.0}
+COLUMNS = (*CENTRE, *MATRIX, *(f"{angle}_{unit}" for angle in ANGLES for unit in RAD_PER))
+SQUARE = 1e-3  # how far R Rᵀ may be from 1: numbers of a matrix that were rounded
+
+
+def start_poses(table: Table) -> Poses | None:
+    """Start values of the poses of a table's rows; None if it has no such columns.
+
+    A matrix is R of R (X − X₀), the camera looking along +z with y down. Angles are those of R = Rx(ω) Ry(φ) Rz(κ) from a camera that looks
+    along −z with y up to the object (K. Kraus, Photogrammetry, 2nd ed., 2007, app. 2.1).
+
+    Raises
+    ------
+    InputError
+        If columns or values are missing, or a matrix is no rotation.
+    """
+    table = table.spelled(*COLUMNS)
+    told = [name for name in COLUMNS if name in table]
+    if not told:
+        return None
+    unit = next((unit for unit in RAD_PER for angle in ANGLES if f"{angle}_{unit}" in table), None)
+    if unit is None:
+        names = MATRIX if any(name in table for name in MATRIX) else tuple(f"{angle}_deg" for angle in ANGLES)
+    else:
+        names = tuple(f"{angle}_{unit}" for angle in ANGLES)
+    other = next((name for name in told if name not in (*CENTRE, *names)), None)
+    if other is not None:
+        what = f"rotations are told twice, by {names[0]} and by {other}"
+        allowed = "r11 … r33, or omega, phi, kappa in one unit"
+        raise InputError(what, where=table.source, allowed=allowed, remedy="leave one of the two out")
+    table.need(*CENTRE, *names)
+    values = np.stack([table.numbers(name, empty=np.nan) for name in (*CENTRE, *names)], axis=1)
+    missing = np.isnan(values)
+    partly = missing.any(axis=1) & ~missing.all(axis=1)
+    if partly.any():
+        row = int(np.flatnonzero(partly)[0])
+        remedy = "add what is missing, or leave all of them empty"
+        raise InputError("a pose with some of its values", where=table.where(row), allowed=", ".join((*CENTRE, *names)), remedy=remedy)
+    position, turn = values[:, :3], values[:, 3:]
+    rotation = _of_angles(turn * RAD_PER[unit]) if unit is not None else _of_matrix(table, turn.reshape(-1, 3, 3))
+    return Poses(rotation, position)
+
+
+def _of_angles(angles: np.ndarray) -> np.ndarray:
+    from scipy.spatial.transform import Rotation
+
+    rotation, given = np.full((len(angles), 3, 3), np.nan), np.isfinite(angles[:, 0])
+    if given.any():
+        to_object = Rotation.from_euler("XYZ", angles[given]).as_matrix()
+        rotation[given] = np.diag([1.0, -1.0, -1.0]) @ np.swapaxes(to_object, 1, 2)
+    return rotation
+
+
+def _of_matrix(table: Table, rotation: np.ndarray) -> np.ndarray:
+    """The nearest rotations of matrices that are rotations but for rounding."""
+    given = np.flatnonzero(np.isfinite(rotation[:, 0, 0]))
+    off = np.abs(rotation[given] @ np.swapaxes(rotation[given], 1, 2) - np.eye(3)).max(axis=(1, 2), initial=0.0)
+    bad = (off > SQUARE) | (np.linalg.det(rotation[given]) < 0)
+    if bad.any():
+        row = int(given[np.flatnonzero(bad)[0]])
+        mirrored = np.linalg.det(rotation[row]) < 0
+        what = "r11 … r33 mirror" if mirrored else "r11 … r33 are no rotation"
+        remedy = "the camera looks along +z, x to the right, y down: change signs of whole rows" if mirrored else "correct them"
+        raise InputError(what, where=table.where(row), allowed="orthonormal rows with determinant +1", remedy=remedy)
+    left, _, right = np.linalg.svd(rotation[given])
+    rotation = rotation.copy()
+    rotation[given] = left @ right
+    return rotation
