@@ -13,7 +13,8 @@ from calibration.adjusted import NOISE_PX, adjusted, measured_again, shifted
 from calibration.networks import image_of, predicted, simulate
 from pixmetry.calibration import hold_out
 from pixmetry.calibration.bundle import adjust
-from pixmetry.calibration.hold_out import LeftOut, hold_out_record, left_out, resect, subset
+from pixmetry.calibration.findings import hold_out_findings
+from pixmetry.calibration.hold_out import LeftOut, expected_median_px, hold_out_record, left_out, resect, subset
 from pixmetry.core.errors import InputError
 
 RATE = 1e-6
@@ -133,3 +134,26 @@ def test_too_few_images(rng):
     found = adjusted(simulated.network, simulated)
     with pytest.raises(InputError, match="2 images"):
         left_out(found)
+
+
+@pytest.mark.parametrize("rays", [4, 30])
+def test_stat_what_noise_alone_would_show(rng, rays):
+    """What is expected of images left out is what comes out, be the points seen by few images or by many; of few, it is above the fit.
+
+    Their ratio varies by 7 % (few images) and 2 %, that of the medians to the fit's by 9 % about 2.2 and by 1 % about 1.06 (60 seeds each).
+    """
+    simulated = simulate(rng, images=30, points=300 if rays == 4 else 40)
+    network = measured_again(rng, simulated)
+    held = tuple(replace(camera, free=np.zeros_like(camera.free)) for camera in network.cameras)
+    found = adjust(replace(network, cameras=held), simulated.truth, used=(network.image * 7 + network.point) % 30 < rays)
+    left = left_out(found)
+    there, fit = (float(np.nanmedian(np.abs(values))) for values in (left.residual_px, left.fit_px))
+    expected = expected_median_px(found, 5)
+    assert 0.6 < there / expected < 1.5
+    assert there > 1.2 * fit if rays == 4 else there < 1.2 * fit
+    record = hold_out_record(None, left)
+    assert hold_out_findings(record, found, free=True) == []
+    record["free"]["left_out_rms_px"] *= 3
+    record["free"]["left_out_median_px"] *= 3
+    (finding,) = hold_out_findings(record, found, free=True)
+    assert f"{expected:.3g} px" in finding.text

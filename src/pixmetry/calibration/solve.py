@@ -183,4 +183,4 @@ def _findings(settled: Settled, tests: dict[str, Any]) -> list[Finding]:
     adjustment = settled.adjustment
     found = [*check_determined(adjustment), *in_the_shadow(pattern_findings(tests["patterns"])), *findings_of(adjustment, tests)]
     found += eccentricity_findings(settled.measured, settled.shift)
-    return found + hold_out_findings(tests.get("hold_out", {}), free=_is_free(settled.measured))
+    return found + hold_out_findings(tests.get("hold_out", {}), adjustment, free=_is_free(settled.measured))
