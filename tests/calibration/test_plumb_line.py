@@ -82,7 +82,7 @@ def test_is_the_maximum_likelihood(rng) -> None:
     """A general optimiser moves every position along its line, too: 1e-3 of the standard uncertainties, and 1 % of those themselves."""
     n = 12
     table = lines(rng, (0.08, 0.08), n=n, count=3)
-    found = calibrate_lines(**table, sensor=SENSOR, loss="none")
+    found = calibrate_lines(**table, sensor=SENSOR, loss="none", reject=False)
     key = np.repeat(np.arange(6), n)
     upright = table["image"] == "upright"
     scale = np.array([1e-3, 1e-5, 1e-5, 1e-5])
@@ -120,7 +120,7 @@ def test_variances_of_both_axes_have_their_degrees_of_freedom(rng) -> None:
     """Sums of squares over the true variances against χ²; dof are n − 2 a line, less four for the lens over both."""
     sums, dof = np.zeros(2), np.zeros(2)
     for _ in range(30):
-        found = calibrate_lines(**lines(rng, (0.08, 0.03)), sensor=SENSOR, loss="none")
+        found = calibrate_lines(**lines(rng, (0.08, 0.03)), sensor=SENSOR, loss="none", reject=False)
         assert found.axes["x"].dof + found.axes["y"].dof == pytest.approx(2 * 8 * 78 - 4, abs=1e-6)
         for k, (name, sigma) in enumerate((("x", 0.08), ("y", 0.03))):
             sums[k] += found.axes[name].dof * (found.axes[name].rms_px / sigma) ** 2

