@@ -86,7 +86,7 @@ def test_limit_pinhole_agrees_with_the_closed_form_of_the_ellipse(rng):
         expected = -np.column_stack([centres.shift_x_px, centres.shift_y_px])
         np.testing.assert_allclose(found.shift_px[rows], expected, atol=1e-8)
     assert found.corrected.all() and found.possible_px == 0
-    assert 0.1 < found.largest_px < 1.5
+    assert 0.02 < found.largest_px < 1.5  # below 0.1 where all six happen to be frontal: 5 of 4000
 
 
 def test_counted_subpixels_of_a_distorted_circle_have_that_centre(rng):

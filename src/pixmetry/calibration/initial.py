@@ -67,8 +67,9 @@ def start_values(network: Network) -> tuple[Network, State]:
             work.mend()
             work.settle()
             work.mend()
+        _check_posed(work)
+        if not work.control.any():
             _to_object(work, framed=posed is not None)
-    _check_posed(work)
     cameras = tuple(replace(camera, values=row) for camera, row in zip(network.cameras, work.interior, strict=True))
     state = work.state()
     fixed = np.where((network.u_xyz == 0) & np.isfinite(network.xyz), network.xyz, state.xyz)
