@@ -127,7 +127,9 @@ def test_stat_projection_map_covers_repeated_calibrations(rng):
         maps = record["u_raw_px"], record["u_px"]
         z2 = [np.sum(e**2, axis=1) / (2 * m.ravel() ** 2) for e, m in zip(row, maps, strict=True)]
         ratios.append([z2[0].mean(), z2[1].mean(), z2[1][len(u) // 2]])
-    assert record["u_px"].shape == (7, 9) and (record["u_px"] < record["u_raw_px"]).all()
+    without, raw = record["u_px"], record["u_raw_px"]
+    assert without.shape == (7, 9) and np.sum(without**2) < np.sum(raw**2)  # least squares over the map, not in each node
+    assert np.median(without / raw) < 0.4  # 0.17 ± 0.02 over 100 networks
     low, high = stats.chi2.ppf([RATE / 6, 1 - RATE / 6], 120) / 120
     mean = np.mean(ratios, axis=0)
     assert ((mean > low) & (mean < high)).all(), mean

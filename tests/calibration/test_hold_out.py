@@ -87,7 +87,9 @@ def test_left_out_is_leaving_one_out_by_hand(rng, monkeypatch):
     without = adjust(part, start, used=used[kept])
     state = replace(simulated.truth, interior=without.state.interior)
     rows, expected = posed_by_scipy(network, state, 3, used)
-    np.testing.assert_allclose(found.residual_px[rows], expected, atol=2e-6)
+    # each of the two adjustments stops 1e-3 standard deviations from its minimum, and u of a prediction is not above the noise
+    np.testing.assert_allclose(found.residual_px[rows], expected, rtol=0, atol=2e-3 * NOISE_PX)
+    assert np.abs(found.fit_px[rows] - expected).max() > 0.02 * NOISE_PX
 
 
 def test_subset_keeps_names_and_coordinates(rng):
@@ -136,24 +138,44 @@ def test_too_few_images(rng):
         left_out(found)
 
 
-@pytest.mark.parametrize("rays", [4, 30])
-def test_stat_what_noise_alone_would_show(rng, rays):
-    """What is expected of images left out is what comes out, be the points seen by few images or by many; of few, it is above the fit.
+KINDS = {"few rays": (0.82, 1.24), "many rays": (0.9, 1.16), "weights": (0.9, 1.16), "bars": (0.9, 1.16)}
 
-    Their ratio varies by 7 % (few images) and 2 %, that of the medians to the fit's by 9 % about 2.2 and by 1 % about 1.06 (60 seeds each).
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_stat_what_noise_alone_would_show(rng, kind):
+    """What is expected of images left out is what comes out, be the points seen by few images or by many, weighted, or held by bars.
+
+    The a priori standard deviation is half the noise. The ratio is 1.03 ± 0.02, of few rays 1.03 ± 0.07 (60 seeds each), and the limits are
+    5.5 standard deviations off, but for few rays, which are averaged over 4 networks; noise that is 16 % off would be seen.
     """
-    simulated = simulate(rng, images=30, points=300 if rays == 4 else 40)
-    network = measured_again(rng, simulated)
-    held = tuple(replace(camera, free=np.zeros_like(camera.free)) for camera in network.cameras)
-    found = adjust(replace(network, cameras=held), simulated.truth, used=(network.image * 7 + network.point) % 30 < rays)
-    left = left_out(found)
-    there, fit = (float(np.nanmedian(np.abs(values))) for values in (left.residual_px, left.fit_px))
-    expected = expected_median_px(found, 5)
-    assert 0.6 < there / expected < 1.5
-    assert there > 1.2 * fit if rays == 4 else there < 1.2 * fit
-    record = hold_out_record(None, left)
-    assert hold_out_findings(record, found, free=True) == []
-    record["free"]["left_out_rms_px"] *= 3
-    record["free"]["left_out_median_px"] *= 3
-    (finding,) = hold_out_findings(record, found, free=True)
-    assert f"{expected:.3g} px" in finding.text
+    ratios = []
+    for _ in range(4 if kind == "few rays" else 1):
+        found = _held(rng, kind)
+        left = left_out(found)
+        ratios.append(np.nanmedian(np.abs(left.residual_px)) / expected_median_px(found, 5))
+    low, high = KINDS[kind]
+    assert low < np.mean(ratios) < high
+
+
+def _held(rng, kind):
+    """An adjustment with the camera held, of noise twice as large as its a priori standard deviation says."""
+    simulated = simulate(rng, images=30, points=300 if kind == "few rays" else 40, bars=20 if kind == "bars" else 2)
+    network = measured_again(rng, simulated, noise_px=2 * NOISE_PX)
+    truth, bars = simulated.truth.xyz, network.bars
+    if kind == "weights":  # so tight that they count, and so loose that images left out show it
+        network = replace(network, xyz=truth + 0.05 * rng.standard_normal(truth.shape), u_xyz=np.full(truth.shape, 0.05))
+    if kind == "bars":
+        network = replace(network, bars=replace(bars, u=np.full(len(bars), 0.002)))
+    cameras = tuple(replace(camera, free=np.zeros_like(camera.free)) for camera in network.cameras)
+    rays = 4 if kind == "few rays" else 30
+    used = (network.image * 7 + network.point) % 30 < rays
+    return adjust(replace(network, cameras=cameras), simulated.truth, used=used)
+
+
+def test_what_noise_explains_is_no_finding():
+    record = {"fixed": None, "free": {"fit_rms_px": 0.1, "left_out_rms_px": 0.5, "left_out_median_px": 0.3}, "expected_median_px": 0.21}
+    assert hold_out_findings(record, free=True) == []
+    record["free"]["left_out_median_px"] = 0.33
+    (finding,) = hold_out_findings(record, free=True)
+    assert "0.21 px" in finding.text and finding.level == "warning"
+    assert hold_out_findings(record, free=False) == [] == hold_out_findings({**record, "expected_median_px": None}, free=True)

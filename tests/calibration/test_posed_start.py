@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calibration.networks import Simulated, simulate
+from calibration.networks import SENSOR, Simulated, predicted, simulate
 from pixmetry.calibration.bundle import adjust
 from pixmetry.calibration.initial import start_values
 from pixmetry.calibration.network import Network, Poses
@@ -21,7 +21,7 @@ ROUGH = 0.03  # of the object's size, and rad
 WEAK_SEED = 1  # of a ring of twelve images that share 3 to 12 points with their neighbours: without poses it is refused
 KINDS = {
     "volume": {"images": 12},
-    "no principal distance": {"images": 12, "c_known": False},
+    "unknown long lens": {"images": 12, "c_known": False, "interior": {"c": 45.0, "k1": 0.0, "k2": 0.0, "k3": 0.0}},
     "plane": {"images": 12, "field": "plane", "c_known": False},
     "ring": {"images": 20, "points": 200, "field": "around"},
     "two cameras": {"images": 16, "cameras": 2},
@@ -53,7 +53,8 @@ def test_rough_poses_are_enough(kind: str, rng: np.random.Generator) -> None:
     assert 0.7 < result.sigma0 < 1.3
     there = np.isfinite(result.state.xyz[:, 0])
     off = np.linalg.norm(result.state.xyz - simulated.truth.xyz, axis=1)[there]
-    assert np.median(off) < 3 * ROUGH * np.ptp(simulated.truth.xyz, axis=0).max()
+    size = np.ptp(np.concatenate([simulated.truth.xyz, simulated.truth.position]), axis=0).max()
+    assert np.median(off) < 3 * ROUGH * size
 
 
 def test_a_ring_that_does_not_hold_together_by_itself() -> None:
@@ -92,12 +93,64 @@ def test_wrong_poses_do_no_harm_and_are_named(rng: np.random.Generator) -> None:
     assert (np.abs(np.subtract(*both)) < 0.01 * u).all()
 
 
-def test_one_wrong_pose_is_named(rng: np.random.Generator) -> None:
+@pytest.mark.parametrize("what", ["rotation", "position"])
+def test_one_wrong_pose_is_named(what: str, rng: np.random.Generator) -> None:
+    """25° and a fifth of where the cameras stand; the others are as rough as in the other tests and are not named."""
     simulated = simulate(rng, images=12, points=40)
     network = with_poses(rng, simulated)
-    network.poses.rotation[3] = Rotation.from_rotvec([0.0, 0.0, 0.7]).as_matrix() @ network.poses.rotation[3]
+    if what == "rotation":
+        network.poses.rotation[3] = Rotation.from_rotvec([0.0, 0.0, np.radians(25)]).as_matrix() @ network.poses.rotation[3]
+    else:
+        network.poses.position[3] += 0.6 * np.linalg.norm(np.std(simulated.truth.position, axis=0)) * np.array([0.0, 0.0, 1.0])
     result = calibrate_network(network, Options(folds=0))
     (finding,) = [f for f in result.findings if f.kind == "start_poses"]
     assert "1 of 12 images" in finding.text and "IMG_0004" in finding.text
     off = fitted(result.adjustment.state.position, simulated.truth.position)[3]
     assert off.max() < 5.0  # mm
+
+
+def test_an_image_with_one_point_does_not_spoil_the_others(rng: np.random.Generator) -> None:
+    simulated = simulate(rng, images=12)
+    network = with_poses(rng, simulated)
+    kept = (network.image != 5) | (network.point == 7)
+    columns = {name: getattr(network, name)[kept] for name in ("x_px", "y_px", "image", "point", "covariance_px2")}
+    work = from_poses(replace(network, **columns), np.stack([camera.values for camera in network.cameras]))
+    assert work is not None and np.delete(work.posed, 5).all()
+
+
+def test_images_that_see_known_points_alone_are_posed(rng: np.random.Generator) -> None:
+    """Two of twelve images show each a third of a known field of which no other image shows anything."""
+    simulated = simulate(rng, images=12, points=90, known="fixed")
+    network = with_poses(rng, simulated)
+    third = network.point // 30
+    kept = np.where(network.image == 0, third == 0, np.where(network.image == 1, third == 1, third == 2))
+    columns = {name: getattr(network, name)[kept] for name in ("x_px", "y_px", "image", "point", "covariance_px2")}
+    assert np.isfinite(start_values(replace(network, **columns))[1].position).all()
+
+
+def of_two_lenses(rng: np.random.Generator) -> tuple[Network, Poses]:
+    """Ten images of a wide camera and ten of a long one of the same points, no principal distance known; poses of the wide one's."""
+    wide, long = (simulate(rng, images=10, c_known=False, interior={"c": c, "k1": 0.0, "k2": 0.0, "k3": 0.0}) for c in (8.5, 45.0))
+    parts = []
+    for k, one in enumerate((wide, long)):
+        x, y = predicted(one.network, replace(one.truth, xyz=wide.truth.xyz)).T
+        good = (x > 0) & (x < SENSOR.cols) & (y > 0) & (y < SENSOR.rows)
+        parts.append(np.stack([x, y, one.network.image + 10 * k, one.network.point])[:, good])
+    x, y, image, point = np.concatenate(parts, axis=1)
+    network = replace(
+        wide.network, cameras=tuple(replace(one.network.cameras[0], name=name) for one, name in ((wide, "A"), (long, "B"))),
+        images=tuple(map(str, range(20))), camera_of=np.repeat([0, 1], 10), image=image.astype(int), point=point.astype(int),
+        x_px=x + 0.04 * rng.standard_normal(len(x)), y_px=y + 0.04 * rng.standard_normal(len(x)),
+        covariance_px2=np.tile([0.0016, 0.0, 0.0016], (len(x), 1)),
+    )  # fmt: skip
+    known, nothing = with_poses(rng, wide).poses, np.full((10, 3, 3), np.nan)
+    return network, Poses(np.concatenate([known.rotation, nothing]), np.concatenate([known.position, nothing[:, 0]]))
+
+
+@pytest.mark.parametrize("posed", [True, False])
+def test_of_two_cameras_one_has_poses(posed: bool, rng: np.random.Generator) -> None:
+    """The other one's principal distance is searched for on the points that stand."""
+    network, poses = of_two_lenses(rng)
+    _, state = start_values(replace(network, poses=poses if posed else None))
+    assert np.isfinite(state.position).all()
+    np.testing.assert_allclose(state.interior[:, 0], [8.5, 45.0], rtol=0.02)

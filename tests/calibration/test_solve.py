@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 from scipy import stats
 
 from calibration.networks import image_of, predicted, simulate
+from pixmetry.calibration import known_checks
+from pixmetry.calibration.known_residuals import contradicted
 from pixmetry.calibration.model import NAMES
 from pixmetry.calibration.network import Calibration, ScaleBars
 from pixmetry.calibration.solve import Options, calibrate_network
@@ -16,6 +19,12 @@ from pixmetry.core.errors import InputError, MeasureError, ParameterError
 
 RATE = 1e-6  # false failures of each statistical test
 QUICK = Options(folds=0)
+
+
+@pytest.fixture
+def rare_alarms(monkeypatch):
+    """One network in a hundred names a right bar or point; here it is one in a million. Planted errors are far above."""
+    monkeypatch.setattr(known_checks, "contradicted", partial(contradicted, false_alarms=RATE))
 
 
 def distance(calibration: Calibration, simulated, camera: int = 0) -> tuple[float, float]:
@@ -204,7 +213,7 @@ def test_a_guessed_covariance_gives_the_same_as_the_right_one(rng):
         np.testing.assert_allclose(np.sqrt(np.diag(guessed.interior_covariance()[1])), u, rtol=0.05)
 
 
-def test_a_wrong_bar_is_the_first_thing_said(rng):
+def test_a_wrong_bar_is_the_first_thing_said(rng, rare_alarms):
     simulated = simulate(rng, images=14, points=50, bars=4)
     bars = simulated.network.bars
     network = replace(simulated.network, bars=ScaleBars(bars.start, bars.end, bars.length + [2.0, 0, 0, 0], bars.u))
@@ -228,7 +237,7 @@ def test_two_bars_that_contradict_each_other_are_both_doubted(rng):
     assert found < limit
 
 
-def test_a_bar_in_other_units_is_left_out_or_refused(rng):
+def test_a_bar_in_other_units_is_left_out_or_refused(rng, rare_alarms):
     simulated = simulate(rng, images=12, points=40, bars=3)
     bars = simulated.network.bars
     inch = ScaleBars(bars.start, bars.end, bars.length / [25.4, 1, 1], bars.u)
@@ -240,7 +249,7 @@ def test_a_bar_in_other_units_is_left_out_or_refused(rng):
         calibrate_network(replace(simulated.network, bars=two), QUICK, simulated.truth)
 
 
-def test_a_wrong_fixed_point_is_set_free_and_its_images_stay(rng):
+def test_a_wrong_fixed_point_is_set_free_and_its_images_stay(rng, rare_alarms):
     """3 mm, some 5 px in every image of it."""
     simulated = simulate(rng, images=12, points=50, known="fixed", bars=0)
     xyz = simulated.network.xyz.copy()
@@ -263,7 +272,7 @@ def test_exact_image_coordinates_are_no_trouble(rng):
 
 
 @pytest.mark.parametrize("fixed", [4, 10])
-def test_a_wrong_one_of_few_fixed_points_is_named_and_image_points_stay(rng, fixed):
+def test_a_wrong_one_of_few_fixed_points_is_named_and_image_points_stay(rng, fixed, rare_alarms):
     """2 mm, several px, beside free points; with four it depends on where they lie what can be said. Right ones are left in peace."""
     simulated = simulate(rng, images=14, points=60, bars=0)
     u = np.where(np.arange(60)[:, None] < fixed, 0.0, np.full((60, 3), np.inf))

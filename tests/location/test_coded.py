@@ -120,7 +120,10 @@ def test_targets_too_small_to_be_read_are_not_read_wrong() -> None:
 
 
 def test_what_is_no_coded_target_has_no_code() -> None:
-    """Plain discs, rings, discs among others, chessboard corners, noise: of 2000 at most 6 are taken for codes."""
+    """Plain discs, rings, discs among others, chessboard corners, noise: of 2000 at most 9 are taken for codes.
+
+    Two thirds of one on average (22 in 33 runs, all of them in the crowd): even of one, ten come by chance once in 10⁷ runs.
+    """
     rng = np.random.default_rng()
     size = 600
     row, col = np.indices((size, size)).astype(float)
@@ -141,7 +144,7 @@ def test_what_is_no_coded_target_has_no_code() -> None:
         five = np.full(400, 5.0)
         found = read_codes(frame, px, py, five, five, np.zeros(400), np.full(400, 170.0))
         taken += (found.number >= 0).sum()
-    assert taken <= 6
+    assert taken <= 9
 
 
 def test_the_same_number_in_every_view() -> None:

@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 
 from pixmetry.calibration.eccentric import Eccentricity
-from pixmetry.calibration.hold_out import expected_median_px
+from pixmetry.calibration.hold_out import WORSE
 from pixmetry.calibration.network import Adjustment, Finding, Network
 from pixmetry.calibration.quality import p_words
-from pixmetry.core.errors import MeasureError
 
 ORDER = (  # of kinds, among findings of the same level; what is not named here comes between the two parts
     "start", "determination", "x_scale_drift", "bad_images", "correlation", "flatness", "lost_points", "gross_scale_bar",
@@ -22,7 +21,6 @@ ORDER = (  # of kinds, among findings of the same level; what is not named here 
 SIGNIFICANT = 0.05
 RARE = 0.001  # level of tests that were not asked for
 CORRELATED = 0.995
-WORSE = 1.5  # than the fit (rms) and than noise (median): residuals of images left out that are worth a sentence
 NOTEWORTHY_PX = 0.002  # an eccentricity of this size is worth a sentence
 NAMED = 5
 LEAST_NOTES = 2
@@ -220,16 +218,11 @@ def eccentricity_findings(measured: Network, found: Eccentricity) -> list[Findin
     return out
 
 
-def hold_out_findings(record: Mapping[str, Any], adjustment: Adjustment, *, free: bool) -> list[Finding]:
+def hold_out_findings(record: Mapping[str, Any], *, free: bool) -> list[Finding]:
     """Images left out that fit much worse than those of the fit, and than noise explains: with the field's points free or not."""
     one = record.get("free" if free else "fixed")
-    if not one or one["left_out_rms_px"] < WORSE * one["fit_rms_px"]:
-        return []
-    try:
-        expected = expected_median_px(adjustment, record["folds"])
-    except MeasureError:  # hardly determined without these images: noise may do anything
-        return []
-    if one["left_out_median_px"] < WORSE * expected:
+    expected = record.get("expected_median_px")
+    if not one or expected is None or one["left_out_median_px"] < WORSE * expected:
         return []
     text = (
         f"Images left out of the fit show {one['left_out_rms_px']:.3g} px, those in it {one['fit_rms_px']:.3g} px (rms). "

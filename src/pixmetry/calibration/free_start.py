@@ -148,19 +148,22 @@ def without_lens(network: Network, interior: np.ndarray) -> np.ndarray:
     return np.where(free, 0.0, interior)
 
 
+def start_interiors(network: Network, interior: np.ndarray) -> list[np.ndarray]:
+    """Interior parameters to try: a lens that was given is believed first, then all principal distances without one."""
+    distances, plain = start_distances(network), without_lens(network, interior)
+    given = [np.column_stack([distances[0], interior[:, 1:]])] if (plain != interior).any() else []
+    return given + [np.column_stack([c, plain[:, 1:]]) for c in distances]
+
+
 def best_free(network: Network, interior: np.ndarray, allowed: np.ndarray, first: int = 0) -> Reconstruction | None:
     """The start that explains the image coordinates best, grown to a few images; None if no pair can be oriented.
 
     ``first`` is the pair to begin with, in the order of `good_pairs`.
     """
     pairs = good_pairs(network, allowed)[first : first + PAIRS]
-    distances = start_distances(network)
     best, least = None, np.inf
     no_control = np.zeros(len(network.points), bool)
-    plain = without_lens(network, interior)
-    starts = [np.column_stack([c, plain[:, 1:]]) for c in distances]
-    if (plain != interior).any():  # a lens that was given is believed first
-        starts.insert(0, np.column_stack([distances[0], interior[:, 1:]]))
+    starts = start_interiors(network, interior)
     order = [(k, row) for k in range(min(2, len(pairs))) for row in starts] + [(k, row) for k in range(2, len(pairs)) for row in starts[:3]]
     for number, (k, values) in enumerate(order):
         if best is not None and number == len(starts):  # one pair has been tried with all: is the best of it on its way down?

@@ -14,6 +14,7 @@ from pixmetry.core.errors import InputError
 
 STEPS = 30
 CLOSE = 1e-6  # steps are small when they move the image by so many px
+WORSE = 1.5  # than the fit, and than noise alone: images left out of which something must be said
 TUNING = 2.5  # of Huber's weights, in standard deviations
 
 
@@ -106,6 +107,7 @@ def subset(network: Network, state: State, images: np.ndarray) -> tuple[Network,
         point=network.point[kept],
         covariance_px2=network.covariance_px2[kept],
         time_s=None if network.time_s is None else network.time_s[images],
+        poses=None,
     )
     start = replace(
         state,
@@ -203,16 +205,26 @@ def _moved(state: State, step: np.ndarray, free: list[int]) -> State:
 
 
 def expected_median_px(adjustment: Adjustment, folds: int, seed: int = 0) -> float:
-    """Median size of the residuals of images left out, were the adjusted network true and its noise all that is wrong: simulated once.
+    """What `left_out` would show if nothing but noise were wrong, by one simulation of the adjusted network.
 
-    Points that few images see are worse known without one of them, so that this is larger than in the fit; how large the rms is would then
-    hang on the weakest of them.
+    Points that few images see are worse known without one of them, so that images left out show more than those of the fit. The median says
+    what half of the image coordinates do; the rms would hang on the few weakest points.
 
     Parameters
     ----------
     adjustment : Adjustment
     folds, seed : int
         As in `left_out`.
+
+    Returns
+    -------
+    float
+        Median size of the residuals, px.
+
+    Raises
+    ------
+    InputError, MeasureError
+        As `left_out`.
     """
     from pixmetry.core.random import generator
 

@@ -14,21 +14,22 @@ import numpy as np
 
 from pixmetry.calibration.free_start import best_free, common_points, without_lens
 from pixmetry.calibration.network import Network, State
+from pixmetry.calibration.object_frame import moved, to_object
 from pixmetry.calibration.planar_start import homography, plane_coordinates, principal_distance
 from pixmetry.calibration.posed_start import from_poses
-from pixmetry.calibration.reconstruction import FINE, Reconstruction
-from pixmetry.calibration.resection import FEWEST, FLAT, fitted, similarity, thickness
+from pixmetry.calibration.reconstruction import Reconstruction
+from pixmetry.calibration.resection import FEWEST, FLAT, fitted, thickness
 from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.core.threads import single_threaded_blas
 
 TRIED_IMAGES = 12  # by which principal distances are compared
 FINE_STEPS = (1.25, 0.8, 1.0, 1.6, 0.63, 2.0, 0.5, 2.6, 0.4, 3.3, 4.2, 5.3, 6.6, 8.5)  # principal distances, in widths of the frame
-FITS = 0.3  # of FINE, as an rms: what a start from known points must reach
+CONTROL_FITS = 0.3  # of FINE, as an rms: what a start from known points must reach
 JOINS = 0.02  # rms distance at the points that join two parts, in units of the extent
 BEGINNINGS = (0, 1, 2, 4, 8, 14)  # pairs to begin with, one after the other while most images get no pose
 TIE = 3  # points that join two parts of a network
 ENOUGH = 0.7  # of the images that must get a pose
-REACH = 0.1  # rms distance from control, in units of its extent, at which coordinates do not belong to the images
+FEW_POSED = 0.5  # of a camera's images: then its principal distance may be a wrong one
 
 
 def start_values(network: Network) -> tuple[Network, State]:
@@ -57,6 +58,8 @@ def start_values(network: Network) -> tuple[Network, State]:
     interior = np.stack([camera.values for camera in network.cameras])
     with single_threaded_blas():
         work = posed = from_poses(network, interior)
+        if work is not None:
+            _grow_cameras(work)
         if work is None:
             work = _from_known_points(network, interior)
         if work is None:
@@ -69,7 +72,7 @@ def start_values(network: Network) -> tuple[Network, State]:
             work.mend()
         _check_posed(work)
         if not work.control.any():
-            _to_object(work, framed=posed is not None)
+            to_object(work, framed=posed is not None)
     cameras = tuple(replace(camera, values=row) for camera, row in zip(network.cameras, work.interior, strict=True))
     state = work.state()
     fixed = np.where((network.u_xyz == 0) & np.isfinite(network.xyz), network.xyz, state.xyz)
@@ -121,9 +124,8 @@ def _resected(network: Network, interior: np.ndarray, control: np.ndarray) -> Re
 
 
 def _fits(work: Reconstruction) -> bool:
-    images = np.flatnonzero(work.posed)
-    rough = ~np.isfinite(work.network.u_xyz[work.control]).all()
-    return bool(len(images) and np.sqrt(work.cost(images)) < (2 if rough else 1) * FITS * FINE * work.width)
+    rough = not np.isfinite(work.network.u_xyz[work.control]).all()
+    return work.fits(np.flatnonzero(work.posed), (2 if rough else 1) * CONTROL_FITS)
 
 
 def _search_distance(work: Reconstruction, camera: int, images: np.ndarray) -> None:
@@ -160,7 +162,7 @@ def _search_distance(work: Reconstruction, camera: int, images: np.ndarray) -> N
 def _distance_from_planes(work: Reconstruction, camera: int, images: np.ndarray) -> float:
     network = work.network
     model = network.cameras[camera]
-    if thickness(network.xyz[work.control])[0] > FLAT:
+    if not work.control.any() or thickness(network.xyz[work.control])[0] > FLAT:
         return 0.0
     plane = np.full((len(network.points), 2), np.nan)
     plane[work.control] = plane_coordinates(network.xyz[work.control])
@@ -210,18 +212,24 @@ def _from_images(network: Network, interior: np.ndarray) -> Reconstruction:
 
 
 def _grow_cameras(work: Reconstruction) -> None:
-    """Grow to all images; cameras that did not take part in the beginning are searched for on the points that stand by then."""
+    """Grow to all images; cameras few of whose images got a pose are searched for anew, on the points that stand by then."""
     network = work.network
     work.grow()
     for camera in range(len(network.cameras)):
         mine = np.flatnonzero(network.camera_of == camera)
-        if work.posed[mine].any() or not len(mine):
+        if not len(mine) or work.posed[mine].mean() > FEW_POSED:
             continue
-        known = np.isfinite(work.xyz[network.point, 0])
+        trial = work.copy()
+        trial.rotation[mine], trial.position[mine] = np.nan, np.nan
+        trial.triangulate()
+        trial.judge()
+        known = np.isfinite(trial.xyz[network.point, 0])
         seen = np.bincount(network.image[known], minlength=len(network.images))
         mine = mine[np.argsort(-seen[mine], kind="stable")][:TRIED_IMAGES]
-        _search_distance(work, camera, mine[seen[mine] >= FEWEST + 2])
-    work.grow()
+        _search_distance(trial, camera, mine[seen[mine] >= FEWEST + 2])
+        trial.grow()
+        if trial.posed.sum() > work.posed.sum():
+            work.__dict__.update(trial.__dict__)
 
 
 def _join_rest(work: Reconstruction) -> bool:
@@ -265,91 +273,10 @@ def _held(network: Network, work: Reconstruction) -> tuple:
     )
 
 
-def moved(work: Reconstruction, scale: float, rotation: np.ndarray, shift: np.ndarray) -> None:
-    """Bring poses and points to another frame."""
-    work.position = scale * work.position @ rotation.T + shift
-    work.xyz = scale * work.xyz @ rotation.T + shift
-    work.rotation = work.rotation @ rotation.T
-
-
-def _to_object(work: Reconstruction, *, framed: bool) -> None:
-    """Bring a free reconstruction to control, nominal coordinates, bars, or, unless it has one (``framed``), a frame of its own."""
-    network = work.network
-    known = np.isfinite(work.xyz[:, 0])
-    given = known & np.isfinite(network.xyz).all(axis=1)
-    control = given & np.isfinite(network.u_xyz).all(axis=1)
-    use = control if control.sum() >= 3 else given
-    use_all = use.sum() >= 3 and thickness(network.xyz[use])[1] > 1e-3
-    if use_all:
-        scale, rotation, shift, away = fitted(work.xyz[use], network.xyz[use])
-        extent = np.linalg.norm(np.std(network.xyz[use], axis=0))
-        if control.sum() >= 3 and np.median(away) > REACH * extent:
-            raise _does_not_fit(work, use)
-        moved(work, scale, rotation, shift)
-    elif not framed:
-        _own_frame(work, known)
-    if control.sum() < 2:
-        _scaled(work)
-    if control.any() and not use_all:
-        _to_few(work, control)
-
-
-def _does_not_fit(work: Reconstruction, use: np.ndarray) -> Exception:
-    network = work.network
-    mirror = np.array([1.0, 1.0, -1.0])
-    away = fitted(work.xyz[use] * mirror, network.xyz[use])[3]
-    extent = np.linalg.norm(np.std(network.xyz[use], axis=0))
-    if thickness(network.xyz[use])[0] > FLAT and np.median(away) < 0.3 * REACH * extent:
-        return InputError(
-            "image and object coordinates fit only mirrored", where="object points",
-            allowed="x to the right and y down in the image, a right-handed frame in the object",
-            remedy="say that y counts upwards in the table of image coordinates, or turn one axis of the object over",
-        )  # fmt: skip
-    return MeasureError(
-        "the images agree with each other, but not with the known coordinates", where="object points",
-        value=f"{np.median(away):.3g} {network.unit} apart at {use.sum()} points",
-        remedy="compare the names of the points in both tables, the order of the coordinates' columns, and their unit",
-    )  # fmt: skip
-
-
-def _own_frame(work: Reconstruction, known: np.ndarray) -> None:
-    """Origin in the middle of the points, z along their least extent towards the images, size from the mean base."""
-    posed = work.posed
-    middle = np.median(work.xyz[known], axis=0)
-    axes = np.linalg.svd(work.xyz[known] - middle, full_matrices=False)[2]
-    z = axes[2] * (np.sign(axes[2] @ (work.position[posed].mean(axis=0) - middle)) or 1.0)
-    rotation = np.stack([axes[0], np.cross(z, axes[0]), z])
-    base = np.sqrt(2 * np.sum(np.var(work.position[posed], axis=0)))
-    scale = 1.0 / float(base) if base > 0 else 1.0
-    moved(work, scale, rotation, -scale * rotation @ middle)
-
-
-def _to_few(work: Reconstruction, control: np.ndarray) -> None:
-    """To control that is one point, or lies in line: what it leaves open stays as it is."""
-    source, target = work.xyz[control], work.network.xyz[control]
-    if len(source) == 1:
-        moved(work, 1.0, np.eye(3), (target - source)[0])
-    else:
-        moved(work, *similarity(source, target, np.ones(len(source))))
-
-
-def _scaled(work: Reconstruction) -> None:
-    """The size that bars ask for, about the middle of the points."""
-    bars = work.network.bars
-    if not len(bars):
-        return
-    there = np.linalg.norm(work.xyz[bars.start] - work.xyz[bars.end], axis=1)
-    good = np.isfinite(there) & (there > 0)
-    if good.any():
-        middle = np.nanmean(work.xyz, axis=0)
-        scale = float(np.median(bars.length[good] / there[good]))
-        moved(work, scale, np.eye(3), (1 - scale) * middle)
-
-
 def _check_posed(work: Reconstruction) -> None:
     posed = work.posed
     measured = np.isin(np.arange(len(posed)), work.network.image)  # an image without any point is nobody's failure
-    if posed.sum() < max(1, ENOUGH * measured.sum()):
+    if (posed & measured).sum() < max(1, ENOUGH * measured.sum()):
         raise _not_oriented(work.network, posed)
 
 

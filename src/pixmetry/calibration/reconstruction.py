@@ -98,12 +98,13 @@ class Reconstruction:
         self.good[rows] = found.fits
         return found.cost * c_px**2
 
-    def triangulate(self) -> None:
-        """Intersect all points that do not stand, and judge their rays."""
+    def triangulate(self, tolerance: float | None = None) -> None:
+        """Intersect all points that do not stand, and judge their rays; they may miss each other by ``tolerance`` (rad)."""
         free = ~self.control[self.network.point]
         image = self.network.image[free]
         ray = rays(self.uv[free], self.rotation[image])
-        tolerance = self.tolerance_px() / 3 / min(self.c_px(k) for k in np.unique(self.camera) if self.interior[k, 0] > 0)
+        if tolerance is None:
+            tolerance = self.tolerance_px() / 3 / min(self.c_px(k) for k in np.unique(self.camera) if self.interior[k, 0] > 0)
         xyz, fits = intersect(self.position[image], ray, self.network.point[free], len(self.xyz), tolerance)
         self.xyz = np.where(self.control[:, None], self.xyz, xyz)
         posed = self.posed[image]
@@ -149,6 +150,10 @@ class Reconstruction:
         error = np.hypot(*self.residuals()[rows].T)
         return float(np.mean(np.minimum(np.where(np.isnan(error), worst, error), worst) ** 2)) if rows.any() else worst**2
 
+    def fits(self, images: np.ndarray, share: float) -> bool:
+        """Whether the root of `cost` is below a share of FINE."""
+        return bool(len(images) and np.sqrt(self.cost(images)) < share * FINE * self.width)
+
     def adjust(self, rounds: int = 2, iterations: int = 8) -> None:
         """Bundle adjustment of what is known, with as many interior parameters free as the images carry."""
         for _ in range(rounds):
@@ -191,7 +196,7 @@ class Reconstruction:
             points=tuple(self.network.points[j] for j in points), x_px=self.network.x_px[rows], y_px=self.network.y_px[rows],
             image=image, point=point, covariance_px2=np.tile([variance, 0.0, variance], (len(rows), 1)),
             xyz=np.where(control, self.network.xyz[points], np.nan), u_xyz=np.where(control, self.network.u_xyz[points], np.inf),
-            bars=ScaleBars.none(), per_image=(), time_s=None, diameter=None, normal=None,
+            bars=ScaleBars.none(), per_image=(), time_s=None, diameter=None, normal=None, poses=None,
         )  # fmt: skip
         zero = np.zeros(len(images))
         start = State(self.interior[cameras], self.rotation[images], self.position[images], zero, zero, self.xyz[points])
@@ -212,7 +217,8 @@ class Reconstruction:
         return True
 
     def _plausible(self, cameras: np.ndarray, state: State) -> bool:
-        if not all(np.isfinite(value).all() for value in (state.interior, state.rotation, state.position)):
+        posed = np.isfinite(state.position).all(axis=1)  # an image that its points do not determine loses its pose, no more
+        if posed.sum() < min(2, len(posed)) or not (np.isfinite(state.interior).all() and np.isfinite(state.rotation[posed]).all()):
             return False
         for k, values in zip(cameras, state.interior, strict=True):
             sensor = self.network.cameras[k].sensor

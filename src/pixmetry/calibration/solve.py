@@ -59,6 +59,8 @@ def calibrate_network(
     settled, tests, more = _checked_field(settled, options, say)
     say("testing the result")
     tests |= _records(settled, network, options)
+    if "hold_out" in tests:
+        tests["hold_out"] = _with_expected(tests["hold_out"], settled)
     if options.residual_grid:
         tests["residual_grid"] = residual_grids(settled.adjustment)
     findings += [*more, *_findings(settled, tests)]
@@ -154,6 +156,19 @@ def _held_out(settled: Settled, options: Options) -> dict[str, Any]:
     return {"hold_out": hold_out_record(None, held) if _is_free(settled.measured) else hold_out_record(held)}
 
 
+def _with_expected(record: dict[str, Any], settled: Settled) -> dict[str, Any]:
+    """The record of images left out; where these fit much worse, with what noise alone would show."""
+    from pixmetry.calibration.hold_out import WORSE, expected_median_px
+
+    one = record["free" if _is_free(settled.measured) else "fixed"]
+    if one is None or one["left_out_rms_px"] < WORSE * one["fit_rms_px"]:
+        return record
+    try:
+        return {**record, "expected_median_px": expected_median_px(settled.adjustment, record["folds"])}
+    except MeasureError:  # hardly determined without these images: noise may do anything
+        return record
+
+
 def _is_free(network: Network) -> bool:
     return not (network.u_xyz == 0).any()
 
@@ -183,4 +198,4 @@ def _findings(settled: Settled, tests: dict[str, Any]) -> list[Finding]:
     adjustment = settled.adjustment
     found = [*check_determined(adjustment), *in_the_shadow(pattern_findings(tests["patterns"])), *findings_of(adjustment, tests)]
     found += eccentricity_findings(settled.measured, settled.shift)
-    return found + hold_out_findings(tests.get("hold_out", {}), adjustment, free=_is_free(settled.measured))
+    return found + hold_out_findings(tests.get("hold_out", {}), free=_is_free(settled.measured))

@@ -9,18 +9,30 @@ from pixmetry.calibration_project.tables import Table
 from pixmetry.core.errors import InputError
 
 CENTRE = ("X0", "Y0", "Z0")
-MATRIX = tuple(f"r{i}{j}" for i in "123" for j in "123")
-ANGLES = ("omega", "phi", "kappa")
 RAD_PER = {"deg": np.pi / 180, "gon": np.pi / 200, "rad": 1.0}
-COLUMNS = (*CENTRE, *MATRIX, *(f"{angle}_{unit}" for angle in ANGLES for unit in RAD_PER))
-SQUARE = 1e-3  # how far R Rᵀ may be from 1: numbers of a matrix that were rounded
+ROTATIONS = {
+    "matrix": tuple(f"r{i}{j}" for i in "123" for j in "123"),
+    **{unit: tuple(f"{angle}_{unit}" for angle in ("omega", "phi", "kappa")) for unit in RAD_PER},
+}
+COLUMNS = (*CENTRE, *(name for names in ROTATIONS.values() for name in names))
+SQUARE = 3e-3  # how far R Rᵀ may be from 1: numbers of a matrix that were rounded
 
 
 def start_poses(table: Table) -> Poses | None:
-    """Start values of the poses of a table's rows; None if it has no such columns.
+    """Start values of the poses of a table's images.
 
-    A matrix is R of R (X − X₀), the camera looking along +z with y down. Angles are those of R = Rx(ω) Ry(φ) Rz(κ) from a camera that looks
-    along −z with y up to the object (K. Kraus, Photogrammetry, 2nd ed., 2007, app. 2.1).
+    A matrix is R of R (X − X₀), the camera looking along +z with y down. Angles are those of Rx(ω) Ry(φ) Rz(κ), which turns from a camera
+    that looks along −z with y up to the object (K. Kraus, Photogrammetry, 2nd ed., de Gruyter, Berlin 2007).
+
+    Parameters
+    ----------
+    table : Table
+        Rows without any of the values have no pose.
+
+    Returns
+    -------
+    Poses or None
+        In the order of the rows; None if there are no such columns.
 
     Raises
     ------
@@ -28,19 +40,15 @@ def start_poses(table: Table) -> Poses | None:
         If columns or values are missing, or a matrix is no rotation.
     """
     table = table.spelled(*COLUMNS)
-    told = [name for name in COLUMNS if name in table]
-    if not told:
+    if not any(name in table for name in COLUMNS):
         return None
-    unit = next((unit for unit in RAD_PER for angle in ANGLES if f"{angle}_{unit}" in table), None)
-    if unit is None:
-        names = MATRIX if any(name in table for name in MATRIX) else tuple(f"{angle}_deg" for angle in ANGLES)
-    else:
-        names = tuple(f"{angle}_{unit}" for angle in ANGLES)
-    other = next((name for name in told if name not in (*CENTRE, *names)), None)
-    if other is not None:
-        what = f"rotations are told twice, by {names[0]} and by {other}"
+    told = [(unit, names) for unit, names in ROTATIONS.items() if any(name in table for name in names)] or [("deg", ROTATIONS["deg"])]
+    if len(told) > 1:
+        first, second = (next(name for name in names if name in table) for _, names in told[:2])
+        what = f"rotations are told twice, by {first} and by {second}"
         allowed = "r11 … r33, or omega, phi, kappa in one unit"
         raise InputError(what, where=table.source, allowed=allowed, remedy="leave one of the two out")
+    ((unit, names),) = told
     table.need(*CENTRE, *names)
     values = np.stack([table.numbers(name, empty=np.nan) for name in (*CENTRE, *names)], axis=1)
     missing = np.isnan(values)
@@ -50,7 +58,7 @@ def start_poses(table: Table) -> Poses | None:
         remedy = "add what is missing, or leave all of them empty"
         raise InputError("a pose with some of its values", where=table.where(row), allowed=", ".join((*CENTRE, *names)), remedy=remedy)
     position, turn = values[:, :3], values[:, 3:]
-    rotation = _of_angles(turn * RAD_PER[unit]) if unit is not None else _of_matrix(table, turn.reshape(-1, 3, 3))
+    rotation = _of_matrix(table, turn.reshape(-1, 3, 3)) if unit == "matrix" else _of_angles(turn * RAD_PER[unit])
     return Poses(rotation, position)
 
 

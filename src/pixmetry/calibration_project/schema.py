@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, model_validator
 
 from pixmetry.calibration.model import NAMES
+from pixmetry.calibration.network import PER_IMAGE_NAMES
 from pixmetry.core.config import Model
 from pixmetry.core.errors import InputError
 
@@ -191,7 +192,7 @@ class ProjectModel(Model):
     target: TargetModel | None = None
     scale_bars: tuple[BarModel, ...] = ()
     scale_bars_table: Annotated[TableModel | None, BeforeValidator(_table)] = None
-    per_image: Annotated[tuple[Literal["x_scale", "x_shift"], ...], BeforeValidator(_listed)] = ()
+    per_image: Annotated[tuple[Literal[PER_IMAGE_NAMES], ...], BeforeValidator(_listed)] = ()  # type: ignore[valid-type]
     scale_origin_px: float = 0.0
     options: OptionsModel = OptionsModel()
 
