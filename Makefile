@@ -8,7 +8,8 @@ PY := $(VENV)/bin/python
 PIP := $(PY) -m pip --disable-pip-version-check
 INSTALLED := $(VENV)/.installed
 ORACLES := .venv-oracles
-PYTEST := $(PY) -m pytest -n $(JOBS) --dist loadfile --hypothesis-seed=0
+# BLAS threads beside JOBS processes would only wait for each other.
+PYTEST := OPENBLAS_NUM_THREADS=1 $(PY) -m pytest -n $(JOBS) --dist loadfile --hypothesis-seed=0
 
 .DEFAULT_GOAL := help
 .PHONY: help install demo test oracles study bench handbook lint browser-test

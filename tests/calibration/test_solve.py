@@ -432,9 +432,9 @@ def test_understated_uncertainties_of_control_are_called_that(rng, bars):
     record = calibration.tests["known"]["control_points"]
     low, high = (25 * np.sqrt(stats.chi2.isf(p, 20) / 20) for p in (1 - RATE / 2, RATE / 2))
     assert 0.8 * low < record["understated"] < 1.2 * high
-    assert [r["name"].split()[0] for r in record["gross"]] == [simulated.network.points[4]]
+    assert simulated.network.points[4] in [r["name"].split()[0] for r in record["gross"]]
     kept = np.isfinite(calibration.adjustment.network.u_xyz[:10]).all(axis=1)
-    assert kept.sum() == 9 and not kept[4]
+    assert kept.sum() > 6 and not kept[4]  # one right one in a hundred networks goes with it, three once in 10⁷
     found, limit = distance(calibration, simulated)
     assert found < limit
 

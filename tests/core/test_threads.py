@@ -86,6 +86,21 @@ def test_blas_is_held_to_one_thread() -> None:
     import numpy as np
     from threadpoolctl import threadpool_info
 
-    with threads.single_threaded_blas():
-        np.ones((4, 4)) @ np.ones((4, 4))
-        assert all(library["num_threads"] == 1 for library in threadpool_info())
+    def numbers() -> list[int]:
+        return [library["num_threads"] for library in threadpool_info()]
+
+    @threads.single_threaded_blas()
+    def inside() -> None:
+        assert set(numbers()) == {1}
+
+    before = []
+    for _ in range(2):
+        with threads.single_threaded_blas():
+            np.ones((4, 4)) @ np.ones((4, 4))
+            inside()  # and does not let go where it ends
+            assert set(numbers()) == {1}
+        before.append(numbers())
+    assert before[0] == before[1]
+    with pytest.raises(ZeroDivisionError), threads.single_threaded_blas():
+        1 / 0  # noqa: B018
+    assert numbers() == before[0]

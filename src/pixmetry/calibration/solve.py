@@ -12,12 +12,14 @@ from pixmetry.calibration.network import PER_IMAGE_NAMES, Calibration, Finding, 
 from pixmetry.calibration.options import Options
 from pixmetry.calibration.settling import Progress, Settled, adjust_with, settle
 from pixmetry.core.errors import InputError, MeasureError
+from pixmetry.core.threads import single_threaded_blas
 
 __all__ = ["Options", "calibrate_network"]
 DEFAULTS = Options()
 FEW = ("c", "k1")  # estimated first where start values are rough
 
 
+@single_threaded_blas()
 def calibrate_network(
     network: Network, options: Options = DEFAULTS, start: State | None = None, progress: Progress | None = None
 ) -> Calibration:

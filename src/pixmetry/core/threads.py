@@ -7,7 +7,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import AbstractContextManager
+from contextlib import contextmanager
 from typing import TypeVar
 
 from pixmetry.core.errors import InputError
@@ -15,7 +15,7 @@ from pixmetry.core.errors import InputError
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-_state = threading.local()  # .inside is True in a worker thread
+_state = threading.local()  # .inside is True in a worker thread, .held where BLAS has one thread
 _lock = threading.Lock()
 _pools: dict[int, ThreadPoolExecutor] = {}
 _chosen: int | None = None
@@ -117,7 +117,7 @@ def _forget_pools() -> None:
     global _lock
     _lock = threading.Lock()
     _pools.clear()
-    _state.inside = False
+    _state.inside = _state.held = False
 
 
 if hasattr(os, "register_at_fork"):
@@ -134,12 +134,22 @@ def _checked(count: int | str, where: str) -> int:
     return number
 
 
-def single_threaded_blas() -> AbstractContextManager[object]:
-    """Hold the BLAS and OpenMP libraries of this process to one thread, inside a ``with`` block.
+@contextmanager
+def single_threaded_blas() -> Iterator[None]:
+    """Hold the BLAS and OpenMP libraries of this process to one thread, inside a ``with`` block or a function that it decorates.
 
     Where `map_tiles` already occupies every processor, their own threads only get in the way; and the order in which a threaded
-    library sums, hence the last bit of its result, may depend on the number of its threads.
+    library sums, hence the last bit of its result, may depend on the number of its threads. A block inside another costs nothing.
     """
+    if getattr(_state, "held", False):
+        yield
+        return
+    import scipy.linalg  # noqa: F401  what is loaded inside the block would not be held
     import threadpoolctl
 
-    return threadpoolctl.threadpool_limits(limits=1)
+    _state.held = True
+    try:
+        with threadpoolctl.threadpool_limits(limits=1):
+            yield
+    finally:
+        _state.held = False
