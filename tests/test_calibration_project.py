@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from pixmetry.calibration.network import Network
 from pixmetry.calibration_project import load_project
@@ -326,6 +327,13 @@ def test_start_poses_by_angles_or_matrices(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.rotation[0], expected, atol=2e-5)
     np.testing.assert_allclose(found.rotation[0] @ found.rotation[0].T, np.eye(3), atol=1e-14)
     assert network(tmp_path, "observations: o.csv\nimages: i.csv\n", o=rows(), i="image\na\nb\n").poses is None
+    x, y, z, w = -2 * Rotation.from_matrix(expected).as_quat()  # of any length and sign
+    t = -expected @ [1, 2, 3]
+    images = f"image,qw,qx,qy,qz,tx,ty,tz\na,{w},{x},{y},{z},{t[0]},{t[1]},{t[2]}\nb,,,,,,,\n"
+    found = network(tmp_path, "observations: o.csv\nimages: i.csv\n", o=rows(), i=images).poses
+    assert found is not None and found.given.tolist() == [True, False]
+    np.testing.assert_allclose(found.rotation[0], expected, atol=1e-12)
+    np.testing.assert_allclose(found.position[0], [1, 2, 3], atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -337,6 +345,8 @@ def test_start_poses_by_angles_or_matrices(tmp_path: Path) -> None:
         ("image,X0,Y0,Z0,omega_deg,phi_deg,kappa_rad\na,1,2,3,4,5,6\nb,1,2,3,4,5,6\n", ("told twice", "kappa_rad")),
         ("image,X0,Y0,Z0,omega_deg,phi_deg,kappa_deg\na,1,2,3,4,5,6\nb,1,,3,4,5,6\n", ("line 3", "some of its values")),
         (f"image,X0,Y0,Z0,{MATRIX}\na,1,2,3,1,0,0,0,1,0,0,0,1\nb,1,2,3,1,0,0,0,1,0,0,0,-1\n", ("line 3", "mirror", "looks along +z")),
+        ("image,X0,Y0,Z0,tx,ty,tz,qw,qx,qy,qz\na,1,2,3,1,2,3,1,0,0,0\nb,1,2,3,1,2,3,1,0,0,0\n", ("told twice", "tx")),
+        ("image,X0,Y0,Z0,qw,qx,qy,qz\na,1,2,3,1,0,0,0\nb,1,2,3,0,0,0,0\n", ("line 3", "length 0")),
         (f"image,X0,Y0,Z0,{MATRIX}\na,1,2,3,1,0,0,0,1,0,0,.1,1\nb,1,2,3,1,0,0,0,1,0,0,0,1\n", ("line 2", "no rotation")),
     ],
 )

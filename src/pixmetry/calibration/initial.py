@@ -57,7 +57,7 @@ def start_values(network: Network) -> tuple[Network, State]:
     _check_distances(network)
     interior = np.stack([camera.values for camera in network.cameras])
     with single_threaded_blas():
-        work = posed = from_poses(network, interior)
+        work = from_poses(network, interior)
         if work is not None:
             _grow_cameras(work)
         if work is None:
@@ -72,7 +72,7 @@ def start_values(network: Network) -> tuple[Network, State]:
             work.mend()
         _check_posed(work)
         if not work.control.any():
-            to_object(work, framed=posed is not None)
+            to_object(work)
     cameras = tuple(replace(camera, values=row) for camera, row in zip(network.cameras, work.interior, strict=True))
     state = work.state()
     fixed = np.where((network.u_xyz == 0) & np.isfinite(network.xyz), network.xyz, state.xyz)

@@ -11,8 +11,8 @@ from pixmetry.core.errors import InputError, MeasureError
 REACH = 0.1  # rms distance from control, in units of its extent, at which coordinates do not belong to the images
 
 
-def to_object(work: Reconstruction, *, framed: bool) -> None:
-    """Bring a free reconstruction to control, nominal coordinates, bars, or, unless it has one (``framed``), a frame of its own."""
+def to_object(work: Reconstruction) -> None:
+    """Bring a free reconstruction to control, nominal coordinates, bars, or a frame of its own."""
     network = work.network
     known = np.isfinite(work.xyz[:, 0])
     given = known & np.isfinite(network.xyz).all(axis=1)
@@ -25,7 +25,7 @@ def to_object(work: Reconstruction, *, framed: bool) -> None:
         if control.sum() >= 3 and np.median(away) > REACH * extent:
             raise _does_not_fit(work, use)
         moved(work, scale, rotation, shift)
-    elif not framed:
+    else:
         _own_frame(work, known)
     if control.sum() < 2:
         _scaled(work)

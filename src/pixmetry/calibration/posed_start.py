@@ -1,11 +1,13 @@
-"""Start values of a network from poses that were given with it, and whether those poses were right."""
+"""Poses that were given with a network: a start from them, their frame for its result, and whether they were right."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 
 from pixmetry.calibration.free_start import start_interiors
-from pixmetry.calibration.network import Finding, Network, State
+from pixmetry.calibration.network import Finding, Network, Poses, State
 from pixmetry.calibration.reconstruction import Reconstruction
 from pixmetry.calibration.resection import fitted, thickness
 
@@ -14,6 +16,10 @@ POSES_FIT = 0.5  # of FINE, as an rms: what a start must reach; a quarter of the
 TURNED = np.deg2rad(15.0)  # by which a pose is wrong, not rough,
 AWAY = 0.2  # or by which it stands elsewhere, in units of the extent of images and points
 SPREAD = 0.05  # least width of where images stand, in units of its length, that tells a rotation
+MOST = 0.5  # of the poses must be right for their frame to mean something
+NAMED = 6
+AXES = np.diag([1.0, -1.0, -1.0])  # from a camera that looks along -z, y up, to one that looks along +z, y down
+ADVICE = "Check which way the camera looks and the rotations go, the unit of the angles, and whether X0, Y0, Z0 are projection centres."
 
 
 def from_poses(network: Network, interior: np.ndarray) -> Reconstruction | None:
@@ -22,18 +28,20 @@ def from_poses(network: Network, interior: np.ndarray) -> Reconstruction | None:
     Parameters
     ----------
     network : Network
-        Nothing that is known of its object takes part: the frame is that of the poses.
+        Nothing that is known of its object takes part.
     interior : ndarray, shape (cameras, 12)
         Start values; 0 in place of principal distances that are not known.
 
     Returns
     -------
     Reconstruction or None
-        None with fewer than two poses, or where they do not fit the image coordinates.
+        In a frame near that of the poses; None with fewer than two of them, or where they do not fit the image coordinates.
     """
-    if network.poses is None or network.poses.given.sum() < 2:
+    if network.poses is None:
         return None
     images = np.flatnonzero(network.poses.given)
+    if len(images) < 2 or not np.ptp(network.poses.position[images], axis=0).any():
+        return None
     best: Reconstruction | None = None
     for values in start_interiors(network, interior):
         work = Reconstruction(network, values, np.zeros(len(network.points), bool))
@@ -51,6 +59,38 @@ def from_poses(network: Network, interior: np.ndarray) -> Reconstruction | None:
     return None
 
 
+def in_their_frame(network: Network, state: State) -> State:
+    """The state in the frame of the network's poses, if nothing that is known of the object has one and most of the poses are right.
+
+    Bars keep what they say of the size.
+    """
+    if not has_their_frame(network, state):
+        return state
+    both = _both(network.poses, state)
+    position, target = state.position[both], network.poses.position[both]
+    if len(both) > 2 and thickness(target)[1] > SPREAD:
+        scale, turn, shift, _ = fitted(position, target, scaled=not len(network.bars))
+    else:
+        turn = _turn(network.poses.rotation[both], state.rotation[both])[0].T
+        turned = position @ turn.T
+        scale = 1.0 if len(network.bars) else _size(target) / _size(turned)
+        shift = np.median(target - scale * turned, axis=0)
+    return replace(
+        state,
+        rotation=state.rotation @ turn.T,
+        position=scale * state.position @ turn.T + shift,
+        xyz=scale * state.xyz @ turn.T + shift,
+    )
+
+
+def has_their_frame(network: Network, state: State) -> bool:
+    """Whether the frame of the network's poses is that of its result."""
+    if network.poses is None or np.isfinite(network.xyz).all(axis=1).any():
+        return False
+    both = _both(network.poses, state)
+    return len(both) > 1 and np.mean(_differ(network.poses, state, both)) <= MOST
+
+
 def pose_findings(network: Network, state: State) -> list[Finding]:
     """Which start poses are far from the adjusted ones, in whatever frame they were.
 
@@ -63,30 +103,68 @@ def pose_findings(network: Network, state: State) -> list[Finding]:
     """
     if network.poses is None:
         return []
-    both = np.flatnonzero(network.poses.given & np.isfinite(state.position[:, 0]))
-    if len(both) < 2:
-        return []
-    extent = np.linalg.norm(np.nanstd(np.concatenate([state.position, state.xyz]), axis=0))
-    off = _differ(network.poses.rotation[both], network.poses.position[both], state.rotation[both], state.position[both], float(extent))
+    both = _both(network.poses, state)
+    off = _differ(network.poses, state, both) if len(both) > 1 else np.zeros(0, bool)
     if not off.any():
         return []
-    names = ", ".join(network.images[i] for i in both[off][:6]) + (", …" if off.sum() > 6 else "")
+    names = ", ".join(network.images[i] for i in both[off][:NAMED]) + (", …" if off.sum() > NAMED else "")
     text = f"The start poses of {off.sum()} of {len(both)} images are far from the adjusted ones: {names}."
-    advice = "Check which way the camera looks and the rotations go, the unit of the angles, and whether X0, Y0, Z0 are projection centres."
-    return [Finding("start_poses", text, advice, "warning")]
+    if off.mean() > MOST:
+        text += " What they say of frame and size was not taken."
+    return [Finding("start_poses", text, _meant(network.poses, state, both) if off.mean() > MOST else ADVICE, "warning")]
 
 
-def _differ(
-    rotation: np.ndarray, position: np.ndarray, found_rotation: np.ndarray, found_position: np.ndarray, extent: float
-) -> np.ndarray:
-    """Which poses differ by more than rough ones may, after one similarity of all."""
+def _meant(poses: Poses, state: State, both: np.ndarray) -> str:
+    """What to do about poses most of which are wrong: in which other convention they would be right, if in one."""
+    transposed = np.swapaxes(poses.rotation, 1, 2)
+    centre = -np.einsum("nji,nj->ni", poses.rotation, poses.position)
+    others = {
+        "the rotations went the other way (transposed)": Poses(transposed, poses.position),
+        "the camera looked along -z, y up (rows 2 and 3 with the other sign)": Poses(AXES @ poses.rotation, poses.position),
+        "the rotations went the other way, of a camera that looks along -z, y up": Poses(AXES @ transposed, poses.position),
+        "X0, Y0, Z0 were the shift t of R X + t (then X0 = -Rᵀ t)": Poses(poses.rotation, centre),
+        "X0, Y0, Z0 had the other sign": Poses(poses.rotation, -poses.position),
+    }
+    for words, other in others.items():
+        if not _differ(other, state, both).any():
+            return f"They would fit if {words}."
+    mirrored = replace(state, rotation=np.diag([1, -1, 1]) @ state.rotation @ np.diag([1, 1, -1]), position=state.position * [1, 1, -1])
+    if not _differ(poses, mirrored, both).any():
+        return "They would fit if y of the image coordinates ran the other way: see image_coordinates.y, the object may be mirrored."
+    return ADVICE
+
+
+def _both(poses: Poses, state: State) -> np.ndarray:
+    """Images with a given and an adjusted pose."""
+    return np.flatnonzero(poses.given & np.isfinite(state.position[:, 0]))
+
+
+def _differ(poses: Poses, state: State, both: np.ndarray) -> np.ndarray:
+    """Which of these poses differ by more than rough ones may, after one similarity of all."""
     from scipy.spatial.transform import Rotation
 
-    turns = Rotation.from_matrix(np.swapaxes(found_rotation, 1, 2) @ rotation)  # of one frame to the other: the same for all that agree
+    position, found = poses.position[both], state.position[both]
+    turn, angle = _turn(poses.rotation[both], state.rotation[both])
+    wrong = angle > TURNED
+    if len(both) < 3:
+        return wrong
+    if not np.ptp(position, axis=0).any():
+        return np.ones(len(both), bool)
+    extent = np.linalg.norm(np.nanstd(np.concatenate([state.position, state.xyz]), axis=0))
+    _, by_position, _, away = fitted(position, found)
+    apart = thickness(position)[1] > SPREAD and Rotation.from_matrix(by_position.T @ turn).magnitude() > TURNED
+    return wrong | (away > AWAY * extent) | bool(apart)
+
+
+def _turn(rotation: np.ndarray, found: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The rotation from the frame of poses to that of the found ones on which most of them agree, and by how much (rad) each differs."""
+    from scipy.spatial.transform import Rotation
+
+    turns = Rotation.from_matrix(np.swapaxes(found, 1, 2) @ rotation)
     angles = np.stack([(turns[k].inv() * turns).magnitude() for k in range(len(turns))])
     nearest = int(np.argmin(np.median(angles, axis=1)))
-    if len(position) < 3:
-        return angles[nearest] > TURNED
-    _, turn, _, away = fitted(position, found_position)
-    apart = (Rotation.from_matrix(turn).inv() * turns[nearest]).magnitude() > TURNED and thickness(found_position)[1] > SPREAD
-    return (angles[nearest] > TURNED) | (away > AWAY * extent) | apart
+    return turns[angles[nearest] <= TURNED].mean().as_matrix(), angles[nearest]
+
+
+def _size(position: np.ndarray) -> float:
+    return float(np.median(np.linalg.norm(position - np.median(position, axis=0), axis=1)))

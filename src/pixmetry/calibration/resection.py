@@ -195,7 +195,8 @@ def similarity(
     left, values, right = np.linalg.svd((b * w[:, None]).T @ a)
     sign = np.array([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
     rotation = (left * sign) @ right
-    scale = float((values * sign).sum() / (w @ (a**2).sum(axis=1))) if scaled else 1.0
+    size = float(w @ (a**2).sum(axis=1))
+    scale = float((values * sign).sum()) / size if scaled and size > 0 else 1.0  # one place has no size
     return scale, rotation, w @ target - scale * rotation @ (w @ source)
 
 

@@ -55,9 +55,7 @@ def calibrate_network(
     measured = _as_asked(network, options)
     say("checking the network")
     findings = list(check_network(measured))
-    measured, state = _started(measured, start, options, say)
-    measured = replace(measured, poses=None)  # they have done their part
-    settled = _settled(_released(measured) if options.field == "free" else measured, state, options, say)
+    settled = _from_start(measured, start, options, say)
     settled, tests, more = _checked_field(settled, options, say)
     say("testing the result")
     tests |= _records(settled, network, options)
@@ -66,9 +64,36 @@ def calibrate_network(
     if options.residual_grid:
         tests["residual_grid"] = residual_grids(settled.adjustment)
     findings += [*more, *_findings(settled, tests)]
-    findings += pose_findings(network, settled.adjustment.state)
+    findings = _sized(findings, network, settled.adjustment.state) + pose_findings(network, settled.adjustment.state)
     grids = tests.get("residual_grid", {})
     return Calibration(settled.adjustment, in_order(findings), tests, grids, {"options": asdict(options)})
+
+
+def _sized(findings: list[Finding], network: Network, state: State) -> list[Finding]:
+    """That nothing says how large the object is, is half true where start poses do."""
+    from pixmetry.calibration.posed_start import has_their_frame
+
+    if not has_their_frame(network, state):
+        return findings
+    text = "nothing but the start poses says how large the object is: lengths are as good as these"
+    return [replace(found, text=text) if found.kind == "no_scale" else found for found in findings]
+
+
+def _from_start(network: Network, start: State | None, options: Options, say: Progress) -> Settled:
+    """A settled adjustment; where poses that were given lead nowhere, without them."""
+    try:
+        measured, state = _started(network, start, options, say)
+        measured = replace(measured, poses=None)  # they have done their part
+        return _settled(_released(measured) if options.field == "free" else measured, state, options, say)
+    except MeasureError as error:
+        if start is not None or network.poses is None:
+            raise
+        say("starting again without the poses")
+        try:
+            return _from_start(replace(network, poses=None), None, options, say)
+        except MeasureError:
+            error.remedy += "; the start poses do not fit the image coordinates either: check which way the camera looks and rotations go"
+            raise error from None
 
 
 def _as_asked(network: Network, options: Options) -> Network:
@@ -79,6 +104,7 @@ def _started(network: Network, start: State | None, options: Options, say: Progr
     """Start values; where they had to be found, improved with few interior parameters and none of the images' own."""
     from pixmetry.calibration.initial import start_values
     from pixmetry.calibration.known_checks import without_absurd_control
+    from pixmetry.calibration.posed_start import in_their_frame
 
     if start is not None:
         return network, start
@@ -88,9 +114,10 @@ def _started(network: Network, start: State | None, options: Options, say: Progr
     loss = "huber" if options.loss == "none" and options.snoop else options.loss
     try:
         part = replace(without_absurd_control(network, state)[0], cameras=tuple(few), per_image=())
-        return network, adjust_with(options)(part, state, loss=loss, loss_scale=options.loss_scale, covariance=False).state
+        state = adjust_with(options)(part, state, loss=loss, loss_scale=options.loss_scale, covariance=False).state
     except MeasureError:
-        return network, state  # the adjustment of all parameters says what is not determined
+        pass  # the adjustment of all parameters says what is not determined
+    return network, in_their_frame(network, state)
 
 
 def _released(network: Network) -> Network:

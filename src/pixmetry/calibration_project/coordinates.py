@@ -167,7 +167,8 @@ def image_facts(
     rows = index_of_names(images, "image")
     missing = next((name for name in names if name not in rows), None)
     if missing is not None:
-        what, remedy = f"image '{missing}' is not in the table of images", f"add it to {images.source}, or correct its name"
+        what = f"image '{missing}' is not in the table of images"
+        remedy = f"add it to {images.source} (a pose may be left empty), or correct its name"
         raise InputError(what, where=where(missing), allowed=first_few(rows), remedy=remedy)
     row_of = np.array([rows[name] for name in names])
     by_name = {model.name: k for k, model in enumerate(cameras)}
