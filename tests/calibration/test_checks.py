@@ -9,7 +9,7 @@ import pytest
 
 from calibration.networks import simulate
 from pixmetry.calibration.bundle import adjust
-from pixmetry.calibration.checks import check_determined, check_network
+from pixmetry.calibration.checks import check_determined, check_network, left_out
 from pixmetry.calibration.network import Network
 from pixmetry.core.errors import InputError, MeasureError
 
@@ -139,3 +139,31 @@ def test_images_without_pose_are_named(rng: np.random.Generator):
     result = adjust(simulated.network, replace(simulated.truth, position=position))
     (finding,) = check_determined(result)
     assert finding.kind == "images_left_out" and "IMG_0003" in finding.text
+
+
+def test_what_goes_with_images_that_are_not_oriented_is_told(rng: np.random.Generator):
+    """The last image alone ties ten points to the others; an image of three points was named before and is not named again."""
+    simulated = simulate(rng, images=8, points=60)
+    network = kept(simulated.network, (simulated.network.image != 5) | (simulated.network.point < 3))
+    only = (network.point >= 50) & ~np.isin(network.image, (0, 7))
+    network, position = kept(network, ~only), simulated.truth.position.copy()
+    position[[5, 7]] = np.nan
+    xyz = simulated.truth.xyz.copy()
+    xyz[50:] = np.nan
+    (finding,) = left_out(network, replace(simulated.truth, position=position, xyz=xyz))
+    first = network.point[network.image == 7]
+    assert finding.level == "warning" and "IMG_0006" not in finding.text
+    assert f"IMG_0008 ({(first < 50).sum()} of its {len(first)} points are determined without it)" in finding.text
+    gone = len(np.intersect1d(first[first >= 50], network.point[network.image == 0]))
+    assert "1 of 8 images is not oriented and took no part" in finding.text and f"go {gone} points" in finding.text
+
+
+def test_image_coordinates_that_all_lie_at_one_place(rng: np.random.Generator):
+    """Millimetres taken for micrometres make a frame of a few pixels; a target of a twentieth of the frame is small, but there."""
+    network = simulate(rng, images=6, points=60).network
+    centre = np.array(network.cameras[0].sensor.centre)
+    for share, place in ((1e-3, centre), (0.008, 1.3 * centre)):
+        shrunk = replace(network, x_px=place[0] + share * (network.x_px - centre[0]), y_px=place[1] + share * (network.y_px - centre[1]))
+        fails(InputError, "within 2% of the frame about one place.*mm taken for um", shrunk)
+    small = [centre[axis] + 0.05 * (values - centre[axis]) for axis, values in enumerate((network.x_px, network.y_px))]
+    assert check_network(replace(network, x_px=small[0], y_px=small[1])) == ()

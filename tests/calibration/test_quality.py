@@ -156,6 +156,7 @@ def test_images_one_by_one(rng):
     used[np.flatnonzero(network.image == 2)[:3]] = False
     found = adjusted(network, simulated, used=used)
     records = quality.image_records(found)
+    assert all(r["oriented"] and r["measured"] == r["n"] + r["rejected"] for r in records)
     assert [r["rejected"] for r in records] == [0, 0, 3, 0, 0, 0] and records[2]["n"] == (network.image == 2).sum() - 3
     assert [r["time_s"] for r in records] == [0, 30, 60, 90, 120, 150]
     z = [(r["x_scale"] - true) / r["u_x_scale"] for r, true in zip(records, simulated.truth.x_scale, strict=True)]

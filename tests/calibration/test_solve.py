@@ -330,6 +330,35 @@ def test_points_of_two_rays_that_contradict_each_other_are_named_with_their_bars
     assert len(calibration.tests["gross_errors"]) >= out.sum() - lost.sum()  # the ray that is left of a point is none
 
 
+def test_an_image_most_of_whose_points_are_wrong_is_named_as_a_whole(rng):
+    """All points of one image lie some 15 px off: it loses them, the others do not."""
+    simulated = simulate(rng, images=12, points=60, bars=2)
+    network = simulated.network
+    off = (network.image == 4) * rng.normal(0, 15, (2, len(network)))
+    calibration = calibrate_network(replace(network, x_px=network.x_px + off[0], y_px=network.y_px + off[1]), QUICK, start=simulated.truth)
+    record = calibration.tests["images"][4]
+    said = [f for f in calibration.findings if f.kind in ("images_rejected", "images_left_out")]
+    assert len(said) == 1 and said[0].level == "warning" and network.images[4] in said[0].text
+    gross = [r for r in calibration.tests["gross_errors"] if r["image"] == network.images[4]]
+    assert record["rejected"] == len(gross) and (record["oriented"] or not gross)
+    sizes = calibration.tests["network"]
+    assert sizes["observations_given"] == len(network) and sizes["observations"] == calibration.adjustment.used.sum()
+    assert sizes["images"] == 12 - (not record["oriented"]) and sizes["images_given"] == 12
+
+
+def test_points_of_two_rays_are_counted_where_they_are_many(rng):
+    simulated = simulate(rng, images=12, points=60, bars=2)
+    network = simulated.network
+    held = np.setdiff1d(np.arange(60), np.concatenate([network.bars.start, network.bars.end]))
+    for count, told in ((20, True), (3, False)):
+        rows = np.concatenate([np.flatnonzero(network.point == k)[2:] for k in held[:count]])
+        kept = np.setdiff1d(np.arange(len(network)), rows)
+        arrays = {n: getattr(network, n)[kept] for n in ("x_px", "y_px", "image", "point", "covariance_px2")}
+        calibration = calibrate_network(replace(network, **arrays), QUICK)
+        said = [f.text for f in calibration.findings if f.kind == "two_rays"]
+        assert bool(said) == told and (not told or said[0].partition(" of ")[0] in (f"{count}", f"{count - 1}"))
+
+
 def test_a_priori_covariances_are_taken_as_they_are(rng):
     """Twice the noise is stated: uncertainties are twice as large as by the residuals."""
     simulated = simulate(rng, images=12, points=40)
@@ -374,7 +403,8 @@ def test_one_bad_image_is_named_and_no_drift_is_made_of_it(rng):
     x = network.x_px + bad * (more[:, 0] + 0.1 * np.sin(network.x_px / 150))
     calibration = calibrate_network(replace(network, x_px=x, y_px=network.y_px + bad * more[:, 1]), QUICK)
     first = calibration.findings[0]
-    assert first.kind == "bad_images" and network.images[7] in first.text and "leave it out" in first.advice
+    # by the pattern in its residuals, or where most of its points are too bad for that, by these
+    assert first.kind in ("bad_images", "images_rejected") and network.images[7] in first.text and "leave it out" in first.advice
     assert not {"x_scale_drift", "x_scale_by_image", "x_shift_by_image"} & set(kinds(calibration))
 
 

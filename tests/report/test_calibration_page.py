@@ -14,6 +14,7 @@ import pytest
 
 from pixmetry.calibration.model import NAMES, Sensor
 from pixmetry.calibration.network import Adjustment, Calibration, Finding
+from pixmetry.calibration.quality import image_records
 from pixmetry.core.errors import InputError
 from pixmetry.report.calibration_figures import (
     MOST_IN_SMALL,
@@ -31,8 +32,8 @@ from pixmetry.report.calibration_figures import (
 from pixmetry.report.calibration_page import render, write_page
 from pixmetry.report.calibration_plots import bin_means, short
 from pixmetry.report.calibration_space import ellipse, field_map, largest_axis, plan_views, pyramids, seen_from, shown_points
-from pixmetry.report.calibration_tables import gross_errors, parameters, scale_bars
-from pixmetry.report.calibration_text import p_text, projection_levels, sentence, summary_text, typeset, worth
+from pixmetry.report.calibration_tables import gross_errors, images, network_facts, parameters, scale_bars
+from pixmetry.report.calibration_text import as_given, p_text, projection_levels, sentence, summary_text, typeset, worth
 from report import calibrations
 from report.test_page import Page
 
@@ -174,8 +175,37 @@ def test_a_parameter_held_fixed_is_shown_without_u(whole: Calibration) -> None:
     keep = [i for i, name in enumerate(adjustment.free_columns) if not name.endswith(":b2")]
     fixed = replace(adjustment, network=network, free_columns=columns, covariance=adjustment.covariance[np.ix_(keep, keep)])
     row = next(r for r in parameters(Calibration(fixed), 0) if r["symbol"] == "B2")
-    assert [plain(row[key]) for key in ("value", "u", "p")] == ["\u22123.000 × 10⁻⁵", "held fixed", ""]
+    assert [plain(row[key]) for key in ("value", "u", "unit", "p")] == ["\u22123", "held fixed", "10⁻⁵", ""]
     assert "fixed" in summary_text(Calibration(fixed))
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "text"),
+    [(2016.1667, "px", "2016.1667 px"), (5657.83, "px", "5657.83 px"), (14.0, "mm", "14 mm"), (3e-4, "1/mm²", "0.0003 1/mm²"),
+     (-1.0543217e-6, "1/mm⁴", "\u22121.0543217 10⁻⁶ 1/mm⁴"), (1.5e-5, "1", "1.5 10⁻⁵"), (0.1 + 0.2, "1", "0.3")],
+)  # fmt: skip
+def test_what_is_held_is_shown_as_it_was_given(value: float, unit: str, text: str) -> None:
+    number = as_given(value, unit)
+    assert plain(f"{number.value} {number.unit}") == text and number.u == "\u2013"
+
+
+def test_images_that_are_not_oriented_are_not_counted_and_nothing_of_them_is_rejected(whole: Calibration) -> None:
+    """Two images without a pose; of another one a point is left out."""
+    adjustment = whole.adjustment
+    net, position = adjustment.network, adjustment.state.position.copy()
+    position[:2] = np.nan
+    used = adjustment.used & (net.image > 1)
+    used[np.flatnonzero(used)[0]] = False
+    without = replace(adjustment, used=used, state=replace(adjustment.state, position=position))
+    records = image_records(without, {net.images[0]: 7, net.images[2]: 1})
+    assert [(r["oriented"], r["rejected"]) for r in records[:3]] == [(False, 0), (False, 0), (True, 1)]
+    assert records[0]["measured"] == (net.image == 0).sum()
+    rows = images(records)["rows"]
+    assert rows[0][2][:2] == ["not oriented", "\u2013"] and rows[2][2][1] == "1"
+    said = plain(summary_text(Calibration(without)))
+    assert f"{len(net.images) - 2} of {len(net.images)} images, " in said and f"{used.sum()} of {len(net)} image points" in said
+    facts = dict(network_facts(Calibration(without)))
+    assert facts["Images"] == f"{len(net.images) - 2} of {len(net.images)}" and facts["Image points used"] == f"{used.sum()} of {len(net)}"
 
 
 @pytest.mark.parametrize(
@@ -449,7 +479,7 @@ def test_the_summary_fits_a_terminal(whole: Calibration) -> None:
 
 def test_sigma0_says_what_it_is_compared_with(whole: Calibration) -> None:
     known: Adjustment = replace(whole.adjustment, network=replace(whole.adjustment.network, covariance_known=True))
-    assert "1 would mean" in summary_text(Calibration(known))
+    assert "1 would mean" in plain(summary_text(Calibration(known)))
     assert "no covariance of the image coordinates was given" in " ".join(summary_text(whole).split())
 
 

@@ -13,10 +13,12 @@ from scipy.sparse.csgraph import connected_components
 
 from pixmetry.calibration.free_start import common_points
 from pixmetry.calibration.network import Adjustment, Finding, Network, State
+from pixmetry.calibration.quality import plain
 from pixmetry.calibration.resection import FEWEST, FLAT, thickness
 from pixmetry.core.errors import InputError, MeasureError
 
 NEAR_ORIGIN = 0.1  # of the frame: image coordinates that all lie nearer to the origin are not pixels
+ONE_PLACE = 0.02  # of the frame: image coordinates that all lie in such a part of it have the wrong unit
 OUTSIDE = 0.2  # share of the image coordinates outside of the frame that is not put down to gross errors
 LINE = 0.005  # width by length below which points count as a line
 TIE = 3  # common points below which two images do not hold each other
@@ -80,6 +82,7 @@ def _check_frames(network: Network) -> list[Finding]:
         x, y, cols, lines = network.x_px[rows], network.y_px[rows], camera.sensor.cols, camera.sensor.rows
         if not (np.isfinite(x).all() and np.isfinite(y).all()):
             raise InputError("image coordinates that are not numbers", where=f"camera {camera.name}", remedy="leave those lines out")
+        off = np.maximum(np.abs(x - np.median(x)) / cols, np.abs(y - np.median(y)) / lines)
         extent = f"x {x.min():.4g} … {x.max():.4g}, y {y.min():.4g} … {y.max():.4g}"
         frame = f"pixels of a frame of {cols} × {lines}"
         reach = np.quantile(np.maximum(np.abs(x) / cols, np.abs(y) / lines), 0.98)
@@ -88,6 +91,10 @@ def _check_frames(network: Network) -> list[Finding]:
             remedy = "state their unit (mm or px) and origin in the project, or the size of the frame"
             what = "all of them lie close to the origin, as if they were not in pixels"
             raise InputError(what, where=where, value=extent, allowed=frame, remedy=remedy)
+        if np.quantile(off, 0.98) < ONE_PLACE / 2:
+            what = f"all of them lie within {ONE_PLACE:.0%} of the frame about one place"
+            remedy = "check their unit (mm taken for um?), the pitch of the pixels and the size of the frame"
+            raise InputError(what, where=where, value=extent, allowed=f"spread over {frame}", remedy=remedy)
         out = (x < -1) | (x > cols) | (y < -1) | (y > lines)
         if out.mean() > OUTSIDE and min(np.mean(x < -1), np.mean(y < -1)) > OUTSIDE and reach < 0.6:
             remedy = "state that their origin is the middle of the frame"
@@ -138,6 +145,22 @@ def _check_bars(network: Network) -> list[Finding]:
 
 def _usable(network: Network, findings: list[Finding]) -> tuple[np.ndarray, np.ndarray]:
     """Images that can take part, and free points that only one of them sees."""
+    usable, seldom, few, lines = _taking_part(network)
+    for which, reason in ((few, f"fewer than {FEWEST} usable points"), (lines, "all its points on one line")):
+        if which:
+            text = f"{many(len(which), 'image')} left out, each with {reason}: {_named(network.images, np.array(which))}"
+            advice = f"an image needs {FEWEST} points, better 12, spread over its frame"
+            findings.append(Finding("images_left_out", text, advice, "warning"))
+    if not usable.any():
+        reason = f"no image shares {FEWEST} points with others or with known ones"
+        reason = "points on a line in each image" if len(lines) > len(few) else reason
+        remedy = "check that the names of the points agree between the images, and spread the points over the frame"
+        raise MeasureError("no image can take part", where="network", value=reason, allowed=f"{FEWEST} points or more", remedy=remedy)
+    return usable, seldom
+
+
+def _taking_part(network: Network) -> tuple[np.ndarray, np.ndarray, list[int], list[int]]:
+    """Images that can take part, free points that only one of them sees, images with too few points and with points on one line."""
     known = np.isfinite(network.xyz).all(axis=1) & np.isfinite(network.u_xyz).all(axis=1)
     usable = np.ones(len(network.images), bool)
     few: list[int] = []
@@ -154,17 +177,7 @@ def _usable(network: Network, findings: list[Finding]) -> tuple[np.ndarray, np.n
         few += [int(i) for i in new]
         lines += straight
         usable[few + lines] = False
-    for which, reason in ((few, f"fewer than {FEWEST} usable points"), (lines, "all its points on one line")):
-        if which:
-            text = f"{many(len(which), 'image')} left out, each with {reason}: {_named(network.images, np.array(which))}"
-            advice = f"an image needs {FEWEST} points, better 12, spread over its frame"
-            findings.append(Finding("images_left_out", text, advice, "warning"))
-    if not usable.any():
-        reason = f"no image shares {FEWEST} points with others or with known ones"
-        reason = "points on a line in each image" if len(lines) > len(few) else reason
-        remedy = "check that the names of the points agree between the images, and spread the points over the frame"
-        raise MeasureError("no image can take part", where="network", value=reason, allowed=f"{FEWEST} points or more", remedy=remedy)
-    return usable, np.flatnonzero(~known & (rays == 1))
+    return usable, np.flatnonzero(~known & (rays == 1)), few, lines
 
 
 def _on_line(network: Network, rows: np.ndarray) -> bool:
@@ -262,15 +275,24 @@ def check_determined(adjustment: Adjustment) -> tuple[Finding, ...]:
 
 
 def left_out(network: Network, state: State) -> list[Finding]:
-    """Images without a pose, though they have enough points."""
-    count = np.bincount(network.image[np.isfinite(state.xyz[network.point, 0])], minlength=len(network.images))
-    missing = np.flatnonzero(~np.isfinite(state.position[:, 0]) & (count >= FEWEST))
+    """Images without a pose, though `check_network` let them pass, and the points that go with them."""
+    posed = np.isfinite(state.position[:, 0])
+    missing = np.flatnonzero(~posed & _taking_part(network)[0])
     if not len(missing):
         return []
-    names = ", ".join(f"{network.images[i]} ({count[i]} points)" for i in missing[:NAMED])
+    size = len(network.images)
+    measured = np.bincount(network.image, minlength=size)
+    count = np.bincount(network.image[np.isfinite(state.xyz[network.point, 0])], minlength=size)
+    names = ", ".join(f"{network.images[i]} ({count[i]} of its {measured[i]} points are determined without it)" for i in missing[:NAMED])
     more = f" and {len(missing) - NAMED} more" if len(missing) > NAMED else ""
-    text = f"{many(len(missing), 'image')} without a pose, and so without a part in the adjustment: {names}{more}"
-    return [Finding("images_left_out", text, "check the names of their points, or give them more points that other images see", "warning")]
+    verb = "is" if len(missing) == 1 else "are"
+    text = f"{len(missing)} of {np.count_nonzero(measured)} images {verb} not oriented and took no part: {names}{more}"
+    rays = [np.bincount(network.point[rows], minlength=len(network.points)) for rows in (slice(None), posed[network.image])]
+    gone = int(((rays[0] >= 2) & (rays[1] < 2) & ~np.isfinite(state.xyz[:, 0])).sum())
+    if gone:
+        text += f"; with them {'goes' if gone == 1 else 'go'} {many(gone, 'point')} that the other images see too seldom"
+    advice = "give them rough poses or more points that other images see; check the names of their points and their camera"
+    return [Finding("images_left_out", text, advice, "warning")]
 
 
 def _both_sides(network: Network, state: State) -> list[Finding]:
@@ -304,7 +326,8 @@ def _check_camera(adjustment: Adjustment, k: int) -> list[Finding]:
     for name, axis in (("xp", 0), ("yp", 1)):
         if u[name] is not None and u[name] > POOR_POINT * width:
             r = _median([_correlation(adjustment, f"{camera.name}:{name}", i, axis) for i in images])
-            text = f"{name} of {camera.name} is badly determined: u = {u[name]:.2g} px, correlation with the places of the images {r:+.4f}"
+            size = f"u = {plain(u[name], 2)} px"
+            text = f"{name} of {camera.name} is badly determined: {size}, correlation with the places of the images {r:+.4f}"
             rolled = _rolled(adjustment.state.rotation[images])
             advice = "add images from other directions" if rolled else "roll the camera by 90° in some of the images"
             findings.append(Finding("correlation", text, advice, "warning"))

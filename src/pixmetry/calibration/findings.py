@@ -11,16 +11,18 @@ import numpy as np
 from pixmetry.calibration.eccentric import Eccentricity
 from pixmetry.calibration.hold_out import WORSE
 from pixmetry.calibration.network import Adjustment, Finding, Network
-from pixmetry.calibration.quality import p_words
+from pixmetry.calibration.quality import p_words, plain
 
 ORDER = (  # of kinds, among findings of the same level; what is not named here comes between the two parts
-    "start", "determination", "x_scale_drift", "bad_images", "correlation", "flatness", "lost_points", "gross_scale_bar",
-    "gross_control_point", "x_shift", "field", "known_uncertainty", "eccentricity", "f_test", "gross_error", None, "significance",
-    "variance_components", "residual_grid", "hold_out", "datum", "adjustment",
+    "start", "determination", "images_left_out", "x_scale_drift", "bad_images", "images_rejected", "correlation", "flatness", "lost_points",
+    "gross_scale_bar", "gross_control_point", "x_shift", "field", "known_uncertainty", "eccentricity", "f_test", "gross_error", None,
+    "two_rays", "significance", "variance_components", "residual_grid", "hold_out", "datum", "adjustment",
 )  # fmt: skip
 SIGNIFICANT = 0.05
 RARE = 0.001  # level of tests that were not asked for
 CORRELATED = 0.995
+REJECTED_SHARE = 0.5  # of the image points of an image: it is not single ones that are wrong
+TWO_RAY_SHARE = 0.1  # of the free points: those on two rays are worth a sentence
 NOTEWORTHY_PX = 0.002  # an eccentricity of this size is worth a sentence
 NAMED = 5
 LEAST_NOTES = 2
@@ -42,10 +44,12 @@ def findings_of(adjustment: Adjustment, tests: Mapping[str, Any]) -> list[Findin
     """What the records of one adjustment say."""
     found = [
         *known_findings(tests["known"], adjustment.network.unit),
+        *rejected_image_findings(tests["images"]),
         *lost_findings(adjustment),
+        *two_ray_findings(adjustment),
         *parameter_findings(tests["parameters"]),
         *f_test_findings(tests["f_test"]),
-        *gross_error_findings(tests["gross_errors"], adjustment),
+        *gross_error_findings(tests["gross_errors"], adjustment, tests["images"]),
         *drift_findings(tests["images"], adjustment),
         Finding("datum", f"Datum: {adjustment.datum}."),
     ]
@@ -110,15 +114,43 @@ def f_test_findings(f_tests: Mapping[str, dict[str, Any]]) -> list[Finding]:
     return found
 
 
-def gross_error_findings(errors: list[dict[str, Any]], adjustment: Adjustment) -> list[Finding]:
-    """Image points that were left out."""
+def mostly_rejected(images: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Records of the images that lost more than half of their image points as gross errors."""
+    return [i for i in images if i["rejected"] > REJECTED_SHARE * i["measured"]]
+
+
+def rejected_image_findings(images: list[dict[str, Any]]) -> list[Finding]:
+    """Images most of whose image points were rejected: it is hardly the points that are wrong."""
+    found = mostly_rejected(images)
+    if not found:
+        return []
+    advice = "Check the camera of these images and the names of their points. If both are right, the images are bad: leave them out."
+    if len(found) == 1:
+        advice = "Check its camera and the names of its points. If both are right, it is a bad image: leave it out."
+        text = f"Image {found[0]['image']}: {found[0]['rejected']} of {found[0]['measured']} image points were rejected."
+    else:
+        named = ", ".join(f"{i['image']} ({i['rejected']} of {i['measured']})" for i in found[:NAMED])
+        more = " …" if len(found) > NAMED else ""
+        text = f"More than half of the image points of {len(found)} images were rejected: {named}{more}."
+    return [Finding("images_rejected", text, advice, "warning")]
+
+
+def gross_error_findings(errors: list[dict[str, Any]], adjustment: Adjustment, images: list[dict[str, Any]]) -> list[Finding]:
+    """Image points that were left out, and what else of the image points took no part."""
     if not errors:
         return []
-    total = len(errors) + int(adjustment.used.sum())
-    names = [f"{e['point']} in {e['image']} ({np.hypot(e['error_x_px'], e['error_y_px']):.2g} px)" for e in errors[:NAMED]]
-    more = " …" if len(errors) > NAMED else ""
+    network, total = adjustment.network, len(adjustment.used)
+    bad = {i["image"] for i in mostly_rejected(images)}
+    single = [e for e in errors if e["image"] not in bad] or errors
+    names = [f"{e['point']} in {e['image']} ({plain(np.hypot(e['error_x_px'], e['error_y_px']), 2)} px)" for e in single[:NAMED]]
+    more = " …" if len(single) > NAMED else ""
     noun = "image point was left out as a gross error" if len(errors) == 1 else "image points were left out as gross errors"
     text = f"{len(errors)} {noun}, of {total}: {', '.join(names)}{more}.{_swapped_names(errors)}"
+    posed = np.isfinite(adjustment.state.position).all(axis=1)[network.image]
+    others = {"images that are not oriented": int((~posed).sum())}
+    others["points that are not determined"] = total - int(adjustment.used.sum()) - len(errors) - others["images that are not oriented"]
+    said = ", ".join(f"{count} of {what}" for what, count in others.items() if count)
+    text += f" Besides, there are {said}." if said else ""
     many = len(errors) > 0.05 * total
     advice = "Look at these targets in the images, and at their names."
     if many:
@@ -134,10 +166,24 @@ def _swapped_names(errors: list[dict[str, Any]]) -> str:
     return f" Names seem to be exchanged: {named}."
 
 
-def lost_findings(adjustment: Adjustment) -> list[Finding]:
-    """Points that two images or more see, of which nothing is left: of two rays that contradict each other none can be said to be right."""
+def two_ray_findings(adjustment: Adjustment) -> list[Finding]:
+    """Points on which one test in two is blind, where they are more than a few."""
     network = adjustment.network
-    rays = np.bincount(network.point, minlength=len(network.points))
+    rays = np.bincount(network.point[adjustment.used], minlength=len(network.points))
+    free = ~np.isfinite(network.u_xyz).all(axis=1) & (rays > 0)
+    two = int((free & (rays == 2)).sum())
+    if two <= TWO_RAY_SHARE * free.sum():
+        return []
+    text = f"{two} of {int(free.sum())} points rest on two rays: an error of their image points along the epipolar line does not show."
+    return [Finding("two_rays", text, "Where such a point matters, take it from a third image.")]
+
+
+def lost_findings(adjustment: Adjustment) -> list[Finding]:
+    """Points that two oriented images or more see, of which nothing is left: of two rays that contradict each other none can be said to be
+    right."""
+    network = adjustment.network
+    posed = np.isfinite(adjustment.state.position).all(axis=1)[network.image]
+    rays = np.bincount(network.point[posed], minlength=len(network.points))
     lost = np.flatnonzero((rays >= 2) & ~np.isfinite(adjustment.state.xyz).all(axis=1))
     if not len(lost):
         return []
@@ -171,6 +217,12 @@ def known_findings(known: Mapping[str, Any], unit: str) -> list[Finding]:
             text = f"The {noun}s scatter {np.sqrt(group['factor']):.2g} times as much as their stated uncertainties say."
             level = "warning" if group["factor"] > 1 else "note"
             found.append(Finding("known_uncertainty", text, "State their uncertainties anew.", level))
+    fixed = known.get("fixed_points")
+    if fixed and fixed["p"] < RARE:
+        miss = plain(fixed["miss"], 2)
+        text = f"The {fixed['n']} fixed points miss the network by about {miss} {unit} together ({p_words(fixed['p'])})."
+        advice = f"Look for a mistake in their coordinates; if there is none, they are not exact: known: weighted with u = {miss} {unit}."
+        found.append(Finding("known_uncertainty", text, advice, "warning"))
     return found
 
 
@@ -225,7 +277,7 @@ def hold_out_findings(record: Mapping[str, Any], *, free: bool) -> list[Finding]
     if not one or expected is None or one["left_out_median_px"] < WORSE * expected:
         return []
     text = (
-        f"Images left out of the fit show {one['left_out_rms_px']:.3g} px, those in it {one['fit_rms_px']:.3g} px (rms). "
-        f"Half of the former are above {one['left_out_median_px']:.3g} px; with noise alone it would be {expected:.3g} px."
+        f"Images left out of the fit show {plain(one['left_out_rms_px'], 3)} px, those in it {plain(one['fit_rms_px'], 3)} px (rms). "
+        f"Half of the former are above {plain(one['left_out_median_px'], 3)} px; with noise alone it would be {plain(expected, 3)} px."
     )
     return [Finding("hold_out", text, "Take more images or fewer parameters.", "warning")]

@@ -15,12 +15,14 @@ import numpy as np
 
 from pixmetry.calibration.known_residuals import Known, bar_residuals, contradicted, control_residuals, group_record
 from pixmetry.calibration.network import Adjustment, Network, ScaleBars, State
-from pixmetry.calibration.snooping import Adjust, finest_factor
+from pixmetry.calibration.resection import similarity
+from pixmetry.calibration.snooping import Adjust, finest_factor, remove_gross_errors
 from pixmetry.calibration.variance_components import image_sigma0, scaled
-from pixmetry.core.errors import InputError
+from pixmetry.core.errors import InputError, MeasureError
 
 LOOSE = 0.05  # uncertainty, as a part of the field's extent, with which a control point does not pull at the image coordinates
 INSEPARABLE = 0.99  # correlation of two residuals from which on it cannot be said which of the two is wrong
+LEAST_FIXED = 3  # points whose distances from each other can be tested
 LEAST_CONTROL = 4  # points that must stay for one to be left out
 CONTROL_SHARE = 0.5  # of the points; more fixed ones are a test field
 ABSURD = 0.1  # a bar that is wrong by such a part of its length, as one in other units, is out before any adjustment with it
@@ -81,6 +83,61 @@ def few_fixed(network: Network) -> np.ndarray:
     fixed = (network.u_xyz == 0).all(axis=1)
     seen = np.bincount(network.point, minlength=len(network.points)) > 1
     return fixed if LEAST_CONTROL <= fixed.sum() < CONTROL_SHARE * seen.sum() else np.zeros_like(fixed)
+
+
+def fixed_record(adjustment: Adjustment, adjust: Adjust) -> dict[str, Any] | None:
+    """Whether the fixed points of a network with free ones beside them fit it together; None without such points or without redundancy.
+
+    The sum of squares falls by what the fixed points take when they are set free: over the degrees of freedom that go with them (3n − 7
+    where nothing else gives the datum) and the variance of the free network it has an F-distribution.
+
+    Parameters
+    ----------
+    adjustment : Adjustment
+    adjust : callable
+        `bundle.adjust`.
+
+    Returns
+    -------
+    dict
+        ``n``, ``f``, ``dof`` (of both), ``p``, and ``miss``: standard deviation of a coordinate that would explain it.
+
+    References
+    ----------
+    K. R. Koch, Parameter Estimation and Hypothesis Testing in Linear Models (1999), 4.2 (general linear hypothesis).
+    """
+    from scipy import stats
+
+    network = adjustment.network
+    posed = np.isfinite(adjustment.state.position).all(axis=1)[network.image]
+    seen = np.bincount(network.point[posed], minlength=len(network.points)) > 0
+    fixed = (network.u_xyz == 0).all(axis=1) & seen
+    if not LEAST_FIXED <= fixed.sum() < CONTROL_SHARE * seen.sum():
+        return None
+    try:  # what the fixed points threw out of their image points comes back, what the free network throws out goes
+        released, used = set_free(network, np.flatnonzero(fixed)), adjustment.used | (posed & fixed[network.point])
+        free = remove_gross_errors(released, adjustment.state, adjust, used=used).adjustment
+        held = adjust(network, adjustment.state, used=free.used, covariance=False)
+    except MeasureError:  # the network hangs on them
+        return None
+    redundant = held.dof - free.dof
+    if redundant < 1 or free.dof < 1:
+        return None
+    variance = max(free.sigma0**2, finest_factor(network))
+    f = float((held.sigma0**2 * held.dof - free.sigma0**2 * free.dof) / redundant / variance)
+    there = fixed & np.isfinite(free.state.xyz).all(axis=1)
+    off = _off(free.state.xyz[there], network.xyz[there], free, 3 * int(there.sum()) - redundant)
+    miss = float(np.sqrt((off**2).sum() / redundant * max(1 - 1 / max(f, 1.0), 0.0)))
+    return {"n": int(there.sum()), "f": f, "dof": (redundant, free.dof), "p": float(stats.f.sf(f, redundant, free.dof)), "miss": miss}
+
+
+def _off(found: np.ndarray, given: np.ndarray, free: Adjustment, missing: int) -> np.ndarray:
+    """Distances of points from where they should be, without what the datum leaves open: so many of its seven parameters."""
+    if missing <= 0:
+        return np.linalg.norm(given - found, axis=1)
+    held = np.isfinite(free.network.u_xyz).all(axis=1) & np.isfinite(free.state.xyz).all(axis=1)
+    scale, rotation, shift = similarity(found, given, np.ones(len(found)), scaled=not len(free.network.bars) and held.sum() < 2)
+    return np.linalg.norm(given - scale * found @ rotation.T - shift, axis=1)
 
 
 def loosened(network: Network) -> Network:

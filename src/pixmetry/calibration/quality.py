@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -182,6 +182,12 @@ def p_words(p: float) -> str:
     return "p < 1e-6" if p < 1e-6 else f"p = {p:.2g}"
 
 
+def plain(value: float, digits: int) -> str:
+    """A number to so many digits for a sentence, without a power of ten as long as it is below a million: 2300 px, not 2.3e+03 px."""
+    rounded = float(f"{value:.{digits}g}")
+    return f"{rounded:.0f}" if 10.0**digits <= abs(rounded) < 1e6 else f"{value:.{digits}g}"
+
+
 def p_fall(before: np.ndarray, after: np.ndarray, image: np.ndarray) -> float:
     """How often chance alone lets residuals fall so much: one-sided t-test on the logarithms of the images' mean squares, paired.
 
@@ -261,19 +267,29 @@ def _f_text(record: dict[str, Any], critical: float) -> str:
     return f"{text}; one-sided, {dof}, critical at 95 %: {critical:.3f}; in px, {verdict}"
 
 
-def image_records(adjustment: Adjustment) -> list[dict[str, Any]]:
-    """One record an image: ``image``, ``camera``, ``n`` used, ``rejected``, rms of x and y (None without points), ``time_s``, and the
-    image's ``x_scale``, ``x_shift_px`` with their uncertainties (None where they are not estimated)."""
+def image_records(adjustment: Adjustment, rejected: Mapping[str, int] | None = None) -> list[dict[str, Any]]:
+    """One record an image: ``image``, ``camera``, ``oriented``, ``n`` used, ``rejected``, ``measured``, rms of x and y (None without
+    points), ``time_s``, and the image's ``x_scale``, ``x_shift_px`` with their uncertainties (None where they are not estimated).
+
+    Of an image that is not oriented nothing was rejected: it took no part.
+
+    Parameters
+    ----------
+    adjustment : Adjustment
+    rejected : mapping, optional
+        How many image points of an image were rejected, by its name; by default all that were not used.
+    """
     network, state = adjustment.network, adjustment.state
     places = {name: i for i, name in enumerate(adjustment.free_columns)}
     out = []
     for i, name in enumerate(network.images):
         mine = network.image == i
-        used = mine & adjustment.used
+        used, oriented = mine & adjustment.used, bool(np.isfinite(state.position[i]).all())
+        out_of_it = int((mine & ~used).sum()) if rejected is None else rejected.get(name, 0)
         rms = np.sqrt(np.mean(adjustment.residual_px[used] ** 2, axis=0)).tolist() if used.any() else (None, None)
         record: dict[str, Any] = {
-            "image": name, "camera": network.cameras[network.camera_of[i]].name, "n": int(used.sum()),
-            "rejected": int((mine & ~adjustment.used).sum()), "rms_x_px": rms[0], "rms_y_px": rms[1],
+            "image": name, "camera": network.cameras[network.camera_of[i]].name, "oriented": oriented, "n": int(used.sum()),
+            "rejected": out_of_it if oriented else 0, "measured": int(mine.sum()), "rms_x_px": rms[0], "rms_y_px": rms[1],
             "time_s": None if network.time_s is None else float(network.time_s[i]),
         }  # fmt: skip
         for kind, key, value in (("x_scale", "x_scale", state.x_scale[i]), ("x_shift", "x_shift_px", state.x_shift_px[i])):

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from pixmetry.calibration.geometry import systematic_rest
+from pixmetry.calibration.known_checks import fixed_record
 from pixmetry.calibration.known_residuals import bar_residuals, control_residuals, group_record
 from pixmetry.calibration.network import Adjustment, Network
 from pixmetry.calibration.snooping import Rejected
@@ -40,6 +42,8 @@ def all_records(
     from pixmetry.calibration.patterns import patterns_without_bad_images
     from pixmetry.calibration.snooping import gross_error_records
 
+    oriented = dict(zip(adjustment.network.images, np.isfinite(adjustment.state.position).all(axis=1), strict=True))
+    gross = [record for record in gross_error_records(adjustment, alpha, rejected) if oriented[record["image"]]]
     return {
         "parameters": quality.parameter_records(adjustment),
         "parameter_groups": quality.group_records(adjustment),
@@ -48,13 +52,16 @@ def all_records(
         "correlations_with_poses": quality.pose_correlations(adjustment),
         "residuals": quality.residual_records(adjustment),
         "f_test": quality.f_test_records(adjustment),
-        "gross_errors": gross_error_records(adjustment, alpha, rejected),
+        "gross_errors": gross,
         "patterns": patterns_without_bad_images(adjustment, adjust),
-        "images": quality.image_records(adjustment),
+        "images": quality.image_records(adjustment, Counter(record["image"] for record in gross)),
         "curves": curves.distortion_curves(adjustment),
         "projection": curves.projection_maps(adjustment),
         "network": network_record(adjustment, a_priori=a_priori),
-        "known": known_record(adjustment, gross_known, a_priori=a_priori),
+        "known": {
+            **known_record(adjustment, gross_known, a_priori=a_priori),
+            "fixed_points": fixed_record(adjustment, adjust),
+        },
     }
 
 
@@ -70,17 +77,31 @@ def add_noise(residuals: dict[str, dict[str, Any]], adjustment: Adjustment, give
         residuals[camera.name] |= {"noise_x_px": noise[0], "noise_y_px": noise[1], "systematic_x_px": rest[0], "systematic_y_px": rest[1]}
 
 
+def sizes(adjustment: Adjustment) -> dict[str, int]:
+    """What took part, and what was given: ``images`` (oriented), ``points`` (determined, in such images), ``observations`` (image points
+    used); ``images_given``, ``points_given``, ``observations_given`` (all that was measured)."""
+    network, state = adjustment.network, adjustment.state
+    posed = np.isfinite(state.position).all(axis=1)
+    seen = np.unique(network.point[posed[network.image]])
+    return {
+        "images": int(posed[np.unique(network.image)].sum()),
+        "points": int(np.isfinite(state.xyz[seen]).all(axis=1).sum()),
+        "observations": int(adjustment.used.sum()),
+        "images_given": len(np.unique(network.image)),
+        "points_given": len(np.unique(network.point)),
+        "observations_given": len(network),
+    }
+
+
 def network_record(adjustment: Adjustment, *, a_priori: bool = False) -> dict[str, Any]:
-    """Sizes of the network: ``images``, ``points`` (determined), ``observations`` (image points used), ``redundancy``, ``rays_per_point``
-    (mean, with ``rays_least`` and ``rays_most``), ``datum``, ``unit``, ``sigma0``, ``scale_bars``."""
-    network, state, used = adjustment.network, adjustment.state, adjustment.used
+    """The `sizes` of the network, ``redundancy``, ``rays_per_point`` (mean, with ``rays_least`` and ``rays_most``), ``datum``, ``unit``,
+    ``sigma0``, ``scale_bars``."""
+    network, used = adjustment.network, adjustment.used
     rays = np.bincount(network.point[used], minlength=len(network.points))
     rays = rays[rays > 0]
     bars = bar_residuals(adjustment, a_priori=a_priori)
     return {
-        "images": int(np.isfinite(state.position).all(axis=1).sum()),
-        "points": int(np.isfinite(state.xyz).all(axis=1).sum()),
-        "observations": int(used.sum()),
+        **sizes(adjustment),
         "redundancy": adjustment.dof,
         "sigma0": adjustment.sigma0,
         "rays_per_point": float(rays.mean()),

@@ -8,7 +8,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pixmetry.report.calibration_space import largest_axis
-from pixmetry.report.calibration_text import TITLES, length, p_text, parameter_records, record_of, residual_record, sentence, symbol
+from pixmetry.report.calibration_text import (
+    TITLES,
+    as_given,
+    counts,
+    length,
+    p_text,
+    parameter_records,
+    record_of,
+    residual_record,
+    sentence,
+    shown,
+    symbol,
+)
 from pixmetry.report.numbers import NO_BREAK, NONE, fixed, length_px, signed, significant, uncertain
 
 if TYPE_CHECKING:
@@ -34,7 +46,7 @@ def parameters(calibration: Calibration, camera: int) -> list[dict[str, str]]:
     centre = dict(zip(("xp", "yp"), adjustment.network.cameras[camera].sensor.centre, strict=True))
     rows = []
     for r in parameter_records(calibration, camera):
-        number = uncertain(r["value"], float("nan") if r["u"] is None else r["u"], r["unit"])
+        number = shown(r)
         strongest, p = r.get("strongest"), r.get("p_zero")
         off = r["value"] - centre.get(r["name"], np.nan)
         rows.append(
@@ -59,7 +71,8 @@ def vision(calibration: Calibration, name: str) -> list[tuple[str, str, str]]:
     for key, title in VISION:
         if found.get(key) is not None:
             u = found.get(f"u_{key}")
-            number = uncertain(float(found[key]), float("nan") if u is None else float(u), "px")
+            held = u is not None and float(u) == 0
+            number = as_given(float(found[key]), "px") if held else uncertain(float(found[key]), np.nan if u is None else float(u), "px")
             rows.append((title, number.value, "" if number.u == NONE else f"± {number.u}"))
     return rows
 
@@ -103,7 +116,8 @@ def images(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     has = {key: any(r.get(key) is not None for r in records) for key in ("x_scale", "x_shift_px", "time_s")}
     rows = []
     for r in records:
-        cells = [str(r["n"]), str(r["rejected"]), px(r["rms_x_px"]), px(r["rms_y_px"])]
+        numbers = [str(r["n"]), str(r["rejected"])] if r.get("oriented", True) else ["not oriented", NONE]
+        cells = [*numbers, px(r["rms_x_px"]), px(r["rms_y_px"])]
         if has["time_s"]:
             cells.append(value(r.get("time_s"), 6))
         for key, u_key, factor in (("x_scale", "u_x_scale", 1e6), ("x_shift_px", "u_x_shift_px", 1.0)):
@@ -220,14 +234,14 @@ def network_facts(calibration: Calibration) -> list[tuple[str, str]]:
     """What the network is made of."""
     adjustment = calibration.adjustment
     net = adjustment.network
-    used, total = int(adjustment.used.sum()), len(net)
+    images_count, points_count, used = counts(calibration)
     rays = np.bincount(net.point[adjustment.used], minlength=len(net.points))
     seen = rays[rays > 0]
     facts = [("Cameras", str(len(net.cameras)))] if len(net.cameras) > 1 else []
     return facts + [
-        ("Images", str(len(net.images))),
-        ("Points", str(len(net.points))),
-        ("Image points used", f"{used} of {total}"),
+        ("Images", images_count),
+        ("Points", points_count),
+        ("Image points used", used),
         ("Rays per point", value(seen.mean()) if len(seen) else NONE),
         ("Degrees of freedom", str(adjustment.dof)),
         ("Iterations", str(adjustment.iterations)),

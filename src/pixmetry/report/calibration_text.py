@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pixmetry.report.numbers import MINUS, NO_BREAK, NONE, SUPERSCRIPT, THIN, length_px, significant, uncertain
+from pixmetry.report.numbers import MINUS, NO_BREAK, NONE, SUPERSCRIPT, THIN, Number, length_px, pretty_unit, significant, uncertain
 
 if TYPE_CHECKING:
     from pixmetry.calibration.network import Calibration
 
 COLUMNS = 100  # of the terminal
+GIVEN_DIGITS = 8  # of a value that was given and held
 TITLES = {
     "c": "Principal distance",
     "xp": "Principal point, x",
@@ -166,12 +167,36 @@ def parameter_records(calibration: Calibration, camera: int) -> list[dict[str, A
     return rows
 
 
+def counts(calibration: Calibration) -> tuple[str, str, str]:
+    """How many images, points and image points took part; where not all did, of how many."""
+    from pixmetry.calibration.records import sizes
+
+    found = sizes(calibration.adjustment)
+    pairs = [(found[key], found[f"{key}_given"]) for key in ("images", "points", "observations")]
+    images, points, observations = (str(part) if part == whole else f"{part} of {whole}" for part, whole in pairs)
+    return images, points, observations
+
+
+def shown(record: Mapping[str, Any]) -> Number:
+    """A parameter as text: with its uncertainty, or where it is held, with the digits that it was given."""
+    if record["fixed"]:
+        return as_given(record["value"], record["unit"])
+    return uncertain(record["value"], float("nan") if record["u"] is None else record["u"], record["unit"])
+
+
+def as_given(value: float, unit: str) -> Number:
+    """A value that was given, to at most eight significant digits; a power of ten is in the unit."""
+    mantissa, _, exponent = f"{value:.{GIVEN_DIGITS}g}".partition("e")
+    power = f"10{str(int(exponent)).translate(SUPERSCRIPT)}{NO_BREAK}" if exponent else ""
+    return Number(mantissa.replace("-", MINUS), NONE, (power + pretty_unit(unit)).rstrip(NO_BREAK))
+
+
 def summary_text(calibration: Calibration) -> str:
     """Summary for the terminal: what each camera is worth, what to know, its parameters."""
     adjustment = calibration.adjustment
     net = adjustment.network
-    size = f"{len(net.images)} images, {len(net.points)} points, {int(adjustment.used.sum())} image points used."
-    lines = [f"{size} {sigma0_text(calibration)}"]
+    images, points, observations = counts(calibration)
+    lines = [f"{images} images, {points} points, {observations} image points used. {sigma0_text(calibration)}"]
     for k, model in enumerate(net.cameras):
         lines += ["", f"{model.name}: {worth(calibration, k)}"]
         found = record_of(calibration, "f_test", model.name)
@@ -196,7 +221,7 @@ def folded(line: str) -> list[str]:
 def _parameter_lines(calibration: Calibration, camera: int) -> list[str]:
     rows = []
     for r in parameter_records(calibration, camera):
-        number = uncertain(r["value"], r["u"] if r["u"] is not None else float("nan"), r["unit"])
+        number = shown(r)
         said = "fixed" if r["fixed"] else ("" if number.u == NONE else f"± {number.u}")
         p = r.get("p_zero")
         rows.append((symbol(r["name"]), number.value, said, number.unit, "not significant" if p is not None and p > 0.05 else ""))
