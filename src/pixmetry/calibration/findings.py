@@ -179,8 +179,8 @@ def two_ray_findings(adjustment: Adjustment) -> list[Finding]:
 
 
 def lost_findings(adjustment: Adjustment) -> list[Finding]:
-    """Points that two oriented images or more see, of which nothing is left: of two rays that contradict each other none can be said to be
-    right."""
+    """Points that two oriented images or more see, of which nothing is left: of a few rays that contradict each other none can be said
+    to be right."""
     network = adjustment.network
     posed = np.isfinite(adjustment.state.position).all(axis=1)[network.image]
     rays = np.bincount(network.point[posed], minlength=len(network.points))
@@ -193,7 +193,7 @@ def lost_findings(adjustment: Adjustment) -> list[Finding]:
     ends = np.isin(network.bars.start, lost) | np.isin(network.bars.end, lost)
     if ends.any():
         text += f"; with them go {ends.sum()} of {len(ends)} scale bars"
-    advice = "Look at these points in their images: with two rays it cannot be told which of them is wrong; a third would tell."
+    advice = "Look at these points in their images: with so few rays it cannot be told which of them is wrong; one more would tell."
     return [Finding("lost_points", f"{text}.", advice, "warning")]
 
 

@@ -17,11 +17,12 @@ W. Baarda, A testing procedure for use in geodetic networks (1968); A. J. Pope, 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
 
+from pixmetry.calibration.few_rays import Mended, mend
 from pixmetry.calibration.network import Adjustment, Network, State
 
 LEAST_REDUNDANCY = 0.01  # below it, in a direction, an error of an image point would not show in its residual
@@ -134,7 +135,8 @@ def remove_gross_errors(
     """Adjust, and leave out image points with gross errors.
 
     First a robust adjustment shows the large ones. Then, by least squares, at most one of each image and one of each object point is
-    rejected at a time, the worst first, until none is left to reject; in the end those come back that pass the test after all.
+    rejected at a time, the worst first, until none is left to reject; in the end those come back that pass the test after all, and of
+    points of few rays those that agree with each other (`pixmetry.calibration.few_rays`).
 
     Parameters
     ----------
@@ -160,14 +162,16 @@ def remove_gross_errors(
         robust = adjust(network, start, loss=loss, loss_scale=loss_scale, used=used, covariance=False)
         used, state = _without_large(robust, alpha, rejected), robust.state
     adjustment = _reject(network, state, adjust, used, alpha, rejected)
-    barred = np.zeros(len(network), bool)
+    barred, chosen = np.zeros(len(network), bool), np.zeros(len(network.points), bool)
     for _ in range(RETURNS):
         back = _passing(adjustment, alpha) & ~barred
-        if not back.any():
-            break
-        barred |= back  # whoever is rejected a second time stays out
+        barred |= back  # whoever is rejected a second time stays out,
         rejected.forget(back)
-        adjustment = _reject(network, adjustment.state, adjust, adjustment.used | back, alpha, rejected)
+        mended = _mended(adjustment, adjustment.used | back, ~chosen, alpha, rejected)
+        chosen[mended.points] = True  # and no point's rays are chosen a second time
+        if (mended.used == adjustment.used).all():
+            break
+        adjustment = _reject(network, replace(adjustment.state, xyz=mended.xyz), adjust, mended.used, alpha, rejected)
     return Snooped(adjustment, alpha, rejected)
 
 
@@ -238,6 +242,17 @@ def _reject(
 def _passing(adjustment: Adjustment, alpha: float) -> np.ndarray:
     statistic, _ = statistics(adjustment)
     return ~adjustment.used & (np.nan_to_num(statistic, nan=np.inf) <= critical_values(alpha, adjustment.dof)[1])
+
+
+def _mended(adjustment: Adjustment, used: np.ndarray, allowed: np.ndarray, alpha: float, rejected: Rejected) -> Mended:
+    """Points of few rays that lost some, with those of their rays that agree, and what the others are rejected for."""
+    network, critical = adjustment.network, critical_values(alpha, adjustment.dof)[1]
+    variance = max(adjustment.sigma0**2, finest_factor(network))
+    mended = mend(adjustment, used, allowed, variance, critical, alpha * len(network))
+    rejected.forget(np.isin(network.point, mended.points))
+    out = np.isfinite(mended.statistic)
+    rejected.note(out, statistic=mended.statistic, critical=critical, residual_px=mended.residual_px, error_px=mended.residual_px)
+    return mended
 
 
 def _one_each(network: Network, statistic: np.ndarray, critical: float) -> np.ndarray:
