@@ -227,10 +227,17 @@ def _field(field: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _hold_out(found: Mapping[str, Any]) -> str:
+    texts = []
     p = tables.p_text(found.get("p"))
-    if p == NONE or not (found.get("fixed") and found.get("free")):
-        return ""
-    return f"That the rms of images left out falls with free points has p {p if p[0] == '<' else '= ' + p} (paired over the images)."
+    if p != NONE and found.get("fixed") and found.get("free"):
+        told = p if p[0] == "<" else f"= {p}"
+        texts.append(f"That the rms of images left out falls with free points has p {told} (paired over the images).")
+    if found.get("expected_median_px"):
+        texts.append(
+            f"With noise alone, half of the residuals of images left out would be above {length_px(found['expected_median_px'])} px: "
+            "points that few images see are worse known without one of them."
+        )
+    return " ".join(texts)
 
 
 def _eccentricity(found: Mapping[str, Any] | None) -> str:

@@ -177,7 +177,7 @@ def hold_out(found: Mapping[str, Any] | None) -> list[list[str]]:
     for key, title in (("fixed", "points as given"), ("free", "points free")):
         part = (found or {}).get(key)
         if part:
-            rows.append([title, px(part["fit_rms_px"]), px(part["left_out_rms_px"])])
+            rows.append([title, px(part["fit_rms_px"]), px(part["left_out_rms_px"]), px(part.get("left_out_median_px"))])
     return rows
 
 
@@ -224,7 +224,7 @@ def scale_bars(calibration: Calibration) -> list[list[str]]:
     for k in range(len(bars)):
         residual = float(bars.length[k] - adjusted[k])
         number = uncertain(float(bars.length[k]), float(bars.u[k]), net.unit)
-        ratio = NONE if not bars.u[k] > 0 else fixed(residual / float(bars.u[k]), 1)
+        ratio = fixed(residual / float(bars.u[k]), 1) if bars.u[k] > 0 and np.isfinite(residual) else NONE
         ends = f"{net.points[bars.start[k]]} – {net.points[bars.end[k]]}"
         rows.append([ends, number.value, f"± {number.u}", signed(residual, lambda v: significant(v, 2)), ratio])
     return rows
