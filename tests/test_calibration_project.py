@@ -346,7 +346,7 @@ def test_start_poses_by_angles_or_matrices(tmp_path: Path) -> None:
         ("image,X0,Y0,Z0,omega_deg,phi_deg,kappa_deg\na,1,2,3,4,5,6\nb,1,,3,4,5,6\n", ("line 3", "some of its values")),
         (f"image,X0,Y0,Z0,{MATRIX}\na,1,2,3,1,0,0,0,1,0,0,0,1\nb,1,2,3,1,0,0,0,1,0,0,0,-1\n", ("line 3", "mirror", "looks along +z")),
         ("image,X0,Y0,Z0,tx,ty,tz,qw,qx,qy,qz\na,1,2,3,1,2,3,1,0,0,0\nb,1,2,3,1,2,3,1,0,0,0\n", ("told twice", "tx")),
-        ("image,X0,Y0,Z0,qw,qx,qy,qz\na,1,2,3,1,0,0,0\nb,1,2,3,0,0,0,0\n", ("line 3", "length 0")),
+        ("image,X0,Y0,Z0,qw,qx,qy,qz\na,,,,,,,\nb,1,2,3,0,0,0,0\n", ("line 3", "length 0")),
         (f"image,X0,Y0,Z0,{MATRIX}\na,1,2,3,1,0,0,0,1,0,0,.1,1\nb,1,2,3,1,0,0,0,1,0,0,0,1\n", ("line 2", "no rotation")),
     ],
 )

@@ -167,3 +167,6 @@ def test_image_coordinates_that_all_lie_at_one_place(rng: np.random.Generator):
         fails(InputError, "within 2% of the frame about one place.*mm taken for um", shrunk)
     small = [centre[axis] + 0.05 * (values - centre[axis]) for axis, values in enumerate((network.x_px, network.y_px))]
     assert check_network(replace(network, x_px=small[0], y_px=small[1])) == ()
+    one = np.where(network.image == network.image[-1], network.point == network.point[-1], True)  # a camera with one image point
+    alone = replace(kept(network, one), cameras=network.cameras * 2, camera_of=(np.arange(len(network.images)) == network.image[-1]) * 1)
+    check_network(replace(alone, cameras=(network.cameras[0], replace(network.cameras[0], name="two"))))

@@ -179,3 +179,17 @@ def test_what_noise_explains_is_no_finding():
     (finding,) = hold_out_findings(record, free=True)
     assert "0.21 px" in finding.text and finding.level == "warning"
     assert hold_out_findings(record, free=False) == [] == hold_out_findings({**record, "expected_median_px": None}, free=True)
+
+
+def test_a_point_beyond_the_lens_of_a_left_out_image_has_no_part(rng):
+    """One point of an image is put where its lens sees nothing: the image is posed by the others, as if the point were not there."""
+    simulated = simulate(rng, images=6, points=30, interior={"k1": -4e-3, "k2": 0.0, "k3": 0.0})
+    network, state = simulated.network, simulated.truth
+    row = int(np.flatnonzero(network.image == 2)[0])
+    state = replace(state, xyz=state.xyz.copy())
+    state.xyz[network.point[row]] = state.position[2] + state.rotation[2].T @ [3000.0, 0.0, 1000.0]
+    others = (network.image == 2) & (np.arange(len(network)) != row)
+    found, residual = resect(network, state, others | (np.arange(len(network)) == row))
+    without, _ = resect(network, state, others)
+    assert np.isnan(residual[row]).all()
+    np.testing.assert_allclose(found.position[2], without.position[2], atol=1e-6)

@@ -14,7 +14,7 @@ from pixmetry.calibration.bundle import adjust
 from pixmetry.calibration.initial import start_values
 from pixmetry.calibration.network import Network, Poses
 from pixmetry.calibration.options import Options
-from pixmetry.calibration.posed_start import from_poses
+from pixmetry.calibration.posed_start import from_poses, to_their_frame
 from pixmetry.calibration.resection import fitted
 from pixmetry.calibration.solve import calibrate_network
 from pixmetry.core.errors import MeasureError
@@ -197,7 +197,7 @@ def test_poses_that_lead_nowhere_are_left_aside(rng: np.random.Generator, monkey
 
     def settle(measured, state, *more):
         if state.xyz[0, 0] == 1e3:
-            raise MeasureError("no minimum was found", remedy="more images")
+            raise MeasureError("no minimum was found", where=where, remedy="more images")
         return before(measured, state, *more)
 
     def started(network, *more):
@@ -206,10 +206,27 @@ def test_poses_that_lead_nowhere_are_left_aside(rng: np.random.Generator, monkey
             state.xyz[0, 0] = 1e3
         return found, state
 
-    begun, never = solve._started, False
+    begun, never, where = solve._started, False, "start values"
     monkeypatch.setattr(solve, "settle", settle)
     monkeypatch.setattr(solve, "_started", started)
     assert calibrate_network(network, Options(folds=0)).adjustment.sigma0 < 1.3
     never = True
     with pytest.raises(MeasureError, match="more images; the start poses do not fit"):
         calibrate_network(network, Options(folds=0))
+    where = "bundle adjustment"  # that they were the reason cannot be said
+    with pytest.raises(MeasureError, match="more images$"):
+        calibrate_network(network, Options(folds=0))
+
+
+def test_poses_most_of_which_are_at_one_place(rng: np.random.Generator) -> None:
+    """Three poses, two of them from one tripod: a size all the same."""
+    simulated = simulate(rng, images=12, bars=0)
+    truth = simulated.truth
+    network = with_poses(rng, simulated, 0.0)
+    network.poses.position[3:] = np.nan
+    state = replace(truth, position=truth.position.copy(), xyz=2 * truth.xyz)
+    state.position[1] = network.poses.position[1] = truth.position[0]
+    state.position[:] *= 2
+    scale, turn, shift = to_their_frame(network, state)
+    assert scale == pytest.approx(0.5) and np.abs(turn - np.eye(3)).max() < 1e-9
+    np.testing.assert_allclose(scale * state.xyz @ turn.T + shift, truth.xyz, atol=1e-6)

@@ -28,6 +28,7 @@ def test_critical_values_are_those_of_beta_and_f():
             assert inside == pytest.approx(dof * stats.beta.isf(alpha, 1, dof / 2 - 1), rel=1e-6)
             assert outside == pytest.approx(2 * stats.f.isf(alpha, 2, dof), rel=1e-6)
     assert critical_values(0.01, 2)[0] == np.inf
+    assert critical_values(0.01, 0) == (np.inf, np.inf)
 
 
 def test_limit_statistic_of_few_observations_has_the_stated_level(rng):

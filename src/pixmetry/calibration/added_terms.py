@@ -124,10 +124,13 @@ class AddedTerms:
     def __init__(self, adjustment: Adjustment) -> None:
         network, state = adjustment.network, adjustment.state
         self.adjustment = adjustment
-        self.rows = np.flatnonzero(adjustment.used & np.isfinite(adjustment.residual_px).all(axis=1))
+        d = derivatives(network, state)
+        known = np.isfinite(adjustment.residual_px).all(axis=1)
+        for part in (d.by_interior, d.by_image, d.by_point):  # at the edge of a lens it may have no inverse
+            known &= np.isfinite(part).all(axis=(1, 2))
+        self.rows = np.flatnonzero(adjustment.used & known)
         self._white = whitening(network.covariance_px2[self.rows]) * np.sqrt(adjustment.weight[self.rows])[:, None, None]
         self._residual = self._whitened(adjustment.residual_px[self.rows])
-        d = derivatives(network, state)
         self._cameras, self._points = self._designs(network, d)
         self._factorise(network, state)
 

@@ -19,6 +19,7 @@ from pixmetry.core.errors import InputError, MeasureError
 
 NEAR_ORIGIN = 0.1  # of the frame: image coordinates that all lie nearer to the origin are not pixels
 ONE_PLACE = 0.02  # of the frame: image coordinates that all lie in such a part of it have the wrong unit
+ENOUGH = 12  # image points of a camera that would hardly lie in one place by chance
 OUTSIDE = 0.2  # share of the image coordinates outside of the frame that is not put down to gross errors
 LINE = 0.005  # width by length below which points count as a line
 TIE = 3  # common points below which two images do not hold each other
@@ -91,7 +92,7 @@ def _check_frames(network: Network) -> list[Finding]:
             remedy = "state their unit (mm or px) and origin in the project, or the size of the frame"
             what = "all of them lie close to the origin, as if they were not in pixels"
             raise InputError(what, where=where, value=extent, allowed=frame, remedy=remedy)
-        if np.quantile(off, 0.98) < ONE_PLACE / 2:
+        if len(rows) >= ENOUGH and np.quantile(off, 0.98) < ONE_PLACE / 2:
             what = f"all of them lie within {ONE_PLACE:.0%} of the frame about one place"
             remedy = "check their unit (mm taken for um?), the pitch of the pixels and the size of the frame"
             raise InputError(what, where=where, value=extent, allowed=f"spread over {frame}", remedy=remedy)

@@ -149,8 +149,8 @@ def gross_error_findings(errors: list[dict[str, Any]], adjustment: Adjustment, i
     posed = np.isfinite(adjustment.state.position).all(axis=1)[network.image]
     others = {"images that are not oriented": int((~posed).sum())}
     others["points that are not determined"] = total - int(adjustment.used.sum()) - len(errors) - others["images that are not oriented"]
-    said = ", ".join(f"{count} of {what}" for what, count in others.items() if count)
-    text += f" Besides, there are {said}." if said else ""
+    said = " and ".join(f"{count} of {what}" for what, count in others.items() if count)
+    text += f" Not among them, and without a part: {said}." if said else ""
     many = len(errors) > 0.05 * total
     advice = "Look at these targets in the images, and at their names."
     if many:

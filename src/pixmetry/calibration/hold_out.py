@@ -185,6 +185,8 @@ def _huber(v: np.ndarray, image: np.ndarray, images: int) -> np.ndarray:
 def _steps(slopes: np.ndarray, v: np.ndarray, weight: np.ndarray, image: np.ndarray, images: int) -> np.ndarray:
     """Gauss–Newton steps of all images, shape (images, k); 0 for an image without observations."""
     k = slopes.shape[2]
+    seen = np.isfinite(v).all(axis=1) & np.isfinite(slopes).all(axis=(1, 2))  # not behind the camera, nor beyond its lens
+    slopes, v, weight = (np.where(seen.reshape(-1, *[1] * (part.ndim - 1)), part, 0.0) for part in (slopes, v, weight))
     normal, right = np.zeros((images, k, k)), np.zeros((images, k))
     np.add.at(normal, image, np.einsum("n,nij,nik->njk", weight, slopes, slopes))
     np.add.at(right, image, np.einsum("n,nij,ni->nj", weight, slopes, v))

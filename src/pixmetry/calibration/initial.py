@@ -283,12 +283,13 @@ def _check_posed(work: Reconstruction) -> None:
 def _not_oriented(network: Network, posed: np.ndarray) -> MeasureError:
     common = common_points(network)
     np.fill_diagonal(common, 0)
-    left = np.flatnonzero(~posed)
+    measured = np.isin(np.arange(len(posed)), network.image)
+    left = np.flatnonzero(~posed & measured)
     best = common[left].max(axis=1)
     worst = left[np.argsort(best, kind="stable")][:5]
     names = ", ".join(f"{network.images[i]} (at most {int(common[i].max())} points in common with another image)" for i in worst)
     remedy = "check the points' names and the size of the frame, give a start value of c, rough coordinates of some points or rough poses"
     if np.median(best) < 8:
         remedy = "take images that share at least 8 points with others, from sides that differ by 10° to 90°, or give rough poses"
-    what = f"{len(left)} of {len(posed)} images cannot be oriented"
+    what = f"{len(left)} of {measured.sum()} images cannot be oriented"
     return MeasureError(what, where="start values", value=names, remedy=remedy)

@@ -64,17 +64,10 @@ def in_their_frame(network: Network, state: State) -> State:
 
     Bars keep what they say of the size.
     """
-    if not has_their_frame(network, state):
+    found = to_their_frame(network, state)
+    if found is None:
         return state
-    both = _both(network.poses, state)
-    position, target = state.position[both], network.poses.position[both]
-    if len(both) > 2 and thickness(target)[1] > SPREAD:
-        scale, turn, shift, _ = fitted(position, target, scaled=not len(network.bars))
-    else:
-        turn = _turn(network.poses.rotation[both], state.rotation[both])[0].T
-        turned = position @ turn.T
-        scale = 1.0 if len(network.bars) else _size(target) / _size(turned)
-        shift = np.median(target - scale * turned, axis=0)
+    scale, turn, shift = found
     return replace(
         state,
         rotation=state.rotation @ turn.T,
@@ -83,12 +76,22 @@ def in_their_frame(network: Network, state: State) -> State:
     )
 
 
-def has_their_frame(network: Network, state: State) -> bool:
-    """Whether the frame of the network's poses is that of its result."""
+def to_their_frame(network: Network, state: State) -> tuple[float, np.ndarray, np.ndarray] | None:
+    """Scale, rotation and shift to the frame of the network's poses; None if it means nothing for the state."""
     if network.poses is None or np.isfinite(network.xyz).all(axis=1).any():
-        return False
+        return None
     both = _both(network.poses, state)
-    return len(both) > 1 and np.mean(_differ(network.poses, state, both)) <= MOST
+    if len(both) < 2 or np.mean(_differ(network.poses, state, both)) > MOST:
+        return None
+    position, target = state.position[both], network.poses.position[both]
+    if len(both) > 2 and thickness(target)[1] > SPREAD:
+        scale, turn, shift, _ = fitted(position, target, scaled=not len(network.bars))
+    else:
+        turn = _turn(network.poses.rotation[both], state.rotation[both])[0].T
+        turned = position @ turn.T
+        scale = 1.0 if len(network.bars) else _size(target) / _size(turned)
+        shift = np.median(target - scale * turned, axis=0)
+    return (scale, turn, shift) if np.isfinite(scale) and scale > 0 else None
 
 
 def pose_findings(network: Network, state: State) -> list[Finding]:
@@ -167,4 +170,4 @@ def _turn(rotation: np.ndarray, found: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def _size(position: np.ndarray) -> float:
-    return float(np.median(np.linalg.norm(position - np.median(position, axis=0), axis=1)))
+    return float(np.linalg.norm(np.std(position, axis=0)))

@@ -112,6 +112,8 @@ def statistics(adjustment: Adjustment) -> tuple[np.ndarray, np.ndarray]:
 
 def critical_values(alpha: float, dof: int) -> tuple[float, float]:
     """Critical values of T for a point that takes part, and for one that does not (see the head of this module)."""
+    if dof < 1:
+        return np.inf, np.inf
     inside = dof * (1 - alpha ** (2 / (dof - 2))) if dof > 2 else np.inf
     return inside, dof * (alpha ** (-2 / dof) - 1)
 

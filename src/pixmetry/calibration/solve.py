@@ -17,6 +17,7 @@ from pixmetry.core.threads import single_threaded_blas
 __all__ = ["Options", "calibrate_network"]
 DEFAULTS = Options()
 FEW = ("c", "k1")  # estimated first where start values are rough
+SIZED = 1.25  # by which lengths may differ from those of the start poses where these gave the size
 
 
 @single_threaded_blas()
@@ -71,9 +72,10 @@ def calibrate_network(
 
 def _sized(findings: list[Finding], network: Network, state: State) -> list[Finding]:
     """That nothing says how large the object is, is half true where start poses do."""
-    from pixmetry.calibration.posed_start import has_their_frame
+    from pixmetry.calibration.posed_start import to_their_frame
 
-    if not has_their_frame(network, state):
+    found = to_their_frame(network, state)
+    if found is None or not 1 / SIZED < found[0] < SIZED:
         return findings
     text = "nothing but the start poses says how large the object is: lengths are as good as these"
     return [replace(found, text=text) if found.kind == "no_scale" else found for found in findings]
@@ -92,7 +94,8 @@ def _from_start(network: Network, start: State | None, options: Options, say: Pr
         try:
             return _from_start(replace(network, poses=None), None, options, say)
         except MeasureError:
-            error.remedy += "; the start poses do not fit the image coordinates either: check which way the camera looks and rotations go"
+            if error.where == "start values":
+                error.remedy += "; the start poses do not fit either: check which way the camera looks and the rotations go"
             raise error from None
 
 

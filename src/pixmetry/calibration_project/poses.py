@@ -88,7 +88,7 @@ def _of_quaternion(table: Table, turn: np.ndarray) -> np.ndarray:
 
     rotation, length = np.full((len(turn), 3, 3), np.nan), np.linalg.norm(turn, axis=1)
     if (length == 0).any():
-        where = table.where(int(np.argmin(length)))
+        where = table.where(int(np.flatnonzero(length == 0)[0]))
         raise InputError("a quaternion of length 0", where=where, allowed="qw, qx, qy, qz, not all 0", remedy="correct it")
     given = length > 0
     if given.any():
