@@ -31,6 +31,7 @@ from pixmetry.calibration.network import PER_IMAGE_NAMES, Network, State
 from pixmetry.core.errors import MeasureError
 
 SINGULAR = 1e10  # variance inflation at which a system counts as singular
+SAME = 0.999  # correlation from which two parameters cannot be told apart
 ALONE = 0.8  # share of the weak direction above which it is one image's, or one point's
 RIDGE = 1e-13  # added to a singular system of unit diagonal, to look at it
 
@@ -50,9 +51,6 @@ class Cofactors:
     reduced: np.ndarray
     points: np.ndarray
     residuals: np.ndarray | None
-
-
-SAME = 0.999  # correlation from which two parameters cannot be told apart
 
 
 @dataclass(frozen=True)

@@ -34,6 +34,7 @@ FREE = ("k1", "k2", "p1", "p2")
 LOSSES = ("none", "huber", "cauchy")
 LOST_REL = 0.002  # of the frame's diagonal: a parameter whose standard uncertainty moves a corner by more is lost (k: ten times as much,
 # since they make up for each other; centre: likewise)
+FRAME = 0.55  # of its size from the middle: places farther off are outside of the frame, where the polynomial means nothing
 SUFFIX = {"p1": 1, "p2": 1, "k1": 2, "k2": 4, "k3": 6, "k4": 8, "k5": 10}
 
 
@@ -150,8 +151,8 @@ def calibrate_lines(
     """
     model = _start(sensor, start, free, loss)
     table = LineTable.of(x_px, y_px, line, image, u_px)
-    x, y = np.asarray(x_px, float), np.asarray(y_px, float)
-    table.inside[:] = (np.abs(x - (sensor.cols - 1) / 2) <= 0.55 * sensor.cols) & (np.abs(y - (sensor.rows - 1) / 2) <= 0.55 * sensor.rows)
+    away = np.abs(np.column_stack([x_px, y_px]) - sensor.centre) / (sensor.cols, sensor.rows)
+    table.inside[:] = (away <= FRAME).all(axis=1)
     fit = LineFit(table, model, free)
     adjust_lines(fit, loss, loss_scale, reject)
     return _result(fit, model, free)
