@@ -14,6 +14,7 @@ from scipy.stats import chi2
 from calibration.networks import disturbed, predicted, simulate
 from pixmetry.calibration import bundle, bundle_covariance, bundle_system
 from pixmetry.calibration.bundle import adjust
+from pixmetry.calibration.known_residuals import bar_residuals
 from pixmetry.calibration.network import Network, ScaleBars, State
 from pixmetry.core.errors import InputError, MeasureError
 
@@ -131,6 +132,7 @@ CASES = {
     "a third of the points fixed": (dict(bars=1, known="partly"), None),
     "weighted control": (dict(bars=0), {j: (0.05, 0.02, 0.1) for j in range(4)}),
     "one weighted point and one height": (dict(bars=1), {2: (0.03, 0.05, 0.0), 7: (inf, inf, 0.1)}),
+    "all heights fixed": (dict(bars=2), {j: (inf, inf, 0.0) for j in range(16)}),
     "one fixed point": (dict(bars=0), {3: (0.0, 0.0, 0.0)}),
     "three cameras": (dict(bars=1, cameras=3, images=12), None),
     "per image": (dict(bars=2, per_image=("x_scale", "x_shift"), cameras=2, images=10), None),
@@ -158,18 +160,23 @@ def test_agrees_with_dense_least_squares(name, rng, monkeypatch):
     take = np.concatenate([np.repeat(used, 2), np.ones(len(v) - 2 * len(network), bool)])
     A, v = J[take], v[take]
     in_datum = np.zeros(oracle.at[-1], bool)
-    carries = np.isinf(network.u_xyz).all(axis=1)
-    in_datum[oracle.at[4] :] = np.broadcast_to(carries[:, None], network.u_xyz.shape)[oracle.point_free]
+    carries = np.isinf(network.u_xyz)
+    whole = carries.all(axis=1, keepdims=True)
+    in_datum[oracle.at[4] :] = (carries & whole if whole.any() else carries)[oracle.point_free]
     Q, missing = bordered(A, oracle.conditions(), in_datum)
-    assert missing == {"free, inner constraints for all seven": 7, "two bars": 6, "one fixed point": 4}.get(name, missing)
+    defects = {"free, inner constraints for all seven": 7, "two bars": 6, "one fixed point": 4, "all heights fixed": 3}
+    assert missing == defects.get(name, missing)
     assert abs(v @ A @ Q @ (A.T @ v)) < 1e-5, "the cost has no minimum where it should"
     units = oracle.units()
     for found in both:
         assert (found.used == used).all()
+        np.testing.assert_array_equal(found.state.xyz[network.u_xyz == 0], network.xyz[network.u_xyz == 0])
         np.testing.assert_allclose(found.cost[-1], v @ v, rtol=1e-8)
         assert found.dof == len(v) + len(oracle.conditions()) + missing - A.shape[1]
         np.testing.assert_allclose(found.sigma0, np.sqrt(v @ v / found.dof), rtol=1e-8)
         _check_covariances(found, oracle, Q * np.outer(units, units))
+        of_bars = J[len(J) - len(network.bars) :] * network.bars.u[:, None]
+        _close(np.diag(network.bars.u**2) - bar_residuals(found, a_priori=True).cofactor, of_bars @ Q @ of_bars.T)
     _check_residuals(both[1], oracle, J, Q, used)
     if name.startswith("free"):
         _stays_in_the_mean(found.state.xyz, network.xyz)

@@ -266,7 +266,7 @@ def _result(
         weight=weight,
         sigma0=sigma0,
         dof=dof,
-        free_columns=layout.columns,
+        free_columns=layout.free_columns,
         covariance=np.zeros((0, 0)) if found is None else np.multiply(found.reduced, factor, out=found.reduced),
         point_covariance=np.full((len(network.points), 3, 3), np.nan) if found is None else factor * found.points,
         redundancy=numbers,
@@ -279,7 +279,7 @@ def _result(
 
 
 def _of_determined(layout: Layout, state: State) -> State:
-    """NaN for images and points that took no part; points known beforehand keep their coordinates."""
+    """NaN for images and points that took no part; these, and what is fixed, keep the coordinates known beforehand."""
     images, points = layout.image_col >= 0, layout.determined
     known = layout.network.xyz.copy()
     known[np.isinf(layout.network.u_xyz)] = np.nan
@@ -287,5 +287,5 @@ def _of_determined(layout: Layout, state: State) -> State:
         state,
         rotation=np.where(images[:, None, None], state.rotation, np.nan),
         position=np.where(images[:, None], state.position, np.nan),
-        xyz=np.where(points[:, None], state.xyz, known),
+        xyz=np.where(points[:, None] & ~layout.held, state.xyz, known),
     )

@@ -43,6 +43,7 @@ class Cofactors:
     Parameters
     ----------
     reduced : ndarray, shape (m, m)
+        Of the reduced unknowns that are estimated.
     points : ndarray, shape (points, 3, 3)
     residuals : ndarray, shape (n, 3), or None
         J Q_xx Jᵀ of the whitened image coordinates in the order of the layout: xx, xy, yy.
@@ -109,7 +110,12 @@ def cofactors(layout: Layout, datum: Datum, now: Linearised, solved: Solved, res
     points[layout.determined & layout.held.all(axis=1)] = 0.0
     held = layout.held & layout.determined[:, None]
     points[held[:, :, None] | held[:, None, :]] = 0.0
-    return Cofactors(Q, points, own)
+    return Cofactors(_of_estimated(layout, Q), points, own)
+
+
+def _of_estimated(layout: Layout, Q: np.ndarray) -> np.ndarray:
+    estimated = layout.estimated
+    return Q if estimated.all() else Q[np.ix_(estimated, estimated)]
 
 
 def _gathered(layout: Layout, solved: Solved, Q: np.ndarray) -> np.ndarray:
@@ -201,7 +207,7 @@ def raise_weak(layout: Layout, datum: Datum, now: Linearised, what: str) -> NoRe
     whole = lower + np.tril(lower, -1).T
     values, vectors = np.linalg.eigh(np.where(np.isfinite(whole), whole, 0.0))
     covariance = (vectors / (np.maximum(values, 0.0) + RIDGE)) @ vectors.T * np.outer(scale, scale)
-    weak = weak_direction(layout.columns, covariance, layout.network, now.state)
+    weak = weak_direction(layout.free_columns, _of_estimated(layout, covariance), layout.network, now.state)
     remedy = "add images that are tilted and rolled against each other, hold one of these parameters fixed, or give control points"
     if len(layout.network.images) < 3:
         free = int(layout.network.cameras[0].free.sum())

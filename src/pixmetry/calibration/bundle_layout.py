@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import compress
 
 import numpy as np
 
@@ -86,6 +87,19 @@ class Layout:
     def eliminated(self) -> np.ndarray:
         """Indices of the points that are eliminated."""
         return np.flatnonzero(self.point_col == ELIMINATED)
+
+    @property
+    def estimated(self) -> np.ndarray:
+        """Reduced unknowns that are estimated, bool: all but the held coordinates of points that bars join."""
+        out = np.ones(len(self.columns), bool)
+        joined = np.flatnonzero(self.point_col >= 0)
+        out[self.point_col[joined][:, None] + np.arange(3)] = ~self.held[joined]
+        return out
+
+    @property
+    def free_columns(self) -> tuple[str, ...]:
+        """Names of the reduced unknowns that are estimated."""
+        return tuple(compress(self.columns, self.estimated))
 
     @property
     def camera_of(self) -> np.ndarray:

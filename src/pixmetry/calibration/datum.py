@@ -3,8 +3,8 @@
 A similarity moves a point by t + θ × (X − m) + s (X − m) about a middle m. Control coordinates and scale bars hold some combinations of
 the seven parameters; along the others the image coordinates say nothing, and the datum is chosen so that the points that carry it stay, in
 the mean, where they were before (K. R. Koch, Parameter Estimation and Hypothesis Testing in Linear Models, 1999, 3.3). A covariance in any
-datum is brought to that one by Q' = S Q Sᵀ with S = I − G (Bᵀ G)⁻¹ Bᵀ: G is the null space and B the same restricted to the points that
-carry the datum (W. Baarda, S-transformations and criterion matrices, 1973).
+datum is brought to that one by Q' = S Q Sᵀ with S = I − G (Bᵀ G)⁻¹ Bᵀ: G is the null space and B the same restricted to the coordinates
+that carry the datum (W. Baarda, S-transformations and criterion matrices, 1973).
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import numpy as np
 
 from pixmetry.calibration.bundle_layout import Layout
 from pixmetry.calibration.network import State
+from pixmetry.core.errors import MeasureError
 
 GIVEN = 1e-8  # relative singular value above which control holds a direction
 ALIGN_STEPS = 50
@@ -31,9 +32,9 @@ class Datum:
         Root mean square distance of the points from their middle: the generators are made free of units by it.
     missing : int
         How many of the seven parameters nothing gives.
-    carriers : ndarray of int
-        Points that carry the datum then.
-    start : ndarray, shape (carriers, 3)
+    carriers : ndarray of bool, shape (points, 3)
+        Coordinates that carry the datum then.
+    start : ndarray, shape (points, 3)
         Where they stay in the mean.
     text : str
     """
@@ -47,21 +48,46 @@ class Datum:
 
 
 def datum_of(layout: Layout, start: State) -> Datum:
-    """Which parameters of the datum are missing, and who carries them."""
+    """Which parameters of the datum are missing, and who carries them: points of which nothing is known (where given, the coordinates that
+    they have beforehand), or, where these are too few, all coordinates that are not known.
+
+    Raises
+    ------
+    MeasureError
+        Where neither carries it.
+    """
     network = layout.network
     there = layout.determined
     middle = start.xyz[there].mean(axis=0)
     size = float(np.sqrt(((start.xyz[there] - middle) ** 2).sum(axis=1).mean())) or 1.0
-    plain = Datum(middle, size, 0, np.zeros(0, np.int64), np.zeros((0, 3)), "")
-    singular = np.linalg.svd(_held_directions(layout, start, plain), compute_uv=False)
+    nobody = np.zeros(network.u_xyz.shape, bool)
+    datum = Datum(middle, size, 0, nobody, start.xyz, "")
+    directions = _held_directions(layout, start, datum)
+    singular = np.linalg.svd(directions, compute_uv=False)
     missing = 7 - int((singular > GIVEN * max(1.0, singular.max(initial=0.0))).sum())
-    movable = there & np.isinf(network.u_xyz).all(axis=1)
-    named = np.flatnonzero(movable & np.isfinite(network.xyz).all(axis=1))
-    # three points that are not in line carry any datum; fewer named ones do not
-    carriers = named if len(named) >= 3 and _spread(network.xyz[named]) > GIVEN else np.flatnonzero(movable)
-    at = network.xyz[carriers] if carriers is named else start.xyz[carriers]
-    datum = replace(plain, missing=missing, carriers=carriers, start=at)
-    return replace(datum, text=_text(layout, datum, carriers is named))
+    named = False
+    if missing:
+        unknown = there[:, None] & np.isinf(network.u_xyz)
+        movable = unknown & unknown.all(axis=1)[:, None]
+        carriers = movable & np.isfinite(network.xyz).all(axis=1)[:, None]
+        # three points that are not in line carry any datum; fewer named ones do not
+        which = carriers[:, 0]
+        named = which.sum() >= 3 and _spread(network.xyz[which]) > GIVEN
+        if not named:
+            null = np.linalg.svd(directions)[2][7 - missing :].T
+            motion = generators(start.xyz, datum) @ null
+            carriers = movable if _carry(motion[movable]) else unknown
+            if not _carry(motion[carriers]):
+                remedy = "let some coordinates free, or give control points that are not in line"
+                raise MeasureError(f"{missing} of the seven parameters of the datum are open", where="bundle adjustment", remedy=remedy)
+        at = np.where(named, network.xyz, start.xyz)
+        datum = replace(datum, missing=missing, carriers=carriers, start=at)
+    return replace(datum, text=_text(layout, datum, named))
+
+
+def _carry(motion: np.ndarray) -> bool:
+    """Whether coordinates, moved by each missing parameter (coordinates, missing), tell all of those apart."""
+    return len(motion) >= motion.shape[1] and np.linalg.svd(motion, compute_uv=False)[-1] > GIVEN * np.abs(motion).max()
 
 
 def generators(points: np.ndarray, datum: Datum) -> np.ndarray:
@@ -97,9 +123,8 @@ def null_space(layout: Layout, state: State, datum: Datum) -> tuple[np.ndarray, 
 
 
 def carried(layout: Layout, points: np.ndarray, datum: Datum) -> tuple[np.ndarray, np.ndarray]:
-    """B: the null space of the points that carry the datum, as parts of the reduced unknowns (m, d) and of all points (points, 3, d)."""
-    of_points = np.zeros_like(points)
-    of_points[datum.carriers] = points[datum.carriers]
+    """B: the null space of the coordinates that carry the datum, as parts of the reduced unknowns (m, d) and of all points (points, 3, d)."""
+    of_points = np.where(datum.carriers[:, :, None], points, 0.0)
     reduced = np.zeros((len(layout.columns), points.shape[2]))
     for j in np.flatnonzero(layout.point_col >= 0):
         reduced[layout.point_col[j] : layout.point_col[j] + 3] = of_points[j]
@@ -114,8 +139,8 @@ def aligned(layout: Layout, state: State, datum: Datum) -> State:
 
     for _ in range(ALIGN_STEPS):
         basis = np.linalg.svd(_held_directions(layout, state, datum))[2][7 - datum.missing :].T
-        G = (generators(state.xyz[datum.carriers], datum) @ basis).reshape(-1, datum.missing)
-        gap = (datum.start - state.xyz[datum.carriers]).ravel()
+        G = generators(state.xyz, datum)[datum.carriers] @ basis
+        gap = (datum.start - state.xyz)[datum.carriers]
         step = basis @ np.linalg.lstsq(G, gap, rcond=None)[0]
         turn = step[3:6] / datum.size
         largest = max(np.abs(turn).max(), abs(step[6]) / datum.size, 1e-300)
@@ -175,5 +200,5 @@ def _text(layout: Layout, datum: Datum, named: bool) -> str:
         scale = " and the scale" if datum.missing == 7 else ""
         what = "the origin, the directions" + scale if datum.missing >= 6 else f"{datum.missing} of the seven parameters of the datum"
         start = "given" if named else "start"
-        parts.append(f"inner constraints on the {start} coordinates of {len(datum.carriers)} points for {what}")
+        parts.append(f"inner constraints on the {start} coordinates of {datum.carriers.any(axis=1).sum()} points for {what}")
     return "; ".join(parts)
