@@ -432,6 +432,17 @@ def test_one_image_of_known_points_gets_its_pose_only(rng):
     assert all(name.endswith(f"of image {network.images[2]}") for name in weak.parameters) and abs(weak.correlation) > 0.5
 
 
+def test_fixed_points_in_line_leave_a_turn_open(rng):
+    simulated = simulate(rng, images=6, points=12, bars=0)
+    line = np.linspace(-100, 100, 12)[:, None] * [1.0, 0.3, 0.2]
+    truth = replace(simulated.truth, xyz=line)
+    x, y = predicted(simulated.network, truth).T
+    camera = replace(simulated.network.cameras[0], free=np.zeros(12, bool))
+    network = replace(simulated.network, cameras=(camera,), x_px=x, y_px=y, xyz=line, u_xyz=np.zeros((12, 3)))
+    with pytest.raises(MeasureError, match="leaves 1 of the seven"):
+        adjust(network, truth)
+
+
 def test_without_noise_the_truth_comes_out(rng):
     simulated = simulate(rng, images=8, points=30, noise_px=1e-9, known="partly", bars=0)
     network = replace(simulated.network, covariance_px2=np.tile([1.0, 0.0, 1.0], (len(simulated.network), 1)))

@@ -67,22 +67,29 @@ def datum_of(layout: Layout, start: State) -> Datum:
     missing = 7 - int((singular > GIVEN * max(1.0, singular.max(initial=0.0))).sum())
     named = False
     if missing:
-        unknown = there[:, None] & np.isinf(network.u_xyz)
-        movable = unknown & unknown.all(axis=1)[:, None]
-        carriers = movable & np.isfinite(network.xyz).all(axis=1)[:, None]
-        # three points that are not in line carry any datum; fewer named ones do not
-        which = carriers[:, 0]
-        named = which.sum() >= 3 and _spread(network.xyz[which]) > GIVEN
-        if not named:
-            null = np.linalg.svd(directions)[2][7 - missing :].T
-            motion = generators(start.xyz, datum) @ null
-            carriers = movable if _carry(motion[movable]) else unknown
-            if not _carry(motion[carriers]):
-                remedy = "let some coordinates free, or give control points that are not in line"
-                raise MeasureError(f"{missing} of the seven parameters of the datum are open", where="bundle adjustment", remedy=remedy)
-        at = np.where(named, network.xyz, start.xyz)
-        datum = replace(datum, missing=missing, carriers=carriers, start=at)
+        carriers, named = _carriers(layout, start, generators(start.xyz, datum) @ np.linalg.svd(directions)[2][7 - missing :].T)
+        datum = replace(datum, missing=missing, carriers=carriers, start=network.xyz if named else start.xyz)
     return replace(datum, text=_text(layout, datum, named))
+
+
+def _carriers(layout: Layout, start: State, motion: np.ndarray) -> tuple[np.ndarray, bool]:
+    """The coordinates that carry a datum whose missing parameters move the points by ``motion`` (points, 3, missing), and whether they stay
+    where they are given rather than at their start."""
+    network = layout.network
+    unknown = layout.determined[:, None] & np.isinf(network.u_xyz)
+    whole = unknown.all(axis=1)
+    given = whole & np.isfinite(network.xyz).all(axis=1)
+    # three points that are not in line carry any datum; fewer given ones do not
+    if given.sum() >= 3 and _spread(network.xyz[given]) > GIVEN:
+        return unknown & given[:, None], True
+    for carriers in (unknown & whole[:, None], unknown):
+        if _carry(motion[carriers]):
+            return carriers, False
+    raise MeasureError(
+        f"what is known leaves {motion.shape[2]} of the seven parameters of the datum open, and no free coordinates carry them",
+        where="bundle adjustment",
+        remedy="let more coordinates free, or give control points that are not in line",
+    )
 
 
 def _carry(motion: np.ndarray) -> bool:
@@ -123,7 +130,7 @@ def null_space(layout: Layout, state: State, datum: Datum) -> tuple[np.ndarray, 
 
 
 def carried(layout: Layout, points: np.ndarray, datum: Datum) -> tuple[np.ndarray, np.ndarray]:
-    """B: the null space of the coordinates that carry the datum, as parts of the reduced unknowns (m, d) and of all points (points, 3, d)."""
+    """B: the null space of the coordinates carrying the datum, as parts of the reduced unknowns (m, d) and of all points (points, 3, d)."""
     of_points = np.where(datum.carriers[:, :, None], points, 0.0)
     reduced = np.zeros((len(layout.columns), points.shape[2]))
     for j in np.flatnonzero(layout.point_col >= 0):
