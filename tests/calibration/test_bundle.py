@@ -133,6 +133,7 @@ CASES = {
     "weighted control": (dict(bars=0), {j: (0.05, 0.02, 0.1) for j in range(4)}),
     "one weighted point and one height": (dict(bars=1), {2: (0.03, 0.05, 0.0), 7: (inf, inf, 0.1)}),
     "all heights fixed": (dict(bars=2), {j: (inf, inf, 0.0) for j in range(16)}),
+    "a fixed point and two coordinates of another": (dict(bars=0), {0: (0.0, 0.0, 0.0), 1: (inf, 0.0, 0.0)}),
     "one fixed point": (dict(bars=0), {3: (0.0, 0.0, 0.0)}),
     "three cameras": (dict(bars=1, cameras=3, images=12), None),
     "per image": (dict(bars=2, per_image=("x_scale", "x_shift"), cameras=2, images=10), None),
@@ -148,7 +149,7 @@ def test_agrees_with_dense_least_squares(name, rng, monkeypatch):
     network = weighted(rng, simulated.network, simulated.truth)
     if known:
         network = control(rng, network, simulated.truth, known)
-    used = rng.random(len(network)) > 0.05
+    used = (rng.random(len(network)) > 0.05) | (network.image < 3)  # a point of one ray would be none
     start = disturbed(rng, simulated)
     both = []
     for dense in (True, False):
@@ -303,6 +304,14 @@ def test_what_cannot_be_determined_is_left_out(rng):
     assert np.isnan(found.state.position[7]).all() and not any(name.startswith(f"{network.images[7]}:") for name in found.free_columns)
     assert not found.used[network.image == 7].any() and np.isnan(found.residual_px[network.image == 7]).all()
     assert np.isnan(found.point_covariance[lost]).all() and found.dof > 0
+
+
+def test_a_point_of_which_little_is_known_may_take_no_part(rng):
+    simulated = simulate(rng, images=6, points=20, bars=2)
+    network = control(rng, simulated.network, simulated.truth, {0: (0.0, np.inf, np.inf)})
+    start = disturbed(rng, simulated)
+    found = adjust(network, start, used=network.point != 0)
+    np.testing.assert_array_equal(np.isnan(found.state.xyz), np.repeat([[True], *[[False]] * 19], 3, axis=1))
 
 
 def test_weighted_points_that_no_image_sees_change_nothing(rng):

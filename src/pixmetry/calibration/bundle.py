@@ -279,10 +279,10 @@ def _result(
 
 
 def _of_determined(layout: Layout, state: State) -> State:
-    """NaN for images and points that took no part; these, and what is fixed, keep the coordinates known beforehand."""
+    """NaN for images and points that took no part, but for wholly known points; what is fixed keeps its digits."""
     images, points = layout.image_col >= 0, layout.determined
-    known = layout.network.xyz.copy()
-    known[np.isinf(layout.network.u_xyz)] = np.nan
+    partly = np.isinf(layout.network.u_xyz).any(axis=1)
+    known = np.where(partly[:, None] & ~points[:, None], np.nan, layout.network.xyz)
     return replace(
         state,
         rotation=np.where(images[:, None, None], state.rotation, np.nan),

@@ -144,6 +144,8 @@ def aligned(layout: Layout, state: State, datum: Datum) -> State:
         return state
     from scipy.linalg import expm
 
+    control = _control(layout)
+    held = state.xyz[control]
     for _ in range(ALIGN_STEPS):
         basis = np.linalg.svd(_held_directions(layout, state, datum))[2][7 - datum.missing :].T
         G = generators(state.xyz, datum)[datum.carriers] @ basis
@@ -152,6 +154,9 @@ def aligned(layout: Layout, state: State, datum: Datum) -> State:
         turn = step[3:6] / datum.size
         largest = max(np.abs(turn).max(), abs(step[6]) / datum.size, 1e-300)
         step *= min(1.0, 0.5 / largest)
+        if len(held):  # the last motion left them at rest to first order only
+            back = np.concatenate([held - state.xyz[control], np.zeros(min(1, len(layout.bars)))])
+            step += np.linalg.lstsq(np.concatenate(_held_rows(layout, state, datum)), back, rcond=GIVEN)[0]
         state = _moved(state, step, datum, expm)
         if np.abs(step).max() < 1e-12 * datum.size:
             break
@@ -159,7 +164,7 @@ def aligned(layout: Layout, state: State, datum: Datum) -> State:
 
 
 def _moved(state: State, step: np.ndarray, datum: Datum, expm) -> State:
-    """The state after the similarity whose generator is ``step``; what it leaves at rest, it leaves there exactly."""
+    """The state after the similarity whose generator is ``step``."""
     t, turn, scale = step[:3], step[3:6] / datum.size, step[6] / datum.size
     field = np.zeros((4, 4))
     field[:3, :3] = np.array([[0, -turn[2], turn[1]], [turn[2], 0, -turn[0]], [-turn[1], turn[0], 0]]) + scale * np.eye(3)
@@ -177,14 +182,18 @@ def _moved(state: State, step: np.ndarray, datum: Datum, expm) -> State:
 
 def _held_directions(layout: Layout, state: State, datum: Datum) -> np.ndarray:
     """What the seven parameters do to control coordinates and bars, shape (held, 7); its null space is what is missing."""
-    rows = [np.zeros((1, 7))]
-    control = layout.determined[:, None] & ~np.isinf(layout.network.u_xyz)
-    some = np.flatnonzero(control.any(axis=1))
-    rows.append(generators(state.xyz[some], datum)[control[some]])
-    if len(layout.bars):
-        rows.append(np.eye(7)[6:])
-    held = np.concatenate(rows)
+    held = np.concatenate([np.zeros((1, 7)), *_held_rows(layout, state, datum)])
     return held if len(held) <= 7 else np.asarray(np.linalg.qr(held, mode="r"))
+
+
+def _held_rows(layout: Layout, state: State, datum: Datum) -> tuple[np.ndarray, np.ndarray]:
+    """Of the control coordinates, and of the scale if there are bars."""
+    return generators(state.xyz, datum)[_control(layout)], np.eye(7)[6:][: len(layout.bars)]
+
+
+def _control(layout: Layout) -> np.ndarray:
+    """Coordinates of points that take part of which something is known, bool."""
+    return layout.determined[:, None] & ~np.isinf(layout.network.u_xyz)
 
 
 def _spread(points: np.ndarray) -> float:
