@@ -209,8 +209,8 @@ def raise_weak(layout: Layout, datum: Datum, now: Linearised, what: str) -> NoRe
     covariance = (vectors / (np.maximum(values, 0.0) + RIDGE)) @ vectors.T * np.outer(scale, scale)
     weak = weak_direction(layout.free_columns, _of_estimated(layout, covariance), layout.network, now.state)
     remedy = "add images that are tilted and rolled against each other, hold one of these parameters fixed, or give control points"
-    if len(layout.network.images) < 3:
-        free = int(layout.network.cameras[0].free.sum())
+    free = int(layout.camera_count.sum())
+    if len(layout.network.images) < 3 and free:
         remedy = f"two images seldom carry {free} interior parameters: hold some of them, or add images"
     cause = f"weakest: {weak.text}"
     if abs(weak.correlation) > SAME:

@@ -57,7 +57,8 @@ def check_network(network: Network) -> tuple[Finding, ...]:
     if len(seldom):
         text = f"{many(len(seldom), 'point')} seen in one image only, without a part in the adjustment: {_named(network.points, seldom)}"
         findings.append(Finding("single_points", text, "take them from a second image, or give their coordinates"))
-    if not len(network.bars) and not np.isfinite(network.xyz).all(axis=1).any():
+    known = np.isfinite(network.xyz) & np.isfinite(network.u_xyz)
+    if not len(network.bars) and network.given.sum() < 3 and known.sum(axis=0).max() < 2:
         text = f"nothing says how large the object is: lengths are in mean distances between the images, not in {network.unit}"
         findings.append(Finding("no_scale", text, "give a scale bar, or the coordinates of two points", "warning"))
     return tuple(findings)
@@ -162,7 +163,7 @@ def _usable(network: Network, findings: list[Finding]) -> tuple[np.ndarray, np.n
 
 def _taking_part(network: Network) -> tuple[np.ndarray, np.ndarray, list[int], list[int]]:
     """Images that can take part, free points that only one of them sees, images with too few points and with points on one line."""
-    known = np.isfinite(network.xyz).all(axis=1) & np.isfinite(network.u_xyz).all(axis=1)
+    known = network.control
     usable = np.ones(len(network.images), bool)
     few: list[int] = []
     lines: list[int] = []
@@ -191,14 +192,13 @@ def _on_line(network: Network, rows: np.ndarray) -> bool:
 
 
 def _check_field(network: Network) -> None:
-    known = np.isfinite(network.xyz).all(axis=1)
     seen = np.bincount(network.point, minlength=len(network.points)) > 0
     images = np.unique(network.image)
-    line = known[seen].all() and seen.sum() > 2 and thickness(network.xyz[seen])[1] < LINE
+    line = network.given[seen].all() and seen.sum() > 2 and thickness(network.xyz[seen])[1] < LINE
     if line or all(_on_line(network, np.flatnonzero(network.image == i)) for i in images):
         remedy = "use points spread over a plane, better a volume"
         raise MeasureError("all points lie on one line", where="object points", value=f"{seen.sum()} points", remedy=remedy)
-    fixed = known & np.isfinite(network.u_xyz).all(axis=1) & seen
+    fixed = network.control & seen
     if len(images) == 1 and fixed.sum() < FEWEST:
         what, value = "one image does not determine points that are not known", f"{fixed.sum()} known points"
         raise MeasureError(what, where=network.images[int(images[0])], value=value, remedy=MORE_IMAGES)
@@ -208,7 +208,7 @@ def _check_one_image(network: Network, usable: np.ndarray) -> None:
     if usable.sum() > 1:
         return
     only = int(np.flatnonzero(usable)[0])
-    known = (np.isfinite(network.xyz) & np.isfinite(network.u_xyz)).all(axis=1)
+    known = network.control
     seen = network.point[network.image == only]
     if network.cameras[network.camera_of[only]].free.any() and thickness(network.xyz[seen[known[seen]]])[0] < FLAT:
         what = "one image of a plane does not determine a camera: principal distance and principal point go with its pose"
@@ -217,7 +217,7 @@ def _check_one_image(network: Network, usable: np.ndarray) -> None:
 
 def _check_ties(network: Network, usable: np.ndarray, findings: list[Finding]) -> None:
     """Groups of images that share too few points to hold each other."""
-    fixed = np.isfinite(network.xyz).all(axis=1) & np.isfinite(network.u_xyz).all(axis=1)
+    fixed = network.control
     images = np.flatnonzero(usable)
     control = np.bincount(network.image[fixed[network.point]], minlength=len(usable))[images] >= FEWEST
     first, second = np.nonzero(np.triu(common_points(network)[np.ix_(images, images)] >= TIE, 1))

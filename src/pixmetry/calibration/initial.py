@@ -88,8 +88,7 @@ def _check_distances(network: Network) -> None:
 
 def _from_known_points(network: Network, interior: np.ndarray) -> Reconstruction | None:
     """Poses from points that are known, or roughly known; None where there are not enough, or they do not fit."""
-    given = np.isfinite(network.xyz).all(axis=1)
-    fixed = given & np.isfinite(network.u_xyz).all(axis=1)
+    fixed, given = network.control, network.given
     for control in (fixed, given) if (given & ~fixed).any() else (fixed,):
         work = _resected(network, interior, control)
         if work is not None:

@@ -127,6 +127,17 @@ class Network:
     def __len__(self) -> int:
         return len(self.x_px)
 
+    @property
+    def control(self) -> np.ndarray:
+        """Points of which all three coordinates are known, bool."""
+        return (np.isfinite(self.xyz) & np.isfinite(self.u_xyz)).all(axis=1)
+
+    @property
+    def given(self) -> np.ndarray:
+        """These, and points of which all three are roughly known; not those of which one or two are known: there somebody had to write
+        something for the others."""
+        return self.control | (np.isfinite(self.xyz) & np.isinf(self.u_xyz)).all(axis=1)
+
 
 @dataclass(frozen=True)
 class State:

@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from pixmetry.calibration.reconstruction import Reconstruction
-from pixmetry.calibration.resection import FLAT, fitted, similarity, thickness
+from pixmetry.calibration.resection import FLAT, fitted, thickness
 from pixmetry.core.errors import InputError, MeasureError
 
+KEEP = 1e-6  # pull of what is not known towards the frame that is there, beside 1 for what is
+AGREES = 1e-3  # of the extent: rms at which what is known is met
 REACH = 0.1  # rms distance from control, in units of its extent, at which coordinates do not belong to the images
 
 
@@ -15,8 +17,7 @@ def to_object(work: Reconstruction) -> None:
     """Bring a free reconstruction to control, nominal coordinates, bars, or a frame of its own."""
     network = work.network
     known = np.isfinite(work.xyz[:, 0])
-    given = known & np.isfinite(network.xyz).all(axis=1)
-    control = given & np.isfinite(network.u_xyz).all(axis=1)
+    control, given = network.control & known, network.given & known
     use = control if control.sum() >= 3 else given
     use_all = use.sum() >= 3 and thickness(network.xyz[use])[1] > 1e-3
     if use_all:
@@ -29,8 +30,8 @@ def to_object(work: Reconstruction) -> None:
         _own_frame(work, known)
     if control.sum() < 2:
         _scaled(work)
-    if control.any() and not use_all:
-        _to_few(work, control)
+    if not use_all or use is given:
+        _to_known(work, scaled=control.sum() >= 2 or not len(network.bars))
     if control.any():
         _grow_on(work)
 
@@ -38,7 +39,7 @@ def to_object(work: Reconstruction) -> None:
 def _grow_on(work: Reconstruction) -> None:
     """Pose images that are left, by known points that none of the others sees (those that others see stay where their rays meet)."""
     network = work.network
-    work.control = np.isnan(work.xyz[:, 0]) & np.isfinite(network.xyz).all(axis=1) & np.isfinite(network.u_xyz).all(axis=1)
+    work.control = np.isnan(work.xyz[:, 0]) & network.control
     if work.control.any():
         work.xyz[work.control] = network.xyz[work.control]
         work.grow()
@@ -50,14 +51,22 @@ def _does_not_fit(work: Reconstruction, use: np.ndarray) -> Exception:
     away = fitted(work.xyz[use] * mirror, network.xyz[use])[3]
     extent = np.linalg.norm(np.std(network.xyz[use], axis=0))
     if thickness(network.xyz[use])[0] > FLAT and np.median(away) < 0.3 * REACH * extent:
-        return InputError(
-            "image and object coordinates fit only mirrored", where="object points",
-            allowed="x to the right and y down in the image, a right-handed frame in the object",
-            remedy="say that y counts upwards in the table of image coordinates, or turn one axis of the object over",
-        )  # fmt: skip
+        return _mirrored()
+    return _disagrees(float(np.median(away)), int(use.sum()), network.unit)
+
+
+def _mirrored() -> InputError:
+    return InputError(
+        "image and object coordinates fit only mirrored", where="object points",
+        allowed="x to the right and y down in the image, a right-handed frame in the object",
+        remedy="say that y counts upwards in the table of image coordinates, or turn one axis of the object over",
+    )  # fmt: skip
+
+
+def _disagrees(apart: float, points: int, unit: str) -> MeasureError:
     return MeasureError(
         "the images agree with each other, but not with the known coordinates", where="object points",
-        value=f"{np.median(away):.3g} {network.unit} apart at {use.sum()} points",
+        value=f"{apart:.3g} {unit} apart at {points} points",
         remedy="compare the names of the points in both tables, the order of the coordinates' columns, and their unit",
     )  # fmt: skip
 
@@ -74,13 +83,63 @@ def _own_frame(work: Reconstruction, known: np.ndarray) -> None:
     moved(work, scale, rotation, -scale * rotation @ middle)
 
 
-def _to_few(work: Reconstruction, control: np.ndarray) -> None:
-    """To control that is one point, or lies in line: what it leaves open stays as it is."""
-    source, target = work.xyz[control], work.network.xyz[control]
-    if len(source) == 1:
-        moved(work, 1.0, np.eye(3), (target - source)[0])
-    else:
-        moved(work, *similarity(source, target, np.ones(len(source))))
+def _to_known(work: Reconstruction, *, scaled: bool) -> None:
+    """To coordinates that are known where these are fewer than three whole points: what they leave open stays as it is."""
+    network, there = work.network, np.isfinite(work.xyz[:, 0])
+    known = there[:, None] & np.isfinite(network.xyz) & np.isfinite(network.u_xyz)
+    if not known.any():
+        return
+    middle = np.median(work.xyz[there], axis=0)
+    size = float(np.sqrt(np.mean((work.xyz[there] - middle) ** 2)))
+    some = known.any(axis=1)
+    source, target, known = (work.xyz[some] - middle) / size, network.xyz[some], known[some]
+    scale, rotation, shift, apart = _nearest(source, target, known, size, scaled)
+    if apart > REACH and known.sum() > 7:
+        if _nearest(source * [1.0, 1.0, -1.0], target, known, size, scaled)[3] < 0.3 * REACH:
+            raise _mirrored()
+        raise _disagrees(apart * scale, known.any(axis=1).sum(), network.unit)
+    moved(work, scale / size, rotation, shift - scale / size * rotation @ middle)
+
+
+def _nearest(
+    source: np.ndarray, target: np.ndarray, known: np.ndarray, size: float, scaled: bool
+) -> tuple[float, np.ndarray, np.ndarray, float]:
+    """Scale, rotation, shift that bring points of extent 1 to coordinates that are known (n, 3), and the median of what remains, in units
+    of the extent; where they leave something open, the nearest to size ``size`` without a turn.
+
+    The shift is the mean of an axis. A turn may be far: the search begins at each of the 24 of a cube.
+    """
+    from scipy.optimize import least_squares
+    from scipy.spatial.transform import Rotation
+
+    count = np.maximum(known.sum(axis=0), 1)
+
+    def centred(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        values = np.where(known, values, 0.0)
+        mean = values.sum(axis=0) / count
+        return (values - mean)[known], mean
+
+    wanted = centred(target)[0]
+
+    def gap(p: np.ndarray) -> np.ndarray:
+        return centred(source @ Rotation.from_rotvec(p[:3]).as_matrix().T)[0] - wanted / (size * np.exp(p[3]))
+
+    def misses(p: np.ndarray, start: float) -> np.ndarray:
+        return np.concatenate([gap(p), KEEP * p[:3], [(KEEP if scaled else 1.0 / KEEP) * (p[3] - start)]])
+
+    best, least = np.zeros(4), np.inf
+    for turn in Rotation.create_group("O"):
+        length = np.linalg.norm(centred(source @ turn.as_matrix().T)[0])
+        ratio = np.linalg.norm(wanted) / (size * length) if scaled and length > 0 else 1.0
+        start = np.log(ratio) if ratio > 0 else 0.0
+        found = least_squares(misses, [*turn.as_rotvec(), start], args=(start,), loss="soft_l1", f_scale=10 * AGREES)
+        if found.cost < least:
+            best, least = found.x, found.cost
+        if np.abs(gap(best)).max() < AGREES:
+            break
+    scale, rotation = size * np.exp(best[3]), Rotation.from_rotvec(best[:3]).as_matrix()
+    shift = np.where(known.any(axis=0), centred(target)[1] - scale * centred(source @ rotation.T)[1], 0.0)
+    return scale, rotation, shift, float(np.median(np.abs(gap(best))))
 
 
 def _scaled(work: Reconstruction) -> None:

@@ -78,7 +78,7 @@ def in_their_frame(network: Network, state: State) -> State:
 
 def to_their_frame(network: Network, state: State) -> tuple[float, np.ndarray, np.ndarray] | None:
     """Scale, rotation and shift to the frame of the network's poses; None if it means nothing for the state."""
-    if network.poses is None or np.isfinite(network.xyz).all(axis=1).any():
+    if network.poses is None or np.isfinite(network.xyz).any():
         return None
     both = _both(network.poses, state)
     if len(both) < 2 or np.mean(_differ(network.poses, state, both)) > MOST:

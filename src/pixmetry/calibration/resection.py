@@ -204,6 +204,7 @@ def fitted(source: np.ndarray, target: np.ndarray, *, scaled: bool = True) -> tu
     """`similarity` by iteratively reweighted least squares against wrong points, and the distances that remain.
 
     It begins with all points or with three, whatever leaves the least median: far points with exchanged names would turn all of them.
+    Of three points none can be told to be wrong.
     """
     from pixmetry.core.random import generator
 
@@ -211,7 +212,7 @@ def fitted(source: np.ndarray, target: np.ndarray, *, scaled: bool = True) -> tu
     if len(source) > 3:
         starts += [np.isin(np.arange(len(source)), rng.choice(len(source), 3, replace=False)).astype(float) for _ in range(TRIPLES)]
     weight = min(starts, key=lambda start: float(np.median(_distances(source, target, similarity(source, target, start, scaled=scaled)))))
-    for _ in range(15):
+    for _ in range(15 if len(source) > 3 else 1):
         scale, rotation, shift = similarity(source, target, weight, scaled=scaled)
         left = _distances(source, target, (scale, rotation, shift))
         spread = max(1.5 * float(np.median(left)), 1e-12 * float(np.abs(target).max()), 1e-300)
