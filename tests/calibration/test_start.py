@@ -139,7 +139,8 @@ def test_points_of_which_some_coordinates_are_known(known, unknown: float, rng: 
     xyz = true + np.where(np.isfinite(u), u, 0.0) * rng.standard_normal(u.shape)
     xyz[np.isinf(u)] = np.nan
     in_part = np.isfinite(u).any(axis=1)[:, None] & np.isinf(u)
-    found = calibrate_network(replace(network, xyz=np.where(in_part, unknown, xyz), u_xyz=u), Options(folds=0, false_alarms=1e-6)).adjustment
+    partly = replace(network, xyz=np.where(in_part, unknown, xyz), u_xyz=u)
+    found = calibrate_network(partly, Options(folds=0, false_alarms=1e-6)).adjustment
     assert found.used.all()
     names, covariance = found.interior_covariance(0)
     off = (found.state.interior[0] - truth.interior[0])[network.cameras[0].free]

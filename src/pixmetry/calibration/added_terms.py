@@ -231,10 +231,12 @@ class AddedTerms:
         cross = self._cross.toarray() if self._cross.nnz > OFTEN * np.prod(self._cross.shape) else self._cross
         reduced = (self._kept.T @ self._kept).toarray() - _dense(cross.T @ (self._point_inverse @ cross))
         first = self._cameras.shape[1]
-        reduced[first:, first:] += (in_points - self._points.T @ self._points)[self._joined][:, self._joined].toarray()
+        known_joined = (in_points - self._points.T @ self._points)[self._joined][:, self._joined]
+        reduced[first:, first:] += known_joined.toarray()
         for columns in self._summing_to_zero:
             reduced[np.ix_(columns, columns)] += np.diag(reduced)[columns].mean()
         diagonal = np.asarray(self._kept.multiply(self._kept).sum(axis=0)).ravel()
+        diagonal[first:] += known_joined.diagonal()
         diagonal[diagonal == 0] = 1.0  # of images and points without observations
         self._scale = 1 / np.sqrt(diagonal)
         reduced *= np.outer(self._scale, self._scale)

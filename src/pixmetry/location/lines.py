@@ -36,6 +36,7 @@ DEG = np.pi / 180.0
 CHUNK = 32  # lines a task
 PIXEL = 0.2887  # standard deviation of a pixel's aperture
 LEAST_BLUR_PX = 0.3  # below it the grey values hardly tell where inside a pixel a line along the grid lies
+BLUR_REACH = 3.0  # of the candidate's: a fitted blur beyond it is no measure of how far a line can be trusted
 
 
 def line_model(
@@ -274,6 +275,8 @@ def _slope_y(p: np.ndarray, angle: np.ndarray) -> np.ndarray:
 def _flags(fit: Fit, candidates: LineCandidates, more: dict[str, np.ndarray]) -> np.ndarray:
     p, met = fit.values, np.nan_to_num(fit.told[:, 3]).astype(np.int64)
     excess = more["chi2_per_dof"] - 1.0 - 5.0 * np.sqrt(2.0 / more["dof"])
+    # noise alone is often fitted best by a blur as wide as the window
+    blur = np.minimum(p[:, kernels.SIGMA], BLUR_REACH * candidates.blur_px)
     with np.errstate(invalid="ignore"):
         said = {
             Flag.BORDER: met & kernels.BORDERS,
@@ -285,7 +288,7 @@ def _flags(fit: Fit, candidates: LineCandidates, more: dict[str, np.ndarray]) ->
             Flag.GRADIENT: p[:, kernels.TAPER] != 0,
             Flag.UNEVEN_BACKGROUND: (p[:, kernels.ACROSS] != 0) | (p[:, kernels.ALONG] != 0),
             Flag.POOR_FIT: excess > 0.1,
-            Flag.FAINT: more["var_across_px2"] > (0.15 * np.hypot(p[:, kernels.SIGMA], PIXEL)) ** 2,
+            Flag.FAINT: more["var_across_px2"] > (0.15 * np.hypot(blur, PIXEL)) ** 2,
         }
     known = np.isfinite(p[:, 0])
     flags = candidates.flags.astype(np.uint32)
