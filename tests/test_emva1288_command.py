@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
+from scipy import stats
 
 from pixmetry import emva1288
 from pixmetry.campaign import load_campaign
@@ -120,7 +121,9 @@ def test_a_mosaic_camera_is_tested_phase_by_phase(tmp_path: Path) -> None:
 def test_a_bootstrap_gives_uncertainties_of_its_own(known: Path) -> None:
     plain, drawn = (emva1288(known, bootstrap=n).results[0].values for n in (0, 400))
     assert drawn["K"].value == plain["K"].value and "bootstrap" in drawn["K"].method and "bootstrap" not in plain["K"].method
-    assert 0.3 < drawn["K"].u / plain["K"].u < 3 and 0.3 < drawn["PRNU1288"].u / plain["PRNU1288"].u < 3
+    for key, n in (("K", LEVELS - 1), ("PRNU1288", STACK - 1)):  # χ² of so few, 1e-6; what is drawn from n + 1 is a tenth too small
+        low, high = np.sqrt(stats.chi2.ppf([5e-7, 1 - 5e-7], n) / n)
+        assert 0.7 * low < drawn[key].u / plain[key].u < 1.3 * high, key
     # degrees of freedom of what was resampled, not those of the u that was replaced
     dof = {key: drawn[key].dof for key in ("K", "u_I_mean", "PRNU1288")}
     assert dof == {"K": LEVELS - 1, "u_I_mean": LEVELS - 1, "PRNU1288": STACK - 1}

@@ -131,6 +131,7 @@ CASES = {
     "all points fixed": (dict(bars=0, known="fixed", field="plane"), None),
     "a third of the points fixed": (dict(bars=1, known="partly"), None),
     "weighted control": (dict(bars=0), {j: (0.05, 0.02, 0.1) for j in range(4)}),
+    "weak control": (dict(bars=0), {j: (50.0, 20.0, 100.0) for j in range(6)}),
     "one weighted point and one height": (dict(bars=1), {2: (0.03, 0.05, 0.0), 7: (inf, inf, 0.1)}),
     "all heights fixed": (dict(bars=2), {j: (inf, inf, 0.0) for j in range(16)}),
     "a fixed point and two coordinates of another": (dict(bars=0), {0: (0.0, 0.0, 0.0), 1: (inf, 0.0, 0.0)}),

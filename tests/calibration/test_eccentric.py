@@ -95,8 +95,10 @@ def test_counted_subpixels_of_a_distorted_circle_have_that_centre(rng):
     r, x0, centre = state.rotation[network.image[row]], state.position[network.image[row]], network.xyz[network.point[row]]
     p = r @ (centre - x0)
     at = np.array(camera.project(p[0] / p[2], p[1] / p[2])).ravel()
-    # 1600 × 1600 sub-pixels of a window of 96 px about it: each is looked through to the plate
-    size, count = 96.0, 1600
+    # 1600 × 1600 sub-pixels of a window about it: each is looked through to the plate; circles are up to 115 px wide
+    t = 2 * np.pi * np.arange(60) / 60
+    rim = (centre + 10 * np.column_stack([np.cos(t), np.sin(t), 0 * t]) - x0) @ r.T
+    size, count = 2.1 * np.abs(np.array(camera.project(rim[:, 0] / rim[:, 2], rim[:, 1] / rim[:, 2])) - at[:, None]).max(), 1600
     grid = (np.arange(count) + 0.5) / count * size - size / 2
     gx, gy = np.meshgrid(at[0] + grid, at[1] + grid)
     a, b = polynomial(camera, (gx - camera["xp"]) * 0.005, (gy - camera["yp"]) * 0.005, affine=True)

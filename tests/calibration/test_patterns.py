@@ -29,10 +29,15 @@ def by_name(found, **options) -> dict[str, dict]:
     return {record["name"]: record for record in residual_patterns(found, **options)}
 
 
-@pytest.mark.parametrize("known", ["free", "fixed"])
+@pytest.mark.parametrize("known", ["free", "fixed", "bars to a nanometre"])
 def test_added_term_is_what_an_adjustment_with_it_finds(rng, known):
     """b1, held at 0 in one adjustment and estimated in another: value, uncertainty and F agree to first order."""
-    simulated, _ = network_of(rng, known=known, interior={"b1": 2e-5})
+    bars = "bars" in known
+    simulated, _ = network_of(rng, **({"bars": 3} if bars else {"known": known}), interior={"b1": 2e-5})
+    if bars:
+        given, xyz = simulated.network.bars, simulated.truth.xyz
+        exact = replace(given, length=np.linalg.norm(xyz[given.end] - xyz[given.start], axis=1), u=np.full(3, 1e-6))
+        simulated = replace(simulated, network=replace(simulated.network, bars=exact))
     camera = simulated.network.cameras[0]
     fewer = replace(camera, free=camera.free & (np.array(NAMES) != "b1"))
     held = replace(simulated.truth, interior=simulated.truth.interior * (np.array(NAMES) != "b1"))

@@ -103,8 +103,11 @@ WRONG = {
 
 @pytest.mark.parametrize("kind", WRONG)
 def test_wrong_poses_do_no_harm_and_are_named(kind: str, rng: np.random.Generator) -> None:
-    """What comes out is what comes out without them, and where another convention explains them, it is told."""
-    simulated = simulate(rng, images=12, points=40)
+    """What comes out is what comes out without them, and where another convention explains them, it is told.
+
+    The cameras stand all round: looking down, half of them would have rotations that are nearly their own transposed.
+    """
+    simulated = simulate(rng, images=12, points=40, look="ring")
     network = with_poses(rng, simulated, 0.01)
     change, words = WRONG[kind]
     wrong = replace(network, poses=Poses(*change(network.poses.rotation, network.poses.position)))

@@ -120,6 +120,7 @@ IN_PART = {
     "X and Y of one": {4: (fixed, fixed, free)},
     "two heights": {4: (free, free, fixed), 9: (free, free, fixed)},
     "all heights": {j: (free, free, weak) for j in range(40)},
+    "vague heights": {j: (free, free, 200.0) for j in range(12)},
     "a point and two coordinates of another": {0: (fixed, fixed, fixed), 5: (free, fixed, fixed)},
     "three and heights": {0: (weak,) * 3, 1: (weak,) * 3, 2: (weak,) * 3} | {j: (free, free, weak) for j in range(3, 8)},
     "places of some, heights of others": {j: (weak, weak, free) if j % 2 else (free, free, weak) for j in range(8)},

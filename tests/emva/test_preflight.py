@@ -56,15 +56,16 @@ def found(result) -> dict[str, str]:
 @pytest.mark.parametrize("signals", [(7000.0,), (1000.0, 3000.0, 7000.0, 12000.0, 16000.0)])
 @pytest.mark.parametrize("n", [2, 8])
 def test_stat_good_cameras_pass(signals: tuple[float, ...], n: int) -> None:
-    """Of about 12 checks on noise, 1e-6 each: all these runs together raise a false alarm once in 5000."""
-    rng = np.random.default_rng()
+    """Of about 12 checks on noise, 1e-6 each: one camera of four has a false alarm once in 20 000 runs, two once in 10⁹."""
+    rng, alarms = np.random.default_rng(), []
     for _ in range(4):
         camera = Camera(noise_e=rng.uniform(5, 20), prnu=rng.uniform(0, 0.01), dsnu_e=rng.uniform(0, 5), row_noise_e=rng.choice([0.0, 3.0]))
         result = look(camera, *signals, n=n)
-        assert found(result) == {}, preflight_text(result)
-        assert result.verdict == "ok"
+        alarms += [preflight_text(result)] if found(result) else []
+        assert (result.verdict == "ok") == (not found(result))
         if n == 2:
             assert {result[name].verdict for name in ("flicker", "drift", "dark_drift", "independent_frames")} == {"not judged"}
+    assert len(alarms) < 2, "\n".join(alarms)
 
 
 def test_first_values_for_a_plan() -> None:

@@ -236,7 +236,8 @@ def test_clocks_that_are_read_back_with_noise_make_no_exposure_sweep() -> None:
     for photons in (None, 10 * mean):
         found = []
         for noise in (0.0, 1e-4):
-            exposure, dark_s = 0.02 * (1 + noise * rng.uniform(-1, 1, n)), 0.02 * (1 + noise * rng.uniform(-1, 1, 6))
+            steps = rng.permutation(np.linspace(-1, 1, n + 6))  # no two alike: equal exposures would belong to each other
+            exposure, dark_s = 0.02 * (1 + noise * steps[:n]), 0.02 * (1 + noise * steps[n:])
             shuffled = rng.permutation(n)
             lit = None if photons is None else list(photons[shuffled])
             bright = level_moments(list(exposure), lit, list(mean[shuffled]))

@@ -17,7 +17,7 @@ import numpy as np
 from pixmetry.calibration.bundle_covariance import Cofactors, cofactors, raise_weak, residual_cofactors_px2
 from pixmetry.calibration.bundle_layout import Layout, layout_of, without
 from pixmetry.calibration.bundle_system import LOSSES, Linearised, Loss, Solved, bent, cost, equations, linearise, point_roots, solve
-from pixmetry.calibration.datum import Datum, aligned, datum_of
+from pixmetry.calibration.datum import Datum, aligned, datum_of, nearest_to_control
 from pixmetry.calibration.network import Adjustment, Network, State
 from pixmetry.core.errors import InputError
 from pixmetry.core.threads import single_threaded_blas
@@ -84,6 +84,7 @@ def adjust(
         layout, counts = layout_of(network, start, used), Loss(loss, loss_scale)
         start = _in_order(layout, start)
         datum = datum_of(layout, start)
+        start = nearest_to_control(layout, start, datum)
         now = linearise(layout, aligned(layout, start, datum), counts)
         work = np.empty((len(layout.columns), len(layout.columns)))
         _, pivot = point_roots(layout, equations(layout, now, work)[1])

@@ -6,7 +6,7 @@ those of the residuals of an image point Q_ll − J Q_xx Jᵀ. Points are taken 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NoReturn
 
 import numpy as np
@@ -31,6 +31,7 @@ from pixmetry.calibration.network import PER_IMAGE_NAMES, Network, State
 from pixmetry.core.errors import MeasureError
 
 SINGULAR = 1e10  # variance inflation at which a system counts as singular
+ROUNDED = 1e14  # the same where rounding takes over
 SAME = 0.999  # correlation from which two parameters cannot be told apart
 ALONE = 0.8  # share of the weak direction above which it is one image's, or one point's
 RIDGE = 1e-13  # added to a singular system of unit diagonal, to look at it
@@ -137,7 +138,7 @@ def _inverse(layout: Layout, datum: Datum, now: Linearised, solved: Solved) -> n
     from scipy.linalg.lapack import dpotri
 
     lower = dpotri(solved.factor, lower=0, overwrite_c=1)[0].T
-    if not np.diagonal(lower).max() < SINGULAR:
+    if not np.diagonal(lower).max() < SINGULAR and not _weakly_placed(layout, datum, now, lower, solved.scale):
         raise_weak(layout, datum, now, "the unknowns are not determined")
     kernels.scaled_whole(lower, solved.scale)
     if len(layout.constraints):
@@ -145,6 +146,17 @@ def _inverse(layout: Layout, datum: Datum, now: Linearised, solved: Solved) -> n
         away = lower @ C.T
         lower -= away @ np.linalg.solve(C @ away, away.T)
     return lower
+
+
+def _weakly_placed(layout: Layout, datum: Datum, now: Linearised, lower: np.ndarray, scale: np.ndarray) -> bool:
+    """Whether a network is determined but for its place, which weak control gives: variance inflation without the seven of the datum."""
+    if (layout.held & layout.determined[:, None]).any() or not np.diagonal(lower).max() < ROUNDED:
+        return False
+    whole = np.tril(lower) + np.tril(lower, -1).T
+    H = np.linalg.qr(null_space(layout, now.state, replace(datum, missing=7))[0] / scale[:, None])[0]
+    away = H @ (H.T @ whole)
+    inflation = np.diagonal(whole) - 2 * np.diagonal(away) + np.sum((away @ H) * H, axis=1)
+    return bool(inflation.max() < SINGULAR)
 
 
 def _residuals(

@@ -151,9 +151,7 @@ def aligned(layout: Layout, state: State, datum: Datum) -> State:
         G = generators(state.xyz, datum)[datum.carriers] @ basis
         gap = (datum.start - state.xyz)[datum.carriers]
         step = basis @ np.linalg.lstsq(G, gap, rcond=None)[0]
-        turn = step[3:6] / datum.size
-        largest = max(np.abs(turn).max(), abs(step[6]) / datum.size, 1e-300)
-        step *= min(1.0, 0.5 / largest)
+        step *= _share(step, datum)
         if len(held):  # the last motion left them at rest to first order only
             back = np.concatenate([held - state.xyz[control], np.zeros(min(1, len(layout.bars)))])
             step += np.linalg.lstsq(np.concatenate(_held_rows(layout, state, datum)), back, rcond=GIVEN)[0]
@@ -161,6 +159,35 @@ def aligned(layout: Layout, state: State, datum: Datum) -> State:
         if np.abs(step).max() < 1e-12 * datum.size:
             break
     return state
+
+
+def nearest_to_control(layout: Layout, state: State, datum: Datum) -> State:
+    """The state after the similarity that brings it to weighted control, where nothing is held.
+
+    An adjustment turns the whole to first order only; where control is weak beside the images it would creep.
+    """
+    weight = np.sqrt(layout.prior)
+    some = weight > 0
+    if not some.any() or (layout.held & layout.determined[:, None]).any():
+        return state
+    from scipy.linalg import expm
+
+    free = 6 if len(layout.bars) else 7
+    for _ in range(ALIGN_STEPS):
+        rows = (weight[:, :, None] * generators(state.xyz, datum))[some][:, :free]
+        gap = (weight * (layout.network.xyz - state.xyz))[some]
+        step = np.zeros(7)
+        step[:free] = np.linalg.lstsq(rows, gap, rcond=GIVEN)[0]
+        step *= _share(step, datum)
+        state = _moved(state, step, datum, expm)
+        if np.abs(step).max() < 1e-9 * datum.size:
+            break
+    return state
+
+
+def _share(step: np.ndarray, datum: Datum) -> float:
+    """What part of a step turns by no more than half a radian, and scales by no more than a half."""
+    return min(1.0, 0.5 / max(np.abs(step[3:]).max() / datum.size, 1e-300))
 
 
 def _moved(state: State, step: np.ndarray, datum: Datum, expm) -> State:
@@ -204,17 +231,34 @@ def _spread(points: np.ndarray) -> float:
 
 def _text(layout: Layout, datum: Datum, named: bool) -> str:
     u = layout.network.u_xyz[layout.determined]
-    fixed, weighted = int((u == 0).any(axis=1).sum()), int(((u > 0) & np.isfinite(u)).any(axis=1).sum())
-    parts = []
-    if fixed:
-        parts.append(f"{fixed} fixed points")
-    if weighted:
-        parts.append(f"{weighted} points with weights")
+    fixed, weighted = _known_text(u == 0, u), _known_text((u > 0) & np.isfinite(u), u)
+    parts = [fixed.format("fixed "), f"{weighted.format('')} with weights" if weighted else ""]
     if len(layout.bars):
-        parts.append(f"{len(layout.bars)} scale bars")
+        parts.append(f"{len(layout.bars)} scale bar{'s' if len(layout.bars) > 1 else ''}")
     if datum.missing:
         scale = " and the scale" if datum.missing == 7 else ""
         what = "the origin, the directions" + scale if datum.missing >= 6 else f"{datum.missing} of the seven parameters of the datum"
+        what = _arbitrary(~np.isinf(u).all(axis=0), datum.missing) or what
         start = "given" if named else "start"
         parts.append(f"inner constraints on the {start} coordinates of {datum.carriers.any(axis=1).sum()} points for {what}")
-    return "; ".join(parts)
+    return "; ".join(part for part in parts if part)
+
+
+def _known_text(which: np.ndarray, u: np.ndarray) -> str:
+    """Known coordinates (points, 3): how many points, where all of theirs are known like this; else coordinates, and how many of the points
+    are known in all three. A place is left for how."""
+    some = which.any(axis=1)
+    points, count, whole = int(some.sum()), int(which.sum()), int(np.isfinite(u[some]).all(axis=1).sum())
+    if 3 * points == count:
+        return f"{points} {{}}point{'s' if points > 1 else ''}" if points else ""
+    return f"{count} {{}}coordinate{'s' if count > 1 else ''} of {points} point{'s' if points > 1 else ''} ({whole or 'none'} complete)"
+
+
+def _arbitrary(known: np.ndarray, missing: int) -> str:
+    """What is open where one or two axes (3,) have no known coordinate and everything else is held; empty in other cases."""
+    open_axes = ["XYZ"[k] for k in np.flatnonzero(~known)]
+    if len(open_axes) == 1 and missing == 1:
+        return f"{open_axes[0]}, which is arbitrary"
+    if len(open_axes) == 2 and missing == 3:
+        return f"{', '.join(open_axes)} and the direction about {'XYZ'[int(np.argmax(known))]}, which are arbitrary"
+    return ""

@@ -91,27 +91,28 @@ def _to_known(work: Reconstruction, *, scaled: bool) -> None:
         return
     middle = np.median(work.xyz[there], axis=0)
     size = float(np.sqrt(np.mean((work.xyz[there] - middle) ** 2)))
-    some = known.any(axis=1)
-    source, target, known = (work.xyz[some] - middle) / size, network.xyz[some], known[some]
-    scale, rotation, shift, apart = _nearest(source, target, known, size, scaled)
-    if apart > REACH and known.sum() > 7:
-        if _nearest(source * [1.0, 1.0, -1.0], target, known, size, scaled)[3] < 0.3 * REACH:
+    some = np.flatnonzero(known.any(axis=1))
+    source, target, u = (work.xyz[some] - middle) / size, network.xyz[some], np.where(known, network.u_xyz, np.inf)[some]
+    scale, rotation, shift, gap = _nearest(source, target, u, size, scaled)
+    if np.median(gap) > REACH and known.sum() > 7:
+        if np.median(_nearest(source * [1.0, 1.0, -1.0], target, u, size, scaled)[3]) < 0.3 * REACH:
             raise _mirrored()
-        raise _disagrees(apart * scale, known.any(axis=1).sum(), network.unit)
+        raise _disagrees(float(np.median(gap)) * scale, len(some), network.unit)
     moved(work, scale / size, rotation, shift - scale / size * rotation @ middle)
 
 
 def _nearest(
-    source: np.ndarray, target: np.ndarray, known: np.ndarray, size: float, scaled: bool
-) -> tuple[float, np.ndarray, np.ndarray, float]:
-    """Scale, rotation, shift that bring points of extent 1 to coordinates that are known (n, 3), and the median of what remains, in units
-    of the extent; where they leave something open, the nearest to size ``size`` without a turn.
+    source: np.ndarray, target: np.ndarray, u: np.ndarray, size: float, scaled: bool
+) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
+    """Scale, rotation, shift that bring points of extent 1 to coordinates that are known with u (n, 3; ``inf``: not known), and how far
+    these remain apart beyond their u, in units of the extent; where they leave something open, the nearest to ``size`` without a turn.
 
     The shift is the mean of an axis. A turn may be far: the search begins at each of the 24 of a cube.
     """
     from scipy.optimize import least_squares
     from scipy.spatial.transform import Rotation
 
+    known = np.isfinite(u)
     count = np.maximum(known.sum(axis=0), 1)
 
     def centred(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -120,12 +121,14 @@ def _nearest(
         return (values - mean)[known], mean
 
     wanted = centred(target)[0]
+    expected = u[known] / (float(np.sqrt(np.mean(wanted**2))) or size)
+    weight = 1 / np.hypot(1.0, expected / AGREES)
 
     def gap(p: np.ndarray) -> np.ndarray:
         return centred(source @ Rotation.from_rotvec(p[:3]).as_matrix().T)[0] - wanted / (size * np.exp(p[3]))
 
     def misses(p: np.ndarray, start: float) -> np.ndarray:
-        return np.concatenate([gap(p), KEEP * p[:3], [(KEEP if scaled else 1.0 / KEEP) * (p[3] - start)]])
+        return np.concatenate([weight * gap(p), KEEP * p[:3], [(KEEP if scaled else 1.0 / KEEP) * (p[3] - start)]])
 
     best, least = np.zeros(4), np.inf
     for turn in Rotation.create_group("O"):
@@ -139,7 +142,7 @@ def _nearest(
             break
     scale, rotation = size * np.exp(best[3]), Rotation.from_rotvec(best[:3]).as_matrix()
     shift = np.where(known.any(axis=0), centred(target)[1] - scale * centred(source @ rotation.T)[1], 0.0)
-    return scale, rotation, shift, float(np.median(np.abs(gap(best))))
+    return scale, rotation, shift, np.abs(gap(best)) / np.hypot(1.0, expected / REACH)
 
 
 def _scaled(work: Reconstruction) -> None:
