@@ -189,6 +189,14 @@ def test_network_without_ties_is_explained(rng: np.random.Generator):
         start_values(replace(network, **columns))
 
 
+def test_two_groups_with_two_points_in_common_are_explained(rng: np.random.Generator):
+    network = simulate(rng, images=24, points=62, bars=0).network
+    keep = np.where(network.image < 12, network.point < 32, network.point >= 30)
+    columns = {name: getattr(network, name)[keep] for name in ("x_px", "y_px", "image", "point", "covariance_px2")}
+    with pytest.raises(MeasureError, match=r"\d+ of 24 images cannot be oriented.*share 2 points with the others"):
+        start_values(replace(network, **columns))
+
+
 def test_principal_distance_of_homographies_is_exact(rng: np.random.Generator):
     """Zhang's closed form, for planes seen by a camera of c = 1234 in any pose."""
     plane = rng.uniform(-1, 1, (30, 2))

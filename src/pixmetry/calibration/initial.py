@@ -290,5 +290,9 @@ def _not_oriented(network: Network, posed: np.ndarray) -> MeasureError:
     remedy = "check the points' names and the size of the frame, give a start value of c, rough coordinates of some points or rough poses"
     if np.median(best) < 8:
         remedy = "take images that share at least 8 points with others, from sides that differ by 10° to 90°, or give rough poses"
+    elif posed.any():
+        ties = len(np.intersect1d(network.point[posed[network.image]], network.point[np.isin(network.image, left)]))
+        if ties < 8:
+            remedy = f"these images share {ties} points with the others: take images or points that tie both together, at least 8 points"
     what = f"{len(left)} of {measured.sum()} images cannot be oriented"
     return MeasureError(what, where="start values", value=names, remedy=remedy)
