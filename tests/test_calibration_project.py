@@ -269,7 +269,7 @@ def test_a_mistake_in_a_table_is_told(tmp_path: Path, table: str, words: tuple[s
         ("point,X,Y,Z,u_X,u_Y,u_Z\n1,0,0,0,-1,0,0\n", "", ("line 2", "u_X", "at least 0")),
         ("point,X,Y,Z,u_X\n1,0,0,0,1\n", "", ("'u_Y' is missing",)),
         ("point,X,Y,Z\n1,0,0,0\n", "", ("how well", "known: fixed", "nominal", "free", "to do: add")),
-        ("point,X,Y,Z\n1,0,,0\n", "known: free", ("line 2", "some of its coordinates")),
+        ("point,X,Y,Z,u_X,u_Y,u_Z\n2,1,1,1,1,1,1\n1,0,,0,,0.1,\n", "", ("line 3", "u_Y of a coordinate that is empty", "leave u_Y empty")),
         ("point,X,Y,Z\n1,0,0,0\n", "known: weighted", ("no uncertainty", "u_X, u_Y, u_Z")),
         ("point,X,Y,Z\n1,0,0,0\n", "known: fixed, u: 0.1", ("known: weighted",)),
         ("point,X,Y,Z,normal_x,normal_y,normal_z\n1,0,0,0,0,0,0\n", "known: fixed", ("line 2", "direction")),
@@ -280,6 +280,42 @@ def test_a_mistake_in_a_table_is_told(tmp_path: Path, table: str, words: tuple[s
 def test_a_mistake_about_points_is_told(tmp_path: Path, points: str, more: str, words: tuple[str, ...]) -> None:
     bars = "scale_bars: [{from: 1, to: 2, length: 10, u: 0.1}]\n"
     refused(tmp_path, GOOD + f"points: {{table: p.csv, {more}}}\n{bars}", *words, o=rows(), p=points)
+
+
+@pytest.mark.parametrize(
+    ("check", "more", "words"),
+    [
+        ("point,X,Y,Z\n7,0,0,0\n2,1,1,1\n", "", ("check.csv, line 3", "point '2' is known and a check point")),
+        ("point,X,Y,Z\n8,0,0,0\n", "", ("no point of the table is seen", "check.csv")),
+        ("point,X,Y,Z,u_X,u_Y,u_Z\n7,0,0,,0,0,0\n", "", ("check.csv, line 2", "u_Z of a coordinate that is empty")),
+        ("point,X,Y\n7,0,0\n", "", ("'Z' is missing",)),
+        ("point,X,Y,Z\n7,0,0,0\n", ", known: fixed", ("unknown key 'check_points.known'",)),
+    ],
+)
+def test_a_mistake_about_check_points_is_told(tmp_path: Path, check: str, more: str, words: tuple[str, ...]) -> None:
+    points = "point,X,Y,Z\n1,0,0,0\n2,,5,\n"
+    tail = f"points: {{table: p.csv, known: fixed}}\ncheck_points: {{table: check.csv{more}}}\n"
+    refused(tmp_path, GOOD + tail, *words, o=rows(), p=points, check=check)
+
+
+def test_check_points_are_not_known(tmp_path: Path) -> None:
+    check = "point;X;Y;Z;u_X;u_Y;u_Z;diameter\n7;1;2;3;0.1;;;5\n2;;;4;;;0.2;\n"
+    path = write(
+        tmp_path,
+        GOOD + "points: p.csv\ncheck_points: {table: check.csv, u: 0.5}\n",
+        o=rows(),
+        p="point,X,Y,Z,u_X,u_Y,u_Z\n1,,,9,,,0\n2,,,,,,\n",
+        check=check,
+    )
+    read = load_project(path)
+    found, checks = read.network, read.check_points
+    assert checks is not None and checks.names == ("7", "2") and {p.name for p in read.inputs} >= {"check.csv"}
+    np.testing.assert_array_equal(checks.xyz, [[1, 2, 3], [np.nan, np.nan, 4]])
+    np.testing.assert_array_equal(checks.u_xyz, [[0.1, 0.5, 0.5], [0, 0, 0.2]])
+    at = [found.points.index(name) for name in "127"]
+    np.testing.assert_array_equal(found.xyz[at], [[np.nan, np.nan, 9], [np.nan] * 3, [np.nan] * 3])
+    np.testing.assert_array_equal(found.u_xyz[at], [[np.inf, np.inf, 0], [np.inf] * 3, [np.inf] * 3])
+    np.testing.assert_array_equal(found.diameter[at], [np.nan, np.nan, 5])
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pixmetry.calibration.check_points import CheckPoints, refuse_known, with_check_points
 from pixmetry.calibration.model import NAMES
 from pixmetry.calibration.network import PER_IMAGE_NAMES, Calibration, Finding, Network
 from pixmetry.calibration_files import check_folder, write_line_results, write_results
@@ -43,6 +44,7 @@ def calibrate(
     free: Sequence[str] | str | None = None,
     per_image: Sequence[str] | str | None = None,
     options: Mapping[str, Any] | None = None,
+    check_points: CheckPoints | None = None,
     progress: Progress | None = None,
     **pictures: Any,
 ) -> Calibration | LineCalibration:
@@ -61,6 +63,8 @@ def calibrate(
         Out of ``"x_scale"`` and ``"x_shift"``, likewise.
     options : mapping, optional
         Of `pixmetry.calibration.solve.Options`, likewise.
+    check_points : CheckPoints, optional
+        Coordinates (`pixmetry.calibration.check_points.CheckPoints`) that the result is compared with, in place of those of the project.
     progress : callable, optional
         Called with (what, done, of).
     **pictures
@@ -93,11 +97,19 @@ def calibrate(
         if output is not None:
             _refuse_inputs(Path(output), project)
     if project is not None and project.lines is not None:
+        if check_points is not None:
+            raise InputError("has no meaning with straight lines", where="check_points", allowed="with points", remedy="leave it away")
         return _from_lines(project, output, free, per_image, {**given, **(options or {})}, _steps(told))
     network = _changed(network, free, per_image)
     chosen = _options({**given, **(options or {})})
+    checks = check_points if check_points is not None or project is None else project.check_points
+    if checks is not None:
+        refuse_known(network, checks)
     step = _steps(told)
     calibration = calibrate_network(network, chosen, progress=step)
+    if checks is not None:
+        step("comparing with the check points")
+        calibration = with_check_points(calibration, checks, a_priori=chosen.a_priori)
     cameras, missing = _camera_files(calibration, project)
     about = {field.name: getattr(chosen, field.name) for field in fields(chosen)}
     findings = (*calibration.findings, *missing, *(project.findings if project is not None else ()))

@@ -247,9 +247,10 @@ def test_minimum_is_that_of_scipy(rng):
     found = adjust(simulated.network, disturbed(rng, simulated))
     oracle = Dense(simulated.network, simulated.truth)
     theirs = least_squares(oracle.residuals, np.zeros(oracle.at[-1]), method="trf", x_scale="jac", xtol=1e-14, ftol=1e-14, gtol=1e-10)
-    np.testing.assert_allclose(2 * theirs.cost, found.cost[-1], rtol=1e-7)
+    # what the rule to stop leaves is less than the last step gained, and moved
+    assert abs(2 * theirs.cost - found.cost[-1]) < bundle.SMALL * found.sigma0**2
     u = np.sqrt(np.diagonal(found.interior_covariance()[1]))
-    assert (np.abs(oracle.state(theirs.x).interior[0, :10] - found.state.interior[0, :10]) < 2e-2 * u).all()
+    assert (np.abs(oracle.state(theirs.x).interior[0, :10] - found.state.interior[0, :10]) < np.sqrt(bundle.SMALL) * u).all()
 
 
 def test_interior_parameters_do_not_depend_on_the_datum(rng):

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from pixmetry.calibration.model import CameraModel, Sensor
+from pixmetry.calibration_project import load_project
+from pixmetry.core.errors import InputError
 
 SENSOR = Sensor(4000, 3000, 5.0, 5.0)
 
@@ -27,6 +31,42 @@ def test_balanced_radial_terms(rng, sign):
     u, v = CameraModel.of(SENSOR, c=c / s, **k, **lens).direction_of(x_px, y_px)
     np.testing.assert_allclose(u, (x + sign * dx) / c, rtol=1e-12, atol=1e-15)
     np.testing.assert_allclose(v, (y + sign * dy) / c, rtol=1e-12, atol=1e-15)
+
+
+def test_a_certificate_in_a_project(rng, tmp_path: Path):
+    """A1 A2 A3 R0, B1 B2, C1 C2: corrections of measured coordinates in mm, y up, that are subtracted; c negative."""
+    a, r0, c = rng.normal(size=3) * [2e-4, 1e-6, 3e-9], 8.0, -24.0
+    (b1, b2), (c1, c2), (x0, y0) = rng.normal(size=2) * 1e-5, rng.normal(size=2) * 1e-4, rng.normal(size=2) * 0.1
+    x_mm, y_mm = rng.uniform(-9.9, 9.9, 50), rng.uniform(-7.4, 7.4, 50)
+    x, y = x_mm - x0, y_mm - y0
+    r2 = x**2 + y**2
+    radial = sum(a[n] * (r2 ** (n + 1) - r0 ** (2 * n + 2)) for n in range(3))
+    dx = x * radial + b1 * (r2 + 2 * x**2) + 2 * b2 * x * y + c1 * x + c2 * y
+    dy = y * radial + b2 * (r2 + 2 * y**2) + 2 * b1 * x * y
+    s = 1 + sum(a[n] * r0 ** (2 * n + 2) for n in range(3))
+    values = {"c_mm": abs(c) / s, "xp_px": 1999.5 + x0 / 0.005, "yp_px": 1499.5 - y0 / 0.005, "p1": -b1 / s, "p2": -b2 / s}
+    values |= {"b1": -c1 / s, "b2": -c2 / s, **{f"k{n + 1}": -a[n] / s for n in range(3)}}
+    (tmp_path / "o.csv").write_text("image,point,x_mm,y_mm\na,1,0,0\n")
+    keys = ", ".join(f"{name}: {float(value)!r}" for name, value in values.items())
+    text = f"schema: pixmetry/calibration/1\ncameras: {{cols: 4000, rows: 3000, pitch_um: 5, free: none, {keys}}}\nobservations: o.csv\n"
+    (tmp_path / "p.yaml").write_text(text)
+    (model,) = load_project(tmp_path / "p.yaml").network.cameras
+    u, v = model.direction_of(1999.5 + x_mm / 0.005, 1499.5 - y_mm / 0.005)
+    np.testing.assert_allclose(u, (x - dx) / -c, rtol=1e-11, atol=1e-14)
+    np.testing.assert_allclose(-v, (y - dy) / -c, rtol=1e-11, atol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("key", "meant"),
+    [("a1", "k1"), ("R0", "k1"), ("c1", "b1"), ("C2", "b2"), ("x0_mm", "xp_px"), ("x0_px", "xp_px"), ("xh", "xp_px"), ("B1", "p1")],
+)
+def test_names_of_other_programs_are_led_to_ours(tmp_path: Path, key: str, meant: str):
+    text = f"schema: pixmetry/calibration/1\ncameras: {{cols: 64, rows: 48, {key}: 0.1}}\nobservations: o.csv\n"
+    (tmp_path / "p.yaml").write_text(text)
+    with pytest.raises(InputError) as caught:
+        load_project(tmp_path / "p.yaml")
+    for words in ("p.yaml, line 2", f"unknown key '{key}'", f"`{meant}`", "Values of another program"):
+        assert words in str(caught.value), str(caught.value)
 
 
 def test_metashape(rng):

@@ -16,6 +16,7 @@ from pixmetry.calibration.model import NAMES, Sensor
 from pixmetry.calibration.network import Adjustment, Calibration, Finding
 from pixmetry.calibration.quality import image_records
 from pixmetry.core.errors import InputError
+from pixmetry.report.calibration_control import control_points
 from pixmetry.report.calibration_figures import (
     MOST_IN_SMALL,
     MOST_VECTORS,
@@ -456,6 +457,51 @@ def test_scale_bars_are_measured_less_adjusted(whole: Calibration) -> None:
     rows = scale_bars(whole)
     assert [row[3:] for row in rows] == [["+0.013", "1.3"], ["\u22120.0040", "\u22120.4"]] or rows[0][3] == "+0.012"
     assert rows[0][0] == "P1 – P9"
+
+
+def test_control_points_far_from_the_origin_have_all_their_digits(rng: np.random.Generator) -> None:
+    far = calibrations.bare(rng)
+    net = far.adjustment.network
+    xyz = net.xyz.copy()
+    xyz[2] = far.adjustment.state.xyz[2] + [0.02, 0, 0]
+    state = replace(far.adjustment.state, xyz=far.adjustment.state.xyz + [5.4e6, 0, 0])
+    network = replace(net, xyz=xyz + [5.4e6, 0, 0], u_xyz=np.where(np.arange(len(xyz))[:, None] == 2, [0.01, 0.02, np.inf], np.inf))
+    rows = control_points(replace(far, adjustment=replace(far.adjustment, network=network, state=state)))
+    assert [row[0] for row in rows] == ["P3 X", "P3 Y"] and [row[2:] for row in rows] == [
+        ["± 0.010", "+0.020", "2.0"],
+        ["± 0.020", "0", "0.0"],
+    ]
+    assert rows[0][1] == f"{network.xyz[2, 0]:.3f}".replace("-", "\u2212")
+
+
+NOTHING = np.full(3, np.nan)
+CHECKED = {
+    "unit": "mm", "datum_parameters": 0, "n": 4, "dof": 4, "level": 0.001, "rms": [0.02, 0.01, 0.03], "expected_rms": [0.02] * 3,
+    "chi2": 3.21, "p": 0.52, "worst": {"name": "C1", "axis": "X", "difference": -0.031, "ratio": -1.57, "critical": 3.5},
+    "text": "2 check points with 4 coordinates: largest: C1 X, -0.031 mm (1.6 u)",
+    "points": [
+        {"name": "C1", "given": np.array([1234567.5, 2.0, 3.0]), "u_given": np.array([0.01, 0.0, 0.0]),
+         "found": np.array([1234567.531, 2.0, 3.0]), "u_found": np.full(3, 0.02), "difference": np.array([-0.031, 0, 0]),
+         "u_difference": np.full(3, 0.02), "ratio": np.array([-1.57, 0, 0]), "images": 7},
+        {"name": "C2", "given": np.array([np.nan, np.nan, 5.25]), "u_given": np.zeros(3),
+         "found": NOTHING, "u_found": NOTHING, "difference": NOTHING, "u_difference": NOTHING, "ratio": NOTHING, "images": 0},
+    ],
+}  # fmt: skip
+
+
+def test_check_points_are_listed(whole: Calibration, page: Page) -> None:
+    assert "Check points" not in page.text
+    checked = with_tests(whole, check_points=CHECKED)
+    shown = Page(render(checked)).text
+    assert "C1 X 1234567.500 ± 0.010 1234567.531 ± 0.020 \u22120.031 \u22121.6 7" in shown
+    assert "C1 Y 2.000 exact 2.000 ± 0.020 0 0.0 7" in shown and "C2 Z 5.25 exact – – – – 0" in shown
+    assert "C2 X" not in shown and "largest: C1 X, \u22120.031 mm (1.6 u)." in shown and "above 3.5 by chance in 0.1 %" in shown
+    assert "parameters of the datum took up" not in shown
+    assert "2 check points with 4 coordinates" in " ".join(summary_text(checked).split())
+    assert max(len(line) for line in summary_text(checked).splitlines()) <= 100
+    silent = with_tests(whole, check_points={**CHECKED, "datum_parameters": 7, "chi2": None, "p": None, "worst": None})
+    shown = Page(render(silent)).text
+    assert "less what the 7 parameters of the datum took up" in shown and "by chance" not in shown
 
 
 def test_words() -> None:

@@ -293,6 +293,8 @@ def left_out(network: Network, state: State) -> list[Finding]:
     if gone:
         text += f"; with them {'goes' if gone == 1 else 'go'} {many(gone, 'point')} that the other images see too seldom"
     advice = "give them rough poses or more points that other images see; check the names of their points and their camera"
+    if (count[missing] >= 2 * FEWEST).all():  # there is nothing that they lack: what is said of them is wrong
+        advice = "check the names of their points, their camera, and whether x and y are exchanged: enough of their points are determined"
     return [Finding("images_left_out", text, advice, "warning")]
 
 

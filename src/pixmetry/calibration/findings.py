@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any
@@ -10,17 +11,20 @@ import numpy as np
 
 from pixmetry.calibration.eccentric import Eccentricity
 from pixmetry.calibration.hold_out import WORSE
+from pixmetry.calibration.lost_control import mostly_lost
 from pixmetry.calibration.network import Adjustment, Finding, Network
 from pixmetry.calibration.quality import p_words, plain
 
 ORDER = (  # of kinds, among findings of the same level; what is not named here comes between the two parts
     "start", "determination", "images_left_out", "x_scale_drift", "bad_images", "images_rejected", "correlation", "flatness", "lost_points",
-    "gross_scale_bar", "gross_control_point", "x_shift", "field", "known_uncertainty", "eccentricity", "f_test", "gross_error", None,
+    "known_untested", "gross_scale_bar", "gross_control_point", "lost_control",
+    "x_shift", "field", "known_uncertainty", "eccentricity", "f_test", "gross_error", None,
     "two_rays", "significance", "variance_components", "residual_grid", "hold_out", "datum", "adjustment",
 )  # fmt: skip
 SIGNIFICANT = 0.05
 RARE = 0.001  # level of tests that were not asked for
 CORRELATED = 0.995
+THROUGHOUT = 0.5  # of the images of two points: where their names are exchanged in more, it is not these images that are wrong
 REJECTED_SHARE = 0.5  # of the image points of an image: it is not single ones that are wrong
 TWO_RAY_SHARE = 0.1  # of the free points: those on two rays are worth a sentence
 NOTEWORTHY_PX = 0.002  # an eccentricity of this size is worth a sentence
@@ -44,6 +48,7 @@ def findings_of(adjustment: Adjustment, tests: Mapping[str, Any]) -> list[Findin
     """What the records of one adjustment say."""
     found = [
         *known_findings(tests["known"], adjustment.network.unit),
+        *lost_control_findings(adjustment),
         *rejected_image_findings(tests["images"]),
         *lost_findings(adjustment),
         *two_ray_findings(adjustment),
@@ -145,7 +150,7 @@ def gross_error_findings(errors: list[dict[str, Any]], adjustment: Adjustment, i
     names = [f"{e['point']} in {e['image']} ({plain(np.hypot(e['error_x_px'], e['error_y_px']), 2)} px)" for e in single[:NAMED]]
     more = " …" if len(single) > NAMED else ""
     noun = "image point was left out as a gross error" if len(errors) == 1 else "image points were left out as gross errors"
-    text = f"{len(errors)} {noun}, of {total}: {', '.join(names)}{more}.{_swapped_names(errors)}"
+    text = f"{len(errors)} {noun}, of {total}: {', '.join(names)}{more}.{_swapped_names(errors, network)}"
     posed = np.isfinite(adjustment.state.position).all(axis=1)[network.image]
     others = {"images that are not oriented": int((~posed).sum())}
     others["points that are not determined"] = total - int(adjustment.used.sum()) - len(errors) - others["images that are not oriented"]
@@ -158,12 +163,20 @@ def gross_error_findings(errors: list[dict[str, Any]], adjustment: Adjustment, i
     return [Finding("gross_error", text, advice, "warning" if many else "note")]
 
 
-def _swapped_names(errors: list[dict[str, Any]]) -> str:
+def _swapped_names(errors: list[dict[str, Any]], network: Network) -> str:
     pairs = dict.fromkeys((e["image"], *sorted((e["point"], e["swapped_with"]))) for e in errors if e["swapped_with"] is not None)
     if not pairs:
         return ""
-    named = "; ".join(f"{a} and {b} in {image}" for image, a, b in list(pairs)[:NAMED]) + ("; …" if len(pairs) > NAMED else "")
-    return f" Names seem to be exchanged: {named}."
+    often = Counter((a, b) for _, a, b in pairs)
+    always = {pair for pair, count in often.items() if count > 1 and count > THROUGHOUT * _images_of_both(network, *pair)}
+    said = [f"{a} and {b} in {often[a, b]} images, rather in the table of points or throughout" for a, b in always]
+    said += [f"{a} and {b} in {image}" for image, a, b in pairs if (a, b) not in always]
+    return f" Names seem to be exchanged: {'; '.join(said[:NAMED])}{'; …' if len(said) > NAMED else ''}."
+
+
+def _images_of_both(network: Network, a: str, b: str) -> int:
+    one, other = (network.image[network.point == network.points.index(name)] for name in (a, b))
+    return len(np.intersect1d(one, other))
 
 
 def two_ray_findings(adjustment: Adjustment) -> list[Finding]:
@@ -198,25 +211,21 @@ def lost_findings(adjustment: Adjustment) -> list[Finding]:
 
 
 def known_findings(known: Mapping[str, Any], unit: str) -> list[Finding]:
-    """Bars and control points that the network contradicts."""
+    """Bars and control points that the network contradicts, or against which it could not be tested."""
     found = []
+    if known.get("untested"):
+        text = f"Neither control points nor scale bars could be tested: without them {known['untested']}."
+        advice = "If one of them is wrong, image points were left out in its stead: check the values where many are."
+        found.append(Finding("known_untested", text, advice, "warning"))
     for name, noun in (("scale_bars", "scale bar"), ("control_points", "control point")):
         record = known[name]
-        for gross in record["gross"][:NAMED]:
-            text = f"The {noun} {gross['name']} does not agree with the network: it seems wrong by {gross['error']:+.4g} {unit}"
-            text += f" (test {gross['statistic']:.1f}, critical {gross['critical']:.1f})."
-            doubt = "with so few it cannot be said which is wrong, and they weigh less now"
-            said = "it was left out" if gross["left_out"] else doubt
-            advice = f"Check its value, its unit and the names of its points; {said}."
-            found.append(Finding(f"gross_{noun.replace(' ', '_')}", text, advice, "warning"))
+        found += [_gross_finding(gross, noun, unit) for gross in _once(record["gross"])[:NAMED]]
         group, factor = record["group"], record.get("understated")
         if factor:
             text = f"The {noun}s miss the network by about {factor:.2g} times their stated uncertainties, which were raised by this."
             found.append(Finding("known_uncertainty", text, "State their uncertainties anew.", "warning"))
-        elif group and group["p"] < RARE and not record["gross"]:
-            text = f"The {noun}s scatter {np.sqrt(group['factor']):.2g} times as much as their stated uncertainties say."
-            level = "warning" if group["factor"] > 1 else "note"
-            found.append(Finding("known_uncertainty", text, "State their uncertainties anew.", level))
+        elif group and group["p"] < RARE and (group["factor"] > 1 or not record["gross"]):
+            found.append(_group_finding(group, noun))
     fixed = known.get("fixed_points")
     if fixed and fixed["p"] < RARE:
         miss = plain(fixed["miss"], 2)
@@ -224,6 +233,60 @@ def known_findings(known: Mapping[str, Any], unit: str) -> list[Finding]:
         advice = f"Look for a mistake in their coordinates; if there is none, they are not exact: known: weighted with u = {miss} {unit}."
         found.append(Finding("known_uncertainty", text, advice, "warning"))
     return found
+
+
+def _once(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Of points that exchanged their names, the first coordinate; all others."""
+    swapped: set[str] = set()
+    out = []
+    for record in records:
+        point = record["name"].rpartition(" ")[0] if record.get("swapped_with") else ""
+        if not point or point not in swapped:
+            out.append(record)
+        swapped.add(point)
+    return out
+
+
+def _gross_finding(gross: Mapping[str, Any], noun: str, unit: str) -> Finding:
+    text = f"The {noun} {gross['name']} does not agree with the network: it seems wrong by {gross['error']:+.4g} {unit}"
+    text += f" (test {gross['statistic']:.1f}, critical {gross['critical']:.1f})."
+    if gross.get("swapped_with"):
+        text += f" It lies where {gross['swapped_with']} should be: their names seem to be exchanged in the table of points."
+    advice = f"Check its value, its unit and the names of its points; {_what_was_done(gross)}."
+    return Finding(f"gross_{noun.replace(' ', '_')}", text, advice, "warning")
+
+
+def _what_was_done(gross: Mapping[str, Any]) -> str:
+    if gross["left_out"]:
+        return "it was left out"
+    others = gross["rivals"]
+    if not others:
+        return "with so few it cannot be said which is wrong, and it weighs less now"
+    named = ", ".join(others[:NAMED]) + (" …" if len(others) > NAMED else "")
+    return f"it cannot be said whether it is wrong or {'one of ' if len(others) > 1 else ''}{named}, and they weigh less now"
+
+
+def _group_finding(group: Mapping[str, Any], noun: str) -> Finding:
+    """A group that scatters otherwise than stated; what stands out comes before new uncertainties for all."""
+    text = f"The {noun}s scatter {np.sqrt(group['factor']):.2g} times as much as their stated uncertainties say."
+    if group["factor"] <= 1:
+        return Finding("known_uncertainty", text, "State their uncertainties anew.", "note")
+    largest = "; ".join(f"{one['name']}, {abs(one['ratio']):.2g} u" for one in group["largest"])
+    advice = f"Check the largest first: {largest}. If they are right, state the uncertainties anew."
+    return Finding("known_uncertainty", text, advice, "warning")
+
+
+def lost_control_findings(adjustment: Adjustment) -> list[Finding]:
+    """Known points that nevertheless lost most of their image points."""
+    network = adjustment.network
+    lost, seen, out = mostly_lost(network, adjustment)
+    if not len(lost):
+        return []
+    named = ", ".join(f"{network.points[k]} ({m} of {n})" for k, n, m in list(zip(lost, seen, out, strict=True))[:NAMED])
+    more = " …" if len(lost) > NAMED else ""
+    text = f"Most image points of {len(lost)} known point{'s' if len(lost) > 1 else ''} were rejected: {named}{more}."
+    advice = "Check their coordinates and names in the table of points before those in the images."
+    return [Finding("lost_control", text, advice, "warning")]
 
 
 def drift_findings(images: list[dict[str, Any]], adjustment: Adjustment) -> list[Finding]:

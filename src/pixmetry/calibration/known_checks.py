@@ -1,9 +1,9 @@
 """Scale bars and control points before they may pull at a network: image coordinates are tested without them, then they by the network.
 
 A wrong bar with a small stated uncertainty is stronger than the image coordinates of its ends, and data snooping would throw these out.
-So gross errors in the images are looked for without bars, and with control points that hardly weigh; then the known observations get their
-weights, and the worst is left out and the network adjusted again as long as one is contradicted (Baarda's w-test). A fixed point most of
-whose image points are gross errors is a wrong point: it is set free, and they take part again.
+So gross errors in the images are looked for without bars and control (`pixmetry.calibration.loosened`); then the known observations get
+their weights, and the worst is left out and the network adjusted again as long as one is contradicted (Baarda's w-test). Where another one
+explains the contradiction nearly as well, both are given the uncertainty of their supposed error instead.
 """
 
 from __future__ import annotations
@@ -13,21 +13,22 @@ from typing import Any
 
 import numpy as np
 
-from pixmetry.calibration.known_residuals import Known, bar_residuals, contradicted, control_residuals, group_record
+from pixmetry.calibration.fit_to_control import far_from_control
+from pixmetry.calibration.known_residuals import Known, bar_residuals, contradicted, control_residuals, group_record, jointly, rivals
+from pixmetry.calibration.loosened import in_frame
+from pixmetry.calibration.lost_control import set_free
 from pixmetry.calibration.network import Adjustment, Network, ScaleBars, State
 from pixmetry.calibration.resection import similarity
 from pixmetry.calibration.snooping import Adjust, finest_factor, remove_gross_errors
 from pixmetry.calibration.variance_components import image_sigma0, scaled
 from pixmetry.core.errors import InputError, MeasureError
 
-LOOSE = 0.05  # uncertainty, as a part of the field's extent, with which a control point does not pull at the image coordinates
-INSEPARABLE = 0.99  # correlation of two residuals from which on it cannot be said which of the two is wrong
 LEAST_FIXED = 3  # points whose distances from each other can be tested
-LEAST_CONTROL = 4  # points that must stay for one to be left out
+LEAST_CONTROL = 4  # whole points that must stay for one to be left out as a whole
+LEFT = 1.5  # redundancy of the other control points without a wrong one: with less they could agree by chance
 CONTROL_SHARE = 0.5  # of the points; more fixed ones are a test field
 ABSURD = 0.1  # a bar that is wrong by such a part of its length, as one in other units, is out before any adjustment with it
-LEAST_RAYS = 3  # rejected rays that condemn a fixed point, where they are more than half
-MOST_WRONG = 0.2  # part of the fixed points that can be wrong one by one
+ABSURD_U = 10.0  # stated uncertainties that a coordinate which is so far off is off by, too
 WIDE = 2.0  # times what they seem to be, uncertainties are taken until gross errors are out
 MANY_WRONG = 1 / 3  # of the control points: it is rather their uncertainties that are wrong
 MOST = 20
@@ -41,13 +42,16 @@ class CheckedKnown:
     ----------
     network : Network
     gross : dict
-        By ``scale_bars`` and ``control_points``: records as of `contradicted`, with ``left_out``; where it is False, the uncertainties of
-        all bars were raised to the size of the contradiction. ``understated``: the ``factor`` by which those of all control points were
-        raised instead, if so.
+        By ``scale_bars`` and ``control_points``: records as of `contradicted`, with ``left_out``; where it is False, the ``rivals`` of
+        which one may be wrong instead. ``raised``: the ``kind`` of these two, ``name`` and stated uncertainty ``u`` of all whose
+        uncertainties were raised. ``understated``: the ``factor`` by which those of all control points were raised, if so. ``untested``:
+        ``why`` nothing of this could be tested, if so.
     """
 
     network: Network
-    gross: dict[str, list[dict[str, Any]]] = field(default_factory=lambda: {"scale_bars": [], "control_points": [], "understated": []})
+    gross: dict[str, list[dict[str, Any]]] = field(
+        default_factory=lambda: {"scale_bars": [], "control_points": [], "raised": [], "understated": [], "untested": []}
+    )
 
 
 def has_known(network: Network) -> bool:
@@ -73,9 +77,9 @@ def weighted_instead(network: Network, clean: Adjustment) -> Network:
 
 
 def fixed_again(network: Network, before: Network, weighted: Network) -> np.ndarray:
-    """u_xyz of a checked network, with those points fixed that had been so before and that nothing contradicts."""
-    same = (network.u_xyz == weighted.u_xyz).all(axis=1) & few_fixed(before)
-    return np.where(same[:, None], before.u_xyz, network.u_xyz)
+    """u_xyz of a checked network, with those coordinates fixed that had been so before and that nothing contradicts."""
+    same = (network.u_xyz == weighted.u_xyz) & few_fixed(before)[:, None]
+    return np.where(same, before.u_xyz, network.u_xyz)
 
 
 def few_fixed(network: Network) -> np.ndarray:
@@ -140,16 +144,14 @@ def _off(found: np.ndarray, given: np.ndarray, free: Adjustment, missing: int) -
     return np.linalg.norm(given - scale * found @ rotation.T - shift, axis=1)
 
 
-def loosened(network: Network) -> Network:
-    """The network without bars, and with control points that hardly weigh."""
-    weighted = np.isfinite(network.u_xyz) & ((network.u_xyz > 0) | few_fixed(network)[:, None])
-    known = network.xyz[np.isfinite(network.xyz).all(axis=1)]
-    extent = float(np.ptp(known, axis=0).max()) if len(known) else 0.0
-    u_xyz = np.where(weighted, np.maximum(network.u_xyz, LOOSE * extent), network.u_xyz)
-    return replace(network, bars=ScaleBars.none(), u_xyz=u_xyz)
+def loose_coordinates(network: Network) -> np.ndarray:
+    """Coordinates of control points that could pull at the image coordinates, shape (points, 3)."""
+    return np.isfinite(network.u_xyz) & ((network.u_xyz > 0) | few_fixed(network)[:, None])
 
 
-def check_known(network: Network, clean: Adjustment, adjust: Adjust, *, stated: bool = True) -> tuple[CheckedKnown, State]:
+def check_known(
+    network: Network, clean: Adjustment, adjust: Adjust, state: State, used: np.ndarray, *, stated: bool = True
+) -> tuple[CheckedKnown, State]:
     """Leave out bars and control points that the network contradicts; where these would be many, see whether their uncertainties are only
     stated too small.
 
@@ -160,9 +162,13 @@ def check_known(network: Network, clean: Adjustment, adjust: Adjust, *, stated: 
     ----------
     network : Network
     clean : Adjustment
-        Of the `loosened` network, without gross errors in the images.
+        Of the `pixmetry.calibration.loosened` network, without gross errors in the images.
     adjust : callable
         `bundle.adjust`, or the same with some options chosen; with a posteriori covariances.
+    state : State
+        Where to begin.
+    used : ndarray of bool, shape (n,)
+        Image points that take part.
     stated : bool
         Whether the uncertainties of control points are those that they came with.
 
@@ -174,36 +180,58 @@ def check_known(network: Network, clean: Adjustment, adjust: Adjust, *, stated: 
     sigma0, dof = image_sigma0(clean)
     size = max(sigma0**2, finest_factor(network))
     weights = scaled(network, np.full((len(network.cameras), 2), size))  # from now on sigma0 of the image coordinates is 1
-    checked, state = _without_absurd(CheckedKnown(weights), clean.state)
-    left, adjustment = _without_contradicted(checked, state, clean, adjust, dof)
-    out, control = len(left.gross["control_points"]), np.isfinite(weights.u_xyz) & (weights.u_xyz > 0)
-    if not stated or out <= MANY_WRONG * control.any(axis=1).sum():
+    checked, state = _without_absurd(CheckedKnown(weights), state)
+    left, adjustment = _without_contradicted(checked, state, used, adjust, dof)
+    out, control = _wrong_points(left), np.isfinite(weights.u_xyz) & (weights.u_xyz > 0)
+    whole = int(control.all(axis=1).sum())
+    if not stated or whole < LEAST_CONTROL or out <= MANY_WRONG * control.any(axis=1).sum():
         return left, adjustment.state
     factor = WIDE * _understatement(weights, clean)
-    again, adjustment = _without_contradicted(_raised(checked, factor), adjustment.state, clean, adjust, dof)
+    try:
+        again, adjustment = _without_contradicted(_raised(checked, factor), adjustment.state, used, adjust, dof)
+    except MeasureError:  # with so little weight they do not hold the network
+        return left, adjustment.state
     group = group_record(adjustment, control_residuals(adjustment))
-    if 2 * len(again.gross["control_points"]) > out or group is None:
+    if 2 * _wrong_points(again) > out or group is None:
         return left, adjustment.state  # with larger uncertainties they are wrong all the same
     better = float(np.sqrt(group["factor"]))
     gross = {**again.gross, "understated": [{"factor": factor * better}]}
     return replace(_raised(again, better), gross=gross), adjustment.state
 
 
+def _wrong_points(checked: CheckedKnown) -> int:
+    """Control points that are contradicted, or may be what is wrong instead."""
+    names = (name for record in checked.gross["control_points"] for name in (record["name"], *record["rivals"]))
+    return len({name.rpartition(" ")[0] for name in names})
+
+
 def _without_contradicted(
-    checked: CheckedKnown, state: State, clean: Adjustment, adjust: Adjust, dof: float
+    checked: CheckedKnown, state: State, used: np.ndarray, adjust: Adjust, dof: float
 ) -> tuple[CheckedKnown, Adjustment]:
     for _ in range(MOST):
-        adjustment = adjust(checked.network, state, used=clean.used, redundancy=True)
+        adjustment = adjust(checked.network, state, used=used, redundancy=True)
         state = adjustment.state
-        bars, control = bar_residuals(adjustment), control_residuals(adjustment)
-        worst = [(k, found[0]) for k in (bars, control) if (found := contradicted(k, 1.0, dof))]
+        kinds = {"scale_bars": bar_residuals(adjustment), "control_points": control_residuals(adjustment)}
+        worst = {kind: found for kind, known in kinds.items() if (found := contradicted(known, 1.0, dof))}
         if not worst:
             break
-        known, record = max(worst, key=lambda item: item[1]["statistic"])
-        checked = _without(checked, known, record, is_bar=known is bars)
-        if not checked.gross["scale_bars" if known is bars else "control_points"][-1]["left_out"]:
-            break
+        kind = max(worst, key=lambda kind: worst[kind][0]["statistic"])
+        known, found = kinds[kind], worst[kind]
+        if kind == "control_points":
+            joint = _together(adjustment, adjust)
+            known, found = (known, found[:1]) if joint is None else (joint, contradicted(joint, 1.0, dof) or found[:1])
+        checked = _without(checked, known, found, kind)
     return checked, adjustment
+
+
+def _together(adjustment: Adjustment, adjust: Adjust) -> Known | None:
+    """Residuals of the control points with what they have to do with each other; None where that cannot be had."""
+    network, state = adjustment.network, adjustment.state
+    try:
+        joint = adjust(jointly(network, state), state, used=adjustment.used, redundancy=True)
+    except MeasureError:
+        return None
+    return control_residuals(replace(joint, network=network))
 
 
 def _raised(checked: CheckedKnown, factor: float) -> CheckedKnown:
@@ -243,6 +271,33 @@ def without_absurd_control(network: Network, state: State) -> tuple[Network, lis
     return set_free(network, rows[bad]), records
 
 
+def in_frame_of_control(network: Network, state: State) -> tuple[Network, State, list[dict[str, Any]]]:
+    """The state in the frame in which most known coordinates of control points are right; the network without points that lie far from
+    where it puts them; and their records.
+
+    Parameters
+    ----------
+    network : Network
+    state : State
+        Without gross errors in the images, in any frame.
+    """
+    weighted = np.isfinite(network.u_xyz).any(axis=1) & (network.u_xyz > 0).all(axis=1)
+    u = np.where(weighted[:, None], network.u_xyz, np.inf)
+    known = network.xyz[np.isfinite(u).all(axis=1)]
+    limit = ABSURD * float(np.ptp(known, axis=0).max()) if len(known) else 0.0
+    fit = far_from_control(state.xyz, network.xyz, u, limit) if (network.u_xyz > 0).all() else None
+    if fit is None:
+        return network, state, []
+    moved, miss = fit
+    bad = np.flatnonzero((np.abs(miss) > np.maximum(limit, ABSURD_U * np.where(np.isfinite(u), u, 0.0))).any(axis=1))
+    records = []
+    for k in bad:
+        off = float(np.linalg.norm(miss[k]))
+        limits = {"statistic": off, "critical": limit, "left_out": True}
+        records.append({"name": network.points[k], "residual": off, "error": off, **limits})
+    return set_free(network, bad), in_frame(state, state.xyz, moved), records
+
+
 def _without_absurd(checked: CheckedKnown, state: State) -> tuple[CheckedKnown, State]:
     """Leave out bars in other units than most, or between other points: no adjustment could start with them. Bring the rest to scale."""
     bars = checked.network.bars
@@ -269,64 +324,61 @@ def _without_absurd(checked: CheckedKnown, state: State) -> tuple[CheckedKnown, 
     return CheckedKnown(network, {**checked.gross, "scale_bars": records}), state
 
 
-def wrong_fixed(network: Network, adjustment: Adjustment) -> np.ndarray:
-    """Fixed points most of whose image points were rejected, as indices; none if they are so many that it is the field that is wrong."""
-    size = len(network.points)
-    rays = np.bincount(network.point, minlength=size)
-    out = rays - np.bincount(network.point[adjustment.used], minlength=size)
-    fixed = (network.u_xyz == 0).all(axis=1)
-    wrong = np.flatnonzero(fixed & (out >= LEAST_RAYS) & (2 * out > rays))
-    return wrong if len(wrong) <= MOST_WRONG * fixed.sum() else wrong[:0]
+def _without(checked: CheckedKnown, known: Known, found: list[dict[str, Any]], kind: str) -> CheckedKnown:
+    """Leave out what is contradicted most, or, where it cannot be told from others, give all of these the uncertainty of their error."""
+    wrong = [known.name.index(record["name"]) for record in found]
+    if kind == "scale_bars":
+        others, alone = rivals(known, wrong, 1.0), True
+        network = _less_bars(checked.network, known, wrong[0], others)
+    else:
+        going = _going(checked.network, known, wrong[0])
+        alone = known.redundancy.sum() - len(going) > LEFT
+        others = rivals(known, wrong, 1.0) if alone else rivals(known, wrong[:1], 1.0, found[0]["critical"])
+        network = _less_control(checked.network, known, wrong[0], others, going if alone else [])
+    record = {**found[0], "left_out": alone and not others, "rivals": [known.name[i] for i in others]}
+    return CheckedKnown(network, {**checked.gross, kind: [*checked.gross[kind], record]})
 
 
-def set_free(network: Network, points: np.ndarray) -> Network:
-    """The network with some points free; their coordinates stay as start values."""
-    u = network.u_xyz.copy()
-    u[points] = np.inf
+def _supposed(known: Known, rows: list[int]) -> np.ndarray:
+    """Sizes of the errors that these would have."""
+    return np.abs(known.residual[rows]) / known.redundancy[rows]
+
+
+def _less_bars(network: Network, known: Known, row: int, others: list[int]) -> Network:
+    bars, rows = network.bars, [row, *others]
+    if others:
+        u = bars.u.copy()
+        u[known.index[rows]] = np.maximum(u[known.index[rows]], _supposed(known, rows))
+        return replace(network, bars=replace(bars, u=u))
+    kept = np.arange(len(bars)) != known.index[row]
+    return replace(network, bars=ScaleBars(bars.start[kept], bars.end[kept], bars.length[kept], bars.u[kept]))
+
+
+def _going(network: Network, known: Known, row: int) -> list[int]:
+    """Coordinates that go with a wrong one, as places in all of them: of many whole points the whole, for it may be another point; of few,
+    its height or its position only."""
+    point, axis = divmod(int(known.index[row]), 3)
+    few = np.isfinite(network.u_xyz).all(axis=1).sum() <= LEAST_CONTROL
+    axes = [0, 1, 2] if not few else [2] if axis == 2 else [0, 1]
+    return [3 * point + k for k in axes if np.isfinite(network.u_xyz[point, k])]
+
+
+def _less_control(network: Network, known: Known, row: int, others: list[int], going: list[int]) -> Network:
+    u, rows = network.u_xyz.copy(), [row, *others]
+    if others or not going:
+        u.flat[known.index[rows]] = np.maximum(u.flat[known.index[rows]], _supposed(known, rows))
+    else:
+        u.flat[going] = np.inf
     return replace(network, u_xyz=u)
 
 
-def wrong_fixed_records(adjustment: Adjustment, points: np.ndarray) -> list[dict[str, Any]]:
-    """How far points that were set free lie from where they were said to be; statistic and critical value of a χ² test, as its root."""
-    from scipy import stats
-
-    network, records = adjustment.network, []
-    critical = float(np.sqrt(stats.chi2.isf(0.01 / len(network.points), 3)))
-    for k in points:
-        off, covariance = network.xyz[k] - adjustment.state.xyz[k], adjustment.point_covariance[k]
-        if np.isfinite(covariance).all():
-            size = float(np.linalg.norm(off))
-            statistic = float(np.sqrt(off @ np.linalg.solve(covariance, off)))
-            limit = {"statistic": statistic, "critical": critical}
-            records.append({"name": network.points[k], "residual": size, "error": size, **limit, "left_out": True})
-    return records
-
-
-def _without(checked: CheckedKnown, known: Known, record: dict[str, Any], *, is_bar: bool) -> CheckedKnown:
-    network, row = checked.network, known.name.index(record["name"])
-    index = int(known.index[row])
-    if is_bar:
-        alone = _separable(known, row)
-        bars = network.bars
-        kept = np.arange(len(bars)) != index
-        if alone:
-            bars = ScaleBars(bars.start[kept], bars.end[kept], bars.length[kept], bars.u[kept])
-        else:
-            bars = replace(bars, u=np.maximum(bars.u, abs(record["error"])))
-        network = replace(network, bars=bars)
-    else:
-        weighted = np.isfinite(network.u_xyz).all(axis=1)
-        alone = bool(weighted.sum() > LEAST_CONTROL)
-        u = network.u_xyz.copy()
-        point = index // 3
-        u[point] = np.inf if alone else np.maximum(u[point], abs(record["error"]))
-        network = replace(network, u_xyz=u)
-    kind = "scale_bars" if is_bar else "control_points"
-    gross = {**checked.gross, kind: [*checked.gross[kind], {**record, "left_out": alone}]}
-    return CheckedKnown(network, gross)
-
-
-def _separable(known: Known, row: int) -> bool:
-    u = np.sqrt(np.maximum(np.diag(known.cofactor), 1e-300))
-    others = np.delete(known.cofactor[row] / u / u[row], row)
-    return bool(np.abs(others).max(initial=0.0) < INSEPARABLE)
+def raised(given: Network, used: Network) -> list[dict[str, Any]]:
+    """Bars and control coordinates that are less certain in one network than they were given in another: ``kind``, ``name``, ``u``."""
+    out, length = [], {(b.start[i], b.end[i], b.length[i]): b.u[i] for b in (given.bars,) for i in range(len(b))}
+    for start, end, long, u in zip(used.bars.start, used.bars.end, used.bars.length, used.bars.u, strict=True):
+        if u > length[start, end, long]:
+            name = f"{given.points[start]}–{given.points[end]}"
+            out.append({"kind": "scale_bars", "name": name, "u": float(length[start, end, long])})
+    for k, axis in np.argwhere(np.isfinite(used.u_xyz) & (used.u_xyz > given.u_xyz)):
+        out.append({"kind": "control_points", "name": f"{given.points[k]} {'XYZ'[axis]}", "u": float(given.u_xyz[k, axis])})
+    return out

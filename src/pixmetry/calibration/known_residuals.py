@@ -10,14 +10,21 @@ W. Baarda, A testing procedure for use in geodetic networks (1968).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from pixmetry.calibration.network import Adjustment
+from pixmetry.calibration.network import Adjustment, Network, ScaleBars, State
 from pixmetry.calibration.snooping import LEAST_REDUNDANCY, finest_factor
 from pixmetry.calibration.variance_components import image_sigma0
+
+LIKELY = 2 * np.log(100.0)  # difference of two squared statistics: odds of 100 that it is the one and not the other that is wrong
+SLIGHT = 1e-4  # redundancy from which on an error of something can be what others show
+NOTHING_KNOWN = 1e6  # uncertainty of a bar that says nothing, over its length
+MOST_JOINT = 100  # control points whose joint covariance is worth its time: of more, each has little to do with the others
+NAMED = 2  # largest residuals of a group
 
 
 @dataclass(frozen=True)
@@ -32,7 +39,7 @@ class Known:
     value, residual, u : ndarray, shape (m,)
         Known value; known less computed; standard uncertainty a priori.
     cofactor : ndarray, shape (m, m)
-        Of the residuals, for unit weight 1; correlations between control points are neglected.
+        Of the residuals, for unit weight 1; correlations between control points only where these are in the joint covariance.
     """
 
     name: tuple[str, ...]
@@ -79,8 +86,25 @@ def control_residuals(adjustment: Adjustment, *, a_priori: bool = False) -> Know
     variance = np.diagonal(adjustment.point_covariance, axis1=1, axis2=2) / unit
     there = np.isfinite(network.u_xyz) & (network.u_xyz > 0) & np.isfinite(network.xyz) & np.isfinite(variance)
     names = tuple(f"{network.points[k]} {'XYZ'[axis]}" for k, axis in zip(*np.nonzero(there), strict=True))
-    value, u = network.xyz[there], network.u_xyz[there]
-    return Known(names, np.flatnonzero(there), value, value - adjustment.state.xyz[there], u, np.diag(u**2 - variance[there]))
+    value, u, cofactor = network.xyz[there], network.u_xyz[there], np.diag(network.u_xyz[there] ** 2 - variance[there])
+    places = {name: i for i, name in enumerate(adjustment.free_columns)}
+    column = np.array([places.get(f"{network.points[k]}:{'XYZ'[axis]}", -1) for k, axis in np.argwhere(there)], int)
+    joint = np.flatnonzero(column >= 0)
+    cofactor[np.ix_(joint, joint)] = np.diag(u[joint] ** 2) - adjustment.covariance[np.ix_(column[joint], column[joint])] / unit
+    return Known(names, np.flatnonzero(there), value, value - adjustment.state.xyz[there], u, cofactor)
+
+
+def jointly(network: Network, state: State) -> Network:
+    """The network with its control points in the joint covariance: bars that say nothing lead from one to the next."""
+    known = np.isfinite(network.u_xyz) & (network.u_xyz > 0) & np.isfinite(network.xyz)
+    seen = np.bincount(network.point, minlength=len(network.points)) > 0
+    rows = np.flatnonzero(known.any(axis=1) & seen & np.isfinite(state.xyz).all(axis=1))
+    if not 1 < len(rows) <= MOST_JOINT:
+        return network
+    b, length = network.bars, np.linalg.norm(state.xyz[rows[1:]] - state.xyz[rows[:-1]], axis=1)
+    some, nothing = length > 0, NOTHING_KNOWN * length.sum()
+    more = (rows[:-1][some], rows[1:][some], length[some], np.full(some.sum(), nothing))
+    return replace(network, bars=ScaleBars(*(np.concatenate(two) for two in zip((b.start, b.end, b.length, b.u), more, strict=True))))
 
 
 def contradicted(known: Known, sigma0: float, dof: float, false_alarms: float = 0.01) -> list[dict[str, Any]]:
@@ -102,8 +126,7 @@ def contradicted(known: Known, sigma0: float, dof: float, false_alarms: float = 
     critical = float(stats.t.isf(false_alarms / len(known) / 2, max(dof, 1.0)))
     v, q, out = known.residual.copy(), known.cofactor.copy(), []
     for _ in range(len(known)):
-        testable = np.diag(q) > LEAST_REDUNDANCY * known.u**2
-        w = np.where(testable, np.abs(v), 0.0) / np.sqrt(np.where(testable, np.diag(q), 1.0)) / sigma0
+        w = _statistics(known, v, q) / sigma0
         worst = int(np.argmax(w))
         if not w[worst] > critical:
             break
@@ -117,11 +140,36 @@ def contradicted(known: Known, sigma0: float, dof: float, false_alarms: float = 
                 "critical": critical,
             }
         )
-        column = q[:, worst] / q[worst, worst]
-        v, q = v - column * v[worst], q - np.outer(column, q[worst])
-        v[worst] = 0.0
-        q[worst, :] = q[:, worst] = 0.0
+        v, q = _without(v, q, worst)
     return out
+
+
+def rivals(known: Known, wrong: Sequence[int], sigma0: float, above: float = np.inf) -> list[int]:
+    """Those of which one may be wrong in place of the first of ``wrong``, beside the others of these: of two of them alone, each would
+    explain the residuals nearly as well (their χ² differ by less than `LIKELY`), or their statistic is above a critical value."""
+    v, q = known.residual.copy(), known.cofactor.copy()
+    for i in wrong[1:]:
+        v, q = _without(v, q, i)
+    square = (_statistics(known, v, q, SLIGHT) / sigma0) ** 2
+    near = square > min(max(square[wrong[0]] - LIKELY, 0.0), above**2)
+    return [int(i) for i in np.flatnonzero(near) if i not in wrong]
+
+
+def _statistics(known: Known, v: np.ndarray, q: np.ndarray, least: float = LEAST_REDUNDANCY) -> np.ndarray:
+    """|v| over its standard deviation, of those that have some redundancy."""
+    testable = np.diag(q) > least * known.u**2
+    return np.where(testable, np.abs(v), 0.0) / np.sqrt(np.where(testable, np.diag(q), 1.0))
+
+
+def _without(v: np.ndarray, q: np.ndarray, i: int) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals and their cofactors with one of them left out."""
+    if not q[i, i] > 0:
+        return v, q
+    column = q[:, i] / q[i, i]
+    v, q = v - column * v[i], q - np.outer(column, q[i])
+    v[i] = 0.0
+    q[i, :] = q[:, i] = 0.0
+    return v, q
 
 
 def group_record(adjustment: Adjustment, known: Known) -> dict[str, Any] | None:
@@ -130,7 +178,8 @@ def group_record(adjustment: Adjustment, known: Known) -> dict[str, Any] | None:
     Returns
     -------
     dict
-        ``factor``, ``dof``, ``p`` (two-sided F-test against the image coordinates), ``n``.
+        ``factor``, ``dof``, ``p`` (two-sided F-test against the image coordinates), ``n``, and ``largest``: ``name`` and ``ratio`` (to
+        the stated uncertainty) of the largest residuals.
     """
     from scipy import stats
 
@@ -140,4 +189,6 @@ def group_record(adjustment: Adjustment, known: Known) -> dict[str, Any] | None:
     sigma0, dof_images = image_sigma0(adjustment)
     factor = float((known.residual**2 / known.u**2).sum() / dof / max(sigma0**2, finest_factor(adjustment.network)))
     tail = stats.f.sf(factor, dof, dof_images)
-    return {"factor": factor, "dof": dof, "p": float(2 * min(tail, 1 - tail)), "n": len(known)}
+    ratio = known.residual / known.u
+    largest = [{"name": known.name[i], "ratio": float(ratio[i])} for i in np.argsort(-np.abs(ratio))[:NAMED]]
+    return {"factor": factor, "dof": dof, "p": float(2 * min(tail, 1 - tail)), "n": len(known), "largest": largest}

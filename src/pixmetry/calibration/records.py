@@ -14,6 +14,8 @@ from pixmetry.calibration.known_residuals import bar_residuals, control_residual
 from pixmetry.calibration.network import Adjustment, Network
 from pixmetry.calibration.snooping import Rejected
 
+SWAPPED = 0.1  # of the distance of two points: as near to the other's place, their names are exchanged
+
 
 def all_records(
     adjustment: Adjustment,
@@ -57,7 +59,7 @@ def all_records(
         "images": quality.image_records(adjustment, Counter(record["image"] for record in gross)),
         "curves": curves.distortion_curves(adjustment),
         "projection": curves.projection_maps(adjustment),
-        "network": network_record(adjustment, a_priori=a_priori),
+        "network": network_record(adjustment, _stated(gross_known, "scale_bars"), a_priori=a_priori),
         "known": {
             **known_record(adjustment, gross_known, a_priori=a_priori),
             "fixed_points": fixed_record(adjustment, adjust),
@@ -78,11 +80,11 @@ def add_noise(residuals: dict[str, dict[str, Any]], adjustment: Adjustment, give
 
 
 def sizes(adjustment: Adjustment) -> dict[str, int]:
-    """What took part, and what was given: ``images`` (oriented), ``points`` (determined, in such images), ``observations`` (image points
-    used); ``images_given``, ``points_given``, ``observations_given`` (all that was measured)."""
+    """What took part, and what was given: ``images`` (oriented), ``points`` (determined, with image points used), ``observations`` (image
+    points used); ``images_given``, ``points_given``, ``observations_given`` (all that was measured)."""
     network, state = adjustment.network, adjustment.state
     posed = np.isfinite(state.position).all(axis=1)
-    seen = np.unique(network.point[posed[network.image]])
+    seen = np.unique(network.point[adjustment.used])
     return {
         "images": int(posed[np.unique(network.image)].sum()),
         "points": int(np.isfinite(state.xyz[seen]).all(axis=1).sum()),
@@ -93,9 +95,9 @@ def sizes(adjustment: Adjustment) -> dict[str, int]:
     }
 
 
-def network_record(adjustment: Adjustment, *, a_priori: bool = False) -> dict[str, Any]:
+def network_record(adjustment: Adjustment, stated: Mapping[str, float] | None = None, *, a_priori: bool = False) -> dict[str, Any]:
     """The `sizes` of the network, ``redundancy``, ``rays_per_point`` (mean, with ``rays_least`` and ``rays_most``), ``datum``, ``unit``,
-    ``sigma0``, ``scale_bars``."""
+    ``sigma0``, ``scale_bars`` (with the uncertainty ``stated``, where it was raised)."""
     network, used = adjustment.network, adjustment.used
     rays = np.bincount(network.point[used], minlength=len(network.points))
     rays = rays[rays > 0]
@@ -113,7 +115,7 @@ def network_record(adjustment: Adjustment, *, a_priori: bool = False) -> dict[st
             {
                 "name": bars.name[i],
                 "length": float(bars.value[i]),
-                "u": float(bars.u[i]),
+                "u": (stated or {}).get(bars.name[i], float(bars.u[i])),
                 "residual": float(bars.residual[i]),
                 "redundancy": float(bars.redundancy[i]),
             }
@@ -122,14 +124,45 @@ def network_record(adjustment: Adjustment, *, a_priori: bool = False) -> dict[st
     }
 
 
-def known_record(
-    adjustment: Adjustment, gross: Mapping[str, list[dict[str, Any]]], *, a_priori: bool = False
-) -> dict[str, dict[str, Any]]:
-    """Bars and weighted control points against the network: for each ``group`` (variance factor, None without redundancy) and ``gross``; of
-    control points also ``understated``: by how much their uncertainties were raised, or None."""
+def known_record(adjustment: Adjustment, gross: Mapping[str, list[dict[str, Any]]], *, a_priori: bool = False) -> dict[str, Any]:
+    """Bars and weighted control points against the network: for each ``group`` (variance factor, None without redundancy), ``gross`` and
+    ``raised`` (stated uncertainties, by name, of those that weigh less now); of control points also ``understated``: by how much their
+    uncertainties were raised, or None. ``untested``: why nothing of this could be tested, or None."""
     groups = {"scale_bars": bar_residuals, "control_points": control_residuals}
     known = {name: residuals(adjustment, a_priori=a_priori) for name, residuals in groups.items()}
-    record: dict[str, dict[str, Any]]
-    record = {name: {"group": group_record(adjustment, k), "gross": list(gross[name])} for name, k in known.items()}
-    record["control_points"]["understated"] = next((r["factor"] for r in gross.get("understated", ())), None)
+    record: dict[str, Any] = {
+        name: {"group": group_record(adjustment, known[name]), "gross": list(gross[name]), "raised": _stated(gross, name)}
+        for name in groups
+    }
+    control = record["control_points"]
+    control["gross"] = [_found(adjustment, one) for one in control["gross"]]
+    control["understated"] = next((r["factor"] for r in gross.get("understated", ())), None)
+    record["untested"] = next((r["why"] for r in gross.get("untested", ())), None)
     return record
+
+
+def _stated(gross: Mapping[str, list[dict[str, Any]]], kind: str) -> dict[str, float]:
+    """Uncertainties, as they were stated, of what weighs less now."""
+    return {r["name"]: r["u"] for r in reversed(gross.get("raised", ())) if r["kind"] == kind}
+
+
+def _found(adjustment: Adjustment, record: dict[str, Any]) -> dict[str, Any]:
+    """The record of a control point that was left out, with its error against where it was found without it, and ``swapped_with``."""
+    network, xyz = adjustment.network, adjustment.state.xyz
+    names = {name: k for k, name in enumerate(network.points)}
+    name, _, axis = record["name"].rpartition(" ")
+    k = names.get(record["name"], names.get(name))
+    if k is None or not record["left_out"] or not np.isfinite(xyz[k]).all():
+        return {**record, "swapped_with": None}
+    off = (network.xyz - xyz)[k]
+    error = float(off["XYZ".index(axis)]) if record["name"] not in names else record["error"]
+    return {**record, "error": error, "swapped_with": _swapped_with(adjustment, k)}
+
+
+def _swapped_with(adjustment: Adjustment, k: int) -> str | None:
+    """The other control point with which one has exchanged its place: each was found where the other was said to be."""
+    given, found = adjustment.network.xyz, adjustment.state.xyz
+    near = SWAPPED * np.linalg.norm(given - given[k], axis=1)
+    with np.errstate(invalid="ignore"):
+        there = (np.linalg.norm(given - found[k], axis=1) < near) & (np.linalg.norm(found - given[k], axis=1) < near)
+    return adjustment.network.points[int(np.argmax(there))] if there.any() else None

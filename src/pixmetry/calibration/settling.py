@@ -13,7 +13,6 @@ from pixmetry.calibration.eccentric import Eccentricity, eccentricity, without_e
 from pixmetry.calibration.network import Adjustment, Network, State
 from pixmetry.calibration.options import Options
 from pixmetry.calibration.snooping import Rejected
-from pixmetry.core.errors import MeasureError
 
 Progress = Callable[[str], None]
 LOOPS = 12
@@ -72,8 +71,10 @@ def settle(measured: Network, state: State, options: Options, say: Progress, bef
     before : Settled, optional
         The same image coordinates, settled already with other points: where to go on.
     """
-    from pixmetry.calibration.known_checks import set_free, wrong_fixed, wrong_fixed_records
+    from pixmetry.calibration.known_checks import raised
+    from pixmetry.calibration.lost_control import lost_records, set_free, where_seen, wrong_known
 
+    given = measured
     loss: str = options.loss if before is None else "none"
     given_px2 = measured.covariance_px2 if before is None else before.given_px2
     rejected = Rejected.none(len(measured)) if before is None else before.rejected
@@ -87,10 +88,11 @@ def settle(measured: Network, state: State, options: Options, say: Progress, bef
     for loop in range(1, LOOPS + 1):
         say(f"adjusting, round {loop}")
         adjustment = _without_gross_errors(without_eccentricity(measured, shift), state, used, loss, options, rejected)
-        wrong = wrong_fixed(measured, adjustment) if options.snoop else freed[:0]
+        wrong = wrong_known(measured, adjustment) if options.snoop else freed[:0]
         if len(wrong):
+            state = where_seen(without_eccentricity(measured, shift), adjustment, wrong)
             measured, used, freed = set_free(measured, wrong), adjustment.used | np.isin(measured.point, wrong), np.append(freed, wrong)
-            adjustment = _without_gross_errors(without_eccentricity(measured, shift), adjustment.state, used, "none", options, rejected)
+            adjustment = _without_gross_errors(without_eccentricity(measured, shift), state, used, "none", options, rejected)
         adjustment, step, components = _weighted(adjustment, given_px2, options, components)
         measured = replace(measured, covariance_px2=adjustment.network.covariance_px2)
         again = _shift(measured, adjustment.state, options)
@@ -100,7 +102,12 @@ def settle(measured: Network, state: State, options: Options, say: Progress, bef
         if still:
             break
         shift = again
-    gross_known = {**gross_known, "control_points": [*gross_known["control_points"], *wrong_fixed_records(adjustment, freed)]}
+    freed_records = lost_records(given, adjustment, freed)
+    gross_known = {
+        **gross_known,
+        "control_points": [*gross_known["control_points"], *freed_records],
+        "raised": raised(given, measured),
+    }
     return Settled(measured, adjustment, shift, components, gross_known, given_px2, rejected)
 
 
@@ -118,17 +125,18 @@ def _as_given(network: Network, options: Options) -> bool:
 def _first_weights(measured: Network, shift: Eccentricity, state: State, options: Options) -> Network:
     """The network with what its image coordinates scatter beyond covariances that differ from point to point, from the middle half of the
     residuals: else the best of them would weigh so much that gross errors are taken for good, and good points for gross errors."""
-    from pixmetry.calibration.known_checks import loosened
+    from pixmetry.calibration.known_checks import loose_coordinates
+    from pixmetry.calibration.loosened import first_that_stands, loosened
     from pixmetry.calibration.variance_components import robust_sizes, same_weights
 
     variance = measured.covariance_px2[:, [0, 2]]
     unequal = measured.covariance_known and (np.ptp(np.log(variance), axis=0) > np.log(UNEQUAL)).any()
     if options.a_priori or not (options.variance_components and unequal):
         return measured
-    alike = same_weights(loosened(without_eccentricity(measured, shift)))
-    try:
-        first = adjust_with(options)(alike, state, loss=options.loss, loss_scale=options.loss_scale, covariance=False)
-    except MeasureError:  # it hangs on bars or control points
+    adjust = partial(adjust_with(options), loss=options.loss, loss_scale=options.loss_scale, covariance=False)
+    networks = loosened(without_eccentricity(measured, shift), loose_coordinates(measured))
+    first, _ = first_that_stands(networks, lambda network: adjust(same_weights(network), state))
+    if first is None:  # it hangs on bars or control points
         return measured
     return robust_sizes(first, measured.covariance_px2).of(measured, measured.covariance_px2)
 
@@ -150,36 +158,43 @@ def _checked_known(
         few_fixed,
         fixed_again,
         has_known,
-        loosened,
+        in_frame_of_control,
+        loose_coordinates,
         weighted_instead,
         without_absurd_control,
     )
+    from pixmetry.calibration.loosened import first_that_stands, loosened, with_the_rest
 
     if not (options.snoop and has_known(measured)):
         return measured, state, used, loss, CheckedKnown(measured).gross
     measured, absurd = without_absurd_control(measured, state)
     say("testing scale bars and control points")
-    try:
-        loose = without_eccentricity(loosened(measured), shift)
-        clean = _without_gross_errors(loose, state, used, loss, replace(options, a_priori=False), rejected)
-    except MeasureError:  # the network hangs on them
-        return measured, state, used, loss, {**CheckedKnown(measured).gross, "control_points": absurd}
+    alone = replace(options, a_priori=False)
+    networks = loosened(without_eccentricity(measured, shift), loose_coordinates(measured))
+    clean, why = first_that_stands(networks, lambda network: _without_gross_errors(network, state, used, loss, alone, rejected))
+    if clean is None:
+        return measured, state, used, loss, {**CheckedKnown(measured).gross, "control_points": absurd, "untested": [{"why": why}]}
     weighted = weighted_instead(measured, clean)
     stated = not few_fixed(measured).any()
-    checked, state = check_known(without_eccentricity(weighted, shift), clean, adjust_with(replace(options, a_priori=False)), stated=stated)
+    begin, used = with_the_rest(weighted, clean, state, used, rejected)
+    near, begin, far = in_frame_of_control(weighted, begin)
+    check = partial(check_known, without_eccentricity(near, shift), clean, adjust_with(alone), used=used, stated=stated)
+    tried, why = first_that_stands((begin, state), lambda start: check(state=start))
+    if tried is None:
+        return measured, state, used, loss, {**CheckedKnown(measured).gross, "control_points": absurd, "untested": [{"why": why}]}
+    checked, state = tried
     measured = replace(measured, bars=checked.network.bars, u_xyz=fixed_again(checked.network, measured, weighted))
     if not _as_given(measured, options):
         measured = replace(measured, covariance_px2=checked.network.covariance_px2)
-    return measured, state, clean.used, "none", {**checked.gross, "control_points": [*absurd, *checked.gross["control_points"]]}
+    gross = {**checked.gross, "control_points": [*absurd, *far, *checked.gross["control_points"]]}
+    return measured, state, used, "none", gross
 
 
 def _shift(measured: Network, state: State, options: Options) -> Eccentricity:
     return eccentricity(measured if options.eccentricity else replace(measured, diameter=None), state, options.target)
 
 
-def _without_gross_errors(
-    network: Network, state: State, used: np.ndarray, loss: str, options: Options, rejected: Rejected
-) -> Adjustment:
+def _without_gross_errors(network: Network, state: State, used: np.ndarray, loss: str, options: Options, rejected: Rejected) -> Adjustment:
     from pixmetry.calibration.snooping import remove_gross_errors
 
     adjust = adjust_with(options)

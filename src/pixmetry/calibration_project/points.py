@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from pixmetry.calibration.check_points import CheckPoints
 from pixmetry.calibration.network import ScaleBars
 from pixmetry.calibration_project.tables import Table, first_few, index_of_names
 from pixmetry.core.errors import InputError
@@ -46,39 +47,84 @@ def known_points(table: Table | None, names: Sequence[str], known: str | None, u
     n = len(names)
     if table is None:
         return Known(np.full((n, 3), np.nan), np.full((n, 3), np.inf), None, None)
-    table = table.spelled("point", "X", "Y", "Z", "u_X", "u_Y", "u_Z", "diameter", "normal_x", "normal_y", "normal_z")
-    table.need("point", "X", "Y", "Z")
-    rows = index_of_names(table, "point")
-    at = np.array([rows.get(name, -1) for name in names])
-    here, row_of = at >= 0, at[at >= 0]
-    if not here.any():
-        what = "no point of the table is seen in an image"
-        remedy = "use the same names in both tables"
-        raise InputError(what, where=table.source, value=first_few(rows), allowed=first_few(names), remedy=remedy)
+    table, rows, here, row_of = _rows_of(table, names)
     xyz, u_xyz = np.full((n, 3), np.nan), np.full((n, 3), np.inf)
-    xyz[here] = _coordinates(table)[row_of]
+    xyz[here] = coordinates(table)[row_of]
     u_xyz[here] = _u_of_points(table, known, u)[row_of]
     u_xyz[np.isnan(xyz)] = np.inf
-    diameter, normal = None, None
-    if "diameter" in table:
-        diameter = np.full(n, np.nan)
-        diameter[here] = table.numbers("diameter", empty=np.nan, above=0)[row_of]
-    if any(f"normal_{axis}" in table for axis in "xyz"):
-        table.need("normal_x", "normal_y", "normal_z")
-        normal = np.full((n, 3), np.nan)
-        normal[here] = _unit_normals(table)[row_of]
+    diameter, normal = _targets(table, here, row_of)
     seen = set(names)
     return Known(xyz, u_xyz, diameter, normal, tuple(name for name in rows if name not in seen))
 
 
-def _coordinates(table: Table) -> np.ndarray:
-    """X, Y, Z of each row; NaN where all three are empty."""
-    xyz = np.stack([table.numbers(axis, empty=np.nan) for axis in "XYZ"], axis=1)
-    partly = np.isnan(xyz).any(axis=1) & ~np.isnan(xyz).all(axis=1)
-    if partly.any():
-        where = table.where(int(np.flatnonzero(partly)[0]))
-        raise InputError("a point with some of its coordinates", where=where, allowed="X, Y and Z, or none", remedy="add what is missing")
-    return xyz
+def _rows_of(table: Table, names: Sequence[str]) -> tuple[Table, dict[str, int], np.ndarray, np.ndarray]:
+    """A table of points with its columns spelled as here, the row of each of its names, which points of the network it has, and where."""
+    table = table.spelled("point", "X", "Y", "Z", "u_X", "u_Y", "u_Z", "diameter", "normal_x", "normal_y", "normal_z")
+    table.need("point", "X", "Y", "Z")
+    rows = index_of_names(table, "point")
+    at = np.array([rows.get(name, -1) for name in names])
+    if not (at >= 0).any():
+        what = "no point of the table is seen in an image"
+        remedy = "use the same names in both tables"
+        raise InputError(what, where=table.source, value=first_few(rows), allowed=first_few(names), remedy=remedy)
+    return table, rows, at >= 0, at[at >= 0]
+
+
+def _targets(table: Table, here: np.ndarray, row_of: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Diameters and normals of the network's points, as far as the table has them."""
+    diameter, normal = None, None
+    if "diameter" in table:
+        diameter = np.full(len(here), np.nan)
+        diameter[here] = table.numbers("diameter", empty=np.nan, above=0)[row_of]
+    if any(f"normal_{axis}" in table for axis in "xyz"):
+        table.need("normal_x", "normal_y", "normal_z")
+        normal = np.full((len(here), 3), np.nan)
+        normal[here] = _unit_normals(table)[row_of]
+    return diameter, normal
+
+
+def with_check_points(known: Known, table: Table | None, names: Sequence[str], u: float | None) -> tuple[Known, CheckPoints | None]:
+    """The check points of a table, and what it says about the size of their targets; none of their coordinates become known.
+
+    Raises
+    ------
+    InputError
+        As from `known_points`, and if a point has coordinates in both tables.
+    """
+    if table is None:
+        return known, None
+    table, rows, here, row_of = _rows_of(table, names)
+    both = here & (np.isfinite(known.xyz) | np.isfinite(known.u_xyz)).any(axis=1)
+    if both.any():
+        name = names[int(np.flatnonzero(both)[0])]
+        what = f"point '{name}' is known and a check point"
+        raise InputError(
+            what, where=table.where(rows[name]), allowed="coordinates in one of the two tables", remedy="delete it in the other"
+        )
+    xyz, u_xyz = coordinates(table), np.full((len(table), 3), u or 0.0)
+    for k, axis in enumerate("XYZ"):
+        if f"u_{axis}" in table:
+            u_xyz[:, k] = table.numbers(f"u_{axis}", empty=u or 0.0, least=0)
+    targets = zip((known.diameter, known.normal), _targets(table, here, row_of), strict=True)
+    diameter, normal = (old if new is None else new if old is None else np.where(np.isfinite(new), new, old) for old, new in targets)
+    return replace(known, diameter=diameter, normal=normal), CheckPoints(tuple(rows), xyz, u_xyz)
+
+
+def coordinates(table: Table) -> np.ndarray:
+    """X, Y, Z of each row; NaN where one is empty: it is not known.
+
+    Raises
+    ------
+    InputError
+        If a value cannot be used, or an uncertainty stands beside an empty coordinate.
+    """
+    for axis in "XYZ":
+        for row, (value, u) in enumerate(zip(table.columns[axis], table.columns.get(f"u_{axis}", ()), strict=False)):
+            if u and not value:
+                remedy = f"add {axis}, or leave u_{axis} empty, too: a coordinate that is not known has none"
+                what, allowed = f"u_{axis} of a coordinate that is empty", "both, neither, or the coordinate alone"
+                raise InputError(what, where=table.where(row), value=u, allowed=allowed, remedy=remedy)
+    return np.stack([table.numbers(axis, empty=np.nan) for axis in "XYZ"], axis=1)
 
 
 def _u_of_points(table: Table, known: str | None, u: float | None) -> np.ndarray:

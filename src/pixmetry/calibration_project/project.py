@@ -9,12 +9,13 @@ from typing import Any
 
 import numpy as np
 
+from pixmetry.calibration.check_points import CheckPoints
 from pixmetry.calibration.model import CameraModel, Sensor
 from pixmetry.calibration.network import Finding, Network
 from pixmetry.calibration_project.cameras import Described, described
 from pixmetry.calibration_project.coordinates import ImageCoordinates, Measured, measured, upwards
 from pixmetry.calibration_project.pictures import located, of_size
-from pixmetry.calibration_project.points import Known, known_points, scale_bars
+from pixmetry.calibration_project.points import Known, known_points, scale_bars, with_check_points
 from pixmetry.calibration_project.reader import Reader
 from pixmetry.calibration_project.schema import PROJECT_SCHEMA, ProjectModel
 from pixmetry.calibration_project.straight_lines import LinePositions, lines_of_pictures, lines_of_table
@@ -47,6 +48,8 @@ class Project:
         By the names of cameras that have one.
     lines : LinePositions or None
         Positions on straight lines, where there are no points.
+    check_points : CheckPoints or None
+        What the result is compared with.
     """
 
     name: str
@@ -57,6 +60,7 @@ class Project:
     findings: tuple[Finding, ...] = ()
     presets: Mapping[str, Camera] = field(default_factory=dict)
     lines: LinePositions | None = None
+    check_points: CheckPoints | None = None
 
     @property
     def folder(self) -> Path:
@@ -130,11 +134,15 @@ def _project(model: ProjectModel, reader: Reader, progress: Progress | None) -> 
         assert table is not None and model.observations is not None
         seen = measured(table, images, cameras, given, model.observations.u_px)
     known = plate if points is None and plate is not None else known_points(points, seen.points, *_trust(model))
+    compared = reader.table("check_points", model.check_points)
+    u_compared = None if model.check_points is None else model.check_points.u
+    known, checks = with_check_points(known, compared, seen.points, u_compared)
     known = _with_target(known, model)
     bars = scale_bars(reader.bars(model), seen.points, known)
     network = network_of(cameras, seen, known, bars=bars, per_image=model.per_image, scale_origin_px=model.scale_origin_px, unit=model.unit)
     findings = (*findings, *_unseen(known, points), *_without_images(network))
-    return Project(network=network, options=_options(model), inputs=tuple(reader.files), findings=findings, **about)
+    about |= {"options": _options(model), "inputs": tuple(reader.files), "findings": findings, "check_points": checks}
+    return Project(network=network, **about)
 
 
 def _lines(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
@@ -13,6 +14,17 @@ from pixmetry.core.errors import InputError
 
 PROJECT_SCHEMA = "pixmetry/calibration/1"
 
+_BALANCED = "`k1` to `k3` and `c_mm`: a balanced radial form is the same lens with another c"
+_AFFINE, _CENTRE = "`b1` and `b2`", "`xp_px` and `yp_px`, in pixels from the centre of the top-left pixel, y down"
+OTHER_NAMES = {  # of the same parameters in certificates and other programs, and what they are here
+    **dict.fromkeys(("a0", "a1", "a2", "a3", "r0", "r0_mm"), _BALANCED),
+    **dict.fromkeys(("c1", "c2"), _AFFINE),
+    **dict.fromkeys([f"{name}{unit}" for name in ("x0", "y0", "xh", "yh", "cx", "cy") for unit in ("", "_mm", "_px")], _CENTRE),
+    **dict.fromkeys(("xp_mm", "yp_mm"), _CENTRE),
+}
+CAPITALS = {
+    name: f"`p{name[1]}` where it is decentring (beside A1, C1), `b{name[1]}` where it is affinity or shear" for name in ("B1", "B2")
+}
 LINE_OPTIONS = ("options.loss", "options.loss_scale", "options.snoop")  # those that mean something for straight lines
 
 Positive = Annotated[float, Field(gt=0)]
@@ -63,6 +75,16 @@ class CameraEntry(Model):
     k5: float = 0.0
     free: Annotated[tuple[Literal[NAMES], ...] | None, BeforeValidator(_listed)] = None  # type: ignore[valid-type]
 
+    @model_validator(mode="before")
+    @classmethod
+    def _named_here(cls, data: Any) -> Any:
+        for key in data if isinstance(data, Mapping) else ():
+            meant = CAPITALS.get(key) or OTHER_NAMES.get(str(key).lower())
+            if meant is not None:
+                remedy = f"write {meant}; signs and factors stand under 'Values of another program' in docs/calibrating.md"
+                raise InputError(f"unknown key '{key}', a name of another program", allowed=", ".join(cls.model_fields), remedy=remedy)
+        return data
+
     @model_validator(mode="after")
     def _agrees(self) -> CameraEntry:
         if self.pitch_um is not None and (self.pitch_x_um is not None or self.pitch_y_um is not None):
@@ -98,6 +120,12 @@ class PointsModel(TableModel):
     """Object points: point, X, Y, Z."""
 
     known: Literal["nominal", "fixed", "free", "weighted"] | None = None
+    u: Positive | None = None
+
+
+class CheckPointsModel(TableModel):
+    """Object points that are compared with the result: point, X, Y, Z."""
+
     u: Positive | None = None
 
 
@@ -189,6 +217,7 @@ class ProjectModel(Model):
     image_coordinates: ImageCoordinatesModel = ImageCoordinatesModel()
     images: Annotated[TableModel | None, BeforeValidator(_table)] = None
     points: Annotated[PointsModel | None, BeforeValidator(_table)] = None
+    check_points: Annotated[CheckPointsModel | None, BeforeValidator(_table)] = None
     target: TargetModel | None = None
     scale_bars: tuple[BarModel, ...] = ()
     scale_bars_table: Annotated[TableModel | None, BeforeValidator(_table)] = None

@@ -5,27 +5,38 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from pixmetry.calibration.control import control_of
-from pixmetry.report.numbers import NONE, fixed, signed, significant, uncertain
+from pixmetry.report.calibration_text import placed
+from pixmetry.report.numbers import NONE, fixed, signed, significant
 
 if TYPE_CHECKING:
     from pixmetry.calibration.network import Calibration
 
 
 def control_points(calibration: Calibration) -> list[list[str]]:
-    """Coordinate, given value, u, given less adjusted, and that over u; those that were left out come first."""
+    """Coordinate, given value, u as it was stated, given less adjusted, and that over u; those that were left out come first.
+
+    What no image point is left of has no adjusted value; what weighs less now, for the network contradicts it, is marked.
+    """
     network, control = calibration.adjustment.network, control_of(calibration.adjustment)
-    rows = [_left_out(record) for record in _gross(calibration) if record.get("left_out")]
+    rays = np.bincount(network.point[calibration.adjustment.used], minlength=len(network.points))
+    known = (calibration.tests.get("known") or {}).get("control_points") or {}
+    gross, raised = list(known.get("gross") or ()), known.get("raised") or {}
+    rows = [_left_out(record) for record in gross if record.get("left_out")]
+    contradicted = {record["name"] for record in gross}
     for k in range(len(control)):
-        number = uncertain(float(control.given[k]), float(control.u[k]), network.unit)
         name = f"{network.points[control.point[k]]} {'XYZ'[control.axis[k]]}"
-        rows.append([name, number.value, f"± {number.u}", _two_digits(control.residual[k]), fixed(float(control.ratio[k]), 1)])
+        u, residual = float(raised.get(name, control.u[k])), float(control.residual[k])
+        given = placed(float(control.given[k]), u or float(control.u[k]))
+        cells = [_two_digits(residual), fixed(residual / u, 1) if u else NONE]
+        if name in raised:
+            name += " (contradicted, weighs less)" if name in contradicted else " (weighs less)"
+        if not rays[control.point[k]]:
+            name, cells = f"{name} (no image point left)", [NONE, NONE]
+        rows.append([name, given, f"± {placed(u, u)}" if u else "fixed", *cells])
     return rows
-
-
-def _gross(calibration: Calibration) -> list[Mapping[str, Any]]:
-    known = calibration.tests.get("known") or {}
-    return list((known.get("control_points") or {}).get("gross") or ())
 
 
 def _left_out(record: Mapping[str, Any]) -> list[str]:

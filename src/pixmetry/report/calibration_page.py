@@ -12,6 +12,7 @@ import numpy as np
 from pixmetry import __version__
 from pixmetry.calibration.model import NAMES
 from pixmetry.report import calibration_tables as tables
+from pixmetry.report.calibration_check_points import check_points
 from pixmetry.report.calibration_control import control_points
 from pixmetry.report.calibration_text import (
     DIRECTIONS,
@@ -88,6 +89,7 @@ def _content(calibration: Calibration) -> dict[str, Any]:
         "all_fixed": bool(len(net.u_xyz) and np.all(net.u_xyz == 0)),
         "bars": tables.scale_bars(calibration),
         "control": control_points(calibration),
+        "checked": check_points(calibration),
         "unit": net.unit,
         "datum": adjustment.datum,
         "notes": [n for n in adjustment.notes if not any(n.rstrip(".") in f.text for f in calibration.findings)],

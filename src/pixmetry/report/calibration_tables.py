@@ -15,6 +15,7 @@ from pixmetry.report.calibration_text import (
     length,
     p_text,
     parameter_records,
+    placed,
     record_of,
     residual_record,
     sentence,
@@ -207,8 +208,7 @@ def worst_points(calibration: Calibration) -> dict[str, Any]:
     rows = []
     for k in known[np.argsort(-size[known], kind="stable")][:MOST_POINTS]:
         u = np.sqrt(np.maximum(np.diag(covariance[k]), 0.0))
-        numbers = [uncertain(float(v), float(s), "1") for v, s in zip(adjustment.state.xyz[k], u, strict=True)]
-        texts = [f"{n.value} ± {n.u}" + (f"{NO_BREAK}{n.unit}" if n.unit else "") for n in numbers]
+        texts = [f"{placed(v, s)} ± {placed(s, s)}" if s > 0 else placed(v, s) for v, s in zip(adjustment.state.xyz[k], u, strict=True)]
         rows.append([net.points[k], *texts, value(size[k], 2), str(rays[k])])
     if not rows:
         return {"rows": [], "median": "", "largest": ""}
@@ -216,16 +216,19 @@ def worst_points(calibration: Calibration) -> dict[str, Any]:
 
 
 def scale_bars(calibration: Calibration) -> list[list[str]]:
-    """Scale bars with their residuals: measured less adjusted length."""
+    """Scale bars with their residuals: measured less adjusted length; u is that which was stated."""
+    raised = ((calibration.tests.get("known") or {}).get("scale_bars") or {}).get("raised") or {}
     net, xyz = calibration.adjustment.network, calibration.adjustment.state.xyz
     bars = net.bars
     adjusted = np.linalg.norm(xyz[bars.end] - xyz[bars.start], axis=1)
     rows = []
     for k in range(len(bars)):
         residual = float(bars.length[k] - adjusted[k])
-        number = uncertain(float(bars.length[k]), float(bars.u[k]), net.unit)
-        ratio = fixed(residual / float(bars.u[k]), 1) if bars.u[k] > 0 and np.isfinite(residual) else NONE
-        ends = f"{net.points[bars.start[k]]} – {net.points[bars.end[k]]}"
+        name = f"{net.points[bars.start[k]]}–{net.points[bars.end[k]]}"
+        u = float(raised.get(name, bars.u[k]))
+        number = uncertain(float(bars.length[k]), u, net.unit)
+        ratio = fixed(residual / u, 1) if u > 0 and np.isfinite(residual) else NONE
+        ends = f"{net.points[bars.start[k]]} – {net.points[bars.end[k]]}" + (" (contradicted, weighs less)" if name in raised else "")
         rows.append([ends, number.value, f"± {number.u}", signed(residual, lambda v: significant(v, 2)), ratio])
     return rows
 

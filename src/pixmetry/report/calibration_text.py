@@ -9,7 +9,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pixmetry.report.numbers import MINUS, NO_BREAK, NONE, SUPERSCRIPT, THIN, Number, length_px, pretty_unit, significant, uncertain
+from pixmetry.report.numbers import (
+    MINUS,
+    NO_BREAK,
+    NONE,
+    SUPERSCRIPT,
+    THIN,
+    Number,
+    decimals_of,
+    fixed,
+    length_px,
+    pretty_unit,
+    significant,
+    uncertain,
+)
 
 if TYPE_CHECKING:
     from pixmetry.calibration.network import Calibration
@@ -191,6 +204,16 @@ def as_given(value: float, unit: str) -> Number:
     return Number(mantissa.replace("-", MINUS), NONE, (power + pretty_unit(unit)).rstrip(NO_BREAK))
 
 
+def placed(value: float, u: float) -> str:
+    """A coordinate to the place of the second digit of its uncertainty, all digits before it: no power of ten, however far the origin."""
+    if not np.isfinite(value):
+        return NONE
+    if np.isfinite(u) and u > 0:
+        return fixed(value, decimals_of(u))
+    number = as_given(value, "1")
+    return f"{number.value} {number.unit}".rstrip()
+
+
 def summary_text(calibration: Calibration) -> str:
     """Summary for the terminal: what each camera is worth, what to know, its parameters."""
     adjustment = calibration.adjustment
@@ -204,6 +227,8 @@ def summary_text(calibration: Calibration) -> str:
             lines.append(sentence(found["text"]))
         lines.append("")
         lines += _parameter_lines(calibration, k)
+    if "check_points" in calibration.tests:
+        lines += ["", sentence(calibration.tests["check_points"]["text"])]
     for finding in calibration.findings:
         mark = "Warning" if finding.level == "warning" else "Note"
         lines += ["", f"{mark}: {sentence(finding.text)}"]
@@ -226,6 +251,4 @@ def _parameter_lines(calibration: Calibration, camera: int) -> list[str]:
         p = r.get("p_zero")
         rows.append((symbol(r["name"]), number.value, said, number.unit, "not significant" if p is not None and p > 0.05 else ""))
     widths = [max((len(row[i]) for row in rows), default=0) for i in range(4)]
-    return [
-        f"  {a:<{widths[0]}}  {b:>{widths[1]}} {c:<{widths[2]}}  {d:<{widths[3]}}  {e}".rstrip() for a, b, c, d, e in rows
-    ]
+    return [f"  {a:<{widths[0]}}  {b:>{widths[1]}} {c:<{widths[2]}}  {d:<{widths[3]}}  {e}".rstrip() for a, b, c, d, e in rows]
