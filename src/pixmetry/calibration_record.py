@@ -126,17 +126,15 @@ def _record(calibration: Calibration) -> dict[str, Any]:
 
 def _control_record(calibration: Calibration) -> dict[str, Any]:
     """Coordinates that were given with an uncertainty, given less adjusted, and that over the uncertainty that was stated."""
-    control = control_of(calibration.adjustment)
+    control = control_of(calibration)
     names = calibration.adjustment.network.points
-    raised = ((calibration.tests.get("known") or {}).get("control_points") or {}).get("raised") or {}
-    u = [raised.get(f"{names[k]} {'XYZ'[axis]}", u) for k, axis, u in zip(control.point, control.axis, control.u, strict=True)]
     return {
         "point": [names[k] for k in control.point],
         "axis": ["XYZ"[k] for k in control.axis],
         "given": control.given,
-        "u": u,
+        "u": control.u,
         "residual": control.residual,
-        "ratio": [r / s if s else None for r, s in zip(control.residual, u, strict=True)],
+        "ratio": np.divide(control.residual, control.u, out=np.full(len(control), np.nan), where=control.u > 0),
     }
 
 

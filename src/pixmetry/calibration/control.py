@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pixmetry.calibration.network import Adjustment
+from pixmetry.calibration.network import Calibration
 
 
 @dataclass(frozen=True)
@@ -19,7 +19,9 @@ class Control:
     axis : ndarray of int, shape (m,)
         0, 1, 2 for X, Y, Z.
     given, u, residual : ndarray, shape (m,)
-        In the object's unit; the residual is given less adjusted.
+        In the object's unit; the residual is given less adjusted, NaN of points of which no image point is left.
+    raised : ndarray of bool, shape (m,)
+        Those that weighed less than their u says, for the network contradicts them.
     """
 
     point: np.ndarray
@@ -27,23 +29,23 @@ class Control:
     given: np.ndarray
     u: np.ndarray
     residual: np.ndarray
+    raised: np.ndarray
 
     def __len__(self) -> int:
         return len(self.point)
 
-    @property
-    def ratio(self) -> np.ndarray:
-        """Residuals over the uncertainty that was stated."""
-        return self.residual / self.u
 
+def control_of(calibration: Calibration) -> Control:
+    """Given less adjusted coordinates of all weighted control points, point by point, with the uncertainties that were stated.
 
-def control_of(adjustment: Adjustment) -> Control:
-    """Given less adjusted coordinates of all weighted control points that took part, point by point.
-
-    A control point that the network contradicts has been set free and is among the gross errors instead.
+    A control point that the network contradicts has been set free and is among the gross errors instead, or weighs less.
     """
-    network, found = adjustment.network, adjustment.state.xyz
+    network, found = calibration.adjustment.network, calibration.adjustment.state.xyz
     weighted = np.isfinite(network.u_xyz) & (network.u_xyz > 0) & np.isfinite(network.xyz) & np.isfinite(found)
     point, axis = np.nonzero(weighted)
-    given = network.xyz[weighted]
-    return Control(point, axis, given, network.u_xyz[weighted], given - found[weighted])
+    names = [f"{network.points[k]} {'XYZ'[a]}" for k, a in zip(point, axis, strict=True)]
+    raised = ((calibration.tests.get("known") or {}).get("control_points") or {}).get("raised") or {}
+    stated = np.array([raised.get(name, u) for name, u in zip(names, network.u_xyz[weighted], strict=True)], float)
+    rays = np.bincount(network.point[calibration.adjustment.used], minlength=len(network.points))
+    residual = np.where(rays[point] > 0, network.xyz[weighted] - found[weighted], np.nan)
+    return Control(point, axis, network.xyz[weighted], stated, residual, np.array([name in raised for name in names], bool))

@@ -20,22 +20,19 @@ def control_points(calibration: Calibration) -> list[list[str]]:
 
     What no image point is left of has no adjusted value; what weighs less now, for the network contradicts it, is marked.
     """
-    network, control = calibration.adjustment.network, control_of(calibration.adjustment)
-    rays = np.bincount(network.point[calibration.adjustment.used], minlength=len(network.points))
-    known = (calibration.tests.get("known") or {}).get("control_points") or {}
-    gross, raised = list(known.get("gross") or ()), known.get("raised") or {}
+    network, control = calibration.adjustment.network, control_of(calibration)
+    gross = list(((calibration.tests.get("known") or {}).get("control_points") or {}).get("gross") or ())
     rows = [_left_out(record) for record in gross if record.get("left_out")]
     contradicted = {record["name"] for record in gross}
     for k in range(len(control)):
         name = f"{network.points[control.point[k]]} {'XYZ'[control.axis[k]]}"
-        u, residual = float(raised.get(name, control.u[k])), float(control.residual[k])
-        given = placed(float(control.given[k]), u or float(control.u[k]))
+        u, residual = float(control.u[k]), float(control.residual[k])
         cells = [_two_digits(residual), fixed(residual / u, 1) if u else NONE]
-        if name in raised:
+        if control.raised[k]:
             name += " (contradicted, weighs less)" if name in contradicted else " (weighs less)"
-        if not rays[control.point[k]]:
+        if np.isnan(residual):
             name, cells = f"{name} (no image point left)", [NONE, NONE]
-        rows.append([name, given, f"± {placed(u, u)}" if u else "fixed", *cells])
+        rows.append([name, placed(float(control.given[k]), u), f"± {placed(u, u)}" if u else "fixed", *cells])
     return rows
 
 
