@@ -57,10 +57,6 @@ def check_network(network: Network) -> tuple[Finding, ...]:
     if len(seldom):
         text = f"{many(len(seldom), 'point')} seen in one image only, without a part in the adjustment: {_named(network.points, seldom)}"
         findings.append(Finding("single_points", text, "take them from a second image, or give their coordinates"))
-    known = np.isfinite(network.xyz) & np.isfinite(network.u_xyz)
-    if not len(network.bars) and network.given.sum() < 3 and known.sum(axis=0).max() < 2:
-        text = f"nothing says how large the object is: lengths are in mean distances between the images, not in {network.unit}"
-        findings.append(Finding("no_scale", text, "give a scale bar, or the coordinates of two points", "warning"))
     return tuple(findings)
 
 

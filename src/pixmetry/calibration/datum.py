@@ -13,12 +13,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pixmetry.calibration.bundle_layout import Layout
-from pixmetry.calibration.network import State
+from pixmetry.calibration.bundle_layout import Layout, layout_of
+from pixmetry.calibration.network import Adjustment, State
 from pixmetry.core.errors import MeasureError
 
 GIVEN = 1e-8  # relative singular value above which control holds a direction
 ALIGN_STEPS = 50
+SOME_SCALE = 1e-6  # part of the scale in a motion of unit length that nothing holds
 
 
 @dataclass(frozen=True)
@@ -70,6 +71,14 @@ def datum_of(layout: Layout, start: State) -> Datum:
         carriers, named = _carriers(layout, start, generators(start.xyz, datum) @ np.linalg.svd(directions)[2][7 - missing :].T)
         datum = replace(datum, missing=missing, carriers=carriers, start=network.xyz if named else start.xyz)
     return replace(datum, text=_text(layout, datum, named))
+
+
+def scale_is_open(adjustment: Adjustment) -> bool:
+    """Whether neither control nor bars of an adjusted network say how large it is."""
+    layout = layout_of(adjustment.network, adjustment.state, adjustment.used)
+    datum = datum_of(layout, adjustment.state)
+    null = np.linalg.svd(_held_directions(layout, adjustment.state, datum))[2][7 - datum.missing :]
+    return bool((np.abs(null[:, 6]) > SOME_SCALE).any())
 
 
 def _carriers(layout: Layout, start: State, motion: np.ndarray) -> tuple[np.ndarray, bool]:

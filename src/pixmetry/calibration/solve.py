@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from pixmetry.calibration.model import NAMES
-from pixmetry.calibration.network import PER_IMAGE_NAMES, Calibration, Finding, Network, State
+from pixmetry.calibration.network import PER_IMAGE_NAMES, Adjustment, Calibration, Finding, Network, State
 from pixmetry.calibration.options import Options
 from pixmetry.calibration.settling import Progress, Settled, adjust_with, settle
 from pixmetry.core.errors import InputError, MeasureError
@@ -65,20 +65,25 @@ def calibrate_network(
     if options.residual_grid:
         tests["residual_grid"] = residual_grids(settled.adjustment)
     findings += [*more, *_findings(settled, tests)]
-    findings = _sized(findings, network, settled.adjustment.state) + pose_findings(network, settled.adjustment.state)
+    findings += _no_scale(network, settled.adjustment) + pose_findings(network, settled.adjustment.state)
     grids = tests.get("residual_grid", {})
     return Calibration(settled.adjustment, in_order(findings), tests, grids, {"options": asdict(options)})
 
 
-def _sized(findings: list[Finding], network: Network, state: State) -> list[Finding]:
-    """That nothing says how large the object is, is half true where start poses do."""
+def _no_scale(network: Network, adjustment: Adjustment) -> list[Finding]:
+    """That nothing, or nothing but the start poses, says how large the object is."""
+    from pixmetry.calibration.datum import scale_is_open
     from pixmetry.calibration.posed_start import to_their_frame
 
-    found = to_their_frame(network, state)
-    if found is None or not 1 / SIZED < found[0] < SIZED:
-        return findings
-    text = "nothing but the start poses says how large the object is: lengths are as good as these"
-    return [replace(found, text=text) if found.kind == "no_scale" else found for found in findings]
+    if network.given.sum() >= 3 or not scale_is_open(adjustment):
+        return []
+    found = to_their_frame(network, adjustment.state)
+    text = f"nothing says how large the object is: lengths are in mean distances between the images, not in {network.unit}"
+    if found is not None and 1 / SIZED < found[0] < SIZED:
+        text = "nothing but the start poses says how large the object is: lengths are as good as these"
+    elif np.isfinite(network.u_xyz).any():
+        text = f"what is known of the points does not say how large the object is: lengths are not in {network.unit}"
+    return [Finding("no_scale", text, "give a scale bar, or the coordinates of two points", "warning")]
 
 
 def _from_start(network: Network, start: State | None, options: Options, say: Progress) -> Settled:
