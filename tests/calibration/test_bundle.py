@@ -168,7 +168,8 @@ def test_agrees_with_dense_least_squares(name, rng, monkeypatch):
     Q, missing = bordered(A, oracle.conditions(), in_datum)
     defects = {"free, inner constraints for all seven": 7, "two bars": 6, "one fixed point": 4, "all heights fixed": 3}
     assert missing == defects.get(name, missing)
-    assert abs(v @ A @ Q @ (A.T @ v)) < 1e-5, "the cost has no minimum where it should"
+    # the rule to stop leaves less than the last step gained; a wrong derivative leaves some 1
+    assert abs(v @ A @ Q @ (A.T @ v)) < bundle.SMALL * both[0].sigma0 ** 2, "the cost has no minimum where it should"
     units = oracle.units()
     for found in both:
         assert (found.used == used).all()

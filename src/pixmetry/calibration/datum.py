@@ -9,6 +9,7 @@ that carry the datum (W. Baarda, S-transformations and criterion matrices, 1973)
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,7 +19,7 @@ from pixmetry.calibration.network import Adjustment, State
 from pixmetry.core.errors import MeasureError
 
 GIVEN = 1e-8  # relative singular value above which control holds a direction
-ALIGN_STEPS = 50
+ALIGN_STEPS, ALIGNED = 50, 1e-10  # at most; a last step, in sizes of the network
 SOME_SCALE = 1e-6  # part of the scale in a motion of unit length that nothing holds
 
 
@@ -151,23 +152,20 @@ def aligned(layout: Layout, state: State, datum: Datum) -> State:
     """The state moved along the null space so that its carriers stay, in the mean, at their start."""
     if datum.missing == 0:
         return state
-    from scipy.linalg import expm
-
     control = _control(layout)
     held = state.xyz[control]
-    for _ in range(ALIGN_STEPS):
-        basis = np.linalg.svd(_held_directions(layout, state, datum))[2][7 - datum.missing :].T
-        G = generators(state.xyz, datum)[datum.carriers] @ basis
-        gap = (datum.start - state.xyz)[datum.carriers]
-        step = basis @ np.linalg.lstsq(G, gap, rcond=None)[0]
-        step *= _share(step, datum)
+
+    def step_from(now: State) -> np.ndarray:
+        basis = np.linalg.svd(_held_directions(layout, now, datum))[2][7 - datum.missing :].T
+        G = generators(now.xyz, datum)[datum.carriers] @ basis
+        gap = (datum.start - now.xyz)[datum.carriers]
+        step = _limited(basis @ np.linalg.lstsq(G, gap, rcond=None)[0], datum)
         if len(held):  # the last motion left them at rest to first order only
-            back = np.concatenate([held - state.xyz[control], np.zeros(min(1, len(layout.bars)))])
-            step += np.linalg.lstsq(np.concatenate(_held_rows(layout, state, datum)), back, rcond=GIVEN)[0]
-        state = _moved(state, step, datum, expm)
-        if np.abs(step).max() < 1e-12 * datum.size:
-            break
-    return state
+            back = np.concatenate([held - now.xyz[control], np.zeros(min(1, len(layout.bars)))])
+            step += np.linalg.lstsq(np.concatenate(_held_rows(layout, now, datum)), back, rcond=GIVEN)[0]
+        return step
+
+    return _settled(state, datum, step_from)
 
 
 def nearest_to_control(layout: Layout, state: State, datum: Datum) -> State:
@@ -179,24 +177,31 @@ def nearest_to_control(layout: Layout, state: State, datum: Datum) -> State:
     some = weight > 0
     if not some.any() or (layout.held & layout.determined[:, None]).any():
         return state
+    free = 6 if len(layout.bars) else 7
+
+    def step_from(now: State) -> np.ndarray:
+        rows = (weight[:, :, None] * generators(now.xyz, datum))[some][:, :free]
+        gap = (weight * (layout.network.xyz - now.xyz))[some]
+        return _limited(np.pad(np.linalg.lstsq(rows, gap, rcond=GIVEN)[0], (0, 7 - free)), datum)
+
+    return _settled(state, datum, step_from)
+
+
+def _settled(state: State, datum: Datum, step_from: Callable[[State], np.ndarray]) -> State:
+    """The state after similarities, one after the other, until they move nothing."""
     from scipy.linalg import expm
 
-    free = 6 if len(layout.bars) else 7
     for _ in range(ALIGN_STEPS):
-        rows = (weight[:, :, None] * generators(state.xyz, datum))[some][:, :free]
-        gap = (weight * (layout.network.xyz - state.xyz))[some]
-        step = np.zeros(7)
-        step[:free] = np.linalg.lstsq(rows, gap, rcond=GIVEN)[0]
-        step *= _share(step, datum)
+        step = step_from(state)
         state = _moved(state, step, datum, expm)
-        if np.abs(step).max() < 1e-9 * datum.size:
+        if np.abs(step).max() < ALIGNED * datum.size:
             break
     return state
 
 
-def _share(step: np.ndarray, datum: Datum) -> float:
-    """What part of a step turns by no more than half a radian, and scales by no more than a half."""
-    return min(1.0, 0.5 / max(np.abs(step[3:]).max() / datum.size, 1e-300))
+def _limited(step: np.ndarray, datum: Datum) -> np.ndarray:
+    """What of a step turns by no more than half a radian, and scales by no more than a half."""
+    return step * min(1.0, 0.5 / max(np.abs(step[3:]).max() / datum.size, 1e-300))
 
 
 def _moved(state: State, step: np.ndarray, datum: Datum, expm) -> State:
