@@ -290,12 +290,21 @@ def test_a_mistake_about_points_is_told(tmp_path: Path, points: str, more: str, 
         ("point,X,Y,Z,u_X,u_Y,u_Z\n7,0,0,,0,0,0\n", "", ("check.csv, line 2", "u_Z of a coordinate that is empty")),
         ("point,X,Y\n7,0,0\n", "", ("'Z' is missing",)),
         ("point,X,Y,Z\n7,0,0,0\n", ", known: fixed", ("unknown key 'check_points.known'",)),
+        ("point,X,Y,Z\n7,0,0,0\n", ", u: -0.1", ("'check_points.u'", "-0.1")),
     ],
 )
 def test_a_mistake_about_check_points_is_told(tmp_path: Path, check: str, more: str, words: tuple[str, ...]) -> None:
     points = "point,X,Y,Z\n1,0,0,0\n2,,5,\n"
     tail = f"points: {{table: p.csv, known: fixed}}\ncheck_points: {{table: check.csv{more}}}\n"
     refused(tmp_path, GOOD + tail, *words, o=rows(), p=points, check=check)
+
+
+@pytest.mark.parametrize("u", [0, 0.3])
+def test_check_points_without_columns_of_u(tmp_path: Path, u: float) -> None:
+    text = f"{GOOD}check_points: {{table: check.csv, u: {u}}}\n"
+    checks = load_project(write(tmp_path, text, o=rows(), check="point,X,Y,Z\n7,1,2,3\n")).check_points
+    assert checks is not None
+    np.testing.assert_array_equal(checks.u_xyz, [[u] * 3])
 
 
 def test_check_points_are_not_known(tmp_path: Path) -> None:
@@ -409,6 +418,15 @@ def test_a_few_places_outside_of_the_frame_are_left_to_the_adjustment(tmp_path: 
     cameras = "cameras:\n- {name: L, cols: 640, rows: 480}\n- {name: R, cols: 640, rows: 480}\nobservations: o.csv\nimages: i.csv\n"
     images = "image,camera\na,L\nb,L\nc,R\n"
     refused(tmp_path, cameras, "line 7", "outside", o=rows() + "c,1,640.0,3000\n", i=images)
+
+
+@pytest.mark.parametrize("key", ["K1", "K2", "K3", "K4", "K5", "P1", "P2"])
+def test_capitals_of_the_lens_are_led_to_our_names(tmp_path: Path, key: str) -> None:
+    camera = CAMERA.replace("c_mm: 8", f"c_mm: 8, {key}: 0.01")
+    path = write(tmp_path, camera + "observations: o.csv\n", o=rows())
+    with pytest.raises(InputError, match=f"unknown key '{key}'.*write `{key.lower()}`.*Values of another program") as caught:
+        load_project(path)
+    assert "delete" not in str(caught.value)
 
 
 @pytest.mark.parametrize("direction", ["image_to_object", "object_to_image"])

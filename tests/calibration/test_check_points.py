@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ import pixmetry
 from calibration.adjusted import measured_again
 from calibration.networks import Simulated, predicted, simulate
 from pixmetry.calibration.bundle import adjust
-from pixmetry.calibration.check_points import CheckPoints, check_findings, check_record, joint_covariance
+from pixmetry.calibration.check_points import CheckPoints, _text, _turned, check_findings, check_record, joint_covariance
 from pixmetry.calibration.network import Adjustment, Network, State
 from pixmetry.core.errors import InputError
 
@@ -204,6 +205,48 @@ def test_the_found_points_are_in_the_frame_of_the_check_points(rng: np.random.Ge
     np.testing.assert_allclose((u**2).sum(axis=1), expected, rtol=1e-4)
 
 
+@pytest.mark.parametrize("kind", ["heights", "free with bars", "free"])
+@pytest.mark.parametrize("partly", [False, True], ids=["whole", "partly known"])
+def test_the_origin_may_be_far_away(rng: np.random.Generator, kind: str, partly: bool) -> None:
+    """Check points in the coordinates of a country, in mm: whatever of them nothing else gives changes nothing but the found points.
+
+    Coordinates of 10⁹ are rounded by 6e-8, a hundred-thousandth of what points are known to.
+    """
+    simulated = world(rng, kind)
+    adjustment = measured(rng, kind, simulated, predicted(simulated.network, simulated.truth))
+    checks = given(rng, simulated, rng.choice(np.arange(12, 40), 9, replace=False))
+    if partly:
+        checks.xyz[::3, 2], checks.xyz[1::3, :2] = np.nan, np.nan
+    near = check_record(adjustment, checks)
+    assert near["datum_parameters"] == KINDS[kind]
+    for size in (5e6, 1e9):
+        far_away = size * rng.choice([-1.0, 1.0], 3) * rng.uniform(0.1, 1, 3) * (1, 1, kind != "heights")
+        far = check_record(adjustment, replace(checks, xyz=checks.xyz + far_away))
+        assert [far[key] for key in ("n", "dof", "datum_parameters")] == [near[key] for key in ("n", "dof", "datum_parameters")]
+        assert far["chi2"] == pytest.approx(near["chi2"], rel=1e-3) and far["p"] == pytest.approx(near["p"], rel=1e-2)
+        for key, offset in (("found", far_away), ("u_found", 0.0), ("difference", 0.0), ("u_difference", 0.0)):
+            values = [np.array([point[key] for point in record["points"]]) for record in (near, far)]
+            np.testing.assert_allclose(values[1] - offset, values[0], atol=2e-6, err_msg=key)
+
+
+@pytest.mark.parametrize("factor", [1e-10, 1e6])
+def test_a_free_network_may_be_of_any_size(rng: np.random.Generator, factor: float) -> None:
+    simulated = world(rng, "free")
+    network = measured_again(rng, simulated, predicted(simulated.network, simulated.truth))
+    checks = given(rng, simulated, rng.choice(np.arange(12, 40), 9, replace=False))
+    truth = simulated.truth
+    scaled = replace(truth, xyz=factor * truth.xyz, position=factor * truth.position)
+    same, found = (check_record(adjust(network, state), checks) for state in (truth, scaled))
+    assert found["datum_parameters"] == 7 and found["dof"] == same["dof"] and found["chi2"] == pytest.approx(same["chi2"], rel=1e-3)
+
+
+def test_a_similarity_of_many_points(rng: np.random.Generator) -> None:
+    """Against the product with a matrix of blocks; of 1500 points this one has 160 MB, and nothing beside the covariance is larger."""
+    A, turn = rng.standard_normal((30, 30)), rng.standard_normal((3, 3))
+    blocks = np.kron(np.eye(10), turn)
+    np.testing.assert_allclose(_turned(A @ A.T, turn), blocks @ A @ A.T @ blocks.T, atol=1e-9)
+
+
 @pytest.mark.parametrize(
     ("kind", "count", "told"), [("free", 3, False), ("free with bars", 3, False), ("free", 4, True), ("control", 1, True)]
 )
@@ -233,6 +276,39 @@ def test_points_that_are_not_determined_are_named(rng: np.random.Generator) -> N
     assert record["n"] == 3 and [point["images"] > 0 for point in record["points"]] == [True, False]
 
 
+@pytest.mark.parametrize("empty", [1, 3])
+def test_rows_without_coordinates_are_not_taken_for_undetermined(rng: np.random.Generator, empty: int) -> None:
+    simulated = world(rng, "control")
+    adjustment = adjust(simulated.network, simulated.truth)
+    checks = given(rng, simulated, np.array([20, 21, 22]))
+    checks.xyz[:empty] = np.nan
+    record = check_record(adjustment, checks)
+    found = [finding for finding in check_findings(record) if "contradict" not in finding.text]
+    assert [finding.level for finding in found] == ["warning" if empty == 3 else "note"]
+    assert found[0].text.startswith(f"{empty} of 3 check points {'is' if empty == 1 else 'are'} without coordinates: T21")
+    assert "not determined" not in found[0].text and ("could be compared" in record["text"]) == (empty == 3)
+
+
+def test_lists_will_do(rng: np.random.Generator) -> None:
+    simulated = world(rng, "control")
+    adjustment = adjust(simulated.network, simulated.truth)
+    checks = given(rng, simulated, np.array([20, 21]))
+    assert checks.u_xyz is not None
+    listed = CheckPoints(list(checks.names), checks.xyz.tolist(), checks.u_xyz.tolist())  # type: ignore[arg-type]
+    assert check_record(adjustment, listed)["chi2"] == check_record(adjustment, checks)["chi2"] and listed.names == checks.names
+    exact = CheckPoints(["T21"], [[1, 2, None]])  # type: ignore[arg-type, list-item]
+    np.testing.assert_array_equal(exact.xyz, [[1, 2, np.nan]])
+    np.testing.assert_array_equal(exact.u_xyz, [[0, 0, 0]])
+
+
+@pytest.mark.parametrize(
+    ("value", "text"), [(0.4, "0.40"), (0.04, "0.040"), (0.0996, "0.10"), (3, "3.0"), (9.96, "10"), (12.3, "12"), (2345, "2300")]
+)
+def test_two_digits_are_said(value: float, text: str) -> None:
+    record = {"n": 3, "rms": [value, np.nan, np.nan], "expected_rms": [value] * 3, "datum_parameters": 0, "unit": "mm", "p": None}
+    assert f" {text} mm rms" in _text(record, 1).replace("X ", "")
+
+
 def test_the_argument_of_calibrate(rng: np.random.Generator) -> None:
     simulated = world(rng, "control", images=12)
     checks = given(rng, simulated, np.arange(20, 30))
@@ -254,8 +330,11 @@ def test_the_argument_of_calibrate(rng: np.random.Generator) -> None:
         ("aa", np.zeros((2, 3)), None),
         ("ab", np.full((2, 3), np.inf), None),
         ("ab", np.zeros((2, 3)), -np.ones((2, 3))),
+        ("ab", np.zeros((2, 3)), np.zeros(2)),
+        ("ab", [[1, 2, 3], [1, 2]], None),
+        ("ab", [[1, 2, "3 mm"], [1, 2, 3]], None),
     ],
 )
-def test_what_cannot_be_check_points_is_refused(names: str, xyz: np.ndarray, u: np.ndarray | None) -> None:
+def test_what_cannot_be_check_points_is_refused(names: str, xyz: Any, u: np.ndarray | None) -> None:
     with pytest.raises(InputError, match="check points"):
         CheckPoints(tuple(names), xyz, u)

@@ -4,20 +4,25 @@ Given less found has the covariance Σ = C + diag(u²). C is the joint one of al
 point x and the reduced unknowns y, whose covariance is Q, that of points i and j is Vᵢ⁻¹ Wᵢᵀ Q Wⱼ Vⱼ⁻¹, and Vᵢ⁻¹ besides where i = j
 (K. R. Koch, Parameter Estimation and Hypothesis Testing in Linear Models, 1999, 3.2). Where neither control nor bars give the whole datum,
 a similarity of the parameters that are missing first brings the network to the check points, by generalised least squares; what is left
-has the covariance Σ − G (Gᵀ Σ⁻¹ G)⁻¹ Gᵀ, which does not depend on the datum of C.
+has the covariance Σ − G (Gᵀ Σ⁻¹ G)⁻¹ Gᵀ, which does not depend on the datum of C. Along axes of which the network knows no coordinate, the
+check points are shifted to it before: far from the origin, a shift and a rotation about the network's own middle could not be told apart.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pixmetry.calibration.network import Adjustment, Calibration, Finding, Network, State
 from pixmetry.calibration.quality import p_words, plain
 from pixmetry.core.errors import InputError
+
+if TYPE_CHECKING:
+    from pixmetry.calibration.bundle_layout import Layout
+    from pixmetry.calibration.datum import Datum
 
 RARE = 0.001  # level of the tests: of all coordinates together, and of the worst one
 LEAST_LEFT = 4  # coordinates over what the missing datum takes: with fewer nothing is said
@@ -35,10 +40,15 @@ class CheckPoints:
     Parameters
     ----------
     names : tuple of str
-    xyz : ndarray, shape (points, 3)
+    xyz : array_like, shape (points, 3)
         In the object's unit; NaN: not known.
-    u_xyz : ndarray, shape (points, 3), optional
+    u_xyz : array_like, shape (points, 3), optional
         Standard uncertainties; without them the coordinates are exact.
+
+    Raises
+    ------
+    InputError
+        If names are given twice, shapes differ, or a value cannot be used.
     """
 
     names: tuple[str, ...]
@@ -46,13 +56,18 @@ class CheckPoints:
     u_xyz: np.ndarray | None = None
 
     def __post_init__(self) -> None:
-        shape, u = (len(self.names), 3), np.zeros_like(self.xyz) if self.u_xyz is None else self.u_xyz
-        u = np.where(np.isfinite(self.xyz), u, 0.0)
-        good = np.shape(self.xyz) == np.shape(u) == shape and not np.isinf(self.xyz).any() and bool((np.isfinite(u) & (u >= 0)).all())
-        if not good or len(set(self.names)) < len(self.names):
+        names, good = tuple(self.names), False
+        try:
+            xyz = np.asarray(self.xyz, float)
+            u = np.where(np.isfinite(xyz), np.asarray(0.0 if self.u_xyz is None else self.u_xyz, float), 0.0)
+            good = xyz.shape == u.shape == (len(names), 3) and not np.isinf(xyz).any() and bool((np.isfinite(u) & (u >= 0)).all())
+        except (TypeError, ValueError):  # no numbers, or rows of unequal length
+            pass
+        if not good or len(set(names)) < len(names):
             allowed = "names that differ, and for each X, Y, Z (NaN: not known) with uncertainties of at least 0"
             raise InputError("these cannot be check points", where="check_points", allowed=allowed)
-        object.__setattr__(self, "u_xyz", u)
+        for key, value in (("names", names), ("xyz", xyz), ("u_xyz", u)):
+            object.__setattr__(self, key, value)
 
 
 def refuse_known(network: Network, checks: CheckPoints) -> None:
@@ -156,20 +171,42 @@ def _compared(
     layout = layout_of(adjustment.network, adjustment.state, adjustment.used)
     state, turn, G = adjustment.state, np.eye(3), np.zeros((int(known.sum()), 0))
     own, datum = joint_covariance(adjustment, points, a_priori=a_priori), datum_of(layout, state)
+    shift = _open_shift(layout, datum, given, known)
+    given = given - shift
     found = given
     for _ in range(ROUNDS if datum.missing else 1):
         if datum.missing:
             state = _brought(layout, state, datum, points, found, known)
             there = layout.determined
             scale, rotation, _ = similarity(adjustment.state.xyz[there], state.xyz[there])
+            datum = _about(datum, state.xyz[points])
             turn, G = scale * rotation, generators(state.xyz[points], datum)[known] @ null_space(layout, state, datum)[2]
-        turns = np.kron(np.eye(len(points)), turn)
-        sigma = (turns @ own @ turns.T)[np.ix_(known.ravel(), known.ravel())] + np.diag(u[known] ** 2)
+        sigma = _turned(own, turn)[np.ix_(known.ravel(), known.ravel())] + np.diag(u[known] ** 2)
         off, covariance, rank, chi2 = _less_fitted((given - state.xyz[points])[known], sigma, G)
         found = state.xyz[points].copy()
         found[known] = given[known] - off
     u_found = np.sqrt(np.diagonal(turn @ adjustment.point_covariance[points] @ turn.T, axis1=1, axis2=2))
-    return found, u_found, off, covariance, rank, chi2
+    return found + shift, u_found, off, covariance, rank, chi2
+
+
+def _open_shift(layout: Layout, datum: Datum, given: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """From the network's middle to that of the check points, along the axes of which the network knows no coordinate, shape (3,)."""
+    closed = np.isfinite(layout.network.u_xyz[layout.determined]).any(axis=0) | ~known.any(axis=0)
+    middle = np.where(known, given, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
+    return np.where(closed, 0.0, middle - datum.middle)
+
+
+def _about(datum: Datum, points: np.ndarray) -> Datum:
+    """The datum with generators about some points, of their size: so they are told apart in whatever units the network has been."""
+    middle = points.mean(axis=0)
+    return replace(datum, middle=middle, size=float(np.sqrt(((points - middle) ** 2).sum(axis=1).mean())) or 1.0)
+
+
+def _turned(covariance: np.ndarray, turn: np.ndarray) -> np.ndarray:
+    """Covariance (3 points, 3 points) of points that are all multiplied by one matrix."""
+    for _ in range(2):  # from the right, then what is turned over from the right, too
+        covariance = (covariance.reshape(-1, 3) @ turn.T).reshape(covariance.shape).T
+    return covariance
 
 
 def _less_fitted(off: np.ndarray, sigma: np.ndarray, G: np.ndarray) -> tuple[np.ndarray, np.ndarray, int, float]:
@@ -183,7 +220,7 @@ def _less_fitted(off: np.ndarray, sigma: np.ndarray, G: np.ndarray) -> tuple[np.
     return off, sigma - G @ inner @ G.T, G.shape[1], float(off @ weight @ off)
 
 
-def _brought(layout: Any, state: State, datum: Any, points: np.ndarray, given: np.ndarray, known: np.ndarray) -> State:
+def _brought(layout: Layout, state: State, datum: Datum, points: np.ndarray, given: np.ndarray, known: np.ndarray) -> State:
     """The network moved to the check points along what nothing else gives."""
     from pixmetry.calibration.datum import aligned
     from pixmetry.calibration.resection import similarity
@@ -228,9 +265,9 @@ def joint_covariance(adjustment: Adjustment, points: np.ndarray, *, a_priori: bo
 
 def _text(record: Mapping[str, Any], points: int) -> str:
     if not record["n"]:
-        return "no check point was determined"
+        return "no coordinate of a check point could be compared"
     rms, expected = (
-        ", ".join(f"{axis} {plain(v, 2)}" for axis, v in zip("XYZ", record[key], strict=True) if np.isfinite(v)) for key in RMS
+        ", ".join(f"{axis} {_two_digits(v)}" for axis, v in zip("XYZ", record[key], strict=True) if np.isfinite(v)) for key in RMS
     )
     noun, unit = "check point" if points == 1 else "check points", record["unit"]
     text = f"{points} {noun} with {record['n']} coordinates: given less found {rms} {unit} rms"
@@ -239,6 +276,11 @@ def _text(record: Mapping[str, Any], points: int) -> str:
     if record["p"] is None:
         return f"{text}; so few check points say nothing about a network without a datum of its own"
     return f"{text}, expected {expected} {unit}; {_chi2(record)}; largest: {_worst(record)}"
+
+
+def _two_digits(value: float) -> str:
+    """A length to two digits, a zero at the end among them: 0.40 mm."""
+    return plain(value, 2) if abs(value) >= 10 else f"{value:#.2g}".rstrip(".")
 
 
 def _chi2(record: Mapping[str, Any]) -> str:
@@ -251,14 +293,19 @@ def _worst(record: Mapping[str, Any], critical: str = "") -> str:
 
 
 def check_findings(record: Mapping[str, Any]) -> list[Finding]:
-    """Which check points are not determined, and a warning where they contradict the network."""
+    """Which check points have no coordinates or are not determined, and a warning where they contradict the network."""
     found = []
-    lost = [point["name"] for point in record["points"] if not np.isfinite(point["found"]).all()]
-    if lost:
-        named = ", ".join(lost[:NAMED]) + (" …" if len(lost) > NAMED else "")
-        text = f"{len(lost)} of {len(record['points'])} check points are not determined: {named}."
-        advice = "See them in two images or more, and compare their names with those of the image coordinates."
-        found.append(Finding("check_points", text, advice, "note" if record["n"] else "warning"))
+    some = [(point, bool(np.isfinite(point["given"]).any())) for point in record["points"]]
+    empty = [point["name"] for point, known in some if not known]
+    lost = [point["name"] for point, known in some if known and not np.isfinite(point["found"]).all()]
+    for names, what, advice in (
+        (empty, "without coordinates", "Fill in X, Y or Z; a row without them compares nothing."),
+        (lost, "not determined", "See them in two images or more, and compare their names with those of the image coordinates."),
+    ):
+        if names:
+            named = ", ".join(names[:NAMED]) + (" …" if len(names) > NAMED else "")
+            text = f"{len(names)} of {len(some)} check points {'is' if len(names) == 1 else 'are'} {what}: {named}."
+            found.append(Finding("check_points", text, advice, "note" if record["n"] else "warning"))
     worst = record["worst"]
     if worst is None:
         return found

@@ -25,9 +25,11 @@ OTHER_NAMES = {  # of the same parameters in certificates and other programs, an
 CAPITALS = {
     name: f"`p{name[1]}` where it is decentring (beside A1, C1), `b{name[1]}` where it is affinity or shear" for name in ("B1", "B2")
 }
+CAPITALS |= {name.upper(): f"`{name}`" for name in NAMES if name[0] in "kp"}  # as formulas have them
 LINE_OPTIONS = ("options.loss", "options.loss_scale", "options.snoop")  # those that mean something for straight lines
 
 Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
 Size = Annotated[int, Field(ge=1, le=1_000_000)]
 Pitch = Annotated[float, Field(gt=0, lt=1000)]  # µm
 # names of points and images may look like numbers
@@ -124,9 +126,9 @@ class PointsModel(TableModel):
 
 
 class CheckPointsModel(TableModel):
-    """Object points that are compared with the result: point, X, Y, Z."""
+    """Object points that are compared with the result: point, X, Y, Z; u 0: exact."""
 
-    u: Positive | None = None
+    u: NotNegative | None = None
 
 
 class LinesModel(TableModel):
