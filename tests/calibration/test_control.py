@@ -16,8 +16,9 @@ from pixmetry.calibration.findings import findings_of, gross_error_findings, kno
 from pixmetry.calibration.known_residuals import Known, contradicted, control_residuals, group_record, jointly, rivals
 from pixmetry.calibration.lost_control import lost_records, mostly_lost, set_free, where_seen, wrong_known
 from pixmetry.calibration.network import Calibration, Finding, ScaleBars
-from pixmetry.calibration.records import sizes
+from pixmetry.calibration.records import known_record, sizes
 from pixmetry.calibration.solve import Options, calibrate_network
+from pixmetry.core.errors import InputError
 from pixmetry.report.calibration_control import control_points
 from pixmetry.report.calibration_tables import scale_bars
 
@@ -292,7 +293,138 @@ def test_exchanged_control_points_are_called_so(rng):
         assert any(f"control point T{a + 1} " in text and f"lies where T{b + 1} should be" in text for text in said)
 
 
+# --- held coordinates beside others
+
+
+def held_beside(rng: np.random.Generator, u: np.ndarray, bars: int, images: int = 10, points: int = 50) -> Simulated:
+    """The first points have these uncertainties, of which 0 is held and exact; nothing is said of coordinates that are not known."""
+    simulated = simulate(rng, images=images, points=points, bars=bars)
+    all_u = np.full((points, 3), np.inf)
+    all_u[: len(u)] = u
+    finite = np.isfinite(all_u)
+    given = np.where(finite, simulated.truth.xyz + np.where(finite, all_u, 0.0) * rng.normal(size=all_u.shape), np.nan)
+    return replace(simulated, network=replace(simulated.network, xyz=given, u_xyz=all_u))
+
+
+def heights(n: int) -> np.ndarray:
+    return np.where(np.arange(3) == 2, 0.0, np.full((n, 3), np.inf))
+
+
+def one_held(n: int) -> np.ndarray:
+    return np.where(np.arange(n)[:, None] == 0, 0.0, np.full((n, 3), U_MM))
+
+
+def of_all_kinds() -> np.ndarray:
+    """Two points held, heights and plan positions with weights, a height held beside weights, whole points with weights."""
+    u = np.full((12, 3), U_MM)
+    u[:2], u[2, :2], u[3, 2], u[4, 2] = 0.0, np.inf, np.inf, 0.0
+    return u
+
+
+MIXTURES = [(heights(10), 2, 1, 2), (heights(10), 0, 1, 2), (one_held(8), 2, 0, 0), (one_held(8), 0, 0, 1), (of_all_kinds(), 2, 1, 0)]
+MIXED = ["heights and bars", "heights", "one held and bars", "one held", "of all kinds"]
+
+
+@pytest.mark.parametrize(("u", "bars", "point", "axis"), MIXTURES, ids=MIXED)
+def test_a_wrong_held_coordinate_is_named_and_not_what_is_right_beside_it(rng, u, bars, point, axis):
+    """5 mm, some hundred times what a network of ten images at 0.04 px knows of it."""
+    simulated = wrong_by(held_beside(rng, u, bars), point, axis, 5.0)
+    calibration = calibrated(simulated)
+    network, records = calibration.adjustment.network, calibration.tests["known"]["control_points"]["gross"]
+    named = {name for record in records for name in (record["name"], *record["rivals"])}
+    assert f"T{point + 1} {'XYZ'[axis]}" in named and len(records) == 1 and len(network.bars) == bars
+    assert not calibration.tests["known"]["scale_bars"]["gross"] and calibration.adjustment.used.all()
+    (record,) = records
+    if record["left_out"]:
+        assert record["error"] == pytest.approx(5.0, abs=stats.norm.isf(RATE / 2) * 0.15)
+        others = np.arange(len(network.points)) != point
+        np.testing.assert_array_equal(network.u_xyz[others], simulated.network.u_xyz[others])
+    else:  # of heights that lie nearly in line it cannot be said which it is
+        assert record["rivals"]
+
+
+@pytest.mark.parametrize(("u", "bars", "point", "axis"), MIXTURES, ids=MIXED)
+def test_right_held_coordinates_stay_held(rng, u, bars, point, axis):
+    simulated = held_beside(rng, u, bars)
+    calibration = calibrated(simulated)
+    known = calibration.tests["known"]
+    assert not known["control_points"]["gross"] and not known["control_points"]["raised"] and known["untested"] is None
+    np.testing.assert_array_equal(calibration.adjustment.network.u_xyz, simulated.network.u_xyz)
+    assert calibration.adjustment.used.all() and len(calibration.adjustment.network.bars) == bars
+    fixed = known["fixed_points"]
+    assert fixed is None or fixed["p"] > RATE
+
+
+def in_metres(simulated: Simulated) -> Simulated:
+    b = simulated.network.bars
+    length = np.where(np.arange(len(b)) == 0, b.length / 1000, b.length)
+    return replace(simulated, network=replace(simulated.network, bars=ScaleBars(b.start, b.end, length, b.u)))
+
+
+LITTLE = [np.array([[np.inf, np.inf, U_MM]]), heights(3), np.full((1, 3), U_MM), np.zeros((1, 3))]
+
+
+@pytest.mark.parametrize("u", LITTLE, ids=["a height", "three heights held", "a point", "a point held"])
+def test_of_two_bars_in_different_units_neither_is_left_out_where_nothing_else_gives_the_scale(rng, u):
+    with pytest.raises(InputError, match="the two scale bars contradict"):
+        calibrated(in_metres(held_beside(rng, u, 2)))
+    calibration = calibrated(in_metres(held_beside(rng, u, 3)))
+    (record,) = calibration.tests["known"]["scale_bars"]["gross"]
+    assert record["left_out"] and len(calibration.adjustment.network.bars) == 2 and not gross(calibration)
+
+
+@pytest.mark.parametrize("u", [np.full((2, 3), U_MM), np.zeros((2, 3))], ids=["two points", "two points held"])
+def test_two_whole_points_tell_which_bar_is_in_other_units(rng, u):
+    simulated = in_metres(held_beside(rng, u, 2))
+    calibration = calibrate_network(simulated.network, QUICK)  # the wrong bar has its part in the start values
+    (record,) = calibration.tests["known"]["scale_bars"]["gross"]
+    b = simulated.network.bars
+    assert record["left_out"] and record["name"] == "–".join(simulated.network.points[k] for k in (b.start[0], b.end[0]))
+    assert calibration.adjustment.used.all()
+
+
 # --- what is said
+
+
+def test_the_error_of_a_whole_point_is_told_along_the_axis_of_it(rng):
+    """5 mm in X and almost as much in Y, of one held point: whichever test is worst, the larger one is said."""
+    simulated = wrong_by(wrong_by(held_beside(rng, one_held(8), 2), 0, 0, 5.0), 0, 1, 4.0)
+    (record,) = calibrated(simulated).tests["known"]["control_points"]["gross"]
+    assert record["name"] == "T1 X" and record["left_out"] and set(record) == {
+        "name", "residual", "error", "statistic", "critical", "left_out", "rivals", "swapped_with"
+    }  # fmt: skip
+    assert record["error"] == pytest.approx(5.0, abs=stats.norm.isf(RATE / 2) * 0.15)
+
+
+def test_what_is_left_out_in_the_end_is_said_once(rng):
+    simulated = with_control(rng, whole=5, images=6, points=30, noise_px=0.04, bars=2)
+    free = adjust(set_free(simulated.network, np.array([1])), simulated.truth, redundancy=True)
+    one = {"residual": 1.0, "error": 1.0, "statistic": 9.0, "critical": 4.0}
+    less, out = {**one, "left_out": False, "rivals": ["B"]}, {**one, "left_out": True, "rivals": []}
+    gross = {
+        "scale_bars": [{**less, "name": "A–B"}, {**less, "name": "C–D"}, {**out, "name": "A–B"}],
+        "control_points": [{**less, "name": "T1 X"}, {**less, "name": "T2 X"}, {**out, "name": "T2 Z"}],
+    }
+    found = known_record(free, gross)
+    assert [(r["name"], r["left_out"]) for r in found["scale_bars"]["gross"]] == [("C–D", False), ("A–B", True)]
+    assert [(r["name"], r["left_out"]) for r in found["control_points"]["gross"]] == [("T1 X", False), ("T2 Z", True)]
+
+
+@pytest.mark.parametrize("wrong", [0.0, 5.0])
+def test_bars_between_the_same_points_are_told_apart(rng, wrong):
+    """The first bar again with another uncertainty, right or wrong: nothing is raised, and each keeps what was stated of it."""
+    simulated = simulate(rng, images=10, points=50, bars=3)
+    b = simulated.network.bars
+    start, end, length = (np.append(v, v[0]) for v in (b.start, b.end, b.length))
+    length[3] += wrong
+    u = np.array([0.05, 0.02, 0.02, 0.03])
+    calibration = calibrated(replace(simulated, network=replace(simulated.network, bars=ScaleBars(start, end, length, u))))
+    known = calibration.tests["known"]["scale_bars"]
+    assert known["raised"] == {} and not any("weighs less" in row[0] for row in scale_bars(calibration))
+    bars = calibration.tests["network"]["scale_bars"]
+    ends = "–".join(simulated.network.points[k] for k in (start[0], end[0]))
+    assert [bar["u"] for bar in bars] == ([0.05, 0.02, 0.02] if wrong else [0.05, 0.02, 0.02, 0.03])
+    assert [r["name"] for r in known["gross"]] == ([f"{ends} (2)"] if wrong else [])
 
 
 def test_names_exchanged_throughout_are_said_once(rng):

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from pixmetry.calibration.fit_to_control import brought_to
 from pixmetry.calibration.hold_out import hold_out_record, left_out
 from pixmetry.calibration.network import Adjustment, Finding, Network
 from pixmetry.calibration.quality import p_words
@@ -36,8 +37,8 @@ class FieldCheck:
         deviations), ``rms_in_plane``, ``peak_in_plane``; ``f``, ``dof``, ``p`` of the F-test of the given coordinates; ``moved_xp_px``,
         ``moved_yp_px``, ``moved_c_px`` (free less fixed) with the formal ``u_xp_px``, ``u_yp_px``, ``u_c_px`` of the fixed solution, of the
         first camera, and of each in ``cameras``; ``points``: ``names``, nominal ``xyz``, deviations ``dx``, ``dy``, ``dz`` after the best
-        similarity and ``u_dx``, ``u_dy``, ``u_dz``, along the rows of ``axes`` (of a plane, z is its normal); ``text``. Only ``verdict``
-        and ``text`` where free points could not be tried or judged.
+        similarity and ``u_dx``, ``u_dy``, ``u_dz``, along the rows of ``axes`` (of a plane, z is its normal), NaN of coordinates that were
+        not given; ``text``. Only ``verdict`` and ``text`` where free points could not be tried or judged.
     hold_out : dict
         See `pixmetry.calibration.hold_out.hold_out_record`; empty if there are too few images.
     findings : tuple of Finding
@@ -75,16 +76,18 @@ def check_field(fixed: Adjustment, folds: int = 5, seed: int = 0, level: float =
     from pixmetry.calibration.bundle import adjust
 
     network = fixed.network
-    nominal = (network.u_xyz == 0).all(axis=1) & np.isin(np.arange(len(network.points)), network.point)
+    nominal = (network.u_xyz == 0).any(axis=1) & np.isin(np.arange(len(network.points)), network.point)
     if nominal.sum() < 4:
         raise InputError("no test field with given coordinates", where="field", value=int(nominal.sum()), allowed="4 fixed points")
     if nominal.sum() < LEAST_FIELD:
         return _kept(fixed, f"{int(nominal.sum())} points are too few to contradict each other", {})
-    released = replace(network, u_xyz=np.where(nominal[:, None], np.inf, network.u_xyz))
+    released = replace(network, u_xyz=np.where(network.u_xyz == 0, np.inf, network.u_xyz))
     try:
         free = adjust(released, fixed.state, used=fixed.used, redundancy=fixed.redundancy is not None)
     except MeasureError as reason:
         return _kept(fixed, f"the images do not carry free points: {reason}", {})
+    if fixed.dof - free.dof < 1:
+        return _kept(fixed, "they hold no more than origin, directions and scale", {})
     held = {}
     try:
         held = hold_out_record(left_out(fixed, folds, seed), left_out(free, folds, seed))
@@ -117,6 +120,8 @@ def _given_coordinates(fixed: Adjustment, free: Adjustment) -> tuple[float, tupl
 
 def _axes(nominal: np.ndarray) -> tuple[np.ndarray, bool]:
     """Rows: axes in which deviations are given; of a plane the last is its normal and the first lies nearest to the object's x."""
+    if not np.isfinite(nominal).all():  # points known in part: along the axes of the object
+        return np.eye(3), False
     _, extent, directions = np.linalg.svd(nominal - nominal.mean(axis=0), full_matrices=False)
     if extent[2] > FLAT * extent[0]:
         return np.eye(3), False
@@ -133,10 +138,11 @@ def _deviations(network: Network, free: Adjustment, nominal: np.ndarray) -> dict
     from scipy import stats
 
     which = np.flatnonzero(nominal & np.isfinite(free.state.xyz).all(axis=1))
-    given = network.xyz[which]
-    scale, rotation, shift = similarity(free.state.xyz[which], given)
+    given = np.where(network.u_xyz[which] == 0, network.xyz[which], np.nan)
+    moved = brought_to(free.state.xyz[which], given, np.isfinite(given))
+    scale, rotation, _ = similarity(free.state.xyz[which], moved)
     axes, plane = _axes(given)
-    off = (scale * free.state.xyz[which] @ rotation.T + shift - given) @ axes.T
+    off = (moved - given) @ axes.T if plane else moved - given
     turn = axes @ rotation * scale
     u = np.sqrt(np.maximum(np.einsum("ij,njk,ik->ni", turn, free.point_covariance[which], turn), 0.0))
     record: dict[str, Any] = {"shape": "plane" if plane else "volume", "unit": network.unit}
@@ -148,7 +154,8 @@ def _deviations(network: Network, free: Adjustment, nominal: np.ndarray) -> dict
         record |= {"p_flat": float(stats.f.sf(f_flat, len(which) - 3, free.dof))}
         record |= {"rms_in_plane": float(np.sqrt(np.mean(inside**2))), "peak_in_plane": float(inside.max())}
     else:
-        length, u_length = np.linalg.norm(off, axis=1), np.linalg.norm(u, axis=1)
+        u[np.isnan(off)] = np.nan
+        length, u_length = (np.sqrt(np.nansum(v**2, axis=1)) for v in (off, u))
         record |= {"p_flat": None, "rms_in_plane": None, "peak_in_plane": None}
     record |= {"rms": float(np.sqrt(np.mean(length**2))), "peak": float(length.max()), "u": float(np.sqrt(np.mean(u_length**2)))}
     points: dict[str, Any] = {"names": [network.points[i] for i in which], "xyz": given, "axes": axes}

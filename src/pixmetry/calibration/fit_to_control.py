@@ -82,8 +82,19 @@ def _turned(points: np.ndarray, by: np.ndarray) -> np.ndarray:
     return Rotation.from_rotvec(by).apply(points)
 
 
-def _fitted(points: np.ndarray, given: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Points moved by the similarity that leaves most of the known coordinates where they should be."""
+def brought_to(found: np.ndarray, given: np.ndarray, known: np.ndarray, *, scaled: bool = True) -> np.ndarray:
+    """Points moved by the similarity that takes them to what is known of them, in least squares; shape (points, 3) as all of these.
+
+    Of points known in part it is the nearest one: they lie about where they should be already.
+    """
+    if not known.all():
+        return _fitted(found, np.where(known, given, 0.0), known, scaled=scaled, robust=False)
+    scale, rotation, shift = similarity(found, given, scaled=scaled)
+    return scale * found @ rotation.T + shift
+
+
+def _fitted(points: np.ndarray, given: np.ndarray, known: np.ndarray, *, scaled: bool = True, robust: bool = True) -> np.ndarray:
+    """Points moved by the similarity that leaves the known coordinates, or most of them, where they should be."""
     extent = max(float(np.linalg.norm(np.std(points, axis=0))), 1e-300)
     for _ in range(STEPS):
         middle = points.mean(axis=0)
@@ -93,10 +104,10 @@ def _fitted(points: np.ndarray, given: np.ndarray, known: np.ndarray) -> np.ndar
         slope[:, 1, 3], slope[:, 2, 3] = -r[:, 2], r[:, 1]
         slope[:, 0, 4], slope[:, 2, 4] = r[:, 2], -r[:, 0]
         slope[:, 0, 5], slope[:, 1, 5] = -r[:, 1], r[:, 0]
-        slope[:, :, 6] = r
+        slope[:, :, 6] = r if scaled else 0.0
         off = (given - points)[known]
         spread = max(1.5 * float(np.median(np.abs(off))), 1e-12 * extent)
-        root = 1 / np.sqrt(1 + (off / spread) ** 2)
+        root = 1 / np.sqrt(1 + (off / spread) ** 2) if robust else np.ones(len(off))
         step = np.linalg.lstsq(root[:, None] * slope[known], root * off, rcond=None)[0]
         turn = step[3:6] / extent
         turn *= min(1.0, 0.5 / max(float(np.linalg.norm(turn)), 1e-300))

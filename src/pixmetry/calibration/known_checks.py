@@ -13,12 +13,20 @@ from typing import Any
 
 import numpy as np
 
-from pixmetry.calibration.fit_to_control import far_from_control
-from pixmetry.calibration.known_residuals import Known, bar_residuals, contradicted, control_residuals, group_record, jointly, rivals
+from pixmetry.calibration.fit_to_control import brought_to, far_from_control
+from pixmetry.calibration.known_residuals import (
+    Known,
+    bar_names,
+    bar_residuals,
+    contradicted,
+    control_residuals,
+    group_record,
+    jointly,
+    rivals,
+)
 from pixmetry.calibration.loosened import in_frame
 from pixmetry.calibration.lost_control import set_free
 from pixmetry.calibration.network import Adjustment, Network, ScaleBars, State
-from pixmetry.calibration.resection import similarity
 from pixmetry.calibration.snooping import Adjust, finest_factor, remove_gross_errors
 from pixmetry.calibration.variance_components import image_sigma0, scaled
 from pixmetry.core.errors import InputError, MeasureError
@@ -45,7 +53,7 @@ class CheckedKnown:
         By ``scale_bars`` and ``control_points``: records as of `contradicted`, with ``left_out``; where it is False, the ``rivals`` of
         which one may be wrong instead. ``raised``: the ``kind`` of these two, ``name`` and stated uncertainty ``u`` of all whose
         uncertainties were raised. ``understated``: the ``factor`` by which those of all control points were raised, if so. ``untested``:
-        ``why`` nothing of this could be tested, if so.
+        ``why`` nothing of this could be tested, if so. ``axes`` of a control point are those that were left out with the one named.
     """
 
     network: Network
@@ -65,28 +73,36 @@ def has_stated(network: Network) -> bool:
 
 
 def weighted_instead(network: Network, clean: Adjustment) -> Network:
-    """The network with the few points that are fixed given an uncertainty, that of one image of them: so they are tested."""
+    """The network with the few coordinates that are fixed given an uncertainty, that of one image of them: so they are tested."""
     fixed = few_fixed(network)
     if not fixed.any():
         return network
     state, rows = clean.state, clean.used & fixed[network.point]
+    rows = rows if rows.any() else clean.used
     distance = np.linalg.norm(state.xyz[network.point[rows]] - state.position[network.image[rows]], axis=1)
     c_px = np.array([np.mean(clean.camera(k).c_px) for k in range(len(network.cameras))])[network.camera_of[network.image[rows]]]
     u = float(np.median(clean.sigma0 * np.sqrt(clean.network.covariance_px2[rows, 0]) * distance / c_px))
-    return replace(network, u_xyz=np.where(fixed[:, None], u, network.u_xyz))
+    return replace(network, u_xyz=np.where(few_held(network), u, network.u_xyz))
 
 
 def fixed_again(network: Network, before: Network, weighted: Network) -> np.ndarray:
     """u_xyz of a checked network, with those coordinates fixed that had been so before and that nothing contradicts."""
-    same = (network.u_xyz == weighted.u_xyz) & few_fixed(before)[:, None]
+    same = (network.u_xyz == weighted.u_xyz) & few_held(before)
     return np.where(same, before.u_xyz, network.u_xyz)
 
 
 def few_fixed(network: Network) -> np.ndarray:
-    """Fixed points, shape (points,), where they are control beside points that are free, and enough to contradict each other."""
-    fixed = (network.u_xyz == 0).all(axis=1)
+    """Points with fixed coordinates, shape (points,), where they are control beside free points, and enough are known to contradict each
+    other."""
+    fixed, known = (network.u_xyz == 0).any(axis=1), np.isfinite(network.u_xyz).any(axis=1)
     seen = np.bincount(network.point, minlength=len(network.points)) > 1
-    return fixed if LEAST_CONTROL <= fixed.sum() < CONTROL_SHARE * seen.sum() else np.zeros_like(fixed)
+    few = known.sum() >= LEAST_CONTROL and fixed.sum() < CONTROL_SHARE * seen.sum()
+    return fixed if few else np.zeros_like(fixed)
+
+
+def few_held(network: Network) -> np.ndarray:
+    """The fixed coordinates of `few_fixed` points, shape (points, 3)."""
+    return (network.u_xyz == 0) & few_fixed(network)[:, None]
 
 
 def fixed_record(adjustment: Adjustment, adjust: Adjust) -> dict[str, Any] | None:
@@ -115,11 +131,12 @@ def fixed_record(adjustment: Adjustment, adjust: Adjust) -> dict[str, Any] | Non
     network = adjustment.network
     posed = np.isfinite(adjustment.state.position).all(axis=1)[network.image]
     seen = np.bincount(network.point[posed], minlength=len(network.points)) > 0
-    fixed = (network.u_xyz == 0).all(axis=1) & seen
+    fixed = (network.u_xyz == 0).any(axis=1) & seen
     if not LEAST_FIXED <= fixed.sum() < CONTROL_SHARE * seen.sum():
         return None
     try:  # what the fixed points threw out of their image points comes back, what the free network throws out goes
-        released, used = set_free(network, np.flatnonzero(fixed)), adjustment.used | (posed & fixed[network.point])
+        released = replace(network, u_xyz=np.where(network.u_xyz == 0, np.inf, network.u_xyz))
+        used = adjustment.used | (posed & fixed[network.point])
         free = remove_gross_errors(released, adjustment.state, adjust, used=used).adjustment
         held = adjust(network, adjustment.state, used=free.used, covariance=False)
     except MeasureError:  # the network hangs on them
@@ -130,27 +147,27 @@ def fixed_record(adjustment: Adjustment, adjust: Adjust) -> dict[str, Any] | Non
     variance = max(free.sigma0**2, finest_factor(network))
     f = float((held.sigma0**2 * held.dof - free.sigma0**2 * free.dof) / redundant / variance)
     there = fixed & np.isfinite(free.state.xyz).all(axis=1)
-    off = _off(free.state.xyz[there], network.xyz[there], free, 3 * int(there.sum()) - redundant)
+    known = (network.u_xyz == 0)[there]
+    off = _off(free.state.xyz[there], network.xyz[there], known, free, int(known.sum()) - redundant)
     miss = float(np.sqrt((off**2).sum() / redundant * max(1 - 1 / max(f, 1.0), 0.0)))
     return {"n": int(there.sum()), "f": f, "dof": (redundant, free.dof), "p": float(stats.f.sf(f, redundant, free.dof)), "miss": miss}
 
 
-def _off(found: np.ndarray, given: np.ndarray, free: Adjustment, missing: int) -> np.ndarray:
-    """Distances of points from where they should be, without what the datum leaves open: so many of its seven parameters."""
-    if missing <= 0:
-        return np.linalg.norm(given - found, axis=1)
-    held = np.isfinite(free.network.u_xyz).all(axis=1) & np.isfinite(free.state.xyz).all(axis=1)
-    scale, rotation, shift = similarity(found, given, np.ones(len(found)), scaled=not len(free.network.bars) and held.sum() < 2)
-    return np.linalg.norm(given - scale * found @ rotation.T - shift, axis=1)
+def _off(found: np.ndarray, given: np.ndarray, known: np.ndarray, free: Adjustment, missing: int) -> np.ndarray:
+    """By how much known coordinates miss their points, without what the datum leaves open: so many of its seven parameters."""
+    if missing > 0:
+        held = np.isfinite(free.network.u_xyz).all(axis=1) & np.isfinite(free.state.xyz).all(axis=1)
+        found = brought_to(found, given, known, scaled=not len(free.network.bars) and held.sum() < 2)
+    return (given - found)[known]
 
 
 def loose_coordinates(network: Network) -> np.ndarray:
     """Coordinates of control points that could pull at the image coordinates, shape (points, 3)."""
-    return np.isfinite(network.u_xyz) & ((network.u_xyz > 0) | few_fixed(network)[:, None])
+    return np.isfinite(network.u_xyz) & ((network.u_xyz > 0) | few_held(network))
 
 
 def check_known(
-    network: Network, clean: Adjustment, adjust: Adjust, state: State, used: np.ndarray, *, stated: bool = True
+    network: Network, clean: Adjustment, adjust: Adjust, state: State, used: np.ndarray, *, held: np.ndarray | None = None
 ) -> tuple[CheckedKnown, State]:
     """Leave out bars and control points that the network contradicts; where these would be many, see whether their uncertainties are only
     stated too small.
@@ -169,8 +186,8 @@ def check_known(
         Where to begin.
     used : ndarray of bool, shape (n,)
         Image points that take part.
-    stated : bool
-        Whether the uncertainties of control points are those that they came with.
+    held : ndarray of bool, shape (points, 3), optional
+        Coordinates whose uncertainties are not those that they came with (`weighted_instead`).
 
     Raises
     ------
@@ -183,12 +200,13 @@ def check_known(
     checked, state = _without_absurd(CheckedKnown(weights), state)
     left, adjustment = _without_contradicted(checked, state, used, adjust, dof)
     out, control = _wrong_points(left), np.isfinite(weights.u_xyz) & (weights.u_xyz > 0)
+    control &= True if held is None else ~held
     whole = int(control.all(axis=1).sum())
-    if not stated or whole < LEAST_CONTROL or out <= MANY_WRONG * control.any(axis=1).sum():
+    if whole < LEAST_CONTROL or out <= MANY_WRONG * control.any(axis=1).sum():
         return left, adjustment.state
-    factor = WIDE * _understatement(weights, clean)
+    factor = WIDE * _understatement(weights, control, clean)
     try:
-        again, adjustment = _without_contradicted(_raised(checked, factor), adjustment.state, used, adjust, dof)
+        again, adjustment = _without_contradicted(_raised(checked, control, factor), adjustment.state, used, adjust, dof)
     except MeasureError:  # with so little weight they do not hold the network
         return left, adjustment.state
     group = group_record(adjustment, control_residuals(adjustment))
@@ -196,7 +214,7 @@ def check_known(
         return left, adjustment.state  # with larger uncertainties they are wrong all the same
     better = float(np.sqrt(group["factor"]))
     gross = {**again.gross, "understated": [{"factor": factor * better}]}
-    return replace(_raised(again, better), gross=gross), adjustment.state
+    return replace(_raised(again, control, better), gross=gross), adjustment.state
 
 
 def _wrong_points(checked: CheckedKnown) -> int:
@@ -234,19 +252,18 @@ def _together(adjustment: Adjustment, adjust: Adjust) -> Known | None:
     return control_residuals(replace(joint, network=network))
 
 
-def _raised(checked: CheckedKnown, factor: float) -> CheckedKnown:
+def _raised(checked: CheckedKnown, control: np.ndarray, factor: float) -> CheckedKnown:
     u = checked.network.u_xyz
-    return replace(checked, network=replace(checked.network, u_xyz=np.where(np.isfinite(u), factor * u, u)))
+    return replace(checked, network=replace(checked.network, u_xyz=np.where(control, factor * u, u)))
 
 
-def _understatement(network: Network, clean: Adjustment) -> float:
-    """What the middle one of the control points is off by, where they hardly pull at the network, over what was stated."""
+def _understatement(network: Network, control: np.ndarray, clean: Adjustment) -> float:
+    """What the middle one of the whole control points is off by, where they hardly pull at the network, over what was stated."""
     from scipy import stats
 
     from pixmetry.calibration.resection import fitted
 
-    stated = np.isfinite(network.u_xyz).all(axis=1) & (network.u_xyz > 0).all(axis=1)
-    rows = np.flatnonzero(stated & np.isfinite(clean.state.xyz).all(axis=1))
+    rows = np.flatnonzero(control.all(axis=1) & np.isfinite(clean.state.xyz).all(axis=1))
     away = fitted(clean.state.xyz[rows], network.xyz[rows])[3]
     return float(np.sqrt(np.median(away**2 / np.mean(network.u_xyz[rows] ** 2, axis=1)) / stats.chi2.median(3)))
 
@@ -303,25 +320,44 @@ def _without_absurd(checked: CheckedKnown, state: State) -> tuple[CheckedKnown, 
     bars = checked.network.bars
     if not len(bars):
         return checked, state
+    state, scaled_by_points = _to_scale_of_control(state, checked.network)
     computed = np.linalg.norm(state.xyz[bars.end] - state.xyz[bars.start], axis=1)
-    ratio = bars.length / computed
-    scale = 1.0
-    if not np.isfinite(checked.network.u_xyz).any() and np.isfinite(ratio).any():
+    ratio, scale = bars.length / computed, 1.0
+    if not scaled_by_points and np.isfinite(ratio).any():
         scale = float(np.nanmedian(ratio))
-        state = replace(state, xyz=scale * state.xyz, position=scale * state.position)
+        state = _enlarged(state, checked.network, scale)
     bad = np.flatnonzero(np.abs(ratio / scale - 1) > ABSURD)
-    if len(bad) and np.isinf(checked.network.u_xyz).all() and len(bars) < 3:
-        found = f"lengths over computed ones: {ratio[0]:.6g}, {ratio[1]:.6g}"
-        raise InputError("the two scale bars contradict each other", where="scale bars", value=found, remedy="check their units and points")
-    records = []
+    if len(bad) == len(bars) and not scaled_by_points:
+        found = "lengths over computed ones: " + ", ".join(f"{one:.6g}" for one in ratio)
+        what = f"the {'two ' if len(bars) == 2 else ''}scale bars contradict each other"
+        raise InputError(what, where="scale bars", value=found, remedy="check their units and points")
+    records, names = [], bar_names(checked.network)
     for i in bad:
-        name = f"{checked.network.points[bars.start[i]]}–{checked.network.points[bars.end[i]]}"
         error = float(bars.length[i] - scale * computed[i])
         limit = {"statistic": float(abs(error) / bars.u[i]), "critical": float(ABSURD * bars.length[i] / bars.u[i])}
-        records.append({"name": name, "residual": error, "error": error, **limit, "left_out": True})
+        records.append({"name": names[i], "residual": error, "error": error, **limit, "left_out": True})
     kept = np.setdiff1d(np.arange(len(bars)), bad)
     network = replace(checked.network, bars=ScaleBars(bars.start[kept], bars.end[kept], bars.length[kept], bars.u[kept]))
     return CheckedKnown(network, {**checked.gross, "scale_bars": records}), state
+
+
+def _to_scale_of_control(state: State, network: Network) -> tuple[State, bool]:
+    """The state in the scale of most distances between whole control points, if bars had brought it to another; whether there are any."""
+    from scipy.spatial.distance import pdist
+
+    whole = network.control & np.isfinite(state.xyz).all(axis=1)
+    if whole.sum() < 2:
+        return state, False
+    ratio = float(np.median(pdist(network.xyz[whole]) / np.maximum(pdist(state.xyz[whole]), 1e-300)))
+    return (_enlarged(state, network, ratio) if ABSURD < abs(ratio - 1) < np.inf and ratio > 0 else state), True
+
+
+def _enlarged(state: State, network: Network, scale: float) -> State:
+    """The state enlarged about the middle of what is known of the points; what is held stays."""
+    known = np.isfinite(network.u_xyz).any(axis=1) & np.isfinite(state.xyz).all(axis=1)
+    middle = state.xyz[known].mean(axis=0) if known.any() else np.zeros(3)
+    xyz = np.where(network.u_xyz == 0, state.xyz, middle + scale * (state.xyz - middle))
+    return replace(state, xyz=xyz, position=middle + scale * (state.position - middle))
 
 
 def _without(checked: CheckedKnown, known: Known, found: list[dict[str, Any]], kind: str) -> CheckedKnown:
@@ -336,6 +372,8 @@ def _without(checked: CheckedKnown, known: Known, found: list[dict[str, Any]], k
         others = rivals(known, wrong, 1.0) if alone else rivals(known, wrong[:1], 1.0, found[0]["critical"])
         network = _less_control(checked.network, known, wrong[0], others, going if alone else [])
     record = {**found[0], "left_out": alone and not others, "rivals": [known.name[i] for i in others]}
+    if kind == "control_points" and record["left_out"]:
+        record["axes"] = [k % 3 for k in going]
     return CheckedKnown(network, {**checked.gross, kind: [*checked.gross[kind], record]})
 
 
@@ -372,13 +410,24 @@ def _less_control(network: Network, known: Known, row: int, others: list[int], g
     return replace(network, u_xyz=u)
 
 
+def _stated_of_bars(given: ScaleBars, used: ScaleBars) -> list[float]:
+    """Stated uncertainties of the bars that are left; of some with the same length between the same points, its own if it is unchanged."""
+    table = np.column_stack([given.start, given.end, given.length])
+    rest, out = np.ones(len(given), bool), []
+    for i in range(len(used)):
+        same = np.flatnonzero(rest & (table == [used.start[i], used.end[i], used.length[i]]).all(axis=1))
+        k = min(same, key=lambda k: given.u[k] != used.u[i])
+        rest[k] = False
+        out.append(float(given.u[k]))
+    return out
+
+
 def raised(given: Network, used: Network) -> list[dict[str, Any]]:
     """Bars and control coordinates that are less certain in one network than they were given in another: ``kind``, ``name``, ``u``."""
-    out, length = [], {(b.start[i], b.end[i], b.length[i]): b.u[i] for b in (given.bars,) for i in range(len(b))}
-    for start, end, long, u in zip(used.bars.start, used.bars.end, used.bars.length, used.bars.u, strict=True):
-        if u > length[start, end, long]:
-            name = f"{given.points[start]}–{given.points[end]}"
-            out.append({"kind": "scale_bars", "name": name, "u": float(length[start, end, long])})
+    out, bars = [], used.bars
+    for i, (name, stated) in enumerate(zip(bar_names(used), _stated_of_bars(given.bars, bars), strict=True)):
+        if bars.u[i] > stated:
+            out.append({"kind": "scale_bars", "name": name, "u": float(stated)})
     for k, axis in np.argwhere(np.isfinite(used.u_xyz) & (used.u_xyz > given.u_xyz)):
         out.append({"kind": "control_points", "name": f"{given.points[k]} {'XYZ'[axis]}", "u": float(given.u_xyz[k, axis])})
     return out

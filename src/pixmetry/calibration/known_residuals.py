@@ -58,6 +58,13 @@ class Known:
         return np.clip(np.diag(self.cofactor) / self.u**2, 0.0, 1.0)
 
 
+def bar_names(network: Network) -> tuple[str, ...]:
+    """The ends of each bar; of several between the same points, the further ones are numbered."""
+    ends = [f"{network.points[i]}–{network.points[k]}" for i, k in zip(network.bars.start, network.bars.end, strict=True)]
+    before = [ends[:i].count(name) for i, name in enumerate(ends)]
+    return tuple(f"{name} ({n + 1})" if n else name for name, n in zip(ends, before, strict=True))
+
+
 def bar_residuals(adjustment: Adjustment, *, a_priori: bool = False) -> Known:
     """Residuals of the scale bars whose ends are determined; ``a_priori``: the covariance of the adjustment is without sigma0²."""
     network, bars = adjustment.network, adjustment.network.bars
@@ -75,8 +82,7 @@ def bar_residuals(adjustment: Adjustment, *, a_priori: bool = False) -> Known:
     unit = 1.0 if a_priori else adjustment.sigma0**2
     touched = np.flatnonzero(slopes.any(axis=0))
     spread = slopes[:, touched] @ adjustment.covariance[np.ix_(touched, touched)] @ slopes[:, touched].T / unit
-    names = tuple(f"{network.points[bars.start[i]]}–{network.points[bars.end[i]]}" for i in there)
-    u = bars.u[there]
+    names, u = tuple(bar_names(network)[i] for i in there), bars.u[there]
     return Known(names, there, bars.length[there], bars.length[there] - length[there], u, np.diag(u**2) - spread)
 
 

@@ -131,7 +131,7 @@ def known_record(adjustment: Adjustment, gross: Mapping[str, list[dict[str, Any]
     groups = {"scale_bars": bar_residuals, "control_points": control_residuals}
     known = {name: residuals(adjustment, a_priori=a_priori) for name, residuals in groups.items()}
     record: dict[str, Any] = {
-        name: {"group": group_record(adjustment, known[name]), "gross": list(gross[name]), "raised": _stated(gross, name)}
+        name: {"group": group_record(adjustment, known[name]), "gross": _last(gross[name], adjustment), "raised": _stated(gross, name)}
         for name in groups
     }
     control = record["control_points"]
@@ -146,17 +146,33 @@ def _stated(gross: Mapping[str, list[dict[str, Any]]], kind: str) -> dict[str, f
     return {r["name"]: r["u"] for r in reversed(gross.get("raised", ())) if r["kind"] == kind}
 
 
+def _last(records: list[dict[str, Any]], adjustment: Adjustment) -> list[dict[str, Any]]:
+    """Records without those of what weighed less first and was left out later."""
+    network, out = adjustment.network, []
+    left = {f"{network.points[k]} {'XYZ'[axis]}" for k, axis in np.argwhere(np.isinf(network.u_xyz))}
+    for i, record in enumerate(records):
+        later = {one["name"] for one in records[i + 1 :] if one["left_out"]}
+        if record["left_out"] or record["name"] not in left | later:
+            out.append(record)
+    return out
+
+
 def _found(adjustment: Adjustment, record: dict[str, Any]) -> dict[str, Any]:
-    """The record of a control point that was left out, with its error against where it was found without it, and ``swapped_with``."""
+    """The record of a control point that was left out, with its error against where it was found without it, along the axis of those left
+    out where it is largest, and ``swapped_with``."""
+    record = dict(record)
+    axes = record.pop("axes", None)
     network, xyz = adjustment.network, adjustment.state.xyz
     names = {name: k for k, name in enumerate(network.points)}
     name, _, axis = record["name"].rpartition(" ")
     k = names.get(record["name"], names.get(name))
     if k is None or not record["left_out"] or not np.isfinite(xyz[k]).all():
         return {**record, "swapped_with": None}
-    off = (network.xyz - xyz)[k]
-    error = float(off["XYZ".index(axis)]) if record["name"] not in names else record["error"]
-    return {**record, "error": error, "swapped_with": _swapped_with(adjustment, k)}
+    swapped, off = _swapped_with(adjustment, k), (network.xyz - xyz)[k]
+    if record["name"] in names:
+        return {**record, "swapped_with": swapped}
+    worst = max(axes or ["XYZ".index(axis)], key=lambda axis: abs(off[axis]))
+    return {**record, "name": f"{name} {'XYZ'[worst]}", "error": float(off[worst]), "swapped_with": swapped}
 
 
 def _swapped_with(adjustment: Adjustment, k: int) -> str | None:

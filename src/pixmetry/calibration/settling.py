@@ -155,7 +155,7 @@ def _checked_known(
     from pixmetry.calibration.known_checks import (
         CheckedKnown,
         check_known,
-        few_fixed,
+        few_held,
         fixed_again,
         has_known,
         in_frame_of_control,
@@ -175,10 +175,9 @@ def _checked_known(
     if clean is None:
         return measured, state, used, loss, {**CheckedKnown(measured).gross, "control_points": absurd, "untested": [{"why": why}]}
     weighted = weighted_instead(measured, clean)
-    stated = not few_fixed(measured).any()
     begin, used = with_the_rest(weighted, clean, state, used, rejected)
     near, begin, far = in_frame_of_control(weighted, begin)
-    check = partial(check_known, without_eccentricity(near, shift), clean, adjust_with(alone), used=used, stated=stated)
+    check = partial(check_known, without_eccentricity(near, shift), clean, adjust_with(alone), used=used, held=few_held(measured))
     tried, why = first_that_stands((begin, state), lambda start: check(state=start))
     if tried is None:
         return measured, state, used, loss, {**CheckedKnown(measured).gross, "control_points": absurd, "untested": [{"why": why}]}

@@ -129,9 +129,8 @@ def _started(network: Network, start: State | None, options: Options, say: Progr
 
 
 def _released(network: Network) -> Network:
-    """The network with its fixed points free; their coordinates stay as start values and datum."""
-    fixed = (network.u_xyz == 0).all(axis=1)
-    return replace(network, u_xyz=np.where(fixed[:, None], np.inf, network.u_xyz))
+    """The network with its fixed coordinates free; they stay as start values and datum."""
+    return replace(network, u_xyz=np.where(network.u_xyz == 0, np.inf, network.u_xyz))
 
 
 def _settled(measured: Network, state: State, options: Options, say: Progress) -> Settled:
@@ -169,7 +168,7 @@ def _checked_field(settled: Settled, options: Options, say: Progress) -> tuple[S
     if options.folds == 0:
         return settled, {}, []
     say("leaving images out of the fit")
-    fixed = (settled.measured.u_xyz == 0).all(axis=1).sum()
+    fixed = (settled.measured.u_xyz == 0).any(axis=1).sum()
     if options.field != "auto" or fixed < LEAST_FIELD:
         return settled, _held_out(settled, options), []
     check = check_field(settled.adjustment, options.folds)

@@ -217,18 +217,19 @@ def worst_points(calibration: Calibration) -> dict[str, Any]:
 
 def scale_bars(calibration: Calibration) -> list[list[str]]:
     """Scale bars with their residuals: measured less adjusted length; u is that which was stated."""
+    from pixmetry.calibration.known_residuals import bar_names
+
     raised = ((calibration.tests.get("known") or {}).get("scale_bars") or {}).get("raised") or {}
     net, xyz = calibration.adjustment.network, calibration.adjustment.state.xyz
     bars = net.bars
     adjusted = np.linalg.norm(xyz[bars.end] - xyz[bars.start], axis=1)
-    rows = []
+    rows, names = [], bar_names(net)
     for k in range(len(bars)):
         residual = float(bars.length[k] - adjusted[k])
-        name = f"{net.points[bars.start[k]]}–{net.points[bars.end[k]]}"
-        u = float(raised.get(name, bars.u[k]))
+        u = float(raised.get(names[k], bars.u[k]))
         number = uncertain(float(bars.length[k]), u, net.unit)
         ratio = fixed(residual / u, 1) if u > 0 and np.isfinite(residual) else NONE
-        ends = f"{net.points[bars.start[k]]} – {net.points[bars.end[k]]}" + (" (contradicted, weighs less)" if name in raised else "")
+        ends = f"{net.points[bars.start[k]]} – {net.points[bars.end[k]]}" + (" (contradicted, weighs less)" if names[k] in raised else "")
         rows.append([ends, number.value, f"± {number.u}", signed(residual, lambda v: significant(v, 2)), ratio])
     return rows
 
