@@ -16,6 +16,7 @@ import numpy as np
 
 from pixmetry.calibration.bundle_layout import Layout, layout_of
 from pixmetry.calibration.network import Adjustment, State
+from pixmetry.calibration.resection import motions
 from pixmetry.core.errors import MeasureError
 
 GIVEN = 1e-8  # relative singular value above which control holds a direction
@@ -109,14 +110,7 @@ def _carry(motion: np.ndarray) -> bool:
 
 def generators(points: np.ndarray, datum: Datum) -> np.ndarray:
     """Motion of points (n, 3) by each of the seven parameters: shift, rotation, scale, shape (n, 3, 7)."""
-    r = (points - datum.middle) / datum.size
-    out = np.zeros((len(points), 3, 7))
-    out[:, 0, 0] = out[:, 1, 1] = out[:, 2, 2] = 1.0
-    out[:, 1, 3], out[:, 2, 3] = -r[:, 2], r[:, 1]
-    out[:, 0, 4], out[:, 2, 4] = r[:, 2], -r[:, 0]
-    out[:, 0, 5], out[:, 1, 5] = -r[:, 1], r[:, 0]
-    out[:, :, 6] = r
-    return out
+    return motions((points - datum.middle) / datum.size)
 
 
 def null_space(layout: Layout, state: State, datum: Datum) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

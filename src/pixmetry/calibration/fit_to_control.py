@@ -12,7 +12,7 @@ from itertools import combinations
 
 import numpy as np
 
-from pixmetry.calibration.resection import fitted, similarity
+from pixmetry.calibration.resection import fitted, motions, similarity
 
 MOST_PAIRS = 28  # of eight points; of more, three right ones are found without heights and positions
 TURNS = 16  # about the line of a pair
@@ -98,13 +98,9 @@ def _fitted(points: np.ndarray, given: np.ndarray, known: np.ndarray, *, scaled:
     extent = max(float(np.linalg.norm(np.std(points, axis=0))), 1e-300)
     for _ in range(STEPS):
         middle = points.mean(axis=0)
-        r = (points - middle) / extent
-        slope = np.zeros((*points.shape, 7))
-        slope[:, [0, 1, 2], [0, 1, 2]] = 1.0
-        slope[:, 1, 3], slope[:, 2, 3] = -r[:, 2], r[:, 1]
-        slope[:, 0, 4], slope[:, 2, 4] = r[:, 2], -r[:, 0]
-        slope[:, 0, 5], slope[:, 1, 5] = -r[:, 1], r[:, 0]
-        slope[:, :, 6] = r if scaled else 0.0
+        slope = motions((points - middle) / extent)
+        if not scaled:
+            slope[:, :, 6] = 0.0
         off = (given - points)[known]
         spread = max(1.5 * float(np.median(np.abs(off))), 1e-12 * extent)
         root = 1 / np.sqrt(1 + (off / spread) ** 2) if robust else np.ones(len(off))

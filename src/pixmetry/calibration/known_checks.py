@@ -200,7 +200,8 @@ def check_known(
     checked, state = _without_absurd(CheckedKnown(weights), state)
     left, adjustment = _without_contradicted(checked, state, used, adjust, dof)
     out, control = _wrong_points(left), np.isfinite(weights.u_xyz) & (weights.u_xyz > 0)
-    control &= True if held is None else ~held
+    if held is not None:
+        control &= ~held
     whole = int(control.all(axis=1).sum())
     if whole < LEAST_CONTROL or out <= MANY_WRONG * control.any(axis=1).sum():
         return left, adjustment.state

@@ -9,7 +9,7 @@ from pixmetry.calibration.resection import FLAT, fitted, thickness
 from pixmetry.core.errors import InputError, MeasureError
 
 KEEP = 1e-6  # pull of what is not known towards the frame that is there, beside 1 for what is
-AGREES = 1e-3  # of the extent: rms at which what is known is met
+AGREES = 1e-3  # of the extent: within it, what is known is met
 REACH = 0.1  # rms distance from control, in units of its extent, at which coordinates do not belong to the images
 
 

@@ -183,6 +183,17 @@ def _summed(index: np.ndarray, size: int, values: np.ndarray) -> np.ndarray:
     return np.stack([np.bincount(index, column, size) for column in values.T], axis=1)
 
 
+def motions(r: np.ndarray) -> np.ndarray:
+    """Slopes of a similarity where it moves nothing yet: of points (n, 3) by shift, rotation, scale, shape (n, 3, 7)."""
+    out = np.zeros((len(r), 3, 7))
+    out[:, 0, 0] = out[:, 1, 1] = out[:, 2, 2] = 1.0
+    out[:, 1, 3], out[:, 2, 3] = -r[:, 2], r[:, 1]
+    out[:, 0, 4], out[:, 2, 4] = r[:, 2], -r[:, 0]
+    out[:, 0, 5], out[:, 1, 5] = -r[:, 1], r[:, 0]
+    out[:, :, 6] = r
+    return out
+
+
 def similarity(
     source: np.ndarray, target: np.ndarray, weight: np.ndarray | None = None, *, scaled: bool = True
 ) -> tuple[float, np.ndarray, np.ndarray]:
