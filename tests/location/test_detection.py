@@ -364,13 +364,18 @@ def test_does_not_depend_on_the_number_of_threads() -> None:
 
 
 def test_turns_with_the_frame() -> None:
-    """Upside down and mirrored frames give the same targets, upside down and mirrored."""
+    """Upside down and mirrored frames give the same targets, upside down and mirrored.
+
+    The background is found on other tiles, so that a pixel at the rim may go in or out: this adds one at a distance r to a second moment
+    of π r² pixels, and changes the semi-axis r by 2/(π r). Beyond 0.1, 0.2 and 0.3 px the largest of 40 changes goes in 7 %, 0.3 % and
+    0.02 % of the frames; three such pixels, 0.64 px of the smallest, in none of 6000 (1e-6 or less, if it goes on falling so).
+    """
     light, _ = discs((256, 320), 40, 3, 8)
     frame = stored(10 + 150 * light)
     a, b = detect(frame).targets, detect(np.ascontiguousarray(frame[::-1, ::-1])).targets
     away, which = cKDTree(np.c_[319 - b.x_px, 255 - b.y_px]).query(np.c_[a.x_px, a.y_px])
     assert away.max() < 0.02
-    assert np.allclose(a.semi_major_px, b.semi_major_px[which], atol=0.1)
+    assert (np.abs(a.semi_major_px - b.semi_major_px[which]) < 3 * 2 / (np.pi * a.semi_major_px)).all()
 
 
 @pytest.mark.parametrize("reach", [0.0, 3.0, 40.0])
