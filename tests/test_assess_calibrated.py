@@ -20,6 +20,8 @@ from pixmetry.campaign import load_campaign
 from pixmetry.cli import main
 from pixmetry.core.errors import InputError
 from pixmetry.core.observations import LENS
+from pixmetry.datasheets import emva1288
+from pixmetry.report.page import render
 
 PITCH = (8.3, 8.3)
 
@@ -101,3 +103,37 @@ def test_a_pitch_of_the_campaign_stands_in_where_the_calibration_has_none() -> N
         calibrated_geometry(calibration)
     with pytest.raises(InputError, match="not square"):
         calibrated_geometry(calibration, pitch_um=(8.6, 8.3))
+
+
+def test_frames_of_a_window_see_the_lens_of_the_whole_sensor(tmp_path: Path) -> None:
+    """The principal point, in pixels of the sensor, is where the calibration has it, whatever part of the sensor the frames show."""
+    sensor = Sensor(780, 582, *PITCH)
+    simulated = simulate(np.random.default_rng(5), images=12, points=60, sensor=sensor, interior={"k1": -2e-3})
+    write_results(calibrate_network(simulated.network, Options(folds=0)), tmp_path / "calibration")
+    campaign = load_campaign(None)
+    facts = {"pitch_x_um": 8.3, "pitch_y_um": 8.3, "sensor_cols": 780, "sensor_rows": 582, "first_col": 500, "first_row": 10}
+    campaign = replace(campaign, camera=replace(campaign.camera, **facts))
+    assessment = assess(campaign, calibration=tmp_path / "calibration", trials=0)
+    lens, whole = assessment.camera[LENS].params, calibrated_geometry(tmp_path / "calibration").lens
+    assert lens.centre_x_px + 159 / 2 + 500 == pytest.approx(whole["centre_x_px"].value + 779 / 2)
+    assert lens.centre_y_px + 159 / 2 + 10 == pytest.approx(whole["centre_y_px"].value + 581 / 2)
+    notes = " ".join(assessment.observations.notes)
+    assert "160 × 160 pixels from column 500, row 10 of a sensor of 780 × 582" in notes
+    assert "not for another camera" not in notes
+
+
+def test_what_is_accepted_is_taken_for_the_whole_sensor_and_what_is_measured_for_the_window() -> None:
+    campaign = load_campaign(None)
+    window = assess(campaign, trials=0)
+    facts = {"sensor_cols": 1600, "sensor_rows": 1600, "vendor": "Maker", "serial_number": "7"}
+    whole = assess(replace(campaign, camera=replace(campaign.camera, **facts), operator="A. Tester"), trials=0)
+    was = {row.name: row for row in window.budget.rows}
+    changed = {row.name for row in whole.budget.rows if row.total_px != was[row.name].total_px}
+    assert changed and all(was[name].status == "accepted" for name in changed)
+    record = whole.to_record()
+    assert record["camera"]["sensor_cols"] == 1600 and record["camera"]["vendor"] == "Maker"
+    assert record["conditions"]["operator"] == "A. Tester"
+    assert record["conditions"]["lossless"] is True and record["conditions"]["lossless_known"] == "proven"
+    assert "Serial number" in render(whole) and "1600 × 1600" in render(whole)
+    camera = emva1288(replace(campaign, camera=replace(campaign.camera, **facts), operator="A. Tester"))
+    assert camera.camera["serial_number"] == "7" and camera.conditions["operator"] == "A. Tester"

@@ -29,6 +29,7 @@ from pixmetry.core.camera import Camera, Element, in_order
 from pixmetry.core.catalogue import catalogue
 from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.core.estimates import Estimates
+from pixmetry.core.geometry import frame_centre
 from pixmetry.core.observations import CameraGeometry, Observations
 from pixmetry.emva.evaluate import standard_values
 from pixmetry.emva.records import Measurement, Results
@@ -92,10 +93,11 @@ def assess(
 
         calibration = calibration_file(calibration)
     geometry = None if calibration is None else _geometry_for(frames, calibration)
+    window = _window_of(frames)
     told = progress or (lambda what, done, of: None)
     hashes, seen = observe_campaign(frames, told)
-    told_of_frames = _other_frames(calibration, seen) if isinstance(calibration, Path) else ()
-    seen = replace(seen, geometry=geometry, notes=(*seen.notes, *told_of_frames))
+    told_of_frames = _other_frames(calibration, frames) if isinstance(calibration, Path) else ()
+    seen = replace(seen, geometry=geometry, notes=(*seen.notes, *window, *told_of_frames))
     if isinstance(calibration, Path):
         hashes.add_file(calibration)
     standard = by_the_standard(frames, seen)
@@ -110,6 +112,7 @@ def assess(
         what_target,
         what_estimator,
         geometry=geometry,
+        sensor_shape=frames.camera.sensor_shape,
         accepted=[e.name for e in camera.active if e.name in unmeasured and e.source.measure is not None],
         trials=trials,
         seed=seed,
@@ -136,18 +139,54 @@ def _geometry_for(campaign: Campaign, calibration: str | Path | CameraGeometry) 
     if ours is not None and not np.allclose(theirs, ours, rtol=1e-6):
         remedy = "give the calibration of this camera"
         raise InputError("a calibration with another pixel pitch", where=str(calibration), value=theirs, allowed=str(ours), remedy=remedy)
+    if isinstance(calibration, Path) and _is_window_of(campaign, _calibrated_shape(calibration)):
+        return _seen_from(geometry, campaign)
     return geometry
 
 
-def _other_frames(calibration: Path, seen: Observations) -> tuple[str, ...]:
-    """A note where the frames are not of the size that was calibrated: a window of them, or another camera's."""
+def _calibrated_shape(calibration: Path) -> tuple[int, int]:
     from pixmetry.calibration_record import stored_cameras
 
-    stack, sensor = seen.bright_stack or seen.dark_stack, stored_cameras(calibration)[0].sensor
-    if stack is None or stack.shape == (sensor.rows, sensor.cols):
+    sensor = stored_cameras(calibration)[0].sensor
+    return sensor.rows, sensor.cols
+
+
+def _is_window_of(campaign: Campaign, shape: tuple[int, int]) -> bool:
+    """Whether the frames are said to be a window, at a known place, of a sensor of this size."""
+    facts = campaign.camera
+    return facts.sensor_shape == shape != campaign.frame_shape and facts.first_col is not None
+
+
+def _seen_from(geometry: CameraGeometry, campaign: Campaign) -> CameraGeometry:
+    """The geometry of the whole sensor with the principal point counted from the centre of the window."""
+    facts, lens = campaign.camera, geometry.lens
+    (x, y), (x0, y0) = frame_centre(campaign.frame_shape), frame_centre(facts.sensor_shape)
+    values = lens.values.copy()
+    values[lens.index("centre_x_px")] += x0 - (facts.first_col + x)
+    values[lens.index("centre_y_px")] += y0 - (facts.first_row + y)
+    return replace(geometry, lens=replace(lens, values=values))
+
+
+def _window_of(campaign: Campaign) -> tuple[str, ...]:
+    """A note where the frames are a window of a sensor: what was seen in it, and what is taken for the whole."""
+    facts, (rows, cols) = campaign.camera, campaign.frame_shape
+    if facts.sensor_shape in (None, (rows, cols)):
         return ()
-    sizes = f"{sensor.cols} × {sensor.rows} pixels, the frames have {stack.shape[1]} × {stack.shape[0]}"
-    return (f"The calibration is of {sizes}: it holds for a window of that camera's frames, not for another camera or binned pixels.",)
+    at = "" if facts.first_col is None else f" from column {facts.first_col}, row {facts.first_row}"
+    whole = f"{cols} × {rows} pixels{at} of a sensor of {facts.sensor_cols} × {facts.sensor_rows}"
+    rest = "what is measured holds for these pixels; what is accepted at a bound is taken for the whole sensor"
+    return (f"The frames show {whole}: {rest}.",)
+
+
+def _other_frames(calibration: Path, campaign: Campaign) -> tuple[str, ...]:
+    """A note where the frames are not of the size that was calibrated: a window of them, or another camera's."""
+    rows, cols = _calibrated_shape(calibration)
+    if (rows, cols) == campaign.frame_shape or _is_window_of(campaign, (rows, cols)):
+        return ()
+    sizes = f"{cols} × {rows} pixels, the frames have {campaign.frame_shape[1]} × {campaign.frame_shape[0]}"
+    which = "" if campaign.camera.first_col is not None else " (sensor_cols, sensor_rows, first_col, first_row in the manifest say which)"
+    holds = f"it holds for a window of that camera's frames{which}, not for another camera or binned pixels"
+    return (f"The calibration is of {sizes}: {holds}.",)
 
 
 def write_results(assessment: Assessment, directory: str | Path) -> Path:
@@ -178,7 +217,7 @@ def observe_campaign(campaign: Campaign, progress: Progress) -> tuple[InputHashe
     seen = observe(groups(), campaign.bits, campaign.camera.temperature_c, on_frames=on_frames)
     for path in {campaign.source_path, campaign.descriptor_path} - {None}:
         reader.hashes.add_file(path)
-    return reader.hashes, seen
+    return reader.hashes, replace(seen, storage=reader.storage)
 
 
 def by_the_standard(campaign: Campaign, observations: Observations) -> Results:

@@ -254,7 +254,7 @@ def compare_fleet(sources: Iterable[DataSheet | str | Path], *, level: float = 0
     found, _ = holm(p, families, 1 - level)
     out = {(flat[at][0], flat[at][1]) for at in found}
     rows = [replace(row, stands_out=tuple((i, j) in out for j in range(len(subjects)))) for i, row in enumerate(rows)]
-    notes = _notes(subjects, frozenset({"name", "serial"}))
+    notes = _notes(subjects, frozenset({"name", "serial_number"}))
     if len(subjects) < JUDGED_FLEET:
         few = f"{len(subjects)} cameras hardly tell their own spread, so that only a gross outlier would stand out"
         notes.append(f"{few}: name {JUDGED_FLEET} or more")

@@ -263,6 +263,13 @@ def _camera(campaign: Campaign) -> dict[str, Any]:
         "temperature_c": facts.temperature_c,
         "wavelength_nm": optics.wavelength_nm,
         "f_number": optics.f_number,
+        "vendor": facts.vendor,
+        "model": facts.model,
+        "serial_number": facts.serial_number,
+        "sensor_cols": facts.sensor_cols,
+        "sensor_rows": facts.sensor_rows,
+        "first_col": facts.first_col,
+        "first_row": facts.first_row,
     }
     return {name: value for name, value in known.items() if value is not None}
 
@@ -287,5 +294,7 @@ def _conditions(campaign: Campaign, measured: Sequence[Measurement], release: st
         "colour_channels": None if first.channel == MONO else [m.channel for m in measured],
         "bootstrap_draws": bootstrap or None,
         "irradiance_uw_per_cm2": campaign.optics.irradiance_uw_per_cm2,
+        "light_source": campaign.optics.light_source,
+        "operator": campaign.operator or None,
     }
     return {name: value for name, value in known.items() if value is not None}

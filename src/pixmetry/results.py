@@ -50,7 +50,7 @@ class Assessment:
     def to_record(self) -> dict[str, Any]:
         """Return the plain record of ``results.json``."""
         fit = self.observations.photon_transfer_fit
-        facts = self.campaign.camera
+        facts, storage = self.campaign.camera, self.observations.storage
         return {
             "schema": RESULTS_SCHEMA,
             "camera": {
@@ -62,6 +62,19 @@ class Assessment:
                 "pitch_y_um": facts.pitch_y_um,
                 "interface": facts.interface,
                 "sensor": facts.sensor,
+                "vendor": facts.vendor,
+                "model": facts.model,
+                "serial_number": facts.serial_number,
+                "sensor_cols": facts.sensor_cols,
+                "sensor_rows": facts.sensor_rows,
+                "first_col": facts.first_col,
+                "first_row": facts.first_row,
+            },
+            "conditions": {
+                "operator": self.campaign.operator or None,
+                "light_source": self.campaign.optics.light_source,
+                "lossless": storage.lossless,
+                "lossless_known": storage.known,
             },
             "estimates": {source: e.to_records() for source, e in self.estimates.items()},
             "unmeasured": self.unmeasured,

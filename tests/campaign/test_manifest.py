@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from campaign.campaign_files import FRAMES, HEAD, put_campaign, put_frame
-from pixmetry.campaign import EXAMPLE, load_campaign, photons_from_irradiance, write_manifest
+from pixmetry.campaign import EXAMPLE, FrameReader, load_campaign, photons_from_irradiance, write_manifest
 from pixmetry.core.errors import InputError
 
 DARK = "frames:\n  - {kind: dark, exposure_s: 0.01, files: [d_0.png, d_1.png]}\n"
@@ -195,3 +195,54 @@ def test_example_is_the_whole_set() -> None:
     assert "Basler AG" in licence
     assert "cropped" in licence
     assert sum(p.stat().st_size for p in EXAMPLE.rglob("*") if p.is_file()) < 8e6
+
+
+TOLD = """schema: pixmetry/campaign/1
+camera:
+  {name: cam, bits: 12, sensor: cmos, vendor: Maker, model: M 1, serial_number: '0815', sensor_cols: 100, sensor_rows: 80, first_col: 30,
+   first_row: 20, lossless: true}
+optics: {light_source: green LED}
+operator: A. Tester
+"""
+
+
+def test_manifest_names_camera_sensor_light_and_operator(tmp_path: Path) -> None:
+    campaign = load_campaign(put_campaign(tmp_path, TOLD + FRAMES))
+    facts = campaign.camera
+    assert (facts.vendor, facts.model, facts.serial_number, facts.lossless) == ("Maker", "M 1", "0815", True)
+    assert (facts.sensor_shape, facts.first_col, facts.first_row) == ((80, 100), 30, 20)
+    assert (campaign.optics.light_source, campaign.operator) == ("green LED", "A. Tester")
+    write_manifest(campaign, tmp_path / "again.yaml")
+    again = load_campaign(tmp_path / "again.yaml")
+    assert (again.camera, again.optics, again.operator) == (facts, campaign.optics, campaign.operator)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("sensor_rows: 80, ", "", ["sensor_cols and sensor_rows", "both or neither"]),
+        ("first_row: 20, ", "", []),
+        ("sensor_cols: 100, sensor_rows: 80, ", "", ["size is not given"]),
+        ("first_col: 30", "first_col: 95", ["do not lie on the sensor", "8 x 6 pixels from (95, 20)", "100 x 80"]),
+        ("lossless: true", "lossless: rather", ["lossless"]),
+        ("'0815'", "0815", ["camera.serial_number", "quotes"]),
+    ],
+)
+def test_a_window_must_lie_on_its_sensor(old: str, new: str, words: list[str], tmp_path: Path) -> None:
+    text = TOLD.replace(old, new).replace("\n   first_row: 20,", "\n   ") if "first_row" in old else TOLD.replace(old, new)
+    with pytest.raises(InputError) as caught:
+        load_campaign(put_campaign(tmp_path, text + FRAMES))
+    for word in words:
+        assert word in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("stated", "expected"), [("", (True, "proven")), (", lossless: true", (True, "stated")), (", lossless: false", (False, "stated"))]
+)
+def test_storage_is_told_by_the_files_and_the_manifest_goes_beyond_them(stated: str, expected: tuple[bool, str], tmp_path: Path) -> None:
+    campaign = load_campaign(put_campaign(tmp_path, HEAD.replace("sensor: cmos", f"sensor: cmos{stated}") + FRAMES))
+    reader = FrameReader(campaign)
+    assert reader.storage.known == ("stated" if stated else "unknown")
+    for group in campaign.groups:
+        list(reader.frames(group))
+    assert (reader.storage.lossless, reader.storage.known) == expected

@@ -156,6 +156,7 @@ def compute_budget(
     estimator: Estimator | None = None,
     *,
     geometry: CameraGeometry | None = None,
+    sensor_shape: tuple[int, int] | None = None,
     accepted: Collection[str] = (),
     frames: Sequence[int] = FRAMES,
     trials: int = 2048,
@@ -179,6 +180,8 @@ def compute_budget(
         By default a soft threshold of three standard deviations in 13 × 13 px.
     geometry : CameraGeometry, optional
         Of a calibration with which positions are corrected: in place of the displacements that it takes up stands what it leaves.
+    sensor_shape : (int, int), optional
+        Rows and columns of the sensor, where the camera's frames are a window of it: what is accepted at its bound is taken for the whole.
     accepted : collection of str
         Names in the chain that are there without being known: taken at their bound.
     frames : sequence of int
@@ -201,13 +204,14 @@ def compute_budget(
         camera = camera.switched(off=[e.name for e in camera.active if e.source.id in TAKEN_UP])
     facts = facts_of(camera, target, known_facts)
     probe = make_probe(facts, target, estimator)
+    whole = probe if sensor_shape is None else replace(probe, frame_shape=sensor_shape)
     rows = []
     for name, source in _sources(camera):
         say(name)
         if geometry is not None and source.id in TAKEN_UP:
             rows.append(_calibrated(name, source, geometry))
         else:
-            rows.append(_row(name, source, camera, estimates_by_source.get(name), name in accepted, probe))
+            rows.append(_row(name, source, camera, estimates_by_source.get(name), name in accepted, probe, whole))
     interaction = None
     if trials:
         design = Trials(camera, target, estimator, facts, trials, units, seed=seed)
@@ -251,7 +255,7 @@ def _as_measured(camera: Camera, estimates_by_source: dict[str, Estimates]) -> C
     return replace(camera, chain=tuple(chain))
 
 
-def _row(name: str, source: Source, camera: Camera, estimates: Estimates | None, at_bound: bool, probe: Any) -> BudgetRow:
+def _row(name: str, source: Source, camera: Camera, estimates: Estimates | None, at_bound: bool, probe: Any, whole: Any) -> BudgetRow:
     head = BudgetRow(name, source.id, source.title, "")
     if not applies(source, camera.facts):
         return replace(head, status="not applicable", reason=f"only in a camera that is {' or '.join(source.applies_to)}")
@@ -272,7 +276,7 @@ def _row(name: str, source: Source, camera: Camera, estimates: Estimates | None,
         reason = source.reasons.get("measure", "not measured in this campaign")
     if source.propagate is None:
         return replace(head, status=status, reason=source.reasons["propagate"])
-    contribution = source.propagate(params, probe)
+    contribution = source.propagate(params, whole if status == "accepted" else probe)
     u = u_of_total(source, params, estimates, probe) if measured else 0.0
     return replace(head, status=status, contribution=contribution, u_of_total_px=u, reason=reason)
 

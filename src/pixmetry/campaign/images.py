@@ -13,23 +13,28 @@ import numpy as np
 from pixmetry.campaign.png import SIGNATURE, PlainPng
 from pixmetry.campaign.provenance import InputHashes
 from pixmetry.campaign.records import Campaign, FrameGroup
-from pixmetry.campaign.zarr_frames import entries, is_entry, read_entry
+from pixmetry.campaign.zarr_frames import entries, is_entry, lossless_store, read_entry
 from pixmetry.core.errors import InputError
+from pixmetry.core.observations import Storage
 from pixmetry.core.threads import imap_tiles
 
 _FORMATS = "grey PNG, TIFF or NPY with 8 or 16 bits"
 _JPEG = b"\xff\xd8"
+_TIFF_MARKS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+_LOSSLESS_TIFF = {1, 5, 8, 32773, 32946, 50000, 34925, 34926}  # none, LZW, Deflate, PackBits, Deflate, Zstandard, LZMA
+_LOSSY_TIFF = {6, 7, 33007}  # JPEG
 ENDINGS = (".png", ".tif", ".tiff", ".npy")
 PICTURE_ENDINGS = (*ENDINGS, ".jpg", ".jpeg")
 CHANNELS = {"red": 0, "green": 1, "blue": 2}
 
 
 class LoadedFrame(NamedTuple):
-    """A decoded frame with the digest of its file."""
+    """A decoded frame with the digest of its file, and whether the file's coder is lossless (None: not known)."""
 
     array: np.ndarray
     sha256: str
     size_bytes: int
+    lossless: bool | None = True
 
 
 def read_frame(path: str | Path) -> np.ndarray:
@@ -52,12 +57,12 @@ def load_frame(path: Path, plain_png: PlainPng | None = None) -> LoadedFrame:
     """Read one frame and the SHA-256 of its file from the same bytes; errors as in `read_frame`."""
     if is_entry(path):
         array, sha256, size = read_entry(path)
-        return LoadedFrame(_checked(array, path), sha256, size)
+        return LoadedFrame(_checked(array, path), sha256, size, lossless_store(path))
     raw = _read_bytes(path)
     array = plain_png.decode(raw) if plain_png is not None and raw.startswith(SIGNATURE) else None
     if array is None:
         array = _checked(_decoded(raw, path), path)
-    return LoadedFrame(array, hashlib.sha256(raw).hexdigest(), len(raw))
+    return LoadedFrame(array, hashlib.sha256(raw).hexdigest(), len(raw), _lossless(raw))
 
 
 def read_picture(path: str | Path, channel: str | None = None) -> np.ndarray:
@@ -141,6 +146,16 @@ def _decoded(raw: bytes, path: Path, lossy: bool = False) -> np.ndarray:
     except Exception as problem:  # every decoder has its own exceptions, and all of them mean a damaged file here
         reason = str(problem).splitlines()[0] if str(problem) else type(problem).__name__
         raise InputError(f"image is damaged or cut off ({reason})", where=str(path), remedy="copy or export the frame again") from None
+
+
+def _lossless(raw: bytes) -> bool | None:
+    """Whether the coder of a file that was decoded is lossless; None if that is not known."""
+    if raw[:4] not in _TIFF_MARKS:
+        return not raw.startswith(_JPEG)
+    import tifffile
+
+    with tifffile.TiffFile(io.BytesIO(raw)) as tiff:
+        return None if (coder := int(tiff.pages[0].compression)) not in _LOSSLESS_TIFF | _LOSSY_TIFF else coder in _LOSSLESS_TIFF
 
 
 def _checked(array: np.ndarray, path: Path) -> np.ndarray:
@@ -295,6 +310,7 @@ class FrameReader:
         self.campaign, self.threads = campaign, threads
         self.hashes = InputHashes(campaign.base)
         self._plain_png = PlainPng()
+        self._coders: set[bool | None] = set()
         for listing in (campaign.source_path, campaign.descriptor_path):
             if listing is not None and listing.is_file():
                 self.hashes.add_file(listing)
@@ -304,7 +320,21 @@ class FrameReader:
         c, frame = self.campaign, load_frame(path, self._plain_png)
         check_frame(frame.array, str(path), bits=c.bits, shape=c.frame_shape, dtype=c.frame_dtype)
         self.hashes.add(path, frame.sha256, frame.size_bytes)
+        self._coders.add(frame.lossless)
+        if frame.lossless is False and c.camera.lossless:
+            remedy = "write `lossless: false`, or store the frames without loss"
+            raise InputError("stored with loss, but `lossless: true` is stated", where=str(path), remedy=remedy)
         return frame.array
+
+    @property
+    def storage(self) -> Storage:
+        """Whether the frames that were read so far were stored without loss; what the manifest states goes beyond the files."""
+        stated = self.campaign.camera.lossless
+        if False in self._coders:
+            return Storage(False, "proven")
+        if stated is not None:
+            return Storage(stated, "stated")
+        return Storage(True, "proven") if self._coders == {True} else Storage()
 
     def frames(self, group: FrameGroup) -> Iterator[np.ndarray]:
         """Yield the frames of one group in order, decoding ahead in threads; errors as in `iter_frames`."""

@@ -60,10 +60,11 @@ def load_campaign(path: str | Path | None = None) -> Campaign:
         parts = _from_descriptor(source, raw, None)
     else:
         model, lines = _read_manifest(source)
-        facts = {"optics": OpticsFacts(**model.optics.model_dump()), "notes": model.notes}
+        facts = {"optics": OpticsFacts(**model.optics.model_dump()), "notes": model.notes, "operator": model.operator}
         parts = _from_manifest(source, model, lines)
     groups = check_groups(parts["groups"], str(source))
     shape, dtype = _discover(groups[0].paths[0], parts)
+    _check_window(parts["camera"], shape, str(source))
     return Campaign(
         camera=parts["camera"],
         groups=groups,
@@ -81,6 +82,18 @@ def _discover(path: Path, parts: Mapping[str, Any]) -> tuple[tuple[int, int], st
     array = read_frame(path)
     check_frame(array, str(path), bits=parts["camera"].bits, shape=parts.get("shape"))
     return (array.shape[0], array.shape[1]), array.dtype.name
+
+
+def _check_window(camera: CameraFacts, shape: tuple[int, int], where: str) -> None:
+    """Refuse frames that do not lie on the sensor that was stated."""
+    if camera.sensor_shape is None:
+        return
+    row, col = camera.first_row or 0, camera.first_col or 0
+    if row + shape[0] > camera.sensor_rows or col + shape[1] > camera.sensor_cols:
+        found = f"{shape[1]} x {shape[0]} pixels from ({col}, {row})"
+        allowed = f"inside sensor_cols x sensor_rows = {camera.sensor_cols} x {camera.sensor_rows}"
+        remedy = "correct sensor_cols, sensor_rows, first_col, first_row"
+        raise InputError("the frames do not lie on the sensor", where=where, value=found, allowed=allowed, remedy=remedy)
 
 
 def _has_schema(path: Path, what: str) -> bool:
@@ -212,4 +225,5 @@ def write_manifest(campaign: Campaign, path: str | Path) -> None:
         files = [p.relative_to(base).as_posix() for p in group.paths]
         frames.append({"kind": group.kind, "exposure_s": group.exposure_s, "photons": photons, "role": group.role, "files": files})
     manifest = {"schema": CAMPAIGN_SCHEMA, "camera": asdict(campaign.camera), "optics": asdict(campaign.optics), "frames": frames}
-    dump_yaml({**manifest, "licence": campaign.licence or None, "notes": campaign.notes or None}, path)
+    told = {name: getattr(campaign, name) or None for name in ("licence", "notes", "operator")}
+    dump_yaml({**manifest, **told}, path)

@@ -27,6 +27,19 @@ class CameraFacts:
     temperature_c: float | None = None
     pixel_clock_mhz: float | None = None
     cfa: str | None = None  # colour filter of a mosaic: the colours of pixels (0,0), (0,1), (1,0), (1,1), e.g. "RGGB"
+    vendor: str | None = None
+    model: str | None = None
+    serial_number: str | None = None
+    sensor_cols: int | None = None  # of the whole sensor, where the frames are a window of it
+    sensor_rows: int | None = None
+    first_col: int | None = None  # place of the frames' first pixel on the sensor, from 0
+    first_row: int | None = None
+    lossless: bool | None = None  # False: somewhere before these files the frames were coded with loss; True: nowhere
+
+    @property
+    def sensor_shape(self) -> tuple[int, int] | None:
+        """Rows and columns of the whole sensor, where they were said."""
+        return None if self.sensor_rows is None or self.sensor_cols is None else (self.sensor_rows, self.sensor_cols)
 
 
 @dataclass(frozen=True)
@@ -37,6 +50,7 @@ class OpticsFacts:
     f_number: float | None = None
     focal_length_mm: float | None = None  # principal distance
     irradiance_uw_per_cm2: float | None = None
+    light_source: str | None = None
 
 
 @dataclass(frozen=True)
@@ -88,6 +102,8 @@ class Campaign:
         The descriptor that the manifest refers to.
     licence, notes : str
         Text that came with the data.
+    operator : str
+        Who took the frames; empty where it was not said.
     """
 
     camera: CameraFacts
@@ -99,6 +115,7 @@ class Campaign:
     descriptor_path: Path | None = None
     licence: str = ""
     notes: str = ""
+    operator: str = ""
 
     @property
     def bits(self) -> int:

@@ -13,6 +13,17 @@ CAMPAIGN_SCHEMA = "pixmetry/campaign/1"
 
 Positive = Annotated[float, Field(gt=0)]
 Pitch = Annotated[float, Field(ge=0.1, le=1000)]  # µm
+Side = Annotated[int, Field(ge=1, le=1_000_000)]
+
+
+def _quoted(value: Any) -> Any:
+    """A serial number of digits alone is a number for YAML, and zeros at its head are gone."""
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        raise InputError("a number where a text belongs", value=value, allowed="a text in quotes", remedy="put it in quotes, as in '0815'")
+    return value
+
+
+Text = Annotated[str, Field(min_length=1), BeforeValidator(_quoted)]
 Names = Annotated[
     tuple[Annotated[str, Field(min_length=1)], ...], Field(min_length=1), BeforeValidator(lambda v: (v,) if isinstance(v, str) else v)
 ]
@@ -31,6 +42,23 @@ class CameraModel(Model):
     temperature_c: Annotated[float, Field(ge=-273.15)] | None = None
     pixel_clock_mhz: Positive | None = None
     cfa: Literal["RGGB", "BGGR", "GRBG", "GBRG"] | None = None
+    vendor: Text | None = None
+    model: Text | None = None
+    serial_number: Text | None = None
+    sensor_cols: Side | None = None
+    sensor_rows: Side | None = None
+    first_col: Annotated[int, Field(ge=0)] | None = None
+    first_row: Annotated[int, Field(ge=0)] | None = None
+    lossless: bool | None = None
+
+    @model_validator(mode="after")
+    def _whole_sensor(self) -> CameraModel:
+        for one, other in (("sensor_cols", "sensor_rows"), ("first_col", "first_row")):
+            if (getattr(self, one) is None) != (getattr(self, other) is None):
+                raise InputError(f"{one} and {other} belong together", allowed="both or neither", remedy="add the one that is missing")
+        if self.first_col is not None and self.sensor_cols is None:
+            raise InputError("a window of a sensor whose size is not given", remedy="add sensor_cols and sensor_rows")
+        return self
 
     @model_validator(mode="after")
     def _one_pitch(self) -> CameraModel:
@@ -50,6 +78,7 @@ class OpticsModel(Model):
     f_number: Positive | None = None
     focal_length_mm: Positive | None = None
     irradiance_uw_per_cm2: Positive | None = None
+    light_source: Text | None = None
 
 
 class GroupModel(Model):
@@ -85,6 +114,7 @@ class ManifestModel(Model):
     emva_descriptor: str | None = None
     licence: str = ""
     notes: str = ""
+    operator: str = ""
 
     @model_validator(mode="before")
     @classmethod

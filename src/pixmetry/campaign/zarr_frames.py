@@ -12,6 +12,7 @@ import numpy as np
 from pixmetry.core.errors import InputError
 
 ARRAY = "frames"
+LOSSLESS = {"bytes", "transpose", "blosc", "zstd", "gzip", "crc32c", "sharding_indexed"}
 
 
 def is_entry(path: Path) -> bool:
@@ -45,6 +46,13 @@ def read_entry(path: Path) -> tuple[np.ndarray, str, int]:
         raise InputError(f"frame is damaged ({reason})", where=str(path), remedy="copy or make the store again") from None
     raw = np.ascontiguousarray(values, values.dtype.newbyteorder("<")).tobytes()
     return values, hashlib.sha256(raw).hexdigest(), len(raw)
+
+
+def lossless_store(path: Path) -> bool | None:
+    """Whether the coders of an entry's store keep every value; None if one of them is not known."""
+    codecs = [codec.to_dict() for codec in _opened(path.parent).metadata.codecs]
+    inner = [part for codec in codecs for part in codec.get("configuration", {}).get("codecs", ())]  # of a shard
+    return True if {codec["name"] for codec in (*codecs, *inner)} <= LOSSLESS else None
 
 
 def _opened(store: Path) -> Any:

@@ -210,6 +210,24 @@ class CameraGeometry:
 
 
 @dataclass(frozen=True)
+class Storage:
+    """Whether a lossy coder changed the frames before they were read, and how that is known.
+
+    Parameters
+    ----------
+    lossless : bool or None
+        True: no lossy coder; False: there was one (JPEG, a video codec); None: not known.
+    known : str
+        ``"proven"``: every file says it itself: PNG, BMP, FITS, NPY, raw, Zarr and TIFF without a coder or with a lossless one, True; a
+        lossy coder inside a TIFF, False. It holds for the files; a coder before them (a camera that sends JPEG) can only be stated.
+        ``"stated"``: ``lossless`` in the manifest says it. ``"unknown"``: neither, as with arrays in memory.
+    """
+
+    lossless: bool | None = None
+    known: str = "unknown"
+
+
+@dataclass(frozen=True)
 class Observations:
     """Everything one campaign's frames were reduced to; what is not there is ``None``.
 
@@ -229,6 +247,7 @@ class Observations:
     code_errors: CodeErrors | None = None
     temperature_c: float | None = None
     geometry: CameraGeometry | None = None
+    storage: Storage = Storage()
     notes: tuple[str, ...] = field(default_factory=tuple)
 
     def fitted(self, names: Mapping[str, str], what: str, *, where: str, remedy: str) -> Estimates:

@@ -26,6 +26,10 @@ LABELS = {
     "photons_u_rel": "u of the photon scale",
     "irradiance_uw_per_cm2": "Irradiance / µW/cm²",
     "f_number": "f-number",
+    "sensor_cols": "Columns of the sensor",
+    "sensor_rows": "Rows of the sensor",
+    "first_col": "First column on the sensor",
+    "first_row": "First row on the sensor",
 }
 SHOWN_APART = {"release", "name", "rows", "cols", "bits", "pitch_x_um", "pitch_y_um", "temperature_c", "wavelength_nm", "sensor"}
 

@@ -10,7 +10,9 @@ from pixmetry.report.numbers import significant
 from pixmetry.report.templates import filled
 
 if TYPE_CHECKING:
+    from pixmetry.campaign.records import Campaign
     from pixmetry.core.estimates import Estimates
+    from pixmetry.core.observations import Storage
     from pixmetry.results import Assessment
 
 TRANSFER = ("transfer", "linearity", "snr", "dark-codes")
@@ -72,13 +74,42 @@ def _facts(assessment: Assessment) -> list[tuple[str, str]]:
     dark, bright = (sum(len(g.paths) for g in campaign.groups if g.kind == kind) for kind in ("dark", "bright"))
     temperature = "not given" if facts.temperature_c is None else f"{significant(facts.temperature_c)} °C"
     return [
+        *_named(assessment),
         ("Frame", f"{cols} × {rows} pixels, {facts.bits} bits"),
+        *_whole_sensor(campaign),
         ("Pixel pitch", pitch),
         ("Interface, sensor", f"{facts.interface}, {facts.sensor.upper() if facts.sensor else 'sensor not given'}"),
         ("Temperature", temperature),
         ("Frames read", f"{dark} dark, {bright} bright"),
+        ("Stored", _stored(assessment.observations.storage)),
         ("Assessed (UTC)", assessment.provenance["time_utc"].replace("T", " ")[:16]),
     ]
+
+
+def _named(assessment: Assessment) -> list[tuple[str, str]]:
+    """What the manifest says of camera and measurement, as far as it does."""
+    campaign, facts = assessment.campaign, assessment.campaign.camera
+    known = {
+        "Vendor, model": ", ".join(filter(None, (facts.vendor, facts.model))),
+        "Serial number": facts.serial_number,
+        "Light source": campaign.optics.light_source,
+        "Operator": campaign.operator,
+    }
+    return [(label, text) for label, text in known.items() if text]
+
+
+def _whole_sensor(campaign: Campaign) -> list[tuple[str, str]]:
+    facts = campaign.camera
+    if facts.sensor_shape is None:
+        return []
+    at = "" if facts.first_col is None else f", the frame from column {facts.first_col}, row {facts.first_row}"
+    return [("Sensor", f"{facts.sensor_cols} × {facts.sensor_rows} pixels{at}")]
+
+
+def _stored(storage: Storage) -> str:
+    """Whether a lossy coder changed the frames, and how that is known."""
+    what = {True: "without loss", False: "with loss", None: "not known whether without loss"}[storage.lossless]
+    return {"proven": f"{what}, by the files", "stated": f"{what}, as stated"}.get(storage.known, what)
 
 
 def _notes(assessment: Assessment) -> list[str]:
