@@ -91,7 +91,7 @@ def correct_files(
     files = _named_once(picture_files(frames))
     hashes = InputHashes(files[0].parent)
     told = progress or (lambda what, step, of: None)
-    done: dict[str, str] = {}
+    done: dict[str, list[str]] = {}
 
     def work(path: Path) -> tuple[Path, LoadedFrame, np.ndarray, dict[str, str]]:
         loaded = load_frame(path)
@@ -102,16 +102,24 @@ def correct_files(
 
     with staged_output(output, "correction") as folder:
         for i, (path, loaded, data, said) in enumerate(imap_tiles(work, files)):
-            done = said
+            for name, text in said.items():
+                done.setdefault(name, []).append(text)
             hashes.add(path, loaded.sha256, loaded.size_bytes)
             imwrite(folder / f"{path.stem}.tif", data.astype(np.float32))
             told("correcting frames", i + 1, len(files))
-        lines = [f"{name}: {text}" for name, text in done.items()]
+        told_of = {name: _together(texts) for name, texts in done.items()}
+        lines = [f"{name}: {text}" for name, text in told_of.items()]
         write_json(
             folder / "correction.json",
-            {"schema": "pixmetry/correction/1", "unit": "DN above black", "sources": done, "provenance": provenance_record(hashes)},
+            {"schema": "pixmetry/correction/1", "unit": "DN above black", "sources": told_of, "provenance": provenance_record(hashes)},
         )
     return lines
+
+
+def _together(texts: Sequence[str]) -> str:
+    """What was done to all frames in a sentence, with the number of frames where it is not the same for all."""
+    counts = {text: texts.count(text) for text in dict.fromkeys(texts)}
+    return texts[0] if len(counts) == 1 else "; ".join(f"{text} ({count} of {len(texts)} frames)" for text, count in counts.items())
 
 
 def _load(results: Path) -> tuple[dict[str, Any], Camera, dict[str, np.ndarray]]:

@@ -82,10 +82,10 @@ def forward(params: SupplyPickup, signal: Signal, stream: Stream) -> Signal:
 
 
 def correct(params: SupplyPickup, signal: Signal, maps: Mapping[str, np.ndarray]) -> Signal:
-    """Fit amplitude and phase at the known frequency to every frame, beside a constant, and subtract the sinusoid.
+    """Fit amplitude and phase at the known frequency to the background of every frame, and subtract what is significant of the sinusoid.
 
-    Amplitude and phase are fitted, for neither is that of the frames to correct. A frame that shows less than a whole period cannot
-    tell the sinusoid from a gradient of the light, and is refused.
+    Targets and uneven light are kept out of the fit (`without_wave`). Amplitude and phase are fitted, for neither is that of the frames
+    to correct. A frame that shows less than a whole period cannot tell the sinusoid from a gradient of the light, and is refused.
     """
     if params.amplitude_dn == 0:
         return signal
@@ -100,10 +100,12 @@ def correct(params: SupplyPickup, signal: Signal, maps: Mapping[str, np.ndarray]
             allowed="one period or more in x or in y",
             remedy="give whole frames, or average frames over a beat of supply and frame period",
         )
-    out = np.empty(signal.data.shape, np.float32)
+    out, changed = np.array(signal.data, np.float32), False
     for index, rows, field, _ in split(params, signal):
-        out[index, rows] = without_wave(field, nu_x, nu_y)
-    return signal.with_data(out)
+        data = without_wave(field, nu_x, nu_y)
+        if data is not None:
+            out[index, rows], changed = data, True
+    return signal.with_data(out) if changed else signal
 
 
 def propagate(params: SupplyPickup, probe: Probe) -> Contribution:

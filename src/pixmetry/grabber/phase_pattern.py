@@ -17,6 +17,8 @@ from pixmetry.core.signal import Kind, Signal
 from pixmetry.core.source import Parameters, Source, quantity
 from pixmetry.core.waves import shift_per_dn, wave, without_wave
 
+LARGEST_REL = 3.0  # amplitude in a frame over the measured one, up to which it is the same wave
+
 
 class PhasePattern(Parameters):
     """One wave over the frame."""
@@ -77,10 +79,14 @@ def _limit(found: PatternList) -> Estimates:
 
 
 def correct(params: PhasePattern, signal: Signal, maps: Mapping[str, np.ndarray]) -> Signal:
-    """Fit amplitude and phase of the wave to every frame at the known frequency, beside a constant, and subtract it."""
+    """Fit amplitude and phase of the wave to the background of every frame, beside uneven light, and subtract what is significant of it.
+
+    A fitted amplitude of more than `LARGEST_REL` times the measured one is the scene's own structure, and stays.
+    """
     if params.amplitude_dn == 0:
         return signal
-    return signal.with_data(without_wave(signal, params.frequency_x, params.frequency_y))
+    data = without_wave(signal, params.frequency_x, params.frequency_y, LARGEST_REL * params.amplitude_dn)
+    return signal if data is None else signal.with_data(data)
 
 
 def propagate(params: PhasePattern, probe: Probe) -> Contribution:
