@@ -80,6 +80,43 @@ def test_a_negative_variance_is_a_limit_that_names_the_row_noise(sheets: dict[st
     assert 0 < limit.value < 4 / np.sqrt(24)
 
 
+class Spoilt(Camera):
+    """Frames with something added to the charge of every pixel."""
+
+    extra_e: np.ndarray
+
+    def frames(self, number, exposure_s, photons, stream):
+        for frame in super().frames(number, exposure_s, photons, stream):
+            yield np.clip(np.rint(frame + self.gain_dn_per_e * self.extra_e), 0, self.top).astype(np.uint16)
+
+
+def spoilt(extra_e: np.ndarray) -> Measurement:
+    camera = Spoilt(seed=5, shape=extra_e.shape, levels=12, stack_frames=16, prnu_rel=(0.011, 0.0, 0.0), dsnu_e=(1.0, 0.0, 0.0))
+    object.__setattr__(camera, "extra_e", extra_e)
+    return measured(camera)
+
+
+@pytest.mark.parametrize("release", RELEASES)
+def test_hot_pixels_that_clip_in_the_light_leave_no_limit_of_the_prnu(release: str) -> None:
+    """1 % of the pixels have 9000 e⁻ more: full in the light. s²_y − s²_y.dark is then thousands of u below zero, PRNU is 1.1 %."""
+    rng = np.random.default_rng()
+    values = standard_values(spoilt(9000.0 * (rng.random((64, 96)) < 0.01)), release, draws=300).values
+    for key in ("PRNU1288", "PRNU1288_pixel"):
+        assert math.isnan(values[key].value) and not values[key].is_limit
+        assert "hot in the dark" in values[key].reason and "highest code" in values[key].reason
+
+
+@pytest.mark.parametrize("release", RELEASES)
+def test_a_wave_across_the_frame_leaves_no_limit_of_rows_and_columns(release: str) -> None:
+    """60 e⁻ of a fixed wave: rows and columns come out at −½ 60²/n e⁻², far below zero, where no variance can be; the pixels stand."""
+    y, x = np.mgrid[:64, :96]
+    values = standard_values(spoilt(60 * np.sin(2 * np.pi * (0.11 * x + 0.17 * y))), release, draws=300).values
+    for line in ("row", "col"):
+        value = values[f"DSNU1288_{line}"]
+        assert math.isnan(value.value) and not value.is_limit and "wave" in value.reason and "stands out" not in value.reason
+    assert values["DSNU1288_pixel"].value == pytest.approx(math.hypot(60 / math.sqrt(2), 1.0), rel=0.02)
+
+
 def test_limits_lie_above_the_truth_in_95_of_100_cameras() -> None:
     """100 cameras whose pixels have a pattern of half of what the row noise takes off: covered 80 times or so but for one in 1e6.
 

@@ -58,3 +58,19 @@ def test_rounding_error_is_bounded(noise: float):
     rng = np.random.default_rng()
     bound = rounding_error_dn(stack(rng, 5 + np.tile(np.linspace(0, 1, 200), (100, 1)), noise))
     assert worst <= bound * 1.02 and bound <= 0.5
+
+
+def test_hot_pixels_that_clip_in_the_light_are_hot_and_not_dead():
+    """40 pixels with 180 DN of dark charge under 120 DN of uneven light end at the top code; 20 dead ones and 5 that are both stay dead."""
+    rng, shape = np.random.default_rng(), (120, 160)
+    places = rng.choice(shape[0] * shape[1], 65, replace=False)
+    extra, response = np.zeros(shape[0] * shape[1]), np.ones(shape[0] * shape[1])
+    extra[places[:40]], response[places[40:]], extra[places[60:]] = 180.0, 0.1, 40.0
+    fall = 1 - 0.4 * (np.mgrid[-1:1:120j, -1:1:160j] ** 2).sum(axis=0) / 2
+    dark = 10 + rng.normal(0, 1, shape) + extra.reshape(shape)
+    bright = dark + 120 * fall * response.reshape(shape) * (1 + rng.normal(0, 0.01, shape))
+    found = find_defects(stack(rng, dark, 1.0), stack(rng, bright, 2.0))
+    kinds = dict(zip((found.row * shape[1] + found.col).tolist(), found.kind, strict=True))
+    assert [kinds.get(int(p)) for p in places] == ["hot"] * 40 + ["dead"] * 25
+    gain = dict(zip((found.row * shape[1] + found.col).tolist(), found.gain_rel.tolist(), strict=True))
+    assert all(np.isnan(gain[int(p)]) for p in places[:40])

@@ -132,7 +132,7 @@ class DefectList:
     col: np.ndarray
     kind: tuple[str, ...]
     dark_excess_dn: np.ndarray
-    gain_rel: np.ndarray  # response over that of its surroundings; 1 is normal; nan without a bright stack
+    gain_rel: np.ndarray  # response over that of its surroundings; nan without a bright stack or where the end of the scale hides it
     expected_false: float  # mean number of false alarms in a frame whose good pixels are Gaussian
     shape: tuple[int, int]
     dark_limit_dn: float = float("nan")  # dark excess at which half of the pixels would be found

@@ -18,7 +18,7 @@ from pixmetry.emva.keys import KEYS, goes_with_photons
 from pixmetry.emva.linear_model import departure_bounds, linear_model
 from pixmetry.emva.lower_limits import with_lower_limits
 from pixmetry.emva.nonlinear import nonlinear_values
-from pixmetry.emva.reasons import DARK_PATTERN, Case, is_blind, is_bound, lifted, notes_of, reason_for
+from pixmetry.emva.reasons import DARK_PATTERN, Case, breaks_the_split, is_blind, is_bound, lifted, notes_of, reason_for
 from pixmetry.emva.records import RELEASES, Measurement, Results, Value
 from pixmetry.emva.rules import ONE_SIDED_95
 from pixmetry.emva.scatter import GROUPS, Scatter, scatter_of
@@ -65,7 +65,8 @@ def evaluate(m: Measurement, release: str, *, draws: int = 4000) -> Results:
     applied to draws of the measured statistics from their sampling laws and from the scatter that the series shows. u is the root mean
     square of the draws about the value of the smooth series behind them, so it holds the bias that noise gives to extremes and absolute
     values (linearity errors). Degrees of freedom by Welch and Satterthwaite (JCGM 100, G.4) over the independent causes, each drawn alone.
-    A standard deviation whose square comes out negative is given as a 95 % upper limit: of the square (from its u), then the root.
+    A standard deviation whose square comes out negative within its u is given as a 95 % upper limit: of the square (from its u), then the
+    root. A square far below zero breaks what the split rests on; it has no root and gives no limit, and its reason says so.
     """
     _check_release(release)
     with single_threaded_blas():
@@ -237,7 +238,7 @@ def _value(key: str, case: Case) -> Value:
     """One value with its uncertainty, or the limit or reason that stands for it."""
     formulas, measured, squares, spread, noise = case.formulas, case.measured, case.squares, case.spread, case.noise
     unit, method, reason = KEYS[key].unit, _method(key, formulas.release), reason_for(key, case)
-    if key not in measured or key not in spread.u or is_blind(key, case):
+    if key not in measured or key not in spread.u or is_blind(key, case) or breaks_the_split(key, case):
         return Value(math.nan, math.nan, math.nan, unit, method, reason)
     value, u, dof = float(measured[key]), spread.u[key], spread.dof.get(key, math.inf)
     known = light_of(formulas.series)

@@ -162,6 +162,10 @@ def _spatial(m: Measurement, fit: Estimates, dnl_lsb: float) -> tuple[dict[str, 
     joint = fit.select(["gain_dn_per_e"]).join(found)
     out = _Propagation(joint, joint.covariance, SPATIAL_METHOD)
     for key, name in SPATIAL_KEYS.items():
+        if name not in found:
+            unit = key_of(key + NONLINEAR).unit
+            out.values[key + NONLINEAR] = Value(math.nan, math.nan, math.nan, unit, SPATIAL_METHOD, found.reasons.get(name, ""))
+            continue
         e = found[name]
         if key.startswith("DSNU"):
             value, gradient = e.value / gain.value, {name: 1 / gain.value, "gain_dn_per_e": -e.value / gain.value**2}

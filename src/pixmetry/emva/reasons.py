@@ -20,6 +20,7 @@ from pixmetry.emva.temporal import dark_line
 from pixmetry.experiment.stack import same_exposure
 
 SWEPT_SHARE = 0.01  # of the slope of the response
+BROKEN = 5.0  # u below zero from which a square is no chance any more (3e-7)
 WANTED_LEVELS, WANTED_DARK_LEVELS = 50, 6  # R4.0 §6.5, §7.1
 BOUNDED_BY_DARK_NOISE = ("sigma_y_dark", "sigma_d", "u_p_min", "u_p_min_area", "u_e_min", "u_e_min_area")
 DARK_PATTERN = ("DSNU1288", "DSNU1288_DN", "DSNU1288_row", "DSNU1288_col", "DSNU1288_pixel", "general_DSNU")
@@ -79,6 +80,14 @@ def lifted(key: str, formulas: Formulas, measured: Values) -> float:
     return max(bright - dark, 0.0) * (100 / light) ** 2
 
 
+def breaks_the_split(key: str, case: Case) -> bool:
+    """Whether the square behind a root lies so far below zero that what the split into parts rests on does not hold."""
+    if key not in case.squares:
+        return False
+    square = float(case.squares[key]) + lifted(key, case.formulas, case.measured)
+    return square < -BROKEN * case.spread.u_square.get(key, math.inf)
+
+
 def reason_for(key: str, case: Case) -> str:
     """What the reader should know about one value; empty where there is nothing to say."""
     m, formulas, measured, squares, spread = case.m, case.formulas, case.measured, case.squares, case.spread
@@ -100,6 +109,8 @@ def reason_for(key: str, case: Case) -> str:
         return _clipped(key, case)
     if section == "dark_current":
         return _dark_current(key, formulas, value)
+    if breaks_the_split(key, case):
+        return _broken(key, case)
     if key in squares and float(squares[key]) < 0:
         return _negative(key, formulas, float(squares[key]))
     if case.noise.below and (is_bound(key) or key.startswith("DR")):
@@ -158,6 +169,39 @@ def _negative(key: str, formulas: Formulas, square: float) -> str:
         f"{stack.n_frames} frames, is taken for a fixed pattern of rows and columns, and off the pixels; 95 % upper limit with "
         "that put back"
     )
+
+
+def _broken(key: str, case: Case) -> str:
+    """Why a square is far below zero, where no square can be: what the split takes for granted does not hold."""
+    square = float(case.squares[key])
+    in_u = f"{square / case.spread.u_square[key]:.0f} u" if case.spread.u_square[key] > 0 else "many u"
+    behind = f"the variance behind it is far below zero ({square:.3g} in {key_of(key).unit} squared, {in_u})".replace("-", "−")
+    if key.startswith("PRNU"):
+        dark = float(case.squares["DSNU1288_DN"])
+        if dark * (100 / _light_dn(case)) ** 2 > abs(square):  # the dark pattern is what was taken off
+            at_top = case.m.bright_stack.fraction_max if case.m.bright_stack is not None else 0.0
+            seen = f"{100 * at_top:.2g} % of the bright pixels are at the highest code; " if at_top > 0 else ""
+            return (
+                f"{behind}: the pixels differ less in the light than in the dark, as those do that are hot in the dark and clip in "
+                f"the light ({seen}the standard takes the dark variance off as if it were still there); no value and no limit: leave "
+                "such pixels out"
+            )
+    line = "rows" if key.endswith("_row") else "columns" if key.endswith("_col") else ""
+    if line:
+        return (
+            f"{behind}: the means of {line} differ less than those of independent pixels would, as under a wave that runs across the "
+            "frame: it adds to the pixels and averages out along a line, while the split takes the pixels for independent of each other; "
+            "no value and no limit"
+        )
+    return (
+        f"{behind}: what is left after averaging is less than the temporal noise of single frames lets expect, as where that noise is not "
+        "independent from frame to frame (a wave that moves, or a mean that drifts); no value and no limit"
+    )
+
+
+def _light_dn(case: Case) -> float:
+    assert case.formulas.stacks is not None
+    return float(case.formulas.stacks[1].vector[0] - case.formulas.stacks[0].vector[0])
 
 
 def _clipped(key: str, case: Case) -> str:

@@ -68,6 +68,9 @@ def find_defects(
     Where the temporal noise is small against a code (σ below about 0.4 DN), mean codes do not follow the signal: two pixels of the
     same signal can lie up to one code apart. What rounding can do at the worst phase is then taken off every deviation first, and the
     width of the core is read from the shares of pixels half a code above and below the commonest one.
+
+    A hot pixel that stands above all good ones in the light although it seems to answer too little has met the end of the scale: it is
+    hot, and its response is not known (``gain_rel`` is NaN).
     """
     from scipy.stats import norm
 
@@ -90,9 +93,12 @@ def find_defects(
     gain, gain_sigma = np.full(shape, np.nan), float("nan")
     if bright_stack is not None:
         own = np.where(noisy, np.hypot(own, np.sqrt(bright_stack.var_map_dn2 / bright_stack.n_frames)), 0.0)
-        gain, gain_z, gain_sigma = _response(dark_stack, bright_stack, surface_degree, threshold, own, rounding)
+        gain, gain_z, gain_sigma, surface = _response(dark_stack, bright_stack, surface_degree, threshold, own, rounding)
+        brightest_good = float(median(dark_stack.mean_map_dn)) + threshold * sigma + surface * (1 + threshold * gain_sigma)
+        clipped = found["hot"] & (gain_z < -threshold) & (bright_stack.mean_map_dn > brightest_good)
+        gain[clipped] = np.nan  # how they answer cannot be seen
         found["dead"] = (gain < 0.5) & (gain_z < -threshold)
-        found["gain"] = (np.abs(gain_z) > threshold) & ~found["dead"]
+        found["gain"] = (np.abs(gain_z) > threshold) & ~found["dead"] & ~clipped
         still = (dark_stack.var_map_dn2 == 0) & (bright_stack.var_map_dn2 == 0)
         found["stuck"] = found["dead"] & still & (np.abs(gain) < 0.01)
     kind = np.full(shape, "", dtype="U5")
@@ -158,8 +164,11 @@ def _noise_z(stack: StackMoments, coarse: bool) -> np.ndarray:
 
 def _response(
     dark: StackMoments, bright: StackMoments, degree: int, threshold: float, own_dn: np.ndarray, rounding_dn: float
-) -> tuple[np.ndarray, np.ndarray, float]:
-    """Response over that of the smooth surface, how many robust σ it is off 1, and that σ; fitted again without what stood out."""
+) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
+    """Response over that of the smooth surface, how many robust σ it is off 1, that σ, and the surface (DN).
+
+    Fitted again without what stood out.
+    """
     light = bright.mean_map_dn - dark.mean_map_dn
     level = float(median(light))
     if level <= 0:
@@ -168,9 +177,10 @@ def _response(
     slack = 2 * (rounding_dn + rounding_error_dn(bright)) / level
     mask = np.zeros(light.shape, dtype=bool)
     for _ in range(2):
-        relative = light / fit_surface(fill(light, mask), degree).values
+        surface = fit_surface(fill(light, mask), degree).values
+        relative = light / surface
         flat = _without_lines(relative)
         sigma = robust_sigma(flat, floor)
         z = _beyond(flat, slack) / np.maximum(sigma, own_dn / level)
         mask = np.abs(z) > threshold
-    return 1.0 + flat, z, sigma
+    return 1.0 + flat, z, sigma, surface

@@ -16,17 +16,22 @@ from pixmetry.experiment.photon_transfer_model import rounding_error_vars, slope
 from pixmetry.experiment.surface import Strata, Surface, cross_strata, fill, fit_surface, residual_parts
 
 PARTS = ("pixel", "row", "col")
+BROKEN = 5.0  # u below zero from which a variance is no chance any more (3e-7)
 NOT_ROUND = 3.0  # curvatures along x and y that differ by more than this many u belong to a light that is not round
 METHOD = "analysis of variance of the mean maps, less temporal mean squares / L; Scheffé 1959, limits after Graybill & Wang 1980"
 
 
 @dataclass(frozen=True)
 class _MeanSquares:
-    """Independent mean squares: values, degrees of freedom, excess kurtosis of what was squared."""
+    """Independent mean squares: values, degrees of freedom, excess kurtosis of what was squared.
+
+    ``waves`` is the part of each that moving waves give on average; it has an exponential law.
+    """
 
     values: np.ndarray
     dof: np.ndarray
     kurtosis: np.ndarray
+    waves: np.ndarray
 
     def relative_variances(self) -> np.ndarray:
         # Var(MS) = MS² (2/ν + γ₂/n), γ₂ the excess kurtosis of what was squared
@@ -72,7 +77,9 @@ def fit_spatial(
         ``dsnu_{pixel,row,col,total}_dn``, ``prnu_{pixel,row,col,total}_rel`` (0.01 is 1 %), standard deviations;
         ``shading_x_per_px``, ``shading_y_per_px`` (relative gradient at the
         centre), ``shading_corner_rel`` (loss from the centre to the corners as r², over the mean light; negative where the corners are
-        brighter) and ``shading_pp_rel``. A non-uniformity that is not significantly above zero is a 95 % upper limit.
+        brighter) and ``shading_pp_rel``. A non-uniformity that is not significantly above zero is a 95 % upper limit. One whose variance
+        lies more than 5 u below zero is left out, with why in ``reasons``: the split takes the pixels for independent of each other, and
+        under a wave across the frame they are not.
 
     Raises
     ------
@@ -123,7 +130,8 @@ def fit_spatial(
         dark = without_fixed_waves(dark, patterns)
     response = fill((bright_stack.mean_map_dn - dark_stack.mean_map_dn) / surface.values, mask)
     response = response - fit_surface(response, surface_degree).values
-    squares, covariance = _mean_squares(dark_stack, bright_stack, dark, response, mask, surface, this_sensor)
+    waves_dn2 = 0.0 if patterns is None else float((0.5 * patterns.amplitude_dn[patterns.moving] ** 2).sum())
+    squares, covariance = _mean_squares(dark_stack, bright_stack, dark, response, mask, surface, this_sensor, waves_dn2)
     components = _components(squares, covariance, dark_stack.shape, float((surface.values**-2.0).mean()))
     result = _with_rounding(components, dither_dn2, dnl_lsb).join(_shading(surface, squares))
     return result if linearity is None else _with_common_scale(result, linearity.contrast_u_rel(stored_dn))
@@ -188,11 +196,13 @@ def _mean_squares(
     mask: np.ndarray,
     surface: Surface,
     this_sensor: bool,
+    waves_dn2: float = 0.0,
 ) -> tuple[_MeanSquares, np.ndarray]:
     """The twelve mean squares (dark map, response map, dark and bright temporal; pixel, row, column each) and their covariance.
 
     Of a given pattern with mean square S, noise of mean square t gives Var(MS) = (4 S t + 2 t²)/ν = 2 (MS² − S²)/ν with MS = S + t; the
-    mean product of two maps goes alike. Drawn anew, pattern and noise give 2 MS²/ν and the pattern's kurtosis.
+    mean product of two maps goes alike. Drawn anew, pattern and noise give 2 MS²/ν and the pattern's kurtosis. Of waves that move, of
+    power P in every frame, the mean of L frames holds P/L on average, with an exponential law: their phases add up as a random walk does.
     """
     rows, cols = dark.shape
     n_defects = int(mask.sum())
@@ -207,7 +217,9 @@ def _mean_squares(
     dof = np.concatenate([dof_map, dof_response, per_frame * (dark_stack.n_frames - 1), per_frame * (bright_stack.n_frames - 1)])
     kurtosis = np.zeros(12)
     kurtosis[0], kurtosis[3] = _kurtosis(residual_parts(dark)[0], mask), _kurtosis(residual_parts(response)[0], mask)
-    squares = _MeanSquares(values, dof, kurtosis)
+    waves = np.zeros(12)
+    waves[0] = waves_dn2 / dark_stack.n_frames
+    squares = _MeanSquares(values, dof, kurtosis, waves)
     variances = values**2 * squares.relative_variances()
     # the dark map enters the response too: Cov(MS_x, MS_y) = 2 c²/ν with c the covariance of x and y
     shared = _array(cross_strata(dark, response)) / dof_response
@@ -218,7 +230,7 @@ def _mean_squares(
         fixed = np.maximum(values[:6] - noise, 0.0)
         variances[:6] = 2 * (values[:6] ** 2 - fixed**2) / dof[:6]
         common = 2 * (shared**2 - (shared + noise_dark * float(per_light.mean())) ** 2) / dof_map
-    covariance = np.diag(variances)
+    covariance = np.diag(variances + waves**2)
     for i in range(3):
         covariance[i, 3 + i] = covariance[3 + i, i] = common[i]
     return squares, covariance
@@ -253,7 +265,9 @@ def _components(squares: _MeanSquares, covariance: np.ndarray, shape: tuple[int,
     terms = matrix**2 * np.diag(covariance)
     dof = own**2 / np.maximum((terms**2 / (2 / squares.relative_variances())).sum(axis=1), 1e-300)  # Welch–Satterthwaite
     limits = frozenset(n for n, s in zip(names, significant, strict=True) if not s)
-    return Estimates(
+    in_u = np.divide(variances, np.sqrt(own), out=np.zeros(8), where=own > 0)
+    broken = {name: _broken(name, float(far)) for name, far in zip(names, in_u, strict=True) if far < -BROKEN}
+    found = Estimates(
         names=tuple(names),
         values=values,
         covariance=covariance_out * np.outer(slope, slope),
@@ -264,15 +278,37 @@ def _components(squares: _MeanSquares, covariance: np.ndarray, shape: tuple[int,
         limits=limits,
         reasons={name: "not significantly above the temporal noise left in the mean map" for name in limits},
     )
+    kept = found.select([name for name in names if name not in broken])
+    return replace(kept, reasons={**kept.reasons, **broken})
+
+
+def _broken(name: str, in_u: float) -> str:
+    """Why a variance lies far below zero, where none can be."""
+    behind = f"the variance behind it lies {-in_u:.0f} u below zero"
+    if "_row_" in name or "_col_" in name:
+        line = "rows" if "_row_" in name else "columns"
+        return (
+            f"{behind}: the means of {line} differ less than those of independent pixels would, as under a wave that runs across the "
+            "frame; the split takes the pixels for independent of each other, and gives neither a value nor a limit"
+        )
+    return (
+        f"{behind}: less is left in the mean of the frames than the noise of single frames lets expect, as where that noise is not "
+        "independent from frame to frame; neither a value nor a limit"
+    )
 
 
 def _bounds(matrix: np.ndarray, squares: _MeanSquares) -> tuple[np.ndarray, np.ndarray]:
-    """One-sided 95 % bounds of linear combinations of mean squares: modified large-sample method of Graybill & Wang (1980)."""
+    """One-sided 95 % bounds of linear combinations of mean squares: modified large-sample method of Graybill & Wang (1980).
+
+    The part of waves lies between ln(20/19) and ln 20 times its mean with 90 %.
+    """
     from scipy.stats import chi2
 
     dof = 2 / squares.relative_variances()
     above = (dof / chi2.ppf(0.05, dof) - 1) * squares.values  # how far the expectation may lie above the mean square
     below = (1 - dof / chi2.ppf(0.95, dof)) * squares.values
+    above = np.hypot(above, (1 - math.log(20 / 19)) * squares.waves)
+    below = np.hypot(below, (math.log(20) - 1) * squares.waves)
     positive, negative = np.maximum(matrix, 0.0), np.minimum(matrix, 0.0)
     best = matrix @ squares.values
     # a best estimate below zero is taken as zero, so that a lucky draw does not give a limit below what the data can tell

@@ -93,7 +93,16 @@ def _rows(found: Estimates | None, shown: Mapping[str, Quantity], standard: Resu
     if found is None:
         return []
     others = {e.name: Quantity(e.name) for e in found if e.name not in shown}
-    return [_row(found[name], quantity, standard) for name, quantity in {**shown, **others}.items() if name in found]
+    return [
+        _row(found[name], quantity, standard) if name in found else _missing(name, quantity, found.reasons[name], standard)
+        for name, quantity in {**shown, **others}.items()
+        if name in found or name in found.reasons
+    ]
+
+
+def _missing(name: str, quantity: Quantity, reason: str, standard: Results | None) -> Row:
+    """A value that was looked for and cannot be had."""
+    return Row(quantity.title, name, Number(NONE, NONE, ""), "", "" if standard is None else say(standard, quantity.standard), reason)
 
 
 def _row(e: Estimate, quantity: Quantity, standard: Results | None) -> Row:

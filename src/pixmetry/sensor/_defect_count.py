@@ -64,7 +64,7 @@ def measure(observations: Observations) -> Estimates:
     return Estimates.from_rows(
         rows,
         method="count of pixels beyond the Gaussian core of the others; moments of their errors",
-        confounders=("hot pixels that saturate in the bright stack count as dead", "cosmic rays and blinking pixels"),
+        confounders=("a pixel stuck at the top of the scale counts as hot", "cosmic rays and blinking pixels"),
         limits=frozenset(limits),
         reasons=reasons,
     )

@@ -50,7 +50,8 @@ def measure(observations: Observations) -> Estimates:
         )
     if transfer is None or "gain_dn_per_e" not in transfer:
         raise MeasureError("DSNU in electrons needs the gain", where="sensor.dsnu", remedy="take a photon-transfer series")
-    in_dn, gain = spatial.select(FITTED), transfer["gain_dn_per_e"]
+    there = {new: old for new, old in FITTED.items() if old in spatial}  # without what the split could not tell
+    in_dn, gain = spatial.select(there), transfer["gain_dn_per_e"]
     values = in_dn.values / gain.value
     own, common = in_dn.covariance / gain.value**2, np.outer(values, values) * (gain.u / gain.value) ** 2
     covariance = own + common
@@ -61,7 +62,7 @@ def measure(observations: Observations) -> Estimates:
         values=values,
         covariance=covariance,
         dof=np.where(dof < 1e9, np.maximum(dof, 1.0), np.inf),
-        units=("e-",) * 3,
+        units=("e-",) * len(in_dn),
         method=f"{in_dn.method}; divided by the gain",
         confounders=in_dn.confounders,
         limits=in_dn.limits,

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from pixmetry.core.contribution import Contribution, Probe
+from pixmetry.core.errors import MeasureError
 from pixmetry.core.estimates import Estimates
 from pixmetry.core.observations import Observations
 from pixmetry.core.random import Grid, Stream
@@ -43,9 +44,18 @@ def truth(params: Prnu, signal: Signal, stream: Stream) -> Mapping[str, np.ndarr
 
 
 def measure(observations: Observations) -> Estimates:
-    """Read the split of the flat-field stack: rows, columns and pixels, shading and temporal noise taken out."""
+    """Read the split of the flat-field stack: rows, columns and pixels, shading and temporal noise taken out.
+
+    A part of which the split gives neither a value nor a limit is left out.
+    """
+    names = {"pixel_std_rel": "prnu_pixel_rel", "row_std_rel": "prnu_row_rel", "col_std_rel": "prnu_col_rel"}
+    spatial = observations.spatial_fit
+    there = {new: old for new, old in names.items() if spatial is None or old in spatial}
+    why = "" if spatial is None else spatial.reasons.get("prnu_pixel_rel", "")
+    if "pixel_std_rel" not in there:
+        raise MeasureError("the PRNU of the pixels cannot be told", where="sensor.prnu", value=why, remedy="see what the frames share")
     return observations.fitted(
-        {"pixel_std_rel": "prnu_pixel_rel", "row_std_rel": "prnu_row_rel", "col_std_rel": "prnu_col_rel"},
+        there,
         "PRNU needs a stack of bright frames and one of dark frames",
         where="sensor.prnu",
         remedy="take at least 16 of each",
