@@ -101,9 +101,14 @@ class Assessment:
         one, many = budget.verdicts[0], budget.verdicts[-1]
         um = budget.um(one)
         size = f" = {um[0]:.2g} µm in x, {um[1]:.2g} µm in y" if um is not None else ""
+        texts = [(f"{c.total_px:.2g}", f"{c.calibrated_px:.2g}") for c in (one, many)]
+        if all(total == calibrated for total, calibrated in texts):
+            after, mean = " (k = 1), calibrated or not", f"{texts[1][0]} px"
+        else:
+            after = f" as it is, and {texts[0][1]} px once a calibration has taken up what is constant or smooth over the frame (k = 1)"
+            mean = f"{texts[1][0]} and {texts[1][1]} px"
         return (
-            f"a coordinate of one target in one frame is worth {one.total_px:.2g} px{size} (k = 1); "
-            f"the mean of {many.frames} frames {many.total_px:.2g} px. "
+            f"a coordinate of one target in one frame is worth {texts[0][0]} px{size}{after}; the mean of {many.frames} frames {mean}. "
             f"{budget.target.describe()}; {budget.estimator.describe()}."
         )
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from pixmetry.budget.combine import combine
-from pixmetry.core.contribution import AVERAGES, Contribution
+from pixmetry.core.contribution import CLASSES, Contribution, smooth_part
 from pixmetry.core.errors import InputError
 
 ROWS = [
@@ -40,8 +41,36 @@ def test_targets_average_what_changes_from_place_to_place() -> None:
     assert got.u_x_px == pytest.approx(7.25**0.5) and got.u_y_px == pytest.approx((16 / 36 + 6) ** 0.5)
 
 
+def test_a_calibration_takes_up_what_is_constant_or_smooth_but_nothing_that_drifts() -> None:
+    got = combine(ROWS)
+    # x: T 9, Tr 36, F 4, D with its bias 4 + 4, O 0; G and the bias of T are gone
+    assert got.left_x_px == pytest.approx(57**0.5)
+    # y: T 16, Tr 0, F 4, D 1, O 4; the bias of F is gone
+    assert got.left_y_px == pytest.approx(5.0) and got.calibrated_px == pytest.approx((0.5 * (57 + 25)) ** 0.5)
+    # over 9 frames of 4 targets: (9 + 36)/36 + 4/4 + 8
+    assert combine(ROWS, frames=9, targets=4).left_x_px == pytest.approx((1.25 + 1 + 8) ** 0.5)
+
+
+def test_parts_that_are_told_go_before_the_class() -> None:
+    """A shift of rows: 3 in time, 4 smoothly over the rows, 12 from place to place: 13 in all."""
+    c = Contribution(13.0, 0.0, "Tr", bias_x_px=1.0, time_px=(3.0, 0.0), smooth_px=(4.0, 0.0))
+    assert c.place_px == pytest.approx((12.0, 0.0)) and c.calibrated_px == pytest.approx((0.5 * 153) ** 0.5)
+    got = combine([c], frames=9, targets=4)
+    assert got.u_x_px == pytest.approx((9 / 36 + 144 / 4 + 16) ** 0.5) and got.left_x_px == pytest.approx((9 / 36 + 144 / 4) ** 0.5)
+    assert Contribution(5.0, 0.0, "G", smooth_px=(0.0, 0.0)).place_px == (5.0, 0.0)
+    assert Contribution(5.0, 0.0, "T", smooth_px=(3.0, 0.0)).time_px == pytest.approx((4.0, 0.0))
+
+
+def test_smooth_part_follows_a_cubic_and_nothing_between_the_pixels() -> None:
+    y, x = np.mgrid[0:20, 0:30]
+    cubic = 2.0 - 0.1 * x + 0.02 * x * y - 1e-3 * y**3
+    assert np.allclose(smooth_part(cubic, y, x), cubic)
+    assert np.abs(smooth_part((-1.0) ** (x + y), y, x)).max() < 0.02
+    assert np.allclose(smooth_part(np.array([1.0, 3.0]), np.array([0, 7])), [1.0, 3.0])  # two places tell a line
+
+
 def test_every_class_has_a_rule_and_nothing_gives_nothing() -> None:
-    assert {c.gum_class for c in ROWS} == set(AVERAGES)
+    assert {c.gum_class for c in ROWS} == set(CLASSES)
     assert combine([]).total_px == 0
     with pytest.raises(InputError):
         combine(ROWS, frames=0)

@@ -79,6 +79,17 @@ def test_nested_analysis_of_variance_separates_what_was_put_in() -> None:
     assert got.se_temporal == pytest.approx(0.2 / math.sqrt(2 * 2 * 24_000), rel=0.05)
 
 
+def test_what_a_calibration_leaves_is_what_is_not_smooth() -> None:
+    """Shifts of known parts: constant 0.5, a cubic of each unit over the frame, 0.3 from place to place, 0.2 in time."""
+    rng = np.random.default_rng()
+    row, col = rng.uniform(0, 1, (2, 12, 150))
+    smooth = 0.5 + rng.normal(0, 1, (12, 1)) * (row - 0.5) + 3 * (row - 0.5) * (col - 0.5) ** 2
+    shift = (smooth + rng.normal(0, 0.3, smooth.shape))[:, :, None] + rng.normal(0, 0.2, (*smooth.shape, 3))
+    got, truth = _axis(shift, row, col), math.hypot(0.3, 0.2)
+    assert got.se_left < 0.02 * truth and abs(got.left - truth) < 1.1 * Z * got.se_left
+    assert _axis(np.full((2, 3, 2), 0.5), *np.zeros((2, 2, 3))).left == 0  # few places: the constant alone
+
+
 def test_a_bias_that_belongs_to_the_unit_widens_the_error_of_the_mean() -> None:
     """Eight units, each with an offset of its own: the standard error is that of eight values, not of 16 000."""
     rng = np.random.default_rng()

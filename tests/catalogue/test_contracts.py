@@ -15,7 +15,7 @@ from catalogue.support import NAME, SHAPE, Amplitude, Texture, camera_with, kind
 from pixmetry.core import bands
 from pixmetry.core.camera import Camera, Element
 from pixmetry.core.catalogue import catalogue
-from pixmetry.core.contribution import AVERAGES
+from pixmetry.core.contribution import CLASSES
 from pixmetry.core.errors import ChainError, InputError
 from pixmetry.core.random import Grid
 from pixmetry.core.signal import Kind, Signal
@@ -226,7 +226,7 @@ def test_the_record_is_complete(source: Source) -> None:
     for name in ("title", "description", "equation", "typical_size", "advice"):
         assert getattr(source, name).strip(), f"{source.id} lacks its {name}"
     assert source.references and all(r.strip() for r in source.references)
-    assert source.gum_class in AVERAGES
+    assert source.gum_class in CLASSES
     assert 0 <= source.stars <= 5
     assert source.parameters.__doc__
     for name, info in source.parameters.model_fields.items():

@@ -92,7 +92,7 @@ def test_shares_of_random_and_systematic() -> None:
     """Squares: random 0.03² + 0.02² + 0.04² + 0.01² = 0.0030, bias 0.02² = 0.0004: 88 % and 12 %."""
     text = page().text
     assert "88 % is random in time" in text
-    assert "12 % is bias" in text
+    assert "12 % is the same everywhere, which a calibration takes up" in text
 
 
 def test_accepted_sources_are_named_with_their_reason() -> None:

@@ -15,7 +15,7 @@ from pixmetry.budget.parameters import applies, base_of, u_of_total, with_estima
 from pixmetry.budget.probe import Facts, Target, facts_of, make_probe, resolve
 from pixmetry.core.camera import Camera
 from pixmetry.core.catalogue import catalogue
-from pixmetry.core.contribution import Contribution
+from pixmetry.core.contribution import UNSTEADY, Contribution
 from pixmetry.core.estimates import Estimates
 from pixmetry.core.observations import LENS, TAKEN_UP, CameraGeometry
 from pixmetry.core.signal import Kind
@@ -69,14 +69,28 @@ class BudgetRow:
         """Root mean square over x and y of random part and bias."""
         return 0.0 if self.contribution is None else self.contribution.total_px
 
+    @property
+    def calibrated_px(self) -> float:
+        """What of it stays once a calibration has taken up what is constant and what is smooth."""
+        return 0.0 if self.contribution is None else self.contribution.calibrated_px
+
 
 @dataclass(frozen=True)
 class Interaction:
-    """Everything at once against the root sum of squares of everything alone, both by Monte Carlo, in px."""
+    """Everything at once against the root sum of squares of everything alone, both by Monte Carlo, in px.
+
+    ``unsteady_px`` is the part of the sources that drift or belong to the object, which the frames of a Monte Carlo hold still.
+    """
 
     together: MonteCarlo
     sum_px: float
     se_sum_px: float
+    unsteady_px: float = 0.0
+
+    @property
+    def calibrated_px(self) -> float:
+        """What a calibration leaves of everything at once: all of what is unsteady, and of the rest what is neither constant nor smooth."""
+        return float(np.hypot(self.together.calibrated_px, self.unsteady_px))
 
     @property
     def difference_px(self) -> float:
@@ -94,7 +108,7 @@ class Budget:
     """All rows, largest first, and what they come to.
 
     ``verdicts`` combines what is measured and modelled, for one frame and for means over several; ``with_accepted`` adds everything that
-    was accepted, at its bound. Totals are k = 1.
+    was accepted, at its bound. Totals are k = 1, as the camera is and (``calibrated_px``) as a calibration leaves it.
     """
 
     camera: str
@@ -144,6 +158,7 @@ class Budget:
                 "se_sum_px": self.interaction.se_sum_px,
                 "difference_px": self.interaction.difference_px,
                 "se_px": self.interaction.se_px,
+                "calibrated_px": self.interaction.calibrated_px,
             },
         }
 
@@ -288,7 +303,9 @@ def _calibrated(name: str, source: Source, geometry: CameraGeometry) -> BudgetRo
         return replace(head, reason=f"taken up by the {geometry.origin}; what is left stands in the row of {catalogue()[LENS].title}")
     u_x, u_y = np.hypot(geometry.u_x_px, geometry.left_x_px), np.hypot(geometry.u_y_px, geometry.left_y_px)
     method = f"what the {geometry.origin} leaves: the uncertainty of a corrected place over the frame, and systematic residuals"
-    return replace(head, contribution=Contribution(float(u_x), float(u_y), "G", model_error=0.2, method=method), reason=method)
+    # no further calibration takes it up: nothing of it counts as smooth
+    found = Contribution(float(u_x), float(u_y), "G", model_error=0.2, method=method, smooth_px=(0.0, 0.0))
+    return replace(head, contribution=found, reason=method)
 
 
 def _simulated(row: BudgetRow, design: Trials, camera: Camera, say: Callable[[str], None]) -> BudgetRow:
@@ -307,7 +324,9 @@ def _interaction(rows: Sequence[BudgetRow], design: Trials) -> Interaction:
     alone = [r.monte_carlo for r in rows if r.monte_carlo is not None]
     total = float(np.sqrt(sum(m.total_px**2 for m in alone)))
     error = float(np.sqrt(sum((m.total_px * m.se_total_px) ** 2 for m in alone)) / total) if total else 0.0
-    return Interaction(design.of(), total, error)
+    drifting = [r.monte_carlo for r in rows if r.monte_carlo and r.contribution and r.contribution.gum_class in UNSTEADY]
+    unsteady = float(np.sqrt(sum(max(m.total_px**2 - m.calibrated_px**2, 0.0) for m in drifting)))
+    return Interaction(design.of(), total, error, unsteady)
 
 
 def _combined(rows: Sequence[BudgetRow], frames: Sequence[int]) -> tuple[list[BudgetRow], tuple[Combined, ...], tuple[Combined, ...]]:
@@ -327,15 +346,18 @@ def _combined(rows: Sequence[BudgetRow], frames: Sequence[int]) -> tuple[list[Bu
 
 
 def _row_record(row: BudgetRow) -> dict[str, Any]:
-    names = ("name", "source_id", "title", "status", "u_of_total_px", "share", "without_px", "reason", "total_px")
+    names = ("name", "source_id", "title", "status", "u_of_total_px", "share", "without_px", "reason", "total_px", "calibrated_px")
     record = {k: getattr(row, k) for k in names}
-    record["contribution"] = None if row.contribution is None else asdict(row.contribution)
+    c = row.contribution
+    parts = {} if c is None else {k: list(getattr(c, k)) for k in ("time_px", "smooth_px", "place_px")}
+    record["contribution"] = None if c is None else asdict(c) | parts
     record["monte_carlo"] = None if row.monte_carlo is None else _monte_carlo_record(row.monte_carlo)
     return record
 
 
 def _monte_carlo_record(result: MonteCarlo) -> dict[str, Any]:
-    record = asdict(result) | {"total_px": result.total_px, "se_total_px": result.se_total_px, "names": list(result.names)}
+    totals = {k: getattr(result, k) for k in ("total_px", "se_total_px", "calibrated_px", "se_calibrated_px")}
+    record = asdict(result) | totals | {"names": list(result.names)}
     for axis in ("x", "y"):
         record[axis] = {k: (v if np.isfinite(v) else None) for k, v in record[axis].items()}
     return {k: (None if isinstance(v, float) and not np.isfinite(v) else v) for k, v in record.items()}
@@ -343,4 +365,5 @@ def _monte_carlo_record(result: MonteCarlo) -> dict[str, Any]:
 
 def _combined_record(budget: Budget, combined: Combined) -> dict[str, Any]:
     um = budget.um(combined)
-    return asdict(combined) | {"total_px": combined.total_px, "total_um": None if um is None else list(um)}
+    totals = {"total_px": combined.total_px, "calibrated_px": combined.calibrated_px}
+    return asdict(combined) | totals | {"total_um": None if um is None else list(um)}

@@ -7,18 +7,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pixmetry.core.contribution import AVERAGES, Contribution
+from pixmetry.core.contribution import UNSTEADY, Contribution
 from pixmetry.core.errors import InputError
 
 
 @dataclass(frozen=True)
 class Combined:
-    """Combined standard uncertainty and bias in px, k = 1."""
+    """Combined standard uncertainty and bias in px, k = 1; ``left_*`` is what a calibration leaves of both together."""
 
     u_x_px: float
     u_y_px: float
     bias_x_px: float
     bias_y_px: float
+    left_x_px: float
+    left_y_px: float
     frames: int = 1
     targets: int = 1
 
@@ -37,16 +39,23 @@ class Combined:
         """Root mean square over x and y of random part and bias together."""
         return float(np.sqrt(0.5 * (self.total_x_px**2 + self.total_y_px**2)))
 
+    @property
+    def calibrated_px(self) -> float:
+        """Root mean square over x and y of what stays once a calibration has taken up what is constant and what is smooth."""
+        return float(np.sqrt(0.5 * (self.left_x_px**2 + self.left_y_px**2)))
+
 
 def combine(contributions: Iterable[Contribution], frames: int = 1, targets: int = 1) -> Combined:
     """Combine the contributions to the mean position over ``frames`` frames and ``targets`` targets.
 
     Notes
     -----
-    u² = Σ u_i²/(frames if its class averages over frames)/(targets if it averages over targets), x and y apart (JCGM 100:2008, 5.1.2;
-    uncorrelated contributions). No number of frames lowers a bias. A bias that is not corrected, and whose sign another camera would have
-    the other way, enters as the root sum of squares with the others: b² = Σ b_i², and the total is √(u² + b²) (cf. JCGM 100:2008,
-    F.2.4.5, which would rather have it corrected; that is what the advice says too).
+    u² = Σ time_i²/(frames · targets) + place_i²/targets + smooth_i², x and y apart (JCGM 100:2008, 5.1.2; uncorrelated contributions); for
+    the classes D and O, which the next frames and targets share, Σ u_i². What a calibration leaves is the same without what is smooth
+    and without the biases, but for D and O, of which it takes nothing up. No number of frames lowers a bias.
+    A bias that is not corrected, and whose sign another camera would have the other way, enters as the root sum of squares with the
+    others: b² = Σ b_i², and the total is √(u² + b²) (cf. JCGM 100:2008, F.2.4.5, which would rather have it corrected; that is what the
+    advice says too).
 
     Raises
     ------
@@ -55,10 +64,13 @@ def combine(contributions: Iterable[Contribution], frames: int = 1, targets: int
     """
     if frames < 1 or targets < 1:
         raise InputError("nothing to average", value=(frames, targets), allowed="1 or more frames and targets")
-    squares = np.zeros(4)
+    squares = np.zeros((3, 2))
     for c in contributions:
-        over_frames, over_targets = AVERAGES[c.gum_class]
-        n = (frames if over_frames else 1) * (targets if over_targets else 1)
-        squares += np.array([c.u_x_px**2 / n, c.u_y_px**2 / n, c.bias_x_px**2, c.bias_y_px**2])
-    u_x, u_y, bias_x, bias_y = (float(v) for v in np.sqrt(squares))
-    return Combined(u_x, u_y, bias_x, bias_y, frames, targets)
+        u, bias, time, smooth, place = (np.square(v) for v in (c.u_px, c.bias_px, c.time_px, c.smooth_px, c.place_px))
+        if c.gum_class in UNSTEADY:
+            squares += [u, bias, u + bias]
+        else:
+            left = time / (frames * targets) + place / targets
+            squares += [left + smooth, bias, left]
+    u_x, u_y, bias_x, bias_y, left_x, left_y = np.sqrt(squares).ravel().tolist()
+    return Combined(u_x, u_y, bias_x, bias_y, left_x, left_y, frames, targets)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from math import comb
 
 import numpy as np
 
 from pixmetry.budget.probe import Facts, Target, background_of, facts_of, resolve, scene_of, spread_windows, window_side
 from pixmetry.core.camera import Camera
+from pixmetry.core.contribution import SMOOTH_ORDER, smooth_part
 from pixmetry.core.errors import ChainError, InputError
 from pixmetry.core.random import Grid, Streams
 from pixmetry.location.estimators import Estimator
@@ -21,7 +23,8 @@ class Axis:
     """Shift along one axis in px, with standard errors of the Monte Carlo.
 
     ``u`` is the standard deviation of all shifts of all units about their mean; its two independent parts are ``temporal``, from frame to
-    frame of one target at one place, and ``fixed``, from place to place and unit to unit.
+    frame of one target at one place, and ``fixed``, from place to place and unit to unit. ``left`` is what stays of bias and ``u`` once
+    each unit has been calibrated: a polynomial of third order in the place taken off (lower where the places are few).
     """
 
     bias: float
@@ -32,6 +35,8 @@ class Axis:
     se_u: float
     se_temporal: float
     se_fixed: float
+    left: float = float("nan")
+    se_left: float = float("nan")
 
 
 @dataclass(frozen=True)
@@ -57,6 +62,18 @@ class MonteCarlo:
     def total_px(self) -> float:
         """Root mean square over x and y of random part and bias together."""
         return float(np.sqrt(0.5 * sum(a.u**2 + a.bias**2 for a in (self.x, self.y))))
+
+    @property
+    def calibrated_px(self) -> float:
+        """Root mean square over x and y of what stays once a calibration has taken up what is constant and what is smooth."""
+        return float(np.sqrt(0.5 * (self.x.left**2 + self.y.left**2)))
+
+    @property
+    def se_calibrated_px(self) -> float:
+        """Standard error of `calibrated_px`."""
+        if self.calibrated_px == 0:
+            return 0.0
+        return float(np.sqrt(sum((a.left * a.se_left) ** 2 for a in (self.x, self.y))) / (2 * self.calibrated_px))
 
     @property
     def se_total_px(self) -> float:
@@ -161,7 +178,7 @@ class Trials:
         if without is not None:
             shift = tuple(a - b for a, b in zip(shift, self.errors(without), strict=True))
         lost = int(np.isnan(shift[0]).sum())
-        x, y = (_axis(s) for s in shift)
+        x, y = (_axis(s, self.row0, self.col0) for s in shift)
         tail = with_it.frozen_tail() if self.mode == "frozen" else 0.0
         return MonteCarlo(x, y, tuple(names), self.units, self.places, self.frames, lost, self.mode, tail)
 
@@ -262,8 +279,8 @@ def _level(camera: Camera, facts: Facts, target: Target, side: int, above_dn: fl
     return float(data[near].mean())
 
 
-def _axis(shift: np.ndarray) -> Axis:
-    """Bias and random parts of shifts (units, places, frames), and their standard errors.
+def _axis(shift: np.ndarray, *where: np.ndarray) -> Axis:
+    """Bias and random parts of shifts (units, places, frames), and their standard errors; ``where`` are coordinates (units, places).
 
     Nested analysis of variance, each place of each unit a group: temporal variance is the mean of the groups' sample variances; fixed
     variance that of the groups' means less temporal/frames. Standard errors are those of means over groups, which asks nothing of the
@@ -272,7 +289,7 @@ def _axis(shift: np.ndarray) -> Axis:
     units, places, frames = shift.shape
     keep = np.isfinite(shift).all(axis=2)
     if keep.sum() < 2:
-        return Axis(*(float("nan"),) * 8)
+        return Axis(*(float("nan"),) * 10)
     groups = shift[keep]
     n = len(groups)
     means = groups.mean(axis=1)
@@ -284,8 +301,31 @@ def _axis(shift: np.ndarray) -> Axis:
     of_units = [row[good].mean() for row, good in zip(shift.mean(axis=2), keep, strict=True) if good.any()]
     if len(of_units) > 1:
         se_bias = max(se_bias, np.std(of_units, ddof=1) / np.sqrt(len(of_units)))
-    (u, se_u), (temporal_u, se_temporal), (fixed_u, se_fixed) = (_root(v) for v in (fixed + temporal, temporal, fixed))
-    return Axis(bias, u, temporal_u, fixed_u, float(se_bias), se_u, se_temporal, se_fixed)
+    rest = _rest(shift.mean(axis=2), keep, where) - temporal / frames
+    (u, se_u), (temporal_u, se_temporal), (fixed_u, se_fixed), (left, se_left) = (
+        _root(v) for v in (fixed + temporal, temporal, fixed, rest + temporal)
+    )
+    return Axis(bias, u, temporal_u, fixed_u, float(se_bias), se_u, se_temporal, se_fixed, left, se_left)
+
+
+def _rest(means: np.ndarray, keep: np.ndarray, where: Sequence[np.ndarray]) -> np.ndarray:
+    """Squared residuals of the means of places about a smooth surface of each unit, unbiased for what is independent from place to place.
+
+    A polynomial of k terms through n places leaves (n − k)/n of such a variance. Four places a term or more decide its order.
+    """
+    found = np.zeros(means.shape)
+    for unit, good in enumerate(keep):
+        n = int(good.sum())
+        order = max(o for o in range(SMOOTH_ORDER + 1) if o == 0 or where and 4 * _terms(o, len(where)) <= n)
+        at = [p[unit, good] for p in where] or [np.zeros(n)]
+        if n:
+            residual = means[unit, good] - smooth_part(means[unit, good], *at, order=order)
+            found[unit, good] = residual**2 * n / max(n - _terms(order, len(at)), 1)
+    return found[keep]
+
+
+def _terms(order: int, axes: int) -> int:
+    return comb(order + axes, axes)
 
 
 def _root(variances: np.ndarray) -> tuple[float, float]:

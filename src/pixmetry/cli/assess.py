@@ -63,19 +63,24 @@ def print_summary(assessment: Assessment) -> None:
     table = Table(
         title="Largest contributions to a target's position in one frame, k = 1, px", title_justify="left", box=None, pad_edge=False
     )
-    for name in ("source", "status", "class", "u in x", "u in y", "bias", "share"):
+    for name in ("source", "status", "class", "u in x", "u in y", "constant", "share", "calibrated"):
         table.add_column(name, justify="left" if name in ("source", "status", "class") else "right")
     for row in [r for r in assessment.budget.of_status(*DECIDED) if r.contribution is not None][:8]:
         c = row.contribution
-        bias = max(abs(c.bias_x_px), abs(c.bias_y_px))
-        table.add_row(row.title, row.status, c.gum_class, *(f"{v:.5f}" for v in (c.u_x_px, c.u_y_px, bias)), f"{100 * row.share:.0f} %")
+        constant = max(abs(c.bias_x_px), abs(c.bias_y_px))
+        numbers = (f"{v:.5f}" for v in (c.u_x_px, c.u_y_px, constant))
+        table.add_row(row.title, row.status, c.gum_class, *numbers, f"{100 * row.share:.0f} %", f"{c.calibrated_px:.5f}")
     console.print(table)
+    console.print("constant: the same all over the frame. calibrated: what a calibration leaves of it (rms of x and y).")
     worst = assessment.budget.with_accepted[0].total_px
     accepted = [r.title for r in assessment.budget.of_status("accepted") if r.contribution is not None and r.total_px > 0]
     console.print(f"\nAccepted, not measured: {', '.join(accepted)}; all of them at the catalogue's bound: {worst:.2g} px.")
     together = assessment.budget.interaction
     if together is not None:
         at_once = together.together
-        console.print(f"Monte Carlo with all that is measured and modelled at once: {at_once.total_px:.2g} ± {at_once.se_total_px:.1g} px.")
+        console.print(
+            f"Monte Carlo with all that is measured and modelled at once: {at_once.total_px:.2g} ± {at_once.se_total_px:.1g} px, "
+            f"after a calibration {together.calibrated_px:.2g} px."
+        )
     for note in assessment.observations.notes:
         console.print(f"Note: {note}")

@@ -1,5 +1,9 @@
 """How an error source reaches a target's position: the linear response of an estimator, and the contribution that comes of it.
 
+A contribution has four parts. What is *constant* over the frame and in time moves the principal point; what changes *smoothly* over the
+frame deforms the image: a calibration of the camera takes up both. What changes from *place* to place within a few pixels (with the phase
+in the pixel, with the pixels that a target falls on) and what changes in *time* stay.
+
 Classes, by what averages a contribution: ``T`` temporal, pixel by pixel or frame by frame, and ``Tr`` temporal, common to a row: over
 frames and targets; ``F`` fixed, changes with the sub-pixel phase or the place on the sensor: over targets; ``G`` smooth geometric
 mapping: by neither, self-calibration absorbs part; ``D`` drift: by neither; ``O`` object and illumination: by neither.
@@ -13,22 +17,22 @@ from typing import Any
 
 import numpy as np
 
-AVERAGES = {  # (over frames, over targets)
-    "T": (True, True),
-    "Tr": (True, True),
-    "F": (False, True),
-    "G": (False, False),
-    "D": (False, False),
-    "O": (False, False),
-}
+CLASSES = ("T", "Tr", "F", "G", "D", "O")
+
+
+UNSTEADY = ("D", "O")  # classes of which a calibration takes nothing up: the next image has them otherwise
+SMOOTH_ORDER = 3  # of the polynomial in the place that a calibration is taken to follow
 
 
 @dataclass(frozen=True)
 class Contribution:
     """What one source adds to the position of one target in one frame, k = 1.
 
-    ``bias_*`` is the mean shift over all phases and places, ``u_*`` the standard deviation about it. ``model_error`` is the relative
-    error that the propagator declares for its ``u`` and ``bias`` (the larger of it and ``floor_px`` holds).
+    ``bias_*`` is the mean shift over all phases and places, constant in time; ``u_*`` the standard deviation about it. ``model_error`` is
+    the relative error that the propagator declares for its ``u`` and ``bias`` (the larger of it and ``floor_px`` holds).
+
+    ``time_px`` and ``smooth_px`` are the parts of ``u`` in x and y that change in time and smoothly over the frame; by default all of it,
+    or nothing, as the class says: T, Tr, D and O change in time, G is smooth, F neither.
     """
 
     u_x_px: float
@@ -39,11 +43,67 @@ class Contribution:
     model_error: float = 0.1
     floor_px: float = 2e-4
     method: str = ""
+    time_px: tuple[float, float] | None = None
+    smooth_px: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        smooth = self.smooth_px
+        if smooth is None:
+            smooth = self.u_px if self.gum_class == "G" and self.time_px is None else (0.0, 0.0)
+        time = self.time_px
+        if time is None:
+            (u_x, u_y), (smooth_x, smooth_y) = self.u_px, smooth
+            time = (0.0, 0.0) if self.gum_class in ("F", "G") else (_less(u_x, smooth_x), _less(u_y, smooth_y))
+        object.__setattr__(self, "smooth_px", smooth)
+        object.__setattr__(self, "time_px", time)
+
+    @property
+    def u_px(self) -> tuple[float, float]:
+        """Standard deviation in x and y."""
+        return self.u_x_px, self.u_y_px
+
+    @property
+    def bias_px(self) -> tuple[float, float]:
+        """Mean shift in x and y."""
+        return self.bias_x_px, self.bias_y_px
+
+    @property
+    def place_px(self) -> tuple[float, float]:
+        """Part of ``u`` in x and y that changes from place to place, and not smoothly."""
+        parts = zip(self.u_px, self.time_px or (), self.smooth_px or (), strict=True)
+        x, y = (_less(u, float(np.hypot(time, smooth))) for u, time, smooth in parts)
+        return x, y
 
     @property
     def total_px(self) -> float:
         """Root mean square over x and y of random part and bias together."""
         return float(np.sqrt(0.5 * (self.u_x_px**2 + self.u_y_px**2 + self.bias_x_px**2 + self.bias_y_px**2)))
+
+    @property
+    def calibrated_px(self) -> float:
+        """What of the total stays once a calibration has taken up what is constant and what is smooth; of the classes D and O, all."""
+        if self.gum_class in UNSTEADY:
+            return self.total_px
+        return float(np.sqrt(0.5 * sum(v**2 for v in (*self.place_px, *(self.time_px or ())))))
+
+
+def _less(whole: float, part: float) -> float:
+    return float(np.sqrt(max(whole**2 - part**2, 0.0)))
+
+
+def smooth_part(values: np.ndarray, *places: np.ndarray, order: int = SMOOTH_ORDER) -> np.ndarray:
+    """What a polynomial of all places follows of values that belong to them, by least squares; shape of the values.
+
+    ``places`` are coordinates, one array for each axis, of the values' shape; with fewer different ones along an axis the order is lower.
+    """
+    from itertools import product
+
+    flat = [np.ravel(p).astype(float) for p in places]
+    scaled = [(p - p.mean()) / (np.ptp(p) or 1.0) for p in flat]
+    powers = [range(min(order, len(np.unique(p)) - 1) + 1) for p in flat]
+    columns = [np.prod([p**k for p, k in zip(scaled, ks, strict=True)], axis=0) for ks in product(*powers) if sum(ks) <= order]
+    basis = np.stack(columns, axis=1)
+    return (basis @ np.linalg.lstsq(basis, np.ravel(values).astype(float), rcond=None)[0]).reshape(np.shape(values))
 
 
 @dataclass(frozen=True)

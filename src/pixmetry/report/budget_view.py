@@ -14,7 +14,7 @@ from pixmetry.budget.combine import Combined
 from pixmetry.budget.monte_carlo import MonteCarlo
 from pixmetry.budget.probe import PHASES
 from pixmetry.core.catalogue import STAGES, get_source
-from pixmetry.core.contribution import AVERAGES
+from pixmetry.core.contribution import UNSTEADY
 from pixmetry.report.numbers import NONE, THIN, decimals_of, fixed, length_mpx, length_px, length_um, percent, signed
 
 CLASSES = {
@@ -48,7 +48,9 @@ class Verdict:
     """The first section's texts and numbers."""
 
     first: list[Length]
+    calibrated: list[Length]
     second: list[Length]
+    second_calibrated: list[Length]
     shares: str
     accepted: str
     target: str
@@ -88,6 +90,10 @@ def _both(combined: Combined, pitch_um: tuple[float, float] | None) -> list[Leng
     return [_length(combined.total_x_px, pitch_um, "x"), _length(combined.total_y_px, pitch_um, "y")]
 
 
+def _left(combined: Combined, pitch_um: tuple[float, float] | None) -> list[Length]:
+    return [_length(combined.left_x_px, pitch_um, "x"), _length(combined.left_y_px, pitch_um, "y")]
+
+
 def _there(budget: Budget, *status: str) -> list[BudgetRow]:
     return [r for r in budget.of_status(*status) if r.contribution is not None]
 
@@ -95,12 +101,14 @@ def _there(budget: Budget, *status: str) -> list[BudgetRow]:
 def _verdict(budget: Budget) -> Verdict:
     pitch = budget.pitch_um
     ladder = [
-        {"label": f"{a.frames} frame{'' if a.frames == 1 else 's'}", "cells": [*_both(a, pitch), *_both(b, pitch)]}
+        {"label": f"{a.frames} frame{'' if a.frames == 1 else 's'}", "cells": [*_both(a, pitch), *_left(a, pitch), *_both(b, pitch)]}
         for a, b in zip(budget.verdicts, budget.with_accepted, strict=True)
     ]
     return Verdict(
         first=_both(budget.verdict, pitch),
+        calibrated=_left(budget.verdict, pitch),
         second=_both(budget.with_accepted[0], pitch),
+        second_calibrated=_left(budget.with_accepted[0], pitch),
         shares=_shares(_there(budget, *DECIDED)),
         accepted=_accepted(_there(budget, "accepted")),
         target=budget.target.describe(),
@@ -111,19 +119,23 @@ def _verdict(budget: Budget) -> Verdict:
 
 
 def _shares(rows: list[BudgetRow]) -> str:
-    """How the square of the verdict divides into what averages over frames, what does not, and bias."""
-    parts = np.zeros(3)
+    """How the square of the verdict divides into what changes in time, from place to place, smoothly, not at all, and what drifts."""
+    parts = np.zeros(5)
     for row in rows:
         c = row.contribution
         assert c is not None
-        parts[0 if AVERAGES[c.gum_class][0] else 1] += c.u_x_px**2 + c.u_y_px**2
-        parts[2] += c.bias_x_px**2 + c.bias_y_px**2
+        if c.gum_class in UNSTEADY:
+            parts[4] += 2 * c.total_px**2
+        else:
+            parts[:4] += [np.square(v).sum() for v in (c.time_px, c.place_px, c.smooth_px, c.bias_px)]
     if parts.sum() == 0:
         return "Nothing that was measured moves this target."
-    random, fixed_part, bias = (percent(v) for v in parts / parts.sum())
+    random, place, smooth, constant, drift = (percent(v) for v in parts / parts.sum())
+    drifting = f"; {drift} % drifts or belongs to the object, and the next image has it otherwise" if parts[4] else ""
     return (
-        f"Of the square of this, {random} % is random in time and falls with more frames; the rest is systematic and does not: "
-        f"{fixed_part} % is fixed in the camera and changes from place to place, {bias} % is bias."
+        f"Of the square of the first numbers, {random} % is random in time and falls with more frames; {place} % is fixed in the camera "
+        f"and changes from place to place; {smooth} % changes smoothly over the frame and {constant} % is the same everywhere, which a "
+        f"calibration takes up{drifting}."
     )
 
 
@@ -258,8 +270,9 @@ def _sums(budget: Budget) -> list[dict[str, Any]]:
 
     rows = [
         row("Standard uncertainties, analytic", v.u_x_px, v.u_y_px),
-        row("Biases, analytic", v.bias_x_px, v.bias_y_px),
+        row("Constant over the frame (bias), analytic", v.bias_x_px, v.bias_y_px),
         row("Sum of all measured and modelled, analytic", v.total_x_px, v.total_y_px, True),
+        row("What a calibration leaves of it", v.left_x_px, v.left_y_px, True),
     ]
     alone = [r.monte_carlo for r in budget.rows if r.monte_carlo is not None]
     if alone:
