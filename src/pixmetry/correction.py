@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,9 @@ import numpy as np
 from pixmetry.campaign import InputHashes, provenance_record, read_maps, staged_output, write_json
 from pixmetry.campaign.images import LoadedFrame, check_frame, load_frame, picture_files
 from pixmetry.core.camera import Camera, load_camera
+from pixmetry.core.conversions import SAMPLE, LineSources
 from pixmetry.core.errors import InputError
+from pixmetry.core.line import Line
 from pixmetry.core.random import Grid
 from pixmetry.core.signal import Kind, Signal
 from pixmetry.core.threads import imap_tiles
@@ -48,12 +51,27 @@ def correct_signal(camera: Camera, signal: Signal, maps: Mapping[str, np.ndarray
             done[element.name] = f"not corrected: {source.reasons['correct']}"
         else:
             try:
-                corrected = source.correct(element.params, signal, maps)
-                done[element.name] = "nothing to correct" if corrected is signal else "corrected"
-                signal = corrected
+                given = replace(signal, line=_rest_of_line(camera, element.name, done, signal))
+                corrected = source.correct(element.params, given, maps)
+                done[element.name] = "nothing to correct" if corrected is given else "corrected"
+                signal = replace(corrected, line=None)
             except InputError as problem:
                 done[element.name] = f"not corrected: {problem}"
     return signal, done
+
+
+def _rest_of_line(camera: Camera, name: str, done: Mapping[str, str], signal: Signal) -> Line | None:
+    """The line that still acts on samples as they are stored, without the source of that name; None for one that is not on a line."""
+    for i, link in enumerate(camera.links):
+        if link.source is SAMPLE and name in (on_line.name for on_line in link.params.links):
+            others = [e for e in link.params.links if e.name != name and done.get(e.name) != "corrected"]
+            line = LineSources(tuple(others), link.params.pixel_hz).line_at(signal)
+            first = np.zeros(1)  # sample of the line that is stored first
+            for later in camera.links[i + 1 :]:
+                if later.source.place is not None:
+                    first, _ = later.source.place(later.params, first, first, later.shape, 0)
+            return replace(line, start_s=line.start_s - float(first[0]) / line.sample_clock_hz)
+    return None
 
 
 def correct_files(

@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 
 from pixmetry.cable.t_piece import SOURCE, TPiece, echoes
-from pixmetry.core.signal import Kind
-from source_signals import signal
 from video_signals import PIXEL_HZ, bump, centre, row_of, sampled, seen, video
 
 SPEED = 0.66 * 299_792_458.0
@@ -52,10 +50,3 @@ def test_published_capacity_of_a_short_open_branch() -> None:
     assert shift == pytest.approx(37.5 * capacity * PIXEL_HZ, rel=2e-3)
     assert shift == pytest.approx(0.036, abs=5e-4)
     assert params.level == pytest.approx(1.0)
-
-
-def test_the_correction_gives_the_pixels_back() -> None:
-    target = np.random.default_rng(1).uniform(0, 200, 200).astype(np.float32)
-    for params in (SOURCE.typical, TPiece(branch="terminated", length_m=6.0, end_ohm=50.0)):
-        changed = signal(seen(SOURCE, params, row_of(target)), Kind.DN, frame_shape=(1, 200))
-        np.testing.assert_allclose(SOURCE.correct(params, changed, {}).data[0, 0], target, atol=1e-3)

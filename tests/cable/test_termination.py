@@ -8,8 +8,6 @@ from scipy.signal import lfilter
 from scipy.special import erfc
 
 from pixmetry.cable.termination import SOURCE, Termination, echoes, near, tail
-from pixmetry.core.signal import Kind
-from source_signals import signal
 from video_signals import PIXEL_HZ, bump, centre, row_of, sampled, seen, video
 
 
@@ -56,13 +54,6 @@ def test_a_delay_of_whole_pixels_is_a_recursive_filter() -> None:
     row[20:30] = 100.0
     rho = params.ghost
     np.testing.assert_allclose(line(row, params), lfilter([1 - rho], [1, 0, 0, -rho], row), atol=2e-3)
-
-
-def test_the_correction_gives_the_pixels_back() -> None:
-    target = np.random.default_rng(1).uniform(0, 200, 200).astype(np.float32)
-    for params in (SOURCE.typical, SOURCE.bound):
-        ghosted = signal(row_of(line(target, params)), Kind.DN, frame_shape=(1, 200))
-        np.testing.assert_allclose(SOURCE.correct(params, ghosted, {}).data[0, 0], target, atol=2e-4)
 
 
 def test_what_comes_from_beyond_the_margin_is_as_small_as_stated() -> None:

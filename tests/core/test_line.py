@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from scipy import signal as sps
 
-from catalogue.support import Flat, Texture, camera_with, make_source
+from catalogue.support import NAME, Flat, Targets, Texture, camera_with, make_source
+from pixmetry.cable.termination import Termination
 from pixmetry.core.camera import Camera, Element
+from pixmetry.core.catalogue import get_source
 from pixmetry.core.errors import ParameterError
 from pixmetry.core.line import Line, correlated_rows, group_delay_s, reach_px
 from pixmetry.core.random import Grid
@@ -56,6 +58,35 @@ def test_a_filter_agrees_with_a_fine_simulation(name: str) -> None:
     smooth = len(zeros) < len(poles)  # with as many zeros as poles the output jumps with the input, exactly at these times
     keep = np.ones(len(got), bool) if smooth else np.arange(len(got)) % 8 != 0
     np.testing.assert_allclose(got[keep], y[:-1][keep], atol=3e-5, rtol=1e-6)
+
+
+LETS_STEPS_THROUGH = {"none": ([], []), "lead": FILTERS["lead"], "all-pass": FILTERS["all-pass"]}
+
+
+@pytest.mark.parametrize("name", LETS_STEPS_THROUGH)
+def test_a_line_that_nothing_limits_goes_by_ramps(name: str) -> None:
+    """Straight from one pixel's middle to the next, by NumPy and SciPy: two echoes and a late row, through filters that let steps pass."""
+    zeros, poles = (np.asarray(v, complex) for v in LETS_STEPS_THROUGH[name])
+    row, delay, amplitude, late = RNG.uniform(0, 200, 60), np.array([0.0, 0.31, 2.7]) / F, np.array([0.9, 0.2, -0.1]), 5e-9
+    line = Line(F, F).echoed(delay, amplitude).delayed(np.full((1, 1), late))
+    fine = 1000
+    t = np.arange(61 * fine + 1) / fine - 1
+    levels = np.interp(t, np.arange(-1, 61) + 0.5, np.concatenate([[0.0], row, [0.0]]))
+    if len(poles):
+        line = line.filtered(zeros, poles)
+        gain = (np.prod(-poles) / np.prod(-zeros)).real
+        _, levels, _ = sps.lsim(sps.ZerosPolesGain(zeros / F, poles / F, gain), levels, t + 1)
+    at = (np.arange(60) + 0.5 - late * F)[:, None] - delay * F
+    expected = (amplitude * np.interp(at, t, levels, left=0.0)).sum(axis=1)
+    limited = line.limited()
+    assert limited.ramps
+    np.testing.assert_allclose(sampled(limited, row), expected, atol=2e-4)
+
+
+def test_a_line_that_a_filter_limits_is_left_as_it_is() -> None:
+    for name in ("rc", "ringing", "one zero of two poles", "slow and fast"):
+        line = Line(F, F).filtered(*FILTERS[name])
+        assert line.limited() is line
 
 
 def test_equal_poles_have_their_closed_form() -> None:
@@ -216,6 +247,28 @@ def test_a_window_of_the_samples_equals_the_crop() -> None:
     assert whole.shape == (2, 48, 50) and camera.output_shape == (48, 50)
     for r, c, h, w in ((0, 0, 9, 7), (20, 13, 11, 30), (47, 49, 1, 1), (3, 40, 20, 10)):
         assert np.array_equal(camera.expose(Texture(), 2, seed=3, window=(r, c, h, w)).data, whole[:, r : r + h, c : c + w])
+
+
+@pytest.mark.parametrize("delay_ns", [0.5, 5.0, 40.0])
+def test_every_delay_is_seen_without_any_filter(delay_ns: float) -> None:
+    """What is late by δ is seen δ later, however small δ is: to 1e-4 of it, and 2e-6 px that float32 leaves. (A bare staircase shows 0.)"""
+    late = on_line("grabber.late", lambda s, _: s.line.delayed(np.full((1, 1), delay_ns * 1e-9)))
+    camera, x = video_camera(late), np.arange(64)
+    spot = Targets(np.array([30.3]), np.array([24.0]), background_dn=0.0)
+    frames = [c.expose(spot, 1, quiet=True).data[0].astype(float) for c in (camera, camera.switched(off=[NAME]))]
+    centres = [(f * x).sum() / f.sum() for f in frames]
+    assert centres[0] - centres[1] == pytest.approx(delay_ns * 1e-9 * F, rel=1e-4, abs=2e-6)
+
+
+def test_echoes_of_a_short_cable_are_seen_without_any_filter() -> None:
+    """2 m of 50 Ω cable: Δx = ρτ/(1 − ρ) = 0.0119 px; and without a source on the line the pixels are as they were."""
+    camera = camera_with(get_source("cable.termination"), Termination(length_m=2.0, line_ohm=50.0))
+    spot = Targets(np.array([30.3]), np.array([24.0]), background_dn=0.0)
+    frames = [c.expose(spot, 1, quiet=True).data[0].astype(float) for c in (camera, camera.switched(off=[NAME]))]
+    centres = [(f * np.arange(64)).sum() / f.sum() for f in frames]
+    assert centres[0] - centres[1] == pytest.approx(0.04 / 0.96 * 2.0 * 2 / (0.66 * 299_792_458.0) * F, rel=1e-4, abs=2e-6)
+    neutral = camera_with(get_source("cable.termination"), Termination())
+    assert np.array_equal(neutral.expose(spot, 1, quiet=True).data, neutral.switched(off=[NAME]).expose(spot, 1, quiet=True).data)
 
 
 def test_delays_belong_to_their_rows_however_the_frame_is_cut() -> None:

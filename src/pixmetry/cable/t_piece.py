@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from pixmetry.cable._kernels import remove_echoes
+from pixmetry.cable._undo import without
 from pixmetry.core.contribution import Contribution, Probe
 from pixmetry.core.line import SMALLEST_ECHO, Line, through_line
 from pixmetry.core.random import Stream
@@ -70,11 +70,10 @@ def forward(params: TPiece, signal: Signal, stream: Stream) -> Signal:
 
 
 def correct(params: TPiece, signal: Signal, maps: Mapping[str, np.ndarray]) -> Signal:
-    """Bring the level back and take the echoes out: exact for pixels that were held on the line and sampled by their own clock."""
+    """Bring the level back and take the echoes out, with the filters of the line that the signal names: see `cable._undo`."""
     if params.branch == "none":
         return signal
-    delay, amplitude = echoes(params)
-    return signal.with_data(remove_echoes(np.ascontiguousarray(signal.data, np.float32), delay * signal.clock.pixel_hz, amplitude))
+    return without(signal, lambda line: line.echoed(*echoes(params)))
 
 
 def near(params: TPiece) -> tuple[int, int, int, int]:

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from pixmetry.cable._kernels import remove_echoes
 from pixmetry.cable._skin import skin_filter, time_scale_s
+from pixmetry.cable._undo import without
 from pixmetry.core.contribution import Contribution, Probe
 from pixmetry.core.line import SMALLEST_ECHO, Line, through_line
 from pixmetry.core.random import Stream
@@ -68,15 +68,10 @@ def _through(params: Termination, line: Line) -> Line:
 
 
 def correct(params: Termination, signal: Signal, maps: Mapping[str, np.ndarray]) -> Signal:
-    """Take the echoes out from left to right: exact for pixels that were held on the line and sampled by their own clock.
-
-    The skin effect stays.
-    """
-    if abs(params.ghost) < 1e-12:
+    """Take echoes and skin effect out, with the filters of the line that the signal names: see `cable._undo`."""
+    if abs(params.ghost) < 1e-12 and not params.skin_db:
         return signal
-    delay, amplitude = echoes(params)
-    data = np.ascontiguousarray(signal.data, np.float32)
-    return signal.with_data(remove_echoes(data, delay * signal.clock.pixel_hz, amplitude))
+    return without(signal, lambda line: _through(params, line))
 
 
 def near(params: Termination) -> tuple[int, int, int, int]:

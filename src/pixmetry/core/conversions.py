@@ -111,6 +111,7 @@ def _sample(params: LineSources, signal: Signal, stream: Stream) -> Signal:
     line = signal.line
     if line.plain:
         return replace(signal, kind=Kind.DN, line=None)
+    line = line.limited()
     grid = params.samples_at(signal.grid, signal.frame_shape)
     data = line.read(signal.data, signal.grid.col0, grid)
     shape = (signal.frame_shape[0], line.samples or signal.frame_shape[1])

@@ -5,6 +5,10 @@ signal: filters (poles and zeros), echoes, and when it is sampled (clock, delay 
 samples it once, at the first source that takes DN. The staircase has an exact answer through any filter of that kind, so nothing is
 interpolated and nothing is filtered at the pixel rate.
 
+No line is a staircase: every output stage has a finite bandwidth. Where no source of the chain says which, the level takes one pixel
+period to go straight from one pixel to the next (`Line.limited`): −3 dB at 0.44 of the pixel clock, and what is sampled in the middle of
+the pixels is the pixels. Else a sample would sit on a flat step, and see neither jitter nor an echo that comes within half a pixel.
+
 Filters and echoes are linear and do not change in time, so their order does not matter. A delay of a whole row may be exchanged with
 them too; a delay that changes along the line may as far as it changes little over the duration of an impulse response.
 """
@@ -59,6 +63,8 @@ class Line:
         ``(grid, line) -> DN``, shape (n, rows, samples): added to the samples; the line is the one that is read.
     black_dn : float
         Level before the first and after the last pixel.
+    ramps : bool
+        Whether the level takes one pixel period to go from one pixel to the next, instead of jumping.
     """
 
     pixel_clock_hz: float
@@ -72,6 +78,7 @@ class Line:
     warps: tuple[Warp, ...] = ()
     noise: tuple[Noise, ...] = ()
     black_dn: float = 0.0
+    ramps: bool = False
 
     # ---- what sources do --------------------------------------------------------------------------------------------------------
 
@@ -116,6 +123,11 @@ class Line:
     def warped(self, warp: Warp) -> Line:
         """Return the line with a delay that changes along it."""
         return replace(self, warps=(*self.warps, warp))
+
+    def limited(self) -> Line:
+        """Return the line with the bandwidth that it has at least: one without a filter that lets no step through goes by ramps."""
+        slow = any(len(poles) > len(zeros) for zeros, poles in self.filters)
+        return self if slow else replace(self, ramps=True)
 
     def with_noise(self, noise: Noise) -> Line:
         """Return the line with noise that is added to its samples."""
@@ -163,9 +175,7 @@ class Line:
         -------
         ndarray, shape (n, rows, samples), float32, DN
         """
-        step, table = response(tuple((z.tobytes(), p.tobytes()) for z, p in self.filters), self.pixel_clock_hz)
-        delays = np.zeros(1) if self.echo_delay_s is None else self.echo_delay_s * self.pixel_clock_hz
-        amplitudes = np.ones(1) if self.echo_amplitude is None else self.echo_amplitude
+        step, table, delays, amplitudes = self.kernel()
         out = np.empty(grid.size, np.float32)
         if out.size == 0:
             return out
@@ -174,12 +184,25 @@ class Line:
         latest = float((at.max(axis=1) - late.min(axis=1) - first).max() - delays.min())
         length = max(data.shape[2], int(np.floor(latest)) + 1)
         read_line(
-            np.ascontiguousarray(data, np.float32), first, self.black_dn, step, table, np.ascontiguousarray(delays, float),
-            np.ascontiguousarray(amplitudes, float), at, late, length, out,
+            np.ascontiguousarray(data, np.float32), first, self.black_dn, step, table, delays, amplitudes, at, late,
+            length, out,
         )  # fmt: skip
         for noise in self.noise:
             out += noise(grid, self)
         return out
+
+    def kernel(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """State step and table of the filters (see `response`), delays in pixel periods and amplitudes of all paths, for `read_line`.
+
+        A level that goes by ramps is the mean of the staircase over one period: its integral half a period later, less that half a period
+        earlier. So there is an integrator behind the filters, and two paths stand for each.
+        """
+        step, table = response(tuple((z.tobytes(), p.tobytes()) for z, p in self.filters), self.pixel_clock_hz, self.ramps)
+        delays = np.zeros(1) if self.echo_delay_s is None else self.echo_delay_s * self.pixel_clock_hz
+        amplitudes = np.ones(1) if self.echo_amplitude is None else self.echo_amplitude
+        if self.ramps:
+            delays, amplitudes = np.concatenate([delays - 0.5, delays + 0.5]), np.concatenate([amplitudes, -amplitudes])
+        return step, table, np.ascontiguousarray(delays, float), np.ascontiguousarray(amplitudes, float)
 
     @property
     def delay_s(self) -> float:
@@ -274,7 +297,7 @@ def through_line(line: Line, probe: Probe, gum_class: str = "G", **kw: Any) -> C
     n, rows, cols = probe.signal_dn.shape
     zero = np.zeros(n, np.int64)
     grid = Grid(zero, zero, zero, (rows, cols))
-    seen = line.read(probe.signal_dn - probe.background_dn, zero, grid) + probe.background_dn
+    seen = line.limited().read(probe.signal_dn - probe.background_dn, zero, grid) + probe.background_dn
     return probe.from_shifts(*probe.moved(seen.astype(float)), gum_class, method="the estimator on the target after the line", **kw)
 
 
@@ -282,15 +305,19 @@ def through_line(line: Line, probe: Probe, gum_class: str = "G", **kw: Any) -> C
 
 
 @lru_cache(maxsize=64)
-def response(filters: tuple[tuple[bytes, bytes], ...], pixel_hz: float) -> tuple[np.ndarray, np.ndarray]:
+def response(filters: tuple[tuple[bytes, bytes], ...], pixel_hz: float, integrated: bool = False) -> tuple[np.ndarray, np.ndarray]:
     """State step over one pixel period and table of read-outs of filters in a row, as `read_line` takes them.
 
     With x' = A x + B u, y = C x + D u and a level u that is held, (x, u) becomes e^(M t)(x, u) with M = [[A, B], [0, 0]]
     (C. F. Van Loan, IEEE Trans. Autom. Control 23, 1978, 395). Equal poles need no care of their own.
+    With ``integrated``, what comes out is integrated over pixel periods: one more state, x' = y.
     """
     from scipy.linalg import expm
 
-    a, b, c, d = _cascade([section for z, p in filters for section in _sections(_scaled(z, pixel_hz), _scaled(p, pixel_hz))])
+    sections = [section for z, p in filters for section in _sections(_scaled(z, pixel_hz), _scaled(p, pixel_hz))]
+    if integrated:
+        sections.append((np.zeros((1, 1)), np.ones(1), np.ones(1), 0.0))
+    a, b, c, d = _cascade(sections)
     k = len(a)
     m = np.zeros((k + 1, k + 1))
     m[:k, :k], m[:k, k] = a, b

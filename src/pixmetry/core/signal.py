@@ -114,7 +114,8 @@ class Signal:
     light : Light
         Of the kind ``LIGHT`` (whose data hold nothing).
     line : Line
-        Of the kind ``VIDEO`` (whose data are the pixels that the line holds one after the other).
+        Of the kind ``VIDEO`` (whose data are the pixels that the line holds one after the other); and with samples of a line that are to be
+        corrected, what else the line did to them.
     """
 
     data: np.ndarray

@@ -6,7 +6,8 @@ A module of a stage makes one ``Source`` record named ``SOURCE``; the catalogue 
   and returns ``(signal, state)``;
 * ``measure(observations)`` returns ``Estimates`` named like the parameters (a subset of them), or raises ``MeasureError``;
 * ``correct(params, signal, maps)`` returns the signal with less of the effect; ``maps`` holds what was measured pixel by pixel in this
-  unit (``dark_dn``, ``prnu_rel``, ``defects``), whole frames by name, and may be empty;
+  unit (``dark_dn``, ``prnu_rel``, ``defects``), whole frames by name, and may be empty; a source of the video line finds the rest of
+  the line, all that still acts on the samples but itself, in ``signal.line``, if it is known;
 * ``propagate(params, probe)`` returns the ``Contribution`` to a target's position.
 
 A verb that cannot exist is given as a sentence in ``reasons`` instead.

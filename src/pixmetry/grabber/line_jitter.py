@@ -75,8 +75,8 @@ def tail(params: LineJitter) -> float:
 def propagate(params: LineJitter, probe: Probe) -> Contribution:
     """Independent and carried-on delays by the response of the estimator to each row; the steady part by its scatter over the frame.
 
-    Holds for a line that is smooth between its samples, as any filter makes it, or for delays above a quarter of a pixel: a bare staircase
-    that is sampled in the middle of its steps does not see smaller ones.
+    Holds for a line that is smooth between its samples. A row that falls between the pixels is also a little smoother, so that less of it
+    stands above a threshold: that moves y by some hundredths of what x moves.
     """
     to_px = 1e-9 * Clock.pixel_hz
     u = u_from_row_delays(probe, params.white_ns * to_px, params.loop_ns * to_px, params.loop_rows, params.stride)
@@ -85,7 +85,7 @@ def propagate(params: LineJitter, probe: Probe) -> Contribution:
     steady = systematic_s(params, first[:, None] + np.arange(len(each)), probe.frame_shape[0]) * Clock.pixel_hz @ each
     return Contribution(
         u_x_px=float(np.hypot(u, steady.std())), u_y_px=0.0, bias_x_px=float(steady.mean()), gum_class="Tr", model_error=0.3,
-        method="response of the estimator to the shift of each row",
+        floor_px=max(2e-4, 0.03 * u), method="response of the estimator to the shift of each row",
     )  # fmt: skip
 
 
