@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from pixmetry.budget.probe import Target, facts_of
 from pixmetry.core.catalogue import catalogue, get_source
 from pixmetry.core.errors import InputError
 from pixmetry.core.estimates import Estimates
+from pixmetry.core.signal import Kind
 from pixmetry.location.estimators import Estimator
 
 KNOWN = {"noise_dn": 0.6}
@@ -47,6 +49,24 @@ def test_status_of_each_source() -> None:
     assert row(budget, "cable.termination").status == "not applicable"
     assert row(budget, "cable.termination").contribution is None
     assert all(r.reason for r in budget.rows if r.contribution is None)
+
+
+FRAME_SIZES = [(240, 320), (480, 640), (1024, 1280), (2048, 2448), (4096, 5120)]
+
+
+@pytest.mark.parametrize("source_id", [i for i, s in catalogue().items() if s.propagate and not s.option and Kind.LIGHT not in s.consumes])
+def test_no_bound_explodes_or_vanishes_with_the_size_of_the_frame(source_id: str) -> None:
+    """What is accepted at its bound: over frames of 77 kpx to 21 Mpx it neither grows to several times that of 640 × 480 pixels, nor is it
+    ever the size of a pixel. The clock that is not warm stretches the row, by a share of its length: that grows as rows do.
+    """
+    source = get_source(source_id)
+    cam = small_camera()
+    probe = make_probe(facts_of(cam, Target(), KNOWN), Target(), Estimator(), 4)
+    totals = np.array([source.propagate(source.bound_of(s), replace(probe, frame_shape=s)).total_px for s in FRAME_SIZES])
+    if source_id != "grabber.clock_warm_up":
+        assert (totals[1:] <= 2 * totals[1]).all() and (totals[:2] <= 3 * totals[1]).all()
+    if source_id in ("optics.shading", "sensor.charge_transfer"):
+        assert 0.001 < totals[3] < 0.03 and totals[-1] > 5e-4
 
 
 def test_the_verdict_is_the_root_sum_of_squares_of_what_is_decided() -> None:

@@ -287,7 +287,7 @@ def _row(name: str, source: Source, camera: Camera, estimates: Estimates | None,
     elif (present and not at_bound) or not source.parameters.model_fields:
         status, params, reason = "modelled", base_of(source, camera, name), "from the description of the camera" if present else ""
     else:
-        status, params = "accepted", source.bound
+        status, params = "accepted", source.bound_of(probe.frame_shape)
         reason = source.reasons.get("measure", "not measured in this campaign")
     if source.propagate is None:
         return replace(head, status=status, reason=source.reasons["propagate"])

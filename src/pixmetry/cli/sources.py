@@ -30,7 +30,7 @@ def sources(source_id: str | None, as_json: bool) -> None:
 
 
 def _details(source) -> dict:
-    from pixmetry.core.source import bounds_text
+    from pixmetry.core.source import STATED_FRAME, bounds_text
 
     return {
         "description": source.description,
@@ -46,6 +46,7 @@ def _details(source) -> dict:
             }
             for name, field in source.parameters.model_fields.items()
         ],
+        "bound_of_frame": "" if source.bound_over is None else "{} × {} px".format(*STATED_FRAME[::-1]),
         "typical_size": source.typical_size,
         "advice": source.advice,
         "references": list(source.references),
@@ -93,6 +94,8 @@ def _explain(record: dict) -> None:
         for p in record["parameters"]:
             table.add_row(p["name"], p["unit"], p["range"], f"{p['typical']}", f"{p['bound']}", escape(p["description"]))
         console.print(table, "")
+        if record["bound_of_frame"]:
+            console.print(f"The bound is stated over the frame; these numbers are for {record['bound_of_frame']}.\n")
     for verb, has in record["verbs"].items():
         console.print(f"{verb:<12}  {'yes' if has else 'no: ' + escape(record['reasons'][verb])}")
     console.print("\nsources: " + escape("; ".join(record["references"])))

@@ -30,6 +30,7 @@ from pixmetry.core.random import Stream
 from pixmetry.core.signal import Kind, Signal, Windows
 
 VERBS = ("forward", "measure", "correct", "propagate")
+STATED_FRAME = (480, 640)  # rows and columns for which a bound is stated that depends on the frame
 
 
 class Parameters(Model):
@@ -69,6 +70,9 @@ class Source:
         Values at which ``forward`` is the identity; where there are none, ``reasons["neutral"]`` says why.
     typical, bound : parameters
         Usual values, and the largest to expect of a sound camera: the bound enters a budget where nothing was measured.
+    bound_over : callable, optional
+        ``bound_over(frame_shape)``: the bound in a frame of this size, for a source with parameters per pixel or per row whose effect adds
+        up over the frame; ``bound`` is that of `STATED_FRAME`.
     context : callable, optional
         ``context(params, windows, frame_shape) -> Windows``: the input it needs to make these windows; by default the windows.
     near : callable, optional
@@ -129,6 +133,7 @@ class Source:
     correct: Callable[[Any, Signal, Mapping[str, np.ndarray]], Signal] | None = None
     propagate: Callable[[Any, Probe], Contribution] | None = None
     context: Callable[[Any, Windows, tuple[int, int]], Windows] | None = None
+    bound_over: Callable[[tuple[int, int]], Any] | None = None
     near: Callable[[Any], tuple[int, int, int, int]] | None = None
     tail: Callable[[Any], float] | None = None
     reshape: Callable[[Any, tuple[int, int]], tuple[int, int]] | None = None
@@ -140,6 +145,8 @@ class Source:
     reasons: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        if self.bound_over is not None and self.bound != self.bound_over(STATED_FRAME):
+            raise ValueError(f"{self.id}: its bound is not that of {STATED_FRAME[0]} × {STATED_FRAME[1]} pixels")
         silent = [v for v in VERBS if getattr(self, v) is None and not self.reasons.get(v)]
         if silent:
             raise ValueError(f"{self.id}: no reason given for the missing verb {', '.join(silent)}")
@@ -163,6 +170,10 @@ class Source:
         """Unit of every parameter."""
         extras: dict[str, Any] = {n: f.json_schema_extra or {} for n, f in self.parameters.model_fields.items()}
         return {n: extra.get("unit", "") for n, extra in extras.items()}
+
+    def bound_of(self, frame_shape: tuple[int, int]) -> Any:
+        """The largest to expect of a sound camera whose frames have this size."""
+        return self.bound if self.bound_over is None else self.bound_over(frame_shape)
 
     def window_needed(self, params: Any, windows: Windows, frame_shape: tuple[int, int]) -> Windows:
         """The input windows that it needs for these output windows."""

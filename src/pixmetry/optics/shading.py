@@ -11,7 +11,7 @@ from pixmetry.core.estimates import Estimates
 from pixmetry.core.observations import Observations
 from pixmetry.core.random import Stream
 from pixmetry.core.signal import Kind, Signal
-from pixmetry.core.source import Parameters, Source, quantity
+from pixmetry.core.source import STATED_FRAME, Parameters, Source, quantity
 
 PLACES = 24  # along each side of the frame, for the spread over it
 SMALLEST_FACTOR = 1e-3  # a frame cannot be darker than dark, and the correction divides by this
@@ -92,6 +92,15 @@ def propagate(params: Shading, probe: Probe) -> Contribution:
     )
 
 
+STEEPEST_PER_PX, ACROSS_REL = 1e-3, 0.5  # of a sound camera: anywhere, and from edge to edge
+
+
+def bound_over(frame_shape: tuple[int, int]) -> Shading:
+    """Light that changes by half of its mean from edge to edge, along either axis, and falls by 0.4 into the corners."""
+    along_y, along_x = (min(STEEPEST_PER_PX, ACROSS_REL / side) for side in frame_shape)
+    return Shading(gradient_x_per_px=along_x, gradient_y_per_px=along_y, corner_rel=0.4)
+
+
 SOURCE = Source(
     id="optics.shading",
     title="Lens shading and uneven light",
@@ -101,7 +110,8 @@ SOURCE = Source(
     before=("sensor",),
     neutral=Shading(),
     typical=Shading(gradient_x_per_px=2e-4, gradient_y_per_px=1e-4, corner_rel=0.2),
-    bound=Shading(gradient_x_per_px=1e-3, gradient_y_per_px=1e-3, corner_rel=0.4),
+    bound=bound_over(STATED_FRAME),
+    bound_over=bound_over,
     forward=forward,
     measure=measure,
     correct=correct,

@@ -20,7 +20,7 @@ from pixmetry.core.contribution import Contribution, Probe
 from pixmetry.core.errors import ParameterError
 from pixmetry.core.random import Stream
 from pixmetry.core.signal import Kind, Signal, Windows
-from pixmetry.core.source import Parameters, Source, quantity
+from pixmetry.core.source import STATED_FRAME, Parameters, Source, quantity
 from pixmetry.sensor._charge_kernels import pass_traps, transfer_columns, transfer_packets, transfer_rows
 
 ITERATIONS = 5
@@ -200,6 +200,15 @@ def _added_dn(params: ChargeTransfer, probe: Probe) -> np.ndarray:
     return probe.gain_dn_per_e * (added[1:] - added[0])
 
 
+MOST_CTI, WHOLE_WAY = 5e-5, 0.03  # of a sound camera: in one transfer, and over all rows or columns
+
+
+def bound_over(frame_shape: tuple[int, int]) -> ChargeTransfer:
+    """A charge leaves 3 % behind on its way across the whole frame, along either axis, and never more than 5e-5 in one transfer."""
+    parallel, serial = (min(MOST_CTI, WHOLE_WAY / side) for side in frame_shape)
+    return ChargeTransfer(parallel_cti=parallel, serial_cti=serial, trail_px=2.0)
+
+
 SOURCE = Source(
     id="sensor.charge_transfer",
     title="Charge transfer inefficiency",
@@ -213,7 +222,8 @@ SOURCE = Source(
     before=("electronics",),
     neutral=ChargeTransfer(),
     typical=ChargeTransfer(parallel_cti=1e-5, serial_cti=1e-5),
-    bound=ChargeTransfer(parallel_cti=5e-5, serial_cti=5e-5, trail_px=2.0),
+    bound=bound_over(STATED_FRAME),
+    bound_over=bound_over,
     forward=forward,
     correct=correct,
     propagate=propagate,
