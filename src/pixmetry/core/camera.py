@@ -22,6 +22,7 @@ from pixmetry.core.random import Grid, Streams
 from pixmetry.core.signal import Clock, Kind, Signal, Windows
 from pixmetry.core.source import run
 from pixmetry.core.threads import imap_tiles, map_tiles
+from pixmetry.core.unit_maps import MeasuredUnit, check_frame, check_maps, maps_file, write_unit_maps
 
 BATCH_PIXELS = 1 << 18  # of the small windows that are run as one batch: enough that the calls cost little beside the work
 
@@ -45,6 +46,9 @@ class Camera:
         How much colder the sensor is at time 0, and the time constant with which it warms up.
     pixel_clock_hz, line_period_s : float
         Of the read-out; CCIR unless told otherwise.
+    measured : MeasuredUnit, optional
+        The unit that the elements' maps were measured in. With its seed they take the place of drawn patterns; with another seed the camera
+        is another one of the type, and its patterns are drawn.
     unit_seed : int
         What this unit's fixed patterns are drawn from: another seed is another camera of the same type.
     facts : mapping
@@ -68,12 +72,15 @@ class Camera:
     warm_up_s: float = 1800.0
     pixel_clock_hz: float = 14.1875e6
     line_period_s: float = 64e-6
+    measured: MeasuredUnit | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "chain", tuple(self.chain))
         check_chain(self.chain, self.name)
         if min(self.frame_shape) < 1:
             raise ChainError("a frame has no pixels", where=self.name, value=self.frame_shape)
+        for element in self.chain:
+            check_maps(element, f"{self.name}, {element.name}")
 
     # ---- variants -------------------------------------------------------------------------------------------------------------
 
@@ -98,7 +105,7 @@ class Camera:
         """Return the same camera with some parameters of one source changed (validated)."""
         element = self[name]
         params = element.source.make({**element.params.model_dump(), **values}, where=f"{self.name}.{name}")
-        return replace(self, chain=tuple(replace(e, params=params) if e.name == name else e for e in self.chain))
+        return replace(self, chain=tuple(e.with_params(params) if e.name == name else e for e in self.chain))
 
     @property
     def active(self) -> tuple[Element, ...]:
@@ -119,7 +126,12 @@ class Camera:
 
     def streams(self, seed: int, quiet: bool = False) -> Streams:
         """Return the keyed randomness of one series of exposures; ``quiet``: every temporal draw at its mean."""
-        return QuietStreams(self.unit_seed, seed) if quiet else Streams(self.unit_seed, seed)
+        known = {}
+        if self.measured is not None and self.unit_seed == self.measured.unit_seed:
+            known = {e.name: e.maps for e in self.active if e.maps}
+            if known:
+                check_frame(self.measured, self.frame_shape, self.name)
+        return (QuietStreams if quiet else Streams)(self.unit_seed, seed, known)
 
     def signal(
         self, scene: Scene, grid: Grid, exposure_s: Any = None, frame_period_s: float | None = None, temperature_c: Any = None
@@ -419,10 +431,12 @@ class Camera:
         return to_record(self)
 
     def save(self, path: str | Path) -> None:
-        """Write the camera as a preset (YAML)."""
+        """Write the camera as a preset (YAML); what was measured in its unit goes into an archive beside it (``camera.maps.npz``)."""
         from pixmetry.core.config import dump_yaml
 
         dump_yaml(self.to_record(), path)
+        if any(e.maps for e in self.chain):
+            write_unit_maps(maps_file(path), self.chain)
 
 
 @dataclass(frozen=True)

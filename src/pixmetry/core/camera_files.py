@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pixmetry.core.chain_order import Element
 from pixmetry.core.errors import InputError
+from pixmetry.core.unit_maps import MeasuredUnit, listing, maps_file, read_unit_maps
 
 if TYPE_CHECKING:
     from pixmetry.core.camera import Camera
@@ -23,10 +25,14 @@ def to_record(camera: Camera) -> dict[str, Any]:
     record |= {"exposure_s": camera.exposure_s, "temperature_c": camera.temperature_c, "unit_seed": camera.unit_seed}
     optional = ("warm_up_k", "warm_up_s", "pixel_clock_hz", "line_period_s")
     record |= {n: getattr(camera, n) for n in optional if getattr(camera, n) != type(camera).__dataclass_fields__[n].default}
+    if camera.measured is not None and any(e.maps for e in camera.chain):
+        rows, cols = camera.measured.frame_shape
+        record["measured"] = {"unit_seed": camera.measured.unit_seed, "rows": rows, "cols": cols}
     record["facts"] = dict(camera.facts)
     record["chain"] = [
         {"source": e.source.id, **({"name": e.name} if e.name != e.source.id else {}), **({} if e.on else {"enabled": False})}
         | {"parameters": e.params.model_dump(mode="json")}
+        | ({"maps": listing(e.maps)} if e.maps else {})
         for e in camera.chain
     ]
     return record
@@ -44,8 +50,16 @@ def clock_values(record: Any) -> dict[str, float]:
     return values | ({"pixel_time_ns": 1e9 / record.pixel_clock_hz} if "pixel_clock_hz" in told else {})
 
 
-def build_camera(record: Mapping[str, Any], where: str = "camera") -> Camera:
+def build_camera(record: Mapping[str, Any], where: str = "camera", maps: str | Path | None = None) -> Camera:
     """Build a camera from its plain record.
+
+    Parameters
+    ----------
+    record : mapping
+    where : str
+        For messages.
+    maps : path, optional
+        The archive of what was measured in its unit, for a record that names such maps.
 
     Raises
     ------
@@ -66,9 +80,19 @@ def build_camera(record: Mapping[str, Any], where: str = "camera") -> Camera:
         own = {name: value for name, value in known.items() if name in source.parameters.model_fields}
         params = source.make(own | entry.parameters, where=f"{where}, chain[{i}] {entry.source}")
         elements.append(Element(entry.name or entry.source, source, params, entry.enabled))
+    wanted = {element.name: entry.maps for element, entry in zip(elements, checked.chain, strict=True) if entry.maps}
+    measured = None
+    if wanted:
+        if checked.measured is None:
+            raise InputError("maps of no unit", where=where, remedy="write `measured:` with unit_seed, rows and cols, or delete `maps:`")
+        if maps is None:
+            raise InputError("the measured maps of this camera are not given", where=where, remedy="load the camera from its file")
+        measured = MeasuredUnit(checked.measured.unit_seed, (checked.measured.rows, checked.measured.cols))
+        found = read_unit_maps(Path(maps), wanted)
+        elements = [replace(e, maps=found.get(e.name, {})) for e in elements]
     same = ("exposure_s", "temperature_c", "unit_seed", "facts", "warm_up_k", "warm_up_s", "pixel_clock_hz", "line_period_s")
     settings = {name: getattr(checked, name) for name in same}
-    return Camera(checked.name, (checked.rows, checked.cols), tuple(elements), pitch, **settings)
+    return Camera(checked.name, (checked.rows, checked.cols), tuple(elements), pitch, measured=measured, **settings)
 
 
 def load_camera(path: str | Path) -> Camera:
@@ -88,4 +112,4 @@ def load_camera(path: str | Path) -> Camera:
         path = Path(str(presets[str(path)]))
     elif not Path(path).is_file():
         raise InputError("no such camera file or preset", value=str(path), allowed=f"a YAML file, or one of {', '.join(sorted(presets))}")
-    return build_camera(load_yaml(path), where=str(path))
+    return build_camera(load_yaml(path), str(path), maps_file(path))

@@ -16,6 +16,15 @@ class ElementRecord(Model):
     name: str | None = None
     enabled: bool = True
     parameters: dict[str, Any] = {}
+    maps: dict[str, str] = {}
+
+
+class MeasuredRecord(Model):
+    """The unit whose maps stand in the archive beside the camera file, and their size."""
+
+    unit_seed: int = Field(ge=0)
+    rows: int = Field(ge=1)
+    cols: int = Field(ge=1)
 
 
 class CameraRecord(Model):
@@ -34,5 +43,6 @@ class CameraRecord(Model):
     pixel_clock_hz: float = Field(default=14.1875e6, gt=0, le=1e12)
     line_period_s: float = Field(default=64e-6, gt=0)
     unit_seed: int = Field(default=0, ge=0)
+    measured: MeasuredRecord | None = None
     facts: dict[str, Any] = {}
     chain: list[ElementRecord]

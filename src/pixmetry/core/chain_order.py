@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
+
+import numpy as np
 
 from pixmetry.core.conversions import conversion
 from pixmetry.core.errors import ChainError
@@ -13,14 +15,25 @@ from pixmetry.core.source import Source
 
 RANK = {Kind.LIGHT: 0, Kind.PHOTONS: 1, Kind.ELECTRONS: 2, Kind.DN: 3, Kind.VIDEO: 3, Kind.CODES: 4}  # in which a chain goes through them
 
+
 @dataclass(frozen=True)
 class Element:
-    """One place in a chain: a source under a name of its own, with parameters; switched on or off."""
+    """One place in a chain: a source under a name of its own, with parameters; switched on or off.
+
+    ``maps`` is what was measured of the unit that the camera speaks of, in place of what ``forward`` draws (see `Source.maps`).
+    """
 
     name: str
     source: Source
     params: Any
     on: bool = True
+    maps: Mapping[str, np.ndarray] = field(default_factory=dict, compare=False, repr=False)
+
+    def with_params(self, params: Any) -> Element:
+        """The element with other parameters; a map that stands for one of those that change goes, and its pattern is drawn."""
+        changed = {name for name in type(params).model_fields if getattr(params, name) != getattr(self.params, name)}
+        maps = {name: array for name, array in self.maps.items() if not changed & set(self.source.maps[name])}
+        return replace(self, params=params, maps=maps)
 
 
 def check_chain(chain: Sequence[Element], where: str = "camera") -> None:

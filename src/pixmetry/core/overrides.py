@@ -85,7 +85,7 @@ def changed_camera(camera: Camera, overrides: Mapping[str, Any] | None = None, o
         for name, values in by_source.items()
     }
     if changed:  # all at once: some only fit together
-        camera = replace(camera, chain=tuple(replace(e, params=changed.get(e.name, e.params)) for e in camera.chain))
+        camera = replace(camera, chain=tuple(e.with_params(changed.get(e.name, e.params)) for e in camera.chain))
     names = [_known(camera, name) for name in off]
     return _with_own(camera, own).switched(off=names)
 
@@ -116,7 +116,7 @@ def _with_own(camera: Camera, values: dict[str, Any]) -> Camera:
     from pixmetry.core.camera_schema import CameraRecord
     from pixmetry.core.config import validate
 
-    same = {f.name for f in fields(Camera)} & set(CameraRecord.model_fields) - {"name", "facts", "chain"}
+    same = {f.name for f in fields(Camera)} & set(CameraRecord.model_fields) - {"name", "facts", "chain", "measured"}
     allowed = sorted(same | {"rows", "cols", "pitch_x_um", "pitch_y_um", PERIOD})
     for key in values:
         if key not in allowed:

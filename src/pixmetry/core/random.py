@@ -11,8 +11,8 @@ hangs on the exposure seed. The methods run in the caller's thread and release t
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import lru_cache
 
 import numpy as np
@@ -71,14 +71,18 @@ class Grid:
 
 @dataclass(frozen=True)
 class Streams:
-    """All randomness of one camera: a seed for what its unit is made of, and one for what happens during the exposures."""
+    """All randomness of one camera: a seed for what its unit is made of, and one for what happens during the exposures.
+
+    ``known`` is what was measured of the unit, by the name of the error source and of the array, and need not be drawn.
+    """
 
     unit_seed: int
     exposure_seed: int
+    known: Mapping[str, Mapping[str, np.ndarray]] = field(default_factory=dict, compare=False, repr=False)
 
     def of(self, instance_name: str) -> Stream:
         """Return the stream of one error source, by the name that it has in its camera."""
-        return Stream(self.unit_seed, self.exposure_seed, instance_name)
+        return Stream(self.unit_seed, self.exposure_seed, instance_name, self.known.get(instance_name, {}))
 
 
 @dataclass(frozen=True)
@@ -96,7 +100,24 @@ class Stream:
     unit_seed: int
     exposure_seed: int
     name: str
+    known: Mapping[str, np.ndarray] = field(default_factory=dict, compare=False, repr=False)
     quiet = False  # True where every temporal draw is at its mean: an effect whose mean is not that of its draw's mean asks for it
+
+    def known_fixed(self, name: str, grid: Grid) -> NDArray[np.float32] | None:
+        """Return what was measured of the unit's pixels under a name, shape (n, rows, cols), float32; None where nothing was."""
+        whole = self.known.get(name)
+        if whole is None:
+            return None
+        rows, cols = grid.shape
+        if len(np.unique(grid.row0)) == 1 == len(np.unique(grid.col0)):  # whole frames, or one window of many
+            part = whole[grid.row0[0] : grid.row0[0] + rows, grid.col0[0] : grid.col0[0] + cols].astype(np.float32)
+            return np.broadcast_to(part, grid.size)
+        at = grid.row0[:, None, None] + np.arange(rows)[:, None], grid.col0[:, None, None] + np.arange(cols)
+        return whole[at].astype(np.float32)
+
+    def known_unit(self, name: str) -> np.ndarray | None:
+        """Return what was measured of the unit as a whole under a name; None where nothing was."""
+        return self.known.get(name)
 
     def normal(self, grid: Grid, draw: int = 0) -> NDArray[np.float32]:
         """Return standard normal numbers, shape (n, rows, cols), new in every frame."""

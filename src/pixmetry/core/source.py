@@ -90,6 +90,9 @@ class Source:
         ``truth(params, signal, stream)``: what it does in this unit and these frames, as named arrays: maps (rows, cols) of the unit,
         masks, shifts (n, rows) of every row; ``signal`` is a batch of whole frames of the kind that it takes, of which only the grid, times
         and sizes count.
+    maps : mapping
+        Arrays of one measured unit that ``forward`` takes from its stream (``known_fixed``, ``known_unit``) in place of what it would draw:
+        by name, the parameters that they stand for.
     start : callable, optional
         ``start(params)``: the state before frame 0, for a source with a memory; None where it has none with these parameters.
     applies_to : tuple of str
@@ -139,6 +142,7 @@ class Source:
     reshape: Callable[[Any, tuple[int, int]], tuple[int, int]] | None = None
     place: Callable[[Any, np.ndarray, np.ndarray, tuple[int, int], int], tuple[np.ndarray, np.ndarray]] | None = None
     truth: Callable[[Any, Signal, Stream], Mapping[str, np.ndarray]] | None = None
+    maps: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     start: Callable[[Any], Any] | None = None
     applies_to: tuple[str, ...] = ()
     option: str = ""

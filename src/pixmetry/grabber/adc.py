@@ -64,11 +64,14 @@ def thresholds(params: Adc, stream: Stream) -> np.ndarray:
 
     Each threshold is displaced by itself, with the standard deviation ``dnl_std_lsb``/√2: the code widths then scatter by
     ``dnl_std_lsb``, and the displacements do not add up along the range, whose slow bend is a parameter of its own. The two
-    thresholds about a missing code meet at its centre.
+    thresholds about a missing code meet at its centre. Of a measured unit the displacements are its own, ``threshold_lsb``, shape (top,).
     """
     k = np.arange(1, params.top + 1, dtype=float)
     level = k - 0.5 + bend(params, k)
-    if params.dnl_std_lsb:
+    known = stream.known_unit("threshold_lsb")
+    if known is not None:
+        level += known
+    elif params.dnl_std_lsb:
         level += params.dnl_std_lsb / math.sqrt(2) * stream.normal_unit(params.top)
     if params.missing_every:
         gone = np.arange(params.missing_every, params.top, params.missing_every)  # T_k is level[k − 1]
@@ -173,6 +176,7 @@ SOURCE = Source(
     before=("storage.jpeg", "storage.video_codec", "processing"),
     typical=Adc(bits=8, offset_dn=5.0, dnl_std_lsb=0.2, inl_amplitude_lsb=0.3),
     bound=Adc(bits=8, offset_dn=16.0, dnl_std_lsb=0.5, inl_amplitude_lsb=1.0),
+    maps={"threshold_lsb": ("dnl_std_lsb", "bits")},
     forward=forward,
     measure=measure,
     correct=correct,

@@ -31,10 +31,14 @@ class PhasePattern(Parameters):
 
 
 def forward(params: PhasePattern, signal: Signal, stream: Stream) -> Signal:
-    """Add A sin(2π(ν_x c + ν_y r + φ)) with the phase φ of the frame."""
+    """Add A sin(2π(ν_x c + ν_y r + φ)) with the phase φ of the frame; of a measured unit, one that stands still has its ``phase_turns``."""
     if params.amplitude_dn == 0 or (params.moving and stream.quiet):  # over the phases of all frames the mean is 0
         return signal
-    phase = stream.uniform_frames(signal.grid) if params.moving else stream.uniform_unit(1) + params.turns_per_frame * signal.grid.frame % 1
+    if params.moving:
+        phase = stream.uniform_frames(signal.grid)
+    else:
+        known = stream.known_unit("phase_turns")
+        phase = (stream.uniform_unit(1) if known is None else known) + params.turns_per_frame * signal.grid.frame % 1
     added = wave(signal, params.frequency_x, params.frequency_y, phase)
     added *= np.float32(params.amplitude_dn)
     return signal.with_data(np.add(signal.data, added, out=added))
@@ -110,6 +114,7 @@ SOURCE = Source(
     neutral=PhasePattern(),
     typical=PhasePattern(amplitude_dn=0.5),
     bound=PhasePattern(amplitude_dn=1.0, frequency_x=0.05, frequency_y=0.05),
+    maps={"phase_turns": ("frequency_x", "frequency_y", "moving")},
     forward=forward,
     measure=measure,
     correct=correct,

@@ -45,8 +45,9 @@ def factor(params: Shading, signal: Signal) -> np.ndarray:
 
 
 def forward(params: Shading, signal: Signal, stream: Stream) -> Signal:
-    """Multiply the light by the factor."""
-    return signal.with_data(signal.data * factor(params, signal))
+    """Multiply the light by the factor, or by the smooth map ``light_rel`` that was measured."""
+    known = stream.known_fixed("light_rel", signal.grid)
+    return signal.with_data(signal.data * (factor(params, signal) if known is None else known))
 
 
 def measure(observations: Observations) -> Estimates:
@@ -112,6 +113,7 @@ SOURCE = Source(
     typical=Shading(gradient_x_per_px=2e-4, gradient_y_per_px=1e-4, corner_rel=0.2),
     bound=bound_over(STATED_FRAME),
     bound_over=bound_over,
+    maps={"light_rel": ("gradient_x_per_px", "gradient_y_per_px", "corner_rel")},
     forward=forward,
     measure=measure,
     correct=correct,

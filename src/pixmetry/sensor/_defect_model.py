@@ -61,10 +61,13 @@ class Defects(Parameters):
 def forward(params: Defects, signal: Signal, stream: Stream) -> Signal:
     """Change the mean signal of the defects; an excess takes part in the shot noise that follows, and no charge falls below zero."""
     p = params
-    if p.none:
+    known = stream.known_unit("pixels")
+    if known is None and p.none:
         return signal
     data = signal.data.copy()
-    if any(p.shares.values()):
+    if known is not None:
+        data = _of_unit(known, data, signal, stream)
+    elif any(p.shares.values()):
         lot = stream.uniform_fixed(signal.grid)
         for kind, (low, high) in _bands(p).items():
             if low == high:
@@ -84,15 +87,29 @@ def forward(params: Defects, signal: Signal, stream: Stream) -> Signal:
     return signal.with_data(data)
 
 
+def _of_unit(pixels: np.ndarray, data: np.ndarray, signal: Signal, stream: Stream) -> np.ndarray:
+    """Change the defects of a measured unit: one row each with row, column, response, dark excess and temporal noise in electrons."""
+    row0, col0, (rows, cols) = signal.grid.row0, signal.grid.col0, signal.grid.shape
+    r, c = pixels[:, 0].astype(int) - row0[:, None], pixels[:, 1].astype(int) - col0[:, None]
+    i, k = np.nonzero((r >= 0) & (r < rows) & (c >= 0) & (c < cols))
+    if len(i):
+        r, c = r[i, k], c[i, k]
+        single = Grid(signal.grid.frame[i], row0[i] + r, col0[i] + c, (1, 1))
+        response, excess_e, noise_e = pixels[k, 2:5].astype(np.float32).T
+        data[i, r, c] = np.maximum(data[i, r, c] * response + excess_e + noise_e * stream.normal(single)[:, 0, 0], 0)
+    return data
+
+
 def truth(params: Defects, signal: Signal, stream: Stream) -> Mapping[str, np.ndarray]:
-    """Masks of the unit, by kind; ``listed`` are those given."""
+    """Masks of the unit, by kind; ``listed`` are those given, or those that were measured in this unit."""
     one = signal.take(np.array([0]))
     lot = stream.uniform_fixed(one.grid)[0]
-    masks = {kind: (lot >= low) & (lot < high) for kind, (low, high) in _bands(params).items()}
+    known = stream.known_unit("pixels")
+    masks = {kind: (lot >= low) & (lot < high) & (known is None) for kind, (low, high) in _bands(params).items()}
     masks["column"] = np.broadcast_to(_columns(params, one.grid, stream)[0], lot.shape).copy()
     masks["cluster"] = _clusters(params, one.grid, stream)[0]
     masks["listed"] = np.zeros(lot.shape, bool)
-    for row, col, _, _ in params.listed:
+    for row, col in [*(entry[:2] for entry in params.listed), *([] if known is None else known[:, :2].astype(int).tolist())]:
         masks["listed"] |= (one.rows[0] == row)[:, None] & (one.cols[0] == col)
     return masks
 

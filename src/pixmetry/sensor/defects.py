@@ -16,6 +16,9 @@ PHASES = 6  # places within the pixel at which a defect is tried
 NODES = 7  # of the Gauss–Hermite quadrature over the logarithm of the excess
 NEIGHBOURS = [(dr, dc) for dr in (-1, 0, 1) for dc in (-1, 0, 1) if (dr, dc) != (0, 0)]
 
+# what describes the single pixels that are drawn, and not those of a measured unit
+DRAWN = tuple(name for name in Defects.model_fields if not name.startswith(("column", "cluster", "listed")))
+
 
 def correct(params: Defects, signal: Signal, maps: Mapping[str, np.ndarray]) -> Signal:
     """Replace every pixel that is set in the map ``defects`` by the median of its good neighbours (of eight) in the window."""
@@ -149,6 +152,7 @@ SOURCE = Source(
     neutral=Defects(),
     typical=Defects(hot_fraction=2e-4, dead_fraction=2e-5),
     bound=Defects(hot_fraction=1e-3, dead_fraction=1e-4, cold_fraction=1e-4, gain_fraction=5e-4, noisy_fraction=5e-4),
+    maps={"pixels": DRAWN},
     forward=forward,
     truth=truth,
     measure=measure,

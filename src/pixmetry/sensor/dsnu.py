@@ -26,7 +26,10 @@ class Dsnu(Parameters):
 
 
 def forward(params: Dsnu, signal: Signal, stream: Stream) -> Signal:
-    """Add each pixel's offset, and that of its row and column."""
+    """Add each pixel's offset, and that of its row and column; of a measured unit its map ``offset_e``."""
+    known = stream.known_fixed("offset_e", signal.grid)
+    if known is not None:
+        return signal.with_data(signal.data + known)
     data = stream.add_normal_fixed(signal.data, signal.grid, params.pixel_std_e)
     if params.row_std_e:
         data += np.float32(params.row_std_e) * stream.normal_rows_fixed(signal.grid)[:, :, None]
@@ -94,6 +97,7 @@ SOURCE = Source(
     neutral=Dsnu(),
     typical=Dsnu(pixel_std_e=3.0, row_std_e=0.5, col_std_e=0.5),
     bound=Dsnu(pixel_std_e=15.0, row_std_e=3.0, col_std_e=3.0),
+    maps={"offset_e": ("pixel_std_e", "row_std_e", "col_std_e")},
     forward=forward,
     truth=truth,
     measure=measure,

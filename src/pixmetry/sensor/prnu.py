@@ -24,7 +24,13 @@ class Prnu(Parameters):
 
 
 def response(params: Prnu, grid: Grid, stream: Stream) -> np.ndarray:
-    """Relative response of every pixel, shape (n, rows, cols), float32: 1 + pixel + row + column part, cut off at 0."""
+    """Relative response of every pixel, shape (n, rows, cols), float32: 1 + pixel + row + column part, cut off at 0.
+
+    Of a measured unit it is 1 + its map ``response_dev_rel``.
+    """
+    known = stream.known_fixed("response_dev_rel", grid)
+    if known is not None:
+        return np.maximum(1 + known, 0)
     gain = stream.add_normal_fixed(np.ones(grid.size, np.float32), grid, params.pixel_std_rel)
     if params.row_std_rel:
         gain += np.float32(params.row_std_rel) * stream.normal_rows_fixed(grid)[:, :, None]
@@ -91,6 +97,7 @@ SOURCE = Source(
     neutral=Prnu(),
     typical=Prnu(pixel_std_rel=0.01, row_std_rel=0.002, col_std_rel=0.002),
     bound=Prnu(pixel_std_rel=0.02, row_std_rel=0.004, col_std_rel=0.004),
+    maps={"response_dev_rel": ("pixel_std_rel", "row_std_rel", "col_std_rel")},
     forward=forward,
     truth=truth,
     measure=measure,
