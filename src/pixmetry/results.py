@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from pixmetry.budget.budget import Budget
+from pixmetry.budget.headline import SUM
 from pixmetry.campaign import Campaign
 from pixmetry.core.camera import Camera
 from pixmetry.core.estimates import Estimates
@@ -108,9 +109,14 @@ class Assessment:
             after = f" as it is, and {texts[0][1]} px once a calibration has taken up what is constant or smooth over the frame (k = 1)"
             mean = f"{texts[1][0]} and {texts[1][1]} px"
         return (
-            f"a coordinate of one target in one frame is worth {texts[0][0]} px{size}{after}; the mean of {many.frames} frames {mean}. "
+            f"a coordinate of one target in one frame is worth {texts[0][0]} px{size}{after}; the mean of {many.frames} frames {mean}. {self._by()}"
             f"{budget.target.describe()}; {budget.estimator.describe()}."
         )
+
+    def _by(self) -> str:
+        """Where the verdict is from, if it is not the sum of what is listed."""
+        found = self.budget.headline
+        return "" if found is None or found.by == SUM else f"{found.why} "
 
     def maps(self) -> dict[str, np.ndarray]:
         """Return what was measured pixel by pixel: ``dark_dn`` above black, ``prnu_rel``, ``defects``."""

@@ -79,7 +79,7 @@ def budget(pitch_um: float | None = PITCH_UM) -> Budget:
         title = get_source(source_id).title
         rows.append(BudgetRow(source_id, source_id, title, status, c, 0.1 * c.total_px, simulated, 0.25, 0.5 * c.total_px, "a reason"))
     rows.append(BudgetRow("cable.termination", "cable.termination", "Cable", "not applicable", reason="only in a camera that is analogue"))
-    rows.sort(key=lambda r: -r.total_px)
+    rows.sort(key=lambda r: (r.status == "accepted", -r.total_px))
     decided = [r.contribution for r in rows if r.status in ("measured", "modelled")]
     everything = [r.contribution for r in rows if r.contribution is not None]
     one, every = (tuple(combine(c, frames=n) for n in (1, 4, 16, 64)) for c in (decided, everything))

@@ -12,6 +12,7 @@ from pixmetry.budget.combine import Combined
 from pixmetry.core.catalogue import get_source
 
 MOST = 5
+MOST_ACCEPTED = 3
 
 
 @dataclass(frozen=True)
@@ -33,13 +34,17 @@ class Advice:
     halved_px: float
 
 
-def advise(rows: Sequence[Any], verdict: Combined, everything: Combined, most: int = MOST) -> tuple[Advice, ...]:
-    """Advice for the largest of the rows that a combined total rests on.
+def advise(
+    rows: Sequence[Any], verdict: Combined, everything: Combined, most: int = MOST, most_accepted: int = MOST_ACCEPTED
+) -> tuple[Advice, ...]:
+    """Advice for the largest of the rows that the verdict rests on; after them, what to measure of those that were only accepted.
 
     The gain is told within the total that the row belongs to: for an accepted source, the one with everything accepted at its bound.
     """
-    chosen = sorted((r for r in rows if r.contribution is not None and r.total_px > 0), key=lambda r: -r.total_px)
-    return tuple(_advice(r, (everything if r.status == "accepted" else verdict).total_px) for r in chosen[:most])
+    there = sorted((r for r in rows if r.contribution is not None and r.total_px > 0), key=lambda r: -r.total_px)
+    known = [r for r in there if r.status != "accepted"][:most]
+    accepted = [r for r in there if r.status == "accepted"][:most_accepted]
+    return (*(_advice(r, verdict.total_px) for r in known), *(_advice(r, everything.total_px) for r in accepted))
 
 
 def _advice(row: Any, combined_px: float) -> Advice:

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from pixmetry.budget.advice import Advice, advise
-from pixmetry.budget.combine import Combined, combine
+from pixmetry.budget.combine import Combined, combine, together_with
+from pixmetry.budget.headline import Headline, headline
 from pixmetry.budget.monte_carlo import MonteCarlo, Trials
 from pixmetry.budget.parameters import applies, base_of, u_of_total, with_estimates
 from pixmetry.budget.probe import Facts, Target, facts_of, make_probe, resolve
@@ -105,10 +106,13 @@ class Interaction:
 
 @dataclass(frozen=True)
 class Budget:
-    """All rows, largest first, and what they come to.
+    """All rows and what they come to.
 
-    ``verdicts`` combines what is measured and modelled, for one frame and for means over several; ``with_accepted`` adds everything that
-    was accepted, at its bound. Totals are k = 1, as the camera is and (``calibrated_px``) as a calibration leaves it.
+    The rows come in one order for all who show them: what is measured, modelled or calibrated, largest first; then what was accepted,
+    largest bound first; then what does not count. ``verdicts`` are for what is measured and modelled, for one frame and for means over
+    several, by the sum of the contributions or by Monte Carlo as ``headline`` says; ``with_accepted`` adds everything that was accepted,
+    at its bound. ``sums`` are always the analytic ones. Totals are k = 1, as the camera is and (``calibrated_px``) as a calibration
+    leaves it.
     """
 
     camera: str
@@ -121,6 +125,8 @@ class Budget:
     with_accepted: tuple[Combined, ...]
     advice: tuple[Advice, ...]
     interaction: Interaction | None = None
+    headline: Headline | None = None
+    sums: tuple[Combined, ...] = ()
 
     @property
     def verdict(self) -> Combined:
@@ -130,6 +136,16 @@ class Budget:
     def of_status(self, *status: str) -> tuple[BudgetRow, ...]:
         """The rows of a status, largest first."""
         return tuple(r for r in self.rows if r.status in status)
+
+    @property
+    def largest(self) -> tuple[BudgetRow, ...]:
+        """What the verdict rests on, largest first."""
+        return tuple(r for r in self.of_status(*DECIDED) if r.total_px > 0)
+
+    @property
+    def accepted(self) -> tuple[BudgetRow, ...]:
+        """What was accepted and counts, largest bound first."""
+        return tuple(r for r in self.of_status("accepted") if r.total_px > 0)
 
     def um(self, combined: Combined) -> tuple[float, float] | None:
         """Totals in x and y in µm on the sensor, if the pitch is known."""
@@ -149,6 +165,8 @@ class Budget:
             "rows": [_row_record(r) for r in self.rows],
             "verdicts": [_combined_record(self, c) for c in self.verdicts],
             "with_accepted": [_combined_record(self, c) for c in self.with_accepted],
+            "sums": [_combined_record(self, c) for c in self.sums],
+            "headline": None if self.headline is None else _finite(asdict(self.headline)),
             "advice": [asdict(a) for a in self.advice],
             "interaction": None
             if self.interaction is None
@@ -227,13 +245,18 @@ def compute_budget(
             rows.append(_calibrated(name, source, geometry))
         else:
             rows.append(_row(name, source, camera, estimates_by_source.get(name), name in accepted, probe, whole))
-    interaction = None
+    interaction = design = None
     if trials:
         design = Trials(camera, target, estimator, facts, trials, units, seed=seed)
         rows = [_simulated(row, design, camera, say) for row in rows]
         say("all sources together")
         interaction = _interaction(rows, design)
-    rows, verdicts, everything = _combined(rows, frames)
+    decided = [r for r in rows if r.status in DECIDED and r.contribution is not None]
+    together, unsteady = (None, 0.0) if interaction is None else (interaction.together, interaction.unsteady_px)
+    found, verdicts = headline(decided, together, frames, lambda name: design.of(off=[name]), unsteady)
+    accepted_rows = [r.contribution for r in rows if r.status == "accepted" and r.contribution is not None]
+    everything = tuple(together_with(v, combine(accepted_rows, frames=v.frames)) for v in verdicts)
+    rows = _ranked(rows, decided, verdicts[0], everything[0])
     return Budget(
         camera.name,
         target,
@@ -245,6 +268,8 @@ def compute_budget(
         everything,
         advise(rows, verdicts[0], everything[0]),
         interaction,
+        found,
+        tuple(combine([r.contribution for r in decided], frames=n) for n in frames),
     )
 
 
@@ -329,20 +354,26 @@ def _interaction(rows: Sequence[BudgetRow], design: Trials) -> Interaction:
     return Interaction(design.of(), total, error, unsteady)
 
 
-def _combined(rows: Sequence[BudgetRow], frames: Sequence[int]) -> tuple[list[BudgetRow], tuple[Combined, ...], tuple[Combined, ...]]:
-    """Combine, give each row its share and what is left without it, and sort by size."""
-    groups = {"decided": DECIDED, "all": (*DECIDED, "accepted")}
-    there = {k: [r for r in rows if r.status in s and r.contribution is not None] for k, s in groups.items()}
-    results = {k: tuple(combine([r.contribution for r in v], frames=n) for n in frames) for k, v in there.items()}
+def _ranked(rows: Sequence[BudgetRow], decided: Sequence[BudgetRow], verdict: Combined, everything: Combined) -> list[BudgetRow]:
+    """Give each row its share and what is left without it, and put all in the order of `Budget.rows`.
+
+    The share of a decided row is that of the square of the sum of all of these; that of an accepted one of the square of the total with
+    everything accepted. Without a row, the total is less by its share.
+    """
+    whole2 = combine([r.contribution for r in decided]).total_px ** 2
     done = []
     for row in rows:
-        group = "decided" if row.status in DECIDED else "all"
-        if row.contribution is not None and row.status in groups["all"]:
-            rest = combine([r.contribution for r in there[group] if r is not row], frames=frames[0]).total_px
-            whole = results[group][0].total_px
-            row = replace(row, share=1 - (rest / whole) ** 2 if whole else 0.0, without_px=rest)
+        if row.contribution is not None and row.status in (*DECIDED, "accepted"):
+            known = row.status in DECIDED
+            base2, total = (whole2, verdict.total_px) if known else (everything.total_px**2, everything.total_px)
+            share = min(row.total_px**2 / base2, 1.0) if base2 else 0.0
+            row = replace(row, share=share, without_px=total * float(np.sqrt(1 - share)))
         done.append(row)
-    return sorted(done, key=lambda r: -r.total_px), results["decided"], results["all"]
+
+    def place(row: BudgetRow) -> int:
+        return 0 if row.status in DECIDED else 1 if row.status == "accepted" else 2
+
+    return sorted(done, key=lambda r: (place(r), -r.total_px))
 
 
 def _row_record(row: BudgetRow) -> dict[str, Any]:
@@ -360,6 +391,10 @@ def _monte_carlo_record(result: MonteCarlo) -> dict[str, Any]:
     record = asdict(result) | totals | {"names": list(result.names)}
     for axis in ("x", "y"):
         record[axis] = {k: (v if np.isfinite(v) else None) for k, v in record[axis].items()}
+    return _finite(record)
+
+
+def _finite(record: dict[str, Any]) -> dict[str, Any]:
     return {k: (None if isinstance(v, float) and not np.isfinite(v) else v) for k, v in record.items()}
 
 

@@ -74,3 +74,10 @@ def combine(contributions: Iterable[Contribution], frames: int = 1, targets: int
             squares += [left + smooth, bias, left]
     u_x, u_y, bias_x, bias_y, left_x, left_y = np.sqrt(squares).ravel().tolist()
     return Combined(u_x, u_y, bias_x, bias_y, left_x, left_y, frames, targets)
+
+
+def together_with(one: Combined, other: Combined) -> Combined:
+    """Two independent parts of one total, for the same number of frames and targets, added as squares."""
+    names = ("u_x_px", "u_y_px", "bias_x_px", "bias_y_px", "left_x_px", "left_y_px")
+    parts = {name: float(np.hypot(getattr(one, name), getattr(other, name))) for name in names}
+    return Combined(**parts, frames=one.frames, targets=one.targets)

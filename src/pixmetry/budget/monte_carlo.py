@@ -156,6 +156,8 @@ class Trials:
             exposure_s=self.facts.exposure_s,
             temperature_c=self.facts.temperature_c,
         )
+        if windows.dtype.kind == "f":  # without a converter in the chain the scale has an end all the same
+            windows = np.minimum(windows, np.float32(self.facts.saturation_dn))
         found = self._as_seen(camera).locate(windows)
         parts = zip(found, (col0, row0), belongs, _layout(camera), strict=True)
         dx, dy = (((hat + first - at) / step).reshape(self.places, self.frames) for hat, first, at, (_, step) in parts)

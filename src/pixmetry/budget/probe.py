@@ -223,6 +223,7 @@ def make_probe(facts: Facts, target: Target, estimator: Estimator, phases: int =
         bits=facts.bits,
         frame_shape=facts.frame_shape,
         locate=estimator.locate,
+        saturation_dn=facts.saturation_dn,
     )
 
 

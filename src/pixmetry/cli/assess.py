@@ -10,6 +10,8 @@ import click
 if TYPE_CHECKING:
     from pixmetry.results import Assessment
 
+LISTED = 8  # contributions that the console names
+
 
 @click.command()
 @click.argument("campaign", required=False, type=click.Path(path_type=Path))
@@ -56,8 +58,6 @@ def print_summary(assessment: Assessment) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from pixmetry.budget.budget import DECIDED
-
     console = Console(width=110, highlight=False)
     console.print(f"\n[bold]{assessment.campaign.camera.name}[/bold]: {assessment.verdict_text()}\n")
     table = Table(
@@ -65,7 +65,7 @@ def print_summary(assessment: Assessment) -> None:
     )
     for name in ("source", "status", "class", "u in x", "u in y", "constant", "share", "calibrated"):
         table.add_column(name, justify="left" if name in ("source", "status", "class") else "right")
-    for row in [r for r in assessment.budget.of_status(*DECIDED) if r.contribution is not None][:8]:
+    for row in assessment.budget.largest[:LISTED]:
         c = row.contribution
         constant = max(abs(c.bias_x_px), abs(c.bias_y_px))
         numbers = (f"{v:.5f}" for v in (c.u_x_px, c.u_y_px, constant))
@@ -73,8 +73,9 @@ def print_summary(assessment: Assessment) -> None:
     console.print(table)
     console.print("constant: the same all over the frame. calibrated: what a calibration leaves of it (rms of x and y).")
     worst = assessment.budget.with_accepted[0].total_px
-    accepted = [r.title for r in assessment.budget.of_status("accepted") if r.contribution is not None and r.total_px > 0]
-    console.print(f"\nAccepted, not measured: {', '.join(accepted)}; all of them at the catalogue's bound: {worst:.2g} px.")
+    accepted = [r.title for r in assessment.budget.accepted]
+    if accepted:
+        console.print(f"\nAccepted, not measured: {', '.join(accepted)}; with all of them at the catalogue's bound: {worst:.2g} px.")
     together = assessment.budget.interaction
     if together is not None:
         at_once = together.together

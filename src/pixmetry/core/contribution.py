@@ -33,6 +33,9 @@ class Contribution:
 
     ``time_px`` and ``smooth_px`` are the parts of ``u`` in x and y that change in time and smoothly over the frame; by default all of it,
     or nothing, as the class says: T, Tr, D and O change in time, G is smooth, F neither.
+
+    ``kurtosis`` is the fourth moment of the shift over the square of the second: 3 of a normal distribution, hundreds of a shift that few
+    targets have.
     """
 
     u_x_px: float
@@ -45,6 +48,7 @@ class Contribution:
     method: str = ""
     time_px: tuple[float, float] | None = None
     smooth_px: tuple[float, float] | None = None
+    kurtosis: float = 3.0
 
     def __post_init__(self) -> None:
         smooth = self.smooth_px
@@ -127,6 +131,8 @@ class Probe:
     frame_shape : (int, int)
     locate : callable, optional
         The estimator itself, (p, rows, cols) DN to x and y in window coordinates, for changes that are too large for its gradient.
+    saturation_dn : float
+        Where the scale ends, above black: no pixel is seen brighter.
     """
 
     signal_dn: np.ndarray
@@ -143,6 +149,7 @@ class Probe:
     bits: int
     frame_shape: tuple[int, int]
     locate: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]] | None = None
+    saturation_dn: float = float("inf")
 
     def white(self, sigma_dn: np.ndarray | float) -> tuple[float, float]:
         """u_x, u_y from independent errors of standard deviation ``sigma_dn`` (scalar or per pixel) in every pixel."""

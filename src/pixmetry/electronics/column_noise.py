@@ -93,7 +93,7 @@ SOURCE = Source(
     references=("EMVA 1288 R4.0 Linear, §8.2 (row and column split)",),
     advice="Subtract each column's mean over optically black rows of the same frame; renew dark frames often.",
     reasons={
-        "measure": "what is new in every frame electronics.row_noise measures; later: a slow part needs dark stacks taken hours apart",
+        "measure": "what is new in every frame electronics.row_noise measures; a slow part needs dark stacks taken hours apart",
         "correct": "needs optically black rows above the picture, which give each column's offset",
     },
 )

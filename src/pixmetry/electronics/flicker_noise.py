@@ -102,7 +102,7 @@ SOURCE = Source(
     ),
     advice="Use correlated double sampling with a short interval; clamp every row on its optically black pixels.",
     reasons={
-        "measure": "later: needs the spectrum of dark rows along the read-out; the photon transfer holds it as white and row noise",
+        "measure": "not measured: needs the spectrum of dark rows along the read-out; the photon transfer holds it as white and row noise",
         "correct": "noise cannot be undone; the part common to a row goes with optically black columns",
     },
 )

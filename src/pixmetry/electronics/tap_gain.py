@@ -115,5 +115,5 @@ SOURCE = Source(
     typical_size="(D/3π) Δg = 0.74 px · Δg for a border through a disc of 7 px: 0.007 px for 1 %",
     references=("ISO 14524:2009 (opto-electronic conversion function)", "EMVA 1288 R4.0 Linear, §8.2 (column split)"),
     advice="Balance the taps with a flat field: a gain for each tap, by the means of the columns on either side of the border.",
-    reasons={"measure": "later: needs the column means of a bright stack beside each border; the PRNU holds the stripes meanwhile"},
+    reasons={"measure": "not measured: needs the column means of a bright stack beside each border; the PRNU holds the stripes"},
 )

@@ -125,7 +125,7 @@ SOURCE = Source(
     ),
     advice="Mask the pixels whose temporal histogram has two or three peaks, or weight them by their own variance.",
     reasons={
-        "measure": "later: needs the kurtosis in time of each pixel of a dark stack of a hundred frames or more",
+        "measure": "not measured: needs the kurtosis in time of each pixel of a dark stack of a hundred frames or more",
         "correct": "the state of a trap in one frame is not known; mask the pixel",
     },
 )

@@ -72,7 +72,7 @@ SOURCE = Source(
     references=("ISO 19084:2015 (chromatic displacement)",),
     advice="Calibrate and measure under the same narrow-band light.",
     reasons={
-        "measure": "later: needs a test field under two kinds of light",
+        "measure": "not measured: needs a test field under two kinds of light",
         "correct": "a frame is not resampled: positions are corrected instead",
     },
 )

@@ -57,8 +57,8 @@ SOURCE = Source(
     references=("J. E. Greivenkamp, Color dependent optical prefilter, Applied Optics 29 (1990) 676–684", "ISO 12233:2023 (SFR)"),
     advice="Fit one, defocus slightly, or stop down, if targets are sharper than about 0.5 px and less than 3 px wide.",
     reasons={
-        "measure": "later: needs the slanted-edge experiment (the zero of the cosine at 1/(2 d))",
+        "measure": "not measured: needs the slanted-edge experiment (the zero of the cosine at 1/(2 d))",
         "correct": "a symmetric spread moves no centre; frames are not deconvolved",
-        "propagate": "later: it only changes how much a target is undersampled, which needs its spread before the plate",
+        "propagate": "it only changes how much a target is undersampled, which needs its spread before the plate",
     },
 )

@@ -139,8 +139,8 @@ SOURCE = Source(
     ),
     advice="Stop down until λN is at least the pixel pitch, or defocus slightly, if targets are only a few pixels wide.",
     reasons={
-        "measure": "later: needs the slanted-edge experiment",
+        "measure": "not measured: needs the slanted-edge experiment",
         "correct": "frames are not deconvolved; a symmetric spread moves no centre",
-        "propagate": "later: it decides how much a target is undersampled, which needs the target before the spread",
+        "propagate": "it decides how much a target is undersampled, which needs the target before the spread",
     },
 )

@@ -104,7 +104,7 @@ SOURCE = Source(
     references=("EMVA 1288 R4.0 Linear, §9 (spectral sensitivity)", "M. A. Green, Solar Energy Mat. & Solar Cells 92 (2008) 1305–1310"),
     advice="Match the filter's band to the light, and focus the lens with the filter in place.",
     reasons={
-        "measure": "later: needs exposures with and without the filter, and the slanted-edge experiment for the focus",
+        "measure": "not measured: needs exposures with and without the filter, and the slanted-edge experiment for the focus",
         "correct": "lost light is not brought back by arithmetic",
         "propagate": "it has no shift of its own: less light enters through the shot noise, a wider spread through the sampling",
     },

@@ -86,7 +86,7 @@ SOURCE = Source(
     references=("EMVA 1288 R4.0 Linear, §2.2 (quantisation, step²/12)", "GenICam PFNC 2.4 (Mono8, Mono12)"),
     advice="Take the raw 10 or 12 bits; else keep the steps below the noise.",
     reasons={
-        "measure": "later: needs the gaps of a code histogram over an even spread of levels",
+        "measure": "not measured: needs the gaps of a code histogram over an even spread of levels",
         "correct": "what rounding merged cannot be told apart",
     },
 )

@@ -67,8 +67,8 @@ SOURCE = Source(
     references=("EMVA 1288 R4.0 Linear, §8.5 (defect pixels)",),
     advice="Switch it off, or have only listed defects replaced; use targets of 3 px or more.",
     reasons={
-        "measure": "later: needs the count of single outliers against the normal law of the noise, which such a correction cuts off",
+        "measure": "not measured: needs the count of single outliers against the normal law of the noise, which such a correction cuts off",
         "correct": "what was replaced is lost",
-        "propagate": "which pixels stand out hangs on the noise: later, by simulation with the noise of the camera",
+        "propagate": "which pixels stand out hangs on the noise: only a simulation with the noise of the camera tells",
     },
 )

@@ -137,7 +137,7 @@ SOURCE = Source(
     ),
     advice="Store the raw mosaic, balance its colours and locate targets there; use targets of 7 px or more.",
     reasons={
-        "measure": "later: needs the spectra of noise by place in the pattern; the method stands in the camera's manual",
+        "measure": "not measured: needs the spectra of noise by place in the pattern; the method stands in the camera's manual",
         "correct": "the mosaic that was interpolated is lost but for the places of the colour that is put out",
     },
 )

@@ -75,8 +75,8 @@ SOURCE = Source(
     ),
     advice="Switch it off; average frames instead.",
     reasons={
-        "measure": "later: needs the correlation of the noise of neighbours, and the response to an edge at two contrasts",
+        "measure": "not measured: needs the correlation of the noise of neighbours, and the response to an edge at two contrasts",
         "correct": "medians and weights that depend on the grey values have no inverse",
-        "propagate": "what it does to an edge depends on the noise on it: later, by simulation with the noise of the camera",
+        "propagate": "what it does to an edge depends on the noise on it: only a simulation with the noise of the camera tells",
     },
 )

@@ -85,7 +85,7 @@ SOURCE = Source(
     references=("R. C. Gonzalez, R. E. Woods, Digital Image Processing, 4th ed., Pearson 2018, §3.6 (unsharp masking)", "ISO 12233:2023"),
     advice="Switch it off.",
     reasons={
-        "measure": "later: needs the slanted edge's response above 1 and the correlation of the noise of neighbours",
+        "measure": "not measured: needs the slanted edge's response above 1 and the correlation of the noise of neighbours",
         "correct": "codes that were cut off at the ends of the range are lost; the rest needs a deconvolution that amplifies no noise",
     },
 )

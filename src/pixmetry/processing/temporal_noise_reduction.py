@@ -60,7 +60,7 @@ SOURCE = Source(
     references=("A. V. Oppenheim, R. W. Schafer, Discrete-Time Signal Processing, Pearson 2010, §5.1 (group delay of a recursive filter)",),
     advice="Switch it off; average frames afterwards, where the motion is known.",
     reasons={
-        "measure": "later: needs the correlation of the noise of successive frames of a steady scene: it is α",
+        "measure": "not measured: needs the correlation of the noise of successive frames of a steady scene: it is α",
         "propagate": "a target at rest does not move, and the shift of a moving one, v α/(1 − α) T_f, hangs on a motion no probe knows",
         "correct": "x = (y − α y_before)/(1 − α) needs the whole sequence without a gap",
     },

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from typing import Any
@@ -11,6 +11,7 @@ import numpy as np
 
 from pixmetry.budget.budget import DECIDED, Budget, BudgetRow
 from pixmetry.budget.combine import Combined
+from pixmetry.budget.headline import SUM
 from pixmetry.budget.monte_carlo import MonteCarlo
 from pixmetry.budget.probe import PHASES
 from pixmetry.core.catalogue import STAGES, get_source
@@ -57,15 +58,17 @@ class Verdict:
     estimator: str
     places: str
     ladder: list[dict[str, Any]]
+    why: str = ""
 
 
 def budget_content(budget: Budget, unmeasured: Mapping[str, str]) -> dict[str, Any]:
     """Everything that the page says of the budget."""
-    top, longest_px = _top(budget)
+    top, accepted, longest_px = _top(budget)
     return {
         "verdict": _verdict(budget),
         "pitch_known": budget.pitch_um is not None,
         "top": top,
+        "accepted": accepted,
         "scale": _text(longest_px, budget.pitch_um),
         "sources": _sources(budget, unmeasured),
         "mc_note": _monte_carlo_note(budget),
@@ -94,10 +97,6 @@ def _left(combined: Combined, pitch_um: tuple[float, float] | None) -> list[Leng
     return [_length(combined.left_x_px, pitch_um, "x"), _length(combined.left_y_px, pitch_um, "y")]
 
 
-def _there(budget: Budget, *status: str) -> list[BudgetRow]:
-    return [r for r in budget.of_status(*status) if r.contribution is not None]
-
-
 def _verdict(budget: Budget) -> Verdict:
     pitch = budget.pitch_um
     ladder = [
@@ -109,17 +108,18 @@ def _verdict(budget: Budget) -> Verdict:
         calibrated=_left(budget.verdict, pitch),
         second=_both(budget.with_accepted[0], pitch),
         second_calibrated=_left(budget.with_accepted[0], pitch),
-        shares=_shares(_there(budget, *DECIDED)),
-        accepted=_accepted(_there(budget, "accepted")),
+        shares=_shares(budget.largest),
+        accepted=_accepted(budget.accepted),
         target=budget.target.describe(),
         estimator=budget.estimator.describe(),
         places=f"Averaged over {PHASES} × {PHASES} places of the target within a pixel.",
         ladder=ladder,
+        why="" if budget.headline is None else budget.headline.why,
     )
 
 
-def _shares(rows: list[BudgetRow]) -> str:
-    """How the square of the verdict divides into what changes in time, from place to place, smoothly, not at all, and what drifts."""
+def _shares(rows: Sequence[BudgetRow]) -> str:
+    """How the square of the sum divides into what changes in time, from place to place, smoothly, not at all, and what drifts."""
     parts = np.zeros(5)
     for row in rows:
         c = row.contribution
@@ -133,14 +133,13 @@ def _shares(rows: list[BudgetRow]) -> str:
     random, place, smooth, constant, drift = (percent(v) for v in parts / parts.sum())
     drifting = f"; {drift} % drifts or belongs to the object, and the next image has it otherwise" if parts[4] else ""
     return (
-        f"Of the square of the first numbers, {random} % is random in time and falls with more frames; {place} % is fixed in the camera "
+        f"Of the square of the sum, {random} % is random in time and falls with more frames; {place} % is fixed in the camera "
         f"and changes from place to place; {smooth} % changes smoothly over the frame and {constant} % is the same everywhere, which a "
         f"calibration takes up{drifting}."
     )
 
 
-def _accepted(rows: list[BudgetRow]) -> str:
-    rows = [r for r in rows if r.total_px > 0]
+def _accepted(rows: Sequence[BudgetRow]) -> str:
     if not rows:
         return "Nothing was left to be accepted."
     names = ", ".join(r.title.lower() if not r.title[:2].isupper() else r.title for r in rows[:NAMED])
@@ -148,29 +147,30 @@ def _accepted(rows: list[BudgetRow]) -> str:
     return f"That adds the largest that is to be expected of a sound camera for {len(rows)} source{'s' * (len(rows) > 1)}: {names}{more}."
 
 
-def _top(budget: Budget) -> tuple[list[dict[str, Any]], float]:
-    """The largest contributions with their advice, and the length in px that the longest bar stands for."""
+def _top(budget: Budget) -> tuple[list[dict[str, Any]], list[dict[str, Any]], float]:
+    """The largest contributions, and the largest of what was accepted, with their advice; and the px that the longest bar stands for."""
     rows = {r.name: r for r in budget.rows}
     chosen = [(a, rows[a.name]) for a in budget.advice]
-    longest = max((abs(v) for _, r in chosen for v in _components(r)), default=0.0)
-    entries = []
+    longest = max((abs(v) for _, r in chosen if r.status != "accepted" for v in _components(r)), default=0.0)
+    entries: dict[bool, list[dict[str, Any]]] = {True: [], False: []}
     for advice, row in chosen:
         c = row.contribution
         assert c is not None
-        status = "accepted at its bound" if row.status == "accepted" else row.status
-        entries.append(
+        accepted = row.status == "accepted"
+        entries[accepted].append(
             {
                 "title": row.title,
-                "chip": f"class {c.gum_class}: {CLASSES[c.gum_class]} · {status}",
+                "chip": f"class {c.gum_class}: {CLASSES[c.gum_class]} · {'accepted at its bound' if accepted else row.status}",
                 "bars": [
                     _bar("x", c.u_x_px, c.bias_x_px, longest, budget.pitch_um),
                     _bar("y", c.u_y_px, c.bias_y_px, longest, budget.pitch_um),
                 ],
+                "size": _text(row.total_px, budget.pitch_um),
                 "advice": advice.text,
                 "gain": _gain(advice),
             }
         )
-    return entries, longest
+    return entries[False], entries[True], longest
 
 
 def _components(row: BudgetRow) -> tuple[float, ...]:
@@ -211,7 +211,7 @@ def _sources(budget: Budget, unmeasured: Mapping[str, str]) -> list[tuple[str, l
     def place(row: BudgetRow) -> int:
         return STAGES.index(row.source_id.split(".")[0])
 
-    ordered = sorted(budget.rows, key=lambda r: (place(r), -r.total_px))
+    ordered = sorted(budget.rows, key=place)  # within a stage in the budget's own order
     return [(STAGES[k].capitalize(), [_source(r, unmeasured) for r in rows]) for k, rows in groupby(ordered, place)]
 
 
@@ -263,7 +263,7 @@ def _known(row: BudgetRow) -> str:
 
 
 def _sums(budget: Budget) -> list[dict[str, Any]]:
-    pitch, v = budget.pitch_um, budget.verdict
+    pitch, v = budget.pitch_um, budget.sums[0] if budget.sums else budget.verdict
 
     def row(label: str, x: float, y: float, strong: bool = False) -> dict[str, Any]:
         return {"label": label, "x": _length(x, pitch, "x"), "y": _length(y, pitch, "y"), "strong": strong}
@@ -281,7 +281,7 @@ def _sums(budget: Budget) -> list[dict[str, Any]]:
         together = [budget.interaction.together]
         rows.append(row("One Monte Carlo with all sources on", _sum_of(together, "x"), _sum_of(together, "y"), True))
     every = budget.with_accepted[0]
-    return [*rows, row("With everything accepted at its bound, analytic", every.total_x_px, every.total_y_px)]
+    return [*rows, row("The verdict, with everything accepted at its bound", every.total_x_px, every.total_y_px)]
 
 
 def _sum_of(results: list[MonteCarlo], axis: str) -> float:
@@ -290,7 +290,7 @@ def _sum_of(results: list[MonteCarlo], axis: str) -> float:
 
 def _interaction(budget: Budget) -> str:
     """Everything at once against everything alone, and whether the difference can be told from chance."""
-    found, analytic_px = budget.interaction, budget.verdict.total_px
+    found, analytic_px = budget.interaction, (budget.sums[0] if budget.sums else budget.verdict).total_px
     if found is None:
         return "No Monte Carlo was made."
     difference, se = found.difference_px, found.se_px
@@ -298,9 +298,9 @@ def _interaction(budget: Budget) -> str:
     if abs(difference) <= 2 * se:
         verdict = "which is within two standard errors: no interaction is seen, and the squares may be added"
     elif difference > 0:
-        verdict = "more than two standard errors: the sources act on each other; trust the simulation with all of them"
+        verdict = "more than two standard errors: the sources act on each other"
     else:
-        verdict = "less by more than two standard errors: the sources partly cancel, and the sum is on the safe side"
+        verdict = "less by more than two standard errors: together the sources do less than each alone"
     lost = f" In {found.together.lost} of {found.together.trials} windows no target was found." if found.together.lost else ""
 
     def px(value: float) -> str:
@@ -309,5 +309,9 @@ def _interaction(budget: Budget) -> str:
     return (
         f"All sources at once give {px(found.together.total_px)} ± {px(found.together.se_total_px)} px (rms of x and y), each alone and "
         f"added as squares {px(found.sum_px)} ± {px(found.se_sum_px)} px. The interaction is the difference, {px(difference)} "
-        f"± {px(se)} px, {verdict}. The analytic sum is {px(analytic_px)} px.{lost}"
+        f"± {px(se)} px, {verdict}. The analytic sum is {px(analytic_px)} px.{lost}{_stands(budget)}"
     )
+
+
+def _stands(budget: Budget) -> str:
+    return "" if budget.headline is None else f" The verdict is by {'the sum' if budget.headline.by == SUM else 'Monte Carlo'}."

@@ -98,5 +98,5 @@ SOURCE = Source(
     typical_size="0.01 px unbalanced on a disc of 7 px; none for a grey scene once the colours are balanced",
     references=("B. E. Bayer, US patent 3 971 065, 1976", "H. S. Malvar, L. He, R. Cutler, ICASSP 2004 (layout of the mosaic)"),
     advice="Use a monochrome sensor; else balance the colours on the raw mosaic and locate targets there, without interpolation.",
-    reasons={"measure": "later: needs the means of a grey flat field by the four places of the pattern; the PRNU holds them meanwhile"},
+    reasons={"measure": "not measured: needs the means of a grey flat field by the four places of the pattern; the PRNU holds them"},
 )

@@ -44,26 +44,30 @@ def propagate(params: Defects, probe: Probe) -> Contribution:
     The mean square shift is Σ share · shift² over pixels and kinds, the shift found by the estimator itself: a threshold is blind to a
     small error of the background, not to a hot pixel that rises above it. The excess runs over a Gauss–Hermite quadrature of its
     log-normal law (without an estimator to ask, E[e²] = m² exp(2s²) to first order), response and noise over ± one standard deviation.
-    Most targets have no defect at all and few have a large error, so u is a root mean square, not the width of a Gaussian; it counts
-    defects one by one, so the share must be small against one defect a window. Noisy and blinking pixels are counted with what is fixed;
-    columns and clusters are changed as a whole. What the user has listed is not in it: those pixels are known.
+    Most targets have no defect at all and few have a large error, so u is a root mean square, not the width of a Gaussian (the kurtosis
+    says how rare they are); it counts defects one by one, so the share must be small against one defect a window. Noisy and blinking
+    pixels are counted with what is fixed; columns and clusters are changed as a whole. No pixel is brighter than the scale's end. What
+    the user has listed is not in it: those pixels are known.
     """
     method = "mean square of the shifts by defects of single pixels, one at a time"
     if probe.locate is None:
         variance = sum(share * _mean_square_dn2(params, name, probe) for name, share in _shares(params))
         u = np.array(probe.white(np.sqrt(variance)))
-        square = np.mean([_of_groups(params, probe, phase) for phase in range(len(probe.signal_dn))], axis=0)
+        square = np.mean([_of_groups(params, probe, phase)[0] for phase in range(len(probe.signal_dn))], axis=0)
         u_x, u_y = np.sqrt(u**2 + square)
         return probe.contribution((float(u_x), float(u_y)), "F", model_error=0.05, method=method + ", first order")
     few = np.unique(np.linspace(0, len(probe.signal_dn) - 1, PHASES).round().astype(int))
-    square = np.zeros(2)
+    moments = np.zeros((2, 2))  # second and fourth; x and y
     for phase in few:
         for name, share in _shares(params):
             for weight, changed in _cases(params, name, probe.signal_dn[phase], probe.gain_dn_per_e):
-                square += share * weight * _sum_of_squares(probe, phase, changed)
-        square += _of_groups(params, probe, phase)
-    u_x, u_y = np.sqrt(square / len(few))
-    return probe.contribution((float(u_x), float(u_y)), "F", model_error=0.05, method=method)
+                moments += share * weight * _of_singles(probe, phase, changed)
+        moments += _of_groups(params, probe, phase)
+    second, fourth = moments / len(few)
+    u_x, u_y = np.sqrt(second)
+    # of a compound Poisson variable: the sum of the fourth powers is its fourth cumulant
+    kurtosis = 3.0 + float(fourth.mean() / second.mean() ** 2) if second.any() else 3.0
+    return probe.contribution((float(u_x), float(u_y)), "F", model_error=0.05, method=method, kurtosis=kurtosis)
 
 
 def _shares(params: Defects) -> list[tuple[str, float]]:
@@ -72,13 +76,13 @@ def _shares(params: Defects) -> list[tuple[str, float]]:
 
 
 def _of_groups(params: Defects, probe: Probe, phase: int) -> np.ndarray:
-    """Sum over columns and clusters of their share times the squared shift in x and y by each of them."""
+    """Sum over columns and clusters of their share times the second and fourth power of the shift in x and y by each of them."""
     base, k = probe.signal_dn[phase], probe.gain_dn_per_e
     rows, cols = base.shape
-    square = np.zeros(2)
+    moments = np.zeros((2, 2))
     if params.column_fraction:
         groups = np.repeat(np.eye(cols, dtype=bool)[:, None, :], rows, axis=1)
-        square += params.column_fraction * _squares(probe, phase, groups, params.column_gain_rel * base + k * params.column_e)
+        moments += params.column_fraction * _powers(probe, phase, groups, params.column_gain_rel * base + k * params.column_e)
     if params.cluster_fraction:
         reach = int(params.cluster_radius_px)
         centres = [(r, c) for r in range(-reach, rows + reach) for c in range(-reach, cols + reach)]
@@ -86,20 +90,20 @@ def _of_groups(params: Defects, probe: Probe, phase: int) -> np.ndarray:
         for dr, dc in disc(params.cluster_radius_px):
             groups[np.arange(len(centres)), [r + dr + 2 * reach for r, _ in centres], [c + dc + 2 * reach for _, c in centres]] = True
         inner = np.ascontiguousarray(groups[:, 2 * reach : 2 * reach + rows, 2 * reach : 2 * reach + cols])
-        square += params.cluster_fraction * _squares(probe, phase, inner, params.cluster_gain_rel * base)
-    return square
+        moments += params.cluster_fraction * _powers(probe, phase, inner, params.cluster_gain_rel * base)
+    return moments
 
 
-def _squares(probe: Probe, phase: int, groups: np.ndarray, changed_dn: np.ndarray) -> np.ndarray:
-    """Sum over groups of pixels, masks (groups, rows, cols), of the squared shift in x and y when one group has its changed values."""
-    base = probe.signal_dn[phase]
+def _powers(probe: Probe, phase: int, groups: np.ndarray, changed_dn: np.ndarray) -> np.ndarray:
+    """Sum over groups of pixels, masks (groups, rows, cols), of the second and fourth power of the shift when one has changed values."""
+    base, changed_dn = probe.signal_dn[phase], np.minimum(changed_dn, probe.saturation_dn)
     if probe.locate is None:
         error = groups * (changed_dn - base)
         shifts = np.array([(g[phase] * error).sum(axis=(1, 2)) for g in (probe.gx, probe.gy)])
     else:
         x, y = probe.locate(np.where(groups, changed_dn, base))
         shifts = np.array([x - probe.x_hat_px[phase], y - probe.y_hat_px[phase]])
-    return np.nansum(shifts**2, axis=1)  # a target that is lost with the group has no position
+    return np.nansum([shifts**2, shifts**4], axis=2)  # a target that is lost with the group has no position
 
 
 def _cases(params: Defects, name: str, signal_dn: np.ndarray, gain_dn_per_e: float) -> list[tuple[float, np.ndarray]]:
@@ -128,15 +132,15 @@ def _mean_square_dn2(params: Defects, name: str, probe: Probe) -> np.ndarray | f
     return sum(w * (v - probe.signal_dn) ** 2 for w, v in _cases(params, name, probe.signal_dn, probe.gain_dn_per_e))
 
 
-def _sum_of_squares(probe: Probe, phase: int, changed_dn: np.ndarray) -> np.ndarray:
-    """Sum over pixels of the squared shift in x and y when one pixel alone has its changed value."""
-    base = probe.signal_dn[phase]
+def _of_singles(probe: Probe, phase: int, changed_dn: np.ndarray) -> np.ndarray:
+    """Sum over pixels of the second and fourth power of the shift in x and y when one pixel alone has its changed value."""
+    base, changed_dn = probe.signal_dn[phase], np.minimum(changed_dn, probe.saturation_dn)
     at = np.flatnonzero(changed_dn != base)
     windows = np.repeat(base.reshape(1, -1), len(at), axis=0)
     windows[np.arange(len(at)), at] = changed_dn.ravel()[at]
     x, y = probe.locate(windows.reshape(-1, *base.shape))
     shifts = np.array([x - probe.x_hat_px[phase], y - probe.y_hat_px[phase]])
-    return np.nansum(shifts**2, axis=1)  # a target that is lost with its only pixel has no position
+    return np.nansum([shifts**2, shifts**4], axis=2)  # a target that is lost with its only pixel has no position
 
 
 SOURCE = Source(

@@ -108,8 +108,8 @@ SOURCE = Source(
     ),
     advice="Put an infrared-cut filter before the sensor, or light the scene with a wavelength below 650 nm.",
     reasons={
-        "measure": "later: needs the slanted-edge experiment at two wavelengths",
+        "measure": "not measured: needs the slanted-edge experiment at two wavelengths",
         "correct": "frames are not deconvolved; the outward shift is part of the calibrated distortion",
-        "propagate": "later: the spread changes how a target is sampled, which needs the target before it",
+        "propagate": "the spread changes how a target is sampled, which needs the target before it",
     },
 )

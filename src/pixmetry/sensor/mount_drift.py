@@ -92,8 +92,8 @@ SOURCE = Source(
     ),
     advice="Wait until the camera has settled; clamp the lens; calibrate in the attitude in which you measure.",
     reasons={
-        "measure": "later: needs a series of a fixed test field after switching on, and rolled images",
+        "measure": "not measured: needs a series of a fixed test field after switching on, and rolled images",
         "correct": "a frame is not resampled: positions are corrected instead, from the time or the temperature",
-        "propagate": "later: it depends on when a frame was taken, which a target's probe does not tell",
+        "propagate": "it depends on when a frame was taken, which a target's probe does not tell",
     },
 )

@@ -71,8 +71,8 @@ SOURCE = Source(
     references=("S. K. Park, R. Schowengerdt, M.-A. Kaczynski, MTF for sampled imaging systems, Applied Optics 23 (1984) 2572–2582",),
     advice="Widen the target's image to a spread of 0.6 px or more, or take a sensor with microlenses.",
     reasons={
-        "measure": "later: needs the slanted-edge experiment above half the sampling frequency, or targets moved by parts of a pixel",
+        "measure": "needs the slanted-edge experiment above half the sampling frequency, or targets moved by parts of a pixel",
         "correct": "what falls between the pixels is not recorded; shifted frames can be interleaved instead",
-        "propagate": "later: it only changes how much a target is undersampled, which needs its spread before the pixel",
+        "propagate": "it only changes how much a target is undersampled, which needs its spread before the pixel",
     },
 )

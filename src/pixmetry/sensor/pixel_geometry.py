@@ -96,7 +96,7 @@ SOURCE = Source(
     ),
     advice="Nothing, as a rule: it is far below other errors. Keep targets away from the seams of a stitched sensor.",
     reasons={
-        "measure": "later: needs very many target positions per place, from a self-calibrating bundle",
+        "measure": "not measured: needs very many target positions per place, from a self-calibrating bundle",
         "correct": "a frame is not resampled: positions are corrected instead, by a map of the residuals",
     },
 )

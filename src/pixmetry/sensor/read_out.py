@@ -126,6 +126,6 @@ SOURCE = Source(
     reasons={
         "measure": "needs an edge or targets: with rows swapped, neighbouring rows of a slanted edge lie in the wrong order",
         "correct": "rows swapped are swapped back by the same source; rows of the other field are not in the frame",
-        "propagate": "later: needs the target on the raster of the field, while a probe holds it on that of the frame",
+        "propagate": "it needs the target on the raster of the field, while a probe holds it on that of the frame",
     },
 )

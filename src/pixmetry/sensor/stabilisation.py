@@ -82,7 +82,7 @@ SOURCE = Source(
     references=("ISO 20954-1:2019 (image stabilisation performance)",),
     advice="Switch the stabilisation off, or estimate principal point and roll for every image.",
     reasons={
-        "measure": "later: needs a series of a fixed test field from a tripod",
+        "measure": "not measured: needs a series of a fixed test field from a tripod",
         "correct": "a frame is not resampled: positions are corrected instead, by the pose of each frame",
     },
 )

@@ -84,7 +84,7 @@ SOURCE = Source(
     ),
     advice="Let the camera warm up, keep its temperature, and calibrate at the temperature of the measurement.",
     reasons={
-        "measure": "later: needs a series of a fixed test field while the camera warms up",
+        "measure": "not measured: needs a series of a fixed test field while the camera warms up",
         "correct": "a frame is not resampled: positions are corrected instead, from the temperature",
     },
 )

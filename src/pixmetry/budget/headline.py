@@ -1,0 +1,134 @@
+"""Which number stands for the whole: the sum of the contributions, or one Monte Carlo with all of them, and why."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from pixmetry.budget.combine import Combined, combine
+from pixmetry.budget.monte_carlo import Axis, MonteCarlo
+
+SUM, MONTE_CARLO = "sum", "Monte Carlo"
+COVERAGE = 2.0  # standard errors beyond which sum and Monte Carlo differ
+LOST = 0.01  # share of windows without a target above which a Monte Carlo does not speak for all targets
+ASKED = 3  # sources that are tried in the whole chain to find out which one makes the difference
+MAIN_PART = 0.5  # of the difference of the squares: what one source must make of it to be named
+
+
+@dataclass(frozen=True)
+class Headline:
+    """Where the verdict is from.
+
+    Parameters
+    ----------
+    by : {"sum", "Monte Carlo"}
+    sum_px : float
+        Total of the contributions that the simulated camera holds, by their formulas, for one target in one frame.
+    simulated_px, se_simulated_px : float
+        The same by one Monte Carlo with all of them on, and its standard error; NaN without one.
+    u_sum_px : float
+        What the formulas leave open: the model errors that the contributions declare.
+    why : str
+        A sentence for the reader.
+    """
+
+    by: str
+    sum_px: float
+    simulated_px: float
+    se_simulated_px: float
+    u_sum_px: float
+    why: str
+
+
+def headline(
+    rows: Sequence[Any],
+    together: MonteCarlo | None,
+    frames: Sequence[int],
+    in_chain: Callable[[str], MonteCarlo],
+    unsteady_px: float = 0.0,
+) -> tuple[Headline, tuple[Combined, ...]]:
+    """Decide between the sum and the Monte Carlo, and combine for each number of frames.
+
+    Parameters
+    ----------
+    rows : sequence of BudgetRow
+        Those that the verdict rests on, all with a contribution.
+    together : MonteCarlo, optional
+        With all sources of the camera on.
+    frames : sequence of int
+    in_chain : callable
+        Monte Carlo of what a source of this name does in the whole chain.
+    unsteady_px : float
+        What a calibration would take up of the Monte Carlo although the next image has it otherwise (`Interaction.unsteady_px`).
+
+    Notes
+    -----
+    The sum is of first order and takes the sources for independent of each other; the Monte Carlo is neither, but it has an error of
+    chance. Where both differ by more than two of their errors together, the Monte Carlo stands. Its error is that of the mean of squares
+    over the places, Var(s²)/n = (κ − 1) s⁴/n: by the scatter that it shows, and by the kurtosis κ that a contribution declares, for an
+    error that few targets have may be missing from it altogether. What the simulated camera does not hold is added to it as squares.
+    """
+    sums = tuple(combine((r.contribution for r in rows), frames=n) for n in frames)
+    held = [r for r in rows if r.monte_carlo is not None]
+    by_formula = combine(r.contribution for r in held).total_px
+    if together is None or not held:
+        return Headline(SUM, by_formula, float("nan"), float("nan"), 0.0, "The sum of the contributions; no Monte Carlo was made."), sums
+    error, u_sum = _error(together, held), _model_error(held)
+    found = Headline(SUM, by_formula, together.total_px, error, u_sum, "")
+    difference, allowed = together.total_px - by_formula, COVERAGE * float(np.hypot(error, u_sum))
+    if not np.isfinite(together.total_px) or together.lost > LOST * together.trials:
+        why = f"The sum of the contributions: in {together.lost} of {together.trials} windows of the Monte Carlo no target was found."
+        return replace(found, why=why), sums
+    if abs(difference) <= allowed:
+        why = "The sum of the contributions; one Monte Carlo with all of them at once agrees with it within their errors."
+        return replace(found, why=why), sums
+    others = [r for r in rows if r.monte_carlo is None]
+    simulated = tuple(_simulated(together, combine((r.contribution for r in others), frames=n), unsteady_px) for n in frames)
+    return replace(found, by=MONTE_CARLO, why=_why(found, held, in_chain)), simulated
+
+
+def _error(together: MonteCarlo, rows: Sequence[Any]) -> float:
+    """Standard error of the total of a Monte Carlo, with what few targets have."""
+    places = together.units * together.places
+    squares = sum((r.contribution.total_px**2) ** 2 * (r.contribution.kurtosis - 1) for r in rows) / places
+    rare = float(np.sqrt(squares)) / (2 * together.total_px) if together.total_px > 0 else float(np.sqrt(np.sqrt(squares)))
+    return float(np.hypot(together.se_total_px, rare))
+
+
+def _model_error(rows: Sequence[Any]) -> float:
+    """Standard uncertainty of the sum from the model errors of its parts: of a half-width that the model declares, taken as k = 2."""
+    total = combine(r.contribution for r in rows).total_px
+    parts = [(max(c.model_error * c.total_px, c.floor_px) * c.total_px) ** 2 for c in (r.contribution for r in rows)]
+    return 0.5 * float(np.sqrt(sum(parts))) / total if total else 0.0
+
+
+def _simulated(together: MonteCarlo, others: Combined, unsteady_px: float) -> Combined:
+    """The mean over frames by the Monte Carlo, with what it does not hold."""
+
+    def axis(a: Axis, u_px: float, bias_px: float, left_px: float) -> tuple[float, float, float]:
+        in_time2 = a.temporal**2 / others.frames
+        left2 = max(a.left**2 - a.temporal**2, 0.0) + in_time2 + left_px**2 + unsteady_px**2
+        return float(np.sqrt(a.fixed**2 + in_time2 + u_px**2)), float(np.hypot(a.bias, bias_px)), float(np.sqrt(left2))
+
+    u_x, bias_x, left_x = axis(together.x, others.u_x_px, others.bias_x_px, others.left_x_px)
+    u_y, bias_y, left_y = axis(together.y, others.u_y_px, others.bias_y_px, others.left_y_px)
+    return Combined(u_x, u_y, bias_x, bias_y, left_x, left_y, others.frames, others.targets)
+
+
+def _why(found: Headline, rows: Sequence[Any], in_chain: Callable[[str], MonteCarlo]) -> str:
+    """Say that they differ, and by which source if it is one."""
+    more = "larger" if found.sum_px > found.simulated_px else "smaller"
+    text = (
+        f"By one Monte Carlo with all sources at once, {found.simulated_px:.2g} ± {found.se_simulated_px:.1g} px: the sum of the "
+        f"contributions, {found.sum_px:.2g} px, is {more} by more than both leave open, for sources act on each other"
+    )
+    difference = found.simulated_px**2 - found.sum_px**2
+    tried = sorted(rows, key=lambda r: -r.total_px)[:ASKED]
+    real = [(r, in_chain(r.name).total_px if r.source_id != "processing.threshold" else r.monte_carlo.total_px) for r in tried]
+    row, in_px = max(real, key=lambda p: (p[1] ** 2 - p[0].total_px ** 2) * np.sign(difference))
+    if np.isfinite(in_px) and (in_px**2 - row.total_px**2) / difference > MAIN_PART:
+        return f"{text}: {row.title.lower()} alone would be {row.total_px:.2g} px, in the whole chain it is {in_px:.2g} px."
+    return f"{text}; no single source makes most of the difference."
