@@ -109,7 +109,8 @@ class Assessment:
             after = f" as it is, and {texts[0][1]} px once a calibration has taken up what is constant or smooth over the frame (k = 1)"
             mean = f"{texts[1][0]} and {texts[1][1]} px"
         return (
-            f"a coordinate of one target in one frame is worth {texts[0][0]} px{size}{after}; the mean of {many.frames} frames {mean}. {self._by()}"
+            f"a coordinate of one target in one frame is worth {texts[0][0]} px{size}{after}; the mean of {many.frames} frames {mean}. "
+            f"{self._by()}"
             f"{budget.target.describe()}; {budget.estimator.describe()}."
         )
 
