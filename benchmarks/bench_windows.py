@@ -19,7 +19,7 @@ from pixmetry.cable.termination import echoes
 from pixmetry.core.camera import Camera, Element
 from pixmetry.core.catalogue import get_source
 from pixmetry.core.random import Grid
-from pixmetry.core.signal import Clock
+from pixmetry.core.signal import Clock, Kind
 from pixmetry.core.threads import set_threads
 from pixmetry.location.estimators import Estimator
 from pixmetry.scene.discs import REACH, STEP, Discs, radial_profile
@@ -67,12 +67,17 @@ def camera() -> Camera:
     return Camera("bench", SHAPE, tuple(chain)).with_parameters("electronics.agc", target_dn=AGC_DN)
 
 
+def _clock(element: Element, cam: Camera) -> tuple[float, int] | tuple[()]:
+    """What the margins of the line's sources depend on besides their parameters."""
+    return (cam.pixel_clock_hz, cam.frame_shape[1]) if Kind.VIDEO in element.source.consumes else ()
+
+
 class InNumpy:
     """The same chain on the same windows, written with NumPy alone; windows are widened by what the row context needs."""
 
     def __init__(self, cam: Camera, row0: np.ndarray, col0: np.ndarray, x: np.ndarray, y: np.ndarray) -> None:
         self.p = {e.name: e.params for e in cam.chain}
-        needs = [e.source.near(e.params) for e in cam.chain if e.source.near is not None]
+        needs = [e.source.near(e.params, *_clock(e, cam)) for e in cam.chain if e.source.near is not None]
         self.up, self.left = sum(n[0] for n in needs), sum(n[2] for n in needs)
         self.rows = row0[:, None] - self.up + np.arange(SIDE + self.up)
         self.cols = col0[:, None] - self.left + np.arange(SIDE + self.left)

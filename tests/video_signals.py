@@ -10,7 +10,7 @@ from catalogue.support import disc_tile, probe_of
 from pixmetry.core.contribution import Probe
 from pixmetry.core.line import Line
 from pixmetry.core.random import Grid
-from pixmetry.core.signal import Kind, Signal
+from pixmetry.core.signal import Clock, Kind, Signal
 from pixmetry.core.source import Source
 from source_signals import signal, stream
 
@@ -18,10 +18,10 @@ PIXEL_HZ = 14.1875e6
 SMOOTH = ([], 2 * np.pi * 4e6 * np.array([-0.87 + 0.5j, -0.87 - 0.5j]))  # a filter that makes the line smooth between its samples
 
 
-def video(data: np.ndarray, smooth: bool = False, **kw: object) -> Signal:
+def video(data: np.ndarray, smooth: bool = False, pixel_hz: float = PIXEL_HZ, **kw: object) -> Signal:
     """Frames 0, 1, … (or a part of them) on the line."""
-    line = Line(PIXEL_HZ, PIXEL_HZ)
-    return replace(signal(data, Kind.VIDEO, **kw), line=line.filtered(*SMOOTH) if smooth else line)
+    line = Line(pixel_hz, pixel_hz)
+    return replace(signal(data, Kind.VIDEO, **kw), clock=Clock(pixel_hz), line=line.filtered(*SMOOTH) if smooth else line)
 
 
 def sampled(on_line: Signal, fine: int = 1) -> np.ndarray:

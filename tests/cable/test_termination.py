@@ -11,8 +11,8 @@ from pixmetry.cable.termination import SOURCE, Termination, echoes, near, tail
 from video_signals import PIXEL_HZ, bump, centre, row_of, sampled, seen, video
 
 
-def line(row: np.ndarray, params: Termination) -> np.ndarray:
-    return seen(SOURCE, params, row_of(row))[0, 0]
+def line(row: np.ndarray, params: Termination, pixel_hz: float = PIXEL_HZ) -> np.ndarray:
+    return seen(SOURCE, params, row_of(row), pixel_hz=pixel_hz)[0, 0]
 
 
 def moved(params: Termination) -> float:
@@ -56,13 +56,14 @@ def test_a_delay_of_whole_pixels_is_a_recursive_filter() -> None:
     np.testing.assert_allclose(line(row, params), lfilter([1 - rho], [1, 0, 0, -rho], row), atol=2e-3)
 
 
-def test_what_comes_from_beyond_the_margin_is_as_small_as_stated() -> None:
+@pytest.mark.parametrize("pixel_hz", [10e6, PIXEL_HZ, 28.4e6])
+def test_what_comes_from_beyond_the_margin_is_as_small_as_stated(pixel_hz: float) -> None:
     params = SOURCE.bound
-    left = near(params)[2]
+    left = near(params, pixel_hz, 0)[2]
     row = np.zeros(left + 400)
     row[0:20] = 1.0  # light that lies farther to the left than the margin
-    reached = line(row, params)[left + 20 :]
-    assert 0 < reached.max() <= tail(params)
+    reached = line(row, params, pixel_hz)[left + 20 :]
+    assert 0 < reached.max() <= tail(params, pixel_hz, 0)
     assert len(echoes(params)[0]) > 5
 
 
@@ -90,7 +91,7 @@ def test_the_loss_grows_as_the_root_of_the_frequency() -> None:
 
 def test_the_skin_effect_reaches_no_farther_than_stated() -> None:
     params = Termination(length_m=5.0, line_ohm=50.0, skin_db=1.0)
-    left = near(params)[2]
+    left = near(params, PIXEL_HZ, 0)[2]
     row = np.zeros(left + 400)
     row[0:20] = 1.0
-    assert 0 < line(row, params)[left + 20 :].max() <= tail(params) < 0.1
+    assert 0 < line(row, params)[left + 20 :].max() <= tail(params, PIXEL_HZ, 0) < 0.1

@@ -227,11 +227,11 @@ def noisy(s, stream):
     return s.line.with_noise(lambda grid, line: stream.normal(grid))
 
 
-REACH = {"near": lambda p: (0, 0, 60, 0), "tail": lambda p: 1e-4}
+REACH = {"near": lambda p, hz, px: (0, 0, 60, 0), "tail": lambda p, hz, px: 1e-4}
 RINGING = on_line("electronics.ringing", lambda s, _: s.line.filtered(*FILTERS["ringing"]), **REACH)
 CLOCK = on_line("grabber.clock", lambda s, _: s.line.clocked(10e6, 100e-9, 50))
 CLOCK_320 = on_line("grabber.clock", lambda s, _: s.line.clocked(10e6, 100e-9, 230))
-JITTER = on_line("grabber.jitter", jittered, near=lambda p: (0, 0, 3, 3), tail=lambda p: 0.0)
+JITTER = on_line("grabber.jitter", jittered, near=lambda p, hz, px: (0, 0, 3, 3), tail=lambda p, hz, px: 0.0)
 NOISE = on_line("storage.noise", noisy)
 SHAPE = (48, 64)
 

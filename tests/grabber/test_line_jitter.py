@@ -69,7 +69,7 @@ def test_published_size_of_20_ns() -> None:
     n_eff = weight.sum(axis=1) ** 2 / (weight**2).sum(axis=1)
     np.testing.assert_allclose(n_eff, 7.07, atol=0.03)
     assert propagate(LineJitter(white_ns=20.0), probe).u_x_px == pytest.approx(0.376 * 0.284, rel=0.02)
-    assert propagate(LineJitter(white_ns=20.0), probe).u_y_px == 0.0
+    assert propagate(LineJitter(white_ns=20.0), probe).u_y_px < 2e-5  # light that leaves the window to the side
 
 
 def test_carried_on_delays_do_not_average_over_the_rows() -> None:

@@ -13,10 +13,11 @@ from pixmetry.budget.combine import Combined, combine, together_with
 from pixmetry.budget.headline import Headline, headline
 from pixmetry.budget.monte_carlo import MonteCarlo, Trials
 from pixmetry.budget.parameters import applies, base_of, u_of_total, with_estimates
-from pixmetry.budget.probe import Facts, Target, facts_of, make_probe, resolve
+from pixmetry.budget.probe import ESTIMATOR_ITSELF, Facts, Probes, Target, facts_of, resolve
 from pixmetry.core.camera import Camera
 from pixmetry.core.catalogue import catalogue
 from pixmetry.core.contribution import UNSTEADY, Contribution
+from pixmetry.core.errors import InputError
 from pixmetry.core.estimates import Estimates
 from pixmetry.core.observations import LENS, TAKEN_UP, CameraGeometry
 from pixmetry.core.signal import Kind
@@ -24,7 +25,6 @@ from pixmetry.core.source import Source
 from pixmetry.location.estimators import Estimator
 
 SCHEMA = "pixmetry/budget/1"
-ESTIMATOR_ITSELF = "processing.threshold"
 DECIDED = ("measured", "modelled", "calibrated")
 FRAMES = (1, 4, 16, 64)
 
@@ -236,14 +236,15 @@ def compute_budget(
     if geometry is not None:
         camera = camera.switched(off=[e.name for e in camera.active if e.source.id in TAKEN_UP])
     facts = facts_of(camera, target, known_facts)
-    probe = make_probe(facts, target, estimator)
-    whole = probe if sensor_shape is None else replace(probe, frame_shape=sensor_shape)
+    probes = Probes(camera, facts, target, estimator)
     rows = []
     for name, source in _sources(camera):
         say(name)
         if geometry is not None and source.id in TAKEN_UP:
             rows.append(_calibrated(name, source, geometry))
         else:
+            probe = probes.of(name, source)
+            whole = probe if sensor_shape is None else replace(probe, frame_shape=sensor_shape)
             rows.append(_row(name, source, camera, estimates_by_source.get(name), name in accepted, probe, whole))
     interaction = design = None
     if trials:
@@ -312,7 +313,7 @@ def _row(name: str, source: Source, camera: Camera, estimates: Estimates | None,
     elif (present and not at_bound) or not source.parameters.model_fields:
         status, params, reason = "modelled", base_of(source, camera, name), "from the description of the camera" if present else ""
     else:
-        status, params = "accepted", source.bound_of(probe.frame_shape)
+        status, params = "accepted", source.bound_of(whole.frame_shape)
         reason = source.reasons.get("measure", "not measured in this campaign")
     if source.propagate is None:
         return replace(head, status=status, reason=source.reasons["propagate"])
@@ -334,15 +335,24 @@ def _calibrated(name: str, source: Source, geometry: CameraGeometry) -> BudgetRo
 
 
 def _simulated(row: BudgetRow, design: Trials, camera: Camera, say: Callable[[str], None]) -> BudgetRow:
-    """Add the Monte Carlo to a row that the chain can simulate with the parameters of the row."""
-    if row.contribution is None or row.status not in DECIDED:
+    """Add the Monte Carlo to a row that the chain can simulate with its parameters; without a propagator it is the contribution."""
+    if row.status not in DECIDED:
         return row
     if row.source_id == ESTIMATOR_ITSELF:
         return replace(row, monte_carlo=design.compare([row.name], camera.switched(on=()), None))
-    if row.name not in camera or not camera[row.name].on:
+    if row.name not in camera or not camera[row.name].on or camera[row.name].source.essential and row.contribution is None:
         return row
     say(f"Monte Carlo: {row.name}")
-    return replace(row, monte_carlo=design.of(only=[row.name]))
+    try:
+        found = design.of(only=[row.name])
+    except InputError as problem:
+        return replace(row, reason=f"{row.reason}; no Monte Carlo: {problem}")
+    if row.contribution is not None:
+        return replace(row, monte_carlo=found)
+    contribution = found.contribution(camera[row.name].source.gum_class)
+    if contribution is None:
+        return replace(row, monte_carlo=found, reason="Monte Carlo: no target was found behind it")
+    return replace(row, monte_carlo=found, contribution=contribution, reason=contribution.method)
 
 
 def _interaction(rows: Sequence[BudgetRow], design: Trials) -> Interaction:

@@ -9,10 +9,12 @@ from math import comb
 import numpy as np
 
 from pixmetry.budget.probe import Facts, Target, background_of, facts_of, resolve, scene_of, spread_windows, window_side
-from pixmetry.core.camera import Camera
-from pixmetry.core.contribution import SMOOTH_ORDER, smooth_part
+from pixmetry.core.camera import Camera, Element
+from pixmetry.core.contribution import SMOOTH_ORDER, Contribution, smooth_part
+from pixmetry.core.conversions import LineSources, Link
 from pixmetry.core.errors import ChainError, InputError
 from pixmetry.core.random import Grid, Streams
+from pixmetry.core.signal import Kind
 from pixmetry.location.estimators import Estimator
 
 UNIT_STRIDE = 1_000_003  # between the unit seeds of cameras of one type
@@ -52,6 +54,23 @@ class MonteCarlo:
     lost: int  # trials in which no target was found, left out together with their place
     mode: str
     frozen_tail: float  # largest share of a pixel's signal that the mode `frozen` takes from the noise-free frame
+
+    def contribution(self, gum_class: str) -> Contribution | None:
+        """The same as a contribution; None where no target was found."""
+        if not np.isfinite(self.total_px):
+            return None
+        smooth = tuple(float(np.sqrt(max(a.u**2 - a.left**2, 0.0))) for a in (self.x, self.y))
+        return Contribution(
+            self.x.u,
+            self.y.u,
+            gum_class,
+            self.x.bias,
+            self.y.bias,
+            floor_px=2 * self.se_total_px,
+            method="Monte Carlo: the camera's chain with it and without, a target at rest",
+            time_px=(self.x.temporal, self.y.temporal),
+            smooth_px=(smooth[0], smooth[1]),
+        )
 
     @property
     def trials(self) -> int:
@@ -145,7 +164,10 @@ class Trials:
         x, y = ((at - start) / step for at, (start, step) in zip(shown, _layout(self.camera), strict=True))
         belongs = camera.layout(x, y, np.arange(n))
         last = [size - self.side for size in camera.output_shape[::-1]]
-        col0, row0 = (np.clip(np.rint(at).astype(np.int64) - middle, 0, most) for at, most in zip(belongs, last, strict=True))
+        moved = self._moved(camera, x, y)
+        col0, row0 = (
+            np.clip(np.rint(at + by).astype(np.int64) - middle, 0, most) for at, by, most in zip(belongs, moved, last, strict=True)
+        )
         scene = scene_of(self.target, self.facts, x, y)
         windows = camera.expose_windows(
             scene,
@@ -161,6 +183,13 @@ class Trials:
         found = self._as_seen(camera).locate(windows)
         parts = zip(found, (col0, row0), belongs, _layout(camera), strict=True)
         dx, dy = (((hat + first - at) / step).reshape(self.places, self.frames) for hat, first, at, (_, step) in parts)
+        return dx, dy
+
+    def _moved(self, camera: Camera, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """By how much targets are seen elsewhere than they belong (a lens, a drift, a cold clock): windows follow, errors do not."""
+        seen = camera.true_positions(x, y, exposure_s=self.facts.exposure_s, temperature_c=self.facts.temperature_c)
+        belongs = camera.layout(x, y)
+        dx, dy = (np.nan_to_num(np.broadcast_to(a, np.shape(b)) - b) for a, b in zip(seen, belongs, strict=True))
         return dx, dy
 
     def _as_seen(self, camera: Camera) -> Estimator:
@@ -185,7 +214,9 @@ class Trials:
         return MonteCarlo(x, y, tuple(names), self.units, self.places, self.frames, lost, self.mode, tail)
 
     def of(self, only: Iterable[str] | None = None, off: Iterable[str] | None = None) -> MonteCarlo:
-        """What some sources do: alone on an otherwise perfect chain (``only``), or as they are missed in the whole chain (``off``).
+        """What some sources do: on an otherwise perfect chain (``only``), or as they are missed in the whole chain (``off``).
+
+        A perfect chain keeps the camera's video line, with all that filters, echoes and samples it: see `helpers_of`.
 
         With neither, what the whole camera and the estimator do against the truth.
         """
@@ -202,13 +233,27 @@ class Trials:
 
 
 def helpers_of(camera: Camera, names: Iterable[str]) -> tuple[str, ...]:
-    """Conversions that some sources need to be run at all although they are not essential: a source of stored codes needs a converter."""
+    """What else must be on for some sources to do what they do in this camera.
+
+    What shapes its video line: filters, echoes and the sampling clock, without which delays and noise would be seen by another line. And
+    conversions, although not essential, without which the sources cannot be run: a source of stored codes needs a converter.
+    """
     names = tuple(names)
+    helpers = [e.name for e in camera.active if e.name not in names and shapes_line(e, camera)]
     try:
-        camera.switched(on=names)
+        camera.switched(on=(*names, *helpers))
     except ChainError:
-        return tuple(e.name for e in camera.chain if e.source.produces is not None and e.name not in names and not e.source.essential)
-    return ()
+        helpers += [e.name for e in camera.chain if e.source.produces is not None and not e.source.essential]
+    return tuple(h for h in dict.fromkeys(helpers) if h not in names)
+
+
+def shapes_line(element: Element, camera: Camera) -> bool:
+    """Whether a source filters, echoes or samples the video line; one that only delays it, or adds noise, does not."""
+    if Kind.VIDEO not in element.source.consumes:
+        return False
+    link = Link(element.name, element.source, element.params, camera.frame_shape)
+    line = LineSources((link,), camera.pixel_clock_hz).line
+    return not replace(line, delays=(), warps=(), noise=()).plain
 
 
 def monte_carlo(

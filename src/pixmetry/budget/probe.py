@@ -3,22 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
 from pixmetry.core.camera import Camera
 from pixmetry.core.contribution import Probe
+from pixmetry.core.conversions import SAMPLE, LineSources, Link
 from pixmetry.core.errors import InputError
+from pixmetry.core.line import Held, Line
 from pixmetry.core.random import Grid
 from pixmetry.core.signal import Kind
+from pixmetry.core.source import Source
 from pixmetry.location.estimators import Estimator, split_text
 from pixmetry.scene.discs import Discs
 from pixmetry.scene.uniform import Uniform
 
 WINDOW_PX = 24  # side of the windows that are exposed; the estimator's own lies in their middle
 PHASES = 8  # per axis
+ESTIMATOR_ITSELF = "processing.threshold"
+AHEAD_OF_LINE = ("optics", "sensor", "electronics")  # stages whose sources work on pixels, where a camera has a video line
 
 
 @dataclass(frozen=True)
@@ -94,6 +100,7 @@ class Facts:
     bits : int
     exposure_s, temperature_c : float
     frame_shape : (int, int)
+    pixel_clock_hz : float
     """
 
     dn_per_photon: float
@@ -104,6 +111,7 @@ class Facts:
     exposure_s: float
     temperature_c: float
     frame_shape: tuple[int, int]
+    pixel_clock_hz: float = 14.1875e6
 
 
 def facts_of(camera: Camera, target: Target, known: Mapping[str, Any] | None = None) -> Facts:
@@ -142,6 +150,7 @@ def facts_of(camera: Camera, target: Target, known: Mapping[str, Any] | None = N
         exposure_s=float(known.get("exposure_s") or camera.exposure_s),
         temperature_c=float(known.get("temperature_c", camera.temperature_c)),
         frame_shape=tuple(known.get("frame_shape") or camera.frame_shape),
+        pixel_clock_hz=float(known.get("pixel_clock_hz") or camera.pixel_clock_hz),
     )
 
 
@@ -174,14 +183,8 @@ def resolve(estimator: Estimator, target: Target, facts: Facts) -> Estimator:
     return estimator.resolved(target.background_rel * facts.saturation_dn, facts.noise_dn)
 
 
-def make_probe(facts: Facts, target: Target, estimator: Estimator, phases: int = PHASES) -> Probe:
-    """Render the target noise-free at a lattice of ``phases`` × ``phases`` places within the pixel and see it through the estimator.
-
-    Raises
-    ------
-    InputError
-        If the target does not stand above the threshold.
-    """
+def _checked(facts: Facts, target: Target, estimator: Estimator) -> Estimator:
+    """The estimator for this target, which it must be able to see."""
     needed = target.diameter_px + 4 * target.blur_px
     if estimator.window < needed:
         raise InputError(
@@ -190,7 +193,6 @@ def make_probe(facts: Facts, target: Target, estimator: Estimator, phases: int =
             allowed=f"a window of {int(np.ceil(needed)) // 2 * 2 + 1} px or more",
             remedy="give a larger window, as in --estimator soft_threshold:window=25",
         )
-    side = window_side(estimator)
     estimator = resolve(estimator, target, facts)
     if estimator.threshold_dn is not None and estimator.threshold_dn >= target.peak_rel * facts.saturation_dn:
         raise InputError(
@@ -198,14 +200,38 @@ def make_probe(facts: Facts, target: Target, estimator: Estimator, phases: int =
             value=f"{target.peak_rel * facts.saturation_dn:.3g} DN against {estimator.threshold_dn:.3g} DN",
             remedy="take a brighter target or a lower threshold",
         )
-    lattice = (np.arange(phases) + 0.5) / phases - 0.5
-    dx, dy = (v.ravel() for v in np.meshgrid(lattice, lattice))
-    x, y = side // 2 + dx, side // 2 + dy
+    return estimator
+
+
+def _lattice(phases: int) -> tuple[np.ndarray, np.ndarray]:
+    """Places within the pixel, each of shape (phases²,)."""
+    places = (np.arange(phases) + 0.5) / phases - 0.5
+    dx, dy = (v.ravel() for v in np.meshgrid(places, places))
+    return dx, dy
+
+
+def _seen(facts: Facts, target: Target, x: np.ndarray, y: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """Linear DN of windows of this shape, with the target at (x, y) in window coordinates; (p, rows, cols)."""
     n = len(x)
     zero = np.zeros(n, np.int64)
-    grid = Grid(np.arange(n), zero, zero, (side, side))
-    photons = scene_of(target, facts, x, y).photons(grid, (side, side), np.full(n, facts.exposure_s), np.zeros(n))
-    signal = photons.astype(float) * facts.dn_per_photon
+    grid = Grid(np.arange(n), zero, zero, shape)
+    photons = scene_of(target, facts, x, y).photons(grid, shape, np.full(n, facts.exposure_s), np.zeros(n))
+    return photons.astype(float) * facts.dn_per_photon
+
+
+def make_probe(facts: Facts, target: Target, estimator: Estimator, phases: int = PHASES) -> Probe:
+    """Render the target noise-free at a lattice of ``phases`` × ``phases`` places within the pixel and see it through the estimator.
+
+    Raises
+    ------
+    InputError
+        If the target does not stand above the threshold.
+    """
+    side = window_side(estimator)
+    estimator = _checked(facts, target, estimator)
+    dx, dy = _lattice(phases)
+    x, y = side // 2 + dx, side // 2 + dy
+    signal = _seen(facts, target, x, y, (side, side))
     x_hat, y_hat = estimator.locate(signal)
     gx, gy = estimator.gradient(signal)
     return Probe(
@@ -224,7 +250,159 @@ def make_probe(facts: Facts, target: Target, estimator: Estimator, phases: int =
         frame_shape=facts.frame_shape,
         locate=estimator.locate,
         saturation_dn=facts.saturation_dn,
+        pixel_clock_hz=facts.pixel_clock_hz,
     )
+
+
+MARGIN_S = 1.7e-6  # of the line ahead of a window: what was on it then has died away at the target
+MARGIN_PX = 6  # behind a window
+
+
+class Probes:
+    """The probes of one camera: for every source, the target as it meets it, with the rest of the camera's line behind it.
+
+    Parameters
+    ----------
+    camera : Camera
+    facts : Facts
+    target : Target
+    estimator : Estimator
+    phases : int
+        Along each axis of the pixel.
+
+    Raises
+    ------
+    InputError
+        If the target does not fit into the estimator's window, or does not stand above the threshold.
+    """
+
+    def __init__(self, camera: Camera, facts: Facts, target: Target, estimator: Estimator, phases: int = PHASES) -> None:
+        self.camera, self.facts, self.target, self.phases = camera, facts, target, phases
+        self.side = window_side(estimator)
+        self.bare = make_probe(facts, target, estimator, phases)
+        self.estimator = resolve(estimator, target, facts)
+        links = (e.params.links for e in camera.links if e.source is SAMPLE and not e.params.line.plain)
+        self.links: tuple[Link, ...] = next(links, ())
+        self._ahead = lru_cache(self._make_ahead)
+
+    def of(self, name: str, source: Source) -> Probe:
+        """The probe for a source of this name; the estimator itself is asked on what the pixels gather."""
+        if not self.links or source.id == ESTIMATOR_ITSELF:
+            return self.bare
+        if Kind.VIDEO in source.consumes:
+            return self._ahead(name if any(e.name == name for e in self.links) else "")
+        whole = self._ahead("")
+        if source.stage in AHEAD_OF_LINE:
+            return whole
+        shape = next((e.shape for e in self.camera.links if e.name == name), self.camera.output_shape)
+        return replace(self._behind(whole), frame_shape=shape)
+
+    def _make_ahead(self, without: str) -> Probe:
+        """Windows of pixels on the line, without one of its sources."""
+        facts, row = self.facts, self.camera.frame_shape[0] // 2 - self.side // 2
+        line, ahead = self._line(without, row + self.side // 2)
+        dx, dy = _lattice(self.phases)
+        n = len(dx)
+        middle = (self.camera.frame_shape[1] - 1) // 2
+        if line.sample_clock_hz != line.pixel_clock_hz:  # every phase to the pixels at another one to the samples
+            dx = dx + np.rint(np.arange(n) * 0.7548776662 % 1 * self.side)
+        x, y = middle + dx, row + self.side // 2 + dy
+        first_sample = np.rint(line.placed(x)).astype(np.int64) - self.side // 2
+        margin = int(np.ceil(MARGIN_S * line.pixel_clock_hz))
+        first = np.floor(line.pixels(first_sample.astype(float))).astype(np.int64) - margin
+        last = np.ceil(line.pixels(first_sample + self.side - 1.0)).astype(np.int64) + MARGIN_PX
+        width, rows = int((last - first).max()) + 1, np.full(n, row)
+        pixels = Grid(np.arange(n), rows, first, (self.side, width))
+        samples = Grid(np.arange(n), rows, first_sample, (self.side, self.side))
+        step = line.sample_clock_hz / line.pixel_clock_hz
+        nothing = np.zeros((n, self.side, self.side))
+
+        def located(samples_dn: np.ndarray, level: float, which: Any = slice(None)) -> tuple[np.ndarray, np.ndarray]:
+            x_hat, y_hat = self._at_level(level).locate(samples_dn)
+            return line.pixels(x_hat + first_sample[which]) - first[which], y_hat
+
+        held = Held(line, pixels, samples, nothing, nothing, located, ahead, self._rows_seen())
+        background = self.bare.background_dn
+        signal = _seen(facts, self.target, x - first, y - row, (self.side, width))
+        seen = held.read(line, signal, background)
+        gx, gy = self._at_level(line.level).gradient(seen)
+        held = replace(held, gx=gx / step, gy=gy)
+        impulses = np.broadcast_to(np.eye(width, dtype=np.float32), (n, width, width))
+        answer = line.limited().read(impulses, first, Grid(np.arange(n), rows, first_sample, (width, self.side))).astype(float)
+
+        def locate(signal_dn: np.ndarray, phase: int | None = None) -> tuple[np.ndarray, np.ndarray]:
+            which = slice(None) if phase is None else np.full(len(signal_dn), phase)
+            return located(held.read(line, signal_dn, background, which), line.level, which)
+
+        x_hat, y_hat = located(seen, line.level)
+        return replace(
+            self.bare,
+            signal_dn=signal,
+            x_px=x - first,
+            y_px=y - row,
+            x_hat_px=x_hat,
+            y_hat_px=y_hat,
+            gx=np.einsum("prs,pcs->prc", held.gx, answer),
+            gy=np.einsum("prs,pcs->prc", held.gy, answer),
+            locate=locate,
+            held=held,
+        )
+
+    def _behind(self, ahead: Probe) -> Probe:
+        """Windows of the line's samples."""
+        held = ahead.held
+        assert held is not None
+        line = held.line
+        seen = held.read(line, ahead.signal_dn, ahead.background_dn)
+        estimator = self._at_level(line.level)
+        step = line.sample_clock_hz / line.pixel_clock_hz
+        x, y = estimator.locate(seen)
+
+        def locate(signal_dn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            x_hat, y_hat = estimator.locate(signal_dn)
+            return x_hat / step, y_hat
+
+        return replace(
+            self.bare,
+            signal_dn=seen,
+            background_dn=ahead.background_dn * line.level,
+            x_px=x,
+            y_px=y,
+            x_hat_px=x / step,
+            y_hat_px=y,
+            gx=held.gx,
+            gy=held.gy,
+            locate=locate,
+        )
+
+    def _at_level(self, level: float) -> Estimator:
+        """The estimator where constant light is seen so many times as bright: background and threshold follow."""
+        threshold = self.estimator.threshold_dn
+        lower = None if threshold is None else threshold * level
+        return replace(self.estimator, background_dn=self.estimator.background_dn * level, threshold_dn=lower, sigma=None)
+
+    def _rows_seen(self) -> tuple[int, int]:
+        """Rows of the sensor that are put out: those that lie in the frame of the output."""
+        rows = self.camera.frame_shape[0]
+        _, at = self.camera.layout(np.zeros(rows), np.arange(rows))
+        seen = np.flatnonzero((at > -0.5) & (at < self.camera.output_shape[0] - 0.5))
+        return (int(seen[0]), int(seen[-1]) + 1) if len(seen) else (0, rows)
+
+    def _line(self, without: str, row: int) -> tuple[Line, int]:
+        """The line of all other sources, and how many of its filters stand ahead of the one left out.
+
+        Nothing in it is random. A warp along the row only displaces targets, whom the window follows: it is left out; the delay of the rows
+        is that of one row.
+        """
+        others = tuple(e for e in self.links if e.name != without)
+        names = [e.name for e in self.links]
+        clock, cols = self.camera.pixel_clock_hz, self.camera.frame_shape[1]
+        line = LineSources(others, clock, cols).line
+        grid = Grid(np.zeros(1, np.int64), np.full(1, row), np.zeros(1, np.int64), (1, 1))
+        late = float(sum(delay(grid)[0, 0] for delay in line.delays))
+        earlier = tuple(e for e in others if without not in names or names.index(e.name) < names.index(without))
+        ahead = len(LineSources(earlier, clock, cols).line.filters)
+        return replace(line, warps=(), noise=(), delays=()).delayed(np.full((1, 1), late)), ahead
 
 
 def _parameter(camera: Camera, name: str) -> Any:

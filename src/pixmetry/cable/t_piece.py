@@ -9,9 +9,9 @@ import numpy as np
 
 from pixmetry.cable._undo import without
 from pixmetry.core.contribution import Contribution, Probe
-from pixmetry.core.line import SMALLEST_ECHO, Line, through_line
+from pixmetry.core.line import SMALLEST_ECHO, through_line
 from pixmetry.core.random import Stream
-from pixmetry.core.signal import Clock, Kind, Signal
+from pixmetry.core.signal import Kind, Signal
 from pixmetry.core.source import Parameters, Source, quantity
 
 DELAY_S_PER_M = 2 / (0.66 * 299_792_458.0)  # there and back, at 0.66 of the speed of light
@@ -76,24 +76,23 @@ def correct(params: TPiece, signal: Signal, maps: Mapping[str, np.ndarray]) -> S
     return without(signal, lambda line: line.echoed(*echoes(params)))
 
 
-def near(params: TPiece) -> tuple[int, int, int, int]:
-    """Pixels of the usual clock to the left from which an echo comes."""
+def near(params: TPiece, pixel_hz: float, row_px: int) -> tuple[int, int, int, int]:
+    """Pixels to the left from which an echo comes."""
     delay, _ = echoes(params)
-    return 0, 0, min(int(np.ceil(delay[-1] * Clock.pixel_hz)) + 1, 256), 0
+    return 0, 0, min(int(np.ceil(delay[-1] * pixel_hz)) + 1, 256), 0
 
 
-def tail(params: TPiece) -> float:
+def tail(params: TPiece, pixel_hz: float, row_px: int) -> float:
     """Sum of the echoes that come from farther left than `near`."""
     delay, amplitude = echoes(params)
-    return float(np.abs(amplitude[delay * Clock.pixel_hz > near(params)[2]]).sum())
+    return float(np.abs(amplitude[delay * pixel_hz > near(params, pixel_hz, row_px)[2]]).sum())
 
 
 def propagate(params: TPiece, probe: Probe) -> Contribution:
-    """The target with its echoes at the usual pixel clock; the level without the target, and thresholds, follow the load."""
+    """The target with its echoes, on the rest of the camera's line; the level without the target, and thresholds, follow the load."""
     if params.branch == "none":
         return Contribution(u_x_px=0.0, u_y_px=0.0, gum_class="G", method="no branch")
-    delay, amplitude = echoes(params)
-    return through_line(Line(Clock.pixel_hz, Clock.pixel_hz).echoed(delay, amplitude / params.level), probe)
+    return through_line(probe, lambda line: line.echoed(*echoes(params)))
 
 
 SOURCE = Source(

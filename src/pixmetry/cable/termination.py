@@ -12,7 +12,7 @@ from pixmetry.cable._undo import without
 from pixmetry.core.contribution import Contribution, Probe
 from pixmetry.core.line import SMALLEST_ECHO, Line, through_line
 from pixmetry.core.random import Stream
-from pixmetry.core.signal import Clock, Kind, Signal
+from pixmetry.core.signal import Kind, Signal
 from pixmetry.core.source import Parameters, Source, quantity
 
 DELAY_S_PER_M = 2 / (0.66 * 299_792_458.0)  # there and back, at 0.66 of the speed of light
@@ -74,32 +74,31 @@ def correct(params: Termination, signal: Signal, maps: Mapping[str, np.ndarray])
     return without(signal, lambda line: _through(params, line))
 
 
-def near(params: Termination) -> tuple[int, int, int, int]:
-    """Pixels of the usual clock to the left until the echoes have fallen below 1e-4; with a skin effect, whose tail is long, the most."""
+def near(params: Termination, pixel_hz: float, row_px: int) -> tuple[int, int, int, int]:
+    """Pixels to the left until the echoes have fallen below 1e-4; with a skin effect, whose tail is long, the most."""
     if params.skin_db:
         return 0, 0, MOST_NEAR, 0
     rho = abs(params.ghost)
     count = 0 if rho < 1e-4 else math.ceil(math.log(1e-4) / math.log(rho))
-    return (0, 0, min(math.ceil(count * params.delay_s * Clock.pixel_hz) + 1, MOST_NEAR), 0)
+    return (0, 0, min(math.ceil(count * params.delay_s * pixel_hz) + 1, MOST_NEAR), 0)
 
 
-def tail(params: Termination) -> float:
+def tail(params: Termination, pixel_hz: float, row_px: int) -> float:
     """Sum of the echoes that come from farther left than `near`, and what the skin effect still lacks of a step there."""
     if params.skin_db:
-        lacks = math.erf(0.5 * math.sqrt(time_scale_s(params.skin_db) * Clock.pixel_hz / MOST_NEAR))
-        return lacks + tail(params.model_copy(update={"skin_db": 0.0}))
+        lacks = math.erf(0.5 * math.sqrt(time_scale_s(params.skin_db) * pixel_hz / MOST_NEAR))
+        return lacks + tail(params.model_copy(update={"skin_db": 0.0}), pixel_hz, row_px)
     if abs(params.ghost) < 1e-12:
         return 0.0
-    first = math.floor((near(params)[2] - 1) / max(params.delay_s * Clock.pixel_hz, 1e-9)) + 1
+    first = math.floor((near(params, pixel_hz, row_px)[2] - 1) / max(params.delay_s * pixel_hz, 1e-9)) + 1
     return abs(params.ghost) ** first
 
 
 def propagate(params: Termination, probe: Probe) -> Contribution:
-    """The target with its echoes, at the usual pixel clock; for a centroid over everything it is the first moment, Δx = ρτ/(1 − ρ)."""
-    line = Line(Clock.pixel_hz, Clock.pixel_hz)
-    if _through(params, line) is line:
+    """The target with its echoes, on the rest of the camera's line; for a centroid over everything the first moment, Δx = ρτ/(1 − ρ)."""
+    if abs(params.ghost) < 1e-12 and not params.skin_db:
         return Contribution(u_x_px=0.0, u_y_px=0.0, gum_class="G", method="no echo")
-    return through_line(_through(params, line), probe)
+    return through_line(probe, lambda line: _through(params, line))
 
 
 SOURCE = Source(

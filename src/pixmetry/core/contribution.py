@@ -13,9 +13,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from pixmetry.core.line import Held
 
 CLASSES = ("T", "Tr", "F", "G", "D", "O")
 
@@ -130,9 +133,20 @@ class Probe:
         Of the camera under which the target is seen.
     frame_shape : (int, int)
     locate : callable, optional
-        The estimator itself, (p, rows, cols) DN to x and y in window coordinates, for changes that are too large for its gradient.
+        The estimator itself, (p, rows, cols) DN to x and y in window coordinates, for changes that are too large for its gradient. With
+        ``held`` it takes the phase as well, for windows that all belong to one.
     saturation_dn : float
         Where the scale ends, above black: no pixel is seen brighter.
+    pixel_clock_hz : float
+        Of the camera.
+    held : Held, optional
+        The windows on the camera's video line, for the sources of the line (`core.line`).
+
+    Notes
+    -----
+    The windows are those that the source meets: pixels ahead of the video line, samples behind it. All that the camera's line does after
+    the source belongs to the estimator: what a filter behind a noise smooths is in ``gx`` and ``locate``. Shifts are in pixels of the
+    sensor everywhere.
     """
 
     signal_dn: np.ndarray
@@ -148,8 +162,10 @@ class Probe:
     temperature_c: float
     bits: int
     frame_shape: tuple[int, int]
-    locate: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]] | None = None
+    locate: Callable[..., tuple[np.ndarray, np.ndarray]] | None = None
     saturation_dn: float = float("inf")
+    pixel_clock_hz: float = 14.1875e6
+    held: Held | None = None
 
     def white(self, sigma_dn: np.ndarray | float) -> tuple[float, float]:
         """u_x, u_y from independent errors of standard deviation ``sigma_dn`` (scalar or per pixel) in every pixel."""
@@ -174,12 +190,17 @@ class Probe:
         """Shift in x and y, shape (p,), from a given error field (p, rows, cols) or (rows, cols) in DN (first order)."""
         return (self.gx * error_dn).sum(axis=(1, 2)), (self.gy * error_dn).sum(axis=(1, 2))
 
-    def moved(self, signal_dn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Shift in x and y, shape (p,), when the signal becomes this one; by the estimator itself, or to first order if it is not given."""
+    def moved(self, signal_dn: np.ndarray, phase: int | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Shift in x and y, shape (p,), when the signal becomes this one; by the estimator itself, or to first order if it is not given.
+
+        With a ``phase``, any number of windows (n, rows, cols) in which the target lies at that one, and n shifts.
+        """
+        which: Any = slice(None) if phase is None else phase
         if self.locate is None:
-            return self.field(signal_dn - self.signal_dn)
-        x, y = self.locate(signal_dn)
-        return x - self.x_hat_px, y - self.y_hat_px
+            change = signal_dn - self.signal_dn[which]
+            return (self.gx[which] * change).sum(axis=(1, 2)), (self.gy[which] * change).sum(axis=(1, 2))
+        x, y = self.locate(signal_dn) if phase is None or self.held is None else self.locate(signal_dn, phase)
+        return x - self.x_hat_px[which], y - self.y_hat_px[which]
 
     def contribution(self, u: tuple[float, float], gum_class: str, **kw: Any) -> Contribution:
         """Shorthand for a contribution without bias."""

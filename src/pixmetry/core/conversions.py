@@ -53,10 +53,11 @@ class Nothing(Parameters):
 
 @dataclass(frozen=True)
 class LineSources:
-    """Parameters of the sampling: the sources of the line signal before it, and the camera's pixel clock."""
+    """Parameters of the sampling: the sources of the line signal before it, and the camera's pixel clock and row."""
 
     links: tuple[Link, ...]
     pixel_hz: float
+    row_px: int = 0  # of a row of pixels, for how far the line is followed
 
     @cached_property
     def line(self) -> Line:
@@ -124,13 +125,15 @@ def _sample_context(params: LineSources, windows: Windows, frame_shape: tuple[in
 
 
 def _sample_near(params: LineSources) -> tuple[int, int, int, int]:
-    reaches = [link.source.near(link.params) for link in params.links if link.source.near is not None]
+    clock = params.pixel_hz, params.row_px
+    reaches = [link.source.near(link.params, *clock) for link in params.links if link.source.near is not None]
     left, right = (sum(r[i] for r in reaches) for i in (2, 3))
     return 0, 0, left + 1, right + 1
 
 
 def _sample_tail(params: LineSources) -> float:
-    return float(sum(link.source.tail(link.params) for link in params.links if link.source.tail is not None))
+    clock = params.pixel_hz, params.row_px
+    return float(sum(link.source.tail(link.params, *clock) for link in params.links if link.source.tail is not None))
 
 
 def _sample_reshape(params: LineSources, frame_shape: tuple[int, int]) -> tuple[int, int]:
@@ -205,7 +208,7 @@ def linked(elements: Any, frame_shape: tuple[int, int], pixel_hz: float) -> tupl
         kind, shape = source.produces or kind, link.shape_out
 
     def convert(source: Source) -> None:
-        params = LineSources(tuple(on_line), pixel_hz) if source is SAMPLE else Nothing()
+        params = LineSources(tuple(on_line), pixel_hz, shape[1]) if source is SAMPLE else Nothing()
         on_line.clear()
         add(f"{source.id} {len(links)}", source, params)
 

@@ -35,7 +35,8 @@ def image_shift(pull: Pull, signal: Signal) -> dict[str, np.ndarray]:
 def map_shifts(pull: Pull, probe: Probe) -> tuple[np.ndarray, np.ndarray]:
     """Displacements of targets at `PLACES` × `PLACES` places, wherever the target's window fits into the frame; flat arrays."""
     axes = []
-    for side, size in zip(probe.frame_shape, probe.signal_dn.shape[1:], strict=True):
+    size = min(probe.signal_dn.shape[1:])  # windows of a video line are wider than the estimator needs
+    for side in probe.frame_shape:
         margin = min(size // 2 + 1, (side - 1) / 2)
         axes.append(margin + (np.arange(PLACES) + 0.5) / PLACES * (side - 1 - 2 * margin))
     y, x = (v[None] for v in np.meshgrid(*axes, indexing="ij"))

@@ -77,7 +77,8 @@ class Source:
         ``context(params, windows, frame_shape) -> Windows``: the input it needs to make these windows; by default the windows.
     near : callable, optional
         ``near(params) -> (up, down, left, right)`` pixels that the budget's frozen mode keeps of a far context; what lies farther is
-        taken from the noise-free frame. By default the exact context is used in that mode too.
+        taken from the noise-free frame. By default the exact context is used in that mode too. Of a source of the video line, ``near`` and
+        ``tail`` take ``(params, pixel_hz, row_px)``: the camera's pixel clock, and the pixels of a row.
     tail : callable, optional
         ``tail(params)``: the largest share of a pixel's signal that reaches beyond ``near``; the frozen mode's stated error.
     reshape : callable, optional
@@ -137,8 +138,8 @@ class Source:
     propagate: Callable[[Any, Probe], Contribution] | None = None
     context: Callable[[Any, Windows, tuple[int, int]], Windows] | None = None
     bound_over: Callable[[tuple[int, int]], Any] | None = None
-    near: Callable[[Any], tuple[int, int, int, int]] | None = None
-    tail: Callable[[Any], float] | None = None
+    near: Callable[..., tuple[int, int, int, int]] | None = None
+    tail: Callable[..., float] | None = None
     reshape: Callable[[Any, tuple[int, int]], tuple[int, int]] | None = None
     place: Callable[[Any, np.ndarray, np.ndarray, tuple[int, int], int], tuple[np.ndarray, np.ndarray]] | None = None
     truth: Callable[[Any, Signal, Stream], Mapping[str, np.ndarray]] | None = None

@@ -7,9 +7,9 @@ import math
 import numpy as np
 
 from pixmetry.core.contribution import Contribution, Probe
-from pixmetry.core.line import Line, reach_px, through_line
+from pixmetry.core.line import reach_px, through_line
 from pixmetry.core.random import Stream
-from pixmetry.core.signal import Clock, Kind, Signal
+from pixmetry.core.signal import Kind, Signal
 from pixmetry.core.source import Parameters, Source, quantity
 
 SHARE_BEYOND = 1e-4  # of a step, beyond the near context
@@ -38,19 +38,19 @@ def forward(params: VideoAmplifier, signal: Signal, stream: Stream) -> Signal:
     return signal.with_line(signal.line.filtered([], params.poles))
 
 
-def near(params: VideoAmplifier) -> tuple[int, int, int, int]:
-    """Pixels of the usual clock to the left until the ringing has died away."""
-    return 0, 0, reach_px([], params.poles, SHARE_BEYOND, Clock.pixel_hz), 0
+def near(params: VideoAmplifier, pixel_hz: float, row_px: int) -> tuple[int, int, int, int]:
+    """Pixels to the left until the ringing has died away."""
+    return 0, 0, reach_px([], params.poles, SHARE_BEYOND, pixel_hz), 0
 
 
-def tail(params: VideoAmplifier) -> float:
+def tail(params: VideoAmplifier, pixel_hz: float, row_px: int) -> float:
     """What is left of a step there."""
     return SHARE_BEYOND
 
 
 def propagate(params: VideoAmplifier, probe: Probe) -> Contribution:
-    """The target behind the amplifier, at the usual pixel clock; for a centroid over everything the first moment, 2ζ/ω0."""
-    return through_line(Line(Clock.pixel_hz, Clock.pixel_hz).filtered([], params.poles), probe)
+    """The target behind the amplifier, on the rest of the camera's line; for a centroid over everything the first moment, 2ζ/ω0."""
+    return through_line(probe, lambda line: line.filtered([], params.poles))
 
 
 SOURCE = Source(

@@ -7,8 +7,9 @@ from collections.abc import Mapping
 import numpy as np
 
 from pixmetry.core.contribution import Contribution, Probe
+from pixmetry.core.line import held_of
 from pixmetry.core.random import Stream
-from pixmetry.core.signal import Clock, Kind, Signal
+from pixmetry.core.signal import Kind, Signal
 from pixmetry.core.source import Parameters, Source, quantity
 
 
@@ -57,22 +58,23 @@ def truth(params: ClockWarmUp, signal: Signal, stream: Stream) -> Mapping[str, n
     return {"col_shift_px": columns, "row_shift_px": rows}
 
 
-def near(params: ClockWarmUp) -> tuple[int, int, int, int]:
-    """Pixels of the usual clock by which a sample at the end of a line of 52 µs may look elsewhere, to either side."""
-    worst = (params.lock_us + 52) * 1e-6 * abs(params.scale_error_rel) / (1 - abs(params.scale_error_rel)) + abs(params.delay_ns) * 1e-9
-    reach = int(np.ceil(worst * Clock.pixel_hz))
+def near(params: ClockWarmUp, pixel_hz: float, row_px: int) -> tuple[int, int, int, int]:
+    """Pixels by which a sample at the end of the row may look elsewhere, to either side."""
+    late, scale = params.lock_us * 1e-6 + row_px / pixel_hz, abs(params.scale_error_rel)
+    reach = int(np.ceil((late * scale / (1 - scale) + abs(params.delay_ns) * 1e-9) * pixel_hz))
     return 0, 0, reach, reach
 
 
-def tail(params: ClockWarmUp) -> float:
+def tail(params: ClockWarmUp, pixel_hz: float, row_px: int) -> float:
     """Nothing comes from farther away."""
     return 0.0
 
 
 def propagate(params: ClockWarmUp, probe: Probe) -> Contribution:
-    """The shift in frame 0, at the usual pixel clock: its mean over all columns, and its scatter over them."""
-    cols = probe.frame_shape[1]
-    shift = shift_s(params, (np.arange(cols) + 0.5) / Clock.pixel_hz, np.zeros(1)) * Clock.pixel_hz
+    """The shift in frame 0: its mean over all samples of a row, and its scatter over them."""
+    line, cols = held_of(probe).line, probe.frame_shape[1]
+    at_s = line.start_s + (np.arange(line.samples or cols) + 0.5) / line.sample_clock_hz
+    shift = shift_s(params, at_s[(at_s > 0) & (at_s < cols / probe.pixel_clock_hz)], np.zeros(1)) * probe.pixel_clock_hz
     return Contribution(
         u_x_px=float(shift.std()), u_y_px=0.0, bias_x_px=float(shift.mean()), gum_class="D", model_error=0.15, floor_px=0.01,
         method="shift of the samples in frame 0 over all columns",

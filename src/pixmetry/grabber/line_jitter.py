@@ -6,10 +6,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from pixmetry.core.contribution import Contribution, Probe
-from pixmetry.core.line import alike_rows, row_response, u_from_row_delays
+from pixmetry.core.contribution import Contribution, Probe, smooth_part
+from pixmetry.core.line import alike_rows, from_row_delays, from_steady_delays
 from pixmetry.core.random import Grid, Stream
-from pixmetry.core.signal import Clock, Kind, Signal
+from pixmetry.core.signal import Kind, Signal
 from pixmetry.core.source import Parameters, Source, quantity
 
 
@@ -60,32 +60,34 @@ def truth(params: LineJitter, signal: Signal, stream: Stream) -> Mapping[str, np
     return {"row_shift_px": delay_s(params, signal.grid, signal.frame_shape[0], stream) * signal.clock.pixel_hz}
 
 
-def near(params: LineJitter) -> tuple[int, int, int, int]:
-    """Pixels of the usual clock by which a row may be shifted, to either side."""
+def near(params: LineJitter, pixel_hz: float, row_px: int) -> tuple[int, int, int, int]:
+    """Pixels by which a row may be shifted, to either side."""
     worst = 7 * np.hypot(params.white_ns, params.loop_ns) + abs(params.settling_ns) + abs(params.shear_ns)
-    reach = int(np.ceil(worst * 1e-9 * Clock.pixel_hz))
+    reach = int(np.ceil(worst * 1e-9 * pixel_hz))
     return 0, 0, reach, reach
 
 
-def tail(params: LineJitter) -> float:
+def tail(params: LineJitter, pixel_hz: float, row_px: int) -> float:
     """Nothing comes from farther away (a normal number beyond 6.8 standard deviations is not drawn)."""
     return 0.0
 
 
 def propagate(params: LineJitter, probe: Probe) -> Contribution:
-    """Independent and carried-on delays by the response of the estimator to each row; the steady part by its scatter over the frame.
+    """Independent and carried-on delays by the answer of the camera's line and of the estimator to the delay of each row.
 
-    Holds for a line that is smooth between its samples. A row that falls between the pixels is also a little smoother, so that less of it
-    stands above a threshold: that moves y by some hundredths of what x moves.
+    The steady part is seen at places down the frame; what a cubic of the row follows of it is smooth.
     """
-    to_px = 1e-9 * Clock.pixel_hz
-    u = u_from_row_delays(probe, params.white_ns * to_px, params.loop_ns * to_px, params.loop_rows, params.stride)
-    each = row_response(probe).mean(axis=0)
-    first = np.arange(max(probe.frame_shape[0] - len(each), 0) + 1)
-    steady = systematic_s(params, first[:, None] + np.arange(len(each)), probe.frame_shape[0]) * Clock.pixel_hz @ each
+    (u_x, u_y), (bias_x, bias_y) = from_row_delays(
+        probe, 1e-9 * params.white_ns, 1e-9 * params.loop_ns, params.loop_rows, params.stride
+    )
+    dx = dy = smooth_x = np.zeros(1)
+    if params.settling_ns or params.shear_ns:
+        dx, dy, first = from_steady_delays(probe, lambda rows: systematic_s(params, rows, probe.frame_shape[0]))
+        smooth_x = smooth_part(dx, first)
     return Contribution(
-        u_x_px=float(np.hypot(u, steady.std())), u_y_px=0.0, bias_x_px=float(steady.mean()), gum_class="Tr", model_error=0.3,
-        floor_px=max(2e-4, 0.03 * u), method="response of the estimator to the shift of each row",
+        u_x_px=float(np.hypot(u_x, dx.std())), u_y_px=float(np.hypot(u_y, dy.std())), bias_x_px=float(bias_x + dx.mean()),
+        bias_y_px=float(bias_y + dy.mean()), gum_class="Tr", model_error=0.15, time_px=(u_x, u_y), smooth_px=(float(smooth_x.std()), 0.0),
+        method="response of the estimator, behind the camera's line, to the delay of each row",
     )  # fmt: skip
 
 

@@ -8,9 +8,9 @@ from typing import Literal
 import numpy as np
 
 from pixmetry.core.contribution import Contribution, Probe
-from pixmetry.core.line import Line, group_delay_s, reach_px, through_line
+from pixmetry.core.line import group_delay_s, reach_px, through_line
 from pixmetry.core.random import Stream
-from pixmetry.core.signal import Clock, Kind, Signal
+from pixmetry.core.signal import Kind, Signal
 from pixmetry.core.source import Parameters, Source, quantity
 
 SHARE_BEYOND = 1e-4  # of a step, beyond the near context
@@ -57,12 +57,12 @@ def forward(params: LowPass, signal: Signal, stream: Stream) -> Signal:
     return signal.with_line(signal.line.filtered(params.zeros, params.poles))
 
 
-def near(params: LowPass) -> tuple[int, int, int, int]:
-    """Pixels of the usual clock to the left that still reach a pixel."""
-    return 0, 0, 0 if params.kind == "off" else reach_px(params.zeros, params.poles, SHARE_BEYOND, Clock.pixel_hz), 0
+def near(params: LowPass, pixel_hz: float, row_px: int) -> tuple[int, int, int, int]:
+    """Pixels to the left that still reach a pixel."""
+    return 0, 0, 0 if params.kind == "off" else reach_px(params.zeros, params.poles, SHARE_BEYOND, pixel_hz), 0
 
 
-def tail(params: LowPass) -> float:
+def tail(params: LowPass, pixel_hz: float, row_px: int) -> float:
     """What is left of a step there."""
     return 0.0 if params.kind == "off" else SHARE_BEYOND
 
@@ -73,10 +73,10 @@ def delay_s(params: LowPass) -> float:
 
 
 def propagate(params: LowPass, probe: Probe) -> Contribution:
-    """The target behind the filter, at the usual pixel clock."""
+    """The target behind the filter, on the rest of the camera's line."""
     if params.kind == "off":
         return Contribution(u_x_px=0.0, u_y_px=0.0, gum_class="G", method="no filter")
-    return through_line(Line(Clock.pixel_hz, Clock.pixel_hz).filtered(params.zeros, params.poles), probe)
+    return through_line(probe, lambda line: line.filtered(params.zeros, params.poles))
 
 
 SOURCE = Source(

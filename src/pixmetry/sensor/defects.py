@@ -97,12 +97,7 @@ def _of_groups(params: Defects, probe: Probe, phase: int) -> np.ndarray:
 def _powers(probe: Probe, phase: int, groups: np.ndarray, changed_dn: np.ndarray) -> np.ndarray:
     """Sum over groups of pixels, masks (groups, rows, cols), of the second and fourth power of the shift when one has changed values."""
     base, changed_dn = probe.signal_dn[phase], np.minimum(changed_dn, probe.saturation_dn)
-    if probe.locate is None:
-        error = groups * (changed_dn - base)
-        shifts = np.array([(g[phase] * error).sum(axis=(1, 2)) for g in (probe.gx, probe.gy)])
-    else:
-        x, y = probe.locate(np.where(groups, changed_dn, base))
-        shifts = np.array([x - probe.x_hat_px[phase], y - probe.y_hat_px[phase]])
+    shifts = np.array(probe.moved(np.where(groups, changed_dn, base), phase))
     return np.nansum([shifts**2, shifts**4], axis=2)  # a target that is lost with the group has no position
 
 
@@ -138,8 +133,7 @@ def _of_singles(probe: Probe, phase: int, changed_dn: np.ndarray) -> np.ndarray:
     at = np.flatnonzero(changed_dn != base)
     windows = np.repeat(base.reshape(1, -1), len(at), axis=0)
     windows[np.arange(len(at)), at] = changed_dn.ravel()[at]
-    x, y = probe.locate(windows.reshape(-1, *base.shape))
-    shifts = np.array([x - probe.x_hat_px[phase], y - probe.y_hat_px[phase]])
+    shifts = np.array(probe.moved(windows.reshape(-1, *base.shape), phase))
     return np.nansum([shifts**2, shifts**4], axis=2)  # a target that is lost with its only pixel has no position
 
 

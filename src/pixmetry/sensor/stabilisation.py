@@ -54,9 +54,9 @@ def truth(params: Stabilisation, signal: Signal, stream: Stream) -> Mapping[str,
 
 def propagate(params: Stabilisation, probe: Probe) -> Contribution:
     """Displacement, and rotation times the distance from the centre, for targets anywhere in the frame."""
-    rows, cols = probe.signal_dn.shape[1:]
+    size = min(probe.signal_dn.shape[1:])
     mean_square = [  # of evenly spread places at which the target's window fits into the frame
-        ((side - 1 - 2 * (size // 2 + 1)) ** 2 / 12) for side, size in zip(probe.frame_shape, (rows, cols), strict=True)
+        ((side - 1 - 2 * (size // 2 + 1)) ** 2 / 12) for side in probe.frame_shape
     ]
     ux = np.sqrt(params.shift_std_px**2 + params.roll_std_rad**2 * mean_square[0])
     uy = np.sqrt(params.shift_std_px**2 + params.roll_std_rad**2 * mean_square[1])

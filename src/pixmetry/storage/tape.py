@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
 
-from pixmetry.core.contribution import Contribution, Probe
-from pixmetry.core.line import Line, alike_rows, group_delay_s, reach_px, row_response, through_line, u_from_row_delays
+from pixmetry.core.contribution import Contribution, Probe, smooth_part
+from pixmetry.core.line import Line, alike_rows, from_row_delays, from_steady_delays, group_delay_s, held_of, reach_px, through_line
 from pixmetry.core.random import Grid, Stream
-from pixmetry.core.signal import Clock, Kind, Signal, Windows
+from pixmetry.core.signal import Kind, Signal, Windows
 from pixmetry.core.source import Parameters, Source, quantity
 
 SHARE_BEYOND = 1e-4  # of a step, beyond the near context
@@ -136,36 +137,44 @@ def context(params: Tape, windows: Windows, frame_shape: tuple[int, int]) -> Win
     return windows.expand(2, 0, 0, 0, frame_shape) if fills else windows
 
 
-def near(params: Tape) -> tuple[int, int, int, int]:
-    """Pixels of the usual clock that reach a sample, with the time-base error to either side."""
+def near(params: Tape, pixel_hz: float, row_px: int) -> tuple[int, int, int, int]:
+    """Pixels that reach a sample, with the time-base error to either side."""
     if params.generations == 0:
         return 0, 0, 0, 0
     spread = 7 * params.grown * np.hypot(params.white_ns, params.wow_ns) + params.generations * abs(params.head_switch_ns)
-    moved = int(np.ceil((spread * 1e-9 + group_delay_s([], params.poles)) * Clock.pixel_hz))
-    return 2, 0, reach_px([], params.poles, SHARE_BEYOND, Clock.pixel_hz) + moved, moved
+    moved = int(np.ceil((spread * 1e-9 + group_delay_s([], params.poles)) * pixel_hz))
+    return 2, 0, reach_px([], params.poles, SHARE_BEYOND, pixel_hz) + moved, moved
 
 
-def tail(params: Tape) -> float:
+def tail(params: Tape, pixel_hz: float, row_px: int) -> float:
     """What is left of a step there."""
     return SHARE_BEYOND if params.generations else 0.0
 
 
 def propagate(params: Tape, probe: Probe) -> Contribution:
-    """Noise with its spectrum (P1), delays of the rows, and the smear of the bandwidth; the heads' step by its scatter."""
+    """Noise with its spectrum (P1), delays of the rows behind the bandwidth, and its smear; the heads' step at places down the frame."""
     if params.generations == 0:
         return Contribution(u_x_px=0.0, u_y_px=0.0, gum_class="Tr", method="no tape")
-    line = Line(Clock.pixel_hz, Clock.pixel_hz).filtered([], params.poles)
-    smear = through_line(line.delayed(np.full((1, 1), -line.delay_s)), probe)
-    taps = _taps(params.bandwidth_mhz * 1e6, Clock.pixel_hz, ()) * params.noise_dn * params.grown
-    to_px = 1e-9 * Clock.pixel_hz * params.grown
-    rows = u_from_row_delays(probe, params.white_ns * to_px, params.wow_ns * to_px, params.wow_rows, 2)
-    each = row_response(probe).mean(axis=0)
-    first = np.arange(max(probe.frame_shape[0] - len(each), 0) + 1)
-    step = steady_s(params, first[:, None] + np.arange(len(each)), probe.frame_shape[0]) * Clock.pixel_hz @ each
-    noise = [float(np.sqrt((np.apply_along_axis(np.convolve, 2, g, taps) ** 2).sum(axis=(1, 2)).mean())) for g in (probe.gx, probe.gy)]
+    held = held_of(probe)
+    common = group_delay_s([], params.poles)
+
+    def band(line: Line) -> Line:
+        return line.filtered([], params.poles).delayed(np.full((1, 1), -common))
+
+    smear = through_line(probe, band)
+    behind = tuple((z.tobytes(), p.tobytes()) for z, p in held.line.filters[held.ahead :])
+    taps = _taps(params.bandwidth_mhz * 1e6, held.line.sample_clock_hz, behind) * params.noise_dn * params.grown
+    noise = [float(np.sqrt((np.apply_along_axis(np.convolve, 2, g, taps) ** 2).sum(axis=(1, 2)).mean())) for g in (held.gx, held.gy)]
+    played = replace(probe, held=replace(held, line=band(held.line)))
+    late = 1e-9 * params.grown
+    rows, _ = from_row_delays(played, late * params.white_ns, late * params.wow_ns, params.wow_rows, 2)
+    step, _, first = from_steady_delays(played, lambda rows: steady_s(params, rows, probe.frame_shape[0]))
+    smooth = smooth_part(step, first)
+    time = float(np.hypot(noise[0], rows[0])), float(np.hypot(noise[1], rows[1]))
     return Contribution(
-        u_x_px=float(np.sqrt(noise[0] ** 2 + rows**2 + step.var() + smear.u_x_px**2)), u_y_px=float(np.hypot(noise[1], smear.u_y_px)),
-        bias_x_px=smear.bias_x_px + float(step.mean()), bias_y_px=smear.bias_y_px, gum_class="Tr", model_error=0.4,
+        u_x_px=float(np.sqrt(time[0] ** 2 + step.var() + smear.u_x_px**2)), u_y_px=float(np.hypot(time[1], smear.u_y_px)),
+        bias_x_px=smear.bias_x_px + float(step.mean()), bias_y_px=smear.bias_y_px, gum_class="Tr", model_error=0.4, time_px=time,
+        smooth_px=(float(smooth.std()), 0.0),
         method="noise of the tape's spectrum, delays of the rows, and the target after its bandwidth; dropouts are outliers apart",
     )  # fmt: skip
 
