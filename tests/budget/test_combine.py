@@ -51,6 +51,15 @@ def test_a_calibration_takes_up_what_is_constant_or_smooth_but_nothing_that_drif
     assert combine(ROWS, frames=9, targets=4).left_x_px == pytest.approx((1.25 + 1 + 8) ** 0.5)
 
 
+def test_known_biases_add_with_their_signs() -> None:
+    """x: 2 of T and −2 of D cancel, but not once a calibration has taken up that of T; y: −1 of F."""
+    got = combine(ROWS, signed=True)
+    assert (got.bias_x_px, got.bias_y_px) == (0.0, 1.0) and got.left_x_px == pytest.approx(57**0.5)
+    delays = [Contribution(0.0, 0.0, "G", bias_x_px=b) for b in (0.9, 0.3)]
+    assert combine(delays, signed=True).total_x_px == pytest.approx(1.2) and combine(delays).total_x_px == pytest.approx(0.9**0.5)
+    assert combine(delays, signed=True).calibrated_px == 0.0
+
+
 def test_parts_that_are_told_go_before_the_class() -> None:
     """A shift of rows: 3 in time, 4 smoothly over the rows, 12 from place to place: 13 in all."""
     c = Contribution(13.0, 0.0, "Tr", bias_x_px=1.0, time_px=(3.0, 0.0), smooth_px=(4.0, 0.0))

@@ -78,7 +78,7 @@ class BudgetRow:
 
 @dataclass(frozen=True)
 class Interaction:
-    """Everything at once against the root sum of squares of everything alone, both by Monte Carlo, in px.
+    """Everything at once against the sum of everything alone (u as squares, biases as they are), both by Monte Carlo, in px.
 
     ``unsteady_px`` is the part of the sources that drift or belong to the object, which the frames of a Monte Carlo hold still.
     """
@@ -270,7 +270,7 @@ def compute_budget(
         advise(rows, verdicts[0], everything[0]),
         interaction,
         found,
-        tuple(combine([r.contribution for r in decided], frames=n) for n in frames),
+        tuple(combine([r.contribution for r in decided], frames=n, signed=True) for n in frames),
     )
 
 
@@ -357,8 +357,13 @@ def _simulated(row: BudgetRow, design: Trials, camera: Camera, say: Callable[[st
 
 def _interaction(rows: Sequence[BudgetRow], design: Trials) -> Interaction:
     alone = [r.monte_carlo for r in rows if r.monte_carlo is not None]
-    total = float(np.sqrt(sum(m.total_px**2 for m in alone)))
-    error = float(np.sqrt(sum((m.total_px * m.se_total_px) ** 2 for m in alone)) / total) if total else 0.0
+    square, varies = 0.0, 0.0  # biases add with their signs
+    for axes in ([m.x for m in alone], [m.y for m in alone]):
+        bias = sum(a.bias for a in axes)
+        square += 0.5 * (sum(a.u**2 for a in axes) + bias**2)
+        varies += 0.25 * sum((a.u * a.se_u) ** 2 + (bias * a.se_bias) ** 2 for a in axes)
+    total = float(np.sqrt(square))
+    error = float(np.sqrt(varies)) / total if total else 0.0
     drifting = [r.monte_carlo for r in rows if r.monte_carlo and r.contribution and r.contribution.gum_class in UNSTEADY]
     unsteady = float(np.sqrt(sum(max(m.total_px**2 - m.calibrated_px**2, 0.0) for m in drifting)))
     return Interaction(design.of(), total, error, unsteady)

@@ -45,17 +45,19 @@ class Combined:
         return float(np.sqrt(0.5 * (self.left_x_px**2 + self.left_y_px**2)))
 
 
-def combine(contributions: Iterable[Contribution], frames: int = 1, targets: int = 1) -> Combined:
+def combine(contributions: Iterable[Contribution], frames: int = 1, targets: int = 1, signed: bool = False) -> Combined:
     """Combine the contributions to the mean position over ``frames`` frames and ``targets`` targets.
+
+    ``signed``: the biases are of one camera whose sources are known, and add with their signs; else each may have either.
 
     Notes
     -----
     u² = Σ time_i²/(frames · targets) + place_i²/targets + smooth_i², x and y apart (JCGM 100:2008, 5.1.2; uncorrelated contributions); for
     the classes D and O, which the next frames and targets share, Σ u_i². What a calibration leaves is the same without what is smooth
     and without the biases, but for D and O, of which it takes nothing up. No number of frames lowers a bias.
-    A bias that is not corrected, and whose sign another camera would have the other way, enters as the root sum of squares with the
-    others: b² = Σ b_i², and the total is √(u² + b²) (cf. JCGM 100:2008, F.2.4.5, which would rather have it corrected; that is what the
-    advice says too).
+    Biases whose signs are known add as they are, b = Σ b_i: two filters delay a line by the sum of their delays. A bias whose sign another
+    camera would have the other way enters as the root sum of squares with the others, b² = Σ b_i². The total is √(u² + b²) (cf. JCGM
+    100:2008, F.2.4.5, which would rather have a bias corrected; that is what the advice says too).
 
     Raises
     ------
@@ -64,14 +66,19 @@ def combine(contributions: Iterable[Contribution], frames: int = 1, targets: int
     """
     if frames < 1 or targets < 1:
         raise InputError("nothing to average", value=(frames, targets), allowed="1 or more frames and targets")
-    squares = np.zeros((3, 2))
+    squares, sums, unsteady = np.zeros((3, 2)), np.zeros(2), np.zeros(2)
     for c in contributions:
         u, bias, time, smooth, place = (np.square(v) for v in (c.u_px, c.bias_px, c.time_px, c.smooth_px, c.place_px))
+        sums += c.bias_px
         if c.gum_class in UNSTEADY:
-            squares += [u, bias, u + bias]
+            unsteady += c.bias_px
+            squares += [u, bias, u + (0 if signed else bias)]
         else:
             left = time / (frames * targets) + place / targets
             squares += [left + smooth, bias, left]
+    if signed:
+        squares[1] = sums**2
+        squares[2] += unsteady**2
     u_x, u_y, bias_x, bias_y, left_x, left_y = np.sqrt(squares).ravel().tolist()
     return Combined(u_x, u_y, bias_x, bias_y, left_x, left_y, frames, targets)
 

@@ -71,9 +71,9 @@ def headline(
     over the places, Var(s²)/n = (κ − 1) s⁴/n: by the scatter that it shows, and by the kurtosis κ that a contribution declares, for an
     error that few targets have may be missing from it altogether. What the simulated camera does not hold is added to it as squares.
     """
-    sums = tuple(combine((r.contribution for r in rows), frames=n) for n in frames)
+    sums = tuple(combine((r.contribution for r in rows), frames=n, signed=True) for n in frames)
     held = [r for r in rows if r.monte_carlo is not None]
-    by_formula = combine(r.contribution for r in held).total_px
+    by_formula = combine((r.contribution for r in held), signed=True).total_px
     if together is None or not held:
         return Headline(SUM, by_formula, float("nan"), float("nan"), 0.0, "The sum of the contributions; no Monte Carlo was made."), sums
     error, u_sum = _error(together, held), _model_error(held)
@@ -86,7 +86,7 @@ def headline(
         why = "The sum of the contributions; one Monte Carlo with all of them at once agrees with it within their errors."
         return replace(found, why=why), sums
     others = [r for r in rows if r.monte_carlo is None]
-    simulated = tuple(_simulated(together, combine((r.contribution for r in others), frames=n), unsteady_px) for n in frames)
+    simulated = tuple(_simulated(together, combine((r.contribution for r in others), frames=n, signed=True), unsteady_px) for n in frames)
     return replace(found, by=MONTE_CARLO, why=_why(found, held, in_chain)), simulated
 
 
@@ -100,7 +100,7 @@ def _error(together: MonteCarlo, rows: Sequence[Any]) -> float:
 
 def _model_error(rows: Sequence[Any]) -> float:
     """Standard uncertainty of the sum from the model errors of its parts: of a half-width that the model declares, taken as k = 2."""
-    total = combine(r.contribution for r in rows).total_px
+    total = combine((r.contribution for r in rows), signed=True).total_px
     parts = [(max(c.model_error * c.total_px, c.floor_px) * c.total_px) ** 2 for c in (r.contribution for r in rows)]
     return 0.5 * float(np.sqrt(sum(parts))) / total if total else 0.0
 

@@ -276,7 +276,7 @@ def _sums(budget: Budget) -> list[dict[str, Any]]:
     ]
     alone = [r.monte_carlo for r in budget.rows if r.monte_carlo is not None]
     if alone:
-        rows.append(row("Each source alone by Monte Carlo, added as squares", _sum_of(alone, "x"), _sum_of(alone, "y")))
+        rows.append(row("Each source alone by Monte Carlo, added", _sum_of(alone, "x"), _sum_of(alone, "y")))
     if budget.interaction is not None:
         together = [budget.interaction.together]
         rows.append(row("One Monte Carlo with all sources on", _sum_of(together, "x"), _sum_of(together, "y"), True))
@@ -285,7 +285,7 @@ def _sums(budget: Budget) -> list[dict[str, Any]]:
 
 
 def _sum_of(results: list[MonteCarlo], axis: str) -> float:
-    return float(np.sqrt(sum(getattr(m, axis).u ** 2 + getattr(m, axis).bias ** 2 for m in results)))
+    return float(np.hypot(np.sqrt(sum(getattr(m, axis).u ** 2 for m in results)), sum(getattr(m, axis).bias for m in results)))
 
 
 def _interaction(budget: Budget) -> str:
