@@ -95,7 +95,8 @@ def main() -> None:
     dark, bright = scene(30, 0.8), scene(30, 3.0)
 
     def bloom(up: float = UP) -> Callable[[np.ndarray], np.ndarray]:
-        return lambda data: spill(data, FULL, 1.0, 0.0, up, 1.0, False)
+        zero = np.zeros(1, np.int64)
+        return lambda data: spill(data, FULL, 1.0, 0.0, up, 1.0, False, False, np.uint64(0), zero, zero)
 
     cases = [
         ("smear, all rows", lambda d: add_column_sums(d, factor), numpy_all, dark, REPEATS, "smear"),

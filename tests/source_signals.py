@@ -6,6 +6,7 @@ import numpy as np
 
 from pixmetry.core.contribution import Probe
 from pixmetry.core.estimates import Estimates
+from pixmetry.core.quiet import QuietStreams
 from pixmetry.core.random import Grid, Stream
 from pixmetry.core.signal import Kind, Signal
 
@@ -18,6 +19,11 @@ def stream(seed: int | None = None) -> Stream:
     """A stream of a unit and of exposures that nobody has seen before."""
     draw = np.random.default_rng(seed)
     return Stream(int(draw.integers(2**62)), int(draw.integers(2**62)), "source under test")
+
+
+def quiet():
+    """A stream of which every draw is at its mean: electrons move by their shares."""
+    return QuietStreams(0, 0).of("source under test")
 
 
 def signal(data: np.ndarray, kind: Kind = Kind.ELECTRONS, row0: int = 0, col0: int = 0, frame_shape=None, **schedule) -> Signal:

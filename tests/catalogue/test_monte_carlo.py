@@ -47,8 +47,8 @@ def windows(unit: int) -> Grid:
 
 
 def exposed(camera: Camera, scene: object, unit: int, quiet: bool = False) -> np.ndarray:
-    """Windows of one unit of this type of camera; a source with a memory has settled on the background."""
-    mode = "exact" if all(e.source.start is None for e in camera.active) else "frozen"
+    """Windows of one unit of this type of camera; a source with a memory has settled on the background, a far context is the budget's."""
+    mode = "exact" if all(e.source.start is None and e.source.near is None for e in camera.active) else "frozen"
     camera = replace(camera, unit_seed=unit)
     return camera.expose_windows(scene, windows(unit), seed=unit, mode=mode, background=Flat(BACKGROUND_DN), quiet=quiet).astype(float)
 

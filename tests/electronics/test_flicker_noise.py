@@ -77,3 +77,18 @@ def test_rows_narrower_than_the_line_leave_the_blanking_out():
 def test_frames_are_independent_of_each_other():
     noise = many(FlickerNoise(rms_e=1.0, octaves=12), (1, 1), 20_000)[:, 0, 0]
     assert abs(np.corrcoef(noise[1:], noise[:-1])[0, 1]) < 1.1 * Z / np.sqrt(len(noise))
+
+
+def test_follows_the_fields_in_time():
+    """Row 2l of the woven frame is as near to row 2l + 2 as rows that are read one after the other are; to row 2l + 1 it is 312 lines.
+
+    At 1e-6, correlations are known to 0.04 from 16 000 frames; rows in the order of the frame would show 0.74 between neighbours.
+    """
+    params = FlickerNoise(rms_e=7.0, octaves=16, line_px=100, interlaced=True, field_lines=12.5)
+    n = 16_000
+    rows = many(params, (5, 2), n, row0=7, col0=30, frame_shape=(24, 90))[:, :, 0]
+    got = np.corrcoef(rows.T)
+    times = np.array([r // 2 + 12.5 * (r % 2) for r in range(7, 12)]) * 100
+    want = covariance(params, times[:, None] - times) / 49
+    assert np.abs(got - want).max() < 5 * np.sqrt(1.3 / n)
+    assert got[1, 3] > got[1, 2] + 0.1

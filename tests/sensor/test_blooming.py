@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter
 
 from pixmetry.sensor.blooming import Blooming, forward
-from source_signals import signal, stream
+from source_signals import quiet, signal
 
 FULL = 1000.0
 
@@ -48,7 +48,7 @@ def spilled_by_equations(charge: np.ndarray, p: Blooming) -> np.ndarray:
 
 def bloomed(charge: np.ndarray, p: Blooming) -> np.ndarray:
     """One column through the source."""
-    return forward(p, signal(np.asarray(charge)[None, :, None]), stream()).data[0, :, 0].astype(float)
+    return forward(p, signal(np.asarray(charge)[None, :, None]), quiet()).data[0, :, 0].astype(float)
 
 
 @settings(max_examples=300, deadline=None)
@@ -101,12 +101,12 @@ def test_shift_of_a_disc_with_more_charge_going_down(diameter: float, over: floa
     The values belong to an independent iteration with its own rendering; 4 % cover the difference in the peak.
     """
     charge = over * FULL * disc(diameter)
-    out = forward(Blooming(full_well_e=FULL, up_share=0.4), signal(charge[None]), stream()).data[0].astype(float)
+    out = forward(Blooming(full_well_e=FULL, up_share=0.4), signal(charge[None]), quiet()).data[0].astype(float)
     assert out.max() <= FULL
     assert out.sum() == pytest.approx(charge.sum(), rel=1e-6)
     y = (out.sum(axis=1) * (np.arange(401) - 200)).sum() / out.sum()
     assert y == pytest.approx(shift, rel=0.04)
-    even = forward(Blooming(full_well_e=FULL), signal(charge[None]), stream()).data[0].astype(float)
+    even = forward(Blooming(full_well_e=FULL), signal(charge[None]), quiet()).data[0].astype(float)
     assert (even.sum(axis=1) * (np.arange(401) - 200)).sum() / even.sum() == pytest.approx(0, abs=1e-4)
 
 
@@ -131,5 +131,5 @@ def test_a_knee_spills_a_part_of_the_charge_before_the_well_is_full_and_keeps_it
 def test_charge_stays_in_its_column() -> None:
     data = np.zeros((1, 31, 5))
     data[0, 15, 2] = 9 * FULL
-    out = forward(Blooming(full_well_e=FULL), signal(data), stream()).data[0]
+    out = forward(Blooming(full_well_e=FULL), signal(data), quiet()).data[0]
     assert out[:, 2].sum() == pytest.approx(9 * FULL) and out[:, [0, 1, 3, 4]].sum() == 0

@@ -8,7 +8,7 @@ import pytest
 from pixmetry.core.errors import ParameterError
 from pixmetry.core.signal import Kind, Windows
 from pixmetry.sensor.charge_transfer import SOURCE, ChargeTransfer, near, tail
-from source_signals import K_DN_PER_E, centroid, flat, signal, spot_probe, spots, stream
+from source_signals import K_DN_PER_E, centroid, flat, quiet, signal, spot_probe, spots
 
 
 def impulse(row: int, after: int, params: ChargeTransfer, electrons: float = 10_000.0) -> np.ndarray:
@@ -16,7 +16,7 @@ def impulse(row: int, after: int, params: ChargeTransfer, electrons: float = 10_
     data = np.zeros((1, after + 1, 1))
     data[0, 0, 0] = electrons
     frame = signal(data, row0=row, frame_shape=(row + after + 1, 1))
-    return SOURCE.forward(params, frame, stream()).data[0, :, 0].astype(float)
+    return SOURCE.forward(params, frame, quiet()).data[0, :, 0].astype(float)
 
 
 def test_share_that_is_left_after_2048_pixels_of_four_phases():
@@ -49,7 +49,7 @@ def clock_out(column: np.ndarray, loss: float, phases: int) -> np.ndarray:
 def test_agrees_with_packets_clocked_one_by_one():
     """Deferred charge within 2 % of itself, in a column of random packets that loses up to 12 % of each."""
     column = np.random.default_rng().uniform(0, 1000, 60) * (np.arange(60) % 7 == 0)
-    out = SOURCE.forward(ChargeTransfer(parallel_cti=1e-3, phases=2), signal(column[None, :, None]), stream()).data[0, :, 0]
+    out = SOURCE.forward(ChargeTransfer(parallel_cti=1e-3, phases=2), signal(column[None, :, None]), quiet()).data[0, :, 0]
     expected = clock_out(column, 1e-3, 2)
     moved = np.abs(expected - column).max()
     assert moved > 30 * (column.max() > 500)
@@ -59,8 +59,8 @@ def test_agrees_with_packets_clocked_one_by_one():
 def test_parallel_trails_point_away_from_row_0_and_serial_ones_from_column_0():
     data = np.zeros((1, 50, 50))
     data[0, 20, 30] = 1e4
-    down = SOURCE.forward(ChargeTransfer(parallel_cti=1e-3), signal(data), stream()).data[0]
-    along = SOURCE.forward(ChargeTransfer(serial_cti=1e-3), signal(data), stream()).data[0]
+    down = SOURCE.forward(ChargeTransfer(parallel_cti=1e-3), signal(data), quiet()).data[0]
+    along = SOURCE.forward(ChargeTransfer(serial_cti=1e-3), signal(data), quiet()).data[0]
     assert down[21, 30] > 100 and down[:20].max() == 0 and down[:, 31].max() == 0
     assert along[20, 31] > 100 and along[:, :30].max() == 0 and along[21].max() == 0
     assert down[20, 30] == pytest.approx(1e4 * (1 - 1e-3) ** 21, rel=1e-6)
@@ -77,9 +77,9 @@ def test_small_packets_lose_more():
 
 def test_packets_below_zero_do_not_trouble_their_neighbours():
     data = np.full((1, 6, 2), 1000.0)
-    clean = SOURCE.forward(ChargeTransfer(parallel_cti=1e-4, beta=0.5), signal(data), stream()).data
+    clean = SOURCE.forward(ChargeTransfer(parallel_cti=1e-4, beta=0.5), signal(data), quiet()).data
     data[0, :, 0] = -5.0
-    mixed = SOURCE.forward(ChargeTransfer(parallel_cti=1e-4, beta=0.5), signal(data), stream()).data
+    mixed = SOURCE.forward(ChargeTransfer(parallel_cti=1e-4, beta=0.5), signal(data), quiet()).data
     assert np.array_equal(mixed[0, :, 1], clean[0, :, 1])
     assert np.array_equal(mixed[0, :, 0], np.full(6, -5, np.float32))
 
@@ -88,7 +88,7 @@ def test_packets_below_zero_do_not_trouble_their_neighbours():
 def test_inversion_brings_the_charge_back(beta):
     params = ChargeTransfer(parallel_cti=1e-4, serial_cti=5e-5, trail_px=2.0, beta=beta, reference_e=5000)
     scene = signal(np.random.default_rng().uniform(500, 5000, (1, 300, 200)))
-    moved = SOURCE.forward(params, scene, stream())
+    moved = SOURCE.forward(params, scene, quiet())
     back = SOURCE.correct(params, moved, {})
     assert np.abs(moved.data - scene.data).max() > 50
     assert np.abs(back.data - scene.data).max() < 0.05
@@ -127,7 +127,7 @@ def test_shift_of_a_spot_at_the_centre_and_over_the_frame():
     shifts = []
     for row0 in rows:
         frame = signal(image, row0=int(row0), frame_shape=(480, 640))
-        shifts.append(centroid(SOURCE.forward(params, frame, stream()).data.astype(float))[1][0] - 30)
+        shifts.append(centroid(SOURCE.forward(params, frame, quiet()).data.astype(float))[1][0] - 30)
     expected = (rows + 31) * 2e-5 * 2
     assert np.allclose(shifts, expected, rtol=0.02)
     assert got.u_y_px == pytest.approx(got.bias_y_px / np.sqrt(3), rel=0.02)
@@ -163,11 +163,11 @@ def test_delays_follow_their_law_exactly(trail):
 def test_register_and_columns_do_the_same_and_columns_come_first():
     data = np.random.default_rng().uniform(0, 5000, (2, 40, 40))
     for extra in ({}, {"beta": 0.6}):
-        down = SOURCE.forward(ChargeTransfer(parallel_cti=2e-3, **extra), signal(data), stream()).data
-        along = SOURCE.forward(ChargeTransfer(serial_cti=2e-3, **extra), signal(data.swapaxes(1, 2)), stream()).data
+        down = SOURCE.forward(ChargeTransfer(parallel_cti=2e-3, **extra), signal(data), quiet()).data
+        along = SOURCE.forward(ChargeTransfer(serial_cti=2e-3, **extra), signal(data.swapaxes(1, 2)), quiet()).data
         assert along.swapaxes(1, 2) == pytest.approx(down, rel=1e-6)
-        both = SOURCE.forward(ChargeTransfer(parallel_cti=2e-3, serial_cti=1e-3, **extra), signal(data), stream()).data
-        after = SOURCE.forward(ChargeTransfer(serial_cti=1e-3, **extra), signal(down), stream()).data
+        both = SOURCE.forward(ChargeTransfer(parallel_cti=2e-3, serial_cti=1e-3, **extra), signal(data), quiet()).data
+        after = SOURCE.forward(ChargeTransfer(serial_cti=1e-3, **extra), signal(down), quiet()).data
         assert np.array_equal(both, after)
 
 
@@ -209,7 +209,7 @@ def test_traps_agree_with_every_packet_over_every_pixel(density, release):
         fast_traps_per_px=density[0] if len(density) > 1 else 0, fast_release_px=release[0], slow_traps_per_px=density[-1],
         slow_release_px=release[-1], fill_beta=0.6, trap_well_e=50_000,
     )  # fmt: skip
-    out = SOURCE.forward(params, signal(columns[None]), stream()).data[0].astype(float)
+    out = SOURCE.forward(params, signal(columns[None]), quiet()).data[0].astype(float)
     for c in range(4):
         expected = over_traps(columns[:, c], density, release, 0.6, 50_000)
         moved = np.abs(expected - columns[:, c]).max()
@@ -221,7 +221,7 @@ def test_traps_keep_the_charge_and_trail_exponentially():
     data = np.zeros((1, 400, 1))
     data[0, 50] = 10_000
     params = ChargeTransfer(slow_traps_per_px=1.0, slow_release_px=10.0)
-    out = SOURCE.forward(params, signal(data), stream()).data[0, :, 0].astype(float)
+    out = SOURCE.forward(params, signal(data), quiet()).data[0, :, 0].astype(float)
     caught = 51 * (10_000 / 100_000) ** 0.5
     assert out.sum() == pytest.approx(10_000, rel=1e-6)
     assert 10_000 - out[50] == pytest.approx(caught, rel=1e-3)
@@ -234,21 +234,21 @@ def test_a_background_fills_the_traps():
     data = np.zeros((1, 300, 2))
     data[0, :, 1] = 500
     data[0, 200, :] += 3000
-    out = SOURCE.forward(ChargeTransfer(slow_traps_per_px=2.0), signal(data), stream()).data[0].astype(float)
+    out = SOURCE.forward(ChargeTransfer(slow_traps_per_px=2.0), signal(data), quiet()).data[0].astype(float)
     lost = data[0, 200] - out[200]
     assert lost[1] < 0.75 * lost[0]
 
 
 def test_traps_never_take_more_than_there_is():
     data = np.abs(np.random.default_rng().normal(0, 20, (1, 500, 20)))
-    out = SOURCE.forward(ChargeTransfer(slow_traps_per_px=50.0, traps_along="both"), signal(data), stream()).data
+    out = SOURCE.forward(ChargeTransfer(slow_traps_per_px=50.0, traps_along="both"), signal(data), quiet()).data
     assert out.min() >= -1e-4 and out.sum() < data.sum() * (1 + 1e-6)
 
 
 def test_traps_are_undone_by_the_inversion_and_reach_as_far_as_stated():
     params = ChargeTransfer(slow_traps_per_px=1.0, fast_traps_per_px=1.0, traps_along="both")
     scene = signal(np.random.default_rng().uniform(500, 5000, (1, 200, 150)))
-    moved = SOURCE.forward(params, scene, stream())
+    moved = SOURCE.forward(params, scene, quiet())
     assert np.abs(moved.data - scene.data).max() > 10
     assert np.abs(SOURCE.correct(params, moved, {}).data - scene.data).max() < 0.2
     assert near(params)[0] == near(params)[2] == 70  # 10 px · ln 1000

@@ -44,6 +44,13 @@ class _Quiet:
     def poisson(self, mean: np.ndarray, grid: Grid, draw: int = 0) -> np.ndarray:
         return _fresh(mean, grid)
 
+    def binomial(self, count: np.ndarray, share: Any, grid: Grid, draw: int = 0) -> np.ndarray:
+        return _fresh(np.asarray(count, np.float32) * np.asarray(share, np.float32), grid)
+
+    def key(self, kind: str, draw: int = 0) -> np.uint64:
+        """Of no draw: a kernel that is given it must ask for ``quiet``."""
+        return np.uint64(0)
+
     def add_normal(self, data: np.ndarray, grid: Grid, scale: Any, draw: int = 0) -> np.ndarray:
         return _fresh(data, grid)
 

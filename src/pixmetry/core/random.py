@@ -19,6 +19,7 @@ import numpy as np
 from numpy.random import Generator, Philox
 from numpy.typing import ArrayLike, NDArray
 
+from pixmetry.core import _binomial_kernels as binomial_kernels
 from pixmetry.core import _random_kernels as kernels
 from pixmetry.core.errors import ParameterError
 
@@ -192,6 +193,37 @@ class Stream:
             If a mean is negative, infinite or NaN.
         """
         return self._poisson(self._key("exposure", "poisson", draw), mean, grid)
+
+    def binomial(self, count: ArrayLike, share: ArrayLike, grid: Grid, draw: int = 0) -> NDArray[np.float32]:
+        """Return how many of each count go one way, each for itself with probability ``share``; shape (n, rows, cols), new in every frame.
+
+        Parameters
+        ----------
+        count : array_like, broadcast to (n, rows, cols), float32
+            Electrons, as a rule whole numbers. Of a part of one the share goes.
+        share : array_like, a number or broadcast to (n, rows, cols)
+            Between 0 and 1.
+        grid : Grid
+            Where.
+        draw : int
+            Which draw of this source.
+
+        Returns
+        -------
+        ndarray, shape (n, rows, cols), float32
+            By inversion: it never falls when the share rises. Exact for means below 12, above to 3e-4 of the cumulative probability.
+        """
+        p = np.asarray(share, np.float64)
+        p = np.ascontiguousarray(p.reshape((1,) * (3 - p.ndim) + p.shape))
+        if p.size and not (p.min() >= 0 and p.max() <= 1):
+            raise ParameterError("a share of charge lies outside 0 to 1", where="share", allowed="0 to 1")
+        out = np.empty(grid.size, np.float32)
+        binomial_kernels.binomial_windows(self.key("binomial", draw), grid.frame, grid.row0, grid.col0, _filled(count, grid), p, out)
+        return out
+
+    def key(self, kind: str, draw: int = 0) -> np.uint64:
+        """Return the key of temporal draws, for a kernel that draws for itself; ``kind`` names what it draws."""
+        return self._key("exposure", kind, draw)
 
     def add_normal(self, data: ArrayLike, grid: Grid, scale: ArrayLike, draw: int = 0) -> NDArray[np.float32]:
         """Return ``data + scale * self.normal(grid, draw)`` in one pass.

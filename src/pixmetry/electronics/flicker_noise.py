@@ -21,7 +21,14 @@ class FlickerNoise(Parameters):
     rms_e: float = quantity(0.0, "e-", "root mean square over all octaves", ge=0, le=1e5)
     corner_rel: float = quantity(0.1, "1", "frequency up to which it goes as 1/f, over the pixel clock", gt=0, le=0.5)
     octaves: int = quantity(16, "1", "octaves of 1/f below the corner; slower than the lowest, the density is level", ge=1, le=32)
-    line_px: float = quantity(908.0, "px", "pixel clocks from row to row; at least the row's pixels", ge=0, le=1e6)
+    line_px: float = quantity(908.0, "px", "pixel clocks from line to line; at least the row's pixels", ge=0, le=1e6)
+    interlaced: bool = quantity(False, "1", "whether even rows are read first, then odd ones")
+    field_lines: float = quantity(312.5, "1", "lines from the start of the first field to that of the second", gt=0, le=1e6)
+
+    def clocks(self, row: np.ndarray, cols: int) -> np.ndarray:
+        """Pixel clocks at which rows of so many pixels begin."""
+        line = row // 2 + self.field_lines * (row % 2) if self.interlaced else row
+        return line * max(self.line_px, float(cols))
 
 
 def octaves(params: FlickerNoise) -> list[tuple[float, float]]:
@@ -46,8 +53,7 @@ def forward(params: FlickerNoise, signal: Signal, stream: Stream) -> Signal:
         return signal
     data = np.array(signal.data, np.float32)
     n, rows, cols = data.shape
-    clocks = max(params.line_px, float(signal.frame_shape[1]))
-    first = (signal.rows * clocks + signal.grid.col0[:, None]).ravel()  # time of each row's first pixel
+    first = (params.clocks(signal.rows, signal.frame_shape[1]) + signal.grid.col0[:, None]).ravel()  # time of each row's first pixel
     lines = data.reshape(n * rows, cols)
     frame = np.repeat(signal.grid.frame, rows)
     for k, (period, share) in enumerate(octaves(params)):
@@ -71,14 +77,20 @@ def covariance(params: FlickerNoise, lag_px: np.ndarray) -> np.ndarray:
 
 
 def propagate(params: FlickerNoise, probe: Probe) -> Contribution:
-    """Propagator P1 with the covariance of the window's pixels at their times of read-out: u² = gᵀ C g."""
+    """Propagator P1 with the covariance of the window's pixels at their times of read-out: u² = gᵀ C g.
+
+    Of two fields, windows that begin on even and on odd rows weigh the same.
+    """
     rows, cols = probe.gx.shape[1:]
-    clocks = max(params.line_px, float(probe.frame_shape[1]))
-    time = (np.arange(rows)[:, None] * clocks + np.arange(cols)).ravel()
-    matrix = covariance(params, time[:, None] - time) * probe.gain_dn_per_e**2
-    flat = (g.reshape(len(g), -1) for g in (probe.gx, probe.gy))
-    u = tuple(float(np.sqrt(np.mean(np.einsum("pi,pi->p", g @ matrix, g)))) for g in flat)
-    return probe.contribution((u[0], u[1]), "T", model_error=0.12, method="linear response of the estimator to noise along the read-out")
+    flat = [g.reshape(len(g), -1) for g in (probe.gx, probe.gy)]
+    squares = np.zeros(2)
+    starts = (0, 1) if params.interlaced else (0,)
+    for start in starts:
+        time = (params.clocks(start + np.arange(rows), probe.frame_shape[1])[:, None] + np.arange(cols)).ravel()
+        matrix = covariance(params, time[:, None] - time) * probe.gain_dn_per_e**2
+        squares += [np.mean(np.einsum("pi,pi->p", g @ matrix, g)) / len(starts) for g in flat]
+    u = float(np.sqrt(squares[0])), float(np.sqrt(squares[1]))
+    return probe.contribution(u, "T", model_error=0.12, method="linear response of the estimator to noise along the read-out")
 
 
 SOURCE = Source(
@@ -94,7 +106,7 @@ SOURCE = Source(
     forward=forward,
     propagate=propagate,
     gum_class="T",
-    equation="n' = n + ζ(t),  t = r t_line + c t_pixel,  S_ζ(f) ∝ 1/f from f_c/2^octaves to f_c",
+    equation="n' = n + ζ(t),  t = r t_line + c t_pixel (r: line of the field),  S_ζ(f) ∝ 1/f from f_c/2^octaves to f_c",
     typical_size="0.009 px in y and 0.002 px in x per DN rms on a disc of 7 px (white noise: 0.004 px): the pixels of a row share it",
     references=(
         "R. F. Voss, J. Clarke, J. Acoust. Soc. Am. 63(1), 1978 (1/f noise as a sum of slow and fast ones)",

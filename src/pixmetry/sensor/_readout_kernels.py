@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from pixmetry.core._binomial_kernels import normal_of_place
 from pixmetry.core.jit import jit
 
 
@@ -82,6 +83,8 @@ def single(excess, row, rows, up, kept, barrier):
 def spill_column(q, full, up, kept, barrier, runs, first, last):
     """Let the charge of one column spill until no pixel holds more than ``full``, in place; the end of any order of spilling.
 
+    Returns how many runs of full pixels there are.
+
     Rows are taken from left to right. Full pixels gather in runs, in which every pixel stays at ``full``: what leaves a run at its ends is
     linear in what came in, so two runs join in a few operations. A row is joined once: the work is proportional to the rows.
     """
@@ -122,6 +125,31 @@ def spill_column(q, full, up, kept, barrier, runs, first, last):
             q[last[i] + 1] += runs[i, 1]
     for r in range(rows):
         q[r] = min(q[r], full)
+    return count
+
+
+@jit
+def share_out(q, full, runs, first, last, count, key, frame, col):
+    """Draw which way the charge went that left every run, in place: each electron for itself, up or down; what finds no room there stays.
+
+    Of L and R electrons that leave at the two ends on average the binomial numbers have the variance L R/(L + R).
+    """
+    words, normal = np.empty(4, np.uint32), np.empty(4, np.float32)
+    for i in range(count):
+        up, down = runs[i, 0], runs[i, 1]
+        if up <= 0.0 or down <= 0.0:
+            continue
+        _, z = normal_of_place(key, frame, first[i], col, words, normal)
+        more = min(max(np.sqrt(up * down / (up + down)) * z, -up), down)
+        above, below = first[i] - 1, last[i] + 1
+        if above >= 0:
+            more = min(max(more, -q[above]), full - q[above])
+        if below < len(q):
+            more = max(min(more, q[below]), q[below] - full)
+        if above >= 0:
+            q[above] += more
+        if below < len(q):
+            q[below] -= more
 
 
 @jit
@@ -144,8 +172,8 @@ def soften(q, top, knee, up, kept, barrier, spare):
 
 
 @jit
-def spill(data, full, drain_ratio, knee, up, kept, barrier):
-    """Return the charge of every pixel after blooming along the columns, shape (n, rows, cols)."""
+def spill(data, full, drain_ratio, knee, up, kept, barrier, noisy, key, frame, col0):
+    """Return the charge of every pixel after blooming along the columns, shape (n, rows, cols); ``noisy``: see `share_out`."""
     n, rows, cols = data.shape
     out = np.empty_like(data)
     highest = np.empty(cols, np.float32)
@@ -167,7 +195,9 @@ def spill(data, full, drain_ratio, knee, up, kept, barrier):
                 q[r] = data[i, r, c]
             if knee > 0.0:
                 soften(q, full, knee, up, kept, barrier, spare)
-            spill_column(q, capacity, up, kept, barrier, runs, first, last)
+            count = spill_column(q, capacity, up, kept, barrier, runs, first, last)
+            if noisy:
+                share_out(q, capacity, runs, first, last, count, key, frame[i], col0[i] + c)
             for r in range(rows):
                 out[i, r, c] = min(q[r], full)
     return out

@@ -35,17 +35,21 @@ class Blooming(Parameters):
 
 
 def forward(params: Blooming, signal: Signal, stream: Stream) -> Signal:
-    """Spill the excess along the columns until no pixel holds more than the full well."""
+    """Spill the excess along the columns until no pixel holds more than the full well; electrons go up or down each for itself."""
     if params.full_well_e == UNLIMITED_E:
         return signal
-    return signal.with_data(_spilled(params, signal.data))
+    draws = None if stream.quiet else (stream.key("ways"), signal.grid.frame, signal.grid.col0)
+    return signal.with_data(_spilled(params, signal.data, draws))
 
 
-def _spilled(params: Blooming, electrons: np.ndarray) -> np.ndarray:
+def _spilled(params: Blooming, electrons: np.ndarray, draws: tuple[np.uint64, np.ndarray, np.ndarray] | None = None) -> np.ndarray:
     data = np.ascontiguousarray(electrons, np.float32)
     kept, barrier = 1.0 - params.drained_share, params.ends == "barrier"
     top = float(params.full_well_e)
-    return spill(data, top, float(params.drain_ratio), float(params.knee_rel), float(params.up_share), kept, barrier)
+    nowhere = np.zeros(len(data), np.int64)
+    where = (np.uint64(0), nowhere, nowhere) if draws is None else draws
+    ways = float(params.up_share), kept, barrier
+    return spill(data, top, float(params.drain_ratio), float(params.knee_rel), *ways, draws is not None, *where)
 
 
 def context(params: Blooming, windows: Windows, frame_shape: tuple[int, int]) -> Windows:

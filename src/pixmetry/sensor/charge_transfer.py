@@ -2,7 +2,8 @@
 
 The register lies before row 0 and its output before column 0, at the top left corner: row r takes r + 1 steps down its column, and after
 that column c takes c + 1 steps along the register, each of so many phases. Deferred charge appears farther from the output, at higher
-rows and columns; what trails beyond the last of them leaves the frame.
+rows and columns; what trails beyond the last of them leaves the frame. Of an interlaced frame each field does so by itself: row r takes
+r div 2 + 1 steps, and what it leaves behind comes two rows farther on.
 
 Two models may act together: a fixed share left behind in every transfer, and traps, of which a packet fills those in its own volume, so
 that the loss depends on the signal and on the packets that went before.
@@ -12,6 +13,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -21,7 +24,7 @@ from pixmetry.core.errors import ParameterError
 from pixmetry.core.random import Stream
 from pixmetry.core.signal import Kind, Signal, Windows
 from pixmetry.core.source import STATED_FRAME, Parameters, Source, quantity
-from pixmetry.sensor._charge_kernels import pass_traps, transfer_columns, transfer_packets, transfer_rows
+from pixmetry.sensor._charge_kernels import pass_traps, scatter, share_table, transfer_columns, transfer_packets, transfer_rows
 
 ITERATIONS = 5
 LONGEST_STEPS = 4096  # pixels to the output that the stated tail allows for
@@ -44,12 +47,18 @@ class ChargeTransfer(Parameters):
     slow_release_px: float = quantity(10.0, "px", "time constant of their release, in steps of one pixel", ge=0.1, le=1000)
     fill_beta: float = quantity(0.5, "1", "a packet fills the share (x / trap_well_e)^fill_beta of a pixel's volume", gt=0, le=1)
     trap_well_e: float = quantity(100_000.0, "e-", "packet that fills the whole volume", gt=0, le=1e7)
+    interlaced: bool = quantity(False, "1", "whether even and odd rows are two fields, each of which is transferred by itself")
     traps_along: Literal["columns", "register", "both"] = quantity("columns", "1", "transfers in which the traps act")
 
     @property
     def traps(self) -> bool:
         """Whether there are any."""
         return self.fast_traps_per_px + self.slow_traps_per_px > 0
+
+    @property
+    def rows_per_line(self) -> int:
+        """Rows of the frame from one line to the next that follows it down the column."""
+        return 2 if self.interlaced else 1
 
     @property
     def in_columns(self) -> bool:
@@ -62,44 +71,118 @@ class ChargeTransfer(Parameters):
         return self.serial_cti > 0 or (self.traps and self.traps_along != "columns")
 
 
-def _move(params: ChargeTransfer, data: np.ndarray, row0: np.ndarray, col0: np.ndarray) -> np.ndarray:
-    """Parallel transfer first, then serial; in each the fixed share, then the traps."""
+@dataclass(frozen=True)
+class _Draws:
+    """Where and from what electrons draw for themselves; none where they move by their shares."""
+
+    stream: Stream
+    frame: np.ndarray
+
+
+def _move(params: ChargeTransfer, data: np.ndarray, row0: np.ndarray, col0: np.ndarray, draws: _Draws | None = None) -> np.ndarray:
+    """Parallel transfer first, line by line of a field; then serial. In each the fixed share, then the traps."""
     data = np.ascontiguousarray(data, np.float32)
     if params.in_columns:
-        if params.parallel_cti and params.beta == 1:
-            data = transfer_columns(data, row0, params.phases, params.parallel_cti, params.trail_px)
-        packets, traps = params.parallel_cti > 0 and params.beta != 1, params.traps and params.traps_along != "register"
-        if packets or traps:
-            turned = np.ascontiguousarray(data.swapaxes(1, 2))
-            data = np.ascontiguousarray(_along_rows(params, turned, row0, params.parallel_cti if packets else 0.0, traps).swapaxes(1, 2))
+        data = _down_columns(params, data, row0, col0, draws) if not params.interlaced else _by_fields(params, data, row0, col0, draws)
     if params.in_register:
         if params.serial_cti and params.beta == 1:
-            data = transfer_rows(data, col0, params.phases, params.serial_cti, params.trail_px)
+            if draws is None:
+                data = transfer_rows(data, col0, params.phases, params.serial_cti, params.trail_px)
+            else:
+                table = _further(int((col0 + data.shape[2]).max()), params.phases, params.serial_cti, params.trail_px)
+                data = _scattered(data, draws.stream.key("along the register"), draws.frame, row0, 1, col0, col0, table, True)
         packets = params.serial_cti > 0 and params.beta != 1
-        data = _along_rows(params, data, col0, params.serial_cti if packets else 0.0, params.traps and params.traps_along != "columns")
+        traps = params.traps and params.traps_along != "columns"
+        data = _by_packet(params, data, "register", col0, params.serial_cti if packets else 0.0, traps, draws, row0, col0, 1)
     return data
 
 
-def _along_rows(params: ChargeTransfer, data: np.ndarray, first: np.ndarray, loss: float, traps: bool) -> np.ndarray:
-    """What depends on the size of the packets, along the last axis."""
+def _by_fields(params: ChargeTransfer, data: np.ndarray, row0: np.ndarray, col0: np.ndarray, draws: _Draws | None) -> np.ndarray:
+    """Row R of the woven frame is line R div 2 of field R mod 2; each field goes down the columns by itself."""
+    out = np.empty_like(data)
+    for first in range(min(2, data.shape[1])):
+        out[:, first::2] = _down_columns(params, np.ascontiguousarray(data[:, first::2]), row0 + first, col0, draws)
+    return out
+
+
+def _down_columns(params: ChargeTransfer, data: np.ndarray, row0: np.ndarray, col0: np.ndarray, draws: _Draws | None) -> np.ndarray:
+    """The lines of a field, or of a whole frame; ``row0`` are their first rows."""
+    step = params.rows_per_line
+    line0 = row0 // step
+    if params.parallel_cti and params.beta == 1:
+        if draws is None:
+            data = transfer_columns(data, line0, params.phases, params.parallel_cti, params.trail_px)
+        else:
+            table = _further(int((line0 + data.shape[1]).max()), params.phases, params.parallel_cti, params.trail_px)
+            data = _scattered(data, draws.stream.key("down the columns"), draws.frame, row0, step, col0, line0, table, False)
+    packets, traps = params.parallel_cti > 0 and params.beta != 1, params.traps and params.traps_along != "register"
+    if packets or traps:
+        turned = np.ascontiguousarray(data.swapaxes(1, 2))
+        turned = _by_packet(params, turned, "columns", line0, params.parallel_cti if packets else 0.0, traps, draws, col0, row0, step)
+        data = np.ascontiguousarray(turned.swapaxes(1, 2))
+    return data
+
+
+@lru_cache(maxsize=16)
+def _further(lines: int, phases: int, loss: float, trail_px: float) -> tuple[np.ndarray, np.ndarray]:
+    """Of the electrons of each line that are j pixels late, the share that falls behind more, and log(1 − share); shape (lags, lines)."""
+    table, _ = share_table(0, lines, phases, loss, trail_px)
+    beyond = np.maximum(1.0 - table.sum(axis=1), 0.0)  # later than there are lines
+    beyond[beyond < 1e-7] = 0.0
+    reached = np.cumsum(table[:, ::-1], axis=1)[:, ::-1] + beyond[:, None]
+    after = np.concatenate([reached[:, 1:], beyond[:, None]], axis=1)
+    share = np.clip(np.divide(after, reached, out=np.zeros_like(after), where=reached > 0), 0.0, 1.0).T
+    with np.errstate(divide="ignore"):
+        return np.ascontiguousarray(share), np.ascontiguousarray(np.log1p(-share))
+
+
+def _scattered(
+    data: np.ndarray, key: np.uint64, frame: np.ndarray, row0: np.ndarray, step: int, col0: np.ndarray, line0: np.ndarray,
+    table: tuple[np.ndarray, np.ndarray], along: bool,
+) -> np.ndarray:  # fmt: skip
+    out = np.zeros_like(data)
+    scatter(data, key, frame, row0, step, col0, line0, *table, along, out)
+    return out
+
+
+def _by_packet(
+    params: ChargeTransfer, data: np.ndarray, where: str, first: np.ndarray, loss: float, traps: bool, draws: _Draws | None,
+    row0: np.ndarray, at0: np.ndarray, step: int,
+) -> np.ndarray:  # fmt: skip
+    """What depends on the size of the packets, along the last axis; ``row0`` and ``at0 + step c`` are places for the draws."""
+    noisy = draws is not None
+    frame = np.zeros_like(first) if draws is None else draws.frame
     if loss:
-        data = transfer_packets(data, first, params.phases, loss, params.trail_px, params.beta, params.reference_e)
+        key = np.uint64(0) if draws is None else draws.stream.key(f"packets, {where}")
+        data = transfer_packets(
+            data, first, params.phases, loss, params.trail_px, params.beta, params.reference_e, noisy, key, frame, row0, at0, step
+        )
     if traps:
+        key = np.uint64(0) if draws is None else draws.stream.key(f"traps, {where}")
         species = ((params.fast_traps_per_px, params.fast_release_px), (params.slow_traps_per_px, params.slow_release_px))
-        density, release = np.array([s for s in species if s[0] > 0]).T
-        data = pass_traps(data, first, np.ascontiguousarray(density), np.ascontiguousarray(release), params.fill_beta, params.trap_well_e)
+        density, release = np.ascontiguousarray(np.array([s for s in species if s[0] > 0]).T)
+        data = pass_traps(data, first, density, release, params.fill_beta, params.trap_well_e, noisy, key, frame, row0, at0, step)
     return data
 
 
 def forward(params: ChargeTransfer, signal: Signal, stream: Stream) -> Signal:
-    """Transfer all packets to the output; charge is kept, but for what trails beyond the last row and column."""
+    """Transfer all packets to the output, every electron for itself; charge is kept, but for what trails beyond the last row and column.
+
+    In each transfer an electron stays behind with the probability ε, whatever the others do: the number that does is binomial. So the
+    electrons of a flat field, Poisson before, are Poisson and independent of their neighbours after it (thinning and superposition of
+    Poisson processes; J. F. C. Kingman, Poisson Processes, 1993, ch. 2 and 5): transfer noise 2 n ε S between a packet and what it leaves.
+    Traps that fill at once do not act like that: see `pass_traps`.
+    """
     if not params.in_columns and not params.in_register:
         return signal
-    return signal.with_data(_move(params, signal.data, signal.grid.row0, signal.grid.col0))
+    draws = None if stream.quiet else _Draws(stream, signal.grid.frame)
+    return signal.with_data(_move(params, signal.data, signal.grid.row0, signal.grid.col0, draws))
 
 
 def correct(params: ChargeTransfer, signal: Signal, maps: Mapping[str, np.ndarray]) -> Signal:
     """Invert the forward model by five fixed-point steps x ← x + (y − F(x)), on whole frames (Massey et al. 2010).
+
+    The noise of the transfer stays.
 
     Raises
     ------
@@ -132,7 +215,7 @@ def _deferred_share(params: ChargeTransfer, loss: float) -> float:
 
 
 def _reach_px(params: ChargeTransfer) -> int:
-    """Pixels after which less than `NEAR_SHARE` of deferred charge is still under way, with the trail of the longest way."""
+    """Lines and columns after which less than `NEAR_SHARE` of deferred charge is still under way, with the trail of the longest way."""
     loss = max(params.parallel_cti, params.serial_cti)
     reach = 0.0
     if loss:
@@ -143,9 +226,9 @@ def _reach_px(params: ChargeTransfer) -> int:
 
 
 def near(params: ChargeTransfer) -> tuple[int, int, int, int]:
-    """Pixels above and to the left from which trails come."""
+    """Pixels above and to the left from which trails come; a line of a field is two rows."""
     reach = _reach_px(params)
-    return (reach if params.in_columns else 0, 0, reach if params.in_register else 0, 0)
+    return (params.rows_per_line * reach if params.in_columns else 0, 0, reach if params.in_register else 0, 0)
 
 
 def tail(params: ChargeTransfer) -> float:
@@ -190,13 +273,14 @@ def _only(params: ChargeTransfer, serial: bool) -> ChargeTransfer:
 
 def _added_dn(params: ChargeTransfer, probe: Probe) -> np.ndarray:
     """What transfer adds to the target at the centre of the frame; the even background around it keeps its level."""
-    reach = _reach_px(params)
+    left = _reach_px(params)
+    up = params.rows_per_line * left
     phases, rows, cols = probe.signal_dn.shape
     row0, col0 = (max((size - length) // 2, 0) for size, length in zip(probe.frame_shape, (rows, cols), strict=True))
-    electrons = np.full((phases + 1, rows + reach, cols + reach), probe.background_dn / probe.gain_dn_per_e, np.float32)
-    electrons[1:, reach:, reach:] = probe.signal_dn / probe.gain_dn_per_e
-    corner = [np.full(phases + 1, max(at - reach, 0), np.int64) for at in (row0, col0)]
-    added = (_move(params, electrons, *corner) - electrons)[:, reach:, reach:].astype(np.float64)
+    electrons = np.full((phases + 1, rows + up, cols + left), probe.background_dn / probe.gain_dn_per_e, np.float32)
+    electrons[1:, up:, left:] = probe.signal_dn / probe.gain_dn_per_e
+    corner = [np.full(phases + 1, max(at - reach, 0), np.int64) for at, reach in ((row0, up), (col0, left))]
+    added = (_move(params, electrons, corner[0], corner[1]) - electrons)[:, up:, left:].astype(np.float64)
     return probe.gain_dn_per_e * (added[1:] - added[0])
 
 
@@ -232,7 +316,7 @@ SOURCE = Source(
     tail=tail,
     applies_to=("ccd",),
     gum_class="G",
-    equation="arrives j px late: (1 − ε)^n (1, nε, n(n + 1)ε²/2, …), mean n ε ⟨k⟩;  traps: caught n ρ (x/w)^β, released as e^(−k/τ)",
+    equation="each electron is j px late with (1 − ε)^n (1, nε, n(n + 1)ε²/2, …), mean n ε ⟨k⟩;  traps: caught n ρ (x/w)^β, released as e^(−k/τ)",
     typical_size="0.0075 px after 752 transfers at 1e-5; 92 % of the charge is left after 8192",
     references=(
         "J. R. Janesick, Scientific Charge-Coupled Devices, SPIE Press 2001, ch. 5",

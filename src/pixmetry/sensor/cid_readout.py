@@ -8,7 +8,7 @@ import numpy as np
 
 from pixmetry.core.contribution import Contribution, Probe
 from pixmetry.core.errors import ParameterError
-from pixmetry.core.random import Stream
+from pixmetry.core.random import Grid, Stream
 from pixmetry.core.signal import Kind, Signal, Windows
 from pixmetry.core.source import Parameters, Source, quantity
 
@@ -53,23 +53,26 @@ def forward(params: CidReadout, signal: Signal, stream: Stream, state: np.ndarra
     """
     data = signal.data
     if state is not None and params.residual:
-        data, state = _with_residual(params, signal, state)
+        data, state = _with_residual(params, signal, state, stream)
     data = crosstalk(params, data)
     if noise_e(params):
         data = stream.add_normal(data, signal.grid, noise_e(params))
     return signal.with_data(data), state
 
 
-def _with_residual(params: CidReadout, signal: Signal, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    share = np.float32(params.residual)
+def _with_residual(params: CidReadout, signal: Signal, state: np.ndarray, stream: Stream) -> tuple[np.ndarray, np.ndarray]:
+    """Add what clearing left of the frame before; each electron is left for itself."""
+    share, first = np.float64(params.residual), signal.grid
     if len(signal) > 1 and signal.data.shape[1:] != tuple(signal.frame_shape):
-        return signal.data + (state if state.size == 1 else state[signal.rows[:, :, None], signal.cols[:, None, :]]), state
+        held = state if state.size == 1 else state[signal.rows[:, :, None], signal.cols[:, None, :]]
+        return signal.data + stream.poisson(np.maximum(held, 0), first), state
     if state.size > 1 and state.shape != signal.data.shape[1:]:
         state = state[signal.rows[0][:, None], signal.cols[0][None, :]]
     data = np.empty_like(signal.data)
     for i, frame in enumerate(signal.data):
+        grid = Grid(first.frame[i : i + 1], first.row0[i : i + 1], first.col0[i : i + 1], first.shape)
         np.add(frame, state, out=data[i])
-        state = share * data[i]
+        state = stream.binomial(data[i : i + 1], share, grid)[0]
     return data, state
 
 
