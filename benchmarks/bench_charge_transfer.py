@@ -1,10 +1,10 @@
 """Speed of charge transfer at 1024 × 1024, one thread: ``python benchmarks/bench_charge_transfer.py [PYTHON_WITH_ARCTICPY]``.
 
-Prints milliseconds a frame, and the ratio to other implementations of the same operation. The fixed share, electron by electron: by NumPy,
-one image of binomial numbers for every pixel of delay; and as shares, for the means. The traps: by NumPy, all columns at once, row after
-row, without their noise; and by arcticpy, which needs NumPy 1 and so an interpreter of its own (``pip install arcticpy``, with the headers of the GNU Scientific Library). There every packet passes every pixel's
-traps if ``express`` is 0, with ``empty_traps_for_first_transfers``; that is what is computed here. Larger numbers of passes are its
-approximations; they are timed too.
+Prints milliseconds a frame, and the ratio to other implementations of the same operation. The fixed share, electron by electron: by
+NumPy, one image of binomial numbers for every pixel of delay; and as shares, for the means. The traps: by NumPy, all columns at once, row
+after row, without their noise; and by arcticpy, which needs NumPy 1 and so an interpreter of its own (``pip install arcticpy``, with the
+headers of the GNU Scientific Library). There every packet passes every pixel's traps if ``express`` is 0, with
+``empty_traps_for_first_transfers``; that is what is computed here. Larger numbers of passes are its approximations; they are timed too.
 """
 
 from __future__ import annotations

@@ -249,12 +249,17 @@ def test_parameters_survive_the_camera_file(source: Source) -> None:
 
 @every_forward
 def test_correct_lowers_the_error_of_forward(source: Source) -> None:
-    """The root mean square over a gently uneven frame, with the true parameters and noise-free maps of the unit."""
+    """The root mean square over a gently uneven frame, with the true parameters and noise-free maps of the unit.
+
+    Draws, which nothing corrects, are at their means, unless they are all that there is (a wave of any phase).
+    """
     if source.correct is None:
         pytest.skip(source.reasons["correct"])
     camera, scene = camera_with(source, shape=(96, 128)), Texture(contrast=0.01)
     signal = camera.switched(off=[NAME]).expose(scene, 4)
-    out = camera.expose(scene, 4)
+    out = camera.expose(scene, 4, quiet=True)
+    if np.array_equal(out.data, signal.data):
+        out = camera.expose(scene, 4)
     untouched = out.data.copy()
     corrected = source.correct(source.typical, out, truth_maps(source, source.typical, camera.frame_shape))
     assert np.array_equal(out.data, untouched)

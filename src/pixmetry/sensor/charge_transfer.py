@@ -316,7 +316,7 @@ SOURCE = Source(
     tail=tail,
     applies_to=("ccd",),
     gum_class="G",
-    equation="each electron is j px late with (1 − ε)^n (1, nε, n(n + 1)ε²/2, …), mean n ε ⟨k⟩;  traps: caught n ρ (x/w)^β, released as e^(−k/τ)",
+    equation="electrons are j px late by (1 − ε)^n (1, nε, n(n + 1)ε²/2, …), mean nε⟨k⟩;  traps: caught n ρ (x/w)^β, released as e^(−k/τ)",
     typical_size="0.0075 px after 752 transfers at 1e-5; 92 % of the charge is left after 8192",
     references=(
         "J. R. Janesick, Scientific Charge-Coupled Devices, SPIE Press 2001, ch. 5",
