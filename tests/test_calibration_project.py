@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from pixmetry.calibration.network import Network
 from pixmetry.calibration_project import load_project
+from pixmetry.calibration_project.tables import read_table
 from pixmetry.core.errors import InputError
 
 COLS, ROWS, PITCH_UM = 640, 480, (5.0, 6.0)
@@ -469,3 +470,23 @@ def test_decentring_and_shear_go_with_y_of_the_image_coordinates(
         a, b = bent(u, sign * v)
         theirs = 310 + 8 * ((1 + b1) * a + b2 * b) / MM[0], 250 + sign * 8 * b / MM[1]
         assert np.allclose(model.project(u, v), theirs, atol=1e-9)
+
+
+def test_a_row_whose_name_begins_with_a_hash_is_not_lost(tmp_path: Path) -> None:
+    path = tmp_path / "t.csv"
+    rows = ["image,point,x_px,y_px", "#im0,p1,1,2", "im1,p1,3,4"]
+    path.write_text("\n".join(rows), encoding="utf-8")
+    with pytest.raises(InputError, match=r"t.csv, line 2: a row whose name begins with #, or a comment; .*in quotes if it is a row"):
+        read_table(path)
+    path.write_text("\n".join(["# made by hand", rows[0], '"#im0",p1,1,2', "# im9,p9,7,8", "#left out", "##", rows[2]]), encoding="utf-8")
+    assert read_table(path).columns["image"] == ["#im0", "im1"]
+    path.write_text("image point x_px y_px\nim1 p1 3 4\n#im0 p1 1 2\n", encoding="utf-8")
+    with pytest.raises(InputError, match="line 3"):
+        read_table(path)
+
+
+def test_a_quote_that_is_not_closed_swallows_no_row(tmp_path: Path) -> None:
+    path = tmp_path / "t.csv"
+    path.write_text('image,point,x_px,y_px\nim0,"p1,1,2\nim1",p2,3,4\nim2,p3,5,6\n', encoding="utf-8")
+    with pytest.raises(InputError, match="line 2: a quote that is not closed"):
+        read_table(path)

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import imagecodecs
@@ -292,3 +295,39 @@ def test_values_that_do_not_fill_their_bits_are_noted(folder: Path, tmp_path: Pa
     done = run("assess", manifest, "-o", tmp_path / "out", "--trials", 400)
     assert done.exit_code == 0, done.output
     assert "bits: 12" in " ".join(done.output.split())
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "latin-1", "cp1252", "utf-8"])
+def test_every_terminal_is_written_to(encoding: str) -> None:
+    """A report that is complete must not end in a traceback because a terminal has no sign for ±."""
+    command = [sys.executable, "-m", "pixmetry", "sources", "sensor.prnu"]
+    ran = subprocess.run(command, capture_output=True, env={**os.environ, "PYTHONIOENCODING": encoding}, check=False)
+    assert ran.returncode == 0 and ran.stderr == b""
+    text = ran.stdout.decode(encoding)
+    assert "Photo response non-uniformity" in text and ("★" in text) == (encoding == "utf-8")
+
+
+def test_too_little_memory_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise MemoryError("Unable to allocate 9 EiB")
+
+    monkeypatch.setattr("pixmetry.core.catalogue.catalogue", full)
+    ran = CliRunner().invoke(main, ["sources"])
+    assert ran.exit_code == 2 and "not enough memory (Unable to allocate 9 EiB)" in ran.output and ran.output.count("\n") == 1
+
+
+def test_stacks_and_raw_values_are_located_and_corrected(folder: Path, tmp_path: Path) -> None:
+    results = folder / "result" / "results.json"
+    frames = np.stack([read_frame(p) for g in load_campaign(folder / "campaign").groups for p in g.paths][-3:])
+    tifffile.imwrite(tmp_path / "s.tif", frames, photometric="minisblack")
+    (tmp_path / "s.raw").write_bytes(frames.astype("<u2").tobytes())
+    size = f"{frames.shape[2]}x{frames.shape[1]}:Mono12"
+    for name, more in (("s.tif", []), ("s.raw", ["--raw", size])):
+        out = tmp_path / f"out-{name}"
+        ran = CliRunner().invoke(main, ["correct", str(tmp_path / name), "--with", str(results), "-o", str(out), *more])
+        assert ran.exit_code == 0, ran.output
+        assert sorted(p.name for p in out.glob("*.tif")) == ["s_0.tif", "s_1.tif", "s_2.tif"]
+        ran = CliRunner().invoke(main, ["locate", str(tmp_path / name), "-o", str(tmp_path / "t.csv"), *more])
+        assert ran.exit_code == 0 and f"{name}/2: " in ran.output
+    one, other = (tifffile.imread(tmp_path / f"out-{name}" / "s_1.tif") for name in ("s.tif", "s.raw"))
+    np.testing.assert_array_equal(one, other)

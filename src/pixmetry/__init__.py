@@ -14,11 +14,13 @@ __version__ = "0.1.0"
 _HOMES = {
     "Camera": "pixmetry.core.camera",
     "Estimates": "pixmetry.core.estimates",
+    "Frames": "pixmetry.campaign",
     "PixmetryError": "pixmetry.core.errors",
     "Signal": "pixmetry.core.signal",
     "add_source_file": "pixmetry.core.catalogue",
     "assess": "pixmetry.assessment",
     "calibrate": "pixmetry.calibrating",
+    "campaign_of_arrays": "pixmetry.campaign",
     "catalogue": "pixmetry.core.catalogue",
     "check_limits": "pixmetry.comparing",
     "compare": "pixmetry.comparing",
@@ -35,12 +37,14 @@ _HOMES = {
 __all__ = [
     "Camera",
     "Estimates",
+    "Frames",
     "PixmetryError",
     "Signal",
     "__version__",
     "add_source_file",
     "assess",
     "calibrate",
+    "campaign_of_arrays",
     "catalogue",
     "check_limits",
     "compare",
@@ -58,7 +62,7 @@ if TYPE_CHECKING:
     from pixmetry.assessment import assess
     from pixmetry.calibrating import calibrate
     from pixmetry.calibration_record import read_calibration
-    from pixmetry.campaign import load_campaign
+    from pixmetry.campaign import Frames, campaign_of_arrays, load_campaign
     from pixmetry.chain import walk
     from pixmetry.comparing import check_limits, compare, compare_fleet
     from pixmetry.core.camera import Camera, load_camera

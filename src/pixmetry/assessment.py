@@ -215,8 +215,6 @@ def observe_campaign(campaign: Campaign, progress: Progress) -> tuple[InputHashe
             yield Group(g.kind, g.role, g.exposure_s, g.photons, [partial(reader.fetch, path) for path in g.paths])
 
     seen = observe(groups(), campaign.bits, campaign.camera.temperature_c, on_frames=on_frames)
-    for path in {campaign.source_path, campaign.descriptor_path} - {None}:
-        reader.hashes.add_file(path)
     return reader.hashes, replace(seen, storage=reader.storage)
 
 

@@ -30,7 +30,7 @@ PROJECT_ENDINGS = (".yaml", ".yml")
 # What is said with pictures, and the keys of a project's ``cameras`` and ``pictures`` that mean the same.
 CAMERA_KEYS = {"camera": "camera", "direction": "direction", "pixel_um": "pitch_um", "c_mm": "c_mm", "c_px": "c_px"}
 PICTURE_KEYS = {
-    **{name: name for name in ("kind", "grid", "polarity", "channel", "noise")},
+    **{name: name for name in ("kind", "grid", "polarity", "channel", "raw", "noise")},
     **{f"{name}_mm": name for name in ("pitch", "side", "diameter")},
 }
 LINE_OPTIONS = {"loss": "loss", "loss_scale": "loss_scale", "snoop": "reject"}  # those of straight lines, and what they are called there
@@ -69,8 +69,9 @@ def calibrate(
         Called with (what, done, of).
     **pictures
         For pictures: ``kind`` ("chessboard", "dots", "coded", "squares" or "lines"), ``grid`` ("9x6"), ``pitch_mm`` (spacing of the
-        targets), ``side_mm``, ``diameter_mm`` (of squares and dots), ``polarity``, ``channel``, ``noise``; and of the camera: ``camera``
-        (a preset or camera file, which brings the pitch), ``direction``, ``pixel_um`` (pitch of the pixels), ``c_mm`` or ``c_px``.
+        targets), ``side_mm``, ``diameter_mm`` (of squares and dots), ``polarity``, ``channel``, ``raw`` ("1920x1200:Mono12p", of files
+        without a header), ``noise``; and of the camera: ``camera`` (a preset or camera file, which brings the pitch), ``direction``,
+        ``pixel_um`` (pitch of the pixels), ``c_mm`` or ``c_px``.
 
     Returns
     -------

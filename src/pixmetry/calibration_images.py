@@ -13,7 +13,9 @@ from pixmetry.calibration.model import CameraModel
 from pixmetry.calibration.network import Finding, Network
 from pixmetry.calibration_numbering import chessboard_reference, consistent
 from pixmetry.calibration_targets import KINDS, Seen, Wanted, board_size, see
+from pixmetry.campaign.formats import frame_name
 from pixmetry.campaign.images import PICTURE_ENDINGS, picture_files
+from pixmetry.campaign.raw_values import RawLayout, parse_raw
 from pixmetry.core.camera import Camera
 from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.core.threads import imap_tiles
@@ -99,6 +101,7 @@ def observations_of(
     diameter: float | None = None,
     polarity: str = "auto",
     channel: str | None = None,
+    raw: str | RawLayout | None = None,
     noise: NoiseModel | Camera | str | Path | None = None,
     least_images: int = LEAST_IMAGES,
     threads: int | None = None,
@@ -109,7 +112,8 @@ def observations_of(
     Parameters
     ----------
     images : sequence of path or ndarray
-        Image files (PNG, TIFF, NPY, JPEG), folders of them, or frames of shape (rows, cols), in the order in which they were taken.
+        Image files (PNG, TIFF, BMP, FITS, NPY, JPEG, raw), folders of them, or frames of shape (rows, cols), in the order in which they
+        were taken. A file with several frames is as many images.
     kind : {"chessboard", "dots", "squares", "coded"}
         Inner corners of a chessboard; a plate of circular targets; corners of a plate of separate squares; coded targets anywhere.
     grid : "COLSxROWS" or (cols, rows), optional
@@ -125,6 +129,8 @@ def observations_of(
         Of dots, squares or coded discs on their ground.
     channel : {"red", "green", "blue"}, optional
         Of colour images.
+    raw : str or RawLayout, optional
+        Of files without a header: ``"1920x1200:Mono12p"``.
     noise : optional
         As in `pixmetry.locate`; by default it is measured in each image.
     least_images : int
@@ -151,8 +157,9 @@ def observations_of(
     if polarity not in ("auto", "bright", "dark"):
         raise InputError("no such polarity", where="polarity", value=polarity, allowed="auto, bright, dark")
     sides = (np.nan, np.nan) if side is None else (side / step[0], side / step[1])
-    wanted = Wanted(kind, size, sides, polarity, channel, noise_model(noise), threads)
-    items = _items(images)
+    layout = parse_raw(raw) if isinstance(raw, str) else raw
+    wanted = Wanted(kind, size, sides, polarity, channel, noise_model(noise), threads, layout)
+    items = _items(images, layout)
     told = progress or (lambda what, done, of: None)
     seen: list[Seen] = []
     for one in imap_tiles(lambda item: see(*item, wanted), items, threads):
@@ -163,6 +170,10 @@ def observations_of(
     _check_enough(seen, good, wanted, least_images)
     lost = [Finding("image_left_out", f"{s.name} was left out: {s.reason}.", level="warning") for s in seen if s.reason]
     notes = [Finding("targets", f"{s.name}: {s.note}.") for s in good if s.note]
+    lossy = [s.name for s in good if s.lossy]
+    if lossy:
+        text = f"{len(lossy)} of {len(good)} images were stored with loss (JPEG): its blocks move edges, and the noise is the coder's."
+        notes.append(Finding("targets", text, "Store images of a test field without loss."))
     good, numbering = _numbered(good, kind)
     out = _gathered(good, kind)
     names, xyz = _nominal(out.xyz, kind, step, side)
@@ -196,7 +207,7 @@ def _checked_lengths(
     return along, across
 
 
-def _items(images: Sequence[str | Path | np.ndarray]) -> list[tuple[str, Path | np.ndarray]]:
+def _items(images: Sequence[str | Path | np.ndarray], raw: RawLayout | None) -> list[tuple[str, Path | np.ndarray]]:
     """Names and sources of all images; a name that two files share has its folder with it."""
     given: Sequence[str | Path | np.ndarray] = [images] if isinstance(images, (str, Path)) else images
     items: list[tuple[str, Path | np.ndarray]] = []
@@ -204,7 +215,7 @@ def _items(images: Sequence[str | Path | np.ndarray]) -> list[tuple[str, Path | 
         if isinstance(one, np.ndarray):
             items.append((f"image {len(items) + 1}", one))
         else:
-            items += [(path.name, path) for path in picture_files([one], PICTURE_ENDINGS)]
+            items += [(frame_name(path), path) for path in picture_files([one], PICTURE_ENDINGS, raw)]
     count = Counter(name for name, _ in items)
     return [(str(source) if count[name] > 1 else name, source) for name, source in items]
 

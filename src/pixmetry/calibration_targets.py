@@ -8,7 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from pixmetry.calibration_numbering import Board, Marks, chessboard_marks, dot_marks
-from pixmetry.campaign.images import read_picture
+from pixmetry.campaign.formats import Decoded
+from pixmetry.campaign.images import load_picture
+from pixmetry.campaign.raw_values import RawLayout
 from pixmetry.core.errors import InputError
 from pixmetry.located import Located
 from pixmetry.locating import checked_frame, locate, scale_ends
@@ -34,6 +36,8 @@ class Wanted:
         Of the squares of a plate, in units of the pitch along columns and along rows.
     polarity, channel, noise, threads
         As in `pixmetry.locate`.
+    raw : RawLayout, optional
+        Of files without a header.
     """
 
     kind: str
@@ -43,6 +47,7 @@ class Wanted:
     channel: str | None = None
     noise: NoiseModel | None = None
     threads: int | None = None
+    raw: RawLayout | None = None
 
     @property
     def whole(self) -> int:
@@ -71,6 +76,8 @@ class Seen:
         Why the image cannot be used; empty if it can.
     note : str
         What else is to be said about it.
+    lossy : bool
+        Whether its file was stored with loss.
     """
 
     name: str
@@ -83,6 +90,7 @@ class Seen:
     marks: Marks | None = None
     reason: str = ""
     note: str = ""
+    lossy: bool = False
 
     @property
     def board(self) -> Board:
@@ -98,8 +106,9 @@ def see(name: str, source: Path | np.ndarray, wanted: Wanted) -> Seen:
     InputError
         If it cannot be read.
     """
-    frame = checked_frame(source if isinstance(source, np.ndarray) else read_picture(source, wanted.channel), name)
-    seen = _FINDERS[wanted.kind](name, frame, wanted)
+    picture = Decoded(source, None) if isinstance(source, np.ndarray) else load_picture(source, wanted.channel, wanted.raw)
+    frame = checked_frame(picture.array, name)
+    seen = replace(_FINDERS[wanted.kind](name, frame, wanted), lossy=picture.lossless is False)
     missing = wanted.whole - len(seen.keys)
     if seen.reason or wanted.grid is None or missing <= 0:
         return seen

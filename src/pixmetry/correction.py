@@ -11,7 +11,9 @@ from typing import Any
 import numpy as np
 
 from pixmetry.campaign import InputHashes, provenance_record, read_maps, staged_output, write_json
+from pixmetry.campaign.formats import is_frame
 from pixmetry.campaign.images import LoadedFrame, check_frame, load_frame, picture_files
+from pixmetry.campaign.raw_values import RawLayout, parse_raw
 from pixmetry.core.camera import Camera, load_camera
 from pixmetry.core.conversions import SAMPLE, LineSources
 from pixmetry.core.errors import InputError
@@ -79,6 +81,7 @@ def correct_files(
     results: str | Path,
     output: str | Path,
     *,
+    raw: str | RawLayout | None = None,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> list[str]:
     """Correct image files with the results of an assessment.
@@ -86,12 +89,15 @@ def correct_files(
     Parameters
     ----------
     frames : sequence of path
-        Image files, folders of them, stores (``frames.zarr``) or single frames of a store (``frames.zarr/7``).
+        Image files, folders of them, stores (``frames.zarr``) or single frames of a store (``frames.zarr/7``). The frames of a file with
+        several are written one by one: ``stack.tif`` becomes ``stack_0.tif``, ``stack_1.tif`` …
     results : path
         ``results.json`` of the assessment; ``camera.yaml`` and ``maps.zarr.zip`` stand beside it.
     output : path
         Folder for the corrected frames, under their own names as TIFF of 32-bit floats in DN above black (rounding them again would add
         noise, and clipping at black would cut it in half); ``correction.json`` says what was done.
+    raw : str or RawLayout, optional
+        Of files without a header: ``"1920x1200:Mono12p"``.
 
     Returns
     -------
@@ -106,13 +112,14 @@ def correct_files(
     from tifffile import imwrite
 
     record, camera, maps = _load(Path(results))
-    files = _named_once(picture_files(frames))
+    layout = parse_raw(raw) if isinstance(raw, str) else raw
+    files = _named_once(picture_files(frames, raw=layout))
     hashes = InputHashes(files[0].parent)
     told = progress or (lambda what, step, of: None)
     done: dict[str, list[str]] = {}
 
     def work(path: Path) -> tuple[Path, LoadedFrame, np.ndarray, dict[str, str]]:
-        loaded = load_frame(path)
+        loaded = load_frame(path, raw=layout)
         frame = loaded.array
         check_frame(frame, str(path), bits=int(record["camera"]["bits"]), shape=camera.output_shape)
         corrected, said = correct_signal(camera, _as_signal(frame, camera), maps)
@@ -123,7 +130,7 @@ def correct_files(
             for name, text in said.items():
                 done.setdefault(name, []).append(text)
             hashes.add(path, loaded.sha256, loaded.size_bytes)
-            imwrite(folder / f"{path.stem}.tif", data.astype(np.float32))
+            imwrite(folder / f"{_stem(path)}.tif", data.astype(np.float32))
             told("correcting frames", i + 1, len(files))
         told_of = {name: _together(texts) for name, texts in done.items()}
         lines = [f"{name}: {text}" for name, text in told_of.items()]
@@ -159,11 +166,15 @@ def _load(results: Path) -> tuple[dict[str, Any], Camera, dict[str, np.ndarray]]
 
 
 def _named_once(files: list[Path]) -> list[Path]:
-    names = [p.stem for p in files]
+    names = [_stem(p) for p in files]
     double = next((n for n in names if names.count(n) > 1), None)
     if double is not None:
         raise InputError("two frames have one name", value=double, remedy="correct them in two runs")
     return files
+
+
+def _stem(path: Path) -> str:
+    return f"{path.parent.stem}_{path.name}" if is_frame(path) else path.stem
 
 
 def _as_signal(frame: np.ndarray, camera: Camera) -> Signal:

@@ -9,7 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from pixmetry.campaign.images import PICTURE_ENDINGS, picture_files, read_picture
+from pixmetry.campaign.formats import frame_name
+from pixmetry.campaign.images import PICTURE_ENDINGS, load_picture, picture_files
+from pixmetry.campaign.raw_values import RawLayout, parse_raw
 from pixmetry.core.camera import Camera, load_camera
 from pixmetry.core.errors import InputError
 from pixmetry.core.threads import imap_tiles
@@ -145,6 +147,7 @@ def locate_files(
     *,
     overlay: str | Path | None = None,
     channel: str | None = None,
+    raw: str | RawLayout | None = None,
     progress: Callable[[str, int, int], None] | None = None,
     noise: NoiseModel | Camera | str | Path | None = None,
     **options: Any,
@@ -154,13 +157,16 @@ def locate_files(
     Parameters
     ----------
     images : sequence of path
-        Image files (PNG, TIFF, NPY, JPEG), folders of them, or Zarr stores of frames.
+        Image files (PNG, TIFF, BMP, FITS, NPY, JPEG, raw), folders of them, or Zarr stores of frames. A file with several frames is as
+        many images.
     output : path, optional
         Where the table goes: ``.csv``, ``.parquet`` or ``.json``.
     overlay : path, optional
         A PNG that shows what was found; a folder for several images.
     channel : {"red", "green", "blue"}, optional
         Of colour images.
+    raw : str or RawLayout, optional
+        Of files without a header: ``"1920x1200:Mono12p"``, size and GenICam's pixel format.
     progress : callable (what, done, of), optional
     noise, **options
         As in `locate`.
@@ -174,30 +180,34 @@ def locate_files(
 
     if output is not None:
         checked_table_name(output)
-    files = picture_files(images, PICTURE_ENDINGS)
+    layout = parse_raw(raw) if isinstance(raw, str) else raw
+    files = picture_files(images, PICTURE_ENDINGS, layout)
     pictures = overlay_names(overlay, files)
     model = noise_model(noise)
     told = progress or (lambda what, step, of: None)
 
     def work(item: tuple[Path, Path | None]) -> Located:
-        path, picture = item
+        path, drawn = item
+        name = frame_name(path)
         try:
-            frame = read_picture(path, channel)
-            table = locate(frame, noise=model, name=path.name, **options)
+            picture = load_picture(path, channel, layout)
+            table = locate(picture.array, noise=model, name=name, **options)
         except InputError as problem:
             if str(path) in problem.where:
                 raise
-            where = f"{path}: {problem.where}" if problem.where and problem.where != path.name else str(path)
+            where = f"{path}: {problem.where}" if problem.where and problem.where != name else str(path)
             raise InputError(problem.what, where=where, value=problem.value, allowed=problem.allowed, remedy=problem.remedy) from None
-        if picture is not None:
-            write_overlay(picture, frame, table)
-        return table
+        if drawn is not None:
+            write_overlay(drawn, picture.array, table)
+        if not picture.notes:
+            return table
+        return Located(table.columns, table.kind, tuple({**image, "file": "; ".join(picture.notes)} for image in table.images))
 
     tables: list[Located] = []
     items = zip(files, pictures, strict=True)
     results = map(work, items) if len(files) == 1 else imap_tiles(work, items)  # the threads share the images, or the one image
     for i, table in enumerate(results):
-        tables.append(Located({"image": np.full(len(table), files[i].name), **table.columns}, table.kind, table.images))
+        tables.append(Located({"image": np.full(len(table), frame_name(files[i])), **table.columns}, table.kind, table.images))
         told("locating", i + 1, len(files))
     found = joined(tables)
     if output is not None:

@@ -14,6 +14,7 @@ from pixmetry.campaign.frame_writer import FORMATS, FrameWriter
 from pixmetry.campaign.truth import TruthWriter
 from pixmetry.core.camera import Camera, load_camera
 from pixmetry.core.errors import InputError
+from pixmetry.core.memory import check_memory
 from pixmetry.core.overrides import changed_camera
 from pixmetry.core.signal import Kind
 from pixmetry.scene.files import SceneModel, SeriesModel, background_of, build_scene, read_scene
@@ -21,6 +22,7 @@ from pixmetry.scene.uniform import Uniform
 
 SERIES_SCHEMA = "pixmetry/campaign/1"
 Window = tuple[int, int, int, int]
+RECORD_BYTES = 350  # what truth.json says of a frame, in memory
 
 
 @dataclass(frozen=True)
@@ -137,8 +139,9 @@ def simulate(
     bits = stored_bits(device)
     parts = _series(model, frames, overrides) if model.photon_transfer is not None else _sequence(device, model, frames, scene)
     shape = _checked_window(device, window)[2:]
+    count = sum(len(p.numbers) for p in parts)
+    check_memory(RECORD_BYTES * count, f"the record of {count} frames", remedy="make fewer frames at a time")
     with staged_output(output, "simulation") as folder:
-        count = sum(len(p.numbers) for p in parts)
         writer = FrameWriter(folder, image_format, bits, count, shape)
         notes = TruthWriter(device, seed, count, window, folder / "truth.zarr" if truth else None)
         files: list[list[str]] = []

@@ -38,6 +38,8 @@ def refused(text: str, tmp_path: Path) -> str:
         ("parts: [{exposure_s: 1, gian: 3}]", ["unknown key", "gian", "did you mean `gain`"]),
         ("parts: [{exposure_s: 1, colour: 3}]", ["unknown key", "colour", "allowed: exposure_s", "delete it"]),
         ("parts: [{gain: 1}]", ["exposure_s", "missing"]),
+        ("parts: [{exposure_s: 1, 'gain]': 3}]", ["line 1", "unknown key 'parts.1.gain]'", "did you mean `gain`"]),
+        ("'a]': 3", ["unknown key 'a]'"]),
         ("parts: [{exposure_s: 10 ms}]", ["not a number", "10 ms", "alone"]),
         ("parts:\n  - exposure_s: .nan\n", ["line 2", "exposure_s", "not a finite number"]),
         ("parts: [{exposure_s: -.inf}]", ["not a finite number"]),

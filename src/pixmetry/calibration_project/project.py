@@ -127,7 +127,7 @@ def _project(model: ProjectModel, reader: Reader, progress: Progress | None) -> 
     images, points = reader.table("images", model.images), reader.table("points", model.points)
     plate, findings = None, ()
     if model.pictures is not None:
-        files = reader.pictures(model.pictures.files)
+        files = reader.pictures(model.pictures.files, model.pictures.raw)
         camera, seen, plate, findings = located(model.pictures, files, cameras[0], images, progress, told[0].check)
         cameras = (camera,)
     else:
@@ -150,7 +150,7 @@ def _lines(
 ) -> tuple[CameraModel, LinePositions, tuple[Finding, ...]]:
     """Positions on straight lines, and the camera with the size of its frame."""
     if model.pictures is not None:
-        lines, size, findings = lines_of_pictures(model.pictures, reader.pictures(model.pictures.files), progress)
+        lines, size, findings = lines_of_pictures(model.pictures, reader.pictures(model.pictures.files, model.pictures.raw), progress)
         told.check(size)
         return of_size(told.model, *size), lines, findings
     assert table is not None and model.lines is not None

@@ -8,7 +8,9 @@ from pathlib import Path
 from pixmetry.calibration_project.schema import ProjectModel, TableModel
 from pixmetry.calibration_project.tables import Table, inline_table, read_table
 from pixmetry.campaign.files import find_file, find_files
+from pixmetry.campaign.formats import is_frame
 from pixmetry.campaign.images import PICTURE_ENDINGS, picture_files
+from pixmetry.campaign.raw_values import parse_raw
 
 
 class Reader:
@@ -40,15 +42,19 @@ class Reader:
         self.files.append(path)
         return read_table(path, wanted.columns)
 
-    def pictures(self, names: Sequence[str]) -> list[Path]:
-        """Files of pictures by names, patterns and folders."""
+    def pictures(self, names: Sequence[str], raw: str | None = None) -> list[Path]:
+        """Pictures by names, patterns and folders of files; ``raw`` is the layout of files without a header."""
+        layout = None if raw is None else parse_raw(raw)
         found: list[Path] = []
         for k, name in enumerate(names):
             where = self.where("pictures", "files", k)
             path = self.folder / name
             base = Path(path.anchor) if Path(name).is_absolute() else self.folder  # patterns count from a folder
-            found += picture_files([path], PICTURE_ENDINGS) if path.is_dir() else find_files(base, [str(path.relative_to(base))], where)
-        self.files += found
+            if path.is_dir():
+                found += picture_files([path], PICTURE_ENDINGS, layout)
+            else:
+                found += find_files(base, [str(path.relative_to(base))], where, layout)
+        self.files += dict.fromkeys(path.parent if is_frame(path) else path for path in found)
         return found
 
     def bars(self, model: ProjectModel) -> list[Table]:

@@ -9,6 +9,7 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from pixmetry.calibration.model import NAMES
 from pixmetry.calibration.network import PER_IMAGE_NAMES
+from pixmetry.campaign.raw_values import parse_raw
 from pixmetry.core.config import Model
 from pixmetry.core.errors import InputError
 
@@ -148,14 +149,21 @@ class PicturesModel(Model):
     diameter: Positive | None = None
     polarity: Literal["auto", "bright", "dark"] = "auto"
     channel: Literal["red", "green", "blue"] | None = None
+    raw: str | None = None
     noise: str | None = None
+
+    @model_validator(mode="after")
+    def _layout(self) -> PicturesModel:
+        if self.raw is not None:
+            parse_raw(self.raw)
+        return self
 
     @model_validator(mode="after")
     def _plate(self) -> PicturesModel:
         given = next((key for key in ("grid", "pitch", "side", "diameter") if getattr(self, key) is not None), None)
         if self.kind == "lines" and given is not None:
             what = f"`{given}` has no meaning with straight lines"
-            raise InputError(what, allowed="files, kind, polarity, channel, noise", remedy="delete it, or name another kind")
+            raise InputError(what, allowed="files, kind, polarity, channel, raw, noise", remedy="delete it, or name another kind")
         return self
 
 

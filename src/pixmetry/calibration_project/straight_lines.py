@@ -76,24 +76,27 @@ def lines_of_pictures(
     InputError, MeasureError
         If a picture cannot be read, their sizes differ, or none shows a line.
     """
+    from pixmetry.campaign.formats import frame_name
     from pixmetry.campaign.images import read_picture
+    from pixmetry.campaign.raw_values import parse_raw
     from pixmetry.locating import checked_frame, noise_model
 
     told = progress or (lambda what, done, of: None)
-    noise = noise_model(wanted.noise)
+    noise, layout = noise_model(wanted.noise), None if wanted.raw is None else parse_raw(wanted.raw)
     parts: list[LinePositions] = []
     findings, size = [], None
     for k, file in enumerate(files):
-        frame = checked_frame(read_picture(file, wanted.channel), file.name)
+        name = frame_name(file)
+        frame = checked_frame(read_picture(file, wanted.channel, layout), name)
         if size is not None and frame.shape != size:
             found, allowed = f"{frame.shape[1]} x {frame.shape[0]} pixels", f"{size[1]} x {size[0]} pixels"
-            raise InputError("the pictures differ in size", where=file.name, value=found, allowed=allowed, remedy="leave it out")
+            raise InputError("the pictures differ in size", where=name, value=found, allowed=allowed, remedy="leave it out")
         size = frame.shape
-        part = _lines(frame, file.name, wanted.polarity, noise)
+        part = _lines(frame, name, wanted.polarity, noise)
         if len(part):
             parts.append(part)
         else:
-            findings.append(Finding("image_left_out", f"{file.name} was left out: no line is found in it.", level="warning"))
+            findings.append(Finding("image_left_out", f"{name} was left out: no line is found in it.", level="warning"))
         told("locating lines", k + 1, len(files))
     if not parts or size is None:
         what, remedy = "no line is found in the pictures", "take lines that stand out, at least a quarter of the frame long"

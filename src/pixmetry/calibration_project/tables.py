@@ -132,6 +132,9 @@ class Table:
 def read_table(path: Path, columns: Sequence[str] | Mapping[str, str] | None = None) -> Table:
     """Read a table whose columns are parted by commas, semicolons, tabs or blanks; lines that begin with # are comments.
 
+    A line that begins with # and no blank behind it, and has as many values as the header, may be a comment or a row whose first name
+    begins with #: it is refused.
+
     Parameters
     ----------
     path : Path
@@ -142,13 +145,15 @@ def read_table(path: Path, columns: Sequence[str] | Mapping[str, str] | None = N
     Raises
     ------
     InputError
-        If the file cannot be read, holds no row, or a row has another number of values than the header.
+        If the file cannot be read, holds no row, a row has another number of values than the header, or may be a row or a comment.
     """
     source = str(path)
-    lines = [(n, line) for n, line in enumerate(read_text(path).splitlines(), 1) if line.strip() and not line.lstrip().startswith("#")]
+    given = [(n, line) for n, line in enumerate(read_text(path).splitlines(), 1) if line.strip()]
+    lines = [(n, line) for n, line in given if not line.lstrip().startswith("#")]
     if not lines:
         raise InputError("the table is empty", where=source, allowed="a header line, then one line a row", remedy="check the file")
     rows = _split(source, lines)
+    _refuse_lost_rows(source, given, lines[0], len(rows[0][1]))
     if columns is None or isinstance(columns, Mapping):
         (line, header), rows = rows[0], rows[1:]
         header = _header(header, columns, f"{source}, line {line}")
@@ -205,7 +210,20 @@ def _split(source: str, lines: Sequence[tuple[int, str]]) -> list[tuple[int, lis
         rows = list(csv.reader((line for _, line in lines), delimiter=parted_by, skipinitialspace=True))
     except csv.Error as problem:
         raise InputError(f"not a table of text ({problem})", where=source, remedy="check the file") from None
-    return [(n, [value.strip() for value in row]) for (n, _), row in zip(lines, rows, strict=False)]
+    if len(rows) != len(lines):
+        n = next(n for n, line in lines if line.count('"') % 2)
+        remedy = "close it on its line, or write two quotes for one in a name"
+        raise InputError("a quote that is not closed", where=f"{source}, line {n}", remedy=remedy)
+    return [(n, [value.strip() for value in row]) for (n, _), row in zip(lines, rows, strict=True)]
+
+
+def _refuse_lost_rows(source: str, given: Sequence[tuple[int, str]], first: tuple[int, str], width: int) -> None:
+    """Refuse what would be left out as a comment although it has the form of a row."""
+    for n, line in given:
+        text = line.strip()
+        if n > first[0] and re.match(r"#[^#\s]", text) and len(_split(source, [first, (n, text)])[1][1]) == width:
+            remedy = f"put the name in quotes if it is a row, or write `# {text[1:10]}…`, with a blank, if it is a comment"
+            raise InputError("a row whose name begins with #, or a comment", where=f"{source}, line {n}", value=text[:60], remedy=remedy)
 
 
 def _header(found: list[str], columns: Mapping[str, str] | None, where: str) -> list[str]:

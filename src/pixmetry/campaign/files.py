@@ -8,12 +8,14 @@ import unicodedata
 from functools import lru_cache
 from pathlib import Path
 
+from pixmetry.campaign.formats import frames_of, is_frame
+from pixmetry.campaign.raw_values import RawLayout
 from pixmetry.campaign.zarr_frames import is_entry
 from pixmetry.core.errors import InputError
 
 
 def find_file(base: Path, text: str, where: str) -> Path:
-    """Find one file by its name relative to a folder (or one entry of a Zarr store of frames, ``frames.zarr/7``).
+    """Find one file by its name relative to a folder (or one frame of a store or file of frames: ``frames.zarr/7``, ``stack.tif/7``).
 
     Backslashes separate folders as slashes do, and where no name fits exactly, one that differs in upper and lower case fits.
 
@@ -41,7 +43,7 @@ def find_file(base: Path, text: str, where: str) -> Path:
 
 def _find(base: Path, text: str, where: str) -> Path:
     path = base / text  # an exact name first: on Linux a backslash may be part of it
-    if path.is_file() or is_entry(path):
+    if path.is_file() or is_entry(path) or is_frame(path):
         return path
     parts = text.replace("\\", "/").split("/")
     path = Path("/") if parts[0] == "" else base
@@ -88,8 +90,10 @@ def _key(name: str) -> str:
     return unicodedata.normalize("NFC", name).casefold()
 
 
-def find_files(base: Path, patterns: list[str] | tuple[str, ...], where: str) -> tuple[Path, ...]:
-    """Find files by names or glob patterns; what a pattern finds is in natural order (``a2`` before ``a10``).
+def find_files(base: Path, patterns: list[str] | tuple[str, ...], where: str, raw: RawLayout | None = None) -> tuple[Path, ...]:
+    """Find frames by names or glob patterns of files; what a pattern finds is in natural order (``a2`` before ``a10``).
+
+    A file with several frames stands for all of them. ``raw`` is the layout of files without a header.
 
     Raises
     ------
@@ -105,7 +109,7 @@ def find_files(base: Path, patterns: list[str] | tuple[str, ...], where: str) ->
         if not fitting:
             raise InputError(f"pattern '{text}' fits no file", where=where, remedy="check it; it is relative to the folder of the manifest")
         found += fitting
-    return tuple(found)
+    return tuple(frame for path in found for frame in frames_of(path, raw))
 
 
 def _glob(base: Path, pattern: str, where: str) -> list[Path]:

@@ -3,27 +3,25 @@
 from __future__ import annotations
 
 import hashlib
-import io
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from pixmetry.campaign.formats import FORMATS, Decoded, decode, frames_of, is_frame, raw_file, read_stacked
+from pixmetry.campaign.in_memory import frame_of
 from pixmetry.campaign.png import SIGNATURE, PlainPng
 from pixmetry.campaign.provenance import InputHashes
+from pixmetry.campaign.raw_values import RawLayout
 from pixmetry.campaign.records import Campaign, FrameGroup
 from pixmetry.campaign.zarr_frames import entries, is_entry, lossless_store, read_entry
 from pixmetry.core.errors import InputError
+from pixmetry.core.memory import check_memory
 from pixmetry.core.observations import Storage
 from pixmetry.core.threads import imap_tiles
 
-_FORMATS = "grey PNG, TIFF or NPY with 8 or 16 bits"
-_JPEG = b"\xff\xd8"
-_TIFF_MARKS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
-_LOSSLESS_TIFF = {1, 5, 8, 32773, 32946, 50000, 34925, 34926}  # none, LZW, Deflate, PackBits, Deflate, Zstandard, LZMA
-_LOSSY_TIFF = {6, 7, 33007}  # JPEG
-ENDINGS = (".png", ".tif", ".tiff", ".npy")
+ENDINGS = (".png", ".tif", ".tiff", ".npy", ".bmp", ".fits", ".fit", ".fts")
 PICTURE_ENDINGS = (*ENDINGS, ".jpg", ".jpeg")
 CHANNELS = {"red": 0, "green": 1, "blue": 2}
 
@@ -53,19 +51,26 @@ def read_frame(path: str | Path) -> np.ndarray:
     return load_frame(Path(path)).array
 
 
-def load_frame(path: Path, plain_png: PlainPng | None = None) -> LoadedFrame:
-    """Read one frame and the SHA-256 of its file from the same bytes; errors as in `read_frame`."""
+def load_frame(path: Path, plain_png: PlainPng | None = None, raw: RawLayout | None = None) -> LoadedFrame:
+    """Read one frame and the SHA-256 of its file from the same bytes; errors as in `read_frame`.
+
+    Of a frame in a store or in a file with several, the digest is that of its values.
+    """
     if is_entry(path):
         array, sha256, size = read_entry(path)
         return LoadedFrame(_checked(array, path), sha256, size, lossless_store(path))
-    raw = _read_bytes(path)
-    array = plain_png.decode(raw) if plain_png is not None and raw.startswith(SIGNATURE) else None
-    if array is None:
-        array = _checked(_decoded(raw, path), path)
-    return LoadedFrame(array, hashlib.sha256(raw).hexdigest(), len(raw), _lossless(raw))
+    if is_frame(path) or raw_file(path, raw):
+        found, sha256, size = read_stacked(path if is_frame(path) else path / "0", raw)
+        return LoadedFrame(_checked(found.array, path), sha256, size, found.lossless)
+    data = _read_bytes(path)
+    sha256 = hashlib.sha256(data).hexdigest()
+    if plain_png is not None and data.startswith(SIGNATURE) and (array := plain_png.decode(data)) is not None:
+        return LoadedFrame(array, sha256, len(data))
+    found = decode(data, path)
+    return LoadedFrame(_checked(found.array, path), sha256, len(data), found.lossless)
 
 
-def read_picture(path: str | Path, channel: str | None = None) -> np.ndarray:
+def read_picture(path: str | Path, channel: str | None = None, raw: RawLayout | None = None) -> np.ndarray:
     """Read a picture to measure positions in: as `read_frame`, and also JPEG, floats, and one channel of a colour image.
 
     Parameters
@@ -73,6 +78,8 @@ def read_picture(path: str | Path, channel: str | None = None) -> np.ndarray:
     path : str or Path
     channel : {"red", "green", "blue"}, optional
         Which one of a colour image; ignored for a grey one.
+    raw : RawLayout, optional
+        Of files without a header.
 
     Returns
     -------
@@ -83,10 +90,20 @@ def read_picture(path: str | Path, channel: str | None = None) -> np.ndarray:
     InputError
         As in `read_frame`, or if the image is in colour and no channel is named.
     """
-    path = Path(path)
+    return load_picture(Path(path), channel, raw).array
+
+
+def load_picture(path: Path, channel: str | None = None, raw: RawLayout | None = None) -> Decoded:
+    """As `read_picture`, with what is to be said of the file: that it was stored with loss, or is to be turned for display."""
     if channel is not None and channel not in CHANNELS:
         raise InputError("no such channel", value=channel, allowed=", ".join(CHANNELS))
-    array = read_entry(path)[0] if is_entry(path) else _decoded(_read_bytes(path), path, lossy=True)
+    if is_entry(path):
+        found = Decoded(read_entry(path)[0], lossless_store(path))
+    elif is_frame(path) or raw_file(path, raw):
+        found = read_stacked(path if is_frame(path) else path / "0", raw)[0]
+    else:
+        found = decode(_read_bytes(path), path, lossy=True)
+    array = found.array
     if array.ndim == 3 and array.shape[2] in (3, 4):
         if channel is None:
             what = f"colour image ({'x'.join(map(str, array.shape))})"
@@ -94,13 +111,13 @@ def read_picture(path: str | Path, channel: str | None = None) -> np.ndarray:
             remedy = f"name the channel to measure in ({keys}), or store the sensor's raw values"
             raise InputError(what, where=str(path), allowed="one grey channel", remedy=remedy)
         array = array[:, :, CHANNELS[channel]]
-    if array.dtype.kind == "f" and array.ndim == 2:
-        return np.ascontiguousarray(array, np.float32)
-    return _checked(array, path)
+    if array.dtype.kind == "f" and array.ndim == 2 and array.size:
+        return Decoded(np.ascontiguousarray(array, np.float32), found.lossless, found.notes)
+    return Decoded(_checked(array, path), found.lossless, found.notes)
 
 
-def picture_files(frames: Iterable[str | Path], endings: tuple[str, ...] = ENDINGS) -> list[Path]:
-    """Name the image files meant by files, folders of them, and Zarr stores of frames.
+def picture_files(frames: Iterable[str | Path], endings: tuple[str, ...] = ENDINGS, raw: RawLayout | None = None) -> list[Path]:
+    """Name the images meant by files, folders of them, and Zarr stores of frames; a file with several has a name for each.
 
     Raises
     ------
@@ -110,9 +127,10 @@ def picture_files(frames: Iterable[str | Path], endings: tuple[str, ...] = ENDIN
     given, files = [Path(f) for f in frames], []
     for path in given:
         if path.is_dir():
-            files += entries(path) or sorted(p for p in path.iterdir() if p.suffix.lower() in endings)
+            inside = sorted(p for p in path.iterdir() if p.suffix.lower() in endings or (p.is_file() and raw_file(p, raw)))
+            files += entries(path) or [name for p in inside for name in frames_of(p, raw)]
         else:
-            files.append(path)
+            files += frames_of(path, raw)
     if not files:
         where = ", ".join(map(str, given))
         raise InputError("no image files", where=where, allowed=", ".join(endings), remedy="name files or a folder of them")
@@ -121,6 +139,7 @@ def picture_files(frames: Iterable[str | Path], endings: tuple[str, ...] = ENDIN
 
 def _read_bytes(path: Path) -> bytes:
     try:
+        check_memory(path.stat().st_size, "the file", where=str(path), remedy="check that it is the right file")
         return path.read_bytes()
     except FileNotFoundError:
         raise InputError("file is missing", where=str(path), remedy="check the name") from None
@@ -128,91 +147,15 @@ def _read_bytes(path: Path) -> bytes:
         raise InputError("file cannot be read", where=str(path), value=problem.strerror, remedy="check the permissions") from None
 
 
-def _decoded(raw: bytes, path: Path, lossy: bool = False) -> np.ndarray:
-    """Decode by content, not by the name's ending."""
-    decode = next((decode for magic, decode in _DECODERS if raw.startswith(magic)), None)
-    if lossy and raw.startswith(_JPEG):
-        decode = _decode_jpeg
-    if decode is None:
-        if raw.startswith(_JPEG):
-            remedy = "store frames without loss: JPEG removes the noise to be measured"
-            raise InputError("JPEG image", where=str(path), allowed=_FORMATS, remedy=remedy)
-        what = "file is empty" if not raw else "not an image of a known format"
-        raise InputError(what, where=str(path), allowed=_FORMATS, remedy="copy or export the frame again")
-    try:
-        return decode(raw)
-    except InputError as problem:
-        raise InputError(problem.what, where=str(path), allowed=problem.allowed, remedy=problem.remedy) from None
-    except Exception as problem:  # every decoder has its own exceptions, and all of them mean a damaged file here
-        reason = str(problem).splitlines()[0] if str(problem) else type(problem).__name__
-        raise InputError(f"image is damaged or cut off ({reason})", where=str(path), remedy="copy or export the frame again") from None
-
-
-def _lossless(raw: bytes) -> bool | None:
-    """Whether the coder of a file that was decoded is lossless; None if that is not known."""
-    if raw[:4] not in _TIFF_MARKS:
-        return not raw.startswith(_JPEG)
-    import tifffile
-
-    with tifffile.TiffFile(io.BytesIO(raw)) as tiff:
-        return None if (coder := int(tiff.pages[0].compression)) not in _LOSSLESS_TIFF | _LOSSY_TIFF else coder in _LOSSLESS_TIFF
-
-
 def _checked(array: np.ndarray, path: Path) -> np.ndarray:
     if array.ndim != 2:
         what = f"colour image ({'x'.join(map(str, array.shape))})"
         raise InputError(what, where=str(path), allowed="one grey channel", remedy="store the sensor's raw values, not a colour picture")
     if array.dtype not in (np.uint8, np.uint16):
-        raise InputError(f"values of type {array.dtype}", where=str(path), allowed=_FORMATS, remedy="store the camera's integer values")
+        raise InputError(f"values of type {array.dtype}", where=str(path), allowed=FORMATS, remedy="store the camera's integer values")
     if array.size == 0:
         raise InputError("image has no pixels", where=str(path), remedy="export the frame again")
     return np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("="))
-
-
-def _decode_png(raw: bytes) -> np.ndarray:
-    import imagecodecs
-
-    array: np.ndarray = imagecodecs.png_decode(raw)
-    if b"IEND" not in raw:
-        raise ValueError("end of the image is missing")
-    return array
-
-
-def _decode_tiff(raw: bytes) -> np.ndarray:
-    import tifffile
-
-    with tifffile.TiffFile(io.BytesIO(raw)) as tiff:
-        if len(tiff.pages) != 1:
-            raise InputError(f"TIFF with {len(tiff.pages)} images", allowed="one frame a file", remedy="write each frame into its own file")
-        page = tiff.pages[0]
-        # tifffile fills strips it has no bytes for with zeros; that must not pass as data
-        for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True):
-            if count <= 0 or offset <= 0 or offset + count > len(raw):
-                raise ValueError("pixel data are missing")
-        array: np.ndarray = page.asarray()
-        return array
-
-
-def _decode_jpeg(raw: bytes) -> np.ndarray:
-    import imagecodecs
-
-    array: np.ndarray = imagecodecs.jpeg_decode(raw)
-    return array
-
-
-def _decode_npy(raw: bytes) -> np.ndarray:
-    array: np.ndarray = np.load(io.BytesIO(raw), allow_pickle=False)
-    return array
-
-
-_DECODERS: tuple[tuple[bytes, Callable[[bytes], np.ndarray]], ...] = (
-    (SIGNATURE, _decode_png),
-    (b"II*\0", _decode_tiff),
-    (b"MM\0*", _decode_tiff),
-    (b"II+\0", _decode_tiff),
-    (b"MM\0+", _decode_tiff),
-    (b"\x93NUMPY", _decode_npy),
-)
 
 
 def check_frame(array: np.ndarray, where: str, *, bits: int, shape: tuple[int, int] | None = None, dtype: str | None = None) -> None:
@@ -268,6 +211,7 @@ def iter_frames(
     shape: tuple[int, int] | None = None,
     dtype: str | None = None,
     threads: int | None = None,
+    raw: RawLayout | None = None,
 ) -> Iterator[np.ndarray]:
     """Read frames in order, decoding ahead in threads; only a few frames (at most twice the threads) are in memory.
 
@@ -277,6 +221,8 @@ def iter_frames(
     bits, shape, dtype
         As in `check_frame`, applied to every frame.
     threads : int, optional
+    raw : RawLayout, optional
+        Of files without a header.
 
     Yields
     ------
@@ -290,7 +236,7 @@ def iter_frames(
     plain_png = PlainPng()
 
     def load(path: Path) -> np.ndarray:
-        array = load_frame(path, plain_png).array
+        array = load_frame(path, plain_png, raw).array
         check_frame(array, str(path), bits=bits, shape=shape, dtype=dtype)
         return array
 
@@ -312,12 +258,18 @@ class FrameReader:
         self._plain_png = PlainPng()
         self._coders: set[bool | None] = set()
         for listing in (campaign.source_path, campaign.descriptor_path):
-            if listing is not None and listing.is_file():
+            if campaign.arrays is None and listing is not None and listing.is_file():
                 self.hashes.add_file(listing)
 
     def fetch(self, path: Path) -> np.ndarray:
         """Read one frame in the calling thread, and take note of its digest; errors as in `iter_frames`."""
-        c, frame = self.campaign, load_frame(path, self._plain_png)
+        c = self.campaign
+        if c.arrays is not None:
+            array = frame_of(c, path)
+            check_frame(array, str(path), bits=c.bits)
+            self._coders.add(None)
+            return array
+        frame = load_frame(path, self._plain_png, c.raw)
         check_frame(frame.array, str(path), bits=c.bits, shape=c.frame_shape, dtype=c.frame_dtype)
         self.hashes.add(path, frame.sha256, frame.size_bytes)
         self._coders.add(frame.lossless)

@@ -9,12 +9,14 @@ from typing import TYPE_CHECKING, Any
 
 from pixmetry.campaign.emva_descriptor import decode_descriptor, is_descriptor, parse_descriptor
 from pixmetry.campaign.files import find_file, find_files
-from pixmetry.campaign.images import check_frame, read_frame
+from pixmetry.campaign.formats import frames_of
+from pixmetry.campaign.images import check_frame, load_frame
+from pixmetry.campaign.raw_values import RawLayout
 from pixmetry.campaign.records import STACK_FRAMES, CameraFacts, Campaign, FrameGroup, OpticsFacts, check_groups
 from pixmetry.core.errors import InputError
 
 if TYPE_CHECKING:
-    from pixmetry.campaign.schema import GroupModel, ManifestModel
+    from pixmetry.campaign.schema import CameraModel, GroupModel, ManifestModel
 
 EXAMPLE = Path(__file__).resolve().parents[1] / "data" / "emva1288-set-001-crop"
 
@@ -50,6 +52,10 @@ def load_campaign(path: str | Path | None = None) -> Campaign:
     InputError
         If anything in the manifest, or about the files it names, makes the campaign unusable.
     """
+    if path is not None and not isinstance(path, str | Path):
+        remedy = "give its path, or make a campaign of arrays with campaign_of_arrays([Frames(kind, exposure_s, data), …], bits=…)"
+        allowed = "path of a manifest or descriptor, or Campaign"
+        raise InputError("not a campaign", value=type(path).__name__, allowed=allowed, remedy=remedy)
     source = _find_source(EXAMPLE if path is None else Path(path))
     try:
         raw = source.read_bytes()
@@ -57,14 +63,15 @@ def load_campaign(path: str | Path | None = None) -> Campaign:
         raise InputError("file cannot be read", where=str(source), value=problem.strerror, remedy="check the permissions") from None
     if source.suffix.lower() not in (".yaml", ".yml") and is_descriptor(decode_descriptor(raw)):
         facts: dict[str, Any] = {"optics": OpticsFacts()}
-        parts = _from_descriptor(source, raw, None)
+        parts = _from_descriptor(source, raw, None, None)
     else:
         model, lines = _read_manifest(source)
         facts = {"optics": OpticsFacts(**model.optics.model_dump()), "notes": model.notes, "operator": model.operator}
-        parts = _from_manifest(source, model, lines)
+        facts["raw"] = None if model.raw is None else RawLayout(**model.raw.model_dump())
+        parts = _from_manifest(source, model, lines, facts["raw"])
     groups = check_groups(parts["groups"], str(source))
-    shape, dtype = _discover(groups[0].paths[0], parts)
-    _check_window(parts["camera"], shape, str(source))
+    shape, dtype = _discover(groups[0].paths[0], parts, facts.get("raw"))
+    check_window(parts["camera"], shape, str(source))
     return Campaign(
         camera=parts["camera"],
         groups=groups,
@@ -77,14 +84,14 @@ def load_campaign(path: str | Path | None = None) -> Campaign:
     )
 
 
-def _discover(path: Path, parts: Mapping[str, Any]) -> tuple[tuple[int, int], str]:
+def _discover(path: Path, parts: Mapping[str, Any], raw: RawLayout | None) -> tuple[tuple[int, int], str]:
     """Take size and depth from the first frame; the size must be the declared one where one was declared."""
-    array = read_frame(path)
+    array = load_frame(path, raw=raw).array
     check_frame(array, str(path), bits=parts["camera"].bits, shape=parts.get("shape"))
     return (array.shape[0], array.shape[1]), array.dtype.name
 
 
-def _check_window(camera: CameraFacts, shape: tuple[int, int], where: str) -> None:
+def check_window(camera: CameraFacts, shape: tuple[int, int], where: str) -> None:
     """Refuse frames that do not lie on the sensor that was stated."""
     if camera.sensor_shape is None:
         return
@@ -141,22 +148,29 @@ def _read_manifest(source: Path) -> tuple[ManifestModel, Mapping[tuple[str | int
     return validate(ManifestModel, data, str(source)), data.lines
 
 
-def _from_manifest(source: Path, model: ManifestModel, lines: Mapping[tuple[str | int, ...], int]) -> dict[str, Any]:
-    facts = model.camera.model_dump(exclude={"pitch_um"})
-    if model.camera.pitch_um is not None:
-        facts["pitch_x_um"] = facts["pitch_y_um"] = model.camera.pitch_um
-    camera = CameraFacts(**facts)
+def _from_manifest(
+    source: Path, model: ManifestModel, lines: Mapping[tuple[str | int, ...], int], raw: RawLayout | None
+) -> dict[str, Any]:
+    camera = camera_facts(model.camera)
     if model.emva_descriptor is not None:
         where = _place(source, lines, "emva_descriptor")
         descriptor = find_file(source.parent, model.emva_descriptor, where)
-        parts = _from_descriptor(descriptor, descriptor.read_bytes(), camera)
+        parts = _from_descriptor(descriptor, descriptor.read_bytes(), camera, raw)
         return {**parts, "descriptor_path": descriptor, "licence": model.licence or parts["licence"]}
     groups = []
     for i, group in enumerate(model.frames):
-        paths = find_files(source.parent, group.files, _place(source, lines, "frames", i, "files"))
+        paths = find_files(source.parent, group.files, _place(source, lines, "frames", i, "files"), raw)
         photons = _photons(group, model, camera, _place(source, lines, "frames", i))
-        groups.append(FrameGroup(group.kind, group.exposure_s, photons, paths, group.role or _role(paths)))
+        groups.append(FrameGroup(group.kind, group.exposure_s, photons, paths, group.role or role_of(paths)))
     return {"camera": camera, "groups": tuple(groups), "licence": model.licence}
+
+
+def camera_facts(model: CameraModel) -> CameraFacts:
+    """The facts of the camera that a manifest states."""
+    facts = model.model_dump(exclude={"pitch_um"})
+    if model.pitch_um is not None:
+        facts["pitch_x_um"] = facts["pitch_y_um"] = model.pitch_um
+    return CameraFacts(**facts)
 
 
 def _place(source: Path, lines: Mapping[tuple[str | int, ...], int], *loc: str | int) -> str:
@@ -164,7 +178,8 @@ def _place(source: Path, lines: Mapping[tuple[str | int, ...], int], *loc: str |
     return f"{source}, line {lines[loc]}" if loc in lines else str(source)
 
 
-def _role(paths: tuple[Path, ...]) -> str:
+def role_of(paths: tuple[Path, ...]) -> str:
+    """Whether a group is a stack or a level, where nobody said."""
     return "stack" if len(paths) >= STACK_FRAMES else "level"
 
 
@@ -180,15 +195,16 @@ def _photons(group: GroupModel, model: ManifestModel, camera: CameraFacts, where
     return photons_from_irradiance(irradiance, group.exposure_s, camera.pitch_x_um * camera.pitch_y_um, model.optics.wavelength_nm)
 
 
-def _from_descriptor(source: Path, raw: bytes, camera: CameraFacts | None) -> dict[str, Any]:
-    descriptor = parse_descriptor(source, raw)
+def _from_descriptor(source: Path, text: bytes, camera: CameraFacts | None, raw: RawLayout | None) -> dict[str, Any]:
+    descriptor = parse_descriptor(source, text)
     if camera is not None and camera.bits != descriptor.bits:
         what = f"the manifest declares {camera.bits} bits, the descriptor {descriptor.bits}"
         raise InputError(what, where=str(source), remedy="correct the one that is wrong")
     groups = []
     for group in descriptor.groups:
-        paths = tuple(find_file(source.parent, text, f"{source}, line {line}") for text, line in group.files)
-        groups.append(FrameGroup(group.kind, group.exposure_s, group.photons, paths, _role(paths)))
+        files = (find_file(source.parent, text, f"{source}, line {line}") for text, line in group.files)
+        paths = tuple(frame for file in files for frame in frames_of(file, raw))
+        groups.append(FrameGroup(group.kind, group.exposure_s, group.photons, paths, role_of(paths)))
     return {
         "camera": camera or CameraFacts(name=source.parent.resolve().name or source.stem, bits=descriptor.bits),
         "groups": tuple(groups),
@@ -226,4 +242,5 @@ def write_manifest(campaign: Campaign, path: str | Path) -> None:
         frames.append({"kind": group.kind, "exposure_s": group.exposure_s, "photons": photons, "role": group.role, "files": files})
     manifest = {"schema": CAMPAIGN_SCHEMA, "camera": asdict(campaign.camera), "optics": asdict(campaign.optics), "frames": frames}
     told = {name: getattr(campaign, name) or None for name in ("licence", "notes", "operator")}
-    dump_yaml({**manifest, **told}, path)
+    layout = None if campaign.raw is None else asdict(campaign.raw)
+    dump_yaml({**manifest, "raw": layout, **told}, path)

@@ -1,4 +1,4 @@
-"""A fast way for the PNG files that cameras' frames are kept in: grey, 8 or 16 bits, not interlaced.
+"""PNG files, and a fast way for those that cameras' frames are kept in: grey, 8 or 16 bits, not interlaced.
 
 Most of the time of decoding goes into inflating; libdeflate does it in half the time of zlib, which PNG libraries use.
 """
@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import struct
 import threading
+import zlib
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,6 +17,64 @@ from pixmetry.campaign._png_kernels import join_bytes, undo_filters
 
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
 MAX_RATIO = 1032  # of inflated to deflated bytes; more is not possible
+
+
+PALETTE = 3  # colour type
+_CHANNELS = {0: 1, 2: 3, PALETTE: 3, 4: 2, 6: 4}  # of a colour type, decoded
+
+
+class PngHead(NamedTuple):
+    """What a PNG says of itself."""
+
+    cols: int
+    rows: int
+    depth: int
+    colour: int
+    transparent: bool  # pixels of some value or palette entry
+
+    @property
+    def decoded_bytes(self) -> int:
+        """Memory that the image takes."""
+        return self.rows * self.cols * (_CHANNELS[self.colour] + self.transparent) * (2 if self.depth == 16 else 1)
+
+
+def png_head(raw: bytes) -> PngHead:
+    """Go through all chunks of a PNG (ISO/IEC 15948) and compare their checksums.
+
+    Raises
+    ------
+    ValueError
+        If it is damaged or cut off, or promises more pixels than its data can hold.
+    """
+    at, head, transparent, data = len(SIGNATURE), None, False, 0
+    while True:
+        if at + 12 > len(raw):
+            raise ValueError("end of the image is missing")
+        length, kind = struct.unpack_from(">I4s", raw, at)
+        end = at + 8 + length
+        if end + 4 > len(raw):
+            raise ValueError("end of the image is missing")
+        if zlib.crc32(memoryview(raw)[at + 4 : end]) != int.from_bytes(raw[end : end + 4], "big"):
+            raise ValueError(f"checksum of {kind.decode('latin-1')!r} is wrong")
+        if kind == b"IHDR":
+            if head is not None or length != 13:
+                raise ValueError("the header is damaged")
+            head = struct.unpack_from(">IIBB", raw, at + 8)
+        elif kind == b"IDAT":
+            data += length
+        elif kind == b"IEND":
+            break
+        transparent = transparent or kind == b"tRNS"
+        at = end + 4
+    if head is None or not data:
+        raise ValueError("there is no image in it")
+    cols, rows, depth, colour = head
+    if not (cols and rows) or colour not in _CHANNELS or depth not in (1, 2, 4, 8, 16):
+        raise ValueError("the header is damaged")
+    samples = {0: 1, 2: 3, PALETTE: 1, 4: 2, 6: 4}[colour]
+    if rows * -(-cols * depth * samples // 8) > MAX_RATIO * data:
+        raise ValueError(f"{data} bytes cannot hold {cols} x {rows} pixels")
+    return PngHead(cols, rows, depth, colour, transparent)
 
 
 class PlainPng:

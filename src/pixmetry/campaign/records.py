@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+
+from pixmetry.campaign.formats import is_frame
+from pixmetry.campaign.raw_values import RawLayout
 from pixmetry.core.errors import InputError, MeasureError
 
 STACK_FRAMES = 8  # from this many frames on, a group is a stack: its mean image serves the spatial measurements
@@ -104,6 +108,11 @@ class Campaign:
         Text that came with the data.
     operator : str
         Who took the frames; empty where it was not said.
+    raw : RawLayout or None
+        Of frames in files without a header.
+    arrays : mapping of Path to ndarray, or None
+        Frames in memory by the folder of their names: ``paths`` of a group are then no files, but ``arrays/3/7`` is frame 7 of
+        ``arrays[Path("arrays/3")]``, of shape (frames, rows, cols).
     """
 
     camera: CameraFacts
@@ -116,6 +125,8 @@ class Campaign:
     licence: str = ""
     notes: str = ""
     operator: str = ""
+    raw: RawLayout | None = None
+    arrays: Mapping[Path, Sequence[np.ndarray] | np.ndarray] | None = field(default=None, compare=False)
 
     @property
     def bits(self) -> int:
@@ -135,8 +146,11 @@ class Campaign:
     @property
     def files(self) -> tuple[Path, ...]:
         """Every file that the campaign is read from."""
+        if self.arrays is not None:
+            return ()
         listings = tuple(path for path in (self.source_path, self.descriptor_path) if path is not None)
-        return (*listings, *(path for group in self.groups for path in group.paths))
+        frames = (path.parent if is_frame(path) else path for group in self.groups for path in group.paths)
+        return (*listings, *dict.fromkeys(frames))
 
     @contextmanager
     def named_in_errors(self) -> Iterator[None]:

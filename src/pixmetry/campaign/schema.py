@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
 
+from pixmetry.campaign.raw_values import RawLayout
 from pixmetry.core.config import Model
 from pixmetry.core.errors import InputError
 
@@ -104,6 +105,20 @@ class GroupModel(Model):
         return self
 
 
+class RawModel(Model):
+    """Layout of frames in files without a header."""
+
+    width: Side
+    height: Side
+    pixel_format: str
+    skip_bytes: Annotated[int, Field(ge=0)] = 0
+
+    @model_validator(mode="after")
+    def _known(self) -> RawModel:
+        RawLayout(**self.model_dump())
+        return self
+
+
 class ManifestModel(Model):
     """A campaign: facts, and frames listed here or in an EMVA 1288 descriptor."""
 
@@ -112,6 +127,7 @@ class ManifestModel(Model):
     optics: Annotated[OpticsModel, BeforeValidator(lambda v: v or {})] = OpticsModel()
     frames: Annotated[tuple[GroupModel, ...], BeforeValidator(lambda v: v or ())] = ()
     emva_descriptor: str | None = None
+    raw: RawModel | None = None
     licence: str = ""
     notes: str = ""
     operator: str = ""

@@ -6,7 +6,11 @@ The group knows the name and the one-line help of each command; the command's ow
 
 from __future__ import annotations
 
+import codecs
 import errno
+import io
+import sys
+import unicodedata
 from importlib import import_module
 from typing import Any
 
@@ -34,8 +38,30 @@ COMMANDS = {
 }
 
 
+_PLAIN = {"×": "x", "·": "*", "µ": "u", "μ": "u", "±": "+-", "–": "-", "—": "-", "−": "-", "…": "...", "≤": "<=", "≥": ">=", "√": "sqrt"}
+_PLAIN |= {"σ": "sigma", "η": "eta", "δ": "delta", "°": " deg", "⁻": "-", "→": "->", "“": '"', "”": '"', "’": "'", "‘": "'", "\u202f": " "}
+
+
+def _plain(problem: UnicodeError) -> tuple[str, int]:
+    """Write what a terminal's encoding has no sign for in letters that it has: an error handler of codecs."""
+    if not isinstance(problem, UnicodeEncodeError):
+        raise problem
+    signs = problem.object[problem.start : problem.end]
+    letters = (_PLAIN.get(c) or unicodedata.normalize("NFKD", c).encode("ascii", "ignore").decode() or "?" for c in signs)
+    return "".join(letters), problem.end
+
+
+codecs.register_error("pixmetry.plain", _plain)
+
+
 class LazyGroup(click.Group):
     """A group whose commands are imported one at a time, and whose deliberate errors are one line each."""
+
+    def main(self, *args: Any, **kwargs: Any) -> Any:
+        for stream in (sys.stdout, sys.stderr):
+            if isinstance(stream, io.TextIOWrapper) and codecs.lookup(stream.encoding).name != "utf-8":
+                stream.reconfigure(errors="pixmetry.plain")
+        return super().main(*args, **kwargs)
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(COMMANDS)
@@ -74,6 +100,10 @@ class LazyGroup(click.Group):
             if "surrogates" not in problem.reason:
                 raise
             click.echo("error: a path holds bytes that are no UTF-8; to do: rename the file or folder", err=True)
+            ctx.exit(EXIT_ERROR)
+        except MemoryError as problem:
+            said = f" ({problem})" if str(problem) else ""
+            click.echo(f"error: there is not enough memory{said}; to do: take smaller or fewer frames, or fewer threads", err=True)
             ctx.exit(EXIT_ERROR)
         except KeyboardInterrupt:
             click.echo("interrupted", err=True)

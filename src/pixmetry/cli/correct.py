@@ -11,8 +11,9 @@ import click
 @click.argument("frames", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option("--with", "results", type=click.Path(path_type=Path), required=True, help="The results.json of an assessment of this camera.")
 @click.option("-o", "--output", type=click.Path(path_type=Path), required=True, help="Folder for the corrected frames.")
+@click.option("--raw", metavar="WxH:FORMAT", help="Layout of files without a header, e.g. 1920x1200:Mono12p (GenICam's names).")
 @click.option("--threads", type=click.IntRange(1), help="Default: all processors.")
-def correct(frames: tuple[Path, ...], results: Path, output: Path, threads: int | None) -> None:
+def correct(frames: tuple[Path, ...], results: Path, output: Path, raw: str | None, threads: int | None) -> None:
     """Take out of frames what was measured in an assessment.
 
     FRAMES are image files, folders of them, or Zarr stores of frames. Dark signal, non-linearity, relative response and defects are
@@ -25,7 +26,7 @@ def correct(frames: tuple[Path, ...], results: Path, output: Path, threads: int 
 
     set_threads(threads)
     with shown_progress() as progress:
-        summary = correct_files(frames, results, output, progress=progress)
+        summary = correct_files(frames, results, output, raw=raw, progress=progress)
     for line in summary:
         click.echo(line)
     click.echo(f"corrected frames: {output}")

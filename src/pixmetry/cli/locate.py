@@ -42,6 +42,7 @@ KINDS = ("disc", "ellipse", "ring", "spot", "line", "edge", "cross", "chessboard
     help="Where light that falls off across a target acts.",
 )
 @click.option("--channel", type=click.Choice(["red", "green", "blue"]), help="Channel of colour images.")
+@click.option("--raw", metavar="WxH:FORMAT", help="Layout of files without a header, e.g. 1920x1200:Mono12p (GenICam's names).")
 @click.option("--threads", type=click.IntRange(1), help="Default: all processors.")
 def locate(
     images: tuple[Path, ...],
@@ -56,11 +57,13 @@ def locate(
     aperture: float,
     light_on: str,
     channel: str | None,
+    raw: str | None,
     threads: int | None,
 ) -> None:
     """Measure where targets or lines are, with a covariance.
 
-    IMAGES are files (PNG, TIFF, NPY, JPEG), folders of them, or Zarr stores of frames. Bright and dark targets are found without tuning.
+    IMAGES are files (PNG, TIFF, BMP, FITS, NPY, JPEG, raw), folders of them, or Zarr stores of frames; a file with several frames is as
+    many images. Bright and dark targets are found without tuning.
     Positions count from the centre of the top-left pixel, x to the right, y down.
     """
     from pixmetry.cli._progress import shown_progress
@@ -88,12 +91,15 @@ def locate(
             aperture_px=aperture,
             light_on=light_on,
             channel=channel,
+            raw=raw,
             progress=progress,
         )
     if output is None:
         click.echo(table.to_csv(), nl=False)
     for image in table.images:
         click.echo(f"{image['name']}: {image['targets']} found; {image['estimator']}: {image['reason']}", err=output is None)
+        if "file" in image:
+            click.echo(f"{image['name']}: {image['file']}", err=output is None)
     if output is not None:
         click.echo(f"table: {output}")
     if overlay is not None:

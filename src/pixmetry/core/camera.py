@@ -17,6 +17,7 @@ from pixmetry.core.conversions import LOOK, SAMPLE, Link, linked, look
 from pixmetry.core.errors import ChainError, InputError
 from pixmetry.core.frozen import Frozen, freeze
 from pixmetry.core.light import Light, Scene
+from pixmetry.core.memory import check_memory
 from pixmetry.core.quiet import QuietStreams
 from pixmetry.core.random import Grid, Streams
 from pixmetry.core.signal import Clock, Kind, Signal, Windows
@@ -183,9 +184,12 @@ class Camera:
         Signal
             With ``data`` of shape (frames, rows, cols).
         """
-        numbers = list(range(frames)) if isinstance(frames, int | np.integer) else [int(f) for f in frames]
-        if not numbers:
+        wanted: Sequence[int] = range(frames) if isinstance(frames, int | np.integer) else frames
+        if not len(wanted):
             raise InputError("no frame is asked for", remedy="give a number of frames of at least 1")
+        rows, cols = self.output_shape if window is None else window[2:]
+        _check_size(self.name, rows, cols, len(wanted))
+        numbers = [int(f) for f in wanted]
         parts = list(self.iter_frames(scene, numbers, seed, window, threads, quiet, **schedule))
         return _concatenate(parts)
 
@@ -204,7 +208,8 @@ class Camera:
         r0, c0, h, w = (0, 0, rows, cols) if window is None else window
         if not (r0 >= 0 and c0 >= 0 and h > 0 and w > 0 and r0 + h <= rows and c0 + w <= cols):
             raise InputError("the window does not lie in the frame", value=window, allowed=f"within {rows} rows and {cols} columns")
-        numbers = [int(f) for f in frames]
+        _check_size(self.name, h, w)
+        numbers = frames if isinstance(frames, range) else [int(f) for f in frames]
         if any(np.size(v) > 1 for v in schedule.values()):
             raise InputError("a series has one schedule for all its frames", value=", ".join(schedule), remedy="expose frame by frame")
         last_memory = max((i for i, e in enumerate(self.links) if e.remembers), default=-1)
@@ -223,13 +228,14 @@ class Camera:
         else:
             yield from imap_tiles(whole, numbers, threads)
 
-    def _with_memory(self, task: _Task, numbers: list[int], grid_of: Callable[[int], Grid], last_memory: int) -> Iterator[Signal]:
+    def _with_memory(self, task: _Task, numbers: Sequence[int], grid_of: Callable[[int], Grid], last_memory: int) -> Iterator[Signal]:
         """Run frames 0, 1, 2 … in order through everything up to the last source with a memory, the rest as far as it is wanted."""
-        if numbers and (min(numbers) < 0 or numbers != sorted(set(numbers))):
-            raise InputError("a camera with a memory needs frame numbers that rise from 0", value=numbers[:5])
+        rising = numbers.step > 0 if isinstance(numbers, range) else numbers == sorted(set(numbers))
+        if numbers and (not rising or numbers[0] < 0):
+            raise InputError("a camera with a memory needs frame numbers that rise from 0", value=list(numbers[:5]))
         head, tail = self.links[: last_memory + 1], self.links[last_memory + 1 :]
         first = next(i for i, e in enumerate(head) if e.remembers)
-        wanted = set(numbers)
+        wanted = numbers if isinstance(numbers, range) else set(numbers)
         before = head[:first]
 
         def prepared(number: int) -> tuple[int, list[Windows], Signal]:
@@ -239,7 +245,7 @@ class Camera:
             return number, needs, self._run(task, grid, before)
 
         state: dict[str, Any] = {}
-        sequence = range(max(numbers) + 1) if numbers else range(0)
+        sequence = range(numbers[-1] + 1) if numbers else range(0)
         for number, needs, signal in imap_tiles(prepared, sequence, task.threads):
             for element, needed in zip(head[first:], needs[first:], strict=False):
                 name, stream = element.name, task.streams.of(element.name)
@@ -494,6 +500,12 @@ def _equal_sizes(needs: list[Windows]) -> list[np.ndarray]:
 
 def _grid_at(grid: Grid, windows: Windows) -> Grid:
     return Grid(grid.frame, windows.row0, windows.col0, (int(windows.rows[0]), int(windows.cols[0])))
+
+
+def _check_size(name: str, rows: int, cols: int, frames: int = 1) -> None:
+    """Refuse frames for which there is no memory: what goes into a source and what comes out are there at once, in single precision."""
+    what = f"{f'{frames} frames' if frames > 1 else 'a frame'} of {cols} x {rows} pixels"
+    check_memory(8.0 * frames * rows * cols, what, where=name, remedy="expose a window, or fewer frames at a time")
 
 
 def _concatenate(parts: list[Signal]) -> Signal:

@@ -151,15 +151,30 @@ def validate(model: type[AnyModel], data: Mapping[str, Any], where: str = "") ->
         problems = problem.errors(include_url=False)
         errors = sorted(problems, key=lambda e: (not _of_schema(e), e["type"] != "extra_forbidden", e["type"] == "missing"))
         lines = getattr(data, "lines", {})
-        raise _explain(model, errors[0], lines, where) from None
+        raise _explain(model, errors[0], data, lines, where) from None
 
 
 def _of_schema(error: Any) -> bool:
     return error["loc"] == ("schema",) and error["type"] == "literal_error"
 
 
-def _explain(model: type[BaseModel], error: Any, lines: Mapping[tuple[str | int, ...], int], where: str) -> InputError:
-    loc = tuple(part for part in error["loc"] if not str(part).endswith("]"))
+def _place_in(data: Any, error: Any) -> tuple[str | int, ...]:
+    """Keys and positions of a problem as they stand in the data: pydantic names the members of unions between them."""
+    loc: list[str | int] = []
+    parts = error["loc"]
+    for k, part in enumerate(parts):
+        if isinstance(data, Mapping) and part in data or isinstance(data, list | tuple) and isinstance(part, int) and part < len(data):
+            loc.append(part)
+            data = data[part]
+        elif k == len(parts) - 1 and error["type"] in ("missing", "invalid_key"):
+            loc.append(part)
+    return tuple(loc)
+
+
+def _explain(
+    model: type[BaseModel], error: Any, data: Mapping[str, Any], lines: Mapping[tuple[str | int, ...], int], where: str
+) -> InputError:
+    loc = _place_in(data, error)
     line = next((lines[loc[:n]] for n in range(len(loc), 0, -1) if loc[:n] in lines), None)
     where = f"{where}, line {line}" if line else where
     name = ".".join(str(part + 1 if isinstance(part, int) else part) for part in loc)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import re
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -69,14 +70,27 @@ class Picture:
     caption: str
 
 
+_style_lock = threading.RLock()  # matplotlib's settings are those of the process
+
+
+@contextmanager
+def own_style(settings: Any) -> Iterator[None]:
+    """Matplotlib's own defaults with these settings, whatever the user's ``matplotlibrc`` says; one thread after the other."""
+    import matplotlib
+
+    with _style_lock, matplotlib.rc_context():
+        matplotlib.rcdefaults()
+        matplotlib.rcParams.update(settings)
+        yield
+
+
 @contextmanager
 def canvas(height_in: float, **kw: Any) -> Iterator[tuple[Figure, Any]]:
     """An empty figure in the report's style, and its axes (``kw`` as of ``Figure.subplots``)."""
-    import matplotlib
     from matplotlib.figure import Figure
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-    with matplotlib.rc_context(STYLE):
+    with own_style(STYLE):
         figure = Figure(figsize=(WIDTH_IN, height_in), layout=ConstrainedLayoutEngine(w_pad=0.03, h_pad=0.03))
         yield figure, figure.subplots(**kw)
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from pixmetry.core.errors import InputError
 from pixmetry.located import ORIGIN, Located
+from pixmetry.report.drawing import own_style
 
 CLEAN, FLAGGED, CROSS = "#00b4d8", "#ff9f1c", "#ff2e63"
 STRIP_IN = 0.42  # of text under the image
@@ -62,6 +63,11 @@ def write_overlay(path: str | Path, frame: np.ndarray, table: Located) -> Path:
     InputError
         If it cannot be written.
     """
+    with own_style({}):
+        return _drawn(Path(path), frame, table)
+
+
+def _drawn(target: Path, frame: np.ndarray, table: Located) -> Path:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -79,7 +85,6 @@ def write_overlay(path: str | Path, frame: np.ndarray, table: Located) -> Path:
     flagged = int((table.flags != 0).sum()) if len(table) else 0
     text = f"{len(table)} of kind {table.kind}, {flagged} flagged (orange)    {ORIGIN}"
     figure.text(0.01, 0.5 * STRIP_IN / (height + STRIP_IN), text, fontsize=8, va="center")
-    target = Path(path)
     partial = target.with_name(f".{target.stem}.partial-{os.getpid()}-{secrets.token_hex(4)}.png")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)

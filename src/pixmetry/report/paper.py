@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
-from pixmetry.report.drawing import GRID, INK, SOFT, STYLE
+from pixmetry.report.drawing import GRID, INK, SOFT, STYLE, own_style
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -225,9 +225,7 @@ class Paper:
 @contextmanager
 def paper() -> Iterator[Paper]:
     """Empty paper in the report's style, with its first page begun."""
-    import matplotlib
-
-    with matplotlib.rc_context(PDF_STYLE):
+    with own_style(PDF_STYLE):
         sheet = Paper()
         sheet.new_page()
         yield sheet
