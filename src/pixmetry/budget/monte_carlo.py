@@ -147,8 +147,15 @@ class Trials:
         draws = Streams(self.seed, self.seed).of("budget.places").uniform_unit(4 * self.units * self.places).astype(float)
         row, col, self.dx, self.dy = draws.reshape(4, self.units, self.places)
         self.dx, self.dy = self.dx - 0.5, self.dy - 0.5
-        self.row0 = np.floor(row * (shape[0] - self.side + 1)).astype(np.int64)
-        self.col0 = np.floor(col * (shape[1] - self.side + 1)).astype(np.int64)
+        ends = self.camera.layout([0.0, self.camera.frame_shape[1] - 1.0], [0.0, self.camera.frame_shape[0] - 1.0])
+        self.col0, self.row0 = (self._first(part, end, size) for part, end, size in zip((col, row), ends, shape[::-1], strict=True))
+
+    def _first(self, part: np.ndarray, ends: np.ndarray, size: int) -> np.ndarray:
+        """First pixels of windows spread over what the frame shows of the sensor: a row of samples may be longer than the line."""
+        start, end = (int(np.clip(at, 0, size)) for at in (np.ceil(ends[0] - 0.5), np.floor(ends[1] + 0.5) + 1))
+        if end - start < self.side:
+            start, end = 0, size
+        return start + np.floor(part * (end - start - self.side + 1)).astype(np.int64)
 
     def errors(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
         """Positions found in the frames of a variant of the camera less the true ones: px of the sensor, (units, places, frames)."""
