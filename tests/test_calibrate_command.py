@@ -7,6 +7,7 @@ import hashlib
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -23,10 +24,10 @@ from pixmetry.calibrated import calibrated_geometry
 from pixmetry.calibration.bundle import SMALL
 from pixmetry.calibration.model import NAMES
 from pixmetry.calibration.network import Calibration, Network
-from pixmetry.calibration_files import TEXTS, write_results
+from pixmetry.calibration_files import TABLES, write_results
 from pixmetry.calibration_project import load_project
 from pixmetry.calibration_project.schema import ProjectModel
-from pixmetry.calibration_record import packed, read_calibration, unpacked
+from pixmetry.calibration_record import json_text, packed, read_calibration, unpacked
 from pixmetry.cli import main
 from pixmetry.core.config import load_yaml, validate
 from pixmetry.core.errors import InputError
@@ -173,9 +174,13 @@ def test_an_earlier_result_is_replaced_and_nothing_else(done: tuple[Path, Path, 
     (tmp_path / "photos" / "a.jpg").write_text("x")
     refused(run(path, "-o", tmp_path / "photos"), "a.jpg", "choose another folder")
     assert {p.name for p in (tmp_path / "photos").iterdir()} == {"a.jpg"}
-    again = path.read_text().replace("{table: observations.csv", "{table: result/residuals.csv")
-    (done[0] / "again.yaml").write_text(again)
-    refused(run(done[0] / "again.yaml", "-o", done[0] / "result"), "holds a file of the project", "residuals.csv")
+    refused(run(path, "-o", done[0] / "result"), "calibration of something else (project.yaml)")  # another project of that name
+    moved = shutil.copytree(done[0], tmp_path / "moved")
+    again = run(moved / "project.yaml", "-o", moved / "result")
+    assert again.exit_code == 0, again.output
+    text = path.read_text().replace("{table: observations.csv", "{table: result/residuals.csv")
+    (moved / "project.yaml").write_text(text)
+    refused(run(moved / "project.yaml", "-o", moved / "result"), "holds a file that is read", "residuals.csv")
 
 
 def test_pictures_of_a_board_alone(tmp_path: Path) -> None:
@@ -256,9 +261,9 @@ def test_numbers_that_are_not_finite_stay_strict_json(by_hand: Calibration) -> N
     xyz = a.state.xyz.copy()
     xyz[3] = np.nan
     lost = replace(by_hand, adjustment=replace(a, state=replace(a.state, xyz=xyz)), tests={**by_hand.tests, "x": np.inf})
-    record = json.loads(TEXTS["calibration.json"](lost), parse_constant=lambda name: pytest.fail(name))
+    record = json.loads(json_text(lost), parse_constant=lambda name: pytest.fail(name))
     assert record["points"]["xyz"][3] == [None] * 3 and record["tests"]["x"] is None
-    assert TEXTS["points.csv"](lost).splitlines()[5].startswith(f"{a.network.points[3]},,,,")
+    assert TABLES["points.csv"](lost).splitlines()[5].startswith(f"{a.network.points[3]},,,,")
 
 
 @pytest.mark.parametrize("text", ["", "{}", '{"schema": "pixmetry/results/1"}', '{"schema": "pixmetry/calibration-result/1"}', "[1]"])

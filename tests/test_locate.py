@@ -345,7 +345,7 @@ def test_colour_and_jpeg_are_read(tmp_path: Path) -> None:
 
 def test_what_cannot_be_written_is_refused_before_any_work(image: Path, tmp_path: Path) -> None:
     (tmp_path / "mine.csv").write_text("a,b\n1,2\n")
-    assert "no table of positions" in refused(image, "-o", tmp_path / "mine.csv")
+    assert "no result of this kind" in refused(image, "-o", tmp_path / "mine.csv")
     assert (tmp_path / "mine.csv").read_text() == "a,b\n1,2\n"
     assert "unknown ending" in refused(image, "-o", tmp_path / "table.xls")
     assert "one picture for several" in refused(image, image, "--overlay", tmp_path / "one.png")
@@ -359,3 +359,15 @@ def test_a_file_that_cannot_be_used_is_named_and_nothing_is_written(image: Path,
 
 def test_the_estimators_are_listed(image: Path) -> None:
     assert all(name in run(image, "--estimator", "list", "--kind", "line") for name in estimators("line"))
+
+
+def test_no_picture_of_the_users_is_replaced(image: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "photo.png"
+    copy.write_bytes(image.read_bytes())
+    raw = copy.read_bytes()
+    assert "would overwrite an input" in refused(copy, "-o", tmp_path / "t.csv", "--overlay", copy)
+    assert "no result of this kind" in refused(image, "-o", tmp_path / "t.csv", "--overlay", copy)
+    assert copy.read_bytes() == raw and not (tmp_path / "t.csv").exists()
+    for _ in range(2):
+        run(image, "-o", tmp_path / "new" / "t.csv", "--overlay", tmp_path / "new" / "found.png")
+    assert {p.name for p in (tmp_path / "new").iterdir()} == {"t.csv", "found.png"}

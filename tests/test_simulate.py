@@ -73,7 +73,7 @@ def exposed(camera: Camera, frames: int, **kw: Any) -> np.ndarray:
 
 
 def written(folder: Path, name: str = "out") -> np.ndarray:
-    return np.stack([read_frame(p) for p in sorted((folder / name / "frames").iterdir())])
+    return np.stack([read_frame(p) for p in sorted((folder / name).glob("frame_*"))])
 
 
 def truth_of(folder: Path, name: str = "out") -> dict[str, Any]:
@@ -418,3 +418,29 @@ def test_names_that_a_disk_or_a_record_cannot_hold_are_one_line(folder: Path, na
     result = run(folder, output=name)
     assert result.exit_code == 2 and result.output.count("\n") == 1 and words in result.output
     assert not [p for p in folder.iterdir() if "partial" in p.name]
+
+
+# ---- what is kept --------------------------------------------------------------------------------------------------------------------
+
+
+def test_frames_stand_in_the_folder_that_was_named(folder: Path) -> None:
+    done(run(folder, "-n", 2, output="frames"))
+    assert {p.name for p in (folder / "frames").glob("*.tif")} == {"frame_00000.tif", "frame_00001.tif"}
+    assert not [p for p in (folder / "frames").iterdir() if p.is_dir()]
+
+
+def test_frames_of_another_camera_or_scene_and_notes_among_them_are_kept(folder: Path) -> None:
+    done(run(folder, "-n", 3, output="frames"))
+    (folder / "other.yaml").write_text((folder / "camera.yaml").read_text())
+    (folder / "twin.yaml").write_text((folder / "scene.yaml").read_text())
+    before = {p: p.read_bytes() for p in (folder / "frames").iterdir()}
+    for other in ({"camera": "other.yaml"}, {"scene": "twin.yaml"}):
+        result = run(folder, output="frames", **other)
+        assert result.exit_code == 2 and "simulation of something else (camera.yaml, scene.yaml)" in result.output
+    (folder / "frames" / "notes.txt").write_text("mine")
+    result = run(folder, output="frames")
+    assert result.exit_code == 2 and "notes.txt" in result.output
+    (folder / "frames" / "notes.txt").unlink()
+    assert {p: p.read_bytes() for p in (folder / "frames").iterdir()} == before
+    done(run(folder, "-n", 1, output="frames"))
+    assert len(list((folder / "frames").glob("*.tif"))) == 1

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -15,6 +15,7 @@ from pixmetry.budget.budget import compute_budget
 from pixmetry.budget.parameters import applies, with_estimates
 from pixmetry.budget.probe import Target, parse_target
 from pixmetry.campaign import (
+    EXAMPLE,
     Campaign,
     FrameReader,
     InputHashes,
@@ -22,8 +23,8 @@ from pixmetry.campaign import (
     load_campaign,
     provenance_record,
     staged_output,
-    write_json,
     write_maps,
+    write_record,
 )
 from pixmetry.core.camera import Camera, Element, in_order
 from pixmetry.core.catalogue import catalogue
@@ -83,11 +84,11 @@ def assess(
     InputError, MeasureError
         If a file or the campaign cannot be used, or the frames do not carry a photon transfer.
     """
-    if output is not None:
-        check_output(output, KIND)  # before the work, not after it
     what_target = parse_target(target) if target else Target()
     what_estimator = parse_estimator(estimator) if estimator else Estimator()
     frames = campaign if isinstance(campaign, Campaign) else load_campaign(campaign)
+    if output is not None:
+        check_output(output, KIND, _origin(frames), _inputs(frames, calibration))  # before the work, not after it
     if isinstance(calibration, str | Path):
         from pixmetry.calibration_record import calibration_file
 
@@ -123,7 +124,7 @@ def assess(
     assessment = Assessment(frames, seen, estimates, unmeasured, standard, camera, budget, record)
     if output is not None:
         told("writing the report", 0, 1)
-        write_results(assessment, output)
+        write_results(assessment, output, _inputs(frames, calibration))
         told("writing the report", 1, 1)
     return assessment
 
@@ -189,14 +190,38 @@ def _other_frames(calibration: Path, campaign: Campaign) -> tuple[str, ...]:
     return (f"The calibration is of {sizes}: {holds}.",)
 
 
-def write_results(assessment: Assessment, directory: str | Path) -> Path:
-    """Write report, results, maps and the twin into a folder, whole or not at all; return the path of the report."""
-    with staged_output(directory, KIND) as folder:
-        write_json(folder / "results.json", assessment.to_record())
+def write_results(assessment: Assessment, directory: str | Path, inputs: Sequence[Path] = ()) -> Path:
+    """Write report, results, maps and the twin into a folder, whole or not at all; return the path of the report.
+
+    Parameters
+    ----------
+    assessment : Assessment
+    directory : path
+    inputs : sequence of Path
+        Files that must not be replaced.
+
+    Raises
+    ------
+    InputError
+        If the folder cannot be written, or holds anything else than an earlier assessment of this campaign.
+    """
+    with staged_output(directory, KIND, _origin(assessment.campaign), inputs) as folder:
         write_maps(folder / "maps.zarr.zip", assessment.maps(), {"camera": assessment.campaign.camera.name})
         assessment.camera.save(folder / "camera.yaml")
         write_report(assessment, folder / "report.html")
+        write_record(folder / "results.json", assessment.to_record())
     return Path(directory) / "report.html"
+
+
+def _origin(campaign: Campaign) -> tuple[str | Path, ...]:
+    """What an assessment is of."""
+    return (campaign.camera.name, "packaged example" if campaign.source_path.is_relative_to(EXAMPLE) else campaign.source_path)
+
+
+def _inputs(campaign: Campaign, calibration: str | Path | CameraGeometry | None) -> list[Path]:
+    """Files that an assessment reads."""
+    more = [Path(calibration)] if isinstance(calibration, str | Path) else []
+    return [*campaign.files, *more]
 
 
 def observe_campaign(campaign: Campaign, progress: Progress) -> tuple[InputHashes, Observations]:

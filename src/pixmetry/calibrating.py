@@ -85,8 +85,9 @@ def calibrate(
     """
     from pixmetry.calibration.solve import calibrate_network
 
+    of = _sources(source)
     if output is not None:
-        check_folder(output)  # before the work, not after it
+        check_folder(output, of, [path for path in of if isinstance(path, Path)])  # before the work, not after it
     told = progress or (lambda what, done, of: None)
     project = None
     if isinstance(source, Network):
@@ -96,11 +97,11 @@ def calibrate(
         project = _project(source, pictures, told)
         network, given = project.network, project.options
         if output is not None:
-            _refuse_inputs(Path(output), project)
+            check_folder(output, of, project.inputs)
     if project is not None and project.lines is not None:
         if check_points is not None:
             raise InputError("has no meaning with straight lines", where="check_points", allowed="with points", remedy="leave it away")
-        return _from_lines(project, output, free, per_image, {**given, **(options or {})}, _steps(told))
+        return _from_lines(project, output, of, free, per_image, {**given, **(options or {})}, _steps(told))
     network = _changed(network, free, per_image)
     chosen = _options({**given, **(options or {})})
     checks = check_points if check_points is not None or project is None else project.check_points
@@ -117,7 +118,7 @@ def calibrate(
     calibration = replace(calibration, findings=findings, provenance={**calibration.provenance, **_origin(project, about)})
     if output is not None:
         step("writing the results")
-        write_results(calibration, output, cameras)
+        write_results(calibration, output, cameras, of, project.inputs if project is not None else ())
     step("")
     return calibration
 
@@ -125,6 +126,7 @@ def calibrate(
 def _from_lines(
     project: Project,
     output: str | Path | None,
+    of: Sequence[str | Path],
     free: Sequence[str] | str | None,
     per_image: Sequence[str] | str | None,
     options: Mapping[str, Any],
@@ -157,7 +159,7 @@ def _from_lines(
     )  # fmt: skip
     if output is not None:
         step("writing the results")
-        write_line_results(calibration, output)
+        write_line_results(calibration, output, of, project.inputs)
     step("")
     return calibration
 
@@ -225,12 +227,12 @@ def _project(source: str | Path | Sequence[str | Path], pictures: Mapping[str, A
     return project_of_pictures(sources, camera, plate, progress)
 
 
-def _refuse_inputs(output: Path, project: Project) -> None:
-    """An earlier result in the folder would be replaced: none of the project's files may be in it."""
-    inside = next((path for path in project.inputs if path.resolve().is_relative_to(output.resolve())), None)
-    if inside is not None:
-        remedy = "choose another folder for the results"
-        raise InputError("the folder holds a file of the project", where=str(output), value=inside.name, remedy=remedy)
+def _sources(source: str | Path | Network | Sequence[str | Path]) -> list[str | Path]:
+    """What is calibrated: a project file, the folders of pictures, or the names of the cameras of a network."""
+    if isinstance(source, Network):
+        return [model.name for model in source.cameras]
+    given = [Path(source)] if isinstance(source, str | Path) else [Path(part) for part in source]
+    return [*dict.fromkeys(path if path.suffix.lower() in PROJECT_ENDINGS or path.is_dir() else path.parent for path in given)]
 
 
 def _refuse_pictures(pictures: Mapping[str, Any], what: str) -> None:

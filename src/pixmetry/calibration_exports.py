@@ -6,40 +6,47 @@ import re
 from collections.abc import Iterable
 from pathlib import Path
 
-from pixmetry.calibration.exchange import COLMAP, EXACT_PX, OPENCV, STORAGES, colmap_line, converted, opencv_form, write_opencv
+from pixmetry import __version__
+from pixmetry.calibration.exchange import COLMAP, EXACT_PX, OPENCV, STORAGES, colmap_line, converted, opencv_text
 from pixmetry.calibration.model import CameraModel
+from pixmetry.campaign.staged_files import Output, check_files, write_together
 from pixmetry.core.errors import InputError
 
 KINDS = ("PINHOLE", "OPENCV", "FULL_OPENCV")  # of COLMAP, the simplest that loses nothing is taken
 COLMAP_HEAD = "# Camera list with one line of data per camera:\n#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n"
+# How a file that pixmetry wrote begins: no other one is replaced.
+COLMAP_MARK = re.compile(rb"# Written by pixmetry ")
+OPENCV_MARKS = {
+    ".yaml": re.compile(rb'%YAML[: ]1\.[0-9]\s+(---\s+)?written_by: "?pixmetry '),
+    ".xml": re.compile(rb'<\?xml version="1\.0"\?>\s*<opencv_storage>\s*<written_by>"?pixmetry '),
+    ".json": re.compile(rb'\{\s*"written_by": "pixmetry '),
+}
+OPENCV_MARKS[".yml"] = OPENCV_MARKS[".yaml"]
 
 
-def check_exports(opencv: Path | None, colmap: Path | None, output: Path, sources: Iterable[Path] = ()) -> None:
+def check_exports(opencv: Path | None, colmap: Path | None, folder: Path, sources: Iterable[Path] = ()) -> None:
     """Refuse names that files cannot be written to, before any work is done.
 
     Raises
     ------
     InputError
-        If a file has another ending, is a folder, lies in the folder of results, or is one of the sources.
+        If a file has another ending, is a folder, lies in the folder of results, is one of the sources, or exists and was not written by
+        an earlier export.
     """
     if opencv is not None and opencv.suffix.lower() not in STORAGES:
         raise InputError("not a file of OpenCV's storage", where=str(opencv), allowed=", ".join(STORAGES))
-    files = [path for path in (opencv, colmap) if path is not None]
-    if len({path.resolve() for path in files}) < len(files):
-        raise InputError("is to be two files at once", where=str(opencv), remedy="give --opencv and --colmap different names")
-    for path in files:
-        if path.resolve().is_relative_to(output.resolve()):
+    outputs = _outputs([opencv] if opencv is not None else [], colmap)
+    for path in (output.path for output in outputs):
+        if path.resolve().is_relative_to(folder.resolve()):
             remedy = "choose a place beside it"
             raise InputError("lies in the folder of results, which is replaced as a whole", where=str(path), remedy=remedy)
-        if path.is_dir() or not path.absolute().parent.is_dir():
-            what = "is a folder" if path.is_dir() else "lies in a folder that does not exist"
-            raise InputError(what, where=str(path), allowed="a file in a folder that exists")
-        if path.resolve() in {source.resolve() for source in sources}:
-            raise InputError("is read and cannot be written as well", where=str(path), remedy="choose another name")
+    check_files(outputs, sources)
 
 
-def write_exports(models: Iterable[CameraModel], opencv: Path | None, colmap: Path | None, may_lose_px: float = 0.0) -> list[str]:
-    """Write the files, all or none.
+def write_exports(
+    models: Iterable[CameraModel], opencv: Path | None, colmap: Path | None, may_lose_px: float = 0.0, sources: Iterable[Path] = ()
+) -> list[str]:
+    """Write the files, all or none; of those that exist, only earlier exports are replaced.
 
     Parameters
     ----------
@@ -50,6 +57,8 @@ def write_exports(models: Iterable[CameraModel], opencv: Path | None, colmap: Pa
         A ``cameras.txt`` with all cameras, numbered from 1.
     may_lose_px : float
         How far a point may move, anywhere in the frame, by what a program has no place for.
+    sources : iterable of Path
+        Files that must not be replaced.
 
     Returns
     -------
@@ -59,7 +68,7 @@ def write_exports(models: Iterable[CameraModel], opencv: Path | None, colmap: Pa
     Raises
     ------
     InputError
-        If more would be lost, or the principal distance is not known.
+        If more would be lost, the principal distance is not known, a file cannot be written, or another one would be replaced.
     """
     cameras = list(models)
     unknown = next((model.name for model in cameras if not model["c"] > 0), None)
@@ -67,20 +76,24 @@ def write_exports(models: Iterable[CameraModel], opencv: Path | None, colmap: Pa
         remedy = "calibrate with a test field, or give c_mm or c_px"
         raise InputError("cannot be exported without a principal distance, which straight lines do not tell", where=unknown, remedy=remedy)
     places = _opencv_places(cameras, opencv)
-    lines, told = [], []
+    lines, told, texts = [f"# Written by pixmetry {__version__}\n{COLMAP_HEAD}# Number of cameras: {len(cameras)}\n"], [], []
     for k, model in enumerate(cameras):
         if opencv is not None:
-            opencv_form(model, may_lose_px)
+            texts.append(opencv_text(model, opencv.suffix, may_lose_px))
         if colmap is not None:
             kind, lost = _simplest(model)
-            lines.append(f"# {model.name}\n{colmap_line(model, k + 1, kind, may_lose_px)}\n")
+            lines.append(f"# {' '.join(model.name.split())}\n{colmap_line(model, k + 1, kind, may_lose_px)}\n")
             told.append(_sentence(colmap, f"{model.name} as camera {k + 1}, {kind}", lost))
-    if colmap is not None:
-        colmap.write_text(f"{COLMAP_HEAD}# Number of cameras: {len(cameras)}\n{''.join(lines)}", encoding="utf-8", newline="\n")
+    texts += ["".join(lines)] if colmap is not None else []
+    write_together(_outputs(places, colmap), [text.encode() for text in texts], sources)
     for model, path in zip(cameras, places, strict=False):
-        write_opencv(model, path, may_lose_px)
         told.append(_sentence(path, f"{model.name} for OpenCV", converted(model, "object_to_image", OPENCV).largest_px))
     return told
+
+
+def _outputs(opencv: Iterable[Path], colmap: Path | None) -> list[Output]:
+    found = [Output(path, OPENCV_MARKS[path.suffix.lower()]) for path in opencv]
+    return found + ([Output(colmap, COLMAP_MARK)] if colmap is not None else [])
 
 
 def _opencv_places(cameras: list[CameraModel], opencv: Path | None) -> list[Path]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,18 +20,32 @@ from pixmetry.line_calibration import LineCalibration
 KIND = "calibration"
 
 
-def check_folder(folder: str | Path) -> None:
-    """Refuse a folder in which something else than an earlier calibration would be lost; before any work is done.
+def check_folder(folder: str | Path, of: Sequence[str | Path] = (), inputs: Iterable[Path] = ()) -> None:
+    """Refuse a folder in which something else than an earlier calibration of the same would be lost; before any work is done.
+
+    Parameters
+    ----------
+    folder : path
+    of : sequence of str or Path
+        What is calibrated: names, and files or folders.
+    inputs : iterable of Path
+        Files that must not be replaced.
 
     Raises
     ------
     InputError
-        If it is a file, or holds other files.
+        If it is a file, holds other files, an input or another calibration, or cannot be written to.
     """
-    check_output(folder, KIND)
+    check_output(folder, KIND, of, inputs)
 
 
-def write_results(calibration: Calibration, folder: str | Path, cameras: Mapping[str, Camera] | None = None) -> Path:
+def write_results(
+    calibration: Calibration,
+    folder: str | Path,
+    cameras: Mapping[str, Camera] | None = None,
+    of: Sequence[str | Path] = (),
+    inputs: Iterable[Path] = (),
+) -> Path:
     """Write the folder of results, whole or not at all; an earlier calibration in it is replaced.
 
     Parameters
@@ -40,32 +54,38 @@ def write_results(calibration: Calibration, folder: str | Path, cameras: Mapping
     folder : path
     cameras : mapping of str to Camera, optional
         Further files, for `pixmetry simulate`.
-
-    Raises
-    ------
-    InputError
-        If it holds other files, or cannot be written.
+    of, inputs
+        As of `check_folder`, which tells the errors.
     """
     from pixmetry.report.calibration_page import write_page
 
-    with staged_output(folder, KIND) as place:
-        for name, text in TEXTS.items():
+    with staged_output(folder, KIND, of, inputs) as place:
+        for name, text in TABLES.items():
             (place / name).write_text(text(calibration), encoding="utf-8", newline="\n")
         write_page(calibration, place / "report.html")
         for name, camera in (cameras or {}).items():
             camera.save(place / name)
+        _write_numbers(place, json_text, calibration)
     return Path(folder)
 
 
-def write_line_results(calibration: LineCalibration, folder: str | Path) -> Path:
+def write_line_results(
+    calibration: LineCalibration, folder: str | Path, of: Sequence[str | Path] = (), inputs: Iterable[Path] = ()
+) -> Path:
     """The same for a calibration from straight lines."""
     from pixmetry.report.lines_page import write_page
 
-    with staged_output(folder, KIND) as place:
-        (place / "calibration.json").write_text(lines_json(calibration), encoding="utf-8", newline="\n")
+    with staged_output(folder, KIND, of, inputs) as place:
         (place / "residuals.csv").write_text(line_residuals_csv(calibration), encoding="utf-8", newline="\n")
         write_page(calibration, place / "report.html")
+        _write_numbers(place, lines_json, calibration)
     return Path(folder)
+
+
+def _write_numbers(place: Path, text: Callable[..., str], calibration: Any) -> None:
+    """Write all numbers, last of all: with the digests of the other files."""
+    beside = [path.name for path in place.iterdir()]
+    (place / "calibration.json").write_text(text(calibration, place, beside), encoding="utf-8", newline="\n")
 
 
 def points_csv(calibration: Calibration) -> str:
@@ -147,9 +167,8 @@ def line_residuals_csv(calibration: LineCalibration) -> str:
     return _csv([PIXELS, "residual: across the line, towards +x (axis x: the line tells about x) or +y"], columns)
 
 
-# A new text file of the results needs a line here.
-TEXTS: dict[str, Callable[[Calibration], str]] = {
-    "calibration.json": json_text,
+# A new table of the results needs a line here.
+TABLES: dict[str, Callable[[Calibration], str]] = {
     "points.csv": points_csv,
     "poses.csv": poses_csv,
     "residuals.csv": residuals_csv,

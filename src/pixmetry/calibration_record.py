@@ -6,7 +6,7 @@ import base64
 import json
 import math
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, is_dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -16,6 +16,7 @@ import numpy as np
 from pixmetry.calibration.control import control_of
 from pixmetry.calibration.model import NAMES, CameraModel, Sensor
 from pixmetry.calibration.network import Calibration, Finding
+from pixmetry.core.checksums import check_record, sealed
 from pixmetry.core.config import read_text
 from pixmetry.core.errors import InputError
 from pixmetry.line_calibration import LineCalibration
@@ -83,9 +84,17 @@ class StoredCalibration:
         return tuple(own[self.columns[i]] for i in rows), self.covariance[np.ix_(rows, rows)]
 
 
-def json_text(calibration: Calibration) -> str:
-    """All numbers of a calibration as strict JSON; the joint covariance is packed, see `unpacked`."""
-    return _json(_plain(_record(calibration))) + "\n"
+def json_text(calibration: Calibration, folder: str | Path = "", beside: Iterable[str] = ()) -> str:
+    """All numbers of a calibration as strict JSON; the joint covariance is packed, see `unpacked`.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    folder : path
+    beside : iterable of str
+        Names of files in the folder whose digests it is to hold.
+    """
+    return _json(sealed(_plain(_record(calibration)), folder, beside)) + "\n"
 
 
 def _record(calibration: Calibration) -> dict[str, Any]:
@@ -142,8 +151,8 @@ def _camera_record(calibration: Calibration, k: int) -> dict[str, Any]:
     return camera_record(calibration.adjustment.camera(k), *calibration.adjustment.interior_covariance(k))
 
 
-def lines_json(calibration: LineCalibration) -> str:
-    """All numbers of a calibration from straight lines as strict JSON."""
+def lines_json(calibration: LineCalibration, folder: str | Path = "", beside: Iterable[str] = ()) -> str:
+    """All numbers of a calibration from straight lines as strict JSON; parameters as of `json_text`."""
     result = calibration.result
     record = {
         "schema": LINES_SCHEMA,
@@ -156,7 +165,7 @@ def lines_json(calibration: LineCalibration) -> str:
         "findings": [asdict(finding) for finding in calibration.findings],
         "provenance": calibration.provenance,
     }
-    return _json(_plain(record)) + "\n"
+    return _json(sealed(_plain(record), folder, beside)) + "\n"
 
 
 def camera_record(model: CameraModel, names: tuple[str, ...], covariance: np.ndarray) -> dict[str, Any]:
@@ -229,6 +238,7 @@ def _read(path: str | Path, schemas: tuple[str, ...], made: Callable[[Mapping[st
         if schema == LINES_SCHEMA:
             remedy = "lines do not tell the whole camera: calibrate with a test field (its project can `start_from` this file)"
         raise InputError("not a calibration", where=str(file), value=schema, allowed=" or ".join(schemas), remedy=remedy)
+    check_record(record, str(file))
     try:
         return made(record)
     except (KeyError, TypeError, ValueError, zlib.error) as problem:

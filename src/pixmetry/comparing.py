@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pixmetry.core.checksums import check_record
 from pixmetry.core.errors import InputError
 from pixmetry.emva.differences import Difference, Subject, decided, difference_of, family, holm
 from pixmetry.emva.fleet import FleetRow, fleet_chance, fleet_row
@@ -102,6 +103,7 @@ def load(source: DataSheet | str | Path, name: str = "") -> Subject:
     if is_xml(raw):
         return _of_sheet(read_sheet(path), name)
     record = parse_json(raw, str(path))
+    check_record(record, str(path))
     if record.get("schema") == ASSESSMENT_SCHEMA:
         return _of_assessment(record, name, str(path))
     if record.get("schema") != SCHEMA:

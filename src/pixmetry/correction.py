@@ -6,7 +6,6 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -15,6 +14,7 @@ from pixmetry.campaign.formats import is_frame
 from pixmetry.campaign.images import LoadedFrame, check_frame, load_frame, picture_files
 from pixmetry.campaign.raw_values import RawLayout, parse_raw
 from pixmetry.core.camera import Camera, load_camera
+from pixmetry.core.checksums import check_file, check_record
 from pixmetry.core.conversions import SAMPLE, LineSources
 from pixmetry.core.errors import InputError
 from pixmetry.core.line import Line
@@ -111,7 +111,7 @@ def correct_files(
     """
     from tifffile import imwrite
 
-    record, camera, maps = _load(Path(results))
+    bits, camera, maps = _load(Path(results))
     layout = parse_raw(raw) if isinstance(raw, str) else raw
     files = _named_once(picture_files(frames, raw=layout))
     hashes = InputHashes(files[0].parent)
@@ -121,11 +121,12 @@ def correct_files(
     def work(path: Path) -> tuple[Path, LoadedFrame, np.ndarray, dict[str, str]]:
         loaded = load_frame(path, raw=layout)
         frame = loaded.array
-        check_frame(frame, str(path), bits=int(record["camera"]["bits"]), shape=camera.output_shape)
+        check_frame(frame, str(path), bits=bits, shape=camera.output_shape)
         corrected, said = correct_signal(camera, _as_signal(frame, camera), maps)
         return path, loaded, corrected.data[0], said
 
-    with staged_output(output, "correction") as folder:
+    of = [Path(results), *dict.fromkeys(path if path.is_dir() else path.parent for path in map(Path, frames))]
+    with staged_output(output, "correction", of, [*files, results]) as folder:
         for i, (path, loaded, data, said) in enumerate(imap_tiles(work, files)):
             for name, text in said.items():
                 done.setdefault(name, []).append(text)
@@ -147,22 +148,34 @@ def _together(texts: Sequence[str]) -> str:
     return texts[0] if len(counts) == 1 else "; ".join(f"{text} ({count} of {len(texts)} frames)" for text, count in counts.items())
 
 
-def _load(results: Path) -> tuple[dict[str, Any], Camera, dict[str, np.ndarray]]:
+def _load(results: Path) -> tuple[int, Camera, dict[str, np.ndarray]]:
+    """Bits of the camera, the camera and its maps, each held against the digest that was taken when it was written."""
+    remedy = "name the results.json of an assessment"
+    if results.is_dir():
+        results = results / "results.json"
     try:
         record = json.loads(results.read_text(encoding="utf-8"))
     except OSError as problem:
-        raise InputError(
-            "results cannot be read", where=str(results), value=problem.strerror, remedy="name the results.json of an assessment"
-        ) from None
-    except ValueError:
-        raise InputError("is not JSON", where=str(results), remedy="name the results.json of an assessment") from None
+        raise InputError("results cannot be read", where=str(results), value=problem.strerror, remedy=remedy) from None
+    except (ValueError, RecursionError):
+        raise InputError("is not JSON", where=str(results), remedy=f"{remedy}; if this is one, it is damaged: assess again") from None
     if not isinstance(record, dict) or record.get("schema") != "pixmetry/results/1":
-        raise InputError("is not the result of an assessment", where=str(results), remedy="name the results.json of an assessment")
+        raise InputError("is not the result of an assessment", where=str(results), remedy=remedy)
+    digests = check_record(record, str(results))
     for name in ("camera.yaml", "maps.zarr.zip"):
-        if not (results.parent / name).is_file():
+        path = results.parent / name
+        if not path.is_file():
             raise InputError(f"{name} is missing beside the results", where=str(results.parent), remedy="assess the camera again")
+        if name not in digests:
+            remedy = "assess the camera again"
+            raise InputError(f"the results do not tell the digest of {name}", where=str(results), remedy=remedy)
+        check_file(path, digests)
+    try:
+        bits = int(record["camera"]["bits"])
+    except (KeyError, TypeError, ValueError):
+        raise InputError("damaged results of an assessment", where=str(results), remedy="assess the camera again") from None
     maps, _ = read_maps(results.parent / "maps.zarr.zip")
-    return record, load_camera(results.parent / "camera.yaml"), maps
+    return bits, load_camera(results.parent / "camera.yaml"), maps
 
 
 def _named_once(files: list[Path]) -> list[Path]:

@@ -4,21 +4,26 @@ from __future__ import annotations
 
 import csv
 import io
-import os
-import secrets
-from collections.abc import Sequence
+import re
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from pixmetry.campaign.staged_files import Output, check_files, write_together
 from pixmetry.core.errors import InputError
 from pixmetry.location.targets import Flag
 
 LOCATED_SCHEMA = "pixmetry/located/1"
 ORIGIN = "(0, 0) is the centre of the top-left pixel, x to the right, y down"
-ENDINGS = (".csv", ".parquet", ".json")
+# How a table with each ending begins (in Parquet the schema stands at the end): no other file is replaced.
+MARKS = {
+    ".csv": re.compile(rb"# pixmetry pixmetry/located/"),
+    ".parquet": re.compile(rb"PAR1.*pixmetry/located/", re.DOTALL),
+    ".json": re.compile(rb'\s*\{\s*"schema": "pixmetry/located/'),
+}
 LAST = ("estimator", "noise_model", "flags")  # columns, in every table
 
 
@@ -90,19 +95,13 @@ class Located:
         InputError
             If the ending is another one, the file exists and is no table of positions, or it cannot be written.
         """
-        target = checked_table_name(path)
-        writers = {".csv": self._csv, ".parquet": self._parquet, ".json": self._json}
-        partial = target.with_name(f".{target.name}.partial-{os.getpid()}-{secrets.token_hex(4)}")
-        try:
-            target.parent.mkdir(parents=True, exist_ok=True)
-            try:
-                partial.write_bytes(writers[target.suffix.lower()]())
-                os.replace(partial, target)
-            finally:
-                partial.unlink(missing_ok=True)
-        except OSError as problem:
-            raise InputError("table cannot be written", where=str(target), value=problem.strerror, remedy="choose another place") from None
-        return target
+        output = checked_table_name(path)
+        write_together([output], [self.content(output.path.suffix)])
+        return output.path
+
+    def content(self, ending: str) -> bytes:
+        """Return what the file with this ending (``.csv``, ``.parquet``, ``.json``) holds."""
+        return {".csv": self._csv, ".parquet": self._parquet, ".json": self._json}[ending.lower()]()
 
     def to_csv(self) -> str:
         """Return the text of the CSV file."""
@@ -153,35 +152,20 @@ class Located:
         return sink.getvalue()
 
 
-def checked_table_name(path: str | Path) -> Path:
+def checked_table_name(path: str | Path, inputs: Iterable[Path] = ()) -> Output:
     """Refuse a name under which a table cannot be written, before any work is done.
 
     Raises
     ------
     InputError
-        If the ending is not known, it is a folder, or there is a file that is no table of positions.
+        If the ending is not known, it is a folder or an input, there is a file that is no table of positions, or it cannot be written.
     """
     target = Path(path)
-    if target.suffix.lower() not in ENDINGS:
-        raise InputError("unknown ending of a table", where=str(target), value=target.suffix, allowed=", ".join(ENDINGS))
-    if target.is_dir():
-        raise InputError("is a folder, not a file", where=str(target), remedy="name the table, such as table.csv")
-    if target.is_file() and not _is_table(target):
-        raise InputError("file exists and is no table of positions", where=str(target), remedy="choose another name")
-    return target
-
-
-def _is_table(path: Path) -> bool:
-    with path.open("rb") as file:
-        head = file.read(200)
-        if path.suffix.lower() == ".parquet" and head.startswith(b"PAR1"):
-            import pyarrow.parquet
-
-            try:
-                return pyarrow.parquet.read_schema(path).metadata.get(b"schema", b"").startswith(b"pixmetry/located/")
-            except Exception:  # a damaged file of somebody else
-                return False
-    return b"pixmetry/located/" in head
+    if target.suffix.lower() not in MARKS:
+        raise InputError("unknown ending of a table", where=str(target), value=target.suffix, allowed=", ".join(MARKS))
+    output = Output(target, MARKS[target.suffix.lower()], True)
+    check_files([output], inputs)
+    return output
 
 
 def joined(tables: Sequence[Located]) -> Located:

@@ -12,6 +12,7 @@ import numpy as np
 from pixmetry.campaign.formats import frame_name
 from pixmetry.campaign.images import PICTURE_ENDINGS, load_picture, picture_files
 from pixmetry.campaign.raw_values import RawLayout, parse_raw
+from pixmetry.campaign.staged_files import Output, check_files, write_together
 from pixmetry.core.camera import Camera, load_camera
 from pixmetry.core.errors import InputError
 from pixmetry.core.threads import imap_tiles
@@ -176,18 +177,18 @@ def locate_files(
     InputError
         If a file or an option cannot be used; nothing is written then.
     """
-    from pixmetry.report.overlay import overlay_names, write_overlay
+    from pixmetry.report.overlay import MARK, overlay_names, overlay_png
 
-    if output is not None:
-        checked_table_name(output)
     layout = parse_raw(raw) if isinstance(raw, str) else raw
     files = picture_files(images, PICTURE_ENDINGS, layout)
     pictures = overlay_names(overlay, files)
+    written = [Output(picture, MARK, True) for picture in pictures if picture is not None]
+    tables_at = [] if output is None else [checked_table_name(output)]
+    check_files([*tables_at, *written], files)  # before the work
     model = noise_model(noise)
     told = progress or (lambda what, step, of: None)
 
-    def work(item: tuple[Path, Path | None]) -> Located:
-        path, drawn = item
+    def work(path: Path) -> tuple[Located, bytes]:
         name = frame_name(path)
         try:
             picture = load_picture(path, channel, layout)
@@ -197,21 +198,21 @@ def locate_files(
                 raise
             where = f"{path}: {problem.where}" if problem.where and problem.where != name else str(path)
             raise InputError(problem.what, where=where, value=problem.value, allowed=problem.allowed, remedy=problem.remedy) from None
-        if drawn is not None:
-            write_overlay(drawn, picture.array, table)
+        drawn = overlay_png(picture.array, table) if overlay is not None else b""
         if not picture.notes:
-            return table
-        return Located(table.columns, table.kind, tuple({**image, "file": "; ".join(picture.notes)} for image in table.images))
+            return table, drawn
+        return Located(table.columns, table.kind, tuple({**image, "file": "; ".join(picture.notes)} for image in table.images)), drawn
 
     tables: list[Located] = []
-    items = zip(files, pictures, strict=True)
-    results = map(work, items) if len(files) == 1 else imap_tiles(work, items)  # the threads share the images, or the one image
-    for i, table in enumerate(results):
+    drawings: list[bytes] = []
+    results = map(work, files) if len(files) == 1 else imap_tiles(work, files)  # the threads share the images, or the one image
+    for i, (table, drawing) in enumerate(results):
+        drawings.append(drawing)
         tables.append(Located({"image": np.full(len(table), frame_name(files[i])), **table.columns}, table.kind, table.images))
         told("locating", i + 1, len(files))
     found = joined(tables)
-    if output is not None:
-        found.write(output)
+    contents = [found.content(one.path.suffix) for one in tables_at]
+    write_together([*tables_at, *written], [*contents, *drawings[: len(written)]], files)
     return found
 
 

@@ -104,8 +104,8 @@ def simulate(
     scene : path or mapping
         Schema ``pixmetry/scene/1``.
     output : path
-        Folder; it gets the frames (``frames/``, or ``frames.zarr``), ``truth.json``, ``camera.yaml`` (the camera that made them) and, for a
-        photon-transfer series, ``campaign.yaml``.
+        Folder; it gets the frames (image files, or ``frames.zarr``), ``truth.json``, ``camera.yaml`` (the camera that made them) and, for a
+        photon-transfer series, ``campaign.yaml``. Only frames of the same camera and scene are replaced.
     frames : int
         How many frames of the scene (a series has its own counts).
     seed : int
@@ -141,7 +141,8 @@ def simulate(
     shape = _checked_window(device, window)[2:]
     count = sum(len(p.numbers) for p in parts)
     check_memory(RECORD_BYTES * count, f"the record of {count} frames", remedy="make fewer frames at a time")
-    with staged_output(output, "simulation") as folder:
+    of = (_origin(camera, device.name), _origin(scene, "scene"))
+    with staged_output(output, "simulation", of, [path for path in of if isinstance(path, Path)]) as folder:
         writer = FrameWriter(folder, image_format, bits, count, shape)
         notes = TruthWriter(device, seed, count, window, folder / "truth.zarr" if truth else None)
         files: list[list[str]] = []
@@ -236,6 +237,13 @@ def _write_manifest(
         facts |= {"pitch_x_um": camera.pitch_um[0], "pitch_y_um": camera.pitch_um[1]}
     entries = [dict(p.entry or {}) | {"files": list(names)} for p, names in zip(parts, files, strict=True)]
     dump_yaml({"schema": SERIES_SCHEMA, "camera": facts, "frames": entries}, folder / "campaign.yaml")
+
+
+def _origin(given: Any, name: str) -> str | Path:
+    """What a camera or scene came from: a file, else its name."""
+    if not isinstance(given, str | Path):
+        return name
+    return Path(given) if Path(given).is_file() else str(given)
 
 
 def _hashes(*given: Any) -> InputHashes:

@@ -125,20 +125,40 @@ def opencv_form(model: CameraModel, tolerance_px: float = 0.0) -> dict[str, Any]
     }
 
 
-def write_opencv(model: CameraModel, path: str | Path, tolerance_px: float = 0.0) -> Path:
-    """Write a file for OpenCV's FileStorage (.yaml, .yml, .xml or .json); raises like `opencv_form`."""
+def opencv_text(model: CameraModel, ending: str, tolerance_px: float = 0.0) -> str:
+    """What a file of OpenCV's FileStorage holds of a camera.
+
+    Parameters
+    ----------
+    model : CameraModel
+    ending : {".yaml", ".yml", ".xml", ".json"}
+    tolerance_px : float
+
+    Raises
+    ------
+    InputError
+        If the ending is another one, and as `opencv_form` does.
+    """
     import cv2
 
-    target = Path(path)
-    if target.suffix.lower() not in STORAGES:
-        raise InputError("not a file of OpenCV's storage", where=str(target), allowed=", ".join(STORAGES))
+    from pixmetry import __version__
+
+    if ending.lower() not in STORAGES:
+        raise InputError("not a file of OpenCV's storage", value=ending, allowed=", ".join(STORAGES))
     form = opencv_form(model, tolerance_px)
-    storage = cv2.FileStorage(target.suffix.lower(), cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
+    storage = cv2.FileStorage(ending.lower(), cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
+    storage.write("written_by", f"pixmetry {__version__}")
     storage.write("image_width", int(form["image_size"][0]))
     storage.write("image_height", int(form["image_size"][1]))
     storage.write("camera_matrix", form["camera_matrix"])
     storage.write("distortion_coefficients", form["distortion_coefficients"].reshape(1, 5))
-    target.write_text(storage.releaseAndGetString(), encoding="utf-8")
+    return str(storage.releaseAndGetString())
+
+
+def write_opencv(model: CameraModel, path: str | Path, tolerance_px: float = 0.0) -> Path:
+    """Write a file for OpenCV's FileStorage (.yaml, .yml, .xml or .json), replacing one of that name; raises like `opencv_text`."""
+    target = Path(path)
+    target.write_text(opencv_text(model, target.suffix, tolerance_px), encoding="utf-8")
     return target
 
 

@@ -21,8 +21,8 @@ class FrameWriter:
     Parameters
     ----------
     folder : Path
-        It gets ``frames/`` with an image file for each frame, or ``frames.zarr`` with the one array ``frames`` [frame, row, column] whose
-        chunks are the frames.
+        It gets an image file for each frame, or ``frames.zarr`` with the one array ``frames`` [frame, row, column] whose chunks are the
+        frames, each with a check sum.
     image_format : {"tiff", "png", "zarr"}
     bits : int
         Of a stored value; up to 8 bits are stored as 8, more as 16.
@@ -36,10 +36,9 @@ class FrameWriter:
         self._array: Any = None
         self._next = 0
         if self.ending is not None:
-            (folder / "frames").mkdir()
             return
         import zarr
-        from zarr.codecs import BloscCodec
+        from zarr.codecs import BloscCodec, Crc32cCodec
         from zarr.storage import LocalStore
 
         group = zarr.create_group(LocalStore(folder / STORE), zarr_format=3)
@@ -51,7 +50,7 @@ class FrameWriter:
             shape=(count, *shape),
             chunks=(1, *shape),
             dtype=dtype,
-            compressors=[codec],
+            compressors=[codec, Crc32cCodec()],
             dimension_names=("frame", "row", "column"),
             attributes={"bits": bits},
             config={"write_empty_chunks": True},
@@ -60,7 +59,7 @@ class FrameWriter:
     def write(self, stem: str, frame: np.ndarray) -> str:
         """Write one frame, shape (rows, cols); return its name relative to the folder (``frames.zarr/7`` is entry 7 of the array)."""
         if self.ending is not None:
-            name = f"frames/{stem}{self.ending}"
+            name = f"{stem}{self.ending}"
             write_frame(self.folder / name, frame, self.bits)
             return name
         if frame.size and int(frame.max()) >= 1 << self.bits:

@@ -2,39 +2,50 @@
 
 from __future__ import annotations
 
+import errno
+import hashlib
 import json
 import os
 import re
 import secrets
 import shutil
 import socket
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from pixmetry.core.checksums import check_record, file_sha256, sealed
 from pixmetry.core.errors import InputError
 
 MARKER = ".pixmetry-output.json"
-OUTPUT_SCHEMA = "pixmetry/output/1"
+OUTPUT_SCHEMA = "pixmetry/output/2"
 _SYSTEM_FILES = {".DS_Store", "Thumbs.db", "desktop.ini"}  # file managers leave these in every folder that is looked at
+_SHOWN = 3
+_LONGEST = 100  # bytes of the wanted name that stand in the name of a temporary folder; most disks hold 255
+OLD, MOVED = ".old", ".moved"  # the earlier result: the folder as it was, or its files one by one
 
 
 @contextmanager
-def staged_output(directory: str | Path, kind: str) -> Iterator[Path]:
+def staged_output(directory: str | Path, kind: str, of: Sequence[str | Path] = (), inputs: Iterable[str | Path] = ()) -> Iterator[Path]:
     """Write a folder of results so that it appears whole or not at all.
 
     Inside the ``with`` block, files go into a temporary folder beside the wanted one; when the block ends well, the folders are
-    swapped. After an error or an interruption the old result stands as it was.
+    swapped. Where a folder cannot be swapped (the mount point of a disk, the folder in which a shell stands, one whose parent cannot be
+    written to) its files are, one by one. After an error or an interruption the old result stands as it was.
 
     Parameters
     ----------
     directory : str or Path
-        The wanted folder. If it exists it must be empty or hold nothing but files of an earlier result of the same kind.
+        The wanted folder. If it exists it must be empty or hold nothing but the files of an earlier result of the same, unchanged.
     kind : str
         What is written, in a word (``"assessment"``): a result of another kind is never replaced, for it may be the input.
+    of : sequence of str or Path
+        What the result is of, such as a camera and a scene: names or files. A result of something else is never replaced.
+    inputs : iterable of str or Path
+        Files and folders that are read and must not be replaced.
 
     Yields
     ------
@@ -44,117 +55,317 @@ def staged_output(directory: str | Path, kind: str) -> Iterator[Path]:
     Raises
     ------
     InputError
-        If the folder holds other files, or cannot be made.
+        If something would be lost, the folder cannot be made, or another run is writing it.
+    """
+    target, inputs = Path(os.path.realpath(directory)), tuple(inputs)
+    check_output(directory, kind, of, inputs)
+    partial = None
+    try:
+        try:
+            place = _place(target)
+            place.mkdir(parents=True, exist_ok=True)
+            _clean_stale(target)
+            check_output(directory, kind, of, inputs)
+            partial = place / f"{_stem(target)}.partial-{_host()}-{os.getpid()}-{secrets.token_hex(4)}"
+            partial.mkdir()
+            lock = _locked(partial)
+        except OSError as problem:
+            raise _unwritable(directory, problem) from None
+        try:
+            yield partial
+            record = {"schema": OUTPUT_SCHEMA, "kind": kind, "of": _names(of), "job": _job(target, of)}
+            write_json(partial / MARKER, sealed(record, partial, _files(partial)))
+            check_output(directory, kind, of, inputs, own=partial)  # somebody may have put a file there in the meantime
+            _swap(partial, target)
+        finally:
+            if lock is not None:
+                os.close(lock)
+    finally:
+        if partial is not None:
+            shutil.rmtree(partial, ignore_errors=True)
+
+
+def check_output(
+    directory: str | Path, kind: str, of: Sequence[str | Path] = (), inputs: Iterable[str | Path] = (), *, own: Path | None = None
+) -> None:
+    """Refuse a folder that cannot be written, or in which something would be lost that no earlier run of the same wrote.
+
+    Parameters
+    ----------
+    directory, kind, of, inputs
+        As of `staged_output`.
+    own : Path, optional
+        The temporary folder of this run.
+
+    Raises
+    ------
+    InputError
+        If it is a file, holds other files (at any depth), a file that was changed since it was written, an input, or a result of
+        another kind or of something else, cannot be written to, or if another run is writing there.
     """
     target = Path(os.path.realpath(directory))
-    check_output(target, kind)
+    where = str(directory)
     try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        _clean_stale(target)
-        check_output(target, kind)
-        partial = target.with_name(f"{target.name}.partial-{_host()}-{os.getpid()}-{secrets.token_hex(4)}")
-        partial.mkdir()
+        marker = _check_earlier(target, where, kind) if target.exists() else None
+        for path in (Path(os.path.realpath(given)) for given in inputs):
+            if path.is_relative_to(target):
+                remedy = "choose another folder for the results"
+                raise InputError("the folder holds a file that is read", where=where, value=path.name, remedy=remedy)
+        if marker is not None:
+            _check_same(target, where, marker, of)
+        _check_alone(target, where, own)
+        if own is None:
+            _probe(target)
     except OSError as problem:
-        raise InputError("folder cannot be written", where=str(directory), value=problem.strerror, remedy="choose another folder") from None
+        raise _unwritable(directory, problem) from None
+
+
+def _check_earlier(target: Path, where: str, kind: str) -> dict[str, Any] | None:
+    """Refuse a folder with files that no earlier run of the same kind wrote; return what that one noted."""
+    if not target.is_dir():
+        raise InputError("is a file, not a folder", where=where, remedy="choose another folder for the results")
+    marker = _marker(target)
+    written = {} if marker is None else marker["checksums"]["files"]
+    foreign = [name for name in _files(target) if name not in written and (name != MARKER or marker is None)]
+    if marker is not None and marker["kind"] != kind:
+        there = marker["kind"]
+        raise InputError(f"folder holds the result of another command ({there})", where=where, remedy="choose another folder")
+    if foreign:
+        remedy = "choose another folder, or move these files away"
+        raise InputError(f"folder holds files that are not results of pixmetry ({_few(foreign)})", where=where, remedy=remedy)
+    return marker
+
+
+def _check_same(target: Path, where: str, marker: Mapping[str, Any], of: Sequence[str | Path]) -> None:
+    """Refuse to replace a result of something else, or files that were changed since they were written."""
+    if of and marker.get("job") and marker["job"] != _job(target, of):
+        what = f"folder holds the {marker['kind']} of something else ({', '.join(marker['of'])})"
+        raise InputError(what, where=where, remedy="choose another folder, or delete this one if it is not needed any more")
+    written = marker["checksums"]["files"]
+    changed = [name for name in written if os.path.lexists(target / name) and file_sha256(target / name) != written[name]]
+    if changed:
+        remedy = "choose another folder, or move these files away"
+        raise InputError(f"folder holds files that were changed since they were written ({_few(changed)})", where=where, remedy=remedy)
+
+
+def _check_alone(target: Path, where: str, own: Path | None) -> None:
+    """Refuse a folder that another run on this machine is writing."""
+    for path, pid, _ in _temporary(target):
+        if path != own and _alive(path, pid):
+            remedy = "wait until it has finished, or choose another folder"
+            raise InputError("another run is writing this folder", where=where, value=f"process {pid}", remedy=remedy)
+
+
+def _probe(target: Path) -> None:
+    """Make and remove a folder where the temporary one will be: OSError if that cannot be done."""
+    place = _place(target)
+    while not place.exists():
+        place = place.parent
+    probe = place / f"{_stem(target)}.probe-{secrets.token_hex(4)}"
+    probe.mkdir()
+    probe.rmdir()
+
+
+def _unwritable(directory: str | Path, problem: OSError) -> InputError:
+    remedies = {errno.ENAMETOOLONG: "choose a shorter name", errno.ENOSPC: "make room, or choose another folder"}
+    remedy = remedies.get(problem.errno or 0, "choose another folder")
+    return InputError("folder cannot be written", where=str(directory), value=problem.strerror, remedy=remedy)
+
+
+def _few(names: Sequence[str]) -> str:
+    return ", ".join(names[:_SHOWN]) + (", ..." if len(names) > _SHOWN else "")
+
+
+def _files(folder: Path) -> list[str]:
+    """Names of all files in a folder and below, with slashes, and of links; what file managers leave is not named."""
+    own = re.compile(_form(folder))
+    found = []
+    for at, folders, files in os.walk(folder, onerror=_raised):
+        here = Path(at)
+        linked = [name for name in folders if (here / name).is_symlink()]
+        folders[:] = [name for name in folders if name not in linked and not (here == folder and own.fullmatch(name))]
+        names = [name for name in (*files, *linked) if name not in _SYSTEM_FILES]
+        found += [(here / name).relative_to(folder).as_posix() for name in names]
+    return sorted(found)
+
+
+def _raised(problem: OSError) -> None:
+    raise problem
+
+
+def _marker(target: Path) -> dict[str, Any] | None:
+    """What an earlier run noted of what it wrote; None if there is no such note, or not one of ours."""
     try:
-        yield partial
-        write_json(partial / MARKER, {"schema": OUTPUT_SCHEMA, "kind": kind, "files": sorted(p.name for p in partial.iterdir())})
-        check_output(target, kind)  # somebody may have put a file there in the meantime
-        _swap(partial, target)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
+        marker = json.loads((target / MARKER).read_text(encoding="utf-8"))
+        check_record(marker, MARKER)
+        return marker if marker["schema"] == OUTPUT_SCHEMA and isinstance(marker["kind"], str) and marker["checksums"] else None
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return None
+
+
+def _names(of: Sequence[str | Path]) -> list[str]:
+    return [Path(one).name if isinstance(one, Path) else one for one in of]
+
+
+def _job(target: Path, of: Sequence[str | Path]) -> str:
+    """A digest of what a result is of: names, and places of files as they are seen from the result, so that both may be moved together."""
+    if not of:
+        return ""
+    try:
+        places = [[os.path.relpath(os.path.realpath(one), target)] if isinstance(one, Path) else one for one in of]
+    except ValueError:  # on another drive
+        places = [[os.path.realpath(one)] if isinstance(one, Path) else one for one in of]
+    return hashlib.sha256(json.dumps(places).encode()).hexdigest()[:16]
+
+
+def _place(target: Path) -> Path:
+    """Where the temporary folder is made: beside the wanted one, or in it where that one cannot be swapped."""
+    here = Path(os.path.realpath(os.curdir))
+    fixed = target.is_dir() and (os.path.ismount(target) or here.is_relative_to(target) or not os.access(target.parent, os.W_OK | os.X_OK))
+    return target if fixed else target.parent
 
 
 def _swap(partial: Path, target: Path) -> None:
-    old = partial.with_name(partial.name + ".old")
-    if target.exists():
-        os.replace(target, old)
+    """Put the new result in the place of the old one: the whole folder, or its files where that cannot be done."""
+    old = partial.with_name(partial.name + OLD)
     try:
+        if partial.parent == target:
+            raise OSError(errno.EBUSY, "cannot be renamed", str(target))
+        if target.exists():
+            shutil.copymode(target, partial)
+            os.replace(target, old)
         os.replace(partial, target)
-    except BaseException:
-        if old.exists():
+    except BaseException as problem:
+        if old.exists() and not target.exists():
             os.replace(old, target)
+        if not isinstance(problem, OSError) or not target.is_dir():
+            raise
+        _move_in(partial, target, partial.with_name(partial.name + MOVED))
+    finally:
+        if not partial.exists():
+            shutil.rmtree(old, ignore_errors=True)
+
+
+def _move_in(partial: Path, target: Path, moved: Path) -> None:
+    """Swap the files of two folders, all or none; the note of what was written is the first to go and the last to come."""
+    marker = _marker(target)
+    earlier = [] if marker is None else [MARKER, *(name for name in marker["checksums"]["files"] if os.path.lexists(target / name))]
+    new = [*(name for name in _files(partial) if name != MARKER), MARKER]
+    try:
+        moved.mkdir()
+        _move(earlier, target, moved)
+        _remove_empty(target, earlier)
+        _move(new, partial, target)
+    except BaseException:
+        _move_back(partial, target, moved)
         raise
-    shutil.rmtree(old, ignore_errors=True)
+    shutil.rmtree(moved, ignore_errors=True)
 
 
-def check_output(directory: str | Path, kind: str) -> None:
-    """Refuse a folder in which something would be lost that no earlier run of the same kind wrote.
-
-    Raises
-    ------
-    InputError
-        If it is a file, or holds other files or a result of another kind.
-    """
-    target = Path(os.path.realpath(directory))
-    if not target.exists():
-        return
-    if not target.is_dir():
-        raise InputError("is a file, not a folder", where=str(target), remedy="choose another folder for the results")
-    names = {p.name for p in target.iterdir()}
-    own, there = _own_files(target)
-    if own and there != kind:
-        raise InputError(f"folder holds the result of another command ({there})", where=str(target), remedy="choose another folder")
-    foreign = sorted(names - own - _SYSTEM_FILES)
-    if foreign:
-        shown = ", ".join(foreign[:3]) + (", ..." if len(foreign) > 3 else "")
-        remedy = "choose another folder, or move these files away"
-        raise InputError(f"folder holds files that are not results of pixmetry ({shown})", where=str(target), remedy=remedy)
+def _move(names: Iterable[str], source: Path, goal: Path) -> None:
+    for name in names:
+        (goal / name).parent.mkdir(parents=True, exist_ok=True)
+        os.replace(source / name, goal / name)
 
 
-def write_page(path: str | Path, text: str) -> Path:
-    """Write one HTML page so that it appears whole or not at all; only a page of pixmetry is ever replaced.
-
-    Raises
-    ------
-    InputError
-        If there is something else of that name, or it cannot be written.
-    """
-    target = Path(path)
-    try:
-        if target.is_dir():
-            raise InputError("is a folder, not a file", where=str(target), remedy="name the page, such as page.html")
-        if target.exists() and b'content="pixmetry ' not in target.read_bytes()[:2000]:
-            raise InputError("file exists and is no page of pixmetry", where=str(target), remedy="choose another name")
-        target.parent.mkdir(parents=True, exist_ok=True)
-        partial = target.with_name(f".{target.name}.partial-{os.getpid()}-{secrets.token_hex(4)}")
-        try:
-            partial.write_text(text, encoding="utf-8")
-            os.replace(partial, target)
-        finally:
-            partial.unlink(missing_ok=True)
-    except OSError as problem:
-        raise InputError("page cannot be written", where=str(target), value=problem.strerror, remedy="choose another place") from None
-    return target
+def _move_back(partial: Path, target: Path, moved: Path) -> None:
+    """Undo `_move_in`, whatever it had done; nothing is to be undone once the note has come."""
+    if (partial / MARKER).exists():
+        marker = _marker(partial)
+        new = [] if marker is None else [*marker["checksums"]["files"]]
+        for name in new:
+            if os.path.lexists(target / name) and not os.path.lexists(partial / name):
+                os.unlink(target / name)
+        _remove_empty(target, new)
+        if moved.exists():
+            _move(sorted(_files(moved), key=MARKER.__eq__), moved, target)
+    shutil.rmtree(moved, ignore_errors=True)
 
 
-def _own_files(target: Path) -> tuple[set[str], str]:
-    """Names of the files that the marker lists, and the kind of result."""
-    try:
-        marker = json.loads((target / MARKER).read_text(encoding="utf-8"))
-        if marker["schema"].startswith("pixmetry/output/"):
-            return {MARKER, *marker["files"]}, str(marker["kind"])
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        pass  # no marker, or not one of ours
-    return set(), ""
+def _remove_empty(target: Path, names: Iterable[str]) -> None:
+    """Remove folders below that held these files and are empty now."""
+    below = {parent for name in names for parent in Path(name).parents if parent != Path()}
+    for folder in sorted(below, key=lambda p: -len(p.parts)):
+        with suppress(OSError):
+            (target / folder).rmdir()
 
 
 def _host() -> str:
     return re.sub(r"[^A-Za-z0-9]+", "_", socket.gethostname()) or "host"
 
 
+def _stem(target: Path) -> str:
+    """How the name of a temporary folder begins: the wanted name, shortened where the disk would not hold it."""
+    raw = os.fsencode(target.name)
+    return target.name if len(raw) <= _LONGEST else f"{target.name[:20]}-{hashlib.sha256(raw).hexdigest()[:16]}"
+
+
+def _form(target: Path) -> str:
+    """Pattern of the names of temporary folders of runs on this machine."""
+    return re.escape(_stem(target)) + rf"\.partial-{_host()}-(\d+)-[0-9a-f]{{8}}({OLD}|{MOVED})?"
+
+
+def _temporary(target: Path) -> list[tuple[Path, int, str]]:
+    """Temporary folders of runs on this machine for a result: path, process, and what it holds (``""``, `OLD` or `MOVED`)."""
+    form = re.compile(_form(target))
+    found = []
+    for place in (target.parent, target):
+        with suppress(OSError):  # not there, or not to be listed
+            found += [(path, match) for path in place.iterdir() if (match := form.fullmatch(path.name))]
+    return [(path, int(match[1]), match[2] or "") for path, match in found]
+
+
 def _clean_stale(target: Path) -> None:
     """Remove what killed runs on this machine left; a result that was set aside and never replaced goes back to its place."""
-    form = re.compile(re.escape(target.name) + rf"\.partial-{_host()}-(\d+)-[0-9a-f]{{8}}(\.old)?")
-    left = [(p, match) for p in target.parent.iterdir() if (match := form.fullmatch(p.name)) and not _alive(int(match[1]))]
-    for path, match in left:
-        if match[2] and not target.exists():
+    left = [item for item in _temporary(target) if not _alive(item[0], item[1])]
+    for path, _, what in sorted(left, key=lambda item: not item[2]):  # what was set aside first
+        partial = path.with_name(path.name.removesuffix(what))
+        if what and _alive(partial, 0):
+            continue
+        if what == MOVED:
+            _move_back(partial, target, path)
+        elif what == OLD and not target.exists():
             os.replace(path, target)
         else:
             shutil.rmtree(path, ignore_errors=True)
 
 
-def _alive(pid: int) -> bool:
+def _locked(folder: Path) -> int | None:
+    """Lock a folder as long as this process lives; None where that is not possible."""
+    try:
+        import fcntl
+
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            os.close(handle)
+            return None
+        return handle
+    except (ImportError, OSError):
+        return None
+
+
+def _alive(folder: Path, pid: int) -> bool:
+    """Whether the run that made a temporary folder goes on: its lock tells, and where there are no locks, its process."""
+    if not folder.exists():
+        return False
+    try:
+        import fcntl
+
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return False
+        except BlockingIOError:
+            return True
+        finally:
+            os.close(handle)
+    except (ImportError, OSError):
+        return _runs(pid)
+
+
+def _runs(pid: int) -> bool:
     if os.name == "nt":  # there, signal 0 would end the process instead of asking after it
         return True
     try:
@@ -190,6 +401,19 @@ def write_json(path: str | Path, obj: Any) -> None:
         os.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)
+
+
+def write_record(path: str | Path, record: Mapping[str, Any]) -> None:
+    """Write the main record of a result as strict JSON, last of all: with the digests of itself and of all files in its folder.
+
+    Parameters
+    ----------
+    path : str or Path
+    record : mapping
+        As of `write_json`, which tells the errors.
+    """
+    path = Path(path)
+    write_json(path, sealed(_plain(record, "$"), path.parent, [name for name in _files(path.parent) if name != path.name]))
 
 
 def _plain(value: Any, at: str) -> Any:
@@ -228,15 +452,24 @@ def write_maps(path: str | Path, maps: Mapping[str, np.ndarray], attrs: Mapping[
     from zarr.storage import LocalStore, ZipStore
 
     path = Path(path)
+    arrays = {name: np.asarray(array) for name, array in maps.items()}
+    digests = {name: _digest(array) for name, array in arrays.items()}
     store = ZipStore(path, mode="w") if path.suffix == ".zip" else LocalStore(path)
     try:
-        group = zarr.create_group(store, zarr_format=3, overwrite=path.suffix != ".zip", attributes=_plain(attrs, "$"))
-        for name, array in maps.items():
-            array = np.asarray(array)
+        attributes = sealed({"attributes": _plain(attrs, "$"), "arrays": digests})
+        group = zarr.create_group(store, zarr_format=3, overwrite=path.suffix != ".zip", attributes=attributes)
+        for name, array in arrays.items():
             codec = BloscCodec(cname="zstd", clevel=5, shuffle="bitshuffle", typesize=array.dtype.itemsize)
             group.create_array(name, data=array, chunks=array.shape if array.nbytes < 1 << 24 else "auto", compressors=[codec])
     finally:
         store.close()
+
+
+def _digest(array: np.ndarray) -> str:
+    """SHA-256 of an array: its shape, the kind of its numbers, and their values, low byte first."""
+    kind = array.dtype.newbyteorder("<")
+    head = json.dumps([list(array.shape), kind.str]).encode()
+    return hashlib.sha256(head + np.ascontiguousarray(array, kind).tobytes()).hexdigest()
 
 
 def read_maps(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
@@ -250,24 +483,30 @@ def read_maps(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     Raises
     ------
     InputError
-        If there is no such store, or if it is damaged.
+        If there is no such store, or if it is damaged: an array or a part of one that is missing would be read as zeros.
     """
-    from zipfile import is_zipfile
-
     import zarr
     from zarr.storage import LocalStore, ZipStore
 
     path = Path(path)
     if not path.exists():
         raise InputError("no such store of maps", where=str(path), remedy="check the name")
-    damaged = InputError("not a store of maps, or damaged", where=str(path), remedy="make the result again")
-    if path.suffix == ".zip" and not is_zipfile(path):
-        raise damaged
-    store = ZipStore(path, mode="r") if path.suffix == ".zip" else LocalStore(path, read_only=True)
+    store: Any = None
     try:
-        group = zarr.open_group(store, mode="r", zarr_format=3)
-        return {name: np.asarray(array[...]) for name, array in sorted(group.arrays())}, dict(group.attrs)
-    except FileNotFoundError:
-        raise damaged from None
+        store = ZipStore(path, mode="r") if path.suffix == ".zip" else LocalStore(path, read_only=True)
+        group: Any = zarr.open_group(store, mode="r", zarr_format=3)
+        record: dict[str, Any] = dict(group.attrs)
+        check_record(record, str(path))
+        digests, attributes = dict(record["arrays"]), dict(record["attributes"])
+        arrays = {name: np.asarray(group[name][...]) for name in sorted(digests)}
+        damaged = [name for name, array in arrays.items() if _digest(array) != digests[name]]
+    except Exception as problem:  # the store, its zip file and every codec have their own, and all of them mean that it is damaged
+        reason = problem.what if isinstance(problem, InputError) else type(problem).__name__
+        raise InputError(f"not a store of maps, or damaged ({reason})", where=str(path), remedy="make the result again") from None
     finally:
-        store.close()
+        if store is not None:
+            with suppress(AttributeError):  # a file that is no zip file was never opened
+                store.close()
+    if damaged:
+        raise InputError(f"damaged: the map '{damaged[0]}' is not what was written", where=str(path), remedy="make the result again")
+    return arrays, attributes

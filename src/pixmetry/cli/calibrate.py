@@ -74,17 +74,16 @@ def calibrate(
     from pixmetry.core.threads import set_threads
 
     set_threads(threads)
-    check_exports(opencv, colmap, output, sources)
+    read = (*sources, *((Path(given["camera"]),) if given["camera"] is not None else ()))
+    check_exports(opencv, colmap, output, read)
     options = {name: given.pop(name) for name in OPTIONS}
     options = {name: value for name, value in options.items() if value is not None}
-    if given["camera"] is not None:
-        check_exports(opencv, colmap, output, (*sources, Path(given["camera"])))
     with shown_progress() as progress:
         calibration = run(sources, output, options=options, progress=progress, **given)
     report = output / "report.html"
     click.echo(_told(calibration, report, json))
     if opencv is not None or colmap is not None:
-        for sentence in write_exports(_models(calibration), opencv, colmap, may_lose_px):
+        for sentence in write_exports(_models(calibration), opencv, colmap, may_lose_px, read):
             click.echo(sentence, err=json)
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pixmetry.core.chain_order import Element
+from pixmetry.core.checksums import check_file
 from pixmetry.core.errors import InputError
 from pixmetry.core.unit_maps import MeasuredUnit, listing, maps_file, read_unit_maps
 
@@ -101,7 +102,7 @@ def load_camera(path: str | Path) -> Camera:
     Raises
     ------
     InputError, ChainError
-        If there is no such file or preset, or it cannot be used.
+        If there is no such file or preset, it cannot be used, or a result stands beside it that was written with another one.
     """
     from importlib.resources import files
 
@@ -112,4 +113,6 @@ def load_camera(path: str | Path) -> Camera:
         path = Path(str(presets[str(path)]))
     elif not Path(path).is_file():
         raise InputError("no such camera file or preset", value=str(path), allowed=f"a YAML file, or one of {', '.join(sorted(presets))}")
+    else:
+        check_file(path)
     return build_camera(load_yaml(path), str(path), maps_file(path))

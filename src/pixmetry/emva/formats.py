@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from pixmetry.core.checksums import check_record, sealed
 from pixmetry.core.errors import InputError
 from pixmetry.emva.records import MONO, DataSheet, Results, Value
 
@@ -24,7 +25,7 @@ _INFINITE = {"inf": math.inf, "-inf": -math.inf}
 
 def json_text(sheet: DataSheet) -> str:
     """Return a data sheet as JSON (RFC 8259)."""
-    return json.dumps(to_record(sheet), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+    return json.dumps(sealed(to_record(sheet)), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
 
 def read_sheet(path: str | Path) -> DataSheet:
@@ -42,7 +43,9 @@ def read_sheet(path: str | Path) -> DataSheet:
         from pixmetry.emva.xml_format import sheet_of_xml
 
         return sheet_of_xml(raw, str(path))
-    return sheet_of_record(parse_json(raw, str(path)), str(path))
+    record = parse_json(raw, str(path))
+    check_record(record, str(path))
+    return sheet_of_record(record, str(path))
 
 
 def read_bytes(path: str | Path) -> bytes:

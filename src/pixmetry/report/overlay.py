@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import os
-import secrets
+import io
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
+from pixmetry.campaign.staged_files import Output, write_together
 from pixmetry.core.errors import InputError
 from pixmetry.located import ORIGIN, Located
 from pixmetry.report.drawing import own_style
@@ -18,6 +19,7 @@ STRIP_IN = 0.42  # of text under the image
 DPI = 100
 WANTED_PX = 1600  # small images are enlarged towards this
 MOST_ZOOM = 6
+MARK = re.compile(rb"\x89PNG\r\n\x1a\n.{29}tEXtSoftware\x00pixmetry", re.DOTALL)  # no other picture is replaced
 
 
 def overlay_names(overlay: str | Path | None, images: Sequence[Path]) -> list[Path | None]:
@@ -48,26 +50,31 @@ def overlay_names(overlay: str | Path | None, images: Sequence[Path]) -> list[Pa
 
 
 def write_overlay(path: str | Path, frame: np.ndarray, table: Located) -> Path:
-    """Draw the outlines, centres or lines of a table over its frame and write a PNG.
-
-    Parameters
-    ----------
-    path : str or Path
-        A file there is replaced.
-    frame : ndarray, shape (rows, cols)
-    table : Located
-        Of this frame.
+    """Draw the outlines, centres or lines of a table over its frame and write a PNG; parameters as of `overlay_png`.
 
     Raises
     ------
     InputError
-        If it cannot be written.
+        If it cannot be written, or there is a file that is no such picture.
+    """
+    write_together([Output(Path(path), MARK, True)], [overlay_png(frame, table)])
+    return Path(path)
+
+
+def overlay_png(frame: np.ndarray, table: Located) -> bytes:
+    """Draw the outlines, centres or lines of a table over its frame, as a PNG.
+
+    Parameters
+    ----------
+    frame : ndarray, shape (rows, cols)
+    table : Located
+        Of this frame.
     """
     with own_style({}):
-        return _drawn(Path(path), frame, table)
+        return _drawn(frame, table)
 
 
-def _drawn(target: Path, frame: np.ndarray, table: Located) -> Path:
+def _drawn(frame: np.ndarray, table: Located) -> bytes:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -85,17 +92,9 @@ def _drawn(target: Path, frame: np.ndarray, table: Located) -> Path:
     flagged = int((table.flags != 0).sum()) if len(table) else 0
     text = f"{len(table)} of kind {table.kind}, {flagged} flagged (orange)    {ORIGIN}"
     figure.text(0.01, 0.5 * STRIP_IN / (height + STRIP_IN), text, fontsize=8, va="center")
-    partial = target.with_name(f".{target.stem}.partial-{os.getpid()}-{secrets.token_hex(4)}.png")
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            figure.savefig(partial, metadata={"Software": "pixmetry"})
-            os.replace(partial, target)
-        finally:
-            partial.unlink(missing_ok=True)
-    except OSError as problem:
-        raise InputError("picture cannot be written", where=str(target), value=problem.strerror, remedy="choose another place") from None
-    return target
+    raw = io.BytesIO()
+    figure.savefig(raw, format="png", metadata={"Software": "pixmetry"})
+    return raw.getvalue()
 
 
 def _marks(axes, table: Located, zoom: int) -> None:
