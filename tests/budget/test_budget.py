@@ -14,6 +14,7 @@ from pixmetry.budget import compute_budget, make_probe
 from pixmetry.budget.monte_carlo import Trials, monte_carlo
 from pixmetry.budget.parameters import applies
 from pixmetry.budget.probe import Target, facts_of
+from pixmetry.core.camera import load_camera
 from pixmetry.core.catalogue import catalogue, get_source
 from pixmetry.core.errors import InputError
 from pixmetry.core.estimates import Estimates
@@ -51,6 +52,27 @@ def test_status_of_each_source() -> None:
     assert row(budget, "cable.termination").status == "not applicable"
     assert row(budget, "cable.termination").contribution is None
     assert all(r.reason for r in budget.rows if r.contribution is None)
+
+
+def test_a_packaged_logarithmic_camera_has_a_budget() -> None:
+    """60 mV a decade are 36 DN: offsets that scatter by 0.75 DN are 4.9 % of the light, and lead the budget."""
+    cam = replace(load_camera("cmos_log_fuga15"), frame_shape=(96, 128))
+    budget = compute_budget(cam, trials=0)
+    assert budget.rows[0].name == "sensor.log_response" and 0.01 < budget.verdict.total_px < 0.05
+    assert math.isfinite(budget.facts.gain_dn_per_e) and budget.facts.saturation_dn == 235
+    assert {r.name for r in budget.rows if r.contribution is not None} >= {"sensor.shot_noise", "grabber.adc", "processing.threshold"}
+
+
+def test_what_stands_in_the_chain_counts_by_monte_carlo_where_there_is_no_propagator() -> None:
+    """A spread of 0.5 px beside the target's own 0.7 px smooths the S-curve: what it changes of that is no more than it was."""
+    cam = camera(element("optics.point_spread", sigma_px=0.5), element("sensor.prnu", pixel_std_rel=0.005))
+    budget = compute_budget(cam, None, KNOWN, trials=512)
+    spread, itself = row(budget, "optics.point_spread"), row(budget, "processing.threshold")
+    assert spread.status == "modelled" and spread.monte_carlo is not None and spread.contribution.method == spread.reason
+    assert 0 < spread.total_px <= 1.5 * itself.total_px
+    assert row(budget, "electronics.gain").contribution is None  # it cannot be left out
+    without = compute_budget(cam, None, KNOWN, trials=0)
+    assert row(without, "optics.point_spread").contribution is None and row(without, "optics.point_spread").reason
 
 
 FRAME_SIZES = [(240, 320), (480, 640), (1024, 1280), (2048, 2448), (4096, 5120)]

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from budget.cameras import ETA, GAIN_DN_PER_E, camera, element
-from pixmetry.budget.monte_carlo import Trials, _axis, monte_carlo
+from pixmetry.budget.monte_carlo import Trials, _axis, helpers_of, monte_carlo
 from pixmetry.budget.probe import Facts, Target, facts_of, make_probe, parse_target, resolve
 from pixmetry.core.errors import InputError
 from pixmetry.location.estimators import Estimator
@@ -77,6 +78,26 @@ def test_nested_analysis_of_variance_separates_what_was_put_in() -> None:
     ):
         assert error < 0.02 * truth and abs(value - truth) < 1.1 * Z * error
     assert got.se_temporal == pytest.approx(0.2 / math.sqrt(2 * 2 * 24_000), rel=0.05)
+
+
+def test_a_source_alone_is_seen_through_the_camera_s_own_line() -> None:
+    """Jitter of 5 ns behind an amplifier: not on a bare staircase, and as the same jitter in the whole chain."""
+    jitter, amplifier = element("grabber.line_jitter", white_ns=5.0), element("electronics.video_amplifier", natural_mhz=8.0, damping=0.7)
+    cam = camera(jitter, element("cable.termination", length_m=2.0, line_ohm=50.0))
+    cam = replace(cam, chain=(*cam.chain[:2], amplifier, *cam.chain[2:]))
+    design = Trials(cam, TARGET, Estimator(), facts(cam), trials=2048, units=4, seed=SEED)
+    alone, missed = design.of(only=["grabber.line_jitter"]), design.of(off=["grabber.line_jitter"])
+    assert alone.x.u == pytest.approx(missed.x.u, rel=1e-6) and 0.015 < alone.x.u < 0.04  # 5 ns are 0.071 px, over seven rows
+    assert {"electronics.video_amplifier", "cable.termination"} == set(helpers_of(cam, ["grabber.line_jitter"]))
+    assert helpers_of(cam, ["electronics.video_amplifier"]) == ("cable.termination",)  # a jitter shapes no line
+
+
+def test_windows_follow_a_clock_that_is_cold() -> None:
+    """Samples 4 px off at the end of the row: no target is lost, and the shift is that of the clock."""
+    cam = camera(element("grabber.clock_warm_up", scale_error_rel=0.02, lock_us=10.0), shape=(96, 200))
+    got = monte_carlo(cam, TARGET, Estimator(), only=["grabber.clock_warm_up"], trials=256, units=2, facts=facts(cam), seed=SEED)
+    assert got.lost == 0
+    assert got.x.bias == pytest.approx((141.9 + 99.5) * 0.02 / 1.02, rel=0.06)  # 10 µs are 141.9 px
 
 
 def test_what_a_calibration_leaves_is_what_is_not_smooth() -> None:

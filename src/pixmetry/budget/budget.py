@@ -13,7 +13,7 @@ from pixmetry.budget.combine import Combined, combine, together_with
 from pixmetry.budget.headline import Headline, headline
 from pixmetry.budget.monte_carlo import MonteCarlo, Trials
 from pixmetry.budget.parameters import applies, base_of, u_of_total, with_estimates
-from pixmetry.budget.probe import ESTIMATOR_ITSELF, Facts, Probes, Target, facts_of, resolve
+from pixmetry.budget.probe import ESTIMATOR_ITSELF, Facts, Probes, Target, facts_of, perfect, resolve
 from pixmetry.core.camera import Camera
 from pixmetry.core.catalogue import catalogue
 from pixmetry.core.contribution import UNSTEADY, Contribution
@@ -339,7 +339,7 @@ def _simulated(row: BudgetRow, design: Trials, camera: Camera, say: Callable[[st
     if row.status not in DECIDED:
         return row
     if row.source_id == ESTIMATOR_ITSELF:
-        return replace(row, monte_carlo=design.compare([row.name], camera.switched(on=()), None))
+        return replace(row, monte_carlo=design.compare([row.name], perfect(camera), None))
     if row.name not in camera or not camera[row.name].on or camera[row.name].source.essential and row.contribution is None:
         return row
     say(f"Monte Carlo: {row.name}")

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from math import comb
+from typing import Any
 
 import numpy as np
 
-from pixmetry.budget.probe import Facts, Target, background_of, facts_of, resolve, scene_of, spread_windows, window_side
+from pixmetry.budget.probe import Facts, Target, background_of, facts_of, perfect, resolve, scene_of, spread_windows, window_side
 from pixmetry.core.camera import Camera, Element
 from pixmetry.core.contribution import SMOOTH_ORDER, Contribution, smooth_part
 from pixmetry.core.conversions import LineSources, Link
@@ -133,7 +134,7 @@ class Trials:
     frames: int = 2
     mode: str = "frozen"
     seed: int = 0
-    _found: dict[tuple[bool, ...], tuple[np.ndarray, np.ndarray]] = field(default_factory=dict, repr=False)
+    _found: dict[Any, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
         if self.units < 1 or self.frames < 1 or self.trials < 1:
@@ -159,7 +160,7 @@ class Trials:
 
     def errors(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
         """Positions found in the frames of a variant of the camera less the true ones: px of the sensor, (units, places, frames)."""
-        key = tuple(e.on for e in camera.chain)
+        key = tuple((e.on, e.params) for e in camera.chain)
         if key not in self._found:
             parts = [self._unit(replace(camera, unit_seed=camera.unit_seed + UNIT_STRIDE * k), k) for k in range(self.units)]
             self._found[key] = np.stack([x for x, _ in parts]), np.stack([y for _, y in parts])
@@ -236,7 +237,7 @@ class Trials:
             return self.compare(off, self.camera, self.camera.switched(off=off))
         only = tuple(only)
         helpers = helpers_of(self.camera, only)
-        return self.compare(only, self.camera.switched(on=(*only, *helpers)), self.camera.switched(on=helpers))
+        return self.compare(only, perfect(self.camera, (*only, *helpers)), perfect(self.camera, helpers))
 
 
 def helpers_of(camera: Camera, names: Iterable[str]) -> tuple[str, ...]:

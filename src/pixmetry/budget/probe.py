@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
 
-from pixmetry.core.camera import Camera
+from pixmetry.core.camera import Camera, Element
 from pixmetry.core.contribution import Probe
 from pixmetry.core.conversions import SAMPLE, LineSources, Link
 from pixmetry.core.errors import InputError
@@ -122,25 +122,30 @@ def facts_of(camera: Camera, target: Target, known: Mapping[str, Any] | None = N
     The linear response is that of the essential conversions alone. Saturation is the smaller of full well and converter's range. The noise
     is the scatter over 128 windows of the background through the whole chain, without what lies beyond four standard deviations.
 
+    Conversions that are not linear (a logarithmic pixel) are counted in DN that would be linear up to the light that saturates: the
+    response is that of black to saturation, and the noise is brought there by the local slope at the target's background. So a target of
+    so many per cent of saturation is one of as much light in any camera. What the curve does to the target is in the probes.
+
     Raises
     ------
     InputError
-        If a name in ``known`` is not one of them, or the camera does not tell gain or saturation.
+        If a name in ``known`` is not one of them, or the camera does not tell its saturation.
     """
     known = dict(known or {})
     unknown = set(known) - {f.name for f in fields(Facts)}
     if unknown:
         raise InputError("not a fact that a budget uses", value=sorted(unknown), allowed=", ".join(f.name for f in fields(Facts)))
-    response = known.get("dn_per_photon") or _response(camera)
-    gain = known.get("gain_dn_per_e") or _parameter(camera, "gain_dn_per_e")
-    if gain is None:
-        raise InputError("the camera does not tell its gain", where=camera.name, remedy="give gain_dn_per_e among the facts")
     bits = known.get("bits") or _parameter(camera, "bits") or camera.facts.get("bits") or 8
-    saturation = known.get("saturation_dn") or camera.facts.get("saturation_dn") or _saturation(camera, gain, int(bits))
+    slope, given = _response(camera), known.get("gain_dn_per_e")
+    gain_in_faint_light = float(given or slope / _electrons_per_photon(camera))
+    saturation = known.get("saturation_dn") or camera.facts.get("saturation_dn") or _saturation(camera, gain_in_faint_light, int(bits))
+    curve = curve_of(camera, float(saturation))
+    response = known.get("dn_per_photon") or (slope if curve is None else saturation / curve.saturating)
+    gain = given or (gain_in_faint_light if curve is None else response / _electrons_per_photon(camera))
     background = target.background_rel * saturation / response
     noise = known.get("noise_dn")
     if noise is None:
-        noise = _noise(camera, background)
+        noise = _noise(camera, background) / (1.0 if curve is None else float(curve.slope(np.array(background))) / response)
     return Facts(
         dn_per_photon=float(response),
         gain_dn_per_e=float(gain),
@@ -152,6 +157,68 @@ def facts_of(camera: Camera, target: Target, known: Mapping[str, Any] | None = N
         frame_shape=tuple(known.get("frame_shape") or camera.frame_shape),
         pixel_clock_hz=float(known.get("pixel_clock_hz") or camera.pixel_clock_hz),
     )
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Response of the essential conversions, without errors of their own, where it is no straight line: DN above black for light.
+
+    ``of`` and ``slope`` are functions of photons; ``saturating`` is the light that reaches saturation.
+    """
+
+    of: Callable[[np.ndarray], np.ndarray]
+    slope: Callable[[np.ndarray], np.ndarray]
+    saturating: float
+
+
+NODES, DARKEST = 160, 1e-12  # of the table of a curve, and the least light in it, over that which saturates
+STRAIGHT = 1e-3  # relative change of the response up to which it is a straight line
+
+
+def perfect(camera: Camera, on: Iterable[str] = ()) -> Camera:
+    """The camera with some sources on an otherwise perfect chain: essential conversions have no errors of their own."""
+    on = tuple(on)
+    alone = camera.switched(on=on)
+    return replace(alone, chain=tuple(e if e.name in on else ideal_element(e) for e in alone.chain))
+
+
+def ideal_element(element: Element) -> Element:
+    """An essential conversion without its errors; any other element as it is."""
+    return element if element.source.ideal is None else replace(element, params=element.source.ideal(element.params))
+
+
+def curve_of(camera: Camera, saturation_dn: float) -> Curve | None:
+    """The response where it is no straight line; None where it is one."""
+    bare = perfect(camera)
+
+    def above_black(photons: float) -> float:
+        return float(bare.expose(Uniform(photons), window=(0, 0, 1, 1), quiet=True).data[0, 0, 0]) - black
+
+    black = 0.0
+    black = above_black(0.0)
+    light = 1.0
+    while above_black(light) < saturation_dn:
+        light *= 2.0
+        if light > 1e30:
+            raise InputError("no light saturates the camera", where=camera.name, value=saturation_dn, remedy="check its chain")
+    if abs(above_black(1e-3 * light) / above_black(light) / 1e-3 - 1) < STRAIGHT:
+        return None
+    from scipy.interpolate import PchipInterpolator
+
+    least = DARKEST * light
+    at = np.arcsinh(np.concatenate([[0.0], np.geomspace(least, 4 * light, NODES)]) / least)
+    table = PchipInterpolator(at, [above_black(float(p)) for p in least * np.sinh(at)])
+    rise = table.derivative()
+
+    def of(photons: np.ndarray) -> np.ndarray:
+        return np.asarray(table(np.arcsinh(np.maximum(photons, 0.0) / least)))
+
+    def slope(photons: np.ndarray) -> np.ndarray:
+        p = np.maximum(np.asarray(photons, float), 0.0)
+        return np.asarray(rise(np.arcsinh(p / least)) / np.hypot(p, least))
+
+    levels = np.geomspace(1e-3 * light, 2 * light, 4000)
+    return Curve(of, slope, float(np.interp(saturation_dn, of(levels), levels)))
 
 
 def scene_of(target: Target, facts: Facts, x_px: np.ndarray, y_px: np.ndarray) -> Discs:
@@ -281,12 +348,20 @@ class Probes:
         self.side = window_side(estimator)
         self.bare = make_probe(facts, target, estimator, phases)
         self.estimator = resolve(estimator, target, facts)
+        self.curve = curve_of(camera, facts.saturation_dn)
+        if self.curve is not None:
+            self.bare = self._bent(self.bare)
         links = (e.params.links for e in camera.links if e.source is SAMPLE and not e.params.line.plain)
         self.links: tuple[Link, ...] = next(links, ())
         self._ahead = lru_cache(self._make_ahead)
 
     def of(self, name: str, source: Source) -> Probe:
         """The probe for a source of this name; the estimator itself is asked on what the pixels gather."""
+        probe = self._of(name, source)
+        light = source.ideal is None and not {Kind.DN, Kind.VIDEO, Kind.CODES} & set(source.consumes)
+        return probe if self.curve is None or not light else self._ahead_of_curve(probe)
+
+    def _of(self, name: str, source: Source) -> Probe:
         if not self.links or source.id == ESTIMATOR_ITSELF:
             return self.bare
         if Kind.VIDEO in source.consumes:
@@ -323,7 +398,7 @@ class Probes:
 
         held = Held(line, pixels, samples, nothing, nothing, located, ahead, self._rows_seen())
         background = self.bare.background_dn
-        signal = _seen(facts, self.target, x - first, y - row, (self.side, width))
+        signal = self._curved(_seen(facts, self.target, x - first, y - row, (self.side, width)))
         seen = held.read(line, signal, background)
         gx, gy = self._at_level(line.level).gradient(seen)
         held = replace(held, gx=gx / step, gy=gy)
@@ -381,6 +456,44 @@ class Probes:
         lower = None if threshold is None else threshold * level
         return replace(self.estimator, background_dn=self.estimator.background_dn * level, threshold_dn=lower, sigma=None)
 
+    def _curved(self, linear_dn: np.ndarray) -> np.ndarray:
+        return linear_dn if self.curve is None else self.curve.of(np.asarray(linear_dn) / self.facts.dn_per_photon)
+
+    def _bent(self, linear: Probe) -> Probe:
+        """The probe on what a curved response makes of the light; the estimator's levels follow."""
+        background = self.estimator.background_dn
+        level, lit = (float(self._curved(np.array(v))) for v in (background, background + (self.estimator.threshold_dn or 0.0)))
+        threshold = None if self.estimator.threshold_dn is None else lit - level
+        self.estimator = replace(self.estimator, background_dn=level, threshold_dn=threshold, sigma=None)
+        signal = self._curved(linear.signal_dn)
+        x_hat, y_hat = self.estimator.locate(signal)
+        gx, gy = self.estimator.gradient(signal)
+        return replace(
+            linear, signal_dn=signal, background_dn=level, x_hat_px=x_hat, y_hat_px=y_hat, gx=gx, gy=gy, locate=self.estimator.locate
+        )
+
+    def _ahead_of_curve(self, probe: Probe) -> Probe:
+        """The probe in DN that are linear in the light, ahead of a curved response, which belongs to the estimator then."""
+        assert self.curve is not None and probe.locate is not None
+        scale, locate = self.facts.dn_per_photon, probe.locate
+        light = np.interp(probe.signal_dn, *self._inverse)
+        slope = self.curve.slope(light) / scale
+        return replace(
+            probe,
+            signal_dn=light * scale,
+            background_dn=float(np.interp(probe.background_dn, *self._inverse)) * scale,
+            gx=probe.gx * slope,
+            gy=probe.gy * slope,
+            locate=lambda signal_dn, *phase: locate(self._curved(signal_dn), *phase),
+        )
+
+    @cached_property
+    def _inverse(self) -> tuple[np.ndarray, np.ndarray]:
+        """DN of the curve and the light that gives them."""
+        assert self.curve is not None
+        light = np.concatenate([[0.0], self.curve.saturating * np.geomspace(1e-9, 4.0, 40_000)])
+        return self.curve.of(light), light
+
     def _rows_seen(self) -> tuple[int, int]:
         """Rows of the sensor that are put out: those that lie in the frame of the output."""
         rows = self.camera.frame_shape[0]
@@ -409,9 +522,17 @@ def _parameter(camera: Camera, name: str) -> Any:
     return next((getattr(e.params, name) for e in camera.chain if hasattr(e.params, name)), None)
 
 
+def _electrons_per_photon(camera: Camera) -> float:
+    """What the essential conversions make of a photon before they make DN of it."""
+    bare = perfect(camera)
+    until = next((i for i, e in enumerate(bare.active) if e.source.produces is Kind.DN), len(bare.active))
+    head = replace(bare, chain=bare.active[:until])
+    return float(head.expose(Uniform(1000.0), window=(0, 0, 1, 1), quiet=True).data[0, 0, 0]) / 1000.0
+
+
 def _response(camera: Camera) -> float:
-    """DN per photon of the essential conversions."""
-    bare = camera.switched(on=())
+    """DN per photon of the essential conversions, in faint light."""
+    bare = perfect(camera)
     level = 1000.0
     out = [float(bare.expose(Uniform(v), window=(0, 0, 1, 1), quiet=True).data[0, 0, 0]) for v in (0.0, level)]
     if not out[1] > out[0]:

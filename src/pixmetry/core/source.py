@@ -73,6 +73,8 @@ class Source:
     bound_over : callable, optional
         ``bound_over(frame_shape)``: the bound in a frame of this size, for a source with parameters per pixel or per row whose effect adds
         up over the frame; ``bound`` is that of `STATED_FRAME`.
+    ideal : callable, optional
+        ``ideal(params)``: an essential conversion with errors of its own, without them; a budget compares with that one.
     context : callable, optional
         ``context(params, windows, frame_shape) -> Windows``: the input it needs to make these windows; by default the windows.
     near : callable, optional
@@ -137,6 +139,7 @@ class Source:
     correct: Callable[[Any, Signal, Mapping[str, np.ndarray]], Signal] | None = None
     propagate: Callable[[Any, Probe], Contribution] | None = None
     context: Callable[[Any, Windows, tuple[int, int]], Windows] | None = None
+    ideal: Callable[[Any], Any] | None = None
     bound_over: Callable[[tuple[int, int]], Any] | None = None
     near: Callable[..., tuple[int, int, int, int]] | None = None
     tail: Callable[..., float] | None = None

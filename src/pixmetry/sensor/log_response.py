@@ -7,6 +7,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from pixmetry.core.contribution import Contribution, Probe
 from pixmetry.core.random import Grid, Stream
 from pixmetry.core.signal import Kind, Signal
 from pixmetry.core.source import Parameters, Source, quantity
@@ -81,6 +82,32 @@ def truth(params: LogResponse, signal: Signal, stream: Stream) -> Mapping[str, n
     return {"a_dn": a, "b_dn": b * float(slope_dn(params, one.temperature_c[0])), "c_e": c}
 
 
+def ideal(params: LogResponse) -> LogResponse:
+    """The same response in every pixel, without noise."""
+    return params.model_copy(update={"offset_std_dn": 0.0, "slope_std_rel": 0.0, "foot_std_rel": 0.0, "noise_dn": 0.0})
+
+
+def propagate(params: LogResponse, probe: Probe) -> Contribution:
+    """Propagator P1 on the target as it is seen, in logarithmic DN: the spread of line, slope and foot, and the noise.
+
+    With y = b f(x/c) above black, a slope that is off by ε adds ε y, and a foot that is off by ε takes ε b s f'(s) away, s = x/c;
+    above a knee k of light, which is k/c of the foot, ε b (k/c + s' f'(s')) with s' = s − k/c.
+    """
+    b = float(slope_dn(params, probe.temperature_c))
+    f = np.maximum(probe.signal_dn, 0.0) / b
+    knee = 0.0 if params.mode == "log" else params.knee_e / params.foot_e
+    below, above = np.minimum(f, knee), np.expm1(np.maximum(f - knee, 0.0))
+    parts = (
+        probe.white(params.offset_std_dn),
+        probe.white(params.slope_std_rel * b * f),
+        probe.white(params.foot_std_rel * b * (below + above / (1 + above))),
+    )
+    time = probe.white(params.noise_dn)
+    u_x, u_y = (float(np.sqrt(sum(p[axis] ** 2 for p in (*parts, time)))) for axis in (0, 1))
+    method = "linear response of the estimator, in logarithmic DN, to the spread of the pixels' curves and to noise"
+    return Contribution(u_x, u_y, "F", model_error=0.2, method=method, time_px=time)
+
+
 SOURCE = Source(
     id="sensor.log_response",
     title="Logarithmic response",
@@ -94,7 +121,9 @@ SOURCE = Source(
     before=("electronics",),
     typical=LogResponse(offset_std_dn=1.8, slope_std_rel=0.01, foot_std_rel=0.05, noise_dn=0.3),
     bound=LogResponse(offset_std_dn=6.0, slope_std_rel=0.03, foot_std_rel=0.2, noise_dn=1.0),
+    ideal=ideal,
     forward=forward,
+    propagate=propagate,
     truth=truth,
     applies_to=("cmos",),
     option="a logarithmic response",
@@ -109,7 +138,6 @@ SOURCE = Source(
     reasons={
         "measure": "needs uniform fields at four levels or more over several decades, read pixel by pixel",
         "correct": "needs the maps of a, b and c of this unit, which dark and flat stacks at one level do not carry",
-        "propagate": "needs the target in logarithmic DN; a probe holds a signal that is linear in the light",
         "neutral": "it is a conversion: without it there are no numbers",
     },
 )
