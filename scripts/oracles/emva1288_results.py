@@ -9,6 +9,8 @@ import json
 import logging
 import sys
 
+import numpy as np
+from emva1288.process import routines
 from emva1288.process.data import Data1288
 from emva1288.process.loader import LoadImageData
 from emva1288.process.parser import ParseEmvaDescriptorFile
@@ -39,8 +41,14 @@ def main(descriptor: str) -> None:
     results = Results1288(reduced, **quiet)
     values = {name: getattr(results, name) for name in NAMES}
     values = {name: float(value() if callable(value) else value) for name, value in values.items()}
+    scalars = {}
+    for name in routines.cls_1288_info(Results1288):
+        value = getattr(results, name)
+        value = value() if callable(value) else value
+        if value is not None and np.ndim(value) == 0 and not isinstance(value, dict):
+            scalars[name] = float(value)
     temporal = {name: [float(v) for v in reduced["temporal"][name]] for name in ("u_y", "s2_y", "u_ydark", "s2_ydark", "texp")}
-    json.dump(values | {"temporal": temporal}, sys.stdout)
+    json.dump(values | {"temporal": temporal, "scalars": scalars}, sys.stdout)
 
 
 if __name__ == "__main__":

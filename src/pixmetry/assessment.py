@@ -7,12 +7,11 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from pixmetry.budget.budget import compute_budget
-from pixmetry.budget.parameters import applies, with_estimates
+from pixmetry.budget.parameters import with_estimates
 from pixmetry.budget.probe import Target, parse_target
 from pixmetry.campaign import (
     EXAMPLE,
@@ -26,12 +25,12 @@ from pixmetry.campaign import (
     write_maps,
     write_record,
 )
-from pixmetry.core.camera import Camera, Element, in_order
 from pixmetry.core.catalogue import catalogue
 from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.core.estimates import Estimates
 from pixmetry.core.geometry import frame_centre
 from pixmetry.core.observations import CameraGeometry, Observations
+from pixmetry.digital_twin import digital_twin, of_unit, self_test
 from pixmetry.emva.evaluate import standard_values
 from pixmetry.emva.records import Measurement, Results
 from pixmetry.experiment.observe import Group, observe
@@ -62,7 +61,7 @@ def assess(
     campaign : path, Campaign or None
         A manifest, an EMVA 1288 descriptor, a folder with one of them, or None for the packaged example.
     output : path, optional
-        Folder for ``report.html``, ``results.json``, ``maps.zarr.zip`` and ``camera.yaml``.
+        Folder for ``report.html``, ``results.json``, ``maps.zarr.zip``, ``camera.yaml`` and ``camera.maps.npz``.
     target, estimator : str
         As on the command line, e.g. ``"disc:diameter=7,blur=0.7,peak=0.6"`` and ``"soft_threshold:sigma=3,window=13"``.
     calibration : path or CameraGeometry, optional
@@ -121,7 +120,11 @@ def assess(
     )
     told("computing the budget", steps, steps)
     record = provenance_record(hashes, seed=seed, libraries=("numpy", "scipy", "numba"))
-    assessment = Assessment(frames, seen, estimates, unmeasured, standard, camera, budget, record)
+    told("testing the digital twin", 0, 1)
+    twin = of_unit(camera, seen)
+    tested = self_test(twin, frames, seen, standard, seed)
+    told("testing the digital twin", 1, 1)
+    assessment = Assessment(frames, seen, estimates, unmeasured, standard, twin, budget, record, tested)
     if output is not None:
         told("writing the report", 0, 1)
         write_results(assessment, output, _inputs(frames, calibration))
@@ -268,49 +271,3 @@ def measure_sources(observations: Observations) -> tuple[dict[str, Estimates], d
         except (MeasureError, InputError) as problem:
             unmeasured[source.id] = str(problem)
     return estimates, unmeasured
-
-
-UNMEASURED = ("sensor.quantum_efficiency", "sensor.shot_noise", "grabber.adc")  # what every twin has, measured or not
-
-
-def digital_twin(campaign: Campaign, estimates: dict[str, Estimates], observations: Observations) -> Camera:
-    """Build the camera that makes frames like the real ones, from what was measured.
-
-    What the campaign only bounds is left out. Without a photon count the quantum efficiency is 1, and a scene's photons are electrons.
-    """
-    facts = campaign.camera
-    told = {"interface": facts.interface, **({} if facts.sensor is None else {"sensor": facts.sensor})}
-    known: dict[str, Any] = {"bits": campaign.bits, "reference_dn": float(2**campaign.bits - 1), "quantum_efficiency": 1.0}
-    if facts.temperature_c is not None:
-        known["reference_temperature_c"] = facts.temperature_c
-    elements = []
-    for source in in_order(s for s in catalogue().values() if s.forward is not None and applies(s, told)):
-        fields = source.parameters.model_fields
-        if source.id not in estimates and source.id not in UNMEASURED:
-            continue
-        values = {k: v for k, v in known.items() if k in fields} | best_values(estimates.get(source.id, Estimates.empty()))
-        elements.append(Element(source.id, source, source.make(values, where=f"digital twin, {source.id}")))
-    pitch = None if facts.pitch_x_um is None else (facts.pitch_x_um, facts.pitch_y_um or facts.pitch_x_um)
-    stack = observations.bright_stack
-    exposure = stack.exposure_s if stack is not None else float(np.median(observations.photon_transfer.bright.exposure_s))
-    photons_known = "sensor.quantum_efficiency" in estimates
-    return Camera(
-        name=facts.name,
-        frame_shape=campaign.frame_shape,
-        chain=tuple(elements),
-        pitch_um=pitch,
-        exposure_s=exposure,
-        temperature_c=20.0 if facts.temperature_c is None else facts.temperature_c,
-        facts={
-            **told,
-            "bits": campaign.bits,
-            "source": f"assessed from {campaign.source_path.name}",
-            "photons": "photons" if photons_known else "electrons: no photon count was given, the quantum efficiency is set to 1",
-        },
-    )
-
-
-def best_values(estimates: Estimates) -> dict[str, float]:
-    """Return values for a simulation: estimates as they are; nothing of what is not significant, but for dark noise that rounding hides."""
-    hidden = {"white_e"}  # the rms of an even spread up to its limit
-    return {e.name: e.representative if e.kind == "value" or e.name in hidden else 0.0 for e in estimates}

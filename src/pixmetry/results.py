@@ -13,6 +13,7 @@ from pixmetry.campaign import Campaign
 from pixmetry.core.camera import Camera
 from pixmetry.core.estimates import Estimates
 from pixmetry.core.observations import Observations
+from pixmetry.digital_twin import SelfTest
 from pixmetry.emva.formats import value_record
 from pixmetry.emva.records import Results
 
@@ -37,6 +38,8 @@ class Assessment:
         The digital twin.
     budget : Budget
     provenance : dict
+    self_test : SelfTest
+        The twin beside the camera.
     """
 
     campaign: Campaign
@@ -47,6 +50,7 @@ class Assessment:
     camera: Camera
     budget: Budget
     provenance: dict[str, Any]
+    self_test: SelfTest = SelfTest()
 
     def to_record(self) -> dict[str, Any]:
         """Return the plain record of ``results.json``."""
@@ -92,6 +96,7 @@ class Assessment:
                 "notes": list(self.standard.notes),
             },
             "budget": self.budget.to_record(),
+            "twin": self.self_test.to_record(),
             "notes": list(self.observations.notes),
             "provenance": self.provenance,
         }

@@ -26,7 +26,8 @@ ALLOWED: dict[str, set[str]] = {
     "budget": {"core", "scene", "location"},
 }
 ALLOWED["simulation"] = ALLOWED["correction"] = {"core", "scene", "campaign"}
-ALLOWED["results"] = {"core", "campaign", "experiment", "budget", "emva"}
+ALLOWED["digital_twin"] = {"core", "scene", "campaign", "experiment", "budget", "emva"}
+ALLOWED["results"] = {"core", "campaign", "experiment", "budget", "emva", "digital_twin"}
 ALLOWED["chain"] = {"core", "scene"}
 ALLOWED["emva"] = {"core", "experiment"}
 ALLOWED["datasheet_files"] = {"core", "campaign", "emva", "report"}
@@ -49,9 +50,10 @@ ALLOWED["calibrating"] |= {"calibration_record", "calibration_files", "line_cali
 ALLOWED["camera_noise"] = {"core", "scene", "location"}
 ALLOWED["located"] = {"core", "campaign", "location"}
 ALLOWED["report"] = {"core", "campaign", "experiment", "budget", "results", "chain", "located", "emva", "calibration", "line_calibration"}
+ALLOWED["report"] |= {"digital_twin"}
 ALLOWED["locating"] = {"core", "campaign", "location", "located", "camera_noise", "report"}
 ALLOWED["assessment"] = {"core", "campaign", "experiment", "location", "budget", "results", "report", "emva", "calibrated"}
-ALLOWED["assessment"] |= {"calibration_record"}
+ALLOWED["assessment"] |= {"calibration_record", "digital_twin"}
 ALLOWED["handbook"] = {*ALLOWED}
 ALLOWED["cli"] = {*ALLOWED}
 ALLOWED["__main__"] = {"cli"}

@@ -37,8 +37,8 @@ def assess(
     """Assess a camera from its frames: measure, budget, advise, and write the report.
 
     CAMPAIGN is a manifest (YAML), an EMVA 1288 descriptor file, or a folder that holds one of them; without it, the packaged example
-    (a crop of a real CCD camera's data set) is assessed. The folder of results gets report.html, results.json, maps.zarr.zip and
-    camera.yaml, the camera's digital twin for `pixmetry simulate`.
+    (a crop of a real CCD camera's data set) is assessed. The folder of results gets report.html, results.json, maps.zarr.zip, and
+    camera.yaml with camera.maps.npz: the camera's digital twin for `pixmetry simulate`.
     """
     from pixmetry.assessment import assess as run
     from pixmetry.cli._progress import shown_progress

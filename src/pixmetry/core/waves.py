@@ -70,13 +70,16 @@ def without_wave(signal: Signal, frequency_x: float, frequency_y: float, most_dn
 def _background_wave(data: np.ndarray, row: np.ndarray, col: np.ndarray) -> complex:
     """What is significant of the complex amplitude a of Re(a z), z = row × col, in one window."""
     amplitude = 0j
-    for _ in range(2):  # first with the wave among the deviations, then without
-        target = _targets(data - np.outer(amplitude * row, col).real)
-        keep = ~_spread(target, MARGIN_PX)
-        found = _fit_wave(data, keep, row, col)
+    for _ in range(2):
+        target, sigma = _targets(data - np.outer(amplitude * row, col).real if amplitude else data)
+        found = _fit_wave(data, ~_spread(target, MARGIN_PX), row, col)
         if found is None:
             return 0j
         amplitude, noise2 = found
+        if abs(amplitude) < sigma / 2:  # else the deviations are looked at again without the wave among them
+            break
+    if abs(amplitude) ** 2 <= noise2 * np.log(1 / CHANCE):
+        return 0j
     if target.any():
         wider = _fit_wave(data, ~_spread(target, 2 * MARGIN_PX), row, col)
         noise2 += 0.0 if wider is None else abs(wider[0] - amplitude) ** 2
@@ -84,14 +87,15 @@ def _background_wave(data: np.ndarray, row: np.ndarray, col: np.ndarray) -> comp
     return amplitude * (1 - noise2 / power) if power > noise2 * np.log(1 / CHANCE) else 0j
 
 
-def _targets(data: np.ndarray) -> np.ndarray:
-    """Pixels that are not background, bool: far from the median of their block."""
+def _targets(data: np.ndarray) -> tuple[np.ndarray, float]:
+    """Pixels that are not background, bool: far from the median of their block; and the robust standard deviation of all."""
     off = np.empty_like(data)
     for rows in np.array_split(np.arange(data.shape[0]), max(data.shape[0] // BLOCK_PX, 1)):
         for cols in np.array_split(np.arange(data.shape[1]), max(data.shape[1] // BLOCK_PX, 1)):
             block = np.s_[rows[0] : rows[-1] + 1, cols[0] : cols[-1] + 1]
             off[block] = np.abs(data[block] - np.median(data[block]))
-    return off > CLIP * 1.4826 * float(np.median(off))
+    sigma = 1.4826 * float(np.median(off))
+    return off > CLIP * sigma, sigma
 
 
 def _spread(mask: np.ndarray, reach: int) -> np.ndarray:
@@ -122,7 +126,9 @@ def _fit_wave(data: np.ndarray, keep: np.ndarray, row: np.ndarray, col: np.ndarr
     level = float(data[keep].mean())
     part = np.where(keep, data - level, 0.0)
     normal = np.zeros((len(of_rows),) * 2, complex)
-    normal[one, other] = ((weight @ (of_cols[one].conj() * of_cols[other]).T) * (of_rows[one].conj() * of_rows[other]).T).sum(axis=0)
+    pairs = (of_cols[one].conj() * of_cols[other]).T
+    summed = weight @ np.ascontiguousarray(pairs.real) + 1j * (weight @ np.ascontiguousarray(pairs.imag))
+    normal[one, other] = (summed * (of_rows[one].conj() * of_rows[other]).T).sum(axis=0)
     normal += np.triu(normal, 1).conj().T
     moments = ((part @ of_cols.conj().T) * of_rows.conj().T).sum(axis=0)
     inverse = np.linalg.pinv(normal, rcond=1e-9, hermitian=True)

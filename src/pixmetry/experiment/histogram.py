@@ -154,7 +154,7 @@ def code_errors(histogram: CodeHistogram, min_expected: float = 100.0) -> CodeEr
     A code that never occurs is missing if its Poisson probability exp(−e_k), times the number of codes tested, is below 1e-6.
     """
     ideal, usable = expected_counts(histogram)
-    weights = _neighbour_weights()
+    weights = neighbour_weights()
     n = histogram.counts.astype(float)
     ratio = np.divide(n, ideal, out=np.zeros_like(n), where=ideal > 0)
     full = np.convolve(usable.astype(float), weights != 0, mode="same") == 2 * HALF_WINDOW
@@ -177,7 +177,7 @@ def code_errors(histogram: CodeHistogram, min_expected: float = 100.0) -> CodeEr
     )
 
 
-def _neighbour_weights() -> np.ndarray:
+def neighbour_weights() -> np.ndarray:
     """Weights with which the neighbours of a code predict it: least squares of a polynomial of degree 4, shape (2·HALF_WINDOW + 1,)."""
     j = np.arange(-HALF_WINDOW, HALF_WINDOW + 1)
     design = np.stack([j**0, j**2, j**4], axis=1)[j != 0].astype(float)
@@ -192,7 +192,7 @@ def _rms_dnl(dnl: np.ndarray, variance: np.ndarray) -> Estimates:
     The neighbours' own DNL adds to the scatter. Thresholds are taken as displaced one by one, so that a wide code has narrow neighbours:
     the widths have a correlation of −1/2 with the next.
     """
-    h = _neighbour_weights()
+    h = neighbour_weights()
     response = -h + (np.arange(h.size) == HALF_WINDOW)
     window = float(response @ response - response[1:] @ response[:-1])
     weights = 1 / variance

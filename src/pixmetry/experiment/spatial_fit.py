@@ -104,6 +104,39 @@ def fit_spatial(
     phase x within a code (first harmonic; Widrow and Kollár, Quantization Noise, ch. 5), and codes of unequal width bend it likewise; u
     of the DSNU holds that.
     """
+    stored_dn, dither_dn2 = bright_stack.mean_dn, white_before_rounding(dark_stack.ms_pixel_dn2, core_spread_dn2(dark_stack))
+    maps = spatial_maps(dark_stack, bright_stack, defects, surface_degree=surface_degree, linearity=linearity, patterns=patterns)
+    dark_stack, bright_stack, dark, response = maps.dark_stack, maps.bright_stack, maps.dark_dn, maps.response_dev_rel
+    surface, mask = maps.surface, maps.mask
+    waves_dn2 = 0.0 if patterns is None else float((0.5 * patterns.amplitude_dn[patterns.moving] ** 2).sum())
+    squares, covariance = _mean_squares(dark_stack, bright_stack, dark, response, mask, surface, this_sensor, waves_dn2)
+    components = _components(squares, covariance, dark_stack.shape, float((surface.values**-2.0).mean()))
+    result = _with_rounding(components, dither_dn2, dnl_lsb).join(_shading(surface, squares))
+    return result if linearity is None else _with_common_scale(result, linearity.contrast_u_rel(stored_dn))
+
+
+@dataclass(frozen=True)
+class SpatialMaps:
+    """What the non-uniformities of a sensor are taken from: straightened stacks, and their maps with defects filled in."""
+
+    dark_stack: StackMoments
+    bright_stack: StackMoments
+    dark_dn: np.ndarray  # without fixed waves
+    response_dev_rel: np.ndarray  # (bright − dark) over its surface, less a surface of its own
+    surface: Surface  # of the light
+    mask: np.ndarray  # defects
+
+
+def spatial_maps(
+    dark_stack: StackMoments,
+    bright_stack: StackMoments,
+    defects: DefectList | None = None,
+    *,
+    surface_degree: int = 4,
+    linearity: Linearity | None = None,
+    patterns: PatternList | None = None,
+) -> SpatialMaps:
+    """Straighten two stacks and make the maps of which `fit_spatial` takes the spread; parameters and errors are those of it."""
     from pixmetry.experiment.defects import find_defects
 
     if dark_stack.shape != bright_stack.shape:
@@ -114,7 +147,6 @@ def fit_spatial(
             "frames are too small for the surface", value=(rows, cols), allowed=f"{2 * surface_degree + 4} rows and columns or more"
         )
     mask = (find_defects(dark_stack, bright_stack, surface_degree=surface_degree) if defects is None else defects).mask()
-    stored_dn, dither_dn2 = bright_stack.mean_dn, white_before_rounding(dark_stack.ms_pixel_dn2, core_spread_dn2(dark_stack))
     if linearity is not None:
         dark_stack, bright_stack = linearity.straight_stack(dark_stack), linearity.straight_stack(bright_stack)
     light = fill(bright_stack.mean_map_dn - dark_stack.mean_map_dn, mask)
@@ -129,12 +161,7 @@ def fit_spatial(
     if patterns is not None:
         dark = without_fixed_waves(dark, patterns)
     response = fill((bright_stack.mean_map_dn - dark_stack.mean_map_dn) / surface.values, mask)
-    response = response - fit_surface(response, surface_degree).values
-    waves_dn2 = 0.0 if patterns is None else float((0.5 * patterns.amplitude_dn[patterns.moving] ** 2).sum())
-    squares, covariance = _mean_squares(dark_stack, bright_stack, dark, response, mask, surface, this_sensor, waves_dn2)
-    components = _components(squares, covariance, dark_stack.shape, float((surface.values**-2.0).mean()))
-    result = _with_rounding(components, dither_dn2, dnl_lsb).join(_shading(surface, squares))
-    return result if linearity is None else _with_common_scale(result, linearity.contrast_u_rel(stored_dn))
+    return SpatialMaps(dark_stack, bright_stack, dark, response - fit_surface(response, surface_degree).values, surface, mask)
 
 
 def _with_common_scale(e: Estimates, u_rel: float) -> Estimates:
@@ -172,7 +199,7 @@ def without_fixed_waves(image: np.ndarray, patterns: PatternList) -> np.ndarray:
     return image
 
 
-def _temporal(stack: StackMoments, mask: np.ndarray, weight: np.ndarray | None = None) -> Strata:
+def temporal_strata(stack: StackMoments, mask: np.ndarray, weight: np.ndarray | None = None) -> Strata:
     """Temporal mean squares per pixel over L, of the good pixels, with weights as of a mean map that is multiplied by them."""
     good = stack.var_map_dn2[~mask].astype(float)
     # only the white part of noisy pixels goes out with them
@@ -210,7 +237,7 @@ def _mean_squares(
     dof_response = dof_map - [surface.n_mixed, surface.degree, surface.degree]
     per_frame = np.array([(rows - 1) * (cols - 1), rows - 1, cols - 1], dtype=float)
     own, other = cross_strata(dark, dark), cross_strata(response, response)
-    temporal_dark, temporal_bright = _temporal(dark_stack, mask), _temporal(bright_stack, mask, 1 / surface.values)
+    temporal_dark, temporal_bright = temporal_strata(dark_stack, mask), temporal_strata(bright_stack, mask, 1 / surface.values)
     values = np.concatenate(
         [_array(own) / dof_map, _array(other) / dof_response, _array(temporal_dark), _array(temporal_bright)],
     )

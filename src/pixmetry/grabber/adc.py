@@ -96,7 +96,7 @@ def forward(params: Adc, signal: Signal, stream: Stream) -> Signal:
         data = (data - np.float32(0.5 * params.hysteresis_lsb / factor) * rising).astype(np.float32)
     if params.offset_drift_dn_per_k or params.gain_drift_per_k:
         data = _drifted(params, data, signal.temperature_c)
-    if params.equal_steps:
+    if params.equal_steps and stream.known_unit("threshold_lsb") is None:
         codes = quantise_ideal(data, factor, params.offset_dn, float(params.top))
     else:
         codes = quantise_at(data, factor, params.offset_dn, thresholds(params, stream))

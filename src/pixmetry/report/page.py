@@ -45,6 +45,7 @@ def _content(assessment: Assessment) -> dict[str, Any]:
     from pixmetry.report.budget_view import budget_content
     from pixmetry.report.figures import all_pictures
     from pixmetry.report.measured import table
+    from pixmetry.report.twin_view import twin_content
 
     seen = assessment.observations
     pictures = all_pictures(seen, assessment.standard, assessment.maps())
@@ -55,6 +56,7 @@ def _content(assessment: Assessment) -> dict[str, Any]:
         "transfer": [pictures[name] for name in TRANSFER if name in pictures],
         "noise": [p for name, p in pictures.items() if name not in TRANSFER],
         "values": table(seen, assessment.standard),
+        **twin_content(assessment.self_test),
         "notes": _notes(assessment),
         "confounders": _confounders(assessment),
         "methods": _methods(assessment),
