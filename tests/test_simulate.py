@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -444,3 +445,15 @@ def test_frames_of_another_camera_or_scene_and_notes_among_them_are_kept(folder:
     assert {p: p.read_bytes() for p in (folder / "frames").iterdir()} == before
     done(run(folder, "-n", 1, output="frames"))
     assert len(list((folder / "frames").glob("*.tif"))) == 1
+
+
+def test_a_name_gives_no_orders_to_a_terminal(folder: Path) -> None:
+    """Escape sequences in the name of a folder, a file, a camera; what is on the disk keeps its name."""
+    evil = "a\x1b[2J\x9b\u202eb\n[/bold]"
+    result = run(folder, output=evil)
+    done(result)
+    assert result.output == f"frames: {folder}/a\\x1b[2J\\x9b\\u202eb\\x0a[/bold]\n" and (folder / evil / "truth.json").is_file()
+    for arguments in (("locate", f"{evil}.png"), ("compare", evil, evil), ("correct", evil, "--with", evil, "-o", evil)):
+        result = CliRunner().invoke(main, list(arguments))
+        assert result.exit_code == 2 and result.output.count("\n") == 1
+        assert not re.search(r"[\x00-\x09\x0b-\x1f\x7f-\x9f\u202e]", result.output)

@@ -15,6 +15,7 @@ from pixmetry.calibration.network import Calibration
 from pixmetry.calibration_record import PIXELS, json_text, lines_json
 from pixmetry.campaign.output import check_output, staged_output
 from pixmetry.core.camera import Camera
+from pixmetry.core.plain_text import cell, comment
 from pixmetry.line_calibration import LineCalibration
 
 KIND = "calibration"
@@ -178,7 +179,7 @@ TABLES: dict[str, Callable[[Calibration], str]] = {
 def _csv(comments: Iterable[str], columns: Mapping[str, Any]) -> str:
     text = io.StringIO()
     for line in comments:
-        text.write(f"# {line}\n")
+        text.write(f"# {comment(line)}\n")
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(columns)
     writer.writerows(zip(*(_texts(values) for values in columns.values()), strict=True))
@@ -186,6 +187,6 @@ def _csv(comments: Iterable[str], columns: Mapping[str, Any]) -> str:
 
 
 def _texts(values: Any) -> list[Any]:
-    """Ten digits of a number, empty where there is none."""
+    """Ten digits of a number, empty where there is none; names as cells may hold them."""
     plain = values.tolist() if isinstance(values, np.ndarray) else values
-    return [("" if math.isnan(v) else f"{v:.10g}") if isinstance(v, float) else v for v in plain]
+    return [cell(v) if isinstance(v, str) else ("" if math.isnan(v) else f"{v:.10g}") if isinstance(v, float) else v for v in plain]

@@ -14,6 +14,7 @@ import numpy as np
 
 from pixmetry.campaign.staged_files import Output, check_files, write_together
 from pixmetry.core.errors import InputError
+from pixmetry.core.plain_text import cell, comment
 from pixmetry.location.targets import Flag
 
 LOCATED_SCHEMA = "pixmetry/located/1"
@@ -127,7 +128,7 @@ class Located:
     def _csv(self) -> bytes:
         text = io.StringIO()
         for line in self._comments():
-            text.write(f"# {' '.join(line.split())}\n")
+            text.write(f"# {comment(line)}\n")
         writer = csv.writer(text, lineterminator="\n")
         writer.writerow(self.columns)
         writer.writerows([[_short(v) for v in row] for row in self._rows()])
@@ -182,5 +183,7 @@ def joined(tables: Sequence[Located]) -> Located:
 
 
 def _short(value: Any) -> Any:
-    """Ten digits of a number: a millionth of a pixel in every frame."""
+    """Ten digits of a number: a millionth of a pixel in every frame; a name as a cell may hold it."""
+    if isinstance(value, str):
+        return cell(value)
     return "" if value is None else f"{value:.10g}" if isinstance(value, float) else value

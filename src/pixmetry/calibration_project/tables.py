@@ -11,8 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
+from pixmetry.core.checksums import check_file
 from pixmetry.core.config import read_text
 from pixmetry.core.errors import InputError
+from pixmetry.core.plain_text import name_of
 
 IGNORED = "-"  # a column of no interest, where columns are named in their order
 _DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+")
@@ -145,9 +147,11 @@ def read_table(path: Path, columns: Sequence[str] | Mapping[str, str] | None = N
     Raises
     ------
     InputError
-        If the file cannot be read, holds no row, a row has another number of values than the header, or may be a row or a comment.
+        If the file cannot be read, holds no row, a row has another number of values than the header, or may be a row or a comment; or if
+        it is a table of a result and was changed since.
     """
     source = str(path)
+    check_file(path)
     given = [(n, line) for n, line in enumerate(read_text(path).splitlines(), 1) if line.strip()]
     lines = [(n, line) for n, line in given if not line.lstrip().startswith("#")]
     if not lines:
@@ -214,7 +218,7 @@ def _split(source: str, lines: Sequence[tuple[int, str]]) -> list[tuple[int, lis
         n = next(n for n, line in lines if line.count('"') % 2)
         remedy = "close it on its line, or write two quotes for one in a name"
         raise InputError("a quote that is not closed", where=f"{source}, line {n}", remedy=remedy)
-    return [(n, [value.strip() for value in row]) for (n, _), row in zip(lines, rows, strict=True)]
+    return [(n, [name_of(value.strip()) for value in row]) for (n, _), row in zip(lines, rows, strict=True)]
 
 
 def _refuse_lost_rows(source: str, given: Sequence[tuple[int, str]], first: tuple[int, str], width: int) -> None:

@@ -17,6 +17,7 @@ from typing import Any
 import click
 
 from pixmetry import __version__
+from pixmetry.cli._console import echo
 from pixmetry.core.errors import PixmetryError
 
 EXIT_ERROR = 2
@@ -87,14 +88,14 @@ class LazyGroup(click.Group):
         except click.UsageError as problem:
             raise _told(problem) from None
         except PixmetryError as error:
-            click.echo(f"error: {' '.join(str(error).split())}", err=True)
+            echo(f"error: {' '.join(str(error).split())}", err=True)
             ctx.exit(EXIT_ERROR)
         except OSError as problem:
             if problem.errno in (None, errno.EPIPE):  # click knows what to do about a closed pipe
                 raise
             where = f"{problem.filename}: " if problem.filename else ""
             remedy = _OS_REMEDIES.get(problem.errno, "check the path and its permissions, or choose another")
-            click.echo(f"error: {where}{problem.strerror}; to do: {remedy}", err=True)
+            echo(f"error: {where}{problem.strerror}; to do: {remedy}", err=True)
             ctx.exit(EXIT_ERROR)
         except UnicodeEncodeError as problem:
             if "surrogates" not in problem.reason:
@@ -116,7 +117,7 @@ def _told(problem: click.UsageError) -> Exception:
         return problem
     name = problem.ctx.command_path if problem.ctx else "pixmetry"
     message = " ".join(problem.format_message().split()).rstrip(".")
-    click.echo(f"error: {message}; to do: see `{name} --help`", err=True)
+    echo(f"error: {message}; to do: see `{name} --help`", err=True)
     return click.exceptions.Exit(EXIT_ERROR)
 
 

@@ -251,6 +251,6 @@ def _mark(reason: str, reasons: dict[str, int]) -> str:
 
 
 def _console() -> Console:
-    from rich.console import Console
+    from pixmetry.cli._console import console
 
-    return Console(width=WIDTH, highlight=False)
+    return console(width=WIDTH)

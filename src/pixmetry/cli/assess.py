@@ -7,6 +7,10 @@ from typing import TYPE_CHECKING
 
 import click
 
+from pixmetry.cli._console import console as plain_console
+from pixmetry.cli._console import echo
+from pixmetry.core.plain_text import shown
+
 if TYPE_CHECKING:
     from pixmetry.results import Assessment
 
@@ -50,16 +54,16 @@ def assess(
             campaign, output, target=target, estimator=estimator, calibration=calibration, trials=trials, seed=seed, progress=progress
         )
     print_summary(assessment)
-    click.echo(f"report: {output / 'report.html'}")
+    echo(f"report: {output / 'report.html'}")
 
 
 def print_summary(assessment: Assessment) -> None:
     """Print the verdict and the largest contributions."""
-    from rich.console import Console
+    from rich.markup import escape
     from rich.table import Table
 
-    console = Console(width=110, highlight=False)
-    console.print(f"\n[bold]{assessment.campaign.camera.name}[/bold]: {assessment.verdict_text()}\n")
+    console = plain_console(width=110)
+    console.print(f"\n[bold]{escape(shown(assessment.campaign.camera.name))}[/bold]: {escape(assessment.verdict_text())}\n")
     table = Table(
         title="Largest contributions to a target's position in one frame, k = 1, px", title_justify="left", box=None, pad_edge=False
     )
@@ -84,4 +88,4 @@ def print_summary(assessment: Assessment) -> None:
             f"after a calibration {together.calibrated_px:.2g} px."
         )
     for note in assessment.observations.notes:
-        console.print(f"Note: {note}")
+        console.print(f"Note: {note}", markup=False)

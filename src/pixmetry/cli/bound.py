@@ -7,6 +7,9 @@ from typing import Any
 
 import click
 
+from pixmetry.cli._console import console as plain_console
+from pixmetry.core.plain_text import json_shown
+
 KINDS = ("disc", "ellipse", "ring", "spot", "line", "edge")
 SIZES = {
     "radius": "radius_px",
@@ -89,7 +92,8 @@ def bound(
         pattern_dn=settings["pattern_dn"],
     )
     if as_json:
-        click.echo(json.dumps(result.to_record() | {"aperture_px": settings["aperture_px"]} | about, indent=2, ensure_ascii=False))
+        record = result.to_record() | {"aperture_px": settings["aperture_px"]} | about
+        click.echo(json_shown(json.dumps(record, indent=2, ensure_ascii=False)))
     else:
         _show(result, about)
 
@@ -117,10 +121,9 @@ def _of_camera(name: str, no_rounding: bool) -> tuple[Any, dict[str, float], dic
 
 
 def _show(result: Any, about: dict[str, Any]) -> None:
-    from rich.console import Console
     from rich.table import Table
 
-    console = Console(highlight=False)
+    console = plain_console()
     size = ", ".join(f"{n.removesuffix('_px')} {v:g}" for n, v in result.parameters.items() if v and n.endswith("_px") and "per" not in n)
     console.print(
         f"{result.kind} of {size} px, {result.parameters['amplitude_dn']:g} grey values over {result.parameters['background_dn']:g}; "

@@ -7,6 +7,8 @@ from typing import Any
 
 import click
 
+from pixmetry.cli._console import echo, echo_lines
+
 KINDS = ("chessboard", "dots", "coded", "squares", "lines")
 OPTIONS = ("field", "loss", "folds", "residual_grid", "snoop", "a_priori")
 
@@ -81,10 +83,10 @@ def calibrate(
     with shown_progress() as progress:
         calibration = run(sources, output, options=options, progress=progress, **given)
     report = output / "report.html"
-    click.echo(_told(calibration, report, json))
+    echo_lines(_told(calibration, report, json))
     if opencv is not None or colmap is not None:
         for sentence in write_exports(_models(calibration), opencv, colmap, may_lose_px, read):
-            click.echo(sentence, err=json)
+            echo(sentence, err=json)
 
 
 def _told(calibration: Any, report: Path, json: bool) -> str:
@@ -93,8 +95,9 @@ def _told(calibration: Any, report: Path, json: bool) -> str:
 
     if json:
         from pixmetry.calibration_record import cameras_text
+        from pixmetry.core.plain_text import json_shown
 
-        return cameras_text(calibration, str(report))
+        return json_shown(cameras_text(calibration, str(report)))
     if isinstance(calibration, LineCalibration):
         from pixmetry.report.lines_text import summary_text as lines_text
 

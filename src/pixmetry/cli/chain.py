@@ -6,6 +6,8 @@ from pathlib import Path
 
 import click
 
+from pixmetry.cli._console import echo
+
 
 @click.command()
 @click.argument("camera")
@@ -43,4 +45,4 @@ def chain(
     from pixmetry.report.chain_page import write_chain_page
 
     changed = changed_camera(load_camera(camera), parse_overrides(settings), off)
-    click.echo(f"page: {write_chain_page(walk(changed, scene, target=target, frame=frame, seed=seed), output)}")
+    echo(f"page: {write_chain_page(walk(changed, scene, target=target, frame=frame, seed=seed), output)}")

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from pixmetry.cli._console import console as plain_console
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
@@ -40,8 +42,6 @@ def compare(files: tuple[Path, ...], limits: Path | None, level: float, same_lig
     three and more each with the fleet's median; with --limits one is enough. Exit status: 0 all the same and within limits; 1 something
     changed, stands out, fails or is undecided; 2 an error.
     """
-    from rich.console import Console
-
     from pixmetry.campaign.staged_files import Output, check_files, write_together
     from pixmetry.comparing import check_limits, compare_fleet
     from pixmetry.comparing import compare as compare_two
@@ -53,7 +53,7 @@ def compare(files: tuple[Path, ...], limits: Path | None, level: float, same_lig
         raise InputError("is for two files", where="--same-light", remedy="leave it away")
     written = [] if json_file is None else [Output(json_file, MARK)]
     check_files(written, files)  # before the work
-    console = Console(width=116, highlight=False)
+    console = plain_console(width=116)
     record: dict[str, Any] = {"schema": SCHEMA}
     good = True
     if len(files) > 1:

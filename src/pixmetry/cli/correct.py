@@ -6,6 +6,8 @@ from pathlib import Path
 
 import click
 
+from pixmetry.cli._console import echo
+
 
 @click.command()
 @click.argument("frames", nargs=-1, required=True, type=click.Path(path_type=Path))
@@ -28,5 +30,5 @@ def correct(frames: tuple[Path, ...], results: Path, output: Path, raw: str | No
     with shown_progress() as progress:
         summary = correct_files(frames, results, output, raw=raw, progress=progress)
     for line in summary:
-        click.echo(line)
-    click.echo(f"corrected frames: {output}")
+        echo(line)
+    echo(f"corrected frames: {output}")

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import click
 
+from pixmetry.cli._console import echo, echo_lines
+
 KINDS = ("disc", "ellipse", "ring", "spot", "line", "edge", "cross", "chessboard", "coded")
 
 
@@ -95,12 +97,12 @@ def locate(
             progress=progress,
         )
     if output is None:
-        click.echo(table.to_csv(), nl=False)
+        echo_lines(table.to_csv(), nl=False)
     for image in table.images:
-        click.echo(f"{image['name']}: {image['targets']} found; {image['estimator']}: {image['reason']}", err=output is None)
+        echo(f"{image['name']}: {image['targets']} found; {image['estimator']}: {image['reason']}", err=output is None)
         if "file" in image:
-            click.echo(f"{image['name']}: {image['file']}", err=output is None)
+            echo(f"{image['name']}: {image['file']}", err=output is None)
     if output is not None:
-        click.echo(f"table: {output}")
+        echo(f"table: {output}")
     if overlay is not None:
-        click.echo(f"overlay: {overlay}", err=output is None)
+        echo(f"overlay: {overlay}", err=output is None)

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import click
 
+from pixmetry.cli._console import echo
+
 
 @click.command()
 @click.argument("camera")
@@ -74,4 +76,4 @@ def simulate(
             window=part,
             progress=progress,
         )
-    click.echo(f"frames: {folder}")
+    echo(f"frames: {folder}")
