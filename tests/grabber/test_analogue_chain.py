@@ -24,7 +24,7 @@ CHAIN = {
     "grabber.clamp": {"offset_dn": -1.0, "noise_dn": 0.2, "droop_rel": 0.01},
     "grabber.fixed_pattern": {"settling_dn": 4.0},
     "grabber.phase_pattern": {"amplitude_dn": 0.5},
-    "grabber.window_offset": {"row_offset": 9, "row_increment": 4, "col_offset": 2, "rows": 64, "inactive_rows": 2},
+    "grabber.window_offset": {"row_offset": 8, "row_increment": 4, "col_offset": 2, "rows": 64, "inactive_rows": 2},
     "grabber.adc": {"offset_dn": 5.0},
 }
 

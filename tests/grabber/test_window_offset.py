@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from catalogue.support import Texture, camera_with
+from pixmetry.core.camera import load_camera
+from pixmetry.core.errors import InputError
 from pixmetry.core.random import Grid
 from pixmetry.grabber.window_offset import SOURCE, WindowOffset
 
@@ -14,14 +16,13 @@ CASES = [
     WindowOffset(row_offset=8, col_offset=5),
     WindowOffset(row_offset=-6, col_offset=-9, rows=70, cols=90),
     WindowOffset(row_offset=10, rows=20, cols=30, col_offset=30),
-    WindowOffset(row_offset=7, row_increment=4, inactive_rows=3),
-    WindowOffset(row_offset=-5, row_increment=4, col_offset=-3, col_increment=2, cols=40),
+    WindowOffset(row_offset=4, row_increment=4, inactive_rows=3),
+    WindowOffset(row_offset=-8, row_increment=4, col_offset=-4, col_increment=2, cols=40),
 ]
 
 
 def expected(params: WindowOffset, image: np.ndarray) -> np.ndarray:
-    row = int(np.floor(params.row_offset / params.row_increment)) * params.row_increment
-    col = int(np.floor(params.col_offset / params.col_increment)) * params.col_increment
+    row, col = params.row_offset, params.col_offset
     wide = np.pad(image, ((0, 0), (200, 200), (200, 200)))
     rows, cols = params.rows or image.shape[1], params.cols or image.shape[2]
     out = wide[:, 200 + row : 200 + row + rows, 200 + col : 200 + col + cols].copy()
@@ -51,6 +52,15 @@ def test_any_window_of_it_is_the_crop(params: WindowOffset) -> None:
 
 
 def test_targets_follow() -> None:
-    camera = camera_with(SOURCE, WindowOffset(row_offset=7, row_increment=4, col_offset=-3))
+    camera = camera_with(SOURCE, WindowOffset(row_offset=4, row_increment=4, col_offset=-3))
     x, y = camera.true_positions([20.25], [30.5])
     assert (x[0], y[0]) == (23.25, 26.5)
+
+
+def test_an_offset_between_the_steps_is_refused_with_those_beside_it() -> None:
+    with pytest.raises(InputError, match=r"row_offset.*33.*32 or 36"):
+        load_camera("pulnix_tm6cn_epix_512").with_parameters("grabber.window_offset", row_offset=33)
+    with pytest.raises(InputError, match=r"col_offset.*-3.*-4 or -2"):
+        SOURCE.make({"col_offset": -3, "col_increment": 2})
+    _, y = load_camera("pulnix_tm6cn_epix_512").layout([100.0], [132.0])
+    assert y[0] == 100.0

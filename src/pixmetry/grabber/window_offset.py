@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from pydantic import model_validator
 
+from pixmetry.core.errors import ParameterError
 from pixmetry.core.random import Grid, Stream
 from pixmetry.core.signal import Kind, Signal, Windows
 from pixmetry.core.source import Parameters, Source, quantity
@@ -14,18 +16,27 @@ from pixmetry.core.source import Parameters, Source, quantity
 class WindowOffset(Parameters):
     """The part of the frame that is stored; what lies outside the image is black."""
 
-    row_offset: int = quantity(0, "px", "row of the image that is asked for as the first one stored", ge=-4096, le=65536)
-    col_offset: int = quantity(0, "px", "column of the image that is asked for as the first one stored", ge=-4096, le=65536)
-    row_increment: int = quantity(1, "px", "the first row can only be a multiple of this; the next lower one is taken", ge=1, le=64)
+    row_offset: int = quantity(0, "px", "row of the image that is stored first", ge=-4096, le=65536)
+    col_offset: int = quantity(0, "px", "column of the image that is stored first", ge=-4096, le=65536)
+    row_increment: int = quantity(1, "px", "steps in which the grabber sets its first row: the offset must be a multiple", ge=1, le=64)
     col_increment: int = quantity(1, "px", "the same for the first column", ge=1, le=64)
     rows: int = quantity(0, "px", "rows stored; 0: as many as the image has", ge=0, le=65536)
     cols: int = quantity(0, "px", "columns stored; 0: as many as the image has", ge=0, le=65536)
     inactive_rows: int = quantity(0, "px", "rows at the top of what is stored that hold no image", ge=0, le=4096)
 
-    @property
-    def first(self) -> tuple[int, int]:
-        """Row and column of the image that are stored first."""
-        return self.row_offset // self.row_increment * self.row_increment, self.col_offset // self.col_increment * self.col_increment
+    @model_validator(mode="after")
+    def _can_be_set(self) -> WindowOffset:
+        for name, offset, step in (
+            ("row_offset", self.row_offset, self.row_increment),
+            ("col_offset", self.col_offset, self.col_increment),
+        ):
+            if offset % step:
+                below = offset // step * step
+                raise ParameterError(
+                    f"this grabber cannot begin there: it sets its window in steps of {step}", where=name, value=offset,
+                    allowed=f"{below} or {below + step}", remedy="take one of them, or give the increment of your grabber",
+                )  # fmt: skip
+        return self
 
 
 def reshape(params: WindowOffset, frame_shape: tuple[int, int]) -> tuple[int, int]:
@@ -37,13 +48,13 @@ def place(
     params: WindowOffset, x: np.ndarray, y: np.ndarray, frame_shape: tuple[int, int], frame: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Where points of the image lie in what is stored."""
-    row, col = params.first
+    row, col = params.row_offset, params.col_offset
     return x - col, y - row
 
 
 def context(params: WindowOffset, windows: Windows, frame_shape: tuple[int, int]) -> Windows:
     """The same part of the image, as far as there is one; else the nearest pixel of it."""
-    row, col = params.first
+    row, col = params.row_offset, params.col_offset
     r0, r1 = (np.clip(windows.row0 + row + d, 0, frame_shape[0] - 1) for d in (0, windows.rows - 1))
     c0, c1 = (np.clip(windows.col0 + col + d, 0, frame_shape[1] - 1) for d in (0, windows.cols - 1))
     return Windows(r0, c0, r1 - r0 + 1, c1 - c0 + 1)
@@ -57,7 +68,7 @@ def forward(params: WindowOffset, signal: Signal, stream: Stream) -> Signal:
     if params == WindowOffset():
         return signal
     stored = reshape(params, signal.frame_shape)
-    (row, col), grid, (n, rows, cols) = params.first, signal.grid, signal.data.shape
+    row, col, grid, (n, rows, cols) = params.row_offset, params.col_offset, signal.grid, signal.data.shape
     row0, height = _span(grid.row0, rows, signal.frame_shape[0], row, stored[0])
     col0, width = _span(grid.col0, cols, signal.frame_shape[1], col, stored[1])
     r = (row0 + row - grid.row0)[:, None] + np.arange(height)
@@ -90,7 +101,7 @@ SOURCE = Source(
     after=("sensor", "electronics", "cable"),
     before=("grabber.adc", "processing"),
     neutral=WindowOffset(),
-    typical=WindowOffset(row_offset=6, row_increment=4, col_offset=3, inactive_rows=2),
+    typical=WindowOffset(row_offset=4, row_increment=4, col_offset=3, inactive_rows=2),
     bound=WindowOffset(row_offset=-8, row_increment=4, col_offset=-5, inactive_rows=4),
     forward=forward,
     reshape=reshape,
@@ -98,7 +109,7 @@ SOURCE = Source(
     context=context,
     applies_to=("analogue",),
     gum_class="G",
-    equation="(r, c)_stored = (r, c)_image − (r_0, c_0),  r_0 = step ⌊offset/step⌋",
+    equation="(r, c)_stored = (r, c)_image − (r_0, c_0),  r_0 a multiple of the grabber's step",
     typical_size="a few pixels of the principal point; 1 px is 8.3 µm down and 8.6 µm across a sensor of that pitch",
     references=("ITU-R BT.470-6 (lines and active part of a 625-line signal)",),
     advice="Determine the principal point with the grabber that measures, leave its window alone, and never take half the stored size.",
