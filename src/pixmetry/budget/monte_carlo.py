@@ -9,7 +9,18 @@ from typing import Any
 
 import numpy as np
 
-from pixmetry.budget.probe import Facts, Target, background_of, facts_of, perfect, resolve, scene_of, spread_windows, window_side
+from pixmetry.budget.probe import (
+    Facts,
+    Target,
+    background_of,
+    facts_of,
+    ideal_element,
+    perfect,
+    resolve,
+    scene_of,
+    spread_windows,
+    window_side,
+)
 from pixmetry.core.camera import Camera, Element
 from pixmetry.core.contribution import SMOOTH_ORDER, Contribution, smooth_part
 from pixmetry.core.conversions import LineSources, Link
@@ -234,10 +245,17 @@ class Trials:
             raise InputError("either only or off", remedy="leave one of them out")
         if off is not None:
             off = tuple(off)
-            return self.compare(off, self.camera, self.camera.switched(off=off))
+            return self.compare(off, self.camera, missed(self.camera, off))
         only = tuple(only)
         helpers = helpers_of(self.camera, only)
         return self.compare(only, perfect(self.camera, (*only, *helpers)), perfect(self.camera, helpers))
+
+
+def missed(camera: Camera, off: Iterable[str]) -> Camera:
+    """The camera without some sources; an essential conversion stays, without the errors of its own."""
+    off = tuple(off)
+    gone = camera.switched(off=[name for name in off if not camera[name].source.essential])
+    return replace(gone, chain=tuple(ideal_element(e) if e.name in off else e for e in gone.chain))
 
 
 def helpers_of(camera: Camera, names: Iterable[str]) -> tuple[str, ...]:

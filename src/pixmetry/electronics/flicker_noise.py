@@ -86,8 +86,10 @@ def propagate(params: FlickerNoise, probe: Probe) -> Contribution:
     squares = np.zeros(2)
     starts = (0, 1) if params.interlaced else (0,)
     for start in starts:
-        time = (params.clocks(start + np.arange(rows), probe.frame_shape[1])[:, None] + np.arange(cols)).ravel()
-        matrix = covariance(params, time[:, None] - time) * probe.gain_dn_per_e**2
+        first = params.clocks(start + np.arange(rows), probe.frame_shape[1])
+        table = covariance(params, (first[:, None] - first)[:, :, None] + np.arange(1 - cols, cols))  # two rows, and columns apart
+        apart = np.arange(cols)[:, None] - np.arange(cols) + cols - 1
+        matrix = table[:, :, apart].transpose(0, 2, 1, 3).reshape(rows * cols, rows * cols) * probe.gain_dn_per_e**2
         squares += [np.mean(np.einsum("pi,pi->p", g @ matrix, g)) / len(starts) for g in flat]
     u = float(np.sqrt(squares[0])), float(np.sqrt(squares[1]))
     return probe.contribution(u, "T", model_error=0.12, method="linear response of the estimator to noise along the read-out")
