@@ -34,7 +34,7 @@ from pixmetry.digital_twin import digital_twin, of_unit, self_test
 from pixmetry.emva.evaluate import standard_values
 from pixmetry.emva.records import Measurement, Results
 from pixmetry.experiment.observe import Group, observe
-from pixmetry.location.estimators import Estimator, parse_estimator
+from pixmetry.location.target_estimator import TargetEstimator, parse_estimator
 from pixmetry.report.page import write_report
 from pixmetry.results import Assessment
 
@@ -63,7 +63,8 @@ def assess(
     output : path, optional
         Folder for ``report.html``, ``results.json``, ``maps.zarr.zip``, ``camera.yaml`` and ``camera.maps.npz``.
     target, estimator : str
-        As on the command line, e.g. ``"disc:diameter=7,blur=0.7,peak=0.6"`` and ``"soft_threshold:sigma=3,window=13"``.
+        As on the command line, e.g. ``"disc:diameter=7,blur=0.7,peak=0.6"`` and ``"template"`` or any other name that `pixmetry.locate`
+        has for discs, or ``"fixed_soft_threshold:sigma=3,window=13"``. By default what `pixmetry.locate` takes.
     calibration : path or CameraGeometry, optional
         Results of `pixmetry calibrate` for the camera (the folder, or its ``calibration.json``), with which positions are corrected: their
         uncertainty and what is left over enter the budget. One in pixels takes the pitch from the campaign.
@@ -84,7 +85,7 @@ def assess(
         If a file or the campaign cannot be used, or the frames do not carry a photon transfer.
     """
     what_target = parse_target(target) if target else Target()
-    what_estimator = parse_estimator(estimator) if estimator else Estimator()
+    what_estimator = parse_estimator(estimator) if estimator else TargetEstimator()
     frames = campaign if isinstance(campaign, Campaign) else load_campaign(campaign)
     if output is not None:
         check_output(output, KIND, _origin(frames), _inputs(frames, calibration))  # before the work, not after it

@@ -18,6 +18,7 @@ from pixmetry.core.errors import InputError
 from pixmetry.core.threads import imap_tiles
 from pixmetry.located import LAST, Located, checked_table_name, joined
 from pixmetry.location.noise import ROUNDING_DN2, NoiseModel, parse_noise
+from pixmetry.location.target_estimator import FEW_ELECTRONS
 from pixmetry.location.targets import Flag, Positions, Targets
 
 FITS = {
@@ -46,7 +47,6 @@ ROWS = {
 }
 AUTO = {"auto": "chooses shape and likelihood of the template by what the image shows, and says why"}
 SPOTS = ("disc", "ellipse", "ring", "spot")
-FEW_ELECTRONS = 50.0  # at a target's peak: below, the errors of a grey value are visibly no normal ones
 FAINTEST = 0.05  # height of lines and edges over that of the frame's strongest
 TILTED = 0.91  # ratio of the axes below which discs are fitted as ellipses
 PILED = 10  # pixels in 4 of one value at the top of an image before it is asked whether they were cut off there

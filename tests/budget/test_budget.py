@@ -25,6 +25,11 @@ KNOWN = {"noise_dn": 0.6}
 SEED = int(np.random.SeedSequence().entropy % 2**31)  # any will do: tolerances are those of the statistics
 
 
+def computed(camera, estimates=None, known=None, target=None, **options):
+    """The budget with an estimator that is quick to propagate."""
+    return compute_budget(camera, estimates, known, target, Estimator(), **options)
+
+
 def small_camera():
     return camera(
         element("sensor.prnu", pixel_std_rel=0.005),
@@ -43,7 +48,7 @@ def row(budget, name):
 
 
 def test_status_of_each_source() -> None:
-    budget = compute_budget(small_camera(), prnu(0.008, 0.0004), KNOWN, trials=0)
+    budget = computed(small_camera(), prnu(0.008, 0.0004), KNOWN, trials=0)
     assert {r.source_id for r in budget.rows} == set(catalogue())
     assert row(budget, "sensor.prnu").status == "measured"
     assert row(budget, "electronics.amplifier_noise").status == "modelled"
@@ -94,7 +99,7 @@ def test_no_bound_explodes_or_vanishes_with_the_size_of_the_frame(source_id: str
 
 
 def test_the_verdict_is_the_root_sum_of_squares_of_what_is_decided() -> None:
-    budget = compute_budget(small_camera(), prnu(0.008, 0.0004), KNOWN, trials=0)
+    budget = computed(small_camera(), prnu(0.008, 0.0004), KNOWN, trials=0)
     decided = [r.total_px**2 for r in budget.of_status("measured", "modelled")]
     accepted = [r.total_px**2 for r in budget.of_status("accepted")]
     assert budget.verdict.total_px == pytest.approx(math.sqrt(sum(decided)))
@@ -108,7 +113,7 @@ def test_the_verdict_is_the_root_sum_of_squares_of_what_is_decided() -> None:
 
 
 def test_frames_lower_only_the_temporal_part() -> None:
-    budget = compute_budget(small_camera(), None, KNOWN, trials=0, frames=(1, 4, 10**12))
+    budget = computed(small_camera(), None, KNOWN, trials=0, frames=(1, 4, 10**12))
     names = ("electronics.amplifier_noise", "sensor.shot_noise", "sensor.prnu")  # light has its shot noise, named in the chain or not
     noise, shot, fixed = (row(budget, name).total_px for name in names)
     one, four, many = (v.total_px**2 for v in budget.verdicts)
@@ -118,8 +123,8 @@ def test_frames_lower_only_the_temporal_part() -> None:
 
 def test_the_estimate_replaces_the_cameras_parameter_and_its_uncertainty_propagates() -> None:
     """PRNU's contribution is proportional to its standard deviation, so the relative uncertainties are equal."""
-    budget = compute_budget(small_camera(), prnu(0.008, 0.0004), KNOWN, trials=0)
-    before = row(compute_budget(small_camera(), None, KNOWN, trials=0), "sensor.prnu")
+    budget = computed(small_camera(), prnu(0.008, 0.0004), KNOWN, trials=0)
+    before = row(computed(small_camera(), None, KNOWN, trials=0), "sensor.prnu")
     got = row(budget, "sensor.prnu")
     assert got.total_px == pytest.approx(before.total_px * 0.008 / 0.005)
     assert got.u_of_total_px == pytest.approx(got.total_px * 0.0004 / 0.008, rel=1e-6)
@@ -129,7 +134,7 @@ def test_the_estimate_replaces_the_cameras_parameter_and_its_uncertainty_propaga
 def test_an_upper_limit_enters_as_a_rectangular_distribution() -> None:
     """A value that may be anywhere from 0 to L has the root mean square L/√3; checked against numbers spread over it."""
     limit = 0.012
-    got = row(compute_budget(small_camera(), prnu(limit, 0.001, limits=frozenset({"pixel_std_rel"})), KNOWN, trials=0), "sensor.prnu")
+    got = row(computed(small_camera(), prnu(limit, 0.001, limits=frozenset({"pixel_std_rel"})), KNOWN, trials=0), "sensor.prnu")
     cam = small_camera()
     probe = make_probe(facts_of(cam, Target(), KNOWN), Target(), Estimator())
     spread = (np.arange(1000) + 0.5) / 1000 * limit
@@ -145,14 +150,14 @@ def test_covariance_between_parameters_counts() -> None:
     def u(rho: float) -> float:
         cov = 0.04 * np.array([[1, rho], [rho, 1]])
         measured = {"electronics.row_noise": Estimates(names, values, cov, np.full(2, 99.0), ("e-", "e-"))}
-        return row(compute_budget(small_camera(), measured, KNOWN, trials=0), "electronics.row_noise").u_of_total_px
+        return row(computed(small_camera(), measured, KNOWN, trials=0), "electronics.row_noise").u_of_total_px
 
     assert u(0.999999) / u(0.0) == pytest.approx(math.sqrt(2), rel=1e-3)
     assert u(-0.999999) < 1e-2 * u(0.0)
 
 
 def test_advice_names_the_largest_and_tells_the_gain() -> None:
-    budget = compute_budget(small_camera(), None, KNOWN, trials=0)
+    budget = computed(small_camera(), None, KNOWN, trials=0)
     known = [a for a in budget.advice if a.status != "accepted"]
     assert [a.name for a in known] == [r.name for r in budget.largest][:5]
     assert [a.name for a in budget.advice] == [a.name for a in known] + [r.name for r in budget.accepted][:3]
@@ -161,14 +166,14 @@ def test_advice_names_the_largest_and_tells_the_gain() -> None:
         assert advice.combined_px == whole.total_px
         assert advice.removed_px == pytest.approx(math.sqrt(whole.total_px**2 - advice.total_px**2), rel=1e-6)
         assert advice.removed_px <= advice.halved_px <= advice.combined_px and advice.text
-    forced = compute_budget(small_camera(), None, KNOWN, trials=0, accepted=["sensor.prnu"])
+    forced = computed(small_camera(), None, KNOWN, trials=0, accepted=["sensor.prnu"])
     assert row(forced, "sensor.prnu").status == "accepted"
 
 
 def test_monte_carlo_stands_beside_and_independent_sources_do_not_interact() -> None:
     """White noise and PRNU: together they are their root sum of squares. False alarm 1e-6, and 4 % of the total beyond that."""
     said = []
-    budget = compute_budget(small_camera(), None, KNOWN, trials=4096, progress=said.append)
+    budget = computed(small_camera(), None, KNOWN, trials=4096, progress=said.append)
     for name in ("sensor.prnu", "electronics.amplifier_noise", "processing.threshold"):
         r = row(budget, name)
         error = 5 * r.monte_carlo.se_total_px + r.contribution.model_error * r.total_px + r.contribution.floor_px
@@ -204,7 +209,7 @@ def test_the_headline_is_that_of_brute_force(defects: dict[str, float]) -> None:
     Without the scale's end in the formula hot pixels came out 1.7 to 4.5 times as large; 20 % would be caught in the first two cases.
     """
     cam = hot_camera(**defects)
-    budget = compute_budget(cam, None, KNOWN, trials=4096, seed=SEED)
+    budget = computed(cam, None, KNOWN, trials=4096, seed=SEED)
     brute = monte_carlo(cam, Target(), Estimator(), trials=40_000, seed=SEED + 1, facts=budget.facts)
     found, error = budget.headline, math.hypot(budget.headline.se_simulated_px, brute.se_total_px)
     assert abs(budget.verdict.total_px - brute.total_px) < 4.9 * error + 0.1 * brute.total_px, (SEED, found)
@@ -213,7 +218,7 @@ def test_the_headline_is_that_of_brute_force(defects: dict[str, float]) -> None:
 
 def test_where_sources_act_on_each_other_the_monte_carlo_is_the_headline_and_says_which() -> None:
     """Two hot pixels and more in every window: one by one, as the formula counts them, they do more than together."""
-    budget = compute_budget(hot_camera(hot_fraction=0.05, hot_median_e=40_000.0, hot_sigma_log=0.5), None, KNOWN, trials=4096, seed=SEED)
+    budget = computed(hot_camera(hot_fraction=0.05, hot_median_e=40_000.0, hot_sigma_log=0.5), None, KNOWN, trials=4096, seed=SEED)
     assert budget.headline.by == "Monte Carlo" and budget.verdict.total_px == pytest.approx(budget.interaction.together.total_px, rel=0.01)
     assert budget.sums[0].total_px > 1.15 * budget.verdict.total_px
     assert "defect pixels alone" in budget.headline.why
@@ -227,9 +232,9 @@ def test_where_sources_act_on_each_other_the_monte_carlo_is_the_headline_and_say
 
 
 def test_the_sum_is_the_headline_where_both_agree() -> None:
-    budget = compute_budget(small_camera(), None, KNOWN, trials=4096, seed=SEED)
+    budget = computed(small_camera(), None, KNOWN, trials=4096, seed=SEED)
     assert budget.headline.by == "sum" and budget.verdict == budget.sums[0] and "agrees" in budget.headline.why
-    assert compute_budget(small_camera(), None, KNOWN, trials=0).headline.by == "sum"
+    assert computed(small_camera(), None, KNOWN, trials=0).headline.by == "sum"
 
 
 def test_kurtosis_of_rare_defects_is_that_of_their_simulation() -> None:
@@ -244,7 +249,7 @@ def test_kurtosis_of_rare_defects_is_that_of_their_simulation() -> None:
 
 
 def test_the_record_is_plain_and_complete() -> None:
-    record = compute_budget(small_camera(), prnu(0.008, 0.0004), KNOWN, trials=256).to_record()
+    record = computed(small_camera(), prnu(0.008, 0.0004), KNOWN, trials=256).to_record()
     again = json.loads(json.dumps(record, allow_nan=False))
     assert again["schema"] == "pixmetry/budget/1" and len(again["rows"]) == len(catalogue())
     assert again["verdicts"][0]["total_um"] is not None and again["interaction"]["together"]["x"]["u"] > 0
@@ -254,7 +259,7 @@ def test_the_record_is_plain_and_complete() -> None:
 def test_a_parameter_that_the_source_does_not_have_is_refused() -> None:
     wrong = {"sensor.prnu": Estimates.from_rows([("sensitivity", 1.0, 0.1, 9.0, "1")])}
     with pytest.raises(InputError, match="sensitivity"):
-        compute_budget(small_camera(), wrong, KNOWN, trials=0)
+        computed(small_camera(), wrong, KNOWN, trials=0)
 
 
 def test_applies_reads_interface_and_sensor() -> None:

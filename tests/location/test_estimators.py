@@ -10,7 +10,9 @@ from scipy.integrate import quad
 from scipy.special import erf
 
 from pixmetry.core.errors import InputError
-from pixmetry.location.estimators import LAWS, Estimator, parse_estimator
+from pixmetry.locating import estimators
+from pixmetry.location.estimators import LAWS, Estimator
+from pixmetry.location.target_estimator import TargetEstimator, parse_estimator
 
 SIDE = 24
 AXIS = np.arange(SIDE, dtype=float)
@@ -136,16 +138,26 @@ def test_gaussian_noise_of_a_centroid_has_the_closed_form() -> None:
 
 
 def test_parse_estimator() -> None:
-    got = parse_estimator("soft_threshold:sigma=4,window=11")
-    assert (got.name, got.sigma, got.window, got.threshold_dn) == ("soft_threshold", 4.0, 11, None)
+    got = parse_estimator("fixed_soft_threshold:sigma=4,window=11")
+    assert (got.name, got.sigma, got.window, got.threshold_dn) == ("fixed_soft_threshold", 4.0, 11, None)
     assert got.resolved(5.0, 0.5).threshold_dn == 2.0 and got.resolved(5.0, 0.5).background_dn == 5.0
-    assert parse_estimator("hard_threshold:threshold=12").threshold_dn == 12.0
-    assert parse_estimator("soft_threshold") == Estimator()
-    assert parse_estimator("centroid:window=9").window == 9
+    assert parse_estimator("fixed_hard_threshold:threshold=12").threshold_dn == 12.0
+    assert parse_estimator("fixed_soft_threshold") == Estimator()
+    assert parse_estimator("fixed_centroid:window=9").window == 9
 
 
-REFUSED = ["median", "centroid:sigma=3", "centroid:size=3", "soft_threshold:window=12", "soft_threshold:window=9.5", "soft_threshold:sigma"]
-REFUSED += ["soft_threshold:sigma=x", "soft_threshold:sigma=-1", "soft_threshold:sigma=nan", "soft_threshold:window=9,window=11"]
+def test_a_name_of_locate_means_what_locate_runs() -> None:
+    """One name, one algorithm: what has a fixed square of pixels is called so, and its settings are refused under the other name."""
+    for name in estimators("disc"):
+        assert parse_estimator(name) == TargetEstimator(name)
+    with pytest.raises(InputError, match="fixed_soft_threshold:window=11"):
+        parse_estimator("soft_threshold:window=11")
+    with pytest.raises(InputError, match="no such"):
+        parse_estimator("fixed_template")
+
+
+REFUSED = ["median", "fixed_centroid:sigma=3", "fixed_centroid:size=3", "fixed_soft_threshold:window=12", "template:window=15"]
+REFUSED += [f"fixed_soft_threshold:{s}" for s in ("window=9.5", "sigma", "sigma=x", "sigma=-1", "sigma=nan", "window=9,window=11")]
 
 
 @pytest.mark.parametrize("text", REFUSED)

@@ -13,7 +13,7 @@ from pixmetry.budget.combine import Combined, combine, together_with
 from pixmetry.budget.headline import Headline, headline
 from pixmetry.budget.monte_carlo import MonteCarlo, Trials
 from pixmetry.budget.parameters import applies, base_of, u_of_total, with_estimates
-from pixmetry.budget.probe import ESTIMATOR_ITSELF, Facts, Probes, Target, facts_of, perfect, resolve
+from pixmetry.budget.probe import ESTIMATOR_ITSELF, AnyEstimator, Facts, Probes, Target, facts_of, perfect, resolve
 from pixmetry.core.camera import Camera
 from pixmetry.core.catalogue import catalogue
 from pixmetry.core.contribution import UNSTEADY, Contribution
@@ -22,7 +22,7 @@ from pixmetry.core.estimates import Estimates
 from pixmetry.core.observations import LENS, TAKEN_UP, CameraGeometry
 from pixmetry.core.signal import Kind
 from pixmetry.core.source import Source
-from pixmetry.location.estimators import Estimator
+from pixmetry.location.target_estimator import TargetEstimator
 
 SCHEMA = "pixmetry/budget/1"
 DECIDED = ("measured", "modelled", "calibrated")
@@ -117,7 +117,7 @@ class Budget:
 
     camera: str
     target: Target
-    estimator: Estimator
+    estimator: AnyEstimator
     facts: Facts
     pitch_um: tuple[float, float] | None
     rows: tuple[BudgetRow, ...]
@@ -159,7 +159,7 @@ class Budget:
             "schema": SCHEMA,
             "camera": self.camera,
             "target": asdict(self.target),
-            "estimator": asdict(self.estimator),
+            "estimator": {"name": self.estimator.name} | asdict(self.estimator),
             "facts": asdict(self.facts),
             "pitch_um": None if self.pitch_um is None else list(self.pitch_um),
             "rows": [_row_record(r) for r in self.rows],
@@ -186,7 +186,7 @@ def compute_budget(
     estimates_by_source: Mapping[str, Estimates] | None = None,
     known_facts: Mapping[str, Any] | None = None,
     target: Target | None = None,
-    estimator: Estimator | None = None,
+    estimator: AnyEstimator | None = None,
     *,
     geometry: CameraGeometry | None = None,
     sensor_shape: tuple[int, int] | None = None,
@@ -209,8 +209,8 @@ def compute_budget(
         Fields of `Facts` that go before what the chain tells.
     target : Target, optional
         By default a disc of 7 px.
-    estimator : Estimator, optional
-        By default a soft threshold of three standard deviations in 13 × 13 px.
+    estimator : Estimator or TargetEstimator, optional
+        By default what `pixmetry.locate` takes for such a target: the template.
     geometry : CameraGeometry, optional
         Of a calibration with which positions are corrected: in place of the displacements that it takes up stands what it leaves.
     sensor_shape : (int, int), optional
@@ -228,7 +228,7 @@ def compute_budget(
     -------
     Budget
     """
-    target, estimator = target or Target(), estimator or Estimator()
+    target, estimator = target or Target(), estimator or TargetEstimator()
     estimates_by_source = dict(estimates_by_source or {})
     say = progress or (lambda text: None)
     say("camera")

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from pixmetry.budget.probe import (
+    AnyEstimator,
     Facts,
     Target,
     background_of,
@@ -27,7 +28,6 @@ from pixmetry.core.conversions import LineSources, Link
 from pixmetry.core.errors import ChainError, InputError
 from pixmetry.core.random import Grid, Streams
 from pixmetry.core.signal import Kind
-from pixmetry.location.estimators import Estimator
 
 UNIT_STRIDE = 1_000_003  # between the unit seeds of cameras of one type
 
@@ -124,7 +124,7 @@ class Trials:
     ----------
     camera : Camera
     target : Target
-    estimator : Estimator
+    estimator : Estimator or TargetEstimator
     facts : Facts
     trials : int
         Windows to expose, at least; rounded up to whole units, places and frames.
@@ -138,7 +138,7 @@ class Trials:
 
     camera: Camera
     target: Target
-    estimator: Estimator
+    estimator: AnyEstimator
     facts: Facts
     trials: int = 2048
     units: int = 8
@@ -150,12 +150,12 @@ class Trials:
     def __post_init__(self) -> None:
         if self.units < 1 or self.frames < 1 or self.trials < 1:
             raise InputError("a Monte Carlo needs trials", value=(self.trials, self.units, self.frames), allowed="1 or more of each")
-        self.side = window_side(self.estimator)
+        self.located = resolve(self.estimator, self.target, self.facts)
+        self.side = window_side(self.located)
         shape = self.camera.output_shape
         if min(shape) < self.side:
             raise InputError("the frame is smaller than the window", value=shape, allowed=f"{self.side} × {self.side} px")
         self.places = max(2, -(-self.trials // (self.units * self.frames)))
-        self.located = resolve(self.estimator, self.target, self.facts)
         draws = Streams(self.seed, self.seed).of("budget.places").uniform_unit(4 * self.units * self.places).astype(float)
         row, col, self.dx, self.dy = draws.reshape(4, self.units, self.places)
         self.dx, self.dy = self.dx - 0.5, self.dy - 0.5
@@ -211,16 +211,13 @@ class Trials:
         dx, dy = (np.nan_to_num(np.broadcast_to(a, np.shape(b)) - b) for a, b in zip(seen, belongs, strict=True))
         return dx, dy
 
-    def _as_seen(self, camera: Camera) -> Estimator:
-        """Return the estimator with background and threshold as this variant of the camera shows them.
+    def _as_seen(self, camera: Camera) -> AnyEstimator:
+        """Return the estimator with background, threshold and height as this variant of the camera shows them.
 
-        Who locates targets takes both from the frame, so they follow what the camera does to the light: black level, gain, a curve. Each is
-        the mean of windows of that light, without what lies beyond four standard deviations.
+        Who locates targets takes them from the frame, so they follow what the camera does to the light: black level, gain, a curve. Each
+        is the mean of windows of that light, without what lies beyond four standard deviations.
         """
-        lit = self.located.threshold_dn or 0.0
-        levels = [_level(camera, self.facts, self.target, self.side, light_dn) for light_dn in (0.0, lit)]
-        threshold = None if self.located.threshold_dn is None else levels[1] - levels[0]
-        return replace(self.located, background_dn=levels[0], threshold_dn=threshold, sigma=None)
+        return self.located.as_seen(lambda light_dn: _level(camera, self.facts, self.target, self.side, light_dn))
 
     def compare(self, names: Iterable[str], with_it: Camera, without: Camera | None) -> MonteCarlo:
         """Shift of the positions in one variant of the camera against those in another, or (None) against the truth."""
@@ -285,7 +282,7 @@ def shapes_line(element: Element, camera: Camera) -> bool:
 def monte_carlo(
     camera: Camera,
     target: Target,
-    estimator: Estimator,
+    estimator: AnyEstimator,
     *,
     only: Iterable[str] | None = None,
     off: Iterable[str] | None = None,
@@ -305,7 +302,7 @@ def monte_carlo(
     ----------
     camera : Camera
     target : Target
-    estimator : Estimator
+    estimator : Estimator or TargetEstimator
     only, off : iterable of str, optional
         Names in the chain: these alone against the bare conversions, or the camera against itself without these. With neither, the whole
         camera against the truth; the estimator's own error is then part of it.

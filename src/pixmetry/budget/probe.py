@@ -18,11 +18,13 @@ from pixmetry.core.random import Grid
 from pixmetry.core.signal import Kind
 from pixmetry.core.source import Source
 from pixmetry.location.estimators import Estimator, split_text
+from pixmetry.location.target_estimator import MOMENTS, OPERATORS, TargetEstimator
 from pixmetry.scene.discs import Discs
 from pixmetry.scene.uniform import Uniform
 
 WINDOW_PX = 24  # side of the windows that are exposed; the estimator's own lies in their middle
 PHASES = 8  # per axis
+FEWER_PHASES = 5  # per axis, where the gradient is found by moving pixel after pixel
 ESTIMATOR_ITSELF = "processing.threshold"
 AHEAD_OF_LINE = ("optics", "sensor", "electronics")  # stages whose sources work on pixels, where a camera has a video line
 
@@ -240,25 +242,45 @@ def background_of(target: Target, facts: Facts) -> Uniform:
     return Uniform(target.background_rel * facts.saturation_dn / facts.dn_per_photon)
 
 
-def window_side(estimator: Estimator) -> int:
-    """Side of the windows that hold the estimator's square and what its neighbours need."""
+AnyEstimator = Estimator | TargetEstimator
+
+
+def window_side(estimator: AnyEstimator) -> int:
+    """Side of the windows that hold what a resolved estimator reads and what its neighbours need."""
     return max(WINDOW_PX, estimator.window + 11)
 
 
-def resolve(estimator: Estimator, target: Target, facts: Facts) -> Estimator:
-    """The estimator for this target's background and noise."""
-    return estimator.resolved(target.background_rel * facts.saturation_dn, facts.noise_dn)
+def resolve(estimator: AnyEstimator, target: Target, facts: Facts) -> AnyEstimator:
+    """The estimator for this target, its background and the noise."""
+    background_dn = target.background_rel * facts.saturation_dn
+    if isinstance(estimator, Estimator):
+        return estimator.resolved(background_dn, facts.noise_dn)
+    return estimator.resolved(
+        background_dn,
+        facts.noise_dn,
+        diameter_px=target.diameter_px,
+        blur_px=target.blur_px,
+        amplitude_dn=target.peak_rel * facts.saturation_dn,
+        gain_dn_per_e=facts.gain_dn_per_e,
+        saturation_dn=facts.saturation_dn,
+        bits=facts.bits,
+    )
 
 
-def _checked(facts: Facts, target: Target, estimator: Estimator) -> Estimator:
+def phases_for(estimator: AnyEstimator) -> int:
+    """Places of the target within the pixel, per axis."""
+    return FEWER_PHASES if estimator.name in (*MOMENTS, *OPERATORS) else PHASES
+
+
+def _checked(facts: Facts, target: Target, estimator: AnyEstimator) -> AnyEstimator:
     """The estimator for this target, which it must be able to see."""
     needed = target.diameter_px + 4 * target.blur_px
-    if estimator.window < needed:
+    if isinstance(estimator, Estimator) and estimator.window < needed:
         raise InputError(
             "the target does not fit into the estimator's window",
             value=f"{target.describe()} in {estimator.window} px",
             allowed=f"a window of {int(np.ceil(needed)) // 2 * 2 + 1} px or more",
-            remedy="give a larger window, as in --estimator soft_threshold:window=25",
+            remedy=f"give a larger window, as in --estimator {estimator.name}:window=25",
         )
     estimator = resolve(estimator, target, facts)
     if estimator.threshold_dn is not None and estimator.threshold_dn >= target.peak_rel * facts.saturation_dn:
@@ -286,17 +308,19 @@ def _seen(facts: Facts, target: Target, x: np.ndarray, y: np.ndarray, shape: tup
     return photons.astype(float) * facts.dn_per_photon
 
 
-def make_probe(facts: Facts, target: Target, estimator: Estimator, phases: int = PHASES) -> Probe:
+def make_probe(facts: Facts, target: Target, estimator: AnyEstimator, phases: int | None = None) -> Probe:
     """Render the target noise-free at a lattice of ``phases`` × ``phases`` places within the pixel and see it through the estimator.
+
+    By default there are `phases_for` the estimator.
 
     Raises
     ------
     InputError
         If the target does not stand above the threshold.
     """
-    side = window_side(estimator)
     estimator = _checked(facts, target, estimator)
-    dx, dy = _lattice(phases)
+    side = window_side(estimator)
+    dx, dy = _lattice(phases or phases_for(estimator))
     x, y = side // 2 + dx, side // 2 + dy
     signal = _seen(facts, target, x, y, (side, side))
     x_hat, y_hat = estimator.locate(signal)
@@ -333,9 +357,9 @@ class Probes:
     camera : Camera
     facts : Facts
     target : Target
-    estimator : Estimator
-    phases : int
-        Along each axis of the pixel.
+    estimator : Estimator or TargetEstimator
+    phases : int, optional
+        Along each axis of the pixel; by default `phases_for` the estimator.
 
     Raises
     ------
@@ -343,11 +367,11 @@ class Probes:
         If the target does not fit into the estimator's window, or does not stand above the threshold.
     """
 
-    def __init__(self, camera: Camera, facts: Facts, target: Target, estimator: Estimator, phases: int = PHASES) -> None:
-        self.camera, self.facts, self.target, self.phases = camera, facts, target, phases
-        self.side = window_side(estimator)
-        self.bare = make_probe(facts, target, estimator, phases)
+    def __init__(self, camera: Camera, facts: Facts, target: Target, estimator: AnyEstimator, phases: int | None = None) -> None:
+        self.camera, self.facts, self.target, self.phases = camera, facts, target, phases or phases_for(estimator)
+        self.bare = make_probe(facts, target, estimator, self.phases)
         self.estimator = resolve(estimator, target, facts)
+        self.side = window_side(self.estimator)
         self.curve = curve_of(camera, facts.saturation_dn)
         if self.curve is not None:
             self.bare = self._bent(self.bare)
@@ -450,21 +474,19 @@ class Probes:
             locate=locate,
         )
 
-    def _at_level(self, level: float) -> Estimator:
-        """The estimator where constant light is seen so many times as bright: background and threshold follow."""
-        threshold = self.estimator.threshold_dn
-        lower = None if threshold is None else threshold * level
-        return replace(self.estimator, background_dn=self.estimator.background_dn * level, threshold_dn=lower, sigma=None)
+    def _at_level(self, level: float) -> AnyEstimator:
+        """The estimator where constant light is seen so many times as bright: background, threshold and height follow."""
+        ground = self.estimator.background_dn
+        return self.estimator.as_seen(lambda light_dn: (ground + light_dn) * level)
 
     def _curved(self, linear_dn: np.ndarray) -> np.ndarray:
         return linear_dn if self.curve is None else self.curve.of(np.asarray(linear_dn) / self.facts.dn_per_photon)
 
     def _bent(self, linear: Probe) -> Probe:
         """The probe on what a curved response makes of the light; the estimator's levels follow."""
-        background = self.estimator.background_dn
-        level, lit = (float(self._curved(np.array(v))) for v in (background, background + (self.estimator.threshold_dn or 0.0)))
-        threshold = None if self.estimator.threshold_dn is None else lit - level
-        self.estimator = replace(self.estimator, background_dn=level, threshold_dn=threshold, sigma=None)
+        ground = self.estimator.background_dn
+        self.estimator = self.estimator.as_seen(lambda light_dn: float(self._curved(np.array(ground + light_dn))))
+        level = self.estimator.background_dn
         signal = self._curved(linear.signal_dn)
         x_hat, y_hat = self.estimator.locate(signal)
         gx, gy = self.estimator.gradient(signal)

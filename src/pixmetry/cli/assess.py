@@ -23,7 +23,7 @@ LISTED = 8  # contributions that the console names
     "-o", "--output", type=click.Path(path_type=Path), default=Path("pixmetry-report"), show_default=True, help="Folder for the results."
 )
 @click.option("--target", default="", help="Target, e.g. disc:diameter=7,blur=0.7,peak=0.6")
-@click.option("--estimator", default="", help="Estimator, e.g. soft_threshold:sigma=3,window=13")
+@click.option("--estimator", default="auto", show_default=True, metavar="NAME", help="As in pixmetry locate; 'list' shows what there is.")
 @click.option("--calibration", type=click.Path(path_type=Path), help="Results of `pixmetry calibrate`: positions are corrected.")
 @click.option("--trials", type=click.IntRange(200, 10_000_000), default=4000, show_default=True, help="Windows for each Monte Carlo.")
 @click.option("--seed", type=click.IntRange(0), default=1, show_default=True, help="Of the Monte Carlo.")
@@ -44,6 +44,9 @@ def assess(
     (a crop of a real CCD camera's data set) is assessed. The folder of results gets report.html, results.json, maps.zarr.zip, and
     camera.yaml with camera.maps.npz: the camera's digital twin for `pixmetry simulate`.
     """
+    if estimator == "list":
+        list_estimators()
+        return
     from pixmetry.assessment import assess as run
     from pixmetry.cli._progress import shown_progress
     from pixmetry.core.threads import set_threads
@@ -55,6 +58,17 @@ def assess(
         )
     print_summary(assessment)
     echo(f"report: {output / 'report.html'}")
+
+
+def list_estimators() -> None:
+    """Print the estimators that there are: those of `pixmetry locate` for discs, and centroids over a fixed square."""
+    from pixmetry.locating import estimators
+    from pixmetry.location.estimators import LAWS, PREFIX
+
+    words = "over a fixed square of pixels; window=13, and sigma=3 of a threshold"
+    fixed = {f"{PREFIX}{law}": f"{law.replace('_', ' ')} {words}" for law in LAWS}
+    for name, text in {**estimators("disc"), **fixed}.items():
+        click.echo(f"{name:<24} {text}")
 
 
 def print_summary(assessment: Assessment) -> None:

@@ -1,7 +1,8 @@
-"""Where a target is: centroids of its grey values, plain, squared, or above a threshold, and how they answer to each pixel."""
+"""Centroids of grey values over a fixed square of pixels, plain, squared, or above a threshold, and how they answer to each pixel."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,6 +11,7 @@ from pixmetry.core.errors import InputError
 from pixmetry.location._kernels import CENTROID, HARD, SOFT, SQUARED, locate_windows
 
 LAWS = {"centroid": CENTROID, "squared_centroid": SQUARED, "soft_threshold": SOFT, "hard_threshold": HARD}
+PREFIX = "fixed_"  # of their names: what pixmetry locate runs under the same law follows the target with its window
 THRESHOLDED = ("soft_threshold", "hard_threshold")
 
 
@@ -17,9 +19,12 @@ THRESHOLDED = ("soft_threshold", "hard_threshold")
 class Estimator:
     """A centroid x̂ = Σ f(I_i) x_i / Σ f(I_i) over a square of pixels about the one that is nearest to the target.
 
+    That is what a program of one's own may do; its name is that of its law after ``fixed_``. The estimators of `pixmetry locate` are in
+    `TargetEstimator`.
+
     Parameters
     ----------
-    name : {"centroid", "squared_centroid", "soft_threshold", "hard_threshold"}
+    law : {"centroid", "squared_centroid", "soft_threshold", "hard_threshold"}
         With I the grey value above the background and T the threshold, f is I, I², max(I − T, 0), or I where I > T and 0 elsewhere.
     window : int
         Side of the square in pixels, odd.
@@ -33,7 +38,7 @@ class Estimator:
     Raises
     ------
     InputError
-        If the name is unknown, the window is not an odd number, or the threshold is negative.
+        If the law is unknown, the window is not an odd number, or the threshold is negative.
 
     References
     ----------
@@ -41,30 +46,41 @@ class Estimator:
     centroids of grey values above a threshold. S. S. Welch, NASA TP-3331 (1993), for the effects of pixel size, noise and window.
     """
 
-    name: str = "soft_threshold"
+    law: str = "soft_threshold"
     window: int = 13
     sigma: float | None = None
     threshold_dn: float | None = None
     background_dn: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.name not in LAWS:
-            raise InputError("no such estimator", value=self.name, allowed=", ".join(LAWS))
+        if self.law not in LAWS:
+            raise InputError("no such law of a centroid", value=self.law, allowed=", ".join(LAWS))
         if self.window != int(self.window) or self.window < 3 or self.window % 2 == 0:
             raise InputError("the estimator's window has no central pixel", value=self.window, allowed="an odd number of pixels from 3 on")
         for value in (self.sigma, self.threshold_dn):
             if value is not None and not (np.isfinite(value) and value >= 0):
                 raise InputError("a threshold below the background", value=value, allowed="0 or more")
-        if self.name in THRESHOLDED:
+        if self.law in THRESHOLDED:
             if self.sigma is None and self.threshold_dn is None:
                 object.__setattr__(self, "sigma", 3.0)
         elif self.sigma is not None or self.threshold_dn is not None:
-            raise InputError(f"a {self.name} has no threshold", allowed=f"only window=, or one of {', '.join(THRESHOLDED)}")
+            raise InputError(f"a {self.law} has no threshold", allowed=f"only window=, or one of {', '.join(THRESHOLDED)}")
+
+    @property
+    def name(self) -> str:
+        """As on the command line."""
+        return PREFIX + self.law
 
     def resolved(self, background_dn: float, noise_dn: float) -> Estimator:
         """Return it for a given background and standard deviation of its noise: a threshold in sigma becomes one in DN."""
         threshold = self.threshold_dn if self.sigma is None else self.sigma * noise_dn
         return replace(self, threshold_dn=threshold, background_dn=background_dn)
+
+    def as_seen(self, level_dn: Callable[[float], float]) -> Estimator:
+        """Return it with background and threshold as a camera shows them; ``level_dn`` gives the grey value of light so much above it."""
+        ground = level_dn(0.0)
+        threshold = None if self.threshold_dn is None else level_dn(self.threshold_dn) - ground
+        return replace(self, background_dn=ground, threshold_dn=threshold, sigma=None)
 
     def locate(self, windows_dn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Estimate one position a window.
@@ -86,7 +102,7 @@ class Estimator:
         """
         data = windows_dn if windows_dn.dtype in (np.float32, np.float64) else windows_dn.astype(np.float32)
         r, c = self._square(data.shape)
-        return locate_windows(data, LAWS[self.name], float(self.background_dn), self._threshold(), r.start, r.stop, c.start, c.stop)
+        return locate_windows(data, LAWS[self.law], float(self.background_dn), self._threshold(), r.start, r.stop, c.start, c.stop)
 
     def gradient(self, windows_dn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return how the estimated x and y change per DN added to each pixel, two arrays of shape (n, rows, cols), float64.
@@ -109,23 +125,23 @@ class Estimator:
 
     def describe(self) -> str:
         """Say it in words."""
-        text = f"{self.name.replace('_', ' ')} in {self.window} × {self.window} px"
-        if self.name in THRESHOLDED:
+        text = f"{self.law.replace('_', ' ')} in a fixed square of {self.window} × {self.window} px"
+        if self.law in THRESHOLDED:
             sigma = "" if self.sigma is None else f"{self.sigma:g} standard deviations"
             level = "" if self.threshold_dn is None else f"{self.threshold_dn:.3g} DN"
             text += ", " + " = ".join(t for t in (sigma, level) if t) + " above the background"
         return text
 
     def _law(self, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        if self.name == "centroid":
+        if self.law == "centroid":
             return value, np.ones_like(value)
-        if self.name == "squared_centroid":
+        if self.law == "squared_centroid":
             return value**2, 2 * value
         above = value > self._threshold()
-        return np.where(above, value - (self._threshold() if self.name == "soft_threshold" else 0.0), 0.0), above.astype(float)
+        return np.where(above, value - (self._threshold() if self.law == "soft_threshold" else 0.0), 0.0), above.astype(float)
 
     def _threshold(self) -> float:
-        if self.name not in THRESHOLDED:
+        if self.law not in THRESHOLDED:
             return 0.0
         if self.threshold_dn is None:
             raise InputError("the threshold is given in standard deviations of a noise that is not known", remedy="call resolved() first")
@@ -138,21 +154,6 @@ class Estimator:
             raise InputError("the estimator's window does not fit", value=shape[1:], allowed=f"at least {self.window} × {self.window} px")
         rows, cols = (slice(m - half, m + half + 1) for m in middle)
         return rows, cols
-
-
-def parse_estimator(text: str) -> Estimator:
-    """Read an estimator from ``name:key=value,…``, as in ``soft_threshold:sigma=3,window=13``.
-
-    Raises
-    ------
-    InputError
-        If name, key or value cannot be used.
-    """
-    name, values = split_text(text, {"sigma": "sigma", "threshold": "threshold_dn", "window": "window"}, "estimator")
-    window = values.pop("window", 13)
-    if window != int(window):
-        raise InputError("the estimator's window is not a whole number", where="estimator", value=window, allowed="an odd number of pixels")
-    return Estimator(name=name, window=int(window), **values)
 
 
 def split_text(text: str, keys: dict[str, str], where: str) -> tuple[str, dict[str, float]]:

@@ -249,6 +249,13 @@ def equivalent_disc(half_height_px: np.ndarray, blur_px: np.ndarray) -> tuple[np
     return radius, blur, spread
 
 
+def half_height_radius(radius_px: np.ndarray | float, blur_px: np.ndarray | float) -> np.ndarray:
+    """Return the radius of the contour at half height of a disc that is blurred by a Gaussian: the inverse of `equivalent_disc`."""
+    ratio, contour, _ = _shape_table()
+    asked = np.asarray(radius_px, float) / blur_px
+    return np.where(asked <= ratio[-1], np.interp(asked, ratio, contour), asked) * blur_px
+
+
 @lru_cache(1)
 def _shape_table() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """For R/s of a blurred disc: radius at half height over s, and half-flux radius over s and √(2 ln 2)."""

@@ -13,7 +13,7 @@ from pixmetry.budget.budget import DECIDED, Budget, BudgetRow
 from pixmetry.budget.combine import Combined
 from pixmetry.budget.headline import SUM
 from pixmetry.budget.monte_carlo import MonteCarlo
-from pixmetry.budget.probe import PHASES
+from pixmetry.budget.probe import phases_for
 from pixmetry.core.catalogue import STAGES, get_source
 from pixmetry.core.contribution import UNSTEADY
 from pixmetry.report.numbers import NONE, THIN, decimals_of, fixed, length_mpx, length_px, length_um, percent, signed
@@ -112,7 +112,7 @@ def _verdict(budget: Budget) -> Verdict:
         accepted=_accepted(budget.accepted),
         target=budget.target.describe(),
         estimator=budget.estimator.describe(),
-        places=f"Averaged over {PHASES} × {PHASES} places of the target within a pixel.",
+        places=f"Averaged over {(n := phases_for(budget.estimator))} × {n} places of the target within a pixel.",
         ladder=ladder,
         why="" if budget.headline is None else budget.headline.why,
     )

@@ -59,9 +59,8 @@ def propagate(params: Defects, probe: Probe) -> Contribution:
     few = np.unique(np.linspace(0, len(probe.signal_dn) - 1, PHASES).round().astype(int))
     moments = np.zeros((2, 2))  # second and fourth; x and y
     for phase in few:
-        for name, share in _shares(params):
-            for weight, changed in _cases(params, name, probe.signal_dn[phase], probe.gain_dn_per_e):
-                moments += share * weight * _of_singles(probe, phase, changed)
+        cases = [(s * w, c) for name, s in _shares(params) for w, c in _cases(params, name, probe.signal_dn[phase], probe.gain_dn_per_e)]
+        moments += _of_singles(probe, phase, cases)
         moments += _of_groups(params, probe, phase)
     second, fourth = moments / len(few)
     u_x, u_y = np.sqrt(second)
@@ -127,14 +126,32 @@ def _mean_square_dn2(params: Defects, name: str, probe: Probe) -> np.ndarray | f
     return sum(w * (v - probe.signal_dn) ** 2 for w, v in _cases(params, name, probe.signal_dn, probe.gain_dn_per_e))
 
 
-def _of_singles(probe: Probe, phase: int, changed_dn: np.ndarray) -> np.ndarray:
-    """Sum over pixels of the second and fourth power of the shift in x and y when one pixel alone has its changed value."""
-    base, changed_dn = probe.signal_dn[phase], np.minimum(changed_dn, probe.saturation_dn)
-    at = np.flatnonzero(changed_dn != base)
-    windows = np.repeat(base.reshape(1, -1), len(at), axis=0)
-    windows[np.arange(len(at)), at] = changed_dn.ravel()[at]
-    shifts = np.array(probe.moved(windows.reshape(-1, *base.shape), phase))
-    return np.nansum([shifts**2, shifts**4], axis=2)  # a target that is lost with its only pixel has no position
+def _of_singles(probe: Probe, phase: int, cases: list[tuple[float, np.ndarray]]) -> np.ndarray:
+    """Sum over pixels and cases, each with its weight, of the second and fourth power of the shift when one pixel has its changed value.
+
+    Pixels that the estimator does not read are found once, by their largest change in any case, which then does not move it at all.
+    """
+    base = probe.signal_dn[phase].ravel()
+    changed = [(weight, np.minimum(values.ravel(), probe.saturation_dn)) for weight, values in cases]
+
+    def shifts(at: np.ndarray, values: np.ndarray) -> np.ndarray:
+        windows = np.repeat(base[None, :], len(at), axis=0)
+        windows[np.arange(len(at)), at] = values[at]
+        return np.array(probe.moved(windows.reshape(-1, *probe.signal_dn.shape[1:]), phase))
+
+    if not changed:
+        return np.zeros((2, 2))
+    values = np.stack([v for _, v in changed])
+    largest = values[np.abs(values - base).argmax(axis=0), np.arange(base.size)]
+    read = np.flatnonzero(largest != base)
+    read = read[(shifts(read, largest) != 0).any(axis=0)] if len(read) and len(changed) > 1 else read
+    moments = np.zeros((2, 2))
+    for weight, one in changed:
+        at = read[one[read] != base[read]]
+        if len(at):
+            moved = shifts(at, one)
+            moments += weight * np.nansum([moved**2, moved**4], axis=2)  # a target that is lost with its only pixel has no position
+    return moments
 
 
 SOURCE = Source(
