@@ -69,6 +69,7 @@ def digital_twin(campaign: Campaign, estimates: Mapping[str, Estimates], observa
         facts={
             **told,
             "bits": campaign.bits,
+            **({} if observations.storage.lossless is None else {"lossless": observations.storage.lossless}),
             "source": f"assessed from {campaign.source_path.name}",
             "photons": "photons" if photons_known else "electrons: no photon count was given, the quantum efficiency is set to 1",
         },

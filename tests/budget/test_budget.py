@@ -98,6 +98,18 @@ def test_no_bound_explodes_or_vanishes_with_the_size_of_the_frame(source_id: str
         assert 0.001 < totals[3] < 0.03 and totals[-1] > 5e-4
 
 
+def test_what_files_and_measurements_rule_out_is_not_accepted() -> None:
+    """Frames stored without loss had no JPEG coder; what a spectrum shows of the supply was measured as a pattern, and counts once."""
+    cam = small_camera()
+    for lossless, status in ((True, "not applicable"), (False, "accepted"), (None, "accepted")):
+        facts = cam.facts if lossless is None else {**cam.facts, "lossless": lossless}
+        assert row(computed(replace(cam, facts=facts), None, KNOWN, trials=0), "storage.jpeg").status == status
+    assert row(computed(cam, None, KNOWN, trials=0), "electronics.supply_pickup").status == "accepted"
+    pattern = Estimates.from_rows([("amplitude_dn", 0.05, 0.01, 99.0, "DN")], limits=frozenset({"amplitude_dn"}))
+    got = row(computed(cam, {"grabber.phase_pattern": pattern}, KNOWN, trials=0), "electronics.supply_pickup")
+    assert got.status == "not applicable" and got.contribution is None and "measured" in got.reason
+
+
 def test_the_verdict_is_the_root_sum_of_squares_of_what_is_decided() -> None:
     budget = computed(small_camera(), prnu(0.008, 0.0004), KNOWN, trials=0)
     decided = [r.total_px**2 for r in budget.of_status("measured", "modelled")]

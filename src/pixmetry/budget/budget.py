@@ -238,6 +238,7 @@ def compute_budget(
     facts = facts_of(camera, target, known_facts)
     probes = Probes(camera, facts, target, estimator)
     rows = []
+    measured_ids = [name for name, found in estimates_by_source.items() if len(found)]
     for name, source in _sources(camera):
         say(name)
         if geometry is not None and source.id in TAKEN_UP:
@@ -245,7 +246,7 @@ def compute_budget(
         else:
             probe = probes.of(name, source)
             whole = probe if sensor_shape is None else replace(probe, frame_shape=sensor_shape)
-            rows.append(_row(name, source, camera, estimates_by_source.get(name), name in accepted, probe, whole))
+            rows.append(_row(name, source, camera, estimates_by_source.get(name), name in accepted, probe, whole, measured_ids))
     interaction = design = None
     if trials:
         design = Trials(camera, target, estimator, facts, trials, units, seed=seed)
@@ -296,7 +297,16 @@ def _as_measured(camera: Camera, estimates_by_source: dict[str, Estimates]) -> C
     return replace(camera, chain=tuple(chain))
 
 
-def _row(name: str, source: Source, camera: Camera, estimates: Estimates | None, at_bound: bool, probe: Any, whole: Any) -> BudgetRow:
+def _row(
+    name: str,
+    source: Source,
+    camera: Camera,
+    estimates: Estimates | None,
+    at_bound: bool,
+    probe: Any,
+    whole: Any,
+    measured_ids: Collection[str] = (),
+) -> BudgetRow:
     head = BudgetRow(name, source.id, source.title, "")
     if not applies(source, camera.facts):
         return replace(head, status="not applicable", reason=f"only in a camera that is {' or '.join(source.applies_to)}")
@@ -304,6 +314,11 @@ def _row(name: str, source: Source, camera: Camera, estimates: Estimates | None,
     present = any(e.name == name for e in camera.active)
     if source.option and not (present or measured):
         return replace(head, status="not applicable", reason=f"only in a camera with {source.option}")
+    if source.stage == "storage" and camera.facts.get("lossless") and not (present or measured):
+        return replace(head, status="not applicable", reason="only in frames that were stored with loss; these were not")
+    if source.held_by and not (present or measured) and all(h in measured_ids for h in source.held_by):
+        where = ", ".join(catalogue()[h].title for h in source.held_by)
+        return replace(head, status="not applicable", reason=f"what of it is in these frames was measured, and counts, as: {where}")
     if Kind.LIGHT in source.consumes and not (present or measured):
         return replace(head, status="left to calibration", reason=CALIBRATED)
     if measured:

@@ -103,6 +103,8 @@ class Source:
     option : str
         What a camera must have for this source to be in it, where most have not: ``a colour mosaic``. A budget counts it only where the
         camera's chain holds it.
+    held_by : tuple of str
+        Sources under whose names frames without targets show all of it. A budget in which these are measured does not count it once more.
     gum_class : str
         Class of its contribution, see ``core.contribution``.
     equation, typical_size : str
@@ -150,6 +152,7 @@ class Source:
     start: Callable[[Any], Any] | None = None
     applies_to: tuple[str, ...] = ()
     option: str = ""
+    held_by: tuple[str, ...] = ()
     reasons: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

@@ -142,6 +142,7 @@ SOURCE = Source(
         "it as stripes that stand still or roll, as the supply beats with the frame rate."
     ),
     number=21,
+    held_by=("grabber.phase_pattern",),
     parameters=SupplyPickup,
     consumes=(Kind.DN,),
     after=("sensor",),

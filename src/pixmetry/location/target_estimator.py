@@ -150,7 +150,7 @@ class TargetEstimator:
             if not np.isfinite(values).all():
                 out[:, k] = np.nan
                 continue
-            mean, jacobian = model("disc", values, rows, cols)
+            mean, jacobian = model("disc", np.array(values), rows, cols)
             y, x = np.ogrid[:rows, :cols]
             near = np.hypot(x - values[0], y - values[1]) <= reach
             columns = jacobian[:, near] / np.sqrt(noise.variance_dn2(mean[near]))
@@ -216,10 +216,10 @@ class TargetEstimator:
         one, none = np.ones(n), np.zeros(n)
         half = float(half_height_radius(radius, edge))
         x_px, y_px = rough[0], rough[1] + rows * np.arange(n)
-        box = [np.rint(v).astype(np.int64) for v in (y_px - half, y_px + half + 1, x_px - half, x_px + half + 1)]
+        top, bottom, left, right = (np.rint(v).astype(np.int64) for v in (y_px - half, y_px + half + 1, x_px - half, x_px + half + 1))
         return Targets(
             x_px, y_px, half * one, half * one, none, edge * one, amplitude * one, self.background_dn * one, none, none,
-            self.noise_dn * one, *box, np.zeros(n, np.uint32),
+            self.noise_dn * one, top, bottom, left, right, np.zeros(n, np.uint32),
         )  # fmt: skip
 
 
