@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -140,8 +140,9 @@ def residual_patterns(adjustment: Adjustment, level: float = 0.01) -> list[dict[
         ``x_scale_by_image`` and ``x_shift_by_image`` also hold ``images``, ``values`` and ``u``, and ``alone``: the one image that differs
         from all others, if it is one; waves hold ``period_px``. Amplitudes:
         of waves and phases their own; of trends the change from the first image to the last, at the edge of the frame; of curves, fields
-        and images the rms of what the residuals show of them; of ``image_rms`` the largest rms of an image, and if few images stand out
-        their names, ``images_out``, with ``rms_px`` and ``times_median``.
+        and images the rms of what the residuals show of them; of ``image_rms`` the largest rms of an image, in x or in y, and if few images
+        stand out their names, ``images_out``, with ``rms_px`` (in x and y), the number of their image points that were ``rejected``, and
+        ``times_median``, how their weighted residuals compare with the median of the images, rejected ones counted.
     """
     with single_threaded_blas():
         out = _of_cameras(adjustment)
@@ -208,14 +209,22 @@ def pattern_findings(records: list[dict[str, Any]]) -> tuple[Finding, ...]:
 
 
 def _bad_images(record: dict[str, Any], where: str) -> Finding:
-    found = list(zip(record["images_out"], record["rms_px"], record["times_median"], strict=True))
-    named = ", ".join(f"{name} ({rms:.2g} px, {times:.1f} times the middle one)" for name, rms, times in found[:NAMED])
+    found = list(zip(record["images_out"], record["rms_px"], record["rejected"], record["times_median"], strict=True))
+    named = ", ".join(f"{name} ({_size(*of_one)})" for name, *of_one in found[:NAMED])
     more = " …" if len(found) > NAMED else ""
     few = "1 image has residuals" if len(found) == 1 else f"{len(found)} images have residuals"
     text = f"{where}{few} much larger than the others: {named}{more}. Patterns in the residuals were sought without"
     it = "it" if len(found) == 1 else "them"
     advice = f"Look at {it}: focus, movement, light, names of points; leave {it} out if nothing mends {it}."
     return Finding("bad_images", f"{text} {it}.", advice, "warning")
+
+
+def _size(rms_px: Sequence[float], rejected: int, times: float) -> str:
+    """Residuals of one image: their rms as the figures show it, and what they are with its rejected image points counted."""
+    size = f"rms {rms_px[0]:.2g} px in x and {rms_px[1]:.2g} px in y"
+    if rejected:
+        return f"{size}, but {rejected} rejected; with {'it' if rejected == 1 else 'them'} {times:.1f} times the median"
+    return f"{size}, {times:.1f} times the median"
 
 
 def _tests(seen: _Seen) -> Iterator[dict[str, Any]]:
@@ -384,11 +393,13 @@ def _image_rms(seen: _Seen, images: np.ndarray) -> dict[str, Any]:
     pooled = total.sum() / dof.sum()
     statistic = dof.sum() * np.log(pooled) - np.sum(dof * np.log(total / dof))
     correction = 1 + (np.sum(1 / dof) - 1 / dof.sum()) / (3 * (len(dof) - 1)) if len(dof) > 1 else 1.0
-    px2 = seen.adjustment.network.covariance_px2[seen.terms.rows[seen.mine]][:, [0, 2]].mean()
     p = float(stats.chi2.sf(statistic / correction, len(dof) - 1)) if len(dof) > 1 else 1.0
-    record = {"name": "image_rms", "amplitude_px": float(np.sqrt((total / dof).max() * px2)), "u_px": None, "p": p}
+    residual_px = seen.adjustment.residual_px[seen.terms.rows[seen.mine]]
+    rms_px = np.sqrt(np.stack([np.bincount(place, axis**2) / np.bincount(place) for axis in residual_px.T], axis=1))[good]
+    record = {"name": "image_rms", "amplitude_px": float(rms_px.max()), "u_px": None, "p": p}
     middle = float(np.median(np.sqrt(total / dof)))
-    total, dof = (part + more[images[good]] for part, more in zip((total, dof), _rejected(seen, WORST * middle), strict=True))
+    squares, coordinates = (part[images[good]] for part in _rejected(seen, WORST * middle))
+    total, dof = total + squares, dof + coordinates
     rms = np.sqrt(total / dof)
     out = np.flatnonzero(rms > OUTSTANDING * middle)
     rest = np.setdiff1d(np.arange(len(dof)), out)
@@ -396,5 +407,6 @@ def _image_rms(seen: _Seen, images: np.ndarray) -> dict[str, Any]:
     if 0 < len(out) <= len(dof) / FEW_OF:
         out = out[np.argsort(-rms[out])]
         names = [seen.adjustment.network.images[i] for i in images[good][out]]
-        record |= {"images_out": names, "rms_px": (rms[out] * np.sqrt(px2)).tolist(), "times_median": (rms[out] / middle).tolist()}
+        rejected = (coordinates[out] / 2).astype(int).tolist()
+        record |= {"images_out": names, "rms_px": rms_px[out].tolist(), "rejected": rejected, "times_median": (rms[out] / middle).tolist()}
     return record
