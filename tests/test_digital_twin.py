@@ -14,7 +14,7 @@ from pixmetry.campaign.records import CameraFacts, Campaign, FrameGroup, OpticsF
 from pixmetry.core.camera import Camera, Element
 from pixmetry.core.catalogue import get_source
 from pixmetry.core.observations import Observations
-from pixmetry.digital_twin import best_values, digital_twin, expose, exposures_of, fewer, of_unit, self_test
+from pixmetry.digital_twin import best_values, digital_twin, expose, exposures_of, fewer, middle_window, of_unit, self_test
 from pixmetry.experiment.observe import observe
 from pixmetry.report.twin_view import twin_sentence
 
@@ -124,8 +124,7 @@ def test_maps_have_the_spread_of_the_camera_and_follow_its_pattern(both, source,
     one, other = pixels(true), pixels(found)
     tolerance = 6 * np.sqrt(2 / good.sum())
     assert other.var() / one.var() == pytest.approx(1, abs=1.5 * tolerance), SEED  # the share of the noise is estimated too
-    stack, level = (seen.bright_stack, None) if source == "sensor.prnu" else (seen.dark_stack, None)
-    assert level is None
+    stack = seen.bright_stack if source == "sensor.prnu" else seen.dark_stack
     gain = seen.photon_transfer_fit["gain_dn_per_e"].value
     temporal = stack.ms_pixel_dn2 / STACK
     if source == "sensor.prnu":
@@ -197,6 +196,18 @@ def test_large_frames_are_tested_with_fewer() -> None:
     assert {e.frames for e in chosen if e.role == "stack"} == {16}
     assert len([e for e in chosen if e.kind == "bright" and e.role == "level"]) == 12
     assert fewer(wanted, 100) == wanted
+
+
+def test_of_large_frames_a_window_is_tested(both) -> None:
+    """As if frames of 120 × 160 pixels were too many: less than half of each, of every second frame."""
+    _, frames, seen, twin = both
+    assert middle_window((480, 640)) is None
+    tested = self_test(twin, frames, seen, by_the_standard(frames, seen), seed=SEED + 1, most_pixels=80 * 80 * 100)
+    assert tested.window == (21, 28, 77, 103)
+    names = {r.name for r in tested.rows}
+    assert {"K", "sigma_y_dark", "sigma_2_y_stack", "DSNU1288", "PRNU1288"} <= names and not names & {"R", "QE", "LE_min", "s_2_y_row"}
+    assert abs(tested.worst.difference_u) < FAR_U, (SEED, tested.worst)
+    assert "in the middle" in twin_sentence(tested)
 
 
 def test_what_is_not_significant_is_not_simulated(both) -> None:

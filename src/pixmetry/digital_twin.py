@@ -16,7 +16,7 @@ from pixmetry.core.camera import Camera, Element, in_order
 from pixmetry.core.catalogue import catalogue
 from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.core.estimates import Estimates
-from pixmetry.core.observations import Observations, PatternList
+from pixmetry.core.observations import Observations, PatternList, StackMoments
 from pixmetry.core.source import Source
 from pixmetry.core.unit_maps import MeasuredUnit
 from pixmetry.emva.evaluate import standard_values
@@ -34,7 +34,9 @@ CORRELATED = 0.5  # values with a larger correlation belong together: one alone 
 WAVES, NOISE = "grabber.phase_pattern", "electronics.amplifier_noise"
 SOME_DITHER_DN2 = 0.5  # variance above which rounding adds 1/12 DN² (to 1e-4)
 TEST_SEED = 1_000_000_007  # so that a campaign that was simulated with a small seed has other noise than its twin
-TEST_PIXELS = 24_000_000  # of all frames of the self-test together, about
+TEST_PIXELS = 26_000_000  # of all frames of the self-test together, about
+TEST_STACK, TEST_LEVELS = 16, 12  # fewest frames of a stack and levels of each kind that it takes, if the campaign has them
+SMALLEST_WINDOW = 64
 
 
 def digital_twin(campaign: Campaign, estimates: Mapping[str, Estimates], observations: Observations) -> Camera:
@@ -221,6 +223,8 @@ class SelfTest:
     rows : tuple of Compared
     frames, of : int
         Frames of the twin that were reduced, and of the campaign.
+    window : (int, int, int, int), optional
+        First row and column, rows and columns of the part of the frames that was compared; None for all of them.
     reason : str
         Why there are no rows.
     """
@@ -228,6 +232,7 @@ class SelfTest:
     rows: tuple[Compared, ...] = ()
     frames: int = 0
     of: int = 0
+    window: tuple[int, int, int, int] | None = None
     reason: str = ""
 
     @property
@@ -249,7 +254,7 @@ class SelfTest:
             }
             for r in self.rows
         ]
-        return {"values": rows, "frames": self.frames, "frames_of_campaign": self.of, "reason": self.reason}
+        return {"values": rows, "frames": self.frames, "frames_of_campaign": self.of, "window": self.window, "reason": self.reason}
 
 
 def exposures_of(campaign: Campaign) -> list[Exposure]:
@@ -257,7 +262,9 @@ def exposures_of(campaign: Campaign) -> list[Exposure]:
     return [Exposure(g.kind, g.role, g.exposure_s, g.photons, len(g.paths)) for g in campaign.groups]
 
 
-def expose(twin: Camera, exposures: Sequence[Exposure], light: Sequence[float], seed: int, threads: int | None = 1) -> Iterator[Group]:
+def expose(
+    twin: Camera, exposures: Sequence[Exposure], light: Sequence[float], seed: int, window: tuple[int, int, int, int] | None = None
+) -> Iterator[Group]:
     """The groups of a campaign as the twin makes them; each frame is exposed when it is fetched.
 
     Parameters
@@ -268,19 +275,19 @@ def expose(twin: Camera, exposures: Sequence[Exposure], light: Sequence[float], 
         Photons per pixel of each, 0 in the dark.
     seed : int
         Of the exposures.
-    threads : int, optional
-        For one frame; the reduction fetches several at once.
+    window : (int, int, int, int), optional
+        First row and column, rows and columns of the part of the frames that is made.
     """
     first = 0
     for exposure, photons in zip(exposures, light, strict=True):
-        make = partial(_frame, twin, Uniform(photons), seed, exposure.exposure_s, threads)
+        make = partial(_frame, twin, Uniform(photons), seed, exposure.exposure_s, window)
         frames = [partial(make, first + k) for k in range(exposure.frames)]
         first += exposure.frames
         yield Group(exposure.kind, exposure.role, exposure.exposure_s, exposure.photons, frames)
 
 
-def _frame(twin: Camera, scene: Uniform, seed: int, exposure_s: float, threads: int | None, number: int) -> np.ndarray:
-    return twin.expose(scene, [number], seed, threads=threads, exposure_s=exposure_s).data[0]
+def _frame(twin: Camera, scene: Uniform, seed: int, exposure_s: float, window: Any, number: int) -> np.ndarray:
+    return twin.expose(scene, [number], seed, window, threads=1, exposure_s=exposure_s).data[0]  # the reduction fetches several at once
 
 
 def light_of(exposures: Sequence[Exposure], seen: Observations) -> list[float]:
@@ -327,23 +334,50 @@ def _more_light(seen: Observations, stated: np.ndarray, dn_per_unit: float) -> f
 
 
 def fewer(exposures: Sequence[Exposure], frame_pixels: int, most_pixels: int = TEST_PIXELS) -> list[Exposure]:
-    """As many of a campaign's exposures as fit into a number of pixels: both stacks with fewer frames, and every so manieth level.
+    """As many of a campaign's exposures as fit into a number of pixels: stacks of fewer frames, and levels spread evenly over the series.
 
-    Never fewer than 16 frames a stack (or all), nor than 12 levels of each kind. Only the stacks that belong together are kept.
+    Never fewer than `TEST_STACK` frames a stack (or all), nor than `TEST_LEVELS` levels of each kind.
     """
     stacks = [e for e in exposures if e.role == "stack"]
-    levels = {kind: sorted((e for e in exposures if e.role == "level" and e.kind == kind), key=_light_key) for kind in ("dark", "bright")}
+    levels = [sorted((e for e in exposures if e.role == "level" and e.kind == kind), key=_light_key) for kind in ("dark", "bright")]
     if sum(e.frames for e in exposures) * frame_pixels <= most_pixels:
         return list(exposures)
     room = max(most_pixels // frame_pixels, 1)
-    each = max(16, room // (2 * max(len(stacks), 1)))
+    each = max(TEST_STACK, room // (2 * max(len(stacks), 1)))
     kept = [replace(e, frames=min(e.frames, each)) for e in stacks]
-    count = max(12, (room - sum(e.frames for e in kept)) // 4)
-    for of_kind in levels.values():
+    count = max(TEST_LEVELS, (room - sum(e.frames for e in kept)) // 4)
+    for of_kind in levels:
         if of_kind:
             at = np.unique(np.linspace(0, len(of_kind) - 1, min(count, len(of_kind))).round().astype(int))
             kept += [replace(of_kind[i], frames=min(of_kind[i].frames, 2)) for i in at]
     return kept
+
+
+def middle_window(frame_shape: tuple[int, int], most_pixels: int = TEST_PIXELS) -> tuple[int, int, int, int] | None:
+    """The part of a frame of which the fewest frames of a test fit into a number of pixels, in its middle; None if all of it does."""
+    share = math.sqrt(most_pixels / ((2 * TEST_STACK + 4 * TEST_LEVELS) * frame_shape[0] * frame_shape[1]))
+    if share >= 1:
+        return None
+    rows, cols = (min(max(int(share * side), SMALLEST_WINDOW), side) for side in frame_shape)
+    return (frame_shape[0] - rows) // 2, (frame_shape[1] - cols) // 2, rows, cols
+
+
+def _cropped(stack: StackMoments | None, window: tuple[int, int, int, int]) -> StackMoments | None:
+    """A stack as if only a window of its frames had been taken; means of rows and columns then hold more of the white noise."""
+    if stack is None:
+        return None
+    row0, col0, rows, cols = window
+    part = np.s_[row0 : row0 + rows, col0 : col0 + cols]
+    mean, variance, white = stack.mean_map_dn[part], stack.var_map_dn2[part], stack.ms_pixel_dn2
+    return replace(
+        stack,
+        mean_map_dn=mean,
+        var_map_dn2=variance,
+        mean_dn=float(mean.mean()),
+        var_stack_dn2=float(variance.mean(dtype=float)),
+        ms_row_dn2=stack.ms_row_dn2 + white * (1 / cols - 1 / stack.shape[1]),
+        ms_col_dn2=stack.ms_col_dn2 + white * (1 / rows - 1 / stack.shape[0]),
+    )
 
 
 def _light_key(exposure: Exposure) -> tuple[float, float]:
@@ -355,27 +389,36 @@ COMPARED = (
     *("sigma_2_y_stack_dark", "s_2_y_dark", "s_2_y_row_dark", "s_2_y_col_dark", "s_2_y_pixel_dark"),
     *("sigma_2_y_stack", "s_2_y", "s_2_y_row", "s_2_y_col", "s_2_y_pixel", "DSNU1288", "PRNU1288"),
 )
-# hang on which levels a series has, or on how many frames a stack: compared if the twin takes them all
-BY_LEVEL = ("R", "u_e_sat", "SNR_max", "DR", "LE_min", "LE_max")
-BY_FRAME = tuple(f"s_2_y_{part}{kind}" for part in ("row", "col", "pixel") for kind in ("", "_dark"))
+# compared only if the twin takes all frames, and the whole of them
+BY_LEVEL = ("R", "u_e_sat", "SNR_max", "DR", "LE_min", "LE_max")  # hang on which levels a series has
+BY_PLACE = ("R", "QE", "u_p_min", "u_e_sat", "SNR_max", "DR")  # hang on the light, which at one place is not the mean over the frame
+BY_FRAME = tuple(f"s_2_y_{part}{kind}" for part in ("row", "col", "pixel") for kind in ("", "_dark"))  # hold row noise over L
 
 
-def self_test(twin: Camera, campaign: Campaign, observations: Observations, standard: Results, seed: int = 1) -> SelfTest:
+def self_test(
+    twin: Camera, campaign: Campaign, observations: Observations, standard: Results, seed: int = 1, most_pixels: int = TEST_PIXELS
+) -> SelfTest:
     """Let the twin take the campaign, reduce its frames as the camera's were, and compare the values of EMVA 1288.
 
-    u of a difference is that of the two values, each of which tells how it would come out of another series of the same camera. Of large
-    frames the twin takes fewer; what hangs on the number of levels or frames is then not compared.
+    u of a difference is that of the two values, each of which tells how it would come out of another series of the same camera. Of a large
+    campaign the twin takes fewer frames, of large frames a window; what hangs on the number of levels or frames, or on the place, is then
+    not compared.
     """
+    window = middle_window(campaign.frame_shape, most_pixels)
     wanted = exposures_of(campaign)
-    chosen = fewer(wanted, campaign.frame_shape[0] * campaign.frame_shape[1])
+    pixels = math.prod(campaign.frame_shape if window is None else window[2:])
+    chosen = fewer(wanted, pixels, most_pixels)
     frames, of = sum(e.frames for e in chosen), sum(e.frames for e in wanted)
-    left_out = (BY_LEVEL if len(chosen) < len(wanted) else ()) + (BY_FRAME if frames < of else ())
+    left_out = (BY_LEVEL if len(chosen) < len(wanted) else ()) + (BY_FRAME if frames < of else ()) + (BY_PLACE if window else ())
     try:
         light = light_of(chosen, observations)
-        (measured,) = measure_frames(expose(twin, chosen, light, seed + TEST_SEED), campaign.bits)
+        (measured,) = measure_frames(expose(twin, chosen, light, seed + TEST_SEED, window), campaign.bits)
         found = standard_values(measured_like(measured, twin), standard.release)
+        if window is not None:
+            dark, bright = _cropped(observations.dark_stack, window), _cropped(observations.bright_stack, window)
+            standard = standard_values(Measurement(observations.photon_transfer, dark, bright), standard.release)
     except (MeasureError, InputError) as problem:
-        return SelfTest(frames=frames, of=of, reason=str(problem))
+        return SelfTest(frames=frames, of=of, window=window, reason=str(problem))
     rows = []
     for key in COMPARED:
         ours, theirs = standard.values[key], found.values[key]
@@ -383,7 +426,7 @@ def self_test(twin: Camera, campaign: Campaign, observations: Observations, stan
         limit = any(v.is_limit or v.is_lower_limit for v in (ours, theirs))
         if np.isfinite(numbers).all() and ours.u > 0 and not limit and key not in left_out:
             rows.append(Compared(key, ours.unit, *numbers))
-    return SelfTest(tuple(rows), frames, of)
+    return SelfTest(tuple(rows), frames, of, window)
 
 
 def measured_like(measured: Measurement, twin: Camera) -> Measurement:

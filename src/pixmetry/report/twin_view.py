@@ -38,4 +38,6 @@ def twin_sentence(test: SelfTest) -> str:
         f"({abs(worst.difference_u):.1f} u)."
     )
     taken = f"It took {test.frames} frames" + ("" if test.frames == test.of else f", where the campaign has {test.of}")
+    if test.window is not None:
+        taken += f", and of each the {test.window[3]} × {test.window[2]} pixels in the middle"
     return f"The digital twin took the campaign, and its frames were reduced as the camera's. {taken}. {outcome}"
