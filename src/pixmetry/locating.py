@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from pixmetry.campaign.formats import frame_name
+from pixmetry.campaign.formats import frame_name, raw_file
 from pixmetry.campaign.images import PICTURE_ENDINGS, load_picture, picture_files
 from pixmetry.campaign.raw_values import RawLayout, parse_raw
 from pixmetry.campaign.staged_files import Output, check_files, write_together
@@ -48,7 +48,7 @@ ROWS = {
 AUTO = {"auto": "chooses shape and likelihood of the template by what the image shows, and says why"}
 SPOTS = ("disc", "ellipse", "ring", "spot")
 FAINTEST = 0.05  # height of lines and edges over that of the frame's strongest
-TILTED = 0.91  # ratio of the axes below which discs are fitted as ellipses
+TILTED, TILTED_PX = 0.91, 0.3  # ratio of the axes below which, difference of half axes above which discs are fitted as ellipses
 PILED = 10  # pixels in 4 of one value at the top of an image before it is asked whether they were cut off there
 LARGE_PX = 2.0  # radius from which that ratio can be told from a look at the region
 
@@ -158,8 +158,8 @@ def locate_files(
     Parameters
     ----------
     images : sequence of path
-        Image files (PNG, TIFF, BMP, FITS, NPY, JPEG, raw), folders of them, or Zarr stores of frames. A file with several frames is as
-        many images.
+        Image files (PNG, TIFF, BMP, FITS, NPY, JPEG, raw), folders of them in the order of their names, folders that `simulate` wrote,
+        or Zarr stores of frames. A file with several frames is as many images.
     output : path, optional
         Where the table goes: ``.csv``, ``.parquet`` or ``.json``.
     overlay : path, optional
@@ -180,7 +180,7 @@ def locate_files(
     from pixmetry.report.overlay import MARK, overlay_names, overlay_png
 
     layout = parse_raw(raw) if isinstance(raw, str) else raw
-    files = picture_files(images, PICTURE_ENDINGS, layout)
+    files = picture_files([frames_inside(path) for path in images], PICTURE_ENDINGS, layout)
     pictures = overlay_names(overlay, files)
     written = [Output(picture, MARK, True) for picture in pictures if picture is not None]
     tables_at = [] if output is None else [checked_table_name(output)]
@@ -214,6 +214,22 @@ def locate_files(
     contents = [found.content(one.path.suffix) for one in tables_at]
     write_together([*tables_at, *written], [*contents, *drawings[: len(written)]], files)
     return found
+
+
+def frames_inside(path: str | Path) -> Path:
+    """Name the folder or store that holds the frames: a folder without images of its own may be what `simulate` wrote."""
+    folder = Path(path)
+    if not folder.is_dir() or folder.suffix.lower() == ".zarr" or any(p.suffix.lower() in PICTURE_ENDINGS for p in folder.iterdir()):
+        return folder
+    return next((inside for inside in (folder / "frames", folder / "frames.zarr") if inside.is_dir()), folder)
+
+
+def skipped_files(images: Sequence[str | Path], raw: RawLayout | str | None = None) -> list[str]:
+    """Names of the files in the given folders that are taken for no images; ``raw`` as of `locate_files`."""
+    layout = parse_raw(raw) if isinstance(raw, str) else raw
+    folders = [folder for folder in map(frames_inside, images) if folder.is_dir() and folder.suffix.lower() != ".zarr"]
+    others = (p for folder in folders for p in sorted(folder.iterdir()) if p.suffix.lower() not in PICTURE_ENDINGS and p.is_file())
+    return [p.name for p in others if not p.name.startswith(".") and not raw_file(p, layout)]
 
 
 def checked_frame(frame: np.ndarray, name: str = "frame") -> np.ndarray:
@@ -331,10 +347,10 @@ def _spots(task: Task) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     shape = "ellipse" if task.kind == "coded" else task.kind
     targets = found.targets[select(found.targets, shape)]
     estimator, reason = task.estimator, "as was asked for"
+    seen, why = seen_shape(shape, targets)
+    noise = _noise_for(task, seen, targets)  # with the targets' own shape, whatever measures them: what it does not explain is noise
     if estimator == "auto":
-        shape, why = seen_shape(shape, targets)  # first, for the noise is what another shape than the targets' own does not explain
-    noise = _noise_for(task, shape, targets)
-    if estimator == "auto":
+        shape = seen
         estimator, reason = chosen_estimator(targets, noise, why)
     positions = measured(task, targets, noise, estimator, shape)
     columns = _columns(positions, estimator if shape == task.kind else f"{estimator} ({shape})", noise)
@@ -381,8 +397,11 @@ def measured(task: Task, targets: Targets, noise: NoiseModel, estimator: str, sh
 def seen_shape(kind: str, targets: Targets) -> tuple[str, str]:
     """Choose the shape of the template for the targets of one frame, and say why: discs that are seen tilted are ellipses."""
     large = (targets.semi_major_px > LARGE_PX) & ((targets.flags & Flag.BORDER) == 0)
-    flat = float(np.median((targets.semi_minor_px / targets.semi_major_px)[large])) if large.any() else 1.0
-    if kind == "disc" and flat < TILTED:
+    if kind != "disc" or not large.any():
+        return kind, "at the Cramér–Rao bound for every size and noise"
+    major, minor = targets.semi_major_px[large], targets.semi_minor_px[large]
+    flat = float(np.median(minor / major))
+    if flat < TILTED or float(np.median(major - minor)) > TILTED_PX:
         return "ellipse", f"the discs are seen as ellipses, axes 1 : {flat:.2f}"
     return kind, "at the Cramér–Rao bound for every size and noise"
 
@@ -395,7 +414,8 @@ def chosen_estimator(targets: Targets, noise: NoiseModel, why: str) -> tuple[str
     """
     if not len(targets):
         return "template", "no target was found"
-    electrons = float(np.median(np.abs(targets.amplitude_dn))) / noise.slope_dn if noise.slope_dn else np.inf
+    known = noise.slope_dn and noise.slope_clear
+    electrons = float(np.median(np.abs(targets.amplitude_dn))) / noise.slope_dn if known else np.inf
     if electrons < FEW_ELECTRONS:
         return "poisson_gaussian", f"{electrons:.0f} electrons at the peak: grey values are not normally distributed; {why}"
     return "template", why
@@ -480,7 +500,12 @@ _WORK = {"line": _lines, "edge": _lines, "cross": _lines, "chessboard": _chessbo
 def _noise_for(task: Task, kind: str, targets: Targets | np.ndarray) -> NoiseModel:
     """The noise model that was given, with the scale's ends; else what the image tells, at targets or by the spread beside them."""
     if task.noise is not None:
-        return replace(task.noise, low_dn=max(task.low_dn, task.noise.low_dn), high_dn=min(task.high_dn, task.noise.high_dn))
+        given = replace(task.noise, low_dn=max(task.low_dn, task.noise.low_dn), high_dn=min(task.high_dn, task.noise.high_dn))
+        if not isinstance(targets, Targets) or not len(targets):
+            return given
+        from pixmetry.location.image_noise import row_shifts_from_image
+
+        return row_shifts_from_image(task.frame, targets, given, kind, aperture_px=task.aperture_px, threads=task.threads)
     if isinstance(targets, Targets) and len(targets):
         from pixmetry.location.image_noise import noise_from_image
 

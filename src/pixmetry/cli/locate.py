@@ -8,6 +8,9 @@ import click
 
 from pixmetry.cli._console import echo, echo_lines
 
+EXIT_NOTHING_FOUND = 1
+MOST_NAMED = 5
+NOT_FOUND = "check --kind and --polarity; targets must be less than half of the picture"
 KINDS = ("disc", "ellipse", "ring", "spot", "line", "edge", "cross", "chessboard", "coded")
 
 
@@ -66,11 +69,12 @@ def locate(
 
     IMAGES are files (PNG, TIFF, BMP, FITS, NPY, JPEG, raw), folders of them, or Zarr stores of frames; a file with several frames is as
     many images. Bright and dark targets are found without tuning.
-    Positions count from the centre of the top-left pixel, x to the right, y down.
+    Positions count from the centre of the top-left pixel, x to the right, y down. The exit status is 1 if no image has a target; the table
+    is written even then.
     """
     from pixmetry.cli._progress import shown_progress
     from pixmetry.core.threads import set_threads
-    from pixmetry.locating import estimators, locate_files
+    from pixmetry.locating import estimators, locate_files, skipped_files
 
     if estimator == "list":
         for name, text in estimators(kind).items():
@@ -79,6 +83,9 @@ def locate(
     if not images:
         raise click.UsageError("no image is named")
     set_threads(threads)
+    if skipped := skipped_files(images, raw):
+        named = ", ".join(skipped[:MOST_NAMED]) + (f" and {len(skipped) - MOST_NAMED} more" if len(skipped) > MOST_NAMED else "")
+        echo(f"skipped, no image by {'its name' if len(skipped) == 1 else 'their names'}: {named}", err=True)
     with shown_progress() as progress:
         table = locate_files(
             images,
@@ -106,3 +113,7 @@ def locate(
         echo(f"table: {output}")
     if overlay is not None:
         echo(f"overlay: {overlay}", err=output is None)
+    if not len(table):
+        where = table.images[0]["name"] if len(table.images) == 1 else f"any of {len(table.images)} images"
+        echo(f"nothing found: no {kind} in {where}; to do: {NOT_FOUND}", err=True)
+        raise click.exceptions.Exit(EXIT_NOTHING_FOUND)

@@ -39,6 +39,8 @@ LEAST_BACKGROUND = 0.01  # electrons, where their likelihood is used: there are 
 LEAST_ELECTRONS = 1e-3  # below it a pixel is as good as dark
 MOST_ELECTRONS = 60.0  # of a reading, from which it is as good as a shifted Poisson number
 PER_E = 8.0  # entries of the efficiency per unit of log(electrons)
+ROWS = 32  # of a target, at most, that are asked whether rows are shifted against each other
+ALIKE = math.exp(-1.0 / 5.0)  # correlation of the shifts of two lines of a field that follow each other, where a loop carries them on
 DOT = {"fastmath": {"reassoc", "contract", "nsz"}}
 
 
@@ -449,7 +451,8 @@ def fit(
 
     ``start``: n × parameters; ``home``: n × 2 or more, the places that the windows are about. ``free``: which parameters are unknown, the
     base and perhaps planes. ``test``: whether to test planes, none of which is free then. Results: ``out`` (parameters), ``variance`` of
-    each, ``covariance`` of x and y, and ``quality``: 0 χ², 2 to 4 the expected falls of χ² with planes, 5 steps (negative: not at rest).
+    each, ``covariance`` of x and y, and ``quality``: 0 χ², 2 to 4 the expected falls of χ² with planes, 5 steps (negative: not at rest),
+    9 the larger variance of x and y by the pixels' noise alone.
     """
     parameters = start.shape[1]
     s = SHAPES[kind]
@@ -471,6 +474,7 @@ def fit(
     gradient, step, right, column = np.empty(MOST), np.empty(MOST), np.empty(MOST), np.empty(MOST)
     p, trial, begin = np.empty(parameters), np.empty(parameters), np.empty(parameters)
     full, figures = np.empty(parameters), np.empty(4)
+    answers, carried = np.empty((side, MOST)), np.empty((2, MOST))
     used = np.flatnonzero(free)
     count = len(used)
     every = np.arange(parameters)
@@ -542,7 +546,8 @@ def fit(
                     break
         if math.isinf(chi2):
             continue
-        out[i] = trial if at_rest else p
+        # only the place need be at rest: a shape of which the image tells nothing may leap where it encloses nothing
+        out[i] = trial if at_rest and allowed(kind, trial, begin, largest, broadest) else p
         out[i, 0] += col0
         out[i, 1] += row0
         quality[i, 0], quality[i, 5] = chi2 - max(falls, 0.0), steps if at_rest else -steps
@@ -555,6 +560,10 @@ def fit(
                 variance[i, used[a]] = step[a]
                 if a < 2:
                     covariance[i, a], covariance[i, 1 + a] = step[0], step[1]
+        quality[i, 9] = max(covariance[i, 0], covariance[i, 2])
+        shifted = noise[6] > 0.0 or noise[7] > 0.0
+        if shifted and row_answers(images, kept, used, count, normal, 0, side, right, step, factor, answers):
+            add_row_shifts(answers[:side], used, count, noise[6], noise[7], carried, variance[i], covariance[i])
         if test:
             add_planes(images, p, count)
             normal_equations(images, residual, kept, every, count, parameters, normal, gradient, scratch)
@@ -562,8 +571,39 @@ def fit(
 
 
 @jit
-def residuals(frame, kind, parameters, slopes, which, home, half, outer, reach, near_start, near_index, noise, aperture, edge, share):
-    """Return levels and residuals/√(1 − leverage) of the pixels where a shift by ``edge`` px moves the mean by less than ``share`` σ.
+def row_answers(images, weight, used, count, normal, first, stop, right, step, factor, out):
+    """How the unknowns answer to a shift of each row along x: N⁻¹ Jᵀ W ∂µ/∂x over the row; rows ``first`` … ``stop`` of ``out``."""
+    for r in range(first, stop):
+        for a in range(count):
+            total = 0.0
+            for c in range(weight.shape[1]):
+                total += weight[r, c] * images[1, r, c] * images[1 + used[a], r, c]
+            right[a] = total
+        if not solve(count, normal, right, 0.0, step, factor):
+            return False
+        out[r, :count] = step[:count]
+    return True
+
+
+@jit
+def add_row_shifts(answers, used, count, lone, field, carried, variance, covariance):
+    """Add to the covariance what rows do that are shifted by themselves (variance ``lone``), or alike in a ``field`` of every other row."""
+    carried[:] = 0.0
+    for r in range(len(answers)):
+        own, before = answers[r], carried[r % 2]
+        for a in range(count):
+            variance[used[a]] += lone * own[a] * own[a] + field * (own[a] * own[a] + 2.0 * own[a] * before[a])
+        for k in range(3):
+            a, b = (0, 0) if k == 0 else (0, 1) if k == 1 else (1, 1)
+            covariance[k] += lone * own[a] * own[b] + field * (own[a] * own[b] + own[a] * before[b] + before[a] * own[b])
+        for a in range(count):
+            before[a] = ALIKE * (before[a] + own[a])
+
+
+@jit
+def residuals(frame, kind, parameters, slopes, which, home, half, outer, reach, near_start, near_index, noise, aperture):
+    """Return what the pixels of fitted targets leave: levels, residuals/√(1 − leverage), slopes of the mean in DN per pixel; of their rows
+    (at most `ROWS` a target) the scores Σ w µ_x (d − µ), and the covariance of these under white noise.
 
     The first ``slopes`` parameters of the planes were among the unknowns.
     """
@@ -573,9 +613,10 @@ def residuals(frame, kind, parameters, slopes, which, home, half, outer, reach, 
     for w in range(len(which)):
         side = 2 * half[which[w]] + 1
         most += side * ((side + 7) // 8 * 8)
-    levels, found = np.empty(most), np.empty(most)
+    levels, found, steep = np.empty(most), np.empty(most), np.empty(most)
+    scores, spread = np.zeros((len(which), ROWS)), np.zeros((len(which), ROWS, ROWS))
     total = 0
-    quality = np.empty((len(home), 9))
+    quality = np.empty((len(home), 10))
     normal, inverse, factor = np.zeros((MOST, MOST)), np.zeros((MOST, MOST)), np.empty((MOST, MOST))
     gradient, column = np.empty(MOST), np.zeros(MOST)
     for w in range(len(which)):
@@ -602,8 +643,7 @@ def residuals(frame, kind, parameters, slopes, which, home, half, outer, reach, 
                 inverse[a] = column
         for r in range(side):
             for c in range(side):
-                steep = edge * math.hypot(images[1, r, c], images[2, r, c])
-                if seen[r, c] == 0.0 or steep * steep * weight[r, c] > share * share:
+                if seen[r, c] == 0.0:
                     continue
                 left = 1.0
                 for a in range(count):
@@ -611,8 +651,25 @@ def residuals(frame, kind, parameters, slopes, which, home, half, outer, reach, 
                         left -= weight[r, c] * inverse[a, b] * images[1 + a, r, c] * images[1 + b, r, c]
                 if left > 0.1:
                     levels[total], found[total] = images[0, r, c], residual[r, c] / math.sqrt(left)
+                    steep[total] = math.hypot(images[1, r, c], images[2, r, c])
                     total += 1
-    return levels[:total], found[:total]
+        first = max(0, (side - ROWS) // 2)
+        stop = min(side, first + ROWS)
+        answers = np.zeros((side, MOST))
+        if not row_answers(images, weight, used, count, normal, first, stop, gradient, column, factor, answers):
+            continue
+        for r in range(first, stop):
+            for c in range(side):
+                scores[w, r - first] += weight[r, c] * images[1, r, c] * residual[r, c]
+                spread[w, r - first, r - first] += weight[r, c] * images[1, r, c] * images[1, r, c]
+        for r in range(first, stop):
+            for a in range(count):
+                told = 0.0
+                for c in range(side):
+                    told += weight[r, c] * images[1, r, c] * images[1 + a, r, c]
+                for q in range(first, stop):
+                    spread[w, q - first, r - first] -= told * answers[q, a]
+    return levels[:total], found[:total], steep[:total], scores, spread
 
 
 @jit

@@ -75,7 +75,7 @@ def moment_positions(frame: np.ndarray, targets: Targets, noise: NoiseModel, nam
         work.record[:, k.THRESHOLD] = np.abs(np.floor(level + sign * threshold) + 0.5 - level)
     result, at_rest = np.full((n, 6), np.nan), np.zeros(n, bool)
     work.over(lambda a, b: k.moments(frame, work.record, a, b, law, work.noise, result, at_rest), threads)
-    return positions(work, targets, result, at_rest, s_curve, law in (k.SOFT, k.HARD))
+    return positions(work, targets, noise, result, at_rest, s_curve, law in (k.SOFT, k.HARD))
 
 
 class Prepared:
@@ -144,7 +144,13 @@ def prepare(frame: np.ndarray, targets: Targets, noise: NoiseModel, *, margin: f
 
 
 def positions(
-    work: Prepared, targets: Targets, result: np.ndarray, at_rest: np.ndarray, s_curve_px: np.ndarray, thresholded: bool = False
+    work: Prepared,
+    targets: Targets,
+    noise: NoiseModel,
+    result: np.ndarray,
+    at_rest: np.ndarray,
+    s_curve_px: np.ndarray,
+    thresholded: bool = False,
 ) -> Positions:
     """Put together what the kernels found; ``result``: x, y, var x, cov, var y, relative standard deviation of the weights' sum."""
     record = work.record
@@ -160,10 +166,40 @@ def positions(
         "threshold_dn": record[:, k.THRESHOLD].copy() if thresholded else np.full(len(record), np.nan),
     }  # fmt: skip
     phase = s_curve_px**2
+    along = phase + row_shift_variance(targets, noise)
     return Positions(
-        x_px=result[:, 0], y_px=result[:, 1], var_x_px2=result[:, 2] + phase, cov_xy_px2=result[:, 3], var_y_px2=result[:, 4] + phase,
+        x_px=result[:, 0], y_px=result[:, 1], var_x_px2=result[:, 2] + along, cov_xy_px2=result[:, 3], var_y_px2=result[:, 4] + phase,
         flags=flags, more=more,
     )  # fmt: skip
+
+
+def row_shift_variance(targets: Targets, noise: NoiseModel) -> np.ndarray:
+    """Variance of x by rows that are shifted against each other in px², shape (n,).
+
+    An operator answers to the shift of a row by the row's share of what it looks at: of the target's area, of its edges' steepness along x,
+    or of its perimeter's. All three go with the length of the row inside the target.
+    """
+    if not (noise.row_shift_px or noise.field_shift_px):
+        return np.zeros(len(targets))
+    from pixmetry.location._template_kernels import ALIKE
+
+    turn = np.deg2rad(targets.angle_deg)
+    height = np.hypot(targets.semi_major_px * np.sin(turn), targets.semi_minor_px * np.cos(turn))
+    height = np.nan_to_num(np.maximum(np.hypot(height, targets.blur_px), 1.0), nan=1.0)
+    size, of = np.unique(np.round(8 * np.log(height)).astype(int), return_inverse=True)
+    variance = np.empty(len(size))
+    for i, h in enumerate(np.exp(size / 8)):
+        row = np.arange(-math.ceil(h), math.ceil(h) + 1)
+        share = np.sqrt(np.maximum(1 - (row / h) ** 2, 0.0))
+        share /= share.sum()
+        alike = share.copy()  # K · share: within a field, falling off from line to line to both sides
+        for shares, out in ((share, alike), (share[::-1], alike[::-1])):
+            before = np.zeros(2)
+            for j, own in enumerate(shares):
+                out[j] += before[j % 2]
+                before[j % 2] = ALIKE * (before[j % 2] + own)
+        variance[i] = noise.row_shift_px**2 * (share @ share) + noise.field_shift_px**2 * (share @ alike)
+    return variance[of]
 
 
 def classes(radius: np.ndarray, blur: np.ndarray, contrast: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

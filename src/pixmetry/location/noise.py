@@ -36,6 +36,11 @@ class NoiseModel:
         Grey values at which the scale ends: what lies beyond is stored as this.
     origin : str
         Where it is from: "camera", "image", or "given".
+    slope_clear : bool
+        Whether the slope is shot noise for certain; False where an image had so few pixels to tell it that it may be a shape that does not
+        fit.
+    row_shift_px, field_shift_px : float
+        Standard deviation of the shift of each row along x by itself (line jitter), and of what neighbouring rows of a field share.
 
     Raises
     ------
@@ -50,9 +55,12 @@ class NoiseModel:
     low_dn: float = -np.inf
     high_dn: float = np.inf
     origin: str = "given"
+    slope_clear: bool = True
+    row_shift_px: float = 0.0
+    field_shift_px: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("constant_dn2", "slope_dn", "pattern_rel"):
+        for name in ("constant_dn2", "slope_dn", "pattern_rel", "row_shift_px", "field_shift_px"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value >= 0):
                 raise InputError(f"{name} cannot be used", where="noise", value=value, allowed="0 or more")
@@ -73,6 +81,8 @@ class NoiseModel:
             text += f" + {self.slope_dn:.4g} DN per DN of light above {self.black_dn:.4g}"
         if self.pattern_rel:
             text += f", sensitivities ±{self.pattern_rel:.2%}"
+        if self.row_shift_px or self.field_shift_px:
+            text += f"; rows shifted against each other by {np.hypot(self.row_shift_px, self.field_shift_px):.2g} px"
         return text
 
 

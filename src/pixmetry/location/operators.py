@@ -64,7 +64,7 @@ def operator_positions(frame: np.ndarray, targets: Targets, noise: NoiseModel, n
     # a fit that has left its target found something else
     lost = ~(np.hypot(result[:, 0] - targets.x_px, result[:, 1] - targets.y_px) < ASTRAY_PX + 0.25 * targets.semi_minor_px)
     result[lost], at_rest[lost] = np.nan, False
-    return positions(work, targets, result, at_rest, s_curve)
+    return positions(work, targets, noise, result, at_rest, s_curve)
 
 
 def _phase_variance(work: Prepared, operator: int, threads: int | None) -> np.ndarray:

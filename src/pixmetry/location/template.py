@@ -280,7 +280,7 @@ def _positions(kind: str, targets: Targets, result: Fitted, on_ground: np.ndarra
         more |= {"semi_major_px": half + spread, "semi_minor_px": half - spread, "angle_deg": np.rad2deg(0.5 * np.arctan2(2 * xy, xx - yy))}
     more |= {"chi2_per_dof": result.chi2_per_dof, "dof": result.dof, "steps": result.steps}
     poor = result.chi2_per_dof > 1 + POOR_SIGMA * np.sqrt(2 / np.maximum(result.dof, 1))
-    worst = np.sqrt(result.variance[:, :2].max(axis=1))
+    worst = np.sqrt(result.noise_var_px2)
     flags = targets.flags.astype(np.uint32)
     for flag, where in (
         (Flag.NOT_CONVERGED, ~result.at_rest),

@@ -72,7 +72,8 @@ class Windows:
     def numbers(self) -> np.ndarray:
         """The noise model as the kernels want it."""
         n = self.noise
-        return np.array([n.constant_dn2, n.slope_dn, n.pattern_rel, n.black_dn, n.low_dn, n.high_dn])
+        about = n.constant_dn2, n.slope_dn, n.pattern_rel, n.black_dn, n.low_dn, n.high_dn
+        return np.array([*about, n.row_shift_px**2, n.field_shift_px**2])
 
 
 @dataclass(frozen=True)
@@ -90,6 +91,7 @@ class Fitted:
     cut: np.ndarray
     at_top: np.ndarray
     at_bottom: np.ndarray
+    noise_var_px2: np.ndarray  # the larger one of x and y, without the shifts of rows
 
     def put(self, which: np.ndarray, part: Fitted) -> Fitted:
         """These, with some of them replaced by those of another fit."""
@@ -153,7 +155,7 @@ def run_fit(
     free = np.ones(count, bool)
     free[-4:-2], free[-2:] = background_plane, light_plane
     parameters, variance, covariance = np.full((n, count), np.nan), np.full((n, count), np.nan), np.full((n, 3), np.nan)
-    quality = np.full((n, 9), np.nan)
+    quality = np.full((n, 10), np.nan)
 
     chunk = min(CHUNK, max(8, len(which) // 8))
 
@@ -170,8 +172,8 @@ def run_fit(
     map_tiles(piece, range(0, len(which), chunk), threads)
     dof = quality[:, 1] - free.sum()
     reduced, steps = quality[:, 0] / np.maximum(dof, 1), quality[:, 5]
-    cut, top, bottom = quality[:, 6] > 0, quality[:, 7], quality[:, 8]
-    return Fitted(parameters, variance, covariance, reduced, dof, quality[:, 2:5], np.abs(steps), steps > 0, cut, top, bottom)
+    cut, (top, bottom, alone) = quality[:, 6] > 0, quality[:, 7:].T
+    return Fitted(parameters, variance, covariance, reduced, dof, quality[:, 2:5], np.abs(steps), steps > 0, cut, top, bottom, alone)
 
 
 def with_second_start(
