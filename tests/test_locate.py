@@ -357,6 +357,32 @@ def test_a_file_that_cannot_be_used_is_named_and_nothing_is_written(image: Path,
     assert "missing" in refused(tmp_path / "none.png", "-o", tmp_path / "t.csv") and not (tmp_path / "t.csv").exists()
 
 
+def test_nothing_found_is_told_by_the_exit_status_and_the_table_is_written(image: Path, tmp_path: Path) -> None:
+    from pixmetry.campaign import write_frame
+
+    empty = np.clip(np.rint(np.random.default_rng(0).normal(20, 1.5, SHAPE)), 0, 255).astype(np.uint8)
+    write_frame(tmp_path / "empty.png", empty, 8)
+    for arguments in (["--kind", "disc"], ["--kind", "chessboard", "--grid", "9x6"]):
+        done = CliRunner().invoke(main, ["locate", str(tmp_path / "empty.png"), "-o", str(tmp_path / "t.csv"), *arguments])
+        assert done.exit_code == 1 and done.stderr.count("\n") == 1 and f"nothing found: no {arguments[1]} in empty.png" in done.stderr
+        assert "x_px" in (tmp_path / "t.csv").read_text()
+    run(image, tmp_path / "empty.png", "-o", tmp_path / "t.csv")  # one of two has targets: exit status 0
+
+
+def test_a_folder_is_taken_in_order_and_what_is_skipped_is_named(tmp_path: Path) -> None:
+    from pixmetry.campaign import write_frame
+
+    (tmp_path / "made" / "frames").mkdir(parents=True)
+    for i in (2, 0, 1):
+        write_frame(tmp_path / "made" / "frames" / f"frame_0000{i}.png", frame_of(i)[0], 8)
+    (tmp_path / "made" / "truth.json").write_text("{}")
+    (tmp_path / "made" / "frames" / "notes.txt").write_text("none")
+    for folder in (tmp_path / "made", tmp_path / "made" / "frames"):  # what `simulate` wrote, and the images themselves
+        done = CliRunner().invoke(main, ["locate", str(folder), "-o", str(tmp_path / "t.json")])
+        assert done.exit_code == 0 and "skipped" in done.stderr and "notes.txt" in done.stderr and "truth.json" not in done.stderr
+        assert [i["name"] for i in json.loads((tmp_path / "t.json").read_text())["images"]] == [f"frame_0000{i}.png" for i in range(3)]
+
+
 def test_the_estimators_are_listed(image: Path) -> None:
     assert all(name in run(image, "--estimator", "list", "--kind", "line") for name in estimators("line"))
 

@@ -22,9 +22,13 @@ from pixmetry.core.errors import PixmetryError
 
 EXIT_ERROR = 2
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as a shell reports it
+COMPILING = (
+    "compiling kernels for this processor, once after an installation or an upgrade: a minute or so for this command; "
+    "`pixmetry warm-up` does it for all of them"
+)
 _OS_REMEDIES = {errno.ENOSPC: "make room, or choose another folder", errno.ENAMETOOLONG: "choose a shorter name"}
 
-# Each command lives in the module of its name below this package, as a click command of that name.
+# Each command lives in the module of its name below this package (- is _ there), as a click command of that name.
 COMMANDS = {
     "assess": "Assess a camera from its frames: measure, budget, advise, and write the report.",
     "emva1288": "Test a camera by EMVA 1288: the data sheet, with uncertainties.",
@@ -36,6 +40,7 @@ COMMANDS = {
     "bound": "Say how well a target can be located, what estimators give, and what limits them.",
     "correct": "Take out of frames what was measured in an assessment.",
     "compare": "Say what changed between two measurements, who stands out of a fleet, and what keeps its limits.",
+    "warm-up": "Compile the kernels of all commands, so that none has to wait for it later.",
 }
 
 
@@ -70,7 +75,8 @@ class LazyGroup(click.Group):
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         if cmd_name not in COMMANDS:
             return None
-        return getattr(import_module(f"{__name__}.{cmd_name}"), cmd_name)
+        name = cmd_name.replace("-", "_")
+        return getattr(import_module(f"{__name__}.{name}"), name)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Commands"):
@@ -83,6 +89,9 @@ class LazyGroup(click.Group):
             raise _told(problem) from None
 
     def invoke(self, ctx: click.Context) -> Any:
+        from pixmetry.core.compiling import tell_when_compiling
+
+        tell_when_compiling(lambda: click.echo(COMPILING, err=True))
         try:
             return super().invoke(ctx)
         except click.UsageError as problem:

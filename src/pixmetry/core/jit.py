@@ -25,6 +25,8 @@ from typing import Any
 
 import numpy as np
 
+from pixmetry.core.compiling import note_compiling
+
 PACKAGE_ROOT = Path(__file__).resolve().parents[1]
 KERNEL_FILE = re.compile(r"_(.+_)?kernels\.py")
 DEFAULTS = {"nogil": True, "cache": True, "fastmath": False, "error_model": "numpy"}
@@ -60,6 +62,11 @@ class Kernel:
                 if self._dispatcher is None:
                     self._dispatcher = _compile(self.py_func, self.options)
         return self._dispatcher
+
+    @property
+    def compiled(self) -> bool:
+        """Whether this process has machine code for it, compiled or from the cache."""
+        return bool(getattr(self._dispatcher, "signatures", ()))
 
     def __call__(self, *args: Any) -> Any:
         return (self._dispatcher or self.dispatcher)(*[_plain(a) if isinstance(a, np.ndarray) else a for a in args])
@@ -135,6 +142,22 @@ def _teach_numba() -> None:
         def _typeof_kernel(value: Kernel, _context: Any) -> Any:
             return types.Dispatcher(value.dispatcher)
 
+        _watch_numba()
+
+
+def _watch_numba() -> None:
+    """Take note of all that Numba compiles, which is nothing where the cache on disk has it."""
+    from numba.core import event
+
+    class Watch(event.Listener):
+        def on_start(self, event: Any) -> None:
+            note_compiling()
+
+        def on_end(self, event: Any) -> None:
+            note_compiling()
+
+    event.register("numba:compile", Watch())
+
 
 def _stamp(file: str) -> tuple[int, int] | None:
     try:
@@ -151,11 +174,11 @@ def _cache_folder(function: Callable[..., Any]) -> Path | None:
     if any(stamp is None or _stamp(file) != stamp for file, stamp in used.items()):
         return None  # made interactively, or edited since it was imported: what runs is not what the files say
     root = _cache_root()
-    folder = root / _hash([*_kernel_files(PACKAGE_ROOT), Path(__file__)], _platform())
+    folder = root / _package_hash()
     if not folder.exists():
         _remove_old(root)
     if own:
-        neighbours = {path for file in own for path in _kernel_files(_top_folder(Path(file)))}
+        neighbours = {path for file in own for path in kernel_files(_top_folder(Path(file)))}
         folder = folder / _hash(sorted(neighbours | {Path(file) for file in own}), "")
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -163,6 +186,16 @@ def _cache_folder(function: Callable[..., Any]) -> Path | None:
     except OSError:
         return None
     return folder
+
+
+def cache_folder() -> Path | None:
+    """Return the folder of the compiled kernels of this package, or None where there is none yet."""
+    folder = _cache_root() / _package_hash()
+    return folder if folder.is_dir() else None
+
+
+def _package_hash() -> str:
+    return _hash([*kernel_files(PACKAGE_ROOT), Path(__file__)], _platform())
 
 
 def _files_reached(function: Callable[..., Any]) -> set[str]:
@@ -196,7 +229,8 @@ def _top_folder(file: Path) -> Path:
     return folder
 
 
-def _kernel_files(folder: Path) -> list[Path]:
+def kernel_files(folder: Path) -> list[Path]:
+    """Name the files of kernels in a folder; in a package, also in the folders below it."""
     in_package = (folder / "__init__.py").exists() or folder == PACKAGE_ROOT
     found = folder.rglob("_*kernels.py") if in_package else folder.glob("_*kernels.py")
     return sorted(path for path in found if KERNEL_FILE.fullmatch(path.name))

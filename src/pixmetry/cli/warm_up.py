@@ -1,0 +1,27 @@
+"""``pixmetry warm-up``: compile all kernels into the cache."""
+
+from __future__ import annotations
+
+import click
+
+
+@click.command("warm-up")
+def warm_up() -> None:
+    """Compile the kernels of all commands into the cache, by running each on something small.
+
+    Kernels are compiled for this processor when they are first needed, once after an installation or an upgrade, which makes the first
+    run of a command wait for a minute or so. This does it for all of them at once, in some minutes. The cache is in the folder that
+    PIXMETRY_CACHE_DIR names, else in the user's cache.
+    """
+    import time
+
+    from pixmetry.cli._progress import shown_progress
+    from pixmetry.cli._warming_up import warm_up as run
+    from pixmetry.core.compiling import tell_when_compiling
+
+    tell_when_compiling(None)
+    begun = time.monotonic()
+    with shown_progress() as progress:
+        count, folder = run(progress)
+    where = f"in {folder}" if folder is not None else "for this process only: no folder can be written to"
+    click.echo(f"{count} kernels are compiled, {where} ({time.monotonic() - begun:.0f} s)")
