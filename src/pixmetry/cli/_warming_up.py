@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from pixmetry.core.compiling import tell_when_compiling
 from pixmetry.core.errors import PixmetryError
 from pixmetry.core.jit import PACKAGE_ROOT, Kernel, cache_folder, kernel_files
 
@@ -43,8 +44,9 @@ plate:
   pose: {{principal_distance_px: 2000, z_mm: 1000, omega_deg: {omega}, phi_deg: {phi}, kappa_deg: {kappa}}}"""
 PLATES = {
     "chessboard": "kind: chessboard\n  rows: 7\n  columns: 9\n  square_mm: 20",
-    "disc": "kind: dots\n  rows: 7\n  columns: 9\n  pitch_mm: 20\n  diameter_mm: 9",
+    "dots": "kind: dots\n  rows: 7\n  columns: 9\n  pitch_mm: 20\n  diameter_mm: 9",
 }
+BOUNDS = ("disc --radius 3.5", "ellipse --semi-major 5 --semi-minor 3", "ring --radius 6 --inner-radius 3", "line --length 50")
 POSES = ((0, 0, 0), (25, 5, 0), (-25, 5, 90), (5, 25, 0), (5, -25, 90), (20, 20, 45))
 TYPES = (np.uint8, np.uint16, np.float32)
 
@@ -118,7 +120,7 @@ def jobs_in(folder: Path) -> Iterator[Job]:
     yield command("assess", manifest, "-o", folder / "assessed", "--trials", 200)
     yield command("assess", "-o", folder / "example", "--trials", 200)
     yield command("correct", folder / "series" / "frames", "--with", folder / "assessed" / "results.json", "-o", folder / "corrected")
-    yield command("emva1288", manifest, "--report", folder / "sheet.html", "--bootstrap", 4)
+    yield command("emva1288", manifest, "--report", folder / "sheet.html", "--bootstrap", 100)
     for kind, plate in PLATES.items():
         for i, (omega, phi, kappa) in enumerate(POSES):
             posed = scene(f"{kind}-{i}", PLATE.format(plate=plate, omega=omega, phi=phi, kappa=kappa))
@@ -129,10 +131,8 @@ def jobs_in(folder: Path) -> Iterator[Job]:
         copies = folder / "boards" / f"{kind}-images"
         yield "calibrate", partial(_numbered, images, copies)
         yield command("calibrate", copies, "--kind", kind, *options, "--pitch-mm", 20, "-o", folder / f"calibrated-{kind}")
-        if kind == "chessboard":
-            yield command("calibrate", copies, "--kind", "lines", "-o", folder / "calibrated-lines")
     yield from _locating()
-    for kind in ("disc --radius 3.5", "ellipse --semi-major 5 --semi-minor 3", "ring --radius 6 --inner-radius 3", "line --length 50"):
+    for kind in BOUNDS:
         yield command("bound", "--kind", *kind.split(), "--blur", 0.7, "--amplitude", 150, "--camera", PRESET, "--estimator", "all")
 
 
@@ -142,6 +142,7 @@ def _run(arguments: list[str]) -> None:
 
     with redirect_stdout(StringIO()), redirect_stderr(StringIO()):
         main.main(arguments, standalone_mode=False)
+    tell_when_compiling(None)
 
 
 def _numbered(images: list[Path], folder: Path) -> None:
@@ -177,10 +178,10 @@ def _pictures() -> dict[str, tuple[np.ndarray, dict[str, Any]]]:
         return np.clip(np.rint(20 + 150 * image + noise), 0, 255)
 
     centres = [(cx + 0.3 * (cy % 7), cy + 0.2 * (cx % 5)) for cy in range(30, 190, 32) for cx in range(30, 230, 32)]
-    discs = sum(soft(np.hypot(x - a, y - b) - 5) for a, b in centres)
-    ellipses = sum(soft((np.hypot((x - a) / 7, (y - b) / 4) - 1) * 5) for a, b in centres)
-    rings = sum(soft(np.hypot(x - a, y - b) - 8) - soft(np.hypot(x - a, y - b) - 4) for a, b in centres)
-    spots = sum(np.exp(-((x - a) ** 2 + (y - b) ** 2) / 4.5) for a, b in centres)
+    discs = np.sum([soft(np.hypot(x - a, y - b) - 5) for a, b in centres], axis=0)
+    ellipses = np.sum([soft((np.hypot((x - a) / 7, (y - b) / 4) - 1) * 5) for a, b in centres], axis=0)
+    rings = np.sum([soft(np.hypot(x - a, y - b) - 8) - soft(np.hypot(x - a, y - b) - 4) for a, b in centres], axis=0)
+    spots = np.sum([np.exp(-((x - a) ** 2 + (y - b) ** 2) / 4.5) for a, b in centres], axis=0)
     line = soft(np.abs(y - 100 - 0.1 * (x - 120)) - 1.5)
     across = np.maximum(line, soft(np.abs(x - 120 + 0.1 * (y - 100)) - 1.5))
     u, v = x * 0.99 + y * 0.1, y * 0.99 - x * 0.1

@@ -172,8 +172,9 @@ def _leftovers(
         return residuals(windows.frame, windows.code, fitted.parameters, slopes, good, *about, windows.aperture_px)
 
     pieces = map_tiles(piece, np.array_split(np.flatnonzero(fitted.at_rest), PIECES), threads)
-    parts = [np.concatenate(values) for values in zip(*pieces, strict=True)]
-    return Leftovers(*parts, np.where(fitted.at_rest[:, None], fitted.parameters, windows.start))
+    level, residual, steep, score, spread = (np.concatenate(values) for values in zip(*pieces, strict=True))
+    parameters = np.where(fitted.at_rest[:, None], fitted.parameters, windows.start)
+    return Leftovers(level, residual, steep, score, spread, parameters)
 
 
 def _fitted(left: Leftovers, guess: NoiseModel, least: float) -> NoiseModel:
