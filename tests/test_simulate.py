@@ -457,3 +457,14 @@ def test_a_name_gives_no_orders_to_a_terminal(folder: Path) -> None:
         result = CliRunner().invoke(main, list(arguments))
         assert result.exit_code == 2 and result.output.count("\n") == 1
         assert not re.search(r"[\x00-\x09\x0b-\x1f\x7f-\x9f\u202e]", result.output)
+
+
+@pytest.mark.parametrize("coder", ["", "- source: storage.jpeg\n"])
+def test_the_manifest_of_a_series_says_what_its_files_do_not_show(folder: Path, coder: str) -> None:
+    """Which part of the frame they are, and whether a coder in the camera's chain changed what was then stored without loss."""
+    (folder / "coded.yaml").write_text(CAMERA.replace("bits: 12, offset_dn: 40", "bits: 8, offset_dn: 4") + coder)
+    done(run(folder, "--window", "8,16,24,32", scene="series.yaml", camera="coded.yaml"))
+    campaign = load_campaign(folder / "out")
+    facts, camera = campaign.camera, load_camera(folder / "coded.yaml")
+    assert facts.lossless is not bool(coder)
+    assert (facts.sensor_shape, facts.first_row, facts.first_col, campaign.frame_shape) == (camera.output_shape, 8, 16, (24, 32))

@@ -22,6 +22,7 @@ from pixmetry.scene.uniform import Uniform
 
 SERIES_SCHEMA = "pixmetry/campaign/1"
 Window = tuple[int, int, int, int]
+LOSSY = ("storage.jpeg", "storage.video_codec")  # sources that are lossy coders
 RECORD_BYTES = 350  # what truth.json says of a frame, in memory
 
 
@@ -154,7 +155,7 @@ def simulate(
                 told("exposing frames", len(notes.frames), count)
         if model.photon_transfer is not None:
             temperature_c = float(np.mean([f["temperature_c"] for f in notes.frames]))  # not the settled one while a camera warms up
-            _write_manifest(device, bits, round(temperature_c, 3), parts, files, folder)
+            _write_manifest(device, bits, round(temperature_c, 3), parts, files, folder, window)
         changed = {"overrides": dict(overrides or {}), "off": list(off)}
         inputs = _hashes(camera, scene)
         write_json(folder / "truth.json", notes.record() | changed | {"provenance": provenance_record(inputs, seed=seed)})
@@ -227,14 +228,24 @@ def _series(model: SceneModel, frames: int, overrides: Mapping[str, Any] | None)
 
 
 def _write_manifest(
-    camera: Camera, bits: int, temperature_c: float, parts: Sequence[_Part], files: Sequence[Sequence[str]], folder: Path
+    camera: Camera,
+    bits: int,
+    temperature_c: float,
+    parts: Sequence[_Part],
+    files: Sequence[Sequence[str]],
+    folder: Path,
+    window: Window | None,
 ) -> None:
+    """Write the manifest of a series; the files do not show that a source of the camera coded their frames before."""
     from pixmetry.core.config import dump_yaml
 
     facts: dict[str, Any] = {"name": camera.name, "bits": bits, "interface": camera.facts.get("interface", "digital")}
     facts |= {"temperature_c": temperature_c} | ({"sensor": camera.facts["sensor"]} if "sensor" in camera.facts else {})
     if camera.pitch_um is not None:
         facts |= {"pitch_x_um": camera.pitch_um[0], "pitch_y_um": camera.pitch_um[1]}
+    facts["lossless"] = not any(e.source.id in LOSSY for e in camera.active)
+    if window is not None:
+        facts |= dict(zip(("sensor_rows", "sensor_cols", "first_row", "first_col"), (*camera.output_shape, *window[:2]), strict=True))
     entries = [dict(p.entry or {}) | {"files": list(names)} for p, names in zip(parts, files, strict=True)]
     dump_yaml({"schema": SERIES_SCHEMA, "camera": facts, "frames": entries}, folder / "campaign.yaml")
 
