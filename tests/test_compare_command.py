@@ -251,7 +251,23 @@ ASSESSMENT = {
         "sensor.smear": [ESTIMATE | {"name": "ratio", "value": 0.01, "unit": "1"}],
     },
     "unmeasured": {},
-    "budget": {"target": {"kind": "disc"}, "estimator": {"name": "template"}, "verdicts": [{"total_px": 0.0123}]},
+    "photon_transfer": {"estimates": [ESTIMATE]},
+    "budget": {
+        "target": {"kind": "disc", "diameter_px": 7.0},
+        "estimator": {"name": "template"},
+        "rows": [
+            {
+                "name": "sensor.shot_noise",
+                "status": "modelled",
+                "total_px": 0.0123,
+                "u_of_total_px": 0.0,
+                "contribution": {"model_error": 0.1, "floor_px": 2e-4},
+            }
+        ],
+        "headline": {"by": "sum", "se_simulated_px": 0.001},
+        "verdicts": [{"total_px": 0.0123, "frames": 1}],
+        "with_accepted": [{"total_px": 0.0123, "frames": 1}],
+    },
 }
 
 
@@ -274,10 +290,44 @@ def test_assessments_are_compared(tmp_path: Path) -> None:
         "electronics.gain.gain_dn_per_e": "changed",
         "sensor.dsnu.row_std_e": "same",
         "sensor.smear.ratio": "only A",
+        "photon_transfer.gain_dn_per_e": "changed",
+        "budget.target.diameter_px": "equal",
+        "budget.sensor.shot_noise": "same",
+        "budget.verdict.1_frames": "same",
+        "budget.with_accepted.1_frames": "same",
+        "budget.estimator": "equal",
+        "budget.target": "equal",
     }
     assert result.of("only A")[0].reason == "no bright spots"
     assert any("0.0123" in note for note in result.notes)
     assert compare(one, one).same
+
+
+def test_the_budget_of_assessments_is_compared(tmp_path: Path) -> None:
+    """A worse verdict is a change in u: of a modelled row half of its declared model error, 5 %, and the gain's 0.36 %."""
+    one = assessment(tmp_path / "a")
+    record = json.loads((one / "results.json").read_text())
+    budget = record["budget"]
+    for part in (budget["rows"][0], budget["verdicts"][0], budget["with_accepted"][0]):
+        part["total_px"] = 0.0200
+    budget["target"]["diameter_px"], budget["estimator"] = 5.0, {"name": "fixed_soft_threshold", "window": 13, "sigma": 3.0}
+    two = tmp_path / "b"
+    two.mkdir()
+    (two / "results.json").write_text(json.dumps(record))
+    result = compare(one, two)
+    found = verdicts(result)
+    assert found["budget.verdict.1_frames"] == found["budget.sensor.shot_noise"] == "changed" and not result.same
+    assert found["budget.target.diameter_px"] == found["budget.estimator"] == "differs"
+    row = next(r for r in result.rows if r.key == "budget.verdict.1_frames")
+    assert row.u == pytest.approx(math.hypot(0.0123, 0.02) * math.hypot(0.05, 0.001 / 0.28), rel=1e-6)
+    assert "template" in next(r.reason for r in result.rows if r.key == "budget.estimator")
+    assert not any("identical" in note for note in result.notes) and any("estimator differ" in note for note in result.notes)
+    json.dumps(result.to_record(), allow_nan=False)
+    assert result.decisions == 3  # gain (in two places), smear, and the total: its one row, the verdict, that with what is accepted
+    budget["headline"] = {"by": "Monte Carlo", "se_simulated_px": 0.001}
+    (two / "results.json").write_text(json.dumps(record))
+    by_chance = next(r for r in compare(two, two).rows if r.key == "budget.verdict.1_frames")
+    assert by_chance.a.u == pytest.approx(math.hypot(0.02 * math.hypot(0.05, 0.001 / 0.28), 0.001))
 
 
 def run(*arguments: object) -> Result:

@@ -17,7 +17,18 @@ from pixmetry.core.checksums import check_record
 from pixmetry.core.errors import InputError
 from pixmetry.emva.differences import Difference, Subject, decided, difference_of, family, holm
 from pixmetry.emva.fleet import FleetRow, fleet_chance, fleet_row
-from pixmetry.emva.formats import SCHEMA, is_xml, number_of, parse_json, plain, read_bytes, read_sheet, sheet_of_record, value_record
+from pixmetry.emva.formats import (
+    SCHEMA,
+    is_xml,
+    number_of,
+    parse_json,
+    plain,
+    read_bytes,
+    read_sheet,
+    sheet_of_record,
+    value_of,
+    value_record,
+)
 from pixmetry.emva.records import MONO, DataSheet, Value
 
 if TYPE_CHECKING:
@@ -120,19 +131,72 @@ def _of_sheet(sheet: DataSheet, name: str) -> Subject:
 
 
 def _of_assessment(record: Mapping[str, Any], name: str, where: str) -> Subject:
-    values: dict[tuple[str, str], Value] = {}
+    values: dict[str, Value] = {}
     try:
-        for source, estimates in record["estimates"].items():
-            for e in estimates:
-                dof = math.inf if e["dof"] is None else float(e["dof"])
-                limit = e["kind"] == "upper_limit"
-                value = Value(float(e["value"]), float(e["u"]), dof, e["unit"], e["method"], e["reason"], limit)
-                values[MONO, f"{source}.{e['name']}"] = value
+        transfer = (record.get("photon_transfer") or {}).get("estimates", [])
+        groups = {**record["estimates"], "photon_transfer": transfer, "spatial": record.get("spatial") or []}
+        for source, estimates in groups.items():
+            values |= {f"{source}.{e['name']}": _estimate(e) for e in estimates}
+        results = (record.get("emva1288") or {}).get("results", {})
+        standard = {k: v for k, v in results.items() if not k.startswith("index_")}
+        values |= {f"emva1288.{key}": value_of(v, f"{where}: emva1288.{key}") for key, v in standard.items()}
         budget = record["budget"]
-        worth = ((budget["target"], budget["estimator"]["name"]), float(budget["verdicts"][0]["total_px"]))
-        return Subject(name, "assessment", "", dict(record["camera"]), values, dict(record["unmeasured"]), worth=worth)
+        values |= _of_budget(budget, _gain_u_rel(groups["photon_transfer"]))
+        how = {"estimator": _estimator_text(budget["estimator"]), "target": str(budget["target"]["kind"])}
+        worth = ((budget["target"], how["estimator"]), float(budget["verdicts"][0]["total_px"]))
+        placed = {(MONO, key): value for key, value in values.items()}
+        return Subject(name, "assessment", "", dict(record["camera"]), placed, dict(record["unmeasured"]), worth=worth, how=how)
     except (KeyError, IndexError, TypeError, AttributeError, ValueError):
         raise InputError("damaged results of an assessment", where=where, remedy="make the assessment again") from None
+
+
+def _estimate(e: Mapping[str, Any]) -> Value:
+    dof = math.inf if e["dof"] is None else float(e["dof"])
+    return Value(float(e["value"]), float(e["u"]), dof, e["unit"], e["method"], e["reason"], e["kind"] == "upper_limit")
+
+
+def _gain_u_rel(estimates: Iterable[Mapping[str, Any]]) -> float:
+    """Relative uncertainty of the gain, on which every number of a budget rests."""
+    return next((float(e["u"]) / float(e["value"]) for e in estimates if e["name"] == "gain_dn_per_e" and e["value"]), 0.0)
+
+
+def _estimator_text(estimator: Mapping[str, Any]) -> str:
+    """Name and settings; not what follows from camera and target."""
+    settings = {k: estimator[k] for k in ("window", "sigma") if estimator.get(k) is not None}
+    return ", ".join([str(estimator["name"]), *(f"{k} = {v:g}" for k, v in settings.items())])
+
+
+def _of_budget(budget: Mapping[str, Any], gain_u_rel: float) -> dict[str, Value]:
+    """Target, rows and totals of a budget, with u of what repeating the measurement would change.
+
+    Of a measured row that is what its parameters leave open, of all others half of what its formula declares to leave open; with both the
+    gain's. A total holds the rows', each as far as it counts, and the error of chance where it is by Monte Carlo.
+    """
+    units = {True: "px", False: "1"}
+    values = {f"budget.target.{k}": Value(float(v), 0.0, math.inf, units[k.endswith("_px")]) for k, v in _numbers(budget["target"])}
+    squares = {True: 0.0, False: 0.0}
+    for row in budget.get("rows", ()):
+        contribution, total = row["contribution"], float(row["total_px"])
+        if contribution is None or row["status"] in ("not applicable", "left to calibration"):
+            continue
+        formula = 0.5 * max(float(contribution["model_error"]) * total, float(contribution["floor_px"]))
+        known = float(row["u_of_total_px"]) if row["status"] == "measured" else formula
+        u = math.hypot(known, gain_u_rel * total)
+        values[f"budget.{row['name']}"] = Value(total, u, math.inf, "px", row["status"], "")
+        squares[row["status"] == "accepted"] += (total * u) ** 2
+    by = budget.get("headline") or {}
+    chance = float(by.get("se_simulated_px") or 0.0) if by.get("by") == "Monte Carlo" else 0.0
+    for group, square in (("verdicts", squares[False]), ("with_accepted", squares[False] + squares[True])):
+        for one in budget.get(group, ()):
+            total = float(one["total_px"])
+            u = math.hypot(math.sqrt(square) / total if total else 0.0, chance)
+            key = f"budget.{'verdict' if group == 'verdicts' else group}.{one.get('frames', 1)}_frames"
+            values[key] = Value(total, u, math.inf, "px", str(by.get("by", "sum")), "")
+    return values
+
+
+def _numbers(record: Mapping[str, Any]) -> list[tuple[str, float]]:
+    return [(k, v) for k, v in record.items() if isinstance(v, int | float) and not isinstance(v, bool)]
 
 
 def compare(
@@ -176,12 +240,29 @@ def compare(
         raise InputError("no channel in common", where=f"{one.name}, {two.name}", remedy="compare sheets with the same colours")
     keys = [place for place in {**one.values, **two.values} if place[0] in channels]
     rows = [difference_of(place, one, two, same_light) for place in keys]
-    changed, decisions = holm([row.p for row in rows], [family(row.channel, row.key) for row in rows], 1 - level)
+    changed, decisions = holm([row.p for row in rows], _families(rows), 1 - level)
     rows = [decided(row, place in changed) for place, row in enumerate(rows)]
+    rows += [_how(key, one.how[key], two.how[key]) for key in one.how if key in two.how]
     notes = _notes((one, two))
     if all(row.verdict in ("same", "equal") and not row.difference > 0 and not row.difference < 0 for row in rows):
         notes.append("all values are identical: two copies of one measurement")
     return Comparison((one.name, two.name), one.kind, level, tuple(rows), decisions, tuple(notes))
+
+
+def _families(rows: Sequence[Difference]) -> list[Any]:
+    """Rows that say the same thing: by their keys, or by their numbers where several parts of an assessment hold one value."""
+    first: dict[Any, Any] = {}
+    found = []
+    for row in rows:
+        numbers = (row.unit, *((v.value, v.u) if v else None for v in (row.a, row.b)))
+        found.append(first.setdefault(numbers, family(row.channel, row.key)) if row.p == row.p else family(row.channel, row.key))
+    return found
+
+
+def _how(key: str, a: str, b: str) -> Difference:
+    """A row for what is no number."""
+    verdict, reason = ("equal", a) if a == b else ("differs", f"{a} in A, {b} in B")
+    return Difference(MONO, f"budget.{key}", "", None, None, verdict=verdict, reason=reason)
 
 
 def _check_level(level: float) -> None:
@@ -205,6 +286,8 @@ def _notes(subjects: Sequence[Subject], passed_over: frozenset[str] = frozenset(
         notes.append(f"left out, as not all have them: channels {', '.join(rest)}")
     if all(s.worth for s in subjects) and len({str(s.worth[0]) for s in subjects}) == 1:
         notes.append(f"a coordinate of one target in one frame is worth {', '.join(f'{s.worth[1]:.3g}' for s in subjects)} px (k = 1)")
+    elif all(s.worth for s in subjects):
+        notes.append("target or estimator differ: what a coordinate is worth is not that of one task")
     return notes
 
 
@@ -248,7 +331,9 @@ def compare_fleet(sources: Iterable[DataSheet | str | Path], *, level: float = 0
     common = channels[0].intersection(*channels)
     if not common:
         raise InputError("no channel in common", remedy="compare sheets with the same colours")
-    places = dict.fromkeys(place for s in subjects for place in s.values if place[0] in common and not place[1].startswith("index_"))
+    # settings, and what is there under another name
+    passed_over = ("index_", "budget.target.", "photon_transfer.", "spatial.", "emva1288.")
+    places = dict.fromkeys(place for s in subjects for place in s.values if place[0] in common and not place[1].startswith(passed_over))
     rows = [row for place in places if (row := fleet_row(place, subjects)) is not None]
     flat = [(i, j, score) for i, row in enumerate(rows) for j, score in enumerate(row.scores)]
     p = [fleet_chance(sum(map(math.isfinite, rows[i].values)), score) for i, _, score in flat]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from pixmetry.emva.keys import NONLINEAR, goes_with_photons
@@ -36,6 +36,7 @@ class Subject:
     absent: Mapping[str, str]  # by source of an assessment: why it was not measured
     photons_u_rel: float = 0.0
     worth: tuple[Any, float] | None = None  # of an assessment: target and estimator, and u of its place, px
+    how: Mapping[str, str] = field(default_factory=dict)  # of an assessment: what is no number, such as the estimator
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,8 @@ from pixmetry.emva.temporal import dark_line
 from pixmetry.experiment.stack import same_exposure
 
 SWEPT_SHARE = 0.01  # of the slope of the response
-BROKEN = 5.0  # u below zero from which a square is no chance any more (3e-7)
+BROKEN = 5.0  # u below zero from which a square is no chance any more
+CHANCE = 3e-7  # of that
 WANTED_LEVELS, WANTED_DARK_LEVELS = 50, 6  # R4.0 §6.5, §7.1
 BOUNDED_BY_DARK_NOISE = ("sigma_y_dark", "sigma_d", "u_p_min", "u_p_min_area", "u_e_min", "u_e_min_area")
 DARK_PATTERN = ("DSNU1288", "DSNU1288_DN", "DSNU1288_row", "DSNU1288_col", "DSNU1288_pixel", "general_DSNU")
@@ -81,11 +82,30 @@ def lifted(key: str, formulas: Formulas, measured: Values) -> float:
 
 
 def breaks_the_split(key: str, case: Case) -> bool:
-    """Whether the square behind a root lies so far below zero that what the split into parts rests on does not hold."""
-    if key not in case.squares:
+    """Whether the square behind a root lies so far below zero that what the split into parts rests on does not hold.
+
+    It must be neither the noise that u holds nor the chance by which the pattern of independent pixels came out: the means of M lines of
+    it have a mean square that is chi-square on M − 1, and PRNU has the product of dark pattern and response beside it.
+    """
+    if key not in case.squares or case.formulas.stacks is None:
         return False
     square = float(case.squares[key]) + lifted(key, case.formulas, case.measured)
-    return square < -BROKEN * case.spread.u_square.get(key, math.inf)
+    if not square < -BROKEN * case.spread.u_square.get(key, math.inf):
+        return False
+    rows, cols = case.formulas.stacks[0].shape
+    base, _, part = key.partition("_")
+    lines, length = {"row": (rows, cols), "col": (cols, rows)}.get(part, (rows * cols, 1))
+    if base == "PRNU1288":
+        dark = float(case.squares["DSNU1288_DN"]) * (100 / _light_dn(case)) ** 2
+        if not square < -BROKEN * 2 * max(dark, 0.0) / (length * math.sqrt(lines)):
+            return False
+    if part in ("row", "col"):
+        from scipy.special import chdtr
+
+        pixel = float(case.squares.get(f"{base}_pixel", 0.0))
+        share = max(1 + square * length / pixel, 0.0) if pixel > 0 else 0.0  # of what such pixels give
+        return float(chdtr(lines - 1, share * (lines - 1))) < CHANCE
+    return True
 
 
 def reason_for(key: str, case: Case) -> str:
@@ -176,7 +196,7 @@ def _broken(key: str, case: Case) -> str:
     square = float(case.squares[key])
     in_u = f"{square / case.spread.u_square[key]:.0f} u" if case.spread.u_square[key] > 0 else "many u"
     behind = f"the variance behind it is far below zero ({square:.3g} in {key_of(key).unit} squared, {in_u})".replace("-", "−")
-    if key.startswith("PRNU"):
+    if key.startswith("PRNU") and float(case.squares["PRNU1288"]) < 0:
         dark = float(case.squares["DSNU1288_DN"])
         if dark * (100 / _light_dn(case)) ** 2 > abs(square):  # the dark pattern is what was taken off
             at_top = case.m.bright_stack.fraction_max if case.m.bright_stack is not None else 0.0

@@ -16,7 +16,7 @@ from pixmetry.experiment.photon_transfer_model import rounding_error_vars, slope
 from pixmetry.experiment.surface import Strata, Surface, cross_strata, fill, fit_surface, residual_parts
 
 PARTS = ("pixel", "row", "col")
-BROKEN = 5.0  # u below zero from which a variance is no chance any more (3e-7)
+BROKEN, CHANCE = 5.0, 3e-7  # u below zero from which a variance is no chance any more, and the chance that remains
 NOT_ROUND = 3.0  # curvatures along x and y that differ by more than this many u belong to a light that is not round
 METHOD = "analysis of variance of the mean maps, less temporal mean squares / L; Scheffé 1959, limits after Graybill & Wang 1980"
 
@@ -293,7 +293,9 @@ def _components(squares: _MeanSquares, covariance: np.ndarray, shape: tuple[int,
     dof = own**2 / np.maximum((terms**2 / (2 / squares.relative_variances())).sum(axis=1), 1e-300)  # Welch–Satterthwaite
     limits = frozenset(n for n, s in zip(names, significant, strict=True) if not s)
     in_u = np.divide(variances, np.sqrt(own), out=np.zeros(8), where=own > 0)
-    broken = {name: _broken(name, float(far)) for name, far in zip(names, in_u, strict=True) if far < -BROKEN}
+    of_lines = np.array([part in ("row", "col") for part in (*PARTS, "total")] * 2)
+    far = np.where(of_lines, (in_u < 0) & _calmer_lines(squares), in_u < -BROKEN)
+    broken = {name: _broken(name, float(in_u[i])) for i, name in enumerate(names) if far[i]}
     found = Estimates(
         names=tuple(names),
         values=values,
@@ -309,9 +311,21 @@ def _components(squares: _MeanSquares, covariance: np.ndarray, shape: tuple[int,
     return replace(kept, reasons={**kept.reasons, **broken})
 
 
+def _calmer_lines(squares: _MeanSquares) -> np.ndarray:
+    """Of the eight components, those of rows and columns whose means differ less than independent pixels by chance would let them."""
+    from scipy.special import chdtr
+
+    found = np.zeros(8, bool)
+    for first, component in ((0, 0), (3, 4)):  # dark map and response
+        for k in (1, 2):
+            dof, pixel = squares.dof[first + k], squares.values[first]
+            found[component + k] = pixel > 0 and chdtr(dof, dof * squares.values[first + k] / pixel) < CHANCE
+    return found
+
+
 def _broken(name: str, in_u: float) -> str:
     """Why a variance lies far below zero, where none can be."""
-    behind = f"the variance behind it lies {-in_u:.0f} u below zero"
+    behind = f"the variance behind it lies {-in_u:.2g} u below zero"
     if "_row_" in name or "_col_" in name:
         line = "rows" if "_row_" in name else "columns"
         return (
