@@ -388,10 +388,6 @@ def test_a_series_without_stacks_says_why_values_are_missing(known: Path, tmp_pa
 def test_campaigns_that_cannot_be_tested(known: Path, tmp_path: Path) -> None:
     top = np.full(SHAPE, 4095, np.uint16)
     cases = {
-        "one level": (changed(known, tmp_path / "a", f"exposure_s: {LONGEST_S / LEVELS},"), ("too few bright levels",)),
-        "no dark": (changed(known, tmp_path / "b", "kind: bright"), ("no dark frames",)),
-        "no light": (changed(known, tmp_path / "c", "kind: dark"), ("no bright frames",)),
-        "only stacks": (changed(known, tmp_path / "d", f"_{STACK - 1}.npy"), ("no dark levels",)),
         "another size": (changed(known, tmp_path / "e", bright5_1=top[:-1]), ("64 x 47 pixels", "bright5_1.npy")),
         "8 bits": (changed(known, tmp_path / "f", bright5_1=np.zeros(SHAPE, np.uint8)), ("8-bit file", "bright5_1.npy")),
         "all saturated": (changed(known, tmp_path / "g", bright=top), ("all bright levels are saturated",)),
@@ -403,6 +399,25 @@ def test_campaigns_that_cannot_be_tested(known: Path, tmp_path: Path) -> None:
     for path, words in (*cases.values(), (missing, ("bright3_0.npy", "missing"))):
         refused(run(path, "--json", tmp_path / "out.json", "--pdf", tmp_path / "out.pdf"), *words)
         assert not list(tmp_path.glob("*out*"))
+
+
+@pytest.mark.parametrize(
+    ("kept", "reason", "given"),
+    [
+        (f"exposure_s: {LONGEST_S / LEVELS},", "too few bright levels", {"sigma_y_dark"}),
+        ("kind: bright", "no dark level", {"s_2_y"}),
+        ("kind: dark", "too few bright levels", {"sigma_y_dark", "u_I_mean_DN", "DSNU1288_DN"}),
+        (f"_{STACK - 1}.npy", "too few bright levels", {"sigma_y_dark", "DSNU1288_DN", "PRNU1288"}),
+    ],
+)
+def test_what_a_campaign_with_gaps_carries_is_given(known: Path, tmp_path: Path, kept: str, reason: str, given: set[str]) -> None:
+    """One level, frames of one kind, stacks alone: values that need no series, and for the others why there are none."""
+    path = changed(known, tmp_path / "a", kept)
+    done = run(path, *(f"--{kind}={tmp_path / f'out.{kind}'}" for kind in ("json", "xml", "report", "pdf")))
+    assert done.exit_code == 0, done.output
+    values = emva1288(path).results[0].values
+    assert given <= {key for key, value in values.items() if np.isfinite(value.value)}
+    assert np.isnan(values["K"].value) and reason in values["K"].reason
 
 
 def test_the_result_does_not_depend_on_the_number_of_threads(known: Path, tmp_path: Path) -> None:

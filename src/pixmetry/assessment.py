@@ -30,7 +30,7 @@ from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.core.estimates import Estimates
 from pixmetry.core.geometry import frame_centre
 from pixmetry.core.observations import CameraGeometry, Observations
-from pixmetry.digital_twin import digital_twin, of_unit, self_test
+from pixmetry.digital_twin import ASSUMED_RANGE_E, digital_twin, of_unit, self_test
 from pixmetry.emva.evaluate import standard_values
 from pixmetry.emva.records import Measurement, Results
 from pixmetry.experiment.observe import Group, observe
@@ -103,6 +103,11 @@ def assess(
         hashes.add_file(calibration)
     standard = by_the_standard(frames, seen)
     estimates, unmeasured = measure_sources(seen)
+    if "electronics.gain" not in estimates:
+        estimates, unmeasured = _at_assumed_gain(seen, estimates, unmeasured, frames.bits)
+        assumed = f"taken as if {ASSUMED_RANGE_E:g} electrons filled the range, fewer than in most cameras"
+        note = f"The gain is not measured. For the shot noise it is {assumed}, which bounds it; electrons are DN over that gain."
+        seen = replace(seen, notes=(*seen.notes, note))
     camera = digital_twin(frames, estimates, seen)
     steps = len(camera.active) + len(catalogue()) + 2
     done = itertools.count(1)
@@ -244,7 +249,7 @@ def observe_campaign(campaign: Campaign, progress: Progress) -> tuple[InputHashe
             yield Group(g.kind, g.role, g.exposure_s, g.photons, [partial(reader.fetch, path) for path in g.paths])
 
     seen = observe(groups(), campaign.bits, campaign.camera.temperature_c, on_frames=on_frames)
-    return reader.hashes, replace(seen, storage=reader.storage)
+    return reader.hashes, replace(seen, storage=reader.storage, notes=(*campaign.findings, *seen.notes))
 
 
 def by_the_standard(campaign: Campaign, observations: Observations) -> Results:
@@ -272,3 +277,29 @@ def measure_sources(observations: Observations) -> tuple[dict[str, Estimates], d
         except (MeasureError, InputError) as problem:
             unmeasured[source.id] = str(problem)
     return estimates, unmeasured
+
+
+IN_ELECTRONS = ("electronics.amplifier_noise", "electronics.row_noise", "sensor.dsnu", "sensor.defects")
+
+
+def _at_assumed_gain(
+    seen: Observations, estimates: dict[str, Estimates], unmeasured: dict[str, str], bits: int
+) -> tuple[dict[str, Estimates], dict[str, str]]:
+    """What was measured in DN, given in electrons at the assumed gain: so it counts in twin and budget with its size in DN."""
+    fit, gain = seen.photon_transfer_fit, (2**bits - 1) / ASSUMED_RANGE_E
+    if fit is None or "dark_noise_dn" not in fit:
+        return estimates, unmeasured
+    parts = [fit[f"{name}_dn"] for name in ("dark_noise", "row_noise", "column_noise")]
+    names = [e.name.replace("_dn", "_e") for e in parts]
+    told = "measured in DN; in electrons at an assumed gain"
+    rows = [("gain_dn_per_e", gain, 0.0, np.inf, "DN/e-")]
+    rows += [(name, e.value / gain, e.u / gain, e.dof, "e-") for name, e in zip(names, parts, strict=True)]
+    assumed = Estimates.from_rows(
+        rows,
+        limits=frozenset(n for n, e in zip(names, parts, strict=True) if e.kind == "upper_limit"),
+        reasons={n: "; ".join(filter(None, (told, e.reason))) for n, e in zip(names, parts, strict=True)},
+        method=fit.method,
+    )
+    found, _ = measure_sources(replace(seen, photon_transfer_fit=fit.join(assumed)))
+    added = {source: found[source] for source in IN_ELECTRONS if source in found}
+    return estimates | added, {source: why for source, why in unmeasured.items() if source not in added}

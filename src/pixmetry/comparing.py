@@ -152,7 +152,8 @@ def _of_assessment(record: Mapping[str, Any], name: str, where: str) -> Subject:
 
 def _estimate(e: Mapping[str, Any]) -> Value:
     dof = math.inf if e["dof"] is None else float(e["dof"])
-    return Value(float(e["value"]), float(e["u"]), dof, e["unit"], e["method"], e["reason"], e["kind"] == "upper_limit")
+    limits = e["kind"] == "upper_limit", e["kind"] == "lower_limit"
+    return Value(float(e["value"]), float(e["u"]), dof, e["unit"], e["method"], e["reason"], *limits)
 
 
 def _gain_u_rel(estimates: Iterable[Mapping[str, Any]]) -> float:

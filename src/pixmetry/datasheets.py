@@ -163,7 +163,7 @@ def measure_campaign(
     cfa = bayer or facts.cfa
     area = None if facts.pitch_x_um is None or facts.pitch_y_um is None else facts.pitch_x_um * facts.pitch_y_um
     found = measure_frames(groups(), campaign.bits, cfa=cfa, pixel_area_um2=area, photons_u_rel=photons_u_rel, on_frames=on_frames)
-    notes, (rows, cols) = [], campaign.frame_shape
+    notes, (rows, cols) = list(campaign.findings), campaign.frame_shape
     if bayer is not None and facts.cfa not in (None, bayer):
         notes.append(f"the colour filter is taken as {bayer}, not {facts.cfa} as stated")
     if cfa is not None and (rows % 2 or cols % 2):
@@ -277,18 +277,18 @@ def _camera(campaign: Campaign) -> dict[str, Any]:
 def _conditions(campaign: Campaign, measured: Sequence[Measurement], release: str, bootstrap: int) -> dict[str, Any]:
     first = measured[0]
     bright, dark = first.transfer.bright, first.transfer.dark
-    photons = [] if bright.photons is None else [float(bright.photons.min()), float(bright.photons.max())]
+    photons = [] if bright.photons is None or not bright.photons.size else [float(bright.photons.min()), float(bright.photons.max())]
     exposures = sorted({float(t) for t in bright.exposure_s})
     known = {
         "release": release,
-        "sweep": "exposure time at constant light" if len(exposures) > 1 else "light at constant exposure time",
+        "sweep": None if not exposures else "exposure time at constant light" if len(exposures) > 1 else "light at constant exposure time",
         "bright_levels": int(bright.mean_dn.size),
         "dark_levels": int(dark.mean_dn.size),
         "frames_per_level": sorted({int(n) for n in (*bright.n_frames, *dark.n_frames)}),
         "dark_stack_frames": None if first.dark_stack is None else first.dark_stack.n_frames,
         "bright_stack_frames": None if first.bright_stack is None else first.bright_stack.n_frames,
         "stack_exposure_s": None if first.dark_stack is None else first.dark_stack.exposure_s,
-        "exposures_s": [exposures[0], exposures[-1]],
+        "exposures_s": [exposures[0], exposures[-1]] if exposures else None,
         "photons": photons or None,
         "photons_u_rel": first.photons_u_rel,
         "colour_channels": None if first.channel == MONO else [m.channel for m in measured],

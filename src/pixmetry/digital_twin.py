@@ -13,10 +13,10 @@ import numpy as np
 from pixmetry.budget.parameters import applies
 from pixmetry.campaign import Campaign
 from pixmetry.core.camera import Camera, Element, in_order
-from pixmetry.core.catalogue import catalogue
+from pixmetry.core.catalogue import catalogue, get_source
 from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.core.estimates import Estimates
-from pixmetry.core.observations import Observations, PatternList, StackMoments
+from pixmetry.core.observations import Observations, PatternList, PhotonTransfer, StackMoments
 from pixmetry.core.source import Source
 from pixmetry.core.unit_maps import MeasuredUnit
 from pixmetry.emva.evaluate import standard_values
@@ -28,6 +28,7 @@ from pixmetry.experiment.one_pass import Group
 from pixmetry.experiment.unit_maps import UnitMaps, threshold_errors, unit_maps
 from pixmetry.scene.uniform import Uniform
 
+ASSUMED_RANGE_E = 5000.0  # electrons for a full range where the gain is not known: the shot noise of most cameras is less
 ALWAYS = ("sensor.quantum_efficiency", "sensor.shot_noise", "grabber.adc")  # what every twin has, measured or not
 SIGNIFICANT_U = 1.96  # below so many u from nothing a value is not simulated
 CORRELATED = 0.5  # values with a larger correlation belong together: one alone may be small and yet needed
@@ -59,7 +60,9 @@ def digital_twin(campaign: Campaign, estimates: Mapping[str, Estimates], observa
         elements.append(Element(source.id, source, source.make(values, where=f"digital twin, {source.id}")))
     pitch = None if facts.pitch_x_um is None else (facts.pitch_x_um, facts.pitch_y_um or facts.pitch_x_um)
     stack = observations.bright_stack
-    exposure = stack.exposure_s if stack is not None else float(np.median(observations.photon_transfer.bright.exposure_s))
+    if not any(element.name == "electronics.gain" for element in elements):
+        elements = _with_assumed_gain(elements, campaign.bits)
+    exposure = stack.exposure_s if stack is not None else _middle_exposure_s(observations.photon_transfer)
     photons_known = "sensor.quantum_efficiency" in estimates
     return Camera(
         name=facts.name,
@@ -78,13 +81,26 @@ def digital_twin(campaign: Campaign, estimates: Mapping[str, Estimates], observa
     )
 
 
+def _with_assumed_gain(elements: list[Element], bits: int) -> list[Element]:
+    """The chain with a gain as if few electrons filled the range, so that the shot noise is bounded where the gain was not measured."""
+    source = get_source("electronics.gain")
+    gain = source.make({"gain_dn_per_e": (2**bits - 1) / ASSUMED_RANGE_E}, where="digital twin, assumed gain")
+    by_name = {e.name: e for e in elements} | {source.id: Element(source.id, source, gain)}
+    return [by_name[s.id] for s in in_order([e.source for e in elements] + [source])]
+
+
+def _middle_exposure_s(transfer: PhotonTransfer) -> float:
+    exposures = transfer.bright.exposure_s if transfer.bright.exposure_s.size else transfer.dark.exposure_s
+    return float(np.median(exposures))
+
+
 def best_values(source: Source, estimates: Estimates) -> dict[str, float]:
     """Values for a simulation: estimates as they are; 0 for what is not significant, but for dark noise that rounding hides."""
     hidden = {"white_e"}  # the rms of an even spread up to its limit
     values = {}
     for e in estimates:
         may_be_none = source.neutral is not None and getattr(source.neutral, e.name) == 0 and _alone(estimates, e.name)
-        nothing = e.kind != "value" or (may_be_none and abs(e.value) < SIGNIFICANT_U * e.u)
+        nothing = e.kind == "upper_limit" or (may_be_none and abs(e.value) < SIGNIFICANT_U * e.u)
         values[e.name] = 0.0 if nothing and e.name not in hidden else e.representative
     return values
 
@@ -103,9 +119,11 @@ def of_unit(twin: Camera, observations: Observations) -> Camera:
 
     With another ``unit_seed`` it is another camera of the type. All waves that were found are in it, each under its own name. The white
     noise is that of the stack of dark frames, less the waves. A full well that the converter hides, or that no level reached, is switched
-    off. A twin without maps (no stacks of dark and bright frames) is as it was.
+    off. A twin without maps (no stacks of dark and bright frames), or without a photon transfer, is as it was.
     """
     bits = int(twin.facts["bits"])
+    if "nonlinearity_a1" not in (observations.photon_transfer_fit or ()):
+        return twin
     try:
         maps = unit_maps(observations, bits)
     except MeasureError:

@@ -70,15 +70,17 @@ def _preflight(reader: FrameReader, part: Part) -> Preflight:
     darks, brights = campaign.stacks("dark"), campaign.stacks("bright")
     d, b = choose_stacks([look(g) for g in darks], [look(g) for g in brights])
     levels = sorted((g for g in campaign.levels("bright") if g.role == "level"), key=lambda g: g.photons or g.exposure_s)
-    black_dn = look(campaign.levels("dark")[0]).mean_dn
+    black = campaign.levels("dark")
+    black_dn = look(black[0]).mean_dn if black else 0.0
     some = [*_below_saturation(levels, lambda g: look(g).mean_dn - black_dn), *([] if b is None else [brights[b]]), *levels[-1:]]
-    exposure_s = some[len(some) // 2].exposure_s
-    dark = darks[d] if d is not None else min(campaign.levels("dark"), key=lambda g: abs(g.exposure_s - exposure_s))
+    exposure_s = some[len(some) // 2].exposure_s if some else 0.0
+    dark = darks[d] if d is not None else min(black, key=lambda g: abs(g.exposure_s - exposure_s), default=None)
 
     def frames(group: FrameGroup) -> Iterator[np.ndarray]:
         return _parts(reader.frames(replace(group, paths=group.paths[:FRAMES])), part)
 
-    return preflight(frames(dark), [BrightLevel(g.exposure_s, g.photons, frames(g)) for g in some], campaign.bits)
+    darkness = iter(()) if dark is None else frames(dark)
+    return preflight(darkness, [BrightLevel(g.exposure_s, g.photons, frames(g)) for g in some], campaign.bits)
 
 
 def _look(reader: FrameReader, part: Part, group: FrameGroup) -> Look:

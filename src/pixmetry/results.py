@@ -129,7 +129,8 @@ class Assessment:
         seen, fit = self.observations, self.observations.photon_transfer_fit
         maps: dict[str, np.ndarray] = {}
         if seen.dark_stack is not None:
-            maps["dark_dn"] = (seen.dark_stack.mean_map_dn - fit["offset_dn"].value).astype(np.float32)
+            black = fit["offset_dn"].value if "offset_dn" in fit else seen.dark_stack.mean_dn
+            maps["dark_dn"] = (seen.dark_stack.mean_map_dn - black).astype(np.float32)
         if seen.defects is not None:
             maps["defects"] = seen.defects.mask().astype(np.uint8)
         if seen.dark_stack is not None and seen.bright_stack is not None and seen.spatial_fit is not None:

@@ -46,11 +46,9 @@ def test_manifest_gives_what_it_says(tmp_path: Path) -> None:
         ("# nothing but a comment\n", ["empty"]),
         (HEAD, ["no frames", "dark and bright"]),
         (HEAD + "frames:\n", ["no frames"]),
-        (HEAD + DARK, ["no bright frames", "uniformly lit"]),
-        (HEAD + "frames:\n" + BRIGHT, ["no dark frames", "capped"]),
         (HEAD + DARK.replace("d_1", "d_9") + BRIGHT, ["d_9.png", "missing", "line 4", "did you mean"]),
         (HEAD + DARK.replace("d_1.png", "x/*.png") + BRIGHT, ["x/*.png", "fits no file", "line 4"]),
-        (HEAD + DARK.replace("d_0.png, d_1.png", "d_0.png") + BRIGHT, ["only 1 frame", "dark", "two frames"]),
+        (HEAD + DARK.replace("d_0.png, d_1.png", "d_0.png"), ["only 1 frame", "dark", "two frames"]),
         (HEAD + DARK.replace("d_1", "d_0") + BRIGHT, ["d_0.png", "listed 2 times"]),
         (HEAD + DARK + BRIGHT.replace("b_1", "d_1"), ["d_1.png", "listed 2 times"]),
         (HEAD + DARK + BRIGHT.replace("exposure_s", "exposure"), ["line 5", "lacks its unit", "exposure_s"]),
@@ -83,17 +81,23 @@ def test_each_bad_manifest_has_its_own_message(text: str, words: list[str], tmp_
         assert word in message
 
 
-def test_levels_are_sorted_and_photons_must_follow(tmp_path: Path) -> None:
+def test_levels_are_sorted_and_photons_that_do_not_follow_are_told(tmp_path: Path) -> None:
     second = "  - {kind: bright, exposure_s: 0.005, photons: PH, files: [c_0.png, c_1.png]}\n"
     for i in range(2):
         put_frame(tmp_path / f"c_{i}.png")
     text = HEAD + FRAMES + second
     campaign = load_campaign(put_campaign(tmp_path, text.replace("PH", "500")))
     assert [g.exposure_s for g in campaign.levels("bright")] == [0.005, 0.01]
-    message = refused(put_campaign(tmp_path, text.replace("PH", "2000")))
-    assert "photons fall from 2000 to 1000 while the exposure rises from 0.005 s to 0.01 s" in message
-    message = refused(put_campaign(tmp_path, text.replace("photons: PH,", "")))
-    assert "photons are known for some bright groups, not for (bright, exposure 0.005 s)" in message
+    (note,) = load_campaign(put_campaign(tmp_path, text.replace("PH", "2000"))).findings
+    assert "photons fall from 2000 to 1000 while the exposure rises from 0.005 s to 0.01 s" in note
+    (note,) = load_campaign(put_campaign(tmp_path, text.replace("photons: PH,", ""))).findings
+    assert "photons are known for some bright groups, not for (bright, exposure 0.005 s)" in note
+
+
+@pytest.mark.parametrize(("kept", "missing"), [(DARK, "bright"), (BRIGHT, "dark")])
+def test_frames_of_one_kind_alone_are_a_campaign(kept: str, missing: str, tmp_path: Path) -> None:
+    campaign = load_campaign(put_campaign(tmp_path, HEAD + "frames:\n" + kept.removeprefix("frames:\n")))
+    assert len(campaign.groups) == 1 and f"no {missing} frames" in campaign.findings[0]
 
 
 def test_light_may_be_changed_at_one_exposure(tmp_path: Path) -> None:

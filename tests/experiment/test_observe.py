@@ -66,14 +66,15 @@ def test_without_a_pair_it_refuses_and_says_what_to_take():
     """The nearest dark stack serves for what the dark tells alone."""
     got = seen([("dark", 0.2, 24), ("dark", 0.007, 16), ("bright", 0.005, 16)])
     assert got.dark_stack.exposure_s == 0.007
-    assert got.bright_stack is None and got.bright_spectra is None and got.spatial_fit is None
+    assert got.bright_stack is None and got.bright_spectra is None
+    assert {name.split("_")[0] for name in got.spatial_fit.names} == {"dsnu"}
     assert got.defects is not None
     assert [note for note in got.notes if "dark 0.007 s, bright 0.005 s" in note and "dark frames at 0.005 s" in note]
 
 
 def test_one_kind_alone():
     got = seen([("dark", 0.005, 9), ("dark", 0.2, 12)])
-    assert got.dark_stack.n_frames == 12 and got.spatial_fit is None
+    assert got.dark_stack.n_frames == 12 and {name.split("_")[0] for name in got.spatial_fit.names} == {"dsnu"}
     assert any("no stack of bright frames" in note for note in got.notes)
     got = seen([("bright", 0.005, 9)])
     assert got.bright_stack is not None and got.dark_stack is None

@@ -1,7 +1,9 @@
 """Read the descriptor file that goes with EMVA 1288 image sets (Release 3.0 and later).
 
 One record a line: ``v`` version, ``n`` bits width height, ``b`` exposure in ns and photons per pixel of the bright frames that
-follow, ``d`` exposure in ns of the dark frames that follow, ``i`` path of one frame; ``#`` begins a comment.
+follow, ``d`` (or ``dc``, of a run for the dark current) exposure in ns of the dark frames that follow, ``i`` path of one frame; ``#``
+begins a comment. As in the public reference implementation, a number may have a decimal comma, and a record of another kind is passed
+over with the images that follow it; it is named in the notes.
 """
 
 from __future__ import annotations
@@ -13,7 +15,8 @@ from pathlib import Path
 
 from pixmetry.core.errors import InputError
 
-_RECORDS = "v (version), n (bits width height), b (exposure photons), d (exposure), i (image), # (comment)"
+_RECORDS = ("v", "n", "b", "d", "dc", "i")
+_THOUSANDS = re.compile(r"[1-9]\d{0,2}(,\d{3})+")  # 40,000: a comma that may stand for nothing
 
 
 @dataclass
@@ -29,7 +32,7 @@ class DescriptorGroup:
 
 @dataclass
 class Descriptor:
-    """A parsed descriptor; ``header`` is the comment before the first record, where the licence stands."""
+    """A parsed descriptor; ``header`` is the comment before the first record, where the licence stands, ``notes`` what was passed over."""
 
     version: str = ""
     bits: int = 0
@@ -37,6 +40,7 @@ class Descriptor:
     height: int = 0
     groups: list[DescriptorGroup] = field(default_factory=list)
     header: str = ""
+    notes: list[str] = field(default_factory=list)
 
 
 def is_descriptor(text: str) -> bool:
@@ -72,6 +76,7 @@ def parse_descriptor(path: Path, raw: bytes) -> Descriptor:
     """
     descriptor = Descriptor()
     header: list[str] = []
+    passed_over = False
     for number, line in enumerate(decode_descriptor(raw).splitlines(), start=1):
         where = f"{path}, line {number}"
         text = line.strip()
@@ -79,7 +84,7 @@ def parse_descriptor(path: Path, raw: bytes) -> Descriptor:
             if not (descriptor.version or descriptor.bits or descriptor.groups):
                 header.append(text.strip("# \t"))
         elif text:
-            _read_record(descriptor, text, number, where)
+            passed_over = _read_record(descriptor, text, number, where, passed_over)
     if not descriptor.bits:
         remedy = "add the line `n BITS WIDTH HEIGHT`, e.g. `n 12 640 480`"
         raise InputError("no record of bits, width and height", where=str(path), remedy=remedy)
@@ -91,9 +96,17 @@ def parse_descriptor(path: Path, raw: bytes) -> Descriptor:
     return descriptor
 
 
-def _read_record(descriptor: Descriptor, text: str, number: int, where: str) -> None:
+def _read_record(descriptor: Descriptor, text: str, number: int, where: str, passed_over: bool) -> bool:
+    """Read one record; tells whether images that follow belong to a record that was passed over."""
     letter, rest = (*text.split(maxsplit=1), "")[:2]
     letter = letter.lower()
+    if letter != "i":
+        rest = rest.split("#")[0].strip()
+    elif passed_over:
+        return True
+    if letter not in _RECORDS:
+        descriptor.notes.append(f"record '{letter}' of line {number} is not known: it and the images that follow it are left out")
+        return True
     if letter == "v":
         descriptor.version = rest
     elif letter == "n":
@@ -105,10 +118,10 @@ def _read_record(descriptor: Descriptor, text: str, number: int, where: str) -> 
         descriptor.bits, descriptor.width, descriptor.height = (int(v) for v in values)
     elif letter == "b":
         exposure_ns, *photons = _numbers(rest, where, "b exposure photons", 1, 2)
-        if not exposure_ns > 0 or (photons and not photons[0] > 0):
-            raise InputError("exposure or photons cannot be used", where=where, value=rest, allowed="numbers above 0")
+        if exposure_ns < 0 or (photons and photons[0] < 0):
+            raise InputError("exposure or photons cannot be used", where=where, value=rest, allowed="0 or more")
         descriptor.groups.append(DescriptorGroup("bright", exposure_ns / 1e9, photons[0] if photons else None, number))
-    elif letter == "d":
+    elif letter in ("d", "dc"):
         (exposure_ns,) = _numbers(rest, where, "d exposure", 1, 1)
         if exposure_ns < 0:
             raise InputError("exposure cannot be used", where=where, value=rest, allowed="0 or more")
@@ -119,18 +132,24 @@ def _read_record(descriptor: Descriptor, text: str, number: int, where: str) -> 
         if not rest:
             raise InputError("an image record without a name", where=where, remedy="add the path of the image, or delete the line")
         descriptor.groups[-1].files.append((rest.strip('"'), number))
-    else:
-        raise InputError(f"unknown record '{letter}'", where=where, allowed=_RECORDS, remedy="correct or delete the line")
+    return False
 
 
 def _numbers(text: str, where: str, form: str, fewest: int, most: int) -> list[float]:
     try:
-        values = [float(part) for part in text.split()]
+        values = [_number(part) for part in text.split()]
     except ValueError:
-        remedy = "write decimals with a point" if "," in text else "correct the line"
+        remedy = "write no sign between thousands, and decimals with a point" if "," in text else "correct the line"
         raise InputError("not a number", where=where, value=text, allowed=form, remedy=remedy) from None
     if not fewest <= len(values) <= most:
         raise InputError(f"{len(values)} numbers in this record", where=where, value=text, allowed=form, remedy="correct the line")
     if not all(map(math.isfinite, values)):
         raise InputError("not a finite number", where=where, value=text, allowed=form, remedy="give a value")
     return values
+
+
+def _number(text: str) -> float:
+    """A number with decimal point or comma; what may be a comma between thousands is no number."""
+    if _THOUSANDS.fullmatch(text):
+        raise ValueError(text)
+    return float(text.replace(",", ".") if "." not in text else text)

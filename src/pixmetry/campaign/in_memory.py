@@ -84,10 +84,11 @@ def campaign_of_arrays(groups: Iterable[Frames], *, optics: Mapping[str, Any] | 
         made.append(FrameGroup(checked.kind, checked.exposure_s, photons, paths, checked.role or role_of(paths)))
     if len(shapes) > 1:
         raise InputError("frames of several sizes", where=NAME, value=sorted(shapes), allowed="one size for all frames")
-    ordered = check_groups(tuple(made), NAME)
+    ordered, findings = check_groups(tuple(made), NAME)
     (shape,) = shapes
     check_window(facts, shape, NAME)
-    return Campaign(facts, told, ordered, shape, "uint8" if eight else "uint16", Path(NAME), operator=operator, arrays=arrays)
+    dtype = "uint8" if eight else "uint16"
+    return Campaign(facts, told, ordered, shape, dtype, Path(NAME), operator=operator, arrays=arrays, findings=findings)
 
 
 def _checked(data: Any, where: str) -> np.ndarray | list[np.ndarray]:

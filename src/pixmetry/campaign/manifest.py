@@ -69,7 +69,7 @@ def load_campaign(path: str | Path | None = None) -> Campaign:
         facts = {"optics": OpticsFacts(**model.optics.model_dump()), "notes": model.notes, "operator": model.operator}
         facts["raw"] = None if model.raw is None else RawLayout(**model.raw.model_dump())
         parts = _from_manifest(source, model, lines, facts["raw"])
-    groups = check_groups(parts["groups"], str(source))
+    groups, findings = check_groups(parts["groups"], str(source))
     shape, dtype = _discover(groups[0].paths[0], parts, facts.get("raw"))
     check_window(parts["camera"], shape, str(source))
     return Campaign(
@@ -80,6 +80,7 @@ def load_campaign(path: str | Path | None = None) -> Campaign:
         source_path=source,
         descriptor_path=parts.get("descriptor_path"),
         licence=parts["licence"],
+        findings=(*parts.get("findings", ()), *findings),
         **facts,
     )
 
@@ -210,6 +211,7 @@ def _from_descriptor(source: Path, text: bytes, camera: CameraFacts | None, raw:
         "groups": tuple(groups),
         "shape": (descriptor.height, descriptor.width),
         "licence": descriptor.header,
+        "findings": tuple(descriptor.notes),
     }
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -113,6 +113,8 @@ class Campaign:
     arrays : mapping of Path to ndarray, or None
         Frames in memory by the folder of their names: ``paths`` of a group are then no files, but ``arrays/3/7`` is frame 7 of
         ``arrays[Path("arrays/3")]``, of shape (frames, rows, cols).
+    findings : tuple of str
+        What was left out of the listing or looks wrong in it; results repeat it among their notes.
     """
 
     camera: CameraFacts
@@ -127,6 +129,7 @@ class Campaign:
     operator: str = ""
     raw: RawLayout | None = None
     arrays: Mapping[Path, Sequence[np.ndarray] | np.ndarray] | None = field(default=None, compare=False)
+    findings: tuple[str, ...] = ()
 
     @property
     def bits(self) -> int:
@@ -173,35 +176,38 @@ class Campaign:
         return tuple(g for g in self.groups if g.kind == kind and g.role == "stack")
 
 
-def check_groups(groups: tuple[FrameGroup, ...], where: str) -> tuple[FrameGroup, ...]:
-    """Sort groups and refuse what cannot be a campaign.
+def check_groups(groups: tuple[FrameGroup, ...], where: str) -> tuple[tuple[FrameGroup, ...], tuple[str, ...]]:
+    """Sort groups, put right what needs no question, and refuse what cannot be a campaign.
+
+    A group of one frame is left out, for noise is measured from differences. Of two groups of one condition the one of more frames is a
+    stack; dark levels of one exposure are taken together.
+
+    Returns
+    -------
+    tuple
+        The groups, dark before bright, then by exposure and photons, and notes on what was left out, put together or looks wrong.
 
     Raises
     ------
     InputError
-        No frames, no dark, no bright, fewer than two frames in a group, a file or a condition listed twice, photons known for some
-        bright groups only, or photons that fall while the exposure rises.
+        No frames, nothing but single frames, a file listed twice, or two bright groups of one condition.
     """
     if not groups:
         raise InputError("no frames are listed", where=where, remedy="list dark and bright frames with their exposure times")
-    for kind, how in (("dark", "with the lens capped or the light off"), ("bright", "of a uniformly lit field")):
-        if not any(g.kind == kind for g in groups):
-            raise InputError(
-                f"no {kind} frames", where=where, allowed=f"at least one {kind} group of two frames", remedy=f"add frames {how}"
-            )
-    for group in groups:
-        if len(group.paths) < 2:
-            raise InputError(
-                f"only {len(group.paths)} frame in group ({group.label})",
-                where=where,
-                allowed="two frames or more: temporal noise is measured from their difference",
-                remedy="take a second frame under the same condition, or leave the group out",
-            )
     _refuse_repeated_files(groups, where)
-    groups = tuple(sorted(groups, key=lambda g: (g.kind != "dark", g.exposure_s, g.photons or 0.0)))
-    _refuse_repeated_conditions(groups, where)
-    _check_photons([g for g in groups if g.kind == "bright"], where)
-    return groups
+    single = [g for g in groups if len(g.paths) < 2]
+    if len(single) == len(groups):
+        raise InputError(
+            f"only 1 frame in group ({single[0].label}), and in every other",
+            where=where,
+            allowed="two frames or more: temporal noise is measured from their difference",
+            remedy="take a second frame under the same condition",
+        )
+    notes = [f"only 1 frame in group ({g.label}): it is left out, noise is measured from the difference of two" for g in single]
+    notes += [f"no {kind} frames: what needs them is not measured" for kind in KINDS if all(g.kind != kind for g in groups)]
+    ordered = sorted((g for g in groups if len(g.paths) > 1), key=lambda g: (g.kind != "dark", g.exposure_s, g.photons or 0.0))
+    groups, told = _of_different_conditions(ordered, where)
+    return groups, (*notes, *told, *_doubtful_photons([g for g in groups if g.kind == "bright" and g.role == "level"]))
 
 
 def _refuse_repeated_files(groups: tuple[FrameGroup, ...], where: str) -> None:
@@ -211,33 +217,47 @@ def _refuse_repeated_files(groups: tuple[FrameGroup, ...], where: str) -> None:
         raise InputError(f"file '{path.name}' is listed {times} times", where=where, allowed="each file once", remedy=remedy)
 
 
-def _refuse_repeated_conditions(groups: tuple[FrameGroup, ...], where: str) -> None:
-    seen = set()
+def _of_different_conditions(groups: list[FrameGroup], where: str) -> tuple[tuple[FrameGroup, ...], list[str]]:
+    """The groups with no condition twice, and what was put together."""
+    seen: dict[tuple[str, str, float, float | None], FrameGroup] = {}
+    notes = []
     for group in groups:
-        condition = (group.kind, group.role, group.exposure_s, group.photons)
-        if condition in seen:
+        other = seen.get(_condition(group))
+        if other is not None and group.role == "level" and len(group.paths) != len(other.paths):
+            more = max(group, other, key=lambda g: len(g.paths))
+            seen[_condition(other)] = group if more is other else other
+            group, other = replace(more, role="stack"), seen.get(_condition(replace(more, role="stack")))
+            notes.append(f"two groups of the same condition ({group.label}): the one of {len(group.paths)} frames is taken as a stack")
+        if other is not None and group.kind == "dark":
+            group = replace(group, paths=(*other.paths, *group.paths))
+            notes.append(f"two groups of the same condition ({group.label}): taken as one of {len(group.paths)} frames")
+        elif other is not None:
             raise InputError(
                 f"two groups have the same condition ({group.label})",
                 where=where,
                 allowed="one group for a level, and one stack",
                 remedy="put their files into one group, or correct the exposure",
             )
-        seen.add(condition)
+        seen[_condition(group)] = group
+    return tuple(sorted(seen.values(), key=lambda g: (g.kind != "dark", g.exposure_s, g.photons or 0.0))), notes
 
 
-def _check_photons(bright: list[FrameGroup], where: str) -> None:
-    known = [(g.exposure_s, g.photons) for g in bright if g.photons is not None]
-    if known and len(known) < len(bright):
-        missing = next(g for g in bright if g.photons is None)
-        remedy = "give photons (or the irradiance) for every bright group or for none"
-        raise InputError(f"photons are known for some bright groups, not for ({missing.label})", where=where, remedy=remedy)
-    longest_s, most = 0.0, 0.0
+def _condition(group: FrameGroup) -> tuple[str, str, float, float | None]:
+    return group.kind, group.role, group.exposure_s, group.photons
+
+
+def _doubtful_photons(levels: list[FrameGroup]) -> list[str]:
+    """What is odd about the photons of a series; those of a stack serve no value."""
+    known = [(g.exposure_s, g.photons) for g in levels if g.photons is not None]
+    if known and len(known) < len(levels):
+        missing = next(g for g in levels if g.photons is None)
+        return [f"photons are known for some bright groups, not for ({missing.label}): there are no values in photons"]
+    notes, longest_s, most = [], 0.0, 0.0
     for exposure_s, photons in known:  # by exposure, then photons
         if exposure_s > longest_s and photons < most:
-            raise InputError(
-                f"photons fall from {most:g} to {photons:g} while the exposure rises from {longest_s:g} s to {exposure_s:g} s",
-                where=where,
-                allowed="photons that rise with the exposure time",
-                remedy="correct the exposure or the photons of these groups",
+            notes.append(
+                f"photons fall from {most:g} to {photons:g} while the exposure rises from {longest_s:g} s to {exposure_s:g} s: "
+                "if the light was not changed there, correct the exposure or the photons; what is counted in photons is wrong otherwise"
             )
         longest_s, most = exposure_s, photons
+    return notes

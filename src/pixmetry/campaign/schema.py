@@ -96,7 +96,7 @@ class GroupModel(Model):
     def _light(self) -> GroupModel:
         if self.kind == "dark" and (self.photons or self.irradiance_uw_per_cm2):
             raise InputError("a dark group has light", allowed="no photons and no irradiance", remedy="write kind: bright, or delete them")
-        if self.kind == "bright" and (self.exposure_s == 0 or self.photons == 0):
+        if self.kind == "bright" and (self.photons == 0 or self.exposure_s == 0 and self.photons is None):
             raise InputError(
                 "a bright group without exposure or photons", allowed="values above 0", remedy="write kind: dark, or correct them"
             )

@@ -16,7 +16,8 @@ class Estimate:
     """One measured value.
 
     ``kind`` is ``"value"``, or ``"upper_limit"`` where the data only bound the quantity: then ``value`` is the one-sided 95 %
-    limit and ``u`` is the standard uncertainty of the best estimate behind it.
+    limit and ``u`` is the standard uncertainty of the best estimate behind it. ``"lower_limit"``: the quantity is ``value`` ± ``u``
+    or more.
     """
 
     name: str
@@ -55,6 +56,8 @@ class Estimates:
         What the same observations could be mistaken for.
     limits : frozenset of str
         Names whose value is a one-sided 95 % upper limit.
+    lower_limits : frozenset of str
+        Names whose value is what the quantity is at least.
     reasons : mapping
         By name: why it is a limit, or what the reader should know about it.
     """
@@ -67,6 +70,7 @@ class Estimates:
     method: str = ""
     confounders: tuple[str, ...] = ()
     limits: frozenset[str] = frozenset()
+    lower_limits: frozenset[str] = frozenset()
     reasons: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -121,7 +125,7 @@ class Estimates:
             dof=float(self.dof[i]),
             unit=self.units[i],
             method=self.method,
-            kind="upper_limit" if name in self.limits else "value",
+            kind="upper_limit" if name in self.limits else "lower_limit" if name in self.lower_limits else "value",
             reason=self.reasons.get(name, ""),
         )
 
@@ -138,6 +142,7 @@ class Estimates:
             method=self.method,
             confounders=self.confounders,
             limits=frozenset(new for new, old in mapping.items() if old in self.limits),
+            lower_limits=frozenset(new for new, old in mapping.items() if old in self.lower_limits),
             reasons={new: self.reasons[old] for new, old in mapping.items() if old in self.reasons},
         )
 
@@ -161,6 +166,7 @@ class Estimates:
             method="; ".join(dict.fromkeys(s.method for s in sets if s.method)),
             confounders=tuple(dict.fromkeys(c for s in sets for c in s.confounders)),
             limits=frozenset().union(*(s.limits for s in sets)),
+            lower_limits=frozenset().union(*(s.lower_limits for s in sets)),
             reasons={k: v for s in sets for k, v in s.reasons.items()},
         )
 

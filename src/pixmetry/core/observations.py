@@ -50,6 +50,8 @@ class PhotonTransfer:
     dark: LevelMoments
     frame_shape: tuple[int, int]
     bits: int
+    # shape (dark levels, 3): what hot pixels add to mean (DN) and spatial variance (DN²), and what of the mean was not seen but estimated
+    dark_tails: np.ndarray | None = None
 
 
 @dataclass(frozen=True)

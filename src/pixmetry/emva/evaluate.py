@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pixmetry.core.errors import InputError
+from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.core.random import Generator, generator
 from pixmetry.core.threads import map_tiles, single_threaded_blas
 from pixmetry.emva.curved import level_free_values
@@ -18,6 +18,7 @@ from pixmetry.emva.keys import KEYS, goes_with_photons
 from pixmetry.emva.linear_model import departure_bounds, linear_model
 from pixmetry.emva.lower_limits import with_lower_limits
 from pixmetry.emva.nonlinear import nonlinear_values
+from pixmetry.emva.partial import partial_results
 from pixmetry.emva.reasons import DARK_PATTERN, Case, breaks_the_split, is_blind, is_bound, lifted, notes_of, reason_for
 from pixmetry.emva.records import RELEASES, Measurement, Results, Value
 from pixmetry.emva.rules import ONE_SIDED_95
@@ -31,6 +32,7 @@ from pixmetry.emva.uncertainty import about, add_wave, bootstrap_series, draw_bl
 GROUP_DRAWS = 300
 SEED = 1288
 MANY = 1e6  # degrees of freedom beyond which u is as good as known
+TWO_SIDED_95 = 1.959964
 DARK_NOISE_LIMIT_DN = 0.40  # R4.0 eq. 54
 MAY_NOT_BE_NEGATIVE = ("u_I_var", "u_I_var_DN")
 
@@ -71,7 +73,7 @@ def evaluate(m: Measurement, release: str, *, draws: int = 4000) -> Results:
     _check_release(release)
     with single_threaded_blas():
         standard, beside = map_tiles(lambda job: job(), (lambda: _by_release(m, release, draws), lambda: _nonlinear(m, release)))
-    notes = (*m.notes, *standard.notes, *beside.notes)
+    notes = tuple(dict.fromkeys((*m.notes, *standard.notes, *beside.notes)))
     return replace(standard, values={**standard.values, **beside.values}, notes=notes)
 
 
@@ -103,10 +105,13 @@ def _check_release(release: str) -> None:
 
 
 def _by_release(m: Measurement, release: str, draws: int, with_curves: bool = True) -> Results:
-    """What the release itself says."""
-    formulas = Formulas.of(m, release)
-    scatter = scatter_of(m, formulas.series)
-    measured, squares = formulas.at(formulas.series, *formulas.vectors)
+    """What the release itself says; where there is no series for it, what needs none."""
+    try:
+        formulas = Formulas.of(m, release)
+        scatter = scatter_of(m, formulas.series)
+        measured, squares = formulas.at(formulas.series, *formulas.vectors)
+    except MeasureError as problem:
+        return partial_results(m, release, problem)
     spread, bounds = _monte_carlo(formulas, scatter, draws)
     case = _case(m, formulas, measured, squares, spread)
     values = with_lower_limits({key: _value(key, case) for key in keys_of(release)}, case)
@@ -267,6 +272,8 @@ def _value(key: str, case: Case) -> Value:
             value += ONE_SIDED_95 * u
         return Value(value, u, dof, unit, method, reason, is_limit=is_bound(key))
     known_value = math.isfinite(value)
+    if 0 <= square < ONE_SIDED_95 * spread.u_square.get(key, 0.0):  # not significant: zero may be the truth, and lies in the interval
+        u = max(u, value / TWO_SIDED_95)
     return Value(value, u if known_value else math.nan, dof if known_value else math.nan, unit, method, reason)
 
 

@@ -31,7 +31,7 @@ TEMPORAL_METHOD = (
 SPATIAL_METHOD = (
     "analysis of variance of the straightened mean maps without defect pixels, less temporal noise and, bright, a surface of degree 4; "
     "not high-passed as in Release 4.0, so it holds coarse patterns too; "
-    "u is that of this sensor measured again"
+    "u is that of this sensor measured again, and holds that what the surface takes of the pattern is not seen"
 )
 
 

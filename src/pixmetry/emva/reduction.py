@@ -10,6 +10,7 @@ import numpy as np
 from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.core.observations import PhotonTransfer, StackMoments
 from pixmetry.emva.records import MONO, Measurement
+from pixmetry.experiment.hot_pixels import tail_of_counts
 from pixmetry.experiment.moments import LevelSummary
 from pixmetry.experiment.one_pass import Group, Level, Part, Reduced, photon_transfer, reduce_groups, refuse_copies, whole
 from pixmetry.experiment.stack import EQUAL_EXPOSURE, StackAccumulator, choose_stacks, same_exposure
@@ -61,6 +62,7 @@ class _Channel:
 
     levels: dict[str, list[Level]] = field(default_factory=lambda: {"dark": [], "bright": []})
     stacks: dict[str, list[tuple[StackMoments, float | None]]] = field(default_factory=lambda: {"dark": [], "bright": []})
+    stacked: dict[str, list[Level]] = field(default_factory=lambda: {"dark": [], "bright": []})  # the stacks as levels
     shape: tuple[int, int] | None = None
 
     def add(self, group: Group, reduced: Reduced, bits: int) -> None:
@@ -69,13 +71,15 @@ class _Channel:
             refuse_copies(group, reduced.sums, bits)
             self.levels[group.kind].append(Level(_without_codes(reduced.sums), group.exposure_s, group.photons))
         elif isinstance(reduced.sums.moments, StackAccumulator):
+            summary = _without_codes(reduced.sums.moments.summary())
+            self.stacked[group.kind].append(Level(summary, group.exposure_s, group.photons))
             self.stacks[group.kind].append((reduced.sums.moments.result(group.exposure_s), group.photons))
 
 
 def _without_codes(level: LevelSummary) -> LevelSummary:
     """Keep of the codes' occurrences the lowest, the highest, and all between together."""
     lowest, highest = level.counts[0], level.counts[-1]
-    return replace(level, counts=np.array([lowest, level.counts.sum() - lowest - highest, highest]))
+    return replace(level, tail=tail_of_counts(level.counts), counts=np.array([lowest, level.counts.sum() - lowest - highest, highest]))
 
 
 def measure_frames(
@@ -116,7 +120,7 @@ def measure_frames(
     InputError
         If a frame does not fit, or there is no such colour filter.
     MeasureError
-        If there are no dark or no bright levels, the frames of a level are copies, bright and dark are exchanged, or all is saturated.
+        If there are no frames, the frames of a level are copies, bright and dark are exchanged, or all is saturated.
     """
     parts = phases(cfa)
     channels = {name: _Channel() for name in parts}
@@ -130,11 +134,15 @@ def measure_frames(
 
 
 def _measurement(channel: _Channel, bits: int, name: str) -> Measurement:
-    transfer = photon_transfer(channel.levels["dark"], channel.levels["bright"], channel.shape, bits)
+    levels = {kind: found or channel.stacked[kind] for kind, found in channel.levels.items()}  # where there are only stacks, these
+    transfer = photon_transfer(levels["dark"], levels["bright"], channel.shape, bits)
     dark, bright, photons, notes = _stacks(channel)
-    _refuse_exchanged(transfer)
-    _refuse_saturated(transfer.bright.fraction_max, name)
-    return Measurement(transfer, dark, bright, photons, channel=name, notes=(*notes, *_uneven_pairs(transfer)))
+    if transfer.bright.mean_dn.size and transfer.dark.mean_dn.size:
+        _refuse_exchanged(transfer)
+        notes = (*notes, *_uneven_pairs(transfer))
+    if transfer.bright.mean_dn.size:
+        _refuse_saturated(transfer.bright.fraction_max, name)
+    return Measurement(transfer, dark, bright, photons, channel=name, notes=notes)
 
 
 def _uneven_pairs(transfer: PhotonTransfer) -> list[str]:

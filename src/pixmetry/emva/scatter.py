@@ -185,7 +185,8 @@ def sampling_u(levels: LevelMoments, shape: tuple[int, int]) -> np.ndarray:
         (levels.ms_col_dn2, cols - 1, rows, 0.0),
     )
     variance = sum((size * lines * ms / (rows * cols)) ** 2 * (2 + kurtosis) / (lines * more) for ms, lines, size, kurtosis in parts)
-    return np.sqrt(variance)
+    # one pixel that toggled once: no variance is known better than to that
+    return np.hypot(np.sqrt(variance), 1 / (rows * cols * levels.n_frames))
 
 
 @dataclass(frozen=True)
@@ -215,7 +216,8 @@ def _dark_mean(m: Measurement, series: Series, dark: LevelMoments) -> tuple[_Cur
             own = m.dark_stack.n_frames - 1.0
             parts.append((own * float(np.var(m.dark_stack.frame_means_dn, ddof=1)) / count, own))
     squares, dof = (float(sum(column)) for column in zip(*parts, strict=True))
-    wander = float(np.sqrt(squares / dof))
+    # codes that do not change tell the mean no better than to one that does
+    wander = float(np.hypot(np.sqrt(squares / dof), (1 / (dark.n_frames * np.prod(m.transfer.frame_shape))).max()))
     residuals = (y - fitted) / max(wander, 1e-300) * np.sqrt(y.size / max(y.size - 2, 1)) if several else np.array([-1.0, 1.0])
     return _Curve(fitted, residuals, dof), wander, dof
 

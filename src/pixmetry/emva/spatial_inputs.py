@@ -160,10 +160,15 @@ class SpatialInputs:
         """Draws of the temporal white, row and column variances, and the deviation that these give σ²_y.stack."""
         rows, cols = self.shape
         white, row, col = self.vector[5:]
+        least = 1 / (rows * cols * self.n_frames)  # one pixel that toggled once: no variance is known better than to that
+        white = max(white, least)
+        # noise of less than a code toggles between two: of a difference of −1, 0 or 1 the fourth power is the square, Var = σ² − σ⁴
+        toggling = max(0.5 * (1 / white - 1), 1.0)
         squares = np.maximum([white, white, row + white / cols, col + white / rows], 0.0)  # per pixel twice, row mean, column mean
         share = self.image_dn.size / (rows * cols)  # the white noise counts in the filtered region, σ²_y.stack in the whole frame
         lines = np.array([share, 1 - share, 1.0, 1.0]) * [(rows - 1) * (cols - 1), (rows - 1) * (cols - 1), rows - 1, cols - 1]
-        dof = np.maximum(lines * (self.n_frames - 1.0) / [self.uneven_second, self.uneven_second, 1.0, 1.0], 1.0)
+        uneven = max(self.uneven_second, toggling)
+        dof = np.maximum(lines * (self.n_frames - 1.0) / [uneven, uneven, 1.0, 1.0], 1.0)
         deviation = squares * (rng.chisquare(dof, (n, 4)) / dof - 1)
         whole = share * deviation[:, 0] + (1 - share) * deviation[:, 1]
         out = np.stack([deviation[:, 0], deviation[:, 2] - whole / cols, deviation[:, 3] - whole / rows], axis=1)

@@ -18,6 +18,7 @@ CORE_SIGMAS = 2.0  # a level is used this many of its standard deviations around
 MIN_SIGMA_DN = 1.5  # a narrower level does not cover its codes evenly enough for a smooth expectation
 MIN_TEMPORAL_SIGMA_DN = 2.5  # a fixed pattern makes structure of the width of the temporal noise, which the window must follow
 HALF_WINDOW = 8  # codes on each side from which the smooth part of the expectation is taken
+SIGNIFICANT = 3.0  # a variance below this many u is given as a limit
 FALSE_ALARM = 1e-6  # that any code at all is wrongly called missing
 
 
@@ -206,7 +207,7 @@ def _rms_dnl(dnl: np.ndarray, variance: np.ndarray) -> Estimates:
     u = u_square(max(square, 0.0))
     name, method = "dnl_rms_lsb", "excess scatter of code counts over their expectation; IEEE Std 1241 code density test"
     dof = 1 / float((weights**2).sum())
-    if square > 1.645 * u_square(0.0):
+    if square > SIGNIFICANT * u_square(0.0):
         rms = math.sqrt(square)
         return Estimates.from_rows(
             [(name, rms, u / (2 * rms), dof, "LSB")], method=method, confounders=("light with structure finer than the window",)

@@ -24,8 +24,10 @@ class Linearity:
     x_ref: float
 
     @classmethod
-    def of(cls, transfer_fit: Estimates, bits: int) -> Linearity:
-        """Take it from a photon-transfer fit of frames of so many bits."""
+    def of(cls, transfer_fit: Estimates, bits: int) -> Linearity | None:
+        """Take it from a photon-transfer fit of frames of so many bits; None where that holds no coefficients."""
+        if COEFFICIENTS[0] not in transfer_fit:
+            return None
         found = transfer_fit.select(COEFFICIENTS)
         return cls(transfer_fit["offset_dn"].value, found.values, found.covariance, float(2**bits - 1))
 

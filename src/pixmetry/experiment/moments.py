@@ -15,6 +15,7 @@ import numpy as np
 from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.core.observations import LevelMoments
 from pixmetry.experiment._kernels import accumulate_frame, count_codes, sum_maps, sum_pair, sum_squares
+from pixmetry.experiment.hot_pixels import HotTail
 
 MAX_FRAMES = 65536  # so that the sum of 16-bit codes fits 32 bits
 
@@ -40,6 +41,7 @@ class LevelSummary:
     kurtosis_excess: float
     counts: np.ndarray
     spatial_cov_dn2: float
+    tail: HotTail | None = None  # of the codes, where they were not kept one by one
 
 
 def check_frame(frame: np.ndarray, bits: int, shape: tuple[int, int] | None = None) -> np.ndarray:
@@ -198,6 +200,21 @@ class FrameMoments:
         _, products = sum_maps(self._total, self._total_sq, f, self._rows, self._cols)
         return _covariance(list(self._frame_sums.values()), size, products)
 
+    def kurtosis_excess(self) -> float:
+        """Excess kurtosis of the frame differences; NaN where it was not summed."""
+        return float("nan")
+
+    def summary(self) -> LevelSummary:
+        """What the level contributes to a series; the maps can then be dropped."""
+        return LevelSummary(
+            n_frames=self.n_frames,
+            mean_dn=float(self.frame_means_dn().mean()),
+            squares=self.mean_squares(),
+            kurtosis_excess=self.kurtosis_excess(),
+            counts=self.counts,
+            spatial_cov_dn2=self.spatial_covariance_dn2(),
+        )
+
 
 class LevelAccumulator(FrameMoments):
     """The two or few frames of one exposure level: moments, and the kurtosis of the differences of frames 2k and 2k + 1."""
@@ -225,17 +242,6 @@ class LevelAccumulator(FrameMoments):
         """Excess kurtosis of the frame differences (0 for Gaussian noise, and where all differences are equal)."""
         self._need(2)
         return self._powers.kurtosis_excess()
-
-    def summary(self) -> LevelSummary:
-        """What the level contributes to a series; the maps can then be dropped."""
-        return LevelSummary(
-            n_frames=self.n_frames,
-            mean_dn=float(self.frame_means_dn().mean()),
-            squares=self.mean_squares(),
-            kurtosis_excess=self.kurtosis_excess(),
-            counts=self.counts,
-            spatial_cov_dn2=self.spatial_covariance_dn2(),
-        )
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from pixmetry.core.observations import (
     DefectList,
     Observations,
     PatternList,
+    PhotonTransfer,
     Spectra,
     StackMoments,
 )
@@ -24,9 +25,11 @@ from pixmetry.experiment.histogram import HistogramAccumulator, code_errors, swe
 from pixmetry.experiment.linearity import Linearity
 from pixmetry.experiment.moments import LevelSummary
 from pixmetry.experiment.one_pass import Group, Level, photon_transfer, reduce_groups, refuse_copies
+from pixmetry.experiment.partial_transfer import is_short, partial_transfer
 from pixmetry.experiment.patterns import find_phase_patterns
 from pixmetry.experiment.photon_transfer_fit import fit_photon_transfer
-from pixmetry.experiment.spatial_fit import fit_spatial
+from pixmetry.experiment.photon_transfer_levels import refuse_dead_series
+from pixmetry.experiment.spatial_fit import fit_dark_pattern, fit_spatial
 from pixmetry.experiment.stack import StackAccumulator, choose_stacks, same_exposure
 
 __all__ = ["Group", "observe"]
@@ -67,9 +70,10 @@ def observe(
     Raises
     ------
     MeasureError
-        If the frames carry no photon transfer: all saturated, all black, too few levels.
+        If all bright frames are saturated, black or copies.
     """
     levels: dict[str, list[Level]] = {"dark": [], "bright": []}
+    stacked: dict[str, list[Level]] = {"dark": [], "bright": []}
     stacks: dict[str, dict[float, _Stack]] = {"dark": {}, "bright": {}}
     histogram = HistogramAccumulator(bits)
     shape = None
@@ -82,10 +86,12 @@ def observe(
             levels[group.kind].append(Level(sums, group.exposure_s, group.photons))
         elif isinstance(sums.moments, StackAccumulator) and sums.spectra is not None:
             histogram.add_counts(sums.moments.counts, dark=group.kind == "dark", level=condition)
+            stacked[group.kind].append(Level(sums.moments.summary(), group.exposure_s, group.photons))
             kept = stacks[group.kind].get(group.exposure_s)
             if kept is None or sums.moments.n_frames > kept.moments.n_frames:
                 stack = sums.moments.result(group.exposure_s)
                 stacks[group.kind][group.exposure_s] = _Stack(stack, sums.spectra.result(stack.mean_map_dn))
+    levels = {kind: found or stacked[kind] for kind, found in levels.items()}  # where there are only stacks, these
     counts = histogram.result()
     notes = _code_notes(counts)
     sweep = [level.summary for level in levels["bright"]]
@@ -94,9 +100,9 @@ def observe(
     transfer = photon_transfer(levels["dark"], levels["bright"], shape, bits)
     codes = _codes(sweep_histogram(sweep, bits), notes)
     with single_threaded_blas():
-        fit = fit_photon_transfer(transfer, dark_stack, bright_stack, _dnl_lsb(codes))
+        fit = _transfer_fit(transfer, dark_stack, bright_stack, _dnl_lsb(codes), notes)
     if dark and not bright:
-        notes.append("no stack of bright frames: DSNU and PRNU are not measured (take 16 or more at half of saturation)")
+        notes.append("no stack of bright frames: PRNU is not measured (take 16 or more at half of saturation)")
     if dark and bright and not same_exposure(dark.moments, bright.moments):
         notes.append(_unpaired(dark, bright))
         bright = bright_stack = None  # a dark map of another exposure holds another dark current: their difference is not the light's
@@ -120,11 +126,30 @@ def observe(
     )
 
 
+def _transfer_fit(
+    transfer: PhotonTransfer, dark: StackMoments | None, bright: StackMoments | None, dnl_lsb: float, notes: list[str]
+) -> Estimates:
+    """The joint fit; where the frames carry none, what they tell nevertheless, and a note."""
+    if transfer.bright.mean_dn.size:
+        refuse_dead_series(transfer)
+    try:
+        return fit_photon_transfer(transfer, dark, bright, dnl_lsb)
+    except MeasureError as problem:
+        found = partial_transfer(transfer, dark, straight=is_short(transfer))
+        if not len(found) and not transfer.bright.mean_dn.size:
+            raise
+        missing = "non-linearity, saturation" if "gain_dn_per_e" in found else "gain, noise in electrons, non-linearity, saturation"
+        notes.append(f"{missing} and what follows from them are not measured: {problem}")
+        return found
+
+
 def _code_notes(histogram: CodeHistogram) -> list[str]:
     """What the codes themselves tell of a wrong or shifted number of bits."""
     used = np.flatnonzero(histogram.counts)
     step, highest = int(np.gcd.reduce(used)), int(used.max())
     fitting = max(highest.bit_length(), 1)
+    if (histogram.counts == histogram.dark_counts).all():  # dark frames alone reach no high code
+        fitting = histogram.bits
     if step > 1 and step & (step - 1) == 0:
         shifted = f"all values are multiples of {step}: the data seem to be shifted left"
         return [f"{shifted}; gain and noise are in steps of the file, not of the converter"]
@@ -142,13 +167,18 @@ def _pair(dark: list[_Stack], bright: list[_Stack]) -> tuple[_Stack | None, _Sta
 def _unpaired(dark: _Stack, bright: _Stack) -> str:
     one, other = dark.moments.exposure_s, bright.moments.exposure_s
     return (
-        f"no dark stack has the exposure of a bright one (nearest: dark {one:g} s, bright {other:g} s): DSNU, PRNU, shading and the "
+        f"no dark stack has the exposure of a bright one (nearest: dark {one:g} s, bright {other:g} s): PRNU, shading and the "
         f"response of single pixels are not measured (take 16 or more dark frames at {other:g} s)"
     )
 
 
 def _spatial(
-    dark: StackMoments | None, bright: StackMoments | None, spectra: Spectra | None, linearity: Linearity, dnl_lsb: float, notes: list[str]
+    dark: StackMoments | None,
+    bright: StackMoments | None,
+    spectra: Spectra | None,
+    linearity: Linearity | None,
+    dnl_lsb: float,
+    notes: list[str],
 ) -> tuple[DefectList | None, Estimates | None, PatternList | None]:
     if dark is None:
         notes.append(
@@ -157,9 +187,9 @@ def _spatial(
         return None, None, None
     defects = find_defects(dark, bright)
     patterns = find_phase_patterns(dark, spectra, defects, dnl_lsb=dnl_lsb)
-    if bright is None:
-        return defects, None, patterns
     try:
+        if bright is None:
+            return defects, fit_dark_pattern(dark, defects, patterns=patterns, dnl_lsb=dnl_lsb), patterns
         return defects, fit_spatial(dark, bright, defects, linearity=linearity, patterns=patterns, dnl_lsb=dnl_lsb), patterns
     except MeasureError as problem:
         notes.append(f"DSNU and PRNU are not measured: {problem}")

@@ -13,6 +13,7 @@ import numpy as np
 from pixmetry.core.errors import MeasureError
 from pixmetry.core.observations import LevelMoments, PhotonTransfer
 from pixmetry.core.threads import imap_tiles
+from pixmetry.experiment.hot_pixels import tail_of_counts
 from pixmetry.experiment.moments import LevelAccumulator, LevelSummary, level_moments, summarize_pair
 from pixmetry.experiment.stack import GroupReduction, new_group
 
@@ -174,21 +175,17 @@ def refuse_copies(group: Group, level: LevelSummary, bits: int) -> None:
 
 
 def photon_transfer(dark: Sequence[Level], bright: Sequence[Level], shape: tuple[int, int] | None, bits: int) -> PhotonTransfer:
-    """Put the levels of a camera together.
+    """Put the levels of a camera together; of one kind there may be none.
 
     Raises
     ------
     MeasureError
-        If there are none of one kind.
+        If there are none at all.
     """
-    for kind, levels in (("dark", dark), ("bright", bright)):
-        if not levels or shape is None:
-            raise MeasureError(
-                f"no {kind} levels of an exposure series",
-                where="photon transfer",
-                remedy=f"add {kind} groups of two frames; a group of 8 or more frames counts as a stack unless its role says 'level'",
-            )
-    return PhotonTransfer(_moments(bright), _moments(dark), shape, bits)
+    if shape is None or not (dark or bright):
+        raise MeasureError("no frames", where="photon transfer", remedy="add groups of two frames or more")
+    tails = [level.summary.tail or tail_of_counts(level.summary.counts) for level in dark]
+    return PhotonTransfer(_moments(bright), _moments(dark), shape, bits, np.array(tails).reshape(-1, 3))
 
 
 def _moments(levels: Sequence[Level]) -> LevelMoments:

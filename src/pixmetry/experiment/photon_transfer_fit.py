@@ -16,6 +16,7 @@ from pixmetry.core.errors import MeasureError
 from pixmetry.core.estimates import Estimates
 from pixmetry.core.observations import PhotonTransfer, StackMoments
 from pixmetry.experiment import photon_transfer_model as model
+from pixmetry.experiment.hot_pixels import HotDoubt, without_hot_pixels
 from pixmetry.experiment.photon_transfer_levels import (
     CLIPPED_BLACK_FRACTION,
     clipped_black,
@@ -36,7 +37,7 @@ SATURATED_FRACTION = 0.002  # EMVA 1288 R4.0 §6.6: saturation is the highest le
 ALL_SATURATED = 0.999  # then the mean is the top code that the camera stores, which may lie below 2**bits − 1
 NOT_SIGNIFICANT = 3.0  # a variance below this many u is given as a limit
 ONE_SIDED_95 = 1.6448536
-ROW_VAR, COL_VAR, SATURATION, LAMP_VAR, DARK_LIMIT = range(12, 17)
+ROW_VAR, COL_VAR, SATURATION, LAMP_VAR, DARK_LIMIT, HOT, EXTRAPOLATED = range(12, 19)
 METHOD = (
     "joint photon-transfer fit: Poisson electrons, gain and noise before a cubic non-linearity; iterated generalised least squares on "
     "level means and white mean squares, wander and lamp noise by REML, dof by Satterthwaite (EMVA 1288 R4.0 §6-7 for the quantities)"
@@ -88,7 +89,7 @@ def fit_photon_transfer(
     """
     refuse_dead_series(pt)
     scale, by_exposure = light_scale(pt.bright)
-    series = with_stacks(pt, dark_stack, bright_stack if by_exposure else None)
+    series, hot = without_hot_pixels(with_stacks(pt, dark_stack, bright_stack if by_exposure else None), dark_stack)
     levels, time_scale = levels_from(series, scale, by_exposure, core_spread_dn2(dark_stack), dnl_lsb)
     refuse_curved(series, levels)
     try:
@@ -99,7 +100,7 @@ def fit_photon_transfer(
     except MeasureError:
         refuse_curved(series, levels, failed=True)  # the plainer reason, if there is one
         raise
-    return _estimates(series, solution, levels.subset(keep), _Axes(scale, time_scale, by_exposure))
+    return _estimates(series, solution, levels.subset(keep), _Axes(scale, time_scale, by_exposure), hot)
 
 
 @dataclass
@@ -112,6 +113,7 @@ class _Rows:
     units: list[str] = field(default_factory=list)
     gradients: list[np.ndarray] = field(default_factory=list)
     limits: set[str] = field(default_factory=set)
+    lower_limits: set[str] = field(default_factory=set)
     reasons: dict[str, str] = field(default_factory=dict)
 
     def add(self, name: str, value: float, unit: str, gradient: dict[int, float], reason: str = "", limit: bool = False) -> None:
@@ -148,7 +150,7 @@ class _Rows:
 def _augmented(pt: PhotonTransfer, s: Solution, d: model.Levels) -> tuple[np.ndarray, np.ndarray]:
     """Parameters of the fit and the quantities beside it, with their covariance."""
     n = s.p.size
-    values, cov = np.zeros(n + 5), np.zeros((n + 5, n + 5))
+    values, cov = np.zeros(n + 7), np.zeros((n + 7, n + 7))
     dark = ~d.bright
     values[:n], cov[:n, :n] = s.p, s.covariance
     line, line_var = temporal_row_col_vars(pt)
@@ -197,9 +199,11 @@ def _limit_factor(dof: float) -> float:
     return float(np.sqrt(dof / 2) * (dof / chi2 - 1))
 
 
-def _estimates(pt: PhotonTransfer, s: Solution, d: model.Levels, axes: _Axes) -> Estimates:
+def _estimates(pt: PhotonTransfer, s: Solution, d: model.Levels, axes: _Axes, hot: HotDoubt) -> Estimates:
     p = s.p
     values, cov = _augmented(pt, s, d)
+    cov[HOT, HOT] = hot.mean_dn**2
+    cov[DARK_VAR, DARK_VAR] += hot.var_dn2**2
     lamp_dof = float(max(d.bright.sum() - s.free[[SLOPE, A1, A1 + 1, A3, LIGHT_OFFSET]].sum(), 1))
     saturation = _saturation(pt, s, d, axes)
     if saturation:
@@ -210,7 +214,7 @@ def _estimates(pt: PhotonTransfer, s: Solution, d: model.Levels, axes: _Axes) ->
     rows.add("gain_dn_per_e", p[GAIN], "DN/e-", {GAIN: 1.0}, wide)
     _add_temporal_noise(rows, s, d, values, clipped_black(pt))
     one_time = "" if s.free[DARK_SLOPE] else "contains the dark signal: the dark frames have about one exposure time"
-    rows.add("offset_dn", p[OFFSET], "DN", {OFFSET: 1.0}, one_time)
+    rows.add("offset_dn", p[OFFSET], "DN", {OFFSET: 1.0, HOT: 1.0}, one_time)
     if s.free[DARK_SLOPE]:
         _add_dark_current(rows, p, axes.time_s)
     for k in range(3):
@@ -218,7 +222,7 @@ def _estimates(pt: PhotonTransfer, s: Solution, d: model.Levels, axes: _Axes) ->
     _add_sensitivity(rows, pt, p, axes)
     rows.add_root("illumination_noise_rel", "1", s.components[1], LAMP_VAR, None, "noise of the light from level to level", dof=lamp_dof)
     if saturation:
-        _add_saturation(rows, p, saturation, d.x_ref)
+        _add_saturation(rows, p, saturation, d.x_ref, float(d.mean[d.bright].max()))
     gradients = np.array(rows.gradients)
     return Estimates(
         names=tuple(rows.names),
@@ -229,6 +233,7 @@ def _estimates(pt: PhotonTransfer, s: Solution, d: model.Levels, axes: _Axes) ->
         method=METHOD,
         confounders=CONFOUNDERS,
         limits=frozenset(rows.limits),
+        lower_limits=frozenset(rows.lower_limits),
         reasons=rows.reasons,
     )
 
@@ -316,15 +321,20 @@ def _saturation(pt: PhotonTransfer, s: Solution, d: model.Levels, axes: _Axes) -
     return (float(b.mean_dn[first]), float(max(growth, 0.3)), "full well") if beyond else None
 
 
-def _add_saturation(rows: _Rows, p: np.ndarray, saturation: tuple[float, float, str], x_ref: float) -> None:
+def _add_saturation(rows: _Rows, p: np.ndarray, saturation: tuple[float, float, str], x_ref: float, brightest_dn: float) -> None:
     """Saturation in stored DN and in electrons."""
     y, _, cause = saturation
     gain, a = p[GAIN], p[A1 : A3 + 1]
-    x = float(model.signal_from_mean(np.array([y - p[OFFSET]]), a, x_ref, np.zeros(1))[0])
-    slope = float(model.transfer(np.array([x]), a, x_ref)[1][0])
+    x, brightest = model.signal_from_mean(np.array([y, brightest_dn]) - p[OFFSET], a, x_ref, np.zeros(1)).tolist()
+    slope, last_slope = model.transfer(np.array([x, brightest]), a, x_ref)[1].tolist()
+    # beyond the brightest level that was fitted the bend is extrapolated: known no better than to all of it
+    bend = x - brightest - (y - brightest_dn) / last_slope
+    rows.covariance[EXTRAPOLATED, EXTRAPOLATED] = (bend / gain) ** 2
     rows.add("saturation_dn", y, "DN", {SATURATION: 1.0}, f"set by the {cause}")
     gradient = {SATURATION: 1 / (slope * gain), OFFSET: -1 / (slope * gain), GAIN: -x / gain**2}
-    gradient |= {A1 + k: -x * (x / x_ref) ** (k + 1) / (slope * gain) for k in range(3)}
+    gradient |= {EXTRAPOLATED: 1.0} | {A1 + k: -x * (x / x_ref) ** (k + 1) / (slope * gain) for k in range(3)}
     clips = cause == "converter"
     note = "lower bound of the pixel's full well: the converter clips first" if clips else "the pixels saturate below the top code"
     rows.add("full_well_e", x / gain, "e-", gradient, note)
+    if clips:
+        rows.lower_limits.add("full_well_e")

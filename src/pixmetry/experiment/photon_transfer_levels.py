@@ -46,7 +46,7 @@ def with_stacks(pt: PhotonTransfer, dark: StackMoments | None, bright: StackMome
 
 
 def _append(levels: LevelMoments, stack: StackMoments | None) -> LevelMoments:
-    if stack is None:
+    if stack is None or _holds(levels, stack):
         return levels
     same = ("exposure_s", "n_frames", "mean_dn", "fraction_min", "fraction_max", "ms_pixel_dn2", "ms_row_dn2", "ms_col_dn2", "ms_frame_dn2")
     extra = {name: getattr(stack, name) for name in same}
@@ -56,14 +56,20 @@ def _append(levels: LevelMoments, stack: StackMoments | None) -> LevelMoments:
     return replace(levels, **{name: np.append(getattr(levels, name), extra[name]) for name in present})
 
 
+def _holds(levels: LevelMoments, stack: StackMoments) -> bool:
+    """Whether the frames of a stack are a level of the series already, for want of others."""
+    same = (levels.exposure_s == stack.exposure_s) & (levels.n_frames == stack.n_frames)
+    return bool(np.any(same & (np.abs(levels.mean_dn - stack.mean_dn) <= 1e-9 * max(abs(stack.mean_dn), 1.0))))
+
+
 def temporal_row_col_vars(pt: PhotonTransfer) -> tuple[np.ndarray, np.ndarray]:
     """Row and column temporal variances from the dark mean squares, DN², and the variances of these two estimates.
 
     Where the dark frames are clipped at black, from the bright ones that are not clipped.
     """
     rows, cols = pt.frame_shape
-    dark, whole = pt.dark, pt.dark.fraction_min - pt.bright.fraction_min.min() <= CLIPPED_BLACK_FRACTION
-    if not whole.any():
+    dark, whole = pt.dark, pt.dark.fraction_min - pt.bright.fraction_min.min(initial=1.0) <= CLIPPED_BLACK_FRACTION
+    if not whole.any() and pt.bright.mean_dn.size:
         dark, whole = pt.bright, unclipped_bright(pt)
     f = (dark.n_frames - 1) * whole
     value, var = np.zeros(2), np.zeros(2)
@@ -149,7 +155,9 @@ def unclipped_bright(pt: PhotonTransfer) -> np.ndarray:
 def refuse_dead_series(pt: PhotonTransfer) -> None:
     """Refuse a series of which no estimate can be made, with the plain reason."""
     what = remedy = ""
-    if (pt.bright.fraction_max > 0.5).all():
+    if not pt.bright.mean_dn.size:
+        what, remedy = "no bright level", "take bright frames at 10 or more light levels, two at each"
+    elif (pt.bright.fraction_max > 0.5).all():
         what, remedy = "all bright frames are saturated", "shorten the exposure or dim the light"
     elif (pt.bright.fraction_min > 0.5).all():
         what, remedy = "all bright frames are black", "check lamp, shutter and exposure"
@@ -211,10 +219,11 @@ def usable_levels(pt: PhotonTransfer, d: model.Levels) -> np.ndarray:
     at = np.flatnonzero(d.bright & keep)
     at = at[np.argsort(d.light[at], kind="stable")]
     if at.size:
-        # the knee: the first level in order of light whose variance lies significantly below that of a darker one
-        peak = np.maximum.accumulate(d.ms[at])
+        # the knee: the first level in order of light whose variance lies significantly below that of a darker one,
+        # whatever rounding did to the two
+        least, most = model.bounds_before_rounding(d.ms[at])
         noise = np.sqrt(4 / np.maximum(d.ms_dof[at], 1))
-        fallen = np.flatnonzero(d.ms[at] < peak * np.minimum(0.9, 1 - 6 * noise))
+        fallen = np.flatnonzero(most < np.maximum.accumulate(least) * np.minimum(0.9, 1 - 6 * noise))
         if fallen.size:
             keep[at[int(np.argmax(d.ms[at[: fallen[0]]])) :]] = False  # the peak itself is already bent
     found = int((keep & d.bright).sum())

@@ -129,10 +129,24 @@ def least_var_before_rounding(var_dn2: float) -> float:
 
     Two codes that toggle show up to 0.25 DN² however small the noise, so the 1/12 rule is not safe near the bound of EMVA 1288 eq. 54.
     """
+    return float(bounds_before_rounding(np.array([var_dn2]))[0][0])
+
+
+def bounds_before_rounding(var_dn2: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Smallest and largest variance before rounding that can look like each of ``var_dn2`` after it, at any sub-code phase, shape (n,).
+
+    By the first harmonic (4v + 1/π²) e^(−2π²v) of the rounded variance (Widrow and Kollár, Quantization Noise, ch. 5), which is enough
+    above v = 0.05 DN²; a smaller noise shows 0 within a code and up to ¼ DN² more than itself at its edge.
+    """
     v = np.linspace(0, 1, 501)
     excess = (4 * v + 1 / np.pi**2) * np.exp(-2 * np.pi**2 * v)
     at_most = v + QUANTISATION_DN2 + np.where(v < 0.05, 0.25 - QUANTISATION_DN2, excess)
-    return float(v[np.argmax(at_most >= var_dn2)]) if var_dn2 < 1 else var_dn2 - QUANTISATION_DN2
+    at_least = np.where(v < 0.05, 0.0, np.maximum(v + QUANTISATION_DN2 - excess, 0.0))
+    seen = np.asarray(var_dn2, float)[:, None]
+    wide = np.maximum(seen[:, 0] - QUANTISATION_DN2, 0.0)
+    low = np.where(seen[:, 0] < 1, v[np.argmax(at_most >= seen, axis=1)], wide)
+    high = np.where(seen[:, 0] < 1, v[v.size - 1 - np.argmax((at_least <= seen)[:, ::-1], axis=1)], wide)
+    return low, high
 
 
 def white_before_rounding(ms_dn2: float, dither_dn2: float) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -17,6 +18,10 @@ from pixmetry.experiment.surface import Strata, Surface, cross_strata, fill, fit
 
 PARTS = ("pixel", "row", "col")
 BROKEN, CHANCE = 5.0, 3e-7  # u below zero from which a variance is no chance any more, and the chance that remains
+HIDDEN = 0.25  # relative error of the local slope beyond which a pattern seen through quantisation is only bounded
+SIGNIFICANT = 3.0  # a variance below this many u is given as a limit
+ONE_SIDED_95 = 1.6448536
+NOT_BY_CHANCE = 0.00135  # beyond so many u of a normal distribution
 NOT_ROUND = 3.0  # curvatures along x and y that differ by more than this many u belong to a light that is not round
 METHOD = "analysis of variance of the mean maps, less temporal mean squares / L; Scheffé 1959, limits after Graybill & Wang 1980"
 
@@ -110,8 +115,9 @@ def fit_spatial(
     surface, mask = maps.surface, maps.mask
     waves_dn2 = 0.0 if patterns is None else float((0.5 * patterns.amplitude_dn[patterns.moving] ** 2).sum())
     squares, covariance = _mean_squares(dark_stack, bright_stack, dark, response, mask, surface, this_sensor, waves_dn2)
-    components = _components(squares, covariance, dark_stack.shape, float((surface.values**-2.0).mean()))
-    result = _with_rounding(components, dither_dn2, dnl_lsb).join(_shading(surface, squares))
+    per_light2 = float((surface.values**-2.0).mean())
+    components = _components(squares, covariance, dark_stack.shape, per_light2, dither_dn2)
+    result = _with_rounding(components, dither_dn2, dnl_lsb, per_light2).join(_shading(surface, squares))
     return result if linearity is None else _with_common_scale(result, linearity.contrast_u_rel(stored_dn))
 
 
@@ -164,6 +170,24 @@ def spatial_maps(
     return SpatialMaps(dark_stack, bright_stack, dark, response - fit_surface(response, surface_degree).values, surface, mask)
 
 
+def fit_dark_pattern(
+    dark_stack: StackMoments, defects: DefectList | None = None, *, patterns: PatternList | None = None, dnl_lsb: float = 0.0
+) -> Estimates:
+    """Dark-signal non-uniformity alone, where there is no bright stack; parameters and values as of `fit_spatial`.
+
+    Raises
+    ------
+    MeasureError
+        If the frames are too small.
+    """
+    # an even light without noise leaves the dark part as it is
+    still: dict[str, Any] = {name: 0.0 for name in ("ms_pixel_dn2", "ms_row_dn2", "ms_col_dn2", "ms_frame_dn2", "var_stack_dn2")}
+    light = float(np.abs(dark_stack.mean_map_dn).max()) + 1.0
+    even = replace(dark_stack, mean_map_dn=dark_stack.mean_map_dn + light, var_map_dn2=np.zeros_like(dark_stack.var_map_dn2), **still)
+    found = fit_spatial(dark_stack, even, defects, patterns=patterns, dnl_lsb=dnl_lsb)
+    return found.select([name for name in found.names if name.startswith("dsnu")])
+
+
 def _with_common_scale(e: Estimates, u_rel: float) -> Estimates:
     """Add the relative uncertainty that all contrasts of the light have in common."""
     contrast = np.array([0.0 if name.startswith("dsnu") else 1.0 for name in e.names]) * e.values * u_rel
@@ -173,18 +197,39 @@ def _with_common_scale(e: Estimates, u_rel: float) -> Estimates:
     return replace(e, covariance=covariance, dof=dof)
 
 
-def _with_rounding(e: Estimates, white_dn2: float, dnl_lsb: float) -> Estimates:
-    """Add what rounding at an unknown phase does to the DSNU: to all variances by their slope, to the pixels by the wave itself."""
-    total2 = e["dsnu_total_dn"].value ** 2
-    slope2 = slope_error_var(white_dn2, total2, dnl_lsb)  # common to all pixels
-    own2 = min(float(rounding_error_vars(np.array(white_dn2), 0.0, dnl_lsb)[0]), slope_error_var(white_dn2, 0.0, dnl_lsb) * total2)
-    extra = np.zeros(len(e))
+def _with_rounding(e: Estimates, white_dn2: float, dnl_lsb: float, per_light2: float) -> Estimates:
+    """Add what rounding at an unknown phase does to the DSNU: to all variances by their slope, to the pixels by the wave itself.
+
+    Where noise and pattern together do not carry the pattern over the steps, it may be hidden altogether, and what was seen is an upper
+    limit with what may be hidden; the response, from which the dark map was taken, then holds as much of it over the square of the light.
+    """
+    seen2 = max((e[name].value ** 2 for name in ("dsnu_total_dn", "dsnu_pixel_dn") if name in e), default=0.0)
+    slope2 = slope_error_var(white_dn2, seen2, dnl_lsb)  # common to all pixels
+    hidden = _is_hidden(white_dn2, seen2)
+    own2 = min(float(rounding_error_vars(np.array(white_dn2), 0.0, dnl_lsb)[0]), slope_error_var(white_dn2, 0.0, dnl_lsb) * seen2)
+    lost2 = float(rounding_error_vars(np.array(white_dn2), seen2, dnl_lsb)[0]) if hidden else 0.0
+    values, u_squares, limits, reasons = e.values.copy(), 2 * e.values * e.u, set(e.limits), dict(e.reasons)
     for i, name in enumerate(e.names):
-        if name.startswith("dsnu"):
+        dark = name.startswith("dsnu")
+        if dark:
             wave2 = own2 if name in ("dsnu_pixel_dn", "dsnu_total_dn") else 0.0
-            u_square = math.hypot(2 * math.sqrt(slope2) * e.values[i] ** 2, wave2)
-            extra[i] = u_square / (2 * e.values[i]) if e.values[i] > 0 else 0.0
-    return replace(e, covariance=e.covariance + np.diag(extra**2))
+            u_squares[i] = float(np.linalg.norm([u_squares[i], 2 * math.sqrt(slope2) * values[i] ** 2, wave2, lost2]))
+        else:
+            u_squares[i] = math.hypot(u_squares[i], lost2 * per_light2)
+        if hidden and (dark or name not in limits and values[i] ** 2 < SIGNIFICANT * u_squares[i]):
+            added = math.hypot(2 * math.sqrt(slope2) * values[i] ** 2, lost2) if name in limits else u_squares[i]
+            values[i] = math.sqrt(values[i] ** 2 + ONE_SIDED_95 * added)
+            limits.add(name)
+            reasons[name] = "the dark noise is too small to carry the pattern over the steps of quantisation; 95 % upper limit"
+    slopes = np.divide(0.5, values, out=np.zeros(len(e)), where=values > 0)
+    covariance = e.covariance.copy()
+    covariance[np.diag_indices(len(e))] = np.maximum((u_squares * slopes) ** 2, 0.0)
+    return replace(e, values=values, covariance=covariance, limits=frozenset(limits), reasons=reasons)
+
+
+def _is_hidden(white_dn2: float, seen_dn2: float) -> bool:
+    """Whether noise and pattern together are too small to carry a pattern over the steps of quantisation."""
+    return slope_error_var(white_dn2, max(seen_dn2, 0.0)) > HIDDEN**2
 
 
 def without_fixed_waves(image: np.ndarray, patterns: PatternList) -> np.ndarray:
@@ -212,7 +257,8 @@ def temporal_strata(stack: StackMoments, mask: np.ndarray, weight: np.ndarray | 
     n = stack.n_frames
     line_row = cols * stack.ms_row_dn2 - stack.ms_pixel_dn2
     line_col = rows * stack.ms_col_dn2 - stack.ms_pixel_dn2
-    return Strata(scale_white * white / n, (scale_white * white + scale * line_row) / n, (scale_white * white + scale * line_col) / n)
+    row, col = (max(scale_white * white + scale * line, 0.0) for line in (line_row, line_col))
+    return Strata(scale_white * white / n, row / n, col / n)
 
 
 def _mean_squares(
@@ -256,6 +302,9 @@ def _mean_squares(
         noise = np.concatenate([noise_dark, values[9:] + noise_dark * float((per_light**2).mean())])
         fixed = np.maximum(values[:6] - noise, 0.0)
         variances[:6] = 2 * (values[:6] ** 2 - fixed**2) / dof[:6]
+        # what of this sensor's own pattern went out with the surface is not seen: ν of n degrees of freedom stand for all of them
+        lost = dof_map - dof_response
+        variances[3:6] += (lost / dof_map * fixed[3:]) ** 2 * (2 / np.maximum(lost, 1) + 2 / dof_response)
         common = 2 * (shared**2 - (shared + noise_dark * float(per_light.mean())) ** 2) / dof_map
     covariance = np.diag(variances + waves**2)
     for i in range(3):
@@ -274,7 +323,7 @@ def _kurtosis(residual: np.ndarray, mask: np.ndarray) -> float:
     return max(float((squares * squares).mean()) / variance**2 - 3.0, -1.5) if variance > 0 else 0.0
 
 
-def _components(squares: _MeanSquares, covariance: np.ndarray, shape: tuple[int, int], per_light2: float) -> Estimates:
+def _components(squares: _MeanSquares, covariance: np.ndarray, shape: tuple[int, int], per_light2: float, white_dn2: float) -> Estimates:
     rows, cols = shape
     # rows of the matrix: pixel, row, column, total variance; columns: mean squares of pixels, rows, columns
     split = np.array([[1.0, 0, 0], [-1 / cols, 1 / cols, 0], [-1 / rows, 0, 1 / rows]])
@@ -295,6 +344,8 @@ def _components(squares: _MeanSquares, covariance: np.ndarray, shape: tuple[int,
     in_u = np.divide(variances, np.sqrt(own), out=np.zeros(8), where=own > 0)
     of_lines = np.array([part in ("row", "col") for part in (*PARTS, "total")] * 2)
     far = np.where(of_lines, (in_u < 0) & _calmer_lines(squares), in_u < -BROKEN)
+    if _is_hidden(white_dn2, float(variances[:4].max())):  # then quantisation is the reason
+        far[:4] = False
     broken = {name: _broken(name, float(in_u[i])) for i, name in enumerate(names) if far[i]}
     found = Estimates(
         names=tuple(names),
@@ -339,17 +390,17 @@ def _broken(name: str, in_u: float) -> str:
 
 
 def _bounds(matrix: np.ndarray, squares: _MeanSquares) -> tuple[np.ndarray, np.ndarray]:
-    """One-sided 95 % bounds of linear combinations of mean squares: modified large-sample method of Graybill & Wang (1980).
+    """One-sided bounds of linear combinations of mean squares, below 99.87 %, above 95 %: large-sample method of Graybill & Wang (1980).
 
-    The part of waves lies between ln(20/19) and ln 20 times its mean with 90 %.
+    The part of waves lies between ln(20/19) and −ln 0.00135 times its mean.
     """
     from scipy.stats import chi2
 
     dof = 2 / squares.relative_variances()
     above = (dof / chi2.ppf(0.05, dof) - 1) * squares.values  # how far the expectation may lie above the mean square
-    below = (1 - dof / chi2.ppf(0.95, dof)) * squares.values
+    below = (1 - dof / chi2.isf(NOT_BY_CHANCE, dof)) * squares.values
     above = np.hypot(above, (1 - math.log(20 / 19)) * squares.waves)
-    below = np.hypot(below, (math.log(20) - 1) * squares.waves)
+    below = np.hypot(below, (-math.log(NOT_BY_CHANCE) - 1) * squares.waves)
     positive, negative = np.maximum(matrix, 0.0), np.minimum(matrix, 0.0)
     best = matrix @ squares.values
     # a best estimate below zero is taken as zero, so that a lucky draw does not give a limit below what the data can tell

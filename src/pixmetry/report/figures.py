@@ -53,7 +53,7 @@ def _size(fit: Estimates | None, name: str) -> float:
 
 
 def _series(seen: Observations) -> tuple[PhotonTransfer, Estimates]:
-    """The photon-transfer series and its fit, which every assessment has."""
+    """The photon-transfer series and its fit."""
     assert seen.photon_transfer is not None and seen.photon_transfer_fit is not None
     return seen.photon_transfer, seen.photon_transfer_fit
 
@@ -270,11 +270,13 @@ def dark_codes(histogram: CodeHistogram) -> Picture:
 
 def all_pictures(seen: Observations, standard: Results, maps: Mapping[str, np.ndarray]) -> dict[str, Picture]:
     """Every figure that these observations can give, by name."""
-    made = [variance_against_mean(seen, standard), nonlinearity(seen), signal_to_noise(seen)]
+    fitted = seen.photon_transfer_fit is not None and "nonlinearity_a1" in seen.photon_transfer_fit
+    made = [variance_against_mean(seen, standard), nonlinearity(seen), signal_to_noise(seen)] if fitted else []
     if seen.dark_spectra is not None and seen.dark_stack is not None:
         made.append(spectra(seen.dark_spectra, "dark", seen.dark_stack.n_frames, 1.0, "DN"))
     if seen.bright_spectra is not None and seen.bright_stack is not None:
-        level = seen.bright_stack.mean_dn - _series(seen)[1]["offset_dn"].value
+        fit = seen.photon_transfer_fit
+        level = seen.bright_stack.mean_dn - (fit["offset_dn"].value if fit is not None and "offset_dn" in fit else 0.0)
         made.append(spectra(seen.bright_spectra, "bright", seen.bright_stack.n_frames, level / 100, "%"))
     if "dark_dn" in maps and seen.dark_stack is not None:
         stack = seen.dark_stack

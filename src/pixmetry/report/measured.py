@@ -107,7 +107,8 @@ def _missing(name: str, quantity: Quantity, reason: str, standard: Results | Non
 
 def _row(e: Estimate, quantity: Quantity, standard: Results | None) -> Row:
     scale, unit = quantity.display or (1.0, e.unit)
-    number = limit(e.value * scale, unit) if e.kind == "upper_limit" else uncertain(e.value * scale, e.u * scale, unit)
+    at_least = e.kind == "lower_limit"
+    number = uncertain(e.value * scale, e.u * scale, unit) if e.kind == "value" else limit(e.value * scale, unit, at_least=at_least)
     return Row(quantity.title, e.name, number, _dof(e.dof), "" if standard is None else say(standard, quantity.standard), e.reason)
 
 

@@ -57,11 +57,11 @@ def uncertain(value: float, u: float, unit: str) -> Number:
     return Number(fixed(scaled_value, places), fixed(scaled_u, places), _with_power(unit, power))
 
 
-def limit(value: float, unit: str) -> Number:
-    """A one-sided upper limit."""
+def limit(value: float, unit: str, *, at_least: bool = False) -> Number:
+    """A one-sided upper limit, or a lower one."""
     power = floor(log10(value)) if value > 0 else 0
     power = 0 if -4 < power < 6 else power
-    return Number(f"<{NO_BREAK}{significant(value / 10.0**power, LIMIT_DIGITS)}", NONE, _with_power(unit, power))
+    return Number(f"{'>' if at_least else '<'}{NO_BREAK}{significant(value / 10.0**power, LIMIT_DIGITS)}", NONE, _with_power(unit, power))
 
 
 def _with_power(unit: str, power: int) -> str:

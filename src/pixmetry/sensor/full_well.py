@@ -59,7 +59,7 @@ def measure(observations: Observations) -> Estimates:
     fit, transfer = observations.photon_transfer_fit, observations.photon_transfer
     if fit is not None and "full_well_e" in fit:
         return fit.select(["full_well_e"])
-    if fit is None or transfer is None:
+    if fit is None or transfer is None or not transfer.bright.mean_dn.size:
         raise MeasureError("full well needs a photon-transfer series", where="sensor.full_well", remedy="add levels up to saturation")
     gain, offset = fit["gain_dn_per_e"], fit["offset_dn"]
     brightest = float(transfer.bright.mean_dn.max() - offset.value) / gain.value
@@ -67,6 +67,7 @@ def measure(observations: Observations) -> Estimates:
     return Estimates.from_rows(
         [("full_well_e", brightest, u, gain.dof, "e-")],
         method="brightest level of the photon transfer",
+        lower_limits=frozenset({"full_well_e"}),
         reasons={"full_well_e": "lower bound: no level is saturated; add levels until the mean stands still"},
     )
 
