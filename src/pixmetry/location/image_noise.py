@@ -30,6 +30,7 @@ VAGUEST = 0.4  # the same from which edges that are not as the template has them
 OUTLIER_SIGMA = 4.0
 KEPT = 0.998872  # variance that a normal distribution keeps when values beyond 4 standard deviations are left out
 SHIFTED_SIGMA = 4.5  # by which the scores of rows must vary more than noise for rows to be shifted
+ROWS_ALONE = 0.5  # of the shifts of rows, above which those of columns say that there is no jitter
 SHIFT_LIMIT = 5.0  # scores farther out than so many times the usual are left out
 
 
@@ -93,7 +94,7 @@ def noise_from_image(
         before, guess, start = guess, _fitted(left, guess, least), left.parameters
         if step and _alike(before, guess, left.level):
             break
-    return _with_row_shifts(guess, _leftovers(windows, targets, which, guess, kind, threads, start))
+    return _with_row_shifts(guess, windows, targets, which, kind, threads, start)
 
 
 def row_shifts_from_image(
@@ -102,7 +103,7 @@ def row_shifts_from_image(
     """Return a noise model that is known with the shifts of rows against each other that the frame shows; arguments as above."""
     which = _some(targets)
     windows = Windows.of(frame, targets, noise, kind, KINDS.index(kind), aperture_px, True, False)
-    return _with_row_shifts(noise, _leftovers(windows, targets, which, windows.noise, kind, threads, None))
+    return _with_row_shifts(noise, replace(windows, noise=noise), targets, which, kind, threads, None)
 
 
 def _some(targets: Targets) -> np.ndarray:
@@ -110,9 +111,43 @@ def _some(targets: Targets) -> np.ndarray:
     return np.unique(np.linspace(0, len(targets) - 1, min(len(targets), MOST_TARGETS)).round().astype(int))
 
 
-def _with_row_shifts(noise: NoiseModel, left: Leftovers) -> NoiseModel:
-    row, field = row_shifts(left)
-    return replace(noise, row_shift_px=row, field_shift_px=field)
+def _with_row_shifts(
+    noise: NoiseModel,
+    windows: Windows,
+    targets: Targets,
+    which: np.ndarray,
+    kind: str,
+    threads: int | None,
+    start: np.ndarray | None,
+) -> NoiseModel:
+    """The noise with what rows are shifted against each other; where columns are so as well, it is the shape that does not fit."""
+    rows = row_shifts(_leftovers(windows, targets, which, noise, kind, threads, start))
+    if not any(rows):
+        return noise
+    turned = transposed(targets)
+    frame = np.ascontiguousarray(windows.frame.T)
+    aside = Windows.of(frame, turned, noise, kind, KINDS.index(kind), windows.aperture_px, True, False)
+    columns = row_shifts(_leftovers(aside, turned, which, noise, kind, threads, None))
+    if math.hypot(*columns) > ROWS_ALONE * math.hypot(*rows):
+        return noise
+    return replace(noise, row_shift_px=rows[0], field_shift_px=rows[1])
+
+
+def transposed(targets: Targets) -> Targets:
+    """The same targets in the frame with rows and columns exchanged."""
+    angle = 90.0 - targets.angle_deg
+    return replace(
+        targets,
+        x_px=targets.y_px,
+        y_px=targets.x_px,
+        angle_deg=np.where(angle > 90.0, angle - 180.0, angle),
+        background_x_dn_per_px=targets.background_y_dn_per_px,
+        background_y_dn_per_px=targets.background_x_dn_per_px,
+        row_first=targets.col_first,
+        row_stop=targets.col_stop,
+        col_first=targets.row_first,
+        col_stop=targets.row_stop,
+    )
 
 
 def _alike(one: NoiseModel, other: NoiseModel, level: np.ndarray) -> bool:

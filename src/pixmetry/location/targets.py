@@ -19,7 +19,7 @@ class Flag(IntFlag):
     GRADIENT = 32  # the light falls off across the target, significantly
     UNEVEN_BACKGROUND = 64  # the background slopes under the target, significantly
     POOR_FIT = 128  # the residuals are larger than the noise
-    NOT_CONVERGED = 256  # the fit did not come to rest; the position is not to be used
+    NOT_CONVERGED = 256  # the fit did not come to rest, or far from knows the place; not to be used
     FAINT = 512  # so little contrast that the covariance, which is of first order, is too small
 
     def words(self) -> str:

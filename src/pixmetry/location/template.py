@@ -283,7 +283,7 @@ def _positions(kind: str, targets: Targets, result: Fitted, on_ground: np.ndarra
     worst = np.sqrt(result.noise_var_px2)
     flags = targets.flags.astype(np.uint32)
     for flag, where in (
-        (Flag.NOT_CONVERGED, ~result.at_rest),
+        (Flag.NOT_CONVERGED, ~result.at_rest | (worst > np.maximum(targets.semi_major_px, 1.0))),  # beyond its own size: no place at all
         (Flag.BORDER, result.cut),
         (Flag.SATURATED, result.at_top > 0),
         (Flag.CLIPPED_AT_BLACK, result.at_bottom > 0),
