@@ -10,7 +10,7 @@ import pytest
 
 from budget.cameras import ETA, GAIN_DN_PER_E, camera, element
 from pixmetry.budget.monte_carlo import Trials, _axis, helpers_of, monte_carlo
-from pixmetry.budget.probe import Facts, Target, facts_of, make_probe, parse_target, resolve
+from pixmetry.budget.probe import Facts, Target, facts_of, make_probe, parse_target, passed_light, resolve
 from pixmetry.core.errors import InputError
 from pixmetry.location.estimators import Estimator
 
@@ -90,6 +90,19 @@ def test_a_source_alone_is_seen_through_the_camera_s_own_line() -> None:
     assert alone.x.u == pytest.approx(missed.x.u, rel=1e-6) and 0.015 < alone.x.u < 0.04  # 5 ns are 0.071 px, over seven rows
     assert {"electronics.video_amplifier", "cable.termination"} == set(helpers_of(cam, ["grabber.line_jitter"]))
     assert helpers_of(cam, ["electronics.video_amplifier"]) == ("cable.termination",)  # a jitter shapes no line
+
+
+def test_a_target_has_its_light_whatever_the_aperture_takes_away() -> None:
+    """Six tenths of every pixel gather light. The target is of so many per cent of saturation all the same: the noise weighs as it did."""
+    noise, aperture = element("electronics.amplifier_noise", white_e=WHITE_E), element("sensor.pixel_aperture", collected_rel=0.6)
+    cam = camera(noise)
+    cam = replace(cam, chain=(aperture, *cam.chain))
+    assert passed_light(cam) == pytest.approx(0.6, rel=1e-5) and passed_light(noisy()) == 1.0
+    law = Estimator(threshold_dn=10.0)
+    design = Trials(cam, TARGET, law, facts(cam), trials=1024, units=4, seed=SEED)
+    alone, whole = design.of(only=["electronics.amplifier_noise"]), design.of(off=["electronics.amplifier_noise"])
+    # the same draws on the same targets: they differ by the target's slopes alone, not by 1/0.6
+    assert whole.x.u == pytest.approx(alone.x.u, rel=0.03) and whole.y.u == pytest.approx(alone.y.u, rel=0.03)
 
 
 def test_windows_follow_a_clock_that_is_cold() -> None:

@@ -16,6 +16,7 @@ from pixmetry.budget.probe import (
     background_of,
     facts_of,
     ideal_element,
+    passed_light,
     perfect,
     resolve,
     scene_of,
@@ -173,11 +174,12 @@ class Trials:
         """Positions found in the frames of a variant of the camera less the true ones: px of the sensor, (units, places, frames)."""
         key = tuple((e.on, e.params) for e in camera.chain)
         if key not in self._found:
-            parts = [self._unit(replace(camera, unit_seed=camera.unit_seed + UNIT_STRIDE * k), k) for k in range(self.units)]
+            facts = replace(self.facts, dn_per_photon=self.facts.dn_per_photon * passed_light(camera))
+            parts = [self._unit(replace(camera, unit_seed=camera.unit_seed + UNIT_STRIDE * k), k, facts) for k in range(self.units)]
             self._found[key] = np.stack([x for x, _ in parts]), np.stack([y for _, y in parts])
         return self._found[key]
 
-    def _unit(self, camera: Camera, unit: int) -> tuple[np.ndarray, np.ndarray]:
+    def _unit(self, camera: Camera, unit: int, facts: Facts) -> tuple[np.ndarray, np.ndarray]:
         n, middle = self.places * self.frames, self.side // 2
         shown = [np.repeat(first[unit] + middle + part[unit], self.frames) for first, part in ((self.col0, self.dx), (self.row0, self.dy))]
         x, y = ((at - start) / step for at, (start, step) in zip(shown, _layout(self.camera), strict=True))
@@ -187,19 +189,19 @@ class Trials:
         col0, row0 = (
             np.clip(np.rint(at + by).astype(np.int64) - middle, 0, most) for at, by, most in zip(belongs, moved, last, strict=True)
         )
-        scene = scene_of(self.target, self.facts, x, y)
+        scene = scene_of(self.target, facts, x, y)
         windows = camera.expose_windows(
             scene,
             Grid(np.arange(n), row0, col0, (self.side, self.side)),
             seed=self.seed + UNIT_STRIDE * unit,
             mode=self.mode,
-            background=background_of(self.target, self.facts),
+            background=background_of(self.target, facts),
             exposure_s=self.facts.exposure_s,
             temperature_c=self.facts.temperature_c,
         )
         if windows.dtype.kind == "f":  # without a converter in the chain the scale has an end all the same
             windows = np.minimum(windows, np.float32(self.facts.saturation_dn))
-        found = self._as_seen(camera).locate(windows)
+        found = self._as_seen(camera, facts).locate(windows)
         parts = zip(found, (col0, row0), belongs, _layout(camera), strict=True)
         dx, dy = (((hat + first - at) / step).reshape(self.places, self.frames) for hat, first, at, (_, step) in parts)
         return dx, dy
@@ -211,13 +213,13 @@ class Trials:
         dx, dy = (np.nan_to_num(np.broadcast_to(a, np.shape(b)) - b) for a, b in zip(seen, belongs, strict=True))
         return dx, dy
 
-    def _as_seen(self, camera: Camera) -> AnyEstimator:
+    def _as_seen(self, camera: Camera, facts: Facts) -> AnyEstimator:
         """Return the estimator with background, threshold and height as this variant of the camera shows them.
 
         Who locates targets takes them from the frame, so they follow what the camera does to the light: black level, gain, a curve. Each
         is the mean of windows of that light, without what lies beyond four standard deviations.
         """
-        return self.located.as_seen(lambda light_dn: _level(camera, self.facts, self.target, self.side, light_dn))
+        return self.located.as_seen(lambda light_dn: _level(camera, facts, self.target, self.side, light_dn))
 
     def compare(self, names: Iterable[str], with_it: Camera, without: Camera | None) -> MonteCarlo:
         """Shift of the positions in one variant of the camera against those in another, or (None) against the truth."""
@@ -381,12 +383,12 @@ def _axis(shift: np.ndarray, *where: np.ndarray) -> Axis:
 def _rest(means: np.ndarray, keep: np.ndarray, where: Sequence[np.ndarray]) -> np.ndarray:
     """Squared residuals of the means of places about a smooth surface of each unit, unbiased for what is independent from place to place.
 
-    A polynomial of k terms through n places leaves (n − k)/n of such a variance. Four places a term or more decide its order.
+    A polynomial of k terms through n places leaves (n − k)/n of such a variance. Its order is as high as two places a term allow.
     """
     found = np.zeros(means.shape)
     for unit, good in enumerate(keep):
         n = int(good.sum())
-        order = max(o for o in range(SMOOTH_ORDER + 1) if o == 0 or where and 4 * _terms(o, len(where)) <= n)
+        order = max(o for o in range(SMOOTH_ORDER + 1) if o == 0 or where and 2 * _terms(o, len(where)) <= n)
         at = [p[unit, good] for p in where] or [np.zeros(n)]
         if n:
             residual = means[unit, good] - smooth_part(means[unit, good], *at, order=order)

@@ -147,7 +147,9 @@ def facts_of(camera: Camera, target: Target, known: Mapping[str, Any] | None = N
     background = target.background_rel * saturation / response
     noise = known.get("noise_dn")
     if noise is None:
-        noise = _noise(camera, background) / (1.0 if curve is None else float(curve.slope(np.array(background))) / response)
+        noise = _noise(camera, background / passed_light(camera))
+        if curve is not None:
+            noise *= response / float(curve.slope(np.array(background)))
     return Facts(
         dn_per_photon=float(response),
         gain_dn_per_e=float(gain),
@@ -542,6 +544,24 @@ class Probes:
 
 def _parameter(camera: Camera, name: str) -> Any:
     return next((getattr(e.params, name) for e in camera.chain if hasattr(e.params, name)), None)
+
+
+AHEAD_OF_CHARGE = {Kind.LIGHT, Kind.PHOTONS}
+
+
+def passed_light(camera: Camera) -> float:
+    """Share of the light that the sources ahead of the electrons let through, as a mean over the frame.
+
+    A target of so many per cent of saturation is given as much more light: what a small aperture or a filter takes away, it lets be made up
+    for, as everyone does who takes the pictures.
+    """
+    ahead = tuple(e for e in camera.active if set(e.source.consumes) <= AHEAD_OF_CHARGE and e.source.produces is None)
+    if not ahead:
+        return 1.0
+    side = min(8, *camera.frame_shape)
+    grid = spread_windows(camera.frame_shape, side, 256)
+    level = 1000.0
+    return float(replace(camera, chain=ahead).expose_windows(Uniform(level), grid, quiet=True).mean(dtype=float)) / level
 
 
 def _electrons_per_photon(camera: Camera) -> float:
