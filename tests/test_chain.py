@@ -120,5 +120,5 @@ def test_the_command_writes_a_page_and_replaces_only_its_own(tmp_path: Path) -> 
     assert len(re.findall(r'<figure id="source-', text)) == 1 + len(small.chain)
     assert "http" not in re.sub(r"http://www\.w3\.org/\S+", "", text)  # asks for nothing from anywhere
     refused = CliRunner().invoke(main, [*arguments[:-1], str(scene)])
-    assert refused.exit_code == 2 and "no result of this kind" in refused.output and "discs" in scene.read_text()
+    assert refused.exit_code == 2 and "would overwrite an input" in refused.output and "discs" in scene.read_text()
     assert sorted(p.name for p in tmp_path.iterdir()) == ["camera.yaml", "page.html", "scene.yaml"]

@@ -39,10 +39,12 @@ def chain(
     CAMERA is a camera file or the name of a preset; SCENE is a scene file. The page shows the image and its profiles after every
     source, how far the target's centre has moved so far, and which source moved it.
     """
+    from pixmetry.campaign.staged_files import Output, check_files, page_mark
     from pixmetry.chain import walk
     from pixmetry.core.camera import load_camera
     from pixmetry.core.overrides import changed_camera, parse_overrides
-    from pixmetry.report.chain_page import write_chain_page
+    from pixmetry.report.chain_page import TITLE, write_chain_page
 
+    check_files([Output(output, page_mark(TITLE))], [scene, Path(camera)])  # before the work
     changed = changed_camera(load_camera(camera), parse_overrides(settings), off)
     echo(f"page: {write_chain_page(walk(changed, scene, target=target, frame=frame, seed=seed), output)}")

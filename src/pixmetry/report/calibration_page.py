@@ -40,7 +40,7 @@ MOST_SHEETS = 30  # of small images on a page; more would make it heavy
 
 
 def write_page(calibration: Calibration, path: str | Path) -> Path:
-    """Write the page and return its path; only an older page of pixmetry is replaced.
+    """Write the page and return its path; only an earlier page of this kind is replaced.
 
     Raises
     ------

@@ -16,10 +16,11 @@ if TYPE_CHECKING:
     from pixmetry.chain import Step, Walk
 
 SHOWN = 5  # movers in the summary
+TITLE = "<title>: one target through the chain</title>"  # ends so
 
 
 def write_chain_page(walk: Walk, path: str | Path) -> Path:
-    """Write the page and return its path; only an older page of pixmetry is replaced."""
+    """Write the page and return its path; only an earlier page of this kind is replaced."""
     from pixmetry.campaign import write_page
 
     return write_page(path, render(walk))
