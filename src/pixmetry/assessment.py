@@ -223,8 +223,10 @@ def write_results(assessment: Assessment, directory: str | Path, inputs: Sequenc
 
 
 def _origin(campaign: Campaign) -> tuple[str | Path, ...]:
-    """What an assessment is of."""
-    return (campaign.camera.name, "packaged example" if campaign.source_path.is_relative_to(EXAMPLE) else campaign.source_path)
+    """What an assessment is of: the file of the campaign, or the camera's name where there is none."""
+    if campaign.arrays is not None:
+        return (campaign.camera.name,)
+    return ("packaged example" if campaign.source_path.is_relative_to(EXAMPLE) else campaign.source_path,)
 
 
 def _inputs(campaign: Campaign, calibration: str | Path | CameraGeometry | None) -> list[Path]:

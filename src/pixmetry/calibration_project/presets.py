@@ -60,8 +60,8 @@ def _changed(camera: Camera, element: Element) -> tuple[tuple[float, float], str
             return (ratio, 1.0), f"its grabber samples with a clock of its own ({ratio:.6g} pixels a sample)"
     if name == READ_OUT and params.mode == "field":
         return (1.0, 2.0), "it stores single fields (rows two pixels apart)"
-    if name == WINDOW and (params.inactive_rows or params.first != (0, 0)):
-        row, col = params.first
+    if name == WINDOW and (params.inactive_rows or params.row_offset or params.col_offset):
+        row, col = params.row_offset, params.col_offset
         return (1.0, 1.0), f"its grabber stores a window from row {row}, column {col} on"
     return (1.0, 1.0), ""
 
