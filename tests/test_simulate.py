@@ -428,6 +428,11 @@ def test_frames_stand_in_the_folder_that_was_named(folder: Path) -> None:
     done(run(folder, "-n", 2, output="frames"))
     assert {p.name for p in (folder / "frames").glob("*.tif")} == {"frame_00000.tif", "frame_00001.tif"}
     assert not [p for p in (folder / "frames").iterdir() if p.is_dir()]
+    found = CliRunner().invoke(main, ["locate", str(folder / "frames"), "-o", str(folder / "t.csv")])
+    assert "frame_00001.tif" in found.output and "skipped" not in found.output
+    (folder / "frames" / "notes.txt").write_text("mine")
+    found = CliRunner().invoke(main, ["locate", str(folder / "frames"), "-o", str(folder / "t.csv")])
+    assert "skipped" in found.output and "notes.txt" in found.output and "truth.json" not in found.output
 
 
 def test_frames_of_another_camera_or_scene_and_notes_among_them_are_kept(folder: Path) -> None:

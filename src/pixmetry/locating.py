@@ -11,6 +11,7 @@ import numpy as np
 
 from pixmetry.campaign.formats import frame_name, raw_file
 from pixmetry.campaign.images import PICTURE_ENDINGS, load_picture, picture_files
+from pixmetry.campaign.output import own_files
 from pixmetry.campaign.raw_values import RawLayout, parse_raw
 from pixmetry.campaign.staged_files import Output, check_files, write_together
 from pixmetry.core.camera import Camera, load_camera
@@ -228,8 +229,9 @@ def skipped_files(images: Sequence[str | Path], raw: RawLayout | str | None = No
     """Names of the files in the given folders that are taken for no images; ``raw`` as of `locate_files`."""
     layout = parse_raw(raw) if isinstance(raw, str) else raw
     folders = [folder for folder in map(frames_inside, images) if folder.is_dir() and folder.suffix.lower() != ".zarr"]
+    written = {folder / name for folder in folders for name in own_files(folder)}  # what `simulate` wrote beside its frames
     others = (p for folder in folders for p in sorted(folder.iterdir()) if p.suffix.lower() not in PICTURE_ENDINGS and p.is_file())
-    return [p.name for p in others if not p.name.startswith(".") and not raw_file(p, layout)]
+    return [p.name for p in others if not p.name.startswith(".") and p not in written and not raw_file(p, layout)]
 
 
 def checked_frame(frame: np.ndarray, name: str = "frame") -> np.ndarray:

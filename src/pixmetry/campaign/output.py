@@ -193,6 +193,12 @@ def _raised(problem: OSError) -> None:
     raise problem
 
 
+def own_files(folder: str | Path) -> frozenset[str]:
+    """Names of the files in a folder that pixmetry wrote as a result, relative to it; none if it holds no result."""
+    marker = _marker(Path(folder))
+    return frozenset() if marker is None else frozenset(marker["checksums"]["files"])
+
+
 def _marker(target: Path) -> dict[str, Any] | None:
     """What an earlier run noted of what it wrote; None if there is no such note, or not one of ours."""
     try:
