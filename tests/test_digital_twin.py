@@ -15,7 +15,9 @@ from pixmetry.core.camera import Camera, Element
 from pixmetry.core.catalogue import get_source
 from pixmetry.core.observations import Observations
 from pixmetry.digital_twin import best_values, digital_twin, expose, exposures_of, fewer, middle_window, of_unit, self_test
+from pixmetry.experiment.converter_bend import converter_bend
 from pixmetry.experiment.observe import observe
+from pixmetry.grabber.adc import bend, thresholds
 from pixmetry.report.twin_view import twin_sentence
 
 SHAPE = (120, 160)
@@ -148,6 +150,36 @@ def test_fixed_waves_stand_where_they_stood(both) -> None:
     off = (turns + shift - true + 0.5) % 1 - 0.5
     sigma = np.sqrt(np.var(seen.dark_stack.mean_map_dn))
     assert abs(off) < 6 * np.sqrt(2 / seen.dark_stack.mean_map_dn.size) * sigma / 0.4 / (2 * np.pi) + 1e-3, (SEED, off)
+
+
+def test_code_widths_are_those_of_the_converter(both) -> None:
+    """Over the tested codes: the correlation of true and measured widths is that of the counts, and their scatter is the true one.
+
+    With widths that scatter by s and counts that tell each to u, it is √(s²/(s² + u²)); of a thousand codes it is known to 0.03.
+    """
+    real, _, seen, twin = both
+    params, stream = real["grabber.adc"].params, real.streams(0).of("grabber.adc")
+    codes = seen.code_errors.codes
+    true = np.diff(thresholds(params, stream))[codes - 1] - 1
+    found = np.diff(twin["grabber.adc"].maps["threshold_lsb"])[codes - 1]
+    u = np.sqrt(np.mean(seen.code_errors.u_dnl_lsb**2))
+    expected = np.sqrt(true.var() / (true.var() + u**2))
+    assert np.corrcoef(true, found)[0, 1] > expected - 6 / np.sqrt(codes.size), (SEED, expected)
+    assert found.std() == pytest.approx(true.std(), rel=0.25), SEED
+
+
+def test_a_bend_of_the_converter_is_followed() -> None:
+    """A sinusoid of 2 LSB and 7 periods over the range, of which a cubic takes nothing: its slope changes variances by ± 2 %."""
+    real = camera(grabber_adc={"inl_amplitude_lsb": 2.0, "inl_cycles": 7.0})
+    frames, light = campaign()
+    seen, twin = assessed(real, frames, light)
+    tested = self_test(twin, frames, seen, by_the_standard(frames, seen), seed=SEED + 1)
+    temporal = [r for r in tested.rows if r.name in ("sigma_2_y_stack", "sigma_2_y_stack_dark", "PRNU1288", "s_2_y")]
+    assert len(temporal) == 4 and max(abs(r.difference_u) for r in temporal) < FAR_U, (SEED, temporal)
+    codes = np.arange(200, 2600)
+    true = bend(real["grabber.adc"].params, codes)
+    found = converter_bend(seen, 12).displacement_lsb[codes]
+    assert np.corrcoef(true, found)[0, 1] > 0.8, SEED
 
 
 def test_defects_are_where_they_were(both) -> None:

@@ -143,7 +143,8 @@ def threshold_errors(codes: CodeErrors, bits: int) -> np.ndarray:
 
     Widths w_k = 1 + d_(k+1) − d_k of the codes come from thresholds that are displaced independently with the variance of the DNL's own
     mean square over 2. What the code density test says is a linear function of the d, with counting noise: y = H d + n. The best
-    predictor is D Hᵀ (H D Hᵀ + R)⁻¹ y; each d is then multiplied up to the spread that it has (as the maps, see `unit_maps`).
+    predictor is D Hᵀ (H D Hᵀ + R)⁻¹ y; it is then multiplied up to the spread that the widths of the tested codes have, as the maps
+    are (`unit_maps`).
     """
     from scipy.sparse import csc_array, csr_array, diags_array
     from scipy.sparse.linalg import splu
@@ -170,8 +171,7 @@ def threshold_errors(codes: CodeErrors, bits: int) -> np.ndarray:
     noise = diags_array(codes.u_dnl_lsb**2)
     system = splu(csc_array(prior * (design @ design.T) + noise))
     best = prior * (design.T @ system.solve(codes.dnl_lsb))
-    near = np.flatnonzero(np.diff(design.tocsc().indptr))
-    power = float(np.mean(best[near] ** 2))
-    if power > 0:
-        out[near] = best[near] * math.sqrt(prior / power)
+    found = float(np.mean(np.diff(best)[tested - 1] ** 2))
+    if found > 0:
+        out[:] = best * math.sqrt(2 * prior / found)
     return out
