@@ -96,7 +96,14 @@ def test_the_folder_may_be_moved_and_each_file_is_checked(tmp_path):
     again = load_camera(file)
     assert np.array_equal(frame(again), frame(camera))
     assert again.to_record() == camera.to_record()
+    renamed = file.with_name("mine.yaml")
+    shutil.copy(file, renamed)
+    assert np.array_equal(frame(load_camera(renamed)), frame(camera))
     text = file.read_text()
+    assert "file: camera.maps.npz" in text
+    renamed.write_text(text.replace("file: camera.maps.npz", "file: ../camera.maps.npz"))
+    with pytest.raises(InputError, match="measured.file"):
+        load_camera(renamed)
     file.write_text(text.replace("phase_turns: sha256:", "phase_turns: sha256:0"))
     with pytest.raises(InputError, match="phase_turns"):
         load_camera(file)

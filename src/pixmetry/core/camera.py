@@ -440,9 +440,12 @@ class Camera:
         """Write the camera as a preset (YAML); what was measured in its unit goes into an archive beside it (``camera.maps.npz``)."""
         from pixmetry.core.config import dump_yaml
 
-        dump_yaml(self.to_record(), path)
-        if any(e.maps for e in self.chain):
-            write_unit_maps(maps_file(path), self.chain)
+        record = self.to_record()
+        if "measured" in record:
+            archive = maps_file(path)
+            record["measured"]["file"] = archive.name
+            write_unit_maps(archive, self.chain)
+        dump_yaml(record, path)
 
 
 @dataclass(frozen=True)

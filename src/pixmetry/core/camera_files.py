@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from pixmetry.core.chain_order import Element
 from pixmetry.core.checksums import check_file
 from pixmetry.core.errors import InputError
-from pixmetry.core.unit_maps import MeasuredUnit, listing, maps_file, read_unit_maps
+from pixmetry.core.unit_maps import MeasuredUnit, listing, read_unit_maps
 
 if TYPE_CHECKING:
     from pixmetry.core.camera import Camera
@@ -51,7 +51,7 @@ def clock_values(record: Any) -> dict[str, float]:
     return values | ({"pixel_time_ns": 1e9 / record.pixel_clock_hz} if "pixel_clock_hz" in told else {})
 
 
-def build_camera(record: Mapping[str, Any], where: str = "camera", maps: str | Path | None = None) -> Camera:
+def build_camera(record: Mapping[str, Any], where: str = "camera", folder: str | Path | None = None) -> Camera:
     """Build a camera from its plain record.
 
     Parameters
@@ -59,8 +59,8 @@ def build_camera(record: Mapping[str, Any], where: str = "camera", maps: str | P
     record : mapping
     where : str
         For messages.
-    maps : path, optional
-        The archive of what was measured in its unit, for a record that names such maps.
+    folder : path, optional
+        Where the archive of what was measured in its unit stands, for a record that names one.
 
     Raises
     ------
@@ -86,10 +86,10 @@ def build_camera(record: Mapping[str, Any], where: str = "camera", maps: str | P
     if wanted:
         if checked.measured is None:
             raise InputError("maps of no unit", where=where, remedy="write `measured:` with unit_seed, rows and cols, or delete `maps:`")
-        if maps is None:
+        if folder is None or checked.measured.file is None:
             raise InputError("the measured maps of this camera are not given", where=where, remedy="load the camera from its file")
         measured = MeasuredUnit(checked.measured.unit_seed, (checked.measured.rows, checked.measured.cols))
-        found = read_unit_maps(Path(maps), wanted)
+        found = read_unit_maps(Path(folder) / checked.measured.file, wanted)
         elements = [replace(e, maps=found.get(e.name, {})) for e in elements]
     same = ("exposure_s", "temperature_c", "unit_seed", "facts", "warm_up_k", "warm_up_s", "pixel_clock_hz", "line_period_s")
     settings = {name: getattr(checked, name) for name in same}
@@ -115,4 +115,4 @@ def load_camera(path: str | Path) -> Camera:
         raise InputError("no such camera file or preset", value=str(path), allowed=f"a YAML file, or one of {', '.join(sorted(presets))}")
     else:
         check_file(path)
-    return build_camera(load_yaml(path), str(path), maps_file(path))
+    return build_camera(load_yaml(path), str(path), Path(path).parent)

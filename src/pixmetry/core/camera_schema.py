@@ -25,6 +25,7 @@ class MeasuredRecord(Model):
     unit_seed: int = Field(ge=0)
     rows: int = Field(ge=1)
     cols: int = Field(ge=1)
+    file: str | None = Field(default=None, pattern=r"^[^/\\]+$")  # name of the archive in the folder of the camera file
 
 
 class CameraRecord(Model):
