@@ -80,6 +80,20 @@ def test_ripple_of_rounded_variance_is_no_knee():
     assert abs(gain.value - 0.02) < 6 * gain.u and gain.u < 0.001, camera.seed
 
 
+def test_dark_levels_that_rounding_bends_do_not_bend_the_gain():
+    """Exposure swept, dark noise of 0.09 DN, 0.3 DN of dark current: the dark variances rise with the exposure by rounding alone.
+
+    Taken for noise of the dark current, they move the gain by 4 %, ten u and more.
+    """
+    camera = ForeignCamera(
+        fresh(), gain_dn_per_e=0.03, read_e=3.0, dsnu_e=(0, 0, 0), bits=8, offset_dn=3.2, dark_e_per_s=500.0, shape=(120, 160), over=1.05
+    )  # fmt: skip
+    seen = observe(groups(camera), camera.bits)
+    assert_within(seen, camera, ("gain_dn_per_e", "quantum_efficiency", "offset_dn", "responsivity_dn_per_s"))
+    gain = seen.photon_transfer_fit["gain_dn_per_e"]
+    assert gain.u < 0.01 * gain.value
+
+
 def test_a_pattern_that_rounding_hides_is_bounded():
     camera = ForeignCamera(fresh(), gain_dn_per_e=0.03, read_e=1.5, dsnu_e=(1.5, 0.7, 0.7), dark_e_per_s=0.0, bits=8, offset_dn=5.0)
     spatial, true = observe(groups(camera), camera.bits).spatial_fit, physical_truths(camera)

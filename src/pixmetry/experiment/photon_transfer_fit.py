@@ -160,8 +160,11 @@ def _augmented(pt: PhotonTransfer, s: Solution, d: model.Levels) -> tuple[np.nda
     # what rounding and code widths stretch in common is no scatter of the lines
     line_var = line_var + 4 * model.slope_error_var(white, dither, d.dnl_lsb) * line**2
     cov[ROW_VAR, ROW_VAR], cov[COL_VAR, COL_VAR] = line_var
+    converter_vars = model.rounding_error_vars(np.array(white), dither, d.dnl_lsb)
     if s.free[DARK_SLOPE]:
-        _add_rounding_of_slopes(cov, s, model.rounding_error_vars(np.array(white), dither, d.dnl_lsb))
+        _add_rounding_of_slopes(cov, s, converter_vars)
+    if model.is_hidden(d):  # the common part is in the fit; levels that pass through few codes do not average the rest
+        cov[OFFSET, OFFSET] += (1 - d.coherence**2) * float(converter_vars[0])
     values[LAMP_VAR], cov[LAMP_VAR, LAMP_VAR] = s.components[1], s.components_cov[1, 1]
     return values, cov
 
@@ -175,6 +178,9 @@ def _add_rounding_of_slopes(cov: np.ndarray, s: Solution, converter_vars: tuple[
     change = np.sqrt(converter_vars) * min(2 * np.pi * abs(s.p[DARK_SLOPE]), 2.0)
     for at, extra in zip((DARK_SLOPE, DARK_VAR_SLOPE), change, strict=True):
         cov[at, at] += float(extra) ** 2
+    cov[SLOPE, SLOPE] += float(change[0]) ** 2  # where the exposure was swept, what is not the one is the other
+    cov[SLOPE, DARK_SLOPE] -= float(change[0]) ** 2
+    cov[DARK_SLOPE, SLOPE] -= float(change[0]) ** 2
 
 
 def _effective_dof(s: Solution, rows: np.ndarray, cov: np.ndarray, lamp_dof: float) -> np.ndarray:
@@ -293,7 +299,7 @@ def _add_dark_current(rows: _Rows, p: np.ndarray, time_scale: float) -> None:
 
     difference = {k: mean_row.get(k, 0.0) - var_row.get(k, 0.0) for k in {*mean_row, *var_row}}
     value, row, reason = from_mean, mean_row, ""
-    if abs(from_mean - from_var) > 4.5 * u_of(difference):
+    if p[DARK_VAR_SLOPE] and abs(from_mean - from_var) > 4.5 * u_of(difference):  # 0: rounding hides the variance
         value, row = from_var, var_row
         reason = f"from the dark variance: the mean ({from_mean:.4g} e-/s) contradicts it, so the black level is clamped or drifts"
     u = u_of(row)

@@ -124,6 +124,12 @@ def slope_error_var(var: float, dither: float = 0.0, dnl_lsb: float = 0.0) -> fl
     return float(2 * np.exp(-4 * np.pi**2 * total) + 0.5 * dnl_lsb**2 / (4 * np.sqrt(np.pi) * sigma**3))
 
 
+def is_hidden(d: Levels) -> bool:
+    """Whether rounding hides the noise of the dark levels (EMVA 1288 R4.0 eq. 54)."""
+    dark = ~d.bright
+    return bool(dark.any() and d.ms[dark].mean() < MINIMUM_DARK_VAR_DN2)
+
+
 def least_var_before_rounding(var_dn2: float) -> float:
     """Smallest variance before rounding that can look like ``var_dn2`` after it, at the worst sub-code phase.
 
@@ -155,15 +161,20 @@ def white_before_rounding(ms_dn2: float, dither_dn2: float) -> float:
 
 
 def linearise(p: np.ndarray, d: Levels) -> Linearised:
-    """Residuals, Jacobian (leading order) and covariance parts at the parameters ``p``."""
+    """Residuals, Jacobian (leading order) and covariance parts at the parameters ``p``.
+
+    Where rounding hides the dark noise, the dark variances do not tell how that of the dark current grows: it is taken as shot noise.
+    """
     a, x_ref = p[A1 : A3 + 1], d.x_ref
     bright = d.bright.astype(float)
     dark_x = p[DARK_SLOPE] * d.time
     light = bright * (d.light + p[LIGHT_OFFSET])
     x_pred = p[SLOPE] * light + dark_x
 
+    shown_x = 0.0 if is_hidden(d) else dark_x  # of the dark signal: that part whose noise the dark frames show
+
     def noise(x):
-        return p[DARK_VAR] + p[GAIN] * (x - dark_x) + p[DARK_VAR_SLOPE] * d.time
+        return p[DARK_VAR] + p[GAIN] * (x - shown_x) + p[DARK_VAR_SLOPE] * d.time
 
     _, f1_pred, _, _ = transfer(x_pred, a, x_ref)
     spread = d.spatial / f1_pred**2
@@ -184,8 +195,8 @@ def linearise(p: np.ndarray, d: Levels) -> Linearised:
     top[:, SLOPE] = f1_pred * light
     top[:, LIGHT_OFFSET] = f1_pred * bright * p[SLOPE]
     top[:, DARK_SLOPE] = f1_pred * d.time
-    low[:, DARK_SLOPE] = -(f1**2) * p[GAIN] * d.time * bright
-    low[:, GAIN] = f1**2 * (x - dark_x)
+    low[:, DARK_SLOPE] = 0.0 if is_hidden(d) else -(f1**2) * p[GAIN] * d.time * bright
+    low[:, GAIN] = f1**2 * (x - shown_x)
     low[:, DARK_VAR] = f1**2
     low[:, DARK_VAR_SLOPE] = f1**2 * d.time
     for k in (1, 2, 3):

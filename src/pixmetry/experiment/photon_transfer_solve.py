@@ -54,6 +54,7 @@ def _free_parameters(d: model.Levels) -> np.ndarray:
     free[[Q_MEAN, Q_VAR]] = times.size > 0
     free[LIGHT_OFFSET] = times.size > 0
     free[[DARK_SLOPE, DARK_VAR_SLOPE]] = times.size >= 3 and np.ptp(times) > 0.2 * times.max()
+    free[DARK_VAR_SLOPE] &= not model.is_hidden(d)
     return free
 
 
