@@ -186,7 +186,7 @@ def sampling_u(levels: LevelMoments, shape: tuple[int, int]) -> np.ndarray:
     )
     variance = sum((size * lines * ms / (rows * cols)) ** 2 * (2 + kurtosis) / (lines * more) for ms, lines, size, kurtosis in parts)
     # one pixel that toggled once: no variance is known better than to that
-    return np.hypot(np.sqrt(variance), 1 / (rows * cols * levels.n_frames))
+    return np.hypot(np.sqrt(variance), (levels.fraction_max < 1) / (rows * cols * levels.n_frames))
 
 
 @dataclass(frozen=True)
