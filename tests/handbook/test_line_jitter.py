@@ -95,7 +95,8 @@ def test_the_jitter_is_found_within_its_uncertainty(way, run) -> None:
         z.append((e.value - level.jitter_ns) / np.hypot(e.u, 0.02 * level.jitter_ns))
     assert np.abs(z).max() < norm.isf(RATE / 2) and np.sum(np.square(z)) < chi2.isf(RATE, 4)
     none = run.levels[0].jitters(run.gain)[way]["jitter_ns"]
-    assert none.kind == "upper_limit" and none.value < 0.4
+    assert none.value < 0.4
+    assert none.kind == "upper_limit" or none.value < norm.isf(RATE) * none.u  # one run in twenty shows something where nothing is
 
 
 def test_lying_lines_have_no_jitter(run) -> None:
