@@ -61,7 +61,7 @@ def warm_up(progress: Callable[[str, int, int], None] | None = None) -> tuple[in
     Returns
     -------
     int
-        How many kernels are compiled now.
+        How many kernels there are.
     Path or None
         Folder of the cache; None if none can be written to.
     """
@@ -75,7 +75,7 @@ def warm_up(progress: Callable[[str, int, int], None] | None = None) -> tuple[in
             except PixmetryError:
                 continue  # something too small to be measured: the kernels that it came to are compiled
         told("compiling", len(jobs), len(jobs))
-    return len(all_kernels()) - len(cold_kernels()), cache_folder()
+    return len(all_kernels()), cache_folder()
 
 
 def all_kernels() -> dict[str, Kernel]:
@@ -86,11 +86,6 @@ def all_kernels() -> dict[str, Kernel]:
         members = vars(import_module(module)).values()
         found |= {f"{module}.{k.__name__}": k for k in members if isinstance(k, Kernel) and k.__module__ == module}
     return found
-
-
-def cold_kernels() -> list[str]:
-    """Names of the kernels that this process has neither compiled nor taken from the cache."""
-    return [name for name, kernel in all_kernels().items() if not kernel.compiled]
 
 
 Job = tuple[str, Callable[[], object]]
@@ -119,17 +114,16 @@ def jobs_in(folder: Path) -> Iterator[Job]:
     manifest = folder / "series" / "campaign.yaml"
     yield command("assess", manifest, "-o", folder / "assessed", "--trials", 200)
     yield command("assess", "-o", folder / "example", "--trials", 200)
-    yield command("correct", folder / "series" / "frames", "--with", folder / "assessed" / "results.json", "-o", folder / "corrected")
+    yield "correct", partial(_correct, folder / "series", folder / "assessed" / "results.json", folder / "corrected")
     yield command("emva1288", manifest, "--report", folder / "sheet.html", "--bootstrap", 100)
     for kind, plate in PLATES.items():
         for i, (omega, phi, kappa) in enumerate(POSES):
             posed = scene(f"{kind}-{i}", PLATE.format(plate=plate, omega=omega, phi=phi, kappa=kappa))
             where = folder / "boards" / kind / str(i)
             yield command("simulate", PRESET, posed, "-o", where, "--window", "624,824,800,800")
-        images = [folder / "boards" / kind / str(i) / "frames" / "frame_00000.tif" for i in range(len(POSES))]
         options = ("--grid", "8x6") if kind == "chessboard" else ("--grid", "9x7", "--diameter-mm", 9, "--polarity", "bright")
         copies = folder / "boards" / f"{kind}-images"
-        yield "calibrate", partial(_numbered, images, copies)
+        yield "calibrate", partial(_numbered, folder / "boards" / kind, copies)
         yield command("calibrate", copies, "--kind", kind, *options, "--pitch-mm", 20, "-o", folder / f"calibrated-{kind}")
     yield from _locating()
     for kind in BOUNDS:
@@ -145,12 +139,17 @@ def _run(arguments: list[str]) -> None:
     tell_when_compiling(None)
 
 
-def _numbered(images: list[Path], folder: Path) -> None:
+def _numbered(boards: Path, folder: Path) -> None:
     """Put images of one name into one folder."""
     folder.mkdir()
-    for i, image in enumerate(images):
-        if image.is_file():
-            (folder / f"{i}.tif").write_bytes(image.read_bytes())
+    for i, image in enumerate(sorted(boards.rglob("frame_*.tif"))):
+        (folder / f"{i}.tif").write_bytes(image.read_bytes())
+
+
+def _correct(series: Path, results: Path, corrected: Path) -> None:
+    from pixmetry.locating import frames_inside
+
+    _run(["correct", str(frames_inside(series)), "--with", str(results), "-o", str(corrected)])
 
 
 def _locating() -> Iterator[Job]:

@@ -63,11 +63,6 @@ class Kernel:
                     self._dispatcher = _compile(self.py_func, self.options)
         return self._dispatcher
 
-    @property
-    def compiled(self) -> bool:
-        """Whether this process has machine code for it, compiled or from the cache."""
-        return bool(getattr(self._dispatcher, "signatures", ()))
-
     def __call__(self, *args: Any) -> Any:
         return (self._dispatcher or self.dispatcher)(*[_plain(a) if isinstance(a, np.ndarray) else a for a in args])
 
