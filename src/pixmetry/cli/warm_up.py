@@ -24,4 +24,4 @@ def warm_up() -> None:
     with shown_progress() as progress:
         count, folder = run(progress)
     where = f"in {folder}" if folder is not None else "for this process only: no folder can be written to"
-    click.echo(f"the commands have gone through their kernels ({count} in all); compiled code is {where} ({time.monotonic() - begun:.0f} s)")
+    click.echo(f"commands went through their kernels ({count} in all); the code is {where} ({time.monotonic() - begun:.0f} s)")
