@@ -11,6 +11,7 @@ import pytest
 
 from budget.cameras import camera, element
 from pixmetry.budget import compute_budget, make_probe
+from pixmetry.budget.headline import headline
 from pixmetry.budget.monte_carlo import Trials, monte_carlo
 from pixmetry.budget.parameters import applies
 from pixmetry.budget.probe import Target, facts_of
@@ -248,6 +249,20 @@ def test_the_sum_is_the_headline_where_both_agree() -> None:
     budget = computed(small_camera(), None, KNOWN, trials=4096, seed=SEED)
     assert budget.headline.by == "sum" and budget.verdict == budget.sums[0] and "agrees" in budget.headline.why
     assert computed(small_camera(), None, KNOWN, trials=0).headline.by == "sum"
+
+
+def test_a_drift_along_the_rows_is_left_by_a_calibration_in_x_alone() -> None:
+    """A cold clock moves targets in x: of y a calibration leaves no more than there is of it."""
+    cam = camera(element("grabber.clock_warm_up", scale_error_rel=0.02, lock_us=10.0), shape=(96, 200))
+    budget = computed(cam, None, KNOWN, trials=256)
+    in_x, in_y = budget.interaction.unsteady_px
+    assert in_x == pytest.approx(row(budget, "grabber.clock_warm_up").contribution.bias_x_px, rel=0.1) and in_y < 0.02 * in_x
+    assert budget.interaction.calibrated_px == pytest.approx(in_x / math.sqrt(2), rel=0.05)
+    _, simulated = headline(
+        [replace(r, contribution=replace(r.contribution, bias_x_px=0.0, model_error=0.0)) for r in budget.largest],
+        budget.interaction.together, (1,), lambda name: budget.interaction.together, budget.interaction.unsteady_px,
+    )  # fmt: skip
+    assert simulated[0].left_x_px == pytest.approx(in_x, rel=0.05) and simulated[0].left_y_px <= 1.1 * simulated[0].total_y_px
 
 
 def test_kurtosis_of_rare_defects_is_that_of_their_simulation() -> None:

@@ -80,18 +80,18 @@ class BudgetRow:
 class Interaction:
     """Everything at once against the sum of everything alone (u as squares, biases as they are), both by Monte Carlo, in px.
 
-    ``unsteady_px`` is the part of the sources that drift or belong to the object, which the frames of a Monte Carlo hold still.
+    ``unsteady_px`` is, in x and y, the part of the sources that drift or belong to the object: the frames of a Monte Carlo hold it still.
     """
 
     together: MonteCarlo
     sum_px: float
     se_sum_px: float
-    unsteady_px: float = 0.0
+    unsteady_px: tuple[float, float] = (0.0, 0.0)
 
     @property
     def calibrated_px(self) -> float:
         """What a calibration leaves of everything at once: all of what is unsteady, and of the rest what is neither constant nor smooth."""
-        return float(np.hypot(self.together.calibrated_px, self.unsteady_px))
+        return float(np.sqrt(self.together.calibrated_px**2 + 0.5 * sum(v**2 for v in self.unsteady_px)))
 
     @property
     def difference_px(self) -> float:
@@ -254,7 +254,7 @@ def compute_budget(
         say("all sources together")
         interaction = _interaction(rows, design)
     decided = [r for r in rows if r.status in DECIDED and r.contribution is not None]
-    together, unsteady = (None, 0.0) if interaction is None else (interaction.together, interaction.unsteady_px)
+    together, unsteady = (None, (0.0, 0.0)) if interaction is None else (interaction.together, interaction.unsteady_px)
     found, verdicts = headline(decided, together, frames, lambda name: design.of(off=[name]), unsteady)
     accepted_rows = [r.contribution for r in rows if r.status == "accepted" and r.contribution is not None]
     everything = tuple(together_with(v, combine(accepted_rows, frames=v.frames)) for v in verdicts)
@@ -380,8 +380,9 @@ def _interaction(rows: Sequence[BudgetRow], design: Trials) -> Interaction:
     total = float(np.sqrt(square))
     error = float(np.sqrt(varies)) / total if total else 0.0
     drifting = [r.monte_carlo for r in rows if r.monte_carlo and r.contribution and r.contribution.gum_class in UNSTEADY]
-    unsteady = float(np.sqrt(sum(max(m.total_px**2 - m.calibrated_px**2, 0.0) for m in drifting)))
-    return Interaction(design.of(), total, error, unsteady)
+    of_axes = ([m.x for m in drifting], [m.y for m in drifting])
+    x, y = (float(np.sqrt(sum(max(a.u**2 + a.bias**2 - a.left**2, 0.0) for a in axes))) for axes in of_axes)
+    return Interaction(design.of(), total, error, (x, y))
 
 
 def _ranked(rows: Sequence[BudgetRow], decided: Sequence[BudgetRow], verdict: Combined, everything: Combined) -> list[BudgetRow]:

@@ -10,6 +10,7 @@ import numpy as np
 
 from pixmetry.budget.combine import Combined, combine
 from pixmetry.budget.monte_carlo import Axis, MonteCarlo
+from pixmetry.budget.probe import ESTIMATOR_ITSELF
 
 SUM, MONTE_CARLO = "sum", "Monte Carlo"
 COVERAGE = 2.0  # standard errors beyond which sum and Monte Carlo differ
@@ -48,7 +49,7 @@ def headline(
     together: MonteCarlo | None,
     frames: Sequence[int],
     in_chain: Callable[[str], MonteCarlo],
-    unsteady_px: float = 0.0,
+    unsteady_px: tuple[float, float] = (0.0, 0.0),
 ) -> tuple[Headline, tuple[Combined, ...]]:
     """Decide between the sum and the Monte Carlo, and combine for each number of frames.
 
@@ -61,8 +62,8 @@ def headline(
     frames : sequence of int
     in_chain : callable
         Monte Carlo of what a source of this name does in the whole chain.
-    unsteady_px : float
-        What a calibration would take up of the Monte Carlo although the next image has it otherwise (`Interaction.unsteady_px`).
+    unsteady_px : (float, float)
+        What a calibration would take up of the Monte Carlo in x and y although the next image has it otherwise (`Interaction.unsteady_px`).
 
     Notes
     -----
@@ -105,16 +106,16 @@ def _model_error(rows: Sequence[Any]) -> float:
     return 0.5 * float(np.sqrt(sum(parts))) / total if total else 0.0
 
 
-def _simulated(together: MonteCarlo, others: Combined, unsteady_px: float) -> Combined:
+def _simulated(together: MonteCarlo, others: Combined, unsteady_px: tuple[float, float]) -> Combined:
     """The mean over frames by the Monte Carlo, with what it does not hold."""
 
-    def axis(a: Axis, u_px: float, bias_px: float, left_px: float) -> tuple[float, float, float]:
+    def axis(a: Axis, u_px: float, bias_px: float, left_px: float, unsteady_px: float) -> tuple[float, float, float]:
         in_time2 = a.temporal**2 / others.frames
         left2 = max(a.left**2 - a.temporal**2, 0.0) + in_time2 + left_px**2 + unsteady_px**2
         return float(np.sqrt(a.fixed**2 + in_time2 + u_px**2)), float(np.hypot(a.bias, bias_px)), float(np.sqrt(left2))
 
-    u_x, bias_x, left_x = axis(together.x, others.u_x_px, others.bias_x_px, others.left_x_px)
-    u_y, bias_y, left_y = axis(together.y, others.u_y_px, others.bias_y_px, others.left_y_px)
+    u_x, bias_x, left_x = axis(together.x, others.u_x_px, others.bias_x_px, others.left_x_px, unsteady_px[0])
+    u_y, bias_y, left_y = axis(together.y, others.u_y_px, others.bias_y_px, others.left_y_px, unsteady_px[1])
     return Combined(u_x, u_y, bias_x, bias_y, left_x, left_y, others.frames, others.targets)
 
 
@@ -127,7 +128,7 @@ def _why(found: Headline, rows: Sequence[Any], in_chain: Callable[[str], MonteCa
     )
     difference = found.simulated_px**2 - found.sum_px**2
     tried = sorted(rows, key=lambda r: -r.total_px)[:ASKED]
-    real = [(r, in_chain(r.name).total_px if r.source_id != "processing.threshold" else r.monte_carlo.total_px) for r in tried]
+    real = [(r, in_chain(r.name).total_px if r.source_id != ESTIMATOR_ITSELF else r.monte_carlo.total_px) for r in tried]
     row, in_px = max(real, key=lambda p: (p[1] ** 2 - p[0].total_px ** 2) * np.sign(difference))
     if np.isfinite(in_px) and (in_px**2 - row.total_px**2) / difference > MAIN_PART:
         return f"{text}: {row.title.lower()} alone would be {row.total_px:.2g} px, in the whole chain it is {in_px:.2g} px."

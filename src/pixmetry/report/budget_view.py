@@ -296,20 +296,20 @@ def _interaction(budget: Budget) -> str:
     difference, se = found.difference_px, found.se_px
     places = min(max(decimals_of(se, 2), 0), 6) if se > 0 else 6
     if abs(difference) <= 2 * se:
-        verdict = "which is within two standard errors: no interaction is seen, and the squares may be added"
+        verdict = "which is within two standard errors: no interaction is seen"
     elif difference > 0:
         verdict = "more than two standard errors: the sources act on each other"
     else:
-        verdict = "less by more than two standard errors: together the sources do less than each alone"
+        verdict = "less by more than two standard errors: together the sources do less than the sum of each alone"
     lost = f" In {found.together.lost} of {found.together.trials} windows no target was found." if found.together.lost else ""
 
     def px(value: float) -> str:
         return fixed(value, places)
 
     return (
-        f"All sources at once give {px(found.together.total_px)} ± {px(found.together.se_total_px)} px (rms of x and y), each alone and "
-        f"added as squares {px(found.sum_px)} ± {px(found.se_sum_px)} px. The interaction is the difference, {px(difference)} "
-        f"± {px(se)} px, {verdict}. The analytic sum is {px(analytic_px)} px.{lost}{_stands(budget)}"
+        f"All sources at once give {px(found.together.total_px)} ± {px(found.together.se_total_px)} px (rms of x and y); each alone, added "
+        f"(scatter as squares, biases with their signs), {px(found.sum_px)} ± {px(found.se_sum_px)} px. The interaction is the "
+        f"difference, {px(difference)} ± {px(se)} px, {verdict}. The analytic sum is {px(analytic_px)} px.{lost}{_stands(budget)}"
     )
 
 
