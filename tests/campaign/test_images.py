@@ -17,6 +17,8 @@ from hypothesis import strategies as st
 
 from campaign.campaign_files import FRAMES, HEAD, put_campaign, put_frame
 from pixmetry.campaign import FrameReader, images, iter_frames, load_campaign, read_frame, write_frame
+from pixmetry.campaign.images import picture_files
+from pixmetry.campaign.raw_values import RawLayout
 from pixmetry.core.errors import InputError
 
 
@@ -63,8 +65,10 @@ def test_other_programs_tiffs_are_read_exactly(kw: dict[str, object], tmp_path: 
 
 
 def test_npy_and_wrong_endings_are_read_by_content(tmp_path: Path) -> None:
-    np.save(tmp_path / "a.npy", NOISE)
-    np.testing.assert_array_equal(read_frame(tmp_path / "a.npy"), NOISE)
+    for order in "<>":
+        np.save(tmp_path / "a.npy", NOISE.astype(f"{order}u2"))
+        np.testing.assert_array_equal(read_frame(tmp_path / "a.npy"), NOISE)
+        assert read_frame(tmp_path / "a.npy").dtype == np.dtype("=u2")
     (tmp_path / "b.tif").write_bytes(imagecodecs.png_encode(NOISE))
     np.testing.assert_array_equal(read_frame(tmp_path / "b.tif"), NOISE)
 
@@ -77,6 +81,15 @@ def test_cut_off_files_are_refused(raw: bytes, share: float, tmp_path: Path) -> 
     path = tmp_path / "a.img"
     path.write_bytes(raw[: int(len(raw) * share)] if share > 0 else raw[:-12])
     assert "damaged or cut off" in refused(path)
+
+
+def test_hidden_files_beside_images_are_no_images(tmp_path: Path) -> None:
+    write_frame(tmp_path / "a.tif", NOISE, 16)
+    (tmp_path / "._a.tif").write_bytes(b"what a system keeps beside it")
+    (tmp_path / ".DS_Store").write_bytes(b"x")
+    (tmp_path / "b.raw").write_bytes(bytes(6))
+    assert picture_files([tmp_path]) == [tmp_path / "a.tif"]
+    assert picture_files([tmp_path], raw=RawLayout(3, 2, "Mono8")) == [tmp_path / "a.tif", tmp_path / "b.raw"]
 
 
 def test_png_without_its_end_is_refused(tmp_path: Path) -> None:

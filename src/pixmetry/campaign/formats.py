@@ -59,7 +59,7 @@ class FrameFile:
 
 def is_frame(path: Path) -> bool:
     """Tell whether a path names a frame in a file, as ``stack.tif/7`` does."""
-    return path.name.isdigit() and path.parent.is_file()
+    return path.name.isdecimal() and path.parent.is_file()
 
 
 def frame_name(path: Path) -> str:

@@ -127,7 +127,8 @@ def picture_files(frames: Iterable[str | Path], endings: tuple[str, ...] = ENDIN
     given, files = [Path(f) for f in frames], []
     for path in given:
         if path.is_dir():
-            inside = sorted(p for p in path.iterdir() if p.suffix.lower() in endings or (p.is_file() and raw_file(p, raw)))
+            shown = (p for p in path.iterdir() if not p.name.startswith("."))  # not what systems put beside images, such as ._a.tif
+            inside = sorted(p for p in shown if p.suffix.lower() in endings or (p.is_file() and raw_file(p, raw)))
             files += entries(path) or [name for p in inside for name in frames_of(p, raw)]
         else:
             files += frames_of(path, raw)
@@ -151,11 +152,12 @@ def _checked(array: np.ndarray, path: Path) -> np.ndarray:
     if array.ndim != 2:
         what = f"colour image ({'x'.join(map(str, array.shape))})"
         raise InputError(what, where=str(path), allowed="one grey channel", remedy="store the sensor's raw values, not a colour picture")
-    if array.dtype not in (np.uint8, np.uint16):
+    native = array.dtype.newbyteorder("=")
+    if native not in (np.uint8, np.uint16):
         raise InputError(f"values of type {array.dtype}", where=str(path), allowed=FORMATS, remedy="store the camera's integer values")
     if array.size == 0:
         raise InputError("image has no pixels", where=str(path), remedy="export the frame again")
-    return np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("="))
+    return np.ascontiguousarray(array, native)
 
 
 def check_frame(array: np.ndarray, where: str, *, bits: int, shape: tuple[int, int] | None = None, dtype: str | None = None) -> None:
