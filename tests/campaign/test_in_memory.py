@@ -74,6 +74,7 @@ def test_arrays_are_assessed_and_tested() -> None:
         (lambda g: Frames("dark", -0.1, g[0].data), ["exposure_s"]),
         (lambda g: Frames("dark", 0.1, g[0].data, photons=5), ["dark group has light"]),
         (lambda g: Frames("dark", 0.1, g[0].data[:, :0]), ["without pixels"]),
+        (lambda g: Frames("dark", 0.1, g[0].data[:0]), ["no frames"]),
     ],
 )
 def test_what_is_no_campaign_is_refused(change: object, words: list[str]) -> None:
@@ -94,6 +95,17 @@ def test_values_must_be_those_of_frames() -> None:
             assess(campaign, trials=0)
     with pytest.raises(InputError, match="unknown key 'bitz'"):
         campaign_of_arrays(groups, bitz=12)
+
+
+def test_irradiance_becomes_photons() -> None:
+    data = np.zeros((2, 4, 5), np.uint8)
+    groups = [Frames("dark", 0.01, data), Frames("bright", 0.01, data), Frames("bright", 0.02, data, photons=7.0)]
+    light = {"irradiance_uw_per_cm2": 1.0, "wavelength_nm": 500}
+    campaign = campaign_of_arrays(groups, optics=light, bits=8, pitch_um=10)
+    # 50.34 A[µm²] t[ms] λ[µm] E[µW/cm²] (EMVA 1288 R4.0)
+    assert [g.photons for g in campaign.groups] == [0.0, pytest.approx(50.34 * 100 * 10 * 0.5, rel=1e-4), 7.0]
+    with pytest.raises(InputError, match="pitch_um"):
+        campaign_of_arrays(groups, optics=light, bits=8)
 
 
 @pytest.mark.parametrize("job", [assess, emva1288])

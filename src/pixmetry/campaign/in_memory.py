@@ -46,7 +46,8 @@ def campaign_of_arrays(groups: Iterable[Frames], *, optics: Mapping[str, Any] | 
     groups : iterable of Frames
         One for each exposure time and light, dark and bright.
     optics : mapping, optional
-        Of the manifest's keys under ``optics``: ``wavelength_nm``, ``f_number``, ``focal_length_mm``, ``light_source``.
+        Of the manifest's keys under ``optics``: ``wavelength_nm``, ``f_number``, ``focal_length_mm``, ``irradiance_uw_per_cm2``,
+        ``light_source``.
     operator : str
         Who took the frames.
     **camera
@@ -61,12 +62,12 @@ def campaign_of_arrays(groups: Iterable[Frames], *, optics: Mapping[str, Any] | 
     InputError
         If a key is unknown, or the frames make no campaign.
     """
-    from pixmetry.campaign.manifest import camera_facts, check_window, role_of
+    from pixmetry.campaign.manifest import camera_facts, check_window, photons_of, role_of
     from pixmetry.campaign.schema import CameraModel, GroupModel, OpticsModel
     from pixmetry.core.config import validate
 
     facts = camera_facts(validate(CameraModel, {"name": NAME, **camera}, NAME))
-    told = OpticsFacts(**validate(OpticsModel, dict(optics or {}), NAME).model_dump())
+    light = validate(OpticsModel, dict(optics or {}), NAME)
     made, shapes, eight = [], set(), True
     arrays: dict[Path, np.ndarray | Sequence[np.ndarray]] = {}
     for number, group in enumerate(groups):
@@ -80,7 +81,7 @@ def campaign_of_arrays(groups: Iterable[Frames], *, optics: Mapping[str, Any] | 
         shapes |= {frame.shape for frame in data}
         eight = eight and all(frame.dtype == np.uint8 for frame in data)
         paths = tuple(folder / str(k) for k in range(len(data)))
-        photons = 0.0 if checked.kind == "dark" else checked.photons
+        photons = photons_of(checked, light, facts, str(folder))
         made.append(FrameGroup(checked.kind, checked.exposure_s, photons, paths, checked.role or role_of(paths)))
     if len(shapes) > 1:
         raise InputError("frames of several sizes", where=NAME, value=sorted(shapes), allowed="one size for all frames")
@@ -88,6 +89,7 @@ def campaign_of_arrays(groups: Iterable[Frames], *, optics: Mapping[str, Any] | 
     (shape,) = shapes
     check_window(facts, shape, NAME)
     dtype = "uint8" if eight else "uint16"
+    told = OpticsFacts(**light.model_dump())
     return Campaign(facts, told, ordered, shape, dtype, Path(NAME), operator=operator, arrays=arrays, findings=findings)
 
 
@@ -100,8 +102,8 @@ def _checked(data: Any, where: str) -> np.ndarray | list[np.ndarray]:
     if wrong is not None:
         remedy = "give the stored values, before anything was done to them"
         raise InputError("grey values that are no whole numbers", where=where, value=str(wrong), allowed="integers", remedy=remedy)
-    if any(frame.size == 0 for frame in frames):
-        raise InputError("frames without pixels", where=where, remedy="leave them out")
+    if not len(frames) or any(frame.size == 0 for frame in frames):
+        raise InputError("no frames, or frames without pixels", where=where, remedy="leave them out")
     return frames
 
 

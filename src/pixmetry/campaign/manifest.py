@@ -16,7 +16,7 @@ from pixmetry.campaign.records import STACK_FRAMES, CameraFacts, Campaign, Frame
 from pixmetry.core.errors import InputError
 
 if TYPE_CHECKING:
-    from pixmetry.campaign.schema import CameraModel, GroupModel, ManifestModel
+    from pixmetry.campaign.schema import CameraModel, GroupModel, ManifestModel, OpticsModel
 
 EXAMPLE = Path(__file__).resolve().parents[1] / "data" / "emva1288-set-001-crop"
 
@@ -161,7 +161,7 @@ def _from_manifest(
     groups = []
     for i, group in enumerate(model.frames):
         paths = find_files(source.parent, group.files, _place(source, lines, "frames", i, "files"), raw)
-        photons = _photons(group, model, camera, _place(source, lines, "frames", i))
+        photons = photons_of(group, model.optics, camera, _place(source, lines, "frames", i))
         groups.append(FrameGroup(group.kind, group.exposure_s, photons, paths, group.role or role_of(paths)))
     return {"camera": camera, "groups": tuple(groups), "licence": model.licence}
 
@@ -184,16 +184,17 @@ def role_of(paths: tuple[Path, ...]) -> str:
     return "stack" if len(paths) >= STACK_FRAMES else "level"
 
 
-def _photons(group: GroupModel, model: ManifestModel, camera: CameraFacts, where: str) -> float | None:
+def photons_of(group: GroupModel, optics: OpticsModel, camera: CameraFacts, where: str) -> float | None:
+    """Photons per pixel and exposure of a group: as stated, else from the irradiance; None where neither is known."""
     if group.kind == "dark":
         return 0.0
-    irradiance = group.irradiance_uw_per_cm2 or model.optics.irradiance_uw_per_cm2
+    irradiance = group.irradiance_uw_per_cm2 or optics.irradiance_uw_per_cm2
     if group.photons is not None or irradiance is None:
         return group.photons
-    if camera.pitch_x_um is None or camera.pitch_y_um is None or model.optics.wavelength_nm is None:
-        missing = "wavelength_nm under optics" if model.optics.wavelength_nm is None else "pitch_um under camera"
+    if camera.pitch_x_um is None or camera.pitch_y_um is None or optics.wavelength_nm is None:
+        missing = "wavelength_nm under optics" if optics.wavelength_nm is None else "pitch_um under camera"
         raise InputError("photons do not follow from the irradiance alone", where=where, remedy=f"add {missing}, or give photons")
-    return photons_from_irradiance(irradiance, group.exposure_s, camera.pitch_x_um * camera.pitch_y_um, model.optics.wavelength_nm)
+    return photons_from_irradiance(irradiance, group.exposure_s, camera.pitch_x_um * camera.pitch_y_um, optics.wavelength_nm)
 
 
 def _from_descriptor(source: Path, text: bytes, camera: CameraFacts | None, raw: RawLayout | None) -> dict[str, Any]:
