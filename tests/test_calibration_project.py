@@ -490,3 +490,6 @@ def test_a_quote_that_is_not_closed_swallows_no_row(tmp_path: Path) -> None:
     path.write_text('image,point,x_px,y_px\nim0,"p1,1,2\nim1",p2,3,4\nim2,p3,5,6\n', encoding="utf-8")
     with pytest.raises(InputError, match="line 2: a quote that is not closed"):
         read_table(path)
+    path.write_text('image,point,x_px,y_px\nim0,p1,1,2\n5" wide,"p2,3,4\nim2,p3,5,6\n', encoding="utf-8")  # the first one is part of a name
+    with pytest.raises(InputError, match="line 3: a quote that is not closed"):
+        read_table(path)

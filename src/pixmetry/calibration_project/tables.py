@@ -211,13 +211,14 @@ def _split(source: str, lines: Sequence[tuple[int, str]]) -> list[tuple[int, lis
     if parted_by is None:
         return [(n, [value.strip('"') for value in line.split()]) for n, line in lines]
     try:
-        rows = list(csv.reader((line for _, line in lines), delimiter=parted_by, skipinitialspace=True))
+        rows, reader = [], csv.reader((line for _, line in lines), delimiter=parted_by, skipinitialspace=True)
+        for row in reader:
+            rows.append(row)
+            if reader.line_num > len(rows):
+                remedy = "close it on its line, or write two quotes for one in a name"
+                raise InputError("a quote that is not closed", where=f"{source}, line {lines[len(rows) - 1][0]}", remedy=remedy)
     except csv.Error as problem:
         raise InputError(f"not a table of text ({problem})", where=source, remedy="check the file") from None
-    if len(rows) != len(lines):
-        n = next(n for n, line in lines if line.count('"') % 2)
-        remedy = "close it on its line, or write two quotes for one in a name"
-        raise InputError("a quote that is not closed", where=f"{source}, line {n}", remedy=remedy)
     return [(n, [name_of(value.strip()) for value in row]) for (n, _), row in zip(lines, rows, strict=True)]
 
 
