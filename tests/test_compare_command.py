@@ -303,6 +303,17 @@ def test_assessments_are_compared(tmp_path: Path) -> None:
     assert compare(one, one).same
 
 
+def test_the_gain_is_one_cause_for_all_rows_of_a_budget(tmp_path: Path) -> None:
+    """Four equal rows scale with the gain together: it moves the total by its own 0.36 %, not by half of that."""
+    record = json.loads((assessment(tmp_path / "a") / "results.json").read_text())
+    row = record["budget"]["rows"][0] | {"total_px": 0.01, "status": "measured"}
+    record["budget"]["rows"] = [row | {"name": f"sensor.source_{k}"} for k in range(4)]
+    record["budget"]["verdicts"][0]["total_px"] = 0.02
+    (tmp_path / "a" / "results.json").write_text(json.dumps(record))
+    total = next(r for r in compare(tmp_path / "a", tmp_path / "a").rows if r.key == "budget.verdict.1_frames")
+    assert total.a.u == pytest.approx(0.02 * 0.001 / 0.28)
+
+
 def test_the_budget_of_assessments_is_compared(tmp_path: Path) -> None:
     """A worse verdict is a change in u: of a modelled row half of its declared model error, 5 %, and the gain's 0.36 %."""
     one = assessment(tmp_path / "a")

@@ -171,7 +171,8 @@ def _of_budget(budget: Mapping[str, Any], gain_u_rel: float) -> dict[str, Value]
     """Target, rows and totals of a budget, with u of what repeating the measurement would change.
 
     Of a measured row that is what its parameters leave open, of all others half of what its formula declares to leave open; with both the
-    gain's. A total holds the rows', each as far as it counts, and the error of chance where it is by Monte Carlo.
+    gain's. A total holds the rows', each as far as it counts, the gain's, which all of them share, and the error of chance where it is by
+    Monte Carlo.
     """
     units = {True: "px", False: "1"}
     values = {f"budget.target.{k}": Value(float(v), 0.0, math.inf, units[k.endswith("_px")]) for k, v in _numbers(budget["target"])}
@@ -182,15 +183,14 @@ def _of_budget(budget: Mapping[str, Any], gain_u_rel: float) -> dict[str, Value]
             continue
         formula = 0.5 * max(float(contribution["model_error"]) * total, float(contribution["floor_px"]))
         known = float(row["u_of_total_px"]) if row["status"] == "measured" else formula
-        u = math.hypot(known, gain_u_rel * total)
-        values[f"budget.{row['name']}"] = Value(total, u, math.inf, "px", row["status"], "")
-        squares[row["status"] == "accepted"] += (total * u) ** 2
+        values[f"budget.{row['name']}"] = Value(total, math.hypot(known, gain_u_rel * total), math.inf, "px", row["status"], "")
+        squares[row["status"] == "accepted"] += (total * known) ** 2
     by = budget.get("headline") or {}
     chance = float(by.get("se_simulated_px") or 0.0) if by.get("by") == "Monte Carlo" else 0.0
     for group, square in (("verdicts", squares[False]), ("with_accepted", squares[False] + squares[True])):
         for one in budget.get(group, ()):
             total = float(one["total_px"])
-            u = math.hypot(math.sqrt(square) / total if total else 0.0, chance)
+            u = math.hypot(math.sqrt(square) / total if total else 0.0, gain_u_rel * total, chance)
             key = f"budget.{'verdict' if group == 'verdicts' else group}.{one.get('frames', 1)}_frames"
             values[key] = Value(total, u, math.inf, "px", str(by.get("by", "sum")), "")
     return values
