@@ -12,6 +12,7 @@ from scipy import stats
 from emva.cameras import Camera
 from emva.scoring import measured
 from emva.truths import truths
+from pixmetry import Frames, campaign_of_arrays, emva1288
 from pixmetry.core.errors import InputError
 from pixmetry.core.observations import LevelMoments
 from pixmetry.emva.evaluate import bootstrap_u, evaluate, standard_values
@@ -104,6 +105,20 @@ def test_hot_pixels_that_clip_in_the_light_leave_no_limit_of_the_prnu(release: s
     for key in ("PRNU1288", "PRNU1288_pixel"):
         assert math.isnan(values[key].value) and not values[key].is_limit
         assert "hot in the dark" in values[key].reason and "highest code" in values[key].reason
+
+
+def test_hot_pixels_that_clip_leave_no_limit_of_the_prnu_where_there_are_only_stacks() -> None:
+    """Pixels 2500 DN above the others in the dark and 1095 in the light, at the top code: the difference of the variances has no root."""
+    rng = np.random.default_rng(1)
+    hot = rng.random((48, 60)) < 0.01
+    groups = [
+        Frames(kind, 0.01, np.clip(rng.normal(mean, 8, (16, 48, 60)), 0, 4095).astype(np.uint16))
+        for kind, mean in (("dark", np.where(hot, 2600, 100)), ("bright", np.where(hot, 4500, 3000)))
+    ]
+    values = emva1288(campaign_of_arrays(groups, bits=12)).results[0].values
+    for key in ("PRNU1288", "PRNU1288_pixel"):
+        assert math.isnan(values[key].value) and not values[key].is_limit and "far below zero" in values[key].reason
+    assert values["DSNU1288_DN"].value > 200
 
 
 @pytest.mark.parametrize("release", RELEASES)

@@ -10,6 +10,7 @@ from pixmetry.core.errors import MeasureError, PixmetryError
 from pixmetry.core.random import generator
 from pixmetry.emva.formulas import keys_of
 from pixmetry.emva.keys import KEYS
+from pixmetry.emva.reasons import BROKEN
 from pixmetry.emva.records import Measurement, Results, Value
 from pixmetry.emva.rules import MINIMUM_DARK_VAR_DN2, ONE_SIDED_95
 from pixmetry.emva.scatter import sampling_u
@@ -87,15 +88,22 @@ def _stacks(m: Measurement, release: str) -> dict[str, Value]:
     if "_dark" in inputs:
         out["DSNU1288_DN"] = _root("DSNU1288_DN", float(variances["s_2_y_dark"]), float(np.std(draws["s_2_y_dark"])))
     if len(inputs) == 2 and inputs[""].vector[0] > inputs["_dark"].vector[0]:
+        rows, cols = inputs[""].shape
         scale = (100.0 / float(inputs[""].vector[0] - inputs["_dark"].vector[0])) ** 2
         for part in PARTS:
             bright, dark = f"s_2_y{part}", f"s_2_y{part}_dark"
             u = scale * float(np.hypot(np.std(draws[bright]), np.std(draws[dark])))
-            out[f"PRNU1288{part}"] = _root(f"PRNU1288{part}", scale * float(variances[bright] - variances[dark]), u)
+            lines, length = {"_row": (rows, cols), "_col": (cols, rows)}.get(part, (rows * cols, 1))
+            chance = 2 * scale * float(variances["s_2_y"] + variances["s_2_y_dark"]) / (length * math.sqrt(lines))
+            out[f"PRNU1288{part}"] = _root(f"PRNU1288{part}", scale * float(variances[bright] - variances[dark]), u, chance)
     return out
 
 
-def _root(key: str, square: float, u_square: float) -> Value:
+def _root(key: str, square: float, u_square: float, chance: float = 0.0) -> Value:
+    """A root of a square with its u, a limit, or nothing where the square is far below zero; ``chance``: scatter from sensor to sensor."""
+    if square < -BROKEN * math.hypot(u_square, chance):
+        reason = f"the variance behind it is far below zero ({square:.3g} in {KEYS[key].unit} squared): no value and no limit"
+        return _value(key, math.nan, math.nan, math.nan, reason)
     if square < ONE_SIDED_95 * u_square:
         limit = math.sqrt(max(square, 0.0) + ONE_SIDED_95 * u_square)
         u, reason = u_square / (2 * limit) if limit > 0 else 0.0, "not significantly above zero; 95 % upper limit"
