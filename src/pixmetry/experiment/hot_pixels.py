@@ -106,8 +106,9 @@ def without_hot_pixels(series: PhotonTransfer, stack: StackMoments | None) -> tu
         of_stack = tail.mean_dn + tail.below_dn
         of_hot, of_noisy, u_rel = _noise_of_defects(stack, hot)
         if tail.mean_dn > 0 and of_hot > 0:
-            own = np.array([1 / max(SHOT_NOISE_REL * gain, 1e-12) ** 2, (tail.mean_dn / (of_hot * u_rel)) ** 2])
-            if abs(of_hot / tail.mean_dn - gain) > FAR * float(np.sqrt((1 / own).sum())):
+            shot = (SHOT_NOISE_REL * gain) ** -2 if gain > 0 else 0.0  # without light it is not known: the stack alone tells
+            own = np.array([shot, (tail.mean_dn / (of_hot * u_rel)) ** 2])
+            if gain > 0 and abs(of_hot / tail.mean_dn - gain) > FAR * float(np.sqrt((1 / own).sum())):
                 own[0] = 0.0  # noisier than shot noise, or clipped
             per_excess = float(own @ [gain, of_hot / tail.mean_dn] / own.sum())
             doubt = float(own.sum() ** -0.5) / per_excess
