@@ -23,5 +23,5 @@ def warm_up() -> None:
     begun = time.monotonic()
     with shown_progress() as progress:
         count, folder = run(progress)
-    where = f"in {folder}" if folder is not None else "for this process only: no folder can be written to"
-    click.echo(f"commands went through their kernels ({count} in all); the code is {where} ({time.monotonic() - begun:.0f} s)")
+    where = f"kept in {folder}" if folder is not None else "lost when this command ends: no folder for them can be written to"
+    click.echo(f"{count} kernels, compiled or found so, in {time.monotonic() - begun:.0f} s; they are {where}")
