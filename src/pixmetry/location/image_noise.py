@@ -276,8 +276,9 @@ def _law(level: np.ndarray, residual: np.ndarray, steep: np.ndarray | None, ends
     fall = float((n * (np.log(without / expected) + v / without - v / expected)).sum()) / excess
     at_ends = np.array([[1.0, 0.0], [1.0, reach]])
     error = np.sqrt(np.maximum(excess * np.einsum("ik,kl,il->i", at_ends, covariance[:2, :2], at_ends), 0.0))
-    vague = float((error / (at_ends @ fitted[:2])).max())
-    return _Law(float(fitted[0]), float(fitted[1]), float(plain[0]), fitted[1] > 0.0 and fall > CLEAR_SIGMA**2, vague)
+    told = np.linalg.matrix_rank(design / np.maximum(design.max(axis=1, keepdims=True), 1e-300)) == len(design)  # else any split would do
+    vague = float((error / (at_ends @ fitted[:2])).max()) if told else math.inf
+    return _Law(float(fitted[0]), float(fitted[1]), float(plain[0]), told and fitted[1] > 0.0 and fall > CLEAR_SIGMA**2, vague)
 
 
 def _variances(n: np.ndarray, v: np.ndarray, design: np.ndarray, least: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
