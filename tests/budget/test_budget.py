@@ -265,6 +265,14 @@ def test_a_drift_along_the_rows_is_left_by_a_calibration_in_x_alone() -> None:
     assert simulated[0].left_x_px == pytest.approx(in_x, rel=0.05) and simulated[0].left_y_px <= 1.1 * simulated[0].total_y_px
 
 
+def test_a_bias_alone_leaves_nothing_to_chance() -> None:
+    """A cold clock is the same in all frames: the error of the Monte Carlo is what its places show."""
+    cam = camera(element("grabber.clock_warm_up", scale_error_rel=0.0, delay_ns=70.0), shape=(96, 200))
+    budget = computed(cam, None, KNOWN, trials=256)
+    assert budget.headline.sum_px > 0.5
+    assert budget.headline.se_simulated_px == pytest.approx(budget.interaction.together.se_total_px, abs=1e-3)
+
+
 def test_kurtosis_of_rare_defects_is_that_of_their_simulation() -> None:
     """Shifts by hot pixels of one size against 40 000 windows, in 6000 of which there is one: the fourth moment is good to some 5 %."""
     cam = camera(element("sensor.defects", hot_fraction=1e-3, hot_median_e=3000.0, hot_sigma_log=0.0))

@@ -69,7 +69,7 @@ def headline(
     -----
     The sum is of first order and takes the sources for independent of each other; the Monte Carlo is neither, but it has an error of
     chance. Where both differ by more than two of their errors together, the Monte Carlo stands. Its error is that of the mean of squares
-    over the places, Var(s²)/n = (κ − 1) s⁴/n: by the scatter that it shows, and by the kurtosis κ that a contribution declares, for an
+    over the places, Var(s²)/n = (κ − 1) s⁴/n: by the scatter that it shows, and by u and kurtosis κ that a contribution declares, for an
     error that few targets have may be missing from it altogether. What the simulated camera does not hold is added to it as squares.
     """
     sums = tuple(combine((r.contribution for r in rows), frames=n, signed=True) for n in frames)
@@ -94,7 +94,8 @@ def headline(
 def _error(together: MonteCarlo, rows: Sequence[Any]) -> float:
     """Standard error of the total of a Monte Carlo, with what few targets have."""
     places = together.units * together.places
-    squares = sum((r.contribution.total_px**2) ** 2 * (r.contribution.kurtosis - 1) for r in rows) / places
+    parts = (r.contribution for r in rows)  # a bias has no chance in it
+    squares = sum((0.5 * (c.u_x_px**2 + c.u_y_px**2)) ** 2 * (c.kurtosis - 1) for c in parts) / places
     rare = float(np.sqrt(squares)) / (2 * together.total_px) if together.total_px > 0 else float(np.sqrt(np.sqrt(squares)))
     return float(np.hypot(together.se_total_px, rare))
 
