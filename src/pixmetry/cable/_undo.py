@@ -90,11 +90,10 @@ def _effect(rest_key: Key, whole_key: Key, col0: int, samples: int) -> np.ndarra
         )
     a, b = (_matrix(line, col0, samples, first, pixels) for line in (whole, rest))
     late = np.arange(first, first + pixels) + whole.delay_s * whole.pixel_clock_hz
-    level = 1.0 if whole.echo_amplitude is None else float(whole.echo_amplitude.sum())
     at = np.clip(whole.placed(late) - col0, 0, samples - 1)
-    nearest = np.maximum(1 - np.abs(at[:, None] - np.arange(samples)), 0.0) / level
+    nearest = np.maximum(1 - np.abs(at[:, None] - np.arange(samples)), 0.0) / whole.level
     normal = a.T @ a
-    normal[np.diag_indices(pixels)] += RIDGE
+    normal[np.diag_indices(pixels)] += RIDGE * whole.level**2
     return (a - b) @ (nearest + np.linalg.solve(normal, a.T - a.T @ a @ nearest))
 
 
