@@ -67,7 +67,7 @@ def partial_transfer(series: PhotonTransfer, stack: StackMoments | None, *, stra
     squares = [white - model.QUANTISATION_DN2, *lines]
     u_squares = [float(np.linalg.norm([white_u, np.sqrt(q_var), hot.var_dn2])), *np.sqrt(line_vars)]
     limits: set[str] = set()
-    gain = _gain(whole, white, black, pixels) if straight else None
+    gain = _gain(whole, (white, float(np.hypot(white_u, hot.var_dn2))), (black, u_black), pixels) if straight else None
     for name, square, u in zip(("dark_noise", "row_noise", "column_noise"), squares, u_squares, strict=True):
         value, u_value, limit, reason = _root(float(square), float(u), hidden)
         rows.append((f"{name}_dn", value, u_value, np.inf, "DN"))
@@ -99,9 +99,12 @@ def _root(square: float, u: float, hidden: bool) -> tuple[float, float, bool, st
     return float(np.sqrt(square)), float(u / (2 * np.sqrt(square))), False, ""
 
 
-def _gain(series: PhotonTransfer, white: float, black: float, pixels: int) -> tuple[float, float, float | None] | None:
-    """Gain, its u, and electrons per photon where these are known; None where no level tells."""
+def _gain(
+    series: PhotonTransfer, dark_var: tuple[float, float], dark_mean: tuple[float, float], pixels: int
+) -> tuple[float, float, float | None] | None:
+    """Gain, its u, and electrons per photon where these are known; None where no level tells. Of the dark: values with their u."""
     bright: LevelMoments = series.bright
+    (white, white_u), (black, black_u) = dark_var, dark_mean
     if bright.mean_dn.size == 0:
         return None
     signal, noise = bright.mean_dn - black, bright.ms_pixel_dn2 - white
@@ -113,7 +116,8 @@ def _gain(series: PhotonTransfer, white: float, black: float, pixels: int) -> tu
         sampling = np.sqrt(2 / ((bright.n_frames - 1) * pixels)) * bright.ms_pixel_dn2
         before = np.array([bright.ms_pixel_dn2, np.full_like(noise, white)]) - model.QUANTISATION_DN2
         q_var = model.rounding_error_vars(before)[1].sum(axis=0)
-        u = np.hypot(np.sqrt(sampling**2 + q_var) / signal, 3 * NONLINEARITY_PRIOR * signal / (2**series.bits - 1) * gain)
+        of_scale = np.hypot(3 * NONLINEARITY_PRIOR * signal / (2**series.bits - 1), black_u / signal)
+        u = np.hypot(np.sqrt(sampling**2 + q_var + white_u**2) / signal, of_scale * gain)
     relative = np.where(usable & (gain > 0), u / gain, np.inf)
     at = int(np.argmin(relative))
     if not relative[at] < 1 / NOT_SIGNIFICANT:
