@@ -66,7 +66,7 @@ def test_the_judge_sees_planted_errors(rng: np.random.Generator):
     assert coverage_cells.departures(z + 0.4, RATE) != []
     assert coverage_cells.departures(1.3 * z, RATE) != []
     assert coverage_cells.departures(0.75 * z, RATE) != []
-    assert coverage_cells.departures(np.sqrt(2) * np.sin(rng.uniform(0, 2 * np.pi, 900)), RATE) != []
+    assert coverage_cells.departures(np.sqrt(2) * np.sin(rng.uniform(0, 2 * np.pi, 3000)), RATE) != []
     assert coverage_cells.under_covered(z, RATE) == [] and coverage_cells.under_covered(0.5 * z, RATE) == []
     assert coverage_cells.under_covered(1.4 * z, RATE) != []
 
