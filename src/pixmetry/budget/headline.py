@@ -124,8 +124,8 @@ def _why(found: Headline, rows: Sequence[Any], in_chain: Callable[[str], MonteCa
     """Say that they differ, and by which source if it is one."""
     more = "larger" if found.sum_px > found.simulated_px else "smaller"
     text = (
-        f"By one Monte Carlo with all sources at once, {found.simulated_px:.2g} ± {found.se_simulated_px:.1g} px: the sum of the "
-        f"contributions, {found.sum_px:.2g} px, is {more} by more than both leave open, for sources act on each other"
+        f"By one Monte Carlo with all sources at once: {found.simulated_px:.2g} ± {found.se_simulated_px:.1g} px. The sum of the "
+        f"contributions, {found.sum_px:.2g} px, is {more} by more than the errors of the two, because sources act on each other"
     )
     difference = found.simulated_px**2 - found.sum_px**2
     tried = sorted(rows, key=lambda r: -r.total_px)[:ASKED]

@@ -40,4 +40,4 @@ def twin_sentence(test: SelfTest) -> str:
     taken = f"It took {test.frames} frames" + ("" if test.frames == test.of else f", where the campaign has {test.of}")
     if test.window is not None:
         taken += f", and of each the {test.window[3]} × {test.window[2]} pixels in the middle"
-    return f"The digital twin took the campaign, and its frames were reduced as the camera's. {taken}. {outcome}"
+    return f"The digital twin was put through the same campaign, and its frames were evaluated as the camera's were. {taken}. {outcome}"
