@@ -265,6 +265,20 @@ def test_a_drift_along_the_rows_is_left_by_a_calibration_in_x_alone() -> None:
     assert simulated[0].left_x_px == pytest.approx(in_x, rel=0.05) and simulated[0].left_y_px <= 1.1 * simulated[0].total_y_px
 
 
+def test_no_number_of_frames_lowers_a_drift_whichever_number_stands() -> None:
+    """A stabilised sensor shifts by 0.2 px: also by Monte Carlo, which is made to stand here by a sum that is far off."""
+    cam = camera()
+    cam = replace(cam, chain=(element("sensor.stabilisation", shift_std_px=0.2), *cam.chain))
+    budget = computed(cam, None, KNOWN, trials=1024)
+    together = budget.interaction.together
+    off = [replace(r, contribution=replace(r.contribution, bias_x_px=1.0)) for r in budget.largest]
+    found, (one, many) = headline(off, together, (1, 64), lambda name: together, budget.interaction.unsteady_px)
+    assert found.by == "Monte Carlo" and one.u_x_px == pytest.approx(together.x.u, rel=0.2)
+    # 6 standard errors of a standard deviation of 512 differences; divided by 64 frames it would be 0.025 px
+    assert many.u_x_px == pytest.approx(0.2, rel=0.2) and many.left_y_px == pytest.approx(0.2, rel=0.2)
+    assert budget.sums[-1].u_x_px == pytest.approx(0.2, rel=0.2)
+
+
 def test_a_bias_alone_leaves_nothing_to_chance() -> None:
     """A cold clock is the same in all frames: the error of the Monte Carlo is what its places show."""
     cam = camera(element("grabber.clock_warm_up", scale_error_rel=0.0, delay_ns=70.0), shape=(96, 200))

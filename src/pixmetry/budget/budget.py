@@ -380,6 +380,7 @@ def _interaction(rows: Sequence[BudgetRow], design: Trials) -> Interaction:
     total = float(np.sqrt(square))
     error = float(np.sqrt(varies)) / total if total else 0.0
     drifting = [r.monte_carlo for r in rows if r.monte_carlo and r.contribution and r.contribution.gum_class in UNSTEADY]
+    drifting = [m for m in drifting if np.isfinite(m.total_px)]  # one behind which no target was found says nothing
     of_axes = ([m.x for m in drifting], [m.y for m in drifting])
     x, y = (float(np.sqrt(sum(max(a.u**2 + a.bias**2 - a.left**2, 0.0) for a in axes))) for axes in of_axes)
     return Interaction(design.of(), total, error, (x, y))

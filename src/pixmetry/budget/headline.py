@@ -11,6 +11,7 @@ import numpy as np
 from pixmetry.budget.combine import Combined, combine
 from pixmetry.budget.monte_carlo import Axis, MonteCarlo
 from pixmetry.budget.probe import ESTIMATOR_ITSELF
+from pixmetry.core.contribution import UNSTEADY
 
 SUM, MONTE_CARLO = "sum", "Monte Carlo"
 COVERAGE = 2.0  # standard errors beyond which sum and Monte Carlo differ
@@ -87,7 +88,9 @@ def headline(
         why = "The sum of the contributions; one Monte Carlo with all of them at once agrees with it within their errors."
         return replace(found, why=why), sums
     others = [r for r in rows if r.monte_carlo is None]
-    simulated = tuple(_simulated(together, combine((r.contribution for r in others), frames=n, signed=True), unsteady_px) for n in frames)
+    drifting = [r.monte_carlo for r in held if r.contribution.gum_class in UNSTEADY and np.isfinite(r.monte_carlo.total_px)]
+    of_others = (combine((r.contribution for r in others), frames=n, signed=True) for n in frames)
+    simulated = tuple(_simulated(together, of_other, unsteady_px, drifting) for of_other in of_others)
     return replace(found, by=MONTE_CARLO, why=_why(found, held, in_chain)), simulated
 
 
@@ -107,16 +110,17 @@ def _model_error(rows: Sequence[Any]) -> float:
     return 0.5 * float(np.sqrt(sum(parts))) / total if total else 0.0
 
 
-def _simulated(together: MonteCarlo, others: Combined, unsteady_px: tuple[float, float]) -> Combined:
-    """The mean over frames by the Monte Carlo, with what it does not hold."""
+def _simulated(together: MonteCarlo, others: Combined, unsteady_px: tuple[float, float], drifting: Sequence[MonteCarlo]) -> Combined:
+    """The mean over frames by the Monte Carlo, with what it does not hold; what drifts, or is the object's, no number of frames lowers."""
 
-    def axis(a: Axis, u_px: float, bias_px: float, left_px: float, unsteady_px: float) -> tuple[float, float, float]:
-        in_time2 = a.temporal**2 / others.frames
+    def axis(a: Axis, drifts: list[Axis], u_px: float, bias_px: float, left_px: float, unsteady_px: float) -> tuple[float, float, float]:
+        stays2 = min(sum(d.temporal**2 for d in drifts), a.temporal**2)
+        in_time2 = stays2 + (a.temporal**2 - stays2) / others.frames
         left2 = max(a.left**2 - a.temporal**2, 0.0) + in_time2 + left_px**2 + unsteady_px**2
         return float(np.sqrt(a.fixed**2 + in_time2 + u_px**2)), float(np.hypot(a.bias, bias_px)), float(np.sqrt(left2))
 
-    u_x, bias_x, left_x = axis(together.x, others.u_x_px, others.bias_x_px, others.left_x_px, unsteady_px[0])
-    u_y, bias_y, left_y = axis(together.y, others.u_y_px, others.bias_y_px, others.left_y_px, unsteady_px[1])
+    u_x, bias_x, left_x = axis(together.x, [m.x for m in drifting], others.u_x_px, others.bias_x_px, others.left_x_px, unsteady_px[0])
+    u_y, bias_y, left_y = axis(together.y, [m.y for m in drifting], others.u_y_px, others.bias_y_px, others.left_y_px, unsteady_px[1])
     return Combined(u_x, u_y, bias_x, bias_y, left_x, left_y, others.frames, others.targets)
 
 
