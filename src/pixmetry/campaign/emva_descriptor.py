@@ -139,8 +139,10 @@ def _numbers(text: str, where: str, form: str, fewest: int, most: int) -> list[f
     try:
         values = [_number(part) for part in text.split()]
     except ValueError:
-        remedy = "write no sign between thousands, and decimals with a point" if "," in text else "correct the line"
-        raise InputError("not a number", where=where, value=text, allowed=form, remedy=remedy) from None
+        what, remedy = "not a number", "write decimals with a point" if "," in text else "correct the line"
+        if any(_THOUSANDS.fullmatch(part) for part in text.split()):
+            what, remedy = "a comma that may part thousands or decimals", "leave it out, or write a point for it"
+        raise InputError(what, where=where, value=text, allowed=form, remedy=remedy) from None
     if not fewest <= len(values) <= most:
         raise InputError(f"{len(values)} numbers in this record", where=where, value=text, allowed=form, remedy="correct the line")
     if not all(map(math.isfinite, values)):
