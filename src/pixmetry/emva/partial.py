@@ -33,12 +33,13 @@ def partial_results(m: Measurement, release: str, problem: MeasureError) -> Resu
         Why there is no series.
     """
     found = _dark_levels(m, release) | _stacks(m, release)
+    why = str(problem).removeprefix("exposure series: ")
     values = {}
     for key in keys_of(release):
         method = f"EMVA 1288 R{release} {KEYS[key].clause}".strip() if release != "reference" else "reference implementation 1.0.2"
-        nothing = Value(math.nan, math.nan, math.nan, KEYS[key].unit, method, f"needs an exposure series: {problem}")
+        nothing = Value(math.nan, math.nan, math.nan, KEYS[key].unit, method, f"needs an exposure series: {why}")
         values[key] = found.get(key, nothing)
-    note = f"no exposure series: {problem}; only values that need none are given"
+    note = f"no exposure series: {why}; only values that need none are given"
     return Results(release, values, notes=(*m.notes, note), channel=m.channel)
 
 
