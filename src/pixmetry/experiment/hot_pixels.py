@@ -17,6 +17,7 @@ QUARTILES_TO_SIGMA = 1.349  # between the quartiles of a normal distribution
 QUANTISATION_DN2 = 1 / 12
 SHOT_NOISE_REL = 0.2  # how near hot pixels' noise is taken to be to shot noise
 FAR = 3.0  # standard uncertainties
+MOST_HOT = 0.02  # of the pixels: what more of them share is a part of the sensor (a tap, a glowing corner), and belongs to its black level
 NOISY_BY_CHANCE = 0.01  # good pixels of a frame whose sample variance is called too large
 
 
@@ -49,10 +50,10 @@ def tail_of_map(mean_map: np.ndarray) -> tuple[HotTail, np.ndarray]:
 
 
 def _tail(deviation: np.ndarray, weight: np.ndarray, limit: float) -> HotTail:
-    """Sums beyond a limit; the core's mean, not its median, is what a hot pixel stands above."""
+    """Sums beyond a limit, if few pixels lie there; the core's mean, not its median, is what a hot pixel stands above."""
     hot = deviation > limit
     total, beyond = float(weight.sum()), weight[hot]
-    if not beyond.any():
+    if not 0.0 < float(beyond.sum()) <= MOST_HOT * total:
         return HotTail(0.0, 0.0, 0.0)
     core = float(weight[~hot] @ deviation[~hot]) / float(weight[~hot].sum())
     excess = deviation[hot] - core
