@@ -109,7 +109,9 @@ class Light:
     dots : (dx, dy, weight), arrays of shape (k,)
         A spread made of a few points, such as a birefringent plate's.
     kernel : ndarray, shape (2 m + 1, 2 m + 1), optional
-        A point spread on a raster of ``FINE`` points per pixel, of sum 1, row by row from the top.
+        A point spread on a raster of ``FINE`` points per pixel, row by row from the top; its sum and the shares of ``far`` make 1.
+    far : ndarray, shape (k, 3), optional
+        The tail of that spread, which reaches beyond its raster: Gaussians by share of the light, variance in x and in y (px²).
     aperture_px : (float, float)
         Width and height of the light-sensitive box in the middle of the pixel.
     sensitivity : float
@@ -130,6 +132,7 @@ class Light:
     varying: tuple[Callable[[np.ndarray, np.ndarray], np.ndarray], ...] = ()
     dots: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
     kernel: np.ndarray | None = None
+    far: np.ndarray | None = None
     aperture_px: tuple[float, float] = (1.0, 1.0)
     sensitivity: float = 1.0
     moments_s: np.ndarray | None = None
@@ -159,17 +162,18 @@ class Light:
             w = (self.dots[2][:, None] * w).ravel()
         return replace(self, dots=(dx, dy, w))
 
-    def convolved(self, kernel: np.ndarray) -> Light:
-        """Return the light after a tabulated point spread: odd sides, ``FINE`` points per pixel."""
+    def convolved(self, kernel: np.ndarray, far: np.ndarray | None = None) -> Light:
+        """Return the light after a tabulated point spread: odd sides, ``FINE`` points per pixel; ``far``: its tail, see `core.raster`."""
         new = np.asarray(kernel, float)
         if new.ndim != 2 or not all(s % 2 for s in new.shape) or not np.isfinite(new).all() or new.sum() <= 0:
             raise InputError("a point spread cannot be used", value=new.shape, allowed="a finite array with odd sides and a positive sum")
-        new = new / new.sum()
+        new = new / new.sum() * (1.0 if far is None else 1.0 - far[:, 0].sum())
         if self.kernel is not None:
             from scipy.signal import convolve2d
 
+            far = _both_tails((self.kernel, self.far), (new, far))
             new = convolve2d(self.kernel, new)
-        return replace(self, kernel=new)
+        return replace(self, kernel=new, far=far)
 
     def seen_at(self, moments_s: np.ndarray, weights: np.ndarray) -> Light:
         """Return the light with other times of looking; arrays of shape (n, rows or 1, m)."""
@@ -235,7 +239,7 @@ class Light:
         if getattr(self.scene, "moving", True):
             return None
         parts = [self.exposure_s, self.moments[1], np.array([self.blur_px2, self.sensitivity, *self.aperture_px])]
-        parts += [*(self.dots or ()), *([] if self.kernel is None else [self.kernel]), *(self.jitter_px or ())]
+        parts += [*(self.dots or ()), *(v for v in (self.kernel, self.far) if v is not None), *(self.jitter_px or ())]
         if self.pulls or self.varying:
             x, y = self._lattice()
             parts += [np.asarray(v, float) for v in (*self.pulled(x, y), *(f(x, y) for f in self.varying))]
@@ -319,6 +323,34 @@ class Light:
         if self.jitter_px is not None:  # to first order: all pixels share one raster
             seen += self.jitter_px[0][:, block] * decimate(fine, _slope(mask, 1), *size)
             seen += self.jitter_px[1][:, block] * decimate(fine, _slope(mask, 0), *size)
+        for share, across, down in () if self.far is None else self.far:
+            seen += share * self._veil(x, y, time[:, :1], across, down)
+        return seen
+
+    def _veil(self, x: np.ndarray, y: np.ndarray, time: np.ndarray, across_px2: float, down_px2: float) -> np.ndarray:
+        """Light through a wide Gaussian as well, shape (n, rows, cols): seen by the scene itself, on every so many pixels.
+
+        These are counted from the frame's corner, whatever the window; between them the light is linear.
+        """
+        shared = min(across_px2, down_px2)
+        look, lattice = replace(self, blur_px2=self.blur_px2 + shared), []
+        for at, variance in ((y[:, :, 0], down_px2), (x[:, 0], across_px2)):
+            step = veil_step(variance)
+            taps = _taps((variance - shared) / step**2)  # of what the Gaussian is wider in this axis
+            rim = len(taps) // 2
+            first, part = np.divmod(at, step)
+            low = first[:, :1] - rim
+            count = int(at.shape[1] - 1) // step + 3 + 2 * rim
+            nodes = (low + np.arange(count)) * step
+            lattice.append((nodes, taps, (first - first[:, :1]).astype(np.int64), part / step))
+        seen = look._averaged(lattice[1][0][:, None, :], lattice[0][0][:, :, None], time, self.aperture_px)
+        for axis, (_, taps, index, part) in zip((1, 2), lattice, strict=True):
+            if len(taps) > 1:
+                size = seen.shape[axis] - len(taps) + 1
+                seen = sum(w * seen.take(range(k, k + size), axis) for k, w in enumerate(taps.tolist()))
+            at, part = np.expand_dims(index, 3 - axis), np.expand_dims(part, 3 - axis)
+            left, right = (np.take_along_axis(seen, at + k, axis) for k in (0, 1))
+            seen = left * (1 - part) + right * part
         return seen
 
     @cached_property
@@ -438,6 +470,45 @@ class Light:
             longest = np.maximum(*(np.hypot(*step) for step in self._pixel_steps()))
             reach = reach * np.maximum(1.0, 1.5 * longest.reshape(len(longest), -1).max(axis=1))[:, None, None]
         return reach
+
+
+def veil_step(variance_px2: float) -> int:
+    """Pixels between the places at which light behind a wide Gaussian is looked at: half a deviation."""
+    return max(1, int(0.5 * variance_px2**0.5))
+
+
+def _taps(variance: float) -> np.ndarray:
+    """Weights of a Gaussian on whole numbers, of exactly this variance: e^(−t) I_k(t) (Lindeberg 1990)."""
+    from scipy.special import ive
+
+    reach = int(np.ceil(6 * variance**0.5 + 2)) if variance > 1e-6 else 0
+    weights = ive(np.abs(np.arange(-reach, reach + 1)), variance)
+    return weights / weights.sum()
+
+
+def _both_tails(one: tuple[np.ndarray, np.ndarray | None], two: tuple[np.ndarray, np.ndarray | None]) -> np.ndarray | None:
+    """The tail of two spreads in a row: each tail through the other's kernel, as far as its variance tells, and through its tail."""
+    parts = []
+    for (kernel, _), (_, far) in ((one, two), (two, one)):
+        if far is not None:
+            share, wide = kernel.sum(), []
+            for axis in (0, 1):
+                at, light = (np.arange(kernel.shape[1 - axis]) - kernel.shape[1 - axis] // 2) / FINE, kernel.sum(axis=axis) / share
+                wide.append(max(float((light * at**2).sum() - (light * at).sum() ** 2), 0.0))
+            parts.append(np.stack([far[:, 0] * share, far[:, 1] + wide[0], far[:, 2] + wide[1]], axis=1))
+    if one[1] is not None and two[1] is not None:
+        first, second = np.repeat(one[1], len(two[1]), axis=0), np.tile(two[1], (len(one[1]), 1))
+        parts.append(np.column_stack([first[:, 0] * second[:, 0], first[:, 1:] + second[:, 1:]]))
+    if not parts:
+        return None
+    together = np.concatenate(parts)
+    size = np.round(np.log2(together[:, 1] * together[:, 2]) / 2)  # those of nearly the same width become one of their mean variance
+    out = []
+    for kind in np.unique(size):
+        mine = together[size == kind]
+        share = mine[:, 0].sum()
+        out.append([share, *(mine[:, 0] @ mine[:, 1:] / share)])
+    return np.array(out)
 
 
 def _levels(variance: np.ndarray | None) -> Iterator[tuple[np.ndarray | None, Any, float]]:

@@ -10,7 +10,7 @@ import numpy as np
 from pixmetry.core.errors import ParameterError
 from pixmetry.core.light import FINE
 from pixmetry.core.random import Stream
-from pixmetry.core.raster import kernel_of
+from pixmetry.core.raster import kernel_of, spread_of
 from pixmetry.core.signal import Kind, Signal
 from pixmetry.core.source import Parameters, Source, quantity
 
@@ -32,7 +32,7 @@ class PointSpread(Parameters):
     coma_x_waves: float = quantity(0.0, "waves", "Zernike (3ρ³ − 2ρ) cos φ, times √8; positive: the tail points to +x", ge=-3, le=3)
     coma_y_waves: float = quantity(0.0, "waves", "Zernike (3ρ³ − 2ρ) sin φ, times √8; positive: the tail points to +y", ge=-3, le=3)
     spherical_waves: float = quantity(0.0, "waves", "Zernike 6ρ⁴ − 6ρ² + 1, times √5", ge=-3, le=3)
-    reach_px: float = quantity(4.0, "px", "half side of the table; the light beyond it is folded back into it (diffraction)", ge=1, le=12)
+    reach_px: float = quantity(4.0, "px", "half side of the fine table; its tail goes on in wide Gaussians (diffraction)", ge=1, le=12)
     table: tuple[tuple[float, ...], ...] = quantity(
         (),
         "1",
@@ -100,14 +100,24 @@ def _check_table(params: PointSpread) -> None:
         )
 
 
+def light_beyond(params: PointSpread, d_um: np.ndarray) -> np.ndarray:
+    """Share of an edge's light farther than d on its dark side, without rings: atan(2λN/(π² d))/π.
+
+    Its transfer function, exp(−4 λNν/π), begins as that of the clear pupil: 1 − 4 λNν/π. Light that is bent far comes from the pupil's
+    edge, whatever the aberrations; its density falls as λN/(π³ r³) (Lord Rayleigh 1881: J0² + J1² of the light is outside a circle).
+    """
+    return np.arctan(2e-3 * params.wavelength_nm * params.f_number / (np.pi**2 * np.asarray(d_um, float))) / np.pi
+
+
 @lru_cache(maxsize=32)
-def kernel(params: PointSpread) -> np.ndarray:
-    """The spread on the light's fine raster, see `core.raster`."""
+def kernel(params: PointSpread) -> tuple[np.ndarray, np.ndarray | None]:
+    """The spread on the light's fine raster and its tail, see `core.raster`."""
     if params.model == "diffraction":
-        return kernel_of(lambda fx, fy: transfer(params, fx, fy), int(round(params.reach_px * FINE)))
+        pitch = params.pitch_x_um, params.pitch_y_um
+        return spread_of(lambda fx, fy: transfer(params, fx, fy), params.reach_px, lambda d: light_beyond(params, d), pitch)
     _check_table(params)
     half = 0.5 * params.table_step_px * max(len(params.table), len(params.table[0]))
-    return kernel_of(lambda fx, fy: table_transfer(params, fx, fy), int(np.ceil(half * FINE)) + 2 * FINE)
+    return kernel_of(lambda fx, fy: table_transfer(params, fx, fy), int(np.ceil(half * FINE)) + 2 * FINE), None
 
 
 def forward(params: PointSpread, signal: Signal, stream: Stream) -> Signal:
@@ -115,7 +125,7 @@ def forward(params: PointSpread, signal: Signal, stream: Stream) -> Signal:
     light = signal.light
     if params.model == "gaussian":
         return signal.with_light(light.blurred(params.sigma_px**2)) if params.sigma_px else signal
-    return signal.with_light(light.convolved(kernel(params)))
+    return signal.with_light(light.convolved(*kernel(params)))
 
 
 SOURCE = Source(

@@ -6,11 +6,13 @@ from collections.abc import Mapping
 from functools import lru_cache
 
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
+from scipy.special import k1
 
 from pixmetry.core.geometry import corner_px, frame_centre, image_shift
-from pixmetry.core.light import FINE, Pull
+from pixmetry.core.light import Pull
 from pixmetry.core.random import Stream
-from pixmetry.core.raster import kernel_of
+from pixmetry.core.raster import spread_of
 from pixmetry.core.signal import Kind, Signal
 from pixmetry.core.silicon import absorption_per_um, refractive_index
 from pixmetry.core.source import Parameters, Source, quantity
@@ -25,7 +27,7 @@ class InfraredDiffusion(Parameters):
     chief_ray_deg: float = quantity(0.0, "deg", "of the lens's chief ray in the frame's corners; 0: telecentric", ge=0, le=60)
     pitch_x_um: float = quantity(8.6, "µm", "pixel pitch along x", gt=0, le=100)
     pitch_y_um: float = quantity(8.3, "µm", "pixel pitch along y", gt=0, le=100)
-    reach_px: float = quantity(4.0, "px", "half side of the table of the spread; what goes farther is folded back into it", ge=1, le=12)
+    reach_px: float = quantity(4.0, "px", "half side of the fine table of the spread; its tail goes on in wide Gaussians", ge=1, le=12)
 
 
 def transfer(params: InfraredDiffusion, fx: np.ndarray, fy: np.ndarray) -> np.ndarray:
@@ -65,17 +67,35 @@ def pull_of(params: InfraredDiffusion, frame_shape: tuple[int, int]) -> Pull:
     return pull
 
 
+def light_beyond(params: InfraredDiffusion, d_um: np.ndarray) -> np.ndarray:
+    """Share of an edge's charge that is collected farther than d on its dark side.
+
+    From a line at depth z it comes with z/(π L ρ) K1(ρ/L), ρ² = x² + z², whose transfer function is the e^(−z/L_k) of `transfer`. Summed
+    over x beyond d and over the absorption below the depleted layer.
+    """
+    alpha, length = float(absorption_per_um(params.wavelength_nm)), params.diffusion_length_um
+    below = np.exp(-alpha * params.depletion_um)
+    d = np.asarray(d_um, float)
+    z = np.geomspace(1e-3, 40.0, 300) / (alpha + 1 / length)
+    x = np.geomspace(d.min(), d.max() + 40 * length, 600)
+    rho = np.hypot(x[:, None], z)
+    density = np.trapezoid(z / (np.pi * length * rho) * k1(rho / length) * np.exp(-alpha * z), z, axis=1)
+    seen = cumulative_trapezoid(density[::-1], -x[::-1], initial=0.0)[::-1]
+    return alpha * below * np.interp(np.log(d), np.log(x), seen) / (1 - below / (1 + alpha * length))
+
+
 @lru_cache(maxsize=32)
-def kernel(params: InfraredDiffusion) -> np.ndarray:
-    """The spread on the light's fine raster, see `core.raster`."""
-    return kernel_of(lambda fx, fy: transfer(params, fx, fy), int(round(params.reach_px * FINE)))
+def kernel(params: InfraredDiffusion) -> tuple[np.ndarray, np.ndarray | None]:
+    """The spread on the light's fine raster and its tail, see `core.raster`."""
+    pitch = params.pitch_x_um, params.pitch_y_um
+    return spread_of(lambda fx, fy: transfer(params, fx, fy), params.reach_px, lambda d: light_beyond(params, d), pitch)
 
 
 def forward(params: InfraredDiffusion, signal: Signal, stream: Stream) -> Signal:
     """Spread the light as the charge spreads, and move it along the slanting ray."""
     light = signal.light
     if params.diffusion_length_um:
-        light = light.convolved(kernel(params))
+        light = light.convolved(*kernel(params))
     if params.chief_ray_deg:
         light = light.moved(pull_of(params, signal.frame_shape))
     return signal.with_light(light)
