@@ -195,7 +195,8 @@ def _truth(camera: Camera, series: SeriesModel, lamp_rel: float, traits: set[str
     shade, response, extra_e = _unit_maps(camera)
     gain = camera["electronics.gain"].params.gain_dn_per_e
     adc, bend = camera["grabber.adc"].params, camera["electronics.nonlinearity"].params
-    truth["grabber.adc.offset_dn"] += gain * float(extra_e.mean())
+    hot = _charge_of("sensor.defects", camera) > 0  # defects are not the black level
+    truth["grabber.adc.offset_dn"] += gain * float(extra_e[~hot].sum()) / extra_e.size
     truth["sensor.quantum_efficiency.quantum_efficiency"] *= float((shade * response).mean() / shade.mean())
     if "converter clips" in traits:
         x = np.linspace(0, 1.5, 200001) * adc.top
@@ -207,9 +208,8 @@ def _truth(camera: Camera, series: SeriesModel, lamp_rel: float, traits: set[str
     truth["lamp noise"] = lamp_rel
     if camera["grabber.phase_pattern"].params.amplitude_dn == 0:
         del truth["grabber.phase_pattern.frequency_x"], truth["grabber.phase_pattern.frequency_y"]
-    hot = int((_charge_of("sensor.defects", camera) > 0).sum())
-    truth["sensor.defects.hot_fraction"] = hot / (camera.frame_shape[0] * camera.frame_shape[1])
-    if hot < 10:
+    truth["sensor.defects.hot_fraction"] = float(hot.mean())
+    if hot.sum() < 10:
         del truth["sensor.defects.hot_median_e"], truth["sensor.defects.hot_sigma_log"]
     for name in ("dead_gain_rel", "cold_e", "gain_std_rel", "noisy_std_e"):  # sizes of what these cameras do not have
         del truth[f"sensor.defects.{name}"]
