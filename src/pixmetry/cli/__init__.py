@@ -30,17 +30,17 @@ _OS_REMEDIES = {errno.ENOSPC: "make room, or choose another folder", errno.ENAME
 
 # Each command lives in the module of its name below this package (- is _ there), as a click command of that name.
 COMMANDS = {
-    "assess": "Assess a camera from its frames: measure, budget, advise, and write the report.",
-    "emva1288": "Test a camera by EMVA 1288: the data sheet, with uncertainties.",
+    "assess": "Assess a camera from dark and bright frames: error sources, error budget, advice, report.",
+    "emva1288": "Test a camera by EMVA 1288 and write its data sheet, with uncertainties.",
     "sources": "List the error sources, or explain one of them.",
-    "simulate": "Make the frames of a camera whose errors are known.",
-    "chain": "Walk one target through a camera, source by source, on one page.",
-    "locate": "Measure where targets or lines are, with a covariance.",
-    "calibrate": "Calibrate a camera from images of a test field or a table of image coordinates: lens, uncertainties, report.",
-    "bound": "Say how well a target can be located, what estimators give, and what limits them.",
-    "correct": "Take out of frames what was measured in an assessment.",
-    "compare": "Say what changed between two measurements, who stands out of a fleet, and what keeps its limits.",
-    "warm-up": "Compile the kernels of all commands, so that none has to wait for it later.",
+    "simulate": "Simulate frames of a camera whose errors are known.",
+    "chain": "Show on one page how each error source of a camera moves a target.",
+    "locate": "Measure the positions of targets or lines, with their covariance.",
+    "calibrate": "Calibrate a camera from images of a test field or from a table of image coordinates.",
+    "bound": "Compute how well a target can be located (Cramér–Rao bound), and what limits it.",
+    "correct": "Correct frames with the results of an assessment.",
+    "compare": "Compare measurements with each other, with a fleet of cameras, or with limits.",
+    "warm-up": "Compile the kernels of all commands, so that no command waits for it later.",
 }
 
 
@@ -138,12 +138,13 @@ def _told(problem: click.UsageError) -> Exception:
     multiple=True,
     type=click.Path(),
     metavar="FILE",
-    help="A Python file with an error source of your own; it is run. May be given several times.",
+    help="A Python file that defines an error source of your own. The file is run. May be repeated.",
 )
 def main(source_files: tuple[str, ...]) -> None:
-    """Follow a target's light from lens to stored number.
+    """Find out how accurately your camera measures positions.
 
-    Simulates, measures, corrects and budgets a camera's error sources, and says how sure each answer is.
+    pixmetry simulates, measures, corrects and budgets the error sources of a camera, from the lens to the stored number. Every result has
+    its uncertainty.
     """
     if source_files:
         from pixmetry.core.catalogue import add_source_file

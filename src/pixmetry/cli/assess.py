@@ -22,12 +22,32 @@ LISTED = 8  # contributions that the console names
 @click.option(
     "-o", "--output", type=click.Path(path_type=Path), default=Path("pixmetry-report"), show_default=True, help="Folder for the results."
 )
-@click.option("--target", default="", help="Target, e.g. disc:diameter=7,blur=0.7,peak=0.6")
-@click.option("--estimator", default="auto", show_default=True, metavar="NAME", help="As in pixmetry locate; 'list' shows what there is.")
-@click.option("--calibration", type=click.Path(path_type=Path), help="Results of `pixmetry calibrate`: positions are corrected.")
-@click.option("--trials", type=click.IntRange(200, 10_000_000), default=4000, show_default=True, help="Windows for each Monte Carlo.")
-@click.option("--seed", type=click.IntRange(0), default=1, show_default=True, help="Of the Monte Carlo.")
-@click.option("--threads", type=click.IntRange(1), help="Default: all processors.")
+@click.option(
+    "--target",
+    default="",
+    help="Target of the error budget. Default: disc:diameter=7,blur=0.7,peak=0.6,background=0.02 (px, and shares of saturation).",
+)
+@click.option(
+    "--estimator",
+    default="auto",
+    show_default=True,
+    metavar="NAME",
+    help="Method that locates the target, as in `pixmetry locate`. 'list' shows all.",
+)
+@click.option(
+    "--calibration",
+    type=click.Path(path_type=Path),
+    help="Results of `pixmetry calibrate` (folder): the budget takes positions as corrected for the lens.",
+)
+@click.option(
+    "--trials",
+    type=click.IntRange(200, 10_000_000),
+    default=4000,
+    show_default=True,
+    help="Number of simulated windows in each Monte Carlo run.",
+)
+@click.option("--seed", type=click.IntRange(0), default=1, show_default=True, help="Seed of the Monte Carlo runs.")
+@click.option("--threads", type=click.IntRange(1), help="Number of threads. Default: one for each processor.")
 def assess(
     campaign: Path | None,
     output: Path,
@@ -38,11 +58,13 @@ def assess(
     seed: int,
     threads: int | None,
 ) -> None:
-    """Assess a camera from its frames: measure, budget, advise, and write the report.
+    """Assess a camera from dark and bright frames: error sources, error budget, advice, report.
 
-    CAMPAIGN is a manifest (YAML), an EMVA 1288 descriptor file, or a folder that holds one of them; without it, the packaged example
-    (a crop of a real CCD camera's data set) is assessed. The folder of results gets report.html, results.json, maps.zarr.zip, and
-    camera.yaml with camera.maps.npz: the camera's digital twin for `pixmetry simulate`.
+    CAMPAIGN is a manifest (YAML), an EMVA 1288 descriptor file, or a folder that holds one of them. Without CAMPAIGN the packaged example
+    is assessed: a crop of a real CCD camera's data set.
+
+    The folder of results gets report.html, results.json, maps.zarr.zip, and camera.yaml with camera.maps.npz. The last two are the
+    camera's digital twin for `pixmetry simulate`.
     """
     if estimator == "list":
         list_estimators()

@@ -23,28 +23,43 @@ SIZES = {
 
 
 @click.command()
-@click.option("--kind", type=click.Choice(KINDS), default="disc", show_default=True)
-@click.option("--radius", type=float, help="Of a disc or ring, px.")
-@click.option("--inner-radius", type=float, help="Of a ring, px.")
-@click.option("--semi-major", type=float, help="Of an ellipse, px.")
-@click.option("--semi-minor", type=float, help="Of an ellipse, px.")
-@click.option("--angle", type=float, help="Of an ellipse's long axis, of a line or edge, degrees from x towards y.")
-@click.option("--width", type=float, help="Of a line, px; by default a thin line, as wide as its blur.")
-@click.option("--length", type=float, help="Of a line or edge, px.")
-@click.option("--blur", type=float, required=True, help="Standard deviation of the edge or spot, without the pixel, px.")
-@click.option("--amplitude", type=float, required=True, help="Grey values above the surround; negative for a dark target.")
-@click.option("--background", type=float, default=0.0, show_default=True, help="Grey value of the surround above the camera's black.")
-@click.option("--noise", metavar="KEY=NUMBER,…", help="Noise in DN: read, gain, prnu, dsnu, black, bits; as in read=1.5,gain=0.01,bits=8.")
-@click.option("--camera", metavar="FILE|PRESET", help="A camera file or preset whose noise, bits, pitch and aperture are taken.")
-@click.option("--no-rounding", is_flag=True, help="Grey values are not whole numbers.")
-@click.option("--unknowns", default="shape", show_default=True, help="position, light, shape, planes, or names of parameters.")
-@click.option("--estimator", default="template", show_default=True, help="Whose limits are wanted; another name lists all.")
-@click.option("--frames", type=click.IntRange(1), default=1, show_default=True, help="Frames that are averaged.")
-@click.option("--aperture", type=float, help="Side of the pixel's sensitive square, px; by default the camera's, or 1.")
-@click.option("--window", type=int, help="Side of the window, odd, px; by default as far as the target reaches.")
-@click.option("--phases", type=int, default=5, show_default=True, help="Places within the pixel, along x and along y.")
-@click.option("--light-on", type=click.Choice(["surface", "image"]), default="surface", show_default=True, help="Where falling light acts.")
-@click.option("--json", "as_json", is_flag=True, help="For programs.")
+@click.option("--kind", type=click.Choice(KINDS), default="disc", show_default=True, help="Kind of target.")
+@click.option("--radius", type=float, help="Radius of a disc, or outer radius of a ring, px.")
+@click.option("--inner-radius", type=float, help="Inner radius of a ring, px.")
+@click.option("--semi-major", type=float, help="Semi-major axis of an ellipse, px.")
+@click.option("--semi-minor", type=float, help="Semi-minor axis of an ellipse, px.")
+@click.option("--angle", type=float, help="Direction of an ellipse's major axis, of a line or of an edge, degrees from x towards y.")
+@click.option("--width", type=float, help="Width of a line, px. Default: a thin line, as wide as its blur.")
+@click.option("--length", type=float, help="Length of a line or edge, px.")
+@click.option("--blur", type=float, required=True, help="Blur of the edge or spot: standard deviation without the pixel, px.")
+@click.option("--amplitude", type=float, required=True, help="Grey values above the background; negative for a dark target.")
+@click.option(
+    "--background", type=float, default=0.0, show_default=True, help="Grey value of the background, above the camera's black level."
+)
+@click.option(
+    "--noise", metavar="KEY=NUMBER,…", help="Noise in DN, such as read=1.5,gain=0.01,bits=8. Keys: read, gain, prnu, dsnu, black, bits."
+)
+@click.option("--camera", metavar="FILE|PRESET", help="Take noise, bits, pitch and aperture from this camera file or preset.")
+@click.option("--no-rounding", is_flag=True, help="Grey values are not rounded to whole numbers.")
+@click.option(
+    "--unknowns",
+    default="shape",
+    show_default=True,
+    help="What is estimated beside the position: position (nothing), light, shape, planes, or names of parameters.",
+)
+@click.option("--estimator", default="template", show_default=True, help="Estimator whose limits are shown. A wrong name lists all.")
+@click.option("--frames", type=click.IntRange(1), default=1, show_default=True, help="Number of frames that are averaged.")
+@click.option("--aperture", type=float, help="Side of the pixel's light-sensitive square, px. Default: the camera's, or 1.")
+@click.option("--window", type=int, help="Side of the window, px, an odd number. Default: as far as the target reaches.")
+@click.option("--phases", type=int, default=5, show_default=True, help="Number of sub-pixel positions along x and along y.")
+@click.option(
+    "--light-on",
+    type=click.Choice(["surface", "image"]),
+    default="surface",
+    show_default=True,
+    help="Where light that falls off across a target acts.",
+)
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def bound(
     kind: str,
     blur: float,
@@ -63,10 +78,12 @@ def bound(
     as_json: bool,
     **sizes: float | None,
 ) -> None:
-    """Say how well a target can be located: the Cramér–Rao bound, estimators beside it, and what limits them.
+    """Compute how well a target can be located (Cramér–Rao bound), and what limits it.
 
-    Uncertainties are standard deviations of one coordinate in pixels, the mean over places within the pixel; in µm too if the camera
-    tells its pitch. Example: pixmetry bound --radius 3.5 --blur 0.7 --amplitude 150 --background 10 --camera imx264_like
+    Uncertainties are standard deviations of one coordinate in pixels, averaged over sub-pixel positions. They are also in µm if the camera
+    states its pixel pitch.
+
+    Example: pixmetry bound --radius 3.5 --blur 0.7 --amplitude 150 --background 10 --camera imx264_like
     """
     from pixmetry.core.errors import InputError
     from pixmetry.location.bound import possible

@@ -16,41 +16,84 @@ OPTIONS = ("field", "loss", "folds", "residual_grid", "snoop", "a_priori")
 @click.command()
 @click.argument("sources", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="PROJECT.yaml|IMAGES…")
 @click.option(
-    "-o", "--output", type=click.Path(path_type=Path), default=Path("pixmetry-calibration"), show_default=True, help="For the results."
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path),
+    default=Path("pixmetry-calibration"),
+    show_default=True,
+    help="Folder for the results.",
 )
-@click.option("--kind", type=click.Choice(KINDS), help="Test field in the images. Default: chessboard.")
-@click.option("--grid", metavar="COLSxROWS", help="Inner corners of a chessboard, or dots of a plate, such as 9x6.")
-@click.option("--pitch-mm", type=click.FloatRange(0, min_open=True), help="Spacing of corners or dots.")
-@click.option("--side-mm", type=click.FloatRange(0, min_open=True), help="Side of separate squares.")
-@click.option("--diameter-mm", type=click.FloatRange(0, min_open=True), help="Of dots; corrects the eccentricity of their images.")
-@click.option("--polarity", type=click.Choice(["auto", "bright", "dark"]), help="Of targets on their ground. Default: auto.")
-@click.option("--channel", type=click.Choice(["red", "green", "blue"]), help="Channel of colour images.")
+@click.option("--kind", type=click.Choice(KINDS), help="Kind of test field in the images. Default: chessboard.")
+@click.option("--grid", metavar="COLSxROWS", help="Size of the test field: inner corners of a chessboard, or dots of a plate, such as 9x6.")
+@click.option("--pitch-mm", type=click.FloatRange(0, min_open=True), help="Spacing of the corners or dots, mm.")
+@click.option("--side-mm", type=click.FloatRange(0, min_open=True), help="Side of separate squares, mm.")
+@click.option(
+    "--diameter-mm",
+    type=click.FloatRange(0, min_open=True),
+    help="Diameter of the dots, mm. With it the eccentricity of their images is corrected.",
+)
+@click.option(
+    "--polarity",
+    type=click.Choice(["auto", "bright", "dark"]),
+    help="Whether targets are brighter or darker than their background. Default: auto.",
+)
+@click.option("--channel", type=click.Choice(["red", "green", "blue"]), help="Channel to use of colour images.")
 @click.option("--raw", metavar="WxH:FORMAT", help="Layout of files without a header, e.g. 1920x1200:Mono12p (GenICam's names).")
-@click.option("--noise", metavar="WHAT", help="Noise model of the images, as of `pixmetry locate`. Default: from each image.")
-@click.option("--camera", metavar="PRESET|FILE", help="Of the images: brings size and pitch; results get its camera.yaml with the lens.")
-@click.option("--pixel-um", type=click.FloatRange(0, min_open=True), help="Pitch of the pixels; without it, lengths are in pixels.")
-@click.option("--c-px", type=click.FloatRange(0, min_open=True), help="Start value of the principal distance in pixels.")
-@click.option("--c-mm", type=click.FloatRange(0, min_open=True), help="Start value of the principal distance.")
+@click.option("--noise", metavar="WHAT", help="Noise of the images, as in `pixmetry locate`. Default: estimated from each image.")
+@click.option(
+    "--camera",
+    metavar="PRESET|FILE",
+    help="Camera of the images: gives frame size and pixel pitch. The results get its camera.yaml with the calibrated lens.",
+)
+@click.option(
+    "--pixel-um", type=click.FloatRange(0, min_open=True), help="Pixel pitch, µm. Without it, lengths in the camera are in pixels."
+)
+@click.option("--c-px", type=click.FloatRange(0, min_open=True), help="Start value of the principal distance, px.")
+@click.option("--c-mm", type=click.FloatRange(0, min_open=True), help="Start value of the principal distance, mm.")
 @click.option(
     "--direction",
     type=click.Choice(["image_to_object", "object_to_image"]),
-    help="What the distortion takes to what: photogrammetry's corrections, or vision's (as OpenCV). Default: image_to_object.",
+    help="Direction of the distortion: corrections to the image (photogrammetry), or distortion of the ideal image (OpenCV). "
+    "Default: image_to_object.",
 )
 @click.option("--free", metavar="NAMES", help="Parameters to estimate, such as c,xp,yp,k1,k2. Default: c,xp,yp,b1,b2,p1,p2,k1,k2,k3.")
-@click.option("--per-image", metavar="NAMES", help="Also for each image: x_scale, x_shift, or both.")
-@click.option("--field", type=click.Choice(["auto", "fixed", "free"]), help="Trust the field's coordinates, estimate them, or find out.")
-@click.option("--loss", type=click.Choice(["huber", "cauchy", "none"]), help="Of the first pass, before gross errors are looked for.")
-@click.option("--folds", type=click.IntRange(0), help="Parts into which images are left out of the fit in turn; 0: none.")
-@click.option("--residual-grid", is_flag=True, default=None, help="Make a correction grid of what the parameters leave over.")
-@click.option("--no-snoop", "snoop", is_flag=True, flag_value=False, default=None, help="Do not look for gross errors.")
-@click.option("--a-priori", is_flag=True, default=None, help="Take the given uncertainties of image coordinates as true.")
-@click.option("--opencv", type=click.Path(path_type=Path), metavar="FILE", help="Also for OpenCV: .yaml, .xml or .json.")
-@click.option("--colmap", type=click.Path(path_type=Path), metavar="FILE", help="Also for COLMAP: cameras.txt.")
 @click.option(
-    "--may-lose-px", type=click.FloatRange(0), default=0.0, show_default=True, help="What these two may lose anywhere in the frame."
+    "--per-image", metavar="NAMES", help="Parameters to estimate for each image (clock of a frame grabber): x_scale, x_shift, or both."
 )
-@click.option("--json", is_flag=True, help="Print the cameras for programs instead of a summary.")
-@click.option("--threads", type=click.IntRange(1), help="Default: all processors.")
+@click.option(
+    "--field",
+    type=click.Choice(["auto", "fixed", "free"]),
+    help="Coordinates of the test field: take them as exact (fixed), estimate them (free), or decide by a test (auto).",
+)
+@click.option(
+    "--loss", type=click.Choice(["huber", "cauchy", "none"]), help="Robust loss of the first pass, before the search for gross errors."
+)
+@click.option(
+    "--folds",
+    type=click.IntRange(0),
+    help="Number of folds for cross-validation: parts of the images that are left out of the fit in turn. 0: none.",
+)
+@click.option(
+    "--residual-grid", is_flag=True, default=None, help="Also estimate a correction grid for the residuals that the parameters leave."
+)
+@click.option("--no-snoop", "snoop", is_flag=True, flag_value=False, default=None, help="Do not search for gross errors.")
+@click.option(
+    "--a-priori",
+    is_flag=True,
+    default=None,
+    help="Take the given uncertainties of image coordinates as true; do not scale them by the residuals.",
+)
+@click.option("--opencv", type=click.Path(path_type=Path), metavar="FILE", help="Also write the camera for OpenCV: .yaml, .xml or .json.")
+@click.option("--colmap", type=click.Path(path_type=Path), metavar="FILE", help="Also write the cameras for COLMAP: cameras.txt.")
+@click.option(
+    "--may-lose-px",
+    type=click.FloatRange(0),
+    default=0.0,
+    show_default=True,
+    help="Largest error that the export to OpenCV or COLMAP may add anywhere in the frame, px.",
+)
+@click.option("--json", is_flag=True, help="Print the cameras as JSON instead of a summary.")
+@click.option("--threads", type=click.IntRange(1), help="Number of threads. Default: one for each processor.")
 def calibrate(
     sources: tuple[Path, ...],
     output: Path,
@@ -61,14 +104,15 @@ def calibrate(
     threads: int | None,
     **given: Any,
 ) -> None:
-    """Calibrate cameras, with the uncertainty of everything that is estimated.
+    """Calibrate one camera or several, with the uncertainty of every estimate.
 
-    The argument is a project file (YAML), which names tables of image coordinates or images with targets; or images of a flat test field
-    or of straight lines themselves (files or folders). The folder of results gets report.html, calibration.json, residuals.csv and, but
-    of lines, points.csv and poses.csv. What OpenCV or COLMAP have no place for is not dropped in silence: the results are written, the
-    export is refused.
+    The argument is a project file (YAML) that names tables of image coordinates or images with targets. Or it is the images themselves
+    (files or folders), of a flat test field or of straight lines.
 
-    Every key of a project file and every message: docs/calibrating.md.
+    The folder of results gets report.html, calibration.json and residuals.csv; except for straight lines also points.csv and poses.csv.
+    An export that OpenCV or COLMAP cannot hold is refused with the reason. The results are written even then.
+
+    docs/calibrating.md explains every key of a project file and every message.
     """
     from pixmetry.calibrating import calibrate as run
     from pixmetry.calibration_exports import check_exports, write_exports

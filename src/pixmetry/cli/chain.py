@@ -12,18 +12,20 @@ from pixmetry.cli._console import echo
 @click.command()
 @click.argument("camera")
 @click.argument("scene", type=click.Path(path_type=Path))
-@click.option("-o", "--output", type=click.Path(path_type=Path, dir_okay=False), required=True, help="The page (HTML).")
-@click.option("--target", type=click.IntRange(0), help="Number of the scene's target; by default the one nearest to the middle.")
+@click.option("-o", "--output", type=click.Path(path_type=Path, dir_okay=False), required=True, help="File of the page (HTML).")
+@click.option(
+    "--target", type=click.IntRange(0), help="Number of the target in the scene. Default: the one nearest to the middle of the frame."
+)
 @click.option("--frame", type=click.IntRange(0), default=0, show_default=True, help="Number of the frame in the sequence.")
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Of the exposures.")
+@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the temporal noise.")
 @click.option(
     "--set",
     "settings",
     multiple=True,
     metavar="NAME.PARAMETER=VALUE",
-    help="Change a parameter of a source of the camera, or a value of the camera itself. May be repeated.",
+    help="Change a parameter of an error source, or a value of the camera itself. May be repeated.",
 )
-@click.option("--off", multiple=True, metavar="NAME", help="Switch a source of the camera off. May be repeated.")
+@click.option("--off", multiple=True, metavar="NAME", help="Switch an error source off. May be repeated.")
 def chain(
     camera: str,
     scene: Path,
@@ -34,9 +36,9 @@ def chain(
     settings: tuple[str, ...],
     off: tuple[str, ...],
 ) -> None:
-    """Walk one target through the chain of a camera.
+    """Show on one page how each error source of a camera moves a target.
 
-    CAMERA is a camera file or the name of a preset; SCENE is a scene file. The page shows the image and its profiles after every
+    CAMERA is a camera file or the name of a preset. SCENE is a scene file. The page shows the image and its profiles after every error
     source, how far the target's centre has moved so far, and which source moved it.
     """
     from pixmetry.campaign.staged_files import Output, check_files, page_mark

@@ -30,17 +30,18 @@ LARGEST = 3  # so many of the differences that are not significant are shown
 
 @click.command()
 @click.argument("files", nargs=-1, required=True, type=click.Path(path_type=Path))
-@click.option("--limits", type=click.Path(path_type=Path), help="A file of limits (YAML): what each file must keep.")
-@click.option("--level", type=float, default=0.95, show_default=True, help="Confidence over all values together.")
-@click.option("--same-light", is_flag=True, help="Both were measured with one calibration of the light.")
-@click.option("--all", "everything", is_flag=True, help="Show what is the same, too.")
-@click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write the comparison for programs.")
+@click.option("--limits", type=click.Path(path_type=Path), help="File of limits (YAML) for the values of each file.")
+@click.option("--level", type=float, default=0.95, show_default=True, help="Confidence level for all values together.")
+@click.option("--same-light", is_flag=True, help="Both measurements share one calibration of the light.")
+@click.option("--all", "everything", is_flag=True, help="Also show the values that did not change.")
+@click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write the comparison as JSON.")
 def compare(files: tuple[Path, ...], limits: Path | None, level: float, same_light: bool, everything: bool, json_file: Path | None) -> None:
-    """Say what changed between two measurements of one camera, or which camera of a fleet stands out.
+    """Compare measurements with each other, with a fleet of cameras, or with limits.
 
-    FILES are data sheets of EMVA 1288 (JSON or XML), or assessments (results.json or its folder): two are compared with each other,
-    three and more each with the fleet's median; with --limits one is enough. Exit status: 0 all the same and within limits; 1 something
-    changed, stands out, fails or is undecided; 2 an error.
+    FILES are EMVA 1288 data sheets (JSON or XML) or assessments (results.json or its folder). Two files are compared with each other.
+    Of three files or more, each is compared with the median of all. With --limits one file is enough.
+
+    Exit status: 0 if nothing changed and all limits hold; 1 if a value changed, stands out, fails or is undecided; 2 after an error.
     """
     from pixmetry.campaign.staged_files import Output, check_files, write_together
     from pixmetry.comparing import check_limits, compare_fleet

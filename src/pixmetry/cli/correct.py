@@ -14,13 +14,13 @@ from pixmetry.cli._console import echo
 @click.option("--with", "results", type=click.Path(path_type=Path), required=True, help="The results.json of an assessment of this camera.")
 @click.option("-o", "--output", type=click.Path(path_type=Path), required=True, help="Folder for the corrected frames.")
 @click.option("--raw", metavar="WxH:FORMAT", help="Layout of files without a header, e.g. 1920x1200:Mono12p (GenICam's names).")
-@click.option("--threads", type=click.IntRange(1), help="Default: all processors.")
+@click.option("--threads", type=click.IntRange(1), help="Number of threads. Default: one for each processor.")
 def correct(frames: tuple[Path, ...], results: Path, output: Path, raw: str | None, threads: int | None) -> None:
-    """Take out of frames what was measured in an assessment.
+    """Correct frames with the results of an assessment.
 
     FRAMES are image files, folders of them, or Zarr stores of frames. Dark signal, non-linearity, relative response and defects are
-    corrected, in this order, as far as the assessment measured them; what could not be corrected is listed with the reason. The corrected
-    frames are TIFF files of 32-bit floats in DN above black.
+    corrected in this order, as far as the assessment measured them. The command lists what could not be corrected, with the reason. The
+    corrected frames are TIFF files of 32-bit floats in DN above black.
     """
     from pixmetry.cli._progress import shown_progress
     from pixmetry.core.threads import set_threads

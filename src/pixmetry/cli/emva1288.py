@@ -20,37 +20,85 @@ OPTIONS = {
 
 @click.command()
 @click.argument("campaigns", nargs=-1, type=FILE)
-@click.option("--release", type=click.Choice(["4.0", "3.1", "reference"]), default="4.0", show_default=True, help="Of the standard.")
-@click.option("--bayer", type=click.Choice(["RGGB", "BGGR", "GRBG", "GBRG"]), help="Colour filter; each phase is tested by itself.")
-@click.option("--json", type=FILE, help="Write the results (or the checks of --preflight) for programs.")
+@click.option(
+    "--release",
+    type=click.Choice(["4.0", "3.1", "reference"]),
+    default="4.0",
+    show_default=True,
+    help="Release of the standard; 'reference' computes as the public implementation does.",
+)
+@click.option(
+    "--bayer",
+    type=click.Choice(["RGGB", "BGGR", "GRBG", "GBRG"]),
+    help="Colour filter array. Each of its four phases is tested as a camera of its own.",
+)
+@click.option("--json", type=FILE, help="Write the results (or the checks of --preflight) as JSON.")
 @click.option("--xml", type=FILE, help="Write the results in the public EMVA 1288 format.")
 @click.option("--report", type=FILE, help="Write the data sheet as a page (HTML).")
 @click.option("--pdf", type=FILE, help="Write the data sheet as PDF.")
-@click.option("--bootstrap", type=click.IntRange(0), default=0, metavar="DRAWS", help="Take u from a bootstrap over frames and levels.")
-@click.option("--photons-u", type=click.FloatRange(0, 99), default=0.0, metavar="PERCENT", help="Standard u of the photon counts.")
-@click.option("--compare", nargs=2, type=FILE, metavar="A B", help="Say what differs between two data sheets (XML or JSON), in u.")
-@click.option("--plan", is_flag=True, help="Say which frames to take for the wanted u.")
-@click.option("--u-gain", type=click.FloatRange(0, min_open=True), metavar="PERCENT", help="Wanted u of the gain, in percent of it.")
-@click.option("--u-dark-noise", type=click.FloatRange(0, min_open=True), metavar="PERCENT", help="Wanted u of the dark noise, of it.")
-@click.option("--u-dsnu", type=click.FloatRange(0, min_open=True), metavar="E", help="Wanted u of the DSNU, in electrons.")
-@click.option("--u-prnu", type=click.FloatRange(0, min_open=True), metavar="PERCENT", help="Wanted u of the PRNU, in % of the signal.")
-@click.option("--sweep", type=click.Choice(["exposure", "light"]), default="exposure", show_default=True, help="What the plan varies.")
-@click.option("--saturation-s", type=click.FloatRange(0, min_open=True), help="Exposure time that saturates the camera, for the plan.")
-@click.option("--frame-rate", type=click.FloatRange(0, min_open=True), help="Frames per second, for the plan.")
-@click.option("--manifest", type=FILE, help="Write the manifest of the planned campaign (YAML).")
-@click.option("--preflight", is_flag=True, help="Check a few frames before a long series.")
-@click.option("--dark", multiple=True, type=FILE, help="Frames for the preflight: a file or folder; may be given several times.")
-@click.option("--bright", multiple=True, type=FILE, help="The same, lit; each folder is a level, all single files together are one.")
-@click.option("--bits", type=click.IntRange(1, 16), help="Bits of a stored value of these frames.")
-@click.option("--threads", type=click.IntRange(1), help="Default: all processors.")
+@click.option(
+    "--bootstrap",
+    type=click.IntRange(0),
+    default=0,
+    metavar="DRAWS",
+    help="Compute u by a bootstrap over frames and levels, with so many draws.",
+)
+@click.option(
+    "--photons-u", type=click.FloatRange(0, 99), default=0.0, metavar="PERCENT", help="Relative standard uncertainty of the photon counts."
+)
+@click.option("--compare", nargs=2, type=FILE, metavar="A B", help="Compare two data sheets (XML or JSON); differences are in units of u.")
+@click.option("--plan", is_flag=True, help="Plan a test: which frames to take for the wanted uncertainties.")
+@click.option(
+    "--u-gain",
+    type=click.FloatRange(0, min_open=True),
+    metavar="PERCENT",
+    help="With --plan: wanted u of the gain, in percent of the gain.",
+)
+@click.option(
+    "--u-dark-noise",
+    type=click.FloatRange(0, min_open=True),
+    metavar="PERCENT",
+    help="With --plan: wanted u of the dark noise, in percent of the dark noise.",
+)
+@click.option("--u-dsnu", type=click.FloatRange(0, min_open=True), metavar="E", help="With --plan: wanted u of the DSNU, in electrons.")
+@click.option(
+    "--u-prnu",
+    type=click.FloatRange(0, min_open=True),
+    metavar="PERCENT",
+    help="With --plan: wanted u of the PRNU, in percent of the signal.",
+)
+@click.option(
+    "--sweep",
+    type=click.Choice(["exposure", "light"]),
+    default="exposure",
+    show_default=True,
+    help="With --plan: vary the exposure time or the light.",
+)
+@click.option(
+    "--saturation-s", type=click.FloatRange(0, min_open=True), help="With --plan: exposure time that saturates the camera, in seconds."
+)
+@click.option("--frame-rate", type=click.FloatRange(0, min_open=True), help="With --plan: frames per second.")
+@click.option("--manifest", type=FILE, help="With --plan: write the manifest of the planned campaign (YAML).")
+@click.option("--preflight", is_flag=True, help="Check a few frames before you take a long series.")
+@click.option("--dark", multiple=True, type=FILE, help="With --preflight: dark frames, a file or a folder. May be repeated.")
+@click.option(
+    "--bright",
+    multiple=True,
+    type=FILE,
+    help="With --preflight: bright frames. Each folder is one light level; all single files together are one. May be repeated.",
+)
+@click.option("--bits", type=click.IntRange(1, 16), help="With --dark and --bright: bits of a stored value.")
+@click.option("--threads", type=click.IntRange(1), help="Number of threads. Default: one for each processor.")
 @click.pass_context
 def emva1288(ctx: click.Context, campaigns: tuple[Path, ...], **given: Any) -> None:
-    """Test a camera by EMVA 1288 and give every value with its uncertainty.
+    """Test a camera by EMVA 1288 and write its data sheet, with uncertainties.
 
-    CAMPAIGNS is an EMVA 1288 descriptor, a manifest (YAML), or a folder that holds one of them; without it, the packaged example is
-    tested. Of several campaigns of one camera, at three temperatures or more, the first gives the data sheet, and all of them the law
-    of the dark current against temperature. For --plan, a data sheet (JSON or XML) or a campaign tells what is known of the camera; a
-    campaign, or --dark and --bright, gives the frames for --preflight.
+    CAMPAIGNS is an EMVA 1288 descriptor, a manifest (YAML), or a folder that holds one of them. Without CAMPAIGNS the packaged example is
+    tested. Three campaigns or more of one camera at different temperatures also give the dark current against temperature; the data sheet
+    is that of the first.
+
+    With --plan, CAMPAIGNS is a data sheet (JSON or XML) or a campaign of the camera. With --preflight, the frames are those of a campaign
+    or of --dark and --bright.
     """
     from pixmetry.cli import _emva
     from pixmetry.core.threads import set_threads

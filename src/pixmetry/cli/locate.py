@@ -16,39 +16,53 @@ KINDS = ("disc", "ellipse", "ring", "spot", "line", "edge", "cross", "chessboard
 
 @click.command()
 @click.argument("images", nargs=-1, type=click.Path(path_type=Path))
-@click.option("--kind", type=click.Choice(KINDS), default="disc", show_default=True, help="What is to be found.")
-@click.option("--estimator", default="auto", show_default=True, metavar="NAME", help="How it is measured; 'list' shows what there is.")
+@click.option("--kind", type=click.Choice(KINDS), default="disc", show_default=True, help="What to look for.")
 @click.option(
-    "-o", "--output", type=click.Path(path_type=Path), help="The table: .csv, .parquet or .json. Default: CSV to standard output."
+    "--estimator",
+    default="auto",
+    show_default=True,
+    metavar="NAME",
+    help="Method that measures the positions. 'list' shows all for this kind.",
 )
-@click.option("--overlay", type=click.Path(path_type=Path), help="A PNG that shows what was found; a folder if there are several images.")
 @click.option(
-    "--polarity", type=click.Choice(["auto", "bright", "dark"]), default="auto", show_default=True, help="Of targets on their ground."
+    "-o", "--output", type=click.Path(path_type=Path), help="File of the table: .csv, .parquet or .json. Default: CSV on standard output."
+)
+@click.option(
+    "--overlay", type=click.Path(path_type=Path), help="Also draw what was found into a PNG. With several images: a folder of PNGs."
+)
+@click.option(
+    "--polarity",
+    type=click.Choice(["auto", "bright", "dark"]),
+    default="auto",
+    show_default=True,
+    help="Whether targets are brighter or darker than their background.",
 )
 @click.option(
     "--grid",
     metavar="COLSxROWS",
-    help="Pattern of a plate: inner corners of a chessboard, dots of a plate; 'any' numbers the dots of a plate of unknown size.",
+    help="Size of the plate: inner corners of a chessboard, or dots. 'any' numbers the dots of a plate of unknown size.",
 )
 @click.option(
     "--noise",
     metavar="WHAT",
-    help="Noise model: a camera (preset, camera.yaml), or read=1.5,gain=0.01,black=16 in DN. Default: from the image.",
+    help="Noise of the image: a camera (preset or camera.yaml), or read=1.5,gain=0.01,black=16 in DN. Default: estimated from the image.",
 )
-@click.option("--bits", type=click.IntRange(1, 16), help="Bits of a stored value, which say where it saturates. Default: from the image.")
 @click.option(
-    "--aperture", type=click.FloatRange(0, 1), default=1.0, show_default=True, help="Side of the pixel's light-sensitive square in pixels."
+    "--bits", type=click.IntRange(1, 16), help="Bits of a stored value; they tell where values saturate. Default: from the image."
+)
+@click.option(
+    "--aperture", type=click.FloatRange(0, 1), default=1.0, show_default=True, help="Side of the pixel's light-sensitive square, in pixels."
 )
 @click.option(
     "--light-on",
     type=click.Choice(["surface", "image"]),
     default="surface",
     show_default=True,
-    help="Where light that falls off across a target acts.",
+    help="Where light that falls off across a target acts: on the surface before the blur, or on the image after it.",
 )
-@click.option("--channel", type=click.Choice(["red", "green", "blue"]), help="Channel of colour images.")
+@click.option("--channel", type=click.Choice(["red", "green", "blue"]), help="Channel to use of colour images.")
 @click.option("--raw", metavar="WxH:FORMAT", help="Layout of files without a header, e.g. 1920x1200:Mono12p (GenICam's names).")
-@click.option("--threads", type=click.IntRange(1), help="Default: all processors.")
+@click.option("--threads", type=click.IntRange(1), help="Number of threads. Default: one for each processor.")
 def locate(
     images: tuple[Path, ...],
     kind: str,
@@ -65,12 +79,13 @@ def locate(
     raw: str | None,
     threads: int | None,
 ) -> None:
-    """Measure where targets or lines are, with a covariance.
+    """Measure the positions of targets or lines, with their covariance.
 
-    IMAGES are files (PNG, TIFF, BMP, FITS, NPY, JPEG, raw), folders of them, or Zarr stores of frames; a file with several frames is as
-    many images. Bright and dark targets are found without tuning.
-    Positions count from the centre of the top-left pixel, x to the right, y down. The exit status is 1 if no image has a target; the table
-    is written even then.
+    IMAGES are files (PNG, TIFF, BMP, FITS, NPY, JPEG, raw), folders of them, or Zarr stores of frames. A file with several frames counts
+    as several images. Bright and dark targets are found without tuning.
+
+    Positions count from the centre of the top-left pixel, x to the right, y down. The exit status is 1 if no target was found in any
+    image. The table is written even then.
     """
     from pixmetry.cli._progress import shown_progress
     from pixmetry.core.threads import set_threads

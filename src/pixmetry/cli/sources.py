@@ -11,12 +11,12 @@ ROOM_FOR_NOTES = 110  # columns of a terminal
 
 @click.command()
 @click.argument("source_id", metavar="[ID]", required=False)
-@click.option("--json", "as_json", is_flag=True, help="For programs.")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def sources(source_id: str | None, as_json: bool) -> None:
     """List the error sources, or explain one of them.
 
-    Without ID: every source with its stage, the handbook's stars and note, and which of the verbs forward, measure, correct and
-    propagate it has. With ID: equation, parameters with units and ranges, sources and typical size.
+    Without ID: all error sources by stage, with the handbook's stars and notes, and which of the verbs forward, measure, correct and
+    propagate each source has. With ID: its equation, its parameters with units and ranges, its references and its typical size.
     """
     from pixmetry.core.catalogue import catalogue, get_source, to_record
 

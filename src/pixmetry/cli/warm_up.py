@@ -7,11 +7,11 @@ import click
 
 @click.command("warm-up")
 def warm_up() -> None:
-    """Compile the kernels of all commands into the cache, by running each on something small.
+    """Compile the kernels of all commands, so that no command waits for it later.
 
-    Kernels are compiled for this processor when they are first needed, once after an installation or an upgrade, which makes the first
-    run of a command wait for a minute or so. This does it for all of them at once, in some minutes. The cache is in the folder that
-    PIXMETRY_CACHE_DIR names, else in the user's cache.
+    Kernels are compiled for this processor when they are first needed: once after an installation or an upgrade. The first run of a command
+    therefore takes a minute or so longer. `pixmetry warm-up` compiles all kernels at once, in some minutes. It stores them in the folder
+    that PIXMETRY_CACHE_DIR names, otherwise in the user's cache.
     """
     import time
 
