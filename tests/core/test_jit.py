@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -88,6 +89,122 @@ def test_edited_callee_in_another_file_is_noticed(tmp_path: Path) -> None:
     assert run(tmp_path)[1] == "12.0"
 
 
+def test_edited_constant_of_a_kernel_file_without_kernels_is_noticed(tmp_path: Path) -> None:
+    """No code refers to that file: only the import statement shows that the compiled number came from there."""
+    write_package(tmp_path, 1.0)
+    constants = tmp_path / "thrown" / "_factor_kernels.py"
+    inner = "from ._factor_kernels import FACTOR\n" + CALLEE.format(factor="FACTOR")
+    (tmp_path / "thrown" / "_inner_kernels.py").write_text(inner)
+    for factor, expected in ((3.0, "36.0"), (7.5, "90.0")):
+        constants.write_text(f"FACTOR = {factor}\n")
+        assert run(tmp_path)[1:] == [expected, "0", "1"]
+    assert run(tmp_path)[1:] == ["90.0", "1", "0"]
+
+
+def test_edit_of_a_kernel_file_that_is_not_imported_compiles_nothing(tmp_path: Path) -> None:
+    write_package(tmp_path, 1.0)
+    other = tmp_path / "thrown" / "_other_kernels.py"
+    other.write_text(CALLEE.format(factor=2.0))
+    assert run(tmp_path)[2:] == ["0", "1"]
+    other.write_text(CALLEE.format(factor=3.0))
+    assert run(tmp_path)[2:] == ["1", "0"]
+
+
+def test_two_checkouts_share_what_is_alike(tmp_path: Path) -> None:
+    first, second = tmp_path / "first", tmp_path / "second"
+    for folder in (first, second):
+        folder.mkdir()
+        write_package(folder, 1.0)
+    shared = {"PIXMETRY_CACHE_DIR": str(tmp_path / "cache")}
+    assert run(first, **shared) == ["False", "12.0", "0", "1"]
+    shutil.rmtree(first)
+    assert run(second, **shared) == ["False", "12.0", "1", "0"]
+    write_package(second, 2.0)
+    assert run(second, **shared) == ["False", "24.0", "0", "1"]
+
+
+def test_same_text_in_a_module_of_another_name_is_another_kernel(tmp_path: Path) -> None:
+    """Compiled code names its module, which need not be there any more."""
+    write_package(tmp_path, 1.0)
+    assert run(tmp_path)[1] == "12.0"
+    (tmp_path / "thrown").rename(tmp_path / "moved")
+    (tmp_path / "moved" / "_outer_kernels.py").write_text(CALLER.format(package="moved"))
+    assert run(tmp_path, "moved") == ["False", "12.0", "0", "1"]
+
+
+def test_processes_that_compile_at_once_keep_all_that_they_compiled(tmp_path: Path) -> None:
+    """Each for another type of number: with an index of its own on disk Numba loses entries here."""
+    write_package(tmp_path, 1.0)
+    types = ("int8", "int16", "int32", "int64", "float32", "float64")
+    variables = os.environ | {"PYTHONPATH": os.pathsep.join([SOURCE, str(tmp_path)]), "PIXMETRY_CACHE_DIR": str(tmp_path / "cache")}
+
+    def start(kind: str) -> subprocess.Popen:
+        script = SCRIPT.format(package="thrown").replace("np.arange(4.0)", f"np.arange(4).astype('{kind}')")
+        return subprocess.Popen([sys.executable, "-c", script], env=variables, stdout=subprocess.PIPE, text=True)
+
+    for misses in (1, 0):
+        for started in [start(kind) for kind in types]:
+            assert started.communicate()[0].split() == ["False", "12.0", str(1 - misses), str(misses)]
+            assert started.returncode == 0
+
+
+def test_spoilt_file_is_compiled_again(tmp_path: Path) -> None:
+    write_package(tmp_path, 1.0)
+    run(tmp_path)
+    for kept in (tmp_path / "cache").rglob("outer-*.nbc"):
+        kept.write_bytes(kept.read_bytes()[:100])
+    assert run(tmp_path) == ["False", "12.0", "0", "1"]
+    assert run(tmp_path) == ["False", "12.0", "1", "0"]
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="nothing is read-only to root")
+def test_read_only_cache_gives_way_to_the_next(tmp_path: Path) -> None:
+    write_package(tmp_path, 1.0)
+    (tmp_path / "cache").mkdir(mode=0o500)
+    assert run(tmp_path, XDG_CACHE_HOME=str(tmp_path / "user"))[1:] == ["12.0", "0", "1"]
+    assert list((tmp_path / "user").rglob("*.nbc"))
+
+
+def test_disk_that_takes_nothing_costs_nothing_but_time(tmp_path: Path) -> None:
+    write_package(tmp_path, 1.0)
+    script = (
+        "import numpy as np, pathlib\nfrom thrown._outer_kernels import outer\ndef full(*_): raise OSError(28, 'No space left on device')\n"
+        "pathlib.Path.write_bytes = full\nprint(outer(np.arange(4.0)))"
+    )
+    variables = os.environ | {"PYTHONPATH": os.pathsep.join([SOURCE, str(tmp_path)]), "PIXMETRY_CACHE_DIR": str(tmp_path / "cache")}
+    done = subprocess.run([sys.executable, "-c", script], env=variables, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "12.0"
+    assert not list((tmp_path / "cache").rglob("*.nbc*"))
+
+
+def test_order_of_the_fields_of_a_named_tuple_is_noticed(tmp_path: Path) -> None:
+    """Compiled code takes fields by place; their order may be declared in a file that no kernel imports."""
+    package = tmp_path / "thrown"
+    package.mkdir()
+    (package / "__init__.py").write_text("")
+    (package / "_kernels.py").write_text("from pixmetry.core.jit import jit\n\n@jit\ndef gain_of(noise):\n    return noise[0].gain\n")
+    script = (
+        "from thrown.records import Noise\nfrom thrown._kernels import gain_of\n"
+        "print(gain_of((Noise(read=2.0, gain=5.0), 1.0)), *gain_of.dispatcher.stats.cache_hits.values())"
+    )
+    variables = os.environ | {"PYTHONPATH": os.pathsep.join([SOURCE, str(tmp_path)]), "PIXMETRY_CACHE_DIR": str(tmp_path / "cache")}
+    variables |= {"PYTHONDONTWRITEBYTECODE": "1"}
+    for fields, expected in (("read gain", "5.0"), ("gain read", "5.0"), ("gain read", "5.0 1")):
+        (package / "records.py").write_text(f"from collections import namedtuple\nNoise = namedtuple('Noise', {fields!r})\n")
+        done = subprocess.run([sys.executable, "-c", script], env=variables, capture_output=True, text=True, check=True)
+        assert done.stdout.strip() == expected
+
+
+def test_kernels_of_the_package_depend_on_the_kernel_files_that_they_import() -> None:
+    from pixmetry.core import _binomial_kernels, _random_kernels
+
+    def modules(kernel) -> set[str]:
+        return {name for name, _ in module._sources_of(kernel.py_func)}
+
+    assert modules(_random_kernels._round) == {module.__name__, _random_kernels.__name__}
+    assert modules(_binomial_kernels.binomial) == {module.__name__, _random_kernels.__name__, _binomial_kernels.__name__}
+
+
 def test_edited_callee_in_another_package_is_noticed(tmp_path: Path) -> None:
     write_package(tmp_path, 2.0, "first")
     write_package(tmp_path, 2.0, "second")
@@ -101,7 +218,7 @@ def test_edited_callee_in_another_package_is_noticed(tmp_path: Path) -> None:
 def test_works_without_compiling(tmp_path: Path) -> None:
     write_package(tmp_path, 5.0)
     assert run(tmp_path, NUMBA_DISABLE_JIT="1") == ["False", "60.0", "None", "None"]
-    assert not list((tmp_path / "cache").rglob("*.nbi"))
+    assert not list((tmp_path / "cache").rglob("*.nbc"))
 
 
 def test_file_edited_after_its_import_is_not_cached(tmp_path: Path) -> None:

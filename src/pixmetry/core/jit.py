@@ -5,20 +5,26 @@ A kernel is scalar code over C-contiguous arrays, releases the GIL and starts no
 named ``_kernels.py`` or ``_*_kernels.py``, together with every constant that it uses.
 
 Numba's cache on disk compares only the file of the function itself, so it would serve a stale result after an edit in a kernel that
-is called from another file. Here the cache folder is named by a hash of all kernel sources, so an edit in any of them makes a new one.
+is called from another file. Here the folder of a kernel is named by a hash of its own file and of the kernel files that this one imports,
+directly or not. An edit compiles again what depends on it, and no more; two checkouts share what is alike in both.
 """
 
 from __future__ import annotations
 
+import ast
 import hashlib
+import importlib.util
 import os
+import pickle
 import re
 import shutil
 import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterable
+import warnings
+from collections.abc import Callable, Iterator
+from functools import cache, lru_cache
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -31,9 +37,20 @@ PACKAGE_ROOT = Path(__file__).resolve().parents[1]
 KERNEL_FILE = re.compile(r"_(.+_)?kernels\.py")
 DEFAULTS = {"nogil": True, "cache": True, "fastmath": False, "error_model": "numpy"}
 KEEP_DAYS = 30
+BLOCKS = ("body", "orelse", "handlers", "finalbody", "cases")  # where a statement of Python holds others
+
+
+def _stamp(file: str) -> tuple[int, int] | None:
+    try:
+        status = os.stat(file)
+    except OSError:
+        return None
+    return status.st_mtime_ns, status.st_size
+
 
 _lock = threading.RLock()
-_loaded: dict[str, tuple[int, int] | None] = {}  # kernel file -> its stamp when it was imported
+_begun_ns = time.time_ns()
+_loaded = {__file__: _stamp(__file__)}  # this file and those of kernels -> their stamps when they were imported
 
 
 class Kernel:
@@ -115,15 +132,88 @@ def _compile(function: Callable[..., Any], options: dict[str, Any]) -> Any:
 
     _teach_numba()
     config: Any = numba.config
+    dispatcher = numba.njit(**options | {"cache": False})(function)
     folder = _cache_folder(function) if options["cache"] and not config.DISABLE_JIT else None
-    if folder is None:
-        return numba.njit(**options | {"cache": False})(function)
-    before = config.CACHE_DIR  # Numba reads it once, when the dispatcher is made
-    try:
-        config.CACHE_DIR = str(folder)
-        return numba.njit(**options)(function)
-    finally:
-        config.CACHE_DIR = before
+    if folder is not None:
+        dispatcher._cache = _Store(function, folder)
+    return dispatcher
+
+
+class _Store:
+    """The compiled code of one kernel on disk, in the place of Numba's own cache: one file for each tuple of argument types.
+
+    Numba's cache names its folder by the path of the source, and leads through an index to numbered files: of two processes that
+    compile one kernel for different types at once, one can lose its entry or find the code of the other behind its own.
+    """
+
+    def __init__(self, function: Callable[..., Any], folder: Path) -> None:
+        self.function, self.folder = function, folder
+        self.cache_path = str(folder)
+
+    def load_overload(self, signature: Any, context: Any) -> Any:
+        """Return the compiled code for a signature, or None where there is none, or none that can be read."""
+        from numba.core.compiler import CompileResult
+
+        context.refresh()
+        key = self._key(signature, context.codegen())
+        if key is None:
+            return None
+        try:
+            kept_key, parts = pickle.loads(self._file(key).read_bytes())
+        except (OSError, EOFError, pickle.UnpicklingError, ValueError):
+            return None
+        return CompileResult._rebuild(context, *parts) if kept_key == key else None
+
+    def save_overload(self, signature: Any, compiled: Any) -> None:
+        """Keep compiled code; where the disk does not take it, it lasts as long as the process."""
+        from numba.core.serialize import dumps
+
+        if compiled.lifted or compiled.library.has_dynamic_globals:
+            name = self.function.__qualname__
+            warnings.warn(f"kernel {name!r} cannot be kept on disk: it holds a pointer or a large global array", stacklevel=2)
+            return
+        key = self._key(signature, compiled.codegen)
+        if key is None:
+            return
+        file = self._file(key)
+        part = file.with_name(f"{file.name}.{os.getpid()}-{threading.get_ident()}.part")
+        try:
+            part.write_bytes(dumps((key, compiled._reduce())))
+            os.replace(part, file)
+        except OSError:
+            part.unlink(missing_ok=True)
+
+    def flush(self) -> None:
+        """Remove what is kept of this kernel; Numba calls it before it compiles all again."""
+        for file in self.folder.glob(f"{self.function.__name__}-*.nbc"):
+            file.unlink(missing_ok=True)
+
+    def _key(self, signature: Any, codegen: Any) -> str | None:
+        """Name all that the compiled code depends on beside the sources; None when an argument is a function, which has no lasting name."""
+        from numba.core.serialize import dumps
+        from numba.core.sigutils import normalize_signature
+
+        arguments, result = normalize_signature(signature)
+        kinds = [_words_of(kind) for kind in (*arguments, result)]
+        if any(" at 0x" in words for words in kinds):
+            return None
+        code = self.function.__code__
+        cells = tuple(cell.cell_contents for cell in self.function.__closure__ or ())
+        parts = (code.co_firstlineno, *kinds, codegen.magic_tuple(), code.co_code, dumps(cells) if cells else b"")
+        return "\0".join(map(str, (self.function.__module__, self.function.__qualname__, *parts)))
+
+    def _file(self, key: str) -> Path:
+        return self.folder / f"{self.function.__name__}-{hashlib.blake2b(key.encode(), digest_size=10).hexdigest()}.nbc"
+
+
+def _words_of(kind: Any) -> str:
+    """Name a Numba type; of a named tuple also the class and the order of its fields, which may be declared in any file."""
+    if not hasattr(kind, "types"):
+        return repr(kind)
+    members = ", ".join(_words_of(member) for member in kind.types)
+    owner = getattr(kind, "instance_class", None)
+    fields = f" {owner.__module__}.{owner.__qualname__} {kind.fields}" if owner is not None else ""
+    return f"{kind!r}{fields} [{members}]"
 
 
 def _teach_numba() -> None:
@@ -154,58 +244,95 @@ def _watch_numba() -> None:
     event.register("numba:compile", Watch())
 
 
-def _stamp(file: str) -> tuple[int, int] | None:
-    try:
-        status = os.stat(file)
-    except OSError:
-        return None
-    return status.st_mtime_ns, status.st_size
-
-
 def _cache_folder(function: Callable[..., Any]) -> Path | None:
     """Return the folder for the compiled code of a function, or None when its source cannot be trusted to stand still."""
-    own = [file for file in _files_reached(function) if PACKAGE_ROOT not in Path(file).parents]
-    used = {file: stamp for file, stamp in _loaded.items() if file in own or PACKAGE_ROOT in Path(file).parents}
-    if any(stamp is None or _stamp(file) != stamp for file, stamp in used.items()):
-        return None  # made interactively, or edited since it was imported: what runs is not what the files say
-    root = _cache_root()
-    folder = root / _package_hash()
-    if not folder.exists():
-        _remove_old(root)
-    if own:
-        neighbours = {path for file in own for path in kernel_files(_top_folder(Path(file)))}
-        folder = folder / _hash(sorted(neighbours | {Path(file) for file in own}), "")
     try:
+        sources = _sources_of(function)
+    except (OSError, SyntaxError):
+        return None  # made interactively, or being edited
+    if not all(_as_imported(file) for _, file in sources):
+        return None  # edited since it was imported: what runs is not what the files say
+    digest = hashlib.blake2b(_platform().encode(), digest_size=10)
+    for (module, _), content in sorted(sources.items()):
+        digest.update(f"\0{module}\0{len(content)}\0".encode() + content)
+    root = _cache_root()
+    folder = root / digest.hexdigest()
+    try:
+        if not folder.exists():
+            _remove_old(root)
         folder.mkdir(parents=True, exist_ok=True)
-        os.utime(root / folder.relative_to(root).parts[0])
+        os.utime(folder)
     except OSError:
         return None
     return folder
 
 
+def _sources_of(function: Callable[..., Any]) -> dict[tuple[str, str], bytes]:
+    """Return the content, by module and file, of all that the compiled code of a function depends on.
+
+    That is this file, the file of every kernel that its code reaches, and the kernel files that those import, which may hold constants.
+    """
+    found: dict[tuple[str, str], bytes] = {}
+    waiting = [(f.__module__, f.__code__.co_filename) for f in _functions_reached(function)]
+    while waiting:
+        module, file = waiting.pop()
+        if (module, file) not in found:
+            found[module, file] = content = Path(file).read_bytes()
+            waiting += _kernel_files_imported(module, content)
+    return found | {(__name__, __file__): Path(__file__).read_bytes()}
+
+
+def _as_imported(file: str) -> bool:
+    stamp = _stamp(file)
+    if file in _loaded:
+        return stamp is not None and stamp == _loaded[file]
+    return stamp is not None and stamp[0] < _begun_ns  # no kernel in it, so nobody took its stamp
+
+
+def _kernel_files_imported(module: str, content: bytes) -> list[tuple[str, str]]:
+    """Return module and file of what a source imports, so far as it is named as a file of kernels or has made kernels."""
+    files = {name: getattr(sys.modules.get(name), "__file__", None) for name in _names_imported(module, content)}
+    return [(name, file) for name, file in files.items() if file and (file in _loaded or KERNEL_FILE.fullmatch(Path(file).name))]
+
+
+@cache
+def _names_imported(module: str, content: bytes) -> tuple[str, ...]:
+    """Return the dotted names that a source imports; of ``from a import b`` both ``a`` and ``a.b``, which may be a module."""
+
+    def names() -> Iterator[str]:
+        waiting: list[Any] = [ast.parse(content)]
+        while waiting:  # statements only: most of a tree are expressions
+            node = waiting.pop()
+            waiting += [inner for block in BLOCKS for inner in getattr(node, block, ())]
+            if isinstance(node, ast.Import):
+                yield from (alias.name for alias in node.names)
+            elif isinstance(node, ast.ImportFrom):
+                package = getattr(sys.modules.get(module), "__package__", "") or ""
+                if node.level > len(package.split(".")) or (node.level and not package):
+                    continue
+                base = importlib.util.resolve_name("." * node.level + (node.module or ""), package)
+                yield base
+                yield from (f"{base}.{alias.name}" for alias in node.names)
+
+    return tuple(dict.fromkeys(names()))
+
+
 def cache_folder() -> Path | None:
-    """Return the folder of the compiled kernels of this package, or None where there is none yet."""
-    folder = _cache_root() / _package_hash()
-    return folder if folder.is_dir() else None
+    """Return the folder of the compiled kernels, or None where nothing has been compiled yet."""
+    root = _cache_root()
+    return root if any(root.iterdir()) else None
 
 
-def _package_hash() -> str:
-    return _hash([*kernel_files(PACKAGE_ROOT), Path(__file__)], _platform())
-
-
-def _files_reached(function: Callable[..., Any]) -> set[str]:
-    """Return the files of a function and of every kernel or jitted function that its code refers to, directly or not."""
-    files: set[str] = set()
-    seen: set[int] = set()
+def _functions_reached(function: Callable[..., Any]) -> list[Callable[..., Any]]:
+    """Return a function and every kernel or jitted function that its code refers to, directly or not."""
+    found: dict[int, Callable[..., Any]] = {}
     waiting = [function]
     while waiting:
         current = waiting.pop()
-        if id(current) in seen:
-            continue
-        seen.add(id(current))
-        files.add(current.__code__.co_filename)
-        waiting += [value.py_func for value in _values_named(current) if hasattr(value, "py_func")]
-    return files
+        if id(current) not in found:
+            found[id(current)] = current
+            waiting += [value.py_func for value in _values_named(current) if hasattr(value, "py_func")]
+    return list(found.values())
 
 
 def _values_named(function: Callable[..., Any]) -> list[Any]:
@@ -216,30 +343,12 @@ def _values_named(function: Callable[..., Any]) -> list[Any]:
     return values + [getattr(module, name) for module in modules for name in code.co_names if hasattr(module, name)]
 
 
-def _top_folder(file: Path) -> Path:
-    """Return the folder of the outermost package that holds a file, or the file's own folder when it is in no package."""
-    folder = file.parent
-    while (folder / "__init__.py").exists() and (folder.parent / "__init__.py").exists():
-        folder = folder.parent
-    return folder
-
-
 def kernel_files(folder: Path) -> list[Path]:
-    """Name the files of kernels in a folder; in a package, also in the folders below it."""
-    in_package = (folder / "__init__.py").exists() or folder == PACKAGE_ROOT
-    found = folder.rglob("_*kernels.py") if in_package else folder.glob("_*kernels.py")
-    return sorted(path for path in found if KERNEL_FILE.fullmatch(path.name))
+    """Name the files of kernels in a package."""
+    return sorted(path for path in folder.rglob("_*kernels.py") if KERNEL_FILE.fullmatch(path.name))
 
 
-def _hash(files: Iterable[Path], extra: str) -> str:
-    digest = hashlib.blake2b(extra.encode(), digest_size=10)
-    for file in files:
-        content = file.read_bytes()
-        digest.update(f"\0{file.name}\0{len(content)}\0".encode())
-        digest.update(content)
-    return digest.hexdigest()
-
-
+@lru_cache(maxsize=1)
 def _platform() -> str:
     import numba
     from llvmlite import binding  # type: ignore[import-untyped]
@@ -273,7 +382,7 @@ def _temporary_root() -> Path:
 
 
 def _remove_old(root: Path) -> None:
-    """Remove the folders of other sources that no process has opened for a month."""
+    """Remove the folders of sources that no process has opened for a month."""
     oldest = time.time() - KEEP_DAYS * 86400
     for folder in root.iterdir():
         try:
