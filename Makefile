@@ -38,7 +38,7 @@ handbook: $(INSTALLED) ## run the handbook's experiments and write docs/handbook
 	@$(PY) scripts/make_handbook.py
 
 lint: $(INSTALLED)-dev ## check style and types
-	@$(PY) -m ruff check src tests benchmarks
+	@$(PY) -m ruff check src tests benchmarks scripts docs
 	@$(PY) -m mypy
 
 browser-test: $(INSTALLED)-test $(INSTALLED)-browser ## open the report in chromium and test it

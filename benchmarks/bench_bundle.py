@@ -19,8 +19,8 @@ from types import ModuleType
 import numpy as np
 from goals import verdict
 
-from pixmetry.calibration.bundle import adjust
-from pixmetry.calibration.network import Adjustment, Network, State
+from pixmetry.calibrate.bundle.bundle import adjust
+from pixmetry.calibrate.bundle.network import Adjustment, Network, State
 from pixmetry.core.threads import single_threaded_blas
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))

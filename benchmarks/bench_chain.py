@@ -18,10 +18,10 @@ from dataclasses import replace
 from bench_detection import camera
 from bench_presets import scene_of
 
-from pixmetry.core import camera as running
-from pixmetry.core.camera import Camera, load_camera
-from pixmetry.core.conversions import look
-from pixmetry.core.source import run
+from pixmetry.camera import camera as running
+from pixmetry.camera.camera import Camera, load_camera
+from pixmetry.camera.conversions import look
+from pixmetry.camera.source import run
 from pixmetry.core.threads import set_threads
 
 FRAMES = 8

@@ -18,10 +18,10 @@ from collections.abc import Callable
 import numpy as np
 from goals import verdict
 
-from pixmetry.core.quiet import QuietStreams
+from pixmetry.camera.quiet import QuietStreams
+from pixmetry.camera.signal import Kind, Signal
 from pixmetry.core.random import Grid, Streams
-from pixmetry.core.signal import Kind, Signal
-from pixmetry.sensor.charge_transfer import SOURCE, ChargeTransfer
+from pixmetry.sources.sensor.charge_transfer import SOURCE, ChargeTransfer
 
 SIDE = 1024
 GOAL = 0.5

@@ -15,8 +15,8 @@ from collections.abc import Callable
 import numpy as np
 from goals import verdict
 
-from pixmetry.core.camera import Camera, Element
-from pixmetry.core.catalogue import get_source
+from pixmetry.camera.camera import Camera, Element
+from pixmetry.camera.catalogue import get_source
 from pixmetry.core.threads import set_threads
 from pixmetry.scene.uniform import Uniform
 

@@ -21,7 +21,7 @@ from pathlib import Path
 from bench_memory import peak_mb, simulated
 from goals import verdict
 
-from pixmetry.campaign import Campaign, load_campaign
+from pixmetry.files import Campaign, load_campaign
 
 ORACLES = Path(__file__).resolve().parents[1] / ".venv-oracles" / "bin" / "python"
 REPEATS, WHOLE, SUMMING, GROWTH_MB = 5, 0.35, 0.22, 10.0

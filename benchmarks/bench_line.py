@@ -16,11 +16,11 @@ from goals import verdict
 from scipy.ndimage import map_coordinates
 from scipy.signal import cont2discrete, lfilter
 
-from pixmetry.cable.termination import Termination, echoes
-from pixmetry.core.line import Line
+from pixmetry.camera.line import Line
 from pixmetry.core.random import Grid
 from pixmetry.core.threads import map_tiles
-from pixmetry.grabber.low_pass import LowPass
+from pixmetry.sources.cable.termination import Termination, echoes
+from pixmetry.sources.grabber.low_pass import LowPass
 
 PIXEL_HZ, SAMPLE_HZ, OVER = 14.1875e6, 10e6, 16
 ROWS, COLS, SAMPLES, THREADS, REPEATS, GOAL = 512, 752, 512, 2, 9, 0.3

@@ -24,7 +24,7 @@ from goals import verdict
 from scipy.spatial import cKDTree
 
 from pixmetry.core.threads import set_threads
-from pixmetry.locating import locate
+from pixmetry.locate.job import locate
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from location import line_frames, rendered  # noqa: E402
@@ -176,9 +176,9 @@ def alone(frame: Frame, count: int) -> np.ndarray:
 
 def stages(frame: Frame, repeats: int) -> None:
     """Detection alone, the fit alone."""
-    from pixmetry.location.detection import detect, select
-    from pixmetry.location.image_noise import noise_from_image
-    from pixmetry.location.template import fit_template
+    from pixmetry.locate.detect.detection import detect, select
+    from pixmetry.locate.template.image_noise import noise_from_image
+    from pixmetry.locate.template.template import fit_template
 
     found = detect(frame.image)
     targets = found.targets[select(found.targets, "disc")]
@@ -202,9 +202,9 @@ def many(rng: np.random.Generator) -> None:
 
 def lines(rng: np.random.Generator, repeats: int) -> tuple[float, float, float]:
     """Lines a second of the template alone, and the rms error of its offsets and of the row-wise squared centroid's over the bound."""
-    from pixmetry.location.line_detection import find_lines
-    from pixmetry.location.lines import line_positions
-    from pixmetry.location.noise import NoiseModel
+    from pixmetry.locate.lines.line_detection import find_lines
+    from pixmetry.locate.lines.lines import line_positions
+    from pixmetry.locate.noise import NoiseModel
 
     bars = line_frames.Bars(width=1.0, blur=1.0)
     frame = line_frames.make_lines(rng, 400, (2600, 2600), bars)

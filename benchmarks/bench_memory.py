@@ -16,9 +16,9 @@ from pathlib import Path
 
 from goals import verdict
 
-from pixmetry.campaign import load_campaign, write_manifest
-from pixmetry.core.camera import build_camera, load_camera
-from pixmetry.simulation import simulate
+from pixmetry.camera.camera import build_camera, load_camera
+from pixmetry.files import load_campaign, write_manifest
+from pixmetry.simulate.job import simulate
 
 ASSESS = """
 import sys

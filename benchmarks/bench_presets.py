@@ -68,7 +68,8 @@ def of_preset(name: str, small: bool = False, timed: bool = True) -> list[float]
 
 def main() -> None:
     """Print a line for each preset, then the verdicts."""
-    names = sys.argv[1:] or sorted(p.name.removesuffix(".yaml") for p in (files("pixmetry") / "cameras").iterdir() if p.suffix == ".yaml")
+    presets = (files("pixmetry.camera") / "presets").iterdir()
+    names = sys.argv[1:] or sorted(p.name.removesuffix(".yaml") for p in presets if p.name.endswith(".yaml"))
     print(f"{'preset':<30}{'frame':>12}{'steps':>7}{'1 thread':>12}{'2 threads':>12}{'memory':>12}")
     told = {}
     for name in names:

@@ -16,7 +16,7 @@ import numpy as np
 from goals import verdict
 
 from pixmetry.core.threads import map_tiles
-from pixmetry.sensor._readout_kernels import add_column_sums, add_rows_passed, spill
+from pixmetry.sources.sensor._readout_kernels import add_column_sums, add_rows_passed, spill
 
 SIDE, BAND, REPEATS = 1024, 128, 7
 SHARE, FULL, UP, GOAL = 1e-5, 20_000.0, 0.4, 0.3

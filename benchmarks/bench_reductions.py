@@ -8,7 +8,7 @@ import time
 import numpy as np
 from goals import verdict
 
-from pixmetry.experiment.stack import GroupReduction, new_group
+from pixmetry.observe.stack import GroupReduction, new_group
 
 GOAL = 1.0
 

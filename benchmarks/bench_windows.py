@@ -15,15 +15,15 @@ from collections.abc import Callable
 import numpy as np
 from goals import verdict
 
-from pixmetry.cable.termination import echoes
-from pixmetry.core.camera import Camera, Element
-from pixmetry.core.catalogue import get_source
+from pixmetry.camera.camera import Camera, Element
+from pixmetry.camera.catalogue import get_source
+from pixmetry.camera.signal import Clock, Kind
 from pixmetry.core.random import Grid
-from pixmetry.core.signal import Clock, Kind
 from pixmetry.core.threads import set_threads
-from pixmetry.location.estimators import Estimator
+from pixmetry.locate.centroids.estimators import Estimator
 from pixmetry.scene.discs import REACH, STEP, Discs, radial_profile
 from pixmetry.scene.uniform import Uniform
+from pixmetry.sources.cable.termination import echoes
 
 COUNT, SIDE, SHAPE = 10_000, 24, (582, 752)
 PEAK_PHOTONS, BACKGROUND_PHOTONS = 30_000.0, 500.0

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pixmetry.calibration.bundle import adjust
+from pixmetry.calibrate.bundle.bundle import adjust
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from calibration.distances import Pooled, each_point, interior_distance, jointly, points_distance  # noqa: E402

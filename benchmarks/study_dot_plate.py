@@ -19,11 +19,11 @@ import numpy as np
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests"))
-from pixmetry.location.detection import detect  # noqa: E402
-from pixmetry.location.image_noise import noise_from_image  # noqa: E402
-from pixmetry.location.moments import moment_positions  # noqa: E402
-from pixmetry.location.operators import operator_positions  # noqa: E402
-from pixmetry.location.template import fit_template  # noqa: E402
+from pixmetry.locate.centroids.moments import moment_positions  # noqa: E402
+from pixmetry.locate.centroids.operators import operator_positions  # noqa: E402
+from pixmetry.locate.detect.detection import detect  # noqa: E402
+from pixmetry.locate.template.image_noise import noise_from_image  # noqa: E402
+from pixmetry.locate.template.template import fit_template  # noqa: E402
 from published import dot_plate  # noqa: E402
 
 MOMENTS = ("centroid", "squared_centroid", "soft_threshold", "hard_threshold", "windowed_centroid")

@@ -13,9 +13,9 @@ import numpy as np
 
 from pixmetry.budget.monte_carlo import Trials
 from pixmetry.budget.probe import Target, facts_of, make_probe
-from pixmetry.core.camera import Camera, Element, in_order
-from pixmetry.core.catalogue import catalogue
-from pixmetry.location.estimators import Estimator
+from pixmetry.camera.camera import Camera, Element, in_order
+from pixmetry.camera.catalogue import catalogue
+from pixmetry.locate.centroids.estimators import Estimator
 
 SETTINGS = {
     "sensor.quantum_efficiency": {"quantum_efficiency": 0.5},

@@ -8,7 +8,7 @@ from __future__ import annotations
 import sys
 import time
 
-from pixmetry.handbook import line_jitter
+from gallery import line_jitter
 
 
 def main() -> None:

@@ -26,8 +26,8 @@ import numpy as np
 from goals import verdict
 
 from pixmetry.core.threads import set_threads
-from pixmetry.locating import locate
-from pixmetry.location.targets import Flag
+from pixmetry.locate.detect.targets import Flag
+from pixmetry.locate.job import locate
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from location import coverage_cells, line_frames  # noqa: E402

@@ -21,14 +21,14 @@ os.environ.setdefault("PIXMETRY_THREADS", "1")  # the processes share out the se
 import numpy as np  # noqa: E402
 from scipy import stats  # noqa: E402
 
-from pixmetry.core.camera import build_camera  # noqa: E402
-from pixmetry.core.observations import PhotonTransfer  # noqa: E402
+from pixmetry.camera.camera import build_camera  # noqa: E402
+from pixmetry.camera.observations import PhotonTransfer  # noqa: E402
 from pixmetry.emva.evaluate import standard_values  # noqa: E402
 from pixmetry.emva.records import Measurement  # noqa: E402
-from pixmetry.experiment.moments import LevelAccumulator, level_moments  # noqa: E402
-from pixmetry.experiment.photon_transfer_fit import fit_photon_transfer  # noqa: E402
+from pixmetry.observe.moments import LevelAccumulator, level_moments  # noqa: E402
+from pixmetry.observe.photon_transfer_fit import fit_photon_transfer  # noqa: E402
 from pixmetry.scene.files import SeriesModel  # noqa: E402
-from pixmetry.simulation import expose_group, plan_series  # noqa: E402
+from pixmetry.simulate.job import expose_group, plan_series  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests"))

@@ -23,10 +23,10 @@ from pathlib import Path
 import numpy as np
 from scipy import stats
 
-from pixmetry.core.observations import PhotonTransfer
+from pixmetry.camera.observations import PhotonTransfer
 from pixmetry.emva.evaluate import standard_values
 from pixmetry.emva.records import Measurement, Value
-from pixmetry.experiment.photon_transfer_fit import fit_photon_transfer
+from pixmetry.observe.photon_transfer_fit import fit_photon_transfer
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from experiment.simulated_camera import Camera, drawn_record, framed_record, random_camera, reference_u, truth  # noqa: E402

@@ -13,9 +13,9 @@ from pathlib import Path
 import imagecodecs
 import numpy as np
 
-from pixmetry.campaign.emva_descriptor import decode_descriptor
-from pixmetry.campaign.files import find_file
-from pixmetry.campaign.images import read_frame
+from pixmetry.files.emva_descriptor import decode_descriptor
+from pixmetry.files.files import find_file
+from pixmetry.files.images import read_frame
 
 FIRST_ROW, FIRST_COLUMN, SIZE = 160, 240, 160
 TARGET = Path(__file__).resolve().parents[1] / "src" / "pixmetry" / "data" / "emva1288-set-001-crop"

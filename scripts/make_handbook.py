@@ -8,7 +8,9 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from pixmetry.handbook.pages import write
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "docs"))  # the gallery is no part of the package
+
+from gallery.pages import write  # noqa: E402
 
 TARGET = Path(__file__).resolve().parents[1] / "docs" / "handbook"
 

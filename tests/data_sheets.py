@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pixmetry.datasheet_files import write_files
-from pixmetry.emva.keys import KEYS, key_of
+from pixmetry.emva.files.keys import KEYS, key_of
+from pixmetry.emva.files.write import write_files
 from pixmetry.emva.records import MONO, DataSheet, Results, Value
 
 

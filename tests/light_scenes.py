@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pixmetry.core.camera import Camera, Element
-from pixmetry.core.light import Points
+from pixmetry.camera.camera import Camera, Element
+from pixmetry.camera.light import Points
+from pixmetry.camera.signal import Signal
+from pixmetry.camera.source import Parameters, Source
 from pixmetry.core.random import Grid
-from pixmetry.core.signal import Signal
-from pixmetry.core.source import Parameters, Source
 
 MEAN = 1e4
 

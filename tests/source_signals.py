@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from pixmetry.core.contribution import Probe
+from pixmetry.camera.contribution import Probe
+from pixmetry.camera.quiet import QuietStreams
+from pixmetry.camera.signal import Kind, Signal
 from pixmetry.core.estimates import Estimates
-from pixmetry.core.quiet import QuietStreams
 from pixmetry.core.random import Grid, Stream
-from pixmetry.core.signal import Kind, Signal
 
 ALPHA = 1e-6  # false-failure rate of every statistical test, for any seed
 Z = 4.8917  # two-sided normal quantile of ALPHA

@@ -11,17 +11,17 @@ from click.testing import CliRunner
 
 from calibration.networks import simulate
 from pixmetry import assess, load_camera
-from pixmetry.calibrated import calibrated_geometry, with_pitch
-from pixmetry.calibration.geometry import geometry_of
-from pixmetry.calibration.model import CameraModel, Sensor
-from pixmetry.calibration.solve import Options, calibrate_network
-from pixmetry.calibration_files import write_results
-from pixmetry.campaign import load_campaign
+from pixmetry.assess.page.page import render
+from pixmetry.calibrate.bundle.model import CameraModel, Sensor
+from pixmetry.calibrate.bundle.solve import Options, calibrate_network
+from pixmetry.calibrate.calibrated_camera import calibrated_geometry, with_pitch
+from pixmetry.calibrate.files.write import write_results
+from pixmetry.calibrate.geometry import geometry_of
+from pixmetry.camera.observations import LENS
 from pixmetry.cli import main
 from pixmetry.core.errors import InputError
-from pixmetry.core.observations import LENS
-from pixmetry.datasheets import emva1288
-from pixmetry.report.page import render
+from pixmetry.emva.job import emva1288
+from pixmetry.files import load_campaign
 
 PITCH = (8.3, 8.3)
 

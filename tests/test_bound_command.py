@@ -8,8 +8,8 @@ import pytest
 from click.testing import CliRunner, Result
 
 from pixmetry.cli import main
-from pixmetry.location.bound import bound
-from pixmetry.location.noise import NoiseModel
+from pixmetry.locate.bound.bound import bound
+from pixmetry.locate.noise import NoiseModel
 
 TARGET = ("--radius", "3.5", "--blur", "0.7", "--amplitude", "150", "--background", "10")
 

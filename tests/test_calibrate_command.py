@@ -20,14 +20,14 @@ from scipy.stats import chi2
 
 import pixmetry
 from calibration.networks import Simulated, simulate
-from pixmetry.calibrated import calibrated_geometry
-from pixmetry.calibration.bundle import SMALL
-from pixmetry.calibration.model import NAMES
-from pixmetry.calibration.network import Calibration, Network
-from pixmetry.calibration_files import TABLES, write_results
-from pixmetry.calibration_project import load_project
-from pixmetry.calibration_project.schema import ProjectModel
-from pixmetry.calibration_record import json_text, packed, read_calibration, unpacked
+from pixmetry.calibrate.bundle.bundle import SMALL
+from pixmetry.calibrate.bundle.model import NAMES
+from pixmetry.calibrate.bundle.network import Calibration, Network
+from pixmetry.calibrate.calibrated_camera import calibrated_geometry
+from pixmetry.calibrate.files.record import json_text, packed, read_calibration, unpacked
+from pixmetry.calibrate.files.write import TABLES, write_results
+from pixmetry.calibrate.project import load_project
+from pixmetry.calibrate.project.schema import ProjectModel
 from pixmetry.cli import main
 from pixmetry.core.config import load_yaml, validate
 from pixmetry.core.errors import InputError

@@ -15,19 +15,19 @@ from scipy.stats import chi2
 import pixmetry
 from calibration.networks import Simulated, simulate
 from calibration.test_plumb_line import COLS, MM_X, MM_Y, RATE, ROWS, TRUE, imaged, lines
-from pixmetry.calibration.exchange import model_of_colmap, read_opencv
-from pixmetry.calibration.model import CameraModel, Sensor
-from pixmetry.calibration_project import load_project
-from pixmetry.calibration_project.presets import stored_grid
-from pixmetry.calibration_project.starts import on_sensor
-from pixmetry.calibration_record import read_calibration, stored_cameras
+from pixmetry.calibrate.bundle.model import CameraModel, Sensor
+from pixmetry.calibrate.exchange import model_of_colmap, read_opencv
+from pixmetry.calibrate.files.record import read_calibration, stored_cameras
+from pixmetry.calibrate.lines.line_calibration import LineCalibration
+from pixmetry.calibrate.page.lines_page import render
+from pixmetry.calibrate.page.lines_text import summary_text
+from pixmetry.calibrate.project import load_project
+from pixmetry.calibrate.project.presets import stored_grid
+from pixmetry.calibrate.project.starts import on_sensor
+from pixmetry.camera.camera import Camera, load_camera
+from pixmetry.camera.observations import AFFINITY, LENS
 from pixmetry.cli import main
-from pixmetry.core.camera import Camera, load_camera
 from pixmetry.core.errors import InputError, MeasureError
-from pixmetry.core.observations import AFFINITY, LENS
-from pixmetry.line_calibration import LineCalibration
-from pixmetry.report.lines_page import render
-from pixmetry.report.lines_text import summary_text
 from report.test_page import Page
 from test_calibrate_command import project, refused, run, table
 from test_calibration_images import COLS as BOARD_COLS
@@ -143,7 +143,7 @@ def test_a_model_that_the_sources_cannot_hold_is_told(tmp_path: Path, monkeypatc
     def cannot(*_: object, **__: object) -> Camera:
         raise InputError("the sources' lens cannot hold this model", value="up to 0.2 px apart", remedy="free fewer terms")
 
-    monkeypatch.setattr("pixmetry.calibrated.calibrated_camera", cannot)
+    monkeypatch.setattr("pixmetry.calibrate.calibrated_camera.calibrated_camera", cannot)
     simulated = simulate(generator(), images=10, points=30, sensor=SENSOR)
     path = with_camera(project(tmp_path, simulated.network), f"{{camera: {PRESET}, c_mm: 8}}")
     result = run(path, "-o", tmp_path / "r", "--folds", 0)

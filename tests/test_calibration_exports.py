@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 import pytest
 
-from pixmetry.calibrating import _changed
-from pixmetry.calibration.exchange import read_opencv
-from pixmetry.calibration.model import CameraModel, Sensor
-from pixmetry.calibration_exports import check_exports, write_exports
-from pixmetry.calibration_project.schema import ProjectModel
+from pixmetry.calibrate.bundle.model import CameraModel, Sensor
+from pixmetry.calibrate.exchange import read_opencv
+from pixmetry.calibrate.files.exports import check_exports, write_exports
+from pixmetry.calibrate.job import _changed
+from pixmetry.calibrate.project.schema import ProjectModel
 from pixmetry.core.config import validate
 from pixmetry.core.errors import InputError
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from pixmetry.calibration.model import CameraModel, Sensor
-from pixmetry.calibration_images import ImageObservations, observations_of
-from pixmetry.calibration_numbering import Board, Marks, consistent, turned, turned_cells
+from pixmetry.calibrate.bundle.model import CameraModel, Sensor
+from pixmetry.calibrate.images.images import ImageObservations, observations_of
+from pixmetry.calibrate.images.numbering import Board, Marks, consistent, turned, turned_cells
 from pixmetry.core.errors import InputError, MeasureError
-from pixmetry.location.coded import BITS, codes
+from pixmetry.locate.detect.coded import BITS, codes
 
 COLS, ROWS, FOCAL = 480, 400, 600.0
 SUB = 4  # samples a pixel and axis

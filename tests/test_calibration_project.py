@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pixmetry.calibration.network import Network
-from pixmetry.calibration_project import load_project
-from pixmetry.calibration_project.tables import read_table
+from pixmetry.calibrate.bundle.network import Network
+from pixmetry.calibrate.project import load_project
+from pixmetry.calibrate.project.tables import read_table
 from pixmetry.core.errors import InputError
 
 COLS, ROWS, PITCH_UM = 640, 480, (5.0, 6.0)

@@ -11,12 +11,12 @@ import pytest
 from click.testing import CliRunner
 
 from catalogue.support import make_source
-from pixmetry.chain import walk
-from pixmetry.core.camera import Camera, Element, load_camera
-from pixmetry.core.catalogue import get_source
+from pixmetry.camera.camera import Camera, Element, load_camera
+from pixmetry.camera.catalogue import get_source
+from pixmetry.camera.signal import Kind
+from pixmetry.camera.source import Parameters
 from pixmetry.core.errors import InputError
-from pixmetry.core.signal import Kind
-from pixmetry.core.source import Parameters
+from pixmetry.simulate.walk import walk
 
 SCENE = {
     "schema": "pixmetry/scene/1",

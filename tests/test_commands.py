@@ -15,10 +15,10 @@ import pytest
 import tifffile
 from click.testing import CliRunner, Result
 
-from pixmetry.campaign import load_campaign, read_frame
+from pixmetry.camera.camera import load_camera
+from pixmetry.camera.catalogue import catalogue
 from pixmetry.cli import main
-from pixmetry.core.camera import load_camera
-from pixmetry.core.catalogue import catalogue
+from pixmetry.files import load_campaign, read_frame
 
 CAMERA = """\
 schema: pixmetry/camera/1
@@ -314,7 +314,7 @@ def test_too_little_memory_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: object) -> None:
         raise MemoryError("Unable to allocate 9 EiB")
 
-    monkeypatch.setattr("pixmetry.core.catalogue.catalogue", full)
+    monkeypatch.setattr("pixmetry.camera.catalogue.catalogue", full)
     ran = CliRunner().invoke(main, ["sources"])
     assert ran.exit_code == 2 and "not enough memory (Unable to allocate 9 EiB)" in ran.output and ran.output.count("\n") == 1
 

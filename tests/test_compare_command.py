@@ -16,11 +16,11 @@ from scipy import stats
 
 from data_sheets import full, measured, sheet, value, written
 from pixmetry.cli import main
-from pixmetry.comparing import Comparison, check_limits, compare, compare_fleet
 from pixmetry.core.errors import InputError
-from pixmetry.emva.conformity import load_limits
-from pixmetry.emva.differences import SAME_THING, holm
-from pixmetry.emva.keys import KEYS
+from pixmetry.emva.files.keys import KEYS
+from pixmetry.emva.judge.compare import Comparison, check_limits, compare, compare_fleet
+from pixmetry.emva.judge.conformity import load_limits
+from pixmetry.emva.judge.differences import SAME_THING, holm
 from pixmetry.emva.records import DataSheet, Value
 
 ALPHA = 1e-6  # false failures of the statistical tests

@@ -13,13 +13,13 @@ from click.testing import CliRunner
 from rich.table import Table
 
 from calibration.networks import simulate
-from pixmetry.calibrating import calibrate
-from pixmetry.calibration_files import points_csv, residuals_csv
-from pixmetry.calibration_project.tables import read_table
-from pixmetry.campaign import write_frame
+from pixmetry.calibrate.files.write import points_csv, residuals_csv
+from pixmetry.calibrate.job import calibrate
+from pixmetry.calibrate.project.tables import read_table
 from pixmetry.cli import main
 from pixmetry.cli._console import console
-from pixmetry.located import Located
+from pixmetry.files import write_frame
+from pixmetry.locate.records import Located
 
 ORDERS = re.compile("[\x00-\x09\x0b-\x1f\x7f-\x9f\u202e]")
 EVIL = ["=1+2", "+cmd|' /C calc'!A0", "-x", "@SUM(A1)", "\tx", "\x1b[2Jx", "a,=1", "'=1", "#1", " x ", "two\nlines", "-5", 'a "x"', "\\x1b"]

@@ -12,16 +12,16 @@ import numpy as np
 import pytest
 import tifffile
 
-from pixmetry.assessment import assess
-from pixmetry.calibrated import calibrated_geometry
-from pixmetry.calibrating import calibrate
-from pixmetry.calibration_record import read_calibration, stored_cameras
-from pixmetry.campaign import read_frame, read_maps, write_maps, zarr_frames
-from pixmetry.comparing import load
+from pixmetry.assess.correct import correct_files
+from pixmetry.assess.job import assess
+from pixmetry.calibrate.calibrated_camera import calibrated_geometry
+from pixmetry.calibrate.files.record import read_calibration, stored_cameras
+from pixmetry.calibrate.job import calibrate
 from pixmetry.core.errors import PixmetryError
-from pixmetry.correction import correct_files
-from pixmetry.datasheets import emva1288
-from pixmetry.simulation import simulate
+from pixmetry.emva.job import emva1288
+from pixmetry.emva.judge.compare import load
+from pixmetry.files import read_frame, read_maps, write_maps, zarr_frames
+from pixmetry.simulate.job import simulate
 from test_commands import CAMERA, DISCS, SERIES, refused, run
 
 PLACES = 5  # of a file, at which a byte is changed

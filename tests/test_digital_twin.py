@@ -9,16 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pixmetry.assessment import by_the_standard, measure_sources
-from pixmetry.campaign.records import CameraFacts, Campaign, FrameGroup, OpticsFacts
-from pixmetry.core.camera import Camera, Element
-from pixmetry.core.catalogue import get_source
-from pixmetry.core.observations import Observations
-from pixmetry.digital_twin import best_values, digital_twin, expose, exposures_of, fewer, middle_window, of_unit, self_test
-from pixmetry.experiment.converter_bend import converter_bend
-from pixmetry.experiment.observe import observe
-from pixmetry.grabber.adc import bend, thresholds
-from pixmetry.report.twin_view import twin_sentence
+from pixmetry.assess.digital_twin import best_values, digital_twin, expose, exposures_of, fewer, middle_window, of_unit, self_test
+from pixmetry.assess.job import by_the_standard, measure_sources
+from pixmetry.assess.page.twin_view import twin_sentence
+from pixmetry.camera.camera import Camera, Element
+from pixmetry.camera.catalogue import get_source
+from pixmetry.camera.observations import Observations
+from pixmetry.files.records import CameraFacts, Campaign, FrameGroup, OpticsFacts
+from pixmetry.observe.converter_bend import converter_bend
+from pixmetry.observe.observe import observe
+from pixmetry.sources.grabber.adc import bend, thresholds
 
 SHAPE = (120, 160)
 LEVELS, LONGEST_S, BRIGHTEST_PHOTONS, STACK = 20, 0.02, 60_000.0, 32

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from pixmetry.core.camera import load_camera
+from pixmetry.camera.camera import load_camera
 from pixmetry.scene.uniform import Uniform
 
 PAGE = (Path(__file__).resolve().parents[1] / "docs" / "cameras.md").read_text(encoding="utf-8")
@@ -40,7 +40,7 @@ def test_the_light_of_the_table_brings_half_of_the_range(name: str) -> None:
 
 def test_the_table_names_every_preset_with_the_size_of_its_frames() -> None:
     rows = [line for line in PAGE.splitlines() if line.startswith("| `")]
-    for path in (files("pixmetry") / "cameras").iterdir():
+    for path in (files("pixmetry.camera") / "presets").iterdir():
         if not path.name.endswith(".yaml"):
             continue
         name = path.name.removesuffix(".yaml")

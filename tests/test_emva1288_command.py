@@ -12,17 +12,17 @@ from click.testing import CliRunner, Result
 from scipy import stats
 
 from pixmetry import emva1288
-from pixmetry.campaign import load_campaign
-from pixmetry.campaign.staged_files import Output, check_files
 from pixmetry.cli import main
 from pixmetry.core.errors import InputError
-from pixmetry.datasheet_files import content_of, write_files
-from pixmetry.datasheets import measure_campaign
-from pixmetry.emva.formats import read_sheet
-from pixmetry.emva.known_camera import camera_from_sheet
-from pixmetry.emva.planning import Plan, predicted_u
-from pixmetry.emva.preflight import camera_from_preflight, preflight_text
-from pixmetry.preflights import preflight_campaign
+from pixmetry.emva.files.formats import read_sheet
+from pixmetry.emva.files.write import content_of, write_files
+from pixmetry.emva.job import measure_campaign
+from pixmetry.emva.planning.known_camera import camera_from_sheet
+from pixmetry.emva.planning.planning import Plan, predicted_u
+from pixmetry.emva.planning.preflight import camera_from_preflight, preflight_text
+from pixmetry.emva.planning.preflights import preflight_campaign
+from pixmetry.files import load_campaign
+from pixmetry.files.staged_files import Output, check_files
 
 SHAPE, GAIN, FULL_E, OFFSET = (48, 64), 0.25, 14000.0, 60.0
 QE = {"R": 0.3, "Gr": 0.5, "Gb": 0.48, "B": 0.2}
@@ -159,7 +159,7 @@ def test_temperatures_are_checked_before_the_work(known: Path, tmp_path: Path, m
         path.write_text(path.read_text().replace("frames:\n", facts + "frames:\n"))
         return path
 
-    monkeypatch.setattr("pixmetry.datasheets.measure_campaign", never)
+    monkeypatch.setattr("pixmetry.emva.job.measure_campaign", never)
     paths = [at(f"t{t}", t) for t in (20, 24, 28)]
     refused(run(*paths[:2]), "too few temperatures")
     refused(run(*paths), "too near to each other")
@@ -289,7 +289,7 @@ def test_output_names_are_checked_before_the_work(known: Path, tmp_path: Path, m
     def never(*_: object, **__: object) -> None:
         raise AssertionError("frames were read")
 
-    monkeypatch.setattr("pixmetry.datasheets.measure_campaign", never)
+    monkeypatch.setattr("pixmetry.emva.job.measure_campaign", never)
     (tmp_path / "notes.txt").write_text("mine")
     refused(run(known, "--json", tmp_path / "none" / "a.json"), "the folder does not exist")
     refused(run(known, "--json", tmp_path / "a", "--xml", tmp_path / "." / "a"), "one file for two results")
@@ -343,7 +343,7 @@ def test_all_files_or_none(known: Path, tmp_path: Path, monkeypatch: pytest.Monk
     def broken(*_: object) -> None:
         raise InputError("no room", where="disk")
 
-    monkeypatch.setattr("pixmetry.report.emva_pdf.render_pdf", broken)
+    monkeypatch.setattr("pixmetry.emva.page.pdf.render_pdf", broken)
     with pytest.raises(InputError, match="no room"):
         write_files(sheet, files)
     assert [p.name for p in tmp_path.iterdir()] == ["a.json"] and files["json"].read_bytes() == before

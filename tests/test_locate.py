@@ -14,10 +14,10 @@ import pixmetry
 from location import rendered
 from pixmetry.cli import main
 from pixmetry.core.errors import InputError
-from pixmetry.located import LOCATED_SCHEMA, ORIGIN
-from pixmetry.locating import FITS, MOMENTS, OPERATORS, estimators, scale_ends
-from pixmetry.location.lines import line_model
-from pixmetry.location.targets import Flag
+from pixmetry.locate.detect.targets import Flag
+from pixmetry.locate.job import FITS, MOMENTS, OPERATORS, estimators, scale_ends
+from pixmetry.locate.lines.lines import line_model
+from pixmetry.locate.records import LOCATED_SCHEMA, ORIGIN
 
 SHAPE = (120, 160)
 Z_1E6 = 5.0  # |z| of the larger of a dozen coordinates, each beyond it with 6e-7
@@ -37,7 +37,7 @@ def frame_of(seed: int = 0, amplitude: float = 150.0, background: float = 20.0, 
     return rendered.expose(mean, rng, read_dn=read_dn, bits=bits), x, y
 
 
-def matched(table: pixmetry.located.Located, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+def matched(table: pixmetry.locate.records.Located, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Errors over their standard deviations, shape (2, n); every target is found once."""
     assert len(table) == len(x)
     order = [int(np.argmin(np.hypot(table.x_px - a, table.y_px - b))) for a, b in zip(x, y, strict=True)]
@@ -131,7 +131,7 @@ def test_short_and_thick_crosses_are_found_or_not_but_never_an_error(angle_deg: 
 def test_coded_targets_are_told_apart_and_placed_as_well_as_others() -> None:
     """Sixteen of them, tilted by 45°; rings are no targets. (Rings near the discs pass for noise there: u is up to 2.5 times too large.)"""
     from location.test_coded import drawn, view
-    from pixmetry.location.coded import codes
+    from pixmetry.locate.detect.coded import codes
 
     rng = np.random.default_rng(4)
     picture, x, y, numbers = np.zeros((320, 320)), [], [], rng.choice(codes(), 16, replace=False)
@@ -271,7 +271,7 @@ def test_options_that_cannot_be_used(options: dict, text: str) -> None:
 
 @pytest.fixture(scope="module")
 def image(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    from pixmetry.campaign import write_frame
+    from pixmetry.files import write_frame
 
     path = tmp_path_factory.mktemp("images") / "discs.png"
     write_frame(path, frame_of()[0], 8)
@@ -311,7 +311,7 @@ def test_the_table_goes_to_standard_output(image: Path) -> None:
 
 
 def test_several_images_and_their_pictures(image: Path, tmp_path: Path) -> None:
-    from pixmetry.campaign import write_frame
+    from pixmetry.files import write_frame
 
     write_frame(tmp_path / "in" / "a.png" if (tmp_path / "in").mkdir() is None else "", frame_of(1)[0], 8)
     write_frame(tmp_path / "in" / "b.tif", frame_of(2)[0], 8)
@@ -358,7 +358,7 @@ def test_a_file_that_cannot_be_used_is_named_and_nothing_is_written(image: Path,
 
 
 def test_nothing_found_is_told_by_the_exit_status_and_the_table_is_written(image: Path, tmp_path: Path) -> None:
-    from pixmetry.campaign import write_frame
+    from pixmetry.files import write_frame
 
     empty = np.clip(np.rint(np.random.default_rng(0).normal(20, 1.5, SHAPE)), 0, 255).astype(np.uint8)
     write_frame(tmp_path / "empty.png", empty, 8)
@@ -370,7 +370,7 @@ def test_nothing_found_is_told_by_the_exit_status_and_the_table_is_written(image
 
 
 def test_a_folder_is_taken_in_order_and_what_is_skipped_is_named(tmp_path: Path) -> None:
-    from pixmetry.campaign import write_frame
+    from pixmetry.files import write_frame
 
     (tmp_path / "made" / "frames").mkdir(parents=True)
     for i in (2, 0, 1):

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from pixmetry.campaign.schema import ManifestModel
 from pixmetry.core.config import load_yaml, validate
+from pixmetry.files.schema import ManifestModel
 from pixmetry.scene.files import read_scene
 
 README = Path(__file__).resolve().parents[1] / "README.md"

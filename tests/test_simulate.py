@@ -15,16 +15,16 @@ import zarr
 from click.testing import CliRunner, Result
 
 from catalogue.support import make_source
-from pixmetry.campaign import load_campaign, read_frame
+from pixmetry.camera.camera import Camera, Element, build_camera, load_camera
+from pixmetry.camera.catalogue import get_source
+from pixmetry.camera.signal import Kind, Windows
+from pixmetry.camera.source import Parameters, quantity
 from pixmetry.cli import main
-from pixmetry.core.camera import Camera, Element, build_camera, load_camera
-from pixmetry.core.catalogue import get_source
 from pixmetry.core.errors import InputError, ParameterError
 from pixmetry.core.random import Grid
-from pixmetry.core.signal import Kind, Windows
-from pixmetry.core.source import Parameters, quantity
+from pixmetry.files import load_campaign, read_frame
 from pixmetry.scene.files import build_scene, read_scene
-from pixmetry.simulation import simulate
+from pixmetry.simulate.job import simulate
 
 CHAIN = """\
 chain:
@@ -408,7 +408,7 @@ def test_a_full_disk_is_one_line_and_leaves_the_old_frames(folder: Path, monkeyp
     def full(*_: object, **__: object) -> str:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("pixmetry.simulation.FrameWriter.write", full)
+    monkeypatch.setattr("pixmetry.simulate.job.FrameWriter.write", full)
     result = run(folder, "-n", 3)
     assert result.exit_code == 2 and result.output == "error: No space left on device; to do: make room, or choose another folder\n"
     assert sorted(p.name for p in folder.rglob("*")) == before

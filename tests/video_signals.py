@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 
 from catalogue.support import disc_tile, probe_of
-from pixmetry.core.contribution import Probe
-from pixmetry.core.line import Line
+from pixmetry.camera.contribution import Probe
+from pixmetry.camera.line import Line
+from pixmetry.camera.signal import Clock, Kind, Signal
+from pixmetry.camera.source import Source
 from pixmetry.core.random import Grid
-from pixmetry.core.signal import Clock, Kind, Signal
-from pixmetry.core.source import Source
 from source_signals import signal, stream
 
 PIXEL_HZ = 14.1875e6

@@ -6,32 +6,34 @@ itself costs next to nothing.
 
 from __future__ import annotations
 
+import sys
 from importlib import import_module
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
 
 _HOMES = {
-    "Camera": "pixmetry.core.camera",
+    "Camera": "pixmetry.camera.camera",
     "Estimates": "pixmetry.core.estimates",
-    "Frames": "pixmetry.campaign",
+    "Frames": "pixmetry.files",
     "PixmetryError": "pixmetry.core.errors",
-    "Signal": "pixmetry.core.signal",
-    "add_source_file": "pixmetry.core.catalogue",
-    "assess": "pixmetry.assessment",
-    "calibrate": "pixmetry.calibrating",
-    "campaign_of_arrays": "pixmetry.campaign",
-    "catalogue": "pixmetry.core.catalogue",
-    "check_limits": "pixmetry.comparing",
-    "compare": "pixmetry.comparing",
-    "compare_fleet": "pixmetry.comparing",
-    "emva1288": "pixmetry.datasheets",
-    "load_camera": "pixmetry.core.camera",
-    "load_campaign": "pixmetry.campaign",
-    "locate": "pixmetry.locating",
-    "read_calibration": "pixmetry.calibration_record",
-    "simulate": "pixmetry.simulation",
-    "walk": "pixmetry.chain",
+    "Signal": "pixmetry.camera.signal",
+    "add_source_file": "pixmetry.camera.catalogue",
+    "assess": "pixmetry.assess.job",
+    "calibrate": "pixmetry.calibrate.job",
+    "campaign_of_arrays": "pixmetry.files",
+    "catalogue": "pixmetry.camera.catalogue",
+    "check_limits": "pixmetry.emva.judge.compare",
+    "compare": "pixmetry.emva.judge.compare",
+    "compare_fleet": "pixmetry.emva.judge.compare",
+    "emva1288": "pixmetry.emva.job",
+    "load_camera": "pixmetry.camera.camera",
+    "load_campaign": "pixmetry.files",
+    "locate": "pixmetry.locate.job",
+    "read_calibration": "pixmetry.calibrate.files.record",
+    "simulate": "pixmetry.simulate.job",
+    "walk": "pixmetry.simulate.walk",
 }
 
 __all__ = [
@@ -59,20 +61,20 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from pixmetry.assessment import assess
-    from pixmetry.calibrating import calibrate
-    from pixmetry.calibration_record import read_calibration
-    from pixmetry.campaign import Frames, campaign_of_arrays, load_campaign
-    from pixmetry.chain import walk
-    from pixmetry.comparing import check_limits, compare, compare_fleet
-    from pixmetry.core.camera import Camera, load_camera
-    from pixmetry.core.catalogue import add_source_file, catalogue
+    from pixmetry.assess.job import assess
+    from pixmetry.calibrate.files.record import read_calibration
+    from pixmetry.calibrate.job import calibrate
+    from pixmetry.camera.camera import Camera, load_camera
+    from pixmetry.camera.catalogue import add_source_file, catalogue
+    from pixmetry.camera.signal import Signal
     from pixmetry.core.errors import PixmetryError
     from pixmetry.core.estimates import Estimates
-    from pixmetry.core.signal import Signal
-    from pixmetry.datasheets import emva1288
-    from pixmetry.locating import locate
-    from pixmetry.simulation import simulate
+    from pixmetry.emva.job import emva1288
+    from pixmetry.emva.judge.compare import check_limits, compare, compare_fleet
+    from pixmetry.files import Frames, campaign_of_arrays, load_campaign
+    from pixmetry.locate.job import locate
+    from pixmetry.simulate.job import simulate
+    from pixmetry.simulate.walk import walk
 
 
 def __getattr__(name: str) -> Any:
@@ -81,6 +83,17 @@ def __getattr__(name: str) -> Any:
     value = getattr(import_module(_HOMES[name]), name)
     globals()[name] = value
     return value
+
+
+class _Package(ModuleType):
+    """Keeps ``pixmetry.locate`` the function: Python would put the room of that name in its place as soon as the room is imported."""
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if not (name in _HOMES and isinstance(value, ModuleType)):
+            super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Package
 
 
 def __dir__() -> list[str]:

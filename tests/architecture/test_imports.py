@@ -1,6 +1,6 @@
 """Who may import whom, read from the source files without running them.
 
-Light walks through the stages and everything rests on ``core``; imports point that way only. Imports inside functions and under
+The rooms stand on floors, and imports point downwards only (``FLOORS``; docs/architecture.md). Imports inside functions and under
 ``TYPE_CHECKING`` count too, and so does ``import_module`` with a literal name.
 """
 
@@ -14,49 +14,20 @@ from pathlib import Path
 import pytest
 
 SRC = Path(__file__).resolve().parents[2] / "src" / "pixmetry"
-STAGES = ("scene", "optics", "sensor", "electronics", "cable", "grabber", "storage", "processing")
-MEASURING = {"experiment", "location", "calibration"}
 
-# What each part may import besides itself. A part that is not listed here fails the test: say where it belongs.
-ALLOWED: dict[str, set[str]] = {
-    "core": set(),
-    **{stage: {"core"} for stage in STAGES},
-    **{part: {"core"} for part in MEASURING},
-    "campaign": {"core"},
-    "budget": {"core", "scene", "location"},
-}
-ALLOWED["simulation"] = ALLOWED["correction"] = {"core", "scene", "campaign"}
-ALLOWED["digital_twin"] = {"core", "scene", "campaign", "experiment", "budget", "emva"}
-ALLOWED["results"] = {"core", "campaign", "experiment", "budget", "emva", "digital_twin"}
-ALLOWED["chain"] = {"core", "scene"}
-ALLOWED["emva"] = {"core", "experiment"}
-ALLOWED["datasheet_files"] = {"core", "campaign", "emva", "report"}
-ALLOWED["datasheets"] = {"core", "campaign", "emva", "datasheet_files"}
-ALLOWED["dark_currents"] = {"core", "campaign", "emva", "datasheet_files", "datasheets"}
-ALLOWED["preflights"] = {"campaign", "experiment", "emva"}
-ALLOWED["comparing"] = {"core", "campaign", "emva"}
-ALLOWED["calibration"] = {"core", "location"}
-ALLOWED["calibration_numbering"] = {"calibration"}
-ALLOWED["calibration_targets"] = {"core", "campaign", "location", "located", "locating", "calibration_numbering"}
-ALLOWED["calibration_images"] = {"core", "campaign", "calibration", "location", "locating", "calibration_numbering", "calibration_targets"}
-ALLOWED["line_calibration"] = {"calibration"}
-ALLOWED["calibration_record"] = {"core", "calibration", "line_calibration"}
-ALLOWED["calibration_project"] = {"core", "campaign", "calibration", "calibration_images", "calibration_record", "location", "locating"}
-ALLOWED["calibration_files"] = {"core", "campaign", "calibration", "calibration_record", "line_calibration", "report"}
-ALLOWED["calibration_exports"] = {"core", "campaign", "calibration"}
-ALLOWED["calibrated"] = {"core", "calibration", "calibration_record"}
-ALLOWED["calibrating"] = {"core", "campaign", "calibration", "calibration_project", "calibrated"}
-ALLOWED["calibrating"] |= {"calibration_record", "calibration_files", "line_calibration"}
-ALLOWED["camera_noise"] = {"core", "scene", "location"}
-ALLOWED["located"] = {"core", "campaign", "location"}
-ALLOWED["report"] = {"core", "campaign", "experiment", "budget", "results", "chain", "located", "emva", "calibration", "line_calibration"}
-ALLOWED["report"] |= {"digital_twin"}
-ALLOWED["locating"] = {"core", "campaign", "location", "located", "camera_noise", "report"}
-ALLOWED["assessment"] = {"core", "campaign", "experiment", "location", "budget", "results", "report", "emva", "calibrated"}
-ALLOWED["assessment"] |= {"calibration_record", "digital_twin"}
-ALLOWED["handbook"] = {*ALLOWED}
-ALLOWED["cli"] = {*ALLOWED}
-ALLOWED["__main__"] = {"cli"}
+# The rooms, from the ground up. A room imports from the floors below its own; rooms on one floor do not see each other.
+FLOORS = (
+    ("core",),
+    ("camera",),
+    ("sources", "scene", "observe", "files", "report"),
+    ("locate",),
+    ("simulate", "emva", "calibrate"),
+    ("budget",),
+    ("assess",),
+    ("cli",),
+    ("__main__",),
+)
+FLOOR = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
 
 KERNEL_FILE = re.compile(r"_(.+_)?kernels")
 THREADS = {"concurrent", "multiprocessing", "_thread", "joblib"}
@@ -105,19 +76,24 @@ def module_name(path: Path) -> str:
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
-def part_of(dotted: str) -> str:
-    """The part of the package that a dotted name is in; ``""`` for the package itself."""
-    return (dotted.split(".") + [""])[1]
+def place_of(dotted: str) -> tuple[int, str]:
+    """The floor and the room that a dotted name is in; each stage of the sources is a room. The package itself is above all floors."""
+    parts = dotted.split(".")
+    if len(parts) == 1:
+        return len(FLOORS), ""
+    room = parts[1]
+    return FLOOR.get(room, len(FLOORS)), ".".join(parts[1:3]) if room == "sources" and len(parts) > 2 else room
 
 
 def wrong_layers(source: str, module: str, is_package: bool = False) -> list[str]:
-    """Imports of a part of pixmetry that this part may not import."""
-    part = part_of(module)
+    """Imports that do not point to a floor below, or into the same room."""
+    floor, room = place_of(module)
     wrong = []
     for found in imports(source, module, is_package):
         if found.dotted.split(".")[0] != "pixmetry" or found.dotted == "pixmetry.__version__":
             continue
-        if part_of(found.dotted) not in {part, *ALLOWED[part]}:
+        other, into = place_of(found.dotted)
+        if into != room and other >= floor:
             wrong.append(f"{module}:{found.line} imports {found.dotted}")
     return wrong
 
@@ -173,20 +149,12 @@ def test_there_is_something_to_check() -> None:
     assert KERNELS
 
 
-def test_every_part_has_its_place() -> None:
-    assert {part_of(module_name(path)) for path in FILES} - {""} <= set(ALLOWED)
+def test_every_room_has_a_floor() -> None:
+    rooms = {module_name(path).split(".")[1] for path in FILES if path.parent != SRC or path.stem != "__init__"}
+    assert rooms == set(FLOOR)
 
 
-def test_allowed_imports_make_no_circle() -> None:
-    """Take away what imports nothing that is left, until all are gone."""
-    left = {part: targets - {part} for part, targets in ALLOWED.items()}
-    while left:
-        done = {part for part, targets in left.items() if not targets & set(left)}
-        assert done, f"a circle among {sorted(left)}"
-        left = {part: targets for part, targets in left.items() if part not in done}
-
-
-def test_parts_import_downwards_only() -> None:
+def test_rooms_import_downwards_only() -> None:
     wrong = [w for path in FILES if path.parent != SRC or path.stem != "__init__" for w in _checked_layers(path)]
     assert not wrong, "\n".join(wrong)
 
@@ -212,15 +180,17 @@ def test_threads_live_in_one_place() -> None:
 @pytest.mark.parametrize(
     ("module", "line"),
     [
-        ("pixmetry.core.camera", "from pixmetry.sensor import shot_noise"),
-        ("pixmetry.core.camera", "from pixmetry import sensor"),
-        ("pixmetry.core.camera", "def f():\n    import pixmetry.budget.montecarlo"),
-        ("pixmetry.core.camera", "importlib.import_module('pixmetry.sensor.prnu')"),
-        ("pixmetry.sensor.prnu", "from ..optics.psf import blur"),
-        ("pixmetry.sensor.prnu", "from pixmetry import assess"),
-        ("pixmetry.experiment.moments", "from pixmetry.sensor.prnu import SOURCE"),
-        ("pixmetry.budget.propagate", "from pixmetry.experiment import moments"),
-        ("pixmetry.report.page", "from pixmetry.cli import main"),
+        ("pixmetry.camera.camera", "from pixmetry.sources.sensor import shot_noise"),
+        ("pixmetry.camera.camera", "from pixmetry import sensor"),
+        ("pixmetry.camera.camera", "def f():\n    import pixmetry.budget.montecarlo"),
+        ("pixmetry.camera.camera", "importlib.import_module('pixmetry.sources.sensor.prnu')"),
+        ("pixmetry.sources.sensor.prnu", "from ..optics.psf import blur"),
+        ("pixmetry.sources.sensor.prnu", "from pixmetry import assess"),
+        ("pixmetry.observe.moments", "from pixmetry.sources.sensor.prnu import SOURCE"),
+        ("pixmetry.budget.propagate", "from pixmetry.assess import results"),
+        ("pixmetry.emva.job", "from pixmetry.calibrate.job import calibrate"),
+        ("pixmetry.sources.sensor.prnu", "from pixmetry.sources.optics import shading"),
+        ("pixmetry.assess.page.page", "from pixmetry.cli import main"),
     ],
 )
 def test_a_planted_wrong_import_is_caught(module: str, line: str) -> None:
@@ -230,8 +200,8 @@ def test_a_planted_wrong_import_is_caught(module: str, line: str) -> None:
 @pytest.mark.parametrize(
     ("module", "line"),
     [
-        ("pixmetry.sensor.prnu", "import numpy as np\nfrom pixmetry.core.signal import Signal\nfrom . import _kernels"),
-        ("pixmetry.budget.propagate", "from pixmetry.scene import targets\nfrom pixmetry.location import centroid"),
+        ("pixmetry.sources.sensor.prnu", "import numpy as np\nfrom pixmetry.camera.signal import Signal\nfrom . import _kernels"),
+        ("pixmetry.budget.propagate", "from pixmetry.scene import targets\nfrom pixmetry.locate import centroid"),
         ("pixmetry.core.provenance", "from pixmetry import __version__"),
     ],
 )
@@ -239,16 +209,16 @@ def test_a_right_import_passes(module: str, line: str) -> None:
     assert not wrong_layers(line, module)
 
 
-@pytest.mark.parametrize("line", ["import scipy", "from pixmetry.core.signal import Signal", "import os", "from .prnu import SOURCE"])
+@pytest.mark.parametrize("line", ["import scipy", "from pixmetry.camera.signal import Signal", "import os", "from .prnu import SOURCE"])
 def test_a_planted_kernel_import_is_caught(line: str) -> None:
-    assert wrong_kernel_imports(line, "pixmetry.sensor._kernels")
+    assert wrong_kernel_imports(line, "pixmetry.sources.sensor._kernels")
 
 
 @pytest.mark.parametrize(
     "line", ["from pixmetry.core._random_kernels import normal", "from . import _smear_kernels", "from pixmetry.core.jit import jit"]
 )
 def test_a_right_kernel_import_passes(line: str) -> None:
-    assert not wrong_kernel_imports(line, "pixmetry.sensor._kernels")
+    assert not wrong_kernel_imports(line, "pixmetry.sources.sensor._kernels")
 
 
 @pytest.mark.parametrize(
@@ -263,11 +233,12 @@ def test_a_right_kernel_import_passes(line: str) -> None:
     ],
 )
 def test_planted_global_randomness_is_caught(source: str) -> None:
-    assert global_randomness(source, "pixmetry.sensor.prnu")
+    assert global_randomness(source, "pixmetry.sources.sensor.prnu")
 
 
 def test_own_streams_are_not_global_randomness() -> None:
-    assert not global_randomness("from pixmetry.core.random import Stream\nfrom pixmetry.core import random", "pixmetry.sensor.prnu")
+    source = "from pixmetry.core.random import Stream\nfrom pixmetry.core import random"
+    assert not global_randomness(source, "pixmetry.sources.sensor.prnu")
 
 
 @pytest.mark.parametrize(
@@ -283,7 +254,7 @@ def test_own_streams_are_not_global_randomness() -> None:
     ],
 )
 def test_planted_parallelism_is_caught(source: str) -> None:
-    assert own_parallelism(source, "pixmetry.sensor.prnu")
+    assert own_parallelism(source, "pixmetry.sources.sensor.prnu")
 
 
 def test_a_lock_is_not_parallelism() -> None:

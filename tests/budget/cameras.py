@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from pixmetry.core.camera import Camera, Element
-from pixmetry.core.catalogue import get_source
+from pixmetry.camera.camera import Camera, Element
+from pixmetry.camera.catalogue import get_source
 
 GAIN_DN_PER_E, ETA = 0.01, 0.5
 

@@ -15,12 +15,12 @@ from pixmetry.budget.headline import headline
 from pixmetry.budget.monte_carlo import Trials, monte_carlo
 from pixmetry.budget.parameters import applies
 from pixmetry.budget.probe import Target, facts_of
-from pixmetry.core.camera import load_camera
-from pixmetry.core.catalogue import catalogue, get_source
+from pixmetry.camera.camera import load_camera
+from pixmetry.camera.catalogue import catalogue, get_source
+from pixmetry.camera.signal import Kind
 from pixmetry.core.errors import InputError
 from pixmetry.core.estimates import Estimates
-from pixmetry.core.signal import Kind
-from pixmetry.location.estimators import Estimator
+from pixmetry.locate.centroids.estimators import Estimator
 
 KNOWN = {"noise_dn": 0.6}
 SEED = int(np.random.SeedSequence().entropy % 2**31)  # any will do: tolerances are those of the statistics

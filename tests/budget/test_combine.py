@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pixmetry.budget.combine import combine
-from pixmetry.core.contribution import CLASSES, Contribution, smooth_part
+from pixmetry.camera.contribution import CLASSES, Contribution, smooth_part
 from pixmetry.core.errors import InputError
 
 ROWS = [

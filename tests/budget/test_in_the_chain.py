@@ -19,11 +19,11 @@ import pytest
 from budget.cameras import camera
 from pixmetry.budget.monte_carlo import Trials
 from pixmetry.budget.probe import Facts, Probes, Target, facts_of
-from pixmetry.core.camera import Camera, Element, in_order
-from pixmetry.core.catalogue import catalogue, get_source
-from pixmetry.core.signal import Kind
-from pixmetry.core.source import Source
-from pixmetry.location.estimators import Estimator
+from pixmetry.camera.camera import Camera, Element, in_order
+from pixmetry.camera.catalogue import catalogue, get_source
+from pixmetry.camera.signal import Kind
+from pixmetry.camera.source import Source
+from pixmetry.locate.centroids.estimators import Estimator
 
 CLOCKS = {10e6: (120, 160), 14.1875e6: (200, 300), 14.75e6: (96, 400), 28.4e6: (160, 240)}
 OWN_CLOCK = 14.75e6  # of the pixels, where the grabber's is another

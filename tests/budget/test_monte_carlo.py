@@ -12,7 +12,7 @@ from budget.cameras import ETA, GAIN_DN_PER_E, camera, element
 from pixmetry.budget.monte_carlo import Trials, _axis, helpers_of, monte_carlo
 from pixmetry.budget.probe import Facts, Target, facts_of, make_probe, parse_target, passed_light, resolve
 from pixmetry.core.errors import InputError
-from pixmetry.location.estimators import Estimator
+from pixmetry.locate.centroids.estimators import Estimator
 
 WHITE_E = 60.0
 Z = 4.9  # of a normal variable: two-sided false-alarm rate 1e-6

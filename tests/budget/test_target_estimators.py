@@ -12,8 +12,8 @@ from pixmetry.budget import compute_budget
 from pixmetry.budget.monte_carlo import monte_carlo
 from pixmetry.budget.probe import Target, facts_of, make_probe, resolve
 from pixmetry.core.errors import InputError
-from pixmetry.locating import estimators, locate
-from pixmetry.location.target_estimator import AUTO, FITS, MOMENTS, OPERATORS, TargetEstimator
+from pixmetry.locate.job import estimators, locate
+from pixmetry.locate.target_estimator import AUTO, FITS, MOMENTS, OPERATORS, TargetEstimator
 from pixmetry.scene.discs import Discs
 from pixmetry.scene.uniform import Uniform
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pixmetry.cable.t_piece import SOURCE, TPiece, echoes
+from pixmetry.sources.cable.t_piece import SOURCE, TPiece, echoes
 from video_signals import PIXEL_HZ, bump, centre, row_of, sampled, seen, video
 
 SPEED = 0.66 * 299_792_458.0

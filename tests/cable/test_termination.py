@@ -7,7 +7,7 @@ import pytest
 from scipy.signal import lfilter
 from scipy.special import erfc
 
-from pixmetry.cable.termination import SOURCE, Termination, echoes, near, tail
+from pixmetry.sources.cable.termination import SOURCE, Termination, echoes, near, tail
 from video_signals import PIXEL_HZ, bump, centre, row_of, sampled, seen, video
 
 

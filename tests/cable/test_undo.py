@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 from catalogue.support import Targets, camera_with
-from pixmetry.cable.t_piece import TPiece
-from pixmetry.cable.termination import Termination
-from pixmetry.core.camera import Camera, Element, load_camera
-from pixmetry.core.catalogue import get_source
+from pixmetry.assess.correct import correct_signal
+from pixmetry.camera.camera import Camera, Element, load_camera
+from pixmetry.camera.catalogue import get_source
+from pixmetry.camera.signal import Kind
 from pixmetry.core.errors import ParameterError
-from pixmetry.core.signal import Kind
-from pixmetry.correction import correct_signal
 from pixmetry.scene.discs import Discs
 from pixmetry.scene.uniform import Uniform
+from pixmetry.sources.cable.t_piece import TPiece
+from pixmetry.sources.cable.termination import Termination
 from source_signals import signal
 
 CABLES = {

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from calibration.networks import Simulated, predicted
-from pixmetry.calibration.bundle import adjust
-from pixmetry.calibration.network import Adjustment, Network
+from pixmetry.calibrate.bundle.bundle import adjust
+from pixmetry.calibrate.bundle.network import Adjustment, Network
 
 NOISE_PX = 0.04
 

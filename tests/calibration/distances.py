@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from calibration.networks import Simulated
-from pixmetry.calibration.network import Adjustment, Network, ScaleBars
+from pixmetry.calibrate.bundle.network import Adjustment, Network, ScaleBars
 
 NOTHING_KNOWN = 1e9  # uncertainty of a bar that says nothing; the points it joins come with their joint covariance
 

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pixmetry.calibration.model import NAMES, CameraModel, Sensor
-from pixmetry.calibration.network import Network, ScaleBars, State
+from pixmetry.calibrate.bundle.model import NAMES, CameraModel, Sensor
+from pixmetry.calibrate.bundle.network import Network, ScaleBars, State
 
 SENSOR = Sensor(2048, 1536, 3.45, 3.45)
 LENS = {"c": 8.5, "b1": 2e-4, "b2": -1.5e-4, "p1": 3e-5, "p2": -4e-5, "k1": 1.2e-3, "k2": -1.5e-5, "k3": 2e-7}  # mm, image to object

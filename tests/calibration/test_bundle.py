@@ -12,10 +12,10 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from calibration.networks import disturbed, predicted, simulate
-from pixmetry.calibration import bundle, bundle_covariance, bundle_system
-from pixmetry.calibration.bundle import adjust
-from pixmetry.calibration.known_residuals import bar_residuals
-from pixmetry.calibration.network import Network, ScaleBars, State
+from pixmetry.calibrate.bundle import bundle, bundle_covariance, bundle_system
+from pixmetry.calibrate.bundle.bundle import adjust
+from pixmetry.calibrate.bundle.network import Network, ScaleBars, State
+from pixmetry.calibrate.checks.known_residuals import bar_residuals
 from pixmetry.core.errors import InputError, MeasureError
 
 RATE = 1e-6  # false failures of one statistical test

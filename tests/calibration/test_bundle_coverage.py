@@ -7,7 +7,7 @@ import pytest
 
 from calibration.distances import Pooled, each_point, interior_distance, jointly, points_distance
 from calibration.networks import disturbed, simulate
-from pixmetry.calibration.bundle import adjust
+from pixmetry.calibrate.bundle.bundle import adjust
 
 RATE = 1e-6
 NETWORKS = 20

@@ -13,9 +13,9 @@ from scipy.stats import chi2, norm
 import pixmetry
 from calibration.adjusted import measured_again
 from calibration.networks import Simulated, predicted, simulate
-from pixmetry.calibration.bundle import adjust
-from pixmetry.calibration.check_points import CheckPoints, _text, _turned, check_findings, check_record, joint_covariance
-from pixmetry.calibration.network import Adjustment, Network, State
+from pixmetry.calibrate.bundle.bundle import adjust
+from pixmetry.calibrate.bundle.network import Adjustment, Network, State
+from pixmetry.calibrate.checks.check_points import CheckPoints, _text, _turned, check_findings, check_record, joint_covariance
 from pixmetry.core.errors import InputError
 
 FALSE_FAILURE = 1e-6

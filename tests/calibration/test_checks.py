@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from calibration.networks import simulate
-from pixmetry.calibration.bundle import adjust
-from pixmetry.calibration.checks import check_determined, check_network, left_out
-from pixmetry.calibration.network import Network
+from pixmetry.calibrate.bundle.bundle import adjust
+from pixmetry.calibrate.bundle.network import Network
+from pixmetry.calibrate.checks.checks import check_determined, check_network, left_out
 from pixmetry.core.errors import InputError, MeasureError
 
 

@@ -10,17 +10,18 @@ import pytest
 from scipy import stats
 
 from calibration.networks import Simulated, simulate
-from pixmetry.calibration import known_checks, known_residuals, loosened, settling
-from pixmetry.calibration.bundle import adjust
-from pixmetry.calibration.findings import findings_of, gross_error_findings, known_findings
-from pixmetry.calibration.known_residuals import Known, contradicted, control_residuals, group_record, jointly, rivals
-from pixmetry.calibration.lost_control import lost_records, mostly_lost, set_free, where_seen, wrong_known
-from pixmetry.calibration.network import Calibration, Finding, ScaleBars
-from pixmetry.calibration.records import known_record, sizes
-from pixmetry.calibration.solve import Options, calibrate_network
+from pixmetry.calibrate.bundle import loosened, settling
+from pixmetry.calibrate.bundle.bundle import adjust
+from pixmetry.calibrate.bundle.network import Calibration, Finding, ScaleBars
+from pixmetry.calibrate.bundle.solve import Options, calibrate_network
+from pixmetry.calibrate.checks import known_checks, known_residuals
+from pixmetry.calibrate.checks.findings import findings_of, gross_error_findings, known_findings
+from pixmetry.calibrate.checks.known_residuals import Known, contradicted, control_residuals, group_record, jointly, rivals
+from pixmetry.calibrate.checks.lost_control import lost_records, mostly_lost, set_free, where_seen, wrong_known
+from pixmetry.calibrate.page.control import control_points
+from pixmetry.calibrate.page.tables import scale_bars
+from pixmetry.calibrate.records import known_record, sizes
 from pixmetry.core.errors import InputError
-from pixmetry.report.calibration_control import control_points
-from pixmetry.report.calibration_tables import scale_bars
 
 RATE = 1e-6
 QUICK = Options(folds=0, false_alarms=RATE)

@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from calibration.adjusted import adjusted, measured_again
 from calibration.networks import SENSOR, _polynomial, distorted, predicted, simulate
-from pixmetry.calibration import curves
-from pixmetry.calibration.model import NAMES, CameraModel
+from pixmetry.calibrate.bundle.model import NAMES, CameraModel
+from pixmetry.calibrate.checks import curves
 
 RATE = 1e-6
 MX = 0.00345

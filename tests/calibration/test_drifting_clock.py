@@ -13,10 +13,10 @@ import pytest
 from scipy import stats
 
 from pixmetry import load_camera, locate
-from pixmetry.calibration.model import CameraModel, Sensor
-from pixmetry.calibration.network import Network
-from pixmetry.calibration.solve import Options, calibrate_network
-from pixmetry.location.targets import Flag
+from pixmetry.calibrate.bundle.model import CameraModel, Sensor
+from pixmetry.calibrate.bundle.network import Network
+from pixmetry.calibrate.bundle.solve import Options, calibrate_network
+from pixmetry.locate.detect.targets import Flag
 from pixmetry.scene.picture import Picture
 from pixmetry.scene.plates import Pose, dot_plate
 from pixmetry.scene.uniform import Uniform

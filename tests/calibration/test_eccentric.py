@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pixmetry.calibration.eccentric import eccentricity, without_eccentricity
-from pixmetry.calibration.model import CameraModel, Sensor
-from pixmetry.calibration.network import Network, State
-from pixmetry.location.eccentricity import circle_seen
+from pixmetry.calibrate.bundle.eccentric import eccentricity, without_eccentricity
+from pixmetry.calibrate.bundle.model import CameraModel, Sensor
+from pixmetry.calibrate.bundle.network import Network, State
+from pixmetry.locate.circles.eccentricity import circle_seen
 
 LENS = {"b1": 3e-4, "b2": -2e-4, "p1": 2e-4, "p2": -1e-4, "k1": -4e-3, "k2": 3e-5}  # mm: 30 px at the corners of this sensor
 

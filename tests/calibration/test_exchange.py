@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from pixmetry.calibration.exchange import (
+from pixmetry.calibrate.bundle.model import CameraModel, Sensor
+from pixmetry.calibrate.exchange import (
     COLMAP,
     colmap_line,
     converted,
@@ -18,7 +19,6 @@ from pixmetry.calibration.exchange import (
     read_opencv,
     write_opencv,
 )
-from pixmetry.calibration.model import CameraModel, Sensor
 from pixmetry.core.errors import InputError
 
 SENSOR = Sensor(752, 582, 8.6, 8.3)

@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from calibration.adjusted import adjusted, measured_again
 from calibration.networks import simulate
-from pixmetry.calibration.field_check import check_field
-from pixmetry.calibration.model import NAMES
-from pixmetry.calibration.resection import similarity
+from pixmetry.calibrate.bundle.model import NAMES
+from pixmetry.calibrate.checks.field_check import check_field
+from pixmetry.calibrate.start.resection import similarity
 from pixmetry.core.errors import InputError
 
 RATE = 1e-6

@@ -11,12 +11,12 @@ from scipy import stats
 
 from calibration.adjusted import adjusted, measured_again
 from calibration.networks import predicted, simulate
-from pixmetry.calibration import known_checks
-from pixmetry.calibration.bundle import adjust
-from pixmetry.calibration.findings import known_findings
-from pixmetry.calibration.known_checks import fixed_record
-from pixmetry.calibration.network import ScaleBars
-from pixmetry.calibration.snooping import remove_gross_errors
+from pixmetry.calibrate.bundle.bundle import adjust
+from pixmetry.calibrate.bundle.network import ScaleBars
+from pixmetry.calibrate.checks import known_checks
+from pixmetry.calibrate.checks.findings import known_findings
+from pixmetry.calibrate.checks.known_checks import fixed_record
+from pixmetry.calibrate.checks.snooping import remove_gross_errors
 
 RATE = 1e-6
 DRAWS = 60

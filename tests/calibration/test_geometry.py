@@ -8,15 +8,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pixmetry.budget.budget import compute_budget
-from pixmetry.calibrated import calibrated_camera
-from pixmetry.calibration.geometry import geometry_of, systematic_rest
-from pixmetry.calibration.model import CameraModel, Sensor
-from pixmetry.core.camera import load_camera
+from pixmetry.budget.job import compute_budget
+from pixmetry.calibrate.bundle.model import CameraModel, Sensor
+from pixmetry.calibrate.calibrated_camera import calibrated_camera
+from pixmetry.calibrate.geometry import geometry_of, systematic_rest
+from pixmetry.camera.camera import load_camera
+from pixmetry.camera.observations import AFFINITY, LENS, TAKEN_UP, Observations
 from pixmetry.core.errors import InputError, MeasureError
-from pixmetry.core.observations import AFFINITY, LENS, TAKEN_UP, Observations
-from pixmetry.optics import distortion
-from pixmetry.sensor import affinity
+from pixmetry.sources.optics import distortion
+from pixmetry.sources.sensor import affinity
 
 SENSOR = Sensor(752, 582, 8.6, 8.3)
 SHAPE = (582, 752)

@@ -11,10 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from calibration.adjusted import NOISE_PX, adjusted, measured_again, shifted
 from calibration.networks import image_of, predicted, simulate
-from pixmetry.calibration import hold_out
-from pixmetry.calibration.bundle import adjust
-from pixmetry.calibration.findings import hold_out_findings
-from pixmetry.calibration.hold_out import LeftOut, expected_median_px, hold_out_record, left_out, resect, subset
+from pixmetry.calibrate.bundle.bundle import adjust
+from pixmetry.calibrate.checks import hold_out
+from pixmetry.calibrate.checks.findings import hold_out_findings
+from pixmetry.calibrate.checks.hold_out import LeftOut, expected_median_px, hold_out_record, left_out, resect, subset
 from pixmetry.core.errors import InputError
 
 RATE = 1e-6

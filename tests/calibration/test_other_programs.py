@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pixmetry.calibration.model import CameraModel, Sensor
-from pixmetry.calibration_project import load_project
+from pixmetry.calibrate.bundle.model import CameraModel, Sensor
+from pixmetry.calibrate.project import load_project
 from pixmetry.core.errors import InputError
 
 SENSOR = Sensor(4000, 3000, 5.0, 5.0)

@@ -10,12 +10,12 @@ from scipy import stats
 
 from calibration.adjusted import NOISE_PX, adjusted, measured_again, shifted
 from calibration.networks import SENSOR, Simulated, predicted, simulate
-from pixmetry.calibration.added_terms import AddedTerms, derivatives
-from pixmetry.calibration.model import NAMES
-from pixmetry.calibration.network import SCALE
-from pixmetry.calibration.patterns import MEANING, pattern_findings, residual_patterns
-from pixmetry.calibration.solve import calibrate_network
-from pixmetry.core.catalogue import catalogue
+from pixmetry.calibrate.bundle.model import NAMES
+from pixmetry.calibrate.bundle.network import SCALE
+from pixmetry.calibrate.bundle.solve import calibrate_network
+from pixmetry.calibrate.checks.added_terms import AddedTerms, derivatives
+from pixmetry.calibrate.checks.patterns import MEANING, pattern_findings, residual_patterns
+from pixmetry.camera.catalogue import catalogue
 
 RATE = 1e-6
 WAVES = ("wave_xx", "wave_xy", "wave_yy")

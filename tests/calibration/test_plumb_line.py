@@ -11,10 +11,10 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.stats import chi2, f, norm
 
-from pixmetry.calibration.line_residuals import AxisResiduals, axis_residuals, compare_axes, correlation_inflation, pooled
-from pixmetry.calibration.model import CameraModel, Sensor
-from pixmetry.calibration.plumb_line import calibrate_lines
-from pixmetry.calibration.row_jitter import RowVariance, Sampling, jitter_from_axes
+from pixmetry.calibrate.bundle.model import CameraModel, Sensor
+from pixmetry.calibrate.lines.line_residuals import AxisResiduals, axis_residuals, compare_axes, correlation_inflation, pooled
+from pixmetry.calibrate.lines.plumb_line import calibrate_lines
+from pixmetry.calibrate.lines.row_jitter import RowVariance, Sampling, jitter_from_axes
 from pixmetry.core.errors import InputError, MeasureError
 
 RATE = 1e-6

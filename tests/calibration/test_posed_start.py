@@ -9,14 +9,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from calibration.networks import SENSOR, Simulated, predicted, simulate
-from pixmetry.calibration import solve
-from pixmetry.calibration.bundle import adjust
-from pixmetry.calibration.initial import start_values
-from pixmetry.calibration.network import Network, Poses
-from pixmetry.calibration.options import Options
-from pixmetry.calibration.posed_start import from_poses, to_their_frame
-from pixmetry.calibration.resection import fitted
-from pixmetry.calibration.solve import calibrate_network
+from pixmetry.calibrate.bundle import solve
+from pixmetry.calibrate.bundle.bundle import adjust
+from pixmetry.calibrate.bundle.network import Network, Poses
+from pixmetry.calibrate.bundle.options import Options
+from pixmetry.calibrate.bundle.solve import calibrate_network
+from pixmetry.calibrate.start.initial import start_values
+from pixmetry.calibrate.start.posed_start import from_poses, to_their_frame
+from pixmetry.calibrate.start.resection import fitted
 from pixmetry.core.errors import MeasureError
 
 ROUGH = 0.03  # of the object's size, and rad

@@ -10,9 +10,9 @@ from scipy import special, stats
 
 from calibration.adjusted import NOISE_PX, adjusted, measured_again
 from calibration.networks import SENSOR, distorted, predicted, simulate
-from pixmetry.calibration import quality
-from pixmetry.calibration.model import NAMES, CameraModel, Sensor
-from pixmetry.calibration.network import Adjustment, Network, State
+from pixmetry.calibrate.bundle.model import NAMES, CameraModel, Sensor
+from pixmetry.calibrate.bundle.network import Adjustment, Network, State
+from pixmetry.calibrate.checks import quality
 
 RATE = 1e-6
 

@@ -10,7 +10,7 @@ from scipy import interpolate, stats
 
 from calibration.adjusted import NOISE_PX, adjusted, measured_again, shifted
 from calibration.networks import SENSOR, Simulated, predicted, simulate
-from pixmetry.calibration import residual_grid
+from pixmetry.calibrate.checks import residual_grid
 
 RATE = 1e-6
 

@@ -10,12 +10,12 @@ import pytest
 from scipy import stats
 
 from calibration.networks import disturbed, image_of, simulate
-from pixmetry.calibration.bundle import adjust
-from pixmetry.calibration.few_rays import mend
-from pixmetry.calibration.known_residuals import bar_residuals, contradicted, control_residuals, group_record
-from pixmetry.calibration.network import ScaleBars
-from pixmetry.calibration.snooping import critical_values, gross_error_records, remove_gross_errors, statistics
-from pixmetry.calibration.variance_components import image_sigma0
+from pixmetry.calibrate.bundle.bundle import adjust
+from pixmetry.calibrate.bundle.network import ScaleBars
+from pixmetry.calibrate.checks.few_rays import mend
+from pixmetry.calibrate.checks.known_residuals import bar_residuals, contradicted, control_residuals, group_record
+from pixmetry.calibrate.checks.snooping import critical_values, gross_error_records, remove_gross_errors, statistics
+from pixmetry.calibrate.checks.variance_components import image_sigma0
 
 RATE = 1e-6  # false failures of each statistical test
 Z = stats.norm.isf(RATE / 2)

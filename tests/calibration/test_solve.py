@@ -11,11 +11,11 @@ import pytest
 from scipy import stats
 
 from calibration.networks import image_of, predicted, simulate
-from pixmetry.calibration import known_checks
-from pixmetry.calibration.known_residuals import contradicted
-from pixmetry.calibration.model import NAMES
-from pixmetry.calibration.network import Calibration, ScaleBars
-from pixmetry.calibration.solve import Options, calibrate_network
+from pixmetry.calibrate.bundle.model import NAMES
+from pixmetry.calibrate.bundle.network import Calibration, ScaleBars
+from pixmetry.calibrate.bundle.solve import Options, calibrate_network
+from pixmetry.calibrate.checks import known_checks
+from pixmetry.calibrate.checks.known_residuals import contradicted
 from pixmetry.core.errors import InputError, MeasureError, ParameterError
 
 RATE = 1e-6  # false failures of each statistical test
@@ -450,9 +450,9 @@ def test_one_bad_image_is_named_and_no_drift_is_made_of_it(rng):
 @pytest.mark.filterwarnings("error")
 def test_a_camera_that_is_held_and_one_without_images_are_no_trouble(rng, tmp_path):
     """Through records, page, file and summary; for the second camera nothing is said but that it took no part."""
-    from pixmetry.calibration_record import json_text, read_calibration
-    from pixmetry.report.calibration_page import render
-    from pixmetry.report.calibration_text import summary_text
+    from pixmetry.calibrate.files.record import json_text, read_calibration
+    from pixmetry.calibrate.page.page import render
+    from pixmetry.calibrate.page.text import summary_text
 
     simulated = simulate(rng, images=10, points=40)
     truth = simulated.truth.interior[0]

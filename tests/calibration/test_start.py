@@ -15,12 +15,12 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from calibration.networks import SENSOR, Simulated, predicted, simulate
-from pixmetry.calibration.bundle import adjust
-from pixmetry.calibration.initial import start_values
-from pixmetry.calibration.options import Options
-from pixmetry.calibration.planar_start import homography, principal_distance
-from pixmetry.calibration.resection import fitted, intersect, pose
-from pixmetry.calibration.solve import calibrate_network
+from pixmetry.calibrate.bundle.bundle import adjust
+from pixmetry.calibrate.bundle.options import Options
+from pixmetry.calibrate.bundle.solve import calibrate_network
+from pixmetry.calibrate.start.initial import start_values
+from pixmetry.calibrate.start.planar_start import homography, principal_distance
+from pixmetry.calibrate.start.resection import fitted, intersect, pose
 from pixmetry.core.errors import InputError, MeasureError
 
 DIRTY = {"gross_share": 0.01, "gross_px": 8.0, "swapped_share": 0.01, "c_known": False}

@@ -9,8 +9,8 @@ import pytest
 from scipy import stats
 
 from calibration.networks import predicted, simulate
-from pixmetry.calibration.bundle import adjust
-from pixmetry.calibration.variance_components import estimate_components, estimated_sizes, groups, image_sigma0, scaled
+from pixmetry.calibrate.bundle.bundle import adjust
+from pixmetry.calibrate.checks.variance_components import estimate_components, estimated_sizes, groups, image_sigma0, scaled
 
 RATE = 1e-6  # false failures of each statistical test
 Z = stats.norm.isf(RATE / 2)

@@ -18,11 +18,11 @@ from PIL import Image
 
 from campaign.campaign_files import FRAMES, HEAD, put_campaign
 from campaign.test_formats import UNSIGNED, fits, jpeg
-from pixmetry.calibration_project.tables import read_table
-from pixmetry.campaign import load_campaign
-from pixmetry.campaign.formats import frames_of
-from pixmetry.campaign.images import read_frame, read_picture
+from pixmetry.calibrate.project.tables import read_table
 from pixmetry.core.errors import InputError
+from pixmetry.files import load_campaign
+from pixmetry.files.formats import frames_of
+from pixmetry.files.images import read_frame, read_picture
 
 IMAGE = np.random.default_rng(11).integers(0, 4096, (9, 13), dtype=np.uint16)
 PAGES = np.random.default_rng(12).integers(0, 4096, (3, 9, 13), dtype=np.uint16)

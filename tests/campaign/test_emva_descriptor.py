@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from campaign.campaign_files import put_descriptor, put_frame
-from pixmetry.campaign import load_campaign
-from pixmetry.campaign.emva_descriptor import parse_descriptor
 from pixmetry.core.errors import InputError
+from pixmetry.files import load_campaign
+from pixmetry.files.emva_descriptor import parse_descriptor
 
 GOOD = """# Copyright somebody
 # Licence: free

@@ -17,11 +17,11 @@ import pytest
 import tifffile
 from PIL import Image
 
-from pixmetry.campaign import read_frame
-from pixmetry.campaign.formats import frames_of
-from pixmetry.campaign.images import load_frame, load_picture, picture_files, read_picture
-from pixmetry.campaign.raw_values import RawLayout, parse_raw
 from pixmetry.core.errors import InputError
+from pixmetry.files import read_frame
+from pixmetry.files.formats import frames_of
+from pixmetry.files.images import load_frame, load_picture, picture_files, read_picture
+from pixmetry.files.raw_values import RawLayout, parse_raw
 
 GREY = np.random.default_rng(3).integers(0, 256, (40, 52), dtype=np.uint8)
 DEEP = np.random.default_rng(4).integers(0, 4096, (40, 52), dtype=np.uint16)

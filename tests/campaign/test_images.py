@@ -16,10 +16,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from campaign.campaign_files import FRAMES, HEAD, put_campaign, put_frame
-from pixmetry.campaign import FrameReader, images, iter_frames, load_campaign, read_frame, write_frame
-from pixmetry.campaign.images import picture_files
-from pixmetry.campaign.raw_values import RawLayout
 from pixmetry.core.errors import InputError
+from pixmetry.files import FrameReader, images, iter_frames, load_campaign, read_frame, write_frame
+from pixmetry.files.images import picture_files
+from pixmetry.files.raw_values import RawLayout
 
 
 def refused(path: Path) -> str:

@@ -9,10 +9,10 @@ import pytest
 import tifffile
 
 from pixmetry import Frames, assess, campaign_of_arrays, emva1288
-from pixmetry.assessment import observe_campaign
-from pixmetry.campaign import EXAMPLE, Campaign, load_campaign, read_frame, write_manifest
+from pixmetry.assess.job import observe_campaign
 from pixmetry.core.errors import InputError
-from pixmetry.preflights import preflight_campaign
+from pixmetry.emva.planning.preflights import preflight_campaign
+from pixmetry.files import EXAMPLE, Campaign, load_campaign, read_frame, write_manifest
 
 
 def example() -> list[Frames]:

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from campaign.campaign_files import FRAMES, HEAD, put_campaign, put_frame
-from pixmetry.campaign import EXAMPLE, FrameReader, load_campaign, photons_from_irradiance, write_manifest
 from pixmetry.core.errors import InputError
+from pixmetry.files import EXAMPLE, FrameReader, load_campaign, photons_from_irradiance, write_manifest
 
 DARK = "frames:\n  - {kind: dark, exposure_s: 0.01, files: [d_0.png, d_1.png]}\n"
 BRIGHT = "  - {kind: bright, exposure_s: 0.01, files: [b_0.png, b_1.png]}\n"

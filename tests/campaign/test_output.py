@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 
 from campaign.failing import FAULTS, Failing
-from pixmetry.campaign import InputHashes, check_output, provenance_record, read_maps, staged_output, write_json, write_maps
-from pixmetry.campaign.output import MARKER, _host
 from pixmetry.core.errors import InputError
+from pixmetry.files import InputHashes, check_output, provenance_record, read_maps, staged_output, write_json, write_maps
+from pixmetry.files.output import MARKER, _host
 
 
 def content(folder: Path) -> dict[str, str]:
@@ -85,7 +85,7 @@ def test_a_swap_that_fails_anywhere_leaves_the_old_or_the_new_result(
             old = tree(target)
             with monkeypatch.context() as patch:
                 if inside:
-                    patch.setattr("pixmetry.campaign.output._place", lambda folder: folder)
+                    patch.setattr("pixmetry.files.output._place", lambda folder: folder)
                 failing = Failing(getattr(os, name), at, problem, after)
                 with suppress(OSError, InputError, KeyboardInterrupt), staged_output(target, "assessment") as stage:
                     for part in SECOND:
@@ -214,7 +214,7 @@ def test_two_runs_do_not_write_one_folder(tmp_path: Path) -> None:
             make(tmp_path / "result", "second")
         make(tmp_path / "other", "second")
     assert content(tmp_path / "result") == {"results.json": "first"}
-    code = "from pixmetry.campaign import staged_output; from pathlib import Path\n"
+    code = "from pixmetry.files import staged_output; from pathlib import Path\n"
     code += f"with staged_output({str(tmp_path / 'result')!r}, 'assessment') as s: print('in', flush=True); input()"
     with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
         assert other.stdout is not None and other.stdout.readline() == "in\n"

@@ -13,10 +13,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pixmetry.campaign import read_frame
-from pixmetry.campaign.images import load_frame
-from pixmetry.campaign.png import SIGNATURE, PlainPng
 from pixmetry.core.errors import InputError
+from pixmetry.files import read_frame
+from pixmetry.files.images import load_frame
+from pixmetry.files.png import SIGNATURE, PlainPng
 
 
 def chunk(kind: bytes, data: bytes) -> bytes:

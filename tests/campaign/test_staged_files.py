@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 
 from campaign.failing import FAULTS, Failing
-from pixmetry.campaign.staged_files import Output, check_files, write_page, write_together
 from pixmetry.core.errors import InputError
+from pixmetry.files.staged_files import Output, check_files, write_page, write_together
 
 MARK = re.compile(rb"ours ")
 NAMES = ("a.json", "b.xml", "c.html")

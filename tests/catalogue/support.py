@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from pixmetry.core.camera import Camera, Element
-from pixmetry.core.contribution import Probe
-from pixmetry.core.light import Points
+from pixmetry.camera.camera import Camera, Element
+from pixmetry.camera.contribution import Probe
+from pixmetry.camera.light import Points
+from pixmetry.camera.signal import Kind
+from pixmetry.camera.source import Parameters, Source
 from pixmetry.core.random import Grid
-from pixmetry.core.signal import Kind
-from pixmetry.core.source import Parameters, Source
 
 ETA, K_DN_PER_E = 0.5, 0.01  # of the ideal conversions of this module
 SHAPE = (48, 64)

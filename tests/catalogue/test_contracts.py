@@ -12,14 +12,14 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from catalogue.support import NAME, SHAPE, Amplitude, Texture, camera_with, kind_of, make_source, truth_maps
-from pixmetry.core import bands
-from pixmetry.core.camera import Camera, Element
-from pixmetry.core.catalogue import catalogue
-from pixmetry.core.contribution import CLASSES
+from pixmetry.camera import bands
+from pixmetry.camera.camera import Camera, Element
+from pixmetry.camera.catalogue import catalogue
+from pixmetry.camera.contribution import CLASSES
+from pixmetry.camera.signal import Kind, Signal
+from pixmetry.camera.source import Source, run
 from pixmetry.core.errors import ChainError, InputError
 from pixmetry.core.random import Grid
-from pixmetry.core.signal import Kind, Signal
-from pixmetry.core.source import Source, run
 
 SOURCES = catalogue()
 SCENE = Texture()

@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 
 from catalogue.support import Flat, Targets, camera_with, kind_of, lead_in, probe_of, soft_centroid, to_dn
-from pixmetry.core.camera import Camera
-from pixmetry.core.catalogue import catalogue
-from pixmetry.core.contribution import Probe
+from pixmetry.camera.camera import Camera
+from pixmetry.camera.catalogue import catalogue
+from pixmetry.camera.contribution import Probe
+from pixmetry.camera.signal import Kind
+from pixmetry.camera.source import Source
 from pixmetry.core.random import Grid
-from pixmetry.core.signal import Kind
-from pixmetry.core.source import Source
 
 SHAPE, SIZE, THRESHOLD_DN, BACKGROUND_DN = (320, 400), 21, 20.0, 10.0
 UNITS, TARGETS = 64, 40

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from pixmetry.core.catalogue import catalogue
+from pixmetry.camera.catalogue import catalogue
 
 FOR_DEVELOPERS = re.compile(r"\b(later|todo|fixme|not (yet )?implemented|to be done)\b", re.I)
 

@@ -10,23 +10,23 @@ import numpy as np
 import pytest
 
 from catalogue.support import IDEAL, Amplitude, Flat, Nothing, Texture, lead_in, make_source
-from pixmetry.cable.termination import SOURCE as TERMINATION
-from pixmetry.cable.termination import Termination
-from pixmetry.core import bands
-from pixmetry.core.camera import Camera, Element, build_camera, load_camera
-from pixmetry.core.catalogue import get_source
+from pixmetry.camera import bands
+from pixmetry.camera.camera import Camera, Element, build_camera, load_camera
+from pixmetry.camera.catalogue import get_source
+from pixmetry.camera.overrides import changed_camera
+from pixmetry.camera.signal import Kind, Windows
 from pixmetry.core.errors import ChainError, InputError
-from pixmetry.core.overrides import changed_camera
 from pixmetry.core.random import Grid
-from pixmetry.core.signal import Kind, Windows
-from pixmetry.grabber.clamp import SOURCE as CLAMP
-from pixmetry.grabber.clamp import Clamp
-from pixmetry.sensor.charge_transfer import SOURCE as CHARGE_TRANSFER
-from pixmetry.sensor.charge_transfer import ChargeTransfer
-from pixmetry.sensor.prnu import SOURCE as PRNU
-from pixmetry.sensor.prnu import Prnu
-from pixmetry.sensor.shot_noise import SOURCE as SHOT_NOISE
-from pixmetry.sensor.shot_noise import ShotNoise
+from pixmetry.sources.cable.termination import SOURCE as TERMINATION
+from pixmetry.sources.cable.termination import Termination
+from pixmetry.sources.grabber.clamp import SOURCE as CLAMP
+from pixmetry.sources.grabber.clamp import Clamp
+from pixmetry.sources.sensor.charge_transfer import SOURCE as CHARGE_TRANSFER
+from pixmetry.sources.sensor.charge_transfer import ChargeTransfer
+from pixmetry.sources.sensor.prnu import SOURCE as PRNU
+from pixmetry.sources.sensor.prnu import Prnu
+from pixmetry.sources.sensor.shot_noise import SOURCE as SHOT_NOISE
+from pixmetry.sources.sensor.shot_noise import ShotNoise
 
 SHAPE = (70, 90)
 SCENE = Texture()
@@ -448,8 +448,8 @@ def test_windows_widened_to_blocks_stay_in_the_frame() -> None:
 
 def test_the_whole_catalogue_has_an_order() -> None:
     """Tape is of the stage of storage, yet plays before the grabber; in-camera processing comes before the codecs."""
-    from pixmetry.core.camera import in_order
-    from pixmetry.core.catalogue import catalogue
+    from pixmetry.camera.camera import in_order
+    from pixmetry.camera.catalogue import catalogue
 
     names = [s.id for s in in_order([s for s in catalogue().values() if s.forward is not None])]
     assert len(names) == sum(s.forward is not None for s in catalogue().values())

@@ -9,13 +9,13 @@ import pytest
 from scipy.special import erf
 
 from catalogue.support import IDEAL, NAME, Texture, make_source
-from pixmetry.core._camera_kernels import decimate
-from pixmetry.core.camera import Camera, Element
+from pixmetry.camera._camera_kernels import decimate
+from pixmetry.camera.camera import Camera, Element
+from pixmetry.camera.light import FINE, Light, Points
+from pixmetry.camera.signal import Kind, Signal
+from pixmetry.camera.source import Parameters
 from pixmetry.core.errors import ChainError, InputError
-from pixmetry.core.light import FINE, Light, Points
 from pixmetry.core.random import Grid
-from pixmetry.core.signal import Kind, Signal
-from pixmetry.core.source import Parameters
 from pixmetry.scene.outlines import line
 from pixmetry.scene.picture import Picture
 from pixmetry.scene.shapes import Shapes

@@ -7,14 +7,14 @@ import pytest
 from scipy import signal as sps
 
 from catalogue.support import NAME, Flat, Targets, Texture, camera_with, make_source
-from pixmetry.cable.termination import Termination
-from pixmetry.core.camera import Camera, Element
-from pixmetry.core.catalogue import get_source
+from pixmetry.camera.camera import Camera, Element
+from pixmetry.camera.catalogue import get_source
+from pixmetry.camera.line import Line, correlated_rows, group_delay_s, reach_px
+from pixmetry.camera.signal import Kind
+from pixmetry.camera.source import Parameters
 from pixmetry.core.errors import ParameterError
-from pixmetry.core.line import Line, correlated_rows, group_delay_s, reach_px
 from pixmetry.core.random import Grid
-from pixmetry.core.signal import Kind
-from pixmetry.core.source import Parameters
+from pixmetry.sources.cable.termination import Termination
 
 F = 14.1875e6
 RNG = np.random.default_rng(5)
@@ -318,7 +318,7 @@ def test_the_near_context_suffices_and_noise_is_not_taken_out_again() -> None:
 
 def test_true_positions_follow_the_clock_as_it_warms_up() -> None:
     """Samples that look at the place, by the exact staircase: the column whose reading time is that of the pixel's middle."""
-    from pixmetry.core.camera import load_camera
+    from pixmetry.camera.camera import load_camera
 
     camera = load_camera("pulnix_tm6cn_epix_512")
     clock = camera["grabber.clock_warm_up"].params

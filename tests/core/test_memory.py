@@ -10,12 +10,12 @@ from pathlib import Path
 import pytest
 
 from pixmetry import load_camera
-from pixmetry.campaign import read_frame
-from pixmetry.campaign.images import read_picture
 from pixmetry.core.errors import InputError
 from pixmetry.core.memory import available_bytes, check_memory
+from pixmetry.files import read_frame
+from pixmetry.files.images import read_picture
 from pixmetry.scene.uniform import Uniform
-from pixmetry.simulation import simulate
+from pixmetry.simulate.job import simulate
 
 
 def test_what_is_free_is_what_the_system_says() -> None:

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from catalogue.support import Texture
-from pixmetry.core import bands
-from pixmetry.core.camera import Camera, load_camera
+from pixmetry.camera import bands
+from pixmetry.camera.camera import Camera, load_camera
 from pixmetry.core.random import Grid
 from pixmetry.scene.uniform import Uniform
 
-PRESETS = sorted(p.name.removesuffix(".yaml") for p in (files("pixmetry") / "cameras").iterdir() if p.name.endswith(".yaml"))
+PRESETS = sorted(p.name.removesuffix(".yaml") for p in (files("pixmetry.camera") / "presets").iterdir() if p.name.endswith(".yaml"))
 SCENE = Texture(mean_dn=200.0)
 SMALL = (96, 128)
 LAYOUT = {"grabber.sampling_clock": {"samples": 84}, "grabber.window_offset": {"row_offset": 8, "rows": 64}}
@@ -61,7 +61,7 @@ def test_published_noise_of_single_frames(name: str) -> None:
 
 @pytest.mark.parametrize("name", PRESETS)
 def test_numbers_say_where_they_come_from(name: str) -> None:
-    text = (files("pixmetry") / "cameras" / f"{name}.yaml").read_text(encoding="utf-8")
+    text = (files("pixmetry.camera") / "presets" / f"{name}.yaml").read_text(encoding="utf-8")
     assert text.startswith("#") and re.search(r"\[assumed\]|typical of the class|none is of one data sheet", text)
     assert load_camera(name).name == name
 

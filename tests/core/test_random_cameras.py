@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from catalogue.support import Texture
-from pixmetry.core import bands
-from pixmetry.core.camera import Camera, Element, in_order
-from pixmetry.core.catalogue import catalogue
+from pixmetry.camera import bands
+from pixmetry.camera.camera import Camera, Element, in_order
+from pixmetry.camera.catalogue import catalogue
+from pixmetry.camera.signal import Kind
 from pixmetry.core.random import Grid
-from pixmetry.core.signal import Kind
 from pixmetry.scene.discs import Discs
 from pixmetry.scene.motion import Motion
 from pixmetry.scene.picture import Picture

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pixmetry.core.catalogue import add_source_file, catalogue
+from pixmetry.camera.catalogue import add_source_file, catalogue
 from pixmetry.core.errors import ChainError, InputError
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "adding-a-source.md"

@@ -8,13 +8,13 @@ import shutil
 import numpy as np
 import pytest
 
-from pixmetry.core.camera import Camera, Element, build_camera, load_camera
-from pixmetry.core.catalogue import get_source
+from pixmetry.camera.camera import Camera, Element, build_camera, load_camera
+from pixmetry.camera.catalogue import get_source
+from pixmetry.camera.overrides import changed_camera
+from pixmetry.camera.unit_maps import MeasuredUnit
 from pixmetry.core.errors import InputError
-from pixmetry.core.overrides import changed_camera
-from pixmetry.core.unit_maps import MeasuredUnit
 from pixmetry.scene.uniform import Uniform
-from pixmetry.simulation import simulate
+from pixmetry.simulate.job import simulate
 
 SHAPE = (48, 64)
 PHOTONS = 4000.0

@@ -7,11 +7,11 @@ import secrets
 import numpy as np
 import pytest
 
-from pixmetry.core.signal import Kind, Signal
-from pixmetry.electronics.supply_pickup import SupplyPickup
-from pixmetry.electronics.supply_pickup import correct as correct_supply
-from pixmetry.grabber.phase_pattern import PhasePattern
-from pixmetry.grabber.phase_pattern import correct as correct_pattern
+from pixmetry.camera.signal import Kind, Signal
+from pixmetry.sources.electronics.supply_pickup import SupplyPickup
+from pixmetry.sources.electronics.supply_pickup import correct as correct_supply
+from pixmetry.sources.grabber.phase_pattern import PhasePattern
+from pixmetry.sources.grabber.phase_pattern import correct as correct_pattern
 from source_signals import signal
 
 ROWS, COLS, PITCH = 240, 360, 30

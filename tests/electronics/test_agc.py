@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from pixmetry.camera.signal import Kind
 from pixmetry.core.errors import InputError
-from pixmetry.core.signal import Kind
-from pixmetry.electronics.agc import SOURCE, Agc, start
+from pixmetry.sources.electronics.agc import SOURCE, Agc, start
 from source_signals import flat, signal, spot_probe, stream
 
 SHAPE = (20, 30)

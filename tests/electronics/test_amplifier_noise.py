@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from pixmetry.camera.observations import Observations
 from pixmetry.core.errors import MeasureError
-from pixmetry.core.observations import Observations
-from pixmetry.electronics.amplifier_noise import SOURCE, AmplifierNoise
+from pixmetry.sources.electronics.amplifier_noise import SOURCE, AmplifierNoise
 from source_signals import ALPHA, K_DN_PER_E, Z, fitted, flat, spot_probe, stream
 
 

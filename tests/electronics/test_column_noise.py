@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from pixmetry.core.contribution import Probe
+from pixmetry.camera.contribution import Probe
+from pixmetry.camera.signal import Kind
 from pixmetry.core.random import Grid
-from pixmetry.core.signal import Kind
-from pixmetry.electronics.column_noise import ColumnNoise, forward, propagate, truth
+from pixmetry.sources.electronics.column_noise import ColumnNoise, forward, propagate, truth
 from source_signals import ALPHA, Z, flat, stream
 
 

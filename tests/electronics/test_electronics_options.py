@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from pixmetry.core.signal import Kind
-from pixmetry.electronics import amplifier_noise, gamma, supply_pickup
-from pixmetry.electronics.amplifier_noise import AmplifierNoise
-from pixmetry.electronics.gamma import Gamma
-from pixmetry.electronics.supply_pickup import SupplyPickup
+from pixmetry.camera.signal import Kind
+from pixmetry.sources.electronics import amplifier_noise, gamma, supply_pickup
+from pixmetry.sources.electronics.amplifier_noise import AmplifierNoise
+from pixmetry.sources.electronics.gamma import Gamma
+from pixmetry.sources.electronics.supply_pickup import SupplyPickup
 from source_signals import ALPHA, flat, signal, spot_probe, stream
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pixmetry.electronics.flicker_noise import FlickerNoise, covariance, forward
+from pixmetry.sources.electronics.flicker_noise import FlickerNoise, covariance, forward
 from source_signals import Z, flat, stream
 
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from pixmetry.camera.observations import Observations
+from pixmetry.camera.signal import Kind
 from pixmetry.core.errors import InputError, MeasureError
-from pixmetry.core.observations import Observations
-from pixmetry.core.signal import Kind
-from pixmetry.electronics.gain import SOURCE
-from pixmetry.sensor.shot_noise import SOURCE as SHOT
+from pixmetry.sources.electronics.gain import SOURCE
+from pixmetry.sources.sensor.shot_noise import SOURCE as SHOT
 from source_signals import Z, fitted, flat, signal, stream
 
 

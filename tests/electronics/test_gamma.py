@@ -7,15 +7,15 @@ import re
 import numpy as np
 import pytest
 
+from pixmetry.camera.observations import LevelMoments, Observations, PhotonTransfer
+from pixmetry.camera.signal import Kind
 from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.core.estimates import Estimates
-from pixmetry.core.observations import LevelMoments, Observations, PhotonTransfer
-from pixmetry.core.signal import Kind
-from pixmetry.electronics.gamma import SOURCE, Gamma
-from pixmetry.electronics.nonlinearity import SOURCE as NONLINEARITY
-from pixmetry.electronics.nonlinearity import Nonlinearity
-from pixmetry.experiment.observe import Group, observe
-from pixmetry.sensor.shot_noise import SOURCE as SHOT
+from pixmetry.observe.observe import Group, observe
+from pixmetry.sources.electronics.gamma import SOURCE, Gamma
+from pixmetry.sources.electronics.nonlinearity import SOURCE as NONLINEARITY
+from pixmetry.sources.electronics.nonlinearity import Nonlinearity
+from pixmetry.sources.sensor.shot_noise import SOURCE as SHOT
 from source_signals import K_DN_PER_E, Z, centroid_probe, flat, signal, spots, stream
 
 TV = Gamma(gamma=0.45, reference_dn=1000.0)

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from pixmetry.core.signal import Kind
-from pixmetry.electronics.hdr_gain import SOURCE, HdrGain
+from pixmetry.camera.signal import Kind
+from pixmetry.sources.electronics.hdr_gain import SOURCE, HdrGain
 from source_signals import Z, centroid, flat, signal, spot_probe, stream
 
 

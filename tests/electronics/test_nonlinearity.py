@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from pixmetry.camera.observations import Observations
+from pixmetry.camera.signal import Kind
 from pixmetry.core.errors import InputError, MeasureError
-from pixmetry.core.observations import Observations
-from pixmetry.core.signal import Kind
-from pixmetry.electronics.nonlinearity import SOURCE, Nonlinearity
+from pixmetry.sources.electronics.nonlinearity import SOURCE, Nonlinearity
 from source_signals import centroid, centroid_probe, fitted, signal, spot_probe, spots, stream
 
 BENT = Nonlinearity(a1=-0.05, a2=0.08, a3=-0.1, reference_dn=1000.0)

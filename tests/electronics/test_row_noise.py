@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from pixmetry.camera.observations import Observations
 from pixmetry.core.errors import MeasureError
-from pixmetry.core.observations import Observations
-from pixmetry.electronics.row_noise import SOURCE, RowNoise
+from pixmetry.sources.electronics.row_noise import SOURCE, RowNoise
 from source_signals import ALPHA, centroid_probe, fitted, flat, stream
 
 SHAPE = (300, 400)

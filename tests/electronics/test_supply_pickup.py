@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from pixmetry.camera.observations import Observations, StackMoments
+from pixmetry.camera.signal import Kind
 from pixmetry.core.errors import InputError
-from pixmetry.core.observations import Observations, StackMoments
 from pixmetry.core.random import Stream
-from pixmetry.core.signal import Kind
-from pixmetry.electronics.supply_pickup import SupplyPickup, correct, forward, propagate, seen_per_px
-from pixmetry.experiment.patterns import find_phase_patterns
-from pixmetry.grabber.phase_pattern import measure as measure_pattern
+from pixmetry.observe.patterns import find_phase_patterns
+from pixmetry.sources.electronics.supply_pickup import SupplyPickup, correct, forward, propagate, seen_per_px
+from pixmetry.sources.grabber.phase_pattern import measure as measure_pattern
 from source_signals import ALPHA, Z, centroid_probe, flat, signal, spots, stream
 
 SHAPE = (64, 96)

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from pixmetry.core.signal import Kind
-from pixmetry.electronics.tap_gain import TapGain, correct, forward, propagate, truth
+from pixmetry.camera.signal import Kind
+from pixmetry.sources.electronics.tap_gain import TapGain, correct, forward, propagate, truth
 from source_signals import centroid, centroid_probe, signal, spots, stream
 
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from pixmetry.camera.signal import Kind, Signal
 from pixmetry.core.random import Grid, Streams
-from pixmetry.core.signal import Kind, Signal
-from pixmetry.electronics.telegraph_noise import TelegraphNoise, forward, propagate, truth
+from pixmetry.sources.electronics.telegraph_noise import TelegraphNoise, forward, propagate, truth
 from source_signals import ALPHA, K_DN_PER_E, Z, spot_probe, stream
 
 SHAPE = (300, 400)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pixmetry.electronics.video_amplifier import SOURCE, VideoAmplifier
+from pixmetry.sources.electronics.video_amplifier import SOURCE, VideoAmplifier
 from video_signals import PIXEL_HZ, bump, centre, row_of, sampled, video
 
 

@@ -10,11 +10,11 @@ from scipy import stats
 
 from emva import truths as rules
 from emva.foreign_cameras import ForeignCamera
-from pixmetry.assessment import measure_sources
+from pixmetry.assess.job import measure_sources
 from pixmetry.core.errors import PixmetryError
 from pixmetry.emva.evaluate import evaluate
 from pixmetry.emva.records import Measurement
-from pixmetry.experiment.observe import Group, observe
+from pixmetry.observe.observe import Group, observe
 
 SKIPPED = ("index_", "shading_pp", "hot_", "cold_", "dead_", "gain_fraction", "noisy_", "frequency_", "moving", "hot_median")
 

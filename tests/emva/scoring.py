@@ -9,10 +9,10 @@ import numpy as np
 from scipy import stats
 
 from emva.cameras import Camera
-from pixmetry.core.observations import PhotonTransfer
+from pixmetry.camera.observations import PhotonTransfer
 from pixmetry.emva.records import Measurement, Results, Value
-from pixmetry.experiment.moments import LevelAccumulator, level_moments
-from pixmetry.experiment.stack import StackAccumulator
+from pixmetry.observe.moments import LevelAccumulator, level_moments
+from pixmetry.observe.stack import StackAccumulator
 
 
 def measured(camera: Camera) -> Measurement:

@@ -15,8 +15,8 @@ from emva.cameras import Camera, random_camera
 from emva.scoring import Score, collect, measured
 from emva.truths import Levels, filter_gains, high_passed, levels, temporal, truths
 from pixmetry.emva.evaluate import evaluate
-from pixmetry.emva.high_pass import high_pass, pattern_gains
 from pixmetry.emva.records import RELEASES, Series
+from pixmetry.emva.spatial.high_pass import high_pass, pattern_gains
 from pixmetry.emva.temporal import temporal_values
 
 ALPHA = 1e-6

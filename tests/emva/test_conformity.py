@@ -11,9 +11,9 @@ import pytest
 from scipy import integrate, stats
 
 from data_sheets import measured, value
-from pixmetry.comparing import load
 from pixmetry.core.errors import InputError, ParameterError
-from pixmetry.emva.conformity import Limits, check, judge, judge_value, load_limits
+from pixmetry.emva.judge.compare import load
+from pixmetry.emva.judge.conformity import Limits, check, judge, judge_value, load_limits
 from pixmetry.emva.records import Value
 
 ALPHA = 1e-6  # false failures of the statistical tests

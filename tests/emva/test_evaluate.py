@@ -13,17 +13,17 @@ from emva.cameras import Camera
 from emva.scoring import measured
 from emva.truths import truths
 from pixmetry import Frames, campaign_of_arrays, emva1288
+from pixmetry.camera.observations import LevelMoments
 from pixmetry.core.errors import InputError
-from pixmetry.core.observations import LevelMoments
 from pixmetry.emva.evaluate import bootstrap_u, evaluate, standard_values
-from pixmetry.emva.frame_products import frame_products
-from pixmetry.emva.general import general_notes
-from pixmetry.emva.keys import KEYS, NONLINEAR, OVER_TEMPERATURES, key_of
+from pixmetry.emva.files.keys import KEYS, NONLINEAR, OVER_TEMPERATURES, key_of
+from pixmetry.emva.general.general import general_notes
 from pixmetry.emva.linear_model import departure_bounds, linear_model
 from pixmetry.emva.records import RELEASES, Measurement, Results
 from pixmetry.emva.series import series_of
-from pixmetry.experiment.moments import LevelAccumulator
-from pixmetry.experiment.moments import level_moments as moments_of
+from pixmetry.emva.spatial.frame_products import frame_products
+from pixmetry.observe.moments import LevelAccumulator
+from pixmetry.observe.moments import level_moments as moments_of
 
 ONLY_4_0 = {"LE", "PTC_linearity"} | {key for key in KEYS if key.startswith("general_")}
 DRAWS = 1000

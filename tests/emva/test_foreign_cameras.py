@@ -14,12 +14,12 @@ from scipy import stats
 
 from emva.foreign_cameras import ForeignCamera, random_camera
 from emva.foreign_scoring import groups, outcomes, physical_truths
-from pixmetry.core.observations import Observations
+from pixmetry.camera.observations import Observations
 from pixmetry.emva.evaluate import evaluate
-from pixmetry.emva.keys import KEYS
+from pixmetry.emva.files.keys import KEYS
 from pixmetry.emva.records import Measurement
-from pixmetry.experiment.observe import Group, observe
-from pixmetry.experiment.photon_transfer_levels import levels_from, light_scale, usable_levels
+from pixmetry.observe.observe import Group, observe
+from pixmetry.observe.photon_transfer_levels import levels_from, light_scale, usable_levels
 
 ALPHA = 1e-6
 

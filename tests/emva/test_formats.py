@@ -15,11 +15,11 @@ from hypothesis import strategies as st
 
 from data_sheets import assert_same, full, sheet, value, written
 from pixmetry.core.errors import InputError
-from pixmetry.emva.formats import read_sheet, sheet_of_record, to_record
-from pixmetry.emva.keys import KEYS
+from pixmetry.emva.files.formats import read_sheet, sheet_of_record, to_record
+from pixmetry.emva.files.keys import KEYS
+from pixmetry.emva.files.units import plain_unit
+from pixmetry.emva.files.xml_format import sheet_of_xml, xml_text
 from pixmetry.emva.records import Value
-from pixmetry.emva.units import plain_unit
-from pixmetry.emva.xml_format import sheet_of_xml, xml_text
 
 ROOT = Path(__file__).resolve().parents[2]
 PYTHON = ROOT / ".venv-oracles" / "bin" / "python"
@@ -297,5 +297,5 @@ def test_we_read_what_the_reference_implementation_writes(tmp_path: Path) -> Non
 
 
 def test_reading_needs_no_heavy_library() -> None:
-    code = "import sys, pixmetry.emva.xml_format; print([m for m in ('scipy', 'pydantic', 'lxml') if m in sys.modules])"
+    code = "import sys, pixmetry.emva.files.xml_format; print([m for m in ('scipy', 'pydantic', 'lxml') if m in sys.modules])"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "[]"

@@ -13,8 +13,8 @@ import pytest
 from scipy import optimize, stats
 
 from pixmetry.core.errors import MeasureError
-from pixmetry.emva.general import general_curve, general_evaluation, general_notes, general_values
-from pixmetry.emva.general_model import levels_of, make_plan, with_setting_errors
+from pixmetry.emva.general.general import general_curve, general_evaluation, general_notes, general_values
+from pixmetry.emva.general.general_model import levels_of, make_plan, with_setting_errors
 from pixmetry.emva.records import Series
 
 ALPHA = 1e-6

@@ -7,7 +7,7 @@ import pytest
 from scipy.signal import convolve2d
 
 from pixmetry.core.errors import MeasureError
-from pixmetry.emva.high_pass import high_pass, passed_power, pattern_gains
+from pixmetry.emva.spatial.high_pass import high_pass, passed_power, pattern_gains
 
 
 def kernel() -> np.ndarray:

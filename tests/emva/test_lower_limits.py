@@ -11,12 +11,12 @@ import pytest
 
 from emva.cameras import Camera
 from emva.scoring import measured
-from pixmetry.emva.conformity import Limit, judge_value
-from pixmetry.emva.differences import Subject, difference_of
 from pixmetry.emva.evaluate import evaluate
-from pixmetry.emva.formats import json_text, read_sheet
+from pixmetry.emva.files.formats import json_text, read_sheet
+from pixmetry.emva.files.xml_format import xml_text
+from pixmetry.emva.judge.conformity import Limit, judge_value
+from pixmetry.emva.judge.differences import Subject, difference_of
 from pixmetry.emva.records import DataSheet, Results, Value
-from pixmetry.emva.xml_format import xml_text
 
 SHORT = Camera(seed=21, over=0.5, shape=(48, 64), levels=20, stack_frames=16)  # the light ends at half of saturation
 LONG = replace(SHORT, over=1.1)

@@ -13,8 +13,8 @@ import pytest
 from scipy import stats
 
 from experiment.simulated_camera import Camera, drawn_record, truth
-from pixmetry.core.observations import StackMoments
-from pixmetry.emva.nonlinear import nonlinear_values
+from pixmetry.camera.observations import StackMoments
+from pixmetry.emva.general.nonlinear import nonlinear_values
 from pixmetry.emva.records import Measurement
 
 ALPHA = 1e-6

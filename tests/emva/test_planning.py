@@ -7,12 +7,12 @@ import pytest
 from scipy import stats
 from scipy.ndimage import convolve1d
 
-from pixmetry.campaign.manifest import load_campaign
 from pixmetry.core.errors import InputError
-from pixmetry.emva.known_camera import KnownCamera, camera_from_results, camera_from_sheet
-from pixmetry.emva.plan_output import parse_wanted, plan_text, write_campaign
-from pixmetry.emva.planning import Plan, plan_for, predicted_u, with_scatter
+from pixmetry.emva.planning.known_camera import KnownCamera, camera_from_results, camera_from_sheet
+from pixmetry.emva.planning.plan_output import parse_wanted, plan_text, write_campaign
+from pixmetry.emva.planning.planning import Plan, plan_for, predicted_u, with_scatter
 from pixmetry.emva.records import DataSheet, Results, Value
+from pixmetry.files.manifest import load_campaign
 
 ALPHA = 1e-6
 CCD = KnownCamera(480, 640, 12, 0.28, 10.9, 14000, 0.3, 0.2, 0.5, 0.0026, 0.0005, 0.001, row_noise_e=1.8, quantum_efficiency=0.45)

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from pixmetry.core.errors import InputError, MeasureError
-from pixmetry.emva.planning import plan_for
-from pixmetry.emva.preflight import BrightLevel, _numbers, camera_from_preflight, preflight, preflight_text
-from pixmetry.emva.preflight_checks import Z
+from pixmetry.emva.planning.planning import plan_for
+from pixmetry.emva.planning.preflight import BrightLevel, _numbers, camera_from_preflight, preflight, preflight_text
+from pixmetry.emva.planning.preflight_checks import Z
 
 SHAPE = (100, 140)
 

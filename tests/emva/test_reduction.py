@@ -14,12 +14,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
+from pixmetry.camera.observations import LevelMoments, StackMoments
 from pixmetry.core.errors import InputError, MeasureError
-from pixmetry.core.observations import LevelMoments, StackMoments
 from pixmetry.emva.records import Measurement
 from pixmetry.emva.reduction import CHANNELS, MOSAICS, measure_frames, phases
-from pixmetry.experiment.moments import LevelAccumulator, summarize_pair
-from pixmetry.experiment.one_pass import Group
+from pixmetry.observe.moments import LevelAccumulator, summarize_pair
+from pixmetry.observe.one_pass import Group
 
 SHAPE, BITS = (26, 34), 12
 

@@ -17,13 +17,13 @@ from scipy.ndimage import uniform_filter
 from scipy.signal import convolve2d
 from scipy.stats import ncx2
 
+from pixmetry.camera.observations import StackMoments
 from pixmetry.core.errors import InputError, MeasureError
-from pixmetry.core.observations import StackMoments
-from pixmetry.emva import frame_products as products_module
-from pixmetry.emva.frame_products import frame_products
-from pixmetry.emva.spatial import SpatialInputs, snr_total_max, spatial_evaluation, spatial_variances
+from pixmetry.emva.spatial import frame_products as products_module
+from pixmetry.emva.spatial.frame_products import frame_products
+from pixmetry.emva.spatial.spatial import SpatialInputs, snr_total_max, spatial_evaluation, spatial_variances
 from pixmetry.emva.uncertainty import add_wave
-from pixmetry.experiment.stack import StackAccumulator
+from pixmetry.observe.stack import StackAccumulator
 
 QUANTILE = 4.9
 SHAPE = (40, 48)
@@ -381,7 +381,7 @@ WHOLE = Path(os.environ.get("PIXMETRY_DATA", "")) / "emva1288-set-001"
 )
 def test_published_values_of_set_001() -> None:
     """Every spatial scalar that the reference implementation 1.0.2 prints, within 1e-9 of its largest summand."""
-    from pixmetry.campaign.images import read_frame
+    from pixmetry.files.images import read_frame
 
     stacks = [stack_of([read_frame(p) for p in sorted((WHOLE / "images").glob(f"{kind}_s_*"))]) for kind in "db"]
     dark, bright = (SpatialInputs.of(stack, high_pass=False) for stack in stacks)

@@ -10,15 +10,15 @@ from scipy import stats
 
 from emva.cameras import Camera
 from emva.truths import levels, temporal
+from pixmetry.camera.observations import PhotonTransfer
 from pixmetry.core.errors import MeasureError
-from pixmetry.core.observations import PhotonTransfer
+from pixmetry.emva.general.smooth import choose_degree, fit_scatter, fit_smooth
 from pixmetry.emva.records import Measurement
 from pixmetry.emva.scatter import GROUPS, sampling_u, scatter_of, spatial_scatter, unsaturated
 from pixmetry.emva.series import series_of
-from pixmetry.emva.smooth import choose_degree, fit_scatter, fit_smooth
 from pixmetry.emva.temporal import temporal_values
 from pixmetry.emva.uncertainty import about, add_wave, bootstrap_series, draw_blocks
-from pixmetry.experiment.moments import LevelAccumulator, level_moments, summarize_pair
+from pixmetry.observe.moments import LevelAccumulator, level_moments, summarize_pair
 
 ALPHA = 1e-6
 Z = float(stats.norm.isf(ALPHA / 2))

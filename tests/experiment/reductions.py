@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from pixmetry.experiment.stack import GroupReduction, new_group
+from pixmetry.observe.stack import GroupReduction, new_group
 
 
 def reduced(frames: Iterable[np.ndarray], bits: int = 12, kind: str = "stack", spectra_pairs: int = 8) -> GroupReduction:

@@ -8,7 +8,7 @@ from math import comb, erfc, exp, pi, sqrt
 
 import numpy as np
 
-from pixmetry.core.observations import LevelMoments, PhotonTransfer
+from pixmetry.camera.observations import LevelMoments, PhotonTransfer
 
 
 @dataclass(frozen=True)

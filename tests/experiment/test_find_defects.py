@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from pixmetry.core.observations import StackMoments
-from pixmetry.experiment.defects import find_defects, rounding_error_dn
-from pixmetry.experiment.stack import StackAccumulator
+from pixmetry.camera.observations import StackMoments
+from pixmetry.observe.defects import find_defects, rounding_error_dn
+from pixmetry.observe.stack import StackAccumulator
 
 ALPHA = 1e-6  # false-failure rate, for any seed
 

@@ -7,7 +7,7 @@ import secrets
 import numpy as np
 import pytest
 
-from pixmetry.experiment.hot_pixels import tail_of_counts, tail_of_map
+from pixmetry.observe.hot_pixels import tail_of_counts, tail_of_map
 
 SHAPE = (200, 300)
 PIXELS = SHAPE[0] * SHAPE[1]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pixmetry.core.observations import Observations
-from pixmetry.experiment.observe import Group, observe
+from pixmetry.camera.observations import Observations
+from pixmetry.observe.observe import Group, observe
 
 SHAPE, GAIN, FULL_E = (48, 64), 0.25, 14000.0
 PRNU, DARK_E_PER_S = 0.01, 2000.0

@@ -6,7 +6,7 @@ import numpy as np
 from scipy import stats
 
 from pixmetry import Frames, campaign_of_arrays
-from pixmetry.assessment import observe_campaign
+from pixmetry.assess.job import observe_campaign
 
 CAMERAS = 100
 

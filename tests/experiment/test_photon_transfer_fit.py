@@ -10,11 +10,11 @@ import pytest
 from scipy import stats
 
 from experiment.simulated_camera import Camera, drawn_levels, drawn_record, framed_record, random_camera, reference_u, truth
+from pixmetry.camera.observations import LevelMoments, PhotonTransfer, StackMoments
 from pixmetry.core.errors import MeasureError
-from pixmetry.core.observations import LevelMoments, PhotonTransfer, StackMoments
 from pixmetry.emva.evaluate import standard_values
 from pixmetry.emva.records import Measurement
-from pixmetry.experiment.photon_transfer_fit import fit_photon_transfer
+from pixmetry.observe.photon_transfer_fit import fit_photon_transfer
 
 RNG = np.random.default_rng()  # the tests must hold for any seed
 KS_PARAMETERS = (

@@ -15,10 +15,10 @@ from scipy import stats
 
 from experiment.reductions import reduced
 from pixmetry.core.errors import InputError, MeasureError
-from pixmetry.experiment.histogram import HistogramAccumulator, code_errors
-from pixmetry.experiment.moments import LevelAccumulator, level_moments
-from pixmetry.experiment.spectra import SpectraAccumulator
-from pixmetry.experiment.stack import StackAccumulator, new_group
+from pixmetry.observe.histogram import HistogramAccumulator, code_errors
+from pixmetry.observe.moments import LevelAccumulator, level_moments
+from pixmetry.observe.spectra import SpectraAccumulator
+from pixmetry.observe.stack import StackAccumulator, new_group
 
 ALPHA = 1e-6
 

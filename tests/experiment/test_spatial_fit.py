@@ -13,15 +13,15 @@ import pytest
 from scipy import stats
 
 from experiment.reductions import reduced
+from pixmetry.camera.observations import DefectList, PatternList, StackMoments
 from pixmetry.core.errors import InputError, MeasureError
-from pixmetry.core.observations import DefectList, PatternList, StackMoments
-from pixmetry.emva.spatial import spatial_variances
-from pixmetry.emva.spatial_inputs import SpatialInputs
-from pixmetry.experiment.defects import find_defects
-from pixmetry.experiment.patterns import find_phase_patterns
-from pixmetry.experiment.spatial_fit import fit_spatial
-from pixmetry.experiment.stack import StackAccumulator
-from pixmetry.experiment.surface import fit_surface
+from pixmetry.emva.spatial.spatial import spatial_variances
+from pixmetry.emva.spatial.spatial_inputs import SpatialInputs
+from pixmetry.observe.defects import find_defects
+from pixmetry.observe.patterns import find_phase_patterns
+from pixmetry.observe.spatial_fit import fit_spatial
+from pixmetry.observe.stack import StackAccumulator
+from pixmetry.observe.surface import fit_surface
 
 ALPHA = 1e-6
 SHAPE = (48, 64)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from pixmetry.camera.observations import CodeErrors, Observations
+from pixmetry.camera.signal import Kind, Windows
 from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.core.estimates import Estimates
-from pixmetry.core.observations import CodeErrors, Observations
 from pixmetry.core.random import Stream
-from pixmetry.core.signal import Kind, Windows
-from pixmetry.grabber.adc import SOURCE, Adc, correct, forward, measure, thresholds
+from pixmetry.sources.grabber.adc import SOURCE, Adc, correct, forward, measure, thresholds
 from source_signals import Z, signal, stream
 
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from catalogue.support import Flat, Targets, Texture, lead_in
-from pixmetry.core.camera import Camera, Element, in_order
-from pixmetry.core.catalogue import get_source
+from pixmetry.camera.camera import Camera, Element, in_order
+from pixmetry.camera.catalogue import get_source
+from pixmetry.camera.signal import Kind
 from pixmetry.core.errors import ChainError
 from pixmetry.core.random import Grid
-from pixmetry.core.signal import Kind
 
 CHAIN = {
     "electronics.video_amplifier": {"natural_mhz": 7.0, "damping": 0.6},

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import signal as sps
 
-from pixmetry.core.signal import Kind, Windows
-from pixmetry.grabber.clamp import SOURCE, Clamp
+from pixmetry.camera.signal import Kind, Windows
+from pixmetry.sources.grabber.clamp import SOURCE, Clamp
 from source_signals import Z, flat, signal, stream
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pixmetry.grabber.clock_warm_up import SOURCE, ClockWarmUp, truth
+from pixmetry.sources.grabber.clock_warm_up import SOURCE, ClockWarmUp, truth
 from source_signals import stream
 from video_signals import PIXEL_HZ, bump, centre, row_of, sampled, video
 

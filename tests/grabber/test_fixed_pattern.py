@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pixmetry.camera.signal import Kind
 from pixmetry.core.errors import MeasureError
-from pixmetry.core.signal import Kind
-from pixmetry.grabber.fixed_pattern import FixedPattern, forward, measure
+from pixmetry.sources.grabber.fixed_pattern import FixedPattern, forward, measure
 from source_signals import Z, flat, stream
 
 PARAMS = FixedPattern(settling_dn=4.0, settling_rows=12.0, column_step_dn=0.3)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pixmetry.core.random import Grid
-from pixmetry.grabber.line_jitter import SOURCE, LineJitter, delay_s, propagate, truth
+from pixmetry.sources.grabber.line_jitter import SOURCE, LineJitter, delay_s, propagate, truth
 from source_signals import Z, stream
 from video_signals import PIXEL_HZ, bump, centre, sampled, standard_probe, video
 

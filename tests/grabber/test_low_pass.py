@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import signal as sps
 
-from pixmetry.core.line import Line
-from pixmetry.grabber.low_pass import SOURCE, LowPass, delay_s, near
+from pixmetry.camera.line import Line
+from pixmetry.sources.grabber.low_pass import SOURCE, LowPass, delay_s, near
 from video_signals import PIXEL_HZ, bump, centre, row_of, sampled, seen, video
 
 F = np.array([0.3e6, 2e6, 5e6, 9e6])

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from pixmetry.camera.observations import Observations, PatternList
+from pixmetry.camera.signal import Kind
 from pixmetry.core.errors import MeasureError
-from pixmetry.core.observations import Observations, PatternList
-from pixmetry.core.signal import Kind
-from pixmetry.grabber.phase_pattern import PhasePattern, correct, forward, measure
+from pixmetry.sources.grabber.phase_pattern import PhasePattern, correct, forward, measure
 from source_signals import flat, signal, stream
 
 SHAPE = (64, 96)

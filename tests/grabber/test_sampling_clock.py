@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from catalogue.support import camera_with
-from pixmetry.grabber.sampling_clock import SOURCE, SamplingClock
+from pixmetry.sources.grabber.sampling_clock import SOURCE, SamplingClock
 from video_signals import PIXEL_HZ, bump, centre, row_of, sampled, seen, video
 
 EPIX = SamplingClock(clock_mhz=10.0, samples=512)

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from catalogue.support import Texture, camera_with
-from pixmetry.core.camera import load_camera
+from pixmetry.camera.camera import load_camera
 from pixmetry.core.errors import InputError
 from pixmetry.core.random import Grid
-from pixmetry.grabber.window_offset import SOURCE, WindowOffset
+from pixmetry.sources.grabber.window_offset import SOURCE, WindowOffset
 
 SHAPE = (48, 64)
 CASES = [

@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from gallery import line_jitter as experiment
+from gallery import line_jitter_frames as frames
+from gallery.line_jitter import JITTERS_NS, PIXEL_NS, key, stored
+from gallery.line_jitter_frames import AVERAGED, LENSES, VIEWS
 from scipy.stats import chi2, norm
 
-from pixmetry.calibration.plumb_line import calibrate_lines
-from pixmetry.calibration.row_jitter import RowVariance, Sampling
-from pixmetry.handbook import line_jitter as experiment
-from pixmetry.handbook import line_jitter_frames as frames
-from pixmetry.handbook.line_jitter import JITTERS_NS, PIXEL_NS, key, stored
-from pixmetry.handbook.line_jitter_frames import AVERAGED, LENSES, VIEWS
+from pixmetry.calibrate.lines.plumb_line import calibrate_lines
+from pixmetry.calibrate.lines.row_jitter import RowVariance, Sampling
 
 RATE = 1e-6
 QUICK = (1, 0, 2)

@@ -7,11 +7,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from gallery import offset as experiment
+from gallery.offset import BLACK_DN, MIDDLE, NOISE_DN, OFFSET_DN, PEAK_DN, PIECE_ROWS, ROWS, SAMPLES, SIGMA_PX, predicted, swing
 from scipy.integrate import quad
 from scipy.stats import chi2, norm
-
-from pixmetry.handbook import offset as experiment
-from pixmetry.handbook.offset import BLACK_DN, MIDDLE, NOISE_DN, OFFSET_DN, PEAK_DN, PIECE_ROWS, ROWS, SAMPLES, SIGMA_PX, predicted, swing
 
 RATE = 1e-6
 # amplitude, half range and rms in px by another program, to the digits that are told; None where they are not

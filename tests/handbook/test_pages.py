@@ -7,9 +7,8 @@ import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import pytest
-
-from pixmetry.handbook.page import Page, table
-from pixmetry.handbook.pages import all_pages
+from gallery.page import Page, table
+from gallery.pages import all_pages
 
 FOLDER = Path(__file__).resolve().parents[2] / "docs" / "handbook"
 NUMBER = re.compile(r"[−-]?\d+(?:\.\d+)?")

@@ -7,12 +7,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from gallery import threshold as experiment
+from gallery.threshold import CURVES, DISC, MIDDLE, SIDE, SPOT, THRESHOLDS_DN, sweep
 from scipy.integrate import dblquad
 from scipy.special import j1
 from scipy.stats import norm
-
-from pixmetry.handbook import threshold as experiment
-from pixmetry.handbook.threshold import CURVES, DISC, MIDDLE, SIDE, SPOT, THRESHOLDS_DN, sweep
 
 RATE = 1e-6
 # rms in px of 800 targets each, by a simulation with discs sampled eight times as finely, other phases and other noise

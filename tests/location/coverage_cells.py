@@ -10,9 +10,9 @@ from scipy import stats
 from scipy.spatial import cKDTree
 
 from location import rendered
-from pixmetry.locating import locate
-from pixmetry.location.noise import NoiseModel
-from pixmetry.location.targets import Flag
+from pixmetry.locate.detect.targets import Flag
+from pixmetry.locate.job import locate
+from pixmetry.locate.noise import NoiseModel
 
 UNSURE = Flag.FAINT | Flag.NOT_CONVERGED  # the table itself says that the covariance is not to be relied on
 

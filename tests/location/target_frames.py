@@ -9,7 +9,7 @@ import numpy as np
 from scipy.special import chndtr
 
 from location import rendered
-from pixmetry.location.targets import Positions, Targets
+from pixmetry.locate.detect.targets import Positions, Targets
 
 
 def half_height(radius: float, blur: float) -> tuple[float, float]:

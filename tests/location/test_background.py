@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm, truncnorm
 
-from pixmetry.location.background import Background, background, before_clipping
+from pixmetry.locate.detect.background import Background, background, before_clipping
 
 SIDE = 512
 Y, X = np.mgrid[:SIDE, :SIDE].astype(float)

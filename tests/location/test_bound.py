@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, norm, poisson
 
-from pixmetry.camera_noise import camera_noise
-from pixmetry.core.camera import load_camera
+from pixmetry.camera.camera import load_camera
 from pixmetry.core.errors import InputError
-from pixmetry.location import closed_bounds as closed
-from pixmetry.location.bound import bound, frames_worth, possible
-from pixmetry.location.fisher import pixel_noise
-from pixmetry.location.information import information_per_dn2, kept_rounding_dn2
-from pixmetry.location.noise import NoiseModel
-from pixmetry.location.predictions import _law, names_for, predict
-from pixmetry.location.template_images import draw_images
+from pixmetry.locate.bound import closed_bounds as closed
+from pixmetry.locate.bound.bound import bound, frames_worth, possible
+from pixmetry.locate.bound.fisher import pixel_noise
+from pixmetry.locate.bound.information import information_per_dn2, kept_rounding_dn2
+from pixmetry.locate.bound.predictions import _law, names_for, predict
+from pixmetry.locate.camera_noise import camera_noise
+from pixmetry.locate.noise import NoiseModel
+from pixmetry.locate.template.template_images import draw_images
 
 FALSE_FAILURES = 1e-6
 K = 0.0097

@@ -11,7 +11,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from pixmetry.core.errors import InputError
-from pixmetry.location.coded import code_svg, codes, least_rotation, read_codes, ring_members
+from pixmetry.locate.detect.coded import code_svg, codes, least_rotation, read_codes, ring_members
 
 
 def printed(u: np.ndarray, v: np.ndarray, number: int, bits: int = 12) -> np.ndarray:

@@ -8,9 +8,9 @@ from scipy import stats
 from scipy.ndimage import gaussian_filter
 
 from pixmetry.core.errors import InputError
-from pixmetry.location.corners import chessboard_reach_px, corner_positions, find_chessboard
-from pixmetry.location.noise import NoiseModel
-from pixmetry.location.targets import Flag
+from pixmetry.locate.detect.targets import Flag
+from pixmetry.locate.noise import NoiseModel
+from pixmetry.locate.template.corners import chessboard_reach_px, corner_positions, find_chessboard
 
 HALF = 12
 SIDE = 2 * HALF + 1

@@ -14,8 +14,8 @@ from scipy import stats
 
 from location import coverage_cells, line_frames, rendered
 from location.coverage_cells import Case
-from pixmetry.locating import locate
-from pixmetry.location.targets import Flag
+from pixmetry.locate.detect.targets import Flag
+from pixmetry.locate.job import locate
 
 RATE = 1e-6
 EXACT = ("template", "poisson_gaussian", "centroid", "squared_centroid", "windowed_centroid")

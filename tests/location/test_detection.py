@@ -12,9 +12,9 @@ from scipy.spatial import cKDTree
 from scipy.special import ndtr
 
 from pixmetry.core.errors import InputError
-from pixmetry.location._detect_kernels import find_runs, group_runs
-from pixmetry.location.detection import Detection, Regions, detect, neighbours, select
-from pixmetry.location.targets import Flag
+from pixmetry.locate.detect._detect_kernels import find_runs, group_runs
+from pixmetry.locate.detect.detection import Detection, Regions, detect, neighbours, select
+from pixmetry.locate.detect.targets import Flag
 
 Shape = Callable[[np.ndarray, np.ndarray], np.ndarray]
 FINE = 4

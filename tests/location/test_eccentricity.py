@@ -8,11 +8,11 @@ from scipy.stats import chi2, norm
 
 from pixmetry.core.errors import InputError
 from pixmetry.core.random import Grid
-from pixmetry.location.circle_planes import common_plane, plane_normals
-from pixmetry.location.eccentricity import both_corrected, circle_seen, corrected, corrected_distorted, homography_of
-from pixmetry.location.ellipses import Ellipses, Pinhole, ellipse_through
-from pixmetry.location.noise import NoiseModel
-from pixmetry.location.targets import Targets
+from pixmetry.locate.circles.circle_planes import common_plane, plane_normals
+from pixmetry.locate.circles.eccentricity import both_corrected, circle_seen, corrected, corrected_distorted, homography_of
+from pixmetry.locate.circles.ellipses import Ellipses, Pinhole, ellipse_through
+from pixmetry.locate.detect.targets import Targets
+from pixmetry.locate.noise import NoiseModel
 from pixmetry.scene.plates import Pose, dot_plate
 
 CAMERA = Pinhole(2500.0, 640.0, 480.0)
@@ -212,7 +212,7 @@ def rough_targets(ellipses: Ellipses, amplitude_dn: float, background_dn: float,
 @pytest.mark.parametrize("tilt_deg", [0.0, 30.0, 60.0])
 def test_centres_in_rendered_images(diameter_mm: float, tilt_deg: float) -> None:
     """Circles of 5 to 42 px radius, rendered by the scenes, fitted by the template: within .002 px, where ellipses are up to .3 px off."""
-    from pixmetry.location.template import fit_template
+    from pixmetry.locate.template.template import fit_template
 
     pose = Pose(2500.0, 250.0, 220.0, tilt_deg * 0.8, tilt_deg * 0.6, 15.0, 2.0, -3.0, 1000.0)
     plate = dot_plate(pose, 3, 3, 1.6 * diameter_mm, diameter_mm, 200.0, 0.7)
@@ -235,7 +235,7 @@ def test_centres_in_rendered_images(diameter_mm: float, tilt_deg: float) -> None
 
 def test_noisy_images_agree_on_the_plane_as_well_as_their_covariance_says() -> None:
     """χ² of 3 × 9 ellipses about common planes: catches a covariance 2.2 times too large or too small at 1e-6."""
-    from pixmetry.location.template import fit_template
+    from pixmetry.locate.template.template import fit_template
 
     rng, shape, camera = np.random.default_rng(), (440, 500), Pinhole(2500.0, 250.0, 220.0)
     total = 0.0

@@ -10,9 +10,9 @@ from scipy.integrate import quad
 from scipy.special import erf
 
 from pixmetry.core.errors import InputError
-from pixmetry.locating import estimators
-from pixmetry.location.estimators import LAWS, Estimator
-from pixmetry.location.target_estimator import TargetEstimator, parse_estimator
+from pixmetry.locate.centroids.estimators import LAWS, Estimator
+from pixmetry.locate.job import estimators
+from pixmetry.locate.target_estimator import TargetEstimator, parse_estimator
 
 SIDE = 24
 AXIS = np.arange(SIDE, dtype=float)

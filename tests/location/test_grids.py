@@ -7,8 +7,8 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from pixmetry.core.errors import InputError
-from pixmetry.location.detection import detect
-from pixmetry.location.grids import eight_bit, order_grid
+from pixmetry.locate.detect.detection import detect
+from pixmetry.locate.detect.grids import eight_bit, order_grid
 
 
 def plate(rng, rows: int, cols: int, *, asymmetric=False, tilt_deg=40.0, turn=None, distortion=0.1, missing=0.0, clutter=0):

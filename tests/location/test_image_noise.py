@@ -13,10 +13,10 @@ from scipy import stats
 
 from location import rendered
 from location.coverage_cells import Case, Outcome, add, make_frame
-from pixmetry.locating import chosen_estimator, locate
-from pixmetry.location.detection import detect
-from pixmetry.location.image_noise import noise_from_image
-from pixmetry.location.noise import NoiseModel
+from pixmetry.locate.detect.detection import detect
+from pixmetry.locate.job import chosen_estimator, locate
+from pixmetry.locate.noise import NoiseModel
+from pixmetry.locate.template.image_noise import noise_from_image
 
 RATE = 1e-6
 PITCH = 30

@@ -15,13 +15,13 @@ from scipy.special import erf
 from scipy.stats import kstest, norm
 
 from pixmetry.core.errors import InputError
-from pixmetry.location.crosses import cross_positions, crossings, find_crosses
-from pixmetry.location.line_candidates import LineCandidates
-from pixmetry.location.line_detection import find_edges, find_lines
-from pixmetry.location.line_rows import line_rows
-from pixmetry.location.lines import ESTIMATORS, PARAMETERS, ROW_ESTIMATORS, line_model, line_positions
-from pixmetry.location.noise import NoiseModel
-from pixmetry.location.targets import Flag
+from pixmetry.locate.detect.targets import Flag
+from pixmetry.locate.lines.crosses import cross_positions, crossings, find_crosses
+from pixmetry.locate.lines.line_candidates import LineCandidates
+from pixmetry.locate.lines.line_detection import find_edges, find_lines
+from pixmetry.locate.lines.line_rows import line_rows
+from pixmetry.locate.lines.lines import ESTIMATORS, PARAMETERS, ROW_ESTIMATORS, line_model, line_positions
+from pixmetry.locate.noise import NoiseModel
 from pixmetry.scene.outlines import edge as scene_edge
 from pixmetry.scene.outlines import line as scene_line
 from pixmetry.scene.outlines import polygon

@@ -12,9 +12,9 @@ from scipy.special import chndtr
 from location import rendered
 from location.target_frames import half_height, lattice, rough_targets, z_scores
 from pixmetry.core.errors import InputError
-from pixmetry.location.moments import LAWS, equivalent_disc, moment_positions
-from pixmetry.location.noise import NoiseModel
-from pixmetry.location.targets import Flag
+from pixmetry.locate.centroids.moments import LAWS, equivalent_disc, moment_positions
+from pixmetry.locate.detect.targets import Flag
+from pixmetry.locate.noise import NoiseModel
 
 Z_TAIL = 4.9  # two-sided chance 1e-6
 

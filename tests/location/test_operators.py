@@ -10,11 +10,11 @@ import pytest
 from location import rendered
 from location.target_frames import half_height, lattice, rough_targets, z_scores
 from pixmetry.core.errors import InputError
-from pixmetry.location import _operator_kernels as o
-from pixmetry.location.moments import prepare
-from pixmetry.location.noise import NoiseModel
-from pixmetry.location.operators import MARGINS, OPERATORS, operator_positions
-from pixmetry.location.targets import Flag
+from pixmetry.locate.centroids import _operator_kernels as o
+from pixmetry.locate.centroids.moments import prepare
+from pixmetry.locate.centroids.operators import MARGINS, OPERATORS, operator_positions
+from pixmetry.locate.detect.targets import Flag
+from pixmetry.locate.noise import NoiseModel
 
 Z_TAIL = 4.9  # two-sided chance 1e-6
 CASES = [(1.0, 0.8, 1.0), (2.0, 0.6, 0.5), (3.0, 0.3, 0.5), (3.0, 0.8, 1.5), (5.0, 1.0, 4.0), (8.0, 0.5, 1.0), (12.0, 1.5, 2.0)]
@@ -53,7 +53,7 @@ def test_ellipses_are_covered_too(name: str) -> None:
 @pytest.mark.parametrize("name", ["forstner", "ellipse_edges", "gaussian"])
 def test_variance_is_that_of_the_slopes_by_finite_differences(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """σ² Σ (dx̂/dI)², every pixel of a small frame moved in turn, with the background's fit among the effects; 12 %."""
-    monkeypatch.setattr("pixmetry.location.operators._phase_variance", lambda *_: np.zeros(1))
+    monkeypatch.setattr("pixmetry.locate.centroids.operators._phase_variance", lambda *_: np.zeros(1))
     rng = np.random.default_rng()
     mean = np.full((37, 37), 20.0)
     at = rendered.window(18.3, 17.8, 8)

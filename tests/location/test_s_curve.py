@@ -9,8 +9,8 @@ import pytest
 from scipy.integrate import quad
 
 from pixmetry.core.errors import InputError
-from pixmetry.location.estimators import Estimator
-from pixmetry.location.s_curve import SCurve, even_phases, s_curve
+from pixmetry.locate.bound.s_curve import SCurve, even_phases, s_curve
+from pixmetry.locate.centroids.estimators import Estimator
 
 
 def line(sigma: float, peak: float):  # noqa: ANN201

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from light_scenes import mapped
-from pixmetry.optics.cover_glass import SOURCE, CoverGlass
+from pixmetry.sources.optics.cover_glass import SOURCE, CoverGlass
 
 GLASS = CoverGlass(thickness_um=750.0, principal_distance_mm=8.0)
 

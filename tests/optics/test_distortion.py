@@ -8,7 +8,7 @@ from scipy.optimize import brentq
 
 from light_scenes import Spot, camera, centroids, mapped, signal_of
 from pixmetry.core.errors import ParameterError
-from pixmetry.optics.distortion import SOURCE, Distortion, pull_of
+from pixmetry.sources.optics.distortion import SOURCE, Distortion, pull_of
 from source_signals import stream
 
 SHAPE = (582, 752)

@@ -7,14 +7,14 @@ import pytest
 from scipy import integrate, stats
 
 from light_scenes import MEAN, Flat, Wave, camera, mapped, transfer
-from pixmetry.core.silicon import absorption_per_um
-from pixmetry.optics import spectral_filter
-from pixmetry.optics.lateral_colour import SOURCE as COLOUR
-from pixmetry.optics.lateral_colour import LateralColour
-from pixmetry.optics.olpf import SOURCE as OLPF
-from pixmetry.optics.olpf import OpticalLowPass
-from pixmetry.optics.spectral_filter import SOURCE as FILTER
-from pixmetry.optics.spectral_filter import SpectralFilter
+from pixmetry.camera.silicon import absorption_per_um
+from pixmetry.sources.optics import spectral_filter
+from pixmetry.sources.optics.lateral_colour import SOURCE as COLOUR
+from pixmetry.sources.optics.lateral_colour import LateralColour
+from pixmetry.sources.optics.olpf import SOURCE as OLPF
+from pixmetry.sources.optics.olpf import OpticalLowPass
+from pixmetry.sources.optics.spectral_filter import SOURCE as FILTER
+from pixmetry.sources.optics.spectral_filter import SpectralFilter
 
 
 @pytest.mark.parametrize(("fx", "fy"), [(0.2, 0.0), (0.4, 0.0), (0.0, 0.6), (0.3, 0.45)])

@@ -7,14 +7,14 @@ import pytest
 from scipy.integrate import quad
 
 from catalogue.support import Flat
-from pixmetry.core.camera import Camera, Element
+from pixmetry.camera.camera import Camera, Element
 from pixmetry.core.random import Grid
-from pixmetry.optics.flicker import SOURCE, Flicker, mean_light, shares
-from pixmetry.sensor import exposure, light_pulses, parasitic_light, rolling_shutter
-from pixmetry.sensor.exposure import Exposure
-from pixmetry.sensor.light_pulses import LightPulses
-from pixmetry.sensor.parasitic_light import ParasiticLight
-from pixmetry.sensor.rolling_shutter import RollingShutter
+from pixmetry.sources.optics.flicker import SOURCE, Flicker, mean_light, shares
+from pixmetry.sources.sensor import exposure, light_pulses, parasitic_light, rolling_shutter
+from pixmetry.sources.sensor.exposure import Exposure
+from pixmetry.sources.sensor.light_pulses import LightPulses
+from pixmetry.sources.sensor.parasitic_light import ParasiticLight
+from pixmetry.sources.sensor.rolling_shutter import RollingShutter
 from sensor.moving_scenes import STEADY, Spot, Steady, chain, moments
 
 LAMPS = {

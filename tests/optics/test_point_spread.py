@@ -9,13 +9,13 @@ import pytest
 from scipy.special import ndtr
 
 from light_scenes import Line, Spot, camera, centroids, first_harmonic, transfer
+from pixmetry.camera.light import Points
 from pixmetry.core.errors import ParameterError
-from pixmetry.core.light import Points
 from pixmetry.core.random import Grid
-from pixmetry.optics import point_spread
-from pixmetry.optics.point_spread import SOURCE, PointSpread
-from pixmetry.sensor.pixel_aperture import SOURCE as APERTURE
-from pixmetry.sensor.pixel_aperture import PixelAperture
+from pixmetry.sources.optics import point_spread
+from pixmetry.sources.optics.point_spread import SOURCE, PointSpread
+from pixmetry.sources.sensor.pixel_aperture import SOURCE as APERTURE
+from pixmetry.sources.sensor.pixel_aperture import PixelAperture
 
 
 def clear(f: np.ndarray, wavelength_um: float, f_number: float, pitch_um: float) -> np.ndarray:

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from pixmetry.camera.observations import DefectList, Observations
+from pixmetry.camera.signal import Kind
 from pixmetry.core.errors import MeasureError
-from pixmetry.core.observations import DefectList, Observations
-from pixmetry.core.signal import Kind
-from pixmetry.experiment.spatial_fit import fit_spatial
-from pixmetry.experiment.stack import StackAccumulator
-from pixmetry.optics.shading import SOURCE, Shading
+from pixmetry.observe.spatial_fit import fit_spatial
+from pixmetry.observe.stack import StackAccumulator
+from pixmetry.sources.optics.shading import SOURCE, Shading
 from source_signals import K_DN_PER_E, centroid, flat, signal, spot_probe, spots, stream
 
 SHAPE = (41, 61)

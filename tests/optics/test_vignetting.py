@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pixmetry.core.signal import Kind
-from pixmetry.optics.vignetting import SOURCE, Vignetting, factor, overlap
+from pixmetry.camera.signal import Kind
+from pixmetry.sources.optics.vignetting import SOURCE, Vignetting, factor, overlap
 from source_signals import centroid, centroid_probe, flat, signal, spots, stream
 
 SHAPE = (101, 201)

@@ -22,7 +22,7 @@ import pytest
 from scipy import stats
 
 from emva.truths import filter_gains, high_passed
-from pixmetry.datasheets import emva1288
+from pixmetry.emva.job import emva1288
 
 ROOT = Path(__file__).resolve().parents[2]
 PYTHON = ROOT / ".venv-oracles" / "bin" / "python"

@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from pixmetry.core.camera import Camera, Element
-from pixmetry.core.catalogue import get_source
+from pixmetry.camera.camera import Camera, Element
+from pixmetry.camera.catalogue import get_source
 from pixmetry.core.config import load_yaml
-from pixmetry.simulation import simulate
+from pixmetry.simulate.job import simulate
 
 ROOT = Path(__file__).resolve().parents[2]
 PYTHON = ROOT / ".venv-oracles" / "bin" / "python"

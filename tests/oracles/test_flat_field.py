@@ -18,8 +18,8 @@ import numpy as np
 import pytest
 from scipy import special, stats
 
-from pixmetry.core.camera import Camera, Element
-from pixmetry.core.catalogue import get_source
+from pixmetry.camera.camera import Camera, Element
+from pixmetry.camera.catalogue import get_source
 from pixmetry.scene.uniform import Uniform
 
 SHAPE = (1024, 1024)

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from pixmetry.core.camera import Camera, Element
-from pixmetry.core.catalogue import get_source
+from pixmetry.camera.camera import Camera, Element
+from pixmetry.camera.catalogue import get_source
 from pixmetry.scene.uniform import Uniform
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from pixmetry.core.camera import Camera, Element
-from pixmetry.core.catalogue import get_source
+from pixmetry.camera.camera import Camera, Element
+from pixmetry.camera.catalogue import get_source
 from pixmetry.core.random import Grid
 from pixmetry.core.threads import map_tiles
 from pixmetry.scene.uniform import Uniform

@@ -18,13 +18,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pixmetry.assessment import measure_sources, observe_campaign
-from pixmetry.campaign import load_campaign
-from pixmetry.campaign.frame_writer import FrameWriter
-from pixmetry.digital_twin import digital_twin, expose, exposures_of, light_of, of_unit
+from pixmetry.assess.digital_twin import digital_twin, expose, exposures_of, light_of, of_unit
+from pixmetry.assess.job import measure_sources, observe_campaign
 from pixmetry.emva.evaluate import standard_values
 from pixmetry.emva.records import Measurement
 from pixmetry.emva.reduction import measure_frames
+from pixmetry.files import load_campaign
+from pixmetry.files.frame_writer import FrameWriter
 
 ROOT = Path(__file__).resolve().parents[2]
 PYTHON = ROOT / ".venv-oracles" / "bin" / "python"

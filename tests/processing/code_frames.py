@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pixmetry.core.signal import Kind, Signal
+from pixmetry.camera.signal import Kind, Signal
 from source_signals import signal
 
 SUB = 8

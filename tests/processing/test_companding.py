@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pixmetry.processing.companding import Companding, forward, propagate, table
+from pixmetry.sources.processing.companding import Companding, forward, propagate, table
 from processing.code_frames import codes
 from source_signals import spot_probe, stream
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pixmetry.processing.defect_correction import DefectCorrection, forward, replaced
+from pixmetry.sources.processing.defect_correction import DefectCorrection, forward, replaced
 from processing.code_frames import codes, disc, soft_centroid
 from source_signals import stream
 

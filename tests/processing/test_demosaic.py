@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import convolve
 
-from pixmetry.processing.demosaic import Demosaic, forward, weights
+from pixmetry.sources.processing.demosaic import Demosaic, forward, weights
 from processing.code_frames import codes, disc, soft_centroid
 from source_signals import stream
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pixmetry.core.catalogue import catalogue
+from pixmetry.camera.catalogue import catalogue
 from processing.code_frames import codes
 from source_signals import stream
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, median_filter
 
-from pixmetry.processing.noise_reduction import NoiseReduction, forward
+from pixmetry.sources.processing.noise_reduction import NoiseReduction, forward
 from processing.code_frames import codes, disc, soft_centroid
 from source_signals import stream
 

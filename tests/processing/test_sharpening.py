@@ -10,7 +10,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.special import erfc
 
-from pixmetry.processing.sharpening import Sharpening, forward, propagate
+from pixmetry.sources.processing.sharpening import Sharpening, forward, propagate
 from processing.code_frames import codes, disc, soft_centroid
 from source_signals import Z, centroid_probe, spot_probe, stream
 

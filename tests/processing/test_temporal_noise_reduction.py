@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from pixmetry.processing.temporal_noise_reduction import TemporalNoiseReduction, forward, start
+from pixmetry.sources.processing.temporal_noise_reduction import TemporalNoiseReduction, forward, start
 from processing.code_frames import codes
 from source_signals import Z, centroid, spots, stream
 

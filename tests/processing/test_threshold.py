@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pixmetry.core.contribution import Probe
-from pixmetry.processing.threshold import SOURCE
+from pixmetry.camera.contribution import Probe
+from pixmetry.sources.processing.threshold import SOURCE
 from source_signals import centroid_probe, spots
 
 

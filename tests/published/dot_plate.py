@@ -13,8 +13,8 @@ import numpy as np
 from numpy.polynomial.legendre import legvander2d
 from scipy.optimize import least_squares
 
-from pixmetry.location.grids import Grid, order_grid
-from pixmetry.location.targets import Flag, Positions, Targets
+from pixmetry.locate.detect.grids import Grid, order_grid
+from pixmetry.locate.detect.targets import Flag, Positions, Targets
 
 PICTURE, COEFFICIENTS = "dot_pattern_05.jpg", "coef_dot_05.txt"
 UNIT_PX = 1000.0  # radius at which a radial term is its own coefficient

@@ -13,10 +13,10 @@ import cv2
 import numpy as np
 import pytest
 
-from pixmetry.calibration.model import CameraModel, Sensor
-from pixmetry.calibration.network import Adjustment, Calibration, Network
-from pixmetry.calibration.solve import Options, calibrate_network
-from pixmetry.calibration_images import ImageObservations, observations_of
+from pixmetry.calibrate.bundle.model import CameraModel, Sensor
+from pixmetry.calibrate.bundle.network import Adjustment, Calibration, Network
+from pixmetry.calibrate.bundle.solve import Options, calibrate_network
+from pixmetry.calibrate.images.images import ImageObservations, observations_of
 
 FOLDER = Path(os.environ.get("PIXMETRY_DATA", "")) / "opencv-chessboards"
 pytestmark = pytest.mark.skipif(

@@ -16,10 +16,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pixmetry.calibration.model import CameraModel, Sensor
-from pixmetry.calibration.network import Network
-from pixmetry.calibration.solve import Options, calibrate_network
-from pixmetry.calibration_images import ImageObservations, observations_of
+from pixmetry.calibrate.bundle.model import CameraModel, Sensor
+from pixmetry.calibrate.bundle.network import Network
+from pixmetry.calibrate.bundle.solve import Options, calibrate_network
+from pixmetry.calibrate.images.images import ImageObservations, observations_of
 
 FOLDER = Path(os.environ.get("PIXMETRY_DATA", "")) / "zhang-calibration"
 pytestmark = pytest.mark.skipif(

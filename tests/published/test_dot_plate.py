@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pixmetry.location.detection import detect
-from pixmetry.location.image_noise import noise_from_image
-from pixmetry.location.template import fit_template
+from pixmetry.locate.detect.detection import detect
+from pixmetry.locate.template.image_noise import noise_from_image
+from pixmetry.locate.template.template import fit_template
 from published import dot_plate
 
 FOLDER = Path(os.environ.get("PIXMETRY_DATA", "")) / "discorpy-dots"

@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pixmetry.calibration.model import Sensor
-from pixmetry.calibration.plumb_line import PlumbLineResult, calibrate_lines
-from pixmetry.location.detection import detect
+from pixmetry.calibrate.bundle.model import Sensor
+from pixmetry.calibrate.lines.plumb_line import PlumbLineResult, calibrate_lines
+from pixmetry.locate.detect.detection import detect
 from published import dot_plate
 
 FOLDER = Path(os.environ.get("PIXMETRY_DATA", "")) / "discorpy-dots"

@@ -13,14 +13,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pixmetry.campaign import load_campaign
-from pixmetry.campaign.images import FrameReader
 from pixmetry.emva.evaluate import bootstrap_u, evaluate
-from pixmetry.emva.frame_products import frame_products
 from pixmetry.emva.records import Measurement, Results
 from pixmetry.emva.reduction import measure_frames
 from pixmetry.emva.series import series_of
-from pixmetry.experiment.one_pass import Group
+from pixmetry.emva.spatial.frame_products import frame_products
+from pixmetry.files import load_campaign
+from pixmetry.files.images import FrameReader
+from pixmetry.observe.one_pass import Group
 
 FOLDER = Path(os.environ.get("PIXMETRY_DATA", "")) / "emva1288-set-001"
 STORED = FOLDER / "reference-implementation-1.0.2-results-full.tsv"

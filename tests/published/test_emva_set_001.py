@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from pixmetry.assessment import by_the_standard, observe_campaign
-from pixmetry.campaign import load_campaign
-from pixmetry.core.observations import Observations
+from pixmetry.assess.job import by_the_standard, observe_campaign
+from pixmetry.camera.observations import Observations
 from pixmetry.emva.records import Results
+from pixmetry.files import load_campaign
 
 
 @pytest.fixture(scope="module")

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from pixmetry.calibration.model import NAMES, CameraModel, Sensor
-from pixmetry.calibration.network import Adjustment, Calibration, Finding, Network, ScaleBars, State
+from pixmetry.calibrate.bundle.model import NAMES, CameraModel, Sensor
+from pixmetry.calibrate.bundle.network import Adjustment, Calibration, Finding, Network, ScaleBars, State
 
 NOISE_PX = 0.04
 SIZE = (1280, 1024)

@@ -6,7 +6,7 @@ from math import erfc, log2, log10, pi, sqrt
 
 import numpy as np
 
-from pixmetry.emva.keys import KEYS, key_of
+from pixmetry.emva.files.keys import KEYS, key_of
 from pixmetry.emva.records import DataSheet, Results, Value
 
 K, ETA, SIGMA_D, DARK_RATE = 0.28, 0.45, 11.0, 30.0  # DN/e-, 1, e-, e-/s

@@ -7,20 +7,20 @@ from pathlib import Path
 
 import numpy as np
 
+from pixmetry.assess.results import Assessment
 from pixmetry.budget.advice import advise
-from pixmetry.budget.budget import Budget, BudgetRow, Interaction
 from pixmetry.budget.combine import combine
+from pixmetry.budget.job import Budget, BudgetRow, Interaction
 from pixmetry.budget.monte_carlo import Axis, MonteCarlo
 from pixmetry.budget.probe import Facts, Target
-from pixmetry.campaign.records import CameraFacts, Campaign, FrameGroup, OpticsFacts
-from pixmetry.core.catalogue import get_source
-from pixmetry.core.contribution import Contribution
-from pixmetry.core.observations import Observations
+from pixmetry.camera.catalogue import get_source
+from pixmetry.camera.contribution import Contribution
+from pixmetry.camera.observations import Observations
 from pixmetry.emva.evaluate import standard_values
 from pixmetry.emva.records import Measurement
-from pixmetry.experiment.observe import Group, observe
-from pixmetry.location.estimators import Estimator
-from pixmetry.results import Assessment
+from pixmetry.files.records import CameraFacts, Campaign, FrameGroup, OpticsFacts
+from pixmetry.locate.centroids.estimators import Estimator
+from pixmetry.observe.observe import Group, observe
 
 GAIN, NOISE_E, OFFSET, BITS, SHAPE = 0.25, 12.0, 40.0, 12, (96, 120)
 LEVELS, STACK = 14, 16

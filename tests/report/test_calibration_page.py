@@ -12,12 +12,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pixmetry.calibration.model import NAMES, Sensor
-from pixmetry.calibration.network import Adjustment, Calibration, Finding
-from pixmetry.calibration.quality import image_records
-from pixmetry.core.errors import InputError
-from pixmetry.report.calibration_control import control_points
-from pixmetry.report.calibration_figures import (
+from pixmetry.calibrate.bundle.model import NAMES, Sensor
+from pixmetry.calibrate.bundle.network import Adjustment, Calibration, Finding
+from pixmetry.calibrate.checks.quality import image_records
+from pixmetry.calibrate.page.control import control_points
+from pixmetry.calibrate.page.figures import (
     MOST_IN_SMALL,
     MOST_VECTORS,
     Residuals,
@@ -30,11 +29,12 @@ from pixmetry.report.calibration_figures import (
     image_order,
     round_number,
 )
-from pixmetry.report.calibration_page import render, write_page
-from pixmetry.report.calibration_plots import bin_means, short
-from pixmetry.report.calibration_space import ellipse, field_map, largest_axis, plan_views, pyramids, seen_from, shown_points
-from pixmetry.report.calibration_tables import gross_errors, images, network_facts, parameters, scale_bars
-from pixmetry.report.calibration_text import as_given, p_text, projection_levels, sentence, summary_text, typeset, worth
+from pixmetry.calibrate.page.page import render, write_page
+from pixmetry.calibrate.page.plots import bin_means, short
+from pixmetry.calibrate.page.space import ellipse, field_map, largest_axis, plan_views, pyramids, seen_from, shown_points
+from pixmetry.calibrate.page.tables import gross_errors, images, network_facts, parameters, scale_bars
+from pixmetry.calibrate.page.text import as_given, p_text, projection_levels, sentence, summary_text, typeset, worth
+from pixmetry.core.errors import InputError
 from report import calibrations
 from report.test_page import Page
 
@@ -532,5 +532,5 @@ def test_sigma0_says_what_it_is_compared_with(whole: Calibration) -> None:
 
 def test_importing_the_page_loads_neither_matplotlib_nor_jinja() -> None:
     heavy = ("matplotlib", "jinja2", "scipy", "numba")
-    code = f"import sys, pixmetry.report.calibration_page; print([m for m in {heavy} if m in sys.modules])"
+    code = f"import sys, pixmetry.calibrate.page.page; print([m for m in {heavy} if m in sys.modules])"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip() == "[]"

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pixmetry.report.calibration_page import write_page
+from pixmetry.calibrate.page.page import write_page
 from report import calibrations
 
 pytestmark = pytest.mark.browser

@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from pixmetry.chain import walk
-from pixmetry.core.camera import load_camera
-from pixmetry.report.chain_page import write_chain_page
+from pixmetry.camera.camera import load_camera
+from pixmetry.simulate.page import write_chain_page
+from pixmetry.simulate.walk import walk
 
 pytestmark = pytest.mark.browser
 SCENE = {

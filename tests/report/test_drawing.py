@@ -9,8 +9,8 @@ import matplotlib
 import numpy as np
 
 from pixmetry import locate
+from pixmetry.locate.overlay import write_overlay
 from pixmetry.report.drawing import canvas, own_style, picture
-from pixmetry.report.overlay import write_overlay
 from pixmetry.report.paper import paper
 
 THEIRS = {"text.usetex": True, "font.family": "serif", "axes.grid": True, "lines.linewidth": 9.0, "savefig.facecolor": "red"}

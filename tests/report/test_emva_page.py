@@ -11,10 +11,8 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from pixmetry.emva.keys import KEYS
-from pixmetry.emva.records import DataSheet, Results, Value
-from pixmetry.report.drawing import STYLE, plain_log
-from pixmetry.report.emva_content import (
+from pixmetry.emva.files.keys import KEYS
+from pixmetry.emva.page.content import (
     GENERAL,
     MAIN,
     all_rows,
@@ -28,9 +26,11 @@ from pixmetry.report.emva_content import (
     number_of,
     symbol_parts,
 )
-from pixmetry.report.emva_facts import facts
-from pixmetry.report.emva_figures import MARGINS_IN, STRETCHES, fill, outline, time_of
-from pixmetry.report.emva_page import all_plots, render
+from pixmetry.emva.page.facts import facts
+from pixmetry.emva.page.figures import MARGINS_IN, STRETCHES, fill, outline, time_of
+from pixmetry.emva.page.page import all_plots, render
+from pixmetry.emva.records import DataSheet, Results, Value
+from pixmetry.report.drawing import STYLE, plain_log
 from pixmetry.report.templates import share_styles
 from report import emva_sheets
 from report.emva_sheets import K, results, sheet
@@ -401,7 +401,7 @@ def test_provenance_and_licence_end_the_page() -> None:
 
 def test_importing_the_page_and_the_pdf_is_cheap() -> None:
     heavy = ("matplotlib", "jinja2", "scipy", "numba", "pydantic")
-    code = f"import sys, pixmetry.report.emva_page, pixmetry.report.emva_pdf; print([m for m in {heavy} if m in sys.modules])"
+    code = f"import sys, pixmetry.emva.page.page, pixmetry.emva.page.pdf; print([m for m in {heavy} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 

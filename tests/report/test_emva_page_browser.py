@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from pixmetry.report.emva_page import render
+from pixmetry.emva.page.page import render
 from report import emva_sheets
 
 pytestmark = pytest.mark.browser

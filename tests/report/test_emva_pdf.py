@@ -13,10 +13,10 @@ from pathlib import Path
 
 import pytest
 
+from pixmetry.emva.page.content import GENERAL, all_rows, dof_text, methods_of
+from pixmetry.emva.page.page import all_plots
+from pixmetry.emva.page.pdf import VALUE_COLUMNS, lay_out, render_pdf
 from pixmetry.emva.records import Value
-from pixmetry.report.emva_content import GENERAL, all_rows, dof_text, methods_of
-from pixmetry.report.emva_page import all_plots
-from pixmetry.report.emva_pdf import VALUE_COLUMNS, lay_out, render_pdf
 from pixmetry.report.paper import HEIGHT_PT, INNER, LEFT, POINTS, RIGHT, WIDTH_PT, Cells, Column, paper, printable, text_width, wrapped
 from report import emva_sheets
 
@@ -48,7 +48,7 @@ def test_pages_are_a4_and_few() -> None:
 def test_the_same_bytes_in_every_process() -> None:
     code = (
         f"import sys; sys.path.insert(0, {str(TESTS)!r}); from report import emva_sheets as s; "
-        "from pixmetry.report.emva_pdf import render_pdf; import hashlib; "
+        "from pixmetry.emva.page.pdf import render_pdf; import hashlib; "
         "print(hashlib.sha256(render_pdf(s.sheet(s.results(stacks=False, photons_known=False)))).hexdigest())"
     )
     digests = {

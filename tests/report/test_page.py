@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pixmetry.core.observations import Observations
+from pixmetry.assess.page.figures import Curve, all_pictures, nonlinearity
+from pixmetry.assess.page.measured import table
+from pixmetry.assess.page.page import render, write_report
+from pixmetry.camera.observations import Observations
 from pixmetry.report.drawing import thumbnail
-from pixmetry.report.figures import Curve, all_pictures, nonlinearity
-from pixmetry.report.measured import table
-from pixmetry.report.page import render, write_report
 from report import simulated
 
 VOID = {"meta", "link", "br", "use", "path", "image", "img", "input", "rect", "circle"}
@@ -242,7 +242,7 @@ def test_thumbnail_is_the_mean_over_blocks() -> None:
 
 
 def test_importing_the_page_is_cheap_and_knows_nothing_of_the_job() -> None:
-    heavy = ("matplotlib", "jinja2", "scipy", "numba", "pydantic", "pixmetry.assessment", "pixmetry.results")
-    code = f"import sys, pixmetry.report.page; print([m for m in {heavy} if m in sys.modules])"
+    heavy = ("matplotlib", "jinja2", "scipy", "numba", "pydantic", "pixmetry.assess.job", "pixmetry.assess.results")
+    code = f"import sys, pixmetry.assess.page.page; print([m for m in {heavy} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from pixmetry.report.page import write_report
+from pixmetry.assess.page.page import write_report
 from report import simulated
 
 pytestmark = pytest.mark.browser

@@ -8,7 +8,7 @@ from scipy.integrate import quad
 from scipy.ndimage import gaussian_filter
 from scipy.special import erf, ndtr
 
-from pixmetry.core.light import Light, Points
+from pixmetry.camera.light import Light, Points
 from pixmetry.core.random import Grid
 from pixmetry.scene import outlines
 from pixmetry.scene.discs import Discs

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from pixmetry.core.light import Light, Points
+from pixmetry.camera.light import Light, Points
 from pixmetry.core.random import Grid
 from pixmetry.scene.lighting import Lighting
 from pixmetry.scene.motion import Motion

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pixmetry.core.light import Light
+from pixmetry.camera.light import Light
 from pixmetry.core.random import Grid
 from pixmetry.scene.discs import Discs
 from pixmetry.scene.lighting import Lighting

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pixmetry.core.camera import Camera
+from pixmetry.camera.camera import Camera
 from pixmetry.core.errors import InputError
 from pixmetry.core.random import Grid
 from pixmetry.scene.files import build_scene, read_scene

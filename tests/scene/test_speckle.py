@@ -10,7 +10,7 @@ import pytest
 from scipy.special import j0
 from scipy.stats import chi2
 
-from pixmetry.core.light import Light, Points
+from pixmetry.camera.light import Light, Points
 from pixmetry.core.random import Grid
 from pixmetry.scene.picture import Picture
 from pixmetry.scene.speckle import Speckle, _weights

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from catalogue.support import Flat
-from pixmetry.core.camera import Camera, Element
-from pixmetry.core.light import Points
-from pixmetry.core.source import Source
+from pixmetry.camera.camera import Camera, Element
+from pixmetry.camera.light import Points
+from pixmetry.camera.source import Source
 
 
 @dataclass(frozen=True)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pixmetry.core.signal import Kind
-from pixmetry.sensor.bayer_mosaic import BayerMosaic, correct, forward, propagate, truth
+from pixmetry.camera.signal import Kind
+from pixmetry.sources.sensor.bayer_mosaic import BayerMosaic, correct, forward, propagate, truth
 from source_signals import centroid_probe, flat, signal, spots, stream
 
 SHARES = {"red": 0.5, "green": 0.8, "blue": 0.2}

@@ -8,7 +8,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter
 
-from pixmetry.sensor.blooming import Blooming, forward
+from pixmetry.sources.sensor.blooming import Blooming, forward
 from source_signals import quiet, signal
 
 FULL = 1000.0

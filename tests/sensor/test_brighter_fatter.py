@@ -7,9 +7,9 @@ import math
 import numpy as np
 import pytest
 
+from pixmetry.camera.signal import Kind
 from pixmetry.core.errors import ParameterError
-from pixmetry.core.signal import Kind
-from pixmetry.sensor.brighter_fatter import SOURCE, BrighterFatter
+from pixmetry.sources.sensor.brighter_fatter import SOURCE, BrighterFatter
 from source_signals import Z, flat, signal, spots, stream
 
 

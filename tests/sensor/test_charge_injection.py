@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from pixmetry.sensor.charge_injection import SOURCE, ChargeInjection, feed_through_e, noise_e
+from pixmetry.sources.sensor.charge_injection import SOURCE, ChargeInjection, feed_through_e, noise_e
 from source_signals import Z, centroid_probe, flat, spots, stream
 
 

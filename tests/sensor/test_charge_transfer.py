@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from pixmetry.camera.signal import Kind, Windows
 from pixmetry.core.errors import ParameterError
-from pixmetry.core.signal import Kind, Windows
-from pixmetry.sensor.charge_transfer import SOURCE, ChargeTransfer, near, tail
+from pixmetry.sources.sensor.charge_transfer import SOURCE, ChargeTransfer, near, tail
 from source_signals import K_DN_PER_E, centroid, flat, quiet, signal, spot_probe, spots
 
 

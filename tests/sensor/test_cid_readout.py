@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from pixmetry.core.signal import Windows
-from pixmetry.sensor.cid_readout import SOURCE, CidReadout, start
+from pixmetry.camera.signal import Windows
+from pixmetry.sources.sensor.cid_readout import SOURCE, CidReadout, start
 from source_signals import Z, flat, quiet, signal, stream
 
 

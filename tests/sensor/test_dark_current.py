@@ -7,11 +7,11 @@ import math
 import numpy as np
 import pytest
 
+from pixmetry.camera.observations import Observations
+from pixmetry.camera.signal import Kind
 from pixmetry.core.errors import MeasureError
-from pixmetry.core.observations import Observations
-from pixmetry.core.signal import Kind
-from pixmetry.sensor.dark_current import SOURCE, DarkCurrent, mean_e, warming
-from pixmetry.sensor.shot_noise import SOURCE as SHOT
+from pixmetry.sources.sensor.dark_current import SOURCE, DarkCurrent, mean_e, warming
+from pixmetry.sources.sensor.shot_noise import SOURCE as SHOT
 from source_signals import K_DN_PER_E, Z, fitted, flat, spot_probe, stream
 
 

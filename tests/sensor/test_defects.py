@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from pixmetry.camera.observations import DefectList, Observations, StackMoments
 from pixmetry.core.errors import MeasureError
-from pixmetry.core.observations import DefectList, Observations, StackMoments
-from pixmetry.experiment.defects import find_defects
-from pixmetry.experiment.stack import StackAccumulator
-from pixmetry.sensor.defects import SOURCE, Defects
+from pixmetry.observe.defects import find_defects
+from pixmetry.observe.stack import StackAccumulator
+from pixmetry.sources.sensor.defects import SOURCE, Defects
 from source_signals import ALPHA, K_DN_PER_E, centroid, centroid_probe, fitted, flat, signal, spot_probe, spots, stream
 
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from pixmetry.camera.observations import Observations
+from pixmetry.camera.signal import Kind
 from pixmetry.core.errors import MeasureError
-from pixmetry.core.observations import Observations
-from pixmetry.core.signal import Kind
-from pixmetry.experiment.spatial_fit import fit_spatial
-from pixmetry.experiment.stack import StackAccumulator
-from pixmetry.sensor.dsnu import SOURCE, Dsnu
+from pixmetry.observe.spatial_fit import fit_spatial
+from pixmetry.observe.stack import StackAccumulator
+from pixmetry.sources.sensor.dsnu import SOURCE, Dsnu
 from source_signals import ALPHA, K_DN_PER_E, centroid, fitted, flat, signal, spot_probe, spots, stream
 
 SHAPE = (200, 300)

@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import quad
 
 from catalogue.support import Flat
-from pixmetry.sensor.exposure import SOURCE, Exposure, rule, truth
+from pixmetry.sources.sensor.exposure import SOURCE, Exposure, rule, truth
 from sensor.moving_scenes import Spot, chain, moments
 from source_signals import flat, stream
 

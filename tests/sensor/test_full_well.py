@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from pixmetry.camera.observations import Observations
 from pixmetry.core.errors import MeasureError
-from pixmetry.core.observations import Observations
-from pixmetry.sensor.full_well import SOURCE, FullWell, response_e
+from pixmetry.sources.sensor.full_well import SOURCE, FullWell, response_e
 from source_signals import K_DN_PER_E, centroid, fitted, signal, spot_probe, stream
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pixmetry.sensor.image_lag import SOURCE, ImageLag, forward, start
+from pixmetry.sources.sensor.image_lag import SOURCE, ImageLag, forward, start
 from source_signals import Z, quiet, signal, stream
 
 

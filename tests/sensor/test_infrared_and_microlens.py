@@ -10,12 +10,12 @@ from scipy import integrate
 from scipy.special import ndtr
 
 from light_scenes import Spot, camera, centroids, mapped, transfer
-from pixmetry.core.signal import Kind
-from pixmetry.core.silicon import absorption_per_um, refractive_index
-from pixmetry.sensor import infrared_diffusion
-from pixmetry.sensor.infrared_diffusion import SOURCE, InfraredDiffusion
-from pixmetry.sensor.microlens import SOURCE as LENS
-from pixmetry.sensor.microlens import Microlens
+from pixmetry.camera.signal import Kind
+from pixmetry.camera.silicon import absorption_per_um, refractive_index
+from pixmetry.sources.sensor import infrared_diffusion
+from pixmetry.sources.sensor.infrared_diffusion import SOURCE, InfraredDiffusion
+from pixmetry.sources.sensor.microlens import SOURCE as LENS
+from pixmetry.sources.sensor.microlens import Microlens
 from source_signals import flat, stream
 
 

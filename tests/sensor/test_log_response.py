@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from pixmetry.core.signal import Kind
-from pixmetry.sensor.log_response import SOURCE, LogResponse
+from pixmetry.camera.signal import Kind
+from pixmetry.sources.sensor.log_response import SOURCE, LogResponse
 from source_signals import Z, flat, signal, stream
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from catalogue.support import Flat
-from pixmetry.sensor.parasitic_light import SOURCE, ParasiticLight, correct
+from pixmetry.sources.sensor.parasitic_light import SOURCE, ParasiticLight, correct
 from sensor.moving_scenes import STEADY, Spot, chain, row_centres
 
 

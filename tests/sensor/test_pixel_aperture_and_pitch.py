@@ -7,12 +7,12 @@ import pytest
 from scipy import stats
 
 from light_scenes import MEAN, Flat, Line, Spot, camera, centroids, first_harmonic, mapped, signal_of, transfer
-from pixmetry.sensor.affinity import SOURCE as AFFINITY
-from pixmetry.sensor.affinity import Affinity
-from pixmetry.sensor.pixel_aperture import SOURCE as APERTURE
-from pixmetry.sensor.pixel_aperture import PixelAperture
-from pixmetry.sensor.pixel_pitch import SOURCE as PITCH
-from pixmetry.sensor.pixel_pitch import PixelPitch
+from pixmetry.sources.sensor.affinity import SOURCE as AFFINITY
+from pixmetry.sources.sensor.affinity import Affinity
+from pixmetry.sources.sensor.pixel_aperture import SOURCE as APERTURE
+from pixmetry.sources.sensor.pixel_aperture import PixelAperture
+from pixmetry.sources.sensor.pixel_pitch import SOURCE as PITCH
+from pixmetry.sources.sensor.pixel_pitch import PixelPitch
 from source_signals import stream
 
 

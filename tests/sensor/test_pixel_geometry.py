@@ -8,10 +8,10 @@ import numpy as np
 from scipy import stats
 
 from light_scenes import MEAN, Spot, camera, signal_of
-from pixmetry.core.light import Points
-from pixmetry.optics.point_spread import SOURCE as LENS
-from pixmetry.optics.point_spread import PointSpread
-from pixmetry.sensor.pixel_geometry import SOURCE, PixelGeometry
+from pixmetry.camera.light import Points
+from pixmetry.sources.optics.point_spread import SOURCE as LENS
+from pixmetry.sources.optics.point_spread import PointSpread
+from pixmetry.sources.sensor.pixel_geometry import SOURCE, PixelGeometry
 from source_signals import ALPHA, stream
 
 

@@ -8,8 +8,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pixmetry.core.signal import Kind
-from pixmetry.sensor import prnu, shot_noise
+from pixmetry.camera.signal import Kind
+from pixmetry.sources.sensor import prnu, shot_noise
 from source_signals import flat, stream
 
 SHAPE = (200, 300)

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from pixmetry.camera.observations import Observations
+from pixmetry.camera.signal import Kind
+from pixmetry.camera.silicon import absorption_per_cm
 from pixmetry.core.errors import InputError, MeasureError, ParameterError
-from pixmetry.core.observations import Observations
-from pixmetry.core.signal import Kind
-from pixmetry.core.silicon import absorption_per_cm
-from pixmetry.sensor.quantum_efficiency import SOURCE, QuantumEfficiency, efficiency, spectral_efficiency
+from pixmetry.sources.sensor.quantum_efficiency import SOURCE, QuantumEfficiency, efficiency, spectral_efficiency
 from source_signals import fitted, signal, stream
 
 

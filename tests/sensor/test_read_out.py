@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from catalogue.support import NAME, Texture, camera_with
-from pixmetry.sensor.read_out import SOURCE, ReadOut, forward, place, truth
+from pixmetry.sources.sensor.read_out import SOURCE, ReadOut, forward, place, truth
 from source_signals import flat, signal, stream
 
 

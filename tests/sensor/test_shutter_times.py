@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from pixmetry.sensor import exposure, interlace, light_pulses, rolling_shutter, trigger_jitter
-from pixmetry.sensor.exposure import Exposure
-from pixmetry.sensor.interlace import Interlace
-from pixmetry.sensor.light_pulses import LightPulses
-from pixmetry.sensor.rolling_shutter import RollingShutter
-from pixmetry.sensor.trigger_jitter import TriggerJitter
+from pixmetry.sources.sensor import exposure, interlace, light_pulses, rolling_shutter, trigger_jitter
+from pixmetry.sources.sensor.exposure import Exposure
+from pixmetry.sources.sensor.interlace import Interlace
+from pixmetry.sources.sensor.light_pulses import LightPulses
+from pixmetry.sources.sensor.rolling_shutter import RollingShutter
+from pixmetry.sources.sensor.trigger_jitter import TriggerJitter
 from sensor.moving_scenes import STEADY, Spot, Steady, chain, moments, row_centres
 from source_signals import ALPHA, flat, stream
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pixmetry.core.signal import Kind
-from pixmetry.sensor.full_well import SOURCE as FULL_WELL
-from pixmetry.sensor.full_well import FullWell
-from pixmetry.sensor.smear import SOURCE, Smear, correct, forward, truth
+from pixmetry.camera.signal import Kind
+from pixmetry.sources.sensor.full_well import SOURCE as FULL_WELL
+from pixmetry.sources.sensor.full_well import FullWell
+from pixmetry.sources.sensor.smear import SOURCE, Smear, correct, forward, truth
 from source_signals import signal, spots, stream
 
 

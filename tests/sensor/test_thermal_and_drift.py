@@ -7,12 +7,12 @@ import pytest
 from scipy import stats
 
 from light_scenes import camera, mapped, signal_of
-from pixmetry.sensor.mount_drift import SOURCE as DRIFT
-from pixmetry.sensor.mount_drift import MountDrift
-from pixmetry.sensor.stabilisation import SOURCE as STABLE
-from pixmetry.sensor.stabilisation import Stabilisation
-from pixmetry.sensor.thermal_expansion import SOURCE as WARM
-from pixmetry.sensor.thermal_expansion import ThermalExpansion
+from pixmetry.sources.sensor.mount_drift import SOURCE as DRIFT
+from pixmetry.sources.sensor.mount_drift import MountDrift
+from pixmetry.sources.sensor.stabilisation import SOURCE as STABLE
+from pixmetry.sources.sensor.stabilisation import Stabilisation
+from pixmetry.sources.sensor.thermal_expansion import SOURCE as WARM
+from pixmetry.sources.sensor.thermal_expansion import ThermalExpansion
 from source_signals import ALPHA, stream
 
 SHAPE = (582, 752)

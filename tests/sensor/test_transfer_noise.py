@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from pixmetry.sensor.charge_transfer import SOURCE, ChargeTransfer
+from pixmetry.sources.sensor.charge_transfer import SOURCE, ChargeTransfer
 from source_signals import ALPHA, Z, quiet, signal, stream
 
 LEVEL = 9000.0

@@ -7,11 +7,11 @@ import pytest
 from scipy.optimize import least_squares
 
 from light_scenes import MEAN, Wave, camera, mapped, signal_of
-from pixmetry.sensor.tilt import SOURCE as TILT
-from pixmetry.sensor.tilt import Tilt
-from pixmetry.sensor.tilt import pull_of as tilt_pull
-from pixmetry.sensor.unflatness import SOURCE as UNFLAT
-from pixmetry.sensor.unflatness import Unflatness, height_um
+from pixmetry.sources.sensor.tilt import SOURCE as TILT
+from pixmetry.sources.sensor.tilt import Tilt
+from pixmetry.sources.sensor.tilt import pull_of as tilt_pull
+from pixmetry.sources.sensor.unflatness import SOURCE as UNFLAT
+from pixmetry.sources.sensor.unflatness import Unflatness, height_um
 from source_signals import stream
 
 

@@ -19,18 +19,18 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy import stats
 
-from pixmetry.assessment import measure_sources
-from pixmetry.core.camera import Camera, Element
-from pixmetry.core.catalogue import catalogue
+from pixmetry.assess.job import measure_sources
+from pixmetry.camera.camera import Camera, Element
+from pixmetry.camera.catalogue import catalogue
+from pixmetry.camera.observations import Observations
+from pixmetry.camera.signal import Kind, Signal
 from pixmetry.core.errors import MeasureError, PixmetryError
 from pixmetry.core.estimates import Estimate
-from pixmetry.core.observations import Observations
 from pixmetry.core.random import Grid
-from pixmetry.core.signal import Kind, Signal
-from pixmetry.experiment.observe import Group, observe
+from pixmetry.observe.observe import Group, observe
 from pixmetry.scene.files import SeriesModel
-from pixmetry.sensor import prnu
-from pixmetry.simulation import expose_group, plan_series
+from pixmetry.simulate.job import expose_group, plan_series
+from pixmetry.sources.sensor import prnu
 from statistical.reference_u import Reference, photon_transfer_u, spatial_u
 
 DIGITAL_CHAIN = (  # what dark and bright frames can tell of a camera, in the order of the light
@@ -227,7 +227,7 @@ def _charge_of(name: str, camera: Camera) -> np.ndarray:
 
 def _unit_maps(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Shading, relative response, and constant extra electrons (DSNU and hot pixels) of this unit, each of the frame's shape."""
-    from pixmetry.optics import shading
+    from pixmetry.sources.optics import shading
 
     grid, streams = Grid.whole([0], camera.frame_shape), camera.streams(0)
     one = np.ones(1)

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scipy.fft import dctn
 
+from pixmetry.camera.signal import Kind, Signal
 from pixmetry.core.errors import ParameterError
-from pixmetry.core.signal import Kind, Signal
-from pixmetry.storage.jpeg import Jpeg, block_error, forward, round_trip, steps
+from pixmetry.sources.storage.jpeg import Jpeg, block_error, forward, round_trip, steps
 from source_signals import signal, stream
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from catalogue.support import Flat, Texture, camera_with
 from pixmetry.core.random import Grid
-from pixmetry.storage.tape import SOURCE, Tape, delay_s, dropout_mask, noise_dn, propagate
+from pixmetry.sources.storage.tape import SOURCE, Tape, delay_s, dropout_mask, noise_dn, propagate
 from source_signals import Z, stream
 from video_signals import PIXEL_HZ, bump, centre, row_of, sampled, standard_probe, video
 

@@ -10,9 +10,9 @@ import av
 import numpy as np
 import pytest
 
+from pixmetry.camera.signal import Kind, Signal
 from pixmetry.core.errors import InputError, ParameterError
-from pixmetry.core.signal import Kind, Signal
-from pixmetry.storage.video_codec import Coder, VideoCodec, forward, start
+from pixmetry.sources.storage.video_codec import Coder, VideoCodec, forward, start
 from source_signals import signal, stream
 
 LOSSY = [("h264", 8), ("h264", 10), ("hevc", 8), ("hevc", 12)]

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from pixmetry.budget.combine import Combined
-from pixmetry.core.catalogue import get_source
+from pixmetry.camera.catalogue import get_source
 
 MOST = 5
 MOST_ACCEPTED = 3

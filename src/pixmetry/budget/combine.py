@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pixmetry.core.contribution import UNSTEADY, Contribution
+from pixmetry.camera.contribution import UNSTEADY, Contribution
 from pixmetry.core.errors import InputError
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from pixmetry.budget.combine import Combined, combine
 from pixmetry.budget.monte_carlo import Axis, MonteCarlo
 from pixmetry.budget.probe import ESTIMATOR_ITSELF
-from pixmetry.core.contribution import UNSTEADY
+from pixmetry.camera.contribution import UNSTEADY
 
 SUM, MONTE_CARLO = "sum", "Monte Carlo"
 COVERAGE = 2.0  # standard errors beyond which sum and Monte Carlo differ

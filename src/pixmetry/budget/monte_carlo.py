@@ -23,12 +23,12 @@ from pixmetry.budget.probe import (
     spread_windows,
     window_side,
 )
-from pixmetry.core.camera import Camera, Element
-from pixmetry.core.contribution import SMOOTH_ORDER, Contribution, smooth_part
-from pixmetry.core.conversions import LineSources, Link
+from pixmetry.camera.camera import Camera, Element
+from pixmetry.camera.contribution import SMOOTH_ORDER, Contribution, smooth_part
+from pixmetry.camera.conversions import LineSources, Link
+from pixmetry.camera.signal import Kind
 from pixmetry.core.errors import ChainError, InputError
 from pixmetry.core.random import Grid, Streams
-from pixmetry.core.signal import Kind
 
 UNIT_STRIDE = 1_000_003  # between the unit seeds of cameras of one type
 

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from pixmetry.core.camera import Camera
-from pixmetry.core.contribution import Probe
+from pixmetry.camera.camera import Camera
+from pixmetry.camera.contribution import Probe
+from pixmetry.camera.source import Source
 from pixmetry.core.errors import InputError
 from pixmetry.core.estimates import Estimates
-from pixmetry.core.source import Source
 
 
 def applies(source: Source, facts: Mapping[str, Any]) -> bool:

@@ -9,16 +9,16 @@ from typing import Any
 
 import numpy as np
 
-from pixmetry.core.camera import Camera, Element
-from pixmetry.core.contribution import Probe
-from pixmetry.core.conversions import SAMPLE, LineSources, Link
+from pixmetry.camera.camera import Camera, Element
+from pixmetry.camera.contribution import Probe
+from pixmetry.camera.conversions import SAMPLE, LineSources, Link
+from pixmetry.camera.line import Held, Line
+from pixmetry.camera.signal import Kind
+from pixmetry.camera.source import Source
 from pixmetry.core.errors import InputError
-from pixmetry.core.line import Held, Line
 from pixmetry.core.random import Grid
-from pixmetry.core.signal import Kind
-from pixmetry.core.source import Source
-from pixmetry.location.estimators import Estimator, split_text
-from pixmetry.location.target_estimator import MOMENTS, OPERATORS, TargetEstimator
+from pixmetry.locate.centroids.estimators import Estimator, split_text
+from pixmetry.locate.target_estimator import MOMENTS, OPERATORS, TargetEstimator
 from pixmetry.scene.discs import Discs
 from pixmetry.scene.uniform import Uniform
 

@@ -147,7 +147,7 @@ def main(source_files: tuple[str, ...]) -> None:
     its uncertainty.
     """
     if source_files:
-        from pixmetry.core.catalogue import add_source_file
+        from pixmetry.camera.catalogue import add_source_file
 
         for path in source_files:
             add_source_file(path)

@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     import numpy as np
     from rich.console import Console
 
-    from pixmetry.emva.known_camera import KnownCamera
-    from pixmetry.emva.preflight import Preflight
+    from pixmetry.emva.planning.known_camera import KnownCamera
+    from pixmetry.emva.planning.preflight import Preflight
     from pixmetry.emva.records import DataSheet, Results
 
 EXIT_DIFFERENT = 1
@@ -39,8 +39,8 @@ def refuse(campaigns: Sequence[Path], option: str, why: str) -> None:
 def test(campaigns: Sequence[Path], given: dict[str, Any]) -> None:
     """Test a camera, print the data sheet, and write what was asked for."""
     from pixmetry.cli._progress import shown_progress
-    from pixmetry.dark_currents import dark_current_law
-    from pixmetry.datasheets import emva1288
+    from pixmetry.emva.dark_currents import dark_current_law
+    from pixmetry.emva.job import emva1288
 
     options = {name: given[name] for name in ("release", "bayer", "bootstrap")} | {"photons_u_rel": given["photons_u"] / 100}
     files = {kind: given[kind] for kind in ("json", "xml", "report", "pdf")}
@@ -60,7 +60,7 @@ def test(campaigns: Sequence[Path], given: dict[str, Any]) -> None:
 def compare(a: Path, b: Path) -> None:
     """Say what differs between two data sheets."""
     from pixmetry.cli.compare import print_comparison
-    from pixmetry.comparing import compare as compare_two
+    from pixmetry.emva.judge.compare import compare as compare_two
 
     result = compare_two(a, b)
     print_comparison(result, _console())
@@ -70,9 +70,9 @@ def compare(a: Path, b: Path) -> None:
 
 def plan(campaigns: Sequence[Path], given: dict[str, Any]) -> None:
     """Say which frames to take."""
-    from pixmetry.emva.known_camera import first_to_saturate
-    from pixmetry.emva.plan_output import parse_wanted, plan_text, write_campaign
-    from pixmetry.emva.planning import plan_for
+    from pixmetry.emva.planning.known_camera import first_to_saturate
+    from pixmetry.emva.planning.plan_output import parse_wanted, plan_text, write_campaign
+    from pixmetry.emva.planning.planning import plan_for
 
     if len(campaigns) > 1:
         raise InputError("plans for one camera", where="--plan", value=len(campaigns), remedy="name one data sheet or campaign")
@@ -124,13 +124,13 @@ def _refuse_sheets(campaigns: Sequence[Path]) -> None:
 
 def _known_cameras(source: Path | None, bayer: str | None, more: dict[str, Any]) -> tuple[dict[str, KnownCamera], dict[str, Any]]:
     """What a data sheet says of a camera, or a look at the frames of a campaign, by channel; and its name and colour filter."""
-    from pixmetry.campaign import load_campaign
-    from pixmetry.emva.known_camera import camera_from_sheet
-    from pixmetry.emva.preflight import camera_from_preflight
-    from pixmetry.preflights import preflight_campaign
+    from pixmetry.emva.planning.known_camera import camera_from_sheet
+    from pixmetry.emva.planning.preflight import camera_from_preflight
+    from pixmetry.emva.planning.preflights import preflight_campaign
+    from pixmetry.files import load_campaign
 
     if source is not None and _is_sheet(source):
-        from pixmetry.emva.formats import read_sheet
+        from pixmetry.emva.files.formats import read_sheet
 
         if bayer is not None:
             raise InputError("has no meaning with a data sheet, which states its channels", where="--bayer", remedy="leave it away")
@@ -149,8 +149,8 @@ def preflight(campaigns: Sequence[Path], given: dict[str, Any]) -> None:
     """Check a few frames."""
     import json
 
-    from pixmetry.campaign.staged_files import Output, check_files, write_together
-    from pixmetry.emva.preflight import preflight_record, preflight_text
+    from pixmetry.emva.planning.preflight import preflight_record, preflight_text
+    from pixmetry.files.staged_files import Output, check_files, write_together
 
     _refuse_sheets(campaigns)
     written = [] if given["json"] is None else [Output(given["json"], PREFLIGHT_MARK)]
@@ -170,8 +170,8 @@ def preflight(campaigns: Sequence[Path], given: dict[str, Any]) -> None:
 
 def _looked_at(campaigns: Sequence[Path], given: dict[str, Any]) -> tuple[dict[str, Preflight], Sequence[Path]]:
     """What the preflight finds, by channel, and the files that it may read."""
-    from pixmetry.campaign import load_campaign
-    from pixmetry.preflights import preflight_campaign
+    from pixmetry.emva.planning.preflights import preflight_campaign
+    from pixmetry.files import load_campaign
 
     if given["dark"] or given["bright"]:
         refuse(campaigns, "--dark and --bright", "they are the frames")
@@ -188,8 +188,8 @@ def _looked_at(campaigns: Sequence[Path], given: dict[str, Any]) -> tuple[dict[s
 
 
 def _look_at_files(dark: Sequence[Path], bright: Sequence[Path], bits: int, bayer: str | None) -> dict[str, Preflight]:
-    from pixmetry.campaign.images import iter_frames, picture_files
-    from pixmetry.preflights import preflight_frames
+    from pixmetry.emva.planning.preflights import preflight_frames
+    from pixmetry.files.images import iter_frames, picture_files
 
     def reading(paths: Sequence[Path]) -> Callable[[], Iterator[np.ndarray]]:
         files = picture_files(paths)
@@ -202,7 +202,7 @@ def _look_at_files(dark: Sequence[Path], bright: Sequence[Path], bits: int, baye
 
 def print_sheet(sheet: DataSheet, console: Console) -> None:
     """Print all values of a data sheet, section by section."""
-    from pixmetry.report import emva_content as content
+    from pixmetry.emva.page import content
 
     camera = sheet.camera
     size = f"{camera['cols']} x {camera['rows']} pixels, {camera['bits']} bits"
@@ -222,8 +222,8 @@ def _print_values(results: Results, methods: list[str], console: Console) -> Non
     from rich.table import Table
     from rich.text import Text
 
-    from pixmetry.emva.keys import NONLINEAR
-    from pixmetry.report import emva_content as content
+    from pixmetry.emva.files.keys import NONLINEAR
+    from pixmetry.emva.page import content
 
     reasons: dict[str, int] = {}
     for title, rows in content.all_rows(results, methods).items():

@@ -103,7 +103,7 @@ def jobs_in(folder: Path) -> Iterator[Job]:
         return str(arguments[0]), lambda: _run([str(a) for a in arguments])
 
     discs, series = scene("discs", DISCS), scene("series", SERIES)
-    presets = sorted(p.name.removesuffix(".yaml") for p in (files("pixmetry") / "cameras").iterdir() if p.name.endswith(".yaml"))
+    presets = sorted(p.name.removesuffix(".yaml") for p in (files("pixmetry.camera") / "presets").iterdir() if p.name.endswith(".yaml"))
     for preset in presets:
         yield command("simulate", preset, discs, "-n", 2, "-o", folder / f"discs-{preset}", "--truth")
     window = ("--window", "900,1100,160,160")
@@ -147,14 +147,14 @@ def _numbered(boards: Path, folder: Path) -> None:
 
 
 def _correct(series: Path, results: Path, corrected: Path) -> None:
-    from pixmetry.locating import frames_inside
+    from pixmetry.locate.job import frames_inside
 
     _run(["correct", str(frames_inside(series)), "--with", str(results), "-o", str(corrected)])
 
 
 def _locating() -> Iterator[Job]:
     """Every kind of target with every estimator, in frames of every type of number."""
-    from pixmetry.locating import estimators, locate
+    from pixmetry.locate.job import estimators, locate
 
     for kind, (picture, options) in _pictures().items():
         for estimator in estimators(kind):

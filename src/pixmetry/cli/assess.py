@@ -12,7 +12,7 @@ from pixmetry.cli._console import echo
 from pixmetry.core.plain_text import shown
 
 if TYPE_CHECKING:
-    from pixmetry.results import Assessment
+    from pixmetry.assess.results import Assessment
 
 LISTED = 8  # contributions that the console names
 
@@ -69,7 +69,7 @@ def assess(
     if estimator == "list":
         list_estimators()
         return
-    from pixmetry.assessment import assess as run
+    from pixmetry.assess.job import assess as run
     from pixmetry.cli._progress import shown_progress
     from pixmetry.core.threads import set_threads
 
@@ -84,8 +84,8 @@ def assess(
 
 def list_estimators() -> None:
     """Print the estimators that there are: those of `pixmetry locate` for discs, and centroids over a fixed square."""
-    from pixmetry.locating import estimators
-    from pixmetry.location.estimators import LAWS, PREFIX
+    from pixmetry.locate.centroids.estimators import LAWS, PREFIX
+    from pixmetry.locate.job import estimators
 
     words = "over a fixed square of pixels; window=13, and sigma=3 of a threshold"
     fixed = {f"{PREFIX}{law}": f"{law.replace('_', ' ')} {words}" for law in LAWS}

@@ -86,7 +86,7 @@ def bound(
     Example: pixmetry bound --radius 3.5 --blur 0.7 --amplitude 150 --background 10 --camera imx264_like
     """
     from pixmetry.core.errors import InputError
-    from pixmetry.location.bound import possible
+    from pixmetry.locate.bound.bound import possible
 
     if noise and camera:
         raise InputError("the noise is given twice", where="--noise, --camera", remedy="give one of them")
@@ -117,7 +117,7 @@ def bound(
 
 def _of_text(text: str, no_rounding: bool) -> tuple[Any, dict[str, float], dict[str, Any]]:
     """Noise model, settings and facts from ``key=number,…``."""
-    from pixmetry.location.noise import parse_noise
+    from pixmetry.locate.noise import parse_noise
 
     model, pattern = parse_noise(text, not no_rounding)
     return model, {"aperture_px": 1.0, "pattern_dn": pattern}, {"camera": None, "pitch_um": None}
@@ -127,9 +127,9 @@ def _of_camera(name: str, no_rounding: bool) -> tuple[Any, dict[str, float], dic
     """The same from a camera file or preset."""
     from dataclasses import replace
 
-    from pixmetry.camera_noise import camera_noise
-    from pixmetry.core.camera import load_camera
-    from pixmetry.location.noise import ROUNDING_DN2
+    from pixmetry.camera.camera import load_camera
+    from pixmetry.locate.camera_noise import camera_noise
+    from pixmetry.locate.noise import ROUNDING_DN2
 
     camera = load_camera(name)
     read = camera_noise(camera)

@@ -114,8 +114,8 @@ def calibrate(
 
     docs/calibrating.md explains every key of a project file and every message.
     """
-    from pixmetry.calibrating import calibrate as run
-    from pixmetry.calibration_exports import check_exports, write_exports
+    from pixmetry.calibrate.files.exports import check_exports, write_exports
+    from pixmetry.calibrate.job import calibrate as run
     from pixmetry.cli._progress import shown_progress
     from pixmetry.core.threads import set_threads
 
@@ -135,26 +135,26 @@ def calibrate(
 
 def _told(calibration: Any, report: Path, json: bool) -> str:
     """What is printed: a summary for people, or the cameras for programs."""
-    from pixmetry.line_calibration import LineCalibration
+    from pixmetry.calibrate.lines.line_calibration import LineCalibration
 
     if json:
-        from pixmetry.calibration_record import cameras_text
+        from pixmetry.calibrate.files.record import cameras_text
         from pixmetry.core.plain_text import json_shown
 
         return json_shown(cameras_text(calibration, str(report)))
     if isinstance(calibration, LineCalibration):
-        from pixmetry.report.lines_text import summary_text as lines_text
+        from pixmetry.calibrate.page.lines_text import summary_text as lines_text
 
         text = lines_text(calibration)
     else:
-        from pixmetry.report.calibration_text import summary_text
+        from pixmetry.calibrate.page.text import summary_text
 
         text = summary_text(calibration)
     return f"{text.rstrip()}\nreport: {report}"
 
 
 def _models(calibration: Any) -> list[Any]:
-    from pixmetry.line_calibration import LineCalibration
+    from pixmetry.calibrate.lines.line_calibration import LineCalibration
 
     if isinstance(calibration, LineCalibration):
         return [calibration.camera()]

@@ -41,11 +41,11 @@ def chain(
     CAMERA is a camera file or the name of a preset. SCENE is a scene file. The page shows the image and its profiles after every error
     source, how far the target's centre has moved so far, and which source moved it.
     """
-    from pixmetry.campaign.staged_files import Output, check_files, page_mark
-    from pixmetry.chain import walk
-    from pixmetry.core.camera import load_camera
-    from pixmetry.core.overrides import changed_camera, parse_overrides
-    from pixmetry.report.chain_page import TITLE, write_chain_page
+    from pixmetry.camera.camera import load_camera
+    from pixmetry.camera.overrides import changed_camera, parse_overrides
+    from pixmetry.files.staged_files import Output, check_files, page_mark
+    from pixmetry.simulate.page import TITLE, write_chain_page
+    from pixmetry.simulate.walk import walk
 
     check_files([Output(output, page_mark(TITLE))], [scene, Path(camera)])  # before the work
     changed = changed_camera(load_camera(camera), parse_overrides(settings), off)

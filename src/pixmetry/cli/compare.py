@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
     from rich.console import Console
 
-    from pixmetry.comparing import Comparison, Fleet
-    from pixmetry.emva.conformity import Checked
+    from pixmetry.emva.judge.compare import Comparison, Fleet
+    from pixmetry.emva.judge.conformity import Checked
     from pixmetry.emva.records import Value
 
 EXIT_DIFFERENT = 1
@@ -43,10 +43,10 @@ def compare(files: tuple[Path, ...], limits: Path | None, level: float, same_lig
 
     Exit status: 0 if nothing changed and all limits hold; 1 if a value changed, stands out, fails or is undecided; 2 after an error.
     """
-    from pixmetry.campaign.staged_files import Output, check_files, write_together
-    from pixmetry.comparing import check_limits, compare_fleet
-    from pixmetry.comparing import compare as compare_two
     from pixmetry.core.errors import InputError
+    from pixmetry.emva.judge.compare import check_limits, compare_fleet
+    from pixmetry.emva.judge.compare import compare as compare_two
+    from pixmetry.files.staged_files import Output, check_files, write_together
 
     if len(files) == 1 and limits is None:
         raise InputError("one file cannot be compared", where=str(files[0]), remedy="name a second one, or --limits")
@@ -63,7 +63,7 @@ def compare(files: tuple[Path, ...], limits: Path | None, level: float, same_lig
         record["comparison"] = result.to_record()
         good = result.same
     if limits is not None:
-        from pixmetry.emva.conformity import load_limits
+        from pixmetry.emva.judge.conformity import load_limits
 
         given = load_limits(limits)
         checked = {str(path): check_limits(path, given) for path in files}
@@ -87,7 +87,7 @@ def print_comparison(result: Comparison | Fleet, console: Console, everything: b
     everything : bool
         Show also what is the same.
     """
-    from pixmetry.comparing import Comparison
+    from pixmetry.emva.judge.compare import Comparison
 
     if isinstance(result, Comparison):
         _print_pair(result, console, everything)
@@ -226,7 +226,7 @@ def _shown(value: Value | None) -> str:
 
 
 def _limit_record(name: str, row: Checked) -> dict[str, Any]:
-    from pixmetry.emva.formats import plain, value_record
+    from pixmetry.emva.files.formats import plain, value_record
 
     judgement = row.judgement
     return {

@@ -22,9 +22,9 @@ def correct(frames: tuple[Path, ...], results: Path, output: Path, raw: str | No
     corrected in this order, as far as the assessment measured them. The command lists what could not be corrected, with the reason. The
     corrected frames are TIFF files of 32-bit floats in DN above black.
     """
+    from pixmetry.assess.correct import correct_files
     from pixmetry.cli._progress import shown_progress
     from pixmetry.core.threads import set_threads
-    from pixmetry.correction import correct_files
 
     set_threads(threads)
     with shown_progress() as progress:

@@ -65,11 +65,11 @@ def simulate(
     The folder gets the frames, truth.json with the true position of every target in every frame, and camera.yaml: the camera with the
     changes of --set and --off.
     """
+    from pixmetry.camera.overrides import parse_overrides
     from pixmetry.cli._progress import shown_progress
-    from pixmetry.core.overrides import parse_overrides
     from pixmetry.core.threads import set_threads
-    from pixmetry.simulation import parse_window
-    from pixmetry.simulation import simulate as run
+    from pixmetry.simulate.job import parse_window
+    from pixmetry.simulate.job import simulate as run
 
     set_threads(threads)
     changes = parse_overrides(settings)

@@ -18,7 +18,7 @@ def sources(source_id: str | None, as_json: bool) -> None:
     Without ID: all error sources by stage, with the handbook's stars and notes, and which of the verbs forward, measure, correct and
     propagate each source has. With ID: its equation, its parameters with units and ranges, its references and its typical size.
     """
-    from pixmetry.core.catalogue import catalogue, get_source, to_record
+    from pixmetry.camera.catalogue import catalogue, get_source, to_record
 
     if source_id is None:
         records = [to_record(s) for s in catalogue().values()]
@@ -30,7 +30,7 @@ def sources(source_id: str | None, as_json: bool) -> None:
 
 
 def _details(source) -> dict:
-    from pixmetry.core.source import STATED_FRAME, bounds_text
+    from pixmetry.camera.source import STATED_FRAME, bounds_text
 
     return {
         "description": source.description,

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pixmetry.emva.files.rules import MINIMUM_DARK_VAR_DN2, ONE_SIDED_95, UNDERFLOW_FRACTION
 from pixmetry.emva.records import Measurement, Series
-from pixmetry.emva.rules import MINIMUM_DARK_VAR_DN2, ONE_SIDED_95, UNDERFLOW_FRACTION
 from pixmetry.emva.series import first_of_equal
 from pixmetry.emva.temporal import dark_line
-from pixmetry.experiment.photon_transfer_levels import clipped_black, core_spread_dn2
-from pixmetry.experiment.photon_transfer_model import rounding_error_vars, slope_error_var, white_before_rounding
+from pixmetry.observe.photon_transfer_levels import clipped_black, core_spread_dn2
+from pixmetry.observe.photon_transfer_model import rounding_error_vars, slope_error_var, white_before_rounding
 
 MOSTLY_BLACK = 0.5  # of the dark pixels at the lowest code: not even the middle one shows its noise
 

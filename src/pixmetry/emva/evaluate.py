@@ -10,21 +10,21 @@ import numpy as np
 from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.core.random import Generator, generator
 from pixmetry.core.threads import map_tiles, single_threaded_blas
-from pixmetry.emva.curved import level_free_values
 from pixmetry.emva.dark_noise import DarkNoise, pattern_limit_dn2
+from pixmetry.emva.files.keys import KEYS, goes_with_photons
+from pixmetry.emva.files.rules import ONE_SIDED_95
 from pixmetry.emva.formulas import DARK_VARIANCE, Formulas, Spread, Values, keys_of
-from pixmetry.emva.general import general_curve
-from pixmetry.emva.keys import KEYS, goes_with_photons
+from pixmetry.emva.general.curved import level_free_values
+from pixmetry.emva.general.general import general_curve
+from pixmetry.emva.general.nonlinear import nonlinear_values
 from pixmetry.emva.linear_model import departure_bounds, linear_model
 from pixmetry.emva.lower_limits import with_lower_limits
-from pixmetry.emva.nonlinear import nonlinear_values
 from pixmetry.emva.partial import partial_results
 from pixmetry.emva.reasons import DARK_PATTERN, Case, breaks_the_split, is_blind, is_bound, lifted, notes_of, reason_for
 from pixmetry.emva.records import RELEASES, Measurement, Results, Value
-from pixmetry.emva.rules import ONE_SIDED_95
 from pixmetry.emva.scatter import GROUPS, Scatter, scatter_of
 from pixmetry.emva.series import light_of
-from pixmetry.emva.spatial_curves import spatial_curves
+from pixmetry.emva.spatial.spatial_curves import spatial_curves
 from pixmetry.emva.temporal import slope_departures, temporal_values
 from pixmetry.emva.temporal_curves import dark_signal, temporal_curves
 from pixmetry.emva.uncertainty import about, add_wave, bootstrap_series, draw_blocks

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from pixmetry.core.errors import MeasureError, PixmetryError
-from pixmetry.emva.curved import is_curved, is_level_free, level_free_values
-from pixmetry.emva.general import general_evaluation
-from pixmetry.emva.keys import KEYS, OVER_TEMPERATURES
+from pixmetry.emva.files.keys import KEYS, OVER_TEMPERATURES
+from pixmetry.emva.general.curved import is_curved, is_level_free, level_free_values
+from pixmetry.emva.general.general import general_evaluation
 from pixmetry.emva.records import Measurement, Series
 from pixmetry.emva.series import light_of, series_of
-from pixmetry.emva.spatial import snr_total_max, spatial_evaluation
-from pixmetry.emva.spatial_inputs import SpatialInputs
+from pixmetry.emva.spatial.spatial import snr_total_max, spatial_evaluation
+from pixmetry.emva.spatial.spatial_inputs import SpatialInputs
 from pixmetry.emva.temporal import dark_line, temporal_values
 
 Values = dict[str, np.ndarray]

@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
-from pixmetry.emva.curved import REASON as NOT_LINEAR
+from pixmetry.emva.files.rules import PTC_LIMIT_PERCENT
+from pixmetry.emva.general.curved import REASON as NOT_LINEAR
 from pixmetry.emva.records import Results
-from pixmetry.emva.rules import PTC_LIMIT_PERCENT
 
 HOLDS, FAILS, OPEN, UNKNOWN, CURVED = "holds", "fails", "open", "unknown", "curved"
 

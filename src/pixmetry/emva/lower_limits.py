@@ -8,12 +8,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from pixmetry.emva.general import general_curve, general_evaluation
-from pixmetry.emva.general_model import light_axis
+from pixmetry.emva.files.rules import ONE_SIDED_95
+from pixmetry.emva.general.general import general_curve, general_evaluation
+from pixmetry.emva.general.general_model import light_axis
+from pixmetry.emva.general.response_end import end_of
 from pixmetry.emva.reasons import Case, ends_early
 from pixmetry.emva.records import Value
-from pixmetry.emva.response_end import end_of
-from pixmetry.emva.rules import ONE_SIDED_95
 
 ENDS_EARLY = "the series ends before saturation"
 FROM_ITS_END = (

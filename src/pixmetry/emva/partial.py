@@ -8,15 +8,15 @@ import numpy as np
 
 from pixmetry.core.errors import MeasureError, PixmetryError
 from pixmetry.core.random import generator
+from pixmetry.emva.files.keys import KEYS
+from pixmetry.emva.files.rules import MINIMUM_DARK_VAR_DN2, ONE_SIDED_95
 from pixmetry.emva.formulas import keys_of
-from pixmetry.emva.keys import KEYS
 from pixmetry.emva.reasons import BROKEN
 from pixmetry.emva.records import Measurement, Results, Value
-from pixmetry.emva.rules import MINIMUM_DARK_VAR_DN2, ONE_SIDED_95
 from pixmetry.emva.scatter import sampling_u
 from pixmetry.emva.series import MINIMUM_EXPOSURES, count_exposures, dark_order, first_of_equal
-from pixmetry.emva.spatial import PARTS, spatial_variances
-from pixmetry.emva.spatial_inputs import SpatialInputs
+from pixmetry.emva.spatial.spatial import PARTS, spatial_variances
+from pixmetry.emva.spatial.spatial_inputs import SpatialInputs
 
 DRAWS = 2000
 SEED = 1288

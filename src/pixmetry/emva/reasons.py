@@ -7,17 +7,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pixmetry.emva.curved import REASON as CURVED
 from pixmetry.emva.dark_noise import DarkNoise
+from pixmetry.emva.files.keys import KEYS, key_of
+from pixmetry.emva.files.rules import EQUAL_EXPOSURE, ONE_SIDED_95, PTC_LIMIT_PERCENT, SATURATED_FRACTION
 from pixmetry.emva.formulas import Formulas, Spread, Values
-from pixmetry.emva.general import general_curve, general_notes
-from pixmetry.emva.keys import KEYS, key_of
+from pixmetry.emva.general.curved import REASON as CURVED
+from pixmetry.emva.general.general import general_curve, general_notes
 from pixmetry.emva.linear_model import FAILS
 from pixmetry.emva.records import Measurement, Series, Value
-from pixmetry.emva.rules import EQUAL_EXPOSURE, ONE_SIDED_95, PTC_LIMIT_PERCENT, SATURATED_FRACTION
 from pixmetry.emva.series import MINIMUM_EXPOSURES, count_exposures, exposure_varies, light_of, without_dark
 from pixmetry.emva.temporal import dark_line
-from pixmetry.experiment.stack import same_exposure
+from pixmetry.observe.stack import same_exposure
 
 SWEPT_SHARE = 0.01  # of the slope of the response
 BROKEN = 5.0  # u below zero from which a square is no chance any more

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from pixmetry.core.observations import PhotonTransfer, StackMoments
+from pixmetry.camera.observations import PhotonTransfer, StackMoments
 
 RELEASES = ("4.0", "3.1", "reference")
 MONO = "mono"
@@ -88,7 +88,7 @@ class Value:
 
 @dataclass(frozen=True)
 class Results:
-    """Values and curves of one channel by one release; keys as in ``pixmetry.emva.keys``."""
+    """Values and curves of one channel by one release; keys as in ``pixmetry.emva.files.keys``."""
 
     release: str
     values: Mapping[str, Value]

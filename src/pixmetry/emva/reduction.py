@@ -7,13 +7,13 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from pixmetry.camera.observations import PhotonTransfer, StackMoments
 from pixmetry.core.errors import InputError, MeasureError
-from pixmetry.core.observations import PhotonTransfer, StackMoments
 from pixmetry.emva.records import MONO, Measurement
-from pixmetry.experiment.hot_pixels import tail_of_counts
-from pixmetry.experiment.moments import LevelSummary
-from pixmetry.experiment.one_pass import Group, Level, Part, Reduced, photon_transfer, reduce_groups, refuse_copies, whole
-from pixmetry.experiment.stack import EQUAL_EXPOSURE, StackAccumulator, choose_stacks, same_exposure
+from pixmetry.observe.hot_pixels import tail_of_counts
+from pixmetry.observe.moments import LevelSummary
+from pixmetry.observe.one_pass import Group, Level, Part, Reduced, photon_transfer, reduce_groups, refuse_copies, whole
+from pixmetry.observe.stack import EQUAL_EXPOSURE, StackAccumulator, choose_stacks, same_exposure
 
 __all__ = ["CHANNELS", "MOSAICS", "Group", "Phase", "measure_frames", "phases"]
 

@@ -18,9 +18,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from pixmetry.camera.observations import LevelMoments
 from pixmetry.core.errors import MeasureError
-from pixmetry.core.observations import LevelMoments
-from pixmetry.emva.curved import following, is_curved
+from pixmetry.emva.general.curved import following, is_curved
+from pixmetry.emva.general.smooth import ScatterFit, fit_scatter
 from pixmetry.emva.records import Measurement, Series
 from pixmetry.emva.series import (
     MINIMUM_EXPOSURES,
@@ -32,8 +33,7 @@ from pixmetry.emva.series import (
     light_of,
     pairing,
 )
-from pixmetry.emva.smooth import ScatterFit, fit_scatter
-from pixmetry.experiment.photon_transfer_levels import USABLE_FRACTION
+from pixmetry.observe.photon_transfer_levels import USABLE_FRACTION
 
 GROUPS = ("light", "variance", "dark_mean", "dark_variance", "spatial", "counts")
 OWN_DOF = 5  # residuals with fewer degrees of freedom are helped by what frames of one level tell

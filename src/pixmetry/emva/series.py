@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from pixmetry.camera.observations import LevelMoments
 from pixmetry.core.errors import MeasureError
-from pixmetry.core.observations import LevelMoments
+from pixmetry.emva.files.rules import EQUAL_EXPOSURE
 from pixmetry.emva.records import Measurement, Series
-from pixmetry.emva.rules import EQUAL_EXPOSURE
 
 MINIMUM_LEVELS = 3
 MINIMUM_EXPOSURES = 3  # for a slope of the dark signal

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from pixmetry.core.errors import MeasureError
-from pixmetry.emva.local_slope import slope_matrix
+from pixmetry.emva.files.rules import FIT_RANGE, MINIMUM_DARK_VAR_DN2, QUANTISATION_DN2, SATURATED_FRACTION
+from pixmetry.emva.general.local_slope import slope_matrix
 from pixmetry.emva.records import Series
-from pixmetry.emva.rules import FIT_RANGE, MINIMUM_DARK_VAR_DN2, QUANTISATION_DN2, SATURATED_FRACTION
 from pixmetry.emva.series import MINIMUM_EXPOSURES, count_exposures, first_of_equal, light_of
 
 LINEAR_RANGE = (0.05, 0.95)  # of saturation, for linearity (R4.0 §6.7)
@@ -33,7 +33,7 @@ def temporal_values(
     Returns
     -------
     dict of ndarray, shape (...)
-        By the keys of ``pixmetry.emva.keys``; NaN where the series does not carry a value (no photons, no area, one exposure).
+        By the keys of ``pixmetry.emva.files.keys``; NaN where the series does not carry a value (no photons, no area, one exposure).
         ``sigma_y_dark`` and what follows from it rest on ``least_dark_var_dn2`` at least.
 
     Raises

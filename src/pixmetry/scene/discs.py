@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from pixmetry.camera.light import Points
 from pixmetry.core.errors import ParameterError
-from pixmetry.core.light import Points
 from pixmetry.core.random import Grid
 from pixmetry.scene._kernels import add_discs, see_discs
 from pixmetry.scene.motion import Motion

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pixmetry.core.light import Points
+from pixmetry.camera.light import Points
 from pixmetry.core.random import Grid
 from pixmetry.scene.lighting import Lighting
 from pixmetry.scene.shapes import pixel_points

@@ -10,8 +10,8 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
+from pixmetry.camera.light import Points
 from pixmetry.core.errors import ParameterError
-from pixmetry.core.light import Points
 from pixmetry.core.random import Grid
 from pixmetry.scene import _contour_kernels as kernels
 from pixmetry.scene.motion import STILL, Motion

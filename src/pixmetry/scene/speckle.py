@@ -9,8 +9,8 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from pixmetry.camera.light import Points
 from pixmetry.core.errors import ParameterError
-from pixmetry.core.light import Points
 from pixmetry.core.random import Grid, Stream
 from pixmetry.scene.motion import STILL, Motion
 from pixmetry.scene.shapes import pixel_points

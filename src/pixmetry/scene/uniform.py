@@ -8,8 +8,8 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
+from pixmetry.camera.light import Points
 from pixmetry.core.errors import ParameterError
-from pixmetry.core.light import Points
 from pixmetry.core.random import Grid
 
 

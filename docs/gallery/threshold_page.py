@@ -1,0 +1,244 @@
+"""The page of the threshold experiment: its figures, tables and text."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gallery import threshold as experiment
+from gallery.page import Page, show, table
+from gallery.threshold import DISC, SPOT, Sweep
+from pixmetry.report.drawing import AMBER, BLUE, INK, RED, SOFT, Picture, canvas, picture
+
+LINES = {
+    "centroid": {"color": RED, "marker": "o"},
+    "squared centroid": {"color": BLUE, "marker": "s"},
+    "soft centroid": {"color": AMBER, "linestyle": "--", "marker": "^"},
+}
+
+
+def sweep_figure(both: tuple[Sweep, Sweep]) -> Picture:
+    """Error against threshold of three centroids, and of the fit, which has no threshold."""
+    with canvas(4.3, nrows=2, sharex=True, sharey=True) as (figure, panels):
+        for axes, found in zip(panels, both, strict=True):
+            for name, look in LINES.items():
+                axes.plot(found.threshold_dn, found.noisy[name].rms_px, label=name, markersize=2.6, **look)
+            axes.axhline(experiment.fitted(found.target).rms_px, color=INK, linestyle=":", label="template fit, no threshold")
+            axes.set_title(_title(found), loc="left")
+            axes.set_ylabel("error, rms / px")
+        panels[0].set_ylim(0, 0.14)
+        panels[1].set_xlim(-1, 101)
+        panels[1].set_xlabel("threshold / grey value")
+        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
+        disc = both[0]
+        alt = (
+            f"Error of centroids against threshold. Disc: the centroid falls from {_px(disc.noisy['centroid'].rms_px[0])} px at 0 to "
+            f"{_px(disc.noisy['centroid'].rms_px.min())} px and rises to {_px(disc.noisy['centroid'].rms_px[-1])} px at 100. "
+            f"The fit stays at {_px(experiment.fitted(DISC).rms_px)} px (disc) and {_px(experiment.fitted(SPOT).rms_px)} px (spot)."
+        )
+        caption = (
+            "Error (root mean square of x and y over 800 targets) against the threshold. Red and blue keep the grey values above the "
+            "threshold as they are (hard threshold), amber takes the threshold from them (soft)."
+        )
+        return picture(figure, "threshold-sweep", alt, caption)
+
+
+def cause_figure(both: tuple[Sweep, Sweep]) -> Picture:
+    """The centroid's error with noise, without noise, and what is left of it in the mean of many frames."""
+    with canvas(4.1, nrows=2, sharex=True, sharey=True) as (figure, panels):
+        for axes, found in zip(panels, both, strict=True):
+            part = experiment.parts(found.target, "centroid")
+            axes.plot(found.threshold_dn, found.noisy["centroid"].rms_px, color=RED, marker="o", markersize=2.6, label="with noise")
+            quiet = found.quiet["centroid"].rms_px
+            axes.plot(found.threshold_dn, quiet, color=INK, linestyle="--", label="without any noise")
+            axes.plot(found.threshold_dn, part.lasting_px, color=BLUE, linestyle="-.", label="with noise, mean of endless frames")
+            axes.set_title(_title(found), loc="left")
+            axes.set_ylabel("error, rms / px")
+        panels[0].set_ylim(0, 0.14)
+        panels[1].set_xlim(-1, 101)
+        panels[1].set_xlabel("threshold / grey value")
+        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
+        disc = both[0]
+        alt = (
+            f"Error of the centroid above a hard threshold with and without noise. At 100 the disc has "
+            f"{_px(disc.noisy['centroid'].rms_px[-1])} px with noise and {_px(disc.quiet['centroid'].rms_px[-1])} px without."
+        )
+        caption = (
+            "The rise is there without any noise: from a threshold of 40 on the dashed line (no noise) nearly is the red one. What the "
+            "blue line shows does not go away however many frames are averaged."
+        )
+        return picture(figure, "threshold-cause", alt, caption)
+
+
+def phase_figure(threshold_dn: float = 30.0) -> Picture:
+    """Error without noise against the place of the spot in its pixel."""
+    phase = np.linspace(-0.5, 0.5, 401)
+    with canvas(2.5) as (figure, axes):
+        for name, look in LINES.items():
+            dash = {"centroid": "-", "squared centroid": "-.", "soft centroid": "--"}[name]
+            axes.plot(phase, experiment.against_phase(SPOT, name, threshold_dn, phase), color=look["color"], linestyle=dash, label=name)
+        axes.axhline(0, color=SOFT, linewidth=0.8)
+        axes.set_xlim(-0.5, 0.5)
+        axes.set_xlabel("true place of the spot in its pixel / px")
+        axes.set_ylabel("error in x / px")
+        figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3)
+        worst = float(np.abs(experiment.against_phase(SPOT, "centroid", threshold_dn, phase)).max())
+        alt = (
+            f"Error against the place in the pixel at a threshold of {threshold_dn:g}: a saw with jumps, up to {_px(worst)} px, for "
+            f"the centroid."
+        )
+        caption = (
+            f"Without noise and rounding, Gaussian spot, threshold {threshold_dn:g}: error in x against the place in the pixel (y: "
+            f"middle of a pixel). With a hard threshold each jump is a pixel that comes in or drops out with its whole grey "
+            "value; with a soft one it comes in at zero."
+        )
+        return picture(figure, "threshold-phase", alt, caption)
+
+
+def _title(found: Sweep) -> str:
+    seen = found.target
+    return _first_up(f"{seen.name}, background {seen.background_dn:g}, noise σ {seen.noise_dn:g}")
+
+
+def _px(value: float) -> str:
+    return f"{value:.3f}"
+
+
+def _curves(found: Sweep) -> str:
+    """Every number of one target."""
+    rows = []
+    for j, t in enumerate(found.threshold_dn):
+        noisy = [_px(found.noisy[c].rms_px[j]) for c in experiment.CURVES]
+        quiet = [_px(found.quiet[c].rms_px[j]) for c in ("centroid", "soft centroid")]
+        rows.append([f"{t:.0f}", *noisy, *quiet])
+    head = ["threshold", "centroid", "squared", "soft", "soft squared", "centroid, no noise", "soft, no noise"]
+    relative = max(float((s.u_px / s.rms_px).max()) for s in found.noisy.values())
+    fitted = experiment.fitted(found.target)
+    fit = f"Template fit: {fitted.rms_px:.4f} ± {fitted.u_px:.4f} px with noise, {fitted.quiet_px:.4f} px without."
+    return f"**{_first_up(found.target.describe())}.** {fit} Standard errors up to {100 * relative:.1f} %.\n\n{table(head, rows, 0)}"
+
+
+def _first_up(text: str) -> str:
+    return text[0].upper() + text[1:]
+
+
+def _claims(disc: Sweep, spot: Sweep) -> str:
+    """What the chapter says beside what was found."""
+    plain, square = disc.noisy["centroid"].rms_px, disc.noisy["squared centroid"].rms_px
+    t = disc.threshold_dn
+    plain_s, square_s = spot.noisy["centroid"].rms_px, spot.noisy["squared centroid"].rms_px
+    slopes = [experiment.rise(s, c) for s in (disc, spot) for c in ("centroid", "squared centroid")]
+    quiet = disc.quiet["centroid"].rms_px
+    highest = max(float(s.noisy[c].rms_px.max()) for s in (disc, spot) for c in ("centroid", "squared centroid"))
+    low_t = [f"{t[np.argmin(v)]:.0f}" for v in (plain, plain_s)]
+    random = experiment.parts(DISC, "centroid").random_px
+    rows = [
+        ["errors lie between 0 and 0.14 px for thresholds 0 … 100 (its axes)", f"largest of all: {_px(highest)} px"],
+        [
+            "without a threshold the centroid is poor, the squared centroid much less so",
+            f"{_px(plain[0])} against {_px(square[0])} px (disc), {_px(plain_s[0])} against {_px(square_s[0])} px (spot)",
+        ],
+        [
+            "above the background's noise both improve, the centroid more",
+            f"centroid {plain[0] / plain.min():.1f} times, squared {square[0] / square.min():.1f} times better at its best; "
+            f"the centroid's best threshold is {low_t[0]} (disc) and {low_t[1]} (spot)",
+        ],
+        [
+            "from there on both rise",
+            "mean slopes from 60 to 100, in 0.001 px per grey value: centroid {:.2f} and {:.2f}, squared {:.2f} and {:.2f} (disc and "
+            "spot); in the trend, not from point to point".format(*(1e3 * slopes[j][0] for j in (0, 2, 1, 3))),
+        ],
+        [
+            "because the target becomes smaller and holds less information",
+            f"no: the rise is the same without noise ({_px(quiet[-1])} px at 100, with noise {_px(plain[-1])} px), "
+            f"and the fit finds the same targets to {_px(experiment.fitted(DISC).rms_px)} px",
+        ],
+        [
+            "a bias that swings with the place in the pixel",
+            "yes, and it is the main part; part of it shows as noise, because noise makes pixels near the threshold come and go: "
+            f"frame to frame, the disc's centroid scatters by {_px(random[5])} px at 25 and {_px(random[-1])} px at 100",
+        ],
+        [
+            "squared: less sensitive, but not at high thresholds on small targets",
+            f"squared over plain: {square[12] / plain[12]:.2f} at 60 and {square[-1] / plain[-1]:.2f} at 100 (disc), "
+            f"{square_s[12] / plain_s[12]:.2f} and {square_s[-1] / plain_s[-1]:.2f} (spot)",
+        ],
+        ["set the threshold as low as possible", "right for a hard threshold above the noise; better, see below"],
+    ]
+    return table(["the chapter", "here"], rows, 2)
+
+
+def _windows() -> str:
+    """The plain centroid without a threshold against its window."""
+    found = {t.name: experiment.without_threshold(t) for t in (DISC, SPOT)}
+    sides = list(found["disc"])
+    rows = [[name, *(_px(values[s][0]) for s in sides)] for name, values in found.items()]
+    return table(["no threshold, error in px", *(f"{s} × {s} px" for s in sides)], rows)
+
+
+def page() -> Page:
+    """Run the experiment and write it up."""
+    disc, spot = both = experiment.sweep(DISC), experiment.sweep(SPOT)
+    on_disc, on_spot = experiment.fitted(DISC), experiment.fitted(SPOT)
+    pictures = sweep_figure(both), cause_figure(both), phase_figure()
+    j20, j10 = (int(np.searchsorted(disc.threshold_dn, t)) for t in (20, 10))
+    text = f"""# Thresholds (Note 8, Fig 3.10)
+
+To find the centre of a bright target one takes the centroid of its grey values. The background must not take part: each of its pixels
+pulls, and its noise pulls at random. So grey values up to a threshold are left out. How high should it be?
+
+## The experiment
+
+{experiment.COUNT} equal targets, each within ±0.5 px of the middle of its own {experiment.SIDE} × {experiment.SIDE} pixels, x and y at
+random and evenly. Light is averaged over each pixel; noise is added, the value rounded to a whole number, and cut off at 0 and 255. Then,
+for each threshold T from 0 to 100 (a grey value, not a height above the background):
+
+- **hard threshold**: a grey value I counts as I where I > T, otherwise not at all. This is the chapter's;
+- **soft threshold**: it counts as I − T where I > T;
+- the **squared centroid** takes the squares of what is left.
+
+The sum always runs over the whole {experiment.SIDE} × {experiment.SIDE} pixels. The chapter does not print the sizes of its target, noise
+or window, so two cases stand here: {DISC.describe()} (of the 8-bit scale); {SPOT.describe()}. The error is the root mean square of found
+less true, of x and y together. The **template fit** is pixmetry's own estimator: the disc (or spot), blurred and averaged over the
+pixels, is fitted by least squares to the grey values around what the detection has found; it is told the noise, where the scale ends and
+that the background is even, and has no threshold.
+
+## What one sees
+
+{show(pictures[0])}
+{_claims(disc, spot)}
+Why the rise, then? Run the same targets once more, and leave the noise out:
+
+{show(pictures[1])}
+A target shows only a few pixels along its rim at the height of the threshold. When the target moves by a fraction of a pixel, one of them
+passes the threshold on one side, and not yet its mate on the other; the centroid jumps. This is a property of the place in the pixel, not
+of the noise, and the same in every frame:
+
+{show(pictures[2])}
+At the left end of the curves it is the window that counts, since without a threshold the whole background takes part:
+
+{_windows()}
+Noise of the many background pixels, and, where the background is not zero, its pull towards the middle of the window, both grow with the
+window. An error "without threshold" means little unless the window is told with it.
+
+## What to do about it
+
+- **Subtract the background, and the threshold too** (soft threshold), at about three standard deviations of the noise above the
+  background. At T = {disc.threshold_dn[j20]:.0f} the disc's centroid has {_px(disc.noisy["soft centroid"].rms_px[j20])} px in place of
+  {_px(disc.noisy["centroid"].rms_px[j20])} px, at T = {spot.threshold_dn[j10]:.0f} the spot's
+  {_px(spot.noisy["soft centroid"].rms_px[j10])} px in place of {_px(spot.noisy["centroid"].rms_px[j10])} px, and from there up to T = 50
+  it hardly matters where the threshold is.
+- **Or use no threshold: fit the target.** The template fit is at {on_disc.rms_px:.4f} px (disc) and {on_spot.rms_px:.4f} px (spot), and
+  says so itself: it states {on_disc.stated_px:.4f} px and {on_spot.stated_px:.4f} px. Without noise it is off by {on_disc.quiet_px:.4f}
+  px and {on_spot.quiet_px:.4f} px, from the rounding alone.
+- Averaging frames does not help against a threshold that is too high; moving the target does.
+
+## All numbers
+
+Root mean square errors in px; {experiment.SIDE} × {experiment.SIDE} px, {experiment.COUNT} targets. "No noise" is rounded to 8 bits like
+the rest.
+
+{_curves(disc)}
+{_curves(spot)}
+Written by `scripts/make_handbook.py` from `gallery.threshold`; run again, it writes the same.
+"""
+    return Page("threshold", text, pictures)

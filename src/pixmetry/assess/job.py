@@ -1,0 +1,307 @@
+"""The main job: from a campaign's frames to what the camera does to a target's position."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from pixmetry.assess.digital_twin import ASSUMED_RANGE_E, digital_twin, of_unit, self_test
+from pixmetry.assess.page.page import write_report
+from pixmetry.assess.results import Assessment
+from pixmetry.budget.job import compute_budget
+from pixmetry.budget.parameters import with_estimates
+from pixmetry.budget.probe import Target, parse_target
+from pixmetry.camera.catalogue import catalogue
+from pixmetry.camera.geometry import frame_centre
+from pixmetry.camera.observations import CameraGeometry, Observations
+from pixmetry.core.errors import InputError, MeasureError
+from pixmetry.core.estimates import Estimates
+from pixmetry.emva.evaluate import standard_values
+from pixmetry.emva.records import Measurement, Results
+from pixmetry.files import (
+    EXAMPLE,
+    Campaign,
+    FrameReader,
+    InputHashes,
+    check_output,
+    load_campaign,
+    provenance_record,
+    staged_output,
+    write_maps,
+    write_record,
+)
+from pixmetry.locate.target_estimator import TargetEstimator, parse_estimator
+from pixmetry.observe.observe import Group, observe
+
+KIND = "assessment"
+
+Progress = Callable[[str, int, int], None]
+
+
+def assess(
+    campaign: str | Path | Campaign | None = None,
+    output: str | Path | None = None,
+    *,
+    target: str = "",
+    estimator: str = "",
+    calibration: str | Path | CameraGeometry | None = None,
+    trials: int = 4000,
+    seed: int = 1,
+    progress: Progress | None = None,
+) -> Assessment:
+    """Assess a camera from its dark and bright frames.
+
+    Parameters
+    ----------
+    campaign : path, Campaign or None
+        A manifest, an EMVA 1288 descriptor, a folder with one of them, or None for the packaged example.
+    output : path, optional
+        Folder for ``report.html``, ``results.json``, ``maps.zarr.zip``, ``camera.yaml`` and ``camera.maps.npz``.
+    target, estimator : str
+        As on the command line, e.g. ``"disc:diameter=7,blur=0.7,peak=0.6"`` and ``"template"`` or any other name that `pixmetry.locate`
+        has for discs, or ``"fixed_soft_threshold:sigma=3,window=13"``. By default what `pixmetry.locate` takes.
+    calibration : path or CameraGeometry, optional
+        Results of `pixmetry calibrate` for the camera (the folder, or its ``calibration.json``), with which positions are corrected: their
+        uncertainty and what is left over enter the budget. One in pixels takes the pitch from the campaign.
+    trials : int
+        Windows for each Monte Carlo of the budget.
+    seed : int
+        Of the Monte Carlo.
+    progress : callable, optional
+        Called with (what, done, of).
+
+    Returns
+    -------
+    Assessment
+
+    Raises
+    ------
+    InputError, MeasureError
+        If a file or the campaign cannot be used, or the frames do not carry a photon transfer.
+    """
+    what_target = parse_target(target) if target else Target()
+    what_estimator = parse_estimator(estimator) if estimator else TargetEstimator()
+    frames = campaign if isinstance(campaign, Campaign) else load_campaign(campaign)
+    if output is not None:
+        check_output(output, KIND, _origin(frames), _inputs(frames, calibration))  # before the work, not after it
+    if isinstance(calibration, str | Path):
+        from pixmetry.calibrate.files.record import calibration_file
+
+        calibration = calibration_file(calibration)
+    geometry = None if calibration is None else _geometry_for(frames, calibration)
+    window = _window_of(frames)
+    told = progress or (lambda what, done, of: None)
+    hashes, seen = observe_campaign(frames, told)
+    told_of_frames = _other_frames(calibration, frames) if isinstance(calibration, Path) else ()
+    seen = replace(seen, geometry=geometry, notes=(*seen.notes, *window, *told_of_frames))
+    if isinstance(calibration, Path):
+        hashes.add_file(calibration)
+    standard = by_the_standard(frames, seen)
+    estimates, unmeasured = measure_sources(seen)
+    if "electronics.gain" not in estimates:
+        estimates, unmeasured = _at_assumed_gain(seen, estimates, unmeasured, frames.bits)
+        assumed = f"taken as if {ASSUMED_RANGE_E:g} electrons filled the range, fewer than in most cameras"
+        note = f"The gain is not measured. For the shot noise it is {assumed}, which bounds it; electrons are DN over that gain."
+        seen = replace(seen, notes=(*seen.notes, note))
+    camera = digital_twin(frames, estimates, seen)
+    steps = len(camera.active) + len(catalogue()) + 2
+    done = itertools.count(1)
+    budget = compute_budget(
+        camera,
+        estimates,
+        None,
+        what_target,
+        what_estimator,
+        geometry=geometry,
+        sensor_shape=frames.camera.sensor_shape,
+        accepted=[e.name for e in camera.active if e.name in unmeasured and e.source.measure is not None],
+        trials=trials,
+        seed=seed,
+        progress=lambda _: told("computing the budget", min(next(done), steps - 1), steps),
+    )
+    told("computing the budget", steps, steps)
+    record = provenance_record(hashes, seed=seed, libraries=("numpy", "scipy", "numba"))
+    told("testing the digital twin", 0, 1)
+    twin = of_unit(camera, seen)
+    tested = self_test(twin, frames, seen, standard, seed)
+    told("testing the digital twin", 1, 1)
+    assessment = Assessment(frames, seen, estimates, unmeasured, standard, twin, budget, record, tested)
+    if output is not None:
+        told("writing the report", 0, 1)
+        write_results(assessment, output, _inputs(frames, calibration))
+        told("writing the report", 1, 1)
+    return assessment
+
+
+def _geometry_for(campaign: Campaign, calibration: str | Path | CameraGeometry) -> CameraGeometry:
+    """The calibrated geometry of a campaign's camera; refused where the pitches say that it is another camera's."""
+    from pixmetry.calibrate.calibrated_camera import calibrated_geometry
+
+    facts = campaign.camera
+    ours = None if facts.pitch_x_um is None else (facts.pitch_x_um, facts.pitch_y_um or facts.pitch_x_um)
+    geometry = calibrated_geometry(calibration, pitch_um=ours)
+    theirs = tuple(geometry.lens[n].value for n in ("pitch_x_um", "pitch_y_um"))
+    if ours is not None and not np.allclose(theirs, ours, rtol=1e-6):
+        remedy = "give the calibration of this camera"
+        raise InputError("a calibration with another pixel pitch", where=str(calibration), value=theirs, allowed=str(ours), remedy=remedy)
+    if isinstance(calibration, Path) and _is_window_of(campaign, _calibrated_shape(calibration)):
+        return _seen_from(geometry, campaign)
+    return geometry
+
+
+def _calibrated_shape(calibration: Path) -> tuple[int, int]:
+    from pixmetry.calibrate.files.record import stored_cameras
+
+    sensor = stored_cameras(calibration)[0].sensor
+    return sensor.rows, sensor.cols
+
+
+def _is_window_of(campaign: Campaign, shape: tuple[int, int]) -> bool:
+    """Whether the frames are said to be a window, at a known place, of a sensor of this size."""
+    facts = campaign.camera
+    return facts.sensor_shape == shape != campaign.frame_shape and facts.first_col is not None
+
+
+def _seen_from(geometry: CameraGeometry, campaign: Campaign) -> CameraGeometry:
+    """The geometry of the whole sensor with the principal point counted from the centre of the window."""
+    facts, lens = campaign.camera, geometry.lens
+    (x, y), (x0, y0) = frame_centre(campaign.frame_shape), frame_centre(facts.sensor_shape)
+    values = lens.values.copy()
+    values[lens.index("centre_x_px")] += x0 - (facts.first_col + x)
+    values[lens.index("centre_y_px")] += y0 - (facts.first_row + y)
+    return replace(geometry, lens=replace(lens, values=values))
+
+
+def _window_of(campaign: Campaign) -> tuple[str, ...]:
+    """A note where the frames are a window of a sensor: what was seen in it, and what is taken for the whole."""
+    facts, (rows, cols) = campaign.camera, campaign.frame_shape
+    if facts.sensor_shape in (None, (rows, cols)):
+        return ()
+    at = "" if facts.first_col is None else f" from column {facts.first_col}, row {facts.first_row}"
+    whole = f"{cols} × {rows} pixels{at} of a sensor of {facts.sensor_cols} × {facts.sensor_rows}"
+    rest = "what is measured holds for these pixels; what is accepted at a bound is taken for the whole sensor"
+    return (f"The frames show {whole}: {rest}.",)
+
+
+def _other_frames(calibration: Path, campaign: Campaign) -> tuple[str, ...]:
+    """A note where the frames are not of the size that was calibrated: a window of them, or another camera's."""
+    rows, cols = _calibrated_shape(calibration)
+    if (rows, cols) == campaign.frame_shape or _is_window_of(campaign, (rows, cols)):
+        return ()
+    sizes = f"{cols} × {rows} pixels, the frames have {campaign.frame_shape[1]} × {campaign.frame_shape[0]}"
+    which = "" if campaign.camera.first_col is not None else " (sensor_cols, sensor_rows, first_col, first_row in the manifest say which)"
+    holds = f"it holds for a window of that camera's frames{which}, not for another camera or binned pixels"
+    return (f"The calibration is of {sizes}: {holds}.",)
+
+
+def write_results(assessment: Assessment, directory: str | Path, inputs: Sequence[Path] = ()) -> Path:
+    """Write report, results, maps and the twin into a folder, whole or not at all; return the path of the report.
+
+    Parameters
+    ----------
+    assessment : Assessment
+    directory : path
+    inputs : sequence of Path
+        Files that must not be replaced.
+
+    Raises
+    ------
+    InputError
+        If the folder cannot be written, or holds anything else than an earlier assessment of this campaign.
+    """
+    with staged_output(directory, KIND, _origin(assessment.campaign), inputs) as folder:
+        write_maps(folder / "maps.zarr.zip", assessment.maps(), {"camera": assessment.campaign.camera.name})
+        assessment.camera.save(folder / "camera.yaml")
+        write_report(assessment, folder / "report.html")
+        write_record(folder / "results.json", assessment.to_record())
+    return Path(directory) / "report.html"
+
+
+def _origin(campaign: Campaign) -> tuple[str | Path, ...]:
+    """What an assessment is of: the file of the campaign, or the camera's name where there is none."""
+    if campaign.arrays is not None:
+        return (campaign.camera.name,)
+    return ("packaged example" if campaign.source_path.is_relative_to(EXAMPLE) else campaign.source_path,)
+
+
+def _inputs(campaign: Campaign, calibration: str | Path | CameraGeometry | None) -> list[Path]:
+    """Files that an assessment reads."""
+    more = [Path(calibration)] if isinstance(calibration, str | Path) else []
+    return [*campaign.files, *more]
+
+
+def observe_campaign(campaign: Campaign, progress: Progress) -> tuple[InputHashes, Observations]:
+    """Read every frame once and reduce it."""
+    done = 0
+
+    def on_frames(count: int) -> None:
+        nonlocal done
+        done += count
+        progress("reading frames", done, campaign.frame_count)
+
+    reader = FrameReader(campaign)
+
+    def groups() -> Iterator[Group]:
+        for g in campaign.groups:
+            yield Group(g.kind, g.role, g.exposure_s, g.photons, [partial(reader.fetch, path) for path in g.paths])
+
+    seen = observe(groups(), campaign.bits, campaign.camera.temperature_c, on_frames=on_frames)
+    return reader.hashes, replace(seen, storage=reader.storage, notes=(*campaign.findings, *seen.notes))
+
+
+def by_the_standard(campaign: Campaign, observations: Observations) -> Results:
+    """What EMVA 1288 says of the same frames, to stand beside: Release 3.1, which takes the images as they are.
+
+    Release 4.0 filters the slow part of the patterns out, and would not speak of the same quantity as the estimates beside it.
+    """
+    pitch_x_um, pitch_y_um = campaign.camera.pitch_x_um, campaign.camera.pitch_y_um
+    area = None if pitch_x_um is None or pitch_y_um is None else pitch_x_um * pitch_y_um
+    seen = Measurement(observations.photon_transfer, observations.dark_stack, observations.bright_stack, pixel_area_um2=area)
+    return standard_values(seen, "3.1")
+
+
+def measure_sources(observations: Observations) -> tuple[dict[str, Estimates], dict[str, str]]:
+    """Ask every source what the observations say of it: estimates, and by source the reason where there are none."""
+    estimates, unmeasured = {}, {}
+    for source in catalogue().values():
+        if source.measure is None:
+            unmeasured[source.id] = source.reasons["measure"]
+            continue
+        try:
+            found = source.measure(observations)
+            with_estimates(source, source.typical, found)  # outside the model's range it is no measurement of this effect
+            estimates[source.id] = found
+        except (MeasureError, InputError) as problem:
+            unmeasured[source.id] = str(problem)
+    return estimates, unmeasured
+
+
+IN_ELECTRONS = ("electronics.amplifier_noise", "electronics.row_noise", "sensor.dsnu", "sensor.defects")
+
+
+def _at_assumed_gain(
+    seen: Observations, estimates: dict[str, Estimates], unmeasured: dict[str, str], bits: int
+) -> tuple[dict[str, Estimates], dict[str, str]]:
+    """What was measured in DN, given in electrons at the assumed gain: so it counts in twin and budget with its size in DN."""
+    fit, gain = seen.photon_transfer_fit, (2**bits - 1) / ASSUMED_RANGE_E
+    if fit is None or "dark_noise_dn" not in fit:
+        return estimates, unmeasured
+    parts = [fit[f"{name}_dn"] for name in ("dark_noise", "row_noise", "column_noise")]
+    names = [e.name.replace("_dn", "_e") for e in parts]
+    told = "measured in DN; in electrons at an assumed gain"
+    rows = [("gain_dn_per_e", gain, 0.0, np.inf, "DN/e-")]
+    rows += [(name, e.value / gain, e.u / gain, e.dof, "e-") for name, e in zip(names, parts, strict=True)]
+    assumed = Estimates.from_rows(
+        rows,
+        limits=frozenset(n for n, e in zip(names, parts, strict=True) if e.kind == "upper_limit"),
+        reasons={n: "; ".join(filter(None, (told, e.reason))) for n, e in zip(names, parts, strict=True)},
+        method=fit.method,
+    )
+    found, _ = measure_sources(replace(seen, photon_transfer_fit=fit.join(assumed)))
+    added = {source: found[source] for source in IN_ELECTRONS if source in found}
+    return estimates | added, {source: why for source, why in unmeasured.items() if source not in added}

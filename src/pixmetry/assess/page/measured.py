@@ -1,0 +1,155 @@
+"""The table of measured camera values beside those of EMVA 1288."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from pixmetry.camera.observations import Observations
+from pixmetry.core.estimates import Estimate, Estimates
+from pixmetry.emva.page.content import say
+from pixmetry.emva.records import Results
+from pixmetry.report.numbers import NONE, Number, limit, significant, uncertain
+
+PERCENT, PER_1000_PX = (100.0, "%"), (1e5, "%/1000 px")
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """How one estimate is shown: its name in words, the key of the standard's value beside it, factor and unit of the display."""
+
+    title: str
+    standard: str = ""
+    display: tuple[float, str] | None = None
+
+
+@dataclass(frozen=True)
+class Row:
+    """A row of the table, all as text."""
+
+    title: str
+    name: str
+    number: Number
+    dof: str
+    standard: str
+    reason: str
+
+
+TRANSFER = {
+    "gain_dn_per_e": Quantity("System gain K", "K"),
+    "quantum_efficiency": Quantity("Quantum efficiency", "QE", PERCENT),
+    "responsivity_dn_per_s": Quantity("Signal rate of this series, at zero signal"),
+    "offset_dn": Quantity("Black level"),
+    "dark_noise_e": Quantity("Dark noise, white", "sigma_d"),
+    "row_noise_e": Quantity("Row noise, temporal"),
+    "column_noise_e": Quantity("Column noise, temporal"),
+    "dark_current_e_per_s": Quantity("Dark current"),
+    "saturation_dn": Quantity("Saturation, stored value"),
+    "full_well_e": Quantity("Saturation, electrons", "u_e_sat"),
+    "nonlinearity_a1": Quantity("Non-linearity a₁, at the top code", "", PERCENT),
+    "nonlinearity_a2": Quantity("Non-linearity a₂, at the top code", "", PERCENT),
+    "nonlinearity_a3": Quantity("Non-linearity a₃, at the top code", "", PERCENT),
+    "illumination_noise_rel": Quantity("Noise of the light, level to level", "", PERCENT),
+}
+SPATIAL = {
+    "dsnu_total_dn": Quantity("DSNU, total", "DSNU1288_DN"),
+    "dsnu_pixel_dn": Quantity("DSNU, pixels"),
+    "dsnu_row_dn": Quantity("DSNU, rows"),
+    "dsnu_col_dn": Quantity("DSNU, columns"),
+    "prnu_total_rel": Quantity("PRNU, total", "PRNU1288", PERCENT),
+    "prnu_pixel_rel": Quantity("PRNU, pixels", "", PERCENT),
+    "prnu_row_rel": Quantity("PRNU, rows", "", PERCENT),
+    "prnu_col_rel": Quantity("PRNU, columns", "", PERCENT),
+    "shading_x_per_px": Quantity("Shading, gradient in x", "", PER_1000_PX),
+    "shading_y_per_px": Quantity("Shading, gradient in y", "", PER_1000_PX),
+    "shading_corner_rel": Quantity("Shading, loss to the corners", "", PERCENT),
+    "shading_pp_rel": Quantity("Shading, peak to peak", "", PERCENT),
+}
+STANDARD_ONLY = {
+    "SNR_max": "Largest signal-to-noise ratio",
+    "DR": "Dynamic range",
+    "u_e_min": "Absolute sensitivity threshold, electrons",
+    "u_p_min": "Absolute sensitivity threshold, photons",
+    "u_p_sat": "Saturation, photons",
+}
+
+
+def table(seen: Observations, standard: Results) -> dict[str, list[Row]]:
+    """Rows by heading, in the order in which a data sheet gives them."""
+    groups = {
+        "Photon transfer": _rows(seen.photon_transfer_fit, TRANSFER, standard),
+        "Fixed pattern": _rows(seen.spatial_fit, SPATIAL, standard),
+        "Converter, defects, patterns": [*_codes(seen), *_defects(seen), *_patterns(seen)],
+        "By EMVA 1288 alone": [
+            Row(title, key, Number("", NONE, ""), "", said, "") for key, title in STANDARD_ONLY.items() if (said := say(standard, key))
+        ],
+    }
+    return {heading: rows for heading, rows in groups.items() if rows}
+
+
+def _rows(found: Estimates | None, shown: Mapping[str, Quantity], standard: Results | None = None) -> list[Row]:
+    if found is None:
+        return []
+    others = {e.name: Quantity(e.name) for e in found if e.name not in shown}
+    return [
+        _row(found[name], quantity, standard) if name in found else _missing(name, quantity, found.reasons[name], standard)
+        for name, quantity in {**shown, **others}.items()
+        if name in found or name in found.reasons
+    ]
+
+
+def _missing(name: str, quantity: Quantity, reason: str, standard: Results | None) -> Row:
+    """A value that was looked for and cannot be had."""
+    return Row(quantity.title, name, Number(NONE, NONE, ""), "", "" if standard is None else say(standard, quantity.standard), reason)
+
+
+def _row(e: Estimate, quantity: Quantity, standard: Results | None) -> Row:
+    scale, unit = quantity.display or (1.0, e.unit)
+    at_least = e.kind == "lower_limit"
+    number = uncertain(e.value * scale, e.u * scale, unit) if e.kind == "value" else limit(e.value * scale, unit, at_least=at_least)
+    return Row(quantity.title, e.name, number, _dof(e.dof), "" if standard is None else say(standard, quantity.standard), e.reason)
+
+
+def _dof(dof: float) -> str:
+    return "∞" if not np.isfinite(dof) or dof >= 1e6 else significant(dof, 2 if dof < 100 else 3)
+
+
+def _codes(seen: Observations) -> list[Row]:
+    found = seen.code_errors
+    if found is None:
+        return []
+    rows = _rows(found.fit, {"dnl_rms_lsb": Quantity("Differential non-linearity, rms")})
+    worst = f"{len(found.codes)} codes tested"
+    if len(found.dnl_lsb):
+        k = int(np.argmax(np.abs(found.dnl_lsb)))
+        worst += f"; the widest departure is code {found.codes[k]}, {significant(float(found.dnl_lsb[k]), 2)} LSB"
+    return [*rows, _count("Missing codes", "missing_codes", len(found.missing_codes), worst)]
+
+
+def _defects(seen: Observations) -> list[Row]:
+    if seen.defects is None:
+        return []
+    kinds = {kind: seen.defects.kind.count(kind) for kind in sorted(set(seen.defects.kind))}
+    words = ", ".join(f"{n} {kind}" for kind, n in kinds.items())
+    words += f"{'; ' if words else ''}{significant(seen.defects.expected_false, 2)} false alarms expected"
+    return [_count("Defect pixels", "defects", len(seen.defects), words)]
+
+
+def _patterns(seen: Observations) -> list[Row]:
+    found = seen.patterns
+    if found is None:
+        return []
+    rows = [_count("Periodic patterns found", "patterns", len(found), f"among {found.n_searched} places of the spectrum")]
+    for k in range(min(len(found), 3)):
+        where = f"at {found.frequency_x[k]:.4f}, {found.frequency_y[k]:.4f} cycles/px, {'moving' if found.moving[k] else 'fixed'}"
+        amplitude = uncertain(float(found.amplitude_dn[k]), float(found.u_amplitude_dn[k]), "DN")
+        rows.append(Row(f"Pattern {k + 1}, amplitude", f"pattern_{k + 1}", amplitude, "", "", where))
+    words = "amplitude that would be found in half of all cases"
+    rows.append(Row("Fixed pattern, weakest to be found", "fixed_limit_dn", limit(found.fixed_limit_dn, "DN"), "", "", words))
+    return rows
+
+
+def _count(title: str, name: str, count: int, reason: str) -> Row:
+    return Row(title, name, Number(str(count), NONE, ""), "", "", reason)

@@ -1,0 +1,155 @@
+"""What an assessment found: the record that the report draws and that goes to disk."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from pixmetry.assess.digital_twin import SelfTest
+from pixmetry.budget.headline import SUM
+from pixmetry.budget.job import Budget
+from pixmetry.camera.camera import Camera
+from pixmetry.camera.observations import Observations
+from pixmetry.core.estimates import Estimates
+from pixmetry.emva.files.formats import value_record
+from pixmetry.emva.records import Results
+from pixmetry.files import Campaign
+
+RESULTS_SCHEMA = "pixmetry/results/1"
+
+
+@dataclass(frozen=True)
+class Assessment:
+    """All that one campaign told of its camera.
+
+    Parameters
+    ----------
+    campaign : Campaign
+    observations : Observations
+    estimates : dict of Estimates
+        By source, named like its parameters.
+    unmeasured : dict of str
+        By source, why this campaign could not measure it.
+    standard : Results
+        The values of EMVA 1288 beside ours.
+    camera : Camera
+        The digital twin.
+    budget : Budget
+    provenance : dict
+    self_test : SelfTest
+        The twin beside the camera.
+    """
+
+    campaign: Campaign
+    observations: Observations
+    estimates: dict[str, Estimates]
+    unmeasured: dict[str, str]
+    standard: Results
+    camera: Camera
+    budget: Budget
+    provenance: dict[str, Any]
+    self_test: SelfTest = SelfTest()
+
+    def to_record(self) -> dict[str, Any]:
+        """Return the plain record of ``results.json``."""
+        fit = self.observations.photon_transfer_fit
+        facts, storage = self.campaign.camera, self.observations.storage
+        return {
+            "schema": RESULTS_SCHEMA,
+            "camera": {
+                "name": facts.name,
+                "bits": facts.bits,
+                "rows": self.campaign.frame_shape[0],
+                "cols": self.campaign.frame_shape[1],
+                "pitch_x_um": facts.pitch_x_um,
+                "pitch_y_um": facts.pitch_y_um,
+                "interface": facts.interface,
+                "sensor": facts.sensor,
+                "vendor": facts.vendor,
+                "model": facts.model,
+                "serial_number": facts.serial_number,
+                "sensor_cols": facts.sensor_cols,
+                "sensor_rows": facts.sensor_rows,
+                "first_col": facts.first_col,
+                "first_row": facts.first_row,
+            },
+            "conditions": {
+                "operator": self.campaign.operator or None,
+                "light_source": self.campaign.optics.light_source,
+                "lossless": storage.lossless,
+                "lossless_known": storage.known,
+            },
+            "estimates": {source: e.to_records() for source, e in self.estimates.items()},
+            "unmeasured": self.unmeasured,
+            "photon_transfer": {
+                "estimates": fit.to_records(),
+                "names": list(fit.names),
+                "covariance": fit.covariance.tolist(),
+                "confounders": list(fit.confounders),
+            },
+            "spatial": self.observations.spatial_fit.to_records() if self.observations.spatial_fit is not None else [],
+            "emva1288": {
+                "release": self.standard.release,
+                "results": {key: value_record(value) for key, value in self.standard.values.items()},
+                "notes": list(self.standard.notes),
+            },
+            "budget": self.budget.to_record(),
+            "twin": self.self_test.to_record(),
+            "notes": list(self.observations.notes),
+            "provenance": self.provenance,
+        }
+
+    def verdict_text(self) -> str:
+        """Return in a sentence what a coordinate is worth."""
+        budget = self.budget
+        one, many = budget.verdicts[0], budget.verdicts[-1]
+        um = budget.um(one)
+        size = f" = {um[0]:.2g} µm in x, {um[1]:.2g} µm in y" if um is not None else ""
+        texts = [(f"{c.total_px:.2g}", f"{c.calibrated_px:.2g}") for c in (one, many)]
+        if all(total == calibrated for total, calibrated in texts):
+            after, mean = " (k = 1), calibrated or not", f"{texts[1][0]} px"
+        else:
+            after = f" as it is, and {texts[0][1]} px once a calibration has taken up what is constant or smooth over the frame (k = 1)"
+            mean = f"{texts[1][0]} and {texts[1][1]} px"
+        return (
+            f"a coordinate of one target in one frame is worth {texts[0][0]} px{size}{after}; the mean of {many.frames} frames {mean}. "
+            f"{self._by()}"
+            f"{budget.target.describe()}; {budget.estimator.describe()}."
+        )
+
+    def _by(self) -> str:
+        """Where the verdict is from, if it is not the sum of what is listed."""
+        found = self.budget.headline
+        return "" if found is None or found.by == SUM else f"{found.why} "
+
+    def maps(self) -> dict[str, np.ndarray]:
+        """Return what was measured pixel by pixel: ``dark_dn`` above black, ``prnu_rel``, ``defects``."""
+        seen, fit = self.observations, self.observations.photon_transfer_fit
+        maps: dict[str, np.ndarray] = {}
+        if seen.dark_stack is not None:
+            black = fit["offset_dn"].value if "offset_dn" in fit else seen.dark_stack.mean_dn
+            maps["dark_dn"] = (seen.dark_stack.mean_map_dn - black).astype(np.float32)
+        if seen.defects is not None:
+            maps["defects"] = seen.defects.mask().astype(np.uint8)
+        if seen.dark_stack is not None and seen.bright_stack is not None and seen.spatial_fit is not None:
+            maps["prnu_rel"] = _response_map(seen).astype(np.float32)
+        return maps
+
+
+def _response_map(seen: Observations) -> np.ndarray:
+    """Relative response with the illumination's slow part taken out, shrunk to what is known of it.
+
+    A map averaged over L frames still holds noise of variance t/L. What is predicted best from it is the map times
+    s²/(s² + t/L) (the linear predictor of least variance), s² from the split of the stack.
+    """
+    from pixmetry.observe.surface import fill, fit_surface
+
+    bright, dark, mask = seen.bright_stack, seen.dark_stack, seen.defects.mask()
+    light = fill(bright.mean_map_dn - dark.mean_map_dn, mask)
+    surface = fit_surface(light, 4).values
+    relative = light / surface - 1.0
+    noise = (bright.ms_pixel_dn2 / bright.n_frames + dark.ms_pixel_dn2 / dark.n_frames) / float(surface.mean()) ** 2
+    fixed = max(float(relative.var()) - noise, 0.0)
+    return 1.0 + relative * (fixed / (fixed + noise))

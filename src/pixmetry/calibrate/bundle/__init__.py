@@ -1,0 +1,1 @@
+"""The bundle adjustment: model, network, normal equations, covariance, datum."""

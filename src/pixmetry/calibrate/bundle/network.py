@@ -1,0 +1,278 @@
+"""What a bundle adjustment takes (image coordinates, points, scale bars, cameras) and gives (all unknowns with their covariance)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from pixmetry.calibrate.bundle.model import NAMES, CameraModel
+
+SCALE, SHIFT = 6, 7  # places of the per-image x-scale and x-shift behind the six of the pose
+PER_IMAGE = 8
+PER_IMAGE_NAMES = ("x_scale", "x_shift")
+
+
+@dataclass(frozen=True)
+class ScaleBars:
+    """Known distances between points.
+
+    Parameters
+    ----------
+    start, end : ndarray of int, shape (b,)
+        Indices of points.
+    length, u : ndarray, shape (b,)
+        In the unit of the object.
+    """
+
+    start: np.ndarray
+    end: np.ndarray
+    length: np.ndarray
+    u: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.start)
+
+    @classmethod
+    def none(cls) -> ScaleBars:
+        """No bar."""
+        return cls(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0), np.zeros(0))
+
+
+@dataclass(frozen=True)
+class Poses:
+    """Start values of the poses of images, as in `State`; NaN where there are none. Their frame need not be that of the points.
+
+    Parameters
+    ----------
+    rotation : ndarray, shape (images, 3, 3)
+    position : ndarray, shape (images, 3)
+    """
+
+    rotation: np.ndarray
+    position: np.ndarray
+
+    @property
+    def given(self) -> np.ndarray:
+        """Which images have one."""
+        return np.isfinite(self.position[:, 0]) & np.isfinite(self.rotation[:, 0, 0])
+
+
+@dataclass(frozen=True)
+class Network:
+    """Everything that is known before an adjustment. Nothing in it is changed by one.
+
+    Parameters
+    ----------
+    cameras : tuple of CameraModel
+        Start values, and which parameters are free.
+    images : tuple of str
+        Names.
+    camera_of : ndarray of int, shape (images,)
+    points : tuple of str
+        Names.
+    x_px, y_px : ndarray, shape (n,)
+        Measured image coordinates.
+    image, point : ndarray of int, shape (n,)
+        Which image, which point.
+    covariance_px2 : ndarray, shape (n, 3)
+        var x, cov xy, var y a priori.
+    xyz : ndarray, shape (points, 3)
+        Object coordinates known beforehand; NaN where there are none.
+    u_xyz : ndarray, shape (points, 3)
+        Their standard uncertainties: 0 is fixed, ``inf`` is free (the coordinates are start values and carry the datum).
+    bars : ScaleBars
+    per_image : tuple of str
+        Out of ``"x_scale"`` and ``"x_shift"``: estimated for each image, by x = x₀ + (1 + s)(x_model − x₀) + d. Both have mean 0 over the
+        images of a camera: what is common to them is affinity and principal point.
+    scale_origin_px : float
+        x₀, the column about which a frame grabber's clock stretches a line: its start.
+    time_s : ndarray, shape (images,), optional
+        When each image was taken.
+    diameter : ndarray, shape (points,), optional
+        Of circular targets, in the object's unit (NaN: none): the image coordinates are those of the centre of area of their images.
+    normal : ndarray, shape (points, 3), optional
+        Unit normals of the circles.
+    unit : str
+        Of the object.
+    covariance_known : bool
+        Whether ``covariance_px2`` came with the data, or is a guess (then only its ratios count).
+    poses : Poses, optional
+        Start values, where there are any; otherwise they are found.
+    """
+
+    cameras: tuple[CameraModel, ...]
+    images: tuple[str, ...]
+    camera_of: np.ndarray
+    points: tuple[str, ...]
+    x_px: np.ndarray
+    y_px: np.ndarray
+    image: np.ndarray
+    point: np.ndarray
+    covariance_px2: np.ndarray
+    xyz: np.ndarray
+    u_xyz: np.ndarray
+    bars: ScaleBars = field(default_factory=ScaleBars.none)
+    per_image: tuple[str, ...] = ()
+    scale_origin_px: float = 0.0
+    time_s: np.ndarray | None = None
+    diameter: np.ndarray | None = None
+    normal: np.ndarray | None = None
+    unit: str = "mm"
+    covariance_known: bool = False
+    poses: Poses | None = None
+
+    def __len__(self) -> int:
+        return len(self.x_px)
+
+    @property
+    def control(self) -> np.ndarray:
+        """Points of which all three coordinates are known, bool."""
+        return (np.isfinite(self.xyz) & np.isfinite(self.u_xyz)).all(axis=1)
+
+    @property
+    def given(self) -> np.ndarray:
+        """These, and points of which all three are roughly known; not those of which one or two are known: there somebody had to write
+        something for the others."""
+        return self.control | (np.isfinite(self.xyz) & np.isinf(self.u_xyz)).all(axis=1)
+
+
+@dataclass(frozen=True)
+class State:
+    """Values of all unknowns: start values of an adjustment, or its result.
+
+    A point X is seen at R (X − X₀) in the frame of the camera, which looks along z, x to the right and y down.
+
+    Parameters
+    ----------
+    interior : ndarray, shape (cameras, 12)
+        In the order of `pixmetry.calibrate.bundle.model.NAMES`.
+    rotation : ndarray, shape (images, 3, 3)
+    position : ndarray, shape (images, 3)
+        X₀, the projection centres.
+    x_scale, x_shift_px : ndarray, shape (images,)
+    xyz : ndarray, shape (points, 3)
+        NaN: not determined (seen too seldom); its image coordinates take no part.
+    """
+
+    interior: np.ndarray
+    rotation: np.ndarray
+    position: np.ndarray
+    x_scale: np.ndarray
+    x_shift_px: np.ndarray
+    xyz: np.ndarray
+
+
+@dataclass(frozen=True)
+class Adjustment:
+    """Result of one bundle adjustment.
+
+    Parameters
+    ----------
+    network : Network
+    state : State
+    used : ndarray of bool, shape (n,)
+        Image coordinates that took part; the others were rejected or belong to an image or point that is not determined.
+    residual_px : ndarray, shape (n, 2)
+        Measured less computed, for all whose image and point are determined, else NaN.
+    weight : ndarray, shape (n,)
+        Factor on the weight by a robust loss; 1 in least squares.
+    sigma0 : float
+        A posteriori standard deviation of unit weight (of image coordinates with their a priori covariance).
+    dof : int
+        Redundancy: observations + constraints − unknowns.
+    free_columns : tuple of str
+        Names of the rows of ``covariance``: ``"camera:c"`` …; ``"image:rx"``, ``"image:ry"``, ``"image:rz"`` (rad, a small rotation about
+        the camera's axes), ``"image:X0"``, ``"image:Y0"``, ``"image:Z0"``, ``"image:x_scale"``, ``"image:x_shift"``; then points that bars
+        join, ``"point:X"`` ….
+    covariance : ndarray, shape (m, m)
+        Of these, a posteriori (sigma0² is in it unless ``a_priori`` was asked for), in the datum stated.
+    point_covariance : ndarray, shape (points, 3, 3)
+        In the same datum; 0 for fixed points, NaN where not determined.
+    redundancy : ndarray, shape (n, 2), optional
+        Redundancy numbers of x and y (0 … 1), and of
+    residual_covariance_px2 : ndarray, shape (n, 3), optional
+        Cofactors of the residuals (var x, cov xy, var y; for unit weight 1), which data snooping divides by. Both None unless asked for.
+    datum : str
+        In words: what fixes origin, directions and scale.
+    iterations : int
+    cost : tuple of float
+        Weighted sum of squares of each iteration.
+    notes : tuple of str
+    """
+
+    network: Network
+    state: State
+    used: np.ndarray
+    residual_px: np.ndarray
+    weight: np.ndarray
+    sigma0: float
+    dof: int
+    free_columns: tuple[str, ...]
+    covariance: np.ndarray
+    point_covariance: np.ndarray
+    redundancy: np.ndarray | None
+    residual_covariance_px2: np.ndarray | None
+    datum: str
+    iterations: int
+    cost: tuple[float, ...]
+    notes: tuple[str, ...] = ()
+
+    def camera(self, index: int = 0) -> CameraModel:
+        """The adjusted model of a camera."""
+        from dataclasses import replace
+
+        return replace(self.network.cameras[index], values=self.state.interior[index].copy())
+
+    def interior_covariance(self, index: int = 0) -> tuple[tuple[str, ...], np.ndarray]:
+        """Names of the estimated parameters of a camera and their covariance."""
+        own = {f"{self.network.cameras[index].name}:{name}": name for name in NAMES}  # an image or a point may have the camera's name
+        rows = [i for i, name in enumerate(self.free_columns) if name in own]
+        return tuple(own[self.free_columns[i]] for i in rows), self.covariance[np.ix_(rows, rows)]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One sentence on what was found and one on what to do.
+
+    Parameters
+    ----------
+    kind : str
+        A short name, such as ``"flatness"``, ``"gross_error"``, ``"x_scale_drift"``, ``"correlation"``.
+    text, advice : str
+    level : {"note", "warning"}
+    """
+
+    kind: str
+    text: str
+    advice: str = ""
+    level: str = "note"
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What a calibration hands to its user, its report and its files.
+
+    Parameters
+    ----------
+    adjustment : Adjustment
+        The one that stands.
+    findings : tuple of Finding
+        What the reader must know, most important first.
+    tests : mapping
+        Plain records by name: ``parameters``, ``vision``, ``correlations``, ``residuals``, ``f_test``, ``variance_components``,
+        ``gross_errors``, ``hold_out``, ``field``, ``patterns``, ``images``, ``curves``, ``projection``, ``network``, ``known`` …; see
+        `pixmetry.calibrate.records` and the modules that it calls.
+    grids : mapping
+        Residual correction grids by camera name.
+    provenance : mapping
+        Inputs with their hashes, options, version.
+    """
+
+    adjustment: Adjustment
+    findings: tuple[Finding, ...] = ()
+    tests: Mapping[str, Any] = field(default_factory=dict)
+    grids: Mapping[str, Any] = field(default_factory=dict)
+    provenance: Mapping[str, Any] = field(default_factory=dict)

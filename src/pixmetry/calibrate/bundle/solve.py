@@ -1,0 +1,237 @@
+"""Calibrating cameras from image coordinates: from start values to an adjustment that stands, and what must be said about it."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+from typing import Any
+
+import numpy as np
+
+from pixmetry.calibrate.bundle.model import NAMES
+from pixmetry.calibrate.bundle.network import PER_IMAGE_NAMES, Adjustment, Calibration, Finding, Network, State
+from pixmetry.calibrate.bundle.options import Options
+from pixmetry.calibrate.bundle.settling import Progress, Settled, adjust_with, settle
+from pixmetry.core.errors import InputError, MeasureError
+from pixmetry.core.threads import single_threaded_blas
+
+__all__ = ["Options", "calibrate_network"]
+DEFAULTS = Options()
+FEW = ("c", "k1")  # estimated first where start values are rough
+SIZED = 1.25  # by which lengths may differ from those of the start poses where these gave the size
+
+
+@single_threaded_blas()
+def calibrate_network(
+    network: Network, options: Options = DEFAULTS, start: State | None = None, progress: Progress | None = None
+) -> Calibration:
+    """Estimate cameras, poses and points of a network, and test the result.
+
+    Parameters
+    ----------
+    network : Network
+    options : Options
+    start : State, optional
+        Start values; by default they are found.
+    progress : callable, optional
+        Called with a few words before each step.
+
+    Returns
+    -------
+    Calibration
+        The image coordinates in the network of its adjustment are those of the targets' centres: without the eccentricity.
+
+    Raises
+    ------
+    InputError
+        If what was given cannot be a network.
+    MeasureError
+        If the network does not determine what was asked for.
+    """
+    from pixmetry.calibrate.checks.checks import check_network
+    from pixmetry.calibrate.checks.findings import in_order
+    from pixmetry.calibrate.checks.residual_grid import residual_grids
+    from pixmetry.calibrate.start.posed_start import pose_findings
+
+    say = progress or (lambda text: None)
+    measured = _as_asked(network, options)
+    say("checking the network")
+    findings = list(check_network(measured))
+    settled = _from_start(measured, start, options, say)
+    settled, tests, more = _checked_field(settled, options, say)
+    say("testing the result")
+    tests |= _records(settled, network, options)
+    if "hold_out" in tests:
+        tests["hold_out"] = _with_expected(tests["hold_out"], settled)
+    if options.residual_grid:
+        tests["residual_grid"] = residual_grids(settled.adjustment)
+    findings += [*more, *_findings(settled, tests)]
+    findings += _no_scale(network, settled.adjustment) + pose_findings(network, settled.adjustment.state)
+    grids = tests.get("residual_grid", {})
+    return Calibration(settled.adjustment, in_order(findings), tests, grids, {"options": asdict(options)})
+
+
+def _no_scale(network: Network, adjustment: Adjustment) -> list[Finding]:
+    """That nothing, or nothing but the start poses, says how large the object is."""
+    from pixmetry.calibrate.bundle.datum import scale_is_open
+    from pixmetry.calibrate.start.posed_start import to_their_frame
+
+    if network.given.sum() >= 3 or not scale_is_open(adjustment):
+        return []
+    found = to_their_frame(network, adjustment.state)
+    text = f"nothing says how large the object is: lengths are in mean distances between the images, not in {network.unit}"
+    if found is not None and 1 / SIZED < found[0] < SIZED:
+        text = "nothing but the start poses says how large the object is: lengths are as good as these"
+    elif np.isfinite(network.u_xyz).any():
+        text = f"what is known of the points does not say how large the object is: lengths are not in {network.unit}"
+    return [Finding("no_scale", text, "give a scale bar, or the coordinates of two points", "warning")]
+
+
+def _from_start(network: Network, start: State | None, options: Options, say: Progress) -> Settled:
+    """A settled adjustment; where poses that were given lead nowhere, without them."""
+    try:
+        measured, state = _started(network, start, options, say)
+        measured = replace(measured, poses=None)  # they have done their part
+        return _settled(_released(measured) if options.field == "free" else measured, state, options, say)
+    except MeasureError as error:
+        if start is not None or network.poses is None:
+            raise
+        say("starting again without the poses")
+        try:
+            return _from_start(replace(network, poses=None), None, options, say)
+        except MeasureError:
+            if error.where == "start values":
+                error.remedy += "; the start poses do not fit either: check which way the camera looks and the rotations go"
+            raise error from None
+
+
+def _as_asked(network: Network, options: Options) -> Network:
+    return network if options.per_image is None else replace(network, per_image=tuple(n for n in PER_IMAGE_NAMES if n in options.per_image))
+
+
+def _started(network: Network, start: State | None, options: Options, say: Progress) -> tuple[Network, State]:
+    """Start values; where they had to be found, improved with few interior parameters and none of the images' own."""
+    from pixmetry.calibrate.checks.known_checks import without_absurd_control
+    from pixmetry.calibrate.start.initial import start_values
+    from pixmetry.calibrate.start.posed_start import in_their_frame
+
+    if start is not None:
+        return network, start
+    say("finding start values")
+    network, state = start_values(network)
+    few = [replace(camera, free=camera.free & np.isin(NAMES, FEW)) for camera in network.cameras]
+    loss = "huber" if options.loss == "none" and options.snoop else options.loss
+    try:
+        part = replace(without_absurd_control(network, state)[0], cameras=tuple(few), per_image=())
+        state = adjust_with(options)(part, state, loss=loss, loss_scale=options.loss_scale, covariance=False).state
+    except MeasureError:
+        pass  # the adjustment of all parameters says what is not determined
+    return network, in_their_frame(network, state)
+
+
+def _released(network: Network) -> Network:
+    """The network with its fixed coordinates free; they stay as start values and datum."""
+    return replace(network, u_xyz=np.where(network.u_xyz == 0, np.inf, network.u_xyz))
+
+
+def _settled(measured: Network, state: State, options: Options, say: Progress) -> Settled:
+    """`settle`; where x-shifts of images are why there is no result, say so."""
+    from pixmetry.calibrate.bundle.bundle import adjust
+
+    try:
+        return settle(measured, state, options, say)
+    except MeasureError:
+        if "x_shift" not in measured.per_image:
+            raise
+        rest = replace(measured, per_image=tuple(name for name in measured.per_image if name != "x_shift"))
+        adjust(rest, state, loss="huber")  # raises where the reason is another
+    image = _least_tilted(measured, state)
+    what = "the x-shifts of the images cannot be told from where the cameras stand and look"
+    where = f"x_shift of image {image}" if image else "x_shift"
+    remedy = "leave x_shift out of per_image (x_scale may stay), or take tilted images only, of a field with depth"
+    raise MeasureError(what, where=where, remedy=remedy) from None
+
+
+def _least_tilted(network: Network, state: State) -> str:
+    """Name of the image that looks most nearly across a flat field; empty if the field has depth."""
+    from pixmetry.calibrate.bundle.eccentric import normals
+
+    normal = normals(replace(network, normal=None), state)[0]
+    if not np.isfinite(normal).all():
+        return ""
+    return network.images[int(np.nanargmax(np.abs(state.rotation[:, 2] @ normal)))]
+
+
+def _checked_field(settled: Settled, options: Options, say: Progress) -> tuple[Settled, dict[str, Any], list[Finding]]:
+    """Fixed points against free ones, with images left out of the fit; without fixed points to test, only images left out."""
+    from pixmetry.calibrate.checks.field_check import LEAST_FIELD, check_field
+
+    if options.folds == 0:
+        return settled, {}, []
+    say("leaving images out of the fit")
+    fixed = (settled.measured.u_xyz == 0).any(axis=1).sum()
+    if options.field != "auto" or fixed < LEAST_FIELD:
+        return settled, _held_out(settled, options), []
+    check = check_field(settled.adjustment, options.folds)
+    tests = {"field": check.field, **({"hold_out": check.hold_out} if check.hold_out else {})}
+    if check.verdict == "free":
+        say("adjusting with the points of the field free")
+        before = replace(settled, adjustment=check.adjustment)
+        again = settle(_released(settled.measured), check.adjustment.state, options, say, before)
+        gross = {kind: [*settled.gross_known[kind], *again.gross_known[kind]] for kind in again.gross_known}
+        settled = replace(again, gross_known=gross)
+    return settled, tests, list(check.findings)
+
+
+def _held_out(settled: Settled, options: Options) -> dict[str, Any]:
+    from pixmetry.calibrate.checks.hold_out import hold_out_record, left_out
+
+    try:
+        held = left_out(settled.adjustment, options.folds)
+    except (InputError, MeasureError):
+        return {}  # too few images to leave some out
+    return {"hold_out": hold_out_record(None, held) if _is_free(settled.measured) else hold_out_record(held)}
+
+
+def _with_expected(record: dict[str, Any], settled: Settled) -> dict[str, Any]:
+    """The record of images left out; where these fit much worse, with what noise alone would show."""
+    from pixmetry.calibrate.checks.hold_out import WORSE, expected_median_px
+
+    one = record["free" if _is_free(settled.measured) else "fixed"]
+    if one is None or one["left_out_rms_px"] < WORSE * one["fit_rms_px"]:
+        return record
+    try:
+        return {**record, "expected_median_px": expected_median_px(settled.adjustment, record["folds"])}
+    except MeasureError:  # hardly determined without these images: noise may do anything
+        return record
+
+
+def _is_free(network: Network) -> bool:
+    return not (network.u_xyz == 0).any()
+
+
+def _records(settled: Settled, given: Network, options: Options) -> dict[str, Any]:
+    from pixmetry.calibrate.records import add_noise, all_records
+
+    alpha = options.false_alarms / len(settled.measured)
+    tests = all_records(settled.adjustment, alpha, settled.gross_known, settled.rejected, a_priori=options.a_priori)
+    add_noise(tests["residuals"], settled.adjustment, given)
+    if settled.components:
+        tests["variance_components"] = settled.components
+    if settled.shift.corrected.any() or settled.shift.possible_px:
+        tests["eccentricity"] = {
+            "corrected": int(settled.shift.corrected.sum()),
+            "largest_px": settled.shift.largest_px,
+            "possible_px": settled.shift.possible_px,
+        }
+    return tests
+
+
+def _findings(settled: Settled, tests: dict[str, Any]) -> list[Finding]:
+    from pixmetry.calibrate.checks.checks import check_determined
+    from pixmetry.calibrate.checks.findings import eccentricity_findings, findings_of, hold_out_findings, in_the_shadow
+    from pixmetry.calibrate.checks.patterns import pattern_findings
+
+    adjustment = settled.adjustment
+    found = [*check_determined(adjustment), *in_the_shadow(pattern_findings(tests["patterns"])), *findings_of(adjustment, tests)]
+    found += eccentricity_findings(settled.measured, settled.shift)
+    return found + hold_out_findings(tests.get("hold_out", {}), free=_is_free(settled.measured))

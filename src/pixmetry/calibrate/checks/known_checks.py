@@ -1,0 +1,434 @@
+"""Scale bars and control points before they may pull at a network: image coordinates are tested without them, then they by the network.
+
+A wrong bar with a small stated uncertainty is stronger than the image coordinates of its ends, and data snooping would throw these out.
+So gross errors in the images are looked for without bars and control (`bundle.loosened`); then the known observations get
+their weights, and the worst is left out and the network adjusted again as long as one is contradicted (Baarda's w-test). Where another one
+explains the contradiction nearly as well, both are given the uncertainty of their supposed error instead.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from pixmetry.calibrate.bundle.loosened import in_frame
+from pixmetry.calibrate.bundle.network import Adjustment, Network, ScaleBars, State
+from pixmetry.calibrate.checks.known_residuals import (
+    Known,
+    bar_names,
+    bar_residuals,
+    contradicted,
+    control_residuals,
+    group_record,
+    jointly,
+    rivals,
+)
+from pixmetry.calibrate.checks.lost_control import set_free
+from pixmetry.calibrate.checks.snooping import Adjust, finest_factor, remove_gross_errors
+from pixmetry.calibrate.checks.variance_components import image_sigma0, scaled
+from pixmetry.calibrate.start.fit_to_control import brought_to, far_from_control
+from pixmetry.core.errors import InputError, MeasureError
+
+LEAST_FIXED = 3  # points whose distances from each other can be tested
+LEAST_CONTROL = 4  # whole points that must stay for one to be left out as a whole
+LEFT = 1.5  # redundancy of the other control points without a wrong one: with less they could agree by chance
+CONTROL_SHARE = 0.5  # of the points; more fixed ones are a test field
+ABSURD = 0.1  # a bar that is wrong by such a part of its length, as one in other units, is out before any adjustment with it
+ABSURD_U = 10.0  # stated uncertainties that a coordinate which is so far off is off by, too
+WIDE = 2.0  # times what they seem to be, uncertainties are taken until gross errors are out
+MANY_WRONG = 1 / 3  # of the control points: it is rather their uncertainties that are wrong
+MOST = 20
+
+
+@dataclass(frozen=True)
+class CheckedKnown:
+    """A network whose bars and control points it does not contradict.
+
+    Parameters
+    ----------
+    network : Network
+    gross : dict
+        By ``scale_bars`` and ``control_points``: records as of `contradicted`, with ``left_out``; where it is False, the ``rivals`` of
+        which one may be wrong instead. ``raised``: the ``kind`` of these two, ``name`` and stated uncertainty ``u`` of all whose
+        uncertainties were raised. ``understated``: the ``factor`` by which those of all control points were raised, if so. ``untested``:
+        ``why`` nothing of this could be tested, if so. ``axes`` of a control point are those that were left out with the one named.
+    """
+
+    network: Network
+    gross: dict[str, list[dict[str, Any]]] = field(
+        default_factory=lambda: {"scale_bars": [], "control_points": [], "raised": [], "understated": [], "untested": []}
+    )
+
+
+def has_known(network: Network) -> bool:
+    """Whether there are bars or control points that can be tested."""
+    return has_stated(network) or bool(few_fixed(network).any())
+
+
+def has_stated(network: Network) -> bool:
+    """Whether there are bars, or points with a stated uncertainty."""
+    return len(network.bars) > 0 or bool((np.isfinite(network.u_xyz) & (network.u_xyz > 0)).any())
+
+
+def weighted_instead(network: Network, clean: Adjustment) -> Network:
+    """The network with the few coordinates that are fixed given an uncertainty, that of one image of them: so they are tested."""
+    fixed = few_fixed(network)
+    if not fixed.any():
+        return network
+    state, rows = clean.state, clean.used & fixed[network.point]
+    rows = rows if rows.any() else clean.used
+    distance = np.linalg.norm(state.xyz[network.point[rows]] - state.position[network.image[rows]], axis=1)
+    c_px = np.array([np.mean(clean.camera(k).c_px) for k in range(len(network.cameras))])[network.camera_of[network.image[rows]]]
+    u = float(np.median(clean.sigma0 * np.sqrt(clean.network.covariance_px2[rows, 0]) * distance / c_px))
+    return replace(network, u_xyz=np.where(few_held(network), u, network.u_xyz))
+
+
+def fixed_again(network: Network, before: Network, weighted: Network) -> np.ndarray:
+    """u_xyz of a checked network, with those coordinates fixed that had been so before and that nothing contradicts."""
+    same = (network.u_xyz == weighted.u_xyz) & few_held(before)
+    return np.where(same, before.u_xyz, network.u_xyz)
+
+
+def few_fixed(network: Network) -> np.ndarray:
+    """Points with fixed coordinates, shape (points,), where they are control beside free points, and enough are known to contradict each
+    other."""
+    fixed, known = (network.u_xyz == 0).any(axis=1), np.isfinite(network.u_xyz).any(axis=1)
+    seen = np.bincount(network.point, minlength=len(network.points)) > 1
+    few = known.sum() >= LEAST_CONTROL and fixed.sum() < CONTROL_SHARE * seen.sum()
+    return fixed if few else np.zeros_like(fixed)
+
+
+def few_held(network: Network) -> np.ndarray:
+    """The fixed coordinates of `few_fixed` points, shape (points, 3)."""
+    return (network.u_xyz == 0) & few_fixed(network)[:, None]
+
+
+def fixed_record(adjustment: Adjustment, adjust: Adjust) -> dict[str, Any] | None:
+    """Whether the fixed points of a network with free ones beside them fit it together; None without such points or without redundancy.
+
+    The sum of squares falls by what the fixed points take when they are set free: over the degrees of freedom that go with them (3n − 7
+    where nothing else gives the datum) and the variance of the free network it has an F-distribution.
+
+    Parameters
+    ----------
+    adjustment : Adjustment
+    adjust : callable
+        `bundle.adjust`.
+
+    Returns
+    -------
+    dict
+        ``n``, ``f``, ``dof`` (of both), ``p``, and ``miss``: standard deviation of a coordinate that would explain it.
+
+    References
+    ----------
+    K. R. Koch, Parameter Estimation and Hypothesis Testing in Linear Models (1999), 4.2 (general linear hypothesis).
+    """
+    from scipy import stats
+
+    network = adjustment.network
+    posed = np.isfinite(adjustment.state.position).all(axis=1)[network.image]
+    seen = np.bincount(network.point[posed], minlength=len(network.points)) > 0
+    fixed = (network.u_xyz == 0).any(axis=1) & seen
+    if not LEAST_FIXED <= fixed.sum() < CONTROL_SHARE * seen.sum():
+        return None
+    try:  # what the fixed points threw out of their image points comes back, what the free network throws out goes
+        released = replace(network, u_xyz=np.where(network.u_xyz == 0, np.inf, network.u_xyz))
+        used = adjustment.used | (posed & fixed[network.point])
+        free = remove_gross_errors(released, adjustment.state, adjust, used=used).adjustment
+        held = adjust(network, adjustment.state, used=free.used, covariance=False)
+    except MeasureError:  # the network hangs on them
+        return None
+    redundant = held.dof - free.dof
+    if redundant < 1 or free.dof < 1:
+        return None
+    variance = max(free.sigma0**2, finest_factor(network))
+    f = float((held.sigma0**2 * held.dof - free.sigma0**2 * free.dof) / redundant / variance)
+    there = fixed & np.isfinite(free.state.xyz).all(axis=1)
+    known = (network.u_xyz == 0)[there]
+    off = _off(free.state.xyz[there], network.xyz[there], known, free, int(known.sum()) - redundant)
+    miss = float(np.sqrt((off**2).sum() / redundant * max(1 - 1 / max(f, 1.0), 0.0)))
+    return {"n": int(there.sum()), "f": f, "dof": (redundant, free.dof), "p": float(stats.f.sf(f, redundant, free.dof)), "miss": miss}
+
+
+def _off(found: np.ndarray, given: np.ndarray, known: np.ndarray, free: Adjustment, missing: int) -> np.ndarray:
+    """By how much known coordinates miss their points, without what the datum leaves open: so many of its seven parameters."""
+    if missing > 0:
+        held = np.isfinite(free.network.u_xyz).all(axis=1) & np.isfinite(free.state.xyz).all(axis=1)
+        found = brought_to(found, given, known, scaled=not len(free.network.bars) and held.sum() < 2)
+    return (given - found)[known]
+
+
+def loose_coordinates(network: Network) -> np.ndarray:
+    """Coordinates of control points that could pull at the image coordinates, shape (points, 3)."""
+    return np.isfinite(network.u_xyz) & ((network.u_xyz > 0) | few_held(network))
+
+
+def check_known(
+    network: Network, clean: Adjustment, adjust: Adjust, state: State, used: np.ndarray, *, held: np.ndarray | None = None
+) -> tuple[CheckedKnown, State]:
+    """Leave out bars and control points that the network contradicts; where these would be many, see whether their uncertainties are only
+    stated too small.
+
+    The network comes back with image coordinates weighted as the loosened one says, beside which bars and control points have their place;
+    the state is that of the adjustment with them.
+
+    Parameters
+    ----------
+    network : Network
+    clean : Adjustment
+        Of the `pixmetry.calibrate.bundle.loosened` network, without gross errors in the images.
+    adjust : callable
+        `bundle.adjust`, or the same with some options chosen; with a posteriori covariances.
+    state : State
+        Where to begin.
+    used : ndarray of bool, shape (n,)
+        Image points that take part.
+    held : ndarray of bool, shape (points, 3), optional
+        Coordinates whose uncertainties are not those that they came with (`weighted_instead`).
+
+    Raises
+    ------
+    InputError
+        If two bars differ by far and nothing tells which of them is wrong.
+    """
+    sigma0, dof = image_sigma0(clean)
+    size = max(sigma0**2, finest_factor(network))
+    weights = scaled(network, np.full((len(network.cameras), 2), size))  # from now on sigma0 of the image coordinates is 1
+    checked, state = _without_absurd(CheckedKnown(weights), state)
+    left, adjustment = _without_contradicted(checked, state, used, adjust, dof)
+    out, control = _wrong_points(left), np.isfinite(weights.u_xyz) & (weights.u_xyz > 0)
+    if held is not None:
+        control &= ~held
+    whole = int(control.all(axis=1).sum())
+    if whole < LEAST_CONTROL or out <= MANY_WRONG * control.any(axis=1).sum():
+        return left, adjustment.state
+    factor = WIDE * _understatement(weights, control, clean)
+    try:
+        again, adjustment = _without_contradicted(_raised(checked, control, factor), adjustment.state, used, adjust, dof)
+    except MeasureError:  # with so little weight they do not hold the network
+        return left, adjustment.state
+    group = group_record(adjustment, control_residuals(adjustment))
+    if 2 * _wrong_points(again) > out or group is None:
+        return left, adjustment.state  # with larger uncertainties they are wrong all the same
+    better = float(np.sqrt(group["factor"]))
+    gross = {**again.gross, "understated": [{"factor": factor * better}]}
+    return replace(_raised(again, control, better), gross=gross), adjustment.state
+
+
+def _wrong_points(checked: CheckedKnown) -> int:
+    """Control points that are contradicted, or may be what is wrong instead."""
+    names = (name for record in checked.gross["control_points"] for name in (record["name"], *record["rivals"]))
+    return len({name.rpartition(" ")[0] for name in names})
+
+
+def _without_contradicted(
+    checked: CheckedKnown, state: State, used: np.ndarray, adjust: Adjust, dof: float
+) -> tuple[CheckedKnown, Adjustment]:
+    for _ in range(MOST):
+        adjustment = adjust(checked.network, state, used=used, redundancy=True)
+        state = adjustment.state
+        kinds = {"scale_bars": bar_residuals(adjustment), "control_points": control_residuals(adjustment)}
+        worst = {kind: found for kind, known in kinds.items() if (found := contradicted(known, 1.0, dof))}
+        if not worst:
+            break
+        kind = max(worst, key=lambda kind: worst[kind][0]["statistic"])
+        known, found = kinds[kind], worst[kind]
+        if kind == "control_points":
+            joint = _together(adjustment, adjust)
+            known, found = (known, found[:1]) if joint is None else (joint, contradicted(joint, 1.0, dof) or found[:1])
+        checked = _without(checked, known, found, kind)
+    return checked, adjustment
+
+
+def _together(adjustment: Adjustment, adjust: Adjust) -> Known | None:
+    """Residuals of the control points with what they have to do with each other; None where that cannot be had."""
+    network, state = adjustment.network, adjustment.state
+    try:
+        joint = adjust(jointly(network, state), state, used=adjustment.used, redundancy=True)
+    except MeasureError:
+        return None
+    return control_residuals(replace(joint, network=network))
+
+
+def _raised(checked: CheckedKnown, control: np.ndarray, factor: float) -> CheckedKnown:
+    u = checked.network.u_xyz
+    return replace(checked, network=replace(checked.network, u_xyz=np.where(control, factor * u, u)))
+
+
+def _understatement(network: Network, control: np.ndarray, clean: Adjustment) -> float:
+    """What the middle one of the whole control points is off by, where they hardly pull at the network, over what was stated."""
+    from scipy import stats
+
+    from pixmetry.calibrate.start.resection import fitted
+
+    rows = np.flatnonzero(control.all(axis=1) & np.isfinite(clean.state.xyz).all(axis=1))
+    away = fitted(clean.state.xyz[rows], network.xyz[rows])[3]
+    return float(np.sqrt(np.median(away**2 / np.mean(network.u_xyz[rows] ** 2, axis=1)) / stats.chi2.median(3)))
+
+
+def without_absurd_control(network: Network, state: State) -> tuple[Network, list[dict[str, Any]]]:
+    """The network without weighted control points that lie far from where most of the others put them, such as those with swapped names;
+    and their records."""
+    from pixmetry.calibrate.start.resection import fitted
+
+    control = np.isfinite(network.u_xyz).all(axis=1) & (network.u_xyz > 0).any(axis=1)
+    rows = np.flatnonzero(control & np.isfinite(state.xyz).all(axis=1))
+    if len(rows) <= LEAST_CONTROL:
+        return network, []
+    away = fitted(state.xyz[rows], network.xyz[rows])[3]
+    limit = ABSURD * float(np.ptp(network.xyz[rows], axis=0).max())
+    bad = np.flatnonzero(away > limit)
+    if not len(bad) or len(rows) - len(bad) < LEAST_CONTROL:
+        return network, []
+    size = {"critical": limit, "left_out": True}
+    measured = [(network.points[rows[i]], float(away[i])) for i in bad]
+    records = [{"name": name, "residual": off, "error": off, "statistic": off, **size} for name, off in measured]
+    return set_free(network, rows[bad]), records
+
+
+def in_frame_of_control(network: Network, state: State) -> tuple[Network, State, list[dict[str, Any]]]:
+    """The state in the frame in which most known coordinates of control points are right; the network without points that lie far from
+    where it puts them; and their records.
+
+    Parameters
+    ----------
+    network : Network
+    state : State
+        Without gross errors in the images, in any frame.
+    """
+    weighted = np.isfinite(network.u_xyz).any(axis=1) & (network.u_xyz > 0).all(axis=1)
+    u = np.where(weighted[:, None], network.u_xyz, np.inf)
+    known = network.xyz[np.isfinite(u).all(axis=1)]
+    limit = ABSURD * float(np.ptp(known, axis=0).max()) if len(known) else 0.0
+    fit = far_from_control(state.xyz, network.xyz, u, limit) if (network.u_xyz > 0).all() else None
+    if fit is None:
+        return network, state, []
+    moved, miss = fit
+    bad = np.flatnonzero((np.abs(miss) > np.maximum(limit, ABSURD_U * np.where(np.isfinite(u), u, 0.0))).any(axis=1))
+    records = []
+    for k in bad:
+        off = float(np.linalg.norm(miss[k]))
+        limits = {"statistic": off, "critical": limit, "left_out": True}
+        records.append({"name": network.points[k], "residual": off, "error": off, **limits})
+    return set_free(network, bad), in_frame(state, state.xyz, moved), records
+
+
+def _without_absurd(checked: CheckedKnown, state: State) -> tuple[CheckedKnown, State]:
+    """Leave out bars in other units than most, or between other points: no adjustment could start with them. Bring the rest to scale."""
+    bars = checked.network.bars
+    if not len(bars):
+        return checked, state
+    state, scaled_by_points = _to_scale_of_control(state, checked.network)
+    computed = np.linalg.norm(state.xyz[bars.end] - state.xyz[bars.start], axis=1)
+    ratio, scale = bars.length / computed, 1.0
+    if not scaled_by_points and np.isfinite(ratio).any():
+        scale = float(np.nanmedian(ratio))
+        state = _enlarged(state, checked.network, scale)
+    bad = np.flatnonzero(np.abs(ratio / scale - 1) > ABSURD)
+    if len(bad) == len(bars) and not scaled_by_points:
+        found = "lengths over computed ones: " + ", ".join(f"{one:.6g}" for one in ratio)
+        what = f"the {'two ' if len(bars) == 2 else ''}scale bars contradict each other"
+        raise InputError(what, where="scale bars", value=found, remedy="check their units and points")
+    records, names = [], bar_names(checked.network)
+    for i in bad:
+        error = float(bars.length[i] - scale * computed[i])
+        limit = {"statistic": float(abs(error) / bars.u[i]), "critical": float(ABSURD * bars.length[i] / bars.u[i])}
+        records.append({"name": names[i], "residual": error, "error": error, **limit, "left_out": True})
+    kept = np.setdiff1d(np.arange(len(bars)), bad)
+    network = replace(checked.network, bars=ScaleBars(bars.start[kept], bars.end[kept], bars.length[kept], bars.u[kept]))
+    return CheckedKnown(network, {**checked.gross, "scale_bars": records}), state
+
+
+def _to_scale_of_control(state: State, network: Network) -> tuple[State, bool]:
+    """The state in the scale of most distances between whole control points, if bars had brought it to another; whether there are any."""
+    from scipy.spatial.distance import pdist
+
+    whole = network.control & np.isfinite(state.xyz).all(axis=1)
+    if whole.sum() < 2:
+        return state, False
+    ratio = float(np.median(pdist(network.xyz[whole]) / np.maximum(pdist(state.xyz[whole]), 1e-300)))
+    return (_enlarged(state, network, ratio) if ABSURD < abs(ratio - 1) < np.inf and ratio > 0 else state), True
+
+
+def _enlarged(state: State, network: Network, scale: float) -> State:
+    """The state enlarged about the middle of what is known of the points; what is held stays."""
+    known = np.isfinite(network.u_xyz).any(axis=1) & np.isfinite(state.xyz).all(axis=1)
+    middle = state.xyz[known].mean(axis=0) if known.any() else np.zeros(3)
+    xyz = np.where(network.u_xyz == 0, state.xyz, middle + scale * (state.xyz - middle))
+    return replace(state, xyz=xyz, position=middle + scale * (state.position - middle))
+
+
+def _without(checked: CheckedKnown, known: Known, found: list[dict[str, Any]], kind: str) -> CheckedKnown:
+    """Leave out what is contradicted most, or, where it cannot be told from others, give all of these the uncertainty of their error."""
+    wrong = [known.name.index(record["name"]) for record in found]
+    if kind == "scale_bars":
+        others, alone = rivals(known, wrong, 1.0), True
+        network = _less_bars(checked.network, known, wrong[0], others)
+    else:
+        going = _going(checked.network, known, wrong[0])
+        alone = known.redundancy.sum() - len(going) > LEFT
+        others = rivals(known, wrong, 1.0) if alone else rivals(known, wrong[:1], 1.0, found[0]["critical"])
+        network = _less_control(checked.network, known, wrong[0], others, going if alone else [])
+    record = {**found[0], "left_out": alone and not others, "rivals": [known.name[i] for i in others]}
+    if kind == "control_points" and record["left_out"]:
+        record["axes"] = [k % 3 for k in going]
+    return CheckedKnown(network, {**checked.gross, kind: [*checked.gross[kind], record]})
+
+
+def _supposed(known: Known, rows: list[int]) -> np.ndarray:
+    """Sizes of the errors that these would have."""
+    return np.abs(known.residual[rows]) / known.redundancy[rows]
+
+
+def _less_bars(network: Network, known: Known, row: int, others: list[int]) -> Network:
+    bars, rows = network.bars, [row, *others]
+    if others:
+        u = bars.u.copy()
+        u[known.index[rows]] = np.maximum(u[known.index[rows]], _supposed(known, rows))
+        return replace(network, bars=replace(bars, u=u))
+    kept = np.arange(len(bars)) != known.index[row]
+    return replace(network, bars=ScaleBars(bars.start[kept], bars.end[kept], bars.length[kept], bars.u[kept]))
+
+
+def _going(network: Network, known: Known, row: int) -> list[int]:
+    """Coordinates that go with a wrong one, as places in all of them: of many whole points the whole, for it may be another point; of few,
+    its height or its position only."""
+    point, axis = divmod(int(known.index[row]), 3)
+    few = np.isfinite(network.u_xyz).all(axis=1).sum() <= LEAST_CONTROL
+    axes = [0, 1, 2] if not few else [2] if axis == 2 else [0, 1]
+    return [3 * point + k for k in axes if np.isfinite(network.u_xyz[point, k])]
+
+
+def _less_control(network: Network, known: Known, row: int, others: list[int], going: list[int]) -> Network:
+    u, rows = network.u_xyz.copy(), [row, *others]
+    if others or not going:
+        u.flat[known.index[rows]] = np.maximum(u.flat[known.index[rows]], _supposed(known, rows))
+    else:
+        u.flat[going] = np.inf
+    return replace(network, u_xyz=u)
+
+
+def _stated_of_bars(given: ScaleBars, used: ScaleBars) -> list[float]:
+    """Stated uncertainties of the bars that are left; of some with the same length between the same points, its own if it is unchanged."""
+    table = np.column_stack([given.start, given.end, given.length])
+    rest, out = np.ones(len(given), bool), []
+    for i in range(len(used)):
+        same = np.flatnonzero(rest & (table == [used.start[i], used.end[i], used.length[i]]).all(axis=1))
+        k = min(same, key=lambda k: given.u[k] != used.u[i])
+        rest[k] = False
+        out.append(float(given.u[k]))
+    return out
+
+
+def raised(given: Network, used: Network) -> list[dict[str, Any]]:
+    """Bars and control coordinates that are less certain in one network than they were given in another: ``kind``, ``name``, ``u``."""
+    out, bars = [], used.bars
+    for i, (name, stated) in enumerate(zip(bar_names(used), _stated_of_bars(given.bars, bars), strict=True)):
+        if bars.u[i] > stated:
+            out.append({"kind": "scale_bars", "name": name, "u": float(stated)})
+    for k, axis in np.argwhere(np.isfinite(used.u_xyz) & (used.u_xyz > given.u_xyz)):
+        out.append({"kind": "control_points", "name": f"{given.points[k]} {'XYZ'[axis]}", "u": float(given.u_xyz[k, axis])})
+    return out

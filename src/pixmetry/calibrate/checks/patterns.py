@@ -1,0 +1,412 @@
+"""Patterns in the residuals, each a hypothesis with its test and its amplitude, and the error source that makes it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from pixmetry.calibrate.bundle.network import Adjustment, Finding
+from pixmetry.calibrate.checks.added_terms import AddedTerms, Terms, whitening
+from pixmetry.calibrate.checks.quality import p_words, redundancy_of
+from pixmetry.core.errors import MeasureError
+from pixmetry.core.threads import single_threaded_blas
+
+HATS = 8  # nodes of a piecewise linear curve
+FIELD_NODES = (6, 5)  # of a piecewise linear field, along x and y
+LONGEST_WAVE = 0.25  # of the frame; what is longer is a curve
+BINS_PER_PX = 4
+DRIFT = ("x_scale_trend", "x_scale_by_image")
+WORST = 5.0  # times the median rms: what a rejected image point counts at most
+OUTSTANDING = 2.5  # times the median rms of the images: such an image is looked at by itself
+RARE = 0.001
+ALIKE = 0.001  # level at which images differ, but for one of them
+FEW_OF = 3  # they are no more than one image in so many
+NAMED = 5
+MANY = 200  # a test needs so many image points of a camera
+
+# what is seen; the error source in the catalogue; what to do
+MEANING = {
+    "radius": ("radial residuals follow the radius", "optics.distortion", "estimate k4 and k5, or correct by a residual grid"),
+    "unflatness": (
+        "radial residuals follow the place in the frame, not the radius alone",
+        "sensor.unflatness",
+        "correct by a residual grid; let views at other angles show whether the shifts grow with the tangent of the chief ray",
+    ),
+    "field": ("residuals follow the place in the frame", "sensor.pixel_geometry", "correct by a residual grid"),
+    "rows_x": (
+        "x residuals follow the row",
+        "grabber.line_jitter",
+        "let the clock settle before the first rows that are used, or correct by a residual grid",
+    ),
+    "columns_x": (
+        "x residuals follow the column",
+        "grabber.sampling_clock",
+        "sample with the camera's pixel clock, or correct by a residual grid",
+    ),
+    "wave_xx": (
+        "x residuals are periodic along the row",
+        "grabber.phase_pattern",
+        "average images, or remove the interference; look at the targets if the period is theirs",
+    ),
+    "wave_xy": (
+        "x residuals are periodic down the column",
+        "grabber.line_jitter",
+        "compare the fields; average images; look at the targets if the period is theirs",
+    ),
+    "wave_yy": (
+        "y residuals are periodic down the column",
+        "sensor.pixel_geometry",
+        "use larger targets; look at how they are located if the period is theirs",
+    ),
+    "phase_x": (
+        "x residuals follow the sub-pixel phase",
+        "sensor.pixel_aperture",
+        "use larger or softer targets, or an estimator of their place that has no such bias",
+    ),
+    "phase_y": (
+        "y residuals follow the sub-pixel phase",
+        "sensor.pixel_aperture",
+        "use larger or softer targets, or an estimator of their place that has no such bias",
+    ),
+    "x_scale_trend": (
+        "the scale of x drifts from the first image to the last",
+        "grabber.clock_warm_up",
+        "estimate an x-scale for each image",
+    ),
+    "x_scale_by_image": ("the scale of x differs from image to image", "grabber.clock_warm_up", "estimate an x-scale for each image"),
+    "x_shift_by_image": ("x is shifted from image to image", "grabber.clock_warm_up", "estimate an x-shift for each image"),
+    "principal_point_trend": ("the image shifts from the first image to the last", "sensor.mount_drift", "wait until the camera is warm"),
+    "principal_distance_trend": (
+        "the image grows or shrinks from the first image to the last",
+        "sensor.thermal_expansion",
+        "wait until the camera is warm, and lock the lens",
+    ),
+    "image_rms": ("residuals are larger in some images than in others", "", "look at the worst images: focus, movement, light"),
+}
+
+SOURCES = {  # in words
+    "optics.distortion": "lens distortion beyond the terms that were estimated",
+    "sensor.unflatness": "a sensor that is not flat",
+    "sensor.pixel_geometry": "pixels, lens or board that are irregular on a small scale",
+    "grabber.line_jitter": "lines that a frame grabber does not start at one place",
+    "grabber.sampling_clock": "samples that are not evenly spaced along a line",
+    "grabber.phase_pattern": "interference that the sampling clock brings in",
+    "sensor.pixel_aperture": "pixels that are coarse for the images of the targets",
+    "grabber.clock_warm_up": "a frame grabber whose clock warms up",
+    "sensor.mount_drift": "a sensor or lens that moves while it warms up",
+    "sensor.thermal_expansion": "a camera that expands while it warms up",
+}
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """Observations of one camera, in the order of the rows of the terms."""
+
+    adjustment: Adjustment
+    terms: AddedTerms
+    camera: int
+    mine: np.ndarray  # which of the rows
+    x: np.ndarray
+    y: np.ndarray
+    image: np.ndarray
+
+    def along(self, x: np.ndarray | None, y: np.ndarray | None) -> np.ndarray:
+        """Terms, shape (m, 2, k), from columns, shape (rows of this camera, k), of what they add to x and to y."""
+        columns = (x if x is not None else y).shape[1]
+        out = np.zeros((len(self.mine), 2, columns))
+        for axis, part in enumerate((x, y)):
+            if part is not None:
+                out[self.mine, axis] = part
+        return out
+
+
+def residual_patterns(adjustment: Adjustment, level: float = 0.01) -> list[dict[str, Any]]:
+    """Test the residuals for patterns, each as if it had been estimated with everything else (see `added_terms`).
+
+    Parameters
+    ----------
+    adjustment : Adjustment
+    level : float
+        Of all tests together: each is held against the level over their number (Bonferroni), which is given as ``level``.
+
+    Returns
+    -------
+    list of dict
+        ``name``, ``camera``, ``amplitude_px``, ``u_px`` (None where the amplitude is an rms over several terms, with the part that noise
+        alone makes taken off), ``p``, ``level``, ``significant``, ``source`` (of the catalogue of error sources), ``text``, ``advice``.
+        ``x_scale_by_image`` and ``x_shift_by_image`` also hold ``images``, ``values`` and ``u``, and ``alone``: the one image that differs
+        from all others, if it is one; waves hold ``period_px``. Amplitudes:
+        of waves and phases their own; of trends the change from the first image to the last, at the edge of the frame; of curves, fields
+        and images the rms of what the residuals show of them; of ``image_rms`` the largest rms of an image, in x or in y, and if few images
+        stand out their names, ``images_out``, with ``rms_px`` (in x and y), the number of their image points that were ``rejected``, and
+        ``times_median``, how their weighted residuals compare with the median of the images, rejected ones counted.
+    """
+    with single_threaded_blas():
+        out = _of_cameras(adjustment)
+    for record in out:
+        what, source, advice = MEANING[record["name"]]
+        significant = bool(record["p"] < level / len(out))
+        number = f"{record['amplitude_px']:.4f} px" if record["u_px"] is None else f"{record['amplitude_px']:.4f} ± {record['u_px']:.4f} px"
+        period = f", period {record['period_px']:.3g} px" if "period_px" in record else ""
+        if record.get("alone"):
+            what, source = f"{what}, but only that of {record['alone']} from all others", ""
+            advice = "look at this image: focus, movement, light, names of points"
+        text = f"{what}: {number}{period}, {p_words(record['p'])}" if significant else f"not seen: {what} ({p_words(record['p'])})"
+        record |= {"level": level / len(out), "significant": significant, "source": source, "text": text, "advice": advice}
+    return out
+
+
+def patterns_without_bad_images(adjustment: Adjustment, adjust: Callable[..., Adjustment]) -> list[dict[str, Any]]:
+    """`residual_patterns`; if few images stand out by their residuals, those of an adjustment without them, but for ``image_rms``."""
+    found = residual_patterns(adjustment)
+    bad = [name for r in found if r["significant"] for name in r.get("images_out", ())]
+    if not bad:
+        return found
+    network = adjustment.network
+    used = adjustment.used & ~np.isin(network.image, np.flatnonzero(np.isin(network.images, bad)))
+    try:
+        again = residual_patterns(adjust(network, adjustment.state, used=used, redundancy=True))
+    except MeasureError:  # the network hangs on them
+        return found
+    return [*(r for r in again if r["name"] != "image_rms"), *(r for r in found if r["name"] == "image_rms")]
+
+
+def _of_cameras(adjustment: Adjustment) -> list[dict[str, Any]]:
+    terms = AddedTerms(adjustment)
+    out: list[dict[str, Any]] = []
+    network = adjustment.network
+    for k, camera in enumerate(network.cameras):
+        rows = terms.rows
+        mine = network.camera_of[network.image[rows]] == k
+        if mine.sum() < MANY:
+            continue
+        place = rows[mine]
+        # places are the computed ones: measured ones hold the noise that is tested
+        x, y = network.x_px[place] - adjustment.residual_px[place, 0], network.y_px[place] - adjustment.residual_px[place, 1]
+        seen = _Seen(adjustment, terms, k, mine, x, y, network.image[place])
+        for record in _tests(seen):
+            out.append({"name": record.pop("name"), "camera": camera.name, **record})
+    return out
+
+
+def pattern_findings(records: list[dict[str, Any]]) -> tuple[Finding, ...]:
+    """A warning for each significant pattern, the surest first."""
+    several = len({record["camera"] for record in records}) > 1
+    out = []
+    for record in sorted((r for r in records if r["significant"]), key=lambda r: r["p"]):
+        where = f"{record['camera']}: " if several else ""
+        source = f" (as from {SOURCES[record['source']]}: {record['source']})" if record["source"] else ""
+        if record.get("images_out"):
+            out.append(_bad_images(record, where))
+            continue
+        kind = "x_scale_drift" if record["name"] in DRIFT and not record.get("alone") else record["name"]
+        advice = record["advice"][0].upper() + record["advice"][1:] + "."
+        out.append(Finding(kind, f"{where}{record['text']}{source}", advice, "warning"))
+    return tuple(out)
+
+
+def _bad_images(record: dict[str, Any], where: str) -> Finding:
+    found = list(zip(record["images_out"], record["rms_px"], record["rejected"], record["times_median"], strict=True))
+    named = ", ".join(f"{name} ({_size(*of_one)})" for name, *of_one in found[:NAMED])
+    more = " …" if len(found) > NAMED else ""
+    few = "1 image has residuals" if len(found) == 1 else f"{len(found)} images have residuals"
+    text = f"{where}{few} much larger than the others: {named}{more}. Patterns in the residuals were sought without"
+    it = "it" if len(found) == 1 else "them"
+    advice = f"Look at {it}: focus, movement, light, names of points; leave {it} out if nothing mends {it}."
+    return Finding("bad_images", f"{text} {it}.", advice, "warning")
+
+
+def _size(rms_px: Sequence[float], rejected: int, times: float) -> str:
+    """Residuals of one image: their rms as the figures show it, and what they are with its rejected image points counted."""
+    size = f"rms {rms_px[0]:.2g} px in x and {rms_px[1]:.2g} px in y"
+    if rejected:
+        return f"{size}, but {rejected} rejected; with {'it' if rejected == 1 else 'them'} {times:.1f} times the median"
+    return f"{size}, {times:.1f} times the median"
+
+
+def _tests(seen: _Seen) -> Iterator[dict[str, Any]]:
+    sensor = seen.adjustment.network.cameras[seen.camera].sensor
+    xp, yp = seen.adjustment.state.interior[seen.camera, 1:3]
+    dx, dy = seen.x - xp, seen.y - yp
+    radius = np.hypot(dx, dy)
+    outward = np.stack([dx, dy], axis=1) / np.maximum(radius, 1e-9)[:, None]
+    hats = _hats(radius, 0.0, radius.max(), HATS)
+    yield _group(seen, "radius", seen.along(hats * outward[:, :1], hats * outward[:, 1:]))
+    heights = _legendre(seen.x, seen.y, sensor.cols, sensor.rows)
+    yield _group(seen, "unflatness", seen.along(heights * dx[:, None], heights * dy[:, None]))
+    field = _field(seen.x, seen.y, sensor.cols, sensor.rows)
+    nothing = np.zeros_like(field)
+    yield _group(seen, "field", seen.along(np.hstack([field, nothing]), np.hstack([nothing, field])))
+    yield _group(seen, "rows_x", seen.along(_hats(seen.y, 0, sensor.rows - 1, HATS), None))
+    yield _group(seen, "columns_x", seen.along(_hats(seen.x, 0, sensor.cols - 1, HATS), None))
+    for name, place, axis, size in (
+        ("wave_xx", seen.x, 0, sensor.cols),
+        ("wave_xy", seen.y, 0, sensor.rows),
+        ("wave_yy", seen.y, 1, sensor.rows),
+    ):
+        yield _wave(seen, name, place, axis, size)
+    yield _harmonic(seen, "phase_x", seen.x, 0, 1.0)
+    yield _harmonic(seen, "phase_y", seen.y, 1, 1.0)
+    yield from _over_images(seen, dx, dy)
+
+
+def _hats(values: np.ndarray, low: float, high: float, nodes: int) -> np.ndarray:
+    """Piecewise linear functions, each 1 at its node and 0 at the others, shape (n, nodes)."""
+    at = np.clip((values - low) / (high - low) * (nodes - 1), 0, nodes - 1)
+    return np.maximum(0.0, 1.0 - np.abs(at[:, None] - np.arange(nodes)))
+
+
+def _field(x: np.ndarray, y: np.ndarray, cols: int, rows: int) -> np.ndarray:
+    across, down = _hats(x, 0, cols - 1, FIELD_NODES[0]), _hats(y, 0, rows - 1, FIELD_NODES[1])
+    return (across[:, :, None] * down[:, None, :]).reshape(len(x), -1)
+
+
+def _legendre(x: np.ndarray, y: np.ndarray, cols: int, rows: int) -> np.ndarray:
+    """Products of Legendre polynomials over the frame, of total degrees 2 to 4: shapes of a surface."""
+    degrees = np.arange(5)
+    across = np.polynomial.legendre.legvander(2 * x / (cols - 1) - 1, 4)
+    down = np.polynomial.legendre.legvander(2 * y / (rows - 1) - 1, 4)
+    i, j = (part.ravel() for part in np.meshgrid(degrees, degrees))
+    kept = (i + j >= 2) & (i + j <= 4)
+    return across[:, i[kept]] * down[:, j[kept]]
+
+
+def _group(seen: _Seen, name: str, columns: Any) -> dict[str, Any]:
+    found = seen.terms.test(columns)
+    return {"name": name, "amplitude_px": _visible(seen, found, columns), "u_px": None, "p": found.p}
+
+
+def _visible(seen: _Seen, found: Terms, columns: Any) -> float:
+    """Rms, px, of what the residuals show of a group of terms, over the coordinates that it touches, less what noise makes of it."""
+    from scipy import sparse
+
+    touched = columns.getnnz(axis=1) > 0 if sparse.issparse(columns) else (columns != 0).any(axis=2).ravel()
+    px2 = seen.adjustment.network.covariance_px2[seen.terms.rows][:, [0, 2]].ravel()[touched].mean()
+    return float(np.sqrt(max(found.fall - found.k * found.variance, 0.0) / touched.sum() * px2)) if found.k else 0.0
+
+
+def _harmonic(seen: _Seen, name: str, place: np.ndarray, axis: int, per_px: float) -> dict[str, Any]:
+    angle = 2 * np.pi * per_px * place
+    columns = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    found = seen.terms.test(seen.along(columns, None) if axis == 0 else seen.along(None, columns))
+    amplitude = float(np.hypot(*found.values))
+    unit = found.values / amplitude if amplitude > 0 else np.array([1.0, 0.0])
+    return {"name": name, "amplitude_px": amplitude, "u_px": float(np.sqrt(unit @ found.covariance @ unit)), "p": found.p}
+
+
+def _wave(seen: _Seen, name: str, place: np.ndarray, axis: int, size: int) -> dict[str, Any]:
+    """The strongest of all waves from a period of 2 px to a quarter of the frame; p is that of the best of so many (Bonferroni)."""
+    residual = seen.adjustment.residual_px[seen.terms.rows[seen.mine], axis]
+    length = 2 * BINS_PER_PX * size
+    bins = np.clip(np.floor((place + 0.5) * BINS_PER_PX).astype(int), 0, length - 1)
+    power = np.abs(np.fft.rfft(np.bincount(bins, residual, length))) ** 2
+    per_px = np.arange(len(power)) / (2 * size)
+    allowed = (per_px <= 0.5) & (per_px >= 1 / (LONGEST_WAVE * size))
+    best = per_px[np.argmax(np.where(allowed, power, -1.0))]
+    record = _harmonic(seen, name, place, axis, best)
+    return {**record, "p": min(1.0, record["p"] * int(allowed.sum())), "period_px": float(1 / best)}
+
+
+def _over_images(seen: _Seen, dx: np.ndarray, dy: np.ndarray) -> Iterator[dict[str, Any]]:
+    network = seen.adjustment.network
+    images = np.unique(seen.image)
+    if len(images) < 3:
+        return
+    sensor = network.cameras[seen.camera].sensor
+    when = np.arange(len(network.images), dtype=float) if network.time_s is None else network.time_s
+    first, last = when[images].min(), when[images].max()
+    time = ((when[seen.image] - first) / (last - first) - 0.5 if last > first else np.zeros(len(seen.image)))[:, None]
+    from_origin = seen.x[:, None] - network.scale_origin_px
+    edge = max(abs(network.scale_origin_px), abs(sensor.cols - 1 - network.scale_origin_px))
+    if "x_scale" not in network.per_image:
+        if last > first:
+            yield _trend(seen, "x_scale_trend", seen.along(time * from_origin, None), edge)
+        yield _by_image(seen, "x_scale_by_image", images, from_origin[:, 0])
+    if "x_shift" not in network.per_image:
+        yield _by_image(seen, "x_shift_by_image", images, np.ones(len(dx)))
+    if last > first:
+        shift = np.hstack([time, np.zeros_like(time)]), np.hstack([np.zeros_like(time), time])
+        yield _trend(seen, "principal_point_trend", seen.along(*shift), 1.0)
+        corner = float(np.hypot(sensor.cols, sensor.rows)) / 2
+        yield _trend(seen, "principal_distance_trend", seen.along(time * dx[:, None], time * dy[:, None]), corner)
+    yield _image_rms(seen, images)
+
+
+def _trend(seen: _Seen, name: str, columns: np.ndarray, edge_px: float) -> dict[str, Any]:
+    found = seen.terms.test(columns)
+    size = float(np.linalg.norm(found.values))
+    unit = found.values / size if size > 0 else np.eye(len(found.values))[0]
+    u = float(np.sqrt(unit @ found.covariance @ unit)) if found.k else np.inf
+    return {"name": name, "amplitude_px": size * edge_px, "u_px": u * edge_px, "p": found.p}
+
+
+def _by_image(seen: _Seen, name: str, images: np.ndarray, x: np.ndarray) -> dict[str, Any]:
+    """A value for each image, of sum 0: what is common to all belongs to affinity and principal point."""
+    from scipy import sparse
+
+    rows = 2 * np.flatnonzero(seen.mine)
+    columns = sparse.csr_matrix((x, (rows, np.searchsorted(images, seen.image))), shape=(2 * len(seen.mine), len(images)))
+    contrasts = np.linalg.svd(np.eye(len(images)) - 1 / len(images))[0][:, :-1]
+    found = seen.terms.test(columns, contrasts)
+    u = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", contrasts, found.covariance, contrasts), 0.0))
+    names = [seen.adjustment.network.images[i] for i in images]
+    amplitude, values = _visible(seen, found, columns), contrasts @ found.values
+    record = {"name": name, "amplitude_px": amplitude, "u_px": None, "p": found.p, "images": names, "values": values, "u": u}
+    alone = int(np.argmax(np.abs(values) / np.maximum(u, 1e-300)))
+    return {**record, "alone": names[alone] if _alone(values, u, alone, found.dof) else None}
+
+
+def _alone(values: np.ndarray, u: np.ndarray, one: int, dof: float) -> bool:
+    """Whether the images other than one do not differ among themselves."""
+    from scipy import stats
+
+    rest = np.delete(np.arange(len(values)), one)
+    weight = 1 / np.maximum(u[rest], 1e-300) ** 2
+    off = values[rest] - weight @ values[rest] / weight.sum()
+    return bool(len(rest) > 1 and stats.f.sf(weight @ off**2 / (len(rest) - 1), len(rest) - 1, dof) > ALIKE)
+
+
+def _rejected(seen: _Seen, most: float) -> tuple[np.ndarray, np.ndarray]:
+    """By image of the network: weighted squares of rejected image points, no coordinate more than so much, squared, and their number."""
+    network = seen.adjustment.network
+    rows = ~seen.adjustment.used & np.isfinite(seen.adjustment.residual_px).all(axis=1)
+    rows &= network.camera_of[network.image] == seen.camera
+    white = np.einsum("nij,nj->ni", whitening(network.covariance_px2[rows]), seen.adjustment.residual_px[rows])
+    squares, count = np.minimum(white**2, most**2).sum(axis=1), np.full(rows.sum(), 2.0)
+    image, images = network.image[rows], len(network.images)
+    return np.bincount(image, squares, images), np.bincount(image, count, images)
+
+
+def _image_rms(seen: _Seen, images: np.ndarray) -> dict[str, Any]:
+    """Bartlett's test of equal variances, with the redundancy of each image (Proc. R. Soc. A 160 (1937) 268–282)."""
+    from scipy import stats
+
+    squares = seen.terms.whitened_squares()[seen.mine]
+    place = np.searchsorted(images, seen.image)
+    total = np.bincount(place, squares)
+    dof = np.bincount(place, redundancy_of(seen.adjustment)[seen.terms.rows[seen.mine]].sum(axis=1))
+    good = (dof > 2) & (total > 0)
+    total, dof = total[good], dof[good]
+    pooled = total.sum() / dof.sum()
+    statistic = dof.sum() * np.log(pooled) - np.sum(dof * np.log(total / dof))
+    correction = 1 + (np.sum(1 / dof) - 1 / dof.sum()) / (3 * (len(dof) - 1)) if len(dof) > 1 else 1.0
+    p = float(stats.chi2.sf(statistic / correction, len(dof) - 1)) if len(dof) > 1 else 1.0
+    residual_px = seen.adjustment.residual_px[seen.terms.rows[seen.mine]]
+    rms_px = np.sqrt(np.stack([np.bincount(place, axis**2) / np.bincount(place) for axis in residual_px.T], axis=1))[good]
+    record = {"name": "image_rms", "amplitude_px": float(rms_px.max()), "u_px": None, "p": p}
+    middle = float(np.median(np.sqrt(total / dof)))
+    squares, coordinates = (part[images[good]] for part in _rejected(seen, WORST * middle))
+    total, dof = total + squares, dof + coordinates
+    rms = np.sqrt(total / dof)
+    out = np.flatnonzero(rms > OUTSTANDING * middle)
+    rest = np.setdiff1d(np.arange(len(dof)), out)
+    out = out[stats.f.sf(rms[out] ** 2 / (total[rest].sum() / dof[rest].sum()), dof[out], dof[rest].sum()) < RARE / len(dof)]
+    if 0 < len(out) <= len(dof) / FEW_OF:
+        out = out[np.argsort(-rms[out])]
+        names = [seen.adjustment.network.images[i] for i in images[good][out]]
+        rejected = (coordinates[out] / 2).astype(int).tolist()
+        record |= {"images_out": names, "rms_px": rms_px[out].tolist(), "rejected": rejected, "times_median": (rms[out] / middle).tolist()}
+    return record

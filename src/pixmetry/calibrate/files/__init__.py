@@ -1,0 +1,1 @@
+"""A calibration on disk, and in the forms of other programs."""

@@ -1,0 +1,319 @@
+"""All numbers of a calibration as one strict JSON text, and read back from it."""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+import zlib
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict, dataclass, is_dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from pixmetry.calibrate.bundle.model import NAMES, CameraModel, Sensor
+from pixmetry.calibrate.bundle.network import Calibration, Finding
+from pixmetry.calibrate.checks.control import control_of
+from pixmetry.calibrate.lines.line_calibration import LineCalibration
+from pixmetry.core.checksums import check_record, sealed
+from pixmetry.core.config import read_text
+from pixmetry.core.errors import InputError
+
+RESULT_SCHEMA = "pixmetry/calibration-result/1"
+LINES_SCHEMA = "pixmetry/line-calibration-result/1"
+PIXELS = "pixel (0, 0) is the centre of the top-left pixel, x to the right, y down"
+T = TypeVar("T")
+SHORT = 130  # characters of a record that stands on one line
+
+
+@dataclass(frozen=True)
+class StoredCalibration:
+    """What `read_calibration` gives back.
+
+    Parameters
+    ----------
+    cameras : tuple of CameraModel
+        Adjusted; ``free`` says which parameters were estimated.
+    columns : tuple of str
+        Names of the rows of ``covariance``, as in `pixmetry.calibrate.bundle.network.Adjustment`.
+    covariance : ndarray, shape (m, m)
+        Of interior parameters, poses, and points that bars join.
+    images : tuple of str
+    camera_of : ndarray of int, shape (images,)
+    rotation : ndarray, shape (images, 3, 3)
+    position : ndarray, shape (images, 3)
+    points : tuple of str
+    xyz : ndarray, shape (points, 3)
+        NaN: not determined.
+    point_covariance : ndarray, shape (points, 3, 3)
+    unit : str
+        Of the object.
+    sigma0 : float
+    dof : int
+    datum : str
+    findings : tuple of Finding
+    tests, grids, provenance : dict
+        As in `pixmetry.calibrate.bundle.network.Calibration`; None where a number was not finite.
+    """
+
+    cameras: tuple[CameraModel, ...]
+    columns: tuple[str, ...]
+    covariance: np.ndarray
+    images: tuple[str, ...]
+    camera_of: np.ndarray
+    rotation: np.ndarray
+    position: np.ndarray
+    points: tuple[str, ...]
+    xyz: np.ndarray
+    point_covariance: np.ndarray
+    unit: str
+    sigma0: float
+    dof: int
+    datum: str
+    findings: tuple[Finding, ...]
+    tests: dict[str, Any]
+    grids: dict[str, Any]
+    provenance: dict[str, Any]
+
+    def interior_covariance(self, index: int = 0) -> tuple[tuple[str, ...], np.ndarray]:
+        """Names of the estimated parameters of a camera and their covariance."""
+        own = {f"{self.cameras[index].name}:{name}": name for name in NAMES}
+        rows = [i for i, column in enumerate(self.columns) if column in own]
+        return tuple(own[self.columns[i]] for i in rows), self.covariance[np.ix_(rows, rows)]
+
+
+def json_text(calibration: Calibration, folder: str | Path = "", beside: Iterable[str] = ()) -> str:
+    """All numbers of a calibration as strict JSON; the joint covariance is packed, see `unpacked`.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    folder : path
+    beside : iterable of str
+        Names of files in the folder whose digests it is to hold.
+    """
+    return _json(sealed(_plain(_record(calibration)), folder, beside)) + "\n"
+
+
+def _record(calibration: Calibration) -> dict[str, Any]:
+    a = calibration.adjustment
+    network, state = a.network, a.state
+    return {
+        "schema": RESULT_SCHEMA,
+        "conventions": f"{PIXELS}; a point X is seen at R (X - X0), z forwards; covariances are a posteriori",
+        "unit": network.unit,
+        "datum": a.datum,
+        "sigma0": a.sigma0,
+        "dof": a.dof,
+        "iterations": a.iterations,
+        "cameras": [_camera_record(calibration, k) for k in range(len(network.cameras))],
+        "images": {
+            "name": network.images,
+            "camera": network.camera_of,
+            "time_s": network.time_s,
+            "rotation": state.rotation.reshape(-1, 9),
+            "position": state.position,
+            "x_scale": state.x_scale if network.per_image else None,
+            "x_shift_px": state.x_shift_px if network.per_image else None,
+        },
+        "points": {
+            "name": network.points,
+            "xyz": state.xyz,
+            "covariance": a.point_covariance.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]],  # XX, XY, XZ, YY, YZ, ZZ
+        },
+        "control_points": _control_record(calibration),
+        "covariance": {"columns": a.free_columns, **packed(a.covariance)},
+        "findings": [asdict(finding) for finding in calibration.findings],
+        "notes": a.notes,
+        "tests": calibration.tests,
+        "grids": calibration.grids,
+        "provenance": calibration.provenance,
+    }
+
+
+def _control_record(calibration: Calibration) -> dict[str, Any]:
+    """Coordinates that were given with an uncertainty, given less adjusted, and that over the uncertainty that was stated."""
+    control = control_of(calibration)
+    names = calibration.adjustment.network.points
+    return {
+        "point": [names[k] for k in control.point],
+        "axis": ["XYZ"[k] for k in control.axis],
+        "given": control.given,
+        "u": control.u,
+        "residual": control.residual,
+        "ratio": np.divide(control.residual, control.u, out=np.full(len(control), np.nan), where=control.u > 0),
+    }
+
+
+def _camera_record(calibration: Calibration, k: int) -> dict[str, Any]:
+    return camera_record(calibration.adjustment.camera(k), *calibration.adjustment.interior_covariance(k))
+
+
+def lines_json(calibration: LineCalibration, folder: str | Path = "", beside: Iterable[str] = ()) -> str:
+    """All numbers of a calibration from straight lines as strict JSON; parameters as of `json_text`."""
+    result = calibration.result
+    record = {
+        "schema": LINES_SCHEMA,
+        "conventions": f"{PIXELS}; residuals are across the lines; covariances are a posteriori; c is 0 where it was not given",
+        "cameras": [camera_record(result.camera, result.free, result.estimates.covariance)],
+        "sigma_px": result.sigma_px,
+        "iterations": result.iterations,
+        **result.to_record(),
+        "curves": calibration.curves(),
+        "findings": [asdict(finding) for finding in calibration.findings],
+        "provenance": calibration.provenance,
+    }
+    return _json(sealed(_plain(record), folder, beside)) + "\n"
+
+
+def camera_record(model: CameraModel, names: tuple[str, ...], covariance: np.ndarray) -> dict[str, Any]:
+    """One camera with the covariance of what was estimated of it."""
+    u = dict(zip(names, np.sqrt(np.diag(covariance)), strict=True))
+    return {
+        "name": model.name,
+        **asdict(model.sensor),
+        "direction": model.direction,
+        "parameters": [
+            {"name": name, "value": value, "u": u.get(name, 0.0), "unit": unit, "free": bool(free)}
+            for name, value, unit, free in zip(NAMES, model.values, model.units, model.free, strict=True)
+        ],
+        "covariance": {"names": names, "rows": covariance},
+    }
+
+
+def packed(matrix: np.ndarray) -> dict[str, Any]:
+    """A symmetric matrix as its lower triangle, row by row: float64, little-endian, zlib, base64."""
+    lower = matrix[np.tril_indices(len(matrix))].astype("<f8")
+    data = base64.b64encode(zlib.compress(lower.tobytes(), 1)).decode()
+    return {"form": "lower triangle by rows: float64 little-endian, zlib, base64", "size": len(matrix), "data": data}
+
+
+def unpacked(record: Mapping[str, Any]) -> np.ndarray:
+    """The matrix that `packed` stored."""
+    n = int(record["size"])
+    lower = np.frombuffer(zlib.decompress(base64.b64decode(record["data"])), "<f8")
+    matrix = np.zeros((n, n))
+    matrix[np.tril_indices(n)] = lower
+    return matrix + np.tril(matrix, -1).T
+
+
+def read_calibration(path: str | Path) -> StoredCalibration:
+    """Read a calibration back.
+
+    Parameters
+    ----------
+    path : path
+        Its folder, or the file ``calibration.json`` in it.
+
+    Raises
+    ------
+    InputError
+        If there is no such file, or it is something else.
+    """
+    return _read(path, (RESULT_SCHEMA,), _stored)
+
+
+def stored_cameras(path: str | Path) -> tuple[CameraModel, ...]:
+    """Read the cameras alone, also of a calibration from straight lines (whose c is 0 unless it was given); raises likewise."""
+    return _read(path, (RESULT_SCHEMA, LINES_SCHEMA), lambda record: tuple(_camera(camera) for camera in record["cameras"]))
+
+
+def calibration_file(path: str | Path) -> Path:
+    """The file with the numbers, of a folder of results or named itself."""
+    return Path(path) / "calibration.json" if Path(path).is_dir() else Path(path)
+
+
+def _read(path: str | Path, schemas: tuple[str, ...], made: Callable[[Mapping[str, Any]], T]) -> T:
+    file = calibration_file(path)
+    text = read_text(file)
+    try:
+        record = json.loads(text)
+        schema = record["schema"]
+    except (ValueError, KeyError, TypeError):
+        schema = None
+    if schema not in schemas:
+        remedy = "name the calibration.json that `pixmetry calibrate` wrote, or its folder"
+        if schema == LINES_SCHEMA:
+            remedy = "lines do not tell the whole camera: calibrate with a test field (its project can `start_from` this file)"
+        raise InputError("not a calibration", where=str(file), value=schema, allowed=" or ".join(schemas), remedy=remedy)
+    check_record(record, str(file))
+    try:
+        return made(record)
+    except (KeyError, TypeError, ValueError, zlib.error) as problem:
+        what = f"a damaged calibration ({problem})"
+        raise InputError(what, where=str(file), remedy="calibrate again") from None
+
+
+def _stored(record: Mapping[str, Any]) -> StoredCalibration:
+    images, points = record["images"], record["points"]
+    xyz, six = _array(points["xyz"], 3), _array(points["covariance"], 6)
+    return StoredCalibration(
+        cameras=tuple(_camera(camera) for camera in record["cameras"]),
+        columns=tuple(record["covariance"]["columns"]),
+        covariance=unpacked(record["covariance"]),
+        images=tuple(images["name"]),
+        camera_of=np.array(images["camera"], dtype=np.int64),
+        rotation=_array(images["rotation"], 9).reshape(-1, 3, 3),
+        position=_array(images["position"], 3),
+        points=tuple(points["name"]),
+        xyz=xyz,
+        point_covariance=six[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3),
+        findings=tuple(Finding(**finding) for finding in record["findings"]),
+        **{name: record[name] for name in ("unit", "sigma0", "dof", "datum", "tests", "grids", "provenance")},
+    )
+
+
+def _camera(record: Mapping[str, Any]) -> CameraModel:
+    parameters = record["parameters"]
+    sensor = Sensor(*(record[name] for name in ("cols", "rows", "pitch_x_um", "pitch_y_um")))
+    values = np.array([parameter["value"] for parameter in parameters], dtype=float)
+    return CameraModel(sensor, record["direction"], values, np.array([p["free"] for p in parameters], dtype=bool), record["name"])
+
+
+def _array(rows: list[list[float | None]], width: int) -> np.ndarray:
+    return np.array(rows, dtype=float).reshape(-1, width)
+
+
+def _plain(value: Any) -> Any:
+    """Plain values; None where a number is not finite."""
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    if is_dataclass(value) and not isinstance(value, type):
+        value = asdict(value)
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if value is None or isinstance(value, str | bool | int | float):
+        return value
+    raise TypeError(f"a {type(value).__name__} has no form in JSON")
+
+
+def _json(value: Any, indent: str = "") -> str:
+    """Strict JSON with a line for each row of numbers and each short record."""
+    one = json.dumps(value, ensure_ascii=False, allow_nan=False)
+    items = list(value.values()) if isinstance(value, dict) else value if isinstance(value, list) else []
+    flat = not any(isinstance(item, dict | list) for item in items)
+    if not items or (flat and (len(one) <= SHORT or isinstance(value, list))):
+        return one
+    inner = indent + " "
+    if isinstance(value, dict):
+        parts = [f"{json.dumps(key, ensure_ascii=False)}: {_json(item, inner)}" for key, item in value.items()]
+    else:
+        parts = [_json(item, inner) for item in value]
+    left, right = "{}" if isinstance(value, dict) else "[]"
+    return f"{left}\n{inner}" + f",\n{inner}".join(parts) + f"\n{indent}{right}"
+
+
+def cameras_text(calibration: Calibration | LineCalibration, report: str = "") -> str:
+    """The cameras alone, with what was found, as strict JSON."""
+    names: tuple[str, ...] = ("schema", "unit", "datum", "sigma0", "dof", "cameras", "findings")
+    if isinstance(calibration, LineCalibration):
+        record, names = json.loads(lines_json(calibration)), ("schema", "cameras", "axes", "f_test", "findings")
+    else:
+        record = _record(calibration)
+    return _json(_plain({**{name: record[name] for name in names}, "report": report or None}))

@@ -1,0 +1,192 @@
+"""The files of a calibration: a folder with the report, all numbers as JSON, and tables of points, poses and residuals."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pixmetry.calibrate.bundle.network import Calibration
+from pixmetry.calibrate.files.record import PIXELS, json_text, lines_json
+from pixmetry.calibrate.lines.line_calibration import LineCalibration
+from pixmetry.camera.camera import Camera
+from pixmetry.core.plain_text import cell, comment
+from pixmetry.files.output import check_output, staged_output
+
+KIND = "calibration"
+
+
+def check_folder(folder: str | Path, of: Sequence[str | Path] = (), inputs: Iterable[Path] = ()) -> None:
+    """Refuse a folder in which something else than an earlier calibration of the same would be lost; before any work is done.
+
+    Parameters
+    ----------
+    folder : path
+    of : sequence of str or Path
+        What is calibrated: names, and files or folders.
+    inputs : iterable of Path
+        Files that must not be replaced.
+
+    Raises
+    ------
+    InputError
+        If it is a file, holds other files, an input or another calibration, or cannot be written to.
+    """
+    check_output(folder, KIND, of, inputs)
+
+
+def write_results(
+    calibration: Calibration,
+    folder: str | Path,
+    cameras: Mapping[str, Camera] | None = None,
+    of: Sequence[str | Path] = (),
+    inputs: Iterable[Path] = (),
+) -> Path:
+    """Write the folder of results, whole or not at all; an earlier calibration in it is replaced.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    folder : path
+    cameras : mapping of str to Camera, optional
+        Further files, for `pixmetry simulate`.
+    of, inputs
+        As of `check_folder`, which tells the errors.
+    """
+    from pixmetry.calibrate.page.page import write_page
+
+    with staged_output(folder, KIND, of, inputs) as place:
+        for name, text in TABLES.items():
+            (place / name).write_text(text(calibration), encoding="utf-8", newline="\n")
+        write_page(calibration, place / "report.html")
+        for name, camera in (cameras or {}).items():
+            camera.save(place / name)
+        _write_numbers(place, json_text, calibration)
+    return Path(folder)
+
+
+def write_line_results(
+    calibration: LineCalibration, folder: str | Path, of: Sequence[str | Path] = (), inputs: Iterable[Path] = ()
+) -> Path:
+    """The same for a calibration from straight lines."""
+    from pixmetry.calibrate.page.lines_page import write_page
+
+    with staged_output(folder, KIND, of, inputs) as place:
+        (place / "residuals.csv").write_text(line_residuals_csv(calibration), encoding="utf-8", newline="\n")
+        write_page(calibration, place / "report.html")
+        _write_numbers(place, lines_json, calibration)
+    return Path(folder)
+
+
+def _write_numbers(place: Path, text: Callable[..., str], calibration: Any) -> None:
+    """Write all numbers, last of all: with the digests of the other files."""
+    beside = [path.name for path in place.iterdir()]
+    (place / "calibration.json").write_text(text(calibration, place, beside), encoding="utf-8", newline="\n")
+
+
+def points_csv(calibration: Calibration) -> str:
+    """Object points with their uncertainties; a table that a project can name as its points."""
+    a = calibration.adjustment
+    c = a.point_covariance
+    used = np.bincount(a.network.point[a.used], minlength=len(a.network.points))
+    columns = {
+        "point": a.network.points,
+        **dict(zip("XYZ", a.state.xyz.T, strict=True)),
+        **{f"u_{axis}": np.sqrt(c[:, k, k]) for k, axis in enumerate("XYZ")},
+        **{f"cov_{'XYZ'[i]}{'XYZ'[j]}": c[:, i, j] for i, j in ((0, 1), (0, 2), (1, 2))},
+        "images": used,
+    }
+    return _csv([f"unit {a.network.unit}; datum: {a.datum}"], columns)
+
+
+def poses_csv(calibration: Calibration) -> str:
+    """Projection centres and rotations of the images with their uncertainties."""
+    a = calibration.adjustment
+    network, state = a.network, a.state
+    u = dict(zip(a.free_columns, np.sqrt(np.maximum(np.diag(a.covariance), 0.0)), strict=True))
+
+    def of(name: str) -> list[float]:
+        return [float(u.get(f"{image}:{name}", np.nan)) for image in network.images]
+
+    columns: dict[str, Any] = {
+        "image": network.images,
+        "camera": [network.cameras[k].name for k in network.camera_of],
+        **{f"{axis}0": state.position[:, k] for k, axis in enumerate("XYZ")},
+        **{f"r{i + 1}{j + 1}": state.rotation[:, i, j] for i in range(3) for j in range(3)},
+        **{f"u_{axis}0": of(f"{axis}0") for axis in "XYZ"},
+        **{f"u_{axis}_rad": of(axis) for axis in ("rx", "ry", "rz")},
+    }
+    if "x_scale" in network.per_image:
+        columns |= {"x_scale": state.x_scale, "u_x_scale": of("x_scale")}
+    if "x_shift" in network.per_image:
+        columns |= {"x_shift_px": state.x_shift_px, "u_x_shift_px": of("x_shift")}
+    text = "a point X is seen at R (X - X0), R by rows, z forwards, x to the right, y down; u of rotations about the camera's axes"
+    return _csv([f"unit {network.unit}; datum: {a.datum}", text], columns)
+
+
+def residuals_csv(calibration: Calibration) -> str:
+    """Image coordinates with their residuals; a table that a project can name as its observations."""
+    a = calibration.adjustment
+    network = a.network
+    columns: dict[str, Any] = {
+        "image": [network.images[k] for k in network.image],
+        "point": [network.points[k] for k in network.point],
+        "x_px": network.x_px,
+        "y_px": network.y_px,
+        "var_x_px2": network.covariance_px2[:, 0],
+        "cov_xy_px2": network.covariance_px2[:, 1],
+        "var_y_px2": network.covariance_px2[:, 2],
+        "residual_x_px": a.residual_px[:, 0],
+        "residual_y_px": a.residual_px[:, 1],
+        "used": a.used.astype(int),
+    }
+    if a.redundancy is not None:
+        columns |= {"redundancy_x": a.redundancy[:, 0], "redundancy_y": a.redundancy[:, 1]}
+    text = "residual: measured less computed; image coordinates of centres, without eccentricity; variances as they were used"
+    return _csv([PIXELS, text], columns)
+
+
+def line_residuals_csv(calibration: LineCalibration) -> str:
+    """Positions on lines with their residuals across them; a table that a project can name as its lines."""
+    result = calibration.result
+    columns: dict[str, Any] = {
+        "image": calibration.image.tolist(),
+        "line": calibration.line.tolist(),
+        "x_px": calibration.x_px,
+        "y_px": calibration.y_px,
+        "axis": [result.lines[k]["axis"] for k in result.line_of],
+        "residual_px": result.residual_px,
+        **({} if result.residual_um is None else {"residual_um": result.residual_um}),
+        "used": result.used.astype(int),
+        "redundancy": result.redundancy,
+    }
+    return _csv([PIXELS, "residual: across the line, towards +x (axis x: the line tells about x) or +y"], columns)
+
+
+# A new table of the results needs a line here.
+TABLES: dict[str, Callable[[Calibration], str]] = {
+    "points.csv": points_csv,
+    "poses.csv": poses_csv,
+    "residuals.csv": residuals_csv,
+}
+
+
+def _csv(comments: Iterable[str], columns: Mapping[str, Any]) -> str:
+    text = io.StringIO()
+    for line in comments:
+        text.write(f"# {comment(line)}\n")
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(zip(*(_texts(values) for values in columns.values()), strict=True))
+    return text.getvalue()
+
+
+def _texts(values: Any) -> list[Any]:
+    """Ten digits of a number, empty where there is none; names as cells may hold them."""
+    plain = values.tolist() if isinstance(values, np.ndarray) else values
+    return [cell(v) if isinstance(v, str) else ("" if math.isnan(v) else f"{v:.10g}") if isinstance(v, float) else v for v in plain]

@@ -1,0 +1,1 @@
+"""Image coordinates measured in the pictures of a test field, and their numbers."""

@@ -1,0 +1,280 @@
+"""From images of a calibration board, or of coded targets, to identified image coordinates with covariances."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from pixmetry.calibrate.bundle.model import CameraModel
+from pixmetry.calibrate.bundle.network import Finding, Network
+from pixmetry.calibrate.images.numbering import chessboard_reference, consistent
+from pixmetry.calibrate.images.targets import KINDS, Seen, Wanted, board_size, see
+from pixmetry.camera.camera import Camera
+from pixmetry.core.errors import InputError, MeasureError
+from pixmetry.core.threads import imap_tiles
+from pixmetry.files.formats import frame_name
+from pixmetry.files.images import PICTURE_ENDINGS, picture_files
+from pixmetry.files.raw_values import RawLayout, parse_raw
+from pixmetry.locate.job import noise_model
+from pixmetry.locate.noise import NoiseModel
+
+LEAST_IMAGES = 3
+
+
+@dataclass(frozen=True)
+class ImageObservations:
+    """Identified image coordinates of several images by one camera. Lengths are in the unit in which the board's were given.
+
+    Parameters
+    ----------
+    kind : str
+    images : tuple of str
+        Names of the images that are used.
+    sizes : tuple of (int, int)
+        Their columns and rows, px; all the same.
+    points : tuple of str
+    xyz : ndarray, shape (points, 3)
+        Nominal coordinates on the board, x along its columns, y along its rows, z = 0; NaN for coded targets.
+    image, point : ndarray of int, shape (n,)
+    x_px, y_px : ndarray, shape (n,)
+    covariance_px2 : ndarray, shape (n, 3)
+        var x, cov xy, var y, of the noise of the grey values.
+    diameter : ndarray, shape (points,), optional
+        Of circular targets: the image coordinates are those of the centres of their images.
+    normal : ndarray, shape (points, 3), optional
+        Of the circles, where they stand on a board.
+    left_out : tuple of (str, str)
+        Names of the images that are not used, and why.
+    findings : tuple of Finding
+    """
+
+    kind: str
+    images: tuple[str, ...]
+    sizes: tuple[tuple[int, int], ...]
+    points: tuple[str, ...]
+    xyz: np.ndarray
+    image: np.ndarray
+    point: np.ndarray
+    x_px: np.ndarray
+    y_px: np.ndarray
+    covariance_px2: np.ndarray
+    diameter: np.ndarray | None = None
+    normal: np.ndarray | None = None
+    left_out: tuple[tuple[str, str], ...] = ()
+    findings: tuple[Finding, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.x_px)
+
+    def network(self, camera: CameraModel, unit: str = "mm") -> Network:
+        """The network of these observations by one camera: the board's coordinates are held fixed, coded targets are free."""
+        return Network(
+            cameras=(camera,),
+            images=self.images,
+            camera_of=np.zeros(len(self.images), np.int64),
+            points=self.points,
+            x_px=self.x_px,
+            y_px=self.y_px,
+            image=self.image,
+            point=self.point,
+            covariance_px2=self.covariance_px2,
+            xyz=self.xyz,
+            u_xyz=np.where(np.isfinite(self.xyz), 0.0, np.inf),
+            diameter=self.diameter,
+            normal=self.normal,
+            unit=unit,
+            covariance_known=True,
+        )
+
+
+def observations_of(
+    images: Sequence[str | Path | np.ndarray],
+    kind: str,
+    *,
+    grid: str | tuple[int, int] | None = None,
+    pitch: float | tuple[float, float] | None = None,
+    side: float | None = None,
+    diameter: float | None = None,
+    polarity: str = "auto",
+    channel: str | None = None,
+    raw: str | RawLayout | None = None,
+    noise: NoiseModel | Camera | str | Path | None = None,
+    least_images: int = LEAST_IMAGES,
+    threads: int | None = None,
+    progress: Callable[[str, int, int], None] | None = None,
+) -> ImageObservations:
+    """Locate and identify the targets of a calibration in all of its images.
+
+    Parameters
+    ----------
+    images : sequence of path or ndarray
+        Image files (PNG, TIFF, BMP, FITS, NPY, JPEG, raw), folders of them, or frames of shape (rows, cols), in the order in which they
+        were taken. A file with several frames is as many images.
+    kind : {"chessboard", "dots", "squares", "coded"}
+        Inner corners of a chessboard; a plate of circular targets; corners of a plate of separate squares; coded targets anywhere.
+    grid : "COLSxROWS" or (cols, rows), optional
+        Of inner corners, dots or squares on the whole board. "any" numbers the dots of a single image that may show a part of the plate.
+        Not for coded targets.
+    pitch : float or (float, float), optional
+        Distance of neighbours along columns and rows, in the unit that object coordinates are wanted in. Not for coded targets.
+    side : float, optional
+        Of the separate squares, in the same unit.
+    diameter : float, optional
+        Of circular targets, in the same unit, for the correction of their eccentricity.
+    polarity : {"auto", "bright", "dark"}
+        Of dots, squares or coded discs on their ground.
+    channel : {"red", "green", "blue"}, optional
+        Of colour images.
+    raw : str or RawLayout, optional
+        Of files without a header: ``"1920x1200:Mono12p"``.
+    noise : optional
+        As in `pixmetry.locate`; by default it is measured in each image.
+    least_images : int
+        From how many usable images on there is a result.
+    threads : int, optional
+    progress : callable (what, done, of), optional
+
+    Returns
+    -------
+    ImageObservations
+        Points are named ``row/col`` from 0 (of squares: ``row/col.k``, k = 0 … 3 round the square from its corner of least row and column
+        along the row first), coded targets by their numbers.
+
+    Raises
+    ------
+    InputError
+        If a file or an option cannot be used.
+    MeasureError
+        If fewer images than ``least_images`` can be used; it says what was found in each.
+    """
+    if kind not in KINDS:
+        raise InputError("no such kind of calibration target", where="kind", value=kind, allowed=", ".join(KINDS))
+    size, step = board_size(kind, grid), _checked_lengths(kind, pitch, side, diameter)
+    if polarity not in ("auto", "bright", "dark"):
+        raise InputError("no such polarity", where="polarity", value=polarity, allowed="auto, bright, dark")
+    sides = (np.nan, np.nan) if side is None else (side / step[0], side / step[1])
+    layout = parse_raw(raw) if isinstance(raw, str) else raw
+    wanted = Wanted(kind, size, sides, polarity, channel, noise_model(noise), threads, layout)
+    items = _items(images, layout)
+    told = progress or (lambda what, done, of: None)
+    seen: list[Seen] = []
+    for one in imap_tiles(lambda item: see(*item, wanted), items, threads):
+        seen.append(one)
+        told("locating", len(seen), len(items))
+    seen = _of_one_size(seen)
+    good = [s for s in seen if not s.reason]
+    _check_enough(seen, good, wanted, least_images)
+    lost = [Finding("image_left_out", f"{s.name} was left out: {s.reason}.", level="warning") for s in seen if s.reason]
+    notes = [Finding("targets", f"{s.name}: {s.note}.") for s in good if s.note]
+    lossy = [s.name for s in good if s.lossy]
+    if lossy:
+        text = f"{len(lossy)} of {len(good)} images were stored with loss (JPEG): its blocks move edges, and the noise is the coder's."
+        notes.append(Finding("targets", text, "Store images of a test field without loss."))
+    good, numbering = _numbered(good, kind)
+    out = _gathered(good, kind)
+    names, xyz = _nominal(out.xyz, kind, step, side)
+    return replace(
+        out,
+        points=names,
+        xyz=xyz,
+        diameter=None if diameter is None or kind not in ("dots", "coded") else np.full(len(names), float(diameter)),
+        normal=np.tile([0.0, 0.0, 1.0], (len(names), 1)) if kind == "dots" else None,
+        left_out=tuple((s.name, s.reason) for s in seen if s.reason),
+        findings=(*lost, *numbering, *notes, *out.findings),
+    )
+
+
+def _checked_lengths(
+    kind: str, pitch: float | tuple[float, float] | None, side: float | None, diameter: float | None
+) -> tuple[float, float]:
+    """Pitch along columns and rows; NaN for coded targets."""
+    if diameter is not None and not (np.isfinite(diameter) and diameter > 0):
+        raise InputError("not a diameter", where="diameter", value=diameter, allowed="above 0")
+    if kind == "coded":
+        return np.nan, np.nan
+    try:
+        along, across = (float(v) for v in np.broadcast_to(np.nan if pitch is None else np.asarray(pitch, float), 2))
+    except ValueError:
+        along = across = np.nan
+    if not (0 < along < np.inf and 0 < across < np.inf):
+        raise InputError("the distance of neighbours on the board is missing", where="pitch", value=pitch, allowed="a length above 0")
+    if kind == "squares" and not (side is not None and 0 < side < min(along, across)):
+        raise InputError("the side of the squares is missing", where="side", value=side, allowed="a length between 0 and the pitch")
+    return along, across
+
+
+def _items(images: Sequence[str | Path | np.ndarray], raw: RawLayout | None) -> list[tuple[str, Path | np.ndarray]]:
+    """Names and sources of all images; a name that two files share has its folder with it."""
+    given: Sequence[str | Path | np.ndarray] = [images] if isinstance(images, (str, Path)) else images
+    items: list[tuple[str, Path | np.ndarray]] = []
+    for one in given:
+        if isinstance(one, np.ndarray):
+            items.append((f"image {len(items) + 1}", one))
+        else:
+            items += [(frame_name(path), path) for path in picture_files([one], PICTURE_ENDINGS, raw)]
+    count = Counter(name for name, _ in items)
+    return [(str(source) if count[name] > 1 else name, source) for name, source in items]
+
+
+def _of_one_size(seen: list[Seen]) -> list[Seen]:
+    """Images of another size than most can no longer be used."""
+    sizes = Counter(s.size for s in seen if not s.reason)
+    if len(sizes) < 2:
+        return seen
+    cols, rows = sizes.most_common(1)[0][0]
+    reason = f"pixels, {cols} x {rows} in the other images"
+    return [s if s.reason or s.size == (cols, rows) else Seen(s.name, s.size, reason=f"{s.size[0]} x {s.size[1]} {reason}") for s in seen]
+
+
+def _check_enough(seen: list[Seen], good: list[Seen], wanted: Wanted, least: int) -> None:
+    if len(good) < least:
+        each = "; ".join(f"{s.name}: {s.reason or f'{len(s.keys)} points'}" for s in seen)
+        what = f"{len(good)} of {len(seen)} images can be used ({each})"
+        remedy = "check kind, grid and polarity, or take more images of the whole board"
+        raise MeasureError(what, where="images", allowed=f"{least} or more", remedy=remedy)
+    if wanted.kind == "dots" and wanted.grid is None and len(good) > 1:
+        what = "parts of a plate in several images cannot be numbered alike"
+        raise InputError(what, where="grid", value="any", allowed="COLSxROWS of the whole plate; any for a single image")
+
+
+def _numbered(good: list[Seen], kind: str) -> tuple[list[Seen], tuple[Finding, ...]]:
+    """The same corner of the board is the first one in all images."""
+    if kind == "coded":
+        return good, ()
+    rows, cols = good[0].extent
+    boards, findings = consistent([s.board for s in good], chessboard_reference(rows - 1, cols - 1) if kind == "chessboard" else None)
+    return [replace(s, keys=np.column_stack([b.row, b.col])) for s, b in zip(good, boards, strict=True)], findings
+
+
+def _gathered(good: list[Seen], kind: str) -> ImageObservations:
+    """All images under each other; the keys of the points stand in the place of their coordinates."""
+    image = np.repeat(np.arange(len(good)), [len(s.keys) for s in good])
+    keys, x, y, covariance = (np.concatenate([getattr(s, name) for s in good]) for name in ("keys", "x_px", "y_px", "covariance_px2"))
+    unique, point = np.unique(keys, axis=0, return_inverse=True)
+    point, use = point.ravel(), np.ones(len(x), bool)
+    findings: tuple[Finding, ...] = ()
+    if kind == "coded" and len(good) > 1:
+        use = np.bincount(point)[point] > 1
+        once = ", ".join(str(k) for k in unique[np.unique(point[~use]), 0])
+        findings = (Finding("targets", f"Coded targets that only one image shows are left out: {once}."),) if once else ()
+        kept, point = np.unique(point[use], return_inverse=True)
+        unique = unique[kept]
+    names, sizes = tuple(s.name for s in good), tuple(s.size for s in good)
+    return ImageObservations(kind, names, sizes, (), unique, image[use], point.ravel(), x[use], y[use], covariance[use], findings=findings)
+
+
+def _nominal(keys: np.ndarray, kind: str, pitch: tuple[float, float], side: float | None) -> tuple[tuple[str, ...], np.ndarray]:
+    """Names of points and their coordinates on the board."""
+    if kind == "coded":
+        return tuple(str(k) for k in keys[:, 0]), np.full((len(keys), 3), np.nan)
+    row, col = keys.T
+    if kind != "squares":
+        return tuple(f"{r}/{c}" for r, c in keys), np.column_stack([col * pitch[0], row * pitch[1], np.zeros(len(keys))])
+    corner = np.where(row % 2 == 0, col % 2, 3 - col % 2)
+    names = tuple(f"{r // 2}/{c // 2}.{k}" for r, c, k in zip(row, col, corner, strict=True))
+    x, y = (v // 2 * step + v % 2 * (side or 0.0) for v, step in zip((col, row), pitch, strict=True))
+    return names, np.column_stack([x, y, np.zeros(len(keys))])

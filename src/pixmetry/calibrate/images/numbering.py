@@ -1,0 +1,184 @@
+"""Which point of a board is which, over all images of it: boards that look the same after a turn are told apart as far as they can be."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from pixmetry.calibrate.bundle.network import Finding
+
+CLEAR = 0.2  # of the marks, by which a turn must agree worse than the best one to be ruled out
+MARKED_AREA = 1.35  # of a dot over that of those around it, from which it is a mark
+NEAR_LIMIT = 0.6  # of the greatest rotation between neighbouring images that leaves the numbering sure
+SAME_MARKS = 0.7  # of the images, that must show the same number of marks for these to be believed
+MARK_AROUND = 9  # dots, itself among them
+
+
+@dataclass(frozen=True)
+class Marks:
+    """What tells one turn of a board from another: values at cells of a grid of ``rows`` × ``cols``; arrays of shape (m,)."""
+
+    row: np.ndarray
+    col: np.ndarray
+    value: np.ndarray
+    rows: int
+    cols: int
+
+
+@dataclass(frozen=True)
+class Board:
+    """A board in one image: places with a row and a column, arrays of shape (n,), and the marks on it."""
+
+    row: np.ndarray
+    col: np.ndarray
+    x_px: np.ndarray
+    y_px: np.ndarray
+    rows: int
+    cols: int
+    marks: Marks | None = field(default=None)
+
+
+def turned_cells(row: np.ndarray, col: np.ndarray, rows: int, cols: int, quarters: int) -> tuple[np.ndarray, np.ndarray]:
+    """Row and column of the same places when a grid of ``rows`` × ``cols`` is counted from another corner, ``quarters`` of a turn on."""
+    turns = ((row, col), (col, rows - 1 - row), (rows - 1 - row, cols - 1 - col), (cols - 1 - col, row))
+    return turns[quarters % 4]
+
+
+def turned(board: Board, quarters: int) -> Board:
+    """The board numbered from another corner."""
+    row, col = turned_cells(board.row, board.col, board.rows, board.cols, quarters)
+    marks = board.marks
+    if marks is not None:
+        at = turned_cells(marks.row, marks.col, marks.rows, marks.cols, quarters)
+        marks = replace(marks, row=at[0], col=at[1])
+    return replace(board, row=row, col=col, marks=marks)
+
+
+def column_angle_deg(board: Board) -> float:
+    """Direction in the image, from x towards y, in which the columns of a board are counted."""
+    design = np.column_stack([board.col, board.row, np.ones(len(board.row))])
+    step = np.linalg.lstsq(design, np.column_stack([board.x_px, board.y_px]), rcond=None)[0][0]
+    return float(np.degrees(np.arctan2(step[1], step[0])))
+
+
+def chessboard_marks(frame: np.ndarray, board: Board) -> Marks:
+    """Colours of the squares between the inner corners: 1 dark, −1 bright, by the sign of the difference from the squares beside."""
+    place = np.full((board.rows, board.cols, 2), np.nan)
+    place[board.row, board.col] = np.column_stack([board.x_px, board.y_px])
+    middle = 0.25 * (place[:-1, :-1] + place[1:, :-1] + place[:-1, 1:] + place[1:, 1:])
+    row, col = np.nonzero(np.isfinite(middle).all(axis=2))
+    x, y = np.rint(middle[row, col]).astype(int).T
+    grey = np.full(middle.shape[:2], np.nan)
+    grey[row, col] = frame[np.clip(y, 0, frame.shape[0] - 1), np.clip(x, 0, frame.shape[1] - 1)]
+    beside = np.pad(grey, 1, constant_values=np.nan)
+    around = np.stack([beside[:-2, 1:-1], beside[2:, 1:-1], beside[1:-1, :-2], beside[1:-1, 2:]])
+    count = np.isfinite(around).sum(axis=0)
+    mean = np.where(count > 0, np.nansum(around, axis=0) / np.maximum(count, 1), np.nan)
+    value = np.nan_to_num(np.sign(mean - grey))
+    return Marks(row, col, value[row, col], board.rows - 1, board.cols - 1)
+
+
+def chessboard_reference(rows: int, cols: int) -> np.ndarray:
+    """Colours of those squares on a board whose first one is dark."""
+    return np.where(np.add.outer(np.arange(rows), np.arange(cols)) % 2 == 0, 1.0, -1.0)
+
+
+def dot_marks(board: Board, area_px: np.ndarray) -> Marks:
+    """Dots that are larger (1) or smaller (−1) than those around them."""
+    from scipy.spatial import cKDTree
+
+    cells = np.column_stack([board.row, board.col]).astype(float)
+    near = cKDTree(cells).query(cells, k=min(MARK_AROUND, len(cells)))[1]
+    ratio = area_px / np.median(area_px[near], axis=1)
+    value = (ratio > MARKED_AREA).astype(float) - (ratio < 1 / MARKED_AREA)
+    return Marks(board.row, board.col, value, board.rows, board.cols)
+
+
+def consistent(boards: Sequence[Board], reference: np.ndarray | None = None) -> tuple[list[Board], tuple[Finding, ...]]:
+    """Number a board in all of its images from the same corner.
+
+    Parameters
+    ----------
+    boards : sequence of Board
+        Of one pattern, in the order in which the images were taken; columns turn to rows as x does to y.
+    reference : ndarray, shape (rows, cols) of the marks, optional
+        What the marks of an image are to agree with; by default those of the images before, if most images show equally many.
+
+    Returns
+    -------
+    boards : list of Board
+    findings : tuple of Finding
+        What the numbering rests on where marks do not settle it.
+
+    Notes
+    -----
+    A board of as many rows as columns can be counted from four corners, any other one from two. Turns with which the marks agree worse
+    are ruled out; of the rest the one is taken that rotates the board least against the image before, or, in the first image, against
+    upright.
+    """
+    known = None if reference is None else np.asarray(reference, float)
+    if reference is None:
+        boards = _with_trusted_marks(boards)
+    out: list[Board] = []
+    open_turns, widest, previous = 1, 0.0, 0.0
+    for board in boards:
+        turns = (0, 1, 2, 3) if board.rows == board.cols else (0, 2)
+        choices = [turned(board, k) for k in _agreeing(board, turns, known)]
+        off = [abs(_wrapped(column_angle_deg(b) - previous)) for b in choices]
+        best = choices[int(np.argmin(off))]
+        if out and len(choices) > 1:
+            open_turns = max(open_turns, len(choices))
+            widest = max(widest, min(off) * len(choices))
+        previous = column_angle_deg(best)
+        if reference is None and best.marks is not None:
+            known = _laid_down(best.marks) + (0.0 if known is None else known)
+        out.append(best)
+    return out, _findings(open_turns, widest, len(out))
+
+
+def _with_trusted_marks(boards: Sequence[Board]) -> list[Board]:
+    """The boards, with marks only where they are as many as in most images: dirt and shadows make marks too, but not always the same."""
+    counts = [0 if b.marks is None else int(np.count_nonzero(b.marks.value)) for b in boards]
+    usual = max(set(counts), key=counts.count, default=0)
+    trusted = usual > 0 and counts.count(usual) >= SAME_MARKS * len(boards)
+    return [b if trusted and count == usual else replace(b, marks=None) for b, count in zip(boards, counts, strict=True)]
+
+
+def _agreeing(board: Board, turns: tuple[int, ...], reference: np.ndarray | None) -> tuple[int, ...]:
+    """Turns that the marks do not rule out."""
+    if board.marks is None or reference is None:
+        return turns
+    scores = [float((_laid_down(turned(board, k).marks) * np.sign(reference)).sum()) for k in turns]
+    marked = min(float(np.abs(board.marks.value).sum()), float(np.abs(np.sign(reference)).sum()))
+    return tuple(k for k, score in zip(turns, scores, strict=True) if score >= max(scores) - CLEAR * marked)
+
+
+def _laid_down(marks: Marks | None) -> np.ndarray:
+    assert marks is not None
+    grid = np.zeros((max(marks.rows, marks.row.max(initial=0) + 1), max(marks.cols, marks.col.max(initial=0) + 1)))
+    grid[marks.row, marks.col] = marks.value
+    return grid
+
+
+def _wrapped(angle_deg: float) -> float:
+    return (angle_deg + 180) % 360 - 180
+
+
+def _findings(open_turns: int, widest: float, images: int) -> tuple[Finding, ...]:
+    if open_turns == 1 or images < 2:
+        return ()
+    limit = 360 / open_turns / 2
+    greatest = widest / open_turns
+    what = {2: "half a turn", 4: "a quarter of a turn"}.get(open_turns, "a turn")
+    text = (
+        f"The board looks the same after {what}; its points were numbered by the smallest rotation from each image to the next, "
+        f"{greatest:.0f}° at most where {limit:.0f}° would be undecided."
+    )
+    unsure = greatest > NEAR_LIMIT * limit
+    advice = (
+        "Check the numbering in images that were taken with the camera rolled, or use a board with a mark; "
+        "with the board's coordinates held fixed a wrong turn does no harm."
+    )
+    return (Finding("numbering", text, advice, "warning" if unsure else "note"),)

@@ -1,0 +1,216 @@
+"""The targets of a calibration in one image: located, identified as far as one image tells, or a reason why not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from pixmetry.calibrate.images.numbering import Board, Marks, chessboard_marks, dot_marks
+from pixmetry.core.errors import InputError
+from pixmetry.files.formats import Decoded
+from pixmetry.files.images import load_picture
+from pixmetry.files.raw_values import RawLayout
+from pixmetry.locate.detect.targets import Flag, Positions
+from pixmetry.locate.job import checked_frame, locate, scale_ends
+from pixmetry.locate.noise import NoiseModel
+from pixmetry.locate.records import Located
+
+KINDS = ("chessboard", "dots", "squares", "coded")
+LEAST_SHARE = 0.5  # of a board's points, that an image must show to be used
+LEAST_CODES = 4  # targets in an image
+UNUSABLE = Flag.NOT_CONVERGED | Flag.BORDER
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What is looked for in all images.
+
+    Parameters
+    ----------
+    kind : {"chessboard", "dots", "squares", "coded"}
+    grid : (int, int) or None
+        Columns and rows of the whole board; None: not known, or there is none.
+    side : (float, float)
+        Of the squares of a plate, in units of the pitch along columns and along rows.
+    polarity, channel, noise, threads
+        As in `pixmetry.locate`.
+    raw : RawLayout, optional
+        Of files without a header.
+    """
+
+    kind: str
+    grid: tuple[int, int] | None = None
+    side: tuple[float, float] = (np.nan, np.nan)
+    polarity: str = "auto"
+    channel: str | None = None
+    noise: NoiseModel | None = None
+    threads: int | None = None
+    raw: RawLayout | None = None
+
+    @property
+    def whole(self) -> int:
+        """Points of the whole board; 0 where it has no size."""
+        return 0 if self.grid is None else self.grid[0] * self.grid[1] * (4 if self.kind == "squares" else 1)
+
+
+@dataclass(frozen=True)
+class Seen:
+    """The points of one image, or why it cannot be used.
+
+    Parameters
+    ----------
+    name : str
+    size : (int, int)
+        Columns and rows, px.
+    keys : ndarray of int, shape (n, 2) or (n, 1)
+        Row and column on the board (of the corners of separate squares: two a square), or the code.
+    x_px, y_px : ndarray, shape (n,)
+    covariance_px2 : ndarray, shape (n, 3)
+        var x, cov xy, var y.
+    extent : (int, int)
+        Rows and columns of the keys.
+    marks : Marks, optional
+    reason : str
+        Why the image cannot be used; empty if it can.
+    note : str
+        What else is to be said about it.
+    lossy : bool
+        Whether its file was stored with loss.
+    """
+
+    name: str
+    size: tuple[int, int]
+    keys: np.ndarray = field(default_factory=lambda: np.zeros((0, 2), np.int64))
+    x_px: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    y_px: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    covariance_px2: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+    extent: tuple[int, int] = (0, 0)
+    marks: Marks | None = None
+    reason: str = ""
+    note: str = ""
+    lossy: bool = False
+
+    @property
+    def board(self) -> Board:
+        """The points as a board."""
+        return Board(self.keys[:, 0], self.keys[:, 1], self.x_px, self.y_px, *self.extent, self.marks)
+
+
+def see(name: str, source: Path | np.ndarray, wanted: Wanted) -> Seen:
+    """Read one image and find in it what is wanted.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read.
+    """
+    picture = Decoded(source, None) if isinstance(source, np.ndarray) else load_picture(source, wanted.channel, wanted.raw)
+    frame = checked_frame(picture.array, name)
+    seen = replace(_FINDERS[wanted.kind](name, frame, wanted), lossy=picture.lossless is False)
+    missing = wanted.whole - len(seen.keys)
+    if seen.reason or wanted.grid is None or missing <= 0:
+        return seen
+    if len(seen.keys) < LEAST_SHARE * wanted.whole:
+        return _nothing(name, frame, f"only {len(seen.keys)} of {wanted.whole} points were found")
+    return replace(seen, note=f"{missing} of {wanted.whole} points were not found or could not be placed")
+
+
+def _nothing(name: str, frame: np.ndarray, reason: str) -> Seen:
+    return Seen(name, (frame.shape[1], frame.shape[0]), reason=reason)
+
+
+def _usable(found: Located | Positions) -> np.ndarray:
+    return np.isfinite(found.x_px) & np.isfinite(found.var_x_px2) & (found.flags & UNUSABLE == 0)
+
+
+def _seen(name: str, frame: np.ndarray, found: Located | Positions, keys: np.ndarray, use: np.ndarray, extent: tuple[int, int]) -> Seen:
+    covariance = np.column_stack([found.var_x_px2, found.cov_xy_px2, found.var_y_px2])
+    return Seen(name, (frame.shape[1], frame.shape[0]), keys[use], found.x_px[use], found.y_px[use], covariance[use], extent)
+
+
+def _located(name: str, frame: np.ndarray, kind: str, wanted: Wanted, grid: str | tuple[int, int] | None = None) -> Located:
+    polarity = "auto" if kind == "chessboard" else wanted.polarity
+    return locate(frame, kind=kind, grid=grid, polarity=polarity, noise=wanted.noise, threads=wanted.threads, name=name)
+
+
+def _chessboard(name: str, frame: np.ndarray, wanted: Wanted) -> Seen:
+    assert wanted.grid is not None
+    cols, rows = wanted.grid
+    found = _located(name, frame, "chessboard", wanted, wanted.grid)
+    use = _usable(found)
+    if use.sum() < 3:
+        return _nothing(name, frame, "its corners could not be placed" if len(found) else found.images[0]["reason"])
+    row, col = found["grid_row"], found["grid_col"]
+    design = np.column_stack([col, row, np.ones(len(row))])[use]
+    steps = np.linalg.lstsq(design, np.column_stack([found.x_px, found.y_px])[use], rcond=None)[0]
+    if steps[0, 0] * steps[1, 1] - steps[0, 1] * steps[1, 0] < 0:  # columns and rows were counted as in a mirror
+        col = cols - 1 - col
+    seen = _seen(name, frame, found, np.column_stack([row, col]), use, (rows, cols))
+    return replace(seen, marks=chessboard_marks(frame, seen.board))
+
+
+def _dots(name: str, frame: np.ndarray, wanted: Wanted) -> Seen:
+    found = _located(name, frame, "disc", wanted, "any" if wanted.grid is None else wanted.grid)
+    keys = np.column_stack([found["grid_row"], found["grid_col"]])
+    placed = keys[:, 0] >= 0
+    rows, cols = (keys[placed].max(axis=0) + 1).tolist() if placed.any() else (0, 0)
+    if placed.sum() < 4 or wanted.grid not in (None, (cols, rows)):
+        return _nothing(name, frame, f"{len(found)} dots were seen: {found.images[0]['grid']}")
+    use = placed & _usable(found)
+    seen = _seen(name, frame, found, keys, use, (rows, cols))
+    tilted = "semi_major_px" in found.columns
+    area = (found["semi_major_px"] * found["semi_minor_px"] if tilted else found["radius_px"] ** 2)[use]
+    return replace(seen, marks=dot_marks(seen.board, area))
+
+
+def _squares(name: str, frame: np.ndarray, wanted: Wanted) -> Seen:
+    from pixmetry.locate.detect.squares import plate_corners
+
+    assert wanted.grid is not None
+    low, high = scale_ends(frame, None, wanted.noise)
+    grid, found = plate_corners(
+        frame, wanted.grid, wanted.side, wanted.noise, polarity=wanted.polarity, low_dn=low, high_dn=high, threads=wanted.threads
+    )
+    if not len(found):
+        return _nothing(name, frame, grid.message)
+    return _seen(name, frame, found, np.column_stack([grid.row, grid.col]), _usable(found), (grid.rows, grid.cols))
+
+
+def _coded(name: str, frame: np.ndarray, wanted: Wanted) -> Seen:
+    found = _located(name, frame, "coded", wanted)
+    numbers, counts = np.unique(found["code"][found["code"] >= 0], return_counts=True)
+    use = _usable(found) & np.isin(found["code"], numbers[counts == 1])
+    if use.sum() < LEAST_CODES:
+        return _nothing(name, frame, f"{int(use.sum())} coded targets were read, {LEAST_CODES} are needed")
+    twice = ", ".join(str(n) for n in numbers[counts > 1])
+    seen = _seen(name, frame, found, found["code"][:, None].astype(np.int64), use, (0, 0))
+    return replace(seen, note=f"codes seen more than once are not used: {twice}" if twice else "")
+
+
+_FINDERS = {"chessboard": _chessboard, "dots": _dots, "squares": _squares, "coded": _coded}
+
+
+def board_size(kind: str, grid: str | tuple[int, int] | None) -> tuple[int, int] | None:
+    """Columns and rows of a board as the user gave them; None for "any" number of dots.
+
+    Raises
+    ------
+    InputError
+        If it is not the size of a board, or the kind has none.
+    """
+    if kind == "coded":
+        if grid is not None:
+            raise InputError("coded targets stand in no grid", where="grid", value=grid, allowed="nothing")
+        return None
+    if grid == "any" and kind == "dots":
+        return None
+    try:
+        cols, rows = (int(v) for v in (grid.lower().split("x") if isinstance(grid, str) else grid or ()))
+    except (TypeError, ValueError):
+        cols = rows = 0
+    if min(cols, rows) < 3:
+        allowed = "COLSxROWS, such as 9x6, both at least 3" + ("; or any, for a single image" if kind == "dots" else "")
+        raise InputError("not the size of a board", where="grid", value=grid, allowed=allowed)
+    return cols, rows

@@ -1,0 +1,1 @@
+"""Calibrating with straight lines, and line jitter from them."""

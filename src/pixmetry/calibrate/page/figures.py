@@ -1,0 +1,253 @@
+"""Residual vectors of one calibrated camera over its sensor, and what the figures of a calibration share."""
+
+from __future__ import annotations
+
+import base64
+import io
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pixmetry.report.drawing import BLUE, INK, SOFT, WIDTH_IN, Picture, canvas, picture
+from pixmetry.report.numbers import significant
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from pixmetry.calibrate.bundle.model import Sensor
+    from pixmetry.calibrate.bundle.network import Adjustment
+
+MOST_VECTORS = 3000  # in a figure, from which on they are stored as pixels
+SHEET_COLS, SHEET_ROWS = 3, 4  # images on a sheet of small ones
+MOST_IN_SMALL = MOST_VECTORS // (SHEET_COLS * SHEET_ROWS)  # vectors in one small image
+LEAST_IN_CELL = 4
+LONG_PATH = 10_000  # characters
+KEY_IN = 0.12  # of the middle of the key above the axes
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """Residuals of one camera that took part: measured less computed, px."""
+
+    x: np.ndarray
+    y: np.ndarray
+    dx: np.ndarray
+    dy: np.ndarray
+    image: np.ndarray
+    sensor: Sensor
+
+    @classmethod
+    def of(cls, adjustment: Adjustment, camera: int) -> Residuals:
+        """Those of a camera; what was rejected or could not be computed is left out."""
+        net, v = adjustment.network, adjustment.residual_px
+        mine = adjustment.used & (net.camera_of[net.image] == camera) & np.isfinite(v).all(axis=1)
+        return cls(net.x_px[mine], net.y_px[mine], v[mine, 0], v[mine, 1], net.image[mine], net.cameras[camera].sensor)
+
+    def __len__(self) -> int:
+        return len(self.x)
+
+
+def finished(figure: Figure, name: str, alt: str, caption: str) -> Picture:
+    """Turn a figure into markup, with few colours where it is stored as pixels, and long paths to a tenth of a point."""
+    made = picture(figure, name, alt, caption)
+    svg = re.sub(r"data:image/png;base64,([^\"]+)", lambda m: _few_colours(m[1]), made.svg)
+    svg = re.sub(rf' d="[^"]{{{LONG_PATH},}}"', lambda m: re.sub(r"(\d\.\d)\d+", r"\1", m[0]), svg)
+    return replace(made, svg=svg)
+
+
+def _few_colours(encoded: str) -> str:
+    from PIL import Image
+
+    image: Image.Image = Image.open(io.BytesIO(base64.b64decode(encoded)))
+    if image.mode == "RGBA":
+        image = image.quantize(48, method=Image.Quantize.FASTOCTREE)
+    out = io.BytesIO()
+    image.save(out, format="PNG", optimize=True)
+    return "data:image/png;base64," + base64.b64encode(out.getvalue()).decode()
+
+
+def round_number(value: float) -> float:
+    """The largest of 1, 2, 5 times a power of ten that is not above a positive value."""
+    power = 10.0 ** np.floor(np.log10(value))
+    return float(power * max(k for k in (1, 2, 5) if k * power <= value * (1 + 1e-9)))
+
+
+def enlargement(dx: np.ndarray, dy: np.ndarray, extent: float, share: float = 0.06) -> tuple[float, float]:
+    """Factor that draws long vectors (their 95th percentile) as a share of an extent, as a round number, and a round length for the key."""
+    length = np.hypot(dx, dy)
+    length = length[np.isfinite(length)]
+    long = float(np.percentile(length, 95)) if len(length) else 0.0
+    if long <= 0:
+        return 1.0, 1.0
+    return round_number(share * extent / long), round_number(1.5 * long)
+
+
+def even_choice(items: np.ndarray, most: int) -> np.ndarray:
+    """At most so many items, every k-th of them."""
+    return items[:: max(1, -(-len(items) // most))]
+
+
+def chain(*parts: np.ndarray) -> np.ndarray:
+    """Many short polylines as one line with gaps: the k-th goes through the k-th element of each part."""
+    return np.column_stack([*parts, np.full(len(parts[0]), np.nan)]).ravel()
+
+
+def arrows(x: np.ndarray, y: np.ndarray, dx: np.ndarray, dy: np.ndarray, factor: float) -> tuple[np.ndarray, np.ndarray]:
+    """Lines from each place along its enlarged vector, with a head."""
+    ax, ay = factor * dx, factor * dy
+    tip_x, tip_y = x + ax, y + ay
+    left = (tip_x - 0.24 * ax + 0.13 * ay, tip_y - 0.24 * ay - 0.13 * ax)
+    right = (tip_x - 0.24 * ax - 0.13 * ay, tip_y - 0.24 * ay + 0.13 * ax)
+    return chain(x, tip_x, left[0], tip_x, right[0]), chain(y, tip_y, left[1], tip_y, right[1])
+
+
+def frame_height(sensor: Sensor, beside_in: float = 0.55) -> float:
+    """Height of a figure that shows the whole sensor, inches; ``beside_in`` of its width are for labels and colour bar."""
+    return 0.75 + (WIDTH_IN - beside_in) * float(np.clip(sensor.rows / sensor.cols, 0.25, 1.6))
+
+
+def frame(axes: Axes, sensor: Sensor) -> None:
+    """Axes over the sensor: x to the right, y down, with room for a key above."""
+    edge_x, edge_y = [-0.5, sensor.cols - 0.5], [-0.5, sensor.rows - 0.5]
+    axes.plot([*edge_x, *edge_x[::-1], edge_x[0]], np.repeat(edge_y, 2).tolist() + edge_y[:1], color=SOFT, linewidth=0.6)
+    axes.set_xlim(-0.02 * sensor.cols, 1.02 * sensor.cols)
+    axes.set_ylim(1.02 * sensor.rows, -0.02 * sensor.rows)
+    axes.set_aspect("equal")
+    axes.grid(False)
+    axes.set_xlabel("x / px")
+    axes.set_ylabel("y / px")
+
+
+def colour_bar(figure: Figure, axes: Axes, image: Any, label: str) -> Axes:
+    """A colour bar as high as the axes beside it, whatever their aspect; the layout sees it only in part and needs wider margins."""
+    engine: Any = figure.get_layout_engine()
+    engine.set(w_pad=0.11)
+    bar = figure.colorbar(image, cax=axes.inset_axes((1.03, 0.0, 0.045, 1.0)))
+    bar.ax.grid(False)
+    bar.set_label(label)
+    bar.outline.set_linewidth(0.4)
+    return bar.ax
+
+
+def length_key(axes: Axes, factor: float, key: float, unit: str = "px") -> None:
+    """An arrow of a round length above the axes, enlarged as the vectors are."""
+    from matplotlib.transforms import ScaledTranslation
+
+    figure: Any = axes.figure
+    low, high = axes.get_xlim()
+    share = factor * key / abs(high - low)
+    above = axes.transAxes + ScaledTranslation(0, KEY_IN, figure.dpi_scale_trans)
+    head = 1 + 0.13 * share * abs((high - low) / np.diff(axes.get_ylim())[0]) * np.array([1, -1])  # x and y have one scale
+    tip = 0.76 * share
+    axes.plot([0, share, tip, share, tip], [1, 1, head[0], 1, head[1]], color=INK, linewidth=0.9, transform=above, clip_on=False)
+    text = f"{significant(key, 1)} {unit}, drawn {significant(factor, 1)} times as long"
+    axes.text(share + 0.02, 1, text, transform=above, va="center", fontsize=7)
+
+
+def draw_vectors(axes: Axes, x: np.ndarray, y: np.ndarray, dx: np.ndarray, dy: np.ndarray, sensor: Sensor) -> float:
+    """Vectors over the sensor with their key; returns the factor by which they are drawn enlarged."""
+    factor, key = enlargement(dx, dy, sensor.cols)
+    frame(axes, sensor)
+    width = float(np.clip(25 / np.sqrt(max(len(x), 1)), 0.4, 0.9))
+    axes.plot(*arrows(x, y, dx, dy, factor), color=BLUE, linewidth=width, rasterized=len(x) > MOST_VECTORS)
+    length_key(axes, factor, key)
+    return factor
+
+
+def residual_vectors(r: Residuals, name: str) -> Picture:
+    """The residual vectors of all images of a camera over its sensor; of very many an even choice, which leaves them apart."""
+    shown = even_choice(np.arange(len(r)), MOST_VECTORS)
+    with canvas(frame_height(r.sensor)) as (figure, axes):
+        factor = draw_vectors(axes, r.x[shown], r.y[shown], r.dx[shown], r.dy[shown], r.sensor)
+        images = len(np.unique(r.image))
+        drawn = "" if len(shown) == len(r) else f" {len(shown)} of them are drawn."
+        caption = (
+            f"Residual vectors of all {images} images, {len(r)} points: measured less computed, {significant(factor, 1)} times enlarged."
+            f"{drawn} Noise points anywhere; arrows that agree with their neighbours are a pattern."
+        )
+        return finished(figure, f"{name}-vectors", f"Residual vectors of {len(r)} points over the sensor", caption)
+
+
+def cell_means(r: Residuals, per_cell: float = 12.0) -> dict[str, np.ndarray]:
+    """Mean residual in square cells with about so many points: their places, means, and points in each."""
+    cell = np.sqrt(per_cell * r.sensor.cols * r.sensor.rows / max(len(r), 1))
+    cell = float(np.clip(cell, r.sensor.cols / 24, r.sensor.cols / 3))
+    col, row = ((v + 0.5) // cell for v in (r.x, r.y))
+    _, index, n = np.unique(col + 1000 * row, return_inverse=True, return_counts=True)
+    means = {key: np.bincount(index, v) / n for key, v in (("x", r.x), ("y", r.y), ("dx", r.dx), ("dy", r.dy))}
+    kept = n >= LEAST_IN_CELL
+    return {key: v[kept] for key, v in means.items()} | {"n": n[kept], "cell_px": np.array(cell)}
+
+
+def mean_vectors(r: Residuals, name: str) -> Picture | None:
+    """What of the residuals is common to all images at one place of the sensor."""
+    means = cell_means(r)
+    if len(means["n"]) < 6:
+        return None
+    found = float(np.sqrt(np.mean(means["dx"] ** 2 + means["dy"] ** 2)))
+    noise = float(np.sqrt(np.mean((np.mean(r.dx**2) + np.mean(r.dy**2)) / means["n"])))
+    with canvas(frame_height(r.sensor)) as (figure, axes):
+        factor = draw_vectors(axes, means["x"], means["y"], means["dx"], means["dy"], r.sensor)
+        caption = (
+            f"Mean residual in cells of {significant(float(means['cell_px']), 2)} px, {significant(factor, 1)} times enlarged. Their rms "
+            f"length is {significant(found, 2)} px; residuals without a pattern would give {significant(noise, 2)} px."
+        )
+        alt = f"Mean residual vectors in {len(means['n'])} cells of the sensor, {significant(found, 2)} px rms"
+        return finished(figure, f"{name}-means", alt, caption)
+
+
+def grid_vectors(grid: Mapping[str, Any], sensor: Sensor, name: str) -> Picture | None:
+    """The correction grid: what the parameters leave over, at its nodes."""
+    x, y = np.meshgrid(np.asarray(grid["x_px"], float), np.asarray(grid["y_px"], float))
+    dx, dy = (np.asarray(grid[key], float) for key in ("dx_px", "dy_px"))
+    good = np.isfinite(dx + dy)
+    if not good.any():
+        return None
+    with canvas(frame_height(sensor)) as (figure, axes):
+        factor = draw_vectors(axes, x[good], y[good], dx[good], dy[good], sensor)
+        caption = f"Correction grid of {x.shape[1]} × {x.shape[0]} nodes, {significant(factor, 1)} times enlarged."
+        if grid.get("u_px") is not None:
+            caption += f" A node is known to {significant(float(np.nanmedian(np.asarray(grid['u_px'], float))), 2)} px (median u)."
+        if grid.get("rms_with_px") is not None:
+            before, after = (significant(float(grid[key]), 3) for key in ("rms_without_px", "rms_with_px"))
+            caption += f" In images left out, it takes the residuals from {before} px to {after} px rms."
+        return finished(figure, f"{name}-grid", f"Correction vectors at {int(good.sum())} nodes of a grid over the sensor", caption)
+
+
+def image_order(r: Residuals) -> np.ndarray:
+    """Images of a camera by the rms of their residuals, worst first."""
+    images, index, n = np.unique(r.image, return_inverse=True, return_counts=True)
+    return images[np.argsort(-np.bincount(index, r.dx**2 + r.dy**2) / n, kind="stable")]
+
+
+def residual_sheet(r: Residuals, images: Sequence[int], titles: Sequence[str], scale: tuple[float, float], name: str) -> Picture:
+    """Residual vectors image by image, small, all at the same enlargement ``scale[0]``; ``scale[1]`` is the length of the key, px."""
+    factor, key = scale
+    step_x, step_y, title = 1.08 * r.sensor.cols, r.sensor.rows + 0.19 * r.sensor.cols, 0.16 * r.sensor.cols
+    rows = -(-len(images) // SHEET_COLS)
+    across, down = SHEET_COLS * step_x - 0.05 * r.sensor.cols, rows * step_y
+    with canvas(0.3 + (WIDTH_IN - 0.06) * down / across) as (figure, axes):
+        axes.set_axis_off()
+        axes.set_aspect("equal")
+        axes.set_xlim(-0.01 * r.sensor.cols, across - 0.01 * r.sensor.cols)
+        axes.set_ylim(down - title, -title)
+        lines: list[tuple[np.ndarray, np.ndarray]] = []
+        edges: list[tuple[float, float]] = []
+        for k, image in enumerate(images):
+            left, top = k % SHEET_COLS * step_x, k // SHEET_COLS * step_y
+            mine = even_choice(np.flatnonzero(r.image == image), MOST_IN_SMALL)
+            x, y = r.x[mine] + left, r.y[mine] + top
+            lines.append((chain(x, x + factor * r.dx[mine]), chain(y, y + factor * r.dy[mine])))
+            edges.append((left, top))
+            axes.text(left, top - 0.03 * r.sensor.cols, titles[k], fontsize=6.2, va="bottom")
+        at = np.array(edges) - 0.5
+        corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1], [0, 0]]) * [r.sensor.cols, r.sensor.rows]
+        axes.plot(chain(*(at[:, 0] + c[0] for c in corners)), chain(*(at[:, 1] + c[1] for c in corners)), color=SOFT, linewidth=0.5)
+        x, y = (np.concatenate(part) for part in zip(*lines, strict=True))
+        axes.plot(x, y, color=BLUE, linewidth=0.6)
+        length_key(axes, factor, key)
+        return finished(figure, name, f"Residual vectors of {len(images)} images", "")

@@ -1,0 +1,215 @@
+"""Figures of one calibrated camera: what its residuals hang on, distortion curves, correlations, projection uncertainty."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pixmetry.calibrate.page.figures import LEAST_IN_CELL, MOST_VECTORS, Residuals, colour_bar, even_choice, finished, frame_height
+from pixmetry.report.drawing import BLUE, INK, RED, SOFT, WIDTH_IN, Picture, canvas, plain_log
+from pixmetry.report.numbers import MINUS, significant, uncertain
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from pixmetry.calibrate.bundle.model import Sensor
+
+COVER_95 = 1.96
+WIDE_RANGE = 6.0  # of a map, from which its colours are logarithmic
+MOST_DOTS = 20_000  # in a scatter of residuals
+DARK_TEXT, LIGHT_TEXT = "#101010", "#fefefe"  # on coloured cells, which do not change with the page's theme
+
+
+@dataclass(frozen=True)
+class Bins:
+    """Mean and its standard uncertainty in each bin."""
+
+    at: np.ndarray
+    mean: np.ndarray
+    u: np.ndarray
+
+
+def bin_means(at: np.ndarray, value: np.ndarray, edges: np.ndarray) -> Bins:
+    """Means between edges, where there are at least `LEAST_IN_CELL` values."""
+    index = np.clip(np.searchsorted(edges, at, side="right") - 1, 0, len(edges) - 2)
+    n = np.bincount(index, minlength=len(edges) - 1)
+    kept = n >= LEAST_IN_CELL
+    n = np.maximum(n, 1)
+    mean, place = (np.bincount(index, v, len(edges) - 1) / n for v in (value, at))
+    scatter = np.sqrt(np.bincount(index, (value - mean[index]) ** 2, len(edges) - 1) / np.maximum(n - 1, 1) / n)
+    return Bins(place[kept], mean[kept], scatter[kept])
+
+
+def _scatter(axes: Axes, at: np.ndarray, value: np.ndarray) -> None:
+    """Dots, of very many an even choice, with the ordinate so that single far ones do not press the others together."""
+    many, shown = len(at) > MOST_VECTORS, even_choice(np.arange(len(at)), MOST_DOTS)
+    axes.plot(at[shown], value[shown], ".", color=SOFT, markersize=1.2 if many else 1.8, alpha=0.5, markeredgewidth=0, rasterized=many)
+    span = float(np.percentile(np.abs(value), 99)) if len(value) else 1.0
+    axes.set_ylim(-1.35 * max(span, 1e-9), 1.35 * max(span, 1e-9))
+
+
+def _bars(axes: Axes, bins: Bins, colour: str, marker: str, label: str) -> None:
+    style: dict[str, Any] = {"color": colour, "marker": marker, "elinewidth": 0.8, "linewidth": 0.9}
+    axes.errorbar(bins.at, bins.mean, yerr=2 * bins.u, label=label, zorder=3, **style)
+
+
+def against_radius(r: Residuals, centre: tuple[float, float], name: str) -> Picture:
+    """Radial and tangential part of the residuals against the distance from the principal point."""
+    x, y = r.x - centre[0], r.y - centre[1]
+    radius = np.maximum(np.hypot(x, y), 1e-9)
+    radial, tangential = (r.dx * x + r.dy * y) / radius, (r.dy * x - r.dx * y) / radius
+    edges = np.unique(np.quantile(radius, np.linspace(0, 1, int(np.clip(len(r) // 30, 3, 12)) + 1)))
+    with canvas(2.4) as (figure, axes):
+        _scatter(axes, radius, radial)
+        axes.axhline(0, color=SOFT, linewidth=0.6)
+        _bars(axes, bin_means(radius, radial, edges), BLUE, "o", "radial, mean ± 2 u")
+        _bars(axes, bin_means(radius, tangential, edges), RED, "s", "tangential, mean ± 2 u")
+        axes.set_xlabel("distance from the principal point / px")
+        axes.set_ylabel("residual / px")
+        figure.legend(loc="outside upper center", ncols=2)
+        caption = "Residuals against the radius: dots are radial parts. A mean that swings with the radius asks for another lens term."
+        return finished(figure, f"{name}-radius", "Radial and tangential residuals against the radius", caption)
+
+
+def against_phase(r: Residuals, name: str) -> Picture:
+    """Residuals of x and of y against the sub-pixel phase of that coordinate."""
+    edges = np.linspace(-0.5, 0.5, 11)
+    with canvas(2.4, ncols=2, sharey=True) as (figure, both):
+        for axes, axis, at, value in zip(both, "xy", (r.x, r.y), (r.dx, r.dy), strict=True):
+            phase = (at - value + 0.5) % 1.0 - 0.5  # of the computed place: the measured one holds the noise that is looked at
+            _scatter(axes, phase, value)
+            axes.axhline(0, color=SOFT, linewidth=0.6)
+            _bars(axes, bin_means(phase, value, edges), BLUE, "o", "mean ± 2 u")
+            axes.set_xlabel(f"phase of {axis} / px")
+            axes.set_xlim(-0.5, 0.5)
+            axes.set_xticks([-0.4, 0.0, 0.4])
+        both[0].set_ylabel("residual / px")
+        caption = "Residuals of x (left) and y (right) against the sub-pixel phase. A swing comes from too small or clipped targets."
+        return finished(figure, f"{name}-phase", "Residuals in x and y against the sub-pixel phase", caption)
+
+
+def short(r: float) -> str:
+    """A correlation to two places, without the zero before the point."""
+    return f"{r:.2f}".replace("0.", ".").replace("-", MINUS)
+
+
+def correlation_map(names: Sequence[str], matrix: np.ndarray, name: str) -> Picture:
+    """Correlations of the interior parameters, with their numbers."""
+    matrix = np.asarray(matrix, float)
+    n = len(names)
+    labels = [label.upper() if label[0] in "bpk" else label for label in names]
+    with canvas(0.95 * WIDTH_IN) as (figure, axes):
+        axes.imshow(matrix, cmap="RdBu_r", vmin=-1, vmax=1, interpolation="none")
+        axes.grid(False)
+        axes.tick_params(length=0)
+        axes.set_xticks(range(n), labels)
+        axes.set_yticks(range(n), labels)
+        axes.xaxis.tick_top()
+        for i, j in zip(*np.nonzero(np.abs(matrix) >= 0.005), strict=True):
+            if i != j:
+                colour = LIGHT_TEXT if abs(matrix[i, j]) > 0.6 else DARK_TEXT
+                axes.text(j, i, short(matrix[i, j]), color=colour, fontsize=5.4, ha="center", va="center")
+        caption = "Correlations of the interior parameters: red positive, blue negative. What correlates strongly is only known together."
+        return finished(figure, f"{name}-correlations", f"Correlation matrix of {n} interior parameters", caption)
+
+
+def curve_pictures(curves: Mapping[str, Any], direction: str, name: str) -> list[Picture]:
+    """Radial, balanced and tangential distortion with their 95 % bands; ``direction`` as of a `CameraModel`."""
+    what = "correction" if direction == "image_to_object" else "distortion"
+    unit, radius = curves["unit"], np.asarray(curves["radius"], float)
+    scaled = 1000.0 if unit == "mm" else 1.0
+    shown = "µm" if unit == "mm" else unit
+    made, forms = [], (("radial", BLUE, "-"), ("balanced", RED, "--"), ("tangential", BLUE, "-"))
+    for kind, members in (("radial", forms[:2]), ("tangential", forms[2:])):
+        parts = [p for p in members if curves.get(p[0]) is not None]
+        if not parts:
+            continue
+        with canvas(2.4) as (figure, axes):
+            axes.axhline(0, color=SOFT, linewidth=0.6)
+            for key, colour, dash in parts:
+                value = scaled * np.asarray(curves[key], float)
+                if curves.get(f"u_{key}") is not None:
+                    half = COVER_95 * scaled * np.asarray(curves[f"u_{key}"], float)
+                    axes.fill_between(radius, value - half, value + half, color=colour, alpha=0.25, linewidth=0)
+                axes.plot(radius, value, dash, color=colour, label=key)
+            axes.set_xlabel(f"distance from the principal point / {unit}")
+            axes.set_ylabel(f"{what} / {shown}")
+            if len(parts) > 1:
+                axes.legend(loc="best")
+            made.append(finished(figure, f"{name}-{kind}", f"{kind} {what} against the radius", _curve_caption(kind, what, curves)))
+    return made
+
+
+def _curve_caption(kind: str, what: str, curves: Mapping[str, Any]) -> str:
+    """What is drawn, and its size at the largest radius with the 95 % band."""
+    unit, scaled = curves["unit"], 1000.0 if curves["unit"] == "mm" else 1.0
+    text = f"Tangential (decentring) {what}, √(P1² + P2²) r²" if kind == "tangential" else f"Radial {what} of the radius"
+    text += ", with its 95 % band"
+    if curves.get(kind) is not None and curves.get(f"u_{kind}") is not None:
+        r, value, u = (float(np.asarray(curves[key], float)[-1]) for key in ("radius", kind, f"u_{kind}"))
+        number = uncertain(scaled * value, COVER_95 * scaled * u, "um" if unit == "mm" else unit)
+        text += f": {number.value} ± {number.u} {number.unit} at {significant(r)} {unit}"
+        if unit == "mm" and curves.get(f"{kind}_px") is not None:
+            value_px, u_px = (float(np.asarray(curves[key], float)[-1]) for key in (f"{kind}_px", f"u_{kind}_px"))
+            px = uncertain(value_px, COVER_95 * u_px, "px")
+            text += f" ({px.value} ± {px.u} px)"
+    balanced = curves.get("balanced_c")
+    if kind == "radial" and curves.get("balanced") is not None and balanced is not None:
+        text += f". Balanced: the same lens with a principal distance of {significant(float(balanced), 5)} {unit}"
+    return text + "."
+
+
+def projection_map(p: Mapping[str, Any], sensor: Sensor, name: str) -> Picture:
+    """Standard uncertainty of a projected direction over the sensor."""
+    u = np.asarray(p["u_px"], float)
+    x, y = np.asarray(p["x_px"], float), np.asarray(p["y_px"], float)
+    half_x, half_y = (float(np.ptp(v)) / max(len(v) - 1, 1) / 2 for v in (x, y))
+    extent = (x.min() - half_x, x.max() + half_x, y.max() + half_y, y.min() - half_y)
+    wide = float(np.nanmax(u)) > WIDE_RANGE * float(np.nanmin(u)) > 0
+    with canvas(frame_height(sensor, 1.15) - 0.2) as (figure, axes):
+        image = axes.imshow(1000 * u, cmap="cividis", extent=extent, interpolation="none", norm="log" if wide else "linear")
+        axes.grid(False)
+        axes.set_xlabel("x / px")
+        axes.set_ylabel("y / px")
+        bar = colour_bar(figure, axes, image, "u / 10⁻³ px")
+        if wide:
+            plain_log(bar.yaxis)
+        caption = (
+            "Projection uncertainty: standard uncertainty of an image coordinate (mean of x and y) with which the calibration tells "
+            "where a direction is imaged; what a rotation of the camera would take up is fitted out. Where no image point lay, it is "
+            "extrapolated by the model."
+        )
+        alt = f"Projection uncertainty over the sensor, {significant(float(np.nanmin(u)), 2)} to {significant(float(np.nanmax(u)), 2)} px"
+        return finished(figure, f"{name}-projection", alt, caption)
+
+
+def by_image(records: Sequence[Mapping[str, Any]], name: str) -> Picture:
+    """Residuals image by image in the order of time, and the x-scale where it was estimated."""
+    timed = all(r.get("time_s") is not None for r in records)
+    at = np.array([r["time_s"] for r in records], float) if timed else np.arange(1, len(records) + 1, dtype=float)
+    factor, label = (1.0, "image") if not timed else (1 / 60, "time / min") if np.ptp(at) > 300 else (1.0, "time / s")
+    scale = np.array([np.nan if r.get("x_scale") is None else r["x_scale"] for r in records], float)
+    scaled = bool(np.isfinite(scale).any())
+    with canvas(3.4 if scaled else 2.2, nrows=1 + scaled, sharex=True, squeeze=False) as (figure, grid):
+        top, size = grid[0, 0], 3.0 if len(records) < 80 else 1.5
+        for axis, colour, marker in (("x", BLUE, "o"), ("y", RED, "s")):
+            rms = np.array([np.nan if r[f"rms_{axis}_px"] is None else r[f"rms_{axis}_px"] for r in records], float)
+            top.plot(factor * at, rms, marker, color=colour, linestyle="none", markersize=size, label=f"{axis}, rms")
+        top.set_ylim(0, 1.15 * top.get_ylim()[1])
+        top.set_ylabel("residuals / px")
+        if scaled:
+            u = np.array([np.nan if r.get("u_x_scale") is None else r["u_x_scale"] for r in records], float)
+            low = grid[1, 0]
+            low.axhline(0, color=SOFT, linewidth=0.6)
+            low.errorbar(factor * at, 1e6 * scale, yerr=2e6 * u, fmt="o", color=INK, markersize=size, elinewidth=0.24 * size)
+            low.set_ylabel("x-scale / 10⁻⁶")
+        grid[-1, 0].set_xlabel(label)
+        grid[-1, 0].xaxis.get_major_locator().set_params(integer=not timed)
+        figure.legend(*top.get_legend_handles_labels(), loc="outside upper center", ncols=2)
+        caption = "Residuals of each image in the order " + ("of time." if timed else "of the project.")
+        if scaled:
+            caption += " Below: the x-scale of each image against their mean, ± 2 u; a drift is a clock that warms up."
+        return finished(figure, f"{name}-time", f"Residual rms of {len(records)} images in order", caption)

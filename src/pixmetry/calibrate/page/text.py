@@ -1,0 +1,254 @@
+"""What a calibration is worth, in words: the sentences that its page, its terminal summary and its tables share."""
+
+from __future__ import annotations
+
+import re
+import textwrap
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pixmetry.report.numbers import (
+    MINUS,
+    NO_BREAK,
+    NONE,
+    SUPERSCRIPT,
+    THIN,
+    Number,
+    decimals_of,
+    fixed,
+    length_px,
+    pretty_unit,
+    significant,
+    uncertain,
+)
+
+if TYPE_CHECKING:
+    from pixmetry.calibrate.bundle.network import Calibration
+
+COLUMNS = 100  # of the terminal
+GIVEN_DIGITS = 8  # of a value that was given and held
+TITLES = {
+    "c": "Principal distance",
+    "xp": "Principal point, x",
+    "yp": "Principal point, y",
+    "b1": "Affinity",
+    "b2": "Shear",
+    "p1": "Decentring",
+    "p2": "Decentring",
+    **{f"k{n}": "Radial" for n in range(1, 6)},
+}
+DIRECTIONS = {
+    "image_to_object": "corrects image coordinates (image to object, as in photogrammetry)",
+    "object_to_image": "distorts ideal directions (object to image, as in computer vision)",
+}
+
+
+def symbol(name: str) -> str:
+    """A parameter's sign as photogrammetry writes it."""
+    return name.upper() if name[0] in "bpk" else name
+
+
+def p_text(p: float | None) -> str:
+    """A probability: two digits, or a bound where it is below a millionth."""
+    if p is None or not np.isfinite(p):
+        return NONE
+    return f"<{THIN}10⁻⁶" if p < 1e-6 else significant(p, 2)
+
+
+def typeset(text: str) -> str:
+    """A sentence made for a terminal, with true minus signs and powers of ten."""
+    text = re.sub(r"(\d)e([+-]?\d+)\b", lambda m: f"{m[1]}{THIN}×{THIN}10{str(int(m[2])).translate(SUPERSCRIPT)}", text)
+    return re.sub(r"(?<![\w.⁻])-(?=\d)", MINUS, text)
+
+
+def sentence(text: str) -> str:
+    """A text with a capital at its beginning, unless that is a symbol or a name, and a full stop at its end."""
+    if not text:
+        return ""
+    first = text[0] if text[1:2] == " " or text.split()[0].endswith(":") else text[0].upper()
+    return f"{first}{text[1:].rstrip('.')}."
+
+
+def record_of(calibration: Calibration, test: str, camera: str) -> Mapping[str, Any] | None:
+    """What a test says of a camera; None where it was not made."""
+    return (calibration.tests.get(test) or {}).get(camera)
+
+
+def residual_record(calibration: Calibration, camera: int) -> Mapping[str, Any]:
+    """Number and rms of the residuals of a camera, from its test or, without one, from the adjustment."""
+    adjustment = calibration.adjustment
+    model = adjustment.network.cameras[camera]
+    found = record_of(calibration, "residuals", model.name)
+    if found is not None:
+        return found
+    net, v = adjustment.network, adjustment.residual_px
+    mine = adjustment.used & (net.camera_of[net.image] == camera) & np.isfinite(v).all(axis=1)
+    rms = np.sqrt(np.mean(v[mine] ** 2, axis=0)) if mine.any() else np.full(2, np.nan)
+    pitch = (model.sensor.pitch_x_um, model.sensor.pitch_y_um)
+    record: dict[str, Any] = {"n": int(mine.sum()), "dof_x": None, "dof_y": None}
+    for axis, value, um in zip("xy", rms, pitch, strict=True):
+        record |= {f"rms_{axis}_px": float(value), f"rms_{axis}_um": None if um is None else float(value * um)}
+    return record
+
+
+def projection_levels(projection: Mapping[str, Any] | None) -> tuple[float, float] | None:
+    """Projection uncertainty in the middle of the frame and in the worst of its corners, px."""
+    if projection is None:
+        return None
+    u = np.asarray(projection["u_px"], float)
+    middle, corners = u[u.shape[0] // 2, u.shape[1] // 2], u[[0, 0, -1, -1], [0, -1, 0, -1]]
+    if not (np.isfinite(middle) and np.isfinite(corners).any()) or not np.nanmax(u) > 0:  # 0: nothing of the camera was estimated
+        return None
+    return float(middle), float(np.nanmax(corners))
+
+
+def length(px: float, um: float | None) -> str:
+    """A length in px and, with a known pitch, in µm."""
+    text = f"{length_px(px)}{NO_BREAK}px"
+    return text if um is None or not np.isfinite(px) else f"{text} ({length_px(um)}{NO_BREAK}µm)"
+
+
+def worth(calibration: Calibration, camera: int) -> str:
+    """One sentence on what the calibration of a camera is worth."""
+    found = residual_record(calibration, camera)
+    name = calibration.adjustment.network.cameras[camera].name
+    if found["n"] == 0:
+        return "No image coordinate of this camera took part."
+    text = (
+        f"The image coordinates agree with the calibrated camera to {length(found['rms_x_px'], found.get('rms_x_um'))} rms in x and "
+        f"{length(found['rms_y_px'], found.get('rms_y_um'))} in y"
+    )
+    levels = projection_levels(record_of(calibration, "projection", name))
+    if levels is None:
+        return text + "."
+    places = f"{length_px(levels[0])}{NO_BREAK}px in the middle of the frame and {length_px(levels[1])}{NO_BREAK}px in its corners"
+    return f"{text}; where a direction is imaged is known to {places} (k = 1)."
+
+
+def sigma0_text(calibration: Calibration) -> str:
+    """By how much the image coordinates scatter, beside what was stated of them."""
+    adjustment = calibration.adjustment
+    models = adjustment.network.cameras
+    parts = [(model.name, record_of(calibration, "variance_components", model.name)) for model in models]
+    found = [(f"{name}: " if len(models) > 1 else "", record) for name, record in parts if record and np.isfinite(record["sigma_x_px"])]
+    if found:
+        return " ".join(sentence(f"{name}{_scatter(record, known=adjustment.network.covariance_known)}") for name, record in found)
+    value = significant(adjustment.sigma0, 3)
+    if adjustment.network.covariance_known:
+        return f"σ₀ = {value} with {adjustment.dof} degrees of freedom: 1 would mean that the image coordinates scatter as was stated."
+    return (
+        f"σ₀ = {value} with {adjustment.dof} degrees of freedom; no covariance of the image coordinates was given, so the scale of "
+        "their weights comes from the residuals."
+    )
+
+
+def _scatter(record: Mapping[str, Any], *, known: bool) -> str:
+    text = f"image coordinates scatter by {_with_u(record, 'x')} in x and {_with_u(record, 'y')} in y"
+    if record.get("common") and record.get("by_axis", True):
+        text += " (estimated in common: the images do not agree that x and y differ)"
+    if not known:
+        return f"{text}, by their residuals: no covariance of the image coordinates was given"
+    if "given_x_px" not in record:
+        return text
+    return f"{text}; stated were {length_px(record['given_x_px'])}{NO_BREAK}px and {length_px(record['given_y_px'])}{NO_BREAK}px"
+
+
+def _with_u(record: Mapping[str, Any], axis: str) -> str:
+    number = uncertain(record[f"sigma_{axis}_px"], record[f"u_sigma_{axis}_px"], "px")
+    return f"{number.value}{NO_BREAK}px" if number.u == NONE else f"({number.value} ± {number.u}){NO_BREAK}px"
+
+
+def parameter_records(calibration: Calibration, camera: int) -> list[dict[str, Any]]:
+    """Estimated parameters and those held fixed at a value other than 0, in the order of the model."""
+    from pixmetry.calibrate.bundle.model import NAMES
+
+    adjustment = calibration.adjustment
+    model = adjustment.camera(camera)
+    tested = {r["name"]: r for r in calibration.tests.get("parameters") or () if r["camera"] == model.name}
+    u: dict[str, float] = {}
+    if adjustment.covariance is not None:  # an adjustment may be asked to leave it out
+        free, covariance = adjustment.interior_covariance(camera)
+        u = dict(zip(free, np.sqrt(np.diag(covariance)), strict=True))
+    rows: list[dict[str, Any]] = []
+    for name, unit, value in zip(NAMES, model.units, model.values, strict=True):
+        if name in tested:
+            rows.append({"fixed": False, **tested[name]})
+        elif model.free[NAMES.index(name)] or value != 0:
+            rows.append({"fixed": not model.free[NAMES.index(name)], "name": name, "value": float(value), "u": u.get(name), "unit": unit})
+    return rows
+
+
+def counts(calibration: Calibration) -> tuple[str, str, str]:
+    """How many images, points and image points took part; where not all did, of how many."""
+    from pixmetry.calibrate.records import sizes
+
+    found = sizes(calibration.adjustment)
+    pairs = [(found[key], found[f"{key}_given"]) for key in ("images", "points", "observations")]
+    images, points, observations = (str(part) if part == whole else f"{part} of {whole}" for part, whole in pairs)
+    return images, points, observations
+
+
+def shown(record: Mapping[str, Any]) -> Number:
+    """A parameter as text: with its uncertainty, or where it is held, with the digits that it was given."""
+    if record["fixed"]:
+        return as_given(record["value"], record["unit"])
+    return uncertain(record["value"], float("nan") if record["u"] is None else record["u"], record["unit"])
+
+
+def as_given(value: float, unit: str) -> Number:
+    """A value that was given, to at most eight significant digits; a power of ten is in the unit."""
+    mantissa, _, exponent = f"{value:.{GIVEN_DIGITS}g}".partition("e")
+    power = f"10{str(int(exponent)).translate(SUPERSCRIPT)}{NO_BREAK}" if exponent else ""
+    return Number(mantissa.replace("-", MINUS), NONE, (power + pretty_unit(unit)).rstrip(NO_BREAK))
+
+
+def placed(value: float, u: float) -> str:
+    """A coordinate to the place of the second digit of its uncertainty, all digits before it: no power of ten, however far the origin."""
+    if not np.isfinite(value):
+        return NONE
+    if np.isfinite(u) and u > 0:
+        return fixed(value, decimals_of(u))
+    number = as_given(value, "1")
+    return f"{number.value} {number.unit}".rstrip()
+
+
+def summary_text(calibration: Calibration) -> str:
+    """Summary for the terminal: what each camera is worth, what to know, its parameters."""
+    adjustment = calibration.adjustment
+    net = adjustment.network
+    images, points, observations = counts(calibration)
+    lines = [f"{images} images, {points} points, {observations} image points used. {sigma0_text(calibration)}"]
+    for k, model in enumerate(net.cameras):
+        lines += ["", f"{model.name}: {worth(calibration, k)}"]
+        found = record_of(calibration, "f_test", model.name)
+        if found and found.get("text"):
+            lines.append(sentence(found["text"]))
+        lines.append("")
+        lines += _parameter_lines(calibration, k)
+    if "check_points" in calibration.tests:
+        lines += ["", sentence(calibration.tests["check_points"]["text"])]
+    for finding in calibration.findings:
+        mark = "Warning" if finding.level == "warning" else "Note"
+        lines += ["", f"{mark}: {sentence(finding.text)}"]
+        if finding.advice:
+            lines.append(f"  To do: {finding.advice}")
+    return "\n".join(part for line in lines for part in folded(line)).replace(NO_BREAK, " ").replace(THIN, " ")
+
+
+def folded(line: str) -> list[str]:
+    """A line as lines of the terminal, indented like its beginning."""
+    indent = " " * (len(line) - len(line.lstrip()) + 2)
+    return textwrap.wrap(line, COLUMNS, subsequent_indent=indent, break_long_words=False) or [""]
+
+
+def _parameter_lines(calibration: Calibration, camera: int) -> list[str]:
+    rows = []
+    for r in parameter_records(calibration, camera):
+        number = shown(r)
+        said = "fixed" if r["fixed"] else ("" if number.u == NONE else f"± {number.u}")
+        p = r.get("p_zero")
+        rows.append((symbol(r["name"]), number.value, said, number.unit, "not significant" if p is not None and p > 0.05 else ""))
+    widths = [max((len(row[i]) for row in rows), default=0) for i in range(4)]
+    return [f"  {a:<{widths[0]}}  {b:>{widths[1]}} {c:<{widths[2]}}  {d:<{widths[3]}}  {e}".rstrip() for a, b, c, d, e in rows]

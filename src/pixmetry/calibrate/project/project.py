@@ -1,0 +1,252 @@
+"""Read a project: the YAML file, the tables and pictures that it names, and all that can be checked before an adjustment."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pixmetry.calibrate.bundle.model import CameraModel, Sensor
+from pixmetry.calibrate.bundle.network import Finding, Network
+from pixmetry.calibrate.checks.check_points import CheckPoints
+from pixmetry.calibrate.project.cameras import Described, described
+from pixmetry.calibrate.project.coordinates import ImageCoordinates, Measured, measured, upwards
+from pixmetry.calibrate.project.pictures import located, of_size
+from pixmetry.calibrate.project.points import Known, known_points, scale_bars, with_check_points
+from pixmetry.calibrate.project.reader import Reader
+from pixmetry.calibrate.project.schema import PROJECT_SCHEMA, ProjectModel
+from pixmetry.calibrate.project.straight_lines import LinePositions, lines_of_pictures, lines_of_table
+from pixmetry.calibrate.project.tables import Table, first_few
+from pixmetry.camera.camera import Camera
+from pixmetry.core.config import Settings, load_yaml, validate
+
+Progress = Callable[[str, int, int], None]
+FIELD_OF = {"fixed": "fixed", "weighted": "fixed", "free": "free"}  # what `known` says; of nominal points images left out decide
+
+
+@dataclass(frozen=True)
+class Project:
+    """A project as it was read.
+
+    Parameters
+    ----------
+    name : str
+    source : Path or None
+        None: pictures alone.
+    network : Network
+        Without observations where it is about straight lines.
+    options : dict
+        What was given of `pixmetry.calibrate.bundle.solve.Options`.
+    inputs : tuple of Path
+        All files that were read.
+    findings : tuple of Finding
+        What was noticed in the tables.
+    presets : dict
+        By the names of cameras that have one.
+    lines : LinePositions or None
+        Positions on straight lines, where there are no points.
+    check_points : CheckPoints or None
+        What the result is compared with.
+    """
+
+    name: str
+    source: Path | None
+    network: Network
+    options: dict[str, Any]
+    inputs: tuple[Path, ...]
+    findings: tuple[Finding, ...] = ()
+    presets: Mapping[str, Camera] = field(default_factory=dict)
+    lines: LinePositions | None = None
+    check_points: CheckPoints | None = None
+
+    @property
+    def folder(self) -> Path:
+        """What file names count from."""
+        return Path() if self.source is None else self.source.parent
+
+
+def load_project(path: str | Path, progress: Progress | None = None) -> Project:
+    """Read a project file and everything that it names.
+
+    Parameters
+    ----------
+    path : path
+        A YAML file of the schema ``pixmetry/calibration/1``.
+    progress : callable, optional
+        Called with (what, done, of) while targets are located in pictures.
+
+    Raises
+    ------
+    InputError
+        If a file is missing, or anything in one of them cannot be used.
+    """
+    source = Path(path)
+    settings = _one_camera_or_many(load_yaml(source))
+    return _project(validate(ProjectModel, settings, str(source)), Reader(source, settings.lines), progress)
+
+
+def project_of_pictures(
+    files: Sequence[str | Path], camera: Mapping[str, Any], plate: Mapping[str, Any], progress: Progress | None = None
+) -> Project:
+    """A project of pictures of one camera alone.
+
+    Parameters
+    ----------
+    files : sequence of path
+        Names, patterns or folders.
+    camera, plate : mapping
+        Keys of the project's ``cameras`` and ``pictures``.
+    progress : callable, optional
+
+    Raises
+    ------
+    InputError
+        As from `load_project`.
+    """
+    pictures = {"files": [str(file) for file in files], **plate}
+    model = validate(ProjectModel, {"schema": PROJECT_SCHEMA, "cameras": [camera], "pictures": pictures})
+    return _project(model, Reader(None, {}), progress)
+
+
+def _project(model: ProjectModel, reader: Reader, progress: Progress | None) -> Project:
+    given = ImageCoordinates(**model.image_coordinates.model_dump())
+    table = reader.table("lines", model.lines) if model.straight else reader.table("observations", model.observations)
+    up = given.y == "up" if table is None else upwards(table, given)
+    told = tuple(described(entry, reader, k, straight=model.straight, upwards=up) for k, entry in enumerate(model.cameras))
+    presets = {one.model.name: one.preset for one in told if one.preset is not None}
+    about: dict[str, Any] = {"name": model.name, "source": reader.source, "presets": presets}
+    if model.straight:
+        camera, lines, findings = _lines(model, reader, table, given, told[0], progress)
+        options = {name: value for name, value in model.options.model_dump().items() if value is not None}
+        network = _no_points(camera)
+        return Project(network=network, options=options, inputs=tuple(reader.files), findings=findings, lines=lines, **about)
+    cameras = tuple(one.model for one in told)
+    images, points = reader.table("images", model.images), reader.table("points", model.points)
+    plate, findings = None, ()
+    if model.pictures is not None:
+        files = reader.pictures(model.pictures.files, model.pictures.raw)
+        camera, seen, plate, findings = located(model.pictures, files, cameras[0], images, progress, told[0].check)
+        cameras = (camera,)
+    else:
+        assert table is not None and model.observations is not None
+        seen = measured(table, images, cameras, given, model.observations.u_px)
+    known = plate if points is None and plate is not None else known_points(points, seen.points, *_trust(model))
+    compared = reader.table("check_points", model.check_points)
+    u_compared = None if model.check_points is None else model.check_points.u
+    known, checks = with_check_points(known, compared, seen.points, u_compared)
+    known = _with_target(known, model)
+    bars = scale_bars(reader.bars(model), seen.points, known)
+    network = network_of(cameras, seen, known, bars=bars, per_image=model.per_image, scale_origin_px=model.scale_origin_px, unit=model.unit)
+    findings = (*findings, *_unseen(known, points), *_without_images(network))
+    about |= {"options": _options(model), "inputs": tuple(reader.files), "findings": findings, "check_points": checks}
+    return Project(network=network, **about)
+
+
+def _lines(
+    model: ProjectModel, reader: Reader, table: Table | None, given: ImageCoordinates, told: Described, progress: Progress | None
+) -> tuple[CameraModel, LinePositions, tuple[Finding, ...]]:
+    """Positions on straight lines, and the camera with the size of its frame."""
+    if model.pictures is not None:
+        lines, size, findings = lines_of_pictures(model.pictures, reader.pictures(model.pictures.files, model.pictures.raw), progress)
+        told.check(size)
+        return of_size(told.model, *size), lines, findings
+    assert table is not None and model.lines is not None
+    lines = lines_of_table(table, told.model, given, model.lines.u_px)
+    return told.model, lines, _outside(lines, told.model.sensor)
+
+
+def _outside(lines: LinePositions, sensor: Sensor) -> tuple[Finding, ...]:
+    (x0, y0), half = sensor.centre, (sensor.cols / 2, sensor.rows / 2)
+    bad = np.flatnonzero((np.abs(lines.x_px - x0) > half[0]) | (np.abs(lines.y_px - y0) > half[1]))
+    if not len(bad):
+        return ()
+    first = f"({lines.x_px[bad[0]]:.1f}, {lines.y_px[bad[0]]:.1f}) of line {lines.line[bad[0]]} in {lines.image[bad[0]]}"
+    text = f"{len(bad)} of {len(lines)} positions lie outside of the frame of {sensor.cols} × {sensor.rows} px, such as {first}."
+    return (Finding("outside_frame", text, "Check the size of the frame and these positions.", "warning"),)
+
+
+def _no_points(camera: CameraModel) -> Network:
+    none, index = np.zeros(0), np.zeros(0, np.int64)
+    return Network((camera,), (), index, (), none, none, index, index, np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)))
+
+
+def _trust(model: ProjectModel) -> tuple[str | None, float | None]:
+    return (None, None) if model.points is None else (model.points.known, model.points.u)
+
+
+def network_of(cameras: Sequence[CameraModel], seen: Measured, known: Known, **more: Any) -> Network:
+    """Put together what was measured and what is known."""
+    return Network(
+        cameras=tuple(cameras),
+        images=seen.images,
+        camera_of=seen.camera_of,
+        points=seen.points,
+        x_px=seen.x_px,
+        y_px=seen.y_px,
+        image=seen.image,
+        point=seen.point,
+        covariance_px2=seen.covariance_px2,
+        xyz=known.xyz,
+        u_xyz=known.u_xyz,
+        time_s=seen.time_s,
+        diameter=known.diameter,
+        normal=known.normal,
+        covariance_known=seen.covariance_known,
+        poses=seen.poses,
+        **more,
+    )
+
+
+def _one_camera_or_many(settings: Settings) -> Settings:
+    """`cameras: {...}` as a list of one, with its lines."""
+    if isinstance(settings.get("cameras"), dict):
+        settings["cameras"] = [settings["cameras"]]
+        settings.lines = {
+            ("cameras", 0, *loc[1:]) if loc[0] == "cameras" and len(loc) > 1 else loc: line for loc, line in settings.lines.items()
+        }
+    return settings
+
+
+def _with_target(known: Known, model: ProjectModel) -> Known:
+    """Size and normal of all targets where the table of points does not say them."""
+    target = model.target
+    if target is None:
+        return known
+    n = len(known.xyz)
+    diameter, normal = known.diameter, known.normal
+    if target.diameter is not None:
+        own = np.full(n, np.nan) if diameter is None else diameter
+        diameter = np.where(np.isfinite(own), own, target.diameter)
+    if target.normal is not None:
+        wanted = np.array(target.normal) / np.linalg.norm(target.normal)
+        own = np.full((n, 3), np.nan) if normal is None else normal
+        normal = np.where(np.isfinite(own), own, wanted)
+    return replace(known, diameter=diameter, normal=normal)
+
+
+def _options(model: ProjectModel) -> dict[str, Any]:
+    given = {name: value for name, value in model.options.model_dump().items() if value is not None}
+    known = None if model.points is None else model.points.known or "weighted"
+    if known in FIELD_OF:
+        given = {"field": FIELD_OF[known], **given}
+    if model.target is not None:
+        given["target"] = model.target.shape
+    return given
+
+
+def _without_images(network: Network) -> tuple[Finding, ...]:
+    names = [camera.name for k, camera in enumerate(network.cameras) if not np.any(network.camera_of == k)]
+    text = "has no image: its values are those that were given."
+    advice = "Name it in the table of images, or delete it."
+    return tuple(Finding("camera_without_images", f"Camera '{name}' {text}", advice, "warning") for name in names)
+
+
+def _unseen(known: Known, points: Table | None) -> tuple[Finding, ...]:
+    if points is None or not known.unseen:
+        return ()
+    n = len(known.unseen)
+    text = f"{n} of {len(points)} object points {'is' if n == 1 else 'are'} seen in no image: {first_few(known.unseen)}."
+    return (Finding("unseen_points", text, "If they should be, compare their names in both tables."),)

@@ -1,0 +1,280 @@
+"""Observations: what a camera's frames are reduced to, once, before anything is measured from them.
+
+Records only. They are made by ``pixmetry.observe`` from streams of frames and read by the sources' ``measure``. All values are
+in DN of the stored frames unless the name says otherwise; variances in DN². Where temporal statistics come from pairs of frames,
+they are from differences, so what is fixed in the camera drops out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
+
+import numpy as np
+
+from pixmetry.core.errors import MeasureError
+from pixmetry.core.estimates import Estimates
+
+
+@dataclass(frozen=True)
+class LevelMoments:
+    """Temporal and spatial moments at several exposure levels, each from the same small number of frames (usually two).
+
+    All arrays have shape (levels,). With F frames of M rows and N columns at a level, the temporal variances are mean squares of the
+    two-way (row, column) analysis of variance of the frame differences: ``ms_*`` are the *mean squares per pixel, per row mean and
+    per column mean*, so that E[ms_pixel] = σ²_white, E[ms_row] = σ²_row + σ²_white/N, E[ms_col] = σ²_col + σ²_white/M, and
+    E[ms_frame] = σ²_frame + σ²_row/M + σ²_col/N + σ²_white/(MN) (the variance of the frame means about their mean).
+    """
+
+    exposure_s: np.ndarray
+    photons: np.ndarray | None  # mean photons per pixel, when the irradiance is known
+    n_frames: np.ndarray
+    mean_dn: np.ndarray
+    var_total_dn2: np.ndarray  # plain temporal variance per pixel (EMVA 1288: ½⟨d²⟩ − ½⟨d⟩² for a pair)
+    ms_pixel_dn2: np.ndarray
+    ms_row_dn2: np.ndarray
+    ms_col_dn2: np.ndarray
+    ms_frame_dn2: np.ndarray
+    kurtosis_excess: np.ndarray  # of the frame differences
+    fraction_min: np.ndarray  # share of pixels at the lowest code that the camera can store
+    fraction_max: np.ndarray  # share at the highest
+    spatial_cov_dn2: np.ndarray  # spatial variance free of temporal noise: ⟨y0 y1⟩ − µ0 µ1
+
+
+@dataclass(frozen=True)
+class PhotonTransfer:
+    """A photon-transfer series: bright and dark levels of one camera at one gain and temperature."""
+
+    bright: LevelMoments
+    dark: LevelMoments
+    frame_shape: tuple[int, int]
+    bits: int
+    # shape (dark levels, 3): what hot pixels add to mean (DN) and spatial variance (DN²), and what of the mean was not seen but estimated
+    dark_tails: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class StackMoments:
+    """Moments of L frames taken at one setting (EMVA 1288 R4.0 §8): the mean image and how much noise is left in it."""
+
+    n_frames: int
+    exposure_s: float
+    mean_map_dn: np.ndarray  # shape (rows, cols), float64
+    var_map_dn2: np.ndarray  # shape (rows, cols), float32; sample variance over the frames
+    mean_dn: float
+    frame_means_dn: np.ndarray  # shape (L,), the mean of each frame
+    var_stack_dn2: float  # σ²_stack: mean over pixels of the sample variance
+    ms_pixel_dn2: float  # temporal mean squares as in LevelMoments, from the whole stack
+    ms_row_dn2: float
+    ms_col_dn2: float
+    ms_frame_dn2: float
+    fraction_min: float
+    fraction_max: float
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        return self.mean_map_dn.shape
+
+
+@dataclass(frozen=True)
+class Spectra:
+    """Power spectra of a mean image (fixed) and of frame differences (temporal), rows and columns apart.
+
+    Frequencies in cycles per pixel, ``k / N`` for k = 0 … N//2; powers in DN² as in EMVA 1288 R4.0 §8.4 (white noise of variance σ²
+    has power σ² at every frequency).
+    """
+
+    frequency_h: np.ndarray
+    fixed_h_dn2: np.ndarray
+    temporal_h_dn2: np.ndarray
+    frequency_v: np.ndarray
+    fixed_v_dn2: np.ndarray
+    temporal_v_dn2: np.ndarray
+    # two-dimensional temporal periodogram, shape (rows, cols // 2 + 1), float32, the mean over the frame pairs, zero on the axes
+    temporal_power_dn2: np.ndarray | None = None
+    n_pairs: int = 0
+
+
+@dataclass(frozen=True)
+class CodeHistogram:
+    """How often each code occurs, over all frames of a campaign (``counts``) and over its dark frames alone."""
+
+    counts: np.ndarray  # shape (2**bits,), int64
+    dark_counts: np.ndarray
+    bits: int
+    # the light levels, for the counts that an ideal converter would give; each of shape (levels,), in order of their means
+    level_means_dn: np.ndarray | None = None
+    level_vars_dn2: np.ndarray | None = None  # variance of all codes of the level, temporal and spatial
+    level_sizes: np.ndarray | None = None  # int64, number of codes of the level
+
+
+@dataclass(frozen=True)
+class CodeErrors:
+    """What a light sweep tells of the converter's codes; all arrays have one entry per tested code, or per missing code."""
+
+    codes: np.ndarray  # int64, the codes that were covered evenly enough to be tested
+    dnl_lsb: np.ndarray
+    u_dnl_lsb: np.ndarray
+    missing_codes: np.ndarray
+    missing_probability: np.ndarray  # chance that any code tested would be empty like this in a converter that has it
+    fit: Estimates  # dnl_rms_lsb; empty if fewer than two codes could be tested
+
+
+@dataclass(frozen=True)
+class DefectList:
+    """Pixels that stand out from the others; arrays have shape (defects,).
+
+    ``kind`` is one of ``hot`` and ``cold`` (dark value), ``dead`` (less than half the response), ``gain`` (response off), ``stuck``
+    (no response, no noise) and ``noisy`` (temporal noise); a pixel is listed once, under the worst of these.
+    """
+
+    row: np.ndarray
+    col: np.ndarray
+    kind: tuple[str, ...]
+    dark_excess_dn: np.ndarray
+    gain_rel: np.ndarray  # response over that of its surroundings; nan without a bright stack or where the end of the scale hides it
+    expected_false: float  # mean number of false alarms in a frame whose good pixels are Gaussian
+    shape: tuple[int, int]
+    dark_limit_dn: float = float("nan")  # dark excess at which half of the pixels would be found
+    dark_sigma_dn: float = float("nan")  # scatter of the good pixels' dark values
+    gain_sigma_rel: float = float("nan")  # scatter of their response
+
+    def __len__(self) -> int:
+        return len(self.kind)
+
+    def mask(self) -> np.ndarray:
+        """True at each defect, shape (rows, cols)."""
+        mask = np.zeros(self.shape, dtype=bool)
+        mask[self.row, self.col] = True
+        return mask
+
+
+@dataclass(frozen=True)
+class PatternList:
+    """Sinusoidal patterns that stand out of the noise, off the two axes (row and column patterns are measured apart).
+
+    Arrays have shape (patterns,), strongest first. Frequencies in cycles per pixel along x (0 … ½) and y (−½ … ½).
+    """
+
+    moving: np.ndarray  # bool; False: at the same place in every frame
+    frequency_x: np.ndarray
+    frequency_y: np.ndarray
+    u_frequency_x: np.ndarray
+    u_frequency_y: np.ndarray
+    amplitude_dn: np.ndarray
+    u_amplitude_dn: np.ndarray
+    false_alarm_rate: float  # of the whole search
+    n_searched: int  # periodogram ordinates looked at
+    fixed_limit_dn: float  # amplitude of the weakest fixed pattern that would be found in half of all cases
+    moving_limit_dn: float  # the same for moving patterns; nan if the frames were not searched
+
+    def strongest(self) -> PatternList:
+        """The strongest alone (or none): the one that the budget has a row for; the others stay in the noise that they make."""
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        first: dict[str, Any] = {name: value[:1] for name, value in values.items() if isinstance(value, np.ndarray)}
+        return replace(self, **first)
+
+    def __len__(self) -> int:
+        return len(self.amplitude_dn)
+
+
+LENS, AFFINITY = "optics.distortion", "sensor.affinity"
+TAKEN_UP = (LENS, AFFINITY, "optics.cover_glass", "sensor.pixel_pitch", "sensor.tilt")  # by a calibration, in the first two
+
+
+@dataclass(frozen=True)
+class CameraGeometry:
+    """What a calibration with targets found of a camera's geometry, and what it left over.
+
+    Parameters
+    ----------
+    lens : Estimates
+        ``k1_per_mm2``, ``k2_per_mm4``, ``k3_per_mm6``, ``p1_per_mm``, ``p2_per_mm`` (distorted to ideal places), ``centre_x_px``,
+        ``centre_y_px`` (principal point less the frame's centre), ``b1``, ``b2`` (of an image that the lens has distorted before),
+        ``principal_distance_mm``, ``pitch_x_um``, ``pitch_y_um``.
+    u_x_px, u_y_px : float
+        Root mean square over the frame of the uncertainty of a corrected place, from the covariance of the parameters, without what a
+        rotation of the camera takes up.
+    left_x_px, left_y_px : float
+        Systematic part of the calibration's residuals: what they have in common at one place of the frame.
+    origin : str
+        Where it comes from.
+    """
+
+    lens: Estimates
+    u_x_px: float
+    u_y_px: float
+    left_x_px: float
+    left_y_px: float
+    origin: str
+
+
+@dataclass(frozen=True)
+class Storage:
+    """Whether a lossy coder changed the frames before they were read, and how that is known.
+
+    Parameters
+    ----------
+    lossless : bool or None
+        True: no lossy coder; False: there was one (JPEG, a video codec); None: not known.
+    known : str
+        ``"proven"``: every file says it itself: PNG, BMP, FITS, NPY, raw, Zarr and TIFF without a coder or with a lossless one, True; a
+        lossy coder inside a TIFF, False. It holds for the files; a coder before them (a camera that sends JPEG) can only be stated.
+        ``"stated"``: ``lossless`` in the manifest says it. ``"unknown"``: neither, as with arrays in memory.
+    """
+
+    lossless: bool | None = None
+    known: str = "unknown"
+
+
+@dataclass(frozen=True)
+class Observations:
+    """Everything one campaign's frames were reduced to; what is not there is ``None``.
+
+    ``photon_transfer_fit`` is the joint estimate made once from ``photon_transfer`` (and the stacks), which many sources read.
+    """
+
+    photon_transfer: PhotonTransfer | None = None
+    photon_transfer_fit: Estimates | None = None
+    dark_stack: StackMoments | None = None
+    bright_stack: StackMoments | None = None
+    dark_spectra: Spectra | None = None
+    bright_spectra: Spectra | None = None
+    histogram: CodeHistogram | None = None
+    spatial_fit: Estimates | None = None
+    defects: DefectList | None = None
+    patterns: PatternList | None = None
+    code_errors: CodeErrors | None = None
+    temperature_c: float | None = None
+    geometry: CameraGeometry | None = None
+    storage: Storage = Storage()
+    notes: tuple[str, ...] = field(default_factory=tuple)
+
+    def fitted(self, names: Mapping[str, str], what: str, *, where: str, remedy: str) -> Estimates:
+        """Take a source's parameters ``{parameter: fitted name}`` out of the joint fit that holds the first of them, with their covariance.
+
+        Raises
+        ------
+        MeasureError
+            With ``what``, ``where`` and ``remedy``, if no fit holds it.
+        """
+        first = next(iter(names.values()))
+        for fit in (self.photon_transfer_fit, self.spatial_fit):
+            if fit is not None and first in fit:
+                return fit.select(names)
+        raise MeasureError(what, where=where, remedy=remedy)
+
+    def calibrated(self, names: Mapping[str, str] | Iterable[str], *, where: str) -> Estimates:
+        """Take a source's parameters out of the calibrated geometry, with their covariance.
+
+        Raises
+        ------
+        MeasureError
+            If there is no calibration.
+        """
+        if self.geometry is None:
+            remedy = "calibrate the camera with images of targets and give the calibration"
+            raise MeasureError("needs a calibrated geometry; dark and bright frames show no targets", where=where, remedy=remedy)
+        return self.geometry.lens.select(names)

@@ -1,0 +1,1 @@
+"""A data sheet on disk: JSON, XML, keys and units."""

@@ -1,0 +1,259 @@
+"""Data sheets on disk: JSON with everything, and the XML of the public EMVA 1288 result format.
+
+In JSON, ``null`` is a number that is not known (NaN) and ``"inf"`` an infinite one, as the degrees of freedom of an uncertainty that
+is known exactly; all other numbers are written so that reading gives the same bits.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pixmetry.core.checksums import check_record, sealed
+from pixmetry.core.errors import InputError
+from pixmetry.emva.records import MONO, DataSheet, Results, Value
+
+SCHEMA = "pixmetry/emva1288/1"
+LARGEST_BYTES = 1 << 28  # a sheet with all its curves has less than 1 MB
+_INFINITE = {"inf": math.inf, "-inf": -math.inf}
+
+
+def json_text(sheet: DataSheet) -> str:
+    """Return a data sheet as JSON (RFC 8259)."""
+    return json.dumps(sealed(to_record(sheet)), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def read_sheet(path: str | Path) -> DataSheet:
+    """Read a data sheet, JSON or XML by its content.
+
+    Of the XML of other programs the values and curves are taken; what they do not say is empty: the release, ``u`` and ``dof`` (NaN).
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, or is no data sheet.
+    """
+    raw = read_bytes(path)
+    if is_xml(raw):
+        from pixmetry.emva.files.xml_format import sheet_of_xml
+
+        return sheet_of_xml(raw, str(path))
+    record = parse_json(raw, str(path))
+    check_record(record, str(path))
+    return sheet_of_record(record, str(path))
+
+
+def read_bytes(path: str | Path) -> bytes:
+    """Read a file whole.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read, is empty, or larger than any data sheet.
+    """
+    try:
+        with open(path, "rb") as stream:
+            raw = stream.read(LARGEST_BYTES + 1)
+    except OSError as problem:
+        raise InputError("file cannot be read", where=str(path), value=problem.strerror or str(problem), remedy="check the path") from None
+    if len(raw) > LARGEST_BYTES:
+        raise InputError("too large for a data sheet", where=str(path), allowed=f"up to {LARGEST_BYTES >> 20} MiB", remedy="check the file")
+    if not raw.strip(b"\x00 \t\r\n\xef\xbb\xbf\xff\xfe"):
+        raise InputError("the file is empty", where=str(path), remedy="make the data sheet again")
+    return raw
+
+
+def parse_json(raw: bytes, where: str) -> dict[str, Any]:
+    """Read one JSON object; NaN, infinities and keys that are given twice are refused.
+
+    Raises
+    ------
+    InputError
+        If it is something else.
+    """
+    if not _starts_with(raw, b"{"):
+        what = "a JSON list, not an object" if _starts_with(raw, b"[") else "neither JSON nor XML"
+        raise InputError(what, where=where, remedy="name a data sheet (.json or .xml) or the results of an assessment")
+    try:
+        record = json.loads(raw, object_pairs_hook=_once, parse_constant=_no_constant)
+    except _RefusedError as problem:
+        raise InputError(str(problem), where=where, remedy="correct the file") from None
+    except json.JSONDecodeError as problem:
+        raise InputError(f"not valid JSON: {problem.msg}", where=f"{where}, line {problem.lineno}", remedy="make the file again") from None
+    except (ValueError, RecursionError):  # not UTF-8, or nested without end
+        raise InputError("not valid JSON", where=where, remedy="make the file again") from None
+    return record
+
+
+def is_xml(raw: bytes) -> bool:
+    """Whether a file's bytes begin as XML does, in any encoding."""
+    return _starts_with(raw, b"<")
+
+
+def _starts_with(raw: bytes, mark: bytes) -> bool:
+    return raw[:64].lstrip(b"\x00 \t\r\n\xef\xbb\xbf\xff\xfe").startswith(mark)
+
+
+class _RefusedError(ValueError):
+    """What JSON would allow and a data sheet does not."""
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    record = dict(pairs)
+    if len(record) < len(pairs):
+        names = [name for name, _ in pairs]
+        raise _RefusedError(f"'{next(n for n in names if names.count(n) > 1)}' is given twice")
+    return record
+
+
+def _no_constant(name: str) -> float:
+    raise _RefusedError(f"holds {name}, which is no number in JSON")
+
+
+def to_record(sheet: DataSheet) -> dict[str, Any]:
+    """Return the plain record of a data sheet, ready for JSON."""
+    parts = {result.channel: _result_record(result) for result in sheet.results}
+    head = {
+        "schema": SCHEMA,
+        "release": sheet.results[0].release if sheet.results else "",
+        "camera": plain(sheet.camera),
+        "conditions": plain(sheet.conditions),
+        "provenance": plain(sheet.provenance),
+        "licence": sheet.licence,
+    }
+    return head | (parts[MONO] if list(parts) == [MONO] else {"channels": parts})
+
+
+def _result_record(result: Results) -> dict[str, Any]:
+    return {
+        "results": {key: value_record(value) for key, value in result.values.items()},
+        "curves": {name: {part: plain(np.atleast_1d(data)) for part, data in curve.items()} for name, curve in result.curves.items()},
+        "notes": list(result.notes),
+    }
+
+
+def value_record(value: Value) -> dict[str, Any]:
+    """Return the plain record of one value."""
+    return {
+        "value": plain(value.value),
+        "u": plain(value.u),
+        "dof": plain(value.dof),
+        "unit": value.unit,
+        "method": value.method,
+        "reason": value.reason,
+        "is_limit": bool(value.is_limit),
+        "is_lower_limit": bool(value.is_lower_limit),
+    }
+
+
+def plain(value: Any) -> Any:
+    """Return a value as JSON can hold it: NumPy's become plain ones, NaN ``None``, infinities ``"inf"`` and ``"-inf"``."""
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None if math.isnan(value) else ("inf" if value > 0 else "-inf")
+    return value if value is None or isinstance(value, bool | int | float) else str(value)
+
+
+def sheet_of_record(record: Mapping[str, Any], where: str = "") -> DataSheet:
+    """Return the data sheet of a record from JSON.
+
+    Raises
+    ------
+    InputError
+        If it is of another kind, or something in it cannot be used.
+    """
+    if record.get("schema") != SCHEMA:
+        found = record.get("schema", "no schema")
+        raise InputError("not a data sheet", where=where, value=found, allowed=SCHEMA, remedy="name a file of `pixmetry emva1288 --json`")
+    release = _of_type(record, "release", str, where)
+    channels = _of_type(record, "channels", dict, where) if "channels" in record else {MONO: record}
+    results = tuple(_result_of(part, release, channel, where) for channel, part in channels.items())
+    camera, conditions, provenance = (_of_type(record, name, dict, where) for name in ("camera", "conditions", "provenance"))
+    return DataSheet(results, camera, conditions, provenance, _of_type(record, "licence", str, where))
+
+
+def _of_type(record: Any, name: str, kind: type, where: str) -> Any:
+    value = record.get(name) if isinstance(record, Mapping) else None
+    if not isinstance(value, kind):
+        allowed = {str: "a text", dict: "keys with values", list: "a list", bool: "true or false"}[kind]
+        raise InputError(f"'{name}' is missing or of the wrong kind", where=where, allowed=allowed, remedy="make the file again")
+    return value
+
+
+def _result_of(record: Any, release: str, channel: str, where: str) -> Results:
+    values = {k: value_of(v, f"{where}: {k}") for k, v in _of_type(record, "results", dict, where).items()}
+    curves = {
+        name: {part: _array_of(data, f"{where}: {name}.{part}") for part, data in _of_type({name: curve}, name, dict, where).items()}
+        for name, curve in _of_type(record, "curves", dict, where).items()
+    }
+    return Results(release, values, curves, tuple(str(note) for note in _of_type(record, "notes", list, where)), channel)
+
+
+def value_of(record: Any, where: str) -> Value:
+    """Return the value of its record.
+
+    Raises
+    ------
+    InputError
+        If something in it cannot be used.
+    """
+    if not isinstance(record, Mapping):
+        raise InputError("is not a value with its uncertainty", where=where, remedy="make the file again")
+    value, u, dof = (number_of(record.get(name), f"{where}.{name}") for name in ("value", "u", "dof"))
+    unit, method, reason = (_of_type(record, name, str, where) for name in ("unit", "method", "reason"))
+    limits = (_of_type(record, name, bool, where) for name in ("is_limit", "is_lower_limit"))
+    return checked(Value(value, u, dof, unit, method, reason, *limits), where)
+
+
+def checked(value: Value, where: str) -> Value:
+    """Return the value if its uncertainty can be one.
+
+    Raises
+    ------
+    InputError
+        If ``u`` is negative or ``dof`` is not positive.
+    """
+    if value.u < 0:
+        raise InputError("negative uncertainty", where=where, value=value.u, allowed="0 or more", remedy="correct the file")
+    if value.dof <= 0:
+        raise InputError("degrees of freedom are not positive", where=where, value=value.dof, allowed="above 0", remedy="correct the file")
+    return value
+
+
+def number_of(value: Any, where: str) -> float:
+    """Return the number that JSON holds as a number, ``null`` (NaN) or ``"inf"``.
+
+    Raises
+    ------
+    InputError
+        If it is none.
+    """
+    if value is None:
+        return math.nan
+    if isinstance(value, str) and value in _INFINITE:
+        return _INFINITE[value]
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise InputError("is not a number", where=where, value=value, allowed='a number, null or "inf"', remedy="correct the file")
+    try:
+        return float(value)
+    except OverflowError:
+        raise InputError("is too large a number", where=where, allowed="up to 1e308", remedy="correct the file") from None
+
+
+def _array_of(data: Any, where: str) -> np.ndarray:
+    if not isinstance(data, list):
+        raise InputError("is not a list of numbers", where=where, remedy="make the file again")
+    kinds = {type(item) for item in data}
+    if kinds == {bool} or (kinds == {int} and max(map(abs, data)) < 1 << 63):
+        return np.array(data)
+    return np.array([number_of(item, where) for item in data], dtype=float)

@@ -1,0 +1,1 @@
+"""The general model of release 4.0: cameras whose response is not a line."""

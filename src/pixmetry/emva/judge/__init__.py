@@ -1,0 +1,1 @@
+"""Data sheets compared: two of them, a fleet, limits."""

@@ -1,0 +1,375 @@
+"""What changed between two measurements of one camera, in units of its uncertainty; and which camera of a fleet stands out.
+
+Differences are judged together: with the confidence ``level`` (0.95), the chance that anything at all is called changed where nothing
+has changed is 1 - level (5 %), by Holm's procedure (1979), which holds whatever the correlation of the values. Keys that say the same
+thing in another unit (K and 1/K, DR in dB) are one decision.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pixmetry.core.checksums import check_record
+from pixmetry.core.errors import InputError
+from pixmetry.emva.files.formats import (
+    SCHEMA,
+    is_xml,
+    number_of,
+    parse_json,
+    plain,
+    read_bytes,
+    read_sheet,
+    sheet_of_record,
+    value_of,
+    value_record,
+)
+from pixmetry.emva.judge.differences import Difference, Subject, decided, difference_of, family, holm
+from pixmetry.emva.judge.fleet import FleetRow, fleet_chance, fleet_row
+from pixmetry.emva.records import MONO, DataSheet, Value
+
+if TYPE_CHECKING:
+    from pixmetry.emva.judge.conformity import Checked, Limits
+
+JUDGED_FLEET = 5  # cameras; among 4 it takes 50 spreads to stand out of 35 values, among 3 more than 1000
+ASSESSMENT_SCHEMA = "pixmetry/results/1"
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Two files beside each other."""
+
+    names: tuple[str, str]
+    kind: str
+    level: float
+    rows: tuple[Difference, ...]
+    decisions: int  # how many were judged together
+    notes: tuple[str, ...] = ()
+
+    def of(self, *verdicts: str) -> tuple[Difference, ...]:
+        """Rows with one of these verdicts."""
+        return tuple(row for row in self.rows if row.verdict in verdicts)
+
+    @property
+    def same(self) -> bool:
+        """Whether nothing changed and nothing was left open."""
+        return not self.of("changed", "differs", "undecided", "only A", "only B")
+
+    def to_record(self) -> dict[str, Any]:
+        """Return the plain record for JSON."""
+        rows = []
+        for row in self.rows:
+            numbers = {"difference": row.difference, "u": row.u, "dof": row.dof, "in_u": row.in_u, "p": row.p}
+            sides = {side: value_record(value) if value else None for side, value in (("a", row.a), ("b", row.b))}
+            head = {"channel": row.channel, "key": row.key, "unit": row.unit, "verdict": row.verdict, "reason": row.reason}
+            rows.append(head | {name: plain(float(number)) for name, number in numbers.items()} | sides)
+        return _head("pixmetry/comparison/1", self) | {"decisions": self.decisions, "rows": rows}
+
+
+@dataclass(frozen=True)
+class Fleet:
+    """Three or more cameras beside each other."""
+
+    names: tuple[str, ...]
+    kind: str
+    level: float
+    rows: tuple[FleetRow, ...]
+    notes: tuple[str, ...] = ()
+
+    @property
+    def same(self) -> bool:
+        """Whether no camera stands out."""
+        return not any(any(row.stands_out) for row in self.rows)
+
+    def to_record(self) -> dict[str, Any]:
+        """Return the plain record for JSON."""
+        rows = [plain({name: getattr(row, name) for name in FleetRow.__dataclass_fields__}) for row in self.rows]
+        return _head("pixmetry/fleet/1", self) | {"rows": rows}
+
+
+def _head(schema: str, result: Comparison | Fleet) -> dict[str, Any]:
+    names, notes = list(result.names), list(result.notes)
+    return {"schema": schema, "names": names, "kind": result.kind, "level": result.level, "same": result.same, "notes": notes}
+
+
+def load(source: DataSheet | str | Path, name: str = "") -> Subject:
+    """Read what is to be compared: a data sheet, its file, or the results of an assessment or their folder.
+
+    Raises
+    ------
+    InputError
+        If it is none of these.
+    """
+    if isinstance(source, DataSheet):
+        return _of_sheet(source, name or str(source.camera.get("name") or "data sheet"))
+    path = Path(source)
+    if path.is_dir():
+        if not (path / "results.json").is_file():
+            raise InputError("folder without results.json", where=str(path), remedy="name a data sheet, or the folder of an assessment")
+        path = path / "results.json"
+    name, raw = name or str(source), read_bytes(path)
+    if is_xml(raw):
+        return _of_sheet(read_sheet(path), name)
+    record = parse_json(raw, str(path))
+    check_record(record, str(path))
+    if record.get("schema") == ASSESSMENT_SCHEMA:
+        return _of_assessment(record, name, str(path))
+    if record.get("schema") != SCHEMA:
+        what, found = "neither a data sheet nor an assessment", record.get("schema", "no schema")
+        raise InputError(what, where=str(path), value=found, allowed=f"{SCHEMA}, {ASSESSMENT_SCHEMA}", remedy="check the file")
+    return _of_sheet(sheet_of_record(record, str(path)), name)
+
+
+def _of_sheet(sheet: DataSheet, name: str) -> Subject:
+    values = {(result.channel, key): value for result in sheet.results for key, value in result.values.items()}
+    release = sheet.results[0].release if sheet.results else ""
+    known = number_of(sheet.conditions.get("photons_u_rel"), f"{name}: photons_u_rel")
+    return Subject(name, "data sheet", release, sheet.camera, values, {}, 0.0 if math.isnan(known) else known)
+
+
+def _of_assessment(record: Mapping[str, Any], name: str, where: str) -> Subject:
+    values: dict[str, Value] = {}
+    try:
+        transfer = (record.get("photon_transfer") or {}).get("estimates", [])
+        groups = {**record["estimates"], "photon_transfer": transfer, "spatial": record.get("spatial") or []}
+        for source, estimates in groups.items():
+            values |= {f"{source}.{e['name']}": _estimate(e) for e in estimates}
+        results = (record.get("emva1288") or {}).get("results", {})
+        standard = {k: v for k, v in results.items() if not k.startswith("index_")}
+        values |= {f"emva1288.{key}": value_of(v, f"{where}: emva1288.{key}") for key, v in standard.items()}
+        budget = record["budget"]
+        values |= _of_budget(budget, _gain_u_rel(groups["photon_transfer"]))
+        how = {"estimator": _estimator_text(budget["estimator"]), "target": str(budget["target"]["kind"])}
+        worth = ((budget["target"], how["estimator"]), float(budget["verdicts"][0]["total_px"]))
+        placed = {(MONO, key): value for key, value in values.items()}
+        return Subject(name, "assessment", "", dict(record["camera"]), placed, dict(record["unmeasured"]), worth=worth, how=how)
+    except (KeyError, IndexError, TypeError, AttributeError, ValueError):
+        raise InputError("damaged results of an assessment", where=where, remedy="make the assessment again") from None
+
+
+def _estimate(e: Mapping[str, Any]) -> Value:
+    dof = math.inf if e["dof"] is None else float(e["dof"])
+    limits = e["kind"] == "upper_limit", e["kind"] == "lower_limit"
+    return Value(float(e["value"]), float(e["u"]), dof, e["unit"], e["method"], e["reason"], *limits)
+
+
+def _gain_u_rel(estimates: Iterable[Mapping[str, Any]]) -> float:
+    """Relative uncertainty of the gain, on which every number of a budget rests."""
+    return next((float(e["u"]) / float(e["value"]) for e in estimates if e["name"] == "gain_dn_per_e" and e["value"]), 0.0)
+
+
+def _estimator_text(estimator: Mapping[str, Any]) -> str:
+    """Name and settings; not what follows from camera and target."""
+    settings = {k: estimator[k] for k in ("window", "sigma") if estimator.get(k) is not None}
+    return ", ".join([str(estimator["name"]), *(f"{k} = {v:g}" for k, v in settings.items())])
+
+
+def _of_budget(budget: Mapping[str, Any], gain_u_rel: float) -> dict[str, Value]:
+    """Target, rows and totals of a budget, with u of what repeating the measurement would change.
+
+    Of a measured row that is what its parameters leave open, of all others half of what its formula declares to leave open; with both the
+    gain's. A total holds the rows', each as far as it counts, the gain's, which all of them share, and the error of chance where it is by
+    Monte Carlo.
+    """
+    units = {True: "px", False: "1"}
+    values = {f"budget.target.{k}": Value(float(v), 0.0, math.inf, units[k.endswith("_px")]) for k, v in _numbers(budget["target"])}
+    squares = {True: 0.0, False: 0.0}
+    for row in budget.get("rows", ()):
+        contribution, total = row["contribution"], float(row["total_px"])
+        if contribution is None or row["status"] in ("not applicable", "left to calibration"):
+            continue
+        formula = 0.5 * max(float(contribution["model_error"]) * total, float(contribution["floor_px"]))
+        known = float(row["u_of_total_px"]) if row["status"] == "measured" else formula
+        values[f"budget.{row['name']}"] = Value(total, math.hypot(known, gain_u_rel * total), math.inf, "px", row["status"], "")
+        squares[row["status"] == "accepted"] += (total * known) ** 2
+    by = budget.get("headline") or {}
+    chance = float(by.get("se_simulated_px") or 0.0) if by.get("by") == "Monte Carlo" else 0.0
+    for group, square in (("verdicts", squares[False]), ("with_accepted", squares[False] + squares[True])):
+        for one in budget.get(group, ()):
+            total = float(one["total_px"])
+            u = math.hypot(math.sqrt(square) / total if total else 0.0, gain_u_rel * total, chance)
+            key = f"budget.{'verdict' if group == 'verdicts' else group}.{one.get('frames', 1)}_frames"
+            values[key] = Value(total, u, math.inf, "px", str(by.get("by", "sum")), "")
+    return values
+
+
+def _numbers(record: Mapping[str, Any]) -> list[tuple[str, float]]:
+    return [(k, v) for k, v in record.items() if isinstance(v, int | float) and not isinstance(v, bool)]
+
+
+def compare(
+    a: DataSheet | str | Path, b: DataSheet | str | Path, *, level: float = 0.95, same_light: bool = False, names: Sequence[str] = ("", "")
+) -> Comparison:
+    """Say what changed between two measurements, in units of its uncertainty.
+
+    Parameters
+    ----------
+    a, b : DataSheet, str or Path
+        Two data sheets (or their JSON or XML files), or the results of two assessments (``results.json`` or their folder).
+        The two measurements are taken as independent.
+    level : float
+        Confidence over all values together: with 0.95 there is a chance of at most 5 % that anything is called changed if nothing did.
+    same_light : bool
+        Both were measured with one calibration of the light: what its uncertainty ``photons_u_rel`` adds to the values that are counted
+        in photons is common to both and is taken off.
+    names : two str
+        What to call them.
+
+    Returns
+    -------
+    Comparison
+
+    Raises
+    ------
+    InputError
+        If a file cannot be read, or the two have nothing in common.
+
+    Notes
+    -----
+    The difference over its uncertainty is compared with Student's distribution, its degrees of freedom by Welch and Satterthwaite
+    (JCGM 100, G.4). Where one side is a one-sided upper limit, only a value above that limit counts, by as much as it is above.
+    """
+    _check_level(level)
+    one, two = load(a, names[0]), load(b, names[1])
+    if one.kind != two.kind:
+        raise InputError(f"{one.name} is a {one.kind} and {two.name} a {two.kind}", remedy="compare two of one kind")
+    channels = {channel for channel, _ in one.values} & {channel for channel, _ in two.values}
+    if not channels:
+        raise InputError("no channel in common", where=f"{one.name}, {two.name}", remedy="compare sheets with the same colours")
+    keys = [place for place in {**one.values, **two.values} if place[0] in channels]
+    rows = [difference_of(place, one, two, same_light) for place in keys]
+    changed, decisions = holm([row.p for row in rows], _families(rows), 1 - level)
+    rows = [decided(row, place in changed) for place, row in enumerate(rows)]
+    rows += [_how(key, one.how[key], two.how[key]) for key in one.how if key in two.how]
+    notes = _notes((one, two))
+    if all(row.verdict in ("same", "equal") and not row.difference > 0 and not row.difference < 0 for row in rows):
+        notes.append("all values are identical: two copies of one measurement")
+    return Comparison((one.name, two.name), one.kind, level, tuple(rows), decisions, tuple(notes))
+
+
+def _families(rows: Sequence[Difference]) -> list[Any]:
+    """Rows that say the same thing: by their keys, or by their numbers where several parts of an assessment hold one value."""
+    first: dict[Any, Any] = {}
+    found = []
+    for row in rows:
+        numbers = (row.unit, *((v.value, v.u) if v else None for v in (row.a, row.b)))
+        found.append(first.setdefault(numbers, family(row.channel, row.key)) if row.p == row.p else family(row.channel, row.key))
+    return found
+
+
+def _how(key: str, a: str, b: str) -> Difference:
+    """A row for what is no number."""
+    verdict, reason = ("equal", a) if a == b else ("differs", f"{a} in A, {b} in B")
+    return Difference(MONO, f"budget.{key}", "", None, None, verdict=verdict, reason=reason)
+
+
+def _check_level(level: float) -> None:
+    if not 0.5 <= level < 1:
+        raise InputError("not a level of confidence", where="level", value=level, allowed="0.5 up to below 1", remedy="take 0.95")
+
+
+def _notes(subjects: Sequence[Subject], passed_over: frozenset[str] = frozenset()) -> list[str]:
+    """What the reader must know before believing the rest."""
+    notes = []
+    releases = list(dict.fromkeys(s.release or "not stated" for s in subjects))
+    if len(releases) > 1:
+        notes.append(f"releases differ ({', '.join(releases)}): differences of definition count as changes")
+    for field in sorted({name for s in subjects for name in s.camera} - passed_over):
+        values = [str(s.camera[field]) for s in subjects if s.camera.get(field) is not None]
+        if len(values) == len(subjects) and len(set(values)) > 1:
+            notes.append(f"{field} differs: {', '.join(dict.fromkeys(values))}")
+    channels = [{channel for channel, _ in s.values} for s in subjects]
+    rest = sorted(set().union(*channels) - channels[0].intersection(*channels))
+    if rest:
+        notes.append(f"left out, as not all have them: channels {', '.join(rest)}")
+    if all(s.worth for s in subjects) and len({str(s.worth[0]) for s in subjects}) == 1:
+        notes.append(f"a coordinate of one target in one frame is worth {', '.join(f'{s.worth[1]:.3g}' for s in subjects)} px (k = 1)")
+    elif all(s.worth for s in subjects):
+        notes.append("target or estimator differ: what a coordinate is worth is not that of one task")
+    return notes
+
+
+def compare_fleet(sources: Iterable[DataSheet | str | Path], *, level: float = 0.95, names: Sequence[str] | None = None) -> Fleet:
+    """Hold each camera of a fleet against the fleet.
+
+    Parameters
+    ----------
+    sources : iterable of DataSheet, str or Path
+        At least three; as for `compare`.
+    level : float
+        Confidence over all values and cameras together: with 0.95 there is a chance of at most 5 % that any camera is said to stand out
+        from a fleet whose values are normally distributed.
+    names : sequence of str, optional
+
+    Returns
+    -------
+    Fleet
+
+    Raises
+    ------
+    InputError
+        If a file cannot be read, the kinds differ, there are fewer than three, or they have no channel in common.
+
+    Notes
+    -----
+    The spread is the distance from the median within which three quarters of the cameras lie, over 1.15 as for a normal distribution:
+    up to a quarter of them may be odd without hiding each other. It is at least the median of the uncertainties; a camera whose own
+    uncertainty is larger than that is judged with the difference added. How far a camera of a normal fleet of this size lies from the
+    median in units of such a spread is drawn once, from a keyed stream; then Holm over all values and cameras.
+    """
+    _check_level(level)
+    sources = list(sources)
+    if len(sources) < 3:
+        raise InputError("a fleet has three cameras or more", value=len(sources), remedy="compare two of them with each other")
+    subjects = [load(source, name) for source, name in zip(sources, names or [""] * len(sources), strict=True)]
+    kinds = list(dict.fromkeys(s.kind for s in subjects))
+    if len(kinds) > 1:
+        raise InputError(f"files of several kinds: {', '.join(kinds)}", remedy="compare files of one kind")
+    channels = [{channel for channel, _ in s.values} for s in subjects]
+    common = channels[0].intersection(*channels)
+    if not common:
+        raise InputError("no channel in common", remedy="compare sheets with the same colours")
+    # settings, and what is there under another name
+    passed_over = ("index_", "budget.target.", "photon_transfer.", "spatial.", "emva1288.")
+    places = dict.fromkeys(place for s in subjects for place in s.values if place[0] in common and not place[1].startswith(passed_over))
+    rows = [row for place in places if (row := fleet_row(place, subjects)) is not None]
+    flat = [(i, j, score) for i, row in enumerate(rows) for j, score in enumerate(row.scores)]
+    p = [fleet_chance(sum(map(math.isfinite, rows[i].values)), score) for i, _, score in flat]
+    families = [(*family(rows[i].channel, rows[i].key), j) for i, j, _ in flat]
+    found, _ = holm(p, families, 1 - level)
+    out = {(flat[at][0], flat[at][1]) for at in found}
+    rows = [replace(row, stands_out=tuple((i, j) in out for j in range(len(subjects)))) for i, row in enumerate(rows)]
+    notes = _notes(subjects, frozenset({"name", "serial_number"}))
+    if len(subjects) < JUDGED_FLEET:
+        few = f"{len(subjects)} cameras hardly tell their own spread, so that only a gross outlier would stand out"
+        notes.append(f"{few}: name {JUDGED_FLEET} or more")
+    return Fleet(tuple(s.name for s in subjects), kinds[0], level, tuple(rows), tuple(notes))
+
+
+def check_limits(source: DataSheet | str | Path, limits: Limits | str | Path) -> tuple[Checked, ...]:
+    """Hold the values of one camera against limits; each key in every channel.
+
+    Parameters
+    ----------
+    source : DataSheet, str or Path
+        As for `compare`.
+    limits : Limits, str or Path
+        A file of limits (YAML), or what `pixmetry.emva.judge.conformity.load_limits` read of it.
+
+    Returns
+    -------
+    tuple of Checked
+        ``key``, ``channel``, ``value``, and in ``judgement`` the ``verdict``: ``"pass"``, ``"fail"`` or ``"undecided"``.
+
+    Raises
+    ------
+    InputError
+        If a file cannot be read, a key does not exist, or a unit is missing or another one.
+    """
+    from pixmetry.emva.judge.conformity import Limits, check, load_limits
+
+    given = limits if isinstance(limits, Limits) else load_limits(limits)
+    return check(load(source).values, given)

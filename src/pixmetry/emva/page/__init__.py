@@ -1,0 +1,1 @@
+"""The pages of a data sheet, on screen and on paper."""

@@ -1,0 +1,307 @@
+"""Decoding of image files by their content, and of the frames in files that hold several.
+
+``stack.tif/7`` names frame 7 (from 0) of a file with several, as ``frames.zarr/7`` names one of a store.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from pathlib import Path
+
+import numpy as np
+
+from pixmetry.core.errors import InputError
+from pixmetry.core.memory import check_memory
+from pixmetry.files import bmp, fits, jpeg, tiff
+from pixmetry.files.png import PALETTE, png_head
+from pixmetry.files.png import SIGNATURE as PNG
+from pixmetry.files.raw_values import RawLayout
+
+FORMATS = "grey PNG, TIFF, BMP, FITS or NPY with 8 or 16 bits"
+NPY = b"\x93NUMPY"
+HEAD_BYTES = 16
+_TURNS = {2: "mirrored", 3: "by 180°", 4: "mirrored, by 180°", 5: "mirrored, by 90°", 6: "by 90°", 7: "mirrored, by 270°", 8: "by 270°"}
+
+Read = Callable[[int, int], bytes]
+
+
+@dataclass(frozen=True)
+class Decoded:
+    """An image as its file has it.
+
+    Parameters
+    ----------
+    array : ndarray, shape (rows, cols) or (rows, cols, channels)
+    lossless : bool or None
+        Whether its coder keeps every value; None: not known.
+    notes : tuple of str
+        What the reader should know: loss, or that it is to be turned for display.
+    """
+
+    array: np.ndarray
+    lossless: bool | None = True
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class FrameFile:
+    """A file with one frame or several, opened: how many there are, and how one is read."""
+
+    count: int
+    read: Callable[[int], Decoded]
+
+
+def is_frame(path: Path) -> bool:
+    """Tell whether a path names a frame in a file, as ``stack.tif/7`` does."""
+    return path.name.isdecimal() and path.parent.is_file()
+
+
+def frame_name(path: Path) -> str:
+    """Name of an image for tables and messages: of a frame in a file with the file's name."""
+    return f"{path.parent.name}/{path.name}" if is_frame(path) else path.name
+
+
+def frames_of(path: Path, raw: RawLayout | None = None) -> list[Path]:
+    """Name the frames of a file: the file itself where it holds one.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, or is damaged.
+    """
+    if not path.is_file() or (not raw_file(path, raw) and not _may_hold_several(path)):
+        return [path]
+    count = opened(path, raw).count
+    return [path] if count == 1 else [path / str(k) for k in range(count)]
+
+
+def raw_file(path: Path, raw: RawLayout | None) -> bool:
+    """Whether a file holds values without a header: where a layout is given, any whose ending is not that of a format with one."""
+    return raw is not None and path.suffix.lower() not in KNOWN_ENDINGS
+
+
+KNOWN_ENDINGS = (".png", ".tif", ".tiff", ".npy", ".bmp", ".fits", ".fit", ".fts", ".jpg", ".jpeg")
+
+
+def _may_hold_several(path: Path) -> bool:
+    with _told_of(path), path.open("rb") as file:
+        head = file.read(HEAD_BYTES)
+    return head.startswith((*tiff.MARKS, NPY, fits.SIGNATURE))
+
+
+def read_stacked(path: Path, raw: RawLayout | None = None) -> tuple[Decoded, str, int]:
+    """Read one frame of a file with several, the SHA-256 of its values (row by row, low byte first), and their size in bytes.
+
+    Raises
+    ------
+    InputError
+        If the file is damaged, or has no such frame.
+    """
+    file, index = opened(path.parent, raw), int(path.name)
+    if index >= file.count:
+        raise InputError("the file has no such frame", where=str(path.parent), value=index, allowed=f"0 to {file.count - 1}")
+    with _told_of(path):
+        found = file.read(index)
+    values = np.ascontiguousarray(found.array, found.array.dtype.newbyteorder("<")).tobytes()
+    return found, hashlib.sha256(values).hexdigest(), len(values)
+
+
+def opened(path: Path, raw: RawLayout | None = None) -> FrameFile:
+    """Open a file that may hold several frames; what was parsed is kept, as long as the file does not change.
+
+    Raises
+    ------
+    InputError
+        If it is damaged, or of no known kind.
+    """
+    with _told_of(path):
+        stat = path.stat()
+        return _opened(path, stat.st_mtime_ns, stat.st_size, raw if raw_file(path, raw) else None)
+
+
+@lru_cache(maxsize=16)
+def _opened(path: Path, modified_ns: int, size: int, raw: RawLayout | None) -> FrameFile:
+    read, lock = partial(_read_part, path), threading.Lock()
+    if raw is not None:
+        start, length = raw.skip_bytes, raw.frame_bytes
+        return FrameFile(raw.frames_in(size), lambda k: Decoded(raw.decode(read(start + k * length, length))))
+    with path.open("rb") as file:
+        head = file.read(HEAD_BYTES)
+        file.seek(0)
+        if head.startswith(tiff.MARKS):
+            return _tiff_file(tiff.pages(file, size), read, lock)
+    if head.startswith(fits.SIGNATURE):
+        return _fits_file(fits.planes(read, size), read)
+    if head.startswith(NPY):
+        return _npy_file(read, size)
+    raise InputError("not a file with several frames", allowed="TIFF, FITS, NPY, or raw values with their layout")
+
+
+def _read_part(path: Path, offset: int, count: int) -> bytes:
+    with path.open("rb") as file:
+        file.seek(offset)
+        return file.read(count)
+
+
+def _part_of(raw: bytes, offset: int, count: int) -> bytes:
+    return raw[offset : offset + count]
+
+
+def decode(raw: bytes, path: Path, *, lossy: bool = False) -> Decoded:
+    """Decode an image file by its content, not by the name's ending.
+
+    Parameters
+    ----------
+    raw : bytes
+    path : Path
+        For messages.
+    lossy : bool
+        Take JPEG files too.
+
+    Raises
+    ------
+    InputError
+        If it is damaged, of another kind, holds several images, or needs more memory than there is.
+    """
+    with _told_of(path):
+        if raw.startswith(jpeg.SIGNATURE):
+            if not lossy:
+                remedy = "store frames without loss: JPEG removes the noise to be measured"
+                raise InputError("JPEG image", allowed=FORMATS, remedy=remedy)
+            return _jpeg(raw)
+        if raw.startswith(PNG):
+            return _png(raw)
+        if raw.startswith(bmp.SIGNATURE):
+            return Decoded(bmp.decode_bmp(raw))
+        read = partial(_part_of, raw)
+        if raw.startswith(tiff.MARKS):
+            file = _tiff_file(tiff.pages(io.BytesIO(raw), len(raw)), read, threading.Lock())
+        elif raw.startswith(fits.SIGNATURE):
+            file = _fits_file(fits.planes(read, len(raw)), read)
+        elif raw.startswith(NPY):
+            file = _npy_file(read, len(raw))
+        else:
+            what = "file is empty" if not raw else "not an image of a known format"
+            remedy = "copy or export the frame again; values without a header need their layout (`raw`)"
+            raise InputError(what, allowed=FORMATS, remedy=remedy)
+        if file.count != 1:
+            remedy = f"name one of them, such as {path.name}/0, or give the file where a stack of frames is expected"
+            raise InputError(f"a file with {file.count} images", allowed="one frame", remedy=remedy)
+        return file.read(0)
+
+
+@contextmanager
+def _told_of(path: Path) -> Iterator[None]:
+    """Name the file in errors; every decoder has its own exceptions, and all of them mean a damaged file here."""
+    try:
+        yield
+    except InputError as problem:
+        where = problem.where or str(path)
+        raise InputError(problem.what, where=where, value=problem.value, allowed=problem.allowed, remedy=problem.remedy) from None
+    except FileNotFoundError:
+        raise InputError("file is missing", where=str(path), remedy="check the name") from None
+    except OSError as problem:
+        raise InputError("file cannot be read", where=str(path), value=problem.strerror, remedy="check the permissions") from None
+    except MemoryError:
+        raise InputError("image needs more memory than there is", where=str(path), remedy="cut the image into parts") from None
+    except Exception as problem:
+        reason = str(problem).splitlines()[0] if str(problem) else type(problem).__name__
+        raise InputError(f"image is damaged or cut off ({reason})", where=str(path), remedy="copy or export the frame again") from None
+
+
+def _png(raw: bytes) -> Decoded:
+    import imagecodecs
+
+    head = png_head(raw)
+    check_memory(head.decoded_bytes, _what(head.cols, head.rows), remedy="cut the image into parts")
+    image: np.ndarray = imagecodecs.png_decode(raw)
+    if image.ndim == 3 and image.shape[2] in (2, 4):
+        image = tiff.opaque(image)
+    if head.colour == PALETTE and image.ndim == 3 and (image == image[:, :, :1]).all():  # a palette of greys
+        image = image[:, :, 0]
+    return Decoded(image[:, :, 0] if image.ndim == 3 and image.shape[2] == 1 else image)
+
+
+def _jpeg(raw: bytes) -> Decoded:
+    import imagecodecs
+
+    facts = jpeg.jpeg_facts(raw)
+    if facts.components not in (1, 3):
+        remedy = "export the image in RGB, or as PNG"
+        raise InputError(f"JPEG with {facts.components} colours", allowed="grey or colour (RGB)", remedy=remedy)
+    needed = facts.rows * facts.cols * facts.components * (1 if facts.bits <= 8 else 2)
+    check_memory(needed, _what(facts.cols, facts.rows), remedy="cut the image into parts")
+    coder = "JPEG, without loss" if facts.lossless else "JPEG: noise and fine structure are those that its coder left"
+    return Decoded(imagecodecs.jpeg_decode(raw), facts.lossless, (coder, *_turned(facts.orientation)))
+
+
+def _turned(orientation: int) -> tuple[str, ...]:
+    turn = _TURNS.get(orientation)
+    return () if turn is None else (f"the file says that it is to be turned for display ({turn}): positions are those of the stored rows",)
+
+
+def _what(cols: int, rows: int) -> str:
+    return f"an image of {cols} x {rows} pixels"
+
+
+def _tiff_file(pages: list[tiff.TiffPage], read: Read, lock: threading.Lock) -> FrameFile:
+    def one(k: int) -> Decoded:
+        page = tiff.with_coder(pages[k], read)
+        check_memory(page.decoded_bytes, _what(page.shaped[3], page.shaped[2]), remedy="cut the image into parts")
+        loss = ("JPEG inside a TIFF: noise and fine structure are those that its coder left",) if page.lossless is False else ()
+        return Decoded(page.image(read), page.lossless, (*loss, *_turned(page.orientation)))
+
+    return FrameFile(len(pages), one)
+
+
+def _fits_file(planes: list[fits.Plane], read: Read) -> FrameFile:
+    def one(k: int) -> Decoded:
+        plane = planes[k]
+        check_memory(2 * plane.stored_bytes, _what(plane.cols, plane.rows), remedy="cut the image into parts")
+        return Decoded(plane.decode(read(plane.offset, plane.stored_bytes)))
+
+    return FrameFile(len(planes), one)
+
+
+def _npy_file(read: Read, size: int) -> FrameFile:
+    start, shape, dtype, fortran = _npy_head(read, size)
+    if len(shape) == 3 and shape[2] in (3, 4) and shape[1] > 4:  # a colour image, not frames of three columns
+        shape = (1, *shape)
+    if len(shape) not in (2, 3, 4) or 0 in shape:
+        raise InputError(f"an array of shape {shape}", allowed="rows and columns, or frames, rows and columns", remedy="store it so")
+    frames = 1 if len(shape) == 2 else shape[0]
+    one_shape = shape if len(shape) == 2 else shape[1:]
+    step = int(np.prod(one_shape, dtype=np.int64)) * dtype.itemsize
+
+    def one(k: int) -> Decoded:
+        check_memory(2 * step, _what(one_shape[1], one_shape[0]), remedy="cut the image into parts")
+        if not fortran:
+            return Decoded(np.frombuffer(read(start + k * step, step), dtype).reshape(one_shape))
+        whole = np.frombuffer(read(start, frames * step), dtype).reshape(shape, order="F")
+        return Decoded(whole if len(shape) == 2 else whole[k])
+
+    return FrameFile(frames, one)
+
+
+def _npy_head(read: Read, size: int) -> tuple[int, tuple[int, ...], np.dtype, bool]:
+    """Where the values begin, their shape and type, and whether columns are stored one by one."""
+    from numpy.lib import format as npy
+
+    head = io.BytesIO(read(0, min(size, 1 << 16)))
+    version = npy.read_magic(head)
+    reader = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}.get(version)
+    if reader is None:
+        raise ValueError(f"version {version} of the format")
+    shape, fortran, dtype = reader(head)
+    if dtype.hasobject:
+        raise InputError("an array of objects", allowed="an array of numbers", remedy="store numbers")
+    start = head.tell()
+    if start + int(np.prod([int(n) for n in shape], dtype=object) if shape else 1) * dtype.itemsize > size or any(n < 0 for n in shape):
+        raise ValueError("values are missing")
+    return start, tuple(int(n) for n in shape), dtype, fortran

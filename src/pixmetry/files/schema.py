@@ -1,0 +1,146 @@
+"""The keys of a campaign's manifest, and what each may hold."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator, Field, model_validator
+
+from pixmetry.core.config import Model
+from pixmetry.core.errors import InputError
+from pixmetry.files.raw_values import RawLayout
+
+CAMPAIGN_SCHEMA = "pixmetry/campaign/1"
+
+Positive = Annotated[float, Field(gt=0)]
+Pitch = Annotated[float, Field(ge=0.1, le=1000)]  # µm
+Side = Annotated[int, Field(ge=1, le=1_000_000)]
+
+
+def _quoted(value: Any) -> Any:
+    """A serial number of digits alone is a number for YAML, and zeros at its head are gone."""
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        raise InputError("a number where a text belongs", value=value, allowed="a text in quotes", remedy="put it in quotes, as in '0815'")
+    return value
+
+
+Text = Annotated[str, Field(min_length=1), BeforeValidator(_quoted)]
+Names = Annotated[
+    tuple[Annotated[str, Field(min_length=1)], ...], Field(min_length=1), BeforeValidator(lambda v: (v,) if isinstance(v, str) else v)
+]
+
+
+class CameraModel(Model):
+    """Facts of the camera."""
+
+    name: str
+    bits: Annotated[int, Field(ge=1, le=16)]
+    pitch_um: Pitch | None = None
+    pitch_x_um: Pitch | None = None
+    pitch_y_um: Pitch | None = None
+    interface: Literal["digital", "analogue"] = "digital"
+    sensor: Literal["ccd", "cmos"] | None = None
+    temperature_c: Annotated[float, Field(ge=-273.15)] | None = None
+    pixel_clock_mhz: Positive | None = None
+    cfa: Literal["RGGB", "BGGR", "GRBG", "GBRG"] | None = None
+    vendor: Text | None = None
+    model: Text | None = None
+    serial_number: Text | None = None
+    sensor_cols: Side | None = None
+    sensor_rows: Side | None = None
+    first_col: Annotated[int, Field(ge=0)] | None = None
+    first_row: Annotated[int, Field(ge=0)] | None = None
+    lossless: bool | None = None
+
+    @model_validator(mode="after")
+    def _whole_sensor(self) -> CameraModel:
+        for one, other in (("sensor_cols", "sensor_rows"), ("first_col", "first_row")):
+            if (getattr(self, one) is None) != (getattr(self, other) is None):
+                raise InputError(f"{one} and {other} belong together", allowed="both or neither", remedy="add the one that is missing")
+        if self.first_col is not None and self.sensor_cols is None:
+            raise InputError("a window of a sensor whose size is not given", remedy="add sensor_cols and sensor_rows")
+        return self
+
+    @model_validator(mode="after")
+    def _one_pitch(self) -> CameraModel:
+        if self.pitch_um is not None and (self.pitch_x_um is not None or self.pitch_y_um is not None):
+            raise InputError("pitch is given twice", allowed="pitch_um, or pitch_x_um with pitch_y_um", remedy="delete one of them")
+        if (self.pitch_x_um is None) != (self.pitch_y_um is None):
+            raise InputError(
+                "pitch is known in one direction only", allowed="pitch_x_um and pitch_y_um", remedy="add the other, or use pitch_um"
+            )
+        return self
+
+
+class OpticsModel(Model):
+    """Facts of light and lens."""
+
+    wavelength_nm: Annotated[float, Field(ge=10, le=20000)] | None = None
+    f_number: Positive | None = None
+    focal_length_mm: Positive | None = None
+    irradiance_uw_per_cm2: Positive | None = None
+    light_source: Text | None = None
+
+
+class GroupModel(Model):
+    """Frames under one condition."""
+
+    kind: Literal["dark", "bright"]
+    exposure_s: Annotated[float, Field(ge=0)]
+    photons: Annotated[float, Field(ge=0)] | None = None
+    irradiance_uw_per_cm2: Positive | None = None
+    role: Literal["level", "stack"] | None = None
+    files: Names
+
+    @model_validator(mode="after")
+    def _light(self) -> GroupModel:
+        if self.kind == "dark" and (self.photons or self.irradiance_uw_per_cm2):
+            raise InputError("a dark group has light", allowed="no photons and no irradiance", remedy="write kind: bright, or delete them")
+        if self.kind == "bright" and (self.photons == 0 or self.exposure_s == 0 and self.photons is None):
+            raise InputError(
+                "a bright group without exposure or photons", allowed="values above 0", remedy="write kind: dark, or correct them"
+            )
+        if self.photons is not None and self.irradiance_uw_per_cm2 is not None:
+            raise InputError("light is given twice", allowed="photons or irradiance_uw_per_cm2", remedy="delete one of them")
+        return self
+
+
+class RawModel(Model):
+    """Layout of frames in files without a header."""
+
+    width: Side
+    height: Side
+    pixel_format: str
+    skip_bytes: Annotated[int, Field(ge=0)] = 0
+
+    @model_validator(mode="after")
+    def _known(self) -> RawModel:
+        RawLayout(**self.model_dump())
+        return self
+
+
+class ManifestModel(Model):
+    """A campaign: facts, and frames listed here or in an EMVA 1288 descriptor."""
+
+    schema_: Annotated[Literal["pixmetry/campaign/1"], Field(alias="schema")]
+    camera: CameraModel
+    optics: Annotated[OpticsModel, BeforeValidator(lambda v: v or {})] = OpticsModel()
+    frames: Annotated[tuple[GroupModel, ...], BeforeValidator(lambda v: v or ())] = ()
+    emva_descriptor: str | None = None
+    raw: RawModel | None = None
+    licence: str = ""
+    notes: str = ""
+    operator: str = ""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _not_empty(cls, data: Any) -> Any:
+        if not data:
+            raise InputError("the manifest is empty", remedy=f"begin with `schema: {CAMPAIGN_SCHEMA}`, then camera and frames")
+        return data
+
+    @model_validator(mode="after")
+    def _one_list(self) -> ManifestModel:
+        if self.frames and self.emva_descriptor:
+            raise InputError("frames are listed twice", allowed="frames or emva_descriptor", remedy="delete one of them")
+        return self

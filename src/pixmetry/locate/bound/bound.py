@@ -1,0 +1,288 @@
+"""What a camera can make of a target: the bound, the estimators beside it, and what limits them, as one plain record."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from pixmetry.core.errors import InputError
+from pixmetry.locate.bound import closed_bounds as closed
+from pixmetry.locate.bound.fisher import Bound, bound, bound_of, pixel_noise
+from pixmetry.locate.bound.predictions import PixelNoise, Prediction, names_for, predict
+from pixmetry.locate.noise import NoiseModel
+from pixmetry.locate.template.template_images import Images, axes_of, draw_images, line_length_px
+
+__all__ = ["Bound", "Limit", "Possible", "bound", "possible"]
+
+SETS = ("position", "light", "shape", "planes")
+WITHIN = 1.05  # frames are averaged until the uncertainty is within 5 % of what stays
+MOST_FRAMES, VERY_MANY = 10**6, 10**12
+UNKNOWN_PX = 1.0  # a place that is less sure than this is not known
+LEFT_OUT = (
+    "the noise is Gaussian, independent from pixel to pixel, and of known variance: that the variance tells of the light too is not used",
+    "first order: where the noise is as large as the target, errors are larger than this",
+    "geometry, drift, lighting, and a target that is not what the template says, are not in it",
+)
+
+
+@dataclass(frozen=True)
+class Limit:
+    """One cause of an estimator's uncertainty: a share of its variance, mean over both coordinates and the phases."""
+
+    cause: str
+    variance_px2: float
+    share: float
+
+
+@dataclass(frozen=True)
+class Possible:
+    """What is possible, what estimators give, and what limits.
+
+    Parameters
+    ----------
+    kind : str
+    parameters : dict
+        Of the target, without place.
+    noise : str
+        In words.
+    window_px, frames : int
+    bounds : dict of str to Bound
+        By set of unknowns; that of the question is under ``asked``.
+    closed_forms_px : dict of str to float
+        Standard deviations in closed form, with what they hold for.
+    predictions : tuple of Prediction
+    chosen : Prediction
+        The estimator whose limits are given.
+    limits : tuple of Limit
+        Largest first; the shares add up to 1.
+    frames_worth : int or None
+        So many frames bring the uncertainty within 5 % of what averaging does not remove; None if it goes on falling as 1/√N.
+    advice, statements : tuple of str
+    """
+
+    kind: str
+    parameters: dict[str, float]
+    noise: str
+    window_px: int
+    frames: int
+    bounds: dict[str, Bound]
+    closed_forms_px: dict[str, float]
+    predictions: tuple[Prediction, ...]
+    chosen: Prediction
+    limits: tuple[Limit, ...]
+    frames_worth: int | None
+    advice: tuple[str, ...]
+    statements: tuple[str, ...]
+
+    @property
+    def u_px(self) -> float:
+        """The bound of one coordinate for the unknowns that were asked for, mean over the phases."""
+        return self.bounds["asked"].place_px[1]
+
+    def to_record(self) -> dict[str, Any]:
+        """Plain values for JSON; infinite ones are None."""
+
+        def number(value: float) -> float | None:
+            return float(value) if np.isfinite(value) else None
+
+        def of(b: Bound) -> dict[str, Any]:
+            names = ("least", "mean", "greatest")
+            per = {n: dict(zip(names, map(number, b.u(n)), strict=True)) for n in b.unknowns}
+            return {"unknowns": list(b.unknowns), "u_px": dict(zip(names, map(number, b.place_px), strict=True)), "u": per}
+
+        predicted = [
+            {"estimator": p.name, "u_px": number(p.u_px), "noise_px": number(p.noise_px), "s_curve_px": number(p.s_curve_px)}
+            | {"over_bound": number(p.u_px / self.u_px), "detail": p.detail}
+            for p in self.predictions
+        ]
+        return {
+            "schema": "pixmetry/bound/1",
+            "origin": "(0, 0) is the centre of the top-left pixel",
+            "kind": self.kind,
+            "parameters": self.parameters,
+            "noise": self.noise,
+            "window_px": self.window_px,
+            "frames": self.frames,
+            "exact_codes": self.bounds["asked"].exact_codes,
+            "bounds": {name: of(b) for name, b in self.bounds.items()},
+            "closed_forms_px": self.closed_forms_px,
+            "predictions": predicted,
+            "estimator": self.chosen.name,
+            "limits": [vars(x) for x in self.limits],
+            "frames_worth": self.frames_worth,
+            "advice": list(self.advice),
+            "statements": list(self.statements),
+        }
+
+
+def possible(
+    kind: str,
+    parameters: Mapping[str, float],
+    noise: NoiseModel,
+    unknowns: str | tuple[str, ...] | list[str] = "shape",
+    *,
+    estimator: str = "template",
+    frames: int = 1,
+    aperture_px: float = 1.0,
+    light_on: str = "surface",
+    window_px: int | None = None,
+    phases: int = 5,
+    rounded: bool = True,
+    pattern_dn: float = 0.0,
+) -> Possible:
+    """Say how well a target can be located, what estimators give, and what limits the one that is named.
+
+    Parameters
+    ----------
+    kind, parameters, noise, unknowns, frames, aperture_px, light_on, window_px, phases, rounded, pattern_dn
+        As for `bound`.
+    estimator : str
+        Whose limits are asked for: one of `pixmetry.locate.bound.predictions.names_for` this kind.
+
+    Raises
+    ------
+    InputError
+        If a value cannot be used.
+    """
+    images = draw_images(kind, parameters, aperture_px=aperture_px, light_on=light_on, window_px=window_px, phases=phases)
+    names = names_for(kind)
+    if estimator not in names:
+        raise InputError(f"no such estimator to predict for a {kind}", where="estimator", value=estimator, allowed=", ".join(names))
+    pixels = pixel_noise(images, noise, rounded, pattern_dn, frames)
+    asked = images.subset(unknowns)
+    bounds = {"asked": bound_of(images, pixels, asked, noise, rounded)}
+    bounds |= {name: bound_of(images, pixels, images.subset(name), noise, rounded) for name in SETS}
+    if not bounds["asked"].place_px[1] < UNKNOWN_PX:
+        raise InputError(
+            "the image does not tell the place together with the other unknowns",
+            where="unknowns",
+            value=", ".join(asked),
+            remedy="ask for fewer unknowns, or give a target with more contrast inside the scale",
+        )
+    predictions = tuple(predict(name, images, pixels, asked) for name in names)
+    chosen = predictions[names.index(estimator)]
+    worth = frames_worth(lambda n: predict(estimator, images, replace(pixels, frames=n), asked).u_px)
+    return Possible(
+        kind=kind,
+        parameters={n: v for n, v in images.parameters.items() if n not in images.place},
+        noise=noise.describe() + (", rounding included" if rounded else ", not rounded"),
+        window_px=images.window_px,
+        frames=pixels.frames,
+        bounds=bounds,
+        closed_forms_px=closed_forms(images, noise, frames),
+        predictions=predictions,
+        chosen=chosen,
+        limits=limits(chosen, images, pixels, asked),
+        frames_worth=worth,
+        advice=tuple(_advice(predictions, worth, bounds)),
+        statements=tuple(_statements(bounds["asked"], rounded)),
+    )
+
+
+def limits(chosen: Prediction, images: Images, pixels: PixelNoise, unknowns: tuple[str, ...]) -> tuple[Limit, ...]:
+    """Split an estimator's variance: noise of the pixels if all but the place were known, other unknowns, what it wastes, sampling.
+
+    Notes
+    -----
+    With only the place unknown, the best estimator's variance is the sum of its causes. Other unknowns add to the bound; an estimator adds
+    what it is above the bound, and its error without noise.
+    """
+    place = tuple(n for n in unknowns if n in images.place)
+    best = pixels.for_the_best()
+    base, full = predict("template", images, best, place), predict("template", images, best, unknowns)
+    noise2, full2, base2 = chosen.noise_px**2, full.noise_px**2, base.noise_px**2
+    variances = dict(base.parts_px2)
+    variances["other unknowns"] = max(min(full2, noise2) - base2, 0.0)
+    variances["the estimator: more noise than the best one lets through"] = max(noise2 - max(full2, base2), 0.0)
+    variances["the estimator: sampling (S-curve)"] = chosen.s_curve_px**2
+    total = sum(variances.values())
+    found = [Limit(cause, v, v / total) for cause, v in variances.items() if v > 1e-6 * total]
+    return tuple(sorted(found, key=lambda x: -x.share))
+
+
+def frames_worth(u_of: Callable[[int], float]) -> int | None:
+    """Least number of frames that brings an uncertainty within 5 % of that of very many; None if it goes on as 1/√N.
+
+    Parameters
+    ----------
+    u_of : callable
+        Uncertainty of the mean of so many frames.
+    """
+    enough = WITHIN * u_of(VERY_MANY)
+    low, high = 0, 1
+    while u_of(high) > enough:
+        low, high = high, 2 * high
+        if high > MOST_FRAMES:
+            return None
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if u_of(middle) <= enough else (middle, high)
+    return high
+
+
+def closed_forms(images: Images, noise: NoiseModel, frames: int = 1) -> dict[str, float]:
+    """Closed forms for this target and noise, each under a name that says what it holds for."""
+    p, a, gain = images.parameters, images.aperture_px, noise.slope_dn
+    amplitude, blur, ground = p["amplitude_dn"], p["blur_px"], p["background_dn"]
+    edge = float(np.sqrt(noise.variance_dn2(ground + amplitude / 2) / frames))
+    if images.kind == "disc":
+        return {"edge formula, disc large against its blur": closed.disc_edge(p["radius_px"], blur, amplitude, edge, a)}
+    if images.kind == "ring":
+        return {"edge formula, both circles far apart": closed.ring_edge(p["radius_px"], p["inner_radius_px"], blur, amplitude, edge, a)}
+    if images.kind == "ellipse":
+        x, y = closed.ellipse_edge(*axes_of(p), blur, amplitude, edge, a)
+        return {"edge formula, ellipse large against its blur, x": x, "the same, y": y}
+    sigma = float(np.sqrt(noise.variance_dn2(ground) / frames))
+    if images.kind in ("line", "edge"):
+        return _line_forms(images, sigma, edge, gain / frames)
+    out = {"additive noise of the background alone": closed.spot_read(blur, amplitude, sigma, a)}
+    if gain > 0 and amplitude > 0:
+        electrons = 2 * np.pi * blur**2 * amplitude / gain * frames
+        out["shot noise alone"] = closed.spot_shot(blur, electrons, a)
+        out["both (Mortensen et al. 2010)"] = closed.spot_mixed(blur, electrons, float(noise.variance_dn2(ground)) / gain**2 * frames, a)
+    return out
+
+
+def _line_forms(images: Images, sigma: float, sigma_edge: float, gain: float) -> dict[str, float]:
+    p, a, length = images.parameters, images.aperture_px, line_length_px(images)
+    blur, amplitude = p["blur_px"], p["amplitude_dn"]
+    if images.kind == "edge" or "width_px" in p:
+        edges = 2.0 if images.kind == "line" else 1.0
+        name = "edge formula" if images.kind == "edge" else "edge formula, both sides of a bar that is wide against its blur"
+        return {name: closed.edge_read(blur, amplitude, sigma_edge, edges * length, a)}
+    out = {"additive noise of the background alone": closed.line_read(blur, amplitude, sigma, length, a)}
+    if gain > 0 and amplitude > 0:
+        out["shot noise alone"] = closed.line_shot(blur, np.sqrt(2 * np.pi) * blur * amplitude / gain, length, a)
+    return out
+
+
+def _advice(predictions: tuple[Prediction, ...], worth: int | None, bounds: dict[str, Bound]) -> list[str]:
+    out = []
+    two = sorted((p for p in predictions if p.name.removeprefix("row_") in ("centroid", "squared_centroid")), key=lambda p: p.u_px)
+    if two:
+        better, other = two
+        out.append(
+            f"of the two classical centroids the {better.name.replace('_', ' ')} is better here, each in its best window: "
+            f"{better.u_px:.2g} px against {other.u_px:.2g} px"
+        )
+    if worth is None:
+        out.append("all of this averages out over frames, as 1/√N")
+    else:
+        out.append(f"more than {worth} frames are not worth averaging: what is fixed in the sensor and in the sampling stays")
+    light, planes = bounds["light"].place_px[1], bounds["planes"].place_px[1]
+    if np.isfinite(planes) and planes > 1.2 * light:
+        out.append(f"unknown slopes of background and light make it {planes / light:.2g} × as large: fit them only where significant")
+    return out
+
+
+def _statements(asked: Bound, rounded: bool) -> list[str]:
+    if not rounded:
+        how = "grey values are taken as not rounded"
+    elif asked.exact_codes:
+        how = "some pixels have less than 0.4 DN of noise: rounding is counted by the exact likelihood of the codes, and the phase matters"
+    else:
+        how = "rounding counts as noise of 1/12 DN², which holds for 0.4 DN of noise or more"
+    return [how, *LEFT_OUT]

@@ -1,0 +1,1 @@
+"""Estimators of a target's place from moments, thresholds and operators."""

@@ -1,0 +1,1 @@
+"""Circles seen as ellipses."""

@@ -1,0 +1,1 @@
+"""Finding targets: background, regions, coded targets, grids."""

@@ -1,0 +1,217 @@
+"""Find targets: regions that stand out from the background, their size and shape."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from pixmetry.core.errors import InputError
+from pixmetry.core.threads import map_tiles
+from pixmetry.locate.detect.background import Background, background, bands_of, scale_of
+from pixmetry.locate.detect.targets import Flag, Targets
+
+POLARITIES = ("auto", "bright", "dark")
+KINDS = ("disc", "ellipse", "ring", "spot")
+LARGEST_RATIO = 3.2  # of the axes of a disc seen at 70°, 2.9, and some noise
+STEEPEST = 0.65  # least noise of a tile over its noisiest neighbour's: from 0.63 on the bilinear continuation stays above 0
+CUT_FILL = 0.1  # by which segments of a disc are less full than the disc
+THRESHOLD_SIGMA = 4.0
+LEAST_AREA_PX = 3
+BEYOND_DN = 1e30  # no grey value is so far from the background
+
+
+@dataclass(frozen=True)
+class Regions(Targets):
+    """Targets with what their regions above half height look like; further arrays of shape (n,).
+
+    Parameters
+    ----------
+    area_px : ndarray
+        Pixels above half height.
+    fill : ndarray
+        That area over the one of an ellipse with the same second moments: 1 for a full ellipse, 0.955 for a rectangle, less for what has
+        holes, corners or waists.
+    holes : ndarray of int
+        Holes in the region.
+    """
+
+    area_px: np.ndarray
+    fill: np.ndarray
+    holes: np.ndarray
+
+    def __getitem__(self, which: np.ndarray | slice) -> Regions:
+        """A part of them, by mask, index array or slice."""
+        return Regions(**{f.name: getattr(self, f.name)[which] for f in fields(self)})
+
+
+@dataclass(frozen=True)
+class Detection:
+    """What was found in a frame.
+
+    Parameters
+    ----------
+    targets : Regions
+        In order of row, then column, of their regions' first pixels.
+    background : Background
+    sigma_dn : float
+        Typical standard deviation of the background's noise.
+    polarity : {"bright", "dark", "both", "none"}
+        Of the targets.
+    """
+
+    targets: Regions
+    background: Background
+    sigma_dn: float
+    polarity: str
+
+
+def detect(
+    frame: np.ndarray,
+    *,
+    polarity: str = "auto",
+    high_dn: float = math.inf,
+    low_dn: float = -math.inf,
+    least_area_px: int = LEAST_AREA_PX,
+    threshold_sigma: float = THRESHOLD_SIGMA,
+    threads: int | None = None,
+) -> Detection:
+    """Find what stands out from the background.
+
+    Parameters
+    ----------
+    frame : ndarray, shape (rows, cols), uint8, uint16 or float32
+        Finite and C-contiguous.
+    polarity : {"auto", "bright", "dark"}
+        Which side of the background targets lie on; "auto" takes both.
+    high_dn, low_dn : float
+        Grey values at which the scale ends; never beyond the range of an integer type.
+    least_area_px : int
+        Connected pixels beyond the threshold that make a region.
+    threshold_sigma : float
+        Threshold in standard deviations of the background's noise.
+    threads : int, optional
+
+    Raises
+    ------
+    InputError
+        If an argument cannot be used.
+
+    Notes
+    -----
+    A region is a set of pixels beyond the threshold T = kσ + ½ DN (½ for rounding) that touch, corners included. It counts if it has
+    ``least_area_px`` pixels and rises to 1.5 T. White noise makes N·A_n·Q(k)ⁿ false regions of n pixels on each side in a frame of N
+    pixels, with Q the tail of the normal distribution and A_n = 1, 4, 20, 110 the number of ways in which n pixels can touch (polyplets).
+    With the defaults, k = 4 and n = 3, these are 2·20·N·(3.17e-5)³: 5e-6 per frame of 2048 × 2048, and less for the rise to 1.5 T. Where
+    the noise is underestimated by a tenth there are 7e-4.
+
+    Everything about a target is measured at half of its own height. A region that has several parts there is several targets, and so is one
+    whose parts are 1.4 times as high as the saddle between them. Where half the height is below the threshold, the mean of 3 × 3 pixels
+    takes the place of the pixels.
+
+    What others cause is left out: less than 0.4 of another target's height, on the other side of the background and at its edge (the halo
+    of a sharpening filter), or less than 0.08 of it within 12 pixels (stray light, and ringing in a coder's block).
+    """
+    from pixmetry.locate.detect._detect_kernels import find_runs, group_runs
+    from pixmetry.locate.detect._region_kernels import measure_regions
+
+    if polarity not in POLARITIES:
+        raise InputError("no such polarity", value=polarity, allowed=", ".join(POLARITIES))
+    if not (threshold_sigma > 0 and least_area_px >= 1):
+        raise InputError("a threshold or area that nothing passes", value=(threshold_sigma, least_area_px), allowed="above 0; 1 or more")
+    ground = background(frame, low_dn=low_dn, high_dn=high_dn, threads=threads)
+    *ends, grain = scale_of(frame, low_dn, high_dn)
+    reach = threshold_sigma * _tame(ground.sigma_dn) + 0.5 * grain
+    low = ground.level_dn - (reach if polarity != "bright" else BEYOND_DN)
+    high = ground.level_dn + (reach if polarity != "dark" else BEYOND_DN)
+    bands = bands_of(frame.shape[0], threads)
+    runs, start = group_runs(np.concatenate(map_tiles(lambda b: find_runs(frame, low, high, *ground.scales, *b), bands, threads)))
+    shares = np.searchsorted(start, np.linspace(0, len(runs), len(bands) + 1)).tolist()
+    parts = map_tiles(
+        lambda b: measure_regions(frame, ground.level_dn, reach, *ground.scales, runs, start, *b, least_area_px, *ends),
+        zip(shares[:-1], [*shares[1:-1], len(start) - 1], strict=True),
+        threads,
+    )
+    targets = _genuine(_targets(np.concatenate(parts), ground))
+    bright, dark = bool((targets.amplitude_dn > 0).any()), bool((targets.amplitude_dn < 0).any())
+    kind = "both" if bright and dark else "bright" if bright else "dark" if dark else "none"
+    return Detection(targets, ground, float(np.median(ground.sigma_dn)), kind)
+
+
+def _tame(sigma_dn: np.ndarray) -> np.ndarray:
+    """The map of the noise, without steps so steep that it would fall below 0 where it is continued to the frame's border."""
+    from scipy.ndimage import maximum_filter
+
+    return np.maximum(sigma_dn, STEEPEST * maximum_filter(sigma_dn, 3))
+
+
+def select(targets: Regions, kind: str) -> np.ndarray:
+    """Return a mask of the targets whose shape can be that of a disc, ellipse, ring or spot; shape (n,), bool.
+
+    Notes
+    -----
+    A disc, ellipse or spot is full: its fill is 1 up to its pixels and its noise, where a square has 0.955, a triangle 0.83 and two equal
+    discs that touch 0.89. Seen at up to 70° from the normal, a disc is an ellipse of axes 1 : 2.9. A ring has a hole, and its moments and
+    area give an outer ellipse that has the size of its box. What the frame's border cuts may be a segment of a disc, less full.
+    """
+    if kind not in KINDS:
+        raise InputError("no such kind", value=kind, allowed=", ".join(KINDS))
+    cut = (targets.flags & Flag.BORDER) != 0
+    full = targets.fill > _least_fill(targets) - np.where(cut, CUT_FILL, 0.0)
+    slim = targets.semi_major_px > LARGEST_RATIO * targets.semi_minor_px
+    shaped = _fits_box(targets) & ~slim
+    return shaped & ~full & (targets.holes > 0) if kind == "ring" else shaped & full
+
+
+def neighbours(targets: Targets, reach_px: float) -> tuple[np.ndarray, np.ndarray]:
+    """Find for each target the others whose boxes come within reach.
+
+    Returns
+    -------
+    start : ndarray, shape (n + 1,), int64
+    index : ndarray, int64
+        Those of target i are ``index[start[i]:start[i + 1]]``, ascending.
+    """
+    from pixmetry.locate.detect._detect_kernels import boxes_in_reach
+
+    box = np.stack([targets.row_first, targets.row_stop, targets.col_first, targets.col_stop], axis=1).astype(np.int64).reshape(-1, 4)
+    return boxes_in_reach(box, float(reach_px))
+
+
+def _least_fill(targets: Regions) -> np.ndarray:
+    noise = (targets.sigma_dn / targets.amplitude_dn) ** 2
+    return 0.975 - 1.5 / targets.area_px - 2 * noise
+
+
+def _fits_box(targets: Regions) -> np.ndarray:
+    """Whether the ellipse of a target is as wide and as high as its box."""
+    turn = np.radians(targets.angle_deg)
+    cosine, sine = np.cos(turn), np.sin(turn)
+    wide = 2 * np.hypot(targets.semi_major_px * cosine, targets.semi_minor_px * sine)
+    high = 2 * np.hypot(targets.semi_major_px * sine, targets.semi_minor_px * cosine)
+    gaps = np.abs(targets.col_stop - targets.col_first - wide), np.abs(targets.row_stop - targets.row_first - high)
+    return np.maximum(*gaps) < 1.5 + 0.15 * np.minimum(wide, high)
+
+
+def _genuine(targets: Regions) -> Regions:
+    """Leave out what other targets cause."""
+    from pixmetry.locate.detect._region_kernels import REACH, spurious
+
+    t = targets
+    box = np.stack([t.row_first, t.row_stop, t.col_first, t.col_stop], axis=1)
+    drop = spurious(t.x_px, t.y_px, t.semi_major_px, t.semi_minor_px, t.angle_deg, t.blur_px, t.amplitude_dn, box, *neighbours(t, REACH))
+    return t[~drop] if drop.any() else t
+
+
+def _targets(table: np.ndarray, ground: Background) -> Regions:
+    x, y = table[:, 0].copy(), table[:, 1].copy()
+    level, slope_x, slope_y = ground.at(x, y)
+    box = table[:, 7:11].astype(np.int64)
+    return Regions(
+        x_px=x, y_px=y, semi_major_px=table[:, 2].copy(), semi_minor_px=table[:, 3].copy(), angle_deg=table[:, 4].copy(),
+        blur_px=table[:, 5].copy(), amplitude_dn=table[:, 6] * table[:, 15], background_dn=level, background_x_dn_per_px=slope_x,
+        background_y_dn_per_px=slope_y, sigma_dn=ground.sigma(x, y), row_first=box[:, 0], row_stop=box[:, 1], col_first=box[:, 2],
+        col_stop=box[:, 3], flags=table[:, 14].astype(np.uint32), area_px=table[:, 11].copy(), fill=table[:, 12].copy(),
+        holes=table[:, 13].astype(np.int64),
+    )  # fmt: skip

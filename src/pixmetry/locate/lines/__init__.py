@@ -1,0 +1,1 @@
+"""Lines, crosses and edges."""

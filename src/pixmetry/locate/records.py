@@ -1,0 +1,189 @@
+"""Positions found in images, as a table that goes to disk with its origin, its units and the noise model behind its covariances."""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pixmetry.core.errors import InputError
+from pixmetry.core.plain_text import cell, comment
+from pixmetry.files.staged_files import Output, check_files, write_together
+from pixmetry.locate.detect.targets import Flag
+
+LOCATED_SCHEMA = "pixmetry/located/1"
+ORIGIN = "(0, 0) is the centre of the top-left pixel, x to the right, y down"
+# How a table with each ending begins (in Parquet the schema stands at the end): no other file is replaced.
+MARKS = {
+    ".csv": re.compile(rb"# pixmetry pixmetry/located/"),
+    ".parquet": re.compile(rb"PAR1.*pixmetry/located/", re.DOTALL),
+    ".json": re.compile(rb'\s*\{\s*"schema": "pixmetry/located/'),
+}
+LAST = ("estimator", "noise_model", "flags")  # columns, in every table
+
+
+@dataclass(frozen=True)
+class Located:
+    """Positions of targets in one or several images, a row a target.
+
+    Each column is an attribute and an item: ``table.x_px`` and ``table["x_px"]`` are arrays of shape (n,).
+
+    Parameters
+    ----------
+    columns : dict of ndarray
+        ``image``, ``target`` (number within the image), ``x_px``, ``y_px``, ``var_x_px2``, ``cov_xy_px2``, ``var_y_px2``, what the kind of
+        target has beside, ``estimator``, ``noise_model`` and ``flags`` (an integer of `pixmetry.locate.detect.targets.Flag`).
+    kind : str
+    images : tuple of dict
+        Of each image: ``name``, ``rows``, ``cols``, ``targets``, ``polarity``, ``estimator``, ``reason`` (why
+        this estimator), ``noise_model``.
+    """
+
+    columns: dict[str, np.ndarray]
+    kind: str
+    images: tuple[dict[str, Any], ...] = field(default_factory=tuple)
+
+    def __len__(self) -> int:
+        return len(self.columns["x_px"])
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        return self.columns[name]
+
+    def __getattr__(self, name: str) -> np.ndarray:
+        try:
+            return self.__dict__["columns"][name]
+        except KeyError:
+            raise AttributeError(f"no column {name!r}; there are {', '.join(self.__dict__.get('columns', ()))}") from None
+
+    def __repr__(self) -> str:
+        return f"<Located: {len(self)} of kind {self.kind} in {len(self.images)} image{'s' * (len(self.images) != 1)}>"
+
+    @property
+    def more(self) -> dict[str, np.ndarray]:
+        """The columns, so that a table can be given where `pixmetry.locate.detect.targets.Positions` are wanted."""
+        return self.columns
+
+    @property
+    def flag_words(self) -> list[str]:
+        """The flags of each target in words."""
+        words = {int(f): Flag(int(f)).words() for f in np.unique(self.flags)}
+        return [words[int(f)] for f in self.flags]
+
+    def to_record(self) -> dict[str, Any]:
+        """Return the plain record of the JSON file; None where a column has no value."""
+        return {
+            "schema": LOCATED_SCHEMA,
+            "kind": self.kind,
+            "origin": ORIGIN,
+            "images": list(self.images),
+            "columns": list(self.columns),
+            "targets": [dict(zip(self.columns, row, strict=True)) for row in self._rows()],
+        }
+
+    def write(self, path: str | Path) -> Path:
+        """Write the table as CSV, Parquet or JSON, by the ending of the name; it appears whole or not at all.
+
+        Every format carries the origin and the notes of each image: CSV in lines that begin with ``#``, Parquet in its metadata.
+
+        Raises
+        ------
+        InputError
+            If the ending is another one, the file exists and is no table of positions, or it cannot be written.
+        """
+        output = checked_table_name(path)
+        write_together([output], [self.content(output.path.suffix)])
+        return output.path
+
+    def content(self, ending: str) -> bytes:
+        """Return what the file with this ending (``.csv``, ``.parquet``, ``.json``) holds."""
+        return {".csv": self._csv, ".parquet": self._parquet, ".json": self._json}[ending.lower()]()
+
+    def to_csv(self) -> str:
+        """Return the text of the CSV file."""
+        return self._csv().decode()
+
+    def _rows(self) -> list[list[Any]]:
+        columns = []
+        for name, values in self.columns.items():
+            if name == "flags":
+                columns.append(self.flag_words)
+            elif values.dtype.kind == "f":
+                columns.append([v if np.isfinite(v) else None for v in values.tolist()])
+            else:
+                columns.append(values.tolist())
+        return [list(row) for row in zip(*columns, strict=True)]
+
+    def _comments(self) -> list[str]:
+        lines = [f"pixmetry {LOCATED_SCHEMA}; kind {self.kind}; origin: {ORIGIN}"]
+        for image in self.images:
+            lines.append("; ".join(f"{key}: {value}" for key, value in image.items()))
+        return lines
+
+    def _csv(self) -> bytes:
+        text = io.StringIO()
+        for line in self._comments():
+            text.write(f"# {comment(line)}\n")
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow(self.columns)
+        writer.writerows([[_short(v) for v in row] for row in self._rows()])
+        return text.getvalue().encode()
+
+    def _json(self) -> bytes:
+        import json
+
+        return (json.dumps(self.to_record(), indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode()
+
+    def _parquet(self) -> bytes:
+        import json
+
+        import pyarrow
+        import pyarrow.parquet
+
+        columns: dict[str, Any] = {**self.columns, "flags": self.flag_words}
+        table = pyarrow.table({name: pyarrow.array(values) for name, values in columns.items()})
+        notes = {"schema": LOCATED_SCHEMA, "kind": self.kind, "origin": ORIGIN, "images": json.dumps(list(self.images), ensure_ascii=False)}
+        sink = io.BytesIO()
+        pyarrow.parquet.write_table(table.replace_schema_metadata(notes), sink)
+        return sink.getvalue()
+
+
+def checked_table_name(path: str | Path, inputs: Iterable[Path] = ()) -> Output:
+    """Refuse a name under which a table cannot be written, before any work is done.
+
+    Raises
+    ------
+    InputError
+        If the ending is not known, it is a folder or an input, there is a file that is no table of positions, or it cannot be written.
+    """
+    target = Path(path)
+    if target.suffix.lower() not in MARKS:
+        raise InputError("unknown ending of a table", where=str(target), value=target.suffix, allowed=", ".join(MARKS))
+    output = Output(target, MARKS[target.suffix.lower()], True)
+    check_files([output], inputs)
+    return output
+
+
+def joined(tables: Sequence[Located]) -> Located:
+    """Put tables of several images under each other; a column that one of them lacks is empty there."""
+    names = list(dict.fromkeys(name for table in tables for name in table.columns))
+    last = [n for n in LAST if n in names]
+    names = [n for n in names if n not in last] + last
+    columns = {}
+    for name in names:
+        kinds = {t.columns[name].dtype.kind for t in tables if name in t.columns}
+        empty: Any = np.nan if "f" in kinds else "" if kinds <= {"U"} else -1
+        columns[name] = np.concatenate([t.columns[name] if name in t.columns else np.full(len(t), empty) for t in tables])
+    return Located(columns, tables[0].kind, tuple(image for t in tables for image in t.images))
+
+
+def _short(value: Any) -> Any:
+    """Ten digits of a number: a millionth of a pixel in every frame; a name as a cell may hold it."""
+    if isinstance(value, str):
+        return cell(value)
+    return "" if value is None else f"{value:.10g}" if isinstance(value, float) else value

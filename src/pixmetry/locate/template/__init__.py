@@ -1,0 +1,1 @@
+"""Fitting a drawn target to the image."""

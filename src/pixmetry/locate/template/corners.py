@@ -1,0 +1,214 @@
+"""Chessboard corners: found by OpenCV, placed by a least-squares fit of two crossing, blurred edges."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from pixmetry.core.errors import InputError
+from pixmetry.core.threads import map_tiles
+from pixmetry.locate.detect.grids import Grid, eight_bit, no_grid
+from pixmetry.locate.detect.targets import Flag, Positions
+from pixmetry.locate.noise import NoiseModel, noise_numbers
+from pixmetry.locate.template import _corner_kernels as kernels
+
+REACH_PX = 10.0  # the blurred edges are straight over this length even through strongly distorting lenses
+LEAST_REACH_PX = 4.0
+CLEARANCE_PX = 3.0  # from the next edge of the board, for its blur
+PLANES = {"never": 0, "always": 1, "auto": 2}
+PLANES_SIGNIFICANT = 23.5  # fall of χ² with 4 unknowns more that noise alone causes once in 1e4
+POOR_FIT_SIGMA = 6.0
+OUTSIDE_PX = 1e6  # where a start that is not a number is put
+LEAST_SQUARE_PX = 4
+CHUNK = 64
+OTHER_STARTS_PX = ((0.8, 0.0), (-0.8, 0.0), (0.0, 0.8), (0.0, -0.8))
+
+
+def find_chessboard(frame: np.ndarray, inner_corners: tuple[int, int]) -> Grid:
+    """Find the inner corners of a chessboard to about a pixel, with OpenCV.
+
+    Parameters
+    ----------
+    frame : ndarray, shape (rows, cols), uint8, uint16 or float32
+    inner_corners : (int, int)
+        Columns and rows of corners at which two dark squares meet (not of squares), each from 3 on.
+
+    Returns
+    -------
+    Grid
+        In the board's order, rows from 0 and columns from 0; empty with a message where no board of this size was seen.
+
+    Raises
+    ------
+    InputError
+        If fewer than 3 corners a side are asked for.
+
+    Notes
+    -----
+    Of OpenCV's two finders the sector-based one is asked first (A. Duda, U. Frese, "Accurate detection and localization of checkerboard
+    corners for calibration", BMVC 2018), then the older one, which follows quadrangles. Both want 8 bits: the frame is stretched between
+    its 0.1 and 99.9 % quantiles for them and not changed itself.
+    """
+    import cv2
+
+    cols, rows = (int(n) for n in inner_corners)
+    if min(cols, rows) < 3:
+        raise InputError("too few corners to know a board by", where="pattern", value=(cols, rows), allowed="3 × 3 inner corners or more")
+    if min(frame.shape) < LEAST_SQUARE_PX * (min(cols, rows) + 1):  # OpenCV stops with an assertion
+        return no_grid(f"the frame is too small for {cols} × {rows} inner corners", rows, cols)
+    grey = eight_bit(frame)
+    found, corners = cv2.findChessboardCornersSB(grey, (cols, rows), flags=cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE)
+    if not found:
+        flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
+        found, corners = cv2.findChessboardCorners(grey, (cols, rows), flags=flags)
+    if not found:
+        return no_grid(f"no chessboard of {cols} × {rows} inner corners was found", rows, cols)
+    place = np.asarray(corners, float).reshape(-1, 2)
+    row, col = np.divmod(np.arange(rows * cols), cols)
+    return Grid(place[:, 0], place[:, 1], row, col, rows, cols)
+
+
+def chessboard_reach_px(grid: Grid, most_px: float = REACH_PX) -> np.ndarray:
+    """How far around each corner the two edges alone are seen, shape (n,), pixels: up to `CLEARANCE_PX` before the next edge.
+
+    Parameters
+    ----------
+    grid : Grid
+        A whole board, corner by corner as from `find_chessboard`.
+    most_px : float
+        Farther than this a fit does not look.
+    """
+    place = np.stack([grid.x_px, grid.y_px], axis=1).reshape(grid.rows, grid.cols, 2)
+    along_col, along_row = np.gradient(place, axis=1), np.gradient(place, axis=0)
+    area = np.abs(along_col[..., 0] * along_row[..., 1] - along_col[..., 1] * along_row[..., 0])
+    next_edge = area / np.maximum(np.hypot(*np.moveaxis(along_col, 2, 0)), np.hypot(*np.moveaxis(along_row, 2, 0)))
+    return np.clip(next_edge.ravel() - CLEARANCE_PX, LEAST_REACH_PX, most_px)
+
+
+def corner_positions(
+    frame: np.ndarray,
+    x_px: np.ndarray,
+    y_px: np.ndarray,
+    noise: NoiseModel,
+    *,
+    reach_px: np.ndarray | float | None = None,
+    planes: str = "auto",
+    aperture_px: float = 1.0,
+    threads: int | None = None,
+) -> Positions:
+    """Place corners at which two straight edges cross, black and white meeting crosswise, from rough places (to about 2 px).
+
+    Parameters
+    ----------
+    frame : ndarray, shape (rows, cols), uint8, uint16 or float32, DN
+    x_px, y_px : ndarray, shape (n,)
+        Rough places.
+    noise : NoiseModel
+        Weights of the pixels; the ends of the scale, where values are cut off.
+    reach_px : float or ndarray, shape (n,), optional
+        Radius of the window. It must not hold a third edge. By default 10 px, or less where the next corner is near.
+    planes : {"auto", "never", "always"}
+        Whether mean and contrast may vary linearly over the window (light that falls off, four unknowns more): "auto" takes them where χ²
+        falls by more than 23.5 (times χ² per degree of freedom, where that is above 1), which noise causes once in 10 000 corners.
+    aperture_px : float
+        Side of the pixel's light-sensitive square.
+    threads : int, optional
+        Default: all.
+
+    Returns
+    -------
+    Positions
+        The covariance is (JᵀWJ)⁻¹. In ``more``: amplitude_dn (bright minus dark), background_dn (dark), blur_px, direction_1_deg and
+        direction_2_deg of the two edges (from x towards y, −90 … 90; from the first towards the second the squares are bright),
+        chi2_per_dof, dof, reach_px.
+
+    Raises
+    ------
+    InputError
+        If ``planes`` is none of the three.
+
+    Notes
+    -----
+    The model (see `_corner_kernels`) is symmetric under half a turn about the corner, as the picture is, and a shift is not; so a blur that
+    is not quite Gaussian, or a wrong aperture, moves no corner.
+    """
+    if planes not in PLANES:
+        raise InputError("no such choice of planes", value=planes, allowed=", ".join(PLANES))
+    x, y = (np.clip(np.nan_to_num(np.ascontiguousarray(v, float).ravel(), nan=-OUTSIDE_PX), -OUTSIDE_PX, OUTSIDE_PX) for v in (x_px, y_px))
+    reach = default_reach_px(x, y) if reach_px is None else np.broadcast_to(np.asarray(reach_px, float), x.shape).copy()
+    law = np.append(noise_numbers(noise, frame.dtype), PLANES_SIGNIFICANT)
+
+    def fit(part: np.ndarray, dx: float, dy: float) -> None:
+        n = len(part)
+        from_x, from_y, within = x[part] + dx, y[part] + dy, reach[part]
+        own = (np.full((n, kernels.ALL), np.nan), np.full((n, 3), np.nan), np.full(n, np.nan), np.zeros(n, np.int64), np.zeros(n, np.int64))
+        kernels.fit_corners(frame, from_x, from_y, within, PLANES[planes], float(aperture_px), law, 0, n, *own)
+        for whole, values in zip(results, own, strict=True):
+            whole[part] = values
+
+    n = len(x)
+    results = (np.full((n, kernels.ALL), np.nan), np.full((n, 3), np.nan), np.full(n, np.nan), np.zeros(n, np.int64), np.zeros(n, np.int64))
+    states = results[4]
+    for dx, dy in ((0.0, 0.0), *OTHER_STARTS_PX):  # one fit in a thousand does not come to rest from where it began
+        lost = np.flatnonzero((states & 1) == 0)
+        map_tiles(partial(fit, dx=dx, dy=dy), [lost[i : i + CHUNK] for i in range(0, len(lost), CHUNK)], threads)
+    found, covariance, chi2, counts, states = results
+    return _positions(x, y, reach, found, covariance, chi2, counts, states)
+
+
+def default_reach_px(x_px: np.ndarray, y_px: np.ndarray) -> np.ndarray:
+    """Radius of the windows, shape (n,), from how near the nearest other corner is."""
+    from scipy.spatial import cKDTree
+
+    if len(x_px) < 2:
+        return np.full(len(x_px), REACH_PX)
+    place = np.stack([x_px, y_px], axis=1)
+    nearest = cKDTree(place).query(place, k=2)[0][:, 1]
+    return np.clip(0.85 * nearest - CLEARANCE_PX, LEAST_REACH_PX, REACH_PX)
+
+
+def _positions(
+    x: np.ndarray,
+    y: np.ndarray,
+    reach: np.ndarray,
+    found: np.ndarray,
+    covariance: np.ndarray,
+    chi2: np.ndarray,
+    dof: np.ndarray,
+    states: np.ndarray,
+) -> Positions:
+    rest = (states & 1) > 0
+    per_dof = np.where(dof > 0, chi2 / np.maximum(dof, 1), np.nan)
+    flags = np.zeros(len(x), np.uint32)
+    marks = (
+        (~rest, Flag.NOT_CONVERGED),
+        (states & 2 > 0, Flag.BORDER),
+        (states & 4 > 0, Flag.GRADIENT),
+        (states & 8 > 0, Flag.SATURATED),
+        (states & 16 > 0, Flag.CLIPPED_AT_BLACK),
+        (per_dof > 1 + POOR_FIT_SIGMA * np.sqrt(2 / np.maximum(dof, 1)), Flag.POOR_FIT),
+    )
+    for mark, flag in marks:
+        flags[mark] |= np.uint32(flag)
+    found, covariance = np.where(rest[:, None], found, np.nan), np.where(rest[:, None], covariance, np.nan)
+    more: dict[str, Any] = {
+        "amplitude_dn": 2 * np.abs(found[:, 6]),
+        "background_dn": found[:, 5] - np.abs(found[:, 6]),
+        "blur_px": found[:, 4],
+        **dict(zip(("direction_1_deg", "direction_2_deg"), _directions_deg(found), strict=True)),
+        "chi2_per_dof": np.where(rest, per_dof, np.nan),
+        "dof": dof,
+        "reach_px": reach,
+    }
+    return Positions(found[:, 0], found[:, 1], covariance[:, 0], covariance[:, 1], covariance[:, 2], flags, more)
+
+
+def _directions_deg(found: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Directions of the two edges in the order in which the squares from the first to the second, turning x to y, are bright."""
+    first, second = np.degrees(found[:, 2]) - 90, np.degrees(found[:, 3]) - 90
+    # half-way from the first to the second, the product of the distances has the sign of −sin² of half the span: dark for contrast > 0
+    swap = found[:, 6] > 0
+    first, second = np.where(swap, second, first), np.where(swap, first, second)
+    return (first + 90) % 180 - 90, (second + 90) % 180 - 90

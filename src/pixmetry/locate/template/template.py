@@ -1,0 +1,298 @@
+"""Least-squares templates: discs, ellipses, rings and Gaussian spots, blurred, averaged over the pixels and fitted to grey values."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pixmetry.core.errors import InputError
+from pixmetry.locate.detect.targets import Flag, Positions, Targets
+from pixmetry.locate.noise import NoiseModel
+from pixmetry.locate.template.image_noise import noise_from_image
+from pixmetry.locate.template.template_fit import KINDS, Fitted, Windows, run_fit, with_second_start
+
+__all__ = ["KINDS", "LIGHT_ON", "PARAMETERS", "PLANES", "choose_planes", "fit_template", "model", "noise_from_image"]
+
+_LAST = ("blur_px", "amplitude_dn", "background_dn")
+PARAMETERS = {
+    "disc": ("x_px", "y_px", "radius_px", *_LAST),
+    "ellipse": ("x_px", "y_px", "shape_xx_px", "shape_yy_px", "shape_xy_px", *_LAST),
+    "ring": ("x_px", "y_px", "radius_px", "inner_radius_px", *_LAST),
+    "spot": ("x_px", "y_px", *_LAST),
+}
+PLANES = ("background_x_dn_per_px", "background_y_dn_per_px", "light_x_per_px", "light_y_per_px")
+LIGHT_ON = ("surface", "image")
+LIKELIHOODS = ("least_squares", "poisson_gaussian")
+RATE_FALL = {2: 13.82, 4: 18.47}  # fall of χ² by 2 or 4 unknowns that chance exceeds once in 1000 targets
+DROP_FALL = 5.99  # fall by 2 unknowns that chance exceeds once in 20
+MEDIAN_FALL = {2: (1.386, 2.0), 4: (3.357, 3.19)}  # median of χ² with 2 or 4 degrees, and its standard deviation times √n
+POOL = 20  # targets from which their falls are also looked at together
+POOLED_SIGMA = 5.0
+MEDIAN_WORTH = 3.0  # of a noncentral χ² with 2 degrees and a noncentrality of 2
+POOR_SIGMA = 5.5
+FAINT_SHARE = 0.15  # of the blur: uncertainty from which the covariance of first order is too small
+SHARP_PX = 0.3  # blur below which a template's position begins to depend on the exact shape of the pixel
+
+
+def model(
+    kind: str, parameters: np.ndarray, rows: int, cols: int, *, aperture_px: float = 1.0, light_on: str = "surface"
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the grey values of a target in a window whose first pixel is (0, 0), and their derivatives; exact to 2e-5 of the amplitude.
+
+    Parameters
+    ----------
+    kind : {"disc", "ellipse", "ring", "spot"}
+    parameters : array_like
+        In the order of ``PARAMETERS[kind]``; the four of `PLANES` may follow. The outline of an ellipse is c + S (cos t, sin t) with the
+        symmetric matrix S of its ``shape_``; the amplitude of a spot is its peak before the average over the pixel.
+    rows, cols : int
+        Size of the window.
+    aperture_px : float
+        Side of a pixel's square aperture; 0 samples at its centre.
+    light_on : {"surface", "image"}
+        Whether the light that falls off acts on the target's surface, before the blur, or on the pixels. A spot knows only the latter.
+
+    Returns
+    -------
+    mean : ndarray, shape (rows, cols), float64
+        In DN.
+    jacobian : ndarray, shape (number of parameters given, rows, cols), float64
+
+    Raises
+    ------
+    InputError
+        If the kind is unknown, or the parameters do not describe a target.
+    """
+    from pixmetry.locate.template._template_kernels import mean_images
+
+    _check(kind, light_on, aperture_px)
+    given = np.asarray(parameters, float).ravel()
+    names = (*PARAMETERS[kind], *PLANES)
+    if len(given) not in (len(names), len(names) - 4) or not np.isfinite(given).all():
+        raise InputError(f"parameters that are not those of a {kind}", value=given.tolist(), allowed=", ".join(names))
+    full = np.zeros(len(names))
+    full[: len(given)] = given
+    _check_shape(kind, full)
+    images = mean_images(KINDS.index(kind), full, int(rows), int(cols), float(aperture_px), light_on == "surface")
+    return images[0, :, :cols].copy(), images[1 : len(given) + 1, :, :cols].copy()
+
+
+def fit_template(
+    frame: np.ndarray,
+    targets: Targets,
+    noise: NoiseModel,
+    kind: str = "disc",
+    *,
+    likelihood: str = "least_squares",
+    background_plane: str | bool = "auto",
+    light_plane: str | bool = "auto",
+    light_on: str = "surface",
+    aperture_px: float = 1.0,
+    threads: int | None = None,
+) -> Positions:
+    """Fit a template to every target by weighted least squares or by the likelihood of Poisson numbers with normal read noise.
+
+    Parameters
+    ----------
+    frame : ndarray, shape (rows, cols), uint8, uint16 or float32
+    targets : Targets
+        Start values.
+    noise : NoiseModel
+        Weights are 1/variance at the fitted mean, and the mean is that of the clipped value where the scale ends; an integer frame's scale
+        ends at the range of its type at the latest.
+    kind : {"disc", "ellipse", "ring", "spot"}
+    likelihood : {"least_squares", "poisson_gaussian"}
+        With weights from the fitted mean, least squares solves the likelihood equations of a Poisson number shifted by the read noise's
+        variance (Huang et al. 2013). ``poisson_gaussian`` uses the exact likelihood (Snyder et al. 1995) where the mean is below 60
+        electrons and the read noise below 3; it is the same as least squares where the noise does not depend on the level.
+    background_plane, light_plane : {"auto"} or bool
+        A slope of the background, and of the light on the target, among the unknowns; see Notes.
+        A spot knows no light plane: to first order it is a shift.
+    light_on : {"surface", "image"}
+        See `model`.
+    aperture_px : float
+        Side of a pixel's square aperture.
+    threads : int, optional
+
+    Returns
+    -------
+    Positions
+        With the unknowns and their standard uncertainties (``u_``) in ``more``, ``chi2_per_dof``, ``dof`` and ``steps``.
+
+    Raises
+    ------
+    InputError
+        If an option is unknown.
+
+    Notes
+    -----
+    "auto" takes a plane in by the fall of χ² that it would bring: for a single target where chance brings it once in 1000; for all of them
+    where the median fall of at least 20 targets stands 5 standard deviations above that of chance (3e-7). Falls are divided by the median
+    χ² per degree of freedom where that exceeds 1. Planes of many targets stay only if they take more bias from the places than they add
+    noise (`worth_it`), and if the ground around the targets has them too (`believable`). A slope too
+    small to be seen, which shifts the position by up to about two standard uncertainties, is not in the covariance of a single target.
+
+    References
+    ----------
+    W. Förstner, Int. Arch. Photogrammetry 24-III, 176 (1982) and A. W. Gruen, S. Afr. J. Photogrammetry 14(3), 175 (1985), for
+    least-squares matching. D. L. Snyder et al., J. Opt. Soc. Am. A 12(2), 272 (1995); F. Huang et al., Nature Methods 10, 653 (2013).
+    """
+    _check(kind, light_on, aperture_px)
+    if likelihood not in LIKELIHOODS:
+        raise InputError("no such likelihood", value=likelihood, allowed=", ".join(LIKELIHOODS))
+    for name, value in (("background_plane", background_plane), ("light_plane", light_plane)):
+        if value not in ("auto", True, False):
+            raise InputError(f"{name} is neither on nor off", value=value, allowed='"auto", True, False')
+    if kind == "spot":
+        if light_plane is True:
+            raise InputError("light that falls off over a Gaussian spot cannot be told from a shift of it", allowed="light_plane=False")
+        light_plane = False
+    surface, exact = light_on == "surface", likelihood == "poisson_gaussian"
+    windows = Windows.of(frame, targets, noise, kind, KINDS.index(kind), aperture_px, surface, exact)
+    everyone = np.arange(len(targets))
+    auto = "auto" in (background_plane, light_plane)
+    on_ground, on_light = np.full(len(targets), background_plane is True), np.full(len(targets), light_plane is True)
+    options = (background_plane is True and not auto, light_plane is True and not auto, auto)
+    result = run_fit(windows, everyone, windows.start, *options, threads)
+    result = with_second_start(windows, targets, everyone, result, options, threads)
+    if auto:
+        on_ground, on_light = choose_planes(result.falls, result.chi2_per_dof, background_plane, light_plane)
+        start = np.where(result.at_rest[:, None], result.parameters, windows.start)
+        for ground, light in ((True, True), (True, False), (False, True)):  # what one does not believe is left to the next
+            again = np.flatnonzero((on_ground == ground) & (on_light == light))
+            if not len(again):
+                continue
+            sloped = run_fit(windows, again, start, ground, light, False, threads)
+            if len(again) >= POOL:
+                real_ground, real_light = believable(targets, windows.noise, sloped, again)
+                if not worth_it(result, sloped, again):
+                    real_ground = real_light = False
+                on_ground[again], on_light[again] = ground and real_ground, light and real_light
+                if (ground and not real_ground) or (light and not real_light):
+                    continue
+            result = result.put(again, sloped)
+    return _positions(kind, targets, result, on_ground, on_light)
+
+
+def choose_planes(
+    falls: np.ndarray, chi2_per_dof: np.ndarray, background_plane: str | bool, light_plane: str | bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """Choose the planes of every target from the expected falls of χ² with the background's, the light's and both; shape (n, 3)."""
+    good = np.isfinite(falls).all(axis=1) & np.isfinite(chi2_per_dof)
+    ground, light, both = (falls / max(1.0, float(np.median(chi2_per_dof[good])) if good.any() else 1.0)).T
+    off = np.zeros(len(falls), bool)
+    if background_plane != "auto":
+        given = ground if background_plane else 0.0
+        return np.full(len(falls), background_plane), good & _significant((both if background_plane else light) - given, good, 2)
+    if light_plane != "auto":
+        given = light if light_plane else 0.0
+        return good & _significant((both if light_plane else ground) - given, good, 2), np.full(len(falls), light_plane)
+    any_ = good & _significant(both, good, 4)
+    if not any_.any():
+        return off, off.copy()
+    pooled = any_.mean() > 0.5
+    need_ground, need_light = both - light, both - ground
+    if pooled:
+        need_ground, need_light = np.full(len(falls), np.median(need_ground[good])), np.full(len(falls), np.median(need_light[good]))
+        needed = MEDIAN_FALL[2][0] * (1 + 4 / np.sqrt(good.sum()))
+    else:
+        needed = DROP_FALL
+    on_ground = any_ & ((need_ground > needed) | ((need_light <= needed) & (ground >= light)))
+    on_light = any_ & ((need_light > needed) | ((need_ground <= needed) & (light > ground)))
+    return on_ground, on_light
+
+
+def believable(targets: Targets, noise: NoiseModel, sloped: Fitted, which: np.ndarray) -> tuple[bool, bool]:
+    """Whether the slopes that many fits found are those of the ground around the targets, as the map of the background has it.
+
+    A background that slopes under targets does so between them. Light that falls off over dark targets falls off over their bright ground,
+    in the same proportion. A halo that a lens, a coder or a sharpening filter puts on one side of every target does neither.
+    """
+    good = which[sloped.at_rest[which]]
+    if len(good) < POOL:
+        return True, True
+    there = np.stack([targets.background_x_dn_per_px[good], targets.background_y_dn_per_px[good]], axis=1)
+    bright = np.maximum(targets.background_dn[good] - max(noise.black_dn, 0.0), 0.0)[:, None]
+    ground, light = sloped.parameters[good, -4:-2], sloped.parameters[good, -2:] * bright
+    u = np.sqrt(np.nan_to_num(sloped.variance[good, -4:]))
+    dark = np.median(bright[:, 0] + targets.amplitude_dn[good]) < 0.5 * np.median(bright)  # the ground is what has the light
+
+    def agrees(slope: np.ndarray, uncertainty: np.ndarray) -> bool:
+        return bool(np.median(np.abs(slope - there)) < 0.5 * np.median(np.abs(slope)) + np.median(uncertainty))
+
+    return agrees(ground, u[:, :2]), not dark or agrees(light, u[:, 2:] * bright)
+
+
+def worth_it(plain: Fitted, sloped: Fitted, which: np.ndarray) -> bool:
+    """Whether planes take more bias from the places of many targets than they add noise to them.
+
+    With Δ the shift of a place and V the rise of its covariance that the planes bring, Δᵀ V⁻¹ Δ is 2 on average where there was no bias,
+    and 4 where bias² is as large as the added variance. Grey values that are not as the template has them (coders, sharpening) bring a
+    fall of χ² by planes that move nothing but the noise.
+    """
+    dx, dy = (sloped.parameters[which, k] - plain.parameters[which, k] for k in (0, 1))
+    xx, xy, yy = (np.where(sloped.at_rest[which], (sloped.covariance - plain.covariance)[which, k], np.nan) for k in range(3))
+    size = xx * yy - xy * xy
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / size
+    ratio = ratio[np.isfinite(ratio) & (size > 0) & (xx > 0)]
+    return bool(len(ratio)) and float(np.median(ratio)) > MEDIAN_WORTH
+
+
+def _significant(fall: np.ndarray, good: np.ndarray, degrees: int) -> np.ndarray:
+    middle, width = MEDIAN_FALL[degrees]
+    count = int(good.sum())
+    if count >= POOL and np.median(fall[good]) > middle + POOLED_SIGMA * width / np.sqrt(count):
+        return good.copy()
+    return np.nan_to_num(fall) > RATE_FALL[degrees]
+
+
+def _check(kind: str, light_on: str, aperture_px: float) -> None:
+    if kind not in KINDS:
+        raise InputError("no such kind of template", value=kind, allowed=", ".join(KINDS))
+    if light_on not in LIGHT_ON:
+        raise InputError("light that acts nowhere", value=light_on, allowed=", ".join(LIGHT_ON))
+    if not 0 <= aperture_px <= 4:
+        raise InputError("an aperture that no pixel has", value=aperture_px, allowed="0 … 4 px")
+
+
+def _check_shape(kind: str, p: np.ndarray) -> None:
+    names = dict(zip(PARAMETERS[kind], p.tolist(), strict=False))
+    good = names["blur_px"] > 0
+    if kind == "disc":
+        good &= names["radius_px"] > 0
+    elif kind == "ring":
+        good &= names["radius_px"] > names["inner_radius_px"] > 0
+    elif kind == "ellipse":
+        xx, yy, xy = p[2:5]
+        good &= bool(xx > 0 and xx * yy > xy * xy)
+    if not good:
+        raise InputError(f"a {kind} that cannot be drawn", value=names, allowed="sizes and blur above 0, an outline that encloses an area")
+
+
+def _positions(kind: str, targets: Targets, result: Fitted, on_ground: np.ndarray, on_light: np.ndarray) -> Positions:
+    names = (*PARAMETERS[kind], *PLANES)
+    p, u = result.parameters, np.sqrt(result.variance)
+    more = {name: p[:, j] for j, name in enumerate(names) if j > 1 and not name.startswith("shape_")}
+    more |= {f"u_{name}": u[:, j] for j, name in enumerate(names) if j > 1 and not name.startswith("shape_")}
+    if kind == "ellipse":
+        xx, yy, xy = p[:, 2:5].T
+        half, spread = 0.5 * (xx + yy), np.hypot(0.5 * (xx - yy), xy)
+        more |= {"semi_major_px": half + spread, "semi_minor_px": half - spread, "angle_deg": np.rad2deg(0.5 * np.arctan2(2 * xy, xx - yy))}
+    more |= {"chi2_per_dof": result.chi2_per_dof, "dof": result.dof, "steps": result.steps}
+    poor = result.chi2_per_dof > 1 + POOR_SIGMA * np.sqrt(2 / np.maximum(result.dof, 1))
+    worst = np.sqrt(result.noise_var_px2)
+    flags = targets.flags.astype(np.uint32)
+    for flag, where in (
+        (Flag.NOT_CONVERGED, ~result.at_rest | (worst > np.maximum(targets.semi_major_px, 1.0))),  # beyond its own size: no place at all
+        (Flag.BORDER, result.cut),
+        (Flag.SATURATED, result.at_top > 0),
+        (Flag.CLIPPED_AT_BLACK, result.at_bottom > 0),
+        (Flag.GRADIENT, on_light),
+        (Flag.UNEVEN_BACKGROUND, on_ground),
+        (Flag.POOR_FIT, poor),
+        (Flag.UNDER_SAMPLED, more["blur_px"] < SHARP_PX),
+        (Flag.FAINT, worst > FAINT_SHARE * np.hypot(more["blur_px"], 0.29)),
+    ):
+        flags[where] |= np.uint32(flag)
+    var_x, cov_xy, var_y = result.covariance.T.copy()
+    return Positions(p[:, 0].copy(), p[:, 1].copy(), var_x, cov_xy, var_y, flags, more)

@@ -1,0 +1,196 @@
+"""From targets to fitted templates: start values, windows, and the fits in pieces on several threads."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from pixmetry.core.threads import map_tiles
+from pixmetry.locate.detect.targets import Targets
+from pixmetry.locate.noise import NoiseModel
+
+KINDS = ("disc", "ellipse", "ring", "spot")  # in the order of the kernels' codes
+REACH = 3.5  # standard deviations of the edge, the pixel included, up to which pixels around a target are used
+NEAR = 3.2  # the same within which a pixel is a neighbour's
+SMALL_PX, SHARP_PX, FAR_TOO_LARGE = 2.5, 0.3, 2.0  # size, blur and χ² per degree of freedom of a second start
+BLUR = -7  # place of the blur among the parameters
+CHUNK = 64  # targets in one piece of work, at most
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Targets with what their fits start from; arrays of shape (n, …).
+
+    Parameters
+    ----------
+    start : ndarray, shape (n, parameters)
+        Start values, the planes included.
+    half : ndarray of int64
+        Half sides of the windows.
+    outer, reach : ndarray, shape (n,) and (n, 2)
+        Longest half axes; how far beyond them pixels are used, and are taken from a neighbour.
+    near_start, near_index : ndarray of int64
+        Neighbours of every target, as of `detection.neighbours`.
+    """
+
+    frame: np.ndarray
+    noise: NoiseModel
+    code: int
+    aperture_px: float
+    surface: bool
+    efficiency: np.ndarray
+    start: np.ndarray
+    half: np.ndarray
+    outer: np.ndarray
+    reach: np.ndarray
+    near_start: np.ndarray
+    near_index: np.ndarray
+
+    @classmethod
+    def of(
+        cls, frame: np.ndarray, targets: Targets, noise: NoiseModel, kind: str, code: int, aperture_px: float, surface: bool, exact: bool
+    ) -> Windows:
+        """Windows and start values of targets; ``exact``: the likelihood of few electrons."""
+        from pixmetry.locate.detect.detection import neighbours
+
+        start, outer, edge = start_values(targets, kind, aperture_px)
+        reach = np.stack([REACH * edge + 1.0, NEAR * edge + 0.5], axis=1)
+        half = np.ceil(outer + reach[:, 0]).astype(np.int64)
+        near = neighbours(targets, float(2 * reach.max() + 2) if len(targets) else 1.0)
+        noise = scale_ends(noise, frame)
+        efficiency = np.empty(0)
+        if exact and noise.slope_dn > 0 and noise.pattern_rel == 0:
+            from pixmetry.locate.bound.few_electrons import efficiency as of_sigma
+
+            efficiency = of_sigma(math.sqrt(noise.constant_dn2) / noise.slope_dn)
+        return cls(frame, noise, code, float(aperture_px), surface, efficiency, start, half, outer, reach, *near)
+
+
+    @property
+    def numbers(self) -> np.ndarray:
+        """The noise model as the kernels want it."""
+        n = self.noise
+        about = n.constant_dn2, n.slope_dn, n.pattern_rel, n.black_dn, n.low_dn, n.high_dn
+        return np.array([*about, n.row_shift_px**2, n.field_shift_px**2])
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """Results of fits, arrays of shape (n, …); NaN where there is none."""
+
+    parameters: np.ndarray
+    variance: np.ndarray
+    covariance: np.ndarray
+    chi2_per_dof: np.ndarray
+    dof: np.ndarray
+    falls: np.ndarray
+    steps: np.ndarray
+    at_rest: np.ndarray
+    cut: np.ndarray
+    at_top: np.ndarray
+    at_bottom: np.ndarray
+    noise_var_px2: np.ndarray  # the larger one of x and y, without the shifts of rows
+
+    def put(self, which: np.ndarray, part: Fitted) -> Fitted:
+        """These, with some of them replaced by those of another fit."""
+        changed = {}
+        for f in fields(self):
+            changed[f.name] = getattr(self, f.name).copy()
+            changed[f.name][which] = getattr(part, f.name)[which]
+        return replace(self, **changed)
+
+
+def scale_ends(noise: NoiseModel, frame: np.ndarray) -> NoiseModel:
+    """The noise model with the ends of the scale that an integer type has."""
+    if frame.dtype.kind != "u":
+        return noise
+    return replace(noise, low_dn=max(noise.low_dn, 0.0), high_dn=min(noise.high_dn, float(np.iinfo(frame.dtype).max)))
+
+
+def start_values(targets: Targets, kind: str, aperture_px: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Start values (n, parameters), longest half axes, and standard deviations of the edges with the pixel in them."""
+    edge = np.clip(np.nan_to_num(targets.blur_px, nan=0.7), 0.3, None)
+    blur = np.sqrt(np.maximum(edge**2 - aperture_px**2 / 12, 0.2**2))
+    major, minor = np.maximum(targets.semi_major_px, 0.5), np.maximum(targets.semi_minor_px, 0.5)
+    amplitude, background = np.asarray(targets.amplitude_dn, float), np.asarray(targets.background_dn, float)
+    shape: list[np.ndarray] = []
+    outer = major
+    if kind == "spot":  # it is at half height at 1.177 standard deviations
+        edge = np.maximum(np.sqrt(major * minor) / math.sqrt(2 * math.log(2)), 0.4)
+        blur = np.sqrt(np.maximum(edge**2 - aperture_px**2 / 12, 0.3**2))
+        amplitude, outer = amplitude * (edge / blur) ** 2, np.zeros(len(targets))
+    elif kind == "disc":
+        outer = np.sqrt(major * minor)
+        shape = [outer]
+    elif kind == "ellipse":
+        c, s = np.cos(np.deg2rad(targets.angle_deg)), np.sin(np.deg2rad(targets.angle_deg))
+        shape = [major * c**2 + minor * s**2, major * s**2 + minor * c**2, (major - minor) * c * s]
+    else:
+        outer = np.maximum((targets.row_stop - targets.row_first + targets.col_stop - targets.col_first) / 4.0, 1.0)
+        area = getattr(targets, "area_px", math.pi * major * minor)
+        shape = [outer, np.sqrt(np.maximum(outer**2 - area / math.pi, (0.2 * outer) ** 2))]
+    rest = np.zeros((4, len(targets)))
+    return np.stack([targets.x_px, targets.y_px, *shape, blur, amplitude, background, *rest], axis=1), outer, edge
+
+
+def run_fit(
+    w: Windows, which: np.ndarray, start: np.ndarray, background_plane: bool, light_plane: bool, test: bool, threads: int | None
+) -> Fitted:
+    """Fit some of the targets, in pieces; the others' results are undefined.
+
+    Parameters
+    ----------
+    w : Windows
+    background_plane, light_plane : bool
+        Whether they are among the unknowns.
+    test : bool
+        Whether to find out what the planes, which are then not among the unknowns, would bring.
+    threads : int, optional
+    """
+    from pixmetry.locate.template._template_kernels import cut_out, fit
+
+    n, count = start.shape
+    free = np.ones(count, bool)
+    free[-4:-2], free[-2:] = background_plane, light_plane
+    parameters, variance, covariance = np.full((n, count), np.nan), np.full((n, count), np.nan), np.full((n, 3), np.nan)
+    quality = np.full((n, 10), np.nan)
+
+    chunk = min(CHUNK, max(8, len(which) // 8))
+
+    def piece(first: int) -> None:
+        part = which[first : first + chunk]
+        side = 2 * w.half[part] + 1
+        place = np.concatenate([[0], np.cumsum(side * ((side + 7) // 8 * 8))])
+        data, mask = np.empty(place[-1], np.float32), np.empty(place[-1], np.float32)
+        near = w.near_start, w.near_index
+        cut_out(w.frame, w.start, w.half, w.outer, w.reach, *near, w.noise.low_dn, w.noise.high_dn, part, place, data, mask, quality)
+        settings = w.numbers, w.efficiency, w.aperture_px, w.surface
+        fit(w.code, start, free, test, w.start, w.half, part, place, data, mask, *settings, parameters, variance, covariance, quality)
+
+    map_tiles(piece, range(0, len(which), chunk), threads)
+    dof = quality[:, 1] - free.sum()
+    reduced, steps = quality[:, 0] / np.maximum(dof, 1), quality[:, 5]
+    cut, (top, bottom, alone) = quality[:, 6] > 0, quality[:, 7:].T
+    return Fitted(parameters, variance, covariance, reduced, dof, quality[:, 2:5], np.abs(steps), steps > 0, cut, top, bottom, alone)
+
+
+def with_second_start(
+    windows: Windows, targets: Targets, which: np.ndarray, result: Fitted, options: tuple[bool, bool, bool], threads: int | None
+) -> Fitted:
+    """Fit small targets whose residuals are far too large once more, from a sharp edge, and keep the better fit.
+
+    A disc of a pixel's size can pass for a far smaller and higher one with more blur; between the two lies a ridge of χ².
+    """
+    if KINDS[windows.code] not in ("disc", "ellipse"):
+        return result
+    small = np.sqrt(targets.semi_major_px * targets.semi_minor_px) < SMALL_PX
+    again = which[(small & ~(result.at_rest & (result.chi2_per_dof < FAR_TOO_LARGE)))[which]]
+    if not len(again):
+        return result
+    start = windows.start.copy()
+    start[again, BLUR] = SHARP_PX
+    other = run_fit(windows, again, start, *options, threads)
+    better = again[other.at_rest[again] & ~(result.at_rest[again] & (result.chi2_per_dof[again] <= other.chi2_per_dof[again]))]
+    return result.put(better, other) if len(better) else result

@@ -1,0 +1,195 @@
+"""The pass over the frames: each is fetched and summed in one of several threads, all sums exact, so their number does not show."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from typing import NamedTuple
+
+import numpy as np
+
+from pixmetry.camera.observations import LevelMoments, PhotonTransfer
+from pixmetry.core.errors import MeasureError
+from pixmetry.core.threads import imap_tiles
+from pixmetry.observe.hot_pixels import tail_of_counts
+from pixmetry.observe.moments import LevelAccumulator, LevelSummary, level_moments, summarize_pair
+from pixmetry.observe.stack import GroupReduction, new_group
+
+Frame = np.ndarray | Callable[[], np.ndarray]
+Part = Callable[[np.ndarray], np.ndarray]
+
+
+def whole(frame: np.ndarray) -> np.ndarray:
+    """All of a frame, as a part."""
+    return frame
+
+
+@dataclass(frozen=True)
+class Group:
+    """Frames of one condition; a frame may be given as a function that fetches it, which is then called in a thread."""
+
+    kind: str  # "dark" or "bright"
+    role: str  # "level" or "stack"
+    exposure_s: float
+    photons: float | None
+    frames: Iterable[Frame]
+
+
+class Level(NamedTuple):
+    """One level of a series."""
+
+    summary: LevelSummary
+    exposure_s: float
+    photons: float | None
+
+
+class Reduced(NamedTuple):
+    """What a part of the frames of one group was reduced to: the summary of a level, or all running sums of a stack."""
+
+    sums: GroupReduction | LevelSummary
+    shape: tuple[int, int]
+
+
+def reduce_groups(
+    groups: Iterable[Group],
+    bits: int,
+    *,
+    parts: Sequence[Part] = (whole,),
+    spectra_pairs: int = 8,
+    threads: int | None = None,
+    on_frames: Callable[[int], object] | None = None,
+) -> Iterator[tuple[Group, list[Reduced]]]:
+    """Reduce the frames of group after group; in memory are the frames in work, two a thread, and the maps of the groups in work.
+
+    Parameters
+    ----------
+    groups : iterable of Group
+        Read as the work proceeds.
+    bits : int
+        Bits per stored code.
+    parts : sequence of callable
+        Each takes its part out of a frame, such as one phase of a colour filter; the parts are reduced apart.
+    spectra_pairs : int
+        Frame pairs of a stack that enter the temporal spectra.
+    threads : int, optional
+    on_frames : callable, optional
+        Called with the number of frames that were done since the last call.
+
+    Yields
+    ------
+    tuple
+        Each group with one ``Reduced`` for each part.
+
+    Raises
+    ------
+    InputError
+        If a frame cannot be fetched or does not fit.
+    """
+    done: list[Reduced] = []
+    for task in imap_tiles(_Task.run, _tasks(groups, bits, parts, spectra_pairs), threads):
+        if on_frames is not None:
+            on_frames(len(task.frames))
+        done = task.results() if task.last else done
+        if task.last:
+            yield task.group, done
+
+
+class _Sums:
+    """Running sums of one part of the frames of one group, shared by the threads."""
+
+    def __init__(self, part: Part, group: Group, bits: int, spectra_pairs: int) -> None:
+        self.part, self.bits = part, bits
+        self.reduction = new_group(bits, group.role, spectra_pairs)
+        self.summary: Reduced | None = None
+        self._lock = threading.Lock()
+
+    def add(self, first_index: int, frames: Sequence[np.ndarray], alone: bool) -> None:
+        own = [np.ascontiguousarray(self.part(frame)) for frame in frames]
+        if alone:
+            self.summary = Reduced(summarize_pair(own[0], own[1], self.bits), (own[0].shape[0], own[0].shape[1]))
+            return
+        with self._lock:
+            for offset, frame in enumerate(own):
+                self.reduction.add(frame, first_index + offset)
+
+    def result(self) -> Reduced:
+        if self.summary is not None:
+            return self.summary
+        moments = self.reduction.moments
+        return Reduced(moments.summary() if isinstance(moments, LevelAccumulator) else self.reduction, moments.shape)
+
+
+@dataclass
+class _Task:
+    """Up to two frames of a group; with ``alone`` they are all that a level has."""
+
+    group: Group
+    sums: list[_Sums]
+    first_index: int
+    frames: list[Frame]
+    last: bool
+    alone: bool
+
+    def run(self) -> _Task:
+        arrays = [frame() if callable(frame) else frame for frame in self.frames]
+        for sums in self.sums:
+            sums.add(self.first_index, arrays, self.alone)
+        return self
+
+    def results(self) -> list[Reduced]:
+        return [sums.result() for sums in self.sums]
+
+
+def _tasks(groups: Iterable[Group], bits: int, parts: Sequence[Part], spectra_pairs: int) -> Iterator[_Task]:
+    for group in groups:
+        sums = [_Sums(part, group, bits, spectra_pairs) for part in parts]
+        frames, index = iter(group.frames), 0
+        pair = list(islice(frames, 2))
+        while True:
+            following = list(islice(frames, 2))
+            alone = group.role == "level" and index == 0 and len(pair) == 2 and not following
+            yield _Task(group, sums, index, pair, not following, alone)
+            if not following:
+                break
+            index, pair = index + 2, following
+
+
+def refuse_copies(group: Group, level: LevelSummary, bits: int) -> None:
+    """Refuse a bright level whose frames are the same picture; frames of one code, or at either end of the codes, may be alike.
+
+    Raises
+    ------
+    MeasureError
+        If they are.
+    """
+    between = 0 < level.mean_dn < 2**bits - 1
+    ends = (level.counts[0] + level.counts[-1]) / level.counts.sum()
+    if group.kind == "bright" and between and ends < 0.5 and level.squares.total_dn2 == 0 and np.count_nonzero(level.counts) > 1:
+        raise MeasureError(
+            f"the frames of a level are identical (bright, exposure {group.exposure_s:g} s): there is no temporal noise to measure",
+            where="photon transfer",
+            remedy="list frames that were taken one after the other, not copies, averages or synthetic frames",
+        )
+
+
+def photon_transfer(dark: Sequence[Level], bright: Sequence[Level], shape: tuple[int, int] | None, bits: int) -> PhotonTransfer:
+    """Put the levels of a camera together; of one kind there may be none.
+
+    Raises
+    ------
+    MeasureError
+        If there are none at all.
+    """
+    if shape is None or not (dark or bright):
+        raise MeasureError("no frames", where="photon transfer", remedy="add groups of two frames or more")
+    tails = [level.summary.tail or tail_of_counts(level.summary.counts) for level in dark]
+    return PhotonTransfer(_moments(bright), _moments(dark), shape, bits, np.array(tails).reshape(-1, 3))
+
+
+def _moments(levels: Sequence[Level]) -> LevelMoments:
+    photons = [float(level.photons) for level in levels if level.photons is not None]
+    return level_moments(
+        [level.summary for level in levels], [level.exposure_s for level in levels], photons if len(photons) == len(levels) else None
+    )

@@ -1,0 +1,346 @@
+"""Joint estimate of gain, dark noise, non-linearity and their companions from a photon-transfer series.
+
+All means and white mean squares are fitted together by iterated generalised least squares, with the non-linearity free, the additive
+wander of the black level and the lamp noise as variance components by restricted maximum likelihood (REML; Patterson & Thompson 1971), and
+effective degrees of freedom by Satterthwaite's rule (JCGM 100 G.4). The reference that it is compared with is the Cramér-Rao bound of the
+same model with every weight and variance component known: no unbiased estimator that has to find the non-linearity does better.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from pixmetry.camera.observations import PhotonTransfer, StackMoments
+from pixmetry.core.errors import MeasureError
+from pixmetry.core.estimates import Estimates
+from pixmetry.observe import photon_transfer_model as model
+from pixmetry.observe.hot_pixels import HotDoubt, without_hot_pixels
+from pixmetry.observe.photon_transfer_levels import (
+    CLIPPED_BLACK_FRACTION,
+    clipped_black,
+    core_spread_dn2,
+    levels_from,
+    light_scale,
+    prior_precision,
+    refuse_curved,
+    refuse_dead_series,
+    temporal_row_col_vars,
+    usable_levels,
+    with_stacks,
+)
+from pixmetry.observe.photon_transfer_model import A1, A3, DARK_SLOPE, DARK_VAR, DARK_VAR_SLOPE, GAIN, LIGHT_OFFSET, OFFSET, SLOPE
+from pixmetry.observe.photon_transfer_solve import Solution, fit_range
+
+SATURATED_FRACTION = 0.002  # EMVA 1288 R4.0 §6.6: saturation is the highest level with at most 0.2 % of the pixels at the top code
+ALL_SATURATED = 0.999  # then the mean is the top code that the camera stores, which may lie below 2**bits − 1
+NOT_SIGNIFICANT = 3.0  # a variance below this many u is given as a limit
+ONE_SIDED_95 = 1.6448536
+ROW_VAR, COL_VAR, SATURATION, LAMP_VAR, DARK_LIMIT, HOT, EXTRAPOLATED = range(12, 19)
+METHOD = (
+    "joint photon-transfer fit: Poisson electrons, gain and noise before a cubic non-linearity; iterated generalised least squares on "
+    "level means and white mean squares, wander and lamp noise by REML, dof by Satterthwaite (EMVA 1288 R4.0 §6-7 for the quantities)"
+)
+CONFOUNDERS = (
+    "gain: any filter in the camera, the brighter-fatter effect, and traps of a CCD that fill at once lower the variance and so the gain",
+    "non-linearity: a lamp whose light is not proportional to exposure looks like a non-linear camera",
+    "dark noise: holds the shot noise of dark current that does not grow with exposure",
+    "row noise: mains flicker under a rolling shutter looks like row noise in bright frames; dark frames are used here",
+)
+
+
+@dataclass(frozen=True)
+class _Axes:
+    """How the scaled axes of the fit go back to physical ones."""
+
+    light: float  # exposure (s) or photons at a scaled light of one
+    time_s: float
+    by_exposure: bool
+
+
+def fit_photon_transfer(
+    pt: PhotonTransfer, dark_stack: StackMoments | None = None, bright_stack: StackMoments | None = None, dnl_lsb: float = 0.0
+) -> Estimates:
+    """Gain, noise, linearity, dark current and saturation of a camera from a photon-transfer series.
+
+    Parameters
+    ----------
+    pt : PhotonTransfer
+        Bright and dark levels; the light is known from the exposure time or, at constant exposure, from the photons.
+    dark_stack, bright_stack : StackMoments, optional
+        Further frames, not contained in ``pt``; they enter as one more level each. The bright stack is used where light goes by exposure.
+    dnl_lsb : float
+        Standard deviation of the converter's code widths, if it is known: means and variances of narrow levels depend on the few codes
+        that they touch.
+
+    Returns
+    -------
+    Estimates
+        ``gain_dn_per_e``, ``dark_noise_e`` (white, without quantisation), ``row_noise_e``, ``column_noise_e`` (temporal), ``offset_dn``,
+        ``nonlinearity_a1``…``a3`` (y = b + x(1 + a₁w + a₂w² + a₃w³), w = x/(2**bits − 1)), ``illumination_noise_rel`` (of the light of
+        a level's mean), and where the series carries them ``dark_current_e_per_s``, ``responsivity_dn_per_s``,
+        ``quantum_efficiency``, ``saturation_dn``, ``full_well_e``.
+
+    Raises
+    ------
+    MeasureError
+        No dark level, no known light, fewer than four levels between black and saturation, or a response like that of a gamma setting.
+    """
+    refuse_dead_series(pt)
+    scale, by_exposure = light_scale(pt.bright)
+    series, hot = without_hot_pixels(with_stacks(pt, dark_stack, bright_stack if by_exposure else None), dark_stack)
+    levels, time_scale = levels_from(series, scale, by_exposure, core_spread_dn2(dark_stack), dnl_lsb)
+    refuse_curved(series, levels)
+    try:
+        solution, keep = fit_range(levels, usable_levels(series, levels), prior_precision(series, levels))
+        if solution.p[GAIN] < 3 * np.sqrt(solution.covariance[GAIN, GAIN]):
+            what = "the temporal variance does not grow with the mean, so the gain is not resolved"
+            raise MeasureError(what, where="photon transfer", remedy="use a higher analogue gain, larger frames or more levels")
+    except MeasureError:
+        refuse_curved(series, levels, failed=True)  # the plainer reason, if there is one
+        raise
+    return _estimates(series, solution, levels.subset(keep), _Axes(scale, time_scale, by_exposure), hot)
+
+
+@dataclass
+class _Rows:
+    """Collects results with their gradients over the parameters of the fit and the quantities estimated beside it."""
+
+    covariance: np.ndarray
+    names: list[str] = field(default_factory=list)
+    values: list[float] = field(default_factory=list)
+    units: list[str] = field(default_factory=list)
+    gradients: list[np.ndarray] = field(default_factory=list)
+    limits: set[str] = field(default_factory=set)
+    lower_limits: set[str] = field(default_factory=set)
+    reasons: dict[str, str] = field(default_factory=dict)
+
+    def add(self, name: str, value: float, unit: str, gradient: dict[int, float], reason: str = "", limit: bool = False) -> None:
+        row = np.zeros(self.covariance.shape[0])
+        for k, v in gradient.items():
+            row[k] = v
+        self.names.append(name)
+        self.values.append(float(value))
+        self.units.append(unit)
+        self.gradients.append(row)
+        if reason:
+            self.reasons[name] = reason
+        if limit:
+            self.limits.add(name)
+
+    def add_root(
+        self, name: str, unit: str, square: float, index: int, gain: float | None, what: str, reason: str = "", dof: float = 1e6
+    ) -> None:
+        """A standard deviation from its square (parameter ``index``), in electrons if a gain is given; a limit if not significant."""
+        u2 = float(np.sqrt(self.covariance[index, index]))
+        limit = square < NOT_SIGNIFICANT * u2
+        root = np.sqrt(max(square, 0.0) + _limit_factor(dof) * u2) if limit else np.sqrt(square)
+        k = gain or 1.0
+        root = max(root, 1e-12)
+        gradient = {index: 0.5 / (root * k)}
+        if gain:
+            gradient[GAIN] = -root / k**2
+        if limit:
+            found = f"its square is {square:.3g} with a standard uncertainty of {u2:.3g}"
+            reason = f"{what} is not significant: {found}; 95 % upper limit. {reason}".strip()
+        self.add(name, root / k, unit, gradient, reason, limit)
+
+
+def _augmented(pt: PhotonTransfer, s: Solution, d: model.Levels) -> tuple[np.ndarray, np.ndarray]:
+    """Parameters of the fit and the quantities beside it, with their covariance."""
+    n = s.p.size
+    values, cov = np.zeros(n + 7), np.zeros((n + 7, n + 7))
+    dark = ~d.bright
+    values[:n], cov[:n, :n] = s.p, s.covariance
+    line, line_var = temporal_row_col_vars(pt)
+    values[ROW_VAR : COL_VAR + 1] = line
+    dither = float(d.dither[dark].mean()) if dark.any() else 0.0
+    white = model.white_before_rounding(float(d.ms[dark].mean()) if dark.any() else 1.0, dither)
+    # what rounding and code widths stretch in common is no scatter of the lines
+    line_var = line_var + 4 * model.slope_error_var(white, dither, d.dnl_lsb) * line**2
+    cov[ROW_VAR, ROW_VAR], cov[COL_VAR, COL_VAR] = line_var
+    converter_vars = model.rounding_error_vars(np.array(white), dither, d.dnl_lsb)
+    if s.free[DARK_SLOPE]:
+        _add_rounding_of_slopes(cov, s, converter_vars)
+    if model.is_hidden(d):  # the common part is in the fit; levels that pass through few codes do not average the rest
+        cov[OFFSET, OFFSET] += (1 - d.coherence**2) * float(converter_vars[0])
+    values[LAMP_VAR], cov[LAMP_VAR, LAMP_VAR] = s.components[1], s.components_cov[1, 1]
+    return values, cov
+
+
+def _add_rounding_of_slopes(cov: np.ndarray, s: Solution, converter_vars: tuple[np.ndarray, np.ndarray]) -> None:
+    """Widen the slopes of the dark mean and variance by what the converter does to them while the mean moves over its codes.
+
+    Its errors are waves of one code: over a rise r of the mean they change by at most 2π r of their amplitude, and never by more than
+    twice it.
+    """
+    change = np.sqrt(converter_vars) * min(2 * np.pi * abs(s.p[DARK_SLOPE]), 2.0)
+    for at, extra in zip((DARK_SLOPE, DARK_VAR_SLOPE), change, strict=True):
+        cov[at, at] += float(extra) ** 2
+    cov[SLOPE, SLOPE] += float(change[0]) ** 2  # where the exposure was swept, what is not the one is the other
+    cov[SLOPE, DARK_SLOPE] -= float(change[0]) ** 2
+    cov[DARK_SLOPE, SLOPE] -= float(change[0]) ** 2
+
+
+def _effective_dof(s: Solution, rows: np.ndarray, cov: np.ndarray, lamp_dof: float) -> np.ndarray:
+    """Satterthwaite: dof = 2u⁴/Var(u²), where u² depends on the variance components.
+
+    A component estimated as zero adds nothing to u, so its scatter is not counted.
+    """
+    n_par = s.p.size
+    total = np.einsum("ki,ij,kj->k", rows, cov, rows)
+    by = np.einsum("ki,cij,kj->kc", rows[:, :n_par], s.covariance_by, rows[:, :n_par]) * (s.components > 0)
+    var_u2 = np.einsum("kc,cd,kd->k", by, s.components_cov, by)
+    var_u2 = var_u2 + 2 * (rows[:, LAMP_VAR] ** 2 * cov[LAMP_VAR, LAMP_VAR]) ** 2 / lamp_dof
+    with np.errstate(divide="ignore", invalid="ignore"):
+        dof = 2 * total**2 / var_u2
+    return np.where((var_u2 > 0) & (dof < 1e6), np.maximum(dof, 1.0), np.inf)
+
+
+def _limit_factor(dof: float) -> float:
+    """How many u lie between a variance and its one-sided 95 % limit: √(ν/2)(ν/χ²₀.₀₅ − 1), 1.645 for many degrees of freedom."""
+    q = 2 / (9 * dof)
+    chi2 = dof * max(1 - q - ONE_SIDED_95 * np.sqrt(q), 0.1) ** 3
+    return float(np.sqrt(dof / 2) * (dof / chi2 - 1))
+
+
+def _estimates(pt: PhotonTransfer, s: Solution, d: model.Levels, axes: _Axes, hot: HotDoubt) -> Estimates:
+    p = s.p
+    values, cov = _augmented(pt, s, d)
+    cov[HOT, HOT] = hot.mean_dn**2
+    cov[DARK_VAR, DARK_VAR] += hot.var_dn2**2
+    lamp_dof = float(max(d.bright.sum() - s.free[[SLOPE, A1, A1 + 1, A3, LIGHT_OFFSET]].sum(), 1))
+    saturation = _saturation(pt, s, d, axes)
+    if saturation:
+        cov[SATURATION, SATURATION] = saturation[1] ** 2
+    rows = _Rows(cov)
+    extra = np.sqrt(s.components[2])
+    wide = f"the variances scatter by {100 * extra:.2g} % beyond their sampling law; u is widened by that" if extra > 0 else ""
+    rows.add("gain_dn_per_e", p[GAIN], "DN/e-", {GAIN: 1.0}, wide)
+    _add_temporal_noise(rows, s, d, values, clipped_black(pt))
+    one_time = "" if s.free[DARK_SLOPE] else "contains the dark signal: the dark frames have about one exposure time"
+    rows.add("offset_dn", p[OFFSET], "DN", {OFFSET: 1.0, HOT: 1.0}, one_time)
+    if s.free[DARK_SLOPE]:
+        _add_dark_current(rows, p, axes.time_s)
+    for k in range(3):
+        rows.add(f"nonlinearity_a{k + 1}", p[A1 + k], "1", {A1 + k: 1.0})
+    _add_sensitivity(rows, pt, p, axes)
+    rows.add_root("illumination_noise_rel", "1", s.components[1], LAMP_VAR, None, "noise of the light from level to level", dof=lamp_dof)
+    if saturation:
+        _add_saturation(rows, p, saturation, d.x_ref, float(d.mean[d.bright].max()))
+    gradients = np.array(rows.gradients)
+    return Estimates(
+        names=tuple(rows.names),
+        values=np.array(rows.values),
+        covariance=gradients @ cov @ gradients.T,
+        dof=_effective_dof(s, gradients, cov, lamp_dof),
+        units=tuple(rows.units),
+        method=METHOD,
+        confounders=CONFOUNDERS,
+        limits=frozenset(rows.limits),
+        lower_limits=frozenset(rows.lower_limits),
+        reasons=rows.reasons,
+    )
+
+
+def _add_sensitivity(rows: _Rows, pt: PhotonTransfer, p: np.ndarray, axes: _Axes) -> None:
+    """Initial slope of the signal against exposure time, and electrons per photon."""
+    if axes.by_exposure:
+        rows.add("responsivity_dn_per_s", p[SLOPE] / axes.light, "DN/s", {SLOPE: 1 / axes.light})
+    if pt.bright.photons is None:
+        return
+    known = np.isfinite(pt.bright.photons)
+    light = pt.bright.exposure_s if axes.by_exposure else pt.bright.photons
+    photons = axes.light * pt.bright.photons[known].sum() / light[known].sum()  # at a scaled light of one
+    value = p[SLOPE] / (p[GAIN] * photons)
+    gradient = {SLOPE: value / p[SLOPE], GAIN: -value / p[GAIN]}
+    rows.add("quantum_efficiency", value, "1", gradient, "u leaves out the calibration of the photon count")
+
+
+def _add_temporal_noise(rows: _Rows, s: Solution, d: model.Levels, values: np.ndarray, clipped: float) -> None:
+    """White, row and column noise, or the bound of EMVA 1288 R4.0 eq. 54 where quantisation hides them."""
+    gain = s.p[GAIN]
+    dark = ~d.bright
+    if dark.any() and d.ms[dark].mean() < model.MINIMUM_DARK_VAR_DN2:
+        bound = 0.40 / gain
+        rows.covariance[DARK_LIMIT, DARK_LIMIT] = bound**2 / 12
+        reason = (
+            f"the dark variance is below {model.MINIMUM_DARK_VAR_DN2} DN², where rounding hides it: "
+            "bound 0.40/K (EMVA 1288 R4.0 eq. 54); u is that of an even spread below it"
+        )
+        for name in ("dark_noise_e", "row_noise_e", "column_noise_e"):
+            rows.add(name, bound, "e-", {DARK_LIMIT: 1.0}, reason, limit=True)
+        return
+    reason = ""
+    if clipped > CLIPPED_BLACK_FRACTION:
+        reason = (
+            f"{100 * clipped:.2g} % of the dark pixels are clipped at black: "
+            "taken from the levels that are not, extrapolated to zero light; raise the black level"
+        )
+    elif not s.free[DARK_VAR_SLOPE]:
+        reason = "contains the shot noise of the dark current at the exposure of the dark frames"
+    rows.add_root("dark_noise_e", "e-", values[DARK_VAR], DARK_VAR, gain, "dark noise", reason)
+    rows.add_root("row_noise_e", "e-", values[ROW_VAR], ROW_VAR, gain, "temporal row noise")
+    rows.add_root("column_noise_e", "e-", values[COL_VAR], COL_VAR, gain, "temporal column noise")
+
+
+def _add_dark_current(rows: _Rows, p: np.ndarray, time_scale: float) -> None:
+    """Dark current from the mean, or from the variance where a clamp or a drifting black level spoils the mean (EMVA 1288 R4.0 §7)."""
+    gain = p[GAIN]
+    from_mean, from_var = p[DARK_SLOPE] / (gain * time_scale), p[DARK_VAR_SLOPE] / (gain**2 * time_scale)
+    mean_row = {DARK_SLOPE: 1 / (gain * time_scale), GAIN: -from_mean / gain}
+    var_row = {DARK_VAR_SLOPE: 1 / (gain**2 * time_scale), GAIN: -2 * from_var / gain}
+    c = rows.covariance
+
+    def u_of(row):
+        k, g = list(row), np.array(list(row.values()))
+        return float(np.sqrt(g @ c[np.ix_(k, k)] @ g))
+
+    difference = {k: mean_row.get(k, 0.0) - var_row.get(k, 0.0) for k in {*mean_row, *var_row}}
+    value, row, reason = from_mean, mean_row, ""
+    if p[DARK_VAR_SLOPE] and abs(from_mean - from_var) > 4.5 * u_of(difference):  # 0: rounding hides the variance
+        value, row = from_var, var_row
+        reason = f"from the dark variance: the mean ({from_mean:.4g} e-/s) contradicts it, so the black level is clamped or drifts"
+    u = u_of(row)
+    limit = value < 2 * u
+    if limit:
+        reason = f"not significant: {value:.3g} e-/s with a standard uncertainty of {u:.3g}; 95 % upper limit. {reason}".strip()
+        value = max(value, 0.0) + ONE_SIDED_95 * u
+    rows.add("dark_current_e_per_s", value, "e-/s", row, reason, limit)
+
+
+def _saturation(pt: PhotonTransfer, s: Solution, d: model.Levels, axes: _Axes) -> tuple[float, float, str] | None:
+    """Stored value of saturation, its standard uncertainty and what sets it; ``None`` where no level is saturated.
+
+    Either the converter clips, or the brightest two levels stand still, less than a tenth of the growth that their light would give.
+    """
+    b = pt.bright
+    if b.fraction_max.max() - pt.dark.fraction_max.max(initial=0.0) > SATURATED_FRACTION:
+        full = b.fraction_max > ALL_SATURATED
+        return (float(b.mean_dn[full].max()) if full.any() else d.x_ref), float(np.sqrt(model.QUANTISATION_DN2)), "converter"
+    light = b.exposure_s if b.photons is None or axes.by_exposure else b.photons
+    light = light / axes.light
+    second, first = np.argsort(light, kind="stable")[-2:]
+    growth, expected = abs(b.mean_dn[first] - b.mean_dn[second]), (light[first] - light[second]) * s.p[SLOPE]
+    beyond = b.mean_dn[second] > d.mean[d.bright].max() and growth < 0.1 * expected
+    return (float(b.mean_dn[first]), float(max(growth, 0.3)), "full well") if beyond else None
+
+
+def _add_saturation(rows: _Rows, p: np.ndarray, saturation: tuple[float, float, str], x_ref: float, brightest_dn: float) -> None:
+    """Saturation in stored DN and in electrons."""
+    y, _, cause = saturation
+    gain, a = p[GAIN], p[A1 : A3 + 1]
+    x, brightest = model.signal_from_mean(np.array([y, brightest_dn]) - p[OFFSET], a, x_ref, np.zeros(1)).tolist()
+    slope, last_slope = model.transfer(np.array([x, brightest]), a, x_ref)[1].tolist()
+    # beyond the brightest level that was fitted the bend is extrapolated: known no better than to all of it
+    bend = x - brightest - (y - brightest_dn) / last_slope
+    rows.covariance[EXTRAPOLATED, EXTRAPOLATED] = (bend / gain) ** 2
+    rows.add("saturation_dn", y, "DN", {SATURATION: 1.0}, f"set by the {cause}")
+    gradient = {SATURATION: 1 / (slope * gain), OFFSET: -1 / (slope * gain), GAIN: -x / gain**2}
+    gradient |= {EXTRAPOLATED: 1.0} | {A1 + k: -x * (x / x_ref) ** (k + 1) / (slope * gain) for k in range(3)}
+    clips = cause == "converter"
+    note = "lower bound of the pixel's full well: the converter clips first" if clips else "the pixels saturate below the top code"
+    rows.add("full_well_e", x / gain, "e-", gradient, note)
+    if clips:
+        rows.lower_limits.add("full_well_e")

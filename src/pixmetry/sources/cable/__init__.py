@@ -1,0 +1,1 @@
+"""Sources of the cable between an analogue camera and its frame grabber."""

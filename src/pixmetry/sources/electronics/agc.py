@@ -1,0 +1,92 @@
+"""Automatic gain control: the gain of each frame follows the brightness of the one before."""
+
+from __future__ import annotations
+
+import numpy as np
+from pydantic import model_validator
+
+from pixmetry.camera.contribution import Contribution, Probe
+from pixmetry.camera.signal import Kind, Signal, Windows
+from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.errors import ParameterError
+from pixmetry.core.random import Stream
+
+DARKEST_DN = 1e-6  # a frame without light asks for all the gain there is
+
+
+class Agc(Parameters):
+    """A loop that is linear in decibels."""
+
+    target_dn: float = quantity(100.0, "DN", "mean of the whole frame above black that it aims at", gt=0, le=1e9)
+    kappa: float = quantity(0.0, "1", "part of the deviation in decibels that one frame removes; 0 locks the gain", ge=0, le=1)
+    lowest_db: float = quantity(0.0, "dB", "lowest gain", ge=-40, le=0)
+    highest_db: float = quantity(32.0, "dB", "highest gain", ge=0, le=80)
+
+    @model_validator(mode="after")
+    def _settles(self) -> Agc:
+        if 0 < self.kappa < 0.02:
+            raise ParameterError("the loop would take hundreds of frames to settle", value=self.kappa, allowed="0, or 0.02 to 1")
+        return self
+
+
+def start(params: Agc) -> float | None:
+    """Gain before frame 0; none where it is locked."""
+    return 1.0 if params.kappa else None
+
+
+def following(params: Agc, gain: float, mean_dn: float) -> float:
+    """Gain of the next frame, from the gain of this one and the mean that it gave."""
+    wanted = gain * (params.target_dn / max(mean_dn, DARKEST_DN)) ** params.kappa
+    return float(np.clip(wanted, 10 ** (params.lowest_db / 20), 10 ** (params.highest_db / 20)))
+
+
+def forward(params: Agc, signal: Signal, stream: Stream, state: float | None) -> tuple[Signal, float | None]:
+    """Multiply frame by frame by the gain and move it on; over windows, which do not know the frame's mean, it stays as it is."""
+    if params.kappa == 0:
+        return signal, state
+    if signal.data.shape[1:] != tuple(signal.frame_shape):
+        return signal.with_data(signal.data * np.float32(state)), state
+    data = np.empty_like(signal.data, np.float32)
+    for i, frame in enumerate(signal.data):
+        np.multiply(frame, np.float32(state), out=data[i])
+        state = following(params, state, float(data[i].mean(dtype=np.float64)))
+    return signal.with_data(data), state
+
+
+def context(params: Agc, windows: Windows, frame_shape: tuple[int, int]) -> Windows:
+    """The whole frame: its mean sets the gain."""
+    return windows.full_frame(frame_shape) if params.kappa else windows
+
+
+def propagate(params: Agc, probe: Probe) -> Contribution:
+    """A common factor moves no centroid whose background and threshold follow it; noise grows with the gain as the signal does."""
+    return probe.contribution((0.0, 0.0), "F", method="a common factor, which background and threshold follow")
+
+
+SOURCE = Source(
+    id="electronics.agc",
+    title="Automatic gain control",
+    description="The gain follows the scene from frame to frame: grey values, noise and what a fixed threshold cuts off change with it.",
+    number=22,
+    stars=3,
+    parameters=Agc,
+    consumes=(Kind.DN,),
+    after=("sensor",),
+    before=("cable", "grabber", "storage"),
+    neutral=Agc(),
+    typical=Agc(kappa=0.3, highest_db=16.0),
+    bound=Agc(kappa=0.3, highest_db=32.0),
+    forward=forward,
+    propagate=propagate,
+    context=context,
+    start=start,
+    gum_class="F",
+    equation="g(t+1) = g(t) (y_target/⟨y(t)⟩)^κ,  within the limits",
+    typical_size="no shift where the threshold follows the frame; with a hard threshold of fixed DN from 0.03 to 0.09 px",
+    references=("K. J. Åström, R. M. Murray, Feedback Systems, Princeton 2008 (first-order discrete loop)",),
+    advice="Switch it off.",
+    reasons={
+        "measure": "needs a sequence in which part of the scene changes: frames of steady light do not move the gain",
+        "correct": "the gain of each frame is not in the frame; lock it, or set the threshold relative to the target's peak",
+    },
+)

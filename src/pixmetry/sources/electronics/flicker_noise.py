@@ -1,0 +1,122 @@
+"""Flicker noise: the 1/f noise of the output amplifier, along the pixels in the order in which they are read."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from pixmetry.camera.contribution import Contribution, Probe
+from pixmetry.camera.signal import Kind, Signal
+from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.random import Grid, Stream
+from pixmetry.sources.electronics._kernels import add_interpolated
+
+VARIANCE = 2 / 3  # of straight lines between independent nodes of variance 1, on average over the places between them
+
+
+class FlickerNoise(Parameters):
+    """Noise whose power density goes as 1/f over a number of octaves below the corner; beyond, it falls off as 1/f⁴."""
+
+    rms_e: float = quantity(0.0, "e-", "root mean square over all octaves", ge=0, le=1e5)
+    corner_rel: float = quantity(0.1, "1", "frequency up to which it goes as 1/f, over the pixel clock", gt=0, le=0.5)
+    octaves: int = quantity(16, "1", "octaves of 1/f below the corner; slower than the lowest, the density is level", ge=1, le=32)
+    line_px: float = quantity(908.0, "px", "pixel clocks from line to line; at least the row's pixels", ge=0, le=1e6)
+    interlaced: bool = quantity(False, "1", "whether even rows are read first, then odd ones")
+    field_lines: float = quantity(312.5, "1", "lines from the start of the first field to that of the second", gt=0, le=1e6)
+
+    def clocks(self, row: np.ndarray, cols: int) -> np.ndarray:
+        """Pixel clocks at which rows of so many pixels begin."""
+        line = row // 2 + self.field_lines * (row % 2) if self.interlaced else row
+        return line * max(self.line_px, float(cols))
+
+
+def octaves(params: FlickerNoise) -> list[tuple[float, float]]:
+    """Distance of the nodes in pixel clocks, and share of the variance, of every octave.
+
+    Straight lines between independent nodes P apart have the density P sinc⁴(f P), up to a factor; its sum over octaves of P is 1/f
+    within 0.4 %, as far as there are octaves on both sides. The fastest counts twice: to low frequencies it is what all faster ones
+    would be together, P/2 + P/4 + … = P. So the density is right within 0.1 dB up to a quarter of the corner, 1 dB at half of it.
+    """
+    shares = np.ones(params.octaves)
+    shares[0] = 2.0
+    periods = 0.5 / params.corner_rel * 2.0 ** np.arange(params.octaves)
+    return [(float(p), float(s)) for p, s in zip(periods, shares / shares.sum(), strict=True)]
+
+
+def forward(params: FlickerNoise, signal: Signal, stream: Stream) -> Signal:
+    """Add the noise: in every octave, straight lines between keyed normal nodes whose raster starts anywhere in each frame.
+
+    A pixel looks up the nodes by its own time, so a window is the crop of its frame.
+    """
+    if params.rms_e == 0 or stream.quiet:
+        return signal
+    data = np.array(signal.data, np.float32)
+    n, rows, cols = data.shape
+    first = (params.clocks(signal.rows, signal.frame_shape[1]) + signal.grid.col0[:, None]).ravel()  # time of each row's first pixel
+    lines = data.reshape(n * rows, cols)
+    frame = np.repeat(signal.grid.frame, rows)
+    for k, (period, share) in enumerate(octaves(params)):
+        start = np.repeat(stream.uniform_frames(signal.grid, k).astype(float), rows)
+        node = np.floor(first / period + start)
+        count = int(cols / period) + 3
+        grid = Grid(frame, np.zeros_like(frame), node.astype(np.int64), (1, count))
+        scale = params.rms_e * math.sqrt(share / VARIANCE)
+        add_interpolated(stream.normal(grid, k)[:, 0], first / period + start - node, 1.0 / period, scale, lines)
+    return signal.with_data(data)
+
+
+def covariance(params: FlickerNoise, lag_px: np.ndarray) -> np.ndarray:
+    """Covariance in e-² at lags in pixel clocks: per octave the cubic B-spline, a triangle with itself, over its value 2/3 at 0."""
+    u = np.abs(np.asarray(lag_px, float))
+    out = np.zeros_like(u)
+    for period, share in octaves(params):
+        v = np.minimum(u / period, 2.0)
+        out += share * np.where(v < 1, 1 - 1.5 * v**2 + 0.75 * v**3, 0.25 * (2 - v) ** 3)
+    return params.rms_e**2 * out
+
+
+def propagate(params: FlickerNoise, probe: Probe) -> Contribution:
+    """Propagator P1 with the covariance of the window's pixels at their times of read-out: u² = gᵀ C g.
+
+    Of two fields, windows that begin on even and on odd rows weigh the same.
+    """
+    rows, cols = probe.gx.shape[1:]
+    flat = [g.reshape(len(g), -1) for g in (probe.gx, probe.gy)]
+    squares = np.zeros(2)
+    starts = (0, 1) if params.interlaced else (0,)
+    for start in starts:
+        first = params.clocks(start + np.arange(rows), probe.frame_shape[1])
+        table = covariance(params, (first[:, None] - first)[:, :, None] + np.arange(1 - cols, cols))  # two rows, and columns apart
+        apart = np.arange(cols)[:, None] - np.arange(cols) + cols - 1
+        matrix = table[:, :, apart].transpose(0, 2, 1, 3).reshape(rows * cols, rows * cols) * probe.gain_dn_per_e**2
+        squares += [np.mean(np.einsum("pi,pi->p", g @ matrix, g)) / len(starts) for g in flat]
+    u = float(np.sqrt(squares[0])), float(np.sqrt(squares[1]))
+    return probe.contribution(u, "T", model_error=0.12, method="linear response of the estimator to noise along the read-out")
+
+
+SOURCE = Source(
+    id="electronics.flicker_noise",
+    title="Flicker noise",
+    description="The 1/f noise of the output amplifier runs along the rows: neighbours in a row share it, rows differ in their mean.",
+    parameters=FlickerNoise,
+    consumes=(Kind.ELECTRONS,),
+    after=("sensor",),
+    neutral=FlickerNoise(),
+    typical=FlickerNoise(rms_e=10.0),
+    bound=FlickerNoise(rms_e=60.0, corner_rel=0.2),
+    forward=forward,
+    propagate=propagate,
+    gum_class="T",
+    equation="n' = n + ζ(t),  t = r t_line + c t_pixel (r: line of the field),  S_ζ(f) ∝ 1/f from f_c/2^octaves to f_c",
+    typical_size="0.009 px in y and 0.002 px in x per DN rms on a disc of 7 px (white noise: 0.004 px): the pixels of a row share it",
+    references=(
+        "R. F. Voss, J. Clarke, J. Acoust. Soc. Am. 63(1), 1978 (1/f noise as a sum of slow and fast ones)",
+        "J. R. Janesick, Photon Transfer, SPIE Press 2007, ch. 11 (1/f noise and correlated double sampling)",
+    ),
+    advice="Use correlated double sampling with a short interval; clamp every row on its optically black pixels.",
+    reasons={
+        "measure": "not measured: needs the spectrum of dark rows along the read-out; the photon transfer holds it as white and row noise",
+        "correct": "noise cannot be undone; the part common to a row goes with optically black columns",
+    },
+)

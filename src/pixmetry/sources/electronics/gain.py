@@ -1,0 +1,59 @@
+"""Conversion gain: electrons become steps of the converter."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pixmetry.camera.observations import Observations
+from pixmetry.camera.signal import Kind, Signal
+from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.estimates import Estimates
+from pixmetry.core.random import Stream
+
+
+class Gain(Parameters):
+    """The system gain K of EMVA 1288."""
+
+    gain_dn_per_e: float = quantity(0.01, "DN/e-", "steps of the converter per electron", gt=0, le=1e4)
+
+
+def forward(params: Gain, signal: Signal, stream: Stream) -> Signal:
+    """Multiply the electrons by the gain."""
+    return signal.with_data(signal.data * np.float32(params.gain_dn_per_e), Kind.DN)
+
+
+def measure(observations: Observations) -> Estimates:
+    """Read the gain from the photon transfer: the slope of temporal variance against mean."""
+    return observations.fitted(
+        {"gain_dn_per_e": "gain_dn_per_e"},
+        "the gain needs a photon-transfer series",
+        where="electronics.gain",
+        remedy="take pairs at ten light levels or more",
+    )
+
+
+SOURCE = Source(
+    id="electronics.gain",
+    title="Conversion gain",
+    description="Charge becomes a voltage and a number: so many steps of the converter per electron.",
+    number=19,
+    parameters=Gain,
+    consumes=(Kind.ELECTRONS,),
+    produces=Kind.DN,
+    essential=True,
+    after=("optics", "sensor"),
+    typical=Gain(),
+    bound=Gain(),
+    forward=forward,
+    measure=measure,
+    gum_class="T",
+    equation="y = K n",
+    typical_size="no shift of its own; a low gain lets the converter's steps show",
+    references=("EMVA 1288 R4.0 Linear, §2.2 and §6.5, eq. 16–18",),
+    advice="Set the gain so that one step of the converter is about the dark noise.",
+    reasons={
+        "correct": "a common factor is no error of the image",
+        "propagate": "it scales all pixels alike, which moves nothing; noise and quantisation have sources of their own",
+        "neutral": "it is a conversion: without it there are no numbers",
+    },
+)

@@ -1,0 +1,67 @@
+"""Temporal row and column noise: offsets common to a row or a column, new in every frame."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pixmetry.camera.contribution import Contribution, Probe
+from pixmetry.camera.observations import Observations
+from pixmetry.camera.signal import Kind, Signal
+from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.estimates import Estimates
+from pixmetry.core.random import Stream
+
+
+class RowNoise(Parameters):
+    """Standard deviations of the offsets, referred to electrons."""
+
+    row_e: float = quantity(0.0, "e-", "common to a row", ge=0, le=1e5)
+    column_e: float = quantity(0.0, "e-", "common to a column", ge=0, le=1e5)
+
+
+def forward(params: RowNoise, signal: Signal, stream: Stream) -> Signal:
+    """Add one normal number a row and one a column."""
+    if params.row_e == 0 and params.column_e == 0:
+        return signal
+    rows = np.float32(params.row_e) * stream.normal_rows(signal.grid)
+    columns = np.float32(params.column_e) * stream.normal_cols(signal.grid)
+    return signal.with_data(signal.data + rows[:, :, None] + columns[:, None, :])
+
+
+def measure(observations: Observations) -> Estimates:
+    """Read the temporal row and column variance of dark pairs, less what white noise gives to a mean of a line."""
+    return observations.fitted(
+        {"row_e": "row_noise_e", "column_e": "column_noise_e"},
+        "row noise needs a photon-transfer series with dark frames",
+        where="electronics.row_noise",
+        remedy="take dark pairs",
+    )
+
+
+def propagate(params: RowNoise, probe: Probe) -> Contribution:
+    """Propagator P1 with the errors of each row, and of each column, in common."""
+    rows, columns = probe.rows(probe.gain_dn_per_e * params.row_e), probe.columns(probe.gain_dn_per_e * params.column_e)
+    u = float(np.hypot(rows[0], columns[0])), float(np.hypot(rows[1], columns[1]))
+    return probe.contribution(u, "Tr", model_error=0.12, method="linear response of the estimator to offsets common to rows and columns")
+
+
+SOURCE = Source(
+    id="electronics.row_noise",
+    title="Temporal row and column noise",
+    description="The reference of each row (or column) amplifier moves from frame to frame, so a whole line goes up or down.",
+    parameters=RowNoise,
+    consumes=(Kind.ELECTRONS,),
+    after=("sensor",),
+    neutral=RowNoise(),
+    typical=RowNoise(row_e=1.0, column_e=0.3),
+    bound=RowNoise(row_e=5.0, column_e=2.0),
+    forward=forward,
+    measure=measure,
+    propagate=propagate,
+    gum_class="Tr",
+    equation="n' = n + σ_row z_r + σ_col z_c",
+    typical_size="0.0155 px per DN in y on a disc of 7 px in a window of radius 6 px",
+    references=("EMVA 1288 R4.0 Linear, §8.2 (row and column split)",),
+    advice="Use optically black columns to take each row's offset off, or average frames.",
+    reasons={"correct": "needs optically black columns beside the picture, which give each row's offset"},
+)

@@ -1,0 +1,1 @@
+"""Sources of the frame grabber: clamp, clock, sampling, converter."""

@@ -1,0 +1,123 @@
+"""Line jitter: the sampling clock is locked anew in every line, and each time a little early or late."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from pixmetry.camera.contribution import Contribution, Probe, smooth_part
+from pixmetry.camera.line import alike_rows, from_row_delays, from_steady_delays
+from pixmetry.camera.signal import Kind, Signal
+from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.random import Grid, Stream
+
+
+class LineJitter(Parameters):
+    """Delays of the rows against each other; rows of a field follow each other in time."""
+
+    white_ns: float = quantity(0.0, "ns", "standard deviation of what is independent from line to line", ge=0, le=1000)
+    loop_ns: float = quantity(0.0, "ns", "standard deviation of what the loop carries on from line to line", ge=0, le=1000)
+    loop_rows: float = quantity(5.0, "rows", "lines of a field over which that falls to 1/e", ge=0.2, le=60)
+    settling_ns: float = quantity(0.0, "ns", "phase error of the first line after the vertical interval", ge=-5000, le=5000)
+    settling_rows: float = quantity(15.0, "rows", "lines of a field over which it falls to 1/e", gt=0.1, le=300)
+    shear_ns: float = quantity(0.0, "ns", "how much later the last row comes than the first, steadily", ge=-5000, le=5000)
+    interlaced: bool = quantity(True, "1", "whether even and odd rows are two fields, each with its own loop")
+
+    @property
+    def stride(self) -> int:
+        """Rows of the frame from line to line of a field."""
+        return 2 if self.interlaced else 1
+
+
+def systematic_s(params: LineJitter, rows: np.ndarray, frame_rows: int) -> np.ndarray:
+    """What is the same in every frame, at absolute rows: A e^(−line/r_s) + shear."""
+    line = np.asarray(rows) // params.stride
+    shear = params.shear_ns * (np.asarray(rows) / max(frame_rows - 1, 1) - 0.5)
+    return 1e-9 * (params.settling_ns * np.exp(-line / params.settling_rows) + shear)
+
+
+def delay_s(params: LineJitter, grid: Grid, frame_rows: int, stream: Stream) -> np.ndarray:
+    """Delay of every row of a grid in s, shape (n, rows)."""
+    total = systematic_s(params, grid.row0[:, None] + np.arange(grid.shape[0]), frame_rows)
+    if params.white_ns:
+        total = total + 1e-9 * params.white_ns * stream.normal_rows(grid)
+    if params.loop_ns:
+        total = total + 1e-9 * params.loop_ns * alike_rows(stream, grid, params.loop_rows, params.stride, draw=1)
+    return total
+
+
+def forward(params: LineJitter, signal: Signal, stream: Stream) -> Signal:
+    """Delay every row."""
+    if not (params.white_ns or params.loop_ns or params.settling_ns or params.shear_ns):
+        return signal
+    frame_rows = signal.frame_shape[0]
+    return signal.with_line(signal.line.delayed(lambda grid: delay_s(params, grid, frame_rows, stream)))
+
+
+def truth(params: LineJitter, signal: Signal, stream: Stream) -> Mapping[str, np.ndarray]:
+    """Shift of every row in pixels, shape (n, rows)."""
+    return {"row_shift_px": delay_s(params, signal.grid, signal.frame_shape[0], stream) * signal.clock.pixel_hz}
+
+
+def near(params: LineJitter, pixel_hz: float, row_px: int) -> tuple[int, int, int, int]:
+    """Pixels by which a row may be shifted, to either side."""
+    worst = 7 * np.hypot(params.white_ns, params.loop_ns) + abs(params.settling_ns) + abs(params.shear_ns)
+    reach = int(np.ceil(worst * 1e-9 * pixel_hz))
+    return 0, 0, reach, reach
+
+
+def tail(params: LineJitter, pixel_hz: float, row_px: int) -> float:
+    """Nothing comes from farther away (a normal number beyond 6.8 standard deviations is not drawn)."""
+    return 0.0
+
+
+def propagate(params: LineJitter, probe: Probe) -> Contribution:
+    """Independent and carried-on delays by the answer of the camera's line and of the estimator to the delay of each row.
+
+    The steady part is seen at places down the frame; what a cubic of the row follows of it is smooth.
+    """
+    (u_x, u_y), (bias_x, bias_y) = from_row_delays(
+        probe, 1e-9 * params.white_ns, 1e-9 * params.loop_ns, params.loop_rows, params.stride
+    )
+    dx = dy = smooth_x = np.zeros(1)
+    if params.settling_ns or params.shear_ns:
+        dx, dy, first = from_steady_delays(probe, lambda rows: systematic_s(params, rows, probe.frame_shape[0]))
+        smooth_x = smooth_part(dx, first)
+    return Contribution(
+        u_x_px=float(np.hypot(u_x, dx.std())), u_y_px=float(np.hypot(u_y, dy.std())), bias_x_px=float(bias_x + dx.mean()),
+        bias_y_px=float(bias_y + dy.mean()), gum_class="Tr", model_error=0.15, time_px=(u_x, u_y), smooth_px=(float(smooth_x.std()), 0.0),
+        method="response of the estimator, behind the camera's line, to the delay of each row",
+    )  # fmt: skip
+
+
+SOURCE = Source(
+    id="grabber.line_jitter",
+    title="Line jitter",
+    description="The loop that follows the line pulses places each row a little early or late, most after the vertical interval.",
+    number=29,
+    stars=1,
+    note="Note 19",
+    parameters=LineJitter,
+    consumes=(Kind.VIDEO,),
+    after=("sensor", "electronics", "cable", "grabber.low_pass"),
+    before=("grabber.clamp", "grabber.fixed_pattern", "grabber.phase_pattern", "grabber.window_offset", "grabber.adc", "processing"),
+    neutral=LineJitter(),
+    typical=LineJitter(white_ns=20.0),
+    bound=LineJitter(white_ns=20.0, loop_ns=20.0),
+    forward=forward,
+    truth=truth,
+    propagate=propagate,
+    near=near,
+    tail=tail,
+    applies_to=("analogue",),
+    gum_class="Tr",
+    equation="δ_r = s_w n_r + s_l a_l + A e^(−l/r_s) + shear,  a_l = ρ a_(l−1) + √(1 − ρ²) n_l,  l the line of the field",
+    typical_size="20 ns are 0.284 px at 14.19 MHz; a disc of 7 px moves by 0.376 of the jitter of a row: 0.107 px",
+    references=("H. A. Beyer, IAPRS XXIX-B5, 1992, 561 (shear and jitter of line-locked grabbers; below 0.005 px with the pixel clock)",),
+    advice="Sample with the camera's pixel clock, or average frames; a digital camera has none.",
+    reasons={
+        "measure": "needs the image of a steep vertical line or edge in several frames",
+        "correct": "needs the place of every row in that very frame, as from a line beside the targets",
+    },
+)

@@ -1,0 +1,113 @@
+"""Low-pass filter before the converter: it smooths, and as every causal filter it does so to one side."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Literal
+
+import numpy as np
+
+from pixmetry.camera.contribution import Contribution, Probe
+from pixmetry.camera.line import group_delay_s, reach_px, through_line
+from pixmetry.camera.signal import Kind, Signal
+from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.random import Stream
+
+SHARE_BEYOND = 1e-4  # of a step, beyond the near context
+
+
+class LowPass(Parameters):
+    """An analogue filter, which may be switched off."""
+
+    kind: Literal["off", "rc", "butterworth", "bessel"] = quantity("off", "1", "kind of filter; rc is a row of equal RC stages")
+    order: int = quantity(3, "1", "number of poles", ge=1, le=8)
+    cutoff_mhz: float = quantity(5.0, "MHz", "frequency of −3 dB (of each stage for rc)", ge=0.1, le=200)
+    all_pass_mhz: float = quantity(0.0, "MHz", "corner of an all-pass section, as of a phase correction that is off; 0: none", ge=0, le=200)
+
+    @property
+    def zeros(self) -> np.ndarray:
+        """In rad/s."""
+        return 2e6 * np.pi * self.all_pass_mhz * np.ones(1 if self.all_pass_mhz and self.kind != "off" else 0)
+
+    @property
+    def poles(self) -> np.ndarray:
+        """In rad/s."""
+        low_pass = 2e6 * np.pi * self.cutoff_mhz * prototype(self.kind, self.order)
+        return np.append(low_pass, -self.zeros)
+
+
+@cache
+def prototype(kind: str, order: int) -> np.ndarray:
+    """Poles of the filter of cut-off 1 rad/s."""
+    if kind == "off":
+        return np.zeros(0, complex)
+    if kind == "rc":
+        return -np.ones(order, complex)
+    if kind == "butterworth":
+        return np.exp(1j * np.pi * (0.5 + (np.arange(order) + 0.5) / order))
+    from scipy.signal import besselap
+
+    return np.asarray(besselap(order, norm="mag")[1], complex)
+
+
+def forward(params: LowPass, signal: Signal, stream: Stream) -> Signal:
+    """Pass the line through the filter."""
+    if params.kind == "off":
+        return signal
+    return signal.with_line(signal.line.filtered(params.zeros, params.poles))
+
+
+def near(params: LowPass, pixel_hz: float, row_px: int) -> tuple[int, int, int, int]:
+    """Pixels to the left that still reach a pixel."""
+    return 0, 0, 0 if params.kind == "off" else reach_px(params.zeros, params.poles, SHARE_BEYOND, pixel_hz), 0
+
+
+def tail(params: LowPass, pixel_hz: float, row_px: int) -> float:
+    """What is left of a step there."""
+    return 0.0 if params.kind == "off" else SHARE_BEYOND
+
+
+def delay_s(params: LowPass) -> float:
+    """Group delay at frequency 0: the shift of a centroid, in time; τ for an RC filter, 2/ω_c for a Butterworth filter of third order."""
+    return group_delay_s(params.zeros, params.poles)
+
+
+def propagate(params: LowPass, probe: Probe) -> Contribution:
+    """The target behind the filter, on the rest of the camera's line."""
+    if params.kind == "off":
+        return Contribution(u_x_px=0.0, u_y_px=0.0, gum_class="G", method="no filter")
+    return through_line(probe, lambda line: line.filtered(params.zeros, params.poles))
+
+
+SOURCE = Source(
+    id="grabber.low_pass",
+    title="Low-pass filter",
+    description="A filter against aliasing delays the line and smears edges to the right; under a threshold bright and faint targets part.",
+    number=27,
+    stars=3,
+    note="Note 6",
+    parameters=LowPass,
+    consumes=(Kind.VIDEO,),
+    after=("sensor", "electronics", "cable"),
+    before=("grabber.clamp", "grabber.fixed_pattern", "grabber.phase_pattern", "grabber.window_offset", "grabber.adc", "processing"),
+    neutral=LowPass(),
+    typical=LowPass(kind="butterworth", order=3, cutoff_mhz=5.0),
+    bound=LowPass(kind="butterworth", order=3, cutoff_mhz=3.0),
+    forward=forward,
+    propagate=propagate,
+    near=near,
+    tail=tail,
+    applies_to=("analogue",),
+    gum_class="G",
+    equation="H(s) = Π p_i/(p_i − s) (1 − s/a)/(1 + s/a),  Δx = f_pixel (2/a − Σ 1/p_i)",
+    typical_size="0.376 px (RC 6 MHz), 0.564 (RC 4 MHz), 0.903 (Butterworth of third order, 5 MHz), 1.505 px (3 MHz) at 14.19 MHz",
+    references=(
+        "A. I. Zverev, Handbook of Filter Synthesis, Wiley 1967 (poles of Butterworth and Bessel filters)",
+        "H. A. Beyer, IAPRS XXIX-B5, 1992, 561 (response of a grabber's filter to edges)",
+    ),
+    advice="Switch it off unless the line carries more than half the sampling frequency; calibrate with it as you measure.",
+    reasons={
+        "measure": "needs the image of a slanted edge: dark and flat frames do not carry it",
+        "correct": "undoing a filter from samples at the pixel rate needs its response between the samples, and lifts the noise",
+    },
+)

@@ -1,0 +1,1 @@
+"""Sources of the lens and what stands in front of the sensor."""

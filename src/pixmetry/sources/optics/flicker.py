@@ -1,0 +1,139 @@
+"""Flicker: lamps on the mains and dimmed diodes change their light faster than a frame; rows that look at other times see another level."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from pixmetry.camera.light import Light
+from pixmetry.camera.signal import Kind, Signal
+from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.random import Stream
+
+
+class Flicker(Parameters):
+    """The lamp's light about its mean of 1."""
+
+    depth_rel: float = quantity(0.0, "1", "half of peak to valley over the mean (sine), or the share that is switched", ge=0, le=1)
+    frequency_hz: float = quantity(100.0, "Hz", "of the light: twice that of the mains", gt=0, le=1e6)
+    phase_rad: float = quantity(0.0, "rad", "at time 0; a sine begins at its peak, a switched lamp with its edge", ge=-10, le=10)
+    waveform: Literal["sine", "switched"] = quantity("sine", "1", "smooth, or on and off")
+    duty: float = quantity(0.5, "1", "share of the time in which a switched lamp is on", gt=0, le=1)
+
+
+def mean_light(params: Flicker, begin_s: np.ndarray, end_s: np.ndarray) -> np.ndarray:
+    """The lamp's light averaged from one time to another (at one instant where they are the same), over its mean."""
+    middle, length = 0.5 * (begin_s + end_s), end_s - begin_s
+    if params.waveform == "sine":
+        wave = np.cos(2 * np.pi * params.frequency_hz * middle + params.phase_rad)
+        return 1 + params.depth_rel * np.sinc(params.frequency_hz * length) * wave
+    offset = params.phase_rad / (2 * np.pi)
+    a, b = (params.frequency_hz * t + offset for t in (begin_s, end_s))
+    now = (0.5 * (a + b)) % 1 < params.duty
+    on = np.where(length > 0, (_on(b, params.duty) - _on(a, params.duty)) / np.where(length > 0, b - a, 1.0), now)
+    return 1 + params.depth_rel * (on / params.duty - 1)
+
+
+def _on(cycles: np.ndarray, duty: float) -> np.ndarray:
+    """Cycles up to a time in which the lamp was on."""
+    whole = np.floor(cycles)
+    return whole * duty + np.minimum(cycles - whole, duty)
+
+
+def shares(light: Light) -> tuple[np.ndarray, np.ndarray]:
+    """Begin and end of the time that every look of the light stands for, shape (n, rows or 1, m).
+
+    The looks of a shutter that is open or closed, whose weights sum to 1, share its time in the ratio of their weights: each lies in its
+    own part (the separation theorem of Chebyshev, Markov and Stieltjes). Looks of other kinds, such as pulses, are taken as instants.
+    """
+    times, weights = light.moments
+    weights = np.broadcast_to(weights, times.shape)
+    end = np.cumsum(weights, axis=2)
+    mine = end <= 1 + 1e-9
+    shutter = np.where(mine, weights, 0.0)
+    middle = (shutter * times).sum(axis=2, keepdims=True) / np.maximum(shutter.sum(axis=2, keepdims=True), 1e-300)
+    length = light.exposure_s[:, None, None]
+    edge = middle - 0.5 * length + length * end
+    begin = edge - length * weights
+    slack = 1e-9 * length
+    fits = (begin - slack <= times) & (times <= edge + slack)
+    whole = np.abs(shutter.sum(axis=2, keepdims=True) - 1) < 1e-9
+    box = (fits | ~mine).all(axis=2, keepdims=True) & whole & mine
+    return np.where(box, begin, times), np.where(box, edge, times)
+
+
+@dataclass(frozen=True)
+class LampLight(Light):
+    """Light of lamps that flicker: each look, at whichever times, is weighted by the lamps' light over its share of time."""
+
+    lamps: tuple[Flicker, ...] = ()
+
+    @property
+    def moving(self) -> bool:
+        """It depends on time, whatever the scene does."""
+        return True
+
+    @property
+    def plain(self) -> bool:
+        """Pixels must ask the lamps."""
+        return False
+
+    def fingerprint(self) -> bytes | None:
+        """What tells whether two exposures see the same: the lamps' light is part of it."""
+        return self._lit().fingerprint()
+
+    def photons(self) -> np.ndarray:
+        """Mean photons of every pixel, float32, shape (n, rows, cols)."""
+        return self._lit().photons()
+
+    def _lit(self) -> Light:
+        times, weights = self.moments
+        begin, end = shares(self)
+        for lamp in self.lamps:
+            weights = weights * mean_light(lamp, begin, end)
+        steady = Light(**{name: getattr(self, name) for name in Light.__dataclass_fields__})
+        return steady.seen_at(times, weights)
+
+
+def forward(params: Flicker, signal: Signal, stream: Stream) -> Signal:
+    """Put the scene under the lamp."""
+    if not params.depth_rel:
+        return signal
+    if isinstance(signal.light, LampLight):
+        return signal.with_light(replace(signal.light, lamps=(*signal.light.lamps, params)))
+    fields = {name: getattr(signal.light, name) for name in Light.__dataclass_fields__}
+    return signal.with_light(LampLight(**fields, lamps=(params,)))
+
+
+def truth(params: Flicker, signal: Signal, stream: Stream) -> Mapping[str, np.ndarray]:
+    """The lamp's light over the exposure of a shutter that opens for all rows at once, shape (n, rows)."""
+    level = mean_light(params, signal.time_s, signal.time_s + signal.exposure_s)
+    return {"light_rel": level[:, None] * np.ones(signal.frame_shape[0])}
+
+
+SOURCE = Source(
+    id="optics.flicker",
+    title="Flicker of the light",
+    description="Light that changes at 100 Hz or at a dimmer's frequency gives unequal frames, and bands under a rolling shutter.",
+    parameters=Flicker,
+    consumes=(Kind.LIGHT,),
+    before=("sensor",),
+    neutral=Flicker(),
+    typical=Flicker(depth_rel=0.3),
+    bound=Flicker(depth_rel=1.0),
+    forward=forward,
+    truth=truth,
+    gum_class="F",
+    equation="E(t) = 1 + d cos(2π f t + φ);  over an exposure d sinc(f t_exp) cos(2π f t_mid + φ), t_mid of each row",
+    typical_size="none at 10 ms and 100 Hz; at 1 ms nearly the lamp's own depth, over rows with a period of 1/(f t_row)",
+    references=("IEEE 1789-2015 (modulation of the light of diodes)",),
+    advice="Use direct current, or expose for a whole number of the light's periods.",
+    reasons={
+        "measure": "needs flat frames in a row: the mean of rows over time is a wave of the lamp's frequency",
+        "correct": "needs the lamp's phase in every frame: divide rows by their means where the scene is known",
+        "propagate": "needs the row times of the camera, which a probe does not hold; a common factor moves no centre",
+    },
+)

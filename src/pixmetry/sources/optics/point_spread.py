@@ -1,0 +1,156 @@
+"""The lens's point spread: a Gaussian, the diffraction at an aberrated circular pupil, or a measured table."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Literal
+
+import numpy as np
+
+from pixmetry.camera.light import FINE
+from pixmetry.camera.raster import kernel_of, spread_of
+from pixmetry.camera.signal import Kind, Signal
+from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.errors import ParameterError
+from pixmetry.core.random import Stream
+
+NODES = 40  # of each integral over the common part of two pupils: 1e-6 for a wave of aberration (root mean square)
+
+
+class PointSpread(Parameters):
+    """One spread for the whole frame. Aberrations are Zernike coefficients by Noll's normalisation: waves, root mean square."""
+
+    model: Literal["gaussian", "diffraction", "measured"] = quantity("gaussian", "name", "which of the three")
+    sigma_px: float = quantity(0.0, "px", "standard deviation along each axis (gaussian)", ge=0, le=50)
+    wavelength_nm: float = quantity(550.0, "nm", "of the light (diffraction)", ge=100, le=2000)
+    f_number: float = quantity(4.0, "1", "working f-number (diffraction)", ge=0.7, le=64)
+    pitch_x_um: float = quantity(3.45, "µm", "pixel pitch along x (diffraction)", gt=0, le=100)
+    pitch_y_um: float = quantity(3.45, "µm", "pixel pitch along y (diffraction)", gt=0, le=100)
+    defocus_waves: float = quantity(0.0, "waves", "Zernike 2ρ² − 1, times √3", ge=-3, le=3)
+    astigmatism_waves: float = quantity(0.0, "waves", "Zernike ρ² cos 2φ, times √6", ge=-3, le=3)
+    oblique_astigmatism_waves: float = quantity(0.0, "waves", "Zernike ρ² sin 2φ, times √6", ge=-3, le=3)
+    coma_x_waves: float = quantity(0.0, "waves", "Zernike (3ρ³ − 2ρ) cos φ, times √8; positive: the tail points to +x", ge=-3, le=3)
+    coma_y_waves: float = quantity(0.0, "waves", "Zernike (3ρ³ − 2ρ) sin φ, times √8; positive: the tail points to +y", ge=-3, le=3)
+    spherical_waves: float = quantity(0.0, "waves", "Zernike 6ρ⁴ − 6ρ² + 1, times √5", ge=-3, le=3)
+    reach_px: float = quantity(4.0, "px", "half side of the fine table; its tail goes on in wide Gaussians (diffraction)", ge=1, le=12)
+    table: tuple[tuple[float, ...], ...] = quantity(
+        (),
+        "1",
+        "mean density of the spread in square cells, rows from the top, odd sides; the middle one is the ideal image point (measured)",
+    )
+    table_step_px: float = quantity(0.25, "px", "side of the table's cells (measured)", gt=0.01, le=0.5)
+
+
+def wave_aberration(params: PointSpread, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Wave aberration in waves at places of the pupil, whose radius is 1."""
+    r2 = x * x + y * y
+    return (
+        np.sqrt(3) * params.defocus_waves * (2 * r2 - 1)
+        + np.sqrt(6) * (params.astigmatism_waves * (x * x - y * y) + params.oblique_astigmatism_waves * 2 * x * y)
+        + np.sqrt(8) * (3 * r2 - 2) * (params.coma_x_waves * x + params.coma_y_waves * y)
+        + np.sqrt(5) * params.spherical_waves * (6 * r2 * r2 - 6 * r2 + 1)
+    )
+
+
+def transfer(params: PointSpread, fx: np.ndarray, fy: np.ndarray) -> np.ndarray:
+    """Optical transfer function at frequencies in cycles per pixel, complex.
+
+    The autocorrelation of the pupil function (Hopkins): the integral of exp(2πi (W(p − s/2) − W(p + s/2))) over the common part of two
+    unit circles whose centres are s = 2 λN ν apart, over π; by Gauss–Legendre nodes along and across the line between the centres.
+    """
+    scale = 2e-3 * params.wavelength_nm * params.f_number
+    sx, sy = (np.asarray(v, float).ravel() * scale / p for v, p in ((fx, params.pitch_x_um), (fy, params.pitch_y_um)))
+    s = np.hypot(sx, sy)
+    out = np.zeros(s.size, complex)
+    at = np.flatnonzero(s < 2)
+    cx, cy = (np.divide(v[at], s[at], out=np.full(at.size, d), where=s[at] > 0) for v, d in ((sx, 1.0), (sy, 0.0)))
+    node, weight = np.polynomial.legendre.leggauss(NODES)
+    height = np.sqrt(1 - s[at] ** 2 / 4)  # half height of the common part; across it v = height sin t
+    angle = 0.5 * np.pi * node
+    total = np.zeros(at.size, complex)
+    for sine, cosine, w in zip(np.sin(angle), np.cos(angle), weight, strict=True):
+        v = height * sine
+        half = np.sqrt(1 - v * v) - s[at] / 2
+        u = half[:, None] * node
+        px, py = cx[:, None] * u - cy[:, None] * v[:, None], cy[:, None] * u + cx[:, None] * v[:, None]
+        dx, dy = 0.5 * sx[at][:, None], 0.5 * sy[at][:, None]
+        phase = wave_aberration(params, px - dx, py - dy) - wave_aberration(params, px + dx, py + dy)
+        total += w * 0.5 * np.pi * cosine * height * half * (np.exp(2j * np.pi * phase) * weight).sum(axis=1)
+    out[at] = total / np.pi
+    return out.reshape(np.shape(fx))
+
+
+def table_transfer(params: PointSpread, fx: np.ndarray, fy: np.ndarray) -> np.ndarray:
+    """Transfer function of the measured table, whose density is constant in each cell."""
+    table, step = np.array(params.table, float), params.table_step_px
+    at_y, at_x = ((np.arange(n) - n // 2) * step for n in table.shape)
+    ex, ey = np.exp(-2j * np.pi * fx.ravel()[:, None] * at_x), np.exp(-2j * np.pi * fy.ravel()[:, None] * at_y)
+    value = ((ey @ table) * ex).sum(axis=1) / table.sum()
+    return value.reshape(fx.shape) * np.sinc(fx * step) * np.sinc(fy * step)
+
+
+def _check_table(params: PointSpread) -> None:
+    sides = {len(row) for row in params.table}
+    if len(sides) != 1 or len(params.table) % 2 == 0 or min(sides) % 2 == 0 or sum(map(sum, params.table)) <= 0:
+        raise ParameterError(
+            "the table of the point spread cannot be used",
+            where="optics.point_spread.table",
+            value=[len(row) for row in params.table][:5],
+            allowed="rows of one length, odd sides, a positive sum",
+        )
+
+
+def light_beyond(params: PointSpread, d_um: np.ndarray) -> np.ndarray:
+    """Share of an edge's light farther than d on its dark side, without rings: atan(2λN/(π² d))/π.
+
+    Its transfer function, exp(−4 λNν/π), begins as that of the clear pupil: 1 − 4 λNν/π. Light that is bent far comes from the pupil's
+    edge, whatever the aberrations; its density falls as λN/(π³ r³) (Lord Rayleigh 1881: J0² + J1² of the light is outside a circle).
+    """
+    return np.arctan(2e-3 * params.wavelength_nm * params.f_number / (np.pi**2 * np.asarray(d_um, float))) / np.pi
+
+
+@lru_cache(maxsize=32)
+def kernel(params: PointSpread) -> tuple[np.ndarray, np.ndarray | None]:
+    """The spread on the light's fine raster and its tail, see `core.raster`."""
+    if params.model == "diffraction":
+        pitch = params.pitch_x_um, params.pitch_y_um
+        return spread_of(lambda fx, fy: transfer(params, fx, fy), params.reach_px, lambda d: light_beyond(params, d), pitch)
+    _check_table(params)
+    half = 0.5 * params.table_step_px * max(len(params.table), len(params.table[0]))
+    return kernel_of(lambda fx, fy: table_transfer(params, fx, fy), int(np.ceil(half * FINE)) + 2 * FINE), None
+
+
+def forward(params: PointSpread, signal: Signal, stream: Stream) -> Signal:
+    """Spread the light."""
+    light = signal.light
+    if params.model == "gaussian":
+        return signal.with_light(light.blurred(params.sigma_px**2)) if params.sigma_px else signal
+    return signal.with_light(light.convolved(*kernel(params)))
+
+
+SOURCE = Source(
+    id="optics.point_spread",
+    title="Point spread of the lens",
+    description="The lens images a point as a small spot. A spot much narrower than a pixel is undersampled; coma makes it one-sided.",
+    note="Note 21",
+    parameters=PointSpread,
+    consumes=(Kind.LIGHT,),
+    before=("sensor",),
+    neutral=PointSpread(),
+    typical=PointSpread(sigma_px=0.6),
+    bound=PointSpread(sigma_px=1.5),
+    forward=forward,
+    gum_class="F",
+    equation="OTF(ν) = (1/π) ∬ exp 2πi (W(p − λNν) − W(p + λNν)) dp;  clear: (2/π)(acos s − s √(1 − s²)), s = λNν",
+    typical_size="periodic error OTF(1)/π of a point under full pixels: 0.08 px at f/4 with 3.45 µm, 1e-6 px at σ = 0.8 px",
+    references=(
+        "H. H. Hopkins, The frequency response of a defocused optical system, Proc. R. Soc. A 231 (1955) 91–103",
+        "R. J. Noll, Zernike polynomials and atmospheric turbulence, JOSA 66 (1976) 207–211",
+    ),
+    advice="Stop down until λN is at least the pixel pitch, or defocus slightly, if targets are only a few pixels wide.",
+    reasons={
+        "measure": "not measured: needs the slanted-edge experiment",
+        "correct": "frames are not deconvolved; a symmetric spread moves no centre",
+        "propagate": "it decides how much a target is undersampled, which needs the target before the spread",
+    },
+)

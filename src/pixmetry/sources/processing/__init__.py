@@ -1,0 +1,1 @@
+"""Sources of the processing in the camera or the computer."""

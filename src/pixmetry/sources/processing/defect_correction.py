@@ -1,0 +1,74 @@
+"""Defect correction in the camera: a pixel that stands out from all its neighbours is taken for a defect and replaced."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+
+from pixmetry.camera.signal import Kind, Signal, Windows
+from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.random import Stream
+from pixmetry.sources.processing._codes import bordered, surround
+from pixmetry.sources.processing._kernels import replace_outliers
+
+OFF = 65535
+
+
+class DefectCorrection(Parameters):
+    """When a pixel is taken for a defect."""
+
+    threshold_dn: int = quantity(OFF, "DN", "by how much it exceeds the highest, or misses the lowest, neighbour; 65535: off", ge=0, le=OFF)
+    mosaic: Literal["none", "bayer"] = quantity("none", "1", "neighbours of the same colour lie two pixels away in a colour mosaic")
+
+
+def reach(params: DefectCorrection) -> int:
+    """Pixels from a pixel to its neighbours of the same colour."""
+    return 2 if params.mosaic == "bayer" else 1
+
+
+def forward(params: DefectCorrection, signal: Signal, stream: Stream) -> Signal:
+    """Replace what stands out by the median of the eight neighbours; beyond the frame it is mirrored, which keeps the colours."""
+    if params.threshold_dn == OFF:
+        return signal
+    return signal.with_data(replace_outliers(bordered(signal.data, reach(params)), reach(params), params.threshold_dn))
+
+
+def context(params: DefectCorrection, windows: Windows, frame_shape: tuple[int, int]) -> Windows:
+    """The neighbours."""
+    return windows if params.threshold_dn == OFF else surround(windows, reach(params), frame_shape)
+
+
+def replaced(params: DefectCorrection, codes: np.ndarray) -> np.ndarray:
+    """Mask of the pixels of frames (n, rows, cols) that are taken for defects; one that equals the neighbours' median stays unseen."""
+    if params.threshold_dn == OFF:
+        return np.zeros(codes.shape, bool)
+    return replace_outliers(bordered(codes, reach(params)), reach(params), params.threshold_dn) != codes
+
+
+SOURCE = Source(
+    id="processing.defect_correction",
+    title="Defect correction",
+    description="Single bright or dark pixels are replaced by the median of their neighbours: also the peak of a target of one pixel.",
+    number=17,
+    parameters=DefectCorrection,
+    consumes=(Kind.CODES,),
+    after=("sensor", "electronics", "cable", "grabber"),
+    before=("storage", "processing.demosaic", "processing.noise_reduction", "processing.sharpening"),
+    neutral=DefectCorrection(),
+    typical=DefectCorrection(threshold_dn=1),
+    bound=DefectCorrection(threshold_dn=0),
+    forward=forward,
+    context=context,
+    option="defect correction in the camera",
+    gum_class="F",
+    equation="y = median of the 8 neighbours if x > max + T or x < min − T, else x",
+    typical_size="none on a disc of 7 px; a target of one pixel vanishes, one of 2 px is shifted by up to 0.3 px",
+    references=("EMVA 1288 R4.0 Linear, §8.5 (defect pixels)",),
+    advice="Switch it off, or have only listed defects replaced; use targets of 3 px or more.",
+    reasons={
+        "measure": "not measured: needs the count of single outliers against the normal law of the noise, which such a correction cuts off",
+        "correct": "what was replaced is lost",
+        "propagate": "which pixels stand out hangs on the noise: only a simulation with the noise of the camera tells",
+    },
+)

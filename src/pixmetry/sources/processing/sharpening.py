@@ -1,0 +1,91 @@
+"""Sharpening: the difference from a blurred copy is added to the frame (unsharp mask)."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from pixmetry.camera.contribution import Contribution, Probe
+from pixmetry.camera.signal import Kind, Signal, Windows
+from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.random import Stream
+from pixmetry.sources.processing._codes import bits_of_camera, bordered, stored, surround
+from pixmetry.sources.processing._kernels import blur
+
+
+class Sharpening(Parameters):
+    """Strength and width of the mask."""
+
+    amount: float = quantity(0.0, "1", "share of the difference from the blurred copy that is added", ge=0, le=10)
+    sigma_px: float = quantity(1.0, "px", "standard deviation of the Gaussian that blurs the copy", gt=0, le=8)
+    bits: int = bits_of_camera()
+
+
+def gaussian(sigma_px: float) -> np.ndarray:
+    """Sampled Gaussian from its middle to three standard deviations, shape (m + 1,), of sum 1 over both sides."""
+    half = np.exp(-0.5 * (np.arange(math.ceil(3 * sigma_px) + 1) / sigma_px) ** 2)
+    return half / (2 * half.sum() - half[0])
+
+
+def forward(params: Sharpening, signal: Signal, stream: Stream) -> Signal:
+    """x + amount (x − blurred x), rounded once; an overshoot beyond the range is cut off."""
+    if params.amount == 0:
+        return signal
+    half = gaussian(params.sigma_px)
+    blurred = blur(bordered(signal.data, half.size - 1), half)
+    return signal.with_data(stored((1 + params.amount) * signal.data.astype(float) - params.amount * blurred, params.bits))
+
+
+def context(params: Sharpening, windows: Windows, frame_shape: tuple[int, int]) -> Windows:
+    """Three standard deviations on each side."""
+    return surround(windows, math.ceil(3 * params.sigma_px), frame_shape) if params.amount else windows
+
+
+def propagate(params: Sharpening, probe: Probe) -> Contribution:
+    """The estimator on the sharpened target, whose undershoot ends at black; and the rounding. The mask is symmetric: no bias."""
+    x = np.asarray(probe.signal_dn, float)
+    half = gaussian(params.sigma_px)
+    m = half.size - 1
+    padded = np.pad(x, ((0, 0), (m, m), (m, m)), mode="edge")
+    full = np.concatenate([half[:0:-1], half])
+    for axis in (1, 2):
+        padded = np.lib.stride_tricks.sliding_window_view(padded, full.size, axis=axis) @ full
+    dx, dy = probe.moved(np.clip(x + params.amount * (x - padded), 0, 2**params.bits - 1))
+    rounding = probe.white(math.sqrt(1 / 12)) if params.amount else (0.0, 0.0)
+    return probe.from_shifts(
+        dx,
+        dy,
+        "F",
+        beside=rounding,
+        model_error=0.15,
+        floor_px=5e-4,
+        method="the estimator on the sharpened target",
+    )
+
+
+SOURCE = Source(
+    id="processing.sharpening",
+    title="Sharpening",
+    description="Edges get a rim that is too bright inside and too dark outside; noise grows, and neighbours share it.",
+    parameters=Sharpening,
+    consumes=(Kind.CODES,),
+    after=("sensor", "electronics", "cable", "grabber", "processing.noise_reduction"),
+    before=("storage",),
+    neutral=Sharpening(),
+    typical=Sharpening(amount=0.5),
+    bound=Sharpening(amount=2.0, sigma_px=1.5),
+    forward=forward,
+    propagate=propagate,
+    context=context,
+    option="sharpening in the camera",
+    gum_class="F",
+    equation="y = x + a (x − G_σ ∗ x);  overshoot at a step of height h: a h (1 − w_0)/2 beside it",
+    typical_size="0.01 to 0.1 px on targets of 3 px or less, through clipping and the threshold",
+    references=("R. C. Gonzalez, R. E. Woods, Digital Image Processing, 4th ed., Pearson 2018, §3.6 (unsharp masking)", "ISO 12233:2023"),
+    advice="Switch it off.",
+    reasons={
+        "measure": "not measured: needs the slanted edge's response above 1 and the correlation of the noise of neighbours",
+        "correct": "codes that were cut off at the ends of the range are lost; the rest needs a deconvolution that amplifies no noise",
+    },
+)

@@ -1,0 +1,1 @@
+"""Sources of the sensor, from the pixels' geometry to the read-out."""

@@ -1,0 +1,102 @@
+"""Colour filter mosaic: every pixel looks through one of three colours, in a pattern of two by two."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Literal
+
+import numpy as np
+
+from pixmetry.camera.contribution import Contribution, Probe
+from pixmetry.camera.signal import Kind, Signal
+from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.random import Stream
+
+CHANNELS = "RGB"
+
+
+class BayerMosaic(Parameters):
+    """Where the colours lie, and how much of this scene's light each lets through to its pixels."""
+
+    pattern: Literal["RGGB", "GRBG", "GBRG", "BGGR"] = quantity("RGGB", "1", "colours of pixels (0,0), (0,1), (1,0), (1,1), row by row")
+    red: float = quantity(1.0, "1", "share of the photons that red pixels see", ge=0, le=1)
+    green: float = quantity(1.0, "1", "share of the photons that green pixels see", ge=0, le=1)
+    blue: float = quantity(1.0, "1", "share of the photons that blue pixels see", ge=0, le=1)
+    green_split_rel: float = quantity(0.0, "1", "green pixels in rows of blue over those in rows of red, less 1", ge=-0.3, le=0.3)
+
+
+def factors(params: BayerMosaic) -> np.ndarray:
+    """Share of the photons of the four pixels of the pattern, shape (2, 2), float64."""
+    share = dict(zip(CHANNELS, (params.red, params.green, params.blue), strict=True))
+    cell = np.array([share[c] for c in params.pattern]).reshape(2, 2)
+    for row in (0, 1):
+        sign = 0.5 if "B" in params.pattern[2 * row : 2 * row + 2] else -0.5
+        cell[row, params.pattern[2 * row : 2 * row + 2].index("G")] *= 1 + sign * params.green_split_rel
+    return cell
+
+
+def over_windows(params: BayerMosaic, signal: Signal) -> np.ndarray:
+    """The same for every pixel, float32, shape (n, rows, cols)."""
+    lines = factors(params).astype(np.float32).T[signal.cols % 2].swapaxes(1, 2)  # rows of the two kinds, (n, 2, cols)
+    return np.ascontiguousarray(lines)[np.arange(len(lines))[:, None], signal.rows % 2]
+
+
+def forward(params: BayerMosaic, signal: Signal, stream: Stream) -> Signal:
+    """Multiply the mean photons by the share of each pixel's colour, by its absolute place."""
+    if (factors(params) == 1).all():
+        return signal
+    return signal.with_data(signal.data * over_windows(params, signal))
+
+
+def correct(params: BayerMosaic, signal: Signal, maps: Mapping[str, np.ndarray]) -> Signal:
+    """Divide every pixel by the share of its colour: for grey scenes that is the frame without a mosaic, with more noise in the weak ones.
+
+    A colour that sees nothing stays as it is.
+    """
+    share = over_windows(params, signal)
+    return signal.with_data(np.divide(signal.data, share, out=np.array(signal.data, np.float32), where=share > 0))
+
+
+def truth(params: BayerMosaic, signal: Signal, stream: Stream) -> Mapping[str, np.ndarray]:
+    """Share of the photons of every pixel of the frame, and its colour (0 red, 1 green, 2 blue)."""
+    row, col = np.indices(signal.frame_shape) % 2
+    colour = np.array([CHANNELS.index(c) for c in params.pattern], np.uint8).reshape(2, 2)
+    return {"mosaic_share": factors(params)[row, col], "colour": colour[row, col]}
+
+
+def propagate(params: BayerMosaic, probe: Probe) -> Contribution:
+    """The estimator on the mosaic, with the target at each of the four places in the pattern; its level is brought back to the median's."""
+    cell = factors(params)
+    level = float(np.median(cell))
+    rows, cols = probe.signal_dn.shape[1:]
+    shifts = []
+    for row in (0, 1):
+        for col in (0, 1):
+            share = np.roll(cell, (row, col), axis=(0, 1))[np.arange(rows)[:, None] % 2, np.arange(cols) % 2]
+            shifts.append(probe.moved(probe.signal_dn * share / level))
+    dx, dy = (np.concatenate([s[a] for s in shifts]) for a in (0, 1))
+    return probe.from_shifts(dx, dy, "F", model_error=0.3, method="the estimator on the unbalanced mosaic, over its four places")
+
+
+SOURCE = Source(
+    id="sensor.bayer_mosaic",
+    title="Colour filter mosaic",
+    description="Pixels of three colours answer even a grey scene differently: a chequered gain that balancing takes out.",
+    parameters=BayerMosaic,
+    consumes=(Kind.PHOTONS,),
+    before=("sensor.quantum_efficiency", "sensor.dark_current", "sensor.shot_noise"),
+    neutral=BayerMosaic(),
+    typical=BayerMosaic(red=0.8, green=0.9, blue=0.6),
+    bound=BayerMosaic(red=0.6, green=1.0, blue=0.4, green_split_rel=0.02),
+    forward=forward,
+    correct=correct,
+    propagate=propagate,
+    truth=truth,
+    option="a colour mosaic",
+    gum_class="F",
+    equation="µ' = µ τ_colour(row mod 2, col mod 2)",
+    typical_size="0.01 px unbalanced on a disc of 7 px; none for a grey scene once the colours are balanced",
+    references=("B. E. Bayer, US patent 3 971 065, 1976", "H. S. Malvar, L. He, R. Cutler, ICASSP 2004 (layout of the mosaic)"),
+    advice="Use a monochrome sensor; else balance the colours on the raw mosaic and locate targets there, without interpolation.",
+    reasons={"measure": "not measured: needs the means of a grey flat field by the four places of the pattern; the PRNU holds them"},
+)

@@ -1,0 +1,127 @@
+"""Exposure: a moving target is seen over a time, so it is spread along its path."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import lru_cache
+from typing import Literal
+
+import numpy as np
+
+from pixmetry.camera.signal import Kind, Signal
+from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.random import Stream
+
+PARTS, POINTS = 50, 40  # of the exposure, and of each part, on which a profile's moments are taken
+
+
+class Exposure(Parameters):
+    """How light is gathered between the start and the end of the exposure, and by how many looks it is stood for."""
+
+    profile: Literal["box", "trapezoid", "exponential", "gaussian"] = quantity(
+        "box", "1", "a shutter that is open or closed, one that opens and closes slowly, a strobe that decays, a pulse"
+    )
+    nodes: int = quantity(
+        1, "1", "looks at a moving scene: 1 at the mean time; for 0.1 % of the peak, 1 and one more per blur radius of path", ge=1, le=64
+    )
+    ramp_rel: float = quantity(0.1, "1", "share of the exposure in which a trapezoid rises, and falls", gt=0, le=0.5)
+    decay_rel: float = quantity(0.2, "1", "time constant of the decay, over the exposure", gt=0.01, le=100)
+    width_rel: float = quantity(0.1, "1", "standard deviation of the pulse in the middle, over the exposure", gt=0.01, le=100)
+
+
+def rule(params: Exposure) -> tuple[np.ndarray, np.ndarray]:
+    """Times (0 to 1) and weights (sum 1), shape (nodes,): the Gauss rule of the profile itself.
+
+    It gives the moments of the profile up to the power 2 nodes − 1 exactly: the mean time with one node, a constant acceleration
+    with two, and the length of the blur.
+    """
+    return _rule(params)
+
+
+@lru_cache(maxsize=64)
+def _rule(params: Exposure) -> tuple[np.ndarray, np.ndarray]:
+    if params.profile == "box":
+        t, w = np.polynomial.legendre.leggauss(params.nodes)
+        return 0.5 + 0.5 * t, 0.5 * w
+    t, w = _profile(params)
+    # the Lanczos (Stieltjes) recurrence of the polynomials orthogonal under the profile, and the eigenvalues of its matrix
+    before, basis, beta = np.zeros_like(t), np.sqrt(w), 0.0
+    alphas, betas = [], []
+    for _ in range(params.nodes):
+        alphas.append(float(basis @ (t * basis)))
+        rest = (t - alphas[-1]) * basis - beta * before
+        beta = float(np.sqrt(rest @ rest))
+        betas.append(beta)
+        before, basis = basis, rest / beta
+    times, vectors = np.linalg.eigh(np.diag(alphas) + np.diag(betas[:-1], 1) + np.diag(betas[:-1], -1))
+    return times, vectors[0] ** 2
+
+
+def _profile(params: Exposure) -> tuple[np.ndarray, np.ndarray]:
+    """The profile in fine weighted points, by Gauss and Legendre between its corners."""
+    corners = np.unique([*np.linspace(0, 1, PARTS + 1), params.ramp_rel, 1 - params.ramp_rel])
+    u, v = np.polynomial.legendre.leggauss(POINTS)
+    ends = zip(corners[:-1], corners[1:], strict=True)
+    t, w = (np.concatenate(part) for part in zip(*((a + (b - a) * (0.5 + 0.5 * u), (b - a) * v) for a, b in ends), strict=True))
+    if params.profile == "trapezoid":
+        w = w * np.minimum(1.0, np.minimum(t, 1 - t) / params.ramp_rel)
+    elif params.profile == "exponential":
+        w = w * np.exp(-t / params.decay_rel)
+    else:
+        w = w * np.exp(-0.5 * ((t - 0.5) / params.width_rel) ** 2)
+    keep = w > 1e-300
+    return t[keep], w[keep] / w[keep].sum()
+
+
+def forward(params: Exposure, signal: Signal, stream: Stream) -> Signal:
+    """Look at a moving scene at the nodes of the profile; a scene that stands still is the same at all of them."""
+    if not signal.light.moving or (params.profile == "box" and params.nodes == 1):
+        return signal
+    times, weights = rule(params)
+    at = (signal.time_s[:, None] + signal.exposure_s[:, None] * times)[:, None, :]
+    return signal.with_light(signal.light.seen_at(at, np.broadcast_to(weights, at.shape)))
+
+
+def truth(params: Exposure, signal: Signal, stream: Stream) -> Mapping[str, np.ndarray]:
+    """The time that a target's centre belongs to, and the standard deviation in time of the light about it, shape (n, rows) each."""
+    times, weights = rule(params.model_copy(update={"nodes": max(params.nodes, 2)}))
+    mean = float(weights @ times)
+    spread = float(np.sqrt(weights @ (times - mean) ** 2))
+    rows = np.ones(signal.frame_shape[0])
+    start, length = signal.time_s[:, None] * rows, signal.exposure_s[:, None] * rows
+    return {"mean_time_s": start + mean * length, "spread_s": spread * length}
+
+
+SOURCE = Source(
+    id="sensor.exposure",
+    title="Motion blur",
+    description="A target that moves during the exposure is spread along its path; its centre belongs to the mean time of the light.",
+    note="Note 4",
+    parameters=Exposure,
+    consumes=(Kind.LIGHT,),
+    before=(
+        "sensor.interlace",
+        "sensor.light_pulses",
+        "sensor.rolling_shutter",
+        "sensor.parasitic_light",
+        "sensor.trigger_jitter",
+    ),
+    neutral=Exposure(),
+    typical=Exposure(nodes=5),
+    bound=Exposure(profile="exponential", nodes=9),
+    forward=forward,
+    truth=truth,
+    gum_class="O",
+    equation="I(x) = ∫ w(t) L(x − x(t)) dt;  box: length b = v t_exp, variance b²/12 along the motion;  shift ½ a t_exp²/12",
+    typical_size="1 px long at 50 px/s and 20 ms; no shift at constant speed if the time is that of the middle",
+    references=(
+        "G. H. Golub, J. H. Welsch, Math. Comp. 23, 221, 1969 (Gauss rules of a weight function)",
+        "W. Gautschi, Orthogonal Polynomials, Oxford 2004, §2.2 (discretised Stieltjes procedure)",
+    ),
+    advice="Expose more shortly, or with a strobe, and give the target's position the mean time of the light.",
+    reasons={
+        "measure": "needs images of a moving target: second moments along and across the motion differ by b²/12",
+        "correct": "not needed for a centre: report the mean time of the light; the blur itself needs the target's path",
+        "propagate": "needs the target's speed and acceleration, which a probe does not hold",
+    },
+)

@@ -1,0 +1,79 @@
+"""Two light pulses: one at the end of the first field and one at the start of the second, so that both see nearly the same instant."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Literal
+
+import numpy as np
+
+from pixmetry.camera.light import GAUSS
+from pixmetry.camera.signal import Kind, Signal
+from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.random import Stream
+
+
+class LightPulses(Parameters):
+    """A pulse for each field, and the steady light beside them."""
+
+    separation_s: float = quantity(1e-3, "s", "from the middle of the first pulse to that of the second", ge=0, le=1)
+    pulse_s: float = quantity(20e-6, "s", "length of a pulse", ge=0, le=1)
+    ambient_share: float = quantity(0.0, "1", "share of steady light in what a field gathers; 1 is no pulse at all", ge=0, le=1)
+    first_field: Literal["even", "odd"] = quantity("even", "1", "the rows that are exposed first")
+
+
+def delay_s(params: LightPulses, signal: Signal) -> np.ndarray:
+    """Middle of the pulse that each row sees, from the end of the first field's exposure, shape (n, rows)."""
+    second = signal.rows % 2 == (1 if params.first_field == "even" else 0)
+    return params.separation_s * (second - 0.5)
+
+
+def forward(params: LightPulses, signal: Signal, stream: Stream) -> Signal:
+    """Let each row see its field's pulse, and the steady light at the times at which it looked before."""
+    if not signal.light.moving or params.ambient_share == 1:
+        return signal
+    nodes, shares = GAUSS[3]
+    middle = (signal.time_s + signal.exposure_s)[:, None] + delay_s(params, signal)
+    at = middle[:, :, None] + params.pulse_s * nodes
+    weights = np.broadcast_to((1 - params.ambient_share) * shares, at.shape)
+    if params.ambient_share:
+        times, before = signal.light.moments
+        size = (*at.shape[:2], times.shape[2])
+        at = np.concatenate([at, np.broadcast_to(times, size)], axis=2)
+        weights = np.concatenate([weights, np.broadcast_to(params.ambient_share * before, size)], axis=2)
+    return signal.with_light(signal.light.seen_at(at, weights))
+
+
+def truth(params: LightPulses, signal: Signal, stream: Stream) -> Mapping[str, np.ndarray]:
+    """Middle of the pulse that each row sees, shape (n, rows)."""
+    return {"pulse_time_s": (signal.time_s + signal.exposure_s)[:, None] + delay_s(params, signal)}
+
+
+SOURCE = Source(
+    id="sensor.light_pulses",
+    title="Two light pulses",
+    description="A pulse at the end of the first field and one at the start of the second show both fields nearly the same instant; "
+    "steady light still blurs and separates them.",
+    note="Note 4",
+    parameters=LightPulses,
+    consumes=(Kind.LIGHT,),
+    after=("sensor.exposure", "sensor.interlace"),
+    before=("sensor.trigger_jitter",),
+    neutral=LightPulses(ambient_share=1.0),
+    typical=LightPulses(ambient_share=0.05),
+    bound=LightPulses(separation_s=1.6e-3, ambient_share=0.2),
+    forward=forward,
+    truth=truth,
+    applies_to=("analogue", "ccd"),
+    option="pulsed light",
+    gum_class="O",
+    equation="field 1: (1 − a) L(t_e − δt/2) + a ∫L;  field 2: (1 − a) L(t_e + δt/2) + a ∫L;  fields lie v δt apart",
+    typical_size="0.05 px between the fields at 50 px/s and 1 ms, 0.35 px at 350 px/s",
+    references=("M. Raffel et al., Particle Image Velocimetry, Springer 2018 (two pulses astride the transfer)",),
+    advice="Bring the pulses as near as the field transfer allows, and keep steady light out by a filter for the pulses' colour.",
+    reasons={
+        "measure": "needs images of a moving target: the centres of the fields still differ by v δt",
+        "correct": "needs the speed of every target; locate in each field by itself instead",
+        "propagate": "needs the target's speed, which a probe does not hold",
+    },
+)
