@@ -24,7 +24,7 @@ from pixmetry.calibrate.bundle.network import Adjustment, Network, State
 from pixmetry.core.threads import single_threaded_blas
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
-from calibration.networks import Simulated, simulate  # noqa: E402
+from calibrate.networks import Simulated, simulate  # noqa: E402
 
 NETWORKS = {
     "50 images x 100 points": (dict(images=50, points=100), 1.2, 9),

@@ -27,7 +27,7 @@ from pixmetry.core.threads import set_threads
 from pixmetry.locate.job import locate
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
-from location import line_frames, rendered  # noqa: E402
+from locate import line_frames, rendered  # noqa: E402
 
 NOISE_DN, EDGE_S, AMPLITUDE_DN = 1.5, 0.757, 170.0
 BACKGROUND_DN = {False: 10.0, True: 180.0}  # bright discs, dark discs

@@ -18,8 +18,8 @@ import numpy as np
 from pixmetry.calibrate.bundle.bundle import adjust
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
-from calibration.distances import Pooled, each_point, interior_distance, jointly, points_distance  # noqa: E402
-from calibration.networks import disturbed, simulate  # noqa: E402
+from calibrate.distances import Pooled, each_point, interior_distance, jointly, points_distance  # noqa: E402
+from calibrate.networks import disturbed, simulate  # noqa: E402
 
 RATE = 1e-6
 KINDS = (

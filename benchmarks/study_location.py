@@ -30,8 +30,8 @@ from pixmetry.locate.detect.targets import Flag
 from pixmetry.locate.job import locate
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
-from location import coverage_cells, line_frames  # noqa: E402
-from location.coverage_cells import Case, Outcome  # noqa: E402
+from locate import coverage_cells, line_frames  # noqa: E402
+from locate.coverage_cells import Case, Outcome  # noqa: E402
 
 RATE = 1e-3
 EXACT = ("template", "poisson_gaussian", "centroid", "squared_centroid", "windowed_centroid")

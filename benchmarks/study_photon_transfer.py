@@ -29,7 +29,7 @@ from pixmetry.emva.records import Measurement, Value
 from pixmetry.observe.photon_transfer_fit import fit_photon_transfer
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
-from experiment.simulated_camera import Camera, drawn_record, framed_record, random_camera, reference_u, truth  # noqa: E402
+from observe.simulated_camera import Camera, drawn_record, framed_record, random_camera, reference_u, truth  # noqa: E402
 
 
 def line(record: PhotonTransfer, name: str) -> Value:

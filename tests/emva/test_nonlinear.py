@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from experiment.simulated_camera import Camera, drawn_record, truth
+from observe.simulated_camera import Camera, drawn_record, truth
 from pixmetry.camera.observations import StackMoments
 from pixmetry.emva.general.nonlinear import nonlinear_values
 from pixmetry.emva.records import Measurement
