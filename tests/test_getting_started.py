@@ -1,7 +1,7 @@
 """The pages docs/start-*.md: every command on them runs, every file on them is accepted, and what they print is what comes out.
 
-A page is run from top to bottom in an empty folder. A block of YAML is written into the file that the line before names; the lines of a block
-``sh`` are run; a block ``text`` shows lines of what the commands before it printed, in their order, … standing for what is left out.
+A page is run from top to bottom in an empty folder. A block of YAML is written into the file that the line before it names. The lines of
+a block ``sh`` are run. A block ``text`` shows lines that the commands before it printed, in their order; … stands for what is left out.
 """
 
 from __future__ import annotations
