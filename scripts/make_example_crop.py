@@ -2,7 +2,7 @@
 
     python scripts/make_example_crop.py PATH/TO/emva1288-set-001
 
-Every frame is kept; of each, the central 160 x 160 pixels (rows 160 to 319, columns 240 to 399 of 480 x 640).
+Every frame is kept; of each, 60 x 60 pixels near the centre (rows 160 to 219, columns 240 to 299 of 480 x 640).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pixmetry.files.emva_descriptor import decode_descriptor
 from pixmetry.files.files import find_file
 from pixmetry.files.images import read_frame
 
-FIRST_ROW, FIRST_COLUMN, SIZE = 160, 240, 160
+FIRST_ROW, FIRST_COLUMN, SIZE = 160, 240, 60
 TARGET = Path(__file__).resolve().parents[1] / "src" / "pixmetry" / "data" / "emva1288-set-001-crop"
 DESCRIPTOR = "EMVA1288_Data.txt"
 
@@ -39,10 +39,15 @@ This folder, and anything made from it, stays under CC BY-SA 3.0. It is data bes
 
 MANIFEST = f"""schema: pixmetry/campaign/1
 camera:
-  name: EMVA 1288 reference set 001 (Basler CCD camera, central {SIZE} x {SIZE} pixels)
+  name: EMVA 1288 reference set 001 (Basler CCD camera, {SIZE} x {SIZE} pixels)
   bits: 12
   interface: digital
   sensor: ccd
+  vendor: Basler AG
+  sensor_cols: 640  # of the published frames, of which these are a crop
+  sensor_rows: 480
+  first_col: {FIRST_COLUMN}
+  first_row: {FIRST_ROW}
 emva_descriptor: {DESCRIPTOR}
 licence: >-
   CC BY-SA 3.0 (https://creativecommons.org/licenses/by-sa/3.0/). Copyright (C) 2011 Basler AG, Basler Vision Technologies;

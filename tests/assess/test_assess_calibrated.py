@@ -36,7 +36,7 @@ def test_a_file_of_a_calibration_enters_twin_report_and_budget(tmp_path: Path) -
     ran = CliRunner().invoke(main, ["assess", "-o", str(tmp_path / "out"), "--trials", "200", "--calibration", str(file.parent)])
     assert ran.exit_code == 0, ran.output
     assert "calibrated" in ran.output and "Lens distortion" in ran.output
-    assert "780 × 582 pixels, the frames have 160 × 160" in " ".join(ran.output.split())
+    assert "780 × 582 pixels, the frames have 60 × 60" in " ".join(ran.output.split())
     twin = load_camera(tmp_path / "out" / "camera.yaml")
     assert twin[LENS].params.k1_per_mm2 == pytest.approx(-2e-3, rel=0.1)
     assert "calibration.json" in (tmp_path / "out" / "results.json").read_text()
@@ -115,10 +115,10 @@ def test_frames_of_a_window_see_the_lens_of_the_whole_sensor(tmp_path: Path) -> 
     campaign = replace(campaign, camera=replace(campaign.camera, **facts))
     assessment = assess(campaign, calibration=tmp_path / "calibration", trials=0)
     lens, whole = assessment.camera[LENS].params, calibrated_geometry(tmp_path / "calibration").lens
-    assert lens.centre_x_px + 159 / 2 + 500 == pytest.approx(whole["centre_x_px"].value + 779 / 2)
-    assert lens.centre_y_px + 159 / 2 + 10 == pytest.approx(whole["centre_y_px"].value + 581 / 2)
+    assert lens.centre_x_px + 59 / 2 + 500 == pytest.approx(whole["centre_x_px"].value + 779 / 2)
+    assert lens.centre_y_px + 59 / 2 + 10 == pytest.approx(whole["centre_y_px"].value + 581 / 2)
     notes = " ".join(assessment.observations.notes)
-    assert "160 × 160 pixels from column 500, row 10 of a sensor of 780 × 582" in notes
+    assert "60 × 60 pixels from column 500, row 10 of a sensor of 780 × 582" in notes
     assert "not for another camera" not in notes
 
 

@@ -42,7 +42,7 @@ def test_arrays_stacks_and_raw_values_give_what_single_files_give(tmp_path: Path
         (tmp_path / "raw" / f"s{k}.raw").write_bytes(three.astype(np.uint8).tobytes())
     text = "schema: pixmetry/campaign/1\ncamera: {name: x, bits: 12, sensor: ccd}\nframes:\n" + "\n".join(lines) + "\n"
     (tmp_path / "campaign.yaml").write_text(text)
-    (tmp_path / "raw" / "campaign.yaml").write_text(text + "raw: {width: 160, height: 160, pixel_format: Mono12p}\n")
+    (tmp_path / "raw" / "campaign.yaml").write_text(text + "raw: {width: 60, height: 60, pixel_format: Mono12p}\n")
     for folder in (tmp_path, tmp_path / "raw"):
         campaign = load_campaign(folder)
         assert numbers(campaign) == (expected, "proven")
@@ -67,7 +67,7 @@ def test_arrays_are_assessed_and_tested() -> None:
     ("change", "words"),
     [
         (lambda g: g[0].data, ["not frames of one condition", "Frames(kind, exposure_s, data)"]),
-        (lambda g: Frames("dark", 0.1, g[0].data[0]), ["not a stack", "(160, 160)"]),
+        (lambda g: Frames("dark", 0.1, g[0].data[0]), ["not a stack", "(60, 60)"]),
         (lambda g: Frames("dark", 0.1, g[0].data.astype(float)), ["float64"]),
         (lambda g: Frames("dark", 0.1, g[0].data[:, :10]), ["several sizes"]),
         (lambda g: Frames("dim", 0.1, g[0].data), ["kind"]),
