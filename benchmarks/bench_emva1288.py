@@ -27,7 +27,7 @@ ORACLES = Path(__file__).resolve().parents[1] / ".venv-oracles" / "bin" / "pytho
 REPEATS, WHOLE, SUMMING, GROWTH_MB = 5, 0.35, 0.22, 10.0
 OURS = """
 import json, sys, time
-from pixmetry.campaign import load_campaign
+from pixmetry.files import load_campaign
 from pixmetry.datasheets import emva1288, measure_campaign
 
 def run():

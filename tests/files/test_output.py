@@ -137,7 +137,7 @@ def test_the_mount_point_of_a_disk_is_written_and_a_full_or_read_only_one_is_tol
         {sys.executable} - <<'END'
         import os, errno
         from pathlib import Path
-        from pixmetry.campaign import check_output, staged_output
+        from pixmetry.files.output import check_output, staged_output
         disk = Path({str(tmp_path)!r})
         (disk / "below").rmdir()
         for text in ("first", "second"):
@@ -154,7 +154,7 @@ def test_the_mount_point_of_a_disk_is_written_and_a_full_or_read_only_one_is_tol
         assert (disk / "maps" / "a").read_text() == "second" and sorted(os.listdir(disk)) == [".pixmetry-output.json", "maps"]
         END
         [ $? = 0 ] && mount -o remount,ro {tmp_path} && {sys.executable} -c "
-        from pixmetry.campaign import check_output
+        from pixmetry.files.output import check_output
         for name in ('', '/below'):
             try: check_output({str(tmp_path)!r} + name, 'assessment')
             except ValueError as problem: assert 'cannot be written' in str(problem), problem
@@ -175,7 +175,7 @@ def test_what_a_killed_run_left_is_cleaned_by_the_next(tmp_path: Path) -> None:
     make(target)
     script = f"""
         import os, signal
-        from pixmetry.campaign.output import staged_output
+        from pixmetry.files.output import staged_output
         with staged_output({str(target)!r}, "assessment") as stage:
             (stage / "results.json").write_text("half")
             os.kill(os.getpid(), signal.SIGKILL)
