@@ -502,10 +502,7 @@ def test_the_example_of_other_programs_runs(by_hand: Calibration, tmp_path: Path
 def test_the_messages_of_the_page_are_those_of_the_program() -> None:
     section = DOCS.read_text().partition("## What the messages mean")[2]
     messages = re.findall(r"^\| `(.*?)` \|", section, re.M)
-    files = [SOURCE / "calibrating.py", SOURCE / "core" / "config.py"]
-    files += [SOURCE / "calibration" / name for name in ("exchange.py", "checks.py")]
-    files += sorted((SOURCE / "calibration").glob("plumb_line*.py"))
-    files += [path for part in ("calibration_project", "campaign") for path in (SOURCE / part).glob("*.py")]
+    files = [SOURCE / "core" / "config.py", *(path for room in ("calibrate", "files") for path in (SOURCE / room).rglob("*.py"))]
     text = " ".join(path.read_text() for path in files)
     assert len(messages) > 15
     for message in messages:
