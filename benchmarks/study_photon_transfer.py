@@ -24,15 +24,16 @@ import numpy as np
 from scipy import stats
 
 from pixmetry.camera.observations import PhotonTransfer
+from pixmetry.core.number import Number
 from pixmetry.emva.evaluate import standard_values
-from pixmetry.emva.records import Measurement, Value
+from pixmetry.emva.records import Measurement
 from pixmetry.observe.photon_transfer_fit import fit_photon_transfer
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from observe.simulated_camera import Camera, drawn_record, framed_record, random_camera, reference_u, truth  # noqa: E402
 
 
-def line(record: PhotonTransfer, name: str) -> Value:
+def line(record: PhotonTransfer, name: str) -> Number:
     """The same value by the standard's line."""
     return standard_values(Measurement(record), "3.1").values[{"gain_dn_per_e": "K", "dark_noise_e": "sigma_d"}[name]]
 

@@ -7,16 +7,17 @@ from pathlib import Path
 
 import numpy as np
 
+from pixmetry.core.number import LOWER_LIMIT, UPPER_LIMIT, Number
 from pixmetry.emva.files.keys import KEYS, key_of
 from pixmetry.emva.files.write import write_files
-from pixmetry.emva.records import MONO, DataSheet, Results, Value
+from pixmetry.emva.records import MONO, DataSheet, Results
 
 
-def value(number: float, u: float = math.nan, dof: float = math.inf, unit: str = "1", **more: object) -> Value:
-    return Value(number, u, dof, unit, **more)  # type: ignore[arg-type]
+def value(number: float, u: float = math.nan, dof: float = math.inf, unit: str = "1", **more: object) -> Number:
+    return Number(number, u, dof, unit, **more)  # type: ignore[arg-type]
 
 
-def sheet(values: dict[str, Value], release: str = "4.0", channel: str = MONO, **more: object) -> DataSheet:
+def sheet(values: dict[str, Number], release: str = "4.0", channel: str = MONO, **more: object) -> DataSheet:
     result = Results(release, values, more.pop("curves", {}), more.pop("notes", ()), channel)  # type: ignore[arg-type]
     return DataSheet((result,), more.pop("camera", {"name": "K"}), more.pop("conditions", {}), {"seed": 1}, **more)  # type: ignore[arg-type]
 
@@ -31,11 +32,11 @@ def full(channels: tuple[str, ...] = (MONO,)) -> DataSheet:
     rng = np.random.Generator(np.random.Philox(7))
     results = []
     for channel in channels:
-        values = {key: Value(float(rng.normal()), float(rng.gamma(1)), 12.5, about.unit, "a method") for key, about in KEYS.items()}
-        values["K_nonlinear"] = Value(1 / 3, 1e-300, math.inf, "DN/e⁻")
-        values["DSNU1288_pixel"] = Value(0.31, 0.1, 63.0, "e⁻", "", "σ² < 0 & more: “taken for pattern”", True)
-        values["u_e_sat"] = Value(35.5e3, 1.0, math.inf, "e⁻", "", "the series ends below saturation", is_lower_limit=True)
-        values["u_p_min_area"] = Value(math.nan, math.nan, math.nan, "photon/µm²", "", "the pixel's area is not known")
+        values = {key: Number(float(rng.normal()), float(rng.gamma(1)), 12.5, about.unit, "a method") for key, about in KEYS.items()}
+        values["K_nonlinear"] = Number(1 / 3, 1e-300, math.inf, "DN/e⁻")
+        values["DSNU1288_pixel"] = Number(0.31, 0.1, 63.0, "e⁻", "", "σ² < 0 & more: “taken for pattern”", UPPER_LIMIT)
+        values["u_e_sat"] = Number(35.5e3, 1.0, math.inf, "e⁻", "", "the series ends below saturation", kind=LOWER_LIMIT)
+        values["u_p_min_area"] = Number(math.nan, math.nan, math.nan, "photon/µm²", "", "the pixel's area is not known")
         curves = {
             "PTC": {
                 "mean_dn": rng.normal(size=9) * 10.0 ** rng.integers(-300, 300, 9),

@@ -7,7 +7,7 @@ import numpy as np
 from pixmetry.camera.contribution import Probe
 from pixmetry.camera.quiet import QuietStreams
 from pixmetry.camera.signal import Kind, Signal
-from pixmetry.core.estimates import Estimates
+from pixmetry.core.number import Estimates
 from pixmetry.core.random import Grid, Stream
 
 ALPHA = 1e-6  # false-failure rate of every statistical test, for any seed

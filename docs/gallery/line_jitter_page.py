@@ -9,7 +9,7 @@ from gallery.line_jitter_frames import AVERAGED, LENSES, LINES, POSITIONS, PRESE
 from gallery.page import Page, show, table
 from pixmetry.calibrate.lines.line_residuals import AxisResiduals, compare_axes
 from pixmetry.calibrate.lines.row_jitter import Sampling, jitter_from_axes
-from pixmetry.core.estimates import Estimates
+from pixmetry.core.number import Estimates
 from pixmetry.report.drawing import AMBER, BLUE, INK, RED, SOFT, Picture, canvas, picture
 from pixmetry.report.numbers import fixed, significant, uncertain
 

@@ -15,8 +15,9 @@ __version__ = "0.1.0"
 
 _HOMES = {
     "Camera": "pixmetry.camera.camera",
-    "Estimates": "pixmetry.core.estimates",
+    "Estimates": "pixmetry.core.number",
     "Frames": "pixmetry.files",
+    "Number": "pixmetry.core.number",
     "PixmetryError": "pixmetry.core.errors",
     "Signal": "pixmetry.camera.signal",
     "add_source_file": "pixmetry.camera.catalogue",
@@ -40,6 +41,7 @@ __all__ = [
     "Camera",
     "Estimates",
     "Frames",
+    "Number",
     "PixmetryError",
     "Signal",
     "__version__",
@@ -68,7 +70,7 @@ if TYPE_CHECKING:
     from pixmetry.camera.catalogue import add_source_file, catalogue
     from pixmetry.camera.signal import Signal
     from pixmetry.core.errors import PixmetryError
-    from pixmetry.core.estimates import Estimates
+    from pixmetry.core.number import Estimates, Number
     from pixmetry.emva.job import emva1288
     from pixmetry.emva.judge.compare import check_limits, compare, compare_fleet
     from pixmetry.files import Frames, campaign_of_arrays, load_campaign

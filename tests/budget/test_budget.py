@@ -19,7 +19,7 @@ from pixmetry.camera.camera import load_camera
 from pixmetry.camera.catalogue import catalogue, get_source
 from pixmetry.camera.signal import Kind
 from pixmetry.core.errors import InputError
-from pixmetry.core.estimates import Estimates
+from pixmetry.core.number import Estimates
 from pixmetry.locate.centroids.estimators import Estimator
 
 KNOWN = {"noise_dn": 0.6}

@@ -86,7 +86,7 @@ def outcomes(camera: ForeignCamera, draws: int) -> tuple[list[Outcome], list[str
         if not np.isfinite(value.value):
             missing.append(f"{key}: {value.reason}"[:110])
             continue
-        kind = "upper_limit" if value.is_limit else "lower_limit" if value.is_lower_limit else "value"
+        kind = value.kind if value.is_limit else "value"
         found.append(outcome(f"emva {key}", kind, value.value, value.u, value.dof, truth))
     return found, missing
 

@@ -10,7 +10,8 @@ from scipy import stats
 
 from emva.cameras import Camera
 from pixmetry.camera.observations import PhotonTransfer
-from pixmetry.emva.records import Measurement, Results, Value
+from pixmetry.core.number import Number
+from pixmetry.emva.records import Measurement, Results
 from pixmetry.observe.moments import LevelAccumulator, level_moments
 from pixmetry.observe.stack import StackAccumulator
 
@@ -55,12 +56,12 @@ class Score:
     covered: list[bool] = field(default_factory=list)  # of values that cannot scatter like Student's t: truth within 3 u
     without: int = 0  # no value, or no truth
 
-    def add(self, value: Value, truth: float, one_sided: bool, near_zero: bool = False) -> None:
-        if not np.isfinite(value.value) or not np.isfinite(truth) and not (value.is_limit or value.is_lower_limit):
+    def add(self, value: Number, truth: float, one_sided: bool, near_zero: bool = False) -> None:
+        if not np.isfinite(value.value) or not np.isfinite(truth) and not value.is_limit:
             assert np.isfinite(value.value) or value.reason, "NaN without a reason"
             self.without += 1
             return
-        if value.is_limit:
+        if value.is_upper_limit:
             self.limits.append(not truth > value.value)
             return
         if value.is_lower_limit:

@@ -17,11 +17,12 @@ from scipy import stats
 from data_sheets import full, measured, sheet, value, written
 from pixmetry.cli import main
 from pixmetry.core.errors import InputError
+from pixmetry.core.number import Number
 from pixmetry.emva.files.keys import KEYS
 from pixmetry.emva.judge.compare import Comparison, check_limits, compare, compare_fleet
 from pixmetry.emva.judge.conformity import load_limits
 from pixmetry.emva.judge.differences import SAME_THING, holm
-from pixmetry.emva.records import DataSheet, Value
+from pixmetry.emva.records import DataSheet
 
 ALPHA = 1e-6  # false failures of the statistical tests
 A = {"K": (0.2800, 0.0002), "sigma_d": (10.90, 0.03), "DSNU1288": (0.55, 0.04), "QE": (45.2, 1.4), "PRNU1288": (0.4327, 0.0005)}
@@ -123,8 +124,8 @@ def test_common_light_is_taken_off() -> None:
     assert result.rows[1].u == pytest.approx(math.hypot(0.0002, 0.0002))
 
 
-def limit(number: float, u: float = 0.1) -> Value:
-    return Value(number, u, math.inf, "e⁻", "", "noise", True)
+def limit(number: float, u: float = 0.1) -> Number:
+    return Number(number, u, math.inf, "e⁻", "", "noise", "upper_limit")
 
 
 @pytest.mark.parametrize(
@@ -140,7 +141,7 @@ def limit(number: float, u: float = 0.1) -> Value:
         (limit(0.5), value(1.5, unit="e⁻"), "undecided"),
     ],
 )
-def test_beside_a_limit_only_what_lies_above_it_counts(a: Value, b: Value, expected: str) -> None:
+def test_beside_a_limit_only_what_lies_above_it_counts(a: Number, b: Number, expected: str) -> None:
     assert verdicts(compare(sheet({"DSNU1288": a}), sheet({"DSNU1288": b}))) == {"DSNU1288": expected}
 
 

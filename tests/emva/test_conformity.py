@@ -12,9 +12,9 @@ from scipy import integrate, stats
 
 from data_sheets import measured, value
 from pixmetry.core.errors import InputError, ParameterError
+from pixmetry.core.number import LOWER_LIMIT, UPPER_LIMIT, Number
 from pixmetry.emva.judge.compare import load
 from pixmetry.emva.judge.conformity import Limits, check, judge, judge_value, load_limits
-from pixmetry.emva.records import Value
 
 ALPHA = 1e-6  # false failures of the statistical tests
 
@@ -106,11 +106,11 @@ def test_what_is_not_known_is_undecided() -> None:
 
 
 def test_upper_limits_are_held_against_limits() -> None:
-    bound = Value(0.4, 0.1, 50.0, "e⁻", is_limit=True)
+    bound = Number(0.4, 0.1, 50.0, "e⁻", kind=UPPER_LIMIT)
 
-    lower_bound = Value(0.4, 0.1, 50.0, "e⁻", is_lower_limit=True)
+    lower_bound = Number(0.4, 0.1, 50.0, "e⁻", kind=LOWER_LIMIT)
 
-    def verdict(bound: Value = bound, **given: float | str) -> str:
+    def verdict(bound: Number = bound, **given: float | str) -> str:
         limits = Limits.model_validate({"schema": "pixmetry/limits/1", "limits": {"DSNU1288": {"unit": "e-", **given}}})
         (row,) = check({("mono", "DSNU1288"): bound}, limits)
         assert row.judgement == judge_value(bound, limits.limits["DSNU1288"], "guarded_acceptance", 0.95)

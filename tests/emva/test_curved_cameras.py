@@ -144,7 +144,7 @@ def test_a_threshold_far_below_the_darkest_level_is_an_upper_limit(sheets: dict,
     light = np.geomspace(1e-2, 1e3, 4000)
     true = float(light[np.argmax(camera.snr(light) >= 1)])
     limit, ratio = result.values["general_u_p_min"], result.values["general_DR"]
-    assert limit.is_limit and "darkest level" in limit.reason and true < limit.value < result.curves["general"]["photons"][0]
+    assert limit.is_upper_limit and "darkest level" in limit.reason and true < limit.value < result.curves["general"]["photons"][0]
     assert ratio.is_lower_limit and ratio.value < result.values["general_u_p_sat"].value / true
 
 

@@ -9,10 +9,11 @@ import pytest
 
 from emva.cameras import Camera
 from emva.scoring import measured
+from pixmetry.core.number import Number
 from pixmetry.emva.evaluate import standard_values
 from pixmetry.emva.files.keys import KEYS, goes_with_photons
 from pixmetry.emva.judge.differences import Subject, difference_of
-from pixmetry.emva.records import Measurement, Value
+from pixmetry.emva.records import Measurement
 from pixmetry.emva.series import series_of
 from pixmetry.emva.temporal import temporal_values
 
@@ -55,5 +56,5 @@ def test_values_that_go_with_the_photons_are_those_that_do(camera: Measurement) 
 def test_a_value_that_is_nothing_but_the_light_has_no_u_of_its_own() -> None:
     """A level of the series under one light: what is left of u is none, not the whole by rounding."""
     for value in (123.4, 98765.4321, 7e-3):
-        sheet = Subject("A", "data sheet", "4.0", {}, {("mono", "u_p_sat"): Value(value, abs(value) * U_REL, np.inf, "photon")}, {}, U_REL)
+        sheet = Subject("A", "data sheet", "4.0", {}, {("mono", "u_p_sat"): Number(value, abs(value) * U_REL, np.inf, "photon")}, {}, U_REL)
         assert difference_of(("mono", "u_p_sat"), sheet, sheet, True).verdict == "equal"

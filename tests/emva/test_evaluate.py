@@ -53,7 +53,7 @@ def test_every_key_is_there_with_a_value_and_u_or_a_reason(sheets: dict[str, Res
     for key, value in results.values.items():
         assert value.unit == key_of(key).unit, key
         assert value.method, key
-        assert value.reason or not value.is_limit, key
+        assert value.reason or not value.is_upper_limit, key
         if math.isnan(value.value):
             assert value.reason, key
         else:
@@ -72,9 +72,9 @@ def test_values_agree_with_the_truth_within_u(sheets: dict[str, Results], releas
 @pytest.mark.parametrize("release", ["3.1", "reference"])
 def test_a_negative_variance_is_a_limit_that_names_the_row_noise(sheets: dict[str, Results], release: str) -> None:
     values = sheets[release].values
-    assert values["s_2_y_pixel_dark"].value < 0 and not values["s_2_y_pixel_dark"].is_limit
+    assert values["s_2_y_pixel_dark"].value < 0 and not values["s_2_y_pixel_dark"].is_upper_limit
     limit = values["DSNU1288_pixel"]
-    assert limit.is_limit and "row" in limit.reason
+    assert limit.is_upper_limit and "row" in limit.reason
     row_dn2 = (ROWS.gain_dn_per_e * ROWS.row_noise_e) ** 2
     assert float(limit.reason.split("row (")[1].split()[0]) == pytest.approx(row_dn2, rel=0.15)
     # with the row noise put back what is left is the noise of 24 frames, 4 e⁻ each, in 6144 pixels
@@ -103,7 +103,7 @@ def test_hot_pixels_that_clip_in_the_light_leave_no_limit_of_the_prnu(release: s
     rng = np.random.default_rng()
     values = standard_values(spoilt(9000.0 * (rng.random((64, 96)) < 0.01)), release, draws=300).values
     for key in ("PRNU1288", "PRNU1288_pixel"):
-        assert math.isnan(values[key].value) and not values[key].is_limit
+        assert math.isnan(values[key].value) and not values[key].is_upper_limit
         assert "hot in the dark" in values[key].reason and "highest code" in values[key].reason
 
 
@@ -117,7 +117,7 @@ def test_hot_pixels_that_clip_leave_no_limit_of_the_prnu_where_there_are_only_st
     ]
     values = emva1288(campaign_of_arrays(groups, bits=12)).results[0].values
     for key in ("PRNU1288", "PRNU1288_pixel"):
-        assert math.isnan(values[key].value) and not values[key].is_limit and "far below zero" in values[key].reason
+        assert math.isnan(values[key].value) and not values[key].is_upper_limit and "far below zero" in values[key].reason
     assert values["DSNU1288_DN"].value > 200
 
 
@@ -128,7 +128,7 @@ def test_a_wave_across_the_frame_leaves_no_limit_of_rows_and_columns(release: st
     values = standard_values(spoilt(60 * np.sin(2 * np.pi * (0.11 * x + 0.17 * y))), release, draws=300).values
     for line in ("row", "col"):
         value = values[f"DSNU1288_{line}"]
-        assert math.isnan(value.value) and not value.is_limit and "wave" in value.reason and "stands out" not in value.reason
+        assert math.isnan(value.value) and not value.is_upper_limit and "wave" in value.reason and "stands out" not in value.reason
     assert values["DSNU1288_pixel"].value == pytest.approx(math.hypot(60 / math.sqrt(2), 1.0), rel=0.02)
 
 
@@ -153,7 +153,7 @@ def test_limits_lie_above_the_truth_in_95_of_100_cameras() -> None:
         small = {"dark_e_per_s": 0.0, "shape": (32, 48), "levels": 8, "stack_frames": 16, "longest_s": 0.001}
         camera = Camera(seed=int(seed), row_noise_e=6.0, dsnu_e=(1.0, 0.0, 0.0), **small)
         limit = evaluate(measured(camera), "3.1", draws=300).values["DSNU1288_pixel"]
-        if limit.is_limit:
+        if limit.is_upper_limit:
             mean = camera.expected(camera.longest_s, 0.0)[0]
             parts = mean - mean.mean(axis=0) - mean.mean(axis=1)[:, None] + mean.mean()
             covered.append(limit.value > parts.std() / camera.gain_dn_per_e)
@@ -212,10 +212,10 @@ def test_dark_noise_below_the_quantisation_is_a_limit_except_in_the_reference() 
     for release in RELEASES:
         values = evaluate(m, release, draws=200).values
         limit = release != "reference"
-        assert values["sigma_d"].is_limit == values["u_p_min"].is_limit == limit
+        assert values["sigma_d"].is_upper_limit == values["u_p_min"].is_upper_limit == limit
         bound = 0.40 if limit else math.sqrt(0.24 - 1 / 12)
         assert values["sigma_d"].value == pytest.approx(bound / values["K"].value)
-        assert not values["DR"].is_limit and "0.24 DN²" in values["DR"].reason
+        assert not values["DR"].is_upper_limit and "0.24 DN²" in values["DR"].reason
 
 
 def test_a_limit_of_extrapolated_dark_noise_lies_above_the_truth() -> None:
@@ -235,8 +235,8 @@ def test_a_limit_of_extrapolated_dark_noise_lies_above_the_truth() -> None:
     limits = []
     for seed in np.random.default_rng().integers(2**31, size=40):
         values = standard_values(measured(Camera(seed=int(seed), **strong)), "3.1", draws=300).values
-        if values["sigma_d"].is_limit:
-            assert values["u_e_min"].is_limit and "does not stand out" in values["DR"].reason
+        if values["sigma_d"].is_upper_limit:
+            assert values["u_e_min"].is_upper_limit and "does not stand out" in values["DR"].reason
             assert values["u_e_min"].value > values["sigma_d"].value
             limits.append(values["sigma_d"].value > 5.0)
     assert limits
@@ -250,7 +250,7 @@ def test_a_dark_pattern_under_the_quantisation_is_a_limit_above_the_truth() -> N
         camera = Camera(seed=5, offset_dn=8.0 + place, shape=(32, 48), levels=12, **low)
         values = standard_values(measured(camera), "4.0", draws=200).values
         for key, truth in (("DSNU1288", 5.0), ("DSNU1288_pixel", 5.0), ("general_DSNU", 10.0)):
-            assert values[key].is_limit and values[key].value > truth, (place, key)
+            assert values[key].is_upper_limit and values[key].value > truth, (place, key)
         for key in ("K", "QE", "u_e_sat", "PRNU1288"):
             assert "quantisation" in values[key].reason or "lowest code" in values[key].reason, key
 

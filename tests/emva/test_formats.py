@@ -15,11 +15,11 @@ from hypothesis import strategies as st
 
 from data_sheets import assert_same, full, sheet, value, written
 from pixmetry.core.errors import InputError
+from pixmetry.core.number import Number
 from pixmetry.emva.files.formats import read_sheet, sheet_of_record, to_record
 from pixmetry.emva.files.keys import KEYS
 from pixmetry.emva.files.units import plain_unit
 from pixmetry.emva.files.xml_format import sheet_of_xml, xml_text
-from pixmetry.emva.records import Value
 
 ROOT = Path(__file__).resolve().parents[2]
 PYTHON = ROOT / ".venv-oracles" / "bin" / "python"
@@ -70,13 +70,13 @@ def test_inverse_reading_gives_what_was_written(kind: str, channels: tuple[str, 
 numbers = st.one_of(st.floats(), st.just(math.nan))
 texts = st.text(st.characters(codec="utf-8", exclude_categories=["Cc", "Cn"]))
 values_drawn = st.builds(
-    Value, numbers, st.floats(0) | st.just(math.nan), st.floats(0, exclude_min=True) | st.just(math.nan), st.just("DN"), texts, texts
+    Number, numbers, st.floats(0) | st.just(math.nan), st.floats(0, exclude_min=True) | st.just(math.nan), st.just("DN"), texts, texts
 )
 
 
 @settings(max_examples=60, deadline=None)
 @given(values_drawn, st.lists(numbers), texts)
-def test_inverse_any_number_and_text_survives(drawn: Value, array: list[float], name: str) -> None:
+def test_inverse_any_number_and_text_survives(drawn: Number, array: list[float], name: str) -> None:
     if math.isnan(drawn.value) and not drawn.reason:  # XML gives a reason of its own
         drawn = value(drawn.value, drawn.u, drawn.dof, "DN", reason="-")
     written = sheet({"K": drawn}, curves={"SNR": {"snr": np.array(array)}}, camera={"name": name})
@@ -128,7 +128,7 @@ def test_sheets_of_other_programs_are_read(tmp_path: Path) -> None:
         "DR": "1",
     }
     assert "None" in got["u_e_sat_area"].reason and "nan" in got["DSNU1288_pixel"].reason
-    assert all(math.isnan(v.u) and math.isnan(v.dof) and not v.is_limit for v in got.values())
+    assert all(math.isnan(v.u) and math.isnan(v.dof) and not v.is_upper_limit for v in got.values())
     curve = result.curves["histogram_DSNU"]
     np.testing.assert_array_equal(curve["bins"], [-1.5, 0.0, 10.0])
     np.testing.assert_array_equal(curve["values"], [1.0, 2.0, math.nan])
@@ -270,7 +270,7 @@ def test_reference_implementation_reads_ours(channels: tuple[str, ...], tmp_path
         channel = "" if result.channel == "mono" else result.channel.lower()
         for key, v in result.values.items():
             seen = found[channel, key.lower()]
-            if v.is_limit or v.is_lower_limit or math.isnan(v.value):
+            if v.is_limit or math.isnan(v.value):
                 assert seen is None or math.isnan(seen), key
             else:
                 assert seen == v.value, key

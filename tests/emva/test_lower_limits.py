@@ -11,12 +11,13 @@ import pytest
 
 from emva.cameras import Camera
 from emva.scoring import measured
+from pixmetry.core.number import LOWER_LIMIT, UPPER_LIMIT, VALUE, Number
 from pixmetry.emva.evaluate import evaluate
 from pixmetry.emva.files.formats import json_text, read_sheet
 from pixmetry.emva.files.xml_format import xml_text
 from pixmetry.emva.judge.conformity import Limit, judge_value
 from pixmetry.emva.judge.differences import Subject, difference_of
-from pixmetry.emva.records import DataSheet, Results, Value
+from pixmetry.emva.records import DataSheet, Results
 
 SHORT = Camera(seed=21, over=0.5, shape=(48, 64), levels=20, stack_frames=16)  # the light ends at half of saturation
 LONG = replace(SHORT, over=1.1)
@@ -33,12 +34,12 @@ def short() -> dict[str, Results]:
 def test_a_series_that_ends_early_gives_lower_limits_below_what_the_longer_one_shows(short: dict[str, Results]) -> None:
     found, whole = short["4.0"].values, evaluate(measured(LONG), "4.0", draws=300).values
     for key in (*LOWER, *GENERAL_LOWER):
-        assert found[key].is_lower_limit and not found[key].is_limit and "ends before saturation" in found[key].reason, key
+        assert found[key].is_lower_limit and not found[key].is_upper_limit and "ends before saturation" in found[key].reason, key
         assert found[key].value < whole[key].value and not whole[key].is_lower_limit, key
-    assert found["inverse_SNR_max"].is_limit and found["inverse_SNR_max"].value > whole["inverse_SNR_max"].value
+    assert found["inverse_SNR_max"].is_upper_limit and found["inverse_SNR_max"].value > whole["inverse_SNR_max"].value
     assert found["LE"].reason.startswith("the series ends before saturation") and not found["LE"].is_lower_limit
     for key in ("K", "R", "sigma_d", "u_p_min", "DSNU1288", "PRNU1288"):
-        assert not found[key].is_lower_limit and not found[key].is_limit, key
+        assert not found[key].is_lower_limit and not found[key].is_upper_limit, key
 
 
 def test_the_limit_is_that_of_one_side_at_95_percent(short: dict[str, Results]) -> None:
@@ -70,7 +71,7 @@ def test_the_other_releases(short: dict[str, Results]) -> None:
 def test_hidden_dark_noise_makes_the_dynamic_range_a_lower_limit() -> None:
     m = measured(Camera(seed=4, read_e=0.3, dark_e_per_s=0.0, dsnu_e=(0.0, 0.0, 0.0), shape=(32, 48), levels=16, stack_frames=16))
     v = evaluate(m, "4.0", draws=300).values
-    assert v["u_e_min"].is_limit and v["general_u_p_min"].is_limit
+    assert v["u_e_min"].is_upper_limit and v["general_u_p_min"].is_upper_limit
     truth = (0.3**2 + 0.25) ** 0.5 + 0.5  # electrons, without the rounding
     for key in ("DR", "DR_dB", "DR_bit", "general_DR", "general_DR_dB"):
         assert v[key].is_lower_limit and v[key].reason, key
@@ -102,7 +103,7 @@ def test_files_keep_a_lower_limit(tmp_path: Path, short: dict[str, Results], end
     ],
 )
 def test_limits_are_judged_by_what_the_lower_limit_tells(limit: dict[str, float], verdict: str) -> None:
-    value = Value(100.0, 1.0, math.inf, "1", is_lower_limit=True)
+    value = Number(100.0, 1.0, math.inf, "1", kind=LOWER_LIMIT)
     for rule in ("guarded_acceptance", "simple_acceptance", "guarded_rejection"):
         assert judge_value(value, Limit(**limit), rule, 0.95).verdict == verdict
 
@@ -124,7 +125,7 @@ def test_limits_are_judged_by_what_the_lower_limit_tells(limit: dict[str, float]
 )
 def test_only_what_lies_beyond_a_limit_is_a_difference(a: tuple[float, str], b: tuple[float, str], changes: bool) -> None:
     def subject(number: float, mark: str, u: float) -> Subject:
-        value = Value(number, u, math.inf, "1", is_limit=mark == "<", is_lower_limit=mark == ">")
+        value = Number(number, u, math.inf, "1", kind={"<": UPPER_LIMIT, ">": LOWER_LIMIT, "": VALUE}[mark])
         return Subject("x", "data sheet", "4.0", {}, {("mono", "DR"): value}, {})
 
     row = difference_of(("mono", "DR"), subject(*a, 1.0), subject(*b, 1.0), False)

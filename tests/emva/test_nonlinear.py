@@ -81,7 +81,7 @@ def test_temporal_values_scatter_by_their_u():
         assert len(notes) == 1 and "stack" in notes[0]
         for key, value in want.items():
             got = values[f"{key}_nonlinear"]
-            if not got.is_limit:
+            if not got.is_upper_limit:
                 t = stats.t.cdf((got.value - value) / got.u, got.dof)
                 z.setdefault(key, []).append(float(stats.norm.ppf(t)))
         assert values["u_e_sat_nonlinear"].value == pytest.approx(camera.x_top / camera.gain, rel=0.02)
@@ -114,7 +114,7 @@ def test_the_pattern_of_this_sensor_is_found_within_its_u():
         for key, value in want.items():
             got = values[f"{key}_nonlinear"]
             z.setdefault(key, []).append((got.value - value) / got.u)
-            assert not got.is_limit and got.unit == ("%" if "PRNU" in key else "e⁻") and "this sensor" in got.method
+            assert not got.is_upper_limit and got.unit == ("%" if "PRNU" in key else "e⁻") and "this sensor" in got.method
     for key, values in z.items():
         check_z(values, key)
 
@@ -137,5 +137,5 @@ def test_noise_hidden_by_rounding_is_a_limit():
     camera = replace(BENT, gain=0.05, dark_noise_e=2.0, row_noise_e=0.0, column_noise_e=0.0, a=(0.0, 0.0, 0.0))
     values, _ = nonlinear_values(Measurement(drawn_record(camera, np.random.default_rng())))
     got = values["sigma_d_nonlinear"]
-    assert got.is_limit and "0.40/K" in got.reason and got.value == pytest.approx(0.4 / camera.gain, rel=0.05)
-    assert values["u_e_min_nonlinear"].is_limit and "QE_nonlinear" not in values
+    assert got.is_upper_limit and "0.40/K" in got.reason and got.value == pytest.approx(0.4 / camera.gain, rel=0.05)
+    assert values["u_e_min_nonlinear"].is_upper_limit and "QE_nonlinear" not in values

@@ -8,10 +8,11 @@ from scipy import stats
 from scipy.ndimage import convolve1d
 
 from pixmetry.core.errors import InputError
+from pixmetry.core.number import UPPER_LIMIT, Number
 from pixmetry.emva.planning.known_camera import KnownCamera, camera_from_results, camera_from_sheet
 from pixmetry.emva.planning.plan_output import parse_wanted, plan_text, write_campaign
 from pixmetry.emva.planning.planning import Plan, plan_for, predicted_u, with_scatter
-from pixmetry.emva.records import DataSheet, Results, Value
+from pixmetry.emva.records import DataSheet, Results
 from pixmetry.files.manifest import load_campaign
 
 ALPHA = 1e-6
@@ -231,12 +232,12 @@ def test_known_camera_from_a_sheet() -> None:
     truth = replace(CCD, var_excess_rel=0.0075, light_scatter_rel=0.004, coherence=6.0, dsnu_col_e=0.0)
     plan = Plan(frames_per_level=2)
     u = predicted_u(truth, plan)
-    values = {key: Value(value, u[key], 50.0, "") for key, value in truth.values.items()}
-    values |= {"u_e_sat": Value(14000.0, 10.0, 50.0, "e⁻"), "u_I_mean": Value(-3.0, 1.0, 9.0, "e⁻/s")}
-    values["DSNU1288_row"] = Value(0.2 * np.sqrt(3), 0.1, 9.0, "e⁻", is_limit=True)
-    values["DSNU1288_col"] = Value(np.nan, np.nan, 9.0, "e⁻", reason="nothing is known")
+    values = {key: Number(value, u[key], 50.0, "") for key, value in truth.values.items()}
+    values |= {"u_e_sat": Number(14000.0, 10.0, 50.0, "e⁻"), "u_I_mean": Number(-3.0, 1.0, 9.0, "e⁻/s")}
+    values["DSNU1288_row"] = Number(0.2 * np.sqrt(3), 0.1, 9.0, "e⁻", kind=UPPER_LIMIT)
+    values["DSNU1288_col"] = Number(np.nan, np.nan, 9.0, "e⁻", reason="nothing is known")
     k2, s = CCD.gain_dn_per_e**2, CCD.dsnu_pixel_e
-    values["s_2_y_pixel_dark"] = Value(k2 * s**2, k2 * 2 * s * u["DSNU1288_pixel"], 50.0, "DN²")
+    values["s_2_y_pixel_dark"] = Number(k2 * s**2, k2 * 2 * s * u["DSNU1288_pixel"], 50.0, "DN²")
     facts = {"rows": 480, "cols": 640, "bits": 12}
     camera = camera_from_sheet(DataSheet((Results("4.0", values),), facts, {}, {}), row_noise_e=1.8)
     expected = vars(replace(CCD, dsnu_col_e=0.0))
@@ -247,12 +248,12 @@ def test_known_camera_from_a_sheet() -> None:
     assert known.coherence == pytest.approx(6.0, rel=0.02)  # u of the root is no tangent
     conditions = {"sweep": "exposure time at constant light", "bright_levels": 50, "frames_per_level": [2], "dark_stack_frames": 100}
     conditions |= {"exposures_s": [0.0, 0.02], "photons": [0.0, 62000.0]}
-    values["u_p_sat"] = Value(31000.0, 10.0, 50.0, "photon")
+    values["u_p_sat"] = Number(31000.0, 10.0, 50.0, "photon")
     timed = camera_from_sheet(DataSheet((Results("4.0", values),), facts, conditions, {}), row_noise_e=1.8)
     assert timed.exposure_sat_s == pytest.approx(0.01)
     assert timed.var_excess_rel == pytest.approx(0.0075, rel=1e-4)
     assert camera_from_sheet(DataSheet((Results("4.0", values),), facts, conditions, {}), var_excess_rel=0.0).var_excess_rel == 0.0
-    as_json = {key: {"value": None if np.isnan(v.value) else v.value, "u": v.u, "is_limit": v.is_limit} for key, v in values.items()}
+    as_json = {key: {"value": None if np.isnan(v.value) else v.value, "u": v.u, "is_limit": v.is_upper_limit} for key, v in values.items()}
     assert camera_from_results(as_json, 480, 640, 12, row_noise_e=1.8) == camera
     with pytest.raises(InputError, match="sigma_d"):
         camera_from_results({"K": 0.3}, 480, 640, 12)

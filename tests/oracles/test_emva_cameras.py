@@ -90,7 +90,7 @@ def compare(descriptor: str, release: str, expected: dict[str, float]) -> None:
         p = 2 * stats.t.sf(abs(z), min(found.dof, 1e9))
         u = f"{found.u:8.5f} ({100 * found.u / truth:.2f} %)"
         print(f"{release:4s}{key:<16} put in {truth:9.4f}   found {found.value:9.4f}   u {u}   z {z:+.2f}")
-        if found.is_limit or p < ALPHA / COMPARISONS:
+        if found.is_upper_limit or p < ALPHA / COMPARISONS:
             failed[key] = (found, truth)
     assert not failed
 

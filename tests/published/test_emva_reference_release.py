@@ -78,7 +78,7 @@ SCALARS = [
 @pytest.mark.parametrize("key", SCALARS)
 def test_published_scalar(key: str) -> None:
     value, published = results("reference").values[key], float(stored()[key][0])
-    assert not value.is_limit
+    assert not value.is_upper_limit
     assert value.value == pytest.approx(published, rel=0, abs=RELATIVE * max(abs(published), largest_summands().get(key, 0.0)))
     assert value.u >= 0
 
@@ -87,7 +87,7 @@ def test_what_is_printed_as_nan_is_a_limit_with_its_reason() -> None:
     missing = {k for k, v in stored().items() if v.size == 1 and np.isnan(v[0])}
     assert missing == {"DSNU1288_pixel", "u_p_min_area", "u_e_min_area", "u_p_sat_area", "u_e_sat_area"}
     limit = results("reference").values["DSNU1288_pixel"]
-    assert limit.is_limit
+    assert limit.is_upper_limit
     assert 0.05 < limit.value < 0.5  # e⁻; less than the pixels' noise left in the mean image, 10.9/√50
     assert "row" in limit.reason
     assert all("area" in results("reference").values[key].reason for key in missing - {"DSNU1288_pixel"})
@@ -143,7 +143,7 @@ def test_without_products_of_frames_the_dark_levels_tell_of_the_wave_in_the_stac
 
 def test_4_0_splits_the_dark_pattern_with_the_temporal_row_noise_taken_off() -> None:
     split = results("4.0").values
-    assert not split["DSNU1288_pixel"].is_limit
+    assert not split["DSNU1288_pixel"].is_upper_limit
     assert abs(split["DSNU1288_pixel"].value - split["DSNU1288_pixel_nonlinear"].value) < 3 * split["DSNU1288_pixel"].u
     # the rows' pattern is the temporal noise that their means keep: 3.1 takes it for a pattern, 4.0 finds none
     assert results("3.1").values["s_2_y_row_dark"].value > 10 * results("3.1").values["s_2_y_row_dark"].u

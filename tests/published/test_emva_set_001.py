@@ -33,5 +33,5 @@ def test_the_crop_has_a_temporal_row_noise_that_the_standard_takes_for_a_pattern
     temporal = (rows.value * seen.photon_transfer_fit["gain_dn_per_e"].value) ** 2 / seen.dark_stack.n_frames
     # of the size of the temporal noise that the mean of the frames keeps
     assert standard.values["s_2_y_row_dark"].value == pytest.approx(temporal, rel=0.6)
-    assert standard.values["DSNU1288_pixel"].is_limit
+    assert standard.values["DSNU1288_pixel"].is_upper_limit
     assert seen.spatial_fit["dsnu_row_dn"].kind == "upper_limit"

@@ -6,8 +6,9 @@ from math import erfc, log2, log10, pi, sqrt
 
 import numpy as np
 
+from pixmetry.core.number import UPPER_LIMIT, Number
 from pixmetry.emva.files.keys import KEYS, key_of
-from pixmetry.emva.records import DataSheet, Results, Value
+from pixmetry.emva.records import DataSheet, Results
 
 K, ETA, SIGMA_D, DARK_RATE = 0.28, 0.45, 11.0, 30.0  # DN/e-, 1, e-, e-/s
 SATURATION_E, DSNU_DN, PRNU_PERCENT = 14000.0, 0.2, 0.4
@@ -33,16 +34,16 @@ def true_values() -> dict[str, float]:
     }  # fmt: skip
 
 
-def values(k: float = 1.0) -> dict[str, Value]:
+def values(k: float = 1.0) -> dict[str, Number]:
     """These values with uncertainties of half a percent; a limit, a value that cannot be given, and two beside the standard's."""
     found = {
-        name: Value(k * v, abs(0.005 * v) if KEYS[name].section != "info" else 0.0, 47.0, KEYS[name].unit, f"by {KEYS[name].section}")
+        name: Number(k * v, abs(0.005 * v) if KEYS[name].section != "info" else 0.0, 47.0, KEYS[name].unit, f"by {KEYS[name].section}")
         for name, v in true_values().items()
     }
-    found["DSNU1288_pixel"] = Value(0.35, 0.2, np.inf, "e⁻", "by spatial", "the variance is negative: temporal row noise", is_limit=True)
-    found["u_p_min_area"] = Value(np.nan, np.nan, np.nan, "photon/µm²", "", "the pixel pitch is not known")
-    found["K_nonlinear"] = Value(0.2851, 0.0006, 80.0, "DN/e⁻", "joint fit", "the camera bends by 2 %")
-    found["u_I_mean_nonlinear"] = Value(28.9, 0.6, 80.0, "e⁻/s", "joint fit")
+    found["DSNU1288_pixel"] = Number(0.35, 0.2, np.inf, "e⁻", "by spatial", "the variance is negative: temporal row noise", UPPER_LIMIT)
+    found["u_p_min_area"] = Number(np.nan, np.nan, np.nan, "photon/µm²", "", "the pixel pitch is not known")
+    found["K_nonlinear"] = Number(0.2851, 0.0006, 80.0, "DN/e⁻", "joint fit", "the camera bends by 2 %")
+    found["u_I_mean_nonlinear"] = Number(28.9, 0.6, 80.0, "e⁻/s", "joint fit")
     return found
 
 

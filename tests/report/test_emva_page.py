@@ -11,6 +11,7 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
+from pixmetry.core.number import LOWER_LIMIT, Number
 from pixmetry.emva.files.keys import KEYS
 from pixmetry.emva.page.content import (
     GENERAL,
@@ -29,7 +30,7 @@ from pixmetry.emva.page.content import (
 from pixmetry.emva.page.facts import facts
 from pixmetry.emva.page.figures import MARGINS_IN, STRETCHES, fill, outline, time_of
 from pixmetry.emva.page.page import all_plots, render
-from pixmetry.emva.records import DataSheet, Results, Value
+from pixmetry.emva.records import DataSheet, Results
 from pixmetry.report.drawing import STYLE, plain_log
 from pixmetry.report.templates import share_styles
 from report import emva_sheets
@@ -47,7 +48,7 @@ def page() -> Page:
     return Page(source())
 
 
-def with_value(key: str, value: Value) -> DataSheet:
+def with_value(key: str, value: Number) -> DataSheet:
     one = results()
     return sheet(replace(one, values={**one.values, key: value}))
 
@@ -87,11 +88,11 @@ def test_a_limit_is_one_and_says_why() -> None:
     [(13999.9, 24.0, "e⁻", "13990"), (61.7259, 0.0087, "dB", "61.725"), (118.35, 0.1, "1", "118.3"), (30957.0, 0.0, "photon", "30957")],
 )
 def test_a_lower_limit_is_rounded_down_and_marked(value: float, u: float, unit: str, text: str) -> None:
-    assert number_of(Value(value, u, 40.0, unit, is_lower_limit=True)).value == f">\u00a0{text}"
+    assert number_of(Number(value, u, 40.0, unit, kind=LOWER_LIMIT)).value == f">\u00a0{text}"
 
 
 def test_a_capacity_that_was_not_reached_is_a_lower_limit_everywhere() -> None:
-    found = Page(render(with_value("u_e_sat", Value(13987.6, 24.0, 40.0, "e⁻", "", "the series ends", is_lower_limit=True)))).text
+    found = Page(render(with_value("u_e_sat", Number(13987.6, 24.0, 40.0, "e⁻", "", "the series ends", kind=LOWER_LIMIT)))).text
     assert found.count("> 13980 (95 %) e⁻") == 3
     assert "µ e.sat > 13980 (95 %) e⁻" in found  # the headline
 
@@ -122,7 +123,7 @@ def test_every_value_is_in_the_table_of_all_values() -> None:
 
 
 def test_a_key_that_no_list_knows_is_shown() -> None:
-    text = Page(render(with_value("extra_value", Value(3.25, 0.1, 5.0, "DN")))).text
+    text = Page(render(with_value("extra_value", Number(3.25, 0.1, 5.0, "DN")))).text
     assert "extra_value" in text
     assert "3.25 ± 0.10 DN" in text
 
@@ -139,7 +140,7 @@ def test_the_document_follows_from_the_linearity_of_the_photon_transfer() -> Non
     """Frames of a camera at the limit show 2.7 to 3.4 %; the value's own u takes no part."""
 
     def with_departure(percent: float, u: float) -> Results:
-        return with_value("PTC_linearity", Value(percent, u, 40.0, "%")).results[0]
+        return with_value("PTC_linearity", Number(percent, u, 40.0, "%")).results[0]
 
     assert document(results()).startswith("Release 4.0 Linear applies")
     curved = with_departure(5.1, 0.4)
@@ -176,7 +177,7 @@ def test_facts_hold_size_and_ranges() -> None:
     + [(8e6, 1.0, ">\u00a01000"), (np.inf, 1.0, "∞"), (np.nan, 1.0, "–"), (50.0, 0.0, "–"), (50.0, np.nan, "–")],
 )
 def test_degrees_of_freedom_beyond_a_thousand_are_all_one(dof: float, u: float, text: str) -> None:
-    assert dof_text(Value(1.0, u, dof, "DN")) == text
+    assert dof_text(Number(1.0, u, dof, "DN")) == text
 
 
 @pytest.mark.parametrize(
@@ -408,8 +409,8 @@ def test_importing_the_page_and_the_pdf_is_cheap() -> None:
 
 def bent(percent: float, channel: str = "mono") -> Results:
     one = results(channel)
-    general = {key: Value(20.0, 0.1, 30.0, KEYS[key].unit) for key in GENERAL}
-    return replace(one, values={**one.values, **general, "PTC_linearity": Value(percent, 0.1, 40.0, "%")})
+    general = {key: Number(20.0, 0.1, 30.0, KEYS[key].unit) for key in GENERAL}
+    return replace(one, values={**one.values, **general, "PTC_linearity": Number(percent, 0.1, 40.0, "%")})
 
 
 def test_a_camera_has_one_verdict_that_of_its_worst_channel() -> None:
@@ -450,9 +451,9 @@ def test_notes_that_differ_in_numbers_are_one_with_the_numbers_of_each_channel()
 
 
 def test_a_number_far_below_its_u_is_not_rounded_to_nothing() -> None:
-    shown = number_of(Value(17.3, 1700.0, 20.0, "e⁻/s"))
+    shown = number_of(Number(17.3, 1700.0, 20.0, "e⁻/s"))
     assert (shown.value, shown.u, shown.unit) == ("17", "± 1700", "e⁻/s")
-    assert number_of(Value(0.0, 1700.0, 20.0, "e⁻/s")).value == "0"
+    assert number_of(Number(0.0, 1700.0, 20.0, "e⁻/s")).value == "0"
 
 
 def test_one_exposure_time_makes_no_plot_against_it() -> None:
@@ -497,7 +498,7 @@ def test_the_model_reaches_one_at_the_threshold_where_no_level_is() -> None:
 
 def test_a_series_that_ends_early_marks_its_last_level() -> None:
     one = results()
-    early = replace(one, values={**one.values, "u_p_sat": replace(one.values["u_p_sat"], is_lower_limit=True)})
+    early = replace(one, values={**one.values, "u_p_sat": replace(one.values["u_p_sat"], kind=LOWER_LIMIT)})
     assert line_of(axes_of(plot("Photon transfer", early)), "last level")
     assert "and last level;" in plot("Signal-to-noise ratio", early).caption
 

@@ -13,10 +13,10 @@ from pathlib import Path
 
 import pytest
 
+from pixmetry.core.number import Number
 from pixmetry.emva.page.content import GENERAL, all_rows, dof_text, methods_of
 from pixmetry.emva.page.page import all_plots
 from pixmetry.emva.page.pdf import VALUE_COLUMNS, lay_out, render_pdf
-from pixmetry.emva.records import Value
 from pixmetry.report.paper import HEIGHT_PT, INNER, LEFT, POINTS, RIGHT, WIDTH_PT, Cells, Column, paper, printable, text_width, wrapped
 from report import emva_sheets
 
@@ -123,9 +123,9 @@ def test_no_text_leaves_the_page_or_runs_into_another(make: object) -> None:
 @poppler
 def test_the_summary_with_general_values_and_long_notes_stays_on_one_page(tmp_path: Path) -> None:
     one = emva_sheets.results()
-    general = {key: Value(20.0, 0.1, 30.0, "photon") for key in GENERAL}
+    general = {key: Number(20.0, 0.1, 30.0, "photon") for key in GENERAL}
     notes = tuple(f"Note {k}, {'which takes more than one line of the page, as some do ' * 3}and ends" for k in range(7))
-    bent = replace(one, values={**one.values, **general, "PTC_linearity": Value(5.0, 0.4, 40.0, "%")}, notes=notes)
+    bent = replace(one, values={**one.values, **general, "PTC_linearity": Number(5.0, 0.4, 40.0, "%")}, notes=notes)
     first = text_of(render_pdf(emva_sheets.sheet(bent)), tmp_path / "sheet.pdf", "-l", "1")
     assert first.count("Note ") == first.count("and ends") == 7
     assert "General applies" in first
@@ -136,7 +136,7 @@ def test_degrees_of_freedom_fit_their_column() -> None:
     (column,) = (c for c in VALUE_COLUMNS if c.heading == "dof")
     assert sum(c.width for c in VALUE_COLUMNS) == pytest.approx(INNER)
     for dof in (1.04, 99.6, 999.6, 1250.0, 1e9, float("inf")):
-        assert len(wrapped(dof_text(Value(1.0, 0.1, dof, "DN")), column.width - 5, 6.6)) == 1, dof
+        assert len(wrapped(dof_text(Number(1.0, 0.1, dof, "DN")), column.width - 5, 6.6)) == 1, dof
 
 
 def test_widths_of_text_are_those_of_the_renderer() -> None:

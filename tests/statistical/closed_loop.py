@@ -25,7 +25,7 @@ from pixmetry.camera.catalogue import catalogue
 from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.core.errors import MeasureError, PixmetryError
-from pixmetry.core.estimates import Estimate
+from pixmetry.core.number import Number
 from pixmetry.core.random import Grid
 from pixmetry.observe.observe import Group, observe
 from pixmetry.scene.files import SeriesModel
@@ -260,7 +260,7 @@ def observe_case(case: Case) -> Observations:
     return observe(groups(), case.camera["grabber.adc"].params.bits)
 
 
-def estimates_of(seen: Observations) -> dict[str, Estimate]:
+def estimates_of(seen: Observations) -> dict[str, Number]:
     """All estimates by ``source.parameter``, and what only the common fit gives."""
     found = {f"{source}.{e.name}": e for source, estimates in measure_sources(seen)[0].items() for e in estimates}
     for name, old in (("lamp noise", "illumination_noise_rel"), ("responsivity (DN/s)", "responsivity_dn_per_s")):
@@ -279,7 +279,7 @@ def run_camera(seed: int, index: int, quick: bool = False) -> list[Score] | str:
     return score(case, estimates_of(seen))
 
 
-def score(case: Case, found: dict[str, Estimate]) -> list[Score]:
+def score(case: Case, found: dict[str, Number]) -> list[Score]:
     """Compare every estimate with the truth."""
     reference = reference_u(case)
     scores = []

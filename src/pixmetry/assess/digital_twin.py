@@ -17,7 +17,7 @@ from pixmetry.camera.observations import Observations, PatternList, PhotonTransf
 from pixmetry.camera.source import Source
 from pixmetry.camera.unit_maps import MeasuredUnit
 from pixmetry.core.errors import InputError, MeasureError
-from pixmetry.core.estimates import Estimates
+from pixmetry.core.number import Estimates
 from pixmetry.emva.evaluate import standard_values
 from pixmetry.emva.records import Measurement, Results
 from pixmetry.emva.reduction import measure_frames
@@ -441,7 +441,7 @@ def self_test(
     for key in COMPARED:
         ours, theirs = standard.values[key], found.values[key]
         numbers = (ours.value, ours.u, theirs.value, theirs.u)
-        limit = any(v.is_limit or v.is_lower_limit for v in (ours, theirs))
+        limit = any(v.is_limit for v in (ours, theirs))
         if np.isfinite(numbers).all() and ours.u > 0 and not limit and key not in left_out:
             rows.append(Compared(key, ours.unit, *numbers))
     return SelfTest(tuple(rows), frames, of, window)

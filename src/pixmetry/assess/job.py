@@ -20,7 +20,7 @@ from pixmetry.camera.catalogue import catalogue
 from pixmetry.camera.geometry import frame_centre
 from pixmetry.camera.observations import CameraGeometry, Observations
 from pixmetry.core.errors import InputError, MeasureError
-from pixmetry.core.estimates import Estimates
+from pixmetry.core.number import Estimates
 from pixmetry.emva.evaluate import standard_values
 from pixmetry.emva.records import Measurement, Results
 from pixmetry.files import (

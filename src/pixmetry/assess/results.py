@@ -12,7 +12,7 @@ from pixmetry.budget.headline import SUM
 from pixmetry.budget.job import Budget
 from pixmetry.camera.camera import Camera
 from pixmetry.camera.observations import Observations
-from pixmetry.core.estimates import Estimates
+from pixmetry.core.number import Estimates
 from pixmetry.emva.files.formats import value_record
 from pixmetry.emva.records import Results
 from pixmetry.files import Campaign

@@ -21,7 +21,7 @@ from pixmetry.camera.observations import LENS, TAKEN_UP, CameraGeometry
 from pixmetry.camera.signal import Kind
 from pixmetry.camera.source import Source
 from pixmetry.core.errors import InputError
-from pixmetry.core.estimates import Estimates
+from pixmetry.core.number import Estimates
 from pixmetry.locate.target_estimator import TargetEstimator
 
 SCHEMA = "pixmetry/budget/1"

@@ -11,7 +11,7 @@ from pixmetry.camera.camera import Camera
 from pixmetry.camera.contribution import Probe
 from pixmetry.camera.source import Source
 from pixmetry.core.errors import InputError
-from pixmetry.core.estimates import Estimates
+from pixmetry.core.number import Estimates
 
 
 def applies(source: Source, facts: Mapping[str, Any]) -> bool:

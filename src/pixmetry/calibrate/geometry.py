@@ -12,7 +12,7 @@ from pixmetry.calibrate.bundle.model import CameraModel
 from pixmetry.calibrate.bundle.network import Adjustment
 from pixmetry.camera.observations import CameraGeometry
 from pixmetry.core.errors import InputError
-from pixmetry.core.estimates import Estimates
+from pixmetry.core.number import Estimates
 
 CELLS = (10, 8)  # of the frame, in which residuals have something in common or not
 GRID = 25  # places along each side of the frame

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from pixmetry.core.errors import MeasureError
-from pixmetry.core.estimates import Estimates
+from pixmetry.core.number import Estimates
 
 
 @dataclass(frozen=True)

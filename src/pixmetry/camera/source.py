@@ -26,7 +26,7 @@ from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal, Windows
 from pixmetry.core.config import Model
 from pixmetry.core.errors import InputError
-from pixmetry.core.estimates import Estimates
+from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
 
 VERBS = ("forward", "measure", "correct", "propagate")

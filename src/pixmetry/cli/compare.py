@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 
     from rich.console import Console
 
+    from pixmetry.core.number import Number
     from pixmetry.emva.judge.compare import Comparison, Fleet
     from pixmetry.emva.judge.conformity import Checked
-    from pixmetry.emva.records import Value
 
 EXIT_DIFFERENT = 1
 SCHEMA = "pixmetry/compared/1"
@@ -207,13 +207,13 @@ def _named(key: str, channel: str) -> str:
     return key if channel == MONO else f"{key} [{channel}]"
 
 
-def _shown(value: Value | None) -> str:
+def _shown(value: Number | None) -> str:
     """A value with its uncertainty, as far as the uncertainty lets its digits go."""
     from pixmetry.report.numbers import decimals_of, fixed, significant
 
     if value is None or isnan(value.value):
         return "–"
-    if value.is_limit:
+    if value.is_upper_limit:
         return f"< {significant(value.value, 2)}"
     if value.is_lower_limit:
         return f"> {significant(value.value, 3)}"

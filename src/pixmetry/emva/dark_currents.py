@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 
 from pixmetry.core.errors import InputError, MeasureError
-from pixmetry.core.estimates import Estimates
+from pixmetry.core.number import Estimates, Number
 from pixmetry.emva.dark_temperature import check_temperatures, fit_dark_temperature, law_at
 from pixmetry.emva.files.keys import OVER_TEMPERATURES
 from pixmetry.emva.files.write import check_names, named
 from pixmetry.emva.job import Options, Progress, tested, write_sheet
-from pixmetry.emva.records import DataSheet, Value
+from pixmetry.emva.records import DataSheet
 from pixmetry.files import Campaign, load_campaign
 
 
@@ -96,7 +96,7 @@ def _temperature_c(campaign: Campaign) -> float:
     return found
 
 
-def _current(sheet: DataSheet, campaign: Campaign) -> Value:
+def _current(sheet: DataSheet, campaign: Campaign) -> Number:
     found = sheet.results[0].values["u_I_mean"]
     if not (math.isfinite(found.value) and found.u > 0):
         remedy = "take dark levels at three exposure times or more, or leave this campaign out"
@@ -104,13 +104,13 @@ def _current(sheet: DataSheet, campaign: Campaign) -> Value:
     return found
 
 
-def _with_law(sheet: DataSheet, temperature_c: np.ndarray, currents: Sequence[Value]) -> tuple[DataSheet, Estimates]:
+def _with_law(sheet: DataSheet, temperature_c: np.ndarray, currents: Sequence[Number]) -> tuple[DataSheet, Estimates]:
     """Fit the dark currents against temperature, and add values, curve and a note to the sheet of the first temperature."""
     current, u = np.array([v.value for v in currents]), np.array([v.u for v in currents])
     reference_c = float(temperature_c[0])
     law = fit_dark_temperature(temperature_c, current, u, reference_c=reference_c)
     found = dict(zip(OVER_TEMPERATURES, (law["dark_current_ref"], law["doubling_temperature_k"]), strict=True))
-    values = {key: Value(e.value, e.u, e.dof, e.unit, e.method, e.reason) for key, e in found.items()}
+    values = {key: replace(e, name="") for key, e in found.items()}
     curve = {
         "temperature_c": temperature_c,
         "current_e_per_s": current,

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from pixmetry.core.errors import InputError, MeasureError
-from pixmetry.core.estimates import Estimates
+from pixmetry.core.number import Estimates
 
 MINIMUM_TEMPERATURES = 3
 MINIMUM_RANGE_K = 10.0

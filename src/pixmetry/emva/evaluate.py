@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from pixmetry.core.errors import InputError, MeasureError
+from pixmetry.core.number import UPPER_LIMIT, VALUE, Number
 from pixmetry.core.random import Generator, generator
 from pixmetry.core.threads import map_tiles, single_threaded_blas
 from pixmetry.emva.dark_noise import DarkNoise, pattern_limit_dn2
@@ -21,7 +22,7 @@ from pixmetry.emva.linear_model import departure_bounds, linear_model
 from pixmetry.emva.lower_limits import with_lower_limits
 from pixmetry.emva.partial import partial_results
 from pixmetry.emva.reasons import DARK_PATTERN, Case, breaks_the_split, is_blind, is_bound, lifted, notes_of, reason_for
-from pixmetry.emva.records import RELEASES, Measurement, Results, Value
+from pixmetry.emva.records import RELEASES, Measurement, Results
 from pixmetry.emva.scatter import GROUPS, Scatter, scatter_of
 from pixmetry.emva.series import light_of
 from pixmetry.emva.spatial.spatial_curves import spatial_curves
@@ -239,12 +240,12 @@ def _deviations(centre: tuple[Values, Values], drawn: tuple[Values, Values]) -> 
     return u, {key: rms(values, float(centre[1][key])) for key, values in drawn[1].items()}
 
 
-def _value(key: str, case: Case) -> Value:
+def _value(key: str, case: Case) -> Number:
     """One value with its uncertainty, or the limit or reason that stands for it."""
     formulas, measured, squares, spread, noise = case.formulas, case.measured, case.squares, case.spread, case.noise
     unit, method, reason = KEYS[key].unit, _method(key, formulas.release), reason_for(key, case)
     if key not in measured or key not in spread.u or is_blind(key, case) or breaks_the_split(key, case):
-        return Value(math.nan, math.nan, math.nan, unit, method, reason)
+        return Number.not_available(unit, reason, method)
     value, u, dof = float(measured[key]), spread.u[key], spread.dof.get(key, math.inf)
     known = light_of(formulas.series)
     if key == "R" and known is not None and known[1] == "s":
@@ -253,13 +254,13 @@ def _value(key: str, case: Case) -> Value:
     has_unit = not formulas.curved or key.endswith("_DN")  # what a code is worth is not known of a curved camera
     if key in DARK_PATTERN and noise.hidden and formulas.release != "reference" and has_unit and math.isfinite(square):
         limit, u = _pattern_limit(key, square, case)
-        return Value(limit, u, dof, unit, method, reason, is_limit=True)
+        return Number(limit, u, dof, unit, method, reason, kind=UPPER_LIMIT)
     if square < 0:
         u_square = spread.u_square[key]
         limit = math.sqrt(max(square + lifted(key, formulas, measured), 0.0) + ONE_SIDED_95 * u_square)
-        return Value(limit, u_square / (2 * limit) if limit > 0 else 0.0, dof, unit, method, reason, is_limit=True)
+        return Number(limit, u_square / (2 * limit) if limit > 0 else 0.0, dof, unit, method, reason, kind=UPPER_LIMIT)
     if key in MAY_NOT_BE_NEGATIVE and value < 0:
-        return Value(ONE_SIDED_95 * u, u, dof, unit, method, reason, is_limit=True)
+        return Number(ONE_SIDED_95 * u, u, dof, unit, method, reason, kind=UPPER_LIMIT)
     if noise.below and formulas.release != "reference" and (is_bound(key) or key.startswith("DR")):
         if formulas.curved:
             at_limit = level_free_values(formulas.series, noise.limit_dn2)
@@ -270,11 +271,11 @@ def _value(key: str, case: Case) -> Value:
             value = max(value, DARK_NOISE_LIMIT_DN / float(measured["K"]))
         elif noise.hidden and is_bound(key):
             value += ONE_SIDED_95 * u
-        return Value(value, u, dof, unit, method, reason, is_limit=is_bound(key))
+        return Number(value, u, dof, unit, method, reason, kind=UPPER_LIMIT if is_bound(key) else VALUE)
     known_value = math.isfinite(value)
     if 0 <= square < ONE_SIDED_95 * spread.u_square.get(key, 0.0):  # not significant: zero may be the truth, and lies in the interval
         u = max(u, value / TWO_SIDED_95)
-    return Value(value, u if known_value else math.nan, dof if known_value else math.nan, unit, method, reason)
+    return Number(value, u if known_value else math.nan, dof if known_value else math.nan, unit, method, reason)
 
 
 def _pattern_limit(key: str, square: float, case: Case) -> tuple[float, float]:

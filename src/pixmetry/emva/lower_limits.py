@@ -8,12 +8,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from pixmetry.core.number import LOWER_LIMIT, UPPER_LIMIT, Number
 from pixmetry.emva.files.rules import ONE_SIDED_95
 from pixmetry.emva.general.general import general_curve, general_evaluation
 from pixmetry.emva.general.general_model import light_axis
 from pixmetry.emva.general.response_end import end_of
 from pixmetry.emva.reasons import Case, ends_early
-from pixmetry.emva.records import Value
 
 ENDS_EARLY = "the series ends before saturation"
 FROM_ITS_END = (
@@ -35,7 +35,7 @@ FAR = 0.5  # of the darkest level: a threshold below that is extrapolated
 SCALES: dict[str, Callable[[float], float]] = {"": float, "_dB": lambda r: 20 * math.log10(r), "_bit": math.log2}
 
 
-def with_lower_limits(values: dict[str, Value], case: Case) -> dict[str, Value]:
+def with_lower_limits(values: dict[str, Number], case: Case) -> dict[str, Number]:
     """The values with limits in place of those that a longer series, or a camera of higher gain, would show to be larger.
 
     One-sided 95 % limits, from the value and its u: the camera holds at least what the last level of the series held. A dynamic range is
@@ -59,37 +59,37 @@ def with_lower_limits(values: dict[str, Value], case: Case) -> dict[str, Value]:
     ):
         if reference:
             out |= {key: _told(out[key], "a lower bound") for key in _family(ratio, out) if ends}
-        elif threshold in out and (ends or out[threshold].is_limit):
+        elif threshold in out and (ends or out[threshold].is_upper_limit):
             out |= _ratio(out, ratio, capacity, threshold)
     return out
 
 
-def _limit(value: Value, key: str) -> Value:
+def _limit(value: Number, key: str) -> Number:
     """The value as a one-sided limit."""
     if not math.isfinite(value.value):
         return value
     if key in FALLING:
-        limit = replace(value, value=value.value + ONE_SIDED_95 * value.u, is_limit=True)
+        limit = replace(value, value=value.value + ONE_SIDED_95 * value.u, kind=UPPER_LIMIT)
         return _told(limit, "95 % upper limit, from its last level")
-    limit = replace(value, value=value.value - ONE_SIDED_95 * value.u, is_lower_limit=True)
+    limit = replace(value, value=value.value - ONE_SIDED_95 * value.u, kind=LOWER_LIMIT)
     return _told(limit, "95 % lower limit, from its last level")
 
 
-def _told(value: Value, what: str) -> Value:
+def _told(value: Number, what: str) -> Number:
     if not math.isfinite(value.value):
         return value
     other = value.reason if value.reason != "the last level of the series" else ""
     return replace(value, reason="; ".join(filter(None, (f"{ENDS_EARLY}: {what}", other))))
 
 
-def _family(ratio: str, values: dict[str, Value]) -> list[str]:
+def _family(ratio: str, values: dict[str, Number]) -> list[str]:
     return [ratio + scale for scale in SCALES if ratio + scale in values]
 
 
-def _ratio(values: dict[str, Value], ratio: str, capacity: str, threshold: str) -> dict[str, Value]:
+def _ratio(values: dict[str, Number], ratio: str, capacity: str, threshold: str) -> dict[str, Number]:
     """Lower limit of a dynamic range, on every scale."""
     top, least, found = values[capacity], values[threshold], values[ratio]
-    if least.is_limit:
+    if least.is_upper_limit:
         lower = top.value - (0.0 if top.is_lower_limit else ONE_SIDED_95 * top.u)
         lower /= least.value
     else:
@@ -102,7 +102,7 @@ def _ratio(values: dict[str, Value], ratio: str, capacity: str, threshold: str) 
         told = _told(held, "95 % lower limit, from its last level") if top.is_lower_limit else held
         if not told.reason:
             told = replace(told, reason=f"its threshold is an upper limit: 95 % lower limit ({least.reason})")
-        out[key] = replace(told, value=SCALES[key.removeprefix(ratio)](lower), is_lower_limit=True)
+        out[key] = replace(told, value=SCALES[key.removeprefix(ratio)](lower), kind=LOWER_LIMIT)
     return out
 
 
@@ -112,7 +112,7 @@ def _general_ends_early(case: Case) -> bool:
     return "general_u_p_sat" in case.measured and not end_of(series, light_axis(series))[1].found
 
 
-def _last_light(values: dict[str, Value], case: Case) -> dict[str, Value]:
+def _last_light(values: dict[str, Number], case: Case) -> dict[str, Number]:
     """The light of the last level, which the camera still follows, as the lower limit of General's capacity."""
     value, m = values["general_u_p_sat"], case.m
     if not math.isfinite(value.value):
@@ -121,7 +121,7 @@ def _last_light(values: dict[str, Value], case: Case) -> dict[str, Value]:
     return {"general_u_p_sat": replace(value, value=light * (1 - ONE_SIDED_95 * m.photons_u_rel), u=light * m.photons_u_rel, dof=math.inf)}
 
 
-def _extrapolated_threshold(values: dict[str, Value], case: Case) -> dict[str, Value]:
+def _extrapolated_threshold(values: dict[str, Number], case: Case) -> dict[str, Number]:
     """Upper limit of the threshold of a curved camera whose darkest level lies far above it: the noise at the input of that level.
 
     How the response goes on below is not known; that its noise at the input is not larger there is.
@@ -137,13 +137,13 @@ def _extrapolated_threshold(values: dict[str, Value], case: Case) -> dict[str, V
     limit = lowest / ratio * (1 + ONE_SIDED_95 * value.u / value.value)
     return {
         "general_u_p_min": replace(
-            value, value=max(limit, value.value), reason=f"{what}; 95 % upper limit: the noise at the input of that level", is_limit=True
+            value, value=max(limit, value.value), reason=f"{what}; 95 % upper limit: the noise at the input of that level", kind=UPPER_LIMIT
         ),
         "general_DSNU": replace(pattern, reason="; ".join(filter(None, (f"{what}, and u does not hold it", pattern.reason)))),
     }
 
 
-def _hidden_threshold(values: dict[str, Value], case: Case) -> dict[str, Value]:
+def _hidden_threshold(values: dict[str, Number], case: Case) -> dict[str, Number]:
     """Upper limit of General's threshold where quantisation hides the dark noise: that of the largest dark noise that may be hidden."""
     value, series = values.get("general_u_p_min"), case.formulas.series
     if value is None or not math.isfinite(value.value) or not case.noise.hidden or case.noise.blind:
@@ -153,4 +153,4 @@ def _hidden_threshold(values: dict[str, Value], case: Case) -> dict[str, Value]:
     if not math.isfinite(limit):
         return {}
     reason = f"the dark variance lies below {case.noise.limit_dn2:.2g} DN², where quantisation covers it: 95 % upper limit (eq. 54)"
-    return {"general_u_p_min": replace(value, value=limit, reason=reason, is_limit=True)}
+    return {"general_u_p_min": replace(value, value=limit, reason=reason, kind=UPPER_LIMIT)}

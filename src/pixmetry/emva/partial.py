@@ -7,12 +7,13 @@ import math
 import numpy as np
 
 from pixmetry.core.errors import MeasureError, PixmetryError
+from pixmetry.core.number import UPPER_LIMIT, VALUE, Number
 from pixmetry.core.random import generator
 from pixmetry.emva.files.keys import KEYS
 from pixmetry.emva.files.rules import MINIMUM_DARK_VAR_DN2, ONE_SIDED_95
 from pixmetry.emva.formulas import keys_of
 from pixmetry.emva.reasons import BROKEN
-from pixmetry.emva.records import Measurement, Results, Value
+from pixmetry.emva.records import Measurement, Results
 from pixmetry.emva.scatter import sampling_u
 from pixmetry.emva.series import MINIMUM_EXPOSURES, count_exposures, dark_order, first_of_equal
 from pixmetry.emva.spatial.spatial import PARTS, spatial_variances
@@ -37,17 +38,17 @@ def partial_results(m: Measurement, release: str, problem: MeasureError) -> Resu
     values = {}
     for key in keys_of(release):
         method = f"EMVA 1288 R{release} {KEYS[key].clause}".strip() if release != "reference" else "reference implementation 1.0.2"
-        nothing = Value(math.nan, math.nan, math.nan, KEYS[key].unit, method, f"needs an exposure series: {why}")
+        nothing = Number.not_available(KEYS[key].unit, f"needs an exposure series: {why}", method)
         values[key] = found.get(key, nothing)
     note = f"no exposure series: {why}; only values that need none are given"
     return Results(release, values, notes=(*m.notes, note), channel=m.channel)
 
 
-def _value(key: str, value: float, u: float, dof: float = math.inf, reason: str = "", is_limit: bool = False) -> Value:
-    return Value(value, u, dof, KEYS[key].unit, f"EMVA 1288 {KEYS[key].clause}".strip(), reason, is_limit)
+def _value(key: str, value: float, u: float, dof: float = math.inf, reason: str = "", kind: str = VALUE) -> Number:
+    return Number(value, u, dof, KEYS[key].unit, f"EMVA 1288 {KEYS[key].clause}".strip(), reason, kind)
 
 
-def _dark_levels(m: Measurement, release: str) -> dict[str, Value]:
+def _dark_levels(m: Measurement, release: str) -> dict[str, Number]:
     """Dark noise in codes, and with three exposures or more the dark current in codes."""
     if m.transfer.dark.mean_dn.size == 0:
         return {}
@@ -59,7 +60,8 @@ def _dark_levels(m: Measurement, release: str) -> dict[str, Value]:
     hidden = middle < MINIMUM_DARK_VAR_DN2
     reason = "the dark variance lies below 0.24 DN², where quantisation covers it: an upper limit (eq. 54)" if hidden else ""
     root = math.sqrt(max(middle, MINIMUM_DARK_VAR_DN2))
-    out = {"sigma_y_dark": _value("sigma_y_dark", root, u / (2 * root), math.inf, reason, hidden and release != "reference")}
+    kind = UPPER_LIMIT if hidden and release != "reference" else VALUE
+    out = {"sigma_y_dark": _value("sigma_y_dark", root, u / (2 * root), math.inf, reason, kind)}
     if count_exposures(exposure) >= MINIMUM_EXPOSURES:
         line, covariance = np.polyfit(exposure, mean, 1, cov="unscaled")
         dof = exposure.size - 2
@@ -69,7 +71,7 @@ def _dark_levels(m: Measurement, release: str) -> dict[str, Value]:
     return out
 
 
-def _stacks(m: Measurement, release: str) -> dict[str, Value]:
+def _stacks(m: Measurement, release: str) -> dict[str, Number]:
     """Variances of each stack, the dark pattern in codes, and of both stacks the non-uniformity of the response."""
     rng = generator(SEED, "partial")
     inputs: dict[str, SpatialInputs] = {}
@@ -100,7 +102,7 @@ def _stacks(m: Measurement, release: str) -> dict[str, Value]:
     return out
 
 
-def _root(key: str, square: float, u_square: float, chance: float = 0.0) -> Value:
+def _root(key: str, square: float, u_square: float, chance: float = 0.0) -> Number:
     """A root of a square with its u, a limit, or nothing where the square is far below zero; ``chance``: scatter from sensor to sensor."""
     if square < -BROKEN * math.hypot(u_square, chance):
         reason = f"the variance behind it is far below zero ({square:.3g} in {KEYS[key].unit} squared): no value and no limit"
@@ -108,5 +110,5 @@ def _root(key: str, square: float, u_square: float, chance: float = 0.0) -> Valu
     if square < ONE_SIDED_95 * u_square:
         limit = math.sqrt(max(square, 0.0) + ONE_SIDED_95 * u_square)
         u, reason = u_square / (2 * limit) if limit > 0 else 0.0, "not significantly above zero; 95 % upper limit"
-        return _value(key, limit, u, reason=reason, is_limit=True)
+        return _value(key, limit, u, reason=reason, kind=UPPER_LIMIT)
     return _value(key, math.sqrt(square), u_square / (2 * math.sqrt(square)))

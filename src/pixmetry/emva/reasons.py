@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pixmetry.core.number import Number
 from pixmetry.emva.dark_noise import DarkNoise
 from pixmetry.emva.files.keys import KEYS, key_of
 from pixmetry.emva.files.rules import EQUAL_EXPOSURE, ONE_SIDED_95, PTC_LIMIT_PERCENT, SATURATED_FRACTION
@@ -14,7 +15,7 @@ from pixmetry.emva.formulas import Formulas, Spread, Values
 from pixmetry.emva.general.curved import REASON as CURVED
 from pixmetry.emva.general.general import general_curve, general_notes
 from pixmetry.emva.linear_model import FAILS
-from pixmetry.emva.records import Measurement, Series, Value
+from pixmetry.emva.records import Measurement, Series
 from pixmetry.emva.series import MINIMUM_EXPOSURES, count_exposures, exposure_varies, light_of, without_dark
 from pixmetry.emva.temporal import dark_line
 from pixmetry.observe.stack import same_exposure
@@ -267,7 +268,7 @@ def ends_early(formulas: Formulas, measured: Values) -> bool:
     return at == formulas.series.mean_dn.size - 1 and bool(formulas.series.fraction_max[at] < SATURATED_FRACTION / 2)
 
 
-def notes_of(case: Case, values: dict[str, Value], linear: str) -> tuple[str, ...]:
+def notes_of(case: Case, values: dict[str, Number], linear: str) -> tuple[str, ...]:
     """What the reader should know about the measurement as a whole; ``linear`` is what ``linear_model`` says of it."""
     m, formulas, measured = case.m, case.formulas, case.measured
     series, notes = formulas.series, []

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from pixmetry.camera.observations import PhotonTransfer, StackMoments
+from pixmetry.core.number import Number
 
 RELEASES = ("4.0", "3.1", "reference")
 MONO = "mono"
@@ -69,29 +70,11 @@ class Series:
 
 
 @dataclass(frozen=True)
-class Value:
-    """One value of a data sheet.
-
-    ``value`` is NaN only where nothing can be said, and then ``reason`` says why. With ``is_limit`` it is a one-sided 95 % upper limit,
-    with ``is_lower_limit`` a lower one.
-    """
-
-    value: float
-    u: float
-    dof: float
-    unit: str
-    method: str = ""
-    reason: str = ""
-    is_limit: bool = False
-    is_lower_limit: bool = False
-
-
-@dataclass(frozen=True)
 class Results:
     """Values and curves of one channel by one release; keys as in ``pixmetry.emva.files.keys``."""
 
     release: str
-    values: Mapping[str, Value]
+    values: Mapping[str, Number]
     curves: Mapping[str, Mapping[str, np.ndarray]] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     channel: str = MONO

@@ -9,7 +9,7 @@ import numpy as np
 
 from pixmetry.camera.observations import CodeErrors, CodeHistogram
 from pixmetry.core.errors import MeasureError
-from pixmetry.core.estimates import Estimates
+from pixmetry.core.number import Estimates
 from pixmetry.observe._kernels import count_codes
 from pixmetry.observe.moments import LevelSummary, check_frame
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pixmetry.camera.observations import StackMoments
-from pixmetry.core.estimates import Estimates
+from pixmetry.core.number import Estimates
 from pixmetry.observe.photon_transfer_model import signal_from_mean, transfer
 
 COEFFICIENTS = ("nonlinearity_a1", "nonlinearity_a2", "nonlinearity_a3")

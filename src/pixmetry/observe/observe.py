@@ -18,7 +18,7 @@ from pixmetry.camera.observations import (
     StackMoments,
 )
 from pixmetry.core.errors import MeasureError
-from pixmetry.core.estimates import Estimates
+from pixmetry.core.number import Estimates
 from pixmetry.core.threads import single_threaded_blas
 from pixmetry.observe.defects import find_defects
 from pixmetry.observe.histogram import HistogramAccumulator, code_errors, sweep_histogram

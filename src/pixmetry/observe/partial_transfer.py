@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from pixmetry.camera.observations import LevelMoments, PhotonTransfer, StackMoments
-from pixmetry.core.estimates import Estimates
+from pixmetry.core.number import Estimates
 from pixmetry.observe import photon_transfer_model as model
 from pixmetry.observe.hot_pixels import without_hot_pixels
 from pixmetry.observe.photon_transfer_levels import (

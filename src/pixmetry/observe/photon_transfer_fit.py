@@ -14,7 +14,7 @@ import numpy as np
 
 from pixmetry.camera.observations import PhotonTransfer, StackMoments
 from pixmetry.core.errors import MeasureError
-from pixmetry.core.estimates import Estimates
+from pixmetry.core.number import Estimates
 from pixmetry.observe import photon_transfer_model as model
 from pixmetry.observe.hot_pixels import HotDoubt, without_hot_pixels
 from pixmetry.observe.photon_transfer_levels import (

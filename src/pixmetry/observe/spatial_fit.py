@@ -10,7 +10,7 @@ import numpy as np
 
 from pixmetry.camera.observations import DefectList, PatternList, StackMoments
 from pixmetry.core.errors import InputError, MeasureError
-from pixmetry.core.estimates import Estimates
+from pixmetry.core.number import Estimates
 from pixmetry.observe.linearity import Linearity
 from pixmetry.observe.photon_transfer_levels import core_spread_dn2
 from pixmetry.observe.photon_transfer_model import rounding_error_vars, slope_error_var, white_before_rounding

@@ -13,7 +13,7 @@ LIMIT_DIGITS = 2  # significant digits of an upper limit, as of an uncertainty
 
 
 @dataclass(frozen=True)
-class Number:
+class PrintedNumber:
     """A value, its standard uncertainty and its unit as text; a power of ten common to both is in ``unit``."""
 
     value: str
@@ -45,23 +45,24 @@ def significant(value: float, digits: int = 3) -> str:
     return fixed(value, decimals_of(value, digits))
 
 
-def uncertain(value: float, u: float, unit: str) -> Number:
+def uncertain(value: float, u: float, unit: str) -> PrintedNumber:
     """Value and standard uncertainty, the uncertainty to two significant digits and the value to the same place (JCGM 100, 7.2.6)."""
     if not (isfinite(u) and u > 0):
-        return Number(significant(value, 4), NONE, pretty_unit(unit))
+        return PrintedNumber(significant(value, 4), NONE, pretty_unit(unit))
     largest = max(abs(value), u)
     power = floor(log10(largest))
     power = 0 if -4 < power < 6 else power
     scaled_value, scaled_u = value / 10.0**power, u / 10.0**power
     places = decimals_of(scaled_u)
-    return Number(fixed(scaled_value, places), fixed(scaled_u, places), _with_power(unit, power))
+    return PrintedNumber(fixed(scaled_value, places), fixed(scaled_u, places), _with_power(unit, power))
 
 
-def limit(value: float, unit: str, *, at_least: bool = False) -> Number:
+def limit(value: float, unit: str, *, at_least: bool = False) -> PrintedNumber:
     """A one-sided upper limit, or a lower one."""
     power = floor(log10(value)) if value > 0 else 0
     power = 0 if -4 < power < 6 else power
-    return Number(f"{'>' if at_least else '<'}{NO_BREAK}{significant(value / 10.0**power, LIMIT_DIGITS)}", NONE, _with_power(unit, power))
+    text = f"{'>' if at_least else '<'}{NO_BREAK}{significant(value / 10.0**power, LIMIT_DIGITS)}"
+    return PrintedNumber(text, NONE, _with_power(unit, power))
 
 
 def _with_power(unit: str, power: int) -> str:

@@ -10,7 +10,7 @@ import pytest
 from pixmetry.camera.observations import LevelMoments, Observations, PhotonTransfer
 from pixmetry.camera.signal import Kind
 from pixmetry.core.errors import InputError, MeasureError
-from pixmetry.core.estimates import Estimates
+from pixmetry.core.number import Estimates
 from pixmetry.observe.observe import Group, observe
 from pixmetry.sources.electronics.gamma import SOURCE, Gamma
 from pixmetry.sources.electronics.nonlinearity import SOURCE as NONLINEARITY

@@ -8,7 +8,7 @@ import pytest
 from pixmetry.camera.observations import CodeErrors, Observations
 from pixmetry.camera.signal import Kind, Windows
 from pixmetry.core.errors import InputError, MeasureError
-from pixmetry.core.estimates import Estimates
+from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
 from pixmetry.sources.grabber.adc import SOURCE, Adc, correct, forward, measure, thresholds
 from source_signals import Z, signal, stream

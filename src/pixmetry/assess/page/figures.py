@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pixmetry.camera.observations import CodeHistogram, Observations, PhotonTransfer, Spectra
-from pixmetry.core.estimates import Estimates
+from pixmetry.core.number import Estimates
 from pixmetry.emva.records import Results
 from pixmetry.emva.temporal import linearity_line
 from pixmetry.observe.photon_transfer_levels import USABLE_FRACTION, light_scale

@@ -8,16 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from pixmetry.camera.observations import Observations
-from pixmetry.core.estimates import Estimate, Estimates
+from pixmetry.core.number import Estimates, Number
 from pixmetry.emva.page.content import say
 from pixmetry.emva.records import Results
-from pixmetry.report.numbers import NONE, Number, limit, significant, uncertain
+from pixmetry.report.numbers import NONE, PrintedNumber, limit, significant, uncertain
 
 PERCENT, PER_1000_PX = (100.0, "%"), (1e5, "%/1000 px")
 
 
 @dataclass(frozen=True)
-class Quantity:
+class Caption:
     """How one estimate is shown: its name in words, the key of the standard's value beside it, factor and unit of the display."""
 
     title: str
@@ -31,41 +31,41 @@ class Row:
 
     title: str
     name: str
-    number: Number
+    number: PrintedNumber
     dof: str
     standard: str
     reason: str
 
 
 TRANSFER = {
-    "gain_dn_per_e": Quantity("System gain K", "K"),
-    "quantum_efficiency": Quantity("Quantum efficiency", "QE", PERCENT),
-    "responsivity_dn_per_s": Quantity("Signal rate of this series, at zero signal"),
-    "offset_dn": Quantity("Black level"),
-    "dark_noise_e": Quantity("Dark noise, white", "sigma_d"),
-    "row_noise_e": Quantity("Row noise, temporal"),
-    "column_noise_e": Quantity("Column noise, temporal"),
-    "dark_current_e_per_s": Quantity("Dark current"),
-    "saturation_dn": Quantity("Saturation, stored value"),
-    "full_well_e": Quantity("Saturation, electrons", "u_e_sat"),
-    "nonlinearity_a1": Quantity("Non-linearity a₁, at the top code", "", PERCENT),
-    "nonlinearity_a2": Quantity("Non-linearity a₂, at the top code", "", PERCENT),
-    "nonlinearity_a3": Quantity("Non-linearity a₃, at the top code", "", PERCENT),
-    "illumination_noise_rel": Quantity("Noise of the light, level to level", "", PERCENT),
+    "gain_dn_per_e": Caption("System gain K", "K"),
+    "quantum_efficiency": Caption("Quantum efficiency", "QE", PERCENT),
+    "responsivity_dn_per_s": Caption("Signal rate of this series, at zero signal"),
+    "offset_dn": Caption("Black level"),
+    "dark_noise_e": Caption("Dark noise, white", "sigma_d"),
+    "row_noise_e": Caption("Row noise, temporal"),
+    "column_noise_e": Caption("Column noise, temporal"),
+    "dark_current_e_per_s": Caption("Dark current"),
+    "saturation_dn": Caption("Saturation, stored value"),
+    "full_well_e": Caption("Saturation, electrons", "u_e_sat"),
+    "nonlinearity_a1": Caption("Non-linearity a₁, at the top code", "", PERCENT),
+    "nonlinearity_a2": Caption("Non-linearity a₂, at the top code", "", PERCENT),
+    "nonlinearity_a3": Caption("Non-linearity a₃, at the top code", "", PERCENT),
+    "illumination_noise_rel": Caption("Noise of the light, level to level", "", PERCENT),
 }
 SPATIAL = {
-    "dsnu_total_dn": Quantity("DSNU, total", "DSNU1288_DN"),
-    "dsnu_pixel_dn": Quantity("DSNU, pixels"),
-    "dsnu_row_dn": Quantity("DSNU, rows"),
-    "dsnu_col_dn": Quantity("DSNU, columns"),
-    "prnu_total_rel": Quantity("PRNU, total", "PRNU1288", PERCENT),
-    "prnu_pixel_rel": Quantity("PRNU, pixels", "", PERCENT),
-    "prnu_row_rel": Quantity("PRNU, rows", "", PERCENT),
-    "prnu_col_rel": Quantity("PRNU, columns", "", PERCENT),
-    "shading_x_per_px": Quantity("Shading, gradient in x", "", PER_1000_PX),
-    "shading_y_per_px": Quantity("Shading, gradient in y", "", PER_1000_PX),
-    "shading_corner_rel": Quantity("Shading, loss to the corners", "", PERCENT),
-    "shading_pp_rel": Quantity("Shading, peak to peak", "", PERCENT),
+    "dsnu_total_dn": Caption("DSNU, total", "DSNU1288_DN"),
+    "dsnu_pixel_dn": Caption("DSNU, pixels"),
+    "dsnu_row_dn": Caption("DSNU, rows"),
+    "dsnu_col_dn": Caption("DSNU, columns"),
+    "prnu_total_rel": Caption("PRNU, total", "PRNU1288", PERCENT),
+    "prnu_pixel_rel": Caption("PRNU, pixels", "", PERCENT),
+    "prnu_row_rel": Caption("PRNU, rows", "", PERCENT),
+    "prnu_col_rel": Caption("PRNU, columns", "", PERCENT),
+    "shading_x_per_px": Caption("Shading, gradient in x", "", PER_1000_PX),
+    "shading_y_per_px": Caption("Shading, gradient in y", "", PER_1000_PX),
+    "shading_corner_rel": Caption("Shading, loss to the corners", "", PERCENT),
+    "shading_pp_rel": Caption("Shading, peak to peak", "", PERCENT),
 }
 STANDARD_ONLY = {
     "SNR_max": "Largest signal-to-noise ratio",
@@ -83,33 +83,35 @@ def table(seen: Observations, standard: Results) -> dict[str, list[Row]]:
         "Fixed pattern": _rows(seen.spatial_fit, SPATIAL, standard),
         "Converter, defects, patterns": [*_codes(seen), *_defects(seen), *_patterns(seen)],
         "By EMVA 1288 alone": [
-            Row(title, key, Number("", NONE, ""), "", said, "") for key, title in STANDARD_ONLY.items() if (said := say(standard, key))
+            Row(title, key, PrintedNumber("", NONE, ""), "", said, "")
+            for key, title in STANDARD_ONLY.items()
+            if (said := say(standard, key))
         ],
     }
     return {heading: rows for heading, rows in groups.items() if rows}
 
 
-def _rows(found: Estimates | None, shown: Mapping[str, Quantity], standard: Results | None = None) -> list[Row]:
+def _rows(found: Estimates | None, shown: Mapping[str, Caption], standard: Results | None = None) -> list[Row]:
     if found is None:
         return []
-    others = {e.name: Quantity(e.name) for e in found if e.name not in shown}
+    others = {e.name: Caption(e.name) for e in found if e.name not in shown}
     return [
-        _row(found[name], quantity, standard) if name in found else _missing(name, quantity, found.reasons[name], standard)
-        for name, quantity in {**shown, **others}.items()
+        _row(found[name], caption, standard) if name in found else _missing(name, caption, found.reasons[name], standard)
+        for name, caption in {**shown, **others}.items()
         if name in found or name in found.reasons
     ]
 
 
-def _missing(name: str, quantity: Quantity, reason: str, standard: Results | None) -> Row:
+def _missing(name: str, caption: Caption, reason: str, standard: Results | None) -> Row:
     """A value that was looked for and cannot be had."""
-    return Row(quantity.title, name, Number(NONE, NONE, ""), "", "" if standard is None else say(standard, quantity.standard), reason)
+    return Row(caption.title, name, PrintedNumber(NONE, NONE, ""), "", "" if standard is None else say(standard, caption.standard), reason)
 
 
-def _row(e: Estimate, quantity: Quantity, standard: Results | None) -> Row:
-    scale, unit = quantity.display or (1.0, e.unit)
+def _row(e: Number, caption: Caption, standard: Results | None) -> Row:
+    scale, unit = caption.display or (1.0, e.unit)
     at_least = e.kind == "lower_limit"
     number = uncertain(e.value * scale, e.u * scale, unit) if e.kind == "value" else limit(e.value * scale, unit, at_least=at_least)
-    return Row(quantity.title, e.name, number, _dof(e.dof), "" if standard is None else say(standard, quantity.standard), e.reason)
+    return Row(caption.title, e.name, number, _dof(e.dof), "" if standard is None else say(standard, caption.standard), e.reason)
 
 
 def _dof(dof: float) -> str:
@@ -120,7 +122,7 @@ def _codes(seen: Observations) -> list[Row]:
     found = seen.code_errors
     if found is None:
         return []
-    rows = _rows(found.fit, {"dnl_rms_lsb": Quantity("Differential non-linearity, rms")})
+    rows = _rows(found.fit, {"dnl_rms_lsb": Caption("Differential non-linearity, rms")})
     worst = f"{len(found.codes)} codes tested"
     if len(found.dnl_lsb):
         k = int(np.argmax(np.abs(found.dnl_lsb)))
@@ -152,4 +154,4 @@ def _patterns(seen: Observations) -> list[Row]:
 
 
 def _count(title: str, name: str, count: int, reason: str) -> Row:
-    return Row(title, name, Number(str(count), NONE, ""), "", "", reason)
+    return Row(title, name, PrintedNumber(str(count), NONE, ""), "", "", reason)

@@ -12,7 +12,7 @@ from pixmetry.report.templates import filled
 if TYPE_CHECKING:
     from pixmetry.assess.results import Assessment
     from pixmetry.camera.observations import Storage
-    from pixmetry.core.estimates import Estimates
+    from pixmetry.core.number import Estimates
     from pixmetry.files.records import Campaign
 
 TRANSFER = ("transfer", "linearity", "snr", "dark-codes")

@@ -9,7 +9,7 @@ import numpy as np
 
 from pixmetry.calibrate.lines.line_residuals import AxisResiduals
 from pixmetry.core.errors import InputError
-from pixmetry.core.estimates import Estimates
+from pixmetry.core.number import Estimates
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from pixmetry.report.numbers import (
     NONE,
     SUPERSCRIPT,
     THIN,
-    Number,
+    PrintedNumber,
     decimals_of,
     fixed,
     length_px,
@@ -190,18 +190,18 @@ def counts(calibration: Calibration) -> tuple[str, str, str]:
     return images, points, observations
 
 
-def shown(record: Mapping[str, Any]) -> Number:
+def shown(record: Mapping[str, Any]) -> PrintedNumber:
     """A parameter as text: with its uncertainty, or where it is held, with the digits that it was given."""
     if record["fixed"]:
         return as_given(record["value"], record["unit"])
     return uncertain(record["value"], float("nan") if record["u"] is None else record["u"], record["unit"])
 
 
-def as_given(value: float, unit: str) -> Number:
+def as_given(value: float, unit: str) -> PrintedNumber:
     """A value that was given, to at most eight significant digits; a power of ten is in the unit."""
     mantissa, _, exponent = f"{value:.{GIVEN_DIGITS}g}".partition("e")
     power = f"10{str(int(exponent)).translate(SUPERSCRIPT)}{NO_BREAK}" if exponent else ""
-    return Number(mantissa.replace("-", MINUS), NONE, (power + pretty_unit(unit)).rstrip(NO_BREAK))
+    return PrintedNumber(mantissa.replace("-", MINUS), NONE, (power + pretty_unit(unit)).rstrip(NO_BREAK))
 
 
 def placed(value: float, u: float) -> str:

@@ -16,7 +16,8 @@ import numpy as np
 
 from pixmetry.core.checksums import check_record, sealed
 from pixmetry.core.errors import InputError
-from pixmetry.emva.records import MONO, DataSheet, Results, Value
+from pixmetry.core.number import LOWER_LIMIT, UPPER_LIMIT, VALUE, Number
+from pixmetry.emva.records import MONO, DataSheet, Results
 
 SCHEMA = "pixmetry/emva1288/1"
 LARGEST_BYTES = 1 << 28  # a sheet with all its curves has less than 1 MB
@@ -137,7 +138,7 @@ def _result_record(result: Results) -> dict[str, Any]:
     }
 
 
-def value_record(value: Value) -> dict[str, Any]:
+def value_record(value: Number) -> dict[str, Any]:
     """Return the plain record of one value."""
     return {
         "value": plain(value.value),
@@ -146,8 +147,8 @@ def value_record(value: Value) -> dict[str, Any]:
         "unit": value.unit,
         "method": value.method,
         "reason": value.reason,
-        "is_limit": bool(value.is_limit),
-        "is_lower_limit": bool(value.is_lower_limit),
+        "is_limit": value.is_upper_limit,
+        "is_lower_limit": value.is_lower_limit,
     }
 
 
@@ -199,7 +200,7 @@ def _result_of(record: Any, release: str, channel: str, where: str) -> Results:
     return Results(release, values, curves, tuple(str(note) for note in _of_type(record, "notes", list, where)), channel)
 
 
-def value_of(record: Any, where: str) -> Value:
+def value_of(record: Any, where: str) -> Number:
     """Return the value of its record.
 
     Raises
@@ -211,11 +212,16 @@ def value_of(record: Any, where: str) -> Value:
         raise InputError("is not a value with its uncertainty", where=where, remedy="make the file again")
     value, u, dof = (number_of(record.get(name), f"{where}.{name}") for name in ("value", "u", "dof"))
     unit, method, reason = (_of_type(record, name, str, where) for name in ("unit", "method", "reason"))
-    limits = (_of_type(record, name, bool, where) for name in ("is_limit", "is_lower_limit"))
-    return checked(Value(value, u, dof, unit, method, reason, *limits), where)
+    upper, lower = (_of_type(record, name, bool, where) for name in ("is_limit", "is_lower_limit"))
+    return checked(Number(value, u, dof, unit, method, reason, kind_of(upper, lower)), where)
 
 
-def checked(value: Value, where: str) -> Value:
+def kind_of(upper: bool, lower: bool) -> str:
+    """The kind of a number by the two marks of a data sheet on disk."""
+    return UPPER_LIMIT if upper else LOWER_LIMIT if lower else VALUE
+
+
+def checked(value: Number, where: str) -> Number:
     """Return the value if its uncertainty can be one.
 
     Raises

@@ -19,10 +19,11 @@ from xml.etree import ElementTree as ET
 import numpy as np
 
 from pixmetry.core.errors import InputError
-from pixmetry.emva.files.formats import SCHEMA, checked, parse_json, plain
+from pixmetry.core.number import Number
+from pixmetry.emva.files.formats import SCHEMA, checked, kind_of, parse_json, plain
 from pixmetry.emva.files.keys import KEYS, NONLINEAR, key_of
 from pixmetry.emva.files.units import plain_unit
-from pixmetry.emva.records import MONO, DataSheet, Results, Value
+from pixmetry.emva.records import MONO, DataSheet, Results
 
 _CURVE_SECTIONS = {"histogram": "defect_pixel", "linearity": "linearity", "dark_signal": "dark_current", "general": "general"}
 _CURVE_SECTIONS |= {"horizontal": "spatial", "vertical": "spatial"}  # else the section is sensitivity
@@ -78,13 +79,13 @@ def _put(parent: ET.Element, name: str, text: str) -> None:
     ET.SubElement(parent, name).text = _NOT_XML.sub("\ufffd", text)
 
 
-def _write_value(section: ET.Element, name: str, value: Value) -> None:
+def _write_value(section: ET.Element, name: str, value: Number) -> None:
     section_name, title, symbol = _about(name)
     entry = _entry(section, name, section_name, title)
     if symbol:
         _put(entry, "symbol", symbol)
     _put(entry, "unit", value.unit)
-    limit = "upper_limit" if value.is_limit else "lower_limit" if value.is_lower_limit else ""
+    limit = value.kind if value.is_limit else ""
     _put(entry, "value", "nan" if limit or math.isnan(value.value) else repr(float(value.value)))
     if limit:
         _put(entry, limit, repr(float(value.value)))
@@ -142,7 +143,7 @@ def sheet_of_xml(raw: bytes, where: str = "") -> DataSheet:
         found, allowed = _short(root.tag), "<results> as root"
         raise InputError("not a result of EMVA 1288", where=where, value=found, allowed=allowed, remedy="check the file")
     sheet = root.find("./info/sheet")
-    channels: dict[str, tuple[dict[str, Value], dict[str, dict[str, np.ndarray]]]] = {}
+    channels: dict[str, tuple[dict[str, Number], dict[str, dict[str, np.ndarray]]]] = {}
     for channel, name, entry in _entries(root):
         if entry is sheet:
             continue
@@ -210,7 +211,7 @@ def _text(element: ET.Element, name: str) -> str:
     return (child.text or "") if child is not None else ""
 
 
-def _value_of(entry: ET.Element, name: str, where: str) -> Value:
+def _value_of(entry: ET.Element, name: str, where: str) -> Number:
     upper, lower, reason = (_text(entry, part) for part in ("upper_limit", "lower_limit", "reason"))
     text = upper or lower or _text(entry, "value")
     value = _number(text, where)
@@ -220,7 +221,7 @@ def _value_of(entry: ET.Element, name: str, where: str) -> Value:
     if math.isnan(value) and not reason:
         reason = f"the file says {text.strip() or 'nothing'}"
     u, dof = (_number(_text(entry, part), f"{where}.{part}") for part in ("u", "dof"))
-    return checked(Value(value, u, dof, given, _text(entry, "method"), reason, bool(upper), bool(lower)), where)
+    return checked(Number(value, u, dof, given, _text(entry, "method"), reason, kind_of(bool(upper), bool(lower))), where)
 
 
 def _number(text: str, where: str) -> float:

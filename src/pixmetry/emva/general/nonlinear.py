@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from pixmetry.core.errors import PixmetryError
-from pixmetry.core.estimates import Estimates
+from pixmetry.core.number import UPPER_LIMIT, VALUE, Estimates, Number
 from pixmetry.core.threads import single_threaded_blas
 from pixmetry.emva.files.keys import NONLINEAR, key_of
-from pixmetry.emva.records import Measurement, Value
+from pixmetry.emva.records import Measurement
 from pixmetry.observe.defects import find_defects
 from pixmetry.observe.linearity import Linearity
 from pixmetry.observe.photon_transfer_fit import fit_photon_transfer
@@ -35,7 +35,7 @@ SPATIAL_METHOD = (
 )
 
 
-def nonlinear_values(m: Measurement, dnl_lsb: float = 0.0) -> tuple[dict[str, Value], tuple[str, ...]]:
+def nonlinear_values(m: Measurement, dnl_lsb: float = 0.0) -> tuple[dict[str, Number], tuple[str, ...]]:
     """Gain, noise, efficiency, dark current, capacity and non-uniformity of a camera whose response may be bent.
 
     Parameters
@@ -80,9 +80,9 @@ class _Propagation:
     source: Estimates
     covariance: np.ndarray
     method: str
-    values: dict[str, Value] = field(default_factory=dict)
+    values: dict[str, Number] = field(default_factory=dict)
 
-    def add(self, key: str, value: float, gradient: dict[str, float], *, is_limit: bool = False, reason: str = "") -> None:
+    def add(self, key: str, value: float, gradient: dict[str, float], *, kind: str = VALUE, reason: str = "") -> None:
         g = np.zeros(len(self.source))
         for name, slope in gradient.items():
             g[self.source.index(name)] = slope
@@ -90,7 +90,7 @@ class _Propagation:
         inverse = float((np.abs(shares) / self._dof()).sum() / max(np.abs(shares).sum(), 1e-300))
         name = key + NONLINEAR
         u, dof = math.sqrt(max(shares.sum(), 0.0)), 1 / inverse if inverse > 0 else math.inf
-        self.values[name] = Value(float(value), u, dof, key_of(name).unit, self.method, reason.replace(" e-", " e⁻"), is_limit)
+        self.values[name] = Number(float(value), u, dof, key_of(name).unit, self.method, reason.replace(" e-", " e⁻"), kind)
 
     def _dof(self) -> np.ndarray:
         """Degrees of freedom of each estimate, more where something known was added to its variance."""
@@ -99,7 +99,7 @@ class _Propagation:
         return self.source.dof * grown**2
 
 
-def _temporal(fit: Estimates, photons_u_rel: float) -> dict[str, Value]:
+def _temporal(fit: Estimates, photons_u_rel: float) -> dict[str, Number]:
     """Everything that the exposure series gives."""
     covariance = fit.covariance.copy()
     photons_known = "quantum_efficiency" in fit
@@ -117,7 +117,7 @@ def _temporal(fit: Estimates, photons_u_rel: float) -> dict[str, Value]:
     for key, name in (("u_I_mean", "dark_current_e_per_s"), ("u_e_sat", "full_well_e")):
         if name in fit:
             e = fit[name]
-            out.add(key, e.value, {name: 1.0}, is_limit=e.kind == "upper_limit", reason=e.reason)
+            out.add(key, e.value, {name: 1.0}, kind=UPPER_LIMIT if e.is_upper_limit else VALUE, reason=e.reason)
     return out.values
 
 
@@ -125,26 +125,26 @@ def _add_noise(out: _Propagation, fit: Estimates) -> None:
     """Temporal dark noise with its row and column parts, and the signal at which it equals the noise."""
     parts = {name: fit[name] for name in NOISE_PARTS}
     white = parts["dark_noise_e"]
-    if white.kind == "upper_limit":
+    if white.is_upper_limit:
         noise, slopes = white.value, {"dark_noise_e": 1.0}
     else:
         noise = math.hypot(*(p.value for p in parts.values() if p.kind == "value"))
         slopes = {name: p.value / noise for name, p in parts.items()}
-    limit, reason = white.kind == "upper_limit", white.reason
-    out.add("sigma_d", noise, slopes, is_limit=limit, reason=reason)
+    reason = white.reason
+    out.add("sigma_d", noise, slopes, kind=white.kind, reason=reason)
     gain = fit["gain_dn_per_e"].value
     root = math.sqrt(noise**2 + QUANTISATION_DN2 / gain**2 + 0.25)
     slopes = {name: slope * noise / root for name, slope in slopes.items()}
     slopes["gain_dn_per_e"] = -QUANTISATION_DN2 / gain**3 / root
     least = root + 0.5
-    out.add("u_e_min", least, slopes, is_limit=limit, reason=reason)
+    out.add("u_e_min", least, slopes, kind=white.kind, reason=reason)
     if "quantum_efficiency" in fit:
         eta = fit["quantum_efficiency"].value
         slopes = {name: slope / eta for name, slope in slopes.items()} | {"quantum_efficiency": -least / eta**2}
-        out.add("u_p_min", least / eta, slopes, is_limit=limit, reason=reason)
+        out.add("u_p_min", least / eta, slopes, kind=white.kind, reason=reason)
 
 
-def _spatial(m: Measurement, fit: Estimates, dnl_lsb: float) -> tuple[dict[str, Value], tuple[str, ...]]:
+def _spatial(m: Measurement, fit: Estimates, dnl_lsb: float) -> tuple[dict[str, Number], tuple[str, ...]]:
     """The non-uniformities from the two stacks, or the reason why there are none."""
     dark, bright = m.dark_stack, m.bright_stack
     missing = "DSNU and PRNU are not measured with the non-linearity taken into account: "
@@ -164,13 +164,13 @@ def _spatial(m: Measurement, fit: Estimates, dnl_lsb: float) -> tuple[dict[str, 
     for key, name in SPATIAL_KEYS.items():
         if name not in found:
             unit = key_of(key + NONLINEAR).unit
-            out.values[key + NONLINEAR] = Value(math.nan, math.nan, math.nan, unit, SPATIAL_METHOD, found.reasons.get(name, ""))
+            out.values[key + NONLINEAR] = Number.not_available(unit, found.reasons.get(name, ""), SPATIAL_METHOD)
             continue
         e = found[name]
         if key.startswith("DSNU"):
             value, gradient = e.value / gain.value, {name: 1 / gain.value, "gain_dn_per_e": -e.value / gain.value**2}
         else:
             value, gradient = 100 * e.value, {name: 100.0}
-        out.add(key, value, gradient, is_limit=e.kind == "upper_limit", reason=e.reason)
+        out.add(key, value, gradient, kind=UPPER_LIMIT if e.is_upper_limit else VALUE, reason=e.reason)
     notes = (f"DSNU1288{NONLINEAR} and PRNU1288{NONLINEAR}, with their parts, leave out {len(defects)} defect pixels",)
     return out.values, notes if len(defects) else ()

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from pixmetry.core.checksums import check_record
 from pixmetry.core.errors import InputError
+from pixmetry.core.number import Number
 from pixmetry.emva.files.formats import (
     SCHEMA,
     is_xml,
@@ -29,7 +30,7 @@ from pixmetry.emva.files.formats import (
 )
 from pixmetry.emva.judge.differences import Difference, Subject, decided, difference_of, family, holm
 from pixmetry.emva.judge.fleet import FleetRow, fleet_chance, fleet_row
-from pixmetry.emva.records import MONO, DataSheet, Value
+from pixmetry.emva.records import MONO, DataSheet
 
 if TYPE_CHECKING:
     from pixmetry.emva.judge.conformity import Checked, Limits
@@ -131,12 +132,12 @@ def _of_sheet(sheet: DataSheet, name: str) -> Subject:
 
 
 def _of_assessment(record: Mapping[str, Any], name: str, where: str) -> Subject:
-    values: dict[str, Value] = {}
+    values: dict[str, Number] = {}
     try:
         transfer = (record.get("photon_transfer") or {}).get("estimates", [])
         groups = {**record["estimates"], "photon_transfer": transfer, "spatial": record.get("spatial") or []}
         for source, estimates in groups.items():
-            values |= {f"{source}.{e['name']}": _estimate(e) for e in estimates}
+            values |= {f"{source}.{e['name']}": Number.from_record(e) for e in estimates}
         results = (record.get("emva1288") or {}).get("results", {})
         standard = {k: v for k, v in results.items() if not k.startswith("index_")}
         values |= {f"emva1288.{key}": value_of(v, f"{where}: emva1288.{key}") for key, v in standard.items()}
@@ -150,12 +151,6 @@ def _of_assessment(record: Mapping[str, Any], name: str, where: str) -> Subject:
         raise InputError("damaged results of an assessment", where=where, remedy="make the assessment again") from None
 
 
-def _estimate(e: Mapping[str, Any]) -> Value:
-    dof = math.inf if e["dof"] is None else float(e["dof"])
-    limits = e["kind"] == "upper_limit", e["kind"] == "lower_limit"
-    return Value(float(e["value"]), float(e["u"]), dof, e["unit"], e["method"], e["reason"], *limits)
-
-
 def _gain_u_rel(estimates: Iterable[Mapping[str, Any]]) -> float:
     """Relative uncertainty of the gain, on which every number of a budget rests."""
     return next((float(e["u"]) / float(e["value"]) for e in estimates if e["name"] == "gain_dn_per_e" and e["value"]), 0.0)
@@ -167,7 +162,7 @@ def _estimator_text(estimator: Mapping[str, Any]) -> str:
     return ", ".join([str(estimator["name"]), *(f"{k} = {v:g}" for k, v in settings.items())])
 
 
-def _of_budget(budget: Mapping[str, Any], gain_u_rel: float) -> dict[str, Value]:
+def _of_budget(budget: Mapping[str, Any], gain_u_rel: float) -> dict[str, Number]:
     """Target, rows and totals of a budget, with u of what repeating the measurement would change.
 
     Of a measured row that is what its parameters leave open, of all others half of what its formula declares to leave open; with both the
@@ -175,7 +170,7 @@ def _of_budget(budget: Mapping[str, Any], gain_u_rel: float) -> dict[str, Value]
     Monte Carlo.
     """
     units = {True: "px", False: "1"}
-    values = {f"budget.target.{k}": Value(float(v), 0.0, math.inf, units[k.endswith("_px")]) for k, v in _numbers(budget["target"])}
+    values = {f"budget.target.{k}": Number(float(v), 0.0, math.inf, units[k.endswith("_px")]) for k, v in _numbers(budget["target"])}
     squares = {True: 0.0, False: 0.0}
     for row in budget.get("rows", ()):
         contribution, total = row["contribution"], float(row["total_px"])
@@ -183,7 +178,7 @@ def _of_budget(budget: Mapping[str, Any], gain_u_rel: float) -> dict[str, Value]
             continue
         formula = 0.5 * max(float(contribution["model_error"]) * total, float(contribution["floor_px"]))
         known = float(row["u_of_total_px"]) if row["status"] == "measured" else formula
-        values[f"budget.{row['name']}"] = Value(total, math.hypot(known, gain_u_rel * total), math.inf, "px", row["status"], "")
+        values[f"budget.{row['name']}"] = Number(total, math.hypot(known, gain_u_rel * total), math.inf, "px", row["status"], "")
         squares[row["status"] == "accepted"] += (total * known) ** 2
     by = budget.get("headline") or {}
     chance = float(by.get("se_simulated_px") or 0.0) if by.get("by") == "Monte Carlo" else 0.0
@@ -192,7 +187,7 @@ def _of_budget(budget: Mapping[str, Any], gain_u_rel: float) -> dict[str, Value]
             total = float(one["total_px"])
             u = math.hypot(math.sqrt(square) / total if total else 0.0, gain_u_rel * total, chance)
             key = f"budget.{'verdict' if group == 'verdicts' else group}.{one.get('frames', 1)}_frames"
-            values[key] = Value(total, u, math.inf, "px", str(by.get("by", "sum")), "")
+            values[key] = Number(total, u, math.inf, "px", str(by.get("by", "sum")), "")
     return values
 
 

@@ -17,10 +17,10 @@ from pydantic import Field, PrivateAttr, field_validator, model_validator
 
 from pixmetry.core.config import Model, load_yaml, validate
 from pixmetry.core.errors import InputError, ParameterError
+from pixmetry.core.number import Number
 from pixmetry.emva.files.keys import KEYS, NONLINEAR
 from pixmetry.emva.files.units import plain_unit
 from pixmetry.emva.judge.differences import upper_tail
-from pixmetry.emva.records import Value
 
 Rule = Literal["guarded_acceptance", "simple_acceptance", "guarded_rejection"]
 
@@ -82,7 +82,7 @@ class Checked:
 
     key: str
     channel: str
-    value: Value
+    value: Number
     lower: float
     upper: float
     judgement: Judgement
@@ -196,7 +196,7 @@ def _guard_band(u: float, dof: float, lower: float, upper: float, confidence: fl
     return float(brentq(lambda y: _within(y, u, dof, lower, upper) - confidence, lower, middle, xtol=1e-12 * u)) - lower
 
 
-def judge_value(value: Value, limit: Limit, rule: str, confidence: float) -> Judgement:
+def judge_value(value: Number, limit: Limit, rule: str, confidence: float) -> Judgement:
     """Say whether one value of a data sheet conforms; where only a limit is known, that limit is held against the others."""
     lower = -math.inf if limit.min is None else limit.min
     upper = math.inf if limit.max is None else limit.max
@@ -207,7 +207,7 @@ def judge_value(value: Value, limit: Limit, rule: str, confidence: float) -> Jud
         elif value.value >= lower and limit.max is None and confidence <= 0.95:
             verdict, reason = "pass", "the lower limit (95 %) lies above"
         return Judgement(verdict, math.nan, 0.0, (lower, upper), rule, reason)
-    if not value.is_limit:
+    if not value.is_upper_limit:
         dof = math.inf if math.isnan(value.dof) else value.dof
         return judge(value.value, value.u, dof, lower, upper, rule, confidence)
     verdict, reason = "undecided", "only an upper limit is known"
@@ -218,7 +218,7 @@ def judge_value(value: Value, limit: Limit, rule: str, confidence: float) -> Jud
     return Judgement(verdict, math.nan, 0.0, (lower, upper), rule, reason)
 
 
-def check(values: Mapping[tuple[str, str], Value], limits: Limits) -> tuple[Checked, ...]:
+def check(values: Mapping[tuple[str, str], Number], limits: Limits) -> tuple[Checked, ...]:
     """Hold values against a file of limits: each key in every channel.
 
     Parameters
@@ -242,7 +242,7 @@ def check(values: Mapping[tuple[str, str], Value], limits: Limits) -> tuple[Chec
         rule = limit.rule or limits.rule
         if not here:
             _refuse_unknown(key, (name for _, name in values), limits.place(key))
-            nothing = Value(math.nan, math.nan, math.nan, limit.unit)
+            nothing = Number.not_available(limit.unit, "")
             here = {channel: nothing for channel in dict.fromkeys(channel for channel, _ in values)}
         for channel, value in here.items():
             _check_unit(limit, value, limits.place(key))
@@ -260,7 +260,7 @@ def _refuse_unknown(key: str, names: Iterable[str], where: str) -> None:
         raise InputError("no such key", where=where, remedy=remedy)
 
 
-def _check_unit(limit: Limit, value: Value, where: str) -> None:
+def _check_unit(limit: Limit, value: Number, where: str) -> None:
     given, unit = plain_unit(limit.unit), plain_unit(value.unit)
     if given != unit:
         what = "the limit lacks its unit" if not limit.unit else "the limit has another unit than the value"

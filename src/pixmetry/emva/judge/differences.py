@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from pixmetry.core.number import Number
 from pixmetry.emva.files.keys import NONLINEAR, goes_with_photons
 from pixmetry.emva.files.units import plain_unit
-from pixmetry.emva.records import Value
 
 EQUAL_REL = 1e-9  # numbers without uncertainty that agree so well are equal
 ROUNDING = 1e-9  # of a square of u: the light's part was all of it
@@ -32,7 +32,7 @@ class Subject:
     kind: str  # "data sheet" or "assessment"
     release: str
     camera: Mapping[str, Any]
-    values: Mapping[tuple[str, str], Value]
+    values: Mapping[tuple[str, str], Number]
     absent: Mapping[str, str]  # by source of an assessment: why it was not measured
     photons_u_rel: float = 0.0
     worth: tuple[Any, float] | None = None  # of an assessment: target and estimator, and u of its place, px
@@ -51,8 +51,8 @@ class Difference:
     channel: str
     key: str
     unit: str
-    a: Value | None
-    b: Value | None
+    a: Number | None
+    b: Number | None
     difference: float = math.nan  # b - a
     u: float = math.nan  # of the difference; where one has none, of the other
     dof: float = math.nan
@@ -104,17 +104,17 @@ def difference_of(place: tuple[str, str], one: Subject, two: Subject, same_light
     return replace(row, p=_chance(row, toward), reason=limits)
 
 
-def is_there(value: Value | None) -> bool:
+def is_there(value: Number | None) -> bool:
     """Whether there is a number."""
     return value is not None and math.isfinite(value.value)
 
 
-def _u(value: Value, key: str, light: Subject | None) -> float:
+def _u(value: Number, key: str, light: Subject | None) -> float:
     """Uncertainty of a value, without the part of the light's calibration if that is common (``light`` given).
 
     A limit whose uncertainty is not known is a number without one.
     """
-    if (value.is_limit or value.is_lower_limit) and math.isnan(value.u):
+    if value.is_limit and math.isnan(value.u):
         return 0.0
     if light is None or not goes_with_photons(key):
         return value.u
@@ -132,14 +132,14 @@ def _joint_dof(*parts: tuple[float, float]) -> float:
     return 1 / weight if weight > 0 else math.inf
 
 
-def _sides(a: Value, b: Value) -> set[int]:
+def _sides(a: Number, b: Number) -> set[int]:
     """Signs of b − a that tell of a change: upwards only from an upper limit, or to a lower one; both where no sign does."""
-    own = {1 if a.is_limit else -1 if a.is_lower_limit else 0, -1 if b.is_limit else 1 if b.is_lower_limit else 0}
+    own = {1 if a.is_upper_limit else -1 if a.is_lower_limit else 0, -1 if b.is_upper_limit else 1 if b.is_lower_limit else 0}
     return own - {0}
 
 
-def _limits_text(a: Value, b: Value) -> str:
-    kinds = ["an upper limit" if v.is_limit else "a lower limit" if v.is_lower_limit else "" for v in (a, b)]
+def _limits_text(a: Number, b: Number) -> str:
+    kinds = ["an upper limit" if v.is_upper_limit else "a lower limit" if v.is_lower_limit else "" for v in (a, b)]
     if kinds[0] and kinds[0] == kinds[1]:
         return f"{kinds[0].split()[1]} limits both"
     return ", ".join(f"{name} is {kind}" for name, kind in zip("AB", kinds, strict=True) if kind)

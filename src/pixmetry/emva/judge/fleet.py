@@ -38,7 +38,7 @@ def fleet_row(place: tuple[str, str], subjects: Sequence[Subject]) -> FleetRow |
     units = [plain_unit(v.unit) for v in held if v is not None]
     unit = max(units, key=units.count)
     usable = [
-        v is not None and math.isfinite(v.value) and not (v.is_limit or v.is_lower_limit) and plain_unit(v.unit) == unit for v in held
+        v is not None and math.isfinite(v.value) and not v.is_limit and plain_unit(v.unit) == unit for v in held
     ]
     if sum(usable) < 3:
         return None

@@ -13,10 +13,11 @@ import numpy as np
 from pixmetry.emva.files.keys import KEYS, NONLINEAR, Key, key_of
 from pixmetry.emva.files.rules import PTC_LIMIT_PERCENT
 from pixmetry.emva.linear_model import CURVED, FAILS, HOLDS, OPEN, UNKNOWN, linear_model
-from pixmetry.report.numbers import NO_BREAK, NONE, Number, decimals_of, fixed, limit, pretty_unit, significant, uncertain
+from pixmetry.report.numbers import NO_BREAK, NONE, PrintedNumber, decimals_of, fixed, limit, pretty_unit, significant, uncertain
 
 if TYPE_CHECKING:
-    from pixmetry.emva.records import DataSheet, Results, Value
+    from pixmetry.core.number import Number
+    from pixmetry.emva.records import DataSheet, Results
 
 HEADLINE = ("QE", "sigma_d", "u_e_sat", "DR_dB")
 GENERAL_HEADLINE = ("general_u_p_min", "general_u_p_sat", "general_SNR_max_dB", "general_DR_dB")
@@ -48,7 +49,7 @@ class Row:
     key: str
     title: str
     symbol: tuple[str, str]  # base and subscript
-    number: Number
+    number: PrintedNumber
     dof: str
     nonlinear: str
     clause: str
@@ -63,7 +64,7 @@ class MainRow:
     key: str
     title: str
     symbol: tuple[str, str]
-    cells: tuple[Number, ...]
+    cells: tuple[PrintedNumber, ...]
     unit: str
 
 
@@ -86,24 +87,24 @@ def describe(name: str, unit: str) -> Key:
     return key_of(name) if name.removesuffix(NONLINEAR) in KEYS else Key("other", name, "", unit)
 
 
-def number_of(value: Value) -> Number:
+def number_of(value: Number) -> PrintedNumber:
     """A value as text: with its standard uncertainty, or as a one-sided 95 % limit."""
     if not isfinite(value.value):
-        return Number(NONE, "", pretty_unit(value.unit))
-    if value.is_limit:
+        return PrintedNumber(NONE, "", pretty_unit(value.unit))
+    if value.is_upper_limit:
         found = limit(value.value, value.unit)
-        return Number(found.value, f"(95{NO_BREAK}%)", found.unit)
+        return PrintedNumber(found.value, f"(95{NO_BREAK}%)", found.unit)
     if value.is_lower_limit:
-        return Number(f">{NO_BREAK}{_rounded_down(value)}", f"(95{NO_BREAK}%)", pretty_unit(value.unit))
+        return PrintedNumber(f">{NO_BREAK}{_rounded_down(value)}", f"(95{NO_BREAK}%)", pretty_unit(value.unit))
     if value.u == 0:  # a setting or a place in the series
-        return Number(short(value.value, 6), "", pretty_unit(value.unit))
+        return PrintedNumber(short(value.value, 6), "", pretty_unit(value.unit))
     found = uncertain(value.value, value.u, value.unit)
     if not any(digit in found.value for digit in "123456789"):  # far less than its u: rounded as that is it would be 0
-        found = Number(short(value.value, 2), short(value.u, 2), pretty_unit(value.unit))
-    return Number(found.value, "" if found.u == NONE else f"± {found.u}", found.unit)
+        found = PrintedNumber(short(value.value, 2), short(value.u, 2), pretty_unit(value.unit))
+    return PrintedNumber(found.value, "" if found.u == NONE else f"± {found.u}", found.unit)
 
 
-def _rounded_down(value: Value) -> str:
+def _rounded_down(value: Number) -> str:
     """A lower limit to the first digit of its u, never above it; a level of the series as it is."""
     if not (isfinite(value.u) and value.u > 0):
         return short(value.value, 6)
@@ -111,7 +112,7 @@ def _rounded_down(value: Value) -> str:
     return fixed(floor(value.value * 10.0**places) / 10.0**places, places)
 
 
-def joined(number: Number, with_unit: bool = True) -> str:
+def joined(number: PrintedNumber, with_unit: bool = True) -> str:
     """Value, uncertainty and unit in one string."""
     return " ".join(part for part in (number.value, number.u, number.unit if with_unit else "") if part)
 
@@ -122,7 +123,7 @@ def say(results: Results, key: str) -> str:
     return joined(number_of(value)) if value is not None and isfinite(value.value) else ""
 
 
-def dof_text(value: Value) -> str:
+def dof_text(value: Number) -> str:
     """Degrees of freedom; beyond a thousand they make no difference, and a dash stands where there is no uncertainty."""
     if value.dof != value.dof or not value.u > 0:
         return NONE
@@ -140,15 +141,15 @@ def main_rows(channels: Sequence[Results], keys: Sequence[str]) -> list[MainRow]
         if not units:
             continue
         known, unit = describe(key, units[0]), pretty_unit(units[0])
-        cells = tuple(Number(NONE, "", "") if v is None else _without_unit(number_of(v), unit) for v in values)
+        cells = tuple(PrintedNumber(NONE, "", "") if v is None else _without_unit(number_of(v), unit) for v in values)
         rows.append(MainRow(key, known.title, symbol_parts(known.symbol), cells, unit))
     return rows
 
 
-def _without_unit(number: Number, unit: str) -> Number:
+def _without_unit(number: PrintedNumber, unit: str) -> PrintedNumber:
     """A power of ten that stands before the unit goes behind the number, for the unit has a column of its own."""
     power = number.unit.removesuffix(unit).strip(NO_BREAK)
-    return Number(number.value, f"{number.u} ×{NO_BREAK}{power}".strip() if power else number.u, "")
+    return PrintedNumber(number.value, f"{number.u} ×{NO_BREAK}{power}".strip() if power else number.u, "")
 
 
 def main_keys(channels: Sequence[Results]) -> tuple[str, ...]:
@@ -167,7 +168,7 @@ def methods_of(sheet: DataSheet) -> list[str]:
     return list(dict.fromkeys(m for r in sheet.results for name, v in r.values.items() if (m := _method(name, v))))
 
 
-def _method(name: str, value: Value) -> str:
+def _method(name: str, value: Number) -> str:
     """The method without the clause, which has a column of its own."""
     clause = describe(name, value.unit).clause
     return value.method.replace(f" {clause}", "", 1) if clause else value.method
@@ -182,7 +183,7 @@ def all_rows(results: Results, methods: Sequence[str]) -> dict[str, list[Row]]:
         known, beside = describe(name, value.unit), results.values.get(name + NONLINEAR)
         number, used = number_of(value), [_method(name, value)]
         if name.startswith("index_") and isfinite(value.value):
-            number = Number(fixed(value.value, 0), "", "")  # one level or the next: no value with a u
+            number = PrintedNumber(fixed(value.value, 0), "", "")  # one level or the next: no value with a u
         reasons, curved = [value.reason], ""
         if beside is not None:
             found = number_of(beside)

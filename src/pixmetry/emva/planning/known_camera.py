@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from pixmetry.core.errors import InputError
+from pixmetry.core.number import Number
 from pixmetry.emva.files.rules import QUANTISATION_DN2
-from pixmetry.emva.records import MONO, DataSheet, Value
+from pixmetry.emva.records import MONO, DataSheet
 from pixmetry.emva.spatial.high_pass import MINIMUM_SIDE
 
 
@@ -85,7 +86,7 @@ def camera_from_results(values: Mapping[str, Any], rows: int, cols: int, bits: i
     Parameters
     ----------
     values : mapping
-        By key: ``Value``, the object of a JSON file (``{"value": …, "u": …}``) or a number.
+        By key: ``Number``, the object of a JSON file (``{"value": …, "u": …}``) or a number.
     rows, cols, bits : int
     more
         Further fields of ``KnownCamera``, such as ``exposure_sat_s``; they come before what is in ``values``.
@@ -120,8 +121,8 @@ def camera_from_results(values: Mapping[str, Any], rows: int, cols: int, bits: i
 
 def number_in(value: Any, name: str = "value") -> float:
     """The number in a value of a data sheet; an upper limit L counts as L/√3."""
-    if isinstance(value, Value):
-        value = vars(value)
+    if isinstance(value, Number):
+        return value.representative if name == "value" else float(getattr(value, name, math.nan))
     if not isinstance(value, Mapping):
         return float(value) if name == "value" and isinstance(value, int | float) else math.nan
     number = value.get(name)

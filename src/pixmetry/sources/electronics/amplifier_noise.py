@@ -11,7 +11,7 @@ from pixmetry.camera.contribution import Contribution, Probe
 from pixmetry.camera.observations import Observations, PatternList
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
-from pixmetry.core.estimates import Estimates
+from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
 
 TAIL = 3.0  # standard deviation of the rare wide part over that of the common one

@@ -12,7 +12,7 @@ from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
 from pixmetry.core.errors import ParameterError
-from pixmetry.core.estimates import Estimates
+from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
 
 LOWEST, HIGHEST = -0.25, 1.25  # of w: where the polynomial holds; beyond, its factor stays as it is there

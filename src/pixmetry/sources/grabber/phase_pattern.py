@@ -14,7 +14,7 @@ from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
 from pixmetry.camera.waves import shift_per_dn, wave, without_wave
 from pixmetry.core.errors import MeasureError
-from pixmetry.core.estimates import Estimates
+from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
 
 LARGEST_REL = 3.0  # amplitude in a frame over the measured one, up to which it is the same wave

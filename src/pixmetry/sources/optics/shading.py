@@ -10,7 +10,7 @@ from pixmetry.camera.contribution import Contribution, Probe
 from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import STATED_FRAME, Parameters, Source, quantity
-from pixmetry.core.estimates import Estimates
+from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
 
 PLACES = 24  # along each side of the frame, for the spread over it

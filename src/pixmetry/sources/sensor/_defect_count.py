@@ -8,7 +8,7 @@ import numpy as np
 
 from pixmetry.camera.observations import Observations
 from pixmetry.core.errors import MeasureError
-from pixmetry.core.estimates import Estimate, Estimates
+from pixmetry.core.number import Estimates, Number
 from pixmetry.sources.sensor._defect_model import MOST
 
 FOUND_95 = 1.645  # standard deviations above the limit at which 95 of 100 defects are found
@@ -73,7 +73,7 @@ def measure(observations: Observations) -> Estimates:
 Row = tuple[str, float, float, float, str]
 
 
-def _errors(observations: Observations, places: Mapping[str, np.ndarray], gain: Estimate | None) -> list[Row]:
+def _errors(observations: Observations, places: Mapping[str, np.ndarray], gain: Number | None) -> list[Row]:
     """How large the errors are of the kinds that were found; those in electrons only if the gain is known."""
     found = observations.defects
     rows: list[Row] = []

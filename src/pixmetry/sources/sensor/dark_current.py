@@ -12,7 +12,7 @@ from pixmetry.camera.contribution import Contribution, Probe
 from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
-from pixmetry.core.estimates import Estimates
+from pixmetry.core.number import Estimates
 from pixmetry.core.random import Grid, Stream
 
 BOLTZMANN_EV_PER_K = 8.617333262e-5  # CODATA 2018

@@ -11,7 +11,7 @@ from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, cut_map, quantity
 from pixmetry.core.errors import MeasureError
-from pixmetry.core.estimates import Estimates
+from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
 
 FITTED = {"pixel_std_e": "dsnu_pixel_dn", "row_std_e": "dsnu_row_dn", "col_std_e": "dsnu_col_dn"}

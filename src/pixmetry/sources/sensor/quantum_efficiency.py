@@ -10,7 +10,7 @@ from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.silicon import FIRST_NM, LAST_NM, absorption_per_cm
 from pixmetry.camera.source import Parameters, Source, quantity
-from pixmetry.core.estimates import Estimates
+from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
 
 NODES = 65  # of the Gauss-Legendre quadrature over the band of light: 1e-4 over the whole table

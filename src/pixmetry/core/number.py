@@ -1,8 +1,9 @@
-"""A joint set of measured values with their covariance, as the GUM (JCGM 100 and 102) has it."""
+"""Measured values: one number, and a joint set of numbers with their covariance, as the GUM (JCGM 100 and 102) has them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import math
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -10,34 +11,124 @@ import numpy as np
 
 from pixmetry.core.errors import MeasureError
 
+VALUE, UPPER_LIMIT, LOWER_LIMIT, NOT_AVAILABLE = KINDS = ("value", "upper_limit", "lower_limit", "not_available")
+
 
 @dataclass(frozen=True)
-class Estimate:
-    """One measured value.
+class Number:
+    """One number with its standard uncertainty, or the limit or the reason that stands for it.
 
-    ``kind`` is ``"value"``, or ``"upper_limit"`` where the data only bound the quantity: then ``value`` is the one-sided 95 %
-    limit and ``u`` is the standard uncertainty of the best estimate behind it. ``"lower_limit"``: the quantity is ``value`` ± ``u``
-    or more.
+    Parameters
+    ----------
+    value : float
+        The best estimate; of a limit the one-sided 95 % limit. NaN where nothing can be said: then the kind is ``"not_available"``,
+        whatever was asked for, and ``reason`` says why.
+    u : float
+        Standard uncertainty (k = 1); of a limit that of the best estimate behind it. NaN where it is not known.
+    dof : float
+        Degrees of freedom of ``u``; ``inf`` where it is known.
+    unit : str
+    method : str
+        How the value was obtained, with the clause or reference.
+    reason : str
+        Why it is a limit or not there, or what the reader should know about it.
+    kind : {"value", "upper_limit", "lower_limit", "not_available"}
+    name : str
+        What it is a number of, where what holds it does not say so.
+
+    Examples
+    --------
+    >>> from pixmetry import Number
+    >>> noise = Number(2.4, 0.3, 9.0, "e⁻", kind="upper_limit", reason="quantisation covers it")
+    >>> noise.is_limit, round(noise.representative, 2)
+    (True, 1.39)
     """
 
-    name: str
     value: float
-    u: float
-    dof: float
-    unit: str
-    method: str
-    kind: str = "value"
+    u: float = math.nan
+    dof: float = math.inf
+    unit: str = "1"
+    method: str = ""
     reason: str = ""
+    kind: str = VALUE
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise ValueError(f"kind of a number: {self.kind!r}, not one of {', '.join(KINDS)}")
+        if math.isnan(self.value):
+            object.__setattr__(self, "kind", NOT_AVAILABLE)
+        elif self.kind == NOT_AVAILABLE:
+            raise ValueError(f"a number that is not available has no value, and not {self.value}")
+
+    @classmethod
+    def not_available(cls, unit: str, reason: str, method: str = "", name: str = "") -> Number:
+        """What stands for a number that cannot be had."""
+        return cls(math.nan, math.nan, math.nan, unit, method, reason, NOT_AVAILABLE, name)
+
+    @property
+    def is_available(self) -> bool:
+        """Whether there is a value or a limit."""
+        return self.kind != NOT_AVAILABLE
+
+    @property
+    def is_upper_limit(self) -> bool:
+        """Whether the quantity is at most ``value``."""
+        return self.kind == UPPER_LIMIT
+
+    @property
+    def is_lower_limit(self) -> bool:
+        """Whether the quantity is at least ``value``."""
+        return self.kind == LOWER_LIMIT
+
+    @property
+    def is_limit(self) -> bool:
+        """Whether the data only bound the quantity, on one side."""
+        return self.kind in (UPPER_LIMIT, LOWER_LIMIT)
 
     @property
     def representative(self) -> float:
         """The value to calculate with: of an upper limit L the root mean square L/√3 of an even spread between 0 and L."""
-        return self.value / 3**0.5 if self.kind == "upper_limit" else self.value
+        return self.value / 3**0.5 if self.is_upper_limit else self.value
+
+    def interval(self, coverage: float = 0.95) -> tuple[float, float]:
+        """Coverage interval: value ∓ t u, with the quantile t of Student's distribution for ``dof`` (JCGM 100, G.3).
+
+        Of a limit, which is one-sided and of 95 % whatever ``coverage`` is, the half line; NaN where there is no value or no u.
+        """
+        if self.is_limit:
+            return (-math.inf, self.value) if self.is_upper_limit else (self.value, math.inf)
+        from scipy.special import ndtri, stdtrit
+
+        p = 0.5 + coverage / 2
+        half = self.u * float(stdtrit(self.dof, p) if math.isfinite(self.dof) else ndtri(p))
+        return self.value - half, self.value + half
+
+    def to_record(self) -> dict[str, Any]:
+        """Plain record for JSON: ``None`` for NaN, and for infinite degrees of freedom."""
+        value, u, dof = (float(x) if math.isfinite(x) else None for x in (self.value, self.u, self.dof))
+        head = {"name": self.name} if self.name else {}
+        return head | {
+            "value": value,
+            "u": u,
+            "dof": dof,
+            "unit": self.unit,
+            "kind": self.kind,
+            "method": self.method,
+            "reason": self.reason,
+        }
+
+    @classmethod
+    def from_record(cls, record: Mapping[str, Any]) -> Number:
+        """The number of its record; ``KeyError``, ``TypeError`` or ``ValueError`` where the record is none."""
+        value, u = (math.nan if record[name] is None else float(record[name]) for name in ("value", "u"))
+        dof = math.inf if record["dof"] is None else float(record["dof"])
+        return cls(value, u, dof, record["unit"], record["method"], record["reason"], record["kind"], record.get("name", ""))
 
 
 @dataclass(frozen=True)
 class Estimates:
-    """A joint set of estimates.
+    """A joint set of numbers: best estimates with their covariance.
 
     Parameters
     ----------
@@ -103,7 +194,7 @@ class Estimates:
     def __contains__(self, name: str) -> bool:
         return name in self.names
 
-    def __iter__(self):
+    def __iter__(self) -> Iterator[Number]:
         return (self[name] for name in self.names)
 
     def __len__(self) -> int:
@@ -116,16 +207,16 @@ class Estimates:
         except ValueError:
             raise MeasureError("no such estimate", where=name, allowed=", ".join(self.names)) from None
 
-    def __getitem__(self, name: str) -> Estimate:
+    def __getitem__(self, name: str) -> Number:
         i = self.index(name)
-        return Estimate(
+        return Number(
             name=name,
             value=float(self.values[i]),
             u=float(np.sqrt(self.covariance[i, i])),
             dof=float(self.dof[i]),
             unit=self.units[i],
             method=self.method,
-            kind="upper_limit" if name in self.limits else "lower_limit" if name in self.lower_limits else "value",
+            kind=UPPER_LIMIT if name in self.limits else LOWER_LIMIT if name in self.lower_limits else VALUE,
             reason=self.reasons.get(name, ""),
         )
 
@@ -177,16 +268,4 @@ class Estimates:
 
     def to_records(self) -> list[dict[str, Any]]:
         """Plain records for JSON, one per value (``dof`` is ``None`` where it is infinite)."""
-        return [
-            {
-                "name": e.name,
-                "value": e.value,
-                "u": e.u,
-                "dof": e.dof if np.isfinite(e.dof) else None,
-                "unit": e.unit,
-                "kind": e.kind,
-                "method": e.method,
-                "reason": e.reason,
-            }
-            for e in self
-        ]
+        return [e.to_record() for e in self]
