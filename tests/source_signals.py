@@ -15,9 +15,9 @@ Z = 4.8917  # two-sided normal quantile of ALPHA
 K_DN_PER_E = 0.01
 
 
-def stream(seed: int | None = None) -> Stream:
-    """A stream of a unit and of exposures that nobody has seen before."""
-    draw = np.random.default_rng(seed)
+def stream(rng: np.random.Generator | int) -> Stream:
+    """A stream of some unit and of some exposures: drawn, or those of a seed."""
+    draw = np.random.default_rng(rng)
     return Stream(int(draw.integers(2**62)), int(draw.integers(2**62)), "source under test")
 
 

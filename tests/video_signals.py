@@ -33,9 +33,11 @@ def sampled(on_line: Signal, fine: int = 1) -> np.ndarray:
     return line.read(on_line.data, on_line.grid.col0, grid).astype(float)
 
 
-def seen(source: Source, params: object, data: np.ndarray, draws: object = None, smooth: bool = False, **kw: object) -> np.ndarray:
+def seen(
+    rng: np.random.Generator, source: Source, params: object, data: np.ndarray, draws: object = None, smooth: bool = False, **kw: object
+) -> np.ndarray:
     """Frames on the line after a source, sampled."""
-    return sampled(source.forward(params, video(data, smooth, **kw), draws or stream()))
+    return sampled(source.forward(params, video(data, smooth, **kw), draws or stream(rng)))
 
 
 def row_of(values: np.ndarray) -> np.ndarray:

@@ -71,13 +71,12 @@ def test_another_folder_is_no_calibration(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("direction", ["image_to_object", "object_to_image"])
-def test_a_calibration_in_pixels_takes_a_pitch_and_sees_the_same(direction: str) -> None:
+def test_a_calibration_in_pixels_takes_a_pitch_and_sees_the_same(direction: str, rng: np.random.Generator) -> None:
     lens = {"p1": 1e-6, "p2": -2e-6, "k1": -1e-8, "k2": 2e-14, "k3": 1e-20, "k4": 1e-26, "k5": -1e-32}
     if direction == "object_to_image":
         lens = {name: value * 800.0 ** (1 if name[0] == "p" else 2 * int(name[1])) for name, value in lens.items()}
     names = ("c", "xp", "yp", "b1", "b2", *lens)
     model = CameraModel.of(Sensor(780, 582), direction, names, c=800.0, xp=380.0, yp=300.0, b1=1e-3, b2=-2e-3, **lens)
-    rng = np.random.default_rng()
     root = rng.normal(0, 1, (12, 12)) * np.where(model.values, 1e-3 * np.abs(model.values), 1)[:, None]
     covariance = root @ root.T
     changed, scaled = with_pitch(model, names, covariance, PITCH)

@@ -120,10 +120,10 @@ def test_a_damaged_assessment_gives_no_wrong_frames_and_no_wrong_values(folder: 
 
 
 @pytest.mark.parametrize(("name", "side"), [("maps.zarr.zip", 2100), ("maps.zarr", 50)])
-def test_damaged_maps_are_never_read_as_others(name: str, side: int, tmp_path: Path) -> None:
+def test_damaged_maps_are_never_read_as_others(name: str, side: int, tmp_path: Path, rng: np.random.Generator) -> None:
     """A map of zeros, whose chunks are not stored, one that is zero in some chunks only, and a small one."""
     maps = {"large": np.zeros((side, side), np.float32), "defects": np.zeros((60, 80), np.uint8)}
-    maps["prnu_rel"] = np.random.default_rng().random((9, 8))
+    maps["prnu_rel"] = rng.random((9, 8))
     maps["large"][:40, :40] = 1.5
     (tmp_path / "maps").mkdir()
     write_maps(tmp_path / "maps" / name, maps, {"camera": "a"})
@@ -135,10 +135,10 @@ def test_damaged_maps_are_never_read_as_others(name: str, side: int, tmp_path: P
     check(tmp_path / "maps", [name], {"read": read}, tmp_path, {"read": 15})
 
 
-def test_a_damaged_calibration_gives_no_wrong_camera(tmp_path: Path) -> None:
+def test_a_damaged_calibration_gives_no_wrong_camera(tmp_path: Path, rng: np.random.Generator) -> None:
     from calibrate.networks import simulate as network
 
-    calibrate(network(np.random.default_rng(), images=5, points=12).network, tmp_path / "result")
+    calibrate(network(rng, images=5, points=12).network, tmp_path / "result")
 
     def cameras(result: Path) -> np.ndarray:
         return np.concatenate([camera.values for camera in stored_cameras(result)])

@@ -17,7 +17,6 @@ from pixmetry.locate.centroids.estimators import Estimator
 WHITE_E = 60.0
 Z = 4.9  # of a normal variable: two-sided false-alarm rate 1e-6
 TARGET = Target(peak_rel=0.75, background_rel=0.025)
-SEED = int(np.random.SeedSequence().entropy % 2**31)  # any will do: tolerances are those of the statistics
 
 
 def noisy() -> object:
@@ -39,12 +38,12 @@ def test_facts_are_those_of_the_chain() -> None:
         facts_of(noisy(), TARGET, {"noise": 1.0})
 
 
-def test_white_noise_has_the_closed_form() -> None:
+def test_white_noise_has_the_closed_form(seed: int) -> None:
     """Plain centroid over w × w pixels: u = σ √(w²(w² − 1)/12)/S with S the disc's light, π R² A. Smallest error seen: 3.5 %."""
     cam, law = noisy(), Estimator("centroid", window=15)
     total = math.pi * 3.5**2 * TARGET.peak_rel * 200.0
     u = WHITE_E * GAIN_DN_PER_E * math.sqrt(225 * 224 / 12) / total
-    got = monte_carlo(cam, TARGET, law, only=["electronics.amplifier_noise"], trials=20_000, facts=facts(cam), seed=SEED)
+    got = monte_carlo(cam, TARGET, law, only=["electronics.amplifier_noise"], trials=20_000, facts=facts(cam), seed=seed)
     for axis in (got.x, got.y):
         assert abs(axis.u / u - 1) < Z / math.sqrt(2 * got.trials) + 0.005  # 0.5 %: the light that ends outside of the square, and phase
         assert abs(axis.temporal / u - 1) < Z / math.sqrt(got.trials) + 0.005
@@ -54,19 +53,18 @@ def test_white_noise_has_the_closed_form() -> None:
         assert axis.se_bias == pytest.approx(u / math.sqrt(got.trials), rel=1.5)
 
 
-def test_what_is_fixed_shows_as_fixed_and_agrees_with_the_linear_response() -> None:
+def test_what_is_fixed_shows_as_fixed_and_agrees_with_the_linear_response(seed: int) -> None:
     """PRNU of 1 %: no difference between frames; 8192 places. The propagator's own error is stated as 12 %, here 3 % are allowed."""
     cam = camera(element("sensor.prnu", pixel_std_rel=0.01))
     probe = make_probe(facts(cam), TARGET, Estimator())
-    got = monte_carlo(cam, TARGET, Estimator(), only=["sensor.prnu"], trials=8192, facts=facts(cam), seed=SEED)
+    got = monte_carlo(cam, TARGET, Estimator(), only=["sensor.prnu"], trials=8192, facts=facts(cam), seed=seed)
     assert got.x.temporal == 0 and got.y.temporal == 0
     for axis, u in zip((got.x, got.y), probe.white(0.01 * probe.signal_dn), strict=True):
         assert abs(axis.fixed / u - 1) < 0.03 + Z / math.sqrt(2 * got.units * got.places)
 
 
-def test_nested_analysis_of_variance_separates_what_was_put_in() -> None:
+def test_nested_analysis_of_variance_separates_what_was_put_in(rng: np.random.Generator) -> None:
     """Shifts made by NumPy with known parts; false alarm 1e-6 per comparison, by the standard errors that it states itself (and 10 %)."""
-    rng = np.random.default_rng()
     shape = (12, 2000, 3)
     shift = 0.5 + rng.normal(0, 0.3, shape[:2])[:, :, None] + rng.normal(0, 0.2, shape)
     got = _axis(shift)
@@ -80,42 +78,41 @@ def test_nested_analysis_of_variance_separates_what_was_put_in() -> None:
     assert got.se_temporal == pytest.approx(0.2 / math.sqrt(2 * 2 * 24_000), rel=0.05)
 
 
-def test_a_source_alone_is_seen_through_the_camera_s_own_line() -> None:
+def test_a_source_alone_is_seen_through_the_camera_s_own_line(seed: int) -> None:
     """Jitter of 5 ns behind an amplifier: not on a bare staircase, and as the same jitter in the whole chain."""
     jitter, amplifier = element("grabber.line_jitter", white_ns=5.0), element("electronics.video_amplifier", natural_mhz=8.0, damping=0.7)
     cam = camera(jitter, element("cable.termination", length_m=2.0, line_ohm=50.0))
     cam = replace(cam, chain=(*cam.chain[:2], amplifier, *cam.chain[2:]))
-    design = Trials(cam, TARGET, Estimator(), facts(cam), trials=2048, units=4, seed=SEED)
+    design = Trials(cam, TARGET, Estimator(), facts(cam), trials=2048, units=4, seed=seed)
     alone, missed = design.of(only=["grabber.line_jitter"]), design.of(off=["grabber.line_jitter"])
     assert alone.x.u == pytest.approx(missed.x.u, rel=1e-6) and 0.015 < alone.x.u < 0.04  # 5 ns are 0.071 px, over seven rows
     assert {"electronics.video_amplifier", "cable.termination"} == set(helpers_of(cam, ["grabber.line_jitter"]))
     assert helpers_of(cam, ["electronics.video_amplifier"]) == ("cable.termination",)  # a jitter shapes no line
 
 
-def test_a_target_has_its_light_whatever_the_aperture_takes_away() -> None:
+def test_a_target_has_its_light_whatever_the_aperture_takes_away(seed: int) -> None:
     """Six tenths of every pixel gather light. The target is of so many per cent of saturation all the same: the noise weighs as it did."""
     noise, aperture = element("electronics.amplifier_noise", white_e=WHITE_E), element("sensor.pixel_aperture", collected_rel=0.6)
     cam = camera(noise)
     cam = replace(cam, chain=(aperture, *cam.chain))
     assert passed_light(cam) == pytest.approx(0.6, rel=1e-5) and passed_light(noisy()) == 1.0
     law = Estimator(threshold_dn=10.0)
-    design = Trials(cam, TARGET, law, facts(cam), trials=1024, units=4, seed=SEED)
+    design = Trials(cam, TARGET, law, facts(cam), trials=1024, units=4, seed=seed)
     alone, whole = design.of(only=["electronics.amplifier_noise"]), design.of(off=["electronics.amplifier_noise"])
     # the same draws on the same targets: they differ by the target's slopes alone, not by 1/0.6
     assert whole.x.u == pytest.approx(alone.x.u, rel=0.03) and whole.y.u == pytest.approx(alone.y.u, rel=0.03)
 
 
-def test_windows_follow_a_clock_that_is_cold() -> None:
+def test_windows_follow_a_clock_that_is_cold(seed: int) -> None:
     """Samples 4 px off at the end of the row: no target is lost, and the shift is that of the clock."""
     cam = camera(element("grabber.clock_warm_up", scale_error_rel=0.02, lock_us=10.0), shape=(96, 200))
-    got = monte_carlo(cam, TARGET, Estimator(), only=["grabber.clock_warm_up"], trials=256, units=2, facts=facts(cam), seed=SEED)
+    got = monte_carlo(cam, TARGET, Estimator(), only=["grabber.clock_warm_up"], trials=256, units=2, facts=facts(cam), seed=seed)
     assert got.lost == 0
     assert got.x.bias == pytest.approx((141.9 + 99.5) * 0.02 / 1.02, rel=0.06)  # 10 µs are 141.9 px
 
 
-def test_what_a_calibration_leaves_is_what_is_not_smooth() -> None:
+def test_what_a_calibration_leaves_is_what_is_not_smooth(rng: np.random.Generator) -> None:
     """Shifts of known parts: constant 0.5, a cubic of each unit over the frame, 0.3 from place to place, 0.2 in time."""
-    rng = np.random.default_rng()
     row, col = rng.uniform(0, 1, (2, 12, 150))
     smooth = 0.5 + rng.normal(0, 1, (12, 1)) * (row - 0.5) + 3 * (row - 0.5) * (col - 0.5) ** 2
     shift = (smooth + rng.normal(0, 0.3, smooth.shape))[:, :, None] + rng.normal(0, 0.2, (*smooth.shape, 3))
@@ -124,9 +121,8 @@ def test_what_a_calibration_leaves_is_what_is_not_smooth() -> None:
     assert _axis(np.full((2, 3, 2), 0.5), *np.zeros((2, 2, 3))).left == 0  # few places: the constant alone
 
 
-def test_a_bias_that_belongs_to_the_unit_widens_the_error_of_the_mean() -> None:
+def test_a_bias_that_belongs_to_the_unit_widens_the_error_of_the_mean(rng: np.random.Generator) -> None:
     """Eight units, each with an offset of its own: the standard error is that of eight values, not of 16 000."""
-    rng = np.random.default_rng()
     offset = np.linspace(-1, 1, 8)
     got = _axis(offset[:, None, None] + rng.normal(0, 0.01, (8, 1000, 2)))
     assert got.se_bias == pytest.approx(offset.std(ddof=1) / math.sqrt(8), rel=0.01)
@@ -140,21 +136,21 @@ def test_lost_targets_are_counted_and_left_out() -> None:
     assert math.isnan(_axis(np.full((2, 3, 2), np.nan)).u)
 
 
-def test_the_estimator_itself_against_the_truth() -> None:
+def test_the_estimator_itself_against_the_truth(seed: int) -> None:
     """Without any source, the whole camera's error is the S-curve that the probe shows on a lattice of 24 × 24 phases; u within 8 %."""
     cam = camera()
     law, target = Estimator(sigma=40.0), Target(diameter_px=4.0, blur_px=0.5, peak_rel=0.7)
     known = facts_of(cam, target, {"noise_dn": 1.0})
-    got = monte_carlo(cam, target, law, trials=4096, facts=known, seed=SEED)
+    got = monte_carlo(cam, target, law, trials=4096, facts=known, seed=seed)
     probe = make_probe(known, target, law, phases=24)
     u = np.std(probe.x_hat_px - probe.x_px)
     assert u > 5e-4 and got.x.temporal == 0
     assert abs(got.x.u / u - 1) < 0.08
 
 
-def test_a_source_of_codes_is_compared_on_a_converter() -> None:
+def test_a_source_of_codes_is_compared_on_a_converter(seed: int) -> None:
     cam = camera(adc=True)
-    got = monte_carlo(cam, TARGET, Estimator(), only=["grabber.adc"], trials=4096, facts=facts(cam, 1.0), seed=SEED)
+    got = monte_carlo(cam, TARGET, Estimator(), only=["grabber.adc"], trials=4096, facts=facts(cam, 1.0), seed=seed)
     probe = make_probe(facts(cam, 1.0), TARGET, Estimator())
     assert abs(got.x.u / probe.white(math.sqrt(1 / 12))[0] - 1) < 0.15  # rounding is not quite white: pixels of the flat top agree
 
@@ -175,12 +171,12 @@ def test_off_equals_only_when_there_is_one_source() -> None:
         design.of(only=["nothing"])
 
 
-def test_places_cover_sensor_and_pixel() -> None:
+def test_places_cover_sensor_and_pixel(seed: int) -> None:
     """Kolmogorov–Smirnov of 4096 uniform numbers each, at 1e-6: shifts of 0.04 of the range are seen."""
     from scipy.stats import kstest
 
     cam = noisy()
-    design = Trials(cam, TARGET, Estimator(), facts(cam), trials=8192, units=8, seed=SEED)
+    design = Trials(cam, TARGET, Estimator(), facts(cam), trials=8192, units=8, seed=seed)
     assert design.dx.shape == (8, 512) and design.row0.min() >= 0 and design.row0.max() <= 96 - 24 and design.col0.max() <= 128 - 24
     for values in (design.dx + 0.5, design.dy + 0.5):
         assert kstest(values.ravel(), "uniform").pvalue > 1e-6
@@ -197,13 +193,13 @@ def test_places_cover_sensor_and_pixel() -> None:
         ],
     ],
 )
-def test_targets_are_sought_where_the_frame_shows_them(more: list) -> None:
+def test_targets_are_sought_where_the_frame_shows_them(more: list, seed: int) -> None:
     """Frames of another size and scale than the sensor's. Without noise, what aliasing does is left: rows or pixels are taken as they come,
     so that at most ±0.5 px, evenly spread (0.29 px), could be wrong, less over a target of several rows and columns.
     """
     cam = camera(*more, adc=True)
     assert cam.output_shape != cam.frame_shape
-    got = monte_carlo(cam, TARGET, Estimator(), trials=256, seed=SEED)
+    got = monte_carlo(cam, TARGET, Estimator(), trials=256, seed=seed)
     assert got.lost == 0
     for axis in (got.x, got.y):
         assert abs(axis.bias) < 0.15 and axis.u < 0.29

@@ -21,6 +21,7 @@ from scipy.stats import chi2
 import pixmetry
 from calibrate.networks import Simulated, simulate
 from calibrate.test_calibration_images import COLS, FOCAL, ROWS, View, chessboard
+from chance import rng_of
 from pixmetry.calibrate.bundle.bundle import SMALL
 from pixmetry.calibrate.bundle.model import NAMES
 from pixmetry.calibrate.bundle.network import Calibration, Network
@@ -83,10 +84,8 @@ def project(folder: Path, network: Network, more: str = "", mm: bool = False) ->
 
 
 @pytest.fixture(scope="module")
-def simulated() -> Simulated:
-    seed = np.random.SeedSequence().entropy
-    print(f"seed {seed}")
-    return simulate(np.random.default_rng(seed), images=12, points=40, bars=2)
+def simulated(request: pytest.FixtureRequest) -> Simulated:
+    return simulate(rng_of(request), images=12, points=40, bars=2)
 
 
 @pytest.fixture(scope="module")
@@ -183,9 +182,8 @@ def test_an_earlier_result_is_replaced_and_nothing_else(done: tuple[Path, Path, 
     refused(run(moved / "project.yaml", "-o", moved / "result"), "holds a file that is read", "residuals.csv")
 
 
-def test_pictures_of_a_board_alone(tmp_path: Path) -> None:
+def test_pictures_of_a_board_alone(tmp_path: Path, rng: np.random.Generator) -> None:
     """Drawn without distortion by a pinhole of known focal length; u is that of the located corners with sigma0."""
-    rng = np.random.default_rng()
     for k, (roll, tilt_x, tilt_y) in enumerate([(3, 0, 8), (85, 25, -10), (4, -28, 8), (178, 12, 30), (2, -10, -32), (-88, 20, 24)]):
         frame = View((3.0, 2.0), 11.5, roll, tilt_x, tilt_y).frame(chessboard(7, 5), rng)
         np.save(tmp_path / f"board_{k}.npy", frame)
@@ -206,8 +204,8 @@ def test_pictures_of_a_board_alone(tmp_path: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def by_hand() -> Calibration:
-    found = full(np.random.default_rng())
+def by_hand(request: pytest.FixtureRequest) -> Calibration:
+    found = full(rng_of(request))
     lower = np.tril(found.adjustment.covariance)  # symmetric to the last bit, as what is stored
     return replace(found, adjustment=replace(found.adjustment, covariance=lower + np.tril(lower, -1).T))
 
@@ -233,8 +231,8 @@ def test_inverse_read_after_write(by_hand: Calibration, tmp_path: Path) -> None:
         assert (stored.sigma0, stored.dof, stored.datum) == (a.sigma0, a.dof, a.datum)
 
 
-def test_any_symmetric_matrix_comes_back_bit_for_bit() -> None:
-    half = np.random.default_rng().normal(size=(7, 7)) * 10.0 ** np.arange(-12, 9, 3)
+def test_any_symmetric_matrix_comes_back_bit_for_bit(rng: np.random.Generator) -> None:
+    half = rng.normal(size=(7, 7)) * 10.0 ** np.arange(-12, 9, 3)
     matrix = half + half.T
     assert np.array_equal(unpacked(json.loads(json.dumps(packed(matrix)))), matrix)
 
@@ -395,9 +393,9 @@ def test_control_points_are_listed_given_less_adjusted(simulated: Simulated, tmp
     assert "Control points" in page and f"{names[0]} X" in page and re.search(rf"{names[3]}( X)? \(left out\)", page)
 
 
-def test_check_points_of_a_project(simulated: Simulated, tmp_path: Path) -> None:
+def test_check_points_of_a_project(simulated: Simulated, tmp_path: Path, rng: np.random.Generator) -> None:
     """They change nothing; the record, the page and the terminal say by how much they differ; the one that is wrong by 1 mm is named."""
-    rng, truth, names = np.random.default_rng(), simulated.truth.xyz, simulated.network.points
+    truth, names = simulated.truth.xyz, simulated.network.points
     table(tmp_path / "control.csv", "point,X,Y,Z,u_X,u_Y,u_Z", names[:8], *truth[:8].T, *np.full((3, 8), 0.05))
     given = truth[20:32] + rng.normal(0, 0.02, (12, 3))
     given[4, 2] += 1.0
@@ -430,9 +428,9 @@ def test_check_points_of_a_project(simulated: Simulated, tmp_path: Path) -> None
     assert "12 check points with 35 coordinates" in page and "12 check points with 35 coordinates" in " ".join(result.output.split())
 
 
-def test_single_coordinates_may_be_known(simulated: Simulated, tmp_path: Path) -> None:
+def test_single_coordinates_may_be_known(simulated: Simulated, tmp_path: Path, rng: np.random.Generator) -> None:
     """Four whole points, heights and places of others, all with other cells empty; the truth of the other points as exact check points."""
-    rng, truth, names = np.random.default_rng(), simulated.truth.xyz, simulated.network.points
+    truth, names = simulated.truth.xyz, simulated.network.points
     given = np.where(np.arange(12)[:, None] < 4, np.ones(3, bool), [False, False, True])
     given[8:] = [True, True, False]
     values = truth[:12] + rng.normal(0, 0.05, (12, 3))
@@ -454,10 +452,10 @@ def test_single_coordinates_may_be_known(simulated: Simulated, tmp_path: Path) -
     assert check["n"] == check["dof"] == 84 and check["p"] > FALSE_FAILURE and check["chi2"] > chi2.ppf(FALSE_FAILURE, 84) / 1.5
 
 
-def test_colour_images_of_a_project_are_told_which_key_is_meant(tmp_path: Path) -> None:
+def test_colour_images_of_a_project_are_told_which_key_is_meant(tmp_path: Path, rng: np.random.Generator) -> None:
     import cv2
 
-    cv2.imwrite(str(tmp_path / "a.png"), np.random.default_rng().integers(0, 255, (60, 80, 3), np.uint8))
+    cv2.imwrite(str(tmp_path / "a.png"), rng.integers(0, 255, (60, 80, 3), np.uint8))
     path = tmp_path / "p.yaml"
     path.write_text("schema: pixmetry/calibration/1\ncameras: {}\npictures: {files: a.png, grid: 5x4, pitch: 1}\n")
     refused(run(path, "-o", tmp_path / "r"), "`channel: green` under `pictures`")

@@ -19,6 +19,7 @@ from calibrate.test_calibration_images import COLS as BOARD_COLS
 from calibrate.test_calibration_images import FOCAL, View, chessboard
 from calibrate.test_calibration_images import ROWS as BOARD_ROWS
 from calibrate.test_plumb_line import COLS, MM_X, MM_Y, RATE, ROWS, TRUE, imaged, lines
+from chance import rng_of
 from pixmetry.calibrate.bundle.model import CameraModel, Sensor
 from pixmetry.calibrate.exchange import model_of_colmap, read_opencv
 from pixmetry.calibrate.files.record import read_calibration, stored_cameras
@@ -39,12 +40,6 @@ SENSOR = Sensor(782, 582, 8.3, 8.3)
 VISION = {"c": 8.0, "xp": 395.0, "yp": 288.5, "b1": 1e-3, "k1": -0.11, "k2": 0.06, "p1": 5e-4, "p2": -3e-4}
 
 
-def generator() -> np.random.Generator:
-    seed = np.random.SeedSequence().entropy
-    print(f"seed {seed}")
-    return np.random.default_rng(seed)
-
-
 def with_camera(path: Path, cameras: str) -> Path:
     """The same project with another line of cameras."""
     text = path.read_text().splitlines()
@@ -57,23 +52,24 @@ def with_camera(path: Path, cameras: str) -> Path:
 
 
 @pytest.fixture(scope="module")
-def sony(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Simulated]:
+def sony(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Simulated]:
     """A project with a preset, and a calibration of it."""
     folder = tmp_path_factory.mktemp("preset")
-    simulated = simulate(generator(), images=12, points=60, sensor=SENSOR, interior={"k1": -2e-3})
+    simulated = simulate(rng_of(request), images=12, points=60, sensor=SENSOR, interior={"k1": -2e-3})
     path = with_camera(project(folder, simulated.network), f"{{camera: {PRESET}, c_mm: 8}}")
     result = run(path, "-o", folder / "result", "--folds", 0)
     assert result.exit_code == 0, result.output
     return folder, simulated
 
 
-def test_the_preset_with_the_lens_is_a_file_that_sees_what_the_calibration_sees(sony: tuple[Path, Simulated]) -> None:
+def test_the_preset_with_the_lens_is_a_file_that_sees_what_the_calibration_sees(
+    sony: tuple[Path, Simulated], rng: np.random.Generator
+) -> None:
     """Places of directions by the camera file, source by source, against the bundle's one formula: another model of a lens, 0.05 px."""
     folder, _ = sony
     camera, stored = load_camera(folder / "result" / "camera.yaml"), read_calibration(folder / "result")
     assert LENS in camera and AFFINITY in camera and camera.name == load_camera(PRESET).name
     only = camera.switched(on=[LENS, AFFINITY])
-    rng = generator()
     x, y = rng.uniform(20, 760, 200), rng.uniform(20, 560, 200)
     model = stored.cameras[0]
     u, v = model.direction_of(x, y)
@@ -93,8 +89,8 @@ def test_the_file_works_with_simulate(sony: tuple[Path, Simulated], tmp_path: Pa
     assert ran.exit_code == 0, ran.output
 
 
-def test_several_cameras_have_a_file_each(tmp_path: Path) -> None:
-    simulated = simulate(generator(), images=24, points=60, sensor=SENSOR, cameras=2)
+def test_several_cameras_have_a_file_each(tmp_path: Path, rng: np.random.Generator) -> None:
+    simulated = simulate(rng, images=24, points=60, sensor=SENSOR, cameras=2)
     network = simulated.network
     path = with_camera(
         project(tmp_path, network, "images: images.csv\n"),
@@ -111,12 +107,12 @@ def test_several_cameras_have_a_file_each(tmp_path: Path) -> None:
     assert [line.split()[0] for line in cameras] == ["1", "2"] and result.output.count("px are lost") == 4
 
 
-def test_another_pixel_grid_gets_no_camera_file_but_a_reason(tmp_path: Path) -> None:
+def test_another_pixel_grid_gets_no_camera_file_but_a_reason(tmp_path: Path, rng: np.random.Generator) -> None:
     """The grabber's samples are 14.1875/10 pixels apart: pitch 12.20125 µm, 512 × 512."""
     grid = stored_grid(load_camera("pulnix_tm6cn_epix_512"))
     assert (grid.cols, grid.rows) == (512, 512) and grid.pitch_um == pytest.approx((8.6 * 1.41875, 8.3), rel=1e-12)
     sensor = Sensor(512, 512, *grid.pitch_um)
-    simulated = simulate(generator(), images=12, points=40, sensor=sensor)
+    simulated = simulate(rng, images=12, points=40, sensor=sensor)
     path = with_camera(project(tmp_path, simulated.network), "{camera: pulnix_tm6cn_epix_512, c_mm: 8}")
     result = run(path, "-o", tmp_path / "r", "--folds", 0)
     assert result.exit_code == 0 and "No camera.yaml is written" in " ".join(result.output.split()), result.output
@@ -139,18 +135,18 @@ def test_which_presets_store_the_sensors_own_pixels(name: str, pitch: tuple[floa
     assert grid.pitch_um == pytest.approx(pitch, rel=1e-12) and (changed in grid.changed if changed else grid.changed == "")
 
 
-def test_a_model_that_the_sources_cannot_hold_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_model_that_the_sources_cannot_hold_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator) -> None:
     def cannot(*_: object, **__: object) -> Camera:
         raise InputError("the sources' lens cannot hold this model", value="up to 0.2 px apart", remedy="free fewer terms")
 
     monkeypatch.setattr("pixmetry.calibrate.calibrated_camera.calibrated_camera", cannot)
-    simulated = simulate(generator(), images=10, points=30, sensor=SENSOR)
+    simulated = simulate(rng, images=10, points=30, sensor=SENSOR)
     path = with_camera(project(tmp_path, simulated.network), f"{{camera: {PRESET}, c_mm: 8}}")
     result = run(path, "-o", tmp_path / "r", "--folds", 0)
     assert result.exit_code == 0 and "0.2 px apart" in " ".join(result.output.split()) and not (tmp_path / "r" / "camera.yaml").exists()
 
 
-def test_another_size_than_the_presets_is_refused(tmp_path: Path) -> None:
+def test_another_size_than_the_presets_is_refused(tmp_path: Path, rng: np.random.Generator) -> None:
     for k in range(3):
         np.save(tmp_path / f"{k}.npy", np.full((60, 80), 9, np.uint8))
     (tmp_path / "p.yaml").write_text(
@@ -158,16 +154,15 @@ def test_another_size_than_the_presets_is_refused(tmp_path: Path) -> None:
     )
     (tmp_path / "o.csv").write_text("image,point,x_px,y_px\na,1,2,3\n")
     refused(run(tmp_path / "p.yaml", "-o", tmp_path / "r"), "640 x 480", "782 x 582", "line 2")
-    wires = with_wires(tmp_path / "wires.npy", generator(), (400, 300))
+    wires = with_wires(tmp_path / "wires.npy", rng, (400, 300))
     refused(run(wires, "--kind", "lines", "--camera", PRESET, "-o", tmp_path / "r"), "400 x 300", "782 x 582")
     refused(run(wires, "--kind", "lines", "--camera", "no_such", "-o", tmp_path / "r"), "no_such", PRESET)
     assert not (tmp_path / "r").exists()
 
 
-def test_pictures_of_a_board_with_a_camera_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pictures_of_a_board_with_a_camera_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator) -> None:
     """Its pitch makes lengths millimetres, its file comes back with the lens; the same pictures and a larger camera are refused."""
     monkeypatch.chdir(tmp_path)
-    rng = generator()
     for k, (roll, tilt_x, tilt_y) in enumerate([(3, 0, 8), (85, 25, -10), (4, -28, 8), (178, 12, 30), (2, -10, -32), (-88, 20, 24)]):
         np.save(tmp_path / f"board_{k}.npy", View((3.0, 2.0), 11.5, roll, tilt_x, tilt_y).frame(chessboard(7, 5), rng))
     camera = "schema: pixmetry/camera/1\nname: small\nrows: {}\ncols: {}\npitch_x_um: 5\npitch_y_um: 5\nchain:\n"
@@ -187,16 +182,16 @@ def test_pictures_of_a_board_with_a_camera_file(tmp_path: Path, monkeypatch: pyt
 
 
 @pytest.fixture(scope="module")
-def vision(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+def vision(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """A project in vision's direction without shear, which both programs can hold."""
     folder = tmp_path_factory.mktemp("vision")
     interior = {**VISION, "b2": 0.0, "k3": 0.0}
-    simulated = simulate(generator(), images=12, points=60, sensor=SENSOR, direction="object_to_image", interior=interior)
+    simulated = simulate(rng_of(request), images=12, points=60, sensor=SENSOR, direction="object_to_image", interior=interior)
     cameras = "{cols: 782, rows: 582, pitch_um: 8.3, c_mm: 8, direction: object_to_image, free: 'c,xp,yp,b1,p1,p2,k1,k2,k3'}"
     return folder, with_camera(project(folder, simulated.network), cameras)
 
 
-def test_export_without_a_loss_and_the_way_back(vision: tuple[Path, Path], tmp_path: Path) -> None:
+def test_export_without_a_loss_and_the_way_back(vision: tuple[Path, Path], tmp_path: Path, rng: np.random.Generator) -> None:
     """What OpenCV itself projects with the file is what the calibration projects; the files are start values of the next project."""
     folder, path = vision
     result = run(path, "-o", folder / "r", "--folds", 0, "--opencv", folder / "cv.yaml", "--colmap", folder / "cameras.txt")
@@ -204,7 +199,6 @@ def test_export_without_a_loss_and_the_way_back(vision: tuple[Path, Path], tmp_p
     model = read_calibration(folder / "r").cameras[0]
     storage = cv2.FileStorage(str(folder / "cv.yaml"), cv2.FILE_STORAGE_READ)
     k, d = (storage.getNode(name).mat() for name in ("camera_matrix", "distortion_coefficients"))
-    rng = generator()
     points = np.column_stack([rng.uniform(-0.35, 0.35, 100), rng.uniform(-0.25, 0.25, 100), np.ones(100)])
     seen = cv2.projectPoints(points, np.zeros(3), np.zeros(3), k, d)[0].reshape(-1, 2)
     assert np.abs(seen - np.stack(model.project(points[:, 0], points[:, 1]), axis=1)).max() < 1e-7
@@ -224,7 +218,7 @@ def test_export_without_a_loss_and_the_way_back(vision: tuple[Path, Path], tmp_p
     assert np.abs(off / np.sqrt(np.diag(stored.interior_covariance()[1]))[:3]).max() < 0.01
 
 
-def test_a_loss_is_refused_after_the_results_are_written(sony: tuple[Path, Simulated], tmp_path: Path) -> None:
+def test_a_loss_is_refused_after_the_results_are_written(sony: tuple[Path, Simulated], tmp_path: Path, rng: np.random.Generator) -> None:
     """Corrections from image to object, and shear: one line says how much, what to allow, and allowing that is enough."""
     path = sony[0] / "project.yaml"
     arguments = (path, "-o", tmp_path / "r", "--folds", 0, "--opencv", tmp_path / "cv.yaml", "--colmap", tmp_path / "c.txt")
@@ -236,7 +230,7 @@ def test_a_loss_is_refused_after_the_results_are_written(sony: tuple[Path, Simul
     allowed = run(*arguments, "--may-lose-px", enough)
     assert allowed.exit_code == 0 and "px are lost" in allowed.output, allowed.output
     model, written = read_calibration(tmp_path / "r").cameras[0], read_opencv(tmp_path / "cv.yaml")
-    x, y = generator().uniform([0, 0], [781, 581], (100, 2)).T
+    x, y = rng.uniform([0, 0], [781, 581], (100, 2)).T
     away = np.hypot(*(np.array(written.project(*model.direction_of(x, y))) - [x, y]))
     assert away.max() <= 1.05 * float(enough)
     line = [line for line in (tmp_path / "c.txt").read_text().splitlines() if not line.startswith("#")][0]
@@ -303,13 +297,13 @@ def test_start_values_that_cannot_be_used_are_told(tmp_path: Path, camera: str, 
 
 
 @pytest.mark.parametrize("direction", ["image_to_object", "object_to_image"])
-def test_start_values_take_another_pitch(direction: str) -> None:
+def test_start_values_take_another_pitch(direction: str, rng: np.random.Generator) -> None:
     """From pixels to µm: the same places of the same directions. What is round in pixels is so in mm only if they are square."""
     lens = {"k1": -0.08, "k2": 0.02, "p1": 4e-4, "p2": 2e-4} if direction == "object_to_image" else {"k1": 8e-8, "p1": 4e-7}
     model = CameraModel.of(Sensor(752, 582), direction, c=1000.0, xp=370.0, yp=293.0, b1=1e-3, b2=-5e-4, **lens)
     pitch = (8.6, 8.3) if direction == "object_to_image" else (8.3, 8.3)
     moved = on_sensor(model, Sensor(752, 582, *pitch), direction)
-    x, y = generator().uniform([0, 0], [751, 581], (200, 2)).T
+    x, y = rng.uniform([0, 0], [751, 581], (200, 2)).T
     assert moved.sensor.unit == "mm" and moved["c"] == pytest.approx(8.3, rel=0.01)
     off = np.hypot(*(np.array(moved.project(*model.direction_of(x, y))) - [x, y])).max()
     assert off < (1e-6 if direction == "object_to_image" else 0.02)
@@ -328,9 +322,9 @@ def line_project(folder: Path, positions: dict[str, np.ndarray], more: str = "",
 
 
 @pytest.fixture(scope="module")
-def wires(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+def wires(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     folder = tmp_path_factory.mktemp("wires")
-    positions = lines(generator(), (0.06, 0.04))
+    positions = lines(rng_of(request), (0.06, 0.04))
     positions["x_px"][100] += 5.0
     positions["y_px"][100] += 5.0
     result = run(line_project(folder, positions), "-o", folder / "r")
@@ -368,14 +362,14 @@ def test_files_page_and_summary_of_lines(wires: tuple[Path, str]) -> None:
         assert record["axes"][axis]["rms_px"] == pytest.approx(np.sqrt(v @ v / record["axes"][axis]["dof"]["positions"]), rel=1e-6)
 
 
-def test_the_curve_is_brown_with_its_band(wires: tuple[Path, str]) -> None:
+def test_the_curve_is_brown_with_its_band(wires: tuple[Path, str], rng: np.random.Generator) -> None:
     calibration = pixmetry.calibrate(wires[0] / "lines.yaml")
     assert isinstance(calibration, LineCalibration)
     camera, curves = calibration.camera(), calibration.curves()
     r = curves["radius"]
     assert r[-1] == pytest.approx(np.hypot(COLS * MM_X, ROWS * MM_Y) / 2)
     np.testing.assert_allclose(curves["radial"], camera["k1"] * r**3 + camera["k2"] * r**5, rtol=1e-12, atol=1e-15)
-    draws = generator().multivariate_normal(calibration.result.estimates.values, calibration.result.estimates.covariance, 4000)
+    draws = rng.multivariate_normal(calibration.result.estimates.values, calibration.result.estimates.covariance, 4000)
     at = {name: draws[:, calibration.result.free.index(name)] for name in ("k1", "k2")}
     spread = np.std(at["k1"] * r[-1] ** 3 + at["k2"] * r[-1] ** 5)
     assert curves["u_radial"][-1] == pytest.approx(spread, rel=5 / np.sqrt(2 * 4000))
@@ -424,9 +418,8 @@ def with_wires(path: Path, rng: np.random.Generator, size: tuple[int, int] = (CO
     return path
 
 
-def test_pictures_of_wires_give_the_lens(tmp_path: Path) -> None:
+def test_pictures_of_wires_give_the_lens(tmp_path: Path, rng: np.random.Generator) -> None:
     """Located without being told anything: four parameters cover their truth, which they know to 0.001 px in the corner."""
-    rng = generator()
     files = [with_wires(tmp_path / "a.npy", rng), with_wires(tmp_path / "b.npy", rng, steep=False)]
     result = run(*files, "--kind", "lines", "--camera", "pulnix_tm6cn", "-o", tmp_path / "r")
     assert result.exit_code == 0 and "No camera.yaml" in result.output, result.output
@@ -456,14 +449,16 @@ def test_pictures_of_wires_give_the_lens(tmp_path: Path) -> None:
         ("", ("--free", "k9"), ("k9", "k5")),
     ],
 )
-def test_what_has_no_meaning_with_lines_is_told(tmp_path: Path, more: str, arguments: tuple[str, ...], words: tuple[str, ...]) -> None:
-    path = line_project(tmp_path, lines(generator(), n=5, count=3), more)
+def test_what_has_no_meaning_with_lines_is_told(
+    tmp_path: Path, more: str, arguments: tuple[str, ...], words: tuple[str, ...], rng: np.random.Generator
+) -> None:
+    path = line_project(tmp_path, lines(rng, n=5, count=3), more)
     refused(run(path, "-o", tmp_path / "r", *arguments), *words)
     assert not (tmp_path / "r").exists()
 
 
-def test_a_stray_position_outside_of_the_frame_is_told_and_rejected(tmp_path: Path) -> None:
-    positions = lines(generator())
+def test_a_stray_position_outside_of_the_frame_is_told_and_rejected(tmp_path: Path, rng: np.random.Generator) -> None:
+    positions = lines(rng)
     positions["x_px"][7] = 5000
     assert run(line_project(tmp_path, positions), "-o", tmp_path / "r").exit_code == 0
     record = json.loads((tmp_path / "r" / "calibration.json").read_text())
@@ -473,18 +468,21 @@ def test_a_stray_position_outside_of_the_frame_is_told_and_rejected(tmp_path: Pa
     assert rows[8].split(",")[rows[0].split(",").index("used")] == "0"
 
 
-def test_mistakes_in_tables_and_pictures_of_lines_are_told(tmp_path: Path) -> None:
-    positions = lines(generator(), n=5, count=3)
+def test_mistakes_in_tables_and_pictures_of_lines_are_told(tmp_path: Path, rng: np.random.Generator) -> None:
+    positions = lines(rng, n=5, count=3)
     path = line_project(tmp_path, positions, header="image,wire,x_px,y_px")
     refused(run(path, "-o", tmp_path / "r"), "lines.csv", "'line' is missing")
     positions["x_px"][::3] = 5000
     refused(run(line_project(tmp_path, positions), "-o", tmp_path / "r"), "lines.csv, line 2", "outside of the frame")
-    np.save(tmp_path / "dark.npy", np.random.default_rng().integers(90, 110, (120, 160)).astype(np.uint8))
+    np.save(tmp_path / "dark.npy", rng.integers(90, 110, (120, 160)).astype(np.uint8))
     dark = (tmp_path / "dark.npy", "--kind", "lines", "-o", tmp_path / "r")
     refused(run(*dark), "no line is found")
     refused(run(*dark, "--grid", "9x6"), "`grid` has no meaning with straight lines")
-    one = lines(generator(), n=20, directions=("x",))
+    one = lines(rng, n=20, directions=("x",))
     with pytest.raises(MeasureError, match="do not determine"):
         pixmetry.calibrate(line_project(tmp_path, one))
-    refused(run(line_project(tmp_path, lines(generator())), "-o", tmp_path / "r", "--opencv", tmp_path / "cv.yaml"), "principal distance")
+    refused(
+        run(line_project(tmp_path, lines(rng)), "-o", tmp_path / "r", "--opencv", tmp_path / "cv.yaml"),
+        "principal distance",
+    )
     assert (tmp_path / "r" / "report.html").is_file() and not (tmp_path / "cv.yaml").exists()

@@ -20,14 +20,6 @@ SOFT = 0.006  # width of a sample on the board, in pitches
 Paint = Callable[[np.ndarray, np.ndarray], np.ndarray]  # (x, y) on the board, pitch 1, to the light from 0 to 1
 
 
-@pytest.fixture
-def rng() -> np.random.Generator:
-    """Other draws in every run; the seed is printed where a test fails."""
-    seed = int(np.random.SeedSequence().entropy % 2**32)
-    print("seed", seed)
-    return np.random.default_rng(seed)
-
-
 def rotation(roll_deg: float, tilt_x_deg: float, tilt_y_deg: float) -> np.ndarray:
     a, b, c = np.radians([tilt_x_deg, tilt_y_deg, roll_deg])
     about_x = np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]])
@@ -292,5 +284,3 @@ def test_each_dot_has_its_coordinates_and_their_covariance(rng: np.random.Genera
 def test_options_that_cannot_be_used_are_refused(kind: str, options: dict, what: str) -> None:
     with pytest.raises(InputError, match=what):
         observations_of([np.zeros((50, 50), np.uint8)] * 3, kind, **options)
-
-

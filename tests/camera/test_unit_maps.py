@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import secrets
 import shutil
 
 import numpy as np
@@ -18,12 +17,10 @@ from pixmetry.simulate.job import simulate
 
 SHAPE = (48, 64)
 PHOTONS = 4000.0
-SEED = secrets.randbits(32)
 
 
-def measured() -> Camera:
+def measured(rng: np.random.Generator) -> Camera:
     """A camera without temporal noise, so that its frames are what its maps say."""
-    rng = np.random.default_rng(SEED)
     chain = {
         "optics.shading": ({"gradient_x_per_px": 1e-3}, {"light_rel": rng.uniform(0.9, 1.1, SHAPE).astype(np.float32)}),
         "sensor.prnu": ({"pixel_std_rel": 0.01}, {"response_dev_rel": rng.normal(0, 0.01, SHAPE).astype(np.float16)}),
@@ -54,21 +51,21 @@ def frame(camera: Camera, **kw) -> np.ndarray:
     return camera.expose(Uniform(PHOTONS), **kw).data
 
 
-def test_the_measured_unit_makes_what_its_maps_say():
-    camera = measured()
+def test_the_measured_unit_makes_what_its_maps_say(rng: np.random.Generator):
+    camera = measured(rng)
     shown = frame(camera)[0].astype(int)
     off = shown - expected(camera)
-    assert np.abs(off).max() <= 1 and np.mean(off != 0) < 5e-3, SEED  # float32 on the edge between two codes
+    assert np.abs(off).max() <= 1 and np.mean(off != 0) < 5e-3  # float32 on the edge between two codes
 
 
-def test_a_window_equals_the_crop_bit_for_bit():
-    camera = measured()
+def test_a_window_equals_the_crop_bit_for_bit(rng: np.random.Generator):
+    camera = measured(rng)
     whole = frame(camera, frames=3)
     assert np.array_equal(frame(camera, frames=3, window=(3, 5, 20, 40)), whole[:, 3:23, 5:45])
 
 
-def test_another_unit_is_another_camera_of_the_type_and_may_have_another_size():
-    camera = measured()
+def test_another_unit_is_another_camera_of_the_type_and_may_have_another_size(rng: np.random.Generator):
+    camera = measured(rng)
     one, two = (frame(changed_camera(camera, {"unit_seed": k})) for k in (1, 2))
     assert not np.array_equal(one, two) and not np.array_equal(one, frame(camera))
     drawn = Camera("drawn", SHAPE, tuple(Element(e.name, e.source, e.params) for e in camera.chain), unit_seed=1)
@@ -76,19 +73,19 @@ def test_another_unit_is_another_camera_of_the_type_and_may_have_another_size():
     assert frame(changed_camera(camera, {"unit_seed": 1, "rows": 60})).shape == (1, 60, 64)
 
 
-def test_the_measured_unit_has_the_size_of_its_maps():
+def test_the_measured_unit_has_the_size_of_its_maps(rng: np.random.Generator):
     with pytest.raises(InputError, match="48 × 64.*unit_seed"):
-        frame(changed_camera(measured(), {"rows": 60}))
+        frame(changed_camera(measured(rng), {"rows": 60}))
 
 
-def test_a_map_goes_with_the_parameters_that_it_stands_for():
-    camera = measured()
+def test_a_map_goes_with_the_parameters_that_it_stands_for(rng: np.random.Generator):
+    camera = measured(rng)
     other = changed_camera(camera, {"sensor.prnu.pixel_std_rel": 0.0, "grabber.adc.offset_dn": 10.0})
     assert not other["sensor.prnu"].maps and other["grabber.adc"].maps and other["sensor.dsnu"].maps
 
 
-def test_the_folder_may_be_moved_and_each_file_is_checked(tmp_path):
-    camera = measured()
+def test_the_folder_may_be_moved_and_each_file_is_checked(tmp_path, rng: np.random.Generator):
+    camera = measured(rng)
     (tmp_path / "made").mkdir()
     camera.save(tmp_path / "made" / "camera.yaml")
     shutil.move(tmp_path / "made", tmp_path / "moved")
@@ -118,18 +115,18 @@ def test_the_folder_may_be_moved_and_each_file_is_checked(tmp_path):
         load_camera(file)
 
 
-def test_a_map_that_a_source_does_not_know_is_refused():
-    record = measured().to_record()
+def test_a_map_that_a_source_does_not_know_is_refused(rng: np.random.Generator):
+    record = measured(rng).to_record()
     record["chain"][1]["maps"] |= {"nonsense": "sha256:0"}
     with pytest.raises(InputError, match="maps of this camera"):
         build_camera(record)
-    element = measured()["sensor.prnu"]
+    element = measured(rng)["sensor.prnu"]
     with pytest.raises(InputError, match="nonsense.*response_dev_rel"):
         Camera("c", SHAPE, (Element("sensor.prnu", element.source, element.params, maps={"nonsense": np.zeros(SHAPE)}),))
 
 
-def test_a_simulation_writes_the_maps_and_its_camera_makes_the_same_frames(tmp_path):
-    measured().save(tmp_path / "camera.yaml")
+def test_a_simulation_writes_the_maps_and_its_camera_makes_the_same_frames(tmp_path, rng: np.random.Generator):
+    measured(rng).save(tmp_path / "camera.yaml")
     scene = {"schema": "pixmetry/scene/1", "uniform": {"level_photons": PHOTONS}}
     first = simulate(tmp_path / "camera.yaml", scene, tmp_path / "one", window=(4, 4, 30, 30), truth=True)
     second = simulate(first / "camera.yaml", scene, tmp_path / "two")

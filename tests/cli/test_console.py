@@ -35,11 +35,11 @@ def test_a_console_draws_its_own_colours_and_no_others() -> None:
     assert r"\x1b[2Jb" in out.getvalue()
 
 
-def test_a_spreadsheet_computes_nothing_and_names_come_back(tmp_path: Path) -> None:
+def test_a_spreadsheet_computes_nothing_and_names_come_back(tmp_path: Path, rng: np.random.Generator) -> None:
     """Names of points and images of a calibration, and of images of a table of positions."""
     from dataclasses import replace
 
-    network = simulate(np.random.default_rng(), images=4, points=len(EVIL)).network
+    network = simulate(rng, images=4, points=len(EVIL)).network
     images = tuple(EVIL[: len(network.images)])
     calibration = calibrate(replace(network, points=tuple(EVIL), images=images))
     for name, text, column, wanted in (

@@ -5,7 +5,6 @@ Statistical tests draw a fresh seed at every run. Each fails by chance with a pr
 
 from __future__ import annotations
 
-import secrets
 from concurrent.futures import ThreadPoolExecutor
 from itertools import combinations
 
@@ -25,9 +24,8 @@ WORD = np.uint64(0xFFFFFFFF)
 
 
 @pytest.fixture
-def stream() -> Stream:
-    seed = secrets.randbits(62)
-    print("seed", seed)  # shown by pytest when the test fails
+def stream(rng: np.random.Generator) -> Stream:
+    seed = int(rng.integers(2**62))
     return Streams(seed, seed + 1).of("sensor.shot_noise")
 
 
@@ -155,9 +153,8 @@ def quantiles(mean: np.ndarray, numerator: np.ndarray) -> tuple[np.ndarray, np.n
     return exact, np.array(fast)
 
 
-def test_poisson_quantile_far_into_both_tails() -> None:
+def test_poisson_quantile_far_into_both_tails(rng: np.random.Generator) -> None:
     """Means from 1e-4 to 1e5, out to 8 standard deviations, checked against the incomplete gamma function."""
-    rng = np.random.default_rng()
     mean = np.exp(rng.uniform(np.log(1e-4), np.log(1e5), 8000)).astype(np.float32)
     z = rng.uniform(-8, 8, mean.size)
     tail = (special.ndtr(-np.abs(z)) * 2**53).astype(np.int64) | 1
@@ -168,9 +165,8 @@ def test_poisson_quantile_far_into_both_tails() -> None:
     np.testing.assert_array_equal(fast[decided], exact[decided])
 
 
-def test_poisson_quantile_at_the_steps() -> None:
+def test_poisson_quantile_at_the_steps(rng: np.random.Generator) -> None:
     """Numbers within 1e-9 of a step of the distribution, where a rounded expansion would miss; below 5 standard deviations."""
-    rng = np.random.default_rng()
     mean = np.exp(rng.uniform(np.log(0.1), np.log(1e6), 8000)).astype(np.float32)
     count = np.maximum(np.rint(mean + rng.uniform(-4, 4, mean.size) * np.sqrt(mean)), 0)
     step = special.gammaincc(count + 1, mean.astype(float)) * (1 + rng.choice([-1e-9, 1e-9], mean.size))
@@ -204,10 +200,9 @@ def test_poisson_refuses_what_is_no_mean(stream: Stream, mean: float) -> None:
         stream.poisson(means, window(0, 0, 0, (8, 8)))
 
 
-def test_stat_independent_draws() -> None:
+def test_stat_independent_draws(rng: np.random.Generator) -> None:
     """Correlations of numbers and of their squares over 2.5e5 pixels: catches a coefficient of 0.016."""
-    seed = secrets.randbits(60)
-    print("seed", seed)
+    seed = int(rng.integers(2**60))
     one, other = Streams(seed, seed).of("a"), Streams(seed + 1, seed + 1).of("a")
     named = Streams(seed, seed).of("b")
     grid = window(0, 0, 0, (500, 500))

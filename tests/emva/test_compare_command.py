@@ -6,7 +6,6 @@ import copy
 import json
 import math
 import re
-import secrets
 from pathlib import Path
 
 import numpy as np
@@ -28,19 +27,13 @@ ALPHA = 1e-6  # false failures of the statistical tests
 A = {"K": (0.2800, 0.0002), "sigma_d": (10.90, 0.03), "DSNU1288": (0.55, 0.04), "QE": (45.2, 1.4), "PRNU1288": (0.4327, 0.0005)}
 
 
-def rng() -> np.random.Generator:
-    seed = secrets.randbits(40)
-    print("seed", seed)
-    return np.random.Generator(np.random.Philox(seed))
-
-
 def verdicts(result: Comparison) -> dict[str, str]:
     return {row.key: row.verdict for row in result.rows}
 
 
-def test_published_welch_test() -> None:
+def test_published_welch_test(rng: np.random.Generator) -> None:
     """Difference, degrees of freedom and chance are those of Welch's test on the readings themselves (SciPy)."""
-    draw = rng()
+    draw = rng
     for n, m in ((4, 9), (30, 5), (2, 2)):
         x, y = draw.normal(0, 1, n), draw.normal(0.5, 3, m)
         sheets = [measured({"K": (float(v.mean()), float(v.std(ddof=1) / math.sqrt(len(v))))}, dof=len(v) - 1.0) for v in (x, y)]
@@ -69,8 +62,8 @@ def test_identity_of_copies(tmp_path: Path) -> None:
         assert {row.verdict for row in result.rows} <= {"same", "equal"}
 
 
-def test_holm_is_the_step_down_of_its_definition() -> None:
-    draw = rng()
+def test_holm_is_the_step_down_of_its_definition(rng: np.random.Generator) -> None:
+    draw = rng
     for _ in range(200):
         p = draw.uniform(size=7) ** 4
         expected = set()
@@ -92,13 +85,13 @@ def test_keys_that_say_the_same_are_one_decision() -> None:
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.8])
-def test_stat_false_alarms_are_as_rare_as_promised(rho: float) -> None:
+def test_stat_false_alarms_are_as_rare_as_promised(rho: float, rng: np.random.Generator) -> None:
     """One camera measured twice, 1500 times, 20 values, correlated or not: at most 5 % of the comparisons see a change.
 
     Of independent values the rate is 4.9 %, so there it is tested from both sides. Catches with 99 %: a u of the difference that is 8 % too
     small or 12 % too large.
     """
-    draw = rng()
+    draw = rng
     keys = [key for key in KEYS if key not in SAME_THING and not key.startswith("index_")][:20]
     alarms, trials = 0, 1500
     for _ in range(trials):
@@ -180,22 +173,22 @@ def fleet(draw: np.random.Generator, n: int, keys: int = 12) -> list[DataSheet]:
 
 
 @pytest.mark.parametrize("n", [5, 12])
-def test_stat_fleet_of_equals_has_no_odd_one(n: int) -> None:
+def test_stat_fleet_of_equals_has_no_odd_one(n: int, rng: np.random.Generator) -> None:
     """Of 300 normal fleets at most 5 % have a camera that stands out. Catches with 99 %: a spread of 12 cameras that is 25 % too small."""
-    draw = rng()
+    draw = rng
     alarms = sum(not compare_fleet(fleet(draw, n)).same for _ in range(300))
     assert stats.binomtest(alarms, 300, 0.05, "greater").pvalue > ALPHA, alarms
 
 
-def test_stat_spread_is_the_standard_deviation() -> None:
+def test_stat_spread_is_the_standard_deviation(rng: np.random.Generator) -> None:
     """Of 3000 cameras: the standard error of three quarters of the distances is 1.7 %. Catches with 99 %: a factor wrong by 13 %."""
-    for row in compare_fleet(fleet(rng(), 3000, 2)).rows:
+    for row in compare_fleet(fleet(rng, 3000, 2)).rows:
         assert abs(row.spread - 1.0) < 5.1 * 0.91 / math.sqrt(3000), row.spread
 
 
-def test_fleet_names_the_odd_one() -> None:
+def test_fleet_names_the_odd_one(rng: np.random.Generator) -> None:
     """Two of twelve cameras are far off in one value, and do not hide each other; the others have it as evenly as none stands out."""
-    sheets = fleet(rng(), 12)
+    sheets = fleet(rng, 12)
     for i, old in enumerate(sheets):
         even = 60.0 if i in (3, 7) else 10.0 + float(stats.norm.ppf((i + 0.5) / 12))
         values = old.results[0].values
@@ -385,8 +378,8 @@ def test_command_shows_names_as_they_are(tmp_path: Path) -> None:
     assert "[red]x.json" in output and "K [R]" in output and "K [B]" in output
 
 
-def test_command_finds_who_stands_out(tmp_path: Path) -> None:
-    sheets = fleet(rng(), 9)
+def test_command_finds_who_stands_out(tmp_path: Path, rng: np.random.Generator) -> None:
+    sheets = fleet(rng, 9)
     sheets[4] = sheet({**sheets[4].results[0].values, "K": value(90.0, 0.1, unit="DN/e⁻")})
     paths = [written(s, tmp_path / f"c{i}.json") for i, s in enumerate(sheets)]
     result = run(*paths, "--json", tmp_path / "out.json")

@@ -15,6 +15,7 @@ from functools import cached_property
 import numpy as np
 import pytest
 
+from chance import rng_of
 from emva.cameras import Camera
 from emva.scoring import measured
 from pixmetry.emva.evaluate import evaluate
@@ -84,8 +85,8 @@ LOG = CurvedCamera(seed=1, curve=log_curve, offset_dn=100.0, out_dn=1.0, **COMMO
 GAMMA = CurvedCamera(seed=2, curve=gamma_curve, offset_dn=60.0, full_well_e=9000.0, **COMMON)
 
 
-def fresh(camera: CurvedCamera) -> CurvedCamera:
-    return replace(camera, seed=int(np.random.default_rng().integers(2**31)))
+def fresh(rng: np.random.Generator, camera: CurvedCamera) -> CurvedCamera:
+    return replace(camera, seed=int(rng.integers(2**31)))
 
 
 def sheet(camera: Camera, release: str = "4.0") -> Results:
@@ -96,8 +97,9 @@ def sheet(camera: Camera, release: str = "4.0") -> Results:
 
 
 @pytest.fixture(scope="module")
-def sheets() -> dict[str, tuple[CurvedCamera, Results]]:
-    cameras = {"log": fresh(LOG), "gamma": fresh(GAMMA)}
+def sheets(request: pytest.FixtureRequest) -> dict[str, tuple[CurvedCamera, Results]]:
+    rng = rng_of(request)
+    cameras = {"log": fresh(rng, LOG), "gamma": fresh(rng, GAMMA)}
     return {name: (camera, sheet(camera)) for name, camera in cameras.items()}
 
 
@@ -149,20 +151,20 @@ def test_a_threshold_far_below_the_darkest_level_is_an_upper_limit(sheets: dict,
 
 
 @pytest.mark.parametrize("release", RELEASES)
-def test_every_release_says_so(release: str) -> None:
-    values = sheet(fresh(LOG), release).values
+def test_every_release_says_so(release: str, rng: np.random.Generator) -> None:
+    values = sheet(fresh(rng, LOG), release).values
     assert math.isnan(values["K"].value) and values["K"].reason == REASON
     assert values["sigma_y_dark"].value == pytest.approx(math.sqrt(1 + 1 / 12), rel=0.05)
 
 
-def test_linear_and_gently_bent_cameras_are_not_taken_for_curved() -> None:
+def test_linear_and_gently_bent_cameras_are_not_taken_for_curved(rng: np.random.Generator) -> None:
     """A bend of 10 % leaves the variance growing; 20 cameras of each kind, dim and noisy ones too."""
     taken = 0
-    for seed in np.random.default_rng().integers(2**31, size=20):
+    for seed in rng.integers(2**31, size=20):
         for curve, brightest, read in ((straight_curve, 26_000.0, 5.0), (bent_curve, 20_000.0, 5.0), (straight_curve, 100.0, 20.0)):
             camera = CurvedCamera(
                 seed=int(seed), curve=curve, brightest=brightest, **{**COMMON, "read_e": read, "shape": (24, 32), "levels": 10}
             )
             taken += is_curved(series_of(measured(camera)))
     assert taken <= 4  # of 60 with a chance of 1e-3 each, more are rarer than 1e-6
-    assert is_curved(series_of(measured(fresh(LOG)))) and is_curved(series_of(measured(fresh(GAMMA))))
+    assert is_curved(series_of(measured(fresh(rng, LOG)))) and is_curved(series_of(measured(fresh(rng, GAMMA))))

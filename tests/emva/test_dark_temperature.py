@@ -24,9 +24,9 @@ def draw(rng: np.random.Generator, scatter: float = 1.0) -> tuple[np.ndarray, np
     return law(T) + scatter * u * rng.standard_normal(T.size), u
 
 
-def test_recovers_the_law_within_its_u():
+def test_recovers_the_law_within_its_u(rng: np.random.Generator):
     """z by Kolmogorov–Smirnov and χ² of both values together, ALPHA each: 500 draws catch a bias of 0.25 u and an u that is 17 % off."""
-    rng, z, d2 = np.random.default_rng(), [], []
+    z, d2 = [], []
     want = np.array([CURRENT, STEP])
     for _ in range(500):
         y, u = draw(rng)
@@ -41,9 +41,8 @@ def test_recovers_the_law_within_its_u():
     assert low < np.sum(d2) < high
 
 
-def test_is_the_weighted_least_squares_fit():
+def test_is_the_weighted_least_squares_fit(rng: np.random.Generator):
     """SciPy's curve_fit on the law as it is written, with its covariance."""
-    rng = np.random.default_rng()
     y, u = draw(rng)
     got = fit_dark_temperature(T, y, u, reference_c=10.0)
     p, covariance = optimize.curve_fit(
@@ -56,9 +55,9 @@ def test_is_the_weighted_least_squares_fit():
     np.testing.assert_allclose(law_at(got, np.array([10.0, 40.0]), reference_c=10.0), [got.values[0], other.value], rtol=1e-9)
 
 
-def test_scatter_beyond_the_stated_u_widens_it():
+def test_scatter_beyond_the_stated_u_widens_it(rng: np.random.Generator):
     """Currents that scatter 2000 times as much: t of n − 2 with the widened u; Kolmogorov–Smirnov, ALPHA."""
-    rng, t = np.random.default_rng(), []
+    t = []
     for _ in range(300):
         y, u = law(T) * (1 + 0.02 * rng.standard_normal(T.size)), 1e-5 * law(T)
         got = fit_dark_temperature(T, y, u, reference_c=REFERENCE)["doubling_temperature_k"]

@@ -11,6 +11,7 @@ import pytest
 from click.testing import CliRunner, Result
 from scipy import stats
 
+from chance import rng_of
 from pixmetry import emva1288
 from pixmetry.cli import main
 from pixmetry.core.errors import InputError
@@ -43,9 +44,10 @@ def refused(result: Result, *words: str) -> None:
         assert word in lines[0], result.output
 
 
-def camera(folder: Path, *, gain: float = GAIN, temperature_c: float | None = None, mosaic: bool = False, facts: str = "") -> Path:
+def camera(
+    rng: np.random.Generator, folder: Path, *, gain: float = GAIN, temperature_c: float | None = None, mosaic: bool = False, facts: str = ""
+) -> Path:
     """Frames of a linear camera with shot noise, dark noise of 8 e-, 1 % PRNU and a dark current that doubles every 7 K; its manifest."""
-    rng = np.random.default_rng()
     efficiency = np.full(SHAPE, 0.5)
     if mosaic:  # RGGB
         for k, channel in enumerate(("R", "Gr", "Gb", "B")):
@@ -72,8 +74,8 @@ def camera(folder: Path, *, gain: float = GAIN, temperature_c: float | None = No
 
 
 @pytest.fixture(scope="module")
-def known(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return camera(tmp_path_factory.mktemp("known") / "mono")
+def known(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return camera(rng_of(request), tmp_path_factory.mktemp("known") / "mono")
 
 
 def test_prints_values_with_uncertainties_and_writes_all_files(known: Path, tmp_path: Path) -> None:
@@ -106,9 +108,9 @@ def test_the_packaged_example_needs_no_argument() -> None:
     assert done.exit_code == 0 and "EMVA 1288" in done.output and "<" in done.output and "Note: " in done.output, done.output
 
 
-def test_a_mosaic_camera_is_tested_phase_by_phase(tmp_path: Path) -> None:
+def test_a_mosaic_camera_is_tested_phase_by_phase(tmp_path: Path, rng: np.random.Generator) -> None:
     """Quantum efficiencies of the four phases; each from 768 pixels: u about 1.5 %, ten times that is caught."""
-    path = camera(tmp_path / "mosaic", mosaic=True, facts="  cfa: RGGB")
+    path = camera(rng, tmp_path / "mosaic", mosaic=True, facts="  cfa: RGGB")
     done = run(path, "--json", tmp_path / "a.json")
     assert done.exit_code == 0 and "Channel Gb" in done.output, done.output
     found = {r.channel: r.values["QE"].value / 100 for r in read_sheet(tmp_path / "a.json").results}
@@ -130,9 +132,9 @@ def test_a_bootstrap_gives_uncertainties_of_its_own(known: Path) -> None:
     assert "dof: frames of a stack less one" in drawn["DSNU1288"].method and "Monte Carlo" not in drawn["K"].method
 
 
-def test_dark_current_against_temperature(tmp_path: Path) -> None:
+def test_dark_current_against_temperature(tmp_path: Path, rng: np.random.Generator) -> None:
     """The doubling step of 7 K within 6 u and 3 %."""
-    paths = [camera(tmp_path / f"t{t}", temperature_c=t) for t in (35, 20, 28)]
+    paths = [camera(rng, tmp_path / f"t{t}", temperature_c=t) for t in (35, 20, 28)]
     done = run(*paths, "--json", tmp_path / "a.json", "--xml", tmp_path / "a.xml")
     assert done.exit_code == 0, done.output
     assert "\nT_d " in done.output and "\nu_I_ref " in done.output and "at 35 °C" in done.output
@@ -172,9 +174,9 @@ def test_temperatures_are_checked_before_the_work(known: Path, tmp_path: Path, m
     refused(run(*paths, mosaic), "another camera", "colour filter", "mosaic")
 
 
-def test_a_mosaic_camera_is_looked_at_and_planned_for_phase_by_phase(tmp_path: Path) -> None:
+def test_a_mosaic_camera_is_looked_at_and_planned_for_phase_by_phase(tmp_path: Path, rng: np.random.Generator) -> None:
     """Phases are flat: no pattern of columns from the filter; the green that saturates first is planned for, with its own pixels."""
-    path = camera(tmp_path / "mosaic", mosaic=True)
+    path = camera(rng, tmp_path / "mosaic", mosaic=True)
     looks = preflight_campaign(load_campaign(path), "RGGB")
     assert list(looks) == ["R", "Gr", "Gb", "B"]
     for channel, look in looks.items():
@@ -198,13 +200,13 @@ def test_a_mosaic_camera_is_looked_at_and_planned_for_phase_by_phase(tmp_path: P
     refused(run("--plan", tmp_path / "a.json", "--bayer", "RGGB", "--u-gain", 0.5), "--bayer", "no meaning with a data sheet")
 
 
-def test_a_preflight_looks_at_the_stacks_that_a_test_takes(tmp_path: Path) -> None:
+def test_a_preflight_looks_at_the_stacks_that_a_test_takes(tmp_path: Path, rng: np.random.Generator) -> None:
     """Of two pairs of stacks the longer one with more frames saturates."""
-    path = camera(tmp_path / "two")
+    path = camera(rng, tmp_path / "two")
     folder, text = path.parent, path.read_text()
     for kind, level in (("dark", int(OFFSET)), ("bright", 4095)):
         names = [f"{kind}x_{k}.npy" for k in range(STACK + 4)]
-        noise = np.random.default_rng().normal(0, 2, (len(names), *SHAPE))
+        noise = rng.normal(0, 2, (len(names), *SHAPE))
         for name, frame in zip(names, np.clip(np.rint(level + noise), 0, 4095).astype(np.uint16), strict=True):
             np.save(folder / name, frame)
         light = f", photons: {1.1 * PHOTONS_PER_S}" if kind == "bright" else ""
@@ -218,8 +220,8 @@ def test_a_preflight_looks_at_the_stacks_that_a_test_takes(tmp_path: Path) -> No
     assert m.bright_stack.fraction_max < 0.01
 
 
-def test_compare_says_what_differs(known: Path, tmp_path: Path) -> None:
-    other = camera(tmp_path / "other", gain=1.2 * GAIN)
+def test_compare_says_what_differs(known: Path, tmp_path: Path, rng: np.random.Generator) -> None:
+    other = camera(rng, tmp_path / "other", gain=1.2 * GAIN)
     for name, path in (("a.json", known), ("b.json", other)):
         assert run(path, "--json", tmp_path / name).exit_code == 0
     same = run("--compare", tmp_path / "a.json", tmp_path / "a.json")

@@ -98,9 +98,8 @@ def spoilt(extra_e: np.ndarray) -> Measurement:
 
 
 @pytest.mark.parametrize("release", RELEASES)
-def test_hot_pixels_that_clip_in_the_light_leave_no_limit_of_the_prnu(release: str) -> None:
+def test_hot_pixels_that_clip_in_the_light_leave_no_limit_of_the_prnu(release: str, rng: np.random.Generator) -> None:
     """1 % of the pixels have 9000 e⁻ more: full in the light. s²_y − s²_y.dark is then thousands of u below zero, PRNU is 1.1 %."""
-    rng = np.random.default_rng()
     values = standard_values(spoilt(9000.0 * (rng.random((64, 96)) < 0.01)), release, draws=300).values
     for key in ("PRNU1288", "PRNU1288_pixel"):
         assert math.isnan(values[key].value) and not values[key].is_upper_limit
@@ -132,24 +131,24 @@ def test_a_wave_across_the_frame_leaves_no_limit_of_rows_and_columns(release: st
     assert values["DSNU1288_pixel"].value == pytest.approx(math.hypot(60 / math.sqrt(2), 1.0), rel=0.02)
 
 
-def test_no_wave_is_seen_in_pixels_that_are_independent() -> None:
+def test_no_wave_is_seen_in_pixels_that_are_independent(rng: np.random.Generator) -> None:
     """Strong patterns of pixels alone, 25 sensors: by chance rows come out at −5 u and less, for u is that of measuring this sensor again.
 
     Four chances of 3e-7 a sensor.
     """
-    for seed in np.random.default_rng().integers(2**31, size=25):
+    for seed in rng.integers(2**31, size=25):
         quick = {"shape": (48, 64), "levels": 8, "stack_frames": 16, "dsnu_e": (40.0, 0.0, 0.0), "prnu_rel": (0.02, 0.0, 0.0)}
         values = standard_values(measured(Camera(seed=int(seed), **quick)), "3.1", draws=200).values
         assert all(math.isfinite(values[f"{base}1288_{part}"].value) for base in ("DSNU", "PRNU") for part in ("row", "col")), seed
 
 
-def test_limits_lie_above_the_truth_in_95_of_100_cameras() -> None:
+def test_limits_lie_above_the_truth_in_95_of_100_cameras(rng: np.random.Generator) -> None:
     """100 cameras whose pixels have a pattern of half of what the row noise takes off: covered 80 times or so but for one in 1e6.
 
     Without the row noise put back none would be covered, without the addition for u a half.
     """
     covered = []
-    for seed in np.random.default_rng().integers(2**31, size=100):
+    for seed in rng.integers(2**31, size=100):
         small = {"dark_e_per_s": 0.0, "shape": (32, 48), "levels": 8, "stack_frames": 16, "longest_s": 0.001}
         camera = Camera(seed=int(seed), row_noise_e=6.0, dsnu_e=(1.0, 0.0, 0.0), **small)
         limit = evaluate(measured(camera), "3.1", draws=300).values["DSNU1288_pixel"]
@@ -218,7 +217,7 @@ def test_dark_noise_below_the_quantisation_is_a_limit_except_in_the_reference() 
         assert not values["DR"].is_upper_limit and "0.24 DN²" in values["DR"].reason
 
 
-def test_a_limit_of_extrapolated_dark_noise_lies_above_the_truth() -> None:
+def test_a_limit_of_extrapolated_dark_noise_lies_above_the_truth(rng: np.random.Generator) -> None:
     """40 cameras whose dark current outshines a read noise of 5 e⁻ = 1 DN²: the variance at zero exposure comes out below 0.24 DN² often.
 
     The limits, or the values, must lie above the truth in 95 of 100 cases but for one in 1e6; 0.40/K would lie below it in each.
@@ -233,7 +232,7 @@ def test_a_limit_of_extrapolated_dark_noise_lies_above_the_truth() -> None:
         "stack_frames": 2,
     }
     limits = []
-    for seed in np.random.default_rng().integers(2**31, size=40):
+    for seed in rng.integers(2**31, size=40):
         values = standard_values(measured(Camera(seed=int(seed), **strong)), "3.1", draws=300).values
         if values["sigma_d"].is_upper_limit:
             assert values["u_e_min"].is_upper_limit and "does not stand out" in values["DR"].reason
@@ -322,11 +321,11 @@ def test_bounds_of_the_departure_of_a_camera_just_at_the_limit() -> None:
     assert all(np.isnan(departure_bounds(np.empty((10, 0)))))
 
 
-def test_small_frames_of_a_straight_camera_are_not_said_to_fail() -> None:
+def test_small_frames_of_a_straight_camera_are_not_said_to_fail(rng: np.random.Generator) -> None:
     """40 cameras of 20 x 24 pixels, whose noisy slopes depart by 8 %: one in 20 may be said to fail, but for one in 1e6."""
     small = {"shape": (20, 24), "levels": 30, "stack_frames": 2, "dark_e_per_s": 0.0, "longest_s": 0.001}
     said, largest = 0, []
-    for seed in np.random.default_rng().integers(2**31, size=40):
+    for seed in rng.integers(2**31, size=40):
         results = standard_values(measured(Camera(seed=int(seed), **small)), "4.0", draws=400)
         said += any("does not hold" in note for note in results.notes)
         largest.append(results.values["PTC_linearity"].value)

@@ -24,8 +24,8 @@ from pixmetry.observe.photon_transfer_levels import levels_from, light_scale, us
 ALPHA = 1e-6
 
 
-def fresh() -> int:
-    return int(np.random.default_rng().integers(2**31))
+def fresh(rng: np.random.Generator) -> int:
+    return int(rng.integers(2**31))
 
 
 def assert_within(seen: Observations, camera: ForeignCamera, names: tuple[str, ...]) -> None:
@@ -40,31 +40,31 @@ def assert_within(seen: Observations, camera: ForeignCamera, names: tuple[str, .
         assert p > ALPHA / len(names), (camera.seed, name, e.value, e.u, true[name])
 
 
-def test_hot_pixels_are_not_black_level_noise_or_dark_current():
+def test_hot_pixels_are_not_black_level_noise_or_dark_current(rng: np.random.Generator):
     """A share of 6e-4 with 400 e- each: taken along, they move the black level by 20 u, the noise by 5 u, the dark current by 10 u."""
-    camera = ForeignCamera(fresh(), hot_share=6e-4, hot_e=1500.0, shape=(120, 160), row_noise_e=1.5)
+    camera = ForeignCamera(fresh(rng), hot_share=6e-4, hot_e=1500.0, shape=(120, 160), row_noise_e=1.5)
     seen = observe(groups(camera), camera.bits)
     assert_within(seen, camera, ("offset_dn", "dark_noise_e", "dark_current_e_per_s", "gain_dn_per_e", "row_noise_e", "column_noise_e"))
 
 
-def test_without_a_stack_hot_pixels_are_seen_in_the_codes():
-    camera = ForeignCamera(fresh(), hot_share=6e-4, hot_e=3000.0, shape=(120, 160))
+def test_without_a_stack_hot_pixels_are_seen_in_the_codes(rng: np.random.Generator):
+    camera = ForeignCamera(fresh(rng), hot_share=6e-4, hot_e=3000.0, shape=(120, 160))
     seen = observe((g for g in groups(camera) if g.role == "level"), camera.bits)
     assert_within(seen, camera, ("offset_dn", "dark_noise_e", "dark_current_e_per_s", "gain_dn_per_e"))
 
 
 @pytest.mark.parametrize("full_well", [math.inf, 9000.0])
-def test_a_converter_that_clips_first_gives_a_lower_limit_of_the_full_well(full_well):
-    camera = ForeignCamera(fresh(), bend="rational", full_well_e=full_well)
+def test_a_converter_that_clips_first_gives_a_lower_limit_of_the_full_well(full_well, rng: np.random.Generator):
+    camera = ForeignCamera(fresh(rng), bend="rational", full_well_e=full_well)
     e = observe(groups(camera), camera.bits).photon_transfer_fit["full_well_e"]
     assert e.kind == ("lower_limit" if math.isinf(full_well) else "value")
     assert abs(e.value - min(full_well, camera.clip_e)) < 6 * e.u, camera.seed
 
 
-def test_ripple_of_rounded_variance_is_no_knee():
+def test_ripple_of_rounded_variance_is_no_knee(rng: np.random.Generator):
     """8 bits, 0.02 DN/e-, dark noise of 0.04 DN: the variance of levels a fraction of a code apart goes up and down by ¼ DN²."""
     share = np.geomspace(0.001, 0.9, 40)
-    camera = ForeignCamera(fresh(), gain_dn_per_e=0.02, read_e=2.0, dsnu_e=(0, 0, 0), prnu_rel=(0.002, 0, 0), bits=8, offset_dn=4.3)
+    camera = ForeignCamera(fresh(rng), gain_dn_per_e=0.02, read_e=2.0, dsnu_e=(0, 0, 0), prnu_rel=(0.002, 0, 0), bits=8, offset_dn=4.3)
     most = camera.settings[1][-1] / camera.over
 
     def frames():
@@ -80,13 +80,13 @@ def test_ripple_of_rounded_variance_is_no_knee():
     assert abs(gain.value - 0.02) < 6 * gain.u and gain.u < 0.001, camera.seed
 
 
-def test_dark_levels_that_rounding_bends_do_not_bend_the_gain():
+def test_dark_levels_that_rounding_bends_do_not_bend_the_gain(rng: np.random.Generator):
     """Exposure swept, dark noise of 0.09 DN, 0.3 DN of dark current: the dark variances rise with the exposure by rounding alone.
 
     Taken for noise of the dark current, they move the gain by 4 %, ten u and more.
     """
     camera = ForeignCamera(
-        fresh(), gain_dn_per_e=0.03, read_e=3.0, dsnu_e=(0, 0, 0), bits=8, offset_dn=3.2, dark_e_per_s=500.0, shape=(120, 160), over=1.05
+        fresh(rng), gain_dn_per_e=0.03, read_e=3.0, dsnu_e=(0, 0, 0), bits=8, offset_dn=3.2, dark_e_per_s=500.0, shape=(120, 160), over=1.05
     )  # fmt: skip
     seen = observe(groups(camera), camera.bits)
     assert_within(seen, camera, ("gain_dn_per_e", "quantum_efficiency", "offset_dn", "responsivity_dn_per_s"))
@@ -94,16 +94,16 @@ def test_dark_levels_that_rounding_bends_do_not_bend_the_gain():
     assert gain.u < 0.01 * gain.value
 
 
-def test_a_pattern_that_rounding_hides_is_bounded():
-    camera = ForeignCamera(fresh(), gain_dn_per_e=0.03, read_e=1.5, dsnu_e=(1.5, 0.7, 0.7), dark_e_per_s=0.0, bits=8, offset_dn=5.0)
+def test_a_pattern_that_rounding_hides_is_bounded(rng: np.random.Generator):
+    camera = ForeignCamera(fresh(rng), gain_dn_per_e=0.03, read_e=1.5, dsnu_e=(1.5, 0.7, 0.7), dark_e_per_s=0.0, bits=8, offset_dn=5.0)
     spatial, true = observe(groups(camera), camera.bits).spatial_fit, physical_truths(camera)
     for name in ("dsnu_pixel_dn", "dsnu_row_dn", "dsnu_col_dn", "dsnu_total_dn"):
         assert spatial[name].kind == "upper_limit" and spatial[name].value > true[name], (camera.seed, name)
 
 
-def test_stat_intervals_hold_the_truth_on_random_cameras():
+def test_stat_intervals_hold_the_truth_on_random_cameras(rng: np.random.Generator):
     """8 cameras of some 110 values. Values of one camera go together: counted as if 20 were independent, ALPHA; 60 % held would fail."""
-    first, held, count, limits = fresh(), 0, 0, []
+    first, held, count, limits = fresh(rng), 0, 0, []
     for seed in range(first, first + 8):
         found, _ = outcomes(random_camera(seed), 300)
         held, count = held + sum(o.holds for o in found if o.kind == "value"), count + sum(o.kind == "value" for o in found)
@@ -129,9 +129,9 @@ def measurement(seen: Observations) -> Measurement:
 
 
 @pytest.mark.parametrize("n", [2, 16])
-def test_dark_frames_alone_give_black_level_and_noise_in_codes(n):
+def test_dark_frames_alone_give_black_level_and_noise_in_codes(n, rng: np.random.Generator):
     camera = replace(CAMERA, dark_e_per_s=0.0)
-    seen = observe([Group("dark", "stack" if n > 8 else "level", 0.01, 0.0, list(camera.frames(n, 0.01, 0.0, fresh())))], camera.bits)
+    seen = observe([Group("dark", "stack" if n > 8 else "level", 0.01, 0.0, list(camera.frames(n, 0.01, 0.0, fresh(rng))))], camera.bits)
     fit = seen.photon_transfer_fit
     noise = camera.gain_dn_per_e * camera.read_e
     assert abs(fit["dark_noise_dn"].value - noise) < 6 * fit["dark_noise_dn"].u

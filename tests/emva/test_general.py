@@ -175,9 +175,9 @@ def test_bends_are_seen_through(response: str, kind: str):
 
 
 @pytest.mark.parametrize(("response", "kind", "bias"), [("linear", "even", 0.01), ("gamma", "log", 0.03), ("log", "log", 0.04)])
-def test_simulated_frames(response: str, kind: str, bias: float):
+def test_simulated_frames(response: str, kind: str, bias: float, rng: np.random.Generator):
     """Mean of ten cameras by frames: within t of its own scatter, ALPHA, and the smoothing's bias. Catches errors above ``bias`` + 4 %."""
-    rng, camera, runs = np.random.default_rng(), Camera(response=response), 10
+    camera, runs = Camera(response=response), 10
     photons, got, snr = sweep(kind), [], []
     for _ in range(runs):
         series = framed_series(camera, photons, rng)
@@ -201,9 +201,9 @@ def test_simulated_frames(response: str, kind: str, bias: float):
     assert (np.abs(ratios.mean(axis=0)) < quantile * ratios.std(axis=0, ddof=1) / np.sqrt(runs) + bias).all()
 
 
-def test_draws_about_one_series_give_its_u():
+def test_draws_about_one_series_give_its_u(rng: np.random.Generator):
     """z of 150 series against the exact values, u from 100 draws about each: χ², ALPHA; catches an u that is 50 % off, a bias of 0.8 u."""
-    rng, runs = np.random.default_rng(), 150
+    runs = 150
     z: dict[str, list[float]] = {}
     series = exact_series(Camera(), sweep("even"))
     want = general_values(series)
@@ -288,11 +288,11 @@ def test_a_plateau_ends_every_response(response: str, kind: str, saturated: int,
     assert not any("plateau" in note for note in general_notes(series))
 
 
-def test_a_light_that_was_not_what_it_was_set_to():
+def test_a_light_that_was_not_what_it_was_set_to(rng: np.random.Generator):
     """The darkest level 5 % too bright, as by a shutter that closes late, the others within 0.03 %: the threshold stays within 5.5 u.
 
     A spline that goes through that level is off by 10 %, 50 u."""
-    camera, photons, rng = Camera(), 30000 * np.r_[0.004, np.arange(1, 41) / 40], np.random.default_rng()
+    camera, photons = Camera(), 30000 * np.r_[0.004, np.arange(1, 41) / 40]
     series = exact_series(camera, photons)
     off = 1 + 3e-4 * rng.standard_normal(photons.size)
     off[0] = 1.05
@@ -306,9 +306,9 @@ def test_a_light_that_was_not_what_it_was_set_to():
     assert not any("darkest level lies" in note for note in general_notes(series))
 
 
-def test_a_level_off_the_curve_is_off_in_the_draws():
+def test_a_level_off_the_curve_is_off_in_the_draws(rng: np.random.Generator):
     """One level in the middle 1 % too bright, where all draws scatter by 0.03 %: it moves by what is left of that beside the curve."""
-    rng, series = np.random.default_rng(), exact_series(Camera(), sweep("even"))
+    series = exact_series(Camera(), sweep("even"))
     measured = replace(series, mean_dn=series.mean_dn + np.where(np.arange(40) == 20, 0.01, 0.0) * (series.mean_dn - 50))
     scatter = 1 + 3e-4 * rng.standard_normal((1000, 40))
     draws = replace(measured, mean_dn=measured.dark_mean_dn + (measured.mean_dn - measured.dark_mean_dn) * scatter)
@@ -321,9 +321,8 @@ def test_a_level_off_the_curve_is_off_in_the_draws():
     assert with_setting_errors(plan, plan.levels) is plan.levels
 
 
-def test_draws_are_smoothed_like_the_series_they_are_of():
+def test_draws_are_smoothed_like_the_series_they_are_of(rng: np.random.Generator):
     """A draw that is the series itself has its value, whatever the other draws."""
-    rng = np.random.default_rng()
     measured = noisy(exact_series(Camera(), sweep("even")), rng, ())
     draws = noisy(measured, rng, (5,))
     draws = replace(draws, **{name: np.vstack([getattr(draws, name), getattr(measured, name)]) for name in NOISY})
@@ -343,9 +342,9 @@ def test_without_photons_and_with_a_negative_variance():
     assert np.isnan(values["general_DSNU"]) and squares["general_DSNU"] == pytest.approx(-0.01 / 0.125**2, rel=1e-6)
 
 
-def test_levels_may_be_repeated():
+def test_levels_may_be_repeated(rng: np.random.Generator):
     photons = np.repeat(sweep("log", 10), 3)
-    series = noisy(exact_series(Camera(), photons), np.random.default_rng(), ())
+    series = noisy(exact_series(Camera(), photons), rng, ())
     assert general_values(series)["general_u_p_min"] == pytest.approx(Camera().threshold, rel=0.1)
     np.testing.assert_allclose(general_curve(series)["snr_p"], Camera().snr_p(photons), rtol=0.15)
 

@@ -6,9 +6,9 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
+from chance import rng_of
 from emva.cameras import Camera
 from emva.scoring import measured
 from pixmetry.core.number import LOWER_LIMIT, UPPER_LIMIT, VALUE, Number
@@ -26,8 +26,8 @@ GENERAL_LOWER = ("general_u_p_sat", "general_SNR_max", "general_SNR_max_dB", "ge
 
 
 @pytest.fixture(scope="module")
-def short() -> dict[str, Results]:
-    m = measured(replace(SHORT, seed=int(np.random.default_rng().integers(2**31))))
+def short(request: pytest.FixtureRequest) -> dict[str, Results]:
+    m = measured(replace(SHORT, seed=int(rng_of(request).integers(2**31))))
     return {release: evaluate(m, release, draws=300) for release in ("4.0", "3.1", "reference")}
 
 

@@ -65,8 +65,8 @@ def bent_stack(rng: np.random.Generator, camera: Camera, linear_dn: np.ndarray, 
     )
 
 
-def test_temporal_values_scatter_by_their_u():
-    rng, camera, z = np.random.default_rng(), replace(BENT, shape=(120, 160)), {}
+def test_temporal_values_scatter_by_their_u(rng: np.random.Generator):
+    camera, z = replace(BENT, shape=(120, 160)), {}
     photons_u = 0.01
     row = truth(camera)
     noise = math.hypot(row["dark_noise_e"], row["row_noise_e"], row["column_noise_e"])
@@ -90,12 +90,12 @@ def test_temporal_values_scatter_by_their_u():
     assert len(z["QE"]) == 60 and np.mean([abs(v) for v in z["QE"]]) > 0.2
 
 
-def test_the_pattern_of_this_sensor_is_found_within_its_u():
+def test_the_pattern_of_this_sensor_is_found_within_its_u(rng: np.random.Generator):
     """60 sensors: z against the own pattern of each; an u that held the scatter between sensors is 2 to 6 times too large.
 
     One that left out what the surface takes of the pattern is too small by a factor of up to 2 for rows and columns of the response.
     """
-    rng, camera, z = np.random.default_rng(), BENT, {}
+    camera, z = BENT, {}
     rows, cols = camera.shape
     for _ in range(60):
         offset = rng.normal(0, 3.0, (rows, cols)) + rng.normal(0, 1.5, (rows, 1)) + rng.normal(0, 2.0, (1, cols))
@@ -119,8 +119,7 @@ def test_the_pattern_of_this_sensor_is_found_within_its_u():
         check_z(values, key)
 
 
-def test_what_cannot_be_fitted_is_a_note():
-    rng = np.random.default_rng()
+def test_what_cannot_be_fitted_is_a_note(rng: np.random.Generator):
     pt = drawn_record(BENT, rng)
     flat = replace(pt, bright=replace(pt.bright, fraction_max=np.ones_like(pt.bright.fraction_max)))
     values, notes = nonlinear_values(Measurement(flat))
@@ -132,10 +131,10 @@ def test_what_cannot_be_fitted_is_a_note():
     assert "DSNU1288_nonlinear" not in values and "brighter" in notes[0]
 
 
-def test_noise_hidden_by_rounding_is_a_limit():
+def test_noise_hidden_by_rounding_is_a_limit(rng: np.random.Generator):
     """EMVA 1288 R4.0 eq. 54: a dark variance below 0.24 DN² bounds the noise by 0.40/K."""
     camera = replace(BENT, gain=0.05, dark_noise_e=2.0, row_noise_e=0.0, column_noise_e=0.0, a=(0.0, 0.0, 0.0))
-    values, _ = nonlinear_values(Measurement(drawn_record(camera, np.random.default_rng())))
+    values, _ = nonlinear_values(Measurement(drawn_record(camera, rng)))
     got = values["sigma_d_nonlinear"]
     assert got.is_upper_limit and "0.40/K" in got.reason and got.value == pytest.approx(0.4 / camera.gain, rel=0.05)
     assert values["u_e_min_nonlinear"].is_upper_limit and "QE_nonlinear" not in values

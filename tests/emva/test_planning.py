@@ -28,14 +28,13 @@ def assert_scatter(values: np.ndarray, u: float, dof: int, model: float = 0.0) -
 
 @pytest.mark.parametrize("sweep", ["exposure", "light"])
 @pytest.mark.parametrize("steady", [True, False])
-def test_stat_series_scatters_as_foretold(sweep: str, steady: bool) -> None:
+def test_stat_series_scatters_as_foretold(sweep: str, steady: bool, rng: np.random.Generator) -> None:
     """K, σ_d, R and η of 500 repeated series; ± 16 % at 1e-6, so a frame too many in the degrees of freedom (22 %) is seen."""
     scatter = {} if steady else {"var_excess_rel": 0.03, "light_scatter_rel": 0.03}
     camera = KnownCamera(
         24, 40, 12, 0.5, 40.0, 3500, row_noise_e=8.0, dark_current_e_per_s=2000, quantum_efficiency=0.6, exposure_sat_s=0.01, **scatter
     )
     plan = Plan(levels=12, frames_per_level=3, stack_frames=200, sweep=sweep)
-    rng = np.random.default_rng()
     found = np.array([_series_values(camera, plan, rng) for _ in range(500)])
     u = predicted_u(camera, plan)
     for i, key in enumerate(("K", "sigma_d", "R", "QE")):
@@ -90,11 +89,10 @@ def _strata(image: np.ndarray) -> np.ndarray:
     return np.array([s / d for s, d in zip(squares, ((rows - 1) * (cols - 1), rows - 1, cols - 1), strict=True)])
 
 
-def test_stat_stacks_scatter_as_foretold() -> None:
+def test_stat_stacks_scatter_as_foretold(rng: np.random.Generator) -> None:
     """DSNU and PRNU with their parts: 20 sensors, 40 stacks each; ± 13 % at 1e-6 beside 4 % for patterns that are no exact sample."""
     camera = KnownCamera(60, 80, 12, 0.5, 6.0, 8000, 3.0, 2.0, 1.5, 0.008, 0.005, 0.004, row_noise_e=1.5)
     plan = Plan(levels=500, frames_per_level=64, stack_frames=8)  # u of K counts for nothing beside the stacks
-    rng = np.random.default_rng()
     shape = (camera.rows, camera.cols)
     white = _strata(_high_passed(rng.standard_normal((300, *shape)))).mean(axis=1)  # what the filter leaves of white noise
     found, sensors = [], 20

@@ -18,6 +18,7 @@ SHAPE = (100, 140)
 class Camera:
     """A linear camera of this test: electrons to codes, and nothing else."""
 
+    rng: np.random.Generator
     gain: float = 0.28
     noise_e: float = 10.0
     black_dn: float = 64.0
@@ -27,7 +28,6 @@ class Camera:
     row_noise_e: float = 0.0
 
     def __post_init__(self) -> None:
-        self.rng = np.random.default_rng()
         self.prnu_map = 1 + self.prnu * self.rng.standard_normal(SHAPE)
         self.dark_map = self.dsnu_e * self.rng.standard_normal(SHAPE)
 
@@ -55,11 +55,17 @@ def found(result) -> dict[str, str]:
 
 @pytest.mark.parametrize("signals", [(7000.0,), (1000.0, 3000.0, 7000.0, 12000.0, 16000.0)])
 @pytest.mark.parametrize("n", [2, 8])
-def test_stat_good_cameras_pass(signals: tuple[float, ...], n: int) -> None:
+def test_stat_good_cameras_pass(signals: tuple[float, ...], n: int, rng: np.random.Generator) -> None:
     """Of about 12 checks on noise, 1e-6 each: one camera of four has a false alarm once in 20 000 runs, two once in 10⁹."""
-    rng, alarms = np.random.default_rng(), []
+    alarms = []
     for _ in range(4):
-        camera = Camera(noise_e=rng.uniform(5, 20), prnu=rng.uniform(0, 0.01), dsnu_e=rng.uniform(0, 5), row_noise_e=rng.choice([0.0, 3.0]))
+        camera = Camera(
+            rng,
+            noise_e=rng.uniform(5, 20),
+            prnu=rng.uniform(0, 0.01),
+            dsnu_e=rng.uniform(0, 5),
+            row_noise_e=rng.choice([0.0, 3.0]),
+        )
         result = look(camera, *signals, n=n)
         alarms += [preflight_text(result)] if found(result) else []
         assert (result.verdict == "ok") == (not found(result))
@@ -68,9 +74,9 @@ def test_stat_good_cameras_pass(signals: tuple[float, ...], n: int) -> None:
     assert len(alarms) < 2, "\n".join(alarms)
 
 
-def test_first_values_for_a_plan() -> None:
+def test_first_values_for_a_plan(rng: np.random.Generator) -> None:
     """K, dark noise and patterns within their sampling scatter at 1e-6, from 8 frames of 14 000 pixels a level."""
-    camera = Camera(row_noise_e=4.0, dsnu_e=6.0, prnu=0.01)
+    camera = Camera(rng, row_noise_e=4.0, dsnu_e=6.0, prnu=0.01)
     result = look(camera, 1000.0, 3000.0, 7000.0, 12000.0, 16000.0)
     known = camera_from_preflight(result, frame_rate_hz=20.0)
     pixels, frames = camera.dark_map.size, 8
@@ -87,8 +93,8 @@ def test_first_values_for_a_plan() -> None:
     assert plan_for(known, {"K": 0.001 * known.gain_dn_per_e}).levels >= 50
 
 
-def test_black_level_too_low() -> None:
-    result = look(Camera(black_dn=4.0))
+def test_black_level_too_low(rng: np.random.Generator) -> None:
+    result = look(Camera(rng, black_dn=4.0))
     assert found(result) == {"underflow": "fail", "black_level": "warn"}
     # P(z < (0.5 − 4)/2.83) with noise 2.8 DN and pattern 0.28 DN: 10.7 %; the pattern is common to the frames
     assert result["underflow"].value == pytest.approx(10.7, abs=1.5)
@@ -96,15 +102,15 @@ def test_black_level_too_low() -> None:
     assert "black level" in preflight_text(result)
 
 
-def test_exposure_wrong() -> None:
-    assert found(look(Camera(), 14500.0)) | {"saturation": "fail"} == found(look(Camera(), 14500.0))
-    assert found(look(Camera(), 800.0)) == {"range": "warn"}
-    assert found(look(Camera(), 1000.0, 4000.0)) == {"range": "warn"}
-    assert "saturation" in found(look(Camera(), 4000.0, 16000.0, 20000.0))
+def test_exposure_wrong(rng: np.random.Generator) -> None:
+    assert found(look(Camera(rng), 14500.0)) | {"saturation": "fail"} == found(look(Camera(rng), 14500.0))
+    assert found(look(Camera(rng), 800.0)) == {"range": "warn"}
+    assert found(look(Camera(rng), 1000.0, 4000.0)) == {"range": "warn"}
+    assert "saturation" in found(look(Camera(rng), 4000.0, 16000.0, 20000.0))
 
 
-def test_bits_are_not_those_stated() -> None:
-    camera = Camera()
+def test_bits_are_not_those_stated(rng: np.random.Generator) -> None:
+    camera = Camera(rng)
 
     def again(change, bits: int, *signals: float):
         levels = [(None, None, [change(f) for f in camera.frames(s)]) for s in signals]
@@ -122,16 +128,16 @@ def test_bits_are_not_those_stated() -> None:
         again(lambda f: f, 8, 7000.0)
 
 
-def test_frames_that_are_not_new() -> None:
-    camera = Camera()
+def test_frames_that_are_not_new(rng: np.random.Generator) -> None:
+    camera = Camera(rng)
     bright = camera.frames(7000.0)
     assert found(preflight(camera.frames(0.0), [(None, None, [*bright, bright[2]])], 12)) == {"repeated_frames": "fail"}
     frozen = preflight([camera.frames(0.0, 1)[0]] * 4, [(None, None, bright)], 12)
     assert {"repeated_frames": "fail", "dark_noise": "fail"}.items() <= found(frozen).items()
 
 
-def test_frames_that_are_averaged_with_earlier_ones() -> None:
-    camera = Camera()
+def test_frames_that_are_averaged_with_earlier_ones(rng: np.random.Generator) -> None:
+    camera = Camera(rng)
     values, stored = camera.frame(7000.0), []
     for _ in range(8):
         values = 0.6 * camera.frame(7000.0) + 0.4 * values
@@ -142,14 +148,14 @@ def test_frames_that_are_averaged_with_earlier_ones() -> None:
     assert result["independent_frames"].value == pytest.approx(0.714, abs=0.05)
 
 
-def test_noise_below_the_codes() -> None:
-    result = look(Camera(gain=0.03, bits=9), 7000.0)
+def test_noise_below_the_codes(rng: np.random.Generator) -> None:
+    result = look(Camera(rng, gain=0.03, bits=9), 7000.0)
     assert found(result) == {"dark_noise": "warn"}
-    assert found(look(Camera(noise_e=0.0, dsnu_e=0.0)))["dark_noise"] == "fail"
+    assert found(look(Camera(rng, noise_e=0.0, dsnu_e=0.0)))["dark_noise"] == "fail"
 
 
-def test_light_that_is_not_steady() -> None:
-    camera = Camera()
+def test_light_that_is_not_steady(rng: np.random.Generator) -> None:
+    camera = Camera(rng)
     flickering = [camera.codes(camera.frame(7000.0 * (1 + 0.01 * s))) for s in (1, -1, 0.4, -1.5, 1.2, -0.2, 0.9, -1.1)]
     result = preflight(camera.frames(0.0), [(None, None, flickering)], 12)
     assert found(result) == {"flicker": "warn"}
@@ -164,16 +170,16 @@ def test_light_that_is_not_steady() -> None:
     assert result["dark_drift"].value == pytest.approx(2.7, abs=0.3)
 
 
-def test_stat_row_noise_is_not_flicker() -> None:
+def test_stat_row_noise_is_not_flicker(rng: np.random.Generator) -> None:
     """Noise of rows moves the frame means by 0.6 %, three times the limit; that is chance, and passes (false alarm: 1e-6 a run)."""
     for _ in range(10):
-        camera = Camera(row_noise_e=30.0)
+        camera = Camera(rng, row_noise_e=30.0)
         result = preflight(camera.frames(0.0), [(None, None, camera.frames(500.0))], 12)
         assert result["flicker"].verdict == "ok", result["flicker"]
 
 
-def test_bands_of_a_rolling_shutter() -> None:
-    camera = Camera()
+def test_bands_of_a_rolling_shutter(rng: np.random.Generator) -> None:
+    camera = Camera(rng)
     rows = np.arange(SHAPE[0])[:, None]
     phases = (0.3, 2.1, 5.0, 0.9, 4.0, 1.7, 3.1, 5.9)
     lit = [camera.codes(camera.frame(7000.0 * (1 + 0.008 * np.sin(2 * np.pi * 3 * rows / SHAPE[0] + p)))) for p in phases]
@@ -184,8 +190,8 @@ def test_bands_of_a_rolling_shutter() -> None:
     assert result["banding"].value == pytest.approx(expected, rel=0.1)
 
 
-def test_uneven_light() -> None:
-    camera = Camera()
+def test_uneven_light(rng: np.random.Generator) -> None:
+    camera = Camera(rng)
     y, x = (np.linspace(-1, 1, n) for n in SHAPE)
     light = 1 - 0.04 * (y[:, None] ** 2 + x[None, :] ** 2)  # from 1 to 0.92
     result = preflight(camera.frames(0.0), [(None, None, camera.frames(7000.0 * light))], 12)
@@ -195,8 +201,8 @@ def test_uneven_light() -> None:
     assert slight["uniformity"].verdict == "ok" and slight["uniformity"].value > 1.5
 
 
-def test_hot_and_dead_pixels() -> None:
-    camera = Camera()
+def test_hot_and_dead_pixels(rng: np.random.Generator) -> None:
+    camera = Camera(rng)
     hot, dead = camera.rng.random(SHAPE) < 0.02, camera.rng.random(SHAPE) < 0.02
     camera.dark_map[hot] += 500.0
     camera.prnu_map[dead] *= 0.2
@@ -206,9 +212,9 @@ def test_hot_and_dead_pixels() -> None:
 
 
 @pytest.mark.parametrize("exponent", [0.45, 0.8])
-def test_gamma(exponent: float) -> None:
+def test_gamma(exponent: float, rng: np.random.Generator) -> None:
     """y ∝ x^γ: variance per signal ∝ x^(γ−1) ∝ y^(1−1/γ), where photon noise rules."""
-    camera = Camera(noise_e=5.0)
+    camera = Camera(rng, noise_e=5.0)
     full = 4000.0
 
     def bent(signal: float) -> list[np.ndarray]:
@@ -223,11 +229,11 @@ def test_gamma(exponent: float) -> None:
 
 
 @pytest.mark.parametrize("quality", [75, 90])
-def test_jpeg(quality: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_jpeg(quality: int, monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator) -> None:
     """Frames of 200 rows: of 100 and quality 75, the scatter of twelve seams hid them 1 in 30 times."""
     imagecodecs = pytest.importorskip("imagecodecs")
     monkeypatch.setattr(sys.modules[__name__], "SHAPE", (200, 280))
-    camera = Camera(gain=0.015, bits=8, black_dn=10.0, noise_e=60.0)
+    camera = Camera(rng, gain=0.015, bits=8, black_dn=10.0, noise_e=60.0)
 
     def compressed(frames):
         return [imagecodecs.jpeg8_decode(imagecodecs.jpeg8_encode(f.astype(np.uint8), level=quality)) for f in frames]
@@ -245,8 +251,8 @@ def test_numbers_are_shown_to_the_digit_of_their_u() -> None:
     )
 
 
-def test_what_cannot_be_looked_at_is_refused() -> None:
-    camera = Camera()
+def test_what_cannot_be_looked_at_is_refused(rng: np.random.Generator) -> None:
+    camera = Camera(rng)
     with pytest.raises(InputError, match="no bright frames"):
         preflight(camera.frames(0.0), [], 12)
     with pytest.raises(InputError, match="too few frames"):
@@ -259,8 +265,8 @@ def test_what_cannot_be_looked_at_is_refused() -> None:
         camera_from_preflight(preflight(camera.frames(0.0), [(None, None, camera.frames(30000.0))], 12))
 
 
-def test_frames_are_taken_one_at_a_time() -> None:
-    camera, alive = Camera(), []
+def test_frames_are_taken_one_at_a_time(rng: np.random.Generator) -> None:
+    camera, alive = Camera(rng), []
 
     def stream(signal: float):
         for _ in range(6):

@@ -51,9 +51,8 @@ def same_bits(one: object, other: object) -> bool:
     return one == other
 
 
-def test_levels_equal_numpy_and_scipy():
+def test_levels_equal_numpy_and_scipy(rng: np.random.Generator):
     """EMVA 1288 R4.0 eq. 16, 18 and 32 on pairs; the kurtosis of SciPy; shares of the lowest and the highest code."""
-    rng = np.random.default_rng()
     pairs = [np.array(noisy(mean, 2, rng)) for mean in (3.0, 700.0, 4085.0)]
     groups = [Group("bright", "level", 1e-3 * i, 10.0 * i, pair) for i, pair in enumerate(pairs, 1)]
     groups.append(Group("dark", "level", 1e-3, 0.0, noisy(9.0, 2, rng)))
@@ -71,9 +70,9 @@ def test_levels_equal_numpy_and_scipy():
     assert m.dark_stack is None and m.bright_stack is None and "no stacks" in m.notes[0]
 
 
-def test_stacks_equal_numpy():
+def test_stacks_equal_numpy(rng: np.random.Generator):
     """EMVA 1288 R4.0 eq. 33, 34 and 65."""
-    groups = series(np.random.default_rng())
+    groups = series(rng)
     (m,) = measure_frames(groups, BITS)
     assert m.bright_stack_photons == 3000.0 and m.notes == ()
     for stack, group in ((m.dark_stack, groups[-2]), (m.bright_stack, groups[-1])):
@@ -103,9 +102,9 @@ def test_a_pair_is_reduced_like_any_level_to_the_bit(rows, cols, seed, bits, few
     assert same_bits(summarize_pair(frames[0], frames[1], bits), general.summary())
 
 
-def test_powers_of_differences_are_exact():
+def test_powers_of_differences_are_exact(rng: np.random.Generator):
     """The largest differences that 16 bits allow, whose fourth powers need 64 bits each, beside Python's integers."""
-    frames = np.random.default_rng().choice([0, 1, 65535], (2, 40, 60)).astype(np.uint16)
+    frames = rng.choice([0, 1, 65535], (2, 40, 60)).astype(np.uint16)
     d = frames[1].astype(object) - frames[0].astype(object)
     n, s = d.size, [(d**k).sum() for k in range(5)]
     m2 = n * s[2] - s[1] ** 2
@@ -114,8 +113,8 @@ def test_powers_of_differences_are_exact():
 
 
 @pytest.mark.parametrize("cfa", [None, "GRBG"])
-def test_same_bits_for_any_number_of_threads(cfa):
-    groups = series(np.random.default_rng())
+def test_same_bits_for_any_number_of_threads(cfa, rng: np.random.Generator):
+    groups = series(rng)
     lazy = [Group(g.kind, g.role, g.exposure_s, g.photons, [fetched(frame) for frame in g.frames]) for g in groups]
     alone = measure_frames(groups, BITS, cfa=cfa, threads=1)
     for threads, given_groups in ((2, lazy), (5, lazy), (3, groups)):
@@ -127,7 +126,7 @@ def fetched(frame: np.ndarray) -> Callable[[], np.ndarray]:
     return frame.copy
 
 
-def test_no_more_frames_are_held_than_are_in_work():
+def test_no_more_frames_are_held_than_are_in_work(rng: np.random.Generator):
     lock, alive, most = threading.Lock(), 0, 0
 
     def gone() -> None:
@@ -144,7 +143,6 @@ def test_no_more_frames_are_held_than_are_in_work():
         weakref.finalize(copy, gone)
         return copy
 
-    rng = np.random.default_rng()
     frame = noisy(500.0, 1, rng)[0]
     other = noisy(500.0, 1, rng)[0]
     levels = [Group(kind, "level", 1e-3 * i, float(i), noisy(30.0 * i, 2, rng)) for i in (1, 2, 3) for kind in ("dark", "bright")]
@@ -156,8 +154,8 @@ def test_no_more_frames_are_held_than_are_in_work():
         assert most <= 2 * threads + 2  # two in each thread's hands; a thread may go on before its last two are released
 
 
-def test_progress_counts_every_frame_once():
-    groups = series(np.random.default_rng())
+def test_progress_counts_every_frame_once(rng: np.random.Generator):
+    groups = series(rng)
     counts = []
     measure_frames(groups, BITS, on_frames=counts.append)
     assert sum(counts) == sum(len(g.frames) for g in groups)
@@ -183,9 +181,9 @@ def test_phases_take_the_pixels_of_their_colour(mosaic, shape):
         assert part(place).ravel().tolist() == want and part(place).shape == (whole_rows // 2, whole_cols // 2)
 
 
-def test_a_channel_is_the_camera_of_its_pixels():
+def test_a_channel_is_the_camera_of_its_pixels(rng: np.random.Generator):
     """Frames of odd sides, cut by hand with other means, reduced as a camera of their own: the same bits."""
-    groups = series(np.random.default_rng(), (27, 35))
+    groups = series(rng, (27, 35))
     by_hand = {"R": (1, 0), "Gr": (1, 1), "Gb": (0, 0), "B": (0, 1)}
     measured = measure_frames(groups, BITS, cfa="GBRG")
     assert [m.channel for m in measured] == list(CHANNELS)
@@ -202,8 +200,7 @@ def brightness(m: Measurement) -> list[float]:
     return [stack.mean_dn for stack in (m.dark_stack, m.bright_stack) if isinstance(stack, StackMoments)]
 
 
-def test_which_stacks_are_taken_and_what_is_said():
-    rng = np.random.default_rng()
+def test_which_stacks_are_taken_and_what_is_said(rng: np.random.Generator):
     levels = series(rng)[:-2]
 
     def stack(kind: str, exposure_s: float, mean: float, count: int = 9) -> Group:
@@ -220,9 +217,8 @@ def test_which_stacks_are_taken_and_what_is_said():
     assert m.dark_stack is None and "no stack of dark frames" in m.notes[0]
 
 
-def test_exchanged_frames_are_refused():
+def test_exchanged_frames_are_refused(rng: np.random.Generator):
     """Bright and dark exchanged; a channel that sees nothing of the light is not."""
-    rng = np.random.default_rng()
     groups = series(rng)
     other = {"dark": "bright", "bright": "dark"}
     with pytest.raises(MeasureError, match="bright levels are darker than the dark ones"):
@@ -231,13 +227,13 @@ def test_exchanged_frames_are_refused():
     assert measure_frames(blind, BITS)[0].transfer.bright.mean_dn.max() < 30
 
 
-def test_a_pair_of_two_lights_is_named():
+def test_a_pair_of_two_lights_is_named(rng: np.random.Generator):
     """Levels 5 and 6 each with one frame of the other; light that flickers by 0.3 % from frame to frame is not.
 
     The flicker of the pairs is spread as evenly as a normal distribution, and the frames are so large that noise does not cover it: of 12
     pairs that are drawn, or of small frames, the median, by which the flicker is known, is far too small once in 200 runs.
     """
-    rng, shape = np.random.default_rng(), (104, 136)
+    shape = (104, 136)
     dark = [Group("dark", "level", i * 1e-3, 0.0, noisy(20.0, 2, rng, shape)) for i in range(1, 13)]
     evenly = 0.003 * np.sqrt(2) * stats.norm.ppf((np.arange(12) + 0.5) / 12)
 
@@ -252,8 +248,7 @@ def test_a_pair_of_two_lights_is_named():
         assert [int(note.split("level ")[1].split()[0]) for note in notes] == named
 
 
-def test_levels_of_full_pixels_below_the_top_code_are_no_copies():
-    rng = np.random.default_rng()
+def test_levels_of_full_pixels_below_the_top_code_are_no_copies(rng: np.random.Generator):
     groups = [g for g in series(rng) if g.role == "level"]
     full = np.full(SHAPE, 3000, np.uint16)
     (m,) = measure_frames([*groups, Group("bright", "level", 9e-3, 9000.0, [full, full.copy()])], BITS)
@@ -263,8 +258,7 @@ def test_levels_of_full_pixels_below_the_top_code_are_no_copies():
         measure_frames([*groups, Group("bright", "level", 9e-3, 9000.0, [pattern, pattern.copy()])], BITS)
 
 
-def test_what_cannot_be_measured_is_refused():
-    rng = np.random.default_rng()
+def test_what_cannot_be_measured_is_refused(rng: np.random.Generator):
     groups = series(rng)
     for kind in ("dark", "bright"):
         (m,) = measure_frames([g for g in groups if g.kind != kind or g.role == "stack"], BITS)
@@ -287,7 +281,7 @@ def test_what_cannot_be_measured_is_refused():
         measure_frames([Group("dark", "level", 1e-3, 0.0, [full[:1], full[:1]])], BITS)
 
 
-def test_levels_do_not_hold_their_codes():
+def test_levels_do_not_hold_their_codes(rng: np.random.Generator):
     """What is kept of a level does not grow with the number of codes."""
-    (m,) = measure_frames(series(np.random.default_rng()), BITS)
+    (m,) = measure_frames(series(rng), BITS)
     assert all(getattr(m.transfer.bright, f.name).shape == (5,) for f in fields(LevelMoments))

@@ -82,8 +82,7 @@ def by_hand(frames: np.ndarray, ddof: int) -> dict[str, float]:
 
 
 @pytest.mark.parametrize(("release", "ddof"), [("reference", 1), ("3.1", 0)])
-def test_releases_without_filter_are_the_formulas_of_the_standard(release: str, ddof: int) -> None:
-    rng = np.random.default_rng()
+def test_releases_without_filter_are_the_formulas_of_the_standard(release: str, ddof: int, rng: np.random.Generator) -> None:
     dark_frames = Sensor(rng, 1.0, level=50.0).frames(5)
     bright_frames = Sensor(rng, 5.0, level=900.0).frames(7)
     dark, bright = (SpatialInputs.of(stack_of(f), high_pass=False) for f in (dark_frames, bright_frames))
@@ -105,9 +104,8 @@ def test_releases_without_filter_are_the_formulas_of_the_standard(release: str, 
             assert np.isnan(got[key])
 
 
-def test_a_negative_variance_keeps_its_sign_and_has_no_root() -> None:
+def test_a_negative_variance_keeps_its_sign_and_has_no_root(rng: np.random.Generator) -> None:
     """Strong row noise, no pattern: the standard's pixel part is −σ²_row,t/L within a tenth of it."""
-    rng = np.random.default_rng()
     dark = SpatialInputs.of(Sensor(rng, white=2.0, row=20.0, col=0.0).stack(6), high_pass=False)
     bright = SpatialInputs.of(Sensor(rng, 10.0, level=3000.0).stack(6), high_pass=False)
     args = (dark, bright, dark.vector, bright.vector, "3.1", 2.0)
@@ -145,13 +143,12 @@ def uniform_kernel() -> np.ndarray:
     return convolve2d(smooth, np.outer([1, 2, 1], [1, 2, 1]) / 16, mode="same")
 
 
-def test_release_4_finds_the_pattern_under_row_noise_without_bias() -> None:
+def test_release_4_finds_the_pattern_under_row_noise_without_bias(rng: np.random.Generator) -> None:
     """A sensor with a slope of light, whose temporal row noise leaves 4 DN² in the row means of six frames.
 
     200 stacks; u of the mean is about 0.13, 0.11 and 0.05 DN² for pixels, rows and columns; the simulated gains add 1 % of the pattern.
     It would catch the row noise left in (4 DN²), white noise left in the rows, or a gain of 1 in place of 0.889 for them.
     """
-    rng = np.random.default_rng()
     sensor = Sensor(rng, pattern=3.0, lines=2.0, white=6.0, row=5.0, col=1.0)
     sensor.pattern += 0.5 * np.arange(SHAPE[1]) + 0.3 * np.arange(SHAPE[0])[:, None]
     expected = truth(sensor.pattern)
@@ -166,8 +163,8 @@ def test_release_4_finds_the_pattern_under_row_noise_without_bias() -> None:
     np.testing.assert_array_less(u, 0.3)
 
 
-def test_release_4_holds_together() -> None:
-    inputs = SpatialInputs.of(Sensor(np.random.default_rng(), 3.0).stack(4), high_pass=True)
+def test_release_4_holds_together(rng: np.random.Generator) -> None:
+    inputs = SpatialInputs.of(Sensor(rng, 3.0).stack(4), high_pass=True)
     v = spatial_variances(inputs, inputs.vector, "4.0")
     m, n = SHAPE
     assert v["s_2_y"] == pytest.approx(v["s_2_y_pixel"] + v["s_2_y_row"] + v["s_2_y_col"])
@@ -178,14 +175,13 @@ def test_release_4_holds_together() -> None:
 
 @pytest.mark.parametrize("high_pass", [False, True])
 @pytest.mark.parametrize("strength", [0.0, 1.0, 10.0])
-def test_draws_and_bootstrap_scatter_as_the_sensor_does(high_pass: bool, strength: float) -> None:
+def test_draws_and_bootstrap_scatter_as_the_sensor_does(high_pass: bool, strength: float, rng: np.random.Generator) -> None:
     """Pattern none, as strong as the noise left in the mean image, and ten times that: u against 500 stacks of one sensor.
 
     u of the scatter is 1/√(2·500) = 3.2 %, with that of the u compared 4 %, times 4.9 is 19 %. Added to it: 12 % for the bootstrap where
     there is no pattern (its estimate of ζ₁ is cut at zero) and 12 % for what the closed forms neglect in frames of 40 x 48 pixels. A
     bootstrap that leaves the degenerate part uncentred is wrong by 73 % without a pattern.
     """
-    rng = np.random.default_rng()
     frames = 30
     sensor = Sensor(rng, strength * 8.0 / np.sqrt(frames))
     vectors, drawn, resampled = [], [], []
@@ -206,9 +202,8 @@ def test_draws_and_bootstrap_scatter_as_the_sensor_does(high_pass: bool, strengt
 
 @pytest.mark.parametrize("part", [0, 1, 2])
 @pytest.mark.parametrize("signal", [0.5, 3.0, 30.0])
-def test_draws_of_one_stratum_have_the_variance_of_a_non_central_chi_square(part: int, signal: float) -> None:
+def test_draws_of_one_stratum_have_the_variance_of_a_non_central_chi_square(part: int, signal: float, rng: np.random.Generator) -> None:
     """Pattern 0.5 to 30 times the noise left, no filter, even noise. 40 000 draws: u of the variance 0.7 %; it would catch 4 %."""
-    rng = np.random.default_rng()
     m, n = SHAPE
     plain = SpatialInputs.of(Sensor(rng).stack(8), high_pass=False)
     white, row, col = 64.0, 4.0, 1.0
@@ -223,17 +218,16 @@ def test_draws_of_one_stratum_have_the_variance_of_a_non_central_chi_square(part
     assert got.std() == pytest.approx(expected, rel=QUANTILE * 1.2 / np.sqrt(2 * 40_000))
 
 
-def test_draws_are_about_the_measured_vector_and_reproducible() -> None:
-    inputs = SpatialInputs.of(Sensor(np.random.default_rng(), 5.0).stack(20), high_pass=True)
+def test_draws_are_about_the_measured_vector_and_reproducible(rng: np.random.Generator) -> None:
+    inputs = SpatialInputs.of(Sensor(rng, 5.0).stack(20), high_pass=True)
     draws = inputs.draws(4000, np.random.default_rng(3))
     assert (draws == inputs.draws(4000, np.random.default_rng(3))).all()
     off = draws.mean(axis=0) - inputs.vector
     np.testing.assert_array_less(np.abs(off), QUANTILE * draws.std(axis=0) / np.sqrt(4000))
 
 
-def test_flicker_of_the_light_moves_the_bright_pattern_with_the_mean() -> None:
+def test_flicker_of_the_light_moves_the_bright_pattern_with_the_mean(rng: np.random.Generator) -> None:
     """s² grows with the square of the light: 2 s²/light times its u, on top of the noise. 2 % flicker, 16 frames: 1 % of s²."""
-    rng = np.random.default_rng()
     y = Sensor(rng, 40.0, white=2.0, row=0.0, col=0.0, frame=0.0, level=1000.0).frames(16).astype(float)
     y = np.rint(y * (1 + 0.02 * rng.standard_normal((16, 1, 1)))).astype(np.uint16)
     inputs = SpatialInputs.of(stack_of(y), high_pass=True)
@@ -243,14 +237,13 @@ def test_flicker_of_the_light_moves_the_bright_pattern_with_the_mean() -> None:
     assert abs(np.corrcoef(inputs.draws(4000, rng)[:, :2].T)[0, 1]) < QUANTILE / np.sqrt(4000)
 
 
-def test_a_wave_that_runs_through_the_frames_is_seen_in_their_products() -> None:
+def test_a_wave_that_runs_through_the_frames_is_seen_in_their_products(rng: np.random.Generator) -> None:
     """Amplitude 3 DN at a random phase in each frame; products of two frames then have the variance A⁴/8 beyond that of white noise.
 
     The s² of 400 mean images scatters more than four times as much as white noise would let it. Draws without the products of the frames
     are too small by more than 2. With those of one stack they are not; they may be too large, since the phases' mean in the 40 frames
     cannot be told from a pattern: its square is exponential, so that once in 10⁶ the variance comes out 27 times too large, u 5.2 times.
     """
-    rng = np.random.default_rng()
     m, n = SHAPE
     y, x = np.mgrid[:m, :n]
 
@@ -272,13 +265,13 @@ def test_a_wave_that_runs_through_the_frames_is_seen_in_their_products() -> None
     assert 1 / 1.6 < aware.draws(2000, rng)[:, 1].std() / u < 6
 
 
-def test_a_wave_that_the_dark_levels_show_widens_the_draws_of_the_stack() -> None:
+def test_a_wave_that_the_dark_levels_show_widens_the_draws_of_the_stack(rng: np.random.Generator) -> None:
     """2000 stacks of 8 frames with a wave of 3 DN at random phases: u of s² as the variances of single pairs foretell it.
 
     The mean of many phases' products is exponential, u of its scatter √(2/2000) = 3.2 %, times 4.9 with that of the pairs 16 %. It would
     catch the products being counted as L in place of L(L − 1)/2: a factor 1.9.
     """
-    rng, frames, (m, n) = np.random.default_rng(), 8, (12, 20)
+    frames, (m, n) = 8, (12, 20)
     y, x = np.mgrid[:m, :n]
     images = np.sin(2 * np.pi * (2 * y / m + 3 * x / n) + rng.uniform(0, 2 * np.pi, (2000, frames, 1, 1)))
     images = 3.0 * images + 0.3 * rng.standard_normal(images.shape)
@@ -290,9 +283,9 @@ def test_a_wave_that_the_dark_levels_show_widens_the_draws_of_the_stack() -> Non
 
 
 @pytest.mark.parametrize("pixels", [1e6, 23 * 29, 7 * 29, 40, 1])
-def test_frame_products_are_those_of_the_frames(pixels: float, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frame_products_are_those_of_the_frames(pixels: float, monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator) -> None:
     """In one block, in bands of rows, in blocks narrower than a row, and pixel by pixel."""
-    y = Sensor(np.random.default_rng(), 4.0, shape=(33, 29)).frames(6)
+    y = Sensor(rng, 4.0, shape=(33, 29)).frames(6)
     monkeypatch.setattr(products_module, "BLOCK_BYTES", pixels * 6 * 8)
     got = frame_products(iter(y), 14)
     filtered = y[:, 9:-9, 9:-9] - np.stack([convolve2d(f.astype(float), uniform_kernel(), mode="valid") for f in y])
@@ -308,9 +301,8 @@ def test_frame_products_are_those_of_the_frames(pixels: float, monkeypatch: pyte
         frame_products([y[0], y[1, :-1]], 14)
 
 
-def test_frame_products_of_wide_frames_stay_within_two_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frame_products_of_wide_frames_stay_within_two_blocks(monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator) -> None:
     """One row of all frames takes 9.6 MB here, their column sums as much; two blocks of 1 MB and one frame of 0.9 MB are 2.9 MB."""
-    rng = np.random.default_rng()
     frame_products(rng.integers(0, 9, (4, 24, 24)).astype(np.uint16), 14)  # compiles
     monkeypatch.setattr(products_module, "BLOCK_BYTES", 1e6)
     tracemalloc.start()
@@ -322,16 +314,15 @@ def test_frame_products_of_wide_frames_stay_within_two_blocks(monkeypatch: pytes
     assert peak < 4.5e6
 
 
-def test_the_mean_of_the_products_is_the_variance_free_of_noise() -> None:
+def test_the_mean_of_the_products_is_the_variance_free_of_noise(rng: np.random.Generator) -> None:
     """⟨Q_kl⟩ over k ≠ l is s²_measured − (σ²_stack − variance of the frame means)/L."""
-    y = Sensor(np.random.default_rng(), 4.0).frames(7)
+    y = Sensor(rng, 4.0).frames(7)
     stack, q = stack_of(y), frame_products(y, 14).pixel_dn2
     pairs = (q.sum() - np.trace(q)) / (7 * 6)
     assert pairs == pytest.approx(stack.mean_map_dn.var() - (stack.var_stack_dn2 - stack.ms_frame_dn2) / 7, rel=1e-9)
 
 
-def test_values_of_draws_are_values_of_each() -> None:
-    rng = np.random.default_rng()
+def test_values_of_draws_are_values_of_each(rng: np.random.Generator) -> None:
     dark, bright = (SpatialInputs.of(Sensor(rng, 3.0, level=v).stack(5), high_pass=True) for v in (60.0, 900.0))
     d, b, gain = dark.draws(3, rng), bright.draws(3, rng), np.array([0.3, 0.4, 0.5])
     together, squares = spatial_evaluation(dark, bright, d, b, "4.0", gain)
@@ -342,8 +333,7 @@ def test_values_of_draws_are_values_of_each() -> None:
                 np.testing.assert_allclose(drawn[key][k], value, rtol=1e-12, err_msg=key)
 
 
-def test_what_does_not_fit_is_refused() -> None:
-    rng = np.random.default_rng()
+def test_what_does_not_fit_is_refused(rng: np.random.Generator) -> None:
     stack, other = Sensor(rng).stack(5), Sensor(rng, level=900.0, shape=(30, 30)).stack(5)
     raw, filtered = SpatialInputs.of(stack, high_pass=False), SpatialInputs.of(stack, high_pass=True)
     brighter = SpatialInputs.of(replace(stack, mean_dn=900.0), high_pass=False)

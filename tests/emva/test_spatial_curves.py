@@ -44,8 +44,7 @@ def curves(dark: np.ndarray, bright: np.ndarray | None, release: str) -> dict[st
 
 
 @pytest.fixture
-def images() -> tuple[np.ndarray, np.ndarray]:
-    rng = np.random.default_rng()
+def images(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     return rng.normal(50.0, 3.0, (60, 75)), rng.normal(900.0, 12.0, (60, 75))
 
 
@@ -82,12 +81,11 @@ def test_a_wave_of_stripes_stands_at_its_frequency(release: str, direction: str)
 
 
 @pytest.mark.parametrize("release", ["4.0", "3.1"])
-def test_white_patterns_are_flat_and_told_to_be_white(release: str) -> None:
+def test_white_patterns_are_flat_and_told_to_be_white(release: str, rng: np.random.Generator) -> None:
     """Mean power is the variance of the image (Parseval); the white share is 1 within the scatter of a median.
 
     The median of n values of density p(m) at m has u = 1/(2 p √n); with R lines averaged p is that of chi-square with 2 R over 2 R.
     """
-    rng = np.random.default_rng()
     curve = curves(rng.normal(300.0, 5.0, (318, 262)), None, release)["horizontal_spectrogram_DSNU"]
     lines, count = (300, 244) if release == "4.0" else (318, 262)
     dof = 2 * lines

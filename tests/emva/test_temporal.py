@@ -229,9 +229,9 @@ def test_pairing_goes_on_along_the_dark_line_or_stops_at_the_nearest_level() -> 
     np.testing.assert_array_equal(without_dark(np.array([0.001, 0.01, 0.02, 0.05]), two), [True, False, False, True])
 
 
-def test_clocks_that_are_read_back_with_noise_make_no_exposure_sweep() -> None:
+def test_clocks_that_are_read_back_with_noise_make_no_exposure_sweep(rng: np.random.Generator) -> None:
     """Light swept at 0.02 s, exposures read back to 1e-4: the same series as with exact ones, whether photons are known or not."""
-    rng, n = np.random.default_rng(), 20
+    n = 20
     mean = np.linspace(50.0, 900.0, n)
     for photons in (None, 10 * mean):
         found = []

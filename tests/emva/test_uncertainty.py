@@ -37,9 +37,9 @@ def series_measured(camera: Camera) -> Measurement:
     return Measurement(PhotonTransfer(bright, dark, camera.shape, camera.bits), pixel_area_um2=camera.pixel_area_um2)
 
 
-def test_sampling_u_is_the_scatter_of_variances_of_simulated_pairs() -> None:
+def test_sampling_u_is_the_scatter_of_variances_of_simulated_pairs(rng: np.random.Generator) -> None:
     """600 pairs with row noise and few electrons (kurtosis): the standard deviation is known to 3 %; an error of 25 % would be caught."""
-    rng, (rows, cols), pairs = np.random.default_rng(), (16, 24), 600
+    (rows, cols), pairs = (16, 24), 600
     summaries = []
     for _ in range(pairs):
         light = 3.0 * rng.poisson(2.0, (2, rows, cols)) + rng.standard_normal((2, rows, cols))
@@ -54,9 +54,9 @@ def test_sampling_u_is_the_scatter_of_variances_of_simulated_pairs() -> None:
 
 
 @pytest.mark.parametrize("frames", [2, 8])
-def test_spatial_variance_of_a_level_scatters_with_its_temporal_one(frames: int) -> None:
+def test_spatial_variance_of_a_level_scatters_with_its_temporal_one(frames: int, rng: np.random.Generator) -> None:
     """1200 levels with a pattern, white and row noise: standard deviation and covariance within ALPHA; errors of 15 % would be caught."""
-    rng, (rows, cols), levels = np.random.default_rng(), (16, 20), 1200
+    (rows, cols), levels = (16, 20), 1200
     pattern = 100 + 4 * rng.standard_normal((rows, cols))
     summaries = []
     for _ in range(levels):
@@ -93,9 +93,9 @@ def test_a_wave_in_the_dark_frames_is_found_and_reaches_the_stack(simulated: Mea
     assert moved[:, 1].std() == pytest.approx(products.mean(axis=1).std(), rel=0.05)
 
 
-def test_scatter_beyond_the_known_noise_is_found() -> None:
+def test_scatter_beyond_the_known_noise_is_found(rng: np.random.Generator) -> None:
     """300 curves of 40 points, sigma 1 and an excess of 2: the mean of the estimates of its square within ALPHA; catches 10 %."""
-    rng, x = np.random.default_rng(), np.linspace(0, 1, 40)
+    x = np.linspace(0, 1, 40)
     shape = 1 + x
     squares = []
     for _ in range(300):
@@ -124,12 +124,11 @@ def test_a_strong_curve_is_followed_and_a_line_is_not_overdone() -> None:
 
 
 @pytest.mark.parametrize("light_swept", [False, True])
-def test_truth_lies_where_u_says(light_swept: bool) -> None:
+def test_truth_lies_where_u_says(light_swept: bool, rng: np.random.Generator) -> None:
     """60 cameras whose light scatters from level to level: the sum of the squared z-scores is chi-square.
 
     False failures ALPHA a value; u that is 1.6 times too small or 2 times too large would be caught.
     """
-    rng = np.random.default_rng()
     keys = ("R", "K", "QE", "sigma_d", "u_e_min", "u_e_sat") + (() if light_swept else ("u_I_mean",))
     z: dict[str, list[float]] = {key: [] for key in keys}
     for seed in rng.integers(2**31, size=60):

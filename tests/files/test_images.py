@@ -42,10 +42,16 @@ NOISE = np.random.default_rng(1).integers(0, 4096, (40, 50), dtype=np.uint16)
 
 
 @settings(max_examples=30, deadline=None)
-@given(bits=st.integers(1, 16), ending=st.sampled_from([".png", ".tif", ".TIFF"]), rows=st.integers(1, 20), cols=st.integers(1, 20))
-def test_inverse_write_then_read(tmp_path_factory: pytest.TempPathFactory, bits: int, ending: str, rows: int, cols: int) -> None:
+@given(
+    bits=st.integers(1, 16),
+    ending=st.sampled_from([".png", ".tif", ".TIFF"]),
+    rows=st.integers(1, 20),
+    cols=st.integers(1, 20),
+    seed=st.integers(0, 2**32),
+)
+def test_inverse_write_then_read(tmp_path_factory: pytest.TempPathFactory, bits: int, ending: str, rows: int, cols: int, seed: int) -> None:
     path = tmp_path_factory.mktemp("frames") / f"a{ending}"
-    array = np.random.default_rng().integers(0, 1 << bits, (rows, cols))
+    array = np.random.default_rng(seed).integers(0, 1 << bits, (rows, cols))
     write_frame(path, array, bits)
     again = read_frame(path)
     assert again.dtype == (np.uint8 if bits <= 8 else np.uint16)

@@ -335,8 +335,7 @@ def test_json_is_strict_and_takes_numpy_values(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["maps.zarr.zip", "maps.zarr"])
 @pytest.mark.filterwarnings("error")
-def test_inverse_write_then_read_maps(name: str, tmp_path: Path) -> None:
-    rng = np.random.default_rng()
+def test_inverse_write_then_read_maps(name: str, tmp_path: Path, rng: np.random.Generator) -> None:
     maps = {
         "prnu_map_percent": rng.normal(size=(33, 47)),
         "var_map_dn2": np.array([[np.nan, 1e-30]], np.float32),

@@ -93,9 +93,8 @@ def test_transparency_and_interlacing_are_left_to_a_complete_decoder():
     assert PlainPng().decode(png(image, [0] * 6, header=b"\0\0\1")) is None
 
 
-def test_damage_is_found_wherever_it_is(tmp_path: Path):
+def test_damage_is_found_wherever_it_is(tmp_path: Path, rng: np.random.Generator):
     """Any byte of header, data and end changed, or the file cut off anywhere: never a frame that differs without an error."""
-    rng = np.random.default_rng()
     image = rng.integers(0, 4096, (9, 11)).astype(np.uint16)
     raw = png(image, [0, 1, 2, 3, 4, 0, 1, 2, 3])
     for at in rng.integers(len(SIGNATURE), len(raw), 60):

@@ -149,9 +149,9 @@ def test_deep_offsets_reach_the_swing_of_real_lines() -> None:
     assert (np.diff(np.sign(amplitude), axis=1) != 0).any()
 
 
-def test_exposures_agree_with_other_noise() -> None:
+def test_exposures_agree_with_other_noise(rng: np.random.Generator) -> None:
     """Means over 800 frames on either side; catches 0.0025 px at the deep cut of the brighter three."""
-    found, rng = experiment.exposures(), np.random.default_rng()
+    found = experiment.exposures()
     x = np.arange(21) - 10.0
     edge = [[quad(lambda u, c=c: np.exp(-((u - c) ** 2) / 2), v - 0.5, v + 0.5, epsabs=1e-12)[0] for v in x] for c in (0.0, 0.35)]
     shape = np.outer(edge[0], edge[1])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from functools import lru_cache
 
 import numpy as np
 from scipy.special import chndtr
@@ -36,13 +35,11 @@ def rough_targets(
     )  # fmt: skip
 
 
-@lru_cache(64)
-def lattice(
-    radius: float, blur: float, *, side: int = 13, amplitude: float = 180.0, background: float = 20.0, minor: float = 0.0,
-    angle_deg: float = 0.0, aperture: float = 1.0,
+def draw_lattice(
+    rng: np.random.Generator, radius: float, blur: float, *, side: int = 13, amplitude: float = 180.0, background: float = 20.0,
+    minor: float = 0.0, angle_deg: float = 0.0, aperture: float = 1.0,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
-    """Mean image of side × side targets at random phases (the same for all tests of a run), far from each other, and their places."""
-    rng = np.random.default_rng()
+    """Mean image of side × side targets at random phases, far from each other, and their places."""
     pitch = int(2 * radius + 14 * max(math.hypot(blur, 0.29), 0.5) + 14)
     rows, cols = np.divmod(np.arange(side * side), side)
     x, y = ((n + 0.5) * pitch + rng.uniform(-0.5, 0.5, side * side) for n in (cols, rows))

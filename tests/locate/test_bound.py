@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache
 
 import numpy as np
 import pytest
 from scipy.stats import chi2, norm, poisson
 
+from chance import rng_of
 from pixmetry.camera.camera import load_camera
 from pixmetry.core.errors import InputError
 from pixmetry.locate.bound import closed_bounds as closed
@@ -299,13 +299,12 @@ def test_the_bound_scales_with_contrast_and_noise() -> None:
 # ---- estimators, simulated -----------------------------------------------------------------------------------------------------------
 
 
-@lru_cache(maxsize=1)
-def simulated() -> tuple:
-    rng = np.random.default_rng()
+@pytest.fixture(scope="module")
+def simulated(request: pytest.FixtureRequest) -> tuple:
     noise = NoiseModel(2.0**2 + 1 / 12, 0.3, low_dn=0, high_dn=255)
     images = draw_images("disc", disc(6, background_dn=30.0), phases=2)
     mean = np.repeat(images.mean, 500, axis=0)
-    frames = np.round(mean + rng.normal(size=mean.shape) * np.sqrt(4.0 + 0.3 * mean))
+    frames = np.round(mean + rng_of(request).normal(size=mean.shape) * np.sqrt(4.0 + 0.3 * mean))
     return images, pixel_noise(images, noise), np.repeat(images.lever, 500, axis=0), frames
 
 
@@ -332,9 +331,9 @@ def test_noise_through_the_laws_of_the_centroids(level: float) -> None:
 
 
 @pytest.mark.parametrize("name", ["centroid", "squared_centroid", "soft_threshold", "hard_threshold"])
-def test_predicted_centroids_are_those_of_simulated_images(name: str) -> None:
+def test_predicted_centroids_are_those_of_simulated_images(simulated: tuple, name: str, rng: np.random.Generator) -> None:
     """2000 images, window about the true place, one step towards the fixed point: catches 8 % of the standard deviation at 1e-6."""
-    images, pixels, lever, frames = simulated()
+    images, pixels, lever, frames = simulated
     told = predict(name, images, pixels, images.place, 5.0)
     level = frames - 30.0
     threshold = 3 * np.sqrt(np.median(pixels.total))
@@ -349,7 +348,6 @@ def test_predicted_centroids_are_those_of_simulated_images(name: str) -> None:
     step = 1e-3  # the answer to a move of the target, from noise-free images moved by the template
     change = images.columns(images.place)
     sigma = np.sqrt(pixels.total)
-    rng = np.random.default_rng()
     draw = rng.normal(size=(400, *images.mean.shape)) * sigma
     law = {
         "centroid": lambda v: v,
@@ -373,9 +371,9 @@ def test_predicted_centroids_are_those_of_simulated_images(name: str) -> None:
     assert abs(spread - told.s_curve_px) < 6 * told.noise_px / np.sqrt(500)
 
 
-def test_template_fits_reach_what_is_predicted() -> None:
+def test_template_fits_reach_what_is_predicted(simulated: tuple) -> None:
     """Linear least squares about the truth, both weightings, 2000 images: catches 8 % of the standard deviation at 1e-6."""
-    images, pixels, _, frames = simulated()
+    images, pixels, _, frames = simulated
     unknowns = images.subset("shape")
     for name in ("template", "template_unweighted"):
         told = predict(name, images, pixels, unknowns)

@@ -90,28 +90,24 @@ def test_a_number_does_not_depend_on_where_the_ring_begins() -> None:
 
 
 @pytest.mark.parametrize(("radius", "tilt"), [(4.5, 0), (5.5, 30), (6.5, 45), (9, 60), (12, 60), (25, 50)])
-def test_every_target_is_read_right(radius: float, tilt: float) -> None:
+def test_every_target_is_read_right(radius: float, tilt: float, rng: np.random.Generator) -> None:
     """Random codes, turns and phases, both polarities, noise 3 of 170; smaller half axes from 4.5 px (margins from 0.6)."""
-    rng = np.random.default_rng()
     for number in rng.choice(codes(), 12):
         found, margin = read(rng, int(number), radius, tilt, contrast=float(rng.choice([-170, 170])))
         assert found == number and margin > 0.3
 
 
-def test_all_codes_are_read_right() -> None:
-    rng = np.random.default_rng()
+def test_all_codes_are_read_right(rng: np.random.Generator) -> None:
     assert [read(rng, number, 5.0, 20.0)[0] for number in codes()] == list(codes())
 
 
-def test_uneven_light_and_weak_contrast() -> None:
-    rng = np.random.default_rng()
+def test_uneven_light_and_weak_contrast(rng: np.random.Generator) -> None:
     for number in rng.choice(codes(), 10):
         assert read(rng, int(number), 6.0, 30.0, contrast=60.0, noise=4.0, slope=0.6)[0] == number
 
 
-def test_targets_too_small_to_be_read_are_not_read_wrong() -> None:
+def test_targets_too_small_to_be_read_are_not_read_wrong(rng: np.random.Generator) -> None:
     """Half axes of 1 … 3 px, where segments run together: of 300 at most 8 wrong (a rate of 1 % gives more once in 300)."""
-    rng = np.random.default_rng()
     wrong = 0
     for number in rng.choice(codes(), 300):
         found, _ = read(rng, int(number), rng.uniform(1, 3), rng.uniform(0, 60), noise=5.0, blur=0.8)
@@ -119,12 +115,11 @@ def test_targets_too_small_to_be_read_are_not_read_wrong() -> None:
     assert wrong <= 8
 
 
-def test_what_is_no_coded_target_has_no_code() -> None:
+def test_what_is_no_coded_target_has_no_code(rng: np.random.Generator) -> None:
     """Plain discs, rings, discs among others, chessboard corners, noise: of 2000 at most 9 are taken for codes.
 
     Two thirds of one on average (22 in 33 runs, all of them in the crowd): even of one, ten come by chance once in 10⁷ runs.
     """
-    rng = np.random.default_rng()
     size = 600
     row, col = np.indices((size, size)).astype(float)
     x, y = rng.uniform(30, size - 30, (2, 400))
@@ -147,22 +142,19 @@ def test_what_is_no_coded_target_has_no_code() -> None:
     assert taken <= 9
 
 
-def test_the_same_number_in_every_view() -> None:
-    rng = np.random.default_rng()
+def test_the_same_number_in_every_view(rng: np.random.Generator) -> None:
     number = int(rng.choice(codes()))
     assert {read(rng, number, rng.uniform(6, 15), rng.uniform(0, 55))[0] for _ in range(15)} == {number}
 
 
-def test_other_rings() -> None:
-    rng = np.random.default_rng()
+def test_other_rings(rng: np.random.Generator) -> None:
     for bits, radius in ((8, 4.0), (14, 6.0)):
         number = int(rng.choice(codes(bits)))
         assert read(rng, number, radius, 20.0, bits=bits)[0] == number
 
 
-def test_segments_are_known_as_parts_of_their_target() -> None:
+def test_segments_are_known_as_parts_of_their_target(rng: np.random.Generator) -> None:
     """Centres of the segments of a ring under 50° of tilt, a neighbour outside it, and a target without a code."""
-    rng = np.random.default_rng()
     homography, (a, b, angle) = view(rng, 8.0, 50.0, near=0.0)
     turns = (np.arange(12) + 0.5) / 12 * 2 * np.pi
     segments = (homography[:2, :2] @ (2.5 * np.stack([np.cos(turns), np.sin(turns)]))).T + 100
@@ -173,8 +165,7 @@ def test_segments_are_known_as_parts_of_their_target() -> None:
     assert member.tolist() == [False] + [True] * 12 + [False] * 3
 
 
-def test_a_ring_that_leaves_the_frame_has_no_code() -> None:
-    rng = np.random.default_rng()
+def test_a_ring_that_leaves_the_frame_has_no_code(rng: np.random.Generator) -> None:
     homography, (a, b, angle) = view(rng, 6.0, 0.0)
     shift = np.eye(3)
     shift[:2, 2] = 12, 30

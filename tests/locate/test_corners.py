@@ -54,9 +54,8 @@ def fitted(rng, pictures: np.ndarray, places: np.ndarray, repeats: int, noise_dn
 
 
 @pytest.mark.parametrize("blur", [0.3, 0.7, 1.5])
-def test_no_bias_at_any_phase_angle_or_sharpness(blur: float) -> None:
+def test_no_bias_at_any_phase_angle_or_sharpness(blur: float, rng: np.random.Generator) -> None:
     """Without noise, off by less than 0.001 px; the drawing itself is good to about 0.0003 px where it is sharp."""
-    rng = np.random.default_rng()
     pictures, places, _ = corners(rng, 12, blur, fine=16)
     places[:4, 0] = [-0.5, -0.25, 0.0, 0.25]
     pictures[:4] = [drawn(x, y, 0.0, np.pi / 2, blur, fine=16) for x, y in places[:4]]
@@ -69,12 +68,11 @@ def test_no_bias_at_any_phase_angle_or_sharpness(blur: float) -> None:
 
 
 @pytest.mark.parametrize(("blur", "noise"), [(0.3, 1.0), (0.7, 8.0), (1.5, 2.0)])
-def test_errors_are_at_the_bound_and_covariances_are_honest(blur: float, noise: float) -> None:
+def test_errors_are_at_the_bound_and_covariances_are_honest(blur: float, noise: float, rng: np.random.Generator) -> None:
     """χ² of 800 normalised errors fails once in 1e6 and catches a standard deviation that is off by 12 % (and any bound missed by more).
 
     The bound comes from derivatives of the drawn pictures by finite differences, not from the fitted template.
     """
-    rng = np.random.default_rng()
     pictures, places, settings = corners(rng, 10, blur)
     variance = noise**2 + 1 / 12
     error, found = fitted(rng, pictures, places, 40, noise, NoiseModel(variance), planes="never")
@@ -99,9 +97,8 @@ def test_errors_are_at_the_bound_and_covariances_are_honest(blur: float, noise: 
     assert stats.kstest(z, "norm").pvalue > FALSE_FAILURES
 
 
-def test_shot_noise_is_weighted() -> None:
+def test_shot_noise_is_weighted(rng: np.random.Generator) -> None:
     """Variance 1 + level: χ² of 400 normalised errors, as above (17 %), and χ² per degree of freedom 1 ± 1 %."""
-    rng = np.random.default_rng()
     pictures, places, _ = corners(rng, 5, 0.8)
     error, found = fitted(rng, pictures, places, 40, lambda level: np.sqrt(1 + level), NoiseModel(1 + 1 / 12, slope_dn=1.0))
     z2 = (error.reshape(-1, 2) ** 2 / np.stack([found.var_x_px2, found.var_y_px2], 1)).sum()
@@ -110,9 +107,8 @@ def test_shot_noise_is_weighted() -> None:
     assert found.more["chi2_per_dof"].mean() == pytest.approx(1, abs=0.02)
 
 
-def test_light_that_falls_off_is_noticed_and_moves_nothing() -> None:
+def test_light_that_falls_off_is_noticed_and_moves_nothing(rng: np.random.Generator) -> None:
     """0.8 % a pixel on mean and contrast: 0.1 px without planes; with them mean errors below 5.5 standard errors (0.006 px)."""
-    rng = np.random.default_rng()
     pictures, places, _ = corners(rng, 4, 0.8, light=(0.8, -0.6, 0.5, 0.4))
     error, found = fitted(rng, pictures, places, 20, 1.0, NoiseModel(1 + 1 / 12))
     assert (found.flags & Flag.GRADIENT > 0).all()
@@ -122,16 +118,14 @@ def test_light_that_falls_off_is_noticed_and_moves_nothing() -> None:
     assert np.abs(plain).max() > 0.02
 
 
-def test_planes_are_seldom_taken_without_need() -> None:
-    rng = np.random.default_rng()
+def test_planes_are_seldom_taken_without_need(rng: np.random.Generator) -> None:
     pictures, places, _ = corners(rng, 5, 0.8)
     _, found = fitted(rng, pictures, places, 60, 2.0, NoiseModel(4 + 1 / 12))
     assert (found.flags & Flag.GRADIENT > 0).sum() <= 4  # once in 1e4: five of 300 happen by chance once in 4e9
 
 
-def test_saturated_squares_leave_no_bias() -> None:
+def test_saturated_squares_leave_no_bias(rng: np.random.Generator) -> None:
     """White at 1.02 of full scale, noise 4: without the scale's end in the model the blur and contrast would be wrong."""
-    rng = np.random.default_rng()
     picture = drawn(0.2, -0.3, 0.4, 1.8, 0.8, mean=160.0, contrast=100.0)
     frame = np.clip(np.rint(np.tile(picture, (8, 8)) + rng.normal(0, 4, (8 * SIDE, 8 * SIDE))), 0, 255).astype(np.uint8)
     cols, rows = np.meshgrid(np.arange(8) * SIDE + HALF, np.arange(8) * SIDE + HALF)
@@ -143,9 +137,8 @@ def test_saturated_squares_leave_no_bias() -> None:
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
-def test_finds_and_refines_a_chessboard_in_perspective(dtype: type) -> None:
+def test_finds_and_refines_a_chessboard_in_perspective(dtype: type, rng: np.random.Generator) -> None:
     """The board is drawn by mapping pixels back to it; corners are where its homography sends them, to 6 standard deviations."""
-    rng = np.random.default_rng()
     rows, cols, fine, blur = 5, 7, 6, 0.8
     to_image = np.array([[24.0, 3.0, 50.0], [-2.0, 22.0, 60.0], [0.0004, 0.0009, 1.0]])
     to_image += rng.uniform(-0.5, 0.5, (3, 3)) * [[1, 1, 1], [1, 1, 1], [1e-4, 1e-4, 0]]
@@ -184,8 +177,7 @@ def test_the_directions_of_the_edges_and_their_order() -> None:
     assert frame[round(12 + 6 * np.sin(middle)), round(12 + 6 * np.cos(middle))] > 160
 
 
-def test_what_is_no_corner_has_an_outcome() -> None:
-    rng = np.random.default_rng()
+def test_what_is_no_corner_has_an_outcome(rng: np.random.Generator) -> None:
     flat = np.full((40, 40), 100, np.uint8)
     found = corner_positions(flat, np.array([20.0, 1.0, 300.0, np.nan]), np.array([20.0, 1.0, 20.0, 3.0]), NoiseModel(1.0))
     assert (found.flags & Flag.NOT_CONVERGED > 0).all() and np.isnan(found.x_px).all() and np.isnan(found.var_x_px2).all()
@@ -201,8 +193,7 @@ def test_what_is_no_corner_has_an_outcome() -> None:
         corner_positions(flat, np.array([1.0]), np.array([1.0]), NoiseModel(1.0), planes="sometimes")
 
 
-def test_the_result_does_not_depend_on_the_threads() -> None:
-    rng = np.random.default_rng()
+def test_the_result_does_not_depend_on_the_threads(rng: np.random.Generator) -> None:
     pictures, places, _ = corners(rng, 3, 0.8)
     frame = np.tile(np.concatenate(pictures), (1, 60)).astype(np.float32)
     x, y = (a.ravel() for a in np.meshgrid(np.arange(60) * SIDE + HALF, np.arange(3) * SIDE + HALF))

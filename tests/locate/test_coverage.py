@@ -6,8 +6,6 @@ coordinates of a cell (900 z values) it misses half of the biases of .17 u, or o
 
 from __future__ import annotations
 
-import secrets
-
 import numpy as np
 import pytest
 from scipy import stats
@@ -31,13 +29,6 @@ CELLS = (
     Case(radius=3.0, gain_dn_per_e=0.5, read_dn=0.5),
     Case(radius=3.0, blur=1.0, amplitude=-2500.0, background=2800.0, gain_dn_per_e=0.3, read_dn=1.0, bits=12),
 )
-
-
-@pytest.fixture
-def rng() -> np.random.Generator:
-    seed = secrets.randbits(64)
-    print(f"seed {seed}")  # pytest shows it with a failure
-    return np.random.default_rng(seed)
 
 
 @pytest.mark.parametrize("case", CELLS, ids=str)

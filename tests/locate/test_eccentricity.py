@@ -107,9 +107,8 @@ def noisy(ellipses: Ellipses, rng: np.random.Generator, sigma_px: float) -> Elli
 
 
 @pytest.mark.parametrize("tilt_deg", [0.0, 5.0, 45.0, 60.0])
-def test_the_covariance_of_the_centres_holds(tilt_deg: float) -> None:
+def test_the_covariance_of_the_centres_holds(tilt_deg: float, rng: np.random.Generator) -> None:
     """χ² over 9 targets × 80 trials × 2: catches a standard deviation 13 % off at a false-failure rate of 1e-6."""
-    rng = np.random.default_rng()
     normal = turn(tilt_deg, 30.0)[:, 2]
     x, y = (v.ravel() for v in np.meshgrid([-60.0, 0, 60.0], [-60.0, 0, 60.0]))
     ellipses, truth = circle_seen(homography_of(CAMERA, normal, np.array([5.0, 8.0, 1000.0])), x, y, 10.0)
@@ -129,9 +128,8 @@ def test_the_covariance_of_the_centres_holds(tilt_deg: float) -> None:
     assert sum(total["common"]) < 1.25 * chi2.ppf(1 - FALSE_FAILURES, dof)  # the plane's error is common to nine targets
 
 
-def test_the_normal_of_several_circles_has_the_covariance_that_is_stated() -> None:
+def test_the_normal_of_several_circles_has_the_covariance_that_is_stated(rng: np.random.Generator) -> None:
     """z² of two angles over 60 trials: catches a standard deviation 34 % off at 1e-6."""
-    rng = np.random.default_rng()
     normal = turn(40.0, -50.0)[:, 2]
     x, y = (v.ravel() for v in np.meshgrid([-60.0, 0, 60.0], [-60.0, 0, 60.0]))
     ellipses, _ = circle_seen(homography_of(CAMERA, normal, np.array([5.0, 8.0, 1000.0])), x, y, 10.0)
@@ -233,11 +231,11 @@ def test_centres_in_rendered_images(diameter_mm: float, tilt_deg: float) -> None
         assert np.hypot(ellipses.x_px - truth[:, 0], ellipses.y_px - truth[:, 1]).max() > 0.25
 
 
-def test_noisy_images_agree_on_the_plane_as_well_as_their_covariance_says() -> None:
+def test_noisy_images_agree_on_the_plane_as_well_as_their_covariance_says(rng: np.random.Generator) -> None:
     """χ² of 3 × 9 ellipses about common planes: catches a covariance 2.2 times too large or too small at 1e-6."""
     from pixmetry.locate.template.template import fit_template
 
-    rng, shape, camera = np.random.default_rng(), (440, 500), Pinhole(2500.0, 250.0, 220.0)
+    shape, camera = (440, 500), Pinhole(2500.0, 250.0, 220.0)
     total = 0.0
     for tilt_deg, diameter_mm in ((20.0, 12.0), (45.0, 20.0), (60.0, 33.6)):
         pose = Pose(2500.0, 250.0, 220.0, tilt_deg * 0.8, tilt_deg * 0.6, 15.0, 2.0, -3.0, 1000.0)

@@ -41,8 +41,7 @@ def by_hand(window: np.ndarray, name: str, half: int = 6, threshold: float = 20.
 
 
 @pytest.mark.parametrize("name", LAWS)
-def test_locate_is_the_definition(name: str) -> None:
-    rng = np.random.default_rng()
+def test_locate_is_the_definition(name: str, rng: np.random.Generator) -> None:
     windows = np.stack([spot(*(12 + rng.uniform(-0.5, 0.5, 2))) + rng.normal(0, 1, (SIDE, SIDE)) for _ in range(5)])
     x, y = estimator(name).locate(windows)
     for k in range(5):
@@ -108,10 +107,9 @@ def test_s_curve_of_a_soft_threshold_equals_the_poisson_sum() -> None:
     assert np.allclose(x - 12 - phases, series, atol=2e-3)  # the kinks at ± edge leave 1/k² beyond the last term
 
 
-def test_noise_of_each_estimator_is_what_the_gradient_predicts() -> None:
+def test_noise_of_each_estimator_is_what_the_gradient_predicts(rng: np.random.Generator) -> None:
     """20 000 windows of plain NumPy noise. False alarm 1e-6 in each of 8 comparisons (z = 4.9 of √(1/2n)); 4 % errors are seen."""
     n, sigma = 20_000, 0.5
-    rng = np.random.default_rng()
     # the profile is flat away from the threshold, so that no noise carries a pixel over it and first order holds
     flat = np.where(np.hypot(AXIS - 12, AXIS[:, None] - 12) < 3.6, 150.0, 0.0) + 10.0
     windows = flat + rng.normal(0, sigma, (n, SIDE, SIDE))

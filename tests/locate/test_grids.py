@@ -45,13 +45,12 @@ def agreeing(grid, i: np.ndarray, j: np.ndarray, asymmetric=False) -> int:
 
 
 @pytest.mark.parametrize("asymmetric", [False, True])
-def test_orders_plates_in_any_pose(asymmetric: bool) -> None:
+def test_orders_plates_in_any_pose(asymmetric: bool, rng: np.random.Generator) -> None:
     """30 plates of 5 × 5 to 30 × 30 dots, tilted up to 55°, distorted by −30 … +20 % at the corner, 3 % missing, 8 dots of clutter.
 
     One plate in a thousand is so oblique that it is numbered along a diagonal: four of 30 are by chance once in 10⁷ runs; a share of 30 %
     would be caught with 99 %. Of the others some 1 in 20 000 dots is left out.
     """
-    rng = np.random.default_rng()
     right = total = wrong_plates = 0
     for _ in range(30):
         rows, cols = rng.integers(5, 31, 2)
@@ -70,8 +69,7 @@ def test_orders_plates_in_any_pose(asymmetric: bool) -> None:
     assert right > 0.99 * total
 
 
-def test_every_dot_of_a_whole_plate_has_its_own_cell() -> None:
-    rng = np.random.default_rng()
+def test_every_dot_of_a_whole_plate_has_its_own_cell(rng: np.random.Generator) -> None:
     x, y, i, j = plate(rng, 40, 60, tilt_deg=30, turn=0.2)
     grid = order_grid(x, y)
     assert (grid.rows, grid.cols) == (40, 60) and grid.placed.all()
@@ -80,16 +78,14 @@ def test_every_dot_of_a_whole_plate_has_its_own_cell() -> None:
     assert (turned.rows, turned.cols) == (60, 40) and (turned.row == j).all() and (turned.col == 39 - i).all()
 
 
-def test_clutter_between_the_dots_is_left_out() -> None:
-    rng = np.random.default_rng()
+def test_clutter_between_the_dots_is_left_out(rng: np.random.Generator) -> None:
     x, y, i, j = plate(rng, 20, 25, tilt_deg=20, turn=0.0)
     between = 0.5 * (x[(i == 7) & (j == 9)] + x[(i == 8) & (j == 10)]), 0.5 * (y[(i == 7) & (j == 9)] + y[(i == 8) & (j == 10)])
     grid = order_grid(np.append(x, between[0]), np.append(y, between[1]))
     assert grid.placed[:-1].all() and not grid.placed[-1] and grid.row[-1] == grid.col[-1] == -1
 
 
-def test_a_dot_that_is_out_of_place_is_an_outlier() -> None:
-    rng = np.random.default_rng()
+def test_a_dot_that_is_out_of_place_is_an_outlier(rng: np.random.Generator) -> None:
     x, y, i, j = plate(rng, 15, 15, tilt_deg=10, turn=0.0, distortion=0.0)
     wrong = np.flatnonzero((i == 7) & (j == 7))[0]
     step = np.hypot(x[(i == 7) & (j == 8)] - x[wrong], y[(i == 7) & (j == 8)] - y[wrong])[0]
@@ -98,17 +94,15 @@ def test_a_dot_that_is_out_of_place_is_an_outlier() -> None:
     assert not grid.placed[wrong] and grid.placed.sum() == 224
 
 
-def test_gaps_are_counted() -> None:
+def test_gaps_are_counted(rng: np.random.Generator) -> None:
     """A missing row and column do not shift the numbers beyond them."""
-    rng = np.random.default_rng()
     x, y, i, j = plate(rng, 16, 20, tilt_deg=35, turn=0.1)
     keep = (i != 6) & (j != 12)
     grid = order_grid(x[keep], y[keep])
     assert grid.placed.all() and (grid.row == i[keep]).all() and (grid.col == j[keep]).all() and (grid.rows, grid.cols) == (16, 20)
 
 
-def test_the_pattern_settles_what_the_dots_leave_open() -> None:
-    rng = np.random.default_rng()
+def test_the_pattern_settles_what_the_dots_leave_open(rng: np.random.Generator) -> None:
     x, y, i, j = plate(rng, 6, 9, tilt_deg=0, turn=np.pi / 2 - 0.1)
     free, named = order_grid(x, y), order_grid(x, y, pattern=(9, 6))
     assert (free.rows, free.cols) == (9, 6) and (named.rows, named.cols) == (6, 9) and not named.message
@@ -118,8 +112,7 @@ def test_the_pattern_settles_what_the_dots_leave_open() -> None:
     assert (grid.row == i).all() and (grid.col == j).all() and (grid.rows, grid.cols) == (11, 4)
 
 
-def test_twenty_thousand_dots() -> None:
-    rng = np.random.default_rng()
+def test_twenty_thousand_dots(rng: np.random.Generator) -> None:
     x, y, i, j = plate(rng, 125, 160, tilt_deg=30, turn=0.05, missing=0.02, clutter=20)
     assert agreeing(order_grid(x, y), i, j) > 0.999 * (i >= 0).sum()
 
@@ -130,8 +123,7 @@ def test_too_few_dots_are_said_to_be_too_few(count: int) -> None:
     assert grid.message and not grid.placed.any() and len(grid) == count
 
 
-def test_odd_inputs_have_an_outcome() -> None:
-    rng = np.random.default_rng()
+def test_odd_inputs_have_an_outcome(rng: np.random.Generator) -> None:
     for x, y in (
         (np.zeros(9), np.zeros(9)),  # all in one place
         (np.arange(9.0), np.zeros(9)),  # a line
@@ -165,8 +157,9 @@ def drawn_circles(rng, rows: int, cols: int, asymmetric: bool, bright: bool) -> 
 
 @pytest.mark.parametrize("asymmetric", [False, True])
 @pytest.mark.parametrize("bright", [False, True])
-def test_a_named_pattern_is_found_in_the_frame_and_ordered_alike_among_targets(asymmetric: bool, bright: bool) -> None:
-    rng = np.random.default_rng()
+def test_a_named_pattern_is_found_in_the_frame_and_ordered_alike_among_targets(
+    asymmetric: bool, bright: bool, rng: np.random.Generator
+) -> None:
     rows, cols = (11, 4) if asymmetric else (5, 7)
     picture, true = drawn_circles(rng, rows, cols, asymmetric, bright)
     for frame in (np.rint(picture).astype(np.uint8), np.rint(picture * 100).astype(np.uint16), (picture / 300).astype(np.float32)):
@@ -179,8 +172,7 @@ def test_a_named_pattern_is_found_in_the_frame_and_ordered_alike_among_targets(a
     assert not among.message and (among.row * cols + among.col == np.arange(rows * cols)[::-1]).all()
 
 
-def test_eight_bits_keep_what_matters() -> None:
-    rng = np.random.default_rng()
+def test_eight_bits_keep_what_matters(rng: np.random.Generator) -> None:
     frame = rng.integers(0, 256, (50, 60)).astype(np.uint8)
     assert eight_bit(frame) is frame
     wide = (frame.astype(np.uint16) + 20) * 200

@@ -5,8 +5,6 @@ Images come from `rendered`, which shares nothing with the package. Tests that c
 
 from __future__ import annotations
 
-import secrets
-
 import numpy as np
 import pytest
 from scipy import stats
@@ -20,13 +18,6 @@ from pixmetry.locate.template.image_noise import noise_from_image
 
 RATE = 1e-6
 PITCH = 30
-
-
-@pytest.fixture
-def rng() -> np.random.Generator:
-    seed = secrets.randbits(64)
-    print(f"seed {seed}")  # pytest shows it with a failure
-    return np.random.default_rng(seed)
 
 
 def few_discs(count: int, case: Case, rng: np.random.Generator, frames: int) -> dict[str, Outcome]:

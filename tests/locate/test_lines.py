@@ -217,9 +217,8 @@ def test_variance_equals_the_closed_form_for_shot_noise() -> None:
 
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)
-def test_lines_reach_the_bound_and_their_covariance_is_true(estimator: str) -> None:
+def test_lines_reach_the_bound_and_their_covariance_is_true(estimator: str, rng: np.random.Generator) -> None:
     """Lines of 41 px at any angle; the bound is that of the closed form for the length that is used."""
-    rng = np.random.default_rng()
     n = 3000
     frame, candidates, true = tiles("gaussian", n, rng)
     p = line_positions(stored(frame, rng), candidates, WHITE, estimator=estimator)
@@ -238,8 +237,7 @@ def test_lines_reach_the_bound_and_their_covariance_is_true(estimator: str) -> N
 
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)
-def test_edges_have_true_covariances(estimator: str) -> None:
-    rng = np.random.default_rng()
+def test_edges_have_true_covariances(estimator: str, rng: np.random.Generator) -> None:
     frame, candidates, true = tiles("edge", 2000, rng, sigma_px=0.9, amplitude_dn=120.0)
     p = line_positions(stored(frame, rng), candidates, WHITE, "edge", estimator)
     assert not (p.flags & np.uint32(Flag.NOT_CONVERGED)).any()
@@ -260,9 +258,8 @@ CASES = {
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_covariance_is_true_for(case: str) -> None:
+def test_covariance_is_true_for(case: str, rng: np.random.Generator) -> None:
     section, fixed, noise = CASES[case]
-    rng = np.random.default_rng()
     frame, candidates, true = tiles(section, 1000, rng, **fixed)
     p = line_positions(stored(frame, rng, noise), candidates, noise)
     inner = ((p.flags & np.uint32(Flag.NOT_CONVERGED | Flag.BORDER)) == 0) & (p.more["chi2_per_dof"] < 1.5)
@@ -278,8 +275,7 @@ def test_covariance_is_true_for(case: str) -> None:
         assert np.median(p.more["width_px"]) == 0
 
 
-def test_slopes_tapers_and_curvature_are_taken_in_when_there() -> None:
-    rng = np.random.default_rng()
+def test_slopes_tapers_and_curvature_are_taken_in_when_there(rng: np.random.Generator) -> None:
     rows, cols = np.arange(120), np.arange(60)
     q = dict(angle_deg=86.0, amplitude_dn=100.0, background_dn=60.0, sigma_px=1.4)
     given = LineCandidates.of(
@@ -310,9 +306,8 @@ def test_slopes_tapers_and_curvature_are_taken_in_when_there() -> None:
     assert p.more["curvature_per_px"][0] == 0 and p.more["taper_per_px"][0] == 0
 
 
-def test_rows_tell_of_jitter() -> None:
+def test_rows_tell_of_jitter(rng: np.random.Generator) -> None:
     """Rows displaced by a known jitter of 0.15 px rms: each row's position follows with its own variance."""
-    rng = np.random.default_rng()
     n = 400
     jitter = rng.normal(0, 0.15, n)
     cols = np.arange(48)
@@ -334,19 +329,20 @@ def cross_frame(x: float, y: float, first: float, second: float, width: float, u
     if union:
         a, b = np.radians([first, second])
         h = 0.5 * width / abs(math.sin(b - a))
-        corners = [(h * (i * math.cos(a) + j * math.cos(b)), h * (i * math.sin(a) + j * math.sin(b))) for i, j in
-                   ((1, 1), (-1, 1), (-1, -1), (1, -1))]
+        corners = [
+            (h * (i * math.cos(a) + j * math.cos(b)), h * (i * math.sin(a) + j * math.sin(b)))
+            for i, j in ((1, 1), (-1, 1), (-1, -1), (1, -1))
+        ]
         outlines.append(polygon([x + u for u, _ in corners], [y + v for _, v in corners], -height))
     return 20.0 + scene(outlines, 1.3, 101, 101)
 
 
-def test_crosses_have_true_covariances() -> None:
+def test_crosses_have_true_covariances(rng: np.random.Generator) -> None:
     """Sums and unions, thin and wide, at any angle of 40° or more; whitened errors of 60 crosses.
 
     About one line in a thousand is found as two, on both sides of the crossing, and then there is no cross (6 of 3500): four of 60 may be
     missed, five are by chance once in 10⁷ runs; a fifth missed would be caught with 99 %.
     """
-    rng = np.random.default_rng()
     z, height, missed = [], 100.0, 0
     for k in range(60):
         x, y = 50 + rng.uniform(-2, 2, 2)
@@ -367,9 +363,8 @@ def test_crosses_have_true_covariances() -> None:
     assert_normal(np.ravel(z))
 
 
-def test_detection_finds_lines_where_they_are() -> None:
+def test_detection_finds_lines_where_they_are(rng: np.random.Generator) -> None:
     """Crossing, short, dark and wide lines at once; ends to 2 px, distance across to 0.4 px, nothing else."""
-    rng = np.random.default_rng()
     true = [(250, 250, 10, 2000, 2.0, 100.0), (300, 200, 80, 2000, 2.0, 90.0), (100, 400, 45, 60, 2.0, 80.0),
             (400, 420, -30, 110, 7.0, -45.0), (120, 120, -60, 40, 3.0, 60.0), (400, 80, 0, 80, 2.0, -40.0)]  # fmt: skip
     frame = 60 + scene([scene_line(x, y, length, width, angle, height) for x, y, angle, length, width, height in true], 1.2, 512, 512)
@@ -388,8 +383,7 @@ def test_detection_finds_lines_where_they_are() -> None:
             assert found.flags[i] & Flag.BORDER
 
 
-def test_detection_finds_edges() -> None:
-    rng = np.random.default_rng()
+def test_detection_finds_edges(rng: np.random.Generator) -> None:
     for angle in (0.0, 5.0, 60.0, 135.0, 200.0):
         frame = stored(30 + scene([scene_edge(100.0, 90.0, angle, 100.0)], 0.8, 180, 200), rng)
         found = find_edges(frame)
@@ -404,17 +398,15 @@ def test_detection_finds_edges() -> None:
 
 
 @pytest.mark.parametrize("sigma", [0.4, 1.5, 12.0])
-def test_noise_holds_no_lines(sigma: float) -> None:
+def test_noise_holds_no_lines(sigma: float, rng: np.random.Generator) -> None:
     """Stated: less than one false line in 1e6 frames; a rate of one in a frame would pass with a probability of e⁻³."""
-    rng = np.random.default_rng()
     for _ in range(3):
         frame = np.clip(np.round(100 + rng.normal(0, sigma, (400, 500))), 0, 255).astype(np.uint8)
         assert len(find_lines(frame)) == 0 and len(find_edges(frame)) == 0
 
 
-def test_a_line_near_another_is_not_pulled() -> None:
+def test_a_line_near_another_is_not_pulled(rng: np.random.Generator) -> None:
     """Pixels that a crossing line covers are left out, and said to be."""
-    rng = np.random.default_rng()
     z = []
     for _ in range(40):
         angle = rng.uniform(-20, 20)
@@ -429,8 +421,7 @@ def test_a_line_near_another_is_not_pulled() -> None:
     assert_normal(np.array(z))
 
 
-def test_threads_give_the_same_bits() -> None:
-    rng = np.random.default_rng()
+def test_threads_give_the_same_bits(rng: np.random.Generator) -> None:
     frame, candidates, _ = tiles("gaussian", 100, rng)
     image = stored(frame, rng)
     for estimator in ("template", "row_soft_threshold"):
@@ -456,10 +447,9 @@ def test_nothing_in_nothing_out() -> None:
         line_model("round", {}, [0], [0])
 
 
-def test_a_candidate_without_a_line_is_refused() -> None:
+def test_a_candidate_without_a_line_is_refused(rng: np.random.Generator) -> None:
     """Nothing there, or all of it saturated: not converged, or faint, and no number that looks good."""
     given = LineCandidates.of(x1_px=10.0, y1_px=30.0, x2_px=50.0, y2_px=30.0, amplitude_dn=50.0, background_dn=100.0, blur_px=1.0)
-    rng = np.random.default_rng()
     for image in (stored(np.full((60, 60), 100.0), rng), np.full((60, 60), 255, np.uint8)):
         p = line_positions(image, given, WHITE)
         assert p.flags[0] & (Flag.NOT_CONVERGED | Flag.FAINT)

@@ -10,7 +10,7 @@ import pytest
 from scipy.special import chndtr
 
 from locate import rendered
-from locate.target_frames import half_height, lattice, rough_targets, z_scores
+from locate.target_frames import half_height, rough_targets, z_scores
 from pixmetry.core.errors import InputError
 from pixmetry.locate.centroids.moments import LAWS, equivalent_disc, moment_positions
 from pixmetry.locate.detect.targets import Flag
@@ -27,13 +27,12 @@ CASES = [
 
 
 @pytest.mark.parametrize("name", ["centroid", "squared_centroid", "windowed_centroid"])
-def test_z_scores_of_centroids_are_standard_normal(name: str) -> None:
+def test_z_scores_of_centroids_are_standard_normal(lattice, name: str, rng: np.random.Generator) -> None:
     """Noise 0.5–8, shot noise, radius 1–12, blur 0.6–2; chance 1e-6 in each comparison.
 
     n = 9 · 338 = 3042 z-scores: their variance is 1 ± 4.9·√(2/n) = 13 % and, for first order and classes of targets, 5 % more; the mean
     0 ± 4.9/√n = 0.09. Each case alone (338): ± 38 % and 7 % more. A factor of 1.13 in u fails.
     """
-    rng = np.random.default_rng()
     every = []
     for radius, blur, sigma, gain in CASES:
         mean, x, y = lattice(radius, blur)
@@ -52,10 +51,9 @@ def test_z_scores_of_centroids_are_standard_normal(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["soft_threshold", "hard_threshold"])
-def test_uncertainty_of_thresholds_covers(name: str) -> None:
+def test_uncertainty_of_thresholds_covers(lattice, name: str, rng: np.random.Generator) -> None:
     """Mean square of z at most 1 but for chance (1e-6) and 12 %, and not below a quarter; sharp small discs included, whose phase rules:
     0.47 ± 0.03."""
-    rng = np.random.default_rng()
     for radius, blur, sigma, gain in [*CASES, (1.0, 0.3, 0.5, 0.0), (3.0, 0.3, 0.5, 0.0), (8.0, 0.3, 0.5, 0.0)]:
         mean, x, y = lattice(radius, blur)
         frame = rendered.expose(mean, rng, read_dn=sigma, gain_dn_per_e=gain, bits=12)
@@ -65,12 +63,11 @@ def test_uncertainty_of_thresholds_covers(name: str) -> None:
         assert 0.25 < np.mean(z_scores(found, x, y) ** 2) < 1.12 + Z_TAIL * math.sqrt(2 / (2 * x.size)), (radius, blur, sigma)
 
 
-def test_the_reference_experiment() -> None:
+def test_the_reference_experiment(rng: np.random.Generator) -> None:
     """2000 discs of 3–8 px: the soft threshold's rms is 1.25 × the bound at most (0.00366 px), both polarities; z of all laws.
 
     The rms of 4000 coordinates is uncertain by 1.1 %, 1.5 % with the radii drawn: 5.5 % is allowed. The centroid's is 1.53 × the bound.
     """
-    rng = np.random.default_rng()
     allowed = 1 + Z_TAIL / math.sqrt(2 * 4000)
     for amplitude, background in ((180.0, 10.0), (-180.0, 230.0)):
         mean, x, y, radius = rendered.discs_frame(rng, amplitude=amplitude, background=background)
@@ -85,9 +82,8 @@ def test_the_reference_experiment() -> None:
             assert not (found.flags & Flag.NOT_CONVERGED).any()
 
 
-def test_an_ellipse_has_an_elliptic_window_and_covariance() -> None:
+def test_an_ellipse_has_an_elliptic_window_and_covariance(lattice, rng: np.random.Generator) -> None:
     """z-scores from the whole covariance, and the covariance's direction: along the long axis it is larger."""
-    rng = np.random.default_rng()
     mean, x, y = lattice(8.0, 0.8, minor=3.5, angle_deg=30.0)
     frame = rendered.expose(mean, rng, read_dn=1.5)
     targets = rough_targets(x, y, 8.0, 3.5, 0.8, 180.0, 20.0, rng, angle_deg=30.0)
@@ -99,18 +95,16 @@ def test_an_ellipse_has_an_elliptic_window_and_covariance() -> None:
         assert values[1] > 1.5 * values[0] and abs(math.degrees(math.atan(vectors[1, 1] / vectors[0, 1])) - 30) < 5, name
 
 
-def test_noise_free_positions_are_exact_and_at_the_stated_origin() -> None:
+def test_noise_free_positions_are_exact_and_at_the_stated_origin(lattice, rng: np.random.Generator) -> None:
     """Well-sampled discs without noise: the centre of the top-left pixel is (0, 0). A shift of 0.001 px fails."""
-    rng = np.random.default_rng()
     mean, x, y = lattice(4.0, 0.9, side=4)
     for name, off in (("centroid", 6e-4), ("squared_centroid", 2e-4), ("windowed_centroid", 2e-4), ("soft_threshold", 1e-3)):
         found = moment_positions(mean.astype(np.float32), rough_targets(x, y, 4.0, 4.0, 0.9, 180.0, 20.0, rng), NoiseModel(0.01), name)
         assert max(np.abs(found.x_px - x).max(), np.abs(found.y_px - y).max()) < off, name
 
 
-def test_the_local_background_takes_up_slope_level_and_neighbours() -> None:
+def test_the_local_background_takes_up_slope_level_and_neighbours(lattice, rng: np.random.Generator) -> None:
     """The map of the background is off by 3 DN and knows no slope, the frame has one of 0.25 DN/px; some targets have a close neighbour."""
-    rng = np.random.default_rng()
     mean, x, y = lattice(4.0, 0.8, side=10)
     mean = mean.copy()
     _, cols = np.indices(mean.shape)
@@ -129,8 +123,7 @@ def test_the_local_background_takes_up_slope_level_and_neighbours() -> None:
         assert np.abs(found.more["background_dn"] - truth).max() < 0.35, name
 
 
-def test_threads_give_the_same() -> None:
-    rng = np.random.default_rng()
+def test_threads_give_the_same(lattice, rng: np.random.Generator) -> None:
     mean, x, y = lattice(3.0, 0.8, side=8)
     frame = rendered.expose(mean, rng, read_dn=1.0)
     targets = rough_targets(x, y, 3.0, 3.0, 0.8, 180.0, 20.0, rng)
@@ -139,8 +132,7 @@ def test_threads_give_the_same() -> None:
         assert np.array_equal(one.x_px, two.x_px) and np.array_equal(one.var_y_px2, two.var_y_px2)
 
 
-def test_a_target_cut_off_at_the_border_is_flagged_and_one_near_it_is_right() -> None:
-    rng = np.random.default_rng()
+def test_a_target_cut_off_at_the_border_is_flagged_and_one_near_it_is_right(rng: np.random.Generator) -> None:
     x, y = np.array([1.3, 6.6, 40.2]), np.array([20.1, 20.4, 20.4])
     mean = np.full((44, 60), 10.0)
     for a, b in zip(x[[0, 2]], y[[0, 2]], strict=True):
@@ -153,8 +145,8 @@ def test_a_target_cut_off_at_the_border_is_flagged_and_one_near_it_is_right() ->
     assert abs(found.x_px[1] - 40.2) < 0.02
 
 
-def test_no_targets_constant_frame_and_unknown_law() -> None:
-    targets = rough_targets(np.array([20.0, np.nan]), np.array([20.0, 20.0]), 3.0, 3.0, 0.8, 100.0, 10.0, np.random.default_rng())
+def test_no_targets_constant_frame_and_unknown_law(rng: np.random.Generator) -> None:
+    targets = rough_targets(np.array([20.0, np.nan]), np.array([20.0, 20.0]), 3.0, 3.0, 0.8, 100.0, 10.0, rng)
     flat = np.full((40, 40), 10, np.uint8)
     for name in LAWS:
         assert len(moment_positions(flat, targets[:0], NoiseModel(1.0), name)) == 0

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from locate import rendered
-from locate.target_frames import half_height, lattice, rough_targets, z_scores
+from locate.target_frames import half_height, rough_targets, z_scores
 from pixmetry.core.errors import InputError
 from pixmetry.locate.centroids import _operator_kernels as o
 from pixmetry.locate.centroids.moments import prepare
@@ -21,12 +21,11 @@ CASES = [(1.0, 0.8, 1.0), (2.0, 0.6, 0.5), (3.0, 0.3, 0.5), (3.0, 0.8, 1.5), (5.
 
 
 @pytest.mark.parametrize("name", OPERATORS)
-def test_uncertainty_of_operators_covers(name: str) -> None:
+def test_uncertainty_of_operators_covers(lattice, name: str, rng: np.random.Generator) -> None:
     """Mean square of z at most 1 but for chance (1e-6) and 15 %, and not below a tenth.
 
     The perimeter's error depends on the very radius; it may exceed the largest of four by a quarter.
     """
-    rng = np.random.default_rng()
     for radius, blur, sigma in CASES:
         mean, x, y = lattice(radius, blur, side=11)
         frame = rendered.expose(mean, rng, read_dn=sigma)
@@ -39,8 +38,7 @@ def test_uncertainty_of_operators_covers(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["forstner", "ellipse_edges", "gaussian"])
-def test_ellipses_are_covered_too(name: str) -> None:
-    rng = np.random.default_rng()
+def test_ellipses_are_covered_too(lattice, name: str, rng: np.random.Generator) -> None:
     mean, x, y = lattice(7.0, 0.8, side=10, minor=4.0, angle_deg=-40.0)
     frame = rendered.expose(mean, rng, read_dn=1.0)
     targets = rough_targets(x, y, 7.0, 4.0, 0.8, 180.0, 20.0, rng, angle_deg=-40.0)
@@ -51,10 +49,9 @@ def test_ellipses_are_covered_too(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["forstner", "ellipse_edges", "gaussian"])
-def test_variance_is_that_of_the_slopes_by_finite_differences(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_variance_is_that_of_the_slopes_by_finite_differences(name: str, monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator) -> None:
     """σ² Σ (dx̂/dI)², every pixel of a small frame moved in turn, with the background's fit among the effects; 12 %."""
     monkeypatch.setattr("pixmetry.locate.centroids.operators._phase_variance", lambda *_: np.zeros(1))
-    rng = np.random.default_rng()
     mean = np.full((37, 37), 20.0)
     at = rendered.window(18.3, 17.8, 8)
     mean[at[0][0] : at[0][-1] + 1, at[1][0] : at[1][-1] + 1] += 150 * rendered.disc(18.3, 17.8, 2.5, 0.9, at)
@@ -79,10 +76,9 @@ def test_variance_is_that_of_the_slopes_by_finite_differences(name: str, monkeyp
     assert var_x == pytest.approx(1e-4 * sum_x, rel=0.12) and var_y == pytest.approx(1e-4 * sum_y, rel=0.12)
 
 
-def test_the_direct_fit_finds_an_exact_ellipse_and_equals_opencvs() -> None:
+def test_the_direct_fit_finds_an_exact_ellipse_and_equals_opencvs(rng: np.random.Generator) -> None:
     """Points of an ellipse give its centre; scattered ones the same as cv2.fitEllipseDirect, another implementation."""
     cv2 = pytest.importorskip("cv2")
-    rng = np.random.default_rng()
     t = np.linspace(0, 2 * np.pi, 41)[:-1]
     px, py = 0.3 + 1.4 * np.cos(t) * 0.8 - 0.7 * np.sin(t) * 0.6, -0.2 + 1.4 * np.cos(t) * 0.6 + 0.7 * np.sin(t) * 0.8
 
@@ -97,14 +93,14 @@ def test_the_direct_fit_finds_an_exact_ellipse_and_equals_opencvs() -> None:
         assert centre(qx, qy) == pytest.approx(theirs, abs=2e-4)
 
 
-def test_the_forstner_point_is_that_of_plain_numpy() -> None:
+def test_the_forstner_point_is_that_of_plain_numpy(rng: np.random.Generator) -> None:
     """The weighted intersection of normals over the operator's own window, without the noise's share, against np.linalg.lstsq."""
     from scipy.ndimage import correlate
 
     mean = np.full((41, 41), 20.0)
     at = rendered.window(20.37, 19.81, 10)
     mean[at[0][0] : at[0][-1] + 1, at[1][0] : at[1][-1] + 1] += 150 * rendered.disc(20.37, 19.81, 4.0, 0.9, at)
-    targets = rough_targets(np.array([20.37]), np.array([19.81]), 4.0, 4.0, 0.9, 150.0, 20.0, np.random.default_rng())
+    targets = rough_targets(np.array([20.37]), np.array([19.81]), 4.0, 4.0, 0.9, 150.0, 20.0, rng)
     frame = mean.astype(np.float32)
     found = operator_positions(frame, targets, NoiseModel(1e-9), "forstner")
     work = prepare(frame, targets, NoiseModel(1e-9), margin=MARGINS["forstner"])
@@ -118,8 +114,7 @@ def test_the_forstner_point_is_that_of_plain_numpy() -> None:
     assert (found.x_px[0], found.y_px[0]) == pytest.approx(tuple(point), abs=1.5e-3)
 
 
-def test_bad_input() -> None:
-    rng = np.random.default_rng()
+def test_bad_input(rng: np.random.Generator) -> None:
     targets = rough_targets(np.array([20.0, 1.0]), np.array([20.0, 20.0]), 3.0, 3.0, 0.8, 100.0, 10.0, rng)
     flat = np.full((40, 40), 10, np.uint8)
     for name in OPERATORS:

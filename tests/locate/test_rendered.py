@@ -90,8 +90,7 @@ def test_light_on_the_image_shifts_the_centroid_by_the_blur_more():
         assert (image * at[1]).sum() / image.sum() == pytest.approx(0.02 * expected, rel=1e-3)
 
 
-def test_places_keep_their_distance():
-    rng = np.random.default_rng()
+def test_places_keep_their_distance(rng: np.random.Generator):
     radii = rng.uniform(3, 8, 500)
     x, y = rendered.scatter(rng, (900, 1100), radii, gap=4.0, margin=5.0)
     apart = np.hypot(x[:, None] - x, y[:, None] - y) - radii[:, None] - radii + 1e9 * np.eye(500)
@@ -106,7 +105,7 @@ def test_bound_of_a_spot_is_the_closed_form():
     assert np.sqrt(covariance[0, 0]) == pytest.approx(np.sqrt(2 / np.pi) * 2 / 100, rel=1e-4)
 
 
-def test_exposure_has_the_stated_variance():
+def test_exposure_has_the_stated_variance(rng: np.random.Generator):
     """Read noise, shot noise and rounding: 4 + .5·100 + 1/12, within 5 standard errors of a variance of 10⁵ values (2.2 %)."""
-    values = rendered.expose(np.full((250, 400), 120.0), np.random.default_rng(), read_dn=2.0, gain_dn_per_e=0.5, black_dn=20.0)
+    values = rendered.expose(np.full((250, 400), 120.0), rng, read_dn=2.0, gain_dn_per_e=0.5, black_dn=20.0)
     assert values.var() == pytest.approx(54.083, rel=5 * np.sqrt(2 / 1e5))

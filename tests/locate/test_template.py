@@ -148,8 +148,7 @@ def assert_normal(z: np.ndarray) -> None:
      ("disc", [5.0, 0.7, -90, 150], 8.0), ("disc", [5.0, 2.0, 150, 20], 2.0), ("disc", [12.0, 0.7, 150, 20], 1.5),
      ("ellipse", [5.0, 0.7, 150, 20], 1.5), ("ring", [6.0, 3.0, 0.7, 150, 20], 1.5), ("spot", [1.3, 150, 20], 1.5)],
 )  # fmt: skip
-def test_errors_follow_their_own_covariance(kind: str, p: list[float], sigma: float) -> None:
-    rng = np.random.default_rng()
+def test_errors_follow_their_own_covariance(kind: str, p: list[float], sigma: float, rng: np.random.Generator) -> None:
     frame, x, y, targets = field(rng, kind, 14, p)
     image = np.clip(np.rint(frame + rng.normal(0, sigma, frame.shape)), 0, 255).astype(np.uint8)
     found = fit_template(image, targets, NoiseModel(sigma**2 + 1 / 12), kind)
@@ -160,9 +159,8 @@ def test_errors_follow_their_own_covariance(kind: str, p: list[float], sigma: fl
 
 @pytest.mark.parametrize("likelihood", ["least_squares", "poisson_gaussian"])
 @pytest.mark.parametrize(("amplitude", "background", "read"), [(25.0, 1.0, 0.4), (60.0, 4.0, 1.5), (5000.0, 20.0, 2.0)])
-def test_photons(likelihood: str, amplitude: float, background: float, read: float) -> None:
+def test_photons(likelihood: str, amplitude: float, background: float, read: float, rng: np.random.Generator) -> None:
     """From a few electrons to many: no bias, and the stated uncertainty."""
-    rng = np.random.default_rng()
     frame, x, y, targets = field(rng, "disc", 14, [4.0, 0.8, amplitude, background])
     gain = 0.5
     image = (gain * (rng.poisson(frame) + rng.normal(0, read, frame.shape)) + 3.0).astype(np.float32)
@@ -171,9 +169,8 @@ def test_photons(likelihood: str, amplitude: float, background: float, read: flo
     assert_normal(errors(found, x, y))
 
 
-def test_little_read_noise_is_used_by_the_exact_likelihood() -> None:
+def test_little_read_noise_is_used_by_the_exact_likelihood(rng: np.random.Generator) -> None:
     """With 0.5 electrons of read noise and most pixels dark, the shifted Poisson number throws information away: 3 % of the variance."""
-    rng = np.random.default_rng()
     frame, x, y, targets = field(rng, "spot", 20, [1.4, 10.0, 0.05])
     image = (rng.poisson(frame) + rng.normal(0, 0.5, frame.shape)).astype(np.float32)
     noise = NoiseModel(0.5**2, 1.0)
@@ -191,9 +188,8 @@ def test_information_of_few_electrons() -> None:
 
 
 @pytest.mark.parametrize("kind", ["disc", "ring", "spot"])
-def test_scipy_finds_the_same(kind: str) -> None:
+def test_scipy_finds_the_same(kind: str, rng: np.random.Generator) -> None:
     """`curve_fit` of the renderer's images to the same pixels, one target."""
-    rng = np.random.default_rng()
     p = {"disc": [4.2, 0.7], "ring": [6.0, 3.0, 0.7], "spot": [1.4]}[kind]
     frame, x, y, targets = field(rng, kind, 1, [*p, 120.0, 30.0])
     image = (frame + rng.normal(0, 1, frame.shape)).astype(np.float32)
@@ -216,9 +212,8 @@ def test_scipy_finds_the_same(kind: str) -> None:
 
 @pytest.mark.parametrize("radius", [2.0, 3.0, 5.5, 8.0])
 @pytest.mark.parametrize("blur", [0.5, 0.7])
-def test_s_curve_is_flat(radius: float, blur: float) -> None:
+def test_s_curve_is_flat(radius: float, blur: float, rng: np.random.Generator) -> None:
     """Without noise: below 0.001 px at every phase, also for discs sampled as Φ((R − ρ)/s), whose pixels have no area."""
-    rng = np.random.default_rng()
     for sampled in (False, True):
         if sampled and radius < 3:
             continue
@@ -228,9 +223,8 @@ def test_s_curve_is_flat(radius: float, blur: float) -> None:
         assert max(np.abs(found.x_px - x).max(), np.abs(found.y_px - y).max()) < (0.001 if sampled else 1e-4)
 
 
-def test_light_falling_ten_per_cent_across_a_disc() -> None:
+def test_light_falling_ten_per_cent_across_a_disc(rng: np.random.Generator) -> None:
     """A plane of the light leaves no bias, where its neglect shifts the disc by many uncertainties; small noise, mean of 100."""
-    rng = np.random.default_rng()
     frame, x, y, targets = field(rng, "disc", 10, [5.0, 0.7, 150.0, 20.0], (0, 0, 0.01, 0.0))
     image = (frame + rng.normal(0, 1.0, frame.shape)).astype(np.float32)
     found = fit_template(image, targets, NoiseModel(1.0), "disc")
@@ -243,8 +237,7 @@ def test_light_falling_ten_per_cent_across_a_disc() -> None:
     assert np.abs(still.x_px - x).max() < 1e-4
 
 
-def test_sloping_background() -> None:
-    rng = np.random.default_rng()
+def test_sloping_background(rng: np.random.Generator) -> None:
     frame, x, y, targets = field(rng, "disc", 12, [5.0, 0.7, 150.0, 40.0], (0.25, -0.1, 0, 0))
     image = np.rint(frame + rng.normal(0, 1.5, frame.shape)).astype(np.uint8)
     targets = replace(targets, background_x_dn_per_px=np.full(len(targets), 0.25), background_y_dn_per_px=np.full(len(targets), -0.1))
@@ -254,9 +247,8 @@ def test_sloping_background() -> None:
     assert found.more["background_x_dn_per_px"].mean() == pytest.approx(0.25, abs=0.02)
 
 
-def test_planes_that_are_not_there_are_seldom_seen() -> None:
+def test_planes_that_are_not_there_are_seldom_seen(rng: np.random.Generator) -> None:
     """Chance takes a plane in once in 1000 targets; of 900 more than 9 are unlikely at 1e-6."""
-    rng = np.random.default_rng()
     frame, x, y, targets = field(rng, "disc", 30, [3.0, 0.6, 150.0, 20.0])
     image = (frame + rng.normal(0, 2.0, frame.shape)).astype(np.float32)
     found = fit_template(image, targets, NoiseModel(4.0), "disc")
@@ -264,9 +256,8 @@ def test_planes_that_are_not_there_are_seldom_seen() -> None:
     assert_normal(errors(found, x, y))
 
 
-def test_planes_of_all_targets_together() -> None:
+def test_planes_of_all_targets_together(rng: np.random.Generator) -> None:
     """Falls that no single target shows are seen in the median of many; a frame of targets without a plane stays without."""
-    rng = np.random.default_rng()
     falls = np.stack([rng.noncentral_chisquare(2, 2.0, 1000), rng.chisquare(2, 1000), rng.noncentral_chisquare(4, 2.0, 1000)], axis=1)
     falls[:, 2] = np.maximum(falls[:, 2], falls[:, :2].max(axis=1))
     ground, light = choose_planes(falls, np.ones(1000), "auto", "auto")
@@ -280,9 +271,8 @@ def test_planes_of_all_targets_together() -> None:
     ("amplitude", "background", "sigma"),
     [(300.0, 20.0, 2.0), (150.0, 0.0, 1.5), (-120.0, 120.0, 6.0), (400.0, 0.0, 4.0), (800.0, 0.0, 2.0)],
 )
-def test_where_the_scale_ends(amplitude: float, background: float, sigma: float) -> None:
+def test_where_the_scale_ends(amplitude: float, background: float, sigma: float, rng: np.random.Generator) -> None:
     """Saturated tops and half the background's noise cut off: no bias, radius and amplitude included, and flags."""
-    rng = np.random.default_rng()
     frame, x, y, targets = field(rng, "disc", 14, [5.0, 0.7, amplitude, background])
     image = np.clip(np.rint(frame + rng.normal(0, sigma, frame.shape)), 0, 255).astype(np.uint8)
     targets = replace(targets, amplitude_dn=np.clip(targets.amplitude_dn, -255 + background, 255 - background))
@@ -294,8 +284,7 @@ def test_where_the_scale_ends(amplitude: float, background: float, sigma: float)
     assert (found.flags & (Flag.SATURATED if amplitude + background > 255 else Flag.CLIPPED_AT_BLACK) > 0).all()
 
 
-def test_a_target_cut_by_the_border_or_near_another() -> None:
-    rng = np.random.default_rng()
+def test_a_target_cut_by_the_border_or_near_another(rng: np.random.Generator) -> None:
     errs = []
     for _ in range(60):
         at = (np.arange(30), np.arange(40))
@@ -312,9 +301,8 @@ def test_a_target_cut_by_the_border_or_near_another() -> None:
     assert_normal(np.concatenate(errs))
 
 
-def test_noise_from_the_image() -> None:
+def test_noise_from_the_image(rng: np.random.Generator) -> None:
     """Constant and slope of the variance to 6 % and 10 %; no slope where there is none, though the template does not fit the edges."""
-    rng = np.random.default_rng()
     frame, _, _, targets = field(rng, "disc", 15, [5.0, 0.7, 150.0, 20.0])
     plain = noise_from_image(np.rint(frame + rng.normal(0, 2.0, frame.shape)).astype(np.uint8), targets)
     assert plain.origin == "image"
@@ -329,8 +317,7 @@ def test_noise_from_the_image() -> None:
     assert misfit.constant_dn2 == pytest.approx(0.25, rel=0.15)
 
 
-def test_frames_without_noise_and_without_targets() -> None:
-    rng = np.random.default_rng()
+def test_frames_without_noise_and_without_targets(rng: np.random.Generator) -> None:
     frame, x, y, targets = field(rng, "disc", 5, [5.0, 0.7, 150.0, 20.0])
     noise = noise_from_image(np.rint(frame).astype(np.uint8), targets)
     assert noise.constant_dn2 >= 1 / 12
@@ -341,17 +328,17 @@ def test_frames_without_noise_and_without_targets() -> None:
     assert len(fit_template(frame.astype(np.float32), targets[:0], noise)) == 0
 
 
-def test_a_square_is_a_poor_fit() -> None:
+def test_a_square_is_a_poor_fit(rng: np.random.Generator) -> None:
     """A shape that is none of the template's has residuals above the noise."""
-    frame, _, _, targets = field(np.random.default_rng(), "disc", 2, [5.0, 0.7, 150.0, 20.0])
+    frame, _, _, targets = field(rng, "disc", 2, [5.0, 0.7, 150.0, 20.0])
     for x, y in zip(np.rint(targets.x_px).astype(int), np.rint(targets.y_px).astype(int), strict=True):
         frame[y - 6 : y + 7, x - 6 : x + 7] = 20
         frame[y - 4 : y + 5, x - 4 : x + 5] = 170
     assert (fit_template(frame.astype(np.float32), targets, NoiseModel(1.0)).flags & Flag.POOR_FIT > 0).all()
 
 
-def test_options_that_are_none() -> None:
-    frame, _, _, targets = field(np.random.default_rng(), "disc", 1, [5.0, 0.7, 150.0, 20.0])
+def test_options_that_are_none(rng: np.random.Generator) -> None:
+    frame, _, _, targets = field(rng, "disc", 1, [5.0, 0.7, 150.0, 20.0])
     image = frame.astype(np.float32)
     for wrong in ({"kind": "line"}, {"likelihood": "maximum"}, {"light_on": "wall"}, {"aperture_px": -1.0}, {"background_plane": "maybe"},
                   {"kind": "spot", "light_plane": True}):  # fmt: skip
@@ -359,9 +346,8 @@ def test_options_that_are_none() -> None:
             fit_template(image, targets, NoiseModel(1.0), **wrong)
 
 
-def test_slopes_under_many_targets_that_their_ground_does_not_have_are_not_believed() -> None:
+def test_slopes_under_many_targets_that_their_ground_does_not_have_are_not_believed(rng: np.random.Generator) -> None:
     """A one-sided halo (an odd tail of the blur) at every dark target: the background's map is even, so no plane is fitted."""
-    rng = np.random.default_rng()
     frame, x, y, targets = field(rng, "disc", 10, [5.0, 0.7, -100.0, 150.0], (0.6, 0, 0.02, 0))
     image = (frame + rng.normal(0, 1.0, frame.shape)).astype(np.float32)
     flags = fit_template(image, targets, NoiseModel(1.0), "disc").flags

@@ -23,9 +23,9 @@ def stack(rng: np.random.Generator, mean: np.ndarray, noise: float, frames: int 
 
 @pytest.mark.parametrize("noise", [0.02, 0.125, 0.3])
 @pytest.mark.parametrize("offset", [5.0, 5.3, 5.47])
-def test_a_coarse_converter_makes_no_defects(noise: float, offset: float):
+def test_a_coarse_converter_makes_no_defects(noise: float, offset: float, rng: np.random.Generator):
     """Poisson, ALPHA, with 0.01 expected a frame: no more than 3 in 6 frames; planted pixels above the stated limit are found."""
-    rng, shape, count = np.random.default_rng(), (120, 160), 0
+    shape, count = (120, 160), 0
     for dsnu in (0.02, 0.1, 0.25, 0.25, 0.4, 0.6):
         dark = offset + rng.normal(0, dsnu, shape) + rng.normal(0, 0.05, (1, shape[1]))
         bright = dark + 120 * (1 + rng.normal(0, 0.01, shape))
@@ -38,9 +38,9 @@ def test_a_coarse_converter_makes_no_defects(noise: float, offset: float):
 
 
 @pytest.mark.parametrize("shape", [(24, 200), (60, 90), (160, 160)])
-def test_false_alarms_do_not_depend_on_the_frame(shape: tuple[int, int]):
+def test_false_alarms_do_not_depend_on_the_frame(shape: tuple[int, int], rng: np.random.Generator):
     """Gaussian pixels, 4 expected a frame, 25 frames: Poisson, ALPHA, about a rate 0.8 to 1.2 times as stated."""
-    rng, count = np.random.default_rng(), 0
+    count = 0
     for _ in range(25):
         dark = 30 + rng.normal(0, 2, shape) + rng.normal(0, 0.5, (shape[0], 1)) + rng.normal(0, 0.5, (1, shape[1]))
         bright = dark + 150 * (1 + rng.normal(0, 0.02, shape))
@@ -49,20 +49,19 @@ def test_false_alarms_do_not_depend_on_the_frame(shape: tuple[int, int]):
 
 
 @pytest.mark.parametrize("noise", [0.1, 0.2, 0.3, 0.45])
-def test_rounding_error_is_bounded(noise: float):
+def test_rounding_error_is_bounded(noise: float, rng: np.random.Generator):
     """The largest |E round(x + n) − x| over the phase, from the normal distribution function; the bound is from the variance."""
     x = np.linspace(0, 1, 201)
     codes = np.arange(-4, 6)
     mean = stats.norm.sf((codes[None, :] - 0.5 - x[:, None]) / noise).sum(axis=1) + codes[0] - 1
     worst = np.abs(mean - x).max()
-    rng = np.random.default_rng()
     bound = rounding_error_dn(stack(rng, 5 + np.tile(np.linspace(0, 1, 200), (100, 1)), noise))
     assert worst <= bound * 1.02 and bound <= 0.5
 
 
-def test_hot_pixels_that_clip_in_the_light_are_hot_and_not_dead():
+def test_hot_pixels_that_clip_in_the_light_are_hot_and_not_dead(rng: np.random.Generator):
     """40 pixels with 180 DN of dark charge under 120 DN of uneven light end at the top code; 20 dead ones and 5 that are both stay dead."""
-    rng, shape = np.random.default_rng(), (120, 160)
+    shape = (120, 160)
     places = rng.choice(shape[0] * shape[1], 65, replace=False)
     extra, response = np.zeros(shape[0] * shape[1]), np.ones(shape[0] * shape[1])
     extra[places[:40]], response[places[40:]], extra[places[60:]] = 180.0, 0.1, 40.0

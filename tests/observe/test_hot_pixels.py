@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import secrets
-
 import numpy as np
 import pytest
 
@@ -14,10 +12,8 @@ PIXELS = SHAPE[0] * SHAPE[1]
 
 
 @pytest.fixture
-def dark() -> np.ndarray:
-    seed = secrets.randbits(64)
-    print(f"seed {seed}")  # pytest shows it with a failure
-    return np.random.default_rng(seed).normal(40.0, 2.0, SHAPE)
+def dark(rng: np.random.Generator) -> np.ndarray:
+    return rng.normal(40.0, 2.0, SHAPE)
 
 
 def counts_of(frame: np.ndarray) -> np.ndarray:

@@ -41,8 +41,8 @@ def plain_mean_squares(frames: np.ndarray) -> dict[str, float]:
     }
 
 
-def random_frames(shape: tuple[int, int, int], dtype: type = np.uint16, top: int = 4096) -> np.ndarray:
-    return np.random.default_rng().integers(0, top, shape).astype(dtype)
+def random_frames(rng: np.random.Generator, shape: tuple[int, int, int], dtype: type = np.uint16, top: int = 4096) -> np.ndarray:
+    return rng.integers(0, top, shape).astype(dtype)
 
 
 @settings(deadline=None, max_examples=30)
@@ -74,9 +74,9 @@ def test_moments_equal_their_numpy_twin(f, m, n, seed, bits, low):
     assert accumulator.spatial_covariance_dn2() == pytest.approx(np.mean(pairs), rel=1e-9, abs=1e-12 * 4**bits)
 
 
-def test_pair_reduces_to_the_standard():
+def test_pair_reduces_to_the_standard(rng: np.random.Generator):
     """EMVA 1288 R4.0 eq. 18 and 32, and the kurtosis of SciPy, on one pair."""
-    frames = random_frames((2, 31, 45))
+    frames = random_frames(rng, (2, 31, 45))
     y0, y1 = frames.astype(float)
     level = level_moments([reduced(frames, bits=12, kind="level").moments.summary()], [0.01], [123.0], code_max=4000)
     d = y1 - y0
@@ -90,11 +90,11 @@ def test_pair_reduces_to_the_standard():
 
 
 @pytest.mark.parametrize("kind", ["level", "stack"])
-def test_same_bits_for_any_order(kind):
-    frames = random_frames((9, 24, 37))
+def test_same_bits_for_any_order(kind, rng: np.random.Generator):
+    frames = random_frames(rng, (9, 24, 37))
     whole = reduced(frames, bits=12, kind=kind, spectra_pairs=4)
     shuffled = new_group(12, kind, 4)
-    for index in np.random.default_rng().permutation(9):
+    for index in rng.permutation(9):
         shuffled.add(frames[index], int(index))
     one, other = whole.moments, shuffled.moments
     assert one.mean_squares() == other.mean_squares()
@@ -110,12 +110,11 @@ def test_same_bits_for_any_order(kind):
         assert np.array_equal(a.temporal_h_dn2, b.temporal_h_dn2) and np.array_equal(a.temporal_power_dn2, b.temporal_power_dn2)
 
 
-def test_analysis_of_variance_is_unbiased_for_known_noise():
+def test_analysis_of_variance_is_unbiased_for_known_noise(rng: np.random.Generator):
     """ν MS/E[MS] is χ²_ν for each stratum, two-sided at ALPHA each.
 
     Smallest error caught with power 0.99 (7.2 relative standard errors √(2/ν)): white 1.0 %, row 14 %, column 12 %; frame 3 ×.
     """
-    rng = np.random.default_rng()
     f, m, n = 40, 150, 200
     white, row, col, frame = 40.0, 12.0, 9.0, 5.0
     mean = rng.normal(2000, 300, (m, n))
@@ -138,9 +137,8 @@ def test_analysis_of_variance_is_unbiased_for_known_noise():
     assert result.var_stack_dn2 == pytest.approx(w + row**2 + col**2 + frame**2, rel=0.05)
 
 
-def test_kurtosis_is_that_of_known_distributions():
+def test_kurtosis_is_that_of_known_distributions(rng: np.random.Generator):
     """Gaussian 0, uniform −1.2/2 for a difference of two. SE = √(24/n) = 0.0098 at 50 000 pixels; errors above 0.07 are caught."""
-    rng = np.random.default_rng()
     for draw, expected in ((lambda: rng.normal(2000, 50, (200, 250)), 0.0), (lambda: rng.uniform(1000, 3000, (200, 250)), -0.6)):
         accumulator = LevelAccumulator(12)
         for _ in range(2):
@@ -148,10 +146,10 @@ def test_kurtosis_is_that_of_known_distributions():
         assert abs(accumulator.kurtosis_excess() - expected) < stats.norm.isf(ALPHA / 2) * math.sqrt(24 / 50000)
 
 
-def test_spectra_are_those_of_the_definition():
+def test_spectra_are_those_of_the_definition(rng: np.random.Generator):
     """EMVA 1288 R4.0 §8.4, row by row with NumPy's one-dimensional transform."""
     for rows, cols in ((16, 22), (15, 21)):
-        frames = random_frames((4, rows, cols)).astype(float)
+        frames = random_frames(rng, (4, rows, cols)).astype(float)
         accumulator = SpectraAccumulator(2)
         for frame in frames:
             accumulator.add(frame.astype(np.uint16))
@@ -167,9 +165,8 @@ def test_spectra_are_those_of_the_definition():
         np.testing.assert_allclose(got.frequency_h, np.fft.rfftfreq(cols), atol=1e-12)
 
 
-def test_white_noise_has_its_variance_as_power():
+def test_white_noise_has_its_variance_as_power(rng: np.random.Generator):
     """Mean of the temporal power over frequencies off zero: relative SE √(2/(pairs·M·N)) = 0.36 %; errors above 2.6 % are caught."""
-    rng = np.random.default_rng()
     rows, cols, sigma = 100, 200, 7.0
     group = reduced((np.rint(rng.normal(500, sigma, (rows, cols))).astype(np.uint16) for _ in range(16)), bits=12)
     got = group.spectra.result(group.moments.mean_map_dn())
@@ -186,9 +183,8 @@ def sweep(thresholds: np.ndarray, levels: np.ndarray, pixels: int, rng: np.rando
     return accumulator
 
 
-def test_ideal_converter_shows_no_code_errors():
+def test_ideal_converter_shows_no_code_errors(rng: np.random.Generator):
     """z of each DNL is N(0, 1): χ² of all, at ALPHA; a systematic misfit of half its u over all codes is caught."""
-    rng = np.random.default_rng()
     result = code_errors(sweep(np.arange(255) + 0.5, np.arange(25.0, 231.0, 5.0), 40000, rng).result())
     z = result.dnl_lsb / result.u_dnl_lsb
     assert result.codes.size > 180
@@ -198,8 +194,7 @@ def test_ideal_converter_shows_no_code_errors():
     assert result.fit["dnl_rms_lsb"].value < 0.02
 
 
-def test_recovers_differential_non_linearity_and_missing_codes():
-    rng = np.random.default_rng()
+def test_recovers_differential_non_linearity_and_missing_codes(rng: np.random.Generator):
     edges = np.arange(256) + 0.5 + rng.normal(0, 0.15 / math.sqrt(2), 256)  # upper edge of each code
     for missing in (100, 150):
         edges[missing - 1 : missing + 1] = edges[missing - 1 : missing + 1].mean()
@@ -214,8 +209,8 @@ def test_recovers_differential_non_linearity_and_missing_codes():
     assert rms.kind == "value" and abs(rms.value - want) < 0.2 * want
 
 
-def test_histogram_counts_dark_frames_and_levels():
-    frames = random_frames((4, 11, 13), np.uint8, 200)
+def test_histogram_counts_dark_frames_and_levels(rng: np.random.Generator):
+    frames = random_frames(rng, (4, 11, 13), np.uint8, 200)
     frames[0] //= 2  # levels are in order of their means, which of like frames can be the same
     histogram = HistogramAccumulator(8)
     histogram.add(frames[0], dark=True, level="a")
@@ -250,8 +245,8 @@ def test_refuses_what_it_cannot_reduce():
         new_group(12, "movie")
 
 
-def test_read_only_and_strided_frames_are_read_like_others():
-    frames = random_frames((3, 20, 30))
+def test_read_only_and_strided_frames_are_read_like_others(rng: np.random.Generator):
+    frames = random_frames(rng, (3, 20, 30))
     strided = np.asfortranarray(frames[1])
     read_only = frames[2].copy()
     read_only.flags.writeable = False

@@ -56,12 +56,11 @@ def check_z(z: np.ndarray, name: str) -> None:
     assert 0.97 * low < (z**2).sum() < 1.03 * high, name  # 3 % for what is not linear
 
 
-def test_uncertainties_are_calibrated():
+def test_uncertainties_are_calibrated(rng: np.random.Generator):
     """Blind recovery of all parts from small stacks with every temporal and fixed part present.
 
     Standard deviations of some 50 rows or columns are skewed, and their u goes with them; their logarithms are nearly normal.
     """
-    rng = np.random.default_rng()
     truth = {
         "dsnu_pixel_dn": 1.5, "dsnu_row_dn": 0.6, "dsnu_col_dn": 0.8,
         "prnu_pixel_rel": 0.01, "prnu_row_rel": 0.004, "prnu_col_rel": 0.003,
@@ -88,9 +87,8 @@ def test_uncertainties_are_calibrated():
         check_z(np.array(values), name)
 
 
-def test_split_without_temporal_noise_is_the_textbook_one():
+def test_split_without_temporal_noise_is_the_textbook_one(rng: np.random.Generator):
     """Variance components of the random two-way layout from NumPy's sample variances of the row and column means."""
-    rng = np.random.default_rng()
     rows, cols = 21, 34
     image = 100 + lines(rng, (rows, cols), 3.0, 1.5, 1.5)
     flat = lines(rng, (rows, cols), 0.01, 0.008, 0.008)
@@ -108,9 +106,8 @@ def test_split_without_temporal_noise_is_the_textbook_one():
             assert got[f"{name}_{part}_{unit}"].value == pytest.approx(math.sqrt(value), rel=1e-6)
 
 
-def test_temporal_row_noise_is_not_taken_for_fixed_pattern():
+def test_temporal_row_noise_is_not_taken_for_fixed_pattern(rng: np.random.Generator):
     """The trap of the standard's split: row noise alone drives its pixel part below zero and gives it a row part."""
-    rng = np.random.default_rng()
     dark, bright = np.full((96, 128), 100.0), np.full((96, 128), 1100.0)
     stacks = stack(rng, dark, 10, 2.0, 2.0), stack(rng, bright, 10, 10.0, 2.0)
     ours, inputs = fit_spatial(*stacks), SpatialInputs.of(stacks[0], high_pass=False)
@@ -123,9 +120,8 @@ def test_temporal_row_noise_is_not_taken_for_fixed_pattern():
     assert ours["dsnu_pixel_dn"].value ** 2 < 0.03  # ± 0.0054, and where it is not found the limit 1.645 of these above
 
 
-def test_a_wave_leaves_neither_value_nor_limit_of_rows_and_columns():
+def test_a_wave_leaves_neither_value_nor_limit_of_rows_and_columns(rng: np.random.Generator):
     """2 % of a fixed wave in the response: −½ 0.02²/n for rows and columns, a hundred u below zero. The pixels' part is the wave's."""
-    rng = np.random.default_rng()
     y, x = np.mgrid[:96, :128]
     wave = 0.02 * np.sin(2 * np.pi * (0.11 * x + 0.17 * y))
     dark = np.full((96, 128), 100.0)
@@ -136,13 +132,12 @@ def test_a_wave_leaves_neither_value_nor_limit_of_rows_and_columns():
     assert got["dsnu_row_dn"].kind == "upper_limit" or got["dsnu_row_dn"].value < 0.2
 
 
-def test_a_moving_wave_is_not_taken_for_rows():
+def test_a_moving_wave_is_not_taken_for_rows(rng: np.random.Generator):
     """Twelve frames under a wave of random phase: the mean of their phasors scatters exponentially, and with it pixels, rows and columns.
 
     No row and column part is there: each is a limit, or within 6 u of zero, and u of the pixels' part holds that scatter. Without it
     a row part of 17 u was seen in one camera of two.
     """
-    rng = np.random.default_rng()
     y, x = np.mgrid[:96, :128]
     for _ in range(6):
         accumulator = StackAccumulator(16)
@@ -157,9 +152,8 @@ def test_a_moving_wave_is_not_taken_for_rows():
         assert "dsnu_pixel_dn" in got and got["dsnu_pixel_dn"].value + 6 * got["dsnu_pixel_dn"].u > 0.2
 
 
-def test_upper_limits_cover_and_significance_is_rare():
+def test_upper_limits_cover_and_significance_is_rare(rng: np.random.Generator):
     """Without any fixed pattern 5 % of the results may be called significant: binomial, ALPHA; a rate above 14 % is caught."""
-    rng = np.random.default_rng()
     runs, none = 150, no_defects(SHAPE)
     significant = {name: 0 for name in ("dsnu_pixel_dn", "dsnu_row_dn", "dsnu_col_dn", "prnu_pixel_rel", "prnu_row_rel", "prnu_col_rel")}
     for _ in range(runs):
@@ -171,9 +165,8 @@ def test_upper_limits_cover_and_significance_is_rare():
     assert all(count <= most for count in significant.values()), significant
 
 
-def test_limit_covers_a_small_truth():
+def test_limit_covers_a_small_truth(rng: np.random.Generator):
     """A row part that is rarely found is below the stated limit or value + 1.645 u in 95 % of the cases."""
-    rng = np.random.default_rng()
     runs, none, row = 150, no_defects(SHAPE), 0.08
     covered = 0
     for _ in range(runs):
@@ -183,8 +176,7 @@ def test_limit_covers_a_small_truth():
     assert covered >= stats.binom.ppf(ALPHA, runs, 0.95)
 
 
-def test_defects_are_found_and_do_not_swamp_the_rest():
-    rng = np.random.default_rng()
+def test_defects_are_found_and_do_not_swamp_the_rest(rng: np.random.Generator):
     shape = (80, 100)
     dark = 100 + lines(rng, shape, 1.0, 0.5, 0.5)
     response = 1 + rng.normal(0, 0.005, shape)
@@ -213,9 +205,8 @@ def test_defects_are_found_and_do_not_swamp_the_rest():
         assert abs(got[name].value - value) < stats.norm.isf(ALPHA / 2) * got[name].u
 
 
-def test_false_alarms_are_as_many_as_stated():
+def test_false_alarms_are_as_many_as_stated(rng: np.random.Generator):
     """Poisson, ALPHA, for Gaussian pixels: expected 90 in 30 sensors; a rate 1.9 × too high or half of it is caught."""
-    rng = np.random.default_rng()
     count = 0
     for _ in range(30):
         dark = 100 + lines(rng, (60, 90), 2.0, 0.5, 0.5)
@@ -224,8 +215,7 @@ def test_false_alarms_are_as_many_as_stated():
     assert stats.poisson.ppf(ALPHA / 2, 0.7 * 90) <= count <= stats.poisson.isf(ALPHA / 2, 1.3 * 90)
 
 
-def test_surface_takes_its_own_kind_and_leaves_noise():
-    rng = np.random.default_rng()
+def test_surface_takes_its_own_kind_and_leaves_noise(rng: np.random.Generator):
     y, x = np.mgrid[:40, :60]
     want = 3 + 0.1 * x - 0.02 * y + 1e-3 * x * y - 2e-4 * x**2 * y + 1e-5 * y**4
     np.testing.assert_allclose(fit_surface(want, 4).values, want, rtol=1e-9)
@@ -236,13 +226,12 @@ def test_surface_takes_its_own_kind_and_leaves_noise():
     assert 1 + 2 * fit.degree + fit.n_mixed == 15
 
 
-def test_recovers_fixed_and_moving_patterns():
+def test_recovers_fixed_and_moving_patterns(rng: np.random.Generator):
     """Frequencies and amplitudes against the truth; a fixed one within 6 u, a moving one within its ordinate and 1 u.
 
     The moving one has a quarter of a turn between the frames of a pair, whose differences then have its power: of arbitrary phases they
     scatter so unevenly that one run in a thousand is 6 u low. What is left is noise, a tenth of u.
     """
-    rng = np.random.default_rng()
     shape, n_frames = (120, 160), 16
     y, x = np.mgrid[: shape[0], : shape[1]]
     fixed = 0.4 * np.sin(2 * np.pi * (0.0813 * x + 0.211 * y) + 1.0) + 0.2 * np.sin(2 * np.pi * (0.3 * x - 0.15 * y))
@@ -265,9 +254,8 @@ def test_recovers_fixed_and_moving_patterns():
             assert abs(found.amplitude_dn[i] - amplitude) < (1 if kind else 6) * found.u_amplitude_dn[i]
 
 
-def test_pattern_search_keeps_its_false_alarm_rate():
+def test_pattern_search_keeps_its_false_alarm_rate(rng: np.random.Generator):
     """At a rate of 0.2 a search, 60 searches: binomial, ALPHA; a rate above 0.62 is caught."""
-    rng = np.random.default_rng()
     hits = 0
     for _ in range(60):
         group = reduced((np.rint(rng.normal(100, 3, (64, 80))).astype(np.uint16) for _ in range(4)), bits=12, spectra_pairs=2)
@@ -276,8 +264,7 @@ def test_pattern_search_keeps_its_false_alarm_rate():
     assert hits <= stats.binom.isf(ALPHA, 60, 0.2)
 
 
-def test_refuses_stacks_that_do_not_fit():
-    rng = np.random.default_rng()
+def test_refuses_stacks_that_do_not_fit(rng: np.random.Generator):
     dark, bright = stack(rng, np.full(SHAPE, 100.0), 3), stack(rng, np.full(SHAPE, 500.0), 3)
     with pytest.raises(InputError):
         fit_spatial(dark, stack(rng, np.full((40, 64), 500.0), 3))

@@ -7,7 +7,6 @@ Each comparison fails by chance with a probability of 1e-6, on the reference's o
 from __future__ import annotations
 
 import json
-import secrets
 import subprocess
 from pathlib import Path
 
@@ -15,6 +14,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from chance import rng_of
 from pixmetry.camera.camera import Camera, Element
 from pixmetry.camera.catalogue import get_source
 from pixmetry.core.config import load_yaml
@@ -65,9 +65,8 @@ def write_descriptor(folder: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def reference(tmp_path_factory) -> dict:
-    seed = secrets.randbits(40)
-    print("seed", seed)
+def reference(request: pytest.FixtureRequest, tmp_path_factory) -> dict:
+    seed = int(rng_of(request).integers(2**40))
     series = {
         "levels": LEVELS,
         "brightest_photons": BRIGHTEST_E / ETA,

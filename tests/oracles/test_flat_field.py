@@ -11,7 +11,6 @@ variance off by 0.7 % (of a normal distribution).
 
 from __future__ import annotations
 
-import secrets
 from dataclasses import dataclass
 
 import numpy as np
@@ -142,10 +141,9 @@ def within(variance: float, samples: int) -> float:
 
 
 @pytest.fixture(params=[(name, level) for name in DETECTORS for level in LEVELS_E], ids=lambda p: f"{p[0]}-{p[1]:g}e")
-def case(request) -> tuple[Detector, float, list[np.ndarray]]:
+def case(request, rng: np.random.Generator) -> tuple[Detector, float, list[np.ndarray]]:
     name, level_e = request.param
-    detector, seed = DETECTORS[name], secrets.randbits(60)
-    print("seed", seed)
+    detector, seed = DETECTORS[name], int(rng.integers(2**60))
     scene = Uniform(level_e / detector.quantum_efficiency)
     return detector, level_e, [detector.camera(seed + u).expose(scene, 2, seed + u).data for u in range(UNITS)]
 
@@ -183,9 +181,8 @@ def test_rounding_adds_a_twelfth_once_where_noise_dithers_it(level_e: float) -> 
     assert temporal_moments(detector, level_e)[0] == pytest.approx(expected, abs=1e-3)
 
 
-def test_the_law_agrees_with_plain_drawing() -> None:
+def test_the_law_agrees_with_plain_drawing(rng: np.random.Generator) -> None:
     """The oracle against NumPy's own generators, written without it: a wrong sum would show here. Catches 0.7 % of a variance."""
-    rng = np.random.default_rng()
     detector, level_e, n = CLIPPED, 5.0, 2**21
     response = 1 + detector.prnu_rel * rng.standard_normal(n)
     held = np.minimum(rng.poisson(level_e * response + detector.dark_e), detector.full_well_e)

@@ -7,7 +7,6 @@ with a probability of 1e-6.
 from __future__ import annotations
 
 import json
-import secrets
 import subprocess
 from pathlib import Path
 
@@ -15,6 +14,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from chance import rng_of
 from pixmetry.camera.camera import Camera, Element
 from pixmetry.camera.catalogue import get_source
 from pixmetry.scene.uniform import Uniform
@@ -62,10 +62,9 @@ def ours(level_e: float, seed: int) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def histograms(tmp_path_factory) -> list[tuple[np.ndarray, np.ndarray]]:
+def histograms(request: pytest.FixtureRequest, tmp_path_factory) -> list[tuple[np.ndarray, np.ndarray]]:
     """GalSim's and ours, level by level."""
-    seed = secrets.randbits(30)
-    print("seed", seed)
+    seed = int(rng_of(request).integers(2**30))
     case = tmp_path_factory.mktemp("galsim") / "case.json"
     case.write_text(json.dumps(CASE | {"seed": seed}))
     done = subprocess.run([str(PYTHON), str(ROOT / "scripts" / "oracles" / "galsim_flats.py"), str(case)], capture_output=True, text=True)

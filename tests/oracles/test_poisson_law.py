@@ -6,8 +6,6 @@ with 99 %.
 
 from __future__ import annotations
 
-import secrets
-
 import numpy as np
 import pytest
 from scipy import stats
@@ -34,12 +32,6 @@ def camera(unit_seed: int = 0, **values: float) -> Camera:
     ]
     elements = tuple(Element(name, get_source(name), get_source(name).make(params)) for name, params in chain)
     return Camera("counting", SHAPE, elements, exposure_s=1.0, unit_seed=unit_seed)
-
-
-def fresh_seed() -> int:
-    seed = secrets.randbits(60)
-    print("seed", seed)  # shown by pytest when a test fails
-    return seed
 
 
 def histogram(level_e: float, seed: int) -> np.ndarray:
@@ -80,7 +72,7 @@ def cells(found: np.ndarray, law: stats.rv_discrete, samples: int, least: float 
 
 
 @pytest.mark.parametrize("level_e", LEVELS_E)
-def test_stat_ten_million_counts_follow_poissons_law(level_e: float) -> None:
+def test_stat_ten_million_counts_follow_poissons_law(level_e: float, rng: np.random.Generator) -> None:
     """χ², the largest distance of the distribution functions, and the mean of the mid-p values; 1e7 counts.
 
     Catches a mean off by 0.0024 σ, a variance off by 0.35 % (0.8 % at 0.1 e), a distribution function off by 0.0013. The distance is
@@ -89,7 +81,7 @@ def test_stat_ten_million_counts_follow_poissons_law(level_e: float) -> None:
     """
     samples, share = FRAMES * SHAPE[0] * SHAPE[1], ALPHA / 5
     law = stats.poisson(float(np.float32(level_e)))
-    found = histogram(level_e, fresh_seed())
+    found = histogram(level_e, int(rng.integers(2**60)))
     assert found.sum() == samples
 
     seen, expected = cells(found, law, samples)
@@ -117,9 +109,9 @@ def standard(data: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("level_e", [5.0, 1e4])
-def test_stat_frames_sources_and_units_are_not_correlated(level_e: float) -> None:
+def test_stat_frames_sources_and_units_are_not_correlated(level_e: float, rng: np.random.Generator) -> None:
     """Every pair of frames, exposure seeds, sources and units over 1e6 pixels: catches a correlation of 0.009."""
-    seed = fresh_seed()
+    seed = int(rng.integers(2**60))
     scene = Uniform(level_e)
     frames = camera().expose(scene, [0, 1, 2, 2**31], seed).data
     unit, other = camera(seed, prnu_rel=0.05), camera(seed + 1, prnu_rel=0.05)
@@ -135,9 +127,9 @@ def test_stat_frames_sources_and_units_are_not_correlated(level_e: float) -> Non
 
 
 @pytest.mark.parametrize("level_e", [5.0, 1e4])
-def test_stat_pixels_are_not_correlated(level_e: float) -> None:
+def test_stat_pixels_are_not_correlated(level_e: float, rng: np.random.Generator) -> None:
     """All shifts up to 40 px down and to both sides within a frame of 1e6 pixels: catches a correlation of 0.009."""
-    noise = standard(camera().expose(Uniform(level_e), 1, fresh_seed()).data).reshape(SHAPE)
+    noise = standard(camera().expose(Uniform(level_e), 1, int(rng.integers(2**60))).data).reshape(SHAPE)
     reach = 40
     padded = [n + reach for n in SHAPE]  # so that no shift wraps around
     spectrum = np.abs(np.fft.rfft2(noise, padded)) ** 2
@@ -161,13 +153,13 @@ def difference_moments(low: float, high: float) -> tuple[float, float, float]:
 
 
 @pytest.mark.parametrize(("level_e", "dark_e"), [(5.0, 0.25), (100.0, 1.0), (1e4, 30.0)])
-def test_stat_with_and_without_a_source_are_paired(level_e: float, dark_e: float) -> None:
+def test_stat_with_and_without_a_source_are_paired(level_e: float, dark_e: float, rng: np.random.Generator) -> None:
     """With and without dark current: the difference has the moments of one shared uniform number, far below independent draws.
 
     1e6 pixels: catches a mean difference off by 0.7 % of its standard deviation, and 0.1 % of pixels that lost their partner. Independent
     draws would differ with a variance of 2 µ + d: 55 times as much at 5 e, 5000 at 100 e, 170 000 at 1e4 e.
     """
-    level_e, seed = float(np.float32(level_e)), fresh_seed()
+    level_e, seed = float(np.float32(level_e)), int(rng.integers(2**60))
     without, with_dark = (camera(dark_e=d).expose(Uniform(level_e), 1, seed).data.astype(float) for d in (0.0, dark_e))
     difference = with_dark - without
     assert difference.min() >= 0  # more electrons never give a smaller count

@@ -43,12 +43,12 @@ def test_published_number_of_dots_is_found_and_ordered() -> None:
     assert len(np.unique(cells, axis=0)) == len(cells)
 
 
-def test_a_lens_fitted_to_half_of_the_dots_fits_the_other_half() -> None:
+def test_a_lens_fitted_to_half_of_the_dots_fits_the_other_half(rng: np.random.Generator) -> None:
     """0.025 px a coordinate, of which a smooth field of plate and lens makes 0.023: any random half stays below 0.028."""
     found, grid, whole = located()
     use = whole & np.isfinite(found.x_px)
     for _ in range(3):
-        residuals, others = dot_plate.held_out(found, grid, use, np.random.default_rng())
+        residuals, others = dot_plate.held_out(found, grid, use, rng)
         assert np.sqrt(np.mean(residuals[others] ** 2)) < 0.028
 
 
@@ -58,10 +58,10 @@ def test_published_coefficients_fit_worse() -> None:
     assert np.sqrt(np.mean(dot_plate.published_residuals(FOLDER, found, grid, use) ** 2)) == pytest.approx(0.052, abs=0.006)
 
 
-def test_places_do_not_depend_on_the_sub_pixel_phase() -> None:
+def test_places_do_not_depend_on_the_sub_pixel_phase(rng: np.random.Generator) -> None:
     """Ten bins of about 440 dots, standard error 0.0004 px each: the largest mean is below 0.004 px (0.0016 px where it was measured)."""
     found, grid, whole = located()
     use = whole & np.isfinite(found.x_px)
-    residuals, _ = dot_plate.held_out(found, grid, use, np.random.default_rng())
+    residuals, _ = dot_plate.held_out(found, grid, use, rng)
     means, errors, scatter = dot_plate.phase_means(np.stack([found.x_px, found.y_px], axis=1)[use], residuals)
     assert np.abs(means).max() < 0.004 and errors.max() < 0.0006 and scatter < 0.012

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from chance import rng_of
 from pixmetry.calibrate.bundle.model import NAMES, Sensor
 from pixmetry.calibrate.bundle.network import Adjustment, Calibration, Finding
 from pixmetry.calibrate.checks.quality import image_records
@@ -41,17 +42,9 @@ from report.test_page import Page
 LIMIT_BYTES = 5_000_000
 
 
-@pytest.fixture
-def rng() -> np.random.Generator:
-    """Another seed every time; it is printed when a test fails."""
-    seed = np.random.SeedSequence().entropy
-    print(f"seed {seed}")
-    return np.random.default_rng(seed)
-
-
 @pytest.fixture(scope="module")
-def whole() -> Calibration:
-    return calibrations.full(np.random.default_rng())
+def whole(request: pytest.FixtureRequest) -> Calibration:
+    return calibrations.full(rng_of(request))
 
 
 @pytest.fixture(scope="module")
@@ -83,11 +76,11 @@ def residuals(x: np.ndarray, y: np.ndarray, dx: np.ndarray, dy: np.ndarray, imag
     return Residuals(x, y, dx, dy, np.zeros(len(x), int) if image is None else image, Sensor(1000, 800))
 
 
-def test_the_verdict_comes_first_in_px_and_um(whole: Calibration) -> None:
+def test_the_verdict_comes_first_in_px_and_um(whole: Calibration, rng: np.random.Generator) -> None:
     """0.03 and 0.05 px of 5.5 µm pixels are 0.165 and 0.275 µm."""
     text = worth(with_residuals(whole, 0.03, -0.05), 0).replace("\u00a0", " ")
     assert "0.030 px (0.165 µm) rms in x and 0.050 px (0.275 µm) in y" in text
-    few = calibrations.full(np.random.default_rng(), images=2)
+    few = calibrations.full(rng, images=2)
     found = Page(render(with_residuals(few, 0.03, -0.05)))
     assert found.headings[1][1].startswith("1What the calibration is worth")
     assert "x 0.030 px = 0.165 µm y 0.050 px = 0.275 µm" in found.text
@@ -121,11 +114,11 @@ def test_every_record_is_on_the_page(whole: Calibration, page: Page) -> None:
     assert "image_coordinates.csv" in text and "pixmetry calibrate project.yaml" in text and "field = auto" in text
 
 
-def test_gross_errors_are_listed_worst_first(whole: Calibration) -> None:
+def test_gross_errors_are_listed_worst_first(whole: Calibration, rng: np.random.Generator) -> None:
     one = dict(whole.tests["gross_errors"][0])
     records = [{**one, "image": "mild", "statistic": 40.0}, {**one, "image": "awful", "statistic": 900.0}]
     assert [row[0] for row in gross_errors(records)] == ["awful", "mild"]
-    few = calibrations.full(np.random.default_rng(), images=3)
+    few = calibrations.full(rng, images=3)
     assert "No gross error was found." in Page(render(with_tests(few, gross_errors=[]))).text
 
 
@@ -302,12 +295,14 @@ def test_many_images_and_points_stay_small(rng: np.random.Generator) -> None:
     assert "data:image/png;base64," in text
 
 
-def test_a_page_is_written_whole_and_nothing_else_is_replaced(whole: Calibration, tmp_path: Path, source: str) -> None:
+def test_a_page_is_written_whole_and_nothing_else_is_replaced(
+    whole: Calibration, tmp_path: Path, source: str, rng: np.random.Generator
+) -> None:
     path = write_page(whole, tmp_path / "report.html")
     assert path.read_text(encoding="utf-8") == source  # also: it is the same every time
     path.write_text("mine")
     with pytest.raises(InputError):
-        write_page(calibrations.bare(np.random.default_rng(), images=2), path)
+        write_page(calibrations.bare(rng, images=2), path)
 
 
 def test_an_arrow_is_its_vector_enlarged(rng: np.random.Generator) -> None:

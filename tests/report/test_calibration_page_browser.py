@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
+from chance import rng_of
 from pixmetry.calibrate.page.page import write_page
 from report import calibrations
 
@@ -23,7 +23,7 @@ KINDS = {
 @pytest.fixture(scope="module", params=KINDS)
 def address(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> str:
     path = tmp_path_factory.mktemp("calibration") / "report.html"
-    return write_page(KINDS[request.param](np.random.default_rng()), path).as_uri()
+    return write_page(KINDS[request.param](rng_of(request)), path).as_uri()
 
 
 @pytest.fixture

@@ -7,12 +7,10 @@ that all cameras have; the study with 1200 cameras (at 1e-3) catches 0.17 u and 
 
 from __future__ import annotations
 
-import secrets
-from functools import lru_cache
-
 import numpy as np
 import pytest
 
+from chance import rng_of
 from statistical.closed_loop import Score, failures, planted, run_camera, summarise
 
 CAMERAS = 60
@@ -27,37 +25,37 @@ MEASURED = (
 )
 
 
-@lru_cache(maxsize=1)
-def scores() -> tuple[int, list[Score], list[str]]:
-    """Seed, scores and refusals of this run."""
-    seed = secrets.randbits(31)
+@pytest.fixture(scope="module")
+def scores(request: pytest.FixtureRequest) -> tuple[list[Score], list[str]]:
+    """Scores and refusals of this run."""
+    seed = int(rng_of(request).integers(2**31))
     results = [run_camera(seed, i, quick=True) for i in range(CAMERAS)]
-    return seed, [s for r in results if not isinstance(r, str) for s in r], [r for r in results if isinstance(r, str)]
+    return [s for r in results if not isinstance(r, str) for s in r], [r for r in results if isinstance(r, str)]
 
 
-def test_every_stated_uncertainty_holds():
-    seed, found, refused = scores()
-    assert failures(summarise(found), RATE) == [], f"seed {seed}"
+def test_every_stated_uncertainty_holds(scores):
+    found, refused = scores
+    assert failures(summarise(found), RATE) == []
     assert len(refused) <= 6, refused  # about one in a hundred has too few levels below saturation
 
 
-def test_the_main_quantities_are_really_measured():
+def test_the_main_quantities_are_really_measured(scores):
     """They are resolved in six cameras of ten or more; below a quarter of 60 comes up once in a million."""
-    lines = {line.name: line.n for line in summarise(scores()[1])}
+    lines = {line.name: line.n for line in summarise(scores[0])}
     for name in MEASURED:
         assert lines[name] >= CAMERAS // 4, (name, lines[name])
 
 
-def test_u_is_close_to_the_least_possible():
+def test_u_is_close_to_the_least_possible(scores):
     """Median of u over the Cramér–Rao or χ² bound at most 1.15, for every quantity that has one."""
-    for line in summarise(scores()[1]):
+    for line in summarise(scores[0]):
         if line.n >= 20 and np.isfinite(line.u_ratio):
             assert line.u_ratio < 1.15, line
 
 
 @pytest.mark.parametrize("name", MEASURED)
-def test_a_planted_error_is_caught(name):
+def test_a_planted_error_is_caught(scores, name):
     """Biases of 5 u and −2.5 u, and a u stated at a quarter of what it is, are caught in each single quantity: the loop is not blind."""
-    found = scores()[1]
+    found = scores[0]
     for fault in ({"bias_u": 5.0}, {"bias_u": -2.5}, {"u_factor": 0.25}):
         assert any(f.startswith(name) for f in failures(summarise(planted(found, name, **fault)), RATE)), fault

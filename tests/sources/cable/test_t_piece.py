@@ -33,11 +33,11 @@ def test_the_echoes_are_the_voltage_of_the_circuit(params: TPiece) -> None:
         assert (amplitude * np.exp(-2j * np.pi * f * delay)).sum() == pytest.approx(expected, abs=2e-6)
 
 
-def test_published_level_of_a_double_termination() -> None:
+def test_published_level_of_a_double_termination(rng: np.random.Generator) -> None:
     """75 Ω twice in parallel on a line of 75 Ω: 2/3, without an echo."""
     params = TPiece(branch="terminated", length_m=3.0)
     assert params.level == pytest.approx(2 / 3)
-    np.testing.assert_allclose(seen(SOURCE, params, row_of(np.full(40, 90.0)))[0, 0], 60.0, rtol=1e-6)
+    np.testing.assert_allclose(seen(rng, SOURCE, params, row_of(np.full(40, 90.0)))[0, 0], 60.0, rtol=1e-6)
 
 
 def test_published_capacity_of_a_short_open_branch() -> None:

@@ -11,8 +11,8 @@ from pixmetry.sources.cable.termination import SOURCE, Termination, echoes, near
 from video_signals import PIXEL_HZ, bump, centre, row_of, sampled, seen, video
 
 
-def line(row: np.ndarray, params: Termination, pixel_hz: float = PIXEL_HZ) -> np.ndarray:
-    return seen(SOURCE, params, row_of(row), pixel_hz=pixel_hz)[0, 0]
+def line(rng: np.random.Generator, row: np.ndarray, params: Termination, pixel_hz: float = PIXEL_HZ) -> np.ndarray:
+    return seen(rng, SOURCE, params, row_of(row), pixel_hz=pixel_hz)[0, 0]
 
 
 def moved(params: Termination) -> float:
@@ -39,30 +39,30 @@ def test_published_reflection_and_delay_of_five_metres_of_50_ohm_cable() -> None
     ],
     ids=["5 m", "2 m", "5 m open", "20 m open"],
 )
-def test_published_shifts_are_first_moments_of_the_echoes(params: Termination, shift_px: float) -> None:
+def test_published_shifts_are_first_moments_of_the_echoes(params: Termination, shift_px: float, rng: np.random.Generator) -> None:
     """Δx = ρτ/(1 − ρ), on the continuous line."""
     expected = params.ghost * params.delay_s * PIXEL_HZ / (1 - params.ghost)
     assert expected == pytest.approx(shift_px, rel=0.03)
     assert moved(params) == pytest.approx(expected, rel=1e-3)
-    assert line(bump(), params).sum() == pytest.approx(bump().sum(), rel=1e-5)
+    assert line(rng, bump(), params).sum() == pytest.approx(bump().sum(), rel=1e-5)
 
 
-def test_a_delay_of_whole_pixels_is_a_recursive_filter() -> None:
+def test_a_delay_of_whole_pixels_is_a_recursive_filter(rng: np.random.Generator) -> None:
     """(1 − ρ)/(1 − ρ z^−3) by SciPy."""
     params = Termination(length_m=3.0 / (Termination(length_m=1.0).delay_s * PIXEL_HZ) * (1 - 1e-9), line_ohm=50.0, load_ohm=1000.0)
     row = np.zeros(120)
     row[20:30] = 100.0
     rho = params.ghost
-    np.testing.assert_allclose(line(row, params), lfilter([1 - rho], [1, 0, 0, -rho], row), atol=2e-3)
+    np.testing.assert_allclose(line(rng, row, params), lfilter([1 - rho], [1, 0, 0, -rho], row), atol=2e-3)
 
 
 @pytest.mark.parametrize("pixel_hz", [10e6, PIXEL_HZ, 28.4e6])
-def test_what_comes_from_beyond_the_margin_is_as_small_as_stated(pixel_hz: float) -> None:
+def test_what_comes_from_beyond_the_margin_is_as_small_as_stated(pixel_hz: float, rng: np.random.Generator) -> None:
     params = SOURCE.bound
     left = near(params, pixel_hz, 0)[2]
     row = np.zeros(left + 400)
     row[0:20] = 1.0  # light that lies farther to the left than the margin
-    reached = line(row, params, pixel_hz)[left + 20 :]
+    reached = line(rng, row, params, pixel_hz)[left + 20 :]
     assert 0 < reached.max() <= tail(params, pixel_hz, 0)
     assert len(echoes(params)[0]) > 5
 
@@ -89,9 +89,9 @@ def test_the_loss_grows_as_the_root_of_the_frequency() -> None:
     assert lost == pytest.approx([0.0, 2.4 / np.sqrt(5), 2.4, 2.4 * np.sqrt(2)], abs=0.04)
 
 
-def test_the_skin_effect_reaches_no_farther_than_stated() -> None:
+def test_the_skin_effect_reaches_no_farther_than_stated(rng: np.random.Generator) -> None:
     params = Termination(length_m=5.0, line_ohm=50.0, skin_db=1.0)
     left = near(params, PIXEL_HZ, 0)[2]
     row = np.zeros(left + 400)
     row[0:20] = 1.0
-    assert 0 < line(row, params)[left + 20 :].max() <= tail(params, PIXEL_HZ, 0) < 0.1
+    assert 0 < line(rng, row, params)[left + 20 :].max() <= tail(params, PIXEL_HZ, 0) < 0.1

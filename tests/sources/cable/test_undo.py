@@ -55,7 +55,7 @@ SCENE = Targets(np.linspace(40.2, 280.7, 12), np.full(12, 11.6))
 
 @pytest.mark.parametrize("filters", [True, False], ids=["behind filters", "bare line"])
 @pytest.mark.parametrize("cable", CABLES)
-def test_the_cable_is_taken_out_of_the_pixels(cable: str, filters: bool) -> None:
+def test_the_cable_is_taken_out_of_the_pixels(cable: str, filters: bool, rng: np.random.Generator) -> None:
     """Of 12 discs; less than 1 % of the shift is left, and noise of the samples is not raised by more than 80 %."""
     camera = chain(cable, filters=filters)
     without = camera.switched(off=[CABLES[cable][0]] if filters else ["source under test"])
@@ -65,7 +65,7 @@ def test_the_cable_is_taken_out_of_the_pixels(cable: str, filters: bool) -> None
     assert np.abs(shift).min() > 0.01
     assert np.abs(left).max() < 0.01 * np.abs(shift).max()
     assert np.abs(back - gone).max() < 0.02 * np.abs(there - gone).max() + 0.2
-    noise = np.random.default_rng().normal(0, 1, there.shape)
+    noise = rng.normal(0, 1, there.shape)
     assert (corrected(camera, there + noise) - back).std() < 1.8
 
 

@@ -14,15 +14,15 @@ from pixmetry.sources.electronics.amplifier_noise import SOURCE, AmplifierNoise
 from source_signals import ALPHA, K_DN_PER_E, Z, fitted, flat, spot_probe, stream
 
 
-def test_normal_with_the_given_standard_deviation():
+def test_normal_with_the_given_standard_deviation(rng: np.random.Generator):
     """Kolmogorov–Smirnov at 1e-6 over 200 000 pixels; an error of 2 % of σ, or a mean of 0.01 σ, would be caught."""
-    out = SOURCE.forward(AmplifierNoise(white_e=12.0), flat(100.0, (400, 500)), stream()).data.astype(float)
+    out = SOURCE.forward(AmplifierNoise(white_e=12.0), flat(100.0, (400, 500)), stream(rng)).data.astype(float)
     assert stats.kstest((out.ravel() - 100) / 12, "norm").pvalue > ALPHA
 
 
-def test_frames_are_independent():
+def test_frames_are_independent(rng: np.random.Generator):
     """Correlation of two frames is 0 ± 1/√n, at 1e-6; 0.011 would be caught."""
-    out = SOURCE.forward(AmplifierNoise(white_e=12.0), flat(0.0, (400, 500), n=2), stream()).data.astype(float)
+    out = SOURCE.forward(AmplifierNoise(white_e=12.0), flat(0.0, (400, 500), n=2), stream(rng)).data.astype(float)
     assert abs(np.corrcoef(out[0].ravel(), out[1].ravel())[0, 1]) < Z / math.sqrt(out[0].size)
 
 

@@ -15,22 +15,22 @@ from pixmetry.sources.electronics.column_noise import ColumnNoise, forward, prop
 from source_signals import ALPHA, Z, flat, stream
 
 
-def columns(params: ColumnNoise, n: int, cols: int = 4000, level: float = 0.0, unit=None) -> np.ndarray:
-    out = forward(params, flat(level, (3, cols), n=n, kind=Kind.DN), unit or stream()).data.astype(float)
+def columns(rng: np.random.Generator, params: ColumnNoise, n: int, cols: int = 4000, level: float = 0.0, unit=None) -> np.ndarray:
+    out = forward(params, flat(level, (3, cols), n=n, kind=Kind.DN), unit or stream(rng)).data.astype(float)
     assert np.array_equal(out[:, 0], out[:, 2])
     return out[:, 0]
 
 
 @pytest.mark.parametrize("frames", [1, 8])
-def test_at_any_moment_the_offsets_are_normal_with_their_deviation(frames):
+def test_at_any_moment_the_offsets_are_normal_with_their_deviation(frames, rng: np.random.Generator):
     """Kolmogorov–Smirnov at 1e-6 on each of the moments between two states; 6 % of the deviation would be caught."""
-    for row in columns(ColumnNoise(offset_dn=2.0, wander_frames=frames), 5, cols=20_000):
+    for row in columns(rng, ColumnNoise(offset_dn=2.0, wander_frames=frames), 5, cols=20_000):
         assert stats.kstest(row / 2, "norm").pvalue > ALPHA
 
 
-def test_correlation_over_frames_is_a_cosine_up_to_the_next_state_and_ends_after_two():
+def test_correlation_over_frames_is_a_cosine_up_to_the_next_state_and_ends_after_two(rng: np.random.Generator):
     """z_0 cos(πs/2) + z_1 sin(πs/2): between moments s and s' of one interval cos(π(s' − s)/2); between intervals sin(πs/2) cos(πs'/2)."""
-    rows = columns(ColumnNoise(offset_dn=1.0, wander_frames=8), 20, cols=20_000)
+    rows = columns(rng, ColumnNoise(offset_dn=1.0, wander_frames=8), 20, cols=20_000)
 
     def expected(a: int, b: int) -> float:
         s, t = (0.5 * math.pi * (v % 8) / 8 for v in (a, b))
@@ -42,14 +42,14 @@ def test_correlation_over_frames_is_a_cosine_up_to_the_next_state_and_ends_after
         assert got == pytest.approx(rho, abs=Z * math.sqrt((1 + rho**2) / 20_000)), (a, b)
 
 
-def test_new_in_every_frame_unless_it_wanders():
-    rows = columns(ColumnNoise(offset_dn=1.0), 2, cols=20_000)
+def test_new_in_every_frame_unless_it_wanders(rng: np.random.Generator):
+    rows = columns(rng, ColumnNoise(offset_dn=1.0), 2, cols=20_000)
     assert abs(np.mean(rows[0] * rows[1])) < Z / math.sqrt(20_000)
 
 
-def test_gain_acts_on_the_signal_and_truth_tells_both():
-    params, unit = ColumnNoise(offset_dn=0.5, gain_rel=0.01, wander_frames=3), stream()
-    dark, light = (columns(params, 4, level=v, unit=unit) for v in (0.0, 200.0))
+def test_gain_acts_on_the_signal_and_truth_tells_both(rng: np.random.Generator):
+    params, unit = ColumnNoise(offset_dn=0.5, gain_rel=0.01, wander_frames=3), stream(rng)
+    dark, light = (columns(rng, params, 4, level=v, unit=unit) for v in (0.0, 200.0))
     gain = (light - dark) / 200
     assert gain.std() == pytest.approx(0.01, rel=Z / math.sqrt(2 * 4000))
     assert np.corrcoef(gain[0], dark[0])[0, 1] == pytest.approx(0.0, abs=Z / math.sqrt(4000))
@@ -76,8 +76,8 @@ def test_shift_per_dn_of_a_disc_in_a_round_window():
     assert got.u_y_px == pytest.approx(0.0, abs=1e-15)
 
 
-def test_a_window_sees_the_columns_of_its_place():
-    params, unit = ColumnNoise(offset_dn=1.0, gain_rel=0.01, wander_frames=5), stream()
+def test_a_window_sees_the_columns_of_its_place(rng: np.random.Generator):
+    params, unit = ColumnNoise(offset_dn=1.0, gain_rel=0.01, wander_frames=5), stream(rng)
     whole = flat(10.0, (6, 40), n=3, kind=Kind.DN)
     part = flat(10.0, (2, 9), n=3, kind=Kind.DN, row0=3, col0=17, frame_shape=(6, 40))
     assert isinstance(part.grid, Grid)

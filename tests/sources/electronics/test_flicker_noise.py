@@ -9,7 +9,7 @@ from pixmetry.sources.electronics.flicker_noise import FlickerNoise, covariance,
 from source_signals import Z, flat, stream
 
 
-def test_density_goes_as_one_over_f():
+def test_density_goes_as_one_over_f(rng: np.random.Generator):
     """Periodogram (SciPy) of 48 read-outs of 65 536 pixels: −10 dB per decade within 0.5 dB, over 2.1 decades.
 
     At 1e-6 the fit is known to 0.2 dB. No band of an octave departs from the line by more than its own scatter and 0.1 dB: a
@@ -18,7 +18,7 @@ def test_density_goes_as_one_over_f():
     from scipy.signal import periodogram
 
     params = FlickerNoise(rms_e=10.0, corner_rel=0.25, octaves=16, line_px=1024)
-    frames = forward(params, flat(0.0, (64, 1024), n=48), stream()).data.reshape(48, -1).astype(float)
+    frames = forward(params, flat(0.0, (64, 1024), n=48), stream(rng)).data.reshape(48, -1).astype(float)
     f, density = periodogram(frames, detrend=False, axis=1)
     centre, level, weight = [], [], []
     for octave in range(5, 12):
@@ -36,8 +36,8 @@ def test_density_goes_as_one_over_f():
     assert np.all(np.abs(level - (fit[0] + fit[1] * centre)) < 0.1 + 1.2 * Z / weight)
 
 
-def many(params: FlickerNoise, shape: tuple[int, int], n: int, **place) -> np.ndarray:
-    return forward(params, flat(0.0, shape, n=n, **place), stream()).data.astype(float)
+def many(rng: np.random.Generator, params: FlickerNoise, shape: tuple[int, int], n: int, **place) -> np.ndarray:
+    return forward(params, flat(0.0, shape, n=n, **place), stream(rng)).data.astype(float)
 
 
 def triangles(lag: float, period: float) -> float:
@@ -47,11 +47,11 @@ def triangles(lag: float, period: float) -> float:
     return float((one * two).sum() / (one * one).sum())
 
 
-def test_covariance_is_that_of_straight_lines_between_independent_nodes():
+def test_covariance_is_that_of_straight_lines_between_independent_nodes(rng: np.random.Generator):
     """Twelve thousand frames, six pixels at lags from 1 to 2 rows; covariances known to 1 %, at 1e-6 to 5 %."""
     params = FlickerNoise(rms_e=7.0, corner_rel=0.1, octaves=9, line_px=100)
     n = 12_000
-    window = many(params, (3, 6), n, row0=50, col0=30, frame_shape=(200, 90))
+    window = many(rng, params, (3, 6), n, row0=50, col0=30, frame_shape=(200, 90))
     picked = np.stack([window[:, r, c] for r, c in ((0, 0), (0, 1), (0, 5), (1, 0), (2, 0), (2, 5))])
     time = np.array([0, 1, 5, 100, 200, 205])
     periods = [5, *(5 * 2**k for k in range(9))]  # the fastest counts twice
@@ -64,29 +64,29 @@ def test_covariance_is_that_of_straight_lines_between_independent_nodes():
     assert want[0, 0] == pytest.approx(49.0)
 
 
-def test_rows_narrower_than_the_line_leave_the_blanking_out():
+def test_rows_narrower_than_the_line_leave_the_blanking_out(rng: np.random.Generator):
     """A camera whose rows are longer than ``line_px`` reads them without a gap: the last pixel of a row is the next one's neighbour."""
     params = FlickerNoise(rms_e=1.0, corner_rel=0.05, octaves=3, line_px=0)
-    noise = many(params, (2, 40), 2000)
+    noise = many(rng, params, (2, 40), 2000)
     across = np.mean((noise[:, 0, -1] - noise[:, 1, 0]) ** 2)
     within = np.mean((noise[:, 0, 10] - noise[:, 0, 11]) ** 2)
     assert across / within == pytest.approx(1.0, abs=2 * Z * np.sqrt(4 / 2000))
     assert np.mean((noise[:, 0, 0] - noise[:, 1, 0]) ** 2) > 5 * within
 
 
-def test_frames_are_independent_of_each_other():
-    noise = many(FlickerNoise(rms_e=1.0, octaves=12), (1, 1), 20_000)[:, 0, 0]
+def test_frames_are_independent_of_each_other(rng: np.random.Generator):
+    noise = many(rng, FlickerNoise(rms_e=1.0, octaves=12), (1, 1), 20_000)[:, 0, 0]
     assert abs(np.corrcoef(noise[1:], noise[:-1])[0, 1]) < 1.1 * Z / np.sqrt(len(noise))
 
 
-def test_follows_the_fields_in_time():
+def test_follows_the_fields_in_time(rng: np.random.Generator):
     """Row 2l of the woven frame is as near to row 2l + 2 as rows that are read one after the other are; to row 2l + 1 it is 312 lines.
 
     At 1e-6, correlations are known to 0.04 from 16 000 frames; rows in the order of the frame would show 0.74 between neighbours.
     """
     params = FlickerNoise(rms_e=7.0, octaves=16, line_px=100, interlaced=True, field_lines=12.5)
     n = 16_000
-    rows = many(params, (5, 2), n, row0=7, col0=30, frame_shape=(24, 90))[:, :, 0]
+    rows = many(rng, params, (5, 2), n, row0=7, col0=30, frame_shape=(24, 90))[:, :, 0]
     got = np.corrcoef(rows.T)
     times = np.array([r // 2 + 12.5 * (r % 2) for r in range(7, 12)]) * 100
     want = covariance(params, times[:, None] - times) / 49

@@ -13,17 +13,17 @@ from pixmetry.sources.sensor.shot_noise import SOURCE as SHOT
 from source_signals import Z, fitted, flat, signal, stream
 
 
-def test_electrons_become_dn():
-    electrons = np.random.default_rng().uniform(-50, 1e5, (2, 5, 7)).astype(np.float32)
-    out = SOURCE.forward(SOURCE.make({"gain_dn_per_e": 0.125}), signal(electrons), stream())
+def test_electrons_become_dn(rng: np.random.Generator):
+    electrons = rng.uniform(-50, 1e5, (2, 5, 7)).astype(np.float32)
+    out = SOURCE.forward(SOURCE.make({"gain_dn_per_e": 0.125}), signal(electrons), stream(rng))
     assert out.kind is Kind.DN
     assert np.array_equal(out.data, electrons / 8)
 
 
-def test_variance_over_mean_is_the_gain():
+def test_variance_over_mean_is_the_gain(rng: np.random.Generator):
     """The photon-transfer law σ² = K µ at 1e-6; an error of 1.5 % of the gain would be caught."""
-    electrons = SHOT.forward(SHOT.typical, flat(1000.0, (500, 500)), stream())
-    dn = SOURCE.forward(SOURCE.make({"gain_dn_per_e": 0.03}), electrons, stream()).data.astype(float)
+    electrons = SHOT.forward(SHOT.typical, flat(1000.0, (500, 500)), stream(rng))
+    dn = SOURCE.forward(SOURCE.make({"gain_dn_per_e": 0.03}), electrons, stream(rng)).data.astype(float)
     assert abs(dn.var() / dn.mean() / 0.03 - 1) < Z * np.sqrt(2 / dn.size)
 
 

@@ -22,39 +22,39 @@ TV = Gamma(gamma=0.45, reference_dn=1000.0)
 ROOT = Gamma(gamma=0.5, reference_dn=1000.0)
 
 
-def bent(params: Gamma, x) -> np.ndarray:
-    return SOURCE.forward(params, signal(np.reshape(x, (1, 1, -1)), Kind.DN), stream()).data[0, 0].astype(float)
+def bent(rng: np.random.Generator, params: Gamma, x) -> np.ndarray:
+    return SOURCE.forward(params, signal(np.reshape(x, (1, 1, -1)), Kind.DN), stream(rng)).data[0, 0].astype(float)
 
 
-def test_doubling_steps_keep_their_ratio_and_the_ends_stay():
+def test_doubling_steps_keep_their_ratio_and_the_ends_stay(rng: np.random.Generator):
     """0.45 is 9/20: twenty halvings of the light are nine of the signal."""
-    assert bent(TV, [1000, 1000 / 2**20, 1000 * 2**20, 0]) == pytest.approx([1000, 1000 / 2**9, 1000 * 2**9, 0], rel=1e-6)
+    assert bent(rng, TV, [1000, 1000 / 2**20, 1000 * 2**20, 0]) == pytest.approx([1000, 1000 / 2**9, 1000 * 2**9, 0], rel=1e-6)
 
 
-def test_published_point_of_bt_709():
+def test_published_point_of_bt_709(rng: np.random.Generator):
     """ITU-R BT.709-6, item 1.2: 1.099 L^0.45 − 0.099 meets 4.5 L at L = 0.018, as far as its three digits go."""
-    assert bent(TV, [18.0])[0] / 1000 == pytest.approx((4.5 * 0.018 + 0.099) / 1.099, rel=3e-3)
+    assert bent(rng, TV, [18.0])[0] / 1000 == pytest.approx((4.5 * 0.018 + 0.099) / 1.099, rel=3e-3)
 
 
-def test_a_gamma_of_one_half_is_a_square_root_and_odd_about_black():
-    x = np.random.default_rng().uniform(0, 3000, 500)
-    assert bent(ROOT, x) == pytest.approx(np.sqrt(1000 * x), rel=1e-5)
-    assert np.array_equal(bent(TV, -x), -bent(TV, x))
+def test_a_gamma_of_one_half_is_a_square_root_and_odd_about_black(rng: np.random.Generator):
+    x = rng.uniform(0, 3000, 500)
+    assert bent(rng, ROOT, x) == pytest.approx(np.sqrt(1000 * x), rel=1e-5)
+    assert np.array_equal(bent(rng, TV, -x), -bent(rng, TV, x))
 
 
-def test_inverse_restores_the_light_on_both_sides_of_black():
-    x = np.random.default_rng().uniform(-300, 2500, (2, 50, 60))
+def test_inverse_restores_the_light_on_both_sides_of_black(rng: np.random.Generator):
+    x = rng.uniform(-300, 2500, (2, 50, 60))
     frame = signal(x, Kind.DN)
-    back = SOURCE.correct(TV, SOURCE.forward(TV, frame, stream()), {})
+    back = SOURCE.correct(TV, SOURCE.forward(TV, frame, stream(rng)), {})
     assert back.data.dtype == np.float32
     assert np.abs(back.data - frame.data).max() < 5e-3  # 1/γ times some steps of float32 at 2500 DN
 
 
-def test_poisson_noise_behind_a_square_root_is_the_same_at_any_level():
+def test_poisson_noise_behind_a_square_root_is_the_same_at_any_level(rng: np.random.Generator):
     """Anscombe (1948): Var √N = ¼(1 + 3/(8µ)), so σ² = K f/4. Fails at 1e-6 by chance; finds an error of 2 % in the variance."""
     for electrons in (1000.0, 20000.0):
-        shot = SHOT.forward(SHOT.typical, flat(electrons, (500, 500)), stream())
-        out = SOURCE.forward(ROOT, shot.with_data(shot.data * np.float32(K_DN_PER_E), Kind.DN), stream()).data.astype(float)
+        shot = SHOT.forward(SHOT.typical, flat(electrons, (500, 500)), stream(rng))
+        out = SOURCE.forward(ROOT, shot.with_data(shot.data * np.float32(K_DN_PER_E), Kind.DN), stream(rng)).data.astype(float)
         expected = K_DN_PER_E * 1000 / 4 * (1 + 3 / (8 * electrons))
         assert abs(out.var() / expected - 1) < Z * np.sqrt(2 / out.size) + 1 / electrons**2
 
@@ -90,14 +90,13 @@ def test_a_target_that_the_estimator_does_not_see_does_not_move():
 TIMES = 0.002 * np.arange(1, 21)
 
 
-def campaign(params: Gamma, top: float = 0.9, bend: Nonlinearity | None = None) -> Observations:
+def campaign(rng: np.random.Generator, params: Gamma, top: float = 0.9, bend: Nonlinearity | None = None) -> Observations:
     """What a series of pairs of 48 × 64 pixels is reduced to: shot noise, noise before the curve, black at 60 DN, 12 bits."""
-    rng = np.random.default_rng()
 
     def frames(part: float) -> list[np.ndarray]:
         electrons = rng.poisson(part * top * 4035 / K_DN_PER_E, (2, 48, 64)) + 8 * rng.standard_normal((2, 48, 64))
         x = signal(K_DN_PER_E * electrons, Kind.DN)
-        y = SOURCE.forward(params, NONLINEARITY.forward(bend or Nonlinearity(), x, stream()), stream()).data
+        y = SOURCE.forward(params, NONLINEARITY.forward(bend or Nonlinearity(), x, stream(rng)), stream(rng)).data
         return list(np.clip(np.rint(y + 60), 0, 4095).astype(np.uint16))
 
     parts = TIMES / TIMES[-1]
@@ -110,9 +109,9 @@ def campaign(params: Gamma, top: float = 0.9, bend: Nonlinearity | None = None) 
 
 @pytest.mark.parametrize("top", [0.9, 1.2])
 @pytest.mark.parametrize("gamma", [0.45, 0.6, 0.8, 0.9])
-def test_photon_transfer_of_a_gamma_camera_is_left_out_with_the_remedy(gamma, top):
+def test_photon_transfer_of_a_gamma_camera_is_left_out_with_the_remedy(gamma, top, rng: np.random.Generator):
     """With and without saturated levels: no gain is measured through a curve whose slope is infinite in the dark, and a note says why."""
-    seen = campaign(Gamma(gamma=gamma), top)
+    seen = campaign(rng, Gamma(gamma=gamma), top)
     assert seen.photon_transfer_fit is None or "gain_dn_per_e" not in seen.photon_transfer_fit
     said = [note for note in seen.notes if re.search(r"strongly curved.*gamma to 1", note)]
     assert len(said) == 1
@@ -122,18 +121,18 @@ def test_photon_transfer_of_a_gamma_camera_is_left_out_with_the_remedy(gamma, to
 @pytest.mark.parametrize(
     ("gamma", "bend"), [(1.0, {}), (1.0, {"a1": -0.02, "a3": -0.03}), (1.0, {"a1": -0.1}), (1.0, {"a3": -0.1}), (0.97, {})]
 )
-def test_a_weak_bend_is_counted_once(gamma, bend):
+def test_a_weak_bend_is_counted_once(gamma, bend, rng: np.random.Generator):
     """Gamma is 1, and the twin's curve (non-linearity, then gamma) meets the camera's level means within 0.3 % of the range.
 
     A bend that is applied twice is off by 1 % for the exponent of 0.97 and by more for 10 % of non-linearity.
     """
-    seen = campaign(Gamma(gamma=gamma), bend=Nonlinearity(**bend))
+    seen = campaign(rng, Gamma(gamma=gamma), bend=Nonlinearity(**bend))
     got, fit = SOURCE.measure(seen), seen.photon_transfer_fit
     assert got["gamma"].value == 1 and got["gamma"].u < 0.01
     assert "electronics.nonlinearity" in got["gamma"].reason
     x = signal((fit["responsivity_dn_per_s"].value * TIMES).reshape(1, 1, -1), Kind.DN)
     twin_bend = NONLINEARITY.make({e.name: e.value for e in NONLINEARITY.measure(seen)})
-    twin = SOURCE.forward(SOURCE.make({"gamma": got["gamma"].value}), NONLINEARITY.forward(twin_bend, x, stream()), stream())
+    twin = SOURCE.forward(SOURCE.make({"gamma": got["gamma"].value}), NONLINEARITY.forward(twin_bend, x, stream(rng)), stream(rng))
     stored = seen.photon_transfer.bright.mean_dn - fit["offset_dn"].value
     assert np.abs(twin.data[0, 0] - stored).max() < 0.003 * 4095
 

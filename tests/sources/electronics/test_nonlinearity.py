@@ -14,16 +14,16 @@ from source_signals import centroid, centroid_probe, fitted, signal, spot_probe,
 BENT = Nonlinearity(a1=-0.05, a2=0.08, a3=-0.1, reference_dn=1000.0)
 
 
-def test_is_the_polynomial_of_the_joint_fit():
-    x = np.random.default_rng().uniform(-100, 1200, (1, 30, 40)).astype(np.float32)
-    out = SOURCE.forward(BENT, signal(x, Kind.DN), stream()).data
+def test_is_the_polynomial_of_the_joint_fit(rng: np.random.Generator):
+    x = rng.uniform(-100, 1200, (1, 30, 40)).astype(np.float32)
+    out = SOURCE.forward(BENT, signal(x, Kind.DN), stream(rng)).data
     w = x.astype(float) / 1000
     assert np.allclose(out, x * (1 - 0.05 * w + 0.08 * w**2 - 0.1 * w**3), rtol=2e-6, atol=1e-4)
 
 
-def test_rises_far_beyond_its_range():
+def test_rises_far_beyond_its_range(rng: np.random.Generator):
     x = np.linspace(-2000, 5000, 70_001, dtype=np.float64)[None, None]
-    out = SOURCE.forward(BENT, signal(x, Kind.DN), stream()).data[0, 0].astype(float)
+    out = SOURCE.forward(BENT, signal(x, Kind.DN), stream(rng)).data[0, 0].astype(float)
     assert (np.diff(out) > 0).all()
 
 
@@ -39,15 +39,15 @@ def test_one_that_still_rises_up_to_its_end_is_taken(values):
     assert SOURCE.make(values)
 
 
-def test_inverse_is_exact():
-    x = np.random.default_rng().uniform(-500, 2500, (2, 50, 60))
+def test_inverse_is_exact(rng: np.random.Generator):
+    x = rng.uniform(-500, 2500, (2, 50, 60))
     frame = signal(x, Kind.DN)
-    back = SOURCE.correct(BENT, SOURCE.forward(BENT, frame, stream()), {})
+    back = SOURCE.correct(BENT, SOURCE.forward(BENT, frame, stream(rng)), {})
     assert np.abs(back.data - frame.data).max() < 2e-3  # a few steps of float32 at 2500 DN
     assert back.data.dtype == np.float32
 
 
-def test_symmetric_targets_have_an_s_curve_and_no_bias():
+def test_symmetric_targets_have_an_s_curve_and_no_bias(rng: np.random.Generator):
     """Against the centroid of bent spots at 16 phases: the first order differs by the factor S/S′, and its mean over the phases is 0."""
     params = Nonlinearity(a1=-0.1, a3=-0.06, reference_dn=200.0)
     x = 12 + np.linspace(-0.5, 0.5, 16, endpoint=False)
@@ -55,7 +55,7 @@ def test_symmetric_targets_have_an_s_curve_and_no_bias():
     image = spots(x, y, sigma=0.45)
     probe = centroid_probe(image, x, y)
     got = SOURCE.propagate(params, probe)
-    bent = SOURCE.forward(params, signal(image, Kind.DN), stream()).data.astype(float)
+    bent = SOURCE.forward(params, signal(image, Kind.DN), stream(rng)).data.astype(float)
     true = centroid(bent)[0] - centroid(image)[0]
     weight = bent.sum(axis=(1, 2)) / image.sum(axis=(1, 2))
     assert got.u_x_px == pytest.approx(np.std(true * weight), rel=1e-3)

@@ -22,11 +22,11 @@ SHAPE = (64, 96)
 ON_BINS = SupplyPickup(amplitude_dn=1.5, frequency_hz=1e6, pixel_time_ns=3125.0, line_time_us=400 - 5 / 64)
 
 
-def wave(params: SupplyPickup, shape=SHAPE, n: int = 1, unit: Stream | None = None, **kw) -> np.ndarray:
-    return forward(params, flat(0.0, shape, n=n, kind=Kind.DN, **kw), unit or stream()).data.astype(float)
+def wave(rng: np.random.Generator, params: SupplyPickup, shape=SHAPE, n: int = 1, unit: Stream | None = None, **kw) -> np.ndarray:
+    return forward(params, flat(0.0, shape, n=n, kind=Kind.DN, **kw), unit or stream(rng)).data.astype(float)
 
 
-def test_all_frames_are_one_sinusoid_of_time_with_one_phase():
+def test_all_frames_are_one_sinusoid_of_time_with_one_phase(rng: np.random.Generator):
     """Time in exact fractions; one amplitude and one phase fitted to windows of four frames, the last after eleven hours at 5 MHz.
 
     Of float64, 3e-5 of a turn is left there: 2π · 3e-5 · 2 DN = 4e-4 DN.
@@ -36,7 +36,7 @@ def test_all_frames_are_one_sinusoid_of_time_with_one_phase():
     frames = signal(
         np.zeros((4, 7, 9)), Kind.DN, row0=1000, col0=1300, frame_shape=(1100, 1400), time_s=np.array([float(t) for t in starts])
     )
-    got = forward(params, frames, stream()).data.astype(float).ravel()
+    got = forward(params, frames, stream(rng)).data.astype(float).ravel()
     line, pixel = Fraction(635, 10**7), Fraction(625, 10**10)
     turns = [4_999_999 * (t + r * line + c * pixel) % 1 for t in starts for r in range(1000, 1007) for c in range(1300, 1309)]
     angle = 2 * np.pi * np.array([float(v) for v in turns])
@@ -46,72 +46,72 @@ def test_all_frames_are_one_sinusoid_of_time_with_one_phase():
     assert np.abs(got - basis @ fitted).max() < 6e-4
 
 
-def test_european_mains_has_two_periods_in_625_television_lines():
+def test_european_mains_has_two_periods_in_625_television_lines(rng: np.random.Generator):
     """ITU-R BT.1700: 625 lines of 64 µs, 25 pictures a second; 50 Hz is the field rate."""
     mains = SupplyPickup(amplitude_dn=1.0, frequency_hz=50.0, line_time_us=64.0, pixel_time_ns=0.0)
-    rows = wave(mains, (1250, 2))[0, :, 0]
+    rows = wave(rng, mains, (1250, 2))[0, :, 0]
     assert rows[625:] == pytest.approx(rows[:625], abs=1e-5)
     assert np.count_nonzero(np.diff(np.sign(rows[:625])) != 0) in (3, 4)
     assert abs(np.fft.rfft(rows[:625]))[2] == pytest.approx(625 / 2, rel=1e-6)
 
 
 @pytest.mark.parametrize(("hertz", "pictures"), [(50.0, 1), (60.0, 5), (51.0, 25)])
-def test_it_stands_still_or_rolls_by_the_beat_with_the_frame_rate(hertz, pictures):
+def test_it_stands_still_or_rolls_by_the_beat_with_the_frame_rate(hertz, pictures, rng: np.random.Generator):
     """At 25 pictures a second: 50 Hz makes two turns a picture, 60 Hz 2.4 (again the same after 5), 51 Hz 2.04 (after 25)."""
     params = SupplyPickup(amplitude_dn=1.0, frequency_hz=hertz)
-    frames = wave(params, (9, 5), n=52, time_s=np.arange(52) / 25)
+    frames = wave(rng, params, (9, 5), n=52, time_s=np.arange(52) / 25)
     same = [np.abs(f - frames[0]).max() < 1e-5 for f in frames]
     assert [k for k in range(52) if same[k]] == list(range(0, 52, pictures))
 
 
-def test_only_what_is_left_of_whole_turns_between_pixels_is_seen():
+def test_only_what_is_left_of_whole_turns_between_pixels_is_seen(rng: np.random.Generator):
     """One line of the spectrum, with the amplitude, and the signs that tell +5 bins from −5."""
     assert seen_per_px(ON_BINS) == pytest.approx((12 / 96, -5 / 64), abs=1e-9)
-    frame = wave(ON_BINS)[0]
+    frame = wave(rng, ON_BINS)[0]
     spectrum = np.fft.fft2(frame) / frame.size
     assert 2 * abs(spectrum[-5, 12]) == pytest.approx(1.5, abs=2e-4)
     assert np.mean(frame**2) == pytest.approx(1.5**2 / 2, rel=1e-4)
 
 
-def test_the_phase_belongs_to_the_unit():
+def test_the_phase_belongs_to_the_unit(rng: np.random.Generator):
     """400 uniform phases: 400 |mean of exp(iφ)|² is exponential with mean 1, above 13.8 once in 1e-6; a mean of 0.2 would be found."""
-    phases = np.angle([np.fft.fft2(wave(ON_BINS)[0])[-5, 12] for _ in range(400)])
+    phases = np.angle([np.fft.fft2(wave(rng, ON_BINS)[0])[-5, 12] for _ in range(400)])
     assert 400 * abs(np.exp(1j * phases).mean()) ** 2 < 13.8
-    days = [wave(ON_BINS, unit=Stream(7, exposure, "pick-up")) for exposure in (1, 2)]
+    days = [wave(rng, ON_BINS, unit=Stream(7, exposure, "pick-up")) for exposure in (1, 2)]
     assert np.array_equal(*days)
 
 
-def test_correct_needs_neither_the_amplitude_nor_the_phase_of_the_frames():
-    dirty = forward(ON_BINS, flat(100.0, SHAPE, n=5, kind=Kind.DN, time_s=np.arange(5) * 0.0123456789), stream())
+def test_correct_needs_neither_the_amplitude_nor_the_phase_of_the_frames(rng: np.random.Generator):
+    dirty = forward(ON_BINS, flat(100.0, SHAPE, n=5, kind=Kind.DN, time_s=np.arange(5) * 0.0123456789), stream(rng))
     nominal = ON_BINS.model_copy(update={"amplitude_dn": 0.1})
     assert np.abs(correct(nominal, dirty, {}).data - 100).max() < 2e-4
 
 
-def test_correct_takes_out_a_sinusoid_that_changes_its_sign_from_row_to_row():
+def test_correct_takes_out_a_sinusoid_that_changes_its_sign_from_row_to_row(rng: np.random.Generator):
     """At half a cycle per pixel sine and cosine are one and the same column of the fit, but for its sign."""
     half = SupplyPickup(amplitude_dn=1.5, frequency_hz=1e6, pixel_time_ns=0.0, line_time_us=64.5)
-    dirty = forward(half, flat(100.0, SHAPE, kind=Kind.DN), stream())
+    dirty = forward(half, flat(100.0, SHAPE, kind=Kind.DN), stream(rng))
     assert np.abs(correct(half, dirty, {}).data - 100).max() < 2e-4
 
 
-def test_correct_puts_in_no_more_noise_than_two_fitted_numbers():
+def test_correct_puts_in_no_more_noise_than_two_fitted_numbers(rng: np.random.Generator):
     """Two orthogonal columns: the power put in is σ²χ² of 2 degrees of freedom a frame.
 
     60 frames find 80 % more, or half as much, at a false rate of 1e-6.
     """
     n, sigma = 60, 0.1
-    noise = np.random.default_rng().normal(0, sigma, (n, *SHAPE)).astype(np.float32)
-    clean = forward(ON_BINS, flat(0.0, SHAPE, n=n, kind=Kind.DN), stream())
+    noise = rng.normal(0, sigma, (n, *SHAPE)).astype(np.float32)
+    clean = forward(ON_BINS, flat(0.0, SHAPE, n=n, kind=Kind.DN), stream(rng))
     left = correct(ON_BINS, clean.with_data(clean.data + noise), {}).data.astype(float) - noise
     assert chi2.ppf(ALPHA / 2, 2 * n) < np.sum(left**2) / sigma**2 < chi2.isf(ALPHA / 2, 2 * n)
 
 
-def test_less_than_a_period_is_not_told_from_a_gradient_and_is_refused():
+def test_less_than_a_period_is_not_told_from_a_gradient_and_is_refused(rng: np.random.Generator):
     mains = SupplyPickup(amplitude_dn=1.0, frequency_hz=50.0)
     with pytest.raises(InputError, match="less than one period"):
         correct(mains, flat(100.0, (300, 96), kind=Kind.DN), {})
     tall = flat(100.0, (320, 96), kind=Kind.DN)  # a period is 312.5 rows
-    assert np.abs(correct(mains, forward(mains, tall, stream()), {}).data - 100).max() < 1e-3
+    assert np.abs(correct(mains, forward(mains, tall, stream(rng)), {}).data - 100).max() < 1e-3
 
 
 @pytest.mark.parametrize("cycles", [0.02, 0.1, 0.31, 1.1, -0.9])
@@ -132,11 +132,11 @@ def test_a_plain_centroid_answers_with_the_slope_of_the_dirichlet_kernel(cycles)
     assert (got.bias_x_px, got.bias_y_px, got.gum_class) == (0, 0, "F")
 
 
-def test_a_line_in_dark_frames_is_found_as_a_phase_pattern_at_the_frequency_that_is_seen():
+def test_a_line_in_dark_frames_is_found_as_a_phase_pattern_at_the_frequency_that_is_seen(rng: np.random.Generator):
     """Why there is no measure: what can be told from frames has its place already. Each within 4.9 u, missed once in 1e-6."""
     params = SupplyPickup(amplitude_dn=0.5, frequency_hz=1.3e6)
     shape = (128, 160)
-    mean_map = wave(params, shape)[0] + np.random.default_rng().normal(0, 0.1, shape)
+    mean_map = wave(rng, params, shape)[0] + rng.normal(0, 0.1, shape)
     nothing = dict.fromkeys(StackMoments.__dataclass_fields__, 0.0)
     stack = StackMoments(**nothing | {"n_frames": 16, "mean_map_dn": mean_map})
     found = measure_pattern(Observations(patterns=find_phase_patterns(stack)))

@@ -28,10 +28,10 @@ def frames(params: TelegraphNoise, numbers, unit) -> np.ndarray:
     return noise[:, told["telegraph_pixels"]] / told["telegraph_step_e"][told["telegraph_pixels"]]
 
 
-def test_two_levels_with_the_occupancy_and_its_kurtosis():
+def test_two_levels_with_the_occupancy_and_its_kurtosis(rng: np.random.Generator):
     """A trap filled in a share p: kurtosis (1 − 3 p (1 − p))/(p (1 − p)). 480 000 states: p is known to 0.004 at 1e-6."""
     p = 0.3
-    level = frames(TelegraphNoise(share=0.5, occupancy=p), range(8), stream())
+    level = frames(TelegraphNoise(share=0.5, occupancy=p), range(8), stream(rng))
     assert np.allclose(level, np.where(level > 0, 1 - p, -p), atol=1e-5)
     share = np.mean(level > 0)
     slack = Z * math.sqrt(p * (1 - p) / level.size)
@@ -43,12 +43,12 @@ def test_two_levels_with_the_occupancy_and_its_kurtosis():
 
 
 @pytest.mark.parametrize("memory", [0.7, 3.0, 20.0])
-def test_correlation_falls_exponentially_with_the_frames_and_needs_no_frame_between(memory):
+def test_correlation_falls_exponentially_with_the_frames_and_needs_no_frame_between(memory, rng: np.random.Generator):
     """60 000 pixels give a correlation to 0.02 at 1e-6: a memory that is off by a tenth would be caught."""
     p, n = 0.4, SHAPE[0] * SHAPE[1] // 2
     params = TelegraphNoise(share=0.5, occupancy=p, memory_frames=memory)
     numbers = [100_000, 100_001, 100_003, 100_010]
-    level = frames(params, numbers, stream())
+    level = frames(params, numbers, stream(rng))
     for i in range(4):
         for j in range(i + 1, 4):
             rho = math.exp(-(numbers[j] - numbers[i]) / memory)
@@ -57,10 +57,10 @@ def test_correlation_falls_exponentially_with_the_frames_and_needs_no_frame_betw
     assert level.mean() == pytest.approx(0.0, abs=Z * 2 * math.sqrt(p * (1 - p) / n))
 
 
-def test_dwell_times_are_geometric():
+def test_dwell_times_are_geometric(rng: np.random.Generator):
     """Of all times in the upper state, a share r^k (1 − r) lasts k frames more, r = 1 − (1 − e^(−1/τ)) (1 − p). Chi-square at 1e-6."""
     p, memory = 0.5, 4.0
-    level = frames(TelegraphNoise(share=0.5, occupancy=p, memory_frames=memory), range(25), stream()) > 0
+    level = frames(TelegraphNoise(share=0.5, occupancy=p, memory_frames=memory), range(25), stream(rng)) > 0
     starts = ~level[:9] & level[1:10]
     stay = 1 - (1 - math.exp(-1 / memory)) * (1 - p)
     length = np.array([np.argmin(np.append(level[t + 1 :, i], False)) for t, i in zip(*np.nonzero(starts), strict=True)])
@@ -70,10 +70,12 @@ def test_dwell_times_are_geometric():
     assert stats.chisquare(bins, chance * bins.sum()).pvalue > ALPHA
 
 
-def test_double_sampling_gives_three_levels():
+def test_double_sampling_gives_three_levels(rng: np.random.Generator):
     """Difference of two states of correlation ρ: ±1 with (1 − ρ) p (1 − p) each; kurtosis 1/(2 (1 − ρ) p (1 − p))."""
     p, rho = 0.4, 0.3
-    level = frames(TelegraphNoise(share=0.5, occupancy=p, levels="cds", cds_correlation=rho, memory_frames=2.0), [5, 500, 5000], stream())
+    level = frames(
+        TelegraphNoise(share=0.5, occupancy=p, levels="cds", cds_correlation=rho, memory_frames=2.0), [5, 500, 5000], stream(rng)
+    )
     assert np.allclose(level, np.rint(level), atol=1e-5) and set(np.unique(np.rint(level))) == {-1.0, 0.0, 1.0}
     each = (1 - rho) * p * (1 - p)
     for side in (-1, 1):
@@ -81,18 +83,18 @@ def test_double_sampling_gives_three_levels():
     assert np.mean(level**4) / np.mean(level**2) ** 2 == pytest.approx(1 / (2 * each), rel=Z / math.sqrt(2 * each * level.size))
 
 
-def test_two_traps_are_binomial():
+def test_two_traps_are_binomial(rng: np.random.Generator):
     p = 0.3
-    level = frames(TelegraphNoise(share=0.5, occupancy=p, levels="three"), range(6), stream())
+    level = frames(TelegraphNoise(share=0.5, occupancy=p, levels="three"), range(6), stream(rng))
     count = np.bincount(np.rint(level + 2 * p).astype(int).ravel(), minlength=3)
     assert stats.chisquare(count, level.size * stats.binom.pmf([0, 1, 2], 2, p)).pvalue > ALPHA
 
 
-def test_the_map_belongs_to_the_unit_with_its_share_and_exponential_steps():
+def test_the_map_belongs_to_the_unit_with_its_share_and_exponential_steps(rng: np.random.Generator):
     params = TelegraphNoise(share=0.2, amplitude_e=15.0)
     grid = Grid.whole([3], SHAPE)
     dark = Signal(np.zeros((1, *SHAPE), np.float32), Kind.ELECTRONS, grid, SHAPE, *(np.zeros(1),) * 3)
-    seed = int(np.random.default_rng().integers(2**60))
+    seed = int(rng.integers(2**60))
     told = truth(params, dark, Streams(seed, 1).of("a"))
     again = truth(params, dark, Streams(seed, 2).of("a"))
     assert np.array_equal(told["telegraph_step_e"], again["telegraph_step_e"])

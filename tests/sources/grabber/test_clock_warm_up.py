@@ -48,9 +48,9 @@ def test_published_times_to_stability() -> None:
     np.testing.assert_allclose(shifts(later), shifts(params, 3600.0))
 
 
-def test_the_truth_is_what_targets_do() -> None:
+def test_the_truth_is_what_targets_do(rng: np.random.Generator) -> None:
     params = ClockWarmUp(scale_error_rel=0.005, delay_ns=-80.0)
-    told = truth(params, video(np.zeros((1, 3, 752)), time_s=100.0), stream())
+    told = truth(params, video(np.zeros((1, 3, 752)), time_s=100.0), stream(rng))
     # told at the column of a sample, not of the target, and the smoothing filter is stretched too: 0.005 of 3.5 px
     np.testing.assert_allclose(told["col_shift_px"][0, COLUMNS.astype(int)], shifts(params, 100.0), atol=0.018)
     assert told["row_shift_px"].shape == (1, 3)

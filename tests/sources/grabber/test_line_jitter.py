@@ -13,26 +13,26 @@ from video_signals import PIXEL_HZ, bump, centre, sampled, standard_probe, video
 N, ROWS = 400, 60
 
 
-def delays_ns(params: LineJitter, n: int = N, rows: int = ROWS, row0: int = 0) -> np.ndarray:
+def delays_ns(rng: np.random.Generator, params: LineJitter, n: int = N, rows: int = ROWS, row0: int = 0) -> np.ndarray:
     grid = Grid(np.arange(n), np.full(n, row0), np.zeros(n), (rows, 8))
-    return 1e9 * delay_s(params, grid, ROWS, stream())
+    return 1e9 * delay_s(params, grid, ROWS, stream(rng))
 
 
-def test_moments_of_the_two_kinds() -> None:
+def test_moments_of_the_two_kinds(rng: np.random.Generator) -> None:
     """Variance of N numbers: relative standard error √(2/N_eff), the carried-on ones with N_eff = N tanh-like (1 − ρ²)/(1 + ρ²)."""
     rho2 = np.exp(-2 / 5)
     for params, independent in ((LineJitter(white_ns=20.0), 1.0), (LineJitter(loop_ns=20.0, loop_rows=5.0), (1 - rho2) / (1 + rho2))):
-        found = delays_ns(params)
+        found = delays_ns(rng, params)
         assert found.var() == pytest.approx(400.0, rel=Z * np.sqrt(2 / (found.size * independent)) * 1.1)
 
 
 @pytest.mark.parametrize("interlaced", [True, False])
-def test_the_loop_carries_on_within_a_field(interlaced: bool) -> None:
+def test_the_loop_carries_on_within_a_field(interlaced: bool, rng: np.random.Generator) -> None:
     """Correlation e^(−k/L) at k lines of the field, and none between fields.
 
     Products of unit variance numbers, alike over (1 + ρ²)/(1 − ρ²) = 5.1 rows; L off by a fifth would change the one at 4 lines by 0.07.
     """
-    found = delays_ns(LineJitter(loop_ns=1.0, loop_rows=5.0, interlaced=interlaced), n=4000)
+    found = delays_ns(rng, LineJitter(loop_ns=1.0, loop_rows=5.0, interlaced=interlaced), n=4000)
     u = Z * np.sqrt(2 * 5.1 / (4000 * (ROWS - 8)))
     for lag in (1, 2, 3, 8):
         got = (found[:, lag:] * found[:, :-lag]).mean()
@@ -40,21 +40,21 @@ def test_the_loop_carries_on_within_a_field(interlaced: bool) -> None:
         assert got == pytest.approx(expected, abs=u), lag
 
 
-def test_any_rows_have_the_delays_of_the_whole() -> None:
-    params, draws = LineJitter(white_ns=3.0, loop_ns=20.0, loop_rows=30.0, settling_ns=50.0, shear_ns=20.0), stream()
+def test_any_rows_have_the_delays_of_the_whole(rng: np.random.Generator) -> None:
+    params, draws = LineJitter(white_ns=3.0, loop_ns=20.0, loop_rows=30.0, settling_ns=50.0, shear_ns=20.0), stream(rng)
     grids = [Grid(np.arange(3), np.full(3, r), np.zeros(3), (h, 4)) for r, h in ((0, 200), (77, 40), (199, 1))]
     whole, some, one = (delay_s(params, g, 200, draws) for g in grids)
     assert np.array_equal(whole[:, 77:117], some) and np.array_equal(whole[:, 199:], one)
 
 
-def test_the_steady_part_settles_after_the_vertical_interval_and_shears() -> None:
-    found = delays_ns(LineJitter(settling_ns=100.0, settling_rows=10.0, shear_ns=30.0), n=1)[0]
+def test_the_steady_part_settles_after_the_vertical_interval_and_shears(rng: np.random.Generator) -> None:
+    found = delays_ns(rng, LineJitter(settling_ns=100.0, settling_rows=10.0, shear_ns=30.0), n=1)[0]
     line = np.arange(ROWS) // 2
     np.testing.assert_allclose(found, 100 * np.exp(-line / 10) + 30 * (np.arange(ROWS) / (ROWS - 1) - 0.5), atol=1e-9)
 
 
-def test_rows_move_by_the_truth() -> None:
-    params, draws = LineJitter(white_ns=20.0, loop_ns=10.0), stream()
+def test_rows_move_by_the_truth(rng: np.random.Generator) -> None:
+    params, draws = LineJitter(white_ns=20.0, loop_ns=10.0), stream(rng)
     before = video(np.broadcast_to(bump(60.0, 120, 3.0), (2, 40, 120)), smooth=True)
     told = truth(params, before, draws)["row_shift_px"]
     moved = (centre(sampled(SOURCE.forward(params, before, draws), 8)) - centre(sampled(before, 8))) / 8

@@ -65,13 +65,13 @@ def test_a_bessel_filter_keeps_edges_straighter_than_a_butterworth_filter() -> N
         assert got.max() == pytest.approx(y[1::2].max(), abs=2e-4)
 
 
-def test_under_a_threshold_bright_and_faint_targets_come_apart() -> None:
+def test_under_a_threshold_bright_and_faint_targets_come_apart(rng: np.random.Generator) -> None:
     """Only with a filter: what remains of the tail above a fixed level depends on the height."""
 
     def shift(params: LowPass) -> float:
         places = []
         for height in (1.0, 0.3):
-            row = np.maximum(seen(SOURCE, params, row_of(height * bump()))[0, 0] - 20.0, 0.0)
+            row = np.maximum(seen(rng, SOURCE, params, row_of(height * bump()))[0, 0] - 20.0, 0.0)
             places.append(centre(row))
         return places[0] - places[1]
 
@@ -79,11 +79,11 @@ def test_under_a_threshold_bright_and_faint_targets_come_apart() -> None:
     assert 0.01 < abs(shift(LowPass(kind="butterworth", cutoff_mhz=3.0))) < 0.2
 
 
-def test_the_margin_holds_all_but_the_stated_share() -> None:
+def test_the_margin_holds_all_but_the_stated_share(rng: np.random.Generator) -> None:
     for params in (SOURCE.typical, SOURCE.bound, LowPass(kind="rc", order=3), LowPass(kind="bessel", order=8, cutoff_mhz=1.0)):
         for pixel_hz in (10e6, PIXEL_HZ, 28.4e6):
             left = near(params, pixel_hz, 0)[2]
             row = np.zeros(left + 60)
             row[:20] = 1.0
-            beyond = np.abs(seen(SOURCE, params, row_of(row), pixel_hz=pixel_hz)[0, 0, left + 20 :]).max()
+            beyond = np.abs(seen(rng, SOURCE, params, row_of(row), pixel_hz=pixel_hz)[0, 0, left + 20 :]).max()
             assert beyond < SOURCE.tail(params, pixel_hz, 0)

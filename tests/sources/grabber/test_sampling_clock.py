@@ -19,10 +19,10 @@ def test_published_ratio_of_the_clocks() -> None:
         assert np.diff(line.pixels(np.array([-0.5, line.samples - 0.5]))) == pytest.approx(pixels)
 
 
-def test_the_pixel_clock_shows_at_its_alias() -> None:
+def test_the_pixel_clock_shows_at_its_alias(rng: np.random.Generator) -> None:
     """Alternating columns have half the pixel clock's frequency: 0.5 × 1.41875 cycles a sample, seen at 1 − 0.709375."""
     row = 100 + 50 * (-1.0) ** np.arange(752)
-    got = seen(SOURCE, EPIX, row_of(row))[0, 0]
+    got = seen(rng, SOURCE, EPIX, row_of(row))[0, 0]
     assert got.shape == (512,)
     power = np.abs(np.fft.rfft((got - got.mean()) * np.hanning(512))) ** 2
     assert power[1:].argmax() + 1 == pytest.approx(512 * (1 - 0.709375), abs=1)
@@ -40,8 +40,8 @@ def test_targets_lie_where_the_geometry_says(start_ns: float) -> None:
     assert camera.output_shape == (4, 512)
 
 
-def test_what_is_sampled_beyond_the_line_is_black() -> None:
-    got = seen(SOURCE, SamplingClock(clock_mhz=10.0, start_ns=-500.0, samples=60), row_of(np.full(64, 80.0)))[0, 0]
+def test_what_is_sampled_beyond_the_line_is_black(rng: np.random.Generator) -> None:
+    got = seen(rng, SOURCE, SamplingClock(clock_mhz=10.0, start_ns=-500.0, samples=60), row_of(np.full(64, 80.0)))[0, 0]
     inside = np.arange(60)
     t = (inside + 0.5) / 10e6 - 500e-9
     np.testing.assert_array_equal(got, np.where((t >= 0) & (t * PIXEL_HZ < 64), 80.0, 0.0))

@@ -27,9 +27,8 @@ ALL = dict(k1_per_mm2=-1e-3, k2_per_mm4=3e-5, k3_per_mm6=-1e-6, p1_per_mm=5e-5, 
 
 
 @pytest.mark.parametrize("direction", ["image_to_object", "object_to_image"])
-def test_the_map_is_the_polynomial_or_its_inverse(direction):
+def test_the_map_is_the_polynomial_or_its_inverse(direction, rng: np.random.Generator):
     params = Distortion(direction=direction, **ALL)
-    rng = np.random.default_rng()
     x, y = rng.uniform(0, 751, 500), rng.uniform(0, 581, 500)
     u, v = pull_of(params, SHAPE)(x, y)
     mm = np.array([[0.0086], [0.0083]])
@@ -77,9 +76,9 @@ def test_a_map_that_folds_is_refused(direction, bad):
         pull_of(Distortion(direction=direction, **bad), SHAPE)
 
 
-def test_truth_is_the_displacement_of_the_image():
+def test_truth_is_the_displacement_of_the_image(rng: np.random.Generator):
     params = Distortion(**ALL)
-    told = SOURCE.truth(params, signal_of(SOURCE, params, (60, 80)), stream())
+    told = SOURCE.truth(params, signal_of(SOURCE, params, (60, 80)), stream(rng))
     (x,), (y,) = mapped(SOURCE, params, [71.3], [52.8], (60, 80))
     col, row = int(round(x)), int(round(y))
     assert (told["shift_x_px"][row, col], told["shift_y_px"][row, col]) == pytest.approx((x - 71.3, y - 52.8), abs=2e-4)

@@ -37,8 +37,7 @@ def integrated(lamp: Flicker, begin: float, length: float) -> float:
 
 
 @pytest.mark.parametrize("lamp", LAMPS.values(), ids=LAMPS.keys())
-def test_the_mean_over_any_time_and_at_an_instant(lamp: Flicker) -> None:
-    rng = np.random.default_rng()
+def test_the_mean_over_any_time_and_at_an_instant(lamp: Flicker, rng: np.random.Generator) -> None:
     begin, length = rng.uniform(-0.05, 0.05, 8), rng.uniform(1e-4, 0.03, 8)
     expected = [integrated(lamp, b, d) for b, d in zip(begin, length, strict=True)]
     assert mean_light(lamp, begin, begin + length) == pytest.approx(expected, abs=1e-4)

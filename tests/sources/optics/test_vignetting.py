@@ -12,9 +12,9 @@ from source_signals import centroid, centroid_probe, flat, signal, spots, stream
 SHAPE = (101, 201)
 
 
-def test_natural_vignetting_is_the_fourth_power_of_the_cosine():
+def test_natural_vignetting_is_the_fourth_power_of_the_cosine(rng: np.random.Generator):
     params = Vignetting(cos_power=4, principal_distance_mm=1.0, pitch_x_um=10, pitch_y_um=5)
-    light = SOURCE.forward(params, flat(1.0, SHAPE, kind=Kind.PHOTONS), stream()).data[0]
+    light = SOURCE.forward(params, flat(1.0, SHAPE, kind=Kind.PHOTONS), stream(rng)).data[0]
     assert light[50, 100] == 1
     assert light[50, 200] == pytest.approx(np.cos(np.pi / 4) ** 4)
     assert light[100, 100] == pytest.approx(np.cos(np.arctan(0.25)) ** 4)
@@ -28,15 +28,15 @@ def test_mechanical_vignetting_is_what_two_openings_have_in_common():
         assert overlap(np.array(shift)) == pytest.approx(common.sum() / (x**2 + y**2 < 1).sum(), abs=2e-3)
 
 
-def test_the_shift_in_the_corner_is_the_parameter():
+def test_the_shift_in_the_corner_is_the_parameter(rng: np.random.Generator):
     params = Vignetting(pupil_shift_rel=0.3, pitch_x_um=8.6, pitch_y_um=8.3)
-    light = SOURCE.forward(params, flat(1.0, SHAPE, kind=Kind.PHOTONS), stream()).data[0]
+    light = SOURCE.forward(params, flat(1.0, SHAPE, kind=Kind.PHOTONS), stream(rng)).data[0]
     assert light[0, 0] == pytest.approx(float(overlap(np.array(0.3))), rel=1e-6)
 
 
-def test_correction_undoes_it():
-    frame = signal(np.random.default_rng().uniform(100, 1000, (2, *SHAPE)), Kind.PHOTONS)
-    back = SOURCE.correct(SOURCE.bound, SOURCE.forward(SOURCE.bound, frame, stream()), {})
+def test_correction_undoes_it(rng: np.random.Generator):
+    frame = signal(rng.uniform(100, 1000, (2, *SHAPE)), Kind.PHOTONS)
+    back = SOURCE.correct(SOURCE.bound, SOURCE.forward(SOURCE.bound, frame, stream(rng)), {})
     assert np.allclose(back.data, frame.data, rtol=1e-5)
 
 

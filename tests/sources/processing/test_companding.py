@@ -42,8 +42,8 @@ def test_the_steps_of_the_root_law_follow_the_shot_noise():
     assert ratio.mean() == pytest.approx(2 * np.sqrt(4095) / 255, rel=0.01)
 
 
-def test_codes_beyond_the_range_count_as_the_highest():
-    out = forward(Companding(law="linear", bits=12), codes(np.full((2, 2), 65535)), stream()).data
+def test_codes_beyond_the_range_count_as_the_highest(rng: np.random.Generator):
+    out = forward(Companding(law="linear", bits=12), codes(np.full((2, 2), 65535)), stream(rng)).data
     assert (out == 4095).all()
 
 

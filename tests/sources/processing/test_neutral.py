@@ -14,9 +14,9 @@ STEPS = {i: s for i, s in catalogue().items() if s.stage == "processing" and "bi
 
 @pytest.mark.parametrize("source", STEPS.values(), ids=STEPS.keys())
 @pytest.mark.parametrize("bits", [8, 12, 16])
-def test_bits_alone_leave_the_frame_as_it_is(source, bits):
+def test_bits_alone_leave_the_frame_as_it_is(source, bits, rng: np.random.Generator):
     params = source.make({"bits": bits})
-    frame = codes(np.random.default_rng().integers(0, 2**bits, (9, 8)))
+    frame = codes(rng.integers(0, 2**bits, (9, 8)))
     extra = () if source.start is None else (source.start(params),)
-    out = source.forward(params, frame, stream(), *extra)
+    out = source.forward(params, frame, stream(rng), *extra)
     assert np.array_equal((out[0] if extra else out).data, frame.data)

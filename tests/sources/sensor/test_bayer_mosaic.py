@@ -21,31 +21,31 @@ SHARES = {"red": 0.5, "green": 0.8, "blue": 0.2}
         ("BGGR", [[0.2, 0.8], [0.8, 0.5]]),
     ],
 )
-def test_colours_lie_as_the_name_says_in_every_window(pattern, want):
+def test_colours_lie_as_the_name_says_in_every_window(pattern, want, rng: np.random.Generator):
     params = BayerMosaic(pattern=pattern, **SHARES)
-    whole = forward(params, flat(1000.0, (6, 8), kind=Kind.PHOTONS), stream()).data[0]
+    whole = forward(params, flat(1000.0, (6, 8), kind=Kind.PHOTONS), stream(rng)).data[0]
     assert whole == pytest.approx(1000 * np.tile(want, (3, 4)), rel=1e-6)
-    part = forward(params, flat(1000.0, (3, 4), kind=Kind.PHOTONS, row0=3, col0=1, frame_shape=(6, 8)), stream()).data[0]
+    part = forward(params, flat(1000.0, (3, 4), kind=Kind.PHOTONS, row0=3, col0=1, frame_shape=(6, 8)), stream(rng)).data[0]
     assert np.array_equal(part, whole[3:6, 1:5])
 
 
-def test_the_two_greens_differ_about_their_mean():
+def test_the_two_greens_differ_about_their_mean(rng: np.random.Generator):
     """Rows of red 1 − 5 %, rows of blue 1 + 5 %."""
-    got = forward(BayerMosaic(pattern="GRBG", green_split_rel=0.1), flat(100.0, (2, 2), kind=Kind.PHOTONS), stream()).data[0]
+    got = forward(BayerMosaic(pattern="GRBG", green_split_rel=0.1), flat(100.0, (2, 2), kind=Kind.PHOTONS), stream(rng)).data[0]
     assert got == pytest.approx(np.array([[95, 100], [100, 105]]))
 
 
-def test_balancing_restores_grey_light_and_leaves_a_blind_colour_alone():
+def test_balancing_restores_grey_light_and_leaves_a_blind_colour_alone(rng: np.random.Generator):
     params = BayerMosaic(**SHARES)
-    x = signal(np.random.default_rng().uniform(0, 1e4, (2, 9, 7)), Kind.PHOTONS, row0=1, frame_shape=(20, 7))
-    assert correct(params, forward(params, x, stream()), {}).data == pytest.approx(x.data, rel=1e-6)
+    x = signal(rng.uniform(0, 1e4, (2, 9, 7)), Kind.PHOTONS, row0=1, frame_shape=(20, 7))
+    assert correct(params, forward(params, x, stream(rng)), {}).data == pytest.approx(x.data, rel=1e-6)
     blind = BayerMosaic(blue=0.0)
-    out = correct(blind, forward(blind, flat(50.0, (4, 4), kind=Kind.PHOTONS), stream()), {}).data[0]
+    out = correct(blind, forward(blind, flat(50.0, (4, 4), kind=Kind.PHOTONS), stream(rng)), {}).data[0]
     assert np.isfinite(out).all() and (out[1::2, 1::2] == 0).all()
 
 
-def test_truth_maps_the_colours():
-    told = truth(BayerMosaic(pattern="BGGR", **SHARES), flat(0.0, (4, 6), kind=Kind.PHOTONS), stream())
+def test_truth_maps_the_colours(rng: np.random.Generator):
+    told = truth(BayerMosaic(pattern="BGGR", **SHARES), flat(0.0, (4, 6), kind=Kind.PHOTONS), stream(rng))
     assert told["colour"].tolist() == [[2, 1, 2, 1, 2, 1], [1, 0, 1, 0, 1, 0]] * 2
     assert told["mosaic_share"][1, 1] == 0.5
 

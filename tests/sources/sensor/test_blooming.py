@@ -69,9 +69,8 @@ def test_it_is_the_end_of_any_spilling(charge: list[float], up: float, drained: 
 
 
 @pytest.mark.parametrize(("up", "ends"), [(0.5, "barrier"), (0.4, "barrier"), (0.3, "barrier"), (0.4, "drain"), (0.02, "drain")])
-def test_conserves_charge_on_long_columns_and_fills_no_pixel_above_the_full_well(up: float, ends: str) -> None:
+def test_conserves_charge_on_long_columns_and_fills_no_pixel_above_the_full_well(up: float, ends: str, rng: np.random.Generator) -> None:
     """Streaks of hundreds of pixels, also piled up at a barrier, where shares of the flow are smaller than the precision of 1."""
-    rng = np.random.default_rng()
     charge = rng.uniform(0, 0.3 * FULL, 2000)
     charge[rng.integers(600, 1400, 30)] += rng.uniform(5, 20, 30) * FULL
     out = bloomed(charge, Blooming(full_well_e=FULL, up_share=up, ends=ends))

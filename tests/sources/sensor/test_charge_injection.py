@@ -18,17 +18,17 @@ def test_forty_electrons_on_ten_femtofarad_at_300_kelvin():
 
 
 @pytest.mark.parametrize(("cds", "sigma"), [(False, math.hypot(40.165, 30)), (True, 30 * math.sqrt(2))])
-def test_double_sampling_takes_the_reset_off_and_doubles_the_rest(cds, sigma):
+def test_double_sampling_takes_the_reset_off_and_doubles_the_rest(cds, sigma, rng: np.random.Generator):
     """Variance at 1e-6 over 500 000 pixels; catches 1 % of it (kTC at 26.46 °C: 40.165 e-)."""
     params = ChargeInjection(node_ff=10.0, injection_std_e=30.0, cds=cds)
-    out = SOURCE.forward(params, flat(1000.0, (500, 500), n=2, temperature_c=26.46), stream()).data.astype(float) - 1000
+    out = SOURCE.forward(params, flat(1000.0, (500, 500), n=2, temperature_c=26.46), stream(rng)).data.astype(float) - 1000
     assert abs(out.var() / sigma**2 - 1) < Z * math.sqrt(2 / out.size) + 2e-4
     assert abs(out.mean()) < Z * sigma / math.sqrt(out.size)
     a, b = out
     assert abs((a * b).mean()) < Z * sigma**2 / math.sqrt(a.size)  # new in every frame
 
 
-def test_pattern_is_that_of_a_settling_edge_sampled_once_a_column():
+def test_pattern_is_that_of_a_settling_edge_sampled_once_a_column(rng: np.random.Generator):
     """Against the transient itself on a fine time axis: the sample at the end of each column minus, with CDS, half a column before."""
     for cds in (False, True):
         params = ChargeInjection(spike_e=100.0, spike_period_px=4, settling_px=1.5, cds=cds)
@@ -38,14 +38,14 @@ def test_pattern_is_that_of_a_settling_edge_sampled_once_a_column():
         later = transient[np.searchsorted(time, at + (0.5 if cds else 0.0))]
         expected = later - (transient[np.searchsorted(time, at)] if cds else 0)
         assert feed_through_e(params, at) == pytest.approx(expected, rel=1e-12)
-        out = SOURCE.forward(params, flat(0.0, (3, 36), n=2), stream()).data
+        out = SOURCE.forward(params, flat(0.0, (3, 36), n=2), stream(rng)).data
         assert out[:, :, 4:] == pytest.approx(np.broadcast_to(feed_through_e(params, at), (2, 3, 32)), rel=1e-6)
 
 
-def test_pattern_is_told():
+def test_pattern_is_told(rng: np.random.Generator):
     params = ChargeInjection(spike_e=50.0)
-    told = SOURCE.truth(params, flat(0.0, (4, 8)), stream())
-    assert told["feed_through_e"] == pytest.approx(SOURCE.forward(params, flat(0.0, (4, 8)), stream()).data[0, 0])
+    told = SOURCE.truth(params, flat(0.0, (4, 8)), stream(rng))
+    assert told["feed_through_e"] == pytest.approx(SOURCE.forward(params, flat(0.0, (4, 8)), stream(rng)).data[0, 0])
 
 
 def test_shift_is_that_of_white_noise():

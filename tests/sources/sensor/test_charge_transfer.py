@@ -46,9 +46,9 @@ def clock_out(column: np.ndarray, loss: float, phases: int) -> np.ndarray:
     return out
 
 
-def test_agrees_with_packets_clocked_one_by_one():
+def test_agrees_with_packets_clocked_one_by_one(rng: np.random.Generator):
     """Deferred charge within 2 % of itself, in a column of random packets that loses up to 12 % of each."""
-    column = np.random.default_rng().uniform(0, 1000, 60) * (np.arange(60) % 7 == 0)
+    column = rng.uniform(0, 1000, 60) * (np.arange(60) % 7 == 0)
     out = SOURCE.forward(ChargeTransfer(parallel_cti=1e-3, phases=2), signal(column[None, :, None]), quiet()).data[0, :, 0]
     expected = clock_out(column, 1e-3, 2)
     moved = np.abs(expected - column).max()
@@ -85,9 +85,9 @@ def test_packets_below_zero_do_not_trouble_their_neighbours():
 
 
 @pytest.mark.parametrize("beta", [1.0, 0.7])
-def test_inversion_brings_the_charge_back(beta):
+def test_inversion_brings_the_charge_back(beta, rng: np.random.Generator):
     params = ChargeTransfer(parallel_cti=1e-4, serial_cti=5e-5, trail_px=2.0, beta=beta, reference_e=5000)
-    scene = signal(np.random.default_rng().uniform(500, 5000, (1, 300, 200)))
+    scene = signal(rng.uniform(500, 5000, (1, 300, 200)))
     moved = SOURCE.forward(params, scene, quiet())
     back = SOURCE.correct(params, moved, {})
     assert np.abs(moved.data - scene.data).max() > 50
@@ -160,8 +160,8 @@ def test_delays_follow_their_law_exactly(trail):
         assert out[:3] / 10_000 == pytest.approx((1 - loss) ** n * np.array([1, n * loss, n * (n + 1) / 2 * loss**2]), rel=1e-5)
 
 
-def test_register_and_columns_do_the_same_and_columns_come_first():
-    data = np.random.default_rng().uniform(0, 5000, (2, 40, 40))
+def test_register_and_columns_do_the_same_and_columns_come_first(rng: np.random.Generator):
+    data = rng.uniform(0, 5000, (2, 40, 40))
     for extra in ({}, {"beta": 0.6}):
         down = SOURCE.forward(ChargeTransfer(parallel_cti=2e-3, **extra), signal(data), quiet()).data
         along = SOURCE.forward(ChargeTransfer(serial_cti=2e-3, **extra), signal(data.swapaxes(1, 2)), quiet()).data
@@ -194,12 +194,9 @@ def over_traps(column: np.ndarray, density: list[float], release: list[float], b
     return packets
 
 
-@pytest.mark.parametrize(
-    ("density", "release"), [([0.5], [4.0]), ([0.6, 0.3], [1.0, 8.0])], ids=["one species", "fast and slow"]
-)
-def test_traps_agree_with_every_packet_over_every_pixel(density, release):
+@pytest.mark.parametrize(("density", "release"), [([0.5], [4.0]), ([0.6, 0.3], [1.0, 8.0])], ids=["one species", "fast and slow"])
+def test_traps_agree_with_every_packet_over_every_pixel(density, release, rng: np.random.Generator):
     """Within 2 % of what is moved, in columns with single packets, steps and random ones."""
-    rng = np.random.default_rng()
     columns = np.zeros((70, 4))
     columns[10, 0], columns[40, 0] = 20_000, 5000
     columns[30:50, 1] = 8000
@@ -239,15 +236,15 @@ def test_a_background_fills_the_traps():
     assert lost[1] < 0.75 * lost[0]
 
 
-def test_traps_never_take_more_than_there_is():
-    data = np.abs(np.random.default_rng().normal(0, 20, (1, 500, 20)))
+def test_traps_never_take_more_than_there_is(rng: np.random.Generator):
+    data = np.abs(rng.normal(0, 20, (1, 500, 20)))
     out = SOURCE.forward(ChargeTransfer(slow_traps_per_px=50.0, traps_along="both"), signal(data), quiet()).data
     assert out.min() >= -1e-4 and out.sum() < data.sum() * (1 + 1e-6)
 
 
-def test_traps_are_undone_by_the_inversion_and_reach_as_far_as_stated():
+def test_traps_are_undone_by_the_inversion_and_reach_as_far_as_stated(rng: np.random.Generator):
     params = ChargeTransfer(slow_traps_per_px=1.0, fast_traps_per_px=1.0, traps_along="both")
-    scene = signal(np.random.default_rng().uniform(500, 5000, (1, 200, 150)))
+    scene = signal(rng.uniform(500, 5000, (1, 200, 150)))
     moved = SOURCE.forward(params, scene, quiet())
     assert np.abs(moved.data - scene.data).max() > 10
     assert np.abs(SOURCE.correct(params, moved, {}).data - scene.data).max() < 0.2

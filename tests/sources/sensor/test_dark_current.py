@@ -15,10 +15,10 @@ from pixmetry.sources.sensor.shot_noise import SOURCE as SHOT
 from source_signals import K_DN_PER_E, Z, fitted, flat, spot_probe, stream
 
 
-def test_doubles_every_eight_kelvin_and_grows_with_time():
+def test_doubles_every_eight_kelvin_and_grows_with_time(rng: np.random.Generator):
     params = DarkCurrent(rate_e_per_s=100.0)
     frames = flat(10.0, (2, 3), n=4, exposure_s=[1.0, 2.0, 1.0, 1.0], temperature_c=[20.0, 20.0, 28.0, 12.0])
-    out = SOURCE.forward(params, frames, stream()).data
+    out = SOURCE.forward(params, frames, stream(rng)).data
     assert out[:, 0, 0] == pytest.approx([110, 210, 210, 60])
     assert (out == out[:, :1, :1]).all()
 
@@ -31,10 +31,10 @@ def test_doubling_is_an_activation_energy():
     assert mean_e(DarkCurrent(rate_e_per_s=1.0), 1.0, 28.0) == pytest.approx(math.exp(-energy / k * (1 / (t + 8) - 1 / t)), rel=1e-9)
 
 
-def test_its_noise_is_poisson():
+def test_its_noise_is_poisson(rng: np.random.Generator):
     """Mean and variance after the shot noise both equal the dark electrons, at 1e-6; an error of 1 % of the mean would be caught."""
     params, shape = DarkCurrent(rate_e_per_s=40.0), (500, 500)
-    dark = SHOT.forward(SHOT.typical, SOURCE.forward(params, flat(0.0, shape, exposure_s=1.0), stream()), stream()).data.astype(float)
+    dark = SHOT.forward(SHOT.typical, SOURCE.forward(params, flat(0.0, shape, exposure_s=1.0), stream(rng)), stream(rng)).data.astype(float)
     n = dark.size
     assert abs(dark.mean() - 40) < Z * math.sqrt(40 / n)
     assert abs(dark.var() - 40) < Z * math.sqrt((2 * 40**2 + 40) / n)  # fourth central moment of Poisson: 3µ² + µ
@@ -59,9 +59,9 @@ def test_shift_is_that_of_white_noise():
     assert got.bias_x_px == 0.0  # the pedestal comes off with the background
 
 
-def test_electrons_stay_electrons():
-    assert SOURCE.forward(SOURCE.typical, flat(1.0, (2, 2)), stream()).kind is Kind.ELECTRONS
-    assert np.array_equal(SOURCE.forward(SOURCE.neutral, flat(7.0, (2, 2)), stream()).data, np.full((1, 2, 2), 7, np.float32))
+def test_electrons_stay_electrons(rng: np.random.Generator):
+    assert SOURCE.forward(SOURCE.typical, flat(1.0, (2, 2)), stream(rng)).kind is Kind.ELECTRONS
+    assert np.array_equal(SOURCE.forward(SOURCE.neutral, flat(7.0, (2, 2)), stream(rng)).data, np.full((1, 2, 2), 7, np.float32))
 
 
 def test_half_the_gap_doubles_in_nine_and_a_half_kelvin():
@@ -78,24 +78,24 @@ def test_half_the_gap_doubles_in_nine_and_a_half_kelvin():
     assert warming(DarkCurrent(law="gap", gap_ev=1.2), 20.0 + rise) > 2.08
 
 
-def test_spread_of_the_rates_is_log_normal_about_the_same_mean():
+def test_spread_of_the_rates_is_log_normal_about_the_same_mean(rng: np.random.Generator):
     """Kolmogorov–Smirnov of the logarithm and the mean rate, 1e-6 each; catches 2 % of the mean. The Poisson draw comes after it."""
     from scipy import stats
 
-    params, one = DarkCurrent(rate_e_per_s=50.0, spread_log=0.6), stream()
+    params, one = DarkCurrent(rate_e_per_s=50.0, spread_log=0.6), stream(rng)
     frames = flat(0.0, (500, 500), n=2, exposure_s=2.0)
     out = SOURCE.forward(params, frames, one).data.astype(float)
     assert np.array_equal(out[0], out[1])
     assert abs(out[0].mean() / 100 - 1) < Z * math.sqrt(math.expm1(0.36) / out[0].size) + 1e-6
     assert stats.kstest((np.log(out[0].ravel() / 100) + 0.18) / 0.6, "norm").pvalue > 1e-6
-    drawn = SHOT.forward(SHOT.typical, SOURCE.forward(params, frames, one), stream()).data.astype(float)
+    drawn = SHOT.forward(SHOT.typical, SOURCE.forward(params, frames, one), stream(rng)).data.astype(float)
     pair = ((drawn[1] - drawn[0]) ** 2).mean() / 2  # temporal variance is the mean, fixed pattern is not in it
     assert abs(pair / out[0].mean() - 1) < Z * math.sqrt((2 + 3 * math.exp(0.36)) / out[0].size)
     assert SOURCE.truth(params, frames, one)["dark_current_e_per_s"] == pytest.approx(out[0] / 2, rel=1e-5)
 
 
-def test_glow_falls_off_from_its_corner_and_grows_with_time_alone():
+def test_glow_falls_off_from_its_corner_and_grows_with_time_alone(rng: np.random.Generator):
     params = DarkCurrent(glow_e_per_s=100.0, glow_reach_px=10.0, glow_corner="bottom right")
-    out = SOURCE.forward(params, flat(0.0, (30, 40), n=2, exposure_s=[1.0, 3.0], temperature_c=[20.0, 60.0]), stream()).data
+    out = SOURCE.forward(params, flat(0.0, (30, 40), n=2, exposure_s=[1.0, 3.0], temperature_c=[20.0, 60.0]), stream(rng)).data
     assert out[0, 29, 39] == pytest.approx(100) and out[0, 26, 35] == pytest.approx(100 * math.exp(-0.5))
     assert out[1] == pytest.approx(3 * out[0])

@@ -17,11 +17,11 @@ from pixmetry.sources.sensor.defects import SOURCE, Defects
 from source_signals import ALPHA, K_DN_PER_E, centroid, centroid_probe, fitted, flat, signal, spot_probe, spots, stream
 
 
-def test_shares_and_excess_follow_their_laws():
+def test_shares_and_excess_follow_their_laws(rng: np.random.Generator):
     """Binomial counts and a Kolmogorov–Smirnov test of the log-normal excess, 1e-6 each; catches 8 % in a share, 5 % in the median."""
     params = Defects(hot_fraction=0.01, hot_median_e=300.0, hot_sigma_log=0.8, dead_fraction=0.005, dead_gain_rel=0.1)
     level, shape = 1000.0, (800, 1000)
-    out = SOURCE.forward(params, flat(level, shape), stream()).data[0].astype(float)
+    out = SOURCE.forward(params, flat(level, shape), stream(rng)).data[0].astype(float)
     n = out.size
     for found, share in ((int((out > level).sum()), 0.01), (int((out == 100.0).sum()), 0.005)):
         low, high = stats.binom.ppf([ALPHA / 2, 1 - ALPHA / 2], n, share)
@@ -31,8 +31,8 @@ def test_shares_and_excess_follow_their_laws():
     assert (out == level).sum() + (out > level).sum() + (out == 100.0).sum() == n
 
 
-def test_the_same_pixels_in_every_frame_and_window():
-    one, params = stream(), Defects(hot_fraction=0.05, dead_fraction=0.05)
+def test_the_same_pixels_in_every_frame_and_window(rng: np.random.Generator):
+    one, params = stream(rng), Defects(hot_fraction=0.05, dead_fraction=0.05)
     whole = SOURCE.forward(params, flat(500.0, (40, 50), n=3), one).data
     assert np.array_equal(whole[0], whole[2])
     window = SOURCE.forward(params, flat(500.0, (10, 12), n=3, row0=7, col0=9, frame_shape=(40, 50)), one).data
@@ -61,10 +61,10 @@ def stack_of(frames_e: np.ndarray, gain: float, rng: np.random.Generator, noise_
     ],
     ids=["charge and response", "cold and noisy"],
 )  # fmt: skip
-def test_counted_blind_through_stacks(dark_e: float, params: Defects):
+def test_counted_blind_through_stacks(dark_e: float, params: Defects, rng: np.random.Generator):
     """Shares are those of the unit: exact but for what is too small to be found; sizes within 6 u and what 100 pixels leave to chance."""
-    rng, shape, gain, frames = np.random.default_rng(), (240, 320), 0.5, 16
-    one = stream()
+    shape, gain, frames = (240, 320), 0.5, 16
+    one = stream(rng)
     still, lit = (SOURCE.forward(params, flat(level, shape, n=frames), one).data.astype(float) for level in (dark_e, dark_e + 2000))
     dark, bright = stack_of(still, gain, rng), stack_of(lit, gain, rng)
     transfer = fitted(gain_dn_per_e=(gain, 0.001, "DN/e-"))
@@ -91,9 +91,9 @@ def test_counted_blind_through_stacks(dark_e: float, params: Defects):
         assert abs(got[name].value - value) < 6 * math.hypot(got[name].u, chance), name
 
 
-def test_pixels_of_low_response_reach_the_budget():
+def test_pixels_of_low_response_reach_the_budget(rng: np.random.Generator):
     """50 of 16384 pixels at 70 %: all of them are counted, and move a centroid as white errors of 0.3 √(50/16384) of the signal do."""
-    rng, shape = np.random.default_rng(), (128, 128)
+    shape = (128, 128)
     light = np.full(16384, 2000.0)
     light[rng.choice(16384, 50, replace=False)] *= 0.7
     dark, bright = (stack_of(np.tile(level.reshape(1, *shape), (16, 1, 1)), 0.5, rng) for level in (0 * light, light))
@@ -106,9 +106,9 @@ def test_pixels_of_low_response_reach_the_budget():
     assert (contribution.u_x_px, contribution.u_y_px) == pytest.approx(expected, rel=0.06)
 
 
-def test_none_found_is_none_and_the_limit_says_how_small_they_may_be():
+def test_none_found_is_none_and_the_limit_says_how_small_they_may_be(rng: np.random.Generator):
     """95 of 100 pixels with the stated excess are found: binomial, 1e-6; catches a limit that is off by a fifth of its distance."""
-    rng, shape, gain = np.random.default_rng(), (160, 160), 0.5
+    shape, gain = (160, 160), 0.5
     transfer = fitted(gain_dn_per_e=(gain, 0.001, "DN/e-"))
     scatter = rng.normal(0, 3.0, shape)
 
@@ -233,13 +233,13 @@ def test_behind_a_threshold_the_estimator_itself_is_asked():
     assert (got.u_x_px, got.u_y_px) == pytest.approx(tuple(np.sqrt(square)), rel=0.03)
 
 
-def test_blinking_is_a_stationary_telegraph_signal():
+def test_blinking_is_a_stationary_telegraph_signal(rng: np.random.Generator):
     """Share on, correlation e^-k of the chain after k frames, and the same for frames far on; 1e-6, catches 10 % of the memory.
 
     After one frame a pixel keeps its level with probability 1 − 1/n, else it is drawn anew: correlation (1 − 1/n)^k.
     """
     params, pixels = Defects(blinking_fraction=0.1, blinking_e=300.0, blinking_on=0.3, blinking_frames=5.0), (300, 400)
-    one, frames = stream(), 24
+    one, frames = stream(rng), 24
     out = SOURCE.forward(params, flat(50.0, pixels, n=frames), one).data.reshape(frames, -1)
     blinking = SOURCE.truth(params, flat(0.0, pixels), one)["blinking"].ravel()
     assert (out[:, ~blinking] == 50).all()
@@ -254,12 +254,12 @@ def test_blinking_is_a_stationary_telegraph_signal():
     assert np.array_equal(alone, out[17])
 
 
-def test_columns_clusters_stuck_and_listed_pixels():
+def test_columns_clusters_stuck_and_listed_pixels(rng: np.random.Generator):
     params = Defects(
         column_fraction=0.05, column_gain_rel=0.5, column_e=10.0, cluster_fraction=0.002, cluster_radius_px=2.0, stuck_fraction=0.002,
         stuck_e=77.0, listed=((3, 4, 0.0, 0.0), (199, 299, 1.0, 5000.0), (500, 2, 0.0, 0.0)),
     )  # fmt: skip
-    one, frames = stream(), flat(1000.0, (200, 300), n=2)
+    one, frames = stream(rng), flat(1000.0, (200, 300), n=2)
     out, told = SOURCE.forward(params, frames, one).data, SOURCE.truth(params, frames, one)
     assert np.array_equal(out[0], out[1])
     assert out[0, 3, 4] == 0 and out[0, 199, 299] >= 5000 and told["listed"].sum() == 2

@@ -19,10 +19,10 @@ from source_signals import ALPHA, K_DN_PER_E, centroid, fitted, flat, signal, sp
 SHAPE = (200, 300)
 
 
-def test_parts_have_their_variances():
+def test_parts_have_their_variances(rng: np.random.Generator):
     """Two-way analysis of variance: each mean square is χ² about its expectation, at 1e-6; catches 2 % in the pixel part, 30 % in lines."""
     pixel, row, col = 3.0, 2.0, 1.0
-    out = SOURCE.forward(Dsnu(pixel_std_e=pixel, row_std_e=row, col_std_e=col), flat(0.0, SHAPE), stream()).data[0].astype(float)
+    out = SOURCE.forward(Dsnu(pixel_std_e=pixel, row_std_e=row, col_std_e=col), flat(0.0, SHAPE), stream(rng)).data[0].astype(float)
     rows, cols = SHAPE
     by_row, by_col = out.mean(axis=1), out.mean(axis=0)
     rest = out - by_row[:, None] - by_col[None, :] + out.mean()
@@ -35,20 +35,20 @@ def test_parts_have_their_variances():
         assert low < squares / expected < high
 
 
-def test_same_unit_same_pattern():
-    one = stream()
+def test_same_unit_same_pattern(rng: np.random.Generator):
+    one = stream(rng)
     other = type(one)(one.unit_seed, one.exposure_seed + 1, one.name)
     frames = SOURCE.forward(SOURCE.bound, flat(0.0, (20, 20), n=2), one).data
     assert np.array_equal(frames[0], frames[1])
     assert np.array_equal(frames, SOURCE.forward(SOURCE.bound, flat(0.0, (20, 20), n=2), other).data)
-    assert not np.array_equal(frames, SOURCE.forward(SOURCE.bound, flat(0.0, (20, 20), n=2), stream()).data)
+    assert not np.array_equal(frames, SOURCE.forward(SOURCE.bound, flat(0.0, (20, 20), n=2), stream(rng)).data)
 
 
-def test_measured_blind_in_electrons():
+def test_measured_blind_in_electrons(rng: np.random.Generator):
     """Within 6 u (t law of 60 degrees of freedom and more, 1e-6) of the truth, through stacks with temporal noise."""
-    rng, shape, gain = np.random.default_rng(), (96, 128), 0.5
+    shape, gain = (96, 128), 0.5
     params = Dsnu(pixel_std_e=6.0, row_std_e=3.0, col_std_e=2.0)
-    fixed = gain * SOURCE.forward(params, flat(0.0, shape), stream()).data[0]
+    fixed = gain * SOURCE.forward(params, flat(0.0, shape), stream(rng)).data[0]
     stacks = []
     for level in (100, 1100):
         accumulator = StackAccumulator(12)
@@ -62,9 +62,9 @@ def test_measured_blind_in_electrons():
         assert got[name].u < 0.15 * value
 
 
-def test_uncertainty_of_the_gain_is_carried_with_its_covariance():
+def test_uncertainty_of_the_gain_is_carried_with_its_covariance(rng: np.random.Generator):
     """Against a Monte Carlo over gain and split (JCGM 101): u to 5 %, correlation of two parts to 0.05 (20 000 draws: 1e-6 is 0.035)."""
-    rng, n = np.random.default_rng(), 20_000
+    n = 20_000
     spatial = fitted(dsnu_pixel_dn=(2.0, 0.02, "DN"), dsnu_row_dn=(0.5, 0.03, "DN"), dsnu_col_dn=(0.3, 0.01, "DN"))
     got = SOURCE.measure(Observations(spatial_fit=spatial, photon_transfer_fit=fitted(gain_dn_per_e=(0.2, 0.01, "DN/e-"))))
     gain = rng.normal(0.2, 0.01, n)
@@ -81,8 +81,8 @@ def test_missing_observations_are_named():
         SOURCE.measure(Observations(spatial_fit=spatial))
 
 
-def test_dark_frame_takes_the_pattern_off():
-    one, scene = stream(), signal(np.random.default_rng().uniform(0, 1e4, (2, 30, 40)))
+def test_dark_frame_takes_the_pattern_off(rng: np.random.Generator):
+    one, scene = stream(rng), signal(rng.uniform(0, 1e4, (2, 30, 40)))
     dark_dn = K_DN_PER_E * SOURCE.forward(SOURCE.bound, flat(0.0, (30, 40)), one).data[0]
     after = SOURCE.forward(SOURCE.bound, scene, one)
     fixed = SOURCE.correct(SOURCE.bound, after.with_data(after.data * np.float32(K_DN_PER_E), Kind.DN), {"dark_dn": dark_dn})

@@ -56,10 +56,10 @@ def test_acceleration_moves_the_centre_by_a_24th_of_a_t_squared() -> None:
 
 
 @pytest.mark.parametrize("profile", ["exponential", "trapezoid"])
-def test_the_centre_belongs_to_the_mean_time_of_the_profile(profile: str) -> None:
+def test_the_centre_belongs_to_the_mean_time_of_the_profile(profile: str, rng: np.random.Generator) -> None:
     chosen = params(profile, 6)
     x = moments(chain((SOURCE, chosen), exposure_s=0.02).expose(Spot(20.0, 15.0, 100.0)).data[0])[0]
-    told = truth(chosen, flat(0, (4, 4), exposure_s=0.02), stream())
+    told = truth(chosen, flat(0, (4, 4), exposure_s=0.02), stream(rng))
     mean, second = (
         quad(lambda t, k=k: PROFILES[profile](t) * t**k, 0, 1, points=[0.3, 0.7])[0] / quad(PROFILES[profile], 0, 1, points=[0.3, 0.7])[0]
         for k in (1, 2)

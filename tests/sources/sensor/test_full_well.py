@@ -11,9 +11,9 @@ from pixmetry.sources.sensor.full_well import SOURCE, FullWell, response_e
 from source_signals import K_DN_PER_E, centroid, fitted, signal, spot_probe, stream
 
 
-def test_hard_top_is_a_minimum():
-    data = np.random.default_rng().uniform(0, 40_000, (2, 30, 40)).astype(np.float32)
-    out = SOURCE.forward(FullWell(full_well_e=15_000), signal(data), stream()).data
+def test_hard_top_is_a_minimum(rng: np.random.Generator):
+    data = rng.uniform(0, 40_000, (2, 30, 40)).astype(np.float32)
+    out = SOURCE.forward(FullWell(full_well_e=15_000), signal(data), stream(rng)).data
     assert np.array_equal(out, np.where(data > 15_000, np.float32(15_000), data))
     assert out.dtype == np.float32
 
@@ -55,9 +55,9 @@ def test_measured_from_saturation():
         SOURCE.measure(Observations(photon_transfer_fit=fitted(gain_dn_per_e=(0.28, 0.001, "DN/e-"))))
 
 
-def test_capacities_differ_by_pixel_and_are_told():
+def test_capacities_differ_by_pixel_and_are_told(rng: np.random.Generator):
     """Spread of the capacities at 1e-6 over 250 000 pixels; catches 1 %."""
-    params, one = FullWell(full_well_e=10_000, spread_rel=0.03), stream()
+    params, one = FullWell(full_well_e=10_000, spread_rel=0.03), stream(rng)
     frames = signal(np.full((2, 500, 500), 1e6))
     out, told = SOURCE.forward(params, frames, one).data, SOURCE.truth(params, frames, one)["full_well_e"]
     assert np.array_equal(out[0], told) and np.array_equal(out[1], told)

@@ -21,8 +21,8 @@ def test_a_flash_decays_geometrically() -> None:
     assert out[:, 1, 2] == pytest.approx(9000 * 0.1 ** np.arange(8), rel=1e-5)
 
 
-def test_conserves_charge_with_a_pocket_too() -> None:
-    data = np.random.default_rng().uniform(0, 3000, (12, 5, 6)).astype(np.float32)
+def test_conserves_charge_with_a_pocket_too(rng: np.random.Generator) -> None:
+    data = rng.uniform(0, 3000, (12, 5, 6)).astype(np.float32)
     out, state = run(ImageLag(lag_rel=0.05, pocket_e=30.0), data)
     assert out.sum(axis=0) + state == pytest.approx(data.sum(axis=0), rel=1e-6)
     dim, _ = run(ImageLag(pocket_e=50.0), np.full((1, 2, 2), 10.0, np.float32))
@@ -39,10 +39,10 @@ def test_a_moving_target_is_behind_by_lambda_v_over_one_minus_lambda() -> None:
     assert centre == pytest.approx(40 + v * 59 - v * lag / (1 - lag), abs=1e-4)
 
 
-def test_steady_light_keeps_its_shot_noise() -> None:
+def test_steady_light_keeps_its_shot_noise(rng: np.random.Generator) -> None:
     """Each electron stays for itself: Poisson's variance, and frames that do not know of each other, to 1 % (a share: −18 and +16 %)."""
-    frames = np.random.default_rng().poisson(4000, (12, 300, 300)).astype(np.float32)
-    out, state = run(ImageLag(lag_rel=0.1), frames, stream())
+    frames = rng.poisson(4000, (12, 300, 300)).astype(np.float32)
+    out, state = run(ImageLag(lag_rel=0.1), frames, stream(rng))
     assert np.array_equal(out.sum(axis=0) + state, frames.astype(float).sum(axis=0))
     late = out[6:] - 4000
     n = late.size
@@ -51,8 +51,8 @@ def test_steady_light_keeps_its_shot_noise() -> None:
     assert (late[1:] * late[:-1]).mean() / 4000 == pytest.approx(0, abs=Z / np.sqrt(n * 5 / 6))
 
 
-def test_no_memory_where_nothing_stays() -> None:
+def test_no_memory_where_nothing_stays(rng: np.random.Generator) -> None:
     assert start(ImageLag()) is None
     data = signal(np.ones((2, 3, 3)))
-    assert forward(ImageLag(), data, stream(), None)[0] is data
+    assert forward(ImageLag(), data, stream(rng), None)[0] is data
     assert SOURCE.neutral == ImageLag()

@@ -107,15 +107,15 @@ def test_slanting_rays_shift_the_image_outwards():
     assert found_x[0] > 85.2 and found_y[0] == pytest.approx(45, abs=1e-3)
 
 
-def test_microlenses_answer_by_the_angle_from_their_design():
+def test_microlenses_answer_by_the_angle_from_their_design(rng: np.random.Generator):
     params = Microlens(chief_ray_deg=25, design_ray_deg=10, acceptance_deg=12)
-    light = LENS.forward(params, flat(1.0, (1, 201), kind=Kind.PHOTONS), stream()).data[0, 0]
+    light = LENS.forward(params, flat(1.0, (1, 201), kind=Kind.PHOTONS), stream(rng)).data[0, 0]
     assert light[100] == 1
     assert light[200] == pytest.approx(np.exp(-0.5 * (15 / 12) ** 2), rel=1e-6)
     half = np.degrees(np.arctan(0.5 * np.tan(np.radians([25, 10]))))
     assert light[150] == pytest.approx(np.exp(-0.5 * ((half[0] - half[1]) / 12) ** 2), rel=1e-6)
 
 
-def test_microlenses_as_designed_lose_nothing():
+def test_microlenses_as_designed_lose_nothing(rng: np.random.Generator):
     params = Microlens(chief_ray_deg=20, design_ray_deg=20)
-    assert (LENS.forward(params, flat(7.0, (9, 11), kind=Kind.PHOTONS), stream()).data == 7).all()
+    assert (LENS.forward(params, flat(7.0, (9, 11), kind=Kind.PHOTONS), stream(rng)).data == 7).all()

@@ -44,12 +44,12 @@ def scurve(sigma: float, width: float) -> float:
     return first_harmonic(centroids(data)[0] - 10 - phase, phase)
 
 
-def test_an_offset_moves_the_image_the_other_way():
+def test_an_offset_moves_the_image_the_other_way(rng: np.random.Generator):
     spot = Spot(np.array([8.0]), np.array([8.0]), sigma=1.2)
     params = PixelAperture(offset_x_px=0.2, offset_y_px=-0.1)
     x, y = centroids(camera((17, 17), (APERTURE, params)).expose(spot).data)
     assert (x[0], y[0]) == pytest.approx((7.8, 8.1), abs=1e-5)
-    told = APERTURE.truth(params, signal_of(APERTURE, params, (5, 6)), stream())
+    told = APERTURE.truth(params, signal_of(APERTURE, params, (5, 6)), stream(rng))
     assert told["shift_x_px"] == pytest.approx(np.full((5, 6), -0.2)) and told["shift_y_px"] == pytest.approx(np.full((5, 6), 0.1))
 
 

@@ -36,9 +36,9 @@ def test_pixels_see_the_slope_at_their_own_places():
     assert np.abs(seen - expected).max() < 2e-3
 
 
-def test_the_scatter_is_the_parameter():
+def test_the_scatter_is_the_parameter(rng: np.random.Generator):
     """4200 pixels: 95 % of a false alarm at 1e-6 lies within 5.3 %; a factor of 1.1 would be seen."""
-    told = SOURCE.truth(PixelGeometry(pixel_std_px=0.01), signal_of(SOURCE, PixelGeometry(), (60, 70)), stream())
+    told = SOURCE.truth(PixelGeometry(pixel_std_px=0.01), signal_of(SOURCE, PixelGeometry(), (60, 70)), stream(rng))
     for shift in told.values():
         low, high = stats.chi2.ppf([ALPHA / 4, 1 - ALPHA / 4], shift.size) / shift.size
         assert low < np.mean(shift**2) / 1e-4 < high
@@ -59,9 +59,9 @@ def test_a_raster_gives_the_same_as_looking_directly():
     assert np.abs(both[1] - both[0]).max() < 0.05 * np.abs(both[0]).max()
 
 
-def test_fields_move_as_a_whole_and_meet_between_pixels():
+def test_fields_move_as_a_whole_and_meet_between_pixels(rng: np.random.Generator):
     params = PixelGeometry(field_std_px=0.3, fields_x=2, fields_y=3)
-    told = SOURCE.truth(params, signal_of(SOURCE, params, (30, 40)), stream())["shift_x_px"]
+    told = SOURCE.truth(params, signal_of(SOURCE, params, (30, 40)), stream(rng))["shift_x_px"]
     blocks = told.reshape(3, 10, 2, 20)
     assert np.abs(blocks - blocks[:, :1, :, :1]).max() < 1e-12
     assert len(np.unique(blocks.round(9))) == 6

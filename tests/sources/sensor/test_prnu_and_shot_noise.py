@@ -25,9 +25,9 @@ def parts(image: np.ndarray) -> tuple[float, float, float]:
     return pixel**0.5, max(rows.var(ddof=1) - pixel / n, 0) ** 0.5, max(cols.var(ddof=1) - pixel / m, 0) ** 0.5
 
 
-def test_prnu_has_the_stated_parts_and_is_the_same_in_every_frame() -> None:
+def test_prnu_has_the_stated_parts_and_is_the_same_in_every_frame(rng: np.random.Generator) -> None:
     params = prnu.Prnu(pixel_std_rel=0.02, row_std_rel=0.01, col_std_rel=0.005)
-    out = prnu.forward(params, flat(5000.0, SHAPE, n=2), stream())
+    out = prnu.forward(params, flat(5000.0, SHAPE, n=2), stream(rng))
     np.testing.assert_array_equal(out.data[0], out.data[1])
     found = parts(out.data[0].astype(float) / 5000.0)
     for value, true, n in zip(found, (0.02, 0.01, 0.005), (SHAPE[0] * SHAPE[1], *SHAPE), strict=True):
@@ -45,17 +45,17 @@ def test_prnu_scales_with_the_light_and_differs_between_units() -> None:
     assert abs(np.corrcoef(one.ravel(), other.ravel())[0, 1]) < Z / one.size**0.5
 
 
-def test_dividing_by_the_true_response_flattens() -> None:
+def test_dividing_by_the_true_response_flattens(rng: np.random.Generator) -> None:
     params = prnu.Prnu(pixel_std_rel=0.02, col_std_rel=0.01)
-    spoilt = prnu.forward(params, flat(1000.0, SHAPE, kind=Kind.ELECTRONS), stream())
+    spoilt = prnu.forward(params, flat(1000.0, SHAPE, kind=Kind.ELECTRONS), stream(rng))
     flattened = prnu.correct(params, spoilt, {"prnu_rel": spoilt.data[0] / 1000.0}).data[0]
     np.testing.assert_allclose(flattened, 1000.0, rtol=1e-5)
 
 
 @pytest.mark.parametrize("mean_e", [0.3, 20.0, 9000.0])
-def test_shot_noise_has_the_variance_of_its_mean_and_no_memory_of_the_last_frame(mean_e: float) -> None:
+def test_shot_noise_has_the_variance_of_its_mean_and_no_memory_of_the_last_frame(mean_e: float, rng: np.random.Generator) -> None:
     n = SHAPE[0] * SHAPE[1]
-    out = shot_noise.forward(shot_noise.ShotNoise(), flat(mean_e, SHAPE, n=2), stream()).data.astype(float)
+    out = shot_noise.forward(shot_noise.ShotNoise(), flat(mean_e, SHAPE, n=2), stream(rng)).data.astype(float)
     assert out.mean() == pytest.approx(mean_e, abs=Z * (mean_e / (2 * n)) ** 0.5)
     # Var(s²) = µ₄/n − σ⁴ (n − 3)/(n (n − 1)), and µ₄ = 3µ² + µ
     assert out[0].var() == pytest.approx(mean_e, abs=Z * ((2 * mean_e**2 + mean_e) / n) ** 0.5)

@@ -13,9 +13,9 @@ from pixmetry.sources.sensor.quantum_efficiency import SOURCE, QuantumEfficiency
 from source_signals import fitted, signal, stream
 
 
-def test_photons_become_electrons():
-    photons = np.random.default_rng().uniform(0, 1e5, (2, 5, 7)).astype(np.float32)
-    out = SOURCE.forward(SOURCE.make({"quantum_efficiency": 0.25}), signal(photons, Kind.PHOTONS), stream())
+def test_photons_become_electrons(rng: np.random.Generator):
+    photons = rng.uniform(0, 1e5, (2, 5, 7)).astype(np.float32)
+    out = SOURCE.forward(SOURCE.make({"quantum_efficiency": 0.25}), signal(photons, Kind.PHOTONS), stream(rng))
     assert out.kind is Kind.ELECTRONS
     assert np.array_equal(out.data, photons / 4)
 
@@ -49,7 +49,7 @@ def test_no_absorption_is_made_up_beyond_the_table():
         absorption_per_cm(np.array([500.0, 1300.0]))
 
 
-def test_light_absorbed_layer_by_layer():
+def test_light_absorbed_layer_by_layer(rng: np.random.Generator):
     """Against photons walked down through thin layers of silicon."""
     params = QuantumEfficiency(model="silicon", wavelength_nm=700, depth_um=8.0, dead_layer_um=0.5, reflectance=0.1, collected=0.9)
     alive, caught, step = 0.9, 0.0, 1e-3
@@ -58,7 +58,7 @@ def test_light_absorbed_layer_by_layer():
         alive -= stopped
         caught += 0.9 * stopped * (k >= 500)
     assert efficiency(params) == pytest.approx(caught, rel=1e-3)
-    out = SOURCE.forward(params, signal(np.full((1, 2, 2), 1000.0), Kind.PHOTONS), stream())
+    out = SOURCE.forward(params, signal(np.full((1, 2, 2), 1000.0), Kind.PHOTONS), stream(rng))
     assert out.data == pytest.approx(1000 * efficiency(params)) and out.kind is Kind.ELECTRONS
 
 

@@ -64,8 +64,8 @@ def test_field_integration_sums_each_row_and_the_next() -> None:
     assert odd - even == pytest.approx(1.0, abs=1e-3)
 
 
-def test_truth_of_the_fields() -> None:
-    told = interlace.truth(Interlace(first_field="odd"), flat(0, (5, 4), 2), stream())
+def test_truth_of_the_fields(rng: np.random.Generator) -> None:
+    told = interlace.truth(Interlace(first_field="odd"), flat(0, (5, 4), 2), stream(rng))
     assert np.array_equal(told["field"], [[1, 0, 1, 0, 1]] * 2)
     assert np.allclose(told["delay_s"], [[0.02, 0, 0.02, 0, 0.02]] * 2)
 
@@ -132,10 +132,10 @@ def test_latency_and_a_slow_clock_move_the_target_by_speed_times_delay() -> None
     assert later == pytest.approx(15.0 + 50.0 * (0.205 + 2e-3 + 0.2e-3), abs=1e-4)
 
 
-def test_stat_the_delay_scatters_as_stated_and_moves_the_image_by_it() -> None:
+def test_stat_the_delay_scatters_as_stated_and_moves_the_image_by_it(rng: np.random.Generator) -> None:
     """False-failure rate 1e-6; with 2000 frames a standard deviation that is off by 1.16 is seen."""
     params, n = TriggerJitter(jitter_s=1e-3), 2000
-    told = trigger_jitter.truth(params, flat(0, (2, 2), n), stream())["delay_s"]
+    told = trigger_jitter.truth(params, flat(0, (2, 2), n), stream(rng))["delay_s"]
     assert np.array_equal(told[:, 0], told[:, 1])
     low, high = chi2.ppf([ALPHA / 2, 1 - ALPHA / 2], n - 1) / (n - 1)
     assert low < told[:, 0].var(ddof=1) / 1e-6 < high

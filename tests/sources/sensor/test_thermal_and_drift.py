@@ -36,10 +36,10 @@ def test_twenty_kelvin_move_the_edge_of_the_image(coefficients, place, expected)
     assert moved == pytest.approx(expected, abs=0.005)
 
 
-def test_the_fixed_point_stays_and_the_rest_follows_each_frame_of_a_warm_up():
+def test_the_fixed_point_stays_and_the_rest_follows_each_frame_of_a_warm_up(rng: np.random.Generator):
     params = ThermalExpansion(mount_per_k=1e-4, fixed_x_px=-10, fixed_y_px=5, shift_x_px_per_k=0.01, reference_c=20)
     signal = signal_of(WARM, params, (41, 61), 3, temperature_c=40.0, warm_up_k=20.0, warm_up_s=0.04)
-    told = WARM.truth(params, signal, stream())
+    told = WARM.truth(params, signal, stream(rng))
     dt = 20 * (1 - np.exp(-np.arange(3)))
     assert told["shift_x_px"][:, 25, 20] == pytest.approx(0.01 * dt / (1 + 1e-4 * dt), abs=1e-12)
     assert told["shift_y_px"][:, 25, 20] == pytest.approx(0, abs=1e-12)
@@ -74,11 +74,11 @@ def test_the_sag_turns_with_the_camera(roll, expected):
     assert (x - 30, y - 20) == pytest.approx(expected, abs=1e-12)
 
 
-def test_every_frame_of_a_stabilised_sensor_has_a_pose_of_its_own():
+def test_every_frame_of_a_stabilised_sensor_has_a_pose_of_its_own(rng: np.random.Generator):
     """2000 frames: a deviation of 9 % of a standard deviation would be seen, at 1e-6 of false alarms."""
     n, params = 2000, Stabilisation(shift_std_px=0.3, roll_std_rad=2e-3)
     signal = signal_of(STABLE, params, (3, 101), n)
-    told = STABLE.truth(params, signal, stream())
+    told = STABLE.truth(params, signal, stream(rng))
     middle_x, middle_y = told["shift_x_px"][:, 1, 50], told["shift_y_px"][:, 1, 50]
     roll = (told["shift_y_px"][:, 1, 100] - told["shift_y_px"][:, 1, 0]) / 100
     for value, std in ((middle_x, 0.3), (middle_y, 0.3), (roll, 2e-3)):

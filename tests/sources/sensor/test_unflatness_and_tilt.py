@@ -39,9 +39,9 @@ def test_rays_meet_the_surface_where_they_should():
     assert x == pytest.approx(200 + u * t, abs=1e-6) and y == pytest.approx(150 + v * t, abs=1e-6)
 
 
-def test_a_lens_that_is_telecentric_on_the_image_side_knows_no_heights():
+def test_a_lens_that_is_telecentric_on_the_image_side_knows_no_heights(rng: np.random.Generator):
     params = Unflatness(bow_x_um=100, chief_ray_deg=0)
-    told = UNFLAT.truth(params, signal_of(UNFLAT, params, (11, 21)), stream())
+    told = UNFLAT.truth(params, signal_of(UNFLAT, params, (11, 21)), stream(rng))
     assert np.abs(told["shift_x_px"]).max() == 0
     assert told["height_um"][5, 10] == pytest.approx(-50) and told["height_um"][5, 0] == pytest.approx(1.5 * 100 * (20 / 21) ** 2 - 50)
 
