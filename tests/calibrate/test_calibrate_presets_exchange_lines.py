@@ -20,6 +20,7 @@ from calibrate.test_calibration_images import FOCAL, View, chessboard
 from calibrate.test_calibration_images import ROWS as BOARD_ROWS
 from calibrate.test_plumb_line import COLS, MM_X, MM_Y, RATE, ROWS, TRUE, imaged, lines
 from chance import rng_of
+from pixmetry.calibrate import calibrated_camera
 from pixmetry.calibrate.bundle.model import CameraModel, Sensor
 from pixmetry.calibrate.exchange import model_of_colmap, read_opencv
 from pixmetry.calibrate.files.record import read_calibration, stored_cameras
@@ -139,7 +140,7 @@ def test_a_model_that_the_sources_cannot_hold_is_told(tmp_path: Path, monkeypatc
     def cannot(*_: object, **__: object) -> Camera:
         raise InputError("the sources' lens cannot hold this model", value="up to 0.2 px apart", remedy="free fewer terms")
 
-    monkeypatch.setattr("pixmetry.calibrate.calibrated_camera.calibrated_camera", cannot)
+    monkeypatch.setattr(calibrated_camera, "calibrated_camera", cannot)
     simulated = simulate(rng, images=10, points=30, sensor=SENSOR)
     path = with_camera(project(tmp_path, simulated.network), f"{{camera: {PRESET}, c_mm: 8}}")
     result = run(path, "-o", tmp_path / "r", "--folds", 0)

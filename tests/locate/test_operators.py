@@ -11,6 +11,7 @@ from locate import rendered
 from locate.target_frames import half_height, rough_targets, z_scores
 from pixmetry.core.errors import InputError
 from pixmetry.locate.centroids import _operator_kernels as o
+from pixmetry.locate.centroids import operators
 from pixmetry.locate.centroids.moments import prepare
 from pixmetry.locate.centroids.operators import MARGINS, OPERATORS, operator_positions
 from pixmetry.locate.detect.targets import Flag
@@ -51,7 +52,7 @@ def test_ellipses_are_covered_too(lattice, name: str, rng: np.random.Generator) 
 @pytest.mark.parametrize("name", ["forstner", "ellipse_edges", "gaussian"])
 def test_variance_is_that_of_the_slopes_by_finite_differences(name: str, monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator) -> None:
     """σ² Σ (dx̂/dI)², every pixel of a small frame moved in turn, with the background's fit among the effects; 12 %."""
-    monkeypatch.setattr("pixmetry.locate.centroids.operators._phase_variance", lambda *_: np.zeros(1))
+    monkeypatch.setattr(operators, "_phase_variance", lambda *_: np.zeros(1))
     mean = np.full((37, 37), 20.0)
     at = rendered.window(18.3, 17.8, 8)
     mean[at[0][0] : at[0][-1] + 1, at[1][0] : at[1][-1] + 1] += 150 * rendered.disc(18.3, 17.8, 2.5, 0.9, at)

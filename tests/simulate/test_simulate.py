@@ -24,6 +24,7 @@ from pixmetry.core.errors import InputError, ParameterError
 from pixmetry.core.random import Grid
 from pixmetry.files import load_campaign, read_frame
 from pixmetry.scene.files import build_scene, read_scene
+from pixmetry.simulate import job
 from pixmetry.simulate.job import simulate
 
 CHAIN = """\
@@ -408,7 +409,7 @@ def test_a_full_disk_is_one_line_and_leaves_the_old_frames(folder: Path, monkeyp
     def full(*_: object, **__: object) -> str:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("pixmetry.simulate.job.FrameWriter.write", full)
+    monkeypatch.setattr(job.FrameWriter, "write", full)
     result = run(folder, "-n", 3)
     assert result.exit_code == 2 and result.output == "error: No space left on device; to do: make room, or choose another folder\n"
     assert sorted(p.name for p in folder.rglob("*")) == before
