@@ -12,7 +12,7 @@ ORACLES := .venv-oracles
 PYTEST := OPENBLAS_NUM_THREADS=1 $(PY) -m pytest -n $(JOBS) --dist loadfile --hypothesis-seed=0
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test oracles study bench handbook lint browser-test
+.PHONY: help install demo test oracles study bench mutants handbook lint browser-test
 
 help: ## show this list
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1|\2/p' $(MAKEFILE_LIST) | while IFS='|' read -r target text; do printf '%-20s %s\n' "$$target" "$$text"; done
@@ -33,6 +33,9 @@ study: $(INSTALLED)-test ## run the studies in benchmarks/
 
 bench: $(INSTALLED)-test ## run the benchmarks
 	@$(call each,$(wildcard benchmarks/bench_*.py))
+
+mutants: $(INSTALLED)-test ## plant wrong factors, one at a time, and see whether the tests find them
+	@$(PY) scripts/mutants.py --jobs $(JOBS)
 
 handbook: $(INSTALLED) ## run the handbook's experiments and write docs/handbook
 	@$(PY) scripts/make_handbook.py

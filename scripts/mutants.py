@@ -1,0 +1,458 @@
+"""Plant wrong factors in a copy of the package, one at a time, and see whether a test fails: is what the tests say worth something?
+
+python scripts/mutants.py [--only TEXT] [--jobs 2] [--list]
+
+Each fault names the text that it replaces, which must stand once in src/pixmetry, and the tests that ought to find it. A fault whose text
+is gone is reported as stale and counts as not found, so the list has to follow the code.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+SOURCE = ROOT / "src" / "pixmetry"
+WANTED = 0.9  # share of the faults that the tests find
+LONGEST_S = 900
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A wrong factor: what it is, the text as it stands and as it becomes, and the tests that should fail."""
+
+    what: str
+    old: str
+    new: str
+    tests: str
+
+
+OPTICS, SENSOR, ELECTRONICS, GRABBER = (f"tests/sources/{stage}/test_" for stage in ("optics", "sensor", "electronics", "grabber"))
+FAULTS = (
+    # the light
+    Fault("Noll factor of defocus", "np.sqrt(3) * params.defocus_waves", "np.sqrt(2) * params.defocus_waves", f"{OPTICS}point_spread.py"),
+    Fault("Noll factor of astigmatism", "np.sqrt(6) * (params.astig", "np.sqrt(5) * (params.astig", f"{OPTICS}point_spread.py"),
+    Fault("Noll factor of coma", "np.sqrt(8) * (3 * r2", "np.sqrt(6) * (3 * r2", f"{OPTICS}point_spread.py"),
+    Fault(
+        "Noll factor of spherical aberration", "np.sqrt(5) * params.spherical", "np.sqrt(6) * params.spherical", f"{OPTICS}point_spread.py"
+    ),
+    Fault(
+        "cut-off of the diffraction doubled",
+        "scale = 2e-3 * params.wavelength_nm",
+        "scale = 1e-3 * params.wavelength_nm",
+        f"{OPTICS}point_spread.py",
+    ),
+    Fault("sign of the pupil's shadow", "np.arccos(s) - s * np.sqrt(1", "np.arccos(s) + s * np.sqrt(1", f"{OPTICS}vignetting.py"),
+    Fault(
+        "mean of shading over the frame",
+        "centre = 1 + loss * (rows**2 + cols**2 - 2) / 12",
+        "centre = 1 + loss * (rows**2 + cols**2 - 2) / 6",
+        f"{OPTICS}shading.py",
+    ),
+    Fault(
+        "sign of lateral colour",
+        "scale = 1 + params.scale_per_nm",
+        "scale = 1 - params.scale_per_nm",
+        f"{OPTICS}filters.py tests/catalogue",
+    ),
+    Fault("width of a logistic edge", "params.edge_nm / (2 * np.log(9))", "params.edge_nm / np.log(9)", f"{OPTICS}filters.py"),
+    Fault(
+        "flicker over the exposure",
+        "params.depth_rel * np.sinc(params.frequency_hz * length)",
+        "params.depth_rel * np.sinc(0.5 * params.frequency_hz * length)",
+        f"{OPTICS}flicker.py",
+    ),
+    # the sensor
+    Fault("half the band gap", "params.gap_ev / (2 * BOLTZMANN", "params.gap_ev / (1 * BOLTZMANN", f"{SENSOR}dark_current.py"),
+    Fault(
+        "mean of a lognormal field",
+        "np.float32(-0.5 * params.spread_log**2)",
+        "np.float32(-1.0 * params.spread_log**2)",
+        f"{SENSOR}dark_current.py",
+    ),
+    Fault(
+        "degrees of freedom of DSNU halved",
+        'dof=np.where(dof < 1e9, np.maximum(dof, 1.0), np.inf),\n        units=("e-",) * len(in_dn)',
+        'dof=np.where(dof < 1e9, np.maximum(dof / 2, 1.0), np.inf),\n        units=("e-",) * len(in_dn)',
+        f"{SENSOR}dsnu.py",
+    ),
+    Fault(
+        "gain's share in DSNU's covariance",
+        "np.outer(values, values) * (gain.u / gain.value) ** 2",
+        "np.outer(values, values) * (gain.u / gain.value)",
+        f"{SENSOR}dsnu.py",
+    ),
+    Fault(
+        "diffusion in the substrate",
+        "np.sqrt(1 + (2 * np.pi * length) ** 2 * k2)",
+        "np.sqrt(1 + (np.pi * length) ** 2 * k2)",
+        f"{SENSOR}infrared_and_microlens.py",
+    ),
+    Fault(
+        "sign of the refocusing by a cover glass",
+        "(1 / n - 1 / root) - seen)",
+        "(1 / n + 1 / root) - seen)",
+        f"{OPTICS}filters.py tests/sources/optics/test_cover_glass.py",
+    ),
+    Fault(
+        "smear by two",
+        "params.leak_rel * params.transfer_s / (signal.frame_shape[0]",
+        "2 * params.leak_rel * params.transfer_s / (signal.frame_shape[0]",
+        f"{SENSOR}smear.py",
+    ),
+    Fault(
+        "knee of the full well",
+        "above - room * np.expm1(-above / room)",
+        "above - room * np.expm1(-above / (2 * room))",
+        f"{SENSOR}full_well.py",
+    ),
+    Fault("tilt the other way", "scale = 1000 / (1 + z / params", "scale = 1000 / (1 - z / params", f"{SENSOR}unflatness_and_tilt.py"),
+    Fault(
+        "expansion of sensor and mount exchanged",
+        "(1 + params.sensor_per_k * dt) / (1 + params.mount_per_k * dt)",
+        "(1 + params.mount_per_k * dt) / (1 + params.sensor_per_k * dt)",
+        f"{SENSOR}thermal_and_drift.py",
+    ),
+    Fault(
+        "borders moved by all four sides",
+        "with_data(move_borders(data, w, params.area_loss_per_e / (4 * (1 - w[1]))",
+        "with_data(move_borders(data, w, params.area_loss_per_e / (2 * (1 - w[1]))",
+        f"{SENSOR}brighter_fatter.py",
+    ),
+    Fault(
+        "lost in the dead layer",
+        "lost = np.exp(-per_um * params.dead_layer_um)",
+        "lost = np.exp(-2 * per_um * params.dead_layer_um)",
+        f"{SENSOR}quantum_efficiency.py",
+    ),
+    Fault(
+        "delay of a rolling shutter's middle",
+        '"delay_s": 0.5 * delay, "exposure_rel"',
+        '"delay_s": delay, "exposure_rel"',
+        f"{SENSOR}shutter_times.py",
+    ),
+    Fault(
+        "acceptance of microlenses",
+        "np.exp(-0.5 * ((chief - design) / np.radians",
+        "np.exp(-1.0 * ((chief - design) / np.radians",
+        f"{SENSOR}infrared_and_microlens.py",
+    ),
+    # electronics, cable, grabber, storage
+    Fault("toe of BT.709", "alpha * gamma * TOE ** (gamma - 1)", "alpha * gamma * TOE**gamma", f"{ELECTRONICS}gamma.py"),
+    Fault(
+        "second term of the nonlinearity's slope",
+        "(2 * params.a1 + w * (3 * params.a2",
+        "(2 * params.a1 + w * (2 * params.a2",
+        f"{ELECTRONICS}nonlinearity.py",
+    ),
+    Fault("variance between nodes of flicker noise", "VARIANCE = 2 / 3 ", "VARIANCE = 1 / 3 ", f"{ELECTRONICS}flicker_noise.py"),
+    Fault(
+        "telegraph noise under double sampling",
+        '"cds": 2 * (1 - params.cds_correlation)',
+        '"cds": (1 - params.cds_correlation)',
+        f"{ELECTRONICS}telegraph_noise.py",
+    ),
+    Fault(
+        "overshoot of a damped amplifier",
+        "math.exp(-math.pi * self.damping / math.sqrt(1 - self.damping**2))",
+        "math.exp(-2 * math.pi * self.damping / math.sqrt(1 - self.damping**2))",
+        f"{ELECTRONICS}video_amplifier.py tests/sources/grabber/test_analogue_chain.py",
+    ),
+    Fault(
+        "echo once instead of there and back",
+        "DELAY_S_PER_M = 2 / (0.66 * 299_792_458.0)  # there and back, at 0.66 of the speed of light\n\n\nclass TPiece",
+        "DELAY_S_PER_M = 1 / (0.66 * 299_792_458.0)  # there and back, at 0.66 of the speed of light\n\n\nclass TPiece",
+        "tests/sources/cable/test_t_piece.py",
+    ),
+    Fault(
+        "sign of the reflection at the load",
+        "reflection[0] * reflection[1] * 10",
+        "-reflection[0] * reflection[1] * 10",
+        "tests/sources/cable/test_termination.py",
+    ),
+    Fault(
+        "power for voltage in the cable's loss",
+        "10 ** (-self.loss_db / 10)",
+        "10 ** (-self.loss_db / 20)",
+        "tests/sources/cable/test_termination.py",
+    ),
+    Fault(
+        "differential nonlinearity shared by two codes",
+        "params.dnl_std_lsb / math.sqrt(2) * stream",
+        "params.dnl_std_lsb * stream",
+        f"{GRABBER}adc.py",
+    ),
+    Fault("droop over the line", "np.log1p(-self.droop_rel) / cols", "np.log1p(-self.droop_rel) / (2 * cols)", f"{GRABBER}clamp.py"),
+    Fault(
+        "sampling in the middle of a pixel",
+        "line.start_s + (np.arange(line.samples or cols) + 0.5) / line.sample_clock_hz",
+        "line.start_s + np.arange(line.samples or cols) * 2.0 / line.sample_clock_hz",
+        f"{GRABBER}clock_warm_up.py tests/budget/test_in_the_chain.py",
+    ),
+    Fault(
+        "poles of a Butterworth filter",
+        "np.pi * (0.5 + (np.arange(order) + 0.5) / order)",
+        "np.pi * (0.5 + (np.arange(order) + 0.4) / order)",
+        f"{GRABBER}low_pass.py",
+    ),
+    Fault(
+        "settling of the lines",
+        "params.settling_ns * np.exp(-line / params.settling_rows)",
+        "params.settling_ns * np.exp(-2 * line / params.settling_rows)",
+        f"{GRABBER}line_jitter.py",
+    ),
+    # locating
+    Fault(
+        "rounding's variance",
+        "ROUNDING_DN2 = 1 / 12  # variance of rounding",
+        "ROUNDING_DN2 = 1 / 6  # variance of rounding",
+        "tests/locate/test_bound.py tests/locate/test_moments.py tests/locate/test_template.py",
+    ),
+    Fault(
+        "aperture's variance",
+        "float(np.sqrt(blur_px**2 + aperture_px**2 / 12))",
+        "float(np.sqrt(blur_px**2 + aperture_px**2 / 6))",
+        "tests/locate/test_bound.py",
+    ),
+    Fault(
+        "sign of the ellipse's eccentricity",
+        "offset = -(m @ w[:, :, None])[:, :, 0]",
+        "offset = (m @ w[:, :, None])[:, :, 0]",
+        "tests/locate/test_eccentricity.py",
+    ),
+    Fault(
+        "window of the shared row shifts",
+        "return self.constant_dn2 + self.slope_dn * light",
+        "return self.constant_dn2 + 1.69 * self.slope_dn * light",
+        "tests/locate/test_moments.py tests/locate/test_template.py tests/locate/test_image_noise.py",
+    ),
+    # EMVA 1288 and the photon transfer
+    Fault(
+        "sign of mean and variance's covariance",
+        "v_ms, skew - g * v_mean, g,",
+        "v_ms, g * v_mean - skew, g,",
+        "tests/observe/test_photon_transfer_fit.py",
+    ),
+    Fault(
+        "skewness of Poisson",
+        "skew = f1**3 * p[GAIN] ** 2 * poisson",
+        "skew = f1**3 * p[GAIN] ** 3 * poisson",
+        "tests/observe/test_photon_transfer_fit.py",
+    ),
+    Fault(
+        "quantisation twice", "QUANTISATION_DN2 = 1.0 / 12.0", "QUANTISATION_DN2 = 1.0 / 6.0", "tests/observe/test_photon_transfer_fit.py"
+    ),
+    Fault(
+        "temporal noise left in a mean map",
+        "pixel, row, col = np.moveaxis(whole - vectors[..., 5:] / frames, -1, 0)",
+        "pixel, row, col = np.moveaxis(whole - vectors[..., 5:] / (frames + 20), -1, 0)",
+        "tests/emva/test_spatial.py",
+    ),
+    Fault(
+        "absolute sensitivity threshold",
+        "np.sqrt(noise_e**2 + 0.25) + 0.5",
+        "np.sqrt(noise_e**2 + 0.5) + 0.5",
+        "tests/emva/test_temporal.py",
+    ),
+    Fault(
+        "light counted twice in SNR max",
+        "return u_e_sat / np.sqrt(dark_noise_e2 + u_e_sat + pattern)",
+        "return u_e_sat / np.sqrt(dark_noise_e2 + 2 * u_e_sat + pattern)",
+        "tests/emva/test_spatial.py",
+    ),
+    Fault(
+        "frames of a stack",
+        'squares[f"PRNU1288{part}"] = (values[f"s_2_y{part}"] - ',
+        'squares[f"PRNU1288{part}"] = (values[f"s_2_y{part}"] + ',
+        "tests/emva/test_spatial.py",
+    ),
+    Fault("doubling temperature by e", "-math.log(2) / growth**2", "-1.0 / growth**2", "tests/emva/test_dark_temperature.py"),
+    Fault(
+        "excess of the fourth moment",
+        "return fourth / variance**2 - 3.0 if",
+        "return fourth / variance**2 - 2.5 if",
+        "tests/observe/test_reductions.py",
+    ),
+    Fault(
+        "degrees of freedom of a stack's variance",
+        "self.deviation_map_dn2() / (self.n_frames - 1)",
+        "self.deviation_map_dn2() / self.n_frames",
+        "tests/observe tests/emva/test_spatial.py",
+    ),
+    Fault(
+        "waves at half their power",
+        "(0.5 * patterns.amplitude_dn[patterns.moving] ** 2)",
+        "(1.0 * patterns.amplitude_dn[patterns.moving] ** 2)",
+        "tests/observe/test_spatial_fit.py tests/sources/electronics/test_supply_pickup.py",
+    ),
+    # calibrating
+    Fault(
+        "half of a pixel beside the centre",
+        "return (self.cols - 1) / 2, (self.rows - 1) / 2",
+        "return self.cols / 2, (self.rows - 1) / 2",
+        "tests/calibrate/test_bundle.py tests/calibrate/test_other_programs.py tests/calibrate/test_exchange.py",
+    ),
+    Fault(
+        "principal distance by the affinity",
+        "by_interior[0, 0], by_interior[1, 0] = ((1.0 + b1) * a + b2 * b) / mx",
+        "by_interior[0, 0], by_interior[1, 0] = ((1.0 - b1) * a + b2 * b) / mx",
+        "tests/calibrate/test_bundle.py tests/calibrate/test_solve.py",
+    ),
+    Fault(
+        "derivative by the shear",
+        "by_interior[0, 4], by_interior[1, 4] = c * b / mx",
+        "by_interior[0, 4], by_interior[1, 4] = c * b / my",
+        "tests/calibrate/test_bundle.py tests/calibrate/test_solve.py",
+    ),
+    Fault(
+        "critical value of the snooping",
+        "dof * (1 - alpha ** (2 / (dof - 2)))",
+        "dof * (1 - alpha ** (1 / (dof - 2)))",
+        "tests/calibrate/test_snooping.py",
+    ),
+    Fault(
+        "circles' normal",
+        "normal = network.normal / np.linalg.norm(network.normal, axis=1, keepdims=True)",
+        "normal = 0.5 * network.normal / np.linalg.norm(network.normal, axis=1, keepdims=True)",
+        "tests/calibrate/test_eccentric.py",
+    ),
+    Fault(
+        "datum's turn scaled",
+        "-state.rotation[there] @ basis[3:6] / datum.size",
+        "-state.rotation[there] @ basis[3:6]",
+        "tests/calibrate/test_bundle.py tests/calibrate/test_control.py",
+    ),
+    Fault(
+        "u of camera constants × 1.3",
+        "float(adjustment.state.interior[k, place]), float(np.sqrt(covariance[i, i]))",
+        "float(adjustment.state.interior[k, place]), 1.3 * float(np.sqrt(covariance[i, i]))",
+        "tests/calibrate/test_quality.py tests/calibrate/test_bundle_coverage.py",
+    ),
+    # the budget
+    Fault("variance of a limit", "covariance[i, i] = e.value**2 / 12", "covariance[i, i] = e.value**2 / 6", "tests/budget"),
+    Fault("value of a limit", "return self.value / 3**0.5 if self.kind", "return self.value / 2 if self.kind", "tests/budget tests/assess"),
+    Fault(
+        "averaging over frames and targets",
+        "left = time / (frames * targets) + place / targets",
+        "left = time / frames + place / targets",
+        "tests/budget/test_combine.py",
+    ),
+    Fault(
+        "both axes in one total",
+        "0.5 * (self.total_x_px**2 + self.total_y_px**2)",
+        "1.0 * (self.total_x_px**2 + self.total_y_px**2)",
+        "tests/budget/test_combine.py",
+    ),
+    Fault(
+        "shot noise × 1.3",
+        "probe.white(np.sqrt(probe.gain_dn_per_e * np.maximum(probe.signal_dn, 0.0)))",
+        "1.3 * probe.white(np.sqrt(probe.gain_dn_per_e * np.maximum(probe.signal_dn, 0.0)))",
+        f"{SENSOR}prnu_and_shot_noise.py",
+    ),
+    # scenes and the line
+    Fault(
+        "acceleration without its half",
+        "0.5 * self.acceleration_px_per_s2[axis] * t**2",
+        "self.acceleration_px_per_s2[axis] * t**2",
+        "tests/scene/test_motion_and_lighting.py",
+    ),
+    Fault(
+        "half a pixel in the sampling",
+        "(at - self.start_s) * self.sample_clock_hz - 0.5",
+        "(at - self.start_s) * self.sample_clock_hz",
+        "tests/camera/test_line.py",
+    ),
+    Fault(
+        "absorption per µm",
+        "np.log(ABSORPTION_PER_CM))) * 1e-4",
+        "np.log(ABSORPTION_PER_CM))) * 2e-4",
+        f"{SENSOR}infrared_and_microlens.py tests/sources/sensor/test_quantum_efficiency.py",
+    ),
+)
+
+
+def main() -> int:
+    """Plant the faults, print which were found, and return 1 when fewer than wanted were."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--only", default="", metavar="TEXT", help="faults with this text in what they are")
+    parser.add_argument("--jobs", type=int, default=2, help="faults at the same time")
+    parser.add_argument("--list", action="store_true", help="say which faults there are, and which are stale")
+    options = parser.parse_args()
+    faults = [f for f in FAULTS if options.only.lower() in f.what.lower()]
+    texts = {path: path.read_text(encoding="utf-8") for path in SOURCE.rglob("*.py")}
+    if options.list:
+        for fault in faults:
+            print(f"{'stale' if place_of(fault, texts) is None else '     '}  {fault.what}")
+        return 0
+    print(f"{len(faults)} faults")
+    with ThreadPoolExecutor(options.jobs) as pool:
+        found = list(pool.map(lambda fault: report(fault, texts), faults))
+    share = sum(found) / max(len(found), 1)
+    print(f"found {sum(found)} of {len(found)}: {share:.2f}, wanted {WANTED}")
+    return int(share < WANTED)
+
+
+def place_of(fault: Fault, texts: dict[Path, str]) -> Path | None:
+    """The file that holds the text of a fault, once; None where there is none, or more than one."""
+    places = [path for path, text in texts.items() for _ in occurrences(text, fault.old)]
+    return places[0] if len(places) == 1 else None
+
+
+def occurrences(text: str, part: str) -> Iterator[int]:
+    """Where a part stands in a text."""
+    at = text.find(part)
+    while at >= 0:
+        yield at
+        at = text.find(part, at + 1)
+
+
+def report(fault: Fault, texts: dict[Path, str]) -> bool:
+    """Plant one fault and say whether a test found it."""
+    place = place_of(fault, texts)
+    if place is None:
+        print(f"STALE     {fault.what}: {fault.old!r} does not stand once in the package", flush=True)
+        return False
+    started = time.monotonic()
+    found = planted(fault, place, texts[place])
+    print(
+        f"{'found   ' if found else 'SURVIVED'}  {fault.what} ({place.relative_to(SOURCE)}, {time.monotonic() - started:.0f} s)", flush=True
+    )
+    return found
+
+
+def planted(fault: Fault, place: Path, text: str) -> bool:
+    """Whether a test fails with the fault in a copy of the package."""
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder) / "src" / "pixmetry"
+        shutil.copytree(SOURCE, copy, ignore=shutil.ignore_patterns("__pycache__"))
+        (copy / place.relative_to(SOURCE)).write_text(text.replace(fault.old, fault.new), encoding="utf-8")
+        environment = {**os.environ, "PYTHONPATH": str(copy.parent), "OPENBLAS_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1"}
+        command = [
+            sys.executable,
+            "-m",
+            "pytest",
+            "-x",
+            "-q",
+            "-p",
+            "no:cacheprovider",
+            "-m",
+            "not browser and not oracle",
+            *fault.tests.split(),
+        ]
+        ran = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=LONGEST_S, check=False)
+    if ran.returncode not in (0, 1):
+        raise SystemExit(f"{fault.what}: the tests could not be run\n{ran.stdout[-2000:]}\n{ran.stderr[-2000:]}")
+    return ran.returncode == 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
