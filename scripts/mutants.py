@@ -235,6 +235,12 @@ FAULTS = (
         "return self.constant_dn2 + 1.69 * self.slope_dn * light",
         "tests/locate/test_moments.py tests/locate/test_template.py tests/locate/test_image_noise.py",
     ),
+    Fault(
+        "covariance of the fitted ground doubled",
+        "factor = variance * max(1.0, chi2 if n > 20.0 else 1.0) / det",
+        "factor = 2.0 * variance * max(1.0, chi2 if n > 20.0 else 1.0) / det",
+        "tests/locate/test_moments.py",
+    ),
     # EMVA 1288 and the photon transfer
     Fault(
         "sign of mean and variance's covariance",

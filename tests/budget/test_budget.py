@@ -8,12 +8,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import uniform
 
 from budget.cameras import camera, element
 from pixmetry.budget import compute_budget, make_probe
 from pixmetry.budget.headline import headline
 from pixmetry.budget.monte_carlo import Trials, monte_carlo
-from pixmetry.budget.parameters import applies
+from pixmetry.budget.parameters import applies, covariance_of
 from pixmetry.budget.probe import Target, facts_of
 from pixmetry.camera.camera import load_camera
 from pixmetry.camera.catalogue import catalogue, get_source
@@ -316,3 +317,17 @@ def test_applies_reads_interface_and_sensor() -> None:
     assert applies(source, {"interface": "analogue"}) and not applies(source, {"interface": "digital"})
     assert applies(source, {})  # not told: it may be there
     assert applies(get_source("sensor.prnu"), {"interface": "digital", "sensor": "cmos"})
+
+
+def test_variance_of_a_limit_is_that_of_numbers_spread_evenly_below_it() -> None:
+    """Against SciPy's rectangular distribution from 0 to L; what is measured keeps its covariance, and none with the limit."""
+    estimates = Estimates(
+        ("pixel_std_rel", "row_std_rel", "col_std_rel"),
+        np.array([0.012, 0.02, 0.03]),
+        np.array([[1.0, 0.5, 0.2], [0.5, 4.0, 1.0], [0.2, 1.0, 9.0]]) * 1e-8,
+        np.full(3, 20.0),
+        ("1", "1", "1"),
+        limits=frozenset({"pixel_std_rel"}),
+    )
+    expected = np.array([[uniform(0, 0.012).var(), 0, 0], [0, 4e-8, 1e-8], [0, 1e-8, 9e-8]])
+    assert covariance_of(estimates) == pytest.approx(expected, rel=1e-12)

@@ -14,6 +14,7 @@ from pixmetry.camera.observations import LevelMoments, PhotonTransfer, StackMome
 from pixmetry.core.errors import MeasureError
 from pixmetry.emva.evaluate import standard_values
 from pixmetry.emva.records import Measurement
+from pixmetry.observe import photon_transfer_model as model
 from pixmetry.observe.photon_transfer_fit import fit_photon_transfer
 
 KS_PARAMETERS = (
@@ -230,3 +231,29 @@ def test_speed(rng: np.random.Generator):
         fit_photon_transfer(pt)
         times.append(time.perf_counter() - start)
     assert min(times) < 0.1
+
+
+def test_mean_and_mean_square_of_a_level_vary_together_as_stated():
+    """Pairs of tiny frames of few electrons, where both go together: 20 000 draws against the stated 2 × 2 covariance.
+
+    A correlation of n pairs is good to 1/√n: 4.9/√20000 = 0.035 at 1e-6, and its sign differs by 0.25. Variances: 4.9 √(3/n) = 6 %.
+    """
+    rng, n, pixels = np.random.default_rng(), 20_000, 40
+    gain, read2, light = 3.0, 18.0, 6.0  # DN/e-, DN², DN: two electrons
+    pairs = gain * rng.poisson(light / gain, (n, 2, pixels)) + rng.normal(0, read2**0.5, (n, 2, pixels))
+    half = (pairs[:, 1] - pairs[:, 0]) / 2**0.5
+    one, zero = np.ones(n), np.zeros(n)
+    levels = model.Levels(
+        bright=one.astype(bool), light=one, time=zero, mean=pairs.mean(axis=(1, 2)), ms=half.var(axis=1, ddof=1) + 1 / 12, spatial=zero,
+        row_col_var=zero, n_frames=2 * one, ms_dof=(pixels - 1) * one, kurtosis=np.nan * one, leak=zero, dither=100.0 * one, dnl_lsb=0.0,
+        coherence=0.0, pixels=pixels, x_ref=4095.0,
+    )  # fmt: skip
+    p = np.zeros(len(model.PARAMETERS))
+    p[[model.SLOPE, model.GAIN, model.DARK_VAR]] = light, gain, read2
+    got = model.linearise(p, levels)
+    seen = np.cov(got.residual[:n], got.residual[n:])
+    assert seen[0, 0] == pytest.approx(got.v_mean.mean(), rel=0.06)
+    assert seen[1, 1] == pytest.approx(got.v_ms.mean(), rel=0.08)
+    stated = got.v_cross.mean() / np.sqrt(got.v_mean.mean() * got.v_ms.mean())
+    assert abs(stated) > 0.1
+    assert np.corrcoef(got.residual[:n], got.residual[n:])[0, 1] == pytest.approx(stated, abs=0.035)

@@ -217,3 +217,22 @@ def test_light_is_kept():
 def test_a_useless_table_is_refused(table):
     with pytest.raises(ParameterError, match="table"):
         camera((9, 9), (SOURCE, PointSpread(model="measured", table=table))).expose(Spot(np.array([4.0]), np.array([4.0]), 1.0))
+
+
+EACH = [name for name in PointSpread.model_fields if name.endswith("_waves")]
+
+
+@pytest.mark.parametrize("name", EACH)
+def test_a_coefficient_is_the_root_mean_square_over_the_pupil(name):
+    """Noll (1976): the polynomials are orthonormal on the unit disc. Integrals by Gauss and by equal steps, exact for their degrees."""
+    node, weight = np.polynomial.legendre.leggauss(12)
+    r, w = np.sqrt(0.5 + 0.5 * node)[:, None], 0.5 * weight[:, None] / 32  # equal areas in r²
+    angle = 2 * np.pi * np.arange(32) / 32
+
+    def waves(one):
+        return point_spread.wave_aberration(PointSpread(model="diffraction", **{one: 1.0}), r * np.cos(angle), r * np.sin(angle))
+
+    assert len(EACH) == 6
+    assert (w * waves(name)).sum() == pytest.approx(0, abs=1e-12)
+    for other in EACH:
+        assert (w * waves(name) * waves(other)).sum() == pytest.approx(float(name == other), abs=1e-12)

@@ -11,6 +11,7 @@ from scipy import stats
 from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind
 from pixmetry.core.errors import MeasureError
+from pixmetry.core.estimates import Estimates
 from pixmetry.observe.spatial_fit import fit_spatial
 from pixmetry.observe.stack import StackAccumulator
 from pixmetry.sources.sensor.dsnu import SOURCE, Dsnu
@@ -99,3 +100,17 @@ def test_shift_is_that_of_the_centroid_over_units():
     assert shifts.std(axis=0) == pytest.approx([got.u_x_px, got.u_y_px], rel=0.1)
     assert got.u_y_px > got.u_x_px
     assert math.isclose(got.bias_x_px, 0)
+
+
+def test_degrees_of_freedom_are_those_of_what_u_comes_from():
+    """Of the split where the gain is known, of the gain where the split is; between, as JCGM 100 G.4.1 has it for a quotient."""
+
+    def measured(u_dn, u_gain):
+        rows = [(f"dsnu_{part}_dn", 2.0, u_dn, 60.0, "DN") for part in ("pixel", "row", "col")]
+        gain = Estimates.from_rows([("gain_dn_per_e", 0.2, u_gain, 25.0, "DN/e-")])
+        return SOURCE.measure(Observations(spatial_fit=Estimates.from_rows(rows), photon_transfer_fit=gain))
+
+    assert measured(0.1, 1e-9).dof == pytest.approx(60.0, rel=1e-6)
+    assert measured(1e-9, 0.01).dof == pytest.approx(25.0, rel=1e-6)
+    # relative parts 0.05 and 0.05: (0.05² + 0.05²)² / (0.05⁴/60 + 0.05⁴/25)
+    assert measured(0.1, 0.01).dof == pytest.approx(4 / (1 / 60 + 1 / 25), rel=1e-6)
