@@ -233,12 +233,12 @@ def test_speed(rng: np.random.Generator):
     assert min(times) < 0.1
 
 
-def test_mean_and_mean_square_of_a_level_vary_together_as_stated():
+def test_mean_and_mean_square_of_a_level_vary_together_as_stated(rng):
     """Pairs of tiny frames of few electrons, where both go together: 20 000 draws against the stated 2 × 2 covariance.
 
     A correlation of n pairs is good to 1/√n: 4.9/√20000 = 0.035 at 1e-6, and its sign differs by 0.25. Variances: 4.9 √(3/n) = 6 %.
     """
-    rng, n, pixels = np.random.default_rng(), 20_000, 40
+    n, pixels = 20_000, 40
     gain, read2, light = 3.0, 18.0, 6.0  # DN/e-, DN², DN: two electrons
     pairs = gain * rng.poisson(light / gain, (n, 2, pixels)) + rng.normal(0, read2**0.5, (n, 2, pixels))
     half = (pairs[:, 1] - pairs[:, 0]) / 2**0.5

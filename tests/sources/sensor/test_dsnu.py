@@ -11,7 +11,7 @@ from scipy import stats
 from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind
 from pixmetry.core.errors import MeasureError
-from pixmetry.core.estimates import Estimates
+from pixmetry.core.number import Estimates
 from pixmetry.observe.spatial_fit import fit_spatial
 from pixmetry.observe.stack import StackAccumulator
 from pixmetry.sources.sensor.dsnu import SOURCE, Dsnu
