@@ -169,7 +169,7 @@ def test_the_disc_behind_a_contour(radius: float, blur: float) -> None:
     assert spread == pytest.approx(np.interp(0.5 * flux[-1], flux, r) / 1.17741, rel=0.01)
 
 
-def test_the_ground_is_as_sure_as_its_covariance_says(rng: np.random.Generator) -> None:
+def test_the_ground_is_as_sure_as_its_covariance_says(lattice, rng: np.random.Generator) -> None:
     """Level and both slopes of 338 fitted grounds in two sizes, z² on average 1 ± 4.9 √(2/n) = 19 % (chance 1e-6); twice the covariance
     would give 0.5."""
     for radius, blur, sigma in ((2.0, 0.8, 3.0), (6.0, 0.8, 3.0)):

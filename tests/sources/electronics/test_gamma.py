@@ -181,11 +181,11 @@ def test_settings_that_no_camera_has_are_refused(values):
         SOURCE.make(values)
 
 
-def test_toe_is_the_straight_line_of_bt_709():
+def test_toe_is_the_straight_line_of_bt_709(rng):
     """ITU-R BT.709-6, item 1.2, to its three digits: 4.5 L below 0.018, 1.099 L^0.45 − 0.099 from there."""
     toe = Gamma(gamma=0.45, reference_dn=1000.0, toe="bt709")
     light = np.array([0.001, 0.005, 0.01, 0.0179, 0.018, 0.0181, 0.03, 0.1, 0.5, 1.0])
     expected = np.where(light < 0.018, 4.5 * light, 1.099 * light**0.45 - 0.099)
-    assert bent(toe, 1000 * light) == pytest.approx(1000 * expected, rel=2e-3)
-    below, at, above = bent(toe, [17.99, 18.0, 18.01])
+    assert bent(rng, toe, 1000 * light) == pytest.approx(1000 * expected, rel=2e-3)
+    below, at, above = bent(rng, toe, [17.99, 18.0, 18.01])
     assert above - at == pytest.approx(at - below, rel=0.01)  # no step and no bend where they meet
