@@ -345,7 +345,12 @@ FAULTS = (
     ),
     # the budget
     Fault("variance of a limit", "covariance[i, i] = e.value**2 / 12", "covariance[i, i] = e.value**2 / 6", "tests/budget"),
-    Fault("value of a limit", "return self.value / 3**0.5 if self.is_upper_limit", "return self.value / 2 if self.is_upper_limit", "tests/budget tests/assess"),
+    Fault(
+        "value of a limit",
+        "return self.value / 3**0.5 if self.is_upper_limit",
+        "return self.value / 2 if self.is_upper_limit",
+        "tests/budget tests/assess",
+    ),
     Fault(
         "averaging over frames and targets",
         "left = time / (frames * targets) + place / targets",
