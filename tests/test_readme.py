@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from html import unescape
 from pathlib import Path
 
 import pytest
@@ -53,3 +54,20 @@ def test_the_printed_example_is_what_the_program_says(tmp_path: Path) -> None:
             assert float(other) == pytest.approx(float(one), rel=0.05, abs=1.01 * 10.0 ** -len(one.partition(".")[2]))
         elif not one.isdigit():
             assert one == other
+
+
+def test_the_picture_shows_the_numbers_of_the_printed_example() -> None:
+    """Both are made from the packaged example: the same sources with the same shares, and the same total."""
+    picture = (README.parent / "docs" / "images" / "chain.svg").read_text(encoding="utf-8")
+    assert len(picture) < 60_000
+    label = re.search(r'aria-label="(.*?)"', picture)
+    assert label
+    drawn = dict(re.findall(r"(?:^|; )(.+?) \d\.\d+ px, (?:< )?(\d+) %", unescape(label[1])))
+    shown = re.findall(r"^(.+?)  +(?:measured|modelled).* (\d+) %  ", blocks("text")[0], re.M)
+    assert len(drawn) > 4 and len(shown) == 8
+    for title, share in shown:
+        if title in drawn:
+            assert drawn[title] == (share if share != "0" else "1"), title
+    assert set(drawn) <= {title for title, _ in shown}
+    total = re.search(r"worth (\S+) px", blocks("text")[0])
+    assert total and f"u = {total[1]} px" in picture

@@ -9,17 +9,17 @@ from gallery.page import Page, table
 
 INDEX = """# The handbook's experiments, made again
 
-The chapter on image sensors of the [handbook](../conventions.md) shows by simulated experiments how a camera moves a target. Here they are
-again, with all their conditions told, pixmetry's estimators at work, and what the numbers say beside what the chapter says.
+The chapter on image sensors of the [handbook](../conventions.md) shows with simulated experiments how a camera moves a target. These pages
+repeat the experiments, state all conditions, add pixmetry's estimators, and compare the numbers with those of the chapter.
 
 {pages}
-The numbers are written by `make handbook` (those of line jitter, which take minutes, by `benchmarks/study_line_jitter.py`) and are the
-same each time: every draw has its key. Positions and errors are in pixels; errors
-are found less true; grey values are those of 8 bits.
+`make handbook` writes the numbers (`benchmarks/study_line_jitter.py` writes those of line jitter, which take minutes). They are the
+same each time, because every draw has its key. Positions and errors are in pixels. An error is found minus true. Grey values are those of
+8 bits.
 """
 
 EXPERIMENTS = (
-    ("Note 8, Fig 3.10", "threshold", "Thresholds", "why a threshold spoils a centroid, and what to take in its place"),
+    ("Note 8, Fig 3.10", "threshold", "Thresholds", "why a threshold spoils a centroid, and what to use instead"),
     ("Note 13, Figs 3.13 to 3.17", "offset", "Black below zero", "why lines wander when the converter cuts off their feet"),
     ("Note 19, Table 3.2", "line-jitter", "Line jitter", "whether the residuals of straight lines tell how steadily a grabber samples"),
 )
