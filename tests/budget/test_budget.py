@@ -251,6 +251,36 @@ def test_the_sum_is_the_headline_where_both_agree(seed: int) -> None:
     assert computed(small_camera(), None, KNOWN, trials=0).headline.by == "sum"
 
 
+def test_what_is_accepted_is_in_neither_total_although_it_stands_in_the_chain() -> None:
+    """PRNU of 5 % would be four fifths of the whole; false alarm 1e-6, and 10 % of the total for what the formulas leave open."""
+    cam = small_camera().with_parameters("sensor.prnu", pixel_std_rel=0.05)
+    budget = computed(cam, None, KNOWN, trials=2048, accepted=["sensor.prnu"], seed=SEED)
+    together = budget.interaction.together
+    assert row(budget, "sensor.prnu").status == "accepted" and budget.with_accepted[0].total_px > 1.5 * budget.verdict.total_px
+    by_formula = budget.headline.sum_px
+    assert abs(together.total_px - by_formula) < 4.9 * together.se_total_px + 0.1 * by_formula
+
+
+def test_the_interval_holds_the_verdict_with_students_factor() -> None:
+    """Parameters known to 20 % have 12.5 degrees of freedom each (JCGM 100:2008, G.4.2); Student gives the factor."""
+    budget = computed(small_camera(), prnu(0.02, 0.004), KNOWN, trials=0)
+    interval, one = budget.interval, budget.verdict
+    assert interval.half_px == pytest.approx((interval.k[0] * one.total_x_px, interval.k[1] * one.total_y_px))
+    assert 1.96 < interval.k[0] < 3 and 5 < interval.dof[0] < 100
+    sharper = computed(small_camera(), prnu(0.02, 0.0001), KNOWN, trials=0)
+    assert sharper.interval.dof[0] > interval.dof[0]
+
+
+def test_the_stages_share_the_verdict_and_rows_that_do_not_count_come_last() -> None:
+    budget = computed(small_camera(), prnu(0.008, 0.0004), KNOWN, trials=0)
+    assert sum(s.share for s in budget.stages) == pytest.approx(1.0)
+    assert sum(s.total_px**2 for s in budget.stages) == pytest.approx(budget.verdict.total_px**2)
+    assert sum(s.accepted_px**2 for s in budget.stages) == pytest.approx(sum(r.total_px**2 for r in budget.accepted))
+    counted = [r.counts for r in budget.rows]
+    assert counted == sorted(counted, reverse=True)
+    assert {r.name for r in budget.rows if r.in_camera} == {e.name for e in small_camera().active}
+
+
 def test_a_drift_along_the_rows_is_left_by_a_calibration_in_x_alone() -> None:
     """A cold clock moves targets in x: of y a calibration leaves no more than there is of it."""
     cam = camera(element("grabber.clock_warm_up", scale_error_rel=0.02, lock_us=10.0), shape=(96, 200))

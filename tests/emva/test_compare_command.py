@@ -255,7 +255,7 @@ ASSESSMENT = {
                 "status": "modelled",
                 "total_px": 0.0123,
                 "u_of_total_px": 0.0,
-                "contribution": {"model_error": 0.1, "floor_px": 2e-4},
+                "contribution": {"model_error": 0.1, "floor_px": 2e-4, "gum_class": "T", "time_px": [0.003, 0.003]},
             }
         ],
         "headline": {"by": "sum", "se_simulated_px": 0.001},

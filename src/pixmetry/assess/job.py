@@ -103,11 +103,15 @@ def assess(
         hashes.add_file(calibration)
     standard = by_the_standard(frames, seen)
     estimates, unmeasured = measure_sources(seen)
+    silent = noise_missing(seen)
+    if silent:
+        seen = replace(seen, notes=(*seen.notes, silent))
     if "electronics.gain" not in estimates:
         estimates, unmeasured = _at_assumed_gain(seen, estimates, unmeasured, frames.bits)
         assumed = f"taken as if {ASSUMED_RANGE_E:g} electrons filled the range, fewer than in most cameras"
         note = f"The gain is not measured. For the shot noise it is {assumed}, which bounds it; electrons are DN over that gain."
         seen = replace(seen, notes=(*seen.notes, note))
+    estimates, unmeasured = without_noise(seen, estimates, unmeasured)
     camera = digital_twin(frames, estimates, seen)
     steps = len(camera.active) + len(catalogue()) + 2
     done = itertools.count(1)
@@ -279,6 +283,40 @@ def measure_sources(observations: Observations) -> tuple[dict[str, Estimates], d
         except (MeasureError, InputError) as problem:
             unmeasured[source.id] = str(problem)
     return estimates, unmeasured
+
+
+NEED_DITHER = ("grabber.phase_pattern", "grabber.fixed_pattern")  # below half a step rounding hides them where there is no noise
+NEED_NOISE = ("electronics.amplifier_noise", "electronics.row_noise", "sensor.dsnu", "sensor.defects", *NEED_DITHER)
+
+
+def equal_dark_dn(observations: Observations) -> float | None:
+    """The grey value that every pixel of every dark frame has; None where they differ."""
+    levels, stack = observations.photon_transfer.dark, observations.dark_stack
+    means = [*levels.mean_dn, *(() if stack is None else (stack.mean_dn,))]
+    scatter = [*levels.var_total_dn2, *(() if stack is None else (stack.var_stack_dn2, np.ptp(stack.mean_map_dn)))]
+    return float(means[0]) if means and not np.any(scatter) and np.ptp(means) == 0 else None
+
+
+def noise_missing(observations: Observations) -> str:
+    """A note where all dark frames are equal, on what they therefore do not tell; empty where they are not."""
+    level = equal_dark_dn(observations)
+    if level is None:
+        return ""
+    if level > 0:
+        told = "Dark noise and DSNU are bounded by the rounding alone, and patterns in the dark are not measured"
+    else:
+        told = "They are clipped at black: noise, DSNU, defects and patterns of the dark are not measured (raise the black level)"
+    return f"All dark frames are equal, {level:g} DN in every pixel: they hold no noise. {told}."
+
+
+def without_noise(
+    observations: Observations, estimates: dict[str, Estimates], unmeasured: dict[str, str]
+) -> tuple[dict[str, Estimates], dict[str, str]]:
+    """Leave out what equal dark frames cannot tell: patterns that only noise carries over the rounding; all noise, where black clips."""
+    level = equal_dark_dn(observations)
+    gone = () if level is None else NEED_DITHER if level > 0 else NEED_NOISE
+    why = "all dark frames are equal: they hold no noise"
+    return {k: v for k, v in estimates.items() if k not in gone}, unmeasured | dict.fromkeys(gone, why)
 
 
 IN_ELECTRONS = ("electronics.amplifier_noise", "electronics.row_noise", "sensor.dsnu", "sensor.defects")

@@ -17,6 +17,7 @@ SUM, MONTE_CARLO = "sum", "Monte Carlo"
 COVERAGE = 2.0  # standard errors beyond which sum and Monte Carlo differ
 LOST = 0.01  # share of windows without a target above which a Monte Carlo does not speak for all targets
 ASKED = 3  # sources that are tried in the whole chain to find out which one makes the difference
+LEVEL = 0.95  # coverage of the interval that is the answer
 MAIN_PART = 0.5  # of the difference of the squares: what one source must make of it to be named
 
 
@@ -43,6 +44,56 @@ class Headline:
     se_simulated_px: float
     u_sum_px: float
     why: str
+
+
+@dataclass(frozen=True)
+class Interval:
+    """The answer in two numbers: within ± ``half_px`` (x and y) of its true place a position lies, with this coverage.
+
+    ``k`` is the coverage factor that the effective degrees of freedom ``dof`` ask for, in x and y.
+    """
+
+    half_px: tuple[float, float]
+    k: tuple[float, float]
+    dof: tuple[float, float]
+    coverage: float = LEVEL
+
+
+def interval_of(total_px: tuple[float, float], dof: tuple[float, float], coverage: float = LEVEL) -> Interval:
+    """Coverage interval of totals in x and y, by the quantile of Student's t (JCGM 100:2008, G.3.2).
+
+    Examples
+    --------
+    >>> found = interval_of((0.01, 0.02), (9.0, float("inf")))
+    >>> [round(k, 3) for k in found.k], [round(half, 4) for half in found.half_px]
+    ([2.262, 1.96], [0.0226, 0.0392])
+    """
+    from scipy.stats import norm, t
+
+    k = tuple(float(t.ppf((1 + coverage) / 2, n) if np.isfinite(n) else norm.ppf((1 + coverage) / 2)) for n in dof)
+    return Interval((k[0] * total_px[0], k[1] * total_px[1]), (k[0], k[1]), dof, coverage)
+
+
+def dof_of(rows: Sequence[Any], verdict: Combined, found: Headline) -> tuple[float, float]:
+    """Effective degrees of freedom of a verdict in x and y.
+
+    Notes
+    -----
+    Welch and Satterthwaite: ν = t⁴/Σ(tᵢ⁴/νᵢ), where a contribution tᵢ that is uncertain by Δᵢ has νᵢ = ½(tᵢ/Δᵢ)² (JCGM 100:2008, G.4.1 and
+    G.4.2). Δᵢ holds what its parameters leave open, and half of the error that its formula declares. Of a Monte Carlo, Δ is its standard
+    error.
+    """
+    if found.by == MONTE_CARLO:
+        error = found.se_simulated_px / found.simulated_px if found.simulated_px else 0.0
+        return (0.5 / error**2,) * 2 if error else (float("inf"),) * 2
+    loose = np.zeros(2)
+    for row in rows:
+        c = row.contribution
+        if c.total_px > 0:
+            error_rel = float(np.hypot(row.u_of_total_px, 0.5 * max(c.model_error * c.total_px, c.floor_px))) / c.total_px
+            loose += 2 * (np.square(c.u_px) + np.square(c.bias_px)) ** 2 * error_rel**2
+    x, y = (t**4 / v if v > 0 else float("inf") for t, v in zip((verdict.total_x_px, verdict.total_y_px), loose, strict=True))
+    return float(max(x, 1.0)), float(max(y, 1.0))
 
 
 def headline(
@@ -98,7 +149,8 @@ def _error(together: MonteCarlo, rows: Sequence[Any]) -> float:
     """Standard error of the total of a Monte Carlo, with what few targets have."""
     places = together.units * together.places
     parts = (r.contribution for r in rows)  # a bias has no chance in it
-    squares = sum((0.5 * (c.u_x_px**2 + c.u_y_px**2)) ** 2 * (c.kurtosis - 1) for c in parts) / places
+    # se_total_px holds the scatter of normal shifts, of a kurtosis of 3: what is beyond that is added
+    squares = sum((0.5 * (c.u_x_px**2 + c.u_y_px**2)) ** 2 * max(c.kurtosis - 3, 0.0) for c in parts) / places
     rare = float(np.sqrt(squares)) / (2 * together.total_px) if together.total_px > 0 else float(np.sqrt(np.sqrt(squares)))
     return float(np.hypot(together.se_total_px, rare))
 

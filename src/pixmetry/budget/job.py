@@ -10,12 +10,12 @@ import numpy as np
 
 from pixmetry.budget.advice import Advice, advise
 from pixmetry.budget.combine import Combined, combine, together_with
-from pixmetry.budget.headline import Headline, headline
-from pixmetry.budget.monte_carlo import MonteCarlo, Trials
+from pixmetry.budget.headline import Headline, Interval, dof_of, headline, interval_of
+from pixmetry.budget.monte_carlo import MonteCarlo, Trials, missed
 from pixmetry.budget.parameters import applies, base_of, u_of_total, with_estimates
 from pixmetry.budget.probe import ESTIMATOR_ITSELF, AnyEstimator, Facts, Probes, Target, facts_of, perfect, resolve
 from pixmetry.camera.camera import Camera
-from pixmetry.camera.catalogue import catalogue
+from pixmetry.camera.catalogue import STAGES, catalogue
 from pixmetry.camera.contribution import UNSTEADY, Contribution
 from pixmetry.camera.observations import LENS, TAKEN_UP, CameraGeometry
 from pixmetry.camera.signal import Kind
@@ -52,6 +52,8 @@ class BudgetRow:
         Combined total if it were gone.
     reason : str
         Why there is no contribution, or how its status came about.
+    in_camera : bool
+        Whether it stands in the camera's chain, switched on.
     """
 
     name: str
@@ -64,6 +66,12 @@ class BudgetRow:
     share: float = 0.0
     without_px: float = 0.0
     reason: str = ""
+    in_camera: bool = False
+
+    @property
+    def counts(self) -> bool:
+        """Whether it is part of the verdict, or of that with everything accepted; the rows that do not count come last."""
+        return self.status in (*DECIDED, "accepted") and self.total_px > 0
 
     @property
     def total_px(self) -> float:
@@ -74,6 +82,20 @@ class BudgetRow:
     def calibrated_px(self) -> float:
         """What of it stays once a calibration has taken up what is constant and what is smooth."""
         return 0.0 if self.contribution is None else self.contribution.calibrated_px
+
+
+@dataclass(frozen=True)
+class StageSum:
+    """What the sources of one link of the chain come to together: those of the verdict, and what was accepted beside them.
+
+    ``share`` is the stage's part of the square of the verdict's sum; those of all stages add up to 1.
+    """
+
+    stage: str
+    total_px: float
+    calibrated_px: float
+    share: float
+    accepted_px: float
 
 
 @dataclass(frozen=True)
@@ -109,10 +131,11 @@ class Budget:
     """All rows and what they come to.
 
     The rows come in one order for all who show them: what is measured, modelled or calibrated, largest first; then what was accepted,
-    largest bound first; then what does not count. ``verdicts`` are for what is measured and modelled, for one frame and for means over
-    several, by the sum of the contributions or by Monte Carlo as ``headline`` says; ``with_accepted`` adds everything that was accepted,
-    at its bound. ``sums`` are always the analytic ones. Totals are k = 1, as the camera is and (``calibrated_px``) as a calibration
-    leaves it.
+    largest bound first; then what does not count (`BudgetRow.counts`). ``verdicts`` are for what is measured and modelled, for one frame
+    and for means over several, by the sum of the contributions or by Monte Carlo as ``headline`` says; ``with_accepted`` adds everything
+    that was accepted, at its bound. ``sums`` are always the analytic ones. ``interval`` is the verdict for one frame in the form of an
+    answer, a coverage interval; ``stages`` says which links of the chain it is from, in the order of the light. Totals are k = 1, as the
+    camera is and (``calibrated_px``) as a calibration leaves it.
     """
 
     camera: str
@@ -127,6 +150,20 @@ class Budget:
     interaction: Interaction | None = None
     headline: Headline | None = None
     sums: tuple[Combined, ...] = ()
+    interval: Interval | None = None
+
+    @property
+    def stages(self) -> tuple[StageSum, ...]:
+        """Sums over each link of the chain that has a row that counts, in the order of the light."""
+        found = []
+        for stage in STAGES:
+            rows = [r for r in self.rows if r.counts and r.source_id.split(".")[0] == stage]
+            known, accepted = ([r for r in rows if (r.status == "accepted") == bound] for bound in (False, True))
+            whole = combine([r.contribution for r in known], signed=True)
+            at_bound = combine([r.contribution for r in accepted]).total_px
+            if rows:
+                found.append(StageSum(stage, whole.total_px, whole.calibrated_px, sum(r.share for r in known), at_bound))
+        return tuple(found)
 
     @property
     def verdict(self) -> Combined:
@@ -167,6 +204,8 @@ class Budget:
             "with_accepted": [_combined_record(self, c) for c in self.with_accepted],
             "sums": [_combined_record(self, c) for c in self.sums],
             "headline": None if self.headline is None else _finite(asdict(self.headline)),
+            "interval": None if self.interval is None else asdict(self.interval) | {"dof": [_or_none(v) for v in self.interval.dof]},
+            "stages": [asdict(s) for s in self.stages],
             "advice": [asdict(a) for a in self.advice],
             "interaction": None
             if self.interaction is None
@@ -249,7 +288,8 @@ def compute_budget(
             rows.append(_row(name, source, camera, estimates_by_source.get(name), name in accepted, probe, whole, measured_ids))
     interaction = design = None
     if trials:
-        design = Trials(camera, target, estimator, facts, trials, units, seed=seed)
+        known = missed(camera, [r.name for r in rows if r.status == "accepted" and r.name in camera])  # what is accepted is no part of it
+        design = Trials(known, target, estimator, facts, trials, units, seed=seed)
         rows = [_simulated(row, design, camera, say) for row in rows]
         say("all sources together")
         interaction = _interaction(rows, design)
@@ -259,6 +299,8 @@ def compute_budget(
     accepted_rows = [r.contribution for r in rows if r.status == "accepted" and r.contribution is not None]
     everything = tuple(together_with(v, combine(accepted_rows, frames=v.frames)) for v in verdicts)
     rows = _ranked(rows, decided, verdicts[0], everything[0])
+    one = verdicts[0]
+    interval = interval_of((one.total_x_px, one.total_y_px), dof_of(decided, one, found))
     return Budget(
         camera.name,
         target,
@@ -272,6 +314,7 @@ def compute_budget(
         interaction,
         found,
         tuple(combine([r.contribution for r in decided], frames=n, signed=True) for n in frames),
+        interval,
     )
 
 
@@ -307,11 +350,11 @@ def _row(
     whole: Any,
     measured_ids: Collection[str] = (),
 ) -> BudgetRow:
-    head = BudgetRow(name, source.id, source.title, "")
+    present = any(e.name == name for e in camera.active)
+    head = BudgetRow(name, source.id, source.title, "", in_camera=present)
     if not applies(source, camera.facts):
         return replace(head, status="not applicable", reason=f"only in a camera that is {' or '.join(source.applies_to)}")
     measured = estimates is not None and len(estimates) > 0
-    present = any(e.name == name for e in camera.active)
     if source.option and not (present or measured):
         return replace(head, status="not applicable", reason=f"only in a camera with {source.option}")
     if source.stage == "storage" and camera.facts.get("lossless") and not (present or measured):
@@ -403,13 +446,14 @@ def _ranked(rows: Sequence[BudgetRow], decided: Sequence[BudgetRow], verdict: Co
         done.append(row)
 
     def place(row: BudgetRow) -> int:
-        return 0 if row.status in DECIDED else 1 if row.status == "accepted" else 2
+        return 2 if not row.counts else 1 if row.status == "accepted" else 0
 
     return sorted(done, key=lambda r: (place(r), -r.total_px))
 
 
 def _row_record(row: BudgetRow) -> dict[str, Any]:
-    names = ("name", "source_id", "title", "status", "u_of_total_px", "share", "without_px", "reason", "total_px", "calibrated_px")
+    names: tuple[str, ...] = ("name", "source_id", "title", "status", "u_of_total_px", "share", "without_px", "reason")
+    names += ("in_camera", "counts", "total_px", "calibrated_px")
     record = {k: getattr(row, k) for k in names}
     c = row.contribution
     parts = {} if c is None else {k: list(getattr(c, k)) for k in ("time_px", "smooth_px", "place_px")}
@@ -424,6 +468,10 @@ def _monte_carlo_record(result: MonteCarlo) -> dict[str, Any]:
     for axis in ("x", "y"):
         record[axis] = {k: (v if np.isfinite(v) else None) for k, v in record[axis].items()}
     return _finite(record)
+
+
+def _or_none(value: float) -> float | None:
+    return value if np.isfinite(value) else None
 
 
 def _finite(record: dict[str, Any]) -> dict[str, Any]:

@@ -171,7 +171,7 @@ def _of_budget(budget: Mapping[str, Any], gain_u_rel: float) -> dict[str, Number
     """
     units = {True: "px", False: "1"}
     values = {f"budget.target.{k}": Number(float(v), 0.0, math.inf, units[k.endswith("_px")]) for k, v in _numbers(budget["target"])}
-    squares = {True: 0.0, False: 0.0}
+    known_rows: list[tuple[Mapping[str, Any], float]] = []
     for row in budget.get("rows", ()):
         contribution, total = row["contribution"], float(row["total_px"])
         if contribution is None or row["status"] in ("not applicable", "left to calibration"):
@@ -179,16 +179,27 @@ def _of_budget(budget: Mapping[str, Any], gain_u_rel: float) -> dict[str, Number
         formula = 0.5 * max(float(contribution["model_error"]) * total, float(contribution["floor_px"]))
         known = float(row["u_of_total_px"]) if row["status"] == "measured" else formula
         values[f"budget.{row['name']}"] = Number(total, math.hypot(known, gain_u_rel * total), math.inf, "px", row["status"], "")
-        squares[row["status"] == "accepted"] += (total * known) ** 2
+        known_rows.append((row, known))
     by = budget.get("headline") or {}
     chance = float(by.get("se_simulated_px") or 0.0) if by.get("by") == "Monte Carlo" else 0.0
-    for group, square in (("verdicts", squares[False]), ("with_accepted", squares[False] + squares[True])):
+    for group, holds in (("verdicts", False), ("with_accepted", True)):
         for one in budget.get(group, ()):
-            total = float(one["total_px"])
+            total, frames = float(one["total_px"]), int(one.get("frames", 1))
+            counted = [(row, known) for row, known in known_rows if holds or row["status"] != "accepted"]
+            square = sum((float(row["total_px"]) * known * _kept(row, frames)) ** 2 for row, known in counted)
             u = math.hypot(math.sqrt(square) / total if total else 0.0, gain_u_rel * total, chance)
-            key = f"budget.{'verdict' if group == 'verdicts' else group}.{one.get('frames', 1)}_frames"
+            key = f"budget.{'verdict' if group == 'verdicts' else group}.{frames}_frames"
             values[key] = Number(total, u, math.inf, "px", str(by.get("by", "sum")), "")
     return values
+
+
+def _kept(row: Mapping[str, Any], frames: int) -> float:
+    """Part of the square of a row's total that the mean over several frames keeps; what drifts or is the object's stays whole."""
+    contribution, total = row["contribution"], float(row["total_px"])
+    if frames == 1 or total == 0 or contribution["gum_class"] in ("D", "O"):
+        return 1.0
+    in_time = 0.5 * sum(float(v) ** 2 for v in contribution["time_px"])
+    return 1.0 - (1.0 - 1.0 / frames) * min(in_time / total**2, 1.0)
 
 
 def _numbers(record: Mapping[str, Any]) -> list[tuple[str, float]]:

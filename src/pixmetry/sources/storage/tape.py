@@ -167,13 +167,14 @@ def propagate(params: Tape, probe: Probe) -> Contribution:
     noise = [float(np.sqrt((np.apply_along_axis(np.convolve, 2, g, taps) ** 2).sum(axis=(1, 2)).mean())) for g in (held.gx, held.gy)]
     played = replace(probe, held=replace(held, line=band(held.line)))
     late = 1e-9 * params.grown
-    rows, _ = from_row_delays(played, late * params.white_ns, late * params.wow_ns, params.wow_rows, 2)
+    rows, late_px = from_row_delays(played, late * params.white_ns, late * params.wow_ns, params.wow_rows, 2)
     step, _, first = from_steady_delays(played, lambda rows: steady_s(params, rows, probe.frame_shape[0]))
     smooth = smooth_part(step, first)
     time = float(np.hypot(noise[0], rows[0])), float(np.hypot(noise[1], rows[1]))
     return Contribution(
         u_x_px=float(np.sqrt(time[0] ** 2 + step.var() + smear.u_x_px**2)), u_y_px=float(np.hypot(time[1], smear.u_y_px)),
-        bias_x_px=smear.bias_x_px + float(step.mean()), bias_y_px=smear.bias_y_px, gum_class="Tr", model_error=0.4, time_px=time,
+        bias_x_px=smear.bias_x_px + float(step.mean()) + late_px[0], bias_y_px=smear.bias_y_px + late_px[1],
+        gum_class="Tr", model_error=0.4, time_px=time,
         smooth_px=(float(smooth.std()), 0.0),
         method="noise of the tape's spectrum, delays of the rows, and the target after its bandwidth; dropouts are outliers apart",
     )  # fmt: skip
