@@ -254,7 +254,7 @@ def test_the_sum_is_the_headline_where_both_agree(seed: int) -> None:
 def test_what_is_accepted_is_in_neither_total_although_it_stands_in_the_chain() -> None:
     """PRNU of 5 % would be four fifths of the whole; false alarm 1e-6, and 10 % of the total for what the formulas leave open."""
     cam = small_camera().with_parameters("sensor.prnu", pixel_std_rel=0.05)
-    budget = computed(cam, None, KNOWN, trials=2048, accepted=["sensor.prnu"], seed=SEED)
+    budget = computed(cam, None, KNOWN, trials=2048, accepted=["sensor.prnu"])
     together = budget.interaction.together
     assert row(budget, "sensor.prnu").status == "accepted" and budget.with_accepted[0].total_px > 1.5 * budget.verdict.total_px
     by_formula = budget.headline.sum_px
