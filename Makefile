@@ -37,7 +37,7 @@ bench: $(INSTALLED)-test ## run the benchmarks
 mutants: $(INSTALLED)-test ## plant wrong factors, one at a time, and see whether the tests find them
 	@$(PY) scripts/mutants.py --jobs $(JOBS)
 
-handbook: $(INSTALLED) ## run the handbook's experiments and write docs/handbook
+handbook: $(INSTALLED)-all ## run the handbook's experiments and write docs/handbook
 	@$(PY) scripts/make_handbook.py
 
 lint: $(INSTALLED)-dev ## check style and types

@@ -18,6 +18,7 @@ import numpy as np
 
 from pixmetry.calibrate.bundle.model import NAMES, CameraModel, Direction, Sensor
 from pixmetry.core.errors import InputError
+from pixmetry.core.extras import import_extra
 
 GRID = 33  # places along each side of the frame at which two models are compared
 EXACT_PX = 1e-9
@@ -139,7 +140,7 @@ def opencv_text(model: CameraModel, ending: str, tolerance_px: float = 0.0) -> s
     InputError
         If the ending is another one, and as `opencv_form` does.
     """
-    import cv2
+    cv2 = import_extra("cv2")
 
     from pixmetry import __version__
 
@@ -178,7 +179,7 @@ def read_opencv(path: str | Path, pitch_um: tuple[float, float] | None = None) -
     InputError
         If the file cannot be read, or holds what would be lost here: a fisheye or rational model, thin prisms, a tilted sensor.
     """
-    import cv2
+    cv2 = import_extra("cv2")
 
     source = Path(path)
     try:

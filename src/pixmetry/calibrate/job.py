@@ -17,6 +17,7 @@ from pixmetry.calibrate.files.record import StoredCalibration, read_calibration
 from pixmetry.calibrate.files.write import check_folder, write_line_results, write_results
 from pixmetry.camera.camera import Camera
 from pixmetry.core.errors import InputError, PixmetryError
+from pixmetry.core.extras import import_extra
 from pixmetry.files.provenance import InputHashes, provenance_record
 
 if TYPE_CHECKING:
@@ -85,6 +86,7 @@ def calibrate(
     """
     from pixmetry.calibrate.bundle.solve import calibrate_network
 
+    import_extra("cv2")
     of = _sources(source)
     if output is not None:
         check_folder(output, of, [path for path in of if isinstance(path, Path)])  # before the work, not after it

@@ -88,9 +88,12 @@ def provenance_record(
 
 @cache
 def _version(name: str) -> str:
-    from importlib.metadata import version
+    from importlib.metadata import PackageNotFoundError, version
 
-    return version(name)
+    try:
+        return version(name)
+    except PackageNotFoundError:  # the same library under another name
+        return "not installed"
 
 
 def _without_folder(argument: str) -> str:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from pixmetry.core.errors import InputError
+from pixmetry.core.extras import import_extra
 from pixmetry.core.plain_text import cell, comment
 from pixmetry.files.staged_files import Output, check_files, write_together
 from pixmetry.locate.detect.targets import Flag
@@ -142,8 +143,8 @@ class Located:
     def _parquet(self) -> bytes:
         import json
 
+        import_extra("pyarrow.parquet")
         import pyarrow
-        import pyarrow.parquet
 
         columns: dict[str, Any] = {**self.columns, "flags": self.flag_words}
         table = pyarrow.table({name: pyarrow.array(values) for name, values in columns.items()})
@@ -165,6 +166,8 @@ def checked_table_name(path: str | Path, inputs: Iterable[Path] = ()) -> Output:
     if target.suffix.lower() not in MARKS:
         raise InputError("unknown ending of a table", where=str(target), value=target.suffix, allowed=", ".join(MARKS))
     output = Output(target, MARKS[target.suffix.lower()], True)
+    if target.suffix.lower() == ".parquet":
+        import_extra("pyarrow.parquet")
     check_files([output], inputs)
     return output
 

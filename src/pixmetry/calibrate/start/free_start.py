@@ -14,6 +14,7 @@ from scipy.sparse import csr_matrix
 from pixmetry.calibrate.bundle.network import Network
 from pixmetry.calibrate.start.reconstruction import COARSE, FINE, Reconstruction
 from pixmetry.calibrate.start.resection import intersect, rays
+from pixmetry.core.extras import import_extra
 
 DISTANCES = (1.25, 2.1, 0.8, 3.6, 0.5, 6.0)  # principal distances to try, in widths of the frame
 FEWEST_COMMON = 6  # points of a pair: five give its relative orientation
@@ -80,7 +81,7 @@ def _parallax(network: Network, a: np.ndarray, b: np.ndarray) -> float:
 
 def seed(work: Reconstruction, i: int, j: int) -> bool:
     """Orient two images relative to each other (base 1) and intersect their points; False if it cannot be done."""
-    import cv2
+    cv2 = import_extra("cv2")
 
     a, b = shared(work.network, i, j)
     good = np.isfinite(work.uv[a]).all(axis=1) & np.isfinite(work.uv[b]).all(axis=1)

@@ -11,6 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pixmetry.core.extras import import_extra
+
 FEWEST = 4  # points from which an image is posed: three determine it, a fourth selects among the answers
 FLAT = 0.02  # thickness by extent below which points count as a plane
 RIGHT_SHARE = 0.6  # of an image's points that must fit
@@ -47,7 +49,7 @@ def pose(uv: np.ndarray, xyz: np.ndarray, tolerance: float) -> Pose | None:
     tolerance : float
         Error of a direction, beyond which a point counts as wrong.
     """
-    import cv2
+    cv2 = import_extra("cv2")
 
     good = np.isfinite(uv).all(axis=1) & np.isfinite(xyz).all(axis=1)
     if good.sum() < FEWEST:
@@ -87,7 +89,7 @@ def pose(uv: np.ndarray, xyz: np.ndarray, tolerance: float) -> Pose | None:
 
 
 def _refined(xyz: np.ndarray, uv: np.ndarray, turn: np.ndarray, shift: np.ndarray, tolerance: float) -> Pose | None:
-    import cv2
+    cv2 = import_extra("cv2")
 
     answer = _judged(xyz, uv, turn, shift, tolerance)
     for _ in range(3):
@@ -106,7 +108,7 @@ def _refined(xyz: np.ndarray, uv: np.ndarray, turn: np.ndarray, shift: np.ndarra
 
 
 def _judged(xyz: np.ndarray, uv: np.ndarray, turn: np.ndarray, shift: np.ndarray, tolerance: float) -> Pose | None:
-    import cv2
+    cv2 = import_extra("cv2")
 
     if not (np.isfinite(turn).all() and np.isfinite(shift).all()):
         return None

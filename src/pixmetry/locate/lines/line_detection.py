@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from pixmetry.core.errors import InputError
+from pixmetry.core.extras import import_extra
 from pixmetry.core.threads import map_tiles
 from pixmetry.locate.detect.background import scale_of
 from pixmetry.locate.detect.targets import Flag
@@ -122,7 +123,7 @@ def _noise_map(light: np.ndarray, noise: NoiseModel | None, least_dn: float) -> 
     J. Immerkær, Computer Vision and Image Understanding 64(2), 300 (1996): a mask that planes and edges along the grid do not pass; here
     its median by blocks instead of the mean, which lines and edges raise.
     """
-    import cv2
+    cv2 = import_extra("cv2")
 
     if noise is not None:
         return np.sqrt(noise.variance_dn2(cv2.GaussianBlur(light, (0, 0), 2.0))).astype(np.float32)
@@ -140,7 +141,7 @@ def _noise_map(light: np.ndarray, noise: NoiseModel | None, least_dn: float) -> 
 
 def _points(light: np.ndarray, sigma: np.ndarray, kind: int, polarity: int, threads: int | None) -> tuple[np.ndarray, np.ndarray]:
     """Points on ridges or steps, shape (rows, cols, 5), and the scale that told of each."""
-    import cv2
+    cv2 = import_extra("cv2")
 
     rows = light.shape[0]
     points, scale = np.zeros((*light.shape, kernels.FIELDS), np.float32), np.zeros(light.shape, np.float32)

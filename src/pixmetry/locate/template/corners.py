@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from pixmetry.core.errors import InputError
+from pixmetry.core.extras import import_extra
 from pixmetry.core.threads import map_tiles
 from pixmetry.locate.detect.grids import Grid, eight_bit, no_grid
 from pixmetry.locate.detect.targets import Flag, Positions
@@ -51,7 +52,7 @@ def find_chessboard(frame: np.ndarray, inner_corners: tuple[int, int]) -> Grid:
     corners for calibration", BMVC 2018), then the older one, which follows quadrangles. Both want 8 bits: the frame is stretched between
     its 0.1 and 99.9 % quantiles for them and not changed itself.
     """
-    import cv2
+    cv2 = import_extra("cv2")
 
     cols, rows = (int(n) for n in inner_corners)
     if min(cols, rows) < 3:

@@ -12,6 +12,7 @@ from pydantic import model_validator
 from pixmetry.camera.signal import Kind, Signal, Windows
 from pixmetry.camera.source import Parameters, Source, quantity
 from pixmetry.core.errors import InputError, ParameterError
+from pixmetry.core.extras import import_extra
 from pixmetry.core.random import Stream
 
 BLOCK = 16  # px: coded pictures are whole macroblocks; what a frame lacks is completed by repeating its last row and column
@@ -65,7 +66,7 @@ class Coder:
 
     def follow(self, frame: np.ndarray) -> np.ndarray:
         """Code and decode the next frame, shape (rows, cols); the result is of its dtype."""
-        av = _library()
+        av = import_extra("av")
         rows, cols = frame.shape
         wide = max(cols + -cols % BLOCK, LEAST_COLS[self.params.codec])
         picture = np.pad(frame, ((0, -rows % BLOCK), (0, wide - cols)), mode="edge")
@@ -81,18 +82,6 @@ class Coder:
         self.count += 1
         self.stored_bytes += sum(packet.size for packet in packets)
         return np.ascontiguousarray(_luma(decoded[0])[:rows, :cols]).astype(frame.dtype)
-
-
-def _library() -> ModuleType:
-    try:
-        import av
-    except ImportError:
-        raise InputError(
-            "the video codecs need the package 'av'",
-            where="storage.video_codec",
-            remedy="pip install 'pixmetry[video]', or switch this source off",
-        ) from None
-    return av
 
 
 def _open(av: ModuleType, params: VideoCodec, shape: tuple[int, int]) -> tuple[Any, Any]:
