@@ -12,7 +12,7 @@ from scipy import stats
 from calibrate.networks import Simulated, simulate
 from pixmetry.calibrate.bundle import loosened, settling
 from pixmetry.calibrate.bundle.bundle import adjust
-from pixmetry.calibrate.bundle.network import Calibration, Finding, ScaleBars
+from pixmetry.calibrate.bundle.network import Calibration, ScaleBars
 from pixmetry.calibrate.bundle.solve import Options, calibrate_network
 from pixmetry.calibrate.checks import known_checks, known_residuals
 from pixmetry.calibrate.checks.findings import findings_of, gross_error_findings, known_findings
@@ -22,6 +22,7 @@ from pixmetry.calibrate.page.control import control_points
 from pixmetry.calibrate.page.tables import scale_bars
 from pixmetry.calibrate.records import known_record, sizes
 from pixmetry.core.errors import InputError
+from pixmetry.core.finding import Finding
 
 RATE = 1e-6
 QUICK = Options(folds=0, false_alarms=RATE)

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from pixmetry.calibrate.bundle.model import NAMES, CameraModel, Sensor
-from pixmetry.calibrate.bundle.network import Adjustment, Calibration, Finding, Network, ScaleBars, State
+from pixmetry.calibrate.bundle.network import Adjustment, Calibration, Network, ScaleBars, State
+from pixmetry.core.finding import Finding
 
 NOISE_PX = 0.04
 SIZE = (1280, 1024)

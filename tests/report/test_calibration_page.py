@@ -14,7 +14,7 @@ import pytest
 
 from chance import rng_of
 from pixmetry.calibrate.bundle.model import NAMES, Sensor
-from pixmetry.calibrate.bundle.network import Adjustment, Calibration, Finding
+from pixmetry.calibrate.bundle.network import Adjustment, Calibration
 from pixmetry.calibrate.checks.quality import image_records
 from pixmetry.calibrate.page.control import control_points
 from pixmetry.calibrate.page.figures import (
@@ -36,6 +36,7 @@ from pixmetry.calibrate.page.space import ellipse, field_map, largest_axis, plan
 from pixmetry.calibrate.page.tables import gross_errors, images, network_facts, parameters, scale_bars
 from pixmetry.calibrate.page.text import as_given, p_text, projection_levels, sentence, summary_text, typeset, worth
 from pixmetry.core.errors import InputError
+from pixmetry.core.finding import Finding
 from report import calibrations
 from report.test_page import Page
 

@@ -11,13 +11,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pixmetry.calibrate.bundle.model import NAMES
-from pixmetry.calibrate.bundle.network import PER_IMAGE_NAMES, Calibration, Finding, Network
+from pixmetry.calibrate.bundle.network import PER_IMAGE_NAMES, Calibration, Network
 from pixmetry.calibrate.checks.check_points import CheckPoints, refuse_known, with_check_points
 from pixmetry.calibrate.files.record import StoredCalibration, read_calibration
 from pixmetry.calibrate.files.write import check_folder, write_line_results, write_results
 from pixmetry.camera.camera import Camera
 from pixmetry.core.errors import InputError, PixmetryError
 from pixmetry.core.extras import import_extra
+from pixmetry.core.finding import Finding
 from pixmetry.files.provenance import InputHashes, provenance_record
 
 if TYPE_CHECKING:

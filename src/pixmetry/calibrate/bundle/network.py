@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from pixmetry.calibrate.bundle.model import NAMES, CameraModel
+from pixmetry.core.finding import Finding
 
 SCALE, SHIFT = 6, 7  # places of the per-image x-scale and x-shift behind the six of the pose
 PER_IMAGE = 8
@@ -231,24 +232,6 @@ class Adjustment:
         own = {f"{self.network.cameras[index].name}:{name}": name for name in NAMES}  # an image or a point may have the camera's name
         rows = [i for i, name in enumerate(self.free_columns) if name in own]
         return tuple(own[self.free_columns[i]] for i in rows), self.covariance[np.ix_(rows, rows)]
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One sentence on what was found and one on what to do.
-
-    Parameters
-    ----------
-    kind : str
-        A short name, such as ``"flatness"``, ``"gross_error"``, ``"x_scale_drift"``, ``"correlation"``.
-    text, advice : str
-    level : {"note", "warning"}
-    """
-
-    kind: str
-    text: str
-    advice: str = ""
-    level: str = "note"
 
 
 @dataclass(frozen=True)

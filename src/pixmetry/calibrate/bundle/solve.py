@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 
 from pixmetry.calibrate.bundle.model import NAMES
-from pixmetry.calibrate.bundle.network import PER_IMAGE_NAMES, Adjustment, Calibration, Finding, Network, State
+from pixmetry.calibrate.bundle.network import PER_IMAGE_NAMES, Adjustment, Calibration, Network, State
 from pixmetry.calibrate.bundle.options import Options
 from pixmetry.calibrate.bundle.settling import Progress, Settled, adjust_with, settle
 from pixmetry.core.errors import InputError, MeasureError
+from pixmetry.core.finding import Finding
 from pixmetry.core.threads import single_threaded_blas
 
 __all__ = ["Options", "calibrate_network"]

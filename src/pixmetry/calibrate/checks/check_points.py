@@ -16,9 +16,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pixmetry.calibrate.bundle.network import Adjustment, Calibration, Finding, Network, State
+from pixmetry.calibrate.bundle.network import Adjustment, Calibration, Network, State
 from pixmetry.calibrate.checks.quality import p_words, plain
 from pixmetry.core.errors import InputError
+from pixmetry.core.finding import Finding
 
 if TYPE_CHECKING:
     from pixmetry.calibrate.bundle.bundle_layout import Layout

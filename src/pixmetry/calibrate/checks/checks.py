@@ -11,11 +11,12 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from pixmetry.calibrate.bundle.network import Adjustment, Finding, Network, State
+from pixmetry.calibrate.bundle.network import Adjustment, Network, State
 from pixmetry.calibrate.checks.quality import plain
 from pixmetry.calibrate.start.free_start import common_points
 from pixmetry.calibrate.start.resection import FEWEST, FLAT, thickness
 from pixmetry.core.errors import InputError, MeasureError
+from pixmetry.core.finding import Finding
 
 NEAR_ORIGIN = 0.1  # of the frame: image coordinates that all lie nearer to the origin are not pixels
 ONE_PLACE = 0.02  # of the frame: image coordinates that all lie in such a part of it have the wrong unit

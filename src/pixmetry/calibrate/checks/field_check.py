@@ -7,12 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from pixmetry.calibrate.bundle.network import Adjustment, Finding, Network
+from pixmetry.calibrate.bundle.network import Adjustment, Network
 from pixmetry.calibrate.checks.hold_out import hold_out_record, left_out
 from pixmetry.calibrate.checks.quality import p_words
 from pixmetry.calibrate.start.fit_to_control import brought_to
 from pixmetry.calibrate.start.resection import similarity
 from pixmetry.core.errors import InputError, MeasureError
+from pixmetry.core.finding import Finding
 
 LEAST_FIELD = 6  # fixed points: with fewer there is little to tell of a field
 FLAT = 1e-3  # nominal coordinates are those of a plane if their least extent is below this share of the largest

@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 
 from pixmetry.calibrate.bundle.eccentric import Eccentricity
-from pixmetry.calibrate.bundle.network import Adjustment, Finding, Network
+from pixmetry.calibrate.bundle.network import Adjustment, Network
 from pixmetry.calibrate.checks.hold_out import WORSE
 from pixmetry.calibrate.checks.lost_control import mostly_lost
 from pixmetry.calibrate.checks.quality import p_words, plain
+from pixmetry.core.finding import Finding
 
 ORDER = (  # of kinds, among findings of the same level; what is not named here comes between the two parts
     "start", "determination", "images_left_out", "x_scale_drift", "bad_images", "images_rejected", "correlation", "flatness", "lost_points",

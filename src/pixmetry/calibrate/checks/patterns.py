@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from pixmetry.calibrate.bundle.network import Adjustment, Finding
+from pixmetry.calibrate.bundle.network import Adjustment
 from pixmetry.calibrate.checks.added_terms import AddedTerms, Terms, whitening
 from pixmetry.calibrate.checks.quality import p_words, redundancy_of
 from pixmetry.core.errors import MeasureError
+from pixmetry.core.finding import Finding
 from pixmetry.core.threads import single_threaded_blas
 
 HATS = 8  # nodes of a piecewise linear curve

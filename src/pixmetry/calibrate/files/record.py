@@ -14,12 +14,13 @@ from typing import Any, TypeVar
 import numpy as np
 
 from pixmetry.calibrate.bundle.model import NAMES, CameraModel, Sensor
-from pixmetry.calibrate.bundle.network import Calibration, Finding
+from pixmetry.calibrate.bundle.network import Calibration
 from pixmetry.calibrate.checks.control import control_of
 from pixmetry.calibrate.lines.line_calibration import LineCalibration
 from pixmetry.core.checksums import check_record, sealed
 from pixmetry.core.config import read_text
 from pixmetry.core.errors import InputError
+from pixmetry.core.finding import Finding
 
 RESULT_SCHEMA = "pixmetry/calibration-result/1"
 LINES_SCHEMA = "pixmetry/line-calibration-result/1"
@@ -125,7 +126,7 @@ def _record(calibration: Calibration) -> dict[str, Any]:
         },
         "control_points": _control_record(calibration),
         "covariance": {"columns": a.free_columns, **packed(a.covariance)},
-        "findings": [asdict(finding) for finding in calibration.findings],
+        "findings": [finding.to_record() for finding in calibration.findings],
         "notes": a.notes,
         "tests": calibration.tests,
         "grids": calibration.grids,
@@ -162,7 +163,7 @@ def lines_json(calibration: LineCalibration, folder: str | Path = "", beside: It
         "iterations": result.iterations,
         **result.to_record(),
         "curves": calibration.curves(),
-        "findings": [asdict(finding) for finding in calibration.findings],
+        "findings": [finding.to_record() for finding in calibration.findings],
         "provenance": calibration.provenance,
     }
     return _json(sealed(_plain(record), folder, beside)) + "\n"
@@ -260,7 +261,7 @@ def _stored(record: Mapping[str, Any]) -> StoredCalibration:
         points=tuple(points["name"]),
         xyz=xyz,
         point_covariance=six[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3),
-        findings=tuple(Finding(**finding) for finding in record["findings"]),
+        findings=tuple(Finding.from_record(finding) for finding in record["findings"]),
         **{name: record[name] for name in ("unit", "sigma0", "dof", "datum", "tests", "grids", "provenance")},
     )
 

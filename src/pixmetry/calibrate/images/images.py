@@ -10,11 +10,12 @@ from pathlib import Path
 import numpy as np
 
 from pixmetry.calibrate.bundle.model import CameraModel
-from pixmetry.calibrate.bundle.network import Finding, Network
+from pixmetry.calibrate.bundle.network import Network
 from pixmetry.calibrate.images.numbering import chessboard_reference, consistent
 from pixmetry.calibrate.images.targets import KINDS, Seen, Wanted, board_size, see
 from pixmetry.camera.camera import Camera
 from pixmetry.core.errors import InputError, MeasureError
+from pixmetry.core.finding import Finding
 from pixmetry.core.threads import imap_tiles
 from pixmetry.files.formats import frame_name
 from pixmetry.files.images import PICTURE_ENDINGS, picture_files

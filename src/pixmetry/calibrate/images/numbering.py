@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from pixmetry.calibrate.bundle.network import Finding
+from pixmetry.core.finding import Finding
 
 CLEAR = 0.2  # of the marks, by which a turn must agree worse than the best one to be ruled out
 MARKED_AREA = 1.35  # of a dot over that of those around it, from which it is a mark

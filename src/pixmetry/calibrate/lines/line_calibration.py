@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from pixmetry.calibrate.bundle.model import CameraModel
-from pixmetry.calibrate.bundle.network import Finding
 from pixmetry.calibrate.lines.plumb_line import PlumbLineResult
+from pixmetry.core.finding import Finding
 
 RADII = 101
 TERMS = {"k1": 3, "k2": 5, "k3": 7, "k4": 9, "k5": 11}  # power of the radius

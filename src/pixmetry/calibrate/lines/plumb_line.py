@@ -24,10 +24,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pixmetry.calibrate.bundle.model import NAMES, CameraModel, Sensor
-from pixmetry.calibrate.bundle.network import Finding
 from pixmetry.calibrate.lines.line_residuals import AxisResiduals, axis_residuals, compare_axes, correlation_inflation
 from pixmetry.calibrate.lines.plumb_line_fit import LineFit, LineTable, adjust_lines, refuse
 from pixmetry.core.errors import InputError
+from pixmetry.core.finding import Finding
 from pixmetry.core.number import Estimates
 
 FREE = ("k1", "k2", "p1", "p2")

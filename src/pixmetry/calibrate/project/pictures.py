@@ -7,11 +7,11 @@ from dataclasses import replace
 from pathlib import Path
 
 from pixmetry.calibrate.bundle.model import CameraModel
-from pixmetry.calibrate.bundle.network import Finding
 from pixmetry.calibrate.project.coordinates import Measured, image_facts
 from pixmetry.calibrate.project.points import Known
 from pixmetry.calibrate.project.schema import PicturesModel
 from pixmetry.calibrate.project.tables import Table
+from pixmetry.core.finding import Finding
 
 Progress = Callable[[str, int, int], None]
 

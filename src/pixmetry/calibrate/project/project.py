@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from pixmetry.calibrate.bundle.model import CameraModel, Sensor
-from pixmetry.calibrate.bundle.network import Finding, Network
+from pixmetry.calibrate.bundle.network import Network
 from pixmetry.calibrate.checks.check_points import CheckPoints
 from pixmetry.calibrate.project.cameras import Described, described
 from pixmetry.calibrate.project.coordinates import ImageCoordinates, Measured, measured, upwards
@@ -22,6 +22,7 @@ from pixmetry.calibrate.project.straight_lines import LinePositions, lines_of_pi
 from pixmetry.calibrate.project.tables import Table, first_few
 from pixmetry.camera.camera import Camera
 from pixmetry.core.config import Settings, load_yaml, validate
+from pixmetry.core.finding import Finding
 
 Progress = Callable[[str, int, int], None]
 FIELD_OF = {"fixed": "fixed", "weighted": "fixed", "free": "free"}  # what `known` says; of nominal points images left out decide

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from pixmetry.calibrate.bundle.model import CameraModel
-from pixmetry.calibrate.bundle.network import Finding
 from pixmetry.calibrate.project.coordinates import ImageCoordinates, measured
 from pixmetry.calibrate.project.schema import PicturesModel
 from pixmetry.calibrate.project.tables import Table
 from pixmetry.core.errors import InputError, MeasureError
+from pixmetry.core.finding import Finding
 
 Progress = Callable[[str, int, int], None]
 LEAST_LENGTH = 0.25  # of the frame's shorter side: what is shorter hardly tells how a line is bent

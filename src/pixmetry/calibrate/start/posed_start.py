@@ -6,10 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from pixmetry.calibrate.bundle.network import Finding, Network, Poses, State
+from pixmetry.calibrate.bundle.network import Network, Poses, State
 from pixmetry.calibrate.start.free_start import start_interiors
 from pixmetry.calibrate.start.reconstruction import Reconstruction
 from pixmetry.calibrate.start.resection import fitted, thickness
+from pixmetry.core.finding import Finding
 
 ANYHOW = 0.3  # rad: how far rays may miss each other under rough poses
 POSES_FIT = 0.5  # of FINE, as an rms: what a start must reach; a quarter of the image points may be gross errors
