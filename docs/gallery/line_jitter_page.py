@@ -10,8 +10,9 @@ from gallery.page import Page, show, table
 from pixmetry.calibrate.lines.line_residuals import AxisResiduals, compare_axes
 from pixmetry.calibrate.lines.row_jitter import Sampling, jitter_from_axes
 from pixmetry.core.number import Estimates
-from pixmetry.report.drawing import AMBER, BLUE, INK, RED, SOFT, Picture, canvas, picture
+from pixmetry.report.drawing import AMBER, BLUE, INK, RED, SOFT, canvas
 from pixmetry.report.numbers import fixed, significant, uncertain
+from pixmetry.report.page import Figure
 
 COMMAND = "python benchmarks/study_line_jitter.py"
 WAYS = {
@@ -28,7 +29,7 @@ def predicted_x_px(level: Level, gain: float) -> float:
     return float(np.sqrt(noise + (gain * level.jitter_ns / PIXEL_NS) ** 2 / AVERAGED))
 
 
-def residual_figure() -> Picture:
+def residual_figure() -> Figure:
     """Residuals of an upright and of a lying line without jitter and with 3 ns."""
     run = stored()
     levels = [level.jitter_ns for level in run.levels]
@@ -52,10 +53,10 @@ def residual_figure() -> Picture:
             f"What the calibration leaves over along one upright and one lying line, mean of {AVERAGED} rows (columns) each. Jitter shakes "
             "the rows sideways: upright lines show it, lying ones do not."
         )
-        return picture(figure, "line-jitter-residuals", alt, caption)
+        return Figure(figure, "line-jitter-residuals", alt, caption)
 
 
-def size_figure() -> Picture:
+def size_figure() -> Figure:
     """Residuals in x and y against the jitter."""
     run = stored()
     jitter = [level.jitter_ns for level in run.levels]
@@ -79,10 +80,10 @@ def size_figure() -> Picture:
             "Root mean square of all residuals along x and y against the jitter of the frame grabber, and the chapter's two values. "
             "Dashed: noise as in y, and the jitter of the rows that were averaged."
         )
-        return picture(figure, "line-jitter-size", alt, caption)
+        return Figure(figure, "line-jitter-size", alt, caption)
 
 
-def found_figure() -> Picture:
+def found_figure() -> Figure:
     """Jitter found less jitter put in, by each way."""
     run = stored()
     with canvas(2.6) as (figure, axes):
@@ -105,7 +106,7 @@ def found_figure() -> Picture:
             "Jitter found less jitter put in, with two standard uncertainties. Where it is not significant there is a limit instead "
             "(table)."
         )
-        return picture(figure, "line-jitter-found", alt, caption)
+        return Figure(figure, "line-jitter-found", alt, caption)
 
 
 def found(level: Level, way: str) -> Estimates:

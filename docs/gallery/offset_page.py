@@ -20,8 +20,9 @@ from gallery.offset import (
 )
 from gallery.page import Page, show, table
 from pixmetry.locate.bound.closed_bounds import line_read
-from pixmetry.report.drawing import AMBER, BLUE, INK, RED, SOFT, Picture, canvas, picture
+from pixmetry.report.drawing import AMBER, BLUE, INK, RED, SOFT, canvas
 from pixmetry.report.numbers import MINUS, fixed
+from pixmetry.report.page import Figure
 
 WAYS = {
     "centroid": {"color": RED, "marker": "o"},
@@ -32,7 +33,7 @@ WAYS = {
 NAMES = {"soft threshold": "black subtracted, soft threshold", "fit": "fit that knows the cut-off"}
 
 
-def error_figure() -> Picture:
+def error_figure() -> Figure:
     """Error along the line's way through three pixels, with and without the offset."""
     with canvas(3.9, nrows=2, sharex=True, sharey=True) as (figure, panels):
         for axes, offset in zip(panels, (OFFSET_DN, 0.0), strict=True):
@@ -54,10 +55,10 @@ def error_figure() -> Picture:
             "Error of the row's centroid on the line's way through three pixels. Above, six grey values are lost at the foot of the "
             "line; below, none. Blue: grey values of any size; red: whole numbers."
         )
-        return picture(figure, "offset-error", alt, caption)
+        return Figure(figure, "offset-error", alt, caption)
 
 
-def depth_figure() -> Picture:
+def depth_figure() -> Figure:
     """First amplitude against the offset."""
     fine, coarse = np.arange(0.25, 40.1, 0.25), np.arange(2.0, 41.0, 2.0)
     with canvas(2.7) as (figure, axes):
@@ -79,10 +80,10 @@ def depth_figure() -> Picture:
             "Amplitude of the first wave, sin 2πc, against the offset; the sign tells on which side the error begins. Lines: from the "
             "integral below; marks: from the rows. A larger offset can do less harm than a smaller one."
         )
-        return picture(figure, "offset-depth", alt, caption)
+        return Figure(figure, "offset-depth", alt, caption)
 
 
-def cures_figure() -> Picture:
+def cures_figure() -> Figure:
     """Error with noise against the black level for each way to locate the line."""
     found = experiment.cures()
     with canvas(2.9) as (figure, axes):
@@ -107,7 +108,7 @@ def cures_figure() -> Picture:
             f"negative is lost. The centroids of the grey values as they are want black to be lost, the soft threshold wants it "
             "kept, and the fit does not care."
         )
-        return picture(figure, "offset-cures", alt, caption)
+        return Figure(figure, "offset-cures", alt, caption)
 
 
 def _micro(value: float) -> str:

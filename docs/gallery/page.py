@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from pixmetry.report.drawing import Picture, escape
+from pixmetry.report.drawing import escape
+from pixmetry.report.page import Figure
 
 WIDTH_PX = 560
 # The colours of the report's figures, light and dark, with a ground of their own, so that they can be read on any page.
@@ -23,14 +24,14 @@ class Page:
 
     name: str
     text: str
-    pictures: tuple[Picture, ...] = ()
+    pictures: tuple[Figure, ...] = ()
 
     def files(self) -> dict[str, str]:
         """What it is made of: file name and content."""
         return {f"{self.name}.md": self.text, **{f"{p.name}.svg": standalone(p) for p in self.pictures}}
 
 
-def standalone(shown: Picture) -> str:
+def standalone(shown: Figure) -> str:
     """A picture of the report as a file of its own: with a size, a name space, colours and a ground."""
     head, rest = shown.svg.split(">", 1)
     left, top, width, height = (float(v) for v in head.split('viewBox="')[1].split('"')[0].split())
@@ -39,7 +40,7 @@ def standalone(shown: Picture) -> str:
     return f"{head.replace('<svg', f'<svg {size}', 1)}><style>{STYLE}</style>{ground}{rest}\n"
 
 
-def show(shown: Picture) -> str:
+def show(shown: Figure) -> str:
     """A figure and its caption in a page's text."""
     return f'<img src="{shown.name}.svg" width="{WIDTH_PX}" alt="{escape(shown.alt)}">\n\n*{shown.caption}*\n'
 

@@ -7,7 +7,8 @@ import numpy as np
 from gallery import threshold as experiment
 from gallery.page import Page, show, table
 from gallery.threshold import DISC, SPOT, Sweep
-from pixmetry.report.drawing import AMBER, BLUE, INK, RED, SOFT, Picture, canvas, picture
+from pixmetry.report.drawing import AMBER, BLUE, INK, RED, SOFT, canvas
+from pixmetry.report.page import Figure
 
 LINES = {
     "centroid": {"color": RED, "marker": "o"},
@@ -16,7 +17,7 @@ LINES = {
 }
 
 
-def sweep_figure(both: tuple[Sweep, Sweep]) -> Picture:
+def sweep_figure(both: tuple[Sweep, Sweep]) -> Figure:
     """Error against threshold of three centroids, and of the fit, which has no threshold."""
     with canvas(4.3, nrows=2, sharex=True, sharey=True) as (figure, panels):
         for axes, found in zip(panels, both, strict=True):
@@ -39,10 +40,10 @@ def sweep_figure(both: tuple[Sweep, Sweep]) -> Picture:
             "Error (root mean square of x and y over 800 targets) against the threshold. Red and blue keep the grey values above the "
             "threshold as they are (hard threshold), amber takes the threshold from them (soft)."
         )
-        return picture(figure, "threshold-sweep", alt, caption)
+        return Figure(figure, "threshold-sweep", alt, caption)
 
 
-def cause_figure(both: tuple[Sweep, Sweep]) -> Picture:
+def cause_figure(both: tuple[Sweep, Sweep]) -> Figure:
     """The centroid's error with noise, without noise, and what is left of it in the mean of many frames."""
     with canvas(4.1, nrows=2, sharex=True, sharey=True) as (figure, panels):
         for axes, found in zip(panels, both, strict=True):
@@ -66,10 +67,10 @@ def cause_figure(both: tuple[Sweep, Sweep]) -> Picture:
             "The rise is there without any noise: from a threshold of 40 on the dashed line (no noise) nearly is the red one. What the "
             "blue line shows does not go away however many frames are averaged."
         )
-        return picture(figure, "threshold-cause", alt, caption)
+        return Figure(figure, "threshold-cause", alt, caption)
 
 
-def phase_figure(threshold_dn: float = 30.0) -> Picture:
+def phase_figure(threshold_dn: float = 30.0) -> Figure:
     """Error without noise against the place of the spot in its pixel."""
     phase = np.linspace(-0.5, 0.5, 401)
     with canvas(2.5) as (figure, axes):
@@ -91,7 +92,7 @@ def phase_figure(threshold_dn: float = 30.0) -> Picture:
             f"middle of a pixel). With a hard threshold each jump is a pixel that comes in or drops out with its whole grey "
             "value; with a soft one it comes in at zero."
         )
-        return picture(figure, "threshold-phase", alt, caption)
+        return Figure(figure, "threshold-phase", alt, caption)
 
 
 def _title(found: Sweep) -> str:

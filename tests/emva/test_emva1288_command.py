@@ -345,7 +345,7 @@ def test_all_files_or_none(known: Path, tmp_path: Path, monkeypatch: pytest.Monk
     def broken(*_: object) -> None:
         raise InputError("no room", where="disk")
 
-    monkeypatch.setattr("pixmetry.emva.page.pdf.render_pdf", broken)
+    monkeypatch.setattr("pixmetry.report.pdf_of", broken)
     with pytest.raises(InputError, match="no room"):
         write_files(sheet, files)
     assert [p.name for p in tmp_path.iterdir()] == ["a.json"] and files["json"].read_bytes() == before

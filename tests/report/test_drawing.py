@@ -10,7 +10,8 @@ import numpy as np
 
 from pixmetry import locate
 from pixmetry.locate.overlay import write_overlay
-from pixmetry.report.drawing import canvas, own_style, picture
+from pixmetry.report.drawing import canvas, own_style
+from pixmetry.report.page import Figure
 from pixmetry.report.paper import paper
 
 THEIRS = {"text.usetex": True, "font.family": "serif", "axes.grid": True, "lines.linewidth": 9.0, "savefig.facecolor": "red"}
@@ -20,7 +21,7 @@ def figure() -> str:
     with canvas(2.0) as (drawn, axes):
         axes.plot([1, 2, 3], [1, 4, 9])
         axes.set_xlabel("µ_y / DN & 50 %")
-        return picture(drawn, "one", "alt", "caption").svg
+        return Figure(drawn, "one", "alt", "caption").svg
 
 
 def page() -> bytes:

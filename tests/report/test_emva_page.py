@@ -29,10 +29,10 @@ from pixmetry.emva.page.content import (
 )
 from pixmetry.emva.page.facts import facts
 from pixmetry.emva.page.figures import MARGINS_IN, STRETCHES, fill, outline, time_of
-from pixmetry.emva.page.page import all_plots, render
+from pixmetry.emva.page.page import all_plots, page_of
 from pixmetry.emva.records import DataSheet, Results
 from pixmetry.report.drawing import STYLE, plain_log
-from pixmetry.report.templates import share_styles
+from pixmetry.report.html import html_of, share_styles
 from report import emva_sheets
 from report.emva_sheets import K, results, sheet
 from report.test_page import Page
@@ -40,7 +40,7 @@ from report.test_page import Page
 
 @lru_cache(maxsize=1)
 def source() -> str:
-    return render(sheet())
+    return html_of(page_of(sheet()))
 
 
 @lru_cache(maxsize=1)
@@ -92,7 +92,7 @@ def test_a_lower_limit_is_rounded_down_and_marked(value: float, u: float, unit: 
 
 
 def test_a_capacity_that_was_not_reached_is_a_lower_limit_everywhere() -> None:
-    found = Page(render(with_value("u_e_sat", Number(13987.6, 24.0, 40.0, "e⁻", "", "the series ends", kind=LOWER_LIMIT)))).text
+    found = Page(html_of(page_of(with_value("u_e_sat", Number(13987.6, 24.0, 40.0, "e⁻", "", "the series ends", kind=LOWER_LIMIT))))).text
     assert found.count("> 13980 (95 %) e⁻") == 3
     assert "µ e.sat > 13980 (95 %) e⁻" in found  # the headline
 
@@ -123,7 +123,7 @@ def test_every_value_is_in_the_table_of_all_values() -> None:
 
 
 def test_a_key_that_no_list_knows_is_shown() -> None:
-    text = Page(render(with_value("extra_value", Number(3.25, 0.1, 5.0, "DN")))).text
+    text = Page(html_of(page_of(with_value("extra_value", Number(3.25, 0.1, 5.0, "DN"))))).text
     assert "extra_value" in text
     assert "3.25 ± 0.10 DN" in text
 
@@ -301,7 +301,7 @@ def test_a_hot_pixel_does_not_squash_a_profile() -> None:
 
 def test_without_light_and_stacks_a_sentence_stands_in_place_of_each_plot() -> None:
     bare = results(photons_known=False, stacks=False)
-    found = Page(render(sheet(bare)))
+    found = Page(html_of(page_of(sheet(bare))))
     missing = [p for p in all_plots(bare) if not p.draw]
     assert len(missing) == 4 + 12
     assert found.text.count("Not drawn: this plot needs") == len(missing)
@@ -338,7 +338,7 @@ def test_levels_beyond_saturation_have_no_signal_to_noise_ratio() -> None:
 
 
 def test_colour_has_its_channels_side_by_side_and_all_plots_of_each() -> None:
-    found = Page(render(emva_sheets.colour_sheet()))
+    found = Page(html_of(page_of(emva_sheets.colour_sheet())))
     figures = [a for a in found.of("svg") if "figure" in a.get("class", "")]
     assert len(figures) == 2 * (len(TITLES) - 1) + 2
     names = [attrs["id"] for _, attrs in found.elements if "id" in attrs]
@@ -391,7 +391,7 @@ def test_shared_styles_can_be_put_back() -> None:
 def test_what_was_given_is_escaped_and_the_same_sheet_gives_the_same_page() -> None:
     assert "Simulated &lt;camera&gt; &amp; co." in source()
     assert "<camera>" not in source()
-    assert render(sheet()) == source()
+    assert html_of(page_of(sheet())) == source()
 
 
 def test_provenance_and_licence_end_the_page() -> None:
@@ -402,7 +402,7 @@ def test_provenance_and_licence_end_the_page() -> None:
 
 def test_importing_the_page_and_the_pdf_is_cheap() -> None:
     heavy = ("matplotlib", "jinja2", "scipy", "numba", "pydantic")
-    code = f"import sys, pixmetry.emva.page.page, pixmetry.emva.page.pdf; print([m for m in {heavy} if m in sys.modules])"
+    code = f"import sys, pixmetry.emva.page.page, pixmetry.report.pdf; print([m for m in {heavy} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 
@@ -426,7 +426,7 @@ def test_a_camera_has_one_verdict_that_of_its_worst_channel() -> None:
 
 def test_the_headline_is_of_the_document_that_applies_and_has_its_u() -> None:
     assert "η 45.00 ± 0.23 %" in page().text[: page().text.index("Quantity")]
-    text = Page(render(sheet(bent(5.0)))).text
+    text = Page(html_of(page_of(sheet(bent(5.0))))).text
     head = text[: text.index("Quantity")]
     assert "µ p.min 20.00 ± 0.10 photon" in head
     assert "η" not in head

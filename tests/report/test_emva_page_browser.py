@@ -7,7 +7,8 @@ from typing import Any
 
 import pytest
 
-from pixmetry.emva.page.page import render
+from pixmetry.emva.page.page import page_of
+from pixmetry.report import html_of
 from report import emva_sheets
 
 pytestmark = pytest.mark.browser
@@ -21,7 +22,7 @@ SHEETS = {
 @pytest.fixture(scope="module", params=SHEETS)
 def address(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> str:
     path = tmp_path_factory.mktemp("emva") / "sheet.html"
-    path.write_text(render(SHEETS[request.param]()), encoding="utf-8")
+    path.write_text(html_of(page_of(SHEETS[request.param]())), encoding="utf-8")
     return path.as_uri()
 
 

@@ -8,7 +8,6 @@ import re
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,6 +24,7 @@ VARIABLES = {INK: "ink", SOFT: "soft", GRID: "grid", BLUE: "blue", RED: "red", A
 WIDTH_IN = 3.7  # of a figure that fills a phone, and half of a sheet
 DENSE = 1500  # points in a line from which it is stored as pixels
 MAP_SIDE = 224  # pixels of a map thumbnail
+LONG_PATH = 10_000  # characters of a path, from which on a tenth of a point has to do
 STYLE: Any = {
     "svg.fonttype": "none",
     "svg.hashsalt": "pixmetry",  # the same figure gives the same file
@@ -60,16 +60,6 @@ STYLE: Any = {
 }
 
 
-@dataclass(frozen=True)
-class Picture:
-    """A figure ready for the page: its markup, what it shows in words, and what there is to see in it."""
-
-    name: str
-    svg: str
-    alt: str
-    caption: str
-
-
 _style_lock = threading.RLock()  # matplotlib's settings are those of the process
 
 
@@ -95,11 +85,12 @@ def canvas(height_in: float, **kw: Any) -> Iterator[tuple[Figure, Any]]:
         yield figure, figure.subplots(**kw)
 
 
-def picture(figure: Figure, name: str, alt: str, caption: str) -> Picture:
-    """Turn a figure into markup; to be called while its ``canvas`` is open."""
+def svg_of(figure: Figure, name: str, alt: str) -> str:
+    """Turn a figure into markup for a page on which its ``name`` is unique."""
     raw = io.StringIO()
-    figure.savefig(raw, format="svg", transparent=True, dpi=200, metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
-    return Picture(name, _slim(raw.getvalue(), name, alt), alt, caption)
+    with own_style(STYLE):
+        figure.savefig(raw, format="svg", transparent=True, dpi=200, metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
+    return _slim(raw.getvalue(), name, alt)
 
 
 def _slim(svg: str, name: str, alt: str) -> str:
@@ -116,6 +107,7 @@ def _slim(svg: str, name: str, alt: str) -> str:
         svg = svg.replace(colour, f"var(--{variable})")
     svg = re.sub(r"'DejaVu Sans'(, [^;\"]+)?", "var(--sans)", svg)
     svg = re.sub(r"<[^>]*>", lambda tag: re.sub(r"(\d+\.\d{2})\d+", r"\1", tag[0]), svg)  # coordinates, not the labels between tags
+    svg = re.sub(rf' d="[^"]{{{LONG_PATH},}}"', lambda path: re.sub(r"(\d\.\d)\d+", r"\1", path[0]), svg)
     svg = head + svg[svg.index(">") + 1 :]  # last, so that its words keep all their digits
     svg = re.sub(r'href="data:image/png;base64,([^"]+)"', lambda m: f'href="{_palette_png(m[1])}"', svg)
     return re.sub(r">\s+<", "><", re.sub(r"\s*\n\s*", " ", svg))
@@ -127,12 +119,15 @@ def escape(text: str) -> str:
 
 
 def _palette_png(encoded: str) -> str:
-    """The same picture with 96 colours where it is opaque: less than half the bytes."""
+    """The same picture with few colours, 96 where it is opaque: less than half the bytes."""
     from PIL import Image
 
     image: Image.Image = Image.open(io.BytesIO(base64.b64decode(encoded)))
-    if image.mode == "RGBA" and image.getchannel("A").getextrema() == (255, 255):
-        image = image.convert("RGB").quantize(96, dither=Image.Dither.NONE)
+    if image.mode == "RGBA":
+        if image.getchannel("A").getextrema() == (255, 255):
+            image = image.convert("RGB").quantize(96, dither=Image.Dither.NONE)
+        else:
+            image = image.quantize(48, method=Image.Quantize.FASTOCTREE)
     out = io.BytesIO()
     image.save(out, format="PNG", optimize=True)
     return "data:image/png;base64," + base64.b64encode(out.getvalue()).decode()

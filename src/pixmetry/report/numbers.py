@@ -6,6 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from math import floor, isfinite, log10
 
+from pixmetry.core.number import Number
+
 MINUS, THIN, NO_BREAK = "\u2212", "\u2009", "\u00a0"
 NONE = "\u2013"
 SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -19,6 +21,10 @@ class PrintedNumber:
     value: str
     u: str
     unit: str
+
+    def joined(self, with_unit: bool = True) -> str:
+        """Value, uncertainty and unit in one string."""
+        return " ".join(part for part in (self.value, self.u, self.unit if with_unit else "") if part)
 
 
 def decimals_of(u: float, digits: int = 2) -> int:
@@ -63,6 +69,17 @@ def limit(value: float, unit: str, *, at_least: bool = False) -> PrintedNumber:
     power = 0 if -4 < power < 6 else power
     text = f"{'>' if at_least else '<'}{NO_BREAK}{significant(value / 10.0**power, LIMIT_DIGITS)}"
     return PrintedNumber(text, NONE, _with_power(unit, power))
+
+
+def printed(number: Number) -> PrintedNumber:
+    """A `Number` as text: value and ± u to the place of u, a one-sided limit, or a dash."""
+    if not number.is_available:
+        return PrintedNumber(NONE, "", pretty_unit(number.unit))
+    if number.is_limit:
+        found = limit(number.value, number.unit, at_least=number.is_lower_limit)
+        return PrintedNumber(found.value, f"(95{NO_BREAK}%)", found.unit)
+    found = uncertain(number.value, number.u, number.unit)
+    return PrintedNumber(found.value, "" if found.u == NONE else f"± {found.u}", found.unit)
 
 
 def _with_power(unit: str, power: int) -> str:

@@ -2,53 +2,86 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pixmetry import __version__
-from pixmetry.report.drawing import BLUE, INK, RED, SOFT, Picture, canvas, picture
+from pixmetry.report import Answer, Column, Figure, Page, Reading, Run, Section, Text, html_of, strong
+from pixmetry.report.drawing import BLUE, INK, RED, SOFT, canvas
 from pixmetry.report.numbers import NONE, length_px, significant
-from pixmetry.report.templates import filled
 
 if TYPE_CHECKING:
     from pixmetry.simulate.walk import Step, Walk
 
 SHOWN = 5  # movers in the summary
-TITLE = "<title>: one target through the chain</title>"  # ends so
+KIND = "one target through the chain"
+TITLE = f"<title>: {KIND}</title>"  # ends so
+KEY = "blue +: true centre; red ×: centre found; blue line: the row through it; red dashes: the column through it"
+HOW = (
+    " The centre is the centroid of what stands out of the background by more than a fifth of the target's contrast. The true centre is "
+    "that of the scene, carried through what only lays out the frame (clock of the samples, offsets, fields); what bends the image, as "
+    "distortion does, counts as a move. Lengths are in pixels of the frame as it is after the source."
+)
 
 
 def write_chain_page(walk: Walk, path: str | Path) -> Path:
     """Write the page and return its path; only an earlier page of this kind is replaced."""
     from pixmetry.files import write_page
 
-    return write_page(path, render(walk))
+    return write_page(path, html_of(page_of(walk)))
 
 
-def render(walk: Walk) -> str:
-    """Return the page as text."""
-    return filled("chain.html.jinja", _content(walk))
+def page_of(walk: Walk) -> Page:
+    """The page of one target through a camera.
+
+    Parameters
+    ----------
+    walk : Walk
+        As `walk` gives it.
+
+    Returns
+    -------
+    Page
+    """
+    page = Page(walk.camera.name, KIND, "pixmetry image chain", _facts(walk))
+    _result(page.add_section("How far the centre has moved", name="result"), walk)
+    found = bool(walk.target["found"])
+    page.add_section(
+        "The image after every source",
+        Text(KEY if found else KEY.replace("; red ×: centre found", ""), "soft small"),
+        *(_card(i, step, found) for i, step in enumerate(walk.steps)),
+        name="steps",
+    )
+    return page
 
 
-def _content(walk: Walk) -> dict[str, Any]:
+def _result(section: Section, walk: Walk) -> None:
+    """The move of the centre, the sources that made it, and its path."""
     last = walk.steps[-1]
-    found = last.error is not None
-    return {
-        "version": __version__,
-        "name": walk.camera.name,
-        "facts": _facts(walk),
-        "has_target": walk.target["found"],
-        "total": _pair(last.error) if found else None,
-        "total_expected": _pair(last.expected_error) if found and last.expected_error is not None else None,
-        "lost": walk.target["found"] and not found,
-        "movers": [
-            {"title": s.title, "name": s.name, "moved": _pair(s.moved), "expected": _pair(s.expected_moved)}
-            for s in walk.movers()[:SHOWN]
-        ],
-        "path": _path(walk) if walk.target["found"] else None,
-        "steps": [_card(i, s, walk.target["found"]) for i, s in enumerate(walk.steps)],
-    }
+    if not walk.target["found"]:
+        section.add_text("The scene has no target with a centre; the page shows what becomes of the middle of the frame.")
+        return
+    if last.error is None:
+        section.add(Answer([Text("The target cannot be told from its background in the stored frame.")]))
+    else:
+        parts: list = [Text("Centre found in the stored frame less the true centre:"), _readings(last.error)]
+        if last.expected_error is not None:
+            x, y = (length_px(v) for v in last.expected_error)
+            words = "Expected of this unit, every temporal draw at its mean: "
+            parts.append(Text((words, strong(f"x {x} px"), ", ", strong(f"y {y} px"), ". The rest is this frame's noise."), "second"))
+        section.add(Answer(parts))
+    movers = walk.movers()[:SHOWN]
+    if movers:
+        section.add_table(
+            "The sources that moved the centre most",
+            ["Source", *(Column(heading, "right") for heading in ("x", "y", "x, expected", "y, expected"))],
+            [[(s.title + " ", Run(s.name, "chip")), *_pair(s.moved), *_pair(s.expected_moved)] for s in movers],
+            caption="The sources that moved the centre most in this frame, in px.",
+        )
+    section.add(_path(walk))
+    section.add_text(strong("How it is measured."), HOW, style="soft")
 
 
 def _facts(walk: Walk) -> list[tuple[str, str]]:
@@ -65,25 +98,27 @@ def _facts(walk: Walk) -> list[tuple[str, str]]:
     ]
 
 
-def _pair(pair: tuple[float, float] | None) -> dict[str, str]:
-    if pair is None:
-        return {"x": NONE, "y": NONE}
-    return {axis: length_px(v) for axis, v in zip(("x", "y"), pair, strict=True)}
+def _readings(pair: tuple[float, float]) -> list[Reading]:
+    return [Reading(axis, f"{length_px(v)} px") for axis, v in zip("xy", pair, strict=True)]
 
 
-def _card(number: int, step: Step, has_target: bool) -> dict[str, Any]:
-    return {
-        "number": number,
-        "name": step.name,
-        "title": step.title,
-        "moved": _pair(step.moved) if has_target and number else None,
-        "expected": _pair(step.expected_moved) if has_target and number else None,
-        "error": _pair(step.error) if has_target else None,
-        "picture": _picture(number, step),
-    }
+def _pair(pair: tuple[float, float] | None) -> tuple[str, str]:
+    return (NONE, NONE) if pair is None else (length_px(pair[0]), length_px(pair[1]))
 
 
-def _picture(number: int, step: Step) -> Picture:
+def _card(number: int, step: Step, has_target: bool) -> Figure:
+    """The image after a source, with what that source moved and how far the centre is off by now."""
+    words = ""
+    if has_target and number:
+        (x, y), (mean_x, mean_y) = _pair(step.moved), _pair(step.expected_moved)
+        words = f"This source: x {x}, y {y} px (expected x {mean_x}, y {mean_y} px). "
+    if has_target:
+        x, y = _pair(step.error)
+        words += f"So far: x {x}, y {y} px."
+    return replace(_picture(number, step), caption=words, title=(f"{number}. {step.title} ", Run(step.name, "chip")))
+
+
+def _picture(number: int, step: Step) -> Figure:
     """The window with the true and the found centre, and the row and column through the found one."""
     col0, row0 = step.origin
     rows, cols = step.image.shape
@@ -105,10 +140,10 @@ def _picture(number: int, step: Step) -> Picture:
         right.set_ylabel(step.unit)
         low, high = float(step.image.min()), float(step.image.max())
         alt = f"{step.title}: image of {cols} by {rows} pixels from {significant(low)} to {significant(high)} {step.unit}, and its profiles"
-        return picture(figure, f"step-{number}", alt, "")
+        return Figure(figure, f"source-{number}", alt, "")
 
 
-def _path(walk: Walk) -> Picture:
+def _path(walk: Walk) -> Figure:
     """How far the centre has moved, source by source."""
     steps = walk.steps
     at = np.arange(len(steps))
@@ -128,7 +163,7 @@ def _path(walk: Walk) -> Picture:
         last = steps[-1]
         end = "not found" if last.error is None else f"x {length_px(last.error[0])} px, y {length_px(last.error[1])} px"
         alt = f"Error of the centre after each of {len(steps)} steps; at the end {end}"
-        return picture(
+        return Figure(
             figure,
             "path",
             alt,

@@ -13,8 +13,9 @@ from pixmetry.emva.records import Results
 from pixmetry.emva.temporal import linearity_line
 from pixmetry.observe.photon_transfer_levels import USABLE_FRACTION, light_scale
 from pixmetry.observe.photon_transfer_model import QUANTISATION_DN2, signal_from_mean, stored_moments
-from pixmetry.report.drawing import AMBER, BLUE, INK, RED, SOFT, Picture, canvas, draw_map, line, picture, plain_log
+from pixmetry.report.drawing import AMBER, BLUE, INK, RED, SOFT, canvas, draw_map, line, plain_log
 from pixmetry.report.numbers import significant
+from pixmetry.report.page import Figure
 
 
 @dataclass(frozen=True)
@@ -73,7 +74,7 @@ def _unsaturated(seen: Observations) -> np.ndarray:
     return (pt.bright.mean_dn <= peak) & (pt.bright.fraction_max <= max(USABLE_FRACTION, stuck))
 
 
-def variance_against_mean(seen: Observations, standard: Results) -> Picture:
+def variance_against_mean(seen: Observations, standard: Results) -> Figure:
     """Photon-transfer curve with the joint fit and the standard's line, and what the fit leaves."""
     pt, fit = _series(seen)
     curve, good = Curve.of(fit, pt.bits), _unsaturated(seen)
@@ -107,7 +108,7 @@ def variance_against_mean(seen: Observations, standard: Results) -> Picture:
             f"({gains}). Below: the same relative to the joint fit; bars are ±2 u of sampling. Where the dashed line leaves the "
             "points, the camera is not linear."
         )
-        return picture(figure, "transfer", alt, caption)
+        return Figure(figure, "transfer", alt, caption)
 
 
 def _light_as_signal(seen: Observations) -> np.ndarray:
@@ -119,7 +120,7 @@ def _light_as_signal(seen: Observations) -> np.ndarray:
     return fit["quantum_efficiency"].value * fit["gain_dn_per_e"].value * bright.photons
 
 
-def nonlinearity(seen: Observations) -> Picture:
+def nonlinearity(seen: Observations) -> Figure:
     """Means against a straight line, in percent of the line, with the fitted curve."""
     pt, fit = _series(seen)
     curve, light = Curve.of(fit, pt.bits), _light_as_signal(seen)
@@ -144,7 +145,7 @@ def nonlinearity(seen: Observations) -> Picture:
             "Non-linearity. The best straight line from 5 % to 95 % of saturation is taken away; the fitted curve departs from it by at "
             f"most {significant(worst, 2)} %. Points that scatter about the curve are noise of the lamp from level to level."
         )
-        return picture(figure, "linearity", alt, caption)
+        return Figure(figure, "linearity", alt, caption)
 
 
 def _off_line(light: np.ndarray, mean: np.ndarray) -> np.ndarray:
@@ -153,7 +154,7 @@ def _off_line(light: np.ndarray, mean: np.ndarray) -> np.ndarray:
     return linearity_line(light, mean, last, last)["relative_deviation"]
 
 
-def signal_to_noise(seen: Observations) -> Picture:
+def signal_to_noise(seen: Observations) -> Figure:
     """Signal-to-noise ratio of one pixel against its electrons, with the two limits that no camera passes."""
     (pt, fit), spatial = _series(seen), seen.spatial_fit
     curve, good = Curve.of(fit, pt.bits), _unsaturated(seen)
@@ -193,10 +194,10 @@ def signal_to_noise(seen: Observations) -> Picture:
         best = significant(float((electrons / noise)[-1]), 3)
         alt = f"Signal-to-noise ratio against electrons on logarithmic axes; {best} at saturation.{words}"
         caption = f"Signal-to-noise ratio of one pixel. Dark noise bends it off the ideal line; at saturation it is {best}.{words}"
-        return picture(figure, "snr", alt, caption)
+        return Figure(figure, "snr", alt, caption)
 
 
-def spectra(found: Spectra, kind: str, fixed_frames: int, unit_dn: float, unit: str) -> Picture:
+def spectra(found: Spectra, kind: str, fixed_frames: int, unit_dn: float, unit: str) -> Figure:
     """Spatial spectra of one stack along rows and columns; ``unit_dn`` DN are one ``unit``."""
     parts = (
         ("along x (rows)", found.frequency_h, found.fixed_h_dn2, found.temporal_h_dn2),
@@ -223,10 +224,10 @@ def spectra(found: Spectra, kind: str, fixed_frames: int, unit_dn: float, unit: 
             f"{kind.capitalize()} frames: noise by spatial frequency{share}. A flat line is white noise; a single peak is a stripe "
             "pattern; a rise towards zero is shading. The red line above the dotted one is fixed pattern, which averaging does not lower."
         )
-        return picture(figure, f"spectrum-{kind}", what, caption)
+        return Figure(figure, f"spectrum-{kind}", what, caption)
 
 
-def map_picture(values: np.ndarray, name: str, title: str, unit: str, words: str) -> Picture:
+def map_picture(values: np.ndarray, name: str, title: str, unit: str, words: str) -> Figure:
     """Thumbnail of a map."""
     height = 0.6 + 0.82 * 3.7 * min(max(values.shape[0] / values.shape[1], 0.4), 1.15) * 0.86
     with canvas(height) as (figure, axes):
@@ -235,10 +236,10 @@ def map_picture(values: np.ndarray, name: str, title: str, unit: str, words: str
         axes.set_ylabel("y / px")
         blocks = "" if block == 1 else f" One dot is the mean of {block} × {block} pixels."
         alt = f"{title} as a map over the sensor; 98 % of it lies between {significant(low)} and {significant(high)} {unit}."
-        return picture(figure, name, alt, f"{title}. {words}{blocks} Colours run from the 1st to the 99th percentile.")
+        return Figure(figure, name, alt, f"{title}. {words}{blocks} Colours run from the 1st to the 99th percentile.")
 
 
-def dark_codes(histogram: CodeHistogram) -> Picture:
+def dark_codes(histogram: CodeHistogram) -> Figure:
     """Histogram of all dark codes beside the normal law of the same spread."""
     counts = np.asarray(histogram.dark_counts, float)
     present = np.flatnonzero(counts)
@@ -265,10 +266,10 @@ def dark_codes(histogram: CodeHistogram) -> Picture:
             "Codes of all dark frames, temporal noise and fixed pattern together. A tail to the right of the dashed line is hot pixels; a "
             "comb, or a gap, is the converter; a cut on the left is a black level set too low."
         )
-        return picture(figure, "dark-codes", alt, caption)
+        return Figure(figure, "dark-codes", alt, caption)
 
 
-def all_pictures(seen: Observations, standard: Results, maps: Mapping[str, np.ndarray]) -> dict[str, Picture]:
+def all_pictures(seen: Observations, standard: Results, maps: Mapping[str, np.ndarray]) -> dict[str, Figure]:
     """Every figure that these observations can give, by name."""
     fitted = seen.photon_transfer_fit is not None and "nonlinearity_a1" in seen.photon_transfer_fit
     made = [variance_against_mean(seen, standard), nonlinearity(seen), signal_to_noise(seen)] if fitted else []

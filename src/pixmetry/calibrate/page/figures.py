@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import base64
-import io
-import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pixmetry.report.drawing import BLUE, INK, SOFT, WIDTH_IN, Picture, canvas, picture
+from pixmetry.report.drawing import BLUE, INK, SOFT, WIDTH_IN, canvas
 from pixmetry.report.numbers import significant
+from pixmetry.report.page import Figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure as Drawing
 
     from pixmetry.calibrate.bundle.model import Sensor
     from pixmetry.calibrate.bundle.network import Adjustment
@@ -25,7 +23,6 @@ MOST_VECTORS = 3000  # in a figure, from which on they are stored as pixels
 SHEET_COLS, SHEET_ROWS = 3, 4  # images on a sheet of small ones
 MOST_IN_SMALL = MOST_VECTORS // (SHEET_COLS * SHEET_ROWS)  # vectors in one small image
 LEAST_IN_CELL = 4
-LONG_PATH = 10_000  # characters
 KEY_IN = 0.12  # of the middle of the key above the axes
 
 
@@ -49,25 +46,6 @@ class Residuals:
 
     def __len__(self) -> int:
         return len(self.x)
-
-
-def finished(figure: Figure, name: str, alt: str, caption: str) -> Picture:
-    """Turn a figure into markup, with few colours where it is stored as pixels, and long paths to a tenth of a point."""
-    made = picture(figure, name, alt, caption)
-    svg = re.sub(r"data:image/png;base64,([^\"]+)", lambda m: _few_colours(m[1]), made.svg)
-    svg = re.sub(rf' d="[^"]{{{LONG_PATH},}}"', lambda m: re.sub(r"(\d\.\d)\d+", r"\1", m[0]), svg)
-    return replace(made, svg=svg)
-
-
-def _few_colours(encoded: str) -> str:
-    from PIL import Image
-
-    image: Image.Image = Image.open(io.BytesIO(base64.b64decode(encoded)))
-    if image.mode == "RGBA":
-        image = image.quantize(48, method=Image.Quantize.FASTOCTREE)
-    out = io.BytesIO()
-    image.save(out, format="PNG", optimize=True)
-    return "data:image/png;base64," + base64.b64encode(out.getvalue()).decode()
 
 
 def round_number(value: float) -> float:
@@ -122,7 +100,7 @@ def frame(axes: Axes, sensor: Sensor) -> None:
     axes.set_ylabel("y / px")
 
 
-def colour_bar(figure: Figure, axes: Axes, image: Any, label: str) -> Axes:
+def colour_bar(figure: Drawing, axes: Axes, image: Any, label: str) -> Axes:
     """A colour bar as high as the axes beside it, whatever their aspect; the layout sees it only in part and needs wider margins."""
     engine: Any = figure.get_layout_engine()
     engine.set(w_pad=0.11)
@@ -158,7 +136,7 @@ def draw_vectors(axes: Axes, x: np.ndarray, y: np.ndarray, dx: np.ndarray, dy: n
     return factor
 
 
-def residual_vectors(r: Residuals, name: str) -> Picture:
+def residual_vectors(r: Residuals, name: str) -> Figure:
     """The residual vectors of all images of a camera over its sensor; of very many an even choice, which leaves them apart."""
     shown = even_choice(np.arange(len(r)), MOST_VECTORS)
     with canvas(frame_height(r.sensor)) as (figure, axes):
@@ -169,7 +147,7 @@ def residual_vectors(r: Residuals, name: str) -> Picture:
             f"Residual vectors of all {images} images, {len(r)} points: measured less computed, {significant(factor, 1)} times enlarged."
             f"{drawn} Noise points anywhere; arrows that agree with their neighbours are a pattern."
         )
-        return finished(figure, f"{name}-vectors", f"Residual vectors of {len(r)} points over the sensor", caption)
+        return Figure(figure, f"{name}-vectors", f"Residual vectors of {len(r)} points over the sensor", caption)
 
 
 def cell_means(r: Residuals, per_cell: float = 12.0) -> dict[str, np.ndarray]:
@@ -183,7 +161,7 @@ def cell_means(r: Residuals, per_cell: float = 12.0) -> dict[str, np.ndarray]:
     return {key: v[kept] for key, v in means.items()} | {"n": n[kept], "cell_px": np.array(cell)}
 
 
-def mean_vectors(r: Residuals, name: str) -> Picture | None:
+def mean_vectors(r: Residuals, name: str) -> Figure | None:
     """What of the residuals is common to all images at one place of the sensor."""
     means = cell_means(r)
     if len(means["n"]) < 6:
@@ -197,10 +175,10 @@ def mean_vectors(r: Residuals, name: str) -> Picture | None:
             f"length is {significant(found, 2)} px; residuals without a pattern would give {significant(noise, 2)} px."
         )
         alt = f"Mean residual vectors in {len(means['n'])} cells of the sensor, {significant(found, 2)} px rms"
-        return finished(figure, f"{name}-means", alt, caption)
+        return Figure(figure, f"{name}-means", alt, caption)
 
 
-def grid_vectors(grid: Mapping[str, Any], sensor: Sensor, name: str) -> Picture | None:
+def grid_vectors(grid: Mapping[str, Any], sensor: Sensor, name: str) -> Figure | None:
     """The correction grid: what the parameters leave over, at its nodes."""
     x, y = np.meshgrid(np.asarray(grid["x_px"], float), np.asarray(grid["y_px"], float))
     dx, dy = (np.asarray(grid[key], float) for key in ("dx_px", "dy_px"))
@@ -215,7 +193,7 @@ def grid_vectors(grid: Mapping[str, Any], sensor: Sensor, name: str) -> Picture 
         if grid.get("rms_with_px") is not None:
             before, after = (significant(float(grid[key]), 3) for key in ("rms_without_px", "rms_with_px"))
             caption += f" In images left out, it takes the residuals from {before} px to {after} px rms."
-        return finished(figure, f"{name}-grid", f"Correction vectors at {int(good.sum())} nodes of a grid over the sensor", caption)
+        return Figure(figure, f"{name}-grid", f"Correction vectors at {int(good.sum())} nodes of a grid over the sensor", caption)
 
 
 def image_order(r: Residuals) -> np.ndarray:
@@ -224,7 +202,7 @@ def image_order(r: Residuals) -> np.ndarray:
     return images[np.argsort(-np.bincount(index, r.dx**2 + r.dy**2) / n, kind="stable")]
 
 
-def residual_sheet(r: Residuals, images: Sequence[int], titles: Sequence[str], scale: tuple[float, float], name: str) -> Picture:
+def residual_sheet(r: Residuals, images: Sequence[int], titles: Sequence[str], scale: tuple[float, float], name: str) -> Figure:
     """Residual vectors image by image, small, all at the same enlargement ``scale[0]``; ``scale[1]`` is the length of the key, px."""
     factor, key = scale
     step_x, step_y, title = 1.08 * r.sensor.cols, r.sensor.rows + 0.19 * r.sensor.cols, 0.16 * r.sensor.cols
@@ -250,4 +228,4 @@ def residual_sheet(r: Residuals, images: Sequence[int], titles: Sequence[str], s
         x, y = (np.concatenate(part) for part in zip(*lines, strict=True))
         axes.plot(x, y, color=BLUE, linewidth=0.6)
         length_key(axes, factor, key)
-        return finished(figure, name, f"Residual vectors of {len(images)} images", "")
+        return Figure(figure, name, f"Residual vectors of {len(images)} images", "")

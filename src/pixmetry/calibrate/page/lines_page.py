@@ -10,12 +10,13 @@ import numpy as np
 
 from pixmetry import __version__
 from pixmetry.calibrate.page import lines_text as text
-from pixmetry.calibrate.page.figures import enlargement, finished, frame, frame_height, length_key
+from pixmetry.calibrate.page.figures import enlargement, frame, frame_height, length_key
 from pixmetry.calibrate.page.page import camera_facts, provenance_rows
 from pixmetry.calibrate.page.plots import correlation_map, curve_pictures
 from pixmetry.calibrate.page.text import DIRECTIONS, sentence, typeset
-from pixmetry.report.drawing import BLUE, RED, SOFT, Picture, canvas
+from pixmetry.report.drawing import BLUE, RED, SOFT, canvas
 from pixmetry.report.numbers import fixed, length_px, significant
+from pixmetry.report.page import Figure
 from pixmetry.report.templates import filled, share_styles
 
 if TYPE_CHECKING:
@@ -71,7 +72,7 @@ def _content(calibration: LineCalibration) -> dict[str, Any]:
     }
 
 
-def drawn_lines(calibration: LineCalibration) -> list[Picture]:
+def drawn_lines(calibration: LineCalibration) -> list[Figure]:
     """Lines over the sensor, image by image, with their residuals across them enlarged; all at one scale."""
     result, sensor = calibration.result, calibration.camera().sensor
     about_x = np.array([r["axis"] == "x" for r in result.lines])[result.line_of]
@@ -97,5 +98,5 @@ def drawn_lines(calibration: LineCalibration) -> list[Picture]:
             length_key(axes, factor, key)
             mine = f"{images[image]}: residuals across the lines, {significant(factor, 1)} times enlarged"
             caption = f"{mine}; crosses are positions that were left out." if len(lost) else f"{mine}."
-            made.append(finished(figure, f"lines{k + 1}", f"Residuals across the lines of {images[image]}", caption))
+            made.append(Figure(figure, f"lines{k + 1}", f"Residuals across the lines of {images[image]}", caption))
     return made

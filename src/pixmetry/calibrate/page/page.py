@@ -26,13 +26,13 @@ from pixmetry.calibrate.page.text import (
     worth,
 )
 from pixmetry.report.numbers import NONE, fixed, length_px, significant
+from pixmetry.report.page import Figure
 from pixmetry.report.templates import filled, share_styles
 
 if TYPE_CHECKING:
     from pixmetry.calibrate.bundle.model import CameraModel
     from pixmetry.calibrate.bundle.network import Calibration
     from pixmetry.calibrate.page.figures import Residuals
-    from pixmetry.report.drawing import Picture
 
 WORST_IMAGES = 6  # on each of the two sheets that are not folded
 VERDICTS = {"fixed": "held as given", "free": "estimated anew, as its given coordinates are not exact enough"}
@@ -197,7 +197,7 @@ def _sheets(calibration: Calibration, r: Residuals, name: str) -> dict[str, Any]
     parts = open_parts + [rest[i : i + size] for i in range(0, len(rest), size)]
     names = calibration.adjustment.network.images
 
-    def sheet(number: int, images: list[int]) -> Picture:
+    def sheet(number: int, images: list[int]) -> Figure:
         return residual_sheet(r, images, [_short(names[i]) for i in images], scale, f"{name}-sheet{number}")
 
     most = max(len(open_parts), MOST_SHEETS // len(calibration.adjustment.network.cameras))

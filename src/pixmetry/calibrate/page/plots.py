@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pixmetry.calibrate.page.figures import LEAST_IN_CELL, MOST_VECTORS, Residuals, colour_bar, even_choice, finished, frame_height
-from pixmetry.report.drawing import BLUE, INK, RED, SOFT, WIDTH_IN, Picture, canvas, plain_log
+from pixmetry.calibrate.page.figures import LEAST_IN_CELL, MOST_VECTORS, Residuals, colour_bar, even_choice, frame_height
+from pixmetry.report.drawing import BLUE, INK, RED, SOFT, WIDTH_IN, canvas, plain_log
 from pixmetry.report.numbers import MINUS, significant, uncertain
+from pixmetry.report.page import Figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -56,7 +57,7 @@ def _bars(axes: Axes, bins: Bins, colour: str, marker: str, label: str) -> None:
     axes.errorbar(bins.at, bins.mean, yerr=2 * bins.u, label=label, zorder=3, **style)
 
 
-def against_radius(r: Residuals, centre: tuple[float, float], name: str) -> Picture:
+def against_radius(r: Residuals, centre: tuple[float, float], name: str) -> Figure:
     """Radial and tangential part of the residuals against the distance from the principal point."""
     x, y = r.x - centre[0], r.y - centre[1]
     radius = np.maximum(np.hypot(x, y), 1e-9)
@@ -71,10 +72,10 @@ def against_radius(r: Residuals, centre: tuple[float, float], name: str) -> Pict
         axes.set_ylabel("residual / px")
         figure.legend(loc="outside upper center", ncols=2)
         caption = "Residuals against the radius: dots are radial parts. A mean that swings with the radius asks for another lens term."
-        return finished(figure, f"{name}-radius", "Radial and tangential residuals against the radius", caption)
+        return Figure(figure, f"{name}-radius", "Radial and tangential residuals against the radius", caption)
 
 
-def against_phase(r: Residuals, name: str) -> Picture:
+def against_phase(r: Residuals, name: str) -> Figure:
     """Residuals of x and of y against the sub-pixel phase of that coordinate."""
     edges = np.linspace(-0.5, 0.5, 11)
     with canvas(2.4, ncols=2, sharey=True) as (figure, both):
@@ -88,7 +89,7 @@ def against_phase(r: Residuals, name: str) -> Picture:
             axes.set_xticks([-0.4, 0.0, 0.4])
         both[0].set_ylabel("residual / px")
         caption = "Residuals of x (left) and y (right) against the sub-pixel phase. A swing comes from too small or clipped targets."
-        return finished(figure, f"{name}-phase", "Residuals in x and y against the sub-pixel phase", caption)
+        return Figure(figure, f"{name}-phase", "Residuals in x and y against the sub-pixel phase", caption)
 
 
 def short(r: float) -> str:
@@ -96,7 +97,7 @@ def short(r: float) -> str:
     return f"{r:.2f}".replace("0.", ".").replace("-", MINUS)
 
 
-def correlation_map(names: Sequence[str], matrix: np.ndarray, name: str) -> Picture:
+def correlation_map(names: Sequence[str], matrix: np.ndarray, name: str) -> Figure:
     """Correlations of the interior parameters, with their numbers."""
     matrix = np.asarray(matrix, float)
     n = len(names)
@@ -113,10 +114,10 @@ def correlation_map(names: Sequence[str], matrix: np.ndarray, name: str) -> Pict
                 colour = LIGHT_TEXT if abs(matrix[i, j]) > 0.6 else DARK_TEXT
                 axes.text(j, i, short(matrix[i, j]), color=colour, fontsize=5.4, ha="center", va="center")
         caption = "Correlations of the interior parameters: red positive, blue negative. What correlates strongly is only known together."
-        return finished(figure, f"{name}-correlations", f"Correlation matrix of {n} interior parameters", caption)
+        return Figure(figure, f"{name}-correlations", f"Correlation matrix of {n} interior parameters", caption)
 
 
-def curve_pictures(curves: Mapping[str, Any], direction: str, name: str) -> list[Picture]:
+def curve_pictures(curves: Mapping[str, Any], direction: str, name: str) -> list[Figure]:
     """Radial, balanced and tangential distortion with their 95 % bands; ``direction`` as of a `CameraModel`."""
     what = "correction" if direction == "image_to_object" else "distortion"
     unit, radius = curves["unit"], np.asarray(curves["radius"], float)
@@ -139,7 +140,7 @@ def curve_pictures(curves: Mapping[str, Any], direction: str, name: str) -> list
             axes.set_ylabel(f"{what} / {shown}")
             if len(parts) > 1:
                 axes.legend(loc="best")
-            made.append(finished(figure, f"{name}-{kind}", f"{kind} {what} against the radius", _curve_caption(kind, what, curves)))
+            made.append(Figure(figure, f"{name}-{kind}", f"{kind} {what} against the radius", _curve_caption(kind, what, curves)))
     return made
 
 
@@ -162,7 +163,7 @@ def _curve_caption(kind: str, what: str, curves: Mapping[str, Any]) -> str:
     return text + "."
 
 
-def projection_map(p: Mapping[str, Any], sensor: Sensor, name: str) -> Picture:
+def projection_map(p: Mapping[str, Any], sensor: Sensor, name: str) -> Figure:
     """Standard uncertainty of a projected direction over the sensor."""
     u = np.asarray(p["u_px"], float)
     x, y = np.asarray(p["x_px"], float), np.asarray(p["y_px"], float)
@@ -183,10 +184,10 @@ def projection_map(p: Mapping[str, Any], sensor: Sensor, name: str) -> Picture:
             "extrapolated by the model."
         )
         alt = f"Projection uncertainty over the sensor, {significant(float(np.nanmin(u)), 2)} to {significant(float(np.nanmax(u)), 2)} px"
-        return finished(figure, f"{name}-projection", alt, caption)
+        return Figure(figure, f"{name}-projection", alt, caption)
 
 
-def by_image(records: Sequence[Mapping[str, Any]], name: str) -> Picture:
+def by_image(records: Sequence[Mapping[str, Any]], name: str) -> Figure:
     """Residuals image by image in the order of time, and the x-scale where it was estimated."""
     timed = all(r.get("time_s") is not None for r in records)
     at = np.array([r["time_s"] for r in records], float) if timed else np.arange(1, len(records) + 1, dtype=float)
@@ -212,4 +213,4 @@ def by_image(records: Sequence[Mapping[str, Any]], name: str) -> Picture:
         caption = "Residuals of each image in the order " + ("of time." if timed else "of the project.")
         if scaled:
             caption += " Below: the x-scale of each image against their mean, ± 2 u; a drift is a clock that warms up."
-        return finished(figure, f"{name}-time", f"Residual rms of {len(records)} images in order", caption)
+        return Figure(figure, f"{name}-time", f"Residual rms of {len(records)} images in order", caption)

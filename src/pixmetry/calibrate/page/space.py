@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pixmetry.calibrate.page.figures import MOST_VECTORS, arrows, chain, colour_bar, enlargement, finished, length_key, round_number
-from pixmetry.report.drawing import AMBER, BLUE, INK, RED, SOFT, WIDTH_IN, Picture, canvas
+from pixmetry.calibrate.page.figures import MOST_VECTORS, arrows, chain, colour_bar, enlargement, length_key, round_number
+from pixmetry.report.drawing import AMBER, BLUE, INK, RED, SOFT, WIDTH_IN, canvas
 from pixmetry.report.numbers import significant
+from pixmetry.report.page import Figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -43,7 +44,7 @@ def pyramids(adjustment: Adjustment, images: np.ndarray, depth: float) -> np.nda
     return np.concatenate(edges)
 
 
-def network_views(adjustment: Adjustment) -> list[Picture]:
+def network_views(adjustment: Adjustment) -> list[Figure]:
     """Cameras as pyramids, points and scale bars, from two sides."""
     state = adjustment.state
     points = state.xyz[np.isfinite(state.xyz).all(axis=1)]
@@ -54,7 +55,7 @@ def network_views(adjustment: Adjustment) -> list[Picture]:
     return [_network_view(adjustment, points, extent, number) for number in range(len(SIDES))]
 
 
-def _network_view(adjustment: Adjustment, points: np.ndarray, extent: float, number: int) -> Picture:
+def _network_view(adjustment: Adjustment, points: np.ndarray, extent: float, number: int) -> Figure:
     """The network from one of its two sides."""
     net, state = adjustment.network, adjustment.state
     view = seen_from(*SIDES[number])
@@ -88,7 +89,7 @@ def _network_view(adjustment: Adjustment, points: np.ndarray, extent: float, num
             f"{significant(length, 1)} {net.unit} long" + ("; thick lines are scale bars." if len(net.bars) else ".")
         ).replace("-", "\u2212")
         alt = f"{int(oriented.sum())} images as pyramids, {len(points)} points and {len(net.bars)} scale bars, side {number + 1} of 2"
-        return finished(figure, f"network-{number + 1}", alt, caption)
+        return Figure(figure, f"network-{number + 1}", alt, caption)
 
 
 def _triad(axes: Axes, view: np.ndarray, seen: np.ndarray, low: np.ndarray, high: np.ndarray, extent: float) -> float:
@@ -131,7 +132,7 @@ def shown_points(size: np.ndarray) -> np.ndarray:
     return np.concatenate([order[:few], order[few :: -(-(len(order) - few) // (MOST_ELLIPSES - few))]])
 
 
-def plan_views(adjustment: Adjustment) -> list[Picture]:
+def plan_views(adjustment: Adjustment) -> list[Figure]:
     """Covariance ellipsoids of the points in two plan views, enlarged; nothing where all points are fixed."""
     net, xyz, covariance = adjustment.network, adjustment.state.xyz, adjustment.point_covariance
     if covariance is None:  # an adjustment may be asked to leave it out
@@ -158,11 +159,11 @@ def plan_views(adjustment: Adjustment) -> list[Picture]:
             axes.set_ylabel(f"{'XYZ'[j]} / {net.unit}")
             part = "" if len(shown) == np.sum(size > 0) else f" The {MOST_ELLIPSES // 10} largest and a selection of the others are drawn."
             caption = f"Standard ellipsoids of the points in the {'XYZ'[i]}{'XYZ'[j]} plane, {significant(factor, 1)} times enlarged.{part}"
-            made.append(finished(figure, f"plan-{'xyz'[i]}{'xyz'[j]}", f"Standard ellipses of {len(shown)} points", caption))
+            made.append(Figure(figure, f"plan-{'xyz'[i]}{'xyz'[j]}", f"Standard ellipses of {len(shown)} points", caption))
     return made
 
 
-def field_map(adjustment: Adjustment, points: Mapping[str, Any]) -> Picture | None:
+def field_map(adjustment: Adjustment, points: Mapping[str, Any]) -> Figure | None:
     """How far the test field's points lie off their nominal places: height as colour, the rest as arrows.
 
     ``points`` holds ``xyz`` (nominal, in the object's axes), ``dx``, ``dy``, ``dz`` and ``axes``: the rows in which these are given.
@@ -194,4 +195,4 @@ def field_map(adjustment: Adjustment, points: Mapping[str, Any]) -> Picture | No
         low, high = significant(float(dz.min()), 2), significant(float(dz.max()), 2)
         caption = f"Deviation of the points from their nominal places: heights as colour ({low} to {high} {net.unit}), the rest as arrows."
         alt = f"Deviation of {len(x)} points of the test field, heights from {low} to {high} {net.unit}"
-        return finished(figure, "field", alt, caption)
+        return Figure(figure, "field", alt, caption)

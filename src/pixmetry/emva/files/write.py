@@ -53,14 +53,11 @@ def write_files(sheet: DataSheet, files: Mapping[str, Path], inputs: Iterable[Pa
 
 def content_of(sheet: DataSheet, kind: str) -> bytes:
     """Return what a file of this kind holds of a data sheet."""
-    if kind == "pdf":
-        from pixmetry.emva.page.pdf import render_pdf
+    if kind in ("pdf", "report"):
+        from pixmetry.emva.page.page import page_of
+        from pixmetry.report import html_of, pdf_of
 
-        return render_pdf(sheet)
-    if kind == "report":
-        from pixmetry.emva.page.page import render
-
-        return render(sheet).encode()
+        return pdf_of(page_of(sheet)) if kind == "pdf" else html_of(page_of(sheet)).encode()
     if kind == "xml":
         from pixmetry.emva.files.xml_format import xml_text
 

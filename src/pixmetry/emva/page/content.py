@@ -112,15 +112,10 @@ def _rounded_down(value: Number) -> str:
     return fixed(floor(value.value * 10.0**places) / 10.0**places, places)
 
 
-def joined(number: PrintedNumber, with_unit: bool = True) -> str:
-    """Value, uncertainty and unit in one string."""
-    return " ".join(part for part in (number.value, number.u, number.unit if with_unit else "") if part)
-
-
 def say(results: Results, key: str) -> str:
     """A value of a channel in one string; nothing where there is none."""
     value = results.values.get(key)
-    return joined(number_of(value)) if value is not None and isfinite(value.value) else ""
+    return number_of(value).joined() if value is not None and isfinite(value.value) else ""
 
 
 def dof_text(value: Number) -> str:
@@ -187,7 +182,7 @@ def all_rows(results: Results, methods: Sequence[str]) -> dict[str, list[Row]]:
         reasons, curved = [value.reason], ""
         if beside is not None:
             found = number_of(beside)
-            curved = joined(found, with_unit=found.unit != number.unit)
+            curved = found.joined(with_unit=found.unit != number.unit)
             used.append(_method(name + NONLINEAR, beside))
             reasons.append(beside.reason and f"with the non-linearity: {beside.reason}")
         sections[SECTIONS.get(known.section, SECTIONS["other"])].append(
