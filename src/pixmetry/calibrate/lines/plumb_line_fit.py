@@ -23,8 +23,8 @@ class LineTable:
 
     def __init__(self, x: np.ndarray, y: np.ndarray, keys: list[tuple[Any, Any]], line_of: np.ndarray, covariance: np.ndarray) -> None:
         self.x, self.y, self.keys, self.line_of, self.covariance = x, y, keys, line_of, covariance
-        self.used = np.ones(len(x), bool)
         self.inside = np.ones(len(x), bool)  # of the frame: what lies outside of it never takes part, where the polynomial means nothing
+        self.used = self.inside.copy()
 
     @classmethod
     def of(cls, x_px: ArrayLike, y_px: ArrayLike, line: ArrayLike, image: ArrayLike, u_px: ArrayLike | None) -> LineTable:
@@ -44,6 +44,19 @@ class LineTable:
             remedy = "measure more positions, or leave the line out"
             raise InputError("a line has fewer than three positions", where="plumb lines", value=few[:3] or None, remedy=remedy)
         return cls(x, y, keys, line_of, _covariances(u_px, len(x)))
+
+    def keep_inside(self, inside: np.ndarray) -> None:
+        """Say which positions lie in the frame; raises where a line has fewer than three of them."""
+        self.inside[:] = self.used[:] = inside
+        self.check_lines()
+
+    def check_lines(self) -> None:
+        """Refuse a line of which fewer than three positions are used."""
+        few = self.sums(self.used.astype(float)) < 3
+        if few.any():
+            image, line = self.keys[int(np.argmax(few))]
+            remedy = "leave it out, or measure it anew"
+            raise MeasureError("hardly a position lies on the line", where=f"image {image}, line {line}", remedy=remedy)
 
     def sums(self, values: np.ndarray) -> np.ndarray:
         """Sum over each line, shape (lines,)."""
@@ -76,13 +89,14 @@ class LineFit:
         self.iterations = 0
         self.x, self.y = table.x.copy(), table.y.copy()  # adjusted: the places on the lines that belong to what was measured
         a, b, _ = self.corrected()
-        n = table.sums(np.ones_like(a))
-        da, db = (v - (table.sums(v) / n)[table.line_of] for v in (a, b))
+        used = table.used.astype(float)
+        n = table.sums(used)
+        da, db = (used * (v - (table.sums(used * v) / n)[table.line_of]) for v in (a, b))
         along = 0.5 * np.arctan2(2 * table.sums(da * db), table.sums(da * da) - table.sums(db * db))
         theta = along + np.pi / 2
         flip = np.where(np.abs(np.cos(theta)) >= np.abs(np.sin(theta)), np.cos(theta), np.sin(theta)) < 0
         self.theta = theta + np.pi * flip  # the normal points towards +x, or +y
-        self.rho = (np.cos(self.theta) * table.sums(a) + np.sin(self.theta) * table.sums(b)) / n
+        self.rho = (np.cos(self.theta) * table.sums(used * a) + np.sin(self.theta) * table.sums(used * b)) / n
 
     def corrected(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Corrected adjusted positions about the centre, and their derivatives by those in the image, shape (n, 2, 2)."""
@@ -174,7 +188,8 @@ class LineFit:
         self.theta += turn
         self.rho += self.f_mean + self.a_mean @ step + self.middle * turn
         left = self.f_left + self.a_left @ step
-        self.x, self.y = self.table.x - self.pull[0] * left, self.table.y - self.pull[1] * left
+        left_inside = np.where(self.table.inside, left, 0.0)  # outside there is no place on the line to adjust to
+        self.x, self.y = self.table.x - self.pull[0] * left_inside, self.table.y - self.pull[1] * left_inside
         if not np.isfinite(self.corrected()[0]).all():
             refuse(self.weakest())
         return float(self.weight @ left**2)
@@ -222,7 +237,7 @@ def adjust_lines(fit: LineFit, loss: str, loss_scale: float, reject: bool) -> No
     fit.table.used[:] = fit.table.inside
     if reject and loss != "none":
         fit.table.used[:] = fit.table.inside & (np.abs(fit.statistics()) < critical_value(len(fit.table.x)))
-        _check_lines(fit.table)
+        fit.table.check_lines()
     fit.factor[:] = 1.0
     _snoop(fit, reject)
 
@@ -286,13 +301,5 @@ def _snoop(fit: LineFit, reject: bool) -> None:
         if not (back | out).any():
             return
         table.used[:] = (table.used | back) & ~out
-        _check_lines(table)
+        table.check_lines()
     fit.solve()
-
-
-def _check_lines(table: LineTable) -> None:
-    few = table.sums(table.used.astype(float)) < 3
-    if few.any():
-        image, line = table.keys[int(np.argmax(few))]
-        remedy = "leave it out, or measure it anew"
-        raise MeasureError("hardly a position lies on the line", where=f"image {image}, line {line}", remedy=remedy)
