@@ -1,6 +1,8 @@
 # Needs Python >= 3.11, git and make. Everything is installed into .venv.
 PYTHON ?= python3
 JOBS ?= 2
+RUNS ?= 200
+FILES ?=
 REPORT ?= pixmetry-report
 
 VENV := .venv
@@ -12,7 +14,7 @@ ORACLES := .venv-oracles
 PYTEST := OPENBLAS_NUM_THREADS=1 $(PY) -m pytest -n $(JOBS) --dist loadfile --hypothesis-seed=0
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test oracles study bench mutants handbook lint browser-test
+.PHONY: help install demo test flaky oracles study bench mutants handbook lint browser-test
 
 help: ## show this list
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1|\2/p' $(MAKEFILE_LIST) | while IFS='|' read -r target text; do printf '%-20s %s\n' "$$target" "$$text"; done
@@ -24,6 +26,9 @@ demo: $(INSTALLED) ## assess the packaged example campaign and write the report
 
 test: $(INSTALLED)-test ## run the quick tests
 	@$(PYTEST) -m "not browser and not oracle"
+
+flaky: $(INSTALLED)-test ## run tests that draw RUNS=200 times with fresh seeds and tell how often each fails (FILES=...)
+	@OPENBLAS_NUM_THREADS=1 $(PY) scripts/flaky.py --runs $(RUNS) --jobs $(JOBS) $(FILES)
 
 oracles: $(INSTALLED)-test $(ORACLES)/.installed ## compare with other people's programs (Python 3.11 or 3.12)
 	@$(PYTEST) -m oracle -rP

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import ast
+import importlib.util
 import re
+import sys
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
@@ -117,8 +120,8 @@ def test_a_failure_tells_the_seed_that_repeats_it(drawn) -> None:
     (seed,) = set(re.findall(r"--seed (\d+) repeats what this test drew", text))
     assert all(drawn("-n0")[0][name] != value for name, value in first.items())
     assert drawn("-n0", "--seed", seed)[0] == first
-    for alone in ("test_two[1]", "test_three[b]"):
-        assert drawn("-n0", "--seed", seed, f"test_draws.py::{alone}")[0] == {alone: first[alone]}
+    alone = ("test_two[1]", "test_three[b]")
+    assert drawn("-n0", "--seed", seed, *(f"test_draws.py::{test}" for test in alone))[0] == {test: first[test] for test in alone}
 
 
 @pytest.mark.parametrize("wrong", ["-3", "abc", "1.5"])
@@ -129,3 +132,41 @@ def test_a_seed_that_is_none_is_refused(pytester: pytest.Pytester, wrong: str) -
     result = pytester.runpytest_inprocess(f"--seed={wrong}")
     assert result.ret == pytest.ExitCode.USAGE_ERROR
     result.stderr.fnmatch_lines(["*is not a seed*"])
+
+
+@pytest.fixture(scope="module")
+def flaky() -> ModuleType:
+    """The script that runs tests again and again."""
+    path = TESTS.parent / "scripts" / "flaky.py"
+    spec = importlib.util.spec_from_file_location("flaky", path)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["flaky"] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_repeated_runs_keep_the_seeds_at_which_a_test_failed(flaky: ModuleType, pytester: pytest.Pytester) -> None:
+    """A test that fails below half, one that never fails, and one that draws nothing and is left out."""
+    pytester.makeconftest((TESTS / "conftest.py").read_text())
+    pytester.makepyfile(
+        chance=(TESTS / "chance.py").read_text(),
+        test_draws="def test_half(rng): assert rng.random() < 0.5\ndef test_sound(rng): pass\ndef test_still(): pass",
+    )
+    pytester.makeini("[pytest]\npythonpath = .\naddopts = -p no:cacheprovider")
+    outcome = flaky.Outcome("test_draws.py")
+    for seed in range(5):
+        pytester.inline_run("-q", "-n0", "--seed", str(seed), plugins=[flaky.Recorder(outcome, seed)])
+    assert outcome.ran == {"test_draws.py::test_half": 5, "test_draws.py::test_sound": 5}
+    (failed,) = outcome.failed.values()  # the same in every run: the seeds are fixed
+    assert 0 < len(failed) < 5 and failed == sorted(set(failed))
+    text, wrong = flaky.report_text({"test_draws.py": outcome})
+    assert wrong and f"{len(failed)} of 5 = {len(failed) / 5:.2g}  test_draws.py::test_half  --seed {failed[0]}" in text
+    sound = flaky.Outcome("test_draws.py", outcome.ran)
+    text, wrong = flaky.report_text({"test_draws.py": sound})
+    assert not wrong and "2 tests, 10 runs: none failed" in text
+
+
+def test_files_that_are_not_there_are_refused(flaky: ModuleType, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        flaky.main(["tests/test_nothing.py"])
+    assert "no such test file" in capsys.readouterr().err

@@ -11,6 +11,7 @@ from scipy.ndimage import gaussian_filter, label
 from scipy.spatial import cKDTree
 from scipy.special import ndtr
 
+from chance import rng_of
 from pixmetry.core.errors import InputError
 from pixmetry.locate.detect._detect_kernels import find_runs, group_runs
 from pixmetry.locate.detect.detection import Detection, Regions, detect, neighbours, select
@@ -139,14 +140,20 @@ def with_defects(rng: np.random.Generator, frame: np.ndarray) -> np.ndarray:
     return frame
 
 
+@pytest.fixture(scope="module")
+def many_discs(request: pytest.FixtureRequest) -> tuple[np.ndarray, np.ndarray]:
+    """Light of 120 discs of radius 3 to 8, the same for all scenes of a run, and their places."""
+    return discs(rng_of(request), (512, 512), 120, 3, 8)
+
+
 @pytest.mark.parametrize("name", SCENES)
-def test_finds_all_and_nothing_else(name: str, rng: np.random.Generator) -> None:
+def test_finds_all_and_nothing_else(name: str, many_discs: tuple[np.ndarray, np.ndarray], rng: np.random.Generator) -> None:
     """Of 120 discs of radius 3 to 8, without tuning; all of them have the shape of a disc, and their sign.
 
     A hot pixel at the rim may take the shape from a small one: once in 4000 frames, so from two of them in one of 30 million.
     """
-    light, truth = discs(rng, (512, 512), 120, 3, 8)
-    found = detect(SCENES[name](light))
+    light, truth = many_discs
+    found = detect(SCENES[name](rng, light))
     assert_exactly(found.targets, truth)
     assert (~select(found.targets, "disc")).sum() <= (1 if name == "defects" else 0)
     dark = "dark" in name or "white" in name or name == "vignetted, no noise"
