@@ -69,5 +69,5 @@ def test_the_picture_shows_the_numbers_of_the_printed_example() -> None:
         if title in drawn:
             assert drawn[title] == (share if share != "0" else "1"), title
     assert set(drawn) <= {title for title, _ in shown}
-    total = re.search(r"worth (\S+) px", blocks("text")[0])
+    total = re.search(r"a target is (\S+) px", " ".join(blocks("text")[0].split()))
     assert total and f"u = {total[1]} px" in picture

@@ -188,7 +188,7 @@ def _window_of(campaign: Campaign) -> tuple[str, ...]:
         return ()
     at = "" if facts.first_col is None else f" from column {facts.first_col}, row {facts.first_row}"
     whole = f"{cols} × {rows} pixels{at} of a sensor of {facts.sensor_cols} × {facts.sensor_rows}"
-    rest = "what is measured holds for these pixels; what is accepted at a bound is taken for the whole sensor"
+    rest = "measured values hold for these pixels; what is accepted at a bound is taken for the whole sensor"
     return (f"The frames show {whole}: {rest}.",)
 
 

@@ -102,21 +102,22 @@ class Assessment:
         }
 
     def verdict_text(self) -> str:
-        """Return in a sentence what a coordinate is worth."""
+        """Return the standard uncertainty of a coordinate in a sentence."""
         budget = self.budget
         one, many = budget.verdicts[0], budget.verdicts[-1]
         um = budget.um(one)
         size = f" = {um[0]:.2g} µm in x, {um[1]:.2g} µm in y" if um is not None else ""
         texts = [(f"{c.total_px:.2g}", f"{c.calibrated_px:.2g}") for c in (one, many)]
-        if all(total == calibrated for total, calibrated in texts):
-            after, mean = " (k = 1), calibrated or not", f"{texts[1][0]} px"
-        else:
-            after = f" as it is, and {texts[0][1]} px once a calibration has taken up what is constant or smooth over the frame (k = 1)"
-            mean = f"{texts[1][0]} and {texts[1][1]} px"
+        same = all(total == calibrated for total, calibrated in texts)
+        first, mean = (
+            f"{total} px{um}" + ("" if same else f" ({left} px after a calibration)")
+            for (total, left), um in zip(texts, (size, ""), strict=True)
+        )
         return (
-            f"a coordinate of one target in one frame is worth {texts[0][0]} px{size}{after}; the mean of {many.frames} frames {mean}. "
-            f"{self._by()}"
-            f"{budget.target.describe()}; {budget.estimator.describe()}."
+            f"the standard uncertainty of one coordinate of a target is {first} in one frame (k = 1)"
+            f"{', before and after a calibration' * same}; "
+            f"in the mean of {many.frames} frames it is {mean}. {self._by()}"
+            f"Target: {budget.target.describe()}; {budget.estimator.describe()}."
         )
 
     def _by(self) -> str:

@@ -111,7 +111,7 @@ def print_summary(assessment: Assessment) -> None:
         numbers = (f"{v:.5f}" for v in (c.u_x_px, c.u_y_px, constant))
         table.add_row(row.title, row.status, c.gum_class, *numbers, f"{100 * row.share:.0f} %", f"{c.calibrated_px:.5f}")
     console.print(table)
-    console.print("constant: the same all over the frame. calibrated: what a calibration leaves of it (rms of x and y).")
+    console.print("constant: the same all over the frame. calibrated: what a calibration of the camera leaves (rms of x and y).")
     worst = assessment.budget.with_accepted[0].total_px
     accepted = [r.title for r in assessment.budget.accepted]
     if accepted:
@@ -120,7 +120,7 @@ def print_summary(assessment: Assessment) -> None:
     if together is not None:
         at_once = together.together
         console.print(
-            f"Monte Carlo with all that is measured and modelled at once: {at_once.total_px:.2g} ± {at_once.se_total_px:.1g} px, "
+            f"Monte Carlo with all measured and modelled sources at once: {at_once.total_px:.2g} ± {at_once.se_total_px:.1g} px, "
             f"after a calibration {together.calibrated_px:.2g} px."
         )
     for note in assessment.observations.notes:

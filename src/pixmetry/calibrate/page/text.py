@@ -124,7 +124,7 @@ def worth(calibration: Calibration, camera: int) -> str:
     if levels is None:
         return text + "."
     places = f"{length_px(levels[0])}{NO_BREAK}px in the middle of the frame and {length_px(levels[1])}{NO_BREAK}px in its corners"
-    return f"{text}; where a direction is imaged is known to {places} (k = 1)."
+    return f"{text}; the image of a given direction has a standard uncertainty of {places}."
 
 
 def sigma0_text(calibration: Calibration) -> str:
@@ -147,12 +147,13 @@ def sigma0_text(calibration: Calibration) -> str:
 def _scatter(record: Mapping[str, Any], *, known: bool) -> str:
     text = f"image coordinates scatter by {_with_u(record, 'x')} in x and {_with_u(record, 'y')} in y"
     if record.get("common") and record.get("by_axis", True):
-        text += " (estimated in common: the images do not agree that x and y differ)"
+        text += " (one estimate for both: the images do not show that x and y differ)"
     if not known:
         return f"{text}, by their residuals: no covariance of the image coordinates was given"
     if "given_x_px" not in record:
         return text
-    return f"{text}; stated were {length_px(record['given_x_px'])}{NO_BREAK}px and {length_px(record['given_y_px'])}{NO_BREAK}px"
+    x, y = (f"{length_px(record[f'given_{axis}_px'])}{NO_BREAK}px in {axis}" for axis in "xy")
+    return f"{text}; stated uncertainties: {x} and {y}"
 
 
 def _with_u(record: Mapping[str, Any], axis: str) -> str:

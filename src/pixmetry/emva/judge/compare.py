@@ -292,9 +292,10 @@ def _notes(subjects: Sequence[Subject], passed_over: frozenset[str] = frozenset(
     if rest:
         notes.append(f"left out, as not all have them: channels {', '.join(rest)}")
     if all(s.worth for s in subjects) and len({str(s.worth[0]) for s in subjects}) == 1:
-        notes.append(f"a coordinate of one target in one frame is worth {', '.join(f'{s.worth[1]:.3g}' for s in subjects)} px (k = 1)")
+        values = ", ".join(f"{s.worth[1]:.3g}" for s in subjects)
+        notes.append(f"the standard uncertainty of one coordinate of a target in one frame is {values} px (k = 1)")
     elif all(s.worth for s in subjects):
-        notes.append("target or estimator differ: what a coordinate is worth is not that of one task")
+        notes.append("target or estimator differ: the uncertainties of a coordinate belong to different tasks")
     return notes
 
 

@@ -151,7 +151,7 @@ def check_code_step(frames: Frames) -> Check:
 
 def check_top_code(frames: Frames) -> Check:
     """A heap at the largest code that occurs, below the highest code of the stated bits."""
-    make = new_check("top_code", "largest code that occurs", "DN", "no heap below the highest code")
+    make = new_check("top_code", "largest code that occurs", "DN", "no pile-up below the highest code")
     group = frames.bright[-1]
     occupied = np.flatnonzero(group.counts)
     top, full = int(occupied[-1]), 2**group.bits - 1
@@ -201,7 +201,7 @@ def check_repeated(frames: Frames) -> Check:
 
 def check_independent(frames: Frames) -> Check:
     """Noise of successive frames: alike where the camera or the grabber averages."""
-    make = new_check("independent_frames", "noise of successive over distant frames", "", "1")
+    make = new_check("independent_frames", "noise of successive to distant frames", "", "1")
     groups = [g for g in (frames.dark, *frames.bright) if math.isfinite(g.follow_ratio)]
     if not groups:
         return make(NAN, NAN, "not judged", "three frames or more under one condition are needed")

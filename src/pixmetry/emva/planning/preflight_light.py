@@ -168,7 +168,7 @@ def _log_slope(x: np.ndarray, y: np.ndarray, u_log_y: np.ndarray) -> tuple[float
 
 def check_transfer(frames: Frames) -> Check:
     """Exponent of variance per signal against signal: 0 for a linear camera, below −1 after gamma 0.45."""
-    make = new_check("transfer", "variance per signal, exponent of signal", "", "0 ± 0.1")
+    make = new_check("transfer", "x in variance/signal ~ signal^x", "", "0 ± 0.1")
     dark = frames.dark
     x = np.array([g.mean_dn - dark.mean_dn for g in frames.unsaturated])
     var = np.array([g.squares.pixel_dn2 for g in frames.unsaturated])
@@ -187,7 +187,7 @@ def check_transfer(frames: Frames) -> Check:
 
 def check_response(frames: Frames) -> Check:
     """Exponent of signal against photons, or exposure time where photons are not known."""
-    make = new_check("response", "signal, exponent of light", "", "1 ± 0.05")
+    make = new_check("response", "x in signal ~ light^x", "", "1 ± 0.05")
     levels = frames.unsaturated
     by_photons = all(g.photons for g in levels)
     light = [g.photons if by_photons else g.exposure_s for g in levels]
@@ -205,7 +205,7 @@ def check_response(frames: Frames) -> Check:
 
 def check_blocks(frames: Frames) -> Check:
     """Steps of the frame difference that are larger or smaller at every eighth column or row: JPEG."""
-    make = new_check("blocks", "steps at every 8th row or column against others", "%", "chance alone")
+    make = new_check("blocks", "noise steps at every 8th row or column", "%", "by chance only")
     from scipy.stats import t
 
     groups = frames.unsaturated or (frames.dark,)
