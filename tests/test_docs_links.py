@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pkgutil
 import re
 from pathlib import Path
 
@@ -49,6 +50,26 @@ def test_planted_links_are_seen() -> None:
         "glossary.md#nothing",
     ]
     assert anchors("# Cramér–Rao bound\n```\n# no\n```\n## `a_b` (c)") == ["cramérrao-bound", "a_b-c"]
+
+
+def test_imports_that_the_pages_show_work() -> None:
+    shown = {
+        line
+        for page in PAGES
+        if page.name != "CHANGELOG.md"
+        for line in re.findall(r"^from pixmetry[\w.]* import .+$", page.read_text(encoding="utf-8"), re.M)
+    }
+    assert len(shown) > 15
+    for line in sorted(shown):
+        exec(compile(line, "page", "exec"), {})
+
+
+def test_names_that_the_pages_mention_exist() -> None:
+    pages = [page for page in PAGES if page.name != "CHANGELOG.md" and page.parent.name != "adr"]
+    named = {name for page in pages for name in re.findall(r"`(pixmetry(?:\.\w+)+)", page.read_text(encoding="utf-8"))}
+    assert len(named) > 10
+    for name in sorted(named):
+        pkgutil.resolve_name(name)
 
 
 def test_pages_named_in_messages_and_help_exist() -> None:
