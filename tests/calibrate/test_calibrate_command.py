@@ -26,7 +26,7 @@ from pixmetry.calibrate.bundle.bundle import SMALL
 from pixmetry.calibrate.bundle.model import NAMES
 from pixmetry.calibrate.bundle.network import Calibration, Network
 from pixmetry.calibrate.calibrated_camera import calibrated_geometry
-from pixmetry.calibrate.files.record import json_text, packed, read_calibration, unpacked
+from pixmetry.calibrate.files.record import calibration_json, packed, read_calibration, unpacked
 from pixmetry.calibrate.files.write import TABLES, write_results
 from pixmetry.calibrate.project import load_project
 from pixmetry.calibrate.project.schema import ProjectModel
@@ -259,8 +259,8 @@ def test_numbers_that_are_not_finite_stay_strict_json(by_hand: Calibration) -> N
     xyz = a.state.xyz.copy()
     xyz[3] = np.nan
     lost = replace(by_hand, adjustment=replace(a, state=replace(a.state, xyz=xyz)), tests={**by_hand.tests, "x": np.inf})
-    record = json.loads(json_text(lost), parse_constant=lambda name: pytest.fail(name))
-    assert record["points"]["xyz"][3] == [None] * 3 and record["tests"]["x"] is None
+    record = json.loads(calibration_json(lost), parse_constant=lambda name: pytest.fail(name))
+    assert record["points"]["xyz"][3] == [None] * 3 and record["tests"]["x"] == "inf"
     assert TABLES["points.csv"](lost).splitlines()[5].startswith(f"{a.network.points[3]},,,,")
 
 

@@ -450,7 +450,7 @@ def test_one_bad_image_is_named_and_no_drift_is_made_of_it(rng):
 @pytest.mark.filterwarnings("error")
 def test_a_camera_that_is_held_and_one_without_images_are_no_trouble(rng, tmp_path):
     """Through records, page, file and summary; for the second camera nothing is said but that it took no part."""
-    from pixmetry.calibrate.files.record import json_text, read_calibration
+    from pixmetry.calibrate.files.record import calibration_json, read_calibration
     from pixmetry.calibrate.page.page import render
     from pixmetry.calibrate.page.text import summary_text
 
@@ -467,7 +467,7 @@ def test_a_camera_that_is_held_and_one_without_images_are_no_trouble(rng, tmp_pa
     assert "spare: No image coordinate of this camera took part." in said
     assert "No image coordinate of this camera took part" in render(calibration)
     path = tmp_path / "calibration.json"
-    path.write_text(json_text(calibration), encoding="utf-8")
+    path.write_text(calibration_json(calibration), encoding="utf-8")
     stored = read_calibration(path)
     np.testing.assert_array_equal(stored.cameras[0].values, truth)
 

@@ -6,9 +6,10 @@ import json
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
-from pixmetry.core.number import LOWER_LIMIT, NOT_AVAILABLE, UPPER_LIMIT, VALUE, Estimates, Number
+from pixmetry.core.number import LOWER_LIMIT, NOT_AVAILABLE, UPPER_LIMIT, VALUE, Estimates, Number, effective_dof
 
 
 def test_nan_is_never_a_value_or_a_limit() -> None:
@@ -52,3 +53,13 @@ def test_a_set_gives_its_numbers() -> None:
     assert found["a"] == Number(3.0, found["a"].u, 9.0, "DN", "m", "", UPPER_LIMIT, "a") and found["a"].u == pytest.approx(0.3)
     assert found["a"].representative == pytest.approx(math.sqrt(3)) and found["b"].representative == 1.0
     assert [Number.from_record(record) for record in found.to_records()] == list(found)
+
+
+def test_effective_degrees_of_freedom() -> None:
+    """JCGM 100:2008, H.1: an end gauge's u of 32 nm with 16.7 (there truncated to 16) degrees of freedom."""
+    u = [25.0, 9.7, 2.9, 16.6]
+    dof = [18.0, 25.6, 50.0, 2.0]
+    assert float(effective_dof(np.square(u), dof)) == pytest.approx(16.7, abs=0.1)
+    both = effective_dof(np.square([u, u]), np.array([dof, [math.inf] * 4]))
+    assert both.shape == (2,) and math.isinf(both[1])
+    assert float(effective_dof([1e-200, 1e-200], [4.0, 4.0])) == pytest.approx(8.0)

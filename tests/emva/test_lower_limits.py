@@ -13,7 +13,7 @@ from emva.cameras import Camera
 from emva.scoring import measured
 from pixmetry.core.number import LOWER_LIMIT, UPPER_LIMIT, VALUE, Number
 from pixmetry.emva.evaluate import evaluate
-from pixmetry.emva.files.formats import json_text, read_sheet
+from pixmetry.emva.files.formats import read_sheet, sheet_json
 from pixmetry.emva.files.xml_format import xml_text
 from pixmetry.emva.judge.conformity import Limit, judge_value
 from pixmetry.emva.judge.differences import Subject, difference_of
@@ -85,7 +85,7 @@ def test_files_keep_a_lower_limit(tmp_path: Path, short: dict[str, Results], end
     camera = {"name": "short", "bits": 12, "rows": 48, "cols": 64}
     sheet = DataSheet((short["4.0"],), camera, {}, {})
     path = tmp_path / f"sheet.{ending}"
-    path.write_text((json_text if ending == "json" else xml_text)(sheet), encoding="utf-8")
+    path.write_text((sheet_json if ending == "json" else xml_text)(sheet), encoding="utf-8")
     got = read_sheet(path).results[0].values
     for key in LOWER:
         assert got[key].is_lower_limit and got[key].value == short["4.0"].values[key].value and got[key].reason, key

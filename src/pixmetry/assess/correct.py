@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +15,7 @@ from pixmetry.camera.line import Line
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.core.checksums import check_file, check_record
 from pixmetry.core.errors import InputError
+from pixmetry.core.progress import Progress, no_progress
 from pixmetry.core.random import Grid
 from pixmetry.core.threads import imap_tiles
 from pixmetry.files import InputHashes, provenance_record, read_maps, staged_output, write_json
@@ -82,7 +83,7 @@ def correct_files(
     output: str | Path,
     *,
     raw: str | RawLayout | None = None,
-    progress: Callable[[str, int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> list[str]:
     """Correct image files with the results of an assessment.
 
@@ -115,7 +116,7 @@ def correct_files(
     layout = parse_raw(raw) if isinstance(raw, str) else raw
     files = _named_once(picture_files(frames, raw=layout))
     hashes = InputHashes(files[0].parent)
-    told = progress or (lambda what, step, of: None)
+    told = progress or no_progress
     done: dict[str, list[str]] = {}
 
     def work(path: Path) -> tuple[Path, LoadedFrame, np.ndarray, dict[str, str]]:

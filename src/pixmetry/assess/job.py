@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -21,6 +21,7 @@ from pixmetry.camera.geometry import frame_centre
 from pixmetry.camera.observations import CameraGeometry, Observations
 from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.core.number import Estimates
+from pixmetry.core.progress import Progress, no_progress
 from pixmetry.emva.evaluate import standard_values
 from pixmetry.emva.records import Measurement, Results
 from pixmetry.files import (
@@ -40,7 +41,6 @@ from pixmetry.observe.observe import Group, observe
 
 KIND = "assessment"
 
-Progress = Callable[[str, int, int], None]
 
 
 def assess(
@@ -95,7 +95,7 @@ def assess(
         calibration = calibration_file(calibration)
     geometry = None if calibration is None else _geometry_for(frames, calibration)
     window = _window_of(frames)
-    told = progress or (lambda what, done, of: None)
+    told = progress or no_progress
     hashes, seen = observe_campaign(frames, told)
     told_of_frames = _other_frames(calibration, frames) if isinstance(calibration, Path) else ()
     seen = replace(seen, geometry=geometry, notes=(*seen.notes, *window, *told_of_frames))

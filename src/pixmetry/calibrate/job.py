@@ -19,6 +19,7 @@ from pixmetry.camera.camera import Camera
 from pixmetry.core.errors import InputError, PixmetryError
 from pixmetry.core.extras import import_extra
 from pixmetry.core.finding import Finding
+from pixmetry.core.progress import Progress, no_progress
 from pixmetry.files.provenance import InputHashes, provenance_record
 
 if TYPE_CHECKING:
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
 
 __all__ = ["StoredCalibration", "calibrate", "read_calibration"]
 
-Progress = Callable[[str, int, int], None]
 PROJECT_ENDINGS = (".yaml", ".yml")
 # What is said with pictures, and the keys of a project's ``cameras`` and ``pictures`` that mean the same.
 CAMERA_KEYS = {"camera": "camera", "direction": "direction", "pixel_um": "pitch_um", "c_mm": "c_mm", "c_px": "c_px"}
@@ -91,7 +91,7 @@ def calibrate(
     of = _sources(source)
     if output is not None:
         check_folder(output, of, [path for path in of if isinstance(path, Path)])  # before the work, not after it
-    told = progress or (lambda what, done, of: None)
+    told = progress or no_progress
     project = None
     if isinstance(source, Network):
         _refuse_pictures(pictures, "a network")

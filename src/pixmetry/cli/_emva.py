@@ -147,10 +147,9 @@ def _known_cameras(source: Path | None, bayer: str | None, more: dict[str, Any])
 
 def preflight(campaigns: Sequence[Path], given: dict[str, Any]) -> None:
     """Check a few frames."""
-    import json
-
     from pixmetry.emva.planning.preflight import preflight_record, preflight_text
     from pixmetry.files.staged_files import Output, check_files, write_together
+    from pixmetry.files.strict_json import json_text
 
     _refuse_sheets(campaigns)
     written = [] if given["json"] is None else [Output(given["json"], PREFLIGHT_MARK)]
@@ -162,7 +161,7 @@ def preflight(campaigns: Sequence[Path], given: dict[str, Any]) -> None:
             console.print(f"Channel {channel}", markup=False)
         console.print(preflight_text(result), markup=False, soft_wrap=True, end="" if len(found) == 1 else "\n")
     record = {"schema": PREFLIGHT_SCHEMA, "channels": {channel: preflight_record(result) for channel, result in found.items()}}
-    text = json.dumps(record, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+    text = json_text(record)
     write_together(written, [text.encode()] * len(written), inputs)
     if any(result.verdict == "fail" for result in found.values()):
         raise SystemExit(EXIT_DIFFERENT)

@@ -17,6 +17,7 @@ import numpy as np
 from pixmetry.core.compiling import tell_when_compiling
 from pixmetry.core.errors import PixmetryError
 from pixmetry.core.jit import PACKAGE_ROOT, Kernel, cache_folder, kernel_files
+from pixmetry.core.progress import Progress, no_progress
 
 PRESET = "imx264_like"
 SERIES = "photon_transfer: {levels: 10, brightest_photons: 12000, frames_per_level: 2, stack_frames: 8}"
@@ -51,7 +52,7 @@ POSES = ((0, 0, 0), (25, 5, 0), (-25, 5, 90), (5, 25, 0), (5, -25, 90), (20, 20,
 TYPES = (np.uint8, np.uint16, np.float32)
 
 
-def warm_up(progress: Callable[[str, int, int], None] | None = None) -> tuple[int, Path | None]:
+def warm_up(progress: Progress | None = None) -> tuple[int, Path | None]:
     """Compile all kernels into the cache on disk, where they are not there yet.
 
     Parameters
@@ -65,7 +66,7 @@ def warm_up(progress: Callable[[str, int, int], None] | None = None) -> tuple[in
     Path or None
         Folder of the cache; None if none can be written to.
     """
-    told = progress or (lambda what, step, of: None)
+    told = progress or no_progress
     with tempfile.TemporaryDirectory(prefix="pixmetry-warm-up-") as name:
         jobs = list(jobs_in(Path(name)))
         for i, (_, job) in enumerate(jobs):

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from typing import Any
 
 import click
 
 from pixmetry.cli._console import console as plain_console
 from pixmetry.core.plain_text import json_shown
+from pixmetry.files.strict_json import json_text
 
 KINDS = ("disc", "ellipse", "ring", "spot", "line", "edge")
 SIZES = {
@@ -110,7 +110,7 @@ def bound(
     )
     if as_json:
         record = result.to_record() | {"aperture_px": settings["aperture_px"]} | about
-        click.echo(json_shown(json.dumps(record, indent=2, ensure_ascii=False)))
+        click.echo(json_shown(json_text(record).rstrip()))
     else:
         _show(result, about)
 

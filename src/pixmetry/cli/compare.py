@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from math import isnan
 from pathlib import Path
@@ -47,6 +46,7 @@ def compare(files: tuple[Path, ...], limits: Path | None, level: float, same_lig
     from pixmetry.emva.judge.compare import check_limits, compare_fleet
     from pixmetry.emva.judge.compare import compare as compare_two
     from pixmetry.files.staged_files import Output, check_files, write_together
+    from pixmetry.files.strict_json import json_text
 
     if len(files) == 1 and limits is None:
         raise InputError("one file cannot be compared", where=str(files[0]), remedy="name a second one, or --limits")
@@ -71,7 +71,7 @@ def compare(files: tuple[Path, ...], limits: Path | None, level: float, same_lig
             print_limits(name, rows, console)
         record["limits"] = [_limit_record(name, row) for name, rows in checked.items() for row in rows]
         good = good and all(row.judgement.verdict == "pass" for rows in checked.values() for row in rows)
-    text = json.dumps(record, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+    text = json_text(record)
     write_together(written, [text.encode()] * len(written), files)
     if not good:
         click.get_current_context().exit(EXIT_DIFFERENT)
@@ -226,7 +226,8 @@ def _shown(value: Number | None) -> str:
 
 
 def _limit_record(name: str, row: Checked) -> dict[str, Any]:
-    from pixmetry.emva.files.formats import plain, value_record
+    from pixmetry.emva.files.formats import value_record
+    from pixmetry.files.strict_json import plain
 
     judgement = row.judgement
     return {

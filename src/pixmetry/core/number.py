@@ -8,10 +8,40 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from pixmetry.core.errors import MeasureError
 
+ONE_SIDED_95, TWO_SIDED_95 = 1.6448536, 1.959964  # coverage factors of the normal distribution
 VALUE, UPPER_LIMIT, LOWER_LIMIT, NOT_AVAILABLE = KINDS = ("value", "upper_limit", "lower_limit", "not_available")
+
+
+def effective_dof(variances: ArrayLike, dof: ArrayLike, total: ArrayLike | None = None) -> np.ndarray:
+    """Effective degrees of freedom of a sum of variances (Welch and Satterthwaite, JCGM 100 eq. G.2b): ν = u⁴/Σ(uᵢ⁴/νᵢ).
+
+    Parameters
+    ----------
+    variances, dof : array_like, shape (..., parts)
+        uᵢ² and their νᵢ; an infinite one is of a part that is known.
+    total : array_like, shape (...), optional
+        u², where it is not the sum of the parts.
+
+    Returns
+    -------
+    ndarray, shape (...)
+        ``inf`` where every part that counts is known.
+
+    Examples
+    --------
+    >>> float(effective_dof([0.04, 0.01], [9.0, float("inf")]))  # u of 0.2 with 9 degrees of freedom, and of 0.1 that is known
+    14.0625
+    """
+    variances, dof = np.asarray(variances, dtype=float), np.asarray(dof, dtype=float)
+    whole = variances.sum(axis=-1) if total is None else np.asarray(total, dtype=float)
+    # in shares of the total, so that no power of a small u is lost
+    shares = np.divide(variances, whole[..., None], out=np.zeros(variances.shape), where=whole[..., None] > 0)
+    weight = (shares**2 / dof).sum(axis=-1)
+    return np.divide(1.0, weight, out=np.full(np.shape(weight), np.inf), where=weight > 0)
 
 
 @dataclass(frozen=True)

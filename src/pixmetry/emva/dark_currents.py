@@ -11,10 +11,11 @@ import numpy as np
 
 from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.core.number import Estimates, Number
+from pixmetry.core.progress import Progress
 from pixmetry.emva.dark_temperature import check_temperatures, fit_dark_temperature, law_at
 from pixmetry.emva.files.keys import OVER_TEMPERATURES
 from pixmetry.emva.files.write import check_names, named
-from pixmetry.emva.job import Options, Progress, tested, write_sheet
+from pixmetry.emva.job import Options, tested, write_sheet
 from pixmetry.emva.records import DataSheet
 from pixmetry.files import Campaign, load_campaign
 

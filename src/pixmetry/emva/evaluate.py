@@ -8,12 +8,11 @@ from dataclasses import replace
 import numpy as np
 
 from pixmetry.core.errors import InputError, MeasureError
-from pixmetry.core.number import UPPER_LIMIT, VALUE, Number
+from pixmetry.core.number import ONE_SIDED_95, TWO_SIDED_95, UPPER_LIMIT, VALUE, Number
 from pixmetry.core.random import Generator, generator
 from pixmetry.core.threads import map_tiles, single_threaded_blas
 from pixmetry.emva.dark_noise import DarkNoise, pattern_limit_dn2
 from pixmetry.emva.files.keys import KEYS, goes_with_photons
-from pixmetry.emva.files.rules import ONE_SIDED_95
 from pixmetry.emva.formulas import DARK_VARIANCE, Formulas, Spread, Values, keys_of
 from pixmetry.emva.general.curved import level_free_values
 from pixmetry.emva.general.general import general_curve
@@ -33,7 +32,6 @@ from pixmetry.emva.uncertainty import about, add_wave, bootstrap_series, draw_bl
 GROUP_DRAWS = 300
 SEED = 1288
 MANY = 1e6  # degrees of freedom beyond which u is as good as known
-TWO_SIDED_95 = 1.959964
 DARK_NOISE_LIMIT_DN = 0.40  # R4.0 eq. 54
 MAY_NOT_BE_NEGATIVE = ("u_I_var", "u_I_var_DN")
 

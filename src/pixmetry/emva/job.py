@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -13,6 +13,7 @@ import numpy as np
 
 from pixmetry.camera.observations import StackMoments
 from pixmetry.core.errors import InputError
+from pixmetry.core.progress import Progress, no_progress
 from pixmetry.core.threads import imap_tiles, map_tiles, single_threaded_blas
 from pixmetry.emva.files.keys import KEYS
 from pixmetry.emva.files.write import check_names, named, write_files
@@ -20,8 +21,6 @@ from pixmetry.emva.records import MONO, RELEASES, DataSheet, Measurement, Result
 from pixmetry.emva.reduction import Group, measure_frames, phases
 from pixmetry.files import Campaign, FrameReader, InputHashes, load_campaign, provenance_record
 from pixmetry.files.records import FrameGroup
-
-Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True)
@@ -107,7 +106,7 @@ def tested(campaign: Campaign, options: Options, progress: Progress | None = Non
 def write_sheet(sheet: DataSheet, files: dict[str, Path], inputs: Sequence[Path], progress: Progress | None = None) -> None:
     """Write the wanted files, if any, with word of progress; as `pixmetry.emva.files.write.write_files`."""
     if files:
-        told = progress or (lambda what, done, of: None)
+        told = progress or no_progress
         told("writing the results", 0, 1)
         write_files(sheet, files, inputs)
         told("writing the results", 1, 1)
@@ -206,7 +205,7 @@ def make_sheet(
     progress: Progress | None = None,
 ) -> DataSheet:
     """Evaluate what the frames of a campaign were reduced to; parameters as of `emva1288`."""
-    told = progress or (lambda what, done, of: None)
+    told = progress or no_progress
     told("evaluating", 0, 1)
     one = partial(_results, release=release, bootstrap=bootstrap)
     with single_threaded_blas():

@@ -8,8 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pixmetry.core.number import LOWER_LIMIT, UPPER_LIMIT, Number
-from pixmetry.emva.files.rules import ONE_SIDED_95
+from pixmetry.core.number import LOWER_LIMIT, ONE_SIDED_95, UPPER_LIMIT, Number
 from pixmetry.emva.general.general import general_curve, general_evaluation
 from pixmetry.emva.general.general_model import light_axis
 from pixmetry.emva.general.response_end import end_of

@@ -19,6 +19,7 @@ import numpy as np
 
 from pixmetry.core.checksums import check_record, file_sha256, sealed
 from pixmetry.core.errors import InputError
+from pixmetry.files.strict_json import json_text, plain
 
 MARKER = ".pixmetry-output.json"
 OUTPUT_SCHEMA = "pixmetry/output/2"
@@ -384,7 +385,7 @@ def _runs(pid: int) -> bool:
 
 
 def write_json(path: str | Path, obj: Any) -> None:
-    """Write strict JSON (RFC 8259): NumPy values become plain ones, and NaN and infinities are refused.
+    """Write strict JSON (RFC 8259) as `pixmetry.files.strict_json` makes it: NaN is ``null``, an infinite number ``"inf"``.
 
     Parameters
     ----------
@@ -394,12 +395,10 @@ def write_json(path: str | Path, obj: Any) -> None:
 
     Raises
     ------
-    ValueError
-        If a number is not finite; the message names its place. Write None where there is no value.
     TypeError
-        If a value has no JSON form.
+        If a value has no JSON form; the message names its place.
     """
-    text = json.dumps(_plain(obj, "$"), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    text = json_text(obj)
     path = Path(path)
     partial = path.with_name(f"{path.name}.partial-{os.getpid()}")
     try:
@@ -419,21 +418,7 @@ def write_record(path: str | Path, record: Mapping[str, Any]) -> None:
         As of `write_json`, which tells the errors.
     """
     path = Path(path)
-    write_json(path, sealed(_plain(record, "$"), path.parent, [name for name in _files(path.parent) if name != path.name]))
-
-
-def _plain(value: Any, at: str) -> Any:
-    if isinstance(value, np.ndarray | np.generic):
-        value = value.tolist()
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item, f"{at}.{key}") for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item, f"{at}[{i}]") for i, item in enumerate(value)]
-    if isinstance(value, float) and not np.isfinite(value):
-        raise ValueError(f"{at} is {value}: JSON holds finite numbers only")
-    if value is None or isinstance(value, str | bool | int | float):
-        return value
-    raise TypeError(f"{at} is a {type(value).__name__}, which JSON cannot hold")
+    write_json(path, sealed(plain(record), path.parent, [name for name in _files(path.parent) if name != path.name]))
 
 
 def write_maps(path: str | Path, maps: Mapping[str, np.ndarray], attrs: Mapping[str, Any]) -> None:
@@ -450,8 +435,8 @@ def write_maps(path: str | Path, maps: Mapping[str, np.ndarray], attrs: Mapping[
 
     Raises
     ------
-    ValueError
-        If the attributes are not strict JSON.
+    TypeError
+        If an attribute has no JSON form.
     """
     import zarr
     from zarr.codecs import BloscCodec
@@ -462,7 +447,7 @@ def write_maps(path: str | Path, maps: Mapping[str, np.ndarray], attrs: Mapping[
     digests = {name: _digest(array) for name, array in arrays.items()}
     store = ZipStore(path, mode="w") if path.suffix == ".zip" else LocalStore(path)
     try:
-        attributes = sealed({"attributes": _plain(attrs, "$"), "arrays": digests})
+        attributes = sealed({"attributes": plain(attrs), "arrays": digests})
         group = zarr.create_group(store, zarr_format=3, overwrite=path.suffix != ".zip", attributes=attributes)
         for name, array in arrays.items():
             codec = BloscCodec(cname="zstd", clevel=5, shuffle="bitshuffle", typesize=array.dtype.itemsize)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,7 @@ import numpy as np
 
 from pixmetry.camera.camera import Camera, load_camera
 from pixmetry.core.errors import InputError
+from pixmetry.core.progress import Progress, no_progress
 from pixmetry.core.threads import imap_tiles
 from pixmetry.files.formats import frame_name, raw_file
 from pixmetry.files.images import PICTURE_ENDINGS, load_picture, picture_files
@@ -150,7 +151,7 @@ def locate_files(
     overlay: str | Path | None = None,
     channel: str | None = None,
     raw: str | RawLayout | None = None,
-    progress: Callable[[str, int, int], None] | None = None,
+    progress: Progress | None = None,
     noise: NoiseModel | Camera | str | Path | None = None,
     **options: Any,
 ) -> Located:
@@ -187,7 +188,7 @@ def locate_files(
     tables_at = [] if output is None else [checked_table_name(output)]
     check_files([*tables_at, *written], files)  # before the work
     model = noise_model(noise)
-    told = progress or (lambda what, step, of: None)
+    told = progress or no_progress
 
     def work(path: Path) -> tuple[Located, bytes]:
         name = frame_name(path)

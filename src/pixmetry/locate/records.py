@@ -16,6 +16,7 @@ from pixmetry.core.errors import InputError
 from pixmetry.core.extras import import_extra
 from pixmetry.core.plain_text import cell, comment
 from pixmetry.files.staged_files import Output, check_files, write_together
+from pixmetry.files.strict_json import json_text
 from pixmetry.locate.detect.targets import Flag
 
 LOCATED_SCHEMA = "pixmetry/located/1"
@@ -136,9 +137,7 @@ class Located:
         return text.getvalue().encode()
 
     def _json(self) -> bytes:
-        import json
-
-        return (json.dumps(self.to_record(), indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode()
+        return json_text(self.to_record()).encode()
 
     def _parquet(self) -> bytes:
         import json

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from pixmetry.camera.observations import LevelMoments, PhotonTransfer, StackMoments
-from pixmetry.core.number import Estimates
+from pixmetry.core.number import ONE_SIDED_95, Estimates
 from pixmetry.observe import photon_transfer_model as model
 from pixmetry.observe.hot_pixels import without_hot_pixels
 from pixmetry.observe.photon_transfer_levels import (
@@ -18,7 +18,6 @@ from pixmetry.observe.photon_transfer_levels import (
 )
 
 NOT_SIGNIFICANT = 3.0
-ONE_SIDED_95 = 1.6448536
 METHOD = "mean squares of the differences of dark frames"
 METHOD_WITH_LIGHT = f"{METHOD}; gain from variance and mean of one light level"
 ONE_LIGHT = "from one light level: u holds that the response may be bent by 10 % over the range"

@@ -14,7 +14,7 @@ import numpy as np
 
 from pixmetry.camera.observations import PhotonTransfer, StackMoments
 from pixmetry.core.errors import MeasureError
-from pixmetry.core.number import Estimates
+from pixmetry.core.number import ONE_SIDED_95, Estimates
 from pixmetry.observe import photon_transfer_model as model
 from pixmetry.observe.hot_pixels import HotDoubt, without_hot_pixels
 from pixmetry.observe.photon_transfer_levels import (
@@ -32,11 +32,10 @@ from pixmetry.observe.photon_transfer_levels import (
 )
 from pixmetry.observe.photon_transfer_model import A1, A3, DARK_SLOPE, DARK_VAR, DARK_VAR_SLOPE, GAIN, LIGHT_OFFSET, OFFSET, SLOPE
 from pixmetry.observe.photon_transfer_solve import Solution, fit_range
+from pixmetry.observe.stack import SATURATED_FRACTION
 
-SATURATED_FRACTION = 0.002  # EMVA 1288 R4.0 §6.6: saturation is the highest level with at most 0.2 % of the pixels at the top code
 ALL_SATURATED = 0.999  # then the mean is the top code that the camera stores, which may lie below 2**bits − 1
 NOT_SIGNIFICANT = 3.0  # a variance below this many u is given as a limit
-ONE_SIDED_95 = 1.6448536
 ROW_VAR, COL_VAR, SATURATION, LAMP_VAR, DARK_LIMIT, HOT, EXTRAPOLATED = range(12, 19)
 METHOD = (
     "joint photon-transfer fit: Poisson electrons, gain and noise before a cubic non-linearity; iterated generalised least squares on "

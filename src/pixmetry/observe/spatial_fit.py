@@ -10,7 +10,7 @@ import numpy as np
 
 from pixmetry.camera.observations import DefectList, PatternList, StackMoments
 from pixmetry.core.errors import InputError, MeasureError
-from pixmetry.core.number import Estimates
+from pixmetry.core.number import ONE_SIDED_95, Estimates, effective_dof
 from pixmetry.observe.linearity import Linearity
 from pixmetry.observe.photon_transfer_levels import core_spread_dn2
 from pixmetry.observe.photon_transfer_model import rounding_error_vars, slope_error_var, white_before_rounding
@@ -20,7 +20,6 @@ PARTS = ("pixel", "row", "col")
 BROKEN, CHANCE = 5.0, 3e-7  # u below zero from which a variance is no chance any more, and the chance that remains
 HIDDEN = 0.25  # relative error of the local slope beyond which a pattern seen through quantisation is only bounded
 SIGNIFICANT = 3.0  # a variance below this many u is given as a limit
-ONE_SIDED_95 = 1.6448536
 NOT_BY_CHANCE = 0.00135  # beyond so many u of a normal distribution
 NOT_ROUND = 3.0  # curvatures along x and y that differ by more than this many u belong to a light that is not round
 METHOD = "analysis of variance of the mean maps, less temporal mean squares / L; Scheffé 1959, limits after Graybill & Wang 1980"
@@ -339,7 +338,7 @@ def _components(squares: _MeanSquares, covariance: np.ndarray, shape: tuple[int,
     slope = np.divide(0.5, values, out=np.zeros(8), where=values > 0)
     own = np.diag(covariance_out)
     terms = matrix**2 * np.diag(covariance)
-    dof = own**2 / np.maximum((terms**2 / (2 / squares.relative_variances())).sum(axis=1), 1e-300)  # Welch–Satterthwaite
+    dof = effective_dof(terms, 2 / squares.relative_variances(), own)
     limits = frozenset(n for n, s in zip(names, significant, strict=True) if not s)
     in_u = np.divide(variances, np.sqrt(own), out=np.zeros(8), where=own > 0)
     of_lines = np.array([part in ("row", "col") for part in (*PARTS, "total")] * 2)

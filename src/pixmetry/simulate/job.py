@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ from pixmetry.camera.overrides import changed_camera
 from pixmetry.camera.signal import Kind
 from pixmetry.core.errors import InputError
 from pixmetry.core.memory import check_memory
+from pixmetry.core.progress import Progress, no_progress
 from pixmetry.files import InputHashes, provenance_record, staged_output, write_json
 from pixmetry.files.frame_writer import FORMATS, FrameWriter
 from pixmetry.files.truth import TruthWriter
@@ -95,7 +96,7 @@ def simulate(
     overrides: Mapping[str, Any] | None = None,
     off: Sequence[str] = (),
     window: Window | None = None,
-    progress: Callable[[str, int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> Path:
     """Write the frames that a camera makes of a scene, with the truth beside them.
 
@@ -134,7 +135,7 @@ def simulate(
     device = camera if isinstance(camera, Camera) else load_camera(camera)
     device = changed_camera(device, overrides, off)
     model = read_scene(scene)
-    told = progress or (lambda what, done, of: None)
+    told = progress or no_progress
     if image_format not in FORMATS:
         raise InputError("no such image format", value=image_format, allowed=", ".join(FORMATS))
     bits = stored_bits(device)

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import base64
 import json
-import math
 import zlib
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass, is_dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -21,12 +20,12 @@ from pixmetry.core.checksums import check_record, sealed
 from pixmetry.core.config import read_text
 from pixmetry.core.errors import InputError
 from pixmetry.core.finding import Finding
+from pixmetry.files.strict_json import json_text, plain
 
 RESULT_SCHEMA = "pixmetry/calibration-result/1"
 LINES_SCHEMA = "pixmetry/line-calibration-result/1"
 PIXELS = "pixel (0, 0) is the centre of the top-left pixel, x to the right, y down"
 T = TypeVar("T")
-SHORT = 130  # characters of a record that stands on one line
 
 
 @dataclass(frozen=True)
@@ -85,7 +84,7 @@ class StoredCalibration:
         return tuple(own[self.columns[i]] for i in rows), self.covariance[np.ix_(rows, rows)]
 
 
-def json_text(calibration: Calibration, folder: str | Path = "", beside: Iterable[str] = ()) -> str:
+def calibration_json(calibration: Calibration, folder: str | Path = "", beside: Iterable[str] = ()) -> str:
     """All numbers of a calibration as strict JSON; the joint covariance is packed, see `unpacked`.
 
     Parameters
@@ -95,7 +94,7 @@ def json_text(calibration: Calibration, folder: str | Path = "", beside: Iterabl
     beside : iterable of str
         Names of files in the folder whose digests it is to hold.
     """
-    return _json(sealed(_plain(_record(calibration)), folder, beside)) + "\n"
+    return json_text(sealed(plain(_record(calibration)), folder, beside))
 
 
 def _record(calibration: Calibration) -> dict[str, Any]:
@@ -153,7 +152,7 @@ def _camera_record(calibration: Calibration, k: int) -> dict[str, Any]:
 
 
 def lines_json(calibration: LineCalibration, folder: str | Path = "", beside: Iterable[str] = ()) -> str:
-    """All numbers of a calibration from straight lines as strict JSON; parameters as of `json_text`."""
+    """All numbers of a calibration from straight lines as strict JSON; parameters as of `calibration_json`."""
     result = calibration.result
     record = {
         "schema": LINES_SCHEMA,
@@ -166,7 +165,7 @@ def lines_json(calibration: LineCalibration, folder: str | Path = "", beside: It
         "findings": [finding.to_record() for finding in calibration.findings],
         "provenance": calibration.provenance,
     }
-    return _json(sealed(_plain(record), folder, beside)) + "\n"
+    return json_text(sealed(plain(record), folder, beside))
 
 
 def camera_record(model: CameraModel, names: tuple[str, ...], covariance: np.ndarray) -> dict[str, Any]:
@@ -277,39 +276,6 @@ def _array(rows: list[list[float | None]], width: int) -> np.ndarray:
     return np.array(rows, dtype=float).reshape(-1, width)
 
 
-def _plain(value: Any) -> Any:
-    """Plain values; None where a number is not finite."""
-    if isinstance(value, np.ndarray | np.generic):
-        value = value.tolist()
-    if is_dataclass(value) and not isinstance(value, type):
-        value = asdict(value)
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    if value is None or isinstance(value, str | bool | int | float):
-        return value
-    raise TypeError(f"a {type(value).__name__} has no form in JSON")
-
-
-def _json(value: Any, indent: str = "") -> str:
-    """Strict JSON with a line for each row of numbers and each short record."""
-    one = json.dumps(value, ensure_ascii=False, allow_nan=False)
-    items = list(value.values()) if isinstance(value, dict) else value if isinstance(value, list) else []
-    flat = not any(isinstance(item, dict | list) for item in items)
-    if not items or (flat and (len(one) <= SHORT or isinstance(value, list))):
-        return one
-    inner = indent + " "
-    if isinstance(value, dict):
-        parts = [f"{json.dumps(key, ensure_ascii=False)}: {_json(item, inner)}" for key, item in value.items()]
-    else:
-        parts = [_json(item, inner) for item in value]
-    left, right = "{}" if isinstance(value, dict) else "[]"
-    return f"{left}\n{inner}" + f",\n{inner}".join(parts) + f"\n{indent}{right}"
-
-
 def cameras_text(calibration: Calibration | LineCalibration, report: str = "") -> str:
     """The cameras alone, with what was found, as strict JSON."""
     names: tuple[str, ...] = ("schema", "unit", "datum", "sigma0", "dof", "cameras", "findings")
@@ -317,4 +283,4 @@ def cameras_text(calibration: Calibration | LineCalibration, report: str = "") -
         record, names = json.loads(lines_json(calibration)), ("schema", "cameras", "axes", "f_test", "findings")
     else:
         record = _record(calibration)
-    return _json(_plain({**{name: record[name] for name in names}, "report": report or None}))
+    return json_text({**{name: record[name] for name in names}, "report": report or None}).rstrip("\n")

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from pixmetry.calibrate.bundle.network import Calibration
-from pixmetry.calibrate.files.record import PIXELS, json_text, lines_json
+from pixmetry.calibrate.files.record import PIXELS, calibration_json, lines_json
 from pixmetry.calibrate.lines.line_calibration import LineCalibration
 from pixmetry.camera.camera import Camera
 from pixmetry.core.plain_text import cell, comment
@@ -66,7 +66,7 @@ def write_results(
         write_page(calibration, place / "report.html")
         for name, camera in (cameras or {}).items():
             camera.save(place / name)
-        _write_numbers(place, json_text, calibration)
+        _write_numbers(place, calibration_json, calibration)
     return Path(folder)
 
 

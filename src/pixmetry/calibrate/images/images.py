@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,6 +16,7 @@ from pixmetry.calibrate.images.targets import KINDS, Seen, Wanted, board_size, s
 from pixmetry.camera.camera import Camera
 from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.core.finding import Finding
+from pixmetry.core.progress import Progress, no_progress
 from pixmetry.core.threads import imap_tiles
 from pixmetry.files.formats import frame_name
 from pixmetry.files.images import PICTURE_ENDINGS, picture_files
@@ -106,7 +107,7 @@ def observations_of(
     noise: NoiseModel | Camera | str | Path | None = None,
     least_images: int = LEAST_IMAGES,
     threads: int | None = None,
-    progress: Callable[[str, int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> ImageObservations:
     """Locate and identify the targets of a calibration in all of its images.
 
@@ -161,7 +162,7 @@ def observations_of(
     layout = parse_raw(raw) if isinstance(raw, str) else raw
     wanted = Wanted(kind, size, sides, polarity, channel, noise_model(noise), threads, layout)
     items = _items(images, layout)
-    told = progress or (lambda what, done, of: None)
+    told = progress or no_progress
     seen: list[Seen] = []
     for one in imap_tiles(lambda item: see(*item, wanted), items, threads):
         seen.append(one)

@@ -12,8 +12,7 @@ from pixmetry.calibrate.project.points import Known
 from pixmetry.calibrate.project.schema import PicturesModel
 from pixmetry.calibrate.project.tables import Table
 from pixmetry.core.finding import Finding
-
-Progress = Callable[[str, int, int], None]
+from pixmetry.core.progress import Progress
 
 
 def located(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -23,8 +23,8 @@ from pixmetry.calibrate.project.tables import Table, first_few
 from pixmetry.camera.camera import Camera
 from pixmetry.core.config import Settings, load_yaml, validate
 from pixmetry.core.finding import Finding
+from pixmetry.core.progress import Progress
 
-Progress = Callable[[str, int, int], None]
 FIELD_OF = {"fixed": "fixed", "weighted": "fixed", "free": "free"}  # what `known` says; of nominal points images left out decide
 
 

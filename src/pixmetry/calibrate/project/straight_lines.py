@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,8 +14,8 @@ from pixmetry.calibrate.project.schema import PicturesModel
 from pixmetry.calibrate.project.tables import Table
 from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.core.finding import Finding
+from pixmetry.core.progress import Progress, no_progress
 
-Progress = Callable[[str, int, int], None]
 LEAST_LENGTH = 0.25  # of the frame's shorter side: what is shorter hardly tells how a line is bent
 FAINTEST = 0.05  # height over that of the frame's strongest line: what a coder or a halo draws beside it is none
 
@@ -81,7 +81,7 @@ def lines_of_pictures(
     from pixmetry.files.raw_values import parse_raw
     from pixmetry.locate.job import checked_frame, noise_model
 
-    told = progress or (lambda what, done, of: None)
+    told = progress or no_progress
     noise, layout = noise_model(wanted.noise), None if wanted.raw is None else parse_raw(wanted.raw)
     parts: list[LinePositions] = []
     findings, size = [], None

@@ -18,15 +18,16 @@ from pixmetry.core.checksums import check_record, sealed
 from pixmetry.core.errors import InputError
 from pixmetry.core.number import LOWER_LIMIT, UPPER_LIMIT, VALUE, Number
 from pixmetry.emva.records import MONO, DataSheet, Results
+from pixmetry.files.strict_json import json_text, plain
 
 SCHEMA = "pixmetry/emva1288/1"
 LARGEST_BYTES = 1 << 28  # a sheet with all its curves has less than 1 MB
 _INFINITE = {"inf": math.inf, "-inf": -math.inf}
 
 
-def json_text(sheet: DataSheet) -> str:
+def sheet_json(sheet: DataSheet) -> str:
     """Return a data sheet as JSON (RFC 8259)."""
-    return json.dumps(sealed(to_record(sheet)), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+    return json_text(sealed(to_record(sheet)))
 
 
 def read_sheet(path: str | Path) -> DataSheet:
@@ -150,19 +151,6 @@ def value_record(value: Number) -> dict[str, Any]:
         "is_limit": value.is_upper_limit,
         "is_lower_limit": value.is_lower_limit,
     }
-
-
-def plain(value: Any) -> Any:
-    """Return a value as JSON can hold it: NumPy's become plain ones, NaN ``None``, infinities ``"inf"`` and ``"-inf"``."""
-    if isinstance(value, np.ndarray | np.generic):
-        value = value.tolist()
-    if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None if math.isnan(value) else ("inf" if value > 0 else "-inf")
-    return value if value is None or isinstance(value, bool | int | float) else str(value)
 
 
 def sheet_of_record(record: Mapping[str, Any], where: str = "") -> DataSheet:

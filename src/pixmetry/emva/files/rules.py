@@ -7,7 +7,6 @@ __all__ = [
     "EQUAL_EXPOSURE",
     "FIT_RANGE",
     "MINIMUM_DARK_VAR_DN2",
-    "ONE_SIDED_95",
     "PTC_LIMIT_PERCENT",
     "QUANTISATION_DN2",
     "SATURATED_FRACTION",
@@ -17,4 +16,3 @@ __all__ = [
 FIT_RANGE = 0.7  # of saturation, for responsivity and gain (R4.0 §6.6)
 UNDERFLOW_FRACTION = 0.005  # of the dark pixels at the lowest code (R4.0 §6.5)
 PTC_LIMIT_PERCENT = 3.0  # departure of the photon transfer's local slope up to which the Linear model is used (R4.0 eq. 51)
-ONE_SIDED_95 = 1.6448536  # standard deviations

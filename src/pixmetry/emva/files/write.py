@@ -62,9 +62,9 @@ def content_of(sheet: DataSheet, kind: str) -> bytes:
         from pixmetry.emva.files.xml_format import xml_text
 
         return xml_text(sheet).encode()
-    from pixmetry.emva.files.formats import json_text
+    from pixmetry.emva.files.formats import sheet_json
 
-    return json_text(sheet).encode()
+    return sheet_json(sheet).encode()
 
 
 def _outputs(files: Mapping[str, Path]) -> list[Output]:

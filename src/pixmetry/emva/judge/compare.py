@@ -21,7 +21,6 @@ from pixmetry.emva.files.formats import (
     is_xml,
     number_of,
     parse_json,
-    plain,
     read_bytes,
     read_sheet,
     sheet_of_record,
@@ -31,6 +30,7 @@ from pixmetry.emva.files.formats import (
 from pixmetry.emva.judge.differences import Difference, Subject, decided, difference_of, family, holm
 from pixmetry.emva.judge.fleet import FleetRow, fleet_chance, fleet_row
 from pixmetry.emva.records import MONO, DataSheet
+from pixmetry.files.strict_json import plain
 
 if TYPE_CHECKING:
     from pixmetry.emva.judge.conformity import Checked, Limits

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from pixmetry.core.number import Number
+from pixmetry.core.number import Number, effective_dof
 from pixmetry.emva.files.keys import NONLINEAR, goes_with_photons
 from pixmetry.emva.files.units import plain_unit
 
@@ -100,7 +100,7 @@ def difference_of(place: tuple[str, str], one: Subject, two: Subject, same_light
         equal = equal or abs(row.difference) <= EQUAL_U * row.u
         reason = "" if equal else f"no uncertainty in {'A' if math.isnan(u_a) else 'B'}"
         return replace(row, verdict="equal" if equal else "undecided", reason=reason)
-    row = replace(row, u=math.hypot(u_a, u_b), dof=_joint_dof((u_a, a.dof), (u_b, b.dof)))
+    row = replace(row, u=math.hypot(u_a, u_b), dof=float(effective_dof([u_a**2, u_b**2], [_known(a.dof), _known(b.dof)])))
     return replace(row, p=_chance(row, toward), reason=limits)
 
 
@@ -124,12 +124,9 @@ def _u(value: Number, key: str, light: Subject | None) -> float:
     return math.sqrt(own) if own > 0 else value.u  # a u that never held the light's part
 
 
-def _joint_dof(*parts: tuple[float, float]) -> float:
-    """Effective degrees of freedom of a root sum of squares (Welch and Satterthwaite, JCGM 100 eq. G.2b)."""
-    total = sum(u**2 for u, _ in parts)
-    # in shares of the total, so that no power of a small u is lost
-    weight = sum((u**2 / total) ** 2 / dof for u, dof in parts if math.isfinite(dof))
-    return 1 / weight if weight > 0 else math.inf
+def _known(dof: float) -> float:
+    """Degrees of freedom that nobody stated count as infinite."""
+    return math.inf if math.isnan(dof) else dof
 
 
 def _sides(a: Number, b: Number) -> set[int]:

@@ -10,12 +10,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pixmetry.core.errors import InputError, MeasureError
-from pixmetry.emva.files.formats import plain
 from pixmetry.emva.files.rules import FIT_RANGE, QUANTISATION_DN2
 from pixmetry.emva.planning.known_camera import KnownCamera
 from pixmetry.emva.planning.preflight_checks import CODE_CHECKS, Check, Frames
 from pixmetry.emva.planning.preflight_frames import Group, reduce_frames
 from pixmetry.emva.planning.preflight_light import FLICKER_FRAMES, LIGHT_CHECKS, flattened, flicker_rel
+from pixmetry.files.strict_json import plain
 from pixmetry.observe.surface import cross_strata
 
 VERDICTS = ("ok", "not judged", "warn", "fail")

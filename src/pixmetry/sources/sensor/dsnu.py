@@ -11,7 +11,7 @@ from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, cut_map, quantity
 from pixmetry.core.errors import MeasureError
-from pixmetry.core.number import Estimates
+from pixmetry.core.number import Estimates, effective_dof
 from pixmetry.core.random import Stream
 
 FITTED = {"pixel_std_e": "dsnu_pixel_dn", "row_std_e": "dsnu_row_dn", "col_std_e": "dsnu_col_dn"}
@@ -58,8 +58,8 @@ def measure(observations: Observations) -> Estimates:
     values = in_dn.values / gain.value
     own, common = in_dn.covariance / gain.value**2, np.outer(values, values) * (gain.u / gain.value) ** 2
     covariance = own + common
-    u2 = np.maximum(np.diag(covariance), 1e-300)
-    dof = u2**2 / np.maximum(np.diag(own) ** 2 / in_dn.dof + np.diag(common) ** 2 / gain.dof, 1e-300)  # Welch–Satterthwaite, JCGM 100 G.4
+    parts, dofs = (np.stack(pair, axis=-1) for pair in ((np.diag(own), np.diag(common)), (in_dn.dof, np.full(len(in_dn), gain.dof))))
+    dof = effective_dof(parts, dofs)
     return Estimates(
         names=in_dn.names,
         values=values,
