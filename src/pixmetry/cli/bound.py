@@ -143,7 +143,7 @@ def _show(result: Any, about: dict[str, Any]) -> None:
     console = plain_console()
     size = ", ".join(f"{n.removesuffix('_px')} {v:g}" for n, v in result.parameters.items() if v and n.endswith("_px") and "per" not in n)
     console.print(
-        f"{result.kind} of {size} px, {result.parameters['amplitude_dn']:g} grey values over {result.parameters['background_dn']:g}; "
+        f"{result.kind} of {size} px, {result.parameters['amplitude_dn']:g} grey values over {result.parameters['background_dn']:.4g}; "
         f"{result.frames} frame{'s' if result.frames > 1 else ''}, window {result.window_px} px",
         soft_wrap=True,
     )
@@ -154,7 +154,7 @@ def _show(result: Any, about: dict[str, Any]) -> None:
     for column in ("unknown", "px", "px by phase", *(["µm"] if micro else [])):
         table.add_column(column, no_wrap=column != "unknown")
     for name, b in result.bounds.items():
-        label = {"asked": f"asked: {', '.join(b.unknowns)}", "position": "place alone"}.get(name, f"… {name} too")
+        label = {"asked": f"asked: {', '.join(b.unknowns)}", "position": "position alone"}.get(name, f"… {name} too")
         least, mean, greatest = b.place_px
         table.add_row(label, f"{mean:.3g}", f"{least:.3g} … {greatest:.3g}", *([micro(mean)] if micro else []))
     for name, value in result.closed_forms_px.items():

@@ -22,9 +22,9 @@ WITHIN = 1.05  # frames are averaged until the uncertainty is within 5 % of what
 MOST_FRAMES, VERY_MANY = 10**6, 10**12
 UNKNOWN_PX = 1.0  # a place that is less sure than this is not known
 LEFT_OUT = (
-    "the noise is Gaussian, independent from pixel to pixel, and of known variance: that the variance tells of the light too is not used",
-    "first order: where the noise is as large as the target, errors are larger than this",
-    "geometry, drift, lighting, and a target that is not what the template says, are not in it",
+    "the noise is Gaussian, independent from pixel to pixel, of known variance; what the variance itself says about the light is not used",
+    "the result is of first order: errors are larger if the noise is as large as the target",
+    "not included: geometry, drift, lighting, and targets that differ from the template",
 )
 
 
@@ -265,16 +265,16 @@ def _advice(predictions: tuple[Prediction, ...], worth: int | None, bounds: dict
     if two:
         better, other = two
         out.append(
-            f"of the two classical centroids the {better.name.replace('_', ' ')} is better here, each in its best window: "
+            f"of the two classical centroids, each in its best window, the {better.name.replace('_', ' ')} is better here: "
             f"{better.u_px:.2g} px against {other.u_px:.2g} px"
         )
     if worth is None:
-        out.append("all of this averages out over frames, as 1/√N")
+        out.append("averaging N frames lowers all of this as 1/√N")
     else:
-        out.append(f"more than {worth} frames are not worth averaging: what is fixed in the sensor and in the sampling stays")
+        out.append(f"averaging more than {worth} frames gains little: errors that are fixed in the sensor and in the sampling stay")
     light, planes = bounds["light"].place_px[1], bounds["planes"].place_px[1]
     if np.isfinite(planes) and planes > 1.2 * light:
-        out.append(f"unknown slopes of background and light make it {planes / light:.2g} × as large: fit them only where significant")
+        out.append(f"unknown slopes of background and light make the result {planes / light:.2g} × as large: fit them only if needed")
     return out
 
 
@@ -282,7 +282,7 @@ def _statements(asked: Bound, rounded: bool) -> list[str]:
     if not rounded:
         how = "grey values are taken as not rounded"
     elif asked.exact_codes:
-        how = "some pixels have less than 0.4 DN of noise: rounding is counted by the exact likelihood of the codes, and the phase matters"
+        how = "some pixels have less than 0.4 DN of noise: the exact likelihood of the codes is used, and the sub-pixel phase matters"
     else:
         how = "rounding counts as noise of 1/12 DN², which holds for 0.4 DN of noise or more"
     return [how, *LEFT_OUT]
