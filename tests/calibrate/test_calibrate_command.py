@@ -24,12 +24,13 @@ from calibrate.test_calibration_images import COLS, FOCAL, ROWS, View, chessboar
 from chance import rng_of
 from pixmetry.calibrate.bundle.bundle import SMALL
 from pixmetry.calibrate.bundle.model import NAMES
-from pixmetry.calibrate.bundle.network import Calibration, Network
+from pixmetry.calibrate.bundle.network import Network
 from pixmetry.calibrate.calibrated_camera import calibrated_geometry
 from pixmetry.calibrate.files.record import calibration_json, packed, read_calibration, unpacked
 from pixmetry.calibrate.files.write import TABLES, write_results
 from pixmetry.calibrate.project import load_project
 from pixmetry.calibrate.project.schema import ProjectModel
+from pixmetry.calibrate.records import Calibration, EccentricityRecord, Tests
 from pixmetry.cli import main
 from pixmetry.core.config import load_yaml, validate
 from pixmetry.core.errors import InputError
@@ -161,7 +162,7 @@ def test_fewer_parameters_and_terms_of_images(simulated: Simulated, tmp_path: Pa
     (camera,) = told["cameras"]
     assert camera["covariance"]["names"] == ["c", "xp", "yp", "k1", "k2"] and told["report"].endswith("report.html")
     stored = read_calibration(tmp_path / "r")
-    assert any(name.endswith(":x_scale") for name in stored.columns) and "hold_out" not in stored.tests
+    assert any(name.endswith(":x_scale") for name in stored.columns) and stored.tests.hold_out is None
     with (tmp_path / "r" / "poses.csv").open() as file:
         rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
     assert len(rows) == 12 and all(float(row["u_x_scale"]) > 0 for row in rows)
@@ -258,9 +259,10 @@ def test_numbers_that_are_not_finite_stay_strict_json(by_hand: Calibration) -> N
     a = by_hand.adjustment
     xyz = a.state.xyz.copy()
     xyz[3] = np.nan
-    lost = replace(by_hand, adjustment=replace(a, state=replace(a.state, xyz=xyz)), tests={**by_hand.tests, "x": np.inf})
+    tests = Tests(eccentricity=EccentricityRecord(0, np.inf, 0.0))
+    lost = replace(by_hand, adjustment=replace(a, state=replace(a.state, xyz=xyz)), tests=tests)
     record = json.loads(calibration_json(lost), parse_constant=lambda name: pytest.fail(name))
-    assert record["points"]["xyz"][3] == [None] * 3 and record["tests"]["x"] == "inf"
+    assert record["points"]["xyz"][3] == [None] * 3 and record["tests"]["eccentricity"]["largest_px"] == "inf"
     assert TABLES["points.csv"](lost).splitlines()[5].startswith(f"{a.network.points[3]},,,,")
 
 

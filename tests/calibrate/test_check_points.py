@@ -16,6 +16,7 @@ from calibrate.networks import Simulated, predicted, simulate
 from pixmetry.calibrate.bundle.bundle import adjust
 from pixmetry.calibrate.bundle.network import Adjustment, Network, State
 from pixmetry.calibrate.checks.check_points import CheckPoints, _text, _turned, check_findings, check_record, joint_covariance
+from pixmetry.calibrate.records import CheckRecord
 from pixmetry.core.errors import InputError
 
 FALSE_FAILURE = 1e-6
@@ -131,15 +132,15 @@ def test_the_p_value_of_good_check_points_is_uniform(rng: np.random.Generator, k
         if partly:
             checks.xyz[::3, 2], checks.xyz[1::3, :2] = np.nan, np.nan
         record = check_record(measured(rng, kind, simulated, exact), checks)
-        assert record["datum_parameters"] == KINDS[kind] and record["n"] == record["dof"] + KINDS[kind] == (24 if partly else 36)
-        deviates.append(norm.isf(record["p"]))
-        total, dof = total + record["chi2"], dof + record["dof"]
-        ratios += [point["ratio"] for point in record["points"]]
+        assert record.datum_parameters == KINDS[kind] and record.n == record.dof + KINDS[kind] == (24 if partly else 36)
+        deviates.append(norm.isf(record.p))
+        total, dof = total + record.chi2, dof + record.dof
+        ratios += [point.ratio for point in record.points]
     limit = norm.isf(FALSE_FAILURE / 8)
     assert abs(np.sum(deviates)) / np.sqrt(12) < limit
     assert chi2.sf(total / 1.05, dof) > FALSE_FAILURE / 8 and chi2.cdf(total * 1.05, dof) > FALSE_FAILURE / 8  # σ₀ has 500 redundancies
     z = np.array(ratios)[np.isfinite(ratios)]
-    assert len(z) == 12 * record["n"] and np.abs(z).max() < 1.1 * norm.isf(FALSE_FAILURE / 8 / len(z))
+    assert len(z) == 12 * record.n and np.abs(z).max() < 1.1 * norm.isf(FALSE_FAILURE / 8 / len(z))
     # the ratios hang together: no fewer than 72 of them are free
     assert chi2.sf(72 * np.mean(z**2) / 1.05, 72) > FALSE_FAILURE / 8 and chi2.cdf(72 * np.mean(z**2) * 1.05, 72) > FALSE_FAILURE / 8
 
@@ -155,11 +156,11 @@ def test_an_error_is_named(rng: np.random.Generator, kind: str) -> None:
     adjustment = measured(rng, kind, simulated, predicted(simulated.network, simulated.truth))
     checks = given(rng, simulated, points)
     row, axis = int(rng.integers(44)), int(rng.integers(3))
-    u = check_record(adjustment, checks)["points"][row]["u_difference"][axis]
+    u = check_record(adjustment, checks).points[row].u_difference[axis]
     checks.xyz[row, axis] += 10 * u
     record = check_record(adjustment, checks)
-    worst = record["worst"]
-    assert (worst["name"], worst["axis"]) == (checks.names[row], "XYZ"[axis])
+    worst = record.worst
+    assert (worst.name, worst.axis) == (checks.names[row], "XYZ"[axis])
     (finding,) = check_findings(record)
     assert finding.level == "warning" and f"{checks.names[row]} {'XYZ'[axis]}" in finding.text and "Check the coordinates" in finding.advice
 
@@ -171,16 +172,16 @@ def test_what_is_known_badly_does_not_pull(rng: np.random.Generator, kind: str) 
     adjustment = measured(rng, kind, simulated, predicted(simulated.network, simulated.truth))
     points = rng.choice(np.arange(12, 40), 10, replace=False)
     checks = given(rng, simulated, points)
-    others = [point["difference"] for point in check_record(adjustment, checks)["points"][1:]]
+    others = [point.difference for point in check_record(adjustment, checks).points[1:]]
     checks.xyz[0] += 50.0
     assert checks.u_xyz is not None
     checks.u_xyz[0] = 50.0
     record = check_record(adjustment, checks)
-    assert abs(record["points"][0]["ratio"][0]) == pytest.approx(1.0, abs=0.1)
-    u = [point["u_difference"] for point in record["points"][1:]]
+    assert abs(record.points[0].ratio[0]) == pytest.approx(1.0, abs=0.1)
+    u = [point.u_difference for point in record.points[1:]]
     # the first point had a share in the fit: beside noise that is smaller than u, nothing comes in its place
-    assert np.abs(np.array([point["difference"] for point in record["points"][1:]]) - others).max() < 5 * np.max(u)
-    found, before = np.array([point["found"] for point in record["points"]]), adjustment.state.xyz[points]
+    assert np.abs(np.array([point.difference for point in record.points[1:]]) - others).max() < 5 * np.max(u)
+    found, before = np.array([point.found for point in record.points]), adjustment.state.xyz[points]
     apart = [np.linalg.norm(xyz[:, None] - xyz[None], axis=2) for xyz in (found, before)]
     if kind == "free":
         apart[1] *= apart[0].sum() / apart[1].sum()
@@ -196,11 +197,11 @@ def test_the_found_points_are_in_the_frame_of_the_check_points(rng: np.random.Ge
     adjustment = adjust(network, start(rng, "free", simulated.truth), a_priori=True)
     points = np.arange(10, 20)
     record = check_record(adjustment, CheckPoints(tuple(network.points[10:20]), simulated.truth.xyz[10:20]), a_priori=True)
-    found = np.array([point["found"] for point in record["points"]])
-    assert np.abs(found - simulated.truth.xyz[points]).max() < 1e-5 and record["chi2"] < 1e-3
+    found = np.array([point.found for point in record.points])
+    assert np.abs(found - simulated.truth.xyz[points]).max() < 1e-5 and record.chi2 < 1e-3
     scale = np.linalg.norm(simulated.truth.xyz[0] - simulated.truth.xyz[1])
     scale /= np.linalg.norm(adjustment.state.xyz[0] - adjustment.state.xyz[1])
-    u = np.array([point["u_found"] for point in record["points"]])
+    u = np.array([point.u_found for point in record.points])
     expected = scale**2 * np.trace(adjustment.point_covariance[points], axis1=1, axis2=2)
     np.testing.assert_allclose((u**2).sum(axis=1), expected, rtol=1e-4)
 
@@ -218,14 +219,14 @@ def test_the_origin_may_be_far_away(rng: np.random.Generator, kind: str, partly:
     if partly:
         checks.xyz[::3, 2], checks.xyz[1::3, :2] = np.nan, np.nan
     near = check_record(adjustment, checks)
-    assert near["datum_parameters"] == KINDS[kind]
+    assert near.datum_parameters == KINDS[kind]
     for size in (5e6, 1e9):
         far_away = size * rng.choice([-1.0, 1.0], 3) * rng.uniform(0.1, 1, 3) * (1, 1, kind != "heights")
         far = check_record(adjustment, replace(checks, xyz=checks.xyz + far_away))
-        assert [far[key] for key in ("n", "dof", "datum_parameters")] == [near[key] for key in ("n", "dof", "datum_parameters")]
-        assert far["chi2"] == pytest.approx(near["chi2"], rel=1e-3) and far["p"] == pytest.approx(near["p"], rel=1e-2)
+        assert (far.n, far.dof, far.datum_parameters) == (near.n, near.dof, near.datum_parameters)
+        assert far.chi2 == pytest.approx(near.chi2, rel=1e-3) and far.p == pytest.approx(near.p, rel=1e-2)
         for key, offset in (("found", far_away), ("u_found", 0.0), ("difference", 0.0), ("u_difference", 0.0)):
-            values = [np.array([point[key] for point in record["points"]]) for record in (near, far)]
+            values = [np.array([getattr(point, key) for point in record.points]) for record in (near, far)]
             np.testing.assert_allclose(values[1] - offset, values[0], atol=2e-6, err_msg=key)
 
 
@@ -237,7 +238,7 @@ def test_a_free_network_may_be_of_any_size(rng: np.random.Generator, factor: flo
     truth = simulated.truth
     scaled = replace(truth, xyz=factor * truth.xyz, position=factor * truth.position)
     same, found = (check_record(adjust(network, state), checks) for state in (truth, scaled))
-    assert found["datum_parameters"] == 7 and found["dof"] == same["dof"] and found["chi2"] == pytest.approx(same["chi2"], rel=1e-3)
+    assert found.datum_parameters == 7 and found.dof == same.dof and found.chi2 == pytest.approx(same.chi2, rel=1e-3)
 
 
 def test_a_similarity_of_many_points(rng: np.random.Generator) -> None:
@@ -255,9 +256,9 @@ def test_so_few_say_nothing(rng: np.random.Generator, kind: str, count: int, tol
     points = rng.choice(np.arange(12, 40), count, replace=False)
     adjustment = measured(rng, kind, simulated, predicted(simulated.network, simulated.truth))
     record = check_record(adjustment, given(rng, simulated, points))
-    assert (record["p"] is not None) == (record["worst"] is not None) == told == ("say nothing" not in record["text"])
-    assert np.isfinite([point["ratio"] for point in record["points"]]).all() == told
-    assert not [f for f in check_findings(record) if record["worst"] is None]
+    assert (record.p is not None) == (record.worst is not None) == told == ("say nothing" not in record.text)
+    assert np.isfinite([point.ratio for point in record.points]).all() == told
+    assert not [f for f in check_findings(record) if record.worst is None]
 
 
 def test_points_that_are_not_determined_are_named(rng: np.random.Generator) -> None:
@@ -269,11 +270,11 @@ def test_points_that_are_not_determined_are_named(rng: np.random.Generator) -> N
     checks = replace(checks, names=("T21", "elsewhere"))
     adjustment = adjust(network, replace(simulated.truth, xyz=np.where(np.arange(40)[:, None] == 20, np.nan, simulated.truth.xyz)))
     record = check_record(adjustment, checks)
-    assert record["n"] == 0 and record["p"] is None and np.isnan(record["points"][0]["found"]).all()
+    assert record.n == 0 and record.p is None and np.isnan(record.points[0].found).all()
     (finding,) = check_findings(record)
     assert finding.level == "warning" and "T21, elsewhere" in finding.text
     record = check_record(adjustment, replace(checks, names=("T22", "T21")))
-    assert record["n"] == 3 and [point["images"] > 0 for point in record["points"]] == [True, False]
+    assert record.n == 3 and [point.images > 0 for point in record.points] == [True, False]
 
 
 @pytest.mark.parametrize("empty", [1, 3])
@@ -286,7 +287,7 @@ def test_rows_without_coordinates_are_not_taken_for_undetermined(rng: np.random.
     found = [finding for finding in check_findings(record) if "contradict" not in finding.text]
     assert [finding.level for finding in found] == ["warning" if empty == 3 else "note"]
     assert found[0].text.startswith(f"{empty} of 3 check points {'is' if empty == 1 else 'are'} without coordinates: T21")
-    assert "not determined" not in found[0].text and ("could be compared" in record["text"]) == (empty == 3)
+    assert "not determined" not in found[0].text and ("could be compared" in record.text) == (empty == 3)
 
 
 def test_lists_will_do(rng: np.random.Generator) -> None:
@@ -295,7 +296,7 @@ def test_lists_will_do(rng: np.random.Generator) -> None:
     checks = given(rng, simulated, np.array([20, 21]))
     assert checks.u_xyz is not None
     listed = CheckPoints(list(checks.names), checks.xyz.tolist(), checks.u_xyz.tolist())  # type: ignore[arg-type]
-    assert check_record(adjustment, listed)["chi2"] == check_record(adjustment, checks)["chi2"] and listed.names == checks.names
+    assert check_record(adjustment, listed).chi2 == check_record(adjustment, checks).chi2 and listed.names == checks.names
     exact = CheckPoints(["T21"], [[1, 2, None]])  # type: ignore[arg-type, list-item]
     np.testing.assert_array_equal(exact.xyz, [[1, 2, np.nan]])
     np.testing.assert_array_equal(exact.u_xyz, [[0, 0, 0]])
@@ -305,8 +306,8 @@ def test_lists_will_do(rng: np.random.Generator) -> None:
     ("value", "text"), [(0.4, "0.40"), (0.04, "0.040"), (0.0996, "0.10"), (3, "3.0"), (9.96, "10"), (12.3, "12"), (2345, "2300")]
 )
 def test_two_digits_are_said(value: float, text: str) -> None:
-    record = {"n": 3, "rms": [value, np.nan, np.nan], "expected_rms": [value] * 3, "datum_parameters": 0, "unit": "mm", "p": None}
-    assert f" {text} mm rms" in _text(record, 1).replace("X ", "")
+    record = CheckRecord("mm", 0, 3, 3, 0.001, (value, np.nan, np.nan), (value,) * 3, None, None, None, "", ())
+    assert f" {text} mm rms" in _text(record).replace("X ", "")
 
 
 def test_the_argument_of_calibrate(rng: np.random.Generator) -> None:
@@ -314,11 +315,11 @@ def test_the_argument_of_calibrate(rng: np.random.Generator) -> None:
     checks = given(rng, simulated, np.arange(20, 30))
     without = pixmetry.calibrate(simulated.network, options={"folds": 0})
     calibration = pixmetry.calibrate(simulated.network, options={"folds": 0}, check_points=checks)
-    assert (calibration.adjustment.state.xyz == without.adjustment.state.xyz).all() and "check_points" not in without.tests
-    record = calibration.tests["check_points"]
+    assert (calibration.adjustment.state.xyz == without.adjustment.state.xyz).all() and without.tests.check_points is None
+    record = calibration.tests.check_points
     a = calibration.adjustment
-    assert [point["name"] for point in record["points"]] == list(checks.names)
-    np.testing.assert_allclose([p["difference"] for p in record["points"]], checks.xyz - a.state.xyz[20:30], atol=1e-12)
+    assert [point.name for point in record.points] == list(checks.names)
+    np.testing.assert_allclose([p.difference for p in record.points], checks.xyz - a.state.xyz[20:30], atol=1e-12)
     with pytest.raises(InputError, match="'T3' is among the points and the check points"):
         pixmetry.calibrate(simulated.network, check_points=replace(checks, names=("T3", *checks.names[1:])))
 

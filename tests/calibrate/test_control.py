@@ -12,15 +12,17 @@ from scipy import stats
 from calibrate.networks import Simulated, simulate
 from pixmetry.calibrate.bundle import loosened, settling
 from pixmetry.calibrate.bundle.bundle import adjust
-from pixmetry.calibrate.bundle.network import Calibration, ScaleBars
+from pixmetry.calibrate.bundle.network import ScaleBars
 from pixmetry.calibrate.bundle.solve import Options, calibrate_network
 from pixmetry.calibrate.checks import known_checks, known_residuals
 from pixmetry.calibrate.checks.findings import findings_of, gross_error_findings, known_findings
+from pixmetry.calibrate.checks.known_checks import KnownFaults
 from pixmetry.calibrate.checks.known_residuals import Known, contradicted, control_residuals, group_record, jointly, rivals
 from pixmetry.calibrate.checks.lost_control import lost_records, mostly_lost, set_free, where_seen, wrong_known
+from pixmetry.calibrate.checks.tests import known_record, sizes
 from pixmetry.calibrate.page.control import control_points
 from pixmetry.calibrate.page.tables import scale_bars
-from pixmetry.calibrate.records import known_record, sizes
+from pixmetry.calibrate.records import Calibration, Contradicted, GrossError, KnownControl, KnownRecord, record_of
 from pixmetry.core.errors import InputError
 from pixmetry.core.finding import Finding
 
@@ -60,7 +62,7 @@ def calibrated(simulated: Simulated, options: Options = QUICK) -> Calibration:
 
 
 def gross(calibration: Calibration) -> list[str]:
-    return [record["name"] for record in calibration.tests["known"]["control_points"]["gross"]]
+    return [record.name for record in calibration.tests.known.control_points.gross]
 
 
 def of_kind(calibration: Calibration, kind: str) -> list[Finding]:
@@ -82,10 +84,10 @@ def test_a_wrong_coordinate_is_found_beside_many_good_images(rng, point, axis):
     """16 images of 120 points at 0.01 px hold their shape a thousand times better than weights of a part of the field hold the datum."""
     simulated = wrong_by(with_control(rng, whole=7, heights=2, positions=2), point, axis, 3.0)
     calibration = calibrated(simulated)
-    (record,) = calibration.tests["known"]["control_points"]["gross"]
-    assert record["name"] == f"T{point + 1} {'XYZ'[axis]}" and record["left_out"]
+    (record,) = calibration.tests.known.control_points.gross
+    assert record.name == f"T{point + 1} {'XYZ'[axis]}" and record.left_out
     # 0.05 mm of its own and of the others, that carry the frame: 0.11 mm for a point at the rim
-    assert record["error"] == pytest.approx(3.0, abs=stats.norm.isf(RATE / 2) * 0.15)
+    assert record.error == pytest.approx(3.0, abs=stats.norm.isf(RATE / 2) * 0.15)
     assert calibration.adjustment.used.all()
     assert_points_as_stated(calibration, simulated)
 
@@ -95,17 +97,17 @@ def test_a_wrong_bar_is_found_between_control_points(rng):
     b = simulated.network.bars
     network = replace(simulated.network, bars=ScaleBars(b.start, b.end, b.length + [0, 2.0, 0, 0], b.u))
     calibration = calibrated(replace(simulated, network=network))
-    (record,) = calibration.tests["known"]["scale_bars"]["gross"]
+    (record,) = calibration.tests.known.scale_bars.gross
     names = [network.points[k] for k in (b.start[1], b.end[1])]
-    assert record["name"] == "–".join(names) and record["left_out"] and not gross(calibration)
+    assert record.name == "–".join(names) and record.left_out and not gross(calibration)
     assert calibration.adjustment.used.all()
 
 
 @pytest.mark.parametrize("noise_px", [0.003, 0.3])
 def test_right_control_stays(rng, noise_px):
     calibration = calibrated(with_control(rng, whole=4, heights=3, positions=3, noise_px=noise_px, images=10, points=60))
-    known = calibration.tests["known"]
-    assert not known["control_points"]["gross"] and not known["control_points"]["raised"] and known["untested"] is None
+    known = calibration.tests.known
+    assert not known.control_points.gross and not known.control_points.raised and known.untested is None
     assert calibration.adjustment.used.all()
     assert not {"known_untested", "gross_control_point", "lost_control"} & {f.kind for f in calibration.findings}
 
@@ -135,7 +137,7 @@ def test_that_control_could_not_be_tested_is_said(rng, monkeypatch):
     monkeypatch.setattr(loosened, "LOOSE", loosened.LOOSE[:1])
     calibration = calibrated(in_two_parts(rng))
     (finding,) = of_kind(calibration, "known_untested")
-    assert finding.level == "warning" and "control points" in finding.text and calibration.tests["known"]["untested"] in finding.text
+    assert finding.level == "warning" and "control points" in finding.text and calibration.tests.known.untested in finding.text
 
 
 def test_what_only_control_determines_takes_part(rng):
@@ -163,14 +165,14 @@ def test_a_weighted_point_without_image_points_is_wrong_by_what_is_known_of_it(r
     assert list(wrong_known(network, before)) == [point]
     lost, seen, out = mostly_lost(network, before)
     assert list(lost) == [point] and seen[0] == out[0] == (network.point == point).sum()
-    assert sizes(before)["points"] == 59
+    assert sizes(before).points == 59
     state = where_seen(network, before, np.array([point]))
     assert np.linalg.norm(state.xyz[point] - simulated.truth.xyz[point]) < 1.0
     after = adjust(set_free(network, np.array([point])), state, redundancy=True)
     (record,) = lost_records(network, after, np.array([point]))
-    assert record["name"] == ("T2" if len(axes) == 3 else "T6 Z") and record["statistic"] > record["critical"]
+    assert record.name == ("T2" if len(axes) == 3 else "T6 Z") and record.statistic > record.critical
     low, high = (stats.chi2.ppf(p, len(axes)) for p in (RATE / 2, 1 - RATE / 2))
-    assert np.sqrt(9 + low * U_MM**2) - 0.6 < record["error"] < 3.0 + 2 * np.sqrt(high) * 2 * U_MM
+    assert np.sqrt(9 + low * U_MM**2) - 0.6 < record.error < 3.0 + 2 * np.sqrt(high) * 2 * U_MM
 
 
 def test_points_too_many_to_be_wrong_one_by_one_are_named(rng):
@@ -189,7 +191,7 @@ def test_points_too_many_to_be_wrong_one_by_one_are_named(rng):
 def test_wrong_control_is_found_by_the_images_that_it_costs(rng, monkeypatch):
     """Where nothing could be tested, the points that lost their image points are set free after all."""
     simulated = wrong_by(with_control(rng, whole=8, heights=2, images=12, points=50, noise_px=0.04), 9, 2, 60.0)
-    monkeypatch.setattr(settling, "_checked_known", lambda m, shift, s, u, loss, *_: (m, s, u, loss, known_checks.CheckedKnown(m).gross))
+    monkeypatch.setattr(settling, "_checked_known", lambda m, shift, s, u, loss, *_: (m, s, u, loss, known_checks.KnownFaults()))
     calibration = calibrated(simulated)
     assert gross(calibration) == ["T10 Z"] and calibration.adjustment.used.all()
     assert_points_as_stated(calibration, simulated)
@@ -250,21 +252,21 @@ def test_where_it_cannot_be_said_which_all_weigh_less_and_keep_what_was_stated(r
     """Three whole points have two degrees of freedom: without one of them nothing would tell whether the others are right."""
     simulated = wrong_by(with_control(rng, whole=3, images=10, points=50), 1, 0, 3.0)
     calibration = calibrated(simulated)
-    record = calibration.tests["known"]["control_points"]
-    named = {name for r in record["gross"] for name in (r["name"], *r["rivals"])}
+    record = calibration.tests.known.control_points
+    named = {name for r in record.gross for name in (r.name, *r.rivals)}
     if not named:  # the three lie so that X of this one has next to no redundancy
         known = control_residuals(adjust(simulated.network, simulated.truth, redundancy=True))
         assert known.redundancy[known.name.index("T2 X")] < 0.02
         return
     assert "T2 X" in named and calibration.adjustment.used.all()
-    assert set(record["raised"].values()) <= {U_MM}
+    assert set(record.raised.values()) <= {U_MM}
     finding = of_kind(calibration, "gross_control_point")[0]
     rows = {row[0]: row for row in control_points(calibration)}
     assert "cannot be said" in finding.advice
-    for one in record["gross"]:
-        assert not one["left_out"] and set(one["rivals"]) <= set(record["raised"])
-        assert f"{one['name']} (contradicted, weighs less)" in rows
-    for name in record["raised"]:
+    for one in record.gross:
+        assert not one.left_out and set(one.rivals) <= set(record.raised)
+        assert f"{one.name} (contradicted, weighs less)" in rows
+    for name in record.raised:
         point, axis = int(name.split()[0][1:]) - 1, "XYZ".index(name.split()[1])
         (row,) = (r for key, r in rows.items() if key.startswith(f"{name} ("))
         assert calibration.adjustment.network.u_xyz[point, axis] > U_MM and row[2] == "± 0.050"
@@ -278,7 +280,7 @@ def test_bars_that_weigh_less_keep_what_was_stated(rng):
     network = replace(simulated.network, bars=ScaleBars(b.start, b.end, b.length + [5.0, 0], b.u))
     calibration = calibrated(replace(simulated, network=network))
     assert (calibration.adjustment.network.bars.u > 1).all()
-    assert [bar["u"] for bar in calibration.tests["network"]["scale_bars"]] == [0.01, 0.01]
+    assert [bar.u for bar in calibration.tests.network.scale_bars] == [0.01, 0.01]
     assert all("weighs less" in row[0] and row[2] == "± 0.010" for row in scale_bars(calibration))
 
 
@@ -332,29 +334,29 @@ def test_a_wrong_held_coordinate_is_named_and_not_what_is_right_beside_it(rng, u
     """5 mm, some hundred times what a network of ten images at 0.04 px knows of it."""
     simulated = wrong_by(held_beside(rng, u, bars), point, axis, 5.0)
     calibration = calibrated(simulated)
-    network, records = calibration.adjustment.network, calibration.tests["known"]["control_points"]["gross"]
-    named = {name for record in records for name in (record["name"], *record["rivals"])}
+    network, records = calibration.adjustment.network, calibration.tests.known.control_points.gross
+    named = {name for record in records for name in (record.name, *record.rivals)}
     assert f"T{point + 1} {'XYZ'[axis]}" in named and len(records) == 1 and len(network.bars) == bars
-    assert not calibration.tests["known"]["scale_bars"]["gross"] and calibration.adjustment.used.all()
+    assert not calibration.tests.known.scale_bars.gross and calibration.adjustment.used.all()
     (record,) = records
-    if record["left_out"]:
-        assert record["error"] == pytest.approx(5.0, abs=stats.norm.isf(RATE / 2) * 0.15)
+    if record.left_out:
+        assert record.error == pytest.approx(5.0, abs=stats.norm.isf(RATE / 2) * 0.15)
         others = np.arange(len(network.points)) != point
         np.testing.assert_array_equal(network.u_xyz[others], simulated.network.u_xyz[others])
     else:  # of heights that lie nearly in line it cannot be said which it is
-        assert record["rivals"]
+        assert record.rivals
 
 
 @pytest.mark.parametrize(("u", "bars", "point", "axis"), MIXTURES, ids=MIXED)
 def test_right_held_coordinates_stay_held(rng, u, bars, point, axis):
     simulated = held_beside(rng, u, bars)
     calibration = calibrated(simulated)
-    known = calibration.tests["known"]
-    assert not known["control_points"]["gross"] and not known["control_points"]["raised"] and known["untested"] is None
+    known = calibration.tests.known
+    assert not known.control_points.gross and not known.control_points.raised and known.untested is None
     np.testing.assert_array_equal(calibration.adjustment.network.u_xyz, simulated.network.u_xyz)
     assert calibration.adjustment.used.all() and len(calibration.adjustment.network.bars) == bars
-    fixed = known["fixed_points"]
-    assert fixed is None or fixed["p"] > RATE
+    fixed = known.fixed_points
+    assert fixed is None or fixed.p > RATE
 
 
 def in_metres(simulated: Simulated) -> Simulated:
@@ -371,17 +373,17 @@ def test_of_two_bars_in_different_units_neither_is_left_out_where_nothing_else_g
     with pytest.raises(InputError, match="the two scale bars contradict"):
         calibrated(in_metres(held_beside(rng, u, 2)))
     calibration = calibrated(in_metres(held_beside(rng, u, 3)))
-    (record,) = calibration.tests["known"]["scale_bars"]["gross"]
-    assert record["left_out"] and len(calibration.adjustment.network.bars) == 2 and not gross(calibration)
+    (record,) = calibration.tests.known.scale_bars.gross
+    assert record.left_out and len(calibration.adjustment.network.bars) == 2 and not gross(calibration)
 
 
 @pytest.mark.parametrize("u", [np.full((2, 3), U_MM), np.zeros((2, 3))], ids=["two points", "two points held"])
 def test_two_whole_points_tell_which_bar_is_in_other_units(rng, u):
     simulated = in_metres(held_beside(rng, u, 2))
     calibration = calibrate_network(simulated.network, QUICK)  # the wrong bar has its part in the start values
-    (record,) = calibration.tests["known"]["scale_bars"]["gross"]
+    (record,) = calibration.tests.known.scale_bars.gross
     b = simulated.network.bars
-    assert record["left_out"] and record["name"] == "–".join(simulated.network.points[k] for k in (b.start[0], b.end[0]))
+    assert record.left_out and record.name == "–".join(simulated.network.points[k] for k in (b.start[0], b.end[0]))
     assert calibration.adjustment.used.all()
 
 
@@ -391,25 +393,27 @@ def test_two_whole_points_tell_which_bar_is_in_other_units(rng, u):
 def test_the_error_of_a_whole_point_is_told_along_the_axis_of_it(rng):
     """5 mm in X and almost as much in Y, of one held point: whichever test is worst, the larger one is said."""
     simulated = wrong_by(wrong_by(held_beside(rng, one_held(8), 2), 0, 0, 5.0), 0, 1, 4.0)
-    (record,) = calibrated(simulated).tests["known"]["control_points"]["gross"]
-    assert record["name"] == "T1 X" and record["left_out"] and set(record) == {
+    (record,) = calibrated(simulated).tests.known.control_points.gross
+    assert record.name == "T1 X" and record.left_out and set(record_of(record)) == {
         "name", "residual", "error", "statistic", "critical", "left_out", "rivals", "swapped_with"
     }  # fmt: skip
-    assert record["error"] == pytest.approx(5.0, abs=stats.norm.isf(RATE / 2) * 0.15)
+    assert record.error == pytest.approx(5.0, abs=stats.norm.isf(RATE / 2) * 0.15)
 
 
 def test_what_is_left_out_in_the_end_is_said_once(rng):
     simulated = with_control(rng, whole=5, images=6, points=30, noise_px=0.04, bars=2)
     free = adjust(set_free(simulated.network, np.array([1])), simulated.truth, redundancy=True)
-    one = {"residual": 1.0, "error": 1.0, "statistic": 9.0, "critical": 4.0}
-    less, out = {**one, "left_out": False, "rivals": ["B"]}, {**one, "left_out": True, "rivals": []}
-    gross = {
-        "scale_bars": [{**less, "name": "A–B"}, {**less, "name": "C–D"}, {**out, "name": "A–B"}],
-        "control_points": [{**less, "name": "T1 X"}, {**less, "name": "T2 X"}, {**out, "name": "T2 Z"}],
-    }
-    found = known_record(free, gross)
-    assert [(r["name"], r["left_out"]) for r in found["scale_bars"]["gross"]] == [("C–D", False), ("A–B", True)]
-    assert [(r["name"], r["left_out"]) for r in found["control_points"]["gross"]] == [("T1 X", False), ("T2 Z", True)]
+
+    def less(name: str) -> Contradicted:
+        return Contradicted(name, 1.0, 1.0, 9.0, 4.0, left_out=False, rivals=("B",))
+
+    def out(name: str) -> Contradicted:
+        return Contradicted(name, 1.0, 1.0, 9.0, 4.0, left_out=True, rivals=())
+
+    faults = KnownFaults((less("A–B"), less("C–D"), out("A–B")), (less("T1 X"), less("T2 X"), out("T2 Z")))
+    found = known_record(free, faults)
+    assert [(r.name, r.left_out) for r in found.scale_bars.gross] == [("C–D", False), ("A–B", True)]
+    assert [(r.name, r.left_out) for r in found.control_points.gross] == [("T1 X", False), ("T2 Z", True)]
 
 
 @pytest.mark.parametrize("wrong", [0.0, 5.0])
@@ -421,20 +425,19 @@ def test_bars_between_the_same_points_are_told_apart(rng, wrong):
     length[3] += wrong
     u = np.array([0.05, 0.02, 0.02, 0.03])
     calibration = calibrated(replace(simulated, network=replace(simulated.network, bars=ScaleBars(start, end, length, u))))
-    known = calibration.tests["known"]["scale_bars"]
-    assert known["raised"] == {} and not any("weighs less" in row[0] for row in scale_bars(calibration))
-    bars = calibration.tests["network"]["scale_bars"]
+    known = calibration.tests.known.scale_bars
+    assert known.raised == {} and not any("weighs less" in row[0] for row in scale_bars(calibration))
+    bars = calibration.tests.network.scale_bars
     ends = "–".join(simulated.network.points[k] for k in (start[0], end[0]))
-    assert [bar["u"] for bar in bars] == ([0.05, 0.02, 0.02] if wrong else [0.05, 0.02, 0.02, 0.03])
-    assert [r["name"] for r in known["gross"]] == ([f"{ends} (2)"] if wrong else [])
+    assert [bar.u for bar in bars] == ([0.05, 0.02, 0.02] if wrong else [0.05, 0.02, 0.02, 0.03])
+    assert [r.name for r in known.gross] == ([f"{ends} (2)"] if wrong else [])
 
 
 def test_names_exchanged_throughout_are_said_once(rng):
     simulated = simulate(rng, images=10, points=40)
     network = simulated.network
-    record = {"error_x_px": 9.0, "error_y_px": 0.0, "statistic": 99.0, "critical": 20.0}
     pairs = [(i, "T1", "T2") for i in range(9)] + [(3, "T5", "T7")]
-    errors = [{**record, "image": network.images[i], "point": a, "swapped_with": b} for i, p, q in pairs for a, b in ((p, q), (q, p))]
+    errors = [GrossError(network.images[i], a, 9.0, 0.0, 9.0, 0.0, 99.0, 20.0, b) for i, p, q in pairs for a, b in ((p, q), (q, p))]
     adjustment = adjust(network, simulated.truth)
     (finding,) = gross_error_findings(errors, adjustment, [])
     assert finding.text.count("T1 and T2") == 1 and "T1 and T2 in 9 images, rather in the table of points" in finding.text
@@ -448,11 +451,10 @@ def test_the_largest_of_a_group_are_named_before_new_uncertainties(rng):
     record = group_record(adjustment, known)
     ratio = np.abs(simulated.network.xyz - adjustment.state.xyz)[:8] / U_MM
     first = np.unravel_index(np.argmax(ratio), ratio.shape)
-    assert record["largest"][0]["name"] == f"T{first[0] + 1} {'XYZ'[first[1]]}"
-    assert abs(record["largest"][0]["ratio"]) == pytest.approx(ratio.max(), rel=1e-6)
-    empty = {"group": None, "gross": []}
-    (finding,) = known_findings({"scale_bars": empty, "control_points": {"group": {**record, "p": 0.0}, "gross": []}}, "mm")
-    assert finding.advice.startswith(f"Check the largest first: {record['largest'][0]['name']}, ")
+    assert record.largest[0].name == f"T{first[0] + 1} {'XYZ'[first[1]]}"
+    assert abs(record.largest[0].ratio) == pytest.approx(ratio.max(), rel=1e-6)
+    (finding,) = known_findings(KnownRecord(control_points=KnownControl(replace(record, p=0.0))), "mm")
+    assert finding.advice.startswith(f"Check the largest first: {record.largest[0].name}, ")
 
 
 @pytest.mark.parametrize(

@@ -80,18 +80,18 @@ def test_stat_bands_follow_from_the_covariance(rng):
     simulated = simulate(rng, images=8, points=50)
     found = adjusted(simulated.network, simulated)
     record = curves.distortion_curves(found, points=41)["camera"]
-    assert record["unit"] == "mm" and record["radius_px"][-1] == pytest.approx(record["radius"][-1] / MX)
-    np.testing.assert_allclose(record["radial_px"], record["radial"] / MX)
+    assert record.unit == "mm" and record.radius_px[-1] == pytest.approx(record.radius[-1] / MX)
+    np.testing.assert_allclose(record.radial_px, record.radial / MX)
     names, covariance = found.interior_covariance()
     camera, places, drawn = found.camera(), [NAMES.index(name) for name in names], []
     for step in rng.multivariate_normal(np.zeros(len(places)), covariance, 400, method="cholesky"):
         values = camera.with_values(**{n: camera[n] + s for n, s in zip(names, step, strict=True)})
-        radial = curves.radial_distortion(values, record["radius"])
-        balanced, c_b = curves.balanced_distortion(values, record["radius"])
-        tangential = curves.tangential_distortion(values, record["radius"])
+        radial = curves.radial_distortion(values, record.radius)
+        balanced, c_b = curves.balanced_distortion(values, record.radius)
+        tangential = curves.tangential_distortion(values, record.radius)
         drawn.append([radial[20], radial[40], balanced[20], balanced[40], tangential[40], c_b])
-    u = [record[f"u_{name}"][i] for name, i in (("radial", 20), ("radial", 40), ("balanced", 20), ("balanced", 40), ("tangential", 40))]
-    ratio = np.var(drawn, axis=0, ddof=1) / np.square([*u, record["u_balanced_c"]])
+    u = [record.u_radial[20], record.u_radial[40], record.u_balanced[20], record.u_balanced[40], record.u_tangential[40]]
+    ratio = np.var(drawn, axis=0, ddof=1) / np.square([*u, record.u_balanced_c])
     low, high = stats.chi2.ppf([RATE / 20, 1 - RATE / 20], 399) / 399
     assert ((ratio > low) & (ratio < high)).all()
 
@@ -124,10 +124,10 @@ def test_stat_projection_map_covers_repeated_calibrations(rng):
         record = curves.projection_maps(found, 9, 7)["camera"]
         error = np.stack(distorted(found.state.interior[0], SENSOR, "image_to_object", u, v), axis=1) - aim
         row = [error, turned_away(error, truth, "image_to_object", u, v)]
-        maps = record["u_raw_px"], record["u_px"]
+        maps = record.u_raw_px, record.u_px
         z2 = [np.sum(e**2, axis=1) / (2 * m.ravel() ** 2) for e, m in zip(row, maps, strict=True)]
         ratios.append([z2[0].mean(), z2[1].mean(), z2[1][len(u) // 2]])
-    without, raw = record["u_px"], record["u_raw_px"]
+    without, raw = record.u_px, record.u_raw_px
     assert without.shape == (7, 9) and np.sum(without**2) < np.sum(raw**2)  # least squares over the map, not in each node
     assert np.median(without / raw) < 0.4  # 0.17 ± 0.02 over 100 networks
     low, high = stats.chi2.ppf([RATE / 6, 1 - RATE / 6], 120) / 120

@@ -67,8 +67,8 @@ def test_without_a_scale_per_image_the_report_names_the_pattern(network: Network
     calibration = calibrate_network(network, Options(field="fixed", folds=0))
     first = calibration.findings[0]
     assert first.kind == "x_scale_drift" and "clock_warm_up" in first.text and "x-scale for each image" in first.advice
-    residuals = calibration.tests["residuals"]["tm6cn"]
-    assert residuals["rms_x_px"] > 2 * residuals["noise_x_px"]
+    residuals = calibration.tests.residuals["tm6cn"]
+    assert residuals.rms_x_px > 2 * residuals.noise_x_px
 
 
 def test_with_one_the_residuals_are_noise_and_the_clock_is_found(network: Network) -> None:
@@ -79,11 +79,11 @@ def test_with_one_the_residuals_are_noise_and_the_clock_is_found(network: Networ
     origin = -LOCK_US * 10.0  # samples at 10 MHz from where the clock is locked
     network = replace(network, per_image=("x_scale",), scale_origin_px=origin)
     calibration = calibrate_network(network, Options(field="fixed", folds=0))
-    residuals = calibration.tests["residuals"]["tm6cn"]
-    assert residuals["rms_x_px"] < 1.2 * residuals["noise_x_px"]
+    residuals = calibration.tests.residuals["tm6cn"]
+    assert residuals.rms_x_px < 1.2 * residuals.noise_x_px
     assert not any(f.kind == "x_scale_drift" and f.level == "warning" for f in calibration.findings)
-    images = calibration.tests["images"]
-    scale, u = np.array([i["x_scale"] for i in images]), np.array([i["u_x_scale"] for i in images])
+    images = calibration.tests.images
+    scale, u = np.array([i.x_scale for i in images]), np.array([i.u_x_scale for i in images])
     expected = np.log1p(ERROR * np.exp(-TIMES_S / TAU_S))
     misses = np.log1p(scale) - expected
     misses -= misses.mean()  # what is common to all is affinity

@@ -46,52 +46,55 @@ def test_stat_bent_board_is_found_with_its_shape(rng, turned):
     simulated, truth = bent(rng, bow, turn)
     fixed = adjusted(simulated.network, start_flat(simulated))
     check = check_field(fixed)
-    field, points = check.field, check.field["points"]
-    assert check.verdict == field["verdict"] == "free" and check.adjustment is check.free and field["shape"] == "plane"
-    assert field["p"] < 1e-6 and field["p_flat"] < 1e-6 and check.hold_out["p"] < 0.01
-    assert check.hold_out["free"]["left_out_rms_px"] < check.hold_out["fixed"]["left_out_rms_px"]
-    plane = np.column_stack([np.ones(80), (points["xyz"] - points["xyz"].mean(axis=0)) @ points["axes"][:2].T])
-    height = truth[:, 2] * (points["axes"][2] @ (turn[:, 2] if turned else np.eye(3)[2]))
+    field, compared = check.field.compared.deviations, check.field.compared
+    points = field.points
+    assert check.verdict == check.field.verdict == "free" and check.adjustment is check.free and field.shape == "plane"
+    assert compared.p < 1e-6 and field.p_flat < 1e-6 and check.hold_out.p < 0.01
+    assert check.hold_out.free.left_out_rms_px < check.hold_out.fixed.left_out_rms_px
+    plane = np.column_stack([np.ones(80), (points.xyz - points.xyz.mean(axis=0)) @ points.axes[:2].T])
+    height = truth[:, 2] * (points.axes[2] @ (turn[:, 2] if turned else np.eye(3)[2]))
     height = height - plane @ np.linalg.lstsq(plane, height, rcond=None)[0]
-    z2 = np.sum(((points["dz"] - height) / points["u_dz"]) ** 2)
+    z2 = np.sum(((points.dz - height) / points.u_dz) ** 2)
     assert stats.chi2.ppf(RATE / 2, 70) < z2 < stats.chi2.isf(RATE / 2, 80)
-    u = points["u_dz"].max()
-    assert field["peak"] == pytest.approx(np.abs(height).max(), abs=6 * u)
-    assert field["rms"] == pytest.approx(np.sqrt(np.mean(height**2)), abs=6 * u) and field["rms_in_plane"] < 6 * np.hypot(u, u)
+    u = points.u_dz.max()
+    assert field.peak == pytest.approx(np.abs(height).max(), abs=6 * u)
+    assert field.rms == pytest.approx(np.sqrt(np.mean(height**2)), abs=6 * u) and field.rms_in_plane < 6 * np.hypot(u, u)
     finding = check.findings[0]
     assert finding.kind == "flatness" and finding.level == "warning" and "not flat" in finding.text and "principal point" in finding.text
     for name in ("c", "xp", "yp"):
         per_px = 0.00345 if name == "c" else 1.0
-        assert field[f"moved_{name}_px"] == pytest.approx((check.free.camera()[name] - fixed.camera()[name]) / per_px)
+        moved, u_formal = compared.first.by_name[name]
+        assert moved == pytest.approx((check.free.camera()[name] - fixed.camera()[name]) / per_px)
         names, covariance = fixed.interior_covariance()
-        assert field[f"u_{name}_px"] == pytest.approx(np.sqrt(covariance[names.index(name), names.index(name)]) / per_px)
+        assert u_formal == pytest.approx(np.sqrt(covariance[names.index(name), names.index(name)]) / per_px)
 
 
 def test_points_off_in_the_plane_are_told_from_bending(rng):
     off = 0.3 * rng.standard_normal((80, 2))
     simulated, _ = bent(rng, lambda x, y: np.column_stack([off, 0 * x]))
     check = check_field(adjusted(simulated.network, start_flat(simulated)))
-    assert check.verdict == "free" and check.field["p_flat"] > RATE
-    said = "not flat" in check.field["text"].split(":")[0]
-    assert said == (check.field["p_flat"] <= 0.01)  # one flat board in a hundred is said not to be
+    field = check.field.compared.deviations
+    assert check.verdict == "free" and field.p_flat > RATE
+    said = "not flat" in check.field.text.split(":")[0]
+    assert said == (field.p_flat <= 0.01)  # one flat board in a hundred is said not to be
     centred = np.column_stack([off, np.zeros(80)])
     scale, rotation, shift = similarity(simulated.network.xyz + centred, simulated.network.xyz)
     left = scale * (simulated.network.xyz + centred) @ rotation.T + shift - simulated.network.xyz
-    u = np.hypot(check.field["points"]["u_dx"].max(), check.field["points"]["u_dy"].max())
-    assert check.field["rms_in_plane"] == pytest.approx(np.sqrt(np.mean(np.sum(left**2, axis=1))), abs=3 * u)
+    u = np.hypot(field.points.u_dx.max(), field.points.u_dy.max())
+    assert field.rms_in_plane == pytest.approx(np.sqrt(np.mean(np.sum(left**2, axis=1))), abs=3 * u)
 
 
 def test_flat_board_stands(rng):
     simulated, _ = bent(rng, lambda x, y: np.zeros((len(x), 3)))
     check = check_field(adjusted(simulated.network, simulated), level=RATE)
     assert check.verdict == "fixed" and check.adjustment is check.fixed and check.findings[0].level == "note"
-    assert "stand" in check.field["text"] and check.hold_out["free"]["left_out_rms_px"] > check.hold_out["fixed"]["left_out_rms_px"] * 0.97
+    assert "stand" in check.field.text and check.hold_out.free.left_out_rms_px > check.hold_out.fixed.left_out_rms_px * 0.97
 
 
 def test_stat_f_test_of_a_true_field_is_fair(rng):
     """p over 12 measurements of a flat board, Fisher's sum, two-sided."""
     simulated, _ = bent(rng, lambda x, y: np.zeros((len(x), 3)), images=8, points=20)
-    p = [check_field(adjusted(measured_again(rng, simulated), simulated), folds=2).field["p"] for _ in range(12)]
+    p = [check_field(adjusted(measured_again(rng, simulated), simulated), folds=2).field.compared.p for _ in range(12)]
     total = -2 * np.log(p).sum()
     assert stats.chi2.ppf(RATE / 2, 24) < total < stats.chi2.isf(RATE / 2, 24)
 
@@ -103,13 +106,14 @@ def test_field_in_space(rng):
     real[11] += [2.0, 0, 0]
     network = measured_again(rng, replace(simulated, truth=replace(simulated.truth, xyz=real)))
     check = check_field(adjusted(network, simulated))
-    off = np.linalg.norm([check.field["points"][f"d{axis}"] for axis in "xyz"], axis=0)
-    assert check.verdict == "free" and check.field["shape"] == "volume" and np.argmax(off) == 11
+    field, points = check.field.compared.deviations, check.field.compared.deviations.points
+    off = np.linalg.norm([points.dx, points.dy, points.dz], axis=0)
+    assert check.verdict == "free" and field.shape == "volume" and np.argmax(off) == 11
     scale, rotation, shift = similarity(real, simulated.network.xyz)
     left = np.linalg.norm((scale * real @ rotation.T + shift - simulated.network.xyz)[11])
-    u = max(check.field["points"][f"u_d{axis}"][11] for axis in "xyz")
+    u = max(points.u_dx[11], points.u_dy[11], points.u_dz[11])
     assert off[11] == pytest.approx(left, abs=6 * u) and 0.005 < u < 0.03
-    assert check.findings[0].kind == "field" and check.field["peak"] == pytest.approx(off[11])
+    assert check.findings[0].kind == "field" and field.peak == pytest.approx(off[11])
 
 
 def test_similarity_against_another_program(rng):
@@ -129,7 +133,7 @@ def test_too_few_images_leave_the_field_untested(rng):
     camera = simulated.network.cameras[0]
     few = replace(camera, values=simulated.truth.interior[0], free=np.array(NAMES) == "xp")
     check = check_field(adjusted(replace(simulated.network, cameras=(few,)), start_flat(simulated)))
-    assert check.verdict == "fixed" and check.hold_out == {} and "untested" in check.field["text"]
+    assert check.verdict == "fixed" and check.hold_out is None and "untested" in check.field.text
 
 
 def test_free_points_are_no_field(rng):

@@ -17,6 +17,7 @@ from pixmetry.calibrate.checks import known_checks
 from pixmetry.calibrate.checks.findings import known_findings
 from pixmetry.calibrate.checks.known_checks import fixed_record
 from pixmetry.calibrate.checks.snooping import remove_gross_errors
+from pixmetry.calibrate.records import KnownRecord
 
 RATE = 1e-6
 DRAWS = 60
@@ -37,8 +38,8 @@ def test_stat_right_points_give_a_uniform_p(rng, fixed, bars, redundant):
     exact, p = predicted(simulated.network, simulated.truth), []
     for _ in range(DRAWS):
         record = fixed_record(adjusted(measured_again(rng, simulated, exact), simulated), adjust)
-        assert record["n"] == fixed and record["dof"][0] == redundant
-        p.append(record["p"])
+        assert record.n == fixed and record.dof[0] == redundant
+        p.append(record.p)
     assert stats.kstest(p, "uniform").pvalue > RATE
 
 
@@ -54,8 +55,8 @@ def test_f_is_that_of_the_distances_between_the_points(rng, monkeypatch):
     free = replace(network, xyz=np.full_like(wrong, np.nan), u_xyz=np.full_like(wrong, np.inf))
     with_bars, without = (adjusted(n, simulated) for n in (replace(free, bars=bars), free))
     squares = with_bars.sigma0**2 * with_bars.dof - without.sigma0**2 * without.dof
-    assert record["dof"] == (with_bars.dof - without.dof, without.dof) == (2, without.dof)
-    assert record["f"] == pytest.approx(squares / 2 / without.sigma0**2, rel=0.01, abs=0.01)
+    assert record.dof == (with_bars.dof - without.dof, without.dof) == (2, without.dof)
+    assert record.f == pytest.approx(squares / 2 / without.sigma0**2, rel=0.01, abs=0.01)
 
 
 @pytest.mark.parametrize("factor", [1.0, 50.0])
@@ -68,12 +69,11 @@ def test_points_that_are_all_wrong_are_told_with_their_size(rng, factor):
     network = replace(simulated.network, xyz=xyz)
     adjustment = adjust(network, simulated.truth, used=(network.point > 5) | (rng.random(len(network)) < 0.7), redundancy=True)
     record = fixed_record(adjustment, adjust)
-    assert record["p"] < 1e-9 and record["dof"][0] == 11
+    assert record.p < 1e-9 and record.dof[0] == 11
     # 11 degrees of freedom; weights differ between directions, so within a factor of 4 at the given rate
     low, high = np.sqrt(stats.chi2.ppf([RATE / 2, 1 - RATE / 2], 11) / 11)
-    assert low / 1.5 < record["miss"] / (0.1 * factor) < 1.5 * high
-    empty = {"group": None, "gross": []}
-    (finding,) = known_findings({"scale_bars": empty, "control_points": empty, "fixed_points": record}, "mm")
+    assert low / 1.5 < record.miss / (0.1 * factor) < 1.5 * high
+    (finding,) = known_findings(KnownRecord(fixed_points=record), "mm")
     assert finding.level == "warning" and "The 6 fixed points miss the network by about" in finding.text
     assert "known: weighted" in finding.advice
 

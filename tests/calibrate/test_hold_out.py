@@ -15,6 +15,7 @@ from pixmetry.calibrate.bundle.bundle import adjust
 from pixmetry.calibrate.checks import hold_out
 from pixmetry.calibrate.checks.findings import hold_out_findings
 from pixmetry.calibrate.checks.hold_out import LeftOut, expected_median_px, hold_out_record, left_out, resect, subset
+from pixmetry.calibrate.records import HeldRms, HoldOut
 from pixmetry.core.errors import InputError
 
 RATE = 1e-6
@@ -110,11 +111,11 @@ def test_stat_left_out_is_a_little_worse_than_the_noise(rng, known):
     whole = adjusted(measured_again(rng, simulated), simulated)
     found = left_out(whole)
     record = hold_out_record(found) if known == "fixed" else hold_out_record(None, found)
-    rms = record[known]
-    assert rms["fit_rms_px"] < rms["left_out_rms_px"] < 1.3 * NOISE_PX
+    rms = record.parts[known]
+    assert rms.fit_rms_px < rms.left_out_rms_px < 1.3 * NOISE_PX
     low, high = NOISE_PX**2 * stats.chi2.ppf([RATE / 2, 1 - RATE / 2], whole.dof)
-    assert low < rms["fit_rms_px"] ** 2 * 2 * len(whole.network) < high
-    assert record["p"] is None and record["folds"] == 5 and f"{rms['left_out_rms_px']:.4f} px in images left out" in record["text"]
+    assert low < rms.fit_rms_px**2 * 2 * len(whole.network) < high
+    assert record.p is None and record.folds == 5 and f"{rms.left_out_rms_px:.4f} px in images left out" in record.text
 
 
 def test_record_compares_on_common_points_and_by_image(rng):
@@ -124,9 +125,9 @@ def test_record_compares_on_common_points_and_by_image(rng):
     second = 0.8 * first * rng.uniform(0.9, 1.1, (500, 2))
     second[0] = np.nan
     record = hold_out_record(LeftOut(first, first, image, 5), LeftOut(second, second, image, 5))
-    assert record["fixed"]["left_out_rms_px"] == pytest.approx(np.sqrt(np.mean(first[1:] ** 2)))
+    assert record.fixed.left_out_rms_px == pytest.approx(np.sqrt(np.mean(first[1:] ** 2)))
     a, b = (np.array([np.sum(v[1:][image[1:] == i] ** 2) for i in range(50)]) for v in (first, second))
-    assert record["p"] == pytest.approx(stats.ttest_rel(np.log(b), np.log(a), alternative="less").pvalue)
+    assert record.p == pytest.approx(stats.ttest_rel(np.log(b), np.log(a), alternative="less").pvalue)
     with pytest.raises(ValueError, match="neither"):
         hold_out_record(None)
 
@@ -173,12 +174,12 @@ def _held(rng, kind):
 
 
 def test_what_noise_explains_is_no_finding():
-    record = {"fixed": None, "free": {"fit_rms_px": 0.1, "left_out_rms_px": 0.5, "left_out_median_px": 0.3}, "expected_median_px": 0.21}
+    record = HoldOut(None, HeldRms(0.1, 0.5, 0.3), 5, None, "", expected_median_px=0.21)
     assert hold_out_findings(record, free=True) == []
-    record["free"]["left_out_median_px"] = 0.33
+    record = replace(record, free=HeldRms(0.1, 0.5, 0.33))
     (finding,) = hold_out_findings(record, free=True)
     assert "0.21 px" in finding.text and finding.level == "warning"
-    assert hold_out_findings(record, free=False) == [] == hold_out_findings({**record, "expected_median_px": None}, free=True)
+    assert hold_out_findings(record, free=False) == [] == hold_out_findings(replace(record, expected_median_px=None), free=True)
 
 
 def test_a_point_beyond_the_lens_of_a_left_out_image_has_no_part(rng):

@@ -15,6 +15,7 @@ from pixmetry.calibrate.bundle.network import SCALE
 from pixmetry.calibrate.bundle.solve import calibrate_network
 from pixmetry.calibrate.checks.added_terms import AddedTerms, derivatives
 from pixmetry.calibrate.checks.patterns import MEANING, pattern_findings, residual_patterns
+from pixmetry.calibrate.records import Pattern
 from pixmetry.camera.catalogue import catalogue
 
 RATE = 1e-6
@@ -27,7 +28,7 @@ def network_of(rng, **options) -> tuple[Simulated, np.ndarray]:
 
 
 def by_name(found, **options) -> dict[str, dict]:
-    return {record["name"]: record for record in residual_patterns(found, **options)}
+    return {record.name: record for record in residual_patterns(found, **options)}
 
 
 @pytest.mark.parametrize("known", ["free", "fixed", "bars to a nanometre"])
@@ -65,10 +66,10 @@ def test_added_x_scale_by_image_is_what_an_adjustment_with_it_finds(rng):
     squares = [part.sigma0**2 * part.dof for part in (without, full)]
     dof = without.dof - full.dof
     f = (squares[0] - squares[1]) / dof / full.sigma0**2
-    assert dof == 11 and record["p"] == pytest.approx(stats.f.sf(f, dof, full.dof), rel=0.1, abs=1e-12)
-    assert np.abs(record["values"] - full.state.x_scale).max() < 0.1 * record["u"].max()
-    rows = [full.free_columns.index(f"{name}:x_scale") for name in record["images"]]
-    np.testing.assert_allclose(record["u"], np.sqrt(np.diag(full.covariance)[rows]), rtol=0.05)
+    assert dof == 11 and record.p == pytest.approx(stats.f.sf(f, dof, full.dof), rel=0.1, abs=1e-12)
+    assert np.abs(record.by_image.values - full.state.x_scale).max() < 0.1 * record.by_image.u.max()
+    rows = [full.free_columns.index(f"{name}:x_scale") for name in record.by_image.images]
+    np.testing.assert_allclose(record.by_image.u, np.sqrt(np.diag(full.covariance)[rows]), rtol=0.05)
 
 
 def test_derivatives_by_image_and_point_are_slopes(rng):
@@ -97,7 +98,7 @@ def test_stat_p_is_uniform_where_there_is_no_pattern(rng):
     p: dict[str, list[float]] = {}
     for _ in range(40):
         for record in residual_patterns(adjusted(measured_again(rng, simulated, exact), simulated)):
-            p.setdefault(record["name"], []).append(record["p"])
+            p.setdefault(record.name, []).append(record.p)
     assert set(p) == set(MEANING)
     for name, values in p.items():
         total = -2 * np.log(values).sum()
@@ -157,14 +158,14 @@ def test_planted_pattern_is_found_and_sized(rng, name):
     simulated, exact = network_of(rng, images=24, points=80)
     dx, dy, amplitude = planted(name, rng, simulated, exact)
     record = by_name(adjusted(shifted(measured_again(rng, simulated, exact), dx, dy), simulated))[name]
-    assert record["significant"] and record["p"] < 1e-6, record
-    assert record["text"].startswith(MEANING[name][0]) and record["level"] == pytest.approx(0.01 / len(MEANING))
+    assert record.significant and record.p < 1e-6, record
+    assert record.text.startswith(MEANING[name][0]) and record.level == pytest.approx(0.01 / len(MEANING))
     if np.isfinite(amplitude):
-        assert abs(record["amplitude_px"] - amplitude) < 6 * record["u_px"] + 0.05 * amplitude, record
+        assert abs(record.amplitude_px - amplitude) < 6 * record.u_px + 0.05 * amplitude, record
     else:
-        assert record["amplitude_px"] > 0.1 * NOISE_PX
+        assert record.amplitude_px > 0.1 * NOISE_PX
     if name.startswith("wave"):
-        assert record["period_px"] == pytest.approx({"wave_xx": 9.3, "wave_xy": 2.0, "wave_yy": 61}[name], rel=0.02)
+        assert record.period_px == pytest.approx({"wave_xx": 9.3, "wave_xy": 2.0, "wave_yy": 61}[name], rel=0.02)
 
 
 def test_one_bad_image_is_found(rng):
@@ -173,7 +174,7 @@ def test_one_bad_image_is_found(rng):
     network = measured_again(rng, simulated, exact)
     worse = (network.image == 5)[:, None] * np.sqrt(8) * NOISE_PX * rng.standard_normal(exact.shape)
     record = by_name(adjusted(shifted(network, *worse.T), simulated))["image_rms"]
-    assert record["significant"] and record["p"] < 1e-6 and 1.5 * NOISE_PX < record["amplitude_px"] < 5 * NOISE_PX
+    assert record.significant and record.p < 1e-6 and 1.5 * NOISE_PX < record.amplitude_px < 5 * NOISE_PX
 
 
 def test_the_sentence_about_a_bad_image_tells_what_its_figure_shows(rng):
@@ -186,13 +187,13 @@ def test_the_sentence_about_a_bad_image_tells_what_its_figure_shows(rng):
     error[mine[:5]] = 30.0
     calibration = calibrate_network(shifted(network, *error.T), progress=None)
     (finding,) = [f for f in calibration.findings if f.kind == "bad_images"]
-    images = calibration.tests["images"]
-    shown = next(i for i in images if i["image"] == network.images[5])
-    assert shown["rejected"] >= 5
-    size = f"rms {shown['rms_x_px']:.2g} px in x and {shown['rms_y_px']:.2g} px in y, but {shown['rejected']} rejected"
-    assert f"{shown['image']} ({size}; with them" in finding.text
-    (record,) = [r for r in calibration.tests["patterns"] if r["name"] == "image_rms"]
-    assert record["amplitude_px"] == pytest.approx(max(max(i["rms_x_px"], i["rms_y_px"]) for i in images), rel=1e-9)
+    images = calibration.tests.images
+    shown = next(i for i in images if i.image == network.images[5])
+    assert shown.rejected >= 5
+    size = f"rms {shown.rms_x_px:.2g} px in x and {shown.rms_y_px:.2g} px in y, but {shown.rejected} rejected"
+    assert f"{shown.image} ({size}; with them" in finding.text
+    (record,) = [r for r in calibration.tests.patterns if r.name == "image_rms"]
+    assert record.amplitude_px == pytest.approx(max(max(i.rms_x_px, i.rms_y_px) for i in images), rel=1e-9)
 
 
 def test_drift_of_the_clock_is_named_and_gone_when_estimated(rng):
@@ -217,7 +218,7 @@ def test_findings_come_with_a_source_of_the_catalogue():
     sources = set(catalogue())
     assert {source for _, source, _ in MEANING.values() if source} <= sources
     made = [
-        {"name": name, "camera": "a", "p": p, "significant": p < 1e-3, "text": name, "source": MEANING[name][1], "advice": "do this"}
+        Pattern(name, "a", 0.01, None, p, significant=p < 1e-3, text=name, source=MEANING[name][1], advice="do this")
         for name, p in (("phase_x", 1e-5), ("field", 0.3), ("radius", 1e-9))
     ]
     findings = pattern_findings(made)
@@ -231,4 +232,4 @@ def test_no_pattern_is_seen_beside_scales_of_images_that_were_estimated(rng):
     for _ in range(6):
         simulated = simulate(rng, images=14, points=40, per_image=("x_scale",))
         adjustment = adjusted(simulated.network, simulated)
-        assert min(record["p"] for record in residual_patterns(adjustment)) > 1e-8
+        assert min(record.p for record in residual_patterns(adjustment)) > 1e-8

@@ -58,18 +58,18 @@ def test_unit_of_the_f_test_follows_the_pitch(rng):
     residual = np.repeat([[0.04, 0.04], [-0.04, -0.04]], 200, axis=0)
     made = by_hand(residual, np.tile([0.0016, 0, 0.0016], (400, 1)), np.ones((400, 2)), Sensor(500, 500, 8.6, 8.3))
     record = quality.f_test_records(made)["camera"]
-    assert record["ratio_px2"] == pytest.approx(1) and record["p_px"] == pytest.approx(0.5)
-    assert record["ratio_um2"] == pytest.approx((8.6 / 8.3) ** 2) and record["p_um"] < record["p_px"]
-    assert record["dof_x"] == record["dof_y"] == pytest.approx(400) and record["side"] == "x noisier than y"
-    assert "400 and 400 degrees of freedom" in record["text"] and "one-sided" in record["text"]
+    assert record.ratio_px2 == pytest.approx(1) and record.p_px == pytest.approx(0.5)
+    assert record.ratio_um2 == pytest.approx((8.6 / 8.3) ** 2) and record.p_um < record.p_px
+    assert record.dof_x == record.dof_y == pytest.approx(400) and record.side == "x noisier than y"
+    assert "400 and 400 degrees of freedom" in record.text and "one-sided" in record.text
 
 
 def test_degrees_of_freedom_given_line_by_line():
     residual = np.repeat([[0.0397, 0.0351], [-0.0397, -0.0351]], 8640, axis=0)
     made = by_hand(residual, np.tile([0.0016, 0, 0.0016], (17280, 1)), np.ones((17280, 2)))
     record = quality.f_test_records(made, {"camera": (216, 216)})["camera"]
-    assert 0.03 < record["p_px"] < 0.042 and (record["dof_x"], record["dof_y"]) == (216, 216)
-    assert quality.f_test_records(made)["camera"]["p_px"] < 1e-20  # all points as if they were independent
+    assert 0.03 < record.p_px < 0.042 and (record.dof_x, record.dof_y) == (216, 216)
+    assert quality.f_test_records(made)["camera"].p_px < 1e-20  # all points as if they were independent
 
 
 def test_stat_f_test_is_fair_with_unequal_weights(rng):
@@ -80,7 +80,7 @@ def test_stat_f_test_is_fair_with_unequal_weights(rng):
     p = []
     for _ in range(1000):
         residual = np.sqrt(variance / mean) * rng.standard_normal(variance.shape)
-        p.append(quality.f_test_records(by_hand(residual, covariance, np.ones((120, 2))))["camera"]["p_px"])
+        p.append(quality.f_test_records(by_hand(residual, covariance, np.ones((120, 2))))["camera"].p_px)
     assert stats.binomtest(int((np.array(p) < 0.05).sum()), 1000, 0.05).pvalue > RATE
     assert stats.kstest(p, "uniform").pvalue > RATE
 
@@ -88,24 +88,25 @@ def test_stat_f_test_is_fair_with_unequal_weights(rng):
 def test_residual_records_in_both_units(rng):
     residual, redundancy = rng.standard_normal((50, 2)), rng.random((50, 2))
     record = quality.residual_records(by_hand(residual, np.tile([1.0, 0, 1], (50, 1)), redundancy))["camera"]
-    assert record["rms_x_px"] == pytest.approx(np.sqrt((residual[:, 0] ** 2).mean())) and record["n"] == 50
-    assert record["rms_y_um"] == pytest.approx(3.45 * np.sqrt((residual[:, 1] ** 2).mean()))
-    assert record["dof_x"] == pytest.approx(redundancy[:, 0].sum())
+    assert record.rms_x_px == pytest.approx(np.sqrt((residual[:, 0] ** 2).mean())) and record.n == 50
+    assert record.rms_y_um == pytest.approx(3.45 * np.sqrt((residual[:, 1] ** 2).mean()))
+    assert record.dof_x == pytest.approx(redundancy[:, 0].sum())
     no_pitch = quality.residual_records(by_hand(residual, np.tile([1.0, 0, 1], (50, 1)), redundancy, Sensor(100, 100)))["camera"]
-    assert no_pitch["rms_x_um"] is None and no_pitch["rms_x_px"] == record["rms_x_px"]
+    assert no_pitch.rms_x_um is None and no_pitch.rms_x_px == record.rms_x_px
 
 
 def test_records_read_the_covariance(rng):
     made = by_hand(rng.standard_normal((50, 2)), np.tile([1.0, 0, 1], (50, 1)), np.ones((50, 2)))
     made = replace(made, state=replace(made.state, interior=made.network.cameras[0].with_values(b1=2e-5).values[None]))
     c, b1, k1 = quality.parameter_records(made)
-    assert (c["name"], c["unit"], c["p_zero"]) == ("c", "mm", None) and c["strongest"] == {"with": "k1", "r": pytest.approx(-0.3)}
-    assert b1["p_zero"] == pytest.approx(2 * special.stdtr(95, -2.0)) and b1["u"] == pytest.approx(1e-5)
-    assert k1["unit"] == "1/mm²" and k1["p_zero"] == pytest.approx(1.0)
-    assert quality.correlation_records(made)["camera"]["matrix"][0, 2] == pytest.approx(-0.3)
+    assert (c.name, c.unit, c.p_zero) == ("c", "mm", None)
+    assert c.strongest.with_ == "k1" and c.strongest.r == pytest.approx(-0.3)
+    assert b1.p_zero == pytest.approx(2 * special.stdtr(95, -2.0)) and b1.u == pytest.approx(1e-5)
+    assert k1.unit == "1/mm²" and k1.p_zero == pytest.approx(1.0)
+    assert quality.correlation_records(made)["camera"].matrix[0, 2] == pytest.approx(-0.3)
     first, second = quality.pose_correlations(made, most=2)
-    assert first == {"a": "camera:c", "b": "image:Z0", "r": pytest.approx(-0.97)}
-    assert second == {"a": "camera:b1", "b": "image:rx", "r": pytest.approx(0.5)}
+    assert (first.a, first.b, first.r) == ("camera:c", "image:Z0", pytest.approx(-0.97))
+    assert (second.a, second.b, second.r) == ("camera:b1", "image:rx", pytest.approx(0.5))
 
 
 def test_group_test_is_the_fall_of_the_sum_of_squares(rng):
@@ -117,10 +118,10 @@ def test_group_test_is_the_fall_of_the_sum_of_squares(rng):
     truth = replace(simulated.truth, interior=simulated.truth.interior * ~np.isin(NAMES, ("b1", "b2")))
     without = adjusted(replace(simulated.network, cameras=(fewer,)), replace(simulated, truth=truth))
     squares = [part.sigma0**2 * part.dof for part in (without, full)]
-    record = next(r for r in quality.group_records(full) if r["group"] == "affinity")
-    assert without.dof - full.dof == 2 and record["dof"] == (2, full.dof)
-    assert record["f"] == pytest.approx((squares[0] - squares[1]) / 2 / full.sigma0**2, rel=5e-3)
-    assert record["p"] == pytest.approx(stats.f.sf(record["f"], 2, full.dof))
+    record = next(r for r in quality.group_records(full) if r.group == "affinity")
+    assert without.dof - full.dof == 2 and record.dof == (2, full.dof)
+    assert record.f == pytest.approx((squares[0] - squares[1]) / 2 / full.sigma0**2, rel=5e-3)
+    assert record.p == pytest.approx(stats.f.sf(record.f, 2, full.dof))
 
 
 @pytest.mark.parametrize("direction", ["image_to_object", "object_to_image"])
@@ -137,14 +138,14 @@ def test_vision_names_are_the_linear_part_of_the_projection(rng, direction):
         return np.array([(x[1] - x[2]) / (2 * h), (y[3] - y[4]) / (2 * h), (x[3] - x[4]) / (2 * h), x[0], y[0]])
 
     record = quality.vision_records(found)["camera"]
-    values = [record[name] for name in quality.VISION]
+    values = [value for _, value, _ in record.rows]
     np.testing.assert_allclose(values, slopes(found.state.interior[0]), rtol=1e-7, atol=1e-6)
     drawn = []
     for step in rng.multivariate_normal(np.zeros(len(places)), covariance, 400, method="cholesky"):
         interior = found.state.interior[0].copy()
         interior[places] += step
         drawn.append(slopes(interior))
-    ratio = np.var(drawn, axis=0, ddof=1) / np.square([record[f"u_{name}"] for name in quality.VISION])
+    ratio = np.var(drawn, axis=0, ddof=1) / np.square([u for _, _, u in record.rows])
     low, high = stats.chi2.ppf([RATE / 20, 1 - RATE / 20], 399) / 399
     assert ((ratio > low) & (ratio < high)).all()
 
@@ -156,13 +157,13 @@ def test_images_one_by_one(rng):
     used[np.flatnonzero(network.image == 2)[:3]] = False
     found = adjusted(network, simulated, used=used)
     records = quality.image_records(found)
-    assert all(r["oriented"] and r["measured"] == r["n"] + r["rejected"] for r in records)
-    assert [r["rejected"] for r in records] == [0, 0, 3, 0, 0, 0] and records[2]["n"] == (network.image == 2).sum() - 3
-    assert [r["time_s"] for r in records] == [0, 30, 60, 90, 120, 150]
-    z = [(r["x_scale"] - true) / r["u_x_scale"] for r, true in zip(records, simulated.truth.x_scale, strict=True)]
-    assert np.abs(z).max() < stats.t.isf(RATE / 12, found.dof) and records[0]["x_shift_px"] is None
+    assert all(r.oriented and r.measured == r.n + r.rejected for r in records)
+    assert [r.rejected for r in records] == [0, 0, 3, 0, 0, 0] and records[2].n == (network.image == 2).sum() - 3
+    assert [r.time_s for r in records] == [0, 30, 60, 90, 120, 150]
+    z = [(r.x_scale - true) / r.u_x_scale for r, true in zip(records, simulated.truth.x_scale, strict=True)]
+    assert np.abs(z).max() < stats.t.isf(RATE / 12, found.dof) and records[0].x_shift_px is None
     rows = used & (network.image == 1)
-    assert records[1]["rms_y_px"] == pytest.approx(np.sqrt(np.mean(found.residual_px[rows, 1] ** 2)))
+    assert records[1].rms_y_px == pytest.approx(np.sqrt(np.mean(found.residual_px[rows, 1] ** 2)))
 
 
 def test_stat_noisier_x_is_found(rng):
@@ -171,4 +172,4 @@ def test_stat_noisier_x_is_found(rng):
     exact = predicted(simulated.network, simulated.truth)
     x, y = (exact + NOISE_PX * np.array([1.5, 1.0]) * rng.standard_normal(exact.shape)).T
     record = quality.f_test_records(adjusted(replace(simulated.network, x_px=x, y_px=y), simulated))["camera"]
-    assert record["p_px"] < 1e-3 and "x is noisier than y" in record["text"]
+    assert record.p_px < 1e-3 and "x is noisier than y" in record.text

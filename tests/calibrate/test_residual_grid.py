@@ -11,6 +11,7 @@ from scipy import interpolate, stats
 from calibrate.adjusted import NOISE_PX, adjusted, measured_again, shifted
 from calibrate.networks import SENSOR, Simulated, predicted, simulate
 from pixmetry.calibrate.checks import residual_grid
+from pixmetry.calibrate.records import ResidualGrid, read_record
 
 RATE = 1e-6
 
@@ -28,13 +29,14 @@ def wave(x, y):
 
 def test_grid_is_read_as_scipy_reads_it(rng):
     x_px, y_px = np.linspace(0, 2047, 9), np.linspace(0, 1535, 7)
-    grid = {"x_px": x_px, "y_px": y_px, "dx_px": rng.standard_normal((7, 9)), "dy_px": rng.standard_normal((7, 9))}
+    by_name = {"x_px": x_px, "y_px": y_px, "dx_px": rng.standard_normal((7, 9)), "dy_px": rng.standard_normal((7, 9))}
+    grid = read_record(ResidualGrid, by_name)
     x, y = rng.uniform(0, 2047, (20, 3)), rng.uniform(0, 1535, (20, 3))
     for name, found in zip(("dx_px", "dy_px"), residual_grid.at(grid, x, y), strict=True):
-        read = interpolate.RegularGridInterpolator((y_px, x_px), grid[name])
+        read = interpolate.RegularGridInterpolator((y_px, x_px), by_name[name])
         np.testing.assert_allclose(found, read(np.stack([y, x], axis=-1)), atol=1e-12)
     beyond, _ = residual_grid.at(grid, np.array([-50.0, 9999.0]), np.array([0.0, 1535.0]))
-    np.testing.assert_allclose(beyond, [grid["dx_px"][0, 0], grid["dx_px"][-1, -1]])
+    np.testing.assert_allclose(beyond, [grid.dx_px[0, 0], grid.dx_px[-1, -1]])
 
 
 def test_stat_values_are_true_within_their_uncertainty(rng, network):
@@ -49,13 +51,13 @@ def test_stat_values_are_true_within_their_uncertainty(rng, network):
     made = replace(found, residual_px=field + NOISE_PX * rng.standard_normal(field.shape))
     made = replace(made, network=replace(found.network, x_px=exact[:, 0], y_px=exact[:, 1]))
     grid = residual_grid.residual_grids(made)["camera"]
-    x, y = np.meshgrid(grid["x_px"], grid["y_px"])
-    among = grid["n"] > 5
+    x, y = np.meshgrid(grid.x_px, grid.y_px)
+    among = grid.n > 5
     for name, truth in zip(("dx_px", "dy_px"), wave(x, y), strict=True):
-        z2 = ((grid[name] - truth) / grid["u_px"])[among] ** 2
+        z2 = ((getattr(grid, name) - truth) / grid.u_px)[among] ** 2
         assert 0.2 < z2.mean() < 2.5, name
-    assert abs(grid["n"].sum() - len(exact)) < grid["n"].size and grid["p"] < 1e-6
-    assert grid["dx_px"].shape == grid["u_px"].shape == grid["n"].shape == (len(grid["y_px"]), len(grid["x_px"]))
+    assert abs(grid.n.sum() - len(exact)) < grid.n.size and grid.p < 1e-6
+    assert grid.dx_px.shape == grid.u_px.shape == grid.n.shape == (len(grid.y_px), len(grid.x_px))
 
 
 def test_planted_field_is_corrected(rng, network):
@@ -64,7 +66,7 @@ def test_planted_field_is_corrected(rng, network):
     measured = shifted(measured_again(rng, simulated, exact), *wave(*exact.T))
     found = adjusted(measured, simulated)
     grid = residual_grid.residual_grids(found)["camera"]
-    assert grid["p"] < 0.01 and grid["rms_with_px"] < 0.8 * grid["rms_without_px"]
+    assert grid.p < 0.01 and grid.rms_with_px < 0.8 * grid.rms_without_px
     x, y = residual_grid.corrected(grid, measured.x_px, measured.y_px)
     better = adjusted(replace(measured, x_px=x, y_px=y), simulated)
     assert better.sigma0 < 0.8 * found.sigma0
@@ -84,7 +86,8 @@ def test_few_points_or_images_give_no_grid(rng):
 
 def test_a_grid_is_subtracted_as_it_is_stored(rng):
     """Bilinear in between, held beyond the edge; lists, as a file has them."""
-    grid = {"x_px": [0.0, 2047.0], "y_px": [0.0, 1535.0], "dx_px": [[0.5, 1.5], [0.5, 1.5]], "dy_px": [[-0.25, -0.25], [0.75, 0.75]]}
+    stored = {"x_px": [0.0, 2047.0], "y_px": [0.0, 1535.0], "dx_px": [[0.5, 1.5], [0.5, 1.5]], "dy_px": [[-0.25, -0.25], [0.75, 0.75]]}
+    grid = read_record(ResidualGrid, stored)
     x, y = rng.uniform(0, SENSOR.cols - 1, (4, 5)), rng.uniform(0, SENSOR.rows - 1, (4, 5))
     found = residual_grid.corrected(grid, x, y)
     np.testing.assert_allclose(found, (x - 0.5 - x / 2047, y + 0.25 - y / 1535))

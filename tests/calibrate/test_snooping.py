@@ -58,8 +58,8 @@ def test_stat_good_points_are_alarms_as_often_as_stated(rng):
 def unlisted(records, adjustment) -> np.ndarray:
     """Points whose rays are out without a record, one entry a ray."""
     network = adjustment.network
-    assert all(np.isfinite([v for v in r.values() if isinstance(v, float)]).all() and r["statistic"] > r["critical"] for r in records)
-    listed = {(r["image"], r["point"]) for r in records}
+    assert all(np.isfinite([v for v in vars(r).values() if isinstance(v, float)]).all() and r.statistic > r.critical for r in records)
+    listed = {(r.image, r.point) for r in records}
     names = zip((network.images[i] for i in network.image), (network.points[k] for k in network.point), strict=True)
     has_record = np.array([name in listed for name in names])
     assert not (has_record & adjustment.used).any()
@@ -121,7 +121,7 @@ def test_rays_of_points_that_nothing_is_left_of_are_listed(rng, loss, off_px):
     records = gross_error_records(snooped.adjustment, snooped.alpha, snooped.rejected)
     assert_every_ray_left_out_is_listed(records, snooped.adjustment)
     lost = {network.points[k] for k in np.flatnonzero(np.isnan(snooped.adjustment.state.xyz).any(axis=1))}
-    assert lost and lost == {r["point"] for r in records if r["point"] in {network.points[k] for k in range(20)}}
+    assert lost and lost == {r.point for r in records if r.point in {network.points[k] for k in range(20)}}
     assert len(gross_error_records(snooped.adjustment, snooped.alpha)) < len(records)  # that is all that is known of them
 
 
@@ -135,7 +135,7 @@ def test_exchanged_names_are_called_so(rng):
     x[c] += 300.0
     network = replace(network, point=point, x_px=x)
     snooped = remove_gross_errors(network, simulated.truth, adjust)
-    said = {r["point"]: r["swapped_with"] for r in gross_error_records(snooped.adjustment, snooped.alpha, snooped.rejected)}
+    said = {r.point: r.swapped_with for r in gross_error_records(snooped.adjustment, snooped.alpha, snooped.rejected)}
     first, second, alone = (network.points[point[i]] for i in (a, b, c))
     assert said[first] == second and said[second] == first and said[alone] is None
 
@@ -183,11 +183,11 @@ def test_records_name_the_worst_first(rng):
     network = replace(simulated.network, x_px=x)
     snooped = remove_gross_errors(network, simulated.truth, adjust)
     records = gross_error_records(snooped.adjustment, snooped.alpha)
-    assert [(r["image"], r["point"]) for r in records[:2]] == [
+    assert [(r.image, r.point) for r in records[:2]] == [
         (network.images[network.image[i]], network.points[network.point[i]]) for i in (111, 7)
     ]
-    assert records[0]["error_x_px"] == pytest.approx(-8.0, abs=8 * 0.05) and abs(records[0]["error_y_px"]) < 8 * 0.05
-    assert records[0]["statistic"] > records[0]["critical"]
+    assert records[0].error_x_px == pytest.approx(-8.0, abs=8 * 0.05) and abs(records[0].error_y_px) < 8 * 0.05
+    assert records[0].statistic > records[0].critical
 
 
 # --- points of few rays
@@ -250,7 +250,7 @@ def test_stat_good_rays_of_points_with_one_bad_ray_come_back(rng):
     adjustment, records = snooped.adjustment, gross_error_records(snooped.adjustment, snooped.alpha, snooped.rejected)
     used, state = adjustment.used, adjustment.state
     surely = 1.2 * (np.sqrt(critical_values(snooped.alpha, adjustment.dof)[1]) + Z)
-    listed = {(r["image"], r["point"]) for r in records}
+    listed = {(r.image, r.point) for r in records}
     wrong = unique = 0
     for bad in np.flatnonzero(gross):
         rays = np.flatnonzero(network.point == network.point[bad])
@@ -305,9 +305,9 @@ def search_from(simulated, rows, there):
         simulated.network, adjustment.state, adjust, used=adjustment.used, loss="none", rejected=snooped.rejected
     )
     np.testing.assert_array_equal(again.adjustment.used, adjustment.used)
-    records = [r for r in gross_error_records(again.adjustment, again.alpha, again.rejected) if r["point"] == name]
-    assert all(r["statistic"] > r["critical"] for r in records)
-    return adjustment.used[rows].tolist(), {r["image"] for r in records}
+    records = [r for r in gross_error_records(again.adjustment, again.alpha, again.rejected) if r.point == name]
+    assert all(r.statistic > r.critical for r in records)
+    return adjustment.used[rows].tolist(), {r.image for r in records}
 
 
 @pytest.mark.parametrize("there", [[1, 1, 1], [1, 0, 1], [1, 1, 0], [1, 0, 0], [0, 0, 0]])
@@ -414,8 +414,8 @@ def test_a_wrong_bar_is_named_and_sized(rng):
     adjustment = adjust(network, simulated.truth, redundancy=True)
     known = bar_residuals(adjustment)
     gross = contradicted(known, *image_sigma0(adjustment))
-    assert gross[0]["name"] == known.name[0] and len(gross) < 3
-    assert gross[0]["error"] == pytest.approx(1.0, abs=Z * 0.02 * np.sqrt(2))
+    assert gross[0].name == known.name[0] and len(gross) < 3
+    assert gross[0].error == pytest.approx(1.0, abs=Z * 0.02 * np.sqrt(2))
     right = adjust(with_bars(rng, simulated), simulated.truth, redundancy=True)
     assert len(contradicted(bar_residuals(right), *image_sigma0(right))) < 3
 
@@ -451,11 +451,11 @@ def test_a_wrong_control_point_is_named(rng):
     known = control_residuals(adjustment)
     assert len(known) == 30 and len(contradicted(known, *image_sigma0(adjustment))) < 3
     group = group_record(adjustment, known)
-    assert 15 < group["dof"] < 23  # 30 coordinates less 7 of the datum
-    low, high = (stats.chi2.isf(p, group["dof"]) / group["dof"] for p in (1 - RATE / 2, RATE / 2))
-    assert 0.9 * low < group["factor"] < 1.1 * high
+    assert 15 < group.dof < 23  # 30 coordinates less 7 of the datum
+    low, high = (stats.chi2.isf(p, group.dof) / group.dof for p in (1 - RATE / 2, RATE / 2))
+    assert 0.9 * low < group.factor < 1.1 * high
     xyz[3, 1] += 2.0
     adjustment = adjust(replace(network, xyz=xyz), simulated.truth, redundancy=True)
     gross = contradicted(control_residuals(adjustment), *image_sigma0(adjustment))
-    assert gross[0]["name"] == f"{network.points[3]} Y"
-    assert gross[0]["error"] == pytest.approx(2.0, abs=0.5)
+    assert gross[0].name == f"{network.points[3]} Y"
+    assert gross[0].error == pytest.approx(2.0, abs=0.5)

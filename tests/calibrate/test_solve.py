@@ -12,10 +12,11 @@ from scipy import stats
 
 from calibrate.networks import image_of, predicted, simulate
 from pixmetry.calibrate.bundle.model import NAMES
-from pixmetry.calibrate.bundle.network import Calibration, ScaleBars
+from pixmetry.calibrate.bundle.network import ScaleBars
 from pixmetry.calibrate.bundle.solve import Options, calibrate_network
 from pixmetry.calibrate.checks import known_checks
 from pixmetry.calibrate.checks.known_residuals import contradicted
+from pixmetry.calibrate.records import Calibration, record_of
 from pixmetry.core.errors import InputError, MeasureError, ParameterError
 
 RATE = 1e-6  # false failures of each statistical test
@@ -57,7 +58,7 @@ def test_recovers_cameras_and_planted_gross_errors_from_image_coordinates_alone(
     out = ~calibration.adjustment.used
     assert (simulated.gross & ~out).sum() == 0 and (out & ~simulated.gross).sum() < 3
     assert "gross_error" in kinds(calibration)
-    assert len(calibration.tests["gross_errors"]) == out.sum()
+    assert len(calibration.tests.gross_errors) == out.sum()
     assert calibration.adjustment.sigma0 == pytest.approx(1.0, abs=0.01)
 
 
@@ -69,17 +70,18 @@ def test_records_hold_what_report_and_files_are_made_of(rng):
         "parameters", "vision", "correlations", "correlations_with_poses", "residuals", "f_test", "variance_components", "gross_errors",
         "hold_out", "patterns", "images", "curves", "projection", "network", "known", "parameter_groups", "residual_grid",
     }  # fmt: skip
-    assert expected == set(calibration.tests)
+    assert expected == set(record_of(calibration.tests))
     assert words[0] == "checking the network" and words[-1] == "testing the result"
-    network = calibration.tests["network"]
-    assert network["observations"] == calibration.adjustment.used.sum() and network["rays_per_point"] == pytest.approx(12, abs=0.1)
-    assert [bar["length"] for bar in network["scale_bars"]] == simulated.network.bars.length.tolist()
+    network = calibration.tests.network
+    assert network.sizes.observations == calibration.adjustment.used.sum() and network.rays_per_point == pytest.approx(12, abs=0.1)
+    assert [bar.length for bar in network.scale_bars] == simulated.network.bars.length.tolist()
     assert calibration.provenance["options"]["false_alarms"] == 0.01
-    assert calibration.tests["hold_out"]["fixed"] is None and calibration.tests["hold_out"]["free"]["left_out_rms_px"] < 0.06
+    assert calibration.tests.hold_out.fixed is None and calibration.tests.hold_out.free.left_out_rms_px < 0.06
     assert "datum" in kinds(calibration)
-    residuals = calibration.tests["residuals"]["camera"]
+    residuals = calibration.tests.residuals["camera"]
     for axis in "xy":  # the noise was given rightly: nothing is left over
-        assert residuals[f"rms_{axis}_px"] == pytest.approx(residuals[f"noise_{axis}_px"], rel=5 / np.sqrt(2 * residuals[f"dof_{axis}"]))
+        noise_px, one = getattr(residuals, f"noise_{axis}_px"), residuals.axes[axis]
+        assert one.rms_px == pytest.approx(noise_px, rel=5 / np.sqrt(2 * one.dof))
 
 
 def test_a_board_that_is_not_flat_is_set_free(rng):
@@ -89,11 +91,11 @@ def test_a_board_that_is_not_flat_is_set_free(rng):
     bent[:, 2] += 2.0 * np.sin(np.pi * (bent[:, 0] / 1000 + 0.5))
     network = measured_anew(rng, simulated, xyz=bent)
     calibration = calibrate_network(network)
-    field, held = calibration.tests["field"], calibration.tests["hold_out"]
-    assert field["verdict"] == "free" and np.isinf(calibration.adjustment.network.u_xyz).all()
-    assert held["free"]["left_out_rms_px"] < 0.5 * held["fixed"]["left_out_rms_px"]
+    field, held = calibration.tests.field, calibration.tests.hold_out
+    assert field.verdict == "free" and np.isinf(calibration.adjustment.network.u_xyz).all()
+    assert held.free.left_out_rms_px < 0.5 * held.fixed.left_out_rms_px
     assert calibration.findings[0].kind == "flatness" and "not flat" in calibration.findings[0].text
-    assert calibration.tests["residuals"]["camera"]["rms_x_px"] < 0.05
+    assert calibration.tests.residuals["camera"].rms_x_px < 0.05
     found, limit = distance(calibration, simulated)
     assert found < limit
     kept = calibrate_network(network, Options(field="fixed", folds=0))
@@ -105,7 +107,7 @@ def test_a_board_that_is_not_flat_is_set_free(rng):
 def test_a_flat_board_is_kept(rng):
     simulated = simulate(rng, images=14, points=60, field="plane", known="fixed", bars=0)
     calibration = calibrate_network(simulated.network, start=simulated.truth)
-    assert calibration.tests["field"]["verdict"] == "fixed" and "flatness" not in kinds(calibration, "warning")
+    assert calibration.tests.field.verdict == "fixed" and "flatness" not in kinds(calibration, "warning")
 
 
 def known_in_part(rng, whole: int, off_mm: float, points: int = 50, known: int = 30):
@@ -122,14 +124,15 @@ def test_a_field_known_in_part_is_set_free_coordinate_by_coordinate(rng, whole):
     """0.5 mm in every given coordinate, which the images know to some 0.02 mm. Nothing stays fixed, and no image point is lost."""
     simulated = known_in_part(rng, whole, 0.5)
     calibration = calibrate_network(simulated.network, start=simulated.truth)
-    field, count = calibration.tests["field"], 60 + whole
-    assert field["verdict"] == "free" and np.isinf(calibration.adjustment.network.u_xyz).all()
-    assert "field" in kinds(calibration, "warning") and calibration.tests["residuals"]["camera"]["rms_x_px"] < 0.05
+    field, count = calibration.tests.field, 60 + whole
+    assert field.verdict == "free" and np.isinf(calibration.adjustment.network.u_xyz).all()
+    assert "field" in kinds(calibration, "warning") and calibration.tests.residuals["camera"].rms_x_px < 0.05
     assert calibration.adjustment.used.sum() > len(simulated.network) - 3
     found, limit = distance(calibration, simulated)
     assert found < limit
-    off = np.column_stack([field["points"][f"d{axis}"] for axis in "xyz"])
-    known = (simulated.network.u_xyz == 0)[[int(name[1:]) - 1 for name in field["points"]["names"]]]
+    points = field.compared.deviations.points
+    off = np.column_stack([points.dx, points.dy, points.dz])
+    known = (simulated.network.u_xyz == 0)[[int(name[1:]) - 1 for name in points.names]]
     np.testing.assert_array_equal(np.isfinite(off), known)
     # the best similarity takes up to seven; points of which an error is large may be set free beforehand
     low, high = np.sqrt(stats.chi2.ppf([RATE / 2, 1 - RATE / 2], known.sum() - 7) / known.sum())
@@ -140,7 +143,7 @@ def test_a_field_known_in_part_is_set_free_coordinate_by_coordinate(rng, whole):
 def test_a_right_field_known_in_part_is_kept(rng, whole):
     simulated = known_in_part(rng, whole, 0.0)
     calibration = calibrate_network(simulated.network, start=simulated.truth)
-    assert calibration.tests["field"]["verdict"] == "fixed" and "field" not in kinds(calibration, "warning")
+    assert calibration.tests.field.verdict == "fixed" and "field" not in kinds(calibration, "warning")
     np.testing.assert_array_equal(calibration.adjustment.network.u_xyz, simulated.network.u_xyz)
     assert calibration.adjustment.used.sum() > len(simulated.network) - 3
 
@@ -152,15 +155,15 @@ def test_a_drifting_clock_is_named_and_its_scales_bring_the_residuals_back_to_no
     network = replace(measured_anew(rng, simulated, x_scale=drift), time_s=60.0 * np.arange(20))
     without = calibrate_network(network, QUICK, simulated.truth)
     assert without.findings[0].kind == "x_scale_drift" and without.findings[0].level == "warning"
-    assert without.tests["variance_components"]["camera"]["sigma_x_px"] > 0.05
+    assert without.tests.variance_components["camera"].x.sigma_px > 0.05
     with_scales = calibrate_network(network, Options(folds=0, per_image=("x_scale",)), simulated.truth)
-    record = with_scales.tests["variance_components"]["camera"]
+    record = with_scales.tests.variance_components["camera"]
     z = stats.norm.isf(RATE / 2)
-    for axis in "xy":
-        assert record[f"sigma_{axis}_px"] == pytest.approx(0.04, abs=z * record[f"u_sigma_{axis}_px"])
+    for axis in (record.x, record.y):
+        assert axis.sigma_px == pytest.approx(0.04, abs=z * axis.u_sigma_px)
     assert "x_scale_drift" not in kinds(with_scales, "warning") and "x_scale_drift" in kinds(with_scales, "note")
-    images = with_scales.tests["images"]
-    off = np.array([(i["x_scale"] - d) / i["u_x_scale"] for i, d in zip(images, drift, strict=True)])
+    images = with_scales.tests.images
+    off = np.array([(i.x_scale - d) / i.u_x_scale for i, d in zip(images, drift, strict=True)])
     assert np.abs(off).max() < stats.norm.isf(RATE / 40)
     assert distance(with_scales, simulated)[0] < distance(with_scales, simulated)[1]
 
@@ -218,16 +221,16 @@ def test_large_circles_are_corrected_for_their_eccentricity(rng):
     calibration = calibrate_network(network, QUICK)
     found, limit = distance(calibration, simulated)
     assert found < limit
-    record = calibration.tests["eccentricity"]
+    record = calibration.tests.eccentricity
     shift = area - predicted(network, simulated.truth)
-    assert record["largest_px"] == pytest.approx(np.hypot(*shift.T).max(), rel=0.01)
+    assert record.largest_px == pytest.approx(np.hypot(*shift.T).max(), rel=0.01)
     assert "eccentricity" in kinds(calibration, "note")
     off = np.column_stack([calibration.adjustment.network.x_px - x, calibration.adjustment.network.y_px - y])
     missed = off + shift
     assert np.sqrt(np.mean(missed**2)) < 2e-3 and np.abs(missed).max() < 0.05  # the largest where circles reach beyond all points
     x, y = (area_centres(simulated, 200.0) + 0.04 * rng.normal(size=(len(network), 2))).T
     plain = calibrate_network(replace(network, x_px=x, y_px=y), Options(folds=0, eccentricity=False), simulated.truth)
-    assert distance(plain, simulated)[0] > 3 * limit and "eccentricity" not in plain.tests
+    assert distance(plain, simulated)[0] > 3 * limit and plain.tests.eccentricity is None
 
 
 def test_circles_without_normals_are_left_and_their_possible_shift_is_told(rng):
@@ -258,7 +261,7 @@ def test_a_wrong_bar_is_the_first_thing_said(rng, rare_alarms):
     calibration = calibrate_network(network, QUICK, simulated.truth)
     first = calibration.findings[0]
     assert first.kind == "gross_scale_bar" and network.points[bars.start[0]] in first.text and "left out" in first.advice
-    assert calibration.tests["known"]["scale_bars"]["gross"][0]["error"] == pytest.approx(2.0, abs=0.5)
+    assert calibration.tests.known.scale_bars.gross[0].error == pytest.approx(2.0, abs=0.5)
     assert len(calibration.adjustment.network.bars) == 3 and calibration.adjustment.used.sum() > len(network) - 3
     found, limit = distance(calibration, simulated)
     assert found < limit
@@ -296,7 +299,7 @@ def test_a_wrong_fixed_point_is_set_free_and_its_images_stay(rng, rare_alarms):
     first = calibration.findings[0]
     assert first.kind == "gross_control_point" and f" {simulated.network.points[7]} " in first.text
     assert np.isinf(calibration.adjustment.network.u_xyz[7]).all() and (calibration.adjustment.network.u_xyz[:7] == 0).all()
-    assert calibration.tests["known"]["control_points"]["gross"][0]["error"] == pytest.approx(3.0, abs=0.3)
+    assert calibration.tests.known.control_points.gross[0].error == pytest.approx(3.0, abs=0.3)
     assert calibration.adjustment.used.sum() > len(simulated.network) - 3
     assert distance(calibration, simulated)[0] < distance(calibration, simulated)[1]
 
@@ -316,7 +319,7 @@ def test_a_wrong_one_of_few_fixed_points_is_named_and_image_points_stay(rng, fix
     u = np.where(np.arange(60)[:, None] < fixed, 0.0, np.full((60, 3), np.inf))
     xyz = np.where(u == 0, simulated.truth.xyz, np.nan)
     right = calibrate_network(replace(simulated.network, xyz=xyz, u_xyz=u))
-    assert "gross_control_point" not in kinds(right) and right.tests["hold_out"]
+    assert "gross_control_point" not in kinds(right) and right.tests.hold_out
     assert ((right.adjustment.network.u_xyz == 0).all(axis=1).sum() == fixed) and right.adjustment.used.sum() > len(simulated.network) - 3
     xyz[0, 2] += 2.0
     wrong = calibrate_network(replace(simulated.network, xyz=xyz, u_xyz=u), QUICK)
@@ -366,7 +369,7 @@ def test_points_of_two_rays_that_contradict_each_other_are_named_with_their_bars
         assert (f"{gone} of 2 scale bars" in said[0].text) == (gone > 0)
     told = [re.search(r"(\d+) of points that are not determined", f.text) for f in calibration.findings if f.kind == "gross_error"]
     without_a_part = sum(int(found[1]) for found in told if found)
-    assert len(calibration.tests["gross_errors"]) + without_a_part == (~calibration.adjustment.used).sum()
+    assert len(calibration.tests.gross_errors) + without_a_part == (~calibration.adjustment.used).sum()
 
 
 def test_an_image_most_of_whose_points_are_wrong_is_named_as_a_whole(rng):
@@ -375,14 +378,14 @@ def test_an_image_most_of_whose_points_are_wrong_is_named_as_a_whole(rng):
     network = simulated.network
     off = (network.image == 4) * rng.normal(0, 15, (2, len(network)))
     calibration = calibrate_network(replace(network, x_px=network.x_px + off[0], y_px=network.y_px + off[1]), QUICK, start=simulated.truth)
-    record = calibration.tests["images"][4]
+    record = calibration.tests.images[4]
     said = [f for f in calibration.findings if f.kind in ("images_rejected", "images_left_out")]
     assert len(said) == 1 and said[0].level == "warning" and network.images[4] in said[0].text
-    gross = [r for r in calibration.tests["gross_errors"] if r["image"] == network.images[4]]
-    assert record["rejected"] == len(gross) and (record["oriented"] or not gross)
-    sizes = calibration.tests["network"]
-    assert sizes["observations_given"] == len(network) and sizes["observations"] == calibration.adjustment.used.sum()
-    assert sizes["images"] == 12 - (not record["oriented"]) and sizes["images_given"] == 12
+    gross = [r for r in calibration.tests.gross_errors if r.image == network.images[4]]
+    assert record.rejected == len(gross) and (record.oriented or not gross)
+    sizes = calibration.tests.network.sizes
+    assert sizes.observations_given == len(network) and sizes.observations == calibration.adjustment.used.sum()
+    assert sizes.images == 12 - (not record.oriented) and sizes.images_given == 12
 
 
 def test_points_of_two_rays_are_counted_where_they_are_many(rng):
@@ -405,8 +408,8 @@ def test_a_priori_covariances_are_taken_as_they_are(rng):
     taken, estimated = (calibrate_network(network, Options(folds=0, a_priori=a), simulated.truth) for a in (True, False))
     u = [np.sqrt(np.diag(c.adjustment.interior_covariance()[1])) for c in (taken, estimated)]
     np.testing.assert_allclose(u[0] / u[1], 2.0, rtol=0.2)
-    assert "variance_components" not in taken.tests and (taken.adjustment.network.covariance_px2 == network.covariance_px2).all()
-    assert estimated.tests["variance_components"]["camera"]["factor_x"] == pytest.approx(0.25, rel=0.4)
+    assert taken.tests.variance_components is None and (taken.adjustment.network.covariance_px2 == network.covariance_px2).all()
+    assert estimated.tests.variance_components["camera"].x.factor == pytest.approx(0.25, rel=0.4)
 
 
 def test_the_uncertainty_of_the_scale_is_that_of_the_bar_whatever_is_stated_of_the_images(rng):
@@ -425,12 +428,12 @@ def test_the_uncertainty_of_the_scale_is_that_of_the_bar_whatever_is_stated_of_t
         slopes = np.append(-along, along) / np.linalg.norm(along)
         u = np.sqrt(slopes @ adjustment.covariance[np.ix_(places, places)] @ slopes)
         assert u == pytest.approx(0.005 * bars.length[0], rel=0.01)
-        record = calibration.tests["variance_components"]["camera"]
-        assert record["factor_x"] == record["factor_y"] == pytest.approx(factor**-2, rel=0.5)
+        record = calibration.tests.variance_components["camera"]
+        assert record.x.factor == record.y.factor == pytest.approx(factor**-2, rel=0.5)
         kept = calibrate_network(network, replace(options, a_priori=True), simulated.truth)
-        assert "variance_components" not in kept.tests
+        assert kept.tests.variance_components is None
     alone = calibrate_network(replace(network, bars=ScaleBars.none()), options, simulated.truth)
-    assert alone.adjustment.sigma0 > 5 and "variance_components" not in alone.tests
+    assert alone.adjustment.sigma0 > 5 and alone.tests.variance_components is None
 
 
 def test_one_bad_image_is_named_and_no_drift_is_made_of_it(rng):
@@ -460,8 +463,8 @@ def test_a_camera_that_is_held_and_one_without_images_are_no_trouble(rng, tmp_pa
     spare = replace(simulated.network.cameras[0], name="spare")
     calibration = calibrate_network(replace(simulated.network, cameras=(camera, spare)), Options(residual_grid=True))
     np.testing.assert_array_equal(calibration.adjustment.state.interior[0], truth)
-    assert calibration.tests["parameters"] == [] and calibration.tests["residuals"]["spare"]["n"] == 0
-    assert (calibration.tests["projection"]["camera"]["u_px"] == 0).all()
+    assert calibration.tests.parameters == () and calibration.tests.residuals["spare"].n == 0
+    assert (calibration.tests.projection["camera"].u_px == 0).all()
     said = summary_text(calibration)
     assert said.count("fixed") == len(NAMES) - 2 and "is imaged" not in said  # k4 and k5 are 0
     assert "spare: No image coordinate of this camera took part." in said
@@ -498,10 +501,10 @@ def test_understated_uncertainties_of_control_are_called_that(rng, bars):
     calibration = calibrate_network(replace(simulated.network, xyz=xyz, u_xyz=u), QUICK, simulated.truth)
     said = {f.kind: f for f in calibration.findings if f.level == "warning"}
     assert "control points miss the network by about" in said["known_uncertainty"].text
-    record = calibration.tests["known"]["control_points"]
+    record = calibration.tests.known.control_points
     low, high = (25 * np.sqrt(stats.chi2.isf(p, 20) / 20) for p in (1 - RATE / 2, RATE / 2))
-    assert 0.8 * low < record["understated"] < 1.2 * high
-    assert simulated.network.points[4] in [r["name"].split()[0] for r in record["gross"]]
+    assert 0.8 * low < record.understated < 1.2 * high
+    assert simulated.network.points[4] in [r.name.split()[0] for r in record.gross]
     kept = np.isfinite(calibration.adjustment.network.u_xyz[:10]).all(axis=1)
     assert kept.sum() > 6 and not kept[4]  # one right one in a hundred networks goes with it, three once in 10⁷
     found, limit = distance(calibration, simulated)
@@ -517,7 +520,7 @@ def test_understated_uncertainties_are_called_that_beside_a_held_point(rng):
     xyz = np.where(np.isfinite(u), simulated.truth.xyz + error, np.nan)
     calibration = calibrate_network(replace(simulated.network, xyz=xyz, u_xyz=u), QUICK, simulated.truth)
     low, high = (25 * np.sqrt(stats.chi2.isf(p, 26) / 26) for p in (1 - RATE / 2, RATE / 2))
-    assert 0.8 * low < calibration.tests["known"]["control_points"]["understated"] < 1.2 * high
+    assert 0.8 * low < calibration.tests.known.control_points.understated < 1.2 * high
     assert (calibration.adjustment.network.u_xyz[0] == 0).all()
     found, limit = distance(calibration, simulated)
     assert found < limit
@@ -529,7 +532,7 @@ def test_not_significant_and_wholly_correlated_parameters_are_named(rng):
     camera = simulated.network.cameras[0]
     network = replace(simulated.network, cameras=(replace(camera, free=camera.free | np.isin(NAMES, ["k4"])),))
     calibration = calibrate_network(network, QUICK, simulated.truth)
-    p = next(r["p_zero"] for r in calibration.tests["parameters"] if r["name"] == "k4")
+    p = next(r.p_zero for r in calibration.tests.parameters if r.name == "k4")
     said = " ".join(f.text for f in calibration.findings if f.kind == "significance")
     assert ("k4" in said) == (p > 0.05)
 

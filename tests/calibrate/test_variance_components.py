@@ -40,9 +40,9 @@ def test_stat_recovers_planted_standard_deviations(rng, correlation):
     for k, (name, record) in enumerate(found.records().items()):
         assert name == network.cameras[k].name
         for axis, letter in enumerate("xy"):
-            u = record[f"u_sigma_{letter}_px"]
+            u = record.axes[letter].u_sigma_px
             assert u < 0.05 * SIGMA[k, axis]  # 0.032 ± 0.002: 480 degrees of freedom
-            assert record[f"sigma_{letter}_px"] == pytest.approx(SIGMA[k, axis], abs=Z * u)
+            assert record.axes[letter].sigma_px == pytest.approx(SIGMA[k, axis], abs=Z * u)
     assert found.adjustment.sigma0 == pytest.approx(1.0, abs=0.01)
     assert found.sizes.estimated.all()
 
@@ -53,8 +53,8 @@ def test_the_start_of_the_weights_does_not_matter(rng):
     other = scaled(network, np.array([[100.0, 1.0], [0.5, 30.0]]))
     records = [estimate_components(adjust(n, simulated.truth, redundancy=True), adjust).records() for n in (network, other)]
     for name in records[0]:
-        for key in ("sigma_x_px", "sigma_y_px"):
-            assert records[0][name][key] == pytest.approx(records[1][name][key], rel=1e-2)
+        for axis, one in records[0][name].axes.items():
+            assert one.sigma_px == pytest.approx(records[1][name].axes[axis].sigma_px, rel=1e-2)
 
 
 def test_identity_factors_are_one_where_the_estimate_has_converged(rng):
@@ -74,7 +74,7 @@ def test_stat_stated_uncertainty_is_that_of_many_estimates(rng):
     for _ in range(20):
         network = noisy(rng, simulated, np.array([[0.06, 0.03]]))
         record = estimate_components(adjust(network, simulated.truth, redundancy=True), adjust).records()["camera"]
-        z += [(record[f"sigma_{a}_px"] - s) / record[f"u_sigma_{a}_px"] for a, s in (("x", 0.06), ("y", 0.03))]
+        z += [(record.axes[a].sigma_px - s) / record.axes[a].u_sigma_px for a, s in (("x", 0.06), ("y", 0.03))]
     scatter = np.sqrt(np.mean(np.square(z)))
     low, high = (np.sqrt(stats.chi2.isf(p, len(z)) / len(z)) for p in (1 - RATE / 2, RATE / 2))
     assert low < scatter < 1.15 * high
@@ -117,11 +117,11 @@ def test_stat_what_is_beyond_stated_noise_is_added_to_it(rng):
     found = estimate_components(adjust(network, simulated.truth, redundancy=True), adjust)
     record = found.records()["camera"]
     for letter, beyond in zip("xy", (0.08, 0.05), strict=True):
-        assert record[f"u_beyond_{letter}_px"] < 0.06 * beyond
-        assert record[f"beyond_{letter}_px"] == pytest.approx(beyond, abs=Z * record[f"u_beyond_{letter}_px"])
-        total = record[f"given_{letter}_px"] ** 2 + record[f"beyond_{letter}_px"] ** 2
-        assert record[f"sigma_{letter}_px"] ** 2 == pytest.approx(total, rel=5e-3)  # weights and sizes differ by the last step
-        assert record[f"factor_{letter}"] == 1
+        assert record.axes[letter].u_beyond_px < 0.06 * beyond
+        assert record.axes[letter].beyond_px == pytest.approx(beyond, abs=Z * record.axes[letter].u_beyond_px)
+        total = record.axes[letter].given_px**2 + record.axes[letter].beyond_px**2
+        assert record.axes[letter].sigma_px**2 == pytest.approx(total, rel=5e-3)  # weights and sizes differ by the last step
+        assert record.axes[letter].factor == 1
     assert found.adjustment.sigma0 == pytest.approx(1.0, abs=0.01)
 
 
@@ -155,10 +155,10 @@ def test_residuals_smaller_than_stated_and_guessed_covariances_are_multiplied(rn
     simulated = simulate(rng, images=10, points=40)
     network = noisy(rng, simulated, np.array([[0.02, 0.02]]))
     record = estimate_components(adjust(network, simulated.truth, redundancy=True), adjust).records()["camera"]
-    assert record["factor_x"] == pytest.approx(0.25, rel=0.35) and record["beyond_x_px"] is None
+    assert record.x.factor == pytest.approx(0.25, rel=0.35) and record.x.beyond_px is None
     guess = replace(noisy(rng, simulated, np.array([[0.08, 0.08]])), covariance_known=False)
     record = estimate_components(adjust(guess, simulated.truth, redundancy=True), adjust).records()["camera"]
-    assert record["factor_x"] == pytest.approx(4, rel=0.35) and record["beyond_x_px"] is None
+    assert record.x.factor == pytest.approx(4, rel=0.35) and record.x.beyond_px is None
 
 
 def test_x_and_y_have_one_size_unless_the_images_agree_that_they_differ(rng):

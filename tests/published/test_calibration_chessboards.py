@@ -14,9 +14,10 @@ import numpy as np
 import pytest
 
 from pixmetry.calibrate.bundle.model import CameraModel, Sensor
-from pixmetry.calibrate.bundle.network import Adjustment, Calibration, Network
+from pixmetry.calibrate.bundle.network import Adjustment, Network
 from pixmetry.calibrate.bundle.solve import Options, calibrate_network
 from pixmetry.calibrate.images.images import ImageObservations, observations_of
+from pixmetry.calibrate.records import Calibration
 
 FOLDER = Path(os.environ.get("PIXMETRY_DATA", "")) / "opencv-chessboards"
 pytestmark = pytest.mark.skipif(
@@ -158,10 +159,10 @@ def test_first_corner_is_the_same_in_all_images() -> None:
 
 def test_free_board_points_serve_images_left_out_of_the_fit() -> None:
     """The board is bent: with its points free the rms falls in images that took no part in the fit, not only in those that did."""
-    held = calibrated().tests["hold_out"]
-    assert held["free"] is not None
-    assert held["free"]["left_out_rms_px"] < 0.8 * held["fixed"]["left_out_rms_px"]
-    assert held["free"]["fit_rms_px"] < held["fixed"]["fit_rms_px"]
+    held = calibrated().tests.hold_out
+    assert held.free is not None
+    assert held.free.left_out_rms_px < 0.8 * held.fixed.left_out_rms_px
+    assert held.free.fit_rms_px < held.fixed.fit_rms_px
 
 
 def test_report_says_that_the_board_is_not_flat() -> None:
@@ -169,6 +170,7 @@ def test_report_says_that_the_board_is_not_flat() -> None:
     calibration = calibrated()
     said = [finding.text for finding in calibration.findings if "flat" in finding.kind + finding.text]
     assert said, [finding.kind for finding in calibration.findings]
-    field = calibration.tests["field"]
-    assert field["verdict"] == "free" and field["peak"] > field["rms"] > 0
-    assert np.hypot(field["moved_xp_px"], field["moved_yp_px"]) > 2 * np.hypot(field["u_xp_px"], field["u_yp_px"])
+    field = calibration.tests.field
+    off, moved = field.compared.deviations, field.compared.first
+    assert field.verdict == "free" and off.peak > off.rms > 0
+    assert np.hypot(moved.moved_xp_px, moved.moved_yp_px) > 2 * np.hypot(moved.u_xp_px, moved.u_yp_px)

@@ -123,8 +123,8 @@ def test_images_give_the_published_camera() -> None:
     found = vision(calibration.adjustment.camera())
     for name, tolerance in (("fx", 2.0), ("fy", 2.0), ("cx", 1.0), ("cy", 1.0)):
         assert abs(found[name] - PUBLISHED[name]) < tolerance, name
-    parts = calibration.tests["variance_components"]["camera"]
-    assert parts["common"] and parts["beyond_x_px"] > 4 * parts["given_x_px"]
+    parts = calibration.tests.variance_components["camera"]
+    assert parts.common and parts.x.beyond_px > 4 * parts.x.given_px
 
 
 def test_weights_of_x_and_y_move_the_principal_point_of_the_published_corners() -> None:

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from pixmetry.calibrate.bundle.model import NAMES, CameraModel, Sensor
-from pixmetry.calibrate.bundle.network import Adjustment, Calibration, Network, ScaleBars, State
+from pixmetry.calibrate.bundle.network import Adjustment, Network, ScaleBars, State
+from pixmetry.calibrate.records import Calibration, Tests, read_record
 from pixmetry.core.finding import Finding
 
 NOISE_PX = 0.04
@@ -173,7 +174,7 @@ def full(rng: np.random.Generator, **kw: Any) -> Calibration:
     bars = ScaleBars(start, end, length, np.array([0.01, 0.01]))
     net = replace(net, bars=bars, time_s=60.0 * np.arange(len(net.images)), per_image=("x_scale",))
     adj = replace(adj, network=net)
-    records = tests_of(rng, adj)
+    records = read_record(Tests, tests_of(rng, adj))
     findings = (
         Finding(
             "flatness",
@@ -241,8 +242,10 @@ def tests_of(rng: np.random.Generator, adj: Adjustment) -> dict[str, Any]:
     xyz = adj.state.xyz
     out["field"] = {
         "verdict": "free",
+        "shape": "volume",
         "rms": 0.21,
         "peak": 0.48,
+        "u": 0.0,
         "unit": "mm",
         "p": 1e-13,
         "moved_xp_px": 1.81,
@@ -254,6 +257,7 @@ def tests_of(rng: np.random.Generator, adj: Adjustment) -> dict[str, Any]:
         "points": {
             "names": names,
             "xyz": xyz,
+            "axes": np.eye(3),
             "dx": rng.normal(0, 0.02, len(names)),
             "dy": rng.normal(0, 0.02, len(names)),
             "dz": 0.5 * np.cos(xyz[:, 0] / 260) * np.cos(xyz[:, 1] / 330) - 0.2,
@@ -272,6 +276,7 @@ def tests_of(rng: np.random.Generator, adj: Adjustment) -> dict[str, Any]:
         {
             "image": name,
             "camera": net.cameras[net.camera_of[k]].name,
+            "oriented": True,
             "n": int((net.image == k).sum()),
             "rejected": int((~adj.used & (net.image == k)).sum()),
             "rms_x_px": float(np.sqrt(np.mean(adj.residual_px[(net.image == k) & adj.used, 0] ** 2))),
@@ -373,4 +378,6 @@ def one_camera(rng: np.random.Generator, adj: Adjustment, k: int, model: CameraM
         "dy_px": 0.01 * rng.normal(size=(9, 11)),
         "u_px": np.full((9, 11), 0.006),
         "n": np.full((9, 11), 20),
+        "rms_without_px": 0.05,
+        "rms_with_px": 0.04,
     }

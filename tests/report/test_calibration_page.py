@@ -14,7 +14,7 @@ import pytest
 
 from chance import rng_of
 from pixmetry.calibrate.bundle.model import NAMES, Sensor
-from pixmetry.calibrate.bundle.network import Adjustment, Calibration
+from pixmetry.calibrate.bundle.network import Adjustment
 from pixmetry.calibrate.checks.quality import image_records
 from pixmetry.calibrate.page.control import control_points
 from pixmetry.calibrate.page.figures import (
@@ -35,6 +35,7 @@ from pixmetry.calibrate.page.plots import bin_means, short
 from pixmetry.calibrate.page.space import ellipse, field_map, largest_axis, plan_views, pyramids, seen_from, shown_points
 from pixmetry.calibrate.page.tables import gross_errors, images, network_facts, parameters, scale_bars
 from pixmetry.calibrate.page.text import as_given, p_text, projection_levels, sentence, summary_text, typeset, worth
+from pixmetry.calibrate.records import Calibration, CheckRecord, FieldPoints, ProjectionMap, read_record
 from pixmetry.core.errors import InputError
 from pixmetry.core.finding import Finding
 from report import calibrations
@@ -64,7 +65,7 @@ def plain(text: str) -> str:
 
 
 def with_tests(calibration: Calibration, **records: Any) -> Calibration:
-    return replace(calibration, tests={**calibration.tests, **records})
+    return replace(calibration, tests=replace(calibration.tests, **records))
 
 
 def with_residuals(calibration: Calibration, x_px: float, y_px: float) -> Calibration:
@@ -90,16 +91,17 @@ def test_the_verdict_comes_first_in_px_and_um(whole: Calibration, rng: np.random
 def test_projection_uncertainty_in_the_middle_and_in_the_worst_corner() -> None:
     u = np.full((5, 7), 9.0)
     u[2, 3], u[0, 0], u[0, -1], u[-1, 0], u[-1, -1] = 0.01, 0.02, 0.03, np.nan, 0.04
-    assert projection_levels({"u_px": u}) == (0.01, 0.04)
-    assert projection_levels({"u_px": np.full((5, 7), np.nan)}) is None
+    axes = np.arange(7.0), np.arange(5.0)
+    assert projection_levels(ProjectionMap(*axes, u, u)) == (0.01, 0.04)
+    assert projection_levels(ProjectionMap(*axes, np.full((5, 7), np.nan), u)) is None
 
 
 def test_every_record_is_on_the_page(whole: Calibration, page: Page) -> None:
     text = page.text
     for finding in whole.findings:
         assert plain(typeset(finding.text)) in text and finding.advice in text
-    assert whole.tests["f_test"]["camera"]["text"] in text
-    dof = [f"{whole.tests['residuals']['camera'][key]:.0f}" for key in ("dof_x", "dof_y")]
+    assert whole.tests.f_test["camera"].text in text
+    dof = [f"{axis.dof:.0f}" for axis in whole.tests.residuals["camera"].axes.values()]
     assert f"in px² 1.31 {dof[0]} and {dof[1]} 1.12 0.00020" in text
     assert f"in µm² 1.31 {dof[0]} and {dof[1]} 1.12 0.00020" in text
     assert "Affinity B1 1.200" in text and "from the middle" in text
@@ -116,17 +118,17 @@ def test_every_record_is_on_the_page(whole: Calibration, page: Page) -> None:
 
 
 def test_gross_errors_are_listed_worst_first(whole: Calibration, rng: np.random.Generator) -> None:
-    one = dict(whole.tests["gross_errors"][0])
-    records = [{**one, "image": "mild", "statistic": 40.0}, {**one, "image": "awful", "statistic": 900.0}]
+    one = whole.tests.gross_errors[0]
+    records = [replace(one, image="mild", statistic=40.0), replace(one, image="awful", statistic=900.0)]
     assert [row[0] for row in gross_errors(records)] == ["awful", "mild"]
     few = calibrations.full(rng, images=3)
-    assert "No gross error was found." in Page(render(with_tests(few, gross_errors=[]))).text
+    assert "No gross error was found." in Page(render(with_tests(few, gross_errors=()))).text
 
 
 def test_a_parameter_that_is_not_significant_says_so(whole: Calibration) -> None:
-    records = [dict(r) for r in whole.tests["parameters"]]
-    records[3] |= {"value": 1e-5, "u": 2e-5, "p_zero": 0.62}
-    changed = with_tests(whole, parameters=records)
+    records = list(whole.tests.parameters)
+    records[3] = replace(records[3], value=1e-5, u=2e-5, p_zero=0.62)
+    changed = with_tests(whole, parameters=tuple(records))
     row = next(r for r in parameters(changed, 0) if r["symbol"] == "B1")
     assert [row[key] for key in ("value", "u", "unit", "p")] == ["1.0", "± 2.0", "10⁻⁵", "0.62, not significant"]
     assert re.search(r"B1 +1\.0 ± 2\.0 +10⁻⁵ +not significant", summary_text(changed))
@@ -155,8 +157,8 @@ def test_a_curve_of_terms_that_are_not_there_is_not_drawn(whole: Calibration) ->
 
 
 def test_a_long_table_says_that_it_scrolls(whole: Calibration) -> None:
-    records = whole.tests["gross_errors"]
-    many = [{**records[0], "point": f"P{i}"} for i in range(30)]
+    records = whole.tests.gross_errors
+    many = [replace(records[0], point=f"P{i}") for i in range(30)]
     assert "The table scrolls." in Page(render(with_tests(whole, gross_errors=many))).text
     assert "The table scrolls." not in Page(render(with_tests(whole, gross_errors=many[:5]))).text
 
@@ -194,8 +196,8 @@ def test_images_that_are_not_oriented_are_not_counted_and_nothing_of_them_is_rej
     used[np.flatnonzero(used)[0]] = False
     without = replace(adjustment, used=used, state=replace(adjustment.state, position=position))
     records = image_records(without, {net.images[0]: 7, net.images[2]: 1})
-    assert [(r["oriented"], r["rejected"]) for r in records[:3]] == [(False, 0), (False, 0), (True, 1)]
-    assert records[0]["measured"] == (net.image == 0).sum()
+    assert [(r.oriented, r.rejected) for r in records[:3]] == [(False, 0), (False, 0), (True, 1)]
+    assert records[0].measured == (net.image == 0).sum()
     rows = images(records)["rows"]
     assert rows[0][2][:2] == ["not oriented", "\u2013"] and rows[2][2][1] == "1"
     said = plain(summary_text(Calibration(without)))
@@ -279,7 +281,7 @@ def test_names_from_outside_are_only_text(rng: np.random.Generator) -> None:
     bad = '<script>alert("x")</script>'
     network = replace(plain.adjustment.network, images=(bad, *plain.adjustment.network.images[1:]))
     findings = (Finding("start", f"Image {bad} was left out.", "", "warning"),)
-    images = [{**r, "image": network.images[k]} for k, r in enumerate(plain.tests["images"])]
+    images = [replace(r, image=network.images[k]) for k, r in enumerate(plain.tests.images)]
     changed = replace(with_tests(plain, images=images), adjustment=replace(plain.adjustment, network=network), findings=findings)
     assert "<script" not in render(changed)
 
@@ -442,11 +444,11 @@ def test_the_field_is_drawn_in_its_own_axes(rng: np.random.Generator) -> None:
     """A board in the XZ plane: without its axes all its points would lie on one line."""
     adjustment = calibrations.bare(rng).adjustment
     xyz = np.column_stack([rng.uniform(0, 100, 30), np.zeros(30), rng.uniform(0, 60, 30)])
-    points = {"names": [], "xyz": xyz, "dx": np.zeros(30), "dy": np.zeros(30), "dz": rng.normal(0, 1, 30)}
-    points["axes"] = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    none, axes = np.zeros(30), np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    points = FieldPoints((), xyz, axes, none, none, none, none, rng.normal(0, 1, 30), none)
     picture = field_map(adjustment, points)
     assert picture is not None and "30 points" in picture.alt and ">Z / mm</text>" in picture.svg
-    assert field_map(adjustment, {**points, "dz": np.full(30, np.nan)}) is None
+    assert field_map(adjustment, replace(points, dz=np.full(30, np.nan))) is None
 
 
 def test_scale_bars_are_measured_less_adjusted(whole: Calibration) -> None:
@@ -487,7 +489,7 @@ CHECKED = {
 
 def test_check_points_are_listed(whole: Calibration, page: Page) -> None:
     assert "Check points" not in page.text
-    checked = with_tests(whole, check_points=CHECKED)
+    checked = with_tests(whole, check_points=read_record(CheckRecord, CHECKED))
     shown = Page(render(checked)).text
     assert "C1 X 1234567.500 ± 0.010 1234567.531 ± 0.020 \u22120.031 \u22121.6 7" in shown
     assert "C1 Y 2.000 exact 2.000 ± 0.020 0 0.0 7" in shown and "C2 Z 5.25 exact – – – – 0" in shown
@@ -495,7 +497,8 @@ def test_check_points_are_listed(whole: Calibration, page: Page) -> None:
     assert "parameters of the datum took up" not in shown
     assert "2 check points with 4 coordinates" in " ".join(summary_text(checked).split())
     assert max(len(line) for line in summary_text(checked).splitlines()) <= 100
-    silent = with_tests(whole, check_points={**CHECKED, "datum_parameters": 7, "chi2": None, "p": None, "worst": None})
+    telling = read_record(CheckRecord, CHECKED)
+    silent = with_tests(whole, check_points=replace(telling, datum_parameters=7, chi2=None, p=None, worst=None))
     shown = Page(render(silent)).text
     assert "less what the 7 parameters of the datum took up" in shown and "by chance" not in shown
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from pixmetry.calibrate.bundle.model import NAMES, CameraModel
-from pixmetry.calibrate.bundle.network import Calibration
 from pixmetry.calibrate.files.record import StoredCalibration, read_calibration
 from pixmetry.calibrate.geometry import geometry_of
+from pixmetry.calibrate.records import Calibration
 from pixmetry.camera.camera import Camera, Element
 from pixmetry.camera.catalogue import get_source
 from pixmetry.camera.observations import AFFINITY, LENS, TAKEN_UP, CameraGeometry, Observations
@@ -61,13 +61,13 @@ def calibrated_geometry(
         remedy = "name it from Python: assess(…, calibration=calibrated_geometry(file, NAME))"
         raise InputError("which camera of the calibration is not clear", value=camera, allowed=", ".join(names), remedy=remedy)
     k = 0 if camera is None else names.index(camera)
-    record, grid = calibration.tests["residuals"][names[k]], calibration.tests["projection"][names[k]]
-    if not record["n"]:
+    record, grid = (calibration.tests.residuals or {}).get(names[k]), (calibration.tests.projection or {}).get(names[k])
+    if record is None or grid is None or not record.n:
         raise InputError("no image coordinate of this camera took part", where=names[k], remedy="calibrate it, or name another camera")
-    left = float(record["systematic_x_px"]), float(record["systematic_y_px"])
+    left = record.systematic_x_px or 0.0, record.systematic_y_px or 0.0
     sensor = models[k].sensor
     origin = f"calibration of {names[k]}, {sensor.cols} × {sensor.rows} px"
-    u = float(np.sqrt(np.nanmean(np.asarray(grid["u_px"], float) ** 2)))
+    u = float(np.sqrt(np.nanmean(grid.u_px**2)))
     model, (estimated, covariance) = models[k], covariances[k]
     if sensor.pitch_x_um is None:
         if pitch_um is None:

@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pixmetry.calibrate.bundle.model import NAMES
-from pixmetry.calibrate.bundle.network import PER_IMAGE_NAMES, Calibration, Network
+from pixmetry.calibrate.bundle.network import PER_IMAGE_NAMES, Network
 from pixmetry.calibrate.checks.check_points import CheckPoints, refuse_known, with_check_points
 from pixmetry.calibrate.files.record import StoredCalibration, read_calibration
 from pixmetry.calibrate.files.write import check_folder, write_line_results, write_results
+from pixmetry.calibrate.records import Calibration
 from pixmetry.camera.camera import Camera
 from pixmetry.core.errors import InputError, PixmetryError
 from pixmetry.core.extras import import_extra

@@ -1,184 +1,1079 @@
-"""Plain records of an adjustment that stands: what report, files and findings are made of."""
+"""What a calibration returns: the adjustment that stands, what must be known about it, and the records of its tests.
+
+A record is written to JSON field by field (`record_of`), and read back by the types of its fields (`read_record`): a part that was not
+made is left out, so is what belongs to the search alone.
+"""
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Mapping
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass
+from types import NoneType, UnionType
+from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 import numpy as np
 
-from pixmetry.calibrate.bundle.network import Adjustment, Network
-from pixmetry.calibrate.checks.known_checks import fixed_record
-from pixmetry.calibrate.checks.known_residuals import bar_residuals, control_residuals, group_record
-from pixmetry.calibrate.checks.snooping import Rejected
-from pixmetry.calibrate.geometry import systematic_rest
+from pixmetry.calibrate.bundle.network import Adjustment
+from pixmetry.core.finding import Finding
 
-SWAPPED = 0.1  # of the distance of two points: as near to the other's place, their names are exchanged
+Axis = Literal["x", "y"]
+R = TypeVar("R")
 
 
-def all_records(
-    adjustment: Adjustment,
-    alpha: float,
-    gross_known: Mapping[str, list[dict[str, Any]]],
-    rejected: Rejected | None = None,
-    *,
-    a_priori: bool = False,
-) -> dict[str, Any]:
-    """The records that follow from one adjustment alone (with redundancy numbers and covariance).
+def _if_made() -> Any:
+    """A field that is left out of the JSON where it is None."""
+    return field(default=None, metadata={"if_made": True})
+
+
+def _joined(axis: str = "") -> Any:
+    """A record whose fields stand among those of its owner, with the axis in their names: ``sigma_px`` as ``sigma_x_px``."""
+    return field(default=None, metadata={"joined": True, "axis": axis})
+
+
+def record_of(value: Any) -> dict[str, Any]:
+    """A record as a mapping of its fields, and those that it holds likewise; arrays and numbers are left as they are.
+
+    Examples
+    --------
+    >>> record_of(Strongest("p1", -0.8))
+    {'with': 'p1', 'r': -0.8}
+    >>> record_of(HoldOut(None, None, 5, None, "not made"))  # what noise alone would show was not asked for
+    {'fixed': None, 'free': None, 'folds': 5, 'p': None, 'text': 'not made'}
+    """
+    record: dict[str, Any] = {}
+    for one in fields(value):
+        own, rule = getattr(value, one.name), one.metadata
+        if rule.get("joined"):
+            record |= {} if own is None else {_along(key, rule["axis"]): part for key, part in record_of(own).items()}
+        elif not rule.get("internal") and not (rule.get("if_made") and own is None):
+            record[one.name.rstrip("_")] = _mapped(own)
+    return record
+
+
+def _mapped(value: Any) -> Any:
+    if is_dataclass(value):
+        return record_of(value)
+    if isinstance(value, Mapping):
+        return {key: _mapped(part) for key, part in value.items()}
+    return [_mapped(part) for part in value] if isinstance(value, tuple) else value
+
+
+def _along(key: str, axis: str) -> str:
+    if not axis:
+        return key
+    return f"{key.removesuffix('_px')}_{axis}_px" if key.endswith("_px") else f"{key}_{axis}"
+
+
+def read_record(kind: type[R], record: Mapping[str, Any]) -> R:
+    """A record out of what `record_of` made of it, as JSON holds that; what is missing in an old file is None.
+
+    Examples
+    --------
+    >>> read_record(ParameterTest, {"name": "k1", "value": 0.1, "u": None, "strongest": {"with": "k2", "r": -0.9}})
+    ParameterTest(camera=None, name='k1', value=0.1, u=nan, unit=None, p_zero=None, strongest=Strongest(with_='k2', r=-0.9), fixed=False)
+    """
+    return _read_fields(kind, lambda key: record.get(key, MISSING))
+
+
+def _read_fields(kind: Any, of: Callable[[str], Any]) -> Any:
+    hints, found = get_type_hints(kind), {}
+    for one in fields(kind):
+        if one.metadata.get("joined"):
+            inner = next(part for part in (get_args(hints[one.name]) or (hints[one.name],)) if part is not NoneType)
+            axis = one.metadata["axis"]
+            joined = _read_fields(inner, lambda key, axis=axis: of(_along(key, axis)))  # type: ignore[misc]
+            there = any(of(_along(part.name.rstrip("_"), axis)) is not MISSING for part in fields(inner))
+            found[one.name] = joined if there else None
+        elif (value := of(one.name.rstrip("_"))) is not MISSING:
+            found[one.name] = _read(hints[one.name], value)
+        elif one.default is MISSING and one.default_factory is MISSING:
+            found[one.name] = _read(hints[one.name], None)
+    return kind(**found)
+
+
+def _read(kind: Any, value: Any) -> Any:
+    """A value of one type; of numbers, None is NaN."""
+    origin, inner = get_origin(kind), get_args(kind)
+    if origin is UnionType:
+        return None if value is None else _read(next(part for part in inner if part is not NoneType), value)
+    if value is None:
+        return float("nan") if kind is float else None
+    if kind is float:
+        return float(value)  # also of "inf"
+    if is_dataclass(kind):
+        return _read_fields(kind, lambda key: value.get(key, MISSING))
+    if kind is np.ndarray:
+        return np.array(value, float)
+    if origin is tuple:
+        return tuple(_read(inner[0], part) for part in value)
+    return {key: _read(inner[1], part) for key, part in value.items()} if origin is Mapping else value
+
+
+@dataclass(frozen=True)
+class Strongest:
+    """The parameter that another one is most correlated with.
+
+    Parameters
+    ----------
+    with_ : str
+    r : float
+    """
+
+    with_: str
+    r: float
+
+
+@dataclass(frozen=True)
+class ParameterTest:
+    """An estimated interior parameter.
+
+    Parameters
+    ----------
+    camera, name : str
+    value, u : float
+    unit : str
+    p_zero : float or None
+        Of the two-sided t-test against 0; None for c, xp and yp.
+    strongest : Strongest or None
+        Interior parameter of the same camera with the largest correlation; None if alone.
+    fixed : bool
+        Whether it was held; records of tests are of estimated ones only.
+    """
+
+    camera: str
+    name: str
+    value: float
+    u: float
+    unit: str
+    p_zero: float | None = None
+    strongest: Strongest | None = None
+    fixed: bool = field(default=False, metadata={"internal": True})
+
+
+@dataclass(frozen=True)
+class GroupTest:
+    """Joint F-test against 0 of parameters that can stand for each other, as the radial ones can.
+
+    Parameters
+    ----------
+    camera, group : str
+    names : tuple of str
+    f : float
+    dof : (int, int)
+        Of numerator and denominator.
+    p : float
+    """
+
+    camera: str
+    group: str
+    names: tuple[str, ...]
+    f: float
+    dof: tuple[int, int]
+    p: float
+
+
+@dataclass(frozen=True)
+class Vision:
+    """A camera in the words of computer vision, in px, with standard uncertainties."""
+
+    fx: float
+    fy: float
+    skew: float
+    cx: float
+    cy: float
+    u_fx: float
+    u_fy: float
+    u_skew: float
+    u_cx: float
+    u_cy: float
+
+    @property
+    def rows(self) -> tuple[tuple[str, float, float], ...]:
+        """Name, value and uncertainty of each."""
+        values, u = (self.fx, self.fy, self.skew, self.cx, self.cy), (self.u_fx, self.u_fy, self.u_skew, self.u_cx, self.u_cy)
+        return tuple(zip(("fx", "fy", "skew", "cx", "cy"), values, u, strict=True))
+
+
+@dataclass(frozen=True)
+class Correlations:
+    """Correlations of the interior parameters of a camera.
+
+    Parameters
+    ----------
+    names : tuple of str
+    matrix : ndarray, shape (names, names)
+    """
+
+    names: tuple[str, ...]
+    matrix: np.ndarray
+
+
+@dataclass(frozen=True)
+class PoseCorrelation:
+    """Correlation ``r`` of an interior parameter ``a`` (``"camera:c"``) with one of a pose ``b`` (``"image:Z0"``)."""
+
+    a: str
+    b: str
+    r: float
+
+
+@dataclass(frozen=True)
+class AxisResidual:
+    """Residuals of x or of y; ``rms_um`` is None without a pitch, ``dof`` is None where there are no redundancy numbers."""
+
+    rms_px: float
+    rms_um: float | None
+    dof: float | None
+
+
+@dataclass(frozen=True)
+class CameraResiduals:
+    """Residuals of the image coordinates of a camera.
+
+    Parameters
+    ----------
+    n : int
+        Image points.
+    rms_x_px, rms_y_px : float
+    rms_x_um, rms_y_um : float or None
+        None without a pitch.
+    dof_x, dof_y : float or None
+        Degrees of freedom: sums of redundancy numbers, what the adjustment has left of n.
+    noise_x_px, noise_y_px : float or None
+        rms that the given covariances alone would leave, √(Σ r s² / n); None where they were a guess.
+    systematic_x_px, systematic_y_px : float or None
+        What is left over besides (`pixmetry.calibrate.geometry.systematic_rest`).
+    """
+
+    n: int
+    rms_x_px: float
+    rms_y_px: float
+    rms_x_um: float | None
+    rms_y_um: float | None
+    dof_x: float | None
+    dof_y: float | None
+    noise_x_px: float | None = None
+    noise_y_px: float | None = None
+    systematic_x_px: float | None = None
+    systematic_y_px: float | None = None
+
+    @property
+    def axes(self) -> dict[Axis, AxisResidual]:
+        """The same, axis by axis."""
+        return {
+            "x": AxisResidual(self.rms_x_px, self.rms_x_um, self.dof_x),
+            "y": AxisResidual(self.rms_y_px, self.rms_y_um, self.dof_y),
+        }
+
+
+@dataclass(frozen=True)
+class FTest:
+    """One-sided F-test whether x is noisier than y.
+
+    Parameters
+    ----------
+    ratio_px2, p_px : float
+        Of the variances in px².
+    ratio_um2, p_um : float or None
+        In µm²; None without a pitch.
+    dof_x, dof_y : float
+    critical_95 : float
+        Ratio that chance exceeds in 5 %.
+    side, text : str
+    """
+
+    ratio_px2: float
+    p_px: float
+    ratio_um2: float | None
+    p_um: float | None
+    dof_x: float
+    dof_y: float
+    critical_95: float
+    side: str
+    text: str
+
+
+@dataclass(frozen=True)
+class GrossError:
+    """An image point that was left out.
+
+    Parameters
+    ----------
+    image, point : str
+    residual_x_px, residual_y_px, error_x_px, error_y_px : float
+        Residual and estimated error.
+    statistic, critical : float
+    swapped_with : str or None
+        Point of the same image that it seems to have exchanged its name with.
+    """
+
+    image: str
+    point: str
+    residual_x_px: float
+    residual_y_px: float
+    error_x_px: float
+    error_y_px: float
+    statistic: float
+    critical: float
+    swapped_with: str | None = None
+
+
+@dataclass(frozen=True)
+class ImageRecord:
+    """One image.
+
+    Parameters
+    ----------
+    image, camera : str
+    oriented : bool
+    n, rejected, measured : int
+        Image points used, rejected (0 of an image that is not oriented: it took no part), and all.
+    rms_x_px, rms_y_px : float or None
+        Of the residuals; None without points.
+    time_s : float or None
+    x_scale, u_x_scale, x_shift_px, u_x_shift_px : float or None
+        The image's own, where they were estimated.
+    """
+
+    image: str
+    camera: str
+    oriented: bool
+    n: int
+    rejected: int
+    measured: int
+    rms_x_px: float | None
+    rms_y_px: float | None
+    time_s: float | None
+    x_scale: float | None = None
+    u_x_scale: float | None = None
+    x_shift_px: float | None = None
+    u_x_shift_px: float | None = None
+
+
+@dataclass(frozen=True)
+class DistortionCurves:
+    """Distortion against the radius, in the unit of the image plane and in px along x, shape (radii,); None where it was not made.
+
+    Parameters
+    ----------
+    unit : str
+    radius, radius_px : ndarray
+    radial, u_radial, radial_px, u_radial_px : ndarray
+    balanced, u_balanced, balanced_px, u_balanced_px : ndarray
+        The same lens with the principal distance ``balanced_c``.
+    tangential, u_tangential, tangential_px, u_tangential_px : ndarray
+        √(p1² + p2²) r².
+    balanced_c, u_balanced_c : float
+    """
+
+    unit: str
+    radius: np.ndarray
+    radius_px: np.ndarray | None = _if_made()
+    radial: np.ndarray | None = _if_made()
+    u_radial: np.ndarray | None = _if_made()
+    radial_px: np.ndarray | None = _if_made()
+    u_radial_px: np.ndarray | None = _if_made()
+    balanced: np.ndarray | None = _if_made()
+    u_balanced: np.ndarray | None = _if_made()
+    balanced_px: np.ndarray | None = _if_made()
+    u_balanced_px: np.ndarray | None = _if_made()
+    tangential: np.ndarray | None = _if_made()
+    u_tangential: np.ndarray | None = _if_made()
+    tangential_px: np.ndarray | None = _if_made()
+    u_tangential_px: np.ndarray | None = _if_made()
+    balanced_c: float | None = _if_made()
+    u_balanced_c: float | None = _if_made()
+
+    @property
+    def radial_curve(self) -> Curve | None:
+        """The radial curve in one piece."""
+        return None if self.radial is None else Curve(self.radial, self.u_radial, self.radial_px, self.u_radial_px)
+
+    @property
+    def balanced_curve(self) -> Curve | None:
+        """The balanced curve in one piece."""
+        return None if self.balanced is None else Curve(self.balanced, self.u_balanced, self.balanced_px, self.u_balanced_px)
+
+    @property
+    def tangential_curve(self) -> Curve | None:
+        """The tangential curve in one piece."""
+        return None if self.tangential is None else Curve(self.tangential, self.u_tangential, self.tangential_px, self.u_tangential_px)
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Values and standard uncertainties, shape (radii,), in the unit of the image plane and in px; None: not made."""
+
+    value: np.ndarray
+    u: np.ndarray | None
+    value_px: np.ndarray | None
+    u_px: np.ndarray | None
+
+
+@dataclass(frozen=True)
+class ProjectionMap:
+    """Standard uncertainty of an image coordinate with which the calibration tells where a direction is imaged.
+
+    Parameters
+    ----------
+    x_px : ndarray, shape (cols,)
+    y_px : ndarray, shape (rows,)
+    u_px, u_raw_px : ndarray, shape (rows, cols)
+        Without and with what a rotation of the camera would take up; NaN where the distortion has no inverse.
+    """
+
+    x_px: np.ndarray
+    y_px: np.ndarray
+    u_px: np.ndarray
+    u_raw_px: np.ndarray
+
+
+@dataclass(frozen=True)
+class AxisComponent:
+    """Standard deviation of x or of y by variance components.
+
+    Parameters
+    ----------
+    sigma_px, u_sigma_px : float
+        rms over the image points.
+    given_px : float
+        As given before.
+    beyond_px, u_beyond_px : float or None
+        Added to what was given; None where a factor was estimated instead.
+    factor, dof : float
+    estimated : bool
+        False: too little redundancy, the size is that of all image points together.
+    """
+
+    sigma_px: float
+    u_sigma_px: float
+    given_px: float
+    beyond_px: float | None
+    u_beyond_px: float | None
+    factor: float
+    dof: float
+    estimated: bool
+
+
+@dataclass(frozen=True)
+class CameraComponents:
+    """Variance components of a camera.
+
+    Parameters
+    ----------
+    iterations : int
+    common : bool
+        Whether x and y have one size,
+    by_axis : bool
+        though two were asked for.
+    x, y : AxisComponent
+    """
+
+    iterations: int
+    common: bool
+    by_axis: bool
+    x: AxisComponent = _joined("x")
+    y: AxisComponent = _joined("y")
+
+    @property
+    def axes(self) -> dict[Axis, AxisComponent]:
+        """Both by name."""
+        return {"x": self.x, "y": self.y}
+
+
+@dataclass(frozen=True)
+class HeldRms:
+    """rms of residuals of a coordinate in the fit and in images left out of it, and the median size of the latter."""
+
+    fit_rms_px: float
+    left_out_rms_px: float
+    left_out_median_px: float
+
+
+@dataclass(frozen=True)
+class HoldOut:
+    """Images left out of the fit.
+
+    Parameters
+    ----------
+    fixed, free : HeldRms or None
+        With the points as given, and with them free.
+    folds : int
+    p : float or None
+        How often chance alone lets the left-out rms fall so much from one to the other; None without both.
+    text : str
+    expected_median_px : float or None
+        What noise alone would show, where images left out fit much worse.
+    """
+
+    fixed: HeldRms | None
+    free: HeldRms | None
+    folds: int
+    p: float | None
+    text: str
+    expected_median_px: float | None = _if_made()
+
+    @property
+    def parts(self) -> dict[str, HeldRms]:
+        """Those of ``fixed`` and ``free`` that were made."""
+        return {name: part for name, part in (("fixed", self.fixed), ("free", self.free)) if part is not None}
+
+
+@dataclass(frozen=True)
+class Moved:
+    """How far freeing the points of a field moved principal point and distance (free less fixed), with the formal uncertainties of the
+    fixed solution (None: not estimated)."""
+
+    moved_c_px: float
+    u_c_px: float | None
+    moved_xp_px: float
+    u_xp_px: float | None
+    moved_yp_px: float
+    u_yp_px: float | None
+
+    @property
+    def by_name(self) -> dict[str, tuple[float, float | None]]:
+        """Move and formal u of each parameter."""
+        return {"xp": (self.moved_xp_px, self.u_xp_px), "yp": (self.moved_yp_px, self.u_yp_px), "c": (self.moved_c_px, self.u_c_px)}
+
+
+@dataclass(frozen=True)
+class FieldPoints:
+    """Points of a field after the best similarity.
+
+    Parameters
+    ----------
+    names : tuple of str
+    xyz : ndarray, shape (points, 3)
+        Nominal; NaN: not given.
+    axes : ndarray, shape (3, 3)
+        Rows: directions of dx, dy, dz; of a plane, z is its normal.
+    dx, u_dx, dy, u_dy, dz, u_dz : ndarray, shape (points,)
+        Deviations.
+    """
+
+    names: tuple[str, ...]
+    xyz: np.ndarray
+    axes: np.ndarray
+    dx: np.ndarray
+    u_dx: np.ndarray
+    dy: np.ndarray
+    u_dy: np.ndarray
+    dz: np.ndarray
+    u_dz: np.ndarray
+
+
+@dataclass(frozen=True)
+class FieldDeviations:
+    """How far the points of a field lie from their nominal places.
+
+    Parameters
+    ----------
+    shape : {"plane", "volume"}
+    unit : str
+    p_flat : float or None
+        Of a plane: how often chance makes such deviations from the best plane.
+    rms_in_plane, peak_in_plane : float or None
+    rms, peak : float
+        Of the deviations from the best plane; of a volume from the nominal coordinates, in 3-D.
+    u : float
+        rms uncertainty of these deviations.
+    points : FieldPoints
+    """
+
+    shape: str
+    unit: str
+    p_flat: float | None
+    rms_in_plane: float | None
+    peak_in_plane: float | None
+    rms: float
+    peak: float
+    u: float
+    points: FieldPoints
+
+
+@dataclass(frozen=True)
+class FieldComparison:
+    """A field with its points fixed and free.
+
+    Parameters
+    ----------
+    f, dof, p
+        F-test of the given coordinates.
+    deviations : FieldDeviations
+    first : Moved
+        Of the first camera.
+    cameras : dict
+        `Moved` of each.
+    """
+
+    f: float
+    dof: tuple[int, int]
+    p: float
+    deviations: FieldDeviations = _joined()
+    first: Moved = _joined()
+    cameras: Mapping[str, Moved] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class FieldTest:
+    """Whether a test field is what it is said to be.
+
+    Parameters
+    ----------
+    verdict : {"fixed", "free"}
+    compared : FieldComparison or None
+        None where free points could not be tried or judged.
+    text : str
+    """
+
+    verdict: str
+    compared: FieldComparison | None = _joined()
+    text: str = ""
+
+
+@dataclass(frozen=True)
+class ByImage:
+    """A value for each image, of sum 0, with its uncertainty; ``alone``: the one image that differs from all others, if it is one."""
+
+    images: tuple[str, ...]
+    values: np.ndarray
+    u: np.ndarray
+    alone: str | None
+
+
+@dataclass(frozen=True)
+class Outstanding:
+    """Images that stand out by their residuals.
+
+    Parameters
+    ----------
+    images_out : tuple of str
+    rms_px : list of (float, float)
+        In x and y.
+    rejected : list of int
+        Number of their image points that were rejected.
+    times_median : list of float
+        How their weighted residuals compare with the median of the images, rejected ones counted.
+    """
+
+    images_out: tuple[str, ...]
+    rms_px: list[list[float]]
+    rejected: list[int]
+    times_median: list[float]
+
+
+@dataclass(frozen=True)
+class Pattern:
+    """A pattern that was looked for in the residuals.
+
+    Parameters
+    ----------
+    name, camera : str
+    amplitude_px : float
+    u_px : float or None
+        None where the amplitude is an rms over several terms.
+    p : float
+    period_px : float or None
+        Of waves.
+    by_image : ByImage or None
+    outstanding : Outstanding or None
+    level : float
+        At which the pattern is held significant.
+    significant : bool
+    source : str
+        Of the catalogue of error sources; empty: none.
+    text, advice : str
+    """
+
+    name: str
+    camera: str
+    amplitude_px: float
+    u_px: float | None
+    p: float
+    period_px: float | None = _if_made()
+    by_image: ByImage | None = _joined()
+    outstanding: Outstanding | None = _joined()
+    level: float = np.nan
+    significant: bool = False
+    source: str = ""
+    text: str = ""
+    advice: str = ""
+
+    @property
+    def alone(self) -> str | None:
+        """The one image that differs from all others."""
+        return None if self.by_image is None else self.by_image.alone
+
+
+@dataclass(frozen=True)
+class ResidualGrid:
+    """Correction grid for what no parameter explains; bilinear between its nodes.
+
+    Parameters
+    ----------
+    x_px : ndarray, shape (cols,)
+    y_px : ndarray, shape (rows,)
+        Nodes.
+    dx_px, dy_px : ndarray, shape (rows, cols)
+        Measured less computed: subtract them from what is measured.
+    u_px : ndarray, shape (rows, cols)
+        Of a value.
+    n : ndarray of int, shape (rows, cols)
+        Image points about each node.
+    rms_without_px, rms_with_px : float
+        Of a coordinate, in images left out.
+    p : float
+        Of the fall from one to the other.
+    """
+
+    x_px: np.ndarray
+    y_px: np.ndarray
+    dx_px: np.ndarray
+    dy_px: np.ndarray
+    u_px: np.ndarray
+    n: np.ndarray
+    rms_without_px: float
+    rms_with_px: float
+    p: float
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """What took part, and what was given.
+
+    Parameters
+    ----------
+    images : int
+        Oriented.
+    points : int
+        Determined, with image points used.
+    observations : int
+        Image points used.
+    images_given, points_given, observations_given : int
+        All that was measured.
+    """
+
+    images: int
+    points: int
+    observations: int
+    images_given: int
+    points_given: int
+    observations_given: int
+
+    @property
+    def pairs(self) -> tuple[tuple[int, int], ...]:
+        """What took part with what was given: of images, points and image points."""
+        given = (self.images_given, self.points_given, self.observations_given)
+        return tuple(zip((self.images, self.points, self.observations), given, strict=True))
+
+
+@dataclass(frozen=True)
+class BarRecord:
+    """A scale bar: known length, u as it was stated, known less computed, redundancy number."""
+
+    name: str
+    length: float
+    u: float
+    residual: float
+    redundancy: float
+
+
+@dataclass(frozen=True)
+class NetworkRecord:
+    """What the network is made of.
+
+    Parameters
+    ----------
+    sizes : Sizes
+    redundancy : int
+    sigma0 : float
+    rays_per_point : float
+        Mean; with
+    rays_least, rays_most : int
+    datum, unit : str
+    scale_bars : tuple of BarRecord
+    """
+
+    sizes: Sizes = _joined()
+    redundancy: int = 0
+    sigma0: float = np.nan
+    rays_per_point: float = np.nan
+    rays_least: int = 0
+    rays_most: int = 0
+    datum: str = ""
+    unit: str = ""
+    scale_bars: tuple[BarRecord, ...] = ()
+
+
+@dataclass(frozen=True)
+class Ratio:
+    """A known value's residual over its stated uncertainty."""
+
+    name: str
+    ratio: float
+
+
+@dataclass(frozen=True)
+class KnownGroup:
+    """Variance factor of bars or control points (squared errors over squared stated uncertainties).
+
+    Parameters
+    ----------
+    factor, dof : float
+    p : float
+        How surely it is not 1: two-sided F-test against the image coordinates.
+    n : int
+    largest : tuple of Ratio
+    """
+
+    factor: float
+    dof: float
+    p: float
+    n: int
+    largest: tuple[Ratio, ...]
+
+
+@dataclass(frozen=True)
+class Contradicted:
+    """A known value that the network contradicts.
+
+    Parameters
+    ----------
+    name : str
+    residual, error : float
+        Known less computed; estimated error.
+    statistic, critical : float
+        Of a normal test.
+    left_out : bool
+        False: it weighs less now.
+    rivals : tuple of str, optional
+        Those of which one may be wrong instead; None where none was looked for.
+    axes : tuple of int
+        Of a control point: those that were left out with the one named.
+    """
+
+    name: str
+    residual: float
+    error: float
+    statistic: float
+    critical: float
+    left_out: bool = False
+    rivals: tuple[str, ...] | None = _if_made()
+    axes: tuple[int, ...] = field(default=(), metadata={"internal": True})
+
+
+@dataclass(frozen=True)
+class ContradictedControl(Contradicted):
+    """The same of a control point; ``swapped_with``: the other one with which it seems to have exchanged its name."""
+
+    swapped_with: str | None = None
+
+
+@dataclass(frozen=True)
+class KnownBars:
+    """Scale bars against the network: variance factor (None without redundancy), those contradicted, and the stated uncertainties, by
+    name, of those that weigh less now."""
+
+    group: KnownGroup | None = None
+    gross: tuple[Contradicted, ...] = ()
+    raised: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class KnownControl:
+    """Weighted control points likewise; ``understated``: by how much their uncertainties were raised, or None."""
+
+    group: KnownGroup | None = None
+    gross: tuple[ContradictedControl, ...] = ()
+    raised: Mapping[str, float] = field(default_factory=dict)
+    understated: float | None = None
+
+
+@dataclass(frozen=True)
+class FixedPoints:
+    """Whether the fixed points of a network with free ones beside them fit it together.
+
+    Parameters
+    ----------
+    n : int
+    f : float
+    dof : (int, int)
+    p : float
+    miss : float
+        Standard deviation of a coordinate that would explain it.
+    """
+
+    n: int
+    f: float
+    dof: tuple[int, int]
+    p: float
+    miss: float
+
+
+@dataclass(frozen=True)
+class KnownRecord:
+    """Bars and control points against the network; ``untested``: why nothing of this could be tested, or None."""
+
+    scale_bars: KnownBars = field(default_factory=KnownBars)
+    control_points: KnownControl = field(default_factory=KnownControl)
+    untested: str | None = None
+    fixed_points: FixedPoints | None = None
+
+
+@dataclass(frozen=True)
+class EccentricityRecord:
+    """How many image points were corrected for eccentricity, by how much at most, and how large it may be where it could not be."""
+
+    corrected: int
+    largest_px: float
+    possible_px: float
+
+
+@dataclass(frozen=True)
+class CheckedPoint:
+    """A check point; X, Y, Z each, NaN: not known.
+
+    Parameters
+    ----------
+    name : str
+    given, u_given, found, u_found : ndarray, shape (3,)
+        Found in the stated datum.
+    difference, u_difference, ratio : ndarray, shape (3,)
+        Given less found, and that over its uncertainty.
+    images : int
+    """
+
+    name: str
+    given: np.ndarray
+    u_given: np.ndarray
+    found: np.ndarray
+    u_found: np.ndarray
+    difference: np.ndarray
+    u_difference: np.ndarray
+    ratio: np.ndarray
+    images: int
+
+
+@dataclass(frozen=True)
+class WorstPoint:
+    """The coordinate of a check point with the largest ratio, and the critical value of that."""
+
+    name: str
+    axis: str
+    difference: float
+    ratio: float
+    critical: float
+
+
+@dataclass(frozen=True)
+class CheckRecord:
+    """Check points beside an adjustment.
+
+    Parameters
+    ----------
+    unit : str
+    datum_parameters : int
+        How many were fitted to the check points.
+    n : int
+        Coordinates.
+    dof : int
+    level : float
+        Of the tests.
+    rms, expected_rms : tuple of float
+        Of X, Y, Z.
+    chi2, p : float or None
+        Of all together (of an F-distribution: the image coordinates tell the variance); None where they tell nothing.
+    worst : WorstPoint or None
+    text : str
+    points : tuple of CheckedPoint
+    """
+
+    unit: str
+    datum_parameters: int
+    n: int
+    dof: int
+    level: float
+    rms: tuple[float, ...]
+    expected_rms: tuple[float, ...]
+    chi2: float | None
+    p: float | None
+    worst: WorstPoint | None
+    text: str
+    points: tuple[CheckedPoint, ...]
+
+
+@dataclass(frozen=True)
+class Tests:
+    """Records of the tests of a calibration; None: not made. Mappings are by the names of the cameras.
+
+    Parameters
+    ----------
+    field : FieldTest
+    hold_out : HoldOut
+    parameters : tuple of ParameterTest
+    parameter_groups : tuple of GroupTest
+    vision, correlations, residuals, f_test, curves, projection, variance_components, residual_grid : mapping
+        Of `Vision`, `Correlations`, `CameraResiduals`, `FTest`, `DistortionCurves`, `ProjectionMap`, `CameraComponents`, `ResidualGrid`.
+    correlations_with_poses : tuple of PoseCorrelation
+    gross_errors : tuple of GrossError
+        Largest statistic first.
+    patterns : tuple of Pattern
+    images : tuple of ImageRecord
+    network : NetworkRecord
+    known : KnownRecord
+    eccentricity : EccentricityRecord
+    check_points : CheckRecord
+    """
+
+    __test__ = False  # no class of tests for pytest
+
+    field: FieldTest | None = _if_made()
+    hold_out: HoldOut | None = _if_made()
+    parameters: tuple[ParameterTest, ...] | None = _if_made()
+    parameter_groups: tuple[GroupTest, ...] | None = _if_made()
+    vision: Mapping[str, Vision] | None = _if_made()
+    correlations: Mapping[str, Correlations] | None = _if_made()
+    correlations_with_poses: tuple[PoseCorrelation, ...] | None = _if_made()
+    residuals: Mapping[str, CameraResiduals] | None = _if_made()
+    f_test: Mapping[str, FTest] | None = _if_made()
+    gross_errors: tuple[GrossError, ...] | None = _if_made()
+    patterns: tuple[Pattern, ...] | None = _if_made()
+    images: tuple[ImageRecord, ...] | None = _if_made()
+    curves: Mapping[str, DistortionCurves] | None = _if_made()
+    projection: Mapping[str, ProjectionMap] | None = _if_made()
+    network: NetworkRecord | None = _if_made()
+    known: KnownRecord | None = _if_made()
+    variance_components: Mapping[str, CameraComponents] | None = _if_made()
+    eccentricity: EccentricityRecord | None = _if_made()
+    residual_grid: Mapping[str, ResidualGrid] | None = _if_made()
+    check_points: CheckRecord | None = _if_made()
+
+    @property
+    def made(self) -> bool:
+        """Whether any test was made."""
+        return any(getattr(self, one.name) is not None for one in fields(self))
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What a calibration hands to its user, its report and its files.
 
     Parameters
     ----------
     adjustment : Adjustment
-    alpha : float
-        Level at which image points were tested for gross errors.
-    gross_known : mapping
-        Bars and control points that were contradicted.
-    rejected : Rejected, optional
-        Why image points were rejected.
-    a_priori : bool
-        Whether the covariances of the adjustment are without sigma0².
+        The one that stands.
+    findings : tuple of Finding
+        What the reader must know, most important first.
+    tests : Tests
+    grids : mapping
+        Of `ResidualGrid`, by camera name.
+    provenance : mapping
+        Inputs with their hashes, options, version.
     """
-    from pixmetry.calibrate.bundle.bundle import adjust
-    from pixmetry.calibrate.checks import curves, quality
-    from pixmetry.calibrate.checks.patterns import patterns_without_bad_images
-    from pixmetry.calibrate.checks.snooping import gross_error_records
 
-    oriented = dict(zip(adjustment.network.images, np.isfinite(adjustment.state.position).all(axis=1), strict=True))
-    gross = [record for record in gross_error_records(adjustment, alpha, rejected) if oriented[record["image"]]]
-    return {
-        "parameters": quality.parameter_records(adjustment),
-        "parameter_groups": quality.group_records(adjustment),
-        "vision": quality.vision_records(adjustment),
-        "correlations": quality.correlation_records(adjustment),
-        "correlations_with_poses": quality.pose_correlations(adjustment),
-        "residuals": quality.residual_records(adjustment),
-        "f_test": quality.f_test_records(adjustment),
-        "gross_errors": gross,
-        "patterns": patterns_without_bad_images(adjustment, adjust),
-        "images": quality.image_records(adjustment, Counter(record["image"] for record in gross)),
-        "curves": curves.distortion_curves(adjustment),
-        "projection": curves.projection_maps(adjustment),
-        "network": network_record(adjustment, _stated(gross_known, "scale_bars"), a_priori=a_priori),
-        "known": {
-            **known_record(adjustment, gross_known, a_priori=a_priori),
-            "fixed_points": fixed_record(adjustment, adjust),
-        },
-    }
-
-
-def add_noise(residuals: dict[str, dict[str, Any]], adjustment: Adjustment, given: Network) -> None:
-    """Add ``noise_x_px``, ``noise_y_px``: rms of residuals by the covariance given alone, √(Σ r s² / n), None where it was a guess;
-    and ``systematic_x_px``, ``systematic_y_px``: see `geometry.systematic_rest`."""
-    for k, camera in enumerate(given.cameras):
-        rows = adjustment.used & (given.camera_of[given.image] == k)
-        noise: list[float | None] = [None, None]
-        if given.covariance_known and rows.any():
-            noise = np.sqrt(np.mean(adjustment.redundancy[rows] * given.covariance_px2[rows][:, [0, 2]], axis=0)).tolist()
-        rest = systematic_rest(adjustment, k)
-        residuals[camera.name] |= {"noise_x_px": noise[0], "noise_y_px": noise[1], "systematic_x_px": rest[0], "systematic_y_px": rest[1]}
-
-
-def sizes(adjustment: Adjustment) -> dict[str, int]:
-    """What took part, and what was given: ``images`` (oriented), ``points`` (determined, with image points used), ``observations`` (image
-    points used); ``images_given``, ``points_given``, ``observations_given`` (all that was measured)."""
-    network, state = adjustment.network, adjustment.state
-    posed = np.isfinite(state.position).all(axis=1)
-    seen = np.unique(network.point[adjustment.used])
-    return {
-        "images": int(posed[np.unique(network.image)].sum()),
-        "points": int(np.isfinite(state.xyz[seen]).all(axis=1).sum()),
-        "observations": int(adjustment.used.sum()),
-        "images_given": len(np.unique(network.image)),
-        "points_given": len(np.unique(network.point)),
-        "observations_given": len(network),
-    }
-
-
-def network_record(adjustment: Adjustment, stated: Mapping[str, float] | None = None, *, a_priori: bool = False) -> dict[str, Any]:
-    """The `sizes` of the network, ``redundancy``, ``rays_per_point`` (mean, with ``rays_least`` and ``rays_most``), ``datum``, ``unit``,
-    ``sigma0``, ``scale_bars`` (with the uncertainty ``stated``, where it was raised)."""
-    network, used = adjustment.network, adjustment.used
-    rays = np.bincount(network.point[used], minlength=len(network.points))
-    rays = rays[rays > 0]
-    bars = bar_residuals(adjustment, a_priori=a_priori)
-    return {
-        **sizes(adjustment),
-        "redundancy": adjustment.dof,
-        "sigma0": adjustment.sigma0,
-        "rays_per_point": float(rays.mean()),
-        "rays_least": int(rays.min()),
-        "rays_most": int(rays.max()),
-        "datum": adjustment.datum,
-        "unit": network.unit,
-        "scale_bars": [
-            {
-                "name": bars.name[i],
-                "length": float(bars.value[i]),
-                "u": (stated or {}).get(bars.name[i], float(bars.u[i])),
-                "residual": float(bars.residual[i]),
-                "redundancy": float(bars.redundancy[i]),
-            }
-            for i in range(len(bars))
-        ],
-    }
-
-
-def known_record(adjustment: Adjustment, gross: Mapping[str, list[dict[str, Any]]], *, a_priori: bool = False) -> dict[str, Any]:
-    """Bars and weighted control points against the network: for each ``group`` (variance factor, None without redundancy), ``gross`` and
-    ``raised`` (stated uncertainties, by name, of those that weigh less now); of control points also ``understated``: by how much their
-    uncertainties were raised, or None. ``untested``: why nothing of this could be tested, or None."""
-    groups = {"scale_bars": bar_residuals, "control_points": control_residuals}
-    known = {name: residuals(adjustment, a_priori=a_priori) for name, residuals in groups.items()}
-    record: dict[str, Any] = {
-        name: {"group": group_record(adjustment, known[name]), "gross": _last(gross[name], adjustment), "raised": _stated(gross, name)}
-        for name in groups
-    }
-    control = record["control_points"]
-    control["gross"] = [_found(adjustment, one) for one in control["gross"]]
-    control["understated"] = next((r["factor"] for r in gross.get("understated", ())), None)
-    record["untested"] = next((r["why"] for r in gross.get("untested", ())), None)
-    return record
-
-
-def _stated(gross: Mapping[str, list[dict[str, Any]]], kind: str) -> dict[str, float]:
-    """Uncertainties, as they were stated, of what weighs less now."""
-    return {r["name"]: r["u"] for r in reversed(gross.get("raised", ())) if r["kind"] == kind}
-
-
-def _last(records: list[dict[str, Any]], adjustment: Adjustment) -> list[dict[str, Any]]:
-    """Records without those of what weighed less first and was left out later."""
-    network, out = adjustment.network, []
-    left = {f"{network.points[k]} {'XYZ'[axis]}" for k, axis in np.argwhere(np.isinf(network.u_xyz))}
-    for i, record in enumerate(records):
-        later = {one["name"] for one in records[i + 1 :] if one["left_out"]}
-        if record["left_out"] or record["name"] not in left | later:
-            out.append(record)
-    return out
-
-
-def _found(adjustment: Adjustment, record: dict[str, Any]) -> dict[str, Any]:
-    """The record of a control point that was left out, with its error against where it was found without it, along the axis of those left
-    out where it is largest, and ``swapped_with``."""
-    record = dict(record)
-    axes = record.pop("axes", None)
-    network, xyz = adjustment.network, adjustment.state.xyz
-    names = {name: k for k, name in enumerate(network.points)}
-    name, _, axis = record["name"].rpartition(" ")
-    k = names.get(record["name"], names.get(name))
-    if k is None or not record["left_out"] or not np.isfinite(xyz[k]).all():
-        return {**record, "swapped_with": None}
-    swapped, off = _swapped_with(adjustment, k), (network.xyz - xyz)[k]
-    if record["name"] in names:
-        return {**record, "swapped_with": swapped}
-    worst = max(axes or ["XYZ".index(axis)], key=lambda axis: abs(off[axis]))
-    return {**record, "name": f"{name} {'XYZ'[worst]}", "error": float(off[worst]), "swapped_with": swapped}
-
-
-def _swapped_with(adjustment: Adjustment, k: int) -> str | None:
-    """The other control point with which one has exchanged its place: each was found where the other was said to be."""
-    given, found = adjustment.network.xyz, adjustment.state.xyz
-    near = SWAPPED * np.linalg.norm(given - given[k], axis=1)
-    with np.errstate(invalid="ignore"):
-        there = (np.linalg.norm(given - found[k], axis=1) < near) & (np.linalg.norm(found - given[k], axis=1) < near)
-    return adjustment.network.points[int(np.argmax(there))] if there.any() else None
+    adjustment: Adjustment
+    findings: tuple[Finding, ...] = ()
+    tests: Tests = field(default_factory=Tests)
+    grids: Mapping[str, ResidualGrid] = field(default_factory=dict)
+    provenance: Mapping[str, Any] = field(default_factory=dict)

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
 from pixmetry.calibrate.bundle.model import NAMES, CameraModel
-from pixmetry.core.finding import Finding
 
 SCALE, SHIFT = 6, 7  # places of the per-image x-scale and x-shift behind the six of the pose
 PER_IMAGE = 8
@@ -232,30 +229,3 @@ class Adjustment:
         own = {f"{self.network.cameras[index].name}:{name}": name for name in NAMES}  # an image or a point may have the camera's name
         rows = [i for i, name in enumerate(self.free_columns) if name in own]
         return tuple(own[self.free_columns[i]] for i in rows), self.covariance[np.ix_(rows, rows)]
-
-
-@dataclass(frozen=True)
-class Calibration:
-    """What a calibration hands to its user, its report and its files.
-
-    Parameters
-    ----------
-    adjustment : Adjustment
-        The one that stands.
-    findings : tuple of Finding
-        What the reader must know, most important first.
-    tests : mapping
-        Plain records by name: ``parameters``, ``vision``, ``correlations``, ``residuals``, ``f_test``, ``variance_components``,
-        ``gross_errors``, ``hold_out``, ``field``, ``patterns``, ``images``, ``curves``, ``projection``, ``network``, ``known`` …; see
-        `pixmetry.calibrate.records` and the modules that it calls.
-    grids : mapping
-        Residual correction grids by camera name.
-    provenance : mapping
-        Inputs with their hashes, options, version.
-    """
-
-    adjustment: Adjustment
-    findings: tuple[Finding, ...] = ()
-    tests: Mapping[str, Any] = field(default_factory=dict)
-    grids: Mapping[str, Any] = field(default_factory=dict)
-    provenance: Mapping[str, Any] = field(default_factory=dict)

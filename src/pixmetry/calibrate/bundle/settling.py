@@ -5,14 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 
 from pixmetry.calibrate.bundle.eccentric import Eccentricity, eccentricity, without_eccentricity
 from pixmetry.calibrate.bundle.network import Adjustment, Network, State
 from pixmetry.calibrate.bundle.options import Options
+from pixmetry.calibrate.checks.known_checks import KnownFaults, raised
 from pixmetry.calibrate.checks.snooping import Rejected
+from pixmetry.calibrate.records import CameraComponents
 
 Progress = Callable[[str], None]
 LOOPS = 12
@@ -33,9 +34,9 @@ class Settled:
         Of the corrected image coordinates.
     shift : Eccentricity
     components : dict
-        Records of the variance components; empty if they were not estimated.
-    gross_known : dict
-        Bars and control points that were left out.
+        Variance components by camera; empty if they were not estimated.
+    known_faults : KnownFaults
+        Bars and control points that were left out or weigh less.
     given_px2 : ndarray, shape (n, 3)
         Covariances of the image coordinates before they were weighted.
     rejected : Rejected
@@ -45,8 +46,8 @@ class Settled:
     measured: Network
     adjustment: Adjustment
     shift: Eccentricity
-    components: dict[str, Any]
-    gross_known: dict[str, Any]
+    components: dict[str, CameraComponents]
+    known_faults: KnownFaults
     given_px2: np.ndarray
     rejected: Rejected
 
@@ -71,7 +72,6 @@ def settle(measured: Network, state: State, options: Options, say: Progress, bef
     before : Settled, optional
         The same image coordinates, settled already with other points: where to go on.
     """
-    from pixmetry.calibrate.checks.known_checks import raised
     from pixmetry.calibrate.checks.lost_control import lost_records, set_free, where_seen, wrong_known
 
     given = measured
@@ -79,12 +79,12 @@ def settle(measured: Network, state: State, options: Options, say: Progress, bef
     given_px2 = measured.covariance_px2 if before is None else before.given_px2
     rejected = Rejected.none(len(measured)) if before is None else before.rejected
     freed = np.zeros(0, int)
-    components: dict[str, Any] = {}
+    components: dict[str, CameraComponents] = {}
     used = np.ones(len(measured), bool) if before is None else before.adjustment.used
     shift = _shift(measured, state, options)
     if before is None:
         measured = _first_weights(measured, shift, state, options)
-    measured, state, used, loss, gross_known = _checked_known(measured, shift, state, used, loss, options, say, rejected)
+    measured, state, used, loss, faults = _checked_known(measured, shift, state, used, loss, options, say, rejected)
     for loop in range(1, LOOPS + 1):
         say(f"adjusting, round {loop}")
         adjustment = _without_gross_errors(without_eccentricity(measured, shift), state, used, loss, options, rejected)
@@ -102,13 +102,9 @@ def settle(measured: Network, state: State, options: Options, say: Progress, bef
         if still:
             break
         shift = again
-    freed_records = lost_records(given, adjustment, freed)
-    gross_known = {
-        **gross_known,
-        "control_points": [*gross_known["control_points"], *freed_records],
-        "raised": raised(given, measured),
-    }
-    return Settled(measured, adjustment, shift, components, gross_known, given_px2, rejected)
+    faults += KnownFaults(control_points=lost_records(given, adjustment, freed))
+    faults = replace(faults, raised=raised(given, measured))
+    return Settled(measured, adjustment, shift, components, faults, given_px2, rejected)
 
 
 def _as_given(network: Network, options: Options) -> bool:
@@ -150,11 +146,10 @@ def _checked_known(
     options: Options,
     say: Progress,
     rejected: Rejected,
-) -> tuple[Network, State, np.ndarray, str, dict[str, Any]]:
+) -> tuple[Network, State, np.ndarray, str, KnownFaults]:
     """The network without bars and control points that it contradicts, and what its image points without them are worth."""
     from pixmetry.calibrate.bundle.loosened import first_that_stands, loosened, with_the_rest
     from pixmetry.calibrate.checks.known_checks import (
-        CheckedKnown,
         check_known,
         few_held,
         fixed_again,
@@ -166,27 +161,26 @@ def _checked_known(
     )
 
     if not (options.snoop and has_known(measured)):
-        return measured, state, used, loss, CheckedKnown(measured).gross
+        return measured, state, used, loss, KnownFaults()
     measured, absurd = without_absurd_control(measured, state)
     say("testing scale bars and control points")
     alone = replace(options, a_priori=False)
     networks = loosened(without_eccentricity(measured, shift), loose_coordinates(measured))
     clean, why = first_that_stands(networks, lambda network: _without_gross_errors(network, state, used, loss, alone, rejected))
     if clean is None:
-        return measured, state, used, loss, {**CheckedKnown(measured).gross, "control_points": absurd, "untested": [{"why": why}]}
+        return measured, state, used, loss, KnownFaults(control_points=absurd, untested=why)
     weighted = weighted_instead(measured, clean)
     begin, used = with_the_rest(weighted, clean, state, used, rejected)
     near, begin, far = in_frame_of_control(weighted, begin)
     check = partial(check_known, without_eccentricity(near, shift), clean, adjust_with(alone), used=used, held=few_held(measured))
     tried, why = first_that_stands((begin, state), lambda start: check(state=start))
     if tried is None:
-        return measured, state, used, loss, {**CheckedKnown(measured).gross, "control_points": absurd, "untested": [{"why": why}]}
+        return measured, state, used, loss, KnownFaults(control_points=absurd, untested=why)
     checked, state = tried
     measured = replace(measured, bars=checked.network.bars, u_xyz=fixed_again(checked.network, measured, weighted))
     if not _as_given(measured, options):
         measured = replace(measured, covariance_px2=checked.network.covariance_px2)
-    gross = {**checked.gross, "control_points": [*absurd, *far, *checked.gross["control_points"]]}
-    return measured, state, used, "none", gross
+    return measured, state, used, "none", KnownFaults(control_points=absurd + far) + checked.faults
 
 
 def _shift(measured: Network, state: State, options: Options) -> Eccentricity:
@@ -206,8 +200,8 @@ def _without_gross_errors(network: Network, state: State, used: np.ndarray, loss
 
 
 def _weighted(
-    adjustment: Adjustment, given_px2: np.ndarray, options: Options, before: dict[str, Any]
-) -> tuple[Adjustment, np.ndarray, dict[str, Any]]:
+    adjustment: Adjustment, given_px2: np.ndarray, options: Options, before: dict[str, CameraComponents]
+) -> tuple[Adjustment, np.ndarray, dict[str, CameraComponents]]:
     """The adjustment with estimated weights, by how much they changed, and records, whose iterations go on from those before.
 
     If weights are not to be estimated, all image coordinates together still get a factor, for bars beside them, or where they are guessed.
@@ -218,7 +212,7 @@ def _weighted(
         return adjustment, np.ones(1), {}
     found = estimate_components(adjustment, adjust_with(options), by_axis=options.variance_components, given_px2=given_px2)
     records = found.records() if options.variance_components or adjustment.network.covariance_known else {}
-    for name, record in records.items():
-        record["iterations"] += before.get(name, {"iterations": 0})["iterations"]
+    so_far = {name: part.iterations for name, part in before.items()}
+    records = {name: replace(part, iterations=part.iterations + so_far.get(name, 0)) for name, part in records.items()}
     step = found.adjustment.network.covariance_px2[:, [0, 2]] / adjustment.network.covariance_px2[:, [0, 2]]
     return found.adjustment, step, records

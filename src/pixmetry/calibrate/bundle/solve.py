@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import asdict, replace
-from typing import Any
 
 import numpy as np
 
 from pixmetry.calibrate.bundle.model import NAMES
-from pixmetry.calibrate.bundle.network import PER_IMAGE_NAMES, Adjustment, Calibration, Network, State
+from pixmetry.calibrate.bundle.network import PER_IMAGE_NAMES, Adjustment, Network, State
 from pixmetry.calibrate.bundle.options import Options
 from pixmetry.calibrate.bundle.settling import Progress, Settled, adjust_with, settle
+from pixmetry.calibrate.records import Calibration, EccentricityRecord, FieldTest, HoldOut, Tests
 from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.core.finding import Finding
 from pixmetry.core.threads import single_threaded_blas
@@ -58,17 +58,14 @@ def calibrate_network(
     say("checking the network")
     findings = list(check_network(measured))
     settled = _from_start(measured, start, options, say)
-    settled, tests, more = _checked_field(settled, options, say)
+    settled, field, held, more = _checked_field(settled, options, say)
     say("testing the result")
-    tests |= _records(settled, network, options)
-    if "hold_out" in tests:
-        tests["hold_out"] = _with_expected(tests["hold_out"], settled)
+    tests = replace(_tests(settled, network, options), field=field, hold_out=_with_expected(held, settled))
     if options.residual_grid:
-        tests["residual_grid"] = residual_grids(settled.adjustment)
+        tests = replace(tests, residual_grid=residual_grids(settled.adjustment))
     findings += [*more, *_findings(settled, tests)]
     findings += _no_scale(network, settled.adjustment) + pose_findings(network, settled.adjustment.state)
-    grids = tests.get("residual_grid", {})
-    return Calibration(settled.adjustment, in_order(findings), tests, grids, {"options": asdict(options)})
+    return Calibration(settled.adjustment, in_order(findings), tests, tests.residual_grid or {}, {"options": asdict(options)})
 
 
 def _no_scale(network: Network, adjustment: Adjustment) -> list[Finding]:
@@ -162,46 +159,46 @@ def _least_tilted(network: Network, state: State) -> str:
     return network.images[int(np.nanargmax(np.abs(state.rotation[:, 2] @ normal)))]
 
 
-def _checked_field(settled: Settled, options: Options, say: Progress) -> tuple[Settled, dict[str, Any], list[Finding]]:
+def _checked_field(
+    settled: Settled, options: Options, say: Progress
+) -> tuple[Settled, FieldTest | None, HoldOut | None, tuple[Finding, ...]]:
     """Fixed points against free ones, with images left out of the fit; without fixed points to test, only images left out."""
     from pixmetry.calibrate.checks.field_check import LEAST_FIELD, check_field
 
     if options.folds == 0:
-        return settled, {}, []
+        return settled, None, None, ()
     say("leaving images out of the fit")
     fixed = (settled.measured.u_xyz == 0).any(axis=1).sum()
     if options.field != "auto" or fixed < LEAST_FIELD:
-        return settled, _held_out(settled, options), []
+        return settled, None, _held_out(settled, options), ()
     check = check_field(settled.adjustment, options.folds)
-    tests = {"field": check.field, **({"hold_out": check.hold_out} if check.hold_out else {})}
     if check.verdict == "free":
         say("adjusting with the points of the field free")
         before = replace(settled, adjustment=check.adjustment)
         again = settle(_released(settled.measured), check.adjustment.state, options, say, before)
-        gross = {kind: [*settled.gross_known[kind], *again.gross_known[kind]] for kind in again.gross_known}
-        settled = replace(again, gross_known=gross)
-    return settled, tests, list(check.findings)
+        settled = replace(again, known_faults=settled.known_faults + again.known_faults)
+    return settled, check.field, check.hold_out, check.findings
 
 
-def _held_out(settled: Settled, options: Options) -> dict[str, Any]:
+def _held_out(settled: Settled, options: Options) -> HoldOut | None:
     from pixmetry.calibrate.checks.hold_out import hold_out_record, left_out
 
     try:
         held = left_out(settled.adjustment, options.folds)
     except (InputError, MeasureError):
-        return {}  # too few images to leave some out
-    return {"hold_out": hold_out_record(None, held) if _is_free(settled.measured) else hold_out_record(held)}
+        return None  # too few images to leave some out
+    return hold_out_record(None, held) if _is_free(settled.measured) else hold_out_record(held)
 
 
-def _with_expected(record: dict[str, Any], settled: Settled) -> dict[str, Any]:
+def _with_expected(record: HoldOut | None, settled: Settled) -> HoldOut | None:
     """The record of images left out; where these fit much worse, with what noise alone would show."""
     from pixmetry.calibrate.checks.hold_out import WORSE, expected_median_px
 
-    one = record["free" if _is_free(settled.measured) else "fixed"]
-    if one is None or one["left_out_rms_px"] < WORSE * one["fit_rms_px"]:
+    one = None if record is None else record.free if _is_free(settled.measured) else record.fixed
+    if record is None or one is None or one.left_out_rms_px < WORSE * one.fit_rms_px:
         return record
     try:
-        return {**record, "expected_median_px": expected_median_px(settled.adjustment, record["folds"])}
+        return replace(record, expected_median_px=expected_median_px(settled.adjustment, record.folds))
     except MeasureError:  # hardly determined without these images: noise may do anything
         return record
 
@@ -210,29 +207,22 @@ def _is_free(network: Network) -> bool:
     return not (network.u_xyz == 0).any()
 
 
-def _records(settled: Settled, given: Network, options: Options) -> dict[str, Any]:
-    from pixmetry.calibrate.records import add_noise, all_records
+def _tests(settled: Settled, given: Network, options: Options) -> Tests:
+    from pixmetry.calibrate.checks.tests import tests_of
 
-    alpha = options.false_alarms / len(settled.measured)
-    tests = all_records(settled.adjustment, alpha, settled.gross_known, settled.rejected, a_priori=options.a_priori)
-    add_noise(tests["residuals"], settled.adjustment, given)
-    if settled.components:
-        tests["variance_components"] = settled.components
-    if settled.shift.corrected.any() or settled.shift.possible_px:
-        tests["eccentricity"] = {
-            "corrected": int(settled.shift.corrected.sum()),
-            "largest_px": settled.shift.largest_px,
-            "possible_px": settled.shift.possible_px,
-        }
-    return tests
+    alpha, shift = options.false_alarms / len(settled.measured), settled.shift
+    tests = tests_of(settled.adjustment, given, alpha, settled.known_faults, settled.rejected, a_priori=options.a_priori)
+    if shift.corrected.any() or shift.possible_px:
+        tests = replace(tests, eccentricity=EccentricityRecord(int(shift.corrected.sum()), shift.largest_px, shift.possible_px))
+    return replace(tests, variance_components=settled.components or None)
 
 
-def _findings(settled: Settled, tests: dict[str, Any]) -> list[Finding]:
+def _findings(settled: Settled, tests: Tests) -> list[Finding]:
     from pixmetry.calibrate.checks.checks import check_determined
     from pixmetry.calibrate.checks.findings import eccentricity_findings, findings_of, hold_out_findings, in_the_shadow
     from pixmetry.calibrate.checks.patterns import pattern_findings
 
     adjustment = settled.adjustment
-    found = [*check_determined(adjustment), *in_the_shadow(pattern_findings(tests["patterns"])), *findings_of(adjustment, tests)]
+    found = [*check_determined(adjustment), *in_the_shadow(pattern_findings(tests.patterns or ())), *findings_of(adjustment, tests)]
     found += eccentricity_findings(settled.measured, settled.shift)
-    return found + hold_out_findings(tests.get("hold_out", {}), free=_is_free(settled.measured))
+    return found + hold_out_findings(tests.hold_out, free=_is_free(settled.measured))

@@ -10,14 +10,14 @@ check points are shifted to it before: far from the origin, a shift and a rotati
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pixmetry.calibrate.bundle.network import Adjustment, Calibration, Network, State
+from pixmetry.calibrate.bundle.network import Adjustment, Network, State
 from pixmetry.calibrate.checks.quality import p_words, plain
+from pixmetry.calibrate.records import Calibration, CheckedPoint, CheckRecord, WorstPoint
 from pixmetry.core.errors import InputError
 from pixmetry.core.finding import Finding
 
@@ -31,7 +31,6 @@ SURE = 1e-9  # relative singular value above which check points determine a para
 ROUNDS = 3  # of fitting: the first is not weighted, each further one squares what is left of a far turn
 LOOSE = 100.0  # variance of what is fitted, in mean variances of a coordinate
 NAMED = 5
-RMS = ("rms", "expected_rms")
 
 
 @dataclass(frozen=True)
@@ -101,20 +100,13 @@ def with_check_points(calibration: Calibration, checks: CheckPoints, *, a_priori
 
     record = check_record(calibration.adjustment, checks, a_priori=a_priori)
     findings = in_order([*calibration.findings, *check_findings(record)])
-    return replace(calibration, findings=findings, tests={**calibration.tests, "check_points": record})
+    return replace(calibration, findings=findings, tests=replace(calibration.tests, check_points=record))
 
 
-def check_record(adjustment: Adjustment, checks: CheckPoints, *, a_priori: bool = False) -> dict[str, Any]:
+def check_record(adjustment: Adjustment, checks: CheckPoints, *, a_priori: bool = False) -> CheckRecord:
     """Compare check points with an adjustment.
 
-    Returns
-    -------
-    dict
-        ``unit``; ``datum_parameters`` (how many were fitted to the check points); ``rms`` and ``expected_rms`` of X, Y, Z; ``n``
-        (coordinates); ``dof``, ``chi2`` and ``p`` of all together (of an F-distribution: the image coordinates tell the variance);
-        ``worst`` with its ``critical`` value at the level ``level``; ``text``. ``points``: for each its ``name``, ``given``, ``u_given``,
-        ``found``, ``u_found`` (in the stated datum), ``difference`` (given less found), ``u_difference``, ``ratio`` of these two (X, Y, Z
-        each, NaN: not known), ``images``. Where they tell nothing, ratios are NaN and ``chi2``, ``p``, ``worst`` None.
+    Where they tell nothing, ratios are NaN and ``chi2``, ``p``, ``worst`` None.
     """
     from scipy import stats
 
@@ -138,26 +130,25 @@ def check_record(adjustment: Adjustment, checks: CheckPoints, *, a_priori: bool 
     if told:
         values[4] = values[2] / np.where(values[3] > 0, values[3], np.nan)
     rays = np.bincount(network.point[adjustment.used], minlength=len(network.points))
-    keys = ("found", "u_found", "difference", "u_difference", "ratio")
-    points = [
-        {"name": name, "given": checks.xyz[k], "u_given": np.where(np.isfinite(checks.xyz[k]), checks.u_xyz[k], np.nan)}
-        | dict(zip(keys, values[:, k], strict=True))
-        | {"images": int(rays[at[k]]) if at[k] >= 0 else 0}
-        for k, name in enumerate(checks.names)
-    ]
-    record: dict[str, Any] = {"unit": network.unit, "datum_parameters": rank, "n": int(known.sum()), "dof": left, "level": RARE}
-    record |= {"rms": _rms(values[2]), "expected_rms": _rms(values[3]), "chi2": chi2 if told else None, "p": None, "worst": None}
+    u_given = np.where(np.isfinite(checks.xyz), 0.0 if checks.u_xyz is None else checks.u_xyz, np.nan)
+    points = tuple(
+        CheckedPoint(name, checks.xyz[k], u_given[k], found, u_found, off, u_off, ratio, int(rays[at[k]]) if at[k] >= 0 else 0)
+        for k, (name, found, u_found, off, u_off, ratio) in enumerate(zip(checks.names, *values, strict=True))
+    )
+    p, worst = None, None
     if told:
-        record["p"] = float(stats.f.sf(chi2 / left, left, dof))
+        p = float(stats.f.sf(chi2 / left, left, dof))
         row, axis = np.unravel_index(np.nanargmax(np.abs(values[4])), values[4].shape)
-        worst = {"name": checks.names[row], "axis": "XYZ"[axis], "difference": values[2, row, axis], "ratio": values[4, row, axis]}
-        record["worst"] = worst | {"critical": float(stats.t.isf(RARE / known.sum() / 2, dof))}
-    return {**record, "text": _text(record, int(known.any(axis=1).sum())), "points": points}
+        critical = float(stats.t.isf(RARE / known.sum() / 2, dof))
+        worst = WorstPoint(checks.names[row], "XYZ"[axis], float(values[2, row, axis]), float(values[4, row, axis]), critical)
+    tests = (chi2, p, worst) if told else (None, None, None)
+    record = CheckRecord(network.unit, rank, int(known.sum()), left, RARE, _rms(values[2]), _rms(values[3]), *tests, "", points)
+    return replace(record, text=_text(record))
 
 
-def _rms(values: np.ndarray) -> list[float]:
+def _rms(values: np.ndarray) -> tuple[float, ...]:
     count = np.isfinite(values).sum(axis=0)
-    return [float(v) for v in np.where(count > 0, np.sqrt(np.nansum(values**2, axis=0) / np.maximum(count, 1)), np.nan)]
+    return tuple(np.where(count > 0, np.sqrt(np.nansum(values**2, axis=0) / np.maximum(count, 1)), np.nan).tolist())
 
 
 def _compared(
@@ -264,19 +255,21 @@ def joint_covariance(adjustment: Adjustment, points: np.ndarray, *, a_priori: bo
     return factor * own.reshape(len(rows), len(rows)) + rows @ adjustment.covariance @ rows.T
 
 
-def _text(record: Mapping[str, Any], points: int) -> str:
-    if not record["n"]:
+def _text(found: CheckRecord) -> str:
+    if not found.n:
         return "no coordinate of a check point could be compared"
     rms, expected = (
-        ", ".join(f"{axis} {_two_digits(v)}" for axis, v in zip("XYZ", record[key], strict=True) if np.isfinite(v)) for key in RMS
+        ", ".join(f"{axis} {_two_digits(v)}" for axis, v in zip("XYZ", values, strict=True) if np.isfinite(v))
+        for values in (found.rms, found.expected_rms)
     )
-    noun, unit = "check point" if points == 1 else "check points", record["unit"]
-    text = f"{points} {noun} with {record['n']} coordinates: given less found {rms} {unit} rms"
-    if record["datum_parameters"]:
-        text += f", after {record['datum_parameters']} parameters of the datum that nothing else gives were fitted to them"
-    if record["p"] is None:
+    points, unit = sum(bool(np.isfinite(point.difference).any()) for point in found.points), found.unit
+    noun = "check point" if points == 1 else "check points"
+    text = f"{points} {noun} with {found.n} coordinates: given less found {rms} {unit} rms"
+    if found.datum_parameters:
+        text += f", after {found.datum_parameters} parameters of the datum that nothing else gives were fitted to them"
+    if found.p is None:
         return f"{text}; so few check points say nothing about a network without a datum of its own"
-    return f"{text}, expected {expected} {unit}; {_chi2(record)}; largest: {_worst(record)}"
+    return f"{text}, expected {expected} {unit}; {_chi2(found)}; largest: {_worst(found)}"
 
 
 def _two_digits(value: float) -> str:
@@ -284,21 +277,23 @@ def _two_digits(value: float) -> str:
     return plain(value, 2) if abs(value) >= 10 else f"{value:#.2g}".rstrip(".")
 
 
-def _chi2(record: Mapping[str, Any]) -> str:
-    return f"χ² = {plain(record['chi2'], 3)} with {record['dof']} degrees of freedom ({p_words(record['p'])})"
+def _chi2(found: CheckRecord) -> str:
+    assert found.chi2 is not None and found.p is not None
+    return f"χ² = {plain(found.chi2, 3)} with {found.dof} degrees of freedom ({p_words(found.p)})"
 
 
-def _worst(record: Mapping[str, Any], critical: str = "") -> str:
-    worst = record["worst"]
-    return f"{worst['name']} {worst['axis']}, {worst['difference']:+.3g} {record['unit']} ({abs(worst['ratio']):.1f} u{critical})"
+def _worst(found: CheckRecord, critical: str = "") -> str:
+    worst = found.worst
+    assert worst is not None
+    return f"{worst.name} {worst.axis}, {worst.difference:+.3g} {found.unit} ({abs(worst.ratio):.1f} u{critical})"
 
 
-def check_findings(record: Mapping[str, Any]) -> list[Finding]:
+def check_findings(record: CheckRecord) -> list[Finding]:
     """Which check points have no coordinates or are not determined, and a warning where they contradict the network."""
     found = []
-    some = [(point, bool(np.isfinite(point["given"]).any())) for point in record["points"]]
-    empty = [point["name"] for point, known in some if not known]
-    lost = [point["name"] for point, known in some if known and not np.isfinite(point["found"]).all()]
+    some = [(point, bool(np.isfinite(point.given).any())) for point in record.points]
+    empty = [point.name for point, known in some if not known]
+    lost = [point.name for point, known in some if known and not np.isfinite(point.found).all()]
     for names, what, advice in (
         (empty, "without coordinates", "Fill in X, Y or Z; a row without them compares nothing."),
         (lost, "not determined", "See them in two images or more, and compare their names with those of the image coordinates."),
@@ -306,13 +301,13 @@ def check_findings(record: Mapping[str, Any]) -> list[Finding]:
         if names:
             named = ", ".join(names[:NAMED]) + (" …" if len(names) > NAMED else "")
             text = f"{len(names)} of {len(some)} check points {'is' if len(names) == 1 else 'are'} {what}: {named}."
-            found.append(Finding("check_points", text, advice, "note" if record["n"] else "warning"))
-    worst = record["worst"]
-    if worst is None:
+            found.append(Finding("check_points", text, advice, "note" if record.n else "warning"))
+    worst = record.worst
+    if worst is None or record.p is None:
         return found
-    single = abs(worst["ratio"]) > worst["critical"]
-    if single or record["p"] < RARE:
-        named = _worst(record, f", critical {worst['critical']:.1f}")
+    single = abs(worst.ratio) > worst.critical
+    if single or record.p < RARE:
+        named = _worst(record, f", critical {worst.critical:.1f}")
         text = f"The check points contradict the network (level {RARE:g}): {_chi2(record)}; the worst, given less found: {named}."
         advice = "Check the coordinates, the name and the image points of this one." if single else "No single one stands out."
         advice += " Where several are off, the given uncertainties or those of the network are too small."

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pixmetry.calibrate.bundle.network import Calibration
+from pixmetry.calibrate.records import Calibration
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ def control_of(calibration: Calibration) -> Control:
     weighted = np.isfinite(network.u_xyz) & (network.u_xyz > 0) & np.isfinite(network.xyz) & np.isfinite(found)
     point, axis = np.nonzero(weighted)
     names = [f"{network.points[k]} {'XYZ'[a]}" for k, a in zip(point, axis, strict=True)]
-    raised = ((calibration.tests.get("known") or {}).get("control_points") or {}).get("raised") or {}
+    raised = calibration.tests.known.control_points.raised if calibration.tests.known is not None else {}
     stated = np.array([raised.get(name, u) for name, u in zip(names, network.u_xyz[weighted], strict=True)], float)
     rays = np.bincount(network.point[calibration.adjustment.used], minlength=len(network.points))
     residual = np.where(rays[point] > 0, network.xyz[weighted] - found[weighted], np.nan)

@@ -11,11 +11,12 @@ import numpy as np
 from pixmetry.calibrate.bundle.model import NAMES, CameraModel
 from pixmetry.calibrate.bundle.network import Adjustment
 from pixmetry.calibrate.checks.quality import propagated
+from pixmetry.calibrate.records import DistortionCurves, ProjectionMap
 
 RADIAL = ("k1", "k2", "k3", "k4", "k5")
 
 
-def distortion_curves(adjustment: Adjustment, balanced_at: float | None = None, points: int = 101) -> dict[str, dict[str, Any]]:
+def distortion_curves(adjustment: Adjustment, balanced_at: float | None = None, points: int = 101) -> dict[str, DistortionCurves]:
     """Radial, balanced and tangential distortion against the radius, from the principal point to the farthest corner.
 
     From image to object these are corrections of the measured radius r: Δr = K1 r³ + K2 r⁵ + …. From object to image they are what the lens
@@ -33,15 +34,14 @@ def distortion_curves(adjustment: Adjustment, balanced_at: float | None = None, 
     Returns
     -------
     dict
-        By camera: ``unit``, ``radius``, ``radial``, ``u_radial``, ``balanced``, ``u_balanced``, ``tangential`` (√(p1² + p2²) r²) and
-        ``u_tangential`` in that unit; ``radius_px``, ``radial_px`` … the same in pixels (along x); ``balanced_c``, ``u_balanced_c``.
+        By camera.
     """
     out = {}
     for k in range(len(adjustment.network.cameras)):
         camera = adjustment.camera(k)
         radius = np.linspace(0.0, _farthest(camera), points)
         per_px = camera.sensor.per_px[0]
-        record: dict[str, Any] = {"unit": camera.sensor.unit, "radius": radius, "radius_px": radius / per_px}
+        made: dict[str, Any] = {}
         forms: dict[str, Callable[[CameraModel], np.ndarray]] = {
             "radial": partial(radial_distortion, radius=radius),
             "balanced": partial(_balanced_curve, radius=radius, balanced_at=balanced_at),
@@ -50,9 +50,11 @@ def distortion_curves(adjustment: Adjustment, balanced_at: float | None = None, 
         for name, form in forms.items():
             values, covariance = propagated(adjustment, k, form)
             u = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-            record |= {name: values, f"u_{name}": u, f"{name}_px": values / per_px, f"u_{name}_px": u / per_px}
+            made |= {name: values, f"u_{name}": u, f"{name}_px": values / per_px, f"u_{name}_px": u / per_px}
         c_b, variance = propagated(adjustment, k, partial(_balanced_c, radius=radius, balanced_at=balanced_at))
-        out[camera.name] = {**record, "balanced_c": float(c_b[0]), "u_balanced_c": float(np.sqrt(max(variance[0, 0], 0.0)))}
+        u_c_b = float(np.sqrt(max(variance[0, 0], 0.0)))
+        balanced: dict[str, Any] = {"balanced_c": float(c_b[0]), "u_balanced_c": u_c_b}
+        out[camera.name] = DistortionCurves(camera.sensor.unit, radius, radius / per_px, **made, **balanced)
     return out
 
 
@@ -106,7 +108,7 @@ def _farthest(camera: CameraModel) -> float:
     return float(np.hypot(dx, dy))
 
 
-def projection_maps(adjustment: Adjustment, cols: int = 25, rows: int = 19) -> dict[str, dict[str, Any]]:
+def projection_maps(adjustment: Adjustment, cols: int = 25, rows: int = 19) -> dict[str, ProjectionMap]:
     """How surely a direction is known over the sensor, as the standard uncertainty of a coordinate in the image (the mean of x and y).
 
     Another principal point is almost the same as another rotation of the camera, which every use of the camera finds anew. In ``u_px`` the
@@ -115,8 +117,7 @@ def projection_maps(adjustment: Adjustment, cols: int = 25, rows: int = 19) -> d
     Returns
     -------
     dict
-        By camera ``x_px``, shape (cols,), ``y_px``, shape (rows,), ``u_px`` and ``u_raw_px``, shape (rows, cols); NaN where the distortion
-        has no inverse.
+        By camera.
     """
     out = {}
     for k in range(len(adjustment.network.cameras)):
@@ -129,7 +130,7 @@ def projection_maps(adjustment: Adjustment, cols: int = 25, rows: int = 19) -> d
         by_parameter, by_rotation = _slopes(camera, names, u[good], v[good])
         taken = by_rotation @ np.linalg.lstsq(by_rotation, by_parameter, rcond=None)[0]
         raw[good], fitted[good] = (_coordinate_u(slopes, covariance) for slopes in (by_parameter, by_parameter - taken))
-        out[camera.name] = {"x_px": x, "y_px": y, "u_px": fitted.reshape(rows, cols), "u_raw_px": raw.reshape(rows, cols)}
+        out[camera.name] = ProjectionMap(x, y, fitted.reshape(rows, cols), raw.reshape(rows, cols))
     return out
 
 

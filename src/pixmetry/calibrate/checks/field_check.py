@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
 from pixmetry.calibrate.bundle.network import Adjustment, Network
 from pixmetry.calibrate.checks.hold_out import hold_out_record, left_out
 from pixmetry.calibrate.checks.quality import p_words
+from pixmetry.calibrate.records import FieldComparison, FieldDeviations, FieldPoints, FieldTest, HoldOut, Moved
 from pixmetry.calibrate.start.fit_to_control import brought_to
 from pixmetry.calibrate.start.resection import similarity
 from pixmetry.core.errors import InputError, MeasureError
@@ -32,16 +32,9 @@ class FieldCheck:
     fixed : Adjustment
     free : Adjustment or None
         None: the images do not carry free points (the finding says why).
-    field : dict
-        ``verdict``, ``shape`` ("plane" or "volume"), ``unit``; ``rms``, ``peak`` of the deviations from the best plane (of a volume: from
-        the nominal coordinates, in 3-D), ``u`` (rms uncertainty of these deviations), ``p_flat`` (of a plane: how often chance makes such
-        deviations), ``rms_in_plane``, ``peak_in_plane``; ``f``, ``dof``, ``p`` of the F-test of the given coordinates; ``moved_xp_px``,
-        ``moved_yp_px``, ``moved_c_px`` (free less fixed) with the formal ``u_xp_px``, ``u_yp_px``, ``u_c_px`` of the fixed solution, of the
-        first camera, and of each in ``cameras``; ``points``: ``names``, nominal ``xyz``, deviations ``dx``, ``dy``, ``dz`` after the best
-        similarity and ``u_dx``, ``u_dy``, ``u_dz``, along the rows of ``axes`` (of a plane, z is its normal), NaN of coordinates that were
-        not given; ``text``. Only ``verdict`` and ``text`` where free points could not be tried or judged.
-    hold_out : dict
-        See `pixmetry.calibrate.checks.hold_out.hold_out_record`; empty if there are too few images.
+    field : FieldTest
+    hold_out : HoldOut or None
+        None where free points could not be tried or judged.
     findings : tuple of Finding
     """
 
@@ -49,8 +42,8 @@ class FieldCheck:
     adjustment: Adjustment
     fixed: Adjustment
     free: Adjustment | None
-    field: dict[str, Any]
-    hold_out: dict[str, Any]
+    field: FieldTest
+    hold_out: HoldOut | None
     findings: tuple[Finding, ...]
 
 
@@ -81,32 +74,34 @@ def check_field(fixed: Adjustment, folds: int = 5, seed: int = 0, level: float =
     if nominal.sum() < 4:
         raise InputError("no test field with given coordinates", where="field", value=int(nominal.sum()), allowed="4 fixed points")
     if nominal.sum() < LEAST_FIELD:
-        return _kept(fixed, f"{int(nominal.sum())} points are too few to contradict each other", {})
+        return _kept(fixed, f"{int(nominal.sum())} points are too few to contradict each other")
     released = replace(network, u_xyz=np.where(network.u_xyz == 0, np.inf, network.u_xyz))
     try:
         free = adjust(released, fixed.state, used=fixed.used, redundancy=fixed.redundancy is not None)
     except MeasureError as reason:
-        return _kept(fixed, f"the images do not carry free points: {reason}", {})
+        return _kept(fixed, f"the images do not carry free points: {reason}")
     if fixed.dof - free.dof < 1:
-        return _kept(fixed, "they hold no more than origin, directions and scale", {})
-    held = {}
+        return _kept(fixed, "they hold no more than origin, directions and scale")
     try:
-        held = hold_out_record(left_out(fixed, folds, seed), left_out(free, folds, seed))
+        parts = left_out(fixed, folds, seed), left_out(free, folds, seed)
     except (InputError, MeasureError) as reason:
-        return _kept(fixed, f"free points cannot be judged by images left out: {reason}", {})
+        return _kept(fixed, f"free points cannot be judged by images left out: {reason}")
+    held = hold_out_record(*parts)
     f, dof, p = _given_coordinates(fixed, free)
-    better = bool(held["p"] < level and held["free"]["left_out_rms_px"] < held["fixed"]["left_out_rms_px"] and p < level)
-    verdict = "free" if better else "fixed"
-    record = {"verdict": verdict, "f": f, "dof": dof, "p": p, **_deviations(network, free, nominal), **_moves(fixed, free)}
-    record["text"] = _text(record, held, level)
+    assert held.fixed is not None and held.free is not None and held.p is not None  # both were asked for
+    better = bool(held.p < level and held.free.left_out_rms_px < held.fixed.left_out_rms_px and p < level)
+    verdict, moves = "free" if better else "fixed", _moves(fixed, free)
+    compared = FieldComparison(f, dof, p, _deviations(network, free, nominal), moves[network.cameras[0].name], moves)
+    text = _text(verdict, compared, held, level)
     advice = "Keep the points free, or have the field measured." if better else ""
-    finding = Finding("flatness" if record["shape"] == "plane" else "field", record["text"], advice, "warning" if better else "note")
-    return FieldCheck(verdict, free if better else fixed, fixed, free, record, held, (finding,))
+    kind = "flatness" if compared.deviations.shape == "plane" else "field"
+    finding = Finding(kind, text, advice, "warning" if better else "note")
+    return FieldCheck(verdict, free if better else fixed, fixed, free, FieldTest(verdict, compared, text), held, (finding,))
 
 
-def _kept(fixed: Adjustment, text: str, held: dict[str, Any]) -> FieldCheck:
-    record = {"verdict": "fixed", "text": f"The given coordinates stand untested: {text}."}
-    return FieldCheck("fixed", fixed, fixed, None, record, held, (Finding("field", record["text"]),))
+def _kept(fixed: Adjustment, text: str) -> FieldCheck:
+    text = f"The given coordinates stand untested: {text}."
+    return FieldCheck("fixed", fixed, fixed, None, FieldTest("fixed", None, text), None, (Finding("field", text),))
 
 
 def _given_coordinates(fixed: Adjustment, free: Adjustment) -> tuple[float, tuple[int, int], float]:
@@ -134,7 +129,7 @@ def _axes(nominal: np.ndarray) -> tuple[np.ndarray, bool]:
     return np.stack([x, np.cross(normal, x), normal]), True
 
 
-def _deviations(network: Network, free: Adjustment, nominal: np.ndarray) -> dict[str, Any]:
+def _deviations(network: Network, free: Adjustment, nominal: np.ndarray) -> FieldDeviations:
     """How far the points lie from their nominal places after the best similarity, and from the best plane."""
     from scipy import stats
 
@@ -146,61 +141,62 @@ def _deviations(network: Network, free: Adjustment, nominal: np.ndarray) -> dict
     off = (moved - given) @ axes.T if plane else moved - given
     turn = axes @ rotation * scale
     u = np.sqrt(np.maximum(np.einsum("ij,njk,ik->ni", turn, free.point_covariance[which], turn), 0.0))
-    record: dict[str, Any] = {"shape": "plane" if plane else "volume", "unit": network.unit}
+    p_flat = rms_inside = peak_inside = None
     if plane:
         flat = np.column_stack([np.ones(len(which)), given @ axes[:2].T])
         length, u_length = np.abs(off[:, 2] - flat @ np.linalg.lstsq(flat, off[:, 2], rcond=None)[0]), u[:, 2]
         inside = np.hypot(off[:, 0], off[:, 1])
         f_flat = float(np.sum((length / u_length) ** 2)) / (len(which) - 3)
-        record |= {"p_flat": float(stats.f.sf(f_flat, len(which) - 3, free.dof))}
-        record |= {"rms_in_plane": float(np.sqrt(np.mean(inside**2))), "peak_in_plane": float(inside.max())}
+        p_flat = float(stats.f.sf(f_flat, len(which) - 3, free.dof))
+        rms_inside, peak_inside = float(np.sqrt(np.mean(inside**2))), float(inside.max())
     else:
         u[np.isnan(off)] = np.nan
         length, u_length = (np.sqrt(np.nansum(v**2, axis=1)) for v in (off, u))
-        record |= {"p_flat": None, "rms_in_plane": None, "peak_in_plane": None}
-    record |= {"rms": float(np.sqrt(np.mean(length**2))), "peak": float(length.max()), "u": float(np.sqrt(np.mean(u_length**2)))}
-    points: dict[str, Any] = {"names": [network.points[i] for i in which], "xyz": given, "axes": axes}
-    for i, axis in enumerate("xyz"):
-        points |= {f"d{axis}": off[:, i], f"u_d{axis}": u[:, i]}
-    return {**record, "points": points}
+    size = float(np.sqrt(np.mean(length**2))), float(length.max()), float(np.sqrt(np.mean(u_length**2)))
+    points = FieldPoints(
+        tuple(network.points[i] for i in which), given, axes, off[:, 0], u[:, 0], off[:, 1], u[:, 1], off[:, 2], u[:, 2]
+    )  # fmt: skip
+    return FieldDeviations("plane" if plane else "volume", network.unit, p_flat, rms_inside, peak_inside, *size, points)
 
 
-def _moves(fixed: Adjustment, free: Adjustment) -> dict[str, Any]:
-    """What freeing the points does to principal point and distance, by camera, and at the top for the first."""
+def _moves(fixed: Adjustment, free: Adjustment) -> dict[str, Moved]:
+    """What freeing the points does to principal point and distance, by camera."""
     cameras = {}
     for k, camera in enumerate(fixed.network.cameras):
         names, covariance = fixed.interior_covariance(k)
-        record: dict[str, Any] = {}
+        moves: list[float | None] = []
         for name, place in PLACES.items():
             per_px = camera.sensor.per_px[0] if name == "c" else 1.0
-            record[f"moved_{name}_px"] = float(free.state.interior[k, place] - fixed.state.interior[k, place]) / per_px
+            moves.append(float(free.state.interior[k, place] - fixed.state.interior[k, place]) / per_px)
             known = name in names
-            record[f"u_{name}_px"] = float(np.sqrt(covariance[names.index(name), names.index(name)])) / per_px if known else None
-        cameras[camera.name] = record
-    return {**cameras[fixed.network.cameras[0].name], "cameras": cameras}
+            moves.append(float(np.sqrt(covariance[names.index(name), names.index(name)])) / per_px if known else None)
+        cameras[camera.name] = Moved(*moves)
+    return cameras
 
 
-def _text(record: dict[str, Any], held: dict[str, Any], level: float) -> str:
-    unit, plane = record["unit"], record["shape"] == "plane"
-    numbers = f"rms {record['rms']:.3g} {unit} (of which {record['u']:.2g} may be noise), peak {record['peak']:.3g} {unit}"
-    left = f"{held['fixed']['left_out_rms_px']:.4f} px with the points as given and {held['free']['left_out_rms_px']:.4f} px with them free"
-    judged = f"images left out of the fit show {left} ({p_words(held['p'])}); F = {record['f']:.3g}, {p_words(record['p'])}"
-    if record["verdict"] == "fixed":
+def _text(verdict: str, compared: FieldComparison, held: HoldOut, level: float) -> str:
+    off, (fixed, free) = compared.deviations, held.parts.values()
+    unit, plane = off.unit, off.shape == "plane"
+    numbers = f"rms {off.rms:.3g} {unit} (of which {off.u:.2g} may be noise), peak {off.peak:.3g} {unit}"
+    left = f"{fixed.left_out_rms_px:.4f} px with the points as given and {free.left_out_rms_px:.4f} px with them free"
+    p_held = "" if held.p is None else p_words(held.p)
+    judged = f"images left out of the fit show {left} ({p_held}); F = {compared.f:.3g}, {p_words(compared.p)}"
+    if verdict == "fixed":
         return f"The given coordinates of the test field stand: {judged}, not both below {level:g}."
     if plane:
-        inside = f"in its plane, points lie off by rms {record['rms_in_plane']:.3g} {unit}, peak {record['peak_in_plane']:.3g} {unit}"
+        inside = f"in its plane, points lie off by rms {off.rms_in_plane:.3g} {unit}, peak {off.peak_in_plane:.3g} {unit}"
         what = f"The board is not flat: it leaves its best plane by {numbers}; {inside}"
-        if record["p_flat"] > level:
+        if off.p_flat is not None and off.p_flat > level:
             what = f"The board is not as given: {inside}; it leaves its best plane by {numbers}"
     else:
         what = f"The test field is not as given: its points lie off by {numbers}"
-    return f"{what}. {judged[0].upper()}{judged[1:]}. Free points moved {_moved_words(record)}."
+    return f"{what}. {judged[0].upper()}{judged[1:]}. Free points moved {_moved_words(compared.first)}."
 
 
-def _moved_words(record: dict[str, Any]) -> str:
+def _moved_words(found: Moved) -> str:
     words = []
     for name, what in (("xp", "the principal point by {} px in x"), ("yp", "{} px in y"), ("c", "the principal distance by {} px")):
-        u = record[f"u_{name}_px"]
-        moved = what.format(f"{round(record[f'moved_{name}_px'], 2) + 0.0:+.2f}")  # + 0.0: no minus before nought
+        by_px, u = found.by_name[name]
+        moved = what.format(f"{round(by_px, 2) + 0.0:+.2f}")  # + 0.0: no minus before nought
         words.append(moved if u is None else f"{moved} (formal u {u:.2f} px)")
     return ", ".join(words)

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -14,6 +13,18 @@ from pixmetry.calibrate.bundle.network import Adjustment, Network
 from pixmetry.calibrate.checks.hold_out import WORSE
 from pixmetry.calibrate.checks.lost_control import mostly_lost
 from pixmetry.calibrate.checks.quality import p_words, plain
+from pixmetry.calibrate.records import (
+    Contradicted,
+    ContradictedControl,
+    FTest,
+    GrossError,
+    HoldOut,
+    ImageRecord,
+    KnownGroup,
+    KnownRecord,
+    ParameterTest,
+    Tests,
+)
 from pixmetry.core.finding import Finding
 
 ORDER = (  # of kinds, among findings of the same level; what is not named here comes between the two parts
@@ -45,18 +56,19 @@ def in_order(findings: Iterable[Finding]) -> tuple[Finding, ...]:
     return tuple(ordered[: max(MOST, warnings + LEAST_NOTES)])
 
 
-def findings_of(adjustment: Adjustment, tests: Mapping[str, Any]) -> list[Finding]:
+def findings_of(adjustment: Adjustment, tests: Tests) -> list[Finding]:
     """What the records of one adjustment say."""
+    images = tests.images or ()
     found = [
-        *known_findings(tests["known"], adjustment.network.unit),
+        *known_findings(tests.known or KnownRecord(), adjustment.network.unit),
         *lost_control_findings(adjustment),
-        *rejected_image_findings(tests["images"]),
+        *rejected_image_findings(images),
         *lost_findings(adjustment),
         *two_ray_findings(adjustment),
-        *parameter_findings(tests["parameters"]),
-        *f_test_findings(tests["f_test"]),
-        *gross_error_findings(tests["gross_errors"], adjustment, tests["images"]),
-        *drift_findings(tests["images"], adjustment),
+        *parameter_findings(tests.parameters or ()),
+        *f_test_findings(tests.f_test or {}),
+        *gross_error_findings(tests.gross_errors or (), adjustment, images),
+        *drift_findings(images, adjustment),
         Finding("datum", f"Datum: {adjustment.datum}."),
     ]
     return found + [Finding("adjustment", note if note.endswith(".") else f"{note}.") for note in adjustment.notes]
@@ -82,12 +94,12 @@ def in_the_shadow(patterns: Iterable[Finding]) -> list[Finding]:
     return out
 
 
-def parameter_findings(parameters: list[dict[str, Any]]) -> list[Finding]:
+def parameter_findings(parameters: Sequence[ParameterTest]) -> list[Finding]:
     """Parameters that are not significant, and pairs that cannot be told apart."""
     found = []
-    for camera in dict.fromkeys(p["camera"] for p in parameters):
-        mine = [p for p in parameters if p["camera"] == camera]
-        weak = [f"{p['name']} (p = {p['p_zero']:.2f})" for p in mine if p["p_zero"] is not None and p["p_zero"] > SIGNIFICANT]
+    for camera in dict.fromkeys(p.camera for p in parameters):
+        mine = [p for p in parameters if p.camera == camera]
+        weak = [f"{p.name} (p = {p.p_zero:.2f})" for p in mine if p.p_zero is not None and p.p_zero > SIGNIFICANT]
         if weak:
             verb = "is" if len(weak) == 1 else "are"
             text = f"{camera}: {', '.join(weak)} {verb} not significantly different from 0."
@@ -99,33 +111,33 @@ def parameter_findings(parameters: list[dict[str, Any]]) -> list[Finding]:
     return found
 
 
-def _pairs(parameters: list[dict[str, Any]]) -> list[tuple[str, str, float]]:
+def _pairs(parameters: Sequence[ParameterTest]) -> list[tuple[str, str, float]]:
     """Pairs with a correlation of almost 1; radial terms among themselves are always close."""
     pairs = {}
     for p in parameters:
-        strongest = p["strongest"]
-        if strongest is None or abs(strongest["r"]) < CORRELATED or {p["name"], strongest["with"]} <= RADIAL:
+        strongest = p.strongest
+        if strongest is None or abs(strongest.r) < CORRELATED or {p.name, strongest.with_} <= RADIAL:
             continue
-        pairs[frozenset((p["name"], strongest["with"]))] = (p["name"], strongest["with"], strongest["r"])
+        pairs[frozenset((p.name, strongest.with_))] = (p.name, strongest.with_, strongest.r)
     return list(pairs.values())
 
 
-def f_test_findings(f_tests: Mapping[str, dict[str, Any]]) -> list[Finding]:
+def f_test_findings(f_tests: Mapping[str, FTest]) -> list[Finding]:
     """Cameras whose x is noisier than y."""
     found = []
-    for camera, record in f_tests.items():
-        if record["p_px"] < RARE:
+    for camera, test in f_tests.items():
+        if test.p_px < RARE:
             advice = "Look for what acts along lines: line jitter, the grabber's clock, or motion."
-            found.append(Finding("f_test", f"{camera}: {record['text']}.", advice, "warning"))
+            found.append(Finding("f_test", f"{camera}: {test.text}.", advice, "warning"))
     return found
 
 
-def mostly_rejected(images: list[dict[str, Any]]) -> list[dict[str, Any]]:
+def mostly_rejected(images: Sequence[ImageRecord]) -> list[ImageRecord]:
     """Records of the images that lost more than half of their image points as gross errors."""
-    return [i for i in images if i["rejected"] > REJECTED_SHARE * i["measured"]]
+    return [i for i in images if i.rejected > REJECTED_SHARE * i.measured]
 
 
-def rejected_image_findings(images: list[dict[str, Any]]) -> list[Finding]:
+def rejected_image_findings(images: Sequence[ImageRecord]) -> list[Finding]:
     """Images most of whose image points were rejected: it is hardly the points that are wrong."""
     found = mostly_rejected(images)
     if not found:
@@ -133,22 +145,22 @@ def rejected_image_findings(images: list[dict[str, Any]]) -> list[Finding]:
     advice = "Check the camera of these images and the names of their points. If both are right, the images are bad: leave them out."
     if len(found) == 1:
         advice = "Check its camera and the names of its points. If both are right, it is a bad image: leave it out."
-        text = f"Image {found[0]['image']}: {found[0]['rejected']} of {found[0]['measured']} image points were rejected."
+        text = f"Image {found[0].image}: {found[0].rejected} of {found[0].measured} image points were rejected."
     else:
-        named = ", ".join(f"{i['image']} ({i['rejected']} of {i['measured']})" for i in found[:NAMED])
+        named = ", ".join(f"{i.image} ({i.rejected} of {i.measured})" for i in found[:NAMED])
         more = " …" if len(found) > NAMED else ""
         text = f"More than half of the image points of {len(found)} images were rejected: {named}{more}."
     return [Finding("images_rejected", text, advice, "warning")]
 
 
-def gross_error_findings(errors: list[dict[str, Any]], adjustment: Adjustment, images: list[dict[str, Any]]) -> list[Finding]:
+def gross_error_findings(errors: Sequence[GrossError], adjustment: Adjustment, images: Sequence[ImageRecord]) -> list[Finding]:
     """Image points that were left out, and what else of the image points took no part."""
     if not errors:
         return []
     network, total = adjustment.network, len(adjustment.used)
-    bad = {i["image"] for i in mostly_rejected(images)}
-    single = [e for e in errors if e["image"] not in bad] or errors
-    names = [f"{e['point']} in {e['image']} ({plain(np.hypot(e['error_x_px'], e['error_y_px']), 2)} px)" for e in single[:NAMED]]
+    bad = {i.image for i in mostly_rejected(images)}
+    single = [e for e in errors if e.image not in bad] or errors
+    names = [f"{e.point} in {e.image} ({plain(np.hypot(e.error_x_px, e.error_y_px), 2)} px)" for e in single[:NAMED]]
     more = " …" if len(single) > NAMED else ""
     noun = "image point was left out as a gross error" if len(errors) == 1 else "image points were left out as gross errors"
     text = f"{len(errors)} {noun}, of {total}: {', '.join(names)}{more}.{_swapped_names(errors, network)}"
@@ -164,8 +176,8 @@ def gross_error_findings(errors: list[dict[str, Any]], adjustment: Adjustment, i
     return [Finding("gross_error", text, advice, "warning" if many else "note")]
 
 
-def _swapped_names(errors: list[dict[str, Any]], network: Network) -> str:
-    pairs = dict.fromkeys((e["image"], *sorted((e["point"], e["swapped_with"]))) for e in errors if e["swapped_with"] is not None)
+def _swapped_names(errors: Sequence[GrossError], network: Network) -> str:
+    pairs = dict.fromkeys((e.image, *sorted((e.point, e.swapped_with))) for e in errors if e.swapped_with is not None)
     if not pairs:
         return ""
     often = Counter((a, b) for _, a, b in pairs)
@@ -211,68 +223,74 @@ def lost_findings(adjustment: Adjustment) -> list[Finding]:
     return [Finding("lost_points", f"{text}.", advice, "warning")]
 
 
-def known_findings(known: Mapping[str, Any], unit: str) -> list[Finding]:
+def known_findings(known: KnownRecord, unit: str) -> list[Finding]:
     """Bars and control points that the network contradicts, or against which it could not be tested."""
     found = []
-    if known.get("untested"):
-        text = f"Neither control points nor scale bars could be tested: without them {known['untested']}."
+    if known.untested:
+        text = f"Neither control points nor scale bars could be tested: without them {known.untested}."
         advice = "If one of them is wrong, image points were left out in its stead: check the values where many are."
         found.append(Finding("known_untested", text, advice, "warning"))
-    for name, noun in (("scale_bars", "scale bar"), ("control_points", "control point")):
-        record = known[name]
-        found += [_gross_finding(gross, noun, unit) for gross in _once(record["gross"])[:NAMED]]
-        group, factor = record["group"], record.get("understated")
+    for record, noun, factor in (
+        (known.scale_bars, "scale bar", None),
+        (known.control_points, "control point", known.control_points.understated),
+    ):
+        found += [_gross_finding(gross, noun, unit) for gross in _once(record.gross)[:NAMED]]
+        group = record.group
         if factor:
             text = f"The {noun}s miss the network by about {factor:.2g} times their stated uncertainties, which were raised by this."
             found.append(Finding("known_uncertainty", text, "State their uncertainties anew.", "warning"))
-        elif group and group["p"] < RARE and (group["factor"] > 1 or not record["gross"]):
+        elif group and group.p < RARE and (group.factor > 1 or not record.gross):
             found.append(_group_finding(group, noun))
-    fixed = known.get("fixed_points")
-    if fixed and fixed["p"] < RARE:
-        miss = plain(fixed["miss"], 2)
-        text = f"The {fixed['n']} fixed points miss the network by about {miss} {unit} together ({p_words(fixed['p'])})."
+    fixed = known.fixed_points
+    if fixed and fixed.p < RARE:
+        miss = plain(fixed.miss, 2)
+        text = f"The {fixed.n} fixed points miss the network by about {miss} {unit} together ({p_words(fixed.p)})."
         advice = f"Look for a mistake in their coordinates; if there is none, they are not exact: known: weighted with u = {miss} {unit}."
         found.append(Finding("known_uncertainty", text, advice, "warning"))
     return found
 
 
-def _once(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
+def _swap_of(one: Contradicted) -> str | None:
+    return one.swapped_with if isinstance(one, ContradictedControl) else None
+
+
+def _once(records: Sequence[Contradicted]) -> list[Contradicted]:
     """Of points that exchanged their names, the first coordinate; all others."""
     swapped: set[str] = set()
     out = []
     for record in records:
-        point = record["name"].rpartition(" ")[0] if record.get("swapped_with") else ""
+        point = record.name.rpartition(" ")[0] if _swap_of(record) else ""
         if not point or point not in swapped:
             out.append(record)
         swapped.add(point)
     return out
 
 
-def _gross_finding(gross: Mapping[str, Any], noun: str, unit: str) -> Finding:
-    text = f"The {noun} {gross['name']} does not agree with the network: it seems wrong by {gross['error']:+.4g} {unit}"
-    text += f" (test {gross['statistic']:.1f}, critical {gross['critical']:.1f})."
-    if gross.get("swapped_with"):
-        text += f" It lies where {gross['swapped_with']} should be: their names seem to be exchanged in the table of points."
+def _gross_finding(gross: Contradicted, noun: str, unit: str) -> Finding:
+    text = f"The {noun} {gross.name} does not agree with the network: it seems wrong by {gross.error:+.4g} {unit}"
+    text += f" (test {gross.statistic:.1f}, critical {gross.critical:.1f})."
+    if _swap_of(gross):
+        text += f" It lies where {_swap_of(gross)} should be: their names seem to be exchanged in the table of points."
     advice = f"Check its value, its unit and the names of its points; {_what_was_done(gross)}."
     return Finding(f"gross_{noun.replace(' ', '_')}", text, advice, "warning")
 
 
-def _what_was_done(gross: Mapping[str, Any]) -> str:
-    if gross["left_out"]:
+def _what_was_done(gross: Contradicted) -> str:
+    if gross.left_out:
         return "it was left out"
-    others = gross["rivals"]
+    others = gross.rivals
     if not others:
         return "with so few it cannot be said which is wrong, and it weighs less now"
     named = ", ".join(others[:NAMED]) + (" …" if len(others) > NAMED else "")
     return f"it cannot be said whether it is wrong or {'one of ' if len(others) > 1 else ''}{named}, and they weigh less now"
 
 
-def _group_finding(group: Mapping[str, Any], noun: str) -> Finding:
+def _group_finding(group: KnownGroup, noun: str) -> Finding:
     """A group that scatters otherwise than stated; what stands out comes before new uncertainties for all."""
-    text = f"The {noun}s scatter {np.sqrt(group['factor']):.2g} times as much as their stated uncertainties say."
-    if group["factor"] <= 1:
+    text = f"The {noun}s scatter {np.sqrt(group.factor):.2g} times as much as their stated uncertainties say."
+    if group.factor <= 1:
         return Finding("known_uncertainty", text, "State their uncertainties anew.", "note")
-    largest = "; ".join(f"{one['name']}, {abs(one['ratio']):.2g} u" for one in group["largest"])
+    largest = "; ".join(f"{one.name}, {abs(one.ratio):.2g} u" for one in group.largest)
     advice = f"Check the largest first: {largest}. If they are right, state the uncertainties anew."
     return Finding("known_uncertainty", text, advice, "warning")
 
@@ -290,17 +308,20 @@ def lost_control_findings(adjustment: Adjustment) -> list[Finding]:
     return [Finding("lost_control", text, advice, "warning")]
 
 
-def drift_findings(images: list[dict[str, Any]], adjustment: Adjustment) -> list[Finding]:
+def drift_findings(images: Sequence[ImageRecord], adjustment: Adjustment) -> list[Finding]:
     """What the images' own x-scales and x-shifts say, where they were estimated."""
     from scipy import stats
 
     found = []
-    for key, unit, factor in (("x_scale", "ppm", 1e6), ("x_shift_px", "px", 1.0)):
-        for camera in dict.fromkeys(i["camera"] for i in images):
-            mine = [i for i in images if i["camera"] == camera and i[key] is not None and i[f"u_{key}"]]
+    for key, unit, factor, own in (
+        ("x_scale", "ppm", 1e6, lambda i: (i.x_scale, i.u_x_scale)),
+        ("x_shift_px", "px", 1.0, lambda i: (i.x_shift_px, i.u_x_shift_px)),
+    ):
+        for camera in dict.fromkeys(i.camera for i in images):
+            mine = [(value, u) for value, u in (own(i) for i in images if i.camera == camera) if value is not None and u]
             if len(mine) < 2:
                 continue
-            value, u = (np.array([i[name] for i in mine]) for name in (key, f"u_{key}"))
+            value, u = np.array(mine).T
             p = stats.f.sf((value**2 / u**2).sum() / (len(mine) - 1), len(mine) - 1, adjustment.dof)
             low, high, middle = value.min() * factor, value.max() * factor, float(np.median(u)) * factor
             spread = f"from {low:+.3g} to {high:+.3g} {unit} (u of one: {middle:.2g} {unit})"
@@ -334,14 +355,14 @@ def eccentricity_findings(measured: Network, found: Eccentricity) -> list[Findin
     return out
 
 
-def hold_out_findings(record: Mapping[str, Any], *, free: bool) -> list[Finding]:
+def hold_out_findings(record: HoldOut | None, *, free: bool) -> list[Finding]:
     """Images left out that fit much worse than those of the fit, and than noise explains: with the field's points free or not."""
-    one = record.get("free" if free else "fixed")
-    expected = record.get("expected_median_px")
-    if not one or expected is None or one["left_out_median_px"] < WORSE * expected:
+    one = None if record is None else record.free if free else record.fixed
+    expected = None if record is None else record.expected_median_px
+    if one is None or expected is None or one.left_out_median_px < WORSE * expected:
         return []
     text = (
-        f"Images left out of the fit show {plain(one['left_out_rms_px'], 3)} px, those in it {plain(one['fit_rms_px'], 3)} px (rms). "
-        f"Half of the former are above {plain(one['left_out_median_px'], 3)} px; with noise alone it would be {plain(expected, 3)} px."
+        f"Images left out of the fit show {plain(one.left_out_rms_px, 3)} px, those in it {plain(one.fit_rms_px, 3)} px (rms). "
+        f"Half of the former are above {plain(one.left_out_median_px, 3)} px; with noise alone it would be {plain(expected, 3)} px."
     )
     return [Finding("hold_out", text, "Take more images or fewer parameters.", "warning")]

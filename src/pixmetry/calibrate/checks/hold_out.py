@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
 from pixmetry.calibrate.bundle.network import SCALE, SHIFT, Adjustment, Network, State
 from pixmetry.calibrate.checks.added_terms import derivatives, whitening
 from pixmetry.calibrate.checks.quality import p_fall, p_words
+from pixmetry.calibrate.records import HeldRms, HoldOut
 from pixmetry.core.errors import InputError
 
 STEPS = 30
@@ -247,7 +247,7 @@ def expected_median_px(adjustment: Adjustment, folds: int, seed: int = 0) -> flo
     return float(np.nanmedian(np.abs(left_out(replace(adjustment, network=simulated), folds, seed).residual_px)))
 
 
-def hold_out_record(fixed: LeftOut | None, free: LeftOut | None = None) -> dict[str, Any]:
+def hold_out_record(fixed: LeftOut | None, free: LeftOut | None = None) -> HoldOut:
     """How well images that were left out fit, beside the fit of all.
 
     Parameters
@@ -257,10 +257,8 @@ def hold_out_record(fixed: LeftOut | None, free: LeftOut | None = None) -> dict[
 
     Returns
     -------
-    dict
-        ``fixed``, ``free``: ``fit_rms_px``, ``left_out_rms_px``, ``left_out_median_px`` (of the sizes; per coordinate) or None;
-        ``folds``; ``p``: how often chance alone lets the left-out rms fall so much (one-sided t-test on the logarithms of the images' mean
-        squares, paired; None without both); ``text``.
+    HoldOut
+        Its ``p`` is that of a one-sided t-test on the logarithms of the images' mean squares, paired.
 
     Raises
     ------
@@ -275,16 +273,19 @@ def hold_out_record(fixed: LeftOut | None, free: LeftOut | None = None) -> dict[
     p = None
     if fixed is not None and free is not None:
         p = p_fall(fixed.residual_px[common], free.residual_px[common], fixed.image[common])
+    found = HoldOut(fixed_record, free_record, given[0].folds, p, "")
+    return replace(found, text=_text(found))
+
+
+def _text(found: HoldOut) -> str:
     words = []
-    for name, record in (("points as given", fixed_record), ("points free", free_record)):
+    for name, record in (("points as given", found.fixed), ("points free", found.free)):
         if record is not None:
-            words.append(f"{name}: {record['fit_rms_px']:.4f} px in the fit, {record['left_out_rms_px']:.4f} px in images left out")
-    text = f"{'; '.join(words)} ({given[0].folds} folds; rms of a coordinate)"
-    if p is not None:
-        text += f"; {p_words(p)} for the fall of the latter"
-    return {"fixed": fixed_record, "free": free_record, "folds": given[0].folds, "p": p, "text": text}
+            words.append(f"{name}: {record.fit_rms_px:.4f} px in the fit, {record.left_out_rms_px:.4f} px in images left out")
+    text = f"{'; '.join(words)} ({found.folds} folds; rms of a coordinate)"
+    return text if found.p is None else f"{text}; {p_words(found.p)} for the fall of the latter"
 
 
-def _rms_record(part: LeftOut, common: np.ndarray) -> dict[str, float]:
+def _rms_record(part: LeftOut, common: np.ndarray) -> HeldRms:
     fit, left = (float(np.sqrt(np.mean(values[common] ** 2))) for values in (part.fit_px, part.residual_px))
-    return {"fit_rms_px": fit, "left_out_rms_px": left, "left_out_median_px": float(np.median(np.abs(part.residual_px[common])))}
+    return HeldRms(fit, left, float(np.median(np.abs(part.residual_px[common]))))

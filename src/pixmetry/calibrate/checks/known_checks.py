@@ -9,7 +9,7 @@ explains the contradiction nearly as well, both are given the uncertainty of the
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Literal
 
 import numpy as np
 
@@ -28,6 +28,7 @@ from pixmetry.calibrate.checks.known_residuals import (
 from pixmetry.calibrate.checks.lost_control import set_free
 from pixmetry.calibrate.checks.snooping import Adjust, finest_factor, remove_gross_errors
 from pixmetry.calibrate.checks.variance_components import image_sigma0, scaled
+from pixmetry.calibrate.records import Contradicted, FixedPoints
 from pixmetry.calibrate.start.fit_to_control import brought_to, far_from_control
 from pixmetry.core.errors import InputError, MeasureError
 
@@ -40,6 +41,50 @@ ABSURD_U = 10.0  # stated uncertainties that a coordinate which is so far off is
 WIDE = 2.0  # times what they seem to be, uncertainties are taken until gross errors are out
 MANY_WRONG = 1 / 3  # of the control points: it is rather their uncertainties that are wrong
 MOST = 20
+Kind = Literal["scale_bars", "control_points"]
+
+
+@dataclass(frozen=True)
+class Raised:
+    """A known value whose uncertainty was raised, with the one that was stated."""
+
+    kind: Kind
+    name: str
+    u: float
+
+
+@dataclass(frozen=True)
+class KnownFaults:
+    """What a network contradicts of what was known.
+
+    Parameters
+    ----------
+    scale_bars, control_points : tuple of Contradicted
+    raised : tuple of Raised
+    understated : float or None
+        Factor by which the uncertainties of all control points were raised, if so.
+    untested : str or None
+        Why nothing of this could be tested, if so.
+    """
+
+    scale_bars: tuple[Contradicted, ...] = ()
+    control_points: tuple[Contradicted, ...] = ()
+    raised: tuple[Raised, ...] = ()
+    understated: float | None = None
+    untested: str | None = None
+
+    def of(self, kind: Kind) -> tuple[Contradicted, ...]:
+        """Those of one kind."""
+        return self.scale_bars if kind == "scale_bars" else self.control_points
+
+    def __add__(self, later: KnownFaults) -> KnownFaults:
+        return KnownFaults(
+            self.scale_bars + later.scale_bars,
+            self.control_points + later.control_points,
+            self.raised + later.raised,
+            later.understated if self.understated is None else self.understated,
+            later.untested if self.untested is None else self.untested,
+        )
 
 
 @dataclass(frozen=True)
@@ -49,17 +94,11 @@ class CheckedKnown:
     Parameters
     ----------
     network : Network
-    gross : dict
-        By ``scale_bars`` and ``control_points``: records as of `contradicted`, with ``left_out``; where it is False, the ``rivals`` of
-        which one may be wrong instead. ``raised``: the ``kind`` of these two, ``name`` and stated uncertainty ``u`` of all whose
-        uncertainties were raised. ``understated``: the ``factor`` by which those of all control points were raised, if so. ``untested``:
-        ``why`` nothing of this could be tested, if so. ``axes`` of a control point are those that were left out with the one named.
+    faults : KnownFaults
     """
 
     network: Network
-    gross: dict[str, list[dict[str, Any]]] = field(
-        default_factory=lambda: {"scale_bars": [], "control_points": [], "raised": [], "understated": [], "untested": []}
-    )
+    faults: KnownFaults = field(default_factory=KnownFaults)
 
 
 def has_known(network: Network) -> bool:
@@ -105,7 +144,7 @@ def few_held(network: Network) -> np.ndarray:
     return (network.u_xyz == 0) & few_fixed(network)[:, None]
 
 
-def fixed_record(adjustment: Adjustment, adjust: Adjust) -> dict[str, Any] | None:
+def fixed_record(adjustment: Adjustment, adjust: Adjust) -> FixedPoints | None:
     """Whether the fixed points of a network with free ones beside them fit it together; None without such points or without redundancy.
 
     The sum of squares falls by what the fixed points take when they are set free: over the degrees of freedom that go with them (3n − 7
@@ -116,11 +155,6 @@ def fixed_record(adjustment: Adjustment, adjust: Adjust) -> dict[str, Any] | Non
     adjustment : Adjustment
     adjust : callable
         `bundle.adjust`.
-
-    Returns
-    -------
-    dict
-        ``n``, ``f``, ``dof`` (of both), ``p``, and ``miss``: standard deviation of a coordinate that would explain it.
 
     References
     ----------
@@ -150,7 +184,7 @@ def fixed_record(adjustment: Adjustment, adjust: Adjust) -> dict[str, Any] | Non
     known = (network.u_xyz == 0)[there]
     off = _off(free.state.xyz[there], network.xyz[there], known, free, int(known.sum()) - redundant)
     miss = float(np.sqrt((off**2).sum() / redundant * max(1 - 1 / max(f, 1.0), 0.0)))
-    return {"n": int(there.sum()), "f": f, "dof": (redundant, free.dof), "p": float(stats.f.sf(f, redundant, free.dof)), "miss": miss}
+    return FixedPoints(int(there.sum()), f, (redundant, free.dof), float(stats.f.sf(f, redundant, free.dof)), miss)
 
 
 def _off(found: np.ndarray, given: np.ndarray, known: np.ndarray, free: Adjustment, missing: int) -> np.ndarray:
@@ -213,14 +247,14 @@ def check_known(
     group = group_record(adjustment, control_residuals(adjustment))
     if 2 * _wrong_points(again) > out or group is None:
         return left, adjustment.state  # with larger uncertainties they are wrong all the same
-    better = float(np.sqrt(group["factor"]))
-    gross = {**again.gross, "understated": [{"factor": factor * better}]}
-    return replace(_raised(again, control, better), gross=gross), adjustment.state
+    better = float(np.sqrt(group.factor))
+    faults = replace(again.faults, understated=factor * better)
+    return replace(_raised(again, control, better), faults=faults), adjustment.state
 
 
 def _wrong_points(checked: CheckedKnown) -> int:
     """Control points that are contradicted, or may be what is wrong instead."""
-    names = (name for record in checked.gross["control_points"] for name in (record["name"], *record["rivals"]))
+    names = (name for found in checked.faults.control_points for name in (found.name, *(found.rivals or ())))
     return len({name.rpartition(" ")[0] for name in names})
 
 
@@ -230,11 +264,11 @@ def _without_contradicted(
     for _ in range(MOST):
         adjustment = adjust(checked.network, state, used=used, redundancy=True)
         state = adjustment.state
-        kinds = {"scale_bars": bar_residuals(adjustment), "control_points": control_residuals(adjustment)}
+        kinds: dict[Kind, Known] = {"scale_bars": bar_residuals(adjustment), "control_points": control_residuals(adjustment)}
         worst = {kind: found for kind, known in kinds.items() if (found := contradicted(known, 1.0, dof))}
         if not worst:
             break
-        kind = max(worst, key=lambda kind: worst[kind][0]["statistic"])
+        kind = max(worst, key=lambda kind: worst[kind][0].statistic)
         known, found = kinds[kind], worst[kind]
         if kind == "control_points":
             joint = _together(adjustment, adjust)
@@ -269,7 +303,7 @@ def _understatement(network: Network, control: np.ndarray, clean: Adjustment) ->
     return float(np.sqrt(np.median(away**2 / np.mean(network.u_xyz[rows] ** 2, axis=1)) / stats.chi2.median(3)))
 
 
-def without_absurd_control(network: Network, state: State) -> tuple[Network, list[dict[str, Any]]]:
+def without_absurd_control(network: Network, state: State) -> tuple[Network, tuple[Contradicted, ...]]:
     """The network without weighted control points that lie far from where most of the others put them, such as those with swapped names;
     and their records."""
     from pixmetry.calibrate.start.resection import fitted
@@ -277,19 +311,21 @@ def without_absurd_control(network: Network, state: State) -> tuple[Network, lis
     control = np.isfinite(network.u_xyz).all(axis=1) & (network.u_xyz > 0).any(axis=1)
     rows = np.flatnonzero(control & np.isfinite(state.xyz).all(axis=1))
     if len(rows) <= LEAST_CONTROL:
-        return network, []
+        return network, ()
     away = fitted(state.xyz[rows], network.xyz[rows])[3]
     limit = ABSURD * float(np.ptp(network.xyz[rows], axis=0).max())
     bad = np.flatnonzero(away > limit)
     if not len(bad) or len(rows) - len(bad) < LEAST_CONTROL:
-        return network, []
-    size = {"critical": limit, "left_out": True}
-    measured = [(network.points[rows[i]], float(away[i])) for i in bad]
-    records = [{"name": name, "residual": off, "error": off, "statistic": off, **size} for name, off in measured]
-    return set_free(network, rows[bad]), records
+        return network, ()
+    return set_free(network, rows[bad]), tuple(_far_off(network.points[rows[i]], float(away[i]), limit) for i in bad)
 
 
-def in_frame_of_control(network: Network, state: State) -> tuple[Network, State, list[dict[str, Any]]]:
+def _far_off(name: str, off: float, limit: float) -> Contradicted:
+    """A control point that lies farther off than any error of measurement."""
+    return Contradicted(name, off, off, off, limit, left_out=True)
+
+
+def in_frame_of_control(network: Network, state: State) -> tuple[Network, State, tuple[Contradicted, ...]]:
     """The state in the frame in which most known coordinates of control points are right; the network without points that lie far from
     where it puts them; and their records.
 
@@ -305,15 +341,11 @@ def in_frame_of_control(network: Network, state: State) -> tuple[Network, State,
     limit = ABSURD * float(np.ptp(known, axis=0).max()) if len(known) else 0.0
     fit = far_from_control(state.xyz, network.xyz, u, limit) if (network.u_xyz > 0).all() else None
     if fit is None:
-        return network, state, []
+        return network, state, ()
     moved, miss = fit
     bad = np.flatnonzero((np.abs(miss) > np.maximum(limit, ABSURD_U * np.where(np.isfinite(u), u, 0.0))).any(axis=1))
-    records = []
-    for k in bad:
-        off = float(np.linalg.norm(miss[k]))
-        limits = {"statistic": off, "critical": limit, "left_out": True}
-        records.append({"name": network.points[k], "residual": off, "error": off, **limits})
-    return set_free(network, bad), in_frame(state, state.xyz, moved), records
+    found = tuple(_far_off(network.points[k], float(np.linalg.norm(miss[k])), limit) for k in bad)
+    return set_free(network, bad), in_frame(state, state.xyz, moved), found
 
 
 def _without_absurd(checked: CheckedKnown, state: State) -> tuple[CheckedKnown, State]:
@@ -332,14 +364,14 @@ def _without_absurd(checked: CheckedKnown, state: State) -> tuple[CheckedKnown, 
         found = "lengths over computed ones: " + ", ".join(f"{one:.6g}" for one in ratio)
         what = f"the {'two ' if len(bars) == 2 else ''}scale bars contradict each other"
         raise InputError(what, where="scale bars", value=found, remedy="check their units and points")
-    records, names = [], bar_names(checked.network)
+    found_bars, names = [], bar_names(checked.network)
     for i in bad:
         error = float(bars.length[i] - scale * computed[i])
-        limit = {"statistic": float(abs(error) / bars.u[i]), "critical": float(ABSURD * bars.length[i] / bars.u[i])}
-        records.append({"name": names[i], "residual": error, "error": error, **limit, "left_out": True})
+        statistic, critical = float(abs(error) / bars.u[i]), float(ABSURD * bars.length[i] / bars.u[i])
+        found_bars.append(Contradicted(names[i], error, error, statistic, critical, left_out=True))
     kept = np.setdiff1d(np.arange(len(bars)), bad)
     network = replace(checked.network, bars=ScaleBars(bars.start[kept], bars.end[kept], bars.length[kept], bars.u[kept]))
-    return CheckedKnown(network, {**checked.gross, "scale_bars": records}), state
+    return CheckedKnown(network, replace(checked.faults, scale_bars=tuple(found_bars))), state
 
 
 def _to_scale_of_control(state: State, network: Network) -> tuple[State, bool]:
@@ -361,21 +393,23 @@ def _enlarged(state: State, network: Network, scale: float) -> State:
     return replace(state, xyz=xyz, position=middle + scale * (state.position - middle))
 
 
-def _without(checked: CheckedKnown, known: Known, found: list[dict[str, Any]], kind: str) -> CheckedKnown:
+def _without(checked: CheckedKnown, known: Known, found: list[Contradicted], kind: Kind) -> CheckedKnown:
     """Leave out what is contradicted most, or, where it cannot be told from others, give all of these the uncertainty of their error."""
-    wrong = [known.name.index(record["name"]) for record in found]
+    wrong = [known.name.index(one.name) for one in found]
+    going: list[int] = []
     if kind == "scale_bars":
         others, alone = rivals(known, wrong, 1.0), True
         network = _less_bars(checked.network, known, wrong[0], others)
     else:
         going = _going(checked.network, known, wrong[0])
         alone = known.redundancy.sum() - len(going) > LEFT
-        others = rivals(known, wrong, 1.0) if alone else rivals(known, wrong[:1], 1.0, found[0]["critical"])
+        others = rivals(known, wrong, 1.0) if alone else rivals(known, wrong[:1], 1.0, found[0].critical)
         network = _less_control(checked.network, known, wrong[0], others, going if alone else [])
-    record = {**found[0], "left_out": alone and not others, "rivals": [known.name[i] for i in others]}
-    if kind == "control_points" and record["left_out"]:
-        record["axes"] = [k % 3 for k in going]
-    return CheckedKnown(network, {**checked.gross, kind: [*checked.gross[kind], record]})
+    left_out = bool(alone and not others)
+    axes = tuple(k % 3 for k in going) if left_out else ()
+    worst = replace(found[0], left_out=left_out, rivals=tuple(known.name[i] for i in others), axes=axes)
+    more = KnownFaults(scale_bars=(worst,)) if kind == "scale_bars" else KnownFaults(control_points=(worst,))
+    return CheckedKnown(network, checked.faults + more)
 
 
 def _supposed(known: Known, rows: list[int]) -> np.ndarray:
@@ -423,12 +457,12 @@ def _stated_of_bars(given: ScaleBars, used: ScaleBars) -> list[float]:
     return out
 
 
-def raised(given: Network, used: Network) -> list[dict[str, Any]]:
-    """Bars and control coordinates that are less certain in one network than they were given in another: ``kind``, ``name``, ``u``."""
+def raised(given: Network, used: Network) -> tuple[Raised, ...]:
+    """Bars and control coordinates that are less certain in one network than they were given in another."""
     out, bars = [], used.bars
     for i, (name, stated) in enumerate(zip(bar_names(used), _stated_of_bars(given.bars, bars), strict=True)):
         if bars.u[i] > stated:
-            out.append({"kind": "scale_bars", "name": name, "u": float(stated)})
+            out.append(Raised("scale_bars", name, float(stated)))
     for k, axis in np.argwhere(np.isfinite(used.u_xyz) & (used.u_xyz > given.u_xyz)):
-        out.append({"kind": "control_points", "name": f"{given.points[k]} {'XYZ'[axis]}", "u": float(given.u_xyz[k, axis])})
-    return out
+        out.append(Raised("control_points", f"{given.points[k]} {'XYZ'[axis]}", float(given.u_xyz[k, axis])))
+    return tuple(out)

@@ -12,13 +12,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
 from pixmetry.calibrate.bundle.network import Adjustment, Network, ScaleBars, State
 from pixmetry.calibrate.checks.snooping import LEAST_REDUNDANCY, finest_factor
 from pixmetry.calibrate.checks.variance_components import image_sigma0
+from pixmetry.calibrate.records import Contradicted, KnownGroup, Ratio
 
 LIKELY = 2 * np.log(100.0)  # difference of two squared statistics: odds of 100 that it is the one and not the other that is wrong
 SLIGHT = 1e-4  # redundancy from which on an error of something can be what others show
@@ -113,9 +113,8 @@ def jointly(network: Network, state: State) -> Network:
     return replace(network, bars=ScaleBars(*(np.concatenate(two) for two in zip((b.start, b.end, b.length, b.u), more, strict=True))))
 
 
-def contradicted(known: Known, sigma0: float, dof: float, false_alarms: float = 0.01) -> list[dict[str, Any]]:
-    """What the network contradicts, worst first: ``name``, ``residual``, ``error`` (estimated), ``statistic`` (of a normal test) and
-    ``critical``.
+def contradicted(known: Known, sigma0: float, dof: float, false_alarms: float = 0.01) -> list[Contradicted]:
+    """What the network contradicts, worst first.
 
     Parameters
     ----------
@@ -137,15 +136,7 @@ def contradicted(known: Known, sigma0: float, dof: float, false_alarms: float = 
         if not w[worst] > critical:
             break
         error = v[worst] * known.u[worst] ** 2 / q[worst, worst]
-        out.append(
-            {
-                "name": known.name[worst],
-                "residual": float(known.residual[worst]),
-                "error": float(error),
-                "statistic": float(w[worst]),
-                "critical": critical,
-            }
-        )
+        out.append(Contradicted(known.name[worst], float(known.residual[worst]), float(error), float(w[worst]), critical))
         v, q = _without(v, q, worst)
     return out
 
@@ -178,15 +169,8 @@ def _without(v: np.ndarray, q: np.ndarray, i: int) -> tuple[np.ndarray, np.ndarr
     return v, q
 
 
-def group_record(adjustment: Adjustment, known: Known) -> dict[str, Any] | None:
-    """Variance factor of a group (squared errors over squared stated uncertainties) and how surely it is not 1; None without redundancy.
-
-    Returns
-    -------
-    dict
-        ``factor``, ``dof``, ``p`` (two-sided F-test against the image coordinates), ``n``, and ``largest``: ``name`` and ``ratio`` (to
-        the stated uncertainty) of the largest residuals.
-    """
+def group_record(adjustment: Adjustment, known: Known) -> KnownGroup | None:
+    """Variance factor of a group; None without redundancy."""
     from scipy import stats
 
     dof = float(known.redundancy.sum())
@@ -196,5 +180,5 @@ def group_record(adjustment: Adjustment, known: Known) -> dict[str, Any] | None:
     factor = float((known.residual**2 / known.u**2).sum() / dof / max(sigma0**2, finest_factor(adjustment.network)))
     tail = stats.f.sf(factor, dof, dof_images)
     ratio = known.residual / known.u
-    largest = [{"name": known.name[i], "ratio": float(ratio[i])} for i in np.argsort(-np.abs(ratio))[:NAMED]]
-    return {"factor": factor, "dof": dof, "p": float(2 * min(tail, 1 - tail)), "n": len(known), "largest": largest}
+    largest = tuple(Ratio(known.name[i], float(ratio[i])) for i in np.argsort(-np.abs(ratio))[:NAMED])
+    return KnownGroup(factor, dof, float(2 * min(tail, 1 - tail)), len(known), largest)

@@ -4,11 +4,11 @@ image points take part again."""
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
 from pixmetry.calibrate.bundle.network import Adjustment, Network, State
+from pixmetry.calibrate.records import Contradicted
 from pixmetry.calibrate.start.resection import intersect, rays
 
 LEAST_RAYS = 3  # rejected rays that condemn a known point, where they are more than half
@@ -53,7 +53,7 @@ def where_seen(network: Network, adjustment: Adjustment, points: np.ndarray) -> 
     return replace(state, xyz=np.where(np.isfinite(found), found, state.xyz))
 
 
-def lost_records(given: Network, adjustment: Adjustment, points: np.ndarray) -> list[dict[str, Any]]:
+def lost_records(given: Network, adjustment: Adjustment, points: np.ndarray) -> tuple[Contradicted, ...]:
     """How far points that were set free lie from where they were said to be, along the axes of which something was said; statistic and
     critical value of a χ² test, as its root.
 
@@ -78,5 +78,5 @@ def lost_records(given: Network, adjustment: Adjustment, points: np.ndarray) -> 
             name, size = f"{name} {'XYZ'[axes[0]]}", float(off[0])
         statistic = float(np.sqrt(off @ np.linalg.solve(covariance, off)))
         critical = float(np.sqrt(stats.chi2.isf(0.01 / len(given.points), len(axes))))
-        records.append({"name": name, "residual": size, "error": size, "statistic": statistic, "critical": critical, "left_out": True})
-    return records
+        records.append(Contradicted(name, size, size, statistic, critical, left_out=True))
+    return tuple(records)

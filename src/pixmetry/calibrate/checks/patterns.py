@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from pixmetry.calibrate.bundle.network import Adjustment
 from pixmetry.calibrate.checks.added_terms import AddedTerms, Terms, whitening
 from pixmetry.calibrate.checks.quality import p_words, redundancy_of
+from pixmetry.calibrate.records import ByImage, Outstanding, Pattern
 from pixmetry.core.errors import MeasureError
 from pixmetry.core.finding import Finding
 from pixmetry.core.threads import single_threaded_blas
@@ -114,6 +115,10 @@ class _Seen:
     y: np.ndarray
     image: np.ndarray
 
+    def pattern(self, name: str, amplitude_px: float, u_px: float | None, p: float, **more: Any) -> Pattern:
+        """What was found of a pattern, before it is held against a level."""
+        return Pattern(name, self.adjustment.network.cameras[self.camera].name, amplitude_px, u_px, p, **more)
+
     def along(self, x: np.ndarray | None, y: np.ndarray | None) -> np.ndarray:
         """Terms, shape (m, 2, k), from columns, shape (rows of this camera, k), of what they add to x and to y."""
         columns = (x if x is not None else y).shape[1]
@@ -124,7 +129,7 @@ class _Seen:
         return out
 
 
-def residual_patterns(adjustment: Adjustment, level: float = 0.01) -> list[dict[str, Any]]:
+def residual_patterns(adjustment: Adjustment, level: float = 0.01) -> tuple[Pattern, ...]:
     """Test the residuals for patterns, each as if it had been estimated with everything else (see `added_terms`).
 
     Parameters
@@ -135,35 +140,32 @@ def residual_patterns(adjustment: Adjustment, level: float = 0.01) -> list[dict[
 
     Returns
     -------
-    list of dict
-        ``name``, ``camera``, ``amplitude_px``, ``u_px`` (None where the amplitude is an rms over several terms, with the part that noise
-        alone makes taken off), ``p``, ``level``, ``significant``, ``source`` (of the catalogue of error sources), ``text``, ``advice``.
-        ``x_scale_by_image`` and ``x_shift_by_image`` also hold ``images``, ``values`` and ``u``, and ``alone``: the one image that differs
-        from all others, if it is one; waves hold ``period_px``. Amplitudes:
-        of waves and phases their own; of trends the change from the first image to the last, at the edge of the frame; of curves, fields
-        and images the rms of what the residuals show of them; of ``image_rms`` the largest rms of an image, in x or in y, and if few images
-        stand out their names, ``images_out``, with ``rms_px`` (in x and y), the number of their image points that were ``rejected``, and
-        ``times_median``, how their weighted residuals compare with the median of the images, rejected ones counted.
+    tuple of Pattern
+        Amplitudes: of waves and phases their own; of trends the change from the first image to the last, at the edge of the frame; of
+        curves, fields and images the rms of what the residuals show of them, less the part that noise alone makes; of ``image_rms`` the
+        largest rms of an image, in x or in y.
     """
     with single_threaded_blas():
-        out = _of_cameras(adjustment)
-    for record in out:
-        what, source, advice = MEANING[record["name"]]
-        significant = bool(record["p"] < level / len(out))
-        number = f"{record['amplitude_px']:.4f} px" if record["u_px"] is None else f"{record['amplitude_px']:.4f} ± {record['u_px']:.4f} px"
-        period = f", period {record['period_px']:.3g} px" if "period_px" in record else ""
-        if record.get("alone"):
-            what, source = f"{what}, but only that of {record['alone']} from all others", ""
-            advice = "look at this image: focus, movement, light, names of points"
-        text = f"{what}: {number}{period}, {p_words(record['p'])}" if significant else f"not seen: {what} ({p_words(record['p'])})"
-        record |= {"level": level / len(out), "significant": significant, "source": source, "text": text, "advice": advice}
-    return out
+        found = _of_cameras(adjustment)
+    return tuple(_worded(replace(one, level=level / len(found), significant=bool(one.p < level / len(found)))) for one in found)
 
 
-def patterns_without_bad_images(adjustment: Adjustment, adjust: Callable[..., Adjustment]) -> list[dict[str, Any]]:
+def _worded(found: Pattern) -> Pattern:
+    """The pattern with its source and what is said of it."""
+    what, source, advice = MEANING[found.name]
+    number = f"{found.amplitude_px:.4f} px" if found.u_px is None else f"{found.amplitude_px:.4f} ± {found.u_px:.4f} px"
+    period = "" if found.period_px is None else f", period {found.period_px:.3g} px"
+    if found.alone:
+        what, source = f"{what}, but only that of {found.alone} from all others", ""
+        advice = "look at this image: focus, movement, light, names of points"
+    text = f"{what}: {number}{period}, {p_words(found.p)}" if found.significant else f"not seen: {what} ({p_words(found.p)})"
+    return replace(found, source=source, text=text, advice=advice)
+
+
+def patterns_without_bad_images(adjustment: Adjustment, adjust: Callable[..., Adjustment]) -> tuple[Pattern, ...]:
     """`residual_patterns`; if few images stand out by their residuals, those of an adjustment without them, but for ``image_rms``."""
     found = residual_patterns(adjustment)
-    bad = [name for r in found if r["significant"] for name in r.get("images_out", ())]
+    bad = [name for one in found if one.significant and one.outstanding for name in one.outstanding.images_out]
     if not bad:
         return found
     network = adjustment.network
@@ -172,14 +174,14 @@ def patterns_without_bad_images(adjustment: Adjustment, adjust: Callable[..., Ad
         again = residual_patterns(adjust(network, adjustment.state, used=used, redundancy=True))
     except MeasureError:  # the network hangs on them
         return found
-    return [*(r for r in again if r["name"] != "image_rms"), *(r for r in found if r["name"] == "image_rms")]
+    return (*(one for one in again if one.name != "image_rms"), *(one for one in found if one.name == "image_rms"))
 
 
-def _of_cameras(adjustment: Adjustment) -> list[dict[str, Any]]:
+def _of_cameras(adjustment: Adjustment) -> list[Pattern]:
     terms = AddedTerms(adjustment)
-    out: list[dict[str, Any]] = []
+    out: list[Pattern] = []
     network = adjustment.network
-    for k, camera in enumerate(network.cameras):
+    for k in range(len(network.cameras)):
         rows = terms.rows
         mine = network.camera_of[network.image[rows]] == k
         if mine.sum() < MANY:
@@ -188,30 +190,28 @@ def _of_cameras(adjustment: Adjustment) -> list[dict[str, Any]]:
         # places are the computed ones: measured ones hold the noise that is tested
         x, y = network.x_px[place] - adjustment.residual_px[place, 0], network.y_px[place] - adjustment.residual_px[place, 1]
         seen = _Seen(adjustment, terms, k, mine, x, y, network.image[place])
-        for record in _tests(seen):
-            out.append({"name": record.pop("name"), "camera": camera.name, **record})
+        out += _tests(seen)
     return out
 
 
-def pattern_findings(records: list[dict[str, Any]]) -> tuple[Finding, ...]:
+def pattern_findings(patterns: Sequence[Pattern]) -> tuple[Finding, ...]:
     """A warning for each significant pattern, the surest first."""
-    several = len({record["camera"] for record in records}) > 1
+    several = len({one.camera for one in patterns}) > 1
     out = []
-    for record in sorted((r for r in records if r["significant"]), key=lambda r: r["p"]):
-        where = f"{record['camera']}: " if several else ""
-        source = f" (as from {SOURCES[record['source']]}: {record['source']})" if record["source"] else ""
-        if record.get("images_out"):
-            out.append(_bad_images(record, where))
+    for one in sorted((one for one in patterns if one.significant), key=lambda one: one.p):
+        where = f"{one.camera}: " if several else ""
+        source = f" (as from {SOURCES[one.source]}: {one.source})" if one.source else ""
+        if one.outstanding:
+            out.append(_bad_images(one.outstanding, where))
             continue
-        kind = "x_scale_drift" if record["name"] in DRIFT and not record.get("alone") else record["name"]
-        advice = record["advice"][0].upper() + record["advice"][1:] + "."
-        out.append(Finding(kind, f"{where}{record['text']}{source}", advice, "warning"))
+        kind = "x_scale_drift" if one.name in DRIFT and not one.alone else one.name
+        out.append(Finding(kind, f"{where}{one.text}{source}", one.advice[0].upper() + one.advice[1:] + ".", "warning"))
     return tuple(out)
 
 
-def _bad_images(record: dict[str, Any], where: str) -> Finding:
-    found = list(zip(record["images_out"], record["rms_px"], record["rejected"], record["times_median"], strict=True))
-    named = ", ".join(f"{name} ({_size(*of_one)})" for name, *of_one in found[:NAMED])
+def _bad_images(bad: Outstanding, where: str) -> Finding:
+    found = list(zip(bad.images_out, bad.rms_px, bad.rejected, bad.times_median, strict=True))
+    named = ", ".join(f"{name} ({_size(rms_px, rejected, times)})" for name, rms_px, rejected, times in found[:NAMED])
     more = " …" if len(found) > NAMED else ""
     few = "1 image has residuals" if len(found) == 1 else f"{len(found)} images have residuals"
     text = f"{where}{few} much larger than the others: {named}{more}. Patterns in the residuals were sought without"
@@ -228,7 +228,7 @@ def _size(rms_px: Sequence[float], rejected: int, times: float) -> str:
     return f"{size}, {times:.1f} times the median"
 
 
-def _tests(seen: _Seen) -> Iterator[dict[str, Any]]:
+def _tests(seen: _Seen) -> Iterator[Pattern]:
     sensor = seen.adjustment.network.cameras[seen.camera].sensor
     xp, yp = seen.adjustment.state.interior[seen.camera, 1:3]
     dx, dy = seen.x - xp, seen.y - yp
@@ -275,9 +275,9 @@ def _legendre(x: np.ndarray, y: np.ndarray, cols: int, rows: int) -> np.ndarray:
     return across[:, i[kept]] * down[:, j[kept]]
 
 
-def _group(seen: _Seen, name: str, columns: Any) -> dict[str, Any]:
+def _group(seen: _Seen, name: str, columns: Any) -> Pattern:
     found = seen.terms.test(columns)
-    return {"name": name, "amplitude_px": _visible(seen, found, columns), "u_px": None, "p": found.p}
+    return seen.pattern(name, _visible(seen, found, columns), None, found.p)
 
 
 def _visible(seen: _Seen, found: Terms, columns: Any) -> float:
@@ -289,16 +289,16 @@ def _visible(seen: _Seen, found: Terms, columns: Any) -> float:
     return float(np.sqrt(max(found.fall - found.k * found.variance, 0.0) / touched.sum() * px2)) if found.k else 0.0
 
 
-def _harmonic(seen: _Seen, name: str, place: np.ndarray, axis: int, per_px: float) -> dict[str, Any]:
+def _harmonic(seen: _Seen, name: str, place: np.ndarray, axis: int, per_px: float) -> Pattern:
     angle = 2 * np.pi * per_px * place
     columns = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     found = seen.terms.test(seen.along(columns, None) if axis == 0 else seen.along(None, columns))
     amplitude = float(np.hypot(*found.values))
     unit = found.values / amplitude if amplitude > 0 else np.array([1.0, 0.0])
-    return {"name": name, "amplitude_px": amplitude, "u_px": float(np.sqrt(unit @ found.covariance @ unit)), "p": found.p}
+    return seen.pattern(name, amplitude, float(np.sqrt(unit @ found.covariance @ unit)), found.p)
 
 
-def _wave(seen: _Seen, name: str, place: np.ndarray, axis: int, size: int) -> dict[str, Any]:
+def _wave(seen: _Seen, name: str, place: np.ndarray, axis: int, size: int) -> Pattern:
     """The strongest of all waves from a period of 2 px to a quarter of the frame; p is that of the best of so many (Bonferroni)."""
     residual = seen.adjustment.residual_px[seen.terms.rows[seen.mine], axis]
     length = 2 * BINS_PER_PX * size
@@ -307,11 +307,11 @@ def _wave(seen: _Seen, name: str, place: np.ndarray, axis: int, size: int) -> di
     per_px = np.arange(len(power)) / (2 * size)
     allowed = (per_px <= 0.5) & (per_px >= 1 / (LONGEST_WAVE * size))
     best = per_px[np.argmax(np.where(allowed, power, -1.0))]
-    record = _harmonic(seen, name, place, axis, best)
-    return {**record, "p": min(1.0, record["p"] * int(allowed.sum())), "period_px": float(1 / best)}
+    found = _harmonic(seen, name, place, axis, best)
+    return replace(found, p=min(1.0, found.p * int(allowed.sum())), period_px=float(1 / best))
 
 
-def _over_images(seen: _Seen, dx: np.ndarray, dy: np.ndarray) -> Iterator[dict[str, Any]]:
+def _over_images(seen: _Seen, dx: np.ndarray, dy: np.ndarray) -> Iterator[Pattern]:
     network = seen.adjustment.network
     images = np.unique(seen.image)
     if len(images) < 3:
@@ -336,15 +336,15 @@ def _over_images(seen: _Seen, dx: np.ndarray, dy: np.ndarray) -> Iterator[dict[s
     yield _image_rms(seen, images)
 
 
-def _trend(seen: _Seen, name: str, columns: np.ndarray, edge_px: float) -> dict[str, Any]:
+def _trend(seen: _Seen, name: str, columns: np.ndarray, edge_px: float) -> Pattern:
     found = seen.terms.test(columns)
     size = float(np.linalg.norm(found.values))
     unit = found.values / size if size > 0 else np.eye(len(found.values))[0]
     u = float(np.sqrt(unit @ found.covariance @ unit)) if found.k else np.inf
-    return {"name": name, "amplitude_px": size * edge_px, "u_px": u * edge_px, "p": found.p}
+    return seen.pattern(name, size * edge_px, u * edge_px, found.p)
 
 
-def _by_image(seen: _Seen, name: str, images: np.ndarray, x: np.ndarray) -> dict[str, Any]:
+def _by_image(seen: _Seen, name: str, images: np.ndarray, x: np.ndarray) -> Pattern:
     """A value for each image, of sum 0: what is common to all belongs to affinity and principal point."""
     from scipy import sparse
 
@@ -353,11 +353,10 @@ def _by_image(seen: _Seen, name: str, images: np.ndarray, x: np.ndarray) -> dict
     contrasts = np.linalg.svd(np.eye(len(images)) - 1 / len(images))[0][:, :-1]
     found = seen.terms.test(columns, contrasts)
     u = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", contrasts, found.covariance, contrasts), 0.0))
-    names = [seen.adjustment.network.images[i] for i in images]
-    amplitude, values = _visible(seen, found, columns), contrasts @ found.values
-    record = {"name": name, "amplitude_px": amplitude, "u_px": None, "p": found.p, "images": names, "values": values, "u": u}
+    names, values = tuple(seen.adjustment.network.images[i] for i in images), contrasts @ found.values
     alone = int(np.argmax(np.abs(values) / np.maximum(u, 1e-300)))
-    return {**record, "alone": names[alone] if _alone(values, u, alone, found.dof) else None}
+    by_image = ByImage(names, values, u, names[alone] if _alone(values, u, alone, found.dof) else None)
+    return seen.pattern(name, _visible(seen, found, columns), None, found.p, by_image=by_image)
 
 
 def _alone(values: np.ndarray, u: np.ndarray, one: int, dof: float) -> bool:
@@ -381,7 +380,7 @@ def _rejected(seen: _Seen, most: float) -> tuple[np.ndarray, np.ndarray]:
     return np.bincount(image, squares, images), np.bincount(image, count, images)
 
 
-def _image_rms(seen: _Seen, images: np.ndarray) -> dict[str, Any]:
+def _image_rms(seen: _Seen, images: np.ndarray) -> Pattern:
     """Bartlett's test of equal variances, with the redundancy of each image (Proc. R. Soc. A 160 (1937) 268–282)."""
     from scipy import stats
 
@@ -397,7 +396,7 @@ def _image_rms(seen: _Seen, images: np.ndarray) -> dict[str, Any]:
     p = float(stats.chi2.sf(statistic / correction, len(dof) - 1)) if len(dof) > 1 else 1.0
     residual_px = seen.adjustment.residual_px[seen.terms.rows[seen.mine]]
     rms_px = np.sqrt(np.stack([np.bincount(place, axis**2) / np.bincount(place) for axis in residual_px.T], axis=1))[good]
-    record = {"name": "image_rms", "amplitude_px": float(rms_px.max()), "u_px": None, "p": p}
+    found = seen.pattern("image_rms", float(rms_px.max()), None, p)
     middle = float(np.median(np.sqrt(total / dof)))
     squares, coordinates = (part[images[good]] for part in _rejected(seen, WORST * middle))
     total, dof = total + squares, dof + coordinates
@@ -407,7 +406,7 @@ def _image_rms(seen: _Seen, images: np.ndarray) -> dict[str, Any]:
     out = out[stats.f.sf(rms[out] ** 2 / (total[rest].sum() / dof[rest].sum()), dof[out], dof[rest].sum()) < RARE / len(dof)]
     if 0 < len(out) <= len(dof) / FEW_OF:
         out = out[np.argsort(-rms[out])]
-        names = [seen.adjustment.network.images[i] for i in images[good][out]]
+        names = tuple(seen.adjustment.network.images[i] for i in images[good][out])
         rejected = (coordinates[out] / 2).astype(int).tolist()
-        record |= {"images_out": names, "rms_px": rms_px[out].tolist(), "rejected": rejected, "times_median": (rms[out] / middle).tolist()}
-    return record
+        return replace(found, outstanding=Outstanding(names, rms_px[out].tolist(), rejected, (rms[out] / middle).tolist()))
+    return found

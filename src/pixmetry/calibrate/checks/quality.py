@@ -3,29 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 
 from pixmetry.calibrate.bundle.model import NAMES, CameraModel
 from pixmetry.calibrate.bundle.network import PER_IMAGE_NAMES, Adjustment
+from pixmetry.calibrate.records import (
+    CameraResiduals,
+    Correlations,
+    FTest,
+    GroupTest,
+    ImageRecord,
+    ParameterTest,
+    PoseCorrelation,
+    Strongest,
+    Vision,
+)
 
 GROUPS = {"radial": ("k1", "k2", "k3", "k4", "k5"), "tangential": ("p1", "p2"), "affinity": ("b1", "b2")}
 TESTED = tuple(name for names in GROUPS.values() for name in names)  # 0 means something for these, not for c, xp and yp
-VISION = ("fx", "fy", "skew", "cx", "cy")
 SIGNIFICANT = 0.05
 POSE = ("rx", "ry", "rz", "X0", "Y0", "Z0", *PER_IMAGE_NAMES)
 
 
-def parameter_records(adjustment: Adjustment) -> list[dict[str, Any]]:
-    """Every estimated interior parameter with its uncertainty.
-
-    Returns
-    -------
-    list of dict
-        ``camera``, ``name``, ``value``, ``u``, ``unit``; ``p_zero``: two-sided t-test against 0 (None for c, xp and yp);
-        ``strongest``: the interior parameter of the same camera that it is most correlated with, and the correlation ``r`` (None if alone).
-    """
+def parameter_records(adjustment: Adjustment) -> tuple[ParameterTest, ...]:
+    """Every estimated interior parameter with its uncertainty."""
     from scipy import stats
 
     out = []
@@ -38,22 +41,13 @@ def parameter_records(adjustment: Adjustment) -> list[dict[str, Any]]:
             p_zero = float(2 * stats.t.sf(abs(value) / u, adjustment.dof)) if name in TESTED and u > 0 and adjustment.dof > 0 else None
             others = np.where(np.arange(len(names)) == i, 0.0, np.abs(matrix[i]))
             best = int(np.argmax(others))
-            strongest = {"with": names[best], "r": float(matrix[i, best])} if len(names) > 1 else None
-            out.append(
-                {"camera": camera.name, "name": name, "value": value, "u": u, "unit": camera.units[place], "p_zero": p_zero,
-                 "strongest": strongest}
-            )  # fmt: skip
-    return out
+            strongest = Strongest(names[best], float(matrix[i, best])) if len(names) > 1 else None
+            out.append(ParameterTest(camera.name, name, value, u, camera.units[place], p_zero, strongest))
+    return tuple(out)
 
 
-def group_records(adjustment: Adjustment) -> list[dict[str, Any]]:
-    """Joint F-tests against 0 of parameters that can stand for each other, as the radial ones can.
-
-    Returns
-    -------
-    list of dict
-        ``camera``, ``group``, ``names``, ``f``, ``dof``: (numerator, denominator), ``p``.
-    """
+def group_records(adjustment: Adjustment) -> tuple[GroupTest, ...]:
+    """Joint F-tests against 0 of parameters that can stand for each other, as the radial ones can."""
     from scipy import stats
 
     out = []
@@ -68,9 +62,8 @@ def group_records(adjustment: Adjustment) -> list[dict[str, Any]]:
             z = values / u
             f = float(z @ np.linalg.solve(covariance[np.ix_(rows, rows)] / np.outer(u, u), z)) / len(rows)
             dof = (len(rows), adjustment.dof)
-            record = {"camera": camera.name, "group": group, "names": [names[i] for i in rows], "f": f, "dof": dof}
-            out.append({**record, "p": float(stats.f.sf(f, *dof))})
-    return out
+            out.append(GroupTest(camera.name, group, tuple(names[i] for i in rows), f, dof, float(stats.f.sf(f, *dof))))
+    return tuple(out)
 
 
 def correlation_of(covariance: np.ndarray) -> np.ndarray:
@@ -80,17 +73,17 @@ def correlation_of(covariance: np.ndarray) -> np.ndarray:
     return np.clip(covariance / np.outer(u, u), -1.0, 1.0)
 
 
-def correlation_records(adjustment: Adjustment) -> dict[str, dict[str, Any]]:
-    """Correlations of the interior parameters: by camera ``names`` and ``matrix``."""
+def correlation_records(adjustment: Adjustment) -> dict[str, Correlations]:
+    """Correlations of the interior parameters, by camera."""
     out = {}
     for k, camera in enumerate(adjustment.network.cameras):
         names, covariance = adjustment.interior_covariance(k)
-        out[camera.name] = {"names": list(names), "matrix": correlation_of(covariance)}
+        out[camera.name] = Correlations(names, correlation_of(covariance))
     return out
 
 
-def pose_correlations(adjustment: Adjustment, most: int = 20) -> list[dict[str, Any]]:
-    """Strongest correlations of interior parameters with poses: records of ``a``, ``b``, ``r``, strongest first.
+def pose_correlations(adjustment: Adjustment, most: int = 20) -> tuple[PoseCorrelation, ...]:
+    """Strongest correlations of interior parameters with poses, strongest first.
 
     Of each interior parameter and each kind of pose parameter (such as c with Z0) only the image where it is strongest.
     """
@@ -111,11 +104,11 @@ def pose_correlations(adjustment: Adjustment, most: int = 20) -> list[dict[str, 
                 best = places[np.argmax(np.abs(block[row, places]))]
                 strongest[i, str(kind)] = (float(np.clip(block[row, best], -1, 1)), poses[best])
     ranked = sorted(strongest.items(), key=lambda item: -abs(item[1][0]))[:most]
-    return [{"a": adjustment.free_columns[i], "b": adjustment.free_columns[j], "r": r} for (i, _), (r, j) in ranked]
+    return tuple(PoseCorrelation(adjustment.free_columns[i], adjustment.free_columns[j], r) for (i, _), (r, j) in ranked)
 
 
-def vision_records(adjustment: Adjustment) -> dict[str, dict[str, float]]:
-    """Focal lengths fx, fy, skew and principal point cx, cy, px, with their uncertainties (``u_fx`` …), by camera.
+def vision_records(adjustment: Adjustment) -> dict[str, Vision]:
+    """Focal lengths fx, fy, skew and principal point cx, cy, px, with their uncertainties, by camera.
 
     x = fx X/Z + skew Y/Z + cx, y = fy Y/Z + cy: exactly the linear part of a distortion from object to image; of one from image to object
     it is the slope at the principal point, c/(1 + b1), c and −c b2/(1 + b1) in pixels.
@@ -124,8 +117,7 @@ def vision_records(adjustment: Adjustment) -> dict[str, dict[str, float]]:
     for k in range(len(adjustment.network.cameras)):
         camera = adjustment.camera(k)
         values, covariance = propagated(adjustment, k, _vision)
-        record = dict(zip(VISION, values.tolist(), strict=True))
-        out[camera.name] = record | {f"u_{name}": float(u) for name, u in zip(VISION, np.sqrt(np.diag(covariance)), strict=True)}
+        out[camera.name] = Vision(*values.tolist(), *np.sqrt(np.diag(covariance)).tolist())
     return out
 
 
@@ -157,23 +149,16 @@ def redundancy_of(adjustment: Adjustment) -> np.ndarray:
     return np.where(adjustment.used[:, None], adjustment.dof / (2 * adjustment.used.sum()), 0.0) * np.ones((1, 2))
 
 
-def residual_records(adjustment: Adjustment) -> dict[str, dict[str, Any]]:
-    """Residuals by camera: ``n`` image points, rms of x and y in px and µm (None without a pitch), degrees of freedom ``dof_x``, ``dof_y``.
-
-    The degrees of freedom are sums of redundancy numbers: what the adjustment has left of n.
-    """
+def residual_records(adjustment: Adjustment) -> dict[str, CameraResiduals]:
+    """Number, rms and degrees of freedom of the residuals, by camera."""
     network, out = adjustment.network, {}
     redundancy = redundancy_of(adjustment)
     for k, camera in enumerate(network.cameras):
         rows = adjustment.used & (network.camera_of[network.image] == k)
         rms = np.sqrt(np.mean(adjustment.residual_px[rows] ** 2, axis=0)) if rows.any() else np.full(2, np.nan)
         dof = redundancy[rows].sum(axis=0)
-        um = rms * 1000 * np.array(camera.sensor.per_px) if camera.sensor.pitch_x_um is not None else (None, None)
-        out[camera.name] = {
-            "n": int(rows.sum()), "rms_x_px": float(rms[0]), "rms_y_px": float(rms[1]),
-            "rms_x_um": um[0] if um[0] is None else float(um[0]), "rms_y_um": um[1] if um[1] is None else float(um[1]),
-            "dof_x": float(dof[0]), "dof_y": float(dof[1]),
-        }  # fmt: skip
+        um = (rms * 1000 * np.array(camera.sensor.per_px)).tolist() if camera.sensor.pitch_x_um is not None else (None, None)
+        out[camera.name] = CameraResiduals(int(rows.sum()), float(rms[0]), float(rms[1]), um[0], um[1], float(dof[0]), float(dof[1]))
     return out
 
 
@@ -217,8 +202,8 @@ def f_test(variance_x: float, variance_y: float, dof_x: float, dof_y: float) -> 
     return float(ratio), float(stats.f.isf(0.05, dof_x, dof_y)), float(stats.f.sf(ratio, dof_x, dof_y))
 
 
-def f_test_records(adjustment: Adjustment, dof: dict[str, tuple[float, float]] | None = None) -> dict[str, dict[str, Any]]:
-    """F-test of the noise of x against that of y, by camera.
+def f_test_records(adjustment: Adjustment, dof: dict[str, tuple[float, float]] | None = None) -> dict[str, FTest]:
+    """F-test of the noise of x against that of y, by camera; none of a camera without redundancy.
 
     Jitter of lines can only enlarge x, so the test is one-sided. It depends on the unit if pixels are not square: both are given. The
     variances are Σ v² / Σ r; where a priori variances s differ from point to point, their degrees of freedom are (Σ r s)² / Σ r s²
@@ -229,12 +214,6 @@ def f_test_records(adjustment: Adjustment, dof: dict[str, tuple[float, float]] |
     adjustment : Adjustment
     dof : mapping, optional
         Degrees of freedom of x and y by camera name, where errors are common to many points, as to those of one line.
-
-    Returns
-    -------
-    dict
-        By camera: ``ratio_px2``, ``p_px``, ``ratio_um2``, ``p_um`` (None without a pitch), ``dof_x``, ``dof_y``, ``critical_95``, ``side``,
-        ``text``. No entry for a camera without redundancy.
     """
     network, out = adjustment.network, {}
     redundancy = redundancy_of(adjustment)
@@ -247,31 +226,28 @@ def f_test_records(adjustment: Adjustment, dof: dict[str, tuple[float, float]] |
         from_points = (r * a_priori).sum(axis=0) ** 2 / (r * a_priori**2).sum(axis=0)
         dof_x, dof_y = (dof or {}).get(camera.name, from_points)
         ratio, critical, p = f_test(variance[0], variance[1], dof_x, dof_y)
-        record: dict[str, Any] = {"ratio_px2": ratio, "p_px": p, "ratio_um2": None, "p_um": None}
-        record |= {"dof_x": float(dof_x), "dof_y": float(dof_y)}
+        ratio_um2 = p_um = None
         if camera.sensor.pitch_x_um is not None:
             um2 = variance * (1000 * np.array(camera.sensor.per_px)) ** 2
-            record["ratio_um2"], _, record["p_um"] = f_test(um2[0], um2[1], dof_x, dof_y)
-        out[camera.name] = {**record, "critical_95": critical, "side": "x noisier than y", "text": _f_text(record, critical)}
+            ratio_um2, _, p_um = f_test(um2[0], um2[1], dof_x, dof_y)
+        found = FTest(ratio, p, ratio_um2, p_um, float(dof_x), float(dof_y), critical, "x noisier than y", "")
+        out[camera.name] = replace(found, text=_f_text(found))
     return out
 
 
-def _f_text(record: dict[str, Any], critical: float) -> str:
-    text = f"variance of x over that of y: {record['ratio_px2']:.3f} in px² ({p_words(record['p_px'])})"
-    if record["ratio_um2"] is not None:
-        text += f", {record['ratio_um2']:.3f} in µm² ({p_words(record['p_um'])})"
-    dof = f"{record['dof_x']:.0f} and {record['dof_y']:.0f} degrees of freedom"
-    verdict = "x is noisier than y" if record["p_px"] < SIGNIFICANT else "x is not significantly noisier than y"
-    if record["p_px"] > 1 - SIGNIFICANT:
+def _f_text(found: FTest) -> str:
+    text = f"variance of x over that of y: {found.ratio_px2:.3f} in px² ({p_words(found.p_px)})"
+    if found.ratio_um2 is not None and found.p_um is not None:
+        text += f", {found.ratio_um2:.3f} in µm² ({p_words(found.p_um)})"
+    dof = f"{found.dof_x:.0f} and {found.dof_y:.0f} degrees of freedom"
+    verdict = "x is noisier than y" if found.p_px < SIGNIFICANT else "x is not significantly noisier than y"
+    if found.p_px > 1 - SIGNIFICANT:
         verdict = "y is noisier than x"
-    return f"{text}; one-sided, {dof}, critical at 95 %: {critical:.3f}; in px, {verdict}"
+    return f"{text}; one-sided, {dof}, critical at 95 %: {found.critical_95:.3f}; in px, {verdict}"
 
 
-def image_records(adjustment: Adjustment, rejected: Mapping[str, int] | None = None) -> list[dict[str, Any]]:
-    """One record an image: ``image``, ``camera``, ``oriented``, ``n`` used, ``rejected``, ``measured``, rms of x and y (None without
-    points), ``time_s``, and the image's ``x_scale``, ``x_shift_px`` with their uncertainties (None where they are not estimated).
-
-    Of an image that is not oriented nothing was rejected: it took no part.
+def image_records(adjustment: Adjustment, rejected: Mapping[str, int] | None = None) -> tuple[ImageRecord, ...]:
+    """One record an image.
 
     Parameters
     ----------
@@ -287,14 +263,11 @@ def image_records(adjustment: Adjustment, rejected: Mapping[str, int] | None = N
         used, oriented = mine & adjustment.used, bool(np.isfinite(state.position[i]).all())
         out_of_it = int((mine & ~used).sum()) if rejected is None else rejected.get(name, 0)
         rms = np.sqrt(np.mean(adjustment.residual_px[used] ** 2, axis=0)).tolist() if used.any() else (None, None)
-        record: dict[str, Any] = {
-            "image": name, "camera": network.cameras[network.camera_of[i]].name, "oriented": oriented, "n": int(used.sum()),
-            "rejected": out_of_it if oriented else 0, "measured": int(mine.sum()), "rms_x_px": rms[0], "rms_y_px": rms[1],
-            "time_s": None if network.time_s is None else float(network.time_s[i]),
-        }  # fmt: skip
-        for kind, key, value in (("x_scale", "x_scale", state.x_scale[i]), ("x_shift", "x_shift_px", state.x_shift_px[i])):
+        own: list[float | None] = []
+        for kind, value in (("x_scale", state.x_scale[i]), ("x_shift", state.x_shift_px[i])):
             place = places.get(f"{name}:{kind}")
-            record[key] = None if place is None else float(value)
-            record[f"u_{key}"] = None if place is None else float(np.sqrt(max(adjustment.covariance[place, place], 0.0)))
-        out.append(record)
-    return out
+            own += (None, None) if place is None else (float(value), float(np.sqrt(max(adjustment.covariance[place, place], 0.0))))
+        time_s, camera = None if network.time_s is None else float(network.time_s[i]), network.cameras[network.camera_of[i]].name
+        out_of_it = out_of_it if oriented else 0
+        out.append(ImageRecord(name, camera, oriented, int(used.sum()), out_of_it, int(mine.sum()), rms[0], rms[1], time_s, *own))
+    return tuple(out)

@@ -13,6 +13,7 @@ import numpy as np
 
 from pixmetry.calibrate.bundle.network import Adjustment
 from pixmetry.calibrate.checks.quality import p_fall
+from pixmetry.calibrate.records import ResidualGrid
 from pixmetry.core.threads import single_threaded_blas
 
 POINTS_PER_NODE = 12  # more nodes than the data carry alone: the penalty smooths, and bilinear cells stay small
@@ -24,7 +25,7 @@ LEVEL = 0.01
 
 def residual_grids(
     adjustment: Adjustment, nodes: tuple[int, int] | None = None, folds: int = 5, seed: int = 0
-) -> dict[str, dict[str, Any]]:
+) -> dict[str, ResidualGrid]:
     """Correction grids of the cameras whose left-out images get better by them.
 
     Parameters
@@ -40,9 +41,7 @@ def residual_grids(
     Returns
     -------
     dict
-        By camera: ``x_px``, ``y_px`` (nodes), ``dx_px``, ``dy_px``, ``u_px`` (of a value), ``n`` (image points about each node), shape
-        (rows, cols) each; ``rms_without_px``, ``rms_with_px`` (of a coordinate, images left out), ``p`` of the fall (paired over images).
-        Values are measured less computed: subtract them from what is measured.
+        By camera; ``p`` is paired over images.
     """
     from pixmetry.core.random import generator
 
@@ -64,9 +63,9 @@ def residual_grids(
         penalty = min(PENALTIES, key=lambda value: float(np.sum(left[value] ** 2)))
         p = min(1.0, len(PENALTIES) * p_fall(v, left[penalty], image))  # over all smoothings tried (Bonferroni)
         if p < LEVEL:
-            record = _fitted(hats, v, roughness, penalty, shape)
-            rms = {"rms_without_px": float(np.sqrt(np.mean(v**2))), "rms_with_px": float(np.sqrt(np.mean(left[penalty] ** 2)))}
-            out[camera.name] = {"x_px": axes[0], "y_px": axes[1], **record, **rms, "p": p}
+            rms = float(np.sqrt(np.mean(v**2))), float(np.sqrt(np.mean(left[penalty] ** 2)))
+            dx, dy, u, n = _fitted(hats, v, roughness, penalty, shape)
+            out[camera.name] = ResidualGrid(axes[0], axes[1], dx, dy, u, n, *rms, p)
     return out
 
 
@@ -124,7 +123,8 @@ def _left_out(hats: Any, v: np.ndarray, roughness: np.ndarray, penalty: float, f
     return out
 
 
-def _fitted(hats: Any, v: np.ndarray, roughness: np.ndarray, penalty: float, shape: tuple[int, int]) -> dict[str, Any]:
+def _fitted(hats: Any, v: np.ndarray, roughness: np.ndarray, penalty: float, shape: tuple[int, int]) -> list[np.ndarray]:
+    """What a `ResidualGrid` holds at its nodes: dx, dy, u and n, shape (rows, cols) each."""
     from scipy import linalg
 
     values, factor = _solved(hats, v, roughness, penalty)
@@ -135,33 +135,32 @@ def _fitted(hats: Any, v: np.ndarray, roughness: np.ndarray, penalty: float, sha
     # with the prior that the penalty stands for, the inverse is the covariance, smoothing included (G. Wahba, J. R. Stat. Soc. B 45, 1983)
     u = np.sqrt(sigma2 * np.diag(inverse))
     count = np.rint(np.asarray(hats.sum(axis=0)).ravel()).astype(int)
-    return {"dx_px": values[:, 0].reshape(grid), "dy_px": values[:, 1].reshape(grid), "u_px": u.reshape(grid), "n": count.reshape(grid)}
+    return [part.reshape(grid) for part in (values[:, 0], values[:, 1], u, count)]
 
 
-def at(grid: dict[str, Any], x_px: np.ndarray, y_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def at(grid: ResidualGrid, x_px: np.ndarray, y_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """What a grid says of the residual (measured less computed) at some places, px; beyond its edge, what it says there.
 
     Parameters
     ----------
-    grid : dict
-        As from `residual_grids`.
+    grid : ResidualGrid
     x_px, y_px : ndarray
         Of one shape.
     """
     x, y = np.broadcast_arrays(np.asarray(x_px, float), np.asarray(y_px, float))
-    hats = _hats(x.ravel(), y.ravel(), np.asarray(grid["x_px"], float), np.asarray(grid["y_px"], float))
-    dx, dy = (np.asarray(hats @ np.ravel(grid[name])).reshape(x.shape) for name in ("dx_px", "dy_px"))
+    hats = _hats(x.ravel(), y.ravel(), grid.x_px, grid.y_px)
+    dx, dy = (np.asarray(hats @ np.ravel(part)).reshape(x.shape) for part in (grid.dx_px, grid.dy_px))
     return dx, dy
 
 
-def corrected(grid: dict[str, Any], x_px: np.ndarray, y_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def corrected(grid: ResidualGrid, x_px: np.ndarray, y_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Image coordinates corrected by the grid of their camera, as they were measured less what the grid says: what the parameters of the
     camera then stand for.
 
     Parameters
     ----------
-    grid : dict
-        As from `residual_grids`, or out of ``grids`` of a calibration, stored or not.
+    grid : ResidualGrid
+        Out of ``grids`` of a calibration, stored or not.
     x_px, y_px : ndarray
         Of one shape.
     """

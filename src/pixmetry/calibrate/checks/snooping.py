@@ -24,6 +24,7 @@ import numpy as np
 
 from pixmetry.calibrate.bundle.network import Adjustment, Network, State
 from pixmetry.calibrate.checks.few_rays import Mended, mend
+from pixmetry.calibrate.records import GrossError
 
 LEAST_REDUNDANCY = 0.01  # below it, in a direction, an error of an image point would not show in its residual
 FINEST_PX = 1e-4  # no image coordinate is better: what lies below is no error, and weights stay within what numbers hold
@@ -177,9 +178,8 @@ def remove_gross_errors(
     return Snooped(adjustment, alpha, rejected)
 
 
-def gross_error_records(adjustment: Adjustment, alpha: float, rejected: Rejected | None = None) -> list[dict[str, Any]]:
-    """The image points that are out, largest statistic first: names, residual and estimated error in px, statistic and critical value, and
-    ``swapped_with``: the point of the same image that it seems to have exchanged its name with, or None.
+def gross_error_records(adjustment: Adjustment, alpha: float, rejected: Rejected | None = None) -> tuple[GrossError, ...]:
+    """The image points that are out, largest statistic first.
 
     Where nothing can be tested any more, for a point has too few rays left, the values are those of the time of rejection.
     """
@@ -194,20 +194,20 @@ def gross_error_records(adjustment: Adjustment, alpha: float, rejected: Rejected
         )
     out = np.flatnonzero(~adjustment.used & np.isfinite(statistic))
     swapped = _swapped(network, out, residual)
-    return [
-        {
-            "image": network.images[network.image[i]],
-            "point": network.points[network.point[i]],
-            "residual_x_px": float(residual[i, 0]),
-            "residual_y_px": float(residual[i, 1]),
-            "error_x_px": float(error[i, 0]),
-            "error_y_px": float(error[i, 1]),
-            "statistic": float(statistic[i]),
-            "critical": float(critical[i]),
-            "swapped_with": network.points[network.point[swapped[i]]] if i in swapped else None,
-        }
+    return tuple(
+        GrossError(
+            network.images[network.image[i]],
+            network.points[network.point[i]],
+            float(residual[i, 0]),
+            float(residual[i, 1]),
+            float(error[i, 0]),
+            float(error[i, 1]),
+            float(statistic[i]),
+            float(critical[i]),
+            network.points[network.point[swapped[i]]] if i in swapped else None,
+        )
         for i in out[np.argsort(-statistic[out])]
-    ]
+    )
 
 
 def _swapped(network: Network, out: np.ndarray, residual_px: np.ndarray) -> dict[int, int]:

@@ -28,12 +28,12 @@ K. R. Koch, Parameter Estimation and Hypothesis Testing (1999), 3.6.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
 from pixmetry.calibrate.bundle.network import Adjustment, Network
 from pixmetry.calibrate.checks.snooping import Adjust, finest_factor
+from pixmetry.calibrate.records import AxisComponent, CameraComponents
 
 LEAST_DOF = 10.0  # redundancy below which a group does not get a factor of its own
 LEAST_IN_IMAGE = 5.0  # redundancy of an axis in an image, for a ratio
@@ -74,40 +74,34 @@ class Components:
     iterations: int
     by_axis: bool = True
 
-    def records(self) -> dict[str, dict[str, Any]]:
-        """By camera, for x and y: ``sigma_x_px`` with ``u_sigma_x_px`` and ``given_x_px`` (rms over its image points; the latter: before),
-        ``beyond_x_px`` with ``u_beyond_x_px`` (added to what was given; None where a factor was estimated instead), ``factor_x``,
-        ``dof_x``, ``estimated_x``; and ``common``: whether x and y have one size (``by_axis``: though two were asked for)."""
+    def records(self) -> dict[str, CameraComponents]:
+        """By camera."""
         network, used = self.adjustment.network, self.adjustment.used
-        out: dict[str, dict[str, Any]] = {}
+        out = {}
         for k, camera in enumerate(network.cameras):
             rows = used & (network.camera_of[network.image] == k)
-            record: dict[str, Any] = {"iterations": self.iterations, "common": bool(self.group[k, 0] == self.group[k, 1])}
-            record["by_axis"] = self.by_axis
-            for axis, name in enumerate("xy"):
-                one = _record(network.covariance_px2[rows, 2 * axis], self.given_px2[rows, 2 * axis], self, (k, axis))
-                record |= {key.replace("_x", f"_{name}"): value for key, value in one.items()}
-            out[camera.name] = record
+            x, y = (_record(network.covariance_px2[rows, 2 * i], self.given_px2[rows, 2 * i], self, (k, i)) for i in (0, 1))
+            out[camera.name] = CameraComponents(self.iterations, bool(self.group[k, 0] == self.group[k, 1]), self.by_axis, x, y)
         return out
 
 
-def _record(variance: np.ndarray, given: np.ndarray, found: Components, group: tuple[int, int]) -> dict[str, Any]:
+def _record(variance: np.ndarray, given: np.ndarray, found: Components, group: tuple[int, int]) -> AxisComponent:
     factor, added, u = float(found.sizes.factor[group]), float(found.sizes.added_px2[group]), float(found.u_factor[group])
     sigma = float(np.sqrt(variance.mean())) if len(variance) else float("nan")
     u_added = u / float(np.mean(1 / variance)) if len(variance) else float("nan")  # what moves Σ v²/(s + τ²) by u of itself
     beyond = u_beyond = None
     if found.sizes.adds[group]:
         beyond, u_beyond = np.sqrt(added), u_added / max(2 * np.sqrt(added), np.sqrt(u_added)) if np.isfinite(u_added) else float("inf")
-    return {
-        "sigma_x_px": sigma,
-        "u_sigma_x_px": u_added / (2 * sigma) if found.sizes.adds[group] else sigma * u / 2,
-        "given_x_px": float(np.sqrt(given.mean())) if len(given) else float("nan"),
-        "beyond_x_px": None if beyond is None else float(beyond),
-        "u_beyond_x_px": None if u_beyond is None else float(u_beyond),
-        "factor_x": factor,
-        "dof_x": float(found.dof[group]),
-        "estimated_x": bool(found.sizes.estimated[group]),
-    }
+    return AxisComponent(
+        sigma_px=sigma,
+        u_sigma_px=u_added / (2 * sigma) if found.sizes.adds[group] else sigma * u / 2,
+        given_px=float(np.sqrt(given.mean())) if len(given) else float("nan"),
+        beyond_px=None if beyond is None else float(beyond),
+        u_beyond_px=None if u_beyond is None else float(u_beyond),
+        factor=factor,
+        dof=float(found.dof[group]),
+        estimated=bool(found.sizes.estimated[group]),
+    )
 
 
 @dataclass(frozen=True)

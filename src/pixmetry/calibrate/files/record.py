@@ -13,9 +13,9 @@ from typing import Any, TypeVar
 import numpy as np
 
 from pixmetry.calibrate.bundle.model import NAMES, CameraModel, Sensor
-from pixmetry.calibrate.bundle.network import Calibration
 from pixmetry.calibrate.checks.control import control_of
 from pixmetry.calibrate.lines.line_calibration import LineCalibration
+from pixmetry.calibrate.records import Calibration, ResidualGrid, Tests, read_record, record_of
 from pixmetry.core.checksums import check_record, sealed
 from pixmetry.core.config import read_text
 from pixmetry.core.errors import InputError
@@ -54,8 +54,9 @@ class StoredCalibration:
     dof : int
     datum : str
     findings : tuple of Finding
-    tests, grids, provenance : dict
-        As in `pixmetry.calibrate.bundle.network.Calibration`; None where a number was not finite.
+    tests : Tests
+    grids, provenance : dict
+        As in `pixmetry.calibrate.records.Calibration`.
     """
 
     cameras: tuple[CameraModel, ...]
@@ -73,8 +74,8 @@ class StoredCalibration:
     dof: int
     datum: str
     findings: tuple[Finding, ...]
-    tests: dict[str, Any]
-    grids: dict[str, Any]
+    tests: Tests
+    grids: dict[str, ResidualGrid]
     provenance: dict[str, Any]
 
     def interior_covariance(self, index: int = 0) -> tuple[tuple[str, ...], np.ndarray]:
@@ -127,8 +128,8 @@ def _record(calibration: Calibration) -> dict[str, Any]:
         "covariance": {"columns": a.free_columns, **packed(a.covariance)},
         "findings": [finding.to_record() for finding in calibration.findings],
         "notes": a.notes,
-        "tests": calibration.tests,
-        "grids": calibration.grids,
+        "tests": record_of(calibration.tests),
+        "grids": {name: record_of(grid) for name, grid in calibration.grids.items()},
         "provenance": calibration.provenance,
     }
 
@@ -161,7 +162,7 @@ def lines_json(calibration: LineCalibration, folder: str | Path = "", beside: It
         "sigma_px": result.sigma_px,
         "iterations": result.iterations,
         **result.to_record(),
-        "curves": calibration.curves(),
+        "curves": record_of(calibration.curves()),
         "findings": [finding.to_record() for finding in calibration.findings],
         "provenance": calibration.provenance,
     }
@@ -261,7 +262,9 @@ def _stored(record: Mapping[str, Any]) -> StoredCalibration:
         xyz=xyz,
         point_covariance=six[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3),
         findings=tuple(Finding.from_record(finding) for finding in record["findings"]),
-        **{name: record[name] for name in ("unit", "sigma0", "dof", "datum", "tests", "grids", "provenance")},
+        tests=read_record(Tests, record["tests"]),
+        grids={name: read_record(ResidualGrid, grid) for name, grid in record["grids"].items()},
+        **{name: record[name] for name in ("unit", "sigma0", "dof", "datum", "provenance")},
     )
 
 

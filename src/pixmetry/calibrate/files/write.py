@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from pixmetry.calibrate.bundle.network import Calibration
 from pixmetry.calibrate.files.record import PIXELS, calibration_json, lines_json
 from pixmetry.calibrate.lines.line_calibration import LineCalibration
+from pixmetry.calibrate.records import Calibration
 from pixmetry.camera.camera import Camera
 from pixmetry.core.plain_text import cell, comment
 from pixmetry.files.output import check_output, staged_output

@@ -10,6 +10,7 @@ import numpy as np
 
 from pixmetry.calibrate.bundle.model import CameraModel
 from pixmetry.calibrate.lines.plumb_line import PlumbLineResult
+from pixmetry.calibrate.records import DistortionCurves
 from pixmetry.core.finding import Finding
 
 RADII = 101
@@ -46,7 +47,7 @@ class LineCalibration:
         """The camera; its c is 0 unless it was given: lines do not tell it."""
         return self.result.camera
 
-    def curves(self) -> dict[str, Any]:
+    def curves(self) -> DistortionCurves:
         """Radial and tangential correction against the radius with standard uncertainties, as of `calibration.curves`.
 
         Both are linear in K, and √(P1² + P2²) is taken to first order.
@@ -59,12 +60,12 @@ class LineCalibration:
         size = float(np.hypot(camera["p1"], camera["p2"]))
         radial = {name: radius**power for name, power in TERMS.items()}
         tangential = {name: camera[name] / size * radius**2 for name in ("p1", "p2")} if size else {}
-        out: dict[str, Any] = {"unit": sensor.unit, "radius": radius}
+        made: dict[str, Any] = {}
         for kind, slopes in (("radial", radial), ("tangential", tangential)):
             if not any(name in slopes for name in free):
                 continue
             rows = np.array([slopes.get(name, np.zeros_like(radius)) for name in free])
             value = sum((camera[name] * slope for name, slope in slopes.items()), np.zeros_like(radius))
             u = np.sqrt(np.maximum(np.einsum("ir,ij,jr->r", rows, covariance, rows), 0.0))
-            out |= {kind: value, f"u_{kind}": u, f"{kind}_px": value / mx, f"u_{kind}_px": u / mx}
-        return out
+            made |= {kind: value, f"u_{kind}": u, f"{kind}_px": value / mx, f"u_{kind}_px": u / mx}
+        return DistortionCurves(sensor.unit, radius, **made)

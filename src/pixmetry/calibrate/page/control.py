@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,7 +11,7 @@ from pixmetry.calibrate.page.text import placed
 from pixmetry.report.numbers import NONE, fixed, signed, significant
 
 if TYPE_CHECKING:
-    from pixmetry.calibrate.bundle.network import Calibration
+    from pixmetry.calibrate.records import Calibration, Contradicted
 
 
 def control_points(calibration: Calibration) -> list[list[str]]:
@@ -21,9 +20,9 @@ def control_points(calibration: Calibration) -> list[list[str]]:
     What no image point is left of has no adjusted value; what weighs less now, for the network contradicts it, is marked.
     """
     network, control = calibration.adjustment.network, control_of(calibration)
-    gross = list(((calibration.tests.get("known") or {}).get("control_points") or {}).get("gross") or ())
-    rows = [_left_out(record) for record in gross if record.get("left_out")]
-    contradicted = {record["name"] for record in gross}
+    gross = calibration.tests.known.control_points.gross if calibration.tests.known is not None else ()
+    rows = [_left_out(one) for one in gross if one.left_out]
+    contradicted = {one.name for one in gross}
     for k in range(len(control)):
         name = f"{network.points[control.point[k]]} {'XYZ'[control.axis[k]]}"
         u, residual = float(control.u[k]), float(control.residual[k])
@@ -36,8 +35,8 @@ def control_points(calibration: Calibration) -> list[list[str]]:
     return rows
 
 
-def _left_out(record: Mapping[str, Any]) -> list[str]:
-    return [f"{record['name']} (left out)", NONE, NONE, _two_digits(record["error"]), NONE]
+def _left_out(one: Contradicted) -> list[str]:
+    return [f"{one.name} (left out)", NONE, NONE, _two_digits(one.error), NONE]
 
 
 def _two_digits(number: float) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
     from pixmetry.calibrate.bundle.model import Sensor
     from pixmetry.calibrate.bundle.network import Adjustment
+    from pixmetry.calibrate.records import ResidualGrid
 
 MOST_VECTORS = 3000  # in a figure, from which on they are stored as pixels
 SHEET_COLS, SHEET_ROWS = 3, 4  # images on a sheet of small ones
@@ -178,21 +179,19 @@ def mean_vectors(r: Residuals, name: str) -> Figure | None:
         return Figure(figure, f"{name}-means", alt, caption)
 
 
-def grid_vectors(grid: Mapping[str, Any], sensor: Sensor, name: str) -> Figure | None:
+def grid_vectors(grid: ResidualGrid, sensor: Sensor, name: str) -> Figure | None:
     """The correction grid: what the parameters leave over, at its nodes."""
-    x, y = np.meshgrid(np.asarray(grid["x_px"], float), np.asarray(grid["y_px"], float))
-    dx, dy = (np.asarray(grid[key], float) for key in ("dx_px", "dy_px"))
+    x, y = np.meshgrid(grid.x_px, grid.y_px)
+    dx, dy = grid.dx_px, grid.dy_px
     good = np.isfinite(dx + dy)
     if not good.any():
         return None
     with canvas(frame_height(sensor)) as (figure, axes):
         factor = draw_vectors(axes, x[good], y[good], dx[good], dy[good], sensor)
         caption = f"Correction grid of {x.shape[1]} × {x.shape[0]} nodes, {significant(factor, 1)} times enlarged."
-        if grid.get("u_px") is not None:
-            caption += f" A node is known to {significant(float(np.nanmedian(np.asarray(grid['u_px'], float))), 2)} px (median u)."
-        if grid.get("rms_with_px") is not None:
-            before, after = (significant(float(grid[key]), 3) for key in ("rms_without_px", "rms_with_px"))
-            caption += f" In images left out, it takes the residuals from {before} px to {after} px rms."
+        caption += f" A node is known to {significant(float(np.nanmedian(grid.u_px)), 2)} px (median u)."
+        before, after = (significant(rms, 3) for rms in (grid.rms_without_px, grid.rms_with_px))
+        caption += f" In images left out, it takes the residuals from {before} px to {after} px rms."
         return Figure(figure, f"{name}-grid", f"Correction vectors at {int(good.sum())} nodes of a grid over the sensor", caption)
 
 

@@ -16,8 +16,8 @@ from pixmetry.calibrate.page.check_points import check_points
 from pixmetry.calibrate.page.control import control_points
 from pixmetry.calibrate.page.text import (
     DIRECTIONS,
+    of_camera,
     projection_levels,
-    record_of,
     residual_record,
     sentence,
     sigma0_text,
@@ -31,8 +31,8 @@ from pixmetry.report.templates import filled, share_styles
 
 if TYPE_CHECKING:
     from pixmetry.calibrate.bundle.model import CameraModel
-    from pixmetry.calibrate.bundle.network import Calibration
     from pixmetry.calibrate.page.figures import Residuals
+    from pixmetry.calibrate.records import Calibration, DistortionCurves, EccentricityRecord, FieldTest, HoldOut
 
 WORST_IMAGES = 6  # on each of the two sheets that are not folded
 VERDICTS = {"fixed": "held as given", "free": "estimated anew, as its given coordinates are not exact enough"}
@@ -61,7 +61,7 @@ def _content(calibration: Calibration) -> dict[str, Any]:
     from pixmetry.calibrate.page.space import field_map, network_views, plan_views
 
     adjustment, tests = calibration.adjustment, calibration.tests
-    net, field = adjustment.network, tests.get("field")
+    net, field, held = adjustment.network, tests.field, tests.hold_out
     cameras = [_camera(calibration, k) for k in range(len(net.cameras))]
     return {
         "version": __version__,
@@ -69,19 +69,19 @@ def _content(calibration: Calibration) -> dict[str, Any]:
         "facts": tables.network_facts(calibration),
         "sigma0": sigma0_text(calibration),
         "findings": [replace(f, text=typeset(sentence(f.text)), advice=typeset(sentence(f.advice))) for f in calibration.findings],
-        "tested": bool(tests),
+        "tested": tests.made,
         "cameras": cameras,
-        "poses": [(_full(r["a"]), _full(r["b"]), fixed(r["r"], 2)) for r in tests.get("correlations_with_poses") or ()],
-        "patterns": tables.patterns(tests.get("patterns") or (), len(cameras) > 1),
-        "gross": tables.gross_errors(tests.get("gross_errors") or ()),
-        "gross_tested": "gross_errors" in tests,
-        "images": tables.images(tests["images"]) if tests.get("images") else None,
-        "hold_out": tables.hold_out(tests.get("hold_out")),
-        "hold_out_text": _hold_out(tests.get("hold_out") or {}),
-        "eccentricity": _eccentricity(tests.get("eccentricity")),
-        "folds": (tests.get("hold_out") or {}).get("folds"),
+        "poses": [(_full(r.a), _full(r.b), fixed(r.r, 2)) for r in tests.correlations_with_poses or ()],
+        "patterns": tables.patterns(tests.patterns or (), len(cameras) > 1),
+        "gross": tables.gross_errors(tests.gross_errors or ()),
+        "gross_tested": tests.gross_errors is not None,
+        "images": tables.images(tests.images) if tests.images else None,
+        "hold_out": tables.hold_out(held),
+        "hold_out_text": _hold_out(held),
+        "eccentricity": _eccentricity(tests.eccentricity),
+        "folds": held and held.folds,
         "field": _field(field) if field else None,
-        "field_map": field_map(adjustment, field["points"]) if field and field.get("points") else None,
+        "field_map": field_map(adjustment, field.compared.deviations.points) if field and field.compared else None,
         "views": network_views(adjustment),
         "plans": plan_views(adjustment),
         "points": tables.worst_points(calibration),
@@ -101,25 +101,25 @@ def _camera(calibration: Calibration, k: int) -> dict[str, Any]:
     """Everything that the page shows of one camera."""
     model = calibration.adjustment.camera(k)
     found = residual_record(calibration, k)
-    levels = projection_levels(record_of(calibration, "projection", model.name))
+    levels = projection_levels(of_camera(calibration.tests.projection, model.name))
     if levels is not None and not any(levels):
         levels = None  # nothing was estimated of this camera
-    test = record_of(calibration, "f_test", model.name) or {}
+    test = of_camera(calibration.tests.f_test, model.name)
     parameters = tables.parameters(calibration, k)
     return {
         "name": model.name,
         "worth": worth(calibration, k),
-        "verdict": [(axis, length_px(found[f"rms_{axis}_px"]), _um(found.get(f"rms_{axis}_um"))) for axis in "xy"] if found["n"] else [],
+        "verdict": [(axis, length_px(one.rms_px), _um(one.rms_um)) for axis, one in found.axes.items()] if found.n else [],
         "levels": levels and [length_px(v) for v in levels],
         "facts": camera_facts(model),
         "direction": DIRECTIONS[model.direction],
         "parameters": parameters,
         "known": any(r["u"].startswith("±") for r in parameters),
-        "groups": tables.groups(calibration.tests.get("parameter_groups") or (), model.name),
+        "groups": tables.groups(calibration.tests.parameter_groups or (), model.name),
         "vision": tables.vision(calibration, model.name),
         "axes": tables.axes(calibration, k),
         "f_test": tables.f_test(calibration, model.name),
-        "f_text": typeset(sentence(test.get("text", ""))),
+        "f_text": typeset(sentence(test.text if test is not None else "")),
         **_pictures(calibration, k),
     }
 
@@ -149,38 +149,39 @@ def _pictures(calibration: Calibration, k: int) -> dict[str, Any]:
     from pixmetry.calibrate.page import figures as over
     from pixmetry.calibrate.page import plots
 
-    adjustment = calibration.adjustment
+    adjustment, tests = calibration.adjustment, calibration.tests
     model, name = adjustment.camera(k), f"c{k + 1}"
     r = over.Residuals.of(adjustment, k)
     out: dict[str, Any] = {"matrix": [], "lens": [], "sensor": [], "plots": [], "worst": [], "sheets": [], "undrawn": 0}
-    correlations = record_of(calibration, "correlations", model.name)
-    if correlations is not None and len(correlations["names"]) > 1:
-        out["matrix"] = [plots.correlation_map(correlations["names"], correlations["matrix"], name)]
-    curves, projection = record_of(calibration, "curves", model.name), record_of(calibration, "projection", model.name)
+    correlations = of_camera(tests.correlations, model.name)
+    if correlations is not None and len(correlations.names) > 1:
+        out["matrix"] = [plots.correlation_map(correlations.names, correlations.matrix, name)]
+    curves, projection = of_camera(tests.curves, model.name), of_camera(tests.projection, model.name)
     out["lens"] = plots.curve_pictures(_bent(curves, model), model.direction, name) if curves is not None else []
-    if projection is not None and np.nanmax(np.asarray(projection["u_px"], float), initial=0.0) > 0:
+    if projection is not None and np.nanmax(projection.u_px, initial=0.0) > 0:
         out["lens"].append(plots.projection_map(projection, model.sensor, name))
     if len(r):
         out["sensor"] = [over.residual_vectors(r, name), over.mean_vectors(r, name)]
         out["plots"] = [plots.against_radius(r, (model["xp"], model["yp"]), name), plots.against_phase(r, name)]
         out |= _sheets(calibration, r, name)
-    grid = record_of(calibration, "residual_grid", model.name) or calibration.grids.get(model.name)
+    grid = of_camera(tests.residual_grid, model.name) or calibration.grids.get(model.name)
     if grid is not None:
         out["sensor"].append(over.grid_vectors(grid, model.sensor, name))
-    records = [i for i in calibration.tests.get("images") or () if i["camera"] == model.name and i["n"] > 0]
+    records = [i for i in tests.images or () if i.camera == model.name and i.n > 0]
     if len(records) > 1:
         out["plots"].append(plots.by_image(records, name))
     out["sensor"] = [p for p in out["sensor"] if p is not None]
     return out | {"thinned": bool(len(r)) and int(np.bincount(r.image).max()) > over.MOST_IN_SMALL}
 
 
-def _bent(curves: Mapping[str, Any], model: CameraModel) -> dict[str, Any]:
+def _bent(curves: DistortionCurves, model: CameraModel) -> DistortionCurves:
     """Curves without those of terms that are 0 and were not estimated."""
     held = {name for name, free, value in zip(NAMES, model.free, model.values, strict=True) if not free and not value}
-    straight = {"tangential"} if {"p1", "p2"} <= held else set()
+    if {"p1", "p2"} <= held:
+        curves = replace(curves, tangential=None)
     if {name for name in NAMES if name[0] == "k"} <= held:
-        straight |= {"radial", "balanced"}
-    return {key: None if key in straight else value for key, value in curves.items()}
+        curves = replace(curves, radial=None, balanced=None)
+    return curves
 
 
 def _sheets(calibration: Calibration, r: Residuals, name: str) -> dict[str, Any]:
@@ -211,43 +212,45 @@ def _short(name: str, most: int = 22) -> str:
     return name if len(name) <= most else "…" + name[1 - most :]
 
 
-def _field(field: Mapping[str, Any]) -> dict[str, Any]:
-    unit = field.get("unit", "")
-    sizes = [f"{significant(float(field[key]), 2)} {unit} {word}" for key, word in (("rms", "rms"), ("peak", "at most")) if field.get(key)]
-    p = tables.p_text(field.get("p"))
-    verdict = VERDICTS.get(field.get("verdict", ""), str(field.get("verdict", "")))
+def _field(field: FieldTest) -> dict[str, Any]:
+    compared, text = field.compared, typeset(sentence(field.text))
+    if compared is None:
+        return {"verdict": VERDICTS[field.verdict], "text": text, "moved": []}
+    off, p = compared.deviations, tables.p_text(compared.p)
+    sizes = [f"{significant(size, 2)} {off.unit} {word}" for size, word in ((off.rms, "rms"), (off.peak, "at most")) if size]
     said = "" if p == NONE else f" (p {p if p[0] == '<' else '= ' + p})"
-    text = typeset(sentence(field.get("text", "")))
     if sizes:
         text = f"The adjusted points lie {' and '.join(sizes)} off their given places{said}."
-    if field.get("shape") == "plane" and field.get("rms_in_plane") is not None:
-        inside = f"{significant(float(field['rms_in_plane']), 2)} {unit}"
+    if off.shape == "plane" and off.rms_in_plane is not None:
+        inside = f"{significant(off.rms_in_plane, 2)} {off.unit}"
         text = f"The points leave their best plane by {' and '.join(sizes)}, and lie {inside} rms off in it{said}."
-    if sizes and field.get("u"):
-        text += f" Their own uncertainty (k = 1) makes {significant(float(field['u']), 2)} {unit} rms of the former."
-    return {"verdict": verdict, "text": text, "moved": tables.moved(field)}
+    if sizes and off.u:
+        text += f" Their own uncertainty (k = 1) makes {significant(off.u, 2)} {off.unit} rms of the former."
+    return {"verdict": VERDICTS[field.verdict], "text": text, "moved": tables.moved(compared)}
 
 
-def _hold_out(found: Mapping[str, Any]) -> str:
+def _hold_out(found: HoldOut | None) -> str:
+    if found is None:
+        return ""
     texts = []
-    p = tables.p_text(found.get("p"))
-    if p != NONE and found.get("fixed") and found.get("free"):
+    p = tables.p_text(found.p)
+    if p != NONE and found.fixed and found.free:
         told = p if p[0] == "<" else f"= {p}"
         texts.append(f"That the rms of images left out falls with free points has p {told} (paired over the images).")
-    if found.get("expected_median_px"):
+    if found.expected_median_px:
         texts.append(
-            f"With noise alone, half of the residuals of images left out would be above {length_px(found['expected_median_px'])} px: "
+            f"With noise alone, half of the residuals of images left out would be above {length_px(found.expected_median_px)} px: "
             "points that few images see are worse known without one of them."
         )
     return " ".join(texts)
 
 
-def _eccentricity(found: Mapping[str, Any] | None) -> str:
-    if not found or not found.get("corrected"):
+def _eccentricity(found: EccentricityRecord | None) -> str:
+    if found is None or not found.corrected:
         return ""
     return (
-        f"{found['corrected']} image points were corrected for the eccentricity of circular targets, by at most "
-        f"{length_px(found['largest_px'])} px."
+        f"{found.corrected} image points were corrected for the eccentricity of circular targets, by at most "
+        f"{length_px(found.largest_px)} px."
     )
 
 

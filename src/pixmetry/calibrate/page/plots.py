@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from pixmetry.calibrate.bundle.model import Sensor
+    from pixmetry.calibrate.records import DistortionCurves, ImageRecord, ProjectionMap
 
 COVER_95 = 1.96
 WIDE_RANGE = 6.0  # of a map, from which its colours are logarithmic
@@ -117,23 +118,24 @@ def correlation_map(names: Sequence[str], matrix: np.ndarray, name: str) -> Figu
         return Figure(figure, f"{name}-correlations", f"Correlation matrix of {n} interior parameters", caption)
 
 
-def curve_pictures(curves: Mapping[str, Any], direction: str, name: str) -> list[Figure]:
+def curve_pictures(curves: DistortionCurves, direction: str, name: str) -> list[Figure]:
     """Radial, balanced and tangential distortion with their 95 % bands; ``direction`` as of a `CameraModel`."""
     what = "correction" if direction == "image_to_object" else "distortion"
-    unit, radius = curves["unit"], np.asarray(curves["radius"], float)
+    unit, radius = curves.unit, curves.radius
     scaled = 1000.0 if unit == "mm" else 1.0
     shown = "µm" if unit == "mm" else unit
-    made, forms = [], (("radial", BLUE, "-"), ("balanced", RED, "--"), ("tangential", BLUE, "-"))
-    for kind, members in (("radial", forms[:2]), ("tangential", forms[2:])):
-        parts = [p for p in members if curves.get(p[0]) is not None]
+    made = []
+    forms = (("radial", curves.radial_curve, BLUE, "-"), ("balanced", curves.balanced_curve, RED, "--"))
+    for kind, members in (("radial", forms), ("tangential", (("tangential", curves.tangential_curve, BLUE, "-"),))):
+        parts = [(key, curve, colour, dash) for key, curve, colour, dash in members if curve is not None]
         if not parts:
             continue
         with canvas(2.4) as (figure, axes):
             axes.axhline(0, color=SOFT, linewidth=0.6)
-            for key, colour, dash in parts:
-                value = scaled * np.asarray(curves[key], float)
-                if curves.get(f"u_{key}") is not None:
-                    half = COVER_95 * scaled * np.asarray(curves[f"u_{key}"], float)
+            for key, curve, colour, dash in parts:
+                value = scaled * curve.value
+                if curve.u is not None:
+                    half = COVER_95 * scaled * curve.u
                     axes.fill_between(radius, value - half, value + half, color=colour, alpha=0.25, linewidth=0)
                 axes.plot(radius, value, dash, color=colour, label=key)
             axes.set_xlabel(f"distance from the principal point / {unit}")
@@ -144,29 +146,27 @@ def curve_pictures(curves: Mapping[str, Any], direction: str, name: str) -> list
     return made
 
 
-def _curve_caption(kind: str, what: str, curves: Mapping[str, Any]) -> str:
+def _curve_caption(kind: str, what: str, curves: DistortionCurves) -> str:
     """What is drawn, and its size at the largest radius with the 95 % band."""
-    unit, scaled = curves["unit"], 1000.0 if curves["unit"] == "mm" else 1.0
+    unit, scaled = curves.unit, 1000.0 if curves.unit == "mm" else 1.0
+    curve = curves.tangential_curve if kind == "tangential" else curves.radial_curve
     text = f"Tangential (decentring) {what}, √(P1² + P2²) r²" if kind == "tangential" else f"Radial {what} of the radius"
     text += ", with its 95 % band"
-    if curves.get(kind) is not None and curves.get(f"u_{kind}") is not None:
-        r, value, u = (float(np.asarray(curves[key], float)[-1]) for key in ("radius", kind, f"u_{kind}"))
+    if curve is not None and curve.u is not None:
+        r, value, u = (float(part[-1]) for part in (curves.radius, curve.value, curve.u))
         number = uncertain(scaled * value, COVER_95 * scaled * u, "um" if unit == "mm" else unit)
         text += f": {number.value} ± {number.u} {number.unit} at {significant(r)} {unit}"
-        if unit == "mm" and curves.get(f"{kind}_px") is not None:
-            value_px, u_px = (float(np.asarray(curves[key], float)[-1]) for key in (f"{kind}_px", f"u_{kind}_px"))
-            px = uncertain(value_px, COVER_95 * u_px, "px")
+        if unit == "mm" and curve.value_px is not None and curve.u_px is not None:
+            px = uncertain(float(curve.value_px[-1]), COVER_95 * float(curve.u_px[-1]), "px")
             text += f" ({px.value} ± {px.u} px)"
-    balanced = curves.get("balanced_c")
-    if kind == "radial" and curves.get("balanced") is not None and balanced is not None:
-        text += f". Balanced: the same lens with a principal distance of {significant(float(balanced), 5)} {unit}"
+    if kind == "radial" and curves.balanced is not None and curves.balanced_c is not None:
+        text += f". Balanced: the same lens with a principal distance of {significant(curves.balanced_c, 5)} {unit}"
     return text + "."
 
 
-def projection_map(p: Mapping[str, Any], sensor: Sensor, name: str) -> Figure:
+def projection_map(p: ProjectionMap, sensor: Sensor, name: str) -> Figure:
     """Standard uncertainty of a projected direction over the sensor."""
-    u = np.asarray(p["u_px"], float)
-    x, y = np.asarray(p["x_px"], float), np.asarray(p["y_px"], float)
+    u, x, y = p.u_px, p.x_px, p.y_px
     half_x, half_y = (float(np.ptp(v)) / max(len(v) - 1, 1) / 2 for v in (x, y))
     extent = (x.min() - half_x, x.max() + half_x, y.max() + half_y, y.min() - half_y)
     wide = float(np.nanmax(u)) > WIDE_RANGE * float(np.nanmin(u)) > 0
@@ -187,22 +187,22 @@ def projection_map(p: Mapping[str, Any], sensor: Sensor, name: str) -> Figure:
         return Figure(figure, f"{name}-projection", alt, caption)
 
 
-def by_image(records: Sequence[Mapping[str, Any]], name: str) -> Figure:
+def by_image(records: Sequence[ImageRecord], name: str) -> Figure:
     """Residuals image by image in the order of time, and the x-scale where it was estimated."""
-    timed = all(r.get("time_s") is not None for r in records)
-    at = np.array([r["time_s"] for r in records], float) if timed else np.arange(1, len(records) + 1, dtype=float)
+    timed = all(r.time_s is not None for r in records)
+    at = np.array([r.time_s for r in records], float) if timed else np.arange(1, len(records) + 1, dtype=float)
     factor, label = (1.0, "image") if not timed else (1 / 60, "time / min") if np.ptp(at) > 300 else (1.0, "time / s")
-    scale = np.array([np.nan if r.get("x_scale") is None else r["x_scale"] for r in records], float)
+    scale = np.array([r.x_scale for r in records], float)
     scaled = bool(np.isfinite(scale).any())
     with canvas(3.4 if scaled else 2.2, nrows=1 + scaled, sharex=True, squeeze=False) as (figure, grid):
         top, size = grid[0, 0], 3.0 if len(records) < 80 else 1.5
-        for axis, colour, marker in (("x", BLUE, "o"), ("y", RED, "s")):
-            rms = np.array([np.nan if r[f"rms_{axis}_px"] is None else r[f"rms_{axis}_px"] for r in records], float)
+        rms_px = np.array([(r.rms_x_px, r.rms_y_px) for r in records], float)
+        for axis, rms, colour, marker in zip("xy", rms_px.T, (BLUE, RED), "os", strict=True):
             top.plot(factor * at, rms, marker, color=colour, linestyle="none", markersize=size, label=f"{axis}, rms")
         top.set_ylim(0, 1.15 * top.get_ylim()[1])
         top.set_ylabel("residuals / px")
         if scaled:
-            u = np.array([np.nan if r.get("u_x_scale") is None else r["u_x_scale"] for r in records], float)
+            u = np.array([r.u_x_scale for r in records], float)
             low = grid[1, 0]
             low.axhline(0, color=SOFT, linewidth=0.6)
             low.errorbar(factor * at, 1e6 * scale, yerr=2e6 * u, fmt="o", color=INK, markersize=size, elinewidth=0.24 * size)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,6 +15,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from pixmetry.calibrate.bundle.network import Adjustment
+    from pixmetry.calibrate.records import FieldPoints
 
 COLOURS = (BLUE, RED, AMBER)
 SIDES = ((-60.0, 25.0), (35.0, 10.0))  # azimuth and elevation from which a network is looked at, degrees
@@ -163,14 +163,11 @@ def plan_views(adjustment: Adjustment) -> list[Figure]:
     return made
 
 
-def field_map(adjustment: Adjustment, points: Mapping[str, Any]) -> Figure | None:
-    """How far the test field's points lie off their nominal places: height as colour, the rest as arrows.
-
-    ``points`` holds ``xyz`` (nominal, in the object's axes), ``dx``, ``dy``, ``dz`` and ``axes``: the rows in which these are given.
-    """
+def field_map(adjustment: Adjustment, points: FieldPoints) -> Figure | None:
+    """How far the test field's points lie off their nominal places: height as colour, the rest as arrows."""
     net = adjustment.network
-    nominal, axes_of = np.asarray(points["xyz"], float).reshape(-1, 3), np.asarray(points.get("axes", np.eye(3)), float)
-    dx, dy, dz = (np.asarray(points[key], float) for key in ("dx", "dy", "dz"))
+    nominal, axes_of = points.xyz, points.axes
+    dx, dy, dz = points.dx, points.dy, points.dz
     good = np.isfinite(nominal).all(axis=1) & np.isfinite(dx + dy + dz)
     if not good.any():
         return None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,10 +13,10 @@ from pixmetry.calibrate.page.text import (
     as_given,
     counts,
     length,
+    of_camera,
     p_text,
     parameter_records,
     placed,
-    record_of,
     residual_record,
     sentence,
     shown,
@@ -25,11 +25,10 @@ from pixmetry.calibrate.page.text import (
 from pixmetry.report.numbers import NO_BREAK, NONE, fixed, length_px, signed, significant, uncertain
 
 if TYPE_CHECKING:
-    from pixmetry.calibrate.bundle.network import Calibration
+    from pixmetry.calibrate.records import Calibration, FieldComparison, GrossError, GroupTest, HoldOut, ImageRecord, Pattern
 
 MOST_POINTS = 20  # in the table of those that are known worst
 NOT_SIGNIFICANT = 0.05
-VISION = (("fx", "fx"), ("fy", "fy"), ("skew", "skew"), ("cx", "cx"), ("cy", "cy"))
 
 
 def value(number: Any, digits: int = 3) -> str:
@@ -48,17 +47,17 @@ def parameters(calibration: Calibration, camera: int) -> list[dict[str, str]]:
     rows = []
     for r in parameter_records(calibration, camera):
         number = shown(r)
-        strongest, p = r.get("strongest"), r.get("p_zero")
-        off = r["value"] - centre.get(r["name"], np.nan)
+        strongest, p = r.strongest, r.p_zero
+        off = r.value - centre.get(r.name, np.nan)
         rows.append(
             {
-                "title": TITLES[r["name"]],
-                "symbol": symbol(r["name"]),
+                "title": TITLES[r.name],
+                "symbol": symbol(r.name),
                 "value": number.value,
-                "u": "held fixed" if r["fixed"] else "" if number.u == NONE else f"± {number.u}",
+                "u": "held fixed" if r.fixed else "" if number.u == NONE else f"± {number.u}",
                 "unit": number.unit,
                 "p": "" if p is None else p_text(p) + (", not significant" if p > NOT_SIGNIFICANT else ""),
-                "with": f"{symbol(strongest['with'])} {fixed(strongest['r'], 2)}" if strongest else "",
+                "with": f"{symbol(strongest.with_)} {fixed(strongest.r, 2)}" if strongest else "",
                 "off": f"{signed(off, length_px)}{NO_BREAK}px from the middle" if np.isfinite(off) else "",
             }
         )
@@ -67,31 +66,27 @@ def parameters(calibration: Calibration, camera: int) -> list[dict[str, str]]:
 
 def vision(calibration: Calibration, name: str) -> list[tuple[str, str, str]]:
     """The same camera in the words of computer vision: name, value, u; in px."""
-    found = record_of(calibration, "vision", name) or {}
+    found = of_camera(calibration.tests.vision, name)
     rows = []
-    for key, title in VISION:
-        if found.get(key) is not None:
-            u = found.get(f"u_{key}")
-            held = u is not None and float(u) == 0
-            number = as_given(float(found[key]), "px") if held else uncertain(float(found[key]), np.nan if u is None else float(u), "px")
-            rows.append((title, number.value, "" if number.u == NONE else f"± {number.u}"))
+    for title, value, u in () if found is None else found.rows:
+        number = as_given(value, "px") if u == 0 else uncertain(value, u, "px")
+        rows.append((title, number.value, "" if number.u == NONE else f"± {number.u}"))
     return rows
 
 
 def axes(calibration: Calibration, camera: int) -> list[dict[str, str]]:
     """Residuals of x and of y, their degrees of freedom, and the standard deviation by variance components."""
     name = calibration.adjustment.network.cameras[camera].name
-    found, parts = residual_record(calibration, camera), record_of(calibration, "variance_components", name) or {}
+    found, parts = residual_record(calibration, camera), of_camera(calibration.tests.variance_components, name)
     rows = []
-    for axis in "xy":
-        sigma, u = parts.get(f"sigma_{axis}_px"), parts.get(f"u_sigma_{axis}_px")
-        number = None if sigma is None else uncertain(sigma, float("nan") if u is None else u, "px")
+    for (axis, one), part in zip(found.axes.items(), (None, None) if parts is None else (parts.x, parts.y), strict=True):
+        number = None if part is None else uncertain(part.sigma_px, part.u_sigma_px, "px")
         rows.append(
             {
                 "axis": axis,
-                "n": str(found["n"]),
-                "rms": length(found[f"rms_{axis}_px"], found.get(f"rms_{axis}_um")),
-                "dof": NONE if found.get(f"dof_{axis}") is None else f"{found[f'dof_{axis}']:.0f}",
+                "n": str(found.n),
+                "rms": length(one.rms_px, one.rms_um),
+                "dof": NONE if one.dof is None else f"{one.dof:.0f}",
                 "sigma": "" if number is None else number.value + ("" if number.u == NONE else f" ± {number.u}") + f"{NO_BREAK}px",
             }
         )
@@ -100,33 +95,30 @@ def axes(calibration: Calibration, camera: int) -> list[dict[str, str]]:
 
 def f_test(calibration: Calibration, name: str) -> list[dict[str, str]]:
     """Variance of x over that of y, in px² and in µm²."""
-    found = record_of(calibration, "f_test", name)
+    found = of_camera(calibration.tests.f_test, name)
     if found is None:
         return []
-    rows = []
-    for unit, key in (("px²", "px"), ("µm²", "um")):
-        if found.get(f"ratio_{key}2") is not None:
-            dof = f"{found['dof_x']:.0f} and {found['dof_y']:.0f}"
-            row = {"unit": unit, "ratio": value(found[f"ratio_{key}2"]), "dof": dof, "critical": value(found.get("critical_95"))}
-            rows.append(row | {"p": p_text(found.get(f"p_{key}"))})
+    rows, dof = [], f"{found.dof_x:.0f} and {found.dof_y:.0f}"
+    for unit, ratio, p in (("px²", found.ratio_px2, found.p_px), ("µm²", found.ratio_um2, found.p_um)):
+        if ratio is not None:
+            rows.append({"unit": unit, "ratio": value(ratio), "dof": dof, "critical": value(found.critical_95), "p": p_text(p)})
     return rows
 
 
-def images(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def images(records: Sequence[ImageRecord]) -> dict[str, Any]:
     """One row an image; columns of the x-scale, the x-shift and the time only where they were there."""
-    has = {key: any(r.get(key) is not None for r in records) for key in ("x_scale", "x_shift_px", "time_s")}
+    timed = any(r.time_s is not None for r in records)
+    scaled, shifted = any(r.x_scale is not None for r in records), any(r.x_shift_px is not None for r in records)
     rows = []
     for r in records:
-        numbers = [str(r["n"]), str(r["rejected"])] if r.get("oriented", True) else ["not oriented", NONE]
-        cells = [*numbers, px(r["rms_x_px"]), px(r["rms_y_px"])]
-        if has["time_s"]:
-            cells.append(value(r.get("time_s"), 6))
-        for key, u_key, factor in (("x_scale", "u_x_scale", 1e6), ("x_shift_px", "u_x_shift_px", 1.0)):
-            if has[key]:
-                cells.append(_with_u(r.get(key), r.get(u_key), factor))
-        rows.append((str(r["image"]), str(r["camera"]), cells))
+        numbers = [str(r.n), str(r.rejected)] if r.oriented else ["not oriented", NONE]
+        cells = [*numbers, px(r.rms_x_px), px(r.rms_y_px)]
+        cells += [value(r.time_s, 6)] if timed else []
+        cells += [_with_u(r.x_scale, r.u_x_scale, 1e6)] if scaled else []
+        cells += [_with_u(r.x_shift_px, r.u_x_shift_px, 1.0)] if shifted else []
+        rows.append((r.image, r.camera, cells))
     heads = ["Points", "Rejected", "rms x / px", "rms y / px"]
-    heads += [h for key, h in (("time_s", "Time / s"), ("x_scale", "x-scale / 10⁻⁶"), ("x_shift_px", "x-shift / px")) if has[key]]
+    heads += [head for there, head in ((timed, "Time / s"), (scaled, "x-scale / 10⁻⁶"), (shifted, "x-shift / px")) if there]
     return {"heads": heads, "rows": rows}
 
 
@@ -137,62 +129,54 @@ def _with_u(number: float | None, u: float | None, factor: float) -> str:
     return shown.value + ("" if shown.u == NONE else f" ± {shown.u}") + (f"{NO_BREAK}{shown.unit}" if shown.unit else "")
 
 
-def gross_errors(records: Sequence[Mapping[str, Any]]) -> list[list[str]]:
+def gross_errors(records: Sequence[GrossError]) -> list[list[str]]:
     """Rejected image coordinates, the worst first."""
     rows = []
-    for r in sorted(records, key=lambda r: -(r.get("statistic") or 0.0)):
-        lengths = [px(r.get(key)) for key in ("residual_x_px", "residual_y_px", "error_x_px", "error_y_px")]
-        rows.append([str(r["image"]), str(r["point"]), *lengths, value(r.get("statistic")), value(r.get("critical"))])
+    for r in sorted(records, key=lambda r: -r.statistic):
+        lengths = [px(length) for length in (r.residual_x_px, r.residual_y_px, r.error_x_px, r.error_y_px)]
+        rows.append([r.image, r.point, *lengths, value(r.statistic), value(r.critical)])
     return rows
 
 
-def patterns(records: Sequence[Mapping[str, Any]], several: bool) -> list[dict[str, Any]]:
+def patterns(records: Sequence[Pattern], several: bool) -> list[dict[str, Any]]:
     """Patterns that were looked for in the residuals, the surest first; with the camera where there are several."""
     from pixmetry.calibrate.checks.patterns import MEANING, SOURCES
 
     rows = []
-    for r in sorted(records, key=lambda r: 1.0 if r.get("p") is None else r["p"]):
-        what, source, _ = MEANING.get(r["name"], (r["name"], "", ""))
-        title = f"{r['camera']}: {what}" if several and r.get("camera") else sentence(what).rstrip(".")
-        found, u = bool(r.get("significant")), r.get("u_px")
-        amplitude = px(r.get("amplitude_px")) + (f" ± {px(u)}" if u is not None else "")
-        why = f"As from {SOURCES[source]} ({source})." if found and source else ""
-        advice = " ".join(part for part in (why, sentence(r.get("advice") or "")) if part)
-        rows.append({"title": title, "amplitude": amplitude, "p": p_text(r.get("p")), "found": found, "advice": advice})
+    for r in sorted(records, key=lambda r: r.p):
+        what, source, _ = MEANING.get(r.name, (r.name, "", ""))
+        title = f"{r.camera}: {what}" if several else sentence(what).rstrip(".")
+        amplitude = px(r.amplitude_px) + (f" ± {px(r.u_px)}" if r.u_px is not None else "")
+        why = f"As from {SOURCES[source]} ({source})." if r.significant and source else ""
+        advice = " ".join(part for part in (why, sentence(r.advice)) if part)
+        rows.append({"title": title, "amplitude": amplitude, "p": p_text(r.p), "found": r.significant, "advice": advice})
     return sorted(rows, key=lambda r: not r["found"])
 
 
-def groups(records: Sequence[Mapping[str, Any]], name: str) -> list[list[str]]:
+def groups(records: Sequence[GroupTest], name: str) -> list[list[str]]:
     """Joint tests of groups of parameters against 0."""
-    mine = [r for r in records if r["camera"] == name]
     rows = []
-    for r in mine:
-        degrees = f"{r['dof'][0]:.0f} and {r['dof'][1]:.0f}"
-        rows.append([str(r["group"]), ", ".join(symbol(n) for n in r["names"]), value(r["f"]), degrees, p_text(r["p"])])
+    for r in (r for r in records if r.camera == name):
+        degrees = f"{r.dof[0]:.0f} and {r.dof[1]:.0f}"
+        rows.append([r.group, ", ".join(symbol(n) for n in r.names), value(r.f), degrees, p_text(r.p)])
     return rows
 
 
-def hold_out(found: Mapping[str, Any] | None) -> list[list[str]]:
+def hold_out(found: HoldOut | None) -> list[list[str]]:
     """Images of the fit against images left out of it."""
-    rows = []
-    for key, title in (("fixed", "points as given"), ("free", "points free")):
-        part = (found or {}).get(key)
-        if part:
-            rows.append([title, px(part["fit_rms_px"]), px(part["left_out_rms_px"]), px(part.get("left_out_median_px"))])
-    return rows
+    titles = {"fixed": "points as given", "free": "points free"}
+    parts = {} if found is None else found.parts
+    return [[titles[key], px(p.fit_rms_px), px(p.left_out_rms_px), px(p.left_out_median_px)] for key, p in parts.items()]
 
 
-def moved(field: Mapping[str, Any]) -> list[list[str]]:
+def moved(compared: FieldComparison) -> list[list[str]]:
     """By how much interior parameters moved when the field was set free, beside their formal u; by camera where there are several."""
-    cameras = field.get("cameras") or {}
-    records = list(cameras.items()) if len(cameras) > 1 else [("", field)]
+    cameras = compared.cameras if len(compared.cameras) > 1 else {"": compared.first}
     rows = []
-    for name, record in records:
-        for key in ("xp", "yp", "c"):
-            shift, u = record.get(f"moved_{key}_px"), record.get(f"u_{key}_px")
-            if shift is not None:
-                ratio = NONE if not u else fixed(abs(shift) / u, 1)
-                rows.append([f"{name}: {symbol(key)}" if name else symbol(key), signed(shift, length_px), px(u), ratio])
+    for name, record in cameras.items():
+        for key, (shift, u) in record.by_name.items():
+            ratio = NONE if not u else fixed(abs(shift) / u, 1)
+            rows.append([f"{name}: {symbol(key)}" if name else symbol(key), signed(shift, length_px), px(u), ratio])
     return rows
 
 
@@ -219,7 +203,7 @@ def scale_bars(calibration: Calibration) -> list[list[str]]:
     """Scale bars with their residuals: measured less adjusted length; u is that which was stated."""
     from pixmetry.calibrate.checks.known_residuals import bar_names
 
-    raised = ((calibration.tests.get("known") or {}).get("scale_bars") or {}).get("raised") or {}
+    raised = calibration.tests.known.scale_bars.raised if calibration.tests.known is not None else {}
     net, xyz = calibration.adjustment.network, calibration.adjustment.state.xyz
     bars = net.bars
     adjusted = np.linalg.norm(xyz[bars.end] - xyz[bars.start], axis=1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import textwrap
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
@@ -25,8 +25,9 @@ from pixmetry.report.numbers import (
 )
 
 if TYPE_CHECKING:
-    from pixmetry.calibrate.bundle.network import Calibration
+    from pixmetry.calibrate.records import AxisComponent, Calibration, CameraComponents, CameraResiduals, ParameterTest, ProjectionMap
 
+T = TypeVar("T")
 COLUMNS = 100  # of the terminal
 GIVEN_DIGITS = 8  # of a value that was given and held
 TITLES = {
@@ -71,33 +72,33 @@ def sentence(text: str) -> str:
     return f"{first}{text[1:].rstrip('.')}."
 
 
-def record_of(calibration: Calibration, test: str, camera: str) -> Mapping[str, Any] | None:
+def of_camera(test: Mapping[str, T] | None, camera: str) -> T | None:
     """What a test says of a camera; None where it was not made."""
-    return (calibration.tests.get(test) or {}).get(camera)
+    return None if test is None else test.get(camera)
 
 
-def residual_record(calibration: Calibration, camera: int) -> Mapping[str, Any]:
+def residual_record(calibration: Calibration, camera: int) -> CameraResiduals:
     """Number and rms of the residuals of a camera, from its test or, without one, from the adjustment."""
+    from pixmetry.calibrate.records import CameraResiduals
+
     adjustment = calibration.adjustment
     model = adjustment.network.cameras[camera]
-    found = record_of(calibration, "residuals", model.name)
+    found = of_camera(calibration.tests.residuals, model.name)
     if found is not None:
         return found
     net, v = adjustment.network, adjustment.residual_px
     mine = adjustment.used & (net.camera_of[net.image] == camera) & np.isfinite(v).all(axis=1)
     rms = np.sqrt(np.mean(v[mine] ** 2, axis=0)) if mine.any() else np.full(2, np.nan)
     pitch = (model.sensor.pitch_x_um, model.sensor.pitch_y_um)
-    record: dict[str, Any] = {"n": int(mine.sum()), "dof_x": None, "dof_y": None}
-    for axis, value, um in zip("xy", rms, pitch, strict=True):
-        record |= {f"rms_{axis}_px": float(value), f"rms_{axis}_um": None if um is None else float(value * um)}
-    return record
+    um = [None if one is None else float(value * one) for value, one in zip(rms, pitch, strict=True)]
+    return CameraResiduals(int(mine.sum()), float(rms[0]), float(rms[1]), um[0], um[1], None, None)
 
 
-def projection_levels(projection: Mapping[str, Any] | None) -> tuple[float, float] | None:
+def projection_levels(projection: ProjectionMap | None) -> tuple[float, float] | None:
     """Projection uncertainty in the middle of the frame and in the worst of its corners, px."""
     if projection is None:
         return None
-    u = np.asarray(projection["u_px"], float)
+    u = projection.u_px
     middle, corners = u[u.shape[0] // 2, u.shape[1] // 2], u[[0, 0, -1, -1], [0, -1, 0, -1]]
     if not (np.isfinite(middle) and np.isfinite(corners).any()) or not np.nanmax(u) > 0:  # 0: nothing of the camera was estimated
         return None
@@ -114,13 +115,13 @@ def worth(calibration: Calibration, camera: int) -> str:
     """One sentence on what the calibration of a camera is worth."""
     found = residual_record(calibration, camera)
     name = calibration.adjustment.network.cameras[camera].name
-    if found["n"] == 0:
+    if found.n == 0:
         return "No image coordinate of this camera took part."
     text = (
-        f"The image coordinates agree with the calibrated camera to {length(found['rms_x_px'], found.get('rms_x_um'))} rms in x and "
-        f"{length(found['rms_y_px'], found.get('rms_y_um'))} in y"
+        f"The image coordinates agree with the calibrated camera to {length(found.rms_x_px, found.rms_x_um)} rms in x and "
+        f"{length(found.rms_y_px, found.rms_y_um)} in y"
     )
-    levels = projection_levels(record_of(calibration, "projection", name))
+    levels = projection_levels(of_camera(calibration.tests.projection, name))
     if levels is None:
         return text + "."
     places = f"{length_px(levels[0])}{NO_BREAK}px in the middle of the frame and {length_px(levels[1])}{NO_BREAK}px in its corners"
@@ -131,8 +132,8 @@ def sigma0_text(calibration: Calibration) -> str:
     """By how much the image coordinates scatter, beside what was stated of them."""
     adjustment = calibration.adjustment
     models = adjustment.network.cameras
-    parts = [(model.name, record_of(calibration, "variance_components", model.name)) for model in models]
-    found = [(f"{name}: " if len(models) > 1 else "", record) for name, record in parts if record and np.isfinite(record["sigma_x_px"])]
+    parts = [(model.name, of_camera(calibration.tests.variance_components, model.name)) for model in models]
+    found = [(f"{name}: " if len(models) > 1 else "", record) for name, record in parts if record and np.isfinite(record.x.sigma_px)]
     if found:
         return " ".join(sentence(f"{name}{_scatter(record, known=adjustment.network.covariance_known)}") for name, record in found)
     value = significant(adjustment.sigma0, 3)
@@ -144,58 +145,54 @@ def sigma0_text(calibration: Calibration) -> str:
     )
 
 
-def _scatter(record: Mapping[str, Any], *, known: bool) -> str:
-    text = f"image coordinates scatter by {_with_u(record, 'x')} in x and {_with_u(record, 'y')} in y"
-    if record.get("common") and record.get("by_axis", True):
+def _scatter(record: CameraComponents, *, known: bool) -> str:
+    text = f"image coordinates scatter by {_with_u(record.x)} in x and {_with_u(record.y)} in y"
+    if record.common and record.by_axis:
         text += " (one estimate for both: the images do not show that x and y differ)"
     if not known:
         return f"{text}, by their residuals: no covariance of the image coordinates was given"
-    if "given_x_px" not in record:
-        return text
-    x, y = (f"{length_px(record[f'given_{axis}_px'])}{NO_BREAK}px in {axis}" for axis in "xy")
+    x, y = (f"{length_px(one.given_px)}{NO_BREAK}px in {axis}" for axis, one in record.axes.items())
     return f"{text}; stated uncertainties: {x} and {y}"
 
 
-def _with_u(record: Mapping[str, Any], axis: str) -> str:
-    number = uncertain(record[f"sigma_{axis}_px"], record[f"u_sigma_{axis}_px"], "px")
+def _with_u(axis: AxisComponent) -> str:
+    number = uncertain(axis.sigma_px, axis.u_sigma_px, "px")
     return f"{number.value}{NO_BREAK}px" if number.u == NONE else f"({number.value} ± {number.u}){NO_BREAK}px"
 
 
-def parameter_records(calibration: Calibration, camera: int) -> list[dict[str, Any]]:
+def parameter_records(calibration: Calibration, camera: int) -> list[ParameterTest]:
     """Estimated parameters and those held fixed at a value other than 0, in the order of the model."""
     from pixmetry.calibrate.bundle.model import NAMES
+    from pixmetry.calibrate.records import ParameterTest
 
     adjustment = calibration.adjustment
     model = adjustment.camera(camera)
-    tested = {r["name"]: r for r in calibration.tests.get("parameters") or () if r["camera"] == model.name}
+    tested = {r.name: r for r in calibration.tests.parameters or () if r.camera == model.name}
     u: dict[str, float] = {}
     if adjustment.covariance is not None:  # an adjustment may be asked to leave it out
         free, covariance = adjustment.interior_covariance(camera)
         u = dict(zip(free, np.sqrt(np.diag(covariance)), strict=True))
-    rows: list[dict[str, Any]] = []
-    for name, unit, value in zip(NAMES, model.units, model.values, strict=True):
+    rows = []
+    for name, unit, value, free in zip(NAMES, model.units, model.values, model.free, strict=True):
         if name in tested:
-            rows.append({"fixed": False, **tested[name]})
-        elif model.free[NAMES.index(name)] or value != 0:
-            rows.append({"fixed": not model.free[NAMES.index(name)], "name": name, "value": float(value), "u": u.get(name), "unit": unit})
+            rows.append(tested[name])
+        elif free or value != 0:
+            rows.append(ParameterTest(model.name, name, float(value), u.get(name, np.nan), unit, fixed=not free))
     return rows
 
 
 def counts(calibration: Calibration) -> tuple[str, str, str]:
     """How many images, points and image points took part; where not all did, of how many."""
-    from pixmetry.calibrate.records import sizes
+    from pixmetry.calibrate.checks.tests import sizes
 
-    found = sizes(calibration.adjustment)
-    pairs = [(found[key], found[f"{key}_given"]) for key in ("images", "points", "observations")]
+    pairs = sizes(calibration.adjustment).pairs
     images, points, observations = (str(part) if part == whole else f"{part} of {whole}" for part, whole in pairs)
     return images, points, observations
 
 
-def shown(record: Mapping[str, Any]) -> PrintedNumber:
+def shown(record: ParameterTest) -> PrintedNumber:
     """A parameter as text: with its uncertainty, or where it is held, with the digits that it was given."""
-    if record["fixed"]:
-        return as_given(record["value"], record["unit"])
-    return uncertain(record["value"], float("nan") if record["u"] is None else record["u"], record["unit"])
+    return as_given(record.value, record.unit) if record.fixed else uncertain(record.value, record.u, record.unit)
 
 
 def as_given(value: float, unit: str) -> PrintedNumber:
@@ -223,13 +220,13 @@ def summary_text(calibration: Calibration) -> str:
     lines = [f"{images} images, {points} points, {observations} image points used. {sigma0_text(calibration)}"]
     for k, model in enumerate(net.cameras):
         lines += ["", f"{model.name}: {worth(calibration, k)}"]
-        found = record_of(calibration, "f_test", model.name)
-        if found and found.get("text"):
-            lines.append(sentence(found["text"]))
+        found = of_camera(calibration.tests.f_test, model.name)
+        if found and found.text:
+            lines.append(sentence(found.text))
         lines.append("")
         lines += _parameter_lines(calibration, k)
-    if "check_points" in calibration.tests:
-        lines += ["", sentence(calibration.tests["check_points"]["text"])]
+    if calibration.tests.check_points is not None:
+        lines += ["", sentence(calibration.tests.check_points.text)]
     for finding in calibration.findings:
         mark = "Warning" if finding.level == "warning" else "Note"
         lines += ["", f"{mark}: {sentence(finding.text)}"]
@@ -247,9 +244,8 @@ def folded(line: str) -> list[str]:
 def _parameter_lines(calibration: Calibration, camera: int) -> list[str]:
     rows = []
     for r in parameter_records(calibration, camera):
-        number = shown(r)
-        said = "fixed" if r["fixed"] else ("" if number.u == NONE else f"± {number.u}")
-        p = r.get("p_zero")
-        rows.append((symbol(r["name"]), number.value, said, number.unit, "not significant" if p is not None and p > 0.05 else ""))
+        number, p = shown(r), r.p_zero
+        said = "fixed" if r.fixed else ("" if number.u == NONE else f"± {number.u}")
+        rows.append((symbol(r.name), number.value, said, number.unit, "not significant" if p is not None and p > 0.05 else ""))
     widths = [max((len(row[i]) for row in rows), default=0) for i in range(4)]
     return [f"  {a:<{widths[0]}}  {b:>{widths[1]}} {c:<{widths[2]}}  {d:<{widths[3]}}  {e}".rstrip() for a, b, c, d, e in rows]
