@@ -152,7 +152,7 @@ def calibrate_lines(
     model = _start(sensor, start, free, loss)
     table = LineTable.of(x_px, y_px, line, image, u_px)
     away = np.abs(np.column_stack([x_px, y_px]) - sensor.centre) / (sensor.cols, sensor.rows)
-    table.keep_inside((away <= FRAME).all(axis=1))
+    table.keep_inside(np.all(away <= FRAME, axis=1))
     fit = LineFit(table, model, free)
     adjust_lines(fit, loss, loss_scale, reject)
     return _result(fit, model, free)
