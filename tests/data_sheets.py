@@ -9,7 +9,7 @@ import numpy as np
 
 from pixmetry.core.number import LOWER_LIMIT, UPPER_LIMIT, Number
 from pixmetry.emva.files.keys import KEYS, key_of
-from pixmetry.emva.files.write import write_files
+from pixmetry.emva.files.sheets import write_files
 from pixmetry.emva.records import MONO, DataSheet, Results
 
 

@@ -15,13 +15,10 @@ from chance import rng_of
 from pixmetry import emva1288
 from pixmetry.cli import main
 from pixmetry.core.errors import InputError
-from pixmetry.emva.files.formats import read_sheet
-from pixmetry.emva.files.write import content_of, write_files
+from pixmetry.emva.files.sheets import content_of, read_sheet, write_files
 from pixmetry.emva.job import measure_campaign
-from pixmetry.emva.planning.known_camera import camera_from_sheet
-from pixmetry.emva.planning.planning import Plan, predicted_u
-from pixmetry.emva.planning.preflight import camera_from_preflight, preflight_text
-from pixmetry.emva.planning.preflights import preflight_campaign
+from pixmetry.emva.planning.planning import Plan, camera_from_sheet, predicted_u
+from pixmetry.emva.planning.preflight import camera_from_preflight, preflight_campaign, preflight_text
 from pixmetry.files import load_campaign
 from pixmetry.files.staged_files import Output, check_files
 

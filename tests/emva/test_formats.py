@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 from data_sheets import assert_same, full, sheet, value, written
 from pixmetry.core.errors import InputError
 from pixmetry.core.number import Number
-from pixmetry.emva.files.formats import read_sheet, sheet_of_record, to_record
-from pixmetry.emva.files.keys import KEYS
-from pixmetry.emva.files.units import plain_unit
+from pixmetry.emva.files.json_format import sheet_of_record, to_record
+from pixmetry.emva.files.keys import KEYS, plain_unit
+from pixmetry.emva.files.sheets import read_sheet
 from pixmetry.emva.files.xml_format import sheet_of_xml, xml_text
 
 ROOT = Path(__file__).resolve().parents[2]

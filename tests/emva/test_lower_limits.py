@@ -13,7 +13,8 @@ from emva.cameras import Camera
 from emva.scoring import measured
 from pixmetry.core.number import LOWER_LIMIT, UPPER_LIMIT, VALUE, Number
 from pixmetry.emva.evaluate import evaluate
-from pixmetry.emva.files.formats import read_sheet, sheet_json
+from pixmetry.emva.files.json_format import sheet_json
+from pixmetry.emva.files.sheets import read_sheet
 from pixmetry.emva.files.xml_format import xml_text
 from pixmetry.emva.judge.conformity import Limit, judge_value
 from pixmetry.emva.judge.differences import Subject, difference_of

@@ -9,9 +9,17 @@ from scipy.ndimage import convolve1d
 
 from pixmetry.core.errors import InputError
 from pixmetry.core.number import UPPER_LIMIT, Number
-from pixmetry.emva.planning.known_camera import KnownCamera, camera_from_results, camera_from_sheet
-from pixmetry.emva.planning.plan_output import parse_wanted, plan_text, write_campaign
-from pixmetry.emva.planning.planning import Plan, plan_for, predicted_u, with_scatter
+from pixmetry.emva.planning.known_camera import KnownCamera, camera_from_results
+from pixmetry.emva.planning.planning import (
+    Plan,
+    camera_from_sheet,
+    parse_wanted,
+    plan_for,
+    plan_text,
+    predicted_u,
+    with_scatter,
+    write_campaign,
+)
 from pixmetry.emva.records import DataSheet, Results
 from pixmetry.files.manifest import load_campaign
 

@@ -10,7 +10,7 @@ from scipy.interpolate import make_smoothing_spline
 
 from pixmetry.camera.observations import LevelMoments, PhotonTransfer
 from pixmetry.core.errors import MeasureError
-from pixmetry.emva.general.local_slope import slope_matrix
+from pixmetry.emva.general.response import slope_matrix
 from pixmetry.emva.records import Measurement, Series
 from pixmetry.emva.series import count_exposures, light_of, pairing, series_of, without_dark
 from pixmetry.emva.temporal import dark_line, linearity_line, saturation_index, temporal_values

@@ -12,7 +12,7 @@ from emva.cameras import Camera
 from emva.truths import levels, temporal
 from pixmetry.camera.observations import PhotonTransfer
 from pixmetry.core.errors import MeasureError
-from pixmetry.emva.general.smooth import choose_degree, fit_scatter, fit_smooth
+from pixmetry.emva.general.response import choose_degree, fit_scatter, fit_smooth
 from pixmetry.emva.records import Measurement
 from pixmetry.emva.scatter import GROUPS, sampling_u, scatter_of, spatial_scatter, unsaturated
 from pixmetry.emva.series import series_of

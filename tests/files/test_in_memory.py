@@ -11,7 +11,7 @@ import tifffile
 from pixmetry import Frames, assess, campaign_of_arrays, emva1288
 from pixmetry.assess.job import observe_campaign
 from pixmetry.core.errors import InputError
-from pixmetry.emva.planning.preflights import preflight_campaign
+from pixmetry.emva.planning.preflight import preflight_campaign
 from pixmetry.files import EXAMPLE, Campaign, load_campaign, read_frame, write_manifest
 
 

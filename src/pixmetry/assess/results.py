@@ -13,7 +13,7 @@ from pixmetry.budget.job import Budget
 from pixmetry.camera.camera import Camera
 from pixmetry.camera.observations import Observations
 from pixmetry.core.number import Estimates
-from pixmetry.emva.files.formats import value_record
+from pixmetry.emva.files.json_format import value_record
 from pixmetry.emva.records import Results
 from pixmetry.files import Campaign
 

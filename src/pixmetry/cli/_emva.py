@@ -39,7 +39,7 @@ def refuse(campaigns: Sequence[Path], option: str, why: str) -> None:
 def test(campaigns: Sequence[Path], given: dict[str, Any]) -> None:
     """Test a camera, print the data sheet, and write what was asked for."""
     from pixmetry.cli._progress import shown_progress
-    from pixmetry.emva.dark_currents import dark_current_law
+    from pixmetry.emva.dark_temperature import dark_current_law
     from pixmetry.emva.job import emva1288
 
     options = {name: given[name] for name in ("release", "bayer", "bootstrap")} | {"photons_u_rel": given["photons_u"] / 100}
@@ -71,8 +71,7 @@ def compare(a: Path, b: Path) -> None:
 def plan(campaigns: Sequence[Path], given: dict[str, Any]) -> None:
     """Say which frames to take."""
     from pixmetry.emva.planning.known_camera import first_to_saturate
-    from pixmetry.emva.planning.plan_output import parse_wanted, plan_text, write_campaign
-    from pixmetry.emva.planning.planning import plan_for
+    from pixmetry.emva.planning.planning import parse_wanted, plan_for, plan_text, write_campaign
 
     if len(campaigns) > 1:
         raise InputError("plans for one camera", where="--plan", value=len(campaigns), remedy="name one data sheet or campaign")
@@ -124,13 +123,12 @@ def _refuse_sheets(campaigns: Sequence[Path]) -> None:
 
 def _known_cameras(source: Path | None, bayer: str | None, more: dict[str, Any]) -> tuple[dict[str, KnownCamera], dict[str, Any]]:
     """What a data sheet says of a camera, or a look at the frames of a campaign, by channel; and its name and colour filter."""
-    from pixmetry.emva.planning.known_camera import camera_from_sheet
-    from pixmetry.emva.planning.preflight import camera_from_preflight
-    from pixmetry.emva.planning.preflights import preflight_campaign
+    from pixmetry.emva.planning.planning import camera_from_sheet
+    from pixmetry.emva.planning.preflight import camera_from_preflight, preflight_campaign
     from pixmetry.files import load_campaign
 
     if source is not None and _is_sheet(source):
-        from pixmetry.emva.files.formats import read_sheet
+        from pixmetry.emva.files.sheets import read_sheet
 
         if bayer is not None:
             raise InputError("has no meaning with a data sheet, which states its channels", where="--bayer", remedy="leave it away")
@@ -169,7 +167,7 @@ def preflight(campaigns: Sequence[Path], given: dict[str, Any]) -> None:
 
 def _looked_at(campaigns: Sequence[Path], given: dict[str, Any]) -> tuple[dict[str, Preflight], Sequence[Path]]:
     """What the preflight finds, by channel, and the files that it may read."""
-    from pixmetry.emva.planning.preflights import preflight_campaign
+    from pixmetry.emva.planning.preflight import preflight_campaign
     from pixmetry.files import load_campaign
 
     if given["dark"] or given["bright"]:
@@ -187,7 +185,7 @@ def _looked_at(campaigns: Sequence[Path], given: dict[str, Any]) -> tuple[dict[s
 
 
 def _look_at_files(dark: Sequence[Path], bright: Sequence[Path], bits: int, bayer: str | None) -> dict[str, Preflight]:
-    from pixmetry.emva.planning.preflights import preflight_frames
+    from pixmetry.emva.planning.preflight import preflight_frames
     from pixmetry.files.images import iter_frames, picture_files
 
     def reading(paths: Sequence[Path]) -> Callable[[], Iterator[np.ndarray]]:

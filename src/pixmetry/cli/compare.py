@@ -226,7 +226,7 @@ def _shown(value: Number | None) -> str:
 
 
 def _limit_record(name: str, row: Checked) -> dict[str, Any]:
-    from pixmetry.emva.files.formats import value_record
+    from pixmetry.emva.files.json_format import value_record
     from pixmetry.files.strict_json import plain
 
     judgement = row.judgement

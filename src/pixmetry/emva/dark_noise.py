@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pixmetry.core.number import ONE_SIDED_95
-from pixmetry.emva.files.rules import MINIMUM_DARK_VAR_DN2, UNDERFLOW_FRACTION
+from pixmetry.emva.files.keys import MINIMUM_DARK_VAR_DN2, UNDERFLOW_FRACTION
 from pixmetry.emva.records import Measurement, Series
 from pixmetry.emva.series import first_of_equal
 from pixmetry.emva.temporal import dark_line

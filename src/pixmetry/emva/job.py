@@ -16,7 +16,7 @@ from pixmetry.core.errors import InputError
 from pixmetry.core.progress import Progress, no_progress
 from pixmetry.core.threads import imap_tiles, map_tiles, single_threaded_blas
 from pixmetry.emva.files.keys import KEYS
-from pixmetry.emva.files.write import check_names, named, write_files
+from pixmetry.emva.files.sheets import check_names, named, write_files
 from pixmetry.emva.records import MONO, RELEASES, DataSheet, Measurement, Results
 from pixmetry.emva.reduction import Group, measure_frames, phases
 from pixmetry.files import Campaign, FrameReader, InputHashes, load_campaign, provenance_record
@@ -104,7 +104,7 @@ def tested(campaign: Campaign, options: Options, progress: Progress | None = Non
 
 
 def write_sheet(sheet: DataSheet, files: dict[str, Path], inputs: Sequence[Path], progress: Progress | None = None) -> None:
-    """Write the wanted files, if any, with word of progress; as `pixmetry.emva.files.write.write_files`."""
+    """Write the wanted files, if any, with word of progress; as `pixmetry.emva.files.sheets.write_files`."""
     if files:
         told = progress or no_progress
         told("writing the results", 0, 1)

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from pixmetry.emva.files.rules import PTC_LIMIT_PERCENT
+from pixmetry.emva.files.keys import PTC_LIMIT_PERCENT
 from pixmetry.emva.general.curved import REASON as NOT_LINEAR
 from pixmetry.emva.records import Results
 

@@ -11,7 +11,7 @@ import numpy as np
 from pixmetry.core.number import LOWER_LIMIT, ONE_SIDED_95, UPPER_LIMIT, Number
 from pixmetry.emva.general.general import general_curve, general_evaluation
 from pixmetry.emva.general.general_model import light_axis
-from pixmetry.emva.general.response_end import end_of
+from pixmetry.emva.general.response import end_of
 from pixmetry.emva.reasons import Case, ends_early
 
 ENDS_EARLY = "the series ends before saturation"

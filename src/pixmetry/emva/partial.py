@@ -9,8 +9,7 @@ import numpy as np
 from pixmetry.core.errors import MeasureError, PixmetryError
 from pixmetry.core.number import ONE_SIDED_95, UPPER_LIMIT, VALUE, Number
 from pixmetry.core.random import generator
-from pixmetry.emva.files.keys import KEYS
-from pixmetry.emva.files.rules import MINIMUM_DARK_VAR_DN2
+from pixmetry.emva.files.keys import KEYS, MINIMUM_DARK_VAR_DN2
 from pixmetry.emva.formulas import keys_of
 from pixmetry.emva.reasons import BROKEN
 from pixmetry.emva.records import Measurement, Results

@@ -9,8 +9,7 @@ import numpy as np
 
 from pixmetry.core.number import ONE_SIDED_95, Number
 from pixmetry.emva.dark_noise import DarkNoise
-from pixmetry.emva.files.keys import KEYS, key_of
-from pixmetry.emva.files.rules import EQUAL_EXPOSURE, PTC_LIMIT_PERCENT, SATURATED_FRACTION
+from pixmetry.emva.files.keys import EQUAL_EXPOSURE, KEYS, PTC_LIMIT_PERCENT, SATURATED_FRACTION, key_of
 from pixmetry.emva.formulas import Formulas, Spread, Values
 from pixmetry.emva.general.curved import REASON as CURVED
 from pixmetry.emva.general.general import general_curve, general_notes

@@ -21,7 +21,7 @@ import numpy as np
 from pixmetry.camera.observations import LevelMoments
 from pixmetry.core.errors import MeasureError
 from pixmetry.emva.general.curved import following, is_curved
-from pixmetry.emva.general.smooth import ScatterFit, fit_scatter
+from pixmetry.emva.general.response import ScatterFit, fit_scatter
 from pixmetry.emva.records import Measurement, Series
 from pixmetry.emva.series import (
     MINIMUM_EXPOSURES,

@@ -6,7 +6,7 @@ import numpy as np
 
 from pixmetry.camera.observations import LevelMoments
 from pixmetry.core.errors import MeasureError
-from pixmetry.emva.files.rules import EQUAL_EXPOSURE
+from pixmetry.emva.files.keys import EQUAL_EXPOSURE
 from pixmetry.emva.records import Measurement, Series
 
 MINIMUM_LEVELS = 3

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from pixmetry.core.errors import MeasureError
-from pixmetry.emva.files.rules import FIT_RANGE, MINIMUM_DARK_VAR_DN2, QUANTISATION_DN2, SATURATED_FRACTION
-from pixmetry.emva.general.local_slope import slope_matrix
+from pixmetry.emva.files.keys import FIT_RANGE, MINIMUM_DARK_VAR_DN2, QUANTISATION_DN2, SATURATED_FRACTION
+from pixmetry.emva.general.response import slope_matrix
 from pixmetry.emva.records import Series
 from pixmetry.emva.series import MINIMUM_EXPOSURES, count_exposures, first_of_equal, light_of
 

@@ -1,8 +1,12 @@
-"""The keys under which results are stored, as the public EMVA 1288 result format has them, and what each stands for."""
+"""Keys of the public result format of EMVA 1288 with their units, one spelling of each unit, and the limits that the standard sets."""
 
 from __future__ import annotations
 
+import re
 from typing import NamedTuple
+
+from pixmetry.observe.photon_transfer_model import MINIMUM_DARK_VAR_DN2, QUANTISATION_DN2
+from pixmetry.observe.stack import EQUAL_EXPOSURE, SATURATED_FRACTION
 
 
 class Key(NamedTuple):
@@ -106,3 +110,33 @@ def key_of(name: str) -> Key:
         return KEYS[name]
     base = KEYS[name.removesuffix(NONLINEAR)]
     return base._replace(title=f"{base.title}, non-linearity taken into account", clause="")
+
+
+def plain_unit(text: str | None) -> str:
+    """Return a unit in plain letters: ``$e^-/\\mu m^2$`` and ``e-/um2`` become ``e⁻/µm²``; an empty one is ``1``.
+
+    Examples
+    --------
+    >>> plain_unit("$DN/e^-$"), plain_unit("DN2"), plain_unit("p"), plain_unit("")
+    ('DN/e⁻', 'DN²', 'photon', '1')
+    """
+    unit = re.sub(r"\\mu\s*|μ", "µ", text or "")  # the Greek letter becomes the micro sign
+    unit = re.sub(r"[$\\{}\s]", "", unit).replace("^", "").replace("e-", "e⁻")
+    unit = re.sub(r"\bum", "µm", unit)
+    unit = re.sub(r"(?<=DN|µm)2\b", "²", unit)
+    return re.sub(r"\bp\b|\bphotons\b", "photon", unit) or "1"
+
+
+__all__ = [
+    "EQUAL_EXPOSURE",
+    "FIT_RANGE",
+    "MINIMUM_DARK_VAR_DN2",
+    "PTC_LIMIT_PERCENT",
+    "QUANTISATION_DN2",
+    "SATURATED_FRACTION",
+    "UNDERFLOW_FRACTION",
+]
+
+FIT_RANGE = 0.7  # of saturation, for responsivity and gain (R4.0 §6.6)
+UNDERFLOW_FRACTION = 0.005  # of the dark pixels at the lowest code (R4.0 §6.5)
+PTC_LIMIT_PERCENT = 3.0  # departure of the photon transfer's local slope up to which the Linear model is used (R4.0 eq. 51)

@@ -20,9 +20,8 @@ import numpy as np
 
 from pixmetry.core.errors import InputError
 from pixmetry.core.number import Number
-from pixmetry.emva.files.formats import SCHEMA, checked, kind_of, parse_json
-from pixmetry.emva.files.keys import KEYS, NONLINEAR, key_of
-from pixmetry.emva.files.units import plain_unit
+from pixmetry.emva.files.json_format import SCHEMA, checked, kind_of, parse_json
+from pixmetry.emva.files.keys import KEYS, NONLINEAR, key_of, plain_unit
 from pixmetry.emva.records import MONO, DataSheet, Results
 from pixmetry.files.strict_json import plain
 

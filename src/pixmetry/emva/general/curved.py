@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from pixmetry.emva.files.keys import KEYS
-from pixmetry.emva.files.rules import FIT_RANGE, MINIMUM_DARK_VAR_DN2
-from pixmetry.emva.general.response_end import end_of
+from pixmetry.emva.files.keys import FIT_RANGE, KEYS, MINIMUM_DARK_VAR_DN2
+from pixmetry.emva.general.response import end_of
 from pixmetry.emva.records import Series
 from pixmetry.emva.series import light_of
 from pixmetry.emva.temporal import dark_line

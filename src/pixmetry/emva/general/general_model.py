@@ -8,8 +8,7 @@ import numpy as np
 
 from pixmetry.core.errors import MeasureError
 from pixmetry.core.random import generator
-from pixmetry.emva.general.response_end import ResponseEnd, end_of
-from pixmetry.emva.general.response_spline import ResponseSpline, smooth_despite_setting, smooth_response
+from pixmetry.emva.general.response import ResponseEnd, ResponseSpline, end_of, smooth_despite_setting, smooth_response
 from pixmetry.emva.records import Series
 
 MINIMUM_LEVELS, SEED = 8, 1288

@@ -16,17 +16,8 @@ from typing import TYPE_CHECKING, Any
 from pixmetry.core.checksums import check_record
 from pixmetry.core.errors import InputError
 from pixmetry.core.number import Number
-from pixmetry.emva.files.formats import (
-    SCHEMA,
-    is_xml,
-    number_of,
-    parse_json,
-    read_bytes,
-    read_sheet,
-    sheet_of_record,
-    value_of,
-    value_record,
-)
+from pixmetry.emva.files.json_format import SCHEMA, is_xml, number_of, parse_json, read_bytes, sheet_of_record, value_of, value_record
+from pixmetry.emva.files.sheets import read_sheet
 from pixmetry.emva.judge.differences import Difference, Subject, decided, difference_of, family, holm
 from pixmetry.emva.judge.fleet import FleetRow, fleet_chance, fleet_row
 from pixmetry.emva.records import MONO, DataSheet
@@ -292,8 +283,8 @@ def _notes(subjects: Sequence[Subject], passed_over: frozenset[str] = frozenset(
     if rest:
         notes.append(f"left out, as not all have them: channels {', '.join(rest)}")
     if all(s.worth for s in subjects) and len({str(s.worth[0]) for s in subjects}) == 1:
-        values = ", ".join(f"{s.worth[1]:.3g}" for s in subjects)
-        notes.append(f"the standard uncertainty of one coordinate of a target in one frame is {values} px (k = 1)")
+        worth = ", ".join(f"{s.worth[1]:.3g}" for s in subjects)
+        notes.append(f"the standard uncertainty of one coordinate of a target in one frame is {worth} px (k = 1)")
     elif all(s.worth for s in subjects):
         notes.append("target or estimator differ: the uncertainties of a coordinate belong to different tasks")
     return notes

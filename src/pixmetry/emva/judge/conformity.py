@@ -18,8 +18,7 @@ from pydantic import Field, PrivateAttr, field_validator, model_validator
 from pixmetry.core.config import Model, load_yaml, validate
 from pixmetry.core.errors import InputError, ParameterError
 from pixmetry.core.number import Number
-from pixmetry.emva.files.keys import KEYS, NONLINEAR
-from pixmetry.emva.files.units import plain_unit
+from pixmetry.emva.files.keys import KEYS, NONLINEAR, plain_unit
 from pixmetry.emva.judge.differences import upper_tail
 
 Rule = Literal["guarded_acceptance", "simple_acceptance", "guarded_rejection"]

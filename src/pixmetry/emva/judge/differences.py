@@ -8,8 +8,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from pixmetry.core.number import Number, effective_dof
-from pixmetry.emva.files.keys import NONLINEAR, goes_with_photons
-from pixmetry.emva.files.units import plain_unit
+from pixmetry.emva.files.keys import NONLINEAR, goes_with_photons, plain_unit
 
 EQUAL_REL = 1e-9  # numbers without uncertainty that agree so well are equal
 ROUNDING = 1e-9  # of a square of u: the light's part was all of it

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pixmetry.emva.files.keys import KEYS, NONLINEAR, Key, key_of
-from pixmetry.emva.files.rules import PTC_LIMIT_PERCENT
+from pixmetry.emva.files.keys import KEYS, NONLINEAR, PTC_LIMIT_PERCENT, Key, key_of
 from pixmetry.emva.linear_model import CURVED, FAILS, HOLDS, OPEN, UNKNOWN, linear_model
 from pixmetry.report.numbers import NO_BREAK, NONE, PrintedNumber, decimals_of, fixed, limit, pretty_unit, significant, uncertain
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pixmetry.emva.files.rules import EQUAL_EXPOSURE
+from pixmetry.emva.files.keys import EQUAL_EXPOSURE
 from pixmetry.emva.page.content import say
 from pixmetry.emva.page.figures import OPEN, Curve, Drawn, Plot, leave_room, light_of, log_log, make_plot, one, time_of
 from pixmetry.report.drawing import BLUE, RED, SOFT, plain_log

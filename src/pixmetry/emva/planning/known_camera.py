@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from pixmetry.core.errors import InputError
 from pixmetry.core.number import Number
-from pixmetry.emva.files.rules import QUANTISATION_DN2
-from pixmetry.emva.records import MONO, DataSheet
+from pixmetry.emva.files.keys import QUANTISATION_DN2
 from pixmetry.emva.spatial.high_pass import MINIMUM_SIDE
 
 
@@ -130,34 +129,6 @@ def number_in(value: Any, name: str = "value") -> float:
     return number / math.sqrt(3) if name == "value" and value.get("is_limit") else number
 
 
-def camera_from_sheet(sheet: DataSheet, channel: str = MONO, **more: Any) -> KnownCamera:
-    """Take what a data sheet says of one channel; ``more`` are further fields of ``KnownCamera``, which come first.
-
-    Where the sheet says how many frames there were, the u that it found tells of scatter beyond sampling; where it knows exposures and
-    photons, of the exposure at saturation.
-
-    Raises
-    ------
-    InputError
-        If the sheet has no such channel, or lacks what is needed.
-    """
-    from pixmetry.emva.planning.planning import Plan, with_scatter  # which needs this module
-
-    results = {r.channel: r for r in sheet.results}
-    if channel not in results:
-        raise InputError("the data sheet has no such channel", value=channel, allowed=", ".join(results))
-    values, conditions = results[channel].values, sheet.conditions
-    cell = 1 if channel == MONO else 2  # a channel of a mosaic has one pixel of each cell of 2 x 2
-    facts = {"rows": int(sheet.camera["rows"]) // cell, "cols": int(sheet.camera["cols"]) // cell, "bits": int(sheet.camera["bits"])}
-    camera = camera_from_results(values, **facts, **{"exposure_sat_s": _exposure_sat_s(values, conditions), **more})
-    if not {"bright_levels", "frames_per_level", "dark_stack_frames", "sweep"} <= conditions.keys():
-        return camera
-    sweep = "exposure" if str(conditions["sweep"]).startswith("exposure") else "light"
-    stack, dark_levels = conditions["dark_stack_frames"] or 2, max(int(conditions.get("dark_levels") or 2), 2)
-    plan = Plan(int(conditions["bright_levels"]), int(np.min(conditions["frames_per_level"])), int(stack), sweep, dark_levels)
-    return replace(with_scatter(camera, values, plan), **more)
-
-
 def first_to_saturate(cameras: Mapping[str, KnownCamera]) -> str:
     """Of the channels of a camera the one that one light saturates first: a series is planned for it."""
 
@@ -167,12 +138,3 @@ def first_to_saturate(cameras: Mapping[str, KnownCamera]) -> str:
         return camera.exposure_sat_s or math.inf, photons
 
     return min(cameras, key=order)
-
-
-def _exposure_sat_s(values: Mapping[str, Any], conditions: Mapping[str, Any]) -> float | None:
-    """Exposure at saturation, where the exposure was swept and photons are known."""
-    exposures, photons = conditions.get("exposures_s") or (), conditions.get("photons") or ()
-    saturation = number_in(values.get("u_p_sat"))
-    if len(exposures) < 2 or len(photons) < 2 or not saturation > 0 or not max(photons) > 0:
-        return None
-    return saturation * max(exposures) / max(photons)

@@ -1,4 +1,4 @@
-"""Data sheets on disk: JSON with everything, and the XML of the public EMVA 1288 result format.
+"""Data sheets as JSON, with everything.
 
 In JSON, ``null`` is a number that is not known (NaN) and ``"inf"`` an infinite one, as the degrees of freedom of an uncertainty that
 is known exactly; all other numbers are written so that reading gives the same bits.
@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from pixmetry.core.checksums import check_record, sealed
+from pixmetry.core.checksums import sealed
 from pixmetry.core.errors import InputError
 from pixmetry.core.number import LOWER_LIMIT, UPPER_LIMIT, VALUE, Number
 from pixmetry.emva.records import MONO, DataSheet, Results
@@ -28,26 +28,6 @@ _INFINITE = {"inf": math.inf, "-inf": -math.inf}
 def sheet_json(sheet: DataSheet) -> str:
     """Return a data sheet as JSON (RFC 8259)."""
     return json_text(sealed(to_record(sheet)))
-
-
-def read_sheet(path: str | Path) -> DataSheet:
-    """Read a data sheet, JSON or XML by its content.
-
-    Of the XML of other programs the values and curves are taken; what they do not say is empty: the release, ``u`` and ``dof`` (NaN).
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read, or is no data sheet.
-    """
-    raw = read_bytes(path)
-    if is_xml(raw):
-        from pixmetry.emva.files.xml_format import sheet_of_xml
-
-        return sheet_of_xml(raw, str(path))
-    record = parse_json(raw, str(path))
-    check_record(record, str(path))
-    return sheet_of_record(record, str(path))
 
 
 def read_bytes(path: str | Path) -> bytes:

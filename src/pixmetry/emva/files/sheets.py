@@ -1,4 +1,4 @@
-"""The files of a data sheet of EMVA 1288: JSON, the public XML format, a page (HTML) and PDF."""
+"""The files of a data sheet of EMVA 1288: JSON, the public XML format, a page (HTML) and PDF, written together; the first two are read."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
+from pixmetry.core.checksums import check_record
+from pixmetry.emva.files.json_format import is_xml, parse_json, read_bytes, sheet_json, sheet_of_record
 from pixmetry.emva.records import DataSheet
 from pixmetry.files.staged_files import Output, check_files, write_together
 
@@ -20,6 +22,26 @@ MARKS = {
     ),
     "pdf": re.compile(rb"%PDF-1\.\d.*\n\d+ 0 obj\s*<< /Creator \(pixmetry\)", re.DOTALL),
 }
+
+
+def read_sheet(path: str | Path) -> DataSheet:
+    """Read a data sheet, JSON or XML by its content.
+
+    Of the XML of other programs the values and curves are taken; what they do not say is empty: the release, ``u`` and ``dof`` (NaN).
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, or is no data sheet.
+    """
+    raw = read_bytes(path)
+    if is_xml(raw):
+        from pixmetry.emva.files.xml_format import sheet_of_xml
+
+        return sheet_of_xml(raw, str(path))
+    record = parse_json(raw, str(path))
+    check_record(record, str(path))
+    return sheet_of_record(record, str(path))
 
 
 def named(**wanted: str | Path | None) -> dict[str, Path]:
@@ -62,8 +84,6 @@ def content_of(sheet: DataSheet, kind: str) -> bytes:
         from pixmetry.emva.files.xml_format import xml_text
 
         return xml_text(sheet).encode()
-    from pixmetry.emva.files.formats import sheet_json
-
     return sheet_json(sheet).encode()
 
 
