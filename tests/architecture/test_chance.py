@@ -102,7 +102,7 @@ def drawn(pytester: pytest.Pytester):
     """Runs the tests above and returns what each of them drew."""
     pytester.makeconftest((TESTS / "conftest.py").read_text())
     pytester.makepyfile(chance=(TESTS / "chance.py").read_text(), test_draws=DRAWS)
-    pytester.makeini("[pytest]\npythonpath = .\naddopts = -p no:cacheprovider")
+    pytester.makeini("[pytest]\npythonpath = .\naddopts = -p no:cacheprovider -p no:hypothesispytest")
 
     def run(*options: str) -> tuple[dict[str, str], str]:
         text = pytester.runpytest_inprocess(*options).stdout.str()
@@ -128,7 +128,7 @@ def test_a_failure_tells_the_seed_that_repeats_it(drawn) -> None:
 def test_a_seed_that_is_none_is_refused(pytester: pytest.Pytester, wrong: str) -> None:
     pytester.makeconftest((TESTS / "conftest.py").read_text())
     pytester.makepyfile(chance=(TESTS / "chance.py").read_text())
-    pytester.makeini("[pytest]\npythonpath = .")
+    pytester.makeini("[pytest]\npythonpath = .\naddopts = -p no:hypothesispytest")
     result = pytester.runpytest_inprocess(f"--seed={wrong}")
     assert result.ret == pytest.ExitCode.USAGE_ERROR
     result.stderr.fnmatch_lines(["*is not a seed*"])
@@ -152,7 +152,7 @@ def test_repeated_runs_keep_the_seeds_at_which_a_test_failed(flaky: ModuleType, 
         chance=(TESTS / "chance.py").read_text(),
         test_draws="def test_half(rng): assert rng.random() < 0.5\ndef test_sound(rng): pass\ndef test_still(): pass",
     )
-    pytester.makeini("[pytest]\npythonpath = .\naddopts = -p no:cacheprovider")
+    pytester.makeini("[pytest]\npythonpath = .\naddopts = -p no:cacheprovider -p no:hypothesispytest")
     outcome = flaky.Outcome("test_draws.py")
     for seed in range(5):
         pytester.inline_run("-q", "-n0", "--seed", str(seed), plugins=[flaky.Recorder(outcome, seed)])

@@ -9,6 +9,7 @@ from __future__ import annotations
 import ast
 import re
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -47,10 +48,17 @@ class Import:
         return f"{self.module}.{self.name}" if self.name else self.module
 
 
+@cache
+def nodes_of(source: str) -> tuple[ast.AST, ...]:
+    """All nodes of a source text, which is parsed once for all that is asked of it."""
+    return tuple(ast.walk(ast.parse(source)))
+
+
+@cache
 def imports(source: str, module: str, is_package: bool = False) -> list[Import]:
     """Every import in a source text; relative ones are resolved against ``module``."""
     found = []
-    for node in ast.walk(ast.parse(source)):
+    for node in nodes_of(source):
         if isinstance(node, ast.Import):
             found += [Import(alias.name, "", node.lineno) for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
@@ -114,12 +122,11 @@ def global_randomness(source: str, module: str) -> list[str]:
     """Uses of ``numpy.random`` or the standard ``random``: draws come from keyed streams only, and ``core.random`` is their home."""
     if module == "pixmetry.core.random":
         return []
-    tree = ast.parse(source)
-    numpy = {a.asname or a.name for n in ast.walk(tree) if isinstance(n, ast.Import) for a in n.names if a.name == "numpy"}
+    numpy = {a.asname or a.name for n in nodes_of(source) if isinstance(n, ast.Import) for a in n.names if a.name == "numpy"}
     lines = [f.line for f in imports(source, module) if (f.dotted + ".").startswith(("numpy.random.", "random."))]
     lines += [
         node.lineno
-        for node in ast.walk(tree)
+        for node in nodes_of(source)
         if isinstance(node, ast.Attribute) and node.attr == "random" and isinstance(node.value, ast.Name) and node.value.id in numpy
     ]
     return [f"{module}:{line} draws outside the keyed streams" for line in lines]
@@ -127,10 +134,9 @@ def global_randomness(source: str, module: str) -> list[str]:
 
 def own_parallelism(source: str, module: str) -> list[str]:
     """Anything that starts threads or processes; locks are no parallelism."""
-    tree = ast.parse(source)
     lines = [f.line for f in imports(source, module) if f.dotted.split(".")[0] in THREADS]
     lines += [f.line for f in imports(source, module) if f.module == "threading" and f.name and f.name not in LOCKS]
-    for node in ast.walk(tree):
+    for node in nodes_of(source):
         if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "threading" and node.attr not in LOCKS:
             lines.append(node.lineno)
         if isinstance(node, ast.keyword) and node.arg == "parallel" and getattr(node.value, "value", None) is True:
