@@ -314,6 +314,7 @@ def test_only_own_files_are_replaced(known: Path, tmp_path: Path) -> None:
         "report": '<!DOCTYPE html><html><head><title>mine</title></head><body>content="pixmetry 1"</body></html>',
         "pdf": "%PDF-1.4 made with (pixmetry) /Creator (pixmetry)",
     }
+    contents = {kind: content_of(sheet, kind) for kind in foreign}
     for kind, text in foreign.items():
         path = tmp_path / kind
         path.write_text(text)
@@ -321,7 +322,7 @@ def test_only_own_files_are_replaced(known: Path, tmp_path: Path) -> None:
             write_files(sheet, {kind: path})
         assert path.read_text() == text
         for other in foreign:
-            path.write_bytes(content_of(sheet, other))
+            path.write_bytes(contents[other])
             if other == kind:
                 write_files(sheet, {kind: path})
             else:

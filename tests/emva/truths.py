@@ -6,6 +6,7 @@ Written without the package. Names of values are those of the public result form
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from scipy import ndimage
@@ -29,8 +30,9 @@ class Levels:
     slope: np.ndarray  # DN per photon
 
 
+@lru_cache(maxsize=1)
 def levels(camera: Camera) -> Levels:
-    """Expectations of what two frames of each level give (R4.0 eq. 16, 18, 32)."""
+    """Expectations of what two frames of each level give (R4.0 eq. 16, 18, 32); all releases of a camera ask for the same."""
     exposure, photons = camera.settings
     rows = camera.shape[0]
     row_dn2 = (camera.gain_dn_per_e * camera.row_noise_e) ** 2

@@ -14,6 +14,7 @@ import pytest
 from scipy.special import erf
 from scipy.stats import kstest, norm
 
+from chance import rng_of
 from pixmetry.core.errors import InputError
 from pixmetry.locate.detect.targets import Flag
 from pixmetry.locate.lines.crosses import cross_positions, crossings, find_crosses
@@ -216,12 +217,27 @@ def test_variance_equals_the_closed_form_for_shot_noise() -> None:
         assert p.more["var_across_px2"][0] == pytest.approx(expected, rel=0.03), estimator
 
 
+@pytest.fixture(scope="module")
+def many_lines(request: pytest.FixtureRequest) -> tuple[np.ndarray, LineCandidates, np.ndarray]:
+    """3000 lines of 41 px at any angle, the same for all estimators of a run: frame, candidates and truth."""
+    rng = rng_of(request)
+    frame, candidates, true = tiles("gaussian", 3000, rng)
+    return stored(frame, rng), candidates, true
+
+
+@pytest.fixture(scope="module")
+def many_edges(request: pytest.FixtureRequest) -> tuple[np.ndarray, LineCandidates, np.ndarray]:
+    """2000 edges, the same for all estimators of a run."""
+    rng = rng_of(request)
+    frame, candidates, true = tiles("edge", 2000, rng, sigma_px=0.9, amplitude_dn=120.0)
+    return stored(frame, rng), candidates, true
+
+
 @pytest.mark.parametrize("estimator", ESTIMATORS)
-def test_lines_reach_the_bound_and_their_covariance_is_true(estimator: str, rng: np.random.Generator) -> None:
-    """Lines of 41 px at any angle; the bound is that of the closed form for the length that is used."""
-    n = 3000
-    frame, candidates, true = tiles("gaussian", n, rng)
-    p = line_positions(stored(frame, rng), candidates, WHITE, estimator=estimator)
+def test_lines_reach_the_bound_and_their_covariance_is_true(estimator: str, many_lines) -> None:
+    """The bound is that of the closed form for the length that is used."""
+    frame, candidates, true = many_lines
+    p = line_positions(frame, candidates, WHITE, estimator=estimator)
     clean = (p.flags & ~np.uint32(Flag.POOR_FIT | Flag.UNEVEN_BACKGROUND | Flag.GRADIENT)) == 0
     inner = clean & (p.more["chi2_per_dof"] < 3)
     assert inner.mean() > 0.85
@@ -237,9 +253,9 @@ def test_lines_reach_the_bound_and_their_covariance_is_true(estimator: str, rng:
 
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)
-def test_edges_have_true_covariances(estimator: str, rng: np.random.Generator) -> None:
-    frame, candidates, true = tiles("edge", 2000, rng, sigma_px=0.9, amplitude_dn=120.0)
-    p = line_positions(stored(frame, rng), candidates, WHITE, "edge", estimator)
+def test_edges_have_true_covariances(estimator: str, many_edges) -> None:
+    frame, candidates, true = many_edges
+    p = line_positions(frame, candidates, WHITE, "edge", estimator)
     assert not (p.flags & np.uint32(Flag.NOT_CONVERGED)).any()
     z = z_scores(p, true)
     for name in ("across", "angle", "distance"):
