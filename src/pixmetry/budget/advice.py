@@ -3,39 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from pixmetry.budget.combine import Combined
+from pixmetry.budget.records import Advice, BudgetRow
 from pixmetry.camera.catalogue import get_source
 
 MOST = 5
 MOST_ACCEPTED = 3
 
 
-@dataclass(frozen=True)
-class Advice:
-    """What to do about one source: measure it if it was only accepted, else lower it.
-
-    ``combined_px`` is the combined total now, ``removed_px`` and ``halved_px`` what it would be without this
-    contribution and with half of it.
-    """
-
-    name: str
-    source_id: str
-    title: str
-    status: str
-    text: str
-    total_px: float
-    combined_px: float
-    removed_px: float
-    halved_px: float
-
-
 def advise(
-    rows: Sequence[Any], verdict: Combined, everything: Combined, most: int = MOST, most_accepted: int = MOST_ACCEPTED
+    rows: Sequence[BudgetRow], verdict: Combined, everything: Combined, most: int = MOST, most_accepted: int = MOST_ACCEPTED
 ) -> tuple[Advice, ...]:
     """Advice for the largest of the rows that the verdict rests on; after them, what to measure of those that were only accepted.
 
@@ -47,7 +27,7 @@ def advise(
     return (*(_advice(r, verdict.total_px) for r in known), *(_advice(r, everything.total_px) for r in accepted))
 
 
-def _advice(row: Any, combined_px: float) -> Advice:
+def _advice(row: BudgetRow, combined_px: float) -> Advice:
     text = get_source(row.source_id).advice
     if row.status == "accepted":
         text = f"Not measured: taken at the largest to expect. {text}"

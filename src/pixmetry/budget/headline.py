@@ -3,60 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 
 from pixmetry.budget.combine import Combined, combine
 from pixmetry.budget.monte_carlo import Axis, MonteCarlo
 from pixmetry.budget.probe import ESTIMATOR_ITSELF
+from pixmetry.budget.records import LEVEL, MONTE_CARLO, SUM, BudgetRow, Headline, Interval
 from pixmetry.camera.contribution import UNSTEADY
 
-SUM, MONTE_CARLO = "sum", "Monte Carlo"
 COVERAGE = 2.0  # standard errors beyond which sum and Monte Carlo differ
 LOST = 0.01  # share of windows without a target above which a Monte Carlo does not speak for all targets
 ASKED = 3  # sources that are tried in the whole chain to find out which one makes the difference
-LEVEL = 0.95  # coverage of the interval that is the answer
 MAIN_PART = 0.5  # of the difference of the squares: what one source must make of it to be named
-
-
-@dataclass(frozen=True)
-class Headline:
-    """Where the verdict is from.
-
-    Parameters
-    ----------
-    by : {"sum", "Monte Carlo"}
-    sum_px : float
-        Total of the contributions that the simulated camera holds, by their formulas, for one target in one frame.
-    simulated_px, se_simulated_px : float
-        The same by one Monte Carlo with all of them on, and its standard error; NaN without one.
-    u_sum_px : float
-        What the formulas leave open: the model errors that the contributions declare.
-    why : str
-        A sentence for the reader.
-    """
-
-    by: str
-    sum_px: float
-    simulated_px: float
-    se_simulated_px: float
-    u_sum_px: float
-    why: str
-
-
-@dataclass(frozen=True)
-class Interval:
-    """The answer in two numbers: within ± ``half_px`` (x and y) of its true place a position lies, with this coverage.
-
-    ``k`` is the coverage factor that the effective degrees of freedom ``dof`` ask for, in x and y.
-    """
-
-    half_px: tuple[float, float]
-    k: tuple[float, float]
-    dof: tuple[float, float]
-    coverage: float = LEVEL
 
 
 def interval_of(total_px: tuple[float, float], dof: tuple[float, float], coverage: float = LEVEL) -> Interval:
@@ -74,7 +34,7 @@ def interval_of(total_px: tuple[float, float], dof: tuple[float, float], coverag
     return Interval((k[0] * total_px[0], k[1] * total_px[1]), (k[0], k[1]), dof, coverage)
 
 
-def dof_of(rows: Sequence[Any], verdict: Combined, found: Headline) -> tuple[float, float]:
+def dof_of(rows: Sequence[BudgetRow], verdict: Combined, found: Headline) -> tuple[float, float]:
     """Effective degrees of freedom of a verdict in x and y.
 
     Notes
@@ -97,7 +57,7 @@ def dof_of(rows: Sequence[Any], verdict: Combined, found: Headline) -> tuple[flo
 
 
 def headline(
-    rows: Sequence[Any],
+    rows: Sequence[BudgetRow],
     together: MonteCarlo | None,
     frames: Sequence[int],
     in_chain: Callable[[str], MonteCarlo],
@@ -128,7 +88,8 @@ def headline(
     held = [r for r in rows if r.monte_carlo is not None]
     by_formula = combine((r.contribution for r in held), signed=True).total_px
     if together is None or not held:
-        return Headline(SUM, by_formula, float("nan"), float("nan"), 0.0, "The sum of the contributions; no Monte Carlo was made."), sums
+        why = "The sum of the contributions; no Monte Carlo was made."
+        return Headline(SUM, sums[0].total_px, float("nan"), float("nan"), 0.0, why), sums
     error, u_sum = _error(together, held), _model_error(held)
     found = Headline(SUM, by_formula, together.total_px, error, u_sum, "")
     difference, allowed = together.total_px - by_formula, COVERAGE * float(np.hypot(error, u_sum))
@@ -145,7 +106,7 @@ def headline(
     return replace(found, by=MONTE_CARLO, why=_why(found, held, in_chain)), simulated
 
 
-def _error(together: MonteCarlo, rows: Sequence[Any]) -> float:
+def _error(together: MonteCarlo, rows: Sequence[BudgetRow]) -> float:
     """Standard error of the total of a Monte Carlo, with what few targets have."""
     places = together.units * together.places
     parts = (r.contribution for r in rows)  # a bias has no chance in it
@@ -155,7 +116,7 @@ def _error(together: MonteCarlo, rows: Sequence[Any]) -> float:
     return float(np.hypot(together.se_total_px, rare))
 
 
-def _model_error(rows: Sequence[Any]) -> float:
+def _model_error(rows: Sequence[BudgetRow]) -> float:
     """Standard uncertainty of the sum from the model errors of its parts: of a half-width that the model declares, taken as k = 2."""
     total = combine((r.contribution for r in rows), signed=True).total_px
     parts = [(max(c.model_error * c.total_px, c.floor_px) * c.total_px) ** 2 for c in (r.contribution for r in rows)]
@@ -176,7 +137,7 @@ def _simulated(together: MonteCarlo, others: Combined, unsteady_px: tuple[float,
     return Combined(u_x, u_y, bias_x, bias_y, left_x, left_y, others.frames, others.targets)
 
 
-def _why(found: Headline, rows: Sequence[Any], in_chain: Callable[[str], MonteCarlo]) -> str:
+def _why(found: Headline, rows: Sequence[BudgetRow], in_chain: Callable[[str], MonteCarlo]) -> str:
     """Say that they differ, and by which source if it is one."""
     more = "larger" if found.sum_px > found.simulated_px else "smaller"
     text = (

@@ -24,6 +24,7 @@ from pixmetry.budget.probe import (
     window_side,
 )
 from pixmetry.camera.camera import Camera, Element
+from pixmetry.camera.catalogue import STAGES
 from pixmetry.camera.contribution import SMOOTH_ORDER, Contribution, smooth_part
 from pixmetry.camera.conversions import LineSources, Link
 from pixmetry.camera.signal import Kind
@@ -69,7 +70,7 @@ class MonteCarlo:
     frozen_tail: float  # largest share of a pixel's signal that the mode `frozen` takes from the noise-free frame
 
     def contribution(self, gum_class: str) -> Contribution | None:
-        """The same as a contribution; None where no target was found."""
+        """The same as a contribution, with twice the standard error as its error; None where no target was found."""
         if not np.isfinite(self.total_px):
             return None
         smooth = tuple(float(np.sqrt(max(a.u**2 - a.left**2, 0.0))) for a in (self.x, self.y))
@@ -81,7 +82,8 @@ class MonteCarlo:
             self.y.bias,
             floor_px=2 * self.se_total_px,
             method="Monte Carlo: the camera's chain with it and without, a target at rest",
-            time_px=(self.x.temporal, self.y.temporal),
+            # of frames that differ by turns (fields), the scatter within a pair is twice that of all
+            time_px=(min(self.x.temporal, self.x.u), min(self.y.temporal, self.y.u)),
             smooth_px=(smooth[0], smooth[1]),
         )
 
@@ -160,19 +162,14 @@ class Trials:
         draws = Streams(self.seed, self.seed).of("budget.places").uniform_unit(4 * self.units * self.places).astype(float)
         row, col, self.dx, self.dy = draws.reshape(4, self.units, self.places)
         self.dx, self.dy = self.dx - 0.5, self.dy - 0.5
-        ends = self.camera.layout([0.0, self.camera.frame_shape[1] - 1.0], [0.0, self.camera.frame_shape[0] - 1.0])
-        self.col0, self.row0 = (self._first(part, end, size) for part, end, size in zip((col, row), ends, shape[::-1], strict=True))
-
-    def _first(self, part: np.ndarray, ends: np.ndarray, size: int) -> np.ndarray:
-        """First pixels of windows spread over what the frame shows of the sensor: a row of samples may be longer than the line."""
-        start, end = (int(np.clip(at, 0, size)) for at in (np.ceil(ends[0] - 0.5), np.floor(ends[1] + 0.5) + 1))
-        if end - start < self.side:
-            start, end = 0, size
-        return start + np.floor(part * (end - start - self.side + 1)).astype(np.int64)
+        self.col0, self.row0 = (
+            start + np.floor(part * (end - start - self.side + 1)).astype(np.int64)
+            for part, (start, end) in zip((col, row), shown_part(self.camera, self.side), strict=True)
+        )
 
     def errors(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
         """Positions found in the frames of a variant of the camera less the true ones: px of the sensor, (units, places, frames)."""
-        key = tuple((e.on, e.params) for e in camera.chain)
+        key = tuple((e.name, e.params) for e in camera.active)
         if key not in self._found:
             facts = replace(self.facts, dn_per_photon=self.facts.dn_per_photon * passed_light(camera))
             parts = [self._unit(replace(camera, unit_seed=camera.unit_seed + UNIT_STRIDE * k), k, facts) for k in range(self.units)]
@@ -246,8 +243,50 @@ class Trials:
             off = tuple(off)
             return self.compare(off, self.camera, missed(self.camera, off))
         only = tuple(only)
-        helpers = helpers_of(self.camera, only)
-        return self.compare(only, perfect(self.camera, (*only, *helpers)), perfect(self.camera, helpers))
+        return self._alone(self.camera, only)
+
+    def alone(self, element: Element) -> MonteCarlo:
+        """What one source with these parameters does in this camera, whether its chain holds it or not; see `of` and `put`.
+
+        Raises
+        ------
+        ChainError
+            If the chain has no place for it.
+        """
+        camera = put(self.camera, element)
+        same = camera.output_shape == self.camera.output_shape and _layout(camera) == _layout(self.camera)
+        design = self if same else replace(self, camera=camera, _found={})  # targets lie where this camera shows them
+        return design._alone(camera, (element.name,))
+
+    def _alone(self, camera: Camera, only: tuple[str, ...]) -> MonteCarlo:
+        """What some sources of a camera with this design's layout do."""
+        helpers = helpers_of(camera, only)
+        return self.compare(only, perfect(camera, (*only, *helpers)), perfect(camera, helpers))
+
+
+def put(camera: Camera, element: Element) -> Camera:
+    """The camera with this element on: in the place of the one of its name, or else where the stages of the chain let it stand.
+
+    Raises
+    ------
+    ChainError
+        If the chain has no place for it.
+    """
+    if element.name in camera:
+        return replace(camera, chain=tuple(replace(element, on=True) if e.name == element.name else e for e in camera.chain))
+    stages = [STAGES.index(e.source.stage) for e in camera.chain]
+    mine = STAGES.index(element.source.stage)
+
+    def apart(at: int) -> tuple[int, int]:
+        """How many elements would stand on the wrong side of it; of equal places, the last."""
+        return sum(s > mine for s in stages[:at]) + sum(s < mine for s in stages[at:]), -at
+
+    for at in sorted(range(len(camera.chain) + 1), key=apart):
+        try:
+            return replace(camera, chain=(*camera.chain[:at], element, *camera.chain[at:]))
+        except ChainError as problem:
+            refused = problem
+    raise refused
 
 
 def missed(camera: Camera, off: Iterable[str]) -> Camera:
@@ -333,11 +372,26 @@ def _layout(camera: Camera) -> list[tuple[float, float]]:
     return [(float(start), float(end - start)) for start, end in camera.layout([0.0, 1.0], [0.0, 1.0])]
 
 
+def shown_part(camera: Camera, side: int) -> list[tuple[int, int]]:
+    """Columns and rows (the first, the one after the last) in which a frame shows the sensor: a row of samples may be longer than the line.
+
+    All of the frame where windows of this side do not fit into that part.
+    """
+    ends = camera.layout([0.0, camera.frame_shape[1] - 1.0], [0.0, camera.frame_shape[0] - 1.0])
+    parts = []
+    for (first, last), size in zip(ends, camera.output_shape[::-1], strict=True):
+        start, end = (int(np.clip(at, 0, size)) for at in (np.ceil(first - 0.5), np.floor(last + 0.5) + 1))
+        parts.append((start, end) if end - start >= side else (0, size))
+    return parts
+
+
 def _level(camera: Camera, facts: Facts, target: Target, side: int, above_dn: float, windows: int = 32) -> float:
     """Grey value of uniform light that lies ``above_dn`` (linear) above the target's background."""
     background = background_of(target, facts)
     light = replace(background, level_photons=background.level_photons + above_dn / facts.dn_per_photon)
-    grid = spread_windows(camera.output_shape, side, windows)
+    (left, right), (top, bottom) = shown_part(camera, side)
+    grid = spread_windows((bottom - top, right - left), side, windows)
+    grid = Grid(grid.frame, grid.row0 + top, grid.col0 + left, grid.shape)
     data = camera.expose_windows(
         light,
         grid,
