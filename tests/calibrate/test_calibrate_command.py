@@ -156,7 +156,7 @@ def test_results_are_input_again(done: tuple[Path, Path, Result], simulated: Sim
 
 def test_fewer_parameters_and_terms_of_images(simulated: Simulated, tmp_path: Path) -> None:
     path = project(tmp_path, simulated.network)
-    result = run(path, "-o", tmp_path / "r", "--free", "c,xp,yp,k1,k2", "--per-image", "x_scale", "--folds", 0, "--json")
+    result = run(path, "-o", tmp_path / "r", "--free", "c,xp,yp,k1,k2", "--per-image", "x_scale", "--folds", 0, "--json", "-")
     assert result.exit_code == 0, result.output
     told = json.loads(result.output)
     (camera,) = told["cameras"]

@@ -156,7 +156,7 @@ def test_discs_come_with_their_truth(folder: Path) -> None:
 
 
 def test_the_catalogue_as_json() -> None:
-    records = json.loads(run("sources", "--json").output)
+    records = json.loads(run("sources", "--json", "-").output)["sources"]
     by_id = {r["id"]: r for r in records}
     assert len(by_id) == len(records) >= 19
     noise = by_id["sensor.shot_noise"]

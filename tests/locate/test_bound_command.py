@@ -26,18 +26,18 @@ def test_it_says_what_is_possible_what_estimators_give_and_what_limits() -> None
 
 
 def test_programs_get_the_numbers_of_the_library() -> None:
-    record = json.loads(run(*TARGET, "--noise", "read=1.5,gain=0.01,bits=8", "--json").output)
+    record = json.loads(run(*TARGET, "--noise", "read=1.5,gain=0.01,bits=8", "--json", "-").output)
     model = NoiseModel(1.5**2 + 1 / 12, 0.01, low_dn=0, high_dn=255)
     disc = {"radius_px": 3.5, "blur_px": 0.7, "amplitude_dn": 150.0, "background_dn": 10.0}
     assert record["bounds"]["asked"]["u_px"]["mean"] == pytest.approx(bound("disc", disc, model).place_px[1])
     assert record["schema"] == "pixmetry/bound/1" and record["frames"] == 1 and record["pitch_um"] is None
     assert sum(limit["share"] for limit in record["limits"]) == pytest.approx(1, abs=1e-5)
-    four = json.loads(run(*TARGET, "--noise", "read=1.5,gain=0.01,bits=8", "--frames", "4", "--json").output)
+    four = json.loads(run(*TARGET, "--noise", "read=1.5,gain=0.01,bits=8", "--frames", "4", "--json", "-").output)
     assert four["bounds"]["asked"]["u_px"]["mean"] == pytest.approx(record["bounds"]["asked"]["u_px"]["mean"] / 2)
 
 
 def test_black_of_a_camera_is_under_the_surround() -> None:
-    record = json.loads(run(*TARGET, "--camera", "imx264_like", "--json").output)
+    record = json.loads(run(*TARGET, "--camera", "imx264_like", "--json", "-").output)
     assert record["parameters"]["background_dn"] == pytest.approx(42.0076, abs=0.05)
     assert record["pitch_um"] == [3.45, 3.45]
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import click
 
 from pixmetry.cli._console import console as plain_console
-from pixmetry.core.plain_text import json_shown
-from pixmetry.files.strict_json import json_text
+from pixmetry.cli._json import JsonResult, json_option
 
 KINDS = ("disc", "ellipse", "ring", "spot", "line", "edge")
 SIZES = {
@@ -59,7 +59,7 @@ SIZES = {
     show_default=True,
     help="Where light that falls off across a target acts.",
 )
-@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+@json_option("what is possible")
 def bound(
     kind: str,
     blur: float,
@@ -75,7 +75,7 @@ def bound(
     window: int | None,
     phases: int,
     light_on: str,
-    as_json: bool,
+    json_file: Path | None,
     **sizes: float | None,
 ) -> None:
     """Compute how well a target can be located (Cramér–Rao bound), and what limits it.
@@ -88,6 +88,7 @@ def bound(
     from pixmetry.core.errors import InputError
     from pixmetry.locate.bound.bound import possible
 
+    written = JsonResult(json_file, "pixmetry/bound/1", inputs=[Path(camera)] if camera else [])
     if noise and camera:
         raise InputError("the noise is given twice", where="--noise, --camera", remedy="give one of them")
     model, settings, about = _of_camera(camera, no_rounding) if camera else _of_text(noise or "read=1.5", no_rounding)
@@ -108,10 +109,8 @@ def bound(
         aperture_px=settings["aperture_px"],
         pattern_dn=settings["pattern_dn"],
     )
-    if as_json:
-        record = result.to_record() | {"aperture_px": settings["aperture_px"]} | about
-        click.echo(json_shown(json_text(record).rstrip()))
-    else:
+    written.put(result.to_record() | {"aperture_px": settings["aperture_px"]} | about)
+    if not written.printed:
         _show(result, about)
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import click
 
 from pixmetry.cli._console import echo, echo_lines
+from pixmetry.cli._json import JsonResult, json_option
 
 KINDS = ("chessboard", "dots", "coded", "squares", "lines")
 OPTIONS = ("field", "loss", "folds", "residual_grid", "snoop", "a_priori")
@@ -92,7 +93,7 @@ OPTIONS = ("field", "loss", "folds", "residual_grid", "snoop", "a_priori")
     show_default=True,
     help="Largest error that the export to OpenCV or COLMAP may add anywhere in the frame, px.",
 )
-@click.option("--json", is_flag=True, help="Print the cameras as JSON instead of a summary.")
+@json_option("the cameras and what was found")
 @click.option("--threads", type=click.IntRange(1), help="Number of threads. Default: one for each processor.")
 def calibrate(
     sources: tuple[Path, ...],
@@ -100,7 +101,7 @@ def calibrate(
     opencv: Path | None,
     colmap: Path | None,
     may_lose_px: float,
-    json: bool,
+    json_file: Path | None,
     threads: int | None,
     **given: Any,
 ) -> None:
@@ -115,6 +116,7 @@ def calibrate(
     docs/calibrating.md explains every key of a project file and every message.
     """
     from pixmetry.calibrate.files.exports import check_exports, write_exports
+    from pixmetry.calibrate.files.record import LINES_SCHEMA, RESULT_SCHEMA, cameras_text
     from pixmetry.calibrate.job import calibrate as run
     from pixmetry.cli._progress import shown_progress
     from pixmetry.core.threads import set_threads
@@ -122,26 +124,24 @@ def calibrate(
     set_threads(threads)
     read = (*sources, *((Path(given["camera"]),) if given["camera"] is not None else ()))
     check_exports(opencv, colmap, output, read)
+    written = JsonResult(json_file, RESULT_SCHEMA, LINES_SCHEMA, inputs=read)
     options = {name: given.pop(name) for name in OPTIONS}
     options = {name: value for name, value in options.items() if value is not None}
     with shown_progress() as progress:
         calibration = run(sources, output, options=options, progress=progress, **given)
     report = output / "report.html"
-    echo_lines(_told(calibration, report, json))
+    written.put_text(cameras_text(calibration, str(report)))
+    if not written.printed:
+        echo_lines(_summary(calibration, report))
     if opencv is not None or colmap is not None:
         for sentence in write_exports(_models(calibration), opencv, colmap, may_lose_px, read):
-            echo(sentence, err=json)
+            echo(sentence, err=written.printed)
 
 
-def _told(calibration: Any, report: Path, json: bool) -> str:
-    """What is printed: a summary for people, or the cameras for programs."""
+def _summary(calibration: Any, report: Path) -> str:
+    """What is printed."""
     from pixmetry.calibrate.lines.line_calibration import LineCalibration
 
-    if json:
-        from pixmetry.calibrate.files.record import cameras_text
-        from pixmetry.core.plain_text import json_shown
-
-        return json_shown(cameras_text(calibration, str(report)))
     if isinstance(calibration, LineCalibration):
         from pixmetry.calibrate.page.lines_text import summary_text as lines_text
 

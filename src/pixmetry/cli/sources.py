@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-import json
+from pathlib import Path
 
 import click
+
+from pixmetry.cli._json import JsonResult, json_option
 
 ROOM_FOR_NOTES = 110  # columns of a terminal
 
 
 @click.command()
 @click.argument("source_id", metavar="[ID]", required=False)
-@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-def sources(source_id: str | None, as_json: bool) -> None:
+@json_option("the list, or the source,")
+def sources(source_id: str | None, json_file: Path | None) -> None:
     """List the error sources, or explain one of them.
 
     Without ID: all error sources by stage, with the handbook's stars and notes, and which of the verbs forward, measure, correct and
@@ -20,13 +22,18 @@ def sources(source_id: str | None, as_json: bool) -> None:
     """
     from pixmetry.camera.catalogue import catalogue, get_source, to_record
 
+    result = JsonResult(json_file, "pixmetry/sources/1" if source_id is None else "pixmetry/source/1")
     if source_id is None:
         records = [to_record(s) for s in catalogue().values()]
-        click.echo(json.dumps(records, indent=2, ensure_ascii=False)) if as_json else _list(records)
+        result.put({"sources": records})
+        if not result.printed:
+            _list(records)
     else:
         source = get_source(source_id)
         record = to_record(source) | _details(source)
-        click.echo(json.dumps(record, indent=2, ensure_ascii=False)) if as_json else _explain(record)
+        result.put(record)
+        if not result.printed:
+            _explain(record)
 
 
 def _details(source) -> dict:
