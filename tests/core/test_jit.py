@@ -148,6 +148,21 @@ def test_processes_that_compile_at_once_keep_all_that_they_compiled(tmp_path: Pa
             assert started.returncode == 0
 
 
+def test_kernel_that_is_compiled_takes_one_that_came_from_the_disk(tmp_path: Path) -> None:
+    """What was loaded has not loaded what compiling needs."""
+    write_package(tmp_path, 1.0)
+    script = (
+        "import sys\nimport numpy as np\nfrom thrown._inner_kernels import inner\nprint(inner(3.0), 'numba.np.arraymath' in sys.modules)\n"
+    )
+    outer = "from thrown._outer_kernels import outer\nprint(outer(np.arange(4.0)), *inner.dispatcher.stats.cache_hits.values())"
+    variables = os.environ | {"PYTHONPATH": os.pathsep.join([SOURCE, str(tmp_path)]), "PIXMETRY_CACHE_DIR": str(tmp_path / "cache")}
+    said = [
+        subprocess.run([sys.executable, "-c", code], env=variables, capture_output=True, text=True, check=True).stdout.split()
+        for code in (script, script + outer)
+    ]
+    assert said == [["3.0", "True"], ["3.0", "False", "12.0", "1"]]
+
+
 def test_spoilt_file_is_compiled_again(tmp_path: Path) -> None:
     write_package(tmp_path, 1.0)
     run(tmp_path)

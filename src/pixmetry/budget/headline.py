@@ -28,9 +28,9 @@ def interval_of(total_px: tuple[float, float], dof: tuple[float, float], coverag
     >>> [round(k, 3) for k in found.k], [round(half, 4) for half in found.half_px]
     ([2.262, 1.96], [0.0226, 0.0392])
     """
-    from scipy.stats import norm, t
+    from scipy.special import ndtri, stdtrit
 
-    k = tuple(float(t.ppf((1 + coverage) / 2, n) if np.isfinite(n) else norm.ppf((1 + coverage) / 2)) for n in dof)
+    k = tuple(float(stdtrit(n, (1 + coverage) / 2) if np.isfinite(n) else ndtri((1 + coverage) / 2)) for n in dof)
     return Interval((k[0] * total_px[0], k[1] * total_px[1]), (k[0], k[1]), dof, coverage)
 
 

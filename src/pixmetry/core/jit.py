@@ -153,8 +153,9 @@ class _Store:
     def load_overload(self, signature: Any, context: Any) -> Any:
         """Return the compiled code for a signature, or None where there is none, or none that can be read."""
         from numba.core.compiler import CompileResult
+        from numba.core.runtime import rtsys
 
-        context.refresh()
+        rtsys.initialize(context)  # all that runs; what compiling needs besides is loaded, for a quarter of a second, by who compiles
         key = self._key(signature, context.codegen())
         if key is None:
             return None

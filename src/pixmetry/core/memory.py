@@ -9,6 +9,7 @@ from pathlib import Path
 
 from pixmetry.core.errors import InputError
 
+UNASKED_BYTES = 1 << 20  # what a process takes at any time; to ask the system takes as long as to read such a file
 _GROUP = (  # limit, use, and what of it is held by files: control groups 2 and 1
     ("memory.max", "memory.current", "inactive_file"),
     ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes", "total_inactive_file"),
@@ -44,6 +45,8 @@ def check_memory(needed_bytes: float, what: str, *, where: str = "", remedy: str
     InputError
         If fewer bytes are available.
     """
+    if needed_bytes <= UNASKED_BYTES:
+        return
     available = available_bytes()
     if needed_bytes > available:
         allowed = f"up to {_size(available)}, the memory that is free now"

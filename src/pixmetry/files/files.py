@@ -45,6 +45,9 @@ def _find(base: Path, text: str, where: str) -> Path:
     path = base / text  # an exact name first: on Linux a backslash may be part of it
     if path.is_file() or is_entry(path) or is_frame(path):
         return path
+    path = base / text.replace("\\", "/")
+    if path.is_file():
+        return path
     parts = text.replace("\\", "/").split("/")
     path = Path("/") if parts[0] == "" else base
     for part in parts:

@@ -62,7 +62,10 @@ def check_files(outputs: Sequence[Output], inputs: Iterable[Path] = ()) -> None:
         If a name is given twice, is that of an input, a folder or another file, or its folder is missing or cannot be written to.
     """
     seen: set[Path] = set()
-    read = {Path(os.path.realpath(path if path.exists() else path.parent)) for path in map(Path, inputs)}  # a frame in a file: that file
+    read: set[Path] = set()
+    if any(output.path.exists() for output in outputs):  # what is not there is no input
+        files = (path if path.exists() else path.parent for path in map(Path, inputs))  # a frame in a file: that file
+        read = {Path(os.path.realpath(file)) for file in files}
     for output in outputs:
         real = Path(os.path.realpath(output.path))
         if real in seen:

@@ -72,13 +72,13 @@ def find_defects(
     A hot pixel that stands above all good ones in the light although it seems to answer too little has met the end of the scale: it is
     hot, and its response is not known (``gain_rel`` is NaN).
     """
-    from scipy.stats import norm
+    from scipy.special import ndtri
 
     shape = dark_stack.shape
     if bright_stack is not None and bright_stack.shape != shape:
         raise InputError("dark and bright stack differ in shape", value=bright_stack.shape, allowed=str(shape))
     tests = 5 if bright_stack is not None else 3  # tails: dark and response have two, noise one
-    threshold = float(norm.isf(expected_false / (tests * shape[0] * shape[1])))
+    threshold = -float(ndtri(expected_false / (tests * shape[0] * shape[1])))
     rounding = rounding_error_dn(dark_stack)
     coarse = rounding > COARSE_DN
     dark = _without_lines(dark_stack.mean_map_dn, COARSE_CLIP_DN if coarse else 0.0)
@@ -136,12 +136,12 @@ def rounding_error_dn(stack: StackMoments) -> float:
 
 def _core_of_codes_dn(mean_map: np.ndarray) -> float:
     """Width of a Gaussian of which the pixels half a code above and half a code below the commonest one are these shares."""
-    from scipy.stats import norm
+    from scipy.special import ndtri
 
     code = np.rint(median(mean_map))
     # half a pixel at least, for a share of which there is none
     shares = [max(float(np.mean(beyond > 0.5)), 0.5 / mean_map.size) for beyond in (mean_map - code, code - mean_map)]
-    return 1.0 / float(max(norm.isf(shares).sum(), 0.5))
+    return 1.0 / float(max(-ndtri(shares).sum(), 0.5))
 
 
 def _beyond(deviation: np.ndarray, slack: float) -> np.ndarray:

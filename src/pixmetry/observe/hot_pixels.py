@@ -154,13 +154,13 @@ def _noise_of_defects(stack: StackMoments, hot: np.ndarray) -> tuple[float, floa
 
     The sample variances of few pixels scatter by √(2/(L − 1)) each.
     """
-    from scipy.stats import chi2
+    from scipy.special import chdtri
 
     var = stack.var_map_dn2.astype(float)
     dof = stack.n_frames - 1
     core = float(var[~hot].mean())
     for _ in range(3):
-        noisy = ~hot & (var > max(core, 0.25) * chi2.isf(NOISY_BY_CHANCE / var.size, dof) / dof)
+        noisy = ~hot & (var > max(core, 0.25) * chdtri(dof, NOISY_BY_CHANCE / var.size) / dof)
         core = float(var[~(hot | noisy)].mean())
     of_hot, of_noisy = (float((var[part] - core).sum()) / var.size for part in (hot, noisy))
     above = np.maximum(var[hot] - core, 0.0)

@@ -114,10 +114,10 @@ def _searched(shape: tuple[int, int]) -> np.ndarray:
 
 def _floor(power: np.ndarray, searched: np.ndarray, pairs: int) -> tuple[np.ndarray, int]:
     """Noise floor at each ordinate from the median of its block, and the smallest number of ordinates in a block."""
-    from scipy.stats import gamma
+    from scipy.special import gammaincinv
 
     floor = np.empty_like(power, dtype=float)
-    median = float(gamma.ppf(0.5, pairs)) / pairs
+    median = float(gammaincinv(pairs, 0.5)) / pairs
     smallest = power.size
     for rows in np.array_split(np.arange(power.shape[0]), max(power.shape[0] // BLOCK, 1)):
         for cols in np.array_split(np.arange(power.shape[1]), max(power.shape[1] // BLOCK, 1)):
@@ -130,10 +130,10 @@ def _floor(power: np.ndarray, searched: np.ndarray, pairs: int) -> tuple[np.ndar
 
 def _threshold(n_searched: int, pairs: int, block: int, rate: float) -> float:
     """Ratio of an ordinate to its floor that white noise exceeds anywhere with the given rate."""
-    from scipy.stats import f
+    from scipy.special import fdtri
 
     per_ordinate = -math.expm1(math.log1p(-rate) / n_searched)
-    return float(f.isf(per_ordinate, 2 * pairs, 2 * pairs * block * math.log(2) ** 2))
+    return float(fdtri(2 * pairs, 2 * pairs * block * math.log(2) ** 2, 1 - per_ordinate))
 
 
 def _is_leftover(line: _Line, moving: list[_Line], n_frames: int, shape: tuple[int, int]) -> bool:

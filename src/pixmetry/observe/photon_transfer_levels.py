@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -190,8 +192,6 @@ def response_exponent(pt: PhotonTransfer, d: model.Levels) -> tuple[float, float
 
     The black level b is free, so that dark current and the curve's start do not bend the result. Too few levels: (1, inf, False).
     """
-    from scipy.optimize import minimize_scalar
-
     unclipped = np.concatenate([np.zeros(pt.dark.mean_dn.size, bool), unclipped_bright(pt)])
     above = d.mean - d.mean[~d.bright].mean()
     share = above / max(float(above.max()), 1e-9)
@@ -205,11 +205,28 @@ def response_exponent(pt: PhotonTransfer, d: model.Levels) -> tuple[float, float
         found = np.linalg.lstsq(design, signal, rcond=None)[0]
         return found, float(((signal - design @ found) ** 2).sum())
 
-    gamma = float(minimize_scalar(lambda g: line(light**g)[1], bounds=(0.05, 3.0), method="bounded", options={"xatol": 1e-7}).x)
+    gamma = _place_of_least(lambda g: line(light**g)[1], 0.05, 3.0, 1e-8)
     found, squares = line(light**gamma)
     jacobian = np.stack([np.ones_like(light), light**gamma, found[1] * light**gamma * np.log(light)], axis=1)
     u = float(np.sqrt(np.linalg.pinv(jacobian.T @ jacobian)[2, 2] * squares / (light.size - 3)))
     return gamma, u, squares < POWER_CURVE * line(light, light**2, light**3)[1]
+
+
+def _place_of_least(function: Callable[[float], float], low: float, high: float, within: float) -> float:
+    """Place of a function's only minimum in an interval, by the golden section (J. Kiefer, Proc. AMS 4, 502 (1953))."""
+    ratio = (math.sqrt(5.0) - 1) / 2
+    left, right = high - ratio * (high - low), low + ratio * (high - low)
+    f_left, f_right = function(left), function(right)
+    while high - low > within:
+        if f_left < f_right:
+            high, right, f_right = right, left, f_left
+            left = high - ratio * (high - low)
+            f_left = function(left)
+        else:
+            low, left, f_left = left, right, f_right
+            right = low + ratio * (high - low)
+            f_right = function(right)
+    return (low + high) / 2
 
 
 def usable_levels(pt: PhotonTransfer, d: model.Levels) -> np.ndarray:

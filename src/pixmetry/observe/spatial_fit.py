@@ -393,11 +393,11 @@ def _bounds(matrix: np.ndarray, squares: _MeanSquares) -> tuple[np.ndarray, np.n
 
     The part of waves lies between ln(20/19) and −ln 0.00135 times its mean.
     """
-    from scipy.stats import chi2
+    from scipy.special import chdtri, gammaincinv
 
     dof = 2 / squares.relative_variances()
-    above = (dof / chi2.ppf(0.05, dof) - 1) * squares.values  # how far the expectation may lie above the mean square
-    below = (1 - dof / chi2.isf(NOT_BY_CHANCE, dof)) * squares.values
+    above = (dof / (2 * gammaincinv(dof / 2, 0.05)) - 1) * squares.values  # how far the expectation may lie above the mean square
+    below = (1 - dof / chdtri(dof, NOT_BY_CHANCE)) * squares.values
     above = np.hypot(above, (1 - math.log(20 / 19)) * squares.waves)
     below = np.hypot(below, (-math.log(NOT_BY_CHANCE) - 1) * squares.waves)
     positive, negative = np.maximum(matrix, 0.0), np.minimum(matrix, 0.0)

@@ -30,11 +30,11 @@ def radial_profile(diameter_px: float, blur_px: float) -> np.ndarray:
     The convolution at distance ρ is ∫₀^R (r/s²) exp(−(r² + ρ²)/2s²) I₀(rρ/s²) dr (polar form of the two-dimensional integral; known as
     1 − Q₁, Marcum's function): here by the non-central χ² distribution with two degrees of freedom.
     """
-    from scipy.stats import ncx2
+    from scipy.special import chndtr
 
     radius = 0.5 * diameter_px
     rho = np.arange(0.0, radius + REACH * blur_px + 1.0 + 2 * STEP, STEP)
-    return ncx2.cdf((radius / blur_px) ** 2, 2, np.maximum((rho / blur_px) ** 2, 1e-300))
+    return chndtr((radius / blur_px) ** 2, 2, np.maximum((rho / blur_px) ** 2, 1e-300))
 
 
 @dataclass(frozen=True)

@@ -382,12 +382,12 @@ def check_flicker(frames: Frames) -> Check:
     groups = [g for g in frames.unsaturated if g.n_frames >= FLICKER_FRAMES and g.mean_noise_dn2 > 0]
     if not groups:
         return make(NAN, NAN, "not judged", "four bright frames or more at one unsaturated level are needed")
-    from scipy.stats import f
+    from scipy.special import fdtri
 
     worst, verdict = max(groups, key=lambda g: flicker_rel(g, frames.dark)), "ok"
     value = flicker_rel(worst, frames.dark)
     dof = worst.n_frames - 1
-    limit = f.isf(FALSE_ALARM / len(groups), dof, min(worst.shape) - 1)
+    limit = fdtri(dof, min(worst.shape) - 1, 1 - FALSE_ALARM / len(groups))
     if worst.squares.frame_dn2 > limit * worst.mean_noise_dn2:
         verdict = "fail" if value > 0.02 else "warn" if value > 0.002 else "ok"
     reason = f"the light flickers or drifts {level_text(worst)}; responsivity, linearity and quantum efficiency will scatter by as much"
@@ -397,14 +397,14 @@ def check_flicker(frames: Frames) -> Check:
 
 def _drift(group: Group) -> tuple[float, float, bool]:
     """Change of the frame mean over the series along a line, its u, and whether it is more than chance."""
-    from scipy.stats import t
+    from scipy.special import stdtrit
 
     n = group.n_frames
     time = np.arange(n) - (n - 1) / 2
     slope = float(time @ group.frame_means_dn / (time @ time))
     rest = group.frame_means_dn - group.mean_dn - slope * time
     u = math.sqrt(max(rest @ rest / (n - 2), group.mean_noise_dn2) / (time @ time))
-    return abs(slope) * (n - 1), u * (n - 1), abs(slope) > t.isf(FALSE_ALARM / 2, n - 2) * u
+    return abs(slope) * (n - 1), u * (n - 1), abs(slope) > -stdtrit(n - 2, FALSE_ALARM / 2) * u
 
 
 def check_drift(frames: Frames) -> Check:
@@ -434,7 +434,7 @@ def check_dark_drift(frames: Frames) -> Check:
 def check_banding(frames: Frames) -> Check:
     """Waves down the rows that differ between frames: mains flicker under a rolling shutter."""
     make = new_check("banding", "bands down the rows, amplitude", "%", "at most 0.1 % of the signal")
-    from scipy.stats import gamma
+    from scipy.special import gammainccinv, gammaincinv
 
     if not frames.unsaturated or frames.dark.shape[0] < 32:
         return make(NAN, NAN, "not judged", "no unsaturated bright level, or fewer than 32 rows")
@@ -444,9 +444,9 @@ def check_banding(frames: Frames) -> Check:
         pairs = profiles[1::2][: g.n_frames // 2] - profiles[0::2][: g.n_frames // 2]
         power = (np.abs(np.fft.rfft(pairs - pairs.mean(axis=1, keepdims=True), axis=1)) ** 2).mean(axis=0)[1:-1] / rows
         n = len(pairs)
-        floor = float(np.median(power)) / (gamma.median(n) / n)
+        floor = float(np.median(power)) / (float(gammaincinv(n, 0.5)) / n)
         # the floor is a median over the frequencies: room for its scatter
-        limit = gamma.isf(FALSE_ALARM / power.size / len(frames.bright), n) / n * (1 + 6.5 / math.sqrt(power.size))
+        limit = gammainccinv(n, FALSE_ALARM / power.size / len(frames.bright)) / n * (1 + 6.5 / math.sqrt(power.size))
         peak = float(power.max())
         amplitude = math.sqrt(max(2 * (peak - floor) / rows, 0.0)) / (g.mean_dn - frames.dark.mean_dn)
         if peak > limit * floor and amplitude > worst:
@@ -537,7 +537,7 @@ def check_response(frames: Frames) -> Check:
 def check_blocks(frames: Frames) -> Check:
     """Steps of the frame difference that are larger or smaller at every eighth column or row: JPEG."""
     make = new_check("blocks", "noise steps at every 8th row or column", "%", "by chance only")
-    from scipy.stats import t
+    from scipy.special import stdtr
 
     groups = frames.unsaturated or (frames.dark,)
     worst, u_worst, chance = 0.0, NAN, 1.0
@@ -550,7 +550,7 @@ def check_blocks(frames: Frames) -> Check:
             # neighbours share a column: of the others every second is independent at least
             u = math.sqrt(own.var(ddof=1) / own.size + 2 * rest.var(ddof=1) / rest.size)
             excess = own.mean() - rest.mean()
-            p = 2 * t.sf(abs(excess) / u, own.size - 1) if u > 0 else float(excess == 0)
+            p = 2 * stdtr(own.size - 1, -abs(excess) / u) if u > 0 else float(excess == 0)
             if p < chance:
                 worst, u_worst, chance = excess / steps.mean(), u / steps.mean(), p
     if math.isnan(u_worst):

@@ -8,10 +8,12 @@ from pixmetry.core.jit import jit
 
 
 @jit
-def subtract_low_pass(image, weights, out):
-    """out = image less its separable convolution with ``weights`` (odd, symmetric) along both axes, where that lies in the image."""
+def subtract_low_pass(image, weights, line, out):
+    """out = image less its separable convolution with ``weights`` (odd, symmetric) along both axes, where that lies in the image.
+
+    ``line`` is room for one row of the image.
+    """
     half = weights.size // 2
-    line = np.empty(image.shape[1])
     for row in range(out.shape[0]):
         line[:] = 0.0
         for k in range(weights.size):

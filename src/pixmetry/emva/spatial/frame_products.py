@@ -106,7 +106,7 @@ def _block(stored: np.ndarray, rows: slice, cols: slice, margin: int) -> np.ndar
         return found.astype(float)
     block = np.empty((len(stored), rows.stop - rows.start, cols.stop - cols.start))
     for frame, out in zip(found, block, strict=True):
-        subtract_low_pass(np.ascontiguousarray(frame, dtype=float), LOW_PASS, out)
+        subtract_low_pass(np.ascontiguousarray(frame, dtype=float), LOW_PASS, np.empty(frame.shape[1]), out)
     return block
 
 

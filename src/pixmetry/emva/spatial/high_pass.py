@@ -36,7 +36,7 @@ def high_pass(image: np.ndarray) -> np.ndarray:
     """
     check_size(image.shape)
     out = np.empty((image.shape[0] - 2 * MARGIN, image.shape[1] - 2 * MARGIN))
-    subtract_low_pass(np.asarray(image, dtype=float), LOW_PASS, out)
+    subtract_low_pass(np.asarray(image, dtype=float), LOW_PASS, np.empty(out.shape[1] + 2 * MARGIN), out)
     return out
 
 
