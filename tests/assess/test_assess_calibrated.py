@@ -11,7 +11,7 @@ from click.testing import CliRunner
 
 from calibrate.networks import simulate
 from pixmetry import assess, load_camera
-from pixmetry.assess.page.page import render
+from pixmetry.assess.page.page import page_of
 from pixmetry.calibrate.bundle.model import CameraModel, Sensor
 from pixmetry.calibrate.bundle.solve import Options, calibrate_network
 from pixmetry.calibrate.calibrated_camera import calibrated_geometry, with_pitch
@@ -22,6 +22,7 @@ from pixmetry.cli import main
 from pixmetry.core.errors import InputError
 from pixmetry.emva.job import emva1288
 from pixmetry.files import load_campaign
+from pixmetry.report import html_of
 
 PITCH = (8.3, 8.3)
 
@@ -133,6 +134,6 @@ def test_what_is_accepted_is_taken_for_the_whole_sensor_and_what_is_measured_for
     assert record["camera"]["sensor_cols"] == 1600 and record["camera"]["vendor"] == "Maker"
     assert record["conditions"]["operator"] == "A. Tester"
     assert record["conditions"]["lossless"] is True and record["conditions"]["lossless_known"] == "proven"
-    assert "Serial number" in render(whole) and "1600 × 1600" in render(whole)
+    assert "Serial number" in html_of(page_of(whole)) and "1600 × 1600" in html_of(page_of(whole))
     camera = emva1288(replace(campaign, camera=replace(campaign.camera, **facts), operator="A. Tester"))
     assert camera.camera["serial_number"] == "7" and camera.conditions["operator"] == "A. Tester"

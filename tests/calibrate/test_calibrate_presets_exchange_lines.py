@@ -25,7 +25,7 @@ from pixmetry.calibrate.bundle.model import CameraModel, Sensor
 from pixmetry.calibrate.exchange import model_of_colmap, read_opencv
 from pixmetry.calibrate.files.record import read_calibration, stored_cameras
 from pixmetry.calibrate.lines.line_calibration import LineCalibration
-from pixmetry.calibrate.page.lines_page import render
+from pixmetry.calibrate.page.lines_page import page_of
 from pixmetry.calibrate.page.lines_text import summary_text
 from pixmetry.calibrate.project import load_project
 from pixmetry.calibrate.project.presets import stored_grid
@@ -34,6 +34,7 @@ from pixmetry.camera.camera import Camera, load_camera
 from pixmetry.camera.observations import AFFINITY, LENS
 from pixmetry.cli import main
 from pixmetry.core.errors import InputError, MeasureError
+from pixmetry.report import html_of
 from report.test_page import Page
 
 PRESET = "sony_xc8500_progressive"
@@ -374,7 +375,7 @@ def test_the_curve_is_brown_with_its_band(wires: tuple[Path, str], rng: np.rando
     at = {name: draws[:, calibration.result.free.index(name)] for name in ("k1", "k2")}
     spread = np.std(at["k1"] * r[-1] ** 3 + at["k2"] * r[-1] ** 5)
     assert curves["u_radial"][-1] == pytest.approx(spread, rel=5 / np.sqrt(2 * 4000))
-    assert render(calibration) and summary_text(calibration)
+    assert html_of(page_of(calibration)) and summary_text(calibration)
 
 
 def test_residuals_of_lines_are_input_again_in_millimetres_too(wires: tuple[Path, str], tmp_path: Path) -> None:

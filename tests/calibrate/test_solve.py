@@ -454,8 +454,9 @@ def test_one_bad_image_is_named_and_no_drift_is_made_of_it(rng):
 def test_a_camera_that_is_held_and_one_without_images_are_no_trouble(rng, tmp_path):
     """Through records, page, file and summary; for the second camera nothing is said but that it took no part."""
     from pixmetry.calibrate.files.record import calibration_json, read_calibration
-    from pixmetry.calibrate.page.page import render
+    from pixmetry.calibrate.page.page import page_of
     from pixmetry.calibrate.page.text import summary_text
+    from pixmetry.report import html_of
 
     simulated = simulate(rng, images=10, points=40)
     truth = simulated.truth.interior[0]
@@ -468,7 +469,7 @@ def test_a_camera_that_is_held_and_one_without_images_are_no_trouble(rng, tmp_pa
     said = summary_text(calibration)
     assert said.count("fixed") == len(NAMES) - 2 and "is imaged" not in said  # k4 and k5 are 0
     assert "spare: No image coordinate of this camera took part." in said
-    assert "No image coordinate of this camera took part" in render(calibration)
+    assert "No image coordinate of this camera took part" in html_of(page_of(calibration))
     path = tmp_path / "calibration.json"
     path.write_text(calibration_json(calibration), encoding="utf-8")
     stored = read_calibration(path)

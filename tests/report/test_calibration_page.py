@@ -30,7 +30,7 @@ from pixmetry.calibrate.page.figures import (
     image_order,
     round_number,
 )
-from pixmetry.calibrate.page.page import render, write_page
+from pixmetry.calibrate.page.page import page_of, write_page
 from pixmetry.calibrate.page.plots import bin_means, short
 from pixmetry.calibrate.page.space import ellipse, field_map, largest_axis, plan_views, pyramids, seen_from, shown_points
 from pixmetry.calibrate.page.tables import gross_errors, images, network_facts, parameters, scale_bars
@@ -38,6 +38,7 @@ from pixmetry.calibrate.page.text import as_given, p_text, projection_levels, se
 from pixmetry.calibrate.records import Calibration, CheckRecord, FieldPoints, ProjectionMap, read_record
 from pixmetry.core.errors import InputError
 from pixmetry.core.finding import Finding
+from pixmetry.report import html_of
 from report import calibrations
 from report.test_page import Page
 
@@ -51,7 +52,7 @@ def whole(request: pytest.FixtureRequest) -> Calibration:
 
 @pytest.fixture(scope="module")
 def source(whole: Calibration) -> str:
-    return render(whole)
+    return html_of(page_of(whole))
 
 
 @pytest.fixture(scope="module")
@@ -83,7 +84,7 @@ def test_the_verdict_comes_first_in_px_and_um(whole: Calibration, rng: np.random
     text = worth(with_residuals(whole, 0.03, -0.05), 0).replace("\u00a0", " ")
     assert "0.030 px (0.165 µm) rms in x and 0.050 px (0.275 µm) in y" in text
     few = calibrations.full(rng, images=2)
-    found = Page(render(with_residuals(few, 0.03, -0.05)))
+    found = Page(html_of(page_of(with_residuals(few, 0.03, -0.05))))
     assert found.headings[1][1].startswith("1What the calibration is worth")
     assert "x 0.030 px = 0.165 µm y 0.050 px = 0.275 µm" in found.text
 
@@ -122,7 +123,7 @@ def test_gross_errors_are_listed_worst_first(whole: Calibration, rng: np.random.
     records = [replace(one, image="mild", statistic=40.0), replace(one, image="awful", statistic=900.0)]
     assert [row[0] for row in gross_errors(records)] == ["awful", "mild"]
     few = calibrations.full(rng, images=3)
-    assert "No gross error was found." in Page(render(with_tests(few, gross_errors=()))).text
+    assert "No gross error was found." in Page(html_of(page_of(with_tests(few, gross_errors=())))).text
 
 
 def test_a_parameter_that_is_not_significant_says_so(whole: Calibration) -> None:
@@ -148,7 +149,7 @@ def test_a_curve_of_terms_that_are_not_there_is_not_drawn(whole: Calibration) ->
         values[0, np.isin(NAMES, held)] = 0.0 if zero else 1e-6
         network = replace(adjustment.network, cameras=(replace(camera, free=camera.free & ~np.isin(NAMES, held)),))
         changed = replace(adjustment, network=network, state=replace(adjustment.state, interior=values))
-        text = render(replace(whole, adjustment=changed))
+        text = html_of(page_of(replace(whole, adjustment=changed)))
         return [f"{kind} correction against the radius" in text for kind in ("radial", "tangential")]
 
     k, p = tuple(f"k{i}" for i in range(1, 6)), ("p1", "p2")
@@ -159,8 +160,8 @@ def test_a_curve_of_terms_that_are_not_there_is_not_drawn(whole: Calibration) ->
 def test_a_long_table_says_that_it_scrolls(whole: Calibration) -> None:
     records = whole.tests.gross_errors
     many = [replace(records[0], point=f"P{i}") for i in range(30)]
-    assert "The table scrolls." in Page(render(with_tests(whole, gross_errors=many))).text
-    assert "The table scrolls." not in Page(render(with_tests(whole, gross_errors=many[:5]))).text
+    assert "The table scrolls." in Page(html_of(page_of(with_tests(whole, gross_errors=many)))).text
+    assert "The table scrolls." not in Page(html_of(page_of(with_tests(whole, gross_errors=many[:5])))).text
 
 
 def test_a_parameter_held_fixed_is_shown_without_u(whole: Calibration) -> None:
@@ -212,7 +213,7 @@ def test_images_that_are_not_oriented_are_not_counted_and_nothing_of_them_is_rej
 )
 def test_the_page_is_whole_for_every_kind(rng: np.random.Generator, make: Any, pitch_um: float | None, cameras: int) -> None:
     calibration = make(rng, pitch_um=pitch_um, cameras=cameras, images=4 * cameras, points=49, plane=cameras == 2)
-    text = render(calibration)
+    text = html_of(page_of(calibration))
     found = Page(text)
     assert found.open == []
     ids = [attrs["id"] for _, attrs in found.elements if "id" in attrs]
@@ -233,19 +234,19 @@ def test_the_page_is_whole_for_every_kind(rng: np.random.Generator, make: Any, p
 
 def test_without_covariance_nothing_is_claimed(rng: np.random.Generator) -> None:
     plain = calibrations.bare(rng, covariance=False, images=4)
-    text = Page(render(plain)).text
+    text = Page(html_of(page_of(plain))).text
     assert "The uncertainty of the parameters was not computed." in text
     assert "±" not in text[text.index("Principal distance") : text.index("Residuals are measured")]
     none: Any = None
     nothing = Calibration(replace(plain.adjustment, covariance=none, point_covariance=none))
-    assert "The uncertainty of the points was not computed." in Page(render(nothing)).text
+    assert "The uncertainty of the points was not computed." in Page(html_of(page_of(nothing))).text
     assert "nan" not in summary_text(nothing)
 
 
 def test_fixed_points_have_no_ellipsoids(rng: np.random.Generator) -> None:
     plain = calibrations.bare(rng, plane=True, images=4)
     assert plan_views(plain.adjustment) == []
-    assert "All points were held at their given coordinates." in Page(render(plain)).text
+    assert "All points were held at their given coordinates." in Page(html_of(page_of(plain))).text
 
 
 def test_images_and_points_that_are_not_determined_are_left_out(rng: np.random.Generator) -> None:
@@ -263,7 +264,7 @@ def test_images_and_points_that_are_not_determined_are_left_out(rng: np.random.G
         used=adjustment.used & ~out,
         point_covariance=covariance,
     )
-    text = Page(render(Calibration(changed))).text
+    text = Page(html_of(page_of(Calibration(changed)))).text
     assert "1 point is not determined" in text and "nan" not in text.lower()
     assert len(Residuals.of(changed, 0)) == int((adjustment.used & ~out).sum())
 
@@ -272,7 +273,7 @@ def test_a_camera_without_used_coordinates_says_so(rng: np.random.Generator) -> 
     plain = calibrations.bare(rng, cameras=2, images=6)
     adjustment = plain.adjustment
     second = adjustment.network.camera_of[adjustment.network.image] == 1
-    text = Page(render(Calibration(replace(adjustment, used=adjustment.used & ~second)))).text
+    text = Page(html_of(page_of(Calibration(replace(adjustment, used=adjustment.used & ~second))))).text
     assert text.count("No image coordinate of this camera took part.") == 1
 
 
@@ -283,12 +284,12 @@ def test_names_from_outside_are_only_text(rng: np.random.Generator) -> None:
     findings = (Finding("start", f"Image {bad} was left out.", "", "warning"),)
     images = [replace(r, image=network.images[k]) for k, r in enumerate(plain.tests.images)]
     changed = replace(with_tests(plain, images=images), adjustment=replace(plain.adjustment, network=network), findings=findings)
-    assert "<script" not in render(changed)
+    assert "<script" not in html_of(page_of(changed))
 
 
 def test_many_images_and_points_stay_small(rng: np.random.Generator) -> None:
     big = calibrations.full(rng, images=300, points=3000, visibility=0.05)
-    text = render(big)
+    text = html_of(page_of(big))
     assert 1_000_000 < len(text.encode()) < LIMIT_BYTES
     found = Page(text)
     assert "Table of the 300 images" in found.text
@@ -490,7 +491,7 @@ CHECKED = {
 def test_check_points_are_listed(whole: Calibration, page: Page) -> None:
     assert "Check points" not in page.text
     checked = with_tests(whole, check_points=read_record(CheckRecord, CHECKED))
-    shown = Page(render(checked)).text
+    shown = Page(html_of(page_of(checked))).text
     assert "C1 X 1234567.500 ± 0.010 1234567.531 ± 0.020 \u22120.031 \u22121.6 7" in shown
     assert "C1 Y 2.000 exact 2.000 ± 0.020 0 0.0 7" in shown and "C2 Z 5.25 exact – – – – 0" in shown
     assert "C2 X" not in shown and "largest: C1 X, \u22120.031 mm (1.6 u)." in shown and "above 3.5 by chance in 0.1 %" in shown
@@ -499,7 +500,7 @@ def test_check_points_are_listed(whole: Calibration, page: Page) -> None:
     assert max(len(line) for line in summary_text(checked).splitlines()) <= 100
     telling = read_record(CheckRecord, CHECKED)
     silent = with_tests(whole, check_points=replace(telling, datum_parameters=7, chi2=None, p=None, worst=None))
-    shown = Page(render(silent)).text
+    shown = Page(html_of(page_of(silent))).text
     assert "less what the 7 parameters of the datum took up" in shown and "by chance" not in shown
 
 

@@ -15,8 +15,9 @@ import pytest
 
 from pixmetry.assess.page.figures import Curve, all_pictures, nonlinearity
 from pixmetry.assess.page.measured import table
-from pixmetry.assess.page.page import render, write_report
+from pixmetry.assess.page.page import page_of, write_report
 from pixmetry.camera.observations import Observations
+from pixmetry.report import html_of
 from pixmetry.report.drawing import thumbnail
 from report import simulated
 
@@ -65,7 +66,7 @@ class Page(HTMLParser):
 
 @lru_cache(maxsize=4)
 def source(pitch_um: float | None = simulated.PITCH_UM, with_stacks: bool = True) -> str:
-    return render(simulated.assessment(pitch_um, with_stacks))
+    return html_of(page_of(simulated.assessment(pitch_um, with_stacks)))
 
 
 def page(pitch_um: float | None = simulated.PITCH_UM, with_stacks: bool = True) -> Page:
@@ -147,7 +148,7 @@ def test_structure_is_accessible() -> None:
     assert [t.strip()[0] for level, t in found.headings if level == "h2"] == list("12345678")
     assert all("scope" in attrs for attrs in found.of("th"))
     figures = [a for a in found.of("svg") if "figure" in a.get("class", "")]
-    assert len(figures) == 8
+    assert len(figures) == 10
     assert all(a["role"] == "img" and len(a["aria-label"]) > 30 for a in figures)
     assert all(attrs.get("aria-label") for attrs in found.of("div") if attrs.get("role") == "region")
 
@@ -175,7 +176,7 @@ def test_the_same_assessment_gives_the_same_file(tmp_path: Path) -> None:
 def test_without_stacks_the_page_stands_and_says_what_is_missing() -> None:
     found = page(simulated.PITCH_UM, False)
     assert "no stack of dark frames" in found.text
-    assert len([a for a in found.of("svg") if "figure" in a.get("class", "")]) == 4
+    assert len([a for a in found.of("svg") if "figure" in a.get("class", "")]) == 6
 
 
 @pytest.fixture(scope="module")

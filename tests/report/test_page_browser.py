@@ -46,14 +46,14 @@ def test_figures_and_their_pictures_are_there(opened: Any) -> None:
     boxes = opened.evaluate(
         "[...document.querySelectorAll('svg.figure')].map(e => e.getBoundingClientRect()).map(box => [box.width, box.height])"
     )
-    assert len(boxes) in (4, 8)
+    assert len(boxes) in (6, 10)
     assert all(width > 250 and height > 120 for width, height in boxes)
     sizes = opened.evaluate(
         "Promise.all([...document.querySelectorAll('svg image')].map(e => new Promise(done => { const i = new Image(); "
         "i.onload = () => done(i.naturalWidth); i.onerror = () => done(0); i.src = e.href.baseVal })))"
     )
     assert all(size > 1 for size in sizes)
-    assert len(sizes) >= (2 if len(boxes) == 8 else 0)
+    assert len(sizes) >= (2 if len(boxes) == 10 else 0)
 
 
 def test_text_stands_out_from_its_ground(opened: Any) -> None:

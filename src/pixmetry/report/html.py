@@ -150,7 +150,7 @@ def _figure(figure: Figure) -> str:
     caption = _inline(figure.caption)
     if figure.drawing is None:
         return f'<div class="none">{title}<p class="small soft">{caption}</p></div>'
-    return f'<figure id="{escape(figure.name)}">' f"{title}{figure.svg}{f'<figcaption>{caption}</figcaption>' if caption else ''}</figure>"
+    return f'<figure id="{escape(figure.name)}">{title}{figure.svg}{f"<figcaption>{caption}</figcaption>" if caption else ""}</figure>'
 
 
 def _table(table: Table) -> str:

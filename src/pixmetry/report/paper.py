@@ -22,6 +22,7 @@ INNER = WIDTH_PT - LEFT - RIGHT
 PAD, LEAST_SIZE = 5.0, 4.6  # points between columns; the smallest type of a table that is too wide
 LEAD, LINE, NOTE = 1.62, 1.2, 0.88  # of a table in its type size: a row of one line, every further line, its small print
 ROUNDING = 0.01  # points
+AIR = 18.0  # points, by which the columns of a narrow table stand apart
 WHOLE = 90.0  # points, up to which a number is not broken
 PDF_STYLE: Any = STYLE | {"pdf.fonttype": 42, "pdf.compression": 9, "font.family": ["DejaVu Sans", "DejaVu Sans Mono"]}
 
@@ -343,22 +344,26 @@ def _widths(columns: Sequence[Column], rows: Sequence[Row], size: float) -> tupl
         lines = [sum(run_width(run, size) for run in line) for line in lines_of(content, 1e9, size)]
         return max(lines), max(words)
 
-    wish, least = [], []
+    wish, least, heads = [], [], []
     for k, column in enumerate(columns):
         cells = [across(row.cells[k]) for row in rows if not row.heading]
         head = across(Run(column.heading, "strong"))
-        longest = max((c[0] for c in cells), default=0.0)
-        word = max((c[1] for c in cells), default=0.0)
+        longest, word = (max((c[i] for c in cells), default=0.0) for i in (0, 1))
         whole = longest if column.align != "left" and longest < WHOLE else word
         least.append(max(whole, head[1]) + PAD)
-        wish.append(max(longest, min(head[0], max(longest, 60.0)), head[1]) + PAD)
+        wish.append(max(longest, head[1]) + PAD)
+        heads.append(max(longest, head[0]) + PAD)
     for group in {c.group for c in columns} - {""}:
         mine = [k for k, c in enumerate(columns) if c.group == group]
         short = across(Run(group, "strong"))[0] + PAD - sum(wish[k] for k in mine)
         for k in mine if short > 0 else ():
             wish[k] += short / len(mine)
+            heads[k] = max(heads[k], wish[k])
+    if sum(heads) <= INNER:
+        wish = heads
     if sum(wish) <= INNER:
-        return wish, size
+        between = min((INNER - sum(wish)) / len(wish), AIR)
+        return [w + (between if c.align != "u" else 0.0) for w, c in zip(wish, [*columns[1:], Column("")], strict=True)], size
     if sum(least) > INNER:
         if size > LEAST_SIZE:
             return _widths(columns, rows, max(0.94 * size, LEAST_SIZE))

@@ -181,7 +181,7 @@ def _answer(sheets: Paper, answer: Answer) -> None:
     sheets.y += 4
     for h, row in rows:
         for x, line, size in row:
-            sheets.put(LEFT + INDENT + x, line, size, down=(h - 1.35 * TEXT) * 0.5 + (14 - size if h > 15 else 0))
+            sheets.put(LEFT + INDENT + x, line, size, down=0.72 * h - size if h > TEXT * 1.35 else 0.0)
         sheets.y += h
     sheets.y += 12
 

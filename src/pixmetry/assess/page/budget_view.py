@@ -1,22 +1,23 @@
-"""The budget as the page shows it: verdict, ladder of frames, largest contributions with advice, table of all sources, sum and check."""
+"""The budget on the page of an assessment: the answer, the largest contributions with advice, all sources, sum and check."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from itertools import groupby
 from typing import Any
 
 import numpy as np
 
+from pixmetry.assess.page.budget_figures import link_shares, pareto
 from pixmetry.budget.combine import Combined
 from pixmetry.budget.headline import SUM
 from pixmetry.budget.job import DECIDED, Budget, BudgetRow
 from pixmetry.budget.monte_carlo import MonteCarlo
 from pixmetry.budget.probe import phases_for
-from pixmetry.camera.catalogue import STAGES, get_source
+from pixmetry.camera.catalogue import get_source
 from pixmetry.camera.contribution import UNSTEADY
-from pixmetry.report.numbers import NONE, THIN, decimals_of, fixed, length_mpx, length_px, length_um, percent, signed
+from pixmetry.report import Answer, Column, Points, Reading, Row, Run, Section, Table, Text, strong
+from pixmetry.report.numbers import NO_BREAK, NONE, THIN, decimals_of, fixed, length_mpx, length_px, length_um, percent, signed
+from pixmetry.report.page import Inline
 
 CLASSES = {
     "T": "random in time, pixel by pixel",
@@ -32,90 +33,99 @@ CLASS_RULES = (
     "G, D and O (smooth geometry, drift, object and light) fall with neither. Uncorrelated contributions add as squares, x and y apart; "
     "a bias that is not corrected adds as its square and is lowered by no number of frames (JCGM 100:2008, 5.1.2 and F.2.4.5)."
 )
+NOT_HELD = (
+    " Dark and evenly lit frames do not see the lens (distortion, blur, its change with focus and temperature), the geometry of sensor and "
+    "mount (tilt, unflatness, expansion), or the object and its lighting. These come on top; a calibration with targets shows them."
+)
+SOURCES = (
+    "One target, one frame; the largest first, then what was accepted. “Row” is the row of the handbook's error table, with its stars. "
+    "Contributions in thousandths of a pixel, bias and uncertainty together (root sum of squares). {} “Known to” is what the uncertainty "
+    "of the measured parameters makes of the analytic contribution. The share is that of the square of the sum; of accepted sources, that "
+    "of the sum with everything accepted."
+)
 NAMED = 6  # accepted sources that the verdict names
 
-
-@dataclass(frozen=True)
-class Length:
-    """A length as text, in px and (where the pitch is known) in µm; ``axis`` is x or y."""
-
-    px: str
-    um: str
-    axis: str = ""
+Pitch = tuple[float, float] | None
 
 
-@dataclass(frozen=True)
-class Verdict:
-    """The first section's texts and numbers."""
-
-    first: list[Length]
-    calibrated: list[Length]
-    second: list[Length]
-    second_calibrated: list[Length]
-    shares: str
-    accepted: str
-    target: str
-    estimator: str
-    places: str
-    ladder: list[dict[str, Any]]
-    why: str = ""
-
-
-def budget_content(budget: Budget, unmeasured: Mapping[str, str]) -> dict[str, Any]:
-    """Everything that the page says of the budget."""
-    top, accepted, longest_px = _top(budget)
-    return {
-        "verdict": _verdict(budget),
-        "pitch_known": budget.pitch_um is not None,
-        "top": top,
-        "accepted": accepted,
-        "scale": _text(longest_px, budget.pitch_um),
-        "sources": _sources(budget, unmeasured),
-        "mc_note": _monte_carlo_note(budget),
-        "sums": _sums(budget),
-        "interaction": _interaction(budget),
-        "class_rules": CLASS_RULES,
-    }
-
-
-def _length(value_px: float, pitch_um: tuple[float, float] | None, axis: str) -> Length:
-    pitch = None if pitch_um is None else pitch_um["xy".index(axis)]
-    return Length(length_px(value_px), "" if pitch is None else length_um(value_px, pitch), axis)
-
-
-def _text(value_px: float, pitch_um: tuple[float, float] | None) -> str:
-    """A length that belongs to no axis; in µm only where the pitch is the same in both."""
-    square = pitch_um is not None and pitch_um[0] == pitch_um[1]
-    return f"{length_px(value_px)} px" + (f" = {length_um(value_px, pitch_um[0])} µm" if square and pitch_um else "")
-
-
-def _both(combined: Combined, pitch_um: tuple[float, float] | None) -> list[Length]:
-    return [_length(combined.total_x_px, pitch_um, "x"), _length(combined.total_y_px, pitch_um, "y")]
-
-
-def _left(combined: Combined, pitch_um: tuple[float, float] | None) -> list[Length]:
-    return [_length(combined.left_x_px, pitch_um, "x"), _length(combined.left_y_px, pitch_um, "y")]
-
-
-def _verdict(budget: Budget) -> Verdict:
-    pitch = budget.pitch_um
-    ladder = [
-        {"label": f"{a.frames} frame{'' if a.frames == 1 else 's'}", "cells": [*_both(a, pitch), *_left(a, pitch), *_both(b, pitch)]}
-        for a, b in zip(budget.verdicts, budget.with_accepted, strict=True)
+def verdict_section(budget: Budget) -> Section:
+    """The answer: an interval, the standard uncertainty behind it, what a calibration leaves, and what more frames would give."""
+    pitch, one, every = budget.pitch_um, budget.verdict, budget.with_accepted[0]
+    section = Section("What a coordinate is worth", name="verdict")
+    parts: list[Text | Sequence[Reading]] = []
+    if budget.interval is not None:
+        words = (
+            f"With a coverage of {100 * budget.interval.coverage:g} %, a position of one target in one frame lies this near its true place:"
+        )
+        parts += [Text(words), _readings(budget.interval.half_px, pitch, "± ")]
+    parts += [
+        Text("One target in one frame, standard uncertainty (k = 1), everything that was measured or modelled, as the camera is:"),
+        _readings((one.total_x_px, one.total_y_px), pitch),
+        Text("and once a calibration has taken up what is constant or smooth over the frame:"),
+        _readings((one.left_x_px, one.left_y_px), pitch),
+        *([Text(budget.headline.why)] if budget.headline is not None and budget.headline.why else []),
+        Text(_shares(budget.largest)),
+        Text(_with_accepted(budget, every), "second"),
     ]
-    return Verdict(
-        first=_both(budget.verdict, pitch),
-        calibrated=_left(budget.verdict, pitch),
-        second=_both(budget.with_accepted[0], pitch),
-        second_calibrated=_left(budget.with_accepted[0], pitch),
-        shares=_shares(budget.largest),
-        accepted=_accepted(budget.accepted),
-        target=budget.target.describe(),
-        estimator=budget.estimator.describe(),
-        places=f"Averaged over {(n := phases_for(budget.estimator))} × {n} places of the target within a pixel.",
-        ladder=ladder,
-        why="" if budget.headline is None else budget.headline.why,
+    places = f"Averaged over {(n := phases_for(budget.estimator))} × {n} places of the target within a pixel."
+    target, estimator = budget.target.describe(), budget.estimator.describe()
+    section.add(Answer(parts))
+    section.add_text(strong("Target:"), f" {target}. ", strong("Estimator:"), f" {estimator}. {places}")
+    section.add(link_shares(budget), pareto(budget))
+    section.add(_ladder(budget))
+    if pitch is None:
+        words = " the pixel pitch of this camera was not given, so lengths are in pixels only. Add "
+        keys = (Run("pitch_x_um", "code"), " and ", Run("pitch_y_um", "code"), " under ", Run("camera", "code"))
+        section.add_text(strong("In µm:"), words, *keys, " in the campaign file and assess again.")
+    return section.add_text(strong("What this number does not hold."), NOT_HELD, style="soft")
+
+
+def _um(value_px: float, pitch: Pitch, axis: str) -> str:
+    return "" if pitch is None else f"{length_um(value_px, pitch['xy'.index(axis)])}{NO_BREAK}µm"
+
+
+def _readings(pair: tuple[float, float], pitch: Pitch, sign: str = "") -> list[Reading]:
+    return [
+        Reading(axis, f"{sign}{length_px(v)} px" + (f" = {_um(v, pitch, axis)}" if pitch else ""))
+        for axis, v in zip("xy", pair, strict=True)
+    ]
+
+
+def _cell(value_px: float, pitch: Pitch, axis: str, unit: str = "") -> Inline:
+    """A length in px, and below it in µm where the pitch is known."""
+    um = _um(value_px, pitch, axis)
+    return [f"{length_px(value_px)}{unit}", *([Run(f"\n{um}", "small")] if um else [])]
+
+
+def _text(value_px: float, pitch: Pitch) -> str:
+    """A length that belongs to no axis; in µm only where the pitch is the same in both."""
+    square = pitch is not None and pitch[0] == pitch[1]
+    return f"{length_px(value_px)} px" + (f" = {length_um(value_px, pitch[0])} µm" if square and pitch else "")
+
+
+def _with_accepted(budget: Budget, every: Combined) -> list[str | Run]:
+    """What everything that was accepted would make of it, and which sources that is."""
+    pitch = budget.pitch_um
+    x, y = (
+        f"{axis} {length_px(v)} px" + (f" = {_um(v, pitch, axis)}" if pitch else "")
+        for axis, v in (("x", every.total_x_px), ("y", every.total_y_px))
     )
+    left = f"(after a calibration x {length_px(every.left_x_px)} px, y {length_px(every.left_y_px)} px)"
+    head = "With everything that was accepted, not measured, at its catalogue bound: "
+    return [head, strong(x), ", ", strong(y), f" {left}. {_accepted(budget.accepted)}"]
+
+
+def _ladder(budget: Budget) -> Table:
+    pitch = budget.pitch_um
+    rows: list[list[Inline]] = []
+    for known, every in zip(budget.verdicts, budget.with_accepted, strict=True):
+        pairs = ((known.total_x_px, known.total_y_px), (known.left_x_px, known.left_y_px), (every.total_x_px, every.total_y_px))
+        cells = [_cell(v, pitch, axis) for pair in pairs for axis, v in zip("xy", pair, strict=True)]
+        rows.append([f"{known.frames} frame{'' if known.frames == 1 else 's'}", *cells])
+    groups = ("as it is", "calibrated", "with accepted")
+    columns: list[Column | str] = ["Frames averaged", *(Column(f"{axis} / px", "right", group=group) for group in groups for axis in "xy")]
+    caption = "More frames of the same target: what is random in time falls, what is fixed stays."
+    return Table("Uncertainty for more frames", columns, rows, caption)
 
 
 def _shares(rows: Sequence[BudgetRow]) -> str:
@@ -147,47 +157,52 @@ def _accepted(rows: Sequence[BudgetRow]) -> str:
     return f"That adds the largest that is to be expected of a sound camera for {len(rows)} source{'s' * (len(rows) > 1)}: {names}{more}."
 
 
-def _top(budget: Budget) -> tuple[list[dict[str, Any]], list[dict[str, Any]], float]:
-    """The largest contributions, and the largest of what was accepted, with their advice; and the px that the longest bar stands for."""
+def largest_section(budget: Budget) -> Section:
+    """The largest contributions with what to do, and the largest of what was only accepted."""
+    section = Section("The largest contributions, and what to do", name="largest")
     rows = {r.name: r for r in budget.rows}
     chosen = [(a, rows[a.name]) for a in budget.advice]
-    longest = max((abs(v) for _, r in chosen if r.status != "accepted" for v in _components(r)), default=0.0)
-    entries: dict[bool, list[dict[str, Any]]] = {True: [], False: []}
-    for advice, row in chosen:
-        c = row.contribution
-        assert c is not None
-        accepted = row.status == "accepted"
-        entries[accepted].append(
-            {
-                "title": row.title,
-                "chip": f"class {c.gum_class}: {CLASSES[c.gum_class]} · {'accepted at its bound' if accepted else row.status}",
-                "bars": [
-                    _bar("x", c.u_x_px, c.bias_x_px, longest, budget.pitch_um),
-                    _bar("y", c.u_y_px, c.bias_y_px, longest, budget.pitch_um),
-                ],
-                "size": _text(row.total_px, budget.pitch_um),
-                "advice": advice.text,
-                "gain": _gain(advice),
-            }
+    known = [(a, r) for a, r in chosen if r.status != "accepted"]
+    for number, (advice, row) in enumerate(known, 1):
+        part = section.add_section([f"{number}. {row.title} ", Run(_chip(row), "chip")])
+        part.add_text(_sizes(row, budget.pitch_um), style="small")
+        part.add_text(strong("To do:"), f" {advice.text} ", strong("Gain:"), f" {_gain(advice)}")
+    if not known:
+        section.add_text("No source contributes.")
+    bounds = [(a, r) for a, r in chosen if r.status == "accepted"]
+    if bounds:
+        items: list[Inline] = [
+            [
+                *(strong(row.title), " ", Run(_chip(row), "chip"), f" at most {_text(row.total_px, budget.pitch_um)}. "),
+                *(strong("To do:"), f" {advice.text} ", strong("Gain:"), f" {_gain(advice)}"),
+            ]
+            for advice, row in bounds
+        ]
+        part = section.add_section("Accepted, not measured: what to measure first")
+        part.add_text(
+            "These count only in the total with everything accepted, each at the largest that is to be expected of a sound camera."
         )
-    return entries[False], entries[True], longest
+        part.add(Points(items))
+    return section
 
 
-def _components(row: BudgetRow) -> tuple[float, ...]:
+def _chip(row: BudgetRow) -> str:
+    gum_class = row.contribution.gum_class
+    return f"class {gum_class}: {CLASSES[gum_class]} · {'accepted at its bound' if row.status == 'accepted' else row.status}"
+
+
+def _sizes(row: BudgetRow, pitch: Pitch) -> str:
+    """Standard uncertainty and bias in x and in y."""
+
+    def um(value: float, axis: str, text: str) -> str:
+        return "" if pitch is None or text == "0" else f" ({signed(value * pitch['xy'.index(axis)], length_px).lstrip('+')}{NO_BREAK}µm)"
+
     c = row.contribution
-    return () if c is None else (c.u_x_px, c.u_y_px, c.bias_x_px, c.bias_y_px)
-
-
-def _bar(axis: str, u: float, bias: float, longest: float, pitch_um: tuple[float, float] | None) -> dict[str, str]:
-    """Bar lengths in percent of the longest, and the two numbers as text."""
-    pitch = None if pitch_um is None else pitch_um["xy".index(axis)]
-
-    def text(px: str, um: str) -> str:
-        return f"{px} px" + (f" ({um} µm)" if pitch is not None and px != "0" else "")
-
-    width = [f"{max(100 * abs(v) / longest, 0.2):.1f}" if v else "0" for v in (u, bias)]
-    shift = text(signed(bias, length_px), signed(bias * (pitch or 0.0), length_px))
-    return {"axis": axis, "random": width[0], "bias": width[1], "u": text(length_px(u), length_um(u, pitch)), "shift": shift}
+    parts = []
+    for axis, u, bias in (("x", c.u_x_px, c.bias_x_px), ("y", c.u_y_px, c.bias_y_px)):
+        own, shift = length_px(u), signed(bias, length_px)
+        parts.append(f"{axis}: u {own} px{um(u, axis, own)}, bias {shift} px{um(bias, axis, shift)}")
+    return "; ".join(parts) + "."
 
 
 def _gain(advice: Any) -> str:
@@ -207,32 +222,41 @@ def _monte_carlo_note(budget: Budget) -> str:
     )
 
 
-def _sources(budget: Budget, unmeasured: Mapping[str, str]) -> list[tuple[str, list[dict[str, str]]]]:
-    def place(row: BudgetRow) -> int:
-        return STAGES.index(row.source_id.split(".")[0])
+def sources_section(budget: Budget, unmeasured: Mapping[str, str]) -> Section:
+    """All sources in the budget's own order; those that do not count are folded away."""
+    section = Section("All error sources", name="sources").add_text(SOURCES.format(_monte_carlo_note(budget)), style="small soft")
+    counting = [r for r in budget.rows if r.counts]
+    section.add(_source_table("Error sources that count", counting, unmeasured))
+    if others := [r for r in budget.rows if not r.counts]:
+        title = f"{len(others)} source{'s' if len(others) > 1 else ''} that {'do' if len(others) > 1 else 'does'} not count, and why"
+        section.add_section(title, _source_table("Error sources that do not count", others, unmeasured), fold=True)
+    return section
 
-    ordered = sorted(budget.rows, key=place)  # within a stage in the budget's own order
-    return [(STAGES[k].capitalize(), [_source(r, unmeasured) for r in rows]) for k, rows in groupby(ordered, place)]
+
+def _source_table(label: str, rows: Sequence[BudgetRow], unmeasured: Mapping[str, str]) -> Table:
+    columns = ["Source", "Row", "Status", "Class"]
+    numbers = [Column(axis, "right", group=group) for group in ("Analytic / 10⁻³ px", "Monte Carlo / 10⁻³ px") for axis in "xy"]
+    return Table(label, [*columns, *numbers, Column("Known to", "right"), Column("Share", "right")], [_source(r, unmeasured) for r in rows])
 
 
-def _source(row: BudgetRow, unmeasured: Mapping[str, str]) -> dict[str, str]:
+def _source(row: BudgetRow, unmeasured: Mapping[str, str]) -> Row:
     source = get_source(row.source_id)
     c, mc = row.contribution, row.monte_carlo
     counts = c is not None and row.status not in ("not applicable", "left to calibration")
-    return {
-        "id": row.name if row.name == row.source_id else f"{row.source_id} ({row.name})",
-        "title": row.title,
-        "number": f"{source.number} {'★' * source.stars}".strip() if source.number else NONE,
-        "status": row.status,
-        "gum_class": c.gum_class if c is not None else source.gum_class,
-        "x": length_mpx(float(np.hypot(c.u_x_px, c.bias_x_px))) if counts and c else NONE,
-        "y": length_mpx(float(np.hypot(c.u_y_px, c.bias_y_px))) if counts and c else NONE,
-        "mc_x": NONE if mc is None else _with_error(mc.x),
-        "mc_y": NONE if mc is None else _with_error(mc.y),
-        "share": f"{percent(row.share)} %" if counts else NONE,
-        "known": _known(row),
-        "reason": _reason(row, unmeasured),
-    }
+    name = row.name if row.name == row.source_id else f"{row.source_id} ({row.name})"
+    cells: list[Inline] = [
+        [row.title, "\n", Run(name, "small mono")],
+        f"{source.number} {'★' * source.stars}".strip() if source.number else NONE,
+        Run(row.status, f"status {row.status.replace(' ', '-')}"),
+        c.gum_class if c is not None else source.gum_class,
+        length_mpx(float(np.hypot(c.u_x_px, c.bias_x_px))) if counts and c else NONE,
+        length_mpx(float(np.hypot(c.u_y_px, c.bias_y_px))) if counts and c else NONE,
+        NONE if mc is None else _with_error(mc.x),
+        NONE if mc is None else _with_error(mc.y),
+        _known(row),
+        f"{percent(row.share)} %" if counts else NONE,
+    ]
+    return Row(cells, _reason(row, unmeasured))
 
 
 def _with_error(axis: Any) -> str:
@@ -262,11 +286,21 @@ def _known(row: BudgetRow) -> str:
     return f"± {percent(share)} %" if share <= 1 else f">{THIN}100 %"
 
 
-def _sums(budget: Budget) -> list[dict[str, Any]]:
-    pitch, v = budget.pitch_um, budget.sums[0] if budget.sums else budget.verdict
+def sum_section(budget: Budget) -> Section:
+    """The sum of all, beside one simulation with all of them, and how classes combine."""
+    section = Section("The sum, and one simulation with all of it", name="sum")
+    columns: list[Column | str] = ["One target, one frame", Column("x", "right"), Column("y", "right")]
+    section.add_table("Sum of the budget and Monte Carlo", columns, _sums(budget)).add_text(_interaction(budget))
+    section.add_section("How classes combine", Text(CLASS_RULES))
+    return section
 
-    def row(label: str, x: float, y: float, strong: bool = False) -> dict[str, Any]:
-        return {"label": label, "x": _length(x, pitch, "x"), "y": _length(y, pitch, "y"), "strong": strong}
+
+def _sums(budget: Budget) -> list[Row]:
+    pitch, v = budget.pitch_um, budget.sums[0] if budget.sums else budget.verdict
+    px = f"{NO_BREAK}px"
+
+    def row(label: str, x: float, y: float, total: bool = False) -> Row:
+        return Row([label, _cell(x, pitch, "x", px), _cell(y, pitch, "y", px)], total=total)
 
     rows = [
         row("Standard uncertainties, analytic", v.u_x_px, v.u_y_px),

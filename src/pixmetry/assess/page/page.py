@@ -1,13 +1,13 @@
-"""The report of an assessment: one HTML file that needs nothing else."""
+"""The page of an assessment."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from pixmetry import __version__
-from pixmetry.report.numbers import significant
-from pixmetry.report.templates import filled
+from pixmetry.report import Column, Page, Points, Row, Section, Table, html_of
+from pixmetry.report.numbers import NONE, significant
+from pixmetry.report.provenance import provenance_section
 
 if TYPE_CHECKING:
     from pixmetry.assess.results import Assessment
@@ -16,10 +16,16 @@ if TYPE_CHECKING:
     from pixmetry.files.records import Campaign
 
 TRANSFER = ("transfer", "linearity", "snr", "dark-codes")
+FOOTER = "All lengths are standard uncertainties (k = 1) unless they say otherwise; x runs along rows, y along columns."
+VALUES = (
+    "Value ± standard uncertainty (k = 1, two significant digits) with its degrees of freedom; “<” is a one-sided 95 % limit. The last "
+    "number is that of EMVA 1288 Release 3.1 from the same frames: its gain is the slope of a straight line up to 70 % of saturation, its "
+    "dark noise holds row and column noise too, its PRNU the unevenness of the light."
+)
 
 
 def write_report(assessment: Assessment, path: str | Path) -> Path:
-    """Write the page of an assessment.
+    """Write the page of an assessment as HTML.
 
     Parameters
     ----------
@@ -32,39 +38,75 @@ def write_report(assessment: Assessment, path: str | Path) -> Path:
     Path
     """
     path = Path(path)
-    path.write_text(render(assessment), encoding="utf-8")
+    path.write_text(html_of(page_of(assessment)), encoding="utf-8")
     return path
 
 
-def render(assessment: Assessment) -> str:
-    """Return the page of an assessment as text."""
-    return filled("page.html.jinja", _content(assessment))
+def page_of(assessment: Assessment) -> Page:
+    """The page of an assessment.
+
+    Parameters
+    ----------
+    assessment : Assessment
+
+    Returns
+    -------
+    Page
+    """
+    from pixmetry.assess.page import budget_view
+
+    budget, name = assessment.budget, assessment.campaign.camera.name
+    page = Page(name, "what its image coordinates are worth", "pixmetry camera assessment", _facts(assessment), FOOTER)
+    page.sections += [
+        budget_view.verdict_section(budget),
+        budget_view.largest_section(budget),
+        _plots(assessment),
+        _values(assessment),
+        budget_view.sources_section(budget, assessment.unmeasured),
+        budget_view.sum_section(budget),
+        _words(assessment),
+    ]
+    if (origin := provenance_section(assessment.provenance, assessment.campaign.licence)) is not None:
+        page.sections.append(origin)
+    return page
 
 
-def _content(assessment: Assessment) -> dict[str, Any]:
-    from pixmetry.assess.page.budget_view import budget_content
+def _plots(assessment: Assessment) -> Section:
     from pixmetry.assess.page.figures import all_pictures
-    from pixmetry.assess.page.measured import table
-    from pixmetry.assess.page.twin_view import twin_content
 
-    seen = assessment.observations
-    pictures = all_pictures(seen, assessment.standard, assessment.maps())
-    return budget_content(assessment.budget, assessment.unmeasured) | {
-        "version": __version__,
-        "name": assessment.campaign.camera.name,
-        "facts": _facts(assessment),
-        "transfer": [pictures[name] for name in TRANSFER if name in pictures],
-        "noise": [p for name, p in pictures.items() if name not in TRANSFER],
-        "values": table(seen, assessment.standard),
-        **twin_content(assessment.self_test),
-        "notes": _notes(assessment),
-        "confounders": _confounders(assessment),
-        "methods": _methods(assessment),
-        "provenance": _provenance(assessment.provenance),
-        "command": " ".join(assessment.provenance["command"]),
-        "licence": assessment.campaign.licence,
-        "inputs": assessment.provenance["inputs"],
-    }
+    pictures = all_pictures(assessment.observations, assessment.standard, assessment.maps())
+    section = Section("What the frames show", name="plots")
+    section.add_section("Photon transfer and codes", *(pictures[name] for name in TRANSFER if name in pictures))
+    if noise := [p for name, p in pictures.items() if name not in TRANSFER]:
+        section.add_section("Noise and fixed pattern", *noise)
+    return section
+
+
+def _values(assessment: Assessment) -> Section:
+    from pixmetry.assess.page.measured import table
+    from pixmetry.assess.page.twin_view import twin_section
+
+    rows: list[Row] = []
+    for heading, found in table(assessment.observations, assessment.standard).items():
+        rows.append(Row([heading], heading=True))
+        for r in found:
+            u = "" if r.number.u == NONE else f"± {r.number.u}"
+            rows.append(Row([r.title, r.number.value, u, r.number.unit, r.dof, r.standard], r.reason))
+    columns: list[Column | str] = ["Quantity", Column("Value", "right"), Column("± u", "u"), Column("Unit", "unit"), Column("dof", "right")]
+    section = Section("Measured camera values", name="values").add_text(VALUES, style="small soft")
+    section.add(Table("Measured camera values", [*columns, Column("EMVA 1288, R3.1", "unit")], rows))
+    return section.add(twin_section(assessment.self_test))
+
+
+def _words(assessment: Assessment) -> Section:
+    """Notes, what the numbers could be mistaken for, methods."""
+    section = Section("Notes, and what the numbers could be mistaken for", name="notes")
+    if notes := _notes(assessment):
+        section.add(Points(notes, style=""))
+    for title, items in (("Could be mistaken for", _confounders(assessment)), ("Methods", _methods(assessment))):
+        if items:
+            section.add_section(title, Points(items))
+    return section
 
 
 def _facts(assessment: Assessment) -> list[tuple[str, str]]:
@@ -145,15 +187,3 @@ def _methods(assessment: Assessment) -> list[str]:
         if s.method and not any(m in s.method or s.method in m for m in shared)
     ]
     return list(dict.fromkeys([*shared, *own]))
-
-
-def _provenance(record: dict[str, Any]) -> list[tuple[str, str]]:
-    libraries = ", ".join(f"{name} {version}" for name, version in record["libraries"].items())
-    return [
-        ("pixmetry", record["pixmetry"]),
-        ("Python", record["python"]),
-        ("Libraries", libraries),
-        ("Platform", record["platform"]),
-        ("Seed of the Monte Carlo", "none" if record["seed"] is None else str(record["seed"])),
-        ("Time (UTC)", record["time_utc"].replace("T", " ").removesuffix("+00:00")),
-    ]

@@ -2,27 +2,40 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from pixmetry.core.number import Number
 from pixmetry.emva.files.keys import KEYS
-from pixmetry.report.numbers import MINUS, uncertain
+from pixmetry.report import Column, Run, Section, Table, Text, strong
+from pixmetry.report.numbers import MINUS, printed
 
 if TYPE_CHECKING:
     from pixmetry.assess.digital_twin import SelfTest
 
+SMALL_PRINT = (
+    "Values of EMVA 1288 Release 3.1 of the camera's frames and of the twin's; the difference in units of its standard uncertainty, that "
+    "of both values together."
+)
 FAR_U = 3.0  # a difference beyond which twin and camera are not the same
 
 
-def twin_content(test: SelfTest) -> dict[str, Any]:
-    """Sentence and rows of the self-test, for the template."""
+def twin_section(test: SelfTest) -> Section:
+    """The self-test: a sentence, and all values of camera and twin folded away."""
+    section = Section("The digital twin beside the camera", [Text(twin_sentence(test))])
+    if not test.rows:
+        return section
     rows = []
     for r in test.rows:
-        own, twin = uncertain(r.camera, r.u_camera, r.unit), uncertain(r.twin, r.u_twin, r.unit)
-        text = f"{r.difference_u:+.1f}".replace("-", MINUS)
+        far, text = abs(r.difference_u) > FAR_U, f"{r.difference_u:+.1f}".replace("-", MINUS)
         key = KEYS[r.name]
-        far = abs(r.difference_u) > FAR_U
-        rows.append({"title": key.title, "symbol": key.symbol, "own": own, "twin": twin, "difference": text, "far": far})
-    return {"twin": {"rows": rows, "said": twin_sentence(test)}}
+        title = [key.title, *([Run(f" {key.symbol}", "soft")] if key.symbol else [])]
+        pair = [printed(Number(value, u, unit=r.unit)) for value, u in ((r.camera, r.u_camera), (r.twin, r.u_twin))]
+        rows.append([title, *pair, strong(text) if far else text])
+    both = [Column("Value", "number", group=whose) for whose in ("Camera", "Twin")]
+    columns: list[Column | str] = ["Quantity", *both, Column("Difference / u", "right")]
+    folded = section.add_section("All values of camera and twin", Text(SMALL_PRINT, "small soft"), fold=True)
+    folded.add(Table("Values of camera and twin", columns, rows))
+    return section
 
 
 def twin_sentence(test: SelfTest) -> str:

@@ -1,75 +1,103 @@
-"""The report of a calibration from straight lines: one HTML file that needs nothing else."""
+"""The page of a calibration from straight lines."""
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pixmetry import __version__
 from pixmetry.calibrate.page import lines_text as text
 from pixmetry.calibrate.page.figures import enlargement, frame, frame_height, length_key
-from pixmetry.calibrate.page.page import camera_facts, provenance_rows
+from pixmetry.calibrate.page.page import FOOTER, camera_facts, number_table, typeset_findings
 from pixmetry.calibrate.page.plots import correlation_map, curve_pictures
 from pixmetry.calibrate.page.text import DIRECTIONS, sentence, typeset
+from pixmetry.report import Answer, Figure, Page, Reading, Section, Text, html_of
 from pixmetry.report.drawing import BLUE, RED, SOFT, canvas
 from pixmetry.report.numbers import fixed, length_px, significant
-from pixmetry.report.page import Figure
-from pixmetry.report.templates import filled, share_styles
+from pixmetry.report.provenance import provenance_section
 
 if TYPE_CHECKING:
     from pixmetry.calibrate.lines.line_calibration import LineCalibration
 
 MOST_IMAGES = 12  # that are drawn, those with the largest residuals
+PARAMETERS = (
+    "Value ± standard uncertainty u (k = 1, two significant digits). Pixel (0, 0) is the centre of the top-left pixel, x to the right, y "
+    "down."
+)
+RESIDUALS = (
+    "Lines that run along y tell about x, lines along x about y. rms: root of the sum of squares over the degrees of freedom, n − 2 for "
+    "each line less what the lens took up."
+)
+COUNTING = (
+    "By position: were all independent. Effective: less, as far as neighbours along a line err alike. By line: were the errors of a line "
+    "all one, which is on the safe side."
+)
 
 
 def write_page(calibration: LineCalibration, path: str | Path) -> Path:
-    """Write the page and return its path; raises as `calibration_page.write_page`."""
+    """Write the page as HTML and return its path; raises as that of a calibration by bundle adjustment."""
     from pixmetry.files import write_page as write
 
-    return write(path, render(calibration))
+    return write(path, html_of(page_of(calibration)))
 
 
-def render(calibration: LineCalibration) -> str:
-    """Return the page as text."""
-    return share_styles(filled("lines.html.jinja", _content(calibration)))
+def page_of(calibration: LineCalibration) -> Page:
+    """The page of a calibration from straight lines.
 
+    Parameters
+    ----------
+    calibration : LineCalibration
 
-def _content(calibration: LineCalibration) -> dict[str, Any]:
+    Returns
+    -------
+    Page
+    """
     result, camera = calibration.result, calibration.camera()
-    images = list(dict.fromkeys(calibration.image.tolist()))
-    told = provenance_rows(calibration.provenance)
-    inputs = [[i["name"], str(i["size_bytes"]), i["sha256"]] for i in told["inputs"]]
-    facts = [("Images", str(len(images))), ("Lines", str(len(result.lines))), ("Positions", str(len(calibration.x_px)))]
+    facts = [
+        ("Images", str(len(set(calibration.image.tolist())))),
+        ("Lines", str(len(result.lines))),
+        ("Positions", str(len(calibration.x_px))),
+        ("Left out", str(int((~result.used).sum()))),
+    ]
+    name = str(calibration.provenance.get("name") or camera.name)
+    page = Page(name, "calibration from straight lines", "pixmetry lens calibration from straight lines", facts, FOOTER)
+    verdict = page.add_section("What is left over", name="verdict")
+    readings = [
+        Reading(axis, f"{length_px(a.rms_px)} px", "" if a.rms_um is None else f"= {length_px(a.rms_um)} µm")
+        for axis, a in result.axes.items()
+    ]
+    verdict.add(Answer([Text(text.worth(calibration)), readings]), *typeset_findings(calibration.findings))
+    if not calibration.findings:
+        verdict.add_text("Nothing that the tests of this calibration looked for was found.", style="soft")
+    lens = page.add_section("Lens", Text(PARAMETERS, "small soft"), name="parameters")
+    lens.add_text(f"{camera_facts(camera)} The distortion model {DIRECTIONS[camera.direction]}.")
+    lens.add(number_table("Parameters", ["Parameter", "", "Value", "± u", "Unit"], text.parameter_rows(calibration), 2))
     matrix = result.estimates.covariance / np.outer(result.estimates.u, result.estimates.u)
-    lens = [*curve_pictures(calibration.curves(), camera.direction, "lens"), correlation_map(result.free, matrix, "lens")]
+    lens.add(*curve_pictures(calibration.curves(), camera.direction, "lens"), correlation_map(result.free, matrix, "lens"))
+    _residuals(page.add_section("Residuals across the lines", name="residuals"), calibration)
+    if (origin := provenance_section(calibration.provenance)) is not None:
+        page.sections.append(origin)
+    return page
+
+
+def _residuals(section: Section, calibration: LineCalibration) -> None:
+    result = calibration.result
+    section.add_text(RESIDUALS, style="small soft")
+    section.add(number_table("Residuals by axis", text.axis_heads(calibration), text.axis_rows(calibration)))
+    test = result.f_test
+    if test:
+        um = ["p in µm²"] if test["p_um"] else []
+        heads = ["Degrees of freedom counted", "x and y", "Critical, 95 %", "p in px²", *um]
+        section.add_text(typeset(sentence(test["text"])))
+        section.add(number_table("F-test of x against y", heads, text.f_rows(test)), Text(COUNTING, "small soft"))
+    section.add(*drawn_lines(calibration))
     rows = [
         [str(r["image"]), str(r["line"]), r["axis"], fixed(r["angle_deg"], 2), str(r["n"]), length_px(r["rms_px"]), f"{r['dof']:.1f}"]
         for r in result.lines
     ]
-    return {
-        "version": __version__,
-        "name": str(calibration.provenance.get("name") or camera.name),
-        "facts": [*facts, ("Left out", str(int((~result.used).sum())))],
-        "worth": text.worth(calibration),
-        "verdict": [(n, length_px(a.rms_px), "" if a.rms_um is None else length_px(a.rms_um)) for n, a in result.axes.items()],
-        "findings": [replace(f, text=typeset(sentence(f.text)), advice=typeset(sentence(f.advice))) for f in calibration.findings],
-        "camera": camera_facts(camera),
-        "direction": DIRECTIONS[camera.direction],
-        "parameters": text.parameter_rows(calibration),
-        "lens": lens,
-        "axis_heads": text.axis_heads(calibration),
-        "axes": text.axis_rows(calibration),
-        "f_text": typeset(sentence(result.f_test["text"])) if result.f_test else "",
-        "f_rows": text.f_rows(result.f_test),
-        "with_um": bool(result.f_test and result.f_test["p_um"]),
-        "drawn": drawn_lines(calibration),
-        "lines": rows,
-        **told,
-        "inputs": inputs,
-    }
+    heads = ["Image", "Line", "Axis", "Angle / °", "Positions", "rms / px", "Degrees of freedom"]
+    section.add_section(f"Table of the {len(rows)} lines", number_table("Lines", heads, rows, 3), fold=True)
 
 
 def drawn_lines(calibration: LineCalibration) -> list[Figure]:

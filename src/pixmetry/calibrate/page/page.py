@@ -1,15 +1,14 @@
-"""The report of a calibration: one HTML file that needs nothing else."""
+"""The page of a calibration by bundle adjustment."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pixmetry import __version__
 from pixmetry.calibrate.bundle.model import NAMES
 from pixmetry.calibrate.page import tables
 from pixmetry.calibrate.page.check_points import check_points
@@ -25,22 +24,34 @@ from pixmetry.calibrate.page.text import (
     typeset,
     worth,
 )
+from pixmetry.report import Answer, Column, Figure, Page, Points, Reading, Row, Run, Section, Table, Text, html_of, strong
 from pixmetry.report.numbers import NONE, fixed, length_px, significant
-from pixmetry.report.page import Figure
-from pixmetry.report.templates import filled, share_styles
+from pixmetry.report.page import LONG, Inline
+from pixmetry.report.provenance import provenance_section
 
 if TYPE_CHECKING:
     from pixmetry.calibrate.bundle.model import CameraModel
     from pixmetry.calibrate.page.figures import Residuals
     from pixmetry.calibrate.records import Calibration, DistortionCurves, EccentricityRecord, FieldTest, HoldOut
+    from pixmetry.core.finding import Finding
 
 WORST_IMAGES = 6  # on each of the two sheets that are not folded
 VERDICTS = {"fixed": "held as given", "free": "estimated anew, as its given coordinates are not exact enough"}
 MOST_SHEETS = 30  # of small images on a page; more would make it heavy
+FOOTER = "Uncertainties are standard uncertainties (k = 1); x runs along rows, y along columns."
+PARAMETERS = (
+    "Value ± standard uncertainty u (k = 1, two significant digits). p is the probability of a value at least that far from 0 if it were "
+    "0: a lens or affinity term with a large p is not significant. Pixel (0, 0) is the centre of the top-left pixel, x to the right, y "
+    "down."
+)
+RESIDUALS = (
+    "Residuals are measured less computed image coordinates. Degrees of freedom are sums of redundancy numbers: of each residual, the "
+    "share that the adjustment could not take up."
+)
 
 
 def write_page(calibration: Calibration, path: str | Path) -> Path:
-    """Write the page and return its path; only an earlier page of this kind is replaced.
+    """Write the page as HTML and return its path; only an earlier page of this kind is replaced.
 
     Raises
     ------
@@ -49,79 +60,294 @@ def write_page(calibration: Calibration, path: str | Path) -> Path:
     """
     from pixmetry.files import write_page as write
 
-    return write(path, render(calibration))
+    return write(path, html_of(page_of(calibration)))
 
 
-def render(calibration: Calibration) -> str:
-    """Return the page of a calibration as text."""
-    return share_styles(filled("calibration.html.jinja", _content(calibration)))
+def page_of(calibration: Calibration) -> Page:
+    """The page of a calibration.
+
+    Parameters
+    ----------
+    calibration : Calibration
+
+    Returns
+    -------
+    Page
+    """
+    net = calibration.adjustment.network
+    name = str(calibration.provenance.get("name") or ", ".join(c.name for c in net.cameras))
+    page = Page(name, "calibration", "pixmetry camera calibration", tables.network_facts(calibration), FOOTER)
+    pictures = [_pictures(calibration, k) for k in range(len(net.cameras))]
+    _verdict(page.add_section("What the calibration is worth", name="verdict"), calibration)
+    _parameters(page.add_section("Interior parameters", name="parameters"), calibration, pictures)
+    if any(p["lens"] for p in pictures):
+        lens = page.add_section("Lens and projection", name="lens")
+        for k, p in enumerate(pictures):
+            if p["lens"]:
+                _channel(lens, calibration, k).add(*p["lens"])
+    _residuals(page.add_section("Residuals", name="residuals"), calibration, pictures)
+    if calibration.tests.hold_out or calibration.tests.field:
+        _field_section(page.add_section("Test field, and images left out", name="field"), calibration)
+    _space(page.add_section("Network and object points", name="space"), calibration)
+    if (origin := provenance_section(calibration.provenance)) is not None:
+        page.sections.append(origin)
+    return page
 
 
-def _content(calibration: Calibration) -> dict[str, Any]:
-    from pixmetry.calibrate.page.space import field_map, network_views, plan_views
-
-    adjustment, tests = calibration.adjustment, calibration.tests
-    net, field, held = adjustment.network, tests.field, tests.hold_out
-    cameras = [_camera(calibration, k) for k in range(len(net.cameras))]
-    return {
-        "version": __version__,
-        "name": str(calibration.provenance.get("name") or ", ".join(c.name for c in net.cameras)),
-        "facts": tables.network_facts(calibration),
-        "sigma0": sigma0_text(calibration),
-        "findings": [replace(f, text=typeset(sentence(f.text)), advice=typeset(sentence(f.advice))) for f in calibration.findings],
-        "tested": tests.made,
-        "cameras": cameras,
-        "poses": [(_full(r.a), _full(r.b), fixed(r.r, 2)) for r in tests.correlations_with_poses or ()],
-        "patterns": tables.patterns(tests.patterns or (), len(cameras) > 1),
-        "gross": tables.gross_errors(tests.gross_errors or ()),
-        "gross_tested": tests.gross_errors is not None,
-        "images": tables.images(tests.images) if tests.images else None,
-        "hold_out": tables.hold_out(held),
-        "hold_out_text": _hold_out(held),
-        "eccentricity": _eccentricity(tests.eccentricity),
-        "folds": held and held.folds,
-        "field": _field(field) if field else None,
-        "field_map": field_map(adjustment, field.compared.deviations.points) if field and field.compared else None,
-        "views": network_views(adjustment),
-        "plans": plan_views(adjustment),
-        "points": tables.worst_points(calibration),
-        "undetermined": int(np.sum(~np.isfinite(adjustment.state.xyz).all(axis=1))),
-        "all_fixed": bool(len(net.u_xyz) and np.all(net.u_xyz == 0)),
-        "bars": tables.scale_bars(calibration),
-        "control": control_points(calibration),
-        "checked": check_points(calibration),
-        "unit": net.unit,
-        "datum": adjustment.datum,
-        "notes": [n for n in adjustment.notes if not any(n.rstrip(".") in f.text for f in calibration.findings)],
-        **provenance_rows(calibration.provenance),
-    }
+def _channel(section: Section, calibration: Calibration, k: int) -> Section:
+    """Where what belongs to one camera goes: a section of its own where there are several."""
+    cameras = calibration.adjustment.network.cameras
+    return section if len(cameras) == 1 else section.add_section(cameras[k].name)
 
 
-def _camera(calibration: Calibration, k: int) -> dict[str, Any]:
-    """Everything that the page shows of one camera."""
-    model = calibration.adjustment.camera(k)
-    found = residual_record(calibration, k)
-    levels = projection_levels(of_camera(calibration.tests.projection, model.name))
-    if levels is not None and not any(levels):
-        levels = None  # nothing was estimated of this camera
-    test = of_camera(calibration.tests.f_test, model.name)
-    parameters = tables.parameters(calibration, k)
-    return {
-        "name": model.name,
-        "worth": worth(calibration, k),
-        "verdict": [(axis, length_px(one.rms_px), _um(one.rms_um)) for axis, one in found.axes.items()] if found.n else [],
-        "levels": levels and [length_px(v) for v in levels],
-        "facts": camera_facts(model),
-        "direction": DIRECTIONS[model.direction],
-        "parameters": parameters,
-        "known": any(r["u"].startswith("±") for r in parameters),
-        "groups": tables.groups(calibration.tests.parameter_groups or (), model.name),
-        "vision": tables.vision(calibration, model.name),
-        "axes": tables.axes(calibration, k),
-        "f_test": tables.f_test(calibration, model.name),
-        "f_text": typeset(sentence(test.text if test is not None else "")),
-        **_pictures(calibration, k),
-    }
+def typeset_findings(findings: Sequence[Finding]) -> list[Finding]:
+    """Findings with true minus signs, capitals and full stops."""
+    return [replace(f, text=typeset(sentence(f.text)), advice=typeset(sentence(f.advice))) for f in findings]
+
+
+def number_table(label: str, heads: Sequence[str], rows: Sequence[Sequence[Inline]], words: int = 1, *, scrolls: bool = False) -> Table:
+    """A table whose first columns hold words and the others numbers."""
+    return Table(label, [Column(h, "left" if k < words else "right") for k, h in enumerate(heads)], list(rows), scrolls=scrolls)
+
+
+def _verdict(section: Section, calibration: Calibration) -> None:
+    """What each camera is worth, σ₀, and what was found."""
+    parts: list[Text | Sequence[Reading]] = []
+    cameras = calibration.adjustment.network.cameras
+    for k in range(len(cameras)):
+        model, found = calibration.adjustment.camera(k), residual_record(calibration, k)
+        levels = projection_levels(of_camera(calibration.tests.projection, model.name))
+        readings = [
+            Reading(axis, f"{length_px(one.rms_px)} px", f"= {um} µm" if (um := _um(one.rms_um)) else "")
+            for axis, one in (found.axes.items() if found.n else ())
+        ]
+        if levels is not None and any(levels):
+            low, high = (length_px(v) for v in levels)
+            readings.append(Reading("projection", f"{low} px", f"to {high} px in the corners"))
+        parts += [Text(strong(model.name))] if len(cameras) > 1 else []
+        parts += [Text(worth(calibration, k)), *([readings] if readings else [])]
+    section.add(Answer([*parts, Text(sigma0_text(calibration), "second")]))
+    if calibration.findings:
+        section.add(*typeset_findings(calibration.findings))
+    elif calibration.tests.made:
+        section.add_text("Nothing that the tests of this calibration looked for was found.", style="soft")
+    else:
+        section.add_text("This calibration was not tested for patterns, gross errors or the shape of its test field.", style="soft")
+
+
+def _parameters(section: Section, calibration: Calibration, pictures: Sequence[Mapping[str, Any]]) -> None:
+    section.add_text(PARAMETERS, style="small soft")
+    for k in range(len(calibration.adjustment.network.cameras)):
+        model, own = calibration.adjustment.camera(k), _channel(section, calibration, k)
+        own.add_text(f"{camera_facts(model)} The distortion model {DIRECTIONS[model.direction]}.")
+        rows = tables.parameters(calibration, k)
+        own.add(_parameter_table(rows, f"Interior parameters of {model.name}"))
+        own.add_text("B2 and P2 are for y down. For y up both change their sign; the other terms keep theirs.", style="small soft")
+        if not any(r["u"].startswith("±") for r in rows):
+            own.add_text("The uncertainty of the parameters was not computed.", style="small")
+        if groups := tables.groups(calibration.tests.parameter_groups or (), model.name):
+            own.add(number_table("Joint tests", ["Together", "Terms", "F", "Degrees of freedom", "p against 0"], groups, 2))
+        if vision := tables.vision(calibration, model.name):
+            part = own.add_section("In the words of computer vision")
+            part.add_table("The linear part of the camera", ["Name", Column("Value / px", "right"), Column("± u", "u")], vision)
+            part.add_text(
+                "The linear part of the camera. The lens terms above go with their own model and are no coefficients of another.",
+                style="small soft",
+            )
+        if pictures[k]["matrix"]:
+            own.add_section("Correlations", *pictures[k]["matrix"])
+    if poses := calibration.tests.correlations_with_poses:
+        rows_of = [(_full(r.a), _full(r.b), fixed(r.r, 2)) for r in poses]
+        table = number_table("Correlations with poses", ["Interior parameter", "Pose", "r"], rows_of, 2)
+        section.add_section("Strongest correlations with poses", table, fold=True)
+
+
+def _parameter_table(rows: Sequence[Mapping[str, str]], label: str) -> Table:
+    columns: list[Column | str] = [
+        "Parameter",
+        "",
+        Column("Value", "right"),
+        Column("± u", "u"),
+        Column("Unit", "unit"),
+        "p against 0",
+        "Correlates most with",
+    ]
+    cells = [
+        [
+            [r["title"], *([Run(f"\n{r['off']}", "small")] if r["off"] else [])],
+            r["symbol"],
+            r["value"],
+            r["u"],
+            r["unit"],
+            Run(r["p"], "soft" if "not" in r["p"] else ""),
+            r["with"],
+        ]
+        for r in rows
+    ]
+    return Table(label, columns, cells)
+
+
+def _residuals(section: Section, calibration: Calibration, pictures: Sequence[Mapping[str, Any]]) -> None:
+    """Residuals by axis with their test, over the sensor and image by image; patterns, gross errors, the images."""
+    section.add_text(RESIDUALS, style="small soft")
+    tests, cameras = calibration.tests, calibration.adjustment.network.cameras
+    for k, drawn in enumerate(pictures):
+        own = _channel(section, calibration, k)
+        _axes_and_test(own, calibration, k)
+        own.add(*drawn["sensor"], *drawn["plots"])
+        if drawn["worst"]:
+            _image_by_image(own, drawn)
+    if text := _eccentricity(tests.eccentricity):
+        section.add_text(text)
+    _patterns(section, tables.patterns(tests.patterns or (), len(cameras) > 1))
+    if gross := tables.gross_errors(tests.gross_errors or ()):
+        heads = ["Image", "Point", "Residual x / px", "y / px", "Error x / px", "y / px", "Statistic", "Critical"]
+        many = f"{len(gross)} image points were" if len(gross) > 1 else "1 image point was"
+        words = f"{many} rejected. The residual is that against the adjustment, the error the size that its removal gives it."
+        part = section.add_section("Gross errors").add_text(words + _scrolls(gross))
+        part.add(number_table("Gross errors", heads, gross, 2, scrolls=True))
+    elif tests.gross_errors is not None:
+        section.add_text("No gross error was found.")
+    if tests.images:
+        table = tables.images(tests.images)
+        several = ["Camera"] if len(cameras) > 1 else []
+        rows = [[image, *([camera] if several else []), *cells] for image, camera, cells in table["rows"]]
+        shown = number_table("Images", ["Image", *several, *table["heads"]], rows, 1 + len(several), scrolls=True)
+        section.add_section(f"Table of the {len(rows)} images", shown, fold=True)
+
+
+def _axes_and_test(own: Section, calibration: Calibration, k: int) -> None:
+    name = calibration.adjustment.camera(k).name
+    axes = tables.axes(calibration, k)
+    shown = [key for key in ("axis", "n", "rms", "dof", "sigma") if key != "sigma" or axes[0]["sigma"]]
+    heads = ["Axis", "Points", "rms", "Degrees of freedom", "Variance component"][: len(shown)]
+    own.add(number_table(f"Residuals by axis of {name}", heads, [[r[key] for key in shown] for r in axes]))
+    told = of_camera(calibration.tests.f_test, name)
+    if told is not None and told.text:
+        own.add_text(typeset(sentence(told.text)))
+    if test := tables.f_test(calibration, name):
+        heads = ["F-test of x against y", "Ratio of variances", "Degrees of freedom", "Critical, 95 %", "p"]
+        rows = [[f"in {r['unit']}", r["ratio"], r["dof"], r["critical"], r["p"]] for r in test]
+        own.add(number_table(f"F-test of {name}", heads, rows))
+
+
+def _image_by_image(own: Section, drawn: Mapping[str, Any]) -> None:
+    part = own.add_section("Image by image", *drawn["worst"])
+    words = "The images with the largest residuals first; all at one enlargement."
+    part.add_text(words + (" Of images with many points an even choice is drawn." if drawn["thinned"] else ""), style="small soft")
+    if drawn["sheets"]:
+        rest = part.add_section("The other images", *drawn["sheets"], fold=True)
+        if drawn["undrawn"]:
+            rest.add_text(f"{drawn['undrawn']} more, with smaller residuals, are only in the table of images.", style="small soft")
+
+
+def _scrolls(rows: Sequence[Any]) -> str:
+    return " The table scrolls." if len(rows) > LONG else ""
+
+
+def _patterns(section: Section, rows: Sequence[Mapping[str, Any]]) -> None:
+    if not rows:
+        return
+    part = section.add_section("Patterns that were looked for")
+    found, others = [r for r in rows if r["found"]], [r for r in rows if not r["found"]]
+    part.add(_pattern_table(found) if found else Text("None was found."))
+    if others:
+        title = f"{len(others)} that {'were' if len(others) > 1 else 'was'} not found"
+        part.add_section(title, _pattern_table(others), fold=True)
+
+
+def _pattern_table(rows: Sequence[Mapping[str, Any]]) -> Table:
+    shown = [Row([r["title"], r["amplitude"], r["p"]], r["advice"] if r["found"] else "") for r in rows]
+    return Table("Patterns in the residuals", ["Pattern", Column("Amplitude / px", "right"), Column("p", "right")], shown)
+
+
+def _field_section(section: Section, calibration: Calibration) -> None:
+    from pixmetry.calibrate.page.space import field_map
+
+    held, field = calibration.tests.hold_out, calibration.tests.field
+    if held is not None and (rows := tables.hold_out(held)):
+        heads = ["Test field", "rms of the fit / px", "rms of images left out / px", "half of them above / px"]
+        section.add(number_table("Images left out", heads, rows))
+        if text := _hold_out(held):
+            section.add_text(text)
+        parts = f"The images were left out in {held.folds} parts, one after the other. " if held.folds else ""
+        words = "An image that was left out gets only its pose. What falls in the fit but not in images left out is not real."
+        section.add_text(parts + words, style="small soft")
+    if not field:
+        return
+    told = _field(field)
+    part = section.add_section("Shape of the test field" + (f": {told['verdict']}" if told["verdict"] else ""))
+    if told["text"]:
+        part.add_text(told["text"])
+    if field.compared:
+        part.add(field_map(calibration.adjustment, field.compared.deviations.points))
+    if told["moved"]:
+        heads = ["Moved with free points", "by / px", "formal u / px", "by / u"]
+        part.add(number_table("Parameters that moved", heads, told["moved"]))
+        words = "The formal u is that of the adjustment with the given coordinates: it does not know of their errors."
+        part.add_text(words, style="small soft")
+
+
+def _space(section: Section, calibration: Calibration) -> None:
+    """Datum, views of the network, what was given of the object, its points."""
+    from pixmetry.calibrate.page.space import network_views
+
+    adjustment = calibration.adjustment
+    unit = adjustment.network.unit
+    lost = int(np.sum(~np.isfinite(adjustment.state.xyz).all(axis=1)))
+    words = f" {adjustment.datum or 'not stated'}."
+    if lost:
+        few, them = ("points are", "them, or their") if lost > 1 else ("point is", "it, or its")
+        words += f" {lost} {few} not determined: too few of the images that took part see {them} rays do not meet."
+    section.add_text(strong("Datum:"), words)
+    section.add(*network_views(adjustment))
+    if bars := tables.scale_bars(calibration):
+        heads = ["Between", f"Length / {unit}", "u", f"Measured less adjusted / {unit}", "by / u"]
+        section.add_section("Scale bars", number_table("Scale bars", heads, bars))
+    if control := control_points(calibration):
+        heads = ["Coordinate", f"Given / {unit}", "u", f"Given less adjusted / {unit}", "by / u"]
+        part = section.add_section("Control points", number_table("Control points", heads, control, scrolls=True))
+        if _scrolls(control):
+            part.add_text("The table scrolls.", style="small soft")
+    _check_points(section, calibration)
+    _object_points(section, calibration)
+    notes = [n for n in adjustment.notes if not any(n.rstrip(".") in f.text for f in calibration.findings)]
+    if notes:
+        section.add_section("Notes", Points(notes))
+
+
+def _check_points(section: Section, calibration: Calibration) -> None:
+    checked = check_points(calibration)
+    if not checked:
+        return
+    unit = calibration.adjustment.network.unit
+    part = section.add_section("Check points", Text(checked["text"]))
+    if not checked["rows"]:
+        return
+    heads = ["Coordinate", f"Given / {unit}", "u", f"Found / {unit}", "u", f"Given less found / {unit}", "by / u", "Images"]
+    part.add(number_table("Check points", heads, checked["rows"], scrolls=True))
+    datum = f", less what {checked['fitted']} of the datum took up; the u found is that in the datum stated" if checked["fitted"] else ""
+    chance = f" One of all would be above {checked['critical']} by chance in {checked['level']} % of cases." if checked["critical"] else ""
+    words = f"They took no part in the adjustment. The last ratio is to the u of the difference, with both parts{datum}.{chance}"
+    part.add_text(words + _scrolls(checked["rows"]), style="small soft")
+
+
+def _object_points(section: Section, calibration: Calibration) -> None:
+    from pixmetry.calibrate.page.space import plan_views
+
+    net, points = calibration.adjustment.network, tables.worst_points(calibration)
+    part = section.add_section("Object points")
+    if points["rows"]:
+        sizes = f"{points['median']} {net.unit} (median), {points['largest']} {net.unit} (largest)"
+        part.add_text(f"Largest semi-axis of a standard ellipsoid: {sizes}, in the datum stated.")
+        part.add(*plan_views(calibration.adjustment))
+        heads = ["Point", *(f"{axis} / {net.unit}" for axis in ("X", "Y", "Z", "Largest semi-axis")), "Rays"]
+        title = f"Table of the {len(points['rows'])} points that are known worst"
+        part.add_section(title, number_table("Object points", heads, points["rows"]), fold=True)
+    elif len(net.u_xyz) and np.all(net.u_xyz == 0):
+        part.add_text("All points were held at their given coordinates.")
+    else:
+        part.add_text("The uncertainty of the points was not computed.")
 
 
 def _um(value: float | None) -> str:
@@ -252,24 +478,3 @@ def _eccentricity(found: EccentricityRecord | None) -> str:
         f"{found.corrected} image points were corrected for the eccentricity of circular targets, by at most "
         f"{length_px(found.largest_px)} px."
     )
-
-
-def provenance_rows(record: Mapping[str, Any]) -> dict[str, Any]:
-    """What both pages of calibrations tell about their origin."""
-    libraries = ", ".join(f"{name} {version}" for name, version in (record.get("libraries") or {}).items())
-    options = ", ".join(f"{key} = {value}" for key, value in (record.get("options") or {}).items())
-    command = record.get("command") or ""
-    rows = [
-        ("pixmetry", record.get("pixmetry", "")),
-        ("Python", record.get("python", "")),
-        ("Libraries", libraries),
-        ("Platform", record.get("platform", "")),
-        ("Seed", "" if record.get("seed") is None else str(record["seed"])),
-        ("Time (UTC)", str(record.get("time_utc", "")).replace("T", " ").removesuffix("+00:00")),
-    ]
-    return {
-        "provenance": [(label, str(text)) for label, text in rows if text],
-        "options": options,
-        "command": command if isinstance(command, str) else " ".join(str(part) for part in command),
-        "inputs": record.get("inputs") or (),
-    }

@@ -192,4 +192,4 @@ def field_map(adjustment: Adjustment, points: FieldPoints) -> Figure | None:
         low, high = significant(float(dz.min()), 2), significant(float(dz.max()), 2)
         caption = f"Deviation of the points from their nominal places: heights as colour ({low} to {high} {net.unit}), the rest as arrows."
         alt = f"Deviation of {len(x)} points of the test field, heights from {low} to {high} {net.unit}"
-        return Figure(figure, "field", alt, caption)
+        return Figure(figure, "field-map", alt, caption)

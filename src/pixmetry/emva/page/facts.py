@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
-from pixmetry.emva.page.content import release_title, short, time_scale
+from pixmetry.emva.page.content import short, time_scale
 from pixmetry.report.numbers import significant
 
 if TYPE_CHECKING:
@@ -105,21 +105,3 @@ def _plain(value: Any) -> str:
         return ", ".join(_plain(v) for v in parts)
     low, high = short(float(min(parts))), short(float(max(parts)))
     return low if low == high else f"{low} … {high}"
-
-
-def provenance(sheet: DataSheet) -> list[tuple[str, str]]:
-    """Where the numbers come from, as label and text."""
-    record = sheet.provenance
-    libraries = ", ".join(f"{name} {version}" for name, version in record.get("libraries", {}).items())
-    command = record.get("command", "")
-    rows = [
-        ("pixmetry", record.get("pixmetry", "")),
-        ("Release", release_title(sheet.results[0].release)),
-        ("Input files", f"{len(record.get('inputs', ()))}, each with its SHA-256" if record.get("inputs") else ""),
-        ("Python", record.get("python", "")),
-        ("Libraries", libraries),
-        ("Platform", record.get("platform", "")),
-        ("Time (UTC)", str(record.get("time_utc", "")).replace("T", " ").removesuffix("+00:00")),
-        ("Command", command if isinstance(command, str) else " ".join(str(part) for part in command)),
-    ]
-    return [(label, str(text)) for label, text in rows if text]

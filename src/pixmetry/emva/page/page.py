@@ -7,9 +7,10 @@ from itertools import groupby
 from typing import TYPE_CHECKING
 
 from pixmetry.emva.page import content
-from pixmetry.emva.page.facts import facts, provenance
-from pixmetry.report import Answer, Column, Facts, Figure, Page, Points, Reading, Row, Run, Section, Table, Text, strong
+from pixmetry.emva.page.facts import facts
+from pixmetry.report import Answer, Column, Figure, Page, Points, Reading, Row, Run, Section, Table, Text
 from pixmetry.report.page import Inline
+from pixmetry.report.provenance import provenance_section
 
 if TYPE_CHECKING:
     from pixmetry.emva.page.figures import Plot
@@ -57,7 +58,8 @@ def page_of(sheet: DataSheet) -> Page:
     for k, (r, every) in enumerate(plots, 1):
         for group, figures in _grouped(every, 100 * k):
             drawn.add_section(group if len(channels) == 1 else f"{r.channel}: {group}", *figures)
-    page.sections.append(_provenance(sheet))
+    if (origin := _origin(sheet)) is not None:
+        page.sections.append(origin)
     return page
 
 
@@ -129,20 +131,10 @@ def _all_values(results: Results, methods: Sequence[str], several: bool) -> Tabl
     return Table(f"All values of channel {results.channel}" if several else "All values", columns, rows)
 
 
-def _provenance(sheet: DataSheet) -> Section:
-    pairs = provenance(sheet)
-    section = Section("Where this comes from", name="provenance")
-    section.add(Facts([p for p in pairs if p[0] != "Command"]))
-    for label, text in pairs:
-        if label == "Command":
-            section.add_text("Command: ", Run(text, "code"), style="small")
-    if sheet.licence:
-        section.add_text(strong("Data:"), f" {sheet.licence}", style="small licence")
-    if inputs := sheet.provenance.get("inputs", ()):
-        rows = [[Run(i["name"], "mono"), str(i["size_bytes"]), Run(i["sha256"], "mono")] for i in inputs]
-        table = Table("Input files", ["File", Column("Bytes", "right"), "SHA-256"], rows)
-        section.add_section(f"{len(inputs)} input files with their SHA-256", table, fold=True)
-    return section
+def _origin(sheet: DataSheet) -> Section | None:
+    inputs = sheet.provenance.get("inputs", ())
+    files = [("Input files", f"{len(inputs)}, each with its SHA-256")] if inputs else []
+    return provenance_section(sheet.provenance, sheet.licence, [("Release", content.release_title(sheet.results[0].release)), *files])
 
 
 def all_plots(results: Results) -> list[Plot]:
