@@ -20,6 +20,7 @@ from gallery.line_jitter_frames import AVERAGED, LINES, SETTLED_C, VIEWS, camera
 from pixmetry.calibrate.lines.line_residuals import AxisResiduals, compare_axes, pooled
 from pixmetry.calibrate.lines.plumb_line import PlumbLineResult, calibrate_lines
 from pixmetry.calibrate.lines.row_jitter import RowVariance, Sampling, jitter_from_axes
+from pixmetry.calibrate.records import LinesFTest
 from pixmetry.core.number import Estimates
 
 JITTERS_NS = (0.0, 1.0, 2.0, 3.0, 5.0)
@@ -150,7 +151,7 @@ class Level:
         )  # fmt: skip
 
     @property
-    def f_test(self) -> dict[str, Any]:
+    def f_test(self) -> LinesFTest:
         """x against y."""
         return compare_axes(self.x, self.y)
 

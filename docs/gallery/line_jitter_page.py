@@ -133,7 +133,7 @@ def _test_table() -> str:
     for level in stored().levels:
         test = level.f_test
         p = [_p(test[f"p_{unit}"][kind]) for unit in ("px", "um") for kind in ("positions", "effective", "lines")]
-        rows.append([f"{level.jitter_ns:g}", fixed(test["ratio_px2"], 3), *p[:3], fixed(test["ratio_um2"], 3), *p[3:]])
+        rows.append([f"{level.jitter_ns:g}", fixed(test.ratio_px2, 3), *p[:3], fixed(test.ratio_um2, 3), *p[3:]])
     kinds = ["p, positions", "p, effective", "p, lines"]
     return table(["jitter / ns", "ratio in px²", *kinds, "ratio in µm²", *kinds], rows)
 
@@ -229,11 +229,11 @@ light or blur.
 Without jitter, x is still worse than y by a tenth of the variance, since pixel and video amplifier blur x more. With all positions taken
 for independent, which their correlations nearly allow, this is significant: a real difference, but none of jitter (see below). A test
 with many degrees of freedom finds any difference, whatever it is from. With one degree of freedom a line (critical value
-{fixed(none.f_test["critical_95"]["lines"], 2)}) it is not significant, and 1 ns is. The unit matters, too, where pixels are not square:
+{fixed(none.f_test.critical_95["lines"], 2)}) it is not significant, and 1 ns is. The unit matters, too, where pixels are not square:
 equal in pixels is not equal in micrometres.
 
-The chapter's own numbers, tested so: {fixed(test["ratio_px2"], 3)} in px² (p = {fixed(test["p_px"]["lines"], 3)}),
-{fixed(test["ratio_um2"], 3)} in µm² (p = {fixed(test["p_um"]["lines"], 3)}), both significant at 5 %. If all of it were jitter, and
+The chapter's own numbers, tested so: {fixed(test.ratio_px2, 3)} in px² (p = {fixed(test.p_px["lines"], 3)}),
+{fixed(test.ratio_um2, 3)} in µm² (p = {fixed(test.p_um["lines"], 3)}), both significant at 5 %. If all of it were jitter, and
 each position a single row that moves as the line does: {fixed(px.value, 2)} ns from pixels and {fixed(um.value, 2)} ns from micrometres,
 {px.reason.replace("(one-sided 95 %)", "").strip()} and {um.reason.replace("(one-sided 95 %)", "").strip()} respectively (one-sided, 95 %).
 So "not to be seen" holds for the size, not for the test.

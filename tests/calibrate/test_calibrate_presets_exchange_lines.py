@@ -368,13 +368,13 @@ def test_the_curve_is_brown_with_its_band(wires: tuple[Path, str], rng: np.rando
     calibration = pixmetry.calibrate(wires[0] / "lines.yaml")
     assert isinstance(calibration, LineCalibration)
     camera, curves = calibration.camera(), calibration.curves()
-    r = curves["radius"]
+    r = curves.radius
     assert r[-1] == pytest.approx(np.hypot(COLS * MM_X, ROWS * MM_Y) / 2)
-    np.testing.assert_allclose(curves["radial"], camera["k1"] * r**3 + camera["k2"] * r**5, rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(curves.radial, camera["k1"] * r**3 + camera["k2"] * r**5, rtol=1e-12, atol=1e-15)
     draws = rng.multivariate_normal(calibration.result.estimates.values, calibration.result.estimates.covariance, 4000)
     at = {name: draws[:, calibration.result.free.index(name)] for name in ("k1", "k2")}
     spread = np.std(at["k1"] * r[-1] ** 3 + at["k2"] * r[-1] ** 5)
-    assert curves["u_radial"][-1] == pytest.approx(spread, rel=5 / np.sqrt(2 * 4000))
+    assert curves.u_radial[-1] == pytest.approx(spread, rel=5 / np.sqrt(2 * 4000))
     assert html_of(page_of(calibration)) and summary_text(calibration)
 
 

@@ -231,10 +231,10 @@ def test_published_residuals_of_54_images() -> None:
     """Known: F.95(216, 216) = 1.25, 1.279 has p = .036 in px², 1.373 has p = .010 in µm²; 1.3 ns (1.46 from µm), at most 1.9 to 2.0 ns."""
     x, y = axis(0.341 / 8.6, 0.341), axis(0.291 / 8.3, 0.291)
     test = compare_axes(x, y)
-    assert test["critical_95"]["lines"] == pytest.approx(1.25, abs=0.005)
-    assert (round(test["ratio_px2"], 3), round(test["ratio_um2"], 3)) == (1.279, 1.373)
-    assert (round(test["p_px"]["lines"], 3), round(test["p_um"]["lines"], 3)) == (0.036, 0.010)
-    assert test["p_px"]["positions"] < 1e-20
+    assert test.critical_95["lines"] == pytest.approx(1.25, abs=0.005)
+    assert (round(test.ratio_px2, 3), round(test.ratio_um2, 3)) == (1.279, 1.373)
+    assert (round(test.p_px["lines"], 3), round(test.p_um["lines"], 3)) == (0.036, 0.010)
+    assert test.p_px["positions"] < 1e-20
     found = jitter_from_axes(x, y, Sampling(70.485), kind="lines")["jitter_ns"]
     assert (found.kind, round(found.value, 2)) == ("value", 1.31)
     assert "1.92 ns" in found.reason

@@ -130,6 +130,7 @@ def calibrated_camera(camera: Camera, geometry: CameraGeometry) -> Camera:
     at = next((i for i, e in enumerate(chain) if e.source.stage not in ("scene", "optics")), len(chain))
     for name in (AFFINITY, LENS):
         source = get_source(name, "calibrated camera")
+        assert source.measure is not None  # both can be read from a geometry
         values = {e.name: e.value for e in source.measure(seen)}
         chain.insert(at, Element(name, source, source.make(values, where=f"{geometry.origin}, {name}")))
     facts = {"calibration": geometry.origin, "principal_distance_mm": geometry.lens["principal_distance_mm"].value}

@@ -8,12 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
+from html import escape
 from types import NoneType, UnionType
 from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 import numpy as np
 
 from pixmetry.calibrate.bundle.network import Adjustment
+from pixmetry.core.errors import InputError
 from pixmetry.core.finding import Finding
 
 Axis = Literal["x", "y"]
@@ -1004,6 +1006,53 @@ class CheckRecord:
 
 
 @dataclass(frozen=True)
+class LineRecord:
+    """A straight line.
+
+    Parameters
+    ----------
+    image, line : str
+    axis : {"x", "y"}
+        "x": it runs along y and tells about x.
+    angle_deg : float
+    n : int
+        Positions used.
+    rms_px, dof : float
+    """
+
+    image: str
+    line: str
+    axis: str
+    angle_deg: float
+    n: int
+    rms_px: float
+    dof: float
+
+
+@dataclass(frozen=True)
+class LinesFTest:
+    """One-sided F-test of positions along x against those along y; mappings by "positions", "effective", "lines": how they are counted.
+
+    Parameters
+    ----------
+    ratio_px2, ratio_um2 : float
+        Of the variances; in µm² None without a pitch.
+    dof : mapping of (float, float)
+    critical_95, p_px, p_um : mapping of float
+    side, text : str
+    """
+
+    ratio_px2: float
+    ratio_um2: float | None
+    dof: Mapping[str, tuple[float, float]]
+    critical_95: Mapping[str, float]
+    p_px: Mapping[str, float]
+    p_um: Mapping[str, float] | None
+    side: str
+    text: str
+
+
+@dataclass(frozen=True)
 class Tests:
     """Records of the tests of a calibration; None: not made. Mappings are by the names of the cameras.
 
@@ -1055,7 +1104,7 @@ class Tests:
         return any(getattr(self, one.name) is not None for one in fields(self))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Calibration:
     """What a calibration hands to its user, its report and its files.
 
@@ -1077,3 +1126,49 @@ class Calibration:
     tests: Tests = field(default_factory=Tests)
     grids: Mapping[str, ResidualGrid] = field(default_factory=dict)
     provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        a = self.adjustment
+        posed = int(np.isfinite(a.state.position).all(axis=1).sum())
+        warnings = sum(finding.level != "note" for finding in self.findings)
+        cameras = ", ".join(camera.name for camera in a.network.cameras)
+        used = f"{posed} images, {int(a.used.sum())} image points"
+        return f"<Calibration of {cameras}: {used}, sigma0 {a.sigma0:.4g} with {a.dof} degrees of freedom, {warnings} warnings>"
+
+    def _repr_html_(self) -> str:
+        """Parameters and findings for a notebook."""
+        columns = self.columns("parameters")
+        rows = [row for row in zip(*columns.values(), strict=True) if row[2] or row[5]]
+        cells = "".join(
+            f"<tr><td>{escape(camera)}</td><td>{name}</td><td>{value:.8g}</td><td>{f'± {u:.2g}' if estimated else 'held'}</td>"
+            f"<td>{escape(unit)}</td></tr>"
+            for camera, name, value, u, unit, estimated in rows
+        )
+        found = "".join(f"<li>{escape(finding.level)}: {escape(finding.text)}</li>" for finding in self.findings)
+        return f"<p>{escape(repr(self).strip('<>'))}</p><table>{cells}</table><ul>{found}</ul>"
+
+    def columns(self, table: Literal["parameters", "points", "poses", "residuals"]) -> dict[str, Any]:
+        """A table of the results as columns by name: interior parameters, object points, poses, or image coordinates with their residuals.
+
+        Raises
+        ------
+        InputError
+            If there is no such table.
+        """
+        from pixmetry.calibrate.tables import TABLES
+
+        if table not in TABLES:
+            raise InputError("no such table of a calibration", where="table", value=table, allowed=", ".join(TABLES))
+        return TABLES[table](self)
+
+    def to_dataframe(self, table: Literal["parameters", "points", "poses", "residuals"] = "parameters") -> Any:
+        """The same as a `pandas.DataFrame`, a row for each parameter, point, image or image coordinate; see `columns`.
+
+        Raises
+        ------
+        InputError
+            If there is no such table, or pandas is not installed.
+        """
+        from pixmetry.calibrate.tables import frame_of
+
+        return frame_of(self.columns(table))

@@ -100,7 +100,7 @@ def adjust(
             if covariance:
                 raise_weak(layout, datum, now, what)
             layout = replace(layout, notes=(*layout.notes, what))
-        found = cofactors(layout, datum, at, solved, redundancy) if covariance else None
+        found = cofactors(layout, datum, at, solved, redundancy) if covariance and solved is not None else None
         return _result(layout, datum, now, found, costs, redundancy, a_priori)
 
 
@@ -250,7 +250,7 @@ def _result(
     used[layout.order] = layout.used & now.valid
     weight[layout.order] = np.where(now.weight > 0, now.weight, 1.0)
     numbers = variances = None
-    if redundancy and found is not None:
+    if found is not None and found.residuals is not None:  # as redundancy was asked for
         numbers, variances = np.full((n, 2), np.nan), np.full((n, 3), np.nan)
         numbers[layout.order], variances[layout.order] = residual_cofactors_px2(layout, now, found.residuals)
     notes = layout.notes

@@ -251,8 +251,9 @@ def weak_direction(columns: tuple[str, ...], covariance: np.ndarray, network: Ne
     direction = eigsh(correlation, k=1, which="LA", v0=np.ones(len(u)))[1][:, 0] if len(u) > 2 else np.ones(len(u))
     alone, share, kinds = _groups(names, direction, network)
     own, common = _worst_pair(alone, covariance), _worst_pair(kinds, covariance)
-    if common is None or (own is not None and (share > ALONE or 1 - abs(own.correlation) < 0.1 * (1 - abs(common.correlation)))):
+    if own is not None and (common is None or share > ALONE or 1 - abs(own.correlation) < 0.1 * (1 - abs(common.correlation))):
         return own
+    assert common is not None  # there are two parameters, or nothing could be weak
     return common
 
 

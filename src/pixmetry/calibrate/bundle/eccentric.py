@@ -84,6 +84,7 @@ def predicted(network: Network, state: State, rows: np.ndarray, normal: np.ndarr
     """Shifts of some image coordinates, px, shape (rows, 2), for targets across ``normal`` (unit vectors, shape (rows, 3))."""
     from pixmetry.calibrate.bundle._eccentric_kernels import area_centres
 
+    assert network.diameter is not None  # the rows are those of circles
     first = _along_x(normal)
     image, point = network.image[rows], network.point[rows]
     place, tangent = outline(shape)

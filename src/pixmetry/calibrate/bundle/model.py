@@ -60,8 +60,8 @@ class Sensor:
         if (self.pitch_x_um is None) != (self.pitch_y_um is None):
             remedy = "give pitch_x_um and pitch_y_um, or neither"
             raise ParameterError("one of the two pixel pitches is missing", where="sensor", remedy=remedy)
-        if self.pitch_x_um is not None and not (0 < self.pitch_x_um < 1000 and 0 < self.pitch_y_um < 1000):
-            pitch = (self.pitch_x_um, self.pitch_y_um)
+        pitch = self.pitch_x_um, self.pitch_y_um
+        if any(one is not None and not 0 < one < 1000 for one in pitch):
             raise ParameterError("not a pixel pitch", where="sensor", value=pitch, allowed="above 0, in µm")
 
     @property
@@ -72,7 +72,9 @@ class Sensor:
     @property
     def per_px(self) -> tuple[float, float]:
         """Length units per pixel along x and y."""
-        return (1.0, 1.0) if self.pitch_x_um is None else (self.pitch_x_um / 1000, self.pitch_y_um / 1000)
+        if self.pitch_x_um is None or self.pitch_y_um is None:
+            return 1.0, 1.0
+        return self.pitch_x_um / 1000, self.pitch_y_um / 1000
 
     @property
     def centre(self) -> tuple[float, float]:

@@ -224,6 +224,20 @@ class Adjustment:
 
         return replace(self.network.cameras[index], values=self.state.interior[index].copy())
 
+    @property
+    def redundancy_numbers(self) -> np.ndarray:
+        """``redundancy``, of an adjustment that was asked for it; else ``ValueError``."""
+        if self.redundancy is None:
+            raise ValueError("an adjustment without redundancy numbers: adjust(…, redundancy=True)")
+        return self.redundancy
+
+    @property
+    def residual_cofactors_px2(self) -> np.ndarray:
+        """``residual_covariance_px2`` likewise."""
+        if self.residual_covariance_px2 is None:
+            raise ValueError("an adjustment without cofactors of its residuals: adjust(…, redundancy=True)")
+        return self.residual_covariance_px2
+
     def interior_covariance(self, index: int = 0) -> tuple[tuple[str, ...], np.ndarray]:
         """Names of the estimated parameters of a camera and their covariance."""
         own = {f"{self.network.cameras[index].name}:{name}": name for name in NAMES}  # an image or a point may have the camera's name

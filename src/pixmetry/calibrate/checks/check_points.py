@@ -141,8 +141,8 @@ def check_record(adjustment: Adjustment, checks: CheckPoints, *, a_priori: bool 
         row, axis = np.unravel_index(np.nanargmax(np.abs(values[4])), values[4].shape)
         critical = float(stats.t.isf(RARE / known.sum() / 2, dof))
         worst = WorstPoint(checks.names[row], "XYZ"[axis], float(values[2, row, axis]), float(values[4, row, axis]), critical)
-    tests = (chi2, p, worst) if told else (None, None, None)
-    record = CheckRecord(network.unit, rank, int(known.sum()), left, RARE, _rms(values[2]), _rms(values[3]), *tests, "", points)
+    rms, expected = _rms(values[2]), _rms(values[3])
+    record = CheckRecord(network.unit, rank, int(known.sum()), left, RARE, rms, expected, chi2 if told else None, p, worst, "", points)
     return replace(record, text=_text(record))
 
 

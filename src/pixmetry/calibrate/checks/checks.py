@@ -324,9 +324,10 @@ def _check_camera(adjustment: Adjustment, k: int) -> list[Finding]:
             text = f"the principal distance of {camera.name} is badly determined: {value}"
             findings.append(Finding("correlation", text, remedy, "warning"))
     for name, axis in (("xp", 0), ("yp", 1)):
-        if u[name] is not None and u[name] > POOR_POINT * width:
+        u_name = u[name]
+        if u_name is not None and u_name > POOR_POINT * width:
             r = _median([_correlation(adjustment, f"{camera.name}:{name}", i, axis) for i in images])
-            size = f"u = {plain(u[name], 2)} px"
+            size = f"u = {plain(u_name, 2)} px"
             text = f"{name} of {camera.name} is badly determined: {size}, correlation with the places of the images {r:+.4f}"
             rolled = _rolled(adjustment.state.rotation[images])
             advice = "add images from other directions" if rolled else "roll the camera by 90° in some of the images"

@@ -164,13 +164,14 @@ def _moves(fixed: Adjustment, free: Adjustment) -> dict[str, Moved]:
     cameras = {}
     for k, camera in enumerate(fixed.network.cameras):
         names, covariance = fixed.interior_covariance(k)
-        moves: list[float | None] = []
+        moves: dict[str, float] = {}
+        formal: dict[str, float | None] = {}
         for name, place in PLACES.items():
             per_px = camera.sensor.per_px[0] if name == "c" else 1.0
-            moves.append(float(free.state.interior[k, place] - fixed.state.interior[k, place]) / per_px)
+            moves[name] = float(free.state.interior[k, place] - fixed.state.interior[k, place]) / per_px
             known = name in names
-            moves.append(float(np.sqrt(covariance[names.index(name), names.index(name)])) / per_px if known else None)
-        cameras[camera.name] = Moved(*moves)
+            formal[name] = float(np.sqrt(covariance[names.index(name), names.index(name)])) / per_px if known else None
+        cameras[camera.name] = Moved(moves["c"], formal["c"], moves["xp"], formal["xp"], moves["yp"], formal["yp"])
     return cameras
 
 

@@ -121,11 +121,10 @@ class _Seen:
 
     def along(self, x: np.ndarray | None, y: np.ndarray | None) -> np.ndarray:
         """Terms, shape (m, 2, k), from columns, shape (rows of this camera, k), of what they add to x and to y."""
-        columns = (x if x is not None else y).shape[1]
-        out = np.zeros((len(self.mine), 2, columns))
-        for axis, part in enumerate((x, y)):
-            if part is not None:
-                out[self.mine, axis] = part
+        parts = [(axis, part) for axis, part in enumerate((x, y)) if part is not None]
+        out = np.zeros((len(self.mine), 2, parts[0][1].shape[1]))
+        for axis, part in parts:
+            out[self.mine, axis] = part
         return out
 
 

@@ -99,7 +99,7 @@ def statistics(adjustment: Adjustment) -> tuple[np.ndarray, np.ndarray]:
     root = _roots(adjustment.network.covariance_px2)
     inverse = np.linalg.inv(root)
     white = (inverse @ adjustment.residual_px[:, :, None])[:, :, 0]
-    cofactor = inverse @ _matrices(adjustment.residual_covariance_px2) @ inverse.swapaxes(1, 2)
+    cofactor = inverse @ _matrices(adjustment.residual_cofactors_px2) @ inverse.swapaxes(1, 2)
     good = np.isfinite(white).all(axis=1) & np.isfinite(cofactor).all(axis=(1, 2))
     share, axes = np.linalg.eigh(np.where(good[:, None, None], cofactor, np.eye(2)))
     along = np.einsum("nji,nj->ni", axes, np.where(good[:, None], white, 0.0))

@@ -79,7 +79,7 @@ def _with_noise(residuals: Mapping[str, CameraResiduals], adjustment: Adjustment
         rows = adjustment.used & (given.camera_of[given.image] == k)
         noise: list[float | None] = [None, None]
         if given.covariance_known and rows.any():
-            noise = np.sqrt(np.mean(adjustment.redundancy[rows] * given.covariance_px2[rows][:, [0, 2]], axis=0)).tolist()
+            noise = np.sqrt(np.mean(adjustment.redundancy_numbers[rows] * given.covariance_px2[rows][:, [0, 2]], axis=0)).tolist()
         rest = systematic_rest(adjustment, k)
         out[camera.name] = replace(
             residuals[camera.name], noise_x_px=noise[0], noise_y_px=noise[1], systematic_x_px=rest[0], systematic_y_px=rest[1]

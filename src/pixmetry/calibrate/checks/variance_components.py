@@ -177,7 +177,7 @@ def _axes_differ(adjustment: Adjustment, variance_px2: np.ndarray, camera: int) 
     network, images = adjustment.network, len(adjustment.network.images)
     rows = adjustment.used & (network.camera_of[network.image] == camera)
     own = weighted_squares(adjustment)[rows] * network.covariance_px2[rows][:, [0, 2]] / variance_px2[rows][:, [0, 2]]
-    r = np.nan_to_num(adjustment.redundancy[rows])
+    r = np.nan_to_num(adjustment.redundancy_numbers[rows])
     squares, dof = (np.stack([np.bincount(network.image[rows], a[:, i], images) for i in (0, 1)], axis=1) for a in (own, r))
     good = (dof > LEAST_IN_IMAGE).all(axis=1) & (squares > 0).all(axis=1)
     if not good.any():
@@ -213,7 +213,7 @@ def estimated_sizes(
     network, used = adjustment.network, adjustment.used
     of = group[network.camera_of[network.image[used]]]
     now, given = network.covariance_px2[used][:, [0, 2]], given_px2[used][:, [0, 2]]
-    squares, r = weighted_squares(adjustment)[used] * now, np.nan_to_num(adjustment.redundancy[used])
+    squares, r = weighted_squares(adjustment)[used] * now, np.nan_to_num(adjustment.redundancy_numbers[used])
     least, least_now = finest_factor(replace(network, covariance_px2=given_px2)), finest_factor(network)
 
     def size(mine: np.ndarray) -> tuple[float, float, bool, float]:
@@ -277,7 +277,7 @@ def relative_u(adjustment: Adjustment, group: np.ndarray) -> np.ndarray:
     """Relative standard uncertainties of Σ v (P v) / Σ r, shape (cameras, 2); inf for a group that cannot be told from the others."""
     network, used = adjustment.network, adjustment.used
     of, size = group[network.camera_of[network.image[used]]].ravel(), int(group.max()) + 1
-    r = np.clip(adjustment.redundancy[used], 0.0, 1.0).ravel()
+    r = np.clip(adjustment.redundancy_numbers[used], 0.0, 1.0).ravel()
     dof, beside, count = (np.bincount(of, weights, minlength=size) for weights in (r, r * (1 - r), None))
     there = dof > 0
     shared = np.outer(beside[there], count[there]) / count.sum()
@@ -305,5 +305,5 @@ def scaled(network: Network, factor: np.ndarray) -> Network:
 def image_sigma0(adjustment: Adjustment) -> tuple[float, float]:
     """sigma0 and redundancy of the image coordinates alone, without bars and control points."""
     used = adjustment.used
-    dof = float(np.nansum(adjustment.redundancy[used]))
+    dof = float(np.nansum(adjustment.redundancy_numbers[used]))
     return float(np.sqrt(weighted_squares(adjustment)[used].sum() / max(dof, 1e-12))), dof

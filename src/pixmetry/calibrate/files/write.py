@@ -14,6 +14,7 @@ import numpy as np
 from pixmetry.calibrate.files.record import PIXELS, calibration_json, lines_json
 from pixmetry.calibrate.lines.line_calibration import LineCalibration
 from pixmetry.calibrate.records import Calibration
+from pixmetry.calibrate.tables import point_columns, pose_columns, residual_columns
 from pixmetry.camera.camera import Camera
 from pixmetry.core.plain_text import cell, comment
 from pixmetry.files.output import check_output, staged_output
@@ -92,63 +93,20 @@ def _write_numbers(place: Path, text: Callable[..., str], calibration: Any) -> N
 def points_csv(calibration: Calibration) -> str:
     """Object points with their uncertainties; a table that a project can name as its points."""
     a = calibration.adjustment
-    c = a.point_covariance
-    used = np.bincount(a.network.point[a.used], minlength=len(a.network.points))
-    columns = {
-        "point": a.network.points,
-        **dict(zip("XYZ", a.state.xyz.T, strict=True)),
-        **{f"u_{axis}": np.sqrt(c[:, k, k]) for k, axis in enumerate("XYZ")},
-        **{f"cov_{'XYZ'[i]}{'XYZ'[j]}": c[:, i, j] for i, j in ((0, 1), (0, 2), (1, 2))},
-        "images": used,
-    }
-    return _csv([f"unit {a.network.unit}; datum: {a.datum}"], columns)
+    return _csv([f"unit {a.network.unit}; datum: {a.datum}"], point_columns(calibration))
 
 
 def poses_csv(calibration: Calibration) -> str:
     """Projection centres and rotations of the images with their uncertainties."""
     a = calibration.adjustment
-    network, state = a.network, a.state
-    u = dict(zip(a.free_columns, np.sqrt(np.maximum(np.diag(a.covariance), 0.0)), strict=True))
-
-    def of(name: str) -> list[float]:
-        return [float(u.get(f"{image}:{name}", np.nan)) for image in network.images]
-
-    columns: dict[str, Any] = {
-        "image": network.images,
-        "camera": [network.cameras[k].name for k in network.camera_of],
-        **{f"{axis}0": state.position[:, k] for k, axis in enumerate("XYZ")},
-        **{f"r{i + 1}{j + 1}": state.rotation[:, i, j] for i in range(3) for j in range(3)},
-        **{f"u_{axis}0": of(f"{axis}0") for axis in "XYZ"},
-        **{f"u_{axis}_rad": of(axis) for axis in ("rx", "ry", "rz")},
-    }
-    if "x_scale" in network.per_image:
-        columns |= {"x_scale": state.x_scale, "u_x_scale": of("x_scale")}
-    if "x_shift" in network.per_image:
-        columns |= {"x_shift_px": state.x_shift_px, "u_x_shift_px": of("x_shift")}
     text = "a point X is seen at R (X - X0), R by rows, z forwards, x to the right, y down; u of rotations about the camera's axes"
-    return _csv([f"unit {network.unit}; datum: {a.datum}", text], columns)
+    return _csv([f"unit {a.network.unit}; datum: {a.datum}", text], pose_columns(calibration))
 
 
 def residuals_csv(calibration: Calibration) -> str:
     """Image coordinates with their residuals; a table that a project can name as its observations."""
-    a = calibration.adjustment
-    network = a.network
-    columns: dict[str, Any] = {
-        "image": [network.images[k] for k in network.image],
-        "point": [network.points[k] for k in network.point],
-        "x_px": network.x_px,
-        "y_px": network.y_px,
-        "var_x_px2": network.covariance_px2[:, 0],
-        "cov_xy_px2": network.covariance_px2[:, 1],
-        "var_y_px2": network.covariance_px2[:, 2],
-        "residual_x_px": a.residual_px[:, 0],
-        "residual_y_px": a.residual_px[:, 1],
-        "used": a.used.astype(int),
-    }
-    if a.redundancy is not None:
-        columns |= {"redundancy_x": a.redundancy[:, 0], "redundancy_y": a.redundancy[:, 1]}
     text = "residual: measured less computed; image coordinates of centres, without eccentricity; variances as they were used"
-    return _csv([PIXELS, text], columns)
+    return _csv([PIXELS, text], residual_columns(calibration))
 
 
 def line_residuals_csv(calibration: LineCalibration) -> str:
@@ -159,7 +117,7 @@ def line_residuals_csv(calibration: LineCalibration) -> str:
         "line": calibration.line.tolist(),
         "x_px": calibration.x_px,
         "y_px": calibration.y_px,
-        "axis": [result.lines[k]["axis"] for k in result.line_of],
+        "axis": [result.lines[k].axis for k in result.line_of],
         "residual_px": result.residual_px,
         **({} if result.residual_um is None else {"residual_um": result.residual_um}),
         "used": result.used.astype(int),

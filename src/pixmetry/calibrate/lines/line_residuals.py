@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from pixmetry.calibrate.records import LinesFTest
+
 LAGS = 20
 SIGNIFICANT = 3.29  # standard deviations: 1e-3, two-sided
 
@@ -119,31 +121,21 @@ def pooled(axes: Sequence[AxisResiduals]) -> AxisResiduals:
     return AxisResiduals(px, um, n, lines, float(dof.sum()), float(dof.sum() * share), correlation, pairs)
 
 
-def compare_axes(x: AxisResiduals, y: AxisResiduals) -> dict[str, Any]:
-    """One-sided F-test of x against y: line jitter can only make x worse.
-
-    Returns
-    -------
-    dict
-        ``ratio_px2``, ``ratio_um2`` (None without a pitch), and by "positions", "effective", "lines": ``dof`` (pairs), ``critical_95``,
-        ``p_px``, ``p_um``; ``side``; ``text``.
-    """
+def compare_axes(x: AxisResiduals, y: AxisResiduals) -> LinesFTest:
+    """One-sided F-test of x against y: line jitter can only make x worse."""
     from pixmetry.calibrate.checks.quality import f_test
 
     dof = {name: (x.dof_of[name], y.dof_of[name]) for name in x.dof_of}
-    rms = {"px": (x.rms_px, y.rms_px)}
+    px = {name: f_test(x.rms_px**2, y.rms_px**2, *d) for name, d in dof.items()}
+    um = None
     if x.rms_um is not None and y.rms_um is not None:
-        rms["um"] = (x.rms_um, y.rms_um)
-    told = {unit: {name: f_test(v[0] ** 2, v[1] ** 2, *d) for name, d in dof.items()} for unit, v in rms.items()}
-    ratio = {unit: told[unit]["lines"][0] if unit in told else None for unit in ("px", "um")}
-    p = {unit: {name: t[2] for name, t in told[unit].items()} if unit in told else None for unit in ("px", "um")}
-    critical = {name: t[1] for name, t in told["px"].items()}
-    um = "" if ratio["um"] is None else f", {ratio['um']:.3f} in µm² (p = {p['um']['lines']:.2g})"
+        um = {name: f_test(x.rms_um**2, y.rms_um**2, *d) for name, d in dof.items()}
+    in_um = "" if um is None else f", {um['lines'][0]:.3f} in µm² (p = {um['lines'][2]:.2g})"
     text = (
-        f"Variance along x over that along y: {ratio['px']:.3f} in px² (p = {p['px']['lines']:.2g}){um}; one-sided, one degree of freedom "
-        f"for each line ({dof['lines'][0]:.0f}, {dof['lines'][1]:.0f}), critical value {critical['lines']:.3f} at 5 %."
+        f"Variance along x over that along y: {px['lines'][0]:.3f} in px² (p = {px['lines'][2]:.2g}){in_um}; one-sided, one degree of "
+        f"freedom for each line ({dof['lines'][0]:.0f}, {dof['lines'][1]:.0f}), critical value {px['lines'][1]:.3f} at 5 %."
     )
-    return {
-        "ratio_px2": ratio["px"], "ratio_um2": ratio["um"], "dof": dof, "critical_95": critical, "p_px": p["px"], "p_um": p["um"],
-        "side": "x above y", "text": text,
-    }  # fmt: skip
+    critical, p_px = ({name: found[k] for name, found in px.items()} for k in (1, 2))
+    p_um = None if um is None else {name: found[2] for name, found in um.items()}
+    ratio_um2 = None if um is None else um["lines"][0]
+    return LinesFTest(px["lines"][0], ratio_um2, dof, critical, p_px, p_um, "x above y", text)

@@ -26,6 +26,7 @@ from numpy.typing import ArrayLike
 from pixmetry.calibrate.bundle.model import NAMES, CameraModel, Sensor
 from pixmetry.calibrate.lines.line_residuals import AxisResiduals, axis_residuals, compare_axes, correlation_inflation
 from pixmetry.calibrate.lines.plumb_line_fit import LineFit, LineTable, adjust_lines, refuse
+from pixmetry.calibrate.records import LineRecord, LinesFTest, record_of
 from pixmetry.core.errors import InputError
 from pixmetry.core.finding import Finding
 from pixmetry.core.number import Estimates
@@ -51,8 +52,7 @@ class PlumbLineResult:
     estimates : Estimates
         Their values and covariance, a posteriori: variances along x and y are those of the residuals, and where these hang together along
         the lines, the covariance is enlarged by ``inflation``.
-    lines : tuple of dict
-        One record a line: image, line, axis ("x": it runs along y and tells about x), angle_deg, n, rms_px, dof.
+    lines : tuple of LineRecord
     line_of : ndarray of int, shape (n,)
         Which of them.
     along : ndarray, shape (n,)
@@ -67,8 +67,8 @@ class PlumbLineResult:
         Factors by which the stated standard deviations along x and y were multiplied (standard deviations, if none were stated).
     axes : dict of AxisResiduals
         By "x" and "y", as far as there are lines.
-    f_test : dict, optional
-        One-sided test of x against y, if there are both.
+    f_test : LinesFTest, optional
+        Of x against y, if there are both.
     inflation : float
     iterations : int
     findings : tuple of Finding
@@ -77,7 +77,7 @@ class PlumbLineResult:
     camera: CameraModel
     free: tuple[str, ...]
     estimates: Estimates
-    lines: tuple[dict[str, Any], ...]
+    lines: tuple[LineRecord, ...]
     line_of: np.ndarray
     along: np.ndarray
     residual_px: np.ndarray
@@ -86,7 +86,7 @@ class PlumbLineResult:
     redundancy: np.ndarray
     sigma_px: tuple[float, float]
     axes: dict[str, AxisResiduals]
-    f_test: dict[str, Any] | None
+    f_test: LinesFTest | None
     inflation: float
     iterations: int
     findings: tuple[Finding, ...]
@@ -96,9 +96,9 @@ class PlumbLineResult:
         return {
             "parameters": self.estimates.to_records(),
             "correlations": (self.estimates.covariance / np.outer(self.estimates.u, self.estimates.u)).tolist(),
-            "lines": list(self.lines),
+            "lines": [record_of(line) for line in self.lines],
             "axes": {name: axis.to_record() for name, axis in self.axes.items()},
-            "f_test": self.f_test,
+            "f_test": None if self.f_test is None else record_of(self.f_test),
             "gross_errors": np.flatnonzero(~self.used).tolist(),
             "inflation": self.inflation,
             "findings": [{"kind": f.kind, "text": f.text, "advice": f.advice, "level": f.level} for f in self.findings],
@@ -201,9 +201,7 @@ def _result(fit: LineFit, model: CameraModel, free: tuple[str, ...]) -> PlumbLin
         dof = float(redundancy[mine].sum())
         rms = float(np.sqrt(np.sum(residual_px[mine] ** 2) / dof)) if dof > 0 else float("nan")
         angle = float((np.degrees(fit.theta[i]) + 180.0) % 180.0 - 90.0)
-        lines.append(
-            {"image": image, "line": line, "axis": "xy"[axis[i]], "angle_deg": angle, "n": int(mine.sum()), "rms_px": rms, "dof": dof}
-        )
+        lines.append(LineRecord(image, line, "xy"[axis[i]], angle, int(mine.sum()), rms, dof))
     return PlumbLineResult(
         camera, free, estimates, tuple(lines), table.line_of, fit.along, residual_px, residual_um, used.copy(), redundancy,
         (float(fit.scale[0]), float(fit.scale[1])), axes, f_test, inflation, fit.iterations, findings,
@@ -241,7 +239,12 @@ def _lost(camera: CameraModel, estimates: Estimates, free: tuple[str, ...]) -> l
 
 
 def _findings(
-    estimates: Estimates, free: tuple[str, ...], axes: dict[str, AxisResiduals], used: np.ndarray, f_test: dict | None, inflation: float
+    estimates: Estimates,
+    free: tuple[str, ...],
+    axes: dict[str, AxisResiduals],
+    used: np.ndarray,
+    f_test: LinesFTest | None,
+    inflation: float,
 ) -> tuple[Finding, ...]:
     found = []
     r = estimates.covariance / np.outer(estimates.u, estimates.u)
@@ -259,6 +262,6 @@ def _findings(
         text = f"Neighbours along the lines err alike: the parameters' variances are {inflation:.1f} times those of independent positions."
         advice = "Free more parameters, or ask whether the lines are straight and the sensor flat."
         found.append(Finding("correlated_residuals", text, advice))
-    if f_test is not None and f_test["p_px"]["lines"] < 0.05:
-        found.append(Finding("line_jitter", f_test["text"], "Ask the frame grabber for its line jitter, or sample with the pixel clock."))
+    if f_test is not None and f_test.p_px["lines"] < 0.05:
+        found.append(Finding("line_jitter", f_test.text, "Ask the frame grabber for its line jitter, or sample with the pixel clock."))
     return tuple(found)

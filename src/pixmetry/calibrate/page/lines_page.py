@@ -87,13 +87,13 @@ def _residuals(section: Section, calibration: LineCalibration) -> None:
     section.add(number_table("Residuals by axis", text.axis_heads(calibration), text.axis_rows(calibration)))
     test = result.f_test
     if test:
-        um = ["p in µm²"] if test["p_um"] else []
+        um = ["p in µm²"] if test.p_um else []
         heads = ["Degrees of freedom counted", "x and y", "Critical, 95 %", "p in px²", *um]
-        section.add_text(typeset(sentence(test["text"])))
+        section.add_text(typeset(sentence(test.text)))
         section.add(number_table("F-test of x against y", heads, text.f_rows(test)), Text(COUNTING, "small soft"))
     section.add(*drawn_lines(calibration))
     rows = [
-        [str(r["image"]), str(r["line"]), r["axis"], fixed(r["angle_deg"], 2), str(r["n"]), length_px(r["rms_px"]), f"{r['dof']:.1f}"]
+        [str(r.image), str(r.line), r.axis, fixed(r.angle_deg, 2), str(r.n), length_px(r.rms_px), f"{r.dof:.1f}"]
         for r in result.lines
     ]
     heads = ["Image", "Line", "Axis", "Angle / °", "Positions", "rms / px", "Degrees of freedom"]
@@ -103,7 +103,7 @@ def _residuals(section: Section, calibration: LineCalibration) -> None:
 def drawn_lines(calibration: LineCalibration) -> list[Figure]:
     """Lines over the sensor, image by image, with their residuals across them enlarged; all at one scale."""
     result, sensor = calibration.result, calibration.camera().sensor
-    about_x = np.array([r["axis"] == "x" for r in result.lines])[result.line_of]
+    about_x = np.array([r.axis == "x" for r in result.lines])[result.line_of]
     dx, dy = np.where(about_x, result.residual_px, 0.0), np.where(about_x, 0.0, result.residual_px)
     images, index = np.unique(calibration.image, return_inverse=True)
     square = np.bincount(index, np.where(result.used, result.residual_px, 0.0) ** 2) / np.bincount(index)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from pixmetry.calibrate.page.text import TITLES, folded, length, p_text, sentence, symbol
 from pixmetry.report.numbers import NO_BREAK, NONE, THIN, length_px, significant, uncertain
 
 if TYPE_CHECKING:
     from pixmetry.calibrate.lines.line_calibration import LineCalibration
+    from pixmetry.calibrate.records import LinesFTest
 
 COUNTED = (("positions", "by position"), ("effective", "effective"), ("lines", "by line"))
 
@@ -52,14 +53,14 @@ def axis_heads(calibration: LineCalibration) -> list[str]:
     return ["Axis", "Positions", "Lines", "rms / px", "in pixels", *um, *(f"dof {text}" for _, text in COUNTED)]
 
 
-def f_rows(test: dict[str, Any] | None) -> list[list[str]]:
+def f_rows(test: LinesFTest | None) -> list[list[str]]:
     """The F-test by how degrees of freedom are counted."""
     rows = []
     for key, text in COUNTED if test is not None else ():
         assert test is not None
-        dof = " and ".join(f"{v:.0f}" for v in test["dof"][key])
-        um = [] if test["p_um"] is None else [p_text(test["p_um"][key])]
-        rows.append([text, dof, significant(test["critical_95"][key]), p_text(test["p_px"][key]), *um])
+        dof = " and ".join(f"{v:.0f}" for v in test.dof[key])
+        um = [] if test.p_um is None else [p_text(test.p_um[key])]
+        rows.append([text, dof, significant(test.critical_95[key]), p_text(test.p_px[key]), *um])
     return rows
 
 
@@ -69,8 +70,8 @@ def summary_text(calibration: LineCalibration) -> str:
     lines += _columns(parameter_rows(calibration))
     lines += ["", *_columns([axis_heads(calibration), *axis_rows(calibration)])]
     test = calibration.result.f_test
-    if test is not None and not any(test["text"] == f.text for f in calibration.findings):
-        lines += ["", sentence(test["text"])]
+    if test is not None and not any(test.text == f.text for f in calibration.findings):
+        lines += ["", sentence(test.text)]
     for finding in calibration.findings:
         lines += ["", f"{'Warning' if finding.level == 'warning' else 'Note'}: {sentence(finding.text)}"]
         lines += [f"  To do: {finding.advice}"] if finding.advice else []

@@ -1,0 +1,85 @@
+"""Records of a calibration: to JSON and back, in a notebook, and as data frames."""
+
+from __future__ import annotations
+
+import json
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from calibrate.networks import simulate
+from pixmetry.calibrate.bundle.solve import Options, calibrate_network
+from pixmetry.calibrate.records import (
+    AxisComponent,
+    CameraComponents,
+    FieldTest,
+    NetworkRecord,
+    Pattern,
+    Tests,
+    read_record,
+    record_of,
+)
+from pixmetry.core.errors import InputError
+from pixmetry.files.strict_json import json_text
+
+
+@pytest.fixture(scope="module")
+def calibration():
+    simulated = simulate(np.random.default_rng(1), images=8, points=30)
+    return calibrate_network(simulated.network, Options(), simulated.truth)
+
+
+def test_records_come_back_as_they_were(calibration):
+    """Whatever the tests hold: text, back, and text again; NaN is None on the way."""
+    text = json_text(record_of(calibration.tests))
+    back = read_record(Tests, json.loads(text))
+    assert json_text(record_of(back)) == text
+    assert back.network.sizes == calibration.tests.network.sizes and back.parameters == calibration.tests.parameters
+    np.testing.assert_array_equal(back.projection["camera"].u_px, calibration.tests.projection["camera"].u_px)
+
+
+def test_what_is_joined_stands_among_the_fields_of_its_owner():
+    x, y = (AxisComponent(s, 0.1, 0.2, None, float("inf"), 1.0, 50.0, True) for s in (0.03, 0.04))
+    record = record_of(CameraComponents(3, False, True, x, y))
+    assert list(record)[:5] == ["iterations", "common", "by_axis", "sigma_x_px", "u_sigma_x_px"]
+    assert (record["sigma_y_px"], record["factor_x"], record["estimated_y"]) == (0.04, 1.0, True)
+    assert read_record(CameraComponents, json.loads(json_text(record))) == CameraComponents(3, False, True, x, y)
+
+
+def test_parts_that_were_not_made_are_left_out_and_missing_ones_are_none():
+    assert record_of(Tests()) == {} and not Tests().made
+    assert record_of(FieldTest("fixed", None, "untested")) == {"verdict": "fixed", "text": "untested"}
+    assert "period_px" not in record_of(Pattern("radius", "a", 0.1, None, 0.5))
+    old = read_record(Tests, {"network": {"images": 3, "sigma0": None}, "patterns": [{"name": "radius", "p": 0.5}]})
+    assert old.network.sizes.images == 3 and np.isnan(old.network.sigma0) and isinstance(old.network, NetworkRecord)
+    assert old.patterns[0].p == 0.5 and old.patterns[0].by_image is None and old.known is None
+
+
+def test_a_calibration_says_in_one_line_what_it_is(calibration):
+    a = calibration.adjustment
+    assert repr(calibration).startswith(f"<Calibration of camera: 8 images, {a.used.sum()} image points, sigma0 ")
+    page = calibration._repr_html_()
+    assert f"<td>c</td><td>{a.camera()['c']:.8g}</td>" in page and page.count("<tr>") == a.network.cameras[0].free.sum()
+
+
+@pytest.mark.parametrize(("table", "rows"), [("parameters", 12), ("points", 30), ("poses", 8), ("residuals", None)])
+def test_tables_become_data_frames(calibration, monkeypatch, table, rows):
+    monkeypatch.setitem(sys.modules, "pandas", SimpleNamespace(DataFrame=dict))  # which holds columns as pandas does
+    frame = calibration.to_dataframe(table)
+    count = len(calibration.adjustment.network) if rows is None else rows
+    assert {len(values) for values in frame.values()} == {count}
+    if table == "parameters":
+        place = frame["parameter"].index("k1")
+        names, covariance = calibration.adjustment.interior_covariance()
+        assert frame["u"][place] == pytest.approx(np.sqrt(covariance[names.index("k1"), names.index("k1")]))
+        assert frame["estimated"].count(True) == len(names)
+
+
+def test_without_pandas_one_error_says_what_to_do(calibration, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(InputError, match="pandas is not installed"):
+        calibration.to_dataframe()
+    with pytest.raises(InputError, match="no such table"):
+        calibration.columns("distances")
