@@ -26,6 +26,7 @@ UNITS, TARGETS = 64, 40
 # Quantile of Student's t with UNITS − 1 degrees of freedom for a false failure in 1e-6 of two-sided tests is 5.4; means of squares over 40
 # targets are not quite normal, so it is rounded up. The standard deviation of a normal shift is then known to 8.5 %, beside the error
 # that the source declares: with 12 % of that, a prediction that is off by a factor of 1.25 is seen.
+OF_LIGHT = 20  # targets that do for what acts on light before it is sampled, and costs the most: 12 % in place of 8.5 %
 QUANTILE = 6.0
 # a curved response is asked on what it makes of the light, which this linear camera does not hold: tests/budget/test_in_the_chain.py
 CASES = {i: s for i, s in catalogue().items() if s.forward is not None and s.propagate is not None and s.ideal is None}
@@ -40,27 +41,29 @@ def scene() -> Targets:
     return Targets(rng.uniform(half, SHAPE[1] - 1 - half, n), rng.uniform(half, SHAPE[0] - 1 - half, n), background_dn=BACKGROUND_DN)
 
 
-def windows(unit: int) -> Grid:
-    frames = np.arange(unit * TARGETS, (unit + 1) * TARGETS)
+def windows(unit: int, count: int) -> Grid:
+    """The windows of the first targets of a unit."""
+    frames = unit * TARGETS + np.arange(count)
     targets = scene()
     row, col = (np.rint(v[frames]).astype(int) - SIZE // 2 for v in (targets.y_px, targets.x_px))
     return Grid(frames, row, col, (SIZE, SIZE))
 
 
-def exposed(camera: Camera, scene: object, unit: int, quiet: bool = False) -> np.ndarray:
+def exposed(camera: Camera, scene: object, unit: int, count: int = TARGETS, quiet: bool = False) -> np.ndarray:
     """Windows of one unit of this type of camera; a source with a memory has settled on the background, a far context is the budget's."""
     mode = "exact" if all(e.source.start is None and e.source.near is None for e in camera.active) else "frozen"
     camera = replace(camera, unit_seed=unit)
-    return camera.expose_windows(scene, windows(unit), seed=unit, mode=mode, background=Flat(BACKGROUND_DN), quiet=quiet).astype(float)
+    grid = windows(unit, count)
+    return camera.expose_windows(scene, grid, seed=unit, mode=mode, background=Flat(BACKGROUND_DN), quiet=quiet).astype(float)
 
 
-def located(camera: Camera) -> np.ndarray:
+def located(camera: Camera, count: int = TARGETS) -> np.ndarray:
     """Centres of every target of every unit in window coordinates, shape (units, targets, 2).
 
     The threshold cuts off the same light in any camera: it is put at the level to which the camera brings a uniform field.
     """
     level = float(np.median(exposed(camera, Flat(THRESHOLD_DN), 0, quiet=True)))
-    return np.stack([np.stack(soft_centroid(exposed(camera, scene(), unit), level), axis=1) for unit in range(UNITS)])
+    return np.stack([np.stack(soft_centroid(exposed(camera, scene(), unit, count), level), axis=1) for unit in range(UNITS)])
 
 
 @cache
@@ -87,7 +90,8 @@ def probed(kind: Kind) -> Probe:
 @pytest.mark.parametrize("source", CASES.values(), ids=CASES.keys())
 def test_propagate_agrees_with_monte_carlo(source: Source, which: str) -> None:
     params = getattr(source, which)
-    shifts = located(camera_with(source, params, shape=SHAPE)) - located_without(kind_of(source))
+    count = OF_LIGHT if kind_of(source) is Kind.LIGHT else TARGETS
+    shifts = located(camera_with(source, params, shape=SHAPE), count) - located_without(kind_of(source))[:, :count]
     contribution = source.propagate(params, probed(kind_of(source)))
     for axis, u, bias in ((0, contribution.u_x_px, contribution.bias_x_px), (1, contribution.u_y_px, contribution.bias_y_px)):
         of_unit = shifts[:, :, axis].mean(axis=1)
