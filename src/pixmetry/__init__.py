@@ -25,16 +25,18 @@ _HOMES = {
     "calibrate": "pixmetry.calibrate.job",
     "campaign_of_arrays": "pixmetry.files",
     "catalogue": "pixmetry.camera.catalogue",
+    "chain": "pixmetry.simulate.chain",
     "check_limits": "pixmetry.emva.judge.compare",
     "compare": "pixmetry.emva.judge.compare",
     "compare_fleet": "pixmetry.emva.judge.compare",
+    "correct": "pixmetry.assess.correct",
     "emva1288": "pixmetry.emva.job",
     "load_camera": "pixmetry.camera.camera",
     "load_campaign": "pixmetry.files",
     "locate": "pixmetry.locate.job",
     "read_calibration": "pixmetry.calibrate.files.record",
+    "read_frame": "pixmetry.files",
     "simulate": "pixmetry.simulate.job",
-    "walk": "pixmetry.simulate.walk",
 }
 
 __all__ = [
@@ -50,19 +52,22 @@ __all__ = [
     "calibrate",
     "campaign_of_arrays",
     "catalogue",
+    "chain",
     "check_limits",
     "compare",
     "compare_fleet",
+    "correct",
     "emva1288",
     "load_camera",
     "load_campaign",
     "locate",
     "read_calibration",
+    "read_frame",
     "simulate",
-    "walk",
 ]
 
 if TYPE_CHECKING:
+    from pixmetry.assess.correct import correct
     from pixmetry.assess.job import assess
     from pixmetry.calibrate.files.record import read_calibration
     from pixmetry.calibrate.job import calibrate
@@ -73,10 +78,10 @@ if TYPE_CHECKING:
     from pixmetry.core.number import Estimates, Number
     from pixmetry.emva.job import emva1288
     from pixmetry.emva.judge.compare import check_limits, compare, compare_fleet
-    from pixmetry.files import Frames, campaign_of_arrays, load_campaign
+    from pixmetry.files import Frames, campaign_of_arrays, load_campaign, read_frame
     from pixmetry.locate.job import locate
+    from pixmetry.simulate.chain import chain
     from pixmetry.simulate.job import simulate
-    from pixmetry.simulate.walk import walk
 
 
 def __getattr__(name: str) -> Any:

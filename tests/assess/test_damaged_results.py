@@ -13,7 +13,7 @@ import pytest
 import tifffile
 
 from cli.test_commands import CAMERA, DISCS, SERIES, refused, run
-from pixmetry.assess.correct import correct_files
+from pixmetry.assess.correct import correct
 from pixmetry.assess.job import assess
 from pixmetry.calibrate.calibrated_camera import calibrated_geometry
 from pixmetry.calibrate.files.record import read_calibration, stored_cameras
@@ -101,7 +101,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_damaged_assessment_gives_no_wrong_frames_and_no_wrong_values(folder: Path, tmp_path: Path) -> None:
     def corrected(result: Path) -> np.ndarray:
         shutil.rmtree(tmp_path / "corrected", ignore_errors=True)
-        correct_files([folder / "frames"], result / "results.json", tmp_path / "corrected")
+        correct([folder / "frames"], result / "results.json", tmp_path / "corrected")
         return tifffile.imread(tmp_path / "corrected" / "frame_00000.tif")
 
     def simulated(result: Path) -> np.ndarray:

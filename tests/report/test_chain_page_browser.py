@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from pixmetry.camera.camera import load_camera
+from pixmetry.simulate.chain import chain
 from pixmetry.simulate.page import write_chain_page
-from pixmetry.simulate.walk import walk
 
 pytestmark = pytest.mark.browser
 SCENE = {
@@ -28,7 +28,7 @@ def steps() -> int:
 @pytest.fixture(scope="module")
 def address(tmp_path_factory: pytest.TempPathFactory) -> str:
     camera = replace(load_camera("pulnix_tm6cn"), frame_shape=(120, 140))
-    return write_chain_page(walk(camera, SCENE, seed=2), tmp_path_factory.mktemp("chain") / "chain.html").as_uri()
+    return write_chain_page(chain(camera, SCENE, seed=2), tmp_path_factory.mktemp("chain") / "chain.html").as_uri()
 
 
 def test_no_complaint_and_no_request_but_the_file_itself(opened: Any, address: str) -> None:

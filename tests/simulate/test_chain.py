@@ -16,7 +16,7 @@ from pixmetry.camera.catalogue import get_source
 from pixmetry.camera.signal import Kind
 from pixmetry.camera.source import Parameters
 from pixmetry.core.errors import InputError
-from pixmetry.simulate.walk import walk
+from pixmetry.simulate.chain import chain
 
 SCENE = {
     "schema": "pixmetry/scene/1",
@@ -38,13 +38,13 @@ SHIFT = make_source(
 
 def camera() -> Camera:
     preset = load_camera("imx264_like")
-    chain = (Element("lens shift", SHIFT, Shift()), *preset.chain)
-    return replace(preset, frame_shape=(90, 110), chain=chain)
+    links = (Element("lens shift", SHIFT, Shift()), *preset.chain)
+    return replace(preset, frame_shape=(90, 110), chain=links)
 
 
 def test_every_step_is_the_camera_cut_short_there() -> None:
     full = camera()
-    result = walk(full, SCENE, seed=4)
+    result = chain(full, SCENE, seed=4)
     from pixmetry.scene.files import build_scene, read_scene
 
     scene = build_scene(read_scene(SCENE), full.frame_shape)
@@ -58,7 +58,7 @@ def test_every_step_is_the_camera_cut_short_there() -> None:
 
 
 def test_a_known_move_is_named_and_the_moves_add_up() -> None:
-    result = walk(camera(), SCENE, seed=4)
+    result = chain(camera(), SCENE, seed=4)
     first, shift = result.steps[:2]
     assert np.allclose(first.error, 0.0, atol=4e-3)  # what sampling and threshold do to a disc of 7 px
     assert np.allclose(shift.moved, (0.25, 0.0), atol=3e-3) and np.allclose(shift.expected_moved, (0.25, 0.0), atol=3e-3)
@@ -68,40 +68,40 @@ def test_a_known_move_is_named_and_the_moves_add_up() -> None:
 
 
 def test_the_target_can_be_chosen_and_a_wrong_one_is_refused() -> None:
-    assert walk(camera(), SCENE).target["x_px"] == pytest.approx(60.3)
-    assert walk(camera(), SCENE, target=1).target["x_px"] == pytest.approx(25.0)
+    assert chain(camera(), SCENE).target["x_px"] == pytest.approx(60.3)
+    assert chain(camera(), SCENE, target=1).target["x_px"] == pytest.approx(25.0)
     with pytest.raises(InputError, match="no such target.*0 to 1"):
-        walk(camera(), SCENE, target=2)
+        chain(camera(), SCENE, target=2)
     with pytest.raises(InputError, match="no such frame"):
-        walk(camera(), SCENE, frame=-1)
+        chain(camera(), SCENE, frame=-1)
 
 
 def test_a_target_out_of_sight_is_refused() -> None:
     scene = {"schema": "pixmetry/scene/1", "targets": [{"kind": "disc", "x_px": 5000, "y_px": 40, "diameter_px": 7}]}
     with pytest.raises(InputError, match="outside of the frame"):
-        walk(camera(), scene)
+        chain(camera(), scene)
 
 
 def test_a_later_frame_of_a_camera_with_a_memory() -> None:
     full = camera()
     agc = get_source("electronics.agc")
-    chain = (*full.chain[:-2], Element("agc", agc, agc.typical), *full.chain[-2:])
-    full = replace(full, chain=chain)
+    links = (*full.chain[:-2], Element("agc", agc, agc.typical), *full.chain[-2:])
+    full = replace(full, chain=links)
     from pixmetry.scene.files import build_scene, read_scene
 
     scene = build_scene(read_scene(SCENE), full.frame_shape)
-    step = walk(full, SCENE, frame=3, seed=1).steps[-1]
+    step = chain(full, SCENE, frame=3, seed=1).steps[-1]
     c, r = step.origin
     assert np.array_equal(step.image, full.expose(scene, [3], seed=1, window=(r, c, *step.image.shape)).data[0].astype(float))
 
 
 def test_dark_and_missing_targets() -> None:
     dark = SCENE | {"uniform": {"level_photons": 9000}, "discs": SCENE["discs"] | {"peak_photons": -8000}}
-    assert np.hypot(*walk(camera(), dark).steps[1].moved) == pytest.approx(0.25, abs=5e-3)
-    nothing = walk(camera(), {"schema": "pixmetry/scene/1", "uniform": {"level_photons": 500}})
+    assert np.hypot(*chain(camera(), dark).steps[1].moved) == pytest.approx(0.25, abs=5e-3)
+    nothing = chain(camera(), {"schema": "pixmetry/scene/1", "uniform": {"level_photons": 500}})
     assert all(s.error is None for s in nothing.steps) and nothing.movers() == []
     faint = SCENE | {"discs": SCENE["discs"] | {"peak_photons": 2.0}}
-    assert walk(camera(), faint).steps[-1].error is None
+    assert chain(camera(), faint).steps[-1].error is None
 
 
 def test_the_command_writes_a_page_and_replaces_only_its_own(tmp_path: Path) -> None:

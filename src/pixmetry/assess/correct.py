@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -77,42 +77,111 @@ def _rest_of_line(camera: Camera, name: str, done: Mapping[str, str], signal: Si
     return None
 
 
-def correct_files(
-    frames: Sequence[str | Path],
-    results: str | Path,
-    output: str | Path,
-    *,
-    raw: str | RawLayout | None = None,
-    progress: Progress | None = None,
-) -> list[str]:
-    """Correct image files with the results of an assessment.
+@dataclass(frozen=True)
+class Correction:
+    """What a correction did.
 
     Parameters
     ----------
-    frames : sequence of path
-        Image files, folders of them, stores (``frames.zarr``) or single frames of a store (``frames.zarr/7``). The frames of a file with
-        several are written one by one: ``stack.tif`` becomes ``stack_0.tif``, ``stack_1.tif`` …
+    sources : mapping of str
+        By error source: what was done, or why nothing was.
+    frames : ndarray, shape (n, rows, cols), float32, or None
+        The corrected frames, DN above black; None where they were written to files.
+    output : Path, optional
+        Their folder.
+    """
+
+    sources: Mapping[str, str]
+    frames: np.ndarray | None = None
+    output: Path | None = None
+
+    def __repr__(self) -> str:
+        done = [name for name, text in self.sources.items() if text.startswith("corrected")]
+        return f"<Correction of {', '.join(done) or 'nothing'}; {len(self.sources) - len(done)} sources left as they are>"
+
+
+def correct(
+    frames: np.ndarray | str | Path | Sequence[str | Path],
+    results: str | Path,
+    output: str | Path | None = None,
+    *,
+    raw: str | RawLayout | None = None,
+    progress: Progress | None = None,
+) -> Correction:
+    """Correct frames with the results of an assessment of their camera.
+
+    Parameters
+    ----------
+    frames : ndarray, shape (rows, cols) or (n, rows, cols), or path or sequence of path
+        Stored codes; or image files, folders of them, stores (``frames.zarr``) or single frames of a store (``frames.zarr/7``). The frames
+        of a file with several are written one by one: ``stack.tif`` becomes ``stack_0.tif``, ``stack_1.tif`` …
     results : path
-        ``results.json`` of the assessment; ``camera.yaml`` and ``maps.zarr.zip`` stand beside it.
-    output : path
-        Folder for the corrected frames, under their own names as TIFF of 32-bit floats in DN above black (rounding them again would add
-        noise, and clipping at black would cut it in half); ``correction.json`` says what was done.
+        ``results.json`` of the assessment, or its folder; ``camera.yaml`` and ``maps.zarr.zip`` stand beside it.
+    output : path, optional
+        Folder for the corrected frames of files, under their own names as TIFF of 32-bit floats in DN above black (rounding them again
+        would add noise, and clipping at black would cut it in half); ``correction.json`` says what was done. Needed for files, and for
+        files only.
     raw : str or RawLayout, optional
         Of files without a header: ``"1920x1200:Mono12p"``.
+    progress : callable, optional
+        Called with (what, done, of).
 
     Returns
     -------
-    list of str
-        One line a source: what was done.
+    Correction
 
     Raises
     ------
     InputError
-        If a file cannot be read, has not the size and depth of this camera's frames, or two frames have one name.
+        If a file cannot be read, a frame has not the size and depth of this camera's frames, or two frames have one name.
+
+    Examples
+    --------
+    >>> import tempfile, numpy as np, pixmetry
+    >>> folder = tempfile.mkdtemp() + "/result"
+    >>> assessment = pixmetry.assess(output=folder, trials=0)  # of the packaged example
+    >>> frame = np.full((60, 60), 200, np.uint16)
+    >>> correction = correct(frame, folder)
+    >>> correction.frames.shape, correction.frames.dtype
+    ((1, 60, 60), dtype('float32'))
     """
+    if isinstance(frames, np.ndarray):
+        if output is not None:
+            remedy = "leave output away, or name files"
+            raise InputError("a folder for corrected frames goes with files, not with arrays", where="output", value=output, remedy=remedy)
+        return _correct_array(frames, *_load(Path(results)))
+    if output is None:
+        remedy = "name one, or give the frames as an array"
+        raise InputError("the folder for the corrected frames is missing", where="output", remedy=remedy)
+    return _correct_files([frames] if isinstance(frames, str | Path) else frames, Path(results), Path(output), raw, progress)
+
+
+def _correct_array(frames: np.ndarray, bits: int, camera: Camera, maps: Mapping[str, np.ndarray]) -> Correction:
+    stack = frames[None] if frames.ndim == 2 else frames
+    if stack.ndim != 3 or stack.dtype.kind not in "ui":
+        allowed = "whole numbers of shape (rows, cols) or (n, rows, cols)"
+        raise InputError("no frames of stored codes", where="frames", value=f"{frames.dtype} of shape {frames.shape}", allowed=allowed)
+    top = 2**bits - 1
+    if stack.size and (int(stack.min()) < 0 or int(stack.max()) > top):
+        raise InputError("values that this camera does not store", where="frames", value=int(stack.max()), allowed=f"0 to {top}")
+    stack = stack.astype(np.uint8 if bits <= 8 else np.uint16)
+    done: dict[str, list[str]] = {}
+    out = np.empty(stack.shape, np.float32)
+    for i, frame in enumerate(stack):
+        check_frame(frame, f"frames[{i}]", bits=bits, shape=camera.output_shape)
+        corrected, said = correct_signal(camera, _as_signal(frame, camera), maps)
+        out[i] = corrected.data[0]
+        for name, text in said.items():
+            done.setdefault(name, []).append(text)
+    return Correction({name: _together(texts) for name, texts in done.items()}, out)
+
+
+def _correct_files(
+    frames: Sequence[str | Path], results: Path, output: Path, raw: str | RawLayout | None, progress: Progress | None
+) -> Correction:
     from tifffile import imwrite
 
-    bits, camera, maps = _load(Path(results))
+    bits, camera, maps = _load(results)
     layout = parse_raw(raw) if isinstance(raw, str) else raw
     files = _named_once(picture_files(frames, raw=layout))
     hashes = InputHashes(files[0].parent)
@@ -126,7 +195,7 @@ def correct_files(
         corrected, said = correct_signal(camera, _as_signal(frame, camera), maps)
         return path, loaded, corrected.data[0], said
 
-    of = [Path(results), *dict.fromkeys(path if path.is_dir() else path.parent for path in map(Path, frames))]
+    of = [results, *dict.fromkeys(path if path.is_dir() else path.parent for path in map(Path, frames))]
     with staged_output(output, "correction", of, [*files, results]) as folder:
         for i, (path, loaded, data, said) in enumerate(imap_tiles(work, files)):
             for name, text in said.items():
@@ -135,12 +204,11 @@ def correct_files(
             imwrite(folder / f"{_stem(path)}.tif", data.astype(np.float32))
             told("correcting frames", i + 1, len(files))
         told_of = {name: _together(texts) for name, texts in done.items()}
-        lines = [f"{name}: {text}" for name, text in told_of.items()]
         write_json(
             folder / "correction.json",
             {"schema": "pixmetry/correction/1", "unit": "DN above black", "sources": told_of, "provenance": provenance_record(hashes)},
         )
-    return lines
+    return Correction(told_of, output=output)
 
 
 def _together(texts: Sequence[str]) -> str:

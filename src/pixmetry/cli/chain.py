@@ -44,9 +44,9 @@ def chain(
     from pixmetry.camera.camera import load_camera
     from pixmetry.camera.overrides import changed_camera, parse_overrides
     from pixmetry.files.staged_files import Output, check_files, page_mark
+    from pixmetry.simulate.chain import chain as follow
     from pixmetry.simulate.page import TITLE, write_chain_page
-    from pixmetry.simulate.walk import walk
 
     check_files([Output(output, page_mark(TITLE))], [scene, Path(camera)])  # before the work
     changed = changed_camera(load_camera(camera), parse_overrides(settings), off)
-    echo(f"page: {write_chain_page(walk(changed, scene, target=target, frame=frame, seed=seed), output)}")
+    echo(f"page: {write_chain_page(follow(changed, scene, target=target, frame=frame, seed=seed), output)}")

@@ -22,13 +22,13 @@ def correct(frames: tuple[Path, ...], results: Path, output: Path, raw: str | No
     corrected in this order, as far as the assessment measured them. The command lists what could not be corrected, with the reason. The
     corrected frames are TIFF files of 32-bit floats in DN above black.
     """
-    from pixmetry.assess.correct import correct_files
+    from pixmetry.assess.correct import correct as run
     from pixmetry.cli._progress import shown_progress
     from pixmetry.core.threads import set_threads
 
     set_threads(threads)
     with shown_progress() as progress:
-        summary = correct_files(frames, results, output, raw=raw, progress=progress)
-    for line in summary:
-        echo(line)
+        correction = run(frames, results, output, raw=raw, progress=progress)
+    for name, text in correction.sources.items():
+        echo(f"{name}: {text}")
     echo(f"corrected frames: {output}")

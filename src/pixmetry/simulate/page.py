@@ -13,7 +13,7 @@ from pixmetry.report.drawing import BLUE, INK, RED, SOFT, canvas
 from pixmetry.report.numbers import NONE, length_px, significant
 
 if TYPE_CHECKING:
-    from pixmetry.simulate.walk import Step, Walk
+    from pixmetry.simulate.chain import Step, Walk
 
 SHOWN = 5  # movers in the summary
 KIND = "one target through the chain"
@@ -39,7 +39,7 @@ def page_of(walk: Walk) -> Page:
     Parameters
     ----------
     walk : Walk
-        As `walk` gives it.
+        As `pixmetry.chain` gives it.
 
     Returns
     -------

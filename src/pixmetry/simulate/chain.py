@@ -72,7 +72,7 @@ class Walk:
         return sorted(moved, key=lambda s: -np.hypot(*s.moved))
 
 
-def walk(camera: str | Path | Camera, scene: Any, *, target: int | None = None, frame: int = 0, seed: int = 0) -> Walk:
+def chain(camera: str | Path | Camera, scene: Any, *, target: int | None = None, frame: int = 0, seed: int = 0) -> Walk:
     """Follow one target through a camera.
 
     Parameters
@@ -94,6 +94,14 @@ def walk(camera: str | Path | Camera, scene: Any, *, target: int | None = None, 
     ------
     InputError
         If the camera, the scene or the target cannot be used.
+
+    Examples
+    --------
+    >>> discs = {"x_px": [100.3], "y_px": [80.6], "diameter_px": 7, "blur_px": 0.7, "peak_photons": 9000}
+    >>> scene = {"schema": "pixmetry/scene/1", "discs": discs}
+    >>> walk = chain("imx264_like", scene, seed=3)
+    >>> walk.steps[0].name, len(walk.steps) > 5
+    ('scene', True)
     """
     camera = camera if isinstance(camera, Camera) else load_camera(camera)
     if frame < 0:
