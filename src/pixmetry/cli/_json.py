@@ -13,7 +13,9 @@ import click
 def json_option(what: str) -> Callable[[Any], Any]:
     """The option ``--json FILE`` of a command, as its parameter ``json_file``; ``what`` says in words what is written."""
     kind = click.Path(path_type=Path, allow_dash=True)
-    return click.option("--json", "json_file", type=kind, metavar="FILE", help=f"Write {what} as JSON; - prints it alone.")
+    return click.option(
+        "--json", "json_file", type=kind, metavar="FILE", help=f"Write {what} as JSON into this file. With - only the JSON is printed."
+    )
 
 
 class JsonResult:

@@ -51,23 +51,22 @@ Pitch = tuple[float, float] | None
 def verdict_section(budget: Budget) -> Section:
     """The answer: an interval, the standard uncertainty behind it, what a calibration leaves, and what more frames would give."""
     pitch, one, every = budget.pitch_um, budget.verdict, budget.with_accepted[0]
-    section = Section("What a coordinate is worth", name="verdict")
+    section = Section("Uncertainty of a coordinate", name="verdict")
     parts: list[Text | Sequence[Reading]] = []
     if budget.interval is not None:
-        words = (
-            f"With a coverage of {100 * budget.interval.coverage:g} %, a position of one target in one frame lies this near its true place:"
-        )
+        coverage = f"{100 * budget.interval.coverage:g} %"
+        words = f"With a coverage of {coverage}, the position of one target in one frame is this near to its true position:"
         parts += [Text(words), _readings(budget.interval.half_px, pitch, "± ")]
     parts += [
-        Text("One target in one frame, standard uncertainty (k = 1), everything that was measured or modelled, as the camera is:"),
+        Text("One target in one frame, standard uncertainty (k = 1), everything that was measured or modelled, without calibration:"),
         _readings((one.total_x_px, one.total_y_px), pitch),
-        Text("and once a calibration has taken up what is constant or smooth over the frame:"),
+        Text("and after a calibration, which takes up what is constant or smooth over the frame:"),
         _readings((one.left_x_px, one.left_y_px), pitch),
         *([Text(budget.headline.why)] if budget.headline is not None and budget.headline.why else []),
         Text(_shares(budget.largest)),
         Text(_with_accepted(budget, every), "second"),
     ]
-    places = f"Averaged over {(n := phases_for(budget.estimator))} × {n} places of the target within a pixel."
+    places = f"Averaged over {(n := phases_for(budget.estimator))} × {n} sub-pixel positions of the target."
     target, estimator = budget.target.describe(), budget.estimator.describe()
     section.add(Answer(parts))
     section.add_text(strong("Target:"), f" {target}. ", strong("Estimator:"), f" {estimator}. {places}")

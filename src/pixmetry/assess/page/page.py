@@ -56,7 +56,7 @@ def page_of(assessment: Assessment) -> Page:
     from pixmetry.assess.page import budget_view
 
     budget, name = assessment.budget, assessment.campaign.camera.name
-    page = Page(name, "what its image coordinates are worth", "pixmetry camera assessment", _facts(assessment), FOOTER)
+    page = Page(name, "uncertainty of its image coordinates", "pixmetry camera assessment", _facts(assessment), FOOTER)
     page.sections += [
         budget_view.verdict_section(budget),
         budget_view.largest_section(budget),
