@@ -243,7 +243,7 @@ def test_thumbnail_is_the_mean_over_blocks() -> None:
 
 
 def test_importing_the_page_is_cheap_and_knows_nothing_of_the_job() -> None:
-    heavy = ("matplotlib", "jinja2", "scipy", "numba", "pydantic", "pixmetry.assess.job", "pixmetry.assess.results")
+    heavy = ("matplotlib", "scipy", "numba", "pydantic", "pixmetry.assess.job", "pixmetry.assess.results")
     code = f"import sys, pixmetry.assess.page.page; print([m for m in {heavy} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
