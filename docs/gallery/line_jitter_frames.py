@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pixmetry.calibrate.bundle.model import Sensor
-from pixmetry.camera.camera import Camera, Element
-from pixmetry.camera.camera_files import load_camera
+from pixmetry.camera.camera import Camera, Element, load_camera
 from pixmetry.camera.light import Points
 from pixmetry.core.random import Grid, generator
 from pixmetry.locate.camera_noise import camera_noise

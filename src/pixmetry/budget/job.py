@@ -76,6 +76,20 @@ def compute_budget(
     Returns
     -------
     Budget
+
+    Examples
+    --------
+    >>> from dataclasses import replace
+    >>> from pixmetry.budget import compute_budget
+    >>> from pixmetry.camera.camera import load_camera
+    >>> camera = replace(load_camera("dcs420_like"), frame_shape=(96, 128))
+    >>> budget = compute_budget(camera, trials=0)
+    >>> budget.rows[0].counts, budget.headline.by
+    (True, 'sum')
+    >>> bool(budget.interval.half_px[0] > budget.verdict.total_x_px > 0)
+    True
+    >>> round(sum(stage.share for stage in budget.stages), 6)
+    1.0
     """
     target, estimator = target or Target(), estimator or TargetEstimator()
     estimates = dict(estimates_by_source or {})

@@ -11,20 +11,21 @@ from typing import Any
 import numpy as np
 
 from pixmetry.camera.bands import cut_bands, find_segment, stitch
-from pixmetry.camera.camera_files import build_camera, load_camera, to_record
 from pixmetry.camera.chain_order import Element, check_chain, in_order
 from pixmetry.camera.conversions import LOOK, SAMPLE, Link, linked, look
-from pixmetry.camera.frozen import Frozen, freeze
+from pixmetry.camera.frozen import Frozen, one_value, settled_state
 from pixmetry.camera.light import Light, Scene
 from pixmetry.camera.quiet import QuietStreams
 from pixmetry.camera.signal import Clock, Kind, Signal, Windows
 from pixmetry.camera.source import run
-from pixmetry.camera.unit_maps import MeasuredUnit, check_frame, check_maps, maps_file, write_unit_maps
+from pixmetry.camera.unit_maps import MeasuredUnit, check_frame, check_maps, listing, maps_file, read_unit_maps, write_unit_maps
+from pixmetry.core.checksums import check_file
 from pixmetry.core.errors import ChainError, InputError
 from pixmetry.core.memory import check_memory
 from pixmetry.core.random import Grid, Streams
 from pixmetry.core.threads import imap_tiles, map_tiles
 
+SCHEMA = "pixmetry/camera/1"
 BATCH_PIXELS = 1 << 18  # of the small windows that are run as one batch: enough that the calls cost little beside the work
 
 
@@ -59,6 +60,18 @@ class Camera:
     ------
     ChainError
         If names repeat, kinds do not fit, or a declared order is broken.
+
+    Examples
+    --------
+    >>> from pixmetry.camera.camera import load_camera
+    >>> from pixmetry.scene.uniform import Uniform
+    >>> camera = load_camera("imx264_like").with_parameters("sensor.prnu", pixel_std_rel=0.02)
+    >>> frames = camera.expose(Uniform(2000.0), frames=2, seed=1, window=(100, 200, 32, 48))
+    >>> frames.data.shape, frames.data.dtype.name
+    ((2, 32, 48), 'uint16')
+    >>> quiet = camera.switched(off=["sensor.prnu"]).expose(Uniform(2000.0), window=(100, 200, 32, 48), quiet=True)
+    >>> bool(quiet.data.std() < frames.data.std())
+    True
     """
 
     name: str
@@ -288,7 +301,7 @@ class Camera:
         last_row, last_col = grid.row0 + grid.shape[0], grid.col0 + grid.shape[1]
         if min(grid.shape) < 1 or (grid.row0 < 0).any() or (grid.col0 < 0).any() or (last_row > rows).any() or (last_col > cols).any():
             raise InputError("a window does not lie in the frame", value=grid.shape, allowed=f"within {rows} rows and {cols} columns")
-        frozen = freeze(self, background, schedule) if mode == "frozen" else None
+        frozen = self._freeze(background, schedule) if mode == "frozen" else None
         if frozen is None and any(e.remembers for e in self.links):
             raise InputError("a source with a memory cannot be run on single windows exactly", remedy="use iter_frames, or mode='frozen'")
         task = _Task(scene, self.streams(seed, quiet), schedule, threads, frozen)
@@ -307,6 +320,28 @@ class Camera:
     def frozen_tail(self) -> float:
         """Largest share of a pixel's signal that the mode ``frozen`` takes from the noise-free frame, over all sources."""
         return float(sum(e.source.tail(e.params) for e in self.links if e.far))
+
+    def _freeze(self, background: Scene | None, schedule: Mapping[str, Any]) -> Frozen:
+        """Run the noise-free background frame once and keep what sources with a far context need of it."""
+        far = [e.name for e in self.links if e.far or e.remembers]
+        if not far:
+            return Frozen({}, self.streams(0, quiet=True))
+        if background is None:
+            raise InputError("the mode 'frozen' needs the background scene", value=", ".join(far), remedy="give it as background=")
+        streams = self.streams(0, quiet=True)
+        rows, cols = self.frame_shape
+        grid = Grid.whole([0], (rows, cols))
+        signal = self.signal(background, grid, **{name: one_value(name, value) for name, value in schedule.items()})
+        kept: dict[str, tuple[Signal, Signal, Any]] = {}
+        for element in self.links:
+            stream = streams.of(element.name)
+            before, state = signal, None
+            if element.remembers:
+                state = settled_state(element, signal, stream)
+            signal, _ = run(element.source, element.params, signal, stream, state)
+            if element.name in far:
+                kept[element.name] = (before, signal, state)
+        return Frozen(kept, streams)
 
     # ---- the walk -------------------------------------------------------------------------------------------------------------
 
@@ -434,7 +469,23 @@ class Camera:
 
     def to_record(self) -> dict[str, Any]:
         """Return the plain record that `load_camera` reads."""
-        return to_record(self)
+        record: dict[str, Any] = {"schema": SCHEMA, "name": self.name, "rows": self.frame_shape[0], "cols": self.frame_shape[1]}
+        if self.pitch_um is not None:
+            record |= {"pitch_x_um": self.pitch_um[0], "pitch_y_um": self.pitch_um[1]}
+        record |= {"exposure_s": self.exposure_s, "temperature_c": self.temperature_c, "unit_seed": self.unit_seed}
+        optional = ("warm_up_k", "warm_up_s", "pixel_clock_hz", "line_period_s")
+        record |= {n: getattr(self, n) for n in optional if getattr(self, n) != type(self).__dataclass_fields__[n].default}
+        if self.measured is not None and any(e.maps for e in self.chain):
+            rows, cols = self.measured.frame_shape
+            record["measured"] = {"unit_seed": self.measured.unit_seed, "rows": rows, "cols": cols}
+        record["facts"] = dict(self.facts)
+        record["chain"] = [
+            {"source": e.source.id, **({"name": e.name} if e.name != e.source.id else {}), **({} if e.on else {"enabled": False})}
+            | {"parameters": e.params.model_dump(mode="json")}
+            | ({"maps": listing(e.maps)} if e.maps else {})
+            for e in self.chain
+        ]
+        return record
 
     def save(self, path: str | Path) -> None:
         """Write the camera as a preset (YAML); what was measured in its unit goes into an archive beside it (``camera.maps.npz``)."""
@@ -524,6 +575,87 @@ def _concatenate(parts: list[Signal]) -> Signal:
 
 
 _ARRAYS = ("data", "exposure_s", "time_s", "temperature_c")  # of a signal, one entry per window
+
+
+# ---- camera files ------------------------------------------------------------------------------------------------------------------
+
+
+def pitch_values(pitch_um: tuple[float, float] | None) -> dict[str, float]:
+    """What sources that know the pixel pitch take from their camera, by the names of their parameters."""
+    return {} if pitch_um is None else {"pitch_x_um": pitch_um[0], "pitch_y_um": pitch_um[1], "pitch_um": pitch_um[0]}
+
+
+def clock_values(record: Any) -> dict[str, float]:
+    """What sources that know the read-out's clock take from their camera, where its file states one."""
+    told = record.model_fields_set
+    values = {"line_time_us": 1e6 * record.line_period_s} if "line_period_s" in told else {}
+    return values | ({"pixel_time_ns": 1e9 / record.pixel_clock_hz} if "pixel_clock_hz" in told else {})
+
+
+def build_camera(record: Mapping[str, Any], where: str = "camera", folder: str | Path | None = None) -> Camera:
+    """Build a camera from its plain record.
+
+    Parameters
+    ----------
+    record : mapping
+    where : str
+        For messages.
+    folder : path, optional
+        Where the archive of what was measured in its unit stands, for a record that names one.
+
+    Raises
+    ------
+    InputError, ChainError
+        With the place in the record that cannot be used.
+    """
+    from pixmetry.camera.camera_schema import CameraRecord
+    from pixmetry.camera.catalogue import get_source
+    from pixmetry.core.config import validate
+
+    checked = validate(CameraRecord, record, where)
+    elements = []
+    pitch = None if checked.pitch_x_um is None else (checked.pitch_x_um, checked.pitch_y_um or checked.pitch_x_um)
+    known = pitch_values(pitch) | clock_values(checked)  # unless a source says otherwise
+    for i, entry in enumerate(checked.chain):
+        source = get_source(entry.source, f"{where}, chain[{i}]")
+        own = {name: value for name, value in known.items() if name in source.parameters.model_fields}
+        params = source.make(own | entry.parameters, where=f"{where}, chain[{i}] {entry.source}")
+        elements.append(Element(entry.name or entry.source, source, params, entry.enabled))
+    wanted = {element.name: entry.maps for element, entry in zip(elements, checked.chain, strict=True) if entry.maps}
+    measured = None
+    if wanted:
+        if checked.measured is None:
+            raise InputError("maps of no unit", where=where, remedy="write `measured:` with unit_seed, rows and cols, or delete `maps:`")
+        if folder is None or checked.measured.file is None:
+            raise InputError("the measured maps of this camera are not given", where=where, remedy="load the camera from its file")
+        measured = MeasuredUnit(checked.measured.unit_seed, (checked.measured.rows, checked.measured.cols))
+        found = read_unit_maps(Path(folder) / checked.measured.file, wanted)
+        elements = [replace(e, maps=found.get(e.name, {})) for e in elements]
+    same = ("exposure_s", "temperature_c", "unit_seed", "facts", "warm_up_k", "warm_up_s", "pixel_clock_hz", "line_period_s")
+    settings = {name: getattr(checked, name) for name in same}
+    return Camera(checked.name, (checked.rows, checked.cols), tuple(elements), pitch, measured=measured, **settings)
+
+
+def load_camera(path: str | Path) -> Camera:
+    """Read a camera from its YAML file, or one of the presets by its name.
+
+    Raises
+    ------
+    InputError, ChainError
+        If there is no such file or preset, it cannot be used, or a result stands beside it that was written with another one.
+    """
+    from importlib.resources import files
+
+    from pixmetry.core.config import load_yaml
+
+    presets = {p.name.removesuffix(".yaml"): p for p in (files("pixmetry.camera") / "presets").iterdir() if p.name.endswith(".yaml")}
+    if str(path) in presets:
+        path = Path(str(presets[str(path)]))
+    elif not Path(path).is_file():
+        raise InputError("no such camera file or preset", value=str(path), allowed=f"a YAML file, or one of {', '.join(sorted(presets))}")
+    else:
+        check_file(path)
+    return build_camera(load_yaml(path), str(path), Path(path).parent)
 
 
 __all__ = ["Camera", "Element", "Scene", "build_camera", "check_chain", "in_order", "load_camera"]

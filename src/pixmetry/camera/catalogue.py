@@ -20,7 +20,15 @@ ENTRY_POINTS = "pixmetry.sources"
 
 @cache
 def catalogue() -> dict[str, Source]:
-    """All sources by id, in the order in which the light meets their stages."""
+    """All sources by id, in the order in which the light meets their stages.
+
+    Examples
+    --------
+    >>> from pixmetry.camera.catalogue import catalogue
+    >>> source = catalogue()["sensor.prnu"]
+    >>> source.title, source.stage, source.units["pixel_std_rel"]
+    ('Photo response non-uniformity', 'sensor', '1')
+    """
     found: dict[str, Source] = {}
     for stage in STAGES:
         package = importlib.import_module(f"pixmetry.sources.{stage}")

@@ -13,12 +13,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from itertools import product
+from typing import Any
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from pixmetry.camera.line import Held
+from pixmetry.camera.line import Held
 
 CLASSES = ("T", "Tr", "F", "G", "D", "O")
 
@@ -103,8 +103,6 @@ def smooth_part(values: np.ndarray, *places: np.ndarray, order: int = SMOOTH_ORD
 
     ``places`` are coordinates, one array for each axis, of the values' shape; with fewer different ones along an axis the order is lower.
     """
-    from itertools import product
-
     flat = [np.ravel(p).astype(float) for p in places]
     scaled = [(p - p.mean()) / (np.ptp(p) or 1.0) for p in flat]
     powers = [range(min(order, len(np.unique(p)) - 1) + 1) for p in flat]

@@ -4,20 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from pixmetry.camera._camera_kernels import cut_windows
 from pixmetry.camera.conversions import Link
-from pixmetry.camera.light import Scene
 from pixmetry.camera.signal import Signal
 from pixmetry.camera.source import run
 from pixmetry.core.errors import InputError
 from pixmetry.core.random import Grid, Streams
-
-if TYPE_CHECKING:
-    from pixmetry.camera.camera import Camera
 
 
 @dataclass(frozen=True)
@@ -58,7 +54,7 @@ def _cut(frame: Signal, like: Signal) -> Signal:
     )
 
 
-def _settled(element: Link, signal: Signal, stream: Any, most: int = 400) -> Any:
+def settled_state(element: Link, signal: Signal, stream: Any, most: int = 400) -> Any:
     """Run a source with a memory over the same frame until its state no longer changes."""
     source: Any = element.source
     state = source.start(element.params)
@@ -75,30 +71,7 @@ def _settled(element: Link, signal: Signal, stream: Any, most: int = 400) -> Any
     raise InputError(f"{element.name} does not settle on the background", remedy="check its parameters, or use mode='exact'")
 
 
-def freeze(camera: Camera, background: Scene | None, schedule: Mapping[str, Any]) -> Frozen:
-    """Run the noise-free background frame once and keep what sources with a far context need of it."""
-    far = [e.name for e in camera.links if e.far or e.remembers]
-    if not far:
-        return Frozen({}, camera.streams(0, quiet=True))
-    if background is None:
-        raise InputError("the mode 'frozen' needs the background scene", value=", ".join(far), remedy="give it as background=")
-    streams = camera.streams(0, quiet=True)
-    rows, cols = camera.frame_shape
-    grid = Grid.whole([0], (rows, cols))
-    signal = camera.signal(background, grid, **{name: _one(name, value) for name, value in schedule.items()})
-    kept: dict[str, tuple[Signal, Signal, Any]] = {}
-    for element in camera.links:
-        stream = streams.of(element.name)
-        before, state = signal, None
-        if element.remembers:
-            state = _settled(element, signal, stream)
-        signal, _ = run(element.source, element.params, signal, stream, state)
-        if element.name in far:
-            kept[element.name] = (before, signal, state)
-    return Frozen(kept, streams)
-
-
-def _one(name: str, value: Any) -> Any:
+def one_value(name: str, value: Any) -> Any:
     """The value of the schedule that all windows have."""
     if np.size(value) > 1 and len(np.unique(value)) > 1:
         raise InputError("the mode 'frozen' has one schedule for all windows", value=name, remedy="expose them group by group")

@@ -7,8 +7,7 @@ from dataclasses import fields, replace
 from difflib import get_close_matches
 from typing import Any
 
-from pixmetry.camera.camera import Camera
-from pixmetry.camera.camera_files import pitch_values
+from pixmetry.camera.camera import Camera, pitch_values
 from pixmetry.camera.catalogue import catalogue
 from pixmetry.core.errors import InputError
 

@@ -8,7 +8,8 @@ from typing import Literal
 import numpy as np
 
 from pixmetry.camera.contribution import Contribution, Probe
-from pixmetry.camera.line import SMALLEST_ECHO, through_line
+from pixmetry.camera.line import SMALLEST_ECHO
+from pixmetry.camera.line_contribution import through_line
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
 from pixmetry.core.random import Stream

@@ -8,7 +8,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from pixmetry.camera.contribution import Contribution, Probe
-from pixmetry.camera.line import SMALLEST_ECHO, Line, through_line
+from pixmetry.camera.line import SMALLEST_ECHO, Line
+from pixmetry.camera.line_contribution import through_line
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
 from pixmetry.core.random import Stream

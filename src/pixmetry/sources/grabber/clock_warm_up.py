@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from pixmetry.camera.contribution import Contribution, Probe
-from pixmetry.camera.line import held_of
+from pixmetry.camera.line_contribution import held_of
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
 from pixmetry.core.random import Stream

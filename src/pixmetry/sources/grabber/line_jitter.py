@@ -7,7 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from pixmetry.camera.contribution import Contribution, Probe, smooth_part
-from pixmetry.camera.line import alike_rows, from_row_delays, from_steady_delays
+from pixmetry.camera.line import alike_rows
+from pixmetry.camera.line_contribution import from_row_delays, from_steady_delays
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
 from pixmetry.core.random import Grid, Stream

@@ -8,7 +8,8 @@ from typing import Literal
 import numpy as np
 
 from pixmetry.camera.contribution import Contribution, Probe
-from pixmetry.camera.line import group_delay_s, reach_px, through_line
+from pixmetry.camera.line import group_delay_s, reach_px
+from pixmetry.camera.line_contribution import through_line
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
 from pixmetry.core.random import Stream

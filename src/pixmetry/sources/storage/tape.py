@@ -9,7 +9,8 @@ from functools import lru_cache
 import numpy as np
 
 from pixmetry.camera.contribution import Contribution, Probe, smooth_part
-from pixmetry.camera.line import Line, alike_rows, from_row_delays, from_steady_delays, group_delay_s, held_of, reach_px, through_line
+from pixmetry.camera.line import Line, alike_rows, group_delay_s, reach_px
+from pixmetry.camera.line_contribution import from_row_delays, from_steady_delays, held_of, through_line
 from pixmetry.camera.signal import Kind, Signal, Windows
 from pixmetry.camera.source import Parameters, Source, quantity
 from pixmetry.core.random import Grid, Stream
