@@ -26,9 +26,9 @@ _HOMES = {
     "campaign_of_arrays": "pixmetry.files",
     "catalogue": "pixmetry.camera.catalogue",
     "chain": "pixmetry.simulate.chain",
-    "check_limits": "pixmetry.emva.judge.compare",
-    "compare": "pixmetry.emva.judge.compare",
-    "compare_fleet": "pixmetry.emva.judge.compare",
+    "check_limits": "pixmetry.assess.judge.compare",
+    "compare": "pixmetry.assess.judge.compare",
+    "compare_fleet": "pixmetry.assess.judge.compare",
     "correct": "pixmetry.assess.correct",
     "emva1288": "pixmetry.emva.job",
     "load_camera": "pixmetry.camera.camera",
@@ -69,6 +69,7 @@ __all__ = [
 if TYPE_CHECKING:
     from pixmetry.assess.correct import correct
     from pixmetry.assess.job import assess
+    from pixmetry.assess.judge.compare import check_limits, compare, compare_fleet
     from pixmetry.calibrate.files.record import read_calibration
     from pixmetry.calibrate.job import calibrate
     from pixmetry.camera.camera import Camera, load_camera
@@ -77,7 +78,6 @@ if TYPE_CHECKING:
     from pixmetry.core.errors import PixmetryError
     from pixmetry.core.number import Estimates, Number
     from pixmetry.emva.job import emva1288
-    from pixmetry.emva.judge.compare import check_limits, compare, compare_fleet
     from pixmetry.files import Frames, campaign_of_arrays, load_campaign, read_frame
     from pixmetry.locate.job import locate
     from pixmetry.simulate.chain import chain

@@ -15,12 +15,12 @@ import tifffile
 from cli.test_commands import CAMERA, DISCS, SERIES, refused, run
 from pixmetry.assess.correct import correct
 from pixmetry.assess.job import assess
+from pixmetry.assess.judge.subjects import load_subject
 from pixmetry.calibrate.calibrated_camera import calibrated_geometry
 from pixmetry.calibrate.files.record import read_calibration, stored_cameras
 from pixmetry.calibrate.job import calibrate
 from pixmetry.core.errors import PixmetryError
 from pixmetry.emva.job import emva1288
-from pixmetry.emva.judge.compare import load
 from pixmetry.files import read_frame, read_maps, write_maps, zarr_frames
 from pixmetry.simulate.job import simulate
 
@@ -110,7 +110,7 @@ def test_a_damaged_assessment_gives_no_wrong_frames_and_no_wrong_values(folder: 
         return read_frame(tmp_path / "simulated" / "frame_00000.tif")
 
     def compared(result: Path) -> np.ndarray:
-        return np.array([[value.value, value.u, value.dof] for value in load(result, "result").values.values()])
+        return np.array([[value.value, value.u, value.dof] for value in load_subject(result, "result").values.values()])
 
     names = ["results.json", "camera.yaml", "maps.zarr.zip", ".pixmetry-output.json"]
     names += [path.name for path in (folder / "result").glob("*.npz")]
@@ -160,7 +160,7 @@ def test_a_damaged_data_sheet_is_not_compared(tmp_path: Path) -> None:
     emva1288(json=tmp_path / "sheet" / "sheet.json", bootstrap=0)
 
     def read(folder: Path) -> np.ndarray:
-        return np.array([[value.value, value.u] for value in load(folder / "sheet.json").values.values()])
+        return np.array([[value.value, value.u] for value in load_subject(folder / "sheet.json").values.values()])
 
     check(tmp_path / "sheet", ["sheet.json"], {"read": read}, tmp_path, {"read": 2 + 2 * PLACES - 2})
 

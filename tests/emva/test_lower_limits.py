@@ -11,13 +11,13 @@ import pytest
 from chance import rng_of
 from emva.cameras import Camera
 from emva.scoring import measured
+from pixmetry.assess.judge.conformity import Limit, judge_value
+from pixmetry.assess.judge.differences import Subject, difference_of
 from pixmetry.core.number import LOWER_LIMIT, UPPER_LIMIT, VALUE, Number
 from pixmetry.emva.evaluate import evaluate
 from pixmetry.emva.files.json_format import sheet_json
 from pixmetry.emva.files.sheets import read_sheet
 from pixmetry.emva.files.xml_format import xml_text
-from pixmetry.emva.judge.conformity import Limit, judge_value
-from pixmetry.emva.judge.differences import Subject, difference_of
 from pixmetry.emva.records import DataSheet, Results
 
 SHORT = Camera(seed=21, over=0.5, shape=(48, 64), levels=20, stack_frames=16)  # the light ends at half of saturation

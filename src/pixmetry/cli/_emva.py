@@ -59,8 +59,8 @@ def test(campaigns: Sequence[Path], given: dict[str, Any]) -> None:
 
 def compare(a: Path, b: Path) -> None:
     """Say what differs between two data sheets."""
+    from pixmetry.assess.judge.compare import compare as compare_two
     from pixmetry.cli.compare import print_comparison
-    from pixmetry.emva.judge.compare import compare as compare_two
 
     result = compare_two(a, b)
     print_comparison(result, _console())

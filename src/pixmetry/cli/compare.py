@@ -16,9 +16,9 @@ if TYPE_CHECKING:
 
     from rich.console import Console
 
+    from pixmetry.assess.judge.compare import Comparison, Fleet
+    from pixmetry.assess.judge.conformity import Checked
     from pixmetry.core.number import Number
-    from pixmetry.emva.judge.compare import Comparison, Fleet
-    from pixmetry.emva.judge.conformity import Checked
 
 EXIT_DIFFERENT = 1
 SCHEMA = "pixmetry/compared/1"
@@ -37,14 +37,15 @@ LARGEST = 3  # so many of the differences that are not significant are shown
 def compare(files: tuple[Path, ...], limits: Path | None, level: float, same_light: bool, everything: bool, json_file: Path | None) -> None:
     """Compare measurements with each other, with a fleet of cameras, or with limits.
 
-    FILES are EMVA 1288 data sheets (JSON or XML) or assessments (results.json or its folder). Two files are compared with each other.
+    FILES are EMVA 1288 data sheets (JSON or XML), assessments (results.json or its folder) or calibrations (calibration.json or its
+    folder). Two files are compared with each other.
     Of three files or more, each is compared with the median of all. With --limits one file is enough.
 
     Exit status: 0 if nothing changed and all limits hold; 1 if a value changed, stands out, fails or is undecided; 2 after an error.
     """
+    from pixmetry.assess.judge.compare import check_limits, compare_fleet
+    from pixmetry.assess.judge.compare import compare as compare_two
     from pixmetry.core.errors import InputError
-    from pixmetry.emva.judge.compare import check_limits, compare_fleet
-    from pixmetry.emva.judge.compare import compare as compare_two
     from pixmetry.files.staged_files import Output, check_files, write_together
     from pixmetry.files.strict_json import json_text
 
@@ -63,7 +64,7 @@ def compare(files: tuple[Path, ...], limits: Path | None, level: float, same_lig
         record["comparison"] = result.to_record()
         good = result.same
     if limits is not None:
-        from pixmetry.emva.judge.conformity import load_limits
+        from pixmetry.assess.judge.conformity import load_limits
 
         given = load_limits(limits)
         checked = {str(path): check_limits(path, given) for path in files}
@@ -87,7 +88,7 @@ def print_comparison(result: Comparison | Fleet, console: Console, everything: b
     everything : bool
         Show also what is the same.
     """
-    from pixmetry.emva.judge.compare import Comparison
+    from pixmetry.assess.judge.compare import Comparison
 
     if isinstance(result, Comparison):
         _print_pair(result, console, everything)

@@ -10,10 +10,10 @@ import pytest
 from scipy import integrate, stats
 
 from data_sheets import measured, value
+from pixmetry.assess.judge.conformity import Limits, check, judge, judge_value, load_limits
+from pixmetry.assess.judge.subjects import load_subject
 from pixmetry.core.errors import InputError, ParameterError
 from pixmetry.core.number import LOWER_LIMIT, UPPER_LIMIT, Number
-from pixmetry.emva.judge.compare import load
-from pixmetry.emva.judge.conformity import Limits, check, judge, judge_value, load_limits
 
 ALPHA = 1e-6  # false failures of the statistical tests
 
@@ -143,7 +143,7 @@ SHEET = measured({"K": (0.28, 0.002), "DR": (1000.0, 9.0), "sigma_d": (10.9, 0.4
 def test_file_of_limits(tmp_path: Path) -> None:
     path = tmp_path / "limits.yaml"
     path.write_text(GOOD)
-    rows = {row.key: row.judgement for row in check(load(SHEET).values, load_limits(path))}
+    rows = {row.key: row.judgement for row in check(load_subject(SHEET).values, load_limits(path))}
     assert {key: j.verdict for key, j in rows.items()} == {"K": "pass", "DR": "undecided", "sigma_d": "pass", "PRNU1288": "undecided"}
     assert rows["DR"].probability == pytest.approx(0.5) and rows["sigma_d"].rule == "simple_acceptance"
     assert "no value" in rows["PRNU1288"].reason
@@ -179,5 +179,5 @@ def test_bad_limits_give_one_clear_error(old: str, new: str, words: list[str], t
     path = tmp_path / "limits.yaml"
     path.write_text(GOOD.replace(old, new))
     with pytest.raises(InputError) as caught:
-        check(load(SHEET).values, load_limits(path))
+        check(load_subject(SHEET).values, load_limits(path))
     assert all(word in str(caught.value) for word in words) and "\n" not in str(caught.value), caught.value

@@ -14,13 +14,13 @@ from click.testing import CliRunner, Result
 from scipy import stats
 
 from data_sheets import full, measured, sheet, value, written
+from pixmetry.assess.judge.compare import Comparison, check_limits, compare, compare_fleet
+from pixmetry.assess.judge.conformity import load_limits
+from pixmetry.assess.judge.differences import SAME_THING, holm
 from pixmetry.cli import main
 from pixmetry.core.errors import InputError
 from pixmetry.core.number import Number
 from pixmetry.emva.files.keys import KEYS
-from pixmetry.emva.judge.compare import Comparison, check_limits, compare, compare_fleet
-from pixmetry.emva.judge.conformity import load_limits
-from pixmetry.emva.judge.differences import SAME_THING, holm
 from pixmetry.emva.records import DataSheet
 
 ALPHA = 1e-6  # false failures of the statistical tests

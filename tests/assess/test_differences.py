@@ -9,10 +9,10 @@ import pytest
 
 from emva.cameras import Camera
 from emva.scoring import measured
+from pixmetry.assess.judge.differences import Subject, difference_of
 from pixmetry.core.number import Number
 from pixmetry.emva.evaluate import standard_values
 from pixmetry.emva.files.keys import KEYS, goes_with_photons
-from pixmetry.emva.judge.differences import Subject, difference_of
 from pixmetry.emva.records import Measurement
 from pixmetry.emva.series import series_of
 from pixmetry.emva.temporal import temporal_values

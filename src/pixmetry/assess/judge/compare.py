@@ -8,26 +8,23 @@ thing in another unit (K and 1/K, DR in dB) are one decision.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pixmetry.core.checksums import check_record
+from pixmetry.assess.judge.differences import Difference, Subject, decided, difference_of, family, holm
+from pixmetry.assess.judge.fleet import FleetRow, fleet_chance, fleet_row
+from pixmetry.assess.judge.subjects import load_subject
 from pixmetry.core.errors import InputError
-from pixmetry.core.number import Number
-from pixmetry.emva.files.json_format import SCHEMA, is_xml, number_of, parse_json, read_bytes, sheet_of_record, value_of, value_record
-from pixmetry.emva.files.sheets import read_sheet
-from pixmetry.emva.judge.differences import Difference, Subject, decided, difference_of, family, holm
-from pixmetry.emva.judge.fleet import FleetRow, fleet_chance, fleet_row
+from pixmetry.emva.files.json_format import value_record
 from pixmetry.emva.records import MONO, DataSheet
 from pixmetry.files.strict_json import plain
 
 if TYPE_CHECKING:
-    from pixmetry.emva.judge.conformity import Checked, Limits
+    from pixmetry.assess.judge.conformity import Checked, Limits
 
 JUDGED_FLEET = 5  # cameras; among 4 it takes 50 spreads to stand out of 35 values, among 3 more than 1000
-ASSESSMENT_SCHEMA = "pixmetry/results/1"
 
 
 @dataclass(frozen=True)
@@ -87,116 +84,6 @@ def _head(schema: str, result: Comparison | Fleet) -> dict[str, Any]:
     return {"schema": schema, "names": names, "kind": result.kind, "level": result.level, "same": result.same, "notes": notes}
 
 
-def load(source: DataSheet | str | Path, name: str = "") -> Subject:
-    """Read what is to be compared: a data sheet, its file, or the results of an assessment or their folder.
-
-    Raises
-    ------
-    InputError
-        If it is none of these.
-    """
-    if isinstance(source, DataSheet):
-        return _of_sheet(source, name or str(source.camera.get("name") or "data sheet"))
-    path = Path(source)
-    if path.is_dir():
-        if not (path / "results.json").is_file():
-            raise InputError("folder without results.json", where=str(path), remedy="name a data sheet, or the folder of an assessment")
-        path = path / "results.json"
-    name, raw = name or str(source), read_bytes(path)
-    if is_xml(raw):
-        return _of_sheet(read_sheet(path), name)
-    record = parse_json(raw, str(path))
-    check_record(record, str(path))
-    if record.get("schema") == ASSESSMENT_SCHEMA:
-        return _of_assessment(record, name, str(path))
-    if record.get("schema") != SCHEMA:
-        what, found = "neither a data sheet nor an assessment", record.get("schema", "no schema")
-        raise InputError(what, where=str(path), value=found, allowed=f"{SCHEMA}, {ASSESSMENT_SCHEMA}", remedy="check the file")
-    return _of_sheet(sheet_of_record(record, str(path)), name)
-
-
-def _of_sheet(sheet: DataSheet, name: str) -> Subject:
-    values = {(result.channel, key): value for result in sheet.results for key, value in result.values.items()}
-    release = sheet.results[0].release if sheet.results else ""
-    known = number_of(sheet.conditions.get("photons_u_rel"), f"{name}: photons_u_rel")
-    return Subject(name, "data sheet", release, sheet.camera, values, {}, 0.0 if math.isnan(known) else known)
-
-
-def _of_assessment(record: Mapping[str, Any], name: str, where: str) -> Subject:
-    values: dict[str, Number] = {}
-    try:
-        transfer = (record.get("photon_transfer") or {}).get("estimates", [])
-        groups = {**record["estimates"], "photon_transfer": transfer, "spatial": record.get("spatial") or []}
-        for source, estimates in groups.items():
-            values |= {f"{source}.{e['name']}": Number.from_record(e) for e in estimates}
-        results = (record.get("emva1288") or {}).get("results", {})
-        standard = {k: v for k, v in results.items() if not k.startswith("index_")}
-        values |= {f"emva1288.{key}": value_of(v, f"{where}: emva1288.{key}") for key, v in standard.items()}
-        budget = record["budget"]
-        values |= _of_budget(budget, _gain_u_rel(groups["photon_transfer"]))
-        how = {"estimator": _estimator_text(budget["estimator"]), "target": str(budget["target"]["kind"])}
-        worth = ((budget["target"], how["estimator"]), float(budget["verdicts"][0]["total_px"]))
-        placed = {(MONO, key): value for key, value in values.items()}
-        return Subject(name, "assessment", "", dict(record["camera"]), placed, dict(record["unmeasured"]), worth=worth, how=how)
-    except (KeyError, IndexError, TypeError, AttributeError, ValueError):
-        raise InputError("damaged results of an assessment", where=where, remedy="make the assessment again") from None
-
-
-def _gain_u_rel(estimates: Iterable[Mapping[str, Any]]) -> float:
-    """Relative uncertainty of the gain, on which every number of a budget rests."""
-    return next((float(e["u"]) / float(e["value"]) for e in estimates if e["name"] == "gain_dn_per_e" and e["value"]), 0.0)
-
-
-def _estimator_text(estimator: Mapping[str, Any]) -> str:
-    """Name and settings; not what follows from camera and target."""
-    settings = {k: estimator[k] for k in ("window", "sigma") if estimator.get(k) is not None}
-    return ", ".join([str(estimator["name"]), *(f"{k} = {v:g}" for k, v in settings.items())])
-
-
-def _of_budget(budget: Mapping[str, Any], gain_u_rel: float) -> dict[str, Number]:
-    """Target, rows and totals of a budget, with u of what repeating the measurement would change.
-
-    Of a measured row that is what its parameters leave open, of all others half of what its formula declares to leave open; with both the
-    gain's. A total holds the rows', each as far as it counts, the gain's, which all of them share, and the error of chance where it is by
-    Monte Carlo.
-    """
-    units = {True: "px", False: "1"}
-    values = {f"budget.target.{k}": Number(float(v), 0.0, math.inf, units[k.endswith("_px")]) for k, v in _numbers(budget["target"])}
-    known_rows: list[tuple[Mapping[str, Any], float]] = []
-    for row in budget.get("rows", ()):
-        contribution, total = row["contribution"], float(row["total_px"])
-        if contribution is None or row["status"] in ("not applicable", "left to calibration"):
-            continue
-        formula = 0.5 * max(float(contribution["model_error"]) * total, float(contribution["floor_px"]))
-        known = float(row["u_of_total_px"]) if row["status"] == "measured" else formula
-        values[f"budget.{row['name']}"] = Number(total, math.hypot(known, gain_u_rel * total), math.inf, "px", row["status"], "")
-        known_rows.append((row, known))
-    by = budget.get("headline") or {}
-    chance = float(by.get("se_simulated_px") or 0.0) if by.get("by") == "Monte Carlo" else 0.0
-    for group, holds in (("verdicts", False), ("with_accepted", True)):
-        for one in budget.get(group, ()):
-            total, frames = float(one["total_px"]), int(one.get("frames", 1))
-            counted = [(row, known) for row, known in known_rows if holds or row["status"] != "accepted"]
-            square = sum((float(row["total_px"]) * known * _kept(row, frames)) ** 2 for row, known in counted)
-            u = math.hypot(math.sqrt(square) / total if total else 0.0, gain_u_rel * total, chance)
-            key = f"budget.{'verdict' if group == 'verdicts' else group}.{frames}_frames"
-            values[key] = Number(total, u, math.inf, "px", str(by.get("by", "sum")), "")
-    return values
-
-
-def _kept(row: Mapping[str, Any], frames: int) -> float:
-    """Part of the square of a row's total that the mean over several frames keeps; what drifts or is the object's stays whole."""
-    contribution, total = row["contribution"], float(row["total_px"])
-    if frames == 1 or total == 0 or contribution["gum_class"] in ("D", "O"):
-        return 1.0
-    in_time = 0.5 * sum(float(v) ** 2 for v in contribution["time_px"])
-    return 1.0 - (1.0 - 1.0 / frames) * min(in_time / total**2, 1.0)
-
-
-def _numbers(record: Mapping[str, Any]) -> list[tuple[str, float]]:
-    return [(k, v) for k, v in record.items() if isinstance(v, int | float) and not isinstance(v, bool)]
-
-
 def compare(
     a: DataSheet | str | Path, b: DataSheet | str | Path, *, level: float = 0.95, same_light: bool = False, names: Sequence[str] = ("", "")
 ) -> Comparison:
@@ -205,7 +92,8 @@ def compare(
     Parameters
     ----------
     a, b : DataSheet, str or Path
-        Two data sheets (or their JSON or XML files), or the results of two assessments (``results.json`` or their folder).
+        Two data sheets (or their JSON or XML files), or the results of two assessments or of two calibrations (``results.json`` or
+        ``calibration.json``, or their folder).
         The two measurements are taken as independent.
     level : float
         Confidence over all values together: with 0.95 there is a chance of at most 5 % that anything is called changed if nothing did.
@@ -230,12 +118,13 @@ def compare(
     (JCGM 100, G.4). Where one side is a one-sided upper limit, only a value above that limit counts, by as much as it is above.
     """
     _check_level(level)
-    one, two = load(a, names[0]), load(b, names[1])
+    one, two = load_subject(a, names[0]), load_subject(b, names[1])
     if one.kind != two.kind:
         raise InputError(f"{one.name} is a {one.kind} and {two.name} a {two.kind}", remedy="compare two of one kind")
     channels = {channel for channel, _ in one.values} & {channel for channel, _ in two.values}
     if not channels:
-        raise InputError("no channel in common", where=f"{one.name}, {two.name}", remedy="compare sheets with the same colours")
+        remedy = "compare sheets with the same colours, or calibrations of the same cameras"
+        raise InputError("no channel in common", where=f"{one.name}, {two.name}", remedy=remedy)
     keys = [place for place in {**one.values, **two.values} if place[0] in channels]
     rows = [difference_of(place, one, two, same_light) for place in keys]
     changed, decisions = holm([row.p for row in rows], _families(rows), 1 - level)
@@ -322,14 +211,14 @@ def compare_fleet(sources: Iterable[DataSheet | str | Path], *, level: float = 0
     sources = list(sources)
     if len(sources) < 3:
         raise InputError("a fleet has three cameras or more", value=len(sources), remedy="compare two of them with each other")
-    subjects = [load(source, name) for source, name in zip(sources, names or [""] * len(sources), strict=True)]
+    subjects = [load_subject(source, name) for source, name in zip(sources, names or [""] * len(sources), strict=True)]
     kinds = list(dict.fromkeys(s.kind for s in subjects))
     if len(kinds) > 1:
         raise InputError(f"files of several kinds: {', '.join(kinds)}", remedy="compare files of one kind")
     channels = [{channel for channel, _ in s.values} for s in subjects]
     common = channels[0].intersection(*channels)
     if not common:
-        raise InputError("no channel in common", remedy="compare sheets with the same colours")
+        raise InputError("no channel in common", remedy="compare sheets with the same colours, or calibrations of the same cameras")
     # settings, and what is there under another name
     passed_over = ("index_", "budget.target.", "photon_transfer.", "spatial.", "emva1288.")
     places = dict.fromkeys(place for s in subjects for place in s.values if place[0] in common and not place[1].startswith(passed_over))
@@ -355,7 +244,7 @@ def check_limits(source: DataSheet | str | Path, limits: Limits | str | Path) ->
     source : DataSheet, str or Path
         As for `compare`.
     limits : Limits, str or Path
-        A file of limits (YAML), or what `pixmetry.emva.judge.conformity.load_limits` read of it.
+        A file of limits (YAML), or what `pixmetry.assess.judge.conformity.load_limits` read of it.
 
     Returns
     -------
@@ -367,7 +256,7 @@ def check_limits(source: DataSheet | str | Path, limits: Limits | str | Path) ->
     InputError
         If a file cannot be read, a key does not exist, or a unit is missing or another one.
     """
-    from pixmetry.emva.judge.conformity import Limits, check, load_limits
+    from pixmetry.assess.judge.conformity import Limits, check, load_limits
 
     given = limits if isinstance(limits, Limits) else load_limits(limits)
-    return check(load(source).values, given)
+    return check(load_subject(source).values, given)

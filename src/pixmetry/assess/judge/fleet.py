@@ -9,9 +9,9 @@ from functools import lru_cache
 
 import numpy as np
 
+from pixmetry.assess.judge.differences import EQUAL_REL, Subject
 from pixmetry.core.random import Grid, Stream
 from pixmetry.emva.files.keys import plain_unit
-from pixmetry.emva.judge.differences import EQUAL_REL, Subject
 
 THREE_QUARTERS = 1.1503493803760079  # so many standard deviations about the mean hold three quarters of a normal distribution
 FLEET_DRAWS = 2_000_000

@@ -15,11 +15,11 @@ from typing import Literal
 
 from pydantic import Field, PrivateAttr, field_validator, model_validator
 
+from pixmetry.assess.judge.differences import upper_tail
 from pixmetry.core.config import Model, load_yaml, validate
 from pixmetry.core.errors import InputError, ParameterError
 from pixmetry.core.number import Number
 from pixmetry.emva.files.keys import KEYS, NONLINEAR, plain_unit
-from pixmetry.emva.judge.differences import upper_tail
 
 Rule = Literal["guarded_acceptance", "simple_acceptance", "guarded_rejection"]
 
@@ -223,7 +223,7 @@ def check(values: Mapping[tuple[str, str], Number], limits: Limits) -> tuple[Che
     Parameters
     ----------
     values : mapping
-        Values by (channel, key), as `pixmetry.emva.judge.compare.load` reads them.
+        Values by (channel, key), as `pixmetry.assess.judge.subjects.load_subject` reads them.
     limits : Limits
 
     Returns

@@ -1,1 +1,0 @@
-"""Data sheets compared: two of them, a fleet, limits."""
