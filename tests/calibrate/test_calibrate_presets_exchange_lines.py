@@ -28,8 +28,7 @@ from pixmetry.calibrate.lines.line_calibration import LineCalibration
 from pixmetry.calibrate.page.lines_page import page_of
 from pixmetry.calibrate.page.lines_text import summary_text
 from pixmetry.calibrate.project import load_project
-from pixmetry.calibrate.project.presets import stored_grid
-from pixmetry.calibrate.project.starts import on_sensor
+from pixmetry.calibrate.project.cameras import on_sensor, stored_grid
 from pixmetry.camera.camera import Camera, load_camera
 from pixmetry.camera.observations import AFFINITY, LENS
 from pixmetry.cli import main

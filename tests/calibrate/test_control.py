@@ -16,9 +16,8 @@ from pixmetry.calibrate.bundle.network import ScaleBars
 from pixmetry.calibrate.bundle.solve import Options, calibrate_network
 from pixmetry.calibrate.checks import known_checks, known_residuals
 from pixmetry.calibrate.checks.findings import findings_of, gross_error_findings, known_findings
-from pixmetry.calibrate.checks.known_checks import KnownFaults
+from pixmetry.calibrate.checks.known_checks import KnownFaults, lost_records, mostly_lost, set_free, where_seen, wrong_known
 from pixmetry.calibrate.checks.known_residuals import Known, contradicted, control_residuals, group_record, jointly, rivals
-from pixmetry.calibrate.checks.lost_control import lost_records, mostly_lost, set_free, where_seen, wrong_known
 from pixmetry.calibrate.checks.tests import known_record, sizes
 from pixmetry.calibrate.page.control import control_points
 from pixmetry.calibrate.page.tables import scale_bars

@@ -171,7 +171,7 @@ def _from_lines(
 def _camera_files(calibration: Calibration, project: Project | None) -> tuple[dict[str, Camera], list[Finding]]:
     """Presets with what was calibrated, by the names of their files; and why one is missing."""
     from pixmetry.calibrate.calibrated_camera import calibrated_camera, calibrated_geometry
-    from pixmetry.calibrate.project.presets import stored_grid
+    from pixmetry.calibrate.project.cameras import stored_grid
 
     made: dict[str, Camera] = {}
     findings = []

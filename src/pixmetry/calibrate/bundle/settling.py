@@ -72,7 +72,7 @@ def settle(measured: Network, state: State, options: Options, say: Progress, bef
     before : Settled, optional
         The same image coordinates, settled already with other points: where to go on.
     """
-    from pixmetry.calibrate.checks.lost_control import lost_records, set_free, where_seen, wrong_known
+    from pixmetry.calibrate.checks.known_checks import lost_records, set_free, where_seen, wrong_known
 
     given = measured
     loss: str = options.loss if before is None else "none"

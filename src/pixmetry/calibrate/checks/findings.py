@@ -11,7 +11,7 @@ import numpy as np
 from pixmetry.calibrate.bundle.eccentric import Eccentricity
 from pixmetry.calibrate.bundle.network import Adjustment, Network
 from pixmetry.calibrate.checks.hold_out import WORSE
-from pixmetry.calibrate.checks.lost_control import mostly_lost
+from pixmetry.calibrate.checks.known_checks import mostly_lost
 from pixmetry.calibrate.checks.quality import p_words, plain
 from pixmetry.calibrate.records import (
     Contradicted,

@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from pixmetry.calibrate.bundle.model import NAMES, CameraModel, Sensor
-from pixmetry.calibrate.checks.control import control_of
+from pixmetry.calibrate.checks.known_residuals import control_of
 from pixmetry.calibrate.lines.line_calibration import LineCalibration
 from pixmetry.calibrate.records import Calibration, ResidualGrid, Tests, read_record, record_of
 from pixmetry.core.checksums import check_record, sealed

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pixmetry.calibrate.checks.control import control_of
+from pixmetry.calibrate.checks.known_residuals import control_of
 from pixmetry.calibrate.page.text import placed
 from pixmetry.report.numbers import NONE, fixed, signed, significant
 

@@ -1,22 +1,36 @@
-"""The cameras of a project: size and pitch from a preset, start values from the project or from another calibration."""
+"""The cameras of a project: size and pitch from a preset, start values from the project or from another calibration.
+
+That may be a `calibration.json`, a file of OpenCV, or COLMAP's cameras.txt. A preset's stored frames may have another grid of pixels than
+its sensor: `stored_grid` says which.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
-from pixmetry.calibrate.bundle.model import NAMES, TEN, CameraModel, Sensor
+import numpy as np
+
+from pixmetry.calibrate.bundle.model import NAMES, TEN, CameraModel, Direction, Sensor
+from pixmetry.calibrate.exchange import converted, model_of_colmap, read_opencv, vision_values
+from pixmetry.calibrate.files.record import stored_cameras
 from pixmetry.calibrate.lines.plumb_line import FREE
-from pixmetry.calibrate.project.presets import check_size, stored_grid
 from pixmetry.calibrate.project.reader import Reader
 from pixmetry.calibrate.project.schema import CameraEntry
-from pixmetry.calibrate.project.starts import on_sensor, read_start
+from pixmetry.calibrate.project.tables import first_few
 from pixmetry.camera.camera import Camera, load_camera
+from pixmetry.camera.chain_order import Element
+from pixmetry.core.config import read_text
 from pixmetry.core.errors import InputError
 from pixmetry.files.files import find_file
 
 Pitch = tuple[float | None, float | None]
 MIRRORED = ("b2", "p2")  # with y the other way round they change their sign, in both directions of the distortion; yp is a place
+CLOCK, READ_OUT, WINDOW = "grabber.sampling_clock", "sensor.read_out", "grabber.window_offset"
+ENDINGS = (".json", ".yaml", ".yml", ".xml", ".txt")
 
 
 @dataclass(frozen=True)
@@ -128,3 +142,130 @@ def _start(file: str, name: str, reader: Reader, k: int) -> CameraModel:
     path = find_file(reader.folder, file, reader.where("cameras", k, "start_from"))
     reader.files.append(path)
     return read_start(path, name)
+
+
+@dataclass(frozen=True)
+class StoredGrid:
+    """The samples of a stored frame.
+
+    Parameters
+    ----------
+    cols, rows : int
+    pitch_um : (float, float) or None
+        Distance of samples on the sensor; None where the sensor's pixel pitch is not known.
+    changed : str
+        What makes them others than the sensor's pixels; empty if they are the same.
+    """
+
+    cols: int
+    rows: int
+    pitch_um: tuple[float, float] | None
+    changed: str
+
+
+def stored_grid(camera: Camera) -> StoredGrid:
+    """The grid of the frames that a camera stores.
+
+    A grabber that samples with a clock f_s of its own has samples f_pixel/f_s pixels apart along the row (R. Lenz, D. Fritsch, ISPRS
+    J. Photogramm. 45, 1990, 90); single fields have rows two pixels apart.
+    """
+    rows, cols = camera.output_shape
+    scale, changes = np.ones(2), []
+    for element in camera.active:
+        step, change = _changed(camera, element)
+        scale *= step
+        changes += [change] * bool(change)
+    if not changes and (rows, cols) != camera.frame_shape:
+        changes.append(f"it stores {cols} x {rows} of the sensor's {camera.frame_shape[1]} x {camera.frame_shape[0]} pixels")
+    pitch = None if camera.pitch_um is None else (camera.pitch_um[0] * float(scale[0]), camera.pitch_um[1] * float(scale[1]))
+    return StoredGrid(cols, rows, pitch, " and ".join(changes))
+
+
+def _changed(camera: Camera, element: Element) -> tuple[tuple[float, float], str]:
+    """Distance of samples in x and y, in samples of before; and what an element does to the grid, in words."""
+    params, name = element.params, element.source.id
+    if name == CLOCK and params != element.source.neutral:
+        ratio = camera.pixel_clock_hz / (1e6 * params.clock_mhz) if params.clock_mhz else 1.0
+        if ratio != 1 or params.start_ns:
+            return (ratio, 1.0), f"its grabber samples with a clock of its own ({ratio:.6g} pixels a sample)"
+    if name == READ_OUT and params.mode == "field":
+        return (1.0, 2.0), "it stores single fields (rows two pixels apart)"
+    if name == WINDOW and (params.inactive_rows or params.row_offset or params.col_offset):
+        row, col = params.row_offset, params.col_offset
+        return (1.0, 1.0), f"its grabber stores a window from row {row}, column {col} on"
+    return (1.0, 1.0), ""
+
+
+def check_size(camera: Camera, size: Sequence[int], where: str, what: str) -> None:
+    """Refuse pictures or a project whose frame is not the one that the camera stores.
+
+    Raises
+    ------
+    InputError
+        With both sizes.
+    """
+    rows, cols = camera.output_shape
+    if tuple(size) != (cols, rows):
+        remedy = "name the camera that took them, or leave the preset away"
+        found, allowed = f"{size[0]} x {size[1]} pixels", f"{cols} x {rows} pixels"
+        raise InputError(f"{what} another size than the frames of {camera.name}", where=where, value=found, allowed=allowed, remedy=remedy)
+
+
+def read_start(path: Path, name: str) -> CameraModel:
+    """The camera that a file holds; of several the one of this name (COLMAP: CAMERA_ID).
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, or does not say which camera is meant.
+    """
+    if path.suffix.lower() not in ENDINGS:
+        allowed = "calibration.json, a file of OpenCV's storage (.yaml, .yml, .xml, .json), or COLMAP's cameras.txt"
+        raise InputError("no start values can be read from such a file", where=str(path), value=path.suffix, allowed=allowed)
+    if path.suffix.lower() == ".txt":
+        lines = [line for line in read_text(path).splitlines() if line.strip() and not line.startswith("#")]
+        return _of_name({line.split()[0]: line for line in lines}, name, path, model_of_colmap)
+    if path.suffix.lower() == ".json" and _is_ours(path):
+        return _of_name({model.name: model for model in stored_cameras(path)}, name, path, lambda model: model)
+    return read_opencv(path)
+
+
+def _is_ours(path: Path) -> bool:
+    try:
+        return str(json.loads(read_text(path)).get("schema", "")).startswith("pixmetry/")
+    except (ValueError, AttributeError):
+        return False
+
+
+def _of_name(cameras: Mapping[str, Any], name: str, path: Path, made: Callable[[Any], CameraModel]) -> CameraModel:
+    if name not in cameras and len(cameras) != 1:
+        remedy = "give the project's camera the name that it has there"
+        raise InputError(f"holds no camera '{name}'", where=str(path), allowed=first_few(cameras) or "at least one", remedy=remedy)
+    return made(cameras.get(name, next(iter(cameras.values()))))
+
+
+def on_sensor(model: CameraModel, sensor: Sensor, direction: Direction | None) -> CameraModel:
+    """The model on another description of the same pixel grid, in a direction (None: its own).
+
+    Another direction, and another pitch where corrections are in millimetres, are fitted all over the frame: good for start values.
+
+    Raises
+    ------
+    InputError
+        If the model cannot be inverted all over the frame, or has no principal distance and would have to be.
+    """
+    wanted = direction or model.direction
+    if model.sensor.per_px == sensor.per_px and model.direction == wanted:
+        return model
+    if not model["c"] > 0:
+        what = "start values without a principal distance cannot take another direction or pitch"
+        remedy = f"write `direction: {model.direction}`, and the pitch that they were found with"
+        raise InputError(what, where=model.name, remedy=remedy)
+    names = (*TEN, *(name for name in ("k4", "k5") if model[name]))
+    if model.sensor.per_px != sensor.per_px:
+        seen = converted(model, "object_to_image", names).model
+        fx, skew, fy, xp, yp = vision_values(seen)
+        mx, c = sensor.per_px[0], fy * sensor.per_px[1]
+        linear = {"c": c, "xp": xp, "yp": yp, "b1": fx * mx / c - 1, "b2": skew * mx / c}
+        model = replace(seen, sensor=sensor).with_values(**linear)  # from object to image the lens has no unit
+    return converted(model, wanted, names).model
