@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -258,6 +259,35 @@ def test_one_type_for_read_only_and_strided_arrays() -> None:
     assert total(np.broadcast_to(np.float64(2.0), (5, 5))) == 50.0
     assert not locked.flags.writeable
     assert len(getattr(total.dispatcher, "signatures", [0])) == 1
+
+
+class Pair(NamedTuple):
+    values: np.ndarray
+    factor: float
+
+
+class Nest(NamedTuple):
+    pair: Pair
+    out: np.ndarray
+
+
+@jit
+def scale_into(nest):
+    for i in range(nest.pair.values.size):
+        nest.out[i] = nest.pair.factor * nest.pair.values[i]
+
+
+def test_arrays_in_tuples_are_treated_like_others() -> None:
+    """One type for read-only and strided arrays however deep they are; an output is written in place."""
+    values, out = np.arange(4.0), np.zeros(4)
+    frozen = values.copy()
+    frozen.setflags(write=False)
+    for given in (values, frozen, np.repeat(values, 2)[::2]):
+        out[:] = 0.0
+        scale_into(Nest(Pair(given, 3.0), out))
+        assert (out == 3.0 * values).all()
+    assert len(scale_into.dispatcher.signatures) == 1
+    assert not frozen.flags.writeable
 
 
 def test_output_is_written_in_place() -> None:

@@ -194,9 +194,9 @@ def test_scipy_finds_the_same(kind: str, rng: np.random.Generator) -> None:
     frame, x, y, targets = field(rng, kind, 1, [*p, 120.0, 30.0])
     image = (frame + rng.normal(0, 1, frame.shape)).astype(np.float32)
     found = fit_template(image, targets, NoiseModel(1.0), kind, background_plane=False, light_plane=False)
-    w = Windows.of(image, targets, NoiseModel(1.0), kind, KINDS.index(kind), 1.0, True, False)
+    w = Windows.of(image, targets, NoiseModel(1.0), kind, 1.0, True, False)
     away = np.hypot(*(np.indices(image.shape) - np.array([targets.y_px[0], targets.x_px[0]])[:, None, None]))
-    rows, cols = np.nonzero(away <= w.outer[0] + w.reach[0, 0])
+    rows, cols = np.nonzero(away <= w.about.outer[0] + w.about.reach[0, 0])
 
     def mean(_: np.ndarray, *q: float) -> np.ndarray:
         at = (np.arange(image.shape[0]), np.arange(image.shape[1]))

@@ -71,6 +71,9 @@ class Kernel:
     def __repr__(self) -> str:
         return f"<kernel {self.__module__}.{self.__qualname__}>"
 
+    def __reduce__(self) -> str:
+        return self.__qualname__  # pickled by its name: the code that is compiled for a kernel which encloses it is known by this
+
     @property
     def dispatcher(self) -> Any:
         """The Numba dispatcher, or the plain function when ``NUMBA_DISABLE_JIT`` is set."""
@@ -81,7 +84,7 @@ class Kernel:
         return self._dispatcher
 
     def __call__(self, *args: Any) -> Any:
-        return (self._dispatcher or self.dispatcher)(*[_plain(a) if isinstance(a, np.ndarray) else a for a in args])
+        return (self._dispatcher or self.dispatcher)(*[_plain(a) if isinstance(a, (np.ndarray, tuple)) else a for a in args])
 
 
 def jit(function: Callable[..., Any] | None = None, /, **options: Any) -> Any:
@@ -91,7 +94,8 @@ def jit(function: Callable[..., Any] | None = None, /, **options: Any) -> Any:
     ----------
     function : callable
         Code that Numba compiles in nopython mode. It may call other kernels, also of other files. It must not write to an array
-        that is an input: arrays come without their read-only flag, and one that is not C-contiguous comes as a copy.
+        that is an input: arrays come without their read-only flag, and one that is not C-contiguous comes as a copy; so do those in
+        (named) tuples.
     **options
         Options of ``numba.njit`` beside or instead of ``nogil=True, cache=True, fastmath=False, error_model="numpy"``.
 
@@ -119,12 +123,19 @@ class _Writable:
         self.__array_interface__ = interface | {"data": (interface["data"][0], False)}
 
 
-def _plain(array: np.ndarray) -> np.ndarray:
-    """Give every array of one dtype and rank the same Numba type: C-contiguous, without the read-only flag."""
-    flags = array.flags
+def _plain(value: Any) -> Any:
+    """Give every array of one dtype and rank the same Numba type, also within tuples: C-contiguous, without the read-only flag."""
+    if isinstance(value, tuple):
+        members = [_plain(member) for member in value]
+        if all(new is old for new, old in zip(members, value, strict=True)):
+            return value
+        return type(value)(*members) if hasattr(value, "_fields") else tuple(members)
+    if not isinstance(value, np.ndarray):
+        return value
+    flags = value.flags
     if not flags.c_contiguous:
-        return np.ascontiguousarray(array)
-    return array if flags.writeable else np.asarray(_Writable(array))
+        return np.ascontiguousarray(value)
+    return value if flags.writeable else np.asarray(_Writable(value))
 
 
 def _compile(function: Callable[..., Any], options: dict[str, Any]) -> Any:

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from pixmetry.core.errors import InputError
+from pixmetry.locate._noise_kernels import Noise, variances_dn2
 from pixmetry.locate.centroids.estimators import split_text
 
 ROUNDING_DN2 = 1 / 12  # variance of rounding to whole numbers
-BEYOND_DN = 1e30  # an end of the scale that is never met
 LEAST_DN2 = 1e-12  # a noise model without noise still weights all pixels alike
 KEYS = {"read": "read_dn", "gain": "slope_dn", "prnu": "pattern_rel", "dsnu": "pattern_dn", "black": "black_dn", "bits": "bits"}
 
@@ -71,8 +71,15 @@ class NoiseModel:
 
     def variance_dn2(self, level_dn: np.ndarray | float) -> np.ndarray:
         """Return the variance at given mean grey values; same shape, DN²."""
-        light = np.maximum(np.asarray(level_dn, float) - self.black_dn, 0.0)
-        return self.constant_dn2 + self.slope_dn * light + (self.pattern_rel * light) ** 2
+        return variances_dn2(np.maximum(np.asarray(level_dn, float) - self.black_dn, 0.0), self)
+
+    def numbers(self, dtype: np.dtype | None = None) -> Noise:
+        """Return the model as kernels read it; the range of an integer type, where one is given, ends the scale too."""
+        low, high = float(self.low_dn), float(self.high_dn)
+        if dtype is not None and np.issubdtype(dtype, np.integer):
+            low, high = max(low, float(np.iinfo(dtype).min)), min(high, float(np.iinfo(dtype).max))
+        law = max(float(self.constant_dn2), LEAST_DN2), float(self.slope_dn), float(self.pattern_rel), float(self.black_dn)
+        return Noise(*law, low, high, float(self.row_shift_px) ** 2, float(self.field_shift_px) ** 2)
 
     def describe(self) -> str:
         """Say it in words."""
@@ -84,14 +91,6 @@ class NoiseModel:
         if self.row_shift_px or self.field_shift_px:
             text += f"; rows shifted against each other by {np.hypot(self.row_shift_px, self.field_shift_px):.2g} px"
         return text
-
-
-def noise_numbers(noise: NoiseModel, dtype: np.dtype) -> np.ndarray:
-    """Constant, slope, pattern, black, low and high of a noise model as kernels want them; the scale of an integer type ends it too."""
-    low, high = max(noise.low_dn, -BEYOND_DN), min(noise.high_dn, BEYOND_DN)
-    if np.issubdtype(dtype, np.integer):
-        low, high = max(low, float(np.iinfo(dtype).min)), min(high, float(np.iinfo(dtype).max))
-    return np.array([max(noise.constant_dn2, LEAST_DN2), noise.slope_dn, noise.pattern_rel, noise.black_dn, low, high])
 
 
 def parse_noise(text: str, rounded: bool = True) -> tuple[NoiseModel, float]:

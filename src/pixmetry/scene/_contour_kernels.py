@@ -14,65 +14,17 @@ import math
 
 import numpy as np
 
+from pixmetry.core._normal_kernels import bowl, cdf, pdf, ramp
 from pixmetry.core.jit import jit
 
 SEGMENT = 13
 REACH = 5.0  # standard deviations of the blur beyond which it is taken as 0 (2.9e-7 of the height)
-LIMIT = 6.0  # of the tables, in standard deviations
-PER = 64  # entries of the tables per standard deviation: cubic interpolation is good to 2e-10
 THIN = 0.005  # a box narrower than this share of the blur is a point (error 1e-6)
 PANEL = 2.5  # standard deviations of blur along the outline for one panel of five nodes
 MOST_PANELS = 16
-_Z = np.arange(-LIMIT * PER, LIMIT * PER + 2) / PER
-CDF = np.array([0.5 * math.erfc(-z / math.sqrt(2.0)) for z in _Z])
-PDF = np.exp(-0.5 * _Z**2) / math.sqrt(2.0 * math.pi) / PER  # slopes of the cubic, per entry
-RAMP = _Z * CDF + PDF * PER
-ROOT = 1.0 / math.sqrt(2.0 * math.pi)
 NODES = np.array([0.04691007703066802, 0.23076534494715845, 0.5, 0.7692346550528415, 0.953089922969332])  # Gauss–Legendre on (0, 1)
 WEIGHTS = np.array([0.11846344252809454, 0.23931433524968324, 0.28444444444444444, 0.23931433524968324, 0.11846344252809454])
 STEPS = np.array([-5.0, -2.5, 0.0, 2.5, 5.0])  # break points about a side of the box, in standard deviations
-
-
-@jit
-def cdf(z):
-    """Distribution function of the normal distribution."""
-    if z <= -LIMIT:
-        return 0.0
-    if z >= LIMIT:
-        return 1.0
-    at = (z + LIMIT) * PER
-    j = int(at)
-    f = at - j
-    rise = CDF[j + 1] - CDF[j]
-    return CDF[j] + f * rise + f * (1.0 - f) * ((1.0 - f) * (PDF[j] - rise) - f * (PDF[j + 1] - rise))
-
-
-@jit
-def pdf(z):
-    """Density of the normal distribution."""
-    return 0.0 if abs(z) > 8.0 else ROOT * math.exp(-0.5 * z * z)
-
-
-@jit
-def ramp(z):
-    """Integral of `cdf`."""
-    if z <= -LIMIT:
-        return 0.0
-    if z >= LIMIT:
-        return z
-    at = (z + LIMIT) * PER
-    j = int(at)
-    f = at - j
-    rise = RAMP[j + 1] - RAMP[j]
-    return RAMP[j] + f * rise + f * (1.0 - f) * ((1.0 - f) * (CDF[j] / PER - rise) - f * (CDF[j + 1] / PER - rise))
-
-
-@jit
-def bowl(z):
-    """Integral of `ramp`."""
-    if z <= -LIMIT:
-        return 0.0
-    return 0.5 * (z * z + 1.0) if z >= LIMIT else 0.5 * ((z * z + 1.0) * cdf(z) + z * pdf(z))
 
 
 @jit

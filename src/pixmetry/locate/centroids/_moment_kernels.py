@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from pixmetry.core.jit import jit
+from pixmetry.locate._noise_kernels import variance_at
 
 CENTROID, SQUARED, SOFT, HARD, WINDOWED = 0, 1, 2, 3, 4
 # columns of a target's record: rough centre, half axes and angle, reach of its light, margins of window and annulus, sign, threshold in DN,
@@ -18,13 +19,6 @@ EXCESS, AMPLITUDE = 21, 22
 COLUMNS = 23
 SHARP_PX = 0.6  # blur, pixel included, below which the pixel's square shape matters
 SUMS = {"reassoc", "contract", "nsz"}  # sums may be taken in any order, so that they fill the vector registers
-
-
-@jit(inline="always")
-def variance_at(level, noise):
-    """Variance of a pixel from its own grey value: linear below black too, so that the mean over noisy values has no bias."""
-    light = level - noise[3]
-    return max(noise[0] + noise[1] * light + noise[2] * noise[2] * light * light, 0.0)
 
 
 @jit(inline="always")
@@ -201,7 +195,7 @@ def weigh(value, level, law, threshold, sign, noise):
     v = variance_at(level, noise)
     if law == SQUARED:
         # E[I²] = s² + v and Var[I²] = 4 s² v + 2 v² = 4 E[I²] v − 2 v²
-        slope = 2.0 * value - sign * (noise[1] + 2.0 * noise[2] * noise[2] * (level - noise[3]))
+        slope = 2.0 * value - sign * (noise.slope_dn + 2.0 * noise.pattern_rel * noise.pattern_rel * (level - noise.black_dn))
         return value * value - v, slope, slope * slope * v - 2.0 * v * v
     if law == SOFT:
         above = 1.0 if value > threshold else 0.0

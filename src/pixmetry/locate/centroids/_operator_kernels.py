@@ -5,8 +5,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
+from pixmetry.core._least_squares_kernels import FREE, Rest, descent_of
+from pixmetry.core._linear_algebra_kernels import Array, factor_for, factorise, invert_root, substitute
 from pixmetry.core.jit import jit
+from pixmetry.locate._noise_kernels import Noise, variance_at
 from pixmetry.locate.centroids._moment_kernels import (
     AMPLITUDE,
     ANGLE,
@@ -26,12 +30,15 @@ from pixmetry.locate.centroids._moment_kernels import (
     ground_variance,
     moment_of,
     quadratic_form,
-    variance_at,
 )
 
 PERIMETER, FORSTNER, ELLIPSE_EDGES, GAUSSIAN = 0, 1, 2, 3
 GRADIENT_NOISE = 2.0 * (9.0 + 100.0 + 9.0) / 1024.0  # variance of one component of Scharr's gradient per variance of a pixel
 MOST_RAYS = 192
+GAUSSIAN_UNKNOWNS = 7
+GAUSSIAN_REST = 1e-10  # of the squared residuals: fall at which the fit of a Gaussian is at rest
+
+Ints = NDArray[np.int64]
 
 
 @jit
@@ -192,26 +199,6 @@ def forstner_of(patch, box, answer):
 
 
 @jit
-def solve_positive(matrix, right, n):
-    """Solve a positive definite system in place by Cholesky's method, ``right`` (n, columns); only the lower triangle is read."""
-    for j in range(n):
-        for i in range(j, n):
-            total = matrix[i, j]
-            for m in range(j):
-                total -= matrix[i, m] * matrix[j, m]
-            matrix[i, j] = math.sqrt(max(total, 1e-300)) if i == j else total / matrix[j, j]
-    for column in range(right.shape[1]):
-        for i in range(n):
-            for m in range(i):
-                right[i, column] -= matrix[i, m] * right[m, column]
-            right[i, column] /= matrix[i, i]
-        for i in range(n - 1, -1, -1):
-            for m in range(i + 1, n):
-                right[i, column] -= matrix[m, i] * right[m, column]
-            right[i, column] /= matrix[i, i]
-
-
-@jit
 def largest_eigenvector(m, vector):
     """Write the eigenvector of the largest eigenvalue of a symmetric 3 × 3 matrix: the roots of the cubic by their cosines."""
     mean = (m[0, 0] + m[1, 1] + m[2, 2]) / 3.0
@@ -251,8 +238,12 @@ def fit_conic(px, py, count):
                 s1[i, j] += quad[i] * quad[j]
                 s2[i, j] += quad[i] * line[j]
                 s3[i, j] += line[i] * line[j]
-    back = s2.T.copy()  # of the linear part by the quadratic one, with the sign turned
-    solve_positive(s3, back, 3)
+    conic, back, factor = np.zeros(6), np.zeros((3, 3)), factor_for(3)
+    if not factorise(s3, 3, 0.0, factor):
+        return conic
+    for j in range(3):  # of the linear part by the quadratic one, with the sign turned
+        substitute(factor, 3, s2[j], line)
+        back[:, j] = line
     lower = s1.copy()
     for i in range(3):
         for j in range(3):
@@ -262,18 +253,13 @@ def fit_conic(px, py, count):
     for i in range(3):
         lower[i, i] += small
     inverse, symmetric = np.zeros((3, 3)), np.zeros((3, 3))
-    solve_positive(lower, inverse, 3)  # for L alone
-    for j in range(3):  # L⁻¹, column by column
-        for i in range(3):
-            total = 1.0 if i == j else 0.0
-            for m in range(i):
-                total -= lower[i, m] * inverse[m, j]
-            inverse[i, j] = total / lower[i, i]
+    if not factorise(lower, 3, 0.0, factor):
+        return conic
+    invert_root(factor, 3, inverse)
     for i in range(3):
         for j in range(3):
             symmetric[i, j] = 2.0 * (inverse[i, 0] * inverse[j, 2] + inverse[i, 2] * inverse[j, 0]) - inverse[i, 1] * inverse[j, 1]
     largest_eigenvector(symmetric, line)
-    conic = np.zeros(6)
     for i in range(3):
         for j in range(3):
             conic[i] += inverse[j, i] * line[j]
@@ -332,11 +318,13 @@ def edges_of(patch, box, record, i, cx, cy, answer):
                 normal[m, n] += row[m] * row[n]
     # of the centre by the coefficients, −[[2a, b], [b, 2c]]⁻¹ [[2x, y, 0, 1, 0], [0, x, 2y, 0, 1]], times the inverse of the normal matrix
     det = 4 * a * c - b * b
-    by_sums = np.zeros((5, 2))
+    by_sums, factor = np.zeros((2, 5)), factor_for(5)
+    if not factorise(normal, 5, 0.0, factor):
+        return False, 0.0, 0.0
     for k in range(2):
         mx, my = (-2 * c / det, b / det) if k == 0 else (b / det, -2 * a / det)
-        by_sums[0, k], by_sums[1, k], by_sums[2, k], by_sums[3, k], by_sums[4, k] = 2 * ex * mx, ey * mx + ex * my, 2 * ey * my, mx, my
-    solve_positive(normal, by_sums, 5)
+        by_sums[k, 0], by_sums[k, 1], by_sums[k, 2], by_sums[k, 3], by_sums[k, 4] = 2 * ex * mx, ey * mx + ex * my, 2 * ey * my, mx, my
+        substitute(factor, 5, by_sums[k], by_sums[k])
     answer[:, :rows, :cols] = 0.0
     for k in range(count):
         cosine, sine = math.cos(2 * math.pi * (k + 0.5) / count), math.sin(2 * math.pi * (k + 0.5) / count)
@@ -344,8 +332,8 @@ def edges_of(patch, box, record, i, cx, cy, answer):
         out = (2 * a * px[k] + b * py[k] + d) * cosine + (b * px[k] + 2 * c * py[k] + e) * sine
         gx, gy = 0.0, 0.0
         for m in range(5):
-            gx -= by_sums[m, 0] * row[m] * out
-            gy -= by_sums[m, 1] * row[m] * out
+            gx -= by_sums[0, m] * row[m] * out
+            gy -= by_sums[1, m] * row[m] * out
         edge = 1.0 / math.sqrt(p * cosine * cosine + 2 * q * cosine * sine + r * sine * sine)
         low = max(0.0, edge - 3.0 * blur)
         steps = max(int(math.ceil((edge + margin - low) / 0.5)), 2)
@@ -380,66 +368,61 @@ def edges_of(patch, box, record, i, cx, cy, answer):
 
 
 @jit
-def gaussian_of(patch, box, record, i, cx, cy, answer):
-    """Least-squares b + A exp(−½ dᵀPd) by Levenberg and Marquardt, all pixels of the window alike; slopes by pixel in ``answer``.
+def gaussian_sums(window: Array, p: Array, weight: Array, fresh: Array, active: Ints, normal: Array, right: Array) -> tuple[float, float]:
+    """Normal equations of b + A exp(−½ dᵀPd), all pixels of the window alike; see `descent_of`.
+
+    ``window``, shape (2, rows, cols): grey value and whether it counts; ``p``: A, b, x, y, and P's xx, xy, yy.
+    """
+    normal[:, :] = 0.0
+    right[:] = 0.0
+    row, total = np.empty(GAUSSIAN_UNKNOWNS), 0.0
+    for a in range(window.shape[1]):
+        for b in range(window.shape[2]):
+            if window[1, a, b] == 0.0:
+                continue
+            dx, dy = b - p[2], a - p[3]
+            ux, uy = p[4] * dx + p[5] * dy, p[5] * dx + p[6] * dy
+            g = math.exp(-0.5 * (ux * dx + uy * dy))
+            f = p[0] * g
+            row[0], row[1], row[2], row[3] = g, 1.0, f * ux, f * uy
+            row[4], row[5], row[6] = -0.5 * f * dx * dx, -f * dx * dy, -0.5 * f * dy * dy
+            residual = window[0, a, b] - p[1] - f
+            total += residual * residual
+            for m in range(GAUSSIAN_UNKNOWNS):
+                right[m] += row[m] * residual
+                for n in range(m + 1):
+                    normal[m, n] += row[m] * row[n]
+    fresh[:] = 1.0
+    return total, total
+
+
+@jit
+def gaussian_trial(window: Array, p: Array, change: Array, active: Ints, trial: Array) -> bool:
+    """Put p + change into ``trial``, with a P that stays positive definite; see `descent_of`."""
+    trial[:] = p + change
+    trial[4], trial[6] = max(trial[4], 0.2 * p[4]), max(trial[6], 0.2 * p[6])
+    most = 0.95 * math.sqrt(trial[4] * trial[6])
+    trial[5] = min(max(trial[5], -most), most)
+    return True
+
+
+descend_gaussian = descent_of(gaussian_sums, gaussian_trial)
+
+
+@jit
+def gaussian_of(patch: Array, box: Ints, record: Array, i: int, cx: float, cy: float, answer: Array) -> tuple[bool, float, float]:
+    """Least-squares b + A exp(−½ dᵀPd), all pixels of the window alike; slopes by pixel in ``answer``.
 
     Return found, x, y. A target is no Gaussian, so the slopes hold the residuals' part of the second derivatives too.
     """
     rows, cols = box[1] - box[0], box[3] - box[2]
     value = patch[0]
     p, q, r = quadratic_form(record[i, MAJOR] / 1.1774, record[i, MINOR] / 1.1774, record[i, ANGLE])
-    height = record[i, AMPLITUDE]
-    at = np.array([height, 0.0, cx - box[2], cy - box[0], p, q, r])
-    scale = np.array([height, height, 1.0, 1.0, math.sqrt(p * r), math.sqrt(p * r), math.sqrt(p * r)])
-    normal, right, row = np.empty((7, 7)), np.empty(7), np.empty(7)
-    damping, cost = 1e-3, np.inf
-    trial = at.copy()
-    kept_normal, kept_right = normal.copy(), right.copy()
-    damped, step = np.empty((7, 7)), np.empty((7, 1))
-    for _ in range(60):
-        normal[:] = 0.0
-        right[:] = 0.0
-        total = 0.0
-        for a in range(rows):
-            for b in range(cols):
-                if patch[2, a, b] == 0.0:
-                    continue
-                dx, dy = b - trial[2], a - trial[3]
-                ux, uy = trial[4] * dx + trial[5] * dy, trial[5] * dx + trial[6] * dy
-                g = math.exp(-0.5 * (ux * dx + uy * dy))
-                f = trial[0] * g
-                row[0], row[1], row[2], row[3] = g, 1.0, f * ux, f * uy
-                row[4], row[5], row[6] = -0.5 * f * dx * dx, -f * dx * dy, -0.5 * f * dy * dy
-                residual = value[a, b] - trial[1] - f
-                total += residual * residual
-                for m in range(7):
-                    scaled = row[m] * scale[m]
-                    right[m] += scaled * residual
-                    for n in range(m + 1):
-                        normal[m, n] += scaled * row[n] * scale[n]
-        if total <= cost:
-            at[:] = trial
-            gain = cost - total
-            cost = total
-            kept_normal[:] = normal
-            kept_right[:] = right
-            damping = max(damping * 0.1, 1e-9)
-            if gain < 1e-10 * total:
-                break
-        else:
-            damping = min(damping * 10.0, 1e6)
-            if damping >= 1e6:
-                break
-        damped[:] = kept_normal
-        step[:, 0] = kept_right
-        for m in range(7):
-            damped[m, m] += damping * damped[m, m] + 1e-12
-        solve_positive(damped, step, 7)
-        for m in range(7):
-            trial[m] = at[m] + step[m, 0] * scale[m]
-        trial[4], trial[6] = max(trial[4], 0.2 * at[4]), max(trial[6], 0.2 * at[6])
-        most = 0.95 * math.sqrt(trial[4] * trial[6])
-        trial[5] = min(max(trial[5], -most), most)
+    at = np.array([record[i, AMPLITUDE], 0.0, cx - box[2], cy - box[0], p, q, r])
+    window = np.empty((2, rows, cols))
+    window[0], window[1] = patch[0, :rows, :cols], patch[2, :rows, :cols]
+    least, active = np.full(GAUSSIAN_UNKNOWNS, -np.inf), np.arange(GAUSSIAN_UNKNOWNS)
+    descend_gaussian(window, at, least, active, 1, Rest(0.0, GAUSSIAN_REST, FREE, 0.0))
     xx, xy, yy = 0.0, 0.0, 0.0
     answer[:, :rows, :cols] = 0.0
     for a in range(rows):
@@ -572,7 +555,7 @@ def phase_variances(shape, first, stop, operator, phases, nodes, weights, column
     margin of the window, and radius at half height. An S-curve swings with the size, over half a pixel or less: the largest of
     four sizes over that counts.
     """
-    noise = np.zeros(4)
+    noise = Noise(0.0, 0.0, 0.0, 0.0, -np.inf, np.inf, 0.0, 0.0)
     box, sums, result = np.zeros(4, np.int64), np.empty(15), np.empty(6)
     for i in range(first, stop):
         most = 0.0

@@ -10,6 +10,7 @@ import numpy as np
 
 from pixmetry.core.errors import InputError
 from pixmetry.core.threads import map_tiles, thread_count
+from pixmetry.locate._noise_kernels import Noise, variances_dn2
 from pixmetry.locate.centroids import _moment_kernels as k
 from pixmetry.locate.detect.targets import Flag, Positions, Targets
 from pixmetry.locate.noise import NoiseModel
@@ -81,7 +82,7 @@ def moment_positions(frame: np.ndarray, targets: Targets, noise: NoiseModel, nam
 class Prepared:
     """The record of each target that the kernels read, and what is common to all."""
 
-    def __init__(self, record: np.ndarray, noise: np.ndarray, flags: np.ndarray, usable: np.ndarray) -> None:
+    def __init__(self, record: np.ndarray, noise: Noise, flags: np.ndarray, usable: np.ndarray) -> None:
         self.record, self.noise, self.flags, self.usable = record, noise, flags, usable
         self.amplitude = np.zeros(len(record))
         self.radius = self.blur = self.amplitude
@@ -96,11 +97,6 @@ def run_slices(function: Callable[[int, int], None], n: int, threads: int | None
     pieces = max(1, min(n // 16, 2 * (thread_count() if threads is None else threads)))
     ends = np.linspace(0, n, pieces + 1).astype(int)
     map_tiles(lambda span: function(int(span[0]), int(span[1])), list(zip(ends[:-1], ends[1:], strict=True)), threads)
-
-
-def noise_numbers(noise: NoiseModel) -> np.ndarray:
-    """Return constant, slope, pattern and black of a noise model as the kernels read them."""
-    return np.array([noise.constant_dn2, noise.slope_dn, noise.pattern_rel, noise.black_dn])
 
 
 def prepare(frame: np.ndarray, targets: Targets, noise: NoiseModel, *, margin: float, threads: int | None = None) -> Prepared:
@@ -135,7 +131,7 @@ def prepare(frame: np.ndarray, targets: Targets, noise: NoiseModel, *, margin: f
     flags = flags | np.where(edge < 1.5 * blur, np.uint32(Flag.BORDER), np.uint32(0))
     flags = flags | np.where(free < 1.5 * blur, np.uint32(Flag.OVERLAPPING), np.uint32(0))
     record[:, k.MARGIN] = np.minimum(wanted, np.maximum(np.minimum(edge, free), blur))
-    work = Prepared(record, noise_numbers(noise), flags, usable)
+    work = Prepared(record, noise.numbers(), flags, usable)
     work.radius, work.blur, spread = equivalent_disc(np.sqrt(major * minor), blur)
     work.amplitude = record[:, k.AMPLITUDE]
     record[:, k.SPREAD] = np.maximum(spread, 0.5)
@@ -224,8 +220,7 @@ def _phase_variance(work: Prepared, law: int, threads: int | None) -> np.ndarray
         return np.zeros(0)
     if law == k.CENTROID:
         return _centroid_phase_variance(work.radius, work.blur)
-    light = record[:, k.LEVEL] - work.noise[3]
-    deviation = np.sqrt(np.maximum(work.noise[0] + work.noise[1] * light + (work.noise[2] * light) ** 2, 1e-12))
+    deviation = np.sqrt(np.maximum(variances_dn2(record[:, k.LEVEL] - work.noise.black_dn, work.noise), 1e-12))
     of, _ = classes(work.radius, work.blur, work.amplitude / deviation)
     radius = np.minimum(work.radius, LARGEST_PX - 12)
     window = np.sqrt(record[:, k.MAJOR] * record[:, k.MINOR]) + record[:, k.MARGIN] - (work.radius - radius)

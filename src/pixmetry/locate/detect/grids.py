@@ -58,9 +58,7 @@ def no_grid(message: str, rows: int = 0, cols: int = 0) -> Grid:
     return Grid(none, none, none.astype(int), none.astype(int), rows, cols, message)
 
 
-def order_grid(
-    x_px: np.ndarray, y_px: np.ndarray, *, pattern: tuple[int, int] | None = None, asymmetric: bool = False
-) -> Grid:
+def order_grid(x_px: np.ndarray, y_px: np.ndarray, *, pattern: tuple[int, int] | None = None, asymmetric: bool = False) -> Grid:
     """Give each of many located dots its row and column on a regular plate, seen in perspective and through a distorting lens.
 
     Parameters

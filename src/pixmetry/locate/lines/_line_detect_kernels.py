@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from pixmetry.core.jit import jit
-from pixmetry.locate.lines._line_kernels import gather
+from pixmetry.locate.lines._line_kernels import Lines, Pixels, gather
 from pixmetry.locate.lines._profile_kernels import BAR, EDGE, GAUSSIAN, profile
 
 FIELDS = 5  # of a point: signal over noise, shift in x and in y from the pixel's centre, direction, strength
@@ -496,8 +496,8 @@ def strength(frame, kind, state):
     room = int((2.0 * reach + 2.0) * (length + 2.0) * 1.5 + 8.0 * (reach + length)) + 64
     x, y, value = np.empty(room), np.empty(room), np.empty(room)
     place = np.array([state[0], state[1], state[2], state[4], state[5], state[3]])
-    none, nobody = np.zeros((1, 6)), np.zeros(1, np.int64)
-    n, _ = gather(frame, place, reach, 0, none, none[0], nobody, 0, 0, 1e30, -1e30, x, y, value)
+    alone = Lines(np.zeros((1, 6)), np.zeros(1), np.zeros(2, np.int64), np.zeros(0, np.int64))
+    n, _ = gather(frame, place, reach, 0, alone, (-math.inf, math.inf), Pixels(x, y, value))
     sums = np.zeros(4)
     for i in range(n):
         t = c * x[i] + s * y[i]

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from pixmetry.core._least_squares_kernels import Rest, descent_of
+from pixmetry.core._linear_algebra_kernels import Array, invert
 from pixmetry.core.jit import jit
-from pixmetry.locate.lines._profile_kernels import BAR, GAUSSIAN, clipped, invert, profile
+from pixmetry.locate._noise_kernels import Noise, stored
+from pixmetry.locate.lines._profile_kernels import BAR, GAUSSIAN, profile
 
 # Unknowns. Offset across the line and angle are against the candidate's; the slopes of the background run across and along it.
 OFFSET, ANGLE, BACKGROUND, AMPLITUDE, SIGMA, WIDTH, ACROSS, ALONG, TAPER, CURVE, FLAT = 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10
@@ -15,13 +20,69 @@ UNKNOWNS = 10  # FLAT is no unknown: it tests whether the section is a bar rathe
 OFF, ON, AUTO = 0, 1, 2
 LEAST_SIGMA, LEAST_WIDTH = 0.05, 0.1
 SIGNIFICANT = 3.0  # standard deviations from which a slope, a taper or a curvature is taken in
-MOST_PASSES = 40
+REST = Rest(1e-5, 0.0, math.inf, 1e-2)  # falls of χ²: 0.003 and 0.1 standard deviations
 PARALLEL = 0.05  # sine of the angle below which lines count as parallel
 BORDERS, HIGH, LOW, SHARED, RESTLESS, SINGULAR = 1, 2, 4, 8, 16, 32  # what a fit came across
 
+Ints = NDArray[np.int64]
+
+
+class Lines(NamedTuple):
+    """Where lines were looked for, and which of them are near to each other."""
+
+    places: Array  # shape (n, 6): x, y, angle, least and greatest distance along the line, curvature; px, rad
+    cores: Array  # shape (n,): how far to either side a line spoils the pixels of others, px
+    begin: Ints  # shape (n + 1,): the lines near line i are near[begin[i]:begin[i + 1]]
+    near: Ints
+
+
+class Pixels(NamedTuple):
+    """Pixels of one line: places relative to the candidate's in px, and grey values in DN; shape (pixels,) each."""
+
+    x: Array
+    y: Array
+    value: Array
+
+
+class Candidates(NamedTuple):
+    """What fits start from."""
+
+    lines: Lines
+    reach: Array  # shape (n,): of the pixels, to either side, px
+    start: Array  # shape (n, 4): background, amplitude, sigma, width
+
+
+class How(NamedTuple):
+    """How lines are fitted."""
+
+    section: int
+    choose: bool  # whether a Gaussian may become a bar
+    options: Ints  # OFF, ON or AUTO for the background's plane, the taper and the curvature
+    aperture: float  # side of the pixel's square, px
+    noise: Noise
+
+
+class Fits(NamedTuple):
+    """Results of fits."""
+
+    values: Array  # shape (n, UNKNOWNS)
+    covariances: Array  # shape (n, UNKNOWNS, UNKNOWNS)
+    told: Array  # shape (n, 5): chi², pixels, unknowns, what was met, section
+
+
+class Line(NamedTuple):
+    """One line to be fitted."""
+
+    section: int
+    angle: float  # of the candidate, rad
+    half: float  # greatest distance along it, px
+    aperture: float
+    noise: Noise
+    pixels: Pixels
+
 
 @jit
-def covered(other, reach, angle, d, col, row):
+def covered(other: Array, reach: float, angle: float, d: float, col: float, row: float) -> bool:
     """Whether a pixel, at distance d from a line of some angle, belongs to another line, too near to it to tell of the first."""
     co, so = math.cos(other[2]), math.sin(other[2])
     u, v = col - other[0], row - other[1]
@@ -34,11 +95,17 @@ def covered(other, reach, angle, d, col, row):
 
 
 @jit
-def gather(frame, place, reach, mine, places, cores, near, first, stop, high, low, x, y, value):
+def gather(
+    frame: NDArray[np.generic], place: Array, reach: float, mine: int, lines: Lines, ends: tuple[float, float], out: Pixels
+) -> tuple[int, int]:
     """Collect the pixels within reach of a line that other lines do not cover; return their number and what was met.
 
-    ``place``: x, y, angle, least and greatest distance along the line, curvature. ``near[first:stop]`` are the indices of other lines.
+    ``place``: x, y, angle, least and greatest distance along the line, curvature. ``mine``: its number among the ``lines``. ``ends``: of
+    the scale, DN.
     """
+    low, high = ends
+    x, y, value = out.x, out.y, out.value
+    places, cores, near, first, stop = lines.places, lines.cores, lines.near, lines.begin[mine], lines.begin[mine + 1]
     x0, y0, angle, least, most, curve = place[0], place[1], place[2], place[3], place[4], place[5]
     c, s = math.cos(angle), math.sin(angle)
     rows, cols = frame.shape
@@ -84,8 +151,22 @@ def gather(frame, place, reach, mine, places, cores, near, first, stop, high, lo
 
 
 @jit
-def pixel(section, p, c, s, c0, s0, a, b, dx, dy, out):
-    """Return the grey value of a pixel and put its derivatives into ``out`` (all but FLAT)."""
+def turned(p: Array, angle: float, aperture: float) -> tuple[tuple[float, float, float, float], tuple[float, float]]:
+    """Cosine and sine of a line's direction and of its candidate's, and the sides of the pixel across it in px."""
+    c, s = math.cos(angle + p[ANGLE]), math.sin(angle + p[ANGLE])
+    return (c, s, math.cos(angle), math.sin(angle)), (aperture * max(abs(c), abs(s)), aperture * min(abs(c), abs(s)))
+
+
+@jit
+def pixel(
+    section: int, p: Array, turn: tuple[float, float, float, float], box: tuple[float, float], dx: float, dy: float, out: Array
+) -> tuple[float, float, float]:
+    """Return the grey value of a pixel, its distance across and its height; put its derivatives into ``out`` (all but FLAT).
+
+    ``turn`` and ``box`` are those of `turned`.
+    """
+    c, s, c0, s0 = turn
+    a, b = box
     t = c * dx + s * dy
     d = c * dy - s * dx - p[OFFSET] - 0.5 * p[CURVE] * t * t
     along, across = c0 * dx + s0 * dy, c0 * dy - s0 * dx
@@ -105,14 +186,11 @@ def pixel(section, p, c, s, c0, s0, a, b, dx, dy, out):
 
 
 @jit
-def sums(section, p, angle, aperture, noise, x, y, value, n, weight, fresh, active, count, normal, right):
-    """Set up the normal equations of the active unknowns; return chi² with the given weights and with fresh ones.
-
-    ``noise``: constant, slope, pattern, black, low, high. The fresh weights go into ``fresh``.
-    """
-    turned = angle + p[ANGLE]
-    c, s, c0, s0 = math.cos(turned), math.sin(turned), math.cos(angle), math.sin(angle)
-    a, b = aperture * max(abs(c), abs(s)), aperture * min(abs(c), abs(s))
+def sums(line: Line, p: Array, weight: Array, fresh: Array, active: Ints, normal: Array, right: Array) -> tuple[float, float]:
+    """Normal equations of the active unknowns, χ² with the given weights and with fresh ones; see `descent_of`."""
+    turn, box = turned(p, line.angle, line.aperture)
+    section, noise, x, y, value = line.section, line.noise, line.pixels.x, line.pixels.y, line.pixels.value
+    count = len(active)
     normal[:, :] = 0.0
     right[:] = 0.0
     slopes = np.zeros(UNKNOWNS + 1)
@@ -121,13 +199,13 @@ def sums(section, p, angle, aperture, noise, x, y, value, n, weight, fresh, acti
     w_bar = 2.4 * p[SIGMA]
     s_bar = math.sqrt(p[SIGMA] ** 2 - w_bar * w_bar / 12.0)
     scale_bar = p[SIGMA] * math.sqrt(2.0 * math.pi) / w_bar  # the same area
-    for i in range(n):
-        mean, d, height = pixel(section, p, c, s, c0, s0, a, b, x[i], y[i], slopes)
+    for i in range(len(value)):
+        mean, d, height = pixel(section, p, turn, box, x[i], y[i], slopes)
         if flat:
-            bar = profile(BAR, d, s_bar, w_bar, a, b)[0]
+            bar = profile(BAR, d, s_bar, w_bar, box[0], box[1])[0]
             slopes[FLAT] = p[AMPLITUDE] * (scale_bar * bar - height)
-        stored, variance, gain = clipped(mean, noise[0], noise[1], noise[2], noise[3], noise[4], noise[5])
-        rest = value[i] - stored
+        expected, variance, gain = stored(mean, noise)
+        rest = value[i] - expected
         fresh[i] = 1.0 / variance
         chi_old += rest * rest * weight[i]
         chi_new += rest * rest * fresh[i]
@@ -145,12 +223,12 @@ def sums(section, p, angle, aperture, noise, x, y, value, n, weight, fresh, acti
 
 
 @jit
-def limited(p, change, active, count, half, trial):
-    """Put p + change into ``trial``, no further than the model can be trusted."""
+def limited(line: Line, p: Array, change: Array, active: Ints, trial: Array) -> bool:
+    """Put p + change into ``trial``, no further than the model can be trusted; see `descent_of`."""
     trial[:] = p
-    size = 1.0
+    size, half = 1.0, line.half
     reach = 0.5 * (p[SIGMA] + 0.5)
-    for j in range(count):
+    for j in range(len(active)):
         k, by = active[j], abs(change[j])
         most = np.inf
         if k == OFFSET:
@@ -165,62 +243,18 @@ def limited(p, change, active, count, half, trial):
             most = 2.0 * reach / max(half * half, 1.0)
         if by > most:
             size = min(size, most / by)
-    for j in range(count):
+    for j in range(len(active)):
         trial[active[j]] += size * change[j]
     trial[SIGMA] = max(trial[SIGMA], LEAST_SIGMA)
     trial[WIDTH] = max(trial[WIDTH], LEAST_WIDTH)
+    return True
+
+
+descend_line = descent_of(sums, limited)
 
 
 @jit
-def descend(section, p, angle, half, aperture, noise, x, y, value, n, weight, fresh, active, count, normal, right):
-    """Levenberg–Marquardt from p, in place; return chi² and whether it came to rest. ``normal`` and ``right`` are those at p."""
-    damped, inverse = np.empty((UNKNOWNS + 1, UNKNOWNS + 1)), np.empty((UNKNOWNS + 1, UNKNOWNS + 1))
-    new_normal, new_right = np.empty_like(normal), np.empty_like(right)
-    change, pull, trial = np.empty(UNKNOWNS + 1), np.empty(UNKNOWNS + 1), np.empty(UNKNOWNS)
-    weight[:n] = 1.0
-    _, chi = sums(section, p, angle, aperture, noise, x, y, value, n, weight, fresh, active, count, normal, right)
-    weight[:n] = fresh[:n]
-    damping = 1e-6
-    for _ in range(MOST_PASSES):
-        damped[:count, :count] = normal[:count, :count]
-        for j in range(count):
-            damped[j, j] *= 1.0 + damping
-        for j in range(count):  # what is held at its least is no unknown as long as it is pressed there
-            pull[j] = right[j]
-            if ((active[j] == SIGMA and p[SIGMA] <= LEAST_SIGMA) or (active[j] == WIDTH and p[WIDTH] <= LEAST_WIDTH)) and right[j] < 0.0:
-                damped[j, :count] = 0.0
-                damped[:count, j] = 0.0
-                damped[j, j], pull[j] = 1.0, 0.0
-        if not invert(damped, count, inverse):
-            damping = max(10.0 * damping, 1e-3)
-            if damping > 1e8:
-                return chi, False
-            continue
-        small = 0.0  # the predicted fall of chi²
-        for j in range(count):
-            total = 0.0
-            for k in range(count):
-                total += inverse[j, k] * pull[k]
-            change[j] = total
-            small += total * pull[j]
-        limited(p, change, active, count, half, trial)
-        if small < 1e-5:  # 0.003 standard deviations: the last step is taken unseen
-            p[:] = trial
-            return chi, True
-        old, new = sums(section, trial, angle, aperture, noise, x, y, value, n, weight, fresh, active, count, new_normal, new_right)
-        if old <= chi * (1.0 + 1e-12):
-            p[:], normal[:, :], right[:], weight[:n] = trial, new_normal, new_right, fresh[:n]
-            chi = new
-            damping = max(0.1 * damping, 1e-9)
-        else:
-            if damping >= 1e8:
-                return chi, small < 1e-2
-            damping = max(10.0 * damping, 1e-4)
-    return chi, False
-
-
-@jit
-def significance(normal, right, count, kept, chi_per_dof):
+def significance(normal: Array, right: Array, count: int, kept: int, chi_per_dof: float) -> Array:
     """Rao's score test of the unknowns after the first ``kept`` of ``count``, one by one: their values in standard deviations."""
     inverse, out = np.empty((kept, kept)), np.zeros(count)
     if not invert(normal, kept, inverse):
@@ -239,7 +273,7 @@ def significance(normal, right, count, kept, chi_per_dof):
 
 
 @jit
-def take_in(active, count, extra, most):
+def take_in(active: Ints, count: int, extra: Ints, most: int) -> int:
     """Append the wanted unknowns; return the new count."""
     for j in range(most):
         found = False
@@ -252,15 +286,17 @@ def take_in(active, count, extra, most):
 
 
 @jit
-def fit_one(section, choose, options, p, angle, half, aperture, noise, x, y, value, n, active):
-    """Fit one line and choose what it is made of; return section, count of unknowns, chi² and whether it rests.
+def fit_one(line: Line, choose: bool, options: Ints, p: Array, active: Ints) -> tuple[int, int, bool]:
+    """Fit one line and choose what it is made of; return section, count of unknowns, and whether it rests.
 
-    ``options``: OFF, ON or AUTO for the background's plane, the taper and the curvature. ``choose``: whether a Gaussian may become a bar.
+    ``options`` and ``choose`` as in `How`.
     """
-    size = UNKNOWNS + 1
+    size, n, section = UNKNOWNS + 1, len(line.pixels.value), line.section
     normal, right = np.zeros((size, size)), np.zeros(size)
-    weight, fresh = np.empty(n), np.empty(n)
+    weight, fresh = np.ones(n), np.empty(n)
     wanted = np.empty(size, np.int64)
+    least = np.full(UNKNOWNS, -np.inf)
+    least[SIGMA], least[WIDTH] = LEAST_SIGMA, LEAST_WIDTH
     count = 5
     for j in range(count):
         active[j] = j
@@ -271,12 +307,12 @@ def fit_one(section, choose, options, p, angle, half, aperture, noise, x, y, val
         if options[0 if k <= ALONG else k - TAPER + 1] == ON:
             active[count] = k
             count += 1
-    chi, rests = 0.0, False
-    tried = False
+    rests, tried = False, False
     for _ in range(4):
         if n <= count + 2:
-            return section, count, np.nan, False
-        chi, rests = descend(section, p, angle, half, aperture, noise, x, y, value, n, weight, fresh, active, count, normal, right)
+            return section, count, False
+        here = Line(section, line.angle, line.half, line.aperture, line.noise, line.pixels)
+        chi, rests = descend_line(here, p, least, active[:count], n, REST)
         if not rests:
             break
         kept, most = count, 0
@@ -290,7 +326,7 @@ def fit_one(section, choose, options, p, angle, half, aperture, noise, x, y, val
             full += 1
         if full == kept:
             break
-        sums(section, p, angle, aperture, noise, x, y, value, n, weight, fresh, active, full, normal, right)
+        sums(here, p, weight, fresh, active[:full], normal, right)
         strong = significance(normal, right, full, kept, chi / (n - kept))
         if active[full - 1] == FLAT and strong[full - 1] > SIGNIFICANT:
             section, tried = BAR, True
@@ -308,40 +344,35 @@ def fit_one(section, choose, options, p, angle, half, aperture, noise, x, y, val
                 count += 1
         if count == kept:
             break
-    return section, count, chi, rests
+    return section, count, rests
 
 
 @jit
-def fit_lines(
-    frame, first, stop, section, choose, options, aperture, noise, places, reach, start, cores, near, begin, values, covariances, told
-):
-    """Fit candidates ``first`` to ``stop``.
-
-    ``places``, shape (n, 6): x, y, angle, least and greatest distance along, curvature. ``start``, shape (n, 4): background, amplitude,
-    sigma, width. ``cores``: how far to either side a line spoils the pixels of others, ``near[begin[i]:begin[i + 1]]`` the others.
-    Into ``values`` (n, 10), ``covariances`` (n, 10, 10), ``told`` (n, 5): chi², pixels, unknowns, what was met, section.
-    """
+def fit_lines(frame: NDArray[np.generic], first: int, stop: int, how: How, candidates: Candidates, fits: Fits) -> None:
+    """Fit candidates ``first`` to ``stop``."""
     size = UNKNOWNS + 1
     normal, right, inverse = np.zeros((size, size)), np.zeros(size), np.zeros((size, size))
     active, p = np.empty(size, np.int64), np.empty(UNKNOWNS)
-    own = np.empty_like(options)
+    own = np.empty_like(how.options)
+    lines, noise = candidates.lines, how.noise
+    values, covariances, told = fits.values, fits.covariances, fits.told
     for i in range(first, stop):
-        half, curve = max(places[i, 4], -places[i, 3]), places[i, 5]
-        tall, wide = 2.0 * reach[i] + 2.0, places[i, 4] - places[i, 3] + 2.0
+        place, start, reach = lines.places[i], candidates.start[i], candidates.reach[i]
+        half, curve = max(place[4], -place[3]), place[5]
+        tall, wide = 2.0 * reach + 2.0, place[4] - place[3] + 2.0
         room = int(min(tall * wide * (1.0 + 0.5 * (curve * half) ** 2) + 4.0 * (tall + wide), 1.0 * frame.size)) + 16
-        x, y, value = np.empty(room), np.empty(room), np.empty(room)
-        n, met = gather(
-            frame, places[i], reach[i], i, places, cores, near, begin[i], begin[i + 1], noise[5], noise[4], x, y, value
-        )
+        all_pixels = Pixels(np.empty(room), np.empty(room), np.empty(room))
+        n, met = gather(frame, place, reach, i, lines, (noise.low_dn, noise.high_dn), all_pixels)
+        pixels = Pixels(all_pixels.x[:n], all_pixels.y[:n], all_pixels.value[:n])
         p[:] = 0.0
-        p[BACKGROUND], p[AMPLITUDE], p[SIGMA], p[WIDTH] = start[i, 0], start[i, 1], start[i, 2], start[i, 3]
-        own[:] = options
-        if own[2] != OFF and 0.5 * abs(curve) * half * half > 0.5 * start[i, 2]:
+        p[BACKGROUND], p[AMPLITUDE], p[SIGMA], p[WIDTH] = start[0], start[1], start[2], start[3]
+        own[:] = how.options
+        if own[2] != OFF and 0.5 * abs(curve) * half * half > 0.5 * start[2]:
             own[2], p[CURVE] = ON, curve  # plainly curved
-        mine = section
-        if choose and section == GAUSSIAN and start[i, 3] > 3.0 * start[i, 2]:
+        mine = how.section
+        if how.choose and mine == GAUSSIAN and start[3] > 3.0 * start[2]:
             mine = BAR  # plainly one
-        mine, count, chi, rests = fit_one(mine, choose, own, p, places[i, 2], half, aperture, noise, x, y, value, n, active)
+        mine, count, rests = fit_one(Line(mine, place[2], half, how.aperture, noise, pixels), how.choose, own, p, active)
         if not rests:
             met |= RESTLESS
         if p[SIGMA] <= LEAST_SIGMA:  # held at the least: no unknown
@@ -353,8 +384,8 @@ def fit_lines(
         covariances[i], values[i], told[i, 0] = np.nan, np.nan, np.nan
         if n <= count + 2:
             continue
-        weight, fresh = np.ones(n), np.empty(n)
-        told[i, 0] = sums(mine, p, places[i, 2], aperture, noise, x, y, value, n, weight, fresh, active, count, normal, right)[1]
+        line = Line(mine, place[2], half, how.aperture, noise, pixels)
+        told[i, 0] = sums(line, p, np.ones(n), np.empty(n), active[:count], normal, right)[1]
         if not invert(normal, count, inverse):
             continue
         told[i, 3], values[i] = met, p
@@ -364,10 +395,8 @@ def fit_lines(
 
 
 @jit
-def render(section, p, angle, aperture, x, y, mean, jacobian):
+def render(section: int, p: Array, angle: float, aperture: float, x: Array, y: Array, mean: Array, jacobian: Array) -> None:
     """Put the grey values at pixels x, y (relative to the candidate's place) and their derivatives into ``mean`` and ``jacobian``."""
-    turned = angle + p[ANGLE]
-    c, s, c0, s0 = math.cos(turned), math.sin(turned), math.cos(angle), math.sin(angle)
-    a, b = aperture * max(abs(c), abs(s)), aperture * min(abs(c), abs(s))
+    turn, box = turned(p, angle, aperture)
     for i in range(len(x)):
-        mean[i] = pixel(section, p, c, s, c0, s0, a, b, x[i], y[i], jacobian[i])[0]
+        mean[i] = pixel(section, p, turn, box, x[i], y[i], jacobian[i])[0]

@@ -3,13 +3,31 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from pixmetry.core._linear_algebra_kernels import Array, invert
+from pixmetry.core._normal_kernels import cdf, pdf
 from pixmetry.core.jit import jit
-from pixmetry.locate.lines._line_kernels import ACROSS, ALONG, AMPLITUDE, ANGLE, BACKGROUND, CURVE, OFFSET, SIGMA, TAPER, WIDTH, covered
-from pixmetry.locate.lines._profile_kernels import BAR, EDGE, clipped, invert, profile
-from pixmetry.locate.template._normal_kernels import cdf, pdf
+from pixmetry.locate._noise_kernels import Noise, stored, variance_of
+from pixmetry.locate.lines._line_kernels import (
+    ACROSS,
+    ALONG,
+    AMPLITUDE,
+    ANGLE,
+    BACKGROUND,
+    CURVE,
+    OFFSET,
+    SIGMA,
+    TAPER,
+    WIDTH,
+    Fits,
+    Lines,
+    covered,
+)
+from pixmetry.locate.lines._profile_kernels import BAR, EDGE, profile
 
 CENTROID, SQUARED, SOFT, TEMPLATE = 0, 1, 2, 3
 THRESHOLD = 3.0  # of the soft threshold, in standard deviations of the noise
@@ -18,8 +36,34 @@ FACTS = 6  # of a row: its number, position, variance of it, distance across fro
 MOST_STEPS = 8
 
 
+class Rows(NamedTuple):
+    """How the rows of lines are measured."""
+
+    law: int
+    aperture: float  # side of the pixel's square, px
+    noise: Noise
+
+
+class Row(NamedTuple):
+    """A row (column, for a flat line) of one line."""
+
+    section: int
+    p: Array  # of the whole line, shape (UNKNOWNS,)
+    slope: float  # how the distance across grows along the row
+    a: float  # sides of the pixel across the line, px
+    b: float
+    noise: Noise
+
+
+class Regressions(NamedTuple):
+    """Lines by regression over their rows."""
+
+    results: Array  # shape (n, 3 + 9): offset, angle, curvature against the fit of the whole line, and their covariance
+    told: Array  # shape (n, 3): chi², degrees of freedom, standard deviation of the offset by sub-pixel phase
+
+
 @jit
-def expected(law, q, v):
+def expected(law: int, q: float, v: float) -> tuple[float, float, float]:
     """Return mean and variance of the law's weight of a value with mean q and variance v, and its mean slope."""
     if law == CENTROID:
         return q, v, 1.0
@@ -33,7 +77,7 @@ def expected(law, q, v):
 
 
 @jit
-def weigh(law, q, v):
+def weigh(law: int, q: float, v: float) -> float:
     """The law's weight of a value q with variance v; the squares are freed of the noise's own."""
     if law == CENTROID:
         return q
@@ -43,20 +87,19 @@ def weigh(law, q, v):
 
 
 @jit
-def predicted_row(law, section, p, a, b, slope, at, first, count, noise, sign, pedestal, out):
+def predicted_row(law: int, row: Row, at: float, first: int, sign: float, pedestal: float, out: Array) -> tuple[float, float]:
     """Fill ``out`` with what a row's pixels hold on average: value, variance, weight, its variance, its slope, and the pixel's variance.
 
-    Return Σ weight and Σ weight·x.
-
-    ``slope``: how the distance across grows along the row; the line crosses it at ``at``. For an edge the values are steps from one pixel
-    to the next, ``sign`` times.
+    Return Σ weight and Σ weight·x. The line crosses the row at ``at``. For an edge the values are steps from one pixel to the next,
+    ``sign`` times.
     """
+    section, p, noise = row.section, row.p, row.noise
     total, moment = 0.0, 0.0
     before, v_before = 0.0, 0.0
-    for k in range(count):
-        d = (first + k - at) * slope
-        mean = p[AMPLITUDE] * profile(section, d, p[SIGMA], p[WIDTH], a, b)[0]
-        v = clipped(mean + pedestal, noise[0], noise[1], noise[2], noise[3], -1e30, 1e30)[1]
+    for k in range(len(out)):
+        d = (first + k - at) * row.slope
+        mean = p[AMPLITUDE] * profile(section, d, p[SIGMA], p[WIDTH], row.a, row.b)[0]
+        v = variance_of(max(mean + pedestal - noise.black_dn, 0.0), noise)
         if section != EDGE:
             q, vq, x = sign * mean, v, 1.0 * (first + k)
         else:
@@ -72,9 +115,9 @@ def predicted_row(law, section, p, a, b, slope, at, first, count, noise, sign, p
 
 
 @jit
-def predicted_variance(law, section, at, first, count, out, total):
+def predicted_variance(law: int, section: int, at: float, first: int, out: Array, total: float) -> tuple[float, float]:
     """Return the variance of a row's position and its change per DN of background (propagator P1 about the line's own place)."""
-    var, by_background = 0.0, 0.0
+    var, by_background, count = 0.0, 0.0, len(out)
     begin, middle = (1, 0.5) if section == EDGE else (0, 0.0)
     for k in range(begin, count):
         x = first + k - middle - at
@@ -87,26 +130,27 @@ def predicted_variance(law, section, at, first, count, out, total):
 
 
 @jit
-def first_of(section, at, half):
+def first_of(section: int, at: float, half: int) -> int:
     """First pixel of a row's window: the pixels, or the steps between them, lie about the one nearest to the line."""
     return int(math.floor(at + 0.5)) - half if section != EDGE else int(math.floor(at)) - half
 
 
 @jit
-def fit_row(section, p, a, b, slope, at, first, values, count, noise, pedestal):
+def fit_row(row: Row, at: float, first: int, values: Array, pedestal: float) -> tuple[float, float]:
     """Fit place, height and background of one row; return the place and its variance, NaN if that fails."""
+    p, slope = row.p, row.slope
     shift, height, ground = 0.0, p[AMPLITUDE], 0.0
     normal, inverse, right = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3)
     j = np.empty(3)
     for _ in range(MOST_STEPS):
         normal[:, :] = 0.0
         right[:] = 0.0
-        for k in range(count):
-            shape, by_d, _, _ = profile(section, (first + k - at - shift) * slope, p[SIGMA], p[WIDTH], a, b)
+        for k in range(len(values)):
+            shape, by_d, _, _ = profile(row.section, (first + k - at - shift) * slope, p[SIGMA], p[WIDTH], row.a, row.b)
             j[0], j[1], j[2] = -height * by_d * slope, shape, 1.0
             mean = pedestal + ground + height * shape
-            stored, v, gain = clipped(mean, noise[0], noise[1], noise[2], noise[3], noise[4], noise[5])
-            rest = values[k] - stored
+            kept, v, gain = stored(mean, row.noise)
+            rest = values[k] - kept
             for m in range(3):
                 right[m] += j[m] * gain * rest / v
                 for n in range(3):
@@ -125,11 +169,13 @@ def fit_row(section, p, a, b, slope, at, first, values, count, noise, pedestal):
 
 
 @jit
-def rows_of(frame, law, section, p, place, mine, places, cores, near, begin, end, aperture, noise, rows):
+def rows_of(frame: NDArray[np.generic], how: Rows, section: int, p: Array, mine: int, others: Lines, rows: Array) -> int:
     """Measure the rows of one line (columns, where the line is flat) into ``rows``, shape (most, FACTS); return their number.
 
     Rows whose window leaves the frame or meets another line are left out.
     """
+    law, aperture, place = how.law, how.aperture, others.places[mine]
+    begin, end = others.begin[mine], others.begin[mine + 1]
     angle = place[2] + p[ANGLE]
     c, s = math.cos(angle), math.sin(angle)
     c0, s0 = math.cos(place[2]), math.sin(place[2])
@@ -161,8 +207,8 @@ def rows_of(frame, law, section, p, place, mine, places, cores, near, begin, end
             col, row = (first + k, r) if steep else (r, first + k)
             values[k] = frame[row, col]
             for m in range(begin, end):
-                other = near[m]
-                if other != mine and covered(places[other], cores[other], angle, 0.5 * wide, col, row):
+                other = others.near[m]
+                if other != mine and covered(others.places[other], others.cores[other], angle, 0.5 * wide, col, row):
                     spoilt = True
         if spoilt:
             continue
@@ -174,13 +220,13 @@ def rows_of(frame, law, section, p, place, mine, places, cores, near, begin, end
         full[AMPLITUDE] *= 1.0 + p[TAPER] * along
         for k in range(count):
             values[k] -= by_row * (first + k - at)
-        by_background = 0.0
+        by_background, here = 0.0, Row(section, full, slope, a, b, how.noise)
         if law == TEMPLATE:
-            position, var = fit_row(section, full, a, b, slope, at, first, values, count, noise, pedestal)
+            position, var = fit_row(here, at, first, values, pedestal)
         else:
             sign = 1.0 if full[AMPLITUDE] * (slope if section == EDGE else 1.0) > 0.0 else -1.0
-            total, _ = predicted_row(law, section, full, a, b, slope, at, first, count, noise, sign, pedestal, out)
-            var, by_background = predicted_variance(law, section, at, first, count, out, total)
+            total, _ = predicted_row(law, here, at, first, sign, pedestal, out)
+            var, by_background = predicted_variance(law, section, at, first, out, total)
             by_background *= sign
             weight, moment = 0.0, 0.0
             for k in range(1 if section == EDGE else 0, count):
@@ -198,8 +244,9 @@ def rows_of(frame, law, section, p, place, mine, places, cores, near, begin, end
 
 
 @jit
-def phase_errors(law, section, p, angle, aperture, noise, errors):
+def phase_errors(how: Rows, section: int, p: Array, angle: float, errors: Array) -> None:
     """Put the noise-free errors of a row's position into ``errors`` for `PHASES` sub-pixel phases: distances across the line."""
+    law, aperture = how.law, how.aperture
     c, s = math.cos(angle), math.sin(angle)
     a, b = aperture * max(abs(c), abs(s)), aperture * min(abs(c), abs(s))
     slope = -s if abs(s) >= abs(c) else c
@@ -211,16 +258,17 @@ def phase_errors(law, section, p, angle, aperture, noise, errors):
     for j in range(PHASES):
         at = (j + 0.5) / PHASES
         first = first_of(section, at, half)
-        total, moment = predicted_row(law, section, p, a, b, slope, at, first, count, noise, sign, p[BACKGROUND], out)
+        total, moment = predicted_row(law, Row(section, p, slope, a, b, how.noise), at, first, sign, p[BACKGROUND], out)
         errors[j] = (moment / total - at) * slope
 
 
 @jit
-def regress(rows, n, unknowns, var_background, slope, errors, out, cov):
+def regress(rows: Array, unknowns: int, var_background: float, slope: float, errors: Array, out: Array, cov: Array) -> tuple[float, float]:
     """Fit offset, turn (and curvature) to the distances of rows from the template; return chi² and the standard deviation by phase.
 
     The covariance holds the rows' noise, the background they share, and the rows' errors by phase for any common phase.
     """
+    n = len(rows)
     normal, inverse, right, shared = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3), np.zeros(3)
     g = np.empty(3)
     for i in range(n):
@@ -265,33 +313,35 @@ def regress(rows, n, unknowns, var_background, slope, errors, out, cov):
 
 
 @jit
-def by_rows(frame, law, begin_line, stop_line, section, aperture, noise, values, covariances, places, cores, near, begin, results, told):
-    """Replace offset, angle and curvature of fitted lines by those from their rows; into ``results`` (n, 3 + 9) and ``told`` (n, 3).
+def regress_lines(
+    frame: NDArray[np.generic], span: tuple[int, int], how: Rows, section: Array, fits: Fits, lines: Lines, out: Regressions
+) -> None:
+    """Replace offset, angle and curvature of fitted lines, number ``span[0]`` to ``span[1]``, by those from their rows.
 
-    ``section``, shape (n,), is the one that was fitted. ``told``: chi², rows, standard deviation of the offset by sub-pixel phase.
+    ``section``, shape (n,), is the one that was fitted.
     """
     rows = np.empty((max(frame.shape[0], frame.shape[1]), FACTS))
-    errors, out, cov = np.zeros(PHASES), np.zeros(3), np.zeros((3, 3))
-    for i in range(begin_line, stop_line):
-        results[i] = np.nan
-        told[i] = np.nan
-        if not math.isfinite(values[i, 0]):
+    errors, found, cov = np.zeros(PHASES), np.zeros(3), np.zeros((3, 3))
+    for i in range(span[0], span[1]):
+        out.results[i] = np.nan
+        out.told[i] = np.nan
+        if not math.isfinite(fits.values[i, 0]):
             continue
-        p, kind = values[i], int(section[i])
-        angle = places[i, 2] + p[ANGLE]
-        n = rows_of(frame, law, kind, p, places[i], i, places, cores, near, begin[i], begin[i + 1], aperture, noise, rows)
-        unknowns = 3 if covariances[i, CURVE, CURVE] > 0.0 else 2
+        p, kind, covariance = fits.values[i], int(section[i]), fits.covariances[i]
+        angle = lines.places[i, 2] + p[ANGLE]
+        n = rows_of(frame, how, kind, p, i, lines, rows)
+        unknowns = 3 if covariance[CURVE, CURVE] > 0.0 else 2
         if n <= unknowns:
             continue
         errors[:] = 0.0
-        if law != TEMPLATE:
-            phase_errors(law, kind, p, angle, aperture, noise, errors)
+        if how.law != TEMPLATE:
+            phase_errors(how, kind, p, angle, errors)
         slope = -math.sin(angle) if abs(math.sin(angle)) >= abs(math.cos(angle)) else math.cos(angle)
-        out[:] = 0.0
+        found[:] = 0.0
         cov[:, :] = 0.0
-        chi, phase = regress(rows, n, unknowns, covariances[i, BACKGROUND, BACKGROUND], slope, errors, out, cov)
+        chi, phase = regress(rows[:n], unknowns, covariance[BACKGROUND, BACKGROUND], slope, errors, found, cov)
         if not math.isfinite(chi):
             continue
-        results[i, :3] = out
-        results[i, 3:] = cov.ravel()
-        told[i, 0], told[i, 1], told[i, 2] = chi, n - unknowns, phase
+        out.results[i, :3] = found
+        out.results[i, 3:] = cov.ravel()
+        out.told[i, 0], out.told[i, 1], out.told[i, 2] = chi, n - unknowns, phase

@@ -1,4 +1,4 @@
-"""Kernels of straight profiles: steps, lines and bars, blurred by a Gaussian and averaged over the square pixel, and clipped grey values.
+"""Kernels of straight profiles: steps, lines and bars, blurred by a Gaussian and averaged over the square pixel.
 
 A straight structure depends on the distance d across it only. The pixel's square, projected on that direction, is a trapezoid: the
 convolution of two boxes as wide as the pixel's sides times the direction's cosines. The average of a function over it is a second
@@ -9,18 +9,15 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
+from pixmetry.core._normal_kernels import LIMIT, ROOT, both, cdf, pdf
 from pixmetry.core.jit import jit
-from pixmetry.locate.template._normal_kernels import LIMIT, ROOT, both, cdf, pdf
 
 EDGE, GAUSSIAN, BAR = 0, 1, 2  # sections: a blurred step; a Gaussian; a bar of some width, blurred
 THIN = 0.05  # a box narrower than this (px) acts as its variance (error below 1e-7 of the height)
-NEAR = 4.5  # standard deviations from an end of the scale within which clipping is looked at
 
 
 @jit
-def step(d, s, a, b):
+def step(d: float, s: float, a: float, b: float) -> tuple[float, float, float, float]:
     """Return a blurred step, 0 at d = −∞ and 1 at ∞, averaged over boxes of widths a ≥ b, and its first three derivatives in d.
 
     Its derivative with respect to s is s times the second derivative in d (heat equation).
@@ -58,7 +55,7 @@ def step(d, s, a, b):
 
 
 @jit
-def profile(section, d, s, w, a, b):
+def profile(section: int, d: float, s: float, w: float, a: float, b: float) -> tuple[float, float, float, float]:
     """Return the height of a section, its slope in d, and its derivatives with respect to s and w.
 
     The step rises from 0 to 1; the Gaussian is 1 at its middle before the pixel's average, the bar before its blur.
@@ -73,55 +70,3 @@ def profile(section, d, s, w, a, b):
     p0, p1, p2, _ = step(d + 0.5 * w, s, a, b)
     m0, m1, m2, _ = step(d - 0.5 * w, s, a, b)
     return p0 - m0, p1 - m1, s * (p2 - m2), 0.5 * (p1 + m1)
-
-
-@jit
-def clipped(mean, constant, slope, pattern, black, low, high):
-    """Return mean and variance of the stored value of a pixel with this mean before the scale's ends, and the slope of the former."""
-    light = max(mean - black, 0.0)
-    v = constant + slope * light + (pattern * light) ** 2
-    s = math.sqrt(v)
-    if mean - low > NEAR * s and high - mean > NEAR * s:
-        return mean, v, 1.0
-    below, above = low - mean, high - mean
-    a, b = below / s, above / s
-    ca, cb, fa, fb = cdf(a), cdf(b), pdf(a), pdf(b)
-    first = below * ca + above * (1.0 - cb) + s * (fa - fb)
-    second = below * below * ca + above * above * (1.0 - cb) + v * (cb - ca + a * fa - b * fb)
-    return mean + first, max(second - first * first, 0.02 * v), max(cb - ca, 1e-6)
-
-
-@jit
-def invert(matrix, count, out):
-    """Put the inverse of the leading part of a symmetric positive matrix into ``out``; False if it is not positive."""
-    scale = np.empty(count)
-    for i in range(count):
-        if not matrix[i, i] > 0.0:
-            return False
-        scale[i] = 1.0 / math.sqrt(matrix[i, i])
-    low = np.zeros((count, count))
-    for i in range(count):
-        for j in range(i + 1):
-            total = matrix[i, j] * scale[i] * scale[j]
-            for k in range(j):
-                total -= low[i, k] * low[j, k]
-            if i == j:
-                if not total > 1e-12:
-                    return False
-                low[i, i] = math.sqrt(total)
-            else:
-                low[i, j] = total / low[j, j]
-    for i in range(count):  # the inverse of the triangle, in place
-        low[i, i] = 1.0 / low[i, i]
-        for j in range(i):
-            total = 0.0
-            for k in range(j, i):
-                total += low[i, k] * low[k, j]
-            low[i, j] = -total * low[i, i]
-    for i in range(count):
-        for j in range(i + 1):
-            total = 0.0
-            for k in range(i, count):
-                total += low[k, i] * low[k, j]
-            out[i, j] = out[j, i] = total * scale[i] * scale[j]
-    return True

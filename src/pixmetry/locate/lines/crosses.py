@@ -15,7 +15,7 @@ from pixmetry.locate.lines._profile_kernels import BAR, GAUSSIAN
 from pixmetry.locate.lines.line_candidates import LineCandidates
 from pixmetry.locate.lines.line_detection import find_lines
 from pixmetry.locate.lines.lines import DEG, LEAST_BLUR_PX, PIXEL, Fit, fit_template
-from pixmetry.locate.noise import NoiseModel, noise_numbers
+from pixmetry.locate.noise import NoiseModel
 
 LEAST_ANGLE_DEG = 15.0
 CHUNK = 8  # crosses a task
@@ -126,25 +126,23 @@ def cross_positions(
     fit = fit_template(frame, candidates.lines, noise, "line", section, (False, False, "auto"), aperture_px, threads)
     pairs = np.stack([candidates.first, candidates.second], axis=1).astype(np.int64).reshape(-1, 2)
     crossing, angles = _start_places(fit, pairs)
-    sections = np.where((fit.told[pairs, 4] == BAR).any(axis=1), BAR, GAUSSIAN)
+    sections = np.where((fit.fits.told[pairs, 4] == BAR).any(axis=1), BAR, GAUSSIAN)
     start = _start_values(fit, pairs, sections)
     blur = np.hypot(start[:, kernels.SIGMA_1 : kernels.SIGMA_2 + 1], PIXEL)
     half_width = 0.5 * start[:, kernels.WIDTH_1 : kernels.WIDTH_2 + 1] * (sections == BAR)[:, None]
     reach, cores = half_width + 5.0 * blur + 1.0, half_width + 3.5 * blur + 0.3
     arms = _arms(fit, pairs, crossing, angles, arm_px)
-    near, begin = _near(fit, crossing, arm_px + reach.max(initial=0.0))
-    found, covariances, told = np.empty((n, 14)), np.empty((n, 14, 14)), np.empty((n, 4))
-    arrays = [np.ascontiguousarray(a) for a in (crossing, angles, arms, reach, cores)]
-    numbers, lines = noise_numbers(noise, frame.dtype), (fit.places, fit.cores, near, pairs)
-
-    def part(first: int) -> None:
-        last = min(first + CHUNK, n)
-        kernels.fit_crosses(
-            frame, first, last, sections, bool(plane), float(aperture_px), numbers, *arrays, lines, begin, start, found, covariances, told
-        )
-
+    begin, near = _near(fit, crossing, arm_px + reach.max(initial=0.0))
+    lines = whole.Lines(fit.lines.places, fit.lines.cores, begin, near)
     usable = np.isfinite(start).all(axis=1)
     start[~usable] = np.where(np.isfinite(start[~usable]), start[~usable], 1.0)
+    crosses = kernels.Crosses(crossing, angles, arms, reach, cores, pairs, lines, sections, start)
+    found, covariances, told = np.empty((n, 14)), np.empty((n, 14, 14)), np.empty((n, 4))
+    fits, numbers = kernels.Fits(found, covariances, told), noise.numbers(frame.dtype)
+
+    def part(first: int) -> None:
+        kernels.fit_crosses(frame, (first, min(first + CHUNK, n)), bool(plane), float(aperture_px), numbers, crosses, fits)
+
     map_tiles(part, range(0, n, CHUNK), threads)
     found[~usable] = np.nan
     return _cross_record(candidates, crossing, angles, found, covariances, told, sections)
@@ -152,7 +150,7 @@ def cross_positions(
 
 def _start_places(fit: Fit, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Intersections of the fitted lines, curved ones by two steps, and their directions there."""
-    p, places = np.nan_to_num(fit.values), fit.places
+    p, places = np.nan_to_num(fit.fits.values), fit.lines.places
     angle = places[:, 2] + p[:, whole.ANGLE]
     x, y = places[:, 0] - np.sin(angle) * p[:, whole.OFFSET], places[:, 1] + np.cos(angle) * p[:, whole.OFFSET]
     a, b = pairs.T
@@ -171,12 +169,12 @@ def _start_places(fit: Fit, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _start_values(fit: Fit, pairs: np.ndarray, sections: np.ndarray) -> np.ndarray:
-    p = fit.values[pairs]  # (n, 2, …)
+    p = fit.fits.values[pairs]  # (n, 2, …)
     start = np.zeros((len(pairs), kernels.UNKNOWNS))
     start[:, kernels.BACKGROUND] = p[:, :, whole.BACKGROUND].mean(axis=1)
     start[:, [kernels.HEIGHT_1, kernels.HEIGHT_2]] = p[:, :, whole.AMPLITUDE]
     start[:, [kernels.SIGMA_1, kernels.SIGMA_2]] = p[:, :, whole.SIGMA]
-    thin = (fit.told[pairs, 4] != BAR) & (sections == BAR)[:, None]
+    thin = (fit.fits.told[pairs, 4] != BAR) & (sections == BAR)[:, None]
     width = np.where(thin, 1.5 * p[:, :, whole.SIGMA], p[:, :, whole.WIDTH])
     start[:, [kernels.WIDTH_1, kernels.WIDTH_2]] = width
     start[:, [kernels.HEIGHT_1, kernels.HEIGHT_2]] *= np.where(thin, 1.9, 1.0)
@@ -190,7 +188,7 @@ def _arms(fit: Fit, pairs: np.ndarray, crossing: np.ndarray, angles: np.ndarray,
     """Least and greatest place along the first and along the second line, from the crossing, shape (n, 4)."""
     out = []
     for side in range(2):
-        place = fit.places[pairs[:, side]]
+        place = fit.lines.places[pairs[:, side]]
         c, s = np.cos(place[:, 2]), np.sin(place[:, 2])
         at = c * (crossing[:, 0] - place[:, 0]) + s * (crossing[:, 1] - place[:, 1])
         out += [np.maximum(place[:, 3] - at, -arm_px), np.minimum(place[:, 4] - at, arm_px)]
@@ -199,17 +197,17 @@ def _arms(fit: Fit, pairs: np.ndarray, crossing: np.ndarray, angles: np.ndarray,
 
 def _near(fit: Fit, crossing: np.ndarray, reach_px: float) -> tuple[np.ndarray, np.ndarray]:
     """Which lines come within reach of each crossing."""
-    place = fit.places
+    place = fit.lines.places
     c, s = np.cos(place[:, 2]), np.sin(place[:, 2])
     begin, found = np.zeros(len(crossing) + 1, np.int64), []
     for i, (x, y) in enumerate(crossing):
         u, v = x - place[:, 0], y - place[:, 1]
         t = np.clip(c * u + s * v, place[:, 3], place[:, 4])
         sag = 0.5 * np.abs(place[:, 5]) * t * t
-        near = np.flatnonzero(np.hypot(u - c * t, v - s * t) < 1.5 * reach_px + fit.cores + sag)
+        near = np.flatnonzero(np.hypot(u - c * t, v - s * t) < 1.5 * reach_px + fit.lines.cores + sag)
         found.append(near)
         begin[i + 1] = begin[i] + len(near)
-    return (np.concatenate(found).astype(np.int64) if found else np.zeros(0, np.int64)), begin
+    return begin, np.concatenate(found).astype(np.int64) if found else np.zeros(0, np.int64)
 
 
 def _cross_record(

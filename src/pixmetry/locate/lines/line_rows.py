@@ -13,7 +13,7 @@ from pixmetry.locate.lines import _line_kernels as whole
 from pixmetry.locate.lines import _line_row_kernels as kernels
 from pixmetry.locate.lines.line_candidates import LineCandidates
 from pixmetry.locate.lines.lines import CHUNK, ROW_ESTIMATORS, Fit, fit_template, oriented, placed
-from pixmetry.locate.noise import NoiseModel, noise_numbers
+from pixmetry.locate.noise import NoiseModel
 
 LAWS = {
     "row_centroid": kernels.CENTROID,
@@ -83,19 +83,17 @@ def line_rows(
     if estimator not in ROW_ESTIMATORS:
         raise InputError("no such estimator of rows", value=estimator, allowed=", ".join(ROW_ESTIMATORS))
     fit = fit_template(frame, candidates, noise, kind, section, ("auto", "auto", curvature), aperture_px, threads)
-    numbers, law = noise_numbers(noise, frame.dtype), LAWS[estimator]
+    how, p, section_of = kernels.Rows(LAWS[estimator], fit.aperture_px, noise.numbers(frame.dtype)), fit.fits.values, fit.fits.told[:, 4]
 
     def one(i: int) -> np.ndarray:
         rows = np.empty((max(frame.shape), kernels.FACTS))
-        near, begin = fit.near
-        arguments = (int(fit.told[i, 4]), fit.values[i], fit.places[i], i, fit.places, fit.cores, near, begin[i], begin[i + 1])
-        n = kernels.rows_of(frame, law, *arguments, fit.aperture_px, numbers, rows) if np.isfinite(fit.values[i, 0]) else 0
+        n = kernels.rows_of(frame, how, int(section_of[i]), p[i], i, fit.lines, rows) if np.isfinite(p[i, 0]) else 0
         return rows[:n].copy()
 
     parts = map_tiles(one, range(len(candidates)), threads)
     table = np.concatenate(parts) if parts else np.empty((0, kernels.FACTS))
     line = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
-    angle = fit.places[:, 2] + fit.values[:, whole.ANGLE]
+    angle = fit.lines.places[:, 2] + p[:, whole.ANGLE]
     flat = np.abs(np.sin(angle)) < np.abs(np.cos(angle))
     return LineRows(line, flat[line], table[:, 0].astype(np.int64), table[:, 1], table[:, 2], table[:, 3], table[:, 4])
 
@@ -107,32 +105,30 @@ def replace_by_rows(
 
     The variances of the rows follow from the template's profile (propagator P1), so that their weights do not answer to the noise.
     """
-    n = len(fit.places)
+    fits, places, n = fit.fits, fit.lines.places, len(fit.lines.places)
     results, told = np.full((n, 12), np.nan), np.full((n, 3), np.nan)
-    numbers, section = noise_numbers(noise, frame.dtype), np.nan_to_num(fit.told[:, 4])
-    near, begin = fit.near
+    how, section = kernels.Rows(LAWS[estimator], fit.aperture_px, noise.numbers(frame.dtype)), np.nan_to_num(fits.told[:, 4])
 
     def part(first: int) -> None:
-        last = min(first + CHUNK, n)
-        found = (fit.values, fit.covariances, fit.places, fit.cores, near, begin)
-        kernels.by_rows(frame, LAWS[estimator], first, last, section, fit.aperture_px, numbers, *found, results, told)
+        span = first, min(first + CHUNK, n)
+        kernels.regress_lines(frame, span, how, section, fits, fit.lines, kernels.Regressions(results, told))
 
     map_tiles(part, range(0, n, CHUNK), threads)
-    p = fit.values.copy()
+    p = fits.values.copy()
     for column, k in enumerate((whole.OFFSET, whole.ANGLE, whole.CURVE)):
         p[:, k] += results[:, column]
-    cov = np.full_like(fit.covariances, np.nan)
+    cov = np.full_like(fits.covariances, np.nan)
     order = [whole.OFFSET, whole.ANGLE, whole.CURVE]
     cov[np.ix_(range(n), order, order)] = results[:, 3:].reshape(n, 3, 3)
-    angle = fit.places[:, 2] + p[:, whole.ANGLE]
+    angle = places[:, 2] + p[:, whole.ANGLE]
     lost = ~np.isfinite(results[:, 0])
     dof = np.maximum(told[:, 1], 1.0)
     changed = {"s_curve_px": told[:, 2], "chi2_per_dof": told[:, 0] / dof, "dof": dof}
-    more = template.more | oriented(fit.places, p, angle, cov, fit.section == 0) | changed
+    more = template.more | oriented(places, p, angle, cov, fit.section == 0) | changed
     flags = template.flags & ~np.uint32(Flag.POOR_FIT)
     excess = changed["chi2_per_dof"] - 1.0 - 5.0 * np.sqrt(2.0 / dof)
     with np.errstate(invalid="ignore"):
         flags = flags | np.where(excess > 0.1, np.uint32(Flag.POOR_FIT), np.uint32(0))
     flags = np.where(lost, flags | np.uint32(Flag.NOT_CONVERGED), flags)
-    moved = placed(fit.places, p[:, whole.OFFSET], angle, cov[:, whole.OFFSET, whole.OFFSET], more, flags)
+    moved = placed(places, p[:, whole.OFFSET], angle, cov[:, whole.OFFSET, whole.OFFSET], more, flags)
     return replace(moved, more=more)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from pixmetry.locate.detect.targets import Flag, Positions
 from pixmetry.locate.lines import _line_kernels as kernels
 from pixmetry.locate.lines._profile_kernels import BAR, EDGE, GAUSSIAN
 from pixmetry.locate.lines.line_candidates import LineCandidates, near_lines, stretches
-from pixmetry.locate.noise import NoiseModel, noise_numbers
+from pixmetry.locate.noise import NoiseModel
 
 SECTIONS = {"edge": EDGE, "gaussian": GAUSSIAN, "bar": BAR}
 CHOICES = {False: kernels.OFF, True: kernels.ON, "auto": kernels.AUTO}
@@ -163,15 +164,15 @@ def line_positions(
     return _positions(fit, candidates, frame.shape)
 
 
+@dataclass(frozen=True)
 class Fit:
-    """What the whole-line template found: where it looked, and parameters, covariances and what it met, as the kernel gives them."""
+    """What the whole-line template found, and where it looked."""
 
-    def __init__(self, section: int, places: np.ndarray, reach: np.ndarray, cores: np.ndarray, near: tuple, aperture_px: float) -> None:
-        n = len(places)
-        self.section, self.places, self.reach, self.cores, self.near, self.aperture_px = section, places, reach, cores, near, aperture_px
-        self.values = np.full((n, kernels.UNKNOWNS), np.nan)
-        self.covariances = np.full((n, kernels.UNKNOWNS, kernels.UNKNOWNS), np.nan)
-        self.told = np.full((n, 5), np.nan)
+    section: int
+    lines: kernels.Lines
+    reach: np.ndarray
+    aperture_px: float
+    fits: kernels.Fits
 
 
 def fit_template(
@@ -184,42 +185,43 @@ def fit_template(
     aperture_px: float,
     threads: int | None,
 ) -> Fit:
+    """Fit the template of whole lines; ``options`` are those of the background's plane, the taper and the curvature."""
     if any(option not in CHOICES for option in options):
         raise InputError("an option of the fit cannot be used", value=options, allowed="True, False, auto")
     blur = np.hypot(candidates.blur_px, PIXEL)
     spread = blur if kind == "line" else 1.6 * blur
     reach = 0.5 * candidates.width_px + 5.0 * spread + (1.0 if kind == "line" else 2.0)
     places = stretches(candidates, frame.shape, 2.5 * blur + 0.5)
-    cores = np.ascontiguousarray(candidates.core_px)
-    begin, near = near_lines(places, reach, cores)
+    cores, n = np.ascontiguousarray(candidates.core_px), len(candidates)
+    lines = kernels.Lines(places, cores, *near_lines(places, reach, cores))
     code = EDGE if kind == "edge" else GAUSSIAN if section == "auto" else SECTIONS[section]
-    fit = Fit(code, places, reach, cores, (near, begin), aperture_px)
     width = np.where(candidates.width_px > 0, candidates.width_px, candidates.blur_px if section == "bar" else 0.1)
     start = np.stack([candidates.background_dn, candidates.amplitude_dn, np.maximum(candidates.blur_px, 0.2), width], axis=1)
     choices = np.array([CHOICES[option] for option in options])
-    arguments = (code, kind == "line" and section == "auto", choices, float(aperture_px), noise_numbers(noise, frame.dtype), places, reach)
+    how = kernels.How(code, kind == "line" and section == "auto", choices, float(aperture_px), noise.numbers(frame.dtype))
+    unknowns = kernels.UNKNOWNS
+    fits = kernels.Fits(np.full((n, unknowns), np.nan), np.full((n, unknowns, unknowns), np.nan), np.full((n, 5), np.nan))
 
     def part(first: int) -> None:
-        last = min(first + CHUNK, len(places))
-        kernels.fit_lines(frame, first, last, *arguments, start, cores, near, begin, fit.values, fit.covariances, fit.told)
+        kernels.fit_lines(frame, first, min(first + CHUNK, n), how, kernels.Candidates(lines, reach, start), fits)
 
-    map_tiles(part, range(0, len(places), CHUNK), threads)
-    return fit
+    map_tiles(part, range(0, n, CHUNK), threads)
+    return Fit(code, lines, reach, float(aperture_px), fits)
 
 
 def _positions(fit: Fit, candidates: LineCandidates, frame_shape: tuple[int, int]) -> Positions:
-    p, cov = fit.values, fit.covariances
+    p, cov, places = fit.fits.values, fit.fits.covariances, fit.lines.places
     known = np.isfinite(p[:, 0])
-    chi2, pixels, unknowns, met, section = fit.told.T
+    chi2, pixels, unknowns, _, section = fit.fits.told.T
     dof = np.maximum(np.where(known, pixels - unknowns, np.nan), 1.0)
-    angle = fit.places[:, 2] + p[:, kernels.ANGLE]
+    angle = places[:, 2] + p[:, kernels.ANGLE]
     filled = np.nan_to_num(cov)
     held = {
         "sigma_px": p[:, kernels.SIGMA],
         "width_px": np.where(section == BAR, p[:, kernels.WIDTH], np.where(known, 0.0, np.nan)),
         "taper_per_px": p[:, kernels.TAPER],
-        "background_x_dn_per_px": _slope_x(p, fit.places[:, 2]),
-        "background_y_dn_per_px": _slope_y(p, fit.places[:, 2]),
+        "background_x_dn_per_px": _slope_x(p, places[:, 2]),
+        "background_y_dn_per_px": _slope_y(p, places[:, 2]),
         "var_sigma_px2": np.where(known, filled[:, kernels.SIGMA, kernels.SIGMA], np.nan),
         "var_amplitude_dn2": np.where(known, filled[:, kernels.AMPLITUDE, kernels.AMPLITUDE], np.nan),
         "length_px": candidates.length_px,
@@ -227,8 +229,8 @@ def _positions(fit: Fit, candidates: LineCandidates, frame_shape: tuple[int, int
         "chi2_per_dof": chi2 / dof,
         "dof": dof,
     }
-    more = oriented(fit.places, p, angle, cov, fit.section == EDGE) | held
-    return placed(fit.places, p[:, kernels.OFFSET], angle, cov[:, kernels.OFFSET, kernels.OFFSET], more, _flags(fit, candidates, more))
+    more = oriented(places, p, angle, cov, fit.section == EDGE) | held
+    return placed(places, p[:, kernels.OFFSET], angle, cov[:, kernels.OFFSET, kernels.OFFSET], more, _flags(fit, candidates, more))
 
 
 def placed(
@@ -273,7 +275,7 @@ def _slope_y(p: np.ndarray, angle: np.ndarray) -> np.ndarray:
 
 
 def _flags(fit: Fit, candidates: LineCandidates, more: dict[str, np.ndarray]) -> np.ndarray:
-    p, met = fit.values, np.nan_to_num(fit.told[:, 3]).astype(np.int64)
+    p, met = fit.fits.values, np.nan_to_num(fit.fits.told[:, 3]).astype(np.int64)
     excess = more["chi2_per_dof"] - 1.0 - 5.0 * np.sqrt(2.0 / more["dof"])
     # noise alone is often fitted best by a blur as wide as the window
     blur = np.minimum(p[:, kernels.SIGMA], BLUR_REACH * candidates.blur_px)

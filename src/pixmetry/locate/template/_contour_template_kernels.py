@@ -17,11 +17,14 @@ where light that falls off over the shape is asked for, two more hold its first 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from pixmetry.core._linear_algebra_kernels import Array
+from pixmetry.core._normal_kernels import both, cdf, pdf
 from pixmetry.core.jit import jit
-from pixmetry.locate.template._normal_kernels import both, cdf, pdf
 
 DISC, ELLIPSE, RING, SPOT = 0, 1, 2, 3
 SHAPES = np.array([1, 3, 2, 0])  # parameters of the outline
@@ -33,21 +36,34 @@ PHASES = 5.0  # entries of a table per standard deviation: cubic interpolation o
 THIN = 0.005  # a box narrower than this share of the blur is a point (error 1e-6)
 FUSED = {"fastmath": {"contract"}}
 
+Singles = NDArray[np.float32]
+
+
+class Canvas(NamedTuple):
+    """What a shape is drawn on, and what is looked up for it."""
+
+    planes: Singles  # shape (rows, (`PAD` + columns + `PAD`) · 8): F, x, y, outline …, blur of a pixel side by side
+    points: Array  # shape (at least points + 1, 7): those of an outline, see `outline`; after them its centre
+    table: Singles  # see `fill_table`
+    across: Singles  # shape (blocks, 40): a point's g and its kin along the row
+    down: Singles  # and along the column
+    parts: Singles  # shape (3, 64): what a point adds to eight pixels, times g, g' and the fall of G
+
 
 @jit
-def reach_px(blur, aperture):
+def reach_px(blur: float, aperture: float) -> int:
     """Whole pixels to either side that a point of the outline reaches."""
     return int(math.ceil(0.5 * aperture + REACH * blur))
 
 
 @jit
-def block_count(half):
+def block_count(half: int) -> int:
     """Blocks of eight offsets that a reach takes."""
     return (2 * half + 7) // 8
 
 
 @jit
-def fill_table(table, phases, half, blur, aperture):
+def fill_table(table: Singles, phases: int, half: int, blur: float, aperture: float) -> None:
     """Fill G, g, g', g'', the first moment m of g below z, and m' = z g at z = phase − offset, offset −half + 1, −half + 2, ….
 
     ``table`` has shape (at least phases + 1, blocks · 48): block after block of eight offsets, in each these six, one after the other, so
@@ -84,7 +100,7 @@ def fill_table(table, phases, half, blur, aperture):
 
 
 @jit
-def cubic(phases, f):
+def cubic(phases: int, f: float) -> tuple[int, np.float32, np.float32, np.float32, np.float32]:
     """First of the two entries of a table about phase f, and the weights of both and of their slopes."""
     at = f * phases
     m = min(int(at), phases - 1)
@@ -94,7 +110,7 @@ def cubic(phases, f):
 
 
 @jit
-def outline(points, kind, inner, p):
+def outline(points: Array, kind: int, inner: bool, p: Array) -> int:
     """Fill the points of an outline and return how many: u, v, du, dv, and the weights ∂u/∂θ dv − ∂v/∂θ du of the shape's parameters."""
     if kind == ELLIPSE:
         a, b, c = p[2], p[3], p[4]
@@ -122,24 +138,28 @@ def outline(points, kind, inner, p):
 
 
 @jit
-def phase_count(blur):
+def phase_count(blur: float) -> int:
     """Entries of the table per pixel."""
     return max(4, int(math.ceil(PHASES / blur)))
 
 
 @jit
-def point_count(longest, blur):
+def point_count(longest: float, blur: float) -> int:
     """Points of an outline: the spacing that the blur asks for, at the longest half axis."""
     return max(LEAST_POINTS, int(math.ceil(2.0 * math.pi * longest / (STEP * blur))))
 
 
 @jit(**FUSED)
-def draw_outline(planes, images, points, count, shapes, blur, aperture, light, gx, gy, table, across, down, parts):
-    """Add an outline to the planes; plane 0 gets the difference of F from row to row. (gx, gy) is the light's slope per pixel.
+def draw_outline(
+    images: Array, canvas: Canvas, count: int, shapes: int, blur: float, aperture: float, light: bool, slope: tuple[float, float]
+) -> None:
+    """Add an outline to the planes; plane 0 gets the difference of F from row to row. ``slope`` is the light's per pixel.
 
-    ``planes`` has shape (rows, (`PAD` + columns + `PAD`) · 8), the planes of a pixel side by side: F, x, y, outline …, blur. With ``light``
-    the first moments about the pixel go to the last two images.
+    With ``light`` the first moments about the pixel go to the last two images.
     """
+    planes, points, table = canvas.planes, canvas.points, canvas.table
+    across, down, parts = canvas.across, canvas.down, canvas.parts
+    gx, gy = slope
     half = reach_px(blur, aperture)
     phases = phase_count(blur)
     blocks = block_count(half)
@@ -187,17 +207,17 @@ def draw_outline(planes, images, points, count, shapes, blur, aperture, light, g
                         across[row, 8 + i] = across[row, 16 + i] = zero
             if shapes == 1:
                 for i in range(8):
-                    g, slope, at = across[row, np.uint64(8 + i)], across[row, np.uint64(16 + i)], np.uint64(8 * i)
+                    g, rise, at = across[row, np.uint64(8 + i)], across[row, np.uint64(16 + i)], np.uint64(8 * i)
                     one[at + np.uint64(1)], one[at + np.uint64(2)], one[at + np.uint64(3)], three[at] = x1 * g, y1 * g, s1 * g, f3 * g
-                    one[at + np.uint64(4)], two[at + np.uint64(4)] = b0 * g + b1 * slope, b2 * g
+                    one[at + np.uint64(4)], two[at + np.uint64(4)] = b0 * g + b1 * rise, b2 * g
             else:
                 for i in range(8):
-                    g, slope, at = across[row, np.uint64(8 + i)], across[row, np.uint64(16 + i)], np.uint64(8 * i)
+                    g, rise, at = across[row, np.uint64(8 + i)], across[row, np.uint64(16 + i)], np.uint64(8 * i)
                     one[at + np.uint64(1)], one[at + np.uint64(2)], three[at] = x1 * g, y1 * g, f3 * g
                     one[at + np.uint64(3)], one[at + np.uint64(4)] = s1 * g, s2 * g
                     if shapes == 3:
                         one[at + np.uint64(5)] = s3 * g
-                    one[at + last], two[at + last] = b0 * g + b1 * slope, b2 * g
+                    one[at + last], two[at + last] = b0 * g + b1 * rise, b2 * g
             start = 8 * min(max(first, 0), cols - 8)
             if start != 8 * first:
                 slide(parts, start // 8 - first)
@@ -209,13 +229,13 @@ def draw_outline(planes, images, points, count, shapes, blur, aperture, light, g
                 below = down[j >> 3, j & 7] if j < n else zero
                 fall = above - below
                 above = below
-                g, slope = zero, zero
+                g, rise = zero, zero
                 if j < n and r >= 0:
-                    g, slope = down[j >> 3, 8 + (j & 7)], down[j >> 3, 16 + (j & 7)]
+                    g, rise = down[j >> 3, 8 + (j & 7)], down[j >> 3, 16 + (j & 7)]
                 # F of row 0 sums what is above it
                 to, at = np.uint64(max(r, 0)), np.uint64(start)
                 for i in range(64):
-                    planes[to, at + np.uint64(i)] += g * one[i] + slope * two[i] + fall * three[i]
+                    planes[to, at + np.uint64(i)] += g * one[i] + rise * two[i] + fall * three[i]
                 if light and j < n and r >= 0:
                     moment = down[j >> 3, 32 + (j & 7)]
                     for i in range(8):
@@ -226,7 +246,7 @@ def draw_outline(planes, images, points, count, shapes, blur, aperture, light, g
 
 
 @jit
-def slide(parts, by):
+def slide(parts: Singles, by: int) -> None:
     """Move eight pixels of the parts, so that each stays where it was when they are written ``by`` pixels further on."""
     for k in range(3):
         for i in range(64) if by > 0 else range(63, -1, -1):
@@ -234,7 +254,7 @@ def slide(parts, by):
 
 
 @jit
-def spread_planes(planes, images, count):
+def spread_planes(planes: Singles, images: Array, count: int) -> None:
     """Write the planes as images, F summed over the rows."""
     for r in range(images.shape[1]):
         for c in range(images.shape[2]):
@@ -246,7 +266,7 @@ def spread_planes(planes, images, count):
 
 
 @jit
-def draw_spot(images, p, aperture):
+def draw_spot(images: Array, p: Array, aperture: float) -> None:
     """Draw a Gaussian spot of height 1, averaged over the pixels, and its derivatives."""
     x, y, s = p[0], p[1], p[2]
     rows, cols = images.shape[1], images.shape[2]
@@ -262,7 +282,7 @@ def draw_spot(images, p, aperture):
 
 
 @jit
-def spot_profile(out, centre, s, aperture):
+def spot_profile(out: Array, centre: float, s: float, aperture: float) -> None:
     """A Gaussian of height 1 averaged over the aperture, its derivative by the centre and by its standard deviation."""
     area = math.sqrt(2.0 * math.pi) * s
     for i in range(out.shape[1]):
@@ -280,7 +300,7 @@ def spot_profile(out, centre, s, aperture):
 
 
 @jit
-def draw(images, planes, kind, p, aperture, light, surface, points, table, across, down, parts):
+def draw(images: Array, canvas: Canvas, kind: int, p: Array, aperture: float, light: bool, surface: bool) -> None:
     """Fill the images of a shape with centre (p[0], p[1]) in their own pixels; the last 4 of ``p`` are the planes of background and light.
 
     ``surface``: the light falls off over the shape, before the blur; its slopes then enter the derivatives by the outline and the blur.
@@ -291,32 +311,33 @@ def draw(images, planes, kind, p, aperture, light, surface, points, table, acros
     if kind == SPOT:
         draw_spot(images, p, aperture)
         return
-    draw_planes(images, planes, kind, p, aperture, light and surface, points, table, across, down, parts)
-    spread_planes(planes, images, 4 + shapes)
+    draw_planes(images, canvas, kind, p, aperture, light and surface)
+    spread_planes(canvas.planes, images, 4 + shapes)
 
 
 @jit
-def draw_planes(images, planes, kind, p, aperture, light, points, table, across, down, parts):
+def draw_planes(images: Array, canvas: Canvas, kind: int, p: Array, aperture: float, light: bool) -> None:
     """Draw all outlines of a shape; see `draw_outline`."""
     shapes = SHAPES[kind]
-    planes[:] = np.float32(0.0)
-    gx, gy = (p[shapes + 7], p[shapes + 8]) if light else (0.0, 0.0)
+    points = canvas.points
+    canvas.planes[:] = np.float32(0.0)
+    slope = (p[shapes + 7], p[shapes + 8]) if light else (0.0, 0.0)
     for inner in range(2 if kind == RING else 1):
         count = outline(points, kind, inner == 1, p)
         points[count, 0], points[count, 1] = p[0], p[1]
-        draw_outline(planes, images, points, count, shapes, p[2 + shapes], aperture, light, gx, gy, table, across, down, parts)
+        draw_outline(images, canvas, count, shapes, p[2 + shapes], aperture, light, slope)
 
 
 @jit
-def draw_plain(images, planes, kind, p, aperture, points, table, across, down, parts):
+def draw_plain(images: Array, canvas: Canvas, kind: int, p: Array, aperture: float) -> None:
     """`draw` and `complete` in one, where neither background nor light have a slope among the unknowns."""
     k = SHAPES[kind] + 3
     if kind == SPOT:
-        draw(images, planes, kind, p, aperture, False, False, points, table, across, down, parts)
+        draw(images, canvas, kind, p, aperture, False, False)
         complete(images, kind, p, False, False)
         return
-    draw_planes(images, planes, kind, p, aperture, False, points, table, across, down, parts)
-    amplitude, background = p[k], p[k + 1]
+    draw_planes(images, canvas, kind, p, aperture, False)
+    planes, amplitude, background = canvas.planes, p[k], p[k + 1]
     for r in range(images.shape[1]):
         for c in range(images.shape[2]):
             at = 8 * (c + PAD)
@@ -327,7 +348,7 @@ def draw_plain(images, planes, kind, p, aperture, points, table, across, down, p
 
 
 @jit
-def complete(images, kind, p, light, surface):
+def complete(images: Array, kind: int, p: Array, light: bool, surface: bool) -> None:
     """Turn the images of `draw` into the mean (0) and its derivatives by all parameters, in their order.
 
     ``p``: x, y, outline …, blur, amplitude, background, background's slopes x and y, light's slopes x and y.

@@ -12,27 +12,64 @@ widen the blur: two an axis have its moments up to the fifth and, to 9 %, its si
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from pixmetry.core._least_squares_kernels import FREE, Rest, descent_of
+from pixmetry.core._linear_algebra_kernels import Array, factor_for, invert, solve
 from pixmetry.core.jit import jit
-from pixmetry.locate.lines._profile_kernels import clipped, invert
+from pixmetry.locate._noise_kernels import Noise, stored
 
 NODE, REST = 240.0**-0.25, 1.0 / 12.0 - 240.0**-0.5  # for an aperture of 1 px: ±NODE, NODE⁴ = 1/240, NODE² + REST = 1/12
 SHARP_NODE, SHARP_WEIGHT, SHARP_REST = 0.345832000, 0.318902969, 0.007051891  # ±NODE with this weight and 0 with what is left
 SHARP_PX = 0.5  # blur, in pixels of aperture, below which three are taken
 FAR = 5.0  # in standard deviations: beyond, a step is ±1 to 6e-7
 LEAST_BLUR_PX = 0.05
-SMALL_STEP = 1e-5  # squared length of a step in standard errors at which a fit is at rest
-MOST_STEPS = 60
+REST_FALL = 1e-5  # of χ²: squared length of a step in standard errors at which a fit is at rest
 LEAST_SINE = 0.1  # of the angle between the edges
 PLAIN, ALL = 7, 11  # number of unknowns: x, y, two angles, blur, mean, contrast; with planes in mean and contrast
 NODES = np.array([0.2386191860831969, 0.6612093864662645, 0.9324695142031521])  # Gauss–Legendre, 6 points: Φ₂ to 2e-6 up to ρ = 0.9
 WEIGHTS = np.array([0.4679139345726910, 0.3607615730481386, 0.1713244923791704])
+NEVER, ALWAYS, AUTO = 0, 1, 2  # whether planes are among the unknowns
+
+Ints = NDArray[np.int64]
+
+
+class Corner(NamedTuple):
+    """One corner to be fitted."""
+
+    x: Array  # places of pixels, shape (pixels,), px
+    y: Array
+    value: Array  # their grey values, DN
+    about: tuple[float, float]  # middle of the window
+    reach: float  # its radius, px
+    aperture: float  # side of the pixel's square, px
+    noise: Noise
+
+
+class How(NamedTuple):
+    """How corners are fitted."""
+
+    planes: int  # NEVER, ALWAYS, or AUTO: where χ² falls by more than ``significant``
+    significant: float
+    aperture: float
+    noise: Noise
+
+
+class Fits(NamedTuple):
+    """Results of fits."""
+
+    found: Array  # shape (n, ALL)
+    covariance: Array  # shape (n, 3), of x, xy, y, px²
+    chi2: Array
+    dof: Ints
+    states: Ints  # bit 1 at rest, bit 2 window cut, bit 4 planes used, bit 8 at the top, 16 at the bottom of the scale
 
 
 @jit
-def _crossing(h, k, rho, root):
+def _crossing(h: float, k: float, rho: float, root: float) -> tuple[float, float, float, float, float, float]:
     """E[sgn sgn] and its derivatives by h, k, ρ (the same as by h and k), hh, kk; root = √(1 − ρ²)."""
     if abs(h) > FAR and abs(k) > FAR:
         return math.copysign(1.0, h * k), 0.0, 0.0, 0.0, 0.0, 0.0
@@ -58,7 +95,7 @@ def _crossing(h, k, rho, root):
 
 
 @jit
-def pixel(x, y, p, unknowns, aperture, d):
+def pixel(x: float, y: float, p: Array, unknowns: int, aperture: float, d: Array) -> float:
     """Grey value of the pixel at (x, y) from the corner; its derivatives by the unknowns go into d."""
     c1, s1, c2, s2 = math.cos(p[2]), math.sin(p[2]), math.cos(p[3]), math.sin(p[3])
     rho, sine = math.cos(p[2] - p[3]), math.sin(p[2] - p[3])
@@ -117,30 +154,18 @@ def pixel(x, y, p, unknowns, aperture, d):
 
 
 @jit
-def _solve(matrix, n, right, inverse, step):
-    """Put matrix⁻¹ right into ``step`` and matrix⁻¹ into ``inverse``; False if the matrix is not positive definite."""
-    if not invert(matrix, n, inverse):
-        return False
-    for i in range(n):
-        total = 0.0
-        for k in range(n):
-            total += inverse[i, k] * right[k]
-        step[i] = total
-    return True
-
-
-@jit
-def normal_equations(values, xs, ys, count, p, unknowns, aperture, noise, kept, weights, matrix, right, d):
-    """JᵀWJ and JᵀWr of the pixels of a window with the weights that belong to p, and χ² with them and with the ``kept`` ones.
-
-    noise = constant, slope, pattern, black, low, high.
-    """
+def normal_equations(
+    corner: Corner, p: Array, kept: Array, weights: Array, active: Ints, matrix: Array, right: Array
+) -> tuple[float, float]:
+    """Normal equations of the active unknowns, χ² with the kept weights and with those at p; see `descent_of`."""
+    xs, ys, values, noise, unknowns = corner.x, corner.y, corner.value, corner.noise, len(active)
     chi2, before = 0.0, 0.0
+    d = np.zeros(ALL)
     matrix[:, :] = 0.0
     right[:] = 0.0
-    for i in range(count):
-        level = pixel(xs[i] - p[0], ys[i] - p[1], p, unknowns, aperture, d)
-        mean, variance, slope = clipped(level, noise[0], noise[1], noise[2], noise[3], noise[4], noise[5])
+    for i in range(len(values)):
+        level = pixel(xs[i] - p[0], ys[i] - p[1], p, unknowns, corner.aperture, d)
+        mean, variance, slope = stored(level, noise)
         weight, residual = 1.0 / variance, values[i] - mean
         weights[i] = weight
         chi2 += residual * residual * weight
@@ -155,12 +180,28 @@ def normal_equations(values, xs, ys, count, p, unknowns, aperture, noise, kept, 
     for a in range(unknowns):
         for b in range(a):
             matrix[b, a] = matrix[a, b]
-    return chi2, before
+    return before, chi2
 
 
 @jit
-def _start(values, xs, ys, count, p, profile, members):
+def trusted(corner: Corner, p: Array, change: Array, active: Ints, trial: Array) -> bool:
+    """Put p + change into ``trial``; False where that is no corner of this window; see `descent_of`."""
+    trial[:] = p
+    for j in range(len(active)):
+        trial[active[j]] += change[j]
+    trial[4] = max(abs(trial[4]), LEAST_BLUR_PX)
+    reach = corner.reach
+    outside = abs(trial[0] - corner.about[0]) > 0.7 * reach or abs(trial[1] - corner.about[1]) > 0.7 * reach or trial[4] > 2.0 * reach
+    return not outside and abs(math.sin(trial[2] - trial[3])) >= LEAST_SINE
+
+
+descend_corner = descent_of(normal_equations, trusted)
+
+
+@jit
+def _start(corner: Corner, p: Array, profile: Array, members: Array) -> None:
     """Angles, mean and contrast of a window from the mean grey value against direction, which repeats after half a turn."""
+    values, xs, ys, count = corner.value, corner.x, corner.y, len(corner.value)
     bins = profile.shape[0]
     profile[:] = 0.0
     members[:] = 0.0
@@ -199,119 +240,84 @@ def _start(values, xs, ys, count, p, profile, members):
 
 
 @jit
-def _descend(values, xs, ys, count, p, unknowns, aperture, noise, reach, inverse):
-    """Levenberg–Marquardt from p, with weights that follow the model: χ² and whether it came to rest.
-
-    A step is judged with the weights it starts from; then they are renewed. The inverse of JᵀWJ at the end goes into ``inverse``.
-    """
-    matrix, trial_matrix = np.zeros((ALL, ALL)), np.zeros((ALL, ALL))
-    right, trial_right, step, trial, d = np.zeros(ALL), np.zeros(ALL), np.zeros(ALL), np.zeros(ALL), np.zeros(ALL)
-    weights, trial_weights = np.zeros(count), np.zeros(count)
-    damping, at_rest, x0, y0 = 1e-3, False, p[0], p[1]
-    chi2, _ = normal_equations(values, xs, ys, count, p, unknowns, aperture, noise, weights, weights, matrix, right, d)
-    for _turn in range(MOST_STEPS):
-        for i in range(unknowns):
-            matrix[i, i] *= 1.0 + damping
-        solved = _solve(matrix, unknowns, right, inverse, step)
-        length = 0.0
-        for i in range(unknowns):
-            matrix[i, i] /= 1.0 + damping
-            length += step[i] * right[i]
-        worse = not (solved and math.isfinite(length))
-        if not worse:
-            for i in range(ALL):
-                trial[i] = p[i] + (step[i] if i < unknowns else 0.0)
-            if length < SMALL_STEP and damping < 0.1:
-                p[:] = trial
-                at_rest = True
-                break
-            trial[4] = max(abs(trial[4]), LEAST_BLUR_PX)
-            worse = abs(trial[0] - x0) > 0.7 * reach or abs(trial[1] - y0) > 0.7 * reach or trial[4] > 2.0 * reach
-            worse = worse or abs(math.sin(trial[2] - trial[3])) < LEAST_SINE
-        if not worse:
-            new, before = normal_equations(
-                values, xs, ys, count, trial, unknowns, aperture, noise, weights, trial_weights, trial_matrix, trial_right, d
-            )
-            worse = not before <= chi2 * (1.0 + 1e-9)
-        if worse:
-            damping = max(10.0 * damping, 1e-3)
-            if damping > 1e8:
-                break
-            continue
-        chi2 = new
-        p[:] = trial
-        weights[:] = trial_weights
-        matrix[:, :] = trial_matrix
-        right[:] = trial_right
-        damping = 0.1 * damping if damping > 1e-7 else 0.0
+def _descend(corner: Corner, p: Array, unknowns: int, inverse: Array) -> tuple[float, bool]:
+    """Fit one corner from p, in place: χ² and whether it came to rest. The inverse of JᵀWJ at the end goes into ``inverse``."""
+    n, active = len(corner.value), np.arange(unknowns)
+    chi2, at_rest = descend_corner(corner, p, np.full(ALL, -np.inf), active, n, Rest(REST_FALL, 0.0, FREE, 0.0))
+    matrix, right = np.zeros((ALL, ALL)), np.zeros(ALL)
+    normal_equations(corner, p, np.zeros(n), np.empty(n), active, matrix, right)
     solved = invert(matrix, unknowns, inverse)
     return chi2, at_rest and solved
 
 
 @jit
-def _promised_fall(values, xs, ys, count, p, aperture, noise):
+def _promised_fall(corner: Corner, p: Array) -> float:
     """Fall of χ² that one step with all unknowns promises from p."""
-    matrix, right, step, d, weights = np.zeros((ALL, ALL)), np.zeros(ALL), np.zeros(ALL), np.zeros(ALL), np.zeros(count)
-    normal_equations(values, xs, ys, count, p, ALL, aperture, noise, weights, weights, matrix, right, d)
-    if not _solve(matrix, ALL, right, np.empty((ALL, ALL)), step):
+    n, matrix, right, step = len(corner.value), np.zeros((ALL, ALL)), np.zeros(ALL), np.zeros(ALL)
+    normal_equations(corner, p, np.zeros(n), np.empty(n), np.arange(ALL), matrix, right)
+    if not solve(matrix, ALL, right, 0.0, factor_for(ALL), step):
         return math.inf
     return float((step * right).sum())
 
 
 @jit
-def fit_corners(frame, x, y, reach, planes, aperture, noise, start, stop, found, covariance, chi2, counts, states):
-    """Fit corners start … stop; planes: 0 never, 1 always, 2 where χ² falls by more than ``noise[6]``.
-
-    found (n, 11), covariance (n, 3) of x, xy, y; states: bit 1 at rest, bit 2 window cut, bit 4 planes used, bit 8 at the top, 16 at the
-    bottom of the scale.
-    """
+def _window(frame: NDArray[np.generic], about: tuple[float, float], reach: float, noise: Noise, out: Array) -> tuple[int, int]:
+    """Collect the pixels of a round window into ``out``, shape (room, 3): x, y, value; return their number and what was met."""
+    column, row = about
     height, width = frame.shape
+    count, state = 0, 0
+    for i in range(int(math.ceil(row - reach)), int(math.floor(row + reach)) + 1):
+        for j in range(int(math.ceil(column - reach)), int(math.floor(column + reach)) + 1):
+            if (i - row) ** 2 + (j - column) ** 2 > reach * reach:
+                continue
+            if not (0 <= i < height and 0 <= j < width):
+                state |= 2
+                continue
+            value = np.float64(frame[i, j])
+            out[0, count], out[1, count], out[2, count] = j, i, value
+            state |= (8 if value >= noise.high_dn else 0) | (16 if value <= noise.low_dn else 0)
+            count += 1
+    return count, state
+
+
+@jit
+def fit_corners(frame: NDArray[np.generic], x: Array, y: Array, reach: Array, how: How, fits: Fits) -> None:
+    """Fit corners from rough places, shape (n,) each, in windows of the radii ``reach``, px."""
     profile, members = np.zeros(48), np.zeros(48)
     inverse = np.zeros((ALL, ALL))
     plain, plain_inverse = np.zeros(ALL), np.zeros((ALL, ALL))
-    for n in range(start, stop):
+    for n in range(len(x)):
         r = reach[n]
-        room = int(2 * math.ceil(r) + 1) ** 2
-        values, xs, ys = np.empty(room), np.empty(room), np.empty(room)
-        p = found[n]
+        pixels = np.empty((3, int(2 * math.ceil(r) + 1) ** 2))
+        p = fits.found[n]
         p[0], p[1] = x[n], y[n]
         for turn in range(3):
-            column, row = p[0], p[1]
-            count, state = 0, 0
-            for i in range(int(math.ceil(row - r)), int(math.floor(row + r)) + 1):
-                for j in range(int(math.ceil(column - r)), int(math.floor(column + r)) + 1):
-                    if (i - row) ** 2 + (j - column) ** 2 > r * r:
-                        continue
-                    if not (0 <= i < height and 0 <= j < width):
-                        state |= 2
-                        continue
-                    values[count], xs[count], ys[count] = frame[i, j], j, i
-                    state |= 8 if values[count] >= noise[5] else 0
-                    state |= 16 if values[count] <= noise[4] else 0
-                    count += 1
+            about = (p[0], p[1])
+            count, state = _window(frame, about, r, how.noise, pixels)
             if count < 4 * ALL:
                 break
+            corner = Corner(pixels[0, :count], pixels[1, :count], pixels[2, :count], about, r, how.aperture, how.noise)
             if turn == 0:
                 p[4] = min(0.8, 0.2 * r)
-                _start(values, xs, ys, count, p, profile, members)
+                _start(corner, p, profile, members)
             unknowns = PLAIN
             p[PLAIN:] = 0.0
-            value, rest = _descend(values, xs, ys, count, p, PLAIN, aperture, noise, r, inverse)
-            tempting = planes == 1 or planes == 2 and 2.0 * _promised_fall(values, xs, ys, count, p, aperture, noise) > noise[6]
-            if planes > 0 and rest and tempting:
+            value, rest = _descend(corner, p, PLAIN, inverse)
+            tempting = how.planes == ALWAYS or how.planes == AUTO and 2.0 * _promised_fall(corner, p) > how.significant
+            if how.planes > NEVER and rest and tempting:
                 plain[:] = p
                 plain_inverse[:, :] = inverse
-                fuller, rested = _descend(values, xs, ys, count, p, ALL, aperture, noise, r, inverse)
+                fuller, rested = _descend(corner, p, ALL, inverse)
                 scatter = max(fuller / max(count - ALL, 1), 1.0)  # a model that fits badly makes every unknown look useful
-                if planes == 1 or (rested and value - fuller > noise[6] * scatter):
+                if how.planes == ALWAYS or (rested and value - fuller > how.significant * scatter):
                     value, rest, unknowns = fuller, rested, ALL
                 else:
                     p[:] = plain
                     inverse[:, :] = plain_inverse
-            counts[n] = count - unknowns
-            chi2[n] = value
+            fits.dof[n] = count - unknowns
+            fits.chi2[n] = value
             state |= (1 if rest else 0) | (4 if unknowns == ALL else 0)
-            covariance[n, 0], covariance[n, 1], covariance[n, 2] = inverse[0, 0], inverse[0, 1], inverse[1, 1]
-            if not rest or max(abs(p[0] - column), abs(p[1] - row)) < 0.75:
+            fits.covariance[n, 0], fits.covariance[n, 1], fits.covariance[n, 2] = inverse[0, 0], inverse[0, 1], inverse[1, 1]
+            if not rest or max(abs(p[0] - about[0]), abs(p[1] - about[1])) < 0.75:
                 break
-        states[n] = state
+        fits.states[n] = state

@@ -1,24 +1,32 @@
-"""Kernels of template fits: weighted least squares of one target after the other, by Gauss–Newton steps with Levenberg's damping."""
+"""Kernels of template fits: weighted least squares of one target after the other, by Gauss–Newton steps with Levenberg's damping.
+
+The steps are not those of `descent_of`, which other models share: a drawn template is smooth to 2e-5 of its height only, a step may be judged
+by an exact likelihood, moves along the curved valley of radius, blur and height, and what counts at the end is the place alone.
+"""
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from pixmetry.core._linear_algebra_kernels import Array, Factor, factor_for, factorise, solve, substitute
 from pixmetry.core.jit import jit
+from pixmetry.locate._noise_kernels import CLIP, Noise, clipped, variance_of, variance_slope
 from pixmetry.locate.template._contour_template_kernels import (
     ELLIPSE,
     PAD,
     RING,
     SHAPES,
     SPOT,
+    Canvas,
+    Singles,
     block_count,
-    cdf,
     complete,
     draw,
     draw_plain,
-    pdf,
     phase_count,
     point_count,
     reach_px,
@@ -33,8 +41,7 @@ LEAST_BLUR_PX = 0.1
 LEAST_RADIUS_PX = 0.2
 SMALL = 2.0  # half axis over blur below which they can hardly be told apart
 VAGUE = 0.5  # relative standard deviation at which radius and blur are held where the image does not tell them apart
-LEAST_SHARE = 0.05  # of the variance that clipping leaves: pixels far beyond the end, which say nothing, must not gain weight
-CLIP = 6.0  # standard deviations from the scale's ends within which clipping is looked at
+RIDGE = 1e-12  # damping that is always there
 LEAST_BACKGROUND = 0.01  # electrons, where their likelihood is used: there are no negative ones
 LEAST_ELECTRONS = 1e-3  # below it a pixel is as good as dark
 MOST_ELECTRONS = 60.0  # of a reading, from which it is as good as a shifted Poisson number
@@ -43,9 +50,79 @@ ROWS = 32  # of a target, at most, that are asked whether rows are shifted again
 ALIKE = math.exp(-1.0 / 5.0)  # correlation of the shifts of two lines of a field that follow each other, where a loop carries them on
 DOT = {"fastmath": {"reassoc", "contract", "nsz"}}
 
+Ints = NDArray[np.int64]
+
+
+class About(NamedTuple):
+    """Where the windows of targets are."""
+
+    home: Array  # shape (n, 2 or more): x, y, px
+    half: Ints  # half sides of the windows
+    outer: Array  # longest half axes, px
+    reach: Array  # shape (n, 2): how far beyond them pixels are used, and are taken from a neighbour, px
+    near_start: Ints  # the neighbours of target i are near_index[near_start[i]:near_start[i + 1]]
+    near_index: Ints
+
+
+class Packed(NamedTuple):
+    """Windows of some targets, one after the other, rows filled up to a multiple of eight pixels."""
+
+    place: Ints  # of each window
+    data: Singles  # DN
+    mask: Singles  # 0 where a pixel does not count
+
+
+class Model(NamedTuple):
+    """The template and the likelihood."""
+
+    kind: int
+    aperture: float  # side of the pixel's square, px
+    surface: bool  # whether light falls off on the target's surface, before the blur
+    noise: Noise
+    efficiency: Array  # of the likelihood of few electrons; empty where it is not used
+
+
+class Fits(NamedTuple):
+    """Results of fits, NaN where there is none."""
+
+    parameters: Array  # shape (n, parameters)
+    variance: Array  # of each
+    covariance: Array  # shape (n, 3): of x and y, xx, xy, yy, px²
+    quality: Array  # shape (n, 10): 0 χ², 1 pixels used, 2 to 4 the expected falls of χ² with planes, 5 steps (negative: not at rest),
+    # 6 whether the frame cuts the window, 7 and 8 pixels at the upper and lower end of the scale, 9 the larger variance of x and y by the
+    # pixels' noise alone
+
+
+class Window(NamedTuple):
+    """One window in work."""
+
+    images: Array  # shape (parameters + 1, rows, cols): the mean and its derivatives
+    data: Singles
+    mask: Singles
+    weight: Array  # of the mean that was looked at last
+    kept: Array  # of the mean that is kept
+    residual: Array
+
+
+class System(NamedTuple):
+    """Normal equations and what is needed to solve them."""
+
+    normal: Array  # shape (MOST, MOST)
+    gradient: Array  # shape (MOST,)
+    factor: Factor
+    right: Array
+    step: Array
+    scratch: Array  # shape (pixels,)
+
+
+@jit
+def system_for(pixels: int) -> System:
+    """Room for the equations of a window."""
+    return System(np.zeros((MOST, MOST)), np.zeros(MOST), factor_for(MOST), np.zeros(MOST), np.zeros(MOST), np.empty(pixels))
+
 
 @jit(**DOT)
-def dot(a, b):
+def dot(a: Array, b: Array) -> float:
     """Sum of products."""
     total = 0.0
     for i in range(len(a)):
@@ -54,61 +131,7 @@ def dot(a, b):
 
 
 @jit
-def solve(n, normal, gradient, damping, step, factor):
-    """Solve (N + damping · diag N) step = gradient by Cholesky's factor of the scaled matrix; False if it is singular."""
-    for i in range(n):
-        for j in range(i + 1):
-            total = normal[i, j] / math.sqrt(normal[i, i] * normal[j, j])
-            if i == j:
-                total += damping + 1e-12
-            for k in range(j):
-                total -= factor[i, k] * factor[j, k]
-            if i == j:
-                if not total > 1e-14:
-                    return False
-                factor[i, i] = math.sqrt(total)
-            else:
-                factor[i, j] = total / factor[j, j]
-    for i in range(n):
-        total = gradient[i] / math.sqrt(normal[i, i])
-        for k in range(i):
-            total -= factor[i, k] * step[k]
-        step[i] = total / factor[i, i]
-    for i in range(n - 1, -1, -1):
-        total = step[i]
-        for k in range(i + 1, n):
-            total -= factor[k, i] * step[k]
-        step[i] = total / factor[i, i]
-    for i in range(n):
-        step[i] /= math.sqrt(normal[i, i])
-    return True
-
-
-@jit
-def clipped(level, variance, slope, low, high):
-    """Mean and variance of min(max(level + n, low), high) with normal n, and the mean's derivative; ``slope``: d variance / d level."""
-    s = math.sqrt(variance)
-    a, b = (low - level) / s, (high - level) / s
-    if a < -CLIP and b > CLIP:
-        return level, variance, 1.0
-    a, b = max(a, -1e6), min(b, 1e6)  # where the scale has no end
-    ca, cb, pa, pb = cdf(a), cdf(b), pdf(a), pdf(b)
-    below = s * (a * ca + pa)  # E max(low − value, 0)
-    above = s * (pb - b * (1.0 - cb))  # E max(value − high, 0)
-    mean = level + below - above
-    inside = cb - ca
-    # second moment of (value − level) after clipping
-    second = variance * (inside - (b * pb if b < CLIP else 0.0) + (a * pa if a > -CLIP else 0.0))
-    if a > -CLIP:
-        second += variance * a * a * ca
-    if b < CLIP:
-        second += variance * b * b * (1.0 - cb)
-    shift = mean - level
-    return mean, max(second - shift * shift, LEAST_SHARE * variance), inside + (pa - pb) * slope / (2.0 * s)
-
-
-@jit
-def electrons_expected(d, mean, sigma):
+def electrons_expected(d: float, mean: float, sigma: float) -> tuple[float, float]:
     """Expected number of electrons n behind a reading d = n + noise, where n is Poisson with this mean, and −2 ln likelihood of d."""
     first = max(0, int(math.floor(d - 6.0 * sigma)))
     last = max(first, int(math.ceil(d + 6.0 * sigma)))
@@ -129,7 +152,7 @@ def electrons_expected(d, mean, sigma):
 
 
 @jit(**DOT)
-def plain_weights(mean, data, mask, weight, residual, w):
+def plain_weights(mean: Array, data: Singles, mask: Singles, weight: Array, residual: Array, w: float) -> float:
     """`weigh` where the variance is the same everywhere."""
     total = 0.0
     for i in range(len(mean)):
@@ -140,16 +163,18 @@ def plain_weights(mean, data, mask, weight, residual, w):
 
 
 @jit
-def weigh(images, data, mask, weight, kept, residual, noise, efficiency, least, most):
+def weigh(window: Window, noise: Noise, efficiency: Array, least: float, most: float) -> tuple[float, float, float]:
     """Set the weights and residuals at the mean that the images hold; return χ², and what a better fit makes smaller, for now and for next.
 
     A weight is 1/variance of the mean. Where the scale ends, the mean and its derivatives become those of the clipped value. What shrinks
     is χ² with the ``kept`` weights. With an ``efficiency`` it is −2 ln likelihood; where a reading has few electrons its weight is then its
     exact information, and the residual its score over that. No mean is known to be outside ``least`` … ``most``.
     """
-    constant, slope, pattern, black, low, high = noise[0], noise[1], noise[2], noise[3], noise[4], noise[5]
+    images, data, mask = window.images, window.data, window.mask
+    weight, kept, residual = window.weight, window.kept, window.residual
+    constant, slope, black, low, high = noise.constant_dn2, noise.slope_dn, noise.black_dn, noise.low_dn, noise.high_dn
     chi2, before, after = 0.0, 0.0, 0.0
-    level_free = slope == 0.0 and pattern == 0.0
+    level_free = slope == 0.0 and noise.pattern_rel == 0.0
     s = math.sqrt(constant)
     lowest, highest = (low + CLIP * s, high - CLIP * s) if level_free else (math.inf, -math.inf)
     ended = low > -math.inf or high < math.inf
@@ -169,9 +194,7 @@ def weigh(images, data, mask, weight, kept, residual, noise, efficiency, least, 
             variance, rise, share = constant, 0.0, 1.0
             light = max(mean - black, 0.0)
             if not level_free:
-                variance += slope * light + pattern * pattern * light * light
-                if light > 0.0:
-                    rise = slope + 2.0 * pattern * pattern * light
+                variance, rise = variance_of(light, noise), variance_slope(light, noise)
             if ended and not lowest < mean < highest:
                 mean, variance, share = clipped(mean, variance, rise, low, high)
                 images[0, r, c] = mean
@@ -204,7 +227,7 @@ def weigh(images, data, mask, weight, kept, residual, noise, efficiency, least, 
 
 
 @jit
-def mean_range(kind, p):
+def mean_range(kind: int, p: Array) -> tuple[float, float]:
     """Least and greatest mean that a template without planes can have; with planes anything."""
     k = SHAPES[kind] + 3
     if p[k + 2] != 0.0 or p[k + 3] != 0.0 or p[k + 4] != 0.0 or p[k + 5] != 0.0:
@@ -214,11 +237,12 @@ def mean_range(kind, p):
 
 
 @jit
-def normal_equations(images, residual, weight, used, first, count, normal, gradient, scratch):
+def normal_equations(images: Array, residual: Array, weight: Array, used: Ints, first: int, system: System) -> None:
     """Fill JᵀWJ and JᵀW · residual for the ``used`` parameters, from the ``first`` on; the images hold the derivatives."""
     size = weight.size
     w, d = weight.reshape(size), residual.reshape(size)
-    for a in range(first, count):
+    normal, gradient, scratch = system.normal, system.gradient, system.scratch
+    for a in range(first, len(used)):
         column = images[1 + used[a]].reshape(size)
         for i in range(size):
             scratch[i] = w[i] * column[i]
@@ -228,12 +252,14 @@ def normal_equations(images, residual, weight, used, first, count, normal, gradi
 
 
 @jit
-def cut_out(frame, start, half, outer, reach, near_start, near_index, low, high, which, place, data, mask, quality):
-    """Copy the windows of the targets ``which``, packed at ``place``, rows filled up to a multiple of eight.
+def cut_out(frame: NDArray[np.generic], about: About, noise: Noise, which: Ints, packed: Packed, quality: Array) -> None:
+    """Copy the windows of the targets ``which``.
 
-    The mask is 0 outside the frame, beyond the reach of the target and where a neighbour is nearer. ``quality`` gets: 1 pixels used,
-    6 whether the frame cuts the window, 7 and 8 pixels at the upper and lower end of the scale.
+    The mask is 0 outside the frame, beyond the reach of the target and where a neighbour is nearer. ``quality``: 1, 6, 7 and 8 of `Fits`.
     """
+    start, half, outer, reach, near_start, near_index = about
+    place, data, mask = packed
+    low, high = noise.low_dn, noise.high_dn
     for w in range(len(which)):
         i = which[w]
         side = 2 * half[i] + 1
@@ -272,7 +298,7 @@ def cut_out(frame, start, half, outer, reach, near_start, near_index, low, high,
 
 
 @jit
-def allowed(kind, p, start, largest, broadest):
+def allowed(kind: int, p: Array, start: Array, largest: float, broadest: float) -> bool:
     """Whether parameters are such that the template can be drawn and still belongs to this target."""
     s = SHAPES[kind]
     away = 1.0 + 0.5 * longest_px(kind, start) + start[2 + s]
@@ -288,19 +314,19 @@ def allowed(kind, p, start, largest, broadest):
 
 
 @jit
-def hold(kind, p, start, used, count, normal, gradient):
+def hold(kind: int, p: Array, start: Array, used: Ints, system: System) -> None:
     """Hold radii and blur weakly to their start values, which matters only where the image does not tell them apart."""
     s = SHAPES[kind]
-    for a in range(count):
+    for a in range(len(used)):
         j = used[a]
         if 2 <= j <= 2 + s and not (s == 3 and j == 4):
             w = 1.0 / (VAGUE * math.hypot(start[j], 0.4)) ** 2
-            normal[a, a] += w
-            gradient[a] -= w * (p[j] - start[j])
+            system.normal[a, a] += w
+            system.gradient[a] -= w * (p[j] - start[j])
 
 
 @jit
-def strain(kind, p, start):
+def strain(kind: int, p: Array, start: Array) -> float:
     """What `hold` adds to χ²."""
     s = SHAPES[kind]
     total = 0.0
@@ -311,7 +337,7 @@ def strain(kind, p, start):
 
 
 @jit
-def longest_px(kind, p):
+def longest_px(kind: int, p: Array) -> float:
     """Longest half axis of a shape; of a spot 0."""
     if kind == SPOT:
         return 0.0
@@ -321,7 +347,7 @@ def longest_px(kind, p):
 
 
 @jit
-def moments(kind, p, step, out):
+def moments(kind: int, p: Array, step: Array, out: Array) -> None:
     """Area over π and mean square half width of an outline, and their changes along a step."""
     if kind == ELLIPSE:
         a, b, c, da, db, dc = p[2], p[3], p[4], step[2], step[3], step[4]
@@ -334,7 +360,7 @@ def moments(kind, p, step, out):
 
 
 @jit
-def move(kind, p, step, used, count, darkest, full, figures, out):
+def move(kind: int, p: Array, step: Array, used: Ints, darkest: float, out: Array) -> None:
     """Take a step; blur and radii stay above what can be drawn, and change by at most a third, the background not below the ``darkest``.
 
     Of a shape smaller than its blur the image tells little more than the light and the second moment. A step then changes these by what it
@@ -342,8 +368,8 @@ def move(kind, p, step, used, count, darkest, full, figures, out):
     """
     s = SHAPES[kind]
     share = 1.0
-    full[: len(p)] = 0.0
-    for a in range(count):
+    full, figures = np.zeros(len(p)), np.empty(4)
+    for a in range(len(used)):
         j = used[a]
         full[j] = step[a]
         if j == 2 + s or (2 <= j < 2 + s and j != 4):
@@ -366,11 +392,12 @@ def move(kind, p, step, used, count, darkest, full, figures, out):
 
 
 @jit
-def pin(kind, p, step, used, count, darkest, normal, gradient):
+def pin(kind: int, p: Array, used: Ints, darkest: float, system: System) -> bool:
     """Take blur, radii and background that would fall below their least values out of the equations; True if there are such."""
     s = SHAPES[kind]
+    normal, gradient, step = system.normal, system.gradient, system.step
     found = False
-    for a in range(count):
+    for a in range(len(used)):
         j = used[a]
         least = -math.inf
         if j == 4 + s:
@@ -388,37 +415,39 @@ def pin(kind, p, step, used, count, darkest, normal, gradient):
 
 
 @jit
-def place_covariance(count, normal, right, column, factor, out):
+def place_covariance(count: int, system: System, out: Array) -> bool:
     """Covariance of x and y from the normal equations: xx, xy, yy; False if these are singular."""
+    if not factorise(system.normal, count, RIDGE, system.factor):
+        return False
     for a in range(2):
-        right[:count] = 0.0
-        right[a] = 1.0
-        if not solve(count, normal, right, 0.0, column, factor):
-            return False
-        out[a], out[1 + a] = column[0], column[1]
+        system.right[:count] = 0.0
+        system.right[a] = 1.0
+        substitute(system.factor, count, system.right, system.right)
+        out[a], out[1 + a] = system.right[0], system.right[1]
     return True
 
 
 @jit
-def place_at_rest(step, c):
+def place_at_rest(step: Array, c: Array) -> bool:
     """Whether a step in x and y is small against their covariance c."""
     det = c[0] * c[2] - c[1] * c[1]
     return step[0] * step[0] * c[2] - 2.0 * step[0] * step[1] * c[1] + step[1] * step[1] * c[0] < AT_REST * det
 
 
 @jit
-def falls_with(normal, gradient, chosen, small, right, step, factor):
+def falls_with(system: System, chosen: Ints, small: Array) -> float:
     """Expected fall of χ² when the chosen parameters are set free."""
     m = len(chosen)
     for a in range(m):
-        right[a] = gradient[chosen[a]]
+        system.right[a] = system.gradient[chosen[a]]
         for b in range(m):
-            small[a, b] = normal[chosen[a], chosen[b]]
-    return dot(step[:m], right[:m]) if solve(m, small, right, 0.0, step, factor) else 0.0
+            small[a, b] = system.normal[chosen[a], chosen[b]]
+    found = solve(small, m, system.right, RIDGE, system.factor, system.step)
+    return dot(system.step[:m], system.right[:m]) if found else 0.0
 
 
 @jit
-def add_planes(images, p, count):
+def add_planes(images: Array, p: Array, count: int) -> None:
     """Derivatives by the slopes of background and light, where these are 0.
 
     Light on the surface differs from light on the image, which this is, by a shift, which is among the unknowns.
@@ -433,162 +462,206 @@ def add_planes(images, p, count):
 
 
 @jit
-def test_planes(normal, gradient, count, small, right, step, factor, quality):
+def test_planes(system: System, count: int, quality: Array) -> None:
     """Expected falls of χ² with a plane of the background (2), of the light (3) and with both (4)."""
-    chosen = np.arange(count + 4)
-    none = falls_with(normal, gradient, chosen[:count], small, right, step, factor)
-    quality[4] = falls_with(normal, gradient, chosen, small, right, step, factor) - none
-    quality[2] = falls_with(normal, gradient, chosen[: count + 2], small, right, step, factor) - none
+    chosen, small = np.arange(count + 4), np.empty((MOST, MOST))
+    none = falls_with(system, chosen[:count], small)
+    quality[4] = falls_with(system, chosen, small) - none
+    quality[2] = falls_with(system, chosen[: count + 2], small) - none
     chosen[count], chosen[count + 1] = count + 2, count + 3
-    quality[3] = falls_with(normal, gradient, chosen[: count + 2], small, right, step, factor) - none
+    quality[3] = falls_with(system, chosen[: count + 2], small) - none
+
+
+class Course(NamedTuple):
+    """How the fit of one target went."""
+
+    chi2: float  # infinite where there was none
+    falls: float  # expected of the step after the last one
+    steps: int
+    at_rest: bool
 
 
 @jit
-def fit(
-    kind, start, free, test, home, half, which, place, data, mask, noise, efficiency, aperture, surface, out, variance, covariance, quality
-):
+def draw_mean(window: Window, canvas: Canvas, model: Model, p: Array, planes: tuple[bool, bool]) -> None:
+    """Draw the mean and its derivatives; ``planes``: whether those of background and light are unknown."""
+    if planes[0] or planes[1]:
+        draw(window.images, canvas, model.kind, p, model.aperture, planes[1], model.surface)
+        complete(window.images, model.kind, p, planes[1], model.surface)
+    else:
+        draw_plain(window.images, canvas, model.kind, p, model.aperture)
+
+
+@jit
+def approach(
+    window: Window, canvas: Canvas, model: Model, p: Array, found: Array, used: Ints, limits: tuple[float, float, float], system: System
+) -> Course:
+    """Fit one target from p, which becomes the parameters that were looked at last, those of the images and kept weights.
+
+    ``found`` gets the result, which the last step leads to. ``limits``: longest half axis and broadest blur that are tried, in px, and the
+    darkest background, in DN.
+    """
+    kind, noise, count, parameters = model.kind, model.noise, len(used), len(p)
+    largest, broadest, darkest = limits
+    begin, trial, figures = p.copy(), p.copy(), np.empty(3)
+    ground, light = False, False
+    for a in range(count):
+        ground, light = ground or used[a] == parameters - 4, light or used[a] == parameters - 1
+    kept, weight = window.kept, window.weight
+    kept[:] = 0.0
+    chi2, merit, strained, damping, falls, steps = math.inf, math.inf, 0.0, 0.0, 0.0, 0
+    at_rest = False
+    while steps < STEPS:
+        steps += 1
+        good = allowed(kind, trial, begin, largest, broadest)
+        if good:
+            now = Window(window.images, window.data, window.mask, weight, kept, window.residual)
+            draw_mean(now, canvas, model, trial, (ground, light))
+            squares, before, after = weigh(now, noise, model.efficiency, *mean_range(kind, trial))
+            held = strain(kind, trial, begin)
+            good = before + held <= merit + strained + 1e-4 * chi2 + 0.02  # the template is not smoother than this
+        if good:
+            p[:] = trial
+            chi2, merit, strained = squares, after, held
+            kept, weight = weight, kept
+            normal_equations(window.images, window.residual, kept, used, 0, system)
+            hold(kind, p, begin, used, system)
+            damping = 0.0 if damping < 1e-3 else 0.1 * damping
+        else:
+            damping = max(10.0 * damping, 1e-2)
+            if damping > 1e8:
+                break
+        if not solve(system.normal, count, system.gradient, damping + RIDGE, system.factor, system.step):
+            break
+        if pin(kind, p, used, darkest, system) and not solve(
+            system.normal, count, system.gradient, damping + RIDGE, system.factor, system.step
+        ):
+            break
+        fell, falls = falls, dot(system.step[:count], system.gradient[:count])
+        if steps > PATIENCE and falls > 0.25 * fell:  # to and fro: half a step lands between
+            system.step[:count] *= 0.5
+        move(kind, p, system.step, used, darkest, trial)
+        if good and (damping == 0.0 or (steps > PATIENCE and damping < 0.05)):
+            # steps shrink by a like factor each time, or faster: what the next one will bring is known before it is made
+            next_falls = falls * min(1.0, falls / fell)
+            at_rest = next_falls < AT_REST
+            if steps > PATIENCE and falls < HARDLY and not at_rest:
+                at_rest = place_covariance(count, system, figures) and place_at_rest(system.step, figures)
+            if at_rest:
+                break
+    window.kept[:] = kept
+    # only the place need be at rest: a shape of which the image tells nothing may leap where it encloses nothing
+    found[:] = trial if at_rest and allowed(kind, trial, begin, largest, broadest) else p
+    return Course(chi2, falls, steps, at_rest)
+
+
+@jit
+def spread_of(window: Window, used: Ints, noise: Noise, system: System, fits: Fits, i: int) -> None:
+    """Variances and covariance of target i from its normal equations, and what rows do that are shifted."""
+    count, variance, covariance = len(used), fits.variance[i], fits.covariance[i]
+    if factorise(system.normal, count, RIDGE, system.factor):
+        for a in range(count):
+            system.right[:count] = 0.0
+            system.right[a] = 1.0
+            substitute(system.factor, count, system.right, system.right)
+            variance[used[a]] = system.right[a]
+            if a < 2:
+                covariance[a], covariance[1 + a] = system.right[0], system.right[1]
+    fits.quality[i, 9] = max(covariance[0], covariance[2])
+    if noise.row_shift_px2 > 0.0 or noise.field_shift_px2 > 0.0:
+        rows = window.weight.shape[0]
+        answers = np.empty((rows, MOST))
+        if row_answers(window.images, window.kept, used, system, (0, rows), answers):
+            add_row_shifts(answers, used, noise, variance, covariance)
+
+
+@jit
+def fit(model: Model, start: Array, free: NDArray[np.bool_], test: bool, about: About, which: Ints, packed: Packed, fits: Fits) -> None:
     """Fit the template to the targets ``which``, whose windows `cut_out` has packed.
 
-    ``start``: n × parameters; ``home``: n × 2 or more, the places that the windows are about. ``free``: which parameters are unknown, the
-    base and perhaps planes. ``test``: whether to test planes, none of which is free then. Results: ``out`` (parameters), ``variance`` of
-    each, ``covariance`` of x and y, and ``quality``: 0 χ², 2 to 4 the expected falls of χ² with planes, 5 steps (negative: not at rest),
-    9 the larger variance of x and y by the pixels' noise alone.
+    ``start``, shape (n, parameters). ``free``: which parameters are unknown, the base and perhaps planes. ``test``: whether to test planes,
+    none of which is free then.
     """
-    parameters = start.shape[1]
+    kind, parameters = model.kind, start.shape[1]
     s = SHAPES[kind]
-    side = 2 * half[which].max() + 1
+    side = 2 * about.half[which].max() + 1
     most = side * ((side + 7) // 8 * 8)
     longest, broadest = 0.0, 0.3
     for i in which:
         longest = max(longest, longest_px(kind, start[i]))
         broadest = max(broadest, start[i, 2 + s])
     largest, broadest = 2.0 * longest + 2.0, 2.5 * broadest + 0.5
-    blocks = block_count(reach_px(broadest, aperture))
+    blocks = block_count(reach_px(broadest, model.aperture))
     store_planes = np.empty(side * 8 * ((side + 7) // 8 * 8 + 2 * PAD), np.float32)
-    store, store_residual, scratch = np.empty((parameters + 1) * most), np.empty(most), np.empty(most)
+    store, store_residual = np.empty((parameters + 1) * most), np.empty(most)
     store_weight, store_kept = np.empty(most), np.empty(most)
     points = np.empty((point_count(largest, LEAST_BLUR_PX) + 1, 7))
     table = np.empty((phase_count(LEAST_BLUR_PX) + 2, 48 * blocks), np.float32)
     across, down, parts = np.empty((blocks, 40), np.float32), np.empty((blocks, 40), np.float32), np.empty((3, 64), np.float32)
-    normal, small, factor = np.empty((MOST, MOST)), np.empty((MOST, MOST)), np.empty((MOST, MOST))
-    gradient, step, right, column = np.empty(MOST), np.empty(MOST), np.empty(MOST), np.empty(MOST)
-    p, trial, begin = np.empty(parameters), np.empty(parameters), np.empty(parameters)
-    full, figures = np.empty(parameters), np.empty(4)
-    answers, carried = np.empty((side, MOST)), np.empty((2, MOST))
-    used = np.flatnonzero(free)
+    system, p = system_for(most), np.empty(parameters)
+    used, every = np.flatnonzero(free), np.arange(parameters)
     count = len(used)
-    every = np.arange(parameters)
-    light = free[parameters - 1]
-    darkest = noise[3] + LEAST_BACKGROUND * noise[1] if len(efficiency) > 0 else -math.inf
+    darkest = model.noise.black_dn + LEAST_BACKGROUND * model.noise.slope_dn if len(model.efficiency) > 0 else -math.inf
+    quality = fits.quality
     for w in range(len(which)):
         i = which[w]
-        side = 2 * half[i] + 1
+        half = about.half[i]
+        side = 2 * half + 1
         wide = (side + 7) // 8 * 8
-        size = side * wide
-        images = store[: (parameters + 1) * size].reshape(parameters + 1, side, wide)
-        values = data[place[w] : place[w] + size].reshape(side, wide)
-        seen = mask[place[w] : place[w] + size].reshape(side, wide)
-        weight, kept = store_weight[:size].reshape(side, wide), store_kept[:size].reshape(side, wide)
-        residual = store_residual[:size].reshape(side, wide)
-        begin[:] = start[i]
-        col0, row0 = int(round(home[i, 0])) - half[i], int(round(home[i, 1])) - half[i]
-        begin[0] -= col0
-        begin[1] -= row0
-        p[:] = begin
-        trial[:] = begin
-        chi2, merit, strained, damping, falls, steps = math.inf, math.inf, 0.0, 0.0, 0.0, 0
-        at_rest = False
-        kept[:] = 0.0
-        out[i], variance[i], covariance[i] = math.nan, math.nan, math.nan
+        size, first = side * wide, packed.place[w]
+        window = Window(
+            store[: (parameters + 1) * size].reshape(parameters + 1, side, wide),
+            packed.data[first : first + size].reshape(side, wide),
+            packed.mask[first : first + size].reshape(side, wide),
+            store_weight[:size].reshape(side, wide),
+            store_kept[:size].reshape(side, wide),
+            store_residual[:size].reshape(side, wide),
+        )
+        canvas = Canvas(store_planes[: side * 8 * (wide + 2 * PAD)].reshape(side, 8 * (wide + 2 * PAD)), points, table, across, down, parts)
+        col0, row0 = int(round(about.home[i, 0])) - half, int(round(about.home[i, 1])) - half
+        p[:] = start[i]
+        p[0] -= col0
+        p[1] -= row0
+        fits.parameters[i], fits.variance[i], fits.covariance[i] = math.nan, math.nan, math.nan
         quality[i, 0], quality[i, 2:5], quality[i, 5] = math.nan, 0.0, -1.0
         if quality[i, 1] <= count:
             continue
-        while steps < STEPS:
-            steps += 1
-            good = allowed(kind, trial, begin, largest, broadest)
-            if good:
-                planes = store_planes[: side * 8 * (wide + 2 * PAD)].reshape(side, 8 * (wide + 2 * PAD))
-                if light or free[parameters - 4]:
-                    draw(images, planes, kind, trial, aperture, light, surface, points, table, across, down, parts)
-                    complete(images, kind, trial, light, surface)
-                else:
-                    draw_plain(images, planes, kind, trial, aperture, points, table, across, down, parts)
-                squares, before, after = weigh(images, values, seen, weight, kept, residual, noise, efficiency, *mean_range(kind, trial))
-                held = strain(kind, trial, begin)
-                good = before + held <= merit + strained + 1e-4 * chi2 + 0.02  # the template is not smoother than this
-            if good:
-                p[:] = trial
-                chi2, merit, strained = squares, after, held
-                kept, weight = weight, kept
-                normal_equations(images, residual, kept, used, 0, count, normal, gradient, scratch)
-                hold(kind, p, begin, used, count, normal, gradient)
-                damping = 0.0 if damping < 1e-3 else 0.1 * damping
-            else:
-                damping = max(10.0 * damping, 1e-2)
-                if damping > 1e8:
-                    break
-            if not solve(count, normal, gradient, damping, step, factor):
-                break
-            if pin(kind, p, step, used, count, darkest, normal, gradient) and not solve(count, normal, gradient, damping, step, factor):
-                break
-            fell, falls = falls, dot(step[:count], gradient[:count])
-            if steps > PATIENCE and falls > 0.25 * fell:  # to and fro: half a step lands between
-                for a in range(count):
-                    step[a] *= 0.5
-            move(kind, p, step, used, count, darkest, full, figures, trial)
-            if good and (damping == 0.0 or (steps > PATIENCE and damping < 0.05)):
-                # steps shrink by a like factor each time, or faster: what the next one will bring is known before it is made
-                next_falls = falls * min(1.0, falls / fell)
-                at_rest = next_falls < AT_REST
-                if steps > PATIENCE and falls < HARDLY and not at_rest:
-                    at_rest = place_covariance(count, normal, right, column, factor, figures) and place_at_rest(step, figures)
-                if at_rest:
-                    break
+        chi2, falls, steps, at_rest = approach(window, canvas, model, p, fits.parameters[i], used, (largest, broadest, darkest), system)
         if math.isinf(chi2):
+            fits.parameters[i] = math.nan
             continue
-        # only the place need be at rest: a shape of which the image tells nothing may leap where it encloses nothing
-        out[i] = trial if at_rest and allowed(kind, trial, begin, largest, broadest) else p
-        out[i, 0] += col0
-        out[i, 1] += row0
+        fits.parameters[i, 0] += col0
+        fits.parameters[i, 1] += row0
         quality[i, 0], quality[i, 5] = chi2 - max(falls, 0.0), steps if at_rest else -steps
         if not at_rest:
             continue
-        for a in range(count):
-            right[:count] = 0.0
-            right[a] = 1.0
-            if solve(count, normal, right, 0.0, step, factor):
-                variance[i, used[a]] = step[a]
-                if a < 2:
-                    covariance[i, a], covariance[i, 1 + a] = step[0], step[1]
-        quality[i, 9] = max(covariance[i, 0], covariance[i, 2])
-        shifted = noise[6] > 0.0 or noise[7] > 0.0
-        if shifted and row_answers(images, kept, used, count, normal, 0, side, right, step, factor, answers):
-            add_row_shifts(answers[:side], used, count, noise[6], noise[7], carried, variance[i], covariance[i])
+        spread_of(window, used, model.noise, system, fits, i)
         if test:
-            add_planes(images, p, count)
-            normal_equations(images, residual, kept, every, count, parameters, normal, gradient, scratch)
-            test_planes(normal, gradient, count, small, right, step, factor, quality[i])
+            add_planes(window.images, p, count)
+            normal_equations(window.images, window.residual, window.kept, every, count, system)
+            test_planes(system, count, quality[i])
 
 
 @jit
-def row_answers(images, weight, used, count, normal, first, stop, right, step, factor, out):
-    """How the unknowns answer to a shift of each row along x: N⁻¹ Jᵀ W ∂µ/∂x over the row; rows ``first`` … ``stop`` of ``out``."""
-    for r in range(first, stop):
+def row_answers(images: Array, weight: Array, used: Ints, system: System, span: tuple[int, int], out: Array) -> bool:
+    """How the unknowns answer to a shift of each row along x: N⁻¹ Jᵀ W ∂µ/∂x over the row; rows of the span of ``out``."""
+    count = len(used)
+    if not factorise(system.normal, count, RIDGE, system.factor):
+        return False
+    for r in range(span[0], span[1]):
         for a in range(count):
             total = 0.0
             for c in range(weight.shape[1]):
                 total += weight[r, c] * images[1, r, c] * images[1 + used[a], r, c]
-            right[a] = total
-        if not solve(count, normal, right, 0.0, step, factor):
-            return False
-        out[r, :count] = step[:count]
+            out[r, a] = total
+        substitute(system.factor, count, out[r], out[r])
     return True
 
 
 @jit
-def add_row_shifts(answers, used, count, lone, field, carried, variance, covariance):
-    """Add to the covariance what rows do that are shifted by themselves (variance ``lone``), or alike in a ``field`` of every other row."""
-    carried[:] = 0.0
+def add_row_shifts(answers: Array, used: Ints, noise: Noise, variance: Array, covariance: Array) -> None:
+    """Add to the covariance what rows do that are shifted by themselves, or alike in a field of every other row."""
+    lone, field, count = noise.row_shift_px2, noise.field_shift_px2, len(used)
+    carried = np.zeros((2, MOST))
     for r in range(len(answers)):
         own, before = answers[r], carried[r % 2]
         for a in range(count):
@@ -601,49 +674,50 @@ def add_row_shifts(answers, used, count, lone, field, carried, variance, covaria
 
 
 @jit
-def residuals(frame, kind, parameters, slopes, which, home, half, outer, reach, near_start, near_index, noise, aperture):
+def residuals(
+    frame: NDArray[np.generic], model: Model, parameters: Array, slopes: int, which: Ints, about: About
+) -> tuple[Array, Array, Array, Array, Array]:
     """Return what the pixels of fitted targets leave: levels, residuals/√(1 − leverage), slopes of the mean in DN per pixel; of their rows
     (at most `ROWS` a target) the scores Σ w µ_x (d − µ), and the covariance of these under white noise.
 
     The first ``slopes`` parameters of the planes were among the unknowns.
     """
+    kind = model.kind
     count = SHAPES[kind] + 5 + slopes
     used = np.arange(count)
-    most = 0
+    most, widest = 0, 0
     for w in range(len(which)):
-        side = 2 * half[which[w]] + 1
+        side = 2 * about.half[which[w]] + 1
+        widest = max(widest, side * ((side + 7) // 8 * 8))
         most += side * ((side + 7) // 8 * 8)
     levels, found, steep = np.empty(most), np.empty(most), np.empty(most)
     scores, spread = np.zeros((len(which), ROWS)), np.zeros((len(which), ROWS, ROWS))
     total = 0
-    quality = np.empty((len(home), 10))
-    normal, inverse, factor = np.zeros((MOST, MOST)), np.zeros((MOST, MOST)), np.empty((MOST, MOST))
-    gradient, column = np.empty(MOST), np.zeros(MOST)
+    quality = np.empty((len(about.home), 10))
+    system, inverse, unit = system_for(widest), np.zeros((MOST, MOST)), np.zeros(MOST)
     for w in range(len(which)):
         i = which[w]
-        side = 2 * half[i] + 1
+        side = 2 * about.half[i] + 1
         wide = (side + 7) // 8 * 8
         data, mask = np.empty(side * wide, np.float32), np.empty(side * wide, np.float32)
-        one = which[w : w + 1]
-        place = np.zeros(1, np.int64)
-        cut_out(frame, home, half, outer, reach, near_start, near_index, noise[4], noise[5], one, place, data, mask, quality)
+        cut_out(frame, about, model.noise, which[w : w + 1], Packed(np.zeros(1, np.int64), data, mask), quality)
         p = parameters[i].copy()
-        p[0] -= int(round(home[i, 0])) - half[i]
-        p[1] -= int(round(home[i, 1])) - half[i]
-        images = mean_images(kind, p, side, side, aperture, True)
+        p[0] -= int(round(about.home[i, 0])) - about.half[i]
+        p[1] -= int(round(about.home[i, 1])) - about.half[i]
+        images = mean_images(kind, p, side, side, model.aperture, True)
         weight, residual, kept = np.empty((side, wide)), np.empty((side, wide)), np.zeros((side, wide))
-        values, seen = data.reshape(side, wide), mask.reshape(side, wide)
-        weigh(images, values, seen, weight, kept, residual, noise, np.empty(0), *mean_range(kind, p))
-        normal_equations(images, residual, weight, used, 0, count, normal, gradient, np.empty(side * wide))
+        window = Window(images, data.reshape(side, wide), mask.reshape(side, wide), weight, kept, residual)
+        weigh(window, model.noise, np.empty(0), *mean_range(kind, p))
+        normal_equations(images, residual, weight, used, 0, system)
         inverse[:] = 0.0
-        for a in range(count):
-            gradient[:count] = 0.0
-            gradient[a] = 1.0
-            if solve(count, normal, gradient, 0.0, column, factor):
-                inverse[a] = column
+        if factorise(system.normal, count, RIDGE, system.factor):
+            for a in range(count):
+                unit[:count] = 0.0
+                unit[a] = 1.0
+                substitute(system.factor, count, unit, inverse[a])
         for r in range(side):
             for c in range(side):
-                if seen[r, c] == 0.0:
+                if window.mask[r, c] == 0.0:
                     continue
                 left = 1.0
                 for a in range(count):
@@ -653,27 +727,35 @@ def residuals(frame, kind, parameters, slopes, which, home, half, outer, reach, 
                     levels[total], found[total] = images[0, r, c], residual[r, c] / math.sqrt(left)
                     steep[total] = math.hypot(images[1, r, c], images[2, r, c])
                     total += 1
-        first = max(0, (side - ROWS) // 2)
-        stop = min(side, first + ROWS)
-        answers = np.zeros((side, MOST))
-        if not row_answers(images, weight, used, count, normal, first, stop, gradient, column, factor, answers):
-            continue
-        for r in range(first, stop):
-            for c in range(side):
-                scores[w, r - first] += weight[r, c] * images[1, r, c] * residual[r, c]
-                spread[w, r - first, r - first] += weight[r, c] * images[1, r, c] * images[1, r, c]
-        for r in range(first, stop):
-            for a in range(count):
-                told = 0.0
-                for c in range(side):
-                    told += weight[r, c] * images[1, r, c] * images[1 + a, r, c]
-                for q in range(first, stop):
-                    spread[w, q - first, r - first] -= told * answers[q, a]
+        row_scores(window, used, system, scores[w], spread[w])
     return levels[:total], found[:total], steep[:total], scores, spread
 
 
 @jit
-def mean_images(kind, p, rows, cols, aperture, surface):
+def row_scores(window: Window, used: Ints, system: System, scores: Array, spread: Array) -> None:
+    """Scores of shifts of the middle rows of a window along x, and their covariance under white noise."""
+    images, weight, residual = window.images, window.weight, window.residual
+    side = weight.shape[0]
+    first = max(0, (side - ROWS) // 2)
+    stop = min(side, first + ROWS)
+    answers = np.zeros((side, MOST))
+    if not row_answers(images, weight, used, system, (first, stop), answers):
+        return
+    for r in range(first, stop):
+        for c in range(side):
+            scores[r - first] += weight[r, c] * images[1, r, c] * residual[r, c]
+            spread[r - first, r - first] += weight[r, c] * images[1, r, c] * images[1, r, c]
+    for r in range(first, stop):
+        for a in range(len(used)):
+            told = 0.0
+            for c in range(side):
+                told += weight[r, c] * images[1, r, c] * images[1 + used[a], r, c]
+            for q in range(first, stop):
+                spread[q - first, r - first] -= told * answers[q, a]
+
+
+@jit
+def mean_images(kind: int, p: Array, rows: int, cols: int, aperture: float, surface: bool) -> Array:
     """Mean and derivatives by all parameters of a window whose first pixel is (0, 0); shape (parameters + 1, rows, cols + padding)."""
     s = SHAPES[kind]
     wide = (cols + 7) // 8 * 8
@@ -683,6 +765,6 @@ def mean_images(kind, p, rows, cols, aperture, surface):
     blocks = block_count(reach_px(p[2 + s], aperture))
     table = np.empty((phase_count(p[2 + s]) + 1, 48 * blocks), np.float32)
     across, down, parts = np.empty((blocks, 40), np.float32), np.empty((blocks, 40), np.float32), np.empty((3, 64), np.float32)
-    draw(images, planes, kind, p, aperture, True, surface, points, table, across, down, parts)
+    draw(images, Canvas(planes, points, table, across, down, parts), kind, p, aperture, True, surface)
     complete(images, kind, p, True, surface)
     return images

@@ -12,13 +12,13 @@ from pixmetry.core.extras import import_extra
 from pixmetry.core.threads import map_tiles
 from pixmetry.locate.detect.grids import Grid, eight_bit, no_grid
 from pixmetry.locate.detect.targets import Flag, Positions
-from pixmetry.locate.noise import NoiseModel, noise_numbers
+from pixmetry.locate.noise import NoiseModel
 from pixmetry.locate.template import _corner_kernels as kernels
 
 REACH_PX = 10.0  # the blurred edges are straight over this length even through strongly distorting lenses
 LEAST_REACH_PX = 4.0
 CLEARANCE_PX = 3.0  # from the next edge of the board, for its blur
-PLANES = {"never": 0, "always": 1, "auto": 2}
+PLANES = {"never": kernels.NEVER, "always": kernels.ALWAYS, "auto": kernels.AUTO}
 PLANES_SIGNIFICANT = 23.5  # fall of χ² with 4 unknowns more that noise alone causes once in 1e4
 POOR_FIT_SIGMA = 6.0
 OUTSIDE_PX = 1e6  # where a start that is not a number is put
@@ -139,24 +139,25 @@ def corner_positions(
         raise InputError("no such choice of planes", value=planes, allowed=", ".join(PLANES))
     x, y = (np.clip(np.nan_to_num(np.ascontiguousarray(v, float).ravel(), nan=-OUTSIDE_PX), -OUTSIDE_PX, OUTSIDE_PX) for v in (x_px, y_px))
     reach = default_reach_px(x, y) if reach_px is None else np.broadcast_to(np.asarray(reach_px, float), x.shape).copy()
-    law = np.append(noise_numbers(noise, frame.dtype), PLANES_SIGNIFICANT)
+    how = kernels.How(PLANES[planes], PLANES_SIGNIFICANT, float(aperture_px), noise.numbers(frame.dtype))
 
     def fit(part: np.ndarray, dx: float, dy: float) -> None:
-        n = len(part)
-        from_x, from_y, within = x[part] + dx, y[part] + dy, reach[part]
-        own = (np.full((n, kernels.ALL), np.nan), np.full((n, 3), np.nan), np.full(n, np.nan), np.zeros(n, np.int64), np.zeros(n, np.int64))
-        kernels.fit_corners(frame, from_x, from_y, within, PLANES[planes], float(aperture_px), law, 0, n, *own)
-        for whole, values in zip(results, own, strict=True):
+        own = _empty(len(part))
+        kernels.fit_corners(frame, x[part] + dx, y[part] + dy, reach[part], how, own)
+        for whole, values in zip(fits, own, strict=True):
             whole[part] = values
 
-    n = len(x)
-    results = (np.full((n, kernels.ALL), np.nan), np.full((n, 3), np.nan), np.full(n, np.nan), np.zeros(n, np.int64), np.zeros(n, np.int64))
-    states = results[4]
+    fits = _empty(len(x))
     for dx, dy in ((0.0, 0.0), *OTHER_STARTS_PX):  # one fit in a thousand does not come to rest from where it began
-        lost = np.flatnonzero((states & 1) == 0)
+        lost = np.flatnonzero((fits.states & 1) == 0)
         map_tiles(partial(fit, dx=dx, dy=dy), [lost[i : i + CHUNK] for i in range(0, len(lost), CHUNK)], threads)
-    found, covariance, chi2, counts, states = results
-    return _positions(x, y, reach, found, covariance, chi2, counts, states)
+    return _positions(reach, fits)
+
+
+def _empty(n: int) -> kernels.Fits:
+    """Room for the fits of n corners."""
+    integers = np.zeros(n, np.int64), np.zeros(n, np.int64)
+    return kernels.Fits(np.full((n, kernels.ALL), np.nan), np.full((n, 3), np.nan), np.full(n, np.nan), *integers)
 
 
 def default_reach_px(x_px: np.ndarray, y_px: np.ndarray) -> np.ndarray:
@@ -170,19 +171,11 @@ def default_reach_px(x_px: np.ndarray, y_px: np.ndarray) -> np.ndarray:
     return np.clip(0.85 * nearest - CLEARANCE_PX, LEAST_REACH_PX, REACH_PX)
 
 
-def _positions(
-    x: np.ndarray,
-    y: np.ndarray,
-    reach: np.ndarray,
-    found: np.ndarray,
-    covariance: np.ndarray,
-    chi2: np.ndarray,
-    dof: np.ndarray,
-    states: np.ndarray,
-) -> Positions:
+def _positions(reach: np.ndarray, fits: kernels.Fits) -> Positions:
+    dof, states = fits.dof, fits.states
     rest = (states & 1) > 0
-    per_dof = np.where(dof > 0, chi2 / np.maximum(dof, 1), np.nan)
-    flags = np.zeros(len(x), np.uint32)
+    per_dof = np.where(dof > 0, fits.chi2 / np.maximum(dof, 1), np.nan)
+    flags = np.zeros(len(dof), np.uint32)
     marks = (
         (~rest, Flag.NOT_CONVERGED),
         (states & 2 > 0, Flag.BORDER),
@@ -193,7 +186,7 @@ def _positions(
     )
     for mark, flag in marks:
         flags[mark] |= np.uint32(flag)
-    found, covariance = np.where(rest[:, None], found, np.nan), np.where(rest[:, None], covariance, np.nan)
+    found, covariance = (np.where(rest[:, None], values, np.nan) for values in (fits.found, fits.covariance))
     more: dict[str, Any] = {
         "amplitude_dn": 2 * np.abs(found[:, 6]),
         "background_dn": found[:, 5] - np.abs(found[:, 6]),

@@ -12,7 +12,8 @@ from pixmetry.core.threads import map_tiles
 from pixmetry.locate.detect.background import scale_of
 from pixmetry.locate.detect.targets import Targets
 from pixmetry.locate.noise import ROUNDING_DN2, NoiseModel
-from pixmetry.locate.template.template_fit import KINDS, Windows, run_fit, with_second_start
+from pixmetry.locate.template._template_kernels import ALIKE, residuals
+from pixmetry.locate.template.template_fit import Windows, run_fit, with_second_start
 
 PIECES = 4  # of the work
 LEAST_SLOPED_PX = 2.0
@@ -87,7 +88,7 @@ def noise_from_image(
     first = max(float(np.median(part.sigma_dn)) ** 2, least)
     low, high, _ = scale_of(frame, low_dn, high_dn)
     guess = NoiseModel(first, low_dn=low, high_dn=high, origin="image")
-    windows = Windows.of(frame, targets, guess, kind, KINDS.index(kind), aperture_px, True, False)
+    windows = Windows.of(frame, targets, guess, kind, aperture_px, True, False)
     start = None
     for step in range(PASSES):
         left = _leftovers(windows, targets, which, guess, kind, threads, start)
@@ -102,7 +103,7 @@ def row_shifts_from_image(
 ) -> NoiseModel:
     """Return a noise model that is known with the shifts of rows against each other that the frame shows; arguments as above."""
     which = _some(targets)
-    windows = Windows.of(frame, targets, noise, kind, KINDS.index(kind), aperture_px, True, False)
+    windows = Windows.of(frame, targets, noise, kind, aperture_px, True, False)
     return _with_row_shifts(noise, replace(windows, noise=noise), targets, which, kind, threads, None)
 
 
@@ -126,7 +127,7 @@ def _with_row_shifts(
         return noise
     turned = transposed(targets)
     frame = np.ascontiguousarray(windows.frame.T)
-    aside = Windows.of(frame, turned, noise, kind, KINDS.index(kind), windows.aperture_px, True, False)
+    aside = Windows.of(frame, turned, noise, kind, windows.aperture_px, True, False)
     columns = row_shifts(_leftovers(aside, turned, which, noise, kind, threads, None))
     if math.hypot(*columns) > ROWS_ALONE * math.hypot(*rows):
         return noise
@@ -191,8 +192,6 @@ def _leftovers(
     start: np.ndarray | None,
 ) -> Leftovers:
     """Fit some of the targets and look at what is left."""
-    from pixmetry.locate.template._template_kernels import residuals
-
     windows = replace(windows, noise=noise)
     first = windows.start if start is None else start
     # planes, so that light or a ground that slopes is not taken for noise; small targets cannot tell them from the rest
@@ -201,10 +200,10 @@ def _leftovers(
     fitted = run_fit(windows, which, first, ground, light, False, threads)
     fitted = with_second_start(windows, targets, which, fitted, (ground, light, False), threads)
     slopes = 2 * ground + 2 * light
-    about = windows.start, windows.half, windows.outer, windows.reach, windows.near_start, windows.near_index, windows.numbers
+    model = windows.model
 
     def piece(good: np.ndarray) -> tuple[np.ndarray, ...]:
-        return residuals(windows.frame, windows.code, fitted.parameters, slopes, good, *about, windows.aperture_px)
+        return residuals(windows.frame, model, fitted.parameters, slopes, good, windows.about)
 
     pieces = map_tiles(piece, np.array_split(np.flatnonzero(fitted.at_rest), PIECES), threads)
     level, residual, steep, score, spread = (np.concatenate(values) for values in zip(*pieces, strict=True))
@@ -323,8 +322,6 @@ def row_shifts(left: Leftovers) -> tuple[float, float]:
     ρ^(lines between) within a field of every other row, with a loop that forgets in five lines. What all rows of a target share cannot
     be seen: it is inferred from what they do not share.
     """
-    from pixmetry.locate.template._template_kernels import ALIKE
-
     spread = left.spread
     own = np.sqrt(np.maximum(np.diagonal(spread, axis1=1, axis2=2), 0.0))
     told = own > 0.1 * own.max(axis=1, initial=0.0, keepdims=True) + 1e-300

@@ -147,7 +147,7 @@ def fit_template(
             raise InputError("light that falls off over a Gaussian spot cannot be told from a shift of it", allowed="light_plane=False")
         light_plane = False
     surface, exact = light_on == "surface", likelihood == "poisson_gaussian"
-    windows = Windows.of(frame, targets, noise, kind, KINDS.index(kind), aperture_px, surface, exact)
+    windows = Windows.of(frame, targets, noise, kind, aperture_px, surface, exact)
     everyone = np.arange(len(targets))
     auto = "auto" in (background_plane, light_plane)
     on_ground, on_light = np.full(len(targets), background_plane is True), np.full(len(targets), light_plane is True)

@@ -10,6 +10,7 @@ import numpy as np
 from pixmetry.core.threads import map_tiles
 from pixmetry.locate.detect.targets import Targets
 from pixmetry.locate.noise import NoiseModel
+from pixmetry.locate.template import _template_kernels as kernels
 
 KINDS = ("disc", "ellipse", "ring", "spot")  # in the order of the kernels' codes
 REACH = 3.5  # standard deviations of the edge, the pixel included, up to which pixels around a target are used
@@ -21,18 +22,22 @@ CHUNK = 64  # targets in one piece of work, at most
 
 @dataclass(frozen=True)
 class Windows:
-    """Targets with what their fits start from; arrays of shape (n, …).
+    """Targets with what their fits start from.
 
     Parameters
     ----------
+    frame : ndarray, shape (rows, cols)
+    noise : NoiseModel
+    code : int
+        Of the kind.
+    aperture_px : float
+    surface : bool
+    efficiency : ndarray
+        Of the likelihood of few electrons; empty where it is not used.
     start : ndarray, shape (n, parameters)
         Start values, the planes included.
-    half : ndarray of int64
-        Half sides of the windows.
-    outer, reach : ndarray, shape (n,) and (n, 2)
-        Longest half axes; how far beyond them pixels are used, and are taken from a neighbour.
-    near_start, near_index : ndarray of int64
-        Neighbours of every target, as of `detection.neighbours`.
+    about : kernels.About
+        Where the windows are.
     """
 
     frame: np.ndarray
@@ -42,15 +47,11 @@ class Windows:
     surface: bool
     efficiency: np.ndarray
     start: np.ndarray
-    half: np.ndarray
-    outer: np.ndarray
-    reach: np.ndarray
-    near_start: np.ndarray
-    near_index: np.ndarray
+    about: kernels.About
 
     @classmethod
     def of(
-        cls, frame: np.ndarray, targets: Targets, noise: NoiseModel, kind: str, code: int, aperture_px: float, surface: bool, exact: bool
+        cls, frame: np.ndarray, targets: Targets, noise: NoiseModel, kind: str, aperture_px: float, surface: bool, exact: bool
     ) -> Windows:
         """Windows and start values of targets; ``exact``: the likelihood of few electrons."""
         from pixmetry.locate.detect.detection import neighbours
@@ -65,15 +66,13 @@ class Windows:
             from pixmetry.locate.bound.few_electrons import efficiency as of_sigma
 
             efficiency = of_sigma(math.sqrt(noise.constant_dn2) / noise.slope_dn)
-        return cls(frame, noise, code, float(aperture_px), surface, efficiency, start, half, outer, reach, *near)
-
+        about = kernels.About(start, half, outer, reach, *near)
+        return cls(frame, noise, KINDS.index(kind), float(aperture_px), surface, efficiency, start, about)
 
     @property
-    def numbers(self) -> np.ndarray:
-        """The noise model as the kernels want it."""
-        n = self.noise
-        about = n.constant_dn2, n.slope_dn, n.pattern_rel, n.black_dn, n.low_dn, n.high_dn
-        return np.array([*about, n.row_shift_px**2, n.field_shift_px**2])
+    def model(self) -> kernels.Model:
+        """Template and likelihood as the kernels want them."""
+        return kernels.Model(self.code, self.aperture_px, self.surface, self.noise.numbers(), self.efficiency)
 
 
 @dataclass(frozen=True)
@@ -149,25 +148,21 @@ def run_fit(
         Whether to find out what the planes, which are then not among the unknowns, would bring.
     threads : int, optional
     """
-    from pixmetry.locate.template._template_kernels import cut_out, fit
-
     n, count = start.shape
     free = np.ones(count, bool)
     free[-4:-2], free[-2:] = background_plane, light_plane
     parameters, variance, covariance = np.full((n, count), np.nan), np.full((n, count), np.nan), np.full((n, 3), np.nan)
     quality = np.full((n, 10), np.nan)
-
+    fits, model, about = kernels.Fits(parameters, variance, covariance, quality), w.model, w.about
     chunk = min(CHUNK, max(8, len(which) // 8))
 
     def piece(first: int) -> None:
         part = which[first : first + chunk]
-        side = 2 * w.half[part] + 1
+        side = 2 * about.half[part] + 1
         place = np.concatenate([[0], np.cumsum(side * ((side + 7) // 8 * 8))])
-        data, mask = np.empty(place[-1], np.float32), np.empty(place[-1], np.float32)
-        near = w.near_start, w.near_index
-        cut_out(w.frame, w.start, w.half, w.outer, w.reach, *near, w.noise.low_dn, w.noise.high_dn, part, place, data, mask, quality)
-        settings = w.numbers, w.efficiency, w.aperture_px, w.surface
-        fit(w.code, start, free, test, w.start, w.half, part, place, data, mask, *settings, parameters, variance, covariance, quality)
+        packed = kernels.Packed(place, np.empty(place[-1], np.float32), np.empty(place[-1], np.float32))
+        kernels.cut_out(w.frame, about, model.noise, part, packed, quality)
+        kernels.fit(model, start, free, test, about, part, packed, fits)
 
     map_tiles(piece, range(0, len(which), chunk), threads)
     dof = quality[:, 1] - free.sum()
