@@ -15,7 +15,7 @@ from pixmetry.camera.light import Points
 from pixmetry.core.random import Grid, generator
 from pixmetry.locate.camera_noise import camera_noise
 from pixmetry.locate.lines.line_detection import find_lines
-from pixmetry.locate.lines.line_rows import LineRows, line_rows
+from pixmetry.locate.lines.lines import LineRows, line_rows
 from pixmetry.locate.noise import NoiseModel
 from pixmetry.scene.outlines import line
 from pixmetry.scene.picture import Picture

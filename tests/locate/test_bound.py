@@ -13,8 +13,7 @@ from pixmetry.camera.camera import load_camera
 from pixmetry.core.errors import InputError
 from pixmetry.locate.bound import closed_bounds as closed
 from pixmetry.locate.bound.bound import bound, frames_worth, possible
-from pixmetry.locate.bound.fisher import pixel_noise
-from pixmetry.locate.bound.information import information_per_dn2, kept_rounding_dn2
+from pixmetry.locate.bound.fisher import information_per_dn2, kept_rounding_dn2, pixel_noise
 from pixmetry.locate.bound.predictions import _law, names_for, predict
 from pixmetry.locate.camera_noise import camera_noise
 from pixmetry.locate.noise import NoiseModel

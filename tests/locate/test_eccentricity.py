@@ -8,8 +8,15 @@ from scipy.stats import chi2, norm
 
 from pixmetry.core.errors import InputError
 from pixmetry.core.random import Grid
-from pixmetry.locate.circles.circle_planes import common_plane, plane_normals
-from pixmetry.locate.circles.eccentricity import both_corrected, circle_seen, corrected, corrected_distorted, homography_of
+from pixmetry.locate.circles.eccentricity import (
+    both_corrected,
+    circle_seen,
+    common_plane,
+    corrected,
+    corrected_distorted,
+    homography_of,
+    plane_normals,
+)
 from pixmetry.locate.circles.ellipses import Ellipses, Pinhole, ellipse_through
 from pixmetry.locate.detect.targets import Targets
 from pixmetry.locate.noise import NoiseModel

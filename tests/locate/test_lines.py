@@ -20,8 +20,7 @@ from pixmetry.locate.detect.targets import Flag
 from pixmetry.locate.lines.crosses import cross_positions, crossings, find_crosses
 from pixmetry.locate.lines.line_candidates import LineCandidates
 from pixmetry.locate.lines.line_detection import find_edges, find_lines
-from pixmetry.locate.lines.line_rows import line_rows
-from pixmetry.locate.lines.lines import ESTIMATORS, PARAMETERS, ROW_ESTIMATORS, line_model, line_positions
+from pixmetry.locate.lines.lines import ESTIMATORS, PARAMETERS, ROW_ESTIMATORS, line_model, line_positions, line_rows
 from pixmetry.locate.noise import NoiseModel
 from pixmetry.scene.outlines import edge as scene_edge
 from pixmetry.scene.outlines import line as scene_line

@@ -11,11 +11,10 @@ from scipy.stats import chi2, kstest, norm
 
 from locate import rendered
 from pixmetry.core.errors import InputError, MeasureError
-from pixmetry.locate.bound.few_electrons import efficiency
 from pixmetry.locate.detect.targets import Flag, Positions, Targets
 from pixmetry.locate.noise import NoiseModel
 from pixmetry.locate.template.template import KINDS, PARAMETERS, choose_planes, fit_template, model, noise_from_image
-from pixmetry.locate.template.template_fit import Windows
+from pixmetry.locate.template.template_fit import Windows, efficiency
 
 RATE = 1e-6  # of false failures of a statistical test
 ROWS, COLS = 26, 30

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pixmetry.observe.hot_pixels import tail_of_counts, tail_of_map
+from pixmetry.observe.defects import tail_of_counts, tail_of_map
 
 SHAPE = (200, 300)
 PIXELS = SHAPE[0] * SHAPE[1]

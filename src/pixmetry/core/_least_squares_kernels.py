@@ -1,7 +1,8 @@
 """Kernel of weighted least squares with a few unknowns: the descent of Levenberg and Marquardt, for every model.
 
-A model is a kernel that sets up the normal equations at given values, and another one that says how far a step may go. A step is judged with the weights it starts from; then these are renewed,
-so that weights may follow the model (iteratively reweighted least squares).
+A model is a kernel that sets up the normal equations at given values, and another one that says how far a step may go. A
+step is judged with the weights it starts from; then these are renewed, so that weights may follow the model (iteratively reweighted least
+squares).
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ import numpy as np
 from pixmetry.camera.observations import PhotonTransfer, StackMoments
 from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.emva.records import MONO, Measurement
-from pixmetry.observe.hot_pixels import tail_of_counts
+from pixmetry.observe.defects import tail_of_counts
 from pixmetry.observe.moments import LevelSummary
 from pixmetry.observe.one_pass import Group, Level, Part, Reduced, photon_transfer, reduce_groups, refuse_copies, whole
 from pixmetry.observe.stack import EQUAL_EXPOSURE, StackAccumulator, choose_stacks, same_exposure

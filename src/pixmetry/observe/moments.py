@@ -15,7 +15,7 @@ import numpy as np
 from pixmetry.camera.observations import LevelMoments
 from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.observe._kernels import accumulate_frame, count_codes, sum_maps, sum_pair, sum_squares
-from pixmetry.observe.hot_pixels import HotTail
+from pixmetry.observe.defects import HotTail
 
 MAX_FRAMES = 65536  # so that the sum of 16-bit codes fits 32 bits
 

@@ -13,7 +13,7 @@ import numpy as np
 from pixmetry.camera.observations import LevelMoments, PhotonTransfer
 from pixmetry.core.errors import MeasureError
 from pixmetry.core.threads import imap_tiles
-from pixmetry.observe.hot_pixels import tail_of_counts
+from pixmetry.observe.defects import tail_of_counts
 from pixmetry.observe.moments import LevelAccumulator, LevelSummary, level_moments, summarize_pair
 from pixmetry.observe.stack import GroupReduction, new_group
 

@@ -108,7 +108,7 @@ def lines_of_pictures(
 
 def _lines(frame: np.ndarray, name: str, polarity: str, noise: object) -> LinePositions:
     from pixmetry.locate.lines.line_detection import find_lines
-    from pixmetry.locate.lines.line_rows import line_rows
+    from pixmetry.locate.lines.lines import line_rows
     from pixmetry.locate.noise import ROUNDING_DN2, NoiseModel
 
     known = noise if isinstance(noise, NoiseModel) else None

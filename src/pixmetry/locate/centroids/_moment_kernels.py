@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
+from pixmetry.core._linear_algebra_kernels import Array
 from pixmetry.core.jit import jit
 from pixmetry.locate._noise_kernels import variance_at
 
@@ -630,3 +632,32 @@ def square_pixel_variance(radius, blur, law, threshold, amplitude, sign, level, 
         for ky in range(4):
             variance += (0.5 if ky == 0 else 1.0) * (2.0 * sums[kx, ky] / area) ** 2
     return variance
+
+
+@jit
+def locate_windows(
+    windows: NDArray[np.floating], law: int, background_dn: float, threshold_dn: float, rows: tuple[int, int], cols: tuple[int, int]
+) -> tuple[Array, Array]:
+    """Return x, y, shape (n,), of Σ f(I) x / Σ f(I) over the given rows and columns; NaN where Σ f is not positive."""
+    n = windows.shape[0]
+    x, y = np.empty(n, np.float64), np.empty(n, np.float64)
+    for i in range(n):
+        total, along_x, along_y = 0.0, 0.0, 0.0
+        for r in range(rows[0], rows[1]):
+            row_total, row_x = 0.0, 0.0
+            for c in range(cols[0], cols[1]):
+                value = np.float64(windows[i, r, c]) - background_dn
+                if law == SOFT:
+                    value = max(value - threshold_dn, 0.0)
+                elif law == HARD:
+                    value = value if value > threshold_dn else 0.0
+                elif law == SQUARED:
+                    value = value * value
+                row_total += value
+                row_x += value * c
+            total += row_total
+            along_x += row_x
+            along_y += row_total * r
+        x[i] = along_x / total if total > 0.0 else np.nan
+        y[i] = along_y / total if total > 0.0 else np.nan
+    return x, y

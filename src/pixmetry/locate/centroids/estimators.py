@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pixmetry.core.errors import InputError
-from pixmetry.locate.centroids._phase_kernels import CENTROID, HARD, SOFT, SQUARED, locate_windows
+from pixmetry.locate.centroids._moment_kernels import CENTROID, HARD, SOFT, SQUARED, locate_windows
 
 LAWS = {"centroid": CENTROID, "squared_centroid": SQUARED, "soft_threshold": SOFT, "hard_threshold": HARD}
 PREFIX = "fixed_"  # of their names: what pixmetry locate runs under the same law follows the target with its window
@@ -102,7 +102,7 @@ class Estimator:
         """
         data = windows_dn if windows_dn.dtype in (np.float32, np.float64) else windows_dn.astype(np.float32)
         r, c = self._square(data.shape)
-        return locate_windows(data, LAWS[self.law], float(self.background_dn), self._threshold(), r.start, r.stop, c.start, c.stop)
+        return locate_windows(data, LAWS[self.law], float(self.background_dn), self._threshold(), (r.start, r.stop), (c.start, c.stop))
 
     def gradient(self, windows_dn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return how the estimated x and y change per DN added to each pixel, two arrays of shape (n, rows, cols), float64.

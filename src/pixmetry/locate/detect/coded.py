@@ -109,7 +109,7 @@ def read_codes(
     not matter; v > ½ is a one. A code is given if every |2v − 1| exceeds the least margin, the zones inside and outside the ring are
     quiet, ones are even in number, and neither none nor all are set. With mirrored pictures the words, and so the numbers, are others.
     """
-    from pixmetry.locate.detect._coded_kernels import sample_rings
+    from pixmetry.locate.detect._detect_kernels import sample_rings
 
     x, y, a, b, amplitude = (np.ascontiguousarray(v, float).ravel() for v in (x_px, y_px, semi_major_px, semi_minor_px, amplitude_dn))
     angle = np.radians(np.ascontiguousarray(angle_deg, float).ravel())

@@ -1,7 +1,7 @@
 """Kernels of template fits: weighted least squares of one target after the other, by Gauss–Newton steps with Levenberg's damping.
 
-The steps are not those of `descent_of`, which other models share: a drawn template is smooth to 2e-5 of its height only, a step may be judged
-by an exact likelihood, moves along the curved valley of radius, blur and height, and what counts at the end is the place alone.
+The steps are not those of `descent_of`, which other models share: a drawn template is smooth to 2e-5 of its height only, a step may be
+judged by an exact likelihood, moves along the curved valley of radius, blur and height, and what counts at the end is the place alone.
 """
 
 from __future__ import annotations
