@@ -20,7 +20,7 @@ from pixmetry.camera.catalogue import get_source
 from pixmetry.camera.signal import Clock, Kind
 from pixmetry.core.random import Grid
 from pixmetry.core.threads import set_threads
-from pixmetry.locate.centroids.estimators import Estimator
+from pixmetry.locate.centroids.fixed import FixedCentroid
 from pixmetry.scene.discs import REACH, STEP, Discs, radial_profile
 from pixmetry.scene.uniform import Uniform
 from pixmetry.sources.cable.termination import echoes
@@ -223,7 +223,7 @@ def main() -> None:
     numpy_s = best_s(lambda: plain.run(3), 1)
     print(f"plain NumPy            {numpy_s:6.3f} s   (x{numpy_s / ours_s:.1f})")
     windows = ours().astype(np.float32)
-    law = Estimator(threshold_dn=5.0, background_dn=float(np.median(windows)))
+    law = FixedCentroid(threshold_dn=5.0, background_dn=float(np.median(windows)))
     verdict(f"{COUNT} windows on two threads", ours_s, GOAL_S, " s")
     print(f"locate (soft, 13 x 13) {1e3 * best_s(lambda: law.locate(windows), 5):6.1f} ms")
     found, check = law.locate(windows)[0], law.locate(plain.run(3))[0]

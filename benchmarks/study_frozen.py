@@ -15,7 +15,7 @@ from pixmetry.budget.monte_carlo import Trials
 from pixmetry.budget.probe import Target, facts_of, make_probe
 from pixmetry.camera.camera import Camera, Element, in_order
 from pixmetry.camera.catalogue import catalogue
-from pixmetry.locate.centroids.estimators import Estimator
+from pixmetry.locate.centroids.fixed import FixedCentroid
 
 SETTINGS = {
     "sensor.quantum_efficiency": {"quantum_efficiency": 0.5},
@@ -32,7 +32,7 @@ def main() -> None:
     sources = catalogue()
     chain = [Element(s.id, s, s.make(SETTINGS[s.id])) for s in in_order(sources[i] for i in SETTINGS)]
     camera = Camera("chain", (240, 320), tuple(chain), facts={"interface": "analogue", "sensor": "ccd", "bits": 8})
-    target, estimator = Target(), Estimator()
+    target, estimator = Target(), FixedCentroid()
     facts = facts_of(camera, target)
     found = {}
     for mode in ("exact", "frozen"):

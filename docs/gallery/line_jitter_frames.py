@@ -13,10 +13,9 @@ from pixmetry.calibrate.bundle.model import Sensor
 from pixmetry.camera.camera import Camera, Element, load_camera
 from pixmetry.camera.light import Points
 from pixmetry.core.random import Grid, generator
-from pixmetry.locate.camera_noise import camera_noise
 from pixmetry.locate.lines.line_detection import find_lines
 from pixmetry.locate.lines.lines import LineRows, line_rows
-from pixmetry.locate.noise import NoiseModel
+from pixmetry.locate.noise import NoiseModel, camera_noise
 from pixmetry.scene.outlines import line
 from pixmetry.scene.picture import Picture
 from pixmetry.scene.shapes import Shapes

@@ -13,7 +13,7 @@ import numpy as np
 
 from gallery.profiles import TOP_DN, gaussian, stored
 from pixmetry.core.random import Grid, Stream
-from pixmetry.locate.centroids.estimators import Estimator
+from pixmetry.locate.centroids.fixed import FixedCentroid
 from pixmetry.locate.lines.line_candidates import LineCandidates
 from pixmetry.locate.lines.lines import line_positions
 from pixmetry.locate.noise import NoiseModel
@@ -38,7 +38,7 @@ def levels(
     return peak_dn * gaussian(np.arange(SAMPLES) - MIDDLE - centre[:, None], sigma_px, integrated) - offset_dn
 
 
-def row_positions(rows_dn: np.ndarray, estimator: Estimator) -> np.ndarray:
+def row_positions(rows_dn: np.ndarray, estimator: FixedCentroid) -> np.ndarray:
     """Centroid of each row less the middle column, shape (rows,).
 
     The estimator takes squares of pixels: each row fills one, as a line would that stays where it is.
@@ -47,7 +47,7 @@ def row_positions(rows_dn: np.ndarray, estimator: Estimator) -> np.ndarray:
     return estimator.locate(np.ascontiguousarray(windows))[0] - MIDDLE
 
 
-CENTROID, SQUARED = Estimator("centroid", SAMPLES), Estimator("squared_centroid", SAMPLES)
+CENTROID, SQUARED = FixedCentroid("centroid", SAMPLES), FixedCentroid("squared_centroid", SAMPLES)
 
 
 @dataclass(frozen=True)
@@ -178,7 +178,7 @@ def exposures(
         for k, peak in enumerate(peak_dn):
             noise = STREAM.normal(Grid.whole(range(frames), shape.shape), draw=1 + j * len(peak_dn) + k)
             windows = stored(peak * shape - offset + noise * np.sqrt(0.81 + 0.0097 * peak * shape))
-            found.append(Estimator("centroid", 21).locate(windows)[0] - 10 - phase_px)
+            found.append(FixedCentroid("centroid", 21).locate(windows)[0] - 10 - phase_px)
         error[offset], u[offset] = np.mean(found, axis=1), np.std(found, axis=1, ddof=1) / np.sqrt(frames)
     return Exposures(peak_dn, error, u)
 
@@ -223,7 +223,7 @@ def cures(frames: int = 20) -> dict[str, Cure]:
     error = {way: np.empty((len(BLACK_DN), frames, ROWS // PIECE_ROWS)) for way in WAYS}
     stated = np.full(len(BLACK_DN), np.nan)
     for j, black in enumerate(BLACK_DN):
-        soft = Estimator("soft_threshold", SAMPLES, sigma=3.0).resolved(max(black, 0.0), NOISE_DN)
+        soft = FixedCentroid("soft_threshold", SAMPLES, sigma=3.0).resolved(max(black, 0.0), NOISE_DN)
         rows = stored(levels(-black, integrated=True) + NOISE_DN * noise)
         for k in range(frames):
             for way, law in zip(WAYS, (CENTROID, SQUARED, soft), strict=False):

@@ -14,7 +14,7 @@ import numpy as np
 from gallery.profiles import TOP_DN, gaussian, stored
 from pixmetry.core.errors import MeasureError
 from pixmetry.core.random import Grid, Stream
-from pixmetry.locate.centroids.estimators import Estimator
+from pixmetry.locate.centroids.fixed import FixedCentroid
 from pixmetry.locate.detect.detection import detect
 from pixmetry.locate.detect.targets import Positions
 from pixmetry.locate.noise import NoiseModel
@@ -159,9 +159,9 @@ def centroids(windows: np.ndarray, curve: str, threshold_dn: float, window: int 
     values = np.asarray(windows, float)
     if "squared" not in curve:
         name = "soft_threshold" if "soft" in curve else "hard_threshold"
-        return Estimator(name, window, threshold_dn=threshold_dn).locate(values)
+        return FixedCentroid(name, window, threshold_dn=threshold_dn).locate(values)
     values = np.where(values > threshold_dn, values - (threshold_dn if "soft" in curve else 0.0), 0.0)
-    return Estimator("squared_centroid", window).locate(values)
+    return FixedCentroid("squared_centroid", window).locate(values)
 
 
 def located(windows: np.ndarray, curve: str, threshold_dn: float, window: int = SIDE) -> tuple[np.ndarray, np.ndarray]:

@@ -30,6 +30,7 @@ FLOORS = (
 )
 FLOOR = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
 
+TYPES = {"typing", "collections.abc", "numpy.typing"}
 KERNEL_FILE = re.compile(r"_(.+_)?kernels")
 THREADS = {"concurrent", "multiprocessing", "_thread", "joblib"}
 LOCKS = {"Lock", "RLock", "local", "current_thread", "main_thread", "get_ident"}  # of ``threading``: these start nothing
@@ -107,10 +108,11 @@ def wrong_layers(source: str, module: str, is_package: bool = False) -> list[str
 
 
 def wrong_kernel_imports(source: str, module: str) -> list[str]:
-    """Imports of a kernel file beyond numpy, math, numba, ``core.jit`` and other kernel files."""
+    """Imports of a kernel file beyond numpy, math, numba, ``core.jit``, other kernel files and what only types are made of."""
 
     def allowed(found: Import) -> bool:
-        if found.module in {"__future__", "numpy", "math", "numba", "pixmetry.core.jit"} or found.dotted == "pixmetry.core.jit":
+        plain = {"__future__", "numpy", "math", "numba", "pixmetry.core.jit"} | TYPES
+        if found.module in plain or found.dotted == "pixmetry.core.jit":
             return True
         ours = found.module.startswith("pixmetry.")
         return ours and any(KERNEL_FILE.fullmatch(name) for name in (found.module.rpartition(".")[2], found.name))

@@ -21,14 +21,14 @@ from pixmetry.camera.catalogue import catalogue, get_source
 from pixmetry.camera.signal import Kind
 from pixmetry.core.errors import InputError
 from pixmetry.core.number import Estimates
-from pixmetry.locate.centroids.estimators import Estimator
+from pixmetry.locate.centroids.fixed import FixedCentroid
 
 KNOWN = {"noise_dn": 0.6}
 
 
 def computed(camera, estimates=None, known=None, target=None, **options):
     """The budget with an estimator that is quick to propagate."""
-    return compute_budget(camera, estimates, known, target, Estimator(), **options)
+    return compute_budget(camera, estimates, known, target, FixedCentroid(), **options)
 
 
 def small_camera():
@@ -93,7 +93,7 @@ def test_no_bound_explodes_or_vanishes_with_the_size_of_the_frame(source_id: str
     """
     source = get_source(source_id)
     cam = small_camera()
-    probe = make_probe(facts_of(cam, Target(), KNOWN), Target(), Estimator(), 4)
+    probe = make_probe(facts_of(cam, Target(), KNOWN), Target(), FixedCentroid(), 4)
     totals = np.array([source.propagate(source.bound_of(s), replace(probe, frame_shape=s)).total_px for s in FRAME_SIZES])
     if source_id != "grabber.clock_warm_up":
         assert (totals[1:] <= 2 * totals[1]).all() and (totals[:2] <= 3 * totals[1]).all()
@@ -151,7 +151,7 @@ def test_an_upper_limit_enters_as_a_rectangular_distribution() -> None:
     limit = 0.012
     got = row(computed(small_camera(), prnu(limit, 0.001, limits=frozenset({"pixel_std_rel"})), KNOWN, trials=0), "sensor.prnu")
     cam = small_camera()
-    probe = make_probe(facts_of(cam, Target(), KNOWN), Target(), Estimator())
+    probe = make_probe(facts_of(cam, Target(), KNOWN), Target(), FixedCentroid())
     spread = (np.arange(1000) + 0.5) / 1000 * limit
     source = get_source("sensor.prnu")
     unit = source.propagate(source.make({"pixel_std_rel": limit}), probe).total_px / limit
@@ -225,7 +225,7 @@ def test_the_headline_is_that_of_brute_force(defects: dict[str, float], seed: in
     """
     cam = hot_camera(**defects)
     budget = computed(cam, None, KNOWN, trials=4096, seed=seed)
-    brute = monte_carlo(cam, Target(), Estimator(), trials=16_384, seed=seed + 1, facts=budget.facts)
+    brute = monte_carlo(cam, Target(), FixedCentroid(), trials=16_384, seed=seed + 1, facts=budget.facts)
     found, error = budget.headline, math.hypot(budget.headline.se_simulated_px, brute.se_total_px)
     assert abs(budget.verdict.total_px - brute.total_px) < 4.9 * error + 0.1 * brute.total_px, found
     assert (found.by == "Monte Carlo") == (abs(found.sum_px - found.simulated_px) > 2 * math.hypot(found.se_simulated_px, found.u_sum_px))
@@ -322,10 +322,10 @@ def test_kurtosis_of_rare_defects_is_that_of_their_simulation(seed: int) -> None
     """Shifts by hot pixels of one size against 40 000 windows, in 6000 of which there is one: the fourth moment is good to some 5 %."""
     cam = camera(element("sensor.defects", hot_fraction=1e-3, hot_median_e=3000.0, hot_sigma_log=0.0))
     known = facts_of(cam, Target(), KNOWN)
-    design = Trials(cam, Target(), Estimator(), known, trials=40_000, frames=1, seed=seed)
+    design = Trials(cam, Target(), FixedCentroid(), known, trials=40_000, frames=1, seed=seed)
     with_it, without = (design.errors(c)[0].ravel() for c in (cam.switched(on=["sensor.defects"]), cam.switched(on=())))
     shift = with_it - without
-    got = get_source("sensor.defects").propagate(cam["sensor.defects"].params, make_probe(known, Target(), Estimator()))
+    got = get_source("sensor.defects").propagate(cam["sensor.defects"].params, make_probe(known, Target(), FixedCentroid()))
     assert got.kurtosis == pytest.approx((shift**4).mean() / (shift**2).mean() ** 2, rel=0.3) and got.kurtosis > 8
 
 

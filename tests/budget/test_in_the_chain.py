@@ -25,7 +25,7 @@ from pixmetry.camera.camera import Camera, Element, in_order
 from pixmetry.camera.catalogue import catalogue, get_source
 from pixmetry.camera.signal import Kind
 from pixmetry.camera.source import Source
-from pixmetry.locate.centroids.estimators import Estimator
+from pixmetry.locate.centroids.fixed import FixedCentroid
 
 CLOCKS = {10e6: (120, 160), 14.1875e6: (200, 300), 14.75e6: (96, 400), 28.4e6: (160, 240)}
 OWN_CLOCK = 14.75e6  # of the pixels, where the grabber's is another
@@ -33,7 +33,7 @@ QUANTILE = 8.0
 CASES = {i: s for i, s in catalogue().items() if s.forward is not None and s.propagate is not None and s.ideal is None}
 ON_LINE = [i for i, s in CASES.items() if Kind.VIDEO in s.consumes and i != "grabber.low_pass"]
 OFF_LINE = [i for i, s in CASES.items() if Kind.VIDEO not in s.consumes]
-TARGET, LAW = Target(peak_rel=0.7, background_rel=0.05), Estimator(threshold_dn=12.0)
+TARGET, LAW = Target(peak_rel=0.7, background_rel=0.05), FixedCentroid(threshold_dn=12.0)
 
 
 def element(source_id: str, **params: object) -> Element:
@@ -102,7 +102,7 @@ def test_a_logarithmic_camera(mode: str, seed: int) -> None:
     cam = Camera("log", (96, 128), tuple(by_id[s.id] for s in in_order(e.source for e in elements)), facts={"bits": 8})
     cam = cam.with_parameters("grabber.adc", offset_dn=8.0)
     facts = facts_of(cam, TARGET, {"noise_dn": 2.0})
-    law = Estimator()
+    law = FixedCentroid()
     trials, probes = Trials(cam, TARGET, law, facts, trials=768, units=16, seed=seed), Probes(cam, facts, TARGET, law)
     for source_id in LOGARITHMIC:
         agree(get_source(source_id), cam, trials, probes)

@@ -12,7 +12,7 @@ from budget.cameras import ETA, GAIN_DN_PER_E, camera, element
 from pixmetry.budget.monte_carlo import Trials, _axis, helpers_of, monte_carlo
 from pixmetry.budget.probe import Facts, Target, facts_of, make_probe, parse_target, passed_light, resolve
 from pixmetry.core.errors import InputError
-from pixmetry.locate.centroids.estimators import Estimator
+from pixmetry.locate.centroids.fixed import FixedCentroid
 
 WHITE_E = 60.0
 Z = 4.9  # of a normal variable: two-sided false-alarm rate 1e-6
@@ -40,7 +40,7 @@ def test_facts_are_those_of_the_chain() -> None:
 
 def test_white_noise_has_the_closed_form(seed: int) -> None:
     """Plain centroid over w × w pixels: u = σ √(w²(w² − 1)/12)/S with S the disc's light, π R² A. Smallest error seen: 3.5 %."""
-    cam, law = noisy(), Estimator("centroid", window=15)
+    cam, law = noisy(), FixedCentroid("centroid", window=15)
     total = math.pi * 3.5**2 * TARGET.peak_rel * 200.0
     u = WHITE_E * GAIN_DN_PER_E * math.sqrt(225 * 224 / 12) / total
     got = monte_carlo(cam, TARGET, law, only=["electronics.amplifier_noise"], trials=20_000, facts=facts(cam), seed=seed)
@@ -56,8 +56,8 @@ def test_white_noise_has_the_closed_form(seed: int) -> None:
 def test_what_is_fixed_shows_as_fixed_and_agrees_with_the_linear_response(seed: int) -> None:
     """PRNU of 1 %: no difference between frames; 8192 places. The propagator's own error is stated as 12 %, here 3 % are allowed."""
     cam = camera(element("sensor.prnu", pixel_std_rel=0.01))
-    probe = make_probe(facts(cam), TARGET, Estimator())
-    got = monte_carlo(cam, TARGET, Estimator(), only=["sensor.prnu"], trials=8192, facts=facts(cam), seed=seed)
+    probe = make_probe(facts(cam), TARGET, FixedCentroid())
+    got = monte_carlo(cam, TARGET, FixedCentroid(), only=["sensor.prnu"], trials=8192, facts=facts(cam), seed=seed)
     assert got.x.temporal == 0 and got.y.temporal == 0
     for axis, u in zip((got.x, got.y), probe.white(0.01 * probe.signal_dn), strict=True):
         assert abs(axis.fixed / u - 1) < 0.03 + Z / math.sqrt(2 * got.units * got.places)
@@ -83,7 +83,7 @@ def test_a_source_alone_is_seen_through_the_camera_s_own_line(seed: int) -> None
     jitter, amplifier = element("grabber.line_jitter", white_ns=5.0), element("electronics.video_amplifier", natural_mhz=8.0, damping=0.7)
     cam = camera(jitter, element("cable.termination", length_m=2.0, line_ohm=50.0))
     cam = replace(cam, chain=(*cam.chain[:2], amplifier, *cam.chain[2:]))
-    design = Trials(cam, TARGET, Estimator(), facts(cam), trials=2048, units=4, seed=seed)
+    design = Trials(cam, TARGET, FixedCentroid(), facts(cam), trials=2048, units=4, seed=seed)
     alone, missed = design.of(only=["grabber.line_jitter"]), design.of(off=["grabber.line_jitter"])
     assert alone.x.u == pytest.approx(missed.x.u, rel=1e-6) and 0.015 < alone.x.u < 0.04  # 5 ns are 0.071 px, over seven rows
     assert {"electronics.video_amplifier", "cable.termination"} == set(helpers_of(cam, ["grabber.line_jitter"]))
@@ -96,7 +96,7 @@ def test_a_target_has_its_light_whatever_the_aperture_takes_away(seed: int) -> N
     cam = camera(noise)
     cam = replace(cam, chain=(aperture, *cam.chain))
     assert passed_light(cam) == pytest.approx(0.6, rel=1e-5) and passed_light(noisy()) == 1.0
-    law = Estimator(threshold_dn=10.0)
+    law = FixedCentroid(threshold_dn=10.0)
     design = Trials(cam, TARGET, law, facts(cam), trials=1024, units=4, seed=seed)
     alone, whole = design.of(only=["electronics.amplifier_noise"]), design.of(off=["electronics.amplifier_noise"])
     # the same draws on the same targets: they differ by the target's slopes alone, not by 1/0.6
@@ -106,7 +106,7 @@ def test_a_target_has_its_light_whatever_the_aperture_takes_away(seed: int) -> N
 def test_windows_follow_a_clock_that_is_cold(seed: int) -> None:
     """Samples 4 px off at the end of the row: no target is lost, and the shift is that of the clock."""
     cam = camera(element("grabber.clock_warm_up", scale_error_rel=0.02, lock_us=10.0), shape=(96, 200))
-    got = monte_carlo(cam, TARGET, Estimator(), only=["grabber.clock_warm_up"], trials=256, units=2, facts=facts(cam), seed=seed)
+    got = monte_carlo(cam, TARGET, FixedCentroid(), only=["grabber.clock_warm_up"], trials=256, units=2, facts=facts(cam), seed=seed)
     assert got.lost == 0
     assert got.x.bias == pytest.approx((141.9 + 99.5) * 0.02 / 1.02, rel=0.06)  # 10 µs are 141.9 px
 
@@ -139,7 +139,7 @@ def test_lost_targets_are_counted_and_left_out() -> None:
 def test_the_estimator_itself_against_the_truth(seed: int) -> None:
     """Without any source, the whole camera's error is the S-curve that the probe shows on a lattice of 24 × 24 phases; u within 8 %."""
     cam = camera()
-    law, target = Estimator(sigma=40.0), Target(diameter_px=4.0, blur_px=0.5, peak_rel=0.7)
+    law, target = FixedCentroid(sigma=40.0), Target(diameter_px=4.0, blur_px=0.5, peak_rel=0.7)
     known = facts_of(cam, target, {"noise_dn": 1.0})
     got = monte_carlo(cam, target, law, trials=4096, facts=known, seed=seed)
     probe = make_probe(known, target, law, phases=24)
@@ -150,20 +150,20 @@ def test_the_estimator_itself_against_the_truth(seed: int) -> None:
 
 def test_a_source_of_codes_is_compared_on_a_converter(seed: int) -> None:
     cam = camera(adc=True)
-    got = monte_carlo(cam, TARGET, Estimator(), only=["grabber.adc"], trials=4096, facts=facts(cam, 1.0), seed=seed)
-    probe = make_probe(facts(cam, 1.0), TARGET, Estimator())
+    got = monte_carlo(cam, TARGET, FixedCentroid(), only=["grabber.adc"], trials=4096, facts=facts(cam, 1.0), seed=seed)
+    probe = make_probe(facts(cam, 1.0), TARGET, FixedCentroid())
     assert abs(got.x.u / probe.white(math.sqrt(1 / 12))[0] - 1) < 0.15  # rounding is not quite white: pixels of the flat top agree
 
 
 def test_the_same_seed_gives_the_same_and_another_one_does_not() -> None:
     cam = noisy()
-    runs = [monte_carlo(cam, TARGET, Estimator(), trials=64, facts=facts(cam), seed=s).x for s in (1, 1, 2)]
+    runs = [monte_carlo(cam, TARGET, FixedCentroid(), trials=64, facts=facts(cam), seed=s).x for s in (1, 1, 2)]
     assert runs[0] == runs[1] != runs[2]
 
 
 def test_off_equals_only_when_there_is_one_source() -> None:
     cam = noisy()
-    design = Trials(cam, TARGET, Estimator(), facts(cam), trials=64)
+    design = Trials(cam, TARGET, FixedCentroid(), facts(cam), trials=64)
     assert design.of(off=["electronics.amplifier_noise"]).x == design.of(only=["electronics.amplifier_noise"]).x
     with pytest.raises(InputError):
         design.of(only=[], off=[])
@@ -176,7 +176,7 @@ def test_places_cover_sensor_and_pixel(seed: int) -> None:
     from scipy.stats import kstest
 
     cam = noisy()
-    design = Trials(cam, TARGET, Estimator(), facts(cam), trials=8192, units=8, seed=seed)
+    design = Trials(cam, TARGET, FixedCentroid(), facts(cam), trials=8192, units=8, seed=seed)
     assert design.dx.shape == (8, 512) and design.row0.min() >= 0 and design.row0.max() <= 96 - 24 and design.col0.max() <= 128 - 24
     for values in (design.dx + 0.5, design.dy + 0.5):
         assert kstest(values.ravel(), "uniform").pvalue > 1e-6
@@ -199,7 +199,7 @@ def test_targets_are_sought_where_the_frame_shows_them(more: list, seed: int) ->
     """
     cam = camera(*more, adc=True)
     assert cam.output_shape != cam.frame_shape
-    got = monte_carlo(cam, TARGET, Estimator(), trials=256, seed=seed)
+    got = monte_carlo(cam, TARGET, FixedCentroid(), trials=256, seed=seed)
     assert got.lost == 0
     for axis in (got.x, got.y):
         assert abs(axis.bias) < 0.15 and axis.u < 0.29
@@ -207,17 +207,17 @@ def test_targets_are_sought_where_the_frame_shows_them(more: list, seed: int) ->
 
 def test_probe_is_the_target_through_the_estimator() -> None:
     cam = noisy()
-    probe = make_probe(facts(cam), TARGET, Estimator())
+    probe = make_probe(facts(cam), TARGET, FixedCentroid())
     assert probe.signal_dn.shape == (64, 24, 24) and probe.background_dn == pytest.approx(5.0)
     total = (probe.signal_dn - probe.background_dn).sum(axis=(1, 2))
     assert np.allclose(total, math.pi * 3.5**2 * 150.0, rtol=2e-4)
     x = ((probe.signal_dn - probe.background_dn) * np.arange(24)).sum(axis=(1, 2)) / total
     assert np.allclose(x, probe.x_px, atol=2e-4)
-    law = resolve(Estimator(), TARGET, facts(cam))
+    law = resolve(FixedCentroid(), TARGET, facts(cam))
     assert law.threshold_dn == pytest.approx(1.8) and law.background_dn == pytest.approx(5.0)
     assert np.array_equal(law.locate(probe.signal_dn)[0], probe.x_hat_px)
     with pytest.raises(InputError, match="threshold"):
-        make_probe(facts(cam), TARGET, Estimator(sigma=None, threshold_dn=1000.0))
+        make_probe(facts(cam), TARGET, FixedCentroid(sigma=None, threshold_dn=1000.0))
 
 
 REFUSED = ["square", "disc:diameter=0", "disc:peak=2", "disc:peak=x", "disc:size=3", "disc:background=-0.1", "disc:peak"]

@@ -12,8 +12,9 @@ from pixmetry.budget import compute_budget
 from pixmetry.budget.monte_carlo import monte_carlo
 from pixmetry.budget.probe import Target, facts_of, make_probe, resolve
 from pixmetry.core.errors import InputError
-from pixmetry.locate.job import estimators, locate
-from pixmetry.locate.target_estimator import AUTO, FITS, MOMENTS, OPERATORS, TargetEstimator
+from pixmetry.locate.estimators import AUTO, estimators, methods
+from pixmetry.locate.job import locate
+from pixmetry.locate.target_estimator import TargetEstimator
 from pixmetry.scene.discs import Discs
 from pixmetry.scene.uniform import Uniform
 
@@ -65,7 +66,7 @@ def test_u_of_the_soft_threshold_too(seed: int, rng: np.random.Generator) -> Non
     assert u == pytest.approx(stated, rel=0.05)
 
 
-@pytest.mark.parametrize("name", [n for n in (*FITS, *MOMENTS, *OPERATORS) if n != "perimeter"])
+@pytest.mark.parametrize("name", [n for n in methods() if n != "perimeter"])
 def test_every_estimator_of_locate_can_be_propagated(name: str, seed: int) -> None:
     """White noise of 0.6 DN by the gradient against 600 pairs of windows: 2.9 % of chance, 4.9 of them, and what is not of first order.
 
@@ -83,7 +84,7 @@ def test_every_estimator_of_locate_can_be_propagated(name: str, seed: int) -> No
 
 
 def test_the_default_is_that_of_locate_and_their_names_are_the_same() -> None:
-    assert set(estimators("disc")) == {AUTO, *FITS, *MOMENTS, *OPERATORS}
+    assert set(estimators("disc")) == {AUTO, *methods()}
     cam = noisy_camera()
     facts = facts_of(cam, Target())
     assert resolve(TargetEstimator(), Target(), facts).name == "template"

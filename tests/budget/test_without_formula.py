@@ -20,7 +20,7 @@ from pixmetry.camera.camera import Camera, Element, load_camera
 from pixmetry.camera.catalogue import catalogue, get_source
 from pixmetry.camera.signal import Kind
 from pixmetry.core.errors import ChainError
-from pixmetry.locate.centroids.estimators import Estimator
+from pixmetry.locate.centroids.fixed import FixedCentroid
 from pixmetry.scene.discs import Discs
 from pixmetry.scene.uniform import Uniform
 
@@ -109,7 +109,7 @@ def test_every_source_of_the_presets_has_a_contribution_or_cannot_be_left_out() 
                 told.add(e.source.id)
     assert told == {"sensor.quantum_efficiency", "electronics.gain"}
     cam = put(camera(element("optics.point_spread", sigma_px=0.5)), element("sensor.exposure"))
-    budget = compute_budget(cam, None, {"noise_dn": 0.6}, TARGET, Estimator(), trials=0)
+    budget = compute_budget(cam, None, {"noise_dn": 0.6}, TARGET, FixedCentroid(), trials=0)
     for row in budget.rows:
         bare = row.source_id in told
         assert row.contribution is not None or bare or row.status in ("not applicable", "left to calibration"), (row.name, row.reason)

@@ -10,7 +10,7 @@ from pixmetry.cli import COMMANDS
 from pixmetry.cli._warming_up import all_kernels, jobs_in
 from pixmetry.core import compiling
 from pixmetry.core.jit import jit
-from pixmetry.locate.job import estimators
+from pixmetry.locate.estimators import estimators
 
 WITHOUT_KERNELS = {"sources", "compare", "warm-up"}
 

@@ -18,8 +18,7 @@ def _noisy(rng: np.random.Generator, a: float, b: float) -> Decay:
     return Decay(t, a * np.exp(-b * t) + rng.normal(0.0, 0.05, 60), 0.0)
 
 
-def test_finds_what_scipy_finds_from_afar() -> None:
-    rng = np.random.default_rng()
+def test_finds_what_scipy_finds_from_afar(rng: np.random.Generator) -> None:
     for start in ((2.0, 1.0), (0.3, 6.0), (20.0, 0.0)):
         decay, p = _noisy(rng, 3.0, 1.3), np.array(start)
         chi2, rests = descend_decay(decay, p, NONE, BOTH, 60, CLOSE)
@@ -29,9 +28,8 @@ def test_finds_what_scipy_finds_from_afar() -> None:
         np.testing.assert_allclose(chi2, 2 * best.cost, rtol=1e-9)
 
 
-def test_weights_that_follow_the_model_solve_their_own_equations() -> None:
+def test_weights_that_follow_the_model_solve_their_own_equations(rng: np.random.Generator) -> None:
     """At rest Σ w(p) (d − µ) ∂µ/∂p is 0, with the weights at p."""
-    rng = np.random.default_rng()
     decay = _noisy(rng, 3.0, 0.5)._replace(noise=0.01)
     p = np.array([2.0, 1.0])
     _, rests = descend_decay(decay, p, NONE, BOTH, 60, CLOSE)
@@ -42,8 +40,7 @@ def test_weights_that_follow_the_model_solve_their_own_equations() -> None:
     assert abs((force * decay.t * fall).sum()) < 1e-5 * abs(force * decay.t * fall).sum()
 
 
-def test_what_is_not_active_stays_and_what_is_least_is_held() -> None:
-    rng = np.random.default_rng()
+def test_what_is_not_active_stays_and_what_is_least_is_held(rng: np.random.Generator) -> None:
     decay, p = _noisy(rng, 3.0, 1.3), np.array([2.0, 1.0])
     assert descend_decay(decay, p, NONE, np.array([0]), 60, CLOSE)[1]
     fall = np.exp(-decay.t)

@@ -14,8 +14,7 @@ def _system(rng: np.random.Generator, n: int) -> tuple[np.ndarray, np.ndarray]:
     return root @ root.T * np.outer(scale, scale), rng.normal(size=n) * scale
 
 
-def test_solves_and_inverts_as_numpy_does() -> None:
-    rng = np.random.default_rng()
+def test_solves_and_inverts_as_numpy_does(rng: np.random.Generator) -> None:
     for n in (1, 2, 5, 10):
         matrix, right = _system(rng, n)
         scale = np.sqrt(np.diag(matrix))
@@ -26,8 +25,7 @@ def test_solves_and_inverts_as_numpy_does() -> None:
         np.testing.assert_allclose(inverse * np.outer(scale, scale), np.linalg.inv(matrix / np.outer(scale, scale)), rtol=1e-8, atol=1e-10)
 
 
-def test_damping_adds_its_share_of_the_diagonal() -> None:
-    rng = np.random.default_rng()
+def test_damping_adds_its_share_of_the_diagonal(rng: np.random.Generator) -> None:
     matrix, right = _system(rng, 4)
     out, scale = np.empty(4), np.sqrt(np.diag(matrix))
     assert solve(matrix, 4, right, 0.3, factor_for(4), out)
@@ -35,8 +33,7 @@ def test_damping_adds_its_share_of_the_diagonal() -> None:
     np.testing.assert_allclose(out * scale, np.linalg.solve(unit, right / scale), rtol=1e-9)
 
 
-def test_root_of_the_inverse() -> None:
-    rng = np.random.default_rng()
+def test_root_of_the_inverse(rng: np.random.Generator) -> None:
     matrix, _ = _system(rng, 5)
     factor, root = factor_for(5), np.zeros((5, 5))
     assert factorise(matrix, 5, 0.0, factor)
@@ -44,8 +41,7 @@ def test_root_of_the_inverse() -> None:
     np.testing.assert_allclose(root @ matrix @ root.T, np.eye(5), atol=1e-9)
 
 
-def test_only_the_leading_part_and_the_lower_triangle_are_read() -> None:
-    rng = np.random.default_rng()
+def test_only_the_leading_part_and_the_lower_triangle_are_read(rng: np.random.Generator) -> None:
     matrix, right = _system(rng, 3)
     wide = np.full((6, 6), np.nan)
     wide[:3, :3] = np.tril(matrix)

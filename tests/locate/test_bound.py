@@ -15,8 +15,7 @@ from pixmetry.locate.bound import closed_bounds as closed
 from pixmetry.locate.bound.bound import bound, frames_worth, possible
 from pixmetry.locate.bound.fisher import information_per_dn2, kept_rounding_dn2, pixel_noise
 from pixmetry.locate.bound.predictions import _law, names_for, predict
-from pixmetry.locate.camera_noise import camera_noise
-from pixmetry.locate.noise import NoiseModel
+from pixmetry.locate.noise import NoiseModel, camera_noise
 from pixmetry.locate.template.template_images import draw_images
 
 FALSE_FAILURES = 1e-6

@@ -10,18 +10,18 @@ from scipy.integrate import quad
 from scipy.special import erf
 
 from pixmetry.core.errors import InputError
-from pixmetry.locate.centroids.estimators import LAWS, Estimator
-from pixmetry.locate.job import estimators
-from pixmetry.locate.target_estimator import TargetEstimator, parse_estimator
+from pixmetry.locate.centroids.fixed import LAWS, FixedCentroid
+from pixmetry.locate.estimators import estimators, parse_estimator
+from pixmetry.locate.target_estimator import TargetEstimator
 
 SIDE = 24
 AXIS = np.arange(SIDE, dtype=float)
 
 
-def estimator(name: str, **kw) -> Estimator:
+def estimator(name: str, **kw) -> FixedCentroid:
     if name.endswith("threshold"):
         kw = {"threshold_dn": 20.0} | kw
-    return Estimator(name, background_dn=10.0, **kw)
+    return FixedCentroid(name, background_dn=10.0, **kw)
 
 
 def spot(x: float, y: float, width: float = 1.8, peak: float = 150.0, background: float = 10.0) -> np.ndarray:
@@ -102,7 +102,7 @@ def test_s_curve_of_a_soft_threshold_equals_the_poisson_sum() -> None:
         bottom += 4 * quad(h, 0, edge, weight="cos", wvar=2 * math.pi * k)[0] * np.cos(2 * math.pi * k * phases)
     series = top / bottom
     windows = np.stack([np.repeat((peak * np.exp(-((AXIS - 12 - c) ** 2) / (2 * width**2)))[None], SIDE, axis=0) for c in phases])
-    x, _ = Estimator("soft_threshold", threshold_dn=threshold).locate(windows)
+    x, _ = FixedCentroid("soft_threshold", threshold_dn=threshold).locate(windows)
     assert np.abs(series).max() > 0.05
     assert np.allclose(x - 12 - phases, series, atol=2e-3)  # the kinks at ± edge leave 1/k² beyond the last term
 
@@ -129,7 +129,7 @@ def test_noise_of_each_estimator_is_what_the_gradient_predicts(rng: np.random.Ge
 def test_gaussian_noise_of_a_centroid_has_the_closed_form() -> None:
     """u = σ √(Σx²)/S: over a square of w pixels, Σx² = w²(w² − 1)/12."""
     window = spot(12, 12)[None]
-    law = Estimator("centroid", window=13, background_dn=10.0)
+    law = FixedCentroid("centroid", window=13, background_dn=10.0)
     gx, _ = law.gradient(window)
     total = 150 * 2 * math.pi * 1.8**2 * erf(6.5 / 1.8 / math.sqrt(2)) ** 2
     assert np.sqrt((gx**2).sum()) == pytest.approx(math.sqrt(169 * 168 / 12) / total, rel=2e-3)
@@ -140,7 +140,7 @@ def test_parse_estimator() -> None:
     assert (got.name, got.sigma, got.window, got.threshold_dn) == ("fixed_soft_threshold", 4.0, 11, None)
     assert got.resolved(5.0, 0.5).threshold_dn == 2.0 and got.resolved(5.0, 0.5).background_dn == 5.0
     assert parse_estimator("fixed_hard_threshold:threshold=12").threshold_dn == 12.0
-    assert parse_estimator("fixed_soft_threshold") == Estimator()
+    assert parse_estimator("fixed_soft_threshold") == FixedCentroid()
     assert parse_estimator("fixed_centroid:window=9").window == 9
 
 
@@ -169,4 +169,4 @@ def test_a_window_that_does_not_fit_and_a_threshold_that_is_not_known_are_refuse
     with pytest.raises(InputError, match="fit"):
         estimator("centroid").locate(np.zeros((1, 12, 24)))
     with pytest.raises(InputError, match="noise"):
-        Estimator().locate(np.zeros((1, 24, 24)))
+        FixedCentroid().locate(np.zeros((1, 24, 24)))

@@ -12,7 +12,8 @@ from scipy import stats
 from locate import rendered
 from locate.coverage_cells import Case, Outcome, add, make_frame
 from pixmetry.locate.detect.detection import detect
-from pixmetry.locate.job import chosen_estimator, locate
+from pixmetry.locate.estimators import chosen_estimator
+from pixmetry.locate.job import locate
 from pixmetry.locate.noise import NoiseModel
 from pixmetry.locate.template.image_noise import noise_from_image
 

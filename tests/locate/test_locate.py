@@ -14,8 +14,10 @@ import pixmetry
 from locate import rendered
 from pixmetry.cli import main
 from pixmetry.core.errors import InputError
+from pixmetry.locate.centroids.operators import OPERATORS
 from pixmetry.locate.detect.targets import Flag
-from pixmetry.locate.job import FITS, MOMENTS, OPERATORS, estimators, scale_ends
+from pixmetry.locate.estimators import AUTO, estimators, methods
+from pixmetry.locate.frame import scale_ends
 from pixmetry.locate.lines.lines import line_model
 from pixmetry.locate.records import LOCATED_SCHEMA, ORIGIN
 
@@ -45,7 +47,7 @@ def matched(table: pixmetry.locate.records.Located, x: np.ndarray, y: np.ndarray
     return np.array([(table.x_px[order] - x) / np.sqrt(table.var_x_px2[order]), (table.y_px[order] - y) / np.sqrt(table.var_y_px2[order])])
 
 
-@pytest.mark.parametrize("estimator", ["auto", *FITS, *MOMENTS, *OPERATORS])
+@pytest.mark.parametrize("estimator", [AUTO, *methods()])
 @pytest.mark.parametrize("amplitude", [150.0, -150.0])
 def test_every_estimator_finds_all_discs_within_its_own_uncertainty(estimator: str, amplitude: float) -> None:
     """Origin included: half a pixel would be 30 standard deviations or more."""

@@ -10,7 +10,7 @@ from scipy.integrate import quad
 
 from pixmetry.core.errors import InputError
 from pixmetry.locate.bound.s_curve import SCurve, even_phases, s_curve
-from pixmetry.locate.centroids.estimators import Estimator
+from pixmetry.locate.centroids.fixed import FixedCentroid
 
 
 def line(sigma: float, peak: float):  # noqa: ANN201
@@ -87,7 +87,7 @@ def test_a_hard_threshold_on_a_gaussian_without_noise() -> None:
     """Clarke's Fig 3.10 for a Gaussian of 1.5 and 150 averaged over the pixel, 21 × 21 window: a simulation of 800 phases, to 12 %."""
     spot = lambda dx, dy: 150 * np.exp(-(dx**2 + dy**2) / (2 * 1.5**2))  # noqa: E731
     for threshold, rms in ((10, 0.014), (20, 0.028), (30, 0.045), (50, 0.065), (70, 0.074), (90, 0.106)):
-        law = Estimator("hard_threshold", window=21, threshold_dn=threshold)
+        law = FixedCentroid("hard_threshold", window=21, threshold_dn=threshold)
         got = s_curve(law, spot, phases_x=28, phases_y=28, window_px=23, rounded=True)
         assert math.hypot(*got.rms_px) / math.sqrt(2) == pytest.approx(rms, rel=0.12)
 
@@ -98,7 +98,7 @@ def test_a_disc_from_the_template_and_the_same_by_quadrature() -> None:
 
     parameters = {"radius_px": 3.0, "blur_px": 0.8, "amplitude_dn": 150.0, "background_dn": 0.0}
     disc = lambda dx, dy: 150 * chndtr((3 / 0.8) ** 2, 2, (dx**2 + dy**2) / 0.8**2)  # noqa: E731
-    law = Estimator("soft_threshold", window=21, threshold_dn=30.0)
+    law = FixedCentroid("soft_threshold", window=21, threshold_dn=30.0)
     by_kind = s_curve(law, "disc", parameters, phases_x=8, phases_y=2)
     by_place = s_curve(law, disc, phases_x=8, phases_y=2)
     assert np.abs(by_kind.error_x_px - by_place.error_x_px).max() < 2e-4

@@ -19,7 +19,7 @@ from pixmetry.camera.observations import Observations
 from pixmetry.emva.evaluate import standard_values
 from pixmetry.emva.records import Measurement
 from pixmetry.files.records import CameraFacts, Campaign, FrameGroup, OpticsFacts
-from pixmetry.locate.centroids.estimators import Estimator
+from pixmetry.locate.centroids.fixed import FixedCentroid
 from pixmetry.observe.observe import Group, observe
 
 GAIN, NOISE_E, OFFSET, BITS, SHAPE = 0.25, 12.0, 40.0, 12, (96, 120)
@@ -86,7 +86,7 @@ def budget(pitch_um: float | None = PITCH_UM) -> Budget:
     facts = Facts(0.1, 0.25, 4000.0, 3.0, BITS, 0.007, 20.0, SHAPE)
     pitch = None if pitch_um is None else (pitch_um, pitch_um)
     interaction = Interaction(monte_carlo(0.0505, 0.0305, 0.0, 0.0, ("all",)), 0.0412, 0.0004)
-    estimator = Estimator().resolved(80.0, 3.0)
+    estimator = FixedCentroid().resolved(80.0, 3.0)
     return Budget("simulated", Target(), estimator, facts, pitch, tuple(rows), one, every, advise(rows, one[0], every[0]), interaction)
 
 

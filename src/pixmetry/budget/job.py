@@ -9,7 +9,7 @@ from pixmetry.budget.advice import advise
 from pixmetry.budget.combine import combine, together_with
 from pixmetry.budget.headline import dof_of, headline, interval_of
 from pixmetry.budget.monte_carlo import Trials
-from pixmetry.budget.probe import AnyEstimator, Probes, Target, facts_of, resolve
+from pixmetry.budget.probe import Probes, Target, facts_of, resolve
 from pixmetry.budget.records import DECIDED, Budget, BudgetRow, Interaction
 from pixmetry.budget.rows import (
     Known,
@@ -24,6 +24,7 @@ from pixmetry.budget.rows import (
 from pixmetry.camera.camera import Camera
 from pixmetry.camera.observations import TAKEN_UP, CameraGeometry
 from pixmetry.core.number import Estimates
+from pixmetry.locate.estimator import Estimator
 from pixmetry.locate.target_estimator import TargetEstimator
 
 FRAMES = (1, 4, 16, 64)
@@ -34,7 +35,7 @@ def compute_budget(
     estimates_by_source: Mapping[str, Estimates] | None = None,
     known_facts: Mapping[str, Any] | None = None,
     target: Target | None = None,
-    estimator: AnyEstimator | None = None,
+    estimator: Estimator | None = None,
     *,
     geometry: CameraGeometry | None = None,
     sensor_shape: tuple[int, int] | None = None,
@@ -57,7 +58,7 @@ def compute_budget(
         Fields of `Facts` that go before what the chain tells.
     target : Target, optional
         By default a disc of 7 px.
-    estimator : Estimator or TargetEstimator, optional
+    estimator : Estimator, optional
         By default what `pixmetry.locate` takes for such a target: the template.
     geometry : CameraGeometry, optional
         Of a calibration with which positions are corrected: in place of the displacements that it takes up stands what it leaves.

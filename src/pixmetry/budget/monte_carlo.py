@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from pixmetry.budget.probe import (
-    AnyEstimator,
     Facts,
     Target,
     background_of,
@@ -30,6 +29,7 @@ from pixmetry.camera.conversions import LineSources, Link
 from pixmetry.camera.signal import Kind
 from pixmetry.core.errors import ChainError, InputError
 from pixmetry.core.random import Grid, Streams
+from pixmetry.locate.estimator import Estimator
 
 UNIT_STRIDE = 1_000_003  # between the unit seeds of cameras of one type
 
@@ -127,7 +127,7 @@ class Trials:
     ----------
     camera : Camera
     target : Target
-    estimator : Estimator or TargetEstimator
+    estimator : Estimator
     facts : Facts
     trials : int
         Windows to expose, at least; rounded up to whole units, places and frames.
@@ -141,7 +141,7 @@ class Trials:
 
     camera: Camera
     target: Target
-    estimator: AnyEstimator
+    estimator: Estimator
     facts: Facts
     trials: int = 2048
     units: int = 8
@@ -210,7 +210,7 @@ class Trials:
         dx, dy = (np.nan_to_num(np.broadcast_to(a, np.shape(b)) - b) for a, b in zip(seen, belongs, strict=True))
         return dx, dy
 
-    def _as_seen(self, camera: Camera, facts: Facts) -> AnyEstimator:
+    def _as_seen(self, camera: Camera, facts: Facts) -> Estimator:
         """Return the estimator with background, threshold and height as this variant of the camera shows them.
 
         Who locates targets takes them from the frame, so they follow what the camera does to the light: black level, gain, a curve. Each
@@ -323,7 +323,7 @@ def shapes_line(element: Element, camera: Camera) -> bool:
 def monte_carlo(
     camera: Camera,
     target: Target,
-    estimator: AnyEstimator,
+    estimator: Estimator,
     *,
     only: Iterable[str] | None = None,
     off: Iterable[str] | None = None,
@@ -343,7 +343,7 @@ def monte_carlo(
     ----------
     camera : Camera
     target : Target
-    estimator : Estimator or TargetEstimator
+    estimator : Estimator
     only, off : iterable of str, optional
         Names in the chain: these alone against the bare conversions, or the camera against itself without these. With neither, the whole
         camera against the truth; the estimator's own error is then part of it.

@@ -17,8 +17,8 @@ from pixmetry.camera.signal import Kind
 from pixmetry.camera.source import Source
 from pixmetry.core.errors import InputError
 from pixmetry.core.random import Grid
-from pixmetry.locate.centroids.estimators import Estimator, split_text
-from pixmetry.locate.target_estimator import MOMENTS, OPERATORS, TargetEstimator
+from pixmetry.locate.estimator import Estimator, KnownTarget
+from pixmetry.locate.noise import split_text
 from pixmetry.scene.discs import Discs
 from pixmetry.scene.uniform import Uniform
 
@@ -244,22 +244,14 @@ def background_of(target: Target, facts: Facts) -> Uniform:
     return Uniform(target.background_rel * facts.saturation_dn / facts.dn_per_photon)
 
 
-AnyEstimator = Estimator | TargetEstimator
-
-
-def window_side(estimator: AnyEstimator) -> int:
+def window_side(estimator: Estimator) -> int:
     """Side of the windows that hold what a resolved estimator reads and what its neighbours need."""
     return max(WINDOW_PX, estimator.window + 11)
 
 
-def resolve(estimator: AnyEstimator, target: Target, facts: Facts) -> AnyEstimator:
+def resolve(estimator: Estimator, target: Target, facts: Facts) -> Estimator:
     """The estimator for this target, its background and the noise."""
-    background_dn = target.background_rel * facts.saturation_dn
-    if isinstance(estimator, Estimator):
-        return estimator.resolved(background_dn, facts.noise_dn)
-    return estimator.resolved(
-        background_dn,
-        facts.noise_dn,
+    known = KnownTarget(
         diameter_px=target.diameter_px,
         blur_px=target.blur_px,
         amplitude_dn=target.peak_rel * facts.saturation_dn,
@@ -267,24 +259,26 @@ def resolve(estimator: AnyEstimator, target: Target, facts: Facts) -> AnyEstimat
         saturation_dn=facts.saturation_dn,
         bits=facts.bits,
     )
+    resolved: Estimator = estimator.resolved(target.background_rel * facts.saturation_dn, facts.noise_dn, known)
+    return resolved
 
 
-def phases_for(estimator: AnyEstimator) -> int:
+def phases_for(estimator: Estimator) -> int:
     """Places of the target within the pixel, per axis."""
-    return FEWER_PHASES if estimator.name in (*MOMENTS, *OPERATORS) else PHASES
+    return FEWER_PHASES if estimator.by_differences else PHASES
 
 
-def _checked(facts: Facts, target: Target, estimator: AnyEstimator) -> AnyEstimator:
+def _checked(facts: Facts, target: Target, estimator: Estimator) -> Estimator:
     """The estimator for this target, which it must be able to see."""
     needed = target.diameter_px + 4 * target.blur_px
-    if isinstance(estimator, Estimator) and estimator.window < needed:
+    estimator = resolve(estimator, target, facts)
+    if estimator.window < needed:
         raise InputError(
             "the target does not fit into the estimator's window",
             value=f"{target.describe()} in {estimator.window} px",
             allowed=f"a window of {int(np.ceil(needed)) // 2 * 2 + 1} px or more",
             remedy=f"give a larger window, as in --estimator {estimator.name}:window=25",
         )
-    estimator = resolve(estimator, target, facts)
     if estimator.threshold_dn is not None and estimator.threshold_dn >= target.peak_rel * facts.saturation_dn:
         raise InputError(
             "the target does not stand above the threshold",
@@ -310,7 +304,7 @@ def _seen(facts: Facts, target: Target, x: np.ndarray, y: np.ndarray, shape: tup
     return photons.astype(float) * facts.dn_per_photon
 
 
-def make_probe(facts: Facts, target: Target, estimator: AnyEstimator, phases: int | None = None) -> Probe:
+def make_probe(facts: Facts, target: Target, estimator: Estimator, phases: int | None = None) -> Probe:
     """Render the target noise-free at a lattice of ``phases`` × ``phases`` places within the pixel and see it through the estimator.
 
     By default there are `phases_for` the estimator.
@@ -359,7 +353,7 @@ class Probes:
     camera : Camera
     facts : Facts
     target : Target
-    estimator : Estimator or TargetEstimator
+    estimator : Estimator
     phases : int, optional
         Along each axis of the pixel; by default `phases_for` the estimator.
 
@@ -369,7 +363,7 @@ class Probes:
         If the target does not fit into the estimator's window, or does not stand above the threshold.
     """
 
-    def __init__(self, camera: Camera, facts: Facts, target: Target, estimator: AnyEstimator, phases: int | None = None) -> None:
+    def __init__(self, camera: Camera, facts: Facts, target: Target, estimator: Estimator, phases: int | None = None) -> None:
         self.camera, self.facts, self.target, self.phases = camera, facts, target, phases or phases_for(estimator)
         self.bare = make_probe(facts, target, estimator, self.phases)
         self.estimator = resolve(estimator, target, facts)
@@ -476,7 +470,7 @@ class Probes:
             locate=locate,
         )
 
-    def _at_level(self, level: float) -> AnyEstimator:
+    def _at_level(self, level: float) -> Estimator:
         """The estimator where constant light is seen so many times as bright: background, threshold and height follow."""
         ground = self.estimator.background_dn
         return self.estimator.as_seen(lambda light_dn: (ground + light_dn) * level)

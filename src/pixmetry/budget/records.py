@@ -9,9 +9,10 @@ import numpy as np
 
 from pixmetry.budget.combine import Combined, combine
 from pixmetry.budget.monte_carlo import MonteCarlo
-from pixmetry.budget.probe import AnyEstimator, Facts, Target
+from pixmetry.budget.probe import Facts, Target
 from pixmetry.camera.catalogue import STAGES
 from pixmetry.camera.contribution import Contribution
+from pixmetry.locate.estimator import Estimator
 
 SCHEMA = "pixmetry/budget/1"
 DECIDED = ("measured", "modelled", "calibrated")
@@ -187,7 +188,7 @@ class Budget:
 
     camera: str
     target: Target
-    estimator: AnyEstimator
+    estimator: Estimator
     facts: Facts
     pitch_um: tuple[float, float] | None
     rows: tuple[BudgetRow, ...]

@@ -148,14 +148,15 @@ def _numbered(boards: Path, folder: Path) -> None:
 
 
 def _correct(series: Path, results: Path, corrected: Path) -> None:
-    from pixmetry.locate.job import frames_inside
+    from pixmetry.locate.files import frames_inside
 
     _run(["correct", str(frames_inside(series)), "--with", str(results), "-o", str(corrected)])
 
 
 def _locating() -> Iterator[Job]:
     """Every kind of target with every estimator, in frames of every type of number."""
-    from pixmetry.locate.job import estimators, locate
+    from pixmetry.locate.estimators import estimators
+    from pixmetry.locate.job import locate
 
     for kind, (picture, options) in _pictures().items():
         for estimator in estimators(kind):

@@ -84,8 +84,8 @@ def assess(
 
 def list_estimators() -> None:
     """Print the estimators that there are: those of `pixmetry locate` for discs, and centroids over a fixed square."""
-    from pixmetry.locate.centroids.estimators import LAWS, PREFIX
-    from pixmetry.locate.job import estimators
+    from pixmetry.locate.centroids.fixed import LAWS, PREFIX
+    from pixmetry.locate.estimators import estimators
 
     words = "over a fixed square of pixels; window=13, and sigma=3 of a threshold"
     fixed = {f"{PREFIX}{law}": f"{law.replace('_', ' ')} {words}" for law in LAWS}

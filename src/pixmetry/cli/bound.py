@@ -127,8 +127,7 @@ def _of_camera(name: str, no_rounding: bool) -> tuple[Any, dict[str, float], dic
     from dataclasses import replace
 
     from pixmetry.camera.camera import load_camera
-    from pixmetry.locate.camera_noise import camera_noise
-    from pixmetry.locate.noise import ROUNDING_DN2
+    from pixmetry.locate.noise import ROUNDING_DN2, camera_noise
 
     camera = load_camera(name)
     read = camera_noise(camera)

@@ -89,7 +89,8 @@ def locate(
     """
     from pixmetry.cli._progress import shown_progress
     from pixmetry.core.threads import set_threads
-    from pixmetry.locate.job import estimators, locate_files, skipped_files
+    from pixmetry.locate.estimators import estimators
+    from pixmetry.locate.files import locate_files, skipped_files
 
     if estimator == "list":
         for name, text in estimators(kind).items():

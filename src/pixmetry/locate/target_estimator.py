@@ -8,15 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pixmetry.core.errors import InputError
-from pixmetry.locate.centroids.estimators import LAWS, PREFIX, Estimator, split_text
 from pixmetry.locate.detect.targets import Flag, Positions, Targets
+from pixmetry.locate.estimator import KnownTarget, Method, Settings
+from pixmetry.locate.estimators import AUTO, FEW_ELECTRONS, methods
 from pixmetry.locate.noise import ROUNDING_DN2, NoiseModel
 
-FITS = ("template", "poisson_gaussian")
-MOMENTS = ("soft_threshold", "squared_centroid", "centroid", "hard_threshold", "windowed_centroid")
-OPERATORS = ("gaussian", "ellipse_edges", "forstner", "perimeter")
-AUTO = "auto"
-FEW_ELECTRONS = 50.0  # at a target's peak: below, the errors of a grey value are visibly no normal ones
 MARGIN_PX = 2.0  # around what an estimator reads of a disc: half a pixel of phase, and rounding up
 
 
@@ -24,13 +20,13 @@ MARGIN_PX = 2.0  # around what an estimator reads of a disc: half a pixel of pha
 class TargetEstimator:
     """An estimator of `pixmetry.locate` for discs, run on windows that hold one target each.
 
-    It is the same code: `template.fit_template` without slopes of ground and light, `moments.moment_positions`,
-    `operators.operator_positions`. Only the search for targets is left out; size, blur, height and noise are those that are known.
+    It is the same code, without slopes of ground and light among a fit's unknowns. Only the search for targets is left out; size, blur,
+    height and noise are those that are known.
 
     Parameters
     ----------
     name : str
-        ``auto``, or one of `FITS`, `MOMENTS`, `OPERATORS`. ``auto`` becomes the template, with the likelihood of few electrons where the
+        ``auto``, or one of `estimators.methods`. ``auto`` becomes the template, with the likelihood of few electrons where the
         target has few.
     radius_px, blur_px, amplitude_dn : float, optional
         Of the target; known by `resolved`.
@@ -56,27 +52,39 @@ class TargetEstimator:
     bits: int | None = None
 
     def __post_init__(self) -> None:
-        if self.name not in (AUTO, *FITS, *MOMENTS, *OPERATORS):
-            raise InputError("no such estimator", value=self.name, allowed=", ".join((AUTO, *FITS, *MOMENTS, *OPERATORS)))
+        if self.name != AUTO and self.name not in methods():
+            raise InputError("no such estimator", value=self.name, allowed=", ".join((AUTO, *methods())))
 
-    def resolved(
-        self,
-        background_dn: float,
-        noise_dn: float,
-        *,
-        diameter_px: float,
-        blur_px: float,
-        amplitude_dn: float,
-        gain_dn_per_e: float,
-        saturation_dn: float,
-        bits: int,
-    ) -> TargetEstimator:
+    @property
+    def method(self) -> Method:
+        """What it runs.
+
+        Raises
+        ------
+        InputError
+            Where ``auto`` was not resolved.
+        """
+        if self.name == AUTO:
+            raise InputError("an estimator for a target that is not known", remedy="call resolved() first")
+        return methods()[self.name]
+
+    def resolved(self, background_dn: float, noise_dn: float, target: KnownTarget | None = None) -> TargetEstimator:
         """Return it for a given target and camera."""
-        few = amplitude_dn < FEW_ELECTRONS * gain_dn_per_e
-        name = self.name if self.name != AUTO else FITS[1] if few else FITS[0]
-        size = {"radius_px": diameter_px / 2, "blur_px": blur_px, "amplitude_dn": amplitude_dn}
-        noise = {"background_dn": background_dn, "noise_dn": max(noise_dn, ROUNDING_DN2**0.5), "slope_dn": gain_dn_per_e}
-        return TargetEstimator(name, **size, **noise, high_dn=saturation_dn, bits=bits)
+        if target is None:
+            raise InputError("an estimator for a target that is not known", remedy="say what target it is")
+        few = target.amplitude_dn < FEW_ELECTRONS * target.gain_dn_per_e
+        name = self.name if self.name != AUTO else "poisson_gaussian" if few else "template"
+        return TargetEstimator(
+            name,
+            radius_px=target.diameter_px / 2,
+            blur_px=target.blur_px,
+            amplitude_dn=target.amplitude_dn,
+            background_dn=background_dn,
+            noise_dn=max(noise_dn, ROUNDING_DN2**0.5),
+            slope_dn=target.gain_dn_per_e,
+            high_dn=target.saturation_dn,
+            bits=target.bits,
+        )
 
     def as_seen(self, level_dn: Callable[[float], float]) -> TargetEstimator:
         """Return it with ground and height as a camera shows them; ``level_dn`` gives the grey value of light so much above the ground."""
@@ -94,13 +102,17 @@ class TargetEstimator:
     def window(self) -> int:
         """Side of the square of pixels that it reads, odd."""
         radius, edge, _ = self._size()
-        reach = 3.5 * edge + 1.0 if self.name in FITS else max(4 * edge, 1.0) + 5 + 0.5 * radius
-        return 2 * int(np.ceil(radius + reach + MARGIN_PX)) + 1
+        return 2 * int(np.ceil(radius + self.method.reach_px(radius, edge) + MARGIN_PX)) + 1
+
+    @property
+    def by_differences(self) -> bool:
+        """Whether its gradient takes a run for every pixel."""
+        return self.name != AUTO and self.method.slopes is None
 
     def describe(self) -> str:
         """Say it in words."""
-        what = {"template": "template fit", "poisson_gaussian": "template fit with the likelihood of few electrons"}
-        return f"{what.get(self.name, self.name.replace('_', ' '))}, as pixmetry locate runs it"
+        words = self.name if self.name == AUTO else self.method.words or self.name.replace("_", " ")
+        return f"{words}, as pixmetry locate runs it"
 
     def locate(self, windows_dn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Estimate one position a window.
@@ -136,28 +148,12 @@ class TargetEstimator:
         Of a fit the rows of (JᵀWJ)⁻¹JᵀW at its result, W one over the variances. Of the others the difference quotient over ± one
         standard deviation of each pixel's noise, so that what a threshold does to that noise is in it.
         """
-        return self._of_fit(windows_dn) if self.name in FITS else self._by_differences(windows_dn)
-
-    def _of_fit(self, windows_dn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        from pixmetry.locate.template.template import PARAMETERS, model
-
-        n, rows, cols = windows_dn.shape
-        found, noise = self._positions(windows_dn), self._noise(windows_dn.dtype)
-        out = np.zeros((2, n, rows, cols))
+        if self.method.slopes is None:
+            return self._by_differences(windows_dn)
         reach = 0.5 * (self.window - 1) - MARGIN_PX + 0.5
-        for k in range(n):
-            values = [found.x_px[k], found.y_px[k], *(found.more[name][k] for name in PARAMETERS["disc"][2:])]
-            if not np.isfinite(values).all():
-                out[:, k] = np.nan
-                continue
-            mean, jacobian = model("disc", np.array(values), rows, cols)
-            y, x = np.ogrid[:rows, :cols]
-            near = np.hypot(x - values[0], y - values[1]) <= reach
-            columns = jacobian[:, near] / np.sqrt(noise.variance_dn2(mean[near]))
-            scale = np.sqrt((columns**2).sum(axis=1, keepdims=True))
-            gain = np.linalg.pinv((columns / scale).T, rcond=1e-9) / scale / np.sqrt(noise.variance_dn2(mean[near]))
-            out[:, k, near] = gain[:2]
-        return out[0], out[1]
+        found, noise = self._positions(windows_dn), self._noise(windows_dn.dtype)
+        slopes = self.method.slopes(found, noise, (windows_dn.shape[1], windows_dn.shape[2]), reach)
+        return slopes[0], slopes[1]
 
     def _by_differences(self, windows_dn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         data = np.asarray(windows_dn, float)
@@ -197,7 +193,7 @@ class TargetEstimator:
             least = f"at least {self.window} × {self.window} px"
             raise InputError("the estimator's window does not fit", value=(rows, cols), allowed=least)
         targets, noise = self._targets(data), self._noise(data.dtype)
-        found = _RUN[self.name](data.reshape(n * rows, cols), targets, noise, self.name)
+        found = self.method.measure(data.reshape(n * rows, cols), targets, noise, Settings(planes=False))
         lost = (found.flags & np.uint32(Flag.NOT_CONVERGED)) > 0
         x, y = np.where(lost, np.nan, found.x_px), np.where(lost, np.nan, found.y_px - rows * np.arange(n))
         return replace(found, x_px=x, y_px=y)
@@ -221,50 +217,3 @@ class TargetEstimator:
             x_px, y_px, half * one, half * one, none, edge * one, amplitude * one, self.background_dn * one, none, none,
             self.noise_dn * one, top, bottom, left, right, np.zeros(n, np.uint32),
         )  # fmt: skip
-
-
-def _fit(frame: np.ndarray, targets: Targets, noise: NoiseModel, name: str) -> Positions:
-    from pixmetry.locate.template.template import fit_template
-
-    likelihood = "least_squares" if name == "template" else name
-    return fit_template(frame, targets, noise, likelihood=likelihood, background_plane=False, light_plane=False)
-
-
-def _moment(frame: np.ndarray, targets: Targets, noise: NoiseModel, name: str) -> Positions:
-    from pixmetry.locate.centroids.moments import moment_positions
-
-    return moment_positions(frame, targets, noise, name)
-
-
-def _operator(frame: np.ndarray, targets: Targets, noise: NoiseModel, name: str) -> Positions:
-    from pixmetry.locate.centroids.operators import operator_positions
-
-    return operator_positions(frame, targets, noise, name)
-
-
-_RUN = {**dict.fromkeys(FITS, _fit), **dict.fromkeys(MOMENTS, _moment), **dict.fromkeys(OPERATORS, _operator)}
-
-
-def parse_estimator(text: str) -> Estimator | TargetEstimator:
-    """Read an estimator: a name of `TargetEstimator`, or ``fixed_…:key=value,…``, as in ``fixed_soft_threshold:sigma=3,window=13``.
-
-    Raises
-    ------
-    InputError
-        If name, key or value cannot be used.
-    """
-    name, _, rest = (part.strip() for part in text.partition(":"))
-    if name in (AUTO, *FITS, *MOMENTS, *OPERATORS):
-        if rest:
-            fixed = f"; for a fixed square of pixels take {PREFIX}{name}:{rest}" if name in LAWS else ""
-            what = f"{name} has no settings: it chooses window and threshold by target and noise, as in pixmetry locate"
-            raise InputError(what, where="estimator", value=rest, remedy=f"name it alone{fixed}")
-        return TargetEstimator(name)
-    if not name.startswith(PREFIX) or name.removeprefix(PREFIX) not in LAWS:
-        known = (AUTO, *FITS, *MOMENTS, *OPERATORS, *(PREFIX + law for law in LAWS))
-        raise InputError("no such estimator", where="estimator", value=name, allowed=", ".join(known))
-    _, values = split_text(text, {"sigma": "sigma", "threshold": "threshold_dn", "window": "window"}, "estimator")
-    window = values.pop("window", 13)
-    if window != int(window):
-        raise InputError("the estimator's window is not a whole number", where="estimator", value=window, allowed="an odd number of pixels")
-    return Estimator(name.removeprefix(PREFIX), window=int(window), **values)

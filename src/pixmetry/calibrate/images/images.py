@@ -21,8 +21,7 @@ from pixmetry.core.threads import imap_tiles
 from pixmetry.files.formats import frame_name
 from pixmetry.files.images import PICTURE_ENDINGS, picture_files
 from pixmetry.files.raw_values import RawLayout, parse_raw
-from pixmetry.locate.job import noise_model
-from pixmetry.locate.noise import NoiseModel
+from pixmetry.locate.noise import NoiseModel, noise_model
 
 LEAST_IMAGES = 3
 

@@ -13,7 +13,8 @@ from pixmetry.files.formats import Decoded
 from pixmetry.files.images import load_picture
 from pixmetry.files.raw_values import RawLayout
 from pixmetry.locate.detect.targets import Flag, Positions
-from pixmetry.locate.job import checked_frame, locate, scale_ends
+from pixmetry.locate.frame import checked_frame, scale_ends
+from pixmetry.locate.job import locate
 from pixmetry.locate.noise import NoiseModel
 from pixmetry.locate.records import Located
 

@@ -79,7 +79,8 @@ def lines_of_pictures(
     from pixmetry.files.formats import frame_name
     from pixmetry.files.images import read_picture
     from pixmetry.files.raw_values import parse_raw
-    from pixmetry.locate.job import checked_frame, noise_model
+    from pixmetry.locate.frame import checked_frame
+    from pixmetry.locate.noise import noise_model
 
     told = progress or no_progress
     noise, layout = noise_model(wanted.noise), None if wanted.raw is None else parse_raw(wanted.raw)

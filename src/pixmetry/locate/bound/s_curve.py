@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pixmetry.core.errors import InputError
-from pixmetry.locate.centroids.estimators import Estimator
 from pixmetry.locate.detect.targets import Targets
+from pixmetry.locate.estimator import Estimator, Settings
+from pixmetry.locate.estimators import methods
 from pixmetry.locate.noise import NoiseModel
 
 Profile = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -75,7 +76,7 @@ def s_curve(
     Parameters
     ----------
     estimator : str, Estimator or callable
-        A name of `moment_positions` or `operator_positions`; an `Estimator` with its own window and threshold; or a function that takes
+        A name of `estimators.methods`; an `Estimator` that is resolved; or a function that takes
         windows of shape (n, rows, cols) and returns x and y, shape (n,), from the centre of a window's first pixel.
     kind : str or callable
         ``disc``, ``ellipse``, ``ring`` or ``spot`` as `template.model` draws them; or a function of dx, dy (px, from the target's centre)
@@ -118,7 +119,7 @@ def s_curve(
     if isinstance(estimator, str):
         found = _by_name(estimator, images, x, y, max(noise_dn, 1e-3), rounded, low_dn, high_dn)
     else:
-        found = estimator.locate(images) if isinstance(estimator, Estimator) else estimator(images)
+        found = estimator(images) if callable(estimator) else estimator.locate(images)
     shape = (len(py), len(px))
     return SCurve(px, py, (np.asarray(found[0]) - x).reshape(shape), (np.asarray(found[1]) - y).reshape(shape))
 
@@ -143,12 +144,8 @@ def _by_name(
     name: str, images: np.ndarray, x: np.ndarray, y: np.ndarray, noise_dn: float, rounded: bool, low_dn: float, high_dn: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Locate by a named estimator: size, blur and background are taken from the images, as a detection would, and the place is known."""
-    from pixmetry.locate.centroids.moments import LAWS, moment_positions
-    from pixmetry.locate.centroids.operators import OPERATORS, operator_positions
-
-    if name not in LAWS and name not in OPERATORS:
-        raise InputError("no such estimator", value=name, allowed=", ".join((*LAWS, *OPERATORS)))
-    locate = moment_positions if name in LAWS else operator_positions
+    if name not in methods():
+        raise InputError("no such estimator", value=name, allowed=", ".join(methods()))
     shape = _shape_of(images[len(images) // 2])
     noise = NoiseModel(noise_dn**2 + rounded / 12, low_dn=low_dn, high_dn=high_dn)
     found_x, found_y = np.empty(len(x)), np.empty(len(x))
@@ -157,7 +154,7 @@ def _by_name(
         rim = 16  # so that neither window nor background is cut off
         wide = np.pad(image, rim, mode="edge").astype(np.float32)
         box = {n: getattr(one, n) + rim for n in ("x_px", "y_px", "row_first", "row_stop", "col_first", "col_stop")}
-        at = locate(wide, replace(one, **box), noise, name, threads=1)
+        at = methods()[name].measure(wide, replace(one, **box), noise, Settings(planes=False, threads=1))
         found_x[i], found_y[i] = at.x_px[0] - rim, at.y_px[0] - rim
     return found_x, found_y
 

@@ -646,7 +646,7 @@ def locate_windows(
         for r in range(rows[0], rows[1]):
             row_total, row_x = 0.0, 0.0
             for c in range(cols[0], cols[1]):
-                value = np.float64(windows[i, r, c]) - background_dn
+                value = float(windows[i, r, c]) - background_dn
                 if law == SOFT:
                     value = max(value - threshold_dn, 0.0)
                 elif law == HARD:

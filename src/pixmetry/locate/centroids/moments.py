@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from pixmetry.core.threads import map_tiles, thread_count
 from pixmetry.locate._noise_kernels import Noise, variances_dn2
 from pixmetry.locate.centroids import _moment_kernels as k
 from pixmetry.locate.detect.targets import Flag, Positions, Targets
+from pixmetry.locate.estimator import Method, Settings
 from pixmetry.locate.noise import NoiseModel
 
 LAWS = {
@@ -302,3 +303,24 @@ def _shape_table() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         flux = np.cumsum(profile * r)
         window[i] = np.interp(0.5 * flux[-1], flux, r + step / 2)
     return ratio, contour, window / math.sqrt(2 * math.log(2))
+
+
+def reach_px(radius_px: float, edge_px: float) -> float:
+    """How far beyond a disc's radius the plane of the background is fitted; ``edge_px``: standard deviation of the edge."""
+    return max(4 * edge_px, 1.0) + 5 + 0.5 * radius_px
+
+
+def _measure(name: str, frame: np.ndarray, targets: Targets, noise: NoiseModel, how: Settings) -> Positions:
+    return moment_positions(frame, targets, noise, name, threads=how.threads)
+
+
+METHODS = tuple(
+    Method(name, text, partial(_measure, name), reach_px)
+    for name, text in {
+        "soft_threshold": "centroid of what exceeds a threshold; fast and nearly as good under white noise",
+        "squared_centroid": "centroid of squared grey values; good for small targets under read noise",
+        "centroid": "centroid of grey values above the background; best for small targets under shot noise",
+        "hard_threshold": "centroid of grey values where they exceed a threshold; depends on the sub-pixel phase",
+        "windowed_centroid": "centroid under a Gaussian window that follows it",
+    }.items()
+)

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 
 from pixmetry.core.errors import InputError
 from pixmetry.locate.centroids import _operator_kernels as o
 from pixmetry.locate.centroids._moment_kernels import ANGLE, COLUMNS, MAJOR, MARGIN, MINOR, REACH
-from pixmetry.locate.centroids.moments import LARGEST_PX, Prepared, class_means, classes, positions, prepare, run_slices
+from pixmetry.locate.centroids.moments import LARGEST_PX, Prepared, class_means, classes, positions, prepare, reach_px, run_slices
 from pixmetry.locate.detect.targets import Positions, Targets
+from pixmetry.locate.estimator import Method, Settings
 from pixmetry.locate.noise import NoiseModel
 
 OPERATORS = {"perimeter": o.PERIMETER, "forstner": o.FORSTNER, "ellipse_edges": o.ELLIPSE_EDGES, "gaussian": o.GAUSSIAN}
@@ -89,3 +92,18 @@ def _phase_variance(work: Prepared, operator: int, threads: int | None) -> np.nd
     out = np.zeros(len(shape))
     run_slices(lambda a, b: o.phase_variances(shape, a, b, operator, phases, nodes, weights, COLUMNS, out), len(shape), threads)
     return out[of]
+
+
+def _measure(name: str, frame: np.ndarray, targets: Targets, noise: NoiseModel, how: Settings) -> Positions:
+    return operator_positions(frame, targets, noise, name, threads=how.threads)
+
+
+METHODS = tuple(
+    Method(name, text, partial(_measure, name), reach_px)
+    for name, text in {
+        "gaussian": "unweighted least-squares fit of a Gaussian",
+        "ellipse_edges": "ellipse through edge points along rays",
+        "forstner": "intersection of the gradients' lines (Förstner operator)",
+        "perimeter": "average of the points of the perimeter",
+    }.items()
+)

@@ -182,8 +182,8 @@ def weigh(window: Window, noise: Noise, efficiency: Array, least: float, most: f
     exact = len(efficiency) > 0 and slope > 0.0
     if level_free and (not ended or (lowest < least and most < highest)):
         size = data.size
-        mean, w, d = images[0].reshape(size), weight.reshape(size), residual.reshape(size)
-        chi2 = plain_weights(mean, data.reshape(size), mask.reshape(size), w, d, 1.0 / constant)
+        flat, w_flat, d_flat = images[0].reshape(size), weight.reshape(size), residual.reshape(size)
+        chi2 = plain_weights(flat, data.reshape(size), mask.reshape(size), w_flat, d_flat, 1.0 / constant)
         return chi2, chi2, chi2
     for r in range(data.shape[0]):
         for c in range(data.shape[1]):

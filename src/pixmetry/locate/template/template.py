@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 
 from pixmetry.core.errors import InputError
 from pixmetry.locate.detect.targets import Flag, Positions, Targets
+from pixmetry.locate.estimator import Method, Settings
+from pixmetry.locate.estimators import TEMPLATE_TEXT
 from pixmetry.locate.noise import NoiseModel
 from pixmetry.locate.template.image_noise import noise_from_image
 from pixmetry.locate.template.template_fit import KINDS, Fitted, Windows, run_fit, with_second_start
@@ -296,3 +300,63 @@ def _positions(kind: str, targets: Targets, result: Fitted, on_ground: np.ndarra
         flags[where] |= np.uint32(flag)
     var_x, cov_xy, var_y = result.covariance.T.copy()
     return Positions(p[:, 0].copy(), p[:, 1].copy(), var_x, cov_xy, var_y, flags, more)
+
+
+def _reach_px(radius_px: float, edge_px: float) -> float:
+    return 3.5 * edge_px + 1.0
+
+
+def _measure(likelihood: str, frame: np.ndarray, targets: Targets, noise: NoiseModel, how: Settings) -> Positions:
+    return fit_template(
+        frame,
+        targets,
+        noise,
+        how.shape,
+        likelihood=likelihood,
+        background_plane=how.planes,
+        light_plane=how.planes,
+        light_on=how.light_on,
+        aperture_px=how.aperture_px,
+        threads=how.threads,
+    )
+
+
+def _slopes(found: Positions, noise: NoiseModel, shape: tuple[int, int], reach_px: float) -> np.ndarray:
+    """How x and y of fitted discs change per DN added to each pixel: rows of (JᵀWJ)⁻¹JᵀW, W one over the variances."""
+    rows, cols = shape
+    out = np.zeros((2, len(found), rows, cols))
+    for k in range(len(found)):
+        values = [found.x_px[k], found.y_px[k], *(found.more[name][k] for name in PARAMETERS["disc"][2:])]
+        if not np.isfinite(values).all():
+            out[:, k] = np.nan
+            continue
+        mean, jacobian = model("disc", np.array(values), rows, cols)
+        y, x = np.ogrid[:rows, :cols]
+        near = np.hypot(x - values[0], y - values[1]) <= reach_px
+        columns = jacobian[:, near] / np.sqrt(noise.variance_dn2(mean[near]))
+        scale = np.sqrt((columns**2).sum(axis=1, keepdims=True))
+        gain = np.linalg.pinv((columns / scale).T, rcond=1e-9) / scale / np.sqrt(noise.variance_dn2(mean[near]))
+        out[:, k, near] = gain[:2]
+    return out
+
+
+METHODS = (
+    Method(
+        "template",
+        TEMPLATE_TEXT,
+        partial(_measure, "least_squares"),
+        _reach_px,
+        knows_aperture=True,
+        slopes=_slopes,
+        words="template fit",
+    ),
+    Method(
+        "poisson_gaussian",
+        "maximum likelihood with the same shape; for few electrons",
+        partial(_measure, "poisson_gaussian"),
+        _reach_px,
+        knows_aperture=True,
+        slopes=_slopes,
+        words="template fit with the likelihood of few electrons",
+    ),
+)

@@ -9,6 +9,7 @@ import numpy as np
 
 from pixmetry.core.errors import InputError
 from pixmetry.locate.centroids._moment_kernels import CENTROID, HARD, SOFT, SQUARED, locate_windows
+from pixmetry.locate.estimator import KnownTarget
 
 LAWS = {"centroid": CENTROID, "squared_centroid": SQUARED, "soft_threshold": SOFT, "hard_threshold": HARD}
 PREFIX = "fixed_"  # of their names: what pixmetry locate runs under the same law follows the target with its window
@@ -16,7 +17,7 @@ THRESHOLDED = ("soft_threshold", "hard_threshold")
 
 
 @dataclass(frozen=True)
-class Estimator:
+class FixedCentroid:
     """A centroid x̂ = Σ f(I_i) x_i / Σ f(I_i) over a square of pixels about the one that is nearest to the target.
 
     That is what a program of one's own may do; its name is that of its law after ``fixed_``. The estimators of `pixmetry locate` are in
@@ -71,12 +72,17 @@ class Estimator:
         """As on the command line."""
         return PREFIX + self.law
 
-    def resolved(self, background_dn: float, noise_dn: float) -> Estimator:
+    @property
+    def by_differences(self) -> bool:
+        """Its gradient is known in closed form."""
+        return False
+
+    def resolved(self, background_dn: float, noise_dn: float, target: KnownTarget | None = None) -> FixedCentroid:
         """Return it for a given background and standard deviation of its noise: a threshold in sigma becomes one in DN."""
         threshold = self.threshold_dn if self.sigma is None else self.sigma * noise_dn
         return replace(self, threshold_dn=threshold, background_dn=background_dn)
 
-    def as_seen(self, level_dn: Callable[[float], float]) -> Estimator:
+    def as_seen(self, level_dn: Callable[[float], float]) -> FixedCentroid:
         """Return it with background and threshold as a camera shows them; ``level_dn`` gives the grey value of light so much above it."""
         ground = level_dn(0.0)
         threshold = None if self.threshold_dn is None else level_dn(self.threshold_dn) - ground
@@ -154,22 +160,3 @@ class Estimator:
             raise InputError("the estimator's window does not fit", value=shape[1:], allowed=f"at least {self.window} × {self.window} px")
         rows, cols = (slice(m - half, m + half + 1) for m in middle)
         return rows, cols
-
-
-def split_text(text: str, keys: dict[str, str], where: str) -> tuple[str, dict[str, float]]:
-    """Split ``name:key=value,…`` into the name and the numbers under the names that ``keys`` gives them."""
-    name, _, rest = text.partition(":")
-    values: dict[str, float] = {}
-    for part in filter(None, (p.strip() for p in rest.split(","))):
-        key, equals, number = (p.strip() for p in part.partition("="))
-        if key not in keys or not equals:
-            raise InputError(f"{part!r} cannot be used", where=where, allowed=", ".join(f"{k}=number" for k in keys))
-        if keys[key] in values:
-            raise InputError(f"{key!r} is given twice", where=where, remedy="give each value once")
-        try:
-            values[keys[key]] = float(number)
-        except ValueError:
-            raise InputError(f"{key} is not a number", where=where, value=number, allowed="a number") from None
-        if not np.isfinite(values[keys[key]]):
-            raise InputError(f"{key} is not a finite number", where=where, value=number, allowed="a finite number")
-    return name.strip(), values

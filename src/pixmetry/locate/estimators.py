@@ -1,0 +1,127 @@
+"""The estimators that there are, by name: those of `pixmetry.locate` for targets that are regions, and centroids over a fixed square."""
+
+from __future__ import annotations
+
+from functools import cache
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pixmetry.core.errors import InputError
+from pixmetry.locate.detect.targets import Flag, Targets
+from pixmetry.locate.noise import NoiseModel, split_text
+
+if TYPE_CHECKING:
+    from pixmetry.locate.estimator import Estimator, Method
+
+MODULES = (  # each has the tuple METHODS
+    "pixmetry.locate.template.template",
+    "pixmetry.locate.centroids.moments",
+    "pixmetry.locate.centroids.operators",
+)
+AUTO = "auto"
+AUTO_TEXT = "chooses shape and likelihood of the template by what the image shows, and says why"
+TEMPLATE_TEXT = "least squares with the target's own shape, integrated over the pixel; at the Cramér–Rao bound"
+ROWS = {
+    "template": "the whole line by least squares, integrated over the pixel; at the Cramér–Rao bound",
+    "row_squared_centroid": "squared centroid of each row (or column), then a straight line through them",
+    "row_centroid": "centroid of each row (or column), then a straight line through them",
+    "row_soft_threshold": "centroid above a threshold of each row (or column), then a straight line through them",
+    "row_template": "a profile fitted to each row (or column), then a straight line through them",
+}
+SPOTS = ("disc", "ellipse", "ring", "spot")
+FEW_ELECTRONS = 50.0  # at a target's peak: below, the errors of a grey value are visibly no normal ones
+TILTED, TILTED_PX = 0.91, 0.3  # ratio of the axes below which, difference of half axes above which discs are fitted as ellipses
+LARGE_PX = 2.0  # radius from which that ratio can be told from a look at the region
+
+
+@cache
+def methods() -> dict[str, Method]:
+    """The methods that measure targets which are regions, by name.
+
+    Examples
+    --------
+    >>> from pixmetry.locate.estimators import methods
+    >>> methods()["centroid"].text
+    'centroid of grey values above the background; best for small targets under shot noise'
+    """
+    return {method.name: method for module in MODULES for method in import_module(module).METHODS}
+
+
+def estimators(kind: str) -> dict[str, str]:
+    """Return the estimators there are for a kind of target, each with a line on what it is.
+
+    Raises
+    ------
+    InputError
+        If there is no such kind.
+
+    Examples
+    --------
+    >>> from pixmetry.locate.estimators import estimators
+    >>> list(estimators("line"))[:2]
+    ['auto', 'template']
+    """
+    if kind in SPOTS or kind == "coded":
+        return {AUTO: AUTO_TEXT} | {name: method.text for name, method in methods().items()}
+    if kind == "line":
+        return {AUTO: AUTO_TEXT, **ROWS}
+    if kind in ("edge", "cross", "chessboard"):
+        return {AUTO: AUTO_TEXT, "template": "least squares with the target's own shape, integrated over the pixel"}
+    raise InputError("no such kind of target", value=kind, allowed=", ".join((*SPOTS, "line", "edge", "cross", "chessboard", "coded")))
+
+
+def parse_estimator(text: str) -> Estimator:
+    """Read an estimator: a name of `TargetEstimator`, or ``fixed_…:key=value,…``, as in ``fixed_soft_threshold:sigma=3,window=13``.
+
+    Raises
+    ------
+    InputError
+        If name, key or value cannot be used.
+    """
+    from pixmetry.locate.centroids.fixed import LAWS, PREFIX, FixedCentroid
+    from pixmetry.locate.target_estimator import TargetEstimator
+
+    name, _, rest = (part.strip() for part in text.partition(":"))
+    if name == AUTO or name in methods():
+        if rest:
+            fixed = f"; for a fixed square of pixels take {PREFIX}{name}:{rest}" if name in LAWS else ""
+            what = f"{name} has no settings: it chooses window and threshold by target and noise, as in pixmetry locate"
+            raise InputError(what, where="estimator", value=rest, remedy=f"name it alone{fixed}")
+        return TargetEstimator(name)
+    if not name.startswith(PREFIX) or name.removeprefix(PREFIX) not in LAWS:
+        known = (AUTO, *methods(), *(PREFIX + law for law in LAWS))
+        raise InputError("no such estimator", where="estimator", value=name, allowed=", ".join(known))
+    _, values = split_text(text, {"sigma": "sigma", "threshold": "threshold_dn", "window": "window"}, "estimator")
+    window = values.pop("window", 13)
+    if window != int(window):
+        raise InputError("the estimator's window is not a whole number", where="estimator", value=window, allowed="an odd number of pixels")
+    return FixedCentroid(name.removeprefix(PREFIX), window=int(window), **values)
+
+
+def seen_shape(kind: str, targets: Targets) -> tuple[str, str]:
+    """Choose the shape of the template for the targets of one frame, and say why: discs that are seen tilted are ellipses."""
+    large = (targets.semi_major_px > LARGE_PX) & ((targets.flags & Flag.BORDER) == 0)
+    if kind != "disc" or not large.any():
+        return kind, "at the Cramér–Rao bound for every size and noise"
+    major, minor = targets.semi_major_px[large], targets.semi_minor_px[large]
+    flat = float(np.median(minor / major))
+    if flat < TILTED or float(np.median(major - minor)) > TILTED_PX:
+        return "ellipse", f"the discs are seen as ellipses, axes 1 : {flat:.2f}"
+    return kind, "at the Cramér–Rao bound for every size and noise"
+
+
+def chosen_estimator(targets: Targets, noise: NoiseModel, why: str) -> tuple[str, str]:
+    """Choose the estimator for the targets of one frame, and say why; ``why`` is what `seen_shape` says.
+
+    The template is at the Cramér–Rao bound for every size and noise (that is what the other rules would trade for speed), so what is to
+    be chosen is its shape and its likelihood.
+    """
+    if not len(targets):
+        return "template", "no target was found"
+    known = noise.slope_dn and noise.slope_clear
+    electrons = float(np.median(np.abs(targets.amplitude_dn))) / noise.slope_dn if known else np.inf
+    if electrons < FEW_ELECTRONS:
+        return "poisson_gaussian", f"{electrons:.0f} electrons at the peak: grey values are not normally distributed; {why}"
+    return "template", why

@@ -1,0 +1,113 @@
+"""Image files in, one table out: which files are meant, and what is written, whole or not at all."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pixmetry.camera.camera import Camera
+from pixmetry.core.errors import InputError
+from pixmetry.core.progress import Progress, no_progress
+from pixmetry.core.threads import imap_tiles
+from pixmetry.files.formats import frame_name, raw_file
+from pixmetry.files.images import PICTURE_ENDINGS, load_picture, picture_files
+from pixmetry.files.output import own_files
+from pixmetry.files.raw_values import RawLayout, parse_raw
+from pixmetry.files.staged_files import Output, check_files, write_together
+from pixmetry.locate.job import locate
+from pixmetry.locate.noise import NoiseModel, noise_model
+from pixmetry.locate.records import Located, checked_table_name, joined
+
+
+def locate_files(
+    images: Sequence[str | Path],
+    output: str | Path | None = None,
+    *,
+    overlay: str | Path | None = None,
+    channel: str | None = None,
+    raw: str | RawLayout | None = None,
+    progress: Progress | None = None,
+    noise: NoiseModel | Camera | str | Path | None = None,
+    **options: Any,
+) -> Located:
+    """Locate targets in image files; one table for all, with a column ``image``.
+
+    Parameters
+    ----------
+    images : sequence of path
+        Image files (PNG, TIFF, BMP, FITS, NPY, JPEG, raw), folders of them in the order of their names, folders that `simulate` wrote,
+        or Zarr stores of frames. A file with several frames is as many images.
+    output : path, optional
+        Where the table goes: ``.csv``, ``.parquet`` or ``.json``.
+    overlay : path, optional
+        A PNG that shows what was found; a folder for several images.
+    channel : {"red", "green", "blue"}, optional
+        Of colour images.
+    raw : str or RawLayout, optional
+        Of files without a header: ``"1920x1200:Mono12p"``, size and GenICam's pixel format.
+    progress : callable (what, done, of), optional
+    noise, **options
+        As in `locate`.
+
+    Raises
+    ------
+    InputError
+        If a file or an option cannot be used; nothing is written then.
+    """
+    from pixmetry.locate.overlay import MARK, overlay_names, overlay_png
+
+    layout = parse_raw(raw) if isinstance(raw, str) else raw
+    files = picture_files([frames_inside(path) for path in images], PICTURE_ENDINGS, layout)
+    pictures = overlay_names(overlay, files)
+    written = [Output(picture, MARK, True) for picture in pictures if picture is not None]
+    tables_at = [] if output is None else [checked_table_name(output)]
+    check_files([*tables_at, *written], files)  # before the work
+    model = noise_model(noise)
+    report = progress or no_progress
+
+    def work(path: Path) -> tuple[Located, bytes]:
+        name = frame_name(path)
+        try:
+            picture = load_picture(path, channel, layout)
+            table = locate(picture.array, noise=model, name=name, **options)
+        except InputError as problem:
+            if str(path) in problem.where:
+                raise
+            where = f"{path}: {problem.where}" if problem.where and problem.where != name else str(path)
+            raise InputError(problem.what, where=where, value=problem.value, allowed=problem.allowed, remedy=problem.remedy) from None
+        drawn = overlay_png(picture.array, table) if overlay is not None else b""
+        if not picture.notes:
+            return table, drawn
+        return Located(table.columns, table.kind, tuple({**image, "file": "; ".join(picture.notes)} for image in table.images)), drawn
+
+    tables: list[Located] = []
+    drawings: list[bytes] = []
+    results = map(work, files) if len(files) == 1 else imap_tiles(work, files)  # the threads share the images, or the one image
+    for i, (table, drawing) in enumerate(results):
+        drawings.append(drawing)
+        tables.append(Located({"image": np.full(len(table), frame_name(files[i])), **table.columns}, table.kind, table.images))
+        report("locating", i + 1, len(files))
+    found = joined(tables)
+    contents = [found.content(one.path.suffix) for one in tables_at]
+    write_together([*tables_at, *written], [*contents, *drawings[: len(written)]], files)
+    return found
+
+
+def frames_inside(path: str | Path) -> Path:
+    """Name the folder or store that holds the frames: a folder without images of its own may be what `simulate` wrote."""
+    folder = Path(path)
+    if not folder.is_dir() or folder.suffix.lower() == ".zarr" or any(p.suffix.lower() in PICTURE_ENDINGS for p in folder.iterdir()):
+        return folder
+    return next((inside for inside in (folder / "frames", folder / "frames.zarr") if inside.is_dir()), folder)
+
+
+def skipped_files(images: Sequence[str | Path], raw: RawLayout | str | None = None) -> list[str]:
+    """Names of the files in the given folders that are taken for no images; ``raw`` as of `locate_files`."""
+    layout = parse_raw(raw) if isinstance(raw, str) else raw
+    folders = [folder for folder in map(frames_inside, images) if folder.is_dir() and folder.suffix.lower() != ".zarr"]
+    written = {folder / name for folder in folders for name in own_files(folder)}  # what `simulate` wrote beside its frames
+    others = (p for folder in folders for p in sorted(folder.iterdir()) if p.suffix.lower() not in PICTURE_ENDINGS and p.is_file())
+    return [p.name for p in others if not p.name.startswith(".") and p not in written and not raw_file(p, layout)]

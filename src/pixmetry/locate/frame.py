@@ -1,0 +1,80 @@
+"""A frame as it is measured: grey values that kernels can read, and where their scale ends."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pixmetry.core.errors import InputError
+from pixmetry.locate.noise import NoiseModel
+
+PILED = 10  # pixels in 4 of one value at the top of an image before it is asked whether they were cut off there
+
+
+def checked_frame(frame: np.ndarray, name: str = "frame") -> np.ndarray:
+    """Return a frame as the kernels want it: C-contiguous uint8, uint16 or float32.
+
+    Raises
+    ------
+    InputError
+        If it is no grey image of finite real numbers.
+    """
+    array = np.asarray(frame)
+    if array.ndim == 3 and array.shape[2] in (3, 4):
+        remedy = "measure in one channel, such as frame[:, :, 1] (green)"
+        raise InputError("a colour image", where=name, value=array.shape, allowed="one grey channel, two axes", remedy=remedy)
+    if array.ndim != 2 or array.size == 0:
+        raise InputError("not a grey image", where=name, value=array.shape, allowed="two axes (row, column), at least one pixel")
+    if array.dtype.kind not in "buif":
+        raise InputError("grey values are not real numbers", where=name, value=str(array.dtype), allowed="integers or floats")
+    if array.dtype.kind == "f" and not np.isfinite(array).all():
+        bad = ~np.isfinite(array)
+        row, col = np.argwhere(bad)[0]
+        remedy = "replace them, for instance by the median of their neighbours"
+        what = f"{int(bad.sum())} pixels are not finite, the first in row {row}, column {col}"
+        raise InputError(what, where=name, allowed="finite grey values", remedy=remedy)
+    if array.dtype in (np.uint8, np.uint16):
+        return np.ascontiguousarray(array, array.dtype.newbyteorder("="))
+    if array.dtype.kind in "bui" and (array.dtype.kind == "b" or (array.min() >= 0 and array.max() < 1 << 16)):
+        return np.ascontiguousarray(array, np.uint16)
+    if array.dtype.kind == "f" and array.dtype.itemsize > 4 and np.abs(array).max() > np.finfo(np.float32).max:
+        raise InputError("grey values are too large", where=name, value=float(np.abs(array).max()), allowed="up to 3e38 (single precision)")
+    return np.ascontiguousarray(array, np.float32)
+
+
+def scale_ends(frame: np.ndarray, bits: int | None, noise: NoiseModel | None) -> tuple[float, float]:
+    """Tell at which grey values the scale ends: from the noise model, the bits, or the image itself.
+
+    Without bits, an integer image is taken to end at the greatest value of 8, 10, 12, 14 or 16 bits if it reaches it, or at its own
+    greatest value if far more pixels have this one than the few values below: they were cut off there.
+
+    Raises
+    ------
+    InputError
+        If there are no such bits, or the image has more.
+    """
+    if frame.dtype.kind == "f":
+        return (-np.inf, np.inf) if noise is None else (noise.low_dn, noise.high_dn)
+    if bits is not None:
+        if bits not in range(1, 17):
+            raise InputError("the bits of a value cannot be used", where="bits", value=bits, allowed="1 to 16")
+        high = float((1 << int(bits)) - 1)
+        if frame.max() > high:
+            raise InputError("grey values that have more bits", where="bits", value=int(frame.max()), allowed=f"up to {high:.0f}")
+        return 0.0, high
+    if noise is not None and np.isfinite(noise.high_dn):
+        return max(0.0, noise.low_dn), noise.high_dn
+    top = int(frame.max())
+    if any(top == (1 << n) - 1 for n in (8, 10, 12, 14, 16)) or _cut_off_at(frame, top):
+        return 0.0, float(top)
+    return 0.0, float("inf")
+
+
+def _cut_off_at(frame: np.ndarray, top: int) -> bool:
+    """Whether far more pixels have the greatest value than the few values below it, in an image that has noise."""
+    part = frame[::2, ::2]
+    piled = int(np.count_nonzero(part == top))
+    if piled < PILED or piled <= 3 * int(np.count_nonzero(part >= max(top - 3, 0))) - 3 * piled:
+        return False
+    usual = int(np.median(part[::4, ::4]))
+    without_noise = usual > 0 and np.count_nonzero(part[::4, ::4] == usual) > 0.5 * part[::4, ::4].size
+    return top > int(part.min()) and not without_noise

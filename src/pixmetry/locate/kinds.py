@@ -1,0 +1,218 @@
+"""What is done for each kind of target: detected, measured, and put into columns with a note on what was chosen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from pixmetry.core.errors import InputError
+from pixmetry.locate.detect.targets import Positions, Targets
+from pixmetry.locate.estimator import Settings
+from pixmetry.locate.estimators import SPOTS, TEMPLATE_TEXT, chosen_estimator, methods, seen_shape
+from pixmetry.locate.noise import ROUNDING_DN2, NoiseModel
+from pixmetry.locate.records import LAST
+
+FAINTEST = 0.05  # height of lines and edges over that of the frame's strongest
+
+
+@dataclass(frozen=True)
+class Task:
+    """One frame and what is wanted of it, as `locate` was told."""
+
+    frame: np.ndarray
+    kind: str
+    estimator: str
+    polarity: str
+    grid: Any  # (cols, rows), "any" or None
+    noise: NoiseModel | None
+    low_dn: float
+    high_dn: float
+    aperture_px: float
+    light_on: str
+    threads: int | None
+
+
+def locate_spots(task: Task) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Targets that are regions: discs, ellipses, rings, spots, with or without a code, on a plate or not."""
+    from pixmetry.locate.detect.detection import detect, select
+
+    found = detect(task.frame, polarity=task.polarity, high_dn=task.high_dn, low_dn=task.low_dn, threads=task.threads)
+    shape = "ellipse" if task.kind == "coded" else task.kind
+    targets = found.targets[select(found.targets, shape)]
+    estimator, reason = task.estimator, "as was asked for"
+    seen, why = seen_shape(shape, targets)
+    noise = _noise_for(task, seen, targets)  # with the targets' own shape, whatever measures them: what it does not explain is noise
+    if estimator == "auto":
+        shape = seen
+        estimator, reason = chosen_estimator(targets, noise, why)
+    planes: str | bool = False if task.kind == "coded" else "auto"  # the rings would pass for slopes
+    settings = Settings(shape, planes, task.light_on, task.aperture_px, task.threads)
+    positions = methods()[estimator].measure(task.frame, targets, noise, settings)
+    columns = _columns(positions, estimator if shape == task.kind else f"{estimator} ({shape})", noise)
+    notes = _notes(estimator, reason, noise, found.polarity if len(targets) else "none found")
+    if task.kind == "coded":
+        columns = _coded(task, positions, columns)
+    if task.grid is not None:
+        from pixmetry.locate.detect.grids import order_grid
+
+        placed = order_grid(positions.x_px, positions.y_px, pattern=None if task.grid == "any" else task.grid)
+        columns = _beside(columns, grid_col=placed.col, grid_row=placed.row)
+        notes["grid"] = placed.message or f"{placed.cols} x {placed.rows}, {int(placed.placed.sum())} of {len(positions)} targets placed"
+    return columns, notes
+
+
+def locate_lines(task: Task) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Lines, edges, and crosses of two lines."""
+    from pixmetry.locate.lines.line_detection import find_edges, find_lines
+
+    if task.kind == "edge":
+        found = find_edges(task.frame, noise=task.noise, threads=task.threads)
+    else:
+        found = find_lines(task.frame, polarity=task.polarity, noise=task.noise, threads=task.threads)
+    height = np.abs(found.amplitude_dn)
+    found = found[height >= FAINTEST * height.max(initial=0.0)]  # beside a strong one, what a coder or a halo draws is no line
+    noise = _noise_for(task, task.kind, found.sigma_dn)
+    estimator, reason = ("template", TEMPLATE_TEXT) if task.estimator == "auto" else (task.estimator, "as was asked for")
+    if task.kind == "cross":
+        from pixmetry.locate.lines.crosses import cross_positions, crossings
+
+        crosses = crossings(found, task.frame.shape)
+        positions = cross_positions(task.frame, crosses, noise, aperture_px=task.aperture_px, threads=task.threads)
+    else:
+        from pixmetry.locate.lines.lines import line_positions
+
+        positions = line_positions(task.frame, found, noise, task.kind, estimator, aperture_px=task.aperture_px, threads=task.threads)
+    columns = _columns(_with_variance_factor(positions, noise), estimator, noise)
+    return columns, _notes(estimator, reason if len(positions) else f"no {task.kind} was found", noise, _polarity(positions))
+
+
+def _with_variance_factor(positions: Positions, noise: NoiseModel) -> Positions:
+    """Covariances times the a posteriori variance factor (median χ²/dof) where the noise was measured in the image beside the targets.
+
+    Noise that rises with the light is seen there only through the residuals. A noise model that was given stands as it is.
+    """
+    chi2 = positions.more.get("chi2_per_dof", np.empty(0))
+    factor = max(1.0, float(np.nanmedian(chi2))) if noise.origin == "image" and np.isfinite(chi2).any() else 1.0
+    scaled = {name: v * factor for name, v in positions.more.items() if name.startswith(("var_", "cov_"))}
+    return replace(
+        positions,
+        var_x_px2=positions.var_x_px2 * factor,
+        cov_xy_px2=positions.cov_xy_px2 * factor,
+        var_y_px2=positions.var_y_px2 * factor,
+        more={**positions.more, **scaled},
+    )
+
+
+def _polarity(positions: Positions) -> str:
+    signs = np.sign(positions.more.get("amplitude_dn", np.empty(0)))
+    return "none found" if not len(positions) else "bright" if (signs > 0).all() else "dark" if (signs < 0).all() else "both"
+
+
+def locate_chessboard(task: Task) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Inner corners of a chessboard of a given size."""
+    from pixmetry.locate.detect.background import background
+    from pixmetry.locate.template.corners import chessboard_reach_px, corner_positions, find_chessboard
+
+    found = find_chessboard(task.frame, task.grid)
+    noise = _noise_for(task, "corner", background(task.frame, low_dn=task.low_dn, high_dn=task.high_dn, threads=task.threads).sigma_dn)
+    reach = chessboard_reach_px(found) if len(found) else 0.0
+
+    def place() -> Positions:
+        return corner_positions(
+            task.frame, found.x_px, found.y_px, noise, reach_px=reach, aperture_px=task.aperture_px, threads=task.threads
+        )
+
+    positions = place()
+    chi2 = positions.more["chi2_per_dof"]
+    if noise.origin == "image" and np.isfinite(chi2).any():
+        # the background's noise has the board's edges in it: the residuals of a first fit know better
+        noise = replace(noise, constant_dn2=noise.constant_dn2 * float(np.nanmedian(chi2)))
+        positions = place()
+    columns = _columns(positions, "template", noise)
+    reason = found.message or "two crossing edges, integrated over the pixel; at the Cramér–Rao bound"
+    columns = _beside(columns, grid_col=found.col, grid_row=found.row)
+    return columns, _notes("template", reason, noise, "none found" if found.message else "both")
+
+
+def _noise_for(task: Task, kind: str, targets: Targets | np.ndarray) -> NoiseModel:
+    """The noise model that was given, with the scale's ends; else what the image tells, at targets or by the spread beside them."""
+    if task.noise is not None:
+        given = replace(task.noise, low_dn=max(task.low_dn, task.noise.low_dn), high_dn=min(task.high_dn, task.noise.high_dn))
+        if not isinstance(targets, Targets) or not len(targets):
+            return given
+        from pixmetry.locate.template.image_noise import row_shifts_from_image
+
+        return row_shifts_from_image(task.frame, targets, given, kind, aperture_px=task.aperture_px, threads=task.threads)
+    if isinstance(targets, Targets) and len(targets):
+        from pixmetry.locate.template.image_noise import noise_from_image
+
+        return noise_from_image(
+            task.frame,
+            targets,
+            kind,
+            low_dn=task.low_dn,
+            high_dn=task.high_dn,
+            aperture_px=task.aperture_px,
+            threads=task.threads,
+        )
+    least = ROUNDING_DN2 if task.frame.dtype.kind == "u" else 1e-12
+    sigma = 0.0 if isinstance(targets, Targets) or not len(targets) else float(np.median(targets))
+    return NoiseModel(max(sigma**2, least), low_dn=task.low_dn, high_dn=task.high_dn, origin="image")
+
+
+def _columns(positions: Positions, estimator: str, noise: NoiseModel) -> dict[str, np.ndarray]:
+    n = len(positions)
+    return {
+        "target": np.arange(n),
+        "x_px": positions.x_px,
+        "y_px": positions.y_px,
+        "var_x_px2": positions.var_x_px2,
+        "cov_xy_px2": positions.cov_xy_px2,
+        "var_y_px2": positions.var_y_px2,
+        **positions.more,
+        "estimator": np.full(n, estimator),
+        "noise_model": np.full(n, noise.origin),
+        "flags": positions.flags,
+    }
+
+
+def _notes(estimator: str, reason: str, noise: NoiseModel, polarity: str) -> dict[str, Any]:
+    return {"polarity": polarity, "estimator": estimator, "reason": reason, "noise_model": noise.describe()}
+
+
+def _coded(task: Task, positions: Positions, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The columns with each target's code, without the segments of the rings; a target that was lost has the code −1."""
+    from pixmetry.locate.detect.coded import read_codes, ring_members
+
+    x, y, more = positions.x_px, positions.y_px, positions.more
+    major, minor, angle = more["semi_major_px"], more["semi_minor_px"], more["angle_deg"]
+    codes = read_codes(task.frame, x, y, major, minor, angle, more["amplitude_dn"], threads=task.threads)
+    whole = ~ring_members(x, y, major, minor, angle, codes.number)
+    columns = {name: values[whole] for name, values in columns.items()} | {"target": np.arange(int(whole.sum()))}
+    return _beside(columns, code=codes.number[whole], code_margin=codes.margin[whole])
+
+
+def _beside(columns: dict[str, np.ndarray], **more: np.ndarray) -> dict[str, np.ndarray]:
+    """The columns with some more before the last three."""
+    first = {name: values for name, values in columns.items() if name not in LAST}
+    return {**first, **more, **{name: columns[name] for name in LAST}}
+
+
+def grid_size(grid: str | tuple[int, int] | None, kind: str) -> tuple[int, int] | str | None:
+    if kind == "chessboard" and grid is None:
+        raise InputError("the size of the chessboard is missing", where="grid", allowed="COLSxROWS of its inner corners, such as 9x6")
+    if grid is not None and kind not in (*SPOTS, "chessboard"):
+        raise InputError(f"targets of kind {kind} stand in no grid", where="grid", allowed="disc, ellipse, ring, spot, chessboard")
+    if grid is None or (grid == "any" and kind != "chessboard"):
+        return grid
+    size = tuple(grid.lower().split("x")) if isinstance(grid, str) else tuple(grid)
+    try:
+        cols, rows = (int(v) for v in size)
+    except (TypeError, ValueError):
+        cols = rows = 0
+    if cols < 2 or rows < 2:
+        allowed = "COLSxROWS, such as 9x6, both at least 2" + ("" if kind == "chessboard" else "; or any")
+        raise InputError("not the size of a grid", where="grid", value=grid, allowed=allowed)
+    return cols, rows
