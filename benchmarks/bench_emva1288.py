@@ -28,7 +28,7 @@ REPEATS, WHOLE, SUMMING, GROWTH_MB = 5, 0.35, 0.22, 10.0
 OURS = """
 import json, sys, time
 from pixmetry.files import load_campaign
-from pixmetry.datasheets import emva1288, measure_campaign
+from pixmetry.emva.job import emva1288, measure_campaign
 
 def run():
     start = time.perf_counter()
@@ -62,7 +62,7 @@ print(json.dumps(run()))
 """
 PEAK = """
 import sys
-from pixmetry.datasheets import emva1288
+from pixmetry.emva.job import emva1288
 emva1288(sys.argv[1])
 """
 
