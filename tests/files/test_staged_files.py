@@ -137,6 +137,16 @@ def test_a_page_replaces_pages_of_its_own_kind(tmp_path: Path) -> None:
     assert path.read_text() == text
 
 
+def test_a_page_as_pdf_replaces_pages_of_ours_alone(tmp_path: Path) -> None:
+    from pixmetry.report import Page, pdf_of
+
+    path = write_page(tmp_path / "page.pdf", pdf_of(Page("a")))
+    assert write_page(path, pdf_of(Page("b"))).read_bytes() == pdf_of(Page("b"))
+    path.write_bytes(b"%PDF-1.4\nanother program's\n")
+    with pytest.raises(InputError, match="no result of this kind"):
+        write_page(path, pdf_of(Page("a")))
+
+
 @pytest.mark.parametrize("name", ["with blanks.json", "ünï€☃.json", "two\nlines.json", "x" * 245 + ".json"])
 def test_any_name_that_a_disk_holds(name: str, tmp_path: Path) -> None:
     for word in (b"ours first", b"ours second"):

@@ -19,6 +19,7 @@ _HEAD = (
     rb"\s*<!DOCTYPE html>\s*<html\b[^>]*>\s*<head>(?:(?!<style|</head>|<body).)*"
     rb'<meta name="generator" content="pixmetry (?:(?!<style|</head>|<body).)*'
 )
+PDF_MARK = re.compile(rb"%PDF-1\.\d.*\n\d+ 0 obj\s*<< /Creator \(pixmetry\)", re.DOTALL)  # a PDF says at its end who made it
 _LONGEST = 100  # bytes of the wanted name that stand in the name of a temporary file; most disks hold 255
 
 
@@ -157,8 +158,10 @@ def write_together(outputs: Sequence[Output], contents: Sequence[bytes], inputs:
         raise
 
 
-def write_page(path: str | Path, text: str) -> Path:
-    """Write one HTML page so that it appears whole or not at all; only an earlier page of the same kind is ever replaced.
+def write_page(path: str | Path, page: str | bytes) -> Path:
+    """Write one page, HTML or the bytes of a PDF, so that it appears whole or not at all.
+
+    Only an earlier HTML page of the same kind is ever replaced, or an earlier PDF of pixmetry.
 
     Raises
     ------
@@ -166,7 +169,8 @@ def write_page(path: str | Path, text: str) -> Path:
         If there is something else of that name, or it cannot be written.
     """
     target = Path(path)
-    write_together([Output(target, page_mark(text))], [text.encode()])
+    mark, raw = (page_mark(page), page.encode()) if isinstance(page, str) else (PDF_MARK, page)
+    write_together([Output(target, mark)], [raw])
     return target
 
 

@@ -9,9 +9,9 @@ from pathlib import Path
 from pixmetry.core.checksums import check_record
 from pixmetry.emva.files.json_format import is_xml, parse_json, read_bytes, sheet_json, sheet_of_record
 from pixmetry.emva.records import DataSheet
-from pixmetry.files.staged_files import Output, check_files, write_together
+from pixmetry.files.staged_files import PDF_MARK, Output, check_files, write_together
 
-# How a file of each kind begins (a PDF says at its end who made it), so that nothing else is ever replaced.
+# How a file of each kind begins, so that nothing else is ever replaced.
 MARKS = {
     "json": re.compile(rb'\s*\{\s*"schema":\s*"pixmetry/emva1288/'),
     "xml": re.compile(rb'(<\?xml[^>]*\?>)?\s*<results schema="pixmetry/emva1288/'),
@@ -20,7 +20,7 @@ MARKS = {
         rb"(?:(?!<style|</head>|<body).)*EMVA 1288 data sheet</title>",
         re.DOTALL,
     ),
-    "pdf": re.compile(rb"%PDF-1\.\d.*\n\d+ 0 obj\s*<< /Creator \(pixmetry\)", re.DOTALL),
+    "pdf": PDF_MARK,
 }
 
 
