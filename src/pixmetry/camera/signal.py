@@ -116,6 +116,14 @@ class Signal:
     line : Line
         Of the kind ``VIDEO`` (whose data are the pixels that the line holds one after the other); and with samples of a line that are to be
         corrected, what else the line did to them.
+
+    Examples
+    --------
+    >>> from pixmetry.camera.camera import load_camera
+    >>> from pixmetry.scene.uniform import Uniform
+    >>> frame = load_camera("imx264_like").expose(Uniform(5000.0), window=(0, 0, 4, 6))
+    >>> frame.kind, frame.data.shape, frame.data.dtype
+    (<Kind.CODES: 'codes'>, (1, 4, 6), dtype('uint16'))
     """
 
     data: np.ndarray

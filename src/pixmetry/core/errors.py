@@ -27,6 +27,13 @@ class PixmetryError(Exception):
         The value that was found, and what would have been accepted.
     remedy : str, optional
         What the reader can do about it.
+
+    Examples
+    --------
+    >>> raise PixmetryError("no such release", where="--release", value="5", allowed="4.0, 3.1")
+    Traceback (most recent call last):
+    ...
+    pixmetry.core.errors.PixmetryError: --release: no such release; found '5'; allowed: 4.0, 3.1
     """
 
     def __init__(self, what: str, *, where: str = "", value: Any = None, allowed: str = "", remedy: str = "") -> None:

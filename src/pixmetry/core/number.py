@@ -33,7 +33,8 @@ def effective_dof(variances: ArrayLike, dof: ArrayLike, total: ArrayLike | None 
 
     Examples
     --------
-    >>> float(effective_dof([0.04, 0.01], [9.0, float("inf")]))  # u of 0.2 with 9 degrees of freedom, and of 0.1 that is known
+    >>> dof = effective_dof([0.04, 0.01], [9.0, float("inf")])  # u of 0.2 with 9 degrees of freedom, and of 0.1 that is known
+    >>> round(float(dof), 4)
     14.0625
     """
     variances, dof = np.asarray(variances, dtype=float), np.asarray(dof, dtype=float)
@@ -181,6 +182,12 @@ class Estimates:
         Names whose value is what the quantity is at least.
     reasons : mapping
         By name: why it is a limit, or what the reader should know about it.
+
+    Examples
+    --------
+    >>> gain = Estimates.from_rows([("gain_dn_per_e", 0.21, 0.002, 40.0, "DN/e-")])
+    >>> gain["gain_dn_per_e"].value, gain.u
+    (0.21, array([0.002]))
     """
 
     names: tuple[str, ...]

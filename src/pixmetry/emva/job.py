@@ -81,6 +81,13 @@ def emva1288(
     ------
     InputError, MeasureError
         If a file or the campaign cannot be used, or the frames do not carry what the standard asks for.
+
+    Examples
+    --------
+    >>> sheet = emva1288()  # the packaged example
+    >>> gain = sheet.results[0].values["K"]
+    >>> 0.1 < gain.value < 1 and gain.u < 0.02 * gain.value
+    True
     """
     options = Options(release, bayer, photons_u_rel, bootstrap)
     files = named(json=json, xml=xml, report=report, pdf=pdf)

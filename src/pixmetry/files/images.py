@@ -47,6 +47,15 @@ def read_frame(path: str | Path) -> np.ndarray:
     ------
     InputError
         If the file is missing, damaged, not an image of an accepted kind, in colour, or holds several images.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import numpy as np
+    >>> path = tempfile.mkdtemp() + "/frame.png"
+    >>> write_frame(path, np.full((4, 6), 1000, np.uint16), 12)
+    >>> read_frame(path).shape
+    (4, 6)
     """
     return load_frame(Path(path)).array
 

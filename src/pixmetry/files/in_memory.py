@@ -29,6 +29,12 @@ class Frames:
         Mean number of photons per pixel and exposure of a bright group.
     role : {"level", "stack"}, optional
         A point of the photon-transfer series, or many frames for the mean image; by default told from their number.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> Frames("dark", 0.01, np.zeros((2, 8, 8), np.uint16)).kind
+    'dark'
     """
 
     kind: str
@@ -61,6 +67,18 @@ def campaign_of_arrays(groups: Iterable[Frames], *, optics: Mapping[str, Any] | 
     ------
     InputError
         If a key is unknown, or the frames make no campaign.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> rng = np.random.default_rng(1)
+    >>> def taken(kind, exposure_s, electrons):
+    ...     dn = 20 + 0.5 * rng.poisson(electrons, (2, 24, 32)) + rng.normal(0, 2, (2, 24, 32))
+    ...     return Frames(kind, exposure_s, np.rint(dn).astype(np.uint16))
+    >>> steps = [0.001 * k for k in range(1, 11)]
+    >>> groups = [taken("dark", t, 0) for t in steps] + [taken("bright", t, 4e5 * t) for t in steps]
+    >>> campaign_of_arrays(groups, bits=12, name="my camera").camera.name
+    'my camera'
     """
     from pixmetry.core.config import validate
     from pixmetry.files.manifest import camera_facts, check_window, photons_of, role_of

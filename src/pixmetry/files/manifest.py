@@ -51,6 +51,12 @@ def load_campaign(path: str | Path | None = None) -> Campaign:
     ------
     InputError
         If anything in the manifest, or about the files it names, makes the campaign unusable.
+
+    Examples
+    --------
+    >>> campaign = load_campaign()  # the packaged example
+    >>> campaign.camera.bits, len(campaign.files) > 100
+    (12, True)
     """
     if path is not None and not isinstance(path, str | Path):
         remedy = "give its path, or make a campaign of arrays with campaign_of_arrays([Frames(kind, exposure_s, data), …], bits=…)"
