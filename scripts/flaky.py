@@ -130,7 +130,8 @@ def main(arguments: list[str] | None = None) -> int:
             if not left[file]:
                 o = outcomes[file]
                 failures = sum(map(len, o.failed.values()))
-                print(f"{file}: {len(o.ran)} tests, {sum(o.ran.values())} runs, {failures} failures", flush=True)
+                which = "".join(f"\n  {test} --seed {seeds[0]}" for test, seeds in o.failed.items())
+                print(f"{file}: {len(o.ran)} tests, {sum(o.ran.values())} runs, {failures} failures{which}", flush=True)
     text, wrong = report_text(outcomes)
     print(text)
     return int(wrong)

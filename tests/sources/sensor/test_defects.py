@@ -101,7 +101,8 @@ def test_pixels_of_low_response_reach_the_budget(rng: np.random.Generator):
     assert got["gain_fraction"].value == pytest.approx(50 / 16384, abs=2 / 16384)
     assert got["gain_std_rel"].value == pytest.approx(0.3, abs=0.006)
     probe = spot_probe()
-    contribution = SOURCE.propagate(Defects(**{e.name: e.value for e in got}), probe)
+    # a sound pixel is taken for a hot or a noisy one once in a hundred frames: those are not asked about here
+    contribution = SOURCE.propagate(Defects(**{e.name: e.value for e in got if e.name.startswith("gain")}), probe)
     expected = probe.white(0.3 * math.sqrt(50 / 16384) * probe.signal_dn)
     assert (contribution.u_x_px, contribution.u_y_px) == pytest.approx(expected, rel=0.06)
 
