@@ -48,7 +48,7 @@ def dof_of(rows: Sequence[BudgetRow], verdict: Combined, found: Headline) -> tup
         return (0.5 / error**2,) * 2 if error else (float("inf"),) * 2
     loose = np.zeros(2)
     for row in rows:
-        c = row.contribution
+        c = row.part
         if c.total_px > 0:
             error_rel = float(np.hypot(row.u_of_total_px, 0.5 * max(c.model_error * c.total_px, c.floor_px))) / c.total_px
             loose += 2 * (np.square(c.u_px) + np.square(c.bias_px)) ** 2 * error_rel**2
@@ -84,9 +84,9 @@ def headline(
     over the places, Var(s²)/n = (κ − 1) s⁴/n: by the scatter that it shows, and by u and kurtosis κ that a contribution declares, for an
     error that few targets have may be missing from it altogether. What the simulated camera does not hold is added to it as squares.
     """
-    sums = tuple(combine((r.contribution for r in rows), frames=n, signed=True) for n in frames)
+    sums = tuple(combine((r.part for r in rows), frames=n, signed=True) for n in frames)
     held = [r for r in rows if r.monte_carlo is not None]
-    by_formula = combine((r.contribution for r in held), signed=True).total_px
+    by_formula = combine((r.part for r in held), signed=True).total_px
     if together is None or not held:
         why = "The sum of the contributions; no Monte Carlo was made."
         return Headline(SUM, sums[0].total_px, float("nan"), float("nan"), 0.0, why), sums
@@ -100,8 +100,8 @@ def headline(
         why = "The sum of the contributions; one Monte Carlo with all of them at once agrees with it within their errors."
         return replace(found, why=why), sums
     others = [r for r in rows if r.monte_carlo is None]
-    drifting = [r.monte_carlo for r in held if r.contribution.gum_class in UNSTEADY and np.isfinite(r.monte_carlo.total_px)]
-    of_others = (combine((r.contribution for r in others), frames=n, signed=True) for n in frames)
+    drifting = [r.monte_carlo for r in held if r.part.gum_class in UNSTEADY and np.isfinite(r.monte_carlo.total_px)]
+    of_others = (combine((r.part for r in others), frames=n, signed=True) for n in frames)
     simulated = tuple(_simulated(together, of_other, unsteady_px, drifting) for of_other in of_others)
     return replace(found, by=MONTE_CARLO, why=_why(found, held, in_chain)), simulated
 
@@ -109,7 +109,7 @@ def headline(
 def _error(together: MonteCarlo, rows: Sequence[BudgetRow]) -> float:
     """Standard error of the total of a Monte Carlo, with what few targets have."""
     places = together.units * together.places
-    parts = (r.contribution for r in rows)  # a bias has no chance in it
+    parts = (r.part for r in rows)  # a bias has no chance in it
     # se_total_px holds the scatter of normal shifts, of a kurtosis of 3: what is beyond that is added
     squares = sum((0.5 * (c.u_x_px**2 + c.u_y_px**2)) ** 2 * max(c.kurtosis - 3, 0.0) for c in parts) / places
     rare = float(np.sqrt(squares)) / (2 * together.total_px) if together.total_px > 0 else float(np.sqrt(np.sqrt(squares)))
@@ -118,8 +118,8 @@ def _error(together: MonteCarlo, rows: Sequence[BudgetRow]) -> float:
 
 def _model_error(rows: Sequence[BudgetRow]) -> float:
     """Standard uncertainty of the sum from the model errors of its parts: of a half-width that the model declares, taken as k = 2."""
-    total = combine((r.contribution for r in rows), signed=True).total_px
-    parts = [(max(c.model_error * c.total_px, c.floor_px) * c.total_px) ** 2 for c in (r.contribution for r in rows)]
+    total = combine((r.part for r in rows), signed=True).total_px
+    parts = [(max(c.model_error * c.total_px, c.floor_px) * c.total_px) ** 2 for c in (r.part for r in rows)]
     return 0.5 * float(np.sqrt(sum(parts))) / total if total else 0.0
 
 

@@ -128,7 +128,7 @@ def compute_budget(
         advice=advise(rows, one, everything[0]),
         interaction=interaction,
         headline=found,
-        sums=tuple(combine([r.contribution for r in decided], frames=n, signed=True) for n in frames),
+        sums=tuple(combine([r.part for r in decided], frames=n, signed=True) for n in frames),
         interval=interval_of((one.total_x_px, one.total_y_px), dof_of(decided, one, found)),
     )
 

@@ -60,6 +60,12 @@ class BudgetRow:
     in_camera: bool = False
 
     @property
+    def part(self) -> Contribution:
+        """The contribution of a row that is known to have one."""
+        assert self.contribution is not None, self.name
+        return self.contribution
+
+    @property
     def counts(self) -> bool:
         """Whether it is part of the verdict, or of that with everything accepted; the rows that do not count come last."""
         return self.status in (*DECIDED, "accepted") and self.total_px > 0
@@ -207,8 +213,8 @@ class Budget:
         for stage in STAGES:
             rows = [r for r in self.rows if r.counts and r.source_id.split(".")[0] == stage]
             known, accepted = ([r for r in rows if (r.status == "accepted") == bound] for bound in (False, True))
-            whole = combine([r.contribution for r in known], signed=True)
-            at_bound = combine([r.contribution for r in accepted]).total_px
+            whole = combine([r.part for r in known], signed=True)
+            at_bound = combine([r.part for r in accepted]).total_px
             if rows:
                 found.append(StageSum(stage, whole.total_px, whole.calibrated_px, sum(r.share for r in known), at_bound))
         return tuple(found)

@@ -257,7 +257,7 @@ def rank_rows(rows: Sequence[BudgetRow], decided: Sequence[BudgetRow], verdict: 
     The share of a decided row is that of the square of the sum of all of these; that of an accepted one of the square of the total with
     everything accepted. Without a row, the total is less by its share.
     """
-    whole2 = combine([r.contribution for r in decided]).total_px ** 2
+    whole2 = combine([r.part for r in decided]).total_px ** 2
     done = []
     for row in rows:
         if row.contribution is not None and row.status in (*DECIDED, "accepted"):
