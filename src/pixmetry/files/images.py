@@ -73,8 +73,8 @@ def load_frame(path: Path, plain_png: PlainPng | None = None, raw: RawLayout | N
         return LoadedFrame(_checked(found.array, path), sha256, size, found.lossless)
     data = _read_bytes(path)
     sha256 = hashlib.sha256(data).hexdigest()
-    if plain_png is not None and data.startswith(SIGNATURE) and (array := plain_png.decode(data)) is not None:
-        return LoadedFrame(array, sha256, len(data))
+    if plain_png is not None and data.startswith(SIGNATURE) and (png := plain_png.decode(data)) is not None:
+        return LoadedFrame(png, sha256, len(data))
     found = decode(data, path)
     return LoadedFrame(_checked(found.array, path), sha256, len(data), found.lossless)
 

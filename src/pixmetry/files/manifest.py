@@ -100,7 +100,7 @@ def _discover(path: Path, parts: Mapping[str, Any], raw: RawLayout | None) -> tu
 
 def check_window(camera: CameraFacts, shape: tuple[int, int], where: str) -> None:
     """Refuse frames that do not lie on the sensor that was stated."""
-    if camera.sensor_shape is None:
+    if camera.sensor_rows is None or camera.sensor_cols is None:
         return
     row, col = camera.first_row or 0, camera.first_col or 0
     if row + shape[0] > camera.sensor_rows or col + shape[1] > camera.sensor_cols:

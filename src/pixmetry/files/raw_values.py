@@ -53,7 +53,9 @@ class RawLayout:
 
     @property
     def _parts(self) -> tuple[int, str]:
-        plain, stream, packed = _FORMAT.fullmatch(self.pixel_format).groups()
+        found = _FORMAT.fullmatch(self.pixel_format)
+        assert found is not None  # checked when it was made
+        plain, stream, packed = found.groups()
         return int(plain or stream or packed), "plain" if plain else "stream" if stream else "packed"
 
     @property

@@ -171,10 +171,11 @@ def _notes(subjects: Sequence[Subject], passed_over: frozenset[str] = frozenset(
     rest = sorted(set().union(*channels) - channels[0].intersection(*channels))
     if rest:
         notes.append(f"left out, as not all have them: channels {', '.join(rest)}")
-    if all(s.worth for s in subjects) and len({str(s.worth[0]) for s in subjects}) == 1:
-        worth = ", ".join(f"{s.worth[1]:.3g}" for s in subjects)
+    told = [s.worth for s in subjects if s.worth is not None]
+    if len(told) == len(subjects) and len({str(task) for task, _ in told}) == 1:
+        worth = ", ".join(f"{u_px:.3g}" for _, u_px in told)
         notes.append(f"the standard uncertainty of one coordinate of a target in one frame is {worth} px (k = 1)")
-    elif all(s.worth for s in subjects):
+    elif len(told) == len(subjects):
         notes.append("target or estimator differ: the uncertainties of a coordinate belong to different tasks")
     return notes
 

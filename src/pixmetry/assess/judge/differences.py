@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, TypeGuard
 
 from pixmetry.core.number import Number, effective_dof
 from pixmetry.emva.files.keys import NONLINEAR, goes_with_photons, plain_unit
@@ -69,12 +69,11 @@ def difference_of(place: tuple[str, str], one: Subject, two: Subject, same_light
     """Difference with its uncertainty and the chance of it, not yet judged."""
     channel, key = place
     a, b = one.values.get(place), two.values.get(place)
-    row = Difference(channel, key, plain_unit((a or b).unit), a, b)
+    row = Difference(channel, key, plain_unit(next(v.unit for v in (a, b) if v is not None)), a, b)
     if not is_there(a) or not is_there(b):
         if not is_there(a) and not is_there(b):
             return replace(row, verdict="same", reason="without a value in both")
-        lacks = two if is_there(a) else one
-        value = b if is_there(a) else a
+        lacks, value = (two, b) if is_there(a) else (one, a)
         reason = value.reason if value else lacks.absent.get(key.rpartition(".")[0], "")
         return replace(row, verdict="only A" if is_there(a) else "only B", reason=reason)
     if plain_unit(a.unit) != plain_unit(b.unit):
@@ -103,7 +102,7 @@ def difference_of(place: tuple[str, str], one: Subject, two: Subject, same_light
     return replace(row, p=_chance(row, toward), reason=limits)
 
 
-def is_there(value: Number | None) -> bool:
+def is_there(value: Number | None) -> TypeGuard[Number]:
     """Whether there is a number."""
     return value is not None and math.isfinite(value.value)
 

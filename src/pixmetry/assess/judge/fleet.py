@@ -9,7 +9,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from pixmetry.assess.judge.differences import EQUAL_REL, Subject
+from pixmetry.assess.judge.differences import EQUAL_REL, Subject, is_there
 from pixmetry.core.random import Grid, Stream
 from pixmetry.emva.files.keys import plain_unit
 
@@ -37,20 +37,19 @@ def fleet_row(place: tuple[str, str], subjects: Sequence[Subject]) -> FleetRow |
     held = [s.values.get(place) for s in subjects]
     units = [plain_unit(v.unit) for v in held if v is not None]
     unit = max(units, key=units.count)
-    usable = [
-        v is not None and math.isfinite(v.value) and not v.is_limit and plain_unit(v.unit) == unit for v in held
-    ]
-    if sum(usable) < 3:
+    judged = [v if is_there(v) and not v.is_limit and plain_unit(v.unit) == unit else None for v in held]
+    if sum(v is not None for v in judged) < 3:
         return None
-    values = np.array([v.value if use else math.nan for v, use in zip(held, usable, strict=True)])
-    u = np.array([v.u if use else math.nan for v, use in zip(held, usable, strict=True)])
+    values = np.array([math.nan if v is None else v.value for v in judged])
+    u = np.array([math.nan if v is None else v.u for v in judged])
+    usable = np.array([v is not None for v in judged])
     median = float(np.nanmedian(values))
     typical = float(np.nanmedian(u)) if np.isfinite(u).any() else 0.0
     spread = max(float(_spread(np.abs(values[usable] - median))), typical)
     own = np.sqrt(spread**2 + np.maximum(np.nan_to_num(u) ** 2 - typical**2, 0.0))
     far = np.where(np.abs(values - median) <= EQUAL_REL * np.maximum(np.abs(values), abs(median)), 0.0, values - median)
     scores = np.divide(far, own, out=np.where(far == 0, 0.0, np.copysign(math.inf, far)), where=own > 0)
-    scores[~np.array(usable)] = math.nan
+    scores[~usable] = math.nan
     n = len(subjects)
     return FleetRow(*place, unit, median, spread, typical, tuple(values.tolist()), tuple(scores.tolist()), (False,) * n)
 

@@ -44,13 +44,14 @@ def frame_products(frames: Iterable[np.ndarray], bits: int) -> FrameProducts:
         With fewer than four frames.
     """
     with tempfile.TemporaryFile(prefix="pixmetry-frames-") as file:
-        shape, count = None, 0
+        shape: tuple[int, int] | None = None
+        count = 0
         for frame in frames:
             frame = check_frame(frame, bits, shape)
-            shape = frame.shape
+            shape = frame.shape[0], frame.shape[1]
             file.write(np.ascontiguousarray(frame, dtype=np.uint16).data)
             count += 1
-        if count < MINIMUM_FRAMES:
+        if shape is None or count < MINIMUM_FRAMES:
             raise MeasureError("a bootstrap over frames needs more of them", value=count, allowed=f"{MINIMUM_FRAMES} or more")
         file.flush()
         stored = np.memmap(file, dtype=np.uint16, mode="r", shape=(count, *shape))
