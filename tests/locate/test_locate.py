@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from pixmetry.locate.detect.targets import Flag
 from pixmetry.locate.estimators import AUTO, estimators, methods
 from pixmetry.locate.frame import scale_ends
 from pixmetry.locate.lines.lines import line_model
-from pixmetry.locate.records import LOCATED_SCHEMA, ORIGIN
+from pixmetry.locate.records import LOCATED_SCHEMA, ORIGIN, Located
 
 SHAPE = (120, 160)
 Z_1E6 = 5.0  # |z| of the larger of a dozen coordinates, each beyond it with 6e-7
@@ -399,3 +400,15 @@ def test_no_picture_of_the_users_is_replaced(image: Path, tmp_path: Path) -> Non
     for _ in range(2):
         run(image, "-o", tmp_path / "new" / "t.csv", "--overlay", tmp_path / "new" / "found.png")
     assert {p.name for p in (tmp_path / "new").iterdir()} == {"t.csv", "found.png"}
+
+
+def test_a_table_shows_itself_in_a_notebook_and_on_axes(monkeypatch: pytest.MonkeyPatch) -> None:
+    columns = {"x_px": np.arange(30.0), "y_px": np.arange(30.0), "radius_px": np.full(30, 2.0), "flags": np.zeros(30, np.uint32)}
+    table = Located(columns | {"code<b>": np.full(30, "<i>")}, "disc")
+    html = table._repr_html_()
+    assert html.count("<tr>") == 21 and "10 more rows" in html and "<i>" not in html and "code&lt;b&gt;" in html
+    axes = table.plot(np.zeros((40, 40)))
+    assert axes.yaxis_inverted() and len(axes.collections) == 2
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(InputError, match="pandas"):
+        table.to_dataframe()

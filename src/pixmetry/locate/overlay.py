@@ -6,6 +6,7 @@ import io
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -87,7 +88,7 @@ def _drawn(frame: np.ndarray, table: Located) -> bytes:
     low, high = np.percentile(frame, [0.5, 99.5])
     axes.imshow(frame, cmap="gray", vmin=low, vmax=high if high > low else low + 1, interpolation="nearest")
     axes.set_axis_off()
-    _marks(axes, table, zoom)
+    draw_marks(axes, table, zoom)
     axes.set(xlim=(-0.5, cols - 0.5), ylim=(rows - 0.5, -0.5))
     flagged = int((table.flags != 0).sum()) if len(table) else 0
     text = f"{len(table)} of kind {table.kind}, {flagged} flagged (orange)    {ORIGIN}"
@@ -97,7 +98,8 @@ def _drawn(frame: np.ndarray, table: Located) -> bytes:
     return raw.getvalue()
 
 
-def _marks(axes, table: Located, zoom: int) -> None:
+def draw_marks(axes: Any, table: Located, zoom: float = 1.0) -> None:
+    """Draw what was located into Matplotlib axes whose unit is the pixel; ``zoom``: how much larger than the frame they are."""
     from matplotlib.collections import EllipseCollection, LineCollection
 
     good = np.isfinite(table.x_px) & np.isfinite(table.y_px)

@@ -27,6 +27,7 @@ MARKS = {
     ".parquet": re.compile(rb"PAR1.*pixmetry/located/", re.DOTALL),
     ".json": re.compile(rb'\s*\{\s*"schema": "pixmetry/located/'),
 }
+SHOWN = 20  # rows of a table in a notebook
 LAST = ("estimator", "noise_model", "flags")  # columns, in every table
 
 
@@ -45,6 +46,16 @@ class Located:
     images : tuple of dict
         Of each image: ``name``, ``rows``, ``cols``, ``targets``, ``polarity``, ``estimator``, ``reason`` (why
         this estimator), ``noise_model``.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from pixmetry.locate.records import Located
+    >>> table = Located({"x_px": np.array([3.25]), "flags": np.array([8])}, "disc")
+    >>> table
+    <Located: 1 of kind disc in 0 images>
+    >>> table.x_px, table.flag_words
+    (array([3.25]), ['under_sampled'])
     """
 
     columns: dict[str, np.ndarray]
@@ -105,6 +116,56 @@ class Located:
     def content(self, ending: str) -> bytes:
         """Return what the file with this ending (``.csv``, ``.parquet``, ``.json``) holds."""
         return {".csv": self._csv, ".parquet": self._parquet, ".json": self._json}[ending.lower()]()
+
+    def to_dataframe(self) -> Any:
+        """Return the table as a ``pandas.DataFrame``, a column for each of its own; flags in words.
+
+        Raises
+        ------
+        InputError
+            If pandas is not installed.
+        """
+        try:
+            import pandas  # type: ignore[import-untyped]
+        except ImportError:
+            raise InputError("pandas is not installed", where="to_dataframe", remedy="install it: pip install pandas") from None
+        return pandas.DataFrame({**self.columns, "flags": self.flag_words})
+
+    def plot(self, frame: np.ndarray | None = None, axes: Any = None) -> Any:
+        """Draw outlines, centres or lines into Matplotlib axes, over the frame where it is given, and return the axes.
+
+        Parameters
+        ----------
+        frame : ndarray, shape (rows, cols), optional
+        axes : matplotlib.axes.Axes, optional
+            New ones by default.
+        """
+        from pixmetry.locate.overlay import draw_marks
+
+        if axes is None:
+            from matplotlib.figure import Figure
+
+            axes = Figure().add_subplot()
+        if frame is not None:
+            axes.imshow(frame, cmap="gray")
+        elif not axes.yaxis_inverted():
+            axes.invert_yaxis()
+        draw_marks(axes, self)
+        axes.set_aspect("equal")
+        axes.autoscale_view()
+        axes.set_xlabel("x (px)")
+        axes.set_ylabel("y (px)")
+        return axes
+
+    def _repr_html_(self) -> str:
+        """Return the first rows as a table, for notebooks."""
+        from html import escape
+
+        head = "".join(f"<th>{escape(name)}</th>" for name in self.columns)
+        cells = [[escape(str(_short(v))) for v in row] for row in self._rows()[:SHOWN]] if len(self) else []
+        body = "".join("<tr>" + "".join(f"<td>{v}</td>" for v in row) + "</tr>" for row in cells)
+        more = f"<p>{len(self) - SHOWN} more rows</p>" if len(self) > SHOWN else ""
+        return f"<p>{escape(repr(self)[1:-1])}</p><table><tr>{head}</tr>{body}</table>{more}"
 
     def to_csv(self) -> str:
         """Return the text of the CSV file."""
