@@ -95,3 +95,10 @@ def test_the_skin_effect_reaches_no_farther_than_stated(rng: np.random.Generator
     row = np.zeros(left + 400)
     row[0:20] = 1.0
     assert 0 < line(rng, row, params)[left + 20 :].max() <= tail(params, PIXEL_HZ, 0) < 0.1
+
+
+@pytest.mark.parametrize("loss_db", [0.0, 0.5, 3.0])
+def test_an_echo_loses_voltage_on_both_ways(loss_db: float) -> None:
+    """An echo goes there and back: twice the loss in dB, 20 lg of the voltage; reflections of 50 Ω between 75 Ω are ρ = 0.2 each."""
+    params = Termination(length_m=5.0, line_ohm=50.0, source_ohm=75.0, load_ohm=75.0, loss_db=loss_db)
+    assert -20 * np.log10(params.ghost / 0.2**2) == pytest.approx(2 * loss_db, abs=1e-9)

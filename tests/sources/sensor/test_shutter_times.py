@@ -100,6 +100,16 @@ def test_a_global_reset_gathers_longer_from_row_to_row_about_a_later_middle() ->
     assert centres == pytest.approx(20.0 + 400.0 * 0.5 * (1e-3 + rows * 1e-4), abs=1e-4)
 
 
+def test_truth_of_the_rows_is_where_a_target_is_seen(rng: np.random.Generator) -> None:
+    """The delay of the middle of each row's exposure, times the speed, is how far the target has moved in that row."""
+    for reset in ("rolling", "global"):
+        params = RollingShutter(row_time_s=1e-4, reset=reset)
+        pairs = (exposure.SOURCE, Exposure(nodes=5)), (rolling_shutter.SOURCE, params)
+        seen = row_centres(chain(*pairs, exposure_s=1e-3).expose(Spot(20.0, None, 400.0)).data[0])
+        told = rolling_shutter.truth(params, flat(0, (32, 48)), stream(rng))
+        assert seen - seen[0] == pytest.approx(400.0 * told["delay_s"][0], abs=2e-4), reset
+
+
 # ---- light pulses ----------------------------------------------------------------------------------------------------------------------
 
 
