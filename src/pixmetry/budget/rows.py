@@ -201,7 +201,8 @@ def in_place_of_formulas(rows: Sequence[BudgetRow], known: Known, design: Trials
     total_px = combine(r.contribution for r in rows if r.status in DECIDED and r.contribution is not None).total_px
     done = []
     for row in rows:
-        if row.contribution is None and row.monte_carlo is None and row.status in (*DECIDED, "accepted") and not _needs_no_simulation(row):
+        lacks_one = row.contribution is None and row.monte_carlo is None  # what a calibration takes up stands in the row of the lens
+        if lacks_one and row.status in ("measured", "modelled", "accepted") and not _needs_no_simulation(row):
             say(f"Monte Carlo: {row.name}")
             element = Element(row.name, catalogue_source(row), known.parameters_of(row))
             try:
