@@ -9,6 +9,7 @@ import click
 
 from pixmetry.cli._console import console as plain_console
 from pixmetry.cli._console import echo
+from pixmetry.cli._pdf import check_pdf, pdf_option, put_pdf
 from pixmetry.core.plain_text import shown
 
 if TYPE_CHECKING:
@@ -47,6 +48,7 @@ LISTED = 8  # contributions that the console names
     help="Number of simulated windows in each Monte Carlo run.",
 )
 @click.option("--seed", type=click.IntRange(0), default=1, show_default=True, help="Seed of the Monte Carlo runs.")
+@pdf_option()
 @click.option("--threads", type=click.IntRange(1), help="Number of threads. Default: one for each processor.")
 def assess(
     campaign: Path | None,
@@ -56,6 +58,7 @@ def assess(
     calibration: Path | None,
     trials: int,
     seed: int,
+    pdf: Path | None,
     threads: int | None,
 ) -> None:
     """Assess a camera from dark and bright frames: error sources, error budget, advice, report.
@@ -70,9 +73,11 @@ def assess(
         list_estimators()
         return
     from pixmetry.assess.job import assess as run
+    from pixmetry.assess.page.page import page_of
     from pixmetry.cli._progress import shown_progress
     from pixmetry.core.threads import set_threads
 
+    check_pdf(pdf, [campaign] if campaign is not None else [])
     set_threads(threads)
     with shown_progress() as progress:
         assessment = run(
@@ -80,6 +85,7 @@ def assess(
         )
     print_summary(assessment)
     echo(f"report: {output / 'report.html'}")
+    put_pdf(pdf, lambda: page_of(assessment))
 
 
 def list_estimators() -> None:

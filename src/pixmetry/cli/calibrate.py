@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from pixmetry.cli._console import echo, echo_lines
 from pixmetry.cli._json import JsonResult, json_option
+from pixmetry.cli._pdf import check_pdf, pdf_option, put_pdf
 
 KINDS = ("chessboard", "dots", "coded", "squares", "lines")
+if TYPE_CHECKING:
+    from pixmetry.report import Page
+
 OPTIONS = ("field", "loss", "folds", "residual_grid", "snoop", "a_priori")
 
 
@@ -93,6 +97,7 @@ OPTIONS = ("field", "loss", "folds", "residual_grid", "snoop", "a_priori")
     show_default=True,
     help="Largest error that the export to OpenCV or COLMAP may add anywhere in the frame, px.",
 )
+@pdf_option()
 @json_option("the cameras and what was found")
 @click.option("--threads", type=click.IntRange(1), help="Number of threads. Default: one for each processor.")
 def calibrate(
@@ -101,6 +106,7 @@ def calibrate(
     opencv: Path | None,
     colmap: Path | None,
     may_lose_px: float,
+    pdf: Path | None,
     json_file: Path | None,
     threads: int | None,
     **given: Any,
@@ -124,6 +130,7 @@ def calibrate(
     set_threads(threads)
     read = (*sources, *((Path(given["camera"]),) if given["camera"] is not None else ()))
     check_exports(opencv, colmap, output, read)
+    check_pdf(pdf, read)
     written = JsonResult(json_file, RESULT_SCHEMA, LINES_SCHEMA, inputs=read)
     options = {name: given.pop(name) for name in OPTIONS}
     options = {name: value for name, value in options.items() if value is not None}
@@ -133,6 +140,7 @@ def calibrate(
     written.put_text(cameras_text(calibration, str(report)))
     if not written.printed:
         echo_lines(_summary(calibration, report))
+    put_pdf(pdf, lambda: _page_of(calibration))
     if opencv is not None or colmap is not None:
         for sentence in write_exports(_models(calibration), opencv, colmap, may_lose_px, read):
             echo(sentence, err=written.printed)
@@ -151,6 +159,13 @@ def _summary(calibration: Any, report: Path) -> str:
 
         text = summary_text(calibration)
     return f"{text.rstrip()}\nreport: {report}"
+
+
+def _page_of(calibration: Any) -> Page:
+    from pixmetry.calibrate.lines.line_calibration import LineCalibration
+    from pixmetry.calibrate.page import lines_page, page
+
+    return (lines_page if isinstance(calibration, LineCalibration) else page).page_of(calibration)
 
 
 def _models(calibration: Any) -> list[Any]:

@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from pixmetry.cli._console import echo
+from pixmetry.cli._pdf import check_pdf, pdf_option, put_pdf
 
 
 @click.command()
@@ -26,6 +27,7 @@ from pixmetry.cli._console import echo
     help="Change a parameter of an error source, or a value of the camera itself. May be repeated.",
 )
 @click.option("--off", multiple=True, metavar="NAME", help="Switch an error source off. May be repeated.")
+@pdf_option()
 def chain(
     camera: str,
     scene: Path,
@@ -35,6 +37,7 @@ def chain(
     seed: int,
     settings: tuple[str, ...],
     off: tuple[str, ...],
+    pdf: Path | None,
 ) -> None:
     """Show on one page how each error source of a camera moves a target.
 
@@ -45,8 +48,11 @@ def chain(
     from pixmetry.camera.overrides import changed_camera, parse_overrides
     from pixmetry.files.staged_files import Output, check_files, page_mark
     from pixmetry.simulate.chain import chain as follow
-    from pixmetry.simulate.page import TITLE, write_chain_page
+    from pixmetry.simulate.page import TITLE, page_of, write_chain_page
 
     check_files([Output(output, page_mark(TITLE))], [scene, Path(camera)])  # before the work
+    check_pdf(pdf, [scene, Path(camera)])
     changed = changed_camera(load_camera(camera), parse_overrides(settings), off)
-    echo(f"page: {write_chain_page(follow(changed, scene, target=target, frame=frame, seed=seed), output)}")
+    walk = follow(changed, scene, target=target, frame=frame, seed=seed)
+    echo(f"page: {write_chain_page(walk, output)}")
+    put_pdf(pdf, lambda: page_of(walk))
