@@ -22,6 +22,7 @@ _HOMES = {
     "Signal": "pixmetry.camera.signal",
     "add_source_file": "pixmetry.camera.catalogue",
     "assess": "pixmetry.assess.job",
+    "bound": "pixmetry.locate.bound.bound",
     "calibrate": "pixmetry.calibrate.job",
     "campaign_of_arrays": "pixmetry.files",
     "catalogue": "pixmetry.camera.catalogue",
@@ -49,6 +50,7 @@ __all__ = [
     "__version__",
     "add_source_file",
     "assess",
+    "bound",
     "calibrate",
     "campaign_of_arrays",
     "catalogue",
@@ -79,6 +81,7 @@ if TYPE_CHECKING:
     from pixmetry.core.number import Estimates, Number
     from pixmetry.emva.job import emva1288
     from pixmetry.files import Frames, campaign_of_arrays, load_campaign, read_frame
+    from pixmetry.locate.bound.bound import bound
     from pixmetry.locate.job import locate
     from pixmetry.simulate.chain import chain
     from pixmetry.simulate.job import simulate

@@ -12,7 +12,7 @@ from chance import rng_of
 from pixmetry.camera.camera import load_camera
 from pixmetry.core.errors import InputError
 from pixmetry.locate.bound import closed_bounds as closed
-from pixmetry.locate.bound.bound import bound, frames_worth, possible
+from pixmetry.locate.bound.bound import bound, cramer_rao_bound, frames_worth
 from pixmetry.locate.bound.fisher import information_per_dn2, kept_rounding_dn2, pixel_noise
 from pixmetry.locate.bound.predictions import _law, names_for, predict
 from pixmetry.locate.noise import NoiseModel, camera_noise
@@ -57,11 +57,11 @@ def disc(diameter: float, **more: float) -> dict[str, float]:
 )
 def test_the_table_of_discs(diameter: float, crb: float, edge: float, rounding: float, centroid: float, squared: float) -> None:
     """Discs of 150 DN, blur .7, on 5 DN, 8-bit camera: bound to 0.5 %, the others to their printed digits, centroids within R + 2.5."""
-    found = bound("disc", disc(diameter), TAPE, "light")
+    found = cramer_rao_bound("disc", disc(diameter), TAPE, "light")
     assert found.place_px[1] == pytest.approx(crb, rel=5e-3)
     formula = closed.disc_edge(diameter / 2, 0.7, 150.0, np.sqrt(TAPE.variance_dn2(80.0)))
     assert formula == pytest.approx(edge, rel=0.02)
-    alone = bound("disc", disc(diameter), NoiseModel(1 / 12), "light", rounded=False)
+    alone = cramer_rao_bound("disc", disc(diameter), NoiseModel(1 / 12), "light", rounded=False)
     assert alone.place_px[1] == pytest.approx(rounding, rel=0.04)
     images = draw_images("disc", disc(diameter))
     pixels = pixel_noise(images, TAPE)
@@ -77,7 +77,7 @@ def test_the_modern_camera_of_the_table() -> None:
     values = []
     for d in (3, 5, 7, 10, 15, 20):
         target = disc(d, blur_px=0.9, amplitude_dn=7300 * gain, background_dn=50 * gain)
-        values.append(bound("disc", target, noise, "light").place_px[1])
+        values.append(cramer_rao_bound("disc", target, noise, "light").place_px[1])
     assert values == pytest.approx([0.0057, 0.0042, 0.0036, 0.0030, 0.0025, 0.0022], abs=1.2e-4)
 
 
@@ -87,7 +87,7 @@ def test_spot_in_shot_noise(blur: float, electrons: float) -> None:
     """s_a/√N: exact for Poisson light where pixels are fine; 0.5 % here."""
     spot = {"blur_px": blur, "amplitude_dn": electrons / (2 * np.pi * blur**2), "background_dn": 0.0}
     tiny = NoiseModel(1e-3 * spot["amplitude_dn"] * 1e-3, 1.0)
-    found = bound("spot", spot, tiny, "position", rounded=False, window_px=2 * int(6 * blur) + 3).place_px[1]
+    found = cramer_rao_bound("spot", spot, tiny, "position", rounded=False, window_px=2 * int(6 * blur) + 3).place_px[1]
     assert found == pytest.approx(closed.spot_shot(blur, electrons), rel=5e-3)
 
 
@@ -96,9 +96,9 @@ def test_spot_in_read_noise(blur: float, table: float) -> None:
     """√(2/π) σ/A (1 + 1/12s²): 1.3 % at s = .8, less above; and the table's sums to their digits."""
     spot = {"blur_px": blur, "amplitude_dn": 1000.0, "background_dn": 0.0}
     window = 2 * int(5 * blur) + 3
-    middle = bound("spot", spot, NoiseModel(1.0), "position", rounded=False, window_px=window, phases=1).place_px[1]
+    middle = cramer_rao_bound("spot", spot, NoiseModel(1.0), "position", rounded=False, window_px=window, phases=1).place_px[1]
     assert 1000 * middle == pytest.approx(table, abs=6e-4)  # the table is for a spot on the middle of a pixel
-    found = bound("spot", spot, NoiseModel(1.0), "position", rounded=False, window_px=window).place_px[1]
+    found = cramer_rao_bound("spot", spot, NoiseModel(1.0), "position", rounded=False, window_px=window).place_px[1]
     assert found == pytest.approx(closed.spot_read(blur, 1000.0, 1.0), rel=0.013)
 
 
@@ -109,7 +109,9 @@ BOTH = [(1.0, 3000.0, 10.0), (1.3, 20000.0, 400.0), (1.5, 1e5, 3000.0), (1.0, 1e
 def test_spot_in_both(blur: float, electrons: float, surround: float) -> None:
     """Mortensen et al. (2010): 5e-4 with pixels of one width."""
     spot = {"blur_px": blur, "amplitude_dn": electrons / (2 * np.pi * blur**2), "background_dn": 0.0}
-    found = bound("spot", spot, NoiseModel(surround, 1.0), "position", rounded=False, window_px=2 * int(8 * blur) + 3).place_px[1]
+    found = cramer_rao_bound("spot", spot, NoiseModel(surround, 1.0), "position", rounded=False, window_px=2 * int(8 * blur) + 3).place_px[
+        1
+    ]
     assert found == pytest.approx(closed.spot_mixed(blur, electrons, surround), rel=1e-3)
 
 
@@ -126,16 +128,16 @@ def test_lines_and_edges() -> None:
     """Read noise, vertical and oblique: the formulas to 1 %."""
     for angle in (90.0, 63.0):
         line = {"blur_px": 1.2, "amplitude_dn": 100.0, "length_px": 400.0, "angle_deg": angle}
-        got = bound("line", line, NoiseModel(4.0), "position", rounded=False, phases=2).place_px[1]
+        got = cramer_rao_bound("line", line, NoiseModel(4.0), "position", rounded=False, phases=2).place_px[1]
         assert got == pytest.approx(closed.line_read(1.2, 100.0, 2.0, 400.0), rel=0.01)
-        got = bound("edge", line, NoiseModel(4.0), "position", rounded=False, phases=2).place_px[1]
+        got = cramer_rao_bound("edge", line, NoiseModel(4.0), "position", rounded=False, phases=2).place_px[1]
         assert got == pytest.approx(closed.edge_read(1.2, 100.0, 2.0, 400.0), rel=0.01)
     wide = line | {"width_px": 15.0, "angle_deg": 90.0}
-    got = bound("line", wide, NoiseModel(4.0), "position", rounded=False, phases=2).place_px[1]
+    got = cramer_rao_bound("line", wide, NoiseModel(4.0), "position", rounded=False, phases=2).place_px[1]
     assert got == pytest.approx(closed.edge_read(1.2, 100.0, 2.0, 800.0), rel=0.01)
     electrons = np.sqrt(2 * np.pi) * 1.2 * 5000.0
     thin = {"blur_px": 1.2, "amplitude_dn": 5000.0, "length_px": 100.0}
-    got = bound("line", thin, NoiseModel(1e-3, 1.0), "position", rounded=False, phases=3, window_px=17).place_px[1]
+    got = cramer_rao_bound("line", thin, NoiseModel(1e-3, 1.0), "position", rounded=False, phases=3, window_px=17).place_px[1]
     assert got == pytest.approx(closed.line_shot(1.2, electrons, 100.0), rel=5e-3)
 
 
@@ -143,11 +145,11 @@ def test_large_outlines_follow_their_edges() -> None:
     """Ellipse and ring of like noise everywhere: the edge formulas to 1 %."""
     flat = NoiseModel(4.0)
     ellipse = {"semi_major_px": 30.0, "semi_minor_px": 18.0, "angle_deg": 25.0, "blur_px": 1.0, "amplitude_dn": 100.0}
-    found = bound("ellipse", ellipse, flat, "position", rounded=False, phases=1)
+    found = cramer_rao_bound("ellipse", ellipse, flat, "position", rounded=False, phases=1)
     formula = closed.ellipse_edge(30.0, 18.0, 25.0, 1.0, 100.0, 2.0)
     assert (found.u("x_px")[1], found.u("y_px")[1]) == pytest.approx(formula, rel=0.01)
     ring = {"radius_px": 25.0, "inner_radius_px": 14.0, "blur_px": 1.0, "amplitude_dn": -100.0, "background_dn": 150.0}
-    got = bound("ring", ring, flat, "position", rounded=False, phases=1).place_px[1]
+    got = cramer_rao_bound("ring", ring, flat, "position", rounded=False, phases=1).place_px[1]
     assert got == pytest.approx(closed.ring_edge(14.0, 25.0, 1.0, 100.0, 2.0), rel=0.01)
 
 
@@ -170,7 +172,7 @@ def test_shot_limited_centroids_of_a_spot() -> None:
     spot = {"blur_px": 1.5, "amplitude_dn": 1e5, "background_dn": 0.0}
     images = draw_images("spot", spot, window_px=25)
     pixels = pixel_noise(images, NoiseModel(0.01, 1.0), rounded=False)
-    least = bound("spot", spot, NoiseModel(0.01, 1.0), "position", rounded=False, window_px=25).place_px[1]
+    least = cramer_rao_bound("spot", spot, NoiseModel(0.01, 1.0), "position", rounded=False, window_px=25).place_px[1]
     u = {n: predict(n, images, pixels, images.subset("shape"), 11.0) for n in ("centroid", "squared_centroid")}
     assert u["centroid"].noise_px == pytest.approx(least, rel=0.01)
     assert (u["squared_centroid"].noise_px / least) ** 2 == pytest.approx(16 / 9, rel=0.03)
@@ -256,7 +258,7 @@ DARK_ELLIPSE["background_dn"] = 200.0
 )
 def test_more_unknowns_cost_and_no_estimator_beats_the_bound(kind: str, parameters: dict[str, float]) -> None:
     noise = NoiseModel(1.0, 0.05, 0.005)
-    result = possible(kind, parameters, noise, "shape")
+    result = bound(kind, parameters, noise, "shape")
     ladder = [result.bounds[n].place_px[1] for n in ("position", "light", "shape", "planes")]
     assert all(b >= a * (1 - 1e-9) for a, b in zip(ladder, ladder[1:], strict=False))
     assert [p.name for p in result.predictions] == list(names_for(kind))
@@ -268,15 +270,15 @@ def test_more_unknowns_cost_and_no_estimator_beats_the_bound(kind: str, paramete
 
 
 def test_frames_average_what_is_temporal() -> None:
-    one = possible("disc", DISC, NoiseModel(1.0, 0.02))
-    nine = possible("disc", DISC, NoiseModel(1.0, 0.02), frames=9)
+    one = bound("disc", DISC, NoiseModel(1.0, 0.02))
+    nine = bound("disc", DISC, NoiseModel(1.0, 0.02), frames=9)
     assert nine.u_px == pytest.approx(one.u_px / 3, rel=1e-9) and one.frames_worth is None
-    fixed = [possible("disc", DISC, NoiseModel(1.0, 0.02, 0.01), frames=n) for n in (1, 10**9)]
+    fixed = [bound("disc", DISC, NoiseModel(1.0, 0.02, 0.01), frames=n) for n in (1, 10**9)]
     floor = fixed[1].u_px
     worth = fixed[0].frames_worth
     assert worth is not None
     for n in (worth - 1, worth):
-        u = possible("disc", DISC, NoiseModel(1.0, 0.02, 0.01), frames=n).chosen.u_px
+        u = bound("disc", DISC, NoiseModel(1.0, 0.02, 0.01), frames=n).chosen.u_px
         assert (u <= 1.05 * floor * (1 + 1e-9)) == (n == worth)
 
 
@@ -288,10 +290,10 @@ def test_the_rule_of_frames() -> None:
 
 
 def test_the_bound_scales_with_contrast_and_noise() -> None:
-    base = bound("disc", DISC, NoiseModel(1.0), rounded=False).place_px[1]
+    base = cramer_rao_bound("disc", DISC, NoiseModel(1.0), rounded=False).place_px[1]
     dark = disc(7, amplitude_dn=-300.0, background_dn=400)
-    assert bound("disc", dark, NoiseModel(1.0), rounded=False).place_px[1] == pytest.approx(base / 2)
-    assert bound("disc", DISC, NoiseModel(9.0), rounded=False).place_px[1] == pytest.approx(3 * base)
+    assert cramer_rao_bound("disc", dark, NoiseModel(1.0), rounded=False).place_px[1] == pytest.approx(base / 2)
+    assert cramer_rao_bound("disc", DISC, NoiseModel(9.0), rounded=False).place_px[1] == pytest.approx(3 * base)
 
 
 # ---- estimators, simulated -----------------------------------------------------------------------------------------------------------
@@ -430,5 +432,5 @@ def test_a_camera_with_a_logarithmic_response_has_a_noise_too() -> None:
 def test_bad_input_is_told_in_one_line(change: dict, text: str) -> None:
     good = {"kind": "disc", "parameters": DISC, "noise": NoiseModel(1.0)}
     with pytest.raises(InputError, match=text) as caught:
-        possible(**(good | change))
+        bound(**(good | change))
     assert "\n" not in str(caught.value)

@@ -8,7 +8,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from pixmetry.cli import main
-from pixmetry.locate.bound.bound import bound
+from pixmetry.locate.bound.fisher import cramer_rao_bound
 from pixmetry.locate.noise import NoiseModel
 
 TARGET = ("--radius", "3.5", "--blur", "0.7", "--amplitude", "150", "--background", "10")
@@ -29,7 +29,7 @@ def test_programs_get_the_numbers_of_the_library() -> None:
     record = json.loads(run(*TARGET, "--noise", "read=1.5,gain=0.01,bits=8", "--json", "-").output)
     model = NoiseModel(1.5**2 + 1 / 12, 0.01, low_dn=0, high_dn=255)
     disc = {"radius_px": 3.5, "blur_px": 0.7, "amplitude_dn": 150.0, "background_dn": 10.0}
-    assert record["bounds"]["asked"]["u_px"]["mean"] == pytest.approx(bound("disc", disc, model).place_px[1])
+    assert record["bounds"]["asked"]["u_px"]["mean"] == pytest.approx(cramer_rao_bound("disc", disc, model).place_px[1])
     assert record["schema"] == "pixmetry/bound/1" and record["frames"] == 1 and record["pitch_um"] is None
     assert sum(limit["share"] for limit in record["limits"]) == pytest.approx(1, abs=1e-5)
     four = json.loads(run(*TARGET, "--noise", "read=1.5,gain=0.01,bits=8", "--frames", "4", "--json", "-").output)

@@ -86,7 +86,7 @@ def bound(
     Example: pixmetry bound --radius 3.5 --blur 0.7 --amplitude 150 --background 10 --camera imx264_like
     """
     from pixmetry.core.errors import InputError
-    from pixmetry.locate.bound.bound import possible
+    from pixmetry.locate.bound.bound import bound as bound_of_target
 
     written = JsonResult(json_file, "pixmetry/bound/1", inputs=[Path(camera)] if camera else [])
     if noise and camera:
@@ -95,7 +95,7 @@ def bound(
     given = {SIZES[name]: value for name, value in sizes.items() if value is not None}
     parameters = given | {"blur_px": blur, "amplitude_dn": amplitude, "background_dn": model.black_dn + background}
     settings["aperture_px"] = settings["aperture_px"] if aperture is None else aperture
-    result = possible(
+    result = bound_of_target(
         kind,
         parameters,
         model,

@@ -10,12 +10,12 @@ import numpy as np
 
 from pixmetry.core.errors import InputError
 from pixmetry.locate.bound import closed_bounds as closed
-from pixmetry.locate.bound.fisher import Bound, bound, bound_of, pixel_noise
+from pixmetry.locate.bound.fisher import Bound, bound_of, cramer_rao_bound, pixel_noise
 from pixmetry.locate.bound.predictions import PixelNoise, Prediction, names_for, predict
-from pixmetry.locate.noise import NoiseModel
+from pixmetry.locate.noise import NoiseModel, parse_noise
 from pixmetry.locate.template.template_images import Images, axes_of, draw_images, line_length_px
 
-__all__ = ["Bound", "Limit", "Possible", "bound", "possible"]
+__all__ = ["Bound", "Limit", "Possible", "bound", "cramer_rao_bound"]
 
 SETS = ("position", "light", "shape", "planes")
 WITHIN = 1.05  # frames are averaged until the uncertainty is within 5 % of what stays
@@ -118,10 +118,10 @@ class Possible:
         }
 
 
-def possible(
+def bound(
     kind: str,
     parameters: Mapping[str, float],
-    noise: NoiseModel,
+    noise: NoiseModel | str,
     unknowns: str | tuple[str, ...] | list[str] = "shape",
     *,
     estimator: str = "template",
@@ -137,16 +137,32 @@ def possible(
 
     Parameters
     ----------
-    kind, parameters, noise, unknowns, frames, aperture_px, light_on, window_px, phases, rounded, pattern_dn
-        As for `bound`.
+    kind, parameters, unknowns, frames, aperture_px, light_on, window_px, phases, rounded, pattern_dn
+        As for `cramer_rao_bound`.
+    noise : NoiseModel or str
+        As for `cramer_rao_bound`, or as the command takes it: ``"read=1.5,gain=0.4,bits=12"``, whose pattern adds to ``pattern_dn``.
     estimator : str
         Whose limits are asked for: one of `pixmetry.locate.bound.predictions.names_for` this kind.
+
+    Returns
+    -------
+    Possible
 
     Raises
     ------
     InputError
         If a value cannot be used.
+
+    Examples
+    --------
+    >>> disc = {"radius_px": 3.5, "blur_px": 0.7, "amplitude_dn": 150.0, "background_dn": 10.0}
+    >>> found = bound("disc", disc, "read=1.5,gain=0.4,bits=8", "position")
+    >>> 0.005 < found.u_px < 0.05, found.predictions[0].name
+    (True, 'template')
     """
+    if isinstance(noise, str):
+        noise, own_pattern_dn = parse_noise(noise, rounded)
+        pattern_dn = float(np.hypot(pattern_dn, own_pattern_dn))
     images = draw_images(kind, parameters, aperture_px=aperture_px, light_on=light_on, window_px=window_px, phases=phases)
     names = names_for(kind)
     if estimator not in names:

@@ -69,7 +69,7 @@ class Bound:
         return float(np.sqrt(variance.min())), float(np.sqrt(variance.mean())), float(np.sqrt(variance.max()))
 
 
-def bound(
+def cramer_rao_bound(
     kind: str,
     parameters: Mapping[str, float],
     noise: NoiseModel,
