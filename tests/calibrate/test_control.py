@@ -19,8 +19,7 @@ from pixmetry.calibrate.checks.findings import findings_of, gross_error_findings
 from pixmetry.calibrate.checks.known_checks import KnownFaults, lost_records, mostly_lost, set_free, where_seen, wrong_known
 from pixmetry.calibrate.checks.known_residuals import Known, contradicted, control_residuals, group_record, jointly, rivals
 from pixmetry.calibrate.checks.tests import known_record, sizes
-from pixmetry.calibrate.page.control import control_points
-from pixmetry.calibrate.page.tables import scale_bars
+from pixmetry.calibrate.page.tables import control_points, scale_bars
 from pixmetry.calibrate.records import Calibration, Contradicted, GrossError, KnownControl, KnownRecord, record_of
 from pixmetry.core.errors import InputError
 from pixmetry.core.finding import Finding

@@ -16,7 +16,6 @@ from chance import rng_of
 from pixmetry.calibrate.bundle.model import NAMES, Sensor
 from pixmetry.calibrate.bundle.network import Adjustment
 from pixmetry.calibrate.checks.quality import image_records
-from pixmetry.calibrate.page.control import control_points
 from pixmetry.calibrate.page.figures import (
     MOST_IN_SMALL,
     MOST_VECTORS,
@@ -33,7 +32,7 @@ from pixmetry.calibrate.page.figures import (
 from pixmetry.calibrate.page.page import page_of, write_page
 from pixmetry.calibrate.page.plots import bin_means, short
 from pixmetry.calibrate.page.space import ellipse, field_map, largest_axis, plan_views, pyramids, seen_from, shown_points
-from pixmetry.calibrate.page.tables import gross_errors, images, network_facts, parameters, scale_bars
+from pixmetry.calibrate.page.tables import control_points, gross_errors, images, network_facts, parameters, scale_bars
 from pixmetry.calibrate.page.text import as_given, p_text, projection_levels, sentence, summary_text, typeset, worth
 from pixmetry.calibrate.records import Calibration, CheckRecord, FieldPoints, ProjectionMap, read_record
 from pixmetry.core.errors import InputError

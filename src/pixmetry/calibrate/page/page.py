@@ -11,8 +11,6 @@ import numpy as np
 
 from pixmetry.calibrate.bundle.model import NAMES
 from pixmetry.calibrate.page import tables
-from pixmetry.calibrate.page.check_points import check_points
-from pixmetry.calibrate.page.control import control_points
 from pixmetry.calibrate.page.text import (
     DIRECTIONS,
     of_camera,
@@ -304,7 +302,7 @@ def _space(section: Section, calibration: Calibration) -> None:
     if bars := tables.scale_bars(calibration):
         heads = ["Between", f"Length / {unit}", "u", f"Measured less adjusted / {unit}", "by / u"]
         section.add_section("Scale bars", number_table("Scale bars", heads, bars))
-    if control := control_points(calibration):
+    if control := tables.control_points(calibration):
         heads = ["Coordinate", f"Given / {unit}", "u", f"Given less adjusted / {unit}", "by / u"]
         part = section.add_section("Control points", number_table("Control points", heads, control, scrolls=True))
         if _scrolls(control):
@@ -317,7 +315,7 @@ def _space(section: Section, calibration: Calibration) -> None:
 
 
 def _check_points(section: Section, calibration: Calibration) -> None:
-    checked = check_points(calibration)
+    checked = tables.check_points(calibration)
     if not checked:
         return
     unit = calibration.adjustment.network.unit

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pixmetry.calibrate.checks.known_residuals import control_of
 from pixmetry.calibrate.page.space import largest_axis
 from pixmetry.calibrate.page.text import (
     TITLES,
@@ -21,11 +22,22 @@ from pixmetry.calibrate.page.text import (
     sentence,
     shown,
     symbol,
+    typeset,
 )
 from pixmetry.report.numbers import NO_BREAK, NONE, fixed, length_px, signed, significant, uncertain
 
 if TYPE_CHECKING:
-    from pixmetry.calibrate.records import Calibration, FieldComparison, GrossError, GroupTest, HoldOut, ImageRecord, Pattern
+    from pixmetry.calibrate.records import (
+        Calibration,
+        CheckedPoint,
+        Contradicted,
+        FieldComparison,
+        GrossError,
+        GroupTest,
+        HoldOut,
+        ImageRecord,
+        Pattern,
+    )
 
 MOST_POINTS = 20  # in the table of those that are known worst
 NOT_SIGNIFICANT = 0.05
@@ -234,3 +246,66 @@ def network_facts(calibration: Calibration) -> list[tuple[str, str]]:
         ("Degrees of freedom", str(adjustment.dof)),
         ("Iterations", str(adjustment.iterations)),
     ]
+
+
+def check_points(calibration: Calibration) -> dict[str, Any] | None:
+    """A sentence, and rows of coordinate, given value, u, found value, u, given less found, that over the u of both, images; None where
+    nothing was compared."""
+    record = calibration.tests.check_points
+    if record is None:
+        return None
+    rows = [_checked_row(point, axis) for point in record.points for axis in range(3) if np.isfinite(point.given[axis])]
+    critical = "" if record.worst is None else fixed(record.worst.critical, 1)
+    fitted = f"the {record.datum_parameters} parameters" if record.datum_parameters > 1 else "the parameter"
+    return {
+        "text": typeset(sentence(record.text)),
+        "rows": rows,
+        "critical": critical,
+        "level": f"{100 * record.level:g}",
+        "fitted": fitted if record.datum_parameters else "",
+    }
+
+
+def _checked_row(point: CheckedPoint, axis: int) -> list[str]:
+    columns = (point.given, point.u_given, point.found, point.u_found, point.difference, point.ratio)
+    given, u_given, found, u_found, off, ratio = (float(column[axis]) for column in columns)
+    u = u_given or u_found
+    return [
+        f"{point.name} {'XYZ'[axis]}",
+        placed(given, u),
+        f"± {placed(u_given, u_given)}" if u_given else "exact",
+        placed(found, u_found),
+        NONE if not np.isfinite(u_found) else f"± {placed(u_found, u_found)}",
+        NONE if not np.isfinite(off) else signed(off, lambda v: significant(v, 2)),
+        NONE if not np.isfinite(ratio) else fixed(ratio, 1),
+        str(point.images),
+    ]
+
+
+def control_points(calibration: Calibration) -> list[list[str]]:
+    """Coordinate, given value, u as it was stated, given less adjusted, and that over u; those that were left out come first.
+
+    What no image point is left of has no adjusted value; what weighs less now, for the network contradicts it, is marked.
+    """
+    network, control = calibration.adjustment.network, control_of(calibration)
+    gross = calibration.tests.known.control_points.gross if calibration.tests.known is not None else ()
+    rows = [_left_out(one) for one in gross if one.left_out]
+    contradicted = {one.name for one in gross}
+    for k in range(len(control)):
+        name = f"{network.points[control.point[k]]} {'XYZ'[control.axis[k]]}"
+        u, residual = float(control.u[k]), float(control.residual[k])
+        cells = [_two_digits(residual), fixed(residual / u, 1) if u else NONE]
+        if control.raised[k]:
+            name += " (contradicted, weighs less)" if name in contradicted else " (weighs less)"
+        if np.isnan(residual):
+            name, cells = f"{name} (no image point left)", [NONE, NONE]
+        rows.append([name, placed(float(control.given[k]), u), f"± {placed(u, u)}" if u else "fixed", *cells])
+    return rows
+
+
+def _left_out(one: Contradicted) -> list[str]:
+    return [f"{one.name} (left out)", NONE, NONE, _two_digits(one.error), NONE]
+
+
+def _two_digits(number: float) -> str:
+    return signed(float(number), lambda v: significant(v, 2))
