@@ -82,7 +82,7 @@ def without_eccentricity(network: Network, found: Eccentricity) -> Network:
 
 def predicted(network: Network, state: State, rows: np.ndarray, normal: np.ndarray, shape: Shape = "circle") -> np.ndarray:
     """Shifts of some image coordinates, px, shape (rows, 2), for targets across ``normal`` (unit vectors, shape (rows, 3))."""
-    from pixmetry.calibrate.bundle._eccentric_kernels import area_centres
+    from pixmetry.calibrate.bundle._model_kernels import area_centres
 
     assert network.diameter is not None  # the rows are those of circles
     first = _along_x(normal)
