@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -13,11 +13,10 @@ from pixmetry.calibrate.bundle.model import CameraModel, Sensor
 from pixmetry.calibrate.bundle.network import Network
 from pixmetry.calibrate.checks.check_points import CheckPoints
 from pixmetry.calibrate.project.cameras import Described, described
-from pixmetry.calibrate.project.coordinates import ImageCoordinates, Measured, measured, upwards
-from pixmetry.calibrate.project.pictures import located, of_size
+from pixmetry.calibrate.project.coordinates import ImageCoordinates, Measured, image_facts, measured, upwards
 from pixmetry.calibrate.project.points import Known, known_points, scale_bars, with_check_points
 from pixmetry.calibrate.project.reader import Reader
-from pixmetry.calibrate.project.schema import PROJECT_SCHEMA, ProjectModel
+from pixmetry.calibrate.project.schema import PROJECT_SCHEMA, PicturesModel, ProjectModel
 from pixmetry.calibrate.project.straight_lines import LinePositions, lines_of_pictures, lines_of_table
 from pixmetry.calibrate.project.tables import Table, first_few
 from pixmetry.camera.camera import Camera
@@ -129,7 +128,7 @@ def _project(model: ProjectModel, reader: Reader, progress: Progress | None) -> 
     plate, findings = None, ()
     if model.pictures is not None:
         files = reader.pictures(model.pictures.files, model.pictures.raw)
-        camera, seen, plate, findings = located(model.pictures, files, cameras[0], images, progress, told[0].check)
+        camera, seen, plate, findings = _locate_targets(model.pictures, files, cameras[0], images, progress, told[0].check)
         cameras = (camera,)
     else:
         assert table is not None and model.observations is not None
@@ -153,7 +152,7 @@ def _lines(
     if model.pictures is not None:
         lines, size, findings = lines_of_pictures(model.pictures, reader.pictures(model.pictures.files, model.pictures.raw), progress)
         told.check(size)
-        return of_size(told.model, *size), lines, findings
+        return _of_size(told.model, *size), lines, findings
     assert table is not None and model.lines is not None
     lines = lines_of_table(table, told.model, given, model.lines.u_px)
     return told.model, lines, _outside(lines, told.model.sensor)
@@ -251,3 +250,59 @@ def _unseen(known: Known, points: Table | None) -> tuple[Finding, ...]:
     n = len(known.unseen)
     text = f"{n} of {len(points)} object points {'is' if n == 1 else 'are'} seen in no image: {first_few(known.unseen)}."
     return (Finding("unseen_points", text, "If they should be, compare their names in both tables."),)
+
+
+def _locate_targets(
+    wanted: PicturesModel,
+    files: Sequence[Path],
+    camera: CameraModel,
+    images: Table | None,
+    progress: Progress | None,
+    check: Callable[[tuple[int, int]], None],
+) -> tuple[CameraModel, Measured, Known, tuple[Finding, ...]]:
+    """Locate the targets of a test field in pictures.
+
+    Parameters
+    ----------
+    wanted : PicturesModel
+    files : sequence of Path
+    camera : CameraModel
+        Its frame takes the size of the pictures.
+    images : Table, optional
+        Time and start pose of each picture, by the name of its file.
+    progress : callable, optional
+    check : callable
+        Called with (cols, rows) of the pictures; refuses what is not the size that was expected.
+
+    Returns
+    -------
+    tuple
+        The camera, what was measured, what the test field's description says of its points, and what was found on the way.
+
+    Raises
+    ------
+    InputError, MeasureError
+        If pictures cannot be read, or too few of them show the test field.
+    """
+    from pixmetry.calibrate.images.images import observations_of
+
+    found = observations_of(files, wanted.kind, **wanted.model_dump(exclude={"files", "kind"}), progress=progress)
+    check(found.sizes[0])
+    camera_of, time_s, poses = image_facts(images, found.images, [camera], lambda name: name)
+    network = found.network(_of_size(camera, *found.sizes[0]))
+    seen = Measured(
+        images=found.images,
+        points=found.points,
+        camera_of=camera_of,
+        time_s=time_s,
+        poses=poses,
+        **{name: getattr(network, name) for name in ("image", "point", "x_px", "y_px", "covariance_px2", "covariance_known")},
+    )
+    return network.cameras[0], seen, Known(network.xyz, network.u_xyz, network.diameter, network.normal), found.findings
+
+
+def _of_size(camera: CameraModel, cols: int, rows: int) -> CameraModel:
+    """The camera with the size of its pictures; a principal point that was not given stays in the middle of the frame."""
+    before, sensor = camera.sensor.centre, replace(camera.sensor, cols=cols, rows=rows)
+    middle = {name: new for name, old, new in zip(("xp", "yp"), before, sensor.centre, strict=True) if camera[name] == old}
+    return replace(camera, sensor=sensor).with_values(**middle)
