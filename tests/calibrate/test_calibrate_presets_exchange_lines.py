@@ -24,7 +24,7 @@ from pixmetry.calibrate import calibrated_camera
 from pixmetry.calibrate.bundle.model import CameraModel, Sensor
 from pixmetry.calibrate.exchange import model_of_colmap, read_opencv
 from pixmetry.calibrate.files.record import read_calibration, stored_cameras
-from pixmetry.calibrate.lines.line_calibration import LineCalibration
+from pixmetry.calibrate.lines.plumb_line import LineCalibration
 from pixmetry.calibrate.page.lines_page import page_of
 from pixmetry.calibrate.page.lines_text import summary_text
 from pixmetry.calibrate.project import load_project

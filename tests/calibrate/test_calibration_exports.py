@@ -11,7 +11,7 @@ import pytest
 
 from pixmetry.calibrate.bundle.model import CameraModel, Sensor
 from pixmetry.calibrate.exchange import read_opencv
-from pixmetry.calibrate.files.exports import check_exports, write_exports
+from pixmetry.calibrate.files.write import check_exports, write_exports
 from pixmetry.calibrate.job import _changed
 from pixmetry.calibrate.project.schema import ProjectModel
 from pixmetry.core.config import validate

@@ -24,7 +24,7 @@ from pixmetry.core.progress import Progress, no_progress
 from pixmetry.files.provenance import InputHashes, provenance_record
 
 if TYPE_CHECKING:
-    from pixmetry.calibrate.lines.line_calibration import LineCalibration
+    from pixmetry.calibrate.lines.plumb_line import LineCalibration
     from pixmetry.calibrate.project import Project
 
 __all__ = ["StoredCalibration", "calibrate", "read_calibration"]
@@ -137,8 +137,7 @@ def _from_lines(
     step: Callable[[str], None],
 ) -> LineCalibration:
     """Calibrate from straight lines."""
-    from pixmetry.calibrate.lines.line_calibration import LineCalibration
-    from pixmetry.calibrate.lines.plumb_line import calibrate_lines
+    from pixmetry.calibrate.lines.plumb_line import LineCalibration, calibrate_lines
 
     wrong = "per_image" if per_image else next((name for name in options if name not in LINE_OPTIONS), None)
     if wrong is not None:

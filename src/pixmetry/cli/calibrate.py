@@ -121,8 +121,8 @@ def calibrate(
 
     docs/calibrating.md explains every key of a project file and every message.
     """
-    from pixmetry.calibrate.files.exports import check_exports, write_exports
     from pixmetry.calibrate.files.record import LINES_SCHEMA, RESULT_SCHEMA, cameras_text
+    from pixmetry.calibrate.files.write import check_exports, write_exports
     from pixmetry.calibrate.job import calibrate as run
     from pixmetry.cli._progress import shown_progress
     from pixmetry.core.threads import set_threads
@@ -148,7 +148,7 @@ def calibrate(
 
 def _summary(calibration: Any, report: Path) -> str:
     """What is printed."""
-    from pixmetry.calibrate.lines.line_calibration import LineCalibration
+    from pixmetry.calibrate.lines.plumb_line import LineCalibration
 
     if isinstance(calibration, LineCalibration):
         from pixmetry.calibrate.page.lines_text import summary_text as lines_text
@@ -169,7 +169,7 @@ def _page_of(calibration: Any) -> Page:
 
 
 def _models(calibration: Any) -> list[Any]:
-    from pixmetry.calibrate.lines.line_calibration import LineCalibration
+    from pixmetry.calibrate.lines.plumb_line import LineCalibration
 
     if isinstance(calibration, LineCalibration):
         return [calibration.camera()]

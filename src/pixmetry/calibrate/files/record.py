@@ -14,7 +14,7 @@ import numpy as np
 
 from pixmetry.calibrate.bundle.model import NAMES, CameraModel, Sensor
 from pixmetry.calibrate.checks.known_residuals import control_of
-from pixmetry.calibrate.lines.line_calibration import LineCalibration
+from pixmetry.calibrate.lines.plumb_line import LineCalibration
 from pixmetry.calibrate.records import Calibration, ResidualGrid, Tests, read_record, record_of
 from pixmetry.core.checksums import check_record, sealed
 from pixmetry.core.config import read_text

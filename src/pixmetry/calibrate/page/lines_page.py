@@ -18,7 +18,7 @@ from pixmetry.report.numbers import fixed, length_px, significant
 from pixmetry.report.provenance import provenance_section
 
 if TYPE_CHECKING:
-    from pixmetry.calibrate.lines.line_calibration import LineCalibration
+    from pixmetry.calibrate.lines.plumb_line import LineCalibration
 
 MOST_IMAGES = 12  # that are drawn, those with the largest residuals
 PARAMETERS = (

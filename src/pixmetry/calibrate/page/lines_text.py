@@ -8,7 +8,7 @@ from pixmetry.calibrate.page.text import TITLES, folded, length, p_text, sentenc
 from pixmetry.report.numbers import NO_BREAK, NONE, THIN, length_px, significant, uncertain
 
 if TYPE_CHECKING:
-    from pixmetry.calibrate.lines.line_calibration import LineCalibration
+    from pixmetry.calibrate.lines.plumb_line import LineCalibration
     from pixmetry.calibrate.records import LinesFTest
 
 COUNTED = (("positions", "by position"), ("effective", "effective"), ("lines", "by line"))
