@@ -106,6 +106,9 @@ def print_summary(assessment: Assessment) -> None:
 
     console = plain_console(width=110)
     console.print(f"\n[bold]{escape(shown(assessment.campaign.camera.name))}[/bold]: {escape(assessment.verdict_text())}\n")
+    if (answer := assessment.budget.interval) is not None:
+        half = " and ".join(f"± {v:.2g} px in {axis}" for v, axis in zip(answer.half_px, "xy", strict=True))
+        console.print(f"In one frame a position is within {half} of the true one (coverage {100 * answer.coverage:.0f} %).\n")
     table = Table(
         title="Largest contributions to a target's position in one frame, k = 1, px", title_justify="left", box=None, pad_edge=False
     )
