@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from pixmetry.cli import COMMANDS
-from pixmetry.cli._warming_up import all_kernels, jobs_in
+from pixmetry.cli.warm_up import all_kernels, jobs_in
 from pixmetry.core import compiling
 from pixmetry.core.jit import jit
 from pixmetry.locate.estimators import estimators
