@@ -13,8 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pixmetry.assess.judge.differences import Difference, Subject, decided, difference_of, family, holm
-from pixmetry.assess.judge.fleet import FleetRow, fleet_chance, fleet_row
+from pixmetry.assess.judge.differences import Difference, FleetRow, Subject, decided, difference_of, family, fleet_chance, fleet_row, holm
 from pixmetry.assess.judge.subjects import load_subject
 from pixmetry.core.errors import InputError
 from pixmetry.emva.files.json_format import value_record

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from pixmetry.assess.page.budget_figures import link_shares, pareto
+from pixmetry.assess.page.figures import link_shares, pareto
 from pixmetry.budget.combine import Combined
 from pixmetry.budget.headline import SUM
 from pixmetry.budget.job import DECIDED, Budget, BudgetRow

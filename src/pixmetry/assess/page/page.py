@@ -83,8 +83,7 @@ def _plots(assessment: Assessment) -> Section:
 
 
 def _values(assessment: Assessment) -> Section:
-    from pixmetry.assess.page.measured import table
-    from pixmetry.assess.page.twin_view import twin_section
+    from pixmetry.assess.page.measured import table, twin_section
 
     rows: list[Row] = []
     for heading, found in table(assessment.observations, assessment.standard).items():
