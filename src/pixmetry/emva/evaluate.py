@@ -11,6 +11,7 @@ from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.core.number import ONE_SIDED_95, TWO_SIDED_95, UPPER_LIMIT, VALUE, Number
 from pixmetry.core.random import Generator, generator
 from pixmetry.core.threads import map_tiles, single_threaded_blas
+from pixmetry.emva.curves import dark_signal, spatial_curves, temporal_curves
 from pixmetry.emva.dark_noise import DarkNoise, pattern_limit_dn2
 from pixmetry.emva.files.keys import KEYS, goes_with_photons
 from pixmetry.emva.formulas import DARK_VARIANCE, Formulas, Spread, Values, keys_of
@@ -24,9 +25,7 @@ from pixmetry.emva.reasons import DARK_PATTERN, Case, breaks_the_split, is_blind
 from pixmetry.emva.records import RELEASES, Measurement, Results
 from pixmetry.emva.scatter import GROUPS, Scatter, scatter_of
 from pixmetry.emva.series import light_of
-from pixmetry.emva.spatial.spatial_curves import spatial_curves
 from pixmetry.emva.temporal import slope_departures, temporal_values
-from pixmetry.emva.temporal_curves import dark_signal, temporal_curves
 from pixmetry.emva.uncertainty import about, add_wave, bootstrap_series, draw_blocks
 
 GROUP_DRAWS = 300

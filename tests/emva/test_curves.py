@@ -8,10 +8,10 @@ from scipy.stats import chi2, norm
 
 from pixmetry.camera.observations import StackMoments
 from pixmetry.core.errors import MeasureError
+from pixmetry.emva.curves import spatial_curves
 from pixmetry.emva.records import Measurement
 from pixmetry.emva.spatial.high_pass import LOW_PASS
 from pixmetry.emva.spatial.spatial import SpatialInputs, spatial_variances
-from pixmetry.emva.spatial.spatial_curves import spatial_curves
 
 FRAMES = 10
 QUANTILE = 4.9  # false-failure rate 1e-6
