@@ -179,6 +179,12 @@ class Light:
         """Return the light with other times of looking; arrays of shape (n, rows or 1, m)."""
         return replace(self, moments_s=moments_s, weights=weights)
 
+    def delayed(self, delay_s: np.ndarray) -> Light:
+        """Return the light seen later by so much; ``delay_s`` has shape (n, rows), or (n, 1) where all rows look together."""
+        times, weights = self.moments
+        times = times + delay_s[:, :, None]
+        return self.seen_at(times, np.broadcast_to(weights, times.shape))
+
     def jittered(self, dx_px: np.ndarray, dy_px: np.ndarray) -> Light:
         """Return the light with every pixel moved by an amount of its own; arrays of shape (n, rows, cols), added to those before."""
         before = (0.0, 0.0) if self.jitter_px is None else self.jitter_px

@@ -14,7 +14,6 @@ import numpy as np
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
 from pixmetry.core.random import Stream
-from pixmetry.sources.sensor._times import delayed
 
 
 class Interlace(Parameters):
@@ -48,7 +47,7 @@ def forward(params: Interlace, signal: Signal, stream: Stream) -> Signal:
         light = light.moved(_half_a_row_down).spread(np.zeros(2), np.array([-0.5, 0.5]), np.array([0.5, 0.5]))
         light = replace(light, sensitivity=2 * light.sensitivity)
     if params.field_period_s and light.moving:
-        light = delayed(light, delay_s(params, signal))
+        light = light.delayed(delay_s(params, signal))
     return signal if light is signal.light else signal.with_light(light)
 
 

@@ -10,7 +10,6 @@ import numpy as np
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
 from pixmetry.core.random import Stream
-from pixmetry.sources.sensor._times import delayed
 
 
 class RollingShutter(Parameters):
@@ -35,7 +34,7 @@ def forward(params: RollingShutter, signal: Signal, stream: Stream) -> Signal:
     if not params.row_time_s:
         return signal
     if params.reset == "rolling":
-        return signal.with_light(delayed(light, delay_s(params, signal))) if light.moving else signal
+        return signal.with_light(light.delayed(delay_s(params, signal))) if light.moving else signal
     longer = (1 + delay_s(params, signal) / signal.exposure_s[:, None])[:, :, None]
     times, weights = light.moments
     start = signal.time_s[:, None, None]

@@ -9,7 +9,6 @@ import numpy as np
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
 from pixmetry.core.random import Stream
-from pixmetry.sources.sensor._times import delayed
 
 
 class TriggerJitter(Parameters):
@@ -32,7 +31,7 @@ def forward(params: TriggerJitter, signal: Signal, stream: Stream) -> Signal:
     """Look at the scene later by the delay."""
     if not signal.light.moving or not (params.latency_s or params.jitter_s or params.clock_error_rel):
         return signal
-    return signal.with_light(delayed(signal.light, delay_s(params, signal, stream)[:, None]))
+    return signal.with_light(signal.light.delayed(delay_s(params, signal, stream)[:, None]))
 
 
 def truth(params: TriggerJitter, signal: Signal, stream: Stream) -> Mapping[str, np.ndarray]:
