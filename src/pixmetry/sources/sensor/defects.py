@@ -3,21 +3,306 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from statistics import NormalDist
 
 import numpy as np
+from pydantic import NonNegativeFloat, NonNegativeInt
 
 from pixmetry.camera.contribution import Contribution, Probe
+from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal
-from pixmetry.camera.source import Source, cut_map
-from pixmetry.sources.sensor._defect_count import measure
-from pixmetry.sources.sensor._defect_model import Defects, disc, forward, truth
+from pixmetry.camera.source import Parameters, Source, cut_map, quantity
+from pixmetry.core.errors import MeasureError
+from pixmetry.core.number import Estimates, Number
+from pixmetry.core.random import Grid, Stream
 
+MOST = 0.1  # share of defects beyond which it is not clear what the good pixels are
+LOOK_BACK = (8, 256)  # frames looked at together for the last draw of a blinking pixel: at first, and at most
+FOUND_95 = 1.645  # standard deviations above the limit at which 95 of 100 defects are found
 PHASES = 6  # places within the pixel at which a defect is tried
 NODES = 7  # of the Gauss–Hermite quadrature over the logarithm of the excess
 NEIGHBOURS = [(dr, dc) for dr in (-1, 0, 1) for dc in (-1, 0, 1) if (dr, dc) != (0, 0)]
+Listed = tuple[NonNegativeInt, NonNegativeInt, NonNegativeFloat, float]
+Row = tuple[str, float, float, float, str]
 
-# what describes the single pixels that are drawn, and not those of a measured unit
-DRAWN = tuple(name for name in Defects.model_fields if not name.startswith(("column", "cluster", "listed")))
+
+class Defects(Parameters):
+    """How many pixels are defect in each way, and how much; which ones is fixed in the unit."""
+
+    hot_fraction: float = quantity(0.0, "1", "share of hot pixels", ge=0, le=MOST)
+    hot_median_e: float = quantity(500.0, "e-", "median dark excess of a hot pixel in one exposure", ge=0, le=1e6)
+    hot_sigma_log: float = quantity(0.5, "1", "standard deviation of the natural logarithm of the excess", ge=0, le=3)
+    dead_fraction: float = quantity(0.0, "1", "share of dead pixels", ge=0, le=MOST)
+    dead_gain_rel: float = quantity(0.0, "1", "response of a dead pixel over that of a good one", ge=0, lt=0.5)
+    cold_fraction: float = quantity(0.0, "1", "share of pixels whose dark value is too low", ge=0, le=MOST)
+    cold_e: float = quantity(200.0, "e-", "what a cold pixel lacks", ge=0, le=1e6)
+    gain_fraction: float = quantity(0.0, "1", "share of pixels whose response is off, yet not dead", ge=0, le=MOST)
+    gain_std_rel: float = quantity(0.2, "1", "root mean square of their relative response error", ge=0, le=10)
+    noisy_fraction: float = quantity(0.0, "1", "share of pixels with too much temporal noise", ge=0, le=MOST)
+    noisy_std_e: float = quantity(100.0, "e-", "standard deviation of that noise", ge=0, le=1e6)
+    blinking_fraction: float = quantity(0.0, "1", "share of pixels whose dark charge jumps between two levels", ge=0, le=MOST)
+    blinking_e: float = quantity(100.0, "e-", "what a blinking pixel has more on its upper level", ge=0, le=1e6)
+    blinking_on: float = quantity(0.5, "1", "share of the frames in which it is on its upper level", gt=0, lt=1)
+    blinking_frames: float = quantity(
+        10.0, "1", "frames, on average, from one draw of its level to the next: correlation (1 − 1/frames)^k", ge=1, le=1000
+    )
+    stuck_fraction: float = quantity(0.0, "1", "share of pixels that hold the same charge whatever the light", ge=0, le=MOST)
+    stuck_e: float = quantity(10_000.0, "e-", "charge of a stuck pixel", ge=0, le=1e7)
+    column_fraction: float = quantity(0.0, "1", "share of defect columns", ge=0, le=MOST)
+    column_gain_rel: float = quantity(0.0, "1", "response of a defect column over that of a good one", ge=0, le=2)
+    column_e: float = quantity(0.0, "e-", "dark excess of a defect column", ge=0, le=1e6)
+    cluster_fraction: float = quantity(0.0, "1", "share of pixels that are the centre of a cluster", ge=0, le=0.01)
+    cluster_radius_px: float = quantity(1.5, "px", "radius of a cluster", ge=0, le=8)
+    cluster_gain_rel: float = quantity(0.0, "1", "response within a cluster over that of good pixels", ge=0, le=2)
+    listed: tuple[Listed, ...] = quantity((), "px, px, 1, e-", "known defects: row, column, response, dark excess (0, 0 is a dead one)")
+
+    @property
+    def shares(self) -> dict[str, float]:
+        """Share of every kind of single defect pixels."""
+        return {kind: getattr(self, f"{kind}_fraction") for kind in ("hot", "cold", "gain", "noisy", "blinking", "stuck", "dead")}
+
+    @property
+    def none(self) -> bool:
+        """Whether there are no defects at all."""
+        return not (any(self.shares.values()) or self.column_fraction or self.cluster_fraction or self.listed)
+
+
+def forward(params: Defects, signal: Signal, stream: Stream) -> Signal:
+    """Change the mean signal of the defects; an excess takes part in the shot noise that follows, and no charge falls below zero."""
+    p = params
+    known = stream.known_unit("pixels")
+    if known is None and p.none:
+        return signal
+    data = signal.data.copy()
+    if known is not None:
+        data = _of_unit(known, data, signal, stream)
+    elif any(p.shares.values()):
+        lot = stream.uniform_fixed(signal.grid)
+        for kind, (low, high) in _bands(p).items():
+            if low == high:
+                continue
+            i, r, c = np.nonzero((lot >= low) & (lot < high))
+            if len(i):
+                single = Grid(signal.grid.frame[i], signal.rows[i, r], signal.cols[i, c], (1, 1))
+                data[i, r, c] = CHANGES[kind](p, data[i, r, c], single, stream)
+    if p.column_fraction:
+        bad = _columns(p, signal.grid, stream)[:, None, :]
+        data = np.where(bad, data * np.float32(p.column_gain_rel) + np.float32(p.column_e), data)
+    if p.cluster_fraction:
+        data = np.where(_clusters(p, signal.grid, stream), data * np.float32(p.cluster_gain_rel), data)
+    for row, col, response, excess_e in p.listed:
+        i, r, c = np.nonzero((signal.rows == row)[:, :, None] & (signal.cols == col)[:, None, :])
+        data[i, r, c] = np.maximum(data[i, r, c] * np.float32(response) + np.float32(excess_e), 0)
+    return signal.with_data(data)
+
+
+def _of_unit(pixels: np.ndarray, data: np.ndarray, signal: Signal, stream: Stream) -> np.ndarray:
+    """Change the defects of a measured unit: one row each with row, column, response, dark excess and temporal noise in electrons."""
+    row0, col0, (rows, cols) = signal.grid.row0, signal.grid.col0, signal.grid.shape
+    r, c = pixels[:, 0].astype(int) - row0[:, None], pixels[:, 1].astype(int) - col0[:, None]
+    i, k = np.nonzero((r >= 0) & (r < rows) & (c >= 0) & (c < cols))
+    if len(i):
+        r, c = r[i, k], c[i, k]
+        single = Grid(signal.grid.frame[i], row0[i] + r, col0[i] + c, (1, 1))
+        response, excess_e, noise_e = pixels[k, 2:5].astype(np.float32).T
+        data[i, r, c] = np.maximum(data[i, r, c] * response + excess_e + noise_e * stream.normal(single)[:, 0, 0], 0)
+    return data
+
+
+def truth(params: Defects, signal: Signal, stream: Stream) -> Mapping[str, np.ndarray]:
+    """Masks of the unit, by kind; ``listed`` are those given, or those that were measured in this unit."""
+    one = signal.take(np.array([0]))
+    lot = stream.uniform_fixed(one.grid)[0]
+    known = stream.known_unit("pixels")
+    masks = {kind: (lot >= low) & (lot < high) & (known is None) for kind, (low, high) in _bands(params).items()}
+    masks["column"] = np.broadcast_to(_columns(params, one.grid, stream)[0], lot.shape).copy()
+    masks["cluster"] = _clusters(params, one.grid, stream)[0]
+    masks["listed"] = np.zeros(lot.shape, bool)
+    for row, col in [*(entry[:2] for entry in params.listed), *([] if known is None else known[:, :2].astype(int).tolist())]:
+        masks["listed"] |= (one.rows[0] == row)[:, None] & (one.cols[0] == col)
+    return masks
+
+
+def _bands(params: Defects) -> dict[str, tuple[float, float]]:
+    """Which part of (0, 1) of the pixel's lot makes it a defect of each kind; the dead ones lie at the top."""
+    bands, low = {}, 0.0
+    for kind, share in params.shares.items():
+        bands[kind] = (low, low + share) if kind != "dead" else (1 - share, 2.0) if share else (1.0, 1.0)
+        low += share
+    return bands
+
+
+def _columns(params: Defects, grid: Grid, stream: Stream) -> np.ndarray:
+    """Which columns are defect, shape (n, cols)."""
+    if not params.column_fraction:
+        return np.zeros((len(grid.frame), grid.shape[1]), bool)
+    return stream.normal_cols_fixed(grid) > np.float32(NormalDist().inv_cdf(1 - params.column_fraction))
+
+
+def _clusters(params: Defects, grid: Grid, stream: Stream) -> np.ndarray:
+    """Which pixels lie within the radius of the centre of a cluster, shape (n, rows, cols)."""
+    rows, cols = grid.shape
+    reach = int(params.cluster_radius_px)
+    if not params.cluster_fraction:
+        return np.zeros(grid.size, bool)
+    wide = Grid(grid.frame, grid.row0 - reach, grid.col0 - reach, (rows + 2 * reach, cols + 2 * reach))
+    centre = stream.uniform_fixed(wide, draw=1) < params.cluster_fraction
+    inside = np.zeros(grid.size, bool)
+    for dr, dc in disc(params.cluster_radius_px):
+        inside |= centre[:, reach + dr : reach + dr + rows, reach + dc : reach + dc + cols]
+    return inside
+
+
+def disc(radius_px: float) -> list[tuple[int, int]]:
+    """Row and column steps to the pixels within a radius."""
+    reach = range(-int(radius_px), int(radius_px) + 1)
+    return [(dr, dc) for dr in reach for dc in reach if dr * dr + dc * dc <= radius_px**2]
+
+
+def blinking_level(params: Defects, single: Grid, stream: Stream) -> np.ndarray:
+    """Level, 0 or 1, of blinking pixels given one by one with their frames, shape (n,); its mean where the stream is quiet.
+
+    In each frame a pixel draws its level anew with probability 1/``blinking_frames``, else it keeps it: a stationary Markov chain, which
+    for any frame is found by looking back for the last draw.
+    """
+    if stream.quiet:
+        return np.full(len(single.frame), params.blinking_on, np.float32)
+    drawn = np.zeros_like(single.frame)
+    open_, back, step = np.arange(len(drawn)), 0, LOOK_BACK[0]
+    while len(open_):
+        frames = np.maximum(single.frame[open_, None] - back - np.arange(step), 0)
+        there = Grid(frames.ravel(), np.repeat(single.row0[open_], step), np.repeat(single.col0[open_], step), (1, 1))
+        anew = (stream.uniform(there)[:, 0, 0].reshape(frames.shape) < 1 / params.blinking_frames) | (frames == 0)
+        hit = anew.any(axis=1)
+        drawn[open_[hit]] = frames[hit, anew[hit].argmax(axis=1)]
+        open_, back, step = open_[~hit], back + step, min(2 * step, LOOK_BACK[1])
+    at = Grid(drawn, single.row0, single.col0, (1, 1))
+    return (stream.uniform(at, draw=1)[:, 0, 0] < params.blinking_on).astype(np.float32)
+
+
+def _heat(params: Defects, value: np.ndarray, single: Grid, stream: Stream) -> np.ndarray:
+    return value + np.float32(params.hot_median_e) * np.exp(np.float32(params.hot_sigma_log) * stream.normal_fixed(single)[:, 0, 0])
+
+
+def _cool(params: Defects, value: np.ndarray, single: Grid, stream: Stream) -> np.ndarray:
+    return np.maximum(value - np.float32(params.cold_e), 0)
+
+
+def _respond(params: Defects, value: np.ndarray, single: Grid, stream: Stream) -> np.ndarray:
+    return value * np.maximum(1 + np.float32(params.gain_std_rel) * stream.normal_fixed(single)[:, 0, 0], 0)
+
+
+def _flicker(params: Defects, value: np.ndarray, single: Grid, stream: Stream) -> np.ndarray:
+    return np.maximum(value + np.float32(params.noisy_std_e) * stream.normal(single)[:, 0, 0], 0)
+
+
+def _blink(params: Defects, value: np.ndarray, single: Grid, stream: Stream) -> np.ndarray:
+    return value + np.float32(params.blinking_e) * blinking_level(params, single, stream)
+
+
+def _stick(params: Defects, value: np.ndarray, single: Grid, stream: Stream) -> np.ndarray:
+    return np.full_like(value, params.stuck_e)
+
+
+def _deaden(params: Defects, value: np.ndarray, single: Grid, stream: Stream) -> np.ndarray:
+    return value * np.float32(params.dead_gain_rel)
+
+
+CHANGES = {"hot": _heat, "cold": _cool, "gain": _respond, "noisy": _flicker, "blinking": _blink, "stuck": _stick, "dead": _deaden}
+
+
+def measure(observations: Observations) -> Estimates:
+    """Count the defects found in the stacks, and describe them.
+
+    The shares are those of this very unit: every pixel of it was looked at, so a count of none means none, without a limit for what a
+    sample might have missed. What u remains is that of the good pixels called defect by chance, √(expected number)/pixels. A pixel whose
+    error is below the limit of the search is not counted here: it stays among the good pixels, and their scatter (DSNU, PRNU) holds it.
+    Where no hot pixel was found, ``hot_median_e`` is that limit: the excess with which 95 of 100 hot pixels would have been found.
+    """
+    found = observations.defects
+    if found is None:
+        raise MeasureError(
+            "defects need a stack of dark frames", where="sensor.defects", remedy="take at least 16 dark and 16 bright frames"
+        )
+    kind = np.array(found.kind, dtype="U5")
+    places = {
+        "hot": kind == "hot",
+        "dead": np.isin(kind, ("dead", "stuck")),
+        "cold": kind == "cold",
+        "gain": kind == "gain",
+        "noisy": kind == "noisy",
+    }
+    lit = observations.bright_stack is not None or bool(np.isfinite(found.gain_rel).any())
+    fit = observations.photon_transfer_fit
+    gain = None if fit is None or "gain_dn_per_e" not in fit else fit["gain_dn_per_e"]
+    pixels, rows, reasons, limits = found.shape[0] * found.shape[1], [], {}, set()
+    for name, here in places.items():
+        if name in ("dead", "gain") and not lit:
+            continue
+        count = int(here.sum())
+        if count > MOST * pixels:
+            raise MeasureError(
+                f"so many pixels are {name} that it is not clear what the good ones are",
+                where="sensor.defects",
+                value=f"{100 * count / pixels:.3g} %",
+                allowed=f"at most {100 * MOST:g} %",
+                remedy="see whether light, exposure and temperature were the same in all frames of the stacks",
+            )
+        by_chance = float(np.sqrt(found.expected_false)) if count else 0.0
+        rows.append((f"{name}_fraction", count / pixels, by_chance / pixels, np.inf, "1"))
+        if not count:
+            reasons[f"{name}_fraction"] = "all pixels were looked at, none was found; smaller errors are in the scatter of the good ones"
+    if not places["hot"].any() and gain is not None and np.isfinite(found.dark_limit_dn):
+        limit = (found.dark_limit_dn + FOUND_95 * found.dark_sigma_dn) / gain.value
+        rows.append(("hot_median_e", min(limit, 1e6), limit * gain.u / gain.value, np.inf, "e-"))
+        limits.add("hot_median_e")
+        reasons["hot_median_e"] = "none was found; 95 of 100 with this excess would have been"
+    rows += _errors(observations, places, gain)
+    return Estimates.from_rows(
+        rows,
+        method="count of pixels beyond the Gaussian core of the others; moments of their errors",
+        confounders=("a pixel stuck at the top of the scale counts as hot", "cosmic rays and blinking pixels"),
+        limits=frozenset(limits),
+        reasons=reasons,
+    )
+
+
+def _errors(observations: Observations, places: Mapping[str, np.ndarray], gain: Number | None) -> list[Row]:
+    """How large the errors are of the kinds that were found; those in electrons only if the gain is known."""
+    found = observations.defects
+    rows: list[Row] = []
+    dark_u, response_u = (float(np.nan_to_num(v)) for v in (found.dark_sigma_dn, found.gain_sigma_rel))
+
+    def add_e(name: str, value_dn: float, u_dn: float, dof: float) -> None:
+        if gain is not None:
+            value = min(value_dn / gain.value, 1e6)
+            rows.append((name, value, float(np.hypot(u_dn / gain.value, value * gain.u / gain.value)), dof, "e-"))
+
+    n = {name: int(here.sum()) for name, here in places.items()}
+    if n["hot"]:
+        log = np.log(np.maximum(found.dark_excess_dn[places["hot"]], 1e-6))
+        spread, dof = (float(log.std(ddof=1)), n["hot"] - 1.0) if n["hot"] > 1 else (0.0, np.inf)
+        median = float(np.exp(log.mean()))
+        own = dark_u / median  # relative, of a single excess: it stands on the pixel's own dark signal
+        u_spread = float(np.hypot(spread / np.sqrt(2 * max(n["hot"] - 1, 1)), own / n["hot"] ** 0.5))
+        rows.append(("hot_sigma_log", min(spread, 3.0), u_spread, dof, "1"))
+        add_e("hot_median_e", median, median * float(np.hypot(spread, own)) / n["hot"] ** 0.5, dof)
+    if n["dead"]:
+        response = found.gain_rel[places["dead"]]
+        u, dof = (float(response.std(ddof=1)), n["dead"] - 1.0) if n["dead"] > 1 else (response_u, np.inf)
+        rows.append(("dead_gain_rel", float(np.clip(response.mean(), 0, 0.4999)), u / n["dead"] ** 0.5, dof, "1"))
+    if n["cold"]:
+        add_e("cold_e", float(np.sqrt((found.dark_excess_dn[places["cold"]] ** 2).mean())), dark_u / n["cold"] ** 0.5, np.inf)
+    if n["gain"]:
+        rms = float(np.sqrt(((found.gain_rel[places["gain"]] - 1) ** 2).mean()))
+        rows.append(("gain_std_rel", min(rms, 10.0), response_u / n["gain"] ** 0.5, np.inf, "1"))
+    stack = observations.dark_stack
+    if n["noisy"] and stack is not None:
+        at = found.row[places["noisy"]], found.col[places["noisy"]]
+        std = float(np.sqrt(max(stack.var_map_dn2[at].mean() - np.median(stack.var_map_dn2), 0.0)))
+        dof = n["noisy"] * (stack.n_frames - 1.0)
+        add_e("noisy_std_e", std, std / np.sqrt(2 * dof), dof)
+    return rows
 
 
 def correct(params: Defects, signal: Signal, maps: Mapping[str, np.ndarray]) -> Signal:
@@ -153,6 +438,9 @@ def _of_singles(probe: Probe, phase: int, cases: list[tuple[float, np.ndarray]])
             moments += weight * np.nansum([moved**2, moved**4], axis=2)  # a target that is lost with its only pixel has no position
     return moments
 
+
+# what describes the single pixels that are drawn, and not those of a measured unit
+DRAWN = tuple(name for name in Defects.model_fields if not name.startswith(("column", "cluster", "listed")))
 
 SOURCE = Source(
     id="sensor.defects",
