@@ -1,10 +1,48 @@
-"""Kernels of the grabber: conversion of the analogue line to codes."""
+"""Kernels of the grabber: droop between two clamp pulses and its inverse, and conversion of the analogue line to codes."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from pixmetry.core.jit import jit
+
+
+@jit
+def droop(data, loss, half, carry, stride):
+    """Return y with y(t) = x(t) − s(t), s' = (x − s)/τ, in the middle of every pixel; float32 (n, rows, cols).
+
+    ``loss`` is 1 − e^(−T/τ) for a pixel of duration T, ``half`` 1 − e^(−T/2τ). At the first pixel of a row, s is the share ``carry`` of
+    what it was at the end of the row ``stride`` above; 0 in the first ones.
+    """
+    out = np.empty_like(data)
+    end = np.zeros(stride)
+    for i in range(data.shape[0]):
+        end[:] = 0.0
+        for r in range(data.shape[1]):
+            s = carry * end[r % stride]
+            for c in range(data.shape[2]):
+                above = np.float64(data[i, r, c]) - s
+                out[i, r, c] = above * (1.0 - half)
+                s += loss * above
+            end[r % stride] = s
+    return out
+
+
+@jit
+def undroop(data, loss, half, carry, stride):
+    """Return x of `droop` from y, from left to right and row by row."""
+    out = np.empty_like(data)
+    end = np.zeros(stride)
+    for i in range(data.shape[0]):
+        end[:] = 0.0
+        for r in range(data.shape[1]):
+            s = carry * end[r % stride]
+            for c in range(data.shape[2]):
+                above = np.float64(data[i, r, c]) / (1.0 - half)
+                out[i, r, c] = above + s
+                s += loss * above
+            end[r % stride] = s
+    return out
 
 
 @jit

@@ -11,7 +11,7 @@ from pixmetry.camera.line import alike_rows
 from pixmetry.camera.signal import Kind, Signal, Windows
 from pixmetry.camera.source import Parameters, Source, quantity
 from pixmetry.core.random import Stream
-from pixmetry.sources.grabber._clamp_kernels import droop, undroop
+from pixmetry.sources.grabber._kernels import droop, undroop
 
 NEAR_PX = 64
 NEAR_SHARE = 1e-3  # of a row's error, may come from rows above the near context
