@@ -18,9 +18,8 @@ from collections.abc import Callable
 import numpy as np
 from goals import verdict
 
-from pixmetry.camera.quiet import QuietStreams
 from pixmetry.camera.signal import Kind, Signal
-from pixmetry.core.random import Grid, Streams
+from pixmetry.core.random import Grid, QuietStreams, Streams
 from pixmetry.sources.sensor.charge_transfer import SOURCE, ChargeTransfer
 
 SIDE = 1024

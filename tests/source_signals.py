@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from pixmetry.camera.contribution import Probe
-from pixmetry.camera.quiet import QuietStreams
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.core.number import Estimates
-from pixmetry.core.random import Grid, Stream
+from pixmetry.core.random import Grid, QuietStreams, Stream
 
 ALPHA = 1e-6  # false-failure rate of every statistical test, for any seed
 Z = 4.8917  # two-sided normal quantile of ALPHA

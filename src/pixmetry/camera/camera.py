@@ -15,14 +15,13 @@ from pixmetry.camera.chain_order import Element, check_chain, in_order
 from pixmetry.camera.conversions import LOOK, SAMPLE, Link, linked, look
 from pixmetry.camera.frozen import Frozen, one_value, settled_state
 from pixmetry.camera.light import Light, Scene
-from pixmetry.camera.quiet import QuietStreams
 from pixmetry.camera.signal import Clock, Kind, Signal, Windows
 from pixmetry.camera.source import run
 from pixmetry.camera.unit_maps import MeasuredUnit, check_frame, check_maps, listing, maps_file, read_unit_maps, write_unit_maps
 from pixmetry.core.checksums import check_file
 from pixmetry.core.errors import ChainError, InputError
 from pixmetry.core.memory import check_memory
-from pixmetry.core.random import Grid, Streams
+from pixmetry.core.random import Grid, QuietStreams, Streams
 from pixmetry.core.threads import imap_tiles, map_tiles
 
 SCHEMA = "pixmetry/camera/1"

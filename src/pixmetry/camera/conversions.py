@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 
 from pixmetry.camera.line import Line
-from pixmetry.camera.quiet import QuietStreams
 from pixmetry.camera.signal import Kind, Signal, Windows
 from pixmetry.camera.source import Parameters, Source, run
-from pixmetry.core.random import Grid, Stream
+from pixmetry.core.random import Grid, QuietStreams, Stream
 
 
 @dataclass(frozen=True)
