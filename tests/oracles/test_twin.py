@@ -24,7 +24,7 @@ from pixmetry.emva.evaluate import standard_values
 from pixmetry.emva.records import Measurement
 from pixmetry.emva.reduction import measure_frames
 from pixmetry.files import load_campaign
-from pixmetry.files.frame_writer import FrameWriter
+from pixmetry.simulate.files import FrameWriter
 
 ROOT = Path(__file__).resolve().parents[2]
 PYTHON = ROOT / ".venv-oracles" / "bin" / "python"

@@ -16,10 +16,9 @@ from pixmetry.core.errors import InputError
 from pixmetry.core.memory import check_memory
 from pixmetry.core.progress import Progress, no_progress
 from pixmetry.files import InputHashes, provenance_record, staged_output, write_json
-from pixmetry.files.frame_writer import FORMATS, FrameWriter
-from pixmetry.files.truth import TruthWriter
 from pixmetry.scene.files import SceneModel, SeriesModel, background_of, build_scene, read_scene
 from pixmetry.scene.uniform import Uniform
+from pixmetry.simulate.files import FORMATS, FrameWriter, TruthWriter
 
 SERIES_SCHEMA = "pixmetry/campaign/1"
 Window = tuple[int, int, int, int]
