@@ -11,8 +11,7 @@ import pytest
 from pixmetry.camera.camera import Camera
 from pixmetry.core.errors import InputError
 from pixmetry.core.random import Grid
-from pixmetry.scene.files import build_scene, read_scene
-from pixmetry.scene.schema import KINDS
+from pixmetry.scene.files import KINDS, build_scene, read_scene
 
 PAGE = (Path(__file__).resolve().parents[2] / "docs" / "scenes.md").read_text()
 BLOCKS = re.findall(r"^```yaml\n(.*?)^```", PAGE, re.M | re.S)
