@@ -14,7 +14,6 @@ from pixmetry.core.errors import InputError
 from pixmetry.core.memory import check_memory
 from pixmetry.core.threads import imap_tiles
 from pixmetry.files.formats import FORMATS, Decoded, decode, frames_of, is_frame, raw_file, read_stacked
-from pixmetry.files.in_memory import frame_of
 from pixmetry.files.png import SIGNATURE, PlainPng
 from pixmetry.files.provenance import InputHashes
 from pixmetry.files.raw_values import RawLayout
@@ -169,6 +168,22 @@ def _checked(array: np.ndarray, path: Path) -> np.ndarray:
     return np.ascontiguousarray(array, native)
 
 
+def _frame_in_memory(campaign: Campaign, path: Path) -> np.ndarray:
+    """One frame of a campaign in memory, uint8 or uint16 as the campaign's frames are.
+
+    Raises
+    ------
+    InputError
+        If a value is negative or above 65535.
+    """
+    assert campaign.arrays is not None  # a campaign of files has none
+    frame = campaign.arrays[path.parent][int(path.name)]
+    low, high = int(frame.min()), int(frame.max())
+    if low < 0 or high > 65535:
+        raise InputError("values that no frame stores", where=str(path), value=f"{low} to {high}", allowed="0 to 65535")
+    return np.ascontiguousarray(frame, campaign.frame_dtype)
+
+
 def check_frame(array: np.ndarray, where: str, *, bits: int, shape: tuple[int, int] | None = None, dtype: str | None = None) -> None:
     """Refuse a frame that does not fit its campaign.
 
@@ -276,7 +291,7 @@ class FrameReader:
         """Read one frame in the calling thread, and take note of its digest; errors as in `iter_frames`."""
         c = self.campaign
         if c.arrays is not None:
-            array = frame_of(c, path)
+            array = _frame_in_memory(c, path)
             check_frame(array, str(path), bits=c.bits)
             self._coders.add(None)
             return array

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from pixmetry.core.errors import InputError
+from pixmetry.files.manifest import camera_facts, check_window, photons_of, role_of
 from pixmetry.files.records import Campaign, FrameGroup, OpticsFacts, check_groups
 
 NAME = "arrays in memory"
@@ -81,7 +82,6 @@ def campaign_of_arrays(groups: Iterable[Frames], *, optics: Mapping[str, Any] | 
     'my camera'
     """
     from pixmetry.core.config import validate
-    from pixmetry.files.manifest import camera_facts, check_window, photons_of, role_of
     from pixmetry.files.schema import CameraModel, GroupModel, OpticsModel
 
     facts = camera_facts(validate(CameraModel, {"name": NAME, **camera}, NAME))
@@ -123,19 +123,3 @@ def _checked(data: Any, where: str) -> np.ndarray | list[np.ndarray]:
     if not len(frames) or any(frame.size == 0 for frame in frames):
         raise InputError("no frames, or frames without pixels", where=where, remedy="leave them out")
     return frames
-
-
-def frame_of(campaign: Campaign, path: Path) -> np.ndarray:
-    """One frame of a campaign in memory, uint8 or uint16 as the campaign's frames are.
-
-    Raises
-    ------
-    InputError
-        If a value is negative or above 65535.
-    """
-    assert campaign.arrays is not None
-    frame = campaign.arrays[path.parent][int(path.name)]
-    low, high = int(frame.min()), int(frame.max())
-    if low < 0 or high > 65535:
-        raise InputError("values that no frame stores", where=str(path), value=f"{low} to {high}", allowed="0 to 65535")
-    return np.ascontiguousarray(frame, campaign.frame_dtype)
