@@ -21,7 +21,7 @@ from pixmetry.core.threads import imap_tiles
 from pixmetry.files import InputHashes, provenance_record, read_maps, staged_output, write_json
 from pixmetry.files.formats import is_frame
 from pixmetry.files.images import LoadedFrame, check_frame, load_frame, picture_files
-from pixmetry.files.raw_values import RawLayout, parse_raw
+from pixmetry.files.raw_values import RawLayout, layout_of
 
 NOT_THE_CAMERA = ("optics",)  # light and lens of the campaign are not those of the frames to correct
 
@@ -182,7 +182,7 @@ def _correct_files(
     from tifffile import imwrite
 
     bits, camera, maps = _load(results)
-    layout = parse_raw(raw) if isinstance(raw, str) else raw
+    layout = layout_of(raw)
     files = _named_once(picture_files(frames, raw=layout))
     hashes = InputHashes(files[0].parent)
     told = progress or no_progress

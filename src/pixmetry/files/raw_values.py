@@ -140,3 +140,8 @@ def parse_raw(text: str) -> RawLayout:
     if found is None:
         raise InputError("not a layout of raw values", value=text, allowed="WIDTHxHEIGHT:PIXELFORMAT, such as 1920x1200:Mono12p")
     return RawLayout(int(found[1]), int(found[2]), found[3], int(found[4] or 0))
+
+
+def layout_of(raw: str | RawLayout | None) -> RawLayout | None:
+    """The layout that an option ``raw`` means: one as it is, a text read by `parse_raw`, None where there is none."""
+    return parse_raw(raw) if isinstance(raw, str) else raw

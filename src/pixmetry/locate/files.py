@@ -15,7 +15,7 @@ from pixmetry.core.threads import imap_tiles
 from pixmetry.files.formats import frame_name, raw_file
 from pixmetry.files.images import PICTURE_ENDINGS, load_picture, picture_files
 from pixmetry.files.output import own_files
-from pixmetry.files.raw_values import RawLayout, parse_raw
+from pixmetry.files.raw_values import RawLayout, layout_of
 from pixmetry.files.staged_files import Output, check_files, write_together
 from pixmetry.locate.job import locate
 from pixmetry.locate.noise import NoiseModel, noise_model
@@ -59,7 +59,7 @@ def locate_files(
     """
     from pixmetry.locate.overlay import MARK, overlay_names, overlay_png
 
-    layout = parse_raw(raw) if isinstance(raw, str) else raw
+    layout = layout_of(raw)
     files = picture_files([frames_inside(path) for path in images], PICTURE_ENDINGS, layout)
     pictures = overlay_names(overlay, files)
     written = [Output(picture, MARK, True) for picture in pictures if picture is not None]
@@ -106,7 +106,7 @@ def frames_inside(path: str | Path) -> Path:
 
 def skipped_files(images: Sequence[str | Path], raw: RawLayout | str | None = None) -> list[str]:
     """Names of the files in the given folders that are taken for no images; ``raw`` as of `locate_files`."""
-    layout = parse_raw(raw) if isinstance(raw, str) else raw
+    layout = layout_of(raw)
     folders = [folder for folder in map(frames_inside, images) if folder.is_dir() and folder.suffix.lower() != ".zarr"]
     written = {folder / name for folder in folders for name in own_files(folder)}  # what `simulate` wrote beside its frames
     others = (p for folder in folders for p in sorted(folder.iterdir()) if p.suffix.lower() not in PICTURE_ENDINGS and p.is_file())

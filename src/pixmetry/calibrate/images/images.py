@@ -20,7 +20,7 @@ from pixmetry.core.progress import Progress, no_progress
 from pixmetry.core.threads import imap_tiles
 from pixmetry.files.formats import frame_name
 from pixmetry.files.images import PICTURE_ENDINGS, picture_files
-from pixmetry.files.raw_values import RawLayout, parse_raw
+from pixmetry.files.raw_values import RawLayout, layout_of
 from pixmetry.locate.noise import NoiseModel, noise_model
 
 LEAST_IMAGES = 3
@@ -158,7 +158,7 @@ def observations_of(
     if polarity not in ("auto", "bright", "dark"):
         raise InputError("no such polarity", where="polarity", value=polarity, allowed="auto, bright, dark")
     sides = (np.nan, np.nan) if side is None else (side / step[0], side / step[1])
-    layout = parse_raw(raw) if isinstance(raw, str) else raw
+    layout = layout_of(raw)
     wanted = Wanted(kind, size, sides, polarity, channel, noise_model(noise), threads, layout)
     items = _items(images, layout)
     told = progress or no_progress

@@ -10,7 +10,7 @@ from pixmetry.calibrate.project.tables import Table, inline_table, read_table
 from pixmetry.files.files import find_file, find_files
 from pixmetry.files.formats import is_frame
 from pixmetry.files.images import PICTURE_ENDINGS, picture_files
-from pixmetry.files.raw_values import parse_raw
+from pixmetry.files.raw_values import layout_of
 
 
 class Reader:
@@ -44,7 +44,7 @@ class Reader:
 
     def pictures(self, names: Sequence[str], raw: str | None = None) -> list[Path]:
         """Pictures by names, patterns and folders of files; ``raw`` is the layout of files without a header."""
-        layout = None if raw is None else parse_raw(raw)
+        layout = layout_of(raw)
         found: list[Path] = []
         for k, name in enumerate(names):
             where = self.where("pictures", "files", k)

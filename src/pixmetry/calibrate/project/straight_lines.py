@@ -78,12 +78,12 @@ def lines_of_pictures(
     """
     from pixmetry.files.formats import frame_name
     from pixmetry.files.images import read_picture
-    from pixmetry.files.raw_values import parse_raw
+    from pixmetry.files.raw_values import layout_of
     from pixmetry.locate.frame import checked_frame
     from pixmetry.locate.noise import noise_model
 
     told = progress or no_progress
-    noise, layout = noise_model(wanted.noise), None if wanted.raw is None else parse_raw(wanted.raw)
+    noise, layout = noise_model(wanted.noise), layout_of(wanted.raw)
     parts: list[LinePositions] = []
     findings, size = [], None
     for k, file in enumerate(files):
