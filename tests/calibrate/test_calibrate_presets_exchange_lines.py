@@ -25,8 +25,7 @@ from pixmetry.calibrate.bundle.model import CameraModel, Sensor
 from pixmetry.calibrate.exchange import model_of_colmap, read_opencv
 from pixmetry.calibrate.files.record import read_calibration, stored_cameras
 from pixmetry.calibrate.lines.plumb_line import LineCalibration
-from pixmetry.calibrate.page.lines_page import page_of
-from pixmetry.calibrate.page.lines_text import summary_text
+from pixmetry.calibrate.page.lines_page import page_of, summary_text
 from pixmetry.calibrate.project import load_project
 from pixmetry.calibrate.project.cameras import on_sensor, stored_grid
 from pixmetry.camera.camera import Camera, load_camera

@@ -151,7 +151,7 @@ def _summary(calibration: Any, report: Path) -> str:
     from pixmetry.calibrate.lines.plumb_line import LineCalibration
 
     if isinstance(calibration, LineCalibration):
-        from pixmetry.calibrate.page.lines_text import summary_text as lines_text
+        from pixmetry.calibrate.page.lines_page import summary_text as lines_text
 
         text = lines_text(calibration)
     else:
