@@ -14,9 +14,8 @@ from pixmetry import assess, load_camera
 from pixmetry.assess.page.page import page_of
 from pixmetry.calibrate.bundle.model import CameraModel, Sensor
 from pixmetry.calibrate.bundle.solve import Options, calibrate_network
-from pixmetry.calibrate.calibrated_camera import calibrated_geometry, with_pitch
+from pixmetry.calibrate.calibrated_camera import calibrated_geometry, geometry_of, with_pitch
 from pixmetry.calibrate.files.write import write_results
-from pixmetry.calibrate.geometry import geometry_of
 from pixmetry.camera.observations import LENS
 from pixmetry.cli import main
 from pixmetry.core.errors import InputError

@@ -10,8 +10,8 @@ import pytest
 
 from pixmetry.budget.job import compute_budget
 from pixmetry.calibrate.bundle.model import CameraModel, Sensor
-from pixmetry.calibrate.calibrated_camera import calibrated_camera
-from pixmetry.calibrate.geometry import geometry_of, systematic_rest
+from pixmetry.calibrate.calibrated_camera import calibrated_camera, geometry_of
+from pixmetry.calibrate.checks.residual_grid import systematic_rest
 from pixmetry.camera.camera import load_camera
 from pixmetry.camera.observations import AFFINITY, LENS, TAKEN_UP, Observations
 from pixmetry.core.errors import InputError, MeasureError

@@ -244,7 +244,7 @@ class CameraResiduals:
     noise_x_px, noise_y_px : float or None
         rms that the given covariances alone would leave, √(Σ r s² / n); None where they were a guess.
     systematic_x_px, systematic_y_px : float or None
-        What is left over besides (`pixmetry.calibrate.geometry.systematic_rest`).
+        What is left over besides (`pixmetry.calibrate.checks.residual_grid.systematic_rest`).
     """
 
     n: int

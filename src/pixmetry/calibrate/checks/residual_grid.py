@@ -2,7 +2,7 @@
 
 Two values at each node of a grid, bilinear in between, are fitted to the residuals by least squares with a penalty on second differences
 (P. H. C. Eilers, B. D. Marx, Statistical Science 11 (1996) 89–121). How much is smoothed, and whether there is anything to correct, is
-decided by images that were left out of the fit.
+decided by images that were left out of the fit. `systematic_rest` says in one number how much the residuals have in common by place.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ MOST_NODES = (33, 25)
 LEAST_POINTS = 400
 PENALTIES = (1.0, 10.0, 100.0, 1000.0, 1e4)  # in image points
 LEVEL = 0.01
+CELLS = (10, 8)  # of the frame, in which residuals have something in common or not
 
 
 def residual_grids(
@@ -166,3 +167,28 @@ def corrected(grid: ResidualGrid, x_px: np.ndarray, y_px: np.ndarray) -> tuple[n
     """
     dx, dy = at(grid, x_px, y_px)
     return np.asarray(x_px, float) - dx, np.asarray(y_px, float) - dy
+
+
+def systematic_rest(adjustment: Adjustment, index: int = 0) -> tuple[float, float]:
+    """What the residuals of a camera have in common at one place of the frame, in x and y, px: a standard deviation over the frame.
+
+    The component between cells of the frame in a one-way analysis of variance with random effects (Searle, Casella, McCulloch, Variance
+    Components, 1992, 3.6); 0 where the cells differ no more than noise makes them. Noise of single points is no error of the camera.
+    """
+    network = adjustment.network
+    sensor = network.cameras[index].sensor
+    own = adjustment.used & (network.camera_of[network.image] == index)
+    col = np.clip(network.x_px[own] / sensor.cols * CELLS[0], 0, CELLS[0] - 1).astype(int)
+    row = np.clip(network.y_px[own] / sensor.rows * CELLS[1], 0, CELLS[1] - 1).astype(int)
+    _, cell, counts = np.unique(row * CELLS[0] + col, return_inverse=True, return_counts=True)
+    n, cells = len(cell), len(counts)
+    if cells < 2 or n <= cells:
+        return 0.0, 0.0
+    per_cell = (n - (counts**2).sum() / n) / (cells - 1)
+    rest = []
+    for v in adjustment.residual_px[own].T:
+        means = np.bincount(cell, v) / counts
+        between = (counts * (means - v.mean()) ** 2).sum() / (cells - 1)
+        within = ((v - means[cell]) ** 2).sum() / (n - cells)
+        rest.append(float(np.sqrt(max(between - within, 0.0) / per_cell)))
+    return rest[0], rest[1]

@@ -13,8 +13,8 @@ from pixmetry.calibrate.checks import curves, quality
 from pixmetry.calibrate.checks.known_checks import Kind, KnownFaults, fixed_record
 from pixmetry.calibrate.checks.known_residuals import bar_residuals, control_residuals, group_record
 from pixmetry.calibrate.checks.patterns import patterns_without_bad_images
+from pixmetry.calibrate.checks.residual_grid import systematic_rest
 from pixmetry.calibrate.checks.snooping import Rejected, gross_error_records
-from pixmetry.calibrate.geometry import systematic_rest
 from pixmetry.calibrate.records import (
     BarRecord,
     CameraResiduals,
