@@ -20,6 +20,7 @@ from pixmetry.emva.page.content import (
     document,
     document_lines,
     dof_text,
+    facts,
     main_keys,
     main_rows,
     methods_of,
@@ -27,7 +28,6 @@ from pixmetry.emva.page.content import (
     number_of,
     symbol_parts,
 )
-from pixmetry.emva.page.facts import facts
 from pixmetry.emva.page.figures import MARGINS_IN, STRETCHES, fill, outline, time_of
 from pixmetry.emva.page.page import all_plots, page_of
 from pixmetry.emva.records import DataSheet, Results

@@ -7,7 +7,6 @@ from itertools import groupby
 from typing import TYPE_CHECKING
 
 from pixmetry.emva.page import content
-from pixmetry.emva.page.facts import facts
 from pixmetry.report import Answer, Column, Figure, Page, Points, Reading, Row, Run, Section, Table, Text
 from pixmetry.report.page import Inline
 from pixmetry.report.provenance import provenance_section
@@ -46,7 +45,7 @@ def page_of(sheet: DataSheet) -> Page:
     channels, methods = sheet.results, content.methods_of(sheet)
     plots = [(r, all_plots(r)) for r in channels]
     lead = f"{KIND}, {content.release_title(channels[0].release)}"
-    page = Page(str(sheet.camera.get("name", "Camera")), KIND, lead, facts(sheet), FOOTER)
+    page = Page(str(sheet.camera.get("name", "Camera")), KIND, lead, content.facts(sheet), FOOTER)
     page.sections.append(_summary(sheet, [_figure(p, k) for k, p in enumerate(summary_plots(channels, plots))]))
     values = page.add_section("All values", Text(VALUES, "small soft"), name="values")
     for r in channels:
@@ -139,16 +138,14 @@ def _origin(sheet: DataSheet) -> Section | None:
 
 def all_plots(results: Results) -> list[Plot]:
     """Every plot of one channel, those that cannot be drawn with the sentence in their place."""
-    from pixmetry.emva.page.dark_figures import dark_and_general_plots
-    from pixmetry.emva.page.series_figures import series_plots
-    from pixmetry.emva.page.spatial_figures import spatial_plots
+    from pixmetry.emva.page.plots import dark_and_general_plots, series_plots, spatial_plots
 
     return [*series_plots(results), *dark_and_general_plots(results), *spatial_plots(results)]
 
 
 def summary_plots(channels: Sequence[Results], plots: Sequence[tuple[Results, Sequence[Plot]]]) -> list[Plot]:
     """Photon transfer and signal-to-noise ratio for the first page: of a colour camera all channels in one plot."""
-    from pixmetry.emva.page.series_figures import snr_together, together
+    from pixmetry.emva.page.plots import snr_together, together
 
     if len(channels) == 1:
         return [p for p in plots[0][1] if p.draw is not None and p.title in ("Photon transfer", "Signal-to-noise ratio")]
