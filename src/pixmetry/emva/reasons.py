@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,6 +43,7 @@ ON_DARK_LEVELS = (
 )  # how they begin
 ON_DARK_VARIANCE = tuple(key for key in ON_DARK_LEVELS if key not in ("R", "LE"))
 IN_PHOTONS = ("QE", "u_p_min", "u_p_min_area", "u_p_sat", "u_p_sat_area", "general_u_p_min", "general_u_p_sat", "general_DSNU")
+NO_LIGHT = "neither photons nor exposure tell the light of the levels"
 
 
 @dataclass(frozen=True)
@@ -110,70 +112,133 @@ def breaks_the_split(key: str, case: Case) -> bool:
 
 def reason_for(key: str, case: Case) -> str:
     """What the reader should know about one value; empty where there is nothing to say."""
-    m, formulas, measured, squares, spread = case.m, case.formulas, case.measured, case.squares, case.spread
-    section, dark_s = KEYS[key].section, formulas.series.dark_exposure_s
-    if section in formulas.missing:
-        return formulas.missing[section]
-    if formulas.curved and key not in measured:
+    return next((said for rule in RULES if (said := rule(key, case)) is not None), "")
+
+
+def _lacking(key: str, case: Case) -> str | None:
+    """What the measurement does not carry."""
+    bright, formulas = case.m.transfer.bright, case.formulas
+    if KEYS[key].section in formulas.missing:
+        return formulas.missing[KEYS[key].section]
+    if formulas.curved and key not in case.measured:
         return CURVED
-    if key in IN_PHOTONS and m.transfer.bright.photons is None:
+    if key in IN_PHOTONS and bright.photons is None:
         return "the photons of the levels are not known"
     if key == "R" and light_of(formulas.series) is None:
-        return "neither photons nor exposure tell the light of the levels"
-    if key == "R" and m.transfer.bright.photons is None:
+        return NO_LIGHT
+    if key == "R" and bright.photons is None:
         return "per second of exposure: the photons of the levels are not known"
-    if key.endswith("_area") and m.pixel_area_um2 is None:
-        return "the pixel's area is not known"
-    value = float(measured[key]) if key in measured else math.nan
-    if case.noise.clipped and (is_bound(key) or key in DARK_PATTERN or section == "dark_current" or key.startswith(ON_DARK_LEVELS)):
-        return _clipped(key, case)
-    if section == "dark_current":
-        return _dark_current(key, formulas, value)
-    if breaks_the_split(key, case):
-        return _broken(key, case)
-    if key in squares and float(squares[key]) < 0:
-        return _negative(key, formulas, float(squares[key]))
-    if case.noise.below and (is_bound(key) or key.startswith("DR")):
-        return _hidden_noise(key, case)
-    if case.noise.hidden and key in DARK_PATTERN:
-        unlimited = formulas.curved and not key.endswith("_DN")
-        return _hidden_pattern("reference" if unlimited else formulas.release)
-    if section == "linearity" and math.isnan(value):
-        if light_of(formulas.series) is None:
-            return "neither photons nor exposure tell the light of the levels"
-        return "fewer than three levels between 5 and 95 % of saturation"
-    if key == "PTC_linearity" and math.isnan(value):
-        return "too few levels for a local slope"
-    if key in ("u_p_sat", "u_p_sat_area"):
-        return _step_of_levels(formulas, measured)
-    if key in squares and float(squares[key]) < ONE_SIDED_95 * spread.u_square[key]:
-        return "its square is not significantly above zero: hardly any pattern stands out of the temporal noise that is left"
-    if case.noise.hidden and key.startswith(ON_DARK_VARIANCE):
-        return (
-            f"the dark variance ({case.noise.var_dn2:.2g} DN²) is hidden by quantisation, which bends variance and mean of dark "
-            "levels: it may be off by more than u; raise the camera's gain"
-        )
-    if key.startswith(ON_DARK_LEVELS) and section != "spatial" and bool(without_dark(formulas.series.exposure_s, dark_s).any()):
-        return (
-            f"no dark level has the bright levels' exposure: that of {_nearest_text(formulas.series.exposure_s, dark_s)} stands for it "
-            "as it is, dark current and all, which u does not hold"
-        )
-    shift = spread.shift.get(key, 0.0)
-    if 2 * abs(shift) > spread.u.get(key, 0.0) > 0 and not key.startswith("index_"):
-        moved = f"{shift:+.2g}".replace("-", "−")
-        return f"noise alone moves it by {moved}: an extreme or absolute value of noisy levels; u holds that"
-    return ""
+    return "the pixel's area is not known" if key.endswith("_area") and case.m.pixel_area_um2 is None else None
 
 
-def _dark_current(key: str, formulas: Formulas, value: float) -> str:
+def _clipped(key: str, case: Case) -> str | None:
+    """Black is cut off: what the dark frames show is brighter and calmer than the camera is."""
+    touched = is_bound(key) or key in DARK_PATTERN or KEYS[key].section == "dark_current" or key.startswith(ON_DARK_LEVELS)
+    if not (case.noise.clipped and touched):
+        return None
+    what = f"{100 * case.noise.black:.3g} % of the dark pixels are at the lowest code"
+    if is_blind(key, case):
+        return f"{what}: noise and pattern below it are not seen; raise the offset"
+    return f"{what}: the dark mean is too high, dark noise and pattern are too small: off by more than u; raise the offset"
+
+
+def _dark_current(key: str, case: Case) -> str | None:
+    if KEYS[key].section != "dark_current":
+        return None
+    value = _measured(key, case)
     if math.isnan(value):
-        found = count_exposures(formulas.series.dark_exposure_s)
+        found = count_exposures(case.formulas.series.dark_exposure_s)
         return f"dark levels of three or more exposures are needed (found: {found})"
     if value < 0 and key.startswith("u_I_var"):
         return f"the dark variance falls with exposure, slope {value:.3g}, within its noise or by drift; 95 % upper limit".replace("-", "−")
-    if value < 0:
-        return "the dark mean falls with exposure: a clamp that follows the dark current, or drift"
-    return ""
+    return "the dark mean falls with exposure: a clamp that follows the dark current, or drift" if value < 0 else ""
+
+
+def _below_zero(key: str, case: Case) -> str | None:
+    if breaks_the_split(key, case):
+        return _broken(key, case)
+    return _negative(key, case.formulas, float(case.squares[key])) if key in case.squares and float(case.squares[key]) < 0 else None
+
+
+def _hidden_by_quantisation(key: str, case: Case) -> str | None:
+    if case.noise.below and (is_bound(key) or key.startswith("DR")):
+        return _hidden_noise(key, case)
+    if case.noise.hidden and key in DARK_PATTERN:
+        unlimited = case.formulas.curved and not key.endswith("_DN")
+        return _hidden_pattern("reference" if unlimited else case.formulas.release)
+    return None
+
+
+def _too_few_levels(key: str, case: Case) -> str | None:
+    if not math.isnan(_measured(key, case)):
+        return None
+    if KEYS[key].section == "linearity":
+        few = "fewer than three levels between 5 and 95 % of saturation"
+        return NO_LIGHT if light_of(case.formulas.series) is None else few
+    return "too few levels for a local slope" if key == "PTC_linearity" else None
+
+
+def _step_of_levels(key: str, case: Case) -> str | None:
+    if key not in ("u_p_sat", "u_p_sat_area"):
+        return None
+    photons, at = case.formulas.series.photons, int(case.measured["index_u_ysat"])
+    if photons is None or at + 1 >= photons.size:
+        return "the last level of the series"
+    step = float(f"{photons[at + 1] - photons[at]:.4g}")
+    return f"a level of the series; the next is {step:.10g} photons brighter, which u does not hold"
+
+
+def _insignificant(key: str, case: Case) -> str | None:
+    if key not in case.squares or not float(case.squares[key]) < ONE_SIDED_95 * case.spread.u_square[key]:
+        return None
+    return "its square is not significantly above zero: hardly any pattern stands out of the temporal noise that is left"
+
+
+def _bent_by_quantisation(key: str, case: Case) -> str | None:
+    if not (case.noise.hidden and key.startswith(ON_DARK_VARIANCE)):
+        return None
+    return (
+        f"the dark variance ({case.noise.var_dn2:.2g} DN²) is hidden by quantisation, which bends variance and mean of dark "
+        "levels: it may be off by more than u; raise the camera's gain"
+    )
+
+
+def _without_own_dark_level(key: str, case: Case) -> str | None:
+    bright_s, dark_s = case.formulas.series.exposure_s, case.formulas.series.dark_exposure_s
+    if not key.startswith(ON_DARK_LEVELS) or KEYS[key].section == "spatial" or not without_dark(bright_s, dark_s).any():
+        return None
+    return (
+        f"no dark level has the bright levels' exposure: that of {_nearest_text(bright_s, dark_s)} stands for it "
+        "as it is, dark current and all, which u does not hold"
+    )
+
+
+def _moved_by_noise(key: str, case: Case) -> str | None:
+    shift = case.spread.shift.get(key, 0.0)
+    if key.startswith("index_") or not 2 * abs(shift) > case.spread.u.get(key, 0.0) > 0:
+        return None
+    moved = f"{shift:+.2g}".replace("-", "−")
+    return f"noise alone moves it by {moved}: an extreme or absolute value of noisy levels; u holds that"
+
+
+# In this order: the first that says anything is the reason, also where it says that there is none ("").
+RULES: tuple[Callable[[str, Case], str | None], ...] = (
+    _lacking,
+    _clipped,
+    _dark_current,
+    _below_zero,
+    _hidden_by_quantisation,
+    _too_few_levels,
+    _step_of_levels,
+    _insignificant,
+    _bent_by_quantisation,
+    _without_own_dark_level,
+    _moved_by_noise,
+)
+
+
+def _measured(key: str, case: Case) -> float:
+    return float(case.measured[key]) if key in case.measured else math.nan
 
 
 def _negative(key: str, formulas: Formulas, square: float) -> str:
@@ -224,14 +289,6 @@ def _light_dn(case: Case) -> float:
     return float(case.formulas.stacks[1].vector[0] - case.formulas.stacks[0].vector[0])
 
 
-def _clipped(key: str, case: Case) -> str:
-    """Black is cut off: what the dark frames show is brighter and calmer than the camera is."""
-    what = f"{100 * case.noise.black:.3g} % of the dark pixels are at the lowest code"
-    if is_blind(key, case):
-        return f"{what}: noise and pattern below it are not seen; raise the offset"
-    return f"{what}: the dark mean is too high, dark noise and pattern are too small: off by more than u; raise the offset"
-
-
 def _hidden_noise(key: str, case: Case) -> str:
     if case.formulas.release == "reference":
         return "the dark variance lies below 0.24 DN², where quantisation covers it; computed with 0.24 DN²"
@@ -250,15 +307,6 @@ def _hidden_pattern(release: str) -> str:
 def _nearest_text(bright_s: np.ndarray, dark_s: np.ndarray) -> str:
     at = int(np.argmax(without_dark(bright_s, dark_s)))
     return f"{dark_s[np.abs(dark_s - bright_s[at]).argmin()]:.4g} s beside {bright_s[at]:.4g} s"
-
-
-def _step_of_levels(formulas: Formulas, measured: Values) -> str:
-    photons = formulas.series.photons
-    at = int(measured["index_u_ysat"])
-    if photons is None or at + 1 >= photons.size:
-        return "the last level of the series"
-    step = float(f"{photons[at + 1] - photons[at]:.4g}")
-    return f"a level of the series; the next is {step:.10g} photons brighter, which u does not hold"
 
 
 def ends_early(formulas: Formulas, measured: Values) -> bool:
