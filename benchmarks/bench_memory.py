@@ -45,7 +45,7 @@ from dataclasses import replace
 sys.path.insert(0, sys.argv[1])
 from bench_presets import scene_of
 from bench_detection import Element, camera, get_source
-from pixmetry.core.camera import load_camera
+from pixmetry.camera.camera import load_camera
 side, frames, name = int(sys.argv[2]), int(sys.argv[3]), sys.argv[4]
 if name == "optics":
     made = camera((side, side))

@@ -23,7 +23,7 @@ import sys, time
 from dataclasses import replace
 sys.path.insert(0, sys.argv[1])
 from bench_presets import scene_of
-from pixmetry.core.camera import load_camera
+from pixmetry.camera.camera import load_camera
 name, small, timed = sys.argv[2], sys.argv[3] == "small", sys.argv[4] == "timed"
 camera = load_camera(name)
 if small:

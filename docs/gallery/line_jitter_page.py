@@ -132,7 +132,7 @@ def _test_table() -> str:
     rows = []
     for level in stored().levels:
         test = level.f_test
-        p = [_p(test[f"p_{unit}"][kind]) for unit in ("px", "um") for kind in ("positions", "effective", "lines")]
+        p = [_p(getattr(test, f"p_{unit}")[kind]) for unit in ("px", "um") for kind in ("positions", "effective", "lines")]
         rows.append([f"{level.jitter_ns:g}", fixed(test.ratio_px2, 3), *p[:3], fixed(test.ratio_um2, 3), *p[3:]])
     kinds = ["p, positions", "p, effective", "p, lines"]
     return table(["jitter / ns", "ratio in px²", *kinds, "ratio in µm²", *kinds], rows)

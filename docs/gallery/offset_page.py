@@ -19,7 +19,7 @@ from gallery.offset import (
     swing,
 )
 from gallery.page import Page, show, table
-from pixmetry.locate.bound.bound import line_read
+from pixmetry.locate.bound.closed_bounds import line_read
 from pixmetry.report.drawing import AMBER, BLUE, INK, RED, SOFT, canvas
 from pixmetry.report.numbers import MINUS, fixed
 from pixmetry.report.page import Figure

@@ -116,11 +116,11 @@ def test_residuals_grow_as_the_averaged_rows_shake(run) -> None:
 
 def test_f_test_is_one_sided_and_states_what_it_takes_for_independent(run) -> None:
     none, one = run.levels[0].f_test, run.levels[1].f_test
-    assert none["side"] == "x above y" and none["critical_95"]["lines"] == pytest.approx(1.2515, abs=0.001)
-    assert none["p_px"]["lines"] > 0.05 and one["p_px"]["lines"] < 1e-6 and one["p_um"]["lines"] < 1e-6
-    assert none["ratio_um2"] / none["ratio_px2"] == pytest.approx((8.6 / 8.3) ** 2, rel=0.01)
+    assert none.side == "x above y" and none.critical_95["lines"] == pytest.approx(1.2515, abs=0.001)
+    assert none.p_px["lines"] > 0.05 and one.p_px["lines"] < 1e-6 and one.p_um["lines"] < 1e-6
+    assert none.ratio_um2 / none.ratio_px2 == pytest.approx((8.6 / 8.3) ** 2, rel=0.01)
     for level in run.levels:
-        d = level.f_test["dof"]
+        d = level.f_test.dof
         assert d["lines"] == (216.0, 216.0)
         assert all(216 < effective <= every < 17_280 for effective, every in zip(d["effective"], d["positions"], strict=True))
 
