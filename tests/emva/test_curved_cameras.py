@@ -20,8 +20,7 @@ from emva.cameras import Camera
 from emva.scoring import measured
 from pixmetry.emva.evaluate import evaluate
 from pixmetry.emva.files.keys import KEYS
-from pixmetry.emva.general.curved import REASON, is_curved
-from pixmetry.emva.linear_model import CURVED, linear_model
+from pixmetry.emva.linear_model import CURVED, REASON, is_curved, linear_model
 from pixmetry.emva.records import RELEASES, Results
 from pixmetry.emva.series import series_of
 

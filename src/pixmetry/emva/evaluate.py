@@ -15,10 +15,9 @@ from pixmetry.emva.curves import dark_signal, spatial_curves, temporal_curves
 from pixmetry.emva.dark_noise import DarkNoise, pattern_limit_dn2
 from pixmetry.emva.files.keys import KEYS, goes_with_photons
 from pixmetry.emva.formulas import DARK_VARIANCE, Formulas, Spread, Values, keys_of
-from pixmetry.emva.general.curved import level_free_values
 from pixmetry.emva.general.general import general_curve
 from pixmetry.emva.general.nonlinear import nonlinear_values
-from pixmetry.emva.linear_model import departure_bounds, linear_model
+from pixmetry.emva.linear_model import departure_bounds, level_free_values, linear_model
 from pixmetry.emva.lower_limits import with_lower_limits
 from pixmetry.emva.partial import partial_results
 from pixmetry.emva.reasons import DARK_PATTERN, Case, breaks_the_split, is_blind, is_bound, lifted, notes_of, reason_for

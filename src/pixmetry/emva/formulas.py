@@ -8,8 +8,8 @@ import numpy as np
 
 from pixmetry.core.errors import MeasureError, PixmetryError
 from pixmetry.emva.files.keys import KEYS, OVER_TEMPERATURES
-from pixmetry.emva.general.curved import is_curved, is_level_free, level_free_values
 from pixmetry.emva.general.general import general_evaluation
+from pixmetry.emva.linear_model import is_curved, is_level_free, level_free_values
 from pixmetry.emva.records import Measurement, Series
 from pixmetry.emva.series import light_of, series_of
 from pixmetry.emva.spatial.spatial import snr_total_max, spatial_evaluation

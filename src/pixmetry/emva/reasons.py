@@ -12,9 +12,9 @@ from pixmetry.core.number import ONE_SIDED_95, Number
 from pixmetry.emva.dark_noise import DarkNoise
 from pixmetry.emva.files.keys import EQUAL_EXPOSURE, KEYS, PTC_LIMIT_PERCENT, SATURATED_FRACTION, key_of
 from pixmetry.emva.formulas import Formulas, Spread, Values
-from pixmetry.emva.general.curved import REASON as CURVED
 from pixmetry.emva.general.general import general_curve, general_notes
 from pixmetry.emva.linear_model import FAILS
+from pixmetry.emva.linear_model import REASON as CURVED
 from pixmetry.emva.records import Measurement, Series
 from pixmetry.emva.series import MINIMUM_EXPOSURES, count_exposures, exposure_varies, light_of, without_dark
 from pixmetry.emva.temporal import dark_line

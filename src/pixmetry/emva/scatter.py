@@ -20,8 +20,8 @@ import numpy as np
 
 from pixmetry.camera.observations import LevelMoments
 from pixmetry.core.errors import MeasureError
-from pixmetry.emva.general.curved import following, is_curved
 from pixmetry.emva.general.response import ScatterFit, fit_scatter
+from pixmetry.emva.linear_model import following, is_curved
 from pixmetry.emva.records import Measurement, Series
 from pixmetry.emva.series import (
     MINIMUM_EXPOSURES,

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from math import floor, isfinite
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,11 +17,6 @@ from pixmetry.report.numbers import NO_BREAK, NONE, PrintedNumber, decimals_of, 
 if TYPE_CHECKING:
     from pixmetry.core.number import Number
     from pixmetry.emva.records import DataSheet, Results
-from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from pixmetry.emva.records import DataSheet
 
 HEADLINE = ("QE", "sigma_d", "u_e_sat", "DR_dB")
 GENERAL_HEADLINE = ("general_u_p_min", "general_u_p_sat", "general_SNR_max_dB", "general_DR_dB")
