@@ -21,6 +21,7 @@ from pixmetry.calibrate.page.figures import (
     MOST_VECTORS,
     Residuals,
     arrows,
+    bin_means,
     cell_means,
     chain,
     draw_vectors,
@@ -28,9 +29,9 @@ from pixmetry.calibrate.page.figures import (
     even_choice,
     image_order,
     round_number,
+    short,
 )
 from pixmetry.calibrate.page.page import page_of, write_page
-from pixmetry.calibrate.page.plots import bin_means, short
 from pixmetry.calibrate.page.space import ellipse, field_map, largest_axis, plan_views, pyramids, seen_from, shown_points
 from pixmetry.calibrate.page.tables import control_points, gross_errors, images, network_facts, parameters, scale_bars
 from pixmetry.calibrate.page.text import as_given, p_text, projection_levels, sentence, summary_text, typeset, worth

@@ -1,4 +1,5 @@
-"""Residual vectors of one calibrated camera over its sensor, and what the figures of a calibration share."""
+"""Figures of one calibrated camera: residual vectors and what residuals hang on, distortion curves, correlations, projection
+uncertainty; and what the figures of a calibration share."""
 
 from __future__ import annotations
 
@@ -8,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pixmetry.report.drawing import BLUE, INK, SOFT, WIDTH_IN, canvas
-from pixmetry.report.numbers import significant
+from pixmetry.report.drawing import BLUE, INK, RED, SOFT, WIDTH_IN, canvas, plain_log
+from pixmetry.report.numbers import MINUS, significant, uncertain
 from pixmetry.report.page import Figure
 
 if TYPE_CHECKING:
@@ -18,13 +19,17 @@ if TYPE_CHECKING:
 
     from pixmetry.calibrate.bundle.model import Sensor
     from pixmetry.calibrate.bundle.network import Adjustment
-    from pixmetry.calibrate.records import ResidualGrid
+    from pixmetry.calibrate.records import DistortionCurves, ImageRecord, ProjectionMap, ResidualGrid
 
 MOST_VECTORS = 3000  # in a figure, from which on they are stored as pixels
 SHEET_COLS, SHEET_ROWS = 3, 4  # images on a sheet of small ones
 MOST_IN_SMALL = MOST_VECTORS // (SHEET_COLS * SHEET_ROWS)  # vectors in one small image
 LEAST_IN_CELL = 4
 KEY_IN = 0.12  # of the middle of the key above the axes
+COVER_95 = 1.96
+WIDE_RANGE = 6.0  # of a map, from which its colours are logarithmic
+MOST_DOTS = 20_000  # in a scatter of residuals
+DARK_TEXT, LIGHT_TEXT = "#101010", "#fefefe"  # on coloured cells, which do not change with the page's theme
 
 
 @dataclass(frozen=True)
@@ -228,3 +233,194 @@ def residual_sheet(r: Residuals, images: Sequence[int], titles: Sequence[str], s
         axes.plot(x, y, color=BLUE, linewidth=0.6)
         length_key(axes, factor, key)
         return Figure(figure, name, f"Residual vectors of {len(images)} images", "")
+
+
+@dataclass(frozen=True)
+class Bins:
+    """Mean and its standard uncertainty in each bin."""
+
+    at: np.ndarray
+    mean: np.ndarray
+    u: np.ndarray
+
+
+def bin_means(at: np.ndarray, value: np.ndarray, edges: np.ndarray) -> Bins:
+    """Means between edges, where there are at least `LEAST_IN_CELL` values."""
+    index = np.clip(np.searchsorted(edges, at, side="right") - 1, 0, len(edges) - 2)
+    n = np.bincount(index, minlength=len(edges) - 1)
+    kept = n >= LEAST_IN_CELL
+    n = np.maximum(n, 1)
+    mean, place = (np.bincount(index, v, len(edges) - 1) / n for v in (value, at))
+    scatter = np.sqrt(np.bincount(index, (value - mean[index]) ** 2, len(edges) - 1) / np.maximum(n - 1, 1) / n)
+    return Bins(place[kept], mean[kept], scatter[kept])
+
+
+def _scatter(axes: Axes, at: np.ndarray, value: np.ndarray) -> None:
+    """Dots, of very many an even choice, with the ordinate so that single far ones do not press the others together."""
+    many, shown = len(at) > MOST_VECTORS, even_choice(np.arange(len(at)), MOST_DOTS)
+    axes.plot(at[shown], value[shown], ".", color=SOFT, markersize=1.2 if many else 1.8, alpha=0.5, markeredgewidth=0, rasterized=many)
+    span = float(np.percentile(np.abs(value), 99)) if len(value) else 1.0
+    axes.set_ylim(-1.35 * max(span, 1e-9), 1.35 * max(span, 1e-9))
+
+
+def _bars(axes: Axes, bins: Bins, colour: str, marker: str, label: str) -> None:
+    style: dict[str, Any] = {"color": colour, "marker": marker, "elinewidth": 0.8, "linewidth": 0.9}
+    axes.errorbar(bins.at, bins.mean, yerr=2 * bins.u, label=label, zorder=3, **style)
+
+
+def against_radius(r: Residuals, centre: tuple[float, float], name: str) -> Figure:
+    """Radial and tangential part of the residuals against the distance from the principal point."""
+    x, y = r.x - centre[0], r.y - centre[1]
+    radius = np.maximum(np.hypot(x, y), 1e-9)
+    radial, tangential = (r.dx * x + r.dy * y) / radius, (r.dy * x - r.dx * y) / radius
+    edges = np.unique(np.quantile(radius, np.linspace(0, 1, int(np.clip(len(r) // 30, 3, 12)) + 1)))
+    with canvas(2.4) as (figure, axes):
+        _scatter(axes, radius, radial)
+        axes.axhline(0, color=SOFT, linewidth=0.6)
+        _bars(axes, bin_means(radius, radial, edges), BLUE, "o", "radial, mean ± 2 u")
+        _bars(axes, bin_means(radius, tangential, edges), RED, "s", "tangential, mean ± 2 u")
+        axes.set_xlabel("distance from the principal point / px")
+        axes.set_ylabel("residual / px")
+        figure.legend(loc="outside upper center", ncols=2)
+        caption = "Residuals against the radius: dots are radial parts. A mean that swings with the radius asks for another lens term."
+        return Figure(figure, f"{name}-radius", "Radial and tangential residuals against the radius", caption)
+
+
+def against_phase(r: Residuals, name: str) -> Figure:
+    """Residuals of x and of y against the sub-pixel phase of that coordinate."""
+    edges = np.linspace(-0.5, 0.5, 11)
+    with canvas(2.4, ncols=2, sharey=True) as (figure, both):
+        for axes, axis, at, value in zip(both, "xy", (r.x, r.y), (r.dx, r.dy), strict=True):
+            phase = (at - value + 0.5) % 1.0 - 0.5  # of the computed place: the measured one holds the noise that is looked at
+            _scatter(axes, phase, value)
+            axes.axhline(0, color=SOFT, linewidth=0.6)
+            _bars(axes, bin_means(phase, value, edges), BLUE, "o", "mean ± 2 u")
+            axes.set_xlabel(f"phase of {axis} / px")
+            axes.set_xlim(-0.5, 0.5)
+            axes.set_xticks([-0.4, 0.0, 0.4])
+        both[0].set_ylabel("residual / px")
+        caption = "Residuals of x (left) and y (right) against the sub-pixel phase. A swing comes from too small or clipped targets."
+        return Figure(figure, f"{name}-phase", "Residuals in x and y against the sub-pixel phase", caption)
+
+
+def short(r: float) -> str:
+    """A correlation to two places, without the zero before the point."""
+    return f"{r:.2f}".replace("0.", ".").replace("-", MINUS)
+
+
+def correlation_map(names: Sequence[str], matrix: np.ndarray, name: str) -> Figure:
+    """Correlations of the interior parameters, with their numbers."""
+    matrix = np.asarray(matrix, float)
+    n = len(names)
+    labels = [label.upper() if label[0] in "bpk" else label for label in names]
+    with canvas(0.95 * WIDTH_IN) as (figure, axes):
+        axes.imshow(matrix, cmap="RdBu_r", vmin=-1, vmax=1, interpolation="none")
+        axes.grid(False)
+        axes.tick_params(length=0)
+        axes.set_xticks(range(n), labels)
+        axes.set_yticks(range(n), labels)
+        axes.xaxis.tick_top()
+        for i, j in zip(*np.nonzero(np.abs(matrix) >= 0.005), strict=True):
+            if i != j:
+                colour = LIGHT_TEXT if abs(matrix[i, j]) > 0.6 else DARK_TEXT
+                axes.text(j, i, short(matrix[i, j]), color=colour, fontsize=5.4, ha="center", va="center")
+        caption = "Correlations of the interior parameters: red positive, blue negative. What correlates strongly is only known together."
+        return Figure(figure, f"{name}-correlations", f"Correlation matrix of {n} interior parameters", caption)
+
+
+def curve_pictures(curves: DistortionCurves, direction: str, name: str) -> list[Figure]:
+    """Radial, balanced and tangential distortion with their 95 % bands; ``direction`` as of a `CameraModel`."""
+    what = "correction" if direction == "image_to_object" else "distortion"
+    unit, radius = curves.unit, curves.radius
+    scaled = 1000.0 if unit == "mm" else 1.0
+    shown = "µm" if unit == "mm" else unit
+    made = []
+    forms = (("radial", curves.radial_curve, BLUE, "-"), ("balanced", curves.balanced_curve, RED, "--"))
+    for kind, members in (("radial", forms), ("tangential", (("tangential", curves.tangential_curve, BLUE, "-"),))):
+        parts = [(key, curve, colour, dash) for key, curve, colour, dash in members if curve is not None]
+        if not parts:
+            continue
+        with canvas(2.4) as (figure, axes):
+            axes.axhline(0, color=SOFT, linewidth=0.6)
+            for key, curve, colour, dash in parts:
+                value = scaled * curve.value
+                if curve.u is not None:
+                    half = COVER_95 * scaled * curve.u
+                    axes.fill_between(radius, value - half, value + half, color=colour, alpha=0.25, linewidth=0)
+                axes.plot(radius, value, dash, color=colour, label=key)
+            axes.set_xlabel(f"distance from the principal point / {unit}")
+            axes.set_ylabel(f"{what} / {shown}")
+            if len(parts) > 1:
+                axes.legend(loc="best")
+            made.append(Figure(figure, f"{name}-{kind}", f"{kind} {what} against the radius", _curve_caption(kind, what, curves)))
+    return made
+
+
+def _curve_caption(kind: str, what: str, curves: DistortionCurves) -> str:
+    """What is drawn, and its size at the largest radius with the 95 % band."""
+    unit, scaled = curves.unit, 1000.0 if curves.unit == "mm" else 1.0
+    curve = curves.tangential_curve if kind == "tangential" else curves.radial_curve
+    text = f"Tangential (decentring) {what}, √(P1² + P2²) r²" if kind == "tangential" else f"Radial {what} of the radius"
+    text += ", with its 95 % band"
+    if curve is not None and curve.u is not None:
+        r, value, u = (float(part[-1]) for part in (curves.radius, curve.value, curve.u))
+        number = uncertain(scaled * value, COVER_95 * scaled * u, "um" if unit == "mm" else unit)
+        text += f": {number.value} ± {number.u} {number.unit} at {significant(r)} {unit}"
+        if unit == "mm" and curve.value_px is not None and curve.u_px is not None:
+            px = uncertain(float(curve.value_px[-1]), COVER_95 * float(curve.u_px[-1]), "px")
+            text += f" ({px.value} ± {px.u} px)"
+    if kind == "radial" and curves.balanced is not None and curves.balanced_c is not None:
+        text += f". Balanced: the same lens with a principal distance of {significant(curves.balanced_c, 5)} {unit}"
+    return text + "."
+
+
+def projection_map(p: ProjectionMap, sensor: Sensor, name: str) -> Figure:
+    """Standard uncertainty of a projected direction over the sensor."""
+    u, x, y = p.u_px, p.x_px, p.y_px
+    half_x, half_y = (float(np.ptp(v)) / max(len(v) - 1, 1) / 2 for v in (x, y))
+    extent = (x.min() - half_x, x.max() + half_x, y.max() + half_y, y.min() - half_y)
+    wide = float(np.nanmax(u)) > WIDE_RANGE * float(np.nanmin(u)) > 0
+    with canvas(frame_height(sensor, 1.15) - 0.2) as (figure, axes):
+        image = axes.imshow(1000 * u, cmap="cividis", extent=extent, interpolation="none", norm="log" if wide else "linear")
+        axes.grid(False)
+        axes.set_xlabel("x / px")
+        axes.set_ylabel("y / px")
+        bar = colour_bar(figure, axes, image, "u / 10⁻³ px")
+        if wide:
+            plain_log(bar.yaxis)
+        caption = (
+            "Projection uncertainty: standard uncertainty of an image coordinate (mean of x and y) with which the calibration tells "
+            "where a direction is imaged; what a rotation of the camera would take up is fitted out. Where no image point lay, it is "
+            "extrapolated by the model."
+        )
+        alt = f"Projection uncertainty over the sensor, {significant(float(np.nanmin(u)), 2)} to {significant(float(np.nanmax(u)), 2)} px"
+        return Figure(figure, f"{name}-projection", alt, caption)
+
+
+def by_image(records: Sequence[ImageRecord], name: str) -> Figure:
+    """Residuals image by image in the order of time, and the x-scale where it was estimated."""
+    timed = all(r.time_s is not None for r in records)
+    at = np.array([r.time_s for r in records], float) if timed else np.arange(1, len(records) + 1, dtype=float)
+    factor, label = (1.0, "image") if not timed else (1 / 60, "time / min") if np.ptp(at) > 300 else (1.0, "time / s")
+    scale = np.array([r.x_scale for r in records], float)
+    scaled = bool(np.isfinite(scale).any())
+    with canvas(3.4 if scaled else 2.2, nrows=1 + scaled, sharex=True, squeeze=False) as (figure, grid):
+        top, size = grid[0, 0], 3.0 if len(records) < 80 else 1.5
+        rms_px = np.array([(r.rms_x_px, r.rms_y_px) for r in records], float)
+        for axis, rms, colour, marker in zip("xy", rms_px.T, (BLUE, RED), "os", strict=True):
+            top.plot(factor * at, rms, marker, color=colour, linestyle="none", markersize=size, label=f"{axis}, rms")
+        top.set_ylim(0, 1.15 * top.get_ylim()[1])
+        top.set_ylabel("residuals / px")
+        if scaled:
+            u = np.array([r.u_x_scale for r in records], float)
+            low = grid[1, 0]
+            low.axhline(0, color=SOFT, linewidth=0.6)
+            low.errorbar(factor * at, 1e6 * scale, yerr=2e6 * u, fmt="o", color=INK, markersize=size, elinewidth=0.24 * size)
+            low.set_ylabel("x-scale / 10⁻⁶")
+        grid[-1, 0].set_xlabel(label)
+        grid[-1, 0].xaxis.get_major_locator().set_params(integer=not timed)
+        figure.legend(*top.get_legend_handles_labels(), loc="outside upper center", ncols=2)
+        caption = "Residuals of each image in the order " + ("of time." if timed else "of the project.")
+        if scaled:
+            caption += " Below: the x-scale of each image against their mean, ± 2 u; a drift is a clock that warms up."
+        return Figure(figure, f"{name}-time", f"Residual rms of {len(records)} images in order", caption)

@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pixmetry.calibrate.bundle.model import NAMES
-from pixmetry.calibrate.page.figures import enlargement, frame, frame_height, length_key
+from pixmetry.calibrate.page.figures import correlation_map, curve_pictures, enlargement, frame, frame_height, length_key
 from pixmetry.calibrate.page.page import FOOTER, camera_facts, number_table, typeset_findings
-from pixmetry.calibrate.page.plots import correlation_map, curve_pictures
 from pixmetry.calibrate.page.text import DIRECTIONS, TITLES, folded, length, p_text, sentence, symbol, typeset
 from pixmetry.report import Answer, Figure, Page, Reading, Section, Text, html_of
 from pixmetry.report.drawing import BLUE, RED, SOFT, canvas

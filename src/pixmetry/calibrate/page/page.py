@@ -370,32 +370,31 @@ def camera_facts(model: Any) -> str:
 
 def _pictures(calibration: Calibration, k: int) -> dict[str, Any]:
     """Figures of one camera, by the part of the page where they stand."""
-    from pixmetry.calibrate.page import figures as over
-    from pixmetry.calibrate.page import plots
+    from pixmetry.calibrate.page import figures
 
     adjustment, tests = calibration.adjustment, calibration.tests
     model, name = adjustment.camera(k), f"c{k + 1}"
-    r = over.Residuals.of(adjustment, k)
+    r = figures.Residuals.of(adjustment, k)
     out: dict[str, Any] = {"matrix": [], "lens": [], "sensor": [], "plots": [], "worst": [], "sheets": [], "undrawn": 0}
     correlations = of_camera(tests.correlations, model.name)
     if correlations is not None and len(correlations.names) > 1:
-        out["matrix"] = [plots.correlation_map(correlations.names, correlations.matrix, name)]
+        out["matrix"] = [figures.correlation_map(correlations.names, correlations.matrix, name)]
     curves, projection = of_camera(tests.curves, model.name), of_camera(tests.projection, model.name)
-    out["lens"] = plots.curve_pictures(_bent(curves, model), model.direction, name) if curves is not None else []
+    out["lens"] = figures.curve_pictures(_bent(curves, model), model.direction, name) if curves is not None else []
     if projection is not None and np.nanmax(projection.u_px, initial=0.0) > 0:
-        out["lens"].append(plots.projection_map(projection, model.sensor, name))
+        out["lens"].append(figures.projection_map(projection, model.sensor, name))
     if len(r):
-        out["sensor"] = [over.residual_vectors(r, name), over.mean_vectors(r, name)]
-        out["plots"] = [plots.against_radius(r, (model["xp"], model["yp"]), name), plots.against_phase(r, name)]
+        out["sensor"] = [figures.residual_vectors(r, name), figures.mean_vectors(r, name)]
+        out["plots"] = [figures.against_radius(r, (model["xp"], model["yp"]), name), figures.against_phase(r, name)]
         out |= _sheets(calibration, r, name)
     grid = of_camera(tests.residual_grid, model.name) or calibration.grids.get(model.name)
     if grid is not None:
-        out["sensor"].append(over.grid_vectors(grid, model.sensor, name))
+        out["sensor"].append(figures.grid_vectors(grid, model.sensor, name))
     records = [i for i in tests.images or () if i.camera == model.name and i.n > 0]
     if len(records) > 1:
-        out["plots"].append(plots.by_image(records, name))
+        out["plots"].append(figures.by_image(records, name))
     out["sensor"] = [p for p in out["sensor"] if p is not None]
-    return out | {"thinned": bool(len(r)) and int(np.bincount(r.image).max()) > over.MOST_IN_SMALL}
+    return out | {"thinned": bool(len(r)) and int(np.bincount(r.image).max()) > figures.MOST_IN_SMALL}
 
 
 def _bent(curves: DistortionCurves, model: CameraModel) -> DistortionCurves:
