@@ -18,8 +18,7 @@ from calibrate.networks import SENSOR, Simulated, predicted, simulate
 from pixmetry.calibrate.bundle.bundle import adjust
 from pixmetry.calibrate.bundle.options import Options
 from pixmetry.calibrate.bundle.solve import calibrate_network
-from pixmetry.calibrate.start.initial import start_values
-from pixmetry.calibrate.start.planar_start import homography, principal_distance
+from pixmetry.calibrate.start.initial import homography, principal_distance, start_values
 from pixmetry.calibrate.start.resection import fitted, intersect, pose
 from pixmetry.core.errors import InputError, MeasureError
 
