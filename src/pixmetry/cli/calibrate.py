@@ -162,7 +162,7 @@ def _summary(calibration: Any, report: Path) -> str:
 
 
 def _page_of(calibration: Any) -> Page:
-    from pixmetry.calibrate.lines.line_calibration import LineCalibration
+    from pixmetry.calibrate.lines.plumb_line import LineCalibration
     from pixmetry.calibrate.page import lines_page, page
 
     return (lines_page if isinstance(calibration, LineCalibration) else page).page_of(calibration)
