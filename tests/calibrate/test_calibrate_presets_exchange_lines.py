@@ -194,7 +194,9 @@ def vision(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
 def test_export_without_a_loss_and_the_way_back(vision: tuple[Path, Path], tmp_path: Path, rng: np.random.Generator) -> None:
     """What OpenCV itself projects with the file is what the calibration projects; the files are start values of the next project."""
     folder, path = vision
-    result = run(path, "-o", folder / "r", "--folds", 0, "--opencv", folder / "cv.yaml", "--colmap", folder / "cameras.txt")
+    exports = ("--opencv", folder / "cv.yaml", "--colmap", folder / "cameras.txt", "--pdf", folder / "page.pdf")
+    result = run(path, "-o", folder / "r", "--folds", 0, *exports)
+    assert (folder / "page.pdf").read_bytes().startswith(b"%PDF-1")
     assert result.exit_code == 0 and result.output.count("nothing is lost") == 2, result.output
     model = read_calibration(folder / "r").cameras[0]
     storage = cv2.FileStorage(str(folder / "cv.yaml"), cv2.FILE_STORAGE_READ)
@@ -327,8 +329,9 @@ def wires(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
     positions = lines(rng_of(request), (0.06, 0.04))
     positions["x_px"][100] += 5.0
     positions["y_px"][100] += 5.0
-    result = run(line_project(folder, positions), "-o", folder / "r")
+    result = run(line_project(folder, positions), "-o", folder / "r", "--pdf", folder / "page.pdf")
     assert result.exit_code == 0, result.output
+    assert (folder / "page.pdf").read_bytes().startswith(b"%PDF-1")
     return folder, result.output
 
 
