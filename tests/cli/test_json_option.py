@@ -21,15 +21,31 @@ def run(*arguments):
     return CliRunner().invoke(main, [str(a) for a in arguments])
 
 
-@pytest.mark.parametrize("name", QUICK)
-def test_the_file_holds_what_is_printed_with_a_dash(name: str, tmp_path: Path) -> None:
-    command, schema = QUICK[name]
+@pytest.fixture(scope="module")
+def commands(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[list[str], str]]:
+    """All commands that have the option and need no pictures of a test field (calibrate: tests/calibrate/test_calibrate_command.py)."""
+    sheet = tmp_path_factory.mktemp("sheet") / "sheet.json"
+    assert run("emva1288", "--json", sheet).exit_code == 0
+    return QUICK | {
+        "data sheet": (["emva1288"], "pixmetry/emva1288/"),
+        "preflight": (["emva1288", "--preflight"], "pixmetry/preflight/"),
+        "comparison": (["compare", sheet, sheet], "pixmetry/compared/"),
+    }
+
+
+@pytest.mark.parametrize("name", [*QUICK, "data sheet", "preflight", "comparison"])
+def test_the_file_holds_what_is_printed_with_a_dash(commands: dict[str, tuple[list[str], str]], name: str, tmp_path: Path) -> None:
+    command, schema = commands[name]
     file = tmp_path / "out.json"
     written = run(*command, "--json", file)
     assert written.exit_code == 0, written.output
     printed = run(*command, "--json", "-")
-    assert json.loads(printed.output) == json.loads(file.read_text(encoding="utf-8"))
-    assert next(iter(json.loads(printed.output).items())) == ("schema", schema)
+    told, stored = json.loads(printed.stdout), json.loads(file.read_text(encoding="utf-8"))
+    first, value = next(iter(told.items()))
+    assert first == "schema" and value.startswith(schema)
+    if name == "data sheet":  # it tells when it was made
+        told, stored = ({key: record[key] for key in ("camera", "conditions", "results")} for record in (told, stored))
+    assert told == stored and not Path("-").exists()
     assert run(*command, "--json", file).exit_code == 0  # its own earlier result is replaced
     file.write_text('{"schema": "pixmetry/results/1"}')
     refused = run(*command, "--json", file)

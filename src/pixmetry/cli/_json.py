@@ -10,12 +10,11 @@ from typing import Any
 import click
 
 
-def json_option(what: str) -> Callable[[Any], Any]:
-    """The option ``--json FILE`` of a command, as its parameter ``json_file``; ``what`` says in words what is written."""
+def json_option(what: str, parameter: str = "json_file") -> Callable[[Any], Any]:
+    """The option ``--json FILE`` of a command, as this parameter of it; ``what`` says in words what is written."""
     kind = click.Path(path_type=Path, allow_dash=True)
-    return click.option(
-        "--json", "json_file", type=kind, metavar="FILE", help=f"Write {what} as JSON into this file. With - only the JSON is printed."
-    )
+    told = f"Write {what} as JSON into this file. With - only the JSON is printed."
+    return click.option("--json", parameter, type=kind, metavar="FILE", help=told)
 
 
 class JsonResult:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from math import isnan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from pixmetry.cli._console import console as plain_console
+from pixmetry.cli._json import JsonResult, json_option
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
 EXIT_DIFFERENT = 1
 SCHEMA = "pixmetry/compared/1"
-MARK = re.compile(rb'\s*\{\s*"schema":\s*"pixmetry/compared/')  # how an earlier comparison begins
 QUIET = ("same", "equal", "setting")
 LARGEST = 3  # so many of the differences that are not significant are shown
 
@@ -33,7 +32,7 @@ LARGEST = 3  # so many of the differences that are not significant are shown
 @click.option("--level", type=float, default=0.95, show_default=True, help="Confidence level for all values together.")
 @click.option("--same-light", is_flag=True, help="Both measurements share one calibration of the light.")
 @click.option("--all", "everything", is_flag=True, help="Also show the values that did not change.")
-@click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write the comparison as JSON.")
+@json_option("the comparison")
 def compare(files: tuple[Path, ...], limits: Path | None, level: float, same_light: bool, everything: bool, json_file: Path | None) -> None:
     """Compare measurements with each other, with a fleet of cameras, or with limits.
 
@@ -46,17 +45,14 @@ def compare(files: tuple[Path, ...], limits: Path | None, level: float, same_lig
     from pixmetry.assess.judge.compare import check_limits, compare_fleet
     from pixmetry.assess.judge.compare import compare as compare_two
     from pixmetry.core.errors import InputError
-    from pixmetry.files.staged_files import Output, check_files, write_together
-    from pixmetry.files.strict_json import json_text
 
     if len(files) == 1 and limits is None:
         raise InputError("one file cannot be compared", where=str(files[0]), remedy="name a second one, or --limits")
     if same_light and len(files) != 2:
         raise InputError("is for two files", where="--same-light", remedy="leave it away")
-    written = [] if json_file is None else [Output(json_file, MARK)]
-    check_files(written, files)  # before the work
-    console = plain_console(width=116)
-    record: dict[str, Any] = {"schema": SCHEMA}
+    written = JsonResult(json_file, SCHEMA, inputs=files)
+    console = plain_console(width=116, quiet=written.printed)
+    record: dict[str, Any] = {}
     good = True
     if len(files) > 1:
         result = compare_two(*files, level=level, same_light=same_light) if len(files) == 2 else compare_fleet(files, level=level)
@@ -72,8 +68,7 @@ def compare(files: tuple[Path, ...], limits: Path | None, level: float, same_lig
             print_limits(name, rows, console)
         record["limits"] = [_limit_record(name, row) for name, rows in checked.items() for row in rows]
         good = good and all(row.judgement.verdict == "pass" for rows in checked.values() for row in rows)
-    text = json_text(record)
-    write_together(written, [text.encode()] * len(written), files)
+    written.put(record)
     if not good:
         click.get_current_context().exit(EXIT_DIFFERENT)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 from click.core import ParameterSource
 
+from pixmetry.cli._json import JsonResult, json_option
 from pixmetry.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -30,7 +30,6 @@ OPTIONS = {
 }
 EXIT_DIFFERENT = 1
 PREFLIGHT_SCHEMA = "pixmetry/preflight/1"
-PREFLIGHT_MARK = re.compile(rb'\s*\{\s*"schema":\s*"pixmetry/preflight/')  # how an earlier one begins
 WIDTH = 116
 WISHES = {"u_gain": ("K", "%"), "u_dark_noise": ("sigma_d", "%"), "u_dsnu": ("DSNU1288", ""), "u_prnu": ("PRNU1288", "%")}
 
@@ -49,7 +48,7 @@ WISHES = {"u_gain": ("K", "%"), "u_dark_noise": ("sigma_d", "%"), "u_dsnu": ("DS
     type=click.Choice(["RGGB", "BGGR", "GRBG", "GBRG"]),
     help="Colour filter array. Each of its four phases is tested as a camera of its own.",
 )
-@click.option("--json", type=FILE, help="Write the results (or the checks of --preflight) as JSON.")
+@json_option("the results (or the checks of --preflight)", "json")
 @click.option("--xml", type=FILE, help="Write the results in the public EMVA 1288 format.")
 @click.option("--report", type=FILE, help="Write the data sheet as a page (HTML).")
 @click.option("--pdf", type=FILE, help="Write the data sheet as PDF.")
@@ -168,14 +167,20 @@ def test(campaigns: Sequence[Path], given: dict[str, Any]) -> None:
     from pixmetry.emva.job import emva1288
 
     options = {name: given[name] for name in ("release", "bayer", "bootstrap")} | {"photons_u_rel": given["photons_u"] / 100}
-    files = {kind: given[kind] for kind in ("json", "xml", "report", "pdf")}
+    printed = str(given["json"]) == "-"
+    files = {kind: given[kind] for kind in ("json", "xml", "report", "pdf") if not (printed and kind == "json")}
     _refuse_sheets(campaigns)
     with shown_progress() as progress:
         if len(campaigns) < 2:
             sheet = emva1288(campaigns[0] if campaigns else None, **options, **files, progress=progress)
         else:
             sheet, _ = dark_current_law(campaigns, **options, **files, progress=progress)
-    console = _console()
+    if printed:
+        from pixmetry.core.plain_text import json_shown
+        from pixmetry.emva.files.json_format import sheet_json
+
+        click.echo(json_shown(sheet_json(sheet).rstrip()))
+    console = _console(quiet=printed)
     print_sheet(sheet, console)
     for kind, path in files.items():
         if path is not None:
@@ -271,21 +276,16 @@ def _known_cameras(source: Path | None, bayer: str | None, more: dict[str, Any])
 def preflight(campaigns: Sequence[Path], given: dict[str, Any]) -> None:
     """Check a few frames."""
     from pixmetry.emva.planning.preflight import preflight_record, preflight_text
-    from pixmetry.files.staged_files import Output, check_files, write_together
-    from pixmetry.files.strict_json import json_text
 
     _refuse_sheets(campaigns)
-    written = [] if given["json"] is None else [Output(given["json"], PREFLIGHT_MARK)]
-    check_files(written)
-    found, inputs = _looked_at(campaigns, given)
-    console = _console()
+    written = JsonResult(given["json"], PREFLIGHT_SCHEMA)
+    found, written.inputs = _looked_at(campaigns, given)
+    console = _console(quiet=written.printed)
     for channel, result in found.items():
         if len(found) > 1:
             console.print(f"Channel {channel}", markup=False)
         console.print(preflight_text(result), markup=False, soft_wrap=True, end="" if len(found) == 1 else "\n")
-    record = {"schema": PREFLIGHT_SCHEMA, "channels": {channel: preflight_record(result) for channel, result in found.items()}}
-    text = json_text(record)
-    write_together(written, [text.encode()] * len(written), inputs)
+    written.put({"channels": {channel: preflight_record(result) for channel, result in found.items()}})
     if any(result.verdict == "fail" for result in found.values()):
         raise SystemExit(EXIT_DIFFERENT)
 
@@ -372,7 +372,7 @@ def _mark(reason: str, reasons: dict[str, int]) -> str:
     return f" [{reasons.setdefault(reason, len(reasons) + 1)}]" if reason else ""
 
 
-def _console() -> Console:
+def _console(quiet: bool = False) -> Console:
     from pixmetry.cli._console import console
 
-    return console(width=WIDTH)
+    return console(width=WIDTH, quiet=quiet)
