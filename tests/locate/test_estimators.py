@@ -11,8 +11,8 @@ from scipy.special import erf
 
 from pixmetry.core.errors import InputError
 from pixmetry.locate.centroids.fixed import LAWS, FixedCentroid
-from pixmetry.locate.estimators import estimators, parse_estimator
-from pixmetry.locate.target_estimator import TargetEstimator
+from pixmetry.locate.estimators import estimators
+from pixmetry.locate.target_estimator import TargetEstimator, parse_estimator
 
 SIDE = 24
 AXIS = np.arange(SIDE, dtype=float)

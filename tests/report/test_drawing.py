@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import threading
-from pathlib import Path
 
 import matplotlib
 import numpy as np
 
 from pixmetry import locate
-from pixmetry.locate.overlay import write_overlay
+from pixmetry.locate.overlay import overlay_png
 from pixmetry.report.drawing import canvas, own_style
 from pixmetry.report.page import Figure
 from pixmetry.report.paper import paper
@@ -30,17 +29,17 @@ def page() -> bytes:
         return sheet.to_bytes({"Title": "x"})
 
 
-def overlay(path: Path) -> bytes:
+def overlay() -> bytes:
     y, x = np.mgrid[:40, :50]
     frame = (200 * (np.hypot(x - 25, y - 20) < 8) + 20).astype(np.uint8)
-    return write_overlay(path, frame, locate(frame)).read_bytes()
+    return overlay_png(frame, locate(frame))
 
 
-def test_a_users_settings_change_no_figure(tmp_path: Path) -> None:
-    usual = figure(), page(), overlay(tmp_path / "a.png")
+def test_a_users_settings_change_no_figure() -> None:
+    usual = figure(), page(), overlay()
     with matplotlib.rc_context():
         matplotlib.rcParams.update(THEIRS)
-        assert (figure(), page(), overlay(tmp_path / "b.png")) == usual
+        assert (figure(), page(), overlay()) == usual
         assert {name: matplotlib.rcParams[name] for name in THEIRS}["text.usetex"] is True  # and ours do not change theirs
 
 

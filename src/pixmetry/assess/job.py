@@ -36,8 +36,7 @@ from pixmetry.files import (
     write_maps,
     write_record,
 )
-from pixmetry.locate.estimators import parse_estimator
-from pixmetry.locate.target_estimator import TargetEstimator
+from pixmetry.locate.target_estimator import TargetEstimator, parse_estimator
 from pixmetry.observe.observe import Group, observe
 
 KIND = "assessment"

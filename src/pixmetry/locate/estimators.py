@@ -1,19 +1,16 @@
-"""The estimators that there are, by name: those of `pixmetry.locate` for targets that are regions, and centroids over a fixed square."""
+"""The estimators that there are for each kind of target, by name, and which of them suits the targets of a frame."""
 
 from __future__ import annotations
 
 from functools import cache
 from importlib import import_module
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pixmetry.core.errors import InputError
 from pixmetry.locate.detect.targets import Flag, Targets
-from pixmetry.locate.noise import NoiseModel, split_text
-
-if TYPE_CHECKING:
-    from pixmetry.locate.estimator import Estimator, Method
+from pixmetry.locate.estimator import Method
+from pixmetry.locate.noise import NoiseModel
 
 MODULES = (  # each has the tuple METHODS
     "pixmetry.locate.template.template",
@@ -22,7 +19,6 @@ MODULES = (  # each has the tuple METHODS
 )
 AUTO = "auto"
 AUTO_TEXT = "chooses shape and likelihood of the template by what the image shows, and says why"
-TEMPLATE_TEXT = "least squares with the target's own shape, integrated over the pixel; at the Cramér–Rao bound"
 ROWS = {
     "template": "the whole line by least squares, integrated over the pixel; at the Cramér–Rao bound",
     "row_squared_centroid": "squared centroid of each row (or column), then a straight line through them",
@@ -70,34 +66,6 @@ def estimators(kind: str) -> dict[str, str]:
     if kind in ("edge", "cross", "chessboard"):
         return {AUTO: AUTO_TEXT, "template": "least squares with the target's own shape, integrated over the pixel"}
     raise InputError("no such kind of target", value=kind, allowed=", ".join((*SPOTS, "line", "edge", "cross", "chessboard", "coded")))
-
-
-def parse_estimator(text: str) -> Estimator:
-    """Read an estimator: a name of `TargetEstimator`, or ``fixed_…:key=value,…``, as in ``fixed_soft_threshold:sigma=3,window=13``.
-
-    Raises
-    ------
-    InputError
-        If name, key or value cannot be used.
-    """
-    from pixmetry.locate.centroids.fixed import LAWS, PREFIX, FixedCentroid
-    from pixmetry.locate.target_estimator import TargetEstimator
-
-    name, _, rest = (part.strip() for part in text.partition(":"))
-    if name == AUTO or name in methods():
-        if rest:
-            fixed = f"; for a fixed square of pixels take {PREFIX}{name}:{rest}" if name in LAWS else ""
-            what = f"{name} has no settings: it chooses window and threshold by target and noise, as in pixmetry locate"
-            raise InputError(what, where="estimator", value=rest, remedy=f"name it alone{fixed}")
-        return TargetEstimator(name)
-    if not name.startswith(PREFIX) or name.removeprefix(PREFIX) not in LAWS:
-        known = (AUTO, *methods(), *(PREFIX + law for law in LAWS))
-        raise InputError("no such estimator", where="estimator", value=name, allowed=", ".join(known))
-    _, values = split_text(text, {"sigma": "sigma", "threshold": "threshold_dn", "window": "window"}, "estimator")
-    window = values.pop("window", 13)
-    if window != int(window):
-        raise InputError("the estimator's window is not a whole number", where="estimator", value=window, allowed="an odd number of pixels")
-    return FixedCentroid(name.removeprefix(PREFIX), window=int(window), **values)
 
 
 def seen_shape(kind: str, targets: Targets) -> tuple[str, str]:

@@ -10,7 +10,7 @@ import numpy as np
 from pixmetry.core.errors import InputError
 from pixmetry.locate.detect.targets import Positions, Targets
 from pixmetry.locate.estimator import Settings
-from pixmetry.locate.estimators import SPOTS, TEMPLATE_TEXT, chosen_estimator, methods, seen_shape
+from pixmetry.locate.estimators import SPOTS, chosen_estimator, methods, seen_shape
 from pixmetry.locate.noise import ROUNDING_DN2, NoiseModel
 from pixmetry.locate.records import LAST
 
@@ -74,7 +74,7 @@ def locate_lines(task: Task) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     height = np.abs(found.amplitude_dn)
     found = found[height >= FAINTEST * height.max(initial=0.0)]  # beside a strong one, what a coder or a halo draws is no line
     noise = _noise_for(task, task.kind, found.sigma_dn)
-    estimator, reason = ("template", TEMPLATE_TEXT) if task.estimator == "auto" else (task.estimator, "as was asked for")
+    estimator, reason = ("template", methods()["template"].text) if task.estimator == "auto" else (task.estimator, "as was asked for")
     if task.kind == "cross":
         from pixmetry.locate.lines.crosses import cross_positions, crossings
 

@@ -140,7 +140,7 @@ class Located:
         axes : matplotlib.axes.Axes, optional
             New ones by default.
         """
-        from pixmetry.locate.overlay import draw_marks
+        from pixmetry.locate.marks import draw_marks
 
         if axes is None:
             from matplotlib.figure import Figure
@@ -150,7 +150,7 @@ class Located:
             axes.imshow(frame, cmap="gray")
         elif not axes.yaxis_inverted():
             axes.invert_yaxis()
-        draw_marks(axes, self)
+        draw_marks(axes, self.columns)
         axes.set_aspect("equal")
         axes.autoscale_view()
         axes.set_xlabel("x (px)")

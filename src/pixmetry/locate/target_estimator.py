@@ -8,10 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pixmetry.core.errors import InputError
+from pixmetry.locate.centroids.fixed import LAWS, PREFIX, FixedCentroid
+from pixmetry.locate.centroids.moments import half_height_radius
 from pixmetry.locate.detect.targets import Flag, Positions, Targets
-from pixmetry.locate.estimator import KnownTarget, Method, Settings
+from pixmetry.locate.estimator import Estimator, KnownTarget, Method, Settings
 from pixmetry.locate.estimators import AUTO, FEW_ELECTRONS, methods
-from pixmetry.locate.noise import ROUNDING_DN2, NoiseModel
+from pixmetry.locate.noise import ROUNDING_DN2, NoiseModel, split_text
 
 MARGIN_PX = 2.0  # around what an estimator reads of a disc: half a pixel of phase, and rounding up
 
@@ -200,8 +202,6 @@ class TargetEstimator:
 
     def _targets(self, data: np.ndarray) -> Targets:
         """The targets as a search would find them: rough centres from the images, the rest from what is known."""
-        from pixmetry.locate.centroids.moments import half_height_radius
-
         n, rows, cols = data.shape
         radius, edge, amplitude = self._size()
         y, x = np.arange(rows)[:, None], np.arange(cols)
@@ -217,3 +217,28 @@ class TargetEstimator:
             x_px, y_px, half * one, half * one, none, edge * one, amplitude * one, self.background_dn * one, none, none,
             self.noise_dn * one, top, bottom, left, right, np.zeros(n, np.uint32),
         )  # fmt: skip
+
+
+def parse_estimator(text: str) -> Estimator:
+    """Read an estimator: a name of `TargetEstimator`, or ``fixed_…:key=value,…``, as in ``fixed_soft_threshold:sigma=3,window=13``.
+
+    Raises
+    ------
+    InputError
+        If name, key or value cannot be used.
+    """
+    name, _, rest = (part.strip() for part in text.partition(":"))
+    if name == AUTO or name in methods():
+        if rest:
+            fixed = f"; for a fixed square of pixels take {PREFIX}{name}:{rest}" if name in LAWS else ""
+            what = f"{name} has no settings: it chooses window and threshold by target and noise, as in pixmetry locate"
+            raise InputError(what, where="estimator", value=rest, remedy=f"name it alone{fixed}")
+        return TargetEstimator(name)
+    if not name.startswith(PREFIX) or name.removeprefix(PREFIX) not in LAWS:
+        known = (AUTO, *methods(), *(PREFIX + law for law in LAWS))
+        raise InputError("no such estimator", where="estimator", value=name, allowed=", ".join(known))
+    _, values = split_text(text, {"sigma": "sigma", "threshold": "threshold_dn", "window": "window"}, "estimator")
+    window = values.pop("window", 13)
+    if window != int(window):
+        raise InputError("the estimator's window is not a whole number", where="estimator", value=window, allowed="an odd number of pixels")
+    return FixedCentroid(name.removeprefix(PREFIX), window=int(window), **values)

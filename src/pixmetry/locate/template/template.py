@@ -9,7 +9,6 @@ import numpy as np
 from pixmetry.core.errors import InputError
 from pixmetry.locate.detect.targets import Flag, Positions, Targets
 from pixmetry.locate.estimator import Method, Settings
-from pixmetry.locate.estimators import TEMPLATE_TEXT
 from pixmetry.locate.noise import NoiseModel
 from pixmetry.locate.template.image_noise import noise_from_image
 from pixmetry.locate.template.template_fit import KINDS, Fitted, Windows, run_fit, with_second_start
@@ -343,7 +342,7 @@ def _slopes(found: Positions, noise: NoiseModel, shape: tuple[int, int], reach_p
 METHODS = (
     Method(
         "template",
-        TEMPLATE_TEXT,
+        "least squares with the target's own shape, integrated over the pixel; at the Cramér–Rao bound",
         partial(_measure, "least_squares"),
         _reach_px,
         knows_aperture=True,
