@@ -77,7 +77,7 @@ def known(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
 
 def test_prints_values_with_uncertainties_and_writes_all_files(known: Path, tmp_path: Path) -> None:
     files = {kind: tmp_path / f"sheet.{kind}" for kind in ("json", "xml", "html", "pdf")}
-    done = run(known, "--json", files["json"], "--xml", files["xml"], "--report", files["html"], "--pdf", files["pdf"], "--photons-u", 3)
+    done = run(known, "--json", files["json"], "--xml", files["xml"], "--html", files["html"], "--pdf", files["pdf"], "--photons-u", 3)
     assert done.exit_code == 0, done.output
     assert any(f"Release 4.0 {verdict}" in done.output for verdict in ("Linear applies", "General applies", "Linear, and General")) or (
         "they do not tell whether Linear or General applies" in done.output
@@ -98,6 +98,14 @@ def test_prints_values_with_uncertainties_and_writes_all_files(known: Path, tmp_
     assert sorted(p.name for p in tmp_path.iterdir()) == sorted(p.name for p in files.values())
     again = run(known, "--json", files["json"], "--release", "3.1")  # its own file may be written again
     assert again.exit_code == 0 and read_sheet(files["json"]).results[0].release == "3.1"
+
+
+def test_the_page_by_its_former_name(known: Path, tmp_path: Path) -> None:
+    """``--report`` is still taken for ``--html``, but not shown, and not both at once."""
+    page = tmp_path / "page.html"
+    assert run(known, "--report", page).exit_code == 0 and "<html" in page.read_text()
+    assert "--report" not in run("--help").output and "--html" in run("--help").output
+    refused(run(known, "--report", page, "--html", tmp_path / "other.html"), "is another name of --html")
 
 
 def test_the_packaged_example_needs_no_argument() -> None:
@@ -294,7 +302,7 @@ def test_output_names_are_checked_before_the_work(known: Path, tmp_path: Path, m
     refused(run(known, "--json", tmp_path / "a", "--xml", tmp_path / "." / "a"), "one file for two results")
     refused(run(known, "--pdf", tmp_path), "is a folder")
     refused(run(known, "--json", tmp_path / "notes.txt"), "no result of this kind")
-    refused(run(known, "--report", known), "no result of this kind")
+    refused(run(known, "--html", known), "no result of this kind")
     refused(run(known, "--xml", known.parent / "dark1_0.npy"), "no result of this kind")
     link = tmp_path / "link"
     link.symlink_to(tmp_path / "notes.txt")
@@ -413,7 +421,7 @@ def test_campaigns_that_cannot_be_tested(known: Path, tmp_path: Path) -> None:
 def test_what_a_campaign_with_gaps_carries_is_given(known: Path, tmp_path: Path, kept: str, reason: str, given: set[str]) -> None:
     """One level, frames of one kind, stacks alone: values that need no series, and for the others why there are none."""
     path = changed(known, tmp_path / "a", kept)
-    done = run(path, *(f"--{kind}={tmp_path / f'out.{kind}'}" for kind in ("json", "xml", "report", "pdf")))
+    done = run(path, *(f"--{kind}={tmp_path / f'out.{kind}'}" for kind in ("json", "xml", "html", "pdf")))
     assert done.exit_code == 0, done.output
     values = emva1288(path).results[0].values
     assert given <= {key for key, value in values.items() if np.isfinite(value.value)}

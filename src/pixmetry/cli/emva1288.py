@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 FILE = click.Path(path_type=Path)
 # What each way of calling the command takes beside its arguments.
 OPTIONS = {
-    "test": {"release", "bayer", "json", "xml", "report", "pdf", "bootstrap", "photons_u", "threads"},
+    "test": {"release", "bayer", "json", "xml", "html", "report", "pdf", "bootstrap", "photons_u", "threads"},
     "compare": {"compare"},
     "plan": {"plan", "bayer", "u_gain", "u_dark_noise", "u_dsnu", "u_prnu", "sweep", "saturation_s", "frame_rate", "manifest", "threads"},
     "preflight": {"preflight", "bayer", "dark", "bright", "bits", "json", "threads"},
@@ -50,7 +50,8 @@ WISHES = {"u_gain": ("K", "%"), "u_dark_noise": ("sigma_d", "%"), "u_dsnu": ("DS
 )
 @json_option("the results (or the checks of --preflight)", "json")
 @click.option("--xml", type=FILE, help="Write the results in the public EMVA 1288 format.")
-@click.option("--report", type=FILE, help="Write the data sheet as a page (HTML).")
+@click.option("--html", type=FILE, help="Write the data sheet as a page (HTML).")
+@click.option("--report", type=FILE, hidden=True)  # as --html was called until 0.1
 @click.option("--pdf", type=FILE, help="Write the data sheet as PDF.")
 @click.option(
     "--bootstrap",
@@ -119,6 +120,9 @@ def emva1288(ctx: click.Context, campaigns: tuple[Path, ...], **given: Any) -> N
     from pixmetry.core.threads import set_threads
 
     mode = _mode(ctx, given)
+    if None not in (given["html"], before := given.pop("report")):
+        raise InputError("is another name of --html, and both are given", where="--report", remedy="leave it away")
+    given["html"] = given["html"] or before
     set_threads(given["threads"])
     if mode == "compare":
         refuse(campaigns, "--compare", "it names its two files itself")
@@ -168,13 +172,14 @@ def test(campaigns: Sequence[Path], given: dict[str, Any]) -> None:
 
     options = {name: given[name] for name in ("release", "bayer", "bootstrap")} | {"photons_u_rel": given["photons_u"] / 100}
     printed = str(given["json"]) == "-"
-    files = {kind: given[kind] for kind in ("json", "xml", "report", "pdf") if not (printed and kind == "json")}
+    files = {kind: given[kind] for kind in ("json", "xml", "html", "pdf") if not (printed and kind == "json")}
+    written = {"report" if kind == "html" else kind: path for kind, path in files.items()}
     _refuse_sheets(campaigns)
     with shown_progress() as progress:
         if len(campaigns) < 2:
-            sheet = emva1288(campaigns[0] if campaigns else None, **options, **files, progress=progress)
+            sheet = emva1288(campaigns[0] if campaigns else None, **options, **written, progress=progress)
         else:
-            sheet, _ = dark_current_law(campaigns, **options, **files, progress=progress)
+            sheet, _ = dark_current_law(campaigns, **options, **written, progress=progress)
     if printed:
         from pixmetry.core.plain_text import json_shown
         from pixmetry.emva.files.json_format import sheet_json

@@ -135,7 +135,7 @@ def jobs_in(folder: Path) -> Iterator[Job]:
     yield command("assess", manifest, "-o", folder / "assessed", "--trials", 200)
     yield command("assess", "-o", folder / "example", "--trials", 200)
     yield "correct", partial(_correct, folder / "series", folder / "assessed" / "results.json", folder / "corrected")
-    yield command("emva1288", manifest, "--report", folder / "sheet.html", "--bootstrap", 100)
+    yield command("emva1288", manifest, "--html", folder / "sheet.html", "--bootstrap", 100)
     for kind, plate in PLATES.items():
         for i, (omega, phi, kappa) in enumerate(POSES):
             posed = scene(f"{kind}-{i}", PLATE.format(plate=plate, omega=omega, phi=phi, kappa=kappa))
