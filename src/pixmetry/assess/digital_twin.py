@@ -14,6 +14,7 @@ from pixmetry.budget.parameters import applies
 from pixmetry.camera.camera import Camera, Element, in_order
 from pixmetry.camera.catalogue import catalogue, get_source
 from pixmetry.camera.observations import Observations, PatternList, PhotonTransfer, StackMoments
+from pixmetry.camera.provenance import DESCRIBED, MEASURED, TYPICAL
 from pixmetry.camera.source import Source
 from pixmetry.camera.unit_maps import MeasuredUnit
 from pixmetry.core.errors import InputError, MeasureError
@@ -43,8 +44,9 @@ SMALLEST_WINDOW = 64
 def digital_twin(campaign: Campaign, estimates: Mapping[str, Estimates], observations: Observations) -> Camera:
     """Build the camera that makes frames like the real ones, from what was measured: the type, whose patterns are drawn.
 
-    What the campaign only bounds, or what is not significant, is left out. Without a photon count the quantum efficiency is 1, and the
-    photons of a scene are electrons. `of_unit` makes the very camera of it.
+    What the campaign only bounds, or what is not significant, is not simulated: it stands in the chain at 0, with what is known of it as
+    the element's estimates. What is in it without being measured is marked as typical. Without a photon count the quantum efficiency is
+    1, and the photons of a scene are electrons. `of_unit` makes the very camera of it.
     """
     facts = campaign.camera
     told = {"interface": facts.interface, **({} if facts.sensor is None else {"sensor": facts.sensor})}
@@ -56,8 +58,10 @@ def digital_twin(campaign: Campaign, estimates: Mapping[str, Estimates], observa
         fields = source.parameters.model_fields
         if source.id not in estimates and source.id not in ALWAYS:
             continue
-        values = {k: v for k, v in known.items() if k in fields} | best_values(source, estimates.get(source.id, Estimates.empty()))
-        elements.append(Element(source.id, source, source.make(values, where=f"digital twin, {source.id}")))
+        found = replace(estimates.get(source.id, Estimates.empty()), confounders=())  # results.json holds these, once for all
+        params = source.make({k: v for k, v in known.items() if k in fields} | best_values(source, found), f"digital twin, {source.id}")
+        known_from = MEASURED if len(found) else TYPICAL if source.measure is not None else DESCRIBED
+        elements.append(Element(source.id, source, params, known_from=known_from, estimates=found))
     pitch = None if facts.pitch_x_um is None else (facts.pitch_x_um, facts.pitch_y_um or facts.pitch_x_um)
     stack = observations.bright_stack
     if not any(element.name == "electronics.gain" for element in elements):
@@ -74,6 +78,7 @@ def digital_twin(campaign: Campaign, estimates: Mapping[str, Estimates], observa
         facts={
             **told,
             "bits": campaign.bits,
+            **({} if facts.sensor_shape is None else {"sensor_rows": facts.sensor_rows, "sensor_cols": facts.sensor_cols}),
             **({} if observations.storage.lossless is None else {"lossless": observations.storage.lossless}),
             "source": f"assessed from {campaign.source_path.name}",
             "photons": "photons" if photons_known else "electrons: no photon count was given, the quantum efficiency is set to 1",
@@ -85,7 +90,7 @@ def _with_assumed_gain(elements: list[Element], bits: int) -> list[Element]:
     """The chain with a gain as if few electrons filled the range, so that the shot noise is bounded where the gain was not measured."""
     source = get_source("electronics.gain")
     gain = source.make({"gain_dn_per_e": (2**bits - 1) / ASSUMED_RANGE_E}, where="digital twin, assumed gain")
-    by_name = {e.name: e for e in elements} | {source.id: Element(source.id, source, gain)}
+    by_name = {e.name: e for e in elements} | {source.id: Element(source.id, source, gain, known_from=TYPICAL)}
     return [by_name[s.id] for s in in_order([e.source for e in elements] + [source])]
 
 
@@ -140,7 +145,11 @@ def of_unit(twin: Camera, observations: Observations) -> Camera:
             chain.append(replace(element, maps=_own_maps(element, maps, bend, observations)))
     unit = replace(twin, chain=tuple(chain), measured=MeasuredUnit(twin.unit_seed, twin.frame_shape))
     white = _white_e(unit, bend, observations)
-    return unit if white is None else unit.with_parameters(NOISE, white_e=white)
+    if white is None:
+        return unit
+    noise = unit[NOISE].source.make({**unit[NOISE].params.model_dump(), "white_e": white}, where=f"digital twin, {NOISE}")
+    # the estimates stay: they are of all frames, this value is that of the stack
+    return replace(unit, chain=tuple(replace(e, params=noise) if e.name == NOISE else e for e in unit.chain))
 
 
 def _own_maps(element: Element, maps: UnitMaps, bend: ConverterBend, seen: Observations) -> dict[str, np.ndarray]:
@@ -197,7 +206,9 @@ def _waves(element: Element, found: PatternList, maps: UnitMaps) -> list[Element
         values = {"amplitude_dn": float(found.amplitude_dn[k]), "frequency_x": nu_x, "frequency_y": nu_y, "moving": bool(found.moving[k])}
         params = element.source.make(values, where=f"digital twin, wave {k + 1}")
         phase = {} if found.moving[k] else {"phase_turns": maps.wave_turns[k : k + 1]}
-        out.append(Element(element.name if k == 0 else f"{element.name}_{k + 1}", element.source, params, maps=phase))
+        wave = replace(element, params=params, maps=phase)
+        # the estimates are of the strongest
+        out.append(wave if k == 0 else replace(wave, name=f"{element.name}_{k + 1}", estimates=Estimates.empty()))
     return out
 
 

@@ -15,12 +15,14 @@ from pixmetry.camera.chain_order import Element, check_chain, in_order
 from pixmetry.camera.conversions import LOOK, SAMPLE, Link, linked, look
 from pixmetry.camera.frozen import Frozen, one_value, settled_state
 from pixmetry.camera.light import Light, Scene
+from pixmetry.camera.provenance import check_provenance, estimates_of, provenance_record
 from pixmetry.camera.signal import Clock, Kind, Signal, Windows
 from pixmetry.camera.source import run
 from pixmetry.camera.unit_maps import MeasuredUnit, check_frame, check_maps, listing, maps_file, read_unit_maps, write_unit_maps
 from pixmetry.core.checksums import check_file
 from pixmetry.core.errors import ChainError, InputError
 from pixmetry.core.memory import check_memory
+from pixmetry.core.number import Estimates
 from pixmetry.core.random import Grid, QuietStreams, Streams
 from pixmetry.core.threads import imap_tiles, map_tiles
 
@@ -94,6 +96,7 @@ class Camera:
             raise ChainError("a frame has no pixels", where=self.name, value=self.frame_shape)
         for element in self.chain:
             check_maps(element, f"{self.name}, {element.name}")
+            check_provenance(element, f"{self.name}, {element.name}")
 
     # ---- variants -------------------------------------------------------------------------------------------------------------
 
@@ -119,6 +122,11 @@ class Camera:
         element = self[name]
         params = element.source.make({**element.params.model_dump(), **values}, where=f"{self.name}.{name}")
         return replace(self, chain=tuple(e.with_params(params) if e.name == name else e for e in self.chain))
+
+    @property
+    def estimates(self) -> dict[str, Estimates]:
+        """How uncertain the parameters are, by the names of the elements that say so, switched on or off."""
+        return {e.name: e.estimates for e in self.chain if len(e.estimates)}
 
     @property
     def active(self) -> tuple[Element, ...]:
@@ -481,6 +489,7 @@ class Camera:
         record["chain"] = [
             {"source": e.source.id, **({"name": e.name} if e.name != e.source.id else {}), **({} if e.on else {"enabled": False})}
             | {"parameters": e.params.model_dump(mode="json")}
+            | provenance_record(e)
             | ({"maps": listing(e.maps)} if e.maps else {})
             for e in self.chain
         ]
@@ -619,7 +628,10 @@ def build_camera(record: Mapping[str, Any], where: str = "camera", folder: str |
         source = get_source(entry.source, f"{where}, chain[{i}]")
         own = {name: value for name, value in known.items() if name in source.parameters.model_fields}
         params = source.make(own | entry.parameters, where=f"{where}, chain[{i}] {entry.source}")
-        elements.append(Element(entry.name or entry.source, source, params, entry.enabled))
+        estimates = estimates_of(entry, source, params, f"{where}, chain[{i}] {entry.source}")
+        elements.append(
+            Element(entry.name or entry.source, source, params, entry.enabled, known_from=entry.known_from, estimates=estimates)
+        )
     wanted = {element.name: entry.maps for element, entry in zip(elements, checked.chain, strict=True) if entry.maps}
     measured = None
     if wanted:

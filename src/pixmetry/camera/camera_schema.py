@@ -4,18 +4,47 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from pixmetry.core.config import Model
+from pixmetry.core.errors import InputError
+
+
+class UncertaintyRecord(Model):
+    """How uncertain a parameter is, as the parameter's value stands or with the best estimate or the limit in place of it."""
+
+    u: float = Field(default=0.0, ge=0)
+    dof: float | None = Field(default=None, gt=0)
+    value: float | None = None
+    upper_limit: float | None = None
+    lower_limit: float | None = None
+    unit: str = ""
+    reason: str = ""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _u_alone(cls, data: Any) -> Any:
+        return {"u": data} if isinstance(data, int | float | str) else data
+
+    @model_validator(mode="after")
+    def _one_value(self) -> UncertaintyRecord:
+        if sum(v is not None for v in (self.value, self.upper_limit, self.lower_limit)) > 1:
+            raise InputError("two values of one parameter", allowed="one of value, upper_limit and lower_limit", remedy="delete the others")
+        return self
 
 
 class ElementRecord(Model):
-    """One entry of a camera's chain."""
+    """One entry of a camera's chain; what it says of uncertainties is explained in ``camera.provenance``."""
 
     source: str
     name: str | None = None
     enabled: bool = True
     parameters: dict[str, Any] = {}
+    known_from: Literal["measured", "sheet", "typical", ""] = ""
+    uncertainties: dict[str, UncertaintyRecord] = {}
+    covariance: dict[str, dict[str, float]] = {}
+    method: str = ""
+    confounders: tuple[str, ...] = ()
     maps: dict[str, str] = {}
 
 

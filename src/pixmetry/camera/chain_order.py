@@ -12,6 +12,7 @@ from pixmetry.camera.conversions import conversion
 from pixmetry.camera.signal import Kind
 from pixmetry.camera.source import Source
 from pixmetry.core.errors import ChainError
+from pixmetry.core.number import Estimates
 
 RANK = {Kind.LIGHT: 0, Kind.PHOTONS: 1, Kind.ELECTRONS: 2, Kind.DN: 3, Kind.VIDEO: 3, Kind.CODES: 4}  # in which a chain goes through them
 
@@ -21,6 +22,8 @@ class Element:
     """One place in a chain: a source under a name of its own, with parameters; switched on or off.
 
     ``maps`` is what was measured of the unit that the camera speaks of, in place of what ``forward`` draws (see `Source.maps`).
+    ``known_from`` says whence the parameters are known: ``"measured"``, ``"sheet"``, ``"typical"``, or ``""`` for the description of the
+    camera; ``estimates`` how uncertain they are, where that is known (see ``camera.provenance``).
     """
 
     name: str
@@ -28,12 +31,21 @@ class Element:
     params: Any
     on: bool = True
     maps: Mapping[str, np.ndarray] = field(default_factory=dict, compare=False, repr=False)
+    known_from: str = ""
+    estimates: Estimates = field(default_factory=Estimates.empty, compare=False, repr=False)
 
     def with_params(self, params: Any) -> Element:
-        """The element with other parameters; a map that stands for one of those that change goes, and its pattern is drawn."""
+        """The element with other parameters.
+
+        Of those that change, a map that stands for one goes, and its pattern is drawn; their estimates go, and with them that all of
+        the element is known from one place.
+        """
         changed = {name for name in type(params).model_fields if getattr(params, name) != getattr(self.params, name)}
+        if not changed:
+            return replace(self, params=params)
         maps = {name: array for name, array in self.maps.items() if not changed & set(self.source.maps[name])}
-        return replace(self, params=params, maps=maps)
+        estimates = self.estimates.select([name for name in self.estimates.names if name not in changed])
+        return replace(self, params=params, maps=maps, known_from="", estimates=estimates)
 
 
 def check_chain(chain: Sequence[Element], where: str = "camera") -> None:
