@@ -104,7 +104,7 @@ def calibrate(
             check_folder(output, of, project.inputs)
     if project is not None and project.lines is not None:
         if check_points is not None:
-            raise InputError("has no meaning with straight lines", where="check_points", allowed="with points", remedy="leave it away")
+            raise InputError("has no meaning with straight lines", where="check_points", allowed="with points", remedy="leave it out")
         return _from_lines(project, output, of, free, per_image, {**given, **(options or {})}, _steps(told))
     network = _changed(network, free, per_image)
     chosen = _options({**given, **(options or {})})
@@ -141,7 +141,7 @@ def _from_lines(
 
     wrong = "per_image" if per_image else next((name for name in options if name not in LINE_OPTIONS), None)
     if wrong is not None:
-        remedy = "leave it away"
+        remedy = "leave it out"
         raise InputError("has no meaning with straight lines", where=wrong, allowed=", ".join(("free", *LINE_OPTIONS)), remedy=remedy)
     seen, (model,) = project.lines, project.network.cameras
     assert seen is not None
@@ -241,7 +241,7 @@ def _sources(source: str | Path | Network | Sequence[str | Path]) -> list[str | 
 def _refuse_pictures(pictures: Mapping[str, Any], what: str) -> None:
     given = [name for name, value in pictures.items() if value is not None]
     if given:
-        raise InputError(f"has no meaning with {what}", where=given[0], allowed="with pictures of a test field", remedy="leave it away")
+        raise InputError(f"has no meaning with {what}", where=given[0], allowed="with pictures of a test field", remedy="leave it out")
 
 
 def _listed(names: Sequence[str] | str) -> tuple[str, ...]:

@@ -138,7 +138,7 @@ class Probe:
     pixel_clock_hz : float
         Of the camera.
     held : Held, optional
-        The windows on the camera's video line, for the sources of the line (`core.line`).
+        The windows on the camera's video line, for the sources of the line (`camera.line`).
 
     Notes
     -----

@@ -163,7 +163,7 @@ class Light:
         return replace(self, dots=(dx, dy, w))
 
     def convolved(self, kernel: np.ndarray, far: np.ndarray | None = None) -> Light:
-        """Return the light after a tabulated point spread: odd sides, ``FINE`` points per pixel; ``far``: its tail, see `core.raster`."""
+        """Return the light after a tabulated point spread: odd sides, ``FINE`` points per pixel; ``far``: its tail, see `camera.raster`."""
         new = np.asarray(kernel, float)
         if new.ndim != 2 or not all(s % 2 for s in new.shape) or not np.isfinite(new).all() or new.sum() <= 0:
             raise InputError("a point spread cannot be used", value=new.shape, allowed="a finite array with odd sides and a positive sum")

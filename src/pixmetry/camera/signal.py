@@ -18,9 +18,9 @@ class Kind(StrEnum):
     ``PHOTONS`` mean photons per pixel and exposure; ``ELECTRONS`` charge (mean before, a sample after the shot noise); ``DN`` the
     analogue signal in units of the converter's step, black at 0; ``CODES`` stored whole numbers.
 
-    Two kinds are functions that are not sampled yet: ``LIGHT``, a scene as pixels will look at it (`core.light`), before ``PHOTONS``; and
-    ``VIDEO``, the line signal in time (`core.line`), between ``DN`` of the pixels and ``DN`` of the samples. The camera samples them at the
-    first source that takes numbers.
+    Two kinds are functions that are not sampled yet: ``LIGHT``, a scene as pixels will look at it (`camera.light`), before ``PHOTONS``;
+    and ``VIDEO``, the line signal in time (`camera.line`), between ``DN`` of the pixels and ``DN`` of the samples. The camera samples them
+    at the first source that takes numbers.
     """
 
     LIGHT = "light"

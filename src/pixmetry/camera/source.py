@@ -106,7 +106,7 @@ class Source:
     held_by : tuple of str
         Sources under whose names frames without targets show all of it. A budget in which these are measured does not count it once more.
     gum_class : str
-        Class of its contribution, see ``core.contribution``.
+        Class of its contribution, see ``camera.contribution``.
     equation, typical_size : str
         For the listing and the docs.
     references : tuple of str

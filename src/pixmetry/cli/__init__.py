@@ -24,7 +24,7 @@ EXIT_ERROR = 2
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as a shell reports it
 COMPILING = (
     "compiling kernels for this processor, once after an installation or an upgrade: a minute or so for this command; "
-    "`pixmetry warm-up` does it for all of them"
+    "`pixmetry warm-up` compiles those of all commands"
 )
 _OS_REMEDIES = {errno.ENOSPC: "make room, or choose another folder", errno.ENAMETOOLONG: "choose a shorter name"}
 
@@ -49,7 +49,7 @@ _PLAIN |= {"σ": "sigma", "η": "eta", "δ": "delta", "°": " deg", "⁻": "-", 
 
 
 def _plain(problem: UnicodeError) -> tuple[str, int]:
-    """Write what a terminal's encoding has no sign for in letters that it has: an error handler of codecs."""
+    """Replace characters that the terminal's encoding does not have by characters that it has: an error handler of codecs."""
     if not isinstance(problem, UnicodeEncodeError):
         raise problem
     signs = problem.object[problem.start : problem.end]
@@ -61,7 +61,7 @@ codecs.register_error("pixmetry.plain", _plain)
 
 
 class LazyGroup(click.Group):
-    """A group whose commands are imported one at a time, and whose deliberate errors are one line each."""
+    """A group that imports a command when it is used, and prints an error of pixmetry in one line."""
 
     def main(self, *args: Any, **kwargs: Any) -> Any:
         for stream in (sys.stdout, sys.stderr):
@@ -86,7 +86,7 @@ class LazyGroup(click.Group):
         try:
             return super().make_context(*args, **kwargs)
         except click.UsageError as problem:
-            raise _told(problem) from None
+            raise _printed(problem) from None
 
     def invoke(self, ctx: click.Context) -> Any:
         from pixmetry.core.compiling import tell_when_compiling
@@ -95,7 +95,7 @@ class LazyGroup(click.Group):
         try:
             return super().invoke(ctx)
         except click.UsageError as problem:
-            raise _told(problem) from None
+            raise _printed(problem) from None
         except PixmetryError as error:
             echo(f"error: {' '.join(str(error).split())}", err=True)
             ctx.exit(EXIT_ERROR)
@@ -109,7 +109,7 @@ class LazyGroup(click.Group):
         except UnicodeEncodeError as problem:
             if "surrogates" not in problem.reason:
                 raise
-            click.echo("error: a path holds bytes that are no UTF-8; to do: rename the file or folder", err=True)
+            click.echo("error: a path is not valid UTF-8; to do: rename the file or folder", err=True)
             ctx.exit(EXIT_ERROR)
         except MemoryError as problem:
             said = f" ({problem})" if str(problem) else ""
@@ -120,8 +120,8 @@ class LazyGroup(click.Group):
             ctx.exit(EXIT_INTERRUPTED)
 
 
-def _told(problem: click.UsageError) -> Exception:
-    """Print a mistake in the arguments in one line; what is left to raise."""
+def _printed(problem: click.UsageError) -> Exception:
+    """Print a wrong argument in one line, and return the exception to raise."""
     if isinstance(problem, click.exceptions.NoArgsIsHelpError):
         return problem
     name = problem.ctx.command_path if problem.ctx else "pixmetry"

@@ -1,4 +1,4 @@
-"""What commands print: names of files and cameras cannot give a terminal orders."""
+"""What commands print, with control characters made visible: a name of a file cannot send commands to the terminal."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ def echo(line: str, err: bool = False) -> None:
 
 
 def echo_lines(text: str, err: bool = False, nl: bool = True) -> None:
-    """Print several lines, whose ends stay."""
+    """Print several lines; line ends are kept, other control characters are shown as ``\\x1b``."""
     click.echo(shown_lines(text), err=err, nl=nl)
 
 
 def console(**options: Any) -> Console:
-    """A console that shows control characters in what it is given as ``\\x1b``; its own colours are drawn.
+    """A console that shows control characters in its input as ``\\x1b``; its own colours are drawn.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""``--json FILE``, which means the same in every command: the result for programs, in a file or, with ``-``, printed."""
+"""``--json FILE``, which means the same in every command: the result as JSON, in a file or, with ``-``, printed."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ import click
 def json_option(what: str, parameter: str = "json_file") -> Callable[[Any], Any]:
     """The option ``--json FILE`` of a command, as this parameter of it; ``what`` says in words what is written."""
     kind = click.Path(path_type=Path, allow_dash=True)
-    told = f"Write {what} as JSON into this file. With - only the JSON is printed."
-    return click.option("--json", parameter, type=kind, metavar="FILE", help=told)
+    text = f"Also write {what} as JSON into this file. With - only the JSON is printed."
+    return click.option("--json", parameter, type=kind, metavar="FILE", help=text)
 
 
 class JsonResult:

@@ -1,4 +1,4 @@
-"""``--pdf FILE``, which means the same in every command: the page of the result, on paper."""
+"""``--pdf FILE``, which means the same in every command: the page of the result as PDF."""
 
 from __future__ import annotations
 

@@ -21,24 +21,33 @@ LISTED = 8  # contributions that the console names
 @click.command()
 @click.argument("campaign", required=False, type=click.Path(path_type=Path))
 @click.option(
-    "-o", "--output", type=click.Path(path_type=Path), default=Path("pixmetry-report"), show_default=True, help="Folder for the results."
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path),
+    default=Path("pixmetry-report"),
+    show_default=True,
+    metavar="FOLDER",
+    help="Folder for the results.",
 )
 @click.option(
     "--target",
     default="",
-    help="Target of the error budget. Default: disc:diameter=7,blur=0.7,peak=0.6,background=0.02 (px, and shares of saturation).",
+    metavar="KIND:KEY=NUMBER,…",
+    help="Target of the error budget: sizes in px, light as a share of saturation. Default: "
+    "disc:diameter=7,blur=0.7,peak=0.6,background=0.02.",
 )
 @click.option(
     "--estimator",
     default="auto",
     show_default=True,
     metavar="NAME",
-    help="Method that locates the target, as in `pixmetry locate`. 'list' shows all.",
+    help="Estimator that locates the target, as in `pixmetry locate`. 'list' shows all.",
 )
 @click.option(
     "--calibration",
     type=click.Path(path_type=Path),
-    help="Results of `pixmetry calibrate` (folder): the budget takes positions as corrected for the lens.",
+    metavar="FOLDER|FILE",
+    help="Results of `pixmetry calibrate` (the folder, or its calibration.json): positions in the budget are corrected for the lens.",
 )
 @click.option(
     "--trials",
@@ -67,7 +76,7 @@ def assess(
     is assessed: a crop of a real CCD camera's data set.
 
     The folder of results gets report.html, results.json, maps.zarr.zip, and camera.yaml with camera.maps.npz. The last two are the
-    camera's digital twin for `pixmetry simulate`.
+    camera's digital twin: a simulated camera for `pixmetry simulate`.
     """
     if estimator == "list":
         list_estimators()
@@ -93,7 +102,7 @@ def list_estimators() -> None:
     from pixmetry.locate.centroids.fixed import LAWS, PREFIX
     from pixmetry.locate.estimators import estimators
 
-    words = "over a fixed square of pixels; window=13, and sigma=3 of a threshold"
+    words = "over a fixed square of pixels; options window=13 (px) and sigma=3 (threshold over the noise)"
     fixed = {f"{PREFIX}{law}": f"{law.replace('_', ' ')} {words}" for law in LAWS}
     for name, text in {**estimators("disc"), **fixed}.items():
         click.echo(f"{name:<24} {text}")

@@ -31,35 +31,49 @@ SIZES = {
 @click.option("--angle", type=float, help="Direction of an ellipse's major axis, of a line or of an edge, degrees from x towards y.")
 @click.option("--width", type=float, help="Width of a line, px. Default: a thin line, as wide as its blur.")
 @click.option("--length", type=float, help="Length of a line or edge, px.")
-@click.option("--blur", type=float, required=True, help="Blur of the edge or spot: standard deviation without the pixel, px.")
-@click.option("--amplitude", type=float, required=True, help="Grey values above the background; negative for a dark target.")
 @click.option(
-    "--background", type=float, default=0.0, show_default=True, help="Grey value of the background, above the camera's black level."
+    "--blur", type=float, required=True, help="Blur of the edge or spot, without the pixel: standard deviation of a Gaussian, px."
+)
+@click.option("--amplitude", type=float, required=True, help="Height of the target above the background, DN. Negative for a dark target.")
+@click.option("--background", type=float, default=0.0, show_default=True, help="Background above the camera's black level, DN.")
+@click.option(
+    "--noise",
+    metavar="KEY=NUMBER,…",
+    help="Noise in DN, such as read=1.5,gain=0.01,bits=8. Keys: read, gain, prnu, dsnu, black, bits. Default: read=1.5.",
 )
 @click.option(
-    "--noise", metavar="KEY=NUMBER,…", help="Noise in DN, such as read=1.5,gain=0.01,bits=8. Keys: read, gain, prnu, dsnu, black, bits."
+    "--camera", metavar="PRESET|FILE", help="Camera that gives noise, bits, pitch and aperture: the name of a preset, or a camera file."
 )
-@click.option("--camera", metavar="FILE|PRESET", help="Take noise, bits, pitch and aperture from this camera file or preset.")
-@click.option("--no-rounding", is_flag=True, help="Grey values are not rounded to whole numbers.")
+@click.option("--no-rounding", is_flag=True, help="Compute for grey values that are not rounded to whole numbers.")
 @click.option(
     "--unknowns",
     default="shape",
     show_default=True,
-    help="What is estimated beside the position: position (nothing), light, shape, planes, or names of parameters.",
+    metavar="SET|NAMES",
+    help="What is unknown: position (nothing else), light (also amplitude and background), shape (also outline and blur), planes (also "
+    "slopes of background and light), or names of parameters.",
 )
-@click.option("--estimator", default="template", show_default=True, help="Estimator whose limits are shown. A wrong name lists all.")
+@click.option(
+    "--estimator",
+    default="template",
+    show_default=True,
+    metavar="NAME",
+    help="Estimator whose causes of error are listed. An unknown name lists all.",
+)
 @click.option("--frames", type=click.IntRange(1), default=1, show_default=True, help="Number of frames that are averaged.")
 @click.option("--aperture", type=float, help="Side of the pixel's light-sensitive square, px. Default: the camera's, or 1.")
-@click.option("--window", type=int, help="Side of the window, px, an odd number. Default: as far as the target reaches.")
-@click.option("--phases", type=int, default=5, show_default=True, help="Number of sub-pixel positions along x and along y.")
+@click.option(
+    "--window", type=int, help="Side of the window around the target, px, an odd number. Default: large enough for the whole target."
+)
+@click.option("--phases", type=int, default=5, show_default=True, help="Number of sub-pixel positions in x and in y that are averaged.")
 @click.option(
     "--light-on",
     type=click.Choice(["surface", "image"]),
     default="surface",
     show_default=True,
-    help="Where light that falls off across a target acts.",
+    help="Where light that falls off across a target acts: on the surface before the blur, or on the image after it.",
 )
-@json_option("what is possible")
+@json_option("the results")
 def bound(
     kind: str,
     blur: float,

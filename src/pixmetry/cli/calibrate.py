@@ -26,6 +26,7 @@ OPTIONS = ("field", "loss", "folds", "residual_grid", "snoop", "a_priori")
     type=click.Path(path_type=Path),
     default=Path("pixmetry-calibration"),
     show_default=True,
+    metavar="FOLDER",
     help="Folder for the results.",
 )
 @click.option("--kind", type=click.Choice(KINDS), help="Kind of test field in the images. Default: chessboard.")
@@ -44,11 +45,14 @@ OPTIONS = ("field", "loss", "folds", "residual_grid", "snoop", "a_priori")
 )
 @click.option("--channel", type=click.Choice(["red", "green", "blue"]), help="Channel to use of colour images.")
 @click.option("--raw", metavar="WxH:FORMAT", help="Layout of files without a header, e.g. 1920x1200:Mono12p (GenICam's names).")
-@click.option("--noise", metavar="WHAT", help="Noise of the images, as in `pixmetry locate`. Default: estimated from each image.")
+@click.option(
+    "--noise", metavar="CAMERA|KEY=NUMBER,…", help="Noise of the images, as in `pixmetry locate`. Default: estimated from each image."
+)
 @click.option(
     "--camera",
     metavar="PRESET|FILE",
-    help="Camera of the images: gives frame size and pixel pitch. The results get its camera.yaml with the calibrated lens.",
+    help="Camera that gives frame size and pixel pitch: the name of a preset, or a camera file. The results get its camera.yaml with the "
+    "calibrated lens.",
 )
 @click.option(
     "--pixel-um", type=click.FloatRange(0, min_open=True), help="Pixel pitch, µm. Without it, lengths in the camera are in pixels."
@@ -63,23 +67,28 @@ OPTIONS = ("field", "loss", "folds", "residual_grid", "snoop", "a_priori")
 )
 @click.option("--free", metavar="NAMES", help="Parameters to estimate, such as c,xp,yp,k1,k2. Default: c,xp,yp,b1,b2,p1,p2,k1,k2,k3.")
 @click.option(
-    "--per-image", metavar="NAMES", help="Parameters to estimate for each image (clock of a frame grabber): x_scale, x_shift, or both."
+    "--per-image",
+    metavar="NAMES",
+    help="Parameters to estimate for each image (clock of a frame grabber): x_scale, x_shift, or both. Default: none.",
 )
 @click.option(
     "--field",
     type=click.Choice(["auto", "fixed", "free"]),
-    help="Coordinates of the test field: take them as exact (fixed), estimate them (free), or decide by a test (auto).",
+    help="Coordinates of the test field: take them as exact (fixed), estimate them (free), or decide by a test (auto). "
+    "Default for images: auto.",
 )
 @click.option(
-    "--loss", type=click.Choice(["huber", "cauchy", "none"]), help="Robust loss of the first pass, before the search for gross errors."
+    "--loss",
+    type=click.Choice(["huber", "cauchy", "none"]),
+    help="Robust loss of the first pass, before the search for gross errors. Default: huber.",
 )
 @click.option(
     "--folds",
     type=click.IntRange(0),
-    help="Number of folds for cross-validation: parts of the images that are left out of the fit in turn. 0: none.",
+    help="Number of folds for cross-validation: parts of the images that are left out of the fit in turn. 0: none. Default: 5.",
 )
 @click.option(
-    "--residual-grid", is_flag=True, default=None, help="Also estimate a correction grid for the residuals that the parameters leave."
+    "--residual-grid", is_flag=True, default=None, help="Also estimate a correction grid for residuals that the parameters do not explain."
 )
 @click.option("--no-snoop", "snoop", is_flag=True, flag_value=False, default=None, help="Do not search for gross errors.")
 @click.option(
@@ -98,7 +107,7 @@ OPTIONS = ("field", "loss", "folds", "residual_grid", "snoop", "a_priori")
     help="Largest error that the export to OpenCV or COLMAP may add anywhere in the frame, px.",
 )
 @pdf_option()
-@json_option("the cameras and what was found")
+@json_option("the cameras and the findings")
 @click.option("--threads", type=click.IntRange(1), help="Number of threads. Default: one for each processor.")
 def calibrate(
     sources: tuple[Path, ...],
@@ -116,8 +125,8 @@ def calibrate(
     The argument is a project file (YAML) that names tables of image coordinates or images with targets. Or it is the images themselves
     (files or folders), of a flat test field or of straight lines.
 
-    The folder of results gets report.html, calibration.json and residuals.csv; except for straight lines also points.csv and poses.csv.
-    An export that OpenCV or COLMAP cannot hold is refused with the reason. The results are written even then.
+    The folder of results gets report.html, calibration.json, residuals.csv, points.csv and poses.csv (straight lines have no points and no
+    poses). An export that OpenCV or COLMAP cannot hold is refused with the reason. The results are written even then.
 
     docs/calibrating.md explains every key of a project file and every message.
     """

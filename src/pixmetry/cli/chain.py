@@ -13,18 +13,26 @@ from pixmetry.cli._pdf import check_pdf, pdf_option, put_pdf
 @click.command()
 @click.argument("camera")
 @click.argument("scene", type=click.Path(path_type=Path))
-@click.option("-o", "--output", type=click.Path(path_type=Path, dir_okay=False), required=True, help="File of the page (HTML).")
+@click.option(
+    "-o", "--output", type=click.Path(path_type=Path, dir_okay=False), required=True, metavar="FILE", help="File of the page (HTML)."
+)
 @click.option(
     "--target", type=click.IntRange(0), help="Number of the target in the scene. Default: the one nearest to the middle of the frame."
 )
 @click.option("--frame", type=click.IntRange(0), default=0, show_default=True, help="Number of the frame in the sequence.")
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the temporal noise.")
+@click.option(
+    "--seed",
+    type=click.IntRange(0),
+    default=0,
+    show_default=True,
+    help="Seed of the temporal noise. Another seed gives other noise of the same camera.",
+)
 @click.option(
     "--set",
     "settings",
     multiple=True,
     metavar="NAME.PARAMETER=VALUE",
-    help="Change a parameter of an error source, or a value of the camera itself. May be repeated.",
+    help="Change a parameter of an error source, or a value of the camera itself (exposure_s=0.02, unit_seed=7). May be repeated.",
 )
 @click.option("--off", multiple=True, metavar="NAME", help="Switch an error source off. May be repeated.")
 @pdf_option()
@@ -41,8 +49,8 @@ def chain(
 ) -> None:
     """Show on one page how each error source of a camera moves a target.
 
-    CAMERA is a camera file or the name of a preset. SCENE is a scene file. The page shows the image and its profiles after every error
-    source, how far the target's centre has moved so far, and which source moved it.
+    CAMERA is a camera file or the name of a preset. SCENE is a scene file. For every error source in the order of the light, the page shows
+    the image of the target and its profiles after this source, by how much the source moved the centre, and how far it has moved so far.
     """
     from pixmetry.camera.camera import load_camera
     from pixmetry.camera.overrides import changed_camera, parse_overrides

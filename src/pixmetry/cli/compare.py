@@ -1,4 +1,4 @@
-"""``pixmetry compare``: what changed, in units of its uncertainty; who stands out; what is within its limits."""
+"""``pixmetry compare``: changes in units of their uncertainty, cameras that stand out, and limits that hold."""
 
 from __future__ import annotations
 
@@ -23,22 +23,32 @@ if TYPE_CHECKING:
 EXIT_DIFFERENT = 1
 SCHEMA = "pixmetry/compared/1"
 QUIET = ("same", "equal", "setting")
-LARGEST = 3  # so many of the differences that are not significant are shown
+LARGEST = 3  # number of differences that are shown although they are not significant
 
 
 @click.command()
 @click.argument("files", nargs=-1, required=True, type=click.Path(path_type=Path))
-@click.option("--limits", type=click.Path(path_type=Path), help="File of limits (YAML) for the values of each file.")
-@click.option("--level", type=float, default=0.95, show_default=True, help="Confidence level for all values together.")
-@click.option("--same-light", is_flag=True, help="Both measurements share one calibration of the light.")
+@click.option("--limits", type=click.Path(path_type=Path), metavar="FILE", help="File of limits (YAML) for the values of each file.")
+@click.option(
+    "--level",
+    type=float,
+    default=0.95,
+    show_default=True,
+    help="Confidence level for all values together: the chance that no value is called changed by chance alone.",
+)
+@click.option(
+    "--same-light",
+    is_flag=True,
+    help="Both measurements used the same calibration of the light: leave its uncertainty out of the differences.",
+)
 @click.option("--all", "everything", is_flag=True, help="Also show the values that did not change.")
 @json_option("the comparison")
 def compare(files: tuple[Path, ...], limits: Path | None, level: float, same_light: bool, everything: bool, json_file: Path | None) -> None:
     """Compare measurements with each other, with a fleet of cameras, or with limits.
 
     FILES are EMVA 1288 data sheets (JSON or XML), assessments (results.json or its folder) or calibrations (calibration.json or its
-    folder). Two files are compared with each other.
-    Of three files or more, each is compared with the median of all. With --limits one file is enough.
+    folder). Two files are compared with each other. Of three files or more, each is compared with the median of all. With --limits one file
+    is enough.
 
     Exit status: 0 if nothing changed and all limits hold; 1 if a value changed, stands out, fails or is undecided; 2 after an error.
     """
@@ -49,7 +59,7 @@ def compare(files: tuple[Path, ...], limits: Path | None, level: float, same_lig
     if len(files) == 1 and limits is None:
         raise InputError("one file cannot be compared", where=str(files[0]), remedy="name a second one, or --limits")
     if same_light and len(files) != 2:
-        raise InputError("is for two files", where="--same-light", remedy="leave it away")
+        raise InputError("is for two files", where="--same-light", remedy="leave it out")
     written = JsonResult(json_file, SCHEMA, inputs=files)
     console = plain_console(width=116, quiet=written.printed)
     record: dict[str, Any] = {}
@@ -118,13 +128,13 @@ def _print_pair(result: Comparison, console: Console, everything: bool) -> None:
     if rows:
         console.print(table)
     words = {word: word for word in ("changed", "differs", "undecided", "only A", "only B")}
-    words |= {"same": "the same within u", "equal": "equal as numbers", "setting": "places in the series, not judged"}
+    words |= {"same": "the same within u", "equal": "equal as numbers", "setting": "numbers of levels in the series, not judged"}
     numbers = {verdict: len(result.of(verdict)) for verdict in words}
     console.print("; ".join(f"{n} {words[verdict]}" for verdict, n in numbers.items() if n) + ".", soft_wrap=True)
     if result.decisions:
         chance = f"{100 * (1 - result.level):.3g} %"
         console.print(
-            f"{result.decisions} decisions, judged together: a chance of at most {chance} that any “changed” is false.", soft_wrap=True
+            f"{result.decisions} decisions, judged together: the chance that any “changed” is false is at most {chance}.", soft_wrap=True
         )
 
 
@@ -154,13 +164,13 @@ def _print_fleet(result: Fleet, console: Console, everything: bool) -> None:
     chance = f"{100 * (1 - result.level):.3g} %"
     console.print(
         f"{len(result.names)} cameras, {len(result.rows)} values; in {odd} of them a camera stands out "
-        f"(of cameras of one kind, any would with a chance of at most {chance}).",
+        f"(if all cameras are alike, the chance that any stands out is at most {chance}).",
         soft_wrap=True,
     )
 
 
 def _last_parts(names: Sequence[str]) -> list[str]:
-    """Paths without what is not needed to tell them apart."""
+    """The shortest ends of the paths that still differ from each other."""
     parts = [Path(name).parts for name in names]
     for n in range(1, max(map(len, parts), default=0)):
         short = ["/".join(p[-n:]) for p in parts]
@@ -204,7 +214,7 @@ def _named(key: str, channel: str) -> str:
 
 
 def _shown(value: Number | None) -> str:
-    """A value with its uncertainty, as far as the uncertainty lets its digits go."""
+    """A value with its uncertainty, rounded to two digits of the uncertainty."""
     from pixmetry.report.numbers import decimals_of, fixed, significant
 
     if value is None or isnan(value.value):

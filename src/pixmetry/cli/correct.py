@@ -1,4 +1,4 @@
-"""``pixmetry correct``: take out of frames what was measured."""
+"""``pixmetry correct``: frames without the errors that an assessment measured."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pixmetry.cli._console import echo
 @click.command()
 @click.argument("frames", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option("--with", "results", type=click.Path(path_type=Path), required=True, help="The results.json of an assessment of this camera.")
-@click.option("-o", "--output", type=click.Path(path_type=Path), required=True, help="Folder for the corrected frames.")
+@click.option("-o", "--output", type=click.Path(path_type=Path), required=True, metavar="FOLDER", help="Folder for the corrected frames.")
 @click.option("--raw", metavar="WxH:FORMAT", help="Layout of files without a header, e.g. 1920x1200:Mono12p (GenICam's names).")
 @click.option("--threads", type=click.IntRange(1), help="Number of threads. Default: one for each processor.")
 def correct(frames: tuple[Path, ...], results: Path, output: Path, raw: str | None, threads: int | None) -> None:

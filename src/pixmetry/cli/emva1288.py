@@ -41,7 +41,7 @@ WISHES = {"u_gain": ("K", "%"), "u_dark_noise": ("sigma_d", "%"), "u_dsnu": ("DS
     type=click.Choice(["4.0", "3.1", "reference"]),
     default="4.0",
     show_default=True,
-    help="Release of the standard; 'reference' computes as the public implementation does.",
+    help="Release of the standard; 'reference' computes as the public reference implementation does.",
 )
 @click.option(
     "--bayer",
@@ -49,19 +49,23 @@ WISHES = {"u_gain": ("K", "%"), "u_dark_noise": ("sigma_d", "%"), "u_dsnu": ("DS
     help="Colour filter array. Each of its four phases is tested as a camera of its own.",
 )
 @json_option("the results (or the checks of --preflight)", "json")
-@click.option("--xml", type=FILE, help="Write the results in the public EMVA 1288 format.")
-@click.option("--html", type=FILE, help="Write the data sheet as a page (HTML).")
+@click.option("--xml", type=FILE, metavar="FILE", help="Also write the results in the public EMVA 1288 format.")
+@click.option("--html", type=FILE, metavar="FILE", help="Also write the data sheet as a page (HTML).")
 @click.option("--report", type=FILE, hidden=True)  # as --html was called until 0.1
-@click.option("--pdf", type=FILE, help="Write the data sheet as PDF.")
+@click.option("--pdf", type=FILE, metavar="FILE", help="Also write the data sheet as PDF.")
 @click.option(
     "--bootstrap",
     type=click.IntRange(0),
     default=0,
     metavar="DRAWS",
-    help="Compute u by a bootstrap over frames and levels, with so many draws.",
+    help="Compute u by a bootstrap over frames and levels, with this number of draws. Default: 0, by propagation of distributions.",
 )
 @click.option(
-    "--photons-u", type=click.FloatRange(0, 99), default=0.0, metavar="PERCENT", help="Relative standard uncertainty of the photon counts."
+    "--photons-u",
+    type=click.FloatRange(0, 99),
+    default=0.0,
+    metavar="PERCENT",
+    help="Relative standard uncertainty of the photon counts, in percent. Default: 0.",
 )
 @click.option("--compare", nargs=2, type=FILE, metavar="A B", help="Compare two data sheets (XML or JSON); differences are in units of u.")
 @click.option("--plan", is_flag=True, help="Plan a test: which frames to take for the wanted uncertainties.")
@@ -77,7 +81,9 @@ WISHES = {"u_gain": ("K", "%"), "u_dark_noise": ("sigma_d", "%"), "u_dsnu": ("DS
     metavar="PERCENT",
     help="With --plan: wanted u of the dark noise, in percent of the dark noise.",
 )
-@click.option("--u-dsnu", type=click.FloatRange(0, min_open=True), metavar="E", help="With --plan: wanted u of the DSNU, in electrons.")
+@click.option(
+    "--u-dsnu", type=click.FloatRange(0, min_open=True), metavar="ELECTRONS", help="With --plan: wanted u of the DSNU, in electrons."
+)
 @click.option(
     "--u-prnu",
     type=click.FloatRange(0, min_open=True),
@@ -89,13 +95,13 @@ WISHES = {"u_gain": ("K", "%"), "u_dark_noise": ("sigma_d", "%"), "u_dsnu": ("DS
     type=click.Choice(["exposure", "light"]),
     default="exposure",
     show_default=True,
-    help="With --plan: vary the exposure time or the light.",
+    help="With --plan: what is varied from level to level, the exposure time or the light.",
 )
 @click.option(
     "--saturation-s", type=click.FloatRange(0, min_open=True), help="With --plan: exposure time that saturates the camera, in seconds."
 )
 @click.option("--frame-rate", type=click.FloatRange(0, min_open=True), help="With --plan: frames per second.")
-@click.option("--manifest", type=FILE, help="With --plan: write the manifest of the planned campaign (YAML).")
+@click.option("--manifest", type=FILE, metavar="FILE", help="With --plan: write the manifest of the planned campaign (YAML).")
 @click.option("--preflight", is_flag=True, help="Check a few frames before you take a long series.")
 @click.option("--dark", multiple=True, type=FILE, help="With --preflight: dark frames, a file or a folder. May be repeated.")
 @click.option(
@@ -148,7 +154,7 @@ def _mode(ctx: click.Context, given: dict[str, Any]) -> str:
         name = "--" + foreign[0].replace("_", "-")
         homes = [f"--{mode}" if mode != "test" else "a test" for mode, own in OPTIONS.items() if foreign[0] in own]
         place = "a test" if modes[0] == "test" else f"--{modes[0]}"
-        raise InputError(f"has no meaning with {place}", where=name, allowed=f"with {' or '.join(homes)}", remedy="leave it away")
+        raise InputError(f"has no meaning with {place}", where=name, allowed=f"with {' or '.join(homes)}", remedy="leave it out")
     return modes[0]
 
 
@@ -161,7 +167,7 @@ def refuse(campaigns: Sequence[Path], option: str, why: str) -> None:
         If there are any.
     """
     if campaigns:
-        raise InputError(f"takes no campaign: {why}", where=option, value=str(campaigns[0]), remedy="leave it away")
+        raise InputError(f"takes no campaign: {why}", where=option, value=str(campaigns[0]), remedy="leave it out")
 
 
 def test(campaigns: Sequence[Path], given: dict[str, Any]) -> None:
@@ -266,7 +272,7 @@ def _known_cameras(source: Path | None, bayer: str | None, more: dict[str, Any])
         from pixmetry.emva.files.sheets import read_sheet
 
         if bayer is not None:
-            raise InputError("has no meaning with a data sheet, which states its channels", where="--bayer", remedy="leave it away")
+            raise InputError("has no meaning with a data sheet, which states its channels", where="--bayer", remedy="leave it out")
         sheet = read_sheet(source)
         if not sheet.results:
             raise InputError("the data sheet holds no results", where=str(source), remedy="make it again")
@@ -307,7 +313,7 @@ def _looked_at(campaigns: Sequence[Path], given: dict[str, Any]) -> tuple[dict[s
                 raise InputError("is missing", where=f"--{name}", remedy="give --dark, --bright and --bits, or a campaign")
         return _look_at_files(given["dark"], given["bright"], given["bits"], given["bayer"]), (*given["dark"], *given["bright"])
     if given["bits"]:
-        raise InputError("has no meaning with a campaign, which states its bits", where="--bits", remedy="leave it away")
+        raise InputError("has no meaning with a campaign, which states its bits", where="--bits", remedy="leave it out")
     if len(campaigns) > 1:
         raise InputError("looks at one campaign", where="--preflight", value=len(campaigns), remedy="name one")
     campaign = load_campaign(campaigns[0] if campaigns else None)

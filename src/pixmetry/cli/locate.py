@@ -10,25 +10,32 @@ from pixmetry.cli._console import echo, echo_lines
 
 EXIT_NOTHING_FOUND = 1
 MOST_NAMED = 5
-NOT_FOUND = "check --kind and --polarity; targets must be less than half of the picture"
+NOT_FOUND = "check --kind and --polarity; targets must cover less than half of the image"
 KINDS = ("disc", "ellipse", "ring", "spot", "line", "edge", "cross", "chessboard", "coded")
 
 
 @click.command()
 @click.argument("images", nargs=-1, type=click.Path(path_type=Path))
-@click.option("--kind", type=click.Choice(KINDS), default="disc", show_default=True, help="What to look for.")
+@click.option("--kind", type=click.Choice(KINDS), default="disc", show_default=True, help="Kind of target or line.")
 @click.option(
     "--estimator",
     default="auto",
     show_default=True,
     metavar="NAME",
-    help="Method that measures the positions. 'list' shows all for this kind.",
+    help="Estimator that measures the positions. 'list' shows all for this kind.",
 )
 @click.option(
-    "-o", "--output", type=click.Path(path_type=Path), help="File of the table: .csv, .parquet or .json. Default: CSV on standard output."
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="File of the table: .csv, .parquet or .json. Default: CSV on standard output.",
 )
 @click.option(
-    "--overlay", type=click.Path(path_type=Path), help="Also draw what was found into a PNG. With several images: a folder of PNGs."
+    "--overlay",
+    type=click.Path(path_type=Path),
+    metavar="FILE|FOLDER",
+    help="Also draw the results into the image (PNG file). With several images: a folder of PNG files.",
 )
 @click.option(
     "--polarity",
@@ -44,14 +51,16 @@ KINDS = ("disc", "ellipse", "ring", "spot", "line", "edge", "cross", "chessboard
 )
 @click.option(
     "--noise",
-    metavar="WHAT",
+    metavar="CAMERA|KEY=NUMBER,…",
     help="Noise of the image: a camera (preset or camera.yaml), or read=1.5,gain=0.01,black=16 in DN. Default: estimated from the image.",
 )
 @click.option(
-    "--bits", type=click.IntRange(1, 16), help="Bits of a stored value; they tell where values saturate. Default: from the image."
+    "--bits",
+    type=click.IntRange(1, 16),
+    help="Bits of a stored value. They give the value at which pixels saturate. Default: from the image.",
 )
 @click.option(
-    "--aperture", type=click.FloatRange(0, 1), default=1.0, show_default=True, help="Side of the pixel's light-sensitive square, in pixels."
+    "--aperture", type=click.FloatRange(0, 1), default=1.0, show_default=True, help="Side of the pixel's light-sensitive square, px."
 )
 @click.option(
     "--light-on",
@@ -101,7 +110,7 @@ def locate(
     set_threads(threads)
     if skipped := skipped_files(images, raw):
         named = ", ".join(skipped[:MOST_NAMED]) + (f" and {len(skipped) - MOST_NAMED} more" if len(skipped) > MOST_NAMED else "")
-        echo(f"skipped, no image by {'its name' if len(skipped) == 1 else 'their names'}: {named}", err=True)
+        echo(f"skipped, not named like an image: {named}", err=True)
     with shown_progress() as progress:
         table = locate_files(
             images,

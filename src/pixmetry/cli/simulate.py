@@ -13,7 +13,7 @@ from pixmetry.cli._console import echo
 @click.argument("camera")
 @click.argument("scene", type=click.Path(path_type=Path))
 @click.option("-n", "--frames", type=click.IntRange(1), default=1, show_default=True, help="Number of frames.")
-@click.option("-o", "--output", type=click.Path(path_type=Path), required=True, help="Folder for the frames.")
+@click.option("-o", "--output", type=click.Path(path_type=Path), required=True, metavar="FOLDER", help="Folder for the frames.")
 @click.option(
     "--seed",
     type=click.IntRange(0),
@@ -29,7 +29,9 @@ from pixmetry.cli._console import echo
     show_default=True,
     help="One image file for each frame (tiff, png), or one Zarr array for all frames.",
 )
-@click.option("--truth", is_flag=True, help="Also write truth.zarr: what every error source did, in this unit and in every frame.")
+@click.option(
+    "--truth", is_flag=True, help="Also write truth.zarr: what every error source did, as maps of this camera and as values of every frame."
+)
 @click.option(
     "--set",
     "settings",

@@ -1,4 +1,4 @@
-"""``pixmetry sources``: the catalogue."""
+"""``pixmetry sources``: the catalogue of error sources."""
 
 from __future__ import annotations
 
@@ -17,8 +17,10 @@ ROOM_FOR_NOTES = 110  # columns of a terminal
 def sources(source_id: str | None, json_file: Path | None) -> None:
     """List the error sources, or explain one of them.
 
-    Without ID: all error sources by stage, with the handbook's stars and notes, and which of the verbs forward, measure, correct and
-    propagate each source has. With ID: its equation, its parameters with units and ranges, its references and its typical size.
+    Without ID: all error sources by stage. Four verbs say what can be done with a source: forward simulates it, measure reads it from dark
+    and bright frames, correct takes it out of frames, propagate gives its contribution to a position. Stars and notes are those of a
+    handbook of camera calibration. With ID: the equation of a source, its parameters with units and ranges, its typical size, and its
+    references.
     """
     from pixmetry.camera.catalogue import catalogue, get_source, to_record
 
@@ -74,7 +76,7 @@ def _list(records: list[dict]) -> None:
         cells = r | {"stars": "★" * r["stars"], "verbs": verbs}
         table.add_row(*(cells[name] for name in names))
     console.print(table)
-    console.print("\nverbs: f forward, m measure, c correct, p propagate; a dash has its reason: `pixmetry sources ID`")
+    console.print("\nverbs: f forward, m measure, c correct, p propagate; `pixmetry sources ID` gives the reason for a dash")
 
 
 def _explain(record: dict) -> None:
@@ -102,7 +104,7 @@ def _explain(record: dict) -> None:
             table.add_row(p["name"], p["unit"], p["range"], f"{p['typical']}", f"{p['bound']}", escape(p["description"]))
         console.print(table, "")
         if record["bound_of_frame"]:
-            console.print(f"The bound is stated over the frame; these numbers are for {record['bound_of_frame']}.\n")
+            console.print(f"The bound holds for the whole frame; the numbers in the table are for a frame of {record['bound_of_frame']}.\n")
     for verb, has in record["verbs"].items():
         console.print(f"{verb:<12}  {'yes' if has else 'no: ' + escape(record['reasons'][verb])}")
-    console.print("\nsources: " + escape("; ".join(record["references"])))
+    console.print("\nreferences: " + escape("; ".join(record["references"])))

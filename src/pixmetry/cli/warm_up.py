@@ -1,4 +1,4 @@
-"""``pixmetry warm-up``: every kernel is compiled into the cache by running what the commands do on something small."""
+"""``pixmetry warm-up``: every kernel is compiled into the cache by running all commands on small inputs."""
 
 from __future__ import annotations
 
@@ -70,8 +70,8 @@ def warm_up() -> None:
     begun = time.monotonic()
     with shown_progress() as progress:
         count, folder = compile_kernels(progress)
-    where = f"kept in {folder}" if folder is not None else "lost when this command ends: no folder for them can be written to"
-    click.echo(f"{count} kernels, compiled or found so, in {time.monotonic() - begun:.0f} s; they are {where}")
+    where = f"kept in {folder}" if folder is not None else "lost when this command ends, because no cache folder can be written"
+    click.echo(f"{count} kernels, compiled now or before, in {time.monotonic() - begun:.0f} s; they are {where}")
 
 
 def compile_kernels(progress: Progress | None = None) -> tuple[int, Path | None]:
@@ -96,7 +96,7 @@ def compile_kernels(progress: Progress | None = None) -> tuple[int, Path | None]
             try:
                 job()
             except PixmetryError:
-                continue  # something too small to be measured: the kernels that it came to are compiled
+                continue  # the input is too small to be measured; the kernels up to there are compiled
         told("compiling", len(jobs), len(jobs))
     return len(all_kernels()), cache_folder()
 
@@ -112,7 +112,7 @@ def all_kernels() -> dict[str, Kernel]:
 
 
 def jobs_in(folder: Path) -> Iterator[Job]:
-    """What is to be run in a folder, with the command's name: as a user types it, in the order in which they need each other's files."""
+    """The commands to run in a folder, each with its name, in the order in which they need each other's files."""
 
     def scene(name: str, text: str) -> Path:
         path = folder / f"{name}.yaml"
@@ -147,11 +147,11 @@ def jobs_in(folder: Path) -> Iterator[Job]:
         yield command("calibrate", copies, "--kind", kind, *options, "--pitch-mm", 20, "-o", folder / f"calibrated-{kind}")
     yield from _locating()
     for kind in BOUNDS:
-        yield command("bound", "--kind", *kind.split(), "--blur", 0.7, "--amplitude", 150, "--camera", PRESET, "--estimator", "all")
+        yield command("bound", "--kind", *kind.split(), "--blur", 0.7, "--amplitude", 150, "--camera", PRESET)
 
 
 def _run(arguments: list[str]) -> None:
-    """Run one command, silently; what it cannot do here is no matter."""
+    """Run one command silently; a refusal does not matter here."""
     from pixmetry.cli import main
 
     with redirect_stdout(StringIO()), redirect_stderr(StringIO()):

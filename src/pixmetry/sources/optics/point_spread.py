@@ -111,7 +111,7 @@ def light_beyond(params: PointSpread, d_um: np.ndarray) -> np.ndarray:
 
 @lru_cache(maxsize=32)
 def kernel(params: PointSpread) -> tuple[np.ndarray, np.ndarray | None]:
-    """The spread on the light's fine raster and its tail, see `core.raster`."""
+    """The spread on the light's fine raster and its tail, see `camera.raster`."""
     if params.model == "diffraction":
         pitch = params.pitch_x_um, params.pitch_y_um
         return spread_of(lambda fx, fy: transfer(params, fx, fy), params.reach_px, lambda d: light_beyond(params, d), pitch)
