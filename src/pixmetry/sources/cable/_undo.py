@@ -86,7 +86,7 @@ def _effect(rest_key: Key, whole_key: Key, col0: int, samples: int) -> np.ndarra
     pixels = max(int(np.ceil(ends[1])) + 2 - first, 1)
     if max(pixels, samples) > MOST_PIXELS:
         raise ParameterError(
-            "the row is too long to take the cable's effect out", value=max(pixels, samples), allowed=f"{MOST_PIXELS} pixels or fewer"
+            "the row is too long for the correction of the cable", value=max(pixels, samples), allowed=f"{MOST_PIXELS} pixels or fewer"
         )
     a, b = (_matrix(line, col0, samples, first, pixels) for line in (whole, rest))
     late = np.arange(first, first + pixels) + whole.delay_s * whole.pixel_clock_hz

@@ -24,7 +24,7 @@ class TPiece(Parameters):
     branch: Literal["none", "open", "terminated"] = quantity("none", "1", "no branch, one with an open end, or one with a termination")
     length_m: float = quantity(1.0, "m", "length of the branch", ge=0, le=200)
     branch_ohm: float = quantity(75.0, "Ω", "characteristic impedance of the branch", gt=10, le=300)
-    end_ohm: float = quantity(75.0, "Ω", "what a terminated branch ends in", gt=0, le=1e6)
+    end_ohm: float = quantity(75.0, "Ω", "termination at the end of the branch", gt=0, le=1e6)
     line_ohm: float = quantity(75.0, "Ω", "characteristic impedance of the cable from the camera", gt=10, le=300)
     load_ohm: float = quantity(75.0, "Ω", "input impedance of the grabber", gt=0, le=1e6)
 
@@ -99,7 +99,8 @@ def propagate(params: TPiece, probe: Probe) -> Contribution:
 SOURCE = Source(
     id="cable.t_piece",
     title="T-piece and double termination",
-    description="A branch at the grabber's input loads the line; an open end returns the signal late, a second termination dims it.",
+    description="A branch at the grabber's input loads the line. An open end reflects the signal with a delay; a second termination "
+    "lowers it.",
     number=25,
     stars=2,
     note="Note 11",
@@ -121,6 +122,6 @@ SOURCE = Source(
     equation="y' = T [y + T' Γ_e Σ_k (Γ' Γ_e)^k y(t − (k+1)τ)],  T = 2Y_0/(Y_0 + Y_L + Y_b),  T' = 2Y_b/(Y_0 + Y_L + Y_b),  Γ' = T' − 1",
     typical_size="level 2/3 when terminated twice; an open stub of matched cable moves a target by τ/4: 0.036 px per metre at 14.19 MHz",
     references=("D. M. Pozar, Microwave Engineering, 4th ed., §2.3 and §4.1 (reflection, and junctions of lines)",),
-    advice="Take T-pieces out, or loop the signal through inputs of high impedance with one termination at the very end.",
-    reasons={"measure": "needs the image of a sharp edge, and the level without the branch: dark and flat frames do not carry them"},
+    advice="Remove T-pieces. Or loop the signal through inputs of high impedance, with one termination at the end of the line.",
+    reasons={"measure": "needs the image of a sharp edge, and the level without the branch: dark and flat frames do not show them"},
 )

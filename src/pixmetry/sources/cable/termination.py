@@ -31,8 +31,8 @@ class Termination(Parameters):
     line_ohm: float = quantity(75.0, "Ω", "characteristic impedance of the cable", gt=10, le=300)
     source_ohm: float = quantity(75.0, "Ω", "output impedance of the camera", gt=0, le=1e4)
     load_ohm: float = quantity(75.0, "Ω", "input impedance of the grabber", gt=0, le=1e6)
-    loss_db: float = quantity(0.0, "dB", "attenuation over one way, alike at all frequencies", ge=0, le=20)
-    skin_db: float = quantity(0.0, "dB", "attenuation over one way at 5 MHz that grows as the root of the frequency", ge=0, le=3)
+    loss_db: float = quantity(0.0, "dB", "attenuation over one way, the same at all frequencies", ge=0, le=20)
+    skin_db: float = quantity(0.0, "dB", "attenuation over one way at 5 MHz; it grows with the square root of the frequency", ge=0, le=3)
 
     @property
     def ghost(self) -> float:
@@ -129,7 +129,8 @@ def propagate(params: Termination, probe: Probe) -> Contribution:
 SOURCE = Source(
     id="cable.termination",
     title="Termination and impedance of the cable",
-    description="A wrong impedance at both ends sends part of the signal to and fro; each echo is a ghost to the right of its target.",
+    description="A wrong impedance at both ends reflects part of the signal back and forth. Each echo is a ghost to the right of the "
+    "target.",
     number=24,
     stars=2,
     note="Note 11",
@@ -151,5 +152,5 @@ SOURCE = Source(
     typical_size="0.030 px for 5 m of 50 Ω cable between 75 Ω ends at 14.19 MHz",
     references=("D. M. Pozar, Microwave Engineering, 4th ed., §2.3 (reflection on a terminated line)",),
     advice="Use 75 Ω cable with 75 Ω at both ends, short, without T-pieces; or a digital camera.",
-    reasons={"measure": "needs the image of a sharp edge or line: dark and flat frames do not carry it"},
+    reasons={"measure": "needs the image of a sharp edge or line: dark and flat frames do not show it"},
 )

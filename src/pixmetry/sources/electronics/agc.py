@@ -17,7 +17,7 @@ DARKEST_DN = 1e-6  # a frame without light asks for all the gain there is
 class Agc(Parameters):
     """A loop that is linear in decibels."""
 
-    target_dn: float = quantity(100.0, "DN", "mean of the whole frame above black that it aims at", gt=0, le=1e9)
+    target_dn: float = quantity(100.0, "DN", "target value of the frame's mean above black", gt=0, le=1e9)
     kappa: float = quantity(0.0, "1", "part of the deviation in decibels that one frame removes; 0 locks the gain", ge=0, le=1)
     lowest_db: float = quantity(0.0, "dB", "lowest gain", ge=-40, le=0)
     highest_db: float = quantity(32.0, "dB", "highest gain", ge=0, le=80)
@@ -60,13 +60,14 @@ def context(params: Agc, windows: Windows, frame_shape: tuple[int, int]) -> Wind
 
 def propagate(params: Agc, probe: Probe) -> Contribution:
     """A common factor moves no centroid whose background and threshold follow it; noise grows with the gain as the signal does."""
-    return probe.contribution((0.0, 0.0), "F", method="a common factor, which background and threshold follow")
+    return probe.contribution((0.0, 0.0), "F", method="a common factor; background and threshold follow it")
 
 
 SOURCE = Source(
     id="electronics.agc",
     title="Automatic gain control",
-    description="The gain follows the scene from frame to frame: grey values, noise and what a fixed threshold cuts off change with it.",
+    description="The gain follows the scene from frame to frame. Grey values and noise change with it, and so does the part of a target "
+    "above a fixed threshold.",
     number=22,
     stars=3,
     parameters=Agc,
@@ -82,11 +83,11 @@ SOURCE = Source(
     start=start,
     gum_class="F",
     equation="g(t+1) = g(t) (y_target/⟨y(t)⟩)^κ,  within the limits",
-    typical_size="no shift where the threshold follows the frame; with a hard threshold of fixed DN from 0.03 to 0.09 px",
+    typical_size="no shift if the threshold follows the frame; 0.03 to 0.09 px with a hard threshold at a fixed DN",
     references=("K. J. Åström, R. M. Murray, Feedback Systems, Princeton 2008 (first-order discrete loop)",),
     advice="Switch it off.",
     reasons={
         "measure": "needs a sequence in which part of the scene changes: frames of steady light do not move the gain",
-        "correct": "the gain of each frame is not in the frame; lock it, or set the threshold relative to the target's peak",
+        "correct": "a frame does not contain its gain; lock the gain, or set the threshold relative to the target's peak",
     },
 )

@@ -21,8 +21,10 @@ class AmplifierNoise(Parameters):
     """White noise, referred to the electrons at the sense node."""
 
     white_e: float = quantity(0.0, "e-", "standard deviation in every pixel", ge=0, le=1e5)
-    tail_share: float = quantity(0.0, "1", "share of the values from a normal law three times as wide; 0: Gaussian", ge=0, le=0.5)
-    clock_ratio: float = quantity(1.0, "1", "pixel clock over the one for which white_e holds: the bandwidth follows it", gt=0, le=1e3)
+    tail_share: float = quantity(0.0, "1", "share of the values from a normal distribution three times as wide; 0: Gaussian", ge=0, le=0.5)
+    clock_ratio: float = quantity(
+        1.0, "1", "pixel clock divided by the clock for which white_e holds; the bandwidth is proportional to it", gt=0, le=1e3
+    )
 
 
 def deviation_e(params: AmplifierNoise) -> float:
@@ -68,7 +70,7 @@ def _without_moving_waves(noise: Estimates, gain: float, found: PatternList, n_f
     u_square = np.sqrt((2 * noise.values[0]) ** 2 * noise.covariance[0, 0] + scatter + float(((amplitude * u_amplitude) ** 2).sum()))
     if square < 3 * u_square:
         limit = float(np.sqrt(max(square, 0.0) + 1.645 * u_square))
-        reason = {"white_e": "the noise of the dark frames is that of moving waves; 95 % upper limit"}
+        reason = {"white_e": "moving waves explain the noise of the dark frames; 95 % upper limit"}
         covariance = np.array([[(u_square / (2 * limit)) ** 2]])
         return replace(noise, values=np.array([limit]), covariance=covariance, limits=frozenset({"white_e"}), reasons=reason)
     value = float(np.sqrt(square))
@@ -84,7 +86,7 @@ def propagate(params: AmplifierNoise, probe: Probe) -> Contribution:
 SOURCE = Source(
     id="electronics.amplifier_noise",
     title="Amplifier noise",
-    description="The output amplifier and what follows it add white noise; more of it at a higher pixel clock.",
+    description="The output amplifier and the circuits behind it add white noise. It grows with the pixel clock.",
     number=18,
     stars=2,
     note="Note 17",
@@ -102,5 +104,5 @@ SOURCE = Source(
     typical_size="0.004 px for 88 e- on a disc of 7 px at 15 000 electrons; with the shot noise 0.0057 px",
     references=("EMVA 1288 R4.0 Linear, §2.2 and §6.5", "J. R. Janesick, Photon Transfer, SPIE Press 2007, ch. 11"),
     advice="Read out more slowly, use more light, or average N frames (1/√N).",
-    reasons={"correct": "noise cannot be undone; averaging frames lowers it"},
+    reasons={"correct": "noise cannot be removed from a single frame; averaging frames lowers it"},
 )

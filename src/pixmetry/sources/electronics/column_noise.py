@@ -21,7 +21,9 @@ class ColumnNoise(Parameters):
 
     offset_dn: float = quantity(0.0, "DN", "offset common to a column", ge=0, le=1e4)
     gain_rel: float = quantity(0.0, "1", "relative gain common to a column", ge=0, le=0.3)
-    wander_frames: int = quantity(1, "1", "frames from one independent state to the next; 1: new in every frame", ge=1, le=1_000_000)
+    wander_frames: int = quantity(
+        1, "1", "number of frames from one independent state to the next; 1: new in every frame", ge=1, le=1_000_000
+    )
 
 
 def wander(params: ColumnNoise, grid: Grid, stream: Stream, draw: int) -> np.ndarray:
@@ -75,7 +77,7 @@ def propagate(params: ColumnNoise, probe: Probe) -> Contribution:
 SOURCE = Source(
     id="electronics.column_noise",
     title="Column noise",
-    description="The amplifiers and converters at the foot of the columns wander: vertical stripes that a dark frame of yesterday leaves.",
+    description="The amplifiers and converters of the columns drift. An old dark frame then leaves vertical stripes.",
     parameters=ColumnNoise,
     consumes=(Kind.DN,),
     after=("sensor", "electronics.gain"),
@@ -93,7 +95,7 @@ SOURCE = Source(
     references=("EMVA 1288 R4.0 Linear, §8.2 (row and column split)",),
     advice="Subtract each column's mean over optically black rows of the same frame; renew dark frames often.",
     reasons={
-        "measure": "what is new in every frame electronics.row_noise measures; a slow part needs dark stacks taken hours apart",
-        "correct": "needs optically black rows above the picture, which give each column's offset",
+        "measure": "electronics.row_noise measures the part that is new in every frame; the slow part needs dark stacks taken hours apart",
+        "correct": "needs optically black rows above the image, which give each column's offset",
     },
 )

@@ -19,11 +19,13 @@ class FlickerNoise(Parameters):
     """Noise whose power density goes as 1/f over a number of octaves below the corner; beyond, it falls off as 1/f⁴."""
 
     rms_e: float = quantity(0.0, "e-", "root mean square over all octaves", ge=0, le=1e5)
-    corner_rel: float = quantity(0.1, "1", "frequency up to which it goes as 1/f, over the pixel clock", gt=0, le=0.5)
-    octaves: int = quantity(16, "1", "octaves of 1/f below the corner; slower than the lowest, the density is level", ge=1, le=32)
+    corner_rel: float = quantity(
+        0.1, "1", "frequency up to which the density is proportional to 1/f, divided by the pixel clock", gt=0, le=0.5
+    )
+    octaves: int = quantity(16, "1", "octaves of 1/f below the corner; below the lowest octave the density is constant", ge=1, le=32)
     line_px: float = quantity(908.0, "px", "pixel clocks from line to line; at least the row's pixels", ge=0, le=1e6)
     interlaced: bool = quantity(False, "1", "whether even rows are read first, then odd ones")
-    field_lines: float = quantity(312.5, "1", "lines from the start of the first field to that of the second", gt=0, le=1e6)
+    field_lines: float = quantity(312.5, "1", "number of lines from the start of the first field to the start of the second", gt=0, le=1e6)
 
     def clocks(self, row: np.ndarray, cols: int) -> np.ndarray:
         """Pixel clocks at which rows of so many pixels begin."""
@@ -98,7 +100,8 @@ def propagate(params: FlickerNoise, probe: Probe) -> Contribution:
 SOURCE = Source(
     id="electronics.flicker_noise",
     title="Flicker noise",
-    description="The 1/f noise of the output amplifier runs along the rows: neighbours in a row share it, rows differ in their mean.",
+    description="The 1/f noise of the output amplifier is correlated along the read-out: neighbours in a row share it, and the means of "
+    "the rows differ.",
     parameters=FlickerNoise,
     consumes=(Kind.ELECTRONS,),
     after=("sensor",),
@@ -116,7 +119,7 @@ SOURCE = Source(
     ),
     advice="Use correlated double sampling with a short interval; clamp every row on its optically black pixels.",
     reasons={
-        "measure": "not measured: needs the spectrum of dark rows along the read-out; the photon transfer holds it as white and row noise",
-        "correct": "noise cannot be undone; the part common to a row goes with optically black columns",
+        "measure": "not measured: needs the spectrum of dark rows along the read-out; the photon transfer has it as white and row noise",
+        "correct": "noise cannot be removed; optically black columns remove the part that is common to a row",
     },
 )

@@ -35,7 +35,7 @@ def measure(observations: Observations) -> Estimates:
 SOURCE = Source(
     id="electronics.gain",
     title="Conversion gain",
-    description="Charge becomes a voltage and a number: so many steps of the converter per electron.",
+    description="Charge becomes a voltage and then a number. The gain is the number of converter steps per electron.",
     number=19,
     parameters=Gain,
     consumes=(Kind.ELECTRONS,),
@@ -48,12 +48,12 @@ SOURCE = Source(
     measure=measure,
     gum_class="T",
     equation="y = K n",
-    typical_size="no shift of its own; a low gain lets the converter's steps show",
+    typical_size="none by itself; with a low gain the quantisation is larger than the noise",
     references=("EMVA 1288 R4.0 Linear, §2.2 and §6.5, eq. 16–18",),
     advice="Set the gain so that one step of the converter is about the dark noise.",
     reasons={
-        "correct": "a common factor is no error of the image",
-        "propagate": "it scales all pixels alike, which moves nothing; noise and quantisation have sources of their own",
-        "neutral": "it is a conversion: without it there are no numbers",
+        "correct": "a common factor is not an error of the image",
+        "propagate": "it scales all pixels alike and moves no target; noise and quantisation are sources of their own",
+        "neutral": "it is a conversion: without it there is no digital signal",
     },
 )

@@ -25,7 +25,7 @@ LIGHT_RATIO = 2.0  # at least, between the brightest and the darkest of them
 class Gamma(Parameters):
     """The setting, and the signal that it leaves as it is."""
 
-    gamma: float = quantity(1.0, "1", "exponent of the curve: 1 is linear, 0.45 the usual setting other than that", ge=LOWEST, le=HIGHEST)
+    gamma: float = quantity(1.0, "1", "exponent of the curve: 1 is linear, 0.45 is the usual other setting", ge=LOWEST, le=HIGHEST)
     reference_dn: float = quantity(4095.0, "DN", "signal above black at which the curve meets the straight line", gt=0, le=1e9)
     toe: Literal["none", "bt709"] = quantity("none", "1", "bt709: straight below 0.018 of the reference, as in television cameras")
 
@@ -90,9 +90,9 @@ def measure(observations: Observations) -> Estimates:
     u_delta = float(np.sqrt(np.linalg.inv(design.T @ design)[2, 2] * variance) / abs(found[1]))
     return Estimates.from_rows(
         [("gamma", 1.0, float(np.hypot(delta, u_delta)), float(light.size - 3), "1")],
-        method="level means, straightened by the measured non-linearity, against a power law with a free offset, least squares",
-        confounders=("a lamp whose light is not proportional to exposure looks like a camera with gamma",),
-        reasons={"gamma": f"the bend of the response is held by electronics.nonlinearity; beyond it the exponent is {1 + delta:.4g}"},
+        method="least-squares fit of a power law with a free offset to the level means, linearised by the measured non-linearity",
+        confounders=("light that is not proportional to the exposure time looks like a camera with gamma",),
+        reasons={"gamma": f"electronics.nonlinearity contains the curvature of the response; beyond it the exponent is {1 + delta:.4g}"},
     )
 
 
@@ -114,7 +114,7 @@ def _straight_levels(observations: Observations) -> tuple[np.ndarray, np.ndarray
     light, stored = light[keep], stored[keep]
     if len(light) < LEVELS or light.max() < LIGHT_RATIO * light.min():
         raise MeasureError(
-            "too few light levels to tell a power curve from a straight line",
+            "too few light levels to distinguish a power curve from a straight line",
             where="electronics.gamma",
             value=len(light),
             allowed=f"{LEVELS} or more between {DARKEST:.0%} and {BRIGHTEST:.0%} of the brightest, light in a ratio of {LIGHT_RATIO:g}",
@@ -150,7 +150,7 @@ def propagate(params: Gamma, probe: Probe) -> Contribution:
 SOURCE = Source(
     id="electronics.gamma",
     title="Gamma",
-    description="The camera is set to a power curve for display: edges grow, noise in the dark is raised, that in the light lowered.",
+    description="The camera applies a power curve for display. Edges become wider; noise rises in the dark and falls in the light.",
     number=23,
     stars=3,
     note="Note 5",
@@ -169,5 +169,5 @@ SOURCE = Source(
     equation="y = y_max (x/y_max)^γ,  γ = 0.45 or 1;  bt709: y/y_max = 1.099 (x/y_max)^γ − 0.099, below 0.018 4.5 x/y_max",
     typical_size="0.0017 px for 0.45 on a disc of 7 px, if the threshold follows the light",
     references=("ITU-R BT.709-6, item 1.2 (exponent 0.45, toe)", "EMVA 1288 R4.0 Linear, §6.7 (linearity error)"),
-    advice="Set the camera to gamma 1; if that cannot be, apply the inverse curve before anything else.",
+    advice="Set the camera to gamma 1. If this is impossible, apply the inverse curve before any other step.",
 )

@@ -18,13 +18,15 @@ BOUNDLESS_DN = 1e9
 class HdrGain(Parameters):
     """The upper part of the signal as it comes out after both parts are brought to the scale of the lower one."""
 
-    mode: Literal["two gains", "knee"] = quantity("two gains", "1", "upper part read at a low gain; or a response with a bend")
+    mode: Literal["two gains", "knee"] = quantity(
+        "two gains", "1", "two gains: the upper part is read at a low gain; knee: a response with a bend"
+    )
     switch_dn: float = quantity(BOUNDLESS_DN, "DN", "signal above black where the upper part begins", gt=0, le=BOUNDLESS_DN)
     mismatch_rel: float = quantity(0.0, "1", "relative error of the ratio of the two slopes that the camera assumes", ge=-0.5, le=0.5)
     offset_dn: float = quantity(0.0, "DN", "two gains: error of the upper part's black level", ge=-1e4, le=1e4)
     column_std_rel: float = quantity(0.0, "1", "standard deviation of the ratio from column to column, fixed in the unit", ge=0, le=0.2)
-    upper_noise_dn: float = quantity(0.0, "DN", "noise that the reading of the upper part adds, on this scale", ge=0, le=1e4)
-    ratio: int = quantity(1, "1", "two gains: the upper part comes in steps of so many DN", ge=1, le=256)
+    upper_noise_dn: float = quantity(0.0, "DN", "noise that the read-out of the upper part adds, on this scale", ge=0, le=1e4)
+    ratio: int = quantity(1, "1", "two gains: step of the upper part in DN", ge=1, le=256)
 
 
 def slopes(params: HdrGain, grid: Grid, stream: Stream) -> np.ndarray:
@@ -79,7 +81,7 @@ def propagate(params: HdrGain, probe: Probe) -> Contribution:
     signal = probe.signal_dn
     above = signal > params.switch_dn
     if not above.any():
-        return probe.contribution((0.0, 0.0), "F", method="the target stays below the switch")
+        return probe.contribution((0.0, 0.0), "F", method="the target is below the level where the gain changes")
     dx, dy = probe.moved(joined(params, signal, signal, 1 + params.mismatch_rel))
     base = params.switch_dn if params.mode == "knee" else 0.0
     noise = probe.white(np.where(above, params.upper_noise_dn * (1 + params.mismatch_rel), 0.0))
@@ -99,7 +101,8 @@ def propagate(params: HdrGain, probe: Probe) -> Contribution:
 SOURCE = Source(
     id="electronics.hdr_gain",
     title="Stitching of two gains",
-    description="Bright pixels are read at a low gain and scaled up: at the switch the signal jumps, above it noise and columns differ.",
+    description="Bright pixels are read at a low gain and scaled up. The signal jumps where the gain changes; above it, noise and "
+    "columns differ.",
     parameters=HdrGain,
     consumes=(Kind.DN,),
     after=("sensor", "electronics.gain"),
@@ -117,6 +120,6 @@ SOURCE = Source(
     equation="y = x below s;  above: (1 + m + m_col) x + o + noise, in steps of the ratio;  knee: s + (1 + m)(x − s)",
     typical_size="below 0.002 px for 2 % of mismatch on a disc of 7 px",
     references=("EMVA 1288 R4.0 General (cameras with a non-linear response)",),
-    advice="Expose so that the target lies on one side of the switch; calibrate the ratio of the gains column by column.",
-    reasons={"measure": "needs flat fields at fine steps of light on both sides of the switch, with the switch known"},
+    advice="Expose so that the whole target is below or above the change of gain. Calibrate the ratio of the gains column by column.",
+    reasons={"measure": "needs flat fields at fine steps of light below and above the change of gain, and its known level"},
 )

@@ -32,7 +32,7 @@ class Nonlinearity(Parameters):
         w = np.linspace(LOWEST, HIGHEST, 1501)
         if min(np.min(slope(self, w)), np.min(factor(self, w))) <= 0:
             raise ParameterError(
-                "the response does not rise everywhere", value=(self.a1, self.a2, self.a3), remedy="use smaller coefficients"
+                "the response does not rise over its whole range", value=(self.a1, self.a2, self.a3), remedy="use smaller coefficients"
             )
         return self
 
@@ -86,13 +86,13 @@ def correct(params: Nonlinearity, signal: Signal, maps: Mapping[str, np.ndarray]
 def propagate(params: Nonlinearity, probe: Probe) -> Contribution:
     """Propagator P4: the bent signal seen by the estimator. A symmetric target has no bias, only an S-curve."""
     dx, dy = probe.moved(response_dn(params, probe.signal_dn))
-    return probe.from_shifts(dx, dy, "F", model_error=0.3, method="the estimator on the bent signal")
+    return probe.from_shifts(dx, dy, "F", model_error=0.3, method="the estimator on the non-linear signal")
 
 
 SOURCE = Source(
     id="electronics.nonlinearity",
     title="Non-linearity",
-    description="The response to light bends by a few parts in a thousand to a few in a hundred.",
+    description="The response to light is not a straight line; it deviates by a few per mille to a few per cent.",
     number=20,
     parameters=Nonlinearity,
     consumes=(Kind.DN,),

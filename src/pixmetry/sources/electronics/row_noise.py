@@ -48,7 +48,7 @@ def propagate(params: RowNoise, probe: Probe) -> Contribution:
 SOURCE = Source(
     id="electronics.row_noise",
     title="Temporal row and column noise",
-    description="The reference of each row (or column) amplifier moves from frame to frame, so a whole line goes up or down.",
+    description="The reference of each row or column amplifier changes from frame to frame: whole rows or columns get brighter or darker.",
     parameters=RowNoise,
     consumes=(Kind.ELECTRONS,),
     after=("sensor",),
@@ -62,6 +62,6 @@ SOURCE = Source(
     equation="n' = n + σ_row z_r + σ_col z_c",
     typical_size="0.0155 px per DN in y on a disc of 7 px in a window of radius 6 px",
     references=("EMVA 1288 R4.0 Linear, §8.2 (row and column split)",),
-    advice="Use optically black columns to take each row's offset off, or average frames.",
-    reasons={"correct": "needs optically black columns beside the picture, which give each row's offset"},
+    advice="Subtract each row's offset, measured in optically black columns, or average frames.",
+    reasons={"correct": "needs optically black columns beside the image, which give each row's offset"},
 )

@@ -24,7 +24,9 @@ class SupplyPickup(Parameters):
     line_time_us: float = quantity(64.0, "µs", "from the first pixel of a row to that of the next", gt=0, le=1e5)
     pixel_time_ns: float = quantity(67.8, "ns", "from pixel to pixel within a row; 0 where a row is read at once", ge=0, le=1e6)
     scan: Literal["progressive", "interlaced"] = quantity("progressive", "1", "order of the rows; interlaced: even rows, then odd ones")
-    field_lines: float = quantity(312.5, "1", "line times from the start of the first field to that of the second", gt=0, le=1e6)
+    field_lines: float = quantity(
+        312.5, "1", "number of line times from the start of the first field to the start of the second", gt=0, le=1e6
+    )
 
 
 def turns_per_px(params: SupplyPickup) -> tuple[float, float]:
@@ -94,7 +96,7 @@ def correct(params: SupplyPickup, signal: Signal, maps: Mapping[str, np.ndarray]
     lines = rows if params.scan == "progressive" else rows // 2
     if abs(nu_x) * cols < 1 and abs(nu_y) * lines < 1:
         raise InputError(
-            "these windows show less than one period of the supply's frequency",
+            "the windows show less than one period of the supply's frequency",
             where="electronics.supply_pickup",
             value=f"{abs(nu_x) * cols:.2g} of a period in x, {abs(nu_y) * lines:.2g} in y",
             allowed="one period or more in x or in y",
@@ -138,7 +140,7 @@ SOURCE = Source(
     id="electronics.supply_pickup",
     title="Supply pick-up",
     description=(
-        "A sinusoid of the mains or of a switching supply gets into the signal while the frame is read out pixel by pixel, and lies over "
+        "The mains or a switching supply adds a sinusoid to the signal while the frame is read out pixel by pixel. and lies over "
         "it as stripes that stand still or roll, as the supply beats with the frame rate."
     ),
     number=21,
@@ -161,7 +163,7 @@ SOURCE = Source(
         "C. E. Shannon, Proc. IRE 37, 1949, 10 (sampling: the frequency that is seen)",
     ),
     advice=(
-        "Filter and shield the supply. Against mains, choose a frame rate with which the stripes roll, and average over a "
+        "Filter and shield the supply. Against mains, choose a frame rate at which the stripes roll, and average over a "
         "beat. A known frequency can be fitted and subtracted in every frame."
     ),
     reasons={

@@ -96,7 +96,8 @@ def propagate(params: TapGain, probe: Probe) -> Contribution:
 SOURCE = Source(
     id="electronics.tap_gain",
     title="Gain of the taps",
-    description="Parts of the frame that go through different amplifiers differ in gain: steps at the borders, stripes of odd columns.",
+    description="Parts of the frame pass through different amplifiers with different gains. This gives steps at the borders and stripes "
+    "of odd columns.",
     number=19,
     parameters=TapGain,
     consumes=(Kind.DN,),
@@ -114,6 +115,6 @@ SOURCE = Source(
     equation="y = x (1 ± Δg/2 ± Δg_oe/2 + g1 x/x_ref)",
     typical_size="(D/3π) Δg = 0.74 px · Δg for a border through a disc of 7 px: 0.007 px for 1 %",
     references=("ISO 14524:2009 (opto-electronic conversion function)", "EMVA 1288 R4.0 Linear, §8.2 (column split)"),
-    advice="Balance the taps with a flat field: a gain for each tap, by the means of the columns on either side of the border.",
-    reasons={"measure": "not measured: needs the column means of a bright stack beside each border; the PRNU holds the stripes"},
+    advice="Balance the taps with a flat field: one gain for each tap, from the means of the columns on both sides of the border.",
+    reasons={"measure": "not measured: needs the column means of a bright stack beside each border; the PRNU contains the stripes"},
 )

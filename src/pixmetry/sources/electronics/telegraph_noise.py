@@ -17,7 +17,7 @@ from pixmetry.core.random import Grid, Stream
 class TelegraphNoise(Parameters):
     """Which pixels have a trap, how much it moves their signal, and how often it switches."""
 
-    share: float = quantity(0.0, "1", "share of the pixels that have it", ge=0, le=0.5)
+    share: float = quantity(0.0, "1", "share of the pixels that blink", ge=0, le=0.5)
     amplitude_e: float = quantity(10.0, "e-", "mean over these pixels of the step between neighbouring levels; exponential", ge=0, le=1e5)
     occupancy: float = quantity(0.5, "1", "share of the time in which a trap is filled", gt=0, lt=1)
     memory_frames: float = quantity(0.0, "1", "frames after which a state's correlation is 1/e; 0: new in every frame", ge=0, le=1000)
@@ -98,14 +98,15 @@ def truth(params: TelegraphNoise, signal: Signal, stream: Stream) -> Mapping[str
 def propagate(params: TelegraphNoise, probe: Probe) -> Contribution:
     """Propagator P1 with the mean variance of a pixel, share · 2 amplitude² · variance of the level; few pixels bear it all."""
     sigma_e = params.amplitude_e * math.sqrt(2 * params.share * level_variance(params))
-    method = "linear response of the estimator to the mean variance of all pixels; a target with no such pixel has none of it"
+    method = "linear response of the estimator to the mean variance of all pixels; a target without such a pixel has no such error"
     return probe.contribution(probe.white(probe.gain_dn_per_e * sigma_e), "T", model_error=0.12, method=method)
 
 
 SOURCE = Source(
     id="electronics.telegraph_noise",
     title="Random telegraph noise",
-    description="Single traps in the first transistor of some pixels catch and free one electron: the pixel blinks between a few levels.",
+    description="A single trap in the first transistor of a pixel catches and releases one electron: the pixel blinks between a few "
+    "levels.",
     parameters=TelegraphNoise,
     consumes=(Kind.ELECTRONS,),
     after=("sensor",),
@@ -126,6 +127,6 @@ SOURCE = Source(
     advice="Mask the pixels whose temporal histogram has two or three peaks, or weight them by their own variance.",
     reasons={
         "measure": "not measured: needs the kurtosis in time of each pixel of a dark stack of a hundred frames or more",
-        "correct": "the state of a trap in one frame is not known; mask the pixel",
+        "correct": "the state of the trap in a single frame is unknown; mask the pixel",
     },
 )

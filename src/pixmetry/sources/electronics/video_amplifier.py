@@ -57,7 +57,7 @@ def propagate(params: VideoAmplifier, probe: Probe) -> Contribution:
 SOURCE = Source(
     id="electronics.video_amplifier",
     title="Video amplifier",
-    description="The camera's output stage rings after edges where it is under-damped, and comes late.",
+    description="The camera's output stage delays the signal. If it is under-damped, it rings after edges.",
     note="Note 11",
     parameters=VideoAmplifier,
     consumes=(Kind.VIDEO,),
@@ -80,8 +80,8 @@ SOURCE = Source(
     references=("K. Ogata, Modern Control Engineering, 5th ed., §5-3 (second-order systems)",),
     advice="Load the output with its 75 Ω; use a camera with a flat video band, or a digital one.",
     reasons={
-        "measure": "needs the image of a sharp edge or line: dark and flat frames do not carry it",
-        "correct": "undoing a filter from samples at the pixel rate needs its response between the samples, and lifts the noise",
-        "neutral": "every amplifier has an upper frequency; leave it out, and the line is not limited",
+        "measure": "needs the image of a sharp edge or line: dark and flat frames do not show it",
+        "correct": "inverting a filter from samples at the pixel rate needs the response between the samples, and amplifies the noise",
+        "neutral": "every amplifier has an upper frequency limit; switch the source off for a line without limit",
     },
 )

@@ -22,19 +22,25 @@ class Adc(Parameters):
     """The converter's black level, range, and departures from equal steps; one LSB is one DN."""
 
     bits: int = quantity(8, "bit", "the codes run from 0 to 2^bits − 1", ge=1, le=16)
-    offset_dn: float = quantity(0.0, "DN", "black level: the value that black is lifted to", ge=-1e4, le=6e4)
+    offset_dn: float = quantity(0.0, "DN", "black level: the value that is added to black", ge=-1e4, le=6e4)
     gain_error_rel: float = quantity(0.0, "1", "relative error of the slope about black", ge=-0.5, le=0.5)
     inl_amplitude_lsb: float = quantity(0.0, "LSB", "amplitude of a sinusoidal bend of the thresholds", ge=0, le=64)
     inl_cycles: float = quantity(1.0, "1", "periods of that bend over the range", ge=0, le=64)
     dnl_std_lsb: float = quantity(0.0, "LSB", "standard deviation of the code widths, fixed in the unit", ge=0, le=2)
-    missing_every: int = quantity(0, "1", "every so many codes one is missing; 0: none is", ge=0, le=65536)
-    hysteresis_lsb: float = quantity(0.0, "LSB", "by how much thresholds lie higher while the line rises than while it falls", ge=0, le=16)
+    missing_every: int = quantity(0, "1", "period of missing codes: one code in this number of codes is missing; 0: none", ge=0, le=65536)
+    hysteresis_lsb: float = quantity(
+        0.0, "LSB", "by how much thresholds are higher for a rising signal than for a falling one", ge=0, le=16
+    )
     aperture_jitter_rel: float = quantity(
-        0.0, "1", "scatter of the moment of sampling, over the sampling period: seen on slopes along the row", ge=0, le=0.1
+        0.0,
+        "1",
+        "standard deviation of the sampling instant, divided by the sampling period; it acts on slopes along the row",
+        ge=0,
+        le=0.1,
     )
     offset_drift_dn_per_k: float = quantity(0.0, "DN/K", "change of the black level with temperature", ge=-10, le=10)
     gain_drift_per_k: float = quantity(0.0, "1/K", "relative change of the slope with temperature", ge=-0.01, le=0.01)
-    reference_temperature_c: float = quantity(20.0, "°C", "temperature at which offset and slope are as given", ge=-60, le=100)
+    reference_temperature_c: float = quantity(20.0, "°C", "temperature at which the stated offset and slope hold", ge=-60, le=100)
 
     @field_validator("missing_every")
     @classmethod
@@ -158,14 +164,15 @@ def propagate(params: Adc, probe: Probe) -> Contribution:
         gum_class="F",
         model_error=0.25,
         floor_px=3e-4,
-        method="white noise of 1/12 + DNL²/2 LSB², and the response of the estimator to bend and ends of the range",
+        method="white noise of 1/12 + DNL²/2 LSB², and the response of the estimator to the curvature and to the ends of the range",
     )
 
 
 SOURCE = Source(
     id="grabber.adc",
     title="Analogue-to-digital conversion",
-    description="The converter adds its black level, rounds to whole codes, bends and clips; its steps are not all of one width.",
+    description="The converter adds its black level, rounds to whole codes and clips. Its curve is not straight, and its steps differ "
+    "in width.",
     number=28,
     stars=1,
     note="Note 18",
@@ -186,6 +193,6 @@ SOURCE = Source(
     equation="code = #{k : T_k ≤ (1 + g) y + b},  T_k = k − 1/2 + A sin(2πm k/2^bits) + (s_DNL/√2) n_k;  σ² = 1/12 + s_DNL²/2 + (j dy/dc)²",
     typical_size="0.003 px at 8 bit on a disc of 7 px of 150 DN (centroid)",
     references=("IEEE Std 1241-2010, §4 (code transition levels, DNL, INL)", "EMVA 1288 R4.0 Linear, §2.2 (σ_q² = 1/12)"),
-    advice="Use the whole range of the converter, let at least 0.5 DN of noise dither it, or take one of more bits.",
-    reasons={"neutral": "it turns the analogue signal into whole codes, which always rounds"},
+    advice="Use the whole range of the converter. Keep at least 0.5 DN of noise as dither, or take a converter with more bits.",
+    reasons={"neutral": "it turns the analogue signal into whole codes, and this always rounds"},
 )

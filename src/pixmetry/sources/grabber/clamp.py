@@ -20,15 +20,15 @@ NEAR_SHARE = 1e-3  # of a row's error, may come from rows above the near context
 class Clamp(Parameters):
     """Restoring of black once in every line."""
 
-    offset_dn: float = quantity(0.0, "DN", "level that black is brought to; what is below code 0 is cut off later", ge=-1e4, le=1e4)
-    noise_dn: float = quantity(0.0, "DN", "standard deviation of that level from line to line", ge=0, le=1e3)
-    drift_dn_per_k: float = quantity(0.0, "DN/K", "how it changes with temperature", ge=-100, le=100)
-    reference_temperature_c: float = quantity(20.0, "°C", "temperature at which it is the offset", ge=-60, le=100)
-    droop_rel: float = quantity(0.0, "1", "share of a constant level that the AC coupling has lost at the end of the line", ge=0, le=0.9)
+    offset_dn: float = quantity(0.0, "DN", "level to which black is set; values below code 0 are cut off later", ge=-1e4, le=1e4)
+    noise_dn: float = quantity(0.0, "DN", "standard deviation of this level from line to line", ge=0, le=1e3)
+    drift_dn_per_k: float = quantity(0.0, "DN/K", "change of the level with temperature", ge=-100, le=100)
+    reference_temperature_c: float = quantity(20.0, "°C", "temperature at which the stated level holds", ge=-60, le=100)
+    droop_rel: float = quantity(0.0, "1", "share of a constant level that the AC coupling loses until the end of the line", ge=0, le=0.9)
     restored_rel: float = quantity(
-        1.0, "1", "share of its error that the clamp makes good at the start of each line; the rest carries over", ge=0.05, le=1
+        1.0, "1", "share of the error that the clamp removes at the start of each line; the rest remains", ge=0.05, le=1
     )
-    interlaced: bool = quantity(True, "1", "whether the line before is that of the field, two rows above")
+    interlaced: bool = quantity(True, "1", "whether the previous line is that of the same field, two rows above")
 
     def black(self, temperature_c: np.ndarray) -> np.ndarray:
         """Mean level of black in DN at some temperatures."""
@@ -106,7 +106,7 @@ def propagate(params: Clamp, probe: Probe) -> Contribution:
     target = np.ascontiguousarray(probe.signal_dn - probe.background_dn, np.float32)
     slope = -loss * probe.background_dn * (np.arange(target.shape[2]) - probe.x_px[:, None])
     dx, dy = probe.field(droop(target, loss, half, *params.carry) - target.astype(float) + slope[:, None, :])
-    method = "offsets common to a row, and the field of the droop"
+    method = "offsets that are common to a row, and the field of the droop"
     floor_px = 4e-4 if params.droop_rel and params.restored_rel < 1 else 2e-4  # the background settles over the first lines
     return probe.from_shifts(dx, dy, "Tr", beside=u, model_error=0.2, floor_px=floor_px, method=method)
 
@@ -126,7 +126,8 @@ def _noise(params: Clamp, probe: Probe) -> tuple[float, float]:
 SOURCE = Source(
     id="grabber.clamp",
     title="Black clamp and offset",
-    description="The clamp's black is off, differs from line to line and with temperature, and sinks to the right of what is bright.",
+    description="The black level of the clamp has an error that varies from line to line and with temperature. To the right of bright "
+    "areas it sinks.",
     number=30,
     stars=2,
     note="Note 13",
@@ -148,6 +149,8 @@ SOURCE = Source(
     equation="y' = y − s + b + d (T − T_0) + s_n n_r,  ds/dt = (y − s)/τ,  s at a line's start: (1 − k) of the line before",
     typical_size="with black 6 DN below the first code a Gaussian spot (σ = 1.5 px, 150 DN) swings by 0.0075 px over the pixel",
     references=("EMVA 1288 R4.0 Linear, §6.1 (black level: at most 0.5 % of the pixels at code 0)",),
-    advice="Set black to at least three standard deviations of the noise above code 0, subtract it, and use a soft threshold.",
-    reasons={"measure": "dark frames show it in grabber.adc's black level and in electronics.row_noise, and do not part them"},
+    advice="Set black at least three standard deviations of the noise above code 0. Subtract it, and use a soft threshold.",
+    reasons={
+        "measure": "dark frames show it in the black level of grabber.adc and in electronics.row_noise, and cannot separate it from these"
+    },
 )

@@ -17,11 +17,11 @@ class ClockWarmUp(Parameters):
     """Errors of a phase-locked sampling clock that die away after it was switched on."""
 
     scale_error_rel: float = quantity(0.0, "1", "relative error of the frequency when switched on", ge=-0.05, le=0.05)
-    scale_tau_s: float = quantity(820.0, "s", "time constant with which it goes", gt=1, le=1e6)
-    delay_ns: float = quantity(0.0, "ns", "by how much lines come late when switched on", ge=-1e4, le=1e4)
-    delay_tau_s: float = quantity(820.0, "s", "time constant with which that goes", gt=1, le=1e6)
-    lock_us: float = quantity(10.5, "µs", "from where the clock is locked in each line to the first pixel", ge=0, le=60)
-    on_for_s: float = quantity(0.0, "s", "how long it had been on when frame 0 was taken", ge=0, le=1e7)
+    scale_tau_s: float = quantity(820.0, "s", "time constant with which this error decreases", gt=1, le=1e6)
+    delay_ns: float = quantity(0.0, "ns", "delay of the lines when switched on", ge=-1e4, le=1e4)
+    delay_tau_s: float = quantity(820.0, "s", "time constant with which this delay decreases", gt=1, le=1e6)
+    lock_us: float = quantity(10.5, "µs", "distance from the point where the clock is locked in each line to the first pixel", ge=0, le=60)
+    on_for_s: float = quantity(0.0, "s", "time between switching on and frame 0", ge=0, le=1e7)
 
     def scale(self, time_s: np.ndarray) -> np.ndarray:
         """Relative error of the frequency at times of the sequence, δ0 e^(−t/τ)."""
@@ -84,7 +84,7 @@ def propagate(params: ClockWarmUp, probe: Probe) -> Contribution:
 SOURCE = Source(
     id="grabber.clock_warm_up",
     title="Warm-up of the frame grabber",
-    description="A sampling clock that is not yet warm has another frequency and starts late: rows are stretched and shifted.",
+    description="Until it is warm, the sampling clock has another frequency and starts late: rows are stretched and shifted.",
     number=31,
     stars=5,
     note="Note 1",
@@ -105,9 +105,9 @@ SOURCE = Source(
     equation="Δx = (x + c0) δ/(1 + δ) + d f_pixel,  δ = δ0 e^(−t/τ),  d = d0 e^(−t/τ2)",
     typical_size="4 px RMS when switched on, for δ0 = 0.71 % locked 149 px before the first pixel; 0.05 px after 60 min at τ = 13.7 min",
     references=("H. A. Beyer, IAPRS XXIX-B5, 1992, 561 (line-start lock of frame grabbers)",),
-    advice="Wait 90 minutes, or sample with the camera's pixel clock; else give every image a scale of its own along the row.",
+    advice="Wait 90 minutes, or sample with the camera's pixel clock. Otherwise estimate a scale along the row for every image.",
     reasons={
-        "measure": "needs a series of images of targets from switching on",
-        "correct": "coordinates are corrected, not images: the scale of every image comes out of its targets",
+        "measure": "needs a series of images of targets that starts when the grabber is switched on",
+        "correct": "coordinates are corrected, not images: the targets of an image give its scale",
     },
 )

@@ -17,11 +17,11 @@ class FixedPattern(Parameters):
     """What the grabber adds to every frame alike."""
 
     settling_dn: float = quantity(0.0, "DN", "error of the black level in row 0", ge=-1e3, le=1e3)
-    settling_rows: float = quantity(10.0, "rows", "rows of the frame over which it falls to 1/e", gt=0.1, le=1e4)
-    interlaced: bool = quantity(False, "1", "whether even and odd rows are two fields, in each of which it settles line by line (2 rows)")
-    column_step_dn: float = quantity(0.0, "DN", "height of one column in every period over the others", ge=-1e3, le=1e3)
-    column_period: int = quantity(2, "px", "period of the columns' pattern, as the number of converters that take turns", ge=2, le=64)
-    random_std_dn: float = quantity(0.0, "DN", "standard deviation of the fixed grain from pixel to pixel", ge=0, le=1e3)
+    settling_rows: float = quantity(10.0, "rows", "number of rows over which it falls to 1/e", gt=0.1, le=1e4)
+    interlaced: bool = quantity(False, "1", "whether even and odd rows are two fields; the level then settles within each field")
+    column_step_dn: float = quantity(0.0, "DN", "height of one column in every period above the others", ge=-1e3, le=1e3)
+    column_period: int = quantity(2, "px", "period of the column pattern: number of converters that take turns", ge=2, le=64)
+    random_std_dn: float = quantity(0.0, "DN", "standard deviation of the fixed pattern from pixel to pixel", ge=0, le=1e3)
 
 
 def settling(params: FixedPattern, rows: np.ndarray) -> np.ndarray:
@@ -86,7 +86,7 @@ def _fit_settling(profile: np.ndarray) -> Estimates:
     if best is not None and np.isfinite(best[2]).all() and abs(best[1][0]) > 4 * np.sqrt(best[2][0, 0]):
         values, covariance = best[1][:2], best[2][:2, :2]
         names, units = ("settling_dn", "settling_rows"), ("DN", "rows")
-        confounders = ("dark signal that falls with the row, such as glow at the upper edge",)
+        confounders = ("dark signal that decreases from row to row, such as amplifier glow at the upper edge",)
         return Estimates(names, values, covariance, np.full(2, dof), units, method=method, confounders=confounders)
     u = float(np.std(np.diff(profile[len(profile) // 2 :])) / np.sqrt(2))
     first = abs(float(profile[0]) - tail)
@@ -94,7 +94,7 @@ def _fit_settling(profile: np.ndarray) -> Estimates:
         [("settling_dn", first + 1.645 * u, u, dof, "DN")],
         method=method,
         limits=frozenset({"settling_dn"}),
-        reasons={"settling_dn": "no settling stands out of the scatter of the rows; the limit is that of row 0"},
+        reasons={"settling_dn": "no settling is significant against the scatter of the rows; the limit holds for row 0"},
     )
 
 
@@ -138,14 +138,15 @@ def propagate(params: FixedPattern, probe: Probe) -> Contribution:
         bias_y_px=float(settle[1].mean()),
         gum_class="F",
         model_error=0.3,
-        method="response of the estimator to the ramp of the rows, the pattern of the columns and white grain, over all places",
+        method="response of the estimator to the ramp of the rows, the pattern of the columns and the pattern of the pixels, averaged "
+        "over all positions",
     )
 
 
 SOURCE = Source(
     id="grabber.fixed_pattern",
     title="Fixed pattern of the grabber",
-    description="The black level settles over the first lines, converters that take turns differ, and a fixed grain lies over the image.",
+    description="The black level settles over the first lines, the converters that take turns differ, and every pixel has a fixed offset.",
     number=33,
     stars=1,
     note="Note 20",
@@ -164,6 +165,6 @@ SOURCE = Source(
     equation="y' = y + B e^(−r/r_s) + a ([c mod p = 0] − 1/p) + s n_rc;  interlaced: 2 (r div 2) in place of r",
     typical_size="0.035 px for a ramp of 0.2 DN a row under a disc of 7 px of 150 DN (centroid, window radius 6)",
     references=("EMVA 1288 R4.0 Linear, §8.2 (row, column and pixel parts)",),
-    advice="Leave out the first lines, subtract a mean dark frame of the same grabber, or subtract the background around each target.",
+    advice="Do not use the first lines. Subtract a mean dark frame of the same grabber, or the background around each target.",
     reasons={"correct": "subtracting the mean dark frame removes it together with the sensor's own dark pattern: sensor.dsnu does that"},
 )

@@ -17,12 +17,12 @@ from pixmetry.core.random import Grid, Stream
 class LineJitter(Parameters):
     """Delays of the rows against each other; rows of a field follow each other in time."""
 
-    white_ns: float = quantity(0.0, "ns", "standard deviation of what is independent from line to line", ge=0, le=1000)
-    loop_ns: float = quantity(0.0, "ns", "standard deviation of what the loop carries on from line to line", ge=0, le=1000)
-    loop_rows: float = quantity(5.0, "rows", "lines of a field over which that falls to 1/e", ge=0.2, le=60)
+    white_ns: float = quantity(0.0, "ns", "standard deviation of the part that is independent from line to line", ge=0, le=1000)
+    loop_ns: float = quantity(0.0, "ns", "standard deviation of the part that is correlated from line to line", ge=0, le=1000)
+    loop_rows: float = quantity(5.0, "rows", "number of lines of a field over which this correlation falls to 1/e", ge=0.2, le=60)
     settling_ns: float = quantity(0.0, "ns", "phase error of the first line after the vertical interval", ge=-5000, le=5000)
-    settling_rows: float = quantity(15.0, "rows", "lines of a field over which it falls to 1/e", gt=0.1, le=300)
-    shear_ns: float = quantity(0.0, "ns", "how much later the last row comes than the first, steadily", ge=-5000, le=5000)
+    settling_rows: float = quantity(15.0, "rows", "number of lines of a field over which this error falls to 1/e", gt=0.1, le=300)
+    shear_ns: float = quantity(0.0, "ns", "delay of the last row against the first, linear from row to row", ge=-5000, le=5000)
     interlaced: bool = quantity(True, "1", "whether even and odd rows are two fields, each with its own loop")
 
     @property
@@ -95,7 +95,8 @@ def propagate(params: LineJitter, probe: Probe) -> Contribution:
 SOURCE = Source(
     id="grabber.line_jitter",
     title="Line jitter",
-    description="The loop that follows the line pulses places each row a little early or late, most after the vertical interval.",
+    description="The phase-locked loop that follows the line pulses starts each row slightly early or late, most of all after the "
+    "vertical interval.",
     number=29,
     stars=1,
     note="Note 19",
@@ -116,9 +117,9 @@ SOURCE = Source(
     equation="δ_r = s_w n_r + s_l a_l + A e^(−l/r_s) + shear,  a_l = ρ a_(l−1) + √(1 − ρ²) n_l,  l the line of the field",
     typical_size="20 ns are 0.284 px at 14.19 MHz; a disc of 7 px moves by 0.376 of the jitter of a row: 0.107 px",
     references=("H. A. Beyer, IAPRS XXIX-B5, 1992, 561 (shear and jitter of line-locked grabbers; below 0.005 px with the pixel clock)",),
-    advice="Sample with the camera's pixel clock, or average frames; a digital camera has none.",
+    advice="Sample with the camera's pixel clock, or average frames. A digital camera has no line jitter.",
     reasons={
         "measure": "needs the image of a steep vertical line or edge in several frames",
-        "correct": "needs the place of every row in that very frame, as from a line beside the targets",
+        "correct": "needs the shift of every row in the same frame, for instance from a line beside the targets",
     },
 )

@@ -20,10 +20,12 @@ SHARE_BEYOND = 1e-4  # of a step, beyond the near context
 class LowPass(Parameters):
     """An analogue filter, which may be switched off."""
 
-    kind: Literal["off", "rc", "butterworth", "bessel"] = quantity("off", "1", "kind of filter; rc is a row of equal RC stages")
+    kind: Literal["off", "rc", "butterworth", "bessel"] = quantity("off", "1", "kind of filter; rc is a chain of equal RC stages")
     order: int = quantity(3, "1", "number of poles", ge=1, le=8)
     cutoff_mhz: float = quantity(5.0, "MHz", "frequency of −3 dB (of each stage for rc)", ge=0.1, le=200)
-    all_pass_mhz: float = quantity(0.0, "MHz", "corner of an all-pass section, as of a phase correction that is off; 0: none", ge=0, le=200)
+    all_pass_mhz: float = quantity(
+        0.0, "MHz", "corner frequency of an all-pass section, such as a wrong phase correction; 0: none", ge=0, le=200
+    )
 
     @property
     def zeros(self) -> np.ndarray:
@@ -83,7 +85,8 @@ def propagate(params: LowPass, probe: Probe) -> Contribution:
 SOURCE = Source(
     id="grabber.low_pass",
     title="Low-pass filter",
-    description="A filter against aliasing delays the line and smears edges to the right; under a threshold bright and faint targets part.",
+    description="An anti-aliasing filter delays the line and smears edges to the right. With a fixed threshold, bright and faint "
+    "targets shift differently.",
     number=27,
     stars=3,
     note="Note 6",
@@ -106,9 +109,10 @@ SOURCE = Source(
         "A. I. Zverev, Handbook of Filter Synthesis, Wiley 1967 (poles of Butterworth and Bessel filters)",
         "H. A. Beyer, IAPRS XXIX-B5, 1992, 561 (response of a grabber's filter to edges)",
     ),
-    advice="Switch it off unless the line carries more than half the sampling frequency; calibrate with it as you measure.",
+    advice="Switch it off, unless the signal contains frequencies above half the sampling frequency. Calibrate and measure with the "
+    "same setting.",
     reasons={
-        "measure": "needs the image of a slanted edge: dark and flat frames do not carry it",
-        "correct": "undoing a filter from samples at the pixel rate needs its response between the samples, and lifts the noise",
+        "measure": "needs the image of a slanted edge: dark and flat frames do not show it",
+        "correct": "inverting a filter from samples at the pixel rate needs the response between the samples, and amplifies the noise",
     },
 )

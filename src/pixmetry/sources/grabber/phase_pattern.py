@@ -26,7 +26,7 @@ class PhasePattern(Parameters):
     amplitude_dn: float = quantity(0.0, "DN", "amplitude of the wave", ge=0, le=1e3)
     frequency_x: float = quantity(0.11, "1/px", "cycles per pixel along the row", ge=0, le=0.5)
     frequency_y: float = quantity(0.07, "1/px", "cycles per pixel down the column", ge=-0.5, le=0.5)
-    moving: bool = quantity(True, "1", "whether its phase is another in every frame, or fixed in the unit")
+    moving: bool = quantity(True, "1", "whether the phase is new in every frame, or fixed in the camera")
     turns_per_frame: float = quantity(0.0, "1", "steady advance of a fixed phase from frame to frame, in turns", ge=-0.5, le=0.5)
 
 
@@ -61,7 +61,7 @@ def measure(observations: Observations) -> Estimates:
         ("moving", float(found.moving[0]), 0.0, math.inf, "1"),
     ]
     return Estimates.from_rows(
-        rows, method="strongest line of the two-dimensional periodogram", confounders=("a pattern of the sensor or of the light",)
+        rows, method="strongest line of the two-dimensional periodogram", confounders=("a periodic pattern of the sensor or of the light",)
     )
 
 
@@ -78,7 +78,7 @@ def _limit(found: PatternList) -> Estimates:
         ],
         method="search of the two-dimensional periodogram",
         limits=frozenset({"amplitude_dn"}),
-        reasons={"amplitude_dn": "no line stands out of the noise"},
+        reasons={"amplitude_dn": "no line of the spectrum is significant against the noise"},
     )
 
 
@@ -104,7 +104,7 @@ def propagate(params: PhasePattern, probe: Probe) -> Contribution:
 SOURCE = Source(
     id="grabber.phase_pattern",
     title="Phase pattern",
-    description="Interference from a clock or a supply beats with the sampling and lies over the frame as a wave, standing or moving.",
+    description="Interference from a clock or a supply beats with the sampling. It appears as a wave over the frame, standing or moving.",
     number=34,
     stars=1,
     parameters=PhasePattern,

@@ -11,7 +11,9 @@ class SamplingClock(Parameters):
     """When the grabber samples the line."""
 
     clock_mhz: float = quantity(0.0, "MHz", "sampling clock; 0: the camera's pixel clock", ge=0, le=1000)
-    start_ns: float = quantity(0.0, "ns", "from the beginning of the first pixel to that of the first sampling period", ge=-1e5, le=1e5)
+    start_ns: float = quantity(
+        0.0, "ns", "delay from the start of the first pixel to the start of the first sampling period", ge=-1e5, le=1e5
+    )
     samples: int = quantity(0, "1", "samples per row; 0: as many as the row has pixels", ge=0, le=65536)
 
 
@@ -26,7 +28,8 @@ def forward(params: SamplingClock, signal: Signal, stream: Stream) -> Signal:
 SOURCE = Source(
     id="grabber.sampling_clock",
     title="Sampling clock",
-    description="The grabber samples with a clock of its own: the image is scaled along the row, and starts and ends anywhere.",
+    description="The grabber samples with a clock of its own. The image is scaled along the row, and its first and last sample may lie "
+    "anywhere in the line.",
     number=32,
     stars=5,
     note="Note 2",
@@ -43,10 +46,11 @@ SOURCE = Source(
     equation="t_k = t_0 + (k + ½)/f_s;  x_image = ((x + ½)/f_pixel − t_0) f_s − ½",
     typical_size="ratio 1.41875 for 10 MHz and 14.1875 MHz: 512 samples span 726.4 pixels; pixel pitch × 1.41875 along the row",
     references=("R. Lenz, D. Fritsch, ISPRS J. Photogramm. 45, 1990, 90 (accuracy of videometry with CCD sensors)",),
-    advice="Sample with the camera's pixel clock, or take a digital camera; else multiply the pitch by f_pixel/f_s, and do not resample.",
+    advice="Sample with the camera's pixel clock, or take a digital camera. Otherwise multiply the pitch by f_pixel/f_s, and do not "
+    "resample.",
     reasons={
         "measure": "needs targets, or the beat of the two clocks in a flat field with a visible pixel clock",
-        "correct": "coordinates are scaled, images are left as they are: a true position follows through the camera's geometry",
-        "propagate": "a known change of coordinates is no error; what aliasing adds depends on all filters before it",
+        "correct": "coordinates are scaled and images are left as they are: the camera's geometry gives the true position",
+        "propagate": "a known change of coordinates is not an error; the error by aliasing depends on all filters before it",
     },
 )

@@ -18,11 +18,11 @@ class WindowOffset(Parameters):
 
     row_offset: int = quantity(0, "px", "row of the image that is stored first", ge=-4096, le=65536)
     col_offset: int = quantity(0, "px", "column of the image that is stored first", ge=-4096, le=65536)
-    row_increment: int = quantity(1, "px", "steps in which the grabber sets its first row: the offset must be a multiple", ge=1, le=64)
+    row_increment: int = quantity(1, "px", "step in which the grabber sets its first row; the offset must be a multiple of it", ge=1, le=64)
     col_increment: int = quantity(1, "px", "the same for the first column", ge=1, le=64)
     rows: int = quantity(0, "px", "rows stored; 0: as many as the image has", ge=0, le=65536)
     cols: int = quantity(0, "px", "columns stored; 0: as many as the image has", ge=0, le=65536)
-    inactive_rows: int = quantity(0, "px", "rows at the top of what is stored that hold no image", ge=0, le=4096)
+    inactive_rows: int = quantity(0, "px", "stored rows at the top that contain no image", ge=0, le=4096)
 
     @model_validator(mode="after")
     def _can_be_set(self) -> WindowOffset:
@@ -33,8 +33,8 @@ class WindowOffset(Parameters):
             if offset % step:
                 below = offset // step * step
                 raise ParameterError(
-                    f"this grabber cannot begin there: it sets its window in steps of {step}", where=name, value=offset,
-                    allowed=f"{below} or {below + step}", remedy="take one of them, or give the increment of your grabber",
+                    f"this grabber cannot start there: it sets its window in steps of {step}", where=name, value=offset,
+                    allowed=f"{below} or {below + step}", remedy="take one of these, or state the step of your grabber",
                 )  # fmt: skip
         return self
 
@@ -92,7 +92,8 @@ def _span(first: np.ndarray, size: int, image: int, offset: int, stored: int) ->
 SOURCE = Source(
     id="grabber.window_offset",
     title="Offsets of the grabber's window",
-    description="The stored image begins at another row and column than the sensor's, in steps, and its first lines may hold no image.",
+    description="The stored image starts at another row and column than the sensor's image, in steps. Its first lines may contain no "
+    "image.",
     number=26,
     stars=2,
     note="Note 12",
@@ -112,10 +113,11 @@ SOURCE = Source(
     equation="(r, c)_stored = (r, c)_image − (r_0, c_0),  r_0 a multiple of the grabber's step",
     typical_size="a few pixels of the principal point; 1 px is 8.3 µm down and 8.6 µm across a sensor of that pitch",
     references=("ITU-R BT.470-6 (lines and active part of a 625-line signal)",),
-    advice="Determine the principal point with the grabber that measures, leave its window alone, and never take half the stored size.",
+    advice="Calibrate the principal point with the grabber that measures, and do not change its window. Do not assume the middle of the "
+    "stored image.",
     reasons={
         "measure": "needs the border of the active image, as in a defocused bright field with the whole frame stored",
-        "correct": "coordinates are shifted, images are left as they are: a true position follows through the camera's geometry",
-        "propagate": "whole pixels of offset move every target alike: they belong to the principal point, not to a target's error",
+        "correct": "coordinates are shifted and images are left as they are: the camera's geometry gives the true position",
+        "propagate": "an offset of whole pixels moves all targets alike: it belongs to the principal point, not to the error of a target",
     },
 )

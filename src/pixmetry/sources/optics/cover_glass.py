@@ -19,9 +19,9 @@ NEWTON_STEPS = 6  # always, so that a place does not depend on the others of its
 class CoverGlass(Parameters):
     """A plate square to the optical axis, with which the lens was focused."""
 
-    thickness_um: float = quantity(0.0, "µm", "of the plate, or of all plates between lens and sensor; 0: none", ge=0, le=3000)
+    thickness_um: float = quantity(0.0, "µm", "thickness of the plate, or of all plates between lens and sensor; 0: none", ge=0, le=3000)
     index: float = quantity(1.5, "1", "refractive index", ge=1, le=2.5)
-    principal_distance_mm: float = quantity(25.0, "mm", "distance of the exit pupil, under which the chief ray comes", ge=4, le=10000)
+    principal_distance_mm: float = quantity(25.0, "mm", "distance of the exit pupil; it gives the angle of the chief ray", ge=4, le=10000)
     pitch_x_um: float = quantity(8.6, "µm", "pixel pitch along x", gt=0, le=100)
     pitch_y_um: float = quantity(8.3, "µm", "pixel pitch along y", gt=0, le=100)
 
@@ -69,7 +69,8 @@ def propagate(params: CoverGlass, probe: Probe) -> Contribution:
 SOURCE = Source(
     id="optics.cover_glass",
     title="Cover glass of the sensor",
-    description="The window over the sensor refracts slanting rays; what focusing leaves of that grows with the third power of the radius.",
+    description="The window over the sensor refracts oblique rays. After focusing, a radial shift remains that grows with the third "
+    "power of the radius.",
     note="successor of the sensor's alignment",
     parameters=CoverGlass,
     consumes=(Kind.LIGHT,),
@@ -84,9 +85,9 @@ SOURCE = Source(
     equation="Δr = −t (tan θ/n − tan θ'),  sin θ = n sin θ',  tan θ = r/c;  ≈ −t (n² − 1)/(2 n³) tan³θ",
     typical_size="0.75 mm of glass: 0.75 µm inwards at 10°, 6.3 µm at 20°; below 0.01 µm where the lens is telecentric on the image side",
     references=("M. Born, E. Wolf, Principles of Optics, 7th ed. 1999, §1.5 (law of refraction)",),
-    advice="Calibrate with the glass in place: K1 takes up nearly all of it.",
+    advice="Calibrate with the glass in place: K1 includes nearly all of it.",
     reasons={
-        "measure": "a calibration takes it up in the radial distortion and cannot tell it apart",
-        "correct": "a frame is not resampled: positions are corrected instead, by the calibration",
+        "measure": "a calibration includes it in the radial distortion and cannot separate it",
+        "correct": "frames are not resampled; positions are corrected instead, by the calibration",
     },
 )

@@ -26,15 +26,17 @@ class Distortion(Parameters):
     """Radial and tangential coefficients on the image plane in millimetres, about a centre of their own."""
 
     direction: Literal["image_to_object", "object_to_image"] = quantity(
-        "image_to_object", "name", "what the polynomial takes to what: distorted to ideal places (photogrammetry), or ideal to distorted"
+        "image_to_object",
+        "name",
+        "direction of the polynomial: from distorted to ideal positions (photogrammetry), or from ideal to distorted positions",
     )
     k1_per_mm2: float = quantity(0.0, "1/mm²", "radial, r³", ge=-0.1, le=0.1)
     k2_per_mm4: float = quantity(0.0, "1/mm⁴", "radial, r⁵", ge=-0.01, le=0.01)
     k3_per_mm6: float = quantity(0.0, "1/mm⁶", "radial, r⁷", ge=-0.001, le=0.001)
     p1_per_mm: float = quantity(0.0, "1/mm", "tangential, (r² + 2x²) in x and 2xy in y", ge=-0.01, le=0.01)
     p2_per_mm: float = quantity(0.0, "1/mm", "tangential, 2xy in x and (r² + 2y²) in y", ge=-0.01, le=0.01)
-    centre_x_px: float = quantity(0.0, "px", "centre of distortion less the frame's centre, along x", ge=-1000, le=1000)
-    centre_y_px: float = quantity(0.0, "px", "centre of distortion less the frame's centre, along y", ge=-1000, le=1000)
+    centre_x_px: float = quantity(0.0, "px", "centre of distortion minus the frame's centre, along x", ge=-1000, le=1000)
+    centre_y_px: float = quantity(0.0, "px", "centre of distortion minus the frame's centre, along y", ge=-1000, le=1000)
     pitch_x_um: float = quantity(8.6, "µm", "pixel pitch along x", gt=0, le=100)
     pitch_y_um: float = quantity(8.3, "µm", "pixel pitch along y", gt=0, le=100)
 
@@ -87,8 +89,8 @@ def _check(params: Distortion, frame_shape: tuple[int, int]) -> None:
             "the distortion folds the image",
             where="optics.distortion",
             value=params.coefficients,
-            allowed="coefficients with which every place in the frame has one ideal place",
-            remedy="lower K1 to K3 (they belong to millimetres on the sensor), or check the pixel pitch",
+            allowed="coefficients for which every position in the frame has exactly one ideal position",
+            remedy="reduce K1 to K3 (they refer to millimetres on the sensor), or check the pixel pitch",
         )
 
 
@@ -122,7 +124,8 @@ _BOUND: dict[str, Any] = {"k1_per_mm2": -1.5e-3, "k2_per_mm4": 2e-5, "p1_per_mm"
 SOURCE = Source(
     id="optics.distortion",
     title="Lens distortion",
-    description="A point is imaged nearer to or farther from the centre than in a pinhole camera, and aside of it if lenses are decentred.",
+    description="A point is imaged nearer to the centre or farther from it than in a pinhole camera. If lenses are decentred, it is "
+    "also shifted sideways.",
     parameters=Distortion,
     consumes=(Kind.LIGHT,),
     before=("sensor",),
@@ -142,6 +145,6 @@ SOURCE = Source(
     advice="Calibrate the camera with targets all over the image, and correct every position.",
     measure=measure,
     reasons={
-        "correct": "a frame is not resampled: positions are corrected instead, by the calibration",
+        "correct": "frames are not resampled; positions are corrected instead, by the calibration",
     },
 )

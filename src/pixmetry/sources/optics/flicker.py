@@ -18,9 +18,11 @@ class Flicker(Parameters):
     """The lamp's light about its mean of 1."""
 
     depth_rel: float = quantity(0.0, "1", "half of peak to valley over the mean (sine), or the share that is switched", ge=0, le=1)
-    frequency_hz: float = quantity(100.0, "Hz", "of the light: twice that of the mains", gt=0, le=1e6)
-    phase_rad: float = quantity(0.0, "rad", "at time 0; a sine begins at its peak, a switched lamp with its edge", ge=-10, le=10)
-    waveform: Literal["sine", "switched"] = quantity("sine", "1", "smooth, or on and off")
+    frequency_hz: float = quantity(100.0, "Hz", "frequency of the light: twice that of the mains", gt=0, le=1e6)
+    phase_rad: float = quantity(
+        0.0, "rad", "phase at time 0; at phase 0 a sine has its maximum, and a switched lamp turns on", ge=-10, le=10
+    )
+    waveform: Literal["sine", "switched"] = quantity("sine", "1", "sine: smooth; or switched on and off")
     duty: float = quantity(0.5, "1", "share of the time in which a switched lamp is on", gt=0, le=1)
 
 
@@ -117,7 +119,8 @@ def truth(params: Flicker, signal: Signal, stream: Stream) -> Mapping[str, np.nd
 SOURCE = Source(
     id="optics.flicker",
     title="Flicker of the light",
-    description="Light that changes at 100 Hz or at a dimmer's frequency gives unequal frames, and bands under a rolling shutter.",
+    description="Light that flickers at 100 Hz or at the frequency of a dimmer makes frames unequal. With a rolling shutter it makes "
+    "bands.",
     parameters=Flicker,
     consumes=(Kind.LIGHT,),
     before=("sensor",),
@@ -128,12 +131,12 @@ SOURCE = Source(
     truth=truth,
     gum_class="F",
     equation="E(t) = 1 + d cos(2π f t + φ);  over an exposure d sinc(f t_exp) cos(2π f t_mid + φ), t_mid of each row",
-    typical_size="none at 10 ms and 100 Hz; at 1 ms nearly the lamp's own depth, over rows with a period of 1/(f t_row)",
+    typical_size="none at 10 ms and 100 Hz; at 1 ms nearly the full modulation of the lamp, in bands with a period of 1/(f t_row) rows",
     references=("IEEE 1789-2015 (modulation of the light of diodes)",),
     advice="Use direct current, or expose for a whole number of the light's periods.",
     reasons={
-        "measure": "needs flat frames in a row: the mean of rows over time is a wave of the lamp's frequency",
-        "correct": "needs the lamp's phase in every frame: divide rows by their means where the scene is known",
-        "propagate": "needs the row times of the camera, which a probe does not hold; a common factor moves no centre",
+        "measure": "needs successive flat frames: the row means over time are a wave with the lamp's frequency",
+        "correct": "needs the lamp's phase in every frame: divide rows by their means if the scene is known",
+        "propagate": "needs the row times of the camera, which the probe does not contain; a common factor moves no centre",
     },
 )

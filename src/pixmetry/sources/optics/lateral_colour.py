@@ -18,8 +18,8 @@ class LateralColour(Parameters):
     """A scale that is linear in the wavelength, and the spectrum that the sensor sees."""
 
     scale_per_nm: float = quantity(0.0, "1/nm", "relative change of the image's scale per nanometre", ge=-1e-4, le=1e-4)
-    mean_nm: float = quantity(550.0, "nm", "mean wavelength of the light that is seen", ge=200, le=1200)
-    std_nm: float = quantity(0.0, "nm", "standard deviation of the spectrum that is seen", ge=0, le=400)
+    mean_nm: float = quantity(550.0, "nm", "mean wavelength of the light on the sensor", ge=200, le=1200)
+    std_nm: float = quantity(0.0, "nm", "standard deviation of the spectrum on the sensor", ge=0, le=400)
     reference_nm: float = quantity(550.0, "nm", "wavelength at which the image has its calibrated scale", ge=200, le=1200)
 
 
@@ -55,7 +55,7 @@ def propagate(params: LateralColour, probe: Probe) -> Contribution:
 SOURCE = Source(
     id="optics.lateral_colour",
     title="Lateral colour",
-    description="The lens images each wavelength at another scale: a change of light moves the image outwards or inwards.",
+    description="The scale of the image depends on the wavelength: a change of the light moves the image outwards or inwards.",
     note="Note 14",
     parameters=LateralColour,
     consumes=(Kind.LIGHT,),
@@ -73,6 +73,6 @@ SOURCE = Source(
     advice="Calibrate and measure under the same narrow-band light.",
     reasons={
         "measure": "not measured: needs a test field under two kinds of light",
-        "correct": "a frame is not resampled: positions are corrected instead",
+        "correct": "frames are not resampled; positions are corrected instead",
     },
 )

@@ -42,7 +42,7 @@ def forward(params: OpticalLowPass, signal: Signal, stream: Stream) -> Signal:
 SOURCE = Source(
     id="optics.olpf",
     title="Optical low-pass filter (diffuser)",
-    description="A plate before the sensor spreads each image point over about a pixel, so that finer detail is not aliased.",
+    description="A plate in front of the sensor spreads each image point over about one pixel, so that finer details cause no aliasing.",
     number=1,
     parameters=OpticalLowPass,
     consumes=(Kind.LIGHT,),
@@ -53,12 +53,12 @@ SOURCE = Source(
     forward=forward,
     gum_class="F",
     equation="PSF = ¼ Σ δ(x ± d_x/2, y ± d_y/2),  MTF = |cos(π d_x ν_x) cos(π d_y ν_y)|,  d = t (n_e² − n_o²)/(n_e² + n_o²)",
-    typical_size="none by itself (symmetric); widens the spread by d²/4 px² and removes the error of an undersampled target",
+    typical_size="none by itself (symmetric); adds d²/4 px² to the variance of the spread and removes the error of an undersampled target",
     references=("J. E. Greivenkamp, Color dependent optical prefilter, Applied Optics 29 (1990) 676–684", "ISO 12233:2023 (SFR)"),
-    advice="Fit one, defocus slightly, or stop down, if targets are sharper than about 0.5 px and less than 3 px wide.",
+    advice="If targets are sharper than about 0.5 px and less than 3 px wide: add such a filter, defocus slightly, or stop down.",
     reasons={
         "measure": "not measured: needs the slanted-edge experiment (the zero of the cosine at 1/(2 d))",
         "correct": "a symmetric spread moves no centre; frames are not deconvolved",
-        "propagate": "it only changes how much a target is undersampled, which needs its spread before the plate",
+        "propagate": "it only changes the undersampling; that needs the spread in front of the plate, which the probe does not contain",
     },
 )

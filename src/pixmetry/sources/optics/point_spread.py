@@ -20,9 +20,9 @@ NODES = 40  # of each integral over the common part of two pupils: 1e-6 for a wa
 class PointSpread(Parameters):
     """One spread for the whole frame. Aberrations are Zernike coefficients by Noll's normalisation: waves, root mean square."""
 
-    model: Literal["gaussian", "diffraction", "measured"] = quantity("gaussian", "name", "which of the three")
+    model: Literal["gaussian", "diffraction", "measured"] = quantity("gaussian", "name", "model of the spread")
     sigma_px: float = quantity(0.0, "px", "standard deviation along each axis (gaussian)", ge=0, le=50)
-    wavelength_nm: float = quantity(550.0, "nm", "of the light (diffraction)", ge=100, le=2000)
+    wavelength_nm: float = quantity(550.0, "nm", "wavelength of the light (diffraction)", ge=100, le=2000)
     f_number: float = quantity(4.0, "1", "working f-number (diffraction)", ge=0.7, le=64)
     pitch_x_um: float = quantity(3.45, "µm", "pixel pitch along x (diffraction)", gt=0, le=100)
     pitch_y_um: float = quantity(3.45, "µm", "pixel pitch along y (diffraction)", gt=0, le=100)
@@ -32,11 +32,11 @@ class PointSpread(Parameters):
     coma_x_waves: float = quantity(0.0, "waves", "Zernike (3ρ³ − 2ρ) cos φ, times √8; positive: the tail points to +x", ge=-3, le=3)
     coma_y_waves: float = quantity(0.0, "waves", "Zernike (3ρ³ − 2ρ) sin φ, times √8; positive: the tail points to +y", ge=-3, le=3)
     spherical_waves: float = quantity(0.0, "waves", "Zernike 6ρ⁴ − 6ρ² + 1, times √5", ge=-3, le=3)
-    reach_px: float = quantity(4.0, "px", "half side of the fine table; its tail goes on in wide Gaussians (diffraction)", ge=1, le=12)
+    reach_px: float = quantity(4.0, "px", "half the side of the fine table; wide Gaussians continue its tail (diffraction)", ge=1, le=12)
     table: tuple[tuple[float, ...], ...] = quantity(
         (),
         "1",
-        "mean density of the spread in square cells, rows from the top, odd sides; the middle one is the ideal image point (measured)",
+        "mean density of the spread in square cells, rows from the top, odd sides; the central cell is the ideal image point (measured)",
     )
     table_step_px: float = quantity(0.25, "px", "side of the table's cells (measured)", gt=0.01, le=0.5)
 
@@ -147,10 +147,10 @@ SOURCE = Source(
         "H. H. Hopkins, The frequency response of a defocused optical system, Proc. R. Soc. A 231 (1955) 91–103",
         "R. J. Noll, Zernike polynomials and atmospheric turbulence, JOSA 66 (1976) 207–211",
     ),
-    advice="Stop down until λN is at least the pixel pitch, or defocus slightly, if targets are only a few pixels wide.",
+    advice="If targets are only a few pixels wide: stop down until λN is at least the pixel pitch, or defocus slightly.",
     reasons={
         "measure": "not measured: needs the slanted-edge experiment",
         "correct": "frames are not deconvolved; a symmetric spread moves no centre",
-        "propagate": "it decides how much a target is undersampled, which needs the target before the spread",
+        "propagate": "it only changes the undersampling; that needs the target before the spread, which the probe does not contain",
     },
 )

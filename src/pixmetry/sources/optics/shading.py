@@ -89,7 +89,7 @@ def propagate(params: Shading, probe: Probe) -> Contribution:
         gx * yx + gy * yy,
         "G",
         model_error=0.15,
-        method="linear response of the estimator to the relative gradient, at places all over the frame",
+        method="linear response of the estimator to the relative gradient, at positions all over the frame",
     )
 
 
@@ -105,7 +105,7 @@ def bound_over(frame_shape: tuple[int, int]) -> Shading:
 SOURCE = Source(
     id="optics.shading",
     title="Lens shading and uneven light",
-    description="The light falls off smoothly over the frame; the gradient across a target pulls its centre to the brighter side.",
+    description="The light falls off smoothly over the frame. The gradient across a target shifts its centre to the brighter side.",
     parameters=Shading,
     consumes=(Kind.PHOTONS,),
     before=("sensor",),

@@ -21,16 +21,16 @@ class SpectralFilter(Parameters):
     """A light's spectrum, a filter's band, and the plate that carries it."""
 
     light: Literal["blackbody", "led", "laser"] = quantity("blackbody", "name", "kind of spectrum")
-    temperature_k: float = quantity(2856.0, "K", "of the black body; 2856 K is CIE illuminant A", ge=1000, le=20000)
-    light_nm: float = quantity(625.0, "nm", "centre of the diode's or laser's line", ge=300, le=1200)
-    light_width_nm: float = quantity(20.0, "nm", "full width at half maximum of the diode's Gaussian line", ge=2, le=300)
+    temperature_k: float = quantity(2856.0, "K", "temperature of the black body; 2856 K is CIE illuminant A", ge=1000, le=20000)
+    light_nm: float = quantity(625.0, "nm", "centre wavelength of the diode or laser", ge=300, le=1200)
+    light_width_nm: float = quantity(20.0, "nm", "full width at half maximum of the diode's Gaussian spectrum", ge=2, le=300)
     band: Literal["none", "short_pass", "band_pass"] = quantity("none", "name", "kind of filter")
     cut_nm: float = quantity(680.0, "nm", "half transmittance (short pass), or middle of the band (band pass)", ge=300, le=1200)
     width_nm: float = quantity(40.0, "nm", "full width at half maximum of the band", ge=2, le=600)
     edge_nm: float = quantity(10.0, "nm", "10 to 90 % width of each edge", ge=2, le=200)
     peak_rel: float = quantity(0.95, "1", "transmittance in the band", gt=0, le=1)
-    collecting_depth_um: float = quantity(5.0, "µm", "depth of silicon that collects charge: what weights the spectrum", gt=0, le=500)
-    plate_um: float = quantity(0.0, "µm", "thickness of the plate for which the lens is not refocused", ge=0, le=10000)
+    collecting_depth_um: float = quantity(5.0, "µm", "depth of silicon that collects charge; it gives the spectral weights", gt=0, le=500)
+    plate_um: float = quantity(0.0, "µm", "thickness of the plate, if the lens was focused without it", ge=0, le=10000)
     plate_index: float = quantity(1.52, "1", "refractive index of the plate", ge=1, le=3)
     f_number: float = quantity(4.0, "1", "working f-number", ge=0.7, le=64)
     pitch_um: float = quantity(8.6, "µm", "pixel pitch", gt=0, le=100)
@@ -87,7 +87,8 @@ def forward(params: SpectralFilter, signal: Signal, stream: Stream) -> Signal:
 SOURCE = Source(
     id="optics.spectral_filter",
     title="Spectral filter",
-    description="A filter keeps infrared light away from the sensor but may also swallow a laser's line; its plate shifts the focus.",
+    description="A filter keeps infrared light away from the sensor. It may also absorb the light of a laser, and its plate shifts the "
+    "focus.",
     number=2,
     stars=1,
     note="Note 14",
@@ -105,7 +106,7 @@ SOURCE = Source(
     advice="Match the filter's band to the light, and focus the lens with the filter in place.",
     reasons={
         "measure": "not measured: needs exposures with and without the filter, and the slanted-edge experiment for the focus",
-        "correct": "lost light is not brought back by arithmetic",
-        "propagate": "it has no shift of its own: less light enters through the shot noise, a wider spread through the sampling",
+        "correct": "lost light cannot be recovered",
+        "propagate": "it shifts no target by itself: less light counts in the shot noise, a wider spread in the sampling",
     },
 )

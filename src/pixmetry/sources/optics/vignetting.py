@@ -12,13 +12,15 @@ from pixmetry.camera.source import Parameters, Source, quantity
 class Vignetting(Parameters):
     """The fall-off about the optical axis, where the factor is 1."""
 
-    cos_power: float = quantity(0.0, "1", "power of the field angle's cosine; 4 for a simple lens, less for a retrofocus one", ge=0, le=8)
-    principal_distance_mm: float = quantity(25.0, "mm", "distance of the exit pupil, under which the field angle is seen", gt=0, le=10000)
+    cos_power: float = quantity(
+        0.0, "1", "power of the cosine of the field angle; 4 for a simple lens, less for a retrofocus lens", ge=0, le=8
+    )
+    principal_distance_mm: float = quantity(25.0, "mm", "distance of the exit pupil; it gives the field angle", gt=0, le=10000)
     pupil_shift_rel: float = quantity(
         0.0, "1", "shift of the lens's two limiting openings against each other in the frame's corners, over their diameter", ge=0, le=0.9
     )
-    centre_x_px: float = quantity(0.0, "px", "optical axis less the frame's centre, along x", ge=-1000, le=1000)
-    centre_y_px: float = quantity(0.0, "px", "optical axis less the frame's centre, along y", ge=-1000, le=1000)
+    centre_x_px: float = quantity(0.0, "px", "optical axis minus the frame's centre, along x", ge=-1000, le=1000)
+    centre_y_px: float = quantity(0.0, "px", "optical axis minus the frame's centre, along y", ge=-1000, le=1000)
     pitch_x_um: float = quantity(8.6, "µm", "pixel pitch along x", gt=0, le=100)
     pitch_y_um: float = quantity(8.3, "µm", "pixel pitch along y", gt=0, le=100)
 
@@ -45,7 +47,7 @@ def factor(params: Vignetting, x_px: np.ndarray, y_px: np.ndarray, frame_shape: 
 SOURCE = Source(
     id="optics.vignetting",
     title="Vignetting",
-    description="Away from the optical axis the lens passes less light; the gradient across a target pulls its centre inwards.",
+    description="Away from the optical axis the lens transmits less light. The gradient across a target shifts its centre inwards.",
     parameters=Vignetting,
     consumes=(Kind.PHOTONS,),
     before=("sensor",),
@@ -53,11 +55,11 @@ SOURCE = Source(
     typical=Vignetting(cos_power=4.0, principal_distance_mm=25.0, pupil_shift_rel=0.1),
     bound=Vignetting(cos_power=4.0, principal_distance_mm=8.0, pupil_shift_rel=0.2),
     **factor_verbs(factor),
-    option="shading that is given by its optical data; what is measured is in optics.shading",
+    option="shading that is described by optical data; measured shading is in optics.shading",
     gum_class="G",
     equation="µ' = µ cos⁴θ · (2/π)(acos s − s √(1 − s²)),  tan θ = r/c,  s = s_corner r/r_corner;  Δx = g ⟨x²⟩",
     typical_size="0.004 to 0.011 px for 0.1 to 0.3 % per px on a disc of 7 px (centroid)",
     references=("ISO 17957:2015 (shading)", "M. Reiss, The cos⁴ law of illumination, JOSA 35 (1945) 283–288"),
-    advice="Stop the lens down, take one with a longer focal length, or divide by a flat field.",
-    reasons={"measure": "a flat field shows only all shading together: optics.shading measures that"},
+    advice="Stop the lens down, take a lens with a longer focal length, or divide by a flat field.",
+    reasons={"measure": "a flat field shows the sum of all shading, which optics.shading measures"},
 )

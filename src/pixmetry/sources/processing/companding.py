@@ -18,9 +18,11 @@ class Companding(Parameters):
     """The curve of the table, and the width of the transport."""
 
     law: Literal["off", "truncated", "linear", "root"] = quantity(
-        "off", "1", "truncated: lower bits cut off, as Mono8 often is; linear: rounded; root: square root, steps that follow the shot noise"
+        "off",
+        "1",
+        "truncated: lower bits cut off, as often in Mono8; linear: rounded; root: square root, with steps in proportion to the shot noise",
     )
-    transport_bits: int = quantity(8, "bit", "bits on the way; at most those of the codes", ge=1, le=16)
+    transport_bits: int = quantity(8, "bit", "bits during transport; at most those of the codes", ge=1, le=16)
     bits: int = bits_of_camera()
 
 
@@ -69,7 +71,7 @@ def propagate(params: Companding, probe: Probe) -> Contribution:
 SOURCE = Source(
     id="processing.companding",
     title="Companding and transport in fewer bits",
-    description="Codes of 12 bits travel as 8 and are spread again: many codes never occur, and rounding is done twice.",
+    description="Codes of 12 bits are sent as 8 bits and expanded again: many codes never occur, and values are rounded twice.",
     parameters=Companding,
     consumes=(Kind.CODES,),
     after=("sensor", "electronics", "cable", "grabber"),
@@ -79,14 +81,14 @@ SOURCE = Source(
     bound=Companding(law="truncated", bits=12),
     forward=forward,
     propagate=propagate,
-    option="fewer bits on the way than in the converter",
+    option="fewer bits during transport than in the converter",
     gum_class="F",
     equation="y = T⁻¹(round T(x)),  T = (2^b − 1)(x/x_max)^γ,  γ = 1 or 1/2",
-    typical_size="below 0.001 px where the steps stay below the noise",
+    typical_size="below 0.001 px if the steps are smaller than the noise",
     references=("EMVA 1288 R4.0 Linear, §2.2 (quantisation, step²/12)", "GenICam PFNC 2.4 (Mono8, Mono12)"),
-    advice="Take the raw 10 or 12 bits; else keep the steps below the noise.",
+    advice="Use the raw 10 or 12 bits. Otherwise keep the steps smaller than the noise.",
     reasons={
         "measure": "not measured: needs the gaps of a code histogram over an even spread of levels",
-        "correct": "what rounding merged cannot be told apart",
+        "correct": "values that rounding merged cannot be separated again",
     },
 )

@@ -18,7 +18,9 @@ OFF = 65535
 class DefectCorrection(Parameters):
     """When a pixel is taken for a defect."""
 
-    threshold_dn: int = quantity(OFF, "DN", "by how much it exceeds the highest, or misses the lowest, neighbour; 65535: off", ge=0, le=OFF)
+    threshold_dn: int = quantity(
+        OFF, "DN", "by how much a pixel is above the highest or below the lowest neighbour; 65535: off", ge=0, le=OFF
+    )
     mosaic: Literal["none", "bayer"] = quantity("none", "1", "neighbours of the same colour lie two pixels away in a colour mosaic")
 
 
@@ -49,7 +51,8 @@ def replaced(params: DefectCorrection, codes: np.ndarray) -> np.ndarray:
 SOURCE = Source(
     id="processing.defect_correction",
     title="Defect correction",
-    description="Single bright or dark pixels are replaced by the median of their neighbours: also the peak of a target of one pixel.",
+    description="Single bright or dark pixels are replaced by the median of their neighbours. This also removes the peak of a target of "
+    "one pixel.",
     number=17,
     parameters=DefectCorrection,
     consumes=(Kind.CODES,),
@@ -65,10 +68,10 @@ SOURCE = Source(
     equation="y = median of the 8 neighbours if x > max + T or x < min − T, else x",
     typical_size="none on a disc of 7 px; a target of one pixel vanishes, one of 2 px is shifted by up to 0.3 px",
     references=("EMVA 1288 R4.0 Linear, §8.5 (defect pixels)",),
-    advice="Switch it off, or have only listed defects replaced; use targets of 3 px or more.",
+    advice="Switch it off, or let it replace only listed defects. Use targets of 3 px or more.",
     reasons={
-        "measure": "not measured: needs the count of single outliers against the normal law of the noise, which such a correction cuts off",
-        "correct": "what was replaced is lost",
-        "propagate": "which pixels stand out hangs on the noise: only a simulation with the noise of the camera tells",
+        "measure": "not measured: needs the number of single outliers compared with a normal distribution; this correction cuts them off",
+        "correct": "the replaced values are lost",
+        "propagate": "the noise decides which pixels are replaced: only a simulation with the camera's noise gives the contribution",
     },
 )

@@ -109,14 +109,15 @@ def propagate(params: Demosaic, probe: Probe) -> Contribution:
         beside=rounding,
         model_error=0.15,
         floor_px=5e-4,
-        method="the estimator on the filled-in mosaic, over its four places",
+        method="the estimator on the interpolated mosaic, over its four positions",
     )
 
 
 SOURCE = Source(
     id="processing.demosaic",
     title="Demosaicing",
-    description="Two of three colours of every pixel come from its neighbours, in another way at each of four places: targets shift.",
+    description="Two of the three colours of every pixel are interpolated from its neighbours. The rule differs between the four "
+    "positions of the mosaic, so targets shift.",
     parameters=Demosaic,
     consumes=(Kind.CODES,),
     after=("sensor", "electronics", "cable", "grabber", "processing.defect_correction"),
@@ -135,9 +136,9 @@ SOURCE = Source(
         "H. S. Malvar, L. He, R. Cutler, High-quality linear interpolation for demosaicing of Bayer-patterned color images, ICASSP 2004",
         "ITU-R BT.601-7 (weights of the luminance)",
     ),
-    advice="Store the raw mosaic, balance its colours and locate targets there; use targets of 7 px or more.",
+    advice="Store the raw mosaic, balance its colours, and locate targets in it. Use targets of 7 px or more.",
     reasons={
-        "measure": "not measured: needs the spectra of noise by place in the pattern; the method stands in the camera's manual",
-        "correct": "the mosaic that was interpolated is lost but for the places of the colour that is put out",
+        "measure": "not measured: needs the noise spectra at each position of the pattern; the camera's manual states the method",
+        "correct": "the raw mosaic is lost, except at the pixels of the colour that is stored",
     },
 )

@@ -17,7 +17,7 @@ from pixmetry.sources.processing._kernels import bilateral, blur, median
 class NoiseReduction(Parameters):
     """Kind and size of the filter."""
 
-    method: Literal["off", "median", "gaussian", "bilateral"] = quantity("off", "1", "bilateral: like pixels only")
+    method: Literal["off", "median", "gaussian", "bilateral"] = quantity("off", "1", "bilateral: only pixels of similar value")
     radius_px: int = quantity(1, "px", "pixels to each side", ge=1, le=7)
     sigma_px: float = quantity(1.0, "px", "standard deviation of the weights in space (gaussian, bilateral)", gt=0, le=16)
     range_dn: float = quantity(10.0, "DN", "standard deviation of the weights in grey value (bilateral)", gt=0, le=65535)
@@ -55,7 +55,7 @@ def context(params: NoiseReduction, windows: Windows, frame_shape: tuple[int, in
 SOURCE = Source(
     id="processing.noise_reduction",
     title="Spatial noise reduction",
-    description="Noise is smoothed; so are small targets, and what a filter does to an edge depends on the noise on it.",
+    description="The filter smooths noise and small targets. Its effect on an edge depends on the noise there.",
     parameters=NoiseReduction,
     consumes=(Kind.CODES,),
     after=("sensor", "electronics", "cable", "grabber", "processing.defect_correction"),
@@ -68,7 +68,7 @@ SOURCE = Source(
     option="noise reduction in the camera",
     gum_class="F",
     equation="y = median, Σ w x, or Σ w(Δr) w(Δx) x / Σ w(Δr) w(Δx) of the pixels around",
-    typical_size="0.01 to 0.1 px on targets of 3 px or less; a pixel that stands alone vanishes",
+    typical_size="0.01 to 0.1 px on targets of 3 px or less; a target of one pixel vanishes",
     references=(
         "J. W. Tukey, Exploratory Data Analysis, Addison-Wesley 1977 (running medians)",
         "C. Tomasi, R. Manduchi, Bilateral filtering for gray and color images, ICCV 1998",
@@ -77,6 +77,6 @@ SOURCE = Source(
     reasons={
         "measure": "not measured: needs the correlation of the noise of neighbours, and the response to an edge at two contrasts",
         "correct": "medians and weights that depend on the grey values have no inverse",
-        "propagate": "what it does to an edge depends on the noise on it: only a simulation with the noise of the camera tells",
+        "propagate": "its effect on an edge depends on the noise there: only a simulation with the camera's noise gives the contribution",
     },
 )

@@ -67,7 +67,8 @@ def propagate(params: Sharpening, probe: Probe) -> Contribution:
 SOURCE = Source(
     id="processing.sharpening",
     title="Sharpening",
-    description="Edges get a rim that is too bright inside and too dark outside; noise grows, and neighbours share it.",
+    description="Edges get a rim that is too bright inside and too dark outside. The noise grows and becomes correlated between "
+    "neighbours.",
     parameters=Sharpening,
     consumes=(Kind.CODES,),
     after=("sensor", "electronics", "cable", "grabber", "processing.noise_reduction"),
@@ -86,6 +87,6 @@ SOURCE = Source(
     advice="Switch it off.",
     reasons={
         "measure": "not measured: needs the slanted edge's response above 1 and the correlation of the noise of neighbours",
-        "correct": "codes that were cut off at the ends of the range are lost; the rest needs a deconvolution that amplifies no noise",
+        "correct": "codes cut off at the ends of the range are lost; the others would need a deconvolution without amplified noise",
     },
 )

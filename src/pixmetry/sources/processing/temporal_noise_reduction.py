@@ -13,7 +13,7 @@ from pixmetry.sources.processing._codes import bits_of_camera, stored
 class TemporalNoiseReduction(Parameters):
     """The recursive filter's weight."""
 
-    alpha: float = quantity(0.0, "1", "share of the frame before in the new one", ge=0, le=0.98)
+    alpha: float = quantity(0.0, "1", "share of the previous frame in the new one", ge=0, le=0.98)
     bits: int = bits_of_camera()
 
 
@@ -43,7 +43,7 @@ def forward(params: TemporalNoiseReduction, signal: Signal, stream: Stream, stat
 SOURCE = Source(
     id="processing.temporal_noise_reduction",
     title="Temporal noise reduction",
-    description="A recursive filter over the frames lowers the noise of what rests, and drags a tail behind what moves.",
+    description="A recursive filter over the frames lowers the noise of a static scene. A moving target gets a tail.",
     parameters=TemporalNoiseReduction,
     consumes=(Kind.CODES,),
     after=("sensor", "electronics", "cable", "grabber", "processing.defect_correction"),
@@ -56,12 +56,12 @@ SOURCE = Source(
     option="noise reduction in the camera",
     gum_class="O",
     equation="y(t) = α y(t − 1) + (1 − α) x(t);  noise √((1 − α)/(1 + α));  lag v α/(1 − α) T_f",
-    typical_size="one frame's motion at α = 0.5; four frames' at 0.8",
+    typical_size="motion of one frame at α = 0.5; of four frames at 0.8",
     references=("A. V. Oppenheim, R. W. Schafer, Discrete-Time Signal Processing, Pearson 2010, §5.1 (group delay of a recursive filter)",),
-    advice="Switch it off; average frames afterwards, where the motion is known.",
+    advice="Switch it off. Average frames afterwards, with the known motion.",
     reasons={
         "measure": "not measured: needs the correlation of the noise of successive frames of a steady scene: it is α",
-        "propagate": "a target at rest does not move, and the shift of a moving one, v α/(1 − α) T_f, hangs on a motion no probe knows",
+        "propagate": "a target at rest is not shifted; the shift of a moving one, v α/(1 − α) T_f, needs its speed, which the probe lacks",
         "correct": "x = (y − α y_before)/(1 − α) needs the whole sequence without a gap",
     },
 )

@@ -20,7 +20,7 @@ def propagate(params: Threshold, probe: Probe) -> Contribution:
 SOURCE = Source(
     id="processing.threshold",
     title="Threshold and sampling",
-    description="Which pixels a threshold lets in changes with the target's place in the pixel, and with it the centre that is found.",
+    description="The pixels above a threshold change with the position of the target within the pixel, and so does the measured centre.",
     number=37,
     stars=3,
     note="Note 8",
@@ -36,8 +36,8 @@ SOURCE = Source(
     advice="Set the threshold three standard deviations above the background and subtract it (soft threshold).",
     reasons={
         "forward": "it acts in the estimator, not on the frame",
-        "measure": "it acts in the estimator: propagate runs it",
+        "measure": "it acts in the estimator: propagate evaluates it there",
         "correct": "it acts in the estimator: choose a soft threshold, or fit a model of the target",
-        "neutral": "every estimator sees the target through pixels",
+        "neutral": "every estimator works on pixels",
     },
 )

@@ -19,7 +19,7 @@ from pixmetry.core.random import Stream
 class Affinity(Parameters):
     """The additional parameters b₁ and b₂ of a bundle adjustment."""
 
-    b1: float = quantity(0.0, "1", "scale along x over that along y, less 1", ge=-0.1, le=0.1)
+    b1: float = quantity(0.0, "1", "ratio of the scales along x and y, minus 1", ge=-0.1, le=0.1)
     b2: float = quantity(0.0, "1", "shear: displacement along x over the distance along y", ge=-0.1, le=0.1)
 
 
@@ -52,7 +52,8 @@ def propagate(params: Affinity, probe: Probe) -> Contribution:
 SOURCE = Source(
     id="sensor.affinity",
     title="Affinity and shear of the image",
-    description="Axes of unequal scale or not square to each other, from the layout of the sensor or from the read-out's timing.",
+    description="The axes have different scales, or are not at right angles. The layout of the sensor or the timing of the read-out "
+    "causes it.",
     number=7,
     stars=2,
     parameters=Affinity,
@@ -73,6 +74,6 @@ SOURCE = Source(
     advice="Let the calibration estimate both, with images rolled by 90°.",
     measure=measure,
     reasons={
-        "correct": "a frame is not resampled: positions are corrected instead, by the calibration",
+        "correct": "frames are not resampled; positions are corrected instead, by the calibration",
     },
 )

@@ -22,7 +22,7 @@ class BayerMosaic(Parameters):
     red: float = quantity(1.0, "1", "share of the photons that red pixels see", ge=0, le=1)
     green: float = quantity(1.0, "1", "share of the photons that green pixels see", ge=0, le=1)
     blue: float = quantity(1.0, "1", "share of the photons that blue pixels see", ge=0, le=1)
-    green_split_rel: float = quantity(0.0, "1", "green pixels in rows of blue over those in rows of red, less 1", ge=-0.3, le=0.3)
+    green_split_rel: float = quantity(0.0, "1", "ratio of green pixels in blue rows to those in red rows, minus 1", ge=-0.3, le=0.3)
 
 
 def factors(params: BayerMosaic) -> np.ndarray:
@@ -75,13 +75,14 @@ def propagate(params: BayerMosaic, probe: Probe) -> Contribution:
             share = np.roll(cell, (row, col), axis=(0, 1))[np.arange(rows)[:, None] % 2, np.arange(cols) % 2]
             shifts.append(probe.moved(probe.signal_dn * share / level))
     dx, dy = (np.concatenate([s[a] for s in shifts]) for a in (0, 1))
-    return probe.from_shifts(dx, dy, "F", model_error=0.3, method="the estimator on the unbalanced mosaic, over its four places")
+    return probe.from_shifts(dx, dy, "F", model_error=0.3, method="the estimator on the unbalanced mosaic, over its four positions")
 
 
 SOURCE = Source(
     id="sensor.bayer_mosaic",
     title="Colour filter mosaic",
-    description="Pixels of three colours answer even a grey scene differently: a chequered gain that balancing takes out.",
+    description="Pixels of the three colours respond differently even to a grey scene. This is a checkered gain, which colour balancing "
+    "removes.",
     parameters=BayerMosaic,
     consumes=(Kind.PHOTONS,),
     before=("sensor.quantum_efficiency", "sensor.dark_current", "sensor.shot_noise"),
@@ -97,6 +98,6 @@ SOURCE = Source(
     equation="µ' = µ τ_colour(row mod 2, col mod 2)",
     typical_size="0.01 px unbalanced on a disc of 7 px; none for a grey scene once the colours are balanced",
     references=("B. E. Bayer, US patent 3 971 065, 1976", "H. S. Malvar, L. He, R. Cutler, ICASSP 2004 (layout of the mosaic)"),
-    advice="Use a monochrome sensor; else balance the colours on the raw mosaic and locate targets there, without interpolation.",
-    reasons={"measure": "not measured: needs the means of a grey flat field by the four places of the pattern; the PRNU holds them"},
+    advice="Use a monochrome sensor. Otherwise balance the colours of the raw mosaic, and locate targets in it without interpolation.",
+    reasons={"measure": "not measured: needs the means of a grey flat field at the four positions of the pattern; the PRNU contains them"},
 )

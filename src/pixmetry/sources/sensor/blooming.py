@@ -23,15 +23,13 @@ class Blooming(Parameters):
     """Capacity of a pixel, and where the charge goes that it cannot hold."""
 
     full_well_e: float = quantity(20_000.0, "e-", "most electrons that a pixel holds", gt=1, le=UNLIMITED_E)
-    up_share: float = quantity(
-        0.5, "1", "of the charge that spills, the part that goes to the row above (with the smaller number)", ge=0, le=1
-    )
-    drained_share: float = quantity(0.0, "1", "of every spill, the part that a lateral drain takes", ge=0, le=1)
+    up_share: float = quantity(0.5, "1", "share of the spilled charge that goes to the row above (with the smaller number)", ge=0, le=1)
+    drained_share: float = quantity(0.0, "1", "share of every spill that a lateral drain takes", ge=0, le=1)
     drain_ratio: float = quantity(
-        1.0, "1", "over-exposure up to which an overflow drain takes all the excess of a pixel; 1 without one", ge=1, le=1e6
+        1.0, "1", "over-exposure up to which an overflow drain takes all the excess of a pixel; 1: no drain", ge=1, le=1e6
     )
-    knee_rel: float = quantity(0.0, "1", "part of the capacity below the top in which a pixel begins to spill its own charge", ge=0, lt=1)
-    ends: Literal["drain", "barrier"] = quantity("drain", "1", "charge that comes to an end of the column is lost there; or goes back")
+    knee_rel: float = quantity(0.0, "1", "share of the capacity, below the top, in which a pixel already spills charge", ge=0, lt=1)
+    ends: Literal["drain", "barrier"] = quantity("drain", "1", "charge at the end of the column is lost, or goes back")
 
 
 def forward(params: Blooming, signal: Signal, stream: Stream) -> Signal:
@@ -62,15 +60,15 @@ def propagate(params: Blooming, probe: Probe) -> Contribution:
     gain = probe.gain_dn_per_e
     electrons = probe.signal_dn / gain
     if electrons.max() <= params.full_well_e * (1 - params.knee_rel):
-        return probe.contribution((0.0, 0.0), "F", method="the target stays below the full well")
+        return probe.contribution((0.0, 0.0), "F", method="the target is below the full well")
     dx, dy = probe.moved(gain * _spilled(params, electrons).astype(np.float64))
-    return probe.from_shifts(dx, dy, "F", model_error=0.5, method="the estimator on the target as it spills within the window")
+    return probe.from_shifts(dx, dy, "F", model_error=0.5, method="the estimator on the target with the spilled charge within the window")
 
 
 SOURCE = Source(
     id="sensor.blooming",
     title="Blooming",
-    description="Charge beyond the full well spills along the column; where more of it goes one way, the target's centre moves.",
+    description="Charge beyond the full well spills along the column. If it spills more in one direction, the target's centre moves.",
     number=11,
     stars=2,
     parameters=Blooming,
@@ -93,7 +91,7 @@ SOURCE = Source(
     ),
     advice="Lower the exposure until the target peaks at 80 % of the full well; drop targets with streaks.",
     reasons={
-        "measure": "needs a bright spot at exposures up to many times the full well: how long its streaks are, up and down",
-        "correct": "how the charge was spread is lost: flag the columns, or fit full pixels as 'at least the full well'",
+        "measure": "needs a bright spot at exposures up to many times the full well: the lengths of its streaks upwards and downwards",
+        "correct": "the original positions of the charge are lost: flag the columns, or fit full pixels as 'at least the full well'",
     },
 )

@@ -21,8 +21,10 @@ FARTHEST = 0.5  # px by which a border moves at most
 class BrighterFatter(Parameters):
     """How much area a pixel loses by its charge."""
 
-    area_loss_per_e: float = quantity(0.0, "1/e-", "relative loss of area per electron more than in the pixels around it", ge=0, le=1e-5)
-    field_px: float = quantity(0.0, "px", "reach s of the repulsion e^(−d²/2s²); 0: a pixel feels its own charge alone", ge=0, le=1)
+    area_loss_per_e: float = quantity(
+        0.0, "1/e-", "relative loss of area per electron of excess over the surrounding pixels", ge=0, le=1e-5
+    )
+    field_px: float = quantity(0.0, "px", "reach s of the repulsion e^(−d²/2s²); 0: only the pixel's own charge acts", ge=0, le=1)
 
 
 def weights(params: BrighterFatter) -> np.ndarray:
@@ -80,7 +82,8 @@ def propagate(params: BrighterFatter, probe: Probe) -> Contribution:
 SOURCE = Source(
     id="sensor.brighter_fatter",
     title="Brighter-fatter effect",
-    description="The charge of a full pixel repels further charge across its borders: bright spots are wider, neighbours are correlated.",
+    description="The charge in a pixel repels further charge across its borders: bright spots become wider, and neighbouring pixels "
+    "correlated.",
     parameters=BrighterFatter,
     consumes=(Kind.ELECTRONS,),
     after=("sensor.shot_noise",),
@@ -94,11 +97,11 @@ SOURCE = Source(
     propagate=propagate,
     gum_class="F",
     equation="across a border: ½ · (q₁ + q₂)/2 · a (φ₁ − φ₂), φ = w ∗ q;  flat field: σ² = µ − A µ², A = 4a (1 − w₁)",
-    typical_size="variance of a flat field 1 % low at 20 000 electrons; a Gaussian spot of peak P wider by σ² + A P/16",
+    typical_size="variance of a flat field 1 % too low at 20 000 electrons; the variance of a Gaussian spot of peak P becomes σ² + A P/16",
     references=(
         "P. Antilogus et al., JINST 9, C03048, 2014 (borders that move with the charge)",
         "P. Astier et al., A&A 629, A36, 2019 (its photon transfer)",
     ),
-    advice="Keep calibration and use at the same brightness; correct in electrons with the measured area loss.",
+    advice="Calibrate and measure at the same brightness. Correct in electrons with the measured loss of area.",
     reasons={"measure": "needs the covariances of neighbouring pixels in pairs of flat fields at several levels"},
 )

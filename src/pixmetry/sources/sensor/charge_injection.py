@@ -21,9 +21,9 @@ class ChargeInjection(Parameters):
 
     node_ff: float = quantity(0.0, "fF", "capacitance C of the sense node; 0 for no reset noise", ge=0, le=1e5)
     injection_std_e: float = quantity(0.0, "e-", "scatter of the charge that the clocks inject into each sample", ge=0, le=1e4)
-    cds: bool = quantity(False, "1", "correlated double sampling: the reset level of each pixel is subtracted, half a pixel earlier")
+    cds: bool = quantity(False, "1", "correlated double sampling: the reset level of each pixel, half a pixel earlier, is subtracted")
     spike_e: float = quantity(0.0, "e-", "depth of the negative transient in a sample taken at the clock edge", ge=0, le=1e5)
-    spike_period_px: int = quantity(2, "px", "there is an edge at every so many columns, from column 0 on", ge=1, le=4096)
+    spike_period_px: int = quantity(2, "px", "period of the clock edges in columns, from column 0 on", ge=1, le=4096)
     settling_px: float = quantity(0.5, "px", "time constant of the transient, in periods of the pixel clock", gt=0, le=1000)
 
 
@@ -62,7 +62,7 @@ def propagate(params: ChargeInjection, probe: Probe) -> Contribution:
     """Propagator P1 with white noise, and the clock's pattern at every phase to the target; the class is that of the larger part."""
     gain, m = probe.gain_dn_per_e, params.spike_period_px
     u_x, u_y = probe.white(gain * float(noise_e(params, probe.temperature_c)))
-    method = "linear response of the estimator to white noise and to the pattern of the clock at every phase"
+    method = "linear response of the estimator to white noise and to the clock pattern at every phase"
     if not params.spike_e or m == 1:
         return probe.contribution((u_x, u_y), "T", model_error=0.12, method=method)
     pattern = gain * feed_through_e(params, np.arange(m))
@@ -84,7 +84,8 @@ def propagate(params: ChargeInjection, probe: Probe) -> Contribution:
 SOURCE = Source(
     id="sensor.charge_injection",
     title="Charge injection and reset noise",
-    description="Switching the sense node leaves √(kTC) of charge on it and lets clock edges through: noise, and a pattern of columns.",
+    description="The reset of the sense node leaves a noise charge of √(kTC), and clock edges couple into the signal. This gives noise "
+    "and a pattern of columns.",
     number=16,
     stars=1,
     parameters=ChargeInjection,
@@ -97,14 +98,14 @@ SOURCE = Source(
     forward=forward,
     truth=truth,
     propagate=propagate,
-    option="a reset of its own at every pixel",
+    option="a reset of the sense node for every pixel",
     gum_class="T",
     equation="σ = √(kTC)/q;  pattern −a e^(−t/τ);  with double sampling √2 σ_inj and a e^(−t/τ) (1 − e^(−1/2τ))",
     typical_size="40 e- for 10 fF at 300 K: 0.002 px on a disc of 7 px at 15 000 electrons",
     references=("J. R. Janesick, Scientific Charge-Coupled Devices, SPIE Press 2001, ch. 6 (reset noise, double sampling)",),
     advice="Use correlated double sampling and a slow clock; subtract a dark frame for the pattern of the clock.",
     reasons={
-        "measure": "dark frames give its noise and that of the amplifier as one sum; telling them apart needs several clock rates",
-        "correct": "noise cannot be undone; the pattern comes off with the dark frame that sensor.dsnu subtracts",
+        "measure": "dark frames give the sum of its noise and the amplifier's; separating them needs several clock rates",
+        "correct": "noise cannot be removed from a single frame; the dark frame that sensor.dsnu subtracts removes the pattern",
     },
 )

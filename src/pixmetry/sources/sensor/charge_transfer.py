@@ -38,17 +38,17 @@ class ChargeTransfer(Parameters):
     parallel_cti: float = quantity(0.0, "1", "share left behind per transfer down a column", ge=0, le=0.01)
     serial_cti: float = quantity(0.0, "1", "share left behind per transfer along the register", ge=0, le=0.01)
     phases: int = quantity(1, "1", "transfers per pixel (1 where the inefficiency is given per pixel)", ge=1, le=4)
-    trail_px: float = quantity(1.0, "px", "mean distance by which charge left behind is late", ge=1, le=50)
+    trail_px: float = quantity(1.0, "px", "mean distance by which deferred charge is late", ge=1, le=50)
     beta: float = quantity(1.0, "1", "lost charge grows with the packet to this power; below 1 small packets lose more", gt=0, le=1)
-    reference_e: float = quantity(10_000.0, "e-", "packet at which the inefficiency is as given", gt=0, le=1e7)
-    fast_traps_per_px: float = quantity(0.0, "1", "traps in the whole volume of a pixel that release soon", ge=0, le=1000)
+    reference_e: float = quantity(10_000.0, "e-", "packet for which the stated inefficiency holds", gt=0, le=1e7)
+    fast_traps_per_px: float = quantity(0.0, "1", "number of fast traps in the whole volume of a pixel", ge=0, le=1000)
     fast_release_px: float = quantity(1.0, "px", "time constant of their release, in steps of one pixel", ge=0.1, le=1000)
-    slow_traps_per_px: float = quantity(0.0, "1", "traps in the whole volume of a pixel that release late", ge=0, le=1000)
+    slow_traps_per_px: float = quantity(0.0, "1", "number of slow traps in the whole volume of a pixel", ge=0, le=1000)
     slow_release_px: float = quantity(10.0, "px", "time constant of their release, in steps of one pixel", ge=0.1, le=1000)
     fill_beta: float = quantity(0.5, "1", "a packet fills the share (x / trap_well_e)^fill_beta of a pixel's volume", gt=0, le=1)
     trap_well_e: float = quantity(100_000.0, "e-", "packet that fills the whole volume", gt=0, le=1e7)
-    interlaced: bool = quantity(False, "1", "whether even and odd rows are two fields, each of which is transferred by itself")
-    traps_along: Literal["columns", "register", "both"] = quantity("columns", "1", "transfers in which the traps act")
+    interlaced: bool = quantity(False, "1", "whether even and odd rows are two fields that are transferred separately")
+    traps_along: Literal["columns", "register", "both"] = quantity("columns", "1", "number of transfers in which the traps act")
 
     @property
     def traps(self) -> bool:
@@ -296,7 +296,8 @@ def bound_over(frame_shape: tuple[int, int]) -> ChargeTransfer:
 SOURCE = Source(
     id="sensor.charge_transfer",
     title="Charge transfer inefficiency",
-    description="Every transfer leaves a share of the charge behind; it trails away from the output and shifts the target.",
+    description="Every transfer leaves a share of the charge behind. This charge trails behind the target and shifts its centre away "
+    "from the output.",
     number=12,
     stars=1,
     note="Note 16",
@@ -324,5 +325,5 @@ SOURCE = Source(
         "R. Massey et al., MNRAS 439, 887, 2014 (traps filled up to the height of the packet)",
     ),
     advice="Clock more slowly, keep a background of some hundred electrons, and correct with the measured inefficiency.",
-    reasons={"measure": "needs overscan pixels, or one target at many distances from the output: dark and flat frames do not carry it"},
+    reasons={"measure": "needs overscan pixels, or one target at many distances from the output: dark and flat frames do not show it"},
 )

@@ -18,12 +18,12 @@ ITERATIONS = 6
 class CidReadout(Parameters):
     """How often each pixel is read, and what electrodes and clearing add."""
 
-    reads: int = quantity(1, "1", "non-destructive reads N whose mean is taken", ge=1, le=100_000)
-    read_std_e: float = quantity(0.0, "e-", "noise of one read that is new in every read", ge=0, le=1e5)
+    reads: int = quantity(1, "1", "number N of non-destructive reads that are averaged", ge=1, le=100_000)
+    read_std_e: float = quantity(0.0, "e-", "noise of one read, independent from read to read", ge=0, le=1e5)
     floor_std_e: float = quantity(0.0, "e-", "slow (1/f) noise that all reads of a pixel share", ge=0, le=1e5)
-    row_crosstalk: float = quantity(0.0, "1", "share of the mean of its row that joins a pixel", ge=0, le=0.2)
-    col_crosstalk: float = quantity(0.0, "1", "share of the mean of its column that joins a pixel", ge=0, le=0.2)
-    residual: float = quantity(0.0, "1", "share of the charge that clearing by injection leaves for the next frame", ge=0, le=0.5)
+    row_crosstalk: float = quantity(0.0, "1", "share of the row's mean that is added to a pixel", ge=0, le=0.2)
+    col_crosstalk: float = quantity(0.0, "1", "share of the column's mean that is added to a pixel", ge=0, le=0.2)
+    residual: float = quantity(0.0, "1", "share of the charge that remains after clearing and appears in the next frame", ge=0, le=0.5)
 
 
 def noise_e(params: CidReadout) -> float:
@@ -90,7 +90,7 @@ def correct(params: CidReadout, signal: Signal, maps: Mapping[str, np.ndarray]) 
         If the signal holds parts of frames.
     """
     if signal.data.shape[1:] != tuple(signal.frame_shape):
-        raise ParameterError("cross-talk of whole rows needs whole frames", value=signal.data.shape[1:], allowed=str(signal.frame_shape))
+        raise ParameterError("cross-talk from whole rows needs whole frames", value=signal.data.shape[1:], allowed=str(signal.frame_shape))
     y = signal.data.astype(np.float64)
     x = y
     for _ in range(ITERATIONS):
@@ -122,7 +122,8 @@ def propagate(params: CidReadout, probe: Probe) -> Contribution:
 SOURCE = Source(
     id="sensor.cid_readout",
     title="Read-out of a charge injection device",
-    description="Pixels are read without loss as often as wanted; long electrodes are noisy and talk across, and clearing leaves a rest.",
+    description="Pixels can be read several times without loss of charge. The long electrodes are noisy and cause cross-talk, and "
+    "clearing leaves some charge.",
     note="Section 3.2",
     parameters=CidReadout,
     consumes=(Kind.ELECTRONS,),
@@ -141,6 +142,6 @@ SOURCE = Source(
     equation="σ² = σ_read²/N + σ_floor²;  y = q + κ_r ⟨q⟩_row + κ_c ⟨q⟩_col;  q(t) joined by r q(t−1)",
     typical_size="0.003 px for 16 reads of 200 e- on a disc of 7 px at 15 000 electrons",
     references=("J. R. Janesick, Scientific Charge-Coupled Devices, SPIE Press 2001, ch. 6 (averaging of samples)",),
-    advice="Read N times until the noise stands still; clear twice after a bright frame.",
+    advice="Increase the number of reads until the noise falls no further. Clear twice after a bright frame.",
     reasons={"measure": "needs the noise at several numbers of reads, and one bright spot on a dark field for the cross-talk"},
 )

@@ -28,13 +28,17 @@ class DarkCurrent(Parameters):
 
     rate_e_per_s: float = quantity(0.0, "e-/s", "mean dark current at the reference temperature", ge=0, le=1e7)
     reference_temperature_c: float = quantity(20.0, "°C", "sensor temperature at which the rate holds", ge=-200, le=150)
-    doubling_c: float = quantity(8.0, "K", "rise of temperature that doubles it", gt=1, le=50)
-    law: Literal["doubling", "gap"] = quantity("doubling", "1", "doubles every doubling_c; or goes as T^1.5 e^(−E_g/2kT)")
+    doubling_c: float = quantity(8.0, "K", "temperature rise that doubles the rate", gt=1, le=50)
+    law: Literal["doubling", "gap"] = quantity(
+        "doubling", "1", "doubling: doubles every doubling_c; gap: proportional to T^1.5 e^(−E_g/2kT)"
+    )
     gap_ev: float = quantity(1.12, "eV", "band gap E_g of the law 'gap'", gt=0.1, le=5)
-    spread_log: float = quantity(0.0, "1", "standard deviation of the logarithm of the pixels' rates; their mean stays", ge=0, le=2)
-    glow_e_per_s: float = quantity(0.0, "e-/s", "what the output amplifier shines into the corner pixel, at any temperature", ge=0, le=1e7)
-    glow_reach_px: float = quantity(50.0, "px", "distance over which its glow falls to 1/e", ge=1, le=1e5)
-    glow_corner: Literal["top left", "top right", "bottom left", "bottom right"] = quantity("top left", "1", "corner of the amplifier")
+    spread_log: float = quantity(0.0, "1", "standard deviation of the logarithm of the pixels' rates, at constant mean", ge=0, le=2)
+    glow_e_per_s: float = quantity(0.0, "e-/s", "glow of the output amplifier in the corner pixel, at any temperature", ge=0, le=1e7)
+    glow_reach_px: float = quantity(50.0, "px", "distance over which the glow falls to 1/e", ge=1, le=1e5)
+    glow_corner: Literal["top left", "top right", "bottom left", "bottom right"] = quantity(
+        "top left", "1", "corner of the frame where the amplifier is"
+    )
 
 
 def warming(params: DarkCurrent, temperature_c: np.ndarray | float) -> np.ndarray:
@@ -111,7 +115,7 @@ def propagate(params: DarkCurrent, probe: Probe) -> Contribution:
 SOURCE = Source(
     id="sensor.dark_current",
     title="Dark current",
-    description="Heat adds electrons in proportion to the exposure time; their mean is a pedestal, their scatter is noise.",
+    description="Heat generates electrons in proportion to the exposure time. Their mean is an offset, their scatter is noise.",
     number=14,
     stars=1,
     note="Note 17",
@@ -131,5 +135,5 @@ SOURCE = Source(
     typical_size="below 0.001 px at video exposure times; 300 e- raise 1.40 DN of noise to 1.41 DN at 0.0097 DN/e-",
     references=("EMVA 1288 R4.0 Linear, §7", "J. R. Janesick, Photon Transfer, SPIE Press 2007 (doubling temperature)"),
     advice="Cool the camera, or expose for a shorter time with more light; subtract a dark frame of the same time and temperature.",
-    reasons={"correct": "its mean comes off with the dark frame that sensor.dsnu subtracts; its shot noise cannot be undone"},
+    reasons={"correct": "the dark frame that sensor.dsnu subtracts removes its mean; its shot noise cannot be removed"},
 )

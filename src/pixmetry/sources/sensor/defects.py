@@ -33,28 +33,30 @@ class Defects(Parameters):
     hot_median_e: float = quantity(500.0, "e-", "median dark excess of a hot pixel in one exposure", ge=0, le=1e6)
     hot_sigma_log: float = quantity(0.5, "1", "standard deviation of the natural logarithm of the excess", ge=0, le=3)
     dead_fraction: float = quantity(0.0, "1", "share of dead pixels", ge=0, le=MOST)
-    dead_gain_rel: float = quantity(0.0, "1", "response of a dead pixel over that of a good one", ge=0, lt=0.5)
+    dead_gain_rel: float = quantity(0.0, "1", "response of a dead pixel relative to a good pixel", ge=0, lt=0.5)
     cold_fraction: float = quantity(0.0, "1", "share of pixels whose dark value is too low", ge=0, le=MOST)
-    cold_e: float = quantity(200.0, "e-", "what a cold pixel lacks", ge=0, le=1e6)
-    gain_fraction: float = quantity(0.0, "1", "share of pixels whose response is off, yet not dead", ge=0, le=MOST)
+    cold_e: float = quantity(200.0, "e-", "deficit of a cold pixel", ge=0, le=1e6)
+    gain_fraction: float = quantity(0.0, "1", "share of pixels whose response is wrong but not zero", ge=0, le=MOST)
     gain_std_rel: float = quantity(0.2, "1", "root mean square of their relative response error", ge=0, le=10)
     noisy_fraction: float = quantity(0.0, "1", "share of pixels with too much temporal noise", ge=0, le=MOST)
     noisy_std_e: float = quantity(100.0, "e-", "standard deviation of that noise", ge=0, le=1e6)
     blinking_fraction: float = quantity(0.0, "1", "share of pixels whose dark charge jumps between two levels", ge=0, le=MOST)
-    blinking_e: float = quantity(100.0, "e-", "what a blinking pixel has more on its upper level", ge=0, le=1e6)
-    blinking_on: float = quantity(0.5, "1", "share of the frames in which it is on its upper level", gt=0, lt=1)
+    blinking_e: float = quantity(100.0, "e-", "difference between the two levels of a blinking pixel", ge=0, le=1e6)
+    blinking_on: float = quantity(0.5, "1", "share of the frames in which a blinking pixel is on its upper level", gt=0, lt=1)
     blinking_frames: float = quantity(
-        10.0, "1", "frames, on average, from one draw of its level to the next: correlation (1 − 1/frames)^k", ge=1, le=1000
+        10.0, "1", "mean number of frames from one draw of the level to the next: correlation (1 − 1/frames)^k", ge=1, le=1000
     )
-    stuck_fraction: float = quantity(0.0, "1", "share of pixels that hold the same charge whatever the light", ge=0, le=MOST)
+    stuck_fraction: float = quantity(0.0, "1", "share of pixels whose charge does not depend on the light", ge=0, le=MOST)
     stuck_e: float = quantity(10_000.0, "e-", "charge of a stuck pixel", ge=0, le=1e7)
     column_fraction: float = quantity(0.0, "1", "share of defect columns", ge=0, le=MOST)
-    column_gain_rel: float = quantity(0.0, "1", "response of a defect column over that of a good one", ge=0, le=2)
+    column_gain_rel: float = quantity(0.0, "1", "response of a defect column relative to a good column", ge=0, le=2)
     column_e: float = quantity(0.0, "e-", "dark excess of a defect column", ge=0, le=1e6)
     cluster_fraction: float = quantity(0.0, "1", "share of pixels that are the centre of a cluster", ge=0, le=0.01)
     cluster_radius_px: float = quantity(1.5, "px", "radius of a cluster", ge=0, le=8)
-    cluster_gain_rel: float = quantity(0.0, "1", "response within a cluster over that of good pixels", ge=0, le=2)
-    listed: tuple[Listed, ...] = quantity((), "px, px, 1, e-", "known defects: row, column, response, dark excess (0, 0 is a dead one)")
+    cluster_gain_rel: float = quantity(0.0, "1", "response within a cluster relative to good pixels", ge=0, le=2)
+    listed: tuple[Listed, ...] = quantity(
+        (), "px, px, 1, e-", "known defects: row, column, response, dark excess (response 0 and excess 0: a dead pixel)"
+    )
 
     @property
     def shares(self) -> dict[str, float]:
@@ -242,25 +244,25 @@ def measure(observations: Observations) -> Estimates:
         count = int(here.sum())
         if count > MOST * pixels:
             raise MeasureError(
-                f"so many pixels are {name} that it is not clear what the good ones are",
+                f"too many pixels are {name}: the good pixels cannot be identified",
                 where="sensor.defects",
                 value=f"{100 * count / pixels:.3g} %",
                 allowed=f"at most {100 * MOST:g} %",
-                remedy="see whether light, exposure and temperature were the same in all frames of the stacks",
+                remedy="check whether light, exposure and temperature were the same in all frames of the stacks",
             )
         by_chance = float(np.sqrt(found.expected_false)) if count else 0.0
         rows.append((f"{name}_fraction", count / pixels, by_chance / pixels, np.inf, "1"))
         if not count:
-            reasons[f"{name}_fraction"] = "all pixels were looked at, none was found; smaller errors are in the scatter of the good ones"
+            reasons[f"{name}_fraction"] = "none found among all pixels; smaller errors are part of the scatter of the good pixels"
     if not places["hot"].any() and gain is not None and np.isfinite(found.dark_limit_dn):
         limit = (found.dark_limit_dn + FOUND_95 * found.dark_sigma_dn) / gain.value
         rows.append(("hot_median_e", min(limit, 1e6), limit * gain.u / gain.value, np.inf, "e-"))
         limits.add("hot_median_e")
-        reasons["hot_median_e"] = "none was found; 95 of 100 with this excess would have been"
+        reasons["hot_median_e"] = "none found; of 100 pixels with this excess, 95 would have been found"
     rows += _errors(observations, places, gain)
     return Estimates.from_rows(
         rows,
-        method="count of pixels beyond the Gaussian core of the others; moments of their errors",
+        method="number of pixels outside the Gaussian distribution of the others; moments of their errors",
         confounders=("a pixel stuck at the top of the scale counts as hot", "cosmic rays and blinking pixels"),
         limits=frozenset(limits),
         reasons=reasons,
@@ -445,7 +447,7 @@ DRAWN = tuple(name for name in Defects.model_fields if not name.startswith(("col
 SOURCE = Source(
     id="sensor.defects",
     title="Defect pixels",
-    description="A few pixels, columns and clusters are hot, dead, cold, stuck, noisy or blinking, always in the same places.",
+    description="A few pixels, columns and clusters are hot, dead, cold, stuck, noisy or blinking, always at the same positions.",
     number=17,
     stars=2,
     parameters=Defects,
@@ -465,5 +467,5 @@ SOURCE = Source(
     equation="hot: n + m e^(s z);  dead: g n;  cold: n − c;  response: (1 + r z) n;  noisy: n + s z;  one pixel of error v: Δ = v d/S",
     typical_size="0.03 px for one pixel that is 50 DN off at the edge of a disc of 7 px",
     references=("EMVA 1288 R4.0 Linear, §8.4 (defect pixels)",),
-    advice="List the defects and leave them out of the fit; or replace them by the median of their neighbours.",
+    advice="List the defects and leave them out of the fit, or replace them by the median of their neighbours.",
 )

@@ -89,7 +89,7 @@ def propagate(params: Dsnu, probe: Probe) -> Contribution:
 SOURCE = Source(
     id="sensor.dsnu",
     title="Dark signal non-uniformity",
-    description="Pixels, rows and columns have fixed offsets of their own, which do not depend on the light.",
+    description="Each pixel, row and column has a fixed offset that does not depend on the light.",
     number=15,
     parameters=Dsnu,
     consumes=(Kind.ELECTRONS,),
@@ -107,5 +107,5 @@ SOURCE = Source(
     equation="n' = n + s_pixel n_rc + s_row n_r + s_col n_c",
     typical_size="0.0055 px per DN of pixel DSNU on a disc of 7 px in a window of radius 6 px (centroid)",
     references=("EMVA 1288 R4.0 Linear, §8.2, eq. 33–42, 66", "JCGM 102:2011, 6.2.1.3"),
-    advice="Subtract the mean of L dark frames; what stays is the noise over √L.",
+    advice="Subtract the mean of L dark frames; noise/√L remains.",
 )

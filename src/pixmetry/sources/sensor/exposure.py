@@ -19,14 +19,18 @@ class Exposure(Parameters):
     """How light is gathered between the start and the end of the exposure, and by how many looks it is stood for."""
 
     profile: Literal["box", "trapezoid", "exponential", "gaussian"] = quantity(
-        "box", "1", "a shutter that is open or closed, one that opens and closes slowly, a strobe that decays, a pulse"
+        "box", "1", "box: open or closed; trapezoid: opens and closes slowly; exponential: a strobe that decays; gaussian: a pulse"
     )
     nodes: int = quantity(
-        1, "1", "looks at a moving scene: 1 at the mean time; for 0.1 % of the peak, 1 and one more per blur radius of path", ge=1, le=64
+        1,
+        "1",
+        "number of times at which a moving scene is evaluated; for 0.1 % of the peak: 1, and one more per blur radius of path",
+        ge=1,
+        le=64,
     )
-    ramp_rel: float = quantity(0.1, "1", "share of the exposure in which a trapezoid rises, and falls", gt=0, le=0.5)
-    decay_rel: float = quantity(0.2, "1", "time constant of the decay, over the exposure", gt=0.01, le=100)
-    width_rel: float = quantity(0.1, "1", "standard deviation of the pulse in the middle, over the exposure", gt=0.01, le=100)
+    ramp_rel: float = quantity(0.1, "1", "share of the exposure in which a trapezoid rises, and again in which it falls", gt=0, le=0.5)
+    decay_rel: float = quantity(0.2, "1", "time constant of the decay, divided by the exposure", gt=0.01, le=100)
+    width_rel: float = quantity(0.1, "1", "standard deviation of the pulse, divided by the exposure", gt=0.01, le=100)
 
 
 def rule(params: Exposure) -> tuple[np.ndarray, np.ndarray]:
@@ -95,7 +99,7 @@ def truth(params: Exposure, signal: Signal, stream: Stream) -> Mapping[str, np.n
 SOURCE = Source(
     id="sensor.exposure",
     title="Motion blur",
-    description="A target that moves during the exposure is spread along its path; its centre belongs to the mean time of the light.",
+    description="A target that moves during the exposure is blurred along its path. Its centre belongs to the mean time of the light.",
     note="Note 4",
     parameters=Exposure,
     consumes=(Kind.LIGHT,),
@@ -113,15 +117,15 @@ SOURCE = Source(
     truth=truth,
     gum_class="O",
     equation="I(x) = ∫ w(t) L(x − x(t)) dt;  box: length b = v t_exp, variance b²/12 along the motion;  shift ½ a t_exp²/12",
-    typical_size="1 px long at 50 px/s and 20 ms; no shift at constant speed if the time is that of the middle",
+    typical_size="1 px long at 50 px/s and 20 ms; no shift at constant speed if the position is assigned to the middle of the exposure",
     references=(
         "G. H. Golub, J. H. Welsch, Math. Comp. 23, 221, 1969 (Gauss rules of a weight function)",
         "W. Gautschi, Orthogonal Polynomials, Oxford 2004, §2.2 (discretised Stieltjes procedure)",
     ),
-    advice="Expose more shortly, or with a strobe, and give the target's position the mean time of the light.",
+    advice="Use a shorter exposure or a strobe, and assign the position to the mean time of the light.",
     reasons={
         "measure": "needs images of a moving target: second moments along and across the motion differ by b²/12",
         "correct": "not needed for a centre: report the mean time of the light; the blur itself needs the target's path",
-        "propagate": "needs the target's speed and acceleration, which a probe does not hold",
+        "propagate": "needs the target's speed and acceleration, which the probe does not contain",
     },
 )

@@ -21,8 +21,10 @@ class FullWell(Parameters):
     """Capacity of a pixel and how softly it is reached."""
 
     full_well_e: float = quantity(20_000.0, "e-", "most electrons that a pixel holds", gt=1, le=UNLIMITED_E)
-    knee_rel: float = quantity(0.0, "1", "part of the capacity below the top in which the response bends; 0 clips hard", ge=0, lt=1)
-    spread_rel: float = quantity(0.0, "1", "relative standard deviation of the capacity over the pixels of a unit", ge=0, le=0.2)
+    knee_rel: float = quantity(
+        0.0, "1", "share of the capacity, below the top, in which the response is curved; 0: hard clipping", ge=0, lt=1
+    )
+    spread_rel: float = quantity(0.0, "1", "relative standard deviation of the capacity from pixel to pixel", ge=0, le=0.2)
 
 
 def capacity_e(params: FullWell, grid: Grid, stream: Stream) -> np.ndarray | float:
@@ -68,7 +70,7 @@ def measure(observations: Observations) -> Estimates:
         [("full_well_e", brightest, u, gain.dof, "e-")],
         method="brightest level of the photon transfer",
         lower_limits=frozenset({"full_well_e"}),
-        reasons={"full_well_e": "lower bound: no level is saturated; add levels until the mean stands still"},
+        reasons={"full_well_e": "lower bound: no level is saturated; add levels until the mean no longer rises"},
     )
 
 
@@ -77,7 +79,7 @@ def propagate(params: FullWell, probe: Probe) -> Contribution:
     gain = probe.gain_dn_per_e
     electrons = probe.signal_dn / gain
     if electrons.max() <= params.full_well_e * (1 - params.knee_rel):
-        return probe.contribution((0.0, 0.0), "F", method="the target stays below the full well")
+        return probe.contribution((0.0, 0.0), "F", method="the target is below the full well")
     dx, dy = probe.moved(gain * response_e(params, electrons))
     return probe.from_shifts(dx, dy, "F", model_error=0.5, method="the estimator on the clipped target")
 

@@ -13,8 +13,8 @@ class ImageLag(Parameters):
     """What stays in the photodiode."""
 
     lag_rel: float = quantity(0.0, "1", "share of the charge that stays behind", ge=0, le=0.9)
-    pocket_e: float = quantity(0.0, "e-", "most that a potential pocket holds back beside that", ge=0, le=1e6)
-    pocket_fill_e: float = quantity(100.0, "e-", "charge at which the pocket is 63 % full", gt=0, le=1e6)
+    pocket_e: float = quantity(0.0, "e-", "largest charge that a potential pocket holds back in addition", ge=0, le=1e6)
+    pocket_fill_e: float = quantity(100.0, "e-", "signal charge at which the pocket is 63 % full", gt=0, le=1e6)
 
 
 def left_behind(params: ImageLag, charge: np.ndarray) -> np.ndarray:
@@ -64,7 +64,7 @@ def forward(params: ImageLag, signal: Signal, stream: Stream, state: np.ndarray 
 SOURCE = Source(
     id="sensor.image_lag",
     title="Image lag",
-    description="A part of the charge stays in the photodiode and appears in the next frame: a moving target drags a ghost behind it.",
+    description="Part of the charge stays in the photodiode and appears in the next frame. A moving target has a ghost behind it.",
     note="Note 16",
     parameters=ImageLag,
     consumes=(Kind.ELECTRONS,),
@@ -79,10 +79,10 @@ SOURCE = Source(
     equation="q_out(t) = q(t) + h(t−1) − h(t);  h(t) ~ Binomial(q(t) + h(t−1) − pocket, λ) + pocket,  pocket = p (1 − e^(−q/p0))",
     typical_size="a target that moves v px a frame is λ v/(1 − λ) behind while its ghost lies in the window: 0.01 px at 1 % and 1 px",
     references=("E. R. Fossum, D. B. Hondongwa, IEEE J. Electron Devices Soc. 2(3), 33, 2014 (pinned photodiodes, lag)",),
-    advice="Leave a dark frame between exposures, or move the target slowly against its size.",
+    advice="Read a dark frame between exposures, or keep the motion per frame small against the size of the target.",
     reasons={
-        "measure": "needs dark frames straight after bright ones: the first of them shows what stayed behind",
-        "correct": "needs the sequence from its first frame on, without a gap",
-        "propagate": "needs the target's speed, which a probe does not hold; a target that stands still is not moved",
+        "measure": "needs dark frames directly after bright frames: the first dark frame shows the lag",
+        "correct": "needs the whole sequence from its first frame on",
+        "propagate": "needs the target's speed, which the probe does not contain; a target at rest is not shifted",
     },
 )

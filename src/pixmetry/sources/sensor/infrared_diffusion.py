@@ -22,12 +22,12 @@ class InfraredDiffusion(Parameters):
     """Light of one wavelength in a sensor lit from the front: a depleted layer, below it silicon without a field."""
 
     wavelength_nm: float = quantity(850.0, "nm", "of the light", ge=300, le=1100)
-    depletion_um: float = quantity(3.0, "µm", "depth down to which charge goes straight to its pixel", ge=0, le=100)
-    diffusion_length_um: float = quantity(0.0, "µm", "how far charge diffuses below; 0: what is absorbed there is lost", ge=0, le=500)
-    chief_ray_deg: float = quantity(0.0, "deg", "of the lens's chief ray in the frame's corners; 0: telecentric", ge=0, le=60)
+    depletion_um: float = quantity(3.0, "µm", "depth above which all charge is collected in its own pixel", ge=0, le=100)
+    diffusion_length_um: float = quantity(0.0, "µm", "diffusion length below that depth; 0: charge from below is lost", ge=0, le=500)
+    chief_ray_deg: float = quantity(0.0, "deg", "angle of the chief ray in the frame's corners; 0: telecentric", ge=0, le=60)
     pitch_x_um: float = quantity(8.6, "µm", "pixel pitch along x", gt=0, le=100)
     pitch_y_um: float = quantity(8.3, "µm", "pixel pitch along y", gt=0, le=100)
-    reach_px: float = quantity(4.0, "px", "half side of the fine table of the spread; its tail goes on in wide Gaussians", ge=1, le=12)
+    reach_px: float = quantity(4.0, "px", "half the side of the fine table of the spread; wide Gaussians continue its tail", ge=1, le=12)
 
 
 def transfer(params: InfraredDiffusion, fx: np.ndarray, fy: np.ndarray) -> np.ndarray:
@@ -109,7 +109,8 @@ def truth(params: InfraredDiffusion, signal: Signal, stream: Stream) -> Mapping[
 SOURCE = Source(
     id="sensor.infrared_diffusion",
     title="Infrared light and charge diffusion",
-    description="Charge from light absorbed deep down diffuses sideways and blurs the image; slanting rays also shift it outwards.",
+    description="Light that is absorbed deep in the silicon generates charge that diffuses sideways and blurs the image. Oblique rays "
+    "also shift it outwards.",
     note="Note 14",
     parameters=InfraredDiffusion,
     consumes=(Kind.LIGHT,),
@@ -126,10 +127,10 @@ SOURCE = Source(
         "C. R. Crowell, E. F. Labuda, The silicon diode array camera tube, BSTJ 48 (1969) 1481–1528",
         "M. A. Green, Solar Energy Mat. & Solar Cells 92 (2008) 1305–1310",
     ),
-    advice="Put an infrared-cut filter before the sensor, or light the scene with a wavelength below 650 nm.",
+    advice="Put an infrared-cut filter in front of the sensor, or use light below 650 nm.",
     reasons={
         "measure": "not measured: needs the slanted-edge experiment at two wavelengths",
         "correct": "frames are not deconvolved; the outward shift is part of the calibrated distortion",
-        "propagate": "the spread changes how a target is sampled, which needs the target before it",
+        "propagate": "it changes the sampling of the target; that needs the target before the spread, which the probe does not contain",
     },
 )

@@ -23,10 +23,10 @@ class Interlace(Parameters):
     in field integration, or less with an electronic shutter.
     """
 
-    field_period_s: float = quantity(0.02, "s", "by which the second field is exposed later", ge=0, le=1)
+    field_period_s: float = quantity(0.02, "s", "delay of the second field", ge=0, le=1)
     first_field: Literal["even", "odd"] = quantity("even", "1", "the rows that are exposed first")
     integration: Literal["frame", "field"] = quantity(
-        "frame", "1", "a line holds the charge of its own row; or of its row and the next, other pairs in each field"
+        "frame", "1", "frame: a line has the charge of its own row; field: of two rows, in different pairs in each field"
     )
 
 
@@ -65,7 +65,7 @@ def truth(params: Interlace, signal: Signal, stream: Stream) -> Mapping[str, np.
 SOURCE = Source(
     id="sensor.interlace",
     title="Interlacing",
-    description="Odd and even rows are exposed one field period apart: a moving target falls apart into two combs.",
+    description="Odd and even rows are exposed one field period apart. A moving target splits into two combs.",
     number=10,
     stars=3,
     note="Note 4",
@@ -81,15 +81,16 @@ SOURCE = Source(
     applies_to=("analogue", "ccd"),
     gum_class="O",
     equation="row r looks at t + t_field (r mod 2);  v t_field = x_second − x_first;  mid-time t + t_exp/2 + t_field/2",
-    typical_size="fields 1 px apart at 50 px/s; a disc of 7 px falls apart at 350 px/s; the centre of the frame keeps within 0.003 px",
+    typical_size="fields 1 px apart at 50 px/s; a disc of 7 px splits at 350 px/s; the centre in the frame is right to 0.003 px",
     references=(
         "ITU-R BT.470 (625 lines, 50 fields)",
         "C. Poynton, Digital Video and HD, 2nd ed., Morgan Kaufmann 2012 (interlaced scanning)",
     ),
-    advice="Take a progressive camera; or locate in each field by itself and give it the field's own time; or flash once for both fields.",
+    advice="Use a progressive camera. Or locate targets in each field separately, at the time of that field. Or use one flash for both "
+    "fields.",
     reasons={
         "measure": "needs images of a moving target: the difference of its centres in both fields over the field period is its speed",
-        "correct": "needs the speed of every target; locate in each field by itself instead",
-        "propagate": "needs the target's speed, which a probe does not hold; the time of the frame's centre is wrong by up to half a field",
+        "correct": "needs the speed of every target; locate targets in each field separately instead",
+        "propagate": "needs the target's speed, which the probe does not contain; the time of the frame is wrong by up to half a field",
     },
 )

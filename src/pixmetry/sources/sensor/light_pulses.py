@@ -16,9 +16,9 @@ from pixmetry.core.random import Stream
 class LightPulses(Parameters):
     """A pulse for each field, and the steady light beside them."""
 
-    separation_s: float = quantity(1e-3, "s", "from the middle of the first pulse to that of the second", ge=0, le=1)
+    separation_s: float = quantity(1e-3, "s", "time from the middle of the first pulse to the middle of the second", ge=0, le=1)
     pulse_s: float = quantity(20e-6, "s", "length of a pulse", ge=0, le=1)
-    ambient_share: float = quantity(0.0, "1", "share of steady light in what a field gathers; 1 is no pulse at all", ge=0, le=1)
+    ambient_share: float = quantity(0.0, "1", "share of steady light in the exposure of a field; 1: no pulse", ge=0, le=1)
     first_field: Literal["even", "odd"] = quantity("even", "1", "the rows that are exposed first")
 
 
@@ -52,8 +52,8 @@ def truth(params: LightPulses, signal: Signal, stream: Stream) -> Mapping[str, n
 SOURCE = Source(
     id="sensor.light_pulses",
     title="Two light pulses",
-    description="A pulse at the end of the first field and one at the start of the second show both fields nearly the same instant; "
-    "steady light still blurs and separates them.",
+    description="One pulse at the end of the first field and one at the start of the second expose both fields at nearly the same time. "
+    "Steady light still blurs and separates the fields.",
     note="Note 4",
     parameters=LightPulses,
     consumes=(Kind.LIGHT,),
@@ -70,10 +70,10 @@ SOURCE = Source(
     equation="field 1: (1 − a) L(t_e − δt/2) + a ∫L;  field 2: (1 − a) L(t_e + δt/2) + a ∫L;  fields lie v δt apart",
     typical_size="0.05 px between the fields at 50 px/s and 1 ms, 0.35 px at 350 px/s",
     references=("M. Raffel et al., Particle Image Velocimetry, Springer 2018 (two pulses astride the transfer)",),
-    advice="Bring the pulses as near as the field transfer allows, and keep steady light out by a filter for the pulses' colour.",
+    advice="Place the pulses as close together as the field transfer allows. Block steady light by a filter for the colour of the pulses.",
     reasons={
         "measure": "needs images of a moving target: the centres of the fields still differ by v δt",
-        "correct": "needs the speed of every target; locate in each field by itself instead",
-        "propagate": "needs the target's speed, which a probe does not hold",
+        "correct": "needs the speed of every target; locate targets in each field separately instead",
+        "propagate": "needs the target's speed, which the probe does not contain",
     },
 )

@@ -22,12 +22,14 @@ class LogResponse(Parameters):
 
     mode: Literal["log", "lin-log"] = quantity("log", "1", "f(s) = ln(1 + s); or s up to a knee k, then k + ln(1 + s − k)")
     gain_dn_per_v: float = quantity(1000.0, "DN/V", "steps of the converter per volt", gt=0, le=1e8)
-    slope_factor: float = quantity(1.0, "1", "n of the transistor below threshold: b = n kT/q per factor e of light", ge=1, le=3)
-    foot_e: float = quantity(100.0, "e-", "c: light at which the response leaves the straight line, dark current included", gt=0, le=1e7)
+    slope_factor: float = quantity(
+        1.0, "1", "slope factor n of the transistor below threshold: b = n kT/q per factor e of light", ge=1, le=3
+    )
+    foot_e: float = quantity(100.0, "e-", "c: light at which the response becomes logarithmic, dark current included", gt=0, le=1e7)
     knee_e: float = quantity(0.0, "e-", "lin-log: light up to which the response is linear", ge=0, le=1e7)
     offset_dn: float = quantity(0.0, "DN", "mean of a, the dark signal", ge=-1e5, le=1e5)
     offset_std_dn: float = quantity(0.0, "DN", "standard deviation of a over the pixels", ge=0, le=1e5)
-    noise_dn: float = quantity(0.0, "DN", "temporal noise of pixel and read-out, alike at all levels, standard deviation", ge=0, le=1e4)
+    noise_dn: float = quantity(0.0, "DN", "temporal noise of pixel and read-out, the same at all levels: standard deviation", ge=0, le=1e4)
     slope_std_rel: float = quantity(0.0, "1", "relative standard deviation of b over the pixels", ge=0, le=0.3)
     foot_std_rel: float = quantity(0.0, "1", "relative standard deviation of c over the pixels", ge=0, le=0.3)
 
@@ -111,7 +113,8 @@ def propagate(params: LogResponse, probe: Probe) -> Contribution:
 SOURCE = Source(
     id="sensor.log_response",
     title="Logarithmic response",
-    description="A pixel that does not integrate answers with the logarithm of the light; every pixel has its own offset, slope and foot.",
+    description="The pixel does not integrate; its output is the logarithm of the light. Every pixel has its own offset a, slope b and "
+    "light c.",
     note="Section 3.2",
     parameters=LogResponse,
     consumes=(Kind.ELECTRONS,),
@@ -137,7 +140,7 @@ SOURCE = Source(
     advice="Calibrate a, b and c of every pixel at four uniform levels or more, and invert the response before measuring.",
     reasons={
         "measure": "needs uniform fields at four levels or more over several decades, read pixel by pixel",
-        "correct": "needs the maps of a, b and c of this unit, which dark and flat stacks at one level do not carry",
-        "neutral": "it is a conversion: without it there are no numbers",
+        "correct": "needs the maps of a, b and c of this camera, which dark and flat stacks at one level do not show",
+        "neutral": "it is a conversion: without it there is no digital signal",
     },
 )

@@ -12,8 +12,8 @@ from pixmetry.camera.source import Parameters, Source, quantity
 class Microlens(Parameters):
     """Acceptance about the chief ray. The tangents of both angles grow in proportion to the distance from the frame's centre."""
 
-    chief_ray_deg: float = quantity(0.0, "deg", "of the lens's chief ray in the frame's corners; 0: telecentric", ge=0, le=60)
-    design_ray_deg: float = quantity(0.0, "deg", "angle for which the microlenses are shifted in the frame's corners", ge=0, le=60)
+    chief_ray_deg: float = quantity(0.0, "deg", "angle of the chief ray in the frame's corners; 0: telecentric", ge=0, le=60)
+    design_ray_deg: float = quantity(0.0, "deg", "chief-ray angle in the corners for which the microlenses are designed", ge=0, le=60)
     acceptance_deg: float = quantity(20.0, "deg", "standard deviation of the response against angle", ge=3, le=90)
     pitch_x_um: float = quantity(8.6, "µm", "pixel pitch along x", gt=0, le=100)
     pitch_y_um: float = quantity(8.3, "µm", "pixel pitch along y", gt=0, le=100)
@@ -31,7 +31,7 @@ def factor(params: Microlens, x_px: np.ndarray, y_px: np.ndarray, frame_shape: t
 SOURCE = Source(
     id="sensor.microlens",
     title="Microlenses and the chief ray's angle",
-    description="Microlenses gather light onto the sensitive area, but less where the chief ray comes at another angle than designed.",
+    description="Microlenses focus light onto the sensitive area. They lose light if the chief ray comes at another angle than designed.",
     number=5,
     parameters=Microlens,
     consumes=(Kind.PHOTONS,),
@@ -40,11 +40,11 @@ SOURCE = Source(
     typical=Microlens(chief_ray_deg=12.0, design_ray_deg=5.0, acceptance_deg=15.0),
     bound=Microlens(chief_ray_deg=20.0, design_ray_deg=0.0, acceptance_deg=15.0),
     **factor_verbs(factor),
-    option="shading that is given by its optical data; what is measured is in optics.shading",
+    option="shading that is described by optical data; measured shading is in optics.shading",
     gum_class="G",
     equation="µ' = µ exp(−(θ − θ_design)²/(2 θ₀²)),  tan θ = tan θ_corner · r/r_corner;  Δx = g ⟨x²⟩",
     typical_size="0.0036 px for a gradient of 0.1 % per px on a disc of 7 px (centroid)",
     references=("P. B. Catrysse, B. A. Wandell, Optical efficiency of image sensor pixels, JOSA A 19 (2002) 1610–1620", "EMVA 1288 R4.0"),
-    advice="Take a lens whose exit pupil suits the sensor; calibrate and flat-field at the working aperture.",
-    reasons={"measure": "a flat field shows only all shading together: optics.shading measures that"},
+    advice="Use a lens with an exit pupil that matches the sensor. Calibrate and take flat fields at the working aperture.",
+    reasons={"measure": "a flat field shows the sum of all shading, which optics.shading measures"},
 )

@@ -18,15 +18,15 @@ class MountDrift(Parameters):
 
     shift_x_px: float = quantity(0.0, "px", "settled displacement along x", ge=-100, le=100)
     shift_y_px: float = quantity(0.0, "px", "settled displacement along y", ge=-100, le=100)
-    scale_rel: float = quantity(0.0, "1", "settled change of scale", ge=-0.01, le=0.01)
-    rotation_rad: float = quantity(0.0, "rad", "settled rotation, positive from x to y", ge=-0.01, le=0.01)
-    affinity_rel: float = quantity(0.0, "1", "settled change of the scale along x alone", ge=-0.01, le=0.01)
-    shear_rel: float = quantity(0.0, "1", "settled displacement along x over the distance along y", ge=-0.01, le=0.01)
+    scale_rel: float = quantity(0.0, "1", "final change of scale", ge=-0.01, le=0.01)
+    rotation_rad: float = quantity(0.0, "rad", "final rotation, positive from x to y", ge=-0.01, le=0.01)
+    affinity_rel: float = quantity(0.0, "1", "final change of the scale along x alone", ge=-0.01, le=0.01)
+    shear_rel: float = quantity(0.0, "1", "final shear: displacement along x over distance along y", ge=-0.01, le=0.01)
     fast_share: float = quantity(0.3, "1", "share that settles with the fast time constant (the chip)", ge=0, le=1)
     fast_s: float = quantity(120.0, "s", "fast time constant", gt=0, le=1e5)
     slow_s: float = quantity(1800.0, "s", "slow time constant (the body)", gt=0, le=1e6)
-    sag_px: float = quantity(0.0, "px", "displacement under the camera's weight, held level", ge=-10, le=10)
-    roll_deg: float = quantity(0.0, "deg", "how far the camera is rolled about its axis since it was calibrated", ge=-180, le=180)
+    sag_px: float = quantity(0.0, "px", "displacement by the camera's weight, camera level", ge=-10, le=10)
+    roll_deg: float = quantity(0.0, "deg", "roll of the camera about its axis since the calibration", ge=-180, le=180)
 
 
 def settled(params: MountDrift, time_s: np.ndarray) -> np.ndarray:
@@ -74,7 +74,8 @@ def truth(params: MountDrift, signal: Signal, stream: Stream) -> Mapping[str, np
 SOURCE = Source(
     id="sensor.mount_drift",
     title="Drift of the sensor in its mount",
-    description="Self-heating moves, turns and stretches the image until it settles; play in the mount moves it when the camera is rolled.",
+    description="Self-heating shifts, rotates and stretches the image until the temperature is stable. Play in the mount shifts it when "
+    "the camera is rolled.",
     note="Note 15",
     parameters=MountDrift,
     consumes=(Kind.LIGHT,),
@@ -90,10 +91,10 @@ SOURCE = Source(
         "S. Robson, T. A. Clarke, J. Chen, Suitability of the Pulnix TM6CN CCD camera for photogrammetric measurement, SPIE 2067 (1993)",
         "H. Handel, Compensation of thermal errors in vision based measurement systems using a system identification approach, ICSP 2008",
     ),
-    advice="Wait until the camera has settled; clamp the lens; calibrate in the attitude in which you measure.",
+    advice="Wait until the camera is warm. Clamp the lens. Calibrate in the orientation in which you measure.",
     reasons={
         "measure": "not measured: needs a series of a fixed test field after switching on, and rolled images",
-        "correct": "a frame is not resampled: positions are corrected instead, from the time or the temperature",
-        "propagate": "it depends on when a frame was taken, which a target's probe does not tell",
+        "correct": "frames are not resampled; positions are corrected instead, from the time or the temperature",
+        "propagate": "it depends on the time of the frame, which the probe does not contain",
     },
 )

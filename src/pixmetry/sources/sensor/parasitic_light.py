@@ -17,10 +17,10 @@ class ParasiticLight(Parameters):
     """Sensitivity of the closed store, and how long each row waits."""
 
     sensitivity_rel: float = quantity(
-        0.0, "1", "of the store over that of the photodiode (the reciprocal of the shutter's efficiency)", ge=0, le=0.1
+        0.0, "1", "sensitivity of the storage node over that of the photodiode (reciprocal of the shutter efficiency)", ge=0, le=0.1
     )
-    wait_s: float = quantity(50e-6, "s", "from the end of the exposure to the read-out of the first row", ge=0, le=1)
-    row_time_s: float = quantity(10e-6, "s", "from the read-out of one row to that of the next", ge=0, le=0.01)
+    wait_s: float = quantity(50e-6, "s", "time from the end of the exposure to the read-out of the first row", ge=0, le=1)
+    row_time_s: float = quantity(10e-6, "s", "time from the read-out of one row to the next", ge=0, le=0.01)
     first_row: Literal["top", "bottom"] = quantity("top", "1", "the row that is read first")
 
 
@@ -61,7 +61,8 @@ def truth(params: ParasiticLight, signal: Signal, stream: Stream) -> Mapping[str
 SOURCE = Source(
     id="sensor.parasitic_light",
     title="Parasitic light sensitivity",
-    description="The stores of a global shutter gather stray light until they are read: a gradient over the rows, and ghosts.",
+    description="The storage nodes of a global shutter collect stray light until they are read. This gives a gradient over the rows, "
+    "and ghosts.",
     parameters=ParasiticLight,
     consumes=(Kind.LIGHT,),
     after=("sensor.exposure",),
@@ -77,9 +78,9 @@ SOURCE = Source(
     equation="I(r) = E t_exp + PLS E (t_wait + r t_row)",
     typical_size="28 % from the first to the last row at 1/700, 20 ms of read-out and 0.1 ms of exposure: 0.0005 px on a disc of 7 px",
     references=("S. Lauxtermann et al., Int. Image Sensor Workshop 2007 (comparison of global shutter pixels)",),
-    advice="Light the scene by a strobe only, or expose longer.",
+    advice="Use a strobe as the only light, or expose longer.",
     reasons={
         "measure": "needs frames of the shortest exposure under steady light: their slope along the rows",
-        "propagate": "needs the share of light that a strobe leaves to the waiting time; under steady light it is a gradient: shift g⟨y²⟩",
+        "propagate": "needs the share of light that falls in the waiting time; under steady light it is a gradient: shift g⟨y²⟩",
     },
 )

@@ -17,10 +17,10 @@ from pixmetry.core.random import Stream
 class PixelAperture(Parameters):
     """A rectangle within the pixel, the same in all pixels."""
 
-    width_x_px: float = quantity(1.0, "px", "width over the pitch", ge=0.05, le=1)
-    width_y_px: float = quantity(1.0, "px", "height over the pitch", ge=0.05, le=1)
-    offset_x_px: float = quantity(0.0, "px", "centre of the rectangle less the pixel's centre, along x", ge=-0.5, le=0.5)
-    offset_y_px: float = quantity(0.0, "px", "centre of the rectangle less the pixel's centre, along y", ge=-0.5, le=0.5)
+    width_x_px: float = quantity(1.0, "px", "width divided by the pitch", ge=0.05, le=1)
+    width_y_px: float = quantity(1.0, "px", "height divided by the pitch", ge=0.05, le=1)
+    offset_x_px: float = quantity(0.0, "px", "centre of the rectangle minus the pixel's centre, along x", ge=-0.5, le=0.5)
+    offset_y_px: float = quantity(0.0, "px", "centre of the rectangle minus the pixel's centre, along y", ge=-0.5, le=0.5)
     collected_rel: float = quantity(
         1.0,
         "1",
@@ -54,7 +54,8 @@ def truth(params: PixelAperture, signal: Signal, stream: Stream) -> Mapping[str,
 SOURCE = Source(
     id="sensor.pixel_aperture",
     title="Light-sensitive area smaller than the pitch",
-    description="Each pixel sees only part of its square. Sharp targets then fall between pixels, and their centres err with the phase.",
+    description="Each pixel is sensitive on part of its square only. Sharp targets fall between pixels, and their centres have an error "
+    "that depends on the sub-pixel phase.",
     number=3,
     stars=1,
     note="Note 21",
@@ -72,7 +73,7 @@ SOURCE = Source(
     advice="Widen the target's image to a spread of 0.6 px or more, or take a sensor with microlenses.",
     reasons={
         "measure": "needs the slanted-edge experiment above half the sampling frequency, or targets moved by parts of a pixel",
-        "correct": "what falls between the pixels is not recorded; shifted frames can be interleaved instead",
-        "propagate": "it only changes how much a target is undersampled, which needs its spread before the pixel",
+        "correct": "light between the pixels is not recorded; shifted frames can be interleaved instead",
+        "propagate": "it only changes the undersampling; that needs the spread in front of the pixel, which the probe does not contain",
     },
 )

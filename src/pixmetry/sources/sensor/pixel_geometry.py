@@ -17,10 +17,12 @@ from pixmetry.core.random import Grid, Stream
 class PixelGeometry(Parameters):
     """Standard deviations along each axis, fixed in the unit."""
 
-    pixel_std_px: float = quantity(0.0, "px", "of each pixel's place", ge=0, le=0.2)
-    field_std_px: float = quantity(0.0, "px", "of the place of each field that is exposed at once on the wafer", ge=0, le=1)
-    fields_x: int = quantity(1, "1", "fields side by side", ge=1, le=32)
-    fields_y: int = quantity(1, "1", "fields one above the other", ge=1, le=32)
+    pixel_std_px: float = quantity(0.0, "px", "standard deviation of each pixel's position", ge=0, le=0.2)
+    field_std_px: float = quantity(
+        0.0, "px", "standard deviation of the position of each field that is exposed in one step on the wafer", ge=0, le=1
+    )
+    fields_x: int = quantity(1, "1", "number of fields side by side", ge=1, le=32)
+    fields_y: int = quantity(1, "1", "number of fields one above the other", ge=1, le=32)
 
 
 def displacements(params: PixelGeometry, grid: Grid, stream: Stream) -> tuple[np.ndarray, np.ndarray]:
@@ -76,7 +78,8 @@ def propagate(params: PixelGeometry, probe: Probe) -> Contribution:
 SOURCE = Source(
     id="sensor.pixel_geometry",
     title="Pixel geometry",
-    description="The places of the pixels scatter about their grid; a sensor stitched from several exposures has steps between its fields.",
+    description="The positions of the pixels scatter about their grid. A sensor that is stitched from several exposures has steps "
+    "between its fields.",
     stars=1,
     note="Note 22",
     parameters=PixelGeometry,
@@ -94,9 +97,9 @@ SOURCE = Source(
         "S. B. Shaklan, M. C. Sharman, S. H. Pravdo, High-precision pixel positions for CCDs, Applied Optics 34 (1995) 6672–6681",
         "JCGM 100:2008, 5.1.2",
     ),
-    advice="Nothing, as a rule: it is far below other errors. Keep targets away from the seams of a stitched sensor.",
+    advice="Usually nothing: it is far smaller than other errors. Keep targets away from the seams of a stitched sensor.",
     reasons={
         "measure": "not measured: needs very many target positions per place, from a self-calibrating bundle",
-        "correct": "a frame is not resampled: positions are corrected instead, by a map of the residuals",
+        "correct": "frames are not resampled; positions are corrected instead, by a map of the residuals",
     },
 )

@@ -19,7 +19,9 @@ class PixelPitch(Parameters):
     """True pitch over the nominal one, less 1. The scene's pixels are the nominal ones; the frame's centre stays."""
 
     error_x_rel: float = quantity(0.0, "1", "along x", ge=-0.2, le=0.2)
-    error_y_rel: float = quantity(0.0, "1", "along y; -0.0349 for 8.6 × 8.3 µm taken as square", ge=-0.2, le=0.2)
+    error_y_rel: float = quantity(
+        0.0, "1", "relative error of the pitch along y; -0.0349 for 8.6 × 8.3 µm taken as square", ge=-0.2, le=0.2
+    )
 
 
 def pull_of(params: PixelPitch, frame_shape: tuple[int, int]) -> Pull:
@@ -51,7 +53,7 @@ def propagate(params: PixelPitch, probe: Probe) -> Contribution:
 SOURCE = Source(
     id="sensor.pixel_pitch",
     title="Pixel pitch",
-    description="A pitch other than the one reckoned with changes the image's scale, and unequally for pixels that are not square.",
+    description="A wrong value of the pixel pitch changes the scale of the image, differently along x and y if the pixels are not square.",
     number=4,
     stars=1,
     note="Note 22",
@@ -69,7 +71,7 @@ SOURCE = Source(
     references=("J. G. Fryer, Camera calibration, in Atkinson (ed.), Close Range Photogrammetry and Machine Vision, 1996",),
     advice="Take both pitches from the data sheet, and let the calibration estimate the ratio of the scales.",
     reasons={
-        "measure": "a calibration finds the ratio of the pitches, as affinity; their size is that of the principal distance",
-        "correct": "a frame is not resampled: positions are multiplied by the true pitch instead",
+        "measure": "a calibration gives the ratio of the pitches as affinity; their size cannot be separated from the principal distance",
+        "correct": "frames are not resampled; positions are multiplied by the true pitch instead",
     },
 )

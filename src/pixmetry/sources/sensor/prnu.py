@@ -59,7 +59,9 @@ def measure(observations: Observations) -> Estimates:
     there = {new: old for new, old in names.items() if spatial is None or old in spatial}
     why = "" if spatial is None else spatial.reasons.get("prnu_pixel_rel", "")
     if "pixel_std_rel" not in there:
-        raise MeasureError("the PRNU of the pixels cannot be told", where="sensor.prnu", value=why, remedy="see what the frames share")
+        raise MeasureError(
+            "the PRNU of the pixels cannot be determined", where="sensor.prnu", value=why, remedy="check what the frames have in common"
+        )
     return observations.fitted(
         there,
         "PRNU needs a stack of bright frames and one of dark frames",
@@ -87,7 +89,7 @@ def propagate(params: Prnu, probe: Probe) -> Contribution:
 SOURCE = Source(
     id="sensor.prnu",
     title="Photo response non-uniformity",
-    description="Pixels, rows and columns differ in sensitivity by a fixed factor; the error grows with the light.",
+    description="Each pixel, row and column has its own sensitivity, a fixed factor. The error grows with the light.",
     number=13,
     stars=1,
     note="Note 20",

@@ -20,12 +20,14 @@ class QuantumEfficiency(Parameters):
     """Mean number of electrons per photon, over the pixel's whole area: a number, or from what silicon absorbs."""
 
     quantum_efficiency: float = quantity(0.5, "1", "electrons per photon that falls on the pixel's area", gt=0, le=1)
-    model: Literal["number", "silicon"] = quantity("number", "1", "the number given; or absorption over the collecting depth")
-    wavelength_nm: float = quantity(550.0, "nm", "middle of the band of the light, in vacuum", ge=FIRST_NM, le=LAST_NM)
-    bandwidth_nm: float = quantity(0.0, "nm", "full width of the band, with as many photons at each wavelength", ge=0, le=900)
-    depth_um: float = quantity(5.0, "um", "depth d of the silicon that collects", gt=0, le=1000)
-    dead_layer_um: float = quantity(0.0, "um", "silicon above it whose charge is lost", ge=0, le=10)
-    reflectance: float = quantity(0.05, "1", "share R of the light that the surface turns back", ge=0, lt=1)
+    model: Literal["number", "silicon"] = quantity(
+        "number", "1", "number: as given; silicon: from the absorption over the collecting depth"
+    )
+    wavelength_nm: float = quantity(550.0, "nm", "centre wavelength of the light, in vacuum", ge=FIRST_NM, le=LAST_NM)
+    bandwidth_nm: float = quantity(0.0, "nm", "full width of the band; the photons are evenly distributed over it", ge=0, le=900)
+    depth_um: float = quantity(5.0, "um", "depth d of the silicon that collects charge", gt=0, le=1000)
+    dead_layer_um: float = quantity(0.0, "um", "thickness of the silicon above it, whose charge is lost", ge=0, le=10)
+    reflectance: float = quantity(0.05, "1", "share R of the light that the surface reflects", ge=0, lt=1)
     collected: float = quantity(1.0, "1", "share CCE of the charge that is collected, fill factor included", gt=0, le=1)
 
 
@@ -65,7 +67,8 @@ def measure(observations: Observations) -> Estimates:
 SOURCE = Source(
     id="sensor.quantum_efficiency",
     title="Quantum efficiency",
-    description="Only a share of the photons becomes electrons that depends on the wavelength; it sets the shot noise of a light level.",
+    description="Only a share of the photons becomes electrons. The share depends on the wavelength and determines the shot noise of a "
+    "light level.",
     note="Note 14",
     parameters=QuantumEfficiency,
     consumes=(Kind.PHOTONS,),
@@ -82,8 +85,8 @@ SOURCE = Source(
     references=("EMVA 1288 R4.0 Linear, §2.1 and §6", "M. A. Green, Sol. Energ. Mat. Sol. Cells 92, 1305, 2008 (absorption of silicon)"),
     advice="Use light at a wavelength where the sensor is sensitive and the lens is corrected.",
     reasons={
-        "correct": "a common factor is no error of the image; the light that was lost cannot be had back",
-        "propagate": "it scales the signal of all pixels alike, which moves nothing; what it does to the noise is in sensor.shot_noise",
+        "correct": "a common factor is not an error of the image; lost light cannot be recovered",
+        "propagate": "it scales the signal of all pixels alike and moves no target; its effect on the noise is in sensor.shot_noise",
         "neutral": "it is a conversion: without it there are no electrons",
     },
 )

@@ -17,11 +17,11 @@ class ReadOut(Parameters):
     """How the rows of one exposure leave the sensor."""
 
     mode: Literal["progressive", "woven", "field"] = quantity(
-        "progressive", "1", "whole frames; both fields of one exposure, woven again by the grabber; one field a frame"
+        "progressive", "1", "progressive: whole frames; woven: both fields of one exposure, interleaved by the grabber; field: one field"
     )
-    swapped: bool = quantity(False, "1", "woven: the grabber takes one field for the other, so the rows of every pair change places")
-    lines: Literal["alternate", "summed"] = quantity("alternate", "1", "field: every other row; or the sum of a row and the next")
-    field: Literal["even", "odd", "alternating"] = quantity("alternating", "1", "field: which one; alternating begins with the even one")
+    swapped: bool = quantity(False, "1", "woven: the grabber exchanges the two fields, so that the rows of every pair are swapped")
+    lines: Literal["alternate", "summed"] = quantity("alternate", "1", "field: every other row, or the sum of a row and the next")
+    field: Literal["even", "odd", "alternating"] = quantity("alternating", "1", "field: which one; alternating starts with even")
 
 
 def fields(params: ReadOut, frame: np.ndarray) -> np.ndarray:
@@ -100,8 +100,8 @@ def truth(params: ReadOut, signal: Signal, stream: Stream) -> Mapping[str, np.nd
 SOURCE = Source(
     id="sensor.read_out",
     title="Read-out modes of a progressive sensor",
-    description="Both fields of one exposure may be woven in the wrong order, which swaps the rows of every pair; single fields have half "
-    "the rows, so small targets show a larger periodic error.",
+    description="If the grabber interleaves two fields in the wrong order, the rows of every pair are swapped. A single field has half the "
+    "rows, so small targets have a larger periodic error.",
     note="Section 3.2",
     parameters=ReadOut,
     consumes=(Kind.ELECTRONS,),
@@ -122,10 +122,10 @@ SOURCE = Source(
         "ITU-R BT.470 (625 lines, 50 fields)",
         "B. F. Alexander, K. C. Ng, Opt. Eng. 30(9), 1320, 1991 (periodic error of centroids)",
     ),
-    advice="Take whole frames; where only fields are to be had, sum the lines, and check the order of the fields on a slanted edge.",
+    advice="Use whole frames. If there are only fields, sum the lines, and check the order of the fields on a slanted edge.",
     reasons={
         "measure": "needs an edge or targets: with rows swapped, neighbouring rows of a slanted edge lie in the wrong order",
         "correct": "rows swapped are swapped back by the same source; rows of the other field are not in the frame",
-        "propagate": "it needs the target on the raster of the field, while a probe holds it on that of the frame",
+        "propagate": "needs the target on the raster of the field; the probe has it on the raster of the frame",
     },
 )

@@ -15,10 +15,10 @@ from pixmetry.core.random import Stream
 class RollingShutter(Parameters):
     """Time from row to row, and where the reading begins."""
 
-    row_time_s: float = quantity(0.0, "s", "from the read-out of one row to that of the next", ge=0, le=0.01)
+    row_time_s: float = quantity(0.0, "s", "time from the read-out of one row to the next", ge=0, le=0.01)
     first_row: Literal["top", "bottom"] = quantity("top", "1", "the row that is read first")
     reset: Literal["rolling", "global"] = quantity(
-        "rolling", "1", "every row is exposed equally long; or all begin together and the last ones gather more light"
+        "rolling", "1", "rolling: all rows are exposed for the same time; global: all start together, and the last rows collect more light"
     )
 
 
@@ -52,7 +52,7 @@ def truth(params: RollingShutter, signal: Signal, stream: Stream) -> Mapping[str
 SOURCE = Source(
     id="sensor.rolling_shutter",
     title="Rolling shutter",
-    description="Rows are exposed one after the other; a moving target is sheared and stretched, and flickering light becomes bands.",
+    description="Rows are exposed one after the other. A moving target is sheared and stretched, and flickering light makes bands.",
     parameters=RollingShutter,
     consumes=(Kind.LIGHT,),
     after=("sensor.exposure",),
@@ -67,10 +67,10 @@ SOURCE = Source(
     equation="row r looks at t + r t_row;  shift v t_row (r − r0);  after a global reset row r gathers for t_exp + r t_row",
     typical_size="1.02 px from the first to the last of 2048 rows at 50 px/s and 10 µs",
     references=("C. Geyer, M. Meingast, S. Sastry, OMNIVIS 2005 (geometric models of rolling shutters)",),
-    advice="Take a global shutter or a strobe after a global reset; else model the time of every row.",
+    advice="Use a global shutter, or a strobe after a global reset. Otherwise model the time of every row.",
     reasons={
         "measure": "needs a moving edge or flickering light of known frequency: the slope of an edge against its speed",
         "correct": "needs the speed of every target: a target at row r belongs to the time of that row",
-        "propagate": "needs the target's speed, which a probe does not hold",
+        "propagate": "needs the target's speed, which the probe does not contain",
     },
 )

@@ -28,7 +28,7 @@ def propagate(params: ShotNoise, probe: Probe) -> Contribution:
 SOURCE = Source(
     id="sensor.shot_noise",
     title="Photon shot noise",
-    description="The number of electrons in a pixel follows Poisson's law; dark electrons share in it.",
+    description="The number of electrons in a pixel, dark electrons included, has a Poisson distribution.",
     note="Figure 3.20",
     parameters=ShotNoise,
     consumes=(Kind.ELECTRONS,),
@@ -42,10 +42,10 @@ SOURCE = Source(
     equation="n ~ Poisson(µ_e);  σ_y² = K µ_y",
     typical_size="0.004 px on a disc of 7 px at 15 000 electrons",
     references=("EMVA 1288 R4.0 Linear, §2.2", "M. B. Giles, ACM TOMS 42(1), 2016, algorithm 955 (inversion)"),
-    advice="Gather more electrons: a brighter target up to 80 % of saturation, a larger target, or N frames (1/√N).",
+    advice="Collect more electrons: a brighter target up to 80 % of saturation, a larger target, or N frames (1/√N).",
     reasons={
         "measure": "it has no free parameter: the gain that scales it is measured by electronics.gain from the photon transfer",
-        "correct": "a Poisson draw cannot be undone; averaging frames lowers it",
-        "neutral": "no light is free of it",
+        "correct": "shot noise cannot be removed from a single frame; averaging frames lowers it",
+        "neutral": "all light has it",
     },
 )

@@ -23,16 +23,18 @@ class Smear(Parameters):
     """How long charge moves through the column, how much light it sees there, and which rows it passes."""
 
     transfer_s: float = quantity(
-        0.0, "s", "frame transfer: to move the whole frame into its store; interline: to read the whole frame", ge=0, le=1
+        0.0, "s", "frame transfer: time to move the whole frame into its storage area; interline: time to read the whole frame", ge=0, le=1
     )
     leak_rel: float = quantity(
-        1.0, "1", "light seen under way over that of a photosite: 1 unshielded, 1e-5 to 1e-4 in an interline sensor", ge=0, le=1
+        1.0, "1", "sensitivity during the transfer over that of a photosite: 1 unshielded, 1e-5 to 1e-4 in an interline sensor", ge=0, le=1
     )
     rows: Literal["all", "passed"] = quantity(
-        "all", "1", "continuous operation: charge has passed all rows of its column; after a flush: only those between it and the store"
+        "all",
+        "1",
+        "all: continuous operation, charge has passed all rows of its column; passed: after a flush, only the rows up to the storage area",
     )
     store: Literal["below", "above"] = quantity(
-        "below", "1", "side of the store: below, the last row is nearest to it; above, row 0, as in sensor.charge_transfer"
+        "below", "1", "side of the storage area: below, the last row is nearest to it; above, row 0, as in sensor.charge_transfer"
     )
 
 
@@ -89,7 +91,8 @@ def truth(params: Smear, signal: Signal, stream: Stream) -> Mapping[str, np.ndar
 SOURCE = Source(
     id="sensor.smear",
     title="Smear",
-    description="Charge on its way down the column gathers more light: a bright target leaves a streak above and below it, or on one side.",
+    description="Charge collects more light while it moves down the column. A bright target leaves a streak above and below it, or on "
+    "one side.",
     number=9,
     stars=2,
     parameters=Smear,
@@ -112,9 +115,9 @@ SOURCE = Source(
         "F. A. Iglesias, A. Feller, K. Nagaraju, Appl. Opt. 54, 5970, 2015 (smear of shutterless sensors and its removal)",
         "J. R. Janesick, Scientific Charge-Coupled Devices, SPIE Press 2001",
     ),
-    advice="Use a strobe or a shutter, an interline sensor, or subtract the streak that covered rows show.",
+    advice="Use a strobe, a shutter or an interline sensor. Or subtract the streak that covered rows show.",
     reasons={
         "measure": "needs covered rows above and below the image, or one bright target on black",
-        "propagate": "needs the light of the whole column: the streaks of all else in it weigh as much as the target's own",
+        "propagate": "needs the light of the whole column: the streaks of other objects in it count as much as the target's own",
     },
 )

@@ -17,8 +17,8 @@ from pixmetry.core.random import Stream
 class Stabilisation(Parameters):
     """Standard deviations from frame to frame, independent of each other."""
 
-    shift_std_px: float = quantity(0.0, "px", "of the place along each axis", ge=0, le=100)
-    roll_std_rad: float = quantity(0.0, "rad", "of the rotation about the frame's centre", ge=0, le=0.05)
+    shift_std_px: float = quantity(0.0, "px", "standard deviation of the position along each axis", ge=0, le=100)
+    roll_std_rad: float = quantity(0.0, "rad", "standard deviation of the rotation about the frame's centre", ge=0, le=0.05)
 
 
 def poses(params: Stabilisation, signal: Signal, stream: Stream) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -66,7 +66,7 @@ def propagate(params: Stabilisation, probe: Probe) -> Contribution:
 SOURCE = Source(
     id="sensor.stabilisation",
     title="Stabilised sensor",
-    description="The actuators of an image stabiliser leave the image at another place and angle in every frame, even on a tripod.",
+    description="The actuators of an image stabiliser move and rotate the image from frame to frame, even on a tripod.",
     parameters=Stabilisation,
     consumes=(Kind.LIGHT,),
     neutral=Stabilisation(),
@@ -83,6 +83,6 @@ SOURCE = Source(
     advice="Switch the stabilisation off, or estimate principal point and roll for every image.",
     reasons={
         "measure": "not measured: needs a series of a fixed test field from a tripod",
-        "correct": "a frame is not resampled: positions are corrected instead, by the pose of each frame",
+        "correct": "frames are not resampled; positions are corrected instead, by the pose of each frame",
     },
 )

@@ -19,10 +19,10 @@ class ThermalExpansion(Parameters):
     """Coefficients of linear expansion about a point that stays, and the temperature at which the camera was calibrated."""
 
     reference_c: float = quantity(20.0, "°C", "sensor temperature at which there is no displacement", ge=-100, le=150)
-    sensor_per_k: float = quantity(0.0, "1/K", "of the sensor: silicon 2.6e-6, ceramic package 7e-6", ge=0, le=1e-4)
-    mount_per_k: float = quantity(0.0, "1/K", "of what holds the lens at its distance: aluminium 23e-6, steel 12e-6", ge=-1e-4, le=1e-3)
-    fixed_x_px: float = quantity(0.0, "px", "the point that stays less the frame's centre, along x", ge=-10000, le=10000)
-    fixed_y_px: float = quantity(0.0, "px", "the point that stays less the frame's centre, along y", ge=-10000, le=10000)
+    sensor_per_k: float = quantity(0.0, "1/K", "expansion coefficient of the sensor: silicon 2.6e-6, ceramic package 7e-6", ge=0, le=1e-4)
+    mount_per_k: float = quantity(0.0, "1/K", "expansion coefficient of the lens mount: aluminium 23e-6, steel 12e-6", ge=-1e-4, le=1e-3)
+    fixed_x_px: float = quantity(0.0, "px", "fixed point minus the frame's centre, along x", ge=-10000, le=10000)
+    fixed_y_px: float = quantity(0.0, "px", "fixed point minus the frame's centre, along y", ge=-10000, le=10000)
     shift_x_px_per_k: float = quantity(0.0, "px/K", "displacement of the whole image along x", ge=-1, le=1)
     shift_y_px_per_k: float = quantity(0.0, "px/K", "displacement of the whole image along y", ge=-1, le=1)
 
@@ -77,14 +77,14 @@ SOURCE = Source(
     propagate=propagate,
     gum_class="D",
     equation="x' − x₀ = (x − x₀)(1 + α_mount ΔT)/(1 + α_sensor ΔT) + s ΔT",
-    typical_size="20 K over half of 752 columns: 0.02 px by the silicon, 0.17 px by an aluminium mount",
+    typical_size="20 K, at half of 752 columns: 0.02 px by the silicon, 0.17 px by an aluminium mount",
     references=(
         "M. J. Smith, E. Cope, The effects of temperature variation on single-lens-reflex digital camera calibration, IAPRS 38/5 (2010)",
         "K. G. Lyon et al., Linear thermal expansion measurements on silicon, J. Appl. Phys. 48 (1977) 865",
     ),
-    advice="Let the camera warm up, keep its temperature, and calibrate at the temperature of the measurement.",
+    advice="Let the camera warm up, keep its temperature constant, and calibrate at the temperature of the measurement.",
     reasons={
         "measure": "not measured: needs a series of a fixed test field while the camera warms up",
-        "correct": "a frame is not resampled: positions are corrected instead, from the temperature",
+        "correct": "frames are not resampled; positions are corrected instead, from the temperature",
     },
 )

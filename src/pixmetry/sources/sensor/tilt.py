@@ -17,9 +17,9 @@ from pixmetry.core.random import Stream
 class Tilt(Parameters):
     """Rotation of the sensor about the point where the optical axis meets it, the frame's centre."""
 
-    tilt_x_deg: float = quantity(0.0, "deg", "how the distance from the lens grows with x", ge=-10, le=10)
-    tilt_y_deg: float = quantity(0.0, "deg", "how the distance from the lens grows with y", ge=-10, le=10)
-    principal_distance_mm: float = quantity(25.0, "mm", "from the exit pupil's centre to the sensor", gt=1, le=10000)
+    tilt_x_deg: float = quantity(0.0, "deg", "tilt about y: growth of the distance from the lens with x", ge=-10, le=10)
+    tilt_y_deg: float = quantity(0.0, "deg", "tilt about x: growth of the distance from the lens with y", ge=-10, le=10)
+    principal_distance_mm: float = quantity(25.0, "mm", "distance from the exit pupil's centre to the sensor", gt=1, le=10000)
     f_number: float = quantity(8.0, "1", "working f-number, for the defocus", ge=0.7, le=64)
     pitch_x_um: float = quantity(8.6, "µm", "pixel pitch along x", gt=0, le=100)
     pitch_y_um: float = quantity(8.3, "µm", "pixel pitch along y", gt=0, le=100)
@@ -81,7 +81,8 @@ def propagate(params: Tilt, probe: Probe) -> Contribution:
 SOURCE = Source(
     id="sensor.tilt",
     title="Sensor tilted against the lens",
-    description="A sensor that is not square to the optical axis sees a perspective of the image, and its focus runs from side to side.",
+    description="A sensor that is not perpendicular to the optical axis records a perspective of the image. Its focus varies from side "
+    "to side.",
     number=7,
     stars=2,
     parameters=Tilt,
@@ -99,9 +100,9 @@ SOURCE = Source(
         "R. Hartley, A. Zisserman, Multiple View Geometry, 2nd ed. 2004, 8.4 (homographies between image planes)",
         "T. A. Clarke, X. Wang, J. G. Fryer, The principal point and CCD cameras, Photogrammetric Record 16 (1998) 293–312",
     ),
-    advice="Calibrate: principal point and principal distance take up nearly all of it. Shim the sensor if one side is out of focus.",
+    advice="Calibrate: principal point and principal distance include nearly all of it. Shim the sensor if one side is out of focus.",
     reasons={
-        "measure": "a calibration takes it up in the principal point and cannot tell it apart; the focus over the frame can",
-        "correct": "a frame is not resampled: positions are corrected instead, by the calibration",
+        "measure": "a calibration includes it in the principal point and cannot separate it; the focus over the frame would show it",
+        "correct": "frames are not resampled; positions are corrected instead, by the calibration",
     },
 )

@@ -17,7 +17,7 @@ class TriggerJitter(Parameters):
     latency_s: float = quantity(0.0, "s", "constant part", ge=-10, le=10)
     jitter_s: float = quantity(0.0, "s", "standard deviation from frame to frame", ge=0, le=1)
     clock_error_rel: float = quantity(
-        0.0, "1", "rate at which the delay grows with time: the clock of the time stamps runs slow", ge=-0.01, le=0.01
+        0.0, "1", "rate at which the delay grows, because the clock of the time stamps is slow", ge=-0.01, le=0.01
     )
 
 
@@ -42,7 +42,8 @@ def truth(params: TriggerJitter, signal: Signal, stream: Stream) -> Mapping[str,
 SOURCE = Source(
     id="sensor.trigger_jitter",
     title="Trigger and time-stamp jitter",
-    description="The exposure begins later than its time stamp says, by a constant, a drift and a random part; what moves is elsewhere.",
+    description="The exposure starts later than its time stamp, by a constant, a drift and a random part. A moving target is then at "
+    "another position.",
     parameters=TriggerJitter,
     consumes=(Kind.LIGHT,),
     after=("sensor.exposure", "sensor.interlace", "sensor.light_pulses", "sensor.rolling_shutter", "sensor.parasitic_light"),
@@ -53,12 +54,12 @@ SOURCE = Source(
     truth=truth,
     gum_class="O",
     equation="t' = t + t_latency + ε t + σ_t n;  shift v (t' − t)",
-    typical_size="0.0005 px at 50 px/s and 10 µs; 0.05 px where a computer's clock gives the time to 1 ms",
+    typical_size="0.0005 px at 50 px/s and 10 µs; 0.05 px if a computer's clock gives the time to 1 ms",
     references=("IEEE 1588-2019 (precision time protocol)", "GigE Vision 2.0 (time stamps)"),
-    advice="Trigger in hardware, take the camera's time stamp rather than the computer's, and keep clocks together by PTP.",
+    advice="Use a hardware trigger and the time stamp of the camera, not of the computer. Synchronise clocks by PTP.",
     reasons={
         "measure": "needs a moving target of known path, or a clock of light-emitting diodes in the image",
-        "correct": "the delay of a frame is not in the frame",
-        "propagate": "needs the target's speed, which a probe does not hold: u = v σ_t",
+        "correct": "a frame does not contain its delay",
+        "propagate": "needs the target's speed, which the probe does not contain: u = v σ_t",
     },
 )

@@ -18,7 +18,13 @@ from pixmetry.core.random import Stream
 class Unflatness(Parameters):
     """Height of the surface by Legendre polynomials over the frame, from -1 to 1 along x and y; positive is farther from the lens."""
 
-    bow_x_um: float = quantity(0.0, "µm", "P₂ along x: height of the left and right edges over 1.5 times lower middle", ge=-1000, le=1000)
+    bow_x_um: float = quantity(
+        0.0,
+        "µm",
+        "P₂ along x: bow of the surface; the edges on the left and right are at this height, the middle at −0.5 times",
+        ge=-1000,
+        le=1000,
+    )
     bow_y_um: float = quantity(0.0, "µm", "P₂ along y", ge=-1000, le=1000)
     twist_um: float = quantity(0.0, "µm", "P₁ along x times P₁ along y: height of two opposite corners", ge=-1000, le=1000)
     skew_x_um: float = quantity(0.0, "µm", "P₃ along x", ge=-1000, le=1000)
@@ -98,7 +104,8 @@ def propagate(params: Unflatness, probe: Probe) -> Contribution:
 SOURCE = Source(
     id="sensor.unflatness",
     title="Sensor unflatness",
-    description="A bowed or twisted sensor is met aside by slanting rays and lies out of focus; it matters with wide-angle lenses.",
+    description="Oblique rays hit a bowed or twisted sensor at shifted positions, and parts of it are out of focus. This matters with "
+    "wide-angle lenses.",
     number=6,
     stars=2,
     note="Note 10",
@@ -114,9 +121,9 @@ SOURCE = Source(
     equation="Δr = Δz tan θ',  σ = |Δz|/(4N)",
     typical_size="10 µm: 0.42 px at 20°, 0.17 px at 8.2° (8.6 µm pixels)",
     references=("C. S. Fraser, Digital camera self-calibration, ISPRS J. 52 (1997) 149–159", "VDI/VDE 2634-1"),
-    advice="Measure the surface apart, take a lens that is telecentric on the image side, or roll the camera in the calibration.",
+    advice="Measure the surface separately, use a lens that is telecentric on the image side, or roll the camera in the calibration.",
     reasons={
-        "measure": "needs a height map measured apart; what a calibration sees of it is in the residual grid",
-        "correct": "a frame is not resampled: positions are corrected instead, from the height map",
+        "measure": "needs a separate measurement of the height; the residual grid of a calibration contains its effect",
+        "correct": "frames are not resampled; positions are corrected instead, from the height map",
     },
 )

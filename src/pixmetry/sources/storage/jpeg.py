@@ -30,7 +30,7 @@ LUMINANCE = np.array(  # ITU-T T.81 (JPEG), Annex K, table K.1
 class Jpeg(Parameters):
     """Setting of the coder."""
 
-    quality: int = quantity(90, "1", "quality by the scale of the Independent JPEG Group", ge=1, le=100)
+    quality: int = quantity(90, "1", "quality on the scale of the Independent JPEG Group", ge=1, le=100)
 
 
 def steps(quality: int) -> np.ndarray:
@@ -117,14 +117,14 @@ def propagate(params: Jpeg, probe: Probe) -> Contribution:
         beside=rounding,
         model_error=0.25 if params.quality >= 50 else 0.45,  # coarse steps change the target beyond first order
         floor_px=5e-4,
-        method="response of the estimator to the rounding of the block coefficients, over all places of the block raster",
+        method="response of the estimator to the rounding of the block coefficients, over all positions in the block raster",
     )
 
 
 SOURCE = Source(
     id="storage.jpeg",
     title="JPEG compression",
-    description="The cosine coefficients of 8 × 8 blocks are rounded; targets shift by where they lie in their block.",
+    description="The cosine coefficients of 8 × 8 blocks are rounded. The shift of a target depends on its position in the block.",
     number=35,
     stars=1,
     parameters=Jpeg,
@@ -141,8 +141,8 @@ SOURCE = Source(
     references=("ITU-T T.81 | ISO/IEC 10918-1, Annexes A and K", "Independent JPEG Group, libjpeg, jcparam.c (scaling of the tables)"),
     advice="Store without loss. If there is no choice, use a quality of at least 95 and large targets.",
     reasons={
-        "measure": "the quality stands in the file; dark and flat frames hold too few coefficients to read it blind",
-        "correct": "the coefficients that were rounded are lost",
+        "measure": "the file states the quality; dark and flat frames have too few coefficients to estimate it",
+        "correct": "the original coefficients are lost",
         "neutral": "even at quality 100 the coefficients are rounded to whole numbers",
     },
 )

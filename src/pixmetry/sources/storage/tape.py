@@ -23,17 +23,17 @@ BESSEL_3 = np.array([-1.32267580, -1.04740916 + 0.99926444j, -1.04740916 - 0.999
 class Tape(Parameters):
     """One recorder, and how often its picture was copied; times are those after a time-base corrector, if there is one."""
 
-    generations: int = quantity(0, "1", "recordings one after the other; 0: no tape", ge=0, le=10)
+    generations: int = quantity(0, "1", "number of successive recordings; 0: no tape", ge=0, le=10)
     bandwidth_mhz: float = quantity(3.0, "MHz", "frequency of −3 dB of the luminance, 3 for VHS, 5 for S-VHS", ge=0.5, le=50)
     noise_dn: float = quantity(0.0, "DN", "standard deviation of the noise, which rises with frequency up to the bandwidth", ge=0, le=1e3)
     white_ns: float = quantity(0.0, "ns", "time-base error that is independent from line to line, standard deviation", ge=0, le=1000)
-    wow_ns: float = quantity(0.0, "ns", "time-base error that lines carry on, standard deviation", ge=0, le=1000)
-    wow_rows: float = quantity(20.0, "rows", "lines of a field over which that falls to 1/e", ge=0.2, le=60)
-    head_switch_ns: float = quantity(0.0, "ns", "step of the time base where the heads change", ge=-5000, le=5000)
-    head_switch_rows: int = quantity(6, "rows", "lines of a field from there to its end", ge=0, le=100)
-    dropouts: float = quantity(0.0, "1", "mean number in a frame", ge=0, le=1e4)
+    wow_ns: float = quantity(0.0, "ns", "time-base error that is correlated from line to line, standard deviation", ge=0, le=1000)
+    wow_rows: float = quantity(20.0, "rows", "number of lines of a field over which this correlation falls to 1/e", ge=0.2, le=60)
+    head_switch_ns: float = quantity(0.0, "ns", "step of the time base where the heads switch", ge=-5000, le=5000)
+    head_switch_rows: int = quantity(6, "rows", "number of lines from there to the end of the field", ge=0, le=100)
+    dropouts: float = quantity(0.0, "1", "mean number of dropouts in a frame", ge=0, le=1e4)
     dropout_us: float = quantity(5.0, "µs", "duration of each", gt=0, le=50)
-    compensated: bool = quantity(True, "1", "whether a dropout is filled from the line before, or black")
+    compensated: bool = quantity(True, "1", "whether a dropout is filled from the previous line, or black")
 
     @property
     def poles(self) -> np.ndarray:
@@ -177,14 +177,16 @@ def propagate(params: Tape, probe: Probe) -> Contribution:
         bias_x_px=smear.bias_x_px + float(step.mean()) + late_px[0], bias_y_px=smear.bias_y_px + late_px[1],
         gum_class="Tr", model_error=0.4, time_px=time,
         smooth_px=(float(smooth.std()), 0.0),
-        method="noise of the tape's spectrum, delays of the rows, and the target after its bandwidth; dropouts are outliers apart",
+        method="noise with the tape's spectrum, delays of the rows, and the target with limited bandwidth; dropouts are outliers and "
+        "not included",
     )  # fmt: skip
 
 
 SOURCE = Source(
     id="storage.tape",
     title="Video tape",
-    description="A recorder before the grabber narrows the band, plays lines early and late, adds noise, and drops some parts.",
+    description="A video recorder in front of the grabber limits the bandwidth, shifts lines in time, adds noise, and loses parts of "
+    "lines.",
     number=36,
     stars=3,
     note="Note 7",
@@ -205,14 +207,15 @@ SOURCE = Source(
     option="a video tape recorder",
     gum_class="Tr",
     equation="y' = (h ∗ y)(t − δ_r) + n,  S_n(f) ∝ f² up to B,  δ_r = s_w n_r + s_l a_l + step;  variances × generations",
-    typical_size="errors of 0.04 px grow by 1.4 (3 DN, 0.1 px) to 2.2 times (4 DN, 0.2 px); neighbouring lines that err alike are worse",
+    typical_size="errors of 0.04 px grow by 1.4 (3 DN, 0.1 px) to 2.2 times (4 DN, 0.2 px); correlated errors of neighbouring lines are "
+    "worse",
     references=(
         "M. R. Shortis, W. L. Snow, B. A. Childers, W. K. Goad, SPIE 2067, 1993 (storage media in digital photogrammetry)",
         "J. Chen, S. Robson et al., IAPRS XXXI-B5, 1996, 84 (S-VHS: up to 0.5 px, four times the direct error)",
     ),
-    advice="Do not record on tape: digitise directly. Else play on the recorder that recorded, through a time-base corrector.",
+    advice="Digitise directly, not from tape. Otherwise play the tape on the recorder that recorded it, through a time-base corrector.",
     reasons={
         "measure": "needs a static line and a flat field, recorded and played",
-        "correct": "needs the place of every line in that very frame, as from a reference line beside the targets",
+        "correct": "needs the shift of every line in the same frame, for instance from a reference line beside the targets",
     },
 )

@@ -26,11 +26,13 @@ FORMATS = {8: "gray", 10: "gray10le", 12: "gray12le", 16: "gray16le"}
 class VideoCodec(Parameters):
     """Setting of the coder."""
 
-    codec: Literal["h264", "hevc", "ffv1"] = quantity("h264", "1", "H.264, HEVC, or FFV1, which loses nothing")
-    control: Literal["crf", "qp"] = quantity("crf", "1", "crf: quantiser by what each picture and block hold; qp: one for all (not FFV1)")
-    quality: int = quantity(23, "1", "quantiser of crf or qp: 6 more double the rounding steps (not FFV1)", ge=1, le=51)
-    group: int = quantity(12, "1", "frames from one picture that is coded by itself to the next; 1 predicts nothing", ge=1, le=1000)
-    depth_bits: Literal[8, 10, 12, 16] = quantity(8, "bit", "of a stored sample: H.264 8 or 10, HEVC also 12, FFV1 also 16")
+    codec: Literal["h264", "hevc", "ffv1"] = quantity("h264", "1", "H.264, HEVC, or FFV1 (lossless)")
+    control: Literal["crf", "qp"] = quantity(
+        "crf", "1", "crf: quantiser depends on the content of picture and block; qp: one quantiser for all (not FFV1)"
+    )
+    quality: int = quantity(23, "1", "quantiser of crf or qp: plus 6 doubles the rounding steps (not FFV1)", ge=1, le=51)
+    group: int = quantity(12, "1", "number of frames from one independently coded picture to the next; 1: no prediction", ge=1, le=1000)
+    depth_bits: Literal[8, 10, 12, 16] = quantity(8, "bit", "bits of a stored sample: H.264 8 or 10, HEVC also 12, FFV1 also 16")
 
     @model_validator(mode="after")
     def _depth(self) -> VideoCodec:
@@ -73,7 +75,7 @@ class Coder:
         if self._pair is None:
             self._size, self._pair = picture.shape, _open(av, self.params, picture.shape)
         if picture.shape != self._size:
-            raise ParameterError("the frames of a sequence differ in size", where="storage.video_codec", allowed="one size for all")
+            raise ParameterError("the frames of a sequence differ in size", where="storage.video_codec", allowed="one size for all frames")
         coder, decoder = self._pair
         packets = coder.encode(_to_picture(av, picture, self.params.depth_bits, self.count))
         decoded = [p for packet in packets for p in decoder.decode(packet)]
@@ -169,7 +171,8 @@ def context(params: VideoCodec, windows: Windows, frame_shape: tuple[int, int]) 
 SOURCE = Source(
     id="storage.video_codec",
     title="Video compression",
-    description="Each frame is predicted from those before; only a coarsely rounded difference is stored. Noise freezes, fine change lags.",
+    description="Each frame is predicted from earlier frames, and only a coarsely rounded difference is stored. Noise freezes, and fine "
+    "changes lag.",
     parameters=VideoCodec,
     consumes=(Kind.CODES,),
     after=("sensor", "electronics", "cable", "grabber"),
@@ -189,10 +192,10 @@ SOURCE = Source(
         "IETF RFC 9043 (FFV1)",
         "G. J. Sullivan, T. Wiegand, Proc. IEEE 93 (2005) 18 (quantiser: a factor of 2 every 6 steps)",
     ),
-    advice="Record without loss (raw, FFV1). If there is no choice: pictures coded by themselves, and a quantiser below 12.",
+    advice="Record without loss (raw, FFV1). If there is no choice: independently coded pictures (group 1), and a quantiser below 12.",
     reasons={
-        "measure": "the setting stands in the stream; dark and flat frames do not tell its quantiser from noise that was lost otherwise",
-        "correct": "what was rounded is lost",
-        "propagate": "blocks and predictions are chosen from the whole picture and those before it; expose sequences and locate in them",
+        "measure": "the stream states the setting; dark and flat frames cannot distinguish its quantiser from other losses of noise",
+        "correct": "the rounded values are lost",
+        "propagate": "blocks and predictions depend on the whole picture and earlier ones; simulate sequences and locate targets in them",
     },
 )
