@@ -175,6 +175,20 @@ def test_mirrored_coordinates_are_named(known: str, rng: np.random.Generator):
         start_values(replace(network, y_px=SENSOR.rows - 1 - network.y_px))
 
 
+def test_mirrored_coordinates_of_a_shallow_field_are_named(rng: np.random.Generator):
+    """Rough coordinates may move, and those of a field that is 80 mm high and good to 10 mm move into its mirror image: then the
+    images fit, and only the shape of the field tells. One that is right is not refused, nor a plane, which fits either way."""
+    for field, height in (("volume", 80.0), ("plane", 400.0)):
+        network = simulate(rng, images=10, points=80, known="rough", field=field, size=(1000.0, 800.0, height)).network
+        start_values(network)
+        turned = replace(network, y_px=SENSOR.rows - 1 - network.y_px)
+        if field == "plane":
+            start_values(turned)
+        else:
+            with pytest.raises(InputError, match="fit only mirrored.*y counts upwards"):
+                start_values(turned)
+
+
 def test_points_with_other_names_are_explained(rng: np.random.Generator):
     network = simulate(rng, images=10, points=80, known="fixed").network
     with pytest.raises(MeasureError, match="agree with each other, but not with the known coordinates.*names of the points"):

@@ -10,6 +10,8 @@ from pixmetry.core.errors import InputError, MeasureError
 
 KEEP = 1e-6  # pull of what is not known towards the frame that is there, beside 1 for what is
 AGREES = 1e-3  # of the extent: within it, what is known is met
+TURNED = 0.5  # of the distance from rough coordinates: what a mirrored frame must leave at most to be the right one
+FEWEST_TURNED = 8  # rough coordinates that can tell this: of few points, errors may look mirrored
 REACH = 0.1  # rms distance from control, in units of its extent, at which coordinates do not belong to the images
 
 
@@ -25,6 +27,8 @@ def to_object(work: Reconstruction) -> None:
         extent = np.linalg.norm(np.std(network.xyz[use], axis=0))
         if control.sum() >= 3 and np.median(away) > REACH * extent:
             raise _does_not_fit(work, use)
+        if use is given and use.sum() >= FEWEST_TURNED and np.median(_turned_away(work, use)) < TURNED * np.median(away):
+            raise _mirrored()
         moved(work, scale, rotation, shift)
     else:
         _own_frame(work, known)
@@ -47,12 +51,16 @@ def _grow_on(work: Reconstruction) -> None:
 
 def _does_not_fit(work: Reconstruction, use: np.ndarray) -> Exception:
     network = work.network
-    mirror = np.array([1.0, 1.0, -1.0])
-    away = fitted(work.xyz[use] * mirror, network.xyz[use])[3]
+    away = _turned_away(work, use)
     extent = np.linalg.norm(np.std(network.xyz[use], axis=0))
     if thickness(network.xyz[use])[0] > FLAT and np.median(away) < 0.3 * REACH * extent:
         return _mirrored()
     return _disagrees(float(np.median(away)), int(use.sum()), network.unit)
+
+
+def _turned_away(work: Reconstruction, use: np.ndarray) -> np.ndarray:
+    """Distances from known points that remain when the reconstruction is mirrored."""
+    return fitted(work.xyz[use] * [1.0, 1.0, -1.0], work.network.xyz[use])[3]
 
 
 def _mirrored() -> InputError:
