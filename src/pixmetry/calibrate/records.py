@@ -15,6 +15,7 @@ from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 import numpy as np
 
 from pixmetry.calibrate.bundle.network import Adjustment
+from pixmetry.calibrate.tables import TABLES, frame_of
 from pixmetry.core.errors import InputError
 from pixmetry.core.finding import Finding
 
@@ -1155,11 +1156,9 @@ class Calibration:
         InputError
             If there is no such table.
         """
-        from pixmetry.calibrate.tables import TABLES
-
         if table not in TABLES:
             raise InputError("no such table of a calibration", where="table", value=table, allowed=", ".join(TABLES))
-        return TABLES[table](self)
+        return TABLES[table](self.adjustment)
 
     def to_dataframe(self, table: Literal["parameters", "points", "poses", "residuals"] = "parameters") -> Any:
         """The same as a `pandas.DataFrame`, a row for each parameter, point, image or image coordinate; see `columns`.
@@ -1169,6 +1168,4 @@ class Calibration:
         InputError
             If there is no such table, or pandas is not installed.
         """
-        from pixmetry.calibrate.tables import frame_of
-
         return frame_of(self.columns(table))

@@ -1,36 +1,32 @@
-"""Results of a calibration as columns by name: what its CSV files and its data frames hold."""
+"""Results of an adjustment as columns by name: what the CSV files of a calibration and its data frames hold."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from pixmetry.calibrate.bundle.model import NAMES
+from pixmetry.calibrate.bundle.network import Adjustment
 from pixmetry.core.errors import InputError
 
-if TYPE_CHECKING:
-    from pixmetry.calibrate.records import Calibration
 
-
-def parameter_columns(calibration: Calibration) -> dict[str, Any]:
+def parameter_columns(a: Adjustment) -> dict[str, Any]:
     """Interior parameters of all cameras: ``value``, standard uncertainty ``u`` (0: held), ``unit``, ``estimated``."""
-    adjustment = calibration.adjustment
     rows = []
-    for k in range(len(adjustment.network.cameras)):
-        camera = adjustment.camera(k)
-        free, covariance = adjustment.interior_covariance(k)
+    for k in range(len(a.network.cameras)):
+        camera = a.camera(k)
+        free, covariance = a.interior_covariance(k)
         u = dict(zip(free, np.sqrt(np.diag(covariance)).tolist(), strict=True))
         for name, value, unit in zip(NAMES, camera.values.tolist(), camera.units, strict=True):
             rows.append((camera.name, name, value, u.get(name, 0.0), unit, name in u))
     return dict(zip(("camera", "parameter", "value", "u", "unit", "estimated"), map(list, zip(*rows, strict=True)), strict=True))
 
 
-def point_columns(calibration: Calibration) -> dict[str, Any]:
+def point_columns(a: Adjustment) -> dict[str, Any]:
     """Object points with their uncertainties and covariances in the unit of the object, and in how many images each was used."""
-    a = calibration.adjustment
     c = a.point_covariance
     return {
         "point": a.network.points,
@@ -41,9 +37,8 @@ def point_columns(calibration: Calibration) -> dict[str, Any]:
     }
 
 
-def pose_columns(calibration: Calibration) -> dict[str, Any]:
+def pose_columns(a: Adjustment) -> dict[str, Any]:
     """Projection centres and rotations of the images with their uncertainties."""
-    a = calibration.adjustment
     network, state = a.network, a.state
     u = dict(zip(a.free_columns, np.sqrt(np.maximum(np.diag(a.covariance), 0.0)), strict=True))
 
@@ -65,9 +60,8 @@ def pose_columns(calibration: Calibration) -> dict[str, Any]:
     return columns
 
 
-def residual_columns(calibration: Calibration) -> dict[str, Any]:
+def residual_columns(a: Adjustment) -> dict[str, Any]:
     """Image coordinates with their variances as they were used, and residuals: measured less computed."""
-    a = calibration.adjustment
     network = a.network
     columns: dict[str, Any] = {
         "image": [network.images[k] for k in network.image],
@@ -86,7 +80,7 @@ def residual_columns(calibration: Calibration) -> dict[str, Any]:
     return columns
 
 
-TABLES: dict[str, Callable[[Calibration], dict[str, Any]]] = {
+TABLES: dict[str, Callable[[Adjustment], dict[str, Any]]] = {
     "parameters": parameter_columns,
     "points": point_columns,
     "poses": pose_columns,

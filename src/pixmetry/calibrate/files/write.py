@@ -110,20 +110,20 @@ def _write_numbers(place: Path, text: Callable[..., str], calibration: Any) -> N
 def points_csv(calibration: Calibration) -> str:
     """Object points with their uncertainties; a table that a project can name as its points."""
     a = calibration.adjustment
-    return _csv([f"unit {a.network.unit}; datum: {a.datum}"], point_columns(calibration))
+    return _csv([f"unit {a.network.unit}; datum: {a.datum}"], point_columns(a))
 
 
 def poses_csv(calibration: Calibration) -> str:
     """Projection centres and rotations of the images with their uncertainties."""
     a = calibration.adjustment
     text = "a point X is seen at R (X - X0), R by rows, z forwards, x to the right, y down; u of rotations about the camera's axes"
-    return _csv([f"unit {a.network.unit}; datum: {a.datum}", text], pose_columns(calibration))
+    return _csv([f"unit {a.network.unit}; datum: {a.datum}", text], pose_columns(a))
 
 
 def residuals_csv(calibration: Calibration) -> str:
     """Image coordinates with their residuals; a table that a project can name as its observations."""
     text = "residual: measured less computed; image coordinates of centres, without eccentricity; variances as they were used"
-    return _csv([PIXELS, text], residual_columns(calibration))
+    return _csv([PIXELS, text], residual_columns(calibration.adjustment))
 
 
 def line_residuals_csv(calibration: LineCalibration) -> str:
