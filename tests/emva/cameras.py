@@ -131,8 +131,11 @@ def _rounded(offset: np.ndarray, gain: float, electrons: np.ndarray, white_dn2: 
     for k in range(1, 60):
         t, sign = 2 * np.pi * k, (-1) ** k
         turn = np.exp(1j * t * gain)
-        if np.exp(-0.5 * t**2 * white_dn2 + electrons.min() * (turn.real - 1)) < 1e-9 and k > np.ceil(gain):
+        white = np.exp(-0.5 * t**2 * white_dn2)
+        if white < 1e-9:  # and with each further k the less
             break
+        if white * np.exp(electrons.min() * (turn.real - 1)) < 1e-9:  # in photon noise it comes back where k·gain is a whole number
+            continue
         phi = np.exp(1j * t * offset + electrons * (turn - 1) - 0.5 * t**2 * white_dn2)
         error += sign / (np.pi * k) * phi.imag
         square += sign / (np.pi * k) ** 2 * phi.real

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -315,6 +316,7 @@ def test_output_names_are_checked_before_the_work(known: Path, tmp_path: Path, m
 def test_only_own_files_are_replaced(known: Path, tmp_path: Path) -> None:
     """A result of another program, and notes that mention the names of the format, are not taken for ours; a sheet of ours is."""
     sheet = emva1288(known)
+    sheet = replace(sheet, results=tuple(replace(r, curves={}) for r in sheet.results))  # drawing takes most of the time
     schema = '"schema": "pixmetry/emva1288/1"'
     foreign = {
         "json": f"My notes: {{{schema}}}",
@@ -423,7 +425,7 @@ def test_what_a_campaign_with_gaps_carries_is_given(known: Path, tmp_path: Path,
     path = changed(known, tmp_path / "a", kept)
     done = run(path, *(f"--{kind}={tmp_path / f'out.{kind}'}" for kind in ("json", "xml", "html", "pdf")))
     assert done.exit_code == 0, done.output
-    values = emva1288(path).results[0].values
+    values = read_sheet(tmp_path / "out.json").results[0].values
     assert given <= {key for key, value in values.items() if np.isfinite(value.value)}
     assert np.isnan(values["K"].value) and reason in values["K"].reason
 

@@ -18,6 +18,7 @@ from pixmetry.core.errors import InputError
 from pixmetry.emva.evaluate import bootstrap_u, evaluate, standard_values
 from pixmetry.emva.files.keys import KEYS, NONLINEAR, OVER_TEMPERATURES, key_of
 from pixmetry.emva.general.general import general_notes
+from pixmetry.emva.general.general_model import make_plan
 from pixmetry.emva.linear_model import departure_bounds, linear_model
 from pixmetry.emva.records import RELEASES, Measurement, Results
 from pixmetry.emva.series import series_of
@@ -347,7 +348,7 @@ def test_the_judgement_is_that_of_the_curve(sheets: dict[str, Results]) -> None:
 
 
 def test_notes_of_the_general_model_are_passed_on(sheets: dict[str, Results]) -> None:
-    assert set(general_notes(series_of(measured(ROWS)))) <= set(sheets["4.0"].notes)
+    assert set(general_notes(make_plan(series_of(measured(ROWS))))) <= set(sheets["4.0"].notes)
 
 
 def test_a_bent_photon_transfer_is_noted_and_a_straight_one_is_not(camera: Measurement, sheets: dict[str, Results]) -> None:

@@ -13,13 +13,18 @@ import pytest
 from scipy import optimize, stats
 
 from pixmetry.core.errors import MeasureError
-from pixmetry.emva.general.general import general_curve, general_evaluation, general_notes, general_values
+from pixmetry.emva.general.general import general_curve, general_evaluation, general_notes
 from pixmetry.emva.general.general_model import levels_of, make_plan, with_setting_errors
 from pixmetry.emva.records import Series
 
 ALPHA = 1e-6
 TOP = 4095.0
 NOISY = ("mean_dn", "var_dn2", "dark_var_dn2", "spatial_var_dn2")
+
+
+def general_values(series: Series, like: Series | None = None) -> dict[str, np.ndarray]:
+    """The values alone; smoothed as ``like`` is."""
+    return general_evaluation(series, None if like is None else make_plan(like))[0]
 
 
 @dataclass(frozen=True)
@@ -129,7 +134,7 @@ def test_a_linear_camera_is_the_linear_model(kind: str, dark_e_per_s: float):
     camera = Camera(dark_e_per_s=dark_e_per_s)
     photons = sweep(kind)
     series = exact_series(camera, photons)
-    got, curve = general_values(series), general_curve(series)
+    got, curve = general_values(series), general_curve(make_plan(series))
     dark2 = camera.dark_noise_e**2 + 1 / 12 / camera.gain**2
     dark_e = dark_e_per_s * series.exposure_s
     electrons = camera.efficiency * photons
@@ -162,7 +167,7 @@ def test_bends_are_seen_through(response: str, kind: str):
     camera = Camera(response=response)
     photons = sweep(kind, 60, bottom=15.0)
     series = exact_series(camera, photons)
-    curve, got = general_curve(series), general_values(series)
+    curve, got = general_curve(make_plan(series)), general_values(series)
     # an even sweep shows the bend at black with its first level alone; the gamma curve has a corner in its slope's slope there
     rough = 0.01 if (response, kind) == ("log", "log") else 0.025
     np.testing.assert_allclose(curve["snr_p"], camera.snr_p(photons), rtol=rough)
@@ -171,7 +176,7 @@ def test_bends_are_seen_through(response: str, kind: str):
     if kind == "log":
         assert got["general_u_p_min"] == pytest.approx(camera.threshold, rel=0.002)
     else:  # the threshold lies far below the darkest level
-        assert any("extrapolated" in note for note in general_notes(series))
+        assert any("extrapolated" in note for note in general_notes(make_plan(series)))
 
 
 @pytest.mark.parametrize(("response", "kind", "bias"), [("linear", "even", 0.01), ("gamma", "log", 0.03), ("log", "log", 0.04)])
@@ -182,7 +187,7 @@ def test_simulated_frames(response: str, kind: str, bias: float, rng: np.random.
     for _ in range(runs):
         series = framed_series(camera, photons, rng)
         got.append(general_values(series))
-        snr.append(general_curve(series)["snr_p"] / camera.snr_p(photons)[: len(general_curve(series)["snr_p"])] - 1)
+        snr.append(general_curve(make_plan(series))["snr_p"] / camera.snr_p(photons)[: len(general_curve(make_plan(series))["snr_p"])] - 1)
     top = photons[len(snr[0]) - 1]
     half = camera.efficiency * top / 2
     want = {
@@ -236,12 +241,13 @@ def test_what_ends_the_series():
     shares[33:] = [0.0019, 0.0021, 0.3, 0.9, 1, 1, 1]
     clipped = replace(series, fraction_max=shares)
     assert general_values(clipped)["general_u_p_sat"] == pytest.approx(series.photons[33])
-    assert len(general_curve(clipped)["photons"]) == 34 and not general_notes(series)[-1].startswith("the photons")
+    assert len(general_curve(make_plan(clipped))["photons"]) == 34 and not general_notes(make_plan(series))[-1].startswith("the photons")
     drawn = np.stack([shares, shares - 0.0002, shares + 0.0002])
     np.testing.assert_allclose(
         general_values(replace(clipped, fraction_max=drawn), clipped)["general_u_p_sat"], series.photons[[33, 34, 32]]
     )
-    assert general_values(series)["general_u_p_sat"] == series.photons[-1] and any("no level" in note for note in general_notes(series))
+    assert general_values(series)["general_u_p_sat"] == series.photons[-1]
+    assert any("no level" in note for note in general_notes(make_plan(series)))
 
 
 def test_full_well_below_the_top_code():
@@ -267,7 +273,7 @@ def test_full_well_below_the_top_code():
     assert values["general_u_p_sat"] == photons[want]
     assert values["general_SNR_max"] == pytest.approx(np.sqrt(electrons[want]), rel=0.01)
     assert values["general_SNR_total_max"] == pytest.approx(np.sqrt(electrons[want]), rel=0.01)
-    assert any("plateau" in note for note in general_notes(full)) and len(general_curve(full)["snr_p"]) == want + 1
+    assert any("plateau" in note for note in general_notes(make_plan(full))) and len(general_curve(make_plan(full))["snr_p"]) == want + 1
 
 
 @pytest.mark.parametrize("response", ["linear", "log", "gamma"])
@@ -282,10 +288,10 @@ def test_a_plateau_ends_every_response(response: str, kind: str, saturated: int,
     var[-saturated:] = noise_left * var[-saturated - 1]
     spatial = np.minimum(series.spatial_var_dn2, 0.01 * var)
     full = replace(series, mean_dn=mean, var_dn2=var, spatial_var_dn2=spatial)
-    assert any("plateau" in note for note in general_notes(full))
+    assert any("plateau" in note for note in general_notes(make_plan(full)))
     assert photons[-saturated - 4] <= general_values(full)["general_u_p_sat"] <= photons[-saturated - 1]
     assert general_values(series)["general_u_p_sat"] >= photons[-3]  # nothing ends where nothing does
-    assert not any("plateau" in note for note in general_notes(series))
+    assert not any("plateau" in note for note in general_notes(make_plan(series)))
 
 
 def test_a_light_that_was_not_what_it_was_set_to(rng: np.random.Generator):
@@ -302,8 +308,8 @@ def test_a_light_that_was_not_what_it_was_set_to(rng: np.random.Generator):
     value, u = general_values(measured)["general_u_p_min"], general_values(draws, measured)["general_u_p_min"].std()
     assert value == pytest.approx(camera.threshold, rel=0.05)
     assert abs(value - camera.threshold) < 5.5 * u and u < 0.06 * value
-    assert any("darkest level lies" in note for note in general_notes(measured))
-    assert not any("darkest level lies" in note for note in general_notes(series))
+    assert any("darkest level lies" in note for note in general_notes(make_plan(measured)))
+    assert not any("darkest level lies" in note for note in general_notes(make_plan(series)))
 
 
 def test_a_level_off_the_curve_is_off_in_the_draws(rng: np.random.Generator):
@@ -337,7 +343,7 @@ def test_without_photons_and_with_a_negative_variance():
     values, squares = general_evaluation(dark)
     assert np.isnan(values["general_u_p_min"]) and np.isnan(values["general_u_p_sat"])
     assert values["general_DR"] == pytest.approx(general_values(series)["general_DR"])
-    assert "exposure_s" in general_curve(dark) and "not known" in general_notes(dark)[-1]
+    assert "exposure_s" in general_curve(make_plan(dark)) and "not known" in general_notes(make_plan(dark))[-1]
     values, squares = general_evaluation(replace(dark, photons=series.photons))
     assert np.isnan(values["general_DSNU"]) and squares["general_DSNU"] == pytest.approx(-0.01 / 0.125**2, rel=1e-6)
 
@@ -346,7 +352,7 @@ def test_levels_may_be_repeated(rng: np.random.Generator):
     photons = np.repeat(sweep("log", 10), 3)
     series = noisy(exact_series(Camera(), photons), rng, ())
     assert general_values(series)["general_u_p_min"] == pytest.approx(Camera().threshold, rel=0.1)
-    np.testing.assert_allclose(general_curve(series)["snr_p"], Camera().snr_p(photons), rtol=0.15)
+    np.testing.assert_allclose(general_curve(make_plan(series))["snr_p"], Camera().snr_p(photons), rtol=0.15)
 
 
 def test_refusals():

@@ -30,7 +30,7 @@ class Levels:
     slope: np.ndarray  # DN per photon
 
 
-@lru_cache(maxsize=1)
+@lru_cache(maxsize=20)
 def levels(camera: Camera) -> Levels:
     """Expectations of what two frames of each level give (R4.0 eq. 16, 18, 32); all releases of a camera ask for the same."""
     exposure, photons = camera.settings

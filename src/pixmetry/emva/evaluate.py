@@ -300,5 +300,5 @@ def _curves(m: Measurement, formulas: Formulas, measured: Values, squares: Value
     if formulas.stacks is not None:
         curves |= spatial_curves(m, formulas.release, formulas.stacks)
     if formulas.release == "4.0" and "general" not in formulas.missing:
-        curves["general"] = general_curve(formulas.series)
+        curves["general"] = general_curve(formulas.plan)
     return curves

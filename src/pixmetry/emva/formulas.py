@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from pixmetry.core.errors import MeasureError, PixmetryError
 from pixmetry.emva.files.keys import KEYS, OVER_TEMPERATURES
 from pixmetry.emva.general.general import general_evaluation
+from pixmetry.emva.general.general_model import Plan, make_plan
 from pixmetry.emva.linear_model import is_curved, is_level_free, level_free_values
 from pixmetry.emva.records import Measurement, Series
 from pixmetry.emva.series import light_of, series_of
@@ -45,6 +47,11 @@ class Formulas:
         if light_of(series) is None:
             missing["general"] = "neither photons nor exposure tell the light of the levels"
         return cls(release, series, m.pixel_area_um2, stacks, missing, is_curved(series))
+
+    @cached_property
+    def plan(self) -> Plan:
+        """What the General model chooses from the measured series; ``MeasureError`` where that carries no characteristic curve."""
+        return make_plan(self.series)
 
     @property
     def vectors(self) -> tuple[np.ndarray, np.ndarray]:
@@ -83,7 +90,7 @@ class Formulas:
             values["SNR_total_max"] = snr_total_max(values["u_e_sat"], dark_noise_e2, squares["DSNU1288"], squares["PRNU1288"])
         if self.release == "4.0" and "general" not in self.missing:
             try:
-                found, roots = general_evaluation(series if general is None else general, like=self.series)
+                found, roots = general_evaluation(series if general is None else general, self.plan)
                 values, squares = values | found, squares | roots
             except MeasureError as problem:
                 self.missing["general"] = str(problem)

@@ -128,7 +128,7 @@ def _extrapolated_threshold(values: dict[str, Number], case: Case) -> dict[str, 
     value, pattern = (values.get(key) for key in ("general_u_p_min", "general_DSNU"))
     if not case.formulas.curved or value is None or pattern is None or not math.isfinite(value.value):
         return {}
-    curve = general_curve(case.formulas.series)
+    curve = general_curve(case.formulas.plan)
     lowest, ratio = float(curve["photons"][0]), float(curve["snr_p"][0])
     if value.value > FAR * lowest or not ratio > 0:
         return {}
@@ -148,7 +148,7 @@ def _hidden_threshold(values: dict[str, Number], case: Case) -> dict[str, Number
     if value is None or not math.isfinite(value.value) or not case.noise.hidden or case.noise.blind:
         return {}
     noisy = replace(series, dark_var_dn2=np.maximum(series.dark_var_dn2, case.noise.limit_dn2))
-    limit = float(general_evaluation(noisy, like=series)[0]["general_u_p_min"]) + ONE_SIDED_95 * value.u
+    limit = float(general_evaluation(noisy, case.formulas.plan)[0]["general_u_p_min"]) + ONE_SIDED_95 * value.u
     if not math.isfinite(limit):
         return {}
     reason = f"the dark variance lies below {case.noise.limit_dn2:.2g} DN², where quantisation covers it: 95 % upper limit (eq. 54)"

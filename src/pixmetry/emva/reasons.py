@@ -13,6 +13,7 @@ from pixmetry.emva.dark_noise import DarkNoise
 from pixmetry.emva.files.keys import EQUAL_EXPOSURE, KEYS, PTC_LIMIT_PERCENT, SATURATED_FRACTION, key_of
 from pixmetry.emva.formulas import Formulas, Spread, Values
 from pixmetry.emva.general.general import general_curve, general_notes
+from pixmetry.emva.general.general_model import Plan
 from pixmetry.emva.linear_model import FAILS
 from pixmetry.emva.linear_model import REASON as CURVED
 from pixmetry.emva.records import Measurement, Series
@@ -348,18 +349,18 @@ def notes_of(case: Case, values: dict[str, Number], linear: str) -> tuple[str, .
         if not same_exposure(m.dark_stack, m.bright_stack):
             notes.append(f"the stacks differ in exposure (dark {one:g} s, bright {other:g} s): their dark signals differ too")
     if formulas.release == "4.0" and "general" not in formulas.missing:
-        notes += general_notes(series)
+        notes += general_notes(formulas.plan)
         if formulas.curved and exposure_varies(series.exposure_s):
-            notes += _swept_dark_current(series)
+            notes += _swept_dark_current(series, formulas.plan)
     return tuple(notes)
 
 
-def _swept_dark_current(series: Series) -> tuple[str, ...]:
+def _swept_dark_current(series: Series, plan: Plan) -> tuple[str, ...]:
     """How far the dark current, which grows with a swept exposure, bends the response that a curved camera shows.
 
     Of y = f(N + D t) − f(D t) over the photons, the second term takes the slope of the dark mean off that of f at constant exposure.
     """
-    curve, slope = general_curve(series), float(dark_line(series)[1])
+    curve, slope = general_curve(plan), float(dark_line(series)[1])
     if "photons" not in curve or math.isnan(slope):
         return ()
     last = int(np.argmax(series.photons))

@@ -70,6 +70,7 @@ def write_files(sheet: DataSheet, files: Mapping[str, Path], inputs: Iterable[Pa
     InputError
         If one cannot be written, or something else would be lost.
     """
+    check_names(files, inputs)  # before anything is drawn
     write_together(_outputs(files), [content_of(sheet, kind) for kind in files], inputs)
 
 

@@ -37,11 +37,14 @@ def _threshold(plan: Plan, d: Levels) -> np.ndarray:
     the plan was made from is bracketed, then iterated; each draw goes on from there with s and q to first order in p.
     """
 
-    def at(light: float) -> tuple[np.ndarray, ...]:
-        p, h = np.array([light]), 1e-3 * max(light, 1e-9)
+    def at(light: float) -> tuple[np.ndarray, np.ndarray]:
+        p = np.array([light])
+        return slope_rows(plan.ratio, p)[0], plan.growth.rows(p)[0]
+
+    def change_at(light: float) -> tuple[np.ndarray, np.ndarray]:
+        h = 1e-3 * max(light, 1e-9)
         around = np.array([max(light - h, 0.0), light + h])
-        slope_by = np.diff(slope_rows(plan.ratio, around), axis=0)[0] / np.ptp(around)
-        return slope_rows(plan.ratio, p)[0], slope_by, plan.growth.rows(p)[0], plan.growth.rows(p, 1)[0]
+        return np.diff(slope_rows(plan.ratio, around), axis=0)[0] / np.ptp(around), plan.growth.rows(np.array([light]), 1)[0]
 
     def root(slope: np.ndarray, growth: np.ndarray, dark: np.ndarray) -> np.ndarray:
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -59,10 +62,13 @@ def _threshold(plan: Plan, d: Levels) -> np.ndarray:
     low, high = grid[max(above[0] - 1, 0)], grid[above[0]]
     middle = float(high)
     for _ in range(20):
-        slope, _, growth, _ = at(middle)
-        middle = float(np.clip(np.nan_to_num(root(slope @ middle_ratios, growth @ middle_growths, dark), nan=high), low, high))
-    drawn, grown = ratios(d), growths(d)
-    slope, slope_by, growth, growth_by = (v @ row for v, row in zip((drawn, drawn, grown, grown), at(middle), strict=True))
+        slope, growth = at(middle)
+        found = np.nan_to_num(root(slope @ middle_ratios, growth @ middle_growths, dark), nan=high)
+        before, middle = middle, float(np.clip(found, low, high))
+        if middle == before:
+            break
+    slope, growth = (values @ row for values, row in zip((ratios(d), growths(d)), at(middle), strict=True))
+    slope_by, growth_by = (values @ row for values, row in zip((ratios(d), growths(d)), change_at(middle), strict=True))
     dark = np.maximum(d.dark_var_dn2[..., 0], 0.0)
     p = np.full(np.shape(slope), middle)
     for _ in range(6):
@@ -70,16 +76,16 @@ def _threshold(plan: Plan, d: Levels) -> np.ndarray:
     return p
 
 
-def general_evaluation(series: Series, like: Series | None = None) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+def general_evaluation(series: Series, plan: Plan | None = None) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     """The values of the General model, and for those that are roots of a variance that may be negative that variance.
 
     Parameters
     ----------
     series : Series
         Measured values of shape (..., levels). Draws of the photons may differ by a common factor only.
-    like : Series, optional
-        One series, without draws, that levels, weights and stiffness of the smooth curves are chosen from: the measured one, so that its
-        draws are smoothed as it is. By default the mean of the draws.
+    plan : Plan, optional
+        Levels, weights and stiffness of the smooth curves: those of the measured series, so that its draws are smoothed as it is. By
+        default those of the mean of the draws.
 
     Returns
     -------
@@ -102,7 +108,7 @@ def general_evaluation(series: Series, like: Series | None = None) -> tuple[dict
     non-uniformity is the mean of the dark levels up to half of saturation over the slope at zero light; that at half of saturation is of
     all there is at that level, light included, between the two nearest levels.
     """
-    plan = make_plan(mean_of_draws(series) if like is None else like)
+    plan = make_plan(mean_of_draws(series)) if plan is None else plan
     d = with_setting_errors(plan, levels_of(series, plan.order))
     slope = ratios(d) @ plan.slopes.T
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -134,14 +140,14 @@ def general_evaluation(series: Series, like: Series | None = None) -> tuple[dict
     return finite, {"general_DSNU": dark2, "general_PRNU": light2}
 
 
-def general_values(series: Series, like: Series | None = None) -> dict[str, np.ndarray]:
-    """The values of :func:`general_evaluation` alone."""
-    return general_evaluation(series, like)[0]
+def general_notes(plan: Plan) -> tuple[str, ...]:
+    """What the reader of the values of one series should know: what was extrapolated, and what ended the series.
 
-
-def general_notes(series: Series) -> tuple[str, ...]:
-    """What the reader of the values of one series (no draws) should know: what was extrapolated, and what ended the series."""
-    plan = make_plan(series)
+    Raises
+    ------
+    MeasureError
+        No signal above the noise.
+    """
     d = plan.levels
     least, lowest = float(_threshold(plan, d)), float(d.light[0])
     notes = []
@@ -188,8 +194,8 @@ def _interpolated(values: np.ndarray, light: np.ndarray, at: np.ndarray) -> np.n
     return lower + share * (upper - lower)
 
 
-def general_curve(series: Series) -> dict[str, np.ndarray]:
-    """The characteristic curve of one series (no draws) and the noise that it sees at the input.
+def general_curve(plan: Plan) -> dict[str, np.ndarray]:
+    """The characteristic curve of one series and the noise that it sees at the input.
 
     Returns
     -------
@@ -197,12 +203,7 @@ def general_curve(series: Series) -> dict[str, np.ndarray]:
         ``photons`` (or ``exposure_s``, where photons are not known), ``mean_dn`` above the dark one, ``var_dn2``, ``slope`` (DN per
         photon), ``sigma_p`` and ``s_p`` (photons; zero where the spatial variance came out negative), ``snr_p``, ``snr_p_total``.
 
-    Raises
-    ------
-    MeasureError
-        As :func:`general_evaluation`.
     """
-    plan = make_plan(series)
     d = plan.levels
     count = int(plan.end.saturation(d.mean_dn, d.fraction_max)) + 1 if plan.end.found else d.light.size
     light, slope = d.light * d.scale, plan.slopes @ ratios(d) / d.scale

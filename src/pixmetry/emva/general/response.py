@@ -48,11 +48,15 @@ class ScatterFit:
 
 def fit_smooth(x: np.ndarray, y: np.ndarray, sigma: np.ndarray, degree: int) -> SmoothFit:
     """Polynomial of a degree in x with weights 1/sigma², by orthogonal factors of its Chebyshev basis."""
-    basis, derivative = _basis(x, degree)
+    return _fit_basis(_basis(x, degree), y, sigma)
+
+
+def _fit_basis(bases: tuple[np.ndarray, np.ndarray], y: np.ndarray, sigma: np.ndarray) -> SmoothFit:
+    basis, derivative = bases
     q, r = np.linalg.qr(basis / sigma[:, None])
     coefficients = np.linalg.solve(r, q.T @ (y / sigma))
     values = basis @ coefficients
-    return SmoothFit(values, derivative @ coefficients, y - values, (q**2).sum(axis=1), x.size - degree - 1)
+    return SmoothFit(values, derivative @ coefficients, y - values, (q**2).sum(axis=1), y.size - basis.shape[1])
 
 
 def _basis(x: np.ndarray, degree: int) -> tuple[np.ndarray, np.ndarray]:
@@ -104,9 +108,10 @@ def fit_scatter(x: np.ndarray, y: np.ndarray, sigma: np.ndarray, shape: np.ndarr
     """
     sigma = np.maximum(sigma, 1e-9 * (float(np.abs(y).max()) or 1.0))
     degree = choose_degree(x, y, np.hypot(sigma, 1e-2 * shape)) if degree is None else degree
+    bases = _basis(x, degree)
 
     def surplus(tau: float) -> float:
-        fit = fit_smooth(x, y, np.hypot(sigma, tau * shape), degree)
+        fit = _fit_basis(bases, y, np.hypot(sigma, tau * shape))
         return float((fit.residuals**2 / (sigma**2 + (tau * shape) ** 2)).sum()) - fit.dof
 
     tau = 0.0
@@ -117,7 +122,7 @@ def fit_scatter(x: np.ndarray, y: np.ndarray, sigma: np.ndarray, shape: np.ndarr
             low, high = (middle, high) if surplus(np.exp(middle)) > 0 else (low, middle)
         tau = float(np.exp(0.5 * (low + high)))
     u = np.hypot(sigma, tau * shape)
-    fit = fit_smooth(x, y, u, degree)
+    fit = _fit_basis(bases, y, u)
     share = float(np.median((tau * shape) ** 2 / u**2))
     return ScatterFit(fit, tau, u, fit.dof / max(share**2, 1e-12))
 
