@@ -68,7 +68,8 @@ def everything(request: pytest.FixtureRequest) -> Callable[[float], tuple[Trials
     @cache
     def at_clock(clock_hz: float) -> tuple[Trials, Probes]:
         cam = chain(*OFF_LINE, clock_hz=clock_hz)
-        return Trials(cam, TARGET, LAW, known(cam), trials=384, units=16, seed=seed), Probes(cam, known(cam), TARGET, LAW)
+        facts = known(cam)
+        return Trials(cam, TARGET, LAW, facts, trials=384, units=16, seed=seed), Probes(cam, facts, TARGET, LAW)
 
     return at_clock
 
@@ -117,8 +118,9 @@ def test_a_logarithmic_camera(mode: str, seed: int) -> None:
 @pytest.mark.parametrize("source_id", [*ON_LINE, "grabber.low_pass"])
 def test_a_source_of_the_line_behind_the_rest_of_it(source_id: str, clock_hz: float, seed: int) -> None:
     cam = chain(source_id, clock_hz=clock_hz)
-    trials = Trials(cam, TARGET, LAW, known(cam), trials=192, units=8, seed=seed)
-    agree(get_source(source_id), cam, trials, Probes(cam, known(cam), TARGET, LAW))
+    facts = known(cam)
+    trials = Trials(cam, TARGET, LAW, facts, trials=192, units=8, seed=seed)
+    agree(get_source(source_id), cam, trials, Probes(cam, facts, TARGET, LAW))
 
 
 @pytest.mark.parametrize(("source_id", "clock_hz"), [(s, list(CLOCKS)[i % len(CLOCKS)]) for i, s in enumerate(OFF_LINE)])

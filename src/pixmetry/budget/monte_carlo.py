@@ -26,6 +26,7 @@ from pixmetry.camera.camera import Camera, Element
 from pixmetry.camera.catalogue import STAGES
 from pixmetry.camera.contribution import SMOOTH_ORDER, Contribution, smooth_part
 from pixmetry.camera.conversions import LineSources, Link
+from pixmetry.camera.frozen import Frozen
 from pixmetry.camera.signal import Kind
 from pixmetry.core.errors import ChainError, InputError
 from pixmetry.core.random import Grid, Streams
@@ -186,19 +187,19 @@ class Trials:
         col0, row0 = (
             np.clip(np.rint(at + by).astype(np.int64) - middle, 0, most) for at, by, most in zip(belongs, moved, last, strict=True)
         )
-        scene = scene_of(self.target, facts, x, y)
+        conditions = {"exposure_s": facts.exposure_s, "temperature_c": facts.temperature_c}
+        frozen = camera.freeze(background_of(self.target, facts), **conditions)
         windows = camera.expose_windows(
-            scene,
+            scene_of(self.target, facts, x, y),
             Grid(np.arange(n), row0, col0, (self.side, self.side)),
             seed=self.seed + UNIT_STRIDE * unit,
             mode=self.mode,
-            background=background_of(self.target, facts),
-            exposure_s=self.facts.exposure_s,
-            temperature_c=self.facts.temperature_c,
+            background=frozen,
+            **conditions,
         )
         if windows.dtype.kind == "f":  # without a converter in the chain the scale has an end all the same
             windows = np.minimum(windows, np.float32(self.facts.saturation_dn))
-        found = self._as_seen(camera, facts).locate(windows)
+        found = self._as_seen(camera, facts, frozen).locate(windows)
         parts = zip(found, (col0, row0), belongs, _layout(camera), strict=True)
         dx, dy = (((hat + first - at) / step).reshape(self.places, self.frames) for hat, first, at, (_, step) in parts)
         return dx, dy
@@ -210,13 +211,13 @@ class Trials:
         dx, dy = (np.nan_to_num(np.broadcast_to(a, np.shape(b)) - b) for a, b in zip(seen, belongs, strict=True))
         return dx, dy
 
-    def _as_seen(self, camera: Camera, facts: Facts) -> Estimator:
+    def _as_seen(self, camera: Camera, facts: Facts, frozen: Frozen) -> Estimator:
         """Return the estimator with background, threshold and height as this variant of the camera shows them.
 
         Who locates targets takes them from the frame, so they follow what the camera does to the light: black level, gain, a curve. Each
         is the mean of windows of that light, without what lies beyond four standard deviations.
         """
-        return self.located.as_seen(lambda light_dn: _level(camera, facts, self.target, self.side, light_dn))
+        return self.located.as_seen(lambda light_dn: _level(camera, facts, self.target, self.side, light_dn, frozen))
 
     def compare(self, names: Iterable[str], with_it: Camera, without: Camera | None) -> MonteCarlo:
         """Shift of the positions in one variant of the camera against those in another, or (None) against the truth."""
@@ -385,7 +386,7 @@ def shown_part(camera: Camera, side: int) -> list[tuple[int, int]]:
     return parts
 
 
-def _level(camera: Camera, facts: Facts, target: Target, side: int, above_dn: float, windows: int = 32) -> float:
+def _level(camera: Camera, facts: Facts, target: Target, side: int, above_dn: float, frozen: Frozen, windows: int = 32) -> float:
     """Grey value of uniform light that lies ``above_dn`` (linear) above the target's background."""
     background = background_of(target, facts)
     light = replace(background, level_photons=background.level_photons + above_dn / facts.dn_per_photon)
@@ -396,7 +397,7 @@ def _level(camera: Camera, facts: Facts, target: Target, side: int, above_dn: fl
         light,
         grid,
         mode="frozen",
-        background=background,
+        background=frozen,
         exposure_s=facts.exposure_s,
         temperature_c=facts.temperature_c,
     ).astype(float)

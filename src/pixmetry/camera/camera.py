@@ -279,7 +279,7 @@ class Camera:
         grid: Grid,
         seed: int = 0,
         mode: str = "exact",
-        background: Scene | None = None,
+        background: Scene | Frozen | None = None,
         threads: int | None = None,
         quiet: bool = False,
         **schedule: Any,
@@ -295,8 +295,9 @@ class Camera:
             ``exact``: every source gets all the context it needs, so that each window equals the crop of its frame. ``frozen``: what
             lies farther away than a source's ``near`` comes from the noise-free frame of ``background``, and so do frame-wide
             quantities; far cheaper, with the truncation error that `frozen_tail` states.
-        background : Scene, optional
-            The scene far from the windows; needed by the mode ``frozen`` when a source looks beyond its window.
+        background : Scene or Frozen, optional
+            The scene far from the windows; needed by the mode ``frozen`` when a source looks beyond its window. What `freeze` made of it
+            does for several batches.
 
         Returns
         -------
@@ -308,7 +309,9 @@ class Camera:
         last_row, last_col = grid.row0 + grid.shape[0], grid.col0 + grid.shape[1]
         if min(grid.shape) < 1 or (grid.row0 < 0).any() or (grid.col0 < 0).any() or (last_row > rows).any() or (last_col > cols).any():
             raise InputError("a window does not lie in the frame", value=grid.shape, allowed=f"within {rows} rows and {cols} columns")
-        frozen = self._freeze(background, schedule) if mode == "frozen" else None
+        frozen = None
+        if mode == "frozen":
+            frozen = background if isinstance(background, Frozen) else self.freeze(background, **schedule)
         if frozen is None and any(e.remembers for e in self.links):
             raise InputError("a source with a memory cannot be run on single windows exactly", remedy="use iter_frames, or mode='frozen'")
         task = _Task(scene, self.streams(seed, quiet), schedule, threads, frozen)
@@ -328,7 +331,7 @@ class Camera:
         """Largest share of a pixel's signal that the mode ``frozen`` takes from the noise-free frame, over all sources."""
         return float(sum(e.source.tail(e.params) for e in self.links if e.far))
 
-    def _freeze(self, background: Scene | None, schedule: Mapping[str, Any]) -> Frozen:
+    def freeze(self, background: Scene | None, **schedule: Any) -> Frozen:
         """Run the noise-free background frame once and keep what sources with a far context need of it."""
         far = [e.name for e in self.links if e.far or e.remembers]
         if not far:

@@ -90,7 +90,7 @@ class Line:
             If the filter is unstable, improper, not real, or blocks a constant level.
         """
         z, p = (np.asarray(v, complex).reshape(-1) for v in (zeros, poles))
-        if not (_real(z) and _real(p)) or len(p) == 0 or len(z) > len(p) or (p.real >= 0).any() or (z == 0).any():
+        if not (_real(z.tobytes()) and _real(p.tobytes())) or len(p) == 0 or len(z) > len(p) or (p.real >= 0).any() or (z == 0).any():
             raise ParameterError("the filter cannot be used", where="line", allowed="real, stable, not more zeros than poles, passing 0 Hz")
         return replace(self, filters=(*self.filters, (z, p)))
 
@@ -360,8 +360,10 @@ def response(filters: tuple[tuple[bytes, bytes], ...], pixel_hz: float, integrat
     return np.ascontiguousarray(whole[:k]), np.ascontiguousarray(np.stack(terms, axis=2))
 
 
-def _real(roots: np.ndarray) -> bool:
+@lru_cache(64)
+def _real(raw: bytes) -> bool:
     """Whether complex roots come in conjugate pairs: their polynomial is real."""
+    roots = np.frombuffer(raw, complex)
     return not roots.any() or bool(np.abs(np.poly(roots / np.abs(roots).max()).imag).max() < 1e-9)
 
 

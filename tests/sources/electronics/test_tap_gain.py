@@ -73,3 +73,4 @@ def test_predicted_scatter_is_the_mean_over_all_places_of_the_border():
     got = propagate(params, centroid_probe(image, x, np.array([12.0]), frame_shape=(80, 101)))
     assert got.bias_x_px == pytest.approx(shifts.mean(), rel=0.01)
     assert got.u_x_px == pytest.approx(shifts.std(), rel=0.01)
+    assert got.kurtosis == pytest.approx((shifts**4).mean() / (shifts**2).mean() ** 2, rel=0.02)  # of few targets: far from 3
