@@ -290,6 +290,13 @@ def test_arrays_in_tuples_are_treated_like_others() -> None:
     assert not frozen.flags.writeable
 
 
+def test_arrays_given_by_name_are_treated_like_others() -> None:
+    values = np.arange(12.0).reshape(3, 4)
+    values.flags.writeable = False
+    assert total(values=values.T) == total(values) == 66.0
+    assert len(total.dispatcher.signatures) == 1
+
+
 def test_output_is_written_in_place() -> None:
     out = np.zeros(5)
     add_one(np.arange(5.0), out)

@@ -101,9 +101,9 @@ def compile_kernels(progress: Progress | None = None) -> tuple[int, Path | None]
     return len(all_kernels()), cache_folder()
 
 
-def all_kernels() -> dict[str, Kernel]:
+def all_kernels() -> dict[str, Kernel[..., Any]]:
     """Every kernel of the package by its module and name; imports all files of kernels."""
-    found: dict[str, Kernel] = {}
+    found: dict[str, Kernel[..., Any]] = {}
     for path in kernel_files(PACKAGE_ROOT):
         module = ".".join(("pixmetry", *path.relative_to(PACKAGE_ROOT).with_suffix("").parts))
         members = vars(import_module(module)).values()

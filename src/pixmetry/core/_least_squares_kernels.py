@@ -11,9 +11,9 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pixmetry.core._linear_algebra_kernels import Array, factor_for, solve
+from pixmetry.core._linear_algebra_kernels import factor_for, solve
+from pixmetry.core.arrays import Array, Ints
 from pixmetry.core.jit import jit
 
 MOST_PASSES = 60
@@ -58,7 +58,7 @@ def descent_of(equations: Callable[..., Any], limit: Callable[..., Any]) -> Any:
     """
 
     @jit
-    def descend(problem: Any, p: Array, least: Array, active: NDArray[np.int64], observations: int, rest: Rest) -> tuple[float, bool]:
+    def descend(problem: Any, p: Array, least: Array, active: Ints, observations: int, rest: Rest) -> tuple[float, bool]:
         count = len(active)
         normal, right = np.zeros((count, count)), np.zeros(count)
         new_normal, new_right, held = np.zeros((count, count)), np.zeros(count), np.zeros((count, count))

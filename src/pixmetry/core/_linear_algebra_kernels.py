@@ -9,13 +9,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pixmetry.core.arrays import Array
 from pixmetry.core.jit import jit
 
 LEAST_PIVOT = 1e-13  # of a unit diagonal: below, rounding decides
-
-Array = NDArray[np.float64]
 
 
 class Factor(NamedTuple):

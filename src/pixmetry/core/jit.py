@@ -27,7 +27,7 @@ from collections.abc import Callable, Iterator
 from functools import cache, lru_cache
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, Generic, ParamSpec, TypeVar, overload
 
 import numpy as np
 
@@ -37,6 +37,8 @@ PACKAGE_ROOT = Path(__file__).resolve().parents[1]
 KERNEL_FILE = re.compile(r"_(.+_)?kernels\.py")
 DEFAULTS = {"nogil": True, "cache": True, "fastmath": False, "error_model": "numpy"}
 KEEP_DAYS = 30
+P = ParamSpec("P")
+R = TypeVar("R")
 BLOCKS = ("body", "orelse", "handlers", "finalbody", "cases")  # where a statement of Python holds others
 
 
@@ -53,11 +55,11 @@ _begun_ns = time.time_ns()
 _loaded = {__file__: _stamp(__file__)}  # this file and those of kernels -> their stamps when they were imported
 
 
-class Kernel:
-    """A function that Numba compiles at its first call. Made by :func:`jit`."""
+class Kernel(Generic[P, R]):
+    """A function that Numba compiles at its first call. Made by :func:`jit`; called as that function is."""
 
-    def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
-        self.py_func = function
+    def __init__(self, function: Callable[P, R], options: dict[str, Any]) -> None:
+        self.py_func: Callable[..., Any] = function  # numbers or arrays: plain Python does not mind
         self.options = options
         self.__name__, self.__qualname__ = function.__name__, function.__qualname__
         self.__module__, self.__doc__ = function.__module__, function.__doc__
@@ -83,8 +85,18 @@ class Kernel:
                     self._dispatcher = _compile(self.py_func, self.options)
         return self._dispatcher
 
-    def __call__(self, *args: Any) -> Any:
-        return (self._dispatcher or self.dispatcher)(*[_plain(a) if isinstance(a, (np.ndarray, tuple)) else a for a in args])
+    def __call__(self, *args: P.args, **named: P.kwargs) -> R:
+        plain = [_plain(value) if isinstance(value, (np.ndarray, tuple)) else value for value in args]
+        result: R = (self._dispatcher or self.dispatcher)(*plain, **{name: _plain(value) for name, value in named.items()})
+        return result
+
+
+@overload
+def jit(function: Callable[P, R], /, **options: Any) -> Kernel[P, R]: ...
+
+
+@overload
+def jit(**options: Any) -> Callable[[Callable[P, R]], Kernel[P, R]]: ...
 
 
 def jit(function: Callable[..., Any] | None = None, /, **options: Any) -> Any:
@@ -102,7 +114,7 @@ def jit(function: Callable[..., Any] | None = None, /, **options: Any) -> Any:
     Returns
     -------
     Kernel
-        A callable with positional arguments.
+        A callable with the arguments of the function.
 
     Raises
     ------
@@ -236,7 +248,7 @@ def _teach_numba() -> None:
     if Kernel not in typeof_impl.registry:
 
         @typeof_impl.register(Kernel)
-        def _typeof_kernel(value: Kernel, _context: Any) -> Any:
+        def _typeof_kernel(value: Kernel[..., Any], _context: Any) -> Any:
             return types.Dispatcher(value.dispatcher)
 
         _watch_numba()

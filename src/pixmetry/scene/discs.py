@@ -143,8 +143,8 @@ class Discs:
         peak = np.array(np.broadcast_to(np.asarray(self.peak_photons, float), count))
         out = np.zeros(at.x_px.size)
         outer = 0.5 * self.diameter_px + REACH * blur_px
-        place = (np.ascontiguousarray(v, float).ravel() for v in (at.x_px, at.y_px, width, height))
-        see_discs(out, *place, row, cx, cy, peak, radial_profile(float(self.diameter_px), blur_px), STEP, outer, blur_px)
+        x, y, wide, high = (np.ascontiguousarray(v, float).ravel() for v in (at.x_px, at.y_px, width, height))
+        see_discs(out, x, y, wide, high, row, cx, cy, peak, radial_profile(float(self.diameter_px), blur_px), STEP, outer, blur_px)
         return out.reshape(at.x_px.shape)
 
     def detailed(self, at: Points, reach_px: ArrayLike) -> np.ndarray:

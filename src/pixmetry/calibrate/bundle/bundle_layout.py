@@ -107,7 +107,7 @@ class Layout:
         return self.network.camera_of.astype(np.int64)
 
     @property
-    def incidence(self) -> tuple[np.ndarray, ...]:
+    def incidence(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """What sees what, and where it stands, as the kernels take it behind Jacobian and weights."""
         return (self.image, self.first, self.camera_of, self.camera_col, self.camera_count, self.image_col)
 

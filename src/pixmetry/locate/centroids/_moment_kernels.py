@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from pixmetry.core._linear_algebra_kernels import Array
+from pixmetry.core.arrays import Array
 from pixmetry.core.jit import jit
 from pixmetry.locate._noise_kernels import variance_at
 

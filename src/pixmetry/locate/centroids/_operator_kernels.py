@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixmetry.core._least_squares_kernels import FREE, Rest, descent_of
-from pixmetry.core._linear_algebra_kernels import Array, factor_for, factorise, invert_root, substitute
+from pixmetry.core._linear_algebra_kernels import factor_for, factorise, invert_root, substitute
+from pixmetry.core.arrays import Array, Ints
 from pixmetry.core.jit import jit
 from pixmetry.locate._noise_kernels import Noise, variance_at
 from pixmetry.locate.centroids._moment_kernels import (
@@ -37,8 +37,6 @@ GRADIENT_NOISE = 2.0 * (9.0 + 100.0 + 9.0) / 1024.0  # variance of one component
 MOST_RAYS = 192
 GAUSSIAN_UNKNOWNS = 7
 GAUSSIAN_REST = 1e-10  # of the squared residuals: fall at which the fit of a Gaussian is at rest
-
-Ints = NDArray[np.int64]
 
 
 @jit

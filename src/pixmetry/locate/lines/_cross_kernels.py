@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pixmetry.core._least_squares_kernels import descent_of
-from pixmetry.core._linear_algebra_kernels import Array, invert
+from pixmetry.core._linear_algebra_kernels import invert
 from pixmetry.core._normal_kernels import ROOT
+from pixmetry.core.arrays import Array, Ints
 from pixmetry.core.jit import jit
 from pixmetry.locate._noise_kernels import Noise, stored
 from pixmetry.locate.lines._line_kernels import (
@@ -23,7 +24,6 @@ from pixmetry.locate.lines._line_kernels import (
     RESTLESS,
     SHARED,
     SINGULAR,
-    Ints,
     Lines,
     covered,
 )

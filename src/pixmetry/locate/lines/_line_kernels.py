@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pixmetry.core._least_squares_kernels import Rest, descent_of
-from pixmetry.core._linear_algebra_kernels import Array, invert
+from pixmetry.core._linear_algebra_kernels import invert
+from pixmetry.core.arrays import Array, Ints
 from pixmetry.core.jit import jit
 from pixmetry.locate._noise_kernels import Noise, stored
 from pixmetry.locate.lines._profile_kernels import BAR, GAUSSIAN, profile
@@ -23,8 +24,6 @@ SIGNIFICANT = 3.0  # standard deviations from which a slope, a taper or a curvat
 REST = Rest(1e-5, 0.0, math.inf, 1e-2)  # falls of χ²: 0.003 and 0.1 standard deviations
 PARALLEL = 0.05  # sine of the angle below which lines count as parallel
 BORDERS, HIGH, LOW, SHARED, RESTLESS, SINGULAR = 1, 2, 4, 8, 16, 32  # what a fit came across
-
-Ints = NDArray[np.int64]
 
 
 class Lines(NamedTuple):

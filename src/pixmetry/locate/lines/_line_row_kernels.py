@@ -8,8 +8,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pixmetry.core._linear_algebra_kernels import Array, invert
+from pixmetry.core._linear_algebra_kernels import invert
 from pixmetry.core._normal_kernels import cdf, pdf
+from pixmetry.core.arrays import Array
 from pixmetry.core.jit import jit
 from pixmetry.locate._noise_kernels import Noise, stored, variance_of
 from pixmetry.locate.lines._line_kernels import (

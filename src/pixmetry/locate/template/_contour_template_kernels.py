@@ -20,10 +20,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pixmetry.core._linear_algebra_kernels import Array
 from pixmetry.core._normal_kernels import both, cdf, pdf
+from pixmetry.core.arrays import Array, Singles
 from pixmetry.core.jit import jit
 
 DISC, ELLIPSE, RING, SPOT = 0, 1, 2, 3
@@ -35,8 +34,6 @@ PAD = 4  # columns to either side of a window that may be drawn to
 PHASES = 5.0  # entries of a table per standard deviation: cubic interpolation of g is good to 6e-6
 THIN = 0.005  # a box narrower than this share of the blur is a point (error 1e-6)
 FUSED = {"fastmath": {"contract"}}
-
-Singles = NDArray[np.float32]
 
 
 class Canvas(NamedTuple):

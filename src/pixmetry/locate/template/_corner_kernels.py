@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pixmetry.core._least_squares_kernels import FREE, Rest, descent_of
-from pixmetry.core._linear_algebra_kernels import Array, factor_for, invert, solve
+from pixmetry.core._linear_algebra_kernels import factor_for, invert, solve
+from pixmetry.core.arrays import Array, Ints
 from pixmetry.core.jit import jit
 from pixmetry.locate._noise_kernels import Noise, stored
 
@@ -33,8 +34,6 @@ PLAIN, ALL = 7, 11  # number of unknowns: x, y, two angles, blur, mean, contrast
 NODES = np.array([0.2386191860831969, 0.6612093864662645, 0.9324695142031521])  # Gauss–Legendre, 6 points: Φ₂ to 2e-6 up to ρ = 0.9
 WEIGHTS = np.array([0.4679139345726910, 0.3607615730481386, 0.1713244923791704])
 NEVER, ALWAYS, AUTO = 0, 1, 2  # whether planes are among the unknowns
-
-Ints = NDArray[np.int64]
 
 
 class Corner(NamedTuple):

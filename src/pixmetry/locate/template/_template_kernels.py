@@ -12,7 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pixmetry.core._linear_algebra_kernels import Array, Factor, factor_for, factorise, solve, substitute
+from pixmetry.core._linear_algebra_kernels import Factor, factor_for, factorise, solve, substitute
+from pixmetry.core.arrays import Array, Ints, Singles
 from pixmetry.core.jit import jit
 from pixmetry.locate._noise_kernels import CLIP, Noise, clipped, variance_of, variance_slope
 from pixmetry.locate.template._contour_template_kernels import (
@@ -22,7 +23,6 @@ from pixmetry.locate.template._contour_template_kernels import (
     SHAPES,
     SPOT,
     Canvas,
-    Singles,
     block_count,
     complete,
     draw,
@@ -49,8 +49,6 @@ PER_E = 8.0  # entries of the efficiency per unit of log(electrons)
 ROWS = 32  # of a target, at most, that are asked whether rows are shifted against each other
 ALIKE = math.exp(-1.0 / 5.0)  # correlation of the shifts of two lines of a field that follow each other, where a loop carries them on
 DOT = {"fastmath": {"reassoc", "contract", "nsz"}}
-
-Ints = NDArray[np.int64]
 
 
 class About(NamedTuple):
