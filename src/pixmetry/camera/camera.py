@@ -651,25 +651,41 @@ def build_camera(record: Mapping[str, Any], where: str = "camera", folder: str |
 
 
 def load_camera(path: str | Path) -> Camera:
-    """Read a camera from its YAML file, or one of the presets by its name.
+    """Read a camera from its YAML file or a data-sheet file, or one of those that come with pixmetry by its name.
 
     Raises
     ------
     InputError, ChainError
-        If there is no such file or preset, it cannot be used, or a result stands beside it that was written with another one.
+        If there is no such file, preset or sheet, it cannot be used, or a result stands beside it that was written with another one.
+
+    Examples
+    --------
+    >>> from pixmetry.camera.camera import load_camera
+    >>> load_camera("imx264_like").frame_shape  # a preset
+    (2048, 2448)
+    >>> load_camera("imx250")["sensor.full_well"].known_from  # a data sheet
+    'sheet'
     """
     from importlib.resources import files
 
     from pixmetry.core.config import load_yaml
 
-    presets = {p.name.removesuffix(".yaml"): p for p in (files("pixmetry.camera") / "presets").iterdir() if p.name.endswith(".yaml")}
-    if str(path) in presets:
-        path = Path(str(presets[str(path)]))
+    folders = [files("pixmetry.camera") / name for name in ("presets", "sheets")]
+    known = {p.name.removesuffix(".yaml"): p for folder in folders for p in folder.iterdir() if p.name.endswith(".yaml")}
+    if str(path) in known:
+        path = Path(str(known[str(path)]))
     elif not Path(path).is_file():
-        raise InputError("no such camera file or preset", value=str(path), allowed=f"a YAML file, or one of {', '.join(sorted(presets))}")
+        allowed = f"a YAML file, or one of {', '.join(sorted(known))}"
+        raise InputError("no such camera file or preset", value=str(path), allowed=allowed)
     else:
         check_file(path)
-    return build_camera(load_yaml(path), str(path), Path(path).parent)
+    record = load_yaml(path)
+    if str(record.get("schema", "")).startswith("pixmetry/data_sheet/"):
+        from pixmetry.camera.data_sheet import camera_of_data_sheet
+
+        camera = camera_of_data_sheet(record, str(path))
+        return camera if record.get("name") else replace(camera, name=Path(path).stem)
+    return build_camera(record, str(path), Path(path).parent)
 
 
 __all__ = ["Camera", "Element", "Scene", "build_camera", "check_chain", "in_order", "load_camera"]
