@@ -204,7 +204,7 @@ def test_small_fleet_says_what_it_cannot_tell() -> None:
     for n in (3, 4, 5):
         sheets = [measured({"K": (0.28 + 0.001 * i, 1e-5)}) for i in range(n - 1)] + [measured({"K": (0.31, 1e-5)})]
         result = compare_fleet(sheets)
-        assert any(f"{n} cameras hardly tell their own spread" in note for note in result.notes) == (n < 5)
+        assert any(f"{n} cameras hardly determine their spread" in note for note in result.notes) == (n < 5)
         assert result.same or n > 3
 
 

@@ -290,7 +290,7 @@ def test_another_file_is_no_calibration(tmp_path: Path, text: str) -> None:
         (("good.yaml", "a.png"), ("good.yaml", "one project, or pictures")),
         (("good.yaml", "--grid", "9x6"), ("grid", "has no meaning with a project file")),
         (("good.yaml", "--free", "c,f"), ("free", "'f'", "k5")),
-        (("good.yaml", "--free", "xp,yp"), ("c of camera 'camera' is to be held",)),
+        (("good.yaml", "--free", "xp,yp"), ("c of camera 'camera' is held fixed",)),
         (("good.yaml", "--per-image", "y_scale"), ("per_image", "x_shift")),
         (("good.yaml", "--field", "wrong"), ("--field", "auto")),
         (("good.yaml", "--folds", "1"), ("folds", "2 and more")),
@@ -368,7 +368,7 @@ def test_a_camera_that_no_image_names(simulated: Simulated, tmp_path: Path) -> N
     record = json.loads((tmp_path / "r" / "calibration.json").read_text())
     assert record["cameras"][1]["covariance"]["names"] == []
     page = words_of(tmp_path / "r" / "report.html")
-    assert "No image coordinate of this camera took part" in page
+    assert "No image coordinate of this camera was used" in page
     with pytest.raises(InputError, match="took part"):
         calibrated_geometry(tmp_path / "r", "B")
     assert calibrated_geometry(tmp_path / "r", "A").u_x_px > 0

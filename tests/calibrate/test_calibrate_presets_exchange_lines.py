@@ -397,7 +397,7 @@ def test_the_lens_of_lines_starts_a_bundle(wires: tuple[Path, str], tmp_path: Pa
     start = load_project(tmp_path / "p.yaml").network.cameras[0]
     assert start["c"] == 12 and start["k1"] == stored_cameras(wires[0] / "r")[0]["k1"] and start.sensor.pitch_x_um == 8.6
     (tmp_path / "p.yaml").write_text(f"{head}cameras: {{start_from: {wires[0]}/r/calibration.json, free: [xp, yp]}}\n")
-    with pytest.raises(InputError, match="c is to be held"):
+    with pytest.raises(InputError, match="c is held fixed"):
         load_project(tmp_path / "p.yaml")
     with pytest.raises(InputError, match="not a calibration"):
         read_calibration(wires[0] / "r")

@@ -208,7 +208,7 @@ GOOD = CAMERA + "observations: o.csv\n"
         (GOOD.replace("c_mm: 8", "c_mm: '8 mm'"), ("line 2", "not a number", "8 mm")),
         (GOOD.replace("c_mm: 8", "c_mm: .nan"), ("line 2", "c_mm")),
         (GOOD.replace("c_mm: 8", "free: [c, f]"), ("line 2", "free")),
-        (GOOD.replace("c_mm: 8", "free: [xp, yp]"), ("c is to be held", "c_mm or c_px")),
+        (GOOD.replace("c_mm: 8", "free: [xp, yp]"), ("c is held fixed", "c_mm or c_px")),
         ("cameras: {cols: 640, rows: 480, c_mm: 8}\nobservations: o.csv\n", ("c_mm, but no pitch", "pitch_um")),
         ("cameras: {cols: 640}\nobservations: o.csv\n", ("line 2", "cols and rows")),
         ("cameras: {c_px: 800}\nobservations: o.csv\n", ("size of the frame is missing", "cols and rows")),
@@ -340,7 +340,7 @@ def test_check_points_are_not_known(tmp_path: Path) -> None:
 def test_a_mistake_about_images_is_told(tmp_path: Path, images: str, words: tuple[str, ...]) -> None:
     cameras = "cameras:\n- {name: left, cols: 640, rows: 480}\n- {name: right, cols: 640, rows: 480}\n"
     refused(tmp_path, cameras + "observations: o.csv\nimages: i.csv\n", *words, o=rows(), i=images)
-    refused(tmp_path, cameras + "observations: o.csv\n", "which image is of which", o=rows())
+    refused(tmp_path, cameras + "observations: o.csv\n", "that assigns images to them", o=rows())
 
 
 MATRIX = ",".join(f"r{i}{j}" for i in "123" for j in "123")
@@ -388,10 +388,10 @@ def test_start_poses_by_angles_or_matrices(tmp_path: Path) -> None:
         ("image,X0,Y0,Z0\na,1,2,3\nb,1,2,3\n", ("'omega_deg' is missing",)),
         ("image,X0,Y0,Z0,omega_deg,phi_deg\na,1,2,3,4,5\nb,1,2,3,4,5\n", ("'kappa_deg' is missing",)),
         ("image,omega_deg,phi_deg,kappa_deg\na,1,2,3\nb,1,2,3\n", ("'X0' is missing",)),
-        ("image,X0,Y0,Z0,omega_deg,phi_deg,kappa_rad\na,1,2,3,4,5,6\nb,1,2,3,4,5,6\n", ("told twice", "kappa_rad")),
-        ("image,X0,Y0,Z0,omega_deg,phi_deg,kappa_deg\na,1,2,3,4,5,6\nb,1,,3,4,5,6\n", ("line 3", "some of its values")),
+        ("image,X0,Y0,Z0,omega_deg,phi_deg,kappa_rad\na,1,2,3,4,5,6\nb,1,2,3,4,5,6\n", ("given twice", "kappa_rad")),
+        ("image,X0,Y0,Z0,omega_deg,phi_deg,kappa_deg\na,1,2,3,4,5,6\nb,1,,3,4,5,6\n", ("line 3", "an incomplete pose")),
         (f"image,X0,Y0,Z0,{MATRIX}\na,1,2,3,1,0,0,0,1,0,0,0,1\nb,1,2,3,1,0,0,0,1,0,0,0,-1\n", ("line 3", "mirror", "looks along +z")),
-        ("image,X0,Y0,Z0,tx,ty,tz,qw,qx,qy,qz\na,1,2,3,1,2,3,1,0,0,0\nb,1,2,3,1,2,3,1,0,0,0\n", ("told twice", "tx")),
+        ("image,X0,Y0,Z0,tx,ty,tz,qw,qx,qy,qz\na,1,2,3,1,2,3,1,0,0,0\nb,1,2,3,1,2,3,1,0,0,0\n", ("given twice", "tx")),
         ("image,X0,Y0,Z0,qw,qx,qy,qz\na,,,,,,,\nb,1,2,3,0,0,0,0\n", ("line 3", "length 0")),
         (f"image,X0,Y0,Z0,{MATRIX}\na,1,2,3,1,0,0,0,1,0,0,.1,1\nb,1,2,3,1,0,0,0,1,0,0,0,1\n", ("line 2", "no rotation")),
     ],
@@ -402,7 +402,7 @@ def test_a_mistake_about_start_poses_is_told(tmp_path: Path, images: str, words:
 
 def test_decimal_commas_are_named_where_they_part_columns(tmp_path: Path) -> None:
     project = CAMERA + "observations: {table: o.csv, columns: [image, point, x_px, y_px]}\n"
-    refused(tmp_path, project, "line 1", "3 values", "write decimal points as points", o="a 1 12,5 30,25\na 2 13,5 31,5\n")
+    refused(tmp_path, project, "line 1", "3 values", "write decimal points, not commas", o="a 1 12,5 30,25\na 2 13,5 31,5\n")
 
 
 def test_a_project_without_a_schema_says_so(tmp_path: Path) -> None:

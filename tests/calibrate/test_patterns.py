@@ -223,7 +223,7 @@ def test_findings_come_with_a_source_of_the_catalogue():
     ]
     findings = pattern_findings(made)
     assert [f.kind for f in findings] == ["radius", "phase_x"]
-    assert findings[0].text.startswith("radius (as from lens distortion") and "optics.distortion" in findings[0].text
+    assert findings[0].text.startswith("radius (possible cause: lens distortion") and "optics.distortion" in findings[0].text
     assert findings[0].advice == "Do this." and {f.level for f in findings} == {"warning"}
 
 

@@ -338,5 +338,5 @@ def test_positions_outside_of_the_frame_change_nothing(rng, far_px) -> None:
 def test_a_line_of_which_hardly_a_position_is_in_the_frame_is_told(rng) -> None:
     table = lines(rng, n=30, count=6)
     table["x_px"][:28] = 5000.0
-    with pytest.raises(MeasureError, match="hardly a position lies on the line"):
+    with pytest.raises(MeasureError, match="almost no position lies on the line"):
         calibrate_lines(**table, sensor=SENSOR)

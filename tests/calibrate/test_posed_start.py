@@ -114,7 +114,7 @@ def test_wrong_poses_do_no_harm_and_are_named(kind: str, rng: np.random.Generato
     options = Options(folds=0)
     with_them, without = calibrate_network(wrong, options), calibrate_network(simulated.network, options)
     (finding,) = [f for f in with_them.findings if f.kind == "start_poses"]
-    assert "frame and size was not taken" in finding.text and words in finding.advice
+    assert "coordinate system and scale were not used" in finding.text and words in finding.advice
     u = np.sqrt(np.diagonal(without.adjustment.interior_covariance()[1]))
     both = (one.adjustment.state.interior[0, :10] for one in (with_them, without))
     assert (np.abs(np.subtract(*both)) < 0.01 * u).all()

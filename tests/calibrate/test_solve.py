@@ -468,8 +468,8 @@ def test_a_camera_that_is_held_and_one_without_images_are_no_trouble(rng, tmp_pa
     assert (calibration.tests.projection["camera"].u_px == 0).all()
     said = summary_text(calibration)
     assert said.count("fixed") == len(NAMES) - 2 and "is imaged" not in said  # k4 and k5 are 0
-    assert "spare: No image coordinate of this camera took part." in said
-    assert "No image coordinate of this camera took part" in html_of(page_of(calibration))
+    assert "spare: No image coordinate of this camera was used." in said
+    assert "No image coordinate of this camera was used" in html_of(page_of(calibration))
     path = tmp_path / "calibration.json"
     path.write_text(calibration_json(calibration), encoding="utf-8")
     stored = read_calibration(path)

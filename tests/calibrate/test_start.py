@@ -171,7 +171,7 @@ def test_point_and_image_seen_too_seldom_are_left_out(rng: np.random.Generator):
 @pytest.mark.parametrize("known", ["fixed", "partly", "rough"])
 def test_mirrored_coordinates_are_named(known: str, rng: np.random.Generator):
     network = simulate(rng, images=10, points=80, known=known).network
-    with pytest.raises(InputError, match="fit only mirrored.*y counts upwards"):
+    with pytest.raises(InputError, match="only if one of them is mirrored.*y counts upwards"):
         start_values(replace(network, y_px=SENSOR.rows - 1 - network.y_px))
 
 

@@ -113,7 +113,7 @@ def test_steps_on_codes_of_fewer_bits_than_the_converter_makes_are_refused() -> 
     """They would take all brighter codes for the highest."""
     dcs = load_camera("dcs420_like")
     for name in ("processing.demosaic", "processing.companding"):
-        with pytest.raises(ChainError, match=rf"{name} takes codes of fewer bits than grabber.adc makes"):
+        with pytest.raises(ChainError, match=rf"{name} takes fewer bits than grabber.adc makes"):
             dcs.with_parameters(name, bits=10)
     with pytest.raises(ChainError, match="fewer bits"):
         dcs.with_parameters("grabber.adc", bits=14)

@@ -253,7 +253,7 @@ def test_light_sources_stand_before_the_pixels_and_need_a_scene_with_radiance() 
         def photons(self, grid: Grid, *_: object) -> np.ndarray:
             return np.zeros(grid.size, np.float32)
 
-    with pytest.raises(InputError, match="cannot be seen through optics"):
+    with pytest.raises(InputError, match="cannot be imaged through optics"):
         Camera("bent", SHAPE, (Element(NAME, BEND, Bend()),)).expose(Numbers())
     with pytest.raises(InputError, match="odd sides"):
         light(Spot()).convolved(np.ones((2, 3)))

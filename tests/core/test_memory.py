@@ -22,7 +22,7 @@ def test_what_is_free_is_what_the_system_says() -> None:
     whole = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     assert 0 < available_bytes() <= whole
     check_memory(1, "a byte", remedy="")
-    with pytest.raises(InputError, match=r"it needs .* GiB of memory; allowed: up to .*, the memory that is free now; to do: less"):
+    with pytest.raises(InputError, match=r"it needs .* GiB of memory; allowed: up to .*, the free memory; to do: less"):
         check_memory(2.0 * whole, "it", remedy="less")
 
 

@@ -81,7 +81,7 @@ def test_prints_values_with_uncertainties_and_writes_all_files(known: Path, tmp_
     done = run(known, "--json", files["json"], "--xml", files["xml"], "--html", files["html"], "--pdf", files["pdf"], "--photons-u", 3)
     assert done.exit_code == 0, done.output
     assert any(f"Release 4.0 {verdict}" in done.output for verdict in ("Linear applies", "General applies", "Linear, and General")) or (
-        "they do not tell whether Linear or General applies" in done.output
+        "they do not decide whether Linear or General applies" in done.output
     )
     index = next(line for line in done.output.splitlines() if line.startswith("index_sensitivity_max"))
     assert re.fullmatch(r"\S+ +\d+( \[\d+\])? *", index)  # a place in the series, without u
@@ -170,7 +170,7 @@ def test_temperatures_are_checked_before_the_work(known: Path, tmp_path: Path, m
     monkeypatch.setattr("pixmetry.emva.job.measure_campaign", never)
     paths = [at(f"t{t}", t) for t in (20, 24, 28)]
     refused(run(*paths[:2]), "too few temperatures")
-    refused(run(*paths), "too near to each other")
+    refused(run(*paths), "too close to each other")
     refused(run(paths[0], at("unknown", None), paths[1]), "the temperature is not known", "unknown")
     other = at("other", 40)
     other.write_text(other.read_text().replace("bits: 12", "bits: 11"))
@@ -402,7 +402,7 @@ def test_campaigns_that_cannot_be_tested(known: Path, tmp_path: Path) -> None:
         "8 bits": (changed(known, tmp_path / "f", bright5_1=np.zeros(SHAPE, np.uint8)), ("8-bit file", "bright5_1.npy")),
         "all saturated": (changed(known, tmp_path / "g", bright=top), ("all bright levels are saturated",)),
         "exchanged": (exchanged(known, tmp_path / "x"), ("campaign.yaml", "bright levels are darker than the dark ones")),
-        "too high": (changed(known, tmp_path / "h", dark7_0=np.full(SHAPE, 4096, np.uint16)), ("above what 12 bits can hold",)),
+        "too high": (changed(known, tmp_path / "h", dark7_0=np.full(SHAPE, 4096, np.uint16)), ("above the range of 12 bits",)),
     }
     missing = changed(known, tmp_path / "i")
     (missing.parent / "bright3_0.npy").unlink()

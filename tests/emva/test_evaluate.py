@@ -236,7 +236,7 @@ def test_a_limit_of_extrapolated_dark_noise_lies_above_the_truth(rng: np.random.
     for seed in rng.integers(2**31, size=40):
         values = standard_values(measured(Camera(seed=int(seed), **strong)), "3.1", draws=300).values
         if values["sigma_d"].is_upper_limit:
-            assert values["u_e_min"].is_upper_limit and "does not stand out" in values["DR"].reason
+            assert values["u_e_min"].is_upper_limit and "is not significant" in values["DR"].reason
             assert values["u_e_min"].value > values["sigma_d"].value
             limits.append(values["sigma_d"].value > 5.0)
     assert limits
@@ -364,7 +364,7 @@ def test_a_bent_photon_transfer_is_noted_and_a_straight_one_is_not(camera: Measu
 def test_notes_tell_what_the_series_lacks(camera: Measurement) -> None:
     short = replace(camera.transfer, bright=only(camera.transfer.bright, slice(0, 20)), dark=only(camera.transfer.dark, [0, 10, 20]))
     notes = " ".join(evaluate(replace(camera, transfer=short), "3.1", draws=200).notes)
-    for words in ("ends before saturation", "20 bright levels", "fewer than 6 exposures", "not every bright level has a dark one"):
+    for words in ("ends before saturation", "20 bright levels", "fewer than 6 exposures", "not every bright level has a dark level"):
         assert words in notes
 
 

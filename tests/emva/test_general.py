@@ -357,7 +357,7 @@ def test_levels_may_be_repeated(rng: np.random.Generator):
 
 def test_refusals():
     series = exact_series(Camera(), sweep("even", 12))
-    with pytest.raises(MeasureError, match="too few lit levels"):
+    with pytest.raises(MeasureError, match="too few bright levels"):
         general_values(replace(series, fraction_max=np.r_[np.zeros(7), np.ones(5)]))
     with pytest.raises(MeasureError, match="no brighter"):
         general_values(replace(series, mean_dn=series.dark_mean_dn))

@@ -244,7 +244,7 @@ def test_a_pair_of_two_lights_is_named(rng: np.random.Generator):
     for others, named in ((swapped, [5, 6]), ({}, [])):
         off = rng.permutation(evenly)
         bright = [Group("bright", "level", i * 1e-3, 1000.0 * i, pair(i, others.get(i, i), off[i - 1])) for i in range(1, 13)]
-        notes = [note for note in measure_frames([*dark, *bright], BITS)[0].notes if "of two lights" in note]
+        notes = [note for note in measure_frames([*dark, *bright], BITS)[0].notes if "under different light" in note]
         assert [int(note.split("level ")[1].split()[0]) for note in notes] == named
 
 

@@ -89,7 +89,7 @@ def test_exact_name_wins_over_one_that_differs_in_case(folder: Path) -> None:
         ("i images\\b_0.png", "i", ["line 6", "without a name"]),
         ("n 12 8 6", "n 12 8", ["line 4", "2 numbers", "n bits width height"]),
         ("n 12 8 6", "n 12,5 8 6", ["line 4", "whole numbers"]),
-        ("b 40000.0 120.0", "b 40,000 120.0", ["line 5", "a comma that may part thousands or decimals", "point"]),
+        ("b 40000.0 120.0", "b 40,000 120.0", ["line 5", "a comma that may separate thousands or decimals", "point"]),
         ("n 12 8 6", "n 20 8 6", ["line 4", "1 to 16 bits"]),
         ("n 12 8 6\n", "", ["no record of bits"]),
         ("n 12 8 6", "n 12 8 6\nn 12 8 6", ["line 5", "second record"]),

@@ -374,7 +374,7 @@ def test_raw_values_of_genicam(name: str, shape: tuple[int, int], tmp_path: Path
         again = load_frame(frame, raw=layout).array
         np.testing.assert_array_equal(again, frames[k])
         assert again.dtype == (np.uint8 if bits == 8 else np.uint16)
-    with pytest.raises(InputError, match="no whole number of frames"):
+    with pytest.raises(InputError, match="not contain a whole number of frames"):
         picture_files([put(tmp_path / "b.raw", path.read_bytes()[: -1 - 2 * layout.frame_bytes])], raw=layout)
 
 

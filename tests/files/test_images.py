@@ -152,7 +152,7 @@ def test_missing_file_is_refused(tmp_path: Path) -> None:
     [
         ({"shape": (6, 9)}, ["9 x 6 pixels", "8 x 6", "one size"]),
         ({"dtype": "uint8"}, ["8-bit file", "12 bits are declared"]),
-        ({"value": 4093}, ["value above what 12 bits can hold", "4096", "0 to 4095", "at least 13"]),
+        ({"value": 4093}, ["value above the range of 12 bits", "4096", "0 to 4095", "at least 13"]),
         ({"shape": (6, 8, 3), "dtype": "uint8"}, ["colour"]),
     ],
 )

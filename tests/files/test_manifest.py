@@ -226,7 +226,7 @@ def test_manifest_names_camera_sensor_light_and_operator(tmp_path: Path) -> None
     [
         ("sensor_rows: 80, ", "", ["sensor_cols and sensor_rows", "both or neither"]),
         ("first_row: 20, ", "", []),
-        ("sensor_cols: 100, sensor_rows: 80, ", "", ["size is not given"]),
+        ("sensor_cols: 100, sensor_rows: 80, ", "", ["no size of the sensor"]),
         ("first_col: 30", "first_col: 95", ["do not lie on the sensor", "8 x 6 pixels from (95, 20)", "100 x 80"]),
         ("lossless: true", "lossless: rather", ["lossless"]),
         ("'0815'", "0815", ["camera.serial_number", "quotes"]),

@@ -420,13 +420,13 @@ def test_a_camera_with_a_logarithmic_response_has_a_noise_too() -> None:
         ({"unknowns": "amplitude_dn"}, "the place is not among"),
         ({"window_px": 10}, "window cannot be used"),
         ({"parameters": DISC | {"radius_px": 900.0}}, "the target is too large"),
-        ({"noise": NoiseModel(0.01)}, "less than rounding makes"),
+        ({"noise": NoiseModel(0.01)}, "smaller than that of rounding"),
         ({"noise": NoiseModel(1 / 12)}, "no bound without noise"),
         ({"frames": 0}, "number of frames"),
         ({"phases": 0}, "number of phases"),
         ({"aperture_px": 1.5}, "aperture"),
         ({"estimator": "magic"}, "no such estimator"),
-        ({"noise": NoiseModel(1.0, low_dn=0, high_dn=3)}, "does not tell the place"),
+        ({"noise": NoiseModel(1.0, low_dn=0, high_dn=3)}, "does not determine the position"),
     ],
 )
 def test_bad_input_is_told_in_one_line(change: dict, text: str) -> None:

@@ -75,7 +75,7 @@ def test_every_kind_of_target(words: tuple[str, ...]) -> None:
         (("--radius", "3.5", "--blur", "0.7", "--amplitude", "0"), "amplitude_dn cannot be used"),
         (("--radius", "3.5", "--blur", "nan", "--amplitude", "9"), "blur_px cannot be used"),
         ((*TARGET, "--window", "8"), "window cannot be used"),
-        ((*TARGET, "--noise", "read=1,bits=1"), "does not tell the place"),
+        ((*TARGET, "--noise", "read=1,bits=1"), "does not determine the position"),
     ],
 )
 def test_mistakes_are_one_line_each(words: tuple[str, ...], text: str) -> None:

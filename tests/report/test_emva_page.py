@@ -395,7 +395,7 @@ def test_what_was_given_is_escaped_and_the_same_sheet_gives_the_same_page() -> N
 
 
 def test_provenance_and_licence_end_the_page() -> None:
-    end = page().text[page().text.index("Where this comes from") :]
+    end = page().text[page().text.index("Versions and inputs") :]
     for words in ("7, each with its SHA-256", "pixmetry emva1288 campaign.yaml", "CC0, made for a test", "numpy 2.0", "2024-06-11 12:00"):
         assert words in end
 

@@ -93,7 +93,7 @@ def test_shares_of_random_and_systematic() -> None:
     """Squares: random 0.03² + 0.02² + 0.04² + 0.01² = 0.0030, bias 0.02² = 0.0004: 88 % and 12 %."""
     text = page().text
     assert "88 % is random in time" in text
-    assert "12 % is the same everywhere, which a calibration takes up" in text
+    assert "12 % is constant; a calibration removes both" in text
 
 
 def test_accepted_sources_are_named_with_their_reason() -> None:
@@ -107,7 +107,7 @@ def test_without_a_pitch_lengths_stay_in_pixels_and_the_page_says_how_to_add_it(
     found = page(None)
     assert "0.050 px" in found.text
     assert "pitch_x_um" in found.text
-    verdict = found.text[found.text.index("One target in one frame") : found.text.index("Target:")]
+    verdict = found.text[found.text.index("Standard uncertainty (k = 1) of one target in one frame") : found.text.index("Target:")]
     assert "µm" not in verdict
 
 

@@ -93,7 +93,7 @@ def test_what_cannot_be_rendered_is_refused(bad) -> None:
 @pytest.mark.parametrize(
     ("record", "words"),
     [
-        ({}, "shows nothing"),
+        ({}, "is empty"),
         ({"uniform": {"level_photons": -1}}, "level_photons"),
         ({"uniform": {"level": 1}}, "level_photons"),
         ({"discs": {"x_px": [1.0]}}, "differ in number"),

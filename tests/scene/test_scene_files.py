@@ -116,7 +116,7 @@ DISC = {"targets": [{"kind": "disc", "x_px": 20.3, "y_px": 18.7, "diameter_px": 
             "contrast",
         ),
         ({**DISC, "photon_transfer": {"brightest_photons": 10}}, "has no targets"),
-        ({"motion": {"velocity_px_per_s": [1, 1]}}, "shows nothing"),
+        ({"motion": {"velocity_px_per_s": [1, 1]}}, "is empty"),
     ],
     ids=str,
 )

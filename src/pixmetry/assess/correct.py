@@ -49,7 +49,7 @@ def correct_signal(camera: Camera, signal: Signal, maps: Mapping[str, np.ndarray
     for element in reversed(camera.active):  # the last error is taken out first
         source = element.source
         if source.stage in NOT_THE_CAMERA:
-            done[element.name] = "not corrected: the light and lens of the campaign are not those of these frames"
+            done[element.name] = "not corrected: these frames have another light and lens than the campaign"
         elif source.correct is None:
             done[element.name] = f"not corrected: {source.reasons['correct']}"
         else:
@@ -97,7 +97,7 @@ class Correction:
 
     def __repr__(self) -> str:
         done = [name for name, text in self.sources.items() if text.startswith("corrected")]
-        return f"<Correction of {', '.join(done) or 'nothing'}; {len(self.sources) - len(done)} sources left as they are>"
+        return f"<Correction of {', '.join(done) or 'nothing'}; {len(self.sources) - len(done)} sources not corrected>"
 
 
 def correct(
@@ -163,7 +163,7 @@ def _correct_array(frames: np.ndarray, bits: int, camera: Camera, maps: Mapping[
         raise InputError("no frames of stored codes", where="frames", value=f"{frames.dtype} of shape {frames.shape}", allowed=allowed)
     top = 2**bits - 1
     if stack.size and (int(stack.min()) < 0 or int(stack.max()) > top):
-        raise InputError("values that this camera does not store", where="frames", value=int(stack.max()), allowed=f"0 to {top}")
+        raise InputError("values that this camera cannot store", where="frames", value=int(stack.max()), allowed=f"0 to {top}")
     stack = stack.astype(np.uint8 if bits <= 8 else np.uint16)
     done: dict[str, list[str]] = {}
     out = np.empty(stack.shape, np.float32)
@@ -237,7 +237,7 @@ def _load(results: Path) -> tuple[int, Camera, dict[str, np.ndarray]]:
             raise InputError(f"{name} is missing beside the results", where=str(results.parent), remedy="assess the camera again")
         if name not in digests:
             remedy = "assess the camera again"
-            raise InputError(f"the results do not tell the digest of {name}", where=str(results), remedy=remedy)
+            raise InputError(f"the results contain no digest of {name}", where=str(results), remedy=remedy)
         check_file(path, digests)
     try:
         bits = int(record["camera"]["bits"])

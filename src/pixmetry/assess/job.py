@@ -188,7 +188,7 @@ def _window_of(campaign: Campaign) -> tuple[str, ...]:
         return ()
     at = "" if facts.first_col is None else f" from column {facts.first_col}, row {facts.first_row}"
     whole = f"{cols} × {rows} pixels{at} of a sensor of {facts.sensor_cols} × {facts.sensor_rows}"
-    rest = "measured values hold for these pixels; what is accepted at a bound is taken for the whole sensor"
+    rest = "measured values hold for these pixels; accepted bounds hold for the whole sensor"
     return (f"The frames show {whole}: {rest}.",)
 
 
@@ -199,7 +199,7 @@ def _other_frames(calibration: Path, campaign: Campaign) -> tuple[str, ...]:
         return ()
     sizes = f"{cols} × {rows} pixels, the frames have {campaign.frame_shape[1]} × {campaign.frame_shape[0]}"
     which = "" if campaign.camera.first_col is not None else " (sensor_cols, sensor_rows, first_col, first_row in the manifest say which)"
-    holds = f"it holds for a window of that camera's frames{which}, not for another camera or binned pixels"
+    holds = f"it can be used for a window of that camera's frames{which}, not for another camera or for binned pixels"
     return (f"The calibration is of {sizes}: {holds}.",)
 
 
@@ -315,7 +315,7 @@ def without_noise(
     """Leave out what equal dark frames cannot tell: patterns that only noise carries over the rounding; all noise, where black clips."""
     level = equal_dark_dn(observations)
     gone = () if level is None else NEED_DITHER if level > 0 else NEED_NOISE
-    why = "all dark frames are equal: they hold no noise"
+    why = "all dark frames are equal: they contain no noise"
     return {k: v for k, v in estimates.items() if k not in gone}, unmeasured | dict.fromkeys(gone, why)
 
 

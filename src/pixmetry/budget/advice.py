@@ -30,7 +30,7 @@ def advise(
 def _advice(row: BudgetRow, combined_px: float) -> Advice:
     text = get_source(row.source_id).advice
     if row.status == "accepted":
-        text = f"Not measured: taken at the largest to expect. {text}"
+        text = f"Not measured: taken at the largest value to be expected of a sound camera. {text}"
     removed = row.without_px
     halved = float(np.sqrt(removed**2 + 0.25 * (combined_px**2 - removed**2)))
     return Advice(row.name, row.source_id, row.title, row.status, text, row.total_px, combined_px, removed, halved)

@@ -88,7 +88,7 @@ def headline(
     held = [r for r in rows if r.monte_carlo is not None]
     by_formula = combine((r.part for r in held), signed=True).total_px
     if together is None or not held:
-        why = "The sum of the contributions; no Monte Carlo was made."
+        why = "The sum of the contributions; there is no Monte Carlo."
         return Headline(SUM, sums[0].total_px, float("nan"), float("nan"), 0.0, why), sums
     error, u_sum = _error(together, held), _model_error(held)
     found = Headline(SUM, by_formula, together.total_px, error, u_sum, "")
@@ -97,7 +97,7 @@ def headline(
         why = f"The sum of the contributions: in {together.lost} of {together.trials} windows of the Monte Carlo no target was found."
         return replace(found, why=why), sums
     if abs(difference) <= allowed:
-        why = "The sum of the contributions; one Monte Carlo with all of them at once agrees with it within their errors."
+        why = "The sum of the contributions. One Monte Carlo with all sources at once agrees with it within the errors of both."
         return replace(found, why=why), sums
     others = [r for r in rows if r.monte_carlo is None]
     drifting = [r.monte_carlo for r in held if r.part.gum_class in UNSTEADY and np.isfinite(r.monte_carlo.total_px)]
@@ -142,12 +142,12 @@ def _why(found: Headline, rows: Sequence[BudgetRow], in_chain: Callable[[str], M
     more = "larger" if found.sum_px > found.simulated_px else "smaller"
     text = (
         f"By one Monte Carlo with all sources at once: {found.simulated_px:.2g} ± {found.se_simulated_px:.1g} px. The sum of the "
-        f"contributions, {found.sum_px:.2g} px, is {more} by more than the errors of the two, because sources act on each other"
+        f"contributions, {found.sum_px:.2g} px, is {more} by more than the errors of both, because sources interact"
     )
     difference = found.simulated_px**2 - found.sum_px**2
     tried = sorted(rows, key=lambda r: -r.total_px)[:ASKED]
     real = [(r, in_chain(r.name).total_px if r.source_id != ESTIMATOR_ITSELF else r.monte_carlo.total_px) for r in tried]
     row, in_px = max(real, key=lambda p: (p[1] ** 2 - p[0].total_px ** 2) * np.sign(difference))
     if np.isfinite(in_px) and (in_px**2 - row.total_px**2) / difference > MAIN_PART:
-        return f"{text}: {row.title.lower()} alone would be {row.total_px:.2g} px, in the whole chain it is {in_px:.2g} px."
-    return f"{text}; no single source makes most of the difference."
+        return f"{text}: {row.title.lower()} alone is {row.total_px:.2g} px, in the whole chain {in_px:.2g} px."
+    return f"{text}; no single source causes most of the difference."

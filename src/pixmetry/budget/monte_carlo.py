@@ -82,7 +82,7 @@ class MonteCarlo:
             self.x.bias,
             self.y.bias,
             floor_px=2 * self.se_total_px,
-            method="Monte Carlo: the camera's chain with it and without, a target at rest",
+            method="Monte Carlo: the camera's chain with the source and without, a target at rest",
             # of frames that differ by turns (fields), the scatter within a pair is twice that of all
             time_px=(min(self.x.temporal, self.x.u), min(self.y.temporal, self.y.u)),
             smooth_px=(smooth[0], smooth[1]),

@@ -136,7 +136,7 @@ def facts_of(camera: Camera, target: Target, known: Mapping[str, Any] | None = N
     known = dict(known or {})
     unknown = set(known) - {f.name for f in fields(Facts)}
     if unknown:
-        raise InputError("not a fact that a budget uses", value=sorted(unknown), allowed=", ".join(f.name for f in fields(Facts)))
+        raise InputError("not a fact that the budget uses", value=sorted(unknown), allowed=", ".join(f.name for f in fields(Facts)))
     bits = known.get("bits") or _parameter(camera, "bits") or camera.facts.get("bits") or 8
     slope, given = _response(camera), known.get("gain_dn_per_e")
     gain_in_faint_light = float(given or slope / _electrons_per_photon(camera))
@@ -204,7 +204,7 @@ def curve_of(camera: Camera, saturation_dn: float) -> Curve | None:
     while above_black(light) < saturation_dn:
         light *= 2.0
         if light > 1e30:
-            raise InputError("no light saturates the camera", where=camera.name, value=saturation_dn, remedy="check its chain")
+            raise InputError("no level of light saturates the camera", where=camera.name, value=saturation_dn, remedy="check its chain")
     if abs(above_black(1e-3 * light) / above_black(light) / 1e-3 - 1) < STRAIGHT:
         return None
     from scipy.interpolate import PchipInterpolator
@@ -572,7 +572,7 @@ def _response(camera: Camera) -> float:
     level = 1000.0
     out = [float(bare.expose(Uniform(v), window=(0, 0, 1, 1), quiet=True).data[0, 0, 0]) for v in (0.0, level)]
     if not out[1] > out[0]:
-        raise InputError("the camera does not answer to light", where=camera.name, remedy="check its chain")
+        raise InputError("the camera does not respond to light", where=camera.name, remedy="check its chain")
     return (out[1] - out[0]) / level
 
 
@@ -583,7 +583,7 @@ def _saturation(camera: Camera, gain_dn_per_e: float, bits: int) -> float:
     if converters or "bits" in camera.facts:
         limits.append(2**bits - 1 - max(0.0, sum(getattr(e.params, "offset_dn", 0.0) for e in converters)))
     if not limits:
-        raise InputError("the camera does not tell where it saturates", where=camera.name, remedy="give saturation_dn among the facts")
+        raise InputError("the saturation of the camera is not known", where=camera.name, remedy="give saturation_dn among the facts")
     return float(min(limits))
 
 

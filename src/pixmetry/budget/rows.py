@@ -23,7 +23,7 @@ from pixmetry.camera.source import Source
 from pixmetry.core.errors import InputError
 from pixmetry.core.number import Estimates
 
-CALIBRATED = "in front of the pixels: frames without targets do not carry it; a calibration with targets does"
+CALIBRATED = "in front of the pixels: frames without targets do not show it; a calibration with targets does"
 FEW, MORE, FEW_UNITS = 256, 1024, 4  # windows and cameras for a source without a formula: more where few leave too much open
 SMALL = 0.05  # of the total with it: what its standard error may be before more are drawn
 
@@ -126,14 +126,14 @@ def _with_status(row: BudgetRow, source: Source, known: Known) -> BudgetRow:
 
 
 def _beyond(source: Source, known: Known) -> str:
-    """Why a camera of which nothing says that it has this source has it not; empty where it may."""
+    """Why a camera does not have this source, if nothing says that it has; empty if it may have it."""
     if source.option:
         return f"only in a camera with {source.option}"
     if source.stage == "storage" and known.camera.facts.get("lossless"):
         return "only in frames that were stored with loss; these were not"
     if source.held_by and all(known.estimates_of(h) is not None for h in source.held_by):
         where = ", ".join(catalogue()[h].title for h in source.held_by)
-        return f"what of it is in these frames was measured, and counts, as: {where}"
+        return f"its part in these frames was measured, and counts, as: {where}"
     return ""
 
 
@@ -145,19 +145,19 @@ def _with_formula(row: BudgetRow, source: Source, known: Known, probes: Probes) 
         probe = replace(probe, frame_shape=known.sensor_shape) if known.sensor_shape != known.camera.frame_shape else probe
     contribution = source.propagate(params, probe)
     if not np.isfinite(contribution.total_px):
-        return replace(row, reason="no target is found behind it")
+        return replace(row, reason="no target is found after this source")
     measured = known.estimates_of(row.name)
     u = 0.0 if measured is None else u_of_total(source, params, measured, probe)
     return replace(row, contribution=contribution, u_of_total_px=u)
 
 
 def _calibrated(name: str, source: Source, geometry: CameraGeometry) -> BudgetRow:
-    """What a calibration leaves, in the row of the lens; the other sources that it takes up are in there."""
+    """The remaining error after a calibration, in the row of the lens; the other sources that it includes point to that row."""
     head = BudgetRow(name, source.id, source.title, "calibrated")
     if source.id != LENS:
-        return replace(head, reason=f"taken up by the {geometry.origin}; what is left stands in the row of {catalogue()[LENS].title}")
+        return replace(head, reason=f"included in the {geometry.origin}; the remaining error is in the row of {catalogue()[LENS].title}")
     u_x, u_y = np.hypot(geometry.u_x_px, geometry.left_x_px), np.hypot(geometry.u_y_px, geometry.left_y_px)
-    method = f"what the {geometry.origin} leaves: the uncertainty of a corrected place over the frame, and systematic residuals"
+    method = f"remaining error after the {geometry.origin}: uncertainty of a corrected position over the frame, and systematic residuals"
     # no further calibration takes it up: nothing of it counts as smooth
     found = Contribution(float(u_x), float(u_y), "G", model_error=0.2, method=method, smooth_px=(0.0, 0.0))
     return replace(head, contribution=found, reason=method)
@@ -167,7 +167,7 @@ def _calibrated(name: str, source: Source, geometry: CameraGeometry) -> BudgetRo
 
 
 def without_accepted(rows: Sequence[BudgetRow], camera: Camera) -> Camera:
-    """The camera that the verdict is of: without what stands in the chain and is only accepted."""
+    """The camera of the verdict: its chain without the sources that are only accepted."""
     return missed(camera, [r.name for r in rows if r.status == "accepted" and r.in_camera])
 
 
@@ -217,23 +217,23 @@ def in_place_of_formulas(rows: Sequence[BudgetRow], known: Known, design: Trials
 
 
 def _needs_no_simulation(row: BudgetRow) -> bool:
-    """Whether it cannot stand in a camera, or be left out of one, so that nothing shows what it does."""
+    """Whether a source cannot be put into a camera or left out of one, so that no simulation shows its effect."""
     source = catalogue_source(row)
     return source.forward is None or source.essential and source.ideal is None
 
 
 def _drawn(row: BudgetRow, found: MonteCarlo, element: Element) -> BudgetRow:
-    """The row with what a Monte Carlo found as its contribution, if it has none."""
+    """The row with the result of a Monte Carlo as its contribution, if it has none."""
     if row.contribution is not None:
         return row
     contribution = found.contribution(element.source.gum_class)
     if contribution is None:
-        return replace(row, reason="Monte Carlo: no target was found behind it")
+        return replace(row, reason="Monte Carlo: no target was found after this source")
     return replace(row, contribution=contribution, reason=row.reason if row.status == "accepted" else contribution.method)
 
 
 def interaction_of(rows: Sequence[BudgetRow], design: Trials) -> Interaction:
-    """Everything at once beside everything alone, both by Monte Carlo."""
+    """All sources at once compared with each source alone, both by Monte Carlo."""
     alone = [r.monte_carlo for r in rows if r.monte_carlo is not None]
     square, varies = 0.0, 0.0  # biases add with their signs
     for axes in ([m.x for m in alone], [m.y for m in alone]):

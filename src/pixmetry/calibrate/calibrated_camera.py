@@ -70,7 +70,7 @@ def calibrated_geometry(
     names = [m.name for m in models]
     if camera is None and len(names) > 1 or camera is not None and camera not in names:
         remedy = "name it from Python: assess(…, calibration=calibrated_geometry(file, NAME))"
-        raise InputError("which camera of the calibration is not clear", value=camera, allowed=", ".join(names), remedy=remedy)
+        raise InputError("the calibration has several cameras", value=camera, allowed=", ".join(names), remedy=remedy)
     k = 0 if camera is None else names.index(camera)
     record, grid = (calibration.tests.residuals or {}).get(names[k]), (calibration.tests.projection or {}).get(names[k])
     if record is None or grid is None or not record.n:
@@ -82,7 +82,7 @@ def calibrated_geometry(
     model, (estimated, covariance) = models[k], covariances[k]
     if sensor.pitch_x_um is None:
         if pitch_um is None:
-            remedy = "calibrate with pitch_um, or say in the campaign what the pitch of its camera is"
+            remedy = "calibrate with pitch_um, or state the pitch in the campaign"
             raise InputError("a calibration in pixels, and the pixel pitch is not known", where=model.name, remedy=remedy)
         model, covariance = with_pitch(model, estimated, covariance, pitch_um)
     return geometry_of(model, estimated, covariance, dof=dof, u_px=(u, u), left_px=left, origin=origin)
@@ -149,7 +149,7 @@ def geometry_of(
         raise InputError("the pixel pitch is not known", where=model.name, remedy="calibrate with pitch_um, so that lengths are in mm")
     values, largest = _fitted(model)
     if not largest < LARGEST_PX:
-        what = "the sources' lens (K1 to K3, P1, P2, affinity and shear) cannot hold this model"
+        what = "the lens of a camera file (K1 to K3, P1, P2, affinity and shear) cannot represent this model"
         raise InputError(what, where=model.name, value=f"up to {largest:.2g} px apart", allowed=f"up to {LARGEST_PX} px")
     slopes = np.zeros((len(FITTED), len(names)))
     for j, name in enumerate(names):

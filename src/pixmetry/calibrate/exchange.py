@@ -217,7 +217,7 @@ def model_of_opencv(
     if len(lens) not in (0, 4, 5, 8, 12, 14) or not np.isfinite(lens).all():
         raise InputError("not OpenCV's coefficients", where=where, value=lens.tolist(), allowed="0, 4, 5, 8, 12 or 14 numbers")
     if lens[5:].any():
-        what = "a rational, thin-prism or tilted model, which would be lost"
+        what = "a rational, thin-prism or tilted model, which pixmetry cannot represent"
         raise InputError(what, where=where, value=lens[5:].tolist(), allowed="k1, k2, p1, p2, k3; the others 0")
     d[: min(len(lens), 5)] = lens[:5]
     mx, my = (1.0, 1.0) if pitch_um is None else (pitch_um[0] / 1000, pitch_um[1] / 1000)
@@ -247,7 +247,7 @@ def colmap_line(model: CameraModel, camera_id: int = 1, kind: str = "FULL_OPENCV
         If there is no such kind, or more would be lost.
     """
     if kind not in COLMAP:
-        raise InputError("no such camera model of COLMAP here", where="kind", value=kind, allowed=", ".join(COLMAP))
+        raise InputError("no such camera model of COLMAP", where="kind", value=kind, allowed=", ".join(COLMAP))
     form = _held(model, ("c", "xp", "yp", *COLMAP[kind]), tolerance_px, f"COLMAP's {kind}")
     fx, _, fy, cx, cy = vision_values(form)
     if "b1" not in COLMAP[kind] and abs(fx - fy) * max(form.sensor.cols, form.sensor.rows) > EXACT_PX * fy:
@@ -273,7 +273,7 @@ def model_of_colmap(line: str, pitch_um: tuple[float, float] | None = None) -> C
     except (IndexError, ValueError):
         raise InputError("not a line of cameras.txt", where="COLMAP", value=line, allowed="CAMERA_ID MODEL WIDTH HEIGHT PARAMS…") from None
     if kind not in counts:
-        raise InputError("a camera model that would be lost here", where="COLMAP", value=kind, allowed=", ".join(counts))
+        raise InputError("a camera model that pixmetry cannot represent", where="COLMAP", value=kind, allowed=", ".join(counts))
     if len(q) != counts[kind]:
         raise InputError(f"{kind} has {counts[kind]} parameters", where="COLMAP", value=len(q))
     if "b1" not in COLMAP[kind]:

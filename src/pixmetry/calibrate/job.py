@@ -152,7 +152,7 @@ def _from_lines(
         seen.x_px, seen.y_px, seen.line, seen.image, model.sensor, free=wanted, u_px=seen.covariance_px2, start=model, **settings
     )
     told = tuple(
-        Finding("camera_file", f"No camera.yaml is written for '{name}': straight lines do not tell the principal distance.", advice)
+        Finding("camera_file", f"No camera.yaml is written for '{name}': straight lines do not determine the principal distance.", advice)
         for name, advice in ((model.name, "Calibrate with a test field; its project can start from this calibration.json."),)
         if name in project.presets
     )
@@ -182,8 +182,8 @@ def _camera_files(calibration: Calibration, project: Project | None) -> tuple[di
         try:
             changed = stored_grid(preset).changed
             if changed:
-                what = f"the calibrated pixels are not those of the sensor, for {changed}"
-                remedy = "use calibration.json as it is: the lens of a camera file stands before the grabber, on the sensor's pixels"
+                what = f"the calibrated pixels are not those of the sensor: {changed}"
+                remedy = "use calibration.json directly: the lens of a camera file comes before the grabber, on the sensor's pixels"
                 raise InputError(what, remedy=remedy)
             if file in made:
                 raise InputError(f"{file} is the name of two files", remedy="give the cameras names that differ in letters and digits")
@@ -218,7 +218,7 @@ def _project(source: str | Path | Sequence[str | Path], pictures: Mapping[str, A
     if projects and len(sources) > 1:
         raise InputError("a project among other files", where=str(projects[0]), allowed="one project, or pictures", remedy="name it alone")
     if projects:
-        _refuse_pictures(pictures, "a project file, which says it itself")
+        _refuse_pictures(pictures, "a project file, which states it itself")
         return load_project(projects[0], progress)
     keys = (*PICTURE_KEYS, *CAMERA_KEYS)
     unknown = next((name for name in pictures if name not in keys), None)
@@ -255,7 +255,7 @@ def _changed(network: Network, free: Sequence[str] | str | None, per_image: Sequ
         wanted = _checked(free, NAMES, "free")
         held = next((model.name for model in network.cameras if "c" not in wanted and not model["c"] > 0), None)
         if held is not None:
-            what, remedy = f"c of camera '{held}' is to be held, but has no value", "give c_mm or c_px, or add c"
+            what, remedy = f"c of camera '{held}' is held fixed, but has no value", "give c_mm or c_px, or add c"
             raise InputError(what, where="free", value=", ".join(wanted), remedy=remedy)
         mask = np.isin(NAMES, wanted)
         network = replace(network, cameras=tuple(replace(model, free=mask.copy()) for model in network.cameras))

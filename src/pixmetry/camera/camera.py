@@ -206,7 +206,7 @@ class Camera:
         """
         wanted: Sequence[int] = range(frames) if isinstance(frames, int | np.integer) else frames
         if not len(wanted):
-            raise InputError("no frame is asked for", remedy="give a number of frames of at least 1")
+            raise InputError("the number of frames is not positive", remedy="give a number of frames of at least 1")
         rows, cols = self.output_shape if window is None else window[2:]
         _check_size(self.name, rows, cols, len(wanted))
         numbers = [int(f) for f in wanted]
@@ -639,7 +639,9 @@ def build_camera(record: Mapping[str, Any], where: str = "camera", folder: str |
     measured = None
     if wanted:
         if checked.measured is None:
-            raise InputError("maps of no unit", where=where, remedy="write `measured:` with unit_seed, rows and cols, or delete `maps:`")
+            raise InputError(
+                "maps without a unit", where=where, remedy="write `measured:` with unit_seed, rows and cols, or delete `maps:`"
+            )
         if folder is None or checked.measured.file is None:
             raise InputError("the measured maps of this camera are not given", where=where, remedy="load the camera from its file")
         measured = MeasuredUnit(checked.measured.unit_seed, (checked.measured.rows, checked.measured.cols))

@@ -95,7 +95,7 @@ def get_source(source_id: str, where: str = "") -> Source:
         f"no error source is called {source_id!r}",
         where=where,
         allowed=", ".join(near or sources),
-        remedy="`pixmetry sources` lists them all; one of your own needs `pixmetry --source-file FILE` before the command",
+        remedy="`pixmetry sources` lists all; for a source of your own add `--source-file FILE` before the command",
     )
 
 

@@ -98,7 +98,7 @@ def _check_bits(chain: Sequence[Element], where: str) -> None:
             converter = element
         elif converter is not None and bits < converter.params.bits:
             raise ChainError(
-                f"{element.name} takes codes of fewer bits than {converter.name} makes",
+                f"{element.name} takes fewer bits than {converter.name} makes",
                 value=bits,
                 allowed=f"{converter.params.bits} or more",
                 where=where,

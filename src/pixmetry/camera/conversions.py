@@ -168,11 +168,11 @@ def _conversion(id: str, title: str, consumes: Kind, produces: Kind, forward: An
     )
 
 
-LOOK = _conversion("core.look", "pixels look at the scene", Kind.LIGHT, Kind.PHOTONS, _look)
-HOLD = _conversion("core.hold", "pixels are held on the line", Kind.DN, Kind.VIDEO, _hold)
+LOOK = _conversion("core.look", "pixels sample the scene", Kind.LIGHT, Kind.PHOTONS, _look)
+HOLD = _conversion("core.hold", "pixels are held on the video line", Kind.DN, Kind.VIDEO, _hold)
 SAMPLE = _conversion(
     "core.sample",
-    "the line is sampled",
+    "the video line is sampled",
     Kind.VIDEO,
     Kind.DN,
     _sample,

@@ -61,14 +61,14 @@ def settled_state(element: Link, signal: Signal, stream: Any, most: int = 400) -
     try:
         np.asarray(state, float)
     except TypeError:
-        raise InputError(f"{element.name} has no state that it settles to", remedy="switch it off: it needs whole sequences") from None
+        raise InputError(f"{element.name} has no steady state", remedy="switch it off: it needs whole sequences") from None
     for _ in range(most):
         _, following = source.forward(element.params, signal, stream, state)
         change = np.max(np.abs(np.asarray(following, float) - np.asarray(state, float)))
         state = following
         if change <= 1e-7 * np.max(np.abs(np.asarray(state, float))):
             return state
-    raise InputError(f"{element.name} does not settle on the background", remedy="check its parameters, or use mode='exact'")
+    raise InputError(f"{element.name} reaches no steady state on the background", remedy="check its parameters, or use mode='exact'")
 
 
 def one_value(name: str, value: Any) -> Any:

@@ -91,5 +91,5 @@ def ramp_contribution(factor: Callable[[np.ndarray, np.ndarray], np.ndarray], pr
     y, x = np.meshgrid(even * probe.frame_shape[0] - 0.5, even * probe.frame_shape[1] - 0.5, indexing="ij")
     right, left, down, up = (np.log(factor(x + dx, y + dy)) for dx, dy in ((0.5, 0), (-0.5, 0), (0, 0.5), (0, -0.5)))
     gx, gy = (right - left).ravel()[:, None], (down - up).ravel()[:, None]
-    method = "linear response of the estimator to the relative gradient, at places all over the frame"
+    method = "linear response of the estimator to the relative gradient, at positions all over the frame"
     return probe.from_shifts(gx * xx + gy * xy, gx * yx + gy * yy, "G", model_error=0.15, method=method)

@@ -277,7 +277,7 @@ class Light:
             return np.ascontiguousarray(self.scene.photons(self.grid, self.frame_shape, self.exposure_s, self.time_s), np.float32)
         if not hasattr(self.scene, "radiance"):
             raise InputError(
-                f"the scene {type(self.scene).__name__} cannot be seen through optics",
+                f"the scene {type(self.scene).__name__} cannot be imaged through optics",
                 allowed="scenes that give their light at any point (`radiance`)",
                 remedy="switch the camera's optical sources off, or take another scene",
             )

@@ -347,7 +347,7 @@ def response(filters: tuple[tuple[bytes, bytes], ...], pixel_hz: float, integrat
     rate = float(np.linalg.norm(a, 2)) if k else 0.0
     nodes = 1 << max(6, int(np.ceil(np.log2(max(NODES_PER_RATE * rate, 1.0)))))
     if nodes > MOST_NODES:
-        raise ParameterError("a filter is faster than a thousandth of a pixel", where="line", remedy="leave it out: it does nothing")
+        raise ParameterError("a filter is faster than a thousandth of a pixel", where="line", remedy="leave it out: it has no effect")
     powers = np.eye(k + 1)[None]
     while len(powers) < nodes:
         powers = np.concatenate([powers, powers @ expm(m * (len(powers) / nodes))])

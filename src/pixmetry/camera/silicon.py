@@ -44,5 +44,5 @@ def absorption_per_cm(wavelength_nm: np.ndarray | float) -> np.ndarray:
     """
     wavelength = np.asarray(wavelength_nm, float)
     if not ((wavelength >= FIRST_NM) & (wavelength <= LAST_NM)).all():
-        raise ParameterError("no absorption of silicon is known at this wavelength", value=wavelength_nm, allowed="300 nm to 1200 nm")
+        raise ParameterError("the absorption of silicon at this wavelength is not known", value=wavelength_nm, allowed="300 nm to 1200 nm")
     return absorption_per_um(wavelength) * 1e4

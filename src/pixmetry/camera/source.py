@@ -212,7 +212,7 @@ def cut_map(maps: Mapping[str, np.ndarray], name: str, signal: Signal) -> np.nda
         )
     if maps[name].shape != tuple(signal.frame_shape):
         raise InputError(
-            f"the map {name!r} is of another frame size",
+            f"the map {name!r} has another frame size",
             value=maps[name].shape,
             allowed=str(signal.frame_shape),
             remedy="use maps of this camera",

@@ -81,7 +81,7 @@ def read_unit_maps(path: Path, wanted: Mapping[str, Mapping[str, str]]) -> dict[
     InputError
         If the file is missing or damaged, or holds other maps.
     """
-    remedy = "copy it from where the camera file comes from, or assess the camera again"
+    remedy = "copy it from the folder of the original camera file, or assess the camera again"
     try:
         with np.load(path, allow_pickle=False) as stored:
             found = {name: {key: stored[f"{name}/{key}"] for key in maps} for name, maps in wanted.items()}
@@ -92,7 +92,7 @@ def read_unit_maps(path: Path, wanted: Mapping[str, Mapping[str, str]]) -> dict[
     for name, maps in wanted.items():
         for key, told in maps.items():
             if digest(found[name][key]) != told:
-                raise InputError(f"the map {key} of {name} is not the one that the camera file names", where=str(path), remedy=remedy)
+                raise InputError(f"the map {key} of {name} is not the one named in the camera file", where=str(path), remedy=remedy)
     return found
 
 
@@ -105,7 +105,7 @@ def check_frame(measured: MeasuredUnit, frame_shape: tuple[int, int], where: str
     """
     if tuple(frame_shape) != tuple(measured.frame_shape):
         raise InputError(
-            "this unit's maps are of another frame size",
+            "the maps of this unit have another frame size",
             where=where,
             value=f"{frame_shape[0]} × {frame_shape[1]}",
             allowed=f"{measured.frame_shape[0]} × {measured.frame_shape[1]} rows and columns",

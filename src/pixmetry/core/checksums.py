@@ -63,7 +63,7 @@ def check_record(record: Mapping[str, Any], where: str) -> dict[str, str]:
     except (KeyError, TypeError, AttributeError):
         same = False
     if not same:
-        raise InputError("damaged: its content is not what was written", where=where, remedy=REMEDY)
+        raise InputError("damaged: its content has changed since it was written", where=where, remedy=REMEDY)
     return files
 
 
@@ -88,7 +88,7 @@ def check_file(path: str | Path, digests: Mapping[str, str] | None = None) -> No
     except OSError as problem:
         raise InputError("file cannot be read", where=str(path), value=problem.strerror, remedy="check the path") from None
     if not same:
-        raise InputError("damaged: its content is not what was written", where=str(path), remedy=REMEDY)
+        raise InputError("damaged: its content has changed since it was written", where=str(path), remedy=REMEDY)
 
 
 def _digests_beside(path: Path) -> dict[str, str]:

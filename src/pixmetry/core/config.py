@@ -186,7 +186,7 @@ def _explain(
         return _unknown_key(str(loc[-1]), name, _keys_at(model, loc[:-1]), where)
     if kind == "invalid_key":
         remedy = f"put quotes around it; if a decimal comma stands before it, write a point: 0.{error['input']}"
-        return InputError("a key that is no text", where=where, value=error["input"], allowed="a text", remedy=remedy)
+        return InputError("a key that is not a text", where=where, value=error["input"], allowed="a text", remedy=remedy)
     if kind == "missing":
         return InputError(f"'{name}' is missing", where=where, remedy=f"add `{loc[-1]}: ...`")
     if kind == "finite_number":

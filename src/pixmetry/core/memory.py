@@ -49,7 +49,7 @@ def check_memory(needed_bytes: float, what: str, *, where: str = "", remedy: str
         return
     available = available_bytes()
     if needed_bytes > available:
-        allowed = f"up to {_size(available)}, the memory that is free now"
+        allowed = f"up to {_size(available)}, the free memory"
         raise InputError(f"{what} needs {_size(needed_bytes)} of memory", where=where, allowed=allowed, remedy=remedy)
 
 

@@ -72,7 +72,7 @@ def fit_dark_temperature(
     chi2 = float((((y - model) / s) ** 2).sum())
     if chi2 > nu * (1 - 2 / (9 * nu) + CONTRADICTION_Z * math.sqrt(2 / (9 * nu))) ** 3:  # Wilson & Hilferty 1931
         covariance, dof = covariance * chi2 / nu, float(nu)
-        reason = f"the currents scatter about the law by {math.sqrt(chi2 / nu):.2g} times their u, so that u is widened by that"
+        reason = f"the currents scatter about the law by {math.sqrt(chi2 / nu):.2g} times their u; u was multiplied by this factor"
     if growth < RESOLVED * math.sqrt(covariance[1, 1]):
         raise MeasureError(
             "the dark current does not grow with temperature by more than its uncertainty",
@@ -100,7 +100,9 @@ def _checked(temperature_c: np.ndarray, dark_current: np.ndarray, u: np.ndarray)
     if not (t.ndim == 1 and t.shape == y.shape == s.shape):
         raise InputError("temperatures, currents and u differ in shape", where=WHERE, value=(t.shape, y.shape, s.shape))
     if not (np.isfinite(t) & np.isfinite(y) & np.isfinite(s) & (s > 0)).all():
-        raise InputError("not finite, or an uncertainty that is not above zero", where=WHERE, remedy="leave out what was not measured")
+        raise InputError(
+            "not finite, or an uncertainty that is not above zero", where=WHERE, remedy="leave out values that were not measured"
+        )
     check_temperatures(t)
     return t, y, s
 
@@ -120,11 +122,11 @@ def check_temperatures(temperature_c: np.ndarray) -> None:
             where=WHERE,
             value=different,
             allowed=f"{MINIMUM_TEMPERATURES} or more",
-            remedy="measure at one temperature more, with the sensor's temperature settled",
+            remedy="measure at another temperature, when the sensor's temperature is stable",
         )
     if np.ptp(temperature_c) < MINIMUM_RANGE_K:
         raise MeasureError(
-            "the temperatures lie too near to each other",
+            "the temperatures are too close to each other",
             where=WHERE,
             value=f"{np.ptp(temperature_c):.3g} K",
             allowed=f"{MINIMUM_RANGE_K:g} K or more from the lowest to the highest",

@@ -163,7 +163,9 @@ def bootstrap_u(m: Measurement, release: str, draws: int = 2000) -> dict[str, fl
         dark, bright = formulas.vectors
         if formulas.stacks is not None:
             if m.dark_products is None or m.bright_products is None:
-                raise InputError("no products of the frames of a stack", where="bootstrap", remedy="make them with emva.frame_products")
+                raise InputError(
+                    "the products of the frames of a stack are missing", where="bootstrap", remedy="make them with emva.frame_products"
+                )
             dark = formulas.stacks[0].bootstrap(m.dark_products, draws, rng)
             bright = formulas.stacks[1].bootstrap(m.bright_products, draws, rng)
         series = bootstrap_series(scatter, draws, rng)

@@ -45,7 +45,7 @@ class Formulas:
             stacks, missing["spatial"] = None, str(problem)
         series = series_of(m)
         if light_of(series) is None:
-            missing["general"] = "neither photons nor exposure tell the light of the levels"
+            missing["general"] = "neither photons nor exposure times give the light of the levels"
         return cls(release, series, m.pixel_area_um2, stacks, missing, is_curved(series))
 
     @cached_property

@@ -173,7 +173,7 @@ def measure_campaign(
     if bayer is not None and facts.cfa not in (None, bayer):
         notes.append(f"the colour filter is taken as {bayer}, not {facts.cfa} as stated")
     if cfa is not None and (rows % 2 or cols % 2):
-        notes.append(f"frames of {cols} x {rows} pixels hold no whole number of colour cells: the last row or column is left out")
+        notes.append(f"frames of {cols} x {rows} pixels do not contain a whole number of colour cells: the last row or column is left out")
     found = tuple(replace(m, notes=(*notes, *m.notes)) for m in found)
     return (tuple(_with_products(m, reader, cfa) for m in found) if products else found), reader.hashes
 
@@ -237,7 +237,10 @@ def _results(m: Measurement, release: str, bootstrap: int) -> Results:
             # what the method says of the value stays, what it says of the other u does not
             method = "; ".join(part for part in (*values[key].method.split("; "), text) if not part.startswith("u by Monte"))
             values[key] = replace(values[key], u=u, dof=dof, method=method)
-    note = f"u by a bootstrap over frames and levels, {bootstrap} draws; values with the non-linearity in account keep the u of their fit"
+    note = (
+        f"u by a bootstrap over frames and levels, {bootstrap} draws; values with the non-linearity taken into account keep the u of "
+        "their fit"
+    )
     return replace(found, values=values, notes=(*found.notes, note))
 
 

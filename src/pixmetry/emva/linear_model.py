@@ -15,7 +15,7 @@ from pixmetry.emva.temporal import dark_line
 HOLDS, FAILS, OPEN, UNKNOWN, CURVED = "holds", "fails", "open", "unknown", "curved"
 REASON = (
     "the photon transfer is not that of a linear camera: the temporal variance does not grow with the signal, as with a logarithmic "
-    "response or gamma; use the General values, which need no linear camera"
+    "response or gamma; use the General values, which do not need a linear camera"
 )
 LEAST_LEVELS = 4  # a line, and what is left of it
 TELLING_LEVELS = 8  # with fewer, the scatter about a line is not known well enough to say much

@@ -49,7 +49,7 @@ def with_lower_limits(values: dict[str, Number], case: Case) -> dict[str, Number
     if general_early and not reference:
         out |= _last_light(out, case)
     for key in filter(out.get, (*(OF_ITS_RANGE if early else ()), *(("general_PRNU",) if general_early else ()))):
-        out[key] = _told(out[key], "its last level stands for that")
+        out[key] = _told(out[key], "the last level is used instead")
     if not reference:
         out |= _hidden_threshold(out, case) | _extrapolated_threshold(out, case)
     for ratio, capacity, threshold, ends in (
@@ -138,7 +138,7 @@ def _extrapolated_threshold(values: dict[str, Number], case: Case) -> dict[str, 
         "general_u_p_min": replace(
             value, value=max(limit, value.value), reason=f"{what}; 95 % upper limit: the noise at the input of that level", kind=UPPER_LIMIT
         ),
-        "general_DSNU": replace(pattern, reason="; ".join(filter(None, (f"{what}, and u does not hold it", pattern.reason)))),
+        "general_DSNU": replace(pattern, reason="; ".join(filter(None, (f"{what}, which u does not include", pattern.reason)))),
     }
 
 
@@ -151,5 +151,5 @@ def _hidden_threshold(values: dict[str, Number], case: Case) -> dict[str, Number
     limit = float(general_evaluation(noisy, case.formulas.plan)[0]["general_u_p_min"]) + ONE_SIDED_95 * value.u
     if not math.isfinite(limit):
         return {}
-    reason = f"the dark variance lies below {case.noise.limit_dn2:.2g} DN², where quantisation covers it: 95 % upper limit (eq. 54)"
+    reason = f"the dark variance lies below {case.noise.limit_dn2:.2g} DN², where quantisation hides it: 95 % upper limit (eq. 54)"
     return {"general_u_p_min": replace(value, value=limit, reason=reason, kind=UPPER_LIMIT)}

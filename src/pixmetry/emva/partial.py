@@ -39,7 +39,7 @@ def partial_results(m: Measurement, release: str, problem: MeasureError) -> Resu
         method = f"EMVA 1288 R{release} {KEYS[key].clause}".strip() if release != "reference" else "reference implementation 1.0.2"
         nothing = Number.not_available(KEYS[key].unit, f"needs an exposure series: {why}", method)
         values[key] = found.get(key, nothing)
-    note = f"no exposure series: {why}; only values that need none are given"
+    note = f"no exposure series: {why}; only values without such a series are given"
     return Results(release, values, notes=(*m.notes, note), channel=m.channel)
 
 
@@ -57,7 +57,7 @@ def _dark_levels(m: Measurement, release: str) -> dict[str, Number]:
     middle = float(var[shortest].mean())
     u = float(np.linalg.norm(sampling_u(dark, m.transfer.frame_shape)[order][shortest]) / shortest.sum())
     hidden = middle < MINIMUM_DARK_VAR_DN2
-    reason = "the dark variance lies below 0.24 DN², where quantisation covers it: an upper limit (eq. 54)" if hidden else ""
+    reason = "the dark variance lies below 0.24 DN², where quantisation hides it: an upper limit (eq. 54)" if hidden else ""
     root = math.sqrt(max(middle, MINIMUM_DARK_VAR_DN2))
     kind = UPPER_LIMIT if hidden and release != "reference" else VALUE
     out = {"sigma_y_dark": _value("sigma_y_dark", root, u / (2 * root), math.inf, reason, kind)}

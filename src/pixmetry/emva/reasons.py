@@ -44,7 +44,7 @@ ON_DARK_LEVELS = (
 )  # how they begin
 ON_DARK_VARIANCE = tuple(key for key in ON_DARK_LEVELS if key not in ("R", "LE"))
 IN_PHOTONS = ("QE", "u_p_min", "u_p_min_area", "u_p_sat", "u_p_sat_area", "general_u_p_min", "general_u_p_sat", "general_DSNU")
-NO_LIGHT = "neither photons nor exposure tell the light of the levels"
+NO_LIGHT = "neither photons nor exposure times give the light of the levels"
 
 
 @dataclass(frozen=True)
@@ -139,8 +139,8 @@ def _clipped(key: str, case: Case) -> str | None:
         return None
     what = f"{100 * case.noise.black:.3g} % of the dark pixels are at the lowest code"
     if is_blind(key, case):
-        return f"{what}: noise and pattern below it are not seen; raise the offset"
-    return f"{what}: the dark mean is too high, dark noise and pattern are too small: off by more than u; raise the offset"
+        return f"{what}: they cut off noise and pattern; raise the offset"
+    return f"{what}: the dark mean is too high, and dark noise and pattern are too small, by more than u; raise the offset"
 
 
 def _dark_current(key: str, case: Case) -> str | None:
@@ -186,21 +186,21 @@ def _step_of_levels(key: str, case: Case) -> str | None:
     if photons is None or at + 1 >= photons.size:
         return "the last level of the series"
     step = float(f"{photons[at + 1] - photons[at]:.4g}")
-    return f"a level of the series; the next is {step:.10g} photons brighter, which u does not hold"
+    return f"a level of the series; the next is {step:.10g} photons brighter, which u does not include"
 
 
 def _insignificant(key: str, case: Case) -> str | None:
     if key not in case.squares or not float(case.squares[key]) < ONE_SIDED_95 * case.spread.u_square[key]:
         return None
-    return "its square is not significantly above zero: hardly any pattern stands out of the temporal noise that is left"
+    return "its square is not significantly above zero: hardly any pattern is larger than the remaining temporal noise"
 
 
 def _bent_by_quantisation(key: str, case: Case) -> str | None:
     if not (case.noise.hidden and key.startswith(ON_DARK_VARIANCE)):
         return None
     return (
-        f"the dark variance ({case.noise.var_dn2:.2g} DN²) is hidden by quantisation, which bends variance and mean of dark "
-        "levels: it may be off by more than u; raise the camera's gain"
+        f"the dark variance ({case.noise.var_dn2:.2g} DN²) is hidden by quantisation, which distorts variance and mean of "
+        "dark levels: it may be wrong by more than u; raise the camera's gain"
     )
 
 
@@ -209,8 +209,8 @@ def _without_own_dark_level(key: str, case: Case) -> str | None:
     if not key.startswith(ON_DARK_LEVELS) or KEYS[key].section == "spatial" or not without_dark(bright_s, dark_s).any():
         return None
     return (
-        f"no dark level has the bright levels' exposure: that of {_nearest_text(bright_s, dark_s)} stands for it "
-        "as it is, dark current and all, which u does not hold"
+        f"no dark level has the bright levels' exposure: that of {_nearest_text(bright_s, dark_s)} is used "
+        "unchanged, with its dark current, which u does not include"
     )
 
 
@@ -219,10 +219,10 @@ def _moved_by_noise(key: str, case: Case) -> str | None:
     if key.startswith("index_") or not 2 * abs(shift) > case.spread.u.get(key, 0.0) > 0:
         return None
     moved = f"{shift:+.2g}".replace("-", "−")
-    return f"noise alone moves it by {moved}: an extreme or absolute value of noisy levels; u holds that"
+    return f"noise alone moves it by {moved}: an extreme or absolute value of noisy levels; u includes this"
 
 
-# In this order: the first that says anything is the reason, also where it says that there is none ("").
+# In this order: the first rule that returns a text gives the reason; an empty text ("") means that there is none.
 RULES: tuple[Callable[[str, Case], str | None], ...] = (
     _lacking,
     _clipped,
@@ -246,19 +246,19 @@ def _negative(key: str, formulas: Formulas, square: float) -> str:
     """The cause of a negative variance, from the temporal row and column noise that the stack shows."""
     behind = f"the variance behind it is negative ({square:.3g} in {key_of(key).unit} squared)".replace("-", "−")
     if formulas.release == "4.0" or not key.endswith("_pixel"):
-        return f"{behind}: no pattern stands out of the temporal noise that is left; 95 % upper limit"
+        return f"{behind}: no pattern is larger than the remaining temporal noise; 95 % upper limit"
     assert formulas.stacks is not None
     stack = formulas.stacks[0 if key.startswith("DSNU") else 1]
     row, col = stack.vector[6:]
     return (
         f"{behind}: temporal noise common to a row ({row:.3g} DN²) or a column ({col:.3g} DN²) stays in the mean of "
-        f"{stack.n_frames} frames, is taken for a fixed pattern of rows and columns, and off the pixels; 95 % upper limit with "
-        "that put back"
+        f"{stack.n_frames} frames, is taken for a fixed pattern of rows and columns, and is subtracted from the pixels; "
+        "95 % upper limit without this subtraction"
     )
 
 
 def _broken(key: str, case: Case) -> str:
-    """Why a square is far below zero, where no square can be: what the split takes for granted does not hold."""
+    """Why a square is far below zero, which no square can be: an assumption of the split does not hold."""
     square = float(case.squares[key])
     in_u = f"{square / case.spread.u_square[key]:.0f} u" if case.spread.u_square[key] > 0 else "many u"
     behind = f"the variance behind it is far below zero ({square:.3g} in {key_of(key).unit} squared, {in_u})".replace("-", "−")
@@ -268,20 +268,20 @@ def _broken(key: str, case: Case) -> str:
             at_top = case.m.bright_stack.fraction_max if case.m.bright_stack is not None else 0.0
             seen = f"{100 * at_top:.2g} % of the bright pixels are at the highest code; " if at_top > 0 else ""
             return (
-                f"{behind}: the pixels differ less in the light than in the dark, as those do that are hot in the dark and clip in "
-                f"the light ({seen}the standard takes the dark variance off as if it were still there); no value and no limit: leave "
-                "such pixels out"
+                f"{behind}: the pixels differ less in the light than in the dark, as pixels do that are hot in the dark and clip in "
+                f"the light ({seen}the standard subtracts the dark variance as if it were still there); no value and no limit: "
+                "leave such pixels out"
             )
     line = "rows" if key.endswith("_row") else "columns" if key.endswith("_col") else ""
     if line:
         return (
             f"{behind}: the means of {line} differ less than those of independent pixels would, as under a wave that runs across the "
-            "frame: it adds to the pixels and averages out along a line, while the split takes the pixels for independent of each other; "
-            "no value and no limit"
+            "frame: it adds to the pixels and averages out along a line, while the split assumes independent pixels; no value and no "
+            "limit"
         )
     return (
-        f"{behind}: what is left after averaging is less than the temporal noise of single frames lets expect, as where that noise is not "
-        "independent from frame to frame (a wave that moves, or a mean that drifts); no value and no limit"
+        f"{behind}: less noise remains after averaging than the temporal noise of single frames predicts, as if that noise were not "
+        "independent from frame to frame (a moving wave, or a drifting mean); no value and no limit"
     )
 
 
@@ -292,16 +292,16 @@ def _light_dn(case: Case) -> float:
 
 def _hidden_noise(key: str, case: Case) -> str:
     if case.formulas.release == "reference":
-        return "the dark variance lies below 0.24 DN², where quantisation covers it; computed with 0.24 DN²"
+        return "the dark variance lies below 0.24 DN², where quantisation hides it; computed with 0.24 DN²"
     bound = "a lower bound" if key.startswith("DR") else "an upper limit"
     if case.noise.hidden:
-        return f"the dark variance lies below 0.24 DN², where quantisation covers it: {bound} (eq. 54)"
+        return f"the dark variance lies below 0.24 DN², where quantisation hides it: {bound} (eq. 54)"
     found = f"{case.noise.var_dn2:.2g} ± {case.noise.u_dn2:.2g} DN²".replace("-", "−")
-    return f"the dark variance at zero exposure ({found}) does not stand out of its u and the 0.24 DN² of quantisation: {bound}"
+    return f"the dark variance at zero exposure ({found}) is not significant against its u and the 0.24 DN² of quantisation: {bound}"
 
 
 def _hidden_pattern(release: str) -> str:
-    what = "the temporal dark noise is too small to carry the pattern over the steps of quantisation, which show it too large or too small"
+    what = "the temporal dark noise is too small to dither the quantisation; the pattern appears too large or too small"
     return what if release == "reference" else f"{what}: 95 % upper limit"
 
 
@@ -330,7 +330,7 @@ def notes_of(case: Case, values: dict[str, Number], linear: str) -> tuple[str, .
         notes.append(CURVED)
     sat = int(measured.get("index_u_ysat", -1))
     if ends_early(formulas, measured):
-        given = "printed as they are, and are lower bounds" if formulas.release == "reference" else "lower limits, from its last level"
+        given = "printed unchanged, and are lower bounds" if formulas.release == "reference" else "lower limits, from its last level"
         notes.append(f"the series ends before saturation: capacity, SNR_max and DR are {given}")
     if formulas.release == "4.0" and 0 <= sat < series.mean_dn.size - 1 and series.fraction_max[sat + 1] <= SATURATED_FRACTION:
         notes.append("the full well lies below the top code: saturation is taken at the maximum of the photon transfer curve")
@@ -342,8 +342,8 @@ def notes_of(case: Case, values: dict[str, Number], linear: str) -> tuple[str, .
         notes.append(f"dark levels of fewer than {WANTED_DARK_LEVELS} exposures (R4.0 §7.1)")
     if not _paired(series.exposure_s, series.dark_exposure_s):
         several = count_exposures(series.dark_exposure_s) >= MINIMUM_EXPOSURES
-        taken = "on straight lines through" if several else "from"
-        notes.append(f"not every bright level has a dark one of its exposure: dark values are taken {taken} the others")
+        taken = "from straight lines through" if several else "from"
+        notes.append(f"not every bright level has a dark level of its exposure: dark values are taken {taken} the others")
     if formulas.stacks is not None and m.dark_stack is not None and m.bright_stack is not None:
         one, other = m.dark_stack.exposure_s, m.bright_stack.exposure_s
         if not same_exposure(m.dark_stack, m.bright_stack):
@@ -368,7 +368,7 @@ def _swept_dark_current(series: Series, plan: Plan) -> tuple[str, ...]:
     if not abs(share) > SWEPT_SHARE:
         return ()
     return (
-        f"the exposure was swept, and the dark signal with it: a response that bends makes the slope of the brightest level up to "
+        f"the exposure was swept, and the dark signal with it: a curved response makes the slope of the brightest level up to "
         f"{100 * abs(share):.2g} % too {'small' if share > 0 else 'large'}, and with it the General values; sweep the light instead",
     )
 

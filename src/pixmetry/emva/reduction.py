@@ -156,7 +156,7 @@ def _uneven_pairs(transfer: PhotonTransfer) -> list[str]:
     times = np.sqrt(b.ms_frame_dn2 / np.where(allowed > 0, allowed, np.inf))
     return [
         f"the frames of bright level {k + 1} (mean {b.mean_dn[k]:.4g} DN) differ by {100 * change[k]:.2g} %, "
-        f"{times[k]:.2g} times what noise and the light's flicker allow: they may be of two lights"
+        f"{times[k]:.2g} times what noise and the light's flicker allow: they may have been taken under different light"
         for k in np.flatnonzero((change > 0.01) & (times > UNEVEN))
     ]
 
@@ -174,7 +174,7 @@ def _stacks(channel: _Channel) -> tuple[StackMoments | None, StackMoments | None
         return dark, bright, photons, (f"no stack of {missing} frames: values of non-uniformity are missing ({STACK_REMEDY})",)
     if not same_exposure(dark, bright):
         gap = f"dark {dark.exposure_s:g} s, bright {bright.exposure_s:g} s"
-        what = "no dark stack has the exposure time of a bright one, so what differs between them is not the light's alone"
+        what = "no dark stack has the exposure time of a bright one, so the light is not the only difference between them"
         return dark, None, None, (f"{what} (nearest: {gap}): PRNU is not measured ({STACK_REMEDY})",)
     return dark, bright, photons, ()
 

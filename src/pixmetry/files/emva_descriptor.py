@@ -141,7 +141,7 @@ def _numbers(text: str, where: str, form: str, fewest: int, most: int) -> list[f
     except ValueError:
         what, remedy = "not a number", "write decimals with a point" if "," in text else "correct the line"
         if any(_THOUSANDS.fullmatch(part) for part in text.split()):
-            what, remedy = "a comma that may part thousands or decimals", "leave it out, or write a point for it"
+            what, remedy = "a comma that may separate thousands or decimals", "leave it out, or write a point for it"
         raise InputError(what, where=where, value=text, allowed=form, remedy=remedy) from None
     if not fewest <= len(values) <= most:
         raise InputError(f"{len(values)} numbers in this record", where=where, value=text, allowed=form, remedy="correct the line")

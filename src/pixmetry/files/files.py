@@ -63,7 +63,10 @@ def _by_case(folder: Path, part: str, text: str, where: str) -> Path:
     if len(fitting) > 1:
         remedy = "write the name exactly"
         raise InputError(
-            f"'{text}' fits several files that differ in upper and lower case only", where=where, allowed=", ".join(fitting), remedy=remedy
+            f"'{text}' matches several files that differ only in upper and lower case",
+            where=where,
+            allowed=", ".join(fitting),
+            remedy=remedy,
         )
     if fitting:
         return folder / fitting[0]
@@ -110,7 +113,9 @@ def find_files(base: Path, patterns: list[str] | tuple[str, ...], where: str, ra
             continue
         fitting = _glob(base, text.replace("\\", "/"), where)
         if not fitting:
-            raise InputError(f"pattern '{text}' fits no file", where=where, remedy="check it; it is relative to the folder of the manifest")
+            raise InputError(
+                f"pattern '{text}' matches no file", where=where, remedy="check it; it is relative to the folder of the manifest"
+            )
         found += fitting
     return tuple(frame for path in found for frame in frames_of(path, raw))
 

@@ -209,7 +209,7 @@ def _told_of(path: Path) -> Iterator[None]:
     except OSError as problem:
         raise InputError("file cannot be read", where=str(path), value=problem.strerror, remedy="check the permissions") from None
     except MemoryError:
-        raise InputError("image needs more memory than there is", where=str(path), remedy="cut the image into parts") from None
+        raise InputError("the image needs more memory than is available", where=str(path), remedy="cut the image into parts") from None
     except Exception as problem:
         reason = str(problem).splitlines()[0] if str(problem) else type(problem).__name__
         raise InputError(f"image is damaged or cut off ({reason})", where=str(path), remedy="copy or export the frame again") from None
@@ -237,13 +237,13 @@ def _jpeg(raw: bytes) -> Decoded:
         raise InputError(f"JPEG with {facts.components} colours", allowed="grey or colour (RGB)", remedy=remedy)
     needed = facts.rows * facts.cols * facts.components * (1 if facts.bits <= 8 else 2)
     check_memory(needed, _what(facts.cols, facts.rows), remedy="cut the image into parts")
-    coder = "JPEG, without loss" if facts.lossless else "JPEG: noise and fine structure are those that its coder left"
+    coder = "JPEG, without loss" if facts.lossless else "JPEG: its coder has changed noise and fine structure"
     return Decoded(imagecodecs.jpeg_decode(raw), facts.lossless, (coder, *_turned(facts.orientation)))
 
 
 def _turned(orientation: int) -> tuple[str, ...]:
     turn = _TURNS.get(orientation)
-    return () if turn is None else (f"the file says that it is to be turned for display ({turn}): positions are those of the stored rows",)
+    return () if turn is None else (f"the file asks for a rotation on display ({turn}): positions are those of the stored rows",)
 
 
 def _what(cols: int, rows: int) -> str:
@@ -254,7 +254,7 @@ def _tiff_file(pages: list[tiff.TiffPage], read: Read, lock: threading.Lock) -> 
     def one(k: int) -> Decoded:
         page = tiff.with_coder(pages[k], read)
         check_memory(page.decoded_bytes, _what(page.shaped[3], page.shaped[2]), remedy="cut the image into parts")
-        loss = ("JPEG inside a TIFF: noise and fine structure are those that its coder left",) if page.lossless is False else ()
+        loss = ("JPEG inside a TIFF: its coder has changed noise and fine structure",) if page.lossless is False else ()
         return Decoded(page.image(read), page.lossless, (*loss, *_turned(page.orientation)))
 
     return FrameFile(len(pages), one)

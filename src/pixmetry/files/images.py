@@ -180,7 +180,7 @@ def _frame_in_memory(campaign: Campaign, path: Path) -> np.ndarray:
     frame = campaign.arrays[path.parent][int(path.name)]
     low, high = int(frame.min()), int(frame.max())
     if low < 0 or high > 65535:
-        raise InputError("values that no frame stores", where=str(path), value=f"{low} to {high}", allowed="0 to 65535")
+        raise InputError("values that a frame cannot store", where=str(path), value=f"{low} to {high}", allowed="0 to 65535")
     return np.ascontiguousarray(frame, campaign.frame_dtype)
 
 
@@ -227,7 +227,7 @@ def _too_high(array: np.ndarray, found: int, bits: int, where: str) -> InputErro
     remedy = f"declare the true number of bits (at least {found.bit_length()})"
     if used & ((1 << spare) - 1) == 0:
         remedy = f"the values are shifted to the left by {spare} bits: store them in the lowest {bits} bits"
-    return InputError(f"value above what {bits} bits can hold", where=where, value=found, allowed=f"0 to {(1 << bits) - 1}", remedy=remedy)
+    return InputError(f"value above the range of {bits} bits", where=where, value=found, allowed=f"0 to {(1 << bits) - 1}", remedy=remedy)
 
 
 def iter_frames(

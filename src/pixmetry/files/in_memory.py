@@ -118,8 +118,8 @@ def _checked(data: Any, where: str) -> np.ndarray | list[np.ndarray]:
         raise InputError("not a stack of frames", where=where, value=found, allowed="shape (frames, rows, cols)", remedy="store it so")
     wrong = next((frame.dtype for frame in frames if frame.dtype.kind not in "ui"), None)
     if wrong is not None:
-        remedy = "give the stored values, before anything was done to them"
-        raise InputError("grey values that are no whole numbers", where=where, value=str(wrong), allowed="integers", remedy=remedy)
+        remedy = "give the stored values, before any processing"
+        raise InputError("grey values that are not whole numbers", where=where, value=str(wrong), allowed="integers", remedy=remedy)
     if not len(frames) or any(frame.size == 0 for frame in frames):
         raise InputError("no frames, or frames without pixels", where=where, remedy="leave them out")
     return frames

@@ -40,7 +40,7 @@ def jpeg_facts(raw: bytes) -> JpegFacts:
         while raw[at : at + 2] == b"\xff\xff":
             at += 1
         if at + 2 > len(raw) or raw[at] != 0xFF:
-            raise ValueError("end of the image is missing" if coded or at + 2 > len(raw) else "no marker where one must be")
+            raise ValueError("end of the image is missing" if coded or at + 2 > len(raw) else "a marker is missing")
         kind = raw[at + 1]
         if kind == 0xD9:
             break
@@ -65,10 +65,10 @@ def jpeg_facts(raw: bytes) -> JpegFacts:
             coded += found.start() - at
             at = found.end() - 2
     if frame is None or not coded:
-        raise ValueError("there is no image in it")
+        raise ValueError("it contains no image")
     kind, bits, rows, cols, components = frame
     if not rows or not cols:
-        raise ValueError("it does not say how large it is")
+        raise ValueError("the size of the image is missing")
     least = rows * cols if kind in _LOSSLESS else -(-rows // 8) * -(-cols // 8)
     if kind not in _ARITHMETIC and 8 * coded < least:
         raise ValueError(f"{coded} bytes cannot hold {cols} x {rows} pixels")

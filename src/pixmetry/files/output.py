@@ -499,5 +499,7 @@ def read_maps(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
             with suppress(AttributeError):  # a file that is no zip file was never opened
                 store.close()
     if damaged:
-        raise InputError(f"damaged: the map '{damaged[0]}' is not what was written", where=str(path), remedy="make the result again")
+        raise InputError(
+            f"damaged: the map '{damaged[0]}' has changed since it was written", where=str(path), remedy="make the result again"
+        )
     return arrays, attributes

@@ -67,7 +67,7 @@ def png_head(raw: bytes) -> PngHead:
         transparent = transparent or kind == b"tRNS"
         at = end + 4
     if head is None or not data:
-        raise ValueError("there is no image in it")
+        raise ValueError("it contains no image")
     cols, rows, depth, colour = head
     if not (cols and rows) or colour not in _CHANNELS or depth not in (1, 2, 4, 8, 16):
         raise ValueError("the header is damaged")

@@ -81,7 +81,7 @@ class RawLayout:
         """
         count, rest = divmod(size - self.skip_bytes, self.frame_bytes)
         if count < 1 or rest:
-            what = f"a file of {size} bytes holds no whole number of frames of {self.width} x {self.height} {self.pixel_format}"
+            what = f"a file of {size} bytes does not contain a whole number of frames of {self.width} x {self.height} {self.pixel_format}"
             allowed = f"{self.skip_bytes} + n x {self.frame_bytes} bytes"
             raise InputError(what, allowed=allowed, remedy="correct width, height, pixel_format or skip_bytes, or copy the file again")
         return count

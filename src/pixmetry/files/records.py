@@ -204,7 +204,7 @@ def check_groups(groups: tuple[FrameGroup, ...], where: str) -> tuple[tuple[Fram
             remedy="take a second frame under the same condition",
         )
     notes = [f"only 1 frame in group ({g.label}): it is left out, noise is measured from the difference of two" for g in single]
-    notes += [f"no {kind} frames: what needs them is not measured" for kind in KINDS if all(g.kind != kind for g in groups)]
+    notes += [f"no {kind} frames: values that need them are not measured" for kind in KINDS if all(g.kind != kind for g in groups)]
     ordered = sorted((g for g in groups if len(g.paths) > 1), key=lambda g: (g.kind != "dark", g.exposure_s, g.photons or 0.0))
     groups, told = _of_different_conditions(ordered, where)
     return groups, (*notes, *told, *_doubtful_photons([g for g in groups if g.kind == "bright" and g.role == "level"]))
@@ -227,7 +227,7 @@ def _of_different_conditions(groups: list[FrameGroup], where: str) -> tuple[tupl
             more = max(group, other, key=lambda g: len(g.paths))
             seen[_condition(other)] = group if more is other else other
             group, other = replace(more, role="stack"), seen.get(_condition(replace(more, role="stack")))
-            notes.append(f"two groups of the same condition ({group.label}): the one of {len(group.paths)} frames is taken as a stack")
+            notes.append(f"two groups of the same condition ({group.label}): the group of {len(group.paths)} frames is taken as a stack")
         if other is not None and group.kind == "dark":
             group = replace(group, paths=(*other.paths, *group.paths))
             notes.append(f"two groups of the same condition ({group.label}): taken as one of {len(group.paths)} frames")
@@ -257,7 +257,7 @@ def _doubtful_photons(levels: list[FrameGroup]) -> list[str]:
         if exposure_s > longest_s and photons < most:
             notes.append(
                 f"photons fall from {most:g} to {photons:g} while the exposure rises from {longest_s:g} s to {exposure_s:g} s: "
-                "if the light was not changed there, correct the exposure or the photons; what is counted in photons is wrong otherwise"
+                "if the light was not changed there, correct the exposure or the photons; otherwise values in photons are wrong"
             )
         longest_s, most = exposure_s, photons
     return notes

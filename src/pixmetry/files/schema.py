@@ -20,7 +20,7 @@ Side = Annotated[int, Field(ge=1, le=1_000_000)]
 def _quoted(value: Any) -> Any:
     """A serial number of digits alone is a number for YAML, and zeros at its head are gone."""
     if isinstance(value, int | float) and not isinstance(value, bool):
-        raise InputError("a number where a text belongs", value=value, allowed="a text in quotes", remedy="put it in quotes, as in '0815'")
+        raise InputError("a number in place of a text", value=value, allowed="a text in quotes", remedy="put it in quotes, as in '0815'")
     return value
 
 
@@ -58,7 +58,7 @@ class CameraModel(Model):
             if (getattr(self, one) is None) != (getattr(self, other) is None):
                 raise InputError(f"{one} and {other} belong together", allowed="both or neither", remedy="add the one that is missing")
         if self.first_col is not None and self.sensor_cols is None:
-            raise InputError("a window of a sensor whose size is not given", remedy="add sensor_cols and sensor_rows")
+            raise InputError("a window, but no size of the sensor", remedy="add sensor_cols and sensor_rows")
         return self
 
     @model_validator(mode="after")

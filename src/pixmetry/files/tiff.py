@@ -89,7 +89,7 @@ class TiffPage(NamedTuple):
             image = image[:, :, 0]
         if self.photometric == 0:
             if image.dtype.kind != "u":
-                raise InputError("WhiteIsZero with values that are no whole numbers", remedy="export the frame again with BlackIsZero")
+                raise InputError("WhiteIsZero with values that are not whole numbers", remedy="export the frame again with BlackIsZero")
             image = ((1 << self.bits) - 1) - image
         return image
 
@@ -134,7 +134,7 @@ def pages(file: BinaryIO, size: int) -> list[TiffPage]:
         every: list[Any] = list(tiff.pages)
         found = [page for page in every if not page.subfiletype & (_REDUCED | _MASK)] or every[:1]
         if not found:
-            raise ValueError(_first(told) or "there is no image in it")
+            raise ValueError(_first(told) or "it contains no image")
         made = [_page(page, size) for page in found]
         if tiff.is_imagej and len(made) == 1:
             made = _of_imagej(made[0], int((tiff.imagej_metadata or {}).get("images", 1)), size)

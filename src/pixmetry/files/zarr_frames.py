@@ -74,7 +74,7 @@ def _frames(store: Path, modified_ns: int) -> Any:
     except (ValueError, KeyError, TypeError) as problem:
         raise InputError(f"not a store of frames ({problem})", where=str(store), remedy="copy or make the store again") from None
     if frames.ndim != 3:
-        raise InputError("the array of frames has other axes", where=str(store), value=frames.shape, allowed="frame, row, column")
+        raise InputError("the array of frames has wrong axes", where=str(store), value=frames.shape, allowed="frame, row, column")
     if not complete:
         raise InputError("frames are missing in the store", where=str(store), remedy="copy or make the store again, empty chunks included")
     return frames

@@ -18,7 +18,7 @@ MODULES = (  # each has the tuple METHODS
     "pixmetry.locate.centroids.operators",
 )
 AUTO = "auto"
-AUTO_TEXT = "chooses shape and likelihood of the template by what the image shows, and says why"
+AUTO_TEXT = "chooses shape and likelihood of the template from the image, and states the reason"
 ROWS = {
     "template": "the whole line by least squares, integrated over the pixel; at the Cramér–Rao bound",
     "row_squared_centroid": "squared centroid of each row (or column), then a straight line through them",
@@ -76,7 +76,7 @@ def seen_shape(kind: str, targets: Targets) -> tuple[str, str]:
     major, minor = targets.semi_major_px[large], targets.semi_minor_px[large]
     flat = float(np.median(minor / major))
     if flat < TILTED or float(np.median(major - minor)) > TILTED_PX:
-        return "ellipse", f"the discs are seen as ellipses, axes 1 : {flat:.2f}"
+        return "ellipse", f"the discs appear as ellipses, axes 1 : {flat:.2f}"
     return kind, "at the Cramér–Rao bound for every size and noise"
 
 

@@ -77,8 +77,8 @@ def locate(
     if not 0 <= aperture_px <= 1:
         raise InputError("the pixel's aperture cannot be used", where="aperture_px", value=aperture_px, allowed="0 to 1 pixel")
     if aperture_px < 1 and estimator in methods() and not methods()[estimator].knows_aperture:
-        what = f"the uncertainty of {estimator} is known for pixels without gaps only"
-        remedy = "take the template, whose model has the aperture"
+        what = f"the uncertainty of {estimator} is known only for pixels without gaps"
+        remedy = "use the template, whose model includes the aperture"
         raise InputError(what, where="aperture_px", value=aperture_px, allowed="1", remedy=remedy)
     image = checked_frame(frame, name)
     model = noise_model(noise)

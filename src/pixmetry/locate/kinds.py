@@ -204,7 +204,7 @@ def grid_size(grid: str | tuple[int, int] | None, kind: str) -> tuple[int, int] 
     if kind == "chessboard" and grid is None:
         raise InputError("the size of the chessboard is missing", where="grid", allowed="COLSxROWS of its inner corners, such as 9x6")
     if grid is not None and kind not in (*SPOTS, "chessboard"):
-        raise InputError(f"targets of kind {kind} stand in no grid", where="grid", allowed="disc, ellipse, ring, spot, chessboard")
+        raise InputError(f"targets of kind {kind} form no grid", where="grid", allowed="disc, ellipse, ring, spot, chessboard")
     if grid is None or (grid == "any" and kind != "chessboard"):
         return grid
     size = tuple(grid.lower().split("x")) if isinstance(grid, str) else tuple(grid)

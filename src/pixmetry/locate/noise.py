@@ -186,7 +186,7 @@ def camera_noise(camera: Camera) -> CameraNoise:
     Raises
     ------
     InputError
-        If the camera does not answer to light.
+        If the camera does not respond to light.
     """
     rows, cols = camera.output_shape
     side_r, side_c = min(SIDE, rows), min(SIDE, cols)
@@ -199,7 +199,7 @@ def camera_noise(camera: Camera) -> CameraNoise:
     dark, top = exposed(0.0), exposed(MOST_PHOTONS, 2)
     black, high = float(dark.mean()), float(np.median(top))
     if high - black < 1.0:
-        raise InputError(f"camera {camera.name} does not answer to light", remedy="name another camera, or give the noise in DN")
+        raise InputError(f"camera {camera.name} does not respond to light", remedy="name another camera, or give the noise in DN")
     low, up, wanted = 0.01, MOST_PHOTONS, black + 0.8 * (high - black)
     while up / low > 1.1:
         middle = float(np.sqrt(low * up))

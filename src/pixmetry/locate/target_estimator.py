@@ -67,13 +67,13 @@ class TargetEstimator:
             Where ``auto`` was not resolved.
         """
         if self.name == AUTO:
-            raise InputError("an estimator for a target that is not known", remedy="call resolved() first")
+            raise InputError("the estimator needs a target", remedy="call resolved() first")
         return methods()[self.name]
 
     def resolved(self, background_dn: float, noise_dn: float, target: KnownTarget | None = None) -> TargetEstimator:
         """Return it for a given target and camera."""
         if target is None:
-            raise InputError("an estimator for a target that is not known", remedy="say what target it is")
+            raise InputError("the estimator needs a target", remedy="say what target it is")
         few = target.amplitude_dn < FEW_ELECTRONS * target.gain_dn_per_e
         name = self.name if self.name != AUTO else "poisson_gaussian" if few else "template"
         return TargetEstimator(
@@ -177,7 +177,7 @@ class TargetEstimator:
     def _size(self) -> tuple[float, float, float]:
         """Radius, standard deviation of the edge with the pixel in it, and height."""
         if self.radius_px is None or self.blur_px is None or self.amplitude_dn is None:
-            raise InputError("an estimator for a target that is not known", remedy="call resolved() first")
+            raise InputError("the estimator needs a target", remedy="call resolved() first")
         return self.radius_px, float(np.hypot(self.blur_px, 12**-0.5)), self.amplitude_dn
 
     def _noise(self, dtype: np.dtype) -> NoiseModel:
@@ -231,7 +231,7 @@ def parse_estimator(text: str) -> Estimator:
     if name == AUTO or name in methods():
         if rest:
             fixed = f"; for a fixed square of pixels take {PREFIX}{name}:{rest}" if name in LAWS else ""
-            what = f"{name} has no settings: it chooses window and threshold by target and noise, as in pixmetry locate"
+            what = f"{name} has no settings: it chooses window and threshold from target and noise, as in pixmetry locate"
             raise InputError(what, where="estimator", value=rest, remedy=f"name it alone{fixed}")
         return TargetEstimator(name)
     if not name.startswith(PREFIX) or name.removeprefix(PREFIX) not in LAWS:

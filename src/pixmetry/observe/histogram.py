@@ -110,7 +110,7 @@ def expected_counts(histogram: CodeHistogram) -> tuple[np.ndarray, np.ndarray]:
         raise MeasureError(
             "no light level covers its codes evenly",
             allowed=f"bright levels with a temporal noise above {MIN_TEMPORAL_SIGMA_DN:g} DN, clear of saturation",
-            remedy="add such levels; a camera as quiet as this has none, and loses nothing but this value",
+            remedy="add such levels; a camera with less noise has none, and only this value is missing",
         )
     edges = np.arange(2**histogram.bits + 1) - 0.5
     expected, usable = np.zeros(edges.size - 1), np.zeros(edges.size - 1, dtype=bool)

@@ -325,7 +325,7 @@ def _joined(halves: tuple[int, int]) -> int:
 
 def _need_rows_and_cols(shape: tuple[int, ...]) -> None:
     if min(shape) < 2:
-        raise MeasureError("frames are too small for rows and columns to be told apart", value=shape, allowed="2 x 2 or more")
+        raise MeasureError("frames are too small to separate rows and columns", value=shape, allowed="2 x 2 or more")
 
 
 def _mean_squares(f: int, shape: tuple[int, int], deviations: float, frames: int, rows: int, cols: int) -> MeanSquares:

@@ -45,7 +45,7 @@ __all__ = ["Group", "observe"]
 NOT_SIGNIFICANT = 3.0
 METHOD = "mean squares of the differences of dark frames"
 METHOD_WITH_LIGHT = f"{METHOD}; gain from variance and mean of one light level"
-ONE_LIGHT = "from one light level: u holds that the response may be bent by 10 % over the range"
+ONE_LIGHT = "from one light level: u includes that the response may deviate from a straight line by 10 % over the range"
 
 
 @dataclass(frozen=True)
@@ -152,7 +152,7 @@ def _transfer_fit(
         if not len(found) and not transfer.bright.mean_dn.size:
             raise
         missing = "non-linearity, saturation" if "gain_dn_per_e" in found else "gain, noise in electrons, non-linearity, saturation"
-        notes.append(f"{missing} and what follows from them are not measured: {problem}")
+        notes.append(f"{missing} and values that follow from them are not measured: {problem}")
         return found
 
 
@@ -280,7 +280,7 @@ def partial_transfer(series: PhotonTransfer, stack: StackMoments | None, *, stra
         reasons["gain_dn_per_e"] = ONE_LIGHT
         if gain[2] is not None:
             rows.append(("quantum_efficiency", gain[2], gain[2] * gain[1] / gain[0], np.inf, "1"))
-            reasons["quantum_efficiency"] = f"{ONE_LIGHT}; u leaves out the calibration of the photon count"
+            reasons["quantum_efficiency"] = f"{ONE_LIGHT}; u does not include the calibration of the photon count"
     method, names = METHOD if gain is None else METHOD_WITH_LIGHT, {row[0] for row in rows}
     told = {name: reason for name, reason in reasons.items() if name in names}
     return Estimates.from_rows(rows, method=method, limits=frozenset(limits & names), reasons=told)

@@ -57,7 +57,7 @@ METHOD = (
 CONFOUNDERS = (
     "gain: any filter in the camera, the brighter-fatter effect, and traps of a CCD that fill at once lower the variance and so the gain",
     "non-linearity: a lamp whose light is not proportional to exposure looks like a non-linear camera",
-    "dark noise: holds the shot noise of dark current that does not grow with exposure",
+    "dark noise: includes the shot noise of dark current that does not grow with exposure",
     "row noise: mains flicker under a rolling shutter looks like row noise in bright frames; dark frames are used here",
 )
 UNDAMPED = 8  # iterations before the variance components move by half steps
@@ -230,7 +230,11 @@ def _estimates(pt: PhotonTransfer, s: Solution, d: model.Levels, axes: _Axes, ho
         cov[SATURATION, SATURATION] = saturation[1] ** 2
     rows = _Rows(cov)
     extra = np.sqrt(s.components[2])
-    wide = f"the variances scatter by {100 * extra:.2g} % beyond their sampling law; u is widened by that" if extra > 0 else ""
+    wide = (
+        f"the variances scatter by {100 * extra:.2g} % more than their sampling distribution; u is increased accordingly"
+        if extra > 0
+        else ""
+    )
     rows.add("gain_dn_per_e", p[GAIN], "DN/e-", {GAIN: 1.0}, wide)
     _add_temporal_noise(rows, s, d, values, clipped_black(pt))
     one_time = "" if s.free[DARK_SLOPE] else "contains the dark signal: the dark frames have about one exposure time"
@@ -269,7 +273,7 @@ def _add_sensitivity(rows: _Rows, pt: PhotonTransfer, p: np.ndarray, axes: _Axes
     photons = axes.light * pt.bright.photons[known].sum() / light[known].sum()  # at a scaled light of one
     value = p[SLOPE] / (p[GAIN] * photons)
     gradient = {SLOPE: value / p[SLOPE], GAIN: -value / p[GAIN]}
-    rows.add("quantum_efficiency", value, "1", gradient, "u leaves out the calibration of the photon count")
+    rows.add("quantum_efficiency", value, "1", gradient, "u does not include the calibration of the photon count")
 
 
 def _add_temporal_noise(rows: _Rows, s: Solution, d: model.Levels, values: np.ndarray, clipped: float) -> None:
@@ -281,7 +285,7 @@ def _add_temporal_noise(rows: _Rows, s: Solution, d: model.Levels, values: np.nd
         rows.covariance[DARK_LIMIT, DARK_LIMIT] = bound**2 / 12
         reason = (
             f"the dark variance is below {model.MINIMUM_DARK_VAR_DN2} DN², where rounding hides it: "
-            "bound 0.40/K (EMVA 1288 R4.0 eq. 54); u is that of an even spread below it"
+            "bound 0.40/K (EMVA 1288 R4.0 eq. 54); u is that of a uniform distribution below it"
         )
         for name in ("dark_noise_e", "row_noise_e", "column_noise_e"):
             rows.add(name, bound, "e-", {DARK_LIMIT: 1.0}, reason, limit=True)
@@ -290,7 +294,7 @@ def _add_temporal_noise(rows: _Rows, s: Solution, d: model.Levels, values: np.nd
     if clipped > CLIPPED_BLACK_FRACTION:
         reason = (
             f"{100 * clipped:.2g} % of the dark pixels are clipped at black: "
-            "taken from the levels that are not, extrapolated to zero light; raise the black level"
+            "extrapolated to zero light from the levels that are not clipped; raise the black level"
         )
     elif not s.free[DARK_VAR_SLOPE]:
         reason = "contains the shot noise of the dark current at the exposure of the dark frames"
@@ -315,7 +319,7 @@ def _add_dark_current(rows: _Rows, p: np.ndarray, time_scale: float) -> None:
     value, row, reason = from_mean, mean_row, ""
     if p[DARK_VAR_SLOPE] and abs(from_mean - from_var) > 4.5 * u_of(difference):  # 0: rounding hides the variance
         value, row = from_var, var_row
-        reason = f"from the dark variance: the mean ({from_mean:.4g} e-/s) contradicts it, so the black level is clamped or drifts"
+        reason = f"from the dark variance: the mean ({from_mean:.4g} e-/s) contradicts it; the black level is clamped or drifts"
     u = u_of(row)
     limit = value < 2 * u
     if limit:
@@ -429,8 +433,8 @@ class _Step:
 
 
 def _unsettled() -> MeasureError:
-    what = "the fit does not settle: the levels do not follow a camera with a smooth, nearly linear response"
-    return MeasureError(what, where="photon transfer", remedy="leave out spoilt levels; raise the black level")
+    what = "the fit does not converge: the levels do not agree with a camera with a smooth, nearly linear response"
+    return MeasureError(what, where="photon transfer", remedy="leave out wrong levels; raise the black level")
 
 
 def _step(d: model.Levels, s: Solution, prior: np.ndarray) -> _Step:

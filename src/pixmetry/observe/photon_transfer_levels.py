@@ -160,7 +160,7 @@ def refuse_dead_series(pt: PhotonTransfer) -> None:
     if not pt.bright.mean_dn.size:
         what, remedy = "no bright level", "take bright frames at 10 or more light levels, two at each"
     elif (pt.bright.fraction_max > 0.5).all():
-        what, remedy = "all bright frames are saturated", "shorten the exposure or dim the light"
+        what, remedy = "all bright frames are saturated", "shorten the exposure or reduce the light"
     elif (pt.bright.fraction_min > 0.5).all():
         what, remedy = "all bright frames are black", "check lamp, shutter and exposure"
     elif not pt.bright.var_total_dn2.any():

@@ -161,7 +161,9 @@ def spatial_maps(
     surface = fit_surface(light, surface_degree)
     surface = fit_surface(np.where(mask, surface.values, light), surface_degree)
     if surface.values.min() <= 0:
-        raise MeasureError("the light falls to nothing within the frame", where="bright stack", remedy="light the frame evenly, or crop it")
+        raise MeasureError(
+            "the light falls to zero within the frame", where="bright stack", remedy="illuminate the frame evenly, or crop it"
+        )
     dark = fill(dark_stack.mean_map_dn, mask)
     if patterns is not None:
         dark = without_fixed_waves(dark, patterns)
@@ -219,7 +221,7 @@ def _with_rounding(e: Estimates, white_dn2: float, dnl_lsb: float, per_light2: f
             added = math.hypot(2 * math.sqrt(slope2) * values[i] ** 2, lost2) if name in limits else u_squares[i]
             values[i] = math.sqrt(values[i] ** 2 + ONE_SIDED_95 * added)
             limits.add(name)
-            reasons[name] = "the dark noise is too small to carry the pattern over the steps of quantisation; 95 % upper limit"
+            reasons[name] = "the dark noise is too small to dither the quantisation; 95 % upper limit"
     slopes = np.divide(0.5, values, out=np.zeros(len(e)), where=values > 0)
     covariance = e.covariance.copy()
     covariance[np.diag_indices(len(e))] = np.maximum((u_squares * slopes) ** 2, 0.0)
@@ -380,10 +382,10 @@ def _broken(name: str, in_u: float) -> str:
         line = "rows" if "_row_" in name else "columns"
         return (
             f"{behind}: the means of {line} differ less than those of independent pixels would, as under a wave that runs across the "
-            "frame; the split takes the pixels for independent of each other, and gives neither a value nor a limit"
+            "frame; the split assumes independent pixels, and gives neither a value nor a limit"
         )
     return (
-        f"{behind}: less is left in the mean of the frames than the noise of single frames lets expect, as where that noise is not "
+        f"{behind}: less noise remains in the mean of the frames than the noise of single frames predicts, as if that noise were not "
         "independent from frame to frame; neither a value nor a limit"
     )
 
@@ -428,9 +430,9 @@ def _shading(surface: Surface, squares: _MeanSquares) -> Estimates:
     covariance = (w * variances.ravel()) @ w.T
     not_round = _not_round_var(along_x, along_y, coefficients, variances)
     covariance[-1, -1] += not_round
-    reasons = {"shading_pp_rel": "cannot be negative: without any shading it comes out at a few u"}
+    reasons = {"shading_pp_rel": "cannot be negative: without any shading its value is a few u"}
     if not_round:
-        reasons["shading_corner_rel"] = "the light falls off differently along x and y: u holds the difference"
+        reasons["shading_corner_rel"] = "the light falls off differently along x and y: u includes the difference"
     return Estimates(
         names=tuple(weights),
         values=w @ coefficients.ravel(),

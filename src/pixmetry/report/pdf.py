@@ -200,7 +200,7 @@ def _table(sheets: Paper, table: Table, folded: bool, lead: float) -> None:
     more = len(table.rows) - MOST_ROWS if folded else 0
     if more > 0:
         sheets.table(Table(table.label, table.columns, table.rows[:MOST_ROWS]))
-        sheets.paragraph(f"{more} more rows are on the page for the screen.", SMALL, color=SOFT)
+        sheets.paragraph(f"The HTML page has {more} more rows.", SMALL, color=SOFT)
     else:
         sheets.table(table, lead=lead)
 

@@ -20,7 +20,7 @@ def provenance_section(record: Mapping[str, Any], licence: str = "", more: Seque
     more : sequence of (str, str)
         Further facts.
     """
-    section = Section("Where this comes from", name="provenance")
+    section = Section("Versions and inputs", name="provenance")
     if facts := provenance_facts(record, more):
         section.add(Facts(facts))
     command = record.get("command") or ""

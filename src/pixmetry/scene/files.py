@@ -172,7 +172,7 @@ def _of_kind(kinds: Mapping[str, type[Model]], data: Any, what: str) -> Model:
         return data
     if not isinstance(data, Mapping):
         raise InputError(
-            f"a {what} holds no keys", allowed="kind: … and its other keys", remedy=f"write `kind: {next(iter(kinds))}` and its keys"
+            f"a {what} has no keys", allowed="kind: … and its other keys", remedy=f"write `kind: {next(iter(kinds))}` and its keys"
         )
     if data.get("kind") not in kinds:
         problem = f"no such kind of {what}" if "kind" in data else f"a {what} lacks its kind"
@@ -394,7 +394,7 @@ def read_scene(source: str | Path | Mapping[str, Any]) -> SceneModel:
     where = "scene" if isinstance(source, Mapping) else str(source)
     model = validate(SceneModel, source if isinstance(source, Mapping) else load_yaml(source), where)
     if not any(getattr(model, part) for part in SHOWN):
-        raise InputError("the scene shows nothing", where=where, allowed=", ".join(SHOWN), remedy="give one of them")
+        raise InputError("the scene is empty", where=where, allowed=", ".join(SHOWN), remedy="give one of them")
     if model.discs is not None and len(model.discs.x_px) != len(model.discs.y_px):
         raise InputError("x_px and y_px of the discs differ in number", where=where, remedy="give both for each disc")
     if model.photon_transfer is not None:

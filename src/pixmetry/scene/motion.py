@@ -41,7 +41,9 @@ class Motion:
         if self.table_px is not None:
             table = np.asarray(self.table_px, float)
             if table.ndim != 2 or table.shape[1] != 2 or not len(table) or not np.isfinite(table).all():
-                raise ParameterError("a table of places cannot be used", where="motion.table_px", allowed="a list of [x, y], one per frame")
+                raise ParameterError(
+                    "a table of displacements cannot be used", where="motion.table_px", allowed="a list of [x, y], one per frame"
+                )
             object.__setattr__(self, "table_px", table)
 
     @property

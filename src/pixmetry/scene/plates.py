@@ -88,7 +88,7 @@ def circle_images(homography: np.ndarray, x: np.ndarray, y: np.ndarray, radius: 
     size = -(conic[:, 2, 2] + (b * centre).sum(axis=1))
     values, axes = np.linalg.eigh(a / size[:, None, None])
     if not (values > 0).all():
-        raise ParameterError("a circle is not seen as an ellipse", where="pose", remedy="tilt the plate less or move it away (z_mm)")
+        raise ParameterError("the image of a circle is not an ellipse", where="pose", remedy="tilt the plate less or move it away (z_mm)")
     u, v = axes[:, :, 0] / np.sqrt(values[:, :1]), axes[:, :, 1] / np.sqrt(values[:, 1:])
     turned = u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0] < 0
     v[turned] *= -1

@@ -129,7 +129,7 @@ def chain(camera: str | Path | Camera, scene: Any, *, target: int | None = None,
         steps.append(
             Step(
                 name="scene" if link is None else link.name,
-                title="The scene, seen by full pixels" if link is None else link.source.title,
+                title="The scene on ideal pixels" if link is None else link.source.title,
                 source_id="" if link is None else link.source.id,
                 unit=UNITS[signal.kind],
                 image=image,
@@ -164,7 +164,7 @@ def _choose(scene: Any, camera: Camera, target: int | None, frame: int, seed: in
     out_rows, out_cols = camera.output_shape
     if not (-0.5 <= x <= out_cols - 0.5 and -0.5 <= y <= out_rows - 0.5):
         place = f"x {one['x_px']:g}, y {one['y_px']:g} px"
-        allowed = f"a place that a frame of {out_cols} x {out_rows} pixels shows"
+        allowed = f"a position within the frame of {out_cols} x {out_rows} pixels"
         remedy = "choose another with --target, or move it"
         raise InputError(f"target {target} lies outside of the frame", value=place, allowed=allowed, remedy=remedy)
     size = float(min(one.get("size_px") or one.get("diameter_px") or 12.0, 200.0))

@@ -178,7 +178,7 @@ def stored_bits(camera: Camera) -> int:
     converter = max(i for i, e in enumerate(camera.active) if e.source.produces is Kind.CODES)
     told = [e.params.bits for e in camera.active[converter:] if hasattr(e.params, "bits")]
     if not told:
-        raise InputError(f"{camera.active[converter].name} does not say how many bits its codes have", remedy="use grabber.adc")
+        raise InputError(f"{camera.active[converter].name} does not state the bits of its codes", remedy="use grabber.adc")
     return int(told[-1])
 
 
@@ -207,7 +207,7 @@ def _checked_window(camera: Camera, window: Window | None) -> Window:
 
 def _sequence(camera: Camera, model: SceneModel, frames: int, source: Any) -> list[_Part]:
     if frames < 1:
-        raise InputError("no frame is asked for", value=frames, allowed="1 or more")
+        raise InputError("the number of frames is not positive", value=frames, allowed="1 or more")
     where = str(source) if isinstance(source, str | Path) else "scene"
     return [_Part(build_scene(model, camera.frame_shape, where), range(frames), "frame", {})]
 

@@ -153,7 +153,7 @@ def _how(key: str, a: str, b: str) -> Difference:
 
 def _check_level(level: float) -> None:
     if not 0.5 <= level < 1:
-        raise InputError("not a level of confidence", where="level", value=level, allowed="0.5 up to below 1", remedy="take 0.95")
+        raise InputError("not a confidence level", where="level", value=level, allowed="0.5 up to below 1", remedy="take 0.95")
 
 
 def _notes(subjects: Sequence[Subject], passed_over: frozenset[str] = frozenset()) -> list[str]:
@@ -169,7 +169,7 @@ def _notes(subjects: Sequence[Subject], passed_over: frozenset[str] = frozenset(
     channels = [{channel for channel, _ in s.values} for s in subjects]
     rest = sorted(set().union(*channels) - channels[0].intersection(*channels))
     if rest:
-        notes.append(f"left out, as not all have them: channels {', '.join(rest)}")
+        notes.append(f"left out, because not all files have them: channels {', '.join(rest)}")
     told = [s.worth for s in subjects if s.worth is not None]
     if len(told) == len(subjects) and len({str(task) for task, _ in told}) == 1:
         worth = ", ".join(f"{u_px:.3g}" for _, u_px in told)
@@ -231,7 +231,7 @@ def compare_fleet(sources: Iterable[DataSheet | str | Path], *, level: float = 0
     rows = [replace(row, stands_out=tuple((i, j) in out for j in range(len(subjects)))) for i, row in enumerate(rows)]
     notes = _notes(subjects, frozenset({"name", "serial_number"}))
     if len(subjects) < JUDGED_FLEET:
-        few = f"{len(subjects)} cameras hardly tell their own spread, so that only a gross outlier would stand out"
+        few = f"{len(subjects)} cameras hardly determine their spread, so that only a gross outlier stands out"
         notes.append(f"{few}: name {JUDGED_FLEET} or more")
     return Fleet(tuple(s.name for s in subjects), kinds[0], level, tuple(rows), tuple(notes))
 

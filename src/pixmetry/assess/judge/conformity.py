@@ -145,7 +145,9 @@ def judge(
     if rule not in ("guarded_acceptance", "simple_acceptance", "guarded_rejection"):
         raise ParameterError("unknown rule", where="rule", value=rule, allowed="guarded_acceptance, simple_acceptance, guarded_rejection")
     if not lower < upper or u < 0 or dof <= 0:
-        raise ParameterError("limits in order, u of at least 0 and positive degrees of freedom are needed", value=(lower, upper, u, dof))
+        raise ParameterError(
+            "needed: lower limit below upper limit, u of at least 0, positive degrees of freedom", value=(lower, upper, u, dof)
+        )
     inside = lower <= value <= upper
     if math.isnan(value):
         return Judgement("undecided", math.nan, math.nan, (math.nan, math.nan), rule, "there is no value")

@@ -78,7 +78,7 @@ def difference_of(place: tuple[str, str], one: Subject, two: Subject, same_light
     row = Difference(channel, key, plain_unit(next(v.unit for v in (a, b) if v is not None)), a, b)
     if not is_there(a) or not is_there(b):
         if not is_there(a) and not is_there(b):
-            return replace(row, verdict="same", reason="without a value in both")
+            return replace(row, verdict="same", reason="no value in both")
         lacks, value = (two, b) if is_there(a) else (one, a)
         reason = value.reason if value else lacks.absent.get(key.rpartition(".")[0], "")
         return replace(row, verdict="only A" if is_there(a) else "only B", reason=reason)
@@ -89,7 +89,9 @@ def difference_of(place: tuple[str, str], one: Subject, two: Subject, same_light
     if key.startswith("index_"):
         foreign = not (one.release or two.release)
         verdict = "equal" if equal else "differs" if foreign else "setting"
-        return replace(row, verdict=verdict, reason="" if verdict != "setting" else "place in the series, no property of the camera")
+        return replace(
+            row, verdict=verdict, reason="" if verdict != "setting" else "number of a level in the series, not a property of the camera"
+        )
     sides, limits = _sides(a, b), _limits_text(a, b)
     if len(sides) > 1:
         return replace(row, verdict="same", reason=limits)

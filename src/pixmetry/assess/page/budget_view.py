@@ -28,20 +28,21 @@ CLASSES = {
     "O": "object and light",
 }
 CLASS_RULES = (
-    "Classes say what averaging does. T and Tr change from frame to frame: their variance falls as 1/n with n frames, and again with "
-    "the number of targets. F stays the same in every frame and changes from place to place: more frames do not help, more targets do. "
-    "G, D and O (smooth geometry, drift, object and light) fall with neither. Uncorrelated contributions add as squares, x and y apart; "
-    "a bias that is not corrected adds as its square and is lowered by no number of frames (JCGM 100:2008, 5.1.2 and F.2.4.5)."
+    "The class says what averaging does. T and Tr change from frame to frame: their variance falls as 1/n with n frames, and also with "
+    "the number of targets. F is the same in every frame and differs between positions: more frames do not help, more targets do. "
+    "G, D and O (smooth geometry, drift, object and light) fall with neither. Uncorrelated contributions add as squares, separately in x "
+    "and y. A bias that is not corrected adds as its square, for any number of frames (JCGM 100:2008, 5.1.2 and F.2.4.5)."
 )
 NOT_HELD = (
-    " Dark and evenly lit frames do not see the lens (distortion, blur, its change with focus and temperature), the geometry of sensor and "
-    "mount (tilt, unflatness, expansion), or the object and its lighting. These come on top; a calibration with targets shows them."
+    " Dark and evenly lit frames do not show the lens (distortion, blur, its change with focus and temperature), the geometry of sensor "
+    "and mount (tilt, unflatness, expansion), or the object and its lighting. Their errors are additional; a calibration with targets "
+    "measures them."
 )
 SOURCES = (
-    "One target, one frame; the largest first, then what was accepted. “Row” is the row of the handbook's error table, with its stars. "
-    "Contributions in thousandths of a pixel, bias and uncertainty together (root sum of squares). {} “Known to” is what the uncertainty "
-    "of the measured parameters makes of the analytic contribution. The share is that of the square of the sum; of accepted sources, that "
-    "of the sum with everything accepted."
+    "One target, one frame. The largest contributions first, then the accepted sources. “Row” is the row in the error table of a handbook "
+    "of camera calibration, with its stars. Contributions are in thousandths of a pixel: root sum of squares of bias and uncertainty. {} "
+    "“Known to” is the relative uncertainty of the analytic contribution that comes from the measured parameters. “Share” is the share of "
+    "the squared total; for accepted sources, of the squared total with all accepted sources."
 )
 NAMED = 6  # accepted sources that the verdict names
 
@@ -55,12 +56,14 @@ def verdict_section(budget: Budget) -> Section:
     parts: list[Text | Sequence[Reading]] = []
     if budget.interval is not None:
         coverage = f"{100 * budget.interval.coverage:g} %"
-        words = f"With a coverage of {coverage}, the position of one target in one frame is this near to its true position:"
+        words = f"With a coverage of {coverage}, the position of one target in one frame is within these limits of its true position:"
         parts += [Text(words), _readings(budget.interval.half_px, pitch, "± ")]
     parts += [
-        Text("One target in one frame, standard uncertainty (k = 1), everything that was measured or modelled, without calibration:"),
+        Text(
+            "Standard uncertainty (k = 1) of one target in one frame, with everything that was measured or modelled, without calibration:"
+        ),
         _readings((one.total_x_px, one.total_y_px), pitch),
-        Text("and after a calibration, which takes up what is constant or smooth over the frame:"),
+        Text("and after a calibration, which removes errors that are constant or smooth over the frame:"),
         _readings((one.left_x_px, one.left_y_px), pitch),
         *([Text(budget.headline.why)] if budget.headline is not None and budget.headline.why else []),
         Text(_shares(budget.largest)),
@@ -76,7 +79,7 @@ def verdict_section(budget: Budget) -> Section:
         words = " the pixel pitch of this camera was not given, so lengths are in pixels only. Add "
         keys = (Run("pitch_x_um", "code"), " and ", Run("pitch_y_um", "code"), " under ", Run("camera", "code"))
         section.add_text(strong("In µm:"), words, *keys, " in the campaign file and assess again.")
-    return section.add_text(strong("What this number does not hold."), NOT_HELD, style="soft")
+    return section.add_text(strong("Not included in this number."), NOT_HELD, style="soft")
 
 
 def _um(value_px: float, pitch: Pitch, axis: str) -> str:
@@ -110,7 +113,7 @@ def _with_accepted(budget: Budget, every: Combined) -> list[str | Run]:
         for axis, v in (("x", every.total_x_px), ("y", every.total_y_px))
     )
     left = f"(after a calibration x {length_px(every.left_x_px)} px, y {length_px(every.left_y_px)} px)"
-    head = "With everything that was accepted, not measured, at its catalogue bound: "
+    head = "With all sources that were accepted, not measured, at their bounds of the catalogue: "
     return [head, strong(x), ", ", strong(y), f" {left}. {_accepted(budget.accepted)}"]
 
 
@@ -123,7 +126,7 @@ def _ladder(budget: Budget) -> Table:
         rows.append([f"{known.frames} frame{'' if known.frames == 1 else 's'}", *cells])
     groups = ("as it is", "calibrated", "with accepted")
     columns: list[Column | str] = ["Frames averaged", *(Column(f"{axis} / px", "right", group=group) for group in groups for axis in "xy")]
-    caption = "More frames of the same target: what is random in time falls, what is fixed stays."
+    caption = "More frames of the same target: random errors fall, fixed errors stay."
     return Table("Uncertainty for more frames", columns, rows, caption)
 
 
@@ -140,20 +143,19 @@ def _shares(rows: Sequence[BudgetRow]) -> str:
     if parts.sum() == 0:
         return "Nothing that was measured moves this target."
     random, place, smooth, constant, drift = (percent(v) for v in parts / parts.sum())
-    drifting = f"; {drift} % drifts or belongs to the object, and the next image has it otherwise" if parts[4] else ""
+    drifting = f"; {drift} % is drift, or belongs to the object, and is different in the next image" if parts[4] else ""
     return (
-        f"Of the square of the sum, {random} % is random in time and falls with more frames; {place} % is fixed in the camera "
-        f"and changes from place to place; {smooth} % changes smoothly over the frame and {constant} % is the same everywhere, which a "
-        f"calibration takes up{drifting}."
+        f"Of the squared total, {random} % is random in time and falls with more frames. {place} % is fixed in the camera and differs "
+        f"between positions. {smooth} % changes smoothly over the frame and {constant} % is constant; a calibration removes both{drifting}."
     )
 
 
 def _accepted(rows: Sequence[BudgetRow]) -> str:
     if not rows:
-        return "Nothing was left to be accepted."
+        return "No source had to be accepted."
     names = ", ".join(r.title.lower() if not r.title[:2].isupper() else r.title for r in rows[:NAMED])
     more = f" and {len(rows) - NAMED} smaller" if len(rows) > NAMED else ""
-    return f"That adds the largest that is to be expected of a sound camera for {len(rows)} source{'s' * (len(rows) > 1)}: {names}{more}."
+    return f"This adds the largest value to be expected of a sound camera for {len(rows)} source{'s' * (len(rows) > 1)}: {names}{more}."
 
 
 def largest_section(budget: Budget) -> Section:
@@ -179,7 +181,7 @@ def largest_section(budget: Budget) -> Section:
         ]
         part = section.add_section("Accepted, not measured: what to measure first")
         part.add_text(
-            "These count only in the total with everything accepted, each at the largest that is to be expected of a sound camera."
+            "These count only in the total with all accepted sources, each at the largest value to be expected of a sound camera."
         )
         part.add(Points(items))
     return section
@@ -205,19 +207,22 @@ def _sizes(row: BudgetRow, pitch: Pitch) -> str:
 
 
 def _gain(advice: Any) -> str:
-    whole = "the total with everything accepted" if advice.status == "accepted" else "the total"
+    whole = "the total with all accepted sources" if advice.status == "accepted" else "the total"
     now, gone, half = (length_px(v, 3) for v in (advice.combined_px, advice.removed_px, advice.halved_px))
     less = percent(1 - advice.removed_px / advice.combined_px) if advice.combined_px else NONE
-    return f"without it {whole} would fall from {now} to {gone} px ({less} % less), with half of it to {half} px (rms of x and y)."
+    return (
+        f"without this source {whole} would fall from {now} to {gone} px ({less} % less); with half of it, to {half} px (rms of x and y)."
+    )
 
 
 def _monte_carlo_note(budget: Budget) -> str:
     done = next((r.monte_carlo for r in budget.rows if r.monte_carlo is not None), None)
     if done is None:
-        return "No Monte Carlo was made."
+        return "There is no Monte Carlo."
     return (
-        f"Monte Carlo with its standard error, from {done.trials} exposed windows a source ({done.units} cameras of this type, "
-        f"{done.places} places, {done.frames} frames each), for what the simulated camera holds."
+        f"Monte Carlo with its standard error, for the sources of the simulated camera, from {done.trials} simulated windows for each "
+        "source "
+        f"({done.units} cameras of this type, {done.places} positions, {done.frames} frames each)."
     )
 
 
@@ -287,7 +292,7 @@ def _known(row: BudgetRow) -> str:
 
 def sum_section(budget: Budget) -> Section:
     """The sum of all, beside one simulation with all of them, and how classes combine."""
-    section = Section("The sum, and one simulation with all of it", name="sum")
+    section = Section("The sum of the contributions, and one simulation of all sources", name="sum")
     columns: list[Column | str] = ["One target, one frame", Column("x", "right"), Column("y", "right")]
     section.add_table("Sum of the budget and Monte Carlo", columns, _sums(budget)).add_text(_interaction(budget))
     section.add_section("How classes combine", Text(CLASS_RULES))
@@ -305,7 +310,7 @@ def _sums(budget: Budget) -> list[Row]:
         row("Standard uncertainties, analytic", v.u_x_px, v.u_y_px),
         row("Constant over the frame (bias), analytic", v.bias_x_px, v.bias_y_px),
         row("Sum of all measured and modelled, analytic", v.total_x_px, v.total_y_px, True),
-        row("What a calibration leaves of it", v.left_x_px, v.left_y_px, True),
+        row("The same after a calibration", v.left_x_px, v.left_y_px, True),
     ]
     alone = [r.monte_carlo for r in budget.rows if r.monte_carlo is not None]
     if alone:
@@ -314,7 +319,7 @@ def _sums(budget: Budget) -> list[Row]:
         together = [budget.interaction.together]
         rows.append(row("One Monte Carlo with all sources on", _sum_of(together, "x"), _sum_of(together, "y"), True))
     every = budget.with_accepted[0]
-    return [*rows, row("The verdict, with everything accepted at its bound", every.total_x_px, every.total_y_px)]
+    return [*rows, row("The verdict, with all accepted sources at their bounds", every.total_x_px, every.total_y_px)]
 
 
 def _sum_of(results: list[MonteCarlo], axis: str) -> float:
@@ -325,26 +330,27 @@ def _interaction(budget: Budget) -> str:
     """Everything at once against everything alone, and whether the difference can be told from chance."""
     found, analytic_px = budget.interaction, (budget.sums[0] if budget.sums else budget.verdict).total_px
     if found is None:
-        return "No Monte Carlo was made."
+        return "There is no Monte Carlo."
     difference, se = found.difference_px, found.se_px
     places = min(max(decimals_of(se, 2), 0), 6) if se > 0 else 6
     if abs(difference) <= 2 * se:
-        verdict = "which is within two standard errors: no interaction is seen"
+        verdict = "which is within two standard errors: no interaction is significant"
     elif difference > 0:
-        verdict = "more than two standard errors: the sources act on each other"
+        verdict = "more than two standard errors: the sources interact"
     else:
-        verdict = "less by more than two standard errors: together the sources do less than the sum of each alone"
+        verdict = "below zero by more than two standard errors: the sources together are less than the sum of each alone"
     lost = f" In {found.together.lost} of {found.together.trials} windows no target was found." if found.together.lost else ""
 
     def px(value: float) -> str:
         return fixed(value, places)
 
     return (
-        f"All sources at once give {px(found.together.total_px)} ± {px(found.together.se_total_px)} px (rms of x and y); each alone, added "
-        f"(scatter as squares, biases with their signs), {px(found.sum_px)} ± {px(found.se_sum_px)} px. The interaction is the "
+        f"All sources at once give {px(found.together.total_px)} ± {px(found.together.se_total_px)} px (rms of x and y). The sum of "
+        "each source "
+        f"alone (scatter as squares, biases with their signs) is {px(found.sum_px)} ± {px(found.se_sum_px)} px. The interaction is the "
         f"difference, {px(difference)} ± {px(se)} px, {verdict}. The analytic sum is {px(analytic_px)} px.{lost}{_stands(budget)}"
     )
 
 
 def _stands(budget: Budget) -> str:
-    return "" if budget.headline is None else f" The verdict is by {'the sum' if budget.headline.by == SUM else 'Monte Carlo'}."
+    return "" if budget.headline is None else f" The verdict is that of {'the sum' if budget.headline.by == SUM else 'the Monte Carlo'}."

@@ -258,7 +258,7 @@ def _result(
     if lost:
         notes += (f"{lost} image points take no part: the adjusted point is behind its camera, or the distortion has no inverse there",)
     if dof <= 0:
-        notes += ("there is no redundancy: the standard deviation of unit weight is not determined and taken as 1",)
+        notes += ("there is no redundancy: the standard deviation of unit weight cannot be estimated and is set to 1",)
     return Adjustment(
         network=network,
         state=_of_determined(layout, now.state),

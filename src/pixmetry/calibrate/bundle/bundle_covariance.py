@@ -223,10 +223,13 @@ def raise_weak(layout: Layout, datum: Datum, now: Linearised, what: str) -> NoRe
     remedy = "add images that are tilted and rolled against each other, hold one of these parameters fixed, or give control points"
     free = int(layout.camera_count.sum())
     if len(layout.network.images) < 3 and free:
-        remedy = f"two images seldom carry {free} interior parameters: hold some of them, or add images"
+        remedy = f"two images seldom determine {free} interior parameters: hold some of them fixed, or add images"
     cause = f"weakest: {weak.text}"
     if abs(weak.correlation) > SAME:
-        cause = f"{weak.parameters[0]} is not determined: it cannot be told from {weak.parameters[1]} (correlation {weak.correlation:+.6f})"
+        cause = (
+            f"{weak.parameters[0]} is not determined: it cannot be separated from {weak.parameters[1]} (correlation "
+            f"{weak.correlation:+.6f})"
+        )
         what, cause = cause, what
     raise MeasureError(f"{what}; {cause}", where="bundle adjustment", remedy=remedy)
 

@@ -190,7 +190,7 @@ def _lost_bars(network: Network, there: np.ndarray) -> tuple[str, ...]:
     b = network.bars
     lost = np.flatnonzero(~(there[b.start] & there[b.end]))
     names = ", ".join(f"{network.points[b.start[k]]}–{network.points[b.end[k]]}" for k in lost)
-    return (f"scale bars take no part, because an end of them is not determined: {names}",) if len(lost) else ()
+    return (f"scale bars are not used, because an end point is not determined: {names}",) if len(lost) else ()
 
 
 def without(layout: Layout, start: State, points: np.ndarray) -> Layout:
@@ -200,7 +200,7 @@ def without(layout: Layout, start: State, points: np.ndarray) -> Layout:
     used = np.zeros(len(layout.network), bool)
     used[layout.order[layout.used]] = True
     names = ", ".join(layout.network.points[j] for j in points[:5]) + (" …" if len(points) > 5 else "")
-    note = f"{len(points)} points are not determined, as their rays hardly meet at an angle: {names}"
+    note = f"{len(points)} points are not determined, because their rays are almost parallel: {names}"
     rest = layout_of(layout.network, replace(start, xyz=xyz), used)
     return replace(rest, notes=(*rest.notes, note))
 

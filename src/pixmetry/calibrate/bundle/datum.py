@@ -97,9 +97,10 @@ def _carriers(layout: Layout, start: State, motion: np.ndarray) -> tuple[np.ndar
         if _carry(motion[carriers]):
             return carriers, False
     raise MeasureError(
-        f"what is known leaves {motion.shape[2]} of the seven parameters of the datum open, and no free coordinates carry them",
+        f"what is known leaves {motion.shape[2]} of the seven parameters of the datum open, and there are no free coordinates for inner "
+        "constraints",
         where="bundle adjustment",
-        remedy="let more coordinates free, or give control points that are not in line",
+        remedy="leave more coordinates free, or give control points that are not on one line",
     )
 
 

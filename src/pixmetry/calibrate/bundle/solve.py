@@ -76,11 +76,11 @@ def _no_scale(network: Network, adjustment: Adjustment) -> list[Finding]:
     if network.given.sum() >= 3 or not scale_is_open(adjustment):
         return []
     found = to_their_frame(network, adjustment.state)
-    text = f"nothing says how large the object is: lengths are in mean distances between the images, not in {network.unit}"
+    text = f"the scale of the object is not known: the unit of length is the mean distance between the images, not {network.unit}"
     if found is not None and 1 / SIZED < found[0] < SIZED:
-        text = "nothing but the start poses says how large the object is: lengths are as good as these"
+        text = "only the start poses give the scale of the object: lengths are only as accurate as these"
     elif np.isfinite(network.u_xyz).any():
-        text = f"what is known of the points does not say how large the object is: lengths are not in {network.unit}"
+        text = f"the known coordinates do not give the scale of the object: lengths are not in {network.unit}"
     return [Finding("no_scale", text, "give a scale bar, or the coordinates of two points", "warning")]
 
 
@@ -98,7 +98,9 @@ def _from_start(network: Network, start: State | None, options: Options, say: Pr
             return _from_start(replace(network, poses=None), None, options, say)
         except MeasureError:
             if error.where == "start values":
-                error.remedy += "; the start poses do not fit either: check which way the camera looks and the rotations go"
+                error.remedy += (
+                    "; the start poses do not fit either: check the viewing direction of the camera and the sense of the rotations"
+                )
             raise error from None
 
 
@@ -143,9 +145,9 @@ def _settled(measured: Network, state: State, options: Options, say: Progress) -
         rest = replace(measured, per_image=tuple(name for name in measured.per_image if name != "x_shift"))
         adjust(rest, state, loss="huber")  # raises where the reason is another
     image = _least_tilted(measured, state)
-    what = "the x-shifts of the images cannot be told from where the cameras stand and look"
+    what = "the x-shifts of the images cannot be separated from the poses of the cameras"
     where = f"x_shift of image {image}" if image else "x_shift"
-    remedy = "leave x_shift out of per_image (x_scale may stay), or take tilted images only, of a field with depth"
+    remedy = "leave x_shift out of per_image (x_scale may stay), or use only tilted images of a test field with depth"
     raise MeasureError(what, where=where, remedy=remedy) from None
 
 

@@ -64,7 +64,7 @@ class CheckPoints:
         except (TypeError, ValueError):  # no numbers, or rows of unequal length
             pass
         if not good or len(set(names)) < len(names):
-            allowed = "names that differ, and for each X, Y, Z (NaN: not known) with uncertainties of at least 0"
+            allowed = "different names, and for each name X, Y, Z (NaN: not known) with uncertainties of at least 0"
             raise InputError("these cannot be check points", where="check_points", allowed=allowed)
         for key, value in (("names", names), ("xyz", xyz), ("u_xyz", u)):
             object.__setattr__(self, key, value)
@@ -82,7 +82,7 @@ def refuse_known(network: Network, checks: CheckPoints) -> None:
     both = set(checks.names) & {network.points[k] for k in np.flatnonzero(known)}
     name = next((name for name in checks.names if name in both), None)
     if name is not None:
-        remedy = "delete it in one of the two: what is compared takes no part in the adjustment, not even as a start value"
+        remedy = "delete it in one of the two: a check point takes no part in the adjustment, not even as a start value"
         raise InputError(f"point '{name}' is among the points and the check points", where="check_points", remedy=remedy)
 
 
@@ -264,11 +264,11 @@ def _text(found: CheckRecord) -> str:
     )
     points, unit = sum(bool(np.isfinite(point.difference).any()) for point in found.points), found.unit
     noun = "check point" if points == 1 else "check points"
-    text = f"{points} {noun} with {found.n} coordinates: given less found {rms} {unit} rms"
+    text = f"{points} {noun} with {found.n} coordinates: given minus computed {rms} {unit} rms"
     if found.datum_parameters:
-        text += f", after {found.datum_parameters} parameters of the datum that nothing else gives were fitted to them"
+        text += f", after {found.datum_parameters} parameters of the datum, which nothing else determines, were fitted to them"
     if found.p is None:
-        return f"{text}; so few check points say nothing about a network without a datum of its own"
+        return f"{text}; so few check points cannot test a network without a datum of its own"
     return f"{text}, expected {expected} {unit}; {_chi2(found)}; largest: {_worst(found)}"
 
 
@@ -295,8 +295,8 @@ def check_findings(record: CheckRecord) -> list[Finding]:
     empty = [point.name for point, known in some if not known]
     lost = [point.name for point, known in some if known and not np.isfinite(point.found).all()]
     for names, what, advice in (
-        (empty, "without coordinates", "Fill in X, Y or Z; a row without them compares nothing."),
-        (lost, "not determined", "See them in two images or more, and compare their names with those of the image coordinates."),
+        (empty, "without coordinates", "Fill in X, Y or Z; a row without coordinates cannot be compared."),
+        (lost, "not determined", "Measure them in two images or more, and compare their names with those of the image coordinates."),
     ):
         if names:
             named = ", ".join(names[:NAMED]) + (" …" if len(names) > NAMED else "")
@@ -308,8 +308,8 @@ def check_findings(record: CheckRecord) -> list[Finding]:
     single = abs(worst.ratio) > worst.critical
     if single or record.p < RARE:
         named = _worst(record, f", critical {worst.critical:.1f}")
-        text = f"The check points contradict the network (level {RARE:g}): {_chi2(record)}; the worst, given less found: {named}."
-        advice = "Check the coordinates, the name and the image points of this one." if single else "No single one stands out."
-        advice += " Where several are off, the given uncertainties or those of the network are too small."
+        text = f"The check points contradict the network (level {RARE:g}): {_chi2(record)}; the worst, given minus computed: {named}."
+        advice = "Check the coordinates, the name and the image points of this one." if single else "No single point stands out."
+        advice += " If several are wrong, the given uncertainties or those of the network are too small."
         found.append(Finding("check_points", text, advice, "warning"))
     return found

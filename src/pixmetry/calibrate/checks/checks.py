@@ -56,8 +56,8 @@ def check_network(network: Network) -> tuple[Finding, ...]:
     _check_one_image(network, usable)
     _check_ties(network, usable, findings)
     if len(seldom):
-        text = f"{many(len(seldom), 'point')} seen in one image only, without a part in the adjustment: {_named(network.points, seldom)}"
-        findings.append(Finding("single_points", text, "take them from a second image, or give their coordinates"))
+        text = f"{many(len(seldom), 'point')} seen in one image only and not used: {_named(network.points, seldom)}"
+        findings.append(Finding("single_points", text, "measure them in a second image, or give their coordinates"))
     return tuple(findings)
 
 
@@ -88,7 +88,7 @@ def _check_frames(network: Network) -> list[Finding]:
         where = f"image coordinates of {camera.name}"
         if reach < NEAR_ORIGIN:
             remedy = "state their unit (mm or px) and origin in the project, or the size of the frame"
-            what = "all of them lie close to the origin, as if they were not in pixels"
+            what = "all of them are close to the origin, as if they were not in pixels"
             raise InputError(what, where=where, value=extent, allowed=frame, remedy=remedy)
         if len(rows) >= ENOUGH and np.quantile(off, 0.98) < ONE_PLACE / 2:
             what = f"all of them lie within {ONE_PLACE:.0%} of the frame about one place"
@@ -123,7 +123,7 @@ def _check_bars(network: Network) -> list[Finding]:
     if len(loose):
         ends = ", ".join(f"{network.points[bars.start[b]]} to {network.points[bars.end[b]]}" for b in loose[:NAMED])
         text = f"{len(loose)} scale bars end at points seen in fewer than two images: {ends}"
-        findings.append(Finding("loose_bars", text, "see their ends from two images or more", "warning"))
+        findings.append(Finding("loose_bars", text, "measure their ends in two images or more", "warning"))
     there = np.linalg.norm(network.xyz[bars.start] - network.xyz[bars.end], axis=1)
     given = np.isfinite(there) & (there > 0)
     if not given.any():
@@ -139,7 +139,7 @@ def _check_bars(network: Network) -> list[Finding]:
         value = f"bar length by distance between the points {ratio:.4g}"
         raise InputError(what, where="scale bars", value=value, allowed="about 1", remedy="use one unit, and check the bars' points")
     text = f"scale bars are {ratio:.3g} times as long as the approximate coordinates say"
-    return [*findings, Finding("bar_ratio", text, "the bars decide; check their points and lengths", "warning")]
+    return [*findings, Finding("bar_ratio", text, "the scale bars are used; check their points and lengths", "warning")]
 
 
 def _usable(network: Network, findings: list[Finding]) -> tuple[np.ndarray, np.ndarray]:
@@ -153,8 +153,8 @@ def _usable(network: Network, findings: list[Finding]) -> tuple[np.ndarray, np.n
     if not usable.any():
         reason = f"no image shares {FEWEST} points with others or with known ones"
         reason = "points on a line in each image" if len(lines) > len(few) else reason
-        remedy = "check that the names of the points agree between the images, and spread the points over the frame"
-        raise MeasureError("no image can take part", where="network", value=reason, allowed=f"{FEWEST} points or more", remedy=remedy)
+        remedy = "check that the names of the points agree between the images, and distribute the points over the frame"
+        raise MeasureError("no image can be used", where="network", value=reason, allowed=f"{FEWEST} points or more", remedy=remedy)
     return usable, seldom
 
 
@@ -208,7 +208,7 @@ def _check_one_image(network: Network, usable: np.ndarray) -> None:
     known = network.control
     seen = network.point[network.image == only]
     if network.cameras[network.camera_of[only]].free.any() and thickness(network.xyz[seen[known[seen]]])[0] < FLAT:
-        what = "one image of a plane does not determine a camera: principal distance and principal point go with its pose"
+        what = "one image of a plane does not determine a camera: principal distance and principal point cannot be separated from the pose"
         raise MeasureError(what, where=network.images[only], allowed="several images, or one of a field with depth", remedy=MORE_IMAGES)
 
 
@@ -230,8 +230,8 @@ def _check_ties(network: Network, usable: np.ndarray, findings: list[Finding]) -
     if size[order[1]] >= 2:
         text = "; ".join(f"{len(group)} images ({_named(network.images, group)})" for group in groups[:4] if len(group) > 1)
         allowed = f"{TIE} common points between one group and the other, better 10"
-        remedy = "take images that see both, check the names of the points, or calibrate the groups one by one"
-        raise MeasureError("the network falls apart", where="network", value=text, allowed=allowed, remedy=remedy)
+        remedy = "take images that show both, check the names of the points, or calibrate the groups separately"
+        raise MeasureError("the network consists of separate parts", where="network", value=text, allowed=allowed, remedy=remedy)
     alone = np.concatenate(groups[1:])
     text = f"{many(len(alone), 'image')} with fewer than {TIE} points in common with any other: {_named(network.images, alone)}"
     findings.append(Finding("images_left_out", text, "take images that overlap, or check the names of the points", "warning"))
@@ -284,14 +284,14 @@ def left_out(network: Network, state: State) -> list[Finding]:
     names = ", ".join(f"{network.images[i]} ({count[i]} of its {measured[i]} points are determined without it)" for i in missing[:NAMED])
     more = f" and {len(missing) - NAMED} more" if len(missing) > NAMED else ""
     verb = "is" if len(missing) == 1 else "are"
-    text = f"{len(missing)} of {np.count_nonzero(measured)} images {verb} not oriented and took no part: {names}{more}"
+    text = f"{len(missing)} of {np.count_nonzero(measured)} images {verb} not oriented and not used: {names}{more}"
     rays = [np.bincount(network.point[rows], minlength=len(network.points)) for rows in (slice(None), posed[network.image])]
     gone = int(((rays[0] >= 2) & (rays[1] < 2) & ~np.isfinite(state.xyz[:, 0])).sum())
     if gone:
-        text += f"; with them {'goes' if gone == 1 else 'go'} {many(gone, 'point')} that the other images see too seldom"
-    advice = "give them rough poses or more points that other images see; check the names of their points and their camera"
+        text += f"; with them {'goes' if gone == 1 else 'go'} {many(gone, 'point')} that too few other images show"
+    advice = "give them rough poses or more points that other images show; check the names of their points and their camera"
     if (count[missing] >= 2 * FEWEST).all():  # there is nothing that they lack: what is said of them is wrong
-        advice = "check the names of their points, their camera, and whether x and y are exchanged: enough of their points are determined"
+        advice = "check the names of their points, their camera, and whether x and y are swapped: enough of their points are determined"
     return [Finding("images_left_out", text, advice, "warning")]
 
 
@@ -306,7 +306,11 @@ def _both_sides(network: Network, state: State) -> list[Finding]:
     if not len(fewer) or len(fewer) == len(posed):
         return []
     text = f"the plane of the points seems to be seen from behind in {many(len(fewer), 'image')}: {_named(network.images, fewer)}"
-    return [Finding("both_sides", text, "if it is not made of glass, these images are mirrored or their points misnamed", "warning")]
+    return [
+        Finding(
+            "both_sides", text, "unless the field is transparent, these images are mirrored or their points have wrong names", "warning"
+        )
+    ]
 
 
 def _check_camera(adjustment: Adjustment, k: int) -> list[Finding]:
@@ -328,7 +332,7 @@ def _check_camera(adjustment: Adjustment, k: int) -> list[Finding]:
         if u_name is not None and u_name > POOR_POINT * width:
             r = _median([_correlation(adjustment, f"{camera.name}:{name}", i, axis) for i in images])
             size = f"u = {plain(u_name, 2)} px"
-            text = f"{name} of {camera.name} is badly determined: {size}, correlation with the places of the images {r:+.4f}"
+            text = f"{name} of {camera.name} is badly determined: {size}, correlation with the positions of the images {r:+.4f}"
             rolled = _rolled(adjustment.state.rotation[images])
             advice = "add images from other directions" if rolled else "roll the camera by 90° in some of the images"
             findings.append(Finding("correlation", text, advice, "warning"))
@@ -384,4 +388,4 @@ def _parallel_rays(network: Network, state: State, used: np.ndarray) -> list[Fin
         return []
     share = f"{len(poor)} of {np.count_nonzero(count >= 2)} points"
     text = f"the rays to {share} meet at less than {np.rad2deg(PARALLEL):.0f}°: {_named(network.points, poor)}"
-    return [Finding("parallel_rays", text, "their depth is uncertain; see them from further apart", "warning")]
+    return [Finding("parallel_rays", text, "their depth is uncertain; take images from positions that are farther apart", "warning")]

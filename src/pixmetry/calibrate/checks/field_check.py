@@ -28,10 +28,10 @@ class FieldCheck:
     ----------
     verdict : {"fixed", "free"}
     adjustment : Adjustment
-        The one that stands.
+        The accepted one.
     fixed : Adjustment
     free : Adjustment or None
-        None: the images do not carry free points (the finding says why).
+        None: the images do not determine free points (the finding says why).
     field : FieldTest
     hold_out : HoldOut or None
         None where free points could not be tried or judged.
@@ -79,13 +79,13 @@ def check_field(fixed: Adjustment, folds: int = 5, seed: int = 0, level: float =
     try:
         free = adjust(released, fixed.state, used=fixed.used, redundancy=fixed.redundancy is not None)
     except MeasureError as reason:
-        return _kept(fixed, f"the images do not carry free points: {reason}")
+        return _kept(fixed, f"the images do not determine free points: {reason}")
     if fixed.dof - free.dof < 1:
-        return _kept(fixed, "they hold no more than origin, directions and scale")
+        return _kept(fixed, "they give only origin, directions and scale")
     try:
         parts = left_out(fixed, folds, seed), left_out(free, folds, seed)
     except (InputError, MeasureError) as reason:
-        return _kept(fixed, f"free points cannot be judged by images left out: {reason}")
+        return _kept(fixed, f"images left out cannot test free points: {reason}")
     held = hold_out_record(*parts)
     f, dof, p = _given_coordinates(fixed, free)
     assert held.fixed is not None and held.free is not None and held.p is not None  # both were asked for
@@ -100,7 +100,7 @@ def check_field(fixed: Adjustment, folds: int = 5, seed: int = 0, level: float =
 
 
 def _kept(fixed: Adjustment, text: str) -> FieldCheck:
-    text = f"The given coordinates stand untested: {text}."
+    text = f"The given coordinates were not tested, and are used: {text}."
     return FieldCheck("fixed", fixed, fixed, None, FieldTest("fixed", None, text), None, (Finding("field", text),))
 
 
@@ -183,14 +183,14 @@ def _text(verdict: str, compared: FieldComparison, held: HoldOut, level: float) 
     p_held = "" if held.p is None else p_words(held.p)
     judged = f"images left out of the fit show {left} ({p_held}); F = {compared.f:.3g}, {p_words(compared.p)}"
     if verdict == "fixed":
-        return f"The given coordinates of the test field stand: {judged}, not both below {level:g}."
+        return f"The given coordinates of the test field are accepted: {judged}, not both below {level:g}."
     if plane:
-        inside = f"in its plane, points lie off by rms {off.rms_in_plane:.3g} {unit}, peak {off.peak_in_plane:.3g} {unit}"
-        what = f"The board is not flat: it leaves its best plane by {numbers}; {inside}"
+        inside = f"in its plane, points deviate by rms {off.rms_in_plane:.3g} {unit}, peak {off.peak_in_plane:.3g} {unit}"
+        what = f"The board is not flat: it deviates from its best plane by {numbers}; {inside}"
         if off.p_flat is not None and off.p_flat > level:
-            what = f"The board is not as given: {inside}; it leaves its best plane by {numbers}"
+            what = f"The board differs from the given coordinates: {inside}; it deviates from its best plane by {numbers}"
     else:
-        what = f"The test field is not as given: its points lie off by {numbers}"
+        what = f"The test field differs from the given coordinates: its points deviate by {numbers}"
     return f"{what}. {judged[0].upper()}{judged[1:]}. Free points moved {_moved_words(compared.first)}."
 
 

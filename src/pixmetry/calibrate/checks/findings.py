@@ -87,10 +87,16 @@ def in_the_shadow(patterns: Iterable[Finding]) -> list[Finding]:
     if len(others) > shown:
         what = "; ".join(dict.fromkeys(MEANING[f.kind][0] for f in others[shown:]))
         if drift:
-            text = f"There are other patterns, which the drift of the x-scale alone can make: {what}."
-            out.append(Finding("pattern", text, "Look at them again with an x-scale for each image."))
+            text = f"There are other patterns, which the drift of the x-scale alone can cause: {what}."
+            out.append(Finding("pattern", text, "Estimate an x-scale for each image, and check again."))
         else:
-            out.append(Finding("pattern", f"Residuals show further patterns, less surely: {what}.", "See to the others first."))
+            out.append(
+                Finding(
+                    "pattern",
+                    f"Residuals show further patterns, with less certainty: {what}.",
+                    "Remove the causes of the other patterns first.",
+                )
+            )
     return out
 
 
@@ -106,8 +112,8 @@ def parameter_findings(parameters: Sequence[ParameterTest]) -> list[Finding]:
             advice = f"Leave {'it out' if len(weak) == 1 else 'them out, one at a time'}, unless other calibrations of this camera need it."
             found.append(Finding("significance", text, advice))
         for a, b, r in _pairs(mine):
-            text = f"{camera}: {a} and {b} are wholly correlated (r = {r:+.4f}); only their sum effect is determined."
-            found.append(Finding("correlation", text, f"Fix one of {a} and {b}, or add images that part them.", "warning"))
+            text = f"{camera}: {a} and {b} are completely correlated (r = {r:+.4f}); only their combined effect is determined."
+            found.append(Finding("correlation", text, f"Fix one of {a} and {b}, or add images that separate them.", "warning"))
     return found
 
 
@@ -127,7 +133,7 @@ def f_test_findings(f_tests: Mapping[str, FTest]) -> list[Finding]:
     found = []
     for camera, test in f_tests.items():
         if test.p_px < RARE:
-            advice = "Look for what acts along lines: line jitter, the grabber's clock, or motion."
+            advice = "Look for a cause along the rows: line jitter, the grabber's clock, or motion."
             found.append(Finding("f_test", f"{camera}: {test.text}.", advice, "warning"))
     return found
 
@@ -142,9 +148,9 @@ def rejected_image_findings(images: Sequence[ImageRecord]) -> list[Finding]:
     found = mostly_rejected(images)
     if not found:
         return []
-    advice = "Check the camera of these images and the names of their points. If both are right, the images are bad: leave them out."
+    advice = "Check the camera of these images and the names of their points. If both are right, the images are poor: leave them out."
     if len(found) == 1:
-        advice = "Check its camera and the names of its points. If both are right, it is a bad image: leave it out."
+        advice = "Check its camera and the names of its points. If both are right, the image is poor: leave it out."
         text = f"Image {found[0].image}: {found[0].rejected} of {found[0].measured} image points were rejected."
     else:
         named = ", ".join(f"{i.image} ({i.rejected} of {i.measured})" for i in found[:NAMED])
@@ -168,11 +174,11 @@ def gross_error_findings(errors: Sequence[GrossError], adjustment: Adjustment, i
     others = {"images that are not oriented": int((~posed).sum())}
     others["points that are not determined"] = total - int(adjustment.used.sum()) - len(errors) - others["images that are not oriented"]
     said = " and ".join(f"{count} of {what}" for what, count in others.items() if count)
-    text += f" Not among them, and without a part: {said}." if said else ""
+    text += f" Not counted here, and not used: {said}." if said else ""
     many = len(errors) > 0.05 * total
-    advice = "Look at these targets in the images, and at their names."
+    advice = "Check these targets in the images, and their names."
     if many:
-        advice = "Check how targets are located and named: so many are not single mistakes."
+        advice = "Check how targets are located and named: this many are not single mistakes."
     return [Finding("gross_error", text, advice, "warning" if many else "note")]
 
 
@@ -182,9 +188,9 @@ def _swapped_names(errors: Sequence[GrossError], network: Network) -> str:
         return ""
     often = Counter((a, b) for _, a, b in pairs)
     always = {pair for pair, count in often.items() if count > 1 and count > THROUGHOUT * _images_of_both(network, *pair)}
-    said = [f"{a} and {b} in {often[a, b]} images, rather in the table of points or throughout" for a, b in always]
+    said = [f"{a} and {b} in {often[a, b]} images, more likely in the table of points or in all images" for a, b in always]
     said += [f"{a} and {b} in {image}" for image, a, b in pairs if (a, b) not in always]
-    return f" Names seem to be exchanged: {'; '.join(said[:NAMED])}{'; …' if len(said) > NAMED else ''}."
+    return f" Names seem to be swapped: {'; '.join(said[:NAMED])}{'; …' if len(said) > NAMED else ''}."
 
 
 def _images_of_both(network: Network, a: str, b: str) -> int:
@@ -200,8 +206,11 @@ def two_ray_findings(adjustment: Adjustment) -> list[Finding]:
     two = int((free & (rays == 2)).sum())
     if two <= TWO_RAY_SHARE * free.sum():
         return []
-    text = f"{two} of {int(free.sum())} points rest on two rays: an error of their image points along the epipolar line does not show."
-    return [Finding("two_rays", text, "Where such a point matters, take it from a third image.")]
+    text = (
+        f"{two} of {int(free.sum())} points are determined by two rays only: an error of an image point along the epipolar line "
+        "cannot be detected."
+    )
+    return [Finding("two_rays", text, "If such a point matters, measure it in a third image.")]
 
 
 def lost_findings(adjustment: Adjustment) -> list[Finding]:
@@ -219,7 +228,7 @@ def lost_findings(adjustment: Adjustment) -> list[Finding]:
     ends = np.isin(network.bars.start, lost) | np.isin(network.bars.end, lost)
     if ends.any():
         text += f"; with them go {ends.sum()} of {len(ends)} scale bars"
-    advice = "Look at these points in their images: with so few rays it cannot be told which of them is wrong; one more would tell."
+    advice = "Look at these points in their images: with so few rays it is not clear which one is wrong. One more ray decides."
     return [Finding("lost_points", f"{text}.", advice, "warning")]
 
 
@@ -228,7 +237,7 @@ def known_findings(known: KnownRecord, unit: str) -> list[Finding]:
     found = []
     if known.untested:
         text = f"Neither control points nor scale bars could be tested: without them {known.untested}."
-        advice = "If one of them is wrong, image points were left out in its stead: check the values where many are."
+        advice = "If one of them is wrong, image points were left out instead: check the values where many are left out."
         found.append(Finding("known_untested", text, advice, "warning"))
     for record, noun, factor in (
         (known.scale_bars, "scale bar", None),
@@ -237,15 +246,18 @@ def known_findings(known: KnownRecord, unit: str) -> list[Finding]:
         found += [_gross_finding(gross, noun, unit) for gross in _once(record.gross)[:NAMED]]
         group = record.group
         if factor:
-            text = f"The {noun}s miss the network by about {factor:.2g} times their stated uncertainties, which were raised by this."
-            found.append(Finding("known_uncertainty", text, "State their uncertainties anew.", "warning"))
+            text = (
+                f"The {noun}s miss the network by about {factor:.2g} times their stated uncertainties. The uncertainties were "
+                "multiplied by this factor."
+            )
+            found.append(Finding("known_uncertainty", text, "Correct their uncertainties.", "warning"))
         elif group and group.p < RARE and (group.factor > 1 or not record.gross):
             found.append(_group_finding(group, noun))
     fixed = known.fixed_points
     if fixed and fixed.p < RARE:
         miss = plain(fixed.miss, 2)
         text = f"The {fixed.n} fixed points miss the network by about {miss} {unit} together ({p_words(fixed.p)})."
-        advice = f"Look for a mistake in their coordinates; if there is none, they are not exact: known: weighted with u = {miss} {unit}."
+        advice = f"Look for a mistake in their coordinates. If there is none, they are not exact: known: weighted with u = {miss} {unit}."
         found.append(Finding("known_uncertainty", text, advice, "warning"))
     return found
 
@@ -270,7 +282,7 @@ def _gross_finding(gross: Contradicted, noun: str, unit: str) -> Finding:
     text = f"The {noun} {gross.name} does not agree with the network: it seems wrong by {gross.error:+.4g} {unit}"
     text += f" (test {gross.statistic:.1f}, critical {gross.critical:.1f})."
     if _swap_of(gross):
-        text += f" It lies where {_swap_of(gross)} should be: their names seem to be exchanged in the table of points."
+        text += f" It lies where {_swap_of(gross)} should be: their names seem to be swapped in the table of points."
     advice = f"Check its value, its unit and the names of its points; {_what_was_done(gross)}."
     return Finding(f"gross_{noun.replace(' ', '_')}", text, advice, "warning")
 
@@ -280,18 +292,18 @@ def _what_was_done(gross: Contradicted) -> str:
         return "it was left out"
     others = gross.rivals
     if not others:
-        return "with so few it cannot be said which is wrong, and it weighs less now"
+        return "with so few it is not clear which one is wrong, and its weight was reduced"
     named = ", ".join(others[:NAMED]) + (" …" if len(others) > NAMED else "")
-    return f"it cannot be said whether it is wrong or {'one of ' if len(others) > 1 else ''}{named}, and they weigh less now"
+    return f"it is not clear whether it is wrong or {'one of ' if len(others) > 1 else ''}{named}, and their weights were reduced"
 
 
 def _group_finding(group: KnownGroup, noun: str) -> Finding:
     """A group that scatters otherwise than stated; what stands out comes before new uncertainties for all."""
-    text = f"The {noun}s scatter {np.sqrt(group.factor):.2g} times as much as their stated uncertainties say."
+    text = f"The {noun}s scatter {np.sqrt(group.factor):.2g} times as much as their stated uncertainties."
     if group.factor <= 1:
-        return Finding("known_uncertainty", text, "State their uncertainties anew.", "note")
+        return Finding("known_uncertainty", text, "Correct their uncertainties.", "note")
     largest = "; ".join(f"{one.name}, {abs(one.ratio):.2g} u" for one in group.largest)
-    advice = f"Check the largest first: {largest}. If they are right, state the uncertainties anew."
+    advice = f"Check the largest first: {largest}. If they are right, correct the uncertainties."
     return Finding("known_uncertainty", text, advice, "warning")
 
 

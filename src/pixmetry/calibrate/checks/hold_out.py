@@ -283,7 +283,7 @@ def _text(found: HoldOut) -> str:
         if record is not None:
             words.append(f"{name}: {record.fit_rms_px:.4f} px in the fit, {record.left_out_rms_px:.4f} px in images left out")
     text = f"{'; '.join(words)} ({found.folds} folds; rms of a coordinate)"
-    return text if found.p is None else f"{text}; {p_words(found.p)} for the fall of the latter"
+    return text if found.p is None else f"{text}; {p_words(found.p)} for the decrease of the latter"
 
 
 def _rms_record(part: LeftOut, common: np.ndarray) -> HeldRms:

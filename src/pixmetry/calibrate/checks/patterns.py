@@ -31,47 +31,47 @@ MANY = 200  # a test needs so many image points of a camera
 
 # what is seen; the error source in the catalogue; what to do
 MEANING = {
-    "radius": ("radial residuals follow the radius", "optics.distortion", "estimate k4 and k5, or correct by a residual grid"),
+    "radius": ("radial residuals depend on the radius", "optics.distortion", "estimate k4 and k5, or correct by a residual grid"),
     "unflatness": (
-        "radial residuals follow the place in the frame, not the radius alone",
+        "radial residuals depend on the position in the frame, not only on the radius",
         "sensor.unflatness",
-        "correct by a residual grid; let views at other angles show whether the shifts grow with the tangent of the chief ray",
+        "correct by a residual grid; check with views at other angles whether the shifts grow with the tangent of the chief ray",
     ),
-    "field": ("residuals follow the place in the frame", "sensor.pixel_geometry", "correct by a residual grid"),
+    "field": ("residuals depend on the position in the frame", "sensor.pixel_geometry", "correct by a residual grid"),
     "rows_x": (
-        "x residuals follow the row",
+        "x residuals depend on the row",
         "grabber.line_jitter",
-        "let the clock settle before the first rows that are used, or correct by a residual grid",
+        "do not use the first rows, where the clock still settles, or correct by a residual grid",
     ),
     "columns_x": (
-        "x residuals follow the column",
+        "x residuals depend on the column",
         "grabber.sampling_clock",
         "sample with the camera's pixel clock, or correct by a residual grid",
     ),
     "wave_xx": (
         "x residuals are periodic along the row",
         "grabber.phase_pattern",
-        "average images, or remove the interference; look at the targets if the period is theirs",
+        "average images, or remove the interference; if the period is that of the targets, check how they are located",
     ),
     "wave_xy": (
         "x residuals are periodic down the column",
         "grabber.line_jitter",
-        "compare the fields; average images; look at the targets if the period is theirs",
+        "compare the fields; average images; if the period is that of the targets, check how they are located",
     ),
     "wave_yy": (
         "y residuals are periodic down the column",
         "sensor.pixel_geometry",
-        "use larger targets; look at how they are located if the period is theirs",
+        "use larger targets; if the period is that of the targets, check how they are located",
     ),
     "phase_x": (
-        "x residuals follow the sub-pixel phase",
+        "x residuals depend on the sub-pixel phase",
         "sensor.pixel_aperture",
-        "use larger or softer targets, or an estimator of their place that has no such bias",
+        "use larger or softer targets, or an estimator without this bias",
     ),
     "phase_y": (
-        "y residuals follow the sub-pixel phase",
+        "y residuals depend on the sub-pixel phase",
         "sensor.pixel_aperture",
-        "use larger or softer targets, or an estimator of their place that has no such bias",
+        "use larger or softer targets, or an estimator without this bias",
     ),
     "x_scale_trend": (
         "the scale of x drifts from the first image to the last",
@@ -86,17 +86,17 @@ MEANING = {
         "sensor.thermal_expansion",
         "wait until the camera is warm, and lock the lens",
     ),
-    "image_rms": ("residuals are larger in some images than in others", "", "look at the worst images: focus, movement, light"),
+    "image_rms": ("residuals are larger in some images than in others", "", "check the worst images: focus, movement, light"),
 }
 
 SOURCES = {  # in words
     "optics.distortion": "lens distortion beyond the terms that were estimated",
     "sensor.unflatness": "a sensor that is not flat",
-    "sensor.pixel_geometry": "pixels, lens or board that are irregular on a small scale",
-    "grabber.line_jitter": "lines that a frame grabber does not start at one place",
+    "sensor.pixel_geometry": "small-scale irregularities of pixels, lens or board",
+    "grabber.line_jitter": "lines that a frame grabber starts at different positions",
     "grabber.sampling_clock": "samples that are not evenly spaced along a line",
-    "grabber.phase_pattern": "interference that the sampling clock brings in",
-    "sensor.pixel_aperture": "pixels that are coarse for the images of the targets",
+    "grabber.phase_pattern": "interference from the sampling clock",
+    "sensor.pixel_aperture": "pixels that are too coarse for the images of the targets",
     "grabber.clock_warm_up": "a frame grabber whose clock warms up",
     "sensor.mount_drift": "a sensor or lens that moves while it warms up",
     "sensor.thermal_expansion": "a camera that expands while it warms up",
@@ -155,9 +155,9 @@ def _worded(found: Pattern) -> Pattern:
     number = f"{found.amplitude_px:.4f} px" if found.u_px is None else f"{found.amplitude_px:.4f} ± {found.u_px:.4f} px"
     period = "" if found.period_px is None else f", period {found.period_px:.3g} px"
     if found.alone:
-        what, source = f"{what}, but only that of {found.alone} from all others", ""
-        advice = "look at this image: focus, movement, light, names of points"
-    text = f"{what}: {number}{period}, {p_words(found.p)}" if found.significant else f"not seen: {what} ({p_words(found.p)})"
+        what, source = f"{what}, but only that of {found.alone} differs from all others", ""
+        advice = "check this image: focus, movement, light, names of points"
+    text = f"{what}: {number}{period}, {p_words(found.p)}" if found.significant else f"not found: {what} ({p_words(found.p)})"
     return replace(found, source=source, text=text, advice=advice)
 
 
@@ -199,7 +199,7 @@ def pattern_findings(patterns: Sequence[Pattern]) -> tuple[Finding, ...]:
     out = []
     for one in sorted((one for one in patterns if one.significant), key=lambda one: one.p):
         where = f"{one.camera}: " if several else ""
-        source = f" (as from {SOURCES[one.source]}: {one.source})" if one.source else ""
+        source = f" (possible cause: {SOURCES[one.source]}, {one.source})" if one.source else ""
         if one.outstanding:
             out.append(_bad_images(one.outstanding, where))
             continue
@@ -213,9 +213,9 @@ def _bad_images(bad: Outstanding, where: str) -> Finding:
     named = ", ".join(f"{name} ({_size(rms_px, rejected, times)})" for name, rms_px, rejected, times in found[:NAMED])
     more = " …" if len(found) > NAMED else ""
     few = "1 image has residuals" if len(found) == 1 else f"{len(found)} images have residuals"
-    text = f"{where}{few} much larger than the others: {named}{more}. Patterns in the residuals were sought without"
+    text = f"{where}{few} much larger than the others: {named}{more}. Patterns in the residuals were searched without"
     it = "it" if len(found) == 1 else "them"
-    advice = f"Look at {it}: focus, movement, light, names of points; leave {it} out if nothing mends {it}."
+    advice = f"Check {it}: focus, movement, light, names of points. If nothing helps, leave {it} out."
     return Finding("bad_images", f"{text} {it}.", advice, "warning")
 
 

@@ -103,7 +103,7 @@ def _record(calibration: Calibration) -> dict[str, Any]:
     network, state = a.network, a.state
     return {
         "schema": RESULT_SCHEMA,
-        "conventions": f"{PIXELS}; a point X is seen at R (X - X0), z forwards; covariances are a posteriori",
+        "conventions": f"{PIXELS}; a point X is imaged at R (X - X0), z forwards; covariances are a posteriori",
         "unit": network.unit,
         "datum": a.datum,
         "sigma0": a.sigma0,
@@ -237,7 +237,9 @@ def _read(path: str | Path, schemas: tuple[str, ...], made: Callable[[Mapping[st
     if schema not in schemas:
         remedy = "name the calibration.json that `pixmetry calibrate` wrote, or its folder"
         if schema == LINES_SCHEMA:
-            remedy = "lines do not tell the whole camera: calibrate with a test field (its project can `start_from` this file)"
+            remedy = (
+                "straight lines do not determine the whole camera: calibrate with a test field (its project can `start_from` this file)"
+            )
         raise InputError("not a calibration", where=str(file), value=schema, allowed=" or ".join(schemas), remedy=remedy)
     check_record(record, str(file))
     try:

@@ -116,13 +116,13 @@ def points_csv(calibration: Calibration) -> str:
 def poses_csv(calibration: Calibration) -> str:
     """Projection centres and rotations of the images with their uncertainties."""
     a = calibration.adjustment
-    text = "a point X is seen at R (X - X0), R by rows, z forwards, x to the right, y down; u of rotations about the camera's axes"
+    text = "a point X is imaged at R (X - X0), R by rows, z forwards, x to the right, y down; u of rotations about the camera's axes"
     return _csv([f"unit {a.network.unit}; datum: {a.datum}", text], pose_columns(a))
 
 
 def residuals_csv(calibration: Calibration) -> str:
     """Image coordinates with their residuals; a table that a project can name as its observations."""
-    text = "residual: measured less computed; image coordinates of centres, without eccentricity; variances as they were used"
+    text = "residual: measured minus computed; image coordinates of centres, without eccentricity; variances as they were used"
     return _csv([PIXELS, text], residual_columns(calibration.adjustment))
 
 
@@ -140,7 +140,7 @@ def line_residuals_csv(calibration: LineCalibration) -> str:
         "used": result.used.astype(int),
         "redundancy": result.redundancy,
     }
-    return _csv([PIXELS, "residual: across the line, towards +x (axis x: the line tells about x) or +y"], columns)
+    return _csv([PIXELS, "residual: across the line, towards +x (axis x: the line determines x) or +y"], columns)
 
 
 # A new table of the results needs a line here.
@@ -181,7 +181,7 @@ def check_exports(opencv: Path | None, colmap: Path | None, folder: Path, source
     outputs = _outputs([opencv] if opencv is not None else [], colmap)
     for path in (output.path for output in outputs):
         if path.resolve().is_relative_to(folder.resolve()):
-            remedy = "choose a place beside it"
+            remedy = "choose a folder beside it"
             raise InputError("lies in the folder of results, which is replaced as a whole", where=str(path), remedy=remedy)
     check_files(outputs, sources)
 
@@ -217,7 +217,9 @@ def write_exports(
     unknown = next((model.name for model in cameras if not model["c"] > 0), None)
     if unknown is not None:
         remedy = "calibrate with a test field, or give c_mm or c_px"
-        raise InputError("cannot be exported without a principal distance, which straight lines do not tell", where=unknown, remedy=remedy)
+        raise InputError(
+            "cannot be exported without a principal distance, which straight lines do not determine", where=unknown, remedy=remedy
+        )
     places = _opencv_places(cameras, opencv)
     lines, told, texts = [f"# Written by pixmetry {__version__}\n{COLMAP_HEAD}# Number of cameras: {len(cameras)}\n"], [], []
     for k, model in enumerate(cameras):
@@ -247,7 +249,7 @@ def _opencv_places(cameras: list[CameraModel], opencv: Path | None) -> list[Path
     twice = next((own for own in owns if owns.count(own) > 1), None)
     if twice is not None:
         remedy = "give the cameras names that differ in letters and digits"
-        raise InputError("would be the file of two cameras", where=f"{opencv.stem}-{twice}{opencv.suffix}", remedy=remedy)
+        raise InputError("would be the file name of two cameras", where=f"{opencv.stem}-{twice}{opencv.suffix}", remedy=remedy)
     return [opencv.with_name(f"{opencv.stem}-{own}{opencv.suffix}") for own in owns]
 
 

@@ -173,7 +173,9 @@ def observations_of(
     notes = [Finding("targets", f"{s.name}: {s.note}.") for s in good if s.note]
     lossy = [s.name for s in good if s.lossy]
     if lossy:
-        text = f"{len(lossy)} of {len(good)} images were stored with loss (JPEG): its blocks move edges, and the noise is the coder's."
+        text = (
+            f"{len(lossy)} of {len(good)} images were stored with loss (JPEG): its blocks shift edges, and the noise is that of the coder."
+        )
         notes.append(Finding("targets", text, "Store images of a test field without loss."))
     good, numbering = _numbered(good, kind)
     out = _gathered(good, kind)
@@ -202,7 +204,7 @@ def _checked_lengths(
     except ValueError:
         along = across = np.nan
     if not (0 < along < np.inf and 0 < across < np.inf):
-        raise InputError("the distance of neighbours on the board is missing", where="pitch", value=pitch, allowed="a length above 0")
+        raise InputError("the spacing of the points on the board is missing", where="pitch", value=pitch, allowed="a length above 0")
     if kind == "squares" and not (side is not None and 0 < side < min(along, across)):
         raise InputError("the side of the squares is missing", where="side", value=side, allowed="a length between 0 and the pitch")
     return along, across
@@ -238,7 +240,7 @@ def _check_enough(seen: list[Seen], good: list[Seen], wanted: Wanted, least: int
         remedy = "check kind, grid and polarity, or take more images of the whole board"
         raise MeasureError(what, where="images", allowed=f"{least} or more", remedy=remedy)
     if wanted.kind == "dots" and wanted.grid is None and len(good) > 1:
-        what = "parts of a plate in several images cannot be numbered alike"
+        what = "parts of a plate cannot be numbered consistently over several images"
         raise InputError(what, where="grid", value="any", allowed="COLSxROWS of the whole plate; any for a single image")
 
 

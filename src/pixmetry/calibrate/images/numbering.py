@@ -173,7 +173,7 @@ def _findings(open_turns: int, widest: float, images: int) -> tuple[Finding, ...
     greatest = widest / open_turns
     what = {2: "half a turn", 4: "a quarter of a turn"}.get(open_turns, "a turn")
     text = (
-        f"The board looks the same after {what}; its points were numbered by the smallest rotation from each image to the next, "
+        f"The board looks the same after {what}. Its points were numbered with the smallest rotation from each image to the next, "
         f"{greatest:.0f}° at most where {limit:.0f}° would be undecided."
     )
     unsure = greatest > NEAR_LIMIT * limit

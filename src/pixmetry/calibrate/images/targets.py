@@ -115,7 +115,7 @@ def see(name: str, source: Path | np.ndarray, wanted: Wanted) -> Seen:
         return seen
     if len(seen.keys) < LEAST_SHARE * wanted.whole:
         return _nothing(name, frame, f"only {len(seen.keys)} of {wanted.whole} points were found")
-    return replace(seen, note=f"{missing} of {wanted.whole} points were not found or could not be placed")
+    return replace(seen, note=f"{missing} of {wanted.whole} points were not found or not identified")
 
 
 def _nothing(name: str, frame: np.ndarray, reason: str) -> Seen:
@@ -142,7 +142,7 @@ def _chessboard(name: str, frame: np.ndarray, wanted: Wanted) -> Seen:
     found = _located(name, frame, "chessboard", wanted, wanted.grid)
     use = _usable(found)
     if use.sum() < 3:
-        return _nothing(name, frame, "its corners could not be placed" if len(found) else found.images[0]["reason"])
+        return _nothing(name, frame, "its corners could not be identified" if len(found) else found.images[0]["reason"])
     row, col = found["grid_row"], found["grid_col"]
     design = np.column_stack([col, row, np.ones(len(row))])[use]
     steps = np.linalg.lstsq(design, np.column_stack([found.x_px, found.y_px])[use], rcond=None)[0]
@@ -203,7 +203,7 @@ def board_size(kind: str, grid: str | tuple[int, int] | None) -> tuple[int, int]
     """
     if kind == "coded":
         if grid is not None:
-            raise InputError("coded targets stand in no grid", where="grid", value=grid, allowed="nothing")
+            raise InputError("coded targets form no grid", where="grid", value=grid, allowed="nothing")
         return None
     if grid == "any" and kind == "dots":
         return None

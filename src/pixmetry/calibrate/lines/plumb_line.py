@@ -219,7 +219,9 @@ def _start(sensor: Sensor, start: CameraModel | None, free: tuple[str, ...], los
     allowed = [name for name in NAMES if name != "c"]
     wrong = [name for name in free if name not in allowed]
     if "c" in wrong:
-        raise InputError("lines have no scale: they do not tell c", where="free", value="c", remedy="calibrate with a test field for c")
+        raise InputError(
+            "lines have no scale: they do not determine c", where="free", value="c", remedy="calibrate with a test field for c"
+        )
     if wrong or not free or len(set(free)) != len(free):
         raise InputError("these parameters cannot be estimated", where="free", value=tuple(wrong) or free, allowed=", ".join(allowed))
     if loss not in LOSSES:
@@ -228,7 +230,7 @@ def _start(sensor: Sensor, start: CameraModel | None, free: tuple[str, ...], los
         return CameraModel.of(sensor, free=free)
     if start.direction != "image_to_object":
         remedy = "give a start of the direction image_to_object"
-        raise InputError("plumb lines correct what was measured", where="start", value=start.direction, remedy=remedy)
+        raise InputError("plumb lines correct measured coordinates", where="start", value=start.direction, remedy=remedy)
     return replace(start, sensor=sensor, free=np.isin(NAMES, free))
 
 
@@ -307,18 +309,21 @@ def _findings(
     r = estimates.covariance / np.outer(estimates.u, estimates.u)
     for i, j in zip(*np.triu_indices(len(free), 1), strict=True):
         if abs(r[i, j]) > 0.95 and {free[i][0], free[j][0]} != {"k"}:
-            text = f"{free[i]} and {free[j]} are hardly told apart (correlation {r[i, j]:+.3f})."
-            found.append(Finding("correlation", text, "Use them together only, or hold one of them.", "warning"))
+            text = f"{free[i]} and {free[j]} can hardly be separated (correlation {r[i, j]:+.3f})."
+            found.append(Finding("correlation", text, "Use them together only, or hold one of them fixed.", "warning"))
     if len(axes) == 1:
-        text = f"All lines tell about {next(iter(axes))} only."
+        text = f"All lines determine {next(iter(axes))} only."
         found.append(Finding("direction", text, "Add an image with the camera rolled by 90°.", "warning"))
     if not used.all():
         text = f"{(~used).sum()} of {len(used)} positions do not lie on their lines and were left out."
-        found.append(Finding("gross_error", text, "Look at them in the image.", "warning"))
+        found.append(Finding("gross_error", text, "Check them in the image.", "warning"))
     if inflation > 1:
-        text = f"Neighbours along the lines err alike: the parameters' variances are {inflation:.1f} times those of independent positions."
-        advice = "Free more parameters, or ask whether the lines are straight and the sensor flat."
+        text = (
+            f"Errors of neighbours along the lines are correlated: the parameters' variances are {inflation:.1f} times those of "
+            "independent positions."
+        )
+        advice = "Free more parameters, or check whether the lines are straight and the sensor flat."
         found.append(Finding("correlated_residuals", text, advice))
     if f_test is not None and f_test.p_px["lines"] < 0.05:
-        found.append(Finding("line_jitter", f_test.text, "Ask the frame grabber for its line jitter, or sample with the pixel clock."))
+        found.append(Finding("line_jitter", f_test.text, "Check the line jitter of the frame grabber, or sample with the pixel clock."))
     return tuple(found)

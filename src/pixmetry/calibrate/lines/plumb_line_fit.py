@@ -55,8 +55,8 @@ class LineTable:
         few = self.sums(self.used.astype(float)) < 3
         if few.any():
             image, line = self.keys[int(np.argmax(few))]
-            remedy = "leave it out, or measure it anew"
-            raise MeasureError("hardly a position lies on the line", where=f"image {image}, line {line}", remedy=remedy)
+            remedy = "leave it out, or measure it again"
+            raise MeasureError("almost no position lies on the line", where=f"image {image}, line {line}", remedy=remedy)
 
     def sums(self, values: np.ndarray) -> np.ndarray:
         """Sum over each line, shape (lines,)."""
@@ -260,7 +260,7 @@ def refuse(names: Sequence[str]) -> None:
         "the lines do not determine the parameters",
         where="plumb lines",
         value=", ".join(names),
-        remedy="combine lines along x and along y all over the frame, free fewer parameters, or (b1, b2) use a test field",
+        remedy="combine lines along x and along y all over the frame, free fewer parameters, or use a test field (for b1, b2)",
     )
 
 

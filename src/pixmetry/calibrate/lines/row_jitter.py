@@ -34,7 +34,7 @@ class Sampling:
     def __post_init__(self) -> None:
         if not min(self.pixel_time_ns, self.rows, self.gain) > 0:
             value = (self.pixel_time_ns, self.rows, self.gain)
-            raise InputError("no jitter can be read with this sampling", where="sampling", value=value, allowed="numbers above 0")
+            raise InputError("jitter cannot be measured with this sampling", where="sampling", value=value, allowed="numbers above 0")
 
     @property
     def ns2_per_px2(self) -> float:
@@ -103,7 +103,7 @@ class RowVariance:
         """``jitter_ns`` from what the lines share in a row; an upper limit (one-sided 95 %) where that is not significant."""
         m = self.lines
         u = np.hypot(self.between_px2 * np.sqrt(2 / self.dof[0]), self.within_px2 * np.sqrt(2 / self.dof[1])) / m
-        method = "analysis of variance: what the positions of several lines in one row have in common"
+        method = "analysis of variance: common part of the positions of several lines in one row"
         confounders = ("patterns fixed to rows",)
         return _estimate((self.between_px2 - self.within_px2) / m, u, self.within_px2 / m, self.dof, sampling, method, confounders)
 
@@ -144,8 +144,8 @@ def jitter_from_axes(
     whole, rest = x.rms_px**2, noise_ratio * y.rms_px**2
     c, w = max(whole - rest, 0.0), min(whole, rest)
     u2 = 2 * c**2 / (jitter_dof or dof[0]) + (4 * c * w + 2 * w**2) / dof[0] + 2 * rest**2 / dof[1]
-    method = "variance along x less that along y, positions on straight lines"
-    confounders = ("noise that differs along x and y", "patterns that differ along x and y")
+    method = "variance along x minus that along y, positions on straight lines"
+    confounders = ("different noise along x and y", "different patterns along x and y")
     return _estimate(whole - rest, np.sqrt(u2), rest, dof, sampling, method, confounders)
 
 

@@ -34,7 +34,7 @@ DARK_TEXT, LIGHT_TEXT = "#101010", "#fefefe"  # on coloured cells, which do not 
 
 @dataclass(frozen=True)
 class Residuals:
-    """Residuals of one camera that took part: measured less computed, px."""
+    """Residuals of one camera that were used: measured minus computed, px."""
 
     x: np.ndarray
     y: np.ndarray
@@ -150,8 +150,8 @@ def residual_vectors(r: Residuals, name: str) -> Figure:
         images = len(np.unique(r.image))
         drawn = "" if len(shown) == len(r) else f" {len(shown)} of them are drawn."
         caption = (
-            f"Residual vectors of all {images} images, {len(r)} points: measured less computed, {significant(factor, 1)} times enlarged."
-            f"{drawn} Noise points anywhere; arrows that agree with their neighbours are a pattern."
+            f"Residual vectors of all {images} images, {len(r)} points: measured minus computed, {significant(factor, 1)} times enlarged."
+            f"{drawn} Noise has random directions; arrows that agree with their neighbours are a pattern."
         )
         return Figure(figure, f"{name}-vectors", f"Residual vectors of {len(r)} points over the sensor", caption)
 
@@ -194,9 +194,9 @@ def grid_vectors(grid: ResidualGrid, sensor: Sensor, name: str) -> Figure | None
     with canvas(frame_height(sensor)) as (figure, axes):
         factor = draw_vectors(axes, x[good], y[good], dx[good], dy[good], sensor)
         caption = f"Correction grid of {x.shape[1]} × {x.shape[0]} nodes, {significant(factor, 1)} times enlarged."
-        caption += f" A node is known to {significant(float(np.nanmedian(grid.u_px)), 2)} px (median u)."
+        caption += f" A node has an uncertainty of {significant(float(np.nanmedian(grid.u_px)), 2)} px (median u)."
         before, after = (significant(rms, 3) for rms in (grid.rms_without_px, grid.rms_with_px))
-        caption += f" In images left out, it takes the residuals from {before} px to {after} px rms."
+        caption += f" In images left out of the fit, it reduces the residuals from {before} px to {after} px rms."
         return Figure(figure, f"{name}-grid", f"Correction vectors at {int(good.sum())} nodes of a grid over the sensor", caption)
 
 
@@ -282,7 +282,9 @@ def against_radius(r: Residuals, centre: tuple[float, float], name: str) -> Figu
         axes.set_xlabel("distance from the principal point / px")
         axes.set_ylabel("residual / px")
         figure.legend(loc="outside upper center", ncols=2)
-        caption = "Residuals against the radius: dots are radial parts. A mean that swings with the radius asks for another lens term."
+        caption = (
+            "Residuals against the radius: dots are radial parts. A mean that oscillates with the radius shows that a lens term is missing."
+        )
         return Figure(figure, f"{name}-radius", "Radial and tangential residuals against the radius", caption)
 
 
@@ -299,7 +301,9 @@ def against_phase(r: Residuals, name: str) -> Figure:
             axes.set_xlim(-0.5, 0.5)
             axes.set_xticks([-0.4, 0.0, 0.4])
         both[0].set_ylabel("residual / px")
-        caption = "Residuals of x (left) and y (right) against the sub-pixel phase. A swing comes from too small or clipped targets."
+        caption = (
+            "Residuals of x (left) and y (right) against the sub-pixel phase. A wave comes from targets that are too small or saturated."
+        )
         return Figure(figure, f"{name}-phase", "Residuals in x and y against the sub-pixel phase", caption)
 
 
@@ -324,7 +328,9 @@ def correlation_map(names: Sequence[str], matrix: np.ndarray, name: str) -> Figu
             if i != j:
                 colour = LIGHT_TEXT if abs(matrix[i, j]) > 0.6 else DARK_TEXT
                 axes.text(j, i, short(matrix[i, j]), color=colour, fontsize=5.4, ha="center", va="center")
-        caption = "Correlations of the interior parameters: red positive, blue negative. What correlates strongly is only known together."
+        caption = (
+            "Correlations of the interior parameters: red positive, blue negative. Strongly correlated parameters are only known together."
+        )
         return Figure(figure, f"{name}-correlations", f"Correlation matrix of {n} interior parameters", caption)
 
 
@@ -390,8 +396,8 @@ def projection_map(p: ProjectionMap, sensor: Sensor, name: str) -> Figure:
             plain_log(bar.yaxis)
         caption = (
             "Projection uncertainty: standard uncertainty of an image coordinate (mean of x and y) with which the calibration tells "
-            "where a direction is imaged; what a rotation of the camera would take up is fitted out. Where no image point lay, it is "
-            "extrapolated by the model."
+            "where a direction is imaged; the part that a rotation of the camera would compensate is removed. Where there were no "
+            "image points, the model extrapolates."
         )
         alt = f"Projection uncertainty over the sensor, {significant(float(np.nanmin(u)), 2)} to {significant(float(np.nanmax(u)), 2)} px"
         return Figure(figure, f"{name}-projection", alt, caption)
@@ -422,5 +428,5 @@ def by_image(records: Sequence[ImageRecord], name: str) -> Figure:
         figure.legend(*top.get_legend_handles_labels(), loc="outside upper center", ncols=2)
         caption = "Residuals of each image in the order " + ("of time." if timed else "of the project.")
         if scaled:
-            caption += " Below: the x-scale of each image against their mean, ± 2 u; a drift is a clock that warms up."
+            caption += " Below: the x-scale of each image against their mean, ± 2 u; a drift comes from a clock that warms up."
         return Figure(figure, f"{name}-time", f"Residual rms of {len(records)} images in order", caption)

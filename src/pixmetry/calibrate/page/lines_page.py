@@ -26,12 +26,12 @@ PARAMETERS = (
     "down."
 )
 RESIDUALS = (
-    "Lines that run along y tell about x, lines along x about y. rms: root of the sum of squares over the degrees of freedom, n − 2 for "
-    "each line less what the lens took up."
+    "Lines along y determine x, lines along x determine y. rms: root of the sum of squares over the degrees of freedom, n − 2 for "
+    "each line minus the share of the lens parameters."
 )
 COUNTING = (
-    "By position: were all independent. Effective: less, as far as neighbours along a line err alike. By line: were the errors of a line "
-    "all one, which is on the safe side."
+    "By position: as if all were independent. Effective: fewer, because errors of neighbours along a line are correlated. By line: as if "
+    "all errors of a line were equal, which is on the safe side."
 )
 COUNTED = (("positions", "by position"), ("effective", "effective"), ("lines", "by line"))
 
@@ -63,14 +63,14 @@ def page_of(calibration: LineCalibration) -> Page:
     ]
     name = str(calibration.provenance.get("name") or camera.name)
     page = Page(name, "calibration from straight lines", "pixmetry lens calibration from straight lines", facts, FOOTER)
-    verdict = page.add_section("What is left over", name="verdict")
+    verdict = page.add_section("Remaining residuals", name="verdict")
     readings = [
         Reading(axis, f"{length_px(a.rms_px)} px", "" if a.rms_um is None else f"= {length_px(a.rms_um)} µm")
         for axis, a in result.axes.items()
     ]
     verdict.add(Answer([Text(worth(calibration)), readings]), *typeset_findings(calibration.findings))
     if not calibration.findings:
-        verdict.add_text("Nothing that the tests of this calibration looked for was found.", style="soft")
+        verdict.add_text("The tests of this calibration found nothing.", style="soft")
     lens = page.add_section("Lens", Text(PARAMETERS, "small soft"), name="parameters")
     lens.add_text(f"{camera_facts(camera)} The distortion model {DIRECTIONS[camera.direction]}.")
     lens.add(number_table("Parameters", ["Parameter", "", "Value", "± u", "Unit"], parameter_rows(calibration), 2))
@@ -135,7 +135,7 @@ def worth(calibration: LineCalibration) -> str:
     """One sentence on what is left over."""
     parts = [f"{length(a.rms_px, a.rms_um)} rms in {name}" for name, a in calibration.result.axes.items()]
     n, lines = int(calibration.result.used.sum()), len(calibration.result.lines)
-    return f"{n} positions on {lines} lines lie straight in the corrected image to {' and '.join(parts)}."
+    return f"{n} positions on {lines} lines lie on straight lines in the corrected image to {' and '.join(parts)}."
 
 
 def parameter_rows(calibration: LineCalibration) -> list[list[str]]:

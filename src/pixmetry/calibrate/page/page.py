@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from pixmetry.core.finding import Finding
 
 WORST_IMAGES = 6  # on each of the two sheets that are not folded
-VERDICTS = {"fixed": "held as given", "free": "estimated anew, as its given coordinates are not exact enough"}
+VERDICTS = {"fixed": "held as given", "free": "estimated, because its given coordinates are not exact enough"}
 MOST_SHEETS = 30  # of small images on a page; more would make it heavy
 FOOTER = "Uncertainties are standard uncertainties (k = 1); x runs along rows, y along columns."
 PARAMETERS = (
@@ -43,7 +43,7 @@ PARAMETERS = (
     "down."
 )
 RESIDUALS = (
-    "Residuals are measured less computed image coordinates. Degrees of freedom are sums of redundancy numbers: of each residual, the "
+    "Residuals are measured minus computed image coordinates. Degrees of freedom are sums of redundancy numbers: of each residual, the "
     "share that the adjustment could not take up."
 )
 
@@ -76,7 +76,7 @@ def page_of(calibration: Calibration) -> Page:
     name = str(calibration.provenance.get("name") or ", ".join(c.name for c in net.cameras))
     page = Page(name, "calibration", "pixmetry camera calibration", tables.network_facts(calibration), FOOTER)
     pictures = [_pictures(calibration, k) for k in range(len(net.cameras))]
-    _verdict(page.add_section("What the calibration is worth", name="verdict"), calibration)
+    _verdict(page.add_section("Accuracy of the calibration", name="verdict"), calibration)
     _parameters(page.add_section("Interior parameters", name="parameters"), calibration, pictures)
     if any(p["lens"] for p in pictures):
         lens = page.add_section("Lens and projection", name="lens")
@@ -128,7 +128,7 @@ def _verdict(section: Section, calibration: Calibration) -> None:
     if calibration.findings:
         section.add(*typeset_findings(calibration.findings))
     elif calibration.tests.made:
-        section.add_text("Nothing that the tests of this calibration looked for was found.", style="soft")
+        section.add_text("The tests of this calibration found nothing.", style="soft")
     else:
         section.add_text("This calibration was not tested for patterns, gross errors or the shape of its test field.", style="soft")
 
@@ -146,10 +146,11 @@ def _parameters(section: Section, calibration: Calibration, pictures: Sequence[M
         if groups := tables.groups(calibration.tests.parameter_groups or (), model.name):
             own.add(number_table("Joint tests", ["Together", "Terms", "F", "Degrees of freedom", "p against 0"], groups, 2))
         if vision := tables.vision(calibration, model.name):
-            part = own.add_section("In the words of computer vision")
+            part = own.add_section("In the notation of computer vision")
             part.add_table("The linear part of the camera", ["Name", Column("Value / px", "right"), Column("± u", "u")], vision)
             part.add_text(
-                "The linear part of the camera. The lens terms above go with their own model and are no coefficients of another.",
+                "The linear part of the camera. The lens terms above belong to their own model; they are not the coefficients of "
+                "another model.",
                 style="small soft",
             )
         if pictures[k]["matrix"]:
@@ -201,7 +202,7 @@ def _residuals(section: Section, calibration: Calibration, pictures: Sequence[Ma
     if gross := tables.gross_errors(tests.gross_errors or ()):
         heads = ["Image", "Point", "Residual x / px", "y / px", "Error x / px", "y / px", "Statistic", "Critical"]
         many = f"{len(gross)} image points were" if len(gross) > 1 else "1 image point was"
-        words = f"{many} rejected. The residual is that against the adjustment, the error the size that its removal gives it."
+        words = f"{many} rejected. “Residual” is the residual of the adjustment, “error” the estimated size of the gross error."
         part = section.add_section("Gross errors").add_text(words + _scrolls(gross))
         part.add(number_table("Gross errors", heads, gross, 2, scrolls=True))
     elif tests.gross_errors is not None:
@@ -232,7 +233,7 @@ def _axes_and_test(own: Section, calibration: Calibration, k: int) -> None:
 def _image_by_image(own: Section, drawn: Mapping[str, Any]) -> None:
     part = own.add_section("Image by image", *drawn["worst"])
     words = "The images with the largest residuals first; all at one enlargement."
-    part.add_text(words + (" Of images with many points an even choice is drawn." if drawn["thinned"] else ""), style="small soft")
+    part.add_text(words + (" Of images with many points an even selection is drawn." if drawn["thinned"] else ""), style="small soft")
     if drawn["sheets"]:
         rest = part.add_section("The other images", *drawn["sheets"], fold=True)
         if drawn["undrawn"]:
@@ -246,7 +247,7 @@ def _scrolls(rows: Sequence[Any]) -> str:
 def _patterns(section: Section, rows: Sequence[Mapping[str, Any]]) -> None:
     if not rows:
         return
-    part = section.add_section("Patterns that were looked for")
+    part = section.add_section("Patterns that were tested")
     found, others = [r for r in rows if r["found"]], [r for r in rows if not r["found"]]
     part.add(_pattern_table(found) if found else Text("None was found."))
     if others:
@@ -268,8 +269,10 @@ def _field_section(section: Section, calibration: Calibration) -> None:
         section.add(number_table("Images left out", heads, rows))
         if text := _hold_out(held):
             section.add_text(text)
-        parts = f"The images were left out in {held.folds} parts, one after the other. " if held.folds else ""
-        words = "An image that was left out gets only its pose. What falls in the fit but not in images left out is not real."
+        parts = f"The images were left out in {held.folds} parts, one part after the other. " if held.folds else ""
+        words = (
+            "Of an image that was left out only the pose is estimated. A decrease in the fit that images left out do not show is not real."
+        )
         section.add_text(parts + words, style="small soft")
     if not field:
         return
@@ -282,7 +285,7 @@ def _field_section(section: Section, calibration: Calibration) -> None:
     if told["moved"]:
         heads = ["Moved with free points", "by / px", "formal u / px", "by / u"]
         part.add(number_table("Parameters that moved", heads, told["moved"]))
-        words = "The formal u is that of the adjustment with the given coordinates: it does not know of their errors."
+        words = "The formal u is that of the adjustment with the given coordinates; it does not include their errors."
         part.add_text(words, style="small soft")
 
 
@@ -300,10 +303,10 @@ def _space(section: Section, calibration: Calibration) -> None:
     section.add_text(strong("Datum:"), words)
     section.add(*network_views(adjustment))
     if bars := tables.scale_bars(calibration):
-        heads = ["Between", f"Length / {unit}", "u", f"Measured less adjusted / {unit}", "by / u"]
+        heads = ["Between", f"Length / {unit}", "u", f"Measured minus adjusted / {unit}", "by / u"]
         section.add_section("Scale bars", number_table("Scale bars", heads, bars))
     if control := tables.control_points(calibration):
-        heads = ["Coordinate", f"Given / {unit}", "u", f"Given less adjusted / {unit}", "by / u"]
+        heads = ["Coordinate", f"Given / {unit}", "u", f"Given minus adjusted / {unit}", "by / u"]
         part = section.add_section("Control points", number_table("Control points", heads, control, scrolls=True))
         if _scrolls(control):
             part.add_text("The table scrolls.", style="small soft")
@@ -322,11 +325,11 @@ def _check_points(section: Section, calibration: Calibration) -> None:
     part = section.add_section("Check points", Text(checked["text"]))
     if not checked["rows"]:
         return
-    heads = ["Coordinate", f"Given / {unit}", "u", f"Found / {unit}", "u", f"Given less found / {unit}", "by / u", "Images"]
+    heads = ["Coordinate", f"Given / {unit}", "u", f"Found / {unit}", "u", f"Given minus computed / {unit}", "by / u", "Images"]
     part.add(number_table("Check points", heads, checked["rows"], scrolls=True))
     datum = f", less what {checked['fitted']} of the datum took up; the u found is that in the datum stated" if checked["fitted"] else ""
     chance = f" One of all would be above {checked['critical']} by chance in {checked['level']} % of cases." if checked["critical"] else ""
-    words = f"They took no part in the adjustment. The last ratio is to the u of the difference, with both parts{datum}.{chance}"
+    words = f"They took no part in the adjustment. The last ratio is the difference over its u, which includes both parts{datum}.{chance}"
     part.add_text(words + _scrolls(checked["rows"]), style="small soft")
 
 
@@ -340,7 +343,7 @@ def _object_points(section: Section, calibration: Calibration) -> None:
         part.add_text(f"Largest semi-axis of a standard ellipsoid: {sizes}, in the datum stated.")
         part.add(*plan_views(calibration.adjustment))
         heads = ["Point", *(f"{axis} / {net.unit}" for axis in ("X", "Y", "Z", "Largest semi-axis")), "Rays"]
-        title = f"Table of the {len(points['rows'])} points that are known worst"
+        title = f"Table of the {len(points['rows'])} points with the largest uncertainty"
         part.add_section(title, number_table("Object points", heads, points["rows"]), fold=True)
     elif len(net.u_xyz) and np.all(net.u_xyz == 0):
         part.add_text("All points were held at their given coordinates.")
@@ -443,10 +446,10 @@ def _field(field: FieldTest) -> dict[str, Any]:
     sizes = [f"{significant(size, 2)} {off.unit} {word}" for size, word in ((off.rms, "rms"), (off.peak, "at most")) if size]
     said = "" if p == NONE else f" (p {p if p[0] == '<' else '= ' + p})"
     if sizes:
-        text = f"The adjusted points lie {' and '.join(sizes)} off their given places{said}."
+        text = f"The adjusted points lie {' and '.join(sizes)} off their given positions{said}."
     if off.shape == "plane" and off.rms_in_plane is not None:
         inside = f"{significant(off.rms_in_plane, 2)} {off.unit}"
-        text = f"The points leave their best plane by {' and '.join(sizes)}, and lie {inside} rms off in it{said}."
+        text = f"The points deviate from their best plane by {' and '.join(sizes)}, and lie {inside} rms off in it{said}."
     if sizes and off.u:
         text += f" Their own uncertainty (k = 1) makes {significant(off.u, 2)} {off.unit} rms of the former."
     return {"verdict": VERDICTS[field.verdict], "text": text, "moved": tables.moved(compared)}
@@ -459,11 +462,11 @@ def _hold_out(found: HoldOut | None) -> str:
     p = tables.p_text(found.p)
     if p != NONE and found.fixed and found.free:
         told = p if p[0] == "<" else f"= {p}"
-        texts.append(f"That the rms of images left out falls with free points has p {told} (paired over the images).")
+        texts.append(f"The decrease of the rms of images left out with free points has p {told} (paired over the images).")
     if found.expected_median_px:
         texts.append(
             f"With noise alone, half of the residuals of images left out would be above {length_px(found.expected_median_px)} px: "
-            "points that few images see are worse known without one of them."
+            "points in few images are less well known without one of them."
         )
     return " ".join(texts)
 

@@ -164,7 +164,7 @@ def plan_views(adjustment: Adjustment) -> list[Figure]:
 
 
 def field_map(adjustment: Adjustment, points: FieldPoints) -> Figure | None:
-    """How far the test field's points lie off their nominal places: height as colour, the rest as arrows."""
+    """Deviation of the test field's points from their nominal positions: height as colour, deviations in the plane as arrows."""
     net = adjustment.network
     nominal, axes_of = points.xyz, points.axes
     dx, dy, dz = points.dx, points.dy, points.dz
@@ -190,6 +190,9 @@ def field_map(adjustment: Adjustment, points: FieldPoints) -> Figure | None:
         length_key(axes, factor, key, net.unit)
         colour_bar(figure, axes, dots, f"height / {net.unit}")
         low, high = significant(float(dz.min()), 2), significant(float(dz.max()), 2)
-        caption = f"Deviation of the points from their nominal places: heights as colour ({low} to {high} {net.unit}), the rest as arrows."
+        caption = (
+            f"Deviation of the points from their nominal positions: heights as colour ({low} to {high} {net.unit}), deviations in "
+            "the plane as arrows."
+        )
         alt = f"Deviation of {len(x)} points of the test field, heights from {low} to {high} {net.unit}"
         return Figure(figure, "field-map", alt, caption)

@@ -159,7 +159,7 @@ def patterns(records: Sequence[Pattern], several: bool) -> list[dict[str, Any]]:
         what, source, _ = MEANING.get(r.name, (r.name, "", ""))
         title = f"{r.camera}: {what}" if several else sentence(what).rstrip(".")
         amplitude = px(r.amplitude_px) + (f" ± {px(r.u_px)}" if r.u_px is not None else "")
-        why = f"As from {SOURCES[source]} ({source})." if r.significant and source else ""
+        why = f"Possible cause: {SOURCES[source]} ({source})." if r.significant and source else ""
         advice = " ".join(part for part in (why, sentence(r.advice)) if part)
         rows.append({"title": title, "amplitude": amplitude, "p": p_text(r.p), "found": r.significant, "advice": advice})
     return sorted(rows, key=lambda r: not r["found"])

@@ -116,7 +116,7 @@ def worth(calibration: Calibration, camera: int) -> str:
     found = residual_record(calibration, camera)
     name = calibration.adjustment.network.cameras[camera].name
     if found.n == 0:
-        return "No image coordinate of this camera took part."
+        return "No image coordinate of this camera was used."
     text = (
         f"The image coordinates agree with the calibrated camera to {length(found.rms_x_px, found.rms_x_um)} rms in x and "
         f"{length(found.rms_y_px, found.rms_y_um)} in y"
@@ -138,7 +138,7 @@ def sigma0_text(calibration: Calibration) -> str:
         return " ".join(sentence(f"{name}{_scatter(record, known=adjustment.network.covariance_known)}") for name, record in found)
     value = significant(adjustment.sigma0, 3)
     if adjustment.network.covariance_known:
-        return f"σ₀ = {value} with {adjustment.dof} degrees of freedom: 1 would mean that the image coordinates scatter as was stated."
+        return f"σ₀ = {value} with {adjustment.dof} degrees of freedom: 1 would mean that the image coordinates scatter as stated."
     return (
         f"σ₀ = {value} with {adjustment.dof} degrees of freedom; no covariance of the image coordinates was given, so the scale of "
         "their weights comes from the residuals."

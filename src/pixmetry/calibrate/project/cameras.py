@@ -109,7 +109,7 @@ def described(entry: CameraEntry, reader: Reader, k: int, *, straight: bool = Fa
     if cols is not None:
         out.check((sensor.cols, sensor.rows), what="the project says")
     if not straight and not out.model["c"] > 0 and not out.model.free[0]:
-        raise InputError("c is to be held, but has no value", where=where, remedy="give c_mm or c_px, or add c to `free`")
+        raise InputError("c is held fixed, but has no value", where=where, remedy="give c_mm or c_px, or add c to `free`")
     return out
 
 
@@ -192,7 +192,7 @@ def _changed(camera: Camera, element: Element) -> tuple[tuple[float, float], str
         return (1.0, 2.0), "it stores single fields (rows two pixels apart)"
     if name == WINDOW and (params.inactive_rows or params.row_offset or params.col_offset):
         row, col = params.row_offset, params.col_offset
-        return (1.0, 1.0), f"its grabber stores a window from row {row}, column {col} on"
+        return (1.0, 1.0), f"its grabber stores a window that starts at row {row}, column {col}"
     return (1.0, 1.0), ""
 
 
@@ -206,7 +206,7 @@ def check_size(camera: Camera, size: Sequence[int], where: str, what: str) -> No
     """
     rows, cols = camera.output_shape
     if tuple(size) != (cols, rows):
-        remedy = "name the camera that took them, or leave the preset away"
+        remedy = "name the camera that took them, or leave the preset out"
         found, allowed = f"{size[0]} x {size[1]} pixels", f"{cols} x {rows} pixels"
         raise InputError(f"{what} another size than the frames of {camera.name}", where=where, value=found, allowed=allowed, remedy=remedy)
 

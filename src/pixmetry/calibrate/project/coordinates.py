@@ -129,7 +129,7 @@ def _unit(table: Table, given: ImageCoordinates) -> str:
             remedy=f"write `unit: {there[0]}` under image_coordinates, or correct the names of the columns",
         )
     if len(there) > 1:
-        remedy = "say under image_coordinates which unit is meant, or delete two of the columns"
+        remedy = "state the unit under image_coordinates, or delete two of the columns"
         raise InputError(
             "image coordinates in several units", where=table.source, value=", ".join(table.columns), allowed="one", remedy=remedy
         )
@@ -152,7 +152,7 @@ def _refuse_twice(table: Table, image: np.ndarray, point: np.ndarray, points: in
         raise InputError(
             f"point '{name}' is measured twice in image '{where}'",
             where=f"{table.source}, lines {table.lines[first]} and {table.lines[second]}",
-            allowed="a point once in an image",
+            allowed="each point once in an image",
             remedy="delete one of the two, or name one of them otherwise",
         )
 
@@ -169,7 +169,7 @@ def image_facts(
     """
     if images is None:
         if len(cameras) > 1:
-            what = "several cameras, but no table that says which image is of which"
+            what = "several cameras, but no table that assigns images to them"
             raise InputError(what, where=where(names[0]), remedy="add `images: images.csv` with the columns image, camera")
         return np.zeros(len(names), np.int64), None, None
     images = images.spelled("image", "camera", "time_s")
@@ -293,12 +293,12 @@ def start_poses(table: Table) -> Poses | None:
     told = [(unit, names) for unit, names in ROTATIONS.items() if any(name in table for name in names)] or [("deg", ROTATIONS["deg"])]
     if len(told) > 1:
         first, second = (next(name for name in names if name in table) for _, names in told[:2])
-        what = f"rotations are told twice, by {first} and by {second}"
+        what = f"rotations are given twice, by {first} and by {second}"
         allowed = "r11 … r33, or qw, qx, qy, qz, or omega, phi, kappa in one unit"
         raise InputError(what, where=table.source, allowed=allowed, remedy="leave one of the two out")
     ((unit, names),) = told
     if all(any(name in table for name in place) for place in (CENTRE, SHIFT)):
-        what, allowed = "places of the images are told twice, by X0 … and by tx …", "X0, Y0, Z0, or tx, ty, tz"
+        what, allowed = "positions of the images are given twice, by X0 … and by tx …", "X0, Y0, Z0, or tx, ty, tz"
         raise InputError(what, where=table.source, allowed=allowed, remedy="leave one of the two out")
     names = (*(SHIFT if any(name in table for name in SHIFT) else CENTRE), *names)
     table.need(*names)
@@ -308,7 +308,7 @@ def start_poses(table: Table) -> Poses | None:
     if partly.any():
         row = int(np.flatnonzero(partly)[0])
         remedy = "add what is missing, or leave all of them empty"
-        raise InputError("a pose with some of its values", where=table.where(row), allowed=", ".join(names), remedy=remedy)
+        raise InputError("an incomplete pose", where=table.where(row), allowed=", ".join(names), remedy=remedy)
     place, turn = values[:, :3], values[:, 3:]
     if unit == "matrix":
         rotation = _of_matrix(table, turn.reshape(-1, 3, 3))

@@ -64,7 +64,7 @@ def _rows_of(table: Table, names: Sequence[str]) -> tuple[Table, dict[str, int],
     rows = index_of_names(table, "point")
     at = np.array([rows.get(name, -1) for name in names])
     if not (at >= 0).any():
-        what = "no point of the table is seen in an image"
+        what = "no point of the table is measured in an image"
         remedy = "use the same names in both tables"
         raise InputError(what, where=table.source, value=first_few(rows), allowed=first_few(names), remedy=remedy)
     return table, rows, at >= 0, at[at >= 0]
@@ -138,9 +138,9 @@ def _u_of_points(table: Table, known: str | None, u: float | None) -> np.ndarray
     if known in ("nominal", "fixed"):
         return np.zeros((len(table), 3))
     if known is None and not columns and u is None:
-        allowed = "known: fixed (exact), nominal (said to be exact, to be found out), weighted (with u), or free (start values)"
+        allowed = "known: fixed (exact), nominal (stated as exact, to be tested), weighted (with u), or free (start values)"
         remedy = "add `known: ...` below `points:`, or columns u_X, u_Y, u_Z"
-        raise InputError("how well the points are known is not said", where=table.source, allowed=allowed, remedy=remedy)
+        raise InputError("the accuracy of the points is not stated", where=table.source, allowed=allowed, remedy=remedy)
     if not columns:
         if u is None:
             what = "weighted points, but no uncertainty"

@@ -239,7 +239,7 @@ def _options(model: ProjectModel) -> dict[str, Any]:
 
 def _without_images(network: Network) -> tuple[Finding, ...]:
     names = [camera.name for k, camera in enumerate(network.cameras) if not np.any(network.camera_of == k)]
-    text = "has no image: its values are those that were given."
+    text = "has no image: its values are the given ones."
     advice = "Name it in the table of images, or delete it."
     return tuple(Finding("camera_without_images", f"Camera '{name}' {text}", advice, "warning") for name in names)
 
@@ -248,7 +248,7 @@ def _unseen(known: Known, points: Table | None) -> tuple[Finding, ...]:
     if points is None or not known.unseen:
         return ()
     n = len(known.unseen)
-    text = f"{n} of {len(points)} object points {'is' if n == 1 else 'are'} seen in no image: {first_few(known.unseen)}."
+    text = f"{n} of {len(points)} object points {'is' if n == 1 else 'are'} measured in no image: {first_few(known.unseen)}."
     return (Finding("unseen_points", text, "If they should be, compare their names in both tables."),)
 
 

@@ -274,7 +274,7 @@ class ProjectModel(Model):
         for camera in self.cameras:
             told = camera.c_mm is not None or camera.c_px is not None or camera.start_from is not None
             if not told and not self.straight and camera.free is not None and "c" not in camera.free:
-                raise InputError("c is to be held, but has no value", remedy="give c_mm or c_px, or add c to `free`")
+                raise InputError("c is held fixed, but has no value", remedy="give c_mm or c_px, or add c to `free`")
         return self
 
     @model_validator(mode="after")

@@ -100,7 +100,7 @@ def lines_of_pictures(
             findings.append(Finding("image_left_out", f"{name} was left out: no line is found in it.", level="warning"))
         told("locating lines", k + 1, len(files))
     if not parts or size is None:
-        what, remedy = "no line is found in the pictures", "take lines that stand out, at least a quarter of the frame long"
+        what, remedy = "no line is found in the pictures", "take lines with more contrast, at least a quarter of the frame long"
         raise MeasureError(what, where="pictures", value=len(files), remedy=remedy)
     names = ("image", "line", "x_px", "y_px", "covariance_px2")
     positions = LinePositions(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))

@@ -71,7 +71,7 @@ class Table:
             where=self.source,
             value=", ".join(self.columns),
             allowed=f"a header with {', '.join(names)}",
-            remedy=f"{meant} say under `columns:` of the project which column it is",
+            remedy=f"{meant} state under `columns:` of the project which column it is",
         )
 
     def texts(self, name: str) -> list[str]:
@@ -168,9 +168,9 @@ def read_table(path: Path, columns: Sequence[str] | Mapping[str, str] | None = N
     for line, row in rows:
         if len(row) != len(header):
             what = f"a row of {len(row)} values where the header names {len(header)}"
-            remedy = "add what is missing, or put names that hold blanks or commas in quotes"
+            remedy = "add what is missing, or put names with blanks or commas in quotes"
             if any(_DECIMAL_COMMA.fullmatch(value) for value in dict(lines)[line].split()):
-                remedy = "write decimal points as points: commas part the columns"
+                remedy = "write decimal points, not commas: commas separate the columns"
             raise InputError(what, where=f"{source}, line {line}", allowed=", ".join(header), remedy=remedy)
     values = zip(*(row for _, row in rows), strict=True)
     return Table(source, {name: list(v) for name, v in zip(header, values, strict=True) if name != IGNORED}, [n for n, _ in rows])

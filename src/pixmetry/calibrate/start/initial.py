@@ -249,9 +249,9 @@ def _check_mirrored(network: Network, interior: np.ndarray, control: np.ndarray,
             _search_distance(turned, camera, mine)
     if _fits(turned):
         raise InputError(
-            "image and object coordinates fit only mirrored", where="image coordinates", value="y counted downwards",
+            "image and object coordinates agree only if one of them is mirrored", where="image coordinates", value="y counted downwards",
             allowed="x to the right and y down in the image, a right-handed frame in the object",
-            remedy="say that y counts upwards in the table of image coordinates, or turn one axis of the object over",
+            remedy="state that y counts upwards in the table of image coordinates, or reverse one axis of the object",
         )  # fmt: skip
 
 
@@ -354,6 +354,6 @@ def _not_oriented(network: Network, posed: np.ndarray) -> MeasureError:
     elif posed.any():
         ties = len(np.intersect1d(network.point[posed[network.image]], network.point[np.isin(network.image, left)]))
         if ties < 8:
-            remedy = f"these images share {ties} points with the others: take images or points that tie both together, at least 8 points"
+            remedy = f"these images share {ties} points with the others: take images or points that connect both, at least 8 points"
     what = f"{len(left)} of {measured.sum()} images cannot be oriented"
     return MeasureError(what, where="start values", value=names, remedy=remedy)

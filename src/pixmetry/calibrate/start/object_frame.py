@@ -65,9 +65,9 @@ def _turned_away(work: Reconstruction, use: np.ndarray) -> np.ndarray:
 
 def _mirrored() -> InputError:
     return InputError(
-        "image and object coordinates fit only mirrored", where="object points",
+        "image and object coordinates agree only if one of them is mirrored", where="object points",
         allowed="x to the right and y down in the image, a right-handed frame in the object",
-        remedy="say that y counts upwards in the table of image coordinates, or turn one axis of the object over",
+        remedy="state that y counts upwards in the table of image coordinates, or reverse one axis of the object",
     )  # fmt: skip
 
 

@@ -20,7 +20,10 @@ SPREAD = 0.05  # least width of where images stand, in units of its length, that
 MOST = 0.5  # of the poses must be right for their frame to mean something
 NAMED = 6
 AXES = np.diag([1.0, -1.0, -1.0])  # from a camera that looks along -z, y up, to one that looks along +z, y down
-ADVICE = "Check which way the camera looks and the rotations go, the unit of the angles, and whether X0, Y0, Z0 are projection centres."
+ADVICE = (
+    "Check the viewing direction of the camera, the sense of the rotations, the unit of the angles, and whether X0, Y0, Z0 are "
+    "projection centres."
+)
 
 
 def from_poses(network: Network, interior: np.ndarray) -> Reconstruction | None:
@@ -114,7 +117,7 @@ def pose_findings(network: Network, state: State) -> list[Finding]:
     names = ", ".join(network.images[i] for i in both[off][:NAMED]) + (", …" if off.sum() > NAMED else "")
     text = f"The start poses of {off.sum()} of {len(both)} images are far from the adjusted ones: {names}."
     if off.mean() > MOST:
-        text += " What they say of frame and size was not taken."
+        text += " Their coordinate system and scale were not used."
     return [Finding("start_poses", text, _meant(network.poses, state, both) if off.mean() > MOST else ADVICE, "warning")]
 
 
@@ -123,9 +126,9 @@ def _meant(poses: Poses, state: State, both: np.ndarray) -> str:
     transposed = np.swapaxes(poses.rotation, 1, 2)
     centre = -np.einsum("nji,nj->ni", poses.rotation, poses.position)
     others = {
-        "the rotations went the other way (transposed)": Poses(transposed, poses.position),
+        "the rotations had the opposite sense (transposed)": Poses(transposed, poses.position),
         "the camera looked along -z, y up (rows 2 and 3 with the other sign)": Poses(AXES @ poses.rotation, poses.position),
-        "the rotations went the other way, of a camera that looks along -z, y up": Poses(AXES @ transposed, poses.position),
+        "the rotations had the opposite sense, and the camera looked along -z, y up": Poses(AXES @ transposed, poses.position),
         "X0, Y0, Z0 were the shift t of R X + t (then X0 = -Rᵀ t)": Poses(poses.rotation, centre),
         "X0, Y0, Z0 had the other sign": Poses(poses.rotation, -poses.position),
     }
@@ -134,7 +137,9 @@ def _meant(poses: Poses, state: State, both: np.ndarray) -> str:
             return f"They would fit if {words}."
     mirrored = replace(state, rotation=np.diag([1, -1, 1]) @ state.rotation @ np.diag([1, 1, -1]), position=state.position * [1, 1, -1])
     if not _differ(poses, mirrored, both).any():
-        return "They would fit if y of the image coordinates ran the other way: see image_coordinates.y, the object may be mirrored."
+        return (
+            "They would fit if y of the image coordinates had the opposite direction: see image_coordinates.y; the object may be mirrored."
+        )
     return ADVICE
 
 

@@ -94,7 +94,7 @@ def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _no_constant(name: str) -> float:
-    raise _RefusedError(f"holds {name}, which is no number in JSON")
+    raise _RefusedError(f"contains {name}, which is not a number in JSON")
 
 
 def to_record(sheet: DataSheet) -> dict[str, Any]:

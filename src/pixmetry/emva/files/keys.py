@@ -59,7 +59,7 @@ KEYS: dict[str, Key] = {
     "u_I_var": Key("dark_current", "Dark current from the variance", "µ_I.var", "e⁻/s", "eq. 30"),
     "u_I_var_DN": Key("dark_current", "Dark current from the variance", "µ_I.var", "DN/s", "eq. 30"),
     "u_I_ref": Key("dark_current", "Dark current at the temperature of the sheet, from all temperatures", "µ_I.ref", "e⁻/s", "eq. 31"),
-    "T_d": Key("dark_current", "Step of temperature that doubles the dark current", "T_d", "K", "eq. 31"),
+    "T_d": Key("dark_current", "Temperature rise that doubles the dark current", "T_d", "K", "eq. 31"),
     "sigma_2_y_stack": Key("spatial", "Temporal variance of the bright stack", "σ²_y.stack", "DN²", "eq. 65"),
     "sigma_2_y_stack_dark": Key("spatial", "Temporal variance of the dark stack", "σ²_y.stack.dark", "DN²", "eq. 65"),
     **{

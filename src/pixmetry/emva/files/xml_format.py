@@ -106,7 +106,7 @@ def _write_array(data: ET.Element, part: str, array: np.ndarray) -> None:
 
 
 def _write_sheet(info: ET.Element, sheet: DataSheet) -> None:
-    entry = _entry(info, "sheet", "info", "What the values hold for")
+    entry = _entry(info, "sheet", "info", "Conditions of the values")
     _put(entry, "value", "None")  # other readers want one
     head = {
         "release": sheet.results[0].release if sheet.results else "",

@@ -154,15 +154,15 @@ def general_notes(plan: Plan) -> tuple[str, ...]:
     if least < 0.5 * lowest:
         at = f"{lowest / least:.2g} times the threshold"
         notes.append(
-            f"general_u_p_min and general_DSNU are extrapolated: the darkest level has {at}; the response between it and black is taken "
-            "as smooth, which a curve with a steep start (gamma) is not"
+            f"general_u_p_min and general_DSNU are extrapolated: the darkest level has {at}; the response between it and black is "
+            "assumed smooth; a curve with a steep start (gamma) is not"
         )
     fitted, measured = float(plan.ratio.rows(d.light[:1])[0] @ ratios(d)), float(ratios(d)[0])
     off = measured / fitted - 1
     if abs(off) > OFF_THE_CURVE:
         notes.append(
             f"the darkest level lies {100 * abs(off):.1f} % {'above' if off > 0 else 'below'} the curve through "
-            "the levels: its light was not what it was said to be, or the response bends there; u of general_u_p_min holds that"
+            "the levels: its light differs from the stated value, or the response is curved there; u of general_u_p_min includes this"
         )
     if np.isfinite(plan.end.plateau_dn):
         notes.append(

@@ -91,7 +91,7 @@ def make_plan(series: Series) -> Plan:
     different = np.unique(light[order]).size
     if different < MINIMUM_LEVELS:
         raise MeasureError(
-            "too few lit levels below saturation for a characteristic curve",
+            "too few bright levels below saturation for a characteristic curve",
             where="EMVA 1288 General",
             value=different,
             allowed=f"{MINIMUM_LEVELS} or more, 50 are better",
@@ -142,7 +142,7 @@ def with_setting_errors(plan: Plan, d: Levels) -> Levels:
     if not far.size:
         return d
     signal = d.signal_dn.copy()
-    signal[:, far] += off[far] * generator(SEED, "levels off the curve").choice([-1.0, 1.0], size=(signal.shape[0], far.size))
+    signal[:, far] += off[far] * generator(SEED, "levels away from the curve").choice([-1.0, 1.0], size=(signal.shape[0], far.size))
     return replace(d, signal_dn=signal)
 
 

@@ -111,7 +111,7 @@ def _temporal(fit: Estimates, photons_u_rel: float) -> dict[str, Number]:
     out.add("K", gain.value, {"gain_dn_per_e": 1.0}, reason=gain.reason)
     out.add("inverse_K", 1 / gain.value, {"gain_dn_per_e": -1 / gain.value**2}, reason=gain.reason)
     if photons_known:
-        known = "" if photons_u_rel > 0 else "u leaves out the calibration of the photon count"
+        known = "" if photons_u_rel > 0 else "u does not include the calibration of the photon count"
         out.add("QE", 100 * fit["quantum_efficiency"].value, {"quantum_efficiency": 100.0}, reason=known)
     _add_noise(out, fit)
     for key, name in (("u_I_mean", "dark_current_e_per_s"), ("u_e_sat", "full_well_e")):
@@ -172,5 +172,5 @@ def _spatial(m: Measurement, fit: Estimates, dnl_lsb: float) -> tuple[dict[str, 
         else:
             value, gradient = 100 * e.value, {name: 100.0}
         out.add(key, value, gradient, kind=UPPER_LIMIT if e.is_upper_limit else VALUE, reason=e.reason)
-    notes = (f"DSNU1288{NONLINEAR} and PRNU1288{NONLINEAR}, with their parts, leave out {len(defects)} defect pixels",)
+    notes = (f"DSNU1288{NONLINEAR} and PRNU1288{NONLINEAR}, with their parts, exclude {len(defects)} defect pixels",)
     return out.values, notes if len(defects) else ()

@@ -251,9 +251,9 @@ def headline_keys(channels: Sequence[Results]) -> tuple[str, ...]:
 def document(results: Results) -> str:
     """Which document of the standard this camera goes by, and why."""
     if results.release == "3.1":
-        return "Release 3.1 knows one document, for linear cameras."
+        return "Release 3.1 has one document, for linear cameras."
     if results.release == "reference":
-        return "The reference implementation 1.0.2 names Release 4.0 and keeps most rules of Release 3.1; these values are for comparison."
+        return "The reference implementation 1.0.2 states Release 4.0 but keeps most rules of Release 3.1; these values are for comparison."
     judgement = linear_model(results)
     if judgement == CURVED:
         return f"Release 4.0 General applies: {results.values['PTC_linearity'].reason}."
@@ -265,7 +265,7 @@ def document(results: Results) -> str:
         f"the {low if low == high else f'{low} to {high}'} % that such frames show of a camera at the allowed {PTC_LIMIT_PERCENT:g} %"
     )
     if judgement == OPEN:
-        return f"Release 4.0: {departs_by}, within {at_limit}: they do not tell whether Linear or General applies, and both are given."
+        return f"Release 4.0: {departs_by}, within {at_limit}: they do not decide whether Linear or General applies, and both are given."
     if judgement == FAILS:
         return f"Release 4.0 General applies: {departs_by}, more than {at_limit}; the values of Linear are given beside it."
     return f"Release 4.0 Linear applies: {departs_by}, less than {at_limit}."

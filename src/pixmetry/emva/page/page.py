@@ -18,17 +18,17 @@ if TYPE_CHECKING:
 PLOT_HEIGHT_IN = 2.2
 KIND = "EMVA 1288 data sheet"
 FOOTER = (
-    "Uncertainties are standard uncertainties (k = 1); they hold the scatter of a repeated measurement of this camera, not that between "
-    "cameras of its type."
+    "Uncertainties are standard uncertainties (k = 1); they include the scatter of a repeated measurement of this camera, not the scatter "
+    "between cameras of its type."
 )
 LIMITS = "Value ± standard uncertainty u (k = 1, two significant digits); “< x (95 %)” and “> x (95 %)” are one-sided 95 % limits."
 VALUES = (
     "Standard uncertainty u (k = 1) with its degrees of freedom; “< x (95 %)” and “> x (95 %)” are one-sided limits. The clause is that of "
     "EMVA 1288 Release 4.0 Linear where it does not say otherwise. “Non-linearity taken into account” is the same quantity from a fit that "
-    "holds the camera's curvature; its DSNU and PRNU are not high-passed as those of Release 4.0 are, and hold coarse patterns too. The "
-    "method's number points into the list below."
+    "includes the camera's curvature; its DSNU and PRNU have no high-pass, unlike those of Release 4.0, and include coarse patterns. The "
+    "number of the method refers to the list below."
 )
-MORE = Text("The table goes on to the right →", "hint")
+MORE = Text("The table continues to the right →", "hint")
 
 
 def page_of(sheet: DataSheet) -> Page:

@@ -96,7 +96,9 @@ def _sensitivity(c: Curve, r: Results) -> Drawn:
         axes.legend(loc="lower right")
 
     slope = f"the responsivity {say(r, 'R')}" if say(r, "R") else "the responsivity"
-    caption = f"Mean above dark against the light: the slope up to 70 % of saturation is {slope}; where it bends, the camera saturates."
+    caption = (
+        f"Mean above dark against the light: the slope up to 70 % of saturation is {slope}; where it becomes flat, the camera saturates."
+    )
     return draw, caption, f"Mean above dark of {len(x)} levels against {label}, with the fitted line; its slope is {slope}."
 
 
@@ -141,13 +143,15 @@ def _off_the_line(c: Curve, r: Results) -> Drawn:
         span = 1.4 * max(float((np.abs(off) + bars)[inner].max(initial=0.0)), 0.2)
         axes.set_ylim(-span, 1.4 * span)  # the darkest levels may stick out: their relative error has no bound
         axes.set_xlabel("mean above dark / DN")
-        axes.set_ylabel("variance off the line / %")
+        axes.set_ylabel("deviation of the variance from the line / %")
         axes.legend(loc="upper center", ncols=2)
 
     departure = say(r, "PTC_linearity")
     words = f", whose local slope departs by up to {departure}" if departure else ""
-    caption = f"Variance relative to the photon transfer's line{words}: a bow says that the camera is not linear; bars are ± 2 u."
-    return draw, caption, f"Variance of {int(shown.sum())} levels in percent off the photon transfer's line{words}."
+    caption = (
+        f"Variance relative to the photon transfer's line{words}: a curved course shows that the camera is not linear; bars are ± 2 u."
+    )
+    return draw, caption, f"Variance of {int(shown.sum())} levels in percent from the photon transfer's line{words}."
 
 
 def _below_saturation(r: Results, size: int) -> np.ndarray:
@@ -229,7 +233,7 @@ def _linearity(c: Curve, r: Results) -> Drawn:
 
     caption = (
         f"Mean above dark with the line of the linearity test, offset {significant(one(c, 'fit_offset'))} DN: "
-        "levels from 5 % to 95 % of saturation, each with the weight of its relative error."
+        "levels from 5 % to 95 % of saturation, weighted by their relative errors."
     )
     return draw, caption, f"Mean above dark against {label} with the line of the linearity test through {int(used.sum())} levels."
 
@@ -259,7 +263,7 @@ def _deviation(c: Curve, r: Results) -> Drawn:
         axes.legend(loc="upper center", ncols=3)
 
     error = f"LE = {say(r, 'LE')}" if say(r, "LE") else f"LE_min = {say(r, 'LE_min')}, LE_max = {say(r, 'LE_max')}"
-    caption = f"Relative deviation from that line, {error}: a bow is non-linearity, scatter is the setting of the light."
+    caption = f"Relative deviation from that line, {error}: a curved course is non-linearity, scatter comes from the setting of the light."
     return draw, caption, f"Relative deviation from the line in percent against {label}; {error}."
 
 
@@ -383,7 +387,7 @@ def _input_snr(c: Curve, r: Results) -> Drawn:
 
     best = say(r, "general_SNR_max_dB")
     words = f", at its maximum {best}" if best else ""
-    caption = f"Light over the noise at the input, without a model of the camera{words}: a linear camera shows the curve of its output."
+    caption = f"Light over the noise at the input, without a model of the camera{words}: for a linear camera it is the curve of the output."
     return draw, caption, f"Signal-to-noise ratio at the input against {label}{words}."
 
 
@@ -404,7 +408,7 @@ def _input_noise(c: Curve, r: Results) -> Drawn:
         leave_room(axes)
         axes.legend(loc="upper left")
 
-    caption = f"Noise of the output over the slope of the characteristic curve, in {unit}: it soars where the output saturates."
+    caption = f"Noise of the output over the slope of the characteristic curve, in {unit}: it rises steeply where the output saturates."
     return draw, caption, f"Temporal and spatial noise in {unit} at the input against {label}."
 
 
@@ -530,5 +534,8 @@ def _accumulated(kind: str, c: Curve, r: Results) -> Drawn:
         axes.set_xlabel("least deviation from the mean / DN")
         axes.set_ylabel("pixels / %")
 
-    caption = f"Share of pixels that deviate by at least so much in the {kind} image: read off how many an application's limit would stop."
+    caption = (
+        f"Share of pixels that deviate by at least so much in the {kind} image: it shows how many pixels exceed the limit of an "
+        "application."
+    )
     return draw, caption, f"Percentage of pixels that deviate at least so far from the mean of the {kind} image, logarithmic axis."

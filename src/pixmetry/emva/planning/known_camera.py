@@ -98,8 +98,8 @@ def camera_from_results(values: Mapping[str, Any], rows: int, cols: int, bits: i
     found = {key: number_in(value) for key, value in values.items()}
     for key in ("K", "sigma_d", "u_e_sat"):
         if not found.get(key, math.nan) > 0:
-            remedy = "type the value, or take it from a few frames (preflight)"
-            raise InputError("the results lack a value to plan with", where=key, value=found.get(key), remedy=remedy)
+            remedy = "give the value, or measure it from a few frames (preflight)"
+            raise InputError("the results lack a value that the plan needs", where=key, value=found.get(key), remedy=remedy)
     facts: dict[str, Any] = {
         "rows": rows,
         "cols": cols,

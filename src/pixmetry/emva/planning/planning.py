@@ -316,19 +316,19 @@ def _why(camera: KnownCamera, most: Plan, key: str, wanted: float) -> str:
     """Say what keeps the largest plan from meeting a wish."""
     best = predicted_u(camera, most)[key]
     if math.isinf(best):
-        return "the dark noise hides in the quantisation (σ²_y.dark < 0.24 DN²): only a bound 0.40/K can be given; raise the camera's gain"
+        return "quantisation hides the dark noise (σ²_y.dark < 0.24 DN²): only a bound 0.40/K can be given; raise the camera's gain"
     size = f"{MAX_LEVELS} levels of {MAX_FRAMES} frames and stacks of {MAX_STACK} give {best:.2g} {KEYS[key].unit}"
     for fact, cause, remedy in (
-        ("var_excess_rel", "the scatter of the variances between levels", "steady the light and the camera, or repeat the test"),
-        ("light_scatter_rel", "the scatter of the light between levels", "steady the light, or measure it with each level"),
+        ("var_excess_rel", "the scatter of the variances between levels", "stabilise the light and the camera, or repeat the test"),
+        ("light_scatter_rel", "the scatter of the light between levels", "stabilise the light, or measure it with each level"),
     ):
         if predicted_u(_with(camera, fact, 0.0), most)[key] <= wanted:
             return f"{size}: {cause}, {100 * getattr(camera, fact):.2g} %, stays; {remedy}"
     if key.startswith("DSNU") and camera.values[key] * predicted_u(camera, most)["K"] / camera.gain_dn_per_e > wanted:
-        return f"{size}: u of K, by which the grey values become electrons, is too large; steady the light"
+        return f"{size}: u of K, which converts grey values to electrons, is too large; stabilise the light"
     if key in SPATIAL_KEYS and camera.values[key] ** 2 < best**2:
-        return f"{size}: the pattern is smaller than the noise left in the mean of the stack; larger frames or cooling would help"
-    return f"{size}: the frames have too few pixels for this wish; use larger frames, or ask for less"
+        return f"{size}: the pattern is smaller than the remaining noise of the stack's mean; larger frames or cooling would help"
+    return f"{size}: the frames have too few pixels for this u; use larger frames, or accept a larger u"
 
 
 def with_scatter(camera: KnownCamera, values: Mapping[str, Any], plan: Plan) -> KnownCamera:
@@ -423,7 +423,7 @@ def parse_wanted(camera: KnownCamera, texts: Sequence[str]) -> dict[str, float]:
             expected = camera.values.get(key, 0.0)
             if not expected > 0:
                 remedy = f"give it in {KEYS[key].unit}"
-                raise InputError("a relative u of a value that is not known, or zero", where="wanted u", value=text, remedy=remedy)
+                raise InputError("a relative u of a value that is unknown or zero", where="wanted u", value=text, remedy=remedy)
             value *= expected / 100
         wanted[key] = value
     return wanted
@@ -438,12 +438,12 @@ def plan_text(camera: KnownCamera, plan: Plan, wanted: Mapping[str, float] | Non
         if name != "dark_levels" or plan.sweep == "light":
             lines.append(f"  {title:<18}{getattr(plan, name):>6}   {plan.drivers.get(name, 'as given')}")
     duration = plan.duration_s(camera)
-    pace = "at this frame rate, without changes of the set-up" if camera.frame_rate_hz else "of exposure"
+    pace = "at this frame rate, without the time for changes of the set-up" if camera.frame_rate_hz else "of exposure"
     time = "" if duration is None else f", {_time(duration)} {pace}"
     lines += ["", f"  {plan.n_frames} frames in all{time}", "", *_where(camera, plan), ""]
     lines += [*_table(camera, plan, wanted), *_taken_as(camera)]
     if plan.stack_frames < 100:
-        lines += ["", "Stacks of 100 to 400 frames are customary; no wish that can be met asks for as many."]
+        lines += ["", "Stacks of 100 to 400 frames are customary; the wanted u that can be reached need fewer."]
     for key, why in plan.unreachable.items():
         lines += ["", f"Cannot be reached: u({key}) = {wanted.get(key, math.nan):.3g} {KEYS[key].unit}: {why}."]
     return "\n".join(lines) + "\n"
@@ -521,7 +521,7 @@ def manifest(camera: KnownCamera, plan: Plan, *, name: str = "camera", cfa: str 
         raise InputError("exposures are not known", where="plan", remedy="give the exposure time at which the light saturates the camera")
     light_swept = plan.sweep == "light"
     if light_swept and camera.quantum_efficiency is None:
-        raise InputError("levels of a light sweep are told apart by their photons", where="plan", remedy="give the quantum efficiency")
+        raise InputError("levels of a light sweep are identified by their photons", where="plan", remedy="give the quantum efficiency")
     photons_sat = camera.saturation_e / camera.quantum_efficiency if light_swept and camera.quantum_efficiency else math.nan
     stack_s = plan.stack_exposure * camera.exposure_sat_s
     groups = [_group("dark", "level", i, float(t) * camera.exposure_sat_s, math.nan, suffix) for i, t in enumerate(plan.dark_fractions, 1)]

@@ -185,7 +185,7 @@ def check_underflow(frames: Frames) -> Check:
     make = new_check("underflow", "dark pixels at the lowest code", "%", "at most 0.5 %")
     share = frames.dark.share(0)
     u = math.sqrt(share * (1 - share) / frames.dark.mean_map_dn.size)  # a pattern may hold the same pixels down in every frame
-    reason = "the dark signal is cut off below: dark mean, dark noise and DSNU would come out wrong"
+    reason = "the dark signal is cut off at the lowest code: dark mean, dark noise and DSNU would be wrong"
     return make(100 * share, 100 * u, "fail" if share - Z * u > UNDERFLOW_FRACTION else "ok", reason, "Raise the black level (offset)")
 
 
@@ -220,7 +220,7 @@ def check_saturation(frames: Frames) -> Check:
     share = worst.share(2**worst.bits - 1)
     u = math.sqrt(share * (1 - share) / worst.mean_map_dn.size)
     verdict = "fail" if share - Z * u > SATURATED_FRACTION else "ok"
-    return make(100 * share, 100 * u, verdict, f"pixels saturate {level_text(worst)}", "Shorten the exposure or dim the light")
+    return make(100 * share, 100 * u, verdict, f"pixels saturate {level_text(worst)}", "Shorten the exposure or reduce the light")
 
 
 def check_range(frames: Frames) -> Check:
@@ -247,7 +247,7 @@ def check_code_step(frames: Frames) -> Check:
     step = int(np.gcd.reduce(np.diff(codes)))
     shift = step.bit_length() - 1
     shifted = f"Shift the codes right by {shift} and state {frames.dark.bits - shift} bits"
-    reason = f"one code of {step} occurs: the stored bits are not those of the converter"
+    reason = f"only one of every {step} codes occurs: the stored bits are not those of the converter"
     return make(step, 0.0, "fail" if step > 1 else "ok", reason, shifted if step == 2**shift else "Switch digital gain off")
 
 
@@ -286,8 +286,11 @@ def check_codes(frames: Frames) -> Check:
         covered += int((here + least > 30).sum())
     if covered == 0:
         return make(NAN, NAN, "not judged", "the noise is too small to cover neighbouring codes evenly")
-    reason = f"{odd} of {covered} codes stand out: stretched by a digital gain or a table, or the converter has missing codes"
-    remedy = "Switch digital gain, gamma and tables off; use the converter's full bits"
+    reason = (
+        f"{odd} of {covered} codes are missing or doubled: a digital gain or a look-up table stretches them, or the converter has "
+        "missing codes"
+    )
+    remedy = "Switch digital gain, gamma and look-up tables off; use all bits of the converter"
     return make(100 * odd / covered, NAN, "warn" if odd else "ok", reason, remedy)
 
 
@@ -303,7 +306,7 @@ def check_repeated(frames: Frames) -> Check:
 
 def check_independent(frames: Frames) -> Check:
     """Noise of successive frames: alike where the camera or the grabber averages."""
-    make = new_check("independent_frames", "noise of successive to distant frames", "", "1")
+    make = new_check("independent_frames", "noise of successive over distant frames", "", "1")
     groups = [g for g in (frames.dark, *frames.bright) if math.isfinite(g.follow_ratio)]
     if not groups:
         return make(NAN, NAN, "not judged", "three frames or more under one condition are needed")
@@ -314,7 +317,7 @@ def check_independent(frames: Frames) -> Check:
     scatter = 2 * (rows * cols * s.pixel_dn2**2 + rows * (cols * s.row_dn2) ** 2 + cols * (rows * s.col_dn2) ** 2) / (rows * cols) ** 2
     u = 2 * math.sqrt(scatter) / s.total_dn2 if s.total_dn2 > 0 else NAN
     verdict = "fail" if worst.follow_ratio < 0.98 - Z * u * math.sqrt(len(groups)) else "ok"
-    return make(worst.follow_ratio, u, verdict, "frames are averaged with those before them", "Switch temporal filters and averaging off")
+    return make(worst.follow_ratio, u, verdict, "frames are averaged with earlier frames", "Switch temporal filters and averaging off")
 
 
 def check_dark_noise(frames: Frames) -> Check:
@@ -391,7 +394,10 @@ def check_flicker(frames: Frames) -> Check:
     if worst.squares.frame_dn2 > limit * worst.mean_noise_dn2:
         verdict = "fail" if value > 0.02 else "warn" if value > 0.002 else "ok"
     reason = f"the light flickers or drifts {level_text(worst)}; responsivity, linearity and quantum efficiency will scatter by as much"
-    remedy = "Run the light on direct current; make exposures multiples of the mains period (10 ms at 50 Hz); let the lamp warm up"
+    remedy = (
+        "Operate the light with direct current; use exposures that are multiples of the light's period (10 ms at 50 Hz mains); let "
+        "the lamp warm up"
+    )
     return make(100 * value, 100 * value / math.sqrt(2 * dof), verdict, reason, remedy)
 
 
@@ -428,7 +434,7 @@ def check_dark_drift(frames: Frames) -> Check:
         return make(NAN, NAN, "not judged", "six dark frames or more are needed")
     change, u, real = _drift(dark)
     verdict = "warn" if real and change > 0.1 * math.sqrt(dark.squares.total_dn2) else "ok"
-    return make(change, u, verdict, "the dark signal drifts", "Let the camera warm up to its steady temperature")
+    return make(change, u, verdict, "the dark signal drifts", "Let the camera warm up until its temperature is stable")
 
 
 def check_banding(frames: Frames) -> Check:
@@ -451,8 +457,13 @@ def check_banding(frames: Frames) -> Check:
         amplitude = math.sqrt(max(2 * (peak - floor) / rows, 0.0)) / (g.mean_dn - frames.dark.mean_dn)
         if peak > limit * floor and amplitude > worst:
             worst, found = amplitude, "fail" if amplitude > 0.01 else "warn" if amplitude > 0.001 else "ok"
-    remedy = "Run the light on direct current, make exposures multiples of the mains period, or use a global shutter"
-    return make(100 * worst, NAN, found, "bands move through the image from frame to frame: flickering light, read row by row", remedy)
+    remedy = (
+        "Operate the light with direct current, use exposures that are multiples of the light's period (10 ms at 50 Hz mains), or "
+        "use a global shutter"
+    )
+    return make(
+        100 * worst, NAN, found, "bands move through the image from frame to frame: flickering light with a rolling shutter", remedy
+    )
 
 
 def check_uniformity(frames: Frames) -> Check:
@@ -468,7 +479,9 @@ def check_uniformity(frames: Frames) -> Check:
     contrast = np.outer(s.basis_y[high[0]], s.basis_x[high[1]]) - np.outer(s.basis_y[low[0]], s.basis_x[low[1]])
     value, u = float(np.ptp(s.values)) / light.signal_dn, math.sqrt(float((contrast**2 * variances).sum())) / light.signal_dn
     remedy = "Move the light away, use an integrating sphere and no lens, and centre the camera"
-    return make(100 * value, 100 * u, beyond(value, u, UNIFORMITY, UNIFORMITY), "the light is uneven; PRNU will hold part of it", remedy)
+    return make(
+        100 * value, 100 * u, beyond(value, u, UNIFORMITY, UNIFORMITY), "the light is uneven; part of it will appear as PRNU", remedy
+    )
 
 
 def check_defects(frames: Frames) -> Check:
@@ -487,7 +500,7 @@ def check_defects(frames: Frames) -> Check:
     share = float(bad.mean())
     u = math.sqrt(share * (1 - share) / bad.size)
     remedy = "Check the cooling, clean the sensor, or leave these pixels out; say so in the data sheet"
-    return make(100 * share, 100 * u, beyond(share, u, 0.001, 0.01), f"{int(bad.sum())} pixels stand out", remedy)
+    return make(100 * share, 100 * u, beyond(share, u, 0.001, 0.01), f"{int(bad.sum())} pixels deviate", remedy)
 
 
 def _log_slope(x: np.ndarray, y: np.ndarray, u_log_y: np.ndarray) -> tuple[float, float]:
@@ -509,10 +522,10 @@ def check_transfer(frames: Frames) -> Check:
     u = np.sqrt(2 * var**2 / pairs + 2 * dark.squares.pixel_dn2**2 / (dark.mean_map_dn.size * (dark.n_frames - 1)) + 0.02**2)
     use = y > 5 * u
     if use.sum() < 2 or np.ptp(np.log(x[use])) < 0.4:
-        return make(NAN, NAN, "not judged", "two unsaturated levels, one and a half times apart, with noise of the light are needed")
+        return make(NAN, NAN, "not judged", "two unsaturated levels with a ratio of 1.5 or more and visible photon noise are needed")
     slope, u_slope = _log_slope(x[use], y[use] / x[use], (u / np.where(y > 0, y, 1))[use])
-    reason = "the noise does not grow with the signal as photons make it: gamma, a table, noise reduction or strong compression"
-    remedy = "Switch gamma and filters off, or use the General values, which need no linear camera"
+    reason = "the noise does not grow with the signal like photon noise: gamma, a look-up table, noise reduction or strong compression"
+    remedy = "Switch gamma and filters off, or use the General values, which do not need a linear camera"
     return make(slope, u_slope, beyond(abs(slope), u_slope, 0.1, 0.3), reason, remedy)
 
 
@@ -524,13 +537,16 @@ def check_response(frames: Frames) -> Check:
     light = [g.photons if by_photons else g.exposure_s for g in levels]
     known = np.array([v for v in light if v], dtype=float)
     if len(levels) < 2 or known.size < len(levels) or known.max() < 1.5 * known.min():
-        return make(NAN, NAN, "not judged", "two unsaturated levels with known light, one and a half times apart, are needed")
+        return make(NAN, NAN, "not judged", "two unsaturated levels with known light and a ratio of 1.5 or more are needed")
     x = np.array([g.mean_dn - frames.dark.mean_dn for g in levels])
     noise = np.array([max(g.squares.frame_dn2 / g.n_frames, g.mean_noise_dn2 / g.n_frames) for g in levels])
     dark = frames.dark.squares.frame_dn2 / frames.dark.n_frames
     slope, u = _log_slope(known, x, np.sqrt(noise + dark + (1e-3 * x) ** 2) / x)
     reason = "the signal does not follow the light" + ("" if by_photons else " (or the light changed while the exposure was swept)")
-    remedy = "Switch gamma, automatic gain and exposure off and check the light, or use the General values, which need no linear camera"
+    remedy = (
+        "Switch gamma, automatic gain and automatic exposure off and check the light, or use the General values, which do not need "
+        "a linear camera"
+    )
     return make(slope, u, beyond(abs(slope - 1), u, 0.05, 0.2), reason, remedy)
 
 
@@ -556,7 +572,7 @@ def check_blocks(frames: Frames) -> Check:
     if math.isnan(u_worst):
         return make(NAN, NAN, "not judged", "the frames are too small or have no noise")
     verdict = "warn" if chance < FALSE_ALARM / tests and abs(worst) > 0.02 else "ok"
-    reason = "the noise has seams every 8 pixels, as JPEG leaves them"
+    reason = "the noise has steps every 8 pixels, as after JPEG"
     return make(100 * worst, 100 * u_worst, verdict, reason, "Store frames without compression")
 
 

@@ -57,7 +57,7 @@ class SpatialInputs:
         """
         rows, cols = stack.shape
         if min(rows, cols) < 3:
-            raise MeasureError("frames are too small to tell rows, columns and pixels apart", value=stack.shape, allowed="3 x 3 or more")
+            raise MeasureError("frames are too small to separate rows, columns and pixels", value=stack.shape, allowed="3 x 3 or more")
         gains = pattern_gains(stack.shape, high_pass)
         image, noise, white = stack.mean_map_dn, stack.var_map_dn2, stack.ms_pixel_dn2
         if high_pass:
@@ -101,7 +101,7 @@ class SpatialInputs:
         if not self.high_passed:
             return products
         if products.high_passed is None:
-            raise InputError("the frame products hold no high-passed frames", remedy="make them from frames of 24 x 24 pixels or more")
+            raise InputError("the frame products contain no high-passed frames", remedy="make them from frames of 24 x 24 pixels or more")
         return products.high_passed
 
     def draws(self, n: int, rng: Generator, dark_mean_dn: float | None = None) -> np.ndarray:

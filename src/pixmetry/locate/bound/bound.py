@@ -22,7 +22,8 @@ WITHIN = 1.05  # frames are averaged until the uncertainty is within 5 % of what
 MOST_FRAMES, VERY_MANY = 10**6, 10**12
 UNKNOWN_PX = 1.0  # a place that is less sure than this is not known
 LEFT_OUT = (
-    "the noise is Gaussian, independent from pixel to pixel, of known variance; what the variance itself says about the light is not used",
+    "the noise is Gaussian, independent from pixel to pixel, and of known variance; the information of the variance about the light is "
+    "not used",
     "the result is of first order: errors are larger if the noise is as large as the target",
     "not included: geometry, drift, lighting, and targets that differ from the template",
 )
@@ -166,17 +167,17 @@ def bound(
     images = draw_images(kind, parameters, aperture_px=aperture_px, light_on=light_on, window_px=window_px, phases=phases)
     names = names_for(kind)
     if estimator not in names:
-        raise InputError(f"no such estimator to predict for a {kind}", where="estimator", value=estimator, allowed=", ".join(names))
+        raise InputError(f"this estimator cannot be predicted for a {kind}", where="estimator", value=estimator, allowed=", ".join(names))
     pixels = pixel_noise(images, noise, rounded, pattern_dn, frames)
     asked = images.subset(unknowns)
     bounds = {"asked": bound_of(images, pixels, asked, noise, rounded)}
     bounds |= {name: bound_of(images, pixels, images.subset(name), noise, rounded) for name in SETS}
     if not bounds["asked"].place_px[1] < UNKNOWN_PX:
         raise InputError(
-            "the image does not tell the place together with the other unknowns",
+            "the image does not determine the position together with the other unknowns",
             where="unknowns",
             value=", ".join(asked),
-            remedy="ask for fewer unknowns, or give a target with more contrast inside the scale",
+            remedy="use fewer unknowns, or a target with more contrast within the scale",
         )
     predictions = tuple(predict(name, images, pixels, asked) for name in names)
     chosen = predictions[names.index(estimator)]
@@ -212,7 +213,7 @@ def limits(chosen: Prediction, images: Images, pixels: PixelNoise, unknowns: tup
     noise2, full2, base2 = chosen.noise_px**2, full.noise_px**2, base.noise_px**2
     variances = dict(base.parts_px2)
     variances["other unknowns"] = max(min(full2, noise2) - base2, 0.0)
-    variances["the estimator: more noise than the best one lets through"] = max(noise2 - max(full2, base2), 0.0)
+    variances["the estimator: more noise than the best estimator"] = max(noise2 - max(full2, base2), 0.0)
     variances["the estimator: sampling (S-curve)"] = chosen.s_curve_px**2
     total = sum(variances.values())
     found = [Limit(cause, v, v / total) for cause, v in variances.items() if v > 1e-6 * total]
@@ -245,12 +246,12 @@ def closed_forms(images: Images, noise: NoiseModel, frames: int = 1) -> dict[str
     amplitude, blur, ground = p["amplitude_dn"], p["blur_px"], p["background_dn"]
     edge = float(np.sqrt(noise.variance_dn2(ground + amplitude / 2) / frames))
     if images.kind == "disc":
-        return {"edge formula, disc large against its blur": closed.disc_edge(p["radius_px"], blur, amplitude, edge, a)}
+        return {"edge formula, disc much larger than its blur": closed.disc_edge(p["radius_px"], blur, amplitude, edge, a)}
     if images.kind == "ring":
         return {"edge formula, both circles far apart": closed.ring_edge(p["radius_px"], p["inner_radius_px"], blur, amplitude, edge, a)}
     if images.kind == "ellipse":
         x, y = closed.ellipse_edge(*axes_of(p), blur, amplitude, edge, a)
-        return {"edge formula, ellipse large against its blur, x": x, "the same, y": y}
+        return {"edge formula, ellipse much larger than its blur, x": x, "the same, y": y}
     sigma = float(np.sqrt(noise.variance_dn2(ground) / frames))
     if images.kind in ("line", "edge"):
         return _line_forms(images, sigma, edge, gain / frames)
@@ -287,7 +288,7 @@ def _advice(predictions: tuple[Prediction, ...], worth: int | None, bounds: dict
     if worth is None:
         out.append("averaging N frames lowers all of this as 1/√N")
     else:
-        out.append(f"averaging more than {worth} frames gains little: errors that are fixed in the sensor and in the sampling stay")
+        out.append(f"averaging more than {worth} frames gains little: fixed errors of the sensor and of the sampling remain")
     light, planes = bounds["light"].place_px[1], bounds["planes"].place_px[1]
     if np.isfinite(planes) and planes > 1.2 * light:
         out.append(f"unknown slopes of background and light make the result {planes / light:.2g} × as large: fit them only if needed")
@@ -296,7 +297,7 @@ def _advice(predictions: tuple[Prediction, ...], worth: int | None, bounds: dict
 
 def _statements(asked: Bound, rounded: bool) -> list[str]:
     if not rounded:
-        how = "grey values are taken as not rounded"
+        how = "grey values are assumed not to be rounded"
     elif asked.exact_codes:
         how = "some pixels have less than 0.4 DN of noise: the exact likelihood of the codes is used, and the sub-pixel phase matters"
     else:

@@ -171,11 +171,11 @@ def unrounded_variance_dn2(mean: np.ndarray, noise: NoiseModel, rounded: bool) -
     variance = noise.variance_dn2(mean) - (ROUNDING_DN2 if rounded else 0.0)
     if (variance < -1e-9).any():
         raise InputError(
-            "the noise is less than rounding makes",
+            "the noise is smaller than that of rounding",
             where="noise",
             value=noise.constant_dn2,
             allowed="a variance of 1/12 DN² or more where values are whole numbers",
-            remedy="give the noise with rounding included, or say that values are not rounded",
+            remedy="give the noise with rounding included, or state that values are not rounded",
         )
     if (variance < (LEAST_NOISE_DN**2 if rounded else 1e-300)).any():
         raise InputError(

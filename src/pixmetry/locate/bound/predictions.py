@@ -128,7 +128,7 @@ def predict(name: str, images: Images, noise: PixelNoise, unknowns: tuple[str, .
     """
     names = names_for(images.kind)
     if name not in names:
-        raise InputError(f"no such estimator to predict for a {images.kind}", where="estimator", value=name, allowed=", ".join(names))
+        raise InputError(f"this estimator cannot be predicted for a {images.kind}", where="estimator", value=name, allowed=", ".join(names))
     if name in ("template", "template_unweighted"):
         return template(images, noise, unknowns, weighted=name == "template")
     if name == "gaussian":
@@ -197,7 +197,7 @@ def gaussian(images: Images, noise: PixelNoise) -> Prediction:
         gains.append(np.linalg.solve(jacobian @ jacobian.T - change, jacobian)[:2])
         biases.append(p[:2] - centre)
     bias = float(np.sqrt(np.mean(np.square(biases))))
-    return Prediction("gaussian", _parts(np.stack(gains) ** 2, noise), bias, "round, all weights alike")
+    return Prediction("gaussian", _parts(np.stack(gains) ** 2, noise), bias, "round, equal weights")
 
 
 def _law(name: str, level: np.ndarray, variance: np.ndarray, threshold: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

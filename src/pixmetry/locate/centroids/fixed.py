@@ -60,7 +60,7 @@ class FixedCentroid:
             raise InputError("the estimator's window has no central pixel", value=self.window, allowed="an odd number of pixels from 3 on")
         for value in (self.sigma, self.threshold_dn):
             if value is not None and not (np.isfinite(value) and value >= 0):
-                raise InputError("a threshold below the background", value=value, allowed="0 or more")
+                raise InputError("the threshold is below the background", value=value, allowed="0 or more")
         if self.law in THRESHOLDED:
             if self.sigma is None and self.threshold_dn is None:
                 object.__setattr__(self, "sigma", 3.0)

@@ -317,10 +317,10 @@ def _measure(name: str, frame: np.ndarray, targets: Targets, noise: NoiseModel, 
 METHODS = tuple(
     Method(name, text, partial(_measure, name), reach_px)
     for name, text in {
-        "soft_threshold": "centroid of what exceeds a threshold; fast and nearly as good under white noise",
-        "squared_centroid": "centroid of squared grey values; good for small targets under read noise",
-        "centroid": "centroid of grey values above the background; best for small targets under shot noise",
+        "soft_threshold": "centroid of the part above a threshold; fast, and nearly as good with white noise",
+        "squared_centroid": "centroid of squared grey values; good for small targets with read noise",
+        "centroid": "centroid of grey values above the background; best for small targets with shot noise",
         "hard_threshold": "centroid of grey values where they exceed a threshold; depends on the sub-pixel phase",
-        "windowed_centroid": "centroid under a Gaussian window that follows it",
+        "windowed_centroid": "centroid with a Gaussian window that follows the target",
     }.items()
 )

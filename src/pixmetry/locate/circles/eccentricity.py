@@ -78,7 +78,7 @@ def circle_seen(homography: np.ndarray, x: ArrayLike, y: ArrayLike, radius: Arra
     centre = np.stack([x, y, np.ones_like(x)]) if len(x) else np.empty((3, 0))
     seen = h @ centre
     if not (np.abs(seen[2]) > radius * np.hypot(h[2, 0], h[2, 1])).all():
-        raise InputError("a circle reaches the horizon of its plane: it is not seen as an ellipse", where="eccentricity")
+        raise InputError("a circle reaches the horizon of its plane: its image is not an ellipse", where="eccentricity")
     # about the image of the centre: (u, v) of the unit circle goes to (M (u, v)) / (1 + w·(u, v))
     image = seen[:2] / seen[2]
     m = radius[:, None, None] * (h[None, :2, :2] - image.T[:, :, None] * h[None, 2:, :2]) / seen[2][:, None, None]
@@ -303,7 +303,7 @@ def common_plane(ellipses: Ellipses, camera: Pinhole, hint: ArrayLike | None = N
     a circle. They are smooth in n and in the ellipse even where the circle is seen from the front and the two answers meet.
     """
     if len(ellipses) == 0:
-        raise InputError("there is no ellipse to find a plane from", where="eccentricity")
+        raise InputError("there is no ellipse that gives a plane", where="eccentricity")
     cones = _cones(ellipses.conics, camera)
     step = max(1, len(ellipses) // MOST_CANDIDATES)
     tried = plane_normals(ellipses[::step], camera)

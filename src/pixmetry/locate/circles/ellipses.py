@@ -40,7 +40,7 @@ class Pinhole:
 
     def __post_init__(self) -> None:
         if not (np.isfinite(list(vars(self).values())).all() and self.principal_distance_px > 0 and self.pitch_ratio > 0):
-            raise InputError("a camera cannot be used", where="pinhole", allowed="finite numbers, distance and pitch ratio above 0")
+            raise InputError("the camera cannot be used", where="pinhole", allowed="finite numbers, distance and pitch ratio above 0")
 
     @property
     def matrix(self) -> np.ndarray:
@@ -157,7 +157,7 @@ def ellipse_through(x_px: ArrayLike, y_px: ArrayLike) -> Ellipses:
     """
     x, y = np.asarray(x_px, float), np.asarray(y_px, float)
     if x.ndim != 1 or x.shape != y.shape or len(x) < 5 or not (np.isfinite(x).all() and np.isfinite(y).all()):
-        raise InputError("an ellipse cannot be laid through these points", where="contour", allowed="five or more points, finite x and y")
+        raise InputError("no ellipse fits these points", where="contour", allowed="five or more points, finite x and y")
     middle, spread = np.array([x.mean(), y.mean()]), max(np.hypot(x.std(), y.std()), 1e-300)
     u, v = (x - middle[0]) / spread, (y - middle[1]) / spread
     (a, b, c, d, e), _, rank, _ = np.linalg.lstsq(np.column_stack([u * u, u * v, v * v, u, v]), np.ones_like(u), rcond=1e-10)
@@ -166,7 +166,7 @@ def ellipse_through(x_px: ArrayLike, y_px: ArrayLike) -> Ellipses:
     centre = -0.5 * np.linalg.pinv(quadratic) @ linear
     size = 1.0 + centre @ quadratic @ centre
     if rank < 5 or not (values * size > 0).all():
-        raise InputError("an ellipse cannot be laid through these points", where="contour", remedy="give points all around the target")
+        raise InputError("no ellipse fits these points", where="contour", remedy="give points all around the target")
     semi = spread * np.sqrt(size / values)  # the smallest eigenvalue is the longest axis
     major = int(np.argmax(semi))
     angle = np.rad2deg(np.arctan2(axes[1, major], axes[0, major]))
@@ -226,5 +226,5 @@ def unit(direction: ArrayLike) -> np.ndarray:
     n = np.asarray(direction, float)
     length = np.linalg.norm(n, axis=-1, keepdims=True)
     if n.shape[-1:] != (3,) or not (np.isfinite(n).all() and (length > 0).all()):
-        raise InputError("a plane's normal is no direction", where="eccentricity", allowed="three finite numbers, not all 0")
+        raise InputError("the normal of a plane is not a direction", where="eccentricity", allowed="three finite numbers, not all 0")
     return n / length

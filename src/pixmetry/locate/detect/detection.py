@@ -119,7 +119,7 @@ def detect(
     if polarity not in POLARITIES:
         raise InputError("no such polarity", value=polarity, allowed=", ".join(POLARITIES))
     if not (threshold_sigma > 0 and least_area_px >= 1):
-        raise InputError("a threshold or area that nothing passes", value=(threshold_sigma, least_area_px), allowed="above 0; 1 or more")
+        raise InputError("a threshold or area that no target exceeds", value=(threshold_sigma, least_area_px), allowed="above 0; 1 or more")
     ground = background(frame, low_dn=low_dn, high_dn=high_dn, threads=threads)
     *ends, grain = scale_of(frame, low_dn, high_dn)
     reach = threshold_sigma * _tame(ground.sigma_dn) + 0.5 * grain

@@ -53,7 +53,7 @@ def find_squares(
         If the pattern has fewer than 3 squares a side.
     """
     if min(pattern) < 3:
-        raise InputError("too few squares to know a plate by", where="pattern", value=pattern, allowed="3 × 3 squares or more")
+        raise InputError("too few squares to identify a plate", where="pattern", value=pattern, allowed="3 × 3 squares or more")
     best: tuple[Grid, Regions] | None = None
     found = detect(frame, polarity=polarity, low_dn=low_dn, high_dn=high_dn).targets
     for side in (found.amplitude_dn < 0, found.amplitude_dn > 0):

@@ -56,7 +56,7 @@ def find_chessboard(frame: np.ndarray, inner_corners: tuple[int, int]) -> Grid:
 
     cols, rows = (int(n) for n in inner_corners)
     if min(cols, rows) < 3:
-        raise InputError("too few corners to know a board by", where="pattern", value=(cols, rows), allowed="3 × 3 inner corners or more")
+        raise InputError("too few corners to identify a board", where="pattern", value=(cols, rows), allowed="3 × 3 inner corners or more")
     if min(frame.shape) < LEAST_SQUARE_PX * (min(cols, rows) + 1):  # OpenCV stops with an assertion
         return no_grid(f"the frame is too small for {cols} × {rows} inner corners", rows, cols)
     grey = eight_bit(frame)

@@ -80,7 +80,7 @@ def noise_from_image(
     has them; where even this leaves it uncertain by 0.4, all that is left is taken for noise, whatever it is from.
     """
     if not len(targets):
-        raise MeasureError("no target to measure the noise at", where="noise_from_image", remedy="give a noise model")
+        raise MeasureError("no target from which the noise could be estimated", where="noise_from_image", remedy="give a noise model")
     which = _some(targets)
     part = targets[which]
     whole = frame.dtype.kind == "u"

@@ -147,7 +147,7 @@ def fit_template(
             raise InputError(f"{name} is neither on nor off", value=value, allowed='"auto", True, False')
     if kind == "spot":
         if light_plane is True:
-            raise InputError("light that falls off over a Gaussian spot cannot be told from a shift of it", allowed="light_plane=False")
+            raise InputError("light that falls off over a Gaussian spot cannot be distinguished from a shift", allowed="light_plane=False")
         light_plane = False
     surface, exact = light_on == "surface", likelihood == "poisson_gaussian"
     windows = Windows.of(frame, targets, noise, kind, aperture_px, surface, exact)
@@ -255,7 +255,7 @@ def _check(kind: str, light_on: str, aperture_px: float) -> None:
     if light_on not in LIGHT_ON:
         raise InputError("light that acts nowhere", value=light_on, allowed=", ".join(LIGHT_ON))
     if not 0 <= aperture_px <= 4:
-        raise InputError("an aperture that no pixel has", value=aperture_px, allowed="0 … 4 px")
+        raise InputError("an impossible aperture of a pixel", value=aperture_px, allowed="0 … 4 px")
 
 
 def _check_shape(kind: str, p: np.ndarray) -> None:
@@ -269,7 +269,7 @@ def _check_shape(kind: str, p: np.ndarray) -> None:
         xx, yy, xy = p[2:5]
         good &= bool(xx > 0 and xx * yy > xy * xy)
     if not good:
-        raise InputError(f"a {kind} that cannot be drawn", value=names, allowed="sizes and blur above 0, an outline that encloses an area")
+        raise InputError(f"this {kind} cannot be computed", value=names, allowed="sizes and blur above 0, an outline that encloses an area")
 
 
 def _positions(kind: str, targets: Targets, result: Fitted, on_ground: np.ndarray, on_light: np.ndarray) -> Positions:

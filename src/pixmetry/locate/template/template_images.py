@@ -83,7 +83,7 @@ class Images:
             allowed = f"position, light, shape, planes, or some of {', '.join(self.names)}"
             raise InputError(f"a {self.kind} has no such parameter", where="unknowns", value=", ".join(unknown), allowed=allowed)
         if not set(self.place) & set(unknowns):
-            raise InputError("the place is not among the unknowns", where="unknowns", allowed=f"{' and '.join(self.place)} among them")
+            raise InputError("the position is not among the unknowns", where="unknowns", allowed=f"{' and '.join(self.place)} among them")
         return tuple(n for n in self.names if n in unknowns)
 
     def columns(self, unknowns: tuple[str, ...]) -> np.ndarray:
