@@ -47,7 +47,7 @@ def test_manifest_gives_what_it_says(tmp_path: Path) -> None:
         (HEAD, ["no frames", "dark and bright"]),
         (HEAD + "frames:\n", ["no frames"]),
         (HEAD + DARK.replace("d_1", "d_9") + BRIGHT, ["d_9.png", "missing", "line 4", "did you mean"]),
-        (HEAD + DARK.replace("d_1.png", "x/*.png") + BRIGHT, ["x/*.png", "fits no file", "line 4"]),
+        (HEAD + DARK.replace("d_1.png", "x/*.png") + BRIGHT, ["x/*.png", "matches no file", "line 4"]),
         (HEAD + DARK.replace("d_0.png, d_1.png", "d_0.png"), ["only 1 frame", "dark", "two frames"]),
         (HEAD + DARK.replace("d_1", "d_0") + BRIGHT, ["d_0.png", "listed 2 times"]),
         (HEAD + DARK + BRIGHT.replace("b_1", "d_1"), ["d_1.png", "listed 2 times"]),

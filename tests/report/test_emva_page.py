@@ -147,7 +147,7 @@ def test_the_document_follows_from_the_linearity_of_the_photon_transfer() -> Non
     found = document(curved)
     assert found.startswith("Release 4.0 General applies")
     assert "5.10 ± 0.40 %, more than the 2.70 to 3.40 % that" in found
-    expected = {(2.6, 0.8): "Linear applies", (2.8, 0.01): "do not tell", (3.3, 0.01): "do not tell", (3.5, 0.8): "General applies"}
+    expected = {(2.6, 0.8): "Linear applies", (2.8, 0.01): "do not decide", (3.3, 0.01): "do not decide", (3.5, 0.8): "General applies"}
     for (percent, u), said in expected.items():
         one = with_departure(percent, u)
         assert said in document(one)
@@ -420,7 +420,7 @@ def test_a_camera_has_one_verdict_that_of_its_worst_channel() -> None:
     assert "5.00 ± 0.10" in line
     assert "channel Gr, the farthest, decides for the camera" in line
     (open_,) = document_lines([bent(1.2, "R"), bent(3.0, "B")])
-    assert "do not tell" in open_ and "channel B" in open_
+    assert "do not decide" in open_ and "channel B" in open_
     assert document_lines([bent(1.2)])[0].startswith("Release 4.0 Linear applies")
 
 
