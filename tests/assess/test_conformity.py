@@ -152,7 +152,11 @@ def test_file_of_limits(tmp_path: Path) -> None:
 def test_each_channel_is_judged() -> None:
     limits = Limits.model_validate({"schema": "pixmetry/limits/1", "limits": {"DR": {"min": 900}}})
     values = {(c, "DR"): value(x, 1.0) for c, x in (("R", 1000.0), ("B", 800.0))}
-    assert {row.channel: row.judgement.verdict for row in check(values, limits)} == {"R": "pass", "B": "fail"}
+    found = {row.channel: row for row in check(values, limits)}
+    assert {channel: row.judgement.verdict for channel, row in found.items()} == {"R": "pass", "B": "fail"}
+    kept, broken = found["R"].finding, found["B"].finding
+    assert (kept.level, kept.advice, broken.level) == ("note", "", "error") and broken.advice
+    assert broken.text == "DR [B] does not keep its limits." and broken.numbers == {"value": values["B", "DR"], "min": 900}
 
 
 @pytest.mark.parametrize(

@@ -180,7 +180,12 @@ def test_advice_names_the_largest_and_tells_the_gain() -> None:
         whole = budget.with_accepted[0] if advice.status == "accepted" else budget.verdict
         assert advice.combined_px == whole.total_px
         assert advice.removed_px == pytest.approx(math.sqrt(whole.total_px**2 - advice.total_px**2), rel=1e-6)
-        assert advice.removed_px <= advice.halved_px <= advice.combined_px and advice.text
+        assert advice.removed_px <= advice.halved_px <= advice.combined_px
+        finding = advice.finding
+        assert finding.kind == ("to_measure" if advice.status == "accepted" else "to_lower")
+        assert finding.text.startswith(advice.title) and finding.advice == get_source(advice.source_id).advice
+        record = advice.to_record()
+        assert record["total_px"] == finding.numbers["total_px"] and record["text"] == finding.text and record["level"] == finding.level
     forced = computed(small_camera(), None, KNOWN, trials=0, accepted=["sensor.prnu"])
     assert row(forced, "sensor.prnu").status == "accepted"
 

@@ -1,4 +1,4 @@
-"""What to do about the largest contributions, and what it would bring."""
+"""Which contributions to lower and which to measure first, and what that would bring; `Advice.finding` says it in words."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import numpy as np
 
 from pixmetry.budget.combine import Combined
 from pixmetry.budget.records import Advice, BudgetRow
-from pixmetry.camera.catalogue import get_source
 
 MOST = 5
 MOST_ACCEPTED = 3
@@ -28,9 +27,6 @@ def advise(
 
 
 def _advice(row: BudgetRow, combined_px: float) -> Advice:
-    text = get_source(row.source_id).advice
-    if row.status == "accepted":
-        text = f"Not measured: taken at the largest value to be expected of a sound camera. {text}"
     removed = row.without_px
     halved = float(np.sqrt(removed**2 + 0.25 * (combined_px**2 - removed**2)))
-    return Advice(row.name, row.source_id, row.title, row.status, text, row.total_px, combined_px, removed, halved)
+    return Advice(row.name, row.source_id, row.title, row.status, row.total_px, combined_px, removed, halved)

@@ -187,7 +187,7 @@ class Trials:
         col0, row0 = (
             np.clip(np.rint(at + by).astype(np.int64) - middle, 0, most) for at, by, most in zip(belongs, moved, last, strict=True)
         )
-        conditions = {"exposure_s": facts.exposure_s, "temperature_c": facts.temperature_c}
+        conditions: dict[str, Any] = {"exposure_s": facts.exposure_s, "temperature_c": facts.temperature_c}
         frozen = camera.freeze(background_of(self.target, facts), **conditions)
         windows = camera.expose_windows(
             scene_of(self.target, facts, x, y),

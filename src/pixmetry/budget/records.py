@@ -10,9 +10,11 @@ import numpy as np
 from pixmetry.budget.combine import Combined, combine
 from pixmetry.budget.monte_carlo import MonteCarlo
 from pixmetry.budget.probe import Facts, Target
-from pixmetry.camera.catalogue import STAGES
+from pixmetry.camera.catalogue import STAGES, get_source
 from pixmetry.camera.contribution import Contribution
+from pixmetry.core.finding import Finding
 from pixmetry.locate.estimator import Estimator
+from pixmetry.report.numbers import NONE, length_px, percent
 
 SCHEMA = "pixmetry/budget/1"
 DECIDED = ("measured", "modelled", "calibrated")
@@ -163,21 +165,44 @@ class Interval:
 
 @dataclass(frozen=True)
 class Advice:
-    """What to do about one source: measure it if it was only accepted, else lower it.
+    """What one source is worth: to be measured if it was only accepted, else to be lowered.
 
-    ``combined_px`` is the combined total now, ``removed_px`` and ``halved_px`` what it would be without this
-    contribution and with half of it.
+    ``combined_px`` is the combined total now, ``removed_px`` and ``halved_px`` what it would be without this contribution and with half
+    of it; for an accepted source all three are totals with everything accepted.
     """
 
     name: str
     source_id: str
     title: str
     status: str
-    text: str
     total_px: float
     combined_px: float
     removed_px: float
     halved_px: float
+
+    @property
+    def finding(self) -> Finding:
+        """The same in words; its kind is ``to_measure`` or ``to_lower``."""
+        accepted = self.status == "accepted"
+        whole = "the total with all accepted sources" if accepted else "the total"
+        now, gone, half = (length_px(v, 3) for v in (self.combined_px, self.removed_px, self.halved_px))
+        less = percent(1 - self.removed_px / self.combined_px) if self.combined_px else NONE
+        size = length_px(self.total_px)
+        made = f"contributes {size} px"
+        if accepted:
+            made = f"is not measured: taken at the largest value to be expected of a sound camera, it contributes {size} px"
+        return Finding(
+            "to_measure" if accepted else "to_lower",
+            f"{self.title} {made}. Without this source {whole} would fall from {now} to {gone} px ({less} % less); with half of it, to "
+            f"{half} px (rms of x and y).",
+            get_source(self.source_id).advice,
+            numbers={name: getattr(self, name) for name in ("total_px", "combined_px", "removed_px", "halved_px")},
+        )
+
+    def to_record(self) -> dict[str, Any]:
+        """Return a plain record for JSON: the source, its numbers, and the finding's words."""
+        words = self.finding.to_record()
+        return asdict(self) | {name: words[name] for name in ("kind", "text", "advice", "level")}
 
 
 @dataclass(frozen=True)
@@ -260,7 +285,7 @@ class Budget:
             "headline": None if self.headline is None else _finite(asdict(self.headline)),
             "interval": None if self.interval is None else asdict(self.interval) | {"dof": [_or_none(v) for v in self.interval.dof]},
             "stages": [asdict(s) for s in self.stages],
-            "advice": [asdict(a) for a in self.advice],
+            "advice": [a.to_record() for a in self.advice],
             "interaction": None
             if self.interaction is None
             else {

@@ -197,6 +197,8 @@ def print_limits(name: str, rows: Sequence[Checked], console: Console) -> None:
         texts = (_named(row.key, row.channel), pretty_unit(row.value.unit), _shown(row.value), limits, accepted, conforms, verdict)
         table.add_row(*map(escape, texts))
     console.print(table)
+    for advice in dict.fromkeys(row.finding.advice for row in rows if row.finding.advice):
+        console.print(f"To do: {advice}", markup=False, soft_wrap=True)
 
 
 def _interval(lower: float, upper: float, number: Any) -> str:
@@ -235,18 +237,18 @@ def _limit_record(name: str, row: Checked) -> dict[str, Any]:
     from pixmetry.emva.files.json_format import value_record
     from pixmetry.files.strict_json import plain
 
-    judgement = row.judgement
-    return {
+    judgement, words = row.judgement, row.finding.to_record()
+    return value_record(row.value) | {
         "file": name,
         "channel": row.channel,
         "key": row.key,
         "verdict": judgement.verdict,
-        "reason": judgement.reason,
+        "reason": judgement.reason or row.value.reason,
         "rule": judgement.rule,
         "min": None if row.lower == float("-inf") else row.lower,
         "max": None if row.upper == float("inf") else row.upper,
         "probability": plain(judgement.probability),
         "guard_band": plain(judgement.guard_band),
         "acceptance": plain(judgement.acceptance),
-        **value_record(row.value),
+        **{name: words[name] for name in ("text", "advice", "level")},
     }

@@ -18,8 +18,10 @@ from pydantic import Field, PrivateAttr, field_validator, model_validator
 from pixmetry.assess.judge.differences import upper_tail
 from pixmetry.core.config import Model, load_yaml, validate
 from pixmetry.core.errors import InputError, ParameterError
+from pixmetry.core.finding import ERROR, NOTE, WARNING, Finding
 from pixmetry.core.number import Number
 from pixmetry.emva.files.keys import KEYS, NONLINEAR, plain_unit
+from pixmetry.emva.records import MONO
 
 Rule = Literal["guarded_acceptance", "simple_acceptance", "guarded_rejection"]
 
@@ -85,6 +87,20 @@ class Checked:
     lower: float
     upper: float
     judgement: Judgement
+
+    @property
+    def finding(self) -> Finding:
+        """The same in words: a warning where it is undecided, an error where the value fails."""
+        verdict = self.judgement.verdict
+        text, level, advice = {
+            "pass": ("keeps its limits", NOTE, ""),
+            "fail": ("does not keep its limits", ERROR, "Reject the camera for this use, or find what changed and measure again."),
+            "undecided": ("may keep its limits or not", WARNING, "Measure with a smaller uncertainty, or agree on wider limits."),
+        }[verdict]
+        channel = "" if self.channel == MONO else f" [{self.channel}]"
+        why = f": {self.judgement.reason}" if self.judgement.reason else ""
+        numbers = {"value": self.value} | {n: v for n, v in (("min", self.lower), ("max", self.upper)) if math.isfinite(v)}
+        return Finding(f"limit_{verdict}", f"{self.key}{channel} {text}{why}.", advice, level, numbers)
 
 
 def load_limits(path: str | Path) -> Limits:

@@ -15,7 +15,7 @@ from pixmetry.budget.monte_carlo import MonteCarlo
 from pixmetry.budget.probe import phases_for
 from pixmetry.camera.catalogue import get_source
 from pixmetry.camera.contribution import UNSTEADY
-from pixmetry.report import Answer, Column, Points, Reading, Row, Run, Section, Table, Text, strong
+from pixmetry.report import Answer, Column, Reading, Row, Run, Section, Table, Text, strong
 from pixmetry.report.numbers import NO_BREAK, NONE, THIN, decimals_of, fixed, length_mpx, length_px, length_um, percent, signed
 from pixmetry.report.page import Inline
 
@@ -162,28 +162,23 @@ def largest_section(budget: Budget) -> Section:
     """The largest contributions with what to do, and the largest of what was only accepted."""
     section = Section("The largest contributions, and what to do", name="largest")
     rows = {r.name: r for r in budget.rows}
-    chosen = [(a, rows[a.name]) for a in budget.advice]
-    known = [(a, r) for a, r in chosen if r.status != "accepted"]
-    for number, (advice, row) in enumerate(known, 1):
+    known = [a for a in budget.advice if a.status != "accepted"]
+    for number, advice in enumerate(known, 1):
+        row = rows[advice.name]
         part = section.add_section([f"{number}. {row.title} ", Run(_chip(row), "chip")])
-        part.add_text(_sizes(row, budget.pitch_um), style="small")
-        part.add_text(strong("To do:"), f" {advice.text} ", strong("Gain:"), f" {_gain(advice)}")
+        part.add_text(_sizes(row, budget.pitch_um), style="small").add_finding(advice.finding)
     if not known:
         section.add_text("No source contributes.")
-    bounds = [(a, r) for a, r in chosen if r.status == "accepted"]
+    bounds = [a for a in budget.advice if a.status == "accepted"]
     if bounds:
-        items: list[Inline] = [
-            [
-                *(strong(row.title), " ", Run(_chip(row), "chip"), f" at most {_text(row.total_px, budget.pitch_um)}. "),
-                *(strong("To do:"), f" {advice.text} ", strong("Gain:"), f" {_gain(advice)}"),
-            ]
-            for advice, row in bounds
-        ]
         part = section.add_section("Accepted, not measured: what to measure first")
         part.add_text(
             "These count only in the total with all accepted sources, each at the largest value to be expected of a sound camera."
         )
-        part.add(Points(items))
+        for advice in bounds:
+            row = rows[advice.name]
+            part.add_text(strong(row.title), " ", Run(_chip(row), "chip"), f" at most {_text(row.total_px, budget.pitch_um)}.")
+            part.add_finding(advice.finding)
     return section
 
 
@@ -204,15 +199,6 @@ def _sizes(row: BudgetRow, pitch: Pitch) -> str:
         own, shift = length_px(u), signed(bias, length_px)
         parts.append(f"{axis}: u {own} px{um(u, axis, own)}, bias {shift} px{um(bias, axis, shift)}")
     return "; ".join(parts) + "."
-
-
-def _gain(advice: Any) -> str:
-    whole = "the total with all accepted sources" if advice.status == "accepted" else "the total"
-    now, gone, half = (length_px(v, 3) for v in (advice.combined_px, advice.removed_px, advice.halved_px))
-    less = percent(1 - advice.removed_px / advice.combined_px) if advice.combined_px else NONE
-    return (
-        f"without this source {whole} would fall from {now} to {gone} px ({less} % less); with half of it, to {half} px (rms of x and y)."
-    )
 
 
 def _monte_carlo_note(budget: Budget) -> str:
