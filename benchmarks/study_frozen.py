@@ -14,7 +14,7 @@ import numpy as np
 from pixmetry.budget.monte_carlo import Trials
 from pixmetry.budget.probe import Target, facts_of, make_probe
 from pixmetry.camera.camera import Camera, Element, in_order
-from pixmetry.camera.catalogue import catalogue
+from pixmetry.camera.catalogue import sources
 from pixmetry.locate.centroids.fixed import FixedCentroid
 
 SETTINGS = {
@@ -29,8 +29,8 @@ SETTINGS = {
 
 
 def main() -> None:
-    sources = catalogue()
-    chain = [Element(s.id, s, s.make(SETTINGS[s.id])) for s in in_order(sources[i] for i in SETTINGS)]
+    every = sources()
+    chain = [Element(s.id, s, s.make(SETTINGS[s.id])) for s in in_order(every[i] for i in SETTINGS)]
     camera = Camera("chain", (240, 320), tuple(chain), facts={"interface": "analogue", "sensor": "ccd", "bits": 8})
     target, estimator = Target(), FixedCentroid()
     facts = facts_of(camera, target)

@@ -25,7 +25,6 @@ _HOMES = {
     "bound": "pixmetry.locate.bound.bound",
     "calibrate": "pixmetry.calibrate.job",
     "campaign_of_arrays": "pixmetry.files",
-    "catalogue": "pixmetry.camera.catalogue",
     "chain": "pixmetry.simulate.chain",
     "check_limits": "pixmetry.assess.judge.compare",
     "compare": "pixmetry.assess.judge.compare",
@@ -38,6 +37,7 @@ _HOMES = {
     "read_calibration": "pixmetry.calibrate.files.record",
     "read_frame": "pixmetry.files",
     "simulate": "pixmetry.simulate.job",
+    "sources": "pixmetry.camera.catalogue",
 }
 
 __all__ = [
@@ -53,7 +53,6 @@ __all__ = [
     "bound",
     "calibrate",
     "campaign_of_arrays",
-    "catalogue",
     "chain",
     "check_limits",
     "compare",
@@ -66,6 +65,7 @@ __all__ = [
     "read_calibration",
     "read_frame",
     "simulate",
+    "sources",
 ]
 
 if TYPE_CHECKING:
@@ -75,7 +75,7 @@ if TYPE_CHECKING:
     from pixmetry.calibrate.files.record import read_calibration
     from pixmetry.calibrate.job import calibrate
     from pixmetry.camera.camera import Camera, load_camera
-    from pixmetry.camera.catalogue import add_source_file, catalogue
+    from pixmetry.camera.catalogue import add_source_file, sources
     from pixmetry.camera.signal import Signal
     from pixmetry.core.errors import PixmetryError
     from pixmetry.core.number import Estimates, Number

@@ -17,7 +17,7 @@ from pixmetry.budget.monte_carlo import Trials, monte_carlo
 from pixmetry.budget.parameters import applies, covariance_of
 from pixmetry.budget.probe import Target, facts_of
 from pixmetry.camera.camera import load_camera
-from pixmetry.camera.catalogue import catalogue, get_source
+from pixmetry.camera.catalogue import get_source, sources
 from pixmetry.camera.signal import Kind
 from pixmetry.core.errors import InputError
 from pixmetry.core.number import Estimates
@@ -50,7 +50,7 @@ def row(budget, name):
 
 def test_status_of_each_source() -> None:
     budget = computed(small_camera(), prnu(0.008, 0.0004), KNOWN, trials=0)
-    assert {r.source_id for r in budget.rows} == set(catalogue())
+    assert {r.source_id for r in budget.rows} == set(sources())
     assert row(budget, "sensor.prnu").status == "measured"
     assert row(budget, "electronics.amplifier_noise").status == "modelled"
     assert row(budget, "processing.threshold").status == "modelled"
@@ -86,7 +86,7 @@ def test_what_stands_in_the_chain_counts_by_monte_carlo_where_there_is_no_propag
 FRAME_SIZES = [(240, 320), (480, 640), (1024, 1280), (2048, 2448), (4096, 5120)]
 
 
-@pytest.mark.parametrize("source_id", [i for i, s in catalogue().items() if s.propagate and not s.option and Kind.LIGHT not in s.consumes])
+@pytest.mark.parametrize("source_id", [i for i, s in sources().items() if s.propagate and not s.option and Kind.LIGHT not in s.consumes])
 def test_no_bound_explodes_or_vanishes_with_the_size_of_the_frame(source_id: str) -> None:
     """What is accepted at its bound: over frames of 77 kpx to 21 Mpx it neither grows to several times that of 640 × 480 pixels, nor is it
     ever the size of a pixel. The clock that is not warm stretches the row, by a share of its length: that grows as rows do.
@@ -337,7 +337,7 @@ def test_kurtosis_of_rare_defects_is_that_of_their_simulation(seed: int) -> None
 def test_the_record_is_plain_and_complete() -> None:
     record = computed(small_camera(), prnu(0.008, 0.0004), KNOWN, trials=256).to_record()
     again = json.loads(json.dumps(record, allow_nan=False))
-    assert again["schema"] == "pixmetry/budget/1" and len(again["rows"]) == len(catalogue())
+    assert again["schema"] == "pixmetry/budget/1" and len(again["rows"]) == len(sources())
     assert again["verdicts"][0]["total_um"] is not None and again["interaction"]["together"]["x"]["u"] > 0
     assert again["estimator"]["threshold_dn"] == pytest.approx(1.8)
 

@@ -22,7 +22,7 @@ from chance import rng_of
 from pixmetry.budget.monte_carlo import Trials
 from pixmetry.budget.probe import Facts, Probes, Target, facts_of
 from pixmetry.camera.camera import Camera, Element, in_order
-from pixmetry.camera.catalogue import catalogue, get_source
+from pixmetry.camera.catalogue import get_source, sources
 from pixmetry.camera.signal import Kind
 from pixmetry.camera.source import Source
 from pixmetry.locate.centroids.fixed import FixedCentroid
@@ -30,7 +30,7 @@ from pixmetry.locate.centroids.fixed import FixedCentroid
 CLOCKS = {10e6: (120, 160), 14.1875e6: (200, 300), 14.75e6: (96, 400), 28.4e6: (160, 240)}
 OWN_CLOCK = 14.75e6  # of the pixels, where the grabber's is another
 QUANTILE = 8.0
-CASES = {i: s for i, s in catalogue().items() if s.forward is not None and s.propagate is not None and s.ideal is None}
+CASES = {i: s for i, s in sources().items() if s.forward is not None and s.propagate is not None and s.ideal is None}
 ON_LINE = [i for i, s in CASES.items() if Kind.VIDEO in s.consumes and i != "grabber.low_pass"]
 OFF_LINE = [i for i, s in CASES.items() if Kind.VIDEO not in s.consumes]
 TARGET, LAW = Target(peak_rel=0.7, background_rel=0.05), FixedCentroid(threshold_dn=12.0)

@@ -17,7 +17,7 @@ from catalogue.support import soft_centroid
 from pixmetry.budget import compute_budget
 from pixmetry.budget.monte_carlo import Trials, put
 from pixmetry.camera.camera import Camera, Element, load_camera
-from pixmetry.camera.catalogue import catalogue, get_source
+from pixmetry.camera.catalogue import get_source, sources
 from pixmetry.camera.signal import Kind
 from pixmetry.core.errors import ChainError
 from pixmetry.locate.centroids.fixed import FixedCentroid
@@ -120,4 +120,4 @@ def test_every_source_of_the_presets_has_a_contribution_or_cannot_be_left_out() 
 
 def test_a_chain_without_a_place_says_so() -> None:
     with pytest.raises(ChainError):
-        put(Camera("empty", (8, 8), ()), Element("x", catalogue()["grabber.adc"], catalogue()["grabber.adc"].typical))
+        put(Camera("empty", (8, 8), ()), Element("x", sources()["grabber.adc"], sources()["grabber.adc"].typical))

@@ -16,7 +16,7 @@ from pixmetry.calibrate.bundle.solve import calibrate_network
 from pixmetry.calibrate.checks.added_terms import AddedTerms, derivatives
 from pixmetry.calibrate.checks.patterns import MEANING, pattern_findings, residual_patterns
 from pixmetry.calibrate.records import Pattern
-from pixmetry.camera.catalogue import catalogue
+from pixmetry.camera.catalogue import sources
 
 RATE = 1e-6
 WAVES = ("wave_xx", "wave_xy", "wave_yy")
@@ -215,8 +215,8 @@ def test_drift_of_the_clock_is_named_and_gone_when_estimated(rng):
 
 
 def test_findings_come_with_a_source_of_the_catalogue():
-    sources = set(catalogue())
-    assert {source for _, source, _ in MEANING.values() if source} <= sources
+    known = set(sources())
+    assert {source for _, source, _ in MEANING.values() if source} <= known
     made = [
         Pattern(name, "a", 0.01, None, p, significant=p < 1e-3, text=name, source=MEANING[name][1], advice="do this")
         for name, p in (("phase_x", 1e-5), ("field", 0.3), ("radius", 1e-9))

@@ -449,10 +449,10 @@ def test_windows_widened_to_blocks_stay_in_the_frame() -> None:
 def test_the_whole_catalogue_has_an_order() -> None:
     """Tape is of the stage of storage, yet plays before the grabber; in-camera processing comes before the codecs."""
     from pixmetry.camera.camera import in_order
-    from pixmetry.camera.catalogue import catalogue
+    from pixmetry.camera.catalogue import sources
 
-    names = [s.id for s in in_order([s for s in catalogue().values() if s.forward is not None])]
-    assert len(names) == sum(s.forward is not None for s in catalogue().values())
+    names = [s.id for s in in_order([s for s in sources().values() if s.forward is not None])]
+    assert len(names) == sum(s.forward is not None for s in sources().values())
     for first, then in (
         ("optics.point_spread", "sensor.quantum_efficiency"),
         ("cable.termination", "storage.tape"),

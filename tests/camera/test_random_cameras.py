@@ -10,7 +10,7 @@ import pytest
 from catalogue.support import Texture
 from pixmetry.camera import bands
 from pixmetry.camera.camera import Camera, Element, in_order
-from pixmetry.camera.catalogue import catalogue
+from pixmetry.camera.catalogue import sources
 from pixmetry.camera.signal import Kind
 from pixmetry.core.random import Grid
 from pixmetry.scene.discs import Discs
@@ -24,7 +24,7 @@ CONVERSIONS = ("sensor.quantum_efficiency", "electronics.gain", "grabber.adc")
 
 def draw_chain(rng: np.random.Generator) -> list[Element]:
     """Three to twelve sources with typical parameters, and the conversions that belong to every camera."""
-    able = [s for s in catalogue().values() if s.forward is not None]
+    able = [s for s in sources().values() if s.forward is not None]
     drawn = rng.choice(len(able), rng.integers(3, 13), replace=False)
     ids = {able[i].id for i in drawn} | set(CONVERSIONS)
     if "sensor.log_response" in ids:  # it makes the step to DN itself, in the pixel

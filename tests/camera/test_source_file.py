@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pixmetry.camera.catalogue import add_source_file, catalogue
+from pixmetry.camera.catalogue import add_source_file, sources
 from pixmetry.core.errors import ChainError, InputError
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "adding-a-source.md"
@@ -27,7 +27,7 @@ def example(tmp_path: Path) -> Path:
 
 
 def test_the_documented_source_works_from_a_file(example: Path) -> None:
-    before = set(catalogue())
+    before = set(sources())
     try:
         source = add_source_file(example)
         assert add_source_file(example).id == source.id == "electronics.fan_noise"
@@ -37,8 +37,8 @@ def test_the_documented_source_works_from_a_file(example: Path) -> None:
         assert np.ptp(frames, axis=(1, 2)).max() < 1e-3
         assert abs(frames[:, 0, 0].std() - 2.0) < 6 * 2.0 / np.sqrt(400)
     finally:
-        for name in set(catalogue()) - before:
-            del catalogue()[name]
+        for name in set(sources()) - before:
+            del sources()[name]
 
 
 def test_the_command_takes_the_file(example: Path) -> None:

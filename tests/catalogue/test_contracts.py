@@ -14,14 +14,14 @@ from hypothesis import strategies as st
 from catalogue.support import NAME, SHAPE, Amplitude, Texture, camera_with, kind_of, make_source, truth_maps
 from pixmetry.camera import bands
 from pixmetry.camera.camera import Camera, Element
-from pixmetry.camera.catalogue import catalogue
+from pixmetry.camera.catalogue import sources
 from pixmetry.camera.contribution import CLASSES
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity, run
 from pixmetry.core.errors import ChainError, InputError
 from pixmetry.core.random import Grid
 
-SOURCES = catalogue()
+SOURCES = sources()
 SCENE = Texture()
 every_source = pytest.mark.parametrize("source", SOURCES.values(), ids=SOURCES.keys())
 IN_FRAMES = {i: s for i, s in SOURCES.items() if s.forward is not None}

@@ -15,7 +15,7 @@ import pytest
 
 from catalogue.support import Flat, Targets, camera_with, kind_of, lead_in, probe_of, soft_centroid, to_dn
 from pixmetry.camera.camera import Camera
-from pixmetry.camera.catalogue import catalogue
+from pixmetry.camera.catalogue import sources
 from pixmetry.camera.contribution import Probe
 from pixmetry.camera.signal import Kind
 from pixmetry.camera.source import Source
@@ -29,7 +29,7 @@ UNITS, TARGETS = 64, 40
 OF_LIGHT = 20  # targets that do for what acts on light before it is sampled, and costs the most: 12 % in place of 8.5 %
 QUANTILE = 6.0
 # a curved response is asked on what it makes of the light, which this linear camera does not hold: tests/budget/test_in_the_chain.py
-CASES = {i: s for i, s in catalogue().items() if s.forward is not None and s.propagate is not None and s.ideal is None}
+CASES = {i: s for i, s in sources().items() if s.forward is not None and s.propagate is not None and s.ideal is None}
 
 
 @cache

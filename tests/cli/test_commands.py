@@ -16,7 +16,7 @@ import tifffile
 from click.testing import CliRunner, Result
 
 from pixmetry.camera.camera import load_camera
-from pixmetry.camera.catalogue import catalogue
+from pixmetry.camera.catalogue import sources
 from pixmetry.cli import main
 from pixmetry.files import load_campaign, read_frame
 
@@ -173,7 +173,7 @@ def test_the_catalogue_as_json() -> None:
 def test_parameters_can_be_read_on_a_narrow_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     """No name is cut, for it is typed again in --set; and choices are named."""
     monkeypatch.setenv("COLUMNS", "80")
-    for source_id, source in catalogue().items():
+    for source_id, source in sources().items():
         shown = run("sources", source_id).output
         assert [name for name in source.parameters.model_fields if name not in shown] == [], source_id
     assert re.search(r"first_field +1 +even, odd", run("sources", "sensor.interlace").output)
@@ -314,7 +314,7 @@ def test_too_little_memory_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: object) -> None:
         raise MemoryError("Unable to allocate 9 EiB")
 
-    monkeypatch.setattr("pixmetry.camera.catalogue.catalogue", full)
+    monkeypatch.setattr("pixmetry.camera.catalogue.sources", full)
     ran = CliRunner().invoke(main, ["sources"])
     assert ran.exit_code == 2 and "not enough memory (Unable to allocate 9 EiB)" in ran.output and ran.output.count("\n") == 1
 

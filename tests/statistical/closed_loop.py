@@ -21,7 +21,7 @@ from scipy import stats
 
 from pixmetry.assess.job import measure_sources
 from pixmetry.camera.camera import Camera, Element
-from pixmetry.camera.catalogue import catalogue
+from pixmetry.camera.catalogue import sources
 from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.core.errors import MeasureError, PixmetryError
@@ -184,8 +184,8 @@ def _draw(rng: np.random.Generator, quick: bool) -> tuple[dict[str, dict[str, fl
 
 
 def _camera(values: dict[str, dict[str, float]], shape: tuple[int, int], series: SeriesModel, index: int) -> Camera:
-    sources = catalogue()
-    chain = tuple(Element(s, sources[s], sources[s].make(values[s])) for s in DIGITAL_CHAIN)
+    every = sources()
+    chain = tuple(Element(s, every[s], every[s].make(values[s])) for s in DIGITAL_CHAIN)
     return Camera(f"camera {index}", shape, chain, exposure_s=series.longest_exposure_s, unit_seed=index)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from pixmetry.budget.parameters import applies
 from pixmetry.camera.camera import Camera, Element, in_order
-from pixmetry.camera.catalogue import catalogue, get_source
+from pixmetry.camera.catalogue import get_source, sources
 from pixmetry.camera.observations import Observations, PatternList, PhotonTransfer, StackMoments
 from pixmetry.camera.provenance import DESCRIBED, MEASURED, TYPICAL
 from pixmetry.camera.source import Source
@@ -54,7 +54,7 @@ def digital_twin(campaign: Campaign, estimates: Mapping[str, Estimates], observa
     if facts.temperature_c is not None:
         known["reference_temperature_c"] = facts.temperature_c
     elements = []
-    for source in in_order(s for s in catalogue().values() if s.forward is not None and applies(s, told)):
+    for source in in_order(s for s in sources().values() if s.forward is not None and applies(s, told)):
         fields = source.parameters.model_fields
         if source.id not in estimates and source.id not in ALWAYS:
             continue

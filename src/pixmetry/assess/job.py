@@ -16,7 +16,7 @@ from pixmetry.assess.results import Assessment
 from pixmetry.budget.job import compute_budget
 from pixmetry.budget.parameters import with_estimates
 from pixmetry.budget.probe import Target, parse_target
-from pixmetry.camera.catalogue import catalogue
+from pixmetry.camera.catalogue import sources
 from pixmetry.camera.geometry import frame_centre
 from pixmetry.camera.observations import CameraGeometry, Observations
 from pixmetry.core.errors import InputError, MeasureError
@@ -113,7 +113,7 @@ def assess(
         seen = replace(seen, notes=(*seen.notes, note))
     estimates, unmeasured = without_noise(seen, estimates, unmeasured)
     camera = digital_twin(frames, estimates, seen)
-    steps = len(camera.active) + len(catalogue()) + 2
+    steps = len(camera.active) + len(sources()) + 2
     done = itertools.count(1)
     budget = compute_budget(
         camera,
@@ -272,7 +272,7 @@ def by_the_standard(campaign: Campaign, observations: Observations) -> Results:
 def measure_sources(observations: Observations) -> tuple[dict[str, Estimates], dict[str, str]]:
     """Ask every source what the observations say of it: estimates, and by source the reason where there are none."""
     estimates, unmeasured = {}, {}
-    for source in catalogue().values():
+    for source in sources().values():
         if source.measure is None:
             unmeasured[source.id] = source.reasons["measure"]
             continue

@@ -15,7 +15,7 @@ from pixmetry.budget.parameters import applies, base_of, u_of_total, with_estima
 from pixmetry.budget.probe import ESTIMATOR_ITSELF, Probes, perfect
 from pixmetry.budget.records import DECIDED, BudgetRow, Interaction
 from pixmetry.camera.camera import Camera, Element
-from pixmetry.camera.catalogue import catalogue
+from pixmetry.camera.catalogue import sources
 from pixmetry.camera.contribution import UNSTEADY, Contribution
 from pixmetry.camera.observations import LENS, TAKEN_UP, CameraGeometry
 from pixmetry.camera.signal import Kind
@@ -57,7 +57,7 @@ class Known:
         """What has a row: the chain, then what the catalogue has beyond it."""
         named = [(e.name, e.source) for e in self.camera.active]
         there = {source.id for _, source in named}
-        return named + [(i, s) for i, s in catalogue().items() if i not in there]
+        return named + [(i, s) for i, s in sources().items() if i not in there]
 
     def has(self, name: str) -> bool:
         """Whether it stands in the chain, switched on."""
@@ -79,7 +79,7 @@ class Known:
 
 def catalogue_source(row: BudgetRow) -> Source:
     """The source of a row."""
-    return catalogue()[row.source_id]
+    return sources()[row.source_id]
 
 
 def as_measured(camera: Camera, estimates_by_source: dict[str, Estimates]) -> Camera:
@@ -132,7 +132,7 @@ def _beyond(source: Source, known: Known) -> str:
     if source.stage == "storage" and known.camera.facts.get("lossless"):
         return "only in frames that were stored with loss; these were not"
     if source.held_by and all(known.estimates_of(h) is not None for h in source.held_by):
-        where = ", ".join(catalogue()[h].title for h in source.held_by)
+        where = ", ".join(sources()[h].title for h in source.held_by)
         return f"its part in these frames was measured, and counts, as: {where}"
     return ""
 
@@ -155,7 +155,7 @@ def _calibrated(name: str, source: Source, geometry: CameraGeometry) -> BudgetRo
     """The remaining error after a calibration, in the row of the lens; the other sources that it includes point to that row."""
     head = BudgetRow(name, source.id, source.title, "calibrated")
     if source.id != LENS:
-        return replace(head, reason=f"included in the {geometry.origin}; the remaining error is in the row of {catalogue()[LENS].title}")
+        return replace(head, reason=f"included in the {geometry.origin}; the remaining error is in the row of {sources()[LENS].title}")
     u_x, u_y = np.hypot(geometry.u_x_px, geometry.left_x_px), np.hypot(geometry.u_y_px, geometry.left_y_px)
     method = f"remaining error after the {geometry.origin}: uncertainty of a corrected position over the frame, and systematic residuals"
     # no further calibration takes it up: nothing of it counts as smooth

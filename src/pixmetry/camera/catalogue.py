@@ -19,13 +19,13 @@ ENTRY_POINTS = "pixmetry.sources"
 
 
 @cache
-def catalogue() -> dict[str, Source]:
+def sources() -> dict[str, Source]:
     """All sources by id, in the order in which the light meets their stages.
 
     Examples
     --------
-    >>> from pixmetry.camera.catalogue import catalogue
-    >>> source = catalogue()["sensor.prnu"]
+    >>> from pixmetry.camera.catalogue import sources
+    >>> source = sources()["sensor.prnu"]
     >>> source.title, source.stage, source.units["pixel_std_rel"]
     ('Photo response non-uniformity', 'sensor', '1')
     """
@@ -66,10 +66,10 @@ def add_source_file(path: str | Path) -> Source:
         raise InputError(f"the file cannot be run: {type(problem).__name__}: {problem}", where=str(path)) from problem
     if not isinstance(getattr(module, "SOURCE", None), Source):
         raise InputError("the file holds no Source record named SOURCE", where=str(path), remedy="see docs/adding-a-source.md")
-    known = catalogue().get(module.SOURCE.id)
+    known = sources().get(module.SOURCE.id)
     if known is not None and getattr(known.forward, "__module__", "") == name:
-        del catalogue()[module.SOURCE.id]  # the same file once more
-    _add(catalogue(), module.SOURCE, str(path), None)
+        del sources()[module.SOURCE.id]  # the same file once more
+    _add(sources(), module.SOURCE, str(path), None)
     return module.SOURCE
 
 
@@ -87,14 +87,14 @@ def get_source(source_id: str, where: str = "") -> Source:
     """The source of that id; ``InputError`` names the nearest ones if there is none, and ``where`` it was asked for."""
     from difflib import get_close_matches
 
-    sources = catalogue()
-    if source_id in sources:
-        return sources[source_id]
-    near = get_close_matches(source_id, sources, n=3, cutoff=0.4) or [i for i in sources if i.endswith("." + source_id)]
+    known = sources()
+    if source_id in known:
+        return known[source_id]
+    near = get_close_matches(source_id, known, n=3, cutoff=0.4) or [i for i in known if i.endswith("." + source_id)]
     raise InputError(
         f"no error source is called {source_id!r}",
         where=where,
-        allowed=", ".join(near or sources),
+        allowed=", ".join(near or known),
         remedy="`pixmetry sources` lists all; for a source of your own add `--source-file FILE` before the command",
     )
 

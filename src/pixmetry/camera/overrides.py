@@ -8,7 +8,7 @@ from difflib import get_close_matches
 from typing import Any
 
 from pixmetry.camera.camera import Camera, pitch_values
-from pixmetry.camera.catalogue import catalogue
+from pixmetry.camera.catalogue import sources
 from pixmetry.core.errors import InputError
 
 PERIOD = "frame_period_s"  # stands among the facts of a camera
@@ -93,7 +93,7 @@ def _known(camera: Camera, name: str, parameter: str = "") -> str:
     if name in camera:
         return name
     there = [e.name for e in camera.chain]
-    if name in catalogue():
+    if name in sources():
         ids = [e.name for e in camera.chain if e.source.id == name]
         if ids:
             raise InputError(f"{name} has a name of its own in {camera.name}", allowed=", ".join(ids), remedy="use that name")

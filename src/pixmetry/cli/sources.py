@@ -22,17 +22,17 @@ def sources(source_id: str | None, json_file: Path | None) -> None:
     handbook of camera calibration. With ID: the equation of a source, its parameters with units and ranges, its typical size, and its
     references.
     """
-    from pixmetry.camera.catalogue import catalogue, get_source, to_record
+    from pixmetry.camera import catalogue
 
     result = JsonResult(json_file, "pixmetry/sources/1" if source_id is None else "pixmetry/source/1")
     if source_id is None:
-        records = [to_record(s) for s in catalogue().values()]
+        records = [catalogue.to_record(s) for s in catalogue.sources().values()]
         result.put({"sources": records})
         if not result.printed:
             _list(records)
     else:
-        source = get_source(source_id)
-        record = to_record(source) | _details(source)
+        source = catalogue.get_source(source_id)
+        record = catalogue.to_record(source) | _details(source)
         result.put(record)
         if not result.printed:
             _explain(record)

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pixmetry.camera.catalogue import catalogue
+from pixmetry.camera.catalogue import sources
 from source_signals import stream
 from sources.processing.code_frames import codes
 
-STEPS = {i: s for i, s in catalogue().items() if s.stage == "processing" and "bits" in s.parameters.model_fields}
+STEPS = {i: s for i, s in sources().items() if s.stage == "processing" and "bits" in s.parameters.model_fields}
 
 
 @pytest.mark.parametrize("source", STEPS.values(), ids=STEPS.keys())
