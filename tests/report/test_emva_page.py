@@ -25,7 +25,6 @@ from pixmetry.emva.page.content import (
     main_rows,
     methods_of,
     notes_of,
-    number_of,
     symbol_parts,
 )
 from pixmetry.emva.page.figures import MARGINS_IN, STRETCHES, fill, outline, time_of
@@ -33,6 +32,7 @@ from pixmetry.emva.page.page import all_plots, page_of
 from pixmetry.emva.records import DataSheet, Results
 from pixmetry.report.drawing import STYLE, plain_log
 from pixmetry.report.html import html_of, share_styles
+from pixmetry.report.numbers import printed_number
 from report import emva_sheets
 from report.emva_sheets import K, results, sheet
 from report.test_page import Page
@@ -88,7 +88,7 @@ def test_a_limit_is_one_and_says_why() -> None:
     [(13999.9, 24.0, "e⁻", "13990"), (61.7259, 0.0087, "dB", "61.725"), (118.35, 0.1, "1", "118.3"), (30957.0, 0.0, "photon", "30957")],
 )
 def test_a_lower_limit_is_rounded_down_and_marked(value: float, u: float, unit: str, text: str) -> None:
-    assert number_of(Number(value, u, 40.0, unit, kind=LOWER_LIMIT)).value == f">\u00a0{text}"
+    assert printed_number(Number(value, u, 40.0, unit, kind=LOWER_LIMIT)).value == f">\u00a0{text}"
 
 
 def test_a_capacity_that_was_not_reached_is_a_lower_limit_everywhere() -> None:
@@ -451,9 +451,9 @@ def test_notes_that_differ_in_numbers_are_one_with_the_numbers_of_each_channel()
 
 
 def test_a_number_far_below_its_u_is_not_rounded_to_nothing() -> None:
-    shown = number_of(Number(17.3, 1700.0, 20.0, "e⁻/s"))
+    shown = printed_number(Number(17.3, 1700.0, 20.0, "e⁻/s"))
     assert (shown.value, shown.u, shown.unit) == ("17", "± 1700", "e⁻/s")
-    assert number_of(Number(0.0, 1700.0, 20.0, "e⁻/s")).value == "0"
+    assert printed_number(Number(0.0, 1700.0, 20.0, "e⁻/s")).value == "0"
 
 
 def test_one_exposure_time_makes_no_plot_against_it() -> None:

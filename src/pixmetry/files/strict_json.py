@@ -1,5 +1,5 @@
-"""JSON (RFC 8259) of records, with one rule for numbers that it does not have: NaN, a number that is not known, is ``null``, and an
-infinite one the word ``"inf"`` or ``"-inf"``."""
+"""JSON (RFC 8259) of records, written and read, with one rule for numbers that it does not have: NaN, a number that is not known, is
+``null``, and an infinite one the word ``"inf"`` or ``"-inf"``."""
 
 from __future__ import annotations
 
@@ -11,6 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from pixmetry.core.errors import InputError
+
+_INFINITE = {"inf": math.inf, "-inf": -math.inf}
 SHORT = 130  # characters of a record that stays on one line
 
 
@@ -66,3 +69,79 @@ def _laid_out(value: Any, indent: str) -> str:
         parts = [_laid_out(item, inner) for item in value]
     left, right = "{}" if isinstance(value, dict) else "[]"
     return f"{left}\n{inner}" + f",\n{inner}".join(parts) + f"\n{indent}{right}"
+
+
+def parse_json(raw: bytes, where: str, remedy: str = "check the file") -> dict[str, Any]:
+    """Read one JSON object; NaN, infinities and keys that are given twice are refused.
+
+    Parameters
+    ----------
+    raw : bytes
+    where : str
+        The file's name, for errors.
+    remedy : str
+        What to do where it holds no JSON object at all.
+
+    Raises
+    ------
+    InputError
+        If it is something else.
+
+    Examples
+    --------
+    >>> parse_json(b'{"u": null, "dof": "inf"}', "a.json")
+    {'u': None, 'dof': 'inf'}
+    """
+    if not starts_with(raw, b"{"):
+        what = "a JSON list, not an object" if starts_with(raw, b"[") else "neither JSON nor XML"
+        raise InputError(what, where=where, remedy=remedy)
+    try:
+        record: dict[str, Any] = json.loads(raw, object_pairs_hook=_once, parse_constant=_no_constant)
+    except _RefusedError as problem:
+        raise InputError(str(problem), where=where, remedy="correct the file") from None
+    except json.JSONDecodeError as problem:
+        raise InputError(f"not valid JSON: {problem.msg}", where=f"{where}, line {problem.lineno}", remedy="make the file again") from None
+    except (ValueError, RecursionError):  # not UTF-8, or nested without end
+        raise InputError("not valid JSON", where=where, remedy="make the file again") from None
+    return record
+
+
+def starts_with(raw: bytes, mark: bytes) -> bool:
+    """Whether a text in any encoding begins with a mark, blanks aside."""
+    return raw[:64].lstrip(b"\x00 \t\r\n\xef\xbb\xbf\xff\xfe").startswith(mark)
+
+
+def number_in(value: Any, where: str) -> float:
+    """The number that JSON holds as a number, ``null`` (NaN) or ``"inf"``: the inverse of `plain`.
+
+    Raises
+    ------
+    InputError
+        If it is none.
+    """
+    if value is None:
+        return math.nan
+    if isinstance(value, str) and value in _INFINITE:
+        return _INFINITE[value]
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise InputError("is not a number", where=where, value=value, allowed='a number, null or "inf"', remedy="correct the file")
+    try:
+        return float(value)
+    except OverflowError:
+        raise InputError("is too large a number", where=where, allowed="up to 1e308", remedy="correct the file") from None
+
+
+class _RefusedError(ValueError):
+    """What Python's reader would take, and JSON or a record of ours does not have."""
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    record = dict(pairs)
+    if len(record) < len(pairs):
+        names = [name for name, _ in pairs]
+        raise _RefusedError(f"'{next(n for n in names if names.count(n) > 1)}' is given twice")
+    return record
+
+
+def _no_constant(name: str) -> float:
+    raise _RefusedError(f"contains {name}, which is not a number in JSON")

@@ -51,6 +51,14 @@ def significant(value: float, digits: int = 3) -> str:
     return fixed(value, decimals_of(value, digits))
 
 
+def short(value: float, digits: int = 4) -> str:
+    """So many digits without the zeros at the end; a whole number as it is."""
+    if isfinite(value) and value == int(value) and abs(value) < 1e6:
+        return fixed(value, 0)
+    text = significant(value, digits)
+    return text.rstrip("0").rstrip(".") if "." in text and "×" not in text else text
+
+
 def uncertain(value: float, u: float, unit: str) -> PrintedNumber:
     """Value and standard uncertainty, the uncertainty to two significant digits and the value to the same place (JCGM 100, 7.2.6)."""
     if not (isfinite(u) and u > 0):
@@ -63,23 +71,44 @@ def uncertain(value: float, u: float, unit: str) -> PrintedNumber:
     return PrintedNumber(fixed(scaled_value, places), fixed(scaled_u, places), _with_power(unit, power))
 
 
-def limit(value: float, unit: str, *, at_least: bool = False) -> PrintedNumber:
-    """A one-sided upper limit, or a lower one."""
+def limit(value: float, unit: str) -> PrintedNumber:
+    """A one-sided upper limit."""
     power = floor(log10(value)) if value > 0 else 0
     power = 0 if -4 < power < 6 else power
-    text = f"{'>' if at_least else '<'}{NO_BREAK}{significant(value / 10.0**power, LIMIT_DIGITS)}"
+    text = f"<{NO_BREAK}{significant(value / 10.0**power, LIMIT_DIGITS)}"
     return PrintedNumber(text, NONE, _with_power(unit, power))
 
 
-def printed(number: Number) -> PrintedNumber:
-    """A `Number` as text: value and ± u to the place of u, a one-sided limit, or a dash."""
-    if not number.is_available:
-        return PrintedNumber(NONE, "", pretty_unit(number.unit))
-    if number.is_limit:
-        found = limit(number.value, number.unit, at_least=number.is_lower_limit)
+def printed_number(number: Number) -> PrintedNumber:
+    """A `Number` as text: value and ± u to the place of u, a one-sided 95 % limit, or a dash.
+
+    Examples
+    --------
+    >>> printed_number(Number(0.28041, 0.00142, unit="DN/e-")).joined()
+    '0.2804 ± 0.0014 DN/e⁻'
+    """
+    unit = pretty_unit(number.unit)
+    if not isfinite(number.value):
+        return PrintedNumber(NONE, "", unit)
+    if number.is_upper_limit:
+        found = limit(number.value, number.unit)
         return PrintedNumber(found.value, f"(95{NO_BREAK}%)", found.unit)
+    if number.is_lower_limit:
+        return PrintedNumber(f">{NO_BREAK}{_rounded_down(number)}", f"(95{NO_BREAK}%)", unit)
+    if number.u == 0:  # a setting or a place in a series
+        return PrintedNumber(short(number.value, 6), "", unit)
     found = uncertain(number.value, number.u, number.unit)
+    if not any(digit in found.value for digit in "123456789"):  # far less than its u: rounded as that is it would be 0
+        found = PrintedNumber(short(number.value, 2), short(number.u, 2), unit)
     return PrintedNumber(found.value, "" if found.u == NONE else f"± {found.u}", found.unit)
+
+
+def _rounded_down(number: Number) -> str:
+    """A lower limit to the first digit of its u, never above it; a place in a series as it is."""
+    if not (isfinite(number.u) and number.u > 0):
+        return short(number.value, 6)
+    places = decimals_of(number.u, 1)
+    return fixed(floor(number.value * 10.0**places) / 10.0**places, places)
 
 
 def _with_power(unit: str, power: int) -> str:

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-from pixmetry.report.numbers import PrintedNumber, printed
+from pixmetry.report.numbers import PrintedNumber, printed_number
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Drawing
@@ -169,7 +169,7 @@ def _spread_cells(columns: Sequence[Column], cells: Sequence[Any]) -> list[Inlin
         if isinstance(cell, str | Run | tuple | list):
             out.append(cell)
             continue
-        number = cell if isinstance(cell, PrintedNumber) else printed(cell)
+        number = cell if isinstance(cell, PrintedNumber) else printed_number(cell)
         if column.align != "number":
             out.append(number.joined())
         else:

@@ -13,9 +13,10 @@ from pixmetry.calibrate.files.record import LINES_SCHEMA, RESULT_SCHEMA
 from pixmetry.core.checksums import check_record
 from pixmetry.core.errors import InputError
 from pixmetry.core.number import Number
-from pixmetry.emva.files.json_format import SCHEMA, is_xml, number_of, parse_json, read_bytes, sheet_of_record, value_of
+from pixmetry.emva.files.json_format import SCHEMA, WHAT_TO_NAME, is_xml, read_bytes, sheet_of_record, value_of
 from pixmetry.emva.files.sheets import read_sheet
 from pixmetry.emva.records import MONO, DataSheet
+from pixmetry.files.strict_json import number_in, parse_json
 
 RESULT_FILES = ("results.json", "calibration.json")
 
@@ -39,7 +40,7 @@ def load_subject(source: DataSheet | str | Path, name: str = "") -> Subject:
     name, raw = name or str(source), read_bytes(path)
     if is_xml(raw):
         return _of_sheet(read_sheet(path), name)
-    record = parse_json(raw, str(path))
+    record = parse_json(raw, str(path), WHAT_TO_NAME)
     check_record(record, str(path))
     schema = record.get("schema", "no schema")
     if schema in READERS:
@@ -54,7 +55,7 @@ def load_subject(source: DataSheet | str | Path, name: str = "") -> Subject:
 def _of_sheet(sheet: DataSheet, name: str) -> Subject:
     values = {(result.channel, key): value for result in sheet.results for key, value in result.values.items()}
     release = sheet.results[0].release if sheet.results else ""
-    known = number_of(sheet.conditions.get("photons_u_rel"), f"{name}: photons_u_rel")
+    known = number_in(sheet.conditions.get("photons_u_rel"), f"{name}: photons_u_rel")
     return Subject(name, "data sheet", release, sheet.camera, values, {}, 0.0 if math.isnan(known) else known)
 
 

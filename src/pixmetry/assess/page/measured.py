@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,7 +14,7 @@ from pixmetry.emva.files.keys import KEYS
 from pixmetry.emva.page.content import say
 from pixmetry.emva.records import Results
 from pixmetry.report import Column, Run, Section, Table, Text, strong
-from pixmetry.report.numbers import MINUS, NONE, PrintedNumber, limit, printed, significant, uncertain
+from pixmetry.report.numbers import MINUS, NONE, PrintedNumber, limit, printed_number, significant, uncertain
 
 if TYPE_CHECKING:
     from pixmetry.assess.digital_twin import SelfTest
@@ -122,8 +122,8 @@ def _missing(name: str, caption: Caption, reason: str, standard: Results | None)
 
 def _row(e: Number, caption: Caption, standard: Results | None) -> Row:
     scale, unit = caption.display or (1.0, e.unit)
-    at_least = e.kind == "lower_limit"
-    number = uncertain(e.value * scale, e.u * scale, unit) if e.kind == "value" else limit(e.value * scale, unit, at_least=at_least)
+    shown = replace(e, value=e.value * scale, u=e.u * scale, unit=unit)
+    number = replace(printed_number(shown), u=NONE) if e.is_limit else uncertain(shown.value, shown.u, unit)
     return Row(caption.title, e.name, number, _dof(e.dof), "" if standard is None else say(standard, caption.standard), e.reason)
 
 
@@ -180,7 +180,7 @@ def twin_section(test: SelfTest) -> Section:
         far, text = abs(r.difference_u) > FAR_U, f"{r.difference_u:+.1f}".replace("-", MINUS)
         key = KEYS[r.name]
         title = [key.title, *([Run(f" {key.symbol}", "soft")] if key.symbol else [])]
-        pair = [printed(Number(value, u, unit=r.unit)) for value, u in ((r.camera, r.u_camera), (r.twin, r.u_twin))]
+        pair = [printed_number(Number(value, u, unit=r.unit)) for value, u in ((r.camera, r.u_camera), (r.twin, r.u_twin))]
         rows.append([title, *pair, strong(text) if far else text])
     both = [Column("Value", "number", group=whose) for whose in ("Camera", "Twin")]
     columns: list[Column | str] = ["Quantity", *both, Column("Difference / u", "right")]

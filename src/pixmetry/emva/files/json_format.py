@@ -1,13 +1,7 @@
-"""Data sheets as JSON, with everything.
-
-In JSON, ``null`` is a number that is not known (NaN) and ``"inf"`` an infinite one, as the degrees of freedom of an uncertainty that
-is known exactly; all other numbers are written so that reading gives the same bits.
-"""
+"""Data sheets as JSON, with everything; all numbers are written so that reading gives the same bits."""
 
 from __future__ import annotations
 
-import json
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -18,11 +12,11 @@ from pixmetry.core.checksums import sealed
 from pixmetry.core.errors import InputError
 from pixmetry.core.number import LOWER_LIMIT, UPPER_LIMIT, VALUE, Number
 from pixmetry.emva.records import MONO, DataSheet, Results
-from pixmetry.files.strict_json import json_text, plain
+from pixmetry.files.strict_json import json_text, number_in, plain, starts_with
 
 SCHEMA = "pixmetry/emva1288/1"
+WHAT_TO_NAME = "name a data sheet (.json or .xml) or the results of an assessment"
 LARGEST_BYTES = 1 << 28  # a sheet with all its curves has less than 1 MB
-_INFINITE = {"inf": math.inf, "-inf": -math.inf}
 
 
 def sheet_json(sheet: DataSheet) -> str:
@@ -50,51 +44,9 @@ def read_bytes(path: str | Path) -> bytes:
     return raw
 
 
-def parse_json(raw: bytes, where: str) -> dict[str, Any]:
-    """Read one JSON object; NaN, infinities and keys that are given twice are refused.
-
-    Raises
-    ------
-    InputError
-        If it is something else.
-    """
-    if not _starts_with(raw, b"{"):
-        what = "a JSON list, not an object" if _starts_with(raw, b"[") else "neither JSON nor XML"
-        raise InputError(what, where=where, remedy="name a data sheet (.json or .xml) or the results of an assessment")
-    try:
-        record = json.loads(raw, object_pairs_hook=_once, parse_constant=_no_constant)
-    except _RefusedError as problem:
-        raise InputError(str(problem), where=where, remedy="correct the file") from None
-    except json.JSONDecodeError as problem:
-        raise InputError(f"not valid JSON: {problem.msg}", where=f"{where}, line {problem.lineno}", remedy="make the file again") from None
-    except (ValueError, RecursionError):  # not UTF-8, or nested without end
-        raise InputError("not valid JSON", where=where, remedy="make the file again") from None
-    return record
-
-
 def is_xml(raw: bytes) -> bool:
     """Whether a file's bytes begin as XML does, in any encoding."""
-    return _starts_with(raw, b"<")
-
-
-def _starts_with(raw: bytes, mark: bytes) -> bool:
-    return raw[:64].lstrip(b"\x00 \t\r\n\xef\xbb\xbf\xff\xfe").startswith(mark)
-
-
-class _RefusedError(ValueError):
-    """What JSON would allow and a data sheet does not."""
-
-
-def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    record = dict(pairs)
-    if len(record) < len(pairs):
-        names = [name for name, _ in pairs]
-        raise _RefusedError(f"'{next(n for n in names if names.count(n) > 1)}' is given twice")
-    return record
-
-
-def _no_constant(name: str) -> float:
-    raise _RefusedError(f"contains {name}, which is not a number in JSON")
+    return starts_with(raw, b"<")
 
 
 def to_record(sheet: DataSheet) -> dict[str, Any]:
@@ -178,7 +130,7 @@ def value_of(record: Any, where: str) -> Number:
     """
     if not isinstance(record, Mapping):
         raise InputError("is not a value with its uncertainty", where=where, remedy="make the file again")
-    value, u, dof = (number_of(record.get(name), f"{where}.{name}") for name in ("value", "u", "dof"))
+    value, u, dof = (number_in(record.get(name), f"{where}.{name}") for name in ("value", "u", "dof"))
     unit, method, reason = (_of_type(record, name, str, where) for name in ("unit", "method", "reason"))
     upper, lower = (_of_type(record, name, bool, where) for name in ("is_limit", "is_lower_limit"))
     return checked(Number(value, u, dof, unit, method, reason, kind_of(upper, lower)), where)
@@ -204,30 +156,10 @@ def checked(value: Number, where: str) -> Number:
     return value
 
 
-def number_of(value: Any, where: str) -> float:
-    """Return the number that JSON holds as a number, ``null`` (NaN) or ``"inf"``.
-
-    Raises
-    ------
-    InputError
-        If it is none.
-    """
-    if value is None:
-        return math.nan
-    if isinstance(value, str) and value in _INFINITE:
-        return _INFINITE[value]
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise InputError("is not a number", where=where, value=value, allowed='a number, null or "inf"', remedy="correct the file")
-    try:
-        return float(value)
-    except OverflowError:
-        raise InputError("is too large a number", where=where, allowed="up to 1e308", remedy="correct the file") from None
-
-
 def _array_of(data: Any, where: str) -> np.ndarray:
     if not isinstance(data, list):
         raise InputError("is not a list of numbers", where=where, remedy="make the file again")
     kinds = {type(item) for item in data}
     if kinds == {bool} or (kinds == {int} and max(map(abs, data)) < 1 << 63):
         return np.array(data)
-    return np.array([number_of(item, where) for item in data], dtype=float)
+    return np.array([number_in(item, where) for item in data], dtype=float)

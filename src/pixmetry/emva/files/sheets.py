@@ -7,9 +7,10 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from pixmetry.core.checksums import check_record
-from pixmetry.emva.files.json_format import is_xml, parse_json, read_bytes, sheet_json, sheet_of_record
+from pixmetry.emva.files.json_format import WHAT_TO_NAME, is_xml, read_bytes, sheet_json, sheet_of_record
 from pixmetry.emva.records import DataSheet
 from pixmetry.files.staged_files import PDF_MARK, Output, check_files, write_together
+from pixmetry.files.strict_json import parse_json
 
 # How a file of each kind begins, so that nothing else is ever replaced.
 MARKS = {
@@ -39,7 +40,7 @@ def read_sheet(path: str | Path) -> DataSheet:
         from pixmetry.emva.files.xml_format import sheet_of_xml
 
         return sheet_of_xml(raw, str(path))
-    record = parse_json(raw, str(path))
+    record = parse_json(raw, str(path), WHAT_TO_NAME)
     check_record(record, str(path))
     return sheet_of_record(record, str(path))
 

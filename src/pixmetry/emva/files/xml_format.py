@@ -20,10 +20,10 @@ import numpy as np
 
 from pixmetry.core.errors import InputError
 from pixmetry.core.number import Number
-from pixmetry.emva.files.json_format import SCHEMA, checked, kind_of, parse_json
+from pixmetry.emva.files.json_format import SCHEMA, checked, kind_of
 from pixmetry.emva.files.keys import KEYS, NONLINEAR, key_of, plain_unit
 from pixmetry.emva.records import MONO, DataSheet, Results
-from pixmetry.files.strict_json import plain
+from pixmetry.files.strict_json import parse_json, plain
 
 _CURVE_SECTIONS = {"histogram": "defect_pixel", "linearity": "linearity", "dark_signal": "dark_current", "general": "general"}
 _CURVE_SECTIONS |= {"horizontal": "spatial", "vertical": "spatial"}  # else the section is sensitivity

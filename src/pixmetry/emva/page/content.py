@@ -5,14 +5,14 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from math import floor, isfinite
+from math import isfinite
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pixmetry.emva.files.keys import KEYS, NONLINEAR, PTC_LIMIT_PERCENT, Key, key_of
 from pixmetry.emva.linear_model import CURVED, FAILS, HOLDS, OPEN, UNKNOWN, linear_model
-from pixmetry.report.numbers import NO_BREAK, NONE, PrintedNumber, decimals_of, fixed, limit, pretty_unit, significant, uncertain
+from pixmetry.report.numbers import NO_BREAK, NONE, PrintedNumber, fixed, pretty_unit, printed_number, short, significant
 
 if TYPE_CHECKING:
     from pixmetry.core.number import Number
@@ -107,35 +107,10 @@ def describe(name: str, unit: str) -> Key:
     return key_of(name) if name.removesuffix(NONLINEAR) in KEYS else Key("other", name, "", unit)
 
 
-def number_of(value: Number) -> PrintedNumber:
-    """A value as text: with its standard uncertainty, or as a one-sided 95 % limit."""
-    if not isfinite(value.value):
-        return PrintedNumber(NONE, "", pretty_unit(value.unit))
-    if value.is_upper_limit:
-        found = limit(value.value, value.unit)
-        return PrintedNumber(found.value, f"(95{NO_BREAK}%)", found.unit)
-    if value.is_lower_limit:
-        return PrintedNumber(f">{NO_BREAK}{_rounded_down(value)}", f"(95{NO_BREAK}%)", pretty_unit(value.unit))
-    if value.u == 0:  # a setting or a place in the series
-        return PrintedNumber(short(value.value, 6), "", pretty_unit(value.unit))
-    found = uncertain(value.value, value.u, value.unit)
-    if not any(digit in found.value for digit in "123456789"):  # far less than its u: rounded as that is it would be 0
-        found = PrintedNumber(short(value.value, 2), short(value.u, 2), pretty_unit(value.unit))
-    return PrintedNumber(found.value, "" if found.u == NONE else f"± {found.u}", found.unit)
-
-
-def _rounded_down(value: Number) -> str:
-    """A lower limit to the first digit of its u, never above it; a level of the series as it is."""
-    if not (isfinite(value.u) and value.u > 0):
-        return short(value.value, 6)
-    places = decimals_of(value.u, 1)
-    return fixed(floor(value.value * 10.0**places) / 10.0**places, places)
-
-
 def say(results: Results, key: str) -> str:
     """A value of a channel in one string; nothing where there is none."""
     value = results.values.get(key)
-    return number_of(value).joined() if value is not None and isfinite(value.value) else ""
+    return printed_number(value).joined() if value is not None and isfinite(value.value) else ""
 
 
 def dof_text(value: Number) -> str:
@@ -156,7 +131,7 @@ def main_rows(channels: Sequence[Results], keys: Sequence[str]) -> list[MainRow]
         if not units:
             continue
         known, unit = describe(key, units[0]), pretty_unit(units[0])
-        cells = tuple(PrintedNumber(NONE, "", "") if v is None else _without_unit(number_of(v), unit) for v in values)
+        cells = tuple(PrintedNumber(NONE, "", "") if v is None else _without_unit(printed_number(v), unit) for v in values)
         rows.append(MainRow(key, known.title, symbol_parts(known.symbol), cells, unit))
     return rows
 
@@ -196,12 +171,12 @@ def all_rows(results: Results, methods: Sequence[str]) -> dict[str, list[Row]]:
         if name.endswith(NONLINEAR) and name.removesuffix(NONLINEAR) in results.values:
             continue
         known, beside = describe(name, value.unit), results.values.get(name + NONLINEAR)
-        number, used = number_of(value), [_method(name, value)]
+        number, used = printed_number(value), [_method(name, value)]
         if name.startswith("index_") and isfinite(value.value):
             number = PrintedNumber(fixed(value.value, 0), "", "")  # one level or the next: no value with a u
         reasons, curved = [value.reason], ""
         if beside is not None:
-            found = number_of(beside)
+            found = printed_number(beside)
             curved = found.joined(with_unit=found.unit != number.unit)
             used.append(_method(name + NONLINEAR, beside))
             reasons.append(beside.reason and f"with the non-linearity: {beside.reason}")
@@ -293,14 +268,6 @@ def notes_of(sheet: DataSheet) -> list[str]:
 def _sentence(note: str) -> str:
     """A note with a capital at its beginning, unless it begins with a key."""
     return note if "_" in note.partition(" ")[0] else note[:1].upper() + note[1:]
-
-
-def short(value: float, digits: int = 4) -> str:
-    """So many digits without the zeros at the end; a whole number as it is."""
-    if isfinite(value) and value == int(value) and abs(value) < 1e6:
-        return fixed(value, 0)
-    text = significant(value, digits)
-    return text.rstrip("0").rstrip(".") if "." in text and "×" not in text else text
 
 
 def time_scale(longest_s: float) -> tuple[float, str]:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from pixmetry.emva.page import content
 from pixmetry.report import Answer, Column, Figure, Page, Points, Reading, Row, Run, Section, Table, Text
+from pixmetry.report.numbers import printed_number
 from pixmetry.report.page import Inline
 from pixmetry.report.provenance import provenance_section
 
@@ -79,7 +80,7 @@ def _readings(results: Results, keys: Iterable[str]) -> Iterator[Reading]:
     for key in keys:
         value = results.values.get(key)
         if value is not None and value.value == value.value:
-            number = content.number_of(value)
+            number = printed_number(value)
             symbol = content.symbol_parts(content.describe(key, value.unit).symbol)
             yield Reading(_symbol(symbol), number.value, f"{number.u} {number.unit}")
 
