@@ -388,6 +388,17 @@ FAULTS = (
         "np.log(ABSORPTION_PER_CM))) * 2e-4",
         f"{SENSOR}infrared_and_microlens.py tests/sources/sensor/test_quantum_efficiency.py",
     ),
+    # the camera of a data sheet
+    Fault("full well below the capacity", "capacity_e + z * math.sqrt(", "capacity_e - z * math.sqrt(", "tests/camera/test_data_sheet.py"),
+    Fault(
+        "half an electron of the threshold",
+        "dynamic_range_db / 20) - 0.5) ** 2",
+        "dynamic_range_db / 20)) ** 2",
+        "tests/camera/test_data_sheet.py",
+    ),
+    Fault("blur of an MTF", "math.sqrt(slope / (2 * np.pi**2))", "math.sqrt(slope / np.pi**2)", "tests/camera/test_data_sheet.py"),
+    Fault("distortion at the corner", "-distortion_rel / ((1 + dist", "-distortion_rel / ((1 - dist", "tests/camera/test_data_sheet.py"),
+    Fault("estimates of what changed stay", "names if name not in changed", "names if name in changed", "tests/camera/test_provenance.py"),
 )
 
 

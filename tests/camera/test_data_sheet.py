@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import re
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -300,3 +302,37 @@ def test_the_line_of_the_mistake_is_named(tmp_path: Path) -> None:
         load_camera(path)
     path.write_text(path.read_text().replace("two", "2.0"), encoding="utf-8")
     assert load_camera(path).name == "mine"
+
+
+# ---- the sheets that come along ----------------------------------------------------------------------------------------------------
+
+SHEETS = sorted(p for p in (files("pixmetry.camera") / "sheets").iterdir() if p.name.endswith(".yaml"))
+PAGE = (Path(__file__).resolve().parents[2] / "docs" / "data-sheets.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("path", SHEETS, ids=lambda p: p.name)
+def test_a_sheet_that_comes_along_is_a_camera_under_its_name(path: Any) -> None:
+    name = path.name.removesuffix(".yaml")
+    camera = load_camera(name)
+    assert camera.name == name and camera.expose(Uniform(500.0), window=(0, 0, 8, 8)).data.shape == (1, 8, 8)
+    assert f"| `{name}` |" in PAGE
+    stated = {e.name for e in camera.chain if e.known_from == "sheet"}
+    text = path.read_text(encoding="utf-8")
+    noise, well = "electronics.amplifier_noise", "sensor.full_well"
+    for key, element in (("full_well_e", well), ("snr_max_db", well), ("read_noise_e", noise), ("dynamic_range_db", noise)):
+        assert f"\n{key}:" not in text or element in stated
+
+
+@pytest.mark.parametrize("path", SHEETS, ids=lambda p: p.name)
+def test_the_source_of_every_number_stands_beside_it(path: Any) -> None:
+    """Rows and columns of one quotation share it."""
+    lines = path.read_text(encoding="utf-8").splitlines()
+    bare = [line for line in lines if re.match(r"\w+: [\d.]+\s*$", line)]
+    assert [line.split(":")[0] for line in bare] in ([], ["cols"])
+    assert lines[0].startswith("# ") and any(line.startswith("source:") for line in lines)
+
+
+def test_five_sensors_come_along_and_no_name_is_that_of_a_preset() -> None:
+    names = {p.name for p in SHEETS}
+    assert {f"{name}.yaml" for name in ("imx264", "imx250", "imx183", "cmv4000", "icx285")} <= names
+    assert not names & {p.name for p in (files("pixmetry.camera") / "presets").iterdir()}

@@ -203,7 +203,7 @@ def diffraction_mtf(lp_per_mm: np.ndarray | float, f_number: float, wavelength_n
     0.722
     """
     s = np.clip(np.asarray(lp_per_mm, float) * f_number * wavelength_nm * 1e-6, 0, 1)
-    return 2 / np.pi * (np.arccos(s) - s * np.sqrt(1 - s**2))
+    return 2 / np.pi * (np.arccos(s) - np.sqrt(1 - s**2) * s)
 
 
 def blur_of_mtf(
