@@ -25,3 +25,8 @@ def test_examples_give_what_they_say(name: str, tmp_path: Path, monkeypatch: pyt
     monkeypatch.chdir(tmp_path)
     result = doctest.testmod(import_module(name), optionflags=FLAGS)
     assert result.attempted and not result.failed
+
+
+@pytest.mark.parametrize("name", [n for n in pixmetry.__all__ if n != "__version__"])
+def test_every_public_name_has_an_example(name: str) -> None:
+    assert ">>> " in (getattr(pixmetry, name).__doc__ or "")

@@ -83,6 +83,16 @@ def assess(
     ------
     InputError, MeasureError
         If a file or the campaign cannot be used, or the frames do not carry a photon transfer.
+
+    Examples
+    --------
+    >>> import pixmetry
+    >>> found = pixmetry.assess(output="result", trials=0)  # the packaged example; without Monte Carlo
+    >>> gain = found.estimates["electronics.gain"]["gain_dn_per_e"]
+    >>> bool(0.2 < gain.value < 0.4 and gain.u < 0.01 * gain.value)
+    True
+    >>> found.budget.largest[0].title, found.budget.advice[0].finding.kind
+    ('Photon shot noise', 'to_lower')
     """
     what_target = parse_target(target) if target else Target()
     what_estimator = parse_estimator(estimator) if estimator else TargetEstimator()

@@ -52,6 +52,18 @@ def add_source_file(path: str | Path) -> Source:
         If there is no such file, it cannot be run, or holds no ``SOURCE``.
     ChainError
         If its id is taken or names no stage.
+
+    Examples
+    --------
+    A copy of a source under an id of its own; a real one is written as `docs/adding-a-source.md` says:
+
+    >>> from pathlib import Path
+    >>> from pixmetry import add_source_file, sources
+    >>> text = "from dataclasses import replace\\nfrom pixmetry.sources.sensor import prnu\\n"
+    >>> written = Path("mine.py").write_text(text + "SOURCE = replace(prnu.SOURCE, id='sensor.mine')\\n")
+    >>> add_source_file("mine.py").id, "sensor.mine" in sources()
+    ('sensor.mine', True)
+    >>> del sources()["sensor.mine"]  # from this process again
     """
     path = Path(path)
     if not path.is_file():

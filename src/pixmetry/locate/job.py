@@ -66,6 +66,16 @@ def locate(
     ------
     InputError
         If the frame or an option cannot be used.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from pixmetry import locate
+    >>> y, x = np.indices((40, 50))
+    >>> disc = 20 + 150 / (1 + np.exp(4 * (np.hypot(x - 24.3, y - 18.6) - 4)))
+    >>> found = locate(np.rint(disc).astype(np.uint8), noise="read=1.5,gain=0.4")
+    >>> bool(abs(found.columns["x_px"][0] - 24.3) < 0.02), bool(0 < found.columns["var_x_px2"][0] < 0.02**2)
+    (True, True)
     """
     known = estimators(kind)
     if estimator not in known:

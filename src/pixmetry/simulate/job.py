@@ -130,6 +130,16 @@ def simulate(
     ------
     InputError, ChainError
         If camera or scene cannot be used.
+
+    Examples
+    --------
+    >>> from pixmetry import read_frame, simulate
+    >>> scene = {"schema": "pixmetry/scene/1", "discs": {"x_px": [620.3], "y_px": [510.6], "diameter_px": 7, "peak_photons": 9000}}
+    >>> folder = simulate("imx264_like", scene, "frames", frames=2, seed=1, window=(490, 600, 40, 40))
+    >>> sorted(path.name for path in folder.glob("*.tif"))
+    ['frame_00000.tif', 'frame_00001.tif']
+    >>> read_frame(folder / "frame_00000.tif").shape
+    (40, 40)
     """
     device = camera if isinstance(camera, Camera) else load_camera(camera)
     device = changed_camera(device, overrides, off)

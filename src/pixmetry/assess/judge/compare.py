@@ -115,6 +115,18 @@ def compare(
     -----
     The difference over its uncertainty is compared with Student's distribution, its degrees of freedom by Welch and Satterthwaite
     (JCGM 100, G.4). Where one side is a one-sided upper limit, only a value above that limit counts, by as much as it is above.
+
+    Examples
+    --------
+    >>> from dataclasses import replace
+    >>> from pixmetry import compare, emva1288
+    >>> before = emva1288()  # the packaged example
+    >>> (results,) = before.results
+    >>> gain = replace(results.values["K"], value=1.1 * results.values["K"].value)
+    >>> after = replace(before, results=(replace(results, values={**results.values, "K": gain}),))
+    >>> found = compare(before, after)
+    >>> found.same, [row.key for row in found.of("changed")]  # the two say the same thing, and are one decision
+    (False, ['K', 'inverse_K'])
     """
     _check_level(level)
     one, two = load_subject(a, names[0]), load_subject(b, names[1])
@@ -206,6 +218,14 @@ def compare_fleet(sources: Iterable[DataSheet | str | Path], *, level: float = 0
     up to a quarter of them may be odd without hiding each other. It is at least the median of the uncertainties; a camera whose own
     uncertainty is larger than that is judged with the difference added. How far a camera of a normal fleet of this size lies from the
     median in units of such a spread is drawn once, from a keyed stream; then Holm over all values and cameras.
+
+    Examples
+    --------
+    >>> from pixmetry import compare_fleet, emva1288
+    >>> sheet = emva1288()  # the packaged example
+    >>> fleet = compare_fleet([sheet] * 5, names=["A", "B", "C", "D", "E"])
+    >>> fleet.same, fleet.names[0], any(row.key == "K" for row in fleet.rows)
+    (True, 'A', True)
     """
     _check_level(level)
     sources = list(sources)
@@ -255,6 +275,15 @@ def check_limits(source: DataSheet | str | Path, limits: Limits | str | Path) ->
     ------
     InputError
         If a file cannot be read, a key does not exist, or a unit is missing or another one.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from pixmetry import check_limits, emva1288
+    >>> written = Path("limits.yaml").write_text("schema: pixmetry/limits/1\\nlimits: {K: {min: 0.2, max: 0.25, unit: DN/e-}}")
+    >>> (row,) = check_limits(emva1288(), "limits.yaml")  # the packaged example
+    >>> row.judgement.verdict, row.finding.level
+    ('fail', 'error')
     """
     from pixmetry.assess.judge.conformity import Limits, check, load_limits
 

@@ -212,6 +212,27 @@ def read_calibration(path: str | Path) -> StoredCalibration:
     ------
     InputError
         If there is no such file, or it is something else.
+
+    Examples
+    --------
+    >>> from pixmetry import calibrate, read_calibration
+    >>> from pathlib import Path
+    >>> import numpy as np
+    >>> from scipy.spatial.transform import Rotation
+    >>> rng = np.random.default_rng(1)
+    >>> points = rng.uniform(-300, 300, (30, 3))
+    >>> table = ["image,point,x_px,y_px"]
+    >>> for image, (turn, roll) in enumerate([(0, 0), (40, 0), (-40, 0), (0, 90), (40, 90), (-40, 90)]):
+    ...     at = Rotation.from_euler("yz", [turn, roll], degrees=True).apply(points) + [0, 0, 2000]
+    ...     x, y = 1500 * at[:, :2].T / at[:, 2] + [[640], [480]] + rng.normal(0, 0.05, (2, 30))
+    ...     table += [f"{image},P{k},{x[k]:.3f},{y[k]:.3f}" for k in range(30)]
+    >>> written = Path("points.csv").write_text("\\n".join(table))
+    >>> project = "schema: pixmetry/calibration/1\\ncameras: {cols: 1280, rows: 960, c_px: 1400, free: 'c, xp, yp'}\\n"
+    >>> written = Path("project.yaml").write_text(project + "observations: {table: points.csv, u_px: 0.05}\\n")
+    >>> made = calibrate("project.yaml", "result")
+    >>> stored = read_calibration("result")
+    >>> stored.images == made.adjustment.network.images, stored.sigma0 == made.adjustment.sigma0
+    (True, True)
     """
     return _read(path, (RESULT_SCHEMA,), _stored)
 
