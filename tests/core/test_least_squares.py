@@ -21,7 +21,7 @@ def _noisy(rng: np.random.Generator, a: float, b: float) -> Decay:
 def test_finds_what_scipy_finds_from_afar(rng: np.random.Generator) -> None:
     for start in ((2.0, 1.0), (0.3, 6.0), (20.0, 0.0)):
         decay, p = _noisy(rng, 3.0, 1.3), np.array(start)
-        chi2, rests = descend_decay(decay, p, NONE, BOTH, 60, CLOSE)
+        chi2, rests, _ = descend_decay(decay, p, NONE, BOTH, 60, CLOSE)
         best = least_squares(lambda q, d=decay: q[0] * np.exp(-q[1] * d.t) - d.value, (3.0, 1.3), xtol=1e-15, ftol=1e-15, gtol=1e-15)
         assert rests
         np.testing.assert_allclose(p, best.x, rtol=1e-6)
@@ -29,15 +29,17 @@ def test_finds_what_scipy_finds_from_afar(rng: np.random.Generator) -> None:
 
 
 def test_weights_that_follow_the_model_solve_their_own_equations(rng: np.random.Generator) -> None:
-    """At rest Σ w(p) (d − µ) ∂µ/∂p is 0, with the weights at p."""
+    """At rest Σ w(p) (d − µ) ∂µ/∂p is 0, with the weights at p; the matrix that is handed back is Σ w(p) (∂µ/∂p)²."""
     decay = _noisy(rng, 3.0, 0.5)._replace(noise=0.01)
     p = np.array([2.0, 1.0])
-    _, rests = descend_decay(decay, p, NONE, BOTH, 60, CLOSE)
+    _, rests, normal = descend_decay(decay, p, NONE, BOTH, 60, CLOSE)
     fall = np.exp(-p[1] * decay.t)
     force = (decay.value - p[0] * fall) / (0.01 * p[0] * fall)
     assert rests
     assert abs((force * fall).sum()) < 1e-5 * abs(force * fall).sum()
     assert abs((force * decay.t * fall).sum()) < 1e-5 * abs(force * decay.t * fall).sum()
+    slopes = np.stack([fall, -p[0] * decay.t * fall])
+    np.testing.assert_allclose(np.tril(normal), np.tril(slopes / (0.01 * p[0] * fall) @ slopes.T), rtol=1e-5)
 
 
 def test_what_is_not_active_stays_and_what_is_least_is_held(rng: np.random.Generator) -> None:

@@ -47,9 +47,10 @@ def descent_of(equations: Callable[..., Any], limit: Callable[..., Any]) -> Any:
 
     Returns
     -------
-    kernel (problem, p, least, active, observations, rest) -> (float, bool)
-        Steps from the parameters p, in place, and returns χ² and whether it came to rest. ``problem`` is what the two kernels read, often a
-        named tuple: pixels, noise, settings. ``least``: values below which parameters cannot fall; one that is there is no unknown as long
+    kernel (problem, p, least, active, observations, rest) -> (float, bool, ndarray)
+        Steps from the parameters p, in place, and returns χ², whether it came to rest, and JᵀWJ of the ``active`` where it was set up last:
+        at the result, or before a last step that is no larger than ``rest`` says. ``problem`` is what the two kernels read, often a named
+        tuple: pixels, noise, settings. ``least``: values below which parameters cannot fall; one that is there is no unknown as long
         as it is pressed there. ``active``: the numbers of those that are unknown. ``observations``: how many weights. ``rest``: a `Rest`.
 
     References
@@ -58,7 +59,7 @@ def descent_of(equations: Callable[..., Any], limit: Callable[..., Any]) -> Any:
     """
 
     @jit
-    def descend(problem: Any, p: Array, least: Array, active: Ints, observations: int, rest: Rest) -> tuple[float, bool]:
+    def descend(problem: Any, p: Array, least: Array, active: Ints, observations: int, rest: Rest) -> tuple[float, bool, Array]:
         count = len(active)
         normal, right = np.zeros((count, count)), np.zeros(count)
         new_normal, new_right, held = np.zeros((count, count)), np.zeros(count), np.zeros((count, count))
@@ -78,7 +79,7 @@ def descent_of(equations: Callable[..., Any], limit: Callable[..., Any]) -> Any:
             if not solve(held, count, pull, damping, factor, change):
                 damping = max(10.0 * damping, RAISED_SINGULAR)
                 if damping > MOST_DAMPING:
-                    return chi2, False
+                    return chi2, False, normal
                 continue
             fall = 0.0
             for j in range(count):
@@ -86,7 +87,7 @@ def descent_of(equations: Callable[..., Any], limit: Callable[..., Any]) -> Any:
             allowed = limit(problem, p, change, active, trial)
             if allowed and fall < rest.fall + rest.share * chi2 and damping < rest.damping:
                 p[:] = trial
-                return chi2, True
+                return chi2, True, normal
             before, now = np.inf, np.inf
             if allowed:
                 before, now = equations(problem, trial, weight, fresh, active, new_normal, new_right)
@@ -97,8 +98,8 @@ def descent_of(equations: Callable[..., Any], limit: Callable[..., Any]) -> Any:
                 damping = max(0.1 * damping, LEAST_DAMPING)
             else:
                 if damping >= MOST_DAMPING:
-                    return chi2, fall < rest.stuck
+                    return chi2, fall < rest.stuck, normal
                 damping = max(10.0 * damping, RAISED)
-        return chi2, False
+        return chi2, False, normal
 
     return descend

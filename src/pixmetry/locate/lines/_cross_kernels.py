@@ -268,7 +268,7 @@ def fit_crosses(
         if n <= count + 2:
             continue
         cross = Cross(section, crosses.angles[i], max(arms[1], arms[3]), aperture, noise, pixels[:n])
-        _, rests = descend_cross(cross, p, least, active[:count], n, REST)
+        _, rests, _ = descend_cross(cross, p, least, active[:count], n, REST)
         kept = 0
         for j in range(count):  # what is held at its least is no unknown
             k = active[j]

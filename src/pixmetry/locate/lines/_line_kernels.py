@@ -311,7 +311,7 @@ def fit_one(line: Line, choose: bool, options: Ints, p: Array, active: Ints) -> 
         if n <= count + 2:
             return section, count, False
         here = Line(section, line.angle, line.half, line.aperture, line.noise, line.pixels)
-        chi, rests = descend_line(here, p, least, active[:count], n, REST)
+        chi, rests, _ = descend_line(here, p, least, active[:count], n, REST)
         if not rests:
             break
         kept, most = count, 0

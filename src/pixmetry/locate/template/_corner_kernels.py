@@ -31,9 +31,11 @@ LEAST_BLUR_PX = 0.05
 REST_FALL = 1e-5  # of χ²: squared length of a step in standard errors at which a fit is at rest
 LEAST_SINE = 0.1  # of the angle between the edges
 PLAIN, ALL = 7, 11  # number of unknowns: x, y, two angles, blur, mean, contrast; with planes in mean and contrast
-NODES = np.array([0.2386191860831969, 0.6612093864662645, 0.9324695142031521])  # Gauss–Legendre, 6 points: Φ₂ to 2e-6 up to ρ = 0.9
-WEIGHTS = np.array([0.4679139345726910, 0.3607615730481386, 0.1713244923791704])
+NODES = np.outer([0.2386191860831969, 0.6612093864662645, 0.9324695142031521], [-1.0, 1.0]).ravel()  # Gauss–Legendre, 6 points
+WEIGHTS = np.repeat([0.4679139345726910, 0.3607615730481386, 0.1713244923791704], 2)  # Φ₂ to 2e-6 up to ρ = 0.9
 NEVER, ALWAYS, AUTO = 0, 1, 2  # whether planes are among the unknowns
+
+Six = tuple[float, float, float, float, float, float]
 
 
 class Corner(NamedTuple):
@@ -67,9 +69,48 @@ class Fits(NamedTuple):
     states: Ints  # bit 1 at rest, bit 2 window cut, bit 4 planes used, bit 8 at the top, 16 at the bottom of the scale
 
 
+class Edges(NamedTuple):
+    """What the pixels of a corner have in common."""
+
+    normal_1: tuple[float, float]  # of the two edges: cos, sin
+    normal_2: tuple[float, float]
+    rho: float  # cosine of the angle between them
+    sine: float
+    root: float  # √(1 − ρ²)
+    sines: Six  # sin t at the nodes of the integral of Φ₂
+    falls: Six  # 1/cos² t there
+    span: float  # ½ asin ρ; 0 where there is nothing to integrate
+    side: int  # normal densities an axis that make up a pixel's square
+    step: float  # from one to the next, px
+    outer: float  # weight of the outer ones
+    variance: float  # of the blur with them, px²
+    wide: float  # its root, px
+
+
 @jit
-def _crossing(h: float, k: float, rho: float, root: float) -> tuple[float, float, float, float, float, float]:
-    """E[sgn sgn] and its derivatives by h, k, ρ (the same as by h and k), hh, kk; root = √(1 − ρ²)."""
+def _six(values: Array) -> Six:
+    """Six numbers as a tuple: an array's users would be counted again for every pixel."""
+    return values[0], values[1], values[2], values[3], values[4], values[5]
+
+
+@jit
+def _edges_of(p: Array, aperture: float) -> Edges:
+    """Prepare the edges of a corner."""
+    rho, sine = math.cos(p[2] - p[3]), math.sin(p[2] - p[3])
+    side, step, rest, outer = 2, 2.0 * NODE * aperture, REST, 0.5
+    if p[4] < SHARP_PX * aperture:
+        side, step, rest, outer = 3, SHARP_NODE * aperture, SHARP_REST, SHARP_WEIGHT
+    variance = p[4] * p[4] + rest * aperture * aperture
+    span = 0.5 * math.asin(rho) if abs(rho) > 1e-12 else 0.0
+    first, second = (math.cos(p[2]), math.sin(p[2])), (math.cos(p[3]), math.sin(p[3]))
+    sines = np.sin(span * (1.0 + NODES))
+    root, falls = max(abs(sine), 1e-6), 1.0 / (1.0 - sines * sines)
+    return Edges(first, second, rho, sine, root, _six(sines), _six(falls), span, side, step, outer, variance, math.sqrt(variance))
+
+
+@jit
+def _crossing(h: float, k: float, edges: Edges) -> tuple[float, float, float, float, float, float]:
+    """E[sgn sgn] and its derivatives by h, k, ρ (the same as by h and k), hh, kk."""
     if abs(h) > FAR and abs(k) > FAR:
         return math.copysign(1.0, h * k), 0.0, 0.0, 0.0, 0.0, 0.0
     if abs(k) > FAR:
@@ -78,14 +119,13 @@ def _crossing(h: float, k: float, rho: float, root: float) -> tuple[float, float
     if abs(h) > FAR:
         side, slope = math.copysign(1.0, h), 0.7978845608028654 * math.exp(-0.5 * k * k)
         return side * math.erf(k * 0.7071067811865476), 0.0, side * slope, 0.0, 0.0, -k * side * slope
+    rho, root = edges.rho, edges.root
     value = math.erf(h * 0.7071067811865476) * math.erf(k * 0.7071067811865476)
-    if abs(rho) > 1e-12:
-        half, squares, product, total = 0.5 * math.asin(rho), 0.5 * (h * h + k * k), h * k, 0.0
-        for i in range(3):
-            for sign in (-1.0, 1.0):
-                sine = math.sin(half * (1.0 + sign * NODES[i]))
-                total += WEIGHTS[i] * math.exp((sine * product - squares) / (1.0 - sine * sine))
-        value += 4.0 * half * total / (2.0 * math.pi)
+    if edges.span != 0.0:
+        squares, product, total = 0.5 * (h * h + k * k), h * k, 0.0
+        for i in range(6):
+            total += WEIGHTS[i] * math.exp((edges.sines[i] * product - squares) * edges.falls[i])
+        value += 4.0 * edges.span * total / (2.0 * math.pi)
     a, b = (k - rho * h) / root, (h - rho * k) / root
     edge_h, edge_k = 0.7978845608028654 * math.exp(-0.5 * h * h), 0.7978845608028654 * math.exp(-0.5 * k * k)
     by_h, by_k = edge_h * math.erf(a * 0.7071067811865476), edge_k * math.erf(b * 0.7071067811865476)
@@ -94,16 +134,11 @@ def _crossing(h: float, k: float, rho: float, root: float) -> tuple[float, float
 
 
 @jit
-def pixel(x: float, y: float, p: Array, unknowns: int, aperture: float, d: Array) -> float:
+def pixel(x: float, y: float, p: Array, edges: Edges, unknowns: int, d: Array) -> float:
     """Grey value of the pixel at (x, y) from the corner; its derivatives by the unknowns go into d."""
-    c1, s1, c2, s2 = math.cos(p[2]), math.sin(p[2]), math.cos(p[3]), math.sin(p[3])
-    rho, sine = math.cos(p[2] - p[3]), math.sin(p[2] - p[3])
-    root = max(abs(sine), 1e-6)
-    side, step, rest, outer = 2, 2.0 * NODE * aperture, REST, 0.5
-    if p[4] < SHARP_PX * aperture:
-        side, step, rest, outer = 3, SHARP_NODE * aperture, SHARP_REST, SHARP_WEIGHT
-    variance = p[4] * p[4] + rest * aperture * aperture
-    wide = math.sqrt(variance)
+    (c1, s1), (c2, s2) = edges.normal_1, edges.normal_2
+    rho, sine, root = edges.rho, edges.sine, edges.root
+    side, step, outer, variance, wide = edges.side, edges.step, edges.outer, edges.variance, edges.wide
     contrast, cx, cy = p[6], p[9], p[10]
     for i in range(unknowns):
         d[i] = 0.0
@@ -118,7 +153,7 @@ def pixel(x: float, y: float, p: Array, unknowns: int, aperture: float, d: Array
         weight = (1.0 - 2.0 * outer if side == 3 and i == 1 else outer) * (1.0 - 2.0 * outer if side == 3 and j == 1 else outer)
         px, py = x + (j - 0.5 * (side - 1)) * step, y + (i - 0.5 * (side - 1)) * step
         u, v = (c1 * px + s1 * py) / wide, (c2 * px + s2 * py) / wide
-        s, su, sv, both, suu, svv = _crossing(u, v, rho, root)  # derivatives by u and v, the distances over the blur
+        s, su, sv, both, suu, svv = _crossing(u, v, edges)  # derivatives by u and v, the distances over the blur
         q1, q2 = (c1 * py - s1 * px) / wide, (c2 * py - s2 * px) / wide
         sx, sy = (c1 * su + c2 * sv) / wide, (s1 * su + s2 * sv) / wide
         local = weight * (contrast + cx * px + cy * py)
@@ -159,11 +194,11 @@ def normal_equations(
     """Normal equations of the active unknowns, χ² with the kept weights and with those at p; see `descent_of`."""
     xs, ys, values, noise, unknowns = corner.x, corner.y, corner.value, corner.noise, len(active)
     chi2, before = 0.0, 0.0
-    d = np.zeros(ALL)
+    d, edges = np.zeros(ALL), _edges_of(p, corner.aperture)
     matrix[:, :] = 0.0
     right[:] = 0.0
     for i in range(len(values)):
-        level = pixel(xs[i] - p[0], ys[i] - p[1], p, unknowns, corner.aperture, d)
+        level = pixel(xs[i] - p[0], ys[i] - p[1], p, edges, unknowns, d)
         mean, variance, slope = stored(level, noise)
         weight, residual = 1.0 / variance, values[i] - mean
         weights[i] = weight
@@ -176,9 +211,6 @@ def normal_equations(
             weighted *= slope
             for b in range(a + 1):
                 matrix[a, b] += weighted * d[b]
-    for a in range(unknowns):
-        for b in range(a):
-            matrix[b, a] = matrix[a, b]
     return before, chi2
 
 
@@ -242,10 +274,8 @@ def _start(corner: Corner, p: Array, profile: Array, members: Array) -> None:
 def _descend(corner: Corner, p: Array, unknowns: int, inverse: Array) -> tuple[float, bool]:
     """Fit one corner from p, in place: χ² and whether it came to rest. The inverse of JᵀWJ at the end goes into ``inverse``."""
     n, active = len(corner.value), np.arange(unknowns)
-    chi2, at_rest = descend_corner(corner, p, np.full(ALL, -np.inf), active, n, Rest(REST_FALL, 0.0, FREE, 0.0))
-    matrix, right = np.zeros((ALL, ALL)), np.zeros(ALL)
-    normal_equations(corner, p, np.zeros(n), np.empty(n), active, matrix, right)
-    solved = invert(matrix, unknowns, inverse)
+    chi2, at_rest, normal = descend_corner(corner, p, np.full(ALL, -np.inf), active, n, Rest(REST_FALL, 0.0, FREE, 0.0))
+    solved = invert(normal, unknowns, inverse)
     return chi2, at_rest and solved
 
 
