@@ -1,1 +1,1 @@
-"""Experiments of the handbook's chapter on image sensors, made again: plain records of numbers, and the pages that show them."""
+"""Experiments of the handbook's chapter on image sensors, repeated: plain records of numbers, and the pages that show them."""

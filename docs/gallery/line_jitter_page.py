@@ -24,20 +24,20 @@ CHAPTER_UM, CHAPTER_PITCH_UM = (0.341, 0.291), (8.6, 8.3)
 
 
 def predicted_x_px(level: Level, gain: float) -> float:
-    """What y leaves over, brought to x, and the jitter of the averaged rows."""
+    """The residual of y, scaled to the noise of x, with the jitter of the averaged rows."""
     noise = level.y.rms_px**2 * level.stated_px2[0] / level.stated_px2[1]
     return float(np.sqrt(noise + (gain * level.jitter_ns / PIXEL_NS) ** 2 / AVERAGED))
 
 
 def residual_figure() -> Figure:
-    """Residuals of an upright and of a lying line without jitter and with 3 ns."""
+    """Residuals of a vertical and of a horizontal line without jitter and with 3 ns."""
     run = stored()
     levels = [level.jitter_ns for level in run.levels]
     with canvas(3.6, nrows=2, sharex=True, sharey=True) as (figure, panels):
         for axes, jitter in zip(panels, (0.0, 3.0), strict=True):
             x, y = run.example_px[levels.index(jitter)]
-            axes.plot(np.arange(1, POSITIONS + 1), x, "o-", color=RED, linewidth=0.6, markersize=2, label="upright line: x")
-            axes.plot(np.arange(1, POSITIONS + 1), y, "s-", color=BLUE, linewidth=0.6, markersize=2, label="lying line: y")
+            axes.plot(np.arange(1, POSITIONS + 1), x, "o-", color=RED, linewidth=0.6, markersize=2, label="vertical line: x")
+            axes.plot(np.arange(1, POSITIONS + 1), y, "s-", color=BLUE, linewidth=0.6, markersize=2, label="horizontal line: y")
             axes.axhline(0, color=SOFT, linewidth=0.8)
             axes.set_title(f"line jitter {jitter:g} ns", loc="left")
             axes.set_ylabel("residual / px")
@@ -46,12 +46,12 @@ def residual_figure() -> Figure:
         figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
         still, shaken = (np.nanstd(run.example_px[levels.index(j)][0]) for j in (0.0, 3.0))
         alt = (
-            f"Residuals along an upright and a lying line: without jitter alike; with 3 ns those in x grow from {still:.3f} to "
+            f"Residuals along a vertical and a horizontal line: similar without jitter; with 3 ns those in x grow from {still:.3f} to "
             f"{shaken:.3f} px."
         )
         caption = (
-            f"What the calibration leaves over along one upright and one lying line, mean of {AVERAGED} rows (columns) each. Jitter shakes "
-            "the rows sideways: upright lines show it, lying ones do not."
+            f"Residuals of the calibration along one vertical and one horizontal line, each the mean of {AVERAGED} rows (columns). Jitter "
+            "shifts rows sideways: vertical lines show it, horizontal lines do not."
         )
         return Figure(figure, "line-jitter-residuals", alt, caption)
 
@@ -65,7 +65,7 @@ def size_figure() -> Figure:
         axes.plot(jitter, [level.x.rms_px for level in run.levels], "o", color=RED, label="x, found")
         axes.plot(jitter, [level.y.rms_px for level in run.levels], "s", color=BLUE, label="y, found")
         for k, (um, pitch) in enumerate(zip(CHAPTER_UM, CHAPTER_PITCH_UM, strict=True)):
-            axes.axhline(um / pitch, color=INK, linewidth=0.7, linestyle=(":", "-.")[k], label=f"the chapter's {'xy'[k]}")
+            axes.axhline(um / pitch, color=INK, linewidth=0.7, linestyle=(":", "-.")[k], label=f"{'xy'[k]} of the chapter")
         axes.set_xlabel("line jitter / ns")
         axes.set_ylabel("residual, rms / px")
         axes.set_xlim(-0.1, 5.2)
@@ -78,13 +78,13 @@ def size_figure() -> Figure:
         )
         caption = (
             "Root mean square of all residuals along x and y against the jitter of the frame grabber, and the chapter's two values. "
-            "Dashed: noise as in y, and the jitter of the rows that were averaged."
+            "Dashed: noise as in y plus the jitter of the averaged rows."
         )
         return Figure(figure, "line-jitter-size", alt, caption)
 
 
 def found_figure() -> Figure:
-    """Jitter found less jitter put in, by each way."""
+    """Measured minus simulated jitter, by each method."""
     run = stored()
     with canvas(2.6) as (figure, axes):
         for k, (way, (name, look)) in enumerate(WAYS.items()):
@@ -97,20 +97,23 @@ def found_figure() -> Figure:
                     u.append(2 * e.u)
             axes.errorbar(at, error, u, linestyle="none", label=name, capsize=2, linewidth=0.8, **look)
         axes.axhline(0, color=SOFT, linewidth=0.8)
-        axes.set_xlabel("jitter put in / ns")
-        axes.set_ylabel("found less put in / ns")
+        axes.set_xlabel("simulated jitter / ns")
+        axes.set_ylabel("measured minus simulated / ns")
         figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3)
         worst = max(abs(found(run.levels[-1], way)["jitter_ns"].value - run.levels[-1].jitter_ns) for way in WAYS)
-        alt = f"Jitter found less jitter put in, three ways: zero within two standard uncertainties; at 5 ns at most {worst:.2f} ns off."
+        alt = (
+            "Measured minus simulated jitter, three methods: zero within two standard uncertainties; at 5 ns the error is at most "
+            f"{worst:.2f} ns."
+        )
         caption = (
-            "Jitter found less jitter put in, with two standard uncertainties. Where it is not significant there is a limit instead "
-            "(table)."
+            "Measured minus simulated jitter, with two standard uncertainties. If the jitter is not significant, the table gives a limit "
+            "instead."
         )
         return Figure(figure, "line-jitter-found", alt, caption)
 
 
 def found(level: Level, way: str) -> Estimates:
-    """The jitter of one level by one way."""
+    """The jitter of one level by one method."""
     return level.jitters(stored().gain)[way]
 
 
@@ -152,7 +155,7 @@ def _value(estimates: Estimates) -> str:
 
 def _jitter_table() -> str:
     rows = [[f"{level.jitter_ns:g}", *(_value(found(level, way)) for way in (*WAYS, "columns"))] for level in stored().levels]
-    return table(["put in / ns", *(name for name, _ in WAYS.values()), "check: columns of lying lines"], rows)
+    return table(["simulated / ns", *(name for name, _ in WAYS.values()), "check: columns of horizontal lines"], rows)
 
 
 def _chapter() -> tuple[dict, Estimates, Estimates]:
@@ -179,101 +182,101 @@ def page() -> Page:
     off, u_k1 = _k1()
     text = f"""# Line jitter (Note 19, Table 3.2)
 
-A frame grabber finds the start of every line of the video signal anew. Each time it is a little early or late, and the whole row moves
-sideways by as much: by {1e3 / PIXEL_NS:.1f} thousandths of a pixel for every nanosecond. Is that to be seen?
+A frame grabber detects the start of every line of the video signal. Each time it is slightly early or late, and the whole row shifts
+sideways, by {1e3 / PIXEL_NS:.1f} thousandths of a pixel for every nanosecond. Is this visible in the residuals of straight lines?
 
 ## The experiment
 
-{LINES} white wires before a dark ground are seen by three cameras with three lenses at three distances, {len(VIEWS)} frames with the wires
-upright, and {len(VIEWS)} more with the camera rolled by 90°. On each wire there are {POSITIONS} positions, each the mean of {AVERAGED}
-rows (columns) next to each other. Each pair of frames is calibrated by its plumb lines: what was straight must become straight, with
-K1, K2, P1 and P2 of Brown's polynomial. The residuals along x, from the upright wires, are compared with those along y, from the lying
-ones. Jitter acts on x only, so the camera is its own control.
+Three cameras with three lenses image {LINES} white wires in front of a dark background from three distances. There are {len(VIEWS)} frames
+with vertical wires, and {len(VIEWS)} with the camera rolled by 90°. Each wire has {POSITIONS} positions, each the mean of {AVERAGED}
+neighbouring rows (columns). Each pair of frames is calibrated with plumb lines: straight wires must become straight lines, with K1, K2,
+P1 and P2 of Brown's polynomial. The residuals along x, from vertical wires, are compared with those along y, from horizontal wires.
+Jitter acts on x only, so y is the control.
 
-Everything runs through the whole chain of `{PRESET}`: lens distortion (K1
-{", ".join(significant(lens["k1_per_mm2"], 2) for lens in LENSES)} /mm², centres some pixels off), a sensor that is not
-quite flat, interlaced read-out, noise, fixed patterns, video amplifier, cable, clamp, 8 bits. Only the grabber's own jitter is
-replaced by {", ".join(f"{level.jitter_ns:g}" for level in run.levels)} ns, independent from row to row. Why the grabber that is driven by
-the camera's pixel clock? The chapter's 0.341 µm are its 1/25 pixel only if a pixel of the image is 8.5 µm wide, as on the sensor (8.6 µm);
-with a clock of 10 MHz it would be 12.2 µm wide.
+The whole chain of `{PRESET}` is simulated: lens distortion (K1
+{", ".join(significant(lens["k1_per_mm2"], 2) for lens in LENSES)} /mm², centres some pixels away from the middle), a sensor that is not
+exactly flat, interlaced read-out, noise, fixed patterns, video amplifier, cable, clamp, 8 bits. Only the grabber's own jitter is
+replaced by {", ".join(f"{level.jitter_ns:g}" for level in run.levels)} ns, independent from row to row. This grabber uses the camera's
+pixel clock, because the chapter's 0.341 µm equal its 1/25 pixel only if a pixel of the image is 8.5 µm wide, as on the sensor (8.6 µm).
+With a clock of 10 MHz it would be 12.2 µm wide.
 
-The wires are found by `find_lines` and measured by `line_rows` without being told anything.
+`find_lines` finds the wires and `line_rows` measures them, without any settings.
 
-## What is left over
+## The residuals
 
 {show(pictures[0])}
-In the form of the chapter's Table 3.2 (it has 0.341 µm, 1/25 pixel in x and 0.291 µm, 1/28 pixel in y):
+In the form of the chapter's Table 3.2 (whose values are 0.341 µm, 1/25 pixel in x and 0.291 µm, 1/28 pixel in y):
 
 {_residual_table()}
 {show(pictures[1])}
-"Noise alone" is what the estimator states for the pixels' noise. Even without jitter more than that is left: sensitivities and offsets
-that differ from pixel to pixel, and what four lens parameters do not describe. Yet it is six times less than the chapter's residuals. Its
-lines were a few pixels wide, unevenly lit and ringing, and we do not know how many rows it averaged and by which estimator. Its y
-residuals at least are no line jitter, and jitter that would explain its x residuals alone, some {_needed_ns():.1f} ns here, would make x
-several times as large as y.
+"Noise alone" is the uncertainty that the estimator states for the noise of the pixels. Even without jitter the residuals are larger:
+sensitivities and offsets differ from pixel to pixel, and four lens parameters do not describe everything. Still they are six times smaller
+than those of the chapter. The chapter's lines were a few pixels wide, unevenly lit and with ringing; the number of averaged rows and the
+estimator are unknown. Its y residuals, at least, cannot be line jitter. Jitter that would explain its x residuals alone, about
+{_needed_ns():.1f} ns here, would make x several times as large as y.
 
-Not everything is left in the residuals. K1 is found {1e5 * off:.1f}·10⁻⁵ /mm² below the lens' own on average (u of one pair about
-{1e5 * u_k1:.1f}·10⁻⁵): light that falls aslant on a bowed sensor lands beside its place, and lines cannot tell that from a lens. P1 and P2
-likewise take up most of what the shifted centre does.
+The residuals do not contain all errors. The measured K1 is on average {1e5 * off:.1f}·10⁻⁵ /mm² below that of the lens (u of one pair
+about {1e5 * u_k1:.1f}·10⁻⁵): oblique light hits a bowed sensor at a shifted position, and lines cannot separate this from distortion. In
+the same way P1 and P2 include most of the effect of the shifted centre.
 
 ## x against y
 
-Jitter can only make x worse, so the F-test is one-sided. How many degrees of freedom? Of {none.x.n} positions in x,
-{none.x.dof:.0f} would remain if all were independent ({POSITIONS} − 2 for each line, less the lens'). Neighbours on a line err partly
-alike, though; from the correlations of the residuals along the lines (first neighbours {fixed(none.x.correlation[0], 2)} in x,
+Jitter can only increase x, so the F-test is one-sided. How many degrees of freedom are there? The {none.x.n} positions in x would give
+{none.x.dof:.0f} if all were independent ({POSITIONS} − 2 for each line, minus the lens parameters). But the errors of neighbours on a line
+are correlated. From the correlations of the residuals along the lines (first neighbours {fixed(none.x.correlation[0], 2)} in x,
 {fixed(none.y.correlation[0], 2)} in y) an effective number of {none.x.dof_effective:.0f} in x and {none.y.dof_effective:.0f} in y follows,
-as dof/(1 + 2 Σ ρ²). The most careful takes one for each line, {none.x.lines}: right if all errors of a line were one, such as its own
-light or blur.
+by dof/(1 + 2 Σ ρ²). The most cautious choice is one for each line, {none.x.lines}. It is right if all errors of a line have one common
+cause, such as its light or its blur.
 
 {_test_table()}
-Without jitter, x is still worse than y by a tenth of the variance, since pixel and video amplifier blur x more. With all positions taken
-for independent, which their correlations nearly allow, this is significant: a real difference, but none of jitter (see below). A test
-with many degrees of freedom finds any difference, whatever it is from. With one degree of freedom a line (critical value
-{fixed(none.f_test.critical_95["lines"], 2)}) it is not significant, and 1 ns is. The unit matters, too, where pixels are not square:
+Without jitter, the variance of x is still a tenth larger than that of y, because pixel and video amplifier blur x more. If all positions
+count as independent, which their correlations nearly allow, this is significant: a real difference, but not jitter (see below). A test
+with many degrees of freedom detects any difference, whatever its cause. With one degree of freedom for each line (critical value
+{fixed(none.f_test.critical_95["lines"], 2)}) it is not significant, while 1 ns is. The unit matters, too, if pixels are not square:
 equal in pixels is not equal in micrometres.
 
-The chapter's own numbers, tested so: {fixed(test.ratio_px2, 3)} in px² (p = {fixed(test.p_px["lines"], 3)}),
-{fixed(test.ratio_um2, 3)} in µm² (p = {fixed(test.p_um["lines"], 3)}), both significant at 5 %. If all of it were jitter, and
-each position a single row that moves as the line does: {fixed(px.value, 2)} ns from pixels and {fixed(um.value, 2)} ns from micrometres,
+The chapter's own numbers, tested in this way: {fixed(test.ratio_px2, 3)} in px² (p = {fixed(test.p_px["lines"], 3)}),
+{fixed(test.ratio_um2, 3)} in µm² (p = {fixed(test.p_um["lines"], 3)}), both significant at 5 %. If jitter were the only cause, and
+each position were a single row that moves with the line: {fixed(px.value, 2)} ns from pixels and {fixed(um.value, 2)} ns from micrometres,
 {px.reason.replace("(one-sided 95 %)", "").strip()} and {um.reason.replace("(one-sided 95 %)", "").strip()} respectively (one-sided, 95 %).
-So "not to be seen" holds for the size, not for the test.
+The chapter's statement that jitter is not visible holds for the size of the residuals, but not for the test.
 
 ## The jitter in nanoseconds
 
-A position is the mean of {AVERAGED} rows, which shake independently: its jitter is that of a row over √{AVERAGED}. And a delay moves
-the line by more than its own length: the amplifier's steps are still rising when the grabber samples them, so that a delay of one pixel
-moves the position by {", ".join(fixed(g, 2) for g in run.gains)} pixels (wires near, farther, far; found by shearing a frame without
-noise by a known delay). With both, three ways lead to the jitter:
+A position is the mean of {AVERAGED} rows with independent jitter: its jitter is that of a row over √{AVERAGED}. Moreover, a delay moves
+the line by more than the delay itself, because the amplifier's steps are still rising when the grabber samples them. A delay of one pixel
+moves the position by {", ".join(fixed(g, 2) for g in run.gains)} pixels (wires near, farther, far; measured by shearing a noise-free frame
+by a known delay). With both factors, three methods give the jitter:
 
-- **x against y**: the difference of the variances, with the ratio of noise that the estimator states for x and y; one degree of freedom a
-  line for the noise.
-- **Rows of one frame**: a row crosses all eight wires and takes them along together. What the eight residuals of a row share is jitter,
-  what they do not share is not (one-way analysis of variance). It needs no lying wires, and each frame is one for itself.
-- **{FRAMES} frames** of one view: the same, less the mean of the frames, so that fixed patterns do not count.
+- **x against y**: the difference of the variances, with the ratio of noise that the estimator states for x and y. One degree of freedom
+  for each line is assumed for the noise.
+- **Rows of one frame**: a row crosses all eight wires and shifts them together. The common part of the eight residuals of a row is jitter,
+  the rest is not (one-way analysis of variance). This needs no horizontal wires, and a single frame is enough.
+- **{FRAMES} frames** of one view: the same after subtraction of the mean of the frames, so that fixed patterns do not count.
 
 {_jitter_table()}
 {show(pictures[2])}
-"<" is a one-sided limit at 95 %. The analysis of rows is by far the sharpest without jitter: it stays below
-{fixed(found(none, "rows")["jitter_ns"].value, 2)} ns where x against y cannot say more than
-{fixed(found(none, "axes")["jitter_ns"].value, 2)} ns. The same analysis of columns on the lying wires, where jitter has no part, finds
-nothing at any level, as it must.
+"<" is a one-sided limit at 95 %. The analysis of rows is by far the most sensitive: without jitter its limit is
+{fixed(found(none, "rows")["jitter_ns"].value, 2)} ns, while that of x against y is
+{fixed(found(none, "axes")["jitter_ns"].value, 2)} ns. The same analysis of columns on the horizontal wires, where jitter has no effect,
+finds nothing at any level, as it must.
 
 ## What to do about it
 
-- Put {LINES} wires, or the edges of a chart, upright before the camera: **one frame** tells the jitter of {POSITIONS * AVERAGED} rows.
-- A specified jitter of 1 ns moves a row by {run.gain / PIXEL_NS:.3f} px here; a target of some rows by that over the root of their number.
-  Against noise of {none.x.rms_px:.4f} px in {AVERAGED} rows, 1 ns doubles the residual, and {_equal_ns():.1f} ns are as large as all
-  the rest together.
-- Sample with the camera's pixel clock, average frames, or take a digital camera.
+- Place {LINES} vertical wires, or the vertical edges of a chart, in front of the camera: **one frame** gives the jitter of
+  {POSITIONS * AVERAGED} rows.
+- A jitter of 1 ns moves a row by {run.gain / PIXEL_NS:.3f} px here, and a target of n rows by this value over √n. Compared with noise of
+  {none.x.rms_px:.4f} px in {AVERAGED} rows, 1 ns doubles the residual, and {_equal_ns():.1f} ns are as large as everything else together.
+- Sample with the camera's pixel clock, average frames, or use a digital camera.
 
-Run in full with `{COMMAND}` ({len(VIEWS) * 2 * len(run.levels)} frames and the repeated ones, about two minutes of one core), which stores
-the numbers that `scripts/make_handbook.py` writes here; run again, both give the same.
+`{COMMAND}` runs the full experiment ({len(VIEWS) * 2 * len(run.levels)} frames and the repeated ones, about two minutes on one core) and
+stores the numbers that `scripts/make_handbook.py` writes here. Both give the same numbers in every run.
 """
     return Page("line-jitter", text, pictures)
 
 
 def _k1() -> tuple[float, float]:
-    """How much lower K1 is found than put in, mean over the pairs without jitter, and the standard uncertainty of one."""
+    """Simulated minus measured K1, mean over the pairs without jitter, and the standard uncertainty of one pair."""
     pairs = {name: view.k1_per_mm2 for name, view in stored().views.items() if name.endswith(" 0")}
     off = [LENSES[int(name[2])]["k1_per_mm2"] - k1 for name, (k1, _) in pairs.items()]
     return float(np.mean(off)), float(np.median([u for _, u in pairs.values()]))
@@ -287,6 +290,6 @@ def _needed_ns() -> float:
 
 
 def _equal_ns() -> float:
-    """Jitter whose share of the residuals equals the rest."""
+    """Jitter whose contribution to the residuals equals that of everything else."""
     run = stored()
     return float(run.levels[0].x.rms_px * np.sqrt(AVERAGED) * PIXEL_NS / run.gain)

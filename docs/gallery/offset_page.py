@@ -30,11 +30,11 @@ WAYS = {
     "soft threshold": {"color": AMBER, "linestyle": "--", "marker": "^"},
     "fit": {"color": INK, "linestyle": ":", "marker": "D"},
 }
-NAMES = {"soft threshold": "black subtracted, soft threshold", "fit": "fit that knows the cut-off"}
+NAMES = {"soft threshold": "black subtracted, soft threshold", "fit": "fit with known cut-off"}
 
 
 def error_figure() -> Figure:
-    """Error along the line's way through three pixels, with and without the offset."""
+    """Error while the line moves through three pixels, with and without the offset."""
     with canvas(3.9, nrows=2, sharex=True, sharey=True) as (figure, panels):
         for axes, offset in zip(panels, (OFFSET_DN, 0.0), strict=True):
             c = experiment.centres()
@@ -44,16 +44,16 @@ def error_figure() -> Figure:
             axes.set_ylabel("error / px")
         panels[1].set_xlim(-1.5, 1.5)
         panels[1].set_ylim(-0.02, 0.02)
-        panels[1].set_xlabel("true place of the line / px")
+        panels[1].set_xlabel("true position of the line / px")
         figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
         six, none = swing(OFFSET_DN), swing(0.0, "rounded")
         alt = (
             f"Error of the centroid over three pixels: with an offset of 6 a wave of three periods, ±{six.half_range_px:.4f} px; without "
-            f"offset a flat line, or, rounded, jitter of ±{none.half_range_px:.4f} px."
+            f"offset a flat line or, with rounding, scatter of ±{none.half_range_px:.4f} px."
         )
         caption = (
-            "Error of the row's centroid on the line's way through three pixels. Above, six grey values are lost at the foot of the "
-            "line; below, none. Blue: grey values of any size; red: whole numbers."
+            "Error of the row's centroid while the line moves through three pixels. Top: six grey values are lost at the foot of the "
+            "line. Bottom: none is lost. Blue: grey values that are not rounded; red: whole numbers."
         )
         return Figure(figure, "offset-error", alt, caption)
 
@@ -73,12 +73,12 @@ def depth_figure() -> Figure:
         figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=2)
         low, high = (swing(o).first_px for o in (30.0, 15.0))
         alt = (
-            f"Amplitude of the error against the offset: it changes sign again and again and grows, {high:+.3f} px at 15, {low:+.3f} "
+            f"Amplitude of the error against the offset: it changes its sign repeatedly and grows, {high:+.3f} px at 15, {low:+.3f} "
             f"px at 30."
         )
         caption = (
-            "Amplitude of the first wave, sin 2πc, against the offset; the sign tells on which side the error begins. Lines: from the "
-            "integral below; marks: from the rows. A larger offset can do less harm than a smaller one."
+            "Amplitude of the first wave, sin 2πc, against the offset. The sign gives the direction of the error. Lines: from the "
+            "integral below; marks: from the rows. A larger offset can cause a smaller error."
         )
         return Figure(figure, "offset-depth", alt, caption)
 
@@ -104,9 +104,9 @@ def cures_figure() -> Figure:
             f"+12; the fit at most {fit.max():.4f} px throughout."
         )
         caption = (
-            f"Pieces of {PIECE_ROWS} rows, with noise (σ {NOISE_DN:g} grey values), against the level at which black is stored; what is "
-            f"negative is lost. The centroids of the grey values as they are want black to be lost, the soft threshold wants it "
-            "kept, and the fit does not care."
+            f"Error of pieces of {PIECE_ROWS} rows, with noise (σ {NOISE_DN:g} grey values), against the level at which black is stored. "
+            f"Negative values are lost. Centroids of the original grey values are better if black is lost, the soft threshold is better "
+            "if it is kept, and the fit is independent of it."
         )
         return Figure(figure, "offset-cures", alt, caption)
 
@@ -117,7 +117,7 @@ def _micro(value: float) -> str:
 
 
 def _swings() -> str:
-    """Every variant: amplitude, half range and rms, and what the integral says."""
+    """Every variant: amplitude, half range and rms, and the values of the integral."""
     rows = []
     for offset in (OFFSET_DN, 0.0):
         for integrated in (False, True):
@@ -126,17 +126,17 @@ def _swings() -> str:
                 for conversion in ("unquantised", "rounded", "truncated"):
                     one = swing(offset, conversion, power, integrated)
                     theory = [_micro(said[0]), _micro(predicted_rms(said))] if conversion == "unquantised" else ["", ""]
-                    what = ["squared" if power == 2 else "centroid", "over the pixel" if integrated else "at its middle", WORDS[conversion]]
+                    what = ["squared" if power == 2 else "centroid", "averaged" if integrated else "at the middle", WORDS[conversion]]
                     rows.append([f"{offset:g}", *what, *map(_micro, (one.first_px, one.half_range_px, one.rms_px)), *theory])
-    head = ["offset", "estimator", "light taken", "grey values", "a₁", "half range", "rms", "a₁ predicted", "rms predicted"]
+    head = ["offset", "estimator", "light in the pixel", "grey values", "a₁", "half range", "rms", "a₁ predicted", "rms predicted"]
     return table(head, rows, 4)
 
 
-WORDS = {"unquantised": "any", "rounded": "rounded", "truncated": "cut to whole"}
+WORDS = {"unquantised": "not rounded", "rounded": "rounded", "truncated": "truncated"}
 
 
 def _claims() -> str:
-    """What the chapter says beside what was found."""
+    """The statements of the chapter, and the results here."""
     six, six_8, six_cut = (swing(OFFSET_DN, c) for c in ("unquantised", "rounded", "truncated"))
     none, none_8 = swing(0.0), swing(0.0, "rounded")
     square = swing(OFFSET_DN, power=2)
@@ -145,36 +145,39 @@ def _claims() -> str:
     rows = [
         [
             "Fig 3.13, offset 6: a wave, on an axis of ±0.02 px",
-            f"three periods, amplitude {abs(six.first_px):.4f} px, greatest error {six.half_range_px:.4f} px; rounded "
-            f"{six_8.half_range_px:.4f}, cut to whole numbers {six_cut.half_range_px:.4f} px",
+            f"three periods, amplitude {abs(six.first_px):.4f} px, largest error {six.half_range_px:.4f} px; rounded "
+            f"{six_8.half_range_px:.4f}, truncated {six_cut.half_range_px:.4f} px",
         ],
         [
             "Fig 3.14, offset 0: no wave",
-            f"{'below 1e-12' if none.half_range_px < 1e-12 else f'{none.half_range_px:.1e}'} px with grey values of any size; rounded, "
-            f"jitter of ±{none_8.half_range_px:.4f} px (rms {none_8.rms_px:.4f} px), because rounding takes the feet below half a grey "
-            "value away",
+            f"{'below 1e-12' if none.half_range_px < 1e-12 else f'{none.half_range_px:.1e}'} px without rounding; with rounding, "
+            f"scatter of ±{none_8.half_range_px:.4f} px (rms {none_8.rms_px:.4f} px), because rounding removes the part of the feet below "
+            "half a grey value",
         ],
         [
             "a symmetric line has no error",
-            "yes: the error is zero where the line is in the middle of a pixel or between two",
+            "yes: the error is zero if the line is in the middle of a pixel or between two pixels",
         ],
         [
-            "the squared centroid suffers less",
-            f"yes: amplitude {abs(square.first_px):.5f} px at 6; the largest up to an offset of 30 is {largest[1]:.4f} px, of the "
-            f"centroid {largest[0]:.4f} px",
+            "the squared centroid has a smaller error",
+            f"yes: amplitude {abs(square.first_px):.5f} px at 6. Up to an offset of 30 the largest amplitude is {largest[1]:.4f} "
+            f"px, that of the centroid {largest[0]:.4f} px",
         ],
-        ["the error is systematic", "yes; no averaging takes it away, only the line's moving through whole pixels"],
-        ["no such error with the background above zero", "yes, if the background is subtracted; if not, it pulls the centroid (see below)"],
+        ["the error is systematic", "yes; averaging frames does not reduce it, averaging over positions within the pixel does"],
+        [
+            "no such error with the background above zero",
+            "yes, if the background is subtracted; otherwise it shifts the centroid (see below)",
+        ],
         [
             "best setting: just below the first step of the converter",
-            "for centroids of the grey values as they are, yes; not otherwise (see below)",
+            "yes for centroids of the original grey values; not otherwise (see below)",
         ],
     ]
     return table(["the chapter", "here"], rows, 2)
 
 
 def _real() -> str:
-    """Figs 3.15 to 3.17: what the same model says about the chapter's real lines and targets."""
+    """Figs 3.15 to 3.17: the same model for the chapter's real lines and targets."""
     shares = (0.02, 0.1, 0.2, 0.3, 0.5, 0.6, 0.7, 0.8)
     rows = []
     for sigma in (0.8, 1.0, 1.2, 1.5):
@@ -187,27 +190,27 @@ def _real() -> str:
     ]
     still = table(["offset", *(f"peak {p:g}" for p in seen.peak_dn)], lines)
     stray, rule = experiment.outlier_shift()
-    return f"""**Fig 3.15**, a real line before the adjustment, swings within ±0.3 px. That takes an offset of a large share of the peak.
-The amplitude a₁ in px for offsets of 2 to 80 % of the peak (not rounded, light at the pixel's middle):
+    return f"""**Fig 3.15** shows a real line before the adjustment; its error oscillates within ±0.3 px. Such an error needs an offset
+of a large share of the peak. The amplitude a₁ in px for offsets of 2 to 80 % of the peak (not rounded, light at the pixel's middle):
 
 {deep}
-Amplitudes of 0.1 to 0.3 px are there, but the same amplitude comes with several offsets: it cannot be read backwards without knowing the
-line's width. Fit the line with its cut-off instead.
+Amplitudes of 0.1 to 0.3 px occur, but several offsets give the same amplitude: without the width of the line, the offset cannot be
+computed from the amplitude. Fit the line with its cut-off instead.
 
-**Fig 3.16**, the same line after it, has single rows that lie off. A stray grey value v at a distance d shifts a centroid by v·d over the
-sum of the row's grey values: a 1 at 10 px from a line like ours ({PEAK_DN:g}, σ {SIGMA_PX:g}) makes {stray:.4f} px (the rule says
-{rule:.4f} px).
+**Fig 3.16** shows the same line after the adjustment; single rows are outliers. A stray grey value v at a distance d shifts a centroid by
+v·d over the sum of the row's grey values. A stray value of 1 at 10 px from a line with peak {PEAK_DN:g} and σ {SIGMA_PX:g} px shifts it by
+{stray:.4f} px (by the rule: {rule:.4f} px).
 
-**Fig 3.17**, a target that stands still, at several exposures. A round Gaussian spot of σ 1 px at 0.35 px from the middle of its pixel,
-21 × 21 px, noise of the variance 0.81 + 0.0097 I, mean error in x of 800 frames, px:
+**Fig 3.17** shows a target at rest, at several exposures. Here it is a round Gaussian spot of σ 1 px at 0.35 px from the middle of its
+pixel, in 21 × 21 px, with noise of the variance 0.81 + 0.0097 I. Mean error in x of 800 frames, px:
 
 {still}
-Cut off deeply, a target moves when the light changes; that is how to find out whether black is set too low, without any test chart.
+If much is cut off, the target moves when the light changes. This shows without any test chart whether black is set too low.
 """
 
 
 def _cured() -> str:
-    """Random and lasting errors at three black levels."""
+    """Random and systematic errors at three black levels."""
     found = experiment.cures()
     at = [int(np.flatnonzero(black == BLACK_DN)[0]) for black in (-6.0, 0.0, 6.0)]
     rows = []
@@ -215,7 +218,7 @@ def _cured() -> str:
         cure = found[way]
         cells = [f"{v[j]:.4f}" for j in at for v in (cure.random_px, cure.lasting_px)]
         rows.append([NAMES.get(way, way), *cells])
-    head = ["px"] + [f"{name}, black {fixed(BLACK_DN[j], 0)}" for j in at for name in ("random", "lasting")]
+    head = ["px"] + [f"{name}, black {fixed(BLACK_DN[j], 0)}" for j in at for name in ("random", "systematic")]
     return table(head, rows)
 
 
@@ -230,70 +233,70 @@ def page() -> Page:
     waves = ", ".join(fixed(1e3 * a, 2) for a in said[:4])
     text = f"""# Black below zero (Note 13, Figs 3.13 and 3.14)
 
-A converter stores nothing below zero. If the level that stands for black lies below it, the feet of every target are cut off. The images
-look clean, cleaner than they should, and the centroids are off: a threshold has been built in.
+A converter stores no values below zero. If the black level is below zero, the converter cuts off the feet of every target. The images
+look cleaner than they should, and the centroids have an error: the cut-off acts like a threshold.
 
 ## The experiment
 
-A line with a Gaussian profile, σ {SIGMA_PX:g} px, peak {PEAK_DN:g} grey values, shifts by {experiment.SKEW_PX:g} px over {ROWS} rows: its
-place in the row goes from −1.5 to 1.5 px about the middle of {SAMPLES} pixels (±{experiment.MIDDLE} px, wide enough that nothing is lost
-at the ends). No noise, no background. From every grey value {OFFSET_DN:g} is subtracted (Fig 3.13), or nothing (Fig 3.14); what is
-negative becomes 0. The centroid of each row is compared with the truth. Variants: the light taken at the pixel's middle, as the chapter's
-formula has it, or averaged over the pixel, as a sensor does; grey values of any size, rounded, or cut to whole numbers by a converter
-that truncates; centroid or squared centroid.
+A line has a Gaussian profile with σ {SIGMA_PX:g} px and a peak of {PEAK_DN:g} grey values. It shifts by {experiment.SKEW_PX:g} px over
+{ROWS} rows: its position in the row goes from −1.5 to 1.5 px about the middle of {SAMPLES} pixels (±{experiment.MIDDLE} px, wide enough
+that nothing is lost at the ends). There is no noise and no background. From every grey value {OFFSET_DN:g} is subtracted (Fig 3.13), or
+nothing (Fig 3.14); negative values become 0. The centroid of each row is compared with the truth. Variants: light at the middle of the
+pixel, as in the chapter's formula, or averaged over the pixel, as in a sensor; grey values not rounded, rounded, or truncated; centroid or
+squared centroid.
 
-## What one sees
+## The result
 
 {show(pictures[0])}
 {_claims()}
-The offset takes the same off both feet, and yet the line moves? Only a line that is symmetric on its pixels loses the same on both sides.
-Otherwise one foot ends just before a pixel and the other just behind one. Over one pixel of travel this evens out: hence a wave, with a
-period of one pixel.
+The same value is subtracted on both sides of the line. Why does the line move? Only a line that is symmetric on its pixels loses the same
+amount on both sides. Otherwise one foot ends just before a pixel centre and the other just behind one. This averages out when the line
+moves by one pixel. The error is therefore a wave with a period of one pixel.
 
-How large it is can be told without any simulation. With h the profile that is left, the error at a place c is
+The error can be computed without a simulation. With the remaining profile h, the error at a position c is
 
     e(c) = −2 Σ S_k sin(2πkc) / ∫h,   S_k = ∫ x h(x) sin(2πkx) dx,   k = 1, 2, 3 …
 
-so that a profile without frequencies of one cycle per pixel and above gives no error, whatever the place. A Gaussian of σ {SIGMA_PX:g} px
-is such a profile; its cut-off feet are what has them. Here the first four amplitudes are {waves} thousandths of a pixel. They depend on
-where the feet end:
+A profile without frequencies of one cycle per pixel and above therefore has no error at any position. A Gaussian of σ {SIGMA_PX:g} px is
+such a profile; the cut at its feet adds these frequencies. Here the first four amplitudes are {waves} thousandths of a pixel. They depend
+on the positions where the feet end:
 
 {show(pictures[1])}
-In thousandths of a pixel (a₁: amplitude of sin 2πc; half range: half the distance from the least error to the greatest; both without
-sign):
+In thousandths of a pixel (a₁: amplitude of sin 2πc; half range: half the difference between the largest and the smallest error; both
+without sign):
 
 {_swings()}
-Rounding alone makes errors of up to {swing(0.0, "rounded").half_range_px:.3f} px, without any offset: many small jumps rather than a
-wave. Noise of half a grey value or more turns them into noise; it does not take the wave away.
+Rounding alone causes errors of up to {swing(0.0, "rounded").half_range_px:.3f} px, without any offset: many small jumps and no wave. Noise
+of half a grey value or more turns these jumps into noise; it does not remove the wave.
 
 ## What to do about it
 
-Now with noise, σ {NOISE_DN:g} grey values, rounded, light averaged over the pixel, and the level of black as it is stored from −12 to 12.
-A line is rarely measured by a single row, so every {PIECE_ROWS} rows are taken together: the mean of the rows' centroids, or a fit.
-{ROWS // PIECE_ROWS} pieces in 20 frames:
+Now there is noise of σ {NOISE_DN:g} grey values, values are rounded, light is averaged over the pixel, and the stored black level goes from
+−12 to 12. A line is rarely measured in a single row, so {PIECE_ROWS} rows are one piece: the mean of the centroids of its rows, or one
+fit. There are {ROWS // PIECE_ROWS} pieces in 20 frames:
 
 {show(pictures[2])}
 {_cured()}
-"Random" is what changes from frame to frame, "lasting" what the mean of endless frames would still be off (below 0.0005 px it cannot be
-told from nothing here).
+"Random" is the part that changes from frame to frame. "Systematic" is the error of the mean of infinitely many frames (below 0.0005 px
+it is not significant here).
 
-- **Keep black above zero**, by three standard deviations of the noise or more, so that nothing is cut off; **subtract it**, and take a
-  **soft threshold** of three standard deviations. Then the error is {soft.total_px[above]:.4f} px, {soft.lasting_px[above]:.4f} px of it
-  lasting, at every such level: that threshold cuts feet off too, but it is low, and it is yours.
-- **If black was lost, do not add a threshold to it**: both cuts act together, and the lasting error grows to {soft.lasting_px.max():.4f}
+- **Keep black above zero** by three standard deviations of the noise or more, so that nothing is cut off. **Subtract it**, and use a
+  **soft threshold** of three standard deviations. Then the error is {soft.total_px[above]:.4f} px at every such level, of which
+  {soft.lasting_px[above]:.4f} px are systematic. This threshold also cuts off the feet, but it is low and known.
+- **If black was lost, do not add a threshold**: both cut-offs act together, and the systematic error grows to {soft.lasting_px.max():.4f}
   px at {fixed(BLACK_DN[soft.lasting_px.argmax()], 0)}.
-- **The squared centroid** hardly notices what is cut off, since squares are small at the feet. A background that is not subtracted it
-  does notice.
-- A plain centroid over all {SAMPLES} pixels, without threshold, fares best with black *below* zero, since this keeps the background's
-  noise and pull out: the chapter's advice is right for it. Above zero and not subtracted, the background pulls it
-  to the middle of the window.
-- **Best: fit the line.** The template of a straight line, told the noise and that the scale ends at 0, has at most
-  {fit.total_px.max():.5f} px at any black level, also on frames that were taken with black lost, and states {fit.stated_px.min():.5f} to
-  {fit.stated_px.max():.5f} px. More is not in the grey values: the Cramér–Rao bound of such a piece, nothing cut off, is {bound:.5f} px.
+- **The squared centroid** is hardly sensitive to the cut-off, because squares are small at the feet. It is sensitive to a background that
+  is not subtracted.
+- A plain centroid over all {SAMPLES} pixels, without a threshold, is best with black *below* zero, because this removes the background
+  and its noise: here the chapter's advice is right. A background above zero that is not subtracted shifts the centroid towards the middle
+  of the window.
+- **Best: fit the line.** The template of a straight line knows the noise and that the scale ends at 0. Its error is at most
+  {fit.total_px.max():.5f} px at any black level, also in frames in which black was lost; it states {fit.stated_px.min():.5f} to
+  {fit.stated_px.max():.5f} px. No estimator can be better: the Cramér–Rao bound of such a piece, without cut-off, is {bound:.5f} px.
 
 ## The chapter's real lines and targets
 
 {_real()}
-Written by `scripts/make_handbook.py` from `gallery.offset`; run again, it writes the same.
+Written by `scripts/make_handbook.py` from `gallery.offset`; it writes the same numbers in every run.
 """
     return Page("offset", text.replace("px, -", f"px, {MINUS}"), pictures)

@@ -1,4 +1,4 @@
-"""A page of the handbook: Markdown with figures beside it as SVG files of their own."""
+"""A page of the handbook: Markdown, with its figures in SVG files."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pixmetry.report.drawing import escape
 from pixmetry.report.page import Figure
 
 WIDTH_PX = 560
-# The colours of the report's figures, light and dark, with a ground of their own, so that they can be read on any page.
+# The colours of the report's figures, light and dark, with a background of their own, so that they can be read on any page.
 STYLE = (
     "svg{--ground:#fff;--ink:#1a1d21;--soft:#5b626b;--grid:#d9dde2;--blue:#0067a5;--red:#c44e00;--amber:#a87400;"
     "--sans:system-ui,-apple-system,'Segoe UI',Roboto,'Noto Sans','Liberation Sans',Arial,sans-serif;background:var(--ground)}"
@@ -27,12 +27,12 @@ class Page:
     pictures: tuple[Figure, ...] = ()
 
     def files(self) -> dict[str, str]:
-        """What it is made of: file name and content."""
+        """The files of the page: name and content."""
         return {f"{self.name}.md": self.text, **{f"{p.name}.svg": standalone(p) for p in self.pictures}}
 
 
 def standalone(shown: Figure) -> str:
-    """A picture of the report as a file of its own: with a size, a name space, colours and a ground."""
+    """A picture of the report as a file of its own: with size, name space, colours and background."""
     head, rest = shown.svg.split(">", 1)
     left, top, width, height = (float(v) for v in head.split('viewBox="')[1].split('"')[0].split())
     size = f'xmlns="http://www.w3.org/2000/svg" width="{WIDTH_PX}" height="{WIDTH_PX * height / width:.0f}"'
@@ -46,6 +46,6 @@ def show(shown: Figure) -> str:
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[object]], numbers_from: int = 1) -> str:
-    """A table in Markdown; columns from ``numbers_from`` on stand right."""
+    """A table in Markdown; columns from ``numbers_from`` on are right-aligned."""
     rule = ["---"] * min(numbers_from, len(head)) + ["---:"] * (len(head) - numbers_from)
     return "\n".join("| " + " | ".join(str(cell) for cell in row) + " |" for row in (head, rule, *rows)) + "\n"

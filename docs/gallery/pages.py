@@ -7,21 +7,27 @@ from pathlib import Path
 from gallery import line_jitter_page, offset_page, threshold_page
 from gallery.page import Page, table
 
-INDEX = """# The handbook's experiments, made again
+INDEX = """# The handbook's experiments, repeated
 
-The chapter on image sensors of the [handbook](../conventions.md) shows with simulated experiments how a camera moves a target. These pages
-repeat the experiments, state all conditions, add pixmetry's estimators, and compare the numbers with those of the chapter.
+A handbook of camera calibration ([the handbook](../conventions.md)) shows in its chapter on image sensors, with simulated experiments, how
+a camera shifts the measured position of a target. These pages repeat the experiments, state all conditions, add pixmetry's estimators, and
+compare the numbers with those of the chapter.
 
 {pages}
-`make handbook` writes the numbers (`benchmarks/study_line_jitter.py` writes those of line jitter, which take minutes). They are the
-same each time, because every draw has its key. Positions and errors are in pixels. An error is found minus true. Grey values are those of
-8 bits.
+`make handbook` writes these pages. The experiment on line jitter takes minutes; `benchmarks/study_line_jitter.py` runs it and stores its
+numbers. All numbers are the same in every run, because the random numbers are keyed. Positions and errors are in pixels. An error is
+measured minus true. Grey values are those of 8 bits.
 """
 
 EXPERIMENTS = (
-    ("Note 8, Fig 3.10", "threshold", "Thresholds", "why a threshold spoils a centroid, and what to use instead"),
-    ("Note 13, Figs 3.13 to 3.17", "offset", "Black below zero", "why lines wander when the converter cuts off their feet"),
-    ("Note 19, Table 3.2", "line-jitter", "Line jitter", "whether the residuals of straight lines tell how steadily a grabber samples"),
+    ("Note 8, Fig 3.10", "threshold", "Thresholds", "why a hard threshold increases the error of a centroid, and what to use instead"),
+    (
+        "Note 13, Figs 3.13 to 3.17",
+        "offset",
+        "Black below zero",
+        "why lines have a periodic error when the converter cuts off values below black",
+    ),
+    ("Note 19, Table 3.2", "line-jitter", "Line jitter", "whether the residuals of straight lines show the jitter of a frame grabber"),
 )
 
 

@@ -38,20 +38,20 @@ def sweep_figure(both: tuple[Sweep, Sweep]) -> Figure:
         )
         caption = (
             "Error (root mean square of x and y over 800 targets) against the threshold. Red and blue keep the grey values above the "
-            "threshold as they are (hard threshold), amber takes the threshold from them (soft)."
+            "threshold as they are (hard threshold); amber subtracts the threshold from them (soft threshold)."
         )
         return Figure(figure, "threshold-sweep", alt, caption)
 
 
 def cause_figure(both: tuple[Sweep, Sweep]) -> Figure:
-    """The centroid's error with noise, without noise, and what is left of it in the mean of many frames."""
+    """The centroid's error with noise, without noise, and in the mean of many frames."""
     with canvas(4.1, nrows=2, sharex=True, sharey=True) as (figure, panels):
         for axes, found in zip(panels, both, strict=True):
             part = experiment.parts(found.target, "centroid")
             axes.plot(found.threshold_dn, found.noisy["centroid"].rms_px, color=RED, marker="o", markersize=2.6, label="with noise")
             quiet = found.quiet["centroid"].rms_px
             axes.plot(found.threshold_dn, quiet, color=INK, linestyle="--", label="without any noise")
-            axes.plot(found.threshold_dn, part.lasting_px, color=BLUE, linestyle="-.", label="with noise, mean of endless frames")
+            axes.plot(found.threshold_dn, part.lasting_px, color=BLUE, linestyle="-.", label="with noise, mean of infinitely many frames")
             axes.set_title(_title(found), loc="left")
             axes.set_ylabel("error, rms / px")
         panels[0].set_ylim(0, 0.14)
@@ -64,14 +64,14 @@ def cause_figure(both: tuple[Sweep, Sweep]) -> Figure:
             f"{_px(disc.noisy['centroid'].rms_px[-1])} px with noise and {_px(disc.quiet['centroid'].rms_px[-1])} px without."
         )
         caption = (
-            "The rise is there without any noise: from a threshold of 40 on the dashed line (no noise) nearly is the red one. What the "
-            "blue line shows does not go away however many frames are averaged."
+            "The error rises without any noise, too: from a threshold of 40 on, the dashed line (no noise) and the red line almost "
+            "coincide. The error of the blue line remains, however many frames are averaged."
         )
         return Figure(figure, "threshold-cause", alt, caption)
 
 
 def phase_figure(threshold_dn: float = 30.0) -> Figure:
-    """Error without noise against the place of the spot in its pixel."""
+    """Error without noise against the position of the spot in its pixel."""
     phase = np.linspace(-0.5, 0.5, 401)
     with canvas(2.5) as (figure, axes):
         for name, look in LINES.items():
@@ -79,18 +79,19 @@ def phase_figure(threshold_dn: float = 30.0) -> Figure:
             axes.plot(phase, experiment.against_phase(SPOT, name, threshold_dn, phase), color=look["color"], linestyle=dash, label=name)
         axes.axhline(0, color=SOFT, linewidth=0.8)
         axes.set_xlim(-0.5, 0.5)
-        axes.set_xlabel("true place of the spot in its pixel / px")
+        axes.set_xlabel("true position of the spot in its pixel / px")
         axes.set_ylabel("error in x / px")
         figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3)
         worst = float(np.abs(experiment.against_phase(SPOT, "centroid", threshold_dn, phase)).max())
         alt = (
-            f"Error against the place in the pixel at a threshold of {threshold_dn:g}: a saw with jumps, up to {_px(worst)} px, for "
+            f"Error against the position in the pixel at a threshold of {threshold_dn:g}: a sawtooth with jumps, up to {_px(worst)} px, "
+            "for "
             f"the centroid."
         )
         caption = (
-            f"Without noise and rounding, Gaussian spot, threshold {threshold_dn:g}: error in x against the place in the pixel (y: "
-            f"middle of a pixel). With a hard threshold each jump is a pixel that comes in or drops out with its whole grey "
-            "value; with a soft one it comes in at zero."
+            f"Without noise and rounding, Gaussian spot, threshold {threshold_dn:g}: error in x against the position in the pixel (y: "
+            f"middle of a pixel). With a hard threshold each jump is a pixel that enters or leaves the sum with its whole grey "
+            "value; with a soft threshold it enters at zero."
         )
         return Figure(figure, "threshold-phase", alt, caption)
 
@@ -123,7 +124,7 @@ def _first_up(text: str) -> str:
 
 
 def _claims(disc: Sweep, spot: Sweep) -> str:
-    """What the chapter says beside what was found."""
+    """The statements of the chapter, and the results here."""
     plain, square = disc.noisy["centroid"].rms_px, disc.noisy["squared centroid"].rms_px
     t = disc.threshold_dn
     plain_s, square_s = spot.noisy["centroid"].rms_px, spot.noisy["squared centroid"].rms_px
@@ -139,31 +140,31 @@ def _claims(disc: Sweep, spot: Sweep) -> str:
             f"{_px(plain[0])} against {_px(square[0])} px (disc), {_px(plain_s[0])} against {_px(square_s[0])} px (spot)",
         ],
         [
-            "above the background's noise both improve, the centroid more",
+            "above the noise of the background both improve, the centroid more",
             f"centroid {plain[0] / plain.min():.1f} times, squared {square[0] / square.min():.1f} times better at its best; "
             f"the centroid's best threshold is {low_t[0]} (disc) and {low_t[1]} (spot)",
         ],
         [
-            "from there on both rise",
+            "for higher thresholds both errors rise",
             "mean slopes from 60 to 100, in 0.001 px per grey value: centroid {:.2f} and {:.2f}, squared {:.2f} and {:.2f} (disc and "
-            "spot); in the trend, not from point to point".format(*(1e3 * slopes[j][0] for j in (0, 2, 1, 3))),
+            "spot); this is the trend, not true from point to point".format(*(1e3 * slopes[j][0] for j in (0, 2, 1, 3))),
         ],
         [
-            "because the target becomes smaller and holds less information",
+            "because the target becomes smaller and contains less information",
             f"no: the rise is the same without noise ({_px(quiet[-1])} px at 100, with noise {_px(plain[-1])} px), "
-            f"and the fit finds the same targets to {_px(experiment.fitted(DISC).rms_px)} px",
+            f"and the fit locates the same targets with an error of {_px(experiment.fitted(DISC).rms_px)} px",
         ],
         [
-            "a bias that swings with the place in the pixel",
-            "yes, and it is the main part; part of it shows as noise, because noise makes pixels near the threshold come and go: "
-            f"frame to frame, the disc's centroid scatters by {_px(random[5])} px at 25 and {_px(random[-1])} px at 100",
+            "a bias that depends on the position in the pixel",
+            "yes, and it is the main part. Part of it appears as noise, because noise lifts pixels near the threshold above or below it: "
+            f"from frame to frame the disc's centroid scatters by {_px(random[5])} px at 25 and {_px(random[-1])} px at 100",
         ],
         [
             "squared: less sensitive, but not at high thresholds on small targets",
             f"squared over plain: {square[12] / plain[12]:.2f} at 60 and {square[-1] / plain[-1]:.2f} at 100 (disc), "
             f"{square_s[12] / plain_s[12]:.2f} and {square_s[-1] / plain_s[-1]:.2f} (spot)",
         ],
-        ["set the threshold as low as possible", "right for a hard threshold above the noise; better, see below"],
+        ["set the threshold as low as possible", "right for a hard threshold above the noise; see below for better ways"],
     ]
     return table(["the chapter", "here"], rows, 2)
 
@@ -184,62 +185,65 @@ def page() -> Page:
     j20, j10 = (int(np.searchsorted(disc.threshold_dn, t)) for t in (20, 10))
     text = f"""# Thresholds (Note 8, Fig 3.10)
 
-To find the centre of a bright target one takes the centroid of its grey values. The background must not take part: each of its pixels
-pulls, and its noise pulls at random. So grey values up to a threshold are left out. How high should it be?
+The centre of a bright target can be measured as the centroid of its grey values. The background must not contribute: each of its
+pixels shifts the centroid, and its noise shifts it at random. Therefore grey values up to a threshold are left out. How high should the
+threshold be?
 
 ## The experiment
 
-{experiment.COUNT} equal targets, each within ±0.5 px of the middle of its own {experiment.SIDE} × {experiment.SIDE} pixels, x and y at
-random and evenly. Light is averaged over each pixel; noise is added, the value rounded to a whole number, and cut off at 0 and 255. Then,
-for each threshold T from 0 to 100 (a grey value, not a height above the background):
+There are {experiment.COUNT} equal targets, each in a window of {experiment.SIDE} × {experiment.SIDE} pixels. Their positions are
+uniformly distributed within ±0.5 px of the middle of the window, in x and in y. The light is averaged over each pixel. Noise is added,
+and the value is rounded to a whole number and limited to 0 … 255. Then, for each threshold T from 0 to 100 (a grey value, not a height
+above the background):
 
-- **hard threshold**: a grey value I counts as I where I > T, otherwise not at all. This is the chapter's;
-- **soft threshold**: it counts as I − T where I > T;
-- the **squared centroid** takes the squares of what is left.
+- **hard threshold** (as in the chapter): a grey value I counts as I if I > T, otherwise as 0;
+- **soft threshold**: it counts as I − T if I > T, otherwise as 0;
+- **squared centroid**: the squares of these values are used.
 
-The sum always runs over the whole {experiment.SIDE} × {experiment.SIDE} pixels. The chapter does not print the sizes of its target, noise
-or window, so two cases stand here: {DISC.describe()} (of the 8-bit scale); {SPOT.describe()}. The error is the root mean square of found
-less true, of x and y together. The **template fit** is pixmetry's own estimator: the disc (or spot), blurred and averaged over the
-pixels, is fitted by least squares to the grey values around what the detection has found; it is told the noise, where the scale ends and
-that the background is even, and has no threshold.
+The sum always runs over all {experiment.SIDE} × {experiment.SIDE} pixels. The chapter does not state the sizes of its target, noise and
+window, so two cases are shown: {DISC.describe()} (8-bit scale); {SPOT.describe()}. The error is the root mean square of measured minus
+true position, of x and y together. The **template fit** is pixmetry's own estimator. It fits the disc (or spot), blurred and averaged
+over the pixels, to the grey values around the detected target by least squares. It knows the noise, the ends of the grey scale, and that
+the background is uniform. It has no threshold.
 
-## What one sees
+## The result
 
 {show(pictures[0])}
 {_claims(disc, spot)}
-Why the rise, then? Run the same targets once more, and leave the noise out:
+Why does the error rise? The same targets without noise show it:
 
 {show(pictures[1])}
-A target shows only a few pixels along its rim at the height of the threshold. When the target moves by a fraction of a pixel, one of them
-passes the threshold on one side, and not yet its mate on the other; the centroid jumps. This is a property of the place in the pixel, not
-of the noise, and the same in every frame:
+Only a few pixels along the rim of a target have grey values near the threshold. When the target moves by a fraction of a pixel, one of
+these pixels crosses the threshold on one side, while the corresponding pixel on the other side does not: the centroid jumps. This error
+depends on the position in the pixel, not on the noise, and is the same in every frame:
 
 {show(pictures[2])}
-At the left end of the curves it is the window that counts, since without a threshold the whole background takes part:
+At the left end of the curves the size of the window matters, because without a threshold the whole background contributes:
 
 {_windows()}
-Noise of the many background pixels, and, where the background is not zero, its pull towards the middle of the window, both grow with the
-window. An error "without threshold" means little unless the window is told with it.
+Two effects grow with the window: the noise of the many background pixels, and, if the background is not zero, the shift towards the
+middle of the window. An error "without threshold" is meaningful only together with the size of the window.
 
 ## What to do about it
 
-- **Subtract the background, and the threshold too** (soft threshold), at about three standard deviations of the noise above the
-  background. At T = {disc.threshold_dn[j20]:.0f} the disc's centroid has {_px(disc.noisy["soft centroid"].rms_px[j20])} px in place of
-  {_px(disc.noisy["centroid"].rms_px[j20])} px, at T = {spot.threshold_dn[j10]:.0f} the spot's
-  {_px(spot.noisy["soft centroid"].rms_px[j10])} px in place of {_px(spot.noisy["centroid"].rms_px[j10])} px, and from there up to T = 50
-  it hardly matters where the threshold is.
-- **Or use no threshold: fit the target.** The template fit is at {on_disc.rms_px:.4f} px (disc) and {on_spot.rms_px:.4f} px (spot), and
-  says so itself: it states {on_disc.stated_px:.4f} px and {on_spot.stated_px:.4f} px. Without noise it is off by {on_disc.quiet_px:.4f}
-  px and {on_spot.quiet_px:.4f} px, from the rounding alone.
-- Averaging frames does not help against a threshold that is too high; moving the target does.
+- **Use a soft threshold**: subtract the background and the threshold. Set the threshold about three standard deviations of the noise above
+  the background. At T = {disc.threshold_dn[j20]:.0f} the error of the disc's centroid is then
+  {_px(disc.noisy["soft centroid"].rms_px[j20])} px instead of {_px(disc.noisy["centroid"].rms_px[j20])} px.
+  At T = {spot.threshold_dn[j10]:.0f} the error of the spot's centroid is
+  {_px(spot.noisy["soft centroid"].rms_px[j10])} px instead of {_px(spot.noisy["centroid"].rms_px[j10])} px. From there up to T = 50 the
+  choice of the threshold hardly matters.
+- **Or use no threshold: fit the target.** The error of the template fit is {on_disc.rms_px:.4f} px (disc) and {on_spot.rms_px:.4f} px
+  (spot). Its stated uncertainties agree: {on_disc.stated_px:.4f} px and {on_spot.stated_px:.4f} px. Without noise its error is
+  {on_disc.quiet_px:.4f} px and {on_spot.quiet_px:.4f} px, from the rounding alone.
+- If the threshold is too high, averaging frames does not help. Averaging over different positions of the target does.
 
 ## All numbers
 
-Root mean square errors in px; {experiment.SIDE} × {experiment.SIDE} px, {experiment.COUNT} targets. "No noise" is rounded to 8 bits like
-the rest.
+Root mean square errors in px; {experiment.SIDE} × {experiment.SIDE} px, {experiment.COUNT} targets. Values without noise are rounded to
+8 bits, like all others.
 
 {_curves(disc)}
 {_curves(spot)}
-Written by `scripts/make_handbook.py` from `gallery.threshold`; run again, it writes the same.
+Written by `scripts/make_handbook.py` from `gallery.threshold`; it writes the same numbers in every run.
 """
     return Page("threshold", text, pictures)
