@@ -21,7 +21,7 @@ from pixmetry.emva.job import measure_campaign
 from pixmetry.emva.planning.planning import Plan, camera_from_sheet, predicted_u
 from pixmetry.emva.planning.preflight import camera_from_preflight, preflight_campaign, preflight_text
 from pixmetry.files import load_campaign
-from pixmetry.files.staged_files import Output, check_files
+from pixmetry.files.output import Output, check_files
 
 SHAPE, GAIN, FULL_E, OFFSET = (48, 64), 0.25, 14000.0, 60.0
 QE = {"R": 0.3, "Gr": 0.5, "Gb": 0.48, "B": 0.2}

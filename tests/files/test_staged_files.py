@@ -13,7 +13,7 @@ import pytest
 
 from files.failing import FAULTS, Failing
 from pixmetry.core.errors import InputError
-from pixmetry.files.staged_files import Output, check_files, write_page, write_together
+from pixmetry.files.output import Output, check_files, write_page, write_together
 
 MARK = re.compile(rb"ours ")
 NAMES = ("a.json", "b.xml", "c.html")

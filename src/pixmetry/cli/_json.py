@@ -36,7 +36,7 @@ class JsonResult:
     """
 
     def __init__(self, file: Path | None, *schemas: str, inputs: Sequence[Path] = ()) -> None:
-        from pixmetry.files.staged_files import Output, check_files
+        from pixmetry.files.output import Output, check_files
 
         self.printed = str(file) == "-"
         self.schema, self.inputs = schemas[0], inputs
@@ -54,7 +54,7 @@ class JsonResult:
     def put_text(self, text: str) -> None:
         """The same with a record that is JSON already and begins with its schema."""
         from pixmetry.core.plain_text import json_shown
-        from pixmetry.files.staged_files import write_together
+        from pixmetry.files.output import write_together
 
         if self.printed:
             click.echo(json_shown(text.rstrip()))

@@ -21,7 +21,7 @@ def pdf_option() -> Callable[[Any], Any]:
 
 def check_pdf(file: Path | None, inputs: Sequence[Path] = ()) -> None:
     """Refuse a file that cannot be written or is none of ours, before the work."""
-    from pixmetry.files.staged_files import PDF_MARK, Output, check_files
+    from pixmetry.files.output import PDF_MARK, Output, check_files
 
     if file is not None:
         check_files([Output(file, PDF_MARK)], inputs)
@@ -29,7 +29,7 @@ def check_pdf(file: Path | None, inputs: Sequence[Path] = ()) -> None:
 
 def put_pdf(file: Path | None, page_of: Callable[[], Page]) -> None:
     """Write the page and say so, if it was asked for."""
-    from pixmetry.files.staged_files import write_page
+    from pixmetry.files.output import write_page
     from pixmetry.report import pdf_of
 
     if file is not None:

@@ -54,7 +54,7 @@ def chain(
     """
     from pixmetry.camera.camera import load_camera
     from pixmetry.camera.overrides import changed_camera, parse_overrides
-    from pixmetry.files.staged_files import Output, check_files, page_mark
+    from pixmetry.files.output import Output, check_files, page_mark
     from pixmetry.simulate.chain import chain as follow
     from pixmetry.simulate.page import TITLE, page_of, write_chain_page
 

@@ -6,10 +6,10 @@ Paths enter; campaigns and frames leave. Records and maps enter; a sealed result
 from pixmetry.files.images import FrameReader, iter_frames, read_frame, write_frame
 from pixmetry.files.in_memory import Frames, campaign_of_arrays
 from pixmetry.files.manifest import EXAMPLE, load_campaign, photons_from_irradiance, write_manifest
-from pixmetry.files.output import check_output, read_maps, staged_output, write_json, write_maps, write_record
+from pixmetry.files.output import check_output, staged_output, write_page
 from pixmetry.files.provenance import InputHashes, provenance_record
 from pixmetry.files.records import CameraFacts, Campaign, FrameGroup, OpticsFacts
-from pixmetry.files.staged_files import write_page
+from pixmetry.files.results import read_maps, write_json, write_maps, write_record
 
 __all__ = [
     "EXAMPLE",

@@ -1,10 +1,16 @@
-"""Results on disk: whole or not at all, strict JSON, one array store for maps."""
+"""The one writer of results. Its rule: they appear whole or not at all, and replace nothing but earlier results of the same kind.
+
+`write_together` writes files beside whatever else stands in their folders: how a file begins tells whether it is an earlier result.
+`staged_output` writes a folder of its own: a note in it tells what was written, and by its digests whether somebody changed it since.
+Both write under temporary names beside the wanted ones, swap when all is there, and put back what was there before if that fails.
+"""
 
 from __future__ import annotations
 
 import errno
 import hashlib
 import json
+import mmap
 import os
 import re
 import secrets
@@ -12,21 +18,232 @@ import shutil
 import socket
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from pixmetry.core.checksums import check_record, file_sha256, sealed
 from pixmetry.core.errors import InputError
-from pixmetry.files.strict_json import json_text, plain
+from pixmetry.files.strict_json import json_text
 
 MARKER = ".pixmetry-output.json"
 OUTPUT_SCHEMA = "pixmetry/output/2"
 _SYSTEM_FILES = {".DS_Store", "Thumbs.db", "desktop.ini"}  # file managers leave these in every folder that is looked at
 _SHOWN = 3
-_LONGEST = 100  # bytes of the wanted name that stand in the name of a temporary folder; most disks hold 255
+_LONGEST = 100  # bytes of the wanted name that stand in a temporary one; most disks hold 255
 OLD, MOVED = ".old", ".moved"  # the earlier result: the folder as it was, or its files one by one
+_HEAD = (
+    rb"\s*<!DOCTYPE html>\s*<html\b[^>]*>\s*<head>(?:(?!<style|</head>|<body).)*"
+    rb'<meta name="generator" content="pixmetry (?:(?!<style|</head>|<body).)*'
+)
+PDF_MARK = re.compile(rb"%PDF-1\.\d.*\n\d+ 0 obj\s*<< /Creator \(pixmetry\)", re.DOTALL)  # a PDF says at its end who made it
+
+
+@dataclass(frozen=True)
+class Output:
+    """Where a result file goes.
+
+    Parameters
+    ----------
+    path : Path
+    mark : re.Pattern
+        What every earlier result of its kind begins with: nothing else is replaced.
+    make_folder : bool
+        Whether its folder is made if it does not exist.
+    """
+
+    path: Path
+    mark: re.Pattern[bytes]
+    make_folder: bool = False
+
+
+def page_mark(page: str) -> re.Pattern[bytes]:
+    """The pattern of pages of pixmetry of one kind: those whose title ends as that of this one does."""
+    head = page.partition("</title>")[0]
+    kind = head[head.rfind("<title>") + len("<title>") :].rpartition(": ")[2]
+    return re.compile(_HEAD + re.escape(kind.encode()) + rb"</title>", re.DOTALL)
+
+
+def check_files(outputs: Sequence[Output], inputs: Iterable[Path] = ()) -> None:
+    """Refuse names under which result files cannot be written, or under which something would be lost.
+
+    Parameters
+    ----------
+    outputs : sequence of Output
+    inputs : iterable of Path
+        Files that must not be touched.
+
+    Raises
+    ------
+    InputError
+        If a name is given twice, is that of an input, a folder or another file, or its folder is missing or cannot be written to.
+    """
+    seen: set[Path] = set()
+    read: set[Path] = set()
+    if any(output.path.exists() for output in outputs):  # what is not there is no input
+        files = (path if path.exists() else path.parent for path in map(Path, inputs))  # a frame in a file: that file
+        read = {Path(os.path.realpath(file)) for file in files}
+    for output in outputs:
+        real = Path(os.path.realpath(output.path))
+        if real in seen:
+            raise InputError("one file for two results", where=str(output.path), remedy="give each its own name")
+        seen.add(real)
+        if real in read or any(_same(real, path) for path in read):
+            raise InputError("would overwrite an input", where=str(output.path), remedy="choose another name")
+        _check_one(real, output)
+
+
+def _same(one: Path, other: Path) -> bool:
+    """Whether two names are those of one file (hard links, upper and lower case)."""
+    try:
+        return os.path.samefile(one, other)
+    except OSError:
+        return False
+
+
+def _check_one(real: Path, output: Output) -> None:
+    folder, where = real.parent, str(output.path)
+    try:
+        if real.is_dir():
+            raise InputError("is a folder, not a file", where=where, remedy="name the file in it")
+        while output.make_folder and not folder.exists():
+            folder = folder.parent
+        if not folder.is_dir():
+            raise InputError("the folder does not exist", where=where, value=str(output.path.parent), remedy="make it, or choose another")
+        if not os.access(folder, os.W_OK | os.X_OK):
+            raise InputError("the folder cannot be written to", where=where, remedy="choose another")
+        if real.exists() and not (real.is_file() and _is_earlier(real, output.mark)):
+            raise InputError("file exists and is no result of this kind", where=where, remedy="choose another name")
+    except OSError as problem:
+        raise _unwritable(output.path, problem, "file", "place") from None
+
+
+def _is_earlier(path: Path, mark: re.Pattern[bytes]) -> bool:
+    """Whether a file begins as results of its kind do, or is empty."""
+    with path.open("rb") as file:
+        if not file.read(1):
+            return True
+        with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as raw:
+            return mark.match(raw) is not None
+
+
+def write_together(outputs: Sequence[Output], contents: Sequence[bytes], inputs: Iterable[Path] = ()) -> None:
+    """Write files so that all of them appear whole, or none.
+
+    Each is written under another name first; then all take their places. If one cannot, those that had taken theirs give way to the files
+    that were there before. A run that is killed between the first and the last of these steps can leave new files beside old ones, each
+    of them whole, and the old ones beside them under names that end in ``.old``.
+
+    Parameters
+    ----------
+    outputs : sequence of Output
+    contents : sequence of bytes
+        What goes into each.
+    inputs : iterable of Path
+        Files that must not be touched.
+
+    Raises
+    ------
+    InputError
+        As `check_files` does, or if the files cannot be written.
+    """
+    check_files(outputs, inputs)
+    steps = [_Step(Path(os.path.realpath(output.path))) for output in outputs]
+    try:
+        for output, step in zip(outputs, steps, strict=True):
+            if output.make_folder:
+                step.path.parent.mkdir(parents=True, exist_ok=True)
+        for step, raw in zip(steps, contents, strict=True):
+            step.prepare(raw)
+        for step in steps:
+            step.take_place()
+    except BaseException as problem:
+        for step in reversed(steps):
+            step.undo()
+        if isinstance(problem, OSError):
+            name, what = (outputs[0].path.parent, "files") if len(outputs) > 1 else (outputs[0].path, "file")
+            raise _unwritable(name, problem, what, "place") from None
+        raise
+    try:
+        for step in steps:
+            step.finish()
+    except BaseException:
+        for step in steps:
+            step.finish()
+        raise
+
+
+def replace_file(path: Path, raw: bytes) -> None:
+    """Write one file into a folder that is this run's own, so that it is never there in part."""
+    step = _Step(path)
+    try:
+        step.prepare(raw)
+        step.take_place()
+    except BaseException:
+        step.undo()
+        raise
+    step.finish()
+
+
+def write_page(path: str | Path, page: str | bytes) -> Path:
+    """Write one page, HTML or the bytes of a PDF, so that it appears whole or not at all.
+
+    Only an earlier HTML page of the same kind is ever replaced, or an earlier PDF of pixmetry.
+
+    Raises
+    ------
+    InputError
+        If there is something else of that name, or it cannot be written.
+    """
+    target = Path(path)
+    mark, raw = (page_mark(page), page.encode()) if isinstance(page, str) else (PDF_MARK, page)
+    write_together([Output(target, mark)], [raw])
+    return target
+
+
+class _Step:
+    """One file on its way: written under another name, put in its place, and taken back if another one fails.
+
+    What has been done is read off the disk, as an interruption may come right after it.
+    """
+
+    def __init__(self, path: Path) -> None:
+        name = f".{_stem(path)}.partial-{os.getpid()}-{secrets.token_hex(4)}"
+        self.path, self.partial, self.old = path, path.with_name(name), path.with_name(f"{name}.old")
+        self.earlier, self.prepared = path.exists(), False
+
+    def prepare(self, raw: bytes) -> None:
+        """Write the content, and keep the earlier file under a second name."""
+        with self.partial.open("xb") as file:
+            file.write(raw)
+            file.flush()
+            os.fsync(file.fileno())
+        if self.earlier:
+            shutil.copymode(self.path, self.partial)
+            try:
+                os.link(self.path, self.old)
+            except OSError:  # a file system without links
+                shutil.copy2(self.path, self.old)
+        self.prepared = True
+
+    def take_place(self) -> None:
+        os.replace(self.partial, self.path)
+
+    def undo(self) -> None:
+        """Put the earlier file back, or remove the new one where there was none."""
+        with suppress(OSError):  # the others are to be taken back all the same
+            if self.prepared and not self.partial.exists():
+                if self.earlier:
+                    os.replace(self.old, self.path)
+                else:
+                    self.path.unlink(missing_ok=True)
+            self.partial.unlink(missing_ok=True)
+            self.old.unlink(missing_ok=True)
+
+    def finish(self) -> None:
+        """Remove the earlier file."""
+        with suppress(OSError):
+            self.old.unlink(missing_ok=True)
 
 
 @contextmanager
@@ -75,7 +292,7 @@ def staged_output(directory: str | Path, kind: str, of: Sequence[str | Path] = (
         try:
             yield partial
             record = {"schema": OUTPUT_SCHEMA, "kind": kind, "of": _names(of), "job": _job(target, of)}
-            write_json(partial / MARKER, sealed(record, partial, _files(partial)))
+            replace_file(partial / MARKER, json_text(sealed(record, partial, files_in(partial))).encode())
             check_output(directory, kind, of, inputs, own=partial)  # somebody may have put a file there in the meantime
             _swap(partial, target)
         finally:
@@ -127,7 +344,7 @@ def _check_earlier(target: Path, where: str, kind: str) -> dict[str, Any] | None
         raise InputError("is a file, not a folder", where=where, remedy="choose another folder for the results")
     marker = _marker(target)
     written = {} if marker is None else marker["checksums"]["files"]
-    foreign = [name for name in _files(target) if name not in written and (name != MARKER or marker is None)]
+    foreign = [name for name in files_in(target) if name not in written and (name != MARKER or marker is None)]
     if marker is not None and marker["kind"] != kind:
         there = marker["kind"]
         raise InputError(f"folder holds the result of another command ({there})", where=where, remedy="choose another folder")
@@ -167,17 +384,17 @@ def _probe(target: Path) -> None:
     probe.rmdir()
 
 
-def _unwritable(directory: str | Path, problem: OSError) -> InputError:
-    remedies = {errno.ENAMETOOLONG: "choose a shorter name", errno.ENOSPC: "make room, or choose another folder"}
-    remedy = remedies.get(problem.errno or 0, "choose another folder")
-    return InputError("folder cannot be written", where=str(directory), value=problem.strerror, remedy=remedy)
+def _unwritable(where: str | Path, problem: OSError, what: str = "folder", place: str = "folder") -> InputError:
+    remedies = {errno.ENAMETOOLONG: "choose a shorter name", errno.ENOSPC: f"make room, or choose another {place}"}
+    remedy = remedies.get(problem.errno or 0, f"choose another {place}")
+    return InputError(f"{what} cannot be written", where=str(where), value=problem.strerror, remedy=remedy)
 
 
 def _few(names: Sequence[str]) -> str:
     return ", ".join(names[:_SHOWN]) + (", ..." if len(names) > _SHOWN else "")
 
 
-def _files(folder: Path) -> list[str]:
+def files_in(folder: Path) -> list[str]:
     """Names of all files in a folder and below, with slashes, and of links; what file managers leave is not named."""
     own = re.compile(_form(folder))
     found = []
@@ -257,7 +474,7 @@ def _move_in(partial: Path, target: Path, moved: Path) -> None:
     """Swap the files of two folders, all or none; the note of what was written is the first to go and the last to come."""
     marker = _marker(target)
     earlier = [] if marker is None else [MARKER, *(name for name in marker["checksums"]["files"] if os.path.lexists(target / name))]
-    new = [*(name for name in _files(partial) if name != MARKER), MARKER]
+    new = [*(name for name in files_in(partial) if name != MARKER), MARKER]
     try:
         moved.mkdir()
         _move(earlier, target, moved)
@@ -285,7 +502,7 @@ def _move_back(partial: Path, target: Path, moved: Path) -> None:
                 os.unlink(target / name)
         _remove_empty(target, new)
         if moved.exists():
-            _move(sorted(_files(moved), key=MARKER.__eq__), moved, target)
+            _move(sorted(files_in(moved), key=MARKER.__eq__), moved, target)
     shutil.rmtree(moved, ignore_errors=True)
 
 
@@ -302,7 +519,7 @@ def _host() -> str:
 
 
 def _stem(target: Path) -> str:
-    """How the name of a temporary folder begins: the wanted name, shortened where the disk would not hold it."""
+    """How a temporary name begins: the wanted name, shortened where the disk would not hold it."""
     raw = os.fsencode(target.name)
     return target.name if len(raw) <= _LONGEST else f"{target.name[:20]}-{hashlib.sha256(raw).hexdigest()[:16]}"
 
@@ -382,124 +599,3 @@ def _runs(pid: int) -> bool:
     except PermissionError:
         return True
     return True
-
-
-def write_json(path: str | Path, obj: Any) -> None:
-    """Write strict JSON (RFC 8259) as `pixmetry.files.strict_json` makes it: NaN is ``null``, an infinite number ``"inf"``.
-
-    Parameters
-    ----------
-    path : str or Path
-        Replaced at once when the text is complete.
-    obj : mapping, list or plain value
-
-    Raises
-    ------
-    TypeError
-        If a value has no JSON form; the message names its place.
-    """
-    text = json_text(obj)
-    path = Path(path)
-    partial = path.with_name(f"{path.name}.partial-{os.getpid()}")
-    try:
-        partial.write_text(text, encoding="utf-8", newline="\n")
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
-
-
-def write_record(path: str | Path, record: Mapping[str, Any]) -> None:
-    """Write the main record of a result as strict JSON, last of all: with the digests of itself and of all files in its folder.
-
-    Parameters
-    ----------
-    path : str or Path
-    record : mapping
-        As of `write_json`, which tells the errors.
-    """
-    path = Path(path)
-    write_json(path, sealed(plain(record), path.parent, [name for name in _files(path.parent) if name != path.name]))
-
-
-def write_maps(path: str | Path, maps: Mapping[str, np.ndarray], attrs: Mapping[str, Any]) -> None:
-    """Write arrays into one Zarr v3 store: a zip file if the name ends in ``.zip``, else a folder.
-
-    Parameters
-    ----------
-    path : str or Path
-        E.g. ``maps.zarr.zip``. An existing store is replaced.
-    maps : mapping of str to ndarray
-        Numeric arrays; the name carries the unit (``prnu_map_percent``). NaN is allowed.
-    attrs : mapping
-        What `write_json` accepts.
-
-    Raises
-    ------
-    TypeError
-        If an attribute has no JSON form.
-    """
-    import zarr
-    from zarr.codecs import BloscCodec
-    from zarr.storage import LocalStore, ZipStore
-
-    path = Path(path)
-    arrays = {name: np.asarray(array) for name, array in maps.items()}
-    digests = {name: _digest(array) for name, array in arrays.items()}
-    store = ZipStore(path, mode="w") if path.suffix == ".zip" else LocalStore(path)
-    try:
-        attributes = sealed({"attributes": plain(attrs), "arrays": digests})
-        group = zarr.create_group(store, zarr_format=3, overwrite=path.suffix != ".zip", attributes=attributes)
-        for name, array in arrays.items():
-            codec = BloscCodec(cname="zstd", clevel=5, shuffle="bitshuffle", typesize=array.dtype.itemsize)
-            group.create_array(name, data=array, chunks=array.shape if array.nbytes < 1 << 24 else "auto", compressors=[codec])
-    finally:
-        store.close()
-
-
-def _digest(array: np.ndarray) -> str:
-    """SHA-256 of an array: its shape, the kind of its numbers, and their values, low byte first."""
-    kind = array.dtype.newbyteorder("<")
-    head = json.dumps([list(array.shape), kind.str]).encode()
-    return hashlib.sha256(head + np.ascontiguousarray(array, kind).tobytes()).hexdigest()
-
-
-def read_maps(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Read what `write_maps` wrote.
-
-    Returns
-    -------
-    tuple
-        The arrays by name, and the attributes.
-
-    Raises
-    ------
-    InputError
-        If there is no such store, or if it is damaged: an array or a part of one that is missing would be read as zeros.
-    """
-    import zarr
-    from zarr.storage import LocalStore, ZipStore
-
-    path = Path(path)
-    if not path.exists():
-        raise InputError("no such store of maps", where=str(path), remedy="check the name")
-    store: Any = None
-    try:
-        store = ZipStore(path, mode="r") if path.suffix == ".zip" else LocalStore(path, read_only=True)
-        group: Any = zarr.open_group(store, mode="r", zarr_format=3)
-        record: dict[str, Any] = dict(group.attrs)
-        check_record(record, str(path))
-        digests, attributes = dict(record["arrays"]), dict(record["attributes"])
-        arrays = {name: np.asarray(group[name][...]) for name in sorted(digests)}
-        damaged = [name for name, array in arrays.items() if _digest(array) != digests[name]]
-    except Exception as problem:  # the store, its zip file and every codec have their own, and all of them mean that it is damaged
-        reason = problem.what if isinstance(problem, InputError) else type(problem).__name__
-        raise InputError(f"not a store of maps, or damaged ({reason})", where=str(path), remedy="make the result again") from None
-    finally:
-        if store is not None:
-            with suppress(AttributeError):  # a file that is no zip file was never opened
-                store.close()
-    if damaged:
-        raise InputError(
-            f"damaged: the map '{damaged[0]}' has changed since it was written", where=str(path), remedy="make the result again"
-        )
-    return arrays, attributes

@@ -14,9 +14,8 @@ from pixmetry.core.progress import Progress, no_progress
 from pixmetry.core.threads import imap_tiles
 from pixmetry.files.formats import frame_name, raw_file
 from pixmetry.files.images import PICTURE_ENDINGS, load_picture, picture_files
-from pixmetry.files.output import own_files
+from pixmetry.files.output import Output, check_files, own_files, write_together
 from pixmetry.files.raw_values import RawLayout, layout_of
-from pixmetry.files.staged_files import Output, check_files, write_together
 from pixmetry.locate.job import locate
 from pixmetry.locate.noise import NoiseModel, noise_model
 from pixmetry.locate.records import Located, checked_table_name, joined

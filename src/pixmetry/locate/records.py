@@ -15,7 +15,7 @@ import numpy as np
 from pixmetry.core.errors import InputError
 from pixmetry.core.extras import import_extra
 from pixmetry.core.plain_text import cell, comment
-from pixmetry.files.staged_files import Output, check_files, write_together
+from pixmetry.files.output import Output, check_files, write_together
 from pixmetry.files.strict_json import json_text
 from pixmetry.locate.detect.targets import Flag
 

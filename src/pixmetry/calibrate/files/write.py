@@ -23,8 +23,7 @@ from pixmetry.calibrate.tables import point_columns, pose_columns, residual_colu
 from pixmetry.camera.camera import Camera
 from pixmetry.core.errors import InputError
 from pixmetry.core.plain_text import cell, comment
-from pixmetry.files.output import check_output, staged_output
-from pixmetry.files.staged_files import Output, check_files, write_together
+from pixmetry.files.output import Output, check_files, check_output, staged_output, write_together
 
 KIND = "calibration"
 COLMAP_KINDS = ("PINHOLE", "OPENCV", "FULL_OPENCV")  # of COLMAP, the simplest that loses nothing is taken

@@ -9,7 +9,7 @@ from pathlib import Path
 from pixmetry.core.checksums import check_record
 from pixmetry.emva.files.json_format import WHAT_TO_NAME, is_xml, read_bytes, sheet_json, sheet_of_record
 from pixmetry.emva.records import DataSheet
-from pixmetry.files.staged_files import PDF_MARK, Output, check_files, write_together
+from pixmetry.files.output import PDF_MARK, Output, check_files, write_together
 from pixmetry.files.strict_json import parse_json
 
 # How a file of each kind begins, so that nothing else is ever replaced.
