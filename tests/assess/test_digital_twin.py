@@ -249,3 +249,13 @@ def test_what_is_not_significant_is_not_simulated(both) -> None:
     weak = replace(estimates, values=np.where(np.arange(len(estimates)) == i, estimates.u[i], estimates.values))
     assert best_values(source, weak)["gradient_x_per_px"] == 0
     assert best_values(source, estimates)["gradient_y_per_px"] == pytest.approx(2e-4, rel=0.2)
+
+
+def test_what_is_in_a_twin_without_being_measured_is_typical(seed: int) -> None:
+    """Without photons the quantum efficiency is set to 1: no description of the camera, and nothing that was measured."""
+    frames, light = campaign(photons=False)
+    _, twin = assessed(seed, camera(seed), frames, light)
+    known = {e.name: e.known_from for e in twin.chain}
+    assert known["sensor.quantum_efficiency"] == "typical" and "sensor.quantum_efficiency" not in twin.estimates
+    assert known["sensor.prnu"] == "measured" and known["sensor.shot_noise"] == ""
+    assert twin["electronics.amplifier_noise"].params.white_e != twin.estimates["electronics.amplifier_noise"]["white_e"].value

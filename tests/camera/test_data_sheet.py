@@ -284,7 +284,9 @@ def test_the_distortion_is_that_at_the_corner_of_the_frame() -> None:
         ({"lens": {"f_number": 16, "mtf": [[100, 0.9]]}}, "better than diffraction at f/16.*up to 0.0"),
         ({"lens": {"mtf": [[100, 1.2]]}}, "an MTF that cannot be"),
         ({"lens": {"mtf": []}}, "an MTF that cannot be"),
-        ({"lens": {"mtf": "good"}}, "mtf"),
+        ({"lens": {"mtf": "good"}}, "lens.mtf: an MTF of no known form.*diffraction-limited.*pairs.*Nyquist"),
+        ({"lens": {"mtf": [50, 0.6]}}, "an MTF of no known form"),
+        ({"lens": {"mtf": {50: 0.6}}}, "an MTF of no known form"),
         ({"lens": {"f_number": 0.2}}, "f_number.*greater than or equal to 0.7"),
         ({"lens": {"distortion_rel": 0.9}}, "lens.distortion_rel.*too strong.*corner"),
     ],
@@ -302,6 +304,9 @@ def test_the_line_of_the_mistake_is_named(tmp_path: Path) -> None:
         load_camera(path)
     path.write_text(path.read_text().replace("two", "2.0"), encoding="utf-8")
     assert load_camera(path).name == "mine"
+    path.write_text(path.read_text().replace("data_sheet/1", "emva1288/1"), encoding="utf-8")
+    with pytest.raises(InputError, match=r"mine.yaml, line 1: a file of another kind.*pixmetry/camera/1, pixmetry/data_sheet/1"):
+        load_camera(path)
 
 
 # ---- the sheets that come along ----------------------------------------------------------------------------------------------------

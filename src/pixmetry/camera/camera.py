@@ -26,7 +26,7 @@ from pixmetry.core.number import Estimates
 from pixmetry.core.random import Grid, QuietStreams, Streams
 from pixmetry.core.threads import imap_tiles, map_tiles
 
-SCHEMA = "pixmetry/camera/1"
+SCHEMA, SHEET_SCHEMA = "pixmetry/camera/1", "pixmetry/data_sheet/1"
 BATCH_PIXELS = 1 << 18  # of the small windows that are run as one batch: enough that the calls cost little beside the work
 
 
@@ -682,7 +682,12 @@ def load_camera(path: str | Path) -> Camera:
     else:
         check_file(path)
     record = load_yaml(path)
-    if str(record.get("schema", "")).startswith("pixmetry/data_sheet/"):
+    if record.get("schema", SCHEMA) not in (SCHEMA, SHEET_SCHEMA):
+        where = f"{path}, line {record.lines[('schema',)]}"
+        remedy = "name a camera file, a data-sheet file, or a preset"
+        allowed = f"{SCHEMA}, {SHEET_SCHEMA}"
+        raise InputError("a file of another kind", where=where, value=record["schema"], allowed=allowed, remedy=remedy)
+    if record.get("schema") == SHEET_SCHEMA:
         from pixmetry.camera.data_sheet import camera_of_data_sheet
 
         camera = camera_of_data_sheet(record, str(path))

@@ -12,10 +12,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from statistics import NormalDist
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from pixmetry.camera.camera import Camera
 from pixmetry.camera.catalogue import get_source
@@ -25,13 +25,14 @@ from pixmetry.core.config import Model, validate
 from pixmetry.core.errors import InputError
 from pixmetry.core.number import Estimates, Number
 
-SCHEMA = "pixmetry/data_sheet/1"
 SATURATED_SHARE = 0.002  # of the pixels, at the brightest level that counts as not saturated (EMVA 1288 R4.0 §6.6)
 LINEAR_RANGE = (0.05, 0.95)  # of saturation, over which the linearity error is taken (EMVA 1288 R4.0 §6.7)
 BLACK_STD = 5.0  # standard deviations of the dark signal by which black is lifted where the sheet does not say
 MTF_ROUNDING = 0.02  # by which a stated MTF may lie above diffraction's before it is taken for a mistake
 SNR_ROUNDING_DB = 1.0  # by which a stated SNR may differ from the root of the capacity
 BLUR = "lens blur"  # the name in the chain of what the lens spreads beside diffraction
+
+LIMITED: Final = "diffraction-limited"
 
 Mtf = tuple[tuple[float, float], ...]
 
@@ -44,6 +45,15 @@ class LensRecord(Model):
     wavelength_nm: float | None = Field(default=None, ge=100, le=2000)
     mtf: Literal["diffraction-limited"] | float | list[tuple[float, float]] | None = None
     distortion_rel: float | None = Field(default=None, gt=-0.5, le=1)
+
+    @field_validator("mtf", mode="before")
+    @classmethod
+    def _has_a_form(cls, data: Any) -> Any:
+        pairs = isinstance(data, list | tuple) and all(isinstance(p, list | tuple) and len(p) == 2 for p in data)
+        if data is None or data == LIMITED or pairs or (isinstance(data, int | float) and not isinstance(data, bool)):
+            return data
+        allowed = f"{LIMITED}; pairs of line pairs per mm and MTF, such as [[50, 0.6], [100, 0.3]]; or one MTF at the Nyquist frequency"
+        raise InputError("an MTF of no known form", value=data, allowed=allowed)
 
 
 class DataSheetRecord(Model):
@@ -357,6 +367,11 @@ def build_sheet_camera(
         What the elements say that hold one of the numbers.
     where : str
         For messages.
+
+    Raises
+    ------
+    InputError, ChainError
+        If the numbers make no camera.
     """
     parts = [*_lens_parts(sheet, numbers, pitch_um, where), *_time_parts(sheet, numbers), *_pixel_parts(sheet, numbers)]
     parts += _signal_parts(sheet, numbers, where)
@@ -400,7 +415,10 @@ def _stated(sheet: DataSheetRecord, where: str) -> dict[str, Number]:
     for name, u in sheet.u.items():
         if name not in stated:
             allowed = ", ".join(stated) or "none: it states none"
-            raise InputError(f"an uncertainty of {name!r}, which the sheet does not state", where=f"{where}, u", allowed=allowed)
+            remedy = f"state {name}, or delete its uncertainty"
+            raise InputError(
+                f"an uncertainty of {name!r}, which the sheet does not state", where=f"{where}, u", allowed=allowed, remedy=remedy
+            )
         if not u >= 0:
             raise InputError(f"the uncertainty of {name} cannot be used", where=f"{where}, u", value=u, allowed="0 or more")
     units = UNITS | OF_THE_LENS
@@ -489,11 +507,11 @@ def _lens_parts(sheet: DataSheetRecord, numbers: Mapping[str, Number], pitch_um:
         spread = {"model": "diffraction", "wavelength_nm": wavelength, "reach_px": min(max(4.0, math.ceil(spot_px) + 2.0), 12.0)}
         spread |= {"sigma_px": 0.0, "pitch_x_um": pitch_um[0], "pitch_y_um": pitch_um[1]}
         parts.append(Part(source, spread, {"f_number": numbers["f_number"]}, where="lens.f_number"))
-    elif lens.mtf == "diffraction-limited":
+    elif lens.mtf == LIMITED:
         raise InputError("'lens.f_number' is missing", where=where, remedy="add `f_number: ...`: diffraction depends on it")
     if lens.mtf is None:
         parts.append(Part(source, {}, {}, BLUR))
-    elif lens.mtf != "diffraction-limited":
+    elif lens.mtf != LIMITED:
         nyquist = 500 / pixel_um  # line pairs per mm
         points = ((nyquist, lens.mtf),) if isinstance(lens.mtf, float | int) else tuple(lens.mtf)
         blur = blur_of_mtf(points, numbers["mtf"].u, lens.f_number, wavelength, f"{where}, lens.mtf")

@@ -6,8 +6,8 @@ import math
 from dataclasses import replace
 from typing import Any
 
-from pixmetry.camera.camera import Camera
-from pixmetry.camera.data_sheet import SCHEMA, UNITS, DataSheetRecord, build_sheet_camera
+from pixmetry.camera.camera import SHEET_SCHEMA, Camera
+from pixmetry.camera.data_sheet import UNITS, DataSheetRecord, build_sheet_camera
 from pixmetry.camera.provenance import MEASURED
 from pixmetry.core.config import validate
 from pixmetry.core.errors import InputError
@@ -81,7 +81,7 @@ def camera_of_sheet(sheet: DataSheet, channel: str = "") -> Camera:
     if isinstance(exposure, int | float) and exposure > 0:
         head["exposure_s"] = exposure
     said = f"EMVA 1288 Release {results.release}" if results.release else "EMVA 1288"
-    record = {"schema": SCHEMA, "name": name, "source": f"measured by {said}"} | head
+    record = {"schema": SHEET_SCHEMA, "name": name, "source": f"measured by {said}"} | head
     x, y = about.get("pitch_x_um"), about.get("pitch_y_um")
     pitch = None if x is None else (float(x), float(x if y is None else y))
     return build_sheet_camera(validate(DataSheetRecord, record, name), _numbers(results), pitch, MEASURED, name)
