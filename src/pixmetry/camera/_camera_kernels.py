@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from pixmetry.core.arrays import Array, Ints
 from pixmetry.core.jit import jit
 
 
 @jit
-def cut_windows(frame, row0, col0, rows, cols):
+def cut_windows(frame: np.ndarray, row0: Ints, col0: Ints, rows: int, cols: int) -> np.ndarray:
     """Return the windows of ``rows`` × ``cols`` pixels whose first pixels are given, shape (n, rows, cols)."""
     out = np.empty((len(row0), rows, cols), frame.dtype)
     for i in range(len(row0)):
@@ -20,7 +21,7 @@ def cut_windows(frame, row0, col0, rows, cols):
 
 
 @jit
-def decimate(fine, mask, step, rows, cols):
+def decimate(fine: Array, mask: Array, step: int, rows: int, cols: int) -> Array:
     """Return the sums of ``fine`` under the mask at every ``step``-th cell, shape (n, rows, cols).
 
     Every row of ``fine`` is split into its ``step`` phases, in which the cells that neighbouring sums take lie side by side.
@@ -43,7 +44,7 @@ def decimate(fine, mask, step, rows, cols):
 
 
 @jit
-def _add_taps(out, phases, first, weights):
+def _add_taps(out: Array, phases: Array, first: int, weights: Array) -> None:
     """Add to every sum one cell of each phase, the ``first`` of them to sum 0."""
     end = first + len(out)
     if len(weights) == 4:  # side by side, so that the sums are loaded and stored once for all four

@@ -4,11 +4,24 @@ from __future__ import annotations
 
 import numpy as np
 
+from pixmetry.core.arrays import Array, Flags, Ints, Singles
 from pixmetry.core.jit import jit
 
 
 @jit
-def read_line(data, first, black, step, table, delays, amplitudes, at, late, length, out):
+def read_line(
+    data: Singles,
+    first: Ints,
+    black: float,
+    step: Array,
+    table: Array,
+    delays: Array,
+    amplitudes: Array,
+    at: Array,
+    late: Array,
+    length: int,
+    out: Singles,
+) -> None:
     """Read every row of a staircase at some times, into ``out``.
 
     Parameters
@@ -76,7 +89,7 @@ def read_line(data, first, black, step, table, delays, amplitudes, at, late, len
 
 
 @jit
-def sum_echoes(level, place, even, amplitudes, black, out):
+def sum_echoes(level: Array, place: Ints, even: Flags, amplitudes: Array, black: float, out: Singles) -> None:
     """Write the sum of levels through all paths, for a line without filters."""
     sums = np.zeros(len(out))
     for e in range(len(place)):
@@ -92,7 +105,7 @@ def sum_echoes(level, place, even, amplitudes, black, out):
 
 
 @jit
-def moving_sum(white, weights, stride, out):
+def moving_sum(white: Array, weights: Array, stride: int, out: Array) -> None:
     """Σ_k weights[k] white[i, r + stride (m − 1 − k)] for every row r, always in the same order of adding; float64 in, (n, rows) out."""
     m = len(weights)
     for i in range(out.shape[0]):

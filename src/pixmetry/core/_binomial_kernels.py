@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pixmetry.core._random_kernels import (
     _K0,
@@ -28,6 +29,7 @@ from pixmetry.core._random_kernels import (
     _normal_quantile,
     philox4x32,
 )  # fmt: skip
+from pixmetry.core.arrays import Array, Ints, Singles
 from pixmetry.core.jit import jit
 
 _32, _16, _LOW = np.uint64(32), np.uint64(16), np.uint64(0xFFFFFFFF)
@@ -39,7 +41,7 @@ _INVERSE = 1.0 / np.arange(1, 64)
 
 
 @jit
-def normals_of(words, count, out):
+def normals_of(words: NDArray[np.uint32], count: int, out: Singles) -> None:
     """Write standard normal quantiles at u = (word + 1/2) 2^-32, float32; error below 1e-6, beyond 5.1 by `_normal_quantile`."""
     for i in range(count):
         word = words[i]
@@ -60,7 +62,7 @@ def normals_of(words, count, out):
 
 
 @jit
-def binomial(n, p, log_stay, u, z):
+def binomial(n: float, p: float, log_stay: float, u: float, z: float) -> float:
     """Smallest k with P(K <= k) >= u for a binomial K of n trials (a whole number, float64); z is the normal quantile at u.
 
     ``log_stay`` is log(1 − p). Below a mean of 12 by adding up probabilities, to 1e-12; above by the expansion of the quantile in powers of
@@ -76,7 +78,7 @@ def binomial(n, p, log_stay, u, z):
 
 
 @jit
-def fewer(n, p, log_stay, u, z):
+def fewer(n: float, p: float, log_stay: float, u: float, z: float) -> float:
     """The same for p of at most 1/2."""
     mean = n * p
     if mean < EXPANDED:
@@ -95,13 +97,13 @@ def fewer(n, p, log_stay, u, z):
 
 
 @jit
-def layer(frame, draw):
+def layer(frame: int, draw: int) -> int:
     """A frame number that stands for one of several draws of the same place; frames up to 2^48, draws up to 2^15."""
     return frame | (draw << 48)
 
 
 @jit
-def place_words(key, frame, row, block, words):
+def place_words(key: np.uint64, frame: int, row: int, block: int, words: NDArray[np.uint32]) -> None:
     """Write the four words of one block to ``words[0:4]``."""
     f = np.uint64(frame)
     w0, w1, w2, w3 = philox4x32(np.uint64(block) & _LOW, np.uint64(row) & _LOW, f & _LOW, f >> _32, key & _LOW, key >> _32)
@@ -109,7 +111,7 @@ def place_words(key, frame, row, block, words):
 
 
 @jit
-def normal_of_place(key, frame, row, col, words, normal):
+def normal_of_place(key: np.uint64, frame: int, row: int, col: int, words: NDArray[np.uint32], normal: Singles) -> tuple[float, float]:
     """The uniform number and its normal quantile that `normals_of_row` gives to one pixel; ``words`` and ``normal`` are room for four."""
     place_words(key, frame, row, col >> 2, words)
     normals_of(words, 4, normal)
@@ -117,7 +119,7 @@ def normal_of_place(key, frame, row, col, words, normal):
 
 
 @jit
-def normals_of_row(key, frame, row, col0, u, z):
+def normals_of_row(key: np.uint64, frame: int, row: int, col0: int, u: Array, z: Singles) -> None:
     """Write a uniform number (float64) and its normal quantile (float32) for every pixel of a row; four neighbours share a block."""
     cols = len(u)
     words, flat = np.empty(4 * CHUNK, np.uint32), np.empty(4 * CHUNK, np.uint32)
@@ -137,7 +139,7 @@ def normals_of_row(key, frame, row, col0, u, z):
 
 
 @jit
-def binomial_windows(key, frame, row0, col0, count, share, out):
+def binomial_windows(key: np.uint64, frame: Ints, row0: Ints, col0: Ints, count: Singles, share: Array, out: Singles) -> None:
     """Write binomial numbers for windows of absolute pixels.
 
     key : uint64; frame, row0, col0 : int64 (n,); count, out : float32 (n, rows, cols); share : float64 (n or 1, rows or 1, cols or 1). Of a

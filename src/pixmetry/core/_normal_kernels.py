@@ -30,7 +30,7 @@ def cdf(z: float) -> float:
     j = int(at)
     f = at - j
     rise = CDF[j + 1] - CDF[j]
-    return CDF[j] + f * rise + f * (1.0 - f) * ((1.0 - f) * (PDF[j] - rise) - f * (PDF[j + 1] - rise))
+    return float(CDF[j] + f * rise + f * (1.0 - f) * ((1.0 - f) * (PDF[j] - rise) - f * (PDF[j + 1] - rise)))
 
 
 @jit
@@ -68,7 +68,7 @@ def ramp(z: float) -> float:
     j = int(at)
     f = at - j
     rise = RAMP[j + 1] - RAMP[j]
-    return RAMP[j] + f * rise + f * (1.0 - f) * ((1.0 - f) * (CDF[j] / PER - rise) - f * (CDF[j + 1] / PER - rise))
+    return float(RAMP[j] + f * rise + f * (1.0 - f) * ((1.0 - f) * (CDF[j] / PER - rise) - f * (CDF[j + 1] / PER - rise)))
 
 
 @jit

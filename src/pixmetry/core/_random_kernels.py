@@ -9,7 +9,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
+from pixmetry.core.arrays import Ints, Singles
 from pixmetry.core.jit import jit
 
 CHUNK = 512  # Philox blocks worked on at a time: the scratch stays in the first-level cache
@@ -21,7 +23,9 @@ _W0, _W1 = np.uint64(0x9E3779B9), np.uint64(0xBB67AE85)
 
 
 @jit(forceinline=True)
-def _round(c0, c1, c2, c3, k0, k1):
+def _round(
+    c0: np.uint64, c1: np.uint64, c2: np.uint64, c3: np.uint64, k0: np.uint64, k1: np.uint64
+) -> tuple[np.uint64, np.uint64, np.uint64, np.uint64]:
     """One round on 32-bit words held in uint64. High halves of c1 and c3 may hold rubbish; it is masked before it matters."""
     p0 = _M0 * c0
     p1 = _M1 * c2
@@ -29,7 +33,9 @@ def _round(c0, c1, c2, c3, k0, k1):
 
 
 @jit(forceinline=True)
-def philox4x32(c0, c1, c2, c3, k0, k1):
+def philox4x32(
+    c0: np.uint64, c1: np.uint64, c2: np.uint64, c3: np.uint64, k0: np.uint64, k1: np.uint64
+) -> tuple[np.uint64, np.uint64, np.uint64, np.uint64]:
     """Philox4x32-10 of Salmon et al. (2011), "Parallel random numbers: as easy as 1, 2, 3"; 32-bit words held in uint64."""
     c0, c1, c2, c3 = _round(c0, c1, c2, c3, k0, k1)
     c0, c1, c2, c3 = _round(c0, c1, c2, c3, (k0 + _W0) & _LOW, (k1 + _W1) & _LOW)
@@ -44,7 +50,7 @@ def philox4x32(c0, c1, c2, c3, k0, k1):
 
 
 @jit
-def _fill_blocks(words, key, frame, row, rows, block, blocks):
+def _fill_blocks(words: NDArray[np.uint32], key: np.uint64, frame: int, row: int, rows: int, block: int, blocks: int) -> None:
     """Write the four output words of `rows` x `blocks` neighbouring blocks to ``words[0..3]``."""
     for r in range(rows):
         for b in range(blocks):
@@ -72,7 +78,7 @@ _L6, _L7, _L8 = np.float32(1.1676998740e-1), np.float32(-1.1514610310e-1), np.fl
 
 
 @jit(forceinline=True)
-def _log(u):
+def _log(u: np.float32) -> np.float32:
     """Natural logarithm of a positive normal float32."""
     bits = np.float32(u).view(np.uint32)
     m = np.uint32((bits & _MANTISSA) | _ONE_BITS).view(np.float32)
@@ -97,7 +103,7 @@ _C1, _C2, _C3 = np.float32(4.166664568298827e-2), np.float32(-1.388731625493765e
 
 
 @jit(forceinline=True)
-def _normal_pair(a, b):
+def _normal_pair(a: np.uint32, b: np.uint32) -> tuple[np.float32, np.float32]:
     """Box and Muller (1958): two standard normal numbers from two 32-bit words.
 
     The second word holds two signs and an angle in the first quadrant, taken as pi/4 + t: sqrt(2) cos = cos t - sin t, and so on.
@@ -118,7 +124,7 @@ def _normal_pair(a, b):
 
 
 @jit
-def _normals(words, count, values):
+def _normals(words: NDArray[np.uint32], count: int, values: Singles) -> None:
     """Turn `count` blocks of words into 4 * `count` normal numbers; pixel 4 i + j takes number j of block i."""
     for i in range(count):
         x, y = _normal_pair(words[i], words[CHUNK + i])
@@ -133,7 +139,7 @@ _9U, _TO_UNIT_23, _HALF_STEP = np.uint32(9), np.float32(2.0**-23), np.float32(2.
 
 
 @jit
-def _uniforms(words, count, values):
+def _uniforms(words: NDArray[np.uint32], count: int, values: Singles) -> None:
     """Like `_normals`: numbers (k + 1/2) 2^-23, exact in float32, strictly between 0 and 1."""
     for i in range(count):
         for j in range(4):
@@ -141,7 +147,7 @@ def _uniforms(words, count, values):
 
 
 @jit
-def draw_windows(key, frame, row0, col0, uniform, out):
+def draw_windows(key: np.uint64, frame: Ints, row0: Ints, col0: Ints, uniform: bool, out: Singles) -> None:
     """Write normal (or uniform) numbers for windows of absolute pixels; four horizontal neighbours share a block.
 
     key : uint64; frame, row0, col0 : int64 (n,); uniform : bool; out : float32 (n, rows, cols).
@@ -170,7 +176,7 @@ def draw_windows(key, frame, row0, col0, uniform, out):
 
 
 @jit
-def add_windows(key, frame, row0, col0, data, scale, out):
+def add_windows(key: np.uint64, frame: Ints, row0: Ints, col0: Ints, data: Singles, scale: Singles, out: Singles) -> None:
     """Write data + scale * normal number; data, out : float32 (n, rows, cols); scale : float32, of size 1 or that of data, flat."""
     n, rows, cols = out.shape
     draw_windows(key, frame, row0, col0, False, out)
@@ -208,7 +214,7 @@ _R0, _R1, _R2 = np.float32(3e-7), np.float32(2e-6), np.float32(1e-6)
 
 
 @jit
-def _numerators(words, count, numerators):
+def _numerators(words: NDArray[np.uint32], count: int, numerators: NDArray[np.uint64]) -> None:
     """Two uniform numbers of 52 bits a block, (k + 1/2) 2^-52, as odd numerators over 2^53: exact, and so is their complement."""
     for i in range(count):
         for j in range(2):
@@ -217,7 +223,7 @@ def _numerators(words, count, numerators):
 
 
 @jit(forceinline=True)
-def fold(numerator):
+def fold(numerator: np.uint64) -> tuple[np.float32, np.float32]:
     """Return min(u, 1 - u) and 2 u - 1 in float32, both to 24 bits, for u = numerator / 2^53."""
     upper = numerator > _2_52
     folded = _2_53 - numerator if upper else numerator
@@ -226,7 +232,7 @@ def fold(numerator):
 
 
 @jit(forceinline=True)
-def poisson_fast(mean, p, x):
+def poisson_fast(mean: np.float32, p: np.float32, x: np.float32) -> np.float32:
     """Poisson quantile in float32 at u with (p, x) = fold(u), or NaN where its error bound does not tell between two integers.
 
     Expansion of the quantile in powers of 1 / sqrt(mean): Giles (2016), ACM TOMS 42(1), Algorithm 955, carried to 1 / mean.
@@ -257,7 +263,7 @@ _STEP = np.float32(4e-6)
 
 
 @jit(forceinline=True)
-def poisson_small(mean, x):
+def poisson_small(mean: np.float32, x: np.float32) -> np.float32:
     """Poisson quantile in float32 for a mean below 4, by counting the steps below u; NaN within 4e-6 of one, or above 15.
 
     The distribution function is good to 1.5e-6 here: exp(-mean) is the eighth power of a series.
@@ -283,7 +289,7 @@ def poisson_small(mean, x):
 
 
 @jit
-def _normal_quantile(p):
+def _normal_quantile(p: float) -> float:
     """Standard normal quantile for 0 < p <= 1/2: Abramowitz and Stegun 26.2.23 and two steps of Halley."""
     t = math.sqrt(-2.0 * math.log(p))
     z = (2.515517 + t * (0.802853 + t * 0.010328)) / (1.0 + t * (1.432788 + t * (0.189269 + t * 0.001308))) - t
@@ -294,7 +300,7 @@ def _normal_quantile(p):
 
 
 @jit
-def _poisson_density(n, mean):
+def _poisson_density(n: float, mean: float) -> float:
     """Poisson probability of n by the saddle point, to about 1e-15.
 
     C. Loader (2000), "Fast and accurate computation of binomial probabilities".
@@ -323,7 +329,7 @@ def _poisson_density(n, mean):
 
 
 @jit
-def _tail(n, mean, upper):
+def _tail(n: float, mean: float, upper: bool) -> float:
     """P(N > n) if upper, else P(N <= n), for n on the tail's own side of the mean or not far from it."""
     total, term = 1.0, 1.0
     if upper:
@@ -343,7 +349,7 @@ def _tail(n, mean, upper):
 
 
 @jit
-def _settle(n, mean, p, upper):
+def _settle(n: float, mean: float, p: float, upper: bool) -> float:
     """Move from a guess to the smallest n with P(N <= n) >= u, told from the tail: p = u, or 1 - u if upper."""
     if upper:
         while _tail(n, mean, True) > p:
@@ -359,11 +365,11 @@ def _settle(n, mean, p, upper):
 
 
 @jit
-def poisson_exact(mean, numerator):
+def poisson_exact(mean: float, numerator: np.uint64) -> float:
     """Smallest n with P(N <= n) >= numerator / 2^53, in float64. Above a mean of 1e7 its expansion alone, good to 1e-6 electrons."""
     if mean == 0.0:
         return 0.0
-    upper = numerator > _2_52
+    upper = bool(numerator > _2_52)
     p = np.float64(_2_53 - numerator if upper else numerator) * 2.0**-53
     if mean < 30.0:
         if upper and p < 1e-3:
@@ -382,12 +388,12 @@ def poisson_exact(mean, numerator):
     error = (0.03 + 0.02 * z2 * z2) / (mean * root) + 1e-13 * mean
     n = max(0.0, np.floor(x))
     if mean > 1e7 or (z2 < min(26.0, 1.0 + 0.7 * mean) and abs(x - np.rint(x)) > error):
-        return n
+        return float(n)
     return _settle(n, mean, p, upper)
 
 
 @jit
-def _poissons(means, numerators, count, folded, values):
+def _poissons(means: Singles, numerators: NDArray[np.uint64], count: int, folded: Singles, values: Singles) -> None:
     for i in range(count):
         folded[i], values[i] = fold(numerators[i])
     least = means[0]
@@ -404,7 +410,7 @@ def _poissons(means, numerators, count, folded, values):
 
 
 @jit
-def poisson_windows(key, frame, row0, col0, mean, out):
+def poisson_windows(key: np.uint64, frame: Ints, row0: Ints, col0: Ints, mean: Singles, out: Singles) -> int:
     """Write Poisson numbers for windows of absolute pixels; two horizontal neighbours share a block.
 
     key : uint64; frame, row0, col0 : int64 (n,); mean, out : float32 (n, rows, cols). Returns the number of pixels whose mean is

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pixmetry.core.jit import jit
 
 
 @jit
-def undo_filters(lines, step):
+def undo_filters(lines: NDArray[np.uint8], step: int) -> bool:
     """Take the prediction of each row off, in place (PNG specification, third edition, §9.2).
 
     Parameters
@@ -53,7 +54,7 @@ def undo_filters(lines, step):
 
 
 @jit
-def join_bytes(lines, out):
+def join_bytes(lines: NDArray[np.uint8], out: NDArray[np.uint16]) -> None:
     """Make 16-bit values of rows of bytes, high byte first: ``lines`` as above, ``out`` of shape (rows, cols), uint16."""
     rows, cols = out.shape
     for r in range(rows):

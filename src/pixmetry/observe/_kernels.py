@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
+from pixmetry.core.arrays import Ints
 from pixmetry.core.jit import jit
 
 
 @jit
-def accumulate_frame(frame, total, total_sq, row_sums, col_sums, counts):
+def accumulate_frame(
+    frame: np.ndarray, total: NDArray[np.uint32], total_sq: NDArray[np.uint64], row_sums: Ints, col_sums: Ints, counts: Ints
+) -> None:
     """Add one frame to the running sums of its group, reading it once.
 
     Parameters
@@ -45,7 +49,7 @@ def accumulate_frame(frame, total, total_sq, row_sums, col_sums, counts):
 
 
 @jit
-def count_codes(frame, counts):
+def count_codes(frame: np.ndarray, counts: Ints) -> None:
     """Count the codes of a frame; arguments as for :func:`accumulate_frame`."""
     rows, cols = frame.shape
     for r in range(rows):
@@ -54,7 +58,9 @@ def count_codes(frame, counts):
 
 
 @jit
-def sum_maps(total, total_sq, n_frames, row_totals, col_totals):
+def sum_maps(
+    total: NDArray[np.uint32], total_sq: NDArray[np.uint64], n_frames: int, row_totals: Ints, col_totals: Ints
+) -> tuple[float, float]:
     """Sum the maps of a group over the pixels.
 
     Parameters
@@ -94,7 +100,7 @@ def sum_maps(total, total_sq, n_frames, row_totals, col_totals):
 
 
 @jit
-def sum_pair(first, second, row_sums, col_sums):
+def sum_pair(first: np.ndarray, second: np.ndarray, row_sums: Ints, col_sums: Ints) -> tuple[int, int, tuple[int, int], tuple[int, int]]:
     """Sum the powers of the difference d = y1 − y0 of two frames, and y0 y1, exactly.
 
     Parameters
@@ -135,15 +141,15 @@ def sum_pair(first, second, row_sums, col_sums):
             fourth = np.uint64(square) * np.uint64(square)  # below 2**64
             fourths_high += np.int64(fourth >> np.uint64(32))
             fourths_low += np.int64(fourth & np.uint64(0xFFFFFFFF))
-    return products, squares, (cubes_high, cubes_low), (fourths_high, fourths_low)
+    return int(products), int(squares), (int(cubes_high), int(cubes_low)), (int(fourths_high), int(fourths_low))
 
 
 @jit
-def sum_squares(values):
+def sum_squares(values: np.ndarray) -> tuple[int, int]:
     """Sum the squares of integers from 0 to 2³² − 1 exactly: (high, low), to be read as 2³² · high + low."""
     high = low = np.int64(0)
     for value in values:
         square = np.uint64(value) * np.uint64(value)
         high += np.int64(square >> np.uint64(32))
         low += np.int64(square & np.uint64(0xFFFFFFFF))
-    return high, low
+    return int(high), int(low)

@@ -15,6 +15,7 @@ import math
 import numpy as np
 
 from pixmetry.core._normal_kernels import bowl, cdf, pdf, ramp
+from pixmetry.core.arrays import Array, Flags, Ints
 from pixmetry.core.jit import jit
 
 SEGMENT = 13
@@ -28,7 +29,7 @@ STEPS = np.array([-5.0, -2.5, 0.0, 2.5, 5.0])  # break points about a side of th
 
 
 @jit
-def weight(d, w, s):
+def weight(d: float, w: float, s: float) -> float:
     """Weight at a distance d from the middle of a box of width w, blurred by s: k_w(d)."""
     if w < THIN * s:
         return pdf(d / s) / s
@@ -36,7 +37,7 @@ def weight(d, w, s):
 
 
 @jit
-def share(d, w, s):
+def share(d: float, w: float, s: float) -> float:
     """Share of the weight below d: F(d) = ∫ k_w."""
     if w < THIN * s:
         return cdf(d / s)
@@ -44,7 +45,7 @@ def share(d, w, s):
 
 
 @jit
-def moment(d, w, s):
+def moment(d: float, w: float, s: float) -> float:
     """First moment of the weight below d: ∫ u k_w(u) du."""
     if w < THIN * s:
         return -s * pdf(d / s)
@@ -52,17 +53,17 @@ def moment(d, w, s):
 
 
 @jit
-def place(seg, axis, t):
+def place(seg: Array, axis: int, t: float) -> float:
     """Coordinate of a point of a segment."""
     if seg[0] == 0.0:
-        return seg[1 + axis] + seg[3 + axis] * t
-    return seg[1 + axis] + seg[3 + axis] * math.cos(t) + seg[5 + axis] * math.sin(t)
+        return float(seg[1 + axis] + seg[3 + axis] * t)
+    return float(seg[1 + axis] + seg[3 + axis] * math.cos(t) + seg[5 + axis] * math.sin(t))
 
 
 @jit
-def when(seg, axis, value):
+def when(seg: Array, axis: int, value: float) -> float:
     """Parameter at which a segment has this coordinate, kept within its ends."""
-    low, high = min(seg[7], seg[8]), max(seg[7], seg[8])
+    low, high = float(min(seg[7], seg[8])), float(max(seg[7], seg[8]))
     if seg[0] == 0.0:
         if seg[3 + axis] == 0.0:
             return low
@@ -74,11 +75,11 @@ def when(seg, axis, value):
         a = (turn + half - middle + math.pi) % (2 * math.pi) - math.pi
         b = (turn - half - middle + math.pi) % (2 * math.pi) - math.pi
         t = middle + (a if abs(a) < abs(b) else b)
-    return min(high, max(low, t))
+    return float(min(high, max(low, t)))
 
 
 @jit
-def panel(seg, ta, tb, x0, y0, w, h, s, lit, sums):
+def panel(seg: Array, ta: float, tb: float, x0: float, y0: float, w: float, h: float, s: float, lit: bool, sums: Array) -> None:
     """Add ∫ F k dy over a panel to ``sums[0]``; where ``lit``, the same with the weights (x − x0) and (y − y0) to the other two."""
     length = tb - ta
     for j in range(5):
@@ -98,7 +99,7 @@ def panel(seg, ta, tb, x0, y0, w, h, s, lit, sums):
 
 
 @jit
-def beyond(seg, ta, tb, y0, h, s, lit, sums):
+def beyond(seg: Array, ta: float, tb: float, y0: float, h: float, s: float, lit: bool, sums: Array) -> None:
     """Add what passes to the right of the box. At the reach all is seen, so that an inside is 1 and an outside 0."""
     reach = 0.5 * h + REACH * s
     limit = reach * (1.0 - 1e-9)
@@ -111,7 +112,7 @@ def beyond(seg, ta, tb, y0, h, s, lit, sums):
 
 
 @jit
-def along(seg, x0, y0, w, h, s, lit, sums, breaks):
+def along(seg: Array, x0: float, y0: float, w: float, h: float, s: float, lit: bool, sums: Array, breaks: Array) -> None:
     """Add a segment's part of the outline integral for the box at (x0, y0)."""
     reach = 0.5 * h + REACH * s
     y1, y2 = seg[10] - y0, seg[12] - y0
@@ -152,7 +153,9 @@ def along(seg, x0, y0, w, h, s, lit, sums, breaks):
 
 
 @jit
-def between(seg, ta, tb, x0, y0, w, h, s, lit, sums, breaks):
+def between(
+    seg: Array, ta: float, tb: float, x0: float, y0: float, w: float, h: float, s: float, lit: bool, sums: Array, breaks: Array
+) -> None:
     """Integrate the piece of a segment near the box: panels of equal length, or broken at the sides of the box where the blur is small."""
     size = math.hypot(seg[3], seg[4])
     if seg[0] == 1.0:
@@ -189,7 +192,7 @@ def between(seg, ta, tb, x0, y0, w, h, s, lit, sums, breaks):
 
 
 @jit
-def around(oval, count, x0, y0, w, h, s, lit, sums):
+def around(oval: Array, count: int, x0: float, y0: float, w: float, h: float, s: float, lit: bool, sums: Array) -> None:
     """The outline integral over a whole ellipse c + u cos t + v sin t by ``count`` equal steps, which converge exponentially."""
     step = 2 * math.pi / count
     cd, sd = math.cos(step), math.sin(step)
@@ -208,7 +211,21 @@ def around(oval, count, x0, y0, w, h, s, lit, sums):
 
 
 @jit
-def add_oval(out, oval, count, height, row0, col0, dx, dy, r1, r2, c1, c2, s):
+def add_oval(
+    out: Array,
+    oval: Array,
+    count: int,
+    height: float,
+    row0: int,
+    col0: int,
+    dx: float,
+    dy: float,
+    r1: int,
+    r2: int,
+    c1: int,
+    c2: int,
+    s: float,
+) -> None:
     """Add an ellipse to pixels (r1 … r2, c1 … c2) of a window; a weight is the product of one of the row and one of the column."""
     across = np.empty((2, count, c2 - c1 + 1))
     down = np.empty((count, 2))
@@ -242,7 +259,7 @@ def add_oval(out, oval, count, height, row0, col0, dx, dy, r1, r2, c1, c2, s):
 
 
 @jit
-def extent(segments, first, last, y0, reach):
+def extent(segments: Array, first: int, last: int, y0: float, reach: float) -> tuple[float, float]:
     """Least and greatest x of an outline within ``reach`` of a row."""
     low, high = math.inf, -math.inf
     for j in range(first, last):
@@ -261,7 +278,20 @@ def extent(segments, first, last, y0, reach):
 
 
 @jit
-def add_shapes(out, row0, col0, dx, dy, segments, start, height, box, oval, count, s):
+def add_shapes(
+    out: Array,
+    row0: Ints,
+    col0: Ints,
+    dx: Array,
+    dy: Array,
+    segments: Array,
+    start: Ints,
+    height: Array,
+    box: Array,
+    oval: Array,
+    count: Ints,
+    s: float,
+) -> None:
     """Add shapes to full pixels of windows: ``out`` has shape (n, 1, rows, cols), or (n, 3, …) with the first moments along x and y.
 
     Shape k has the segments ``start[k]`` to ``start[k + 1]``, the height ``height[k]`` and lies within ``box[k]``; where ``count[k]`` is
@@ -302,7 +332,7 @@ def add_shapes(out, row0, col0, dx, dy, segments, start, height, box, oval, coun
 
 
 @jit
-def bins(x, y, box, reach, side):
+def bins(x: Array, y: Array, box: Array, reach: float, side: float) -> tuple[float, float, int, Ints, Ints]:
     """Sort boxes, widened by ``reach``, into square bins over the points: corner, bins along x, first entry of each bin, entries."""
     x0, y0 = x.min(), y.min()
     nx, ny = int((x.max() - x0) / side) + 1, int((y.max() - y0) / side) + 1
@@ -332,7 +362,21 @@ def bins(x, y, box, reach, side):
 
 
 @jit
-def at_points(out, x, y, w, h, side, segments, start, height, box, oval, count, s):
+def at_points(
+    out: Array,
+    x: Array,
+    y: Array,
+    w: Array,
+    h: Array,
+    side: float,
+    segments: Array,
+    start: Ints,
+    height: Array,
+    box: Array,
+    oval: Array,
+    count: Ints,
+    s: float,
+) -> None:
     """Light of shapes averaged over a box of size w × h about each point (0: the point); ``out`` has shape (1 or 3, points)."""
     if len(x) == 0 or len(height) == 0:
         return
@@ -358,7 +402,7 @@ def at_points(out, x, y, w, h, side, segments, start, height, box, oval, count, 
 
 
 @jit
-def outline_near(out, x, y, reach, side, segments, start, box):
+def outline_near(out: Flags, x: Array, y: Array, reach: Array, side: float, segments: Array, start: Ints, box: Array) -> None:
     """Mark the points that may have an outline within ``reach``."""
     if len(x) == 0 or len(box) == 0:
         return
@@ -379,7 +423,7 @@ def outline_near(out, x, y, reach, side, segments, start, box):
 
 
 @jit
-def close(seg, x, y, reach):
+def close(seg: Array, x: float, y: float, reach: float) -> bool:
     """Whether a segment may pass within ``reach`` of a point."""
     if max(seg[9], seg[11]) < x - reach or min(seg[9], seg[11]) > x + reach:
         return False
@@ -388,7 +432,7 @@ def close(seg, x, y, reach):
     px, py = x - seg[1], y - seg[2]
     cross = seg[3] * seg[6] - seg[4] * seg[5]
     if seg[0] == 0.0:
-        return abs(px * seg[4] - py * seg[3]) <= reach * math.hypot(seg[3], seg[4])
+        return bool(abs(px * seg[4] - py * seg[3]) <= reach * math.hypot(seg[3], seg[4]))
     # distance from an ellipse is at least |ρ − 1| times its smaller half axis, ρ being the radius where it is the unit circle
     a, b = (px * seg[6] - py * seg[5]) / cross, (py * seg[3] - px * seg[4]) / cross
     total = seg[3] ** 2 + seg[4] ** 2 + seg[5] ** 2 + seg[6] ** 2

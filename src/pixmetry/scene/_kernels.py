@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from pixmetry.core.arrays import Array, Ints
 from pixmetry.core.jit import jit
 
 # Gauss–Legendre nodes and weights on (-1/2, 1/2)
@@ -14,7 +15,20 @@ WEIGHTS = 0.5 * np.array([5.0 / 9.0, 8.0 / 9.0, 5.0 / 9.0])
 
 
 @jit
-def add_discs(out, x, y, entry, row0, col0, profile, step, inner, outer, peak, split):
+def add_discs(
+    out: Array,
+    x: Array,
+    y: Array,
+    entry: Ints,
+    row0: Ints,
+    col0: Ints,
+    profile: Array,
+    step: float,
+    inner: float,
+    outer: float,
+    peak: Array,
+    split: int,
+) -> None:
     """Add discs to windows in place.
 
     ``entry[k]`` is the window that disc ``k`` falls into, ``(x[k], y[k])`` its centre in absolute pixels, ``peak[k]`` its height.
@@ -61,7 +75,21 @@ def add_discs(out, x, y, entry, row0, col0, profile, step, inner, outer, peak, s
 
 
 @jit
-def see_discs(out, x, y, w, h, row, cx, cy, peak, profile, step, outer, blur):
+def see_discs(
+    out: Array,
+    x: Array,
+    y: Array,
+    w: Array,
+    h: Array,
+    row: Ints,
+    cx: Array,
+    cy: Array,
+    peak: Array,
+    profile: Array,
+    step: float,
+    outer: float,
+    blur: float,
+) -> None:
     """Add discs at points, averaged over a box w × h about each, to ``out``; point i sees the discs at ``cx[row[i]], cy[row[i]]``.
 
     ``profile`` is as for `add_discs` and 0 beyond ``outer``. The boxes must be no wider than twice the blur: then three nodes a side do to

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from pixmetry.core.arrays import Array, Singles
 from pixmetry.core.jit import jit
 
 
 @jit
-def add_interpolated(nodes, place, step, scale, out):
+def add_interpolated(nodes: Singles, place: Array, step: float, scale: float, out: Singles) -> None:
     """Add a line through random nodes to every row: out[i, c] += scale · (node at place[i] + c · step, straight between neighbours).
 
     nodes : float32 (n, m); place : float64 (n,), from the first node of the row; out : float32 (n, cols), changed.

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
+from pixmetry.core.arrays import Array, Singles
 from pixmetry.core.jit import jit
 
 
 @jit
-def droop(data, loss, half, carry, stride):
+def droop(data: Singles, loss: float, half: float, carry: float, stride: int) -> Singles:
     """Return y with y(t) = x(t) − s(t), s' = (x − s)/τ, in the middle of every pixel; float32 (n, rows, cols).
 
     ``loss`` is 1 − e^(−T/τ) for a pixel of duration T, ``half`` 1 − e^(−T/2τ). At the first pixel of a row, s is the share ``carry`` of
@@ -29,7 +31,7 @@ def droop(data, loss, half, carry, stride):
 
 
 @jit
-def undroop(data, loss, half, carry, stride):
+def undroop(data: Singles, loss: float, half: float, carry: float, stride: int) -> Singles:
     """Return x of `droop` from y, from left to right and row by row."""
     out = np.empty_like(data)
     end = np.zeros(stride)
@@ -46,7 +48,7 @@ def undroop(data, loss, half, carry, stride):
 
 
 @jit
-def quantise_ideal(data, factor, offset, top):
+def quantise_ideal(data: Singles, factor: float, offset: float, top: float) -> NDArray[np.uint16]:
     """Return min(max(floor(factor·y + offset + 1/2), 0), top) as uint16."""
     flat = data.reshape(-1)
     out = np.empty(flat.size, np.uint16)
@@ -57,7 +59,7 @@ def quantise_ideal(data, factor, offset, top):
 
 
 @jit
-def quantise_at(data, factor, offset, thresholds):
+def quantise_at(data: Singles, factor: float, offset: float, thresholds: Array) -> NDArray[np.uint16]:
     """Return how many of the rising thresholds T_1 … T_top the value reaches, as uint16; it starts at the ideal code."""
     top = thresholds.size
     flat = data.reshape(-1)

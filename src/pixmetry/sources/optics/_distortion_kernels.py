@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from pixmetry.core.arrays import Array
 from pixmetry.core.jit import jit
 
 
 @jit
-def polynomial(x, y, k1, k2, k3, p1, p2):
+def polynomial(x: Array, y: Array, k1: float, k2: float, k3: float, p1: float, p2: float) -> tuple[Array, Array]:
     """Return the polynomial's values at flat arrays of places."""
     u, v = np.empty_like(x), np.empty_like(y)
     for i in range(len(x)):
@@ -20,7 +21,7 @@ def polynomial(x, y, k1, k2, k3, p1, p2):
 
 
 @jit
-def inverse(u, v, k1, k2, k3, p1, p2):
+def inverse(u: Array, v: Array, k1: float, k2: float, k3: float, p1: float, p2: float) -> tuple[Array, Array]:
     """Return the places at which the polynomial has these values, by Newton's method from the values themselves."""
     x, y = np.empty_like(u), np.empty_like(v)
     for i in range(len(u)):

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
+from pixmetry.core.arrays import Array, Ints
 from pixmetry.core.jit import jit
 
 
 @jit(forceinline=True)
-def _code(value, top):
+def _code(value: float, top: float) -> np.uint16:
     return np.uint16(min(max(np.floor(value + 0.5), 0.0), top))
 
 
 @jit
-def filter_by_place(codes, row0, col0, weights, top):
+def filter_by_place(codes: NDArray[np.uint16], row0: Ints, col0: Ints, weights: Array, top: float) -> NDArray[np.uint16]:
     """Correlate with the weights that belong to each pixel's place in a pattern of two by two.
 
     codes : uint16 (n, rows + 2 m, cols + 2 m); row0, col0 : int64 (n,), of the first pixel without border; weights : float64
@@ -44,7 +46,7 @@ def filter_by_place(codes, row0, col0, weights, top):
 
 
 @jit
-def blur(codes, weights):
+def blur(codes: NDArray[np.uint16], weights: Array) -> Array:
     """Symmetric separable filter, float64 (n, rows, cols); codes : uint16 with a border of m; weights : float64 (m + 1,)."""
     m = weights.size - 1
     n, rows, cols = codes.shape[0], codes.shape[1] - 2 * m, codes.shape[2] - 2 * m
@@ -67,7 +69,7 @@ def blur(codes, weights):
 
 
 @jit(forceinline=True)
-def _sort(values, count):
+def _sort(values: np.ndarray, count: int) -> None:
     for a in range(1, count):
         v = values[a]
         b = a - 1
@@ -78,13 +80,13 @@ def _sort(values, count):
 
 
 @jit(forceinline=True)
-def _order(values, a, b):
+def _order(values: NDArray[np.uint16], a: int, b: int) -> None:
     low, high = min(values[a], values[b]), max(values[a], values[b])
     values[a], values[b] = low, high
 
 
 @jit(forceinline=True)
-def _middle_of_nine(v):
+def _middle_of_nine(v: NDArray[np.uint16]) -> np.uint16:
     """Median of nine values by 19 exchanges (J. L. Smith, XCell 23, 1996); it ends up in place 4."""
     _order(v, 1, 2)
     _order(v, 4, 5)
@@ -105,11 +107,11 @@ def _middle_of_nine(v):
     _order(v, 4, 2)
     _order(v, 6, 4)
     _order(v, 4, 2)
-    return v[4]
+    return np.uint16(v[4])
 
 
 @jit
-def median(codes, m):
+def median(codes: NDArray[np.uint16], m: int) -> NDArray[np.uint16]:
     """Median of the square of 2 m + 1 pixels about each pixel; codes : uint16 with a border of m."""
     n, rows, cols = codes.shape[0], codes.shape[1] - 2 * m, codes.shape[2] - 2 * m
     out = np.empty((n, rows, cols), np.uint16)
@@ -130,7 +132,7 @@ def median(codes, m):
 
 
 @jit
-def bilateral(codes, space, likeness, top):
+def bilateral(codes: NDArray[np.uint16], space: Array, likeness: Array, top: float) -> NDArray[np.uint16]:
     """Mean of the square about each pixel, weighted by distance and by likeness.
 
     codes : uint16 with a border of m; space : float64 (2 m + 1, 2 m + 1); likeness : float64, weight of each difference of codes; a
@@ -159,7 +161,7 @@ def bilateral(codes, space, likeness, top):
 
 
 @jit
-def replace_outliers(codes, step, threshold):
+def replace_outliers(codes: NDArray[np.uint16], step: int, threshold: float) -> NDArray[np.uint16]:
     """Replace a pixel that exceeds all its eight neighbours (``step`` pixels away) by more than the threshold, or falls below them all.
 
     It becomes their median, the mean of the middle two, halves up. codes : uint16 with a border of ``step``.

@@ -8,13 +8,14 @@ from __future__ import annotations
 import numpy as np
 
 from pixmetry.core._binomial_kernels import binomial, layer, normal_of_place, normals_of, normals_of_row, place_words
+from pixmetry.core.arrays import Array, Ints, Singles
 from pixmetry.core.jit import jit
 
 REST = 1e-9  # of a packet: what would arrive still later is counted with the last pixel that is followed
 
 
 @jit
-def trail_shares(transfers, loss, trail_px, shares):
+def trail_shares(transfers: float, loss: float, trail_px: float, shares: Array) -> int:
     """Fill in which shares of a packet arrive 0, 1, 2, … pixels late; return how many there are.
 
     In each transfer a packet stays whole with probability 1 − ε, or that share waits a geometric time of mean ``trail_px`` pixels, in
@@ -41,7 +42,7 @@ def trail_shares(transfers, loss, trail_px, shares):
 
 
 @jit
-def share_table(first, lines, phases, loss, trail_px):
+def share_table(first: int, lines: int, phases: int, loss: float, trail_px: float) -> tuple[Array, Ints]:
     """Return the shares of each of the lines ``first``, ``first + 1``, …, shape (lines, longest), and how many each has."""
     longest = trail_shares(np.float64((first + lines) * phases), loss, trail_px, np.empty(lines + 1))
     table = np.zeros((lines, longest + 1))
@@ -52,7 +53,7 @@ def share_table(first, lines, phases, loss, trail_px):
 
 
 @jit
-def transfer_columns(data, first, phases, loss, trail_px):
+def transfer_columns(data: Singles, first: Ints, phases: int, loss: float, trail_px: float) -> Singles:
     """Move the packets of every column to the register before row 0: row ``first[i] + r`` takes ``first + r + 1`` pixel steps."""
     n, rows, cols = data.shape
     out = np.empty_like(data)
@@ -74,7 +75,7 @@ def transfer_columns(data, first, phases, loss, trail_px):
 
 
 @jit
-def transfer_rows(data, first, phases, loss, trail_px):
+def transfer_rows(data: Singles, first: Ints, phases: int, loss: float, trail_px: float) -> Singles:
     """The same along the register: column ``first[i] + c`` takes ``first + c + 1`` pixel steps to the output before column 0."""
     n, rows, cols = data.shape
     out = np.empty_like(data)
@@ -94,7 +95,19 @@ def transfer_rows(data, first, phases, loss, trail_px):
 
 
 @jit
-def scatter(data, key, frame, row0, step, col0, line0, further, log_stay, along, out):
+def scatter(
+    data: Singles,
+    key: np.uint64,
+    frame: Ints,
+    row0: Ints,
+    step: int,
+    col0: Ints,
+    line0: Ints,
+    further: Array,
+    log_stay: Array,
+    along: bool,
+    out: Singles,
+) -> None:
     """Let every electron fall behind for itself, down the columns or (with ``along``) along the rows.
 
     Of those that are j pixels late, ``further[j, line]`` go on to fall behind more; what is no whole number goes by shares.
@@ -151,7 +164,21 @@ def scatter(data, key, frame, row0, step, col0, line0, further, log_stay, along,
 
 
 @jit
-def transfer_packets(data, first, phases, loss, trail_px, beta, reference_e, noisy, key, frame, row0, at0, step):
+def transfer_packets(
+    data: Singles,
+    first: Ints,
+    phases: int,
+    loss: float,
+    trail_px: float,
+    beta: float,
+    reference_e: float,
+    noisy: bool,
+    key: np.uint64,
+    frame: Ints,
+    row0: Ints,
+    at0: Ints,
+    step: int,
+) -> Singles:
     """Transfer along the rows with a loss that follows the packet, ε (x / reference)^(β − 1); a packet below zero loses nothing.
 
     ``row0`` and ``at0 + step c`` are the places of rows and pixels for the draws.
@@ -190,7 +217,20 @@ def transfer_packets(data, first, phases, loss, trail_px, beta, reference_e, noi
 
 
 @jit
-def pass_traps(data, first, traps_per_px, release_px, fill_beta, well_e, noisy, key, frame, row0, at0, step):
+def pass_traps(
+    data: Singles,
+    first: Ints,
+    traps_per_px: Array,
+    release_px: Array,
+    fill_beta: float,
+    well_e: float,
+    noisy: bool,
+    key: np.uint64,
+    frame: Ints,
+    row0: Ints,
+    at0: Ints,
+    step: int,
+) -> Singles:
     """Move packets along the rows over traps of several species that fill at once and empty as e^(−k/τ).
 
     A packet of x electrons fills all traps of its volume v = (x/well)^β in each of the ``first + c + 1`` pixels that it crosses. Seen
@@ -281,7 +321,7 @@ def pass_traps(data, first, traps_per_px, release_px, fill_beta, well_e, noisy, 
 
 
 @jit
-def move_borders(data, weights, strength_per_e, farthest):
+def move_borders(data: Singles, weights: Array, strength_per_e: float, farthest: float) -> Singles:
     """Move the borders between pixels away from the charge they hold, and with them charge; the border of the array stands still.
 
     ``weights[k]`` is the repulsion over k pixels along each axis. While the charge gathers the border moves from 0 to

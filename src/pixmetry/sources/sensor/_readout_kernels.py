@@ -5,11 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from pixmetry.core._binomial_kernels import normal_of_place
+from pixmetry.core.arrays import Array, Ints, Singles
 from pixmetry.core.jit import jit
+
+Run = tuple[float, float, float, float, float, float]  # of full pixels, see `join`
 
 
 @jit
-def add_column_sums(data, factor):
+def add_column_sums(data: Singles, factor: Singles) -> Singles:
     """Return the data plus ``factor[i]`` times the sum over each whole column."""
     n, rows, cols = data.shape
     out = np.empty_like(data)
@@ -28,7 +31,7 @@ def add_column_sums(data, factor):
 
 
 @jit
-def add_rows_passed(data, factor, store_below, undo):
+def add_rows_passed(data: Singles, factor: Singles, store_below: bool, undo: bool) -> Singles:
     """Return the data plus ``factor[i]`` times the sum over the rows between each row and the store.
 
     With ``undo`` the data hold the smear and the factor is negative: the sum is over what has been freed of it.
@@ -48,7 +51,7 @@ def add_rows_passed(data, factor, store_below, undo):
 
 
 @jit
-def join(x, y):
+def join(x: Run, y: Run) -> Run:
     """Return two neighbouring runs of full pixels as one.
 
     A run is (left, right, lr, rl, dl, dr): charge that leaves at its left and right end; of charge that enters at the left end the share
@@ -67,7 +70,7 @@ def join(x, y):
 
 
 @jit
-def single(excess, row, rows, up, kept, barrier):
+def single(excess: float, row: int, rows: int, up: float, kept: float, barrier: bool) -> Run:
     """Return the run of one full pixel: the share ``kept`` of its excess goes on, ``up`` of that to the left."""
     left, right = kept * up, kept * (1.0 - up)
     if barrier and row == 0:
@@ -80,7 +83,7 @@ def single(excess, row, rows, up, kept, barrier):
 
 
 @jit
-def spill_column(q, full, up, kept, barrier, runs, first, last):
+def spill_column(q: Array, full: float, up: float, kept: float, barrier: bool, runs: Array, first: Ints, last: Ints) -> int:
     """Let the charge of one column spill until no pixel holds more than ``full``, in place; the end of any order of spilling.
 
     Returns how many runs of full pixels there are.
@@ -129,7 +132,7 @@ def spill_column(q, full, up, kept, barrier, runs, first, last):
 
 
 @jit
-def share_out(q, full, runs, first, last, count, key, frame, col):
+def share_out(q: Array, full: float, runs: Array, first: Ints, last: Ints, count: int, key: np.uint64, frame: int, col: int) -> None:
     """Draw which way the charge went that left every run, in place: each electron for itself, up or down; what finds no room there stays.
 
     Of L and R electrons that leave at the two ends on average the binomial numbers have the variance L R/(L + R).
@@ -153,7 +156,7 @@ def share_out(q, full, runs, first, last, count, key, frame, col):
 
 
 @jit
-def soften(q, top, knee, up, kept, barrier, spare):
+def soften(q: Array, top: float, knee: float, up: float, kept: float, barrier: bool, spare: Array) -> None:
     """Let the part of each pixel's own charge that its soft capacity does not take go to the neighbours, in place."""
     rows = len(q)
     spare[:] = 0.0
@@ -172,7 +175,19 @@ def soften(q, top, knee, up, kept, barrier, spare):
 
 
 @jit
-def spill(data, full, drain_ratio, knee, up, kept, barrier, noisy, key, frame, col0):
+def spill(
+    data: Singles,
+    full: float,
+    drain_ratio: float,
+    knee: float,
+    up: float,
+    kept: float,
+    barrier: bool,
+    noisy: bool,
+    key: np.uint64,
+    frame: Ints,
+    col0: Ints,
+) -> Singles:
     """Return the charge of every pixel after blooming along the columns, shape (n, rows, cols); ``noisy``: see `share_out`."""
     n, rows, cols = data.shape
     out = np.empty_like(data)
