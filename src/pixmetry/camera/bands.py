@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 
@@ -56,13 +57,13 @@ def _same_span(needed: Windows, given: Windows, axis: int) -> bool:
 
 def stitch(parts: Iterable[Signal], grid: Grid, axis: int) -> Signal:
     """Join bands along an axis; each is let go of as soon as it is copied, so that few of them exist at a time."""
-    whole: Signal | None = None
+    parts = iter(parts)
+    first = next(parts)
+    if first.data.shape == grid.size:
+        return first
+    whole = replace(first, data=np.empty(grid.size, first.data.dtype), grid=grid)
     at = 0
-    for part in parts:
-        if part.data.shape == grid.size:
-            return part
-        if whole is None:
-            whole = replace(part, data=np.empty(grid.size, part.data.dtype), grid=grid)
+    for part in chain([first], parts):
         place = slice(at, at + part.data.shape[axis + 1])
         whole.data[(slice(None), place) if axis == 0 else (slice(None), slice(None), place)] = part.data
         at = place.stop

@@ -114,8 +114,11 @@ class Camera:
         off, on = kw.get("off", ()), kw.get("on")
         for name in (*off, *(on or ())):
             self[name]
-        keep = (lambda e: e.source.essential or e.name in on) if on is not None else (lambda e: e.name not in off)
-        return replace(self, chain=tuple(replace(e, on=e.on and keep(e)) for e in self.chain))
+
+        def keeps(element: Element) -> bool:
+            return element.name not in off if on is None else element.source.essential or element.name in on
+
+        return replace(self, chain=tuple(replace(e, on=e.on and keeps(e)) for e in self.chain))
 
     def with_parameters(self, name: str, **values: Any) -> Camera:
         """Return the same camera with some parameters of one source changed (validated)."""
@@ -329,7 +332,7 @@ class Camera:
 
     def frozen_tail(self) -> float:
         """Largest share of a pixel's signal that the mode ``frozen`` takes from the noise-free frame, over all sources."""
-        return float(sum(e.source.tail(e.params) for e in self.links if e.far))
+        return float(sum(e.source.tail(e.params) for e in self.links if e.far and e.source.tail is not None))
 
     def freeze(self, background: Scene | None, **schedule: Any) -> Frozen:
         """Run the noise-free background frame once and keep what sources with a far context need of it."""
@@ -445,7 +448,7 @@ class Camera:
             if Kind.LIGHT in link.source.consumes and link.source is not LOOK:
                 signal, _ = run(link.source, link.params, signal, streams.of(link.name))
             elif link.source is LOOK:
-                x, y = (v[0, :, 0] for v in signal.light.placed(x[None, :, None], y[None, :, None]))
+                x, y = (v[0, :, 0] for v in signal.own_light.placed(x[None, :, None], y[None, :, None]))
             elif link.source is SAMPLE:
                 x = link.params.line_at(signal).placed(x, warped=True)
             elif link.source.place is not None:
@@ -523,8 +526,8 @@ class _Task:
 
     def look(self, signal: Signal) -> Signal:
         """Sample the light, or take what was sampled for an earlier frame that saw the same."""
-        mark = None if self.rendered is None else signal.light.fingerprint()
-        if mark is None:
+        mark = None if self.rendered is None else signal.own_light.fingerprint()
+        if self.rendered is None or mark is None:
             return look(signal)
         grid = signal.grid
         key = (grid.row0.tobytes(), grid.col0.tobytes(), grid.shape)

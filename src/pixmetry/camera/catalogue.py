@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import importlib
 import importlib.machinery
-import importlib.util
 import pkgutil
 import sys
 from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
+from types import ModuleType
 
 from pixmetry.camera.source import Source
 from pixmetry.core.errors import ChainError, InputError
@@ -69,20 +69,21 @@ def add_source_file(path: str | Path) -> Source:
     if not path.is_file():
         raise InputError("no such file", where=str(path), remedy="name a Python file that holds a SOURCE")
     name = f"pixmetry_source_{path.stem}"
-    spec = importlib.util.spec_from_loader(name, importlib.machinery.SourceFileLoader(name, str(path)))
-    module = importlib.util.module_from_spec(spec)
+    loader = importlib.machinery.SourceFileLoader(name, str(path))
+    module = ModuleType(name)
     sys.modules[name] = module  # models look up their module while they are made
     try:
-        spec.loader.exec_module(module)
+        loader.exec_module(module)
     except Exception as problem:
         raise InputError(f"the file cannot be run: {type(problem).__name__}: {problem}", where=str(path)) from problem
     if not isinstance(getattr(module, "SOURCE", None), Source):
         raise InputError("the file holds no Source record named SOURCE", where=str(path), remedy="see docs/adding-a-source.md")
-    known = sources().get(module.SOURCE.id)
+    source: Source = module.SOURCE
+    known = sources().get(source.id)
     if known is not None and getattr(known.forward, "__module__", "") == name:
-        del sources()[module.SOURCE.id]  # the same file once more
-    _add(sources(), module.SOURCE, str(path), None)
-    return module.SOURCE
+        del sources()[source.id]  # the same file once more
+    _add(sources(), source, str(path), None)
+    return source
 
 
 def _add(found: dict[str, Source], source: Source, where: str, stage: str | None) -> None:

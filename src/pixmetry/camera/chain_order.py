@@ -68,7 +68,7 @@ def check_chain(chain: Sequence[Element], where: str = "camera") -> None:
         if source.forward is None:
             raise ChainError(f"{element.name} cannot stand in a camera: {source.reasons['forward']}", where=where, remedy="take it out")
         step = conversion(kind, source.consumes)
-        if step is not None:
+        if step is not None and step.produces is not None:
             kind = step.produces
         if kind not in source.consumes:
             given = Kind.PHOTONS if kind is Kind.LIGHT else kind

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from pixmetry.camera.line import Held
+from pixmetry.core.arrays import Array
 
 CLASSES = ("T", "Tr", "F", "G", "D", "O")
 
@@ -108,7 +109,8 @@ def smooth_part(values: np.ndarray, *places: np.ndarray, order: int = SMOOTH_ORD
     powers = [range(min(order, len(np.unique(p)) - 1) + 1) for p in flat]
     columns = [np.prod([p**k for p, k in zip(scaled, ks, strict=True)], axis=0) for ks in product(*powers) if sum(ks) <= order]
     basis = np.stack(columns, axis=1)
-    return (basis @ np.linalg.lstsq(basis, np.ravel(values).astype(float), rcond=None)[0]).reshape(np.shape(values))
+    smooth: Array = (basis @ np.linalg.lstsq(basis, np.ravel(values).astype(float), rcond=None)[0]).reshape(np.shape(values))
+    return smooth
 
 
 @dataclass(frozen=True)

@@ -35,10 +35,11 @@ class Link:
 
     def nearby(self, windows: Windows) -> Windows:
         """The input windows of the mode ``frozen``."""
-        reach = self.source.near(self.params)
-        if self.source is SAMPLE:
-            return self.params.pixels_of(windows, self.shape).expand(*reach, self.shape)
-        return windows.expand(*reach, self.shape)
+        if self.source.near is None:
+            return windows
+        seen: Windows = self.params.pixels_of(windows, self.shape) if self.source is SAMPLE else windows
+        up, down, left, right = self.source.near(self.params)
+        return seen.expand(up, down, left, right, self.shape)
 
     @property
     def remembers(self) -> bool:
@@ -70,7 +71,7 @@ class LineSources:
         signal = replace(signal, kind=Kind.VIDEO, clock=replace(signal.clock, pixel_hz=self.pixel_hz), line=line)
         for link in self.links:
             signal, _ = run(link.source, link.params, replace(signal, frame_shape=link.shape), QuietStreams(0, 0).of(link.name))
-        return signal.line
+        return signal.own_line
 
     def pixels_of(self, windows: Windows, frame_shape: tuple[int, int]) -> Windows:
         """The pixels at which the samples of some windows look."""
@@ -96,7 +97,7 @@ class LineSources:
 
 def look(signal: Signal, photons: np.ndarray | None = None) -> Signal:
     """The light as numbers: sampled, or given by somebody who has sampled it."""
-    return replace(signal, data=signal.light.photons() if photons is None else photons, kind=Kind.PHOTONS, light=None)
+    return replace(signal, data=signal.own_light.photons() if photons is None else photons, kind=Kind.PHOTONS, light=None)
 
 
 def _look(params: Nothing, signal: Signal, stream: Stream) -> Signal:
@@ -108,7 +109,7 @@ def _hold(params: Nothing, signal: Signal, stream: Stream) -> Signal:
 
 
 def _sample(params: LineSources, signal: Signal, stream: Stream) -> Signal:
-    line = signal.line
+    line = signal.own_line
     if line.plain:
         return replace(signal, kind=Kind.DN, line=None)
     line = line.limited()

@@ -10,6 +10,7 @@ import numpy as np
 from pixmetry.camera.contribution import Contribution, Probe
 from pixmetry.camera.light import Pull
 from pixmetry.camera.signal import Signal
+from pixmetry.core.arrays import Singles
 
 PLACES = 24  # along each side of the frame, for the spread over it
 
@@ -60,7 +61,8 @@ def factor_verbs(factor: Callable[[Any, np.ndarray, np.ndarray, tuple[int, int]]
 
     def over_frame(params: Any, signal: Signal) -> np.ndarray:
         light = factor(params, signal.cols[:, None, :].astype(float), signal.rows[:, :, None].astype(float), signal.frame_shape)
-        return np.maximum(light, 1e-3).astype(np.float32)  # cut off just above 0: the correction divides by it
+        shading: Singles = np.maximum(light, 1e-3).astype(np.float32)  # cut off just above 0: the correction divides by it
+        return shading
 
     def forward(params: Any, signal: Signal, stream: Any) -> Signal:
         """Multiply the light by the factor."""

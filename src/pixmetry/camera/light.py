@@ -16,6 +16,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from pixmetry.camera._camera_kernels import decimate
+from pixmetry.core.arrays import Array, Ints, Singles
 from pixmetry.core.errors import InputError
 from pixmetry.core.random import Grid
 
@@ -193,7 +194,7 @@ class Light:
     @property
     def moments(self) -> tuple[np.ndarray, np.ndarray]:
         """Times and weights, shape (n, rows or 1, m) each."""
-        if self.moments_s is None:
+        if self.moments_s is None or self.weights is None:
             middle = (self.time_s + 0.5 * self.exposure_s)[:, None, None]
             return middle, np.ones_like(middle)
         return self.moments_s, self.weights
@@ -287,7 +288,8 @@ class Light:
             out = self._at(times.mean(axis=2)[:, :1], slice(None)) * total
         else:
             out = self._moving(times, weights)
-        return np.maximum(out * self.sensitivity, 0.0).astype(np.float32)
+        in_pixels: Singles = np.maximum(out * self.sensitivity, 0.0).astype(np.float32)
+        return in_pixels
 
     def _moving(self, times: np.ndarray, weights: np.ndarray) -> np.ndarray:
         n, rows, cols = self.grid.size
@@ -313,11 +315,13 @@ class Light:
         y = (self.grid.row0[:, None] + rows).astype(float)[:, :, None]
         x = (self.grid.col0[:, None] + np.arange(self.grid.shape[1])).astype(float)[:, None, :]
         time = time_s[:, :, None]
-        if self.kernel is None:
+        mask = self._mask
+        if mask is None:
             if self.jitter_px is not None:
                 x, y = x + self.jitter_px[0][:, block], y + self.jitter_px[1][:, block]
             return self._averaged(x, y, time, self.aperture_px)
-        mask = self._mask if self.jitter_px is None else np.pad(self._mask, 2)
+        if self.jitter_px is not None:
+            mask = np.pad(mask, 2)
         m = mask.shape[0] // 2, mask.shape[1] // 2
         fine_y, fine_x = (_refined(v, axis, reach) for v, axis, reach in ((y, 1, m[0]), (x, 2, m[1])))
         fine, size = np.empty((len(fine_y), fine_y.shape[1], fine_x.shape[2])), (FINE, len(rows), self.grid.shape[1])
@@ -360,9 +364,9 @@ class Light:
         return seen
 
     @cached_property
-    def _mask(self) -> np.ndarray:
-        """Weights of the raster about a pixel's centre: what a point gives to its right, a pixel takes from its left."""
-        return np.ascontiguousarray(self.kernel[::-1, ::-1])
+    def _mask(self) -> np.ndarray | None:
+        """Weights of the raster about a pixel's centre, if there is one: what a point gives to its right, a pixel takes from its left."""
+        return None if self.kernel is None else np.ascontiguousarray(self.kernel[::-1, ::-1])
 
     def _averaged(self, x: np.ndarray, y: np.ndarray, time: np.ndarray, cell: tuple[float, float]) -> np.ndarray:
         """Light averaged over a cell about every point, through all spreads but the tabulated one."""
@@ -403,7 +407,7 @@ class Light:
         """Light averaged over a cell about the points ``which`` of the batch; the cell is cut into ``parts`` along each side."""
         exact = getattr(self.scene, "averaged", None)
         places, total = _Places(which, self), np.zeros(len(x))
-        size = None if exact is None else places.size(x, y, cell[0] / parts, cell[1] / parts)
+        size = () if exact is None else places.size(x, y, cell[0] / parts, cell[1] / parts)
         levels = [
             (mine, share, replace(centre if mine is None else centre.take(mine), blur_px=np.sqrt(self.blur_px2 + level)))
             for mine, share, level in _levels(variance)
@@ -434,7 +438,8 @@ class Light:
         spread2 = blur2 + 1.0 / 12.0
         turned = (2.0 * turn / spread2**2) ** 0.25 if blur2 > 0.04 else 30.0 * np.sqrt(np.maximum(turn, shear))
         parts = np.maximum(np.sqrt(100.0 * shear / spread2), turned)
-        return np.clip(np.ceil(parts - 1e-3), 1, 12).astype(np.int64)
+        count: Ints = np.clip(np.ceil(parts - 1e-3), 1, 12).astype(np.int64)
+        return count
 
     def _nodes(self, cell: tuple[float, float], dots: Any, boxes: int = 0) -> Iterator[tuple[float, float, float]]:
         """Offsets and weights that stand for the aperture and the dots; or for the dots and the aperture cut into ``boxes``²."""
@@ -489,7 +494,8 @@ def _taps(variance: float) -> np.ndarray:
 
     reach = int(np.ceil(6 * variance**0.5 + 2)) if variance > 1e-6 else 0
     weights = ive(np.abs(np.arange(-reach, reach + 1)), variance)
-    return weights / weights.sum()
+    normalised: Array = weights / weights.sum()
+    return normalised
 
 
 def _both_tails(one: tuple[np.ndarray, np.ndarray | None], two: tuple[np.ndarray, np.ndarray | None]) -> np.ndarray | None:
@@ -577,4 +583,5 @@ def _refined(v: np.ndarray, axis: int, reach: int) -> np.ndarray:
 def _slope(mask: np.ndarray, axis: int) -> np.ndarray:
     """The mask under which the raster's derivative per pixel is seen: differences of fourth order; the mask's rim of two cells is 0."""
     one, two = (np.roll(mask, k, axis) - np.roll(mask, -k, axis) for k in (1, 2))
-    return FINE * (8 * one - two) / 12
+    slope: Array = FINE * (8 * one - two) / 12
+    return slope

@@ -97,7 +97,7 @@ class Line:
     def echoed(self, delay_s: Any, amplitude: Any) -> Line:
         """Return the line after several paths of these delays and amplitudes."""
         d, a = (np.atleast_1d(np.asarray(v, float)) for v in (delay_s, amplitude))
-        if self.echo_delay_s is not None:
+        if self.echo_delay_s is not None and self.echo_amplitude is not None:
             d = (self.echo_delay_s[:, None] + d).ravel()
             a = (self.echo_amplitude[:, None] * a).ravel()
             d, same = np.unique(np.round(d, 16), return_inverse=True)  # to a ten-millionth of a nanosecond: equal cables share their echoes
@@ -212,7 +212,7 @@ class Line:
     def delay_s(self) -> float:
         """First moment of the impulse response of filters and echoes: how much later the centroid of anything comes."""
         total = sum(group_delay_s(z, p) for z, p in self.filters)
-        if self.echo_delay_s is not None:
+        if self.echo_delay_s is not None and self.echo_amplitude is not None:
             total += float((self.echo_delay_s * self.echo_amplitude).sum() / self.echo_amplitude.sum())
         return total
 

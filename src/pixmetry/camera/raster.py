@@ -9,6 +9,7 @@ from scipy.optimize import nnls
 from scipy.special import ndtr
 
 from pixmetry.camera.light import FINE, veil_step
+from pixmetry.core.arrays import Array
 
 Transfer = Callable[[np.ndarray, np.ndarray], np.ndarray]
 Beyond = Callable[[np.ndarray], np.ndarray]
@@ -106,4 +107,5 @@ def _hat(f: np.ndarray, variance_px2: float) -> np.ndarray:
 def _share(f: np.ndarray) -> np.ndarray:
     """Weight of a frequency: 1 below the band's limit, 0 above it, blended over it; the weights of all periods sum to 1."""
     t = np.clip((np.abs(f) - BAND + BLEND) / (2 * BLEND), 0.0, 1.0)
-    return np.cos(0.5 * np.pi * t) ** 2
+    share: Array = np.cos(0.5 * np.pi * t) ** 2
+    return share

@@ -155,6 +155,20 @@ class Signal:
         """Absolute column numbers, shape (n, cols)."""
         return self.grid.col0[:, None] + np.arange(self.data.shape[2])
 
+    @property
+    def own_light(self) -> Light:
+        """The light of a signal of that kind; every other signal has none, and to ask it for some is a mistake in a program."""
+        if self.light is None:
+            raise TypeError(f"a signal of the kind {self.kind} holds no light")
+        return self.light
+
+    @property
+    def own_line(self) -> Line:
+        """The line of a signal of the kind ``VIDEO``, as `own_light`."""
+        if self.line is None:
+            raise TypeError(f"a signal of the kind {self.kind} holds no line")
+        return self.line
+
     def with_data(self, data: np.ndarray, kind: Kind | None = None) -> Signal:
         """The same windows with new numbers (and, where the source converts, a new kind)."""
         return replace(self, data=data, kind=self.kind if kind is None else kind)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from pixmetry.core.arrays import Array
 from pixmetry.core.errors import ParameterError
 
 FIRST_NM, LAST_NM = 300.0, 1200.0
@@ -26,12 +27,14 @@ REFRACTIVE_INDEX = np.array(
 
 def absorption_per_um(wavelength_nm: np.ndarray | float) -> np.ndarray:
     """Absorption coefficient at 300 K in 1/µm, interpolated in its logarithm; constant beyond 300 nm and 1200 nm."""
-    return np.exp(np.interp(wavelength_nm, WAVELENGTH_NM, np.log(ABSORPTION_PER_CM))) * 1e-4
+    absorption: Array = np.exp(np.interp(wavelength_nm, WAVELENGTH_NM, np.log(ABSORPTION_PER_CM))) * 1e-4
+    return absorption
 
 
 def refractive_index(wavelength_nm: np.ndarray | float) -> np.ndarray:
     """Real part of the refractive index at 300 K."""
-    return np.interp(wavelength_nm, WAVELENGTH_NM, REFRACTIVE_INDEX)
+    index: Array = np.interp(wavelength_nm, WAVELENGTH_NM, REFRACTIVE_INDEX)
+    return index
 
 
 def absorption_per_cm(wavelength_nm: np.ndarray | float) -> np.ndarray:

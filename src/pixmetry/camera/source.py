@@ -199,9 +199,12 @@ class Source:
 
 def run(source: Source, params: Any, signal: Signal, stream: Stream, state: Any = None) -> tuple[Signal, Any]:
     """Call ``forward`` of any source, with or without a memory."""
+    if source.forward is None:
+        raise TypeError(f"{source.id} cannot stand in a camera: {source.reasons['forward']}")
     if source.start is None:
         return source.forward(params, signal, stream), None
-    return source.forward(params, signal, stream, source.start(params) if state is None else state)
+    following: tuple[Signal, Any] = source.forward(params, signal, stream, source.start(params) if state is None else state)
+    return following
 
 
 def cut_map(maps: Mapping[str, np.ndarray], name: str, signal: Signal) -> np.ndarray:
@@ -217,7 +220,8 @@ def cut_map(maps: Mapping[str, np.ndarray], name: str, signal: Signal) -> np.nda
             allowed=str(signal.frame_shape),
             remedy="use maps of this camera",
         )
-    return maps[name][signal.rows[:, :, None], signal.cols[:, None, :]]
+    window: np.ndarray = maps[name][signal.rows[:, :, None], signal.cols[:, None, :]]
+    return window
 
 
 def bounds_text(field: Any) -> str:

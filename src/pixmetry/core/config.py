@@ -155,7 +155,7 @@ def validate(model: type[AnyModel], data: Mapping[str, Any], where: str = "") ->
 
 
 def _of_schema(error: Any) -> bool:
-    return error["loc"] == ("schema",) and error["type"] == "literal_error"
+    return (error["loc"], error["type"]) == (("schema",), "literal_error")
 
 
 def _place_in(data: Any, error: Any) -> tuple[str | int, ...]:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from pixmetry.core.arrays import Array
 from pixmetry.core.errors import MeasureError
 
 ONE_SIDED_95, TWO_SIDED_95 = 1.6448536, 1.959964  # coverage factors of the normal distribution
@@ -42,7 +43,8 @@ def effective_dof(variances: ArrayLike, dof: ArrayLike, total: ArrayLike | None 
     # in shares of the total, so that no power of a small u is lost
     shares = np.divide(variances, whole[..., None], out=np.zeros(variances.shape), where=whole[..., None] > 0)
     weight = (shares**2 / dof).sum(axis=-1)
-    return np.divide(1.0, weight, out=np.full(np.shape(weight), np.inf), where=weight > 0)
+    effective: Array = np.divide(1.0, weight, out=np.full(np.shape(weight), np.inf), where=weight > 0)
+    return effective
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pixmetry.core import _binomial_kernels as binomial_kernels
 from pixmetry.core import _random_kernels as kernels
+from pixmetry.core.arrays import Singles
 from pixmetry.core.errors import ParameterError
 
 _ZERO = np.zeros(1, np.int64)
@@ -115,7 +116,8 @@ class Stream:
             part = whole[grid.row0[0] : grid.row0[0] + rows, grid.col0[0] : grid.col0[0] + cols].astype(np.float32)
             return np.broadcast_to(part, grid.size)
         at = grid.row0[:, None, None] + np.arange(rows)[:, None], grid.col0[:, None, None] + np.arange(cols)
-        return whole[at].astype(np.float32)
+        in_windows: Singles = whole[at].astype(np.float32)
+        return in_windows
 
     def known_unit(self, name: str) -> np.ndarray | None:
         """Return what was measured of the unit as a whole under a name; None where nothing was."""
@@ -151,7 +153,8 @@ class Stream:
 
     def normal_unit(self, count: int, draw: int = 0) -> NDArray[np.float32]:
         """Return `count` standard normal numbers fixed in the unit, shape (count,); a shorter call gives the first of them."""
-        return self._lines(self._key("unit", "normal unit", draw), _ZERO, _ZERO, count)[0]
+        numbers: Singles = self._lines(self._key("unit", "normal unit", draw), _ZERO, _ZERO, count)[0]
+        return numbers
 
     def uniform(self, grid: Grid, draw: int = 0) -> NDArray[np.float32]:
         """Return uniform numbers in (0, 1), shape (n, rows, cols), new in every frame."""
@@ -167,7 +170,8 @@ class Stream:
 
     def uniform_unit(self, count: int, draw: int = 0) -> NDArray[np.float32]:
         """Return `count` uniform numbers fixed in the unit, shape (count,); a shorter call gives the first of them."""
-        return self._lines(self._key("unit", "uniform unit", draw), _ZERO, _ZERO, count, uniform=True)[0]
+        numbers: Singles = self._lines(self._key("unit", "uniform unit", draw), _ZERO, _ZERO, count, uniform=True)[0]
+        return numbers
 
     def poisson(self, mean: ArrayLike, grid: Grid, draw: int = 0) -> NDArray[np.float32]:
         """Return Poisson numbers, shape (n, rows, cols), new in every frame.

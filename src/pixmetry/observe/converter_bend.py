@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pixmetry.camera.observations import Observations
+from pixmetry.core.arrays import Array
 from pixmetry.observe.linearity import COEFFICIENTS, Linearity
 from pixmetry.observe.photon_transfer_model import transfer
 
@@ -84,7 +85,8 @@ def _kernel(one: np.ndarray, other: np.ndarray, slope_one: np.ndarray, slope_oth
     k = np.exp(-0.5 * (t / length) ** 2)
     a, b = slope_one[:, None], slope_other[None, :]
     value_slope, slopes = k * t / length**2, k * (1 / length**2 - t**2 / length**4)
-    return np.where(a & b, slopes, np.where(b, value_slope, np.where(a, -value_slope, k)))
+    kernel: Array = np.where(a & b, slopes, np.where(b, value_slope, np.where(a, -value_slope, k)))
+    return kernel
 
 
 def _data(seen: Observations, bits: int) -> tuple[np.ndarray, ...] | None:

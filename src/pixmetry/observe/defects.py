@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pixmetry.camera.observations import DefectList, LevelMoments, PhotonTransfer, StackMoments
+from pixmetry.core.arrays import Array
 from pixmetry.core.errors import InputError
 from pixmetry.observe.photon_transfer_levels import core_spread_dn2
 from pixmetry.observe.photon_transfer_model import QUANTISATION_DN2, white_before_rounding
@@ -38,7 +39,7 @@ def _without_lines(image: np.ndarray, least_clip: float = 0.0) -> np.ndarray:
     Medians alone would do less well: pixels near the middle draw them along, so that the core looks narrower than the tails are, and
     the median of coarse codes is itself a code. A defect moves a clipped mean by no more than the clip over the number of pixels.
     """
-    residual = image - median(image, axis=0)[None, :]
+    residual: Array = image - median(image, axis=0)[None, :]
     residual -= median(residual, axis=1)[:, None]
     clip = max(4 * robust_sigma(residual), least_clip)
     for axis in (0, 1):
@@ -157,7 +158,8 @@ def _core_of_codes_dn(mean_map: np.ndarray) -> float:
 
 def _beyond(deviation: np.ndarray, slack: float) -> np.ndarray:
     """What of the deviations goes beyond ``slack``, with their sign."""
-    return np.sign(deviation) * np.maximum(np.abs(deviation) - slack, 0.0)
+    rest: Array = np.sign(deviation) * np.maximum(np.abs(deviation) - slack, 0.0)
+    return rest
 
 
 def _noise_z(stack: StackMoments, coarse: bool) -> np.ndarray:
@@ -300,7 +302,8 @@ def without_hot_pixels(series: PhotonTransfer, stack: StackMoments | None) -> tu
     order = np.argsort(series.dark.exposure_s, kind="stable")
 
     def beside(values: np.ndarray) -> np.ndarray:
-        return np.interp(series.bright.exposure_s, series.dark.exposure_s[order], values[order])
+        between: Array = np.interp(series.bright.exposure_s, series.dark.exposure_s[order], values[order])
+        return between
 
     shape = series.frame_shape
     dark = _less(series.dark, shape, tails[:, 0], tails[:, 1], noise)

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pixmetry.camera.observations import LevelMoments
+from pixmetry.core.arrays import Ints
 from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.observe._kernels import accumulate_frame, count_codes, sum_maps, sum_pair, sum_squares
 from pixmetry.observe.defects import HotTail
@@ -137,7 +138,8 @@ class FrameMoments:
     def counts(self) -> np.ndarray:
         """Occurrences of each code, shape (2**bits,), int64."""
         self._need(1)
-        return self._counts.sum(axis=0)
+        of_codes: Ints = self._counts.sum(axis=0)
+        return of_codes
 
     def _need(self, frames: int) -> None:
         if self.n_frames < frames:

@@ -216,7 +216,7 @@ def _dnl_lsb(codes: CodeErrors | None) -> float:
     return codes.fit["dnl_rms_lsb"].value
 
 
-def _codes(counts, notes: list[str]) -> CodeErrors | None:
+def _codes(counts: CodeHistogram, notes: list[str]) -> CodeErrors | None:
     try:
         return code_errors(counts)
     except MeasureError as problem:
@@ -322,8 +322,8 @@ def _gain(
     at = int(np.argmin(relative))
     if not relative[at] < 1 / NOT_SIGNIFICANT:
         return None
-    known = bright.photons is not None and bool(bright.photons[at] > 0)
-    efficiency = float(signal[at] / (gain[at] * bright.photons[at])) if known else None
+    photons = 0.0 if bright.photons is None else float(bright.photons[at])
+    efficiency = float(signal[at] / (gain[at] * photons)) if photons > 0 else None
     return float(gain[at]), float(u[at]), efficiency
 
 

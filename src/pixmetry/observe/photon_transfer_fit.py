@@ -8,6 +8,7 @@ same model with every weight and variance component known: no unbiased estimator
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -311,7 +312,7 @@ def _add_dark_current(rows: _Rows, p: np.ndarray, time_scale: float) -> None:
     var_row = {DARK_VAR_SLOPE: 1 / (gain**2 * time_scale), GAIN: -2 * from_var / gain}
     c = rows.covariance
 
-    def u_of(row):
+    def u_of(row: Mapping[int, float]) -> float:
         k, g = list(row), np.array(list(row.values()))
         return float(np.sqrt(g @ c[np.ix_(k, k)] @ g))
 
@@ -573,4 +574,4 @@ def fit_range(levels: model.Levels, keep: np.ndarray, prior: np.ndarray) -> tupl
 
 def _chi2_limit(dof: int) -> float:
     """Upper 0.1 % point of chi-squared (Wilson & Hilferty 1931)."""
-    return dof * (1 - 2 / (9 * dof) + LACK_OF_FIT_Z * np.sqrt(2 / (9 * dof))) ** 3
+    return float(dof * (1 - 2 / (9 * dof) + LACK_OF_FIT_Z * np.sqrt(2 / (9 * dof))) ** 3)

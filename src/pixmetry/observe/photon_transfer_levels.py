@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from pixmetry.camera.observations import LevelMoments, PhotonTransfer, StackMoments
+from pixmetry.core.arrays import Flags
 from pixmetry.core.errors import MeasureError
 from pixmetry.observe import photon_transfer_model as model
 
@@ -106,7 +107,8 @@ def levels_from(
     both = {name: np.concatenate([getattr(pt.dark, name), getattr(pt.bright, name)]).astype(float) for name in names}
     is_bright = np.arange(both["mean_dn"].size) >= pt.dark.mean_dn.size
     light = np.zeros(is_bright.size)
-    light[is_bright] = (pt.bright.exposure_s if by_exposure else pt.bright.photons) / scale
+    photons = pt.bright.photons
+    light[is_bright] = (pt.bright.exposure_s if by_exposure or photons is None else photons) / scale
     time_scale = float(max(both["exposure_s"].max(), 1e-12))
     lines = np.maximum(temporal_row_col_vars(pt)[0], 0) @ [1 / rows, 1 / cols]
     black = pt.dark.mean_dn.mean()
@@ -151,7 +153,8 @@ def clipped_black(pt: PhotonTransfer) -> float:
 def unclipped_bright(pt: PhotonTransfer) -> np.ndarray:
     """Bright levels without pixels at either end, but for those that always are (stuck and hot ones)."""
     stuck, hot = pt.bright.fraction_min.min(), pt.dark.fraction_max.max(initial=0.0)
-    return (pt.bright.fraction_max - hot <= USABLE_FRACTION) & (pt.bright.fraction_min - stuck <= USABLE_FRACTION)
+    unclipped: Flags = (pt.bright.fraction_max - hot <= USABLE_FRACTION) & (pt.bright.fraction_min - stuck <= USABLE_FRACTION)
+    return unclipped
 
 
 def refuse_dead_series(pt: PhotonTransfer) -> None:

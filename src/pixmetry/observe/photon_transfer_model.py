@@ -16,6 +16,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from pixmetry.core.arrays import Array
+
 PARAMETERS = ("offset", "slope", "gain", "dark_var", "a1", "a2", "a3", "light_offset", "dark_slope", "dark_var_slope", "q_mean", "q_var")
 OFFSET, SLOPE, GAIN, DARK_VAR, A1, A2, A3, LIGHT_OFFSET, DARK_SLOPE, DARK_VAR_SLOPE, Q_MEAN, Q_VAR = range(12)
 QUANTISATION_DN2 = 1.0 / 12.0
@@ -79,7 +81,7 @@ def transfer(x: np.ndarray, a: np.ndarray, x_ref: float) -> tuple[np.ndarray, np
     return f, f1, f2, f3
 
 
-def stored_moments(x: np.ndarray, v: np.ndarray, gain: float, signal: np.ndarray, spread: np.ndarray, a: np.ndarray, x_ref: float):
+def stored_moments(x: Array, v: Array, gain: float, signal: Array, spread: Array, a: Array, x_ref: float) -> tuple[Array, Array]:
     """Mean above black and temporal variance of stored values, for a linear signal of mean ``x`` and variance ``v``.
 
     Second-order expansion: mean f + ½f''(v + s²); variance f'²v + f'f''m₃ + (½f''² + f'f''')v², averaged over a spatial spread s² of x,
@@ -92,7 +94,7 @@ def stored_moments(x: np.ndarray, v: np.ndarray, gain: float, signal: np.ndarray
     return mean, var + QUANTISATION_DN2
 
 
-def signal_from_mean(stored: np.ndarray, a: np.ndarray, x_ref: float, correction: np.ndarray) -> np.ndarray:
+def signal_from_mean(stored: Array, a: Array, x_ref: float, correction: Array) -> Array:
     """Linear signal x of f(x) + correction = stored, by Newton's method."""
     x = stored - correction
     for _ in range(6):
@@ -173,8 +175,9 @@ def linearise(p: np.ndarray, d: Levels) -> Linearised:
 
     shown_x = 0.0 if is_hidden(d) else dark_x  # of the dark signal: that part whose noise the dark frames show
 
-    def noise(x):
-        return p[DARK_VAR] + p[GAIN] * (x - shown_x) + p[DARK_VAR_SLOPE] * d.time
+    def noise(x: Array) -> Array:
+        variance: Array = p[DARK_VAR] + p[GAIN] * (x - shown_x) + p[DARK_VAR_SLOPE] * d.time
+        return variance
 
     _, f1_pred, _, _ = transfer(x_pred, a, x_ref)
     spread = d.spatial / f1_pred**2

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from pixmetry.camera.observations import DefectList, PatternList, StackMoments
+from pixmetry.core.arrays import Array
 from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.core.number import ONE_SIDED_95, Estimates, effective_dof
 from pixmetry.observe.linearity import Linearity
@@ -39,7 +40,8 @@ class _MeanSquares:
 
     def relative_variances(self) -> np.ndarray:
         # Var(MS) = MS² (2/ν + γ₂/n), γ₂ the excess kurtosis of what was squared
-        return 2.0 / self.dof + self.kurtosis / self.dof
+        relative: Array = 2.0 / self.dof + self.kurtosis / self.dof
+        return relative
 
 
 def fit_spatial(
@@ -475,4 +477,5 @@ def _not_round_var(along_x: np.ndarray, along_y: np.ndarray, coefficients: np.nd
 def _centre(basis: np.ndarray) -> np.ndarray:
     """Values of the basis at the centre of the grid: the mean of its two middle pixels (one pixel, if the number is odd)."""
     n = basis.shape[0]
-    return 0.5 * (basis[(n - 1) // 2] + basis[n // 2])
+    centre: Array = 0.5 * (basis[(n - 1) // 2] + basis[n // 2])
+    return centre

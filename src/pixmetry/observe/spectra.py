@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from pixmetry.camera.observations import Spectra
+from pixmetry.core.arrays import Array
 from pixmetry.core.errors import InputError, MeasureError
 
 GRAIN_DN2 = 2.0**-12  # powers are rounded to this, so that their sum is exact and does not depend on the order
@@ -25,7 +26,8 @@ def periodogram(image: np.ndarray) -> np.ndarray:
     from scipy.fft import rfft2
 
     spectrum = rfft2(image - image.mean(dtype=float).astype(image.dtype))
-    return (spectrum.real**2 + spectrum.imag**2) / image.size
+    power: Array = (spectrum.real**2 + spectrum.imag**2) / image.size
+    return power
 
 
 def _profiles(power: np.ndarray, cols: int) -> tuple[np.ndarray, np.ndarray]:

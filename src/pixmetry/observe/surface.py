@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pixmetry.core.arrays import Array
+
 
 def orthonormal_polynomials(n: int, degree: int) -> tuple[np.ndarray, np.ndarray]:
     """Polynomials that are orthonormal over n equidistant pixels, and their slopes at the centre.
@@ -60,7 +62,7 @@ class Surface:
 
     def coefficient_variances(self, pixel: float, row: float, col: float) -> np.ndarray:
         """Variances of the coefficients from the per-pixel mean squares of the three strata; the constant term is given none."""
-        variances = np.full(self.coefficients.shape, pixel) * _total_degree(self.degree)
+        variances: Array = np.full(self.coefficients.shape, pixel) * _total_degree(self.degree)
         variances[:, 0], variances[0, :] = row, col
         variances[0, 0] = 0.0
         return variances

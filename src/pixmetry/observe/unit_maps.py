@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pixmetry.camera.observations import CodeErrors, Observations, PatternList
+from pixmetry.camera.observations import CodeErrors, DefectList, Observations, PatternList, StackMoments
+from pixmetry.core.arrays import Array
 from pixmetry.core.errors import MeasureError
 from pixmetry.observe.histogram import neighbour_weights
 from pixmetry.observe.linearity import Linearity
@@ -86,7 +87,7 @@ def unit_maps(seen: Observations, bits: int) -> UnitMaps:
     relative = np.clip((bright_map - dark_map)[at] / ((1 + response) * surface.values)[at], 0.0, None)
     excess = dark_map[at] - float(maps.dark_dn.mean()) - offset[at]
     offset[at] += np.minimum(excess, 0.0)  # below the others there is no charge that could be taken away
-    pixels = np.column_stack([row, col, relative, np.maximum(excess, 0.0), _own_noise_dn(seen, at)]).astype(float)
+    pixels = np.column_stack([row, col, relative, np.maximum(excess, 0.0), _own_noise_dn(seen.dark_stack, seen.defects, at)]).astype(float)
     whole = (1 + response) * surface.values
     whole[at] *= relative
     return UnitMaps(
@@ -112,16 +113,17 @@ def _with_true_spread(image: np.ndarray, noise: Strata, dof: np.ndarray, n_frame
     u = t * np.sqrt(2 / dof + (2 / (dof[:, None] * (n_frames - 1))).max(axis=1))
     share = np.where(found > t + SIGNIFICANT * u, 1 - t / np.maximum(found, 1e-300), 0.0)
     of_pixel, of_row, of_col = np.sqrt(np.maximum(share, 0.0))
-    return of_pixel * pixel + of_row * row[:, None] + of_col * col[None, :]
+    spread: Array = of_pixel * pixel + of_row * row[:, None] + of_col * col[None, :]
+    return spread
 
 
-def _own_noise_dn(seen: Observations, at: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+def _own_noise_dn(dark: StackMoments, defects: DefectList | None, at: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
     """Temporal noise of the noisy ones among the pixels, beyond that of the others; 0 for all else."""
-    variance = seen.dark_stack.var_map_dn2
+    variance = dark.var_map_dn2
     noisy = np.zeros(variance.shape, bool)
-    if seen.defects is not None:
-        of_noise = np.array([kind == "noisy" for kind in seen.defects.kind], bool)
-        noisy[seen.defects.row[of_noise], seen.defects.col[of_noise]] = True
+    if defects is not None:
+        of_noise = np.array([kind == "noisy" for kind in defects.kind], bool)
+        noisy[defects.row[of_noise], defects.col[of_noise]] = True
     more = np.maximum(variance[at].astype(float) - float(np.median(variance)), 0.0)
     return np.sqrt(np.where(noisy[at], more, 0.0))
 

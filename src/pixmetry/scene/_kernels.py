@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from pixmetry.core.arrays import Array, Ints
+from pixmetry.core.arrays import Array, Ints, Singles
 from pixmetry.core.jit import jit
 
 # Gauss–Legendre nodes and weights on (-1/2, 1/2)
@@ -16,7 +16,7 @@ WEIGHTS = 0.5 * np.array([5.0 / 9.0, 8.0 / 9.0, 5.0 / 9.0])
 
 @jit
 def add_discs(
-    out: Array,
+    out: Singles,
     x: Array,
     y: Array,
     entry: Ints,

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pixmetry.camera.light import Points
+from pixmetry.core.arrays import Array, Singles
 from pixmetry.core.errors import ParameterError
 from pixmetry.core.random import Grid
 from pixmetry.scene._kernels import add_discs, see_discs
@@ -34,7 +35,8 @@ def radial_profile(diameter_px: float, blur_px: float) -> np.ndarray:
 
     radius = 0.5 * diameter_px
     rho = np.arange(0.0, radius + REACH * blur_px + 1.0 + 2 * STEP, STEP)
-    return chndtr((radius / blur_px) ** 2, 2, np.maximum((rho / blur_px) ** 2, 1e-300))
+    profile: Array = chndtr((radius / blur_px) ** 2, 2, np.maximum((rho / blur_px) ** 2, 1e-300))
+    return profile
 
 
 @dataclass(frozen=True)
@@ -101,7 +103,8 @@ class Discs:
         peak = np.broadcast_to(np.asarray(self.peak_photons, float), (x.shape[1],))[which] * scale[entry]
         split = 1 if self.blur_px >= 0.5 else int(np.ceil(0.5 / self.blur_px))
         add_discs(out, x[entry, which], y[entry, which], entry, grid.row0, grid.col0, profile, STEP, inner, outer, peak, split)
-        return np.maximum(out, 0, out=out)
+        light: Singles = np.maximum(out, 0, out=out)
+        return light
 
     @property
     def moving(self) -> bool:
@@ -125,10 +128,12 @@ class Discs:
         out = self.background.radiance(at)
         blur = float(np.hypot(self.blur_px, at.blur_px))
         if self._count <= FEW and max(np.max(width, initial=0.0), np.max(height, initial=0.0)) <= 2 * blur:
-            return np.maximum(out + scale * self._few(at, width, height, blur), 0.0)
-        for shapes, which in self._seen(at):
-            out[which] += scale[which] * shapes.sums(at.take(which), width[which], height[which], False)[0]
-        return np.maximum(out, 0.0)
+            out = out + scale * self._few(at, width, height, blur)
+        else:
+            for shapes, which in self._seen(at):
+                out[which] += scale[which] * shapes.sums(at.take(which), width[which], height[which], False)[0]
+        light: Array = np.maximum(out, 0.0)
+        return light
 
     @property
     def _count(self) -> int:

@@ -313,20 +313,19 @@ def build_scene(model: SceneModel, frame_shape: tuple[int, int], where: str = "s
     background = background_of(model)
     layered = bool(model.targets) or any(v is not None for v in (model.plate, model.spot, model.motion, model.lighting))
     if not layered:
-        return background if model.discs is None else _discs(model, frame_shape, background)
+        return background if model.discs is None else _discs(model.discs, frame_shape, background)
     try:
         motion = STILL if model.motion is None else Motion(**model.motion.model_dump())
         layers = [*_targets(model, motion), *_plate(model, motion, frame_shape), *_spot(model, motion)]
         if model.discs is not None:
-            layers += [_discs(model, frame_shape, Uniform()).layer(motion)]
+            layers += [_discs(model.discs, frame_shape, Uniform()).layer(motion)]
         return Picture(tuple(layers), background, _lighting(model, frame_shape))
     except ParameterError as problem:
         place = ": ".join(part for part in (where, problem.where) if part)
         raise InputError(problem.what, where=place, value=problem.value, allowed=problem.allowed, remedy=problem.remedy) from None
 
 
-def _discs(model: SceneModel, frame_shape: tuple[int, int], background: Uniform) -> Discs:
-    discs = model.discs
+def _discs(discs: DiscsModel, frame_shape: tuple[int, int], background: Uniform) -> Discs:
     x, y = list(discs.x_px), list(discs.y_px)
     if discs.lattice_px is not None:
         rows, cols = frame_shape

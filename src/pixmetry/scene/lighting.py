@@ -7,6 +7,7 @@ from typing import Literal
 
 import numpy as np
 
+from pixmetry.core.arrays import Array
 from pixmetry.core.errors import ParameterError
 
 Surface = Literal["gradient", "lambert", "glossy", "retro"]
@@ -79,7 +80,8 @@ class Lighting:
             return np.maximum(1 + self.gradient_x_per_px * u + self.gradient_y_per_px * v, 0.0)
         zero = np.zeros(1)
         if self.relative_to == "centre":
-            return self._brightness(u, v) / self._brightness(zero, zero)[0]
+            relative: Array = self._brightness(u, v) / self._brightness(zero, zero)[0]
+            return relative
         return self._brightness(u, v) * float(np.dot(self.lamp_px, self.lamp_px))
 
     def with_slopes(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -108,7 +110,8 @@ class Lighting:
             lobe = np.exp(-0.5 * (between / np.deg2rad(self.lobe_width_deg)) ** 2)
         else:
             lobe = np.zeros_like(facing)
-        return facing / distance**2 * (1 + self.lobe_gain * lobe)
+        brightness: Array = facing / distance**2 * (1 + self.lobe_gain * lobe)
+        return brightness
 
 
 def _unit(v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -32,7 +33,7 @@ class Outline:
     segments: np.ndarray
     height_photons: float
     oval: np.ndarray | None = None
-    target: dict = field(default_factory=dict)
+    target: dict[str, Any] = field(default_factory=dict)
 
     def box(self) -> tuple[float, float, float, float]:
         """The least x and y, and the greatest."""

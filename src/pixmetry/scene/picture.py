@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pixmetry.camera.light import Points
+from pixmetry.core.arrays import Array, Singles
 from pixmetry.core.random import Grid
 from pixmetry.scene.lighting import Lighting
 from pixmetry.scene.shapes import pixel_points
@@ -74,7 +75,8 @@ class Picture:
         total *= scale
         total[0] += self.background.photons(grid, frame_shape, exposure_s, time_s)
         at = pixel_points(grid, frame_shape, middle, exposure_s) if lit else None
-        return np.maximum(self._lit(total, at) + own * scale, 0.0).astype(np.float32)
+        seen: Singles = np.maximum(self._lit(total, at) + own * scale, 0.0).astype(np.float32)
+        return seen
 
     def radiance(self, at: Points) -> np.ndarray:
         """Light at points after the blur, float64."""
@@ -94,13 +96,16 @@ class Picture:
         scale = self.background.photons_scale(exposure.ravel()).reshape(exposure.shape)
         total *= scale
         total[0] += self.background.radiance(at)
-        return np.maximum(self._lit(total, at) + own * scale, 0.0)
+        seen: Array = np.maximum(self._lit(total, at) + own * scale, 0.0)
+        return seen
 
-    def _lit(self, total: np.ndarray, at: Points | None) -> np.ndarray:
+    def _lit(self, total: Array, at: Points | None) -> Array:
+        lit: Array = total[0]
         if self.lighting is None or at is None:
-            return total[0]
+            return lit
         factor, along_x, along_y = self.lighting.with_slopes(at.x_px, at.y_px)
-        return factor * total[0] + along_x * total[1] + along_y * total[2]
+        lit = factor * total[0] + along_x * total[1] + along_y * total[2]
+        return lit
 
     def detailed(self, at: Points, reach_px: ArrayLike) -> np.ndarray:
         """Where the light may vary by more than a slope within a reach of each point."""

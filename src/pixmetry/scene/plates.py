@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pixmetry.core.arrays import Array
 from pixmetry.core.errors import ParameterError
 from pixmetry.scene.motion import STILL, Motion
 from pixmetry.scene.outlines import Outline, polygon
@@ -51,7 +52,8 @@ class Pose:
         turn = about_z @ about_y @ about_x
         c = self.principal_distance_px
         camera = np.array([[c, 0, self.principal_x_px], [0, c, self.principal_y_px], [0, 0, 1]])
-        return camera @ np.column_stack([turn[:, 0], turn[:, 1], [self.x_mm, self.y_mm, self.z_mm]])
+        plane_to_image: Array = camera @ np.column_stack([turn[:, 0], turn[:, 1], [self.x_mm, self.y_mm, self.z_mm]])
+        return plane_to_image
 
     def seen(self, x_mm: np.ndarray, y_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Images of points of the plate.

@@ -17,6 +17,8 @@ from pixmetry.scene import _contour_kernels as kernels
 from pixmetry.scene.motion import STILL, Motion
 from pixmetry.scene.outlines import Outline, whole_ovals
 
+Prepared = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]  # what the kernels take, see `_arrays`
+
 SHARP_PX = 1e-6  # a blur of 0 is taken as this
 MOST_NODES = 160  # of an ellipse that is integrated as a whole
 
@@ -100,10 +102,10 @@ class Shapes:
         return np.stack(low + [np.maximum.reduceat(v.max(axis=1), first) for v in (x, y)], axis=1)
 
     @cached_property
-    def _sets(self) -> dict[float, tuple]:
+    def _sets(self) -> dict[float, Prepared]:
         return {}
 
-    def _arrays(self, s: float) -> tuple:
+    def _arrays(self, s: float) -> Prepared:
         """What the kernels take for a blur ``s``."""
         found = self._sets.get(s)
         if found is None:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pixmetry.camera.light import Points
+from pixmetry.core.arrays import Array
 from pixmetry.core.errors import ParameterError
 from pixmetry.core.random import Grid, Stream
 from pixmetry.scene.motion import STILL, Motion
@@ -124,14 +125,16 @@ class Speckle:
         share = pupil.mean()
         if self.contrast == 0:  # incoherent: the mean of all realisations
             spread = np.abs(ifft2(pupil.astype(float))) ** 2
-            return self.peak_photons * np.maximum(ifft2(fft2(spot) * fft2(spread)).real / share, 0.0)
+            mean: Array = self.peak_photons * np.maximum(ifft2(fft2(spot) * fft2(spread)).real / share, 0.0)
+            return mean
         out = np.zeros_like(spot)
         for k, weight in enumerate(_weights(self.contrast)):
             grid = Grid.whole([realisation], spot.shape)
             phase = 2 * np.pi * Stream(0, self.seed, "scene.speckle").uniform(grid, k)[0].astype(float)
             field = ifft2(fft2(np.sqrt(spot) * np.exp(1j * phase)) * pupil)
             out += weight * (field.real**2 + field.imag**2)
-        return self.peak_photons * out / share
+        speckles: Array = self.peak_photons * out / share
+        return speckles
 
     def _splines(self, realisation: int, width_px: float, height_px: float, blur_px: float) -> np.ndarray:
         kept = _many if self.side <= SMALL_RASTER else _few
@@ -200,7 +203,8 @@ def _splines(frozen: _Frozen, realisation: int, width_px: float, height_px: floa
     f = fftfreq(spot.side, spot.step_px)
     across, down = (np.sinc(f * size) * np.exp(-2 * (np.pi * f * blur_px) ** 2) for size in (width_px, height_px))
     seen = ifft2(fft2(spot.intensity(realisation)) * (down[:, None] * across[None, :])).real
-    return spline_filter(seen, order=5, mode="mirror")
+    splines: Array = spline_filter(seen, order=5, mode="mirror")
+    return splines
 
 
 _many, _few = lru_cache(maxsize=24)(_splines), lru_cache(maxsize=3)(_splines)

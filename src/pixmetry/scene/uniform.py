@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pixmetry.camera.light import Points
+from pixmetry.core.arrays import Singles
 from pixmetry.core.errors import ParameterError
 from pixmetry.core.random import Grid
 
@@ -54,9 +55,10 @@ class Uniform:
 
     def photons(self, grid: Grid, frame_shape: tuple[int, int], exposure_s: np.ndarray, time_s: np.ndarray) -> np.ndarray:
         """Photons per pixel, shape (n, rows, cols), float32."""
-        return (self.level_photons * self.photons_scale(exposure_s)).astype(np.float32)[:, None, None] * np.broadcast_to(
+        light: Singles = (self.level_photons * self.photons_scale(exposure_s)).astype(np.float32)[:, None, None] * np.broadcast_to(
             self.photons_map(grid, frame_shape), grid.size
         )
+        return light
 
     def radiance(self, at: Points) -> np.ndarray:
         """Photons per pixel at points; no blur changes a slope."""

@@ -68,8 +68,8 @@ class Walk:
 
     def movers(self) -> list[Step]:
         """The sources that moved the centre in this frame, the strongest first."""
-        moved = [s for s in self.steps[1:] if s.moved is not None and np.hypot(*s.moved) > 1e-6]
-        return sorted(moved, key=lambda s: -np.hypot(*s.moved))
+        by = [(float(np.hypot(*s.moved)), s) for s in self.steps[1:] if s.moved is not None]
+        return [step for px, step in sorted(by, key=lambda pair: -pair[0]) if px > 1e-6]
 
 
 def chain(camera: str | Path | Camera, scene: Any, *, target: int | None = None, frame: int = 0, seed: int = 0) -> Walk:
@@ -190,7 +190,7 @@ def _images(camera: Camera, scene: Any, frame: int, seed: int, quiet: bool) -> I
             signal = look(signal)
         elif signal.kind is Kind.VIDEO:
             params = LineSources(tuple(on_line), camera.pixel_clock_hz)
-            signal = SAMPLE.forward(params, signal, streams.of(SAMPLE.id))
+            signal, _ = run(SAMPLE, params, signal, streams.of(SAMPLE.id))
         yield link, done, signal
 
 

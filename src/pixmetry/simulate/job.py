@@ -148,7 +148,11 @@ def simulate(
     if image_format not in FORMATS:
         raise InputError("no such image format", value=image_format, allowed=", ".join(FORMATS))
     bits = stored_bits(device)
-    parts = _series(model, frames, overrides) if model.photon_transfer is not None else _sequence(device, model, frames, scene)
+    parts = (
+        _series(model, model.photon_transfer, frames, overrides)
+        if model.photon_transfer is not None
+        else _sequence(device, model, frames, scene)
+    )
     shape = _checked_window(device, window)[2:]
     count = sum(len(p.numbers) for p in parts)
     check_memory(RECORD_BYTES * count, f"the record of {count} frames", remedy="make fewer frames at a time")
@@ -222,7 +226,7 @@ def _sequence(camera: Camera, model: SceneModel, frames: int, source: Any) -> li
     return [_Part(build_scene(model, camera.frame_shape, where), range(frames), "frame", {})]
 
 
-def _series(model: SceneModel, frames: int, overrides: Mapping[str, Any] | None) -> list[_Part]:
+def _series(model: SceneModel, series: SeriesModel, frames: int, overrides: Mapping[str, Any] | None) -> list[_Part]:
     if "exposure_s" in (overrides or {}):
         raise InputError(
             "a photon-transfer series sets its own exposures", value="exposure_s", remedy="set longest_exposure_s in the scene"
@@ -230,7 +234,7 @@ def _series(model: SceneModel, frames: int, overrides: Mapping[str, Any] | None)
     if frames != 1:
         raise InputError("a photon-transfer series has its own number of frames", value=frames, remedy="set frames_per_level in the scene")
     light, parts = background_of(model), []
-    for g in plan_series(model.photon_transfer):
+    for g in plan_series(series):
         entry = {"kind": g.kind, "role": g.role, "exposure_s": g.exposure_s} | ({"photons": g.photons} if g.kind == "bright" else {})
         numbers = range(g.first_frame, g.first_frame + g.count)
         parts.append(_Part(field_of(g, light), numbers, f"{g.kind}_{g.role}_{g.first_frame:05d}", {"exposure_s": g.exposure_s}, entry))

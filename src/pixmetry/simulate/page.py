@@ -66,7 +66,7 @@ def _result(section: Section, walk: Walk) -> None:
     if last.error is None:
         section.add(Answer([Text("The target cannot be told from its background in the stored frame.")]))
     else:
-        parts: list = [Text("Centre found in the stored frame less the true centre:"), _readings(last.error)]
+        parts: list[Text | list[Reading]] = [Text("Centre found in the stored frame less the true centre:"), _readings(last.error)]
         if last.expected_error is not None:
             x, y = (length_px(v) for v in last.expected_error)
             words = "Expected of this unit, every temporal draw at its mean: "

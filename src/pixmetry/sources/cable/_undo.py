@@ -18,6 +18,7 @@ import numpy as np
 
 from pixmetry.camera.line import Line
 from pixmetry.camera.signal import Signal
+from pixmetry.core.arrays import Array
 from pixmetry.core.errors import ParameterError
 from pixmetry.core.random import Grid
 from pixmetry.core.threads import single_threaded_blas
@@ -94,11 +95,13 @@ def _effect(rest_key: Key, whole_key: Key, col0: int, samples: int) -> np.ndarra
     nearest = np.maximum(1 - np.abs(at[:, None] - np.arange(samples)), 0.0) / whole.level
     normal = a.T @ a
     normal[np.diag_indices(pixels)] += RIDGE * whole.level**2
-    return (a - b) @ (nearest + np.linalg.solve(normal, a.T - a.T @ a @ nearest))
+    effect: Array = (a - b) @ (nearest + np.linalg.solve(normal, a.T - a.T @ a @ nearest))
+    return effect
 
 
 def _matrix(line: Line, col0: int, samples: int, first: int, pixels: int) -> np.ndarray:
     """What every sample sees of every pixel, shape (samples, pixels)."""
     zero = np.zeros(1, np.int64)
     grid = Grid(zero, zero, zero + col0, (pixels, samples))
-    return line.limited().read(np.eye(pixels, dtype=np.float32)[None], np.array([first]), grid)[0].T.astype(np.float64)
+    matrix: Array = line.limited().read(np.eye(pixels, dtype=np.float32)[None], np.array([first]), grid)[0].T.astype(np.float64)
+    return matrix

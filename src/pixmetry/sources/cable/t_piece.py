@@ -67,7 +67,7 @@ def forward(params: TPiece, signal: Signal, stream: Stream) -> Signal:
     """Add what comes back from the branch, and lower the level by the load that it is."""
     if params.branch == "none":
         return signal
-    return signal.with_line(signal.line.echoed(*echoes(params)))
+    return signal.with_line(signal.own_line.echoed(*echoes(params)))
 
 
 def correct(params: TPiece, signal: Signal, maps: Mapping[str, np.ndarray]) -> Signal:

@@ -48,7 +48,7 @@ class Termination(Parameters):
 
 def time_scale_s(loss_db: float) -> float:
     """T of exp(−√(sT)), which loses so many decibels at 5 MHz: |H| = exp(−√(πfT)). Its step response is erfc(½ √(T/t))."""
-    return (loss_db / NEPER_DB) ** 2 / (np.pi * REFERENCE_HZ)
+    return float((loss_db / NEPER_DB) ** 2 / (np.pi * REFERENCE_HZ))
 
 
 @lru_cache(maxsize=32)
@@ -82,8 +82,8 @@ def forward(params: Termination, signal: Signal, stream: Stream) -> Signal:
 
     The skin effect acts on all of it once; what an echo loses of its high frequencies on its further ways is not counted.
     """
-    line = _through(params, signal.line)
-    return signal if line is signal.line else signal.with_line(line)
+    line = _through(params, signal.own_line)
+    return signal if line is signal.own_line else signal.with_line(line)
 
 
 def _through(params: Termination, line: Line) -> Line:

@@ -42,7 +42,7 @@ def following(params: Agc, gain: float, mean_dn: float) -> float:
 
 def forward(params: Agc, signal: Signal, stream: Stream, state: float | None) -> tuple[Signal, float | None]:
     """Multiply frame by frame by the gain and move it on; over windows, which do not know the frame's mean, it stays as it is."""
-    if params.kappa == 0:
+    if params.kappa == 0 or state is None:
         return signal, state
     if signal.data.shape[1:] != tuple(signal.frame_shape):
         return signal.with_data(signal.data * np.float32(state)), state

@@ -51,11 +51,10 @@ def measure(observations: Observations) -> Estimates:
         remedy="take dark pairs",
     )
     found = None if observations.patterns is None else observations.patterns.strongest()
-    if found is None or observations.photon_transfer is None or not found.moving.any() or noise.limits:
+    fit, series = observations.photon_transfer_fit, observations.photon_transfer
+    if found is None or fit is None or series is None or not found.moving.any() or noise.limits:
         return noise
-    return _without_moving_waves(
-        noise, observations.photon_transfer_fit["gain_dn_per_e"].value, found, observations.photon_transfer.dark.n_frames
-    )
+    return _without_moving_waves(noise, fit["gain_dn_per_e"].value, found, series.dark.n_frames)
 
 
 def _without_moving_waves(noise: Estimates, gain: float, found: PatternList, n_frames: np.ndarray) -> Estimates:

@@ -9,6 +9,7 @@ import numpy as np
 from pixmetry.camera.contribution import Contribution, Probe
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.arrays import Array
 from pixmetry.core.random import Grid, Stream
 from pixmetry.sources.electronics._kernels import add_interpolated
 
@@ -75,7 +76,8 @@ def covariance(params: FlickerNoise, lag_px: np.ndarray) -> np.ndarray:
     for period, share in octaves(params):
         v = np.minimum(u / period, 2.0)
         out += share * np.where(v < 1, 1 - 1.5 * v**2 + 0.75 * v**3, 0.25 * (2 - v) ** 3)
-    return params.rms_e**2 * out
+    covariance_e2: Array = params.rms_e**2 * out
+    return covariance_e2
 
 
 def propagate(params: FlickerNoise, probe: Probe) -> Contribution:

@@ -11,6 +11,7 @@ from pixmetry.camera.contribution import Contribution, Probe
 from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.arrays import Array
 from pixmetry.core.errors import MeasureError
 from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
@@ -50,7 +51,8 @@ def curve_dn(x_dn: np.ndarray, gamma: float, reference_dn: float, toe: str = "no
     if toe != "none":
         alpha, slope = shape(gamma, toe)
         y = np.where(share < TOE, number(slope) * share, number(alpha) * y - number(alpha - 1))
-    return np.copysign(number(reference_dn) * y, x_dn)
+    curved: np.ndarray = np.copysign(number(reference_dn) * y, x_dn)
+    return curved
 
 
 def straight_dn(y_dn: np.ndarray, gamma: float, reference_dn: float, toe: str) -> np.ndarray:
@@ -60,7 +62,8 @@ def straight_dn(y_dn: np.ndarray, gamma: float, reference_dn: float, toe: str) -
     x = np.power((share + (alpha - 1)) / alpha, 1 / gamma)
     if toe != "none":
         x = np.where(share < slope * TOE, share / slope, x)
-    return np.copysign(reference_dn * x, y_dn)
+    straight: Array = np.copysign(reference_dn * x, y_dn)
+    return straight
 
 
 def forward(params: Gamma, signal: Signal, stream: Stream) -> Signal:
@@ -105,6 +108,10 @@ def _straight_levels(observations: Observations) -> tuple[np.ndarray, np.ndarray
         remedy="take ten light levels or more",
     )
     transfer = observations.photon_transfer
+    if transfer is None:
+        raise MeasureError(
+            "gamma needs the levels of a photon-transfer series", where="electronics.gamma", remedy="take ten light levels or more"
+        )
     bright = transfer.bright
     known = bright.photons is not None and bool(np.isfinite(bright.photons).all())
     light = np.asarray(bright.photons if known else bright.exposure_s, float)

@@ -50,7 +50,8 @@ def slope(params: Nonlinearity, w: np.ndarray) -> np.ndarray:
 def response_dn(params: Nonlinearity, x_dn: np.ndarray) -> np.ndarray:
     """Signal after the non-linearity, in the shape and dtype given."""
     w = np.clip(x_dn * x_dn.dtype.type(1 / params.reference_dn), LOWEST, HIGHEST)
-    return x_dn * factor(params, w)
+    response: np.ndarray = x_dn * factor(params, w)
+    return response
 
 
 def forward(params: Nonlinearity, signal: Signal, stream: Stream) -> Signal:

@@ -11,6 +11,7 @@ import numpy as np
 from pixmetry.camera.contribution import Contribution, Probe
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.arrays import Array
 from pixmetry.core.random import Grid, Stream
 
 
@@ -35,7 +36,8 @@ def affected(params: TelegraphNoise, grid: Grid, stream: Stream) -> tuple[np.nda
 
 def steps_e(params: TelegraphNoise, single: Grid, stream: Stream) -> np.ndarray:
     """Step of each pixel of a grid of single pixels, e-, exponential, fixed in the unit."""
-    return -params.amplitude_e * np.log(stream.uniform_fixed(single, 1)[:, 0, 0].astype(float))
+    steps: Array = -params.amplitude_e * np.log(stream.uniform_fixed(single, 1)[:, 0, 0].astype(float))
+    return steps
 
 
 def filled(params: TelegraphNoise, single: Grid, stream: Stream, trap: int) -> np.ndarray:
@@ -61,10 +63,12 @@ def level(params: TelegraphNoise, single: Grid, stream: Stream) -> np.ndarray:
     if params.levels == "two":
         return now - params.occupancy
     if params.levels == "three":
-        return now + filled(params, single, stream, 1) - 2 * params.occupancy
+        both: Array = now + filled(params, single, stream, 1) - 2 * params.occupancy
+        return both
     stays = stream.uniform(single, 30)[:, 0, 0] < np.float32(params.cds_correlation)
     again = stream.uniform(single, 31)[:, 0, 0] < np.float32(params.occupancy)
-    return np.where(stays, now, again) - now
+    difference: Array = np.where(stays, now, again) - now
+    return difference
 
 
 def level_variance(params: TelegraphNoise) -> float:

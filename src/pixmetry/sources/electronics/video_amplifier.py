@@ -36,7 +36,7 @@ class VideoAmplifier(Parameters):
 
 def forward(params: VideoAmplifier, signal: Signal, stream: Stream) -> Signal:
     """Pass the line through ω0²/(s² + 2ζω0 s + ω0²)."""
-    return signal.with_line(signal.line.filtered([], params.poles))
+    return signal.with_line(signal.own_line.filtered([], params.poles))
 
 
 def near(params: VideoAmplifier, pixel_hz: float, row_px: int) -> tuple[int, int, int, int]:
@@ -62,9 +62,18 @@ SOURCE = Source(
     parameters=VideoAmplifier,
     consumes=(Kind.VIDEO,),
     after=(
-        "sensor", "electronics.agc", "electronics.amplifier_noise", "electronics.column_noise", "electronics.flicker_noise",
-        "electronics.gain", "electronics.gamma", "electronics.nonlinearity", "electronics.row_noise", "electronics.supply_pickup",
-        "electronics.tap_gain", "electronics.telegraph_noise",
+        "sensor",
+        "electronics.agc",
+        "electronics.amplifier_noise",
+        "electronics.column_noise",
+        "electronics.flicker_noise",
+        "electronics.gain",
+        "electronics.gamma",
+        "electronics.nonlinearity",
+        "electronics.row_noise",
+        "electronics.supply_pickup",
+        "electronics.tap_gain",
+        "electronics.telegraph_noise",
     ),  # fmt: skip
     before=("cable", "grabber", "storage"),
     typical=VideoAmplifier(natural_mhz=5.0, damping=0.25),

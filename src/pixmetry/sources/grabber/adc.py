@@ -12,6 +12,7 @@ from pixmetry.camera.contribution import Contribution, Probe
 from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal, Windows
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.arrays import Array
 from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
@@ -52,7 +53,7 @@ class Adc(Parameters):
     @property
     def top(self) -> int:
         """The highest code."""
-        return 2**self.bits - 1
+        return (1 << self.bits) - 1
 
     @property
     def equal_steps(self) -> bool:
@@ -62,7 +63,8 @@ class Adc(Parameters):
 
 def bend(params: Adc, level_dn: np.ndarray) -> np.ndarray:
     """Integral non-linearity of the thresholds in LSB at a level in DN: A sin(2πm v/2^bits); a threshold that is late is positive."""
-    return params.inl_amplitude_lsb * np.sin(2 * np.pi * params.inl_cycles * np.asarray(level_dn, float) / 2**params.bits)
+    bend_lsb: Array = params.inl_amplitude_lsb * np.sin(2 * np.pi * params.inl_cycles * np.asarray(level_dn, float) / 2**params.bits)
+    return bend_lsb
 
 
 def thresholds(params: Adc, stream: Stream) -> np.ndarray:

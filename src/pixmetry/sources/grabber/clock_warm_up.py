@@ -10,6 +10,7 @@ from pixmetry.camera.contribution import Contribution, Probe
 from pixmetry.camera.line_contribution import held_of
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.arrays import Array
 from pixmetry.core.random import Stream
 
 
@@ -39,7 +40,8 @@ def shift_s(params: ClockWarmUp, at_s: np.ndarray, time_s: np.ndarray) -> np.nda
     (t + c0) δ/(1 + δ) late.
     """
     scale = params.scale(time_s)
-    return (at_s + params.lock_us * 1e-6) * scale / (1 + scale) + params.late_s(time_s)
+    shift: Array = (at_s + params.lock_us * 1e-6) * scale / (1 + scale) + params.late_s(time_s)
+    return shift
 
 
 def forward(params: ClockWarmUp, signal: Signal, stream: Stream) -> Signal:
@@ -47,7 +49,7 @@ def forward(params: ClockWarmUp, signal: Signal, stream: Stream) -> Signal:
     if params.scale_error_rel == 0 and params.delay_ns == 0:
         return signal
     time_s = signal.time_s[:, None, None]
-    return signal.with_line(signal.line.warped(lambda at_s: shift_s(params, at_s, time_s)))
+    return signal.with_line(signal.own_line.warped(lambda at_s: shift_s(params, at_s, time_s)))
 
 
 def truth(params: ClockWarmUp, signal: Signal, stream: Stream) -> Mapping[str, np.ndarray]:

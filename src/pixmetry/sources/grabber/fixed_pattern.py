@@ -8,6 +8,7 @@ from pixmetry.camera.contribution import Contribution, Probe
 from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.arrays import Array
 from pixmetry.core.errors import MeasureError
 from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
@@ -32,7 +33,8 @@ def settling(params: FixedPattern, rows: np.ndarray) -> np.ndarray:
 
 def channel(params: FixedPattern, cols: np.ndarray) -> np.ndarray:
     """Column pattern in DN at absolute columns, with mean zero over a period."""
-    return params.column_step_dn * ((np.asarray(cols) % params.column_period == 0) - 1 / params.column_period)
+    offset: Array = params.column_step_dn * ((np.asarray(cols) % params.column_period == 0) - 1 / params.column_period)
+    return offset
 
 
 def forward(params: FixedPattern, signal: Signal, stream: Stream) -> Signal:

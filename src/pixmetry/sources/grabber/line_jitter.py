@@ -53,7 +53,7 @@ def forward(params: LineJitter, signal: Signal, stream: Stream) -> Signal:
     if not (params.white_ns or params.loop_ns or params.settling_ns or params.shear_ns):
         return signal
     frame_rows = signal.frame_shape[0]
-    return signal.with_line(signal.line.delayed(lambda grid: delay_s(params, grid, frame_rows, stream)))
+    return signal.with_line(signal.own_line.delayed(lambda grid: delay_s(params, grid, frame_rows, stream)))
 
 
 def truth(params: LineJitter, signal: Signal, stream: Stream) -> Mapping[str, np.ndarray]:
@@ -78,9 +78,7 @@ def propagate(params: LineJitter, probe: Probe) -> Contribution:
 
     The steady part is seen at places down the frame; what a cubic of the row follows of it is smooth.
     """
-    (u_x, u_y), (bias_x, bias_y) = from_row_delays(
-        probe, 1e-9 * params.white_ns, 1e-9 * params.loop_ns, params.loop_rows, params.stride
-    )
+    (u_x, u_y), (bias_x, bias_y) = from_row_delays(probe, 1e-9 * params.white_ns, 1e-9 * params.loop_ns, params.loop_rows, params.stride)
     dx = dy = smooth_x = np.zeros(1)
     if params.settling_ns or params.shear_ns:
         dx, dy, first = from_steady_delays(probe, lambda rows: systematic_s(params, rows, probe.frame_shape[0]))

@@ -6,6 +6,7 @@ from functools import cache
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pixmetry.camera.contribution import Contribution, Probe
 from pixmetry.camera.line import group_delay_s, reach_px
@@ -47,7 +48,8 @@ def prototype(kind: str, order: int) -> np.ndarray:
     if kind == "rc":
         return -np.ones(order, complex)
     if kind == "butterworth":
-        return np.exp(1j * np.pi * (0.5 + (np.arange(order) + 0.5) / order))
+        unit_poles: NDArray[np.complex128] = np.exp(1j * np.pi * (0.5 + (np.arange(order) + 0.5) / order))
+        return unit_poles
     from scipy.signal import besselap
 
     return np.asarray(besselap(order, norm="mag")[1], complex)
@@ -57,7 +59,7 @@ def forward(params: LowPass, signal: Signal, stream: Stream) -> Signal:
     """Pass the line through the filter."""
     if params.kind == "off":
         return signal
-    return signal.with_line(signal.line.filtered(params.zeros, params.poles))
+    return signal.with_line(signal.own_line.filtered(params.zeros, params.poles))
 
 
 def near(params: LowPass, pixel_hz: float, row_px: int) -> tuple[int, int, int, int]:

@@ -52,8 +52,8 @@ def measure(observations: Observations) -> Estimates:
     if len(found) == 0:
         return _limit(found)
     # the power of a moving wave is the mean over a few pairs of frames, and its u comes from their number (JCGM 100, 4.2)
-    few = found.moving[0] and observations.dark_spectra is not None
-    dof = max(observations.dark_spectra.n_pairs - 1.0, 1.0) if few else math.inf
+    spectra = observations.dark_spectra
+    dof = max(spectra.n_pairs - 1.0, 1.0) if found.moving[0] and spectra is not None else math.inf
     rows = [
         ("amplitude_dn", found.amplitude_dn[0], found.u_amplitude_dn[0], dof, "DN"),
         ("frequency_x", found.frequency_x[0], found.u_frequency_x[0], math.inf, "1/px"),

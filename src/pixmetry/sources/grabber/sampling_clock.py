@@ -22,7 +22,7 @@ def forward(params: SamplingClock, signal: Signal, stream: Stream) -> Signal:
     if params == SamplingClock():
         return signal
     clock_hz = params.clock_mhz * 1e6 or signal.clock.pixel_hz
-    return signal.with_line(signal.line.clocked(clock_hz, params.start_ns * 1e-9, params.samples or signal.frame_shape[1]))
+    return signal.with_line(signal.own_line.clocked(clock_hz, params.start_ns * 1e-9, params.samples or signal.frame_shape[1]))
 
 
 SOURCE = Source(

@@ -53,7 +53,7 @@ def forward(params: CoverGlass, signal: Signal, stream: Stream) -> Signal:
     """Look where the rays would have landed without the plate."""
     if not params.thickness_um or params.index == 1:
         return signal
-    return signal.with_light(signal.light.moved(pull_of(params, signal.frame_shape)))
+    return signal.with_light(signal.own_light.moved(pull_of(params, signal.frame_shape)))
 
 
 def truth(params: CoverGlass, signal: Signal, stream: Stream) -> Mapping[str, np.ndarray]:

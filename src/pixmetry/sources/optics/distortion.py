@@ -98,7 +98,7 @@ def forward(params: Distortion, signal: Signal, stream: Stream) -> Signal:
     """Look at the ideal places."""
     if not any(params.coefficients):
         return signal
-    return signal.with_light(signal.light.moved(pull_of(params, signal.frame_shape)))
+    return signal.with_light(signal.own_light.moved(pull_of(params, signal.frame_shape)))
 
 
 def truth(params: Distortion, signal: Signal, stream: Stream) -> Mapping[str, np.ndarray]:

@@ -11,6 +11,7 @@ import numpy as np
 from pixmetry.camera.light import Light
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.arrays import Array
 from pixmetry.core.random import Stream
 
 
@@ -31,7 +32,8 @@ def mean_light(params: Flicker, begin_s: np.ndarray, end_s: np.ndarray) -> np.nd
     middle, length = 0.5 * (begin_s + end_s), end_s - begin_s
     if params.waveform == "sine":
         wave = np.cos(2 * np.pi * params.frequency_hz * middle + params.phase_rad)
-        return 1 + params.depth_rel * np.sinc(params.frequency_hz * length) * wave
+        mean: Array = 1 + params.depth_rel * np.sinc(params.frequency_hz * length) * wave
+        return mean
     offset = params.phase_rad / (2 * np.pi)
     a, b = (params.frequency_hz * t + offset for t in (begin_s, end_s))
     now = (0.5 * (a + b)) % 1 < params.duty
@@ -42,7 +44,8 @@ def mean_light(params: Flicker, begin_s: np.ndarray, end_s: np.ndarray) -> np.nd
 def _on(cycles: np.ndarray, duty: float) -> np.ndarray:
     """Cycles up to a time in which the lamp was on."""
     whole = np.floor(cycles)
-    return whole * duty + np.minimum(cycles - whole, duty)
+    lit: Array = whole * duty + np.minimum(cycles - whole, duty)
+    return lit
 
 
 def shares(light: Light) -> tuple[np.ndarray, np.ndarray]:
@@ -104,9 +107,9 @@ def forward(params: Flicker, signal: Signal, stream: Stream) -> Signal:
     """Put the scene under the lamp."""
     if not params.depth_rel:
         return signal
-    if isinstance(signal.light, LampLight):
-        return signal.with_light(replace(signal.light, lamps=(*signal.light.lamps, params)))
-    fields = {name: getattr(signal.light, name) for name in Light.__dataclass_fields__}
+    if isinstance(signal.own_light, LampLight):
+        return signal.with_light(replace(signal.own_light, lamps=(*signal.own_light.lamps, params)))
+    fields = {name: getattr(signal.own_light, name) for name in Light.__dataclass_fields__}
     return signal.with_light(LampLight(**fields, lamps=(params,)))
 
 

@@ -32,7 +32,7 @@ def pull_of(params: LateralColour, frame_shape: tuple[int, int]) -> Pull:
 
 def forward(params: LateralColour, signal: Signal, stream: Stream) -> Signal:
     """Change the scale by the mean wavelength; smear by the spectrum's width, by a round spot of the radial variance."""
-    light = signal.light
+    light = signal.own_light
     if params.scale_per_nm and params.mean_nm != params.reference_nm:
         light = light.moved(pull_of(params, signal.frame_shape))
     if params.scale_per_nm and params.std_nm:

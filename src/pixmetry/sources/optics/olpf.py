@@ -33,10 +33,10 @@ def dots(params: OpticalLowPass) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def forward(params: OpticalLowPass, signal: Signal, stream: Stream) -> Signal:
     """Spread the light."""
     if params.model == "frosted":
-        return signal.with_light(signal.light.blurred(params.sigma_px**2)) if params.sigma_px else signal
+        return signal.with_light(signal.own_light.blurred(params.sigma_px**2)) if params.sigma_px else signal
     if not (params.separation_x_px or params.separation_y_px):
         return signal
-    return signal.with_light(signal.light.spread(*dots(params)))
+    return signal.with_light(signal.own_light.spread(*dots(params)))
 
 
 SOURCE = Source(

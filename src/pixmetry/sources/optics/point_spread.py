@@ -11,6 +11,7 @@ from pixmetry.camera.light import FINE
 from pixmetry.camera.raster import kernel_of, spread_of
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.arrays import Array
 from pixmetry.core.errors import ParameterError
 from pixmetry.core.random import Stream
 
@@ -44,12 +45,13 @@ class PointSpread(Parameters):
 def wave_aberration(params: PointSpread, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Wave aberration in waves at places of the pupil, whose radius is 1."""
     r2 = x * x + y * y
-    return (
+    waves: Array = (
         np.sqrt(3) * params.defocus_waves * (2 * r2 - 1)
         + np.sqrt(6) * (params.astigmatism_waves * (x * x - y * y) + params.oblique_astigmatism_waves * 2 * x * y)
         + np.sqrt(8) * (3 * r2 - 2) * (params.coma_x_waves * x + params.coma_y_waves * y)
         + np.sqrt(5) * params.spherical_waves * (6 * r2 * r2 - 6 * r2 + 1)
     )
+    return waves
 
 
 def transfer(params: PointSpread, fx: np.ndarray, fy: np.ndarray) -> np.ndarray:
@@ -86,7 +88,8 @@ def table_transfer(params: PointSpread, fx: np.ndarray, fy: np.ndarray) -> np.nd
     at_y, at_x = ((np.arange(n) - n // 2) * step for n in table.shape)
     ex, ey = np.exp(-2j * np.pi * fx.ravel()[:, None] * at_x), np.exp(-2j * np.pi * fy.ravel()[:, None] * at_y)
     value = ((ey @ table) * ex).sum(axis=1) / table.sum()
-    return value.reshape(fx.shape) * np.sinc(fx * step) * np.sinc(fy * step)
+    interpolated: Array = value.reshape(fx.shape) * np.sinc(fx * step) * np.sinc(fy * step)
+    return interpolated
 
 
 def _check_table(params: PointSpread) -> None:
@@ -122,7 +125,7 @@ def kernel(params: PointSpread) -> tuple[np.ndarray, np.ndarray | None]:
 
 def forward(params: PointSpread, signal: Signal, stream: Stream) -> Signal:
     """Spread the light."""
-    light = signal.light
+    light = signal.own_light
     if params.model == "gaussian":
         return signal.with_light(light.blurred(params.sigma_px**2)) if params.sigma_px else signal
     return signal.with_light(light.convolved(*kernel(params)))

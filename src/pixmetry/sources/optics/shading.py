@@ -10,6 +10,7 @@ from pixmetry.camera.contribution import Contribution, Probe
 from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import STATED_FRAME, Parameters, Source, quantity
+from pixmetry.core.arrays import Singles
 from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
 
@@ -41,7 +42,8 @@ def factor(params: Shading, signal: Signal) -> np.ndarray:
     centre = 1 + loss * (rows**2 + cols**2 - 2) / 12  # the mean of x² over n pixels about their centre is (n² − 1)/12
     along_y = (centre + y * (params.gradient_y_per_px - loss * y)).astype(np.float32)
     along_x = (x * (params.gradient_x_per_px - loss * x)).astype(np.float32)
-    return np.maximum(along_y[:, :, None] + along_x[:, None, :], np.float32(SMALLEST_FACTOR))
+    shade: Singles = np.maximum(along_y[:, :, None] + along_x[:, None, :], np.float32(SMALLEST_FACTOR))
+    return shade
 
 
 def forward(params: Shading, signal: Signal, stream: Stream) -> Signal:

@@ -11,6 +11,7 @@ import numpy as np
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.silicon import absorption_per_um
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.arrays import Array
 from pixmetry.core.random import Stream
 
 WAVELENGTH_NM = np.arange(300.0, 1200.5, 0.5)
@@ -43,7 +44,8 @@ def photon_spectrum(params: SpectralFilter) -> np.ndarray:
     else:
         width = params.light_width_nm if params.light == "led" else 1.0  # a laser's line is narrower than any filter's edge
         shape = np.exp(-4 * np.log(2) * ((WAVELENGTH_NM - params.light_nm) / width) ** 2)
-    return shape / shape.sum()
+    spectrum: Array = shape / shape.sum()
+    return spectrum
 
 
 def transmittance(params: SpectralFilter) -> np.ndarray:
@@ -53,12 +55,14 @@ def transmittance(params: SpectralFilter) -> np.ndarray:
     slope = params.edge_nm / (2 * np.log(9))  # a logistic goes from 10 to 90 % in 2 ln 9 of its scale
 
     def below(limit_nm: float) -> np.ndarray:
-        return 0.5 - 0.5 * np.tanh((WAVELENGTH_NM - limit_nm) / (2 * slope))
+        share: Array = 0.5 - 0.5 * np.tanh((WAVELENGTH_NM - limit_nm) / (2 * slope))
+        return share
 
     if params.band == "short_pass":
         return params.peak_rel * below(params.cut_nm)
     lower, upper = params.cut_nm - params.width_nm / 2, params.cut_nm + params.width_nm / 2
-    return params.peak_rel * below(upper) * (1 - below(lower))
+    transmission: Array = params.peak_rel * below(upper) * (1 - below(lower))
+    return transmission
 
 
 @lru_cache(maxsize=64)
@@ -76,7 +80,7 @@ def defocus_px2(params: SpectralFilter) -> float:
 
 def forward(params: SpectralFilter, signal: Signal, stream: Stream) -> Signal:
     """Dim the light and defocus it. The scene's photons are those that the sensor would see without the filter."""
-    light = signal.light
+    light = signal.own_light
     if params.band != "none":
         light = replace(light, sensitivity=light.sensitivity * passed(params))
     if params.plate_um:

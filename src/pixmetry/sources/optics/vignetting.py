@@ -7,6 +7,7 @@ import numpy as np
 from pixmetry.camera.geometry import corner_px, factor_verbs, frame_centre
 from pixmetry.camera.signal import Kind
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.arrays import Array
 
 
 class Vignetting(Parameters):
@@ -28,7 +29,8 @@ class Vignetting(Parameters):
 def overlap(shift: np.ndarray) -> np.ndarray:
     """Common area of two circles whose centres are so many diameters apart, over the area of one."""
     s = np.minimum(shift, 1.0)
-    return 2 / np.pi * (np.arccos(s) - s * np.sqrt(1 - s * s))
+    shared: Array = 2 / np.pi * (np.arccos(s) - s * np.sqrt(1 - s * s))
+    return shared
 
 
 def factor(params: Vignetting, x_px: np.ndarray, y_px: np.ndarray, frame_shape: tuple[int, int]) -> np.ndarray:

@@ -10,6 +10,7 @@ import numpy as np
 from pixmetry.camera.contribution import Contribution, Probe
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.arrays import Array
 from pixmetry.core.random import Stream
 from pixmetry.sources.processing._codes import bits_of_camera, stored
 
@@ -54,7 +55,8 @@ def step_dn(params: Companding, level_dn: np.ndarray) -> np.ndarray:
     if params.law == "off":
         return np.ones_like(level_dn)
     if params.law == "root":
-        return np.maximum(2 * np.sqrt(np.maximum(level_dn, 0) * top) / way, 1.0)
+        step: Array = np.maximum(2 * np.sqrt(np.maximum(level_dn, 0) * top) / way, 1.0)
+        return step
     if params.law == "truncated":
         return np.full_like(level_dn, 2.0 ** max(params.bits - params.transport_bits, 0))
     return np.full_like(level_dn, max(top / way, 1.0))

@@ -8,6 +8,7 @@ import numpy as np
 
 from pixmetry.camera.signal import Kind, Signal, Windows
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.arrays import Flags
 from pixmetry.core.random import Stream
 from pixmetry.sources.processing._codes import bordered, surround
 from pixmetry.sources.processing._kernels import replace_outliers
@@ -45,7 +46,8 @@ def replaced(params: DefectCorrection, codes: np.ndarray) -> np.ndarray:
     """Mask of the pixels of frames (n, rows, cols) that are taken for defects; one that equals the neighbours' median stays unseen."""
     if params.threshold_dn == OFF:
         return np.zeros(codes.shape, bool)
-    return replace_outliers(bordered(codes, reach(params)), reach(params), params.threshold_dn) != codes
+    changed: Flags = replace_outliers(bordered(codes, reach(params)), reach(params), params.threshold_dn) != codes
+    return changed
 
 
 SOURCE = Source(

@@ -9,6 +9,7 @@ import numpy as np
 
 from pixmetry.camera.signal import Kind, Signal, Windows
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.arrays import Array
 from pixmetry.core.random import Stream
 from pixmetry.sources.processing._codes import bits_of_camera, bordered, stored, surround
 from pixmetry.sources.processing._kernels import bilateral, blur, median
@@ -27,7 +28,8 @@ class NoiseReduction(Parameters):
 def half_weights(params: NoiseReduction) -> np.ndarray:
     """Gaussian weights from the middle outwards, shape (radius + 1,), of sum 1 over both sides."""
     half = np.exp(-0.5 * (np.arange(params.radius_px + 1) / params.sigma_px) ** 2)
-    return half / (2 * half.sum() - half[0])
+    weights: Array = half / (2 * half.sum() - half[0])
+    return weights
 
 
 def forward(params: NoiseReduction, signal: Signal, stream: Stream) -> Signal:

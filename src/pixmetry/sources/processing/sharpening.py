@@ -9,6 +9,7 @@ import numpy as np
 from pixmetry.camera.contribution import Contribution, Probe
 from pixmetry.camera.signal import Kind, Signal, Windows
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.arrays import Array
 from pixmetry.core.random import Stream
 from pixmetry.sources.processing._codes import bits_of_camera, bordered, stored, surround
 from pixmetry.sources.processing._kernels import blur
@@ -25,7 +26,8 @@ class Sharpening(Parameters):
 def gaussian(sigma_px: float) -> np.ndarray:
     """Sampled Gaussian from its middle to three standard deviations, shape (m + 1,), of sum 1 over both sides."""
     half = np.exp(-0.5 * (np.arange(math.ceil(3 * sigma_px) + 1) / sigma_px) ** 2)
-    return half / (2 * half.sum() - half[0])
+    weights: Array = half / (2 * half.sum() - half[0])
+    return weights
 
 
 def forward(params: Sharpening, signal: Signal, stream: Stream) -> Signal:

@@ -12,7 +12,7 @@ Run = tuple[float, float, float, float, float, float]  # of full pixels, see `jo
 
 
 @jit
-def add_column_sums(data: Singles, factor: Singles) -> Singles:
+def add_column_sums(data: Singles, factor: Array) -> Singles:
     """Return the data plus ``factor[i]`` times the sum over each whole column."""
     n, rows, cols = data.shape
     out = np.empty_like(data)
@@ -31,7 +31,7 @@ def add_column_sums(data: Singles, factor: Singles) -> Singles:
 
 
 @jit
-def add_rows_passed(data: Singles, factor: Singles, store_below: bool, undo: bool) -> Singles:
+def add_rows_passed(data: Singles, factor: Array, store_below: bool, undo: bool) -> Singles:
     """Return the data plus ``factor[i]`` times the sum over the rows between each row and the store.
 
     With ``undo`` the data hold the smear and the factor is negative: the sum is over what has been freed of it.

@@ -36,7 +36,7 @@ def measure(observations: Observations) -> Estimates:
 
 def forward(params: Affinity, signal: Signal, stream: Stream) -> Signal:
     """Shear and stretch the image along x."""
-    return signal.with_light(signal.light.moved(pull_of(params, signal.frame_shape))) if params.b1 or params.b2 else signal
+    return signal.with_light(signal.own_light.moved(pull_of(params, signal.frame_shape))) if params.b1 or params.b2 else signal
 
 
 def truth(params: Affinity, signal: Signal, stream: Stream) -> Mapping[str, np.ndarray]:

@@ -38,7 +38,8 @@ def factors(params: BayerMosaic) -> np.ndarray:
 def over_windows(params: BayerMosaic, signal: Signal) -> np.ndarray:
     """The same for every pixel, float32, shape (n, rows, cols)."""
     lines = factors(params).astype(np.float32).T[signal.cols % 2].swapaxes(1, 2)  # rows of the two kinds, (n, 2, cols)
-    return np.ascontiguousarray(lines)[np.arange(len(lines))[:, None], signal.rows % 2]
+    pattern: np.ndarray = np.ascontiguousarray(lines)[np.arange(len(lines))[:, None], signal.rows % 2]
+    return pattern
 
 
 def forward(params: BayerMosaic, signal: Signal, stream: Stream) -> Signal:

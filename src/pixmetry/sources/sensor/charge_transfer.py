@@ -281,7 +281,8 @@ def _added_dn(params: ChargeTransfer, probe: Probe) -> np.ndarray:
     electrons[1:, up:, left:] = probe.signal_dn / probe.gain_dn_per_e
     corner = [np.full(phases + 1, max(at - reach, 0), np.int64) for at, reach in ((row0, up), (col0, left))]
     added = (_move(params, electrons, corner[0], corner[1]) - electrons)[:, up:, left:].astype(np.float64)
-    return probe.gain_dn_per_e * (added[1:] - added[0])
+    added_dn: np.ndarray = probe.gain_dn_per_e * (added[1:] - added[0])
+    return added_dn
 
 
 MOST_CTI, WHOLE_WAY = 5e-5, 0.03  # of a sound camera: in one transfer, and over all rows or columns

@@ -12,6 +12,7 @@ from pixmetry.camera.contribution import Contribution, Probe
 from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.arrays import Array
 from pixmetry.core.number import Estimates
 from pixmetry.core.random import Grid, Stream
 
@@ -52,7 +53,8 @@ def warming(params: DarkCurrent, temperature_c: np.ndarray | float) -> np.ndarra
 
 def mean_e(params: DarkCurrent, exposure_s: np.ndarray | float, temperature_c: np.ndarray | float) -> np.ndarray:
     """Mean number of dark electrons of one exposure, float64, in the shape of the arguments."""
-    return params.rate_e_per_s * np.asarray(exposure_s, float) * warming(params, temperature_c)
+    mean: Array = params.rate_e_per_s * np.asarray(exposure_s, float) * warming(params, temperature_c)
+    return mean
 
 
 def unevenness(params: DarkCurrent, grid: Grid, stream: Stream) -> np.ndarray:
@@ -64,7 +66,8 @@ def glow_e_per_s(params: DarkCurrent, rows: np.ndarray, cols: np.ndarray, frame_
     """Glow of the amplifier at pixels of these rows (n, rows) and columns (n, cols)."""
     row, col = (part * (size - 1) for part, size in zip(CORNERS[params.glow_corner], frame_shape, strict=True))
     distance = np.hypot((rows - row)[:, :, None], (cols - col)[:, None, :])
-    return params.glow_e_per_s * np.exp(-distance / params.glow_reach_px)
+    glow: Array = params.glow_e_per_s * np.exp(-distance / params.glow_reach_px)
+    return glow
 
 
 def forward(params: DarkCurrent, signal: Signal, stream: Stream) -> Signal:

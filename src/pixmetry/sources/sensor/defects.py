@@ -12,6 +12,7 @@ from pixmetry.camera.contribution import Contribution, Probe
 from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, cut_map, quantity
+from pixmetry.core.arrays import Array, Singles
 from pixmetry.core.errors import MeasureError
 from pixmetry.core.number import Estimates, Number
 from pixmetry.core.random import Grid, Stream
@@ -183,7 +184,8 @@ def blinking_level(params: Defects, single: Grid, stream: Stream) -> np.ndarray:
 
 
 def _heat(params: Defects, value: np.ndarray, single: Grid, stream: Stream) -> np.ndarray:
-    return value + np.float32(params.hot_median_e) * np.exp(np.float32(params.hot_sigma_log) * stream.normal_fixed(single)[:, 0, 0])
+    hot: Singles = value + np.float32(params.hot_median_e) * np.exp(np.float32(params.hot_sigma_log) * stream.normal_fixed(single)[:, 0, 0])
+    return hot
 
 
 def _cool(params: Defects, value: np.ndarray, single: Grid, stream: Stream) -> np.ndarray:
@@ -191,11 +193,13 @@ def _cool(params: Defects, value: np.ndarray, single: Grid, stream: Stream) -> n
 
 
 def _respond(params: Defects, value: np.ndarray, single: Grid, stream: Stream) -> np.ndarray:
-    return value * np.maximum(1 + np.float32(params.gain_std_rel) * stream.normal_fixed(single)[:, 0, 0], 0)
+    weakened: Singles = value * np.maximum(1 + np.float32(params.gain_std_rel) * stream.normal_fixed(single)[:, 0, 0], 0)
+    return weakened
 
 
 def _flicker(params: Defects, value: np.ndarray, single: Grid, stream: Stream) -> np.ndarray:
-    return np.maximum(value + np.float32(params.noisy_std_e) * stream.normal(single)[:, 0, 0], 0)
+    flickering: Singles = np.maximum(value + np.float32(params.noisy_std_e) * stream.normal(single)[:, 0, 0], 0)
+    return flickering
 
 
 def _blink(params: Defects, value: np.ndarray, single: Grid, stream: Stream) -> np.ndarray:
@@ -273,6 +277,8 @@ def _errors(observations: Observations, places: Mapping[str, np.ndarray], gain: 
     """How large the errors are of the kinds that were found; those in electrons only if the gain is known."""
     found = observations.defects
     rows: list[Row] = []
+    if found is None:
+        return rows
     dark_u, response_u = (float(np.nan_to_num(v)) for v in (found.dark_sigma_dn, found.gain_sigma_rel))
 
     def add_e(name: str, value_dn: float, u_dn: float, dof: float) -> None:
@@ -384,7 +390,8 @@ def _powers(probe: Probe, phase: int, groups: np.ndarray, changed_dn: np.ndarray
     """Sum over groups of pixels, masks (groups, rows, cols), of the second and fourth power of the shift when one has changed values."""
     base, changed_dn = probe.signal_dn[phase], np.minimum(changed_dn, probe.saturation_dn)
     shifts = np.array(probe.moved(np.where(groups, changed_dn, base), phase))
-    return np.nansum([shifts**2, shifts**4], axis=2)  # a target that is lost with the group has no position
+    powers: Array = np.nansum([shifts**2, shifts**4], axis=2)  # a target that is lost with the group has no position
+    return powers
 
 
 def _cases(params: Defects, name: str, signal_dn: np.ndarray, gain_dn_per_e: float) -> list[tuple[float, np.ndarray]]:
@@ -409,8 +416,10 @@ def _cases(params: Defects, name: str, signal_dn: np.ndarray, gain_dn_per_e: flo
 
 def _mean_square_dn2(params: Defects, name: str, probe: Probe) -> np.ndarray | float:
     if name == "hot":
-        return (probe.gain_dn_per_e * params.hot_median_e) ** 2 * np.exp(2 * params.hot_sigma_log**2)
-    return sum(w * (v - probe.signal_dn) ** 2 for w, v in _cases(params, name, probe.signal_dn, probe.gain_dn_per_e))
+        square_dn2: np.ndarray = (probe.gain_dn_per_e * params.hot_median_e) ** 2 * np.exp(2 * params.hot_sigma_log**2)
+        return square_dn2
+    others: np.ndarray = sum(w * (v - probe.signal_dn) ** 2 for w, v in _cases(params, name, probe.signal_dn, probe.gain_dn_per_e))
+    return others
 
 
 def _of_singles(probe: Probe, phase: int, cases: list[tuple[float, np.ndarray]]) -> np.ndarray:

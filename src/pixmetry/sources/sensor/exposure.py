@@ -79,11 +79,11 @@ def _profile(params: Exposure) -> tuple[np.ndarray, np.ndarray]:
 
 def forward(params: Exposure, signal: Signal, stream: Stream) -> Signal:
     """Look at a moving scene at the nodes of the profile; a scene that stands still is the same at all of them."""
-    if not signal.light.moving or (params.profile == "box" and params.nodes == 1):
+    if not signal.own_light.moving or (params.profile == "box" and params.nodes == 1):
         return signal
     times, weights = rule(params)
     at = (signal.time_s[:, None] + signal.exposure_s[:, None] * times)[:, None, :]
-    return signal.with_light(signal.light.seen_at(at, np.broadcast_to(weights, at.shape)))
+    return signal.with_light(signal.own_light.seen_at(at, np.broadcast_to(weights, at.shape)))
 
 
 def truth(params: Exposure, signal: Signal, stream: Stream) -> Mapping[str, np.ndarray]:

@@ -10,6 +10,7 @@ from pixmetry.camera.contribution import Contribution, Probe
 from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.arrays import Singles
 from pixmetry.core.errors import MeasureError
 from pixmetry.core.number import Estimates
 from pixmetry.core.random import Grid, Stream
@@ -32,14 +33,16 @@ def capacity_e(params: FullWell, grid: Grid, stream: Stream) -> np.ndarray | flo
     if params.spread_rel == 0:
         return params.full_well_e
     spread = np.float32(params.spread_rel) * stream.normal_fixed(grid)
-    return np.float32(params.full_well_e) * np.maximum(1 + spread, np.float32(1e-3))
+    capacity: Singles = np.float32(params.full_well_e) * np.maximum(1 + spread, np.float32(1e-3))
+    return capacity
 
 
 def response_e(params: FullWell, electrons: np.ndarray, capacity: np.ndarray | float | None = None) -> np.ndarray:
     """Electrons held of those that arrived, in the dtype given: a straight line up to the knee, then an exponential approach."""
     top = params.full_well_e if capacity is None else capacity
     if params.knee_rel == 0:
-        return np.minimum(electrons, np.asarray(top, electrons.dtype))
+        held: np.ndarray = np.minimum(electrons, np.asarray(top, electrons.dtype))
+        return held
     room = params.knee_rel * top
     above = np.maximum(electrons - (top - room), 0)
     return (electrons - above - room * np.expm1(-above / room)).astype(electrons.dtype)

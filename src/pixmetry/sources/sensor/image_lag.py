@@ -6,6 +6,7 @@ import numpy as np
 
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.arrays import Singles
 from pixmetry.core.random import Grid, Stream
 
 
@@ -21,7 +22,8 @@ def left_behind(params: ImageLag, charge: np.ndarray) -> np.ndarray:
     """Mean charge that stays, in electrons: what the pocket takes, never more than there is, and a share of the rest."""
     above = np.maximum(charge, 0)
     pocket = np.minimum(-params.pocket_e * np.expm1(-above / params.pocket_fill_e), above)
-    return (pocket + params.lag_rel * (charge - pocket)).astype(np.float32)
+    left: Singles = (pocket + params.lag_rel * (charge - pocket)).astype(np.float32)
+    return left
 
 
 def start(params: ImageLag) -> np.ndarray | None:

@@ -15,6 +15,7 @@ from pixmetry.camera.raster import spread_of
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.silicon import absorption_per_um, refractive_index
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.arrays import Array
 from pixmetry.core.random import Stream
 
 
@@ -81,7 +82,8 @@ def light_beyond(params: InfraredDiffusion, d_um: np.ndarray) -> np.ndarray:
     rho = np.hypot(x[:, None], z)
     density = np.trapezoid(z / (np.pi * length * rho) * k1(rho / length) * np.exp(-alpha * z), z, axis=1)
     seen = cumulative_trapezoid(density[::-1], -x[::-1], initial=0.0)[::-1]
-    return alpha * below * np.interp(np.log(d), np.log(x), seen) / (1 - below / (1 + alpha * length))
+    light: Array = alpha * below * np.interp(np.log(d), np.log(x), seen) / (1 - below / (1 + alpha * length))
+    return light
 
 
 @lru_cache(maxsize=32)
@@ -93,7 +95,7 @@ def kernel(params: InfraredDiffusion) -> tuple[np.ndarray, np.ndarray | None]:
 
 def forward(params: InfraredDiffusion, signal: Signal, stream: Stream) -> Signal:
     """Spread the light as the charge spreads, and move it along the slanting ray."""
-    light = signal.light
+    light = signal.own_light
     if params.diffusion_length_um:
         light = light.convolved(*kernel(params))
     if params.chief_ray_deg:

@@ -13,6 +13,7 @@ import numpy as np
 
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.arrays import Array
 from pixmetry.core.random import Stream
 
 
@@ -33,7 +34,8 @@ class Interlace(Parameters):
 def delay_s(params: Interlace, signal: Signal) -> np.ndarray:
     """How much later than the first field each row is exposed, shape (n, rows)."""
     second = signal.rows % 2 == (1 if params.first_field == "even" else 0)
-    return params.field_period_s * second
+    delay: Array = params.field_period_s * second
+    return delay
 
 
 def forward(params: Interlace, signal: Signal, stream: Stream) -> Signal:
@@ -42,13 +44,13 @@ def forward(params: Interlace, signal: Signal, stream: Stream) -> Signal:
     In both fields a line is the sum of its own row and the next (2k and 2k + 1, 2k + 1 and 2k + 2): the same aperture everywhere, whose
     middle lies half a row lower.
     """
-    light = signal.light
+    light = signal.own_light
     if params.integration == "field":
         light = light.moved(_half_a_row_down).spread(np.zeros(2), np.array([-0.5, 0.5]), np.array([0.5, 0.5]))
         light = replace(light, sensitivity=2 * light.sensitivity)
     if params.field_period_s and light.moving:
         light = light.delayed(delay_s(params, signal))
-    return signal if light is signal.light else signal.with_light(light)
+    return signal if light is signal.own_light else signal.with_light(light)
 
 
 def _half_a_row_down(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -10,6 +10,7 @@ import numpy as np
 from pixmetry.camera.light import GAUSS
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.arrays import Array
 from pixmetry.core.random import Stream
 
 
@@ -25,23 +26,24 @@ class LightPulses(Parameters):
 def delay_s(params: LightPulses, signal: Signal) -> np.ndarray:
     """Middle of the pulse that each row sees, from the end of the first field's exposure, shape (n, rows)."""
     second = signal.rows % 2 == (1 if params.first_field == "even" else 0)
-    return params.separation_s * (second - 0.5)
+    delay: Array = params.separation_s * (second - 0.5)
+    return delay
 
 
 def forward(params: LightPulses, signal: Signal, stream: Stream) -> Signal:
     """Let each row see its field's pulse, and the steady light at the times at which it looked before."""
-    if not signal.light.moving or params.ambient_share == 1:
+    if not signal.own_light.moving or params.ambient_share == 1:
         return signal
     nodes, shares = GAUSS[3]
     middle = (signal.time_s + signal.exposure_s)[:, None] + delay_s(params, signal)
     at = middle[:, :, None] + params.pulse_s * nodes
     weights = np.broadcast_to((1 - params.ambient_share) * shares, at.shape)
     if params.ambient_share:
-        times, before = signal.light.moments
+        times, before = signal.own_light.moments
         size = (*at.shape[:2], times.shape[2])
         at = np.concatenate([at, np.broadcast_to(times, size)], axis=2)
         weights = np.concatenate([weights, np.broadcast_to(params.ambient_share * before, size)], axis=2)
-    return signal.with_light(signal.light.seen_at(at, weights))
+    return signal.with_light(signal.own_light.seen_at(at, weights))
 
 
 def truth(params: LightPulses, signal: Signal, stream: Stream) -> Mapping[str, np.ndarray]:

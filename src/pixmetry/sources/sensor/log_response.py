@@ -64,7 +64,8 @@ def response_dn(params: LogResponse, electrons: np.ndarray, b_dn: np.ndarray | f
     else:
         above = np.maximum(x - params.knee_e / pixels.c_e, 0)
         f = x - above + np.log1p(above)
-    return pixels.a_dn + b_dn * pixels.b_rel * f
+    response: np.ndarray = pixels.a_dn + b_dn * pixels.b_rel * f
+    return response
 
 
 def forward(params: LogResponse, signal: Signal, stream: Stream) -> Signal:

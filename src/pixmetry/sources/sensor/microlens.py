@@ -7,6 +7,7 @@ import numpy as np
 from pixmetry.camera.geometry import corner_px, factor_verbs, frame_centre
 from pixmetry.camera.signal import Kind
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.arrays import Array
 
 
 class Microlens(Parameters):
@@ -25,7 +26,8 @@ def factor(params: Microlens, x_px: np.ndarray, y_px: np.ndarray, frame_shape: t
     aspect = params.pitch_y_um / params.pitch_x_um
     r = np.hypot(x_px - x0, aspect * (y_px - y0)) / corner_px(frame_shape, aspect)
     chief, design = (np.arctan(np.tan(np.radians(a)) * r) for a in (params.chief_ray_deg, params.design_ray_deg))
-    return np.exp(-0.5 * ((chief - design) / np.radians(params.acceptance_deg)) ** 2)
+    accepted: Array = np.exp(-0.5 * ((chief - design) / np.radians(params.acceptance_deg)) ** 2)
+    return accepted
 
 
 SOURCE = Source(

@@ -63,7 +63,7 @@ def forward(params: MountDrift, signal: Signal, stream: Stream) -> Signal:
     drift = (params.shift_x_px, params.shift_y_px, params.scale_rel, params.rotation_rad, params.affinity_rel, params.shear_rel)
     if not any(drift) and not (params.sag_px and params.roll_deg):
         return signal
-    return signal.with_light(signal.light.moved(_pull(params, signal)))
+    return signal.with_light(signal.own_light.moved(_pull(params, signal)))
 
 
 def truth(params: MountDrift, signal: Signal, stream: Stream) -> Mapping[str, np.ndarray]:

@@ -10,6 +10,7 @@ import numpy as np
 from pixmetry.camera.light import GAUSS
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.arrays import Array
 from pixmetry.core.random import Stream
 
 
@@ -33,7 +34,8 @@ def stored_s(params: ParasiticLight, signal: Signal) -> np.ndarray:
 
 def gain(params: ParasiticLight, signal: Signal) -> np.ndarray:
     """Light gathered over that of the exposure alone, for a scene that stands still, shape (n, rows)."""
-    return 1 + params.sensitivity_rel * stored_s(params, signal) / signal.exposure_s[:, None]
+    brighter: Array = 1 + params.sensitivity_rel * stored_s(params, signal) / signal.exposure_s[:, None]
+    return brighter
 
 
 def forward(params: ParasiticLight, signal: Signal, stream: Stream) -> Signal:
@@ -44,8 +46,8 @@ def forward(params: ParasiticLight, signal: Signal, stream: Stream) -> Signal:
     stored = stored_s(params, signal)[:, :, None]
     late = (signal.time_s + signal.exposure_s)[:, None, None] + stored * (0.5 + nodes)
     added = (gain(params, signal) - 1)[:, :, None] * shares
-    times, weights = (np.broadcast_to(v, (*late.shape[:2], v.shape[2])) for v in signal.light.moments)
-    return signal.with_light(signal.light.seen_at(np.concatenate([times, late], axis=2), np.concatenate([weights, added], axis=2)))
+    times, weights = (np.broadcast_to(v, (*late.shape[:2], v.shape[2])) for v in signal.own_light.moments)
+    return signal.with_light(signal.own_light.seen_at(np.concatenate([times, late], axis=2), np.concatenate([weights, added], axis=2)))
 
 
 def correct(params: ParasiticLight, signal: Signal, maps: Mapping[str, np.ndarray]) -> Signal:

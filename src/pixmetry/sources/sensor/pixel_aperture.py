@@ -38,7 +38,7 @@ def pull_of(params: PixelAperture) -> Pull:
 
 def forward(params: PixelAperture, signal: Signal, stream: Stream) -> Signal:
     """Narrow the window through which each pixel looks, and move it."""
-    light = signal.light
+    light = signal.own_light
     width, height = light.aperture_px
     if params.offset_x_px or params.offset_y_px:
         light = light.moved(pull_of(params))

@@ -47,7 +47,7 @@ def pull_of(params: PixelGeometry, frame_shape: tuple[int, int], stream: Stream)
 
 def forward(params: PixelGeometry, signal: Signal, stream: Stream) -> Signal:
     """Look from where the pixels really lie."""
-    light = signal.light
+    light = signal.own_light
     if params.field_std_px:
         light = light.moved(pull_of(params, signal.frame_shape, stream))
     if params.pixel_std_px:

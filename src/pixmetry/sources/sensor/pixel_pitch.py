@@ -35,7 +35,7 @@ def forward(params: PixelPitch, signal: Signal, stream: Stream) -> Signal:
     """Look from pixels of the true pitch, which collect light by their area."""
     if not (params.error_x_rel or params.error_y_rel):
         return signal
-    light = signal.light.moved(pull_of(params, signal.frame_shape))
+    light = signal.own_light.moved(pull_of(params, signal.frame_shape))
     area = (1 + params.error_x_rel) * (1 + params.error_y_rel)
     return signal.with_light(replace(light, sensitivity=light.sensitivity * area))
 

@@ -30,7 +30,7 @@ def delay_s(params: RollingShutter, signal: Signal) -> np.ndarray:
 
 def forward(params: RollingShutter, signal: Signal, stream: Stream) -> Signal:
     """Let every row look in its own time; after a global reset, over a longer time."""
-    light = signal.light
+    light = signal.own_light
     if not params.row_time_s:
         return signal
     if params.reset == "rolling":

@@ -12,6 +12,7 @@ import numpy as np
 
 from pixmetry.camera.signal import Kind, Signal, Windows
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.arrays import Array
 from pixmetry.core.random import Stream
 from pixmetry.sources.sensor._readout_kernels import add_column_sums, add_rows_passed
 
@@ -40,7 +41,8 @@ class Smear(Parameters):
 
 def share(params: Smear, signal: Signal) -> np.ndarray:
     """Part of one row's light that every packet takes up on passing it, shape (n,)."""
-    return params.leak_rel * params.transfer_s / (signal.frame_shape[0] * np.maximum(signal.exposure_s, 1e-12))
+    leaked: Array = params.leak_rel * params.transfer_s / (signal.frame_shape[0] * np.maximum(signal.exposure_s, 1e-12))
+    return leaked
 
 
 def forward(params: Smear, signal: Signal, stream: Stream) -> Signal:

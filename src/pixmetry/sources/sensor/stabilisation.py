@@ -44,7 +44,7 @@ def forward(params: Stabilisation, signal: Signal, stream: Stream) -> Signal:
     """Look from the pose of each frame."""
     if not (params.shift_std_px or params.roll_std_rad):
         return signal
-    return signal.with_light(signal.light.moved(pull_of(params, signal, stream)))
+    return signal.with_light(signal.own_light.moved(pull_of(params, signal, stream)))
 
 
 def truth(params: Stabilisation, signal: Signal, stream: Stream) -> Mapping[str, np.ndarray]:

@@ -47,7 +47,7 @@ def forward(params: ThermalExpansion, signal: Signal, stream: Stream) -> Signal:
     """Look from the warm sensor."""
     if not (params.sensor_per_k or params.mount_per_k or params.shift_x_px_per_k or params.shift_y_px_per_k):
         return signal
-    return signal.with_light(signal.light.moved(_pull(params, signal)))
+    return signal.with_light(signal.own_light.moved(_pull(params, signal)))
 
 
 def truth(params: ThermalExpansion, signal: Signal, stream: Stream) -> Mapping[str, np.ndarray]:

@@ -11,6 +11,7 @@ from pixmetry.camera.geometry import frame_centre, image_shift, map_contribution
 from pixmetry.camera.light import Pull
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.arrays import Array
 from pixmetry.core.random import Stream
 
 
@@ -30,7 +31,8 @@ def rotation(params: Tilt) -> np.ndarray:
     a, b = np.radians([params.tilt_x_deg, params.tilt_y_deg])
     about_y = np.array([[np.cos(a), 0, -np.sin(a)], [0, 1, 0], [np.sin(a), 0, np.cos(a)]])
     about_x = np.array([[1, 0, 0], [0, np.cos(b), -np.sin(b)], [0, np.sin(b), np.cos(b)]])
-    return about_y @ about_x
+    turn: Array = about_y @ about_x
+    return turn
 
 
 def places_mm(params: Tilt, x: np.ndarray, y: np.ndarray, frame_shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -64,7 +66,7 @@ def forward(params: Tilt, signal: Signal, stream: Stream) -> Signal:
     if not (params.tilt_x_deg or params.tilt_y_deg):
         return signal
     shape = signal.frame_shape
-    light = signal.light.moved(pull_of(params, shape))
+    light = signal.own_light.moved(pull_of(params, shape))
     return signal.with_light(light.blurred_by_place(lambda x, y: defocus_px2(params, x, y, shape)))
 
 

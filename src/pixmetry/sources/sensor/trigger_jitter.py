@@ -29,9 +29,9 @@ def delay_s(params: TriggerJitter, signal: Signal, stream: Stream) -> np.ndarray
 
 def forward(params: TriggerJitter, signal: Signal, stream: Stream) -> Signal:
     """Look at the scene later by the delay."""
-    if not signal.light.moving or not (params.latency_s or params.jitter_s or params.clock_error_rel):
+    if not signal.own_light.moving or not (params.latency_s or params.jitter_s or params.clock_error_rel):
         return signal
-    return signal.with_light(signal.light.delayed(delay_s(params, signal, stream)[:, None]))
+    return signal.with_light(signal.own_light.delayed(delay_s(params, signal, stream)[:, None]))
 
 
 def truth(params: TriggerJitter, signal: Signal, stream: Stream) -> Mapping[str, np.ndarray]:

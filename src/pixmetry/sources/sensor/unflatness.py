@@ -83,7 +83,7 @@ def forward(params: Unflatness, signal: Signal, stream: Stream) -> Signal:
     """Move and defocus the light by the height of the surface."""
     if not coefficients_um(params).any():
         return signal
-    shape, light = signal.frame_shape, signal.light
+    shape, light = signal.frame_shape, signal.own_light
     if params.chief_ray_deg:
         light = light.moved(pull_of(params, shape))
     return signal.with_light(light.blurred_by_place(lambda x, y: defocus_px2(params, x, y, shape)))

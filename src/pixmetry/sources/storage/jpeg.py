@@ -7,6 +7,7 @@ import numpy as np
 from pixmetry.camera.contribution import Contribution, Probe
 from pixmetry.camera.signal import Kind, Signal, Windows
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.arrays import Array, Ints
 from pixmetry.core.errors import ParameterError
 from pixmetry.core.random import Stream
 
@@ -36,7 +37,8 @@ class Jpeg(Parameters):
 def steps(quality: int) -> np.ndarray:
     """Quantiser steps of the luminance coefficients, shape (8, 8): the standard table scaled by the Independent JPEG Group's rule."""
     scale = 5000 // quality if quality < 50 else 200 - 2 * quality
-    return np.clip((LUMINANCE * scale + 50) // 100, 1, 255)
+    quantisers: Ints = np.clip((LUMINANCE * scale + 50) // 100, 1, 255)
+    return quantisers
 
 
 def forward(params: Jpeg, signal: Signal, stream: Stream) -> Signal:
@@ -79,7 +81,7 @@ def context(params: Jpeg, windows: Windows, frame_shape: tuple[int, int]) -> Win
 def cosines() -> np.ndarray:
     """Orthonormal cosine transform of eight samples, shape (8, 8)."""
     k, x = np.meshgrid(np.arange(BLOCK), np.arange(BLOCK), indexing="ij")
-    matrix = np.sqrt(2 / BLOCK) * np.cos(np.pi * (2 * x + 1) * k / (2 * BLOCK))
+    matrix: Array = np.sqrt(2 / BLOCK) * np.cos(np.pi * (2 * x + 1) * k / (2 * BLOCK))
     matrix[0] /= np.sqrt(2)
     return matrix
 
@@ -93,7 +95,8 @@ def block_error(image_dn: np.ndarray, quality: int) -> np.ndarray:
     coefficients = transform @ (tiles - 128.0) @ transform.T
     whole = np.copysign(np.floor(np.abs(coefficients) / step + 0.5), coefficients)  # halves away from zero, as the codec does
     lost = whole * step - coefficients
-    return (transform.T @ lost @ transform).swapaxes(2, 3).reshape(padded.shape)[:, :rows, :cols]
+    error: Array = (transform.T @ lost @ transform).swapaxes(2, 3).reshape(padded.shape)[:, :rows, :cols]
+    return error
 
 
 def propagate(params: Jpeg, probe: Probe) -> Contribution:

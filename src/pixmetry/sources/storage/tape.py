@@ -13,6 +13,7 @@ from pixmetry.camera.line import Line, alike_rows, group_delay_s, reach_px
 from pixmetry.camera.line_contribution import from_row_delays, from_steady_delays, held_of, through_line
 from pixmetry.camera.signal import Kind, Signal, Windows
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.arrays import Array, Flags
 from pixmetry.core.random import Grid, Stream
 
 SHARE_BEYOND = 1e-4  # of a step, beyond the near context
@@ -74,7 +75,8 @@ def _taps(bandwidth_hz: float, sample_hz: float, filters: tuple[tuple[bytes, byt
     k = np.arange(-most, most + 1)
     wave = np.sin(2 * np.pi * f[:, None] * k / sample_hz) * np.cos(0.5 * np.pi * k / (most + 1)) ** 2
     plain, seen = (np.asarray(w @ wave) for w in (f, f * line.gain(f)))
-    return seen / np.sqrt((plain**2).sum())
+    taps: Array = seen / np.sqrt((plain**2).sum())
+    return taps
 
 
 def noise_dn(params: Tape, grid: Grid, line: Line, behind: int, stream: Stream) -> np.ndarray:
@@ -99,7 +101,8 @@ def dropout_mask(params: Tape, signal: Signal, stream: Stream) -> np.ndarray:
     begin = lot[:, :, 1] * signal.frame_shape[1]
     end = begin + params.dropout_us * 1e-6 * signal.clock.pixel_hz
     cols = signal.cols[:, None, :]
-    return hit[:, :, None] & (cols >= begin[:, :, None]) & (cols < end[:, :, None])
+    lost: Flags = hit[:, :, None] & (cols >= begin[:, :, None]) & (cols < end[:, :, None])
+    return lost
 
 
 def _with_dropouts(params: Tape, signal: Signal, stream: Stream) -> np.ndarray:
@@ -115,7 +118,7 @@ def forward(params: Tape, signal: Signal, stream: Stream) -> Signal:
     """Record and play: dropouts, bandwidth, time base and noise. What delays picture and line pulses alike does not show."""
     if params.generations == 0:
         return signal
-    frame_rows, line = signal.frame_shape[0], signal.line
+    frame_rows, line = signal.frame_shape[0], signal.own_line
     common = group_delay_s([], params.poles)
     behind = len(line.filters) + 1
     line = line.filtered([], params.poles).delayed(lambda grid: delay_s(params, grid, frame_rows, stream) - common)
