@@ -415,7 +415,7 @@ def test_a_full_disk_is_one_line_and_leaves_the_old_frames(folder: Path, monkeyp
     assert sorted(p.name for p in folder.rglob("*")) == before
 
 
-@pytest.mark.parametrize(("name", "words"), [("x" * 300, "shorter name"), ("c\udcff", "no UTF-8")])
+@pytest.mark.parametrize(("name", "words"), [("x" * 300, "shorter name"), ("c\udcff", "not valid UTF-8")])
 def test_names_that_a_disk_or_a_record_cannot_hold_are_one_line(folder: Path, name: str, words: str) -> None:
     result = run(folder, output=name)
     assert result.exit_code == 2 and result.output.count("\n") == 1 and words in result.output
