@@ -9,26 +9,81 @@ matrix is U − Σ Z Zᵀ (the Schur complement).
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
-from pixmetry.calibrate.bundle._model_kernels import INTERIOR, image_point
+from pixmetry.calibrate.bundle._model_kernels import INTERIOR, Cameras, Lens, Views, image_point
+from pixmetry.core.arrays import Array, Flags, Ints
 from pixmetry.core.jit import jit
 
 ELIMINATED, HELD = -1, -2  # values of ``point_col``: eliminated; no unknown, or not determined
 SUMS = {"contract", "reassoc", "nsz"}  # sums in any order
 
 
+class Measured(NamedTuple):
+    """Image coordinates, px."""
+
+    x: Array  # (n,)
+    y: Array  # (n,)
+    whiten: Array  # (n, 3): lower triangle of the inverse Cholesky factor of each covariance, 1/px
+
+
+class Incidence(NamedTuple):
+    """Which image shows which point, and which unknowns these have."""
+
+    image: Ints  # (n,)
+    point: Ints  # (n,)
+    first: Ints  # (points + 1,): image coordinates of each point
+    camera_of: Ints  # (images,)
+    free: Ints  # (cameras, f): free interior parameters, −1 after the last
+    extra: Ints  # (2,): places of x-scale and x-shift behind the pose, −1 if not estimated
+    camera_col: Ints  # (cameras,): first reduced unknown of each camera, and
+    camera_count: Ints  # (cameras,): how many it has
+    image_col: Ints  # (images,): first reduced unknown, −1 if there is none
+    point_col: Ints  # (points,): likewise, or `ELIMINATED` or `HELD`
+
+
+class Stretch(NamedTuple):
+    """What the grabber does to each image along x: x = x₀ + (1 + scale)(x_model − x₀) + shift."""
+
+    scale: Array  # (images,)
+    shift_px: Array  # (images,)
+    origin_px: float  # x₀
+
+
+class Points(NamedTuple):
+    """Object points."""
+
+    xyz: Array  # (points, 3)
+    held: Flags  # (points, 3): coordinates that are fixed
+
+
+class Linear(NamedTuple):
+    """The observation equations, linearised and whitened."""
+
+    jacobian: Array  # (n, 2, q)
+    weight: Array  # (n,): 0 where an image coordinate takes no part
+
+
+class Eliminated(NamedTuple):
+    """Z of the eliminated points."""
+
+    of_images: Array  # (n, 3, p): image point by image point, by the p unknowns of an image
+    of_cameras: Array  # (points, 3, interior): by the unknowns of all cameras
+
+
 @jit
 def linearise(
-    x, y, whiten, image, point, camera_of, interior, direction, per_px, free, rotation, position, x_scale, x_shift, origin, extra, xyz,
-    held, residual, jacobian,
-):
-    """Whitened residuals (n, 2) and Jacobian (n, 2, q) at a state; NaN and 0 where a point has no image.
-
-    ``whiten`` holds the lower triangle of the inverse Cholesky factor of each covariance; ``free`` (cameras, f) the free parameters of each
-    camera, −1 after the last; ``extra`` the places of x-scale and x-shift behind the pose, −1 if not estimated; ``held`` the coordinates of
-    points that are fixed.
-    """
+    measured: Measured, at: Incidence, cameras: Cameras, views: Views, stretches: Stretch, points: Points, residual: Array, jacobian: Array
+) -> None:
+    """Whitened residuals (n, 2) and Jacobian (n, 2, q) at a state; NaN and 0 where a point has no image."""
+    x, y, whiten = measured
+    image, point, camera_of, free, extra = at.image, at.point, at.camera_of, at.free, at.extra
+    interior, direction, per_px = cameras
+    rotation, position = views
+    x_scale, x_shift, origin = stretches
+    xyz, held = points
     f = free.shape[1]
     wide = jacobian.shape[2]
     by_direction, by_interior = np.empty((2, 2)), np.empty((2, INTERIOR))
@@ -45,10 +100,10 @@ def linearise(
         if zc > 1e-9 * (abs(xc) + abs(yc)):
             u, v = xc / zc, yc / zc
             guess = origin + (x[i] - x_shift[m] - origin) / stretch
-            q, mx, my = interior[k], per_px[k, 0], per_px[k, 1]
-            px, py = image_point(u, v, q, direction[k], mx, my, guess, y[i], by_direction, by_interior)
+            lens = Lens(interior[k], direction[k], per_px[k, 0], per_px[k, 1])
+            px, py = image_point(u, v, lens, guess, y[i], by_direction, by_interior)
             if np.isnan(px):
-                px, py = image_point(u, v, q, direction[k], mx, my, np.nan, np.nan, by_direction, by_interior)
+                px, py = image_point(u, v, lens, np.nan, np.nan, by_direction, by_interior)
         rows = jacobian[i]
         if np.isnan(px) or np.isnan(py):
             residual[i, 0], residual[i, 1] = np.nan, np.nan
@@ -85,8 +140,11 @@ def linearise(
 
 
 @jit
-def normals(residual, jacobian, weight, image, first, camera_of, camera_col, camera_count, image_col, point_col, U, g, V, h):
+def normals(residual: Array, linear: Linear, at: Incidence, U: Array, g: Array, V: Array, h: Array) -> None:
     """Add the normal equations of all image coordinates: U, g of the reduced unknowns, V (points, 3, 3), h (points, 3) of the points."""
+    jacobian, weight = linear
+    image, first, camera_of, camera_col, camera_count = at.image, at.first, at.camera_of, at.camera_col, at.camera_count
+    image_col, point_col = at.image_col, at.point_col
     wide = jacobian.shape[2]
     each = camera_count.max()
     poses = wide - 3 - each
@@ -135,8 +193,11 @@ def normals(residual, jacobian, weight, image, first, camera_of, camera_col, cam
 
 
 @jit
-def gradients(residual, jacobian, weight, image, first, camera_of, camera_col, camera_count, image_col, point_col, g, h):
+def gradients(residual: Array, linear: Linear, at: Incidence, g: Array, h: Array) -> None:
     """Add the right sides alone: g of the reduced unknowns, h (points, 3) of the eliminated points."""
+    jacobian, weight = linear
+    image, first, camera_of, camera_col, camera_count = at.image, at.first, at.camera_of, at.camera_col, at.camera_count
+    image_col, point_col = at.image_col, at.point_col
     each = camera_count.max()
     p = jacobian.shape[2] - 3
     for j in range(len(first) - 1):
@@ -157,7 +218,7 @@ def gradients(residual, jacobian, weight, image, first, camera_of, camera_col, c
 
 
 @jit
-def roots(V, point_col, root):
+def roots(V: Array, point_col: Ints, root: Array) -> Array:
     """L⁻¹ of V = L Lᵀ for the eliminated points; returns for each the smallest ratio of a pivot to its diagonal."""
     pivot = np.ones(len(V))
     for j in range(len(V)):
@@ -189,8 +250,12 @@ def roots(V, point_col, root):
 
 
 @jit
-def condense(jacobian, weight, image, first, camera_of, camera_col, camera_count, image_col, point_col, root, of_images, of_cameras):
-    """Rows of Z of the eliminated points: ``of_images`` (n, 3, p) image point by image point, ``of_cameras`` (points, 3, interior)."""
+def condense(linear: Linear, at: Incidence, root: Array, Z: Eliminated) -> None:
+    """Write Z of the eliminated points."""
+    jacobian, weight = linear
+    of_images, of_cameras = Z
+    image, first, camera_of, camera_col, camera_count = at.image, at.first, at.camera_of, at.camera_col, at.camera_count
+    point_col = at.point_col
     each = camera_count.max()
     poses = of_images.shape[2]
     p = each + poses
@@ -224,8 +289,10 @@ def condense(jacobian, weight, image, first, camera_of, camera_col, camera_count
 
 
 @jit
-def reduce_pairs(of_images, of_cameras, by_image, image, point, first, image_col, S):
+def reduce_pairs(Z: Eliminated, by_image: Ints, at: Incidence, S: Array) -> None:
     """Subtract Z Zᵀ from the rows of the images, pair of image points by pair; image after image, so that its rows stay at hand."""
+    of_images, of_cameras = Z
+    image, point, first, image_col = at.image, at.point, at.first, at.image_col
     poses, interior = of_images.shape[2], of_cameras.shape[2]
     for i in by_image:
         row, j = image_col[image[i]], point[i]
@@ -250,8 +317,10 @@ def reduce_pairs(of_images, of_cameras, by_image, image, point, first, image_col
 
 
 @jit
-def spread(which, of_images, of_cameras, image, first, image_col, out):
+def spread(which: Ints, Z: Eliminated, at: Incidence, out: Array) -> None:
     """Write Z of the points ``which`` into the zeroed rows of ``out`` (3 points, unknowns)."""
+    of_images, of_cameras = Z
+    image, first, image_col = at.image, at.first, at.image_col
     for n in range(len(which)):
         j = which[n]
         for c in range(3):
@@ -265,11 +334,14 @@ def spread(which, of_images, of_cameras, image, first, image_col, out):
 
 
 @jit
-def point_steps(jacobian, weight, image, first, camera_of, camera_col, camera_count, image_col, point_col, root, h, step, out):
+def point_steps(linear: Linear, at: Incidence, root: Array, h: Array, step: Array, out: Array) -> None:
     """Unknowns of the eliminated points from those of the reduced system, for several right-hand sides: V⁻¹ (h − Wᵀ step).
 
     ``h`` (points, 3, s), ``step`` (unknowns, s), ``out`` (points, 3, s).
     """
+    jacobian, weight = linear
+    image, first, camera_of, camera_col, camera_count = at.image, at.first, at.camera_of, at.camera_col, at.camera_count
+    image_col, point_col = at.image_col, at.point_col
     each = camera_count.max()
     p = jacobian.shape[2] - 3
     rest = np.empty(3)
@@ -304,11 +376,13 @@ def point_steps(jacobian, weight, image, first, camera_of, camera_col, camera_co
 
 
 @jit(fastmath=SUMS)
-def quadratic(of_images, by_image, image, point, first, image_col, Q, of_cameras, T):
-    """Add Z Q Zᵀ (points, 3, 3) as half of a sum with its own transpose, from the rows of the images in Q.
+def quadratic(Z: Eliminated, by_image: Ints, at: Incidence, Q: Array, T: Array) -> None:
+    """Add Z Q Zᵀ (points, 3, 3) to T as half of a sum with its own transpose, from the rows of the images in Q.
 
-    ``of_cameras`` is Z of the cameras here; what lies between cameras is left to the caller.
+    What lies between cameras is left to the caller.
     """
+    of_images, of_cameras = Z
+    image, point, first, image_col = at.image, at.point, at.first, at.image_col
     poses, interior = of_images.shape[2], of_cameras.shape[2]
     g = np.empty((3, poses))
     for i in by_image:
@@ -344,8 +418,10 @@ def quadratic(of_images, by_image, image, point, first, image_col, Q, of_cameras
 
 
 @jit(fastmath=SUMS)
-def products(which, of_images, of_cameras, image, first, image_col, Q, G):
+def products(which: Ints, Z: Eliminated, at: Incidence, Q: Array, G: Array) -> None:
     """Write Zᵀ Q of the points ``which`` into ``G`` (3 points, unknowns), for the unknowns of cameras and of images that see the point."""
+    of_images, of_cameras = Z
+    image, first, image_col = at.image, at.first, at.image_col
     poses, interior = of_images.shape[2], of_cameras.shape[2]
     for n in range(len(which)):
         j = which[n]
@@ -370,12 +446,15 @@ def products(which, of_images, of_cameras, image, first, image_col, Q, G):
 
 @jit
 def residual_cofactors(
-    jacobian, weight, image, point, place, camera_of, camera_col, camera_count, image_col, point_col, root, cofactor, Q, G, own
-):
+    linear: Linear, at: Incidence, place: Ints, root: Array, cofactor: Array, Q: Array, G: Array, own: Array
+) -> None:
     """2 × 2 matrices J Qxx Jᵀ of whitened image coordinates, shape (n, 3) for xx, xy, yy, in units of their own weight.
 
     ``place[i]``: row block of its point in ``G`` = Zᵀ Q (3 points, unknowns), −1 where the point is not eliminated and −2 to pass it over.
     """
+    jacobian, weight = linear
+    image, point, camera_of, camera_col, camera_count = at.image, at.point, at.camera_of, at.camera_col, at.camera_count
+    image_col, point_col = at.image_col, at.point_col
     each = camera_count.max()
     p = jacobian.shape[2] - 3
     poses = p - each
@@ -436,8 +515,11 @@ def residual_cofactors(
 
 
 @jit
-def from_points(jacobian, weight, image, first, camera_of, camera_col, camera_count, image_col, point_col, values, out):
+def from_points(linear: Linear, at: Incidence, values: Array, out: Array) -> None:
     """Subtract W ``values`` from ``out`` (unknowns, s), for ``values`` (points, 3, s) of the eliminated points."""
+    jacobian, weight = linear
+    image, first, camera_of, camera_col, camera_count = at.image, at.first, at.camera_of, at.camera_col, at.camera_count
+    image_col, point_col = at.image_col, at.point_col
     each = camera_count.max()
     p = jacobian.shape[2] - 3
     for j in range(len(first) - 1):
@@ -462,7 +544,7 @@ def from_points(jacobian, weight, image, first, camera_of, camera_col, camera_co
 
 
 @jit
-def scaled_whole(lower, scale):
+def scaled_whole(lower: Array, scale: Array) -> None:
     """Scale rows and columns of a symmetric matrix and write its lower triangle into the upper, in place, tile by tile."""
     n, tile = len(lower), 64
     for i0 in range(0, n, tile):
@@ -475,7 +557,7 @@ def scaled_whole(lower, scale):
 
 
 @jit
-def scaled_lower(lower, scale):
+def scaled_lower(lower: Array, scale: Array) -> None:
     """Scale rows and columns of the lower triangle of a matrix, in place."""
     for i in range(len(lower)):
         row, own = lower[i], scale[i]

@@ -2,13 +2,16 @@
 centre of area of the image of a flat target, by integrals along its outline.
 
 Interior parameters are a row of `INTERIOR` numbers: c, xp, yp, b1, b2, p1, p2, k1 … k5. Length units are those of the image plane:
-millimetres, or pixels where no pitch is known; ``mx``, ``my`` are their number per pixel.
+millimetres, or pixels where no pitch is known.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
+from pixmetry.core.arrays import Array, Ints
 from pixmetry.core.jit import jit
 
 INTERIOR = 12
@@ -16,8 +19,50 @@ IMAGE_TO_OBJECT, OBJECT_TO_IMAGE = 0, 1
 NEWTON_STEPS = 30
 
 
+class Lens(NamedTuple):
+    """Interior orientation of one camera."""
+
+    values: Array  # (INTERIOR,)
+    direction: int  # of the distortion: `IMAGE_TO_OBJECT` or `OBJECT_TO_IMAGE`
+    mx: float  # length units per pixel along x, and
+    my: float  # along y
+
+
+class Cameras(NamedTuple):
+    """Interior orientations of all cameras."""
+
+    values: Array  # (cameras, INTERIOR)
+    direction: Ints  # (cameras,)
+    per_px: Array  # (cameras, 2): length units per pixel along x and y
+
+
+class Views(NamedTuple):
+    """Where the images stand: a point X is seen at R (X − X₀)."""
+
+    rotation: Array  # (images, 3, 3)
+    position: Array  # (images, 3)
+
+
+class Targets(NamedTuple):
+    """Flat targets, each as one image sees it."""
+
+    image: Ints  # (n,)
+    camera: Ints  # (n,): of this image
+    xyz: Array  # (n, 3): their centres
+    first: Array  # (n, 3): unit vectors in their planes
+    second: Array  # (n, 3): across these
+    size: Array  # (n,): what one unit of an outline is in the object
+
+
+class Outline(NamedTuple):
+    """Nodes of a quadrature along the outline of a target."""
+
+    place: Array  # (m, 2)
+    tangent: Array  # (m, 2): the weighted steps along it
+
+
 @jit
-def corrected(a, b, q, slopes):
+def corrected(a: float, b: float, q: Array, slopes: Array) -> tuple[float, float]:
     """Brown's polynomial at (a, b), with affinity and shear; ``slopes`` takes d(a', b')/d(a, b), flat of 4.
 
     a' = a (1 + b1 + radial) + b2 b + p1 (r² + 2 a²) + 2 p2 a b;  b' = b (1 + radial) + p2 (r² + 2 b²) + 2 p1 a b.
@@ -36,7 +81,7 @@ def corrected(a, b, q, slopes):
 
 
 @jit
-def uncorrected(ideal_a, ideal_b, a, b, q, slopes):
+def uncorrected(ideal_a: float, ideal_b: float, a: float, b: float, q: Array, slopes: Array) -> tuple[float, float]:
     """The place (a, b) whose polynomial is (ideal_a, ideal_b), by Newton's method from a first guess; NaN where there is none."""
     scale = 1e-13 * (1.0 + abs(ideal_a) + abs(ideal_b))
     for _ in range(NEWTON_STEPS):
@@ -57,12 +102,15 @@ def uncorrected(ideal_a, ideal_b, a, b, q, slopes):
 
 
 @jit
-def image_point(u, v, q, direction, mx, my, guess_x, guess_y, by_direction, by_interior):
+def image_point(
+    u: float, v: float, lens: Lens, guess_x: float, guess_y: float, by_direction: Array, by_interior: Array
+) -> tuple[float, float]:
     """Image of the direction (u, v) = (X/Z, Y/Z), in pixels.
 
     ``guess_x``, ``guess_y``: pixels near which it lies (NaN if not known). ``by_direction`` takes d(x, y)/d(u, v), shape (2, 2);
     ``by_interior`` takes d(x, y)/d q, shape (2, INTERIOR).
     """
+    q, direction, mx, my = lens
     c, b1, b2, p1, p2 = q[0], q[3], q[4], q[5], q[6]
     slopes = np.empty(4)
     if direction == IMAGE_TO_OBJECT:
@@ -120,19 +168,20 @@ def image_point(u, v, q, direction, mx, my, guess_x, guess_y, by_direction, by_i
 
 
 @jit
-def image_points(u, v, q, direction, mx, my):
+def image_points(u: Array, v: Array, lens: Lens) -> tuple[Array, Array, Array, Array]:
     """Images of many directions, with derivatives: x, y of shape (n,), (n, 2, 2) by direction, (n, 2, INTERIOR) by interior."""
     n = len(u)
     x, y = np.empty(n), np.empty(n)
     by_direction, by_interior = np.empty((n, 2, 2)), np.empty((n, 2, INTERIOR))
     for i in range(n):
-        x[i], y[i] = image_point(u[i], v[i], q, direction, mx, my, np.nan, np.nan, by_direction[i], by_interior[i])
+        x[i], y[i] = image_point(u[i], v[i], lens, np.nan, np.nan, by_direction[i], by_interior[i])
     return x, y, by_direction, by_interior
 
 
 @jit
-def directions(x, y, q, direction, mx, my):
+def directions(x: Array, y: Array, lens: Lens) -> tuple[Array, Array, Array]:
     """Directions (X/Z, Y/Z) in which pixels look, with derivatives: u, v of shape (n,), (n, 2, 2) by the pixel; NaN where there is none."""
+    q, direction, mx, my = lens
     n = len(x)
     u, v, by_pixel = np.empty(n), np.empty(n), np.empty((n, 2, 2))
     slopes, plain = np.empty(4), q.copy()
@@ -156,20 +205,21 @@ def directions(x, y, q, direction, mx, my):
 
 
 @jit
-def area_centres(xyz, first, second, size, image, camera, rotation, position, interior, direction, per_px, place, tangent):
+def area_centres(targets: Targets, views: Views, cameras: Cameras, outline: Outline) -> Array:
     """Shift of the centre of area against the image of the centre, px, shape (n, 2); NaN where the outline has no image.
 
-    ``first``, ``second``: unit vectors in the target's plane, shape (n, 3); ``size``: what one unit of ``place`` is in the object, (n,).
-    ``place``, ``tangent``: nodes of a quadrature along the outline and the weighted steps along it, shape (m, 2). By Green's theorem
-    the area is ½ ∮ (x dy − y dx) and its moments are ½ ∮ x² dy and −½ ∮ y² dx, here about the image of the centre.
+    By Green's theorem the area is ½ ∮ (x dy − y dx) and its moments are ½ ∮ x² dy and −½ ∮ y² dx, here about the image of the centre.
     """
+    image, camera, xyz, first, second, size = targets
+    rotation, position = views
+    place, tangent = outline
     n, m = len(size), len(place)
     shift = np.full((n, 2), np.nan)
     by_direction, by_interior = np.empty((2, 2)), np.empty((2, INTERIOR))
     centre, e, f, p, t = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for i in range(n):
-        j, k = image[i], camera[image[i]]
-        q, mx, my = interior[k], per_px[k, 0], per_px[k, 1]
+        j, k = image[i], camera[i]
+        lens = Lens(cameras.values[k], cameras.direction[k], cameras.per_px[k, 0], cameras.per_px[k, 1])
         for a in range(3):
             centre[a] = e[a] = f[a] = 0.0
             for b in range(3):
@@ -178,9 +228,7 @@ def area_centres(xyz, first, second, size, image, camera, rotation, position, in
                 f[a] += rotation[j, a, b] * second[i, b] * size[i]
         if not centre[2] > 0:
             continue
-        x0, y0 = image_point(
-            centre[0] / centre[2], centre[1] / centre[2], q, direction[k], mx, my, np.nan, np.nan, by_direction, by_interior
-        )
+        x0, y0 = image_point(centre[0] / centre[2], centre[1] / centre[2], lens, np.nan, np.nan, by_direction, by_interior)
         area = moment_x = moment_y = 0.0
         for o in range(m):
             for a in range(3):
@@ -191,7 +239,7 @@ def area_centres(xyz, first, second, size, image, camera, rotation, position, in
                 break
             u, v = p[0] / p[2], p[1] / p[2]
             du, dv = (t[0] - u * t[2]) / p[2], (t[1] - v * t[2]) / p[2]
-            x, y = image_point(u, v, q, direction[k], mx, my, x0, y0, by_direction, by_interior)
+            x, y = image_point(u, v, lens, x0, y0, by_direction, by_interior)
             dx = by_direction[0, 0] * du + by_direction[0, 1] * dv
             dy = by_direction[1, 0] * du + by_direction[1, 1] * dv
             x -= x0

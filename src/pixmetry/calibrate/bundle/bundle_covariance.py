@@ -97,7 +97,7 @@ def cofactors(layout: Layout, datum: Datum, now: Linearised, solved: Solved, res
             points[which] = _with_own(solved.root[which], inner)
         else:
             G = np.empty((3 * len(which), len(Q)))
-            kernels.products(which, *solved.Z, layout.image, layout.first, layout.image_col, Q, G)
+            kernels.products(which, solved.Z, layout.incidence, Q, G)
         if own is not None:
             _residuals(layout, now, solved, which, points, Q, G, own)
     joined = np.flatnonzero(layout.point_col >= 0)
@@ -121,10 +121,10 @@ def _of_estimated(layout: Layout, Q: np.ndarray) -> np.ndarray:
 
 def _gathered(layout: Layout, solved: Solved, Q: np.ndarray) -> np.ndarray:
     """Cofactors of the eliminated points, from those parts of Q that they touch."""
-    of_images, of_cameras = solved.Z
+    of_cameras = solved.Z.of_cameras
     n = of_cameras.shape[2]
     half = 0.5 * (of_cameras @ Q[:n, :n]) @ np.swapaxes(of_cameras, 1, 2)
-    kernels.quadratic(of_images, layout.by_image, layout.image, layout.point, layout.first, layout.image_col, Q, of_cameras, half)
+    kernels.quadratic(solved.Z, layout.by_image, layout.incidence, Q, half)
     return _with_own(solved.root, half + np.swapaxes(half, 1, 2))
 
 
@@ -167,10 +167,8 @@ def _residuals(
         return
     block = np.full(len(layout.point_col), -2, np.int64)
     block[which] = np.where(layout.point_col[which] == kernels.ELIMINATED, np.arange(len(which)), -1)
-    kernels.residual_cofactors(
-        now.jacobian, now.weight, layout.image, layout.point, block[layout.point], layout.camera_of, layout.camera_col, layout.camera_count,
-        layout.image_col, layout.point_col, solved.root, points, Q, np.ascontiguousarray(G), own,
-    )  # fmt: skip
+    place = block[layout.point]
+    kernels.residual_cofactors(now.linear, layout.incidence, place, solved.root, points, Q, np.ascontiguousarray(G), own)
 
 
 def _in_datum(
@@ -183,13 +181,12 @@ def _in_datum(
 
     G, G_points, _ = null_space(layout, now.state, datum)
     B, B_points = carried(layout, G_points, datum)
-    common = (now.jacobian, now.weight, *layout.incidence)
     inverse = np.swapaxes(solved.root, 1, 2) @ solved.root
     right = B.copy()
-    kernels.from_points(*common, layout.point_col, inverse @ B_points, right)
+    kernels.from_points(now.linear, layout.incidence, inverse @ B_points, right)
     QB = Q @ right
     QB_points = np.zeros_like(B_points)
-    kernels.point_steps(*common, layout.point_col, solved.root, B_points, QB, QB_points)
+    kernels.point_steps(now.linear, layout.incidence, solved.root, B_points, QB, QB_points)
     out = layout.point_col == kernels.ELIMINATED
     product = np.linalg.inv(np.einsum("jad,jae->de", B_points, G_points))
     K = product @ (B.T @ QB + np.einsum("jad,jae->de", B_points[out], QB_points[out])) @ product.T

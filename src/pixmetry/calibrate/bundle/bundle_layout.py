@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import compress
 
 import numpy as np
 
-from pixmetry.calibrate.bundle._bundle_kernels import ELIMINATED, HELD
+from pixmetry.calibrate.bundle._bundle_kernels import ELIMINATED, HELD, Incidence
 from pixmetry.calibrate.bundle.model import CODES, NAMES
 from pixmetry.calibrate.bundle.network import PER_IMAGE_NAMES, Network, ScaleBars, State
 from pixmetry.core.errors import InputError, MeasureError
@@ -106,10 +107,12 @@ class Layout:
         """Camera of each image."""
         return self.network.camera_of.astype(np.int64)
 
-    @property
-    def incidence(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """What sees what, and where it stands, as the kernels take it behind Jacobian and weights."""
-        return (self.image, self.first, self.camera_of, self.camera_col, self.camera_count, self.image_col)
+    @cached_property
+    def incidence(self) -> Incidence:
+        """What sees what, and which unknowns there are, as the kernels take it."""
+        free = np.ascontiguousarray(self.free[:, : int(self.camera_count.max())])
+        columns = (self.camera_col, self.camera_count, self.image_col, self.point_col)
+        return Incidence(self.image, self.point, self.first, self.camera_of, free, self.extra, *columns)
 
     @property
     def per_image(self) -> int:

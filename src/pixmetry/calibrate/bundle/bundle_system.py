@@ -7,6 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pixmetry.calibrate.bundle import _bundle_kernels as kernels
+from pixmetry.calibrate.bundle._bundle_kernels import Eliminated, Linear, Measured, Points, Stretch
+from pixmetry.calibrate.bundle._model_kernels import Cameras, Views
 from pixmetry.calibrate.bundle.bundle_layout import Layout
 from pixmetry.calibrate.bundle.datum import Datum, null_space
 from pixmetry.calibrate.bundle.network import State
@@ -38,6 +40,11 @@ class Linearised:
     unit: float  # robust variance of a whitened coordinate, by which the loss counts
     cost: float
 
+    @property
+    def linear(self) -> Linear:
+        """Jacobian and weights, as the kernels take them."""
+        return Linear(self.jacobian, self.weight)
+
 
 @dataclass
 class Solved:
@@ -49,19 +56,17 @@ class Solved:
     factor: np.ndarray  # Cholesky factor of the scaled reduced system, in the work space
     scale: np.ndarray
     root: np.ndarray
-    Z: tuple[np.ndarray, np.ndarray]
+    Z: Eliminated
 
 
 def linearise(layout: Layout, state: State, loss: Loss) -> Linearised:
     """Residuals, Jacobian and weights at a state."""
-    n = len(layout.x)
-    free = layout.free[:, : int(layout.camera_count.max())]
-    residual, jacobian = np.empty((n, 2)), np.empty((n, 2, free.shape[1] + 6 + int((layout.extra >= 0).sum()) + 3))
-    kernels.linearise(
-        layout.x, layout.y, layout.whiten, layout.image, layout.point, layout.camera_of, state.interior, layout.direction, layout.per_px,
-        free, state.rotation, state.position, state.x_scale, state.x_shift_px, float(layout.network.scale_origin_px), layout.extra,
-        state.xyz, layout.held, residual, jacobian,
-    )  # fmt: skip
+    n, at = len(layout.x), layout.incidence
+    residual, jacobian = np.empty((n, 2)), np.empty((n, 2, at.free.shape[1] + 6 + int((layout.extra >= 0).sum()) + 3))
+    measured, cameras = Measured(layout.x, layout.y, layout.whiten), Cameras(state.interior, layout.direction, layout.per_px)
+    stretch = Stretch(state.x_scale, state.x_shift_px, float(layout.network.scale_origin_px))
+    views, points = Views(state.rotation, state.position), Points(state.xyz, layout.held)
+    kernels.linearise(measured, at, cameras, views, stretch, points, residual, jacobian)
     valid = np.asarray(np.isfinite(residual).all(axis=1))
     residual[~valid] = 0.0
     loss_weight, unit = _loss_weight(residual, layout.used & valid, loss)
@@ -74,7 +79,7 @@ def equations(layout: Layout, now: Linearised, work: np.ndarray) -> tuple[np.nda
     p = len(layout.network.points)
     g, V, h = np.zeros(len(work)), np.zeros((p, 3, 3)), np.zeros((p, 3))
     work[:] = 0.0
-    kernels.normals(now.residual, now.jacobian, now.weight, *layout.incidence, layout.point_col, work, g, V, h)
+    kernels.normals(now.residual, now.linear, layout.incidence, work, g, V, h)
     _add_control(layout, now.state, work, g, V, h)
     return g, V, h
 
@@ -126,19 +131,18 @@ def point_roots(layout: Layout, V: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return root, kernels.roots(V, layout.point_col, root)
 
 
-def condensed(layout: Layout, now: Linearised, root: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Z of the eliminated points: of images, by image point (n, 3, p), and of cameras (points, 3, interior parameters)."""
-    of_images = np.zeros((len(layout.x), 3, layout.per_image))
-    of_cameras = np.zeros((len(root), 3, int(layout.camera_count.sum())))
-    kernels.condense(now.jacobian, now.weight, *layout.incidence, layout.point_col, root, of_images, of_cameras)
-    return of_images, of_cameras
+def condensed(layout: Layout, now: Linearised, root: np.ndarray) -> Eliminated:
+    """Z of the eliminated points."""
+    Z = Eliminated(np.zeros((len(layout.x), 3, layout.per_image)), np.zeros((len(root), 3, int(layout.camera_count.sum()))))
+    kernels.condense(now.linear, layout.incidence, root, Z)
+    return Z
 
 
-def reduce(layout: Layout, Z: tuple[np.ndarray, np.ndarray], h: np.ndarray, root: np.ndarray, S: np.ndarray, g: np.ndarray) -> None:
+def reduce(layout: Layout, Z: Eliminated, h: np.ndarray, root: np.ndarray, S: np.ndarray, g: np.ndarray) -> None:
     """Eliminate the points: S (lower triangle) and its right side g, in place."""
     from scipy.linalg.blas import dsyrk
 
-    of_images, of_cameras = Z
+    of_cameras = Z.of_cameras
     n = of_cameras.shape[2]
     _reduce_right(layout, Z, h, root, g)
     if dense(layout):
@@ -147,10 +151,10 @@ def reduce(layout: Layout, Z: tuple[np.ndarray, np.ndarray], h: np.ndarray, root
             dsyrk(-1.0, rows.T, beta=1.0, c=S.T, lower=0, overwrite_c=1)
         return
     S[:n, :n] -= np.tensordot(of_cameras, of_cameras, axes=([0, 1], [0, 1]))
-    kernels.reduce_pairs(of_images, of_cameras, layout.by_image, layout.image, layout.point, layout.first, layout.image_col, S)
+    kernels.reduce_pairs(Z, layout.by_image, layout.incidence, S)
 
 
-def _reduce_right(layout: Layout, Z: tuple[np.ndarray, np.ndarray], h: np.ndarray, root: np.ndarray, g: np.ndarray) -> None:
+def _reduce_right(layout: Layout, Z: Eliminated, h: np.ndarray, root: np.ndarray, g: np.ndarray) -> None:
     """Eliminate the points from the right side g, in place."""
     of_images, of_cameras = Z
     t = np.einsum("jab,jb->ja", root, h)
@@ -159,10 +163,10 @@ def _reduce_right(layout: Layout, Z: tuple[np.ndarray, np.ndarray], h: np.ndarra
     np.subtract.at(g, layout.image_col[layout.image][:, None] + np.arange(layout.per_image), pulls)
 
 
-def rows_of(layout: Layout, Z: tuple[np.ndarray, np.ndarray], which: np.ndarray) -> np.ndarray:
+def rows_of(layout: Layout, Z: Eliminated, which: np.ndarray) -> np.ndarray:
     """Zᵀ of some points in whole rows, shape (3 points, unknowns)."""
     rows = np.zeros((3 * len(which), len(layout.columns)))
-    kernels.spread(which, *Z, layout.image, layout.first, layout.image_col, rows)
+    kernels.spread(which, Z, layout.incidence, rows)
     return rows
 
 
@@ -202,7 +206,7 @@ def bent(layout: Layout, now: Linearised, solved: Solved, second: np.ndarray) ->
     M. K. Transtrum, J. P. Sethna, Improvements to the Levenberg–Marquardt algorithm (2012), arXiv:1201.5885: geodesic acceleration.
     """
     g, h = np.zeros(len(solved.step)), np.zeros_like(solved.points)
-    kernels.gradients(second, now.jacobian, now.weight, *layout.incidence, layout.point_col, g, h)
+    kernels.gradients(second, now.linear, layout.incidence, g, h)
     _reduce_right(layout, solved.Z, h, solved.root, g)
     step, points = _answer(layout, now, solved.factor, solved.scale, solved.root, g, h)
     length, along = np.linalg.norm(step / solved.scale) / 2, np.linalg.norm(solved.step / solved.scale)
@@ -223,7 +227,7 @@ def _answer(
         step -= away @ np.linalg.solve(C @ away, C @ step)
     step *= scale
     points = np.zeros((*h.shape, 1))
-    kernels.point_steps(now.jacobian, now.weight, *layout.incidence, layout.point_col, root, h[:, :, None], step[:, None], points)
+    kernels.point_steps(now.linear, layout.incidence, root, h[:, :, None], step[:, None], points)
     points = points[:, :, 0]
     points[layout.held] = 0.0
     return step, points

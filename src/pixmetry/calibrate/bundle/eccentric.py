@@ -16,6 +16,7 @@ from typing import Literal
 
 import numpy as np
 
+from pixmetry.calibrate.bundle._model_kernels import Cameras, Outline, Targets, Views, area_centres
 from pixmetry.calibrate.bundle.model import CODES
 from pixmetry.calibrate.bundle.network import Network, State
 
@@ -82,41 +83,28 @@ def without_eccentricity(network: Network, found: Eccentricity) -> Network:
 
 def predicted(network: Network, state: State, rows: np.ndarray, normal: np.ndarray, shape: Shape = "circle") -> np.ndarray:
     """Shifts of some image coordinates, px, shape (rows, 2), for targets across ``normal`` (unit vectors, shape (rows, 3))."""
-    from pixmetry.calibrate.bundle._model_kernels import area_centres
-
     assert network.diameter is not None  # the rows are those of circles
     first = _along_x(normal)
-    image, point = network.image[rows], network.point[rows]
-    place, tangent = outline(shape)
-    shift = area_centres(
-        state.xyz[point],
-        first,
-        np.cross(normal, first),
-        network.diameter[point] / 2,
-        image.astype(np.int64),
-        network.camera_of.astype(np.int64),
-        state.rotation,
-        state.position,
-        state.interior,
-        np.array([CODES[camera.direction] for camera in network.cameras]),
-        np.array([camera.sensor.per_px for camera in network.cameras]),
-        place,
-        tangent,
-    )
+    image, point = network.image[rows].astype(np.int64), network.point[rows]
+    camera = network.camera_of[image].astype(np.int64)
+    targets = Targets(image, camera, state.xyz[point], first, np.cross(normal, first), network.diameter[point] / 2)
+    direction = np.array([CODES[camera.direction] for camera in network.cameras], np.int64)
+    cameras = Cameras(state.interior, direction, np.array([camera.sensor.per_px for camera in network.cameras]))
+    shift = area_centres(targets, Views(state.rotation, state.position), cameras, outline(shape))
     shift[:, 0] *= 1.0 + state.x_scale[image]
     return shift
 
 
-def outline(shape: Shape) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes of a quadrature along the outline of a target of radius (half a side) 1, and the weighted steps along it, shape (m, 2) each."""
+def outline(shape: Shape) -> Outline:
+    """Outline of a target of radius (half a side) 1."""
     if shape == "circle":
         t = 2 * np.pi * np.arange(CIRCLE_NODES) / CIRCLE_NODES
-        return np.column_stack([np.cos(t), np.sin(t)]), np.column_stack([-np.sin(t), np.cos(t)]) * (2 * np.pi / CIRCLE_NODES)
+        return Outline(np.column_stack([np.cos(t), np.sin(t)]), np.column_stack([-np.sin(t), np.cos(t)]) * (2 * np.pi / CIRCLE_NODES))
     node, weight = np.polynomial.legendre.leggauss(SIDE_NODES)
     one, none = np.ones(SIDE_NODES), np.zeros(SIDE_NODES)
     place = [(one, node), (-node, one), (-one, -node), (node, -one)]
     step = [(none, weight), (-weight, none), (none, -weight), (weight, none)]
-    return np.concatenate([np.column_stack(p) for p in place]), np.concatenate([np.column_stack(s) for s in step])
+    return Outline(np.concatenate([np.column_stack(p) for p in place]), np.concatenate([np.column_stack(s) for s in step]))
 
 
 def normals(network: Network, state: State) -> np.ndarray:

@@ -27,7 +27,7 @@ from typing import Literal
 
 import numpy as np
 
-from pixmetry.calibrate.bundle._model_kernels import IMAGE_TO_OBJECT, INTERIOR, OBJECT_TO_IMAGE, directions, image_points
+from pixmetry.calibrate.bundle._model_kernels import IMAGE_TO_OBJECT, INTERIOR, OBJECT_TO_IMAGE, Lens, directions, image_points
 from pixmetry.core.errors import ParameterError
 
 Direction = Literal["image_to_object", "object_to_image"]
@@ -148,6 +148,10 @@ class CameraModel:
         mx, my = self.sensor.per_px
         return self.values[0] / mx, self.values[0] / my
 
+    @property
+    def _lens(self) -> Lens:
+        return Lens(self.values, CODES[self.direction], *self.sensor.per_px)
+
     def project(self, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Places in the image, px, of directions u = X/Z, v = Y/Z; NaN where the distortion has no inverse."""
         x, y, _, _ = self.projected(u, v)
@@ -155,11 +159,11 @@ class CameraModel:
 
     def projected(self, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Like `project`, flat, with the derivatives by (u, v), shape (n, 2, 2), and by the parameters, shape (n, 2, 12)."""
-        return image_points(_flat(u), _flat(v), self.values, CODES[self.direction], *self.sensor.per_px)
+        return image_points(_flat(u), _flat(v), self._lens)
 
     def direction_of(self, x_px: np.ndarray, y_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Directions u = X/Z, v = Y/Z in which places in the image look; NaN where the distortion has no inverse."""
-        u, v, _ = directions(_flat(x_px), _flat(y_px), self.values, CODES[self.direction], *self.sensor.per_px)
+        u, v, _ = directions(_flat(x_px), _flat(y_px), self._lens)
         return u, v
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pixmetry.calibrate.bundle._model_kernels import IMAGE_TO_OBJECT, directions
+from pixmetry.calibrate.bundle._model_kernels import IMAGE_TO_OBJECT, Lens, directions
 from pixmetry.calibrate.bundle.model import NAMES, CameraModel
 from pixmetry.core.errors import InputError, MeasureError
 
@@ -102,7 +102,7 @@ class LineFit:
         """Corrected adjusted positions about the centre, and their derivatives by those in the image, shape (n, 2, 2)."""
         q = self.q.copy()
         q[0] = 1.0
-        return directions(self.x, self.y, q, IMAGE_TO_OBJECT, *self.per_px)
+        return directions(self.x, self.y, Lens(q, IMAGE_TO_OBJECT, *self.per_px))
 
     def by_parameter(self, slopes: np.ndarray) -> np.ndarray:
         """Derivatives of the corrected positions by the free parameters, shape (n, 2, p)."""
