@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from pixmetry.calibrate.bundle.model import NAMES, CameraModel, Direction, Sensor
+from pixmetry.core.arrays import Array
 from pixmetry.core.errors import InputError
 from pixmetry.core.extras import import_extra
 
@@ -89,9 +90,10 @@ def converted(model: CameraModel, direction: Direction, names: tuple[str, ...] =
         row[kept] = values
         return replace(new, values=row)
 
-    def misses(values: np.ndarray) -> np.ndarray:
+    def misses(values: Array) -> Array:
         a, b = at(values).project(u, v)
-        return np.nan_to_num(np.concatenate([a - x, b - y]), nan=1e3)
+        gaps: Array = np.nan_to_num(np.concatenate([a - x, b - y]), nan=1e3)
+        return gaps
 
     def slopes(values: np.ndarray) -> np.ndarray:
         by = np.nan_to_num(at(values).projected(u, v)[3][:, :, kept])

@@ -75,7 +75,8 @@ def read_record(kind: type[R], record: Mapping[str, Any]) -> R:
     >>> read_record(ParameterTest, {"name": "k1", "value": 0.1, "u": None, "strongest": {"with": "k2", "r": -0.9}})
     ParameterTest(camera=None, name='k1', value=0.1, u=nan, unit=None, p_zero=None, strongest=Strongest(with_='k2', r=-0.9), fixed=False)
     """
-    return _read_fields(kind, lambda key: record.get(key, MISSING))
+    made: R = _read_fields(kind, lambda key: record.get(key, MISSING))
+    return made
 
 
 def _read_fields(kind: Any, of: Callable[[str], Any]) -> Any:
@@ -1130,7 +1131,7 @@ class Calibration:
 
     def __repr__(self) -> str:
         a = self.adjustment
-        posed = int(np.isfinite(a.state.position).all(axis=1).sum())
+        posed = int(a.state.posed.sum())
         warnings = sum(finding.level != "note" for finding in self.findings)
         cameras = ", ".join(camera.name for camera in a.network.cameras)
         used = f"{posed} images, {int(a.used.sum())} image points"

@@ -19,6 +19,7 @@ from pixmetry.calibrate.bundle.bundle_layout import Layout, layout_of, without
 from pixmetry.calibrate.bundle.bundle_system import LOSSES, Linearised, Loss, Solved, bent, cost, equations, linearise, point_roots, solve
 from pixmetry.calibrate.bundle.datum import Datum, aligned, datum_of, nearest_to_control
 from pixmetry.calibrate.bundle.network import Adjustment, Network, State
+from pixmetry.core.arrays import Array, Flags
 from pixmetry.core.errors import InputError
 from pixmetry.core.threads import single_threaded_blas
 
@@ -38,7 +39,7 @@ def adjust(
     *,
     loss: str = "none",
     loss_scale: float = 2.5,
-    used: np.ndarray | None = None,
+    used: Flags | None = None,
     redundancy: bool = False,
     covariance: bool = True,
     a_priori: bool = False,
@@ -135,7 +136,7 @@ def _moved(layout: Layout, state: State, solved: Solved) -> State:
     return State(interior, rotation, position, x_scale, x_shift, xyz)
 
 
-def _along_arc(rotation: np.ndarray, turn: np.ndarray, shift: np.ndarray) -> np.ndarray:
+def _along_arc(rotation: Array, turn: Array, shift: Array) -> Array:
     """Shifts of projection centres, bent as a screw motion bends them: a camera that turns with its object in view goes round the object,
     not along the tangent (the exponential map of SE(3): F. Dellaert, M. Kaess, Factor Graphs for Robot Perception (2017), chapter 6).
 
@@ -145,14 +146,16 @@ def _along_arc(rotation: np.ndarray, turn: np.ndarray, shift: np.ndarray) -> np.
     along = np.einsum("nij,nj->ni", rotation, shift)
     across = np.cross(turn, along)
     bent = along - (1 - np.cos(angle)) / angle**2 * across + (angle - np.sin(angle)) / angle**3 * np.cross(turn, across)
-    return np.einsum("nji,nj->ni", rotation, bent)
+    arc: Array = np.einsum("nji,nj->ni", rotation, bent)
+    return arc
 
 
-def _turns(w: np.ndarray) -> np.ndarray:
+def _turns(w: Array) -> Array:
     """Rotation matrices exp([w]×) of rotation vectors, shape (n, 3, 3)."""
     from scipy.spatial.transform import Rotation
 
-    return Rotation.from_rotvec(w).as_matrix()
+    turns: Array = Rotation.from_rotvec(w).as_matrix()
+    return turns
 
 
 def _iterate(
@@ -282,7 +285,7 @@ def _result(
 def _of_determined(layout: Layout, state: State) -> State:
     """NaN for images and points that took no part, but for wholly known points; what is fixed keeps its digits."""
     images, points = layout.image_col >= 0, layout.determined
-    partly = np.isinf(layout.network.u_xyz).any(axis=1)
+    partly: Flags = np.any(np.isinf(layout.network.u_xyz), axis=1)
     known = np.where(partly[:, None] & ~points[:, None], np.nan, layout.network.xyz)
     return replace(
         state,

@@ -28,6 +28,7 @@ from pixmetry.calibrate.bundle.bundle_system import (
 from pixmetry.calibrate.bundle.datum import Datum, carried, null_space
 from pixmetry.calibrate.bundle.model import NAMES
 from pixmetry.calibrate.bundle.network import PER_IMAGE_NAMES, Network, State
+from pixmetry.core.arrays import Array
 from pixmetry.core.errors import MeasureError
 
 SINGULAR = 1e10  # variance inflation at which a system counts as singular
@@ -128,16 +129,17 @@ def _gathered(layout: Layout, solved: Solved, Q: np.ndarray) -> np.ndarray:
     return _with_own(solved.root, half + np.swapaxes(half, 1, 2))
 
 
-def _with_own(root: np.ndarray, inner: np.ndarray) -> np.ndarray:
+def _with_own(root: Array, inner: Array) -> Array:
     """V⁻¹ + V⁻¹ Wᵀ Q W V⁻¹ from L⁻¹ and Zᵀ Q Z."""
-    return np.swapaxes(root, 1, 2) @ (np.eye(3) + inner) @ root
+    whole: Array = np.swapaxes(root, 1, 2) @ (np.eye(3) + inner) @ root
+    return whole
 
 
-def _inverse(layout: Layout, datum: Datum, now: Linearised, solved: Solved) -> np.ndarray:
+def _inverse(layout: Layout, datum: Datum, now: Linearised, solved: Solved) -> Array:
     """Cofactors of the reduced unknowns, in the datum that made the system regular."""
     from scipy.linalg.lapack import dpotri
 
-    lower = dpotri(solved.factor, lower=0, overwrite_c=1)[0].T
+    lower: Array = dpotri(solved.factor, lower=0, overwrite_c=1)[0].T
     if not np.diagonal(lower).max() < SINGULAR and not _weakly_placed(layout, datum, now, lower, solved.scale):
         raise_weak(layout, datum, now, "the unknowns are not determined")
     kernels.scaled_whole(lower, solved.scale)

@@ -11,6 +11,7 @@ import numpy as np
 from pixmetry.calibrate.bundle._bundle_kernels import ELIMINATED, HELD, Incidence
 from pixmetry.calibrate.bundle.model import CODES, NAMES
 from pixmetry.calibrate.bundle.network import PER_IMAGE_NAMES, Network, ScaleBars, State
+from pixmetry.core.arrays import Array, Flags, Ints
 from pixmetry.core.errors import InputError, MeasureError
 
 POSE = ("rx", "ry", "rz", "X0", "Y0", "Z0")
@@ -55,42 +56,42 @@ class Layout:
     """
 
     network: Network
-    order: np.ndarray
-    used: np.ndarray
-    first: np.ndarray
-    by_image: np.ndarray
-    x: np.ndarray
-    y: np.ndarray
-    whiten: np.ndarray
-    image: np.ndarray
-    point: np.ndarray
-    free: np.ndarray
-    camera_col: np.ndarray
-    camera_count: np.ndarray
-    image_col: np.ndarray
-    point_col: np.ndarray
-    extra: np.ndarray
+    order: Ints
+    used: Flags
+    first: Ints
+    by_image: Ints
+    x: Array
+    y: Array
+    whiten: Array
+    image: Ints
+    point: Ints
+    free: Ints
+    camera_col: Ints
+    camera_count: Ints
+    image_col: Ints
+    point_col: Ints
+    extra: Ints
     columns: tuple[str, ...]
-    held: np.ndarray
-    prior: np.ndarray
+    held: Flags
+    prior: Array
     bars: ScaleBars
-    constraints: np.ndarray
-    direction: np.ndarray
-    per_px: np.ndarray
+    constraints: Array
+    direction: Ints
+    per_px: Array
     notes: tuple[str, ...] = ()
 
     @property
-    def determined(self) -> np.ndarray:
+    def determined(self) -> Flags:
         """Points that take part, bool."""
         return np.bincount(self.point, minlength=len(self.network.points)) > 0
 
     @property
-    def eliminated(self) -> np.ndarray:
+    def eliminated(self) -> Ints:
         """Indices of the points that are eliminated."""
         return np.flatnonzero(self.point_col == ELIMINATED)
 
     @property
-    def estimated(self) -> np.ndarray:
+    def estimated(self) -> Flags:
         """Reduced unknowns that are estimated, bool: all but the held coordinates of points that bars join."""
         out = np.ones(len(self.columns), bool)
         joined = np.flatnonzero(self.point_col >= 0)
@@ -103,7 +104,7 @@ class Layout:
         return tuple(compress(self.columns, self.estimated))
 
     @property
-    def camera_of(self) -> np.ndarray:
+    def camera_of(self) -> Ints:
         """Camera of each image."""
         return self.network.camera_of.astype(np.int64)
 
@@ -134,9 +135,8 @@ def layout_of(network: Network, start: State, used: np.ndarray | None) -> Layout
     take = np.ones(len(network), bool) if used is None else np.asarray(used, bool).copy()
     take &= np.isfinite(network.x_px) & np.isfinite(network.y_px)
     held = network.u_xyz == 0
-    image_there = np.isfinite(start.rotation).all(axis=(1, 2)) & np.isfinite(start.position).all(axis=1)
-    point_there = np.isfinite(start.xyz).all(axis=1)
-    take, image_there, point_there = _determined(network, take, image_there, point_there)
+    image_there = start.posed & np.all(np.isfinite(start.rotation), axis=(1, 2))
+    take, image_there, point_there = _determined(network, take, image_there, start.located)
     known = image_there[network.image] & point_there[network.point]
     known &= np.isfinite(network.x_px) & np.isfinite(network.y_px)
     if not (take & known).any():

@@ -12,6 +12,7 @@ from pixmetry.calibrate.bundle._model_kernels import Cameras, Views
 from pixmetry.calibrate.bundle.bundle_layout import Layout
 from pixmetry.calibrate.bundle.datum import Datum, null_space
 from pixmetry.calibrate.bundle.network import State
+from pixmetry.core.arrays import Array, Flags
 
 LOSSES = ("none", "huber", "cauchy")
 BLOCK_POINTS = 256
@@ -33,10 +34,10 @@ class Linearised:
     """Residuals and Jacobian at a state."""
 
     state: State
-    residual: np.ndarray  # (n, 2), whitened
-    jacobian: np.ndarray  # (n, 2, q)
-    valid: np.ndarray  # (n,), the point has an image
-    weight: np.ndarray  # (n,), by the robust loss; 0 where it takes no part
+    residual: Array  # (n, 2), whitened
+    jacobian: Array  # (n, 2, q)
+    valid: Flags  # (n,), the point has an image
+    weight: Array  # (n,), by the robust loss; 0 where it takes no part
     unit: float  # robust variance of a whitened coordinate, by which the loss counts
     cost: float
 
@@ -50,12 +51,12 @@ class Linearised:
 class Solved:
     """A step, and what it was found with."""
 
-    step: np.ndarray
-    points: np.ndarray
+    step: Array
+    points: Array
     gain: float  # by how much the cost would fall in a linear world
-    factor: np.ndarray  # Cholesky factor of the scaled reduced system, in the work space
-    scale: np.ndarray
-    root: np.ndarray
+    factor: Array  # Cholesky factor of the scaled reduced system, in the work space
+    scale: Array
+    root: Array
     Z: Eliminated
 
 

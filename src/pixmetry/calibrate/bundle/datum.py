@@ -17,6 +17,7 @@ import numpy as np
 from pixmetry.calibrate.bundle.bundle_layout import Layout, layout_of
 from pixmetry.calibrate.bundle.network import Adjustment, State
 from pixmetry.calibrate.start.resection import motions
+from pixmetry.core.arrays import Array, Flags
 from pixmetry.core.errors import MeasureError
 
 GIVEN = 1e-8  # relative singular value above which control holds a direction
@@ -88,8 +89,8 @@ def _carriers(layout: Layout, start: State, motion: np.ndarray) -> tuple[np.ndar
     where they are given rather than at their start."""
     network = layout.network
     unknown = layout.determined[:, None] & np.isinf(network.u_xyz)
-    whole = unknown.all(axis=1)
-    given = whole & np.isfinite(network.xyz).all(axis=1)
+    whole: Flags = np.all(unknown, axis=1)
+    given = whole & np.all(np.isfinite(network.xyz), axis=1)
     # three points that are not in line carry any datum; fewer given ones do not
     if given.sum() >= 3 and _spread(network.xyz[given]) > GIVEN:
         return unknown & given[:, None], True
@@ -106,7 +107,7 @@ def _carriers(layout: Layout, start: State, motion: np.ndarray) -> tuple[np.ndar
 
 def _carry(motion: np.ndarray) -> bool:
     """Whether coordinates, moved by each missing parameter (coordinates, missing), tell all of those apart."""
-    return len(motion) >= motion.shape[1] and np.linalg.svd(motion, compute_uv=False)[-1] > GIVEN * np.abs(motion).max()
+    return bool(len(motion) >= motion.shape[1] and np.linalg.svd(motion, compute_uv=False)[-1] > GIVEN * np.abs(motion).max())
 
 
 def generators(points: np.ndarray, datum: Datum) -> np.ndarray:
@@ -125,10 +126,10 @@ def null_space(layout: Layout, state: State, datum: Datum) -> tuple[np.ndarray, 
     points[there] = generators(state.xyz[there], datum) @ basis
     points[layout.held] = 0.0
     reduced = np.zeros((m, d))
-    there = np.flatnonzero(layout.image_col >= 0)
-    rows = layout.image_col[there][:, None] + np.arange(3)
-    reduced[rows] = -state.rotation[there] @ basis[3:6] / datum.size
-    reduced[rows + 3] = generators(state.position[there], datum) @ basis
+    posed = np.flatnonzero(layout.image_col >= 0)
+    rows = layout.image_col[posed][:, None] + np.arange(3)
+    reduced[rows] = -state.rotation[posed] @ basis[3:6] / datum.size
+    reduced[rows + 3] = generators(state.position[posed], datum) @ basis
     for j in np.flatnonzero(layout.point_col >= 0):
         reduced[layout.point_col[j] : layout.point_col[j] + 3] = points[j]
     return reduced, points, basis
@@ -194,12 +195,12 @@ def _settled(state: State, datum: Datum, step_from: Callable[[State], np.ndarray
     return state
 
 
-def _limited(step: np.ndarray, datum: Datum) -> np.ndarray:
+def _limited(step: Array, datum: Datum) -> Array:
     """What of a step turns by no more than half a radian, and scales by no more than a half."""
-    return step * min(1.0, 0.5 / max(np.abs(step[3:]).max() / datum.size, 1e-300))
+    return step * min(1.0, 0.5 / max(float(np.abs(step[3:]).max()) / datum.size, 1e-300))
 
 
-def _moved(state: State, step: np.ndarray, datum: Datum, expm) -> State:
+def _moved(state: State, step: Array, datum: Datum, expm: Callable[[Array], Array]) -> State:
     """The state after the similarity whose generator is ``step``."""
     t, turn, scale = step[:3], step[3:6] / datum.size, step[6] / datum.size
     field = np.zeros((4, 4))
@@ -227,7 +228,7 @@ def _held_rows(layout: Layout, state: State, datum: Datum) -> tuple[np.ndarray, 
     return generators(state.xyz, datum)[_control(layout)], np.eye(7)[6:][: len(layout.bars)]
 
 
-def _control(layout: Layout) -> np.ndarray:
+def _control(layout: Layout) -> Flags:
     """Coordinates of points that take part of which something is known, bool."""
     return layout.determined[:, None] & ~np.isinf(layout.network.u_xyz)
 
@@ -247,7 +248,7 @@ def _text(layout: Layout, datum: Datum, named: bool) -> str:
     if datum.missing:
         scale = " and the scale" if datum.missing == 7 else ""
         what = "the origin, the directions" + scale if datum.missing >= 6 else f"{datum.missing} of the seven parameters of the datum"
-        what = _arbitrary(~np.isinf(u).all(axis=0), datum.missing) or what
+        what = _arbitrary(~np.all(np.isinf(u), axis=0), datum.missing) or what
         start = "given" if named else "start"
         parts.append(f"inner constraints on the {start} coordinates of {datum.carriers.any(axis=1).sum()} points for {what}")
     return "; ".join(part for part in parts if part)

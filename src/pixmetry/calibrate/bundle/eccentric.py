@@ -19,6 +19,7 @@ import numpy as np
 from pixmetry.calibrate.bundle._model_kernels import Cameras, Outline, Targets, Views, area_centres
 from pixmetry.calibrate.bundle.model import CODES
 from pixmetry.calibrate.bundle.network import Network, State
+from pixmetry.core.arrays import Array
 
 CIRCLE_NODES = 20
 SIDE_NODES = 6  # of each side of a square
@@ -66,8 +67,8 @@ def eccentricity(network: Network, state: State, shape: Shape = "circle") -> Ecc
     shift, corrected = np.zeros((n, 2)), np.zeros(n, bool)
     if network.diameter is None:
         return Eccentricity(shift, corrected, 0.0)
-    seen = np.isfinite(network.diameter[network.point]) & np.isfinite(state.xyz[network.point]).all(axis=1)
-    seen &= np.isfinite(state.position[network.image]).all(axis=1)
+    seen = np.isfinite(network.diameter[network.point]) & state.located[network.point]
+    seen &= state.posed[network.image]
     normal = normals(network, state)[network.point]
     known = seen & np.isfinite(normal).all(axis=1)
     shift[known] = predicted(network, state, np.flatnonzero(known), normal[known], shape)
@@ -113,7 +114,7 @@ def normals(network: Network, state: State) -> np.ndarray:
     if network.normal is not None:
         normal = network.normal / np.linalg.norm(network.normal, axis=1, keepdims=True)
     missing = ~np.isfinite(normal).all(axis=1)
-    known = np.isfinite(state.xyz).all(axis=1)
+    known = state.located
     if missing.any() and known.sum() >= 4:
         spread = np.linalg.svd(state.xyz[known] - state.xyz[known].mean(axis=0), full_matrices=False)
         if spread[1][2] < FLAT * spread[1][1]:
@@ -121,11 +122,12 @@ def normals(network: Network, state: State) -> np.ndarray:
     return normal
 
 
-def _along_x(normal: np.ndarray) -> np.ndarray:
+def _along_x(normal: Array) -> Array:
     """Unit vectors across the normals, along the object's x axis as far as they can be (its y axis where a normal is along x)."""
     axis = np.where((np.abs(normal[:, :1]) < 0.9), [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
     flat = axis - (axis * normal).sum(axis=1, keepdims=True) * normal
-    return flat / np.linalg.norm(flat, axis=1, keepdims=True)
+    of_unit_length: Array = flat / np.linalg.norm(flat, axis=1, keepdims=True)
+    return of_unit_length
 
 
 def _possible(network: Network, state: State, rows: np.ndarray, shape: Shape) -> float:

@@ -72,8 +72,9 @@ def with_the_rest(network: Network, clean: Adjustment, start: State, used: np.nd
         Those that were rejected stay out.
     """
     state = clean.state if (clean.network.u_xyz == 0).any() else in_frame(clean.state, clean.state.xyz, start.xyz)
-    lost_image, lost_point = ~np.isfinite(state.position[:, 0]), ~np.isfinite(state.xyz).all(axis=1)
-    partly, wholly = np.isfinite(network.u_xyz).any(axis=1), np.isfinite(network.u_xyz).all(axis=1)
+    lost_image, lost_point = ~state.posed, ~state.located
+    known = np.isfinite(network.u_xyz)
+    partly, wholly = np.any(known, axis=1), np.all(known, axis=1)
     untested = lost_image[network.image] | (lost_point & partly)[network.point]
     untested &= np.isnan(rejected.statistic)
     again = lost_point & np.isin(np.arange(len(lost_point)), network.point[untested])

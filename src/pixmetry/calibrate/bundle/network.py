@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from pixmetry.calibrate.bundle.model import NAMES, CameraModel
+from pixmetry.core.arrays import Array, Flags, Ints
 
 SCALE, SHIFT = 6, 7  # places of the per-image x-scale and x-shift behind the six of the pose
 PER_IMAGE = 8
@@ -25,10 +26,10 @@ class ScaleBars:
         In the unit of the object.
     """
 
-    start: np.ndarray
-    end: np.ndarray
-    length: np.ndarray
-    u: np.ndarray
+    start: Ints
+    end: Ints
+    length: Array
+    u: Array
 
     def __len__(self) -> int:
         return len(self.start)
@@ -49,11 +50,11 @@ class Poses:
     position : ndarray, shape (images, 3)
     """
 
-    rotation: np.ndarray
-    position: np.ndarray
+    rotation: Array
+    position: Array
 
     @property
-    def given(self) -> np.ndarray:
+    def given(self) -> Flags:
         """Which images have one."""
         return np.isfinite(self.position[:, 0]) & np.isfinite(self.rotation[:, 0, 0])
 
@@ -103,21 +104,21 @@ class Network:
 
     cameras: tuple[CameraModel, ...]
     images: tuple[str, ...]
-    camera_of: np.ndarray
+    camera_of: Ints
     points: tuple[str, ...]
-    x_px: np.ndarray
-    y_px: np.ndarray
-    image: np.ndarray
-    point: np.ndarray
-    covariance_px2: np.ndarray
-    xyz: np.ndarray
-    u_xyz: np.ndarray
+    x_px: Array
+    y_px: Array
+    image: Ints
+    point: Ints
+    covariance_px2: Array
+    xyz: Array
+    u_xyz: Array
     bars: ScaleBars = field(default_factory=ScaleBars.none)
     per_image: tuple[str, ...] = ()
     scale_origin_px: float = 0.0
-    time_s: np.ndarray | None = None
-    diameter: np.ndarray | None = None
-    normal: np.ndarray | None = None
+    time_s: Array | None = None
+    diameter: Array | None = None
+    normal: Array | None = None
     unit: str = "mm"
     covariance_known: bool = False
     poses: Poses | None = None
@@ -126,15 +127,17 @@ class Network:
         return len(self.x_px)
 
     @property
-    def control(self) -> np.ndarray:
+    def control(self) -> Flags:
         """Points of which all three coordinates are known, bool."""
-        return (np.isfinite(self.xyz) & np.isfinite(self.u_xyz)).all(axis=1)
+        known: Flags = np.all(np.isfinite(self.xyz) & np.isfinite(self.u_xyz), axis=1)
+        return known
 
     @property
-    def given(self) -> np.ndarray:
+    def given(self) -> Flags:
         """These, and points of which all three are roughly known; not those of which one or two are known: there somebody had to write
         something for the others."""
-        return self.control | (np.isfinite(self.xyz) & np.isinf(self.u_xyz)).all(axis=1)
+        roughly: Flags = np.all(np.isfinite(self.xyz) & np.isinf(self.u_xyz), axis=1)
+        return self.control | roughly
 
 
 @dataclass(frozen=True)
@@ -155,12 +158,24 @@ class State:
         NaN: not determined (seen too seldom); its image coordinates take no part.
     """
 
-    interior: np.ndarray
-    rotation: np.ndarray
-    position: np.ndarray
-    x_scale: np.ndarray
-    x_shift_px: np.ndarray
-    xyz: np.ndarray
+    interior: Array
+    rotation: Array
+    position: Array
+    x_scale: Array
+    x_shift_px: Array
+    xyz: Array
+
+    @property
+    def posed(self) -> Flags:
+        """Images that have a pose."""
+        posed: Flags = np.all(np.isfinite(self.position), axis=1)
+        return posed
+
+    @property
+    def located(self) -> Flags:
+        """Points that have coordinates."""
+        located: Flags = np.all(np.isfinite(self.xyz), axis=1)
+        return located
 
 
 @dataclass(frozen=True)
@@ -203,16 +218,16 @@ class Adjustment:
 
     network: Network
     state: State
-    used: np.ndarray
-    residual_px: np.ndarray
-    weight: np.ndarray
+    used: Flags
+    residual_px: Array
+    weight: Array
     sigma0: float
     dof: int
     free_columns: tuple[str, ...]
-    covariance: np.ndarray
-    point_covariance: np.ndarray
-    redundancy: np.ndarray | None
-    residual_covariance_px2: np.ndarray | None
+    covariance: Array
+    point_covariance: Array
+    redundancy: Array | None
+    residual_covariance_px2: Array | None
     datum: str
     iterations: int
     cost: tuple[float, ...]
@@ -225,20 +240,20 @@ class Adjustment:
         return replace(self.network.cameras[index], values=self.state.interior[index].copy())
 
     @property
-    def redundancy_numbers(self) -> np.ndarray:
+    def redundancy_numbers(self) -> Array:
         """``redundancy``, of an adjustment that was asked for it; else ``ValueError``."""
         if self.redundancy is None:
             raise ValueError("an adjustment without redundancy numbers: adjust(…, redundancy=True)")
         return self.redundancy
 
     @property
-    def residual_cofactors_px2(self) -> np.ndarray:
+    def residual_cofactors_px2(self) -> Array:
         """``residual_covariance_px2`` likewise."""
         if self.residual_covariance_px2 is None:
             raise ValueError("an adjustment without cofactors of its residuals: adjust(…, redundancy=True)")
         return self.residual_covariance_px2
 
-    def interior_covariance(self, index: int = 0) -> tuple[tuple[str, ...], np.ndarray]:
+    def interior_covariance(self, index: int = 0) -> tuple[tuple[str, ...], Array]:
         """Names of the estimated parameters of a camera and their covariance."""
         own = {f"{self.network.cameras[index].name}:{name}": name for name in NAMES}  # an image or a point may have the camera's name
         rows = [i for i, name in enumerate(self.free_columns) if name in own]

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from pixmetry.calibrate.bundle.network import PER_IMAGE, SCALE, SHIFT, Adjustment, Network, State
+from pixmetry.core.arrays import Array
 
 RIDGE = 1e-11  # on a unit diagonal: carries the directions that no observation sees (the datum), moves no other
 OFTEN = 0.1  # share of the images that see a point above which dense products are faster
@@ -171,12 +172,14 @@ class AddedTerms:
         f = fall / k / variance
         return Terms(found, inverse * variance, f, float(stats.f.sf(f, k, dof)), k, float(dof), fall, variance)
 
-    def whitened_squares(self) -> np.ndarray:
+    def whitened_squares(self) -> Array:
         """Weighted square of the residual of each of the rows, shape (m,)."""
-        return (self._residual.reshape(-1, 2) ** 2).sum(axis=1)
+        squares: Array = (self._residual.reshape(-1, 2) ** 2).sum(axis=1)
+        return squares
 
-    def _whitened(self, values: np.ndarray) -> np.ndarray:
-        return np.einsum("nij,nj->ni", self._white, values).ravel()
+    def _whitened(self, values: Array) -> Array:
+        white: Array = np.einsum("nij,nj->ni", self._white, values)
+        return white.ravel()
 
     def _designs(self, network: Network, d: Derivatives) -> tuple[Any, Any]:
         """Whitened derivatives by cameras and images, and by points, as sparse matrices of 2 m rows."""
@@ -243,7 +246,7 @@ class AddedTerms:
         reduced[np.diag_indices(len(reduced))] += RIDGE
         self._factor = linalg.cho_factor(reduced, lower=True, overwrite_a=True)
 
-    def _taken(self, white: Any) -> np.ndarray:
+    def _taken(self, white: Any) -> Array:
         """Gᵀ A (Aᵀ A)⁻ Aᵀ G."""
         from scipy import linalg
 
@@ -251,7 +254,8 @@ class AddedTerms:
         over_points = self._point_inverse @ by_point
         right = _dense(self._kept.T @ white - self._cross.T @ over_points) * self._scale[:, None]
         half = linalg.solve_triangular(self._factor[0], right, lower=True)
-        return _dense(by_point.T @ over_points) + half.T @ half
+        taken: Array = _dense(by_point.T @ over_points) + half.T @ half
+        return taken
 
 
 def _dense(matrix: Any) -> np.ndarray:

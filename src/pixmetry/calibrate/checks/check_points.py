@@ -18,6 +18,7 @@ import numpy as np
 from pixmetry.calibrate.bundle.network import Adjustment, Network, State
 from pixmetry.calibrate.checks.quality import p_words, plain
 from pixmetry.calibrate.records import Calibration, CheckedPoint, CheckRecord, WorstPoint
+from pixmetry.core.arrays import Array, Ints
 from pixmetry.core.errors import InputError
 from pixmetry.core.finding import Finding
 
@@ -228,12 +229,13 @@ def _brought(layout: Layout, state: State, datum: Datum, points: np.ndarray, giv
     return aligned(layout, state, replace(datum, carriers=carriers, start=start))
 
 
-def joint_covariance(adjustment: Adjustment, points: np.ndarray, *, a_priori: bool = False) -> np.ndarray:
+def joint_covariance(adjustment: Adjustment, points: Ints, *, a_priori: bool = False) -> Array:
     """Covariance of the coordinates of some free points together, shape (3 points, 3 points).
 
     Where the datum is missing, it holds for what does not depend on it.
     """
-    from pixmetry.calibrate.bundle.bundle_layout import ELIMINATED, layout_of
+    from pixmetry.calibrate.bundle._bundle_kernels import ELIMINATED
+    from pixmetry.calibrate.bundle.bundle_layout import layout_of
     from pixmetry.calibrate.bundle.bundle_system import Loss, condensed, equations, linearise, point_roots, rows_of
 
     layout = layout_of(adjustment.network, adjustment.state, adjustment.used)
@@ -252,7 +254,8 @@ def joint_covariance(adjustment: Adjustment, points: np.ndarray, *, a_priori: bo
             slopes[i, range(3), layout.point_col[point] + np.arange(3)] = 1.0
     factor = 1.0 if a_priori else adjustment.sigma0**2
     rows = slopes.reshape(-1, m)[:, layout.estimated]
-    return factor * own.reshape(len(rows), len(rows)) + rows @ adjustment.covariance @ rows.T
+    joint: Array = factor * own.reshape(len(rows), len(rows)) + rows @ adjustment.covariance @ rows.T
+    return joint
 
 
 def _text(found: CheckRecord) -> str:

@@ -15,6 +15,7 @@ from pixmetry.calibrate.bundle.network import Adjustment, Network, State
 from pixmetry.calibrate.checks.quality import plain
 from pixmetry.calibrate.start.free_start import common_points
 from pixmetry.calibrate.start.resection import FEWEST, FLAT, thickness
+from pixmetry.core.arrays import Ints
 from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.core.finding import Finding
 
@@ -237,9 +238,9 @@ def _check_ties(network: Network, usable: np.ndarray, findings: list[Finding]) -
     findings.append(Finding("images_left_out", text, "take images that overlap, or check the names of the points", "warning"))
 
 
-def _joined(network: Network, images: np.ndarray, label: np.ndarray) -> np.ndarray:
+def _joined(network: Network, images: Ints, label: Ints) -> Ints:
     """Join groups that share `TIE` points as a whole, though no two of their images do."""
-    group = np.full(len(network.images), -1)
+    group: Ints = np.full(len(network.images), -1)
     group[images] = label
     while True:
         rows = np.flatnonzero(group[network.image] >= 0)
@@ -274,7 +275,7 @@ def check_determined(adjustment: Adjustment) -> tuple[Finding, ...]:
 
 def left_out(network: Network, state: State) -> list[Finding]:
     """Images without a pose, though `check_network` let them pass, and the points that go with them."""
-    posed = np.isfinite(state.position[:, 0])
+    posed = state.posed
     missing = np.flatnonzero(~posed & _taking_part(network)[0])
     if not len(missing):
         return []
@@ -297,7 +298,7 @@ def left_out(network: Network, state: State) -> list[Finding]:
 
 def _both_sides(network: Network, state: State) -> list[Finding]:
     points = state.xyz[np.isfinite(state.xyz[:, 0])]
-    posed = np.flatnonzero(np.isfinite(state.position[:, 0]))
+    posed = np.flatnonzero(state.posed)
     if len(points) < FEWEST or thickness(points)[0] > FLAT:
         return []
     middle = points.mean(axis=0)
@@ -317,7 +318,7 @@ def _check_camera(adjustment: Adjustment, k: int) -> list[Finding]:
     network, camera = adjustment.network, adjustment.network.cameras[k]
     u = {name: _u(adjustment, f"{camera.name}:{name}") for name in ("c", "xp", "yp")}
     c, width, findings = adjustment.state.interior[k, 0], camera.sensor.cols, []
-    images = [int(i) for i in np.flatnonzero((network.camera_of == k) & np.isfinite(adjustment.state.position[:, 0]))]
+    images = [int(i) for i in np.flatnonzero((network.camera_of == k) & adjustment.state.posed)]
     if u["c"] is not None:
         r = _median([_correlation(adjustment, f"{camera.name}:c", i, 2) for i in images])
         if abs(r) > SAME and u["c"] > POOR_C * c:

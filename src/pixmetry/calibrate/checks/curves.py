@@ -12,6 +12,7 @@ from pixmetry.calibrate.bundle.model import NAMES, CameraModel
 from pixmetry.calibrate.bundle.network import Adjustment
 from pixmetry.calibrate.checks.quality import propagated
 from pixmetry.calibrate.records import DistortionCurves, ProjectionMap
+from pixmetry.core.arrays import Array
 
 RADIAL = ("k1", "k2", "k3", "k4", "k5")
 
@@ -66,9 +67,9 @@ def radial_distortion(camera: CameraModel, radius: np.ndarray) -> np.ndarray:
     return delta * (camera["c"] if to_image else 1.0)
 
 
-def tangential_distortion(camera: CameraModel, radius: np.ndarray) -> np.ndarray:
+def tangential_distortion(camera: CameraModel, radius: Array) -> Array:
     """Profile of the decentring distortion, √(p1² + p2²) r², in the unit of the image plane (Brown 1971)."""
-    size = np.hypot(camera["p1"], camera["p2"])
+    size = float(np.hypot(camera["p1"], camera["p2"]))
     return size * np.asarray(radius, float) ** 2 / (camera["c"] if camera.direction == "object_to_image" else 1.0)
 
 
@@ -144,6 +145,7 @@ def _slopes(camera: CameraModel, names: tuple[str, ...], u: np.ndarray, v: np.nd
     return by_parameter.reshape(2 * len(u), len(names)), np.einsum("nij,njk->nik", by_direction, turned).reshape(-1, 3)
 
 
-def _coordinate_u(slopes: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+def _coordinate_u(slopes: Array, covariance: Array) -> Array:
     variance = np.einsum("ij,jk,ik->i", slopes, covariance, slopes).reshape(-1, 2)
-    return np.sqrt(np.maximum(variance.mean(axis=1), 0.0))
+    u: Array = np.sqrt(np.maximum(variance.mean(axis=1), 0.0))
+    return u

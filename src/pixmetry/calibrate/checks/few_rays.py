@@ -21,6 +21,7 @@ from itertools import combinations
 import numpy as np
 
 from pixmetry.calibrate.bundle.network import Adjustment, Network, State
+from pixmetry.core.arrays import Array
 
 MOST_RAYS = 8  # of more, most are good, and the tests of an adjustment tell
 MEET = 1e-11  # least determinant of a set's equations over the product of their diagonal: rays that hardly meet at an angle
@@ -234,7 +235,7 @@ def _intersected(rays: _Rays, size: int, variance: float) -> _Sets:
     return _Sets(member, np.where(meet, chi2, np.inf), xyz + middle, normal / variance)
 
 
-def _highest(sets: _Sets, smaller: _Sets | None) -> np.ndarray:
+def _highest(sets: _Sets, smaller: _Sets | None) -> Array:
     """By how much leaving out one ray lowers χ² at most, shape (p, sets); of two rays, their χ²."""
     if smaller is None:
         return sets.chi2
@@ -245,7 +246,8 @@ def _highest(sets: _Sets, smaller: _Sets | None) -> np.ndarray:
         for i, ray in enumerate(np.flatnonzero(member)):
             without[s, i] = place[tuple(j != ray and bool(b) for j, b in enumerate(member))]
     rest = np.where(np.isfinite(smaller.chi2), smaller.chi2, 0.0)
-    return sets.chi2 - rest[:, without].min(axis=2)
+    fall: Array = sets.chi2 - rest[:, without].min(axis=2)
+    return fall
 
 
 def _choice(rays: _Rays, sets: _Sets, agree: np.ndarray, critical: float) -> _Choice:

@@ -133,7 +133,7 @@ def _deviations(network: Network, free: Adjustment, nominal: np.ndarray) -> Fiel
     """How far the points lie from their nominal places after the best similarity, and from the best plane."""
     from scipy import stats
 
-    which = np.flatnonzero(nominal & np.isfinite(free.state.xyz).all(axis=1))
+    which = np.flatnonzero(nominal & free.state.located)
     given = np.where(network.u_xyz[which] == 0, network.xyz[which], np.nan)
     moved = brought_to(free.state.xyz[which], given, np.isfinite(given))
     scale, rotation, _ = similarity(free.state.xyz[which], moved)

@@ -170,7 +170,7 @@ def gross_error_findings(errors: Sequence[GrossError], adjustment: Adjustment, i
     more = " …" if len(single) > NAMED else ""
     noun = "image point was left out as a gross error" if len(errors) == 1 else "image points were left out as gross errors"
     text = f"{len(errors)} {noun}, of {total}: {', '.join(names)}{more}.{_swapped_names(errors, network)}"
-    posed = np.isfinite(adjustment.state.position).all(axis=1)[network.image]
+    posed = adjustment.state.posed[network.image]
     others = {"images that are not oriented": int((~posed).sum())}
     others["points that are not determined"] = total - int(adjustment.used.sum()) - len(errors) - others["images that are not oriented"]
     said = " and ".join(f"{count} of {what}" for what, count in others.items() if count)
@@ -217,9 +217,9 @@ def lost_findings(adjustment: Adjustment) -> list[Finding]:
     """Points that two oriented images or more see, of which nothing is left: of a few rays that contradict each other none can be said
     to be right."""
     network = adjustment.network
-    posed = np.isfinite(adjustment.state.position).all(axis=1)[network.image]
+    posed = adjustment.state.posed[network.image]
     rays = np.bincount(network.point[posed], minlength=len(network.points))
-    lost = np.flatnonzero((rays >= 2) & ~np.isfinite(adjustment.state.xyz).all(axis=1))
+    lost = np.flatnonzero((rays >= 2) & ~adjustment.state.located)
     if not len(lost):
         return []
     named = ", ".join(network.points[k] for k in lost[:NAMED]) + (" …" if len(lost) > NAMED else "")
@@ -325,12 +325,11 @@ def drift_findings(images: Sequence[ImageRecord], adjustment: Adjustment) -> lis
     from scipy import stats
 
     found = []
-    for key, unit, factor, own in (
-        ("x_scale", "ppm", 1e6, lambda i: (i.x_scale, i.u_x_scale)),
-        ("x_shift_px", "px", 1.0, lambda i: (i.x_shift_px, i.u_x_shift_px)),
-    ):
+    scales = [(i.camera, i.x_scale, i.u_x_scale) for i in images]
+    shifts = [(i.camera, i.x_shift_px, i.u_x_shift_px) for i in images]
+    for key, unit, factor, own in (("x_scale", "ppm", 1e6, scales), ("x_shift_px", "px", 1.0, shifts)):
         for camera in dict.fromkeys(i.camera for i in images):
-            mine = [(value, u) for value, u in (own(i) for i in images if i.camera == camera) if value is not None and u]
+            mine = [(value, u) for name, value, u in own if name == camera and value is not None and u]
             if len(mine) < 2:
                 continue
             value, u = np.array(mine).T

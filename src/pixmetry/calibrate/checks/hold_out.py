@@ -10,6 +10,7 @@ from pixmetry.calibrate.bundle.network import SCALE, SHIFT, Adjustment, Network,
 from pixmetry.calibrate.checks.added_terms import derivatives, whitening
 from pixmetry.calibrate.checks.quality import p_fall, p_words
 from pixmetry.calibrate.records import HeldRms, HoldOut
+from pixmetry.core.arrays import Array
 from pixmetry.core.errors import InputError
 
 STEPS = 30
@@ -137,8 +138,8 @@ def resect(network: Network, state: State, used: np.ndarray) -> tuple[State, np.
     residual_px : ndarray, shape (n, 2)
         Measured less computed, of the observations used; NaN for the others and where a point has no coordinates.
     """
-    posed = np.isfinite(state.rotation).all(axis=(1, 2)) & np.isfinite(state.position).all(axis=1)
-    used = used & np.isfinite(state.xyz[network.point]).all(axis=1) & posed[network.image]
+    posed = state.posed & np.all(np.isfinite(state.rotation), axis=(1, 2))
+    used = used & state.located[network.point] & posed[network.image]
     free = [*range(6), *((SCALE,) if "x_scale" in network.per_image else ()), *((SHIFT,) if "x_shift" in network.per_image else ())]
     known = 2 * np.bincount(network.image[used], minlength=len(network.images)) >= len(free)
     used = used & known[network.image]
@@ -193,7 +194,8 @@ def _steps(slopes: np.ndarray, v: np.ndarray, weight: np.ndarray, image: np.ndar
     length = np.sqrt(np.einsum("nii->ni", normal))
     length[length == 0] = 1.0
     unit = normal / length[:, :, None] / length[:, None, :]
-    return np.einsum("nij,nj->ni", np.linalg.pinv(unit, rcond=1e-13, hermitian=True), right / length) / length
+    steps: Array = np.einsum("nij,nj->ni", np.linalg.pinv(unit, rcond=1e-13, hermitian=True), right / length) / length
+    return steps
 
 
 def _moved(state: State, step: np.ndarray, free: list[int]) -> State:

@@ -31,6 +31,7 @@ from pixmetry.calibrate.checks.variance_components import image_sigma0, scaled
 from pixmetry.calibrate.records import Contradicted, FixedPoints
 from pixmetry.calibrate.start.fit_to_control import brought_to, far_from_control
 from pixmetry.calibrate.start.resection import intersect, rays
+from pixmetry.core.arrays import Array, Flags
 from pixmetry.core.errors import InputError, MeasureError
 
 LEAST_FIXED = 3  # points whose distances from each other can be tested
@@ -134,18 +135,20 @@ def fixed_again(network: Network, before: Network, weighted: Network) -> np.ndar
     return np.where(same, before.u_xyz, network.u_xyz)
 
 
-def few_fixed(network: Network) -> np.ndarray:
+def few_fixed(network: Network) -> Flags:
     """Points with fixed coordinates, shape (points,), where they are control beside free points, and enough are known to contradict each
     other."""
-    fixed, known = (network.u_xyz == 0).any(axis=1), np.isfinite(network.u_xyz).any(axis=1)
+    fixed: Flags = np.any(network.u_xyz == 0, axis=1)
+    known: Flags = np.any(np.isfinite(network.u_xyz), axis=1)
     seen = np.bincount(network.point, minlength=len(network.points)) > 1
     few = known.sum() >= LEAST_CONTROL and fixed.sum() < CONTROL_SHARE * seen.sum()
     return fixed if few else np.zeros_like(fixed)
 
 
-def few_held(network: Network) -> np.ndarray:
+def few_held(network: Network) -> Flags:
     """The fixed coordinates of `few_fixed` points, shape (points, 3)."""
-    return (network.u_xyz == 0) & few_fixed(network)[:, None]
+    held: Flags = (network.u_xyz == 0) & few_fixed(network)[:, None]
+    return held
 
 
 def fixed_record(adjustment: Adjustment, adjust: Adjust) -> FixedPoints | None:
@@ -167,7 +170,7 @@ def fixed_record(adjustment: Adjustment, adjust: Adjust) -> FixedPoints | None:
     from scipy import stats
 
     network = adjustment.network
-    posed = np.isfinite(adjustment.state.position).all(axis=1)[network.image]
+    posed = adjustment.state.posed[network.image]
     seen = np.bincount(network.point[posed], minlength=len(network.points)) > 0
     fixed = (network.u_xyz == 0).any(axis=1) & seen
     if not LEAST_FIXED <= fixed.sum() < CONTROL_SHARE * seen.sum():
@@ -184,22 +187,22 @@ def fixed_record(adjustment: Adjustment, adjust: Adjust) -> FixedPoints | None:
         return None
     variance = max(free.sigma0**2, finest_factor(network))
     f = float((held.sigma0**2 * held.dof - free.sigma0**2 * free.dof) / redundant / variance)
-    there = fixed & np.isfinite(free.state.xyz).all(axis=1)
+    there = fixed & free.state.located
     known = (network.u_xyz == 0)[there]
     off = _off(free.state.xyz[there], network.xyz[there], known, free, int(known.sum()) - redundant)
     miss = float(np.sqrt((off**2).sum() / redundant * max(1 - 1 / max(f, 1.0), 0.0)))
     return FixedPoints(int(there.sum()), f, (redundant, free.dof), float(stats.f.sf(f, redundant, free.dof)), miss)
 
 
-def _off(found: np.ndarray, given: np.ndarray, known: np.ndarray, free: Adjustment, missing: int) -> np.ndarray:
+def _off(found: Array, given: Array, known: Flags, free: Adjustment, missing: int) -> np.ndarray:
     """By how much known coordinates miss their points, without what the datum leaves open: so many of its seven parameters."""
     if missing > 0:
-        held = np.isfinite(free.network.u_xyz).all(axis=1) & np.isfinite(free.state.xyz).all(axis=1)
+        held = np.isfinite(free.network.u_xyz).all(axis=1) & free.state.located
         found = brought_to(found, given, known, scaled=not len(free.network.bars) and held.sum() < 2)
     return (given - found)[known]
 
 
-def loose_coordinates(network: Network) -> np.ndarray:
+def loose_coordinates(network: Network) -> Flags:
     """Coordinates of control points that could pull at the image coordinates, shape (points, 3)."""
     return np.isfinite(network.u_xyz) & ((network.u_xyz > 0) | few_held(network))
 
@@ -302,7 +305,7 @@ def _understatement(network: Network, control: np.ndarray, clean: Adjustment) ->
 
     from pixmetry.calibrate.start.resection import fitted
 
-    rows = np.flatnonzero(control.all(axis=1) & np.isfinite(clean.state.xyz).all(axis=1))
+    rows = np.flatnonzero(control.all(axis=1) & clean.state.located)
     away = fitted(clean.state.xyz[rows], network.xyz[rows])[3]
     return float(np.sqrt(np.median(away**2 / np.mean(network.u_xyz[rows] ** 2, axis=1)) / stats.chi2.median(3)))
 
@@ -313,7 +316,7 @@ def without_absurd_control(network: Network, state: State) -> tuple[Network, tup
     from pixmetry.calibrate.start.resection import fitted
 
     control = np.isfinite(network.u_xyz).all(axis=1) & (network.u_xyz > 0).any(axis=1)
-    rows = np.flatnonzero(control & np.isfinite(state.xyz).all(axis=1))
+    rows = np.flatnonzero(control & state.located)
     if len(rows) <= LEAST_CONTROL:
         return network, ()
     away = fitted(state.xyz[rows], network.xyz[rows])[3]
@@ -339,7 +342,7 @@ def in_frame_of_control(network: Network, state: State) -> tuple[Network, State,
     state : State
         Without gross errors in the images, in any frame.
     """
-    weighted = np.isfinite(network.u_xyz).any(axis=1) & (network.u_xyz > 0).all(axis=1)
+    weighted: Flags = np.any(np.isfinite(network.u_xyz), axis=1) & np.all(network.u_xyz > 0, axis=1)
     u = np.where(weighted[:, None], network.u_xyz, np.inf)
     known = network.xyz[np.isfinite(u).all(axis=1)]
     limit = ABSURD * float(np.ptp(known, axis=0).max()) if len(known) else 0.0
@@ -382,7 +385,7 @@ def _to_scale_of_control(state: State, network: Network) -> tuple[State, bool]:
     """The state in the scale of most distances between whole control points, if bars had brought it to another; whether there are any."""
     from scipy.spatial.distance import pdist
 
-    whole = network.control & np.isfinite(state.xyz).all(axis=1)
+    whole = network.control & state.located
     if whole.sum() < 2:
         return state, False
     ratio = float(np.median(pdist(network.xyz[whole]) / np.maximum(pdist(state.xyz[whole]), 1e-300)))
@@ -391,7 +394,7 @@ def _to_scale_of_control(state: State, network: Network) -> tuple[State, bool]:
 
 def _enlarged(state: State, network: Network, scale: float) -> State:
     """The state enlarged about the middle of what is known of the points; what is held stays."""
-    known = np.isfinite(network.u_xyz).any(axis=1) & np.isfinite(state.xyz).all(axis=1)
+    known = np.isfinite(network.u_xyz).any(axis=1) & state.located
     middle = state.xyz[known].mean(axis=0) if known.any() else np.zeros(3)
     xyz = np.where(network.u_xyz == 0, state.xyz, middle + scale * (state.xyz - middle))
     return replace(state, xyz=xyz, position=middle + scale * (state.position - middle))
@@ -416,9 +419,10 @@ def _without(checked: CheckedKnown, known: Known, found: list[Contradicted], kin
     return CheckedKnown(network, checked.faults + more)
 
 
-def _supposed(known: Known, rows: list[int]) -> np.ndarray:
+def _supposed(known: Known, rows: list[int]) -> Array:
     """Sizes of the errors that these would have."""
-    return np.abs(known.residual[rows]) / known.redundancy[rows]
+    sizes: Array = np.abs(known.residual[rows]) / known.redundancy[rows]
+    return sizes
 
 
 def _less_bars(network: Network, known: Known, row: int, others: list[int]) -> Network:
@@ -475,7 +479,7 @@ def raised(given: Network, used: Network) -> tuple[Raised, ...]:
 def mostly_lost(network: Network, adjustment: Adjustment) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points of which something is known and most of whose image points in oriented images are out: indices, image points, those out."""
     size = len(network.points)
-    posed = np.isfinite(adjustment.state.position).all(axis=1)[network.image]
+    posed = adjustment.state.posed[network.image]
     seen = np.bincount(network.point[posed], minlength=size)
     out = seen - np.bincount(network.point[adjustment.used], minlength=size)
     known = np.isfinite(network.u_xyz).any(axis=1)

@@ -20,6 +20,7 @@ from pixmetry.calibrate.bundle.network import Adjustment, Network, ScaleBars, St
 from pixmetry.calibrate.checks.snooping import LEAST_REDUNDANCY, finest_factor
 from pixmetry.calibrate.checks.variance_components import image_sigma0
 from pixmetry.calibrate.records import Calibration, Contradicted, KnownGroup, Ratio
+from pixmetry.core.arrays import Array
 
 LIKELY = 2 * np.log(100.0)  # difference of two squared statistics: odds of 100 that it is the one and not the other that is wrong
 SLIGHT = 1e-4  # redundancy from which on an error of something can be what others show
@@ -54,9 +55,10 @@ class Known:
         return len(self.name)
 
     @property
-    def redundancy(self) -> np.ndarray:
+    def redundancy(self) -> Array:
         """Redundancy numbers, 0 … 1."""
-        return np.clip(np.diag(self.cofactor) / self.u**2, 0.0, 1.0)
+        numbers: Array = np.clip(np.diag(self.cofactor) / self.u**2, 0.0, 1.0)
+        return numbers
 
 
 def bar_names(network: Network) -> tuple[str, ...]:
@@ -105,7 +107,7 @@ def jointly(network: Network, state: State) -> Network:
     """The network with its control points in the joint covariance: bars that say nothing lead from one to the next."""
     known = np.isfinite(network.u_xyz) & (network.u_xyz > 0) & np.isfinite(network.xyz)
     seen = np.bincount(network.point, minlength=len(network.points)) > 0
-    rows = np.flatnonzero(known.any(axis=1) & seen & np.isfinite(state.xyz).all(axis=1))
+    rows = np.flatnonzero(known.any(axis=1) & seen & state.located)
     if not 1 < len(rows) <= MOST_JOINT:
         return network
     b, length = network.bars, np.linalg.norm(state.xyz[rows[1:]] - state.xyz[rows[:-1]], axis=1)

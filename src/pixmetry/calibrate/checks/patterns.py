@@ -12,6 +12,7 @@ from pixmetry.calibrate.bundle.network import Adjustment
 from pixmetry.calibrate.checks.added_terms import AddedTerms, Terms, whitening
 from pixmetry.calibrate.checks.quality import p_words, redundancy_of
 from pixmetry.calibrate.records import ByImage, Outstanding, Pattern
+from pixmetry.core.arrays import Array
 from pixmetry.core.errors import MeasureError
 from pixmetry.core.finding import Finding
 from pixmetry.core.threads import single_threaded_blas
@@ -259,9 +260,10 @@ def _hats(values: np.ndarray, low: float, high: float, nodes: int) -> np.ndarray
     return np.maximum(0.0, 1.0 - np.abs(at[:, None] - np.arange(nodes)))
 
 
-def _field(x: np.ndarray, y: np.ndarray, cols: int, rows: int) -> np.ndarray:
+def _field(x: Array, y: Array, cols: int, rows: int) -> Array:
     across, down = _hats(x, 0, cols - 1, FIELD_NODES[0]), _hats(y, 0, rows - 1, FIELD_NODES[1])
-    return (across[:, :, None] * down[:, None, :]).reshape(len(x), -1)
+    products: Array = across[:, :, None] * down[:, None, :]
+    return products.reshape(len(x), -1)
 
 
 def _legendre(x: np.ndarray, y: np.ndarray, cols: int, rows: int) -> np.ndarray:

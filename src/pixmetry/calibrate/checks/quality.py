@@ -20,6 +20,7 @@ from pixmetry.calibrate.records import (
     Strongest,
     Vision,
 )
+from pixmetry.core.arrays import Array
 
 GROUPS = {"radial": ("k1", "k2", "k3", "k4", "k5"), "tangential": ("p1", "p2"), "affinity": ("b1", "b2")}
 TESTED = tuple(name for names in GROUPS.values() for name in names)  # 0 means something for these, not for c, xp and yp
@@ -66,11 +67,12 @@ def group_records(adjustment: Adjustment) -> tuple[GroupTest, ...]:
     return tuple(out)
 
 
-def correlation_of(covariance: np.ndarray) -> np.ndarray:
+def correlation_of(covariance: Array) -> Array:
     """Correlations of a covariance; 0 with what has no variance."""
     u = np.sqrt(np.diag(covariance))
     u = np.where(u > 0, u, np.inf)
-    return np.clip(covariance / np.outer(u, u), -1.0, 1.0)
+    correlation: Array = np.clip(covariance / np.outer(u, u), -1.0, 1.0)
+    return correlation
 
 
 def correlation_records(adjustment: Adjustment) -> dict[str, Correlations]:

@@ -25,6 +25,7 @@ import numpy as np
 from pixmetry.calibrate.bundle.network import Adjustment, Network, State
 from pixmetry.calibrate.checks.few_rays import Mended, mend
 from pixmetry.calibrate.records import GrossError
+from pixmetry.core.arrays import Flags
 
 LEAST_REDUNDANCY = 0.01  # below it, in a direction, an error of an image point would not show in its residual
 FINEST_PX = 1e-4  # no image coordinate is better: what lies below is no error, and weights stay within what numbers hold
@@ -241,9 +242,10 @@ def _reject(
     return adjustment
 
 
-def _passing(adjustment: Adjustment, alpha: float) -> np.ndarray:
+def _passing(adjustment: Adjustment, alpha: float) -> Flags:
     statistic, _ = statistics(adjustment)
-    return ~adjustment.used & (np.nan_to_num(statistic, nan=np.inf) <= critical_values(alpha, adjustment.dof)[1])
+    small: Flags = np.nan_to_num(statistic, nan=np.inf) <= critical_values(alpha, adjustment.dof)[1]
+    return ~adjustment.used & small
 
 
 def _mended(adjustment: Adjustment, used: np.ndarray, allowed: np.ndarray, alpha: float, rejected: Rejected) -> Mended:

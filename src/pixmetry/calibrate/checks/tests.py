@@ -52,7 +52,7 @@ def tests_of(
     """
     from pixmetry.calibrate.bundle.bundle import adjust
 
-    oriented = dict(zip(adjustment.network.images, np.isfinite(adjustment.state.position).all(axis=1), strict=True))
+    oriented = dict(zip(adjustment.network.images, adjustment.state.posed, strict=True))
     gross = tuple(error for error in gross_error_records(adjustment, alpha, rejected) if oriented[error.image])
     return Tests(
         parameters=quality.parameter_records(adjustment),
@@ -90,11 +90,11 @@ def _with_noise(residuals: Mapping[str, CameraResiduals], adjustment: Adjustment
 def sizes(adjustment: Adjustment) -> Sizes:
     """What took part, and what was given."""
     network, state = adjustment.network, adjustment.state
-    posed = np.isfinite(state.position).all(axis=1)
+    posed = state.posed
     seen = np.unique(network.point[adjustment.used])
     return Sizes(
         images=int(posed[np.unique(network.image)].sum()),
-        points=int(np.isfinite(state.xyz[seen]).all(axis=1).sum()),
+        points=int(state.located[seen].sum()),
         observations=int(adjustment.used.sum()),
         images_given=len(np.unique(network.image)),
         points_given=len(np.unique(network.point)),

@@ -34,6 +34,7 @@ import numpy as np
 from pixmetry.calibrate.bundle.network import Adjustment, Network
 from pixmetry.calibrate.checks.snooping import Adjust, finest_factor
 from pixmetry.calibrate.records import AxisComponent, CameraComponents
+from pixmetry.core.arrays import Array, Ints
 
 LEAST_DOF = 10.0  # redundancy below which a group does not get a factor of its own
 LEAST_IN_IMAGE = 5.0  # redundancy of an axis in an image, for a ratio
@@ -249,8 +250,8 @@ def robust_sizes(adjustment: Adjustment, given_px2: np.ndarray) -> Sizes:
         for axis in (0, 1) if rows.any() else ():
             squares, given = adjustment.residual_px[rows, axis] ** 2, given_px2[rows, 2 * axis]
 
-            def excess(size: float, squares: np.ndarray = squares, given: np.ndarray = given) -> float:
-                return float(np.median(squares / (given + size))) - share * MEDIAN_SQUARE
+            def excess(size: float, squares: Array = squares, given: Array = given) -> float:
+                return float(np.median(squares / (given + size)) - share * MEDIAN_SQUARE)
 
             if excess(0.0) > 0:
                 added[k, axis] = optimize.brentq(excess, 0.0, squares.max() / share / MEDIAN_SQUARE)
@@ -273,7 +274,7 @@ def added_variance(squares: np.ndarray, given: np.ndarray, dof: float) -> float:
     return float(optimize.brentq(excess, 0.0, most, xtol=1e-9 * most)) if excess(0.0) > 0 else 0.0
 
 
-def relative_u(adjustment: Adjustment, group: np.ndarray) -> np.ndarray:
+def relative_u(adjustment: Adjustment, group: Ints) -> Array:
     """Relative standard uncertainties of Σ v (P v) / Σ r, shape (cameras, 2); inf for a group that cannot be told from the others."""
     network, used = adjustment.network, adjustment.used
     of, size = group[network.camera_of[network.image[used]]].ravel(), int(group.max()) + 1
@@ -283,16 +284,17 @@ def relative_u(adjustment: Adjustment, group: np.ndarray) -> np.ndarray:
     shared = np.outer(beside[there], count[there]) / count.sum()
     shared = (shared + shared.T) / 2
     S = shared + np.diag(dof[there] - shared.sum(axis=1))
-    u = np.full(size, np.inf)
+    u: Array = np.full(size, np.inf)
     u[there] = np.sqrt(2 * np.diag(np.linalg.inv(S))) if np.linalg.eigvalsh(S)[0] > 0 else np.inf
     return u[group]
 
 
-def weighted_squares(adjustment: Adjustment) -> np.ndarray:
+def weighted_squares(adjustment: Adjustment) -> Array:
     """v (P v) of x and y, shape (n, 2)."""
     v, (xx, xy, yy) = adjustment.residual_px, adjustment.network.covariance_px2.T
     det = xx * yy - xy**2
-    return np.column_stack([v[:, 0] * (yy * v[:, 0] - xy * v[:, 1]), v[:, 1] * (xx * v[:, 1] - xy * v[:, 0])]) / det[:, None]
+    squares: Array = np.column_stack([v[:, 0] * (yy * v[:, 0] - xy * v[:, 1]), v[:, 1] * (xx * v[:, 1] - xy * v[:, 0])]) / det[:, None]
+    return squares
 
 
 def scaled(network: Network, factor: np.ndarray) -> Network:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from pixmetry.calibrate.images.numbering import Board, Marks, chessboard_marks, dot_marks
+from pixmetry.core.arrays import Flags
 from pixmetry.core.errors import InputError
 from pixmetry.files.formats import Decoded
 from pixmetry.files.images import load_picture
@@ -122,8 +123,9 @@ def _nothing(name: str, frame: np.ndarray, reason: str) -> Seen:
     return Seen(name, (frame.shape[1], frame.shape[0]), reason=reason)
 
 
-def _usable(found: Located | Positions) -> np.ndarray:
-    return np.isfinite(found.x_px) & np.isfinite(found.var_x_px2) & (found.flags & UNUSABLE == 0)
+def _usable(found: Located | Positions) -> Flags:
+    usable: Flags = np.isfinite(found.x_px) & np.isfinite(found.var_x_px2) & (found.flags & UNUSABLE == 0)
+    return usable
 
 
 def _seen(name: str, frame: np.ndarray, found: Located | Positions, keys: np.ndarray, use: np.ndarray, extent: tuple[int, int]) -> Seen:

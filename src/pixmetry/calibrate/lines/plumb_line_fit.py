@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from pixmetry.calibrate.bundle._model_kernels import IMAGE_TO_OBJECT, Lens, directions
 from pixmetry.calibrate.bundle.model import NAMES, CameraModel
+from pixmetry.core.arrays import Array, Flags, Ints
 from pixmetry.core.errors import InputError, MeasureError
 
 ALARM = 1e-3  # chance that a table without gross errors loses a position
@@ -152,7 +153,7 @@ class LineFit:
         slope = self.table.sums(self.weight * self.t * z) / self.moment
         return z - mean[self.table.line_of] - slope[self.table.line_of] * self.t, mean, slope
 
-    def inverse(self) -> np.ndarray:
+    def inverse(self) -> Array:
         """Inverse of the normal equations; raises where they are singular."""
         size = np.sqrt(np.diag(self.normal))
         if not (np.isfinite(self.normal).all() and (size > 0).all()):
@@ -160,7 +161,8 @@ class LineFit:
         values, vectors = np.linalg.eigh(self.normal / np.outer(size, size))
         if values[0] < SINGULAR * values[-1]:
             refuse([name for name, v in zip(self.names, vectors[:, 0], strict=True) if abs(v) > 0.3])
-        return (vectors / values @ vectors.T) / np.outer(size, size)
+        inverse: Array = (vectors / values @ vectors.T) / np.outer(size, size)
+        return inverse
 
     def weakest(self) -> list[str]:
         """The parameter of whose effect the least is left when the lines are eliminated."""
@@ -194,21 +196,25 @@ class LineFit:
             refuse(self.weakest())
         return float(self.weight @ left**2)
 
-    def leverage(self) -> np.ndarray:
+    def leverage(self) -> Array:
         """Share of each position's variance that the fit takes up, were its weight that of a used one; shape (n,)."""
         inverse, line = self.inverse(), self.table.line_of
         own = 1.0 / self.variance
-        return own * (1 / self.total[line] + self.t**2 / self.moment[line] + np.einsum("np,pq,nq->n", self.a_left, inverse, self.a_left))
+        of_parameters = np.einsum("np,pq,nq->n", self.a_left, inverse, self.a_left)
+        share: Array = own * (1 / self.total[line] + self.t**2 / self.moment[line] + of_parameters)
+        return share
 
-    def statistics(self) -> np.ndarray:
+    def statistics(self) -> Array:
         """Residuals over their standard deviations; of those left out, over that of their prediction."""
         h = self.leverage()
         q = np.where(self.table.used, np.maximum(1 - h, 1e-9), 1 + h)
-        return self.f_left / np.sqrt(self.variance * q)
+        statistic: Array = self.f_left / np.sqrt(self.variance * q)
+        return statistic
 
-    def axis_of_line(self) -> np.ndarray:
+    def axis_of_line(self) -> Ints:
         """0 for lines that tell about x, 1 for those about y."""
-        return (np.abs(np.cos(self.theta)) < np.abs(np.sin(self.theta))).astype(np.int64)
+        steep: Flags = np.abs(np.cos(self.theta)) < np.abs(np.sin(self.theta))
+        return steep.astype(np.int64)
 
     def rescale(self, robust: bool = False) -> float:
         """Bring the variances along x and y to the residuals' level; returns by how much they changed."""

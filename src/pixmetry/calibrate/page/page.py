@@ -14,6 +14,7 @@ from pixmetry.calibrate.page import tables
 from pixmetry.calibrate.page.text import (
     DIRECTIONS,
     of_camera,
+    p_text,
     projection_levels,
     residual_record,
     sentence,
@@ -295,7 +296,7 @@ def _space(section: Section, calibration: Calibration) -> None:
 
     adjustment = calibration.adjustment
     unit = adjustment.network.unit
-    lost = int(np.sum(~np.isfinite(adjustment.state.xyz).all(axis=1)))
+    lost = int(np.sum(~adjustment.state.located))
     words = f" {adjustment.datum or 'not stated'}."
     if lost:
         few, them = ("points are", "them, or their") if lost > 1 else ("point is", "it, or its")
@@ -442,7 +443,7 @@ def _field(field: FieldTest) -> dict[str, Any]:
     compared, text = field.compared, typeset(sentence(field.text))
     if compared is None:
         return {"verdict": VERDICTS[field.verdict], "text": text, "moved": []}
-    off, p = compared.deviations, tables.p_text(compared.p)
+    off, p = compared.deviations, p_text(compared.p)
     sizes = [f"{significant(size, 2)} {off.unit} {word}" for size, word in ((off.rms, "rms"), (off.peak, "at most")) if size]
     said = "" if p == NONE else f" (p {p if p[0] == '<' else '= ' + p})"
     if sizes:
@@ -459,7 +460,7 @@ def _hold_out(found: HoldOut | None) -> str:
     if found is None:
         return ""
     texts = []
-    p = tables.p_text(found.p)
+    p = p_text(found.p)
     if p != NONE and found.fixed and found.free:
         told = p if p[0] == "<" else f"= {p}"
         texts.append(f"The decrease of the rms of images left out with free points has p {told} (paired over the images).")

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pixmetry.calibrate.page.figures import MOST_VECTORS, arrows, chain, colour_bar, enlargement, length_key, round_number
+from pixmetry.core.arrays import Array
 from pixmetry.report.drawing import AMBER, BLUE, INK, RED, SOFT, WIDTH_IN, canvas
 from pixmetry.report.numbers import significant
 from pixmetry.report.page import Figure
@@ -47,8 +48,8 @@ def pyramids(adjustment: Adjustment, images: np.ndarray, depth: float) -> np.nda
 def network_views(adjustment: Adjustment) -> list[Figure]:
     """Cameras as pyramids, points and scale bars, from two sides."""
     state = adjustment.state
-    points = state.xyz[np.isfinite(state.xyz).all(axis=1)]
-    everything = np.concatenate([points, state.position[np.isfinite(state.position).all(axis=1)]])
+    points = state.xyz[state.located]
+    everything = np.concatenate([points, state.position[state.posed]])
     if len(everything) < 2:
         return []
     extent = float(np.linalg.norm(np.ptp(everything, axis=0))) or 1.0
@@ -59,7 +60,7 @@ def _network_view(adjustment: Adjustment, points: np.ndarray, extent: float, num
     """The network from one of its two sides."""
     net, state = adjustment.network, adjustment.state
     view = seen_from(*SIDES[number])
-    oriented = np.isfinite(state.position).all(axis=1)
+    oriented = state.posed
     groups = [np.flatnonzero((net.camera_of == k) & oriented) for k in range(len(net.cameras))]
     edges = [pyramids(adjustment, images, 0.09 * extent) @ view.T if len(images) else np.zeros((0, 2, 2)) for images in groups]
     seen = points @ view.T
@@ -108,10 +109,11 @@ def _triad(axes: Axes, view: np.ndarray, seen: np.ndarray, low: np.ndarray, high
     return length
 
 
-def ellipse(covariance: np.ndarray) -> np.ndarray:
+def ellipse(covariance: Array) -> Array:
     """Outline of the standard ellipse of a 2 × 2 covariance about the origin, shape (2, 25)."""
     values, vectors = np.linalg.eigh(covariance)
-    return vectors @ (np.sqrt(np.maximum(values, 0.0))[:, None] * CIRCLE)
+    outline: Array = vectors @ (np.sqrt(np.maximum(values, 0.0))[:, None] * CIRCLE)
+    return outline
 
 
 def largest_axis(covariance: np.ndarray) -> np.ndarray:

@@ -10,6 +10,7 @@ import numpy as np
 from pixmetry.calibrate.bundle.network import ScaleBars
 from pixmetry.calibrate.checks.check_points import CheckPoints
 from pixmetry.calibrate.project.tables import Table, first_few, index_of_names
+from pixmetry.core.arrays import Array
 from pixmetry.core.errors import InputError
 
 OTHER_UNIT = 5.0  # a scale bar and the distance of its points that differ by this factor are in different units
@@ -151,12 +152,13 @@ def _u_of_points(table: Table, known: str | None, u: float | None) -> np.ndarray
     return np.stack([table.numbers(name, empty=empty, least=0) for name in columns], axis=1)
 
 
-def _unit_normals(table: Table) -> np.ndarray:
-    normals = np.stack([table.numbers(f"normal_{axis}", empty=np.nan) for axis in "xyz"], axis=1)
+def _unit_normals(table: Table) -> Array:
+    normals: Array = np.stack([table.numbers(f"normal_{axis}", empty=np.nan) for axis in "xyz"], axis=1)
     length = np.linalg.norm(normals, axis=1)
     if (length == 0).any():
         raise InputError("a normal without direction", where=table.where(int(np.flatnonzero(length == 0)[0])), remedy="correct it")
-    return normals / length[:, None]
+    of_unit_length: Array = normals / length[:, None]
+    return of_unit_length
 
 
 def scale_bars(tables: Sequence[Table], names: Sequence[str], known: Known | None = None) -> ScaleBars:

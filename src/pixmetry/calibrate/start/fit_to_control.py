@@ -13,6 +13,7 @@ from itertools import combinations
 import numpy as np
 
 from pixmetry.calibrate.start.resection import fitted, motions, similarity
+from pixmetry.core.arrays import Array, Flags
 
 MOST_PAIRS = 28  # of eight points; of more, three right ones are found without heights and positions
 TURNS = 16  # about the line of a pair
@@ -76,13 +77,14 @@ def _starts(found: np.ndarray, given: np.ndarray, whole: np.ndarray) -> Iterator
             yield _turned(moved - moved[pair[0]], turn * axis / max(float(np.linalg.norm(axis)), 1e-300)) + moved[pair[0]]
 
 
-def _turned(points: np.ndarray, by: np.ndarray) -> np.ndarray:
+def _turned(points: np.ndarray, by: np.ndarray) -> Array:
     from scipy.spatial.transform import Rotation
 
-    return Rotation.from_rotvec(by).apply(points)
+    turned: Array = Rotation.from_rotvec(by).apply(points)
+    return turned
 
 
-def brought_to(found: np.ndarray, given: np.ndarray, known: np.ndarray, *, scaled: bool = True) -> np.ndarray:
+def brought_to(found: Array, given: Array, known: Flags, *, scaled: bool = True) -> Array:
     """Points moved by the similarity that takes them to what is known of them, in least squares; shape (points, 3) as all of these.
 
     Of points known in part it is the nearest one: they lie about where they should be already.

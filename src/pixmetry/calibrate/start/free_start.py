@@ -76,7 +76,7 @@ def _parallax(network: Network, a: np.ndarray, b: np.ndarray) -> float:
     size = float(np.median(np.hypot(*left.T))) * np.sqrt(len(a) / max(len(a) - 3, 1))
     width = network.cameras[0].sensor.cols
     spread = float(np.sqrt(np.linalg.det(np.cov(y.T)))) / width**2  # a pair should fill the frame
-    return min(size / width, 0.05) * min(1.0, 20 * spread)
+    return float(min(size / width, 0.05) * min(1.0, 20 * spread))
 
 
 def seed(work: Reconstruction, i: int, j: int) -> bool:

@@ -17,12 +17,14 @@ from dataclasses import replace
 
 import numpy as np
 
+from pixmetry.calibrate.bundle.model import CameraModel
 from pixmetry.calibrate.bundle.network import Network, State
 from pixmetry.calibrate.start.free_start import best_free, common_points, without_lens
 from pixmetry.calibrate.start.object_frame import moved, to_object
 from pixmetry.calibrate.start.posed_start import from_poses
 from pixmetry.calibrate.start.reconstruction import Reconstruction
 from pixmetry.calibrate.start.resection import FEWEST, FLAT, fitted, thickness
+from pixmetry.core.arrays import Array
 from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.core.threads import single_threaded_blas
 
@@ -180,7 +182,7 @@ def _distance_from_planes(work: Reconstruction, camera: int, images: np.ndarray)
     return float(c) if np.isfinite(c) else 0.0
 
 
-def homography(plane: np.ndarray, image: np.ndarray, passes: int = 6) -> np.ndarray:
+def homography(plane: Array, image: Array, passes: int = 6) -> Array:
     """Homography that takes points of a plane to an image, both shape (n, 2), n ≥ 4; wrong points are weighted down.
 
     Raises
@@ -204,7 +206,8 @@ def homography(plane: np.ndarray, image: np.ndarray, passes: int = 6) -> np.ndar
             depth = np.abs(seen[:, 2]) / np.median(np.abs(seen[:, 2]))  # algebraic errors are geometric ones times the depth
             weight = np.nan_to_num(1 / (depth * np.sqrt(1 + (error / spread) ** 2)))
     h = np.linalg.inv(to_b) @ h @ to_a
-    return h / np.linalg.norm(h)
+    of_unit_length: Array = h / np.linalg.norm(h)
+    return of_unit_length
 
 
 def principal_distance(homographies: list[np.ndarray]) -> float:
@@ -224,10 +227,11 @@ def principal_distance(homographies: list[np.ndarray]) -> float:
     return float(1 / np.sqrt(slope)) if slope > 0 else float("nan")
 
 
-def plane_coordinates(xyz: np.ndarray) -> np.ndarray:
+def plane_coordinates(xyz: Array) -> Array:
     """Coordinates (n, 2) of points in the plane that lies through them."""
     a = xyz - xyz.mean(axis=0)
-    return a @ np.linalg.svd(a, full_matrices=False)[2][:2].T
+    within: Array = a @ np.linalg.svd(a, full_matrices=False)[2][:2].T
+    return within
 
 
 def _normalised(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -325,7 +329,7 @@ def _join_rest(work: Reconstruction) -> bool:
     return bool(new.any())
 
 
-def _held(network: Network, work: Reconstruction) -> tuple:
+def _held(network: Network, work: Reconstruction) -> tuple[CameraModel, ...]:
     """Cameras whose principal distance is known by now."""
     return tuple(
         replace(camera, values=row, free=np.zeros(len(row), bool)) if row[0] > 0 else camera

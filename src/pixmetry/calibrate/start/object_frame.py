@@ -6,6 +6,7 @@ import numpy as np
 
 from pixmetry.calibrate.start.reconstruction import Reconstruction
 from pixmetry.calibrate.start.resection import FLAT, fitted, thickness
+from pixmetry.core.arrays import Array, Flags
 from pixmetry.core.errors import InputError, MeasureError
 
 KEEP = 1e-6  # pull of what is not known towards the frame that is there, beside 1 for what is
@@ -58,7 +59,7 @@ def _does_not_fit(work: Reconstruction, use: np.ndarray) -> Exception:
     return _disagrees(float(np.median(away)), int(use.sum()), network.unit)
 
 
-def _turned_away(work: Reconstruction, use: np.ndarray) -> np.ndarray:
+def _turned_away(work: Reconstruction, use: Flags) -> Array:
     """Distances from known points that remain when the reconstruction is mirrored."""
     return fitted(work.xyz[use] * [1.0, 1.0, -1.0], work.network.xyz[use])[3]
 
@@ -110,8 +111,8 @@ def _to_known(work: Reconstruction, *, scaled: bool) -> None:
 
 
 def _nearest(
-    source: np.ndarray, target: np.ndarray, u: np.ndarray, size: float, scaled: bool
-) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
+    source: Array, target: Array, u: Array, size: float, scaled: bool
+) -> tuple[float, Array, Array, Array]:
     """Scale, rotation, shift that bring points of extent 1 to coordinates that are known with u (n, 3; ``inf``: not known), and how far
     these remain apart beyond their u, in units of the extent; where they leave something open, the nearest to ``size`` without a turn.
 
@@ -123,7 +124,7 @@ def _nearest(
     known = np.isfinite(u)
     count = np.maximum(known.sum(axis=0), 1)
 
-    def centred(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def centred(values: Array) -> tuple[Array, Array]:
         values = np.where(known, values, 0.0)
         mean = values.sum(axis=0) / count
         return (values - mean)[known], mean
@@ -132,8 +133,9 @@ def _nearest(
     expected = u[known] / (float(np.sqrt(np.mean(wanted**2))) or size)
     weight = 1 / np.hypot(1.0, expected / AGREES)
 
-    def gap(p: np.ndarray) -> np.ndarray:
-        return centred(source @ Rotation.from_rotvec(p[:3]).as_matrix().T)[0] - wanted / (size * np.exp(p[3]))
+    def gap(p: Array) -> Array:
+        gaps: Array = centred(source @ Rotation.from_rotvec(p[:3]).as_matrix().T)[0] - wanted / (size * np.exp(p[3]))
+        return gaps
 
     def misses(p: np.ndarray, start: float) -> np.ndarray:
         return np.concatenate([weight * gap(p), KEEP * p[:3], [(KEEP if scaled else 1.0 / KEEP) * (p[3] - start)]])

@@ -10,6 +10,7 @@ from pixmetry.calibrate.bundle.network import Network, Poses, State
 from pixmetry.calibrate.start.free_start import start_interiors
 from pixmetry.calibrate.start.reconstruction import Reconstruction
 from pixmetry.calibrate.start.resection import fitted, thickness
+from pixmetry.core.arrays import Flags, Ints
 from pixmetry.core.finding import Finding
 
 ANYHOW = 0.3  # rad: how far rays may miss each other under rough poses
@@ -145,16 +146,16 @@ def _meant(poses: Poses, state: State, both: np.ndarray) -> str:
 
 def _both(poses: Poses, state: State) -> np.ndarray:
     """Images with a given and an adjusted pose."""
-    return np.flatnonzero(poses.given & np.isfinite(state.position[:, 0]))
+    return np.flatnonzero(poses.given & state.posed)
 
 
-def _differ(poses: Poses, state: State, both: np.ndarray) -> np.ndarray:
+def _differ(poses: Poses, state: State, both: Ints) -> Flags:
     """Which of these poses differ by more than rough ones may, after one similarity of all."""
     from scipy.spatial.transform import Rotation
 
     position, found = poses.position[both], state.position[both]
     turn, angle = _turn(poses.rotation[both], state.rotation[both])
-    wrong = angle > TURNED
+    wrong: Flags = angle > TURNED
     if len(both) < 3:
         return wrong
     if not np.ptp(position, axis=0).any():
@@ -162,7 +163,7 @@ def _differ(poses: Poses, state: State, both: np.ndarray) -> np.ndarray:
     extent = np.linalg.norm(np.nanstd(np.concatenate([state.position, state.xyz]), axis=0))
     _, by_position, _, away = fitted(position, found)
     apart = thickness(position)[1] > SPREAD and Rotation.from_matrix(by_position.T @ turn).magnitude() > TURNED
-    return wrong | (away > AWAY * extent) | bool(apart)
+    return wrong | (away > AWAY * float(extent)) | bool(apart)
 
 
 def _turn(rotation: np.ndarray, found: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -9,6 +9,7 @@ import numpy as np
 from pixmetry.calibrate.bundle.model import NAMES, TEN
 from pixmetry.calibrate.bundle.network import Network, ScaleBars, State
 from pixmetry.calibrate.start.resection import FEWEST, RIGHT_SHARE, intersect, pose, rays
+from pixmetry.core.arrays import Array, Flags
 from pixmetry.core.errors import MeasureError
 
 COARSE = 0.03  # of the frame's width: what may count as the same place while neither principal distance nor distortion are known
@@ -41,7 +42,7 @@ class Reconstruction:
         Points whose coordinates stand; the others are intersected.
     """
 
-    def __init__(self, network: Network, interior: np.ndarray, control: np.ndarray) -> None:
+    def __init__(self, network: Network, interior: Array, control: Flags) -> None:
         self.network, self.interior, self.control = network, interior.copy(), control
         images = len(network.images)
         self.rotation, self.position = np.full((images, 3, 3), np.nan), np.full((images, 3), np.nan)
@@ -65,9 +66,10 @@ class Reconstruction:
         return new
 
     @property
-    def posed(self) -> np.ndarray:
+    def posed(self) -> Flags:
         """Which images have a pose."""
-        return np.isfinite(self.position[:, 0])
+        posed: Flags = np.isfinite(self.position[:, 0])
+        return posed
 
     def c_px(self, camera: int) -> float:
         """Principal distance of a camera, px."""
@@ -217,7 +219,7 @@ class Reconstruction:
         return True
 
     def _plausible(self, cameras: np.ndarray, state: State) -> bool:
-        posed = np.isfinite(state.position).all(axis=1)  # an image that its points do not determine loses its pose, no more
+        posed = state.posed  # an image that its points do not determine loses its pose, no more
         if posed.sum() < min(2, len(posed)) or not (np.isfinite(state.interior).all() and np.isfinite(state.rotation[posed]).all()):
             return False
         for k, values in zip(cameras, state.interior, strict=True):

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pixmetry.core.arrays import Array
 from pixmetry.core.extras import import_extra
 
 FEWEST = 4  # points from which an image is posed: three determine it, a fourth selects among the answers
@@ -120,11 +121,12 @@ def _judged(xyz: np.ndarray, uv: np.ndarray, turn: np.ndarray, shift: np.ndarray
     return Pose(rotation, -rotation.T @ shift.ravel(), error2 < tolerance**2, float(error2.mean()))
 
 
-def rays(uv: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+def rays(uv: np.ndarray, rotation: np.ndarray) -> Array:
     """Unit vectors in the object's frame of directions (n, 2) with the rotations (n, 3, 3) of their images."""
     camera = np.column_stack([uv, np.ones(len(uv))])
     camera /= np.linalg.norm(camera, axis=1, keepdims=True)
-    return np.einsum("nji,nj->ni", rotation, camera)
+    turned: Array = np.einsum("nji,nj->ni", rotation, camera)
+    return turned
 
 
 def intersect(origin: np.ndarray, ray: np.ndarray, point: np.ndarray, points: int, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
@@ -197,8 +199,8 @@ def motions(r: np.ndarray) -> np.ndarray:
 
 
 def similarity(
-    source: np.ndarray, target: np.ndarray, weight: np.ndarray | None = None, *, scaled: bool = True
-) -> tuple[float, np.ndarray, np.ndarray]:
+    source: Array, target: Array, weight: Array | None = None, *, scaled: bool = True
+) -> tuple[float, Array, Array]:
     """Scale, rotation and shift that take points to others in least squares: target = scale · R source + shift.
 
     S. Umeyama, IEEE PAMI 13 (1991) 376–380.
@@ -213,7 +215,7 @@ def similarity(
     return scale, rotation, w @ target - scale * rotation @ (w @ source)
 
 
-def fitted(source: np.ndarray, target: np.ndarray, *, scaled: bool = True) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
+def fitted(source: Array, target: Array, *, scaled: bool = True) -> tuple[float, Array, Array, Array]:
     """`similarity` by iteratively reweighted least squares against wrong points, and the distances that remain.
 
     It begins with all points or with three, whatever leaves the least median: far points with exchanged names would turn all of them.
@@ -233,6 +235,7 @@ def fitted(source: np.ndarray, target: np.ndarray, *, scaled: bool = True) -> tu
     return scale, rotation, shift, left
 
 
-def _distances(source: np.ndarray, target: np.ndarray, by: tuple[float, np.ndarray, np.ndarray]) -> np.ndarray:
+def _distances(source: Array, target: Array, by: tuple[float, Array, Array]) -> Array:
     scale, rotation, shift = by
-    return np.linalg.norm(target - scale * source @ rotation.T - shift, axis=1)
+    distances: Array = np.linalg.norm(target - scale * source @ rotation.T - shift, axis=1)
+    return distances
