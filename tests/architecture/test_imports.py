@@ -10,6 +10,7 @@ import ast
 import re
 from dataclasses import dataclass
 from functools import cache
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -29,6 +30,9 @@ FLOORS = (
     ("__main__",),
 )
 FLOOR = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
+
+# The one import upwards in a circle: what loads a camera file hands a data sheet on to the module that makes a camera of it.
+HANDED_ON = {"pixmetry.camera.camera": "from pixmetry.camera.data_sheet import camera_of_data_sheet"}
 
 TYPES = {"typing", "collections.abc", "numpy.typing"}
 KERNEL_FILE = re.compile(r"_(.+_)?kernels")
@@ -107,6 +111,20 @@ def wrong_layers(source: str, module: str, is_package: bool = False) -> list[str
     return wrong
 
 
+def circle_of(sources: dict[str, str], packages: frozenset[str] = frozenset()) -> list[str]:
+    """Modules that import each other in a circle, the first one again at the end; empty where there is none."""
+    graph = {}
+    for module, source in sources.items():
+        found = [one for one in imports(source, module, module in packages) if one.dotted != "pixmetry.__version__"]
+        graph[module] = {one.dotted if one.dotted in sources else one.module for one in found} & sources.keys() - {module}
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        circle: list[str] = error.args[1]
+        return circle
+    return []
+
+
 def wrong_kernel_imports(source: str, module: str) -> list[str]:
     """Imports of a kernel file beyond numpy, math, numba, ``core.jit``, other kernel files and what only annotations are made of."""
 
@@ -169,6 +187,30 @@ def test_rooms_import_downwards_only() -> None:
 
 def _checked_layers(path: Path) -> list[str]:
     return wrong_layers(path.read_text(), module_name(path), path.stem == "__init__")
+
+
+def test_no_modules_import_each_other() -> None:
+    packages = frozenset(module_name(path) for path in FILES if path.stem == "__init__")
+    sources = {module_name(path): path.read_text() for path in FILES}
+    for module, line in HANDED_ON.items():
+        assert sources[module].count(line) == 1
+        sources[module] = sources[module].replace(line, "pass")
+    circle = circle_of(sources, packages)
+    assert not circle, " -> ".join(circle)
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        ("from pixmetry.locate import b", "from pixmetry.locate.a import A"),
+        ("from pixmetry.locate.b import B", "def f():\n    from pixmetry.locate.a import A"),
+        ("from pixmetry.locate.b import B", "if TYPE_CHECKING:\n    from .a import A"),
+        ("from . import b", "from . import c", "from . import a"),
+    ],
+)
+def test_a_planted_circle_is_caught(lines: tuple[str, ...]) -> None:
+    circle = circle_of(dict(zip(("pixmetry.locate.a", "pixmetry.locate.b", "pixmetry.locate.c"), lines, strict=False)))
+    assert circle[0] == circle[-1] and len(circle) == len(lines) + 1
 
 
 @pytest.mark.parametrize("path", KERNELS, ids=module_name)
