@@ -417,7 +417,7 @@ def test_a_camera_with_a_logarithmic_response_has_a_noise_too() -> None:
         ({"parameters": DISC | {"blur_px": np.nan}}, "blur_px cannot be used"),
         ({"parameters": DISC | {"weight": 1.0}}, "no such parameter"),
         ({"unknowns": "shapes"}, "no such parameter"),
-        ({"unknowns": "amplitude_dn"}, "the place is not among"),
+        ({"unknowns": "amplitude_dn"}, "the position is not among"),
         ({"window_px": 10}, "window cannot be used"),
         ({"parameters": DISC | {"radius_px": 900.0}}, "the target is too large"),
         ({"noise": NoiseModel(0.01)}, "smaller than that of rounding"),
@@ -425,7 +425,7 @@ def test_a_camera_with_a_logarithmic_response_has_a_noise_too() -> None:
         ({"frames": 0}, "number of frames"),
         ({"phases": 0}, "number of phases"),
         ({"aperture_px": 1.5}, "aperture"),
-        ({"estimator": "magic"}, "no such estimator"),
+        ({"estimator": "magic"}, "estimator cannot be predicted"),
         ({"noise": NoiseModel(1.0, low_dn=0, high_dn=3)}, "does not determine the position"),
     ],
 )
@@ -434,3 +434,18 @@ def test_bad_input_is_told_in_one_line(change: dict, text: str) -> None:
     with pytest.raises(InputError, match=text) as caught:
         bound(**(good | change))
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("phases", [1, 2])
+def test_too_few_phases_are_refused_since_an_s_curve_would_be_lost_or_doubled(phases: int) -> None:
+    """At the pixel's centre alone an S-curve is 0; the bound of a single phase is still to be had."""
+    sharp = disc(2, blur_px=0.3)
+    images = draw_images("disc", sharp, phases=phases, window_px=15)
+    noise = NoiseModel(1.0)
+    centroid = predict("hard_threshold", images, pixel_noise(images, noise), ("x_px", "y_px"), 4.0)
+    fine = draw_images("disc", sharp, phases=12, window_px=15)
+    whole = predict("hard_threshold", fine, pixel_noise(fine, noise), ("x_px", "y_px"), 4.0)
+    assert not 0.9 < centroid.s_curve_px / whole.s_curve_px < 1.1
+    with pytest.raises(InputError, match="so few phases"):
+        bound("disc", sharp, noise, phases=phases)
+    assert cramer_rao_bound("disc", sharp, noise, phases=phases).place_px[1] > 0

@@ -55,7 +55,7 @@ def test_black_of_a_camera_is_under_the_surround() -> None:
     ],
 )
 def test_every_kind_of_target(words: tuple[str, ...]) -> None:
-    result = run(*words, "--blur", "0.8", "--amplitude", "100", "--phases", "2")
+    result = run(*words, "--blur", "0.8", "--amplitude", "100", "--phases", "3")
     assert result.exit_code == 0, result.output
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,10 @@ from scipy.special import erf
 
 from pixmetry.core.errors import InputError
 from pixmetry.locate.centroids.fixed import LAWS, FixedCentroid
-from pixmetry.locate.estimators import estimators
+from pixmetry.locate.detect.targets import Positions
+from pixmetry.locate.estimator import Method, Settings
+from pixmetry.locate.estimators import estimators, methods
+from pixmetry.locate.noise import NoiseModel
 from pixmetry.locate.target_estimator import TargetEstimator, parse_estimator
 
 SIDE = 24
@@ -170,3 +174,24 @@ def test_a_window_that_does_not_fit_and_a_threshold_that_is_not_known_are_refuse
         estimator("centroid").locate(np.zeros((1, 12, 24)))
     with pytest.raises(InputError, match="noise"):
         FixedCentroid().locate(np.zeros((1, 24, 24)))
+
+
+def _stating(s_curve_px: float | None, var_px2: float) -> Method:
+    """A method that puts every target at 0, with this covariance and this error over the phase."""
+    more = {} if s_curve_px is None else {"s_curve_px": np.array([s_curve_px, np.nan])}
+    var, none = np.array([var_px2, np.nan]), np.zeros(2)
+    return Method("mine", "", lambda *_: Positions(none, none, var, none, var, none.astype(np.uint32), more), lambda *_: 2.0)
+
+
+@pytest.mark.parametrize(("s_curve_px", "var_px2", "what"), [(None, 1e-4, "without the sub-pixel phase"), (0.02, 1e-4, "less than those")])
+def test_a_covariance_without_the_phase_is_refused(s_curve_px: float | None, var_px2: float, what: str) -> None:
+    with pytest.raises(InputError, match=what):
+        _stating(s_curve_px, var_px2).positions(np.zeros((9, 9), np.uint8), None, NoiseModel(1.0), Settings())
+
+
+def test_a_covariance_with_the_phase_or_of_a_method_that_does_not_see_it_passes() -> None:
+    method = _stating(0.02, 4e-4)
+    assert method.positions(np.zeros((9, 9), np.uint8), None, NoiseModel(1.0), Settings()).var_x_px2[0] == 4e-4
+    method = replace(_stating(None, 1e-4), sees_phase=False)
+    assert method.positions(np.zeros((9, 9), np.uint8), None, NoiseModel(1.0), Settings()).var_x_px2[0] == 1e-4
+    assert {name for name, one in methods().items() if not one.sees_phase} == {"template", "poisson_gaussian"}

@@ -16,6 +16,7 @@ from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
+from pixmetry.core.errors import InputError
 from pixmetry.locate.detect.targets import Positions, Targets
 from pixmetry.locate.noise import NoiseModel
 
@@ -64,6 +65,10 @@ class Method:
         default difference quotients, which take a run for every pixel.
     words : str
         Its name in a sentence; by default the name.
+    sees_phase : bool
+        Whether its error depends on where in its pixel a target lies, even without noise. ``measure`` states this error then: column
+        ``s_curve_px``, the standard deviation over the phase, whose square is in the variances. That of a fit of the target's own shape
+        does not.
     """
 
     name: str
@@ -73,6 +78,26 @@ class Method:
     knows_aperture: bool = False
     slopes: Callable[[Positions, NoiseModel, tuple[int, int], float], np.ndarray] | None = None
     words: str = ""
+    sees_phase: bool = True
+
+    def positions(self, frame: np.ndarray, targets: Targets, noise: NoiseModel, settings: Settings) -> Positions:
+        """Measure the targets of a frame, and refuse a covariance that lacks the variance over the sub-pixel phase.
+
+        Raises
+        ------
+        InputError
+            If ``s_curve_px`` is not stated, or its square is not in the variances.
+        """
+        found = self.measure(frame, targets, noise, settings)
+        if not self.sees_phase:
+            return found
+        remedy = "add its square to the variances, with s_curve_px in more; or say sees_phase=False if it does not depend on the phase"
+        if "s_curve_px" not in found.more:
+            raise InputError(f"the covariance of {self.name} is without the sub-pixel phase", where="s_curve_px", remedy=remedy)
+        least = (1 - 1e-9) * found.more["s_curve_px"] ** 2
+        if np.any((found.var_x_px2 < least) | (found.var_y_px2 < least)):
+            raise InputError(f"variances of {self.name} are less than those over the sub-pixel phase", where="s_curve_px", remedy=remedy)
+        return found
 
 
 @dataclass(frozen=True)

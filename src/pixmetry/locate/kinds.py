@@ -49,7 +49,7 @@ def locate_spots(task: Task) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         estimator, reason = chosen_estimator(targets, noise, why)
     planes: str | bool = False if task.kind == "coded" else "auto"  # the rings would pass for slopes
     settings = Settings(shape, planes, task.light_on, task.aperture_px, task.threads)
-    positions = methods()[estimator].measure(task.frame, targets, noise, settings)
+    positions = methods()[estimator].positions(task.frame, targets, noise, settings)
     columns = _columns(positions, estimator if shape == task.kind else f"{estimator} ({shape})", noise)
     notes = _notes(estimator, reason, noise, found.polarity if len(targets) else "none found")
     if task.kind == "coded":

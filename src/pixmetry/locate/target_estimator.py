@@ -195,7 +195,7 @@ class TargetEstimator:
             least = f"at least {self.window} × {self.window} px"
             raise InputError("the estimator's window does not fit", value=(rows, cols), allowed=least)
         targets, noise = self._targets(data), self._noise(data.dtype)
-        found = self.method.measure(data.reshape(n * rows, cols), targets, noise, Settings(planes=False))
+        found = self.method.positions(data.reshape(n * rows, cols), targets, noise, Settings(planes=False))
         lost = (found.flags & np.uint32(Flag.NOT_CONVERGED)) > 0
         x, y = np.where(lost, np.nan, found.x_px), np.where(lost, np.nan, found.y_px - rows * np.arange(n))
         return replace(found, x_px=x, y_px=y)

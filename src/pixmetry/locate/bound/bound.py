@@ -20,6 +20,7 @@ __all__ = ["Bound", "Limit", "Possible", "bound", "cramer_rao_bound"]
 SETS = ("position", "light", "shape", "planes")
 WITHIN = 1.05  # frames are averaged until the uncertainty is within 5 % of what stays
 MOST_FRAMES, VERY_MANY = 10**6, 10**12
+LEAST_PHASES = 3  # along an axis: with one or two, the first wave of an S-curve has not its mean square over the pixel
 UNKNOWN_PX = 1.0  # a place that is less sure than this is not known
 LEFT_OUT = (
     "the noise is Gaussian, independent from pixel to pixel, and of known variance; the information of the variance about the light is "
@@ -139,7 +140,7 @@ def bound(
     Parameters
     ----------
     kind, parameters, unknowns, frames, aperture_px, light_on, window_px, phases, rounded, pattern_dn
-        As for `cramer_rao_bound`.
+        As for `cramer_rao_bound`; but three ``phases`` at least, since what an estimator does over the phase is part of its uncertainty.
     noise : NoiseModel or str
         As for `cramer_rao_bound`, or as the command takes it: ``"read=1.5,gain=0.4,bits=12"``, whose pattern adds to ``pattern_dn``.
     estimator : str
@@ -165,6 +166,9 @@ def bound(
         noise, own_pattern_dn = parse_noise(noise, rounded)
         pattern_dn = float(np.hypot(pattern_dn, own_pattern_dn))
     images = draw_images(kind, parameters, aperture_px=aperture_px, light_on=light_on, window_px=window_px, phases=phases)
+    if phases < LEAST_PHASES:
+        what, remedy = "an error over the sub-pixel phase does not show in so few phases", "for the bound alone: cramer_rao_bound"
+        raise InputError(what, where="phases", value=phases, allowed=f"{LEAST_PHASES} to 50", remedy=remedy)
     names = names_for(kind)
     if estimator not in names:
         raise InputError(f"this estimator cannot be predicted for a {kind}", where="estimator", value=estimator, allowed=", ".join(names))

@@ -154,7 +154,7 @@ def _by_name(
         rim = 16  # so that neither window nor background is cut off
         wide = np.pad(image, rim, mode="edge").astype(np.float32)
         box = {n: getattr(one, n) + rim for n in ("x_px", "y_px", "row_first", "row_stop", "col_first", "col_stop")}
-        at = methods()[name].measure(wide, replace(one, **box), noise, Settings(planes=False, threads=1))
+        at = methods()[name].positions(wide, replace(one, **box), noise, Settings(planes=False, threads=1))
         found_x[i], found_y[i] = at.x_px[0] - rim, at.y_px[0] - rim
     return found_x, found_y
 

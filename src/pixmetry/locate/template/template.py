@@ -348,6 +348,7 @@ METHODS = (
         knows_aperture=True,
         slopes=_slopes,
         words="template fit",
+        sees_phase=False,
     ),
     Method(
         "poisson_gaussian",
@@ -357,5 +358,6 @@ METHODS = (
         knows_aperture=True,
         slopes=_slopes,
         words="template fit with the likelihood of few electrons",
+        sees_phase=False,
     ),
 )
