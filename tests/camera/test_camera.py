@@ -141,7 +141,7 @@ def test_unknown_names_no_frames_and_unknown_modes_are_refused() -> None:
     chain = camera(TO_ELECTRONS)
     with pytest.raises(InputError, match="no source named 'nothing'"):
         chain.switched(off=["nothing"])
-    with pytest.raises(InputError, match="no frame"):
+    with pytest.raises(InputError, match="the number of frames is not positive"):
         chain.expose(SCENE, [])
     with pytest.raises(InputError, match="no such mode"):
         chain.expose_windows(SCENE, Grid.whole([0], (5, 5)), mode="fast")
