@@ -17,6 +17,7 @@ BOX = 5  # side of the filter that release 3.1 puts before the PRNU histograms
 Curve = dict[str, np.ndarray]
 
 
+@np.errstate(divide="ignore", invalid="ignore")  # lines through levels without light are NaN
 def temporal_curves(
     series: Series, values: dict[str, np.ndarray], u_var_dn2: np.ndarray, dsnu2_e2: float = 0.0, prnu2_percent2: float = 0.0
 ) -> dict[str, Curve]:

@@ -29,7 +29,10 @@ from pixmetry.emva.uncertainty import about, add_wave, bootstrap_series, draw_bl
 
 GROUP_DRAWS = 300
 SEED = 1288
+MOST_DRAWS = 0.99  # have a value: else it rests on levels that noise chooses
 MANY = 1e6  # degrees of freedom beyond which u is as good as known
+LEFT_TO_NOISE = "noise decides whether these levels give a value at all: take more levels, larger frames or more light"
+NEGATIVE = "the root or the logarithm of a negative number: the signal does not grow with the light"
 DARK_NOISE_LIMIT_DN = 0.40  # R4.0 eq. 54
 MAY_NOT_BE_NEGATIVE = ("u_I_var", "u_I_var_DN")
 
@@ -107,9 +110,10 @@ def _by_release(m: Measurement, release: str, draws: int, with_curves: bool = Tr
         formulas = Formulas.of(m, release)
         scatter = scatter_of(m, formulas.series)
         measured, squares = formulas.at(formulas.series, *formulas.vectors)
+        _refuse_no_gain(measured)
+        spread, bounds = _monte_carlo(formulas, scatter, draws)
     except MeasureError as problem:
         return partial_results(m, release, problem)
-    spread, bounds = _monte_carlo(formulas, scatter, draws)
     case = _case(m, formulas, measured, squares, spread)
     values = with_lower_limits({key: _value(key, case) for key in keys_of(release)}, case)
     low, high = np.split(np.array(bounds), 2)
@@ -118,6 +122,18 @@ def _by_release(m: Measurement, release: str, draws: int, with_curves: bool = Tr
     if "PTC" in curves and release == "4.0":
         curves["PTC"] |= {"departure_low": low, "departure_high": high}
     return Results(release, values, curves, notes_of(case, values, judged), m.channel)
+
+
+def _refuse_no_gain(measured: Values) -> None:
+    """Refuse a series whose variance falls with the signal, as where no light came in: nothing in electrons follows from it."""
+    if "K" in measured and not measured["K"] > 0:
+        raise MeasureError(
+            "the temporal variance does not grow with the signal",
+            where="exposure series",
+            value=f"K = {float(measured['K']):.3g} DN/e⁻",
+            allowed="above 0",
+            remedy="check whether light reached the sensor",
+        )
 
 
 def _case(m: Measurement, formulas: Formulas, measured: Values, squares: Values, spread: Spread) -> Case:
@@ -226,10 +242,14 @@ def _rows(drawn: tuple[Values, Values], rows: slice, total: int) -> tuple[Values
 
 
 def _deviations(centre: tuple[Values, Values], drawn: tuple[Values, Values]) -> tuple[dict[str, float], dict[str, float]]:
-    """Root mean square of the draws about the centre, of values and of squares; a root of a negative draw counts as zero."""
+    """Root mean square of the draws about the centre, of values and of squares; a root of a negative draw counts as zero.
+
+    NaN where the value is, or where more than one draw in a hundred has none.
+    """
 
     def rms(values: np.ndarray, about: float) -> float:
-        return float(np.sqrt(np.mean((values - about) ** 2))) if np.isfinite(about) else math.nan
+        kept = values[~np.isnan(values)]
+        return float(np.sqrt(np.mean((kept - about) ** 2))) if np.isfinite(about) and kept.size >= MOST_DRAWS * values.size else math.nan
 
     u = {}
     for key, values in drawn[0].items():
@@ -259,6 +279,8 @@ def _value(key: str, case: Case) -> Number:
         return Number(limit, u_square / (2 * limit) if limit > 0 else 0.0, dof, unit, method, reason, kind=UPPER_LIMIT)
     if key in MAY_NOT_BE_NEGATIVE and value < 0:
         return Number(ONE_SIDED_95 * u, u, dof, unit, method, reason, kind=UPPER_LIMIT)
+    if math.isfinite(value) and math.isnan(u):
+        return Number.not_available(unit, "; ".join(filter(None, (LEFT_TO_NOISE, reason))), method)
     if noise.below and formulas.release != "reference" and (is_bound(key) or key.startswith("DR")):
         if formulas.curved:
             at_limit = level_free_values(formulas.series, noise.limit_dn2)
@@ -271,6 +293,7 @@ def _value(key: str, case: Case) -> Number:
             value += ONE_SIDED_95 * u
         return Number(value, u, dof, unit, method, reason, kind=UPPER_LIMIT if is_bound(key) else VALUE)
     known_value = math.isfinite(value)
+    reason = reason or ("" if known_value else NEGATIVE)
     if 0 <= square < ONE_SIDED_95 * spread.u_square.get(key, 0.0):  # not significant: zero may be the truth, and lies in the interval
         u = max(u, value / TWO_SIDED_95)
     return Number(value, u if known_value else math.nan, dof if known_value else math.nan, unit, method, reason)

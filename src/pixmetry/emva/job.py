@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from pixmetry.camera.observations import StackMoments
-from pixmetry.core.errors import InputError
+from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.core.progress import Progress, no_progress
 from pixmetry.core.threads import imap_tiles, map_tiles, single_threaded_blas
 from pixmetry.emva.files.keys import KEYS
@@ -229,9 +229,13 @@ def _results(m: Measurement, release: str, bootstrap: int) -> Results:
     found = evaluate(m, release)
     if not bootstrap:
         return found
+    try:
+        drawn = bootstrap_u(m, release, bootstrap)
+    except MeasureError as problem:
+        return replace(found, notes=(*found.notes, f"no u by a bootstrap: {problem}"))
     values = dict(found.values)
-    for key, u in bootstrap_u(m, release, bootstrap).items():
-        if math.isfinite(u) and key in values:
+    for key, u in drawn.items():
+        if math.isfinite(u) and key in values and values[key].is_available:
             dof, units = _bootstrap_dof(key, m)
             text = f"u by a bootstrap, {bootstrap} draws, dof: {units} less one"
             # what the method says of the value stays, what it says of the other u does not

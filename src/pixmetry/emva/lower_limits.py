@@ -98,6 +98,8 @@ def _ratio(values: dict[str, Number], ratio: str, capacity: str, threshold: str)
     out = {}
     for key in _family(ratio, values):
         held = values[key]
+        if not held.is_available:
+            continue
         told = _told(held, "95 % lower limit, from its last level") if top.is_lower_limit else held
         if not told.reason:
             told = replace(told, reason=f"its threshold is an upper limit: 95 % lower limit ({least.reason})")

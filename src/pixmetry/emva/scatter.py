@@ -109,7 +109,10 @@ def scatter_of(m: Measurement, series: Series) -> Scatter:
     u_var = np.hypot(u_var, variance.excess * series.var_dn2 * (1 - series.fraction_max))
     dark_sampled = sampling_u(dark, shape)
     dark_variance = _dark_variance(series, dark_sampled, variance)
-    wave = np.sqrt(np.maximum(dark_variance.u**2 - dark_sampled**2, 0.0)) * (dark_variance.fit.dof >= OWN_DOF)
+    # few dark levels have no residuals to speak of; of one there must be two signs all the same
+    own = dark_variance.fit.dof >= OWN_DOF
+    z_dark_variance = dark_variance.standardised if own else np.resize([-1.0, 1.0], max(series.dark_exposure_s.size, 2))
+    wave = np.sqrt(np.maximum(dark_variance.u**2 - dark_sampled**2, 0.0)) * own
 
     u_spatial, share = spatial_scatter(bright, shape, u_var)
     u_dark_spatial, dark_share = spatial_scatter(dark, shape, dark_variance.u, wave)
@@ -144,7 +147,7 @@ def scatter_of(m: Measurement, series: Series) -> Scatter:
         z_light=light.z,
         z_variance=variance.standardised,
         z_dark_mean=dark_mean.z,
-        z_dark_variance=dark_variance.standardised,
+        z_dark_variance=z_dark_variance,
         wave_dn2=float(wave.mean()),
         pixels=bright.n_frames * shape[0] * shape[1],
         dof={
@@ -254,9 +257,7 @@ def _dark_variance(series: Series, sampled: np.ndarray, bright: ScatterFit) -> S
     found = fit_scatter(t, y, sampled, y, degree)
     if found.fit.dof >= OWN_DOF:
         return found
-    u = np.hypot(sampled, bright.excess * y)
-    fit = replace(found.fit, residuals=np.resize([-1.0, 1.0], y.size) * u, leverage=np.zeros(y.size))
-    return ScatterFit(fit, bright.excess, u, bright.dof)
+    return ScatterFit(found.fit, bright.excess, np.hypot(sampled, bright.excess * y), bright.dof)
 
 
 def _light_share(light: np.ndarray, u_light: np.ndarray) -> np.ndarray:

@@ -16,6 +16,7 @@ SLOPE_DOF = 4.0  # equivalent degrees of freedom of the spline behind PTC_linear
 MINIMUM_LINE = 3  # levels that a straight line can leave something of
 
 
+@np.errstate(divide="ignore", invalid="ignore")  # draws of too few levels, or without light, are NaN
 def temporal_values(
     series: Series, release: str, pixel_area_um2: float | None = None, least_dark_var_dn2: float = MINIMUM_DARK_VAR_DN2
 ) -> dict[str, np.ndarray]:
@@ -151,6 +152,7 @@ def _capacity(
     }
 
 
+@np.errstate(divide="ignore", invalid="ignore")  # as above
 def linearity_line(light: np.ndarray, signal: np.ndarray, sat: np.ndarray, last: np.ndarray) -> dict[str, np.ndarray]:
     """Straight line of the signal over the light from 5 to 95 % of saturation with weights 1/y² (R4.0 eq. 58 to 63), and what is left.
 

@@ -448,6 +448,8 @@ def _step(d: model.Levels, s: Solution, prior: np.ndarray) -> _Step:
     vij = vi @ jac
     precision = prior[s.free]
     normal = jac.T @ vij + np.diag(precision)
+    if not (np.diag(normal) > 0).all():  # covariances of the levels that cannot be
+        raise _unsettled()
     scale = 1 / np.sqrt(np.diag(normal))
     normal_inv = np.linalg.pinv(normal * np.outer(scale, scale), rcond=1e-12, hermitian=True) * np.outer(scale, scale)
     shift = normal_inv @ (vij.T @ lin.residual - precision * s.p[s.free])
@@ -511,7 +513,7 @@ def _solve(d: model.Levels, prior: np.ndarray, start: np.ndarray | None = None, 
     for iteration in range(40):
         step = _step(d, s, prior)
         s.p[free] += step.shift * _damping(s, step.shift)
-        sigma = np.sqrt(np.diag(step.normal_inv))
+        sigma = np.sqrt(np.maximum(np.diag(step.normal_inv), 0.0))
         score, info = _reml(step, s, prior)
         new = _update_components(s, score, info) if iteration else s.components
         if iteration >= UNDAMPED:  # a component at its bound may go to and fro
@@ -521,7 +523,7 @@ def _solve(d: model.Levels, prior: np.ndarray, start: np.ndarray | None = None, 
         if still and np.all(np.abs(step.shift) < 1e-3 * sigma):
             break
     step = _step(d, s, prior)
-    if not np.all(np.abs(step.shift) < 0.5 * np.sqrt(np.diag(step.normal_inv))):
+    if not np.all(np.abs(step.shift) < 0.5 * np.sqrt(np.maximum(np.diag(step.normal_inv), 0.0))):
         raise _unsettled()
     _, info = _reml(step, s, prior)
     return _finish(d, s, step, info)

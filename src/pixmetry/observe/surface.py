@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pixmetry.core.arrays import Array
+from pixmetry.core.errors import MeasureError
 
 
 def orthonormal_polynomials(n: int, degree: int) -> tuple[np.ndarray, np.ndarray]:
@@ -74,8 +75,22 @@ def _total_degree(degree: int) -> np.ndarray:
 
 
 def fit_surface(image: np.ndarray, degree: int) -> Surface:
-    """Fit a polynomial surface of a total degree to an image, shape (rows, cols)."""
+    """Fit a polynomial surface of a total degree to an image, shape (rows, cols).
+
+    Raises
+    ------
+    MeasureError
+        If there are no more rows or columns than the degree.
+    """
     (rows, cols) = image.shape
+    if min(rows, cols) <= degree:
+        raise MeasureError(
+            f"frames are too small for a surface of degree {degree}",
+            where="illumination",
+            value=image.shape,
+            allowed=f"{degree + 1} or more rows and columns",
+            remedy="take larger frames",
+        )
     basis_y, slopes_y = orthonormal_polynomials(rows, degree)
     basis_x, slopes_x = orthonormal_polynomials(cols, degree)
     coefficients = (basis_y.T @ image @ basis_x) * _total_degree(degree)
