@@ -1,5 +1,6 @@
 """Decoding of image files by their content, and of the frames in files that hold several.
 
+`TABLE` at the end says all there is to say of a format: by which first bytes it is known, its endings, and how it is opened.
 ``stack.tif/7`` names frame 7 (from 0) of a file with several, as ``frames.zarr/7`` names one of a store.
 """
 
@@ -7,12 +8,12 @@ from __future__ import annotations
 
 import hashlib
 import io
-import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
@@ -23,8 +24,6 @@ from pixmetry.files.png import PALETTE, png_head
 from pixmetry.files.png import SIGNATURE as PNG
 from pixmetry.files.raw_values import RawLayout
 
-FORMATS = "grey PNG, TIFF, BMP, FITS or NPY with 8 or 16 bits"
-NPY = b"\x93NUMPY"
 HEAD_BYTES = 16
 _TURNS = {2: "mirrored", 3: "by 180°", 4: "mirrored, by 180°", 5: "mirrored, by 90°", 6: "by 90°", 7: "mirrored, by 270°", 8: "by 270°"}
 
@@ -57,6 +56,58 @@ class FrameFile:
     read: Callable[[int], Decoded]
 
 
+@dataclass(frozen=True)
+class Stored:
+    """The bytes of a file, on disk or in memory: how many there are, how some are read, and the whole as a file."""
+
+    size: int
+    read: Read
+    file: Callable[[], BinaryIO]
+
+    @classmethod
+    def on_disk(cls, path: Path, size: int) -> Stored:
+        """The bytes of a file, of which only those are read that are asked for."""
+        return cls(size, partial(_read_part, path), lambda: path.open("rb"))
+
+    @classmethod
+    def in_memory(cls, raw: bytes) -> Stored:
+        """The bytes of a file that was read."""
+        return cls(len(raw), partial(_part_of, raw), partial(io.BytesIO, raw))
+
+
+@dataclass(frozen=True)
+class Format:
+    """A format of image files.
+
+    Parameters
+    ----------
+    name : str
+        For messages.
+    marks : tuple of bytes
+        First bytes by which its files are known, `HEAD_BYTES` at most.
+    endings : tuple of str
+        Of the names of its files, in small letters.
+    open : callable
+        From the bytes of a file to its frames.
+    several : bool
+        Whether a file may hold several frames.
+    lossy : bool
+        Whether its coder changes noise, so that it is no format for frames; positions may be measured in its pictures.
+    """
+
+    name: str
+    marks: tuple[bytes, ...]
+    endings: tuple[str, ...]
+    open: Callable[[Stored], FrameFile]
+    several: bool = False
+    lossy: bool = False
+
+
+def format_of(head: bytes) -> Format | None:
+    """Tell a format by the first bytes of a file; None where it is none that is known."""
+    return next((known for known in TABLE if head.startswith(known.marks)), None)
+
+
 def is_frame(path: Path) -> bool:
     """Tell whether a path names a frame in a file, as ``stack.tif/7`` does."""
     return path.name.isdecimal() and path.parent.is_file()
@@ -83,16 +134,13 @@ def frames_of(path: Path, raw: RawLayout | None = None) -> list[Path]:
 
 def raw_file(path: Path, raw: RawLayout | None) -> bool:
     """Whether a file holds values without a header: where a layout is given, any whose ending is not that of a format with one."""
-    return raw is not None and path.suffix.lower() not in KNOWN_ENDINGS
-
-
-KNOWN_ENDINGS = (".png", ".tif", ".tiff", ".npy", ".bmp", ".fits", ".fit", ".fts", ".jpg", ".jpeg")
+    return raw is not None and path.suffix.lower() not in PICTURE_ENDINGS
 
 
 def _may_hold_several(path: Path) -> bool:
     with _told_of(path), path.open("rb") as file:
-        head = file.read(HEAD_BYTES)
-    return head.startswith((*tiff.MARKS, NPY, fits.SIGNATURE))
+        known = format_of(file.read(HEAD_BYTES))
+    return known is not None and known.several
 
 
 def read_stacked(path: Path, raw: RawLayout | None = None) -> tuple[Decoded, str, int]:
@@ -127,20 +175,15 @@ def opened(path: Path, raw: RawLayout | None = None) -> FrameFile:
 
 @lru_cache(maxsize=16)
 def _opened(path: Path, modified_ns: int, size: int, raw: RawLayout | None) -> FrameFile:
-    read, lock = partial(_read_part, path), threading.Lock()
+    stored = Stored.on_disk(path, size)
     if raw is not None:
         start, length = raw.skip_bytes, raw.frame_bytes
-        return FrameFile(raw.frames_in(size), lambda k: Decoded(raw.decode(read(start + k * length, length))))
-    with path.open("rb") as file:
-        head = file.read(HEAD_BYTES)
-        file.seek(0)
-        if head.startswith(tiff.MARKS):
-            return _tiff_file(tiff.pages(file, size), read, lock)
-    if head.startswith(fits.SIGNATURE):
-        return _fits_file(fits.planes(read, size), read)
-    if head.startswith(NPY):
-        return _npy_file(read, size)
-    raise InputError("not a file with several frames", allowed="TIFF, FITS, NPY, or raw values with their layout")
+        return FrameFile(raw.frames_in(size), lambda k: Decoded(raw.decode(stored.read(start + k * length, length))))
+    known = format_of(stored.read(0, HEAD_BYTES))
+    if known is None or not known.several:
+        names = ", ".join(each.name for each in TABLE if each.several)
+        raise InputError("not a file with several frames", allowed=f"{names}, or raw values with their layout")
+    return known.open(stored)
 
 
 def _read_part(path: Path, offset: int, count: int) -> bytes:
@@ -170,26 +213,15 @@ def decode(raw: bytes, path: Path, *, lossy: bool = False) -> Decoded:
         If it is damaged, of another kind, holds several images, or needs more memory than there is.
     """
     with _told_of(path):
-        if raw.startswith(jpeg.SIGNATURE):
-            if not lossy:
-                remedy = "store frames without loss: JPEG removes the noise to be measured"
-                raise InputError("JPEG image", allowed=FORMATS, remedy=remedy)
-            return _jpeg(raw)
-        if raw.startswith(PNG):
-            return _png(raw)
-        if raw.startswith(bmp.SIGNATURE):
-            return Decoded(bmp.decode_bmp(raw))
-        read = partial(_part_of, raw)
-        if raw.startswith(tiff.MARKS):
-            file = _tiff_file(tiff.pages(io.BytesIO(raw), len(raw)), read, threading.Lock())
-        elif raw.startswith(fits.SIGNATURE):
-            file = _fits_file(fits.planes(read, len(raw)), read)
-        elif raw.startswith(NPY):
-            file = _npy_file(read, len(raw))
-        else:
+        known = format_of(raw[:HEAD_BYTES])
+        if known is None:
             what = "file is empty" if not raw else "not an image of a known format"
             remedy = "copy or export the frame again; values without a header need their layout (`raw`)"
             raise InputError(what, allowed=FORMATS, remedy=remedy)
+        if known.lossy and not lossy:
+            remedy = f"store frames without loss: {known.name} removes the noise to be measured"
+            raise InputError(f"{known.name} image", allowed=FORMATS, remedy=remedy)
+        file = known.open(Stored.in_memory(raw))
         if file.count != 1:
             remedy = f"name one of them, such as {path.name}/0, or give the file where a stack of frames is expected"
             raise InputError(f"a file with {file.count} images", allowed="one frame", remedy=remedy)
@@ -250,27 +282,46 @@ def _what(cols: int, rows: int) -> str:
     return f"an image of {cols} x {rows} pixels"
 
 
-def _tiff_file(pages: list[tiff.TiffPage], read: Read, lock: threading.Lock) -> FrameFile:
+def _one(decoder: Callable[[bytes], Decoded]) -> Callable[[Stored], FrameFile]:
+    """Open a file of a format that holds one frame, which is decoded from all of its bytes."""
+
+    def open_file(stored: Stored) -> FrameFile:
+        return FrameFile(1, lambda _: decoder(stored.read(0, stored.size)))
+
+    return open_file
+
+
+def _bmp(raw: bytes) -> Decoded:
+    return Decoded(bmp.decode_bmp(raw))
+
+
+def _tiff_file(stored: Stored) -> FrameFile:
+    with stored.file() as file:
+        pages = tiff.pages(file, stored.size)
+
     def one(k: int) -> Decoded:
-        page = tiff.with_coder(pages[k], read)
+        page = tiff.with_coder(pages[k], stored.read)
         check_memory(page.decoded_bytes, _what(page.shaped[3], page.shaped[2]), remedy="cut the image into parts")
         loss = ("JPEG inside a TIFF: its coder has changed noise and fine structure",) if page.lossless is False else ()
-        return Decoded(page.image(read), page.lossless, (*loss, *_turned(page.orientation)))
+        return Decoded(page.image(stored.read), page.lossless, (*loss, *_turned(page.orientation)))
 
     return FrameFile(len(pages), one)
 
 
-def _fits_file(planes: list[fits.Plane], read: Read) -> FrameFile:
+def _fits_file(stored: Stored) -> FrameFile:
+    planes = fits.planes(stored.read, stored.size)
+
     def one(k: int) -> Decoded:
         plane = planes[k]
         check_memory(2 * plane.stored_bytes, _what(plane.cols, plane.rows), remedy="cut the image into parts")
-        return Decoded(plane.decode(read(plane.offset, plane.stored_bytes)))
+        return Decoded(plane.decode(stored.read(plane.offset, plane.stored_bytes)))
 
     return FrameFile(len(planes), one)
 
 
-def _npy_file(read: Read, size: int) -> FrameFile:
-    start, shape, dtype, fortran = _npy_head(read, size)
+def _npy_file(stored: Stored) -> FrameFile:
+    read = stored.read
+    start, shape, dtype, fortran = _npy_head(read, stored.size)
     if len(shape) == 3 and shape[2] in (3, 4) and shape[1] > 4:  # a colour image, not frames of three columns
         shape = (1, *shape)
     if len(shape) not in (2, 3, 4) or 0 in shape:
@@ -305,3 +356,17 @@ def _npy_head(read: Read, size: int) -> tuple[int, tuple[int, ...], np.dtype, bo
     if start + int(np.prod([int(n) for n in shape], dtype=object) if shape else 1) * dtype.itemsize > size or any(n < 0 for n in shape):
         raise ValueError("values are missing")
     return start, tuple(int(n) for n in shape), dtype, fortran
+
+
+TABLE = (
+    Format("PNG", (PNG,), (".png",), _one(_png)),
+    Format("TIFF", tiff.MARKS, (".tif", ".tiff"), _tiff_file, several=True),
+    Format("BMP", (bmp.SIGNATURE,), (".bmp",), _one(_bmp)),
+    Format("FITS", (fits.SIGNATURE,), (".fits", ".fit", ".fts"), _fits_file, several=True),
+    Format("NPY", (b"\x93NUMPY",), (".npy",), _npy_file, several=True),
+    Format("JPEG", (jpeg.SIGNATURE,), (".jpg", ".jpeg"), _one(_jpeg), lossy=True),
+)
+*_MOST, _LAST = (known.name for known in TABLE if not known.lossy)
+FORMATS = f"grey {', '.join(_MOST)} or {_LAST} with 8 or 16 bits"
+ENDINGS = tuple(ending for known in TABLE if not known.lossy for ending in known.endings)  # of frames
+PICTURE_ENDINGS = tuple(ending for known in TABLE for ending in known.endings)

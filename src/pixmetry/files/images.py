@@ -13,15 +13,13 @@ from pixmetry.camera.observations import Storage
 from pixmetry.core.errors import InputError
 from pixmetry.core.memory import check_memory
 from pixmetry.core.threads import imap_tiles
-from pixmetry.files.formats import FORMATS, Decoded, decode, frames_of, is_frame, raw_file, read_stacked
+from pixmetry.files.formats import ENDINGS, FORMATS, Decoded, decode, frames_of, is_frame, raw_file, read_stacked
 from pixmetry.files.png import SIGNATURE, PlainPng
 from pixmetry.files.provenance import InputHashes
 from pixmetry.files.raw_values import RawLayout
 from pixmetry.files.records import Campaign, FrameGroup
 from pixmetry.files.zarr_frames import entries, is_entry, lossless_store, read_entry
 
-ENDINGS = (".png", ".tif", ".tiff", ".npy", ".bmp", ".fits", ".fit", ".fts")
-PICTURE_ENDINGS = (*ENDINGS, ".jpg", ".jpeg")
 CHANNELS = {"red": 0, "green": 1, "blue": 2}
 
 

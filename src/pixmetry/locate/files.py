@@ -12,8 +12,8 @@ from pixmetry.camera.camera import Camera
 from pixmetry.core.errors import InputError
 from pixmetry.core.progress import Progress, no_progress
 from pixmetry.core.threads import imap_tiles
-from pixmetry.files.formats import frame_name, raw_file
-from pixmetry.files.images import PICTURE_ENDINGS, load_picture, picture_files
+from pixmetry.files.formats import PICTURE_ENDINGS, frame_name, raw_file
+from pixmetry.files.images import load_picture, picture_files
 from pixmetry.files.output import Output, check_files, own_files, write_together
 from pixmetry.files.raw_values import RawLayout, layout_of
 from pixmetry.locate.job import locate

@@ -18,8 +18,8 @@ from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.core.finding import Finding
 from pixmetry.core.progress import Progress, no_progress
 from pixmetry.core.threads import imap_tiles
-from pixmetry.files.formats import frame_name
-from pixmetry.files.images import PICTURE_ENDINGS, picture_files
+from pixmetry.files.formats import PICTURE_ENDINGS, frame_name
+from pixmetry.files.images import picture_files
 from pixmetry.files.raw_values import RawLayout, layout_of
 from pixmetry.locate.noise import NoiseModel, noise_model
 

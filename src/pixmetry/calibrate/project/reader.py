@@ -8,8 +8,8 @@ from pathlib import Path
 from pixmetry.calibrate.project.schema import ProjectModel, TableModel
 from pixmetry.calibrate.project.tables import Table, inline_table, read_table
 from pixmetry.files.files import find_file, find_files
-from pixmetry.files.formats import is_frame
-from pixmetry.files.images import PICTURE_ENDINGS, picture_files
+from pixmetry.files.formats import PICTURE_ENDINGS, is_frame
+from pixmetry.files.images import picture_files
 from pixmetry.files.raw_values import layout_of
 
 
