@@ -10,11 +10,12 @@ import pytest
 
 from chance import rng_of
 from pixmetry.assess.digital_twin import best_values, digital_twin, expose, exposures_of, fewer, middle_window, of_unit, self_test
-from pixmetry.assess.job import by_the_standard, measure_sources
+from pixmetry.assess.job import assess, by_the_standard, measure_sources
 from pixmetry.assess.page.measured import twin_sentence
 from pixmetry.camera.camera import Camera, Element
 from pixmetry.camera.catalogue import get_source
 from pixmetry.camera.observations import Observations
+from pixmetry.files.in_memory import Frames, campaign_of_arrays
 from pixmetry.files.records import CameraFacts, Campaign, FrameGroup, OpticsFacts
 from pixmetry.observe.converter_bend import converter_bend
 from pixmetry.observe.observe import observe
@@ -259,3 +260,18 @@ def test_what_is_in_a_twin_without_being_measured_is_typical(seed: int) -> None:
     assert known["sensor.quantum_efficiency"] == "typical" and "sensor.quantum_efficiency" not in twin.estimates
     assert known["sensor.prnu"] == "measured" and known["sensor.shot_noise"] == ""
     assert twin["electronics.amplifier_noise"].params.white_e != twin.estimates["electronics.amplifier_noise"]["white_e"].value
+
+
+def test_few_levels_below_saturation_tell_no_response_and_the_twin_is_tested_all_the_same(rng: np.random.Generator) -> None:
+    """Three levels with counted photons and two that saturate: they tell the gain, but not how the response bends."""
+
+    def taken(kind: str, exposure_s: float, electrons: float) -> Frames:
+        dn = 20 + 0.5 * rng.poisson(electrons, (2, 48, 64)) + rng.normal(0, 2, (2, 48, 64))
+        frames = np.rint(np.minimum(dn, 4095)).astype(np.uint16)
+        return Frames(kind, exposure_s, frames, 2 * electrons if kind == "bright" else None)
+
+    steps = [0.001 * k for k in range(1, 6)]
+    groups = [taken("dark", t, 0) for t in steps] + [taken("bright", t, 2.4e6 * t) for t in steps]
+    found = assess(campaign_of_arrays(groups, bits=12), trials=0)
+    assert "quantum_efficiency" in found.observations.fit and "nonlinearity_a1" not in found.observations.fit
+    assert found.self_test.rows and not found.self_test.reason

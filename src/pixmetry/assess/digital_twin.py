@@ -66,7 +66,7 @@ def digital_twin(campaign: Campaign, estimates: Mapping[str, Estimates], observa
     stack = observations.bright_stack
     if not any(element.name == "electronics.gain" for element in elements):
         elements = _with_assumed_gain(elements, campaign.bits)
-    exposure = stack.exposure_s if stack is not None else _middle_exposure_s(observations.photon_transfer)
+    exposure = stack.exposure_s if stack is not None else _middle_exposure_s(observations.series)
     photons_known = "sensor.quantum_efficiency" in estimates
     return Camera(
         name=facts.name,
@@ -127,13 +127,13 @@ def of_unit(twin: Camera, observations: Observations) -> Camera:
     off. A twin without maps (no stacks of dark and bright frames), or without a photon transfer, is as it was.
     """
     bits = int(twin.facts["bits"])
-    if "nonlinearity_a1" not in (observations.photon_transfer_fit or ()):
+    fit = observations.photon_transfer_fit
+    if fit is None or "nonlinearity_a1" not in fit:
         return twin
     try:
         maps = unit_maps(observations, bits)
     except MeasureError:
         return twin
-    fit = observations.photon_transfer_fit
     bend = converter_bend(observations, bits)
     chain: list[Element] = []
     for element in twin.chain:
@@ -154,8 +154,8 @@ def of_unit(twin: Camera, observations: Observations) -> Camera:
 
 def _own_maps(element: Element, maps: UnitMaps, bend: ConverterBend, seen: Observations) -> dict[str, np.ndarray]:
     """What the unit's maps say of one source; contrasts in front of the converter are larger where it is flat."""
-    gain = seen.photon_transfer_fit["gain_dn_per_e"].value
-    bright, dark = bend.gain_at(seen.bright_stack.mean_dn), bend.gain_at(seen.dark_stack.mean_dn)
+    gain = seen.fit["gain_dn_per_e"].value
+    dark, bright = (bend.gain_at(stack.mean_dn) for stack in seen.stacks)
     if element.source.id == "optics.shading":
         return {"light_rel": (1 + (maps.light_rel - 1) / bright).astype(np.float32)}
     if element.source.id == "sensor.prnu":
@@ -176,11 +176,12 @@ def _white_e(unit: Camera, bend: ConverterBend, seen: Observations) -> float | N
 
     None where it is not to be told from rounding, or stands for what is not known.
     """
-    stack, fit = seen.dark_stack, seen.photon_transfer_fit
-    if NOISE not in unit or stack.ms_pixel_dn2 < SOME_DITHER_DN2 or "dark_noise_e" in fit.limits:
+    (stack, _), fit = seen.stacks, seen.fit
+    linearity = Linearity.of(fit, int(unit.facts["bits"]))
+    if NOISE not in unit or linearity is None or stack.ms_pixel_dn2 < SOME_DITHER_DN2 or "dark_noise_e" in fit.limits:
         return None
     waves = 0.0 if seen.patterns is None else 0.5 * float((seen.patterns.amplitude_dn[seen.patterns.moving] ** 2).sum())
-    slope2 = stack.ms_pixel_dn2 / Linearity.of(fit, int(unit.facts["bits"])).straight_stack(stack).ms_pixel_dn2  # of the response, squared
+    slope2 = stack.ms_pixel_dn2 / linearity.straight_stack(stack).ms_pixel_dn2  # of the response, squared
     gain = fit["gain_dn_per_e"].value * bend.gain_at(stack.mean_dn)
     square = (stack.var_stack_dn2 - 1 / 12 - waves) / (slope2 * gain**2)
     if "electronics.row_noise" in unit:
@@ -195,7 +196,8 @@ def _white_e(unit: Camera, bend: ConverterBend, seen: Observations) -> float | N
 
 def _half(deviation: np.ndarray) -> np.ndarray:
     """Deviations as 16-bit floats: to 0.05 % of each, in half of the bytes."""
-    return np.clip(deviation, -65504, 65504).astype(np.float16)
+    half: np.ndarray = np.clip(deviation, -65504, 65504).astype(np.float16)
+    return half
 
 
 def _waves(element: Element, found: PatternList, maps: UnitMaps) -> list[Element]:
@@ -316,7 +318,8 @@ def expose(
 
 
 def _frame(twin: Camera, scene: Uniform, seed: int, exposure_s: float, window: Any, number: int) -> np.ndarray:
-    return twin.expose(scene, [number], seed, window, threads=1, exposure_s=exposure_s).data[0]  # the reduction fetches several at once
+    frame: np.ndarray = twin.expose(scene, [number], seed, window, threads=1, exposure_s=exposure_s).data[0]
+    return frame  # on one thread: the reduction fetches several at once
 
 
 def light_of(exposures: Sequence[Exposure], seen: Observations) -> list[float]:
@@ -330,27 +333,30 @@ def light_of(exposures: Sequence[Exposure], seen: Observations) -> list[float]:
     MeasureError
         If neither photons nor the camera's response per second are known.
     """
-    fit, bright = seen.photon_transfer_fit, seen.photon_transfer.bright
-    counted = all(e.photons is not None for e in exposures if e.kind == "bright") and "quantum_efficiency" in fit
+    fit, bright = seen.fit, seen.series.bright
+    stated_all = all(e.photons is not None for e in exposures if e.kind == "bright")
+    photons = bright.photons if stated_all and "quantum_efficiency" in fit else None
+    counted = photons is not None
     if not counted and "responsivity_dn_per_s" not in fit:
         raise MeasureError("the light of the levels is not known", where="digital twin", remedy="give the photons of each level")
     gain = fit["gain_dn_per_e"].value
     per_unit = 1.0 if counted else fit["responsivity_dn_per_s"].value / gain  # photons for a photon, or electrons for a second
     dn = gain * (fit["quantum_efficiency"].value if counted else 1.0)
-    stated = per_unit * (bright.photons if counted else bright.exposure_s)
+    stated = per_unit * (bright.exposure_s if photons is None else photons)
     more = _more_light(seen, stated, dn)
     asked = [float(per_unit * (e.photons or 0.0 if counted else e.exposure_s)) for e in exposures]
     return [max(light + more, 0.0) if e.kind == "bright" else 0.0 for e, light in zip(exposures, asked, strict=True)]
 
 
 def _more_light(seen: Observations, stated: np.ndarray, dn_per_unit: float) -> float:
-    """What the bright levels got beside the stated light, in its unit; 0 where it is not significant."""
-    fit, bright, bits = seen.photon_transfer_fit, seen.photon_transfer.bright, seen.photon_transfer.bits
+    """What the bright levels got beside the stated light, in its unit; 0 where it is not significant, or few levels tell no response."""
+    fit, bright = seen.fit, seen.series.bright
+    linearity = Linearity.of(fit, seen.series.bits)
     use = bright.mean_dn < (0.9 * fit["saturation_dn"].value if "saturation_dn" in fit else math.inf)
-    if use.sum() < 4:
+    if use.sum() < 4 or linearity is None:
         return 0.0
     lamp = fit["illumination_noise_rel"].value if "illumination_noise_rel" in fit else 1e-3
-    above = Linearity.of(fit, bits).straight(bright.mean_dn[use])
+    above = linearity.straight(bright.mean_dn[use])
     if "dark_current_e_per_s" in fit and "dark_current_e_per_s" not in fit.limits:
         above = above - fit["gain_dn_per_e"].value * fit["dark_current_e_per_s"].value * bright.exposure_s[use]
     weight = 1 / np.hypot(lamp * above, fit["offset_dn"].u)
@@ -445,7 +451,7 @@ def self_test(
         found = standard_values(measured_like(measured, twin), standard.release)
         if window is not None:
             dark, bright = _cropped(observations.dark_stack, window), _cropped(observations.bright_stack, window)
-            standard = standard_values(Measurement(observations.photon_transfer, dark, bright), standard.release)
+            standard = standard_values(Measurement(observations.series, dark, bright), standard.release)
     except (MeasureError, InputError) as problem:
         return SelfTest(frames=frames, of=of, window=window, reason=str(problem))
     rows = []

@@ -184,6 +184,8 @@ def _is_window_of(campaign: Campaign, shape: tuple[int, int]) -> bool:
 def _seen_from(geometry: CameraGeometry, campaign: Campaign) -> CameraGeometry:
     """The geometry of the whole sensor with the principal point counted from the centre of the window."""
     facts, lens = campaign.camera, geometry.lens
+    if facts.sensor_shape is None or facts.first_col is None or facts.first_row is None:
+        return geometry
     (x, y), (x0, y0) = frame_centre(campaign.frame_shape), frame_centre(facts.sensor_shape)
     values = lens.values.copy()
     values[lens.index("centre_x_px")] += x0 - (facts.first_col + x)
@@ -275,7 +277,7 @@ def by_the_standard(campaign: Campaign, observations: Observations) -> Results:
     """
     pitch_x_um, pitch_y_um = campaign.camera.pitch_x_um, campaign.camera.pitch_y_um
     area = None if pitch_x_um is None or pitch_y_um is None else pitch_x_um * pitch_y_um
-    seen = Measurement(observations.photon_transfer, observations.dark_stack, observations.bright_stack, pixel_area_um2=area)
+    seen = Measurement(observations.series, observations.dark_stack, observations.bright_stack, pixel_area_um2=area)
     return standard_values(seen, "3.1")
 
 
@@ -301,7 +303,7 @@ NEED_NOISE = ("electronics.amplifier_noise", "electronics.row_noise", "sensor.ds
 
 def equal_dark_dn(observations: Observations) -> float | None:
     """The grey value that every pixel of every dark frame has; None where they differ."""
-    levels, stack = observations.photon_transfer.dark, observations.dark_stack
+    levels, stack = observations.series.dark, observations.dark_stack
     means = [*levels.mean_dn, *(() if stack is None else (stack.mean_dn,))]
     scatter = [*levels.var_total_dn2, *(() if stack is None else (stack.var_stack_dn2, np.ptp(stack.mean_map_dn)))]
     return float(means[0]) if means and not np.any(scatter) and np.ptp(means) == 0 else None

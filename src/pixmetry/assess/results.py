@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 
 from pixmetry.assess.digital_twin import SelfTest
-from pixmetry.budget.headline import SUM
-from pixmetry.budget.job import Budget
+from pixmetry.budget.records import SUM, Budget
 from pixmetry.camera.camera import Camera
-from pixmetry.camera.observations import Observations
+from pixmetry.camera.observations import Observations, StackMoments
 from pixmetry.core.number import Estimates
 from pixmetry.emva.files.json_format import value_record
 from pixmetry.emva.records import Results
@@ -54,7 +53,7 @@ class Assessment:
 
     def to_record(self) -> dict[str, Any]:
         """Return the plain record of ``results.json``."""
-        fit = self.observations.photon_transfer_fit
+        fit = self.observations.fit
         facts, storage = self.campaign.camera, self.observations.storage
         return {
             "schema": RESULTS_SCHEMA,
@@ -127,19 +126,20 @@ class Assessment:
 
     def maps(self) -> dict[str, np.ndarray]:
         """Return what was measured pixel by pixel: ``dark_dn`` above black, ``prnu_rel``, ``defects``."""
-        seen, fit = self.observations, self.observations.photon_transfer_fit
+        seen, fit = self.observations, self.observations.fit
         maps: dict[str, np.ndarray] = {}
         if seen.dark_stack is not None:
             black = fit["offset_dn"].value if "offset_dn" in fit else seen.dark_stack.mean_dn
             maps["dark_dn"] = (seen.dark_stack.mean_map_dn - black).astype(np.float32)
         if seen.defects is not None:
-            maps["defects"] = seen.defects.mask().astype(np.uint8)
-        if seen.dark_stack is not None and seen.bright_stack is not None and seen.spatial_fit is not None:
-            maps["prnu_rel"] = _response_map(seen).astype(np.float32)
+            mask = seen.defects.mask()
+            maps["defects"] = mask.astype(np.uint8)
+            if seen.dark_stack is not None and seen.bright_stack is not None and seen.spatial_fit is not None:
+                maps["prnu_rel"] = _response_map(seen.dark_stack, seen.bright_stack, mask).astype(np.float32)
         return maps
 
 
-def _response_map(seen: Observations) -> np.ndarray:
+def _response_map(dark: StackMoments, bright: StackMoments, mask: np.ndarray) -> np.ndarray:
     """Relative response with the illumination's slow part taken out, shrunk to what is known of it.
 
     A map averaged over L frames still holds noise of variance t/L. What is predicted best from it is the map times
@@ -147,10 +147,10 @@ def _response_map(seen: Observations) -> np.ndarray:
     """
     from pixmetry.observe.surface import fill, fit_surface
 
-    bright, dark, mask = seen.bright_stack, seen.dark_stack, seen.defects.mask()
     light = fill(bright.mean_map_dn - dark.mean_map_dn, mask)
     surface = fit_surface(light, 4).values
     relative = light / surface - 1.0
     noise = (bright.ms_pixel_dn2 / bright.n_frames + dark.ms_pixel_dn2 / dark.n_frames) / float(surface.mean()) ** 2
     fixed = max(float(relative.var()) - noise, 0.0)
-    return 1.0 + relative * (fixed / (fixed + noise))
+    response: np.ndarray = 1.0 + relative * (fixed / (fixed + noise))
+    return response

@@ -100,7 +100,8 @@ def headline(
         why = "The sum of the contributions. One Monte Carlo with all sources at once agrees with it within the errors of both."
         return replace(found, why=why), sums
     others = [r for r in rows if r.monte_carlo is None]
-    drifting = [r.monte_carlo for r in held if r.part.gum_class in UNSTEADY and np.isfinite(r.monte_carlo.total_px)]
+    unsteady = (r.monte_carlo for r in held if r.part.gum_class in UNSTEADY)
+    drifting = [m for m in unsteady if m is not None and np.isfinite(m.total_px)]
     of_others = (combine((r.part for r in others), frames=n, signed=True) for n in frames)
     simulated = tuple(_simulated(together, of_other, unsteady_px, drifting) for of_other in of_others)
     return replace(found, by=MONTE_CARLO, why=_why(found, held, in_chain)), simulated
@@ -146,7 +147,8 @@ def _why(found: Headline, rows: Sequence[BudgetRow], in_chain: Callable[[str], M
     )
     difference = found.simulated_px**2 - found.sum_px**2
     tried = sorted(rows, key=lambda r: -r.total_px)[:ASKED]
-    real = [(r, in_chain(r.name).total_px if r.source_id != ESTIMATOR_ITSELF else r.monte_carlo.total_px) for r in tried]
+    in_whole = [(r, r.monte_carlo if r.source_id == ESTIMATOR_ITSELF else in_chain(r.name)) for r in tried]
+    real = [(r, m.total_px) for r, m in in_whole if m is not None]
     row, in_px = max(real, key=lambda p: (p[1] ** 2 - p[0].total_px ** 2) * np.sign(difference))
     if np.isfinite(in_px) and (in_px**2 - row.total_px**2) / difference > MAIN_PART:
         return f"{text}: {row.title.lower()} alone is {row.total_px:.2g} px, in the whole chain {in_px:.2g} px."

@@ -217,7 +217,8 @@ class Trials:
         Who locates targets takes them from the frame, so they follow what the camera does to the light: black level, gain, a curve. Each
         is the mean of windows of that light, without what lies beyond four standard deviations.
         """
-        return self.located.as_seen(lambda light_dn: _level(camera, facts, self.target, self.side, light_dn, frozen))
+        seen: Estimator = self.located.as_seen(lambda light_dn: _level(camera, facts, self.target, self.side, light_dn, frozen))
+        return seen
 
     def compare(self, names: Iterable[str], with_it: Camera, without: Camera | None) -> MonteCarlo:
         """Shift of the positions in one variant of the camera against those in another, or (None) against the truth."""
@@ -236,15 +237,14 @@ class Trials:
 
         With neither, what the whole camera and the estimator do against the truth.
         """
-        if only is None and off is None:
-            return self.compare([e.name for e in self.camera.active], self.camera, None)
         if only is not None and off is not None:
             raise InputError("either only or off", remedy="leave one of them out")
+        if only is not None:
+            return self._alone(self.camera, tuple(only))
         if off is not None:
             off = tuple(off)
             return self.compare(off, self.camera, missed(self.camera, off))
-        only = tuple(only)
-        return self._alone(self.camera, only)
+        return self.compare([e.name for e in self.camera.active], self.camera, None)
 
     def alone(self, element: Element) -> MonteCarlo:
         """What one source with these parameters does in this camera, whether its chain holds it or not; see `of` and `put`.
@@ -448,7 +448,8 @@ def _rest(means: np.ndarray, keep: np.ndarray, where: Sequence[np.ndarray]) -> n
         if n:
             residual = means[unit, good] - smooth_part(means[unit, good], *at, order=order)
             found[unit, good] = residual**2 * n / max(n - _terms(order, len(at)), 1)
-    return found[keep]
+    rest: np.ndarray = found[keep]
+    return rest
 
 
 def _terms(order: int, axes: int) -> int:

@@ -54,6 +54,8 @@ def u_of_total(source: Source, params: Any, estimates: Estimates, probe: Probe) 
     First-order propagation (JCGM 100:2008, 5.2.2) with derivatives by central differences over ± u, one-sided where the
     model allows no other side.
     """
+    if source.propagate is None:
+        return 0.0
     covariance = covariance_of(estimates)
     slopes = np.zeros(len(estimates))
     for i, name in enumerate(estimates.names):

@@ -473,7 +473,8 @@ class Probes:
     def _at_level(self, level: float) -> Estimator:
         """The estimator where constant light is seen so many times as bright: background, threshold and height follow."""
         ground = self.estimator.background_dn
-        return self.estimator.as_seen(lambda light_dn: (ground + light_dn) * level)
+        seen: Estimator = self.estimator.as_seen(lambda light_dn: (ground + light_dn) * level)
+        return seen
 
     def _curved(self, linear_dn: np.ndarray) -> np.ndarray:
         return linear_dn if self.curve is None else self.curve.of(np.asarray(linear_dn) / self.facts.dn_per_photon)

@@ -252,6 +252,27 @@ class Observations:
     storage: Storage = Storage()
     notes: tuple[str, ...] = field(default_factory=tuple)
 
+    @property
+    def series(self) -> PhotonTransfer:
+        """The levels of a campaign that must have some; `MeasureError` where it has none."""
+        if self.photon_transfer is None:
+            raise MeasureError("no levels of dark and bright frames", remedy="take frames at several exposures")
+        return self.photon_transfer
+
+    @property
+    def fit(self) -> Estimates:
+        """The joint estimate of a campaign that must have one; `MeasureError` where it has none."""
+        if self.photon_transfer_fit is None:
+            raise MeasureError("nothing was fitted to the levels", remedy="take frames at several exposures")
+        return self.photon_transfer_fit
+
+    @property
+    def stacks(self) -> tuple[StackMoments, StackMoments]:
+        """The stacks of dark and of bright frames; `MeasureError` where one is missing."""
+        if self.dark_stack is None or self.bright_stack is None:
+            raise MeasureError("needs a stack of dark and one of bright frames", remedy="take 16 or more of each")
+        return self.dark_stack, self.bright_stack
+
     def fitted(self, names: Mapping[str, str], what: str, *, where: str, remedy: str) -> Estimates:
         """Take a source's parameters ``{parameter: fitted name}`` out of the joint fit that holds the first of them, with their covariance.
 

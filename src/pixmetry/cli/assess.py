@@ -124,7 +124,7 @@ def print_summary(assessment: Assessment) -> None:
     for name in ("source", "status", "class", "u in x", "u in y", "constant", "share", "calibrated"):
         table.add_column(name, justify="left" if name in ("source", "status", "class") else "right")
     for row in assessment.budget.largest[:LISTED]:
-        c = row.contribution
+        c = row.part
         constant = max(abs(c.bias_x_px), abs(c.bias_y_px))
         numbers = (f"{v:.5f}" for v in (c.u_x_px, c.u_y_px, constant))
         table.add_row(row.title, row.status, c.gum_class, *numbers, f"{100 * row.share:.0f} %", f"{c.calibrated_px:.5f}")

@@ -174,7 +174,7 @@ def _page_of(calibration: Any) -> Page:
     from pixmetry.calibrate.lines.plumb_line import LineCalibration
     from pixmetry.calibrate.page import lines_page, page
 
-    return (lines_page if isinstance(calibration, LineCalibration) else page).page_of(calibration)
+    return lines_page.page_of(calibration) if isinstance(calibration, LineCalibration) else page.page_of(calibration)
 
 
 def _models(calibration: Any) -> list[Any]:

@@ -113,7 +113,7 @@ WISHES = {"u_gain": ("K", "%"), "u_dark_noise": ("sigma_d", "%"), "u_dsnu": ("DS
 @click.option("--bits", type=click.IntRange(1, 16), help="With --dark and --bright: bits of a stored value.")
 @click.option("--threads", type=click.IntRange(1), help="Number of threads. Default: one for each processor.")
 @click.pass_context
-def emva1288(ctx: click.Context, campaigns: tuple[Path, ...], **given: Any) -> None:
+def emva1288(ctx: click.Context, /, campaigns: tuple[Path, ...], **given: Any) -> None:
     """Test a camera by EMVA 1288 and write its data sheet, with uncertainties.
 
     CAMPAIGNS is an EMVA 1288 descriptor, a manifest (YAML), or a folder that holds one of them. Without CAMPAIGNS the packaged example is
@@ -336,13 +336,14 @@ def _look_at_files(dark: Sequence[Path], bright: Sequence[Path], bits: int, baye
 def print_sheet(sheet: DataSheet, console: Console) -> None:
     """Print all values of a data sheet, section by section."""
     from pixmetry.emva.page import content
+    from pixmetry.report.numbers import NO_BREAK
 
     camera = sheet.camera
     size = f"{camera['cols']} x {camera['rows']} pixels, {camera['bits']} bits"
     release = content.release_title(sheet.results[0].release)
     console.print(f"\n{camera['name']}: {size}, EMVA 1288 {release}\n", markup=False, soft_wrap=True)
     for line in content.document_lines(sheet.results):
-        console.print(line.replace(content.NO_BREAK, " ") + "\n", markup=False, soft_wrap=True)
+        console.print(line.replace(NO_BREAK, " ") + "\n", markup=False, soft_wrap=True)
     for results in sheet.results:
         if len(sheet.results) > 1:
             console.print(f"Channel {results.channel}\n", markup=False)

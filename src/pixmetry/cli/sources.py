@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from pixmetry.cli._json import JsonResult, json_option
+
+if TYPE_CHECKING:
+    from pixmetry.camera.source import Source
 
 ROOM_FOR_NOTES = 110  # columns of a terminal
 
@@ -38,7 +42,7 @@ def sources(source_id: str | None, json_file: Path | None) -> None:
             _explain(record)
 
 
-def _details(source) -> dict:
+def _details(source: Source) -> dict[str, Any]:
     from pixmetry.camera.source import STATED_FRAME, bounds_text
 
     return {
@@ -62,7 +66,7 @@ def _details(source) -> dict:
     }
 
 
-def _list(records: list[dict]) -> None:
+def _list(records: list[dict[str, Any]]) -> None:
     from rich.console import Console
     from rich.table import Table
 
@@ -79,7 +83,7 @@ def _list(records: list[dict]) -> None:
     console.print("\nverbs: f forward, m measure, c correct, p propagate; `pixmetry sources ID` gives the reason for a dash")
 
 
-def _explain(record: dict) -> None:
+def _explain(record: dict[str, Any]) -> None:
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table

@@ -203,7 +203,7 @@ class Figure:
         """Markup that takes its colours and its type from the page around it."""
         from pixmetry.report.drawing import svg_of
 
-        return svg_of(self.drawing, self.name, self.alt)
+        return "" if self.drawing is None else svg_of(self.drawing, self.name, self.alt)
 
 
 @dataclass

@@ -77,7 +77,7 @@ def _advance(character: str, face: str) -> float:
     """Width of one character in units of the type size."""
     font = _font(face)
     font.set_size(1000, 72)
-    return font.load_char(ord(character)).linearHoriAdvance / 65536 / 1000
+    return float(font.load_char(ord(character)).linearHoriAdvance) / 65536 / 1000
 
 
 def text_width(text: str, size: float, face: str = "normal") -> float:

@@ -254,6 +254,8 @@ def _figure_row(sheets: Paper, row: Sequence[Figure], width: float, shrink: floa
 
 def _height(figure: Figure, width: float) -> float:
     """Height of a figure that is that wide, in points."""
+    if figure.drawing is None:
+        return 0.0
     across, up = figure.drawing.get_size_inches()
     return float(width * up / across)
 

@@ -9,10 +9,9 @@ import numpy as np
 
 from pixmetry.assess.page.figures import link_shares, pareto
 from pixmetry.budget.combine import Combined
-from pixmetry.budget.headline import SUM
-from pixmetry.budget.job import DECIDED, Budget, BudgetRow
 from pixmetry.budget.monte_carlo import MonteCarlo
 from pixmetry.budget.probe import phases_for
+from pixmetry.budget.records import DECIDED, SUM, Budget, BudgetRow
 from pixmetry.camera.catalogue import get_source
 from pixmetry.camera.contribution import UNSTEADY
 from pixmetry.report import Answer, Column, Reading, Row, Run, Section, Table, Text, strong
@@ -183,7 +182,7 @@ def largest_section(budget: Budget) -> Section:
 
 
 def _chip(row: BudgetRow) -> str:
-    gum_class = row.contribution.gum_class
+    gum_class = row.part.gum_class
     return f"class {gum_class}: {CLASSES[gum_class]} · {'accepted at its bound' if row.status == 'accepted' else row.status}"
 
 
@@ -193,7 +192,7 @@ def _sizes(row: BudgetRow, pitch: Pitch) -> str:
     def um(value: float, axis: str, text: str) -> str:
         return "" if pitch is None or text == "0" else f" ({signed(value * pitch['xy'.index(axis)], length_px).lstrip('+')}{NO_BREAK}µm)"
 
-    c = row.contribution
+    c = row.part
     parts = []
     for axis, u, bias in (("x", c.u_x_px, c.bias_x_px), ("y", c.u_y_px, c.bias_y_px)):
         own, shift = length_px(u), signed(bias, length_px)

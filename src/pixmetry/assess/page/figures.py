@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pixmetry.budget.job import Budget, BudgetRow
-from pixmetry.camera.observations import CodeHistogram, Observations, PhotonTransfer, Spectra
+from pixmetry.camera.observations import CodeHistogram, Observations, Spectra
 from pixmetry.core.number import Estimates
 from pixmetry.emva.records import Results
 from pixmetry.emva.temporal import linearity_line
@@ -43,7 +43,8 @@ class Curve:
     def moments(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Mean above black in DN and temporal variance in DN², white part."""
         zero = np.zeros_like(x)
-        return stored_moments(x, self.dark_var_dn2 + self.gain * x, self.gain, x, zero, self.a, self.x_ref)
+        mean, variance = stored_moments(x, self.dark_var_dn2 + self.gain * x, self.gain, x, zero, self.a, self.x_ref)
+        return mean, variance
 
     def signal(self, mean_above_dn: np.ndarray) -> np.ndarray:
         """Linear signal in DN of a mean above black."""
@@ -57,30 +58,25 @@ def _size(fit: Estimates | None, name: str) -> float:
     return fit[name].representative
 
 
-def _series(seen: Observations) -> tuple[PhotonTransfer, Estimates]:
-    """The photon-transfer series and its fit."""
-    assert seen.photon_transfer is not None and seen.photon_transfer_fit is not None
-    return seen.photon_transfer, seen.photon_transfer_fit
-
-
 def _top(seen: Observations) -> float:
     """Mean above black of saturation, or of the brightest level."""
-    pt, fit = _series(seen)
+    pt, fit = seen.series, seen.fit
     level = fit["saturation_dn"].value if "saturation_dn" in fit else float(pt.bright.mean_dn.max())
     return level - fit["offset_dn"].value
 
 
 def _unsaturated(seen: Observations) -> np.ndarray:
     """Bright levels below the peak of the variance and without pixels at the top code."""
-    pt, _ = _series(seen)
+    pt = seen.series
     peak = pt.bright.mean_dn[np.argmax(pt.bright.var_total_dn2)]
     stuck = float(pt.dark.fraction_max.max(initial=0.0))  # hot pixels are at the top code in the dark already
-    return (pt.bright.mean_dn <= peak) & (pt.bright.fraction_max <= max(USABLE_FRACTION, stuck))
+    usable: np.ndarray = (pt.bright.mean_dn <= peak) & (pt.bright.fraction_max <= max(USABLE_FRACTION, stuck))
+    return usable
 
 
 def variance_against_mean(seen: Observations, standard: Results) -> Figure:
     """Photon-transfer curve with the joint fit and the standard's line, and what the fit leaves."""
-    pt, fit = _series(seen)
+    pt, fit = seen.series, seen.fit
     curve, good = Curve.of(fit, pt.bits), _unsaturated(seen)
     mean, var = pt.bright.mean_dn - curve.offset_dn, pt.bright.ms_pixel_dn2
     x = np.linspace(0, curve.signal(np.array([mean[good].max()]))[0], 200)
@@ -117,7 +113,7 @@ def variance_against_mean(seen: Observations, standard: Results) -> Figure:
 
 def _light_as_signal(seen: Observations) -> np.ndarray:
     """What a straight camera would give for each bright level, DN above black."""
-    pt, fit = _series(seen)
+    pt, fit = seen.series, seen.fit
     bright = pt.bright
     if bright.photons is None or light_scale(bright)[1]:
         return fit["responsivity_dn_per_s"].value * bright.exposure_s
@@ -126,7 +122,7 @@ def _light_as_signal(seen: Observations) -> np.ndarray:
 
 def nonlinearity(seen: Observations) -> Figure:
     """Means against a straight line, in percent of the line, with the fitted curve."""
-    pt, fit = _series(seen)
+    pt, fit = seen.series, seen.fit
     curve, light = Curve.of(fit, pt.bits), _light_as_signal(seen)
     mean = pt.bright.mean_dn - curve.offset_dn
     use = _unsaturated(seen) & (mean >= 0.05 * _top(seen)) & (mean <= 0.95 * _top(seen))
@@ -160,7 +156,7 @@ def _off_line(light: np.ndarray, mean: np.ndarray) -> np.ndarray:
 
 def signal_to_noise(seen: Observations) -> Figure:
     """Signal-to-noise ratio of one pixel against its electrons, with the two limits that no camera passes."""
-    (pt, fit), spatial = _series(seen), seen.spatial_fit
+    pt, fit, spatial = seen.series, seen.fit, seen.spatial_fit
     curve, good = Curve.of(fit, pt.bits), _unsaturated(seen)
     mean = pt.bright.mean_dn[good] - curve.offset_dn
     lit = mean > 0
