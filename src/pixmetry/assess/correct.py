@@ -79,7 +79,7 @@ def _rest_of_line(camera: Camera, name: str, done: Mapping[str, str], signal: Si
 
 @dataclass(frozen=True)
 class Correction:
-    """What a correction did.
+    """Result of a correction.
 
     Parameters
     ----------

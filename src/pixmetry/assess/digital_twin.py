@@ -42,7 +42,7 @@ SMALLEST_WINDOW = 64
 
 
 def digital_twin(campaign: Campaign, estimates: Mapping[str, Estimates], observations: Observations) -> Camera:
-    """Build the camera that makes frames like the real ones, from what was measured: the type, whose patterns are drawn.
+    """Build the simulated camera from the measured values: a camera of the type, with random fixed patterns.
 
     What the campaign only bounds, or what is not significant, is not simulated: it stands in the chain at 0, with what is known of it as
     the element's estimates. What is in it without being measured is marked as typical. Without a photon count the quantum efficiency is
@@ -100,7 +100,7 @@ def _middle_exposure_s(transfer: PhotonTransfer) -> float:
 
 
 def best_values(source: Source, estimates: Estimates) -> dict[str, float]:
-    """Values for a simulation: estimates as they are; 0 for what is not significant, but for dark noise that rounding hides."""
+    """Values for a simulation: the estimates; 0 for values that are not significant, except dark noise that rounding hides."""
     hidden = {"white_e"}  # the rms of an even spread up to its limit
     values = {}
     for e in estimates:
@@ -247,7 +247,7 @@ class Compared:
 
 @dataclass(frozen=True)
 class SelfTest:
-    """Camera and twin beside each other.
+    """Values of camera and twin.
 
     Parameters
     ----------
@@ -433,7 +433,7 @@ BY_FRAME = tuple(f"s_2_y_{part}{kind}" for part in ("row", "col", "pixel") for k
 def self_test(
     twin: Camera, campaign: Campaign, observations: Observations, standard: Results, seed: int = 1, most_pixels: int = TEST_PIXELS
 ) -> SelfTest:
-    """Let the twin take the campaign, reduce its frames as the camera's were, and compare the values of EMVA 1288.
+    """Simulate the campaign with the twin, reduce the frames like those of the camera, and compare the values of EMVA 1288.
 
     u of a difference is that of the two values, each of which tells how it would come out of another series of the same camera. Of a large
     campaign the twin takes fewer frames, of large frames a window; what hangs on the number of levels or frames, or on the place, is then

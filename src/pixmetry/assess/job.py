@@ -1,4 +1,4 @@
-"""The main job: from a campaign's frames to what the camera does to a target's position."""
+"""The main job: from the frames of a campaign to the uncertainty of a target's position."""
 
 from __future__ import annotations
 
@@ -194,7 +194,7 @@ def _seen_from(geometry: CameraGeometry, campaign: Campaign) -> CameraGeometry:
 
 
 def _window_of(campaign: Campaign) -> tuple[str, ...]:
-    """A note where the frames are a window of a sensor: what was seen in it, and what is taken for the whole."""
+    """A note if the frames are a window of a sensor: which values hold for the window, and which for the whole sensor."""
     facts, (rows, cols) = campaign.camera, campaign.frame_shape
     if facts.sensor_shape in (None, (rows, cols)):
         return ()
@@ -271,7 +271,7 @@ def observe_campaign(campaign: Campaign, progress: Progress) -> tuple[InputHashe
 
 
 def by_the_standard(campaign: Campaign, observations: Observations) -> Results:
-    """What EMVA 1288 says of the same frames, to stand beside: Release 3.1, which takes the images as they are.
+    """Values of EMVA 1288 from the same frames, for comparison: Release 3.1, which takes the images as they are.
 
     Release 4.0 filters the slow part of the patterns out, and would not speak of the same quantity as the estimates beside it.
     """
@@ -282,7 +282,7 @@ def by_the_standard(campaign: Campaign, observations: Observations) -> Results:
 
 
 def measure_sources(observations: Observations) -> tuple[dict[str, Estimates], dict[str, str]]:
-    """Ask every source what the observations say of it: estimates, and by source the reason where there are none."""
+    """Let every source measure its parameters from the observations: estimates, and by source the reason if there are none."""
     estimates, unmeasured = {}, {}
     for source in sources().values():
         if source.measure is None:
@@ -310,7 +310,7 @@ def equal_dark_dn(observations: Observations) -> float | None:
 
 
 def noise_missing(observations: Observations) -> str:
-    """A note where all dark frames are equal, on what they therefore do not tell; empty where they are not."""
+    """A note on what cannot be measured if all dark frames are equal; empty if they differ."""
     level = equal_dark_dn(observations)
     if level is None:
         return ""
@@ -324,7 +324,7 @@ def noise_missing(observations: Observations) -> str:
 def without_noise(
     observations: Observations, estimates: dict[str, Estimates], unmeasured: dict[str, str]
 ) -> tuple[dict[str, Estimates], dict[str, str]]:
-    """Leave out what equal dark frames cannot tell: patterns that only noise carries over the rounding; all noise, where black clips."""
+    """Leave out values that equal dark frames cannot show: patterns below the rounding, and all noise if black is clipped."""
     level = equal_dark_dn(observations)
     gone = () if level is None else NEED_DITHER if level > 0 else NEED_NOISE
     why = "all dark frames are equal: they contain no noise"

@@ -1,4 +1,4 @@
-"""What an assessment found: the record that the report draws and that goes to disk."""
+"""Results of an assessment: the record of the report and of the files."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ RESULTS_SCHEMA = "pixmetry/results/1"
 
 @dataclass(frozen=True)
 class Assessment:
-    """All that one campaign told of its camera.
+    """All results of one campaign.
 
     Parameters
     ----------
@@ -120,7 +120,7 @@ class Assessment:
         )
 
     def _by(self) -> str:
-        """Where the verdict is from, if it is not the sum of what is listed."""
+        """Origin of the verdict, if it is not the sum of the listed contributions."""
         found = self.budget.headline
         return "" if found is None or found.by == SUM else f"{found.why} "
 

@@ -16,7 +16,7 @@ MOST_ACCEPTED = 3
 def advise(
     rows: Sequence[BudgetRow], verdict: Combined, everything: Combined, most: int = MOST, most_accepted: int = MOST_ACCEPTED
 ) -> tuple[Advice, ...]:
-    """Advice for the largest of the rows that the verdict rests on; after them, what to measure of those that were only accepted.
+    """Advice for the largest rows of the verdict; after them, for the largest accepted sources.
 
     The gain is told within the total that the row belongs to: for an accepted source, the one with everything accepted at its bound.
     """

@@ -13,7 +13,7 @@ from pixmetry.core.errors import InputError
 
 @dataclass(frozen=True)
 class Combined:
-    """Combined standard uncertainty and bias in px, k = 1; ``left_*`` is what a calibration leaves of both together."""
+    """Combined standard uncertainty and bias in px, k = 1; ``left_*`` is the remaining error of both after a calibration."""
 
     u_x_px: float
     u_y_px: float
@@ -41,7 +41,7 @@ class Combined:
 
     @property
     def calibrated_px(self) -> float:
-        """Root mean square over x and y of what stays once a calibration has taken up what is constant and what is smooth."""
+        """Root mean square over x and y of the error that remains after a calibration, without the constant and the smooth part."""
         return float(np.sqrt(0.5 * (self.left_x_px**2 + self.left_y_px**2)))
 
 

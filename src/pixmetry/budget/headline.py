@@ -1,4 +1,4 @@
-"""Which number stands for the whole: the sum of the contributions, or one Monte Carlo with all of them, and why."""
+"""The total: the sum of the contributions, or one Monte Carlo with all sources, and the reason for the choice."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def headline(
 
 
 def _error(together: MonteCarlo, rows: Sequence[BudgetRow]) -> float:
-    """Standard error of the total of a Monte Carlo, with what few targets have."""
+    """Standard error of the total of a Monte Carlo, with errors that only few targets have."""
     places = together.units * together.places
     parts = (r.part for r in rows)  # a bias has no chance in it
     # se_total_px holds the scatter of normal shifts, of a kurtosis of 3: what is beyond that is added
@@ -125,7 +125,7 @@ def _model_error(rows: Sequence[BudgetRow]) -> float:
 
 
 def _simulated(together: MonteCarlo, others: Combined, unsteady_px: tuple[float, float], drifting: Sequence[MonteCarlo]) -> Combined:
-    """The mean over frames by the Monte Carlo, with what it does not hold; what drifts, or is the object's, no number of frames lowers."""
+    """The mean over frames by the Monte Carlo, with contributions outside of it; drift and errors of the object do not average."""
 
     def axis(a: Axis, drifts: list[Axis], u_px: float, bias_px: float, left_px: float, unsteady_px: float) -> tuple[float, float, float]:
         stays2 = min(sum(d.temporal**2 for d in drifts), a.temporal**2)
@@ -139,7 +139,7 @@ def _simulated(together: MonteCarlo, others: Combined, unsteady_px: tuple[float,
 
 
 def _why(found: Headline, rows: Sequence[BudgetRow], in_chain: Callable[[str], MonteCarlo]) -> str:
-    """Say that they differ, and by which source if it is one."""
+    """State that sum and Monte Carlo differ, and the source that causes most of the difference."""
     more = "larger" if found.sum_px > found.simulated_px else "smaller"
     text = (
         f"By one Monte Carlo with all sources at once: {found.simulated_px:.2g} ± {found.se_simulated_px:.1g} px. The sum of the "

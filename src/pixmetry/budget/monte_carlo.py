@@ -100,7 +100,7 @@ class MonteCarlo:
 
     @property
     def calibrated_px(self) -> float:
-        """Root mean square over x and y of what stays once a calibration has taken up what is constant and what is smooth."""
+        """Root mean square over x and y of the error that remains after a calibration, without the constant and the smooth part."""
         return float(np.sqrt(0.5 * (self.x.left**2 + self.y.left**2)))
 
     @property
@@ -247,7 +247,7 @@ class Trials:
         return self.compare([e.name for e in self.camera.active], self.camera, None)
 
     def alone(self, element: Element) -> MonteCarlo:
-        """What one source with these parameters does in this camera, whether its chain holds it or not; see `of` and `put`.
+        """Effect of one source with these parameters in this camera, whether it is in the chain or not; see `of` and `put`.
 
         Raises
         ------
@@ -266,7 +266,7 @@ class Trials:
 
 
 def put(camera: Camera, element: Element) -> Camera:
-    """The camera with this element on: in the place of the one of its name, or else where the stages of the chain let it stand.
+    """The camera with this element on: in place of the element of the same name, otherwise at a place that its stage allows.
 
     Raises
     ------
@@ -279,7 +279,7 @@ def put(camera: Camera, element: Element) -> Camera:
     mine = STAGES.index(element.source.stage)
 
     def apart(at: int) -> tuple[int, int]:
-        """How many elements would stand on the wrong side of it; of equal places, the last."""
+        """Number of elements that would be on its wrong side; of equal places, the last."""
         return sum(s > mine for s in stages[:at]) + sum(s < mine for s in stages[at:]), -at
 
     for at in sorted(range(len(camera.chain) + 1), key=apart):
@@ -291,7 +291,7 @@ def put(camera: Camera, element: Element) -> Camera:
 
 
 def missed(camera: Camera, off: Iterable[str]) -> Camera:
-    """The camera without some sources; an essential conversion stays, without the errors of its own."""
+    """The camera without some sources; an essential conversion stays, without its own errors."""
     off = tuple(off)
     gone = camera.switched(off=[name for name in off if not camera[name].source.essential])
     return replace(gone, chain=tuple(ideal_element(e) if e.name in off else e for e in gone.chain))
@@ -369,7 +369,7 @@ def monte_carlo(
 
 
 def _layout(camera: Camera) -> list[tuple[float, float]]:
-    """Place of the sensor's pixel (0, 0) in frame 0 as it is put out, and pixels of the frame for one of the sensor; for x and y."""
+    """Position of the sensor's pixel (0, 0) in the output frame 0, and output pixels for one sensor pixel; for x and y."""
     return [(float(start), float(end - start)) for start, end in camera.layout([0.0, 1.0], [0.0, 1.0])]
 
 

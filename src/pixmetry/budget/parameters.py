@@ -1,4 +1,4 @@
-"""What a budget knows of each source: its parameters, whence they come, and how uncertain its contribution is for that."""
+"""Parameters of each source in a budget, their origin, and the resulting uncertainty of its contribution."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pixmetry.core.number import Estimates
 
 
 def applies(source: Source, facts: Mapping[str, Any]) -> bool:
-    """Whether a camera of this interface (digital, analogue) and sensor (ccd, cmos) can have the source; what is not known may be."""
+    """Whether a camera of this interface (digital, analogue) and sensor (ccd, cmos) can have the source; unknown counts as yes."""
     for kinds, fact in ((("digital", "analogue"), "interface"), (("ccd", "cmos"), "sensor")):
         wanted = [k for k in source.applies_to if k in kinds]
         told = str(facts.get(fact, "")).lower()

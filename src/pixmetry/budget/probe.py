@@ -117,7 +117,7 @@ class Facts:
 
 
 def facts_of(camera: Camera, target: Target, known: Mapping[str, Any] | None = None) -> Facts:
-    """Read these numbers off a camera's chain; what is given in ``known`` goes before.
+    """Read these numbers from a camera's chain; values in ``known`` have priority.
 
     Notes
     -----
@@ -187,7 +187,7 @@ def perfect(camera: Camera, on: Iterable[str] = ()) -> Camera:
 
 
 def ideal_element(element: Element) -> Element:
-    """An essential conversion without its errors; any other element as it is."""
+    """An essential conversion without its errors; any other element unchanged."""
     return element if element.source.ideal is None else replace(element, params=element.source.ideal(element.params))
 
 
@@ -245,7 +245,7 @@ def background_of(target: Target, facts: Facts) -> Uniform:
 
 
 def window_side(estimator: Estimator) -> int:
-    """Side of the windows that hold what a resolved estimator reads and what its neighbours need."""
+    """Side of the windows that contain the pixels of the estimator and the neighbours that these need."""
     return max(WINDOW_PX, estimator.window + 11)
 
 
@@ -376,7 +376,7 @@ class Probes:
         self._ahead = lru_cache(self._make_ahead)
 
     def of(self, name: str, source: Source) -> Probe:
-        """The probe for a source of this name; the estimator itself is asked on what the pixels gather."""
+        """The probe for a source of this name; for the estimator itself, the probe on the light of the pixels."""
         probe = self._of(name, source)
         light = source.ideal is None and not {Kind.DN, Kind.VIDEO, Kind.CODES} & set(source.consumes)
         return probe if self.curve is None or not light else self._ahead_of_curve(probe)
@@ -471,7 +471,7 @@ class Probes:
         )
 
     def _at_level(self, level: float) -> Estimator:
-        """The estimator where constant light is seen so many times as bright: background, threshold and height follow."""
+        """The estimator for light that is brighter by a factor: background, threshold and height follow."""
         ground = self.estimator.background_dn
         seen: Estimator = self.estimator.as_seen(lambda light_dn: (ground + light_dn) * level)
         return seen
@@ -480,7 +480,7 @@ class Probes:
         return linear_dn if self.curve is None else self.curve.of(np.asarray(linear_dn) / self.facts.dn_per_photon)
 
     def _bent(self, linear: Probe) -> Probe:
-        """The probe on what a curved response makes of the light; the estimator's levels follow."""
+        """The probe behind a curved response; the estimator's levels follow."""
         ground = self.estimator.background_dn
         self.estimator = self.estimator.as_seen(lambda light_dn: float(self._curved(np.array(ground + light_dn))))
         level = self.estimator.background_dn
@@ -560,7 +560,7 @@ def passed_light(camera: Camera) -> float:
 
 
 def _electrons_per_photon(camera: Camera) -> float:
-    """What the essential conversions make of a photon before they make DN of it."""
+    """Signal per photon after the essential conversions in front of the one that makes DN."""
     bare = perfect(camera)
     until = next((i for i, e in enumerate(bare.active) if e.source.produces is Kind.DN), len(bare.active))
     head = replace(bare, chain=bare.active[:until])

@@ -1,4 +1,4 @@
-"""What a budget holds: its rows, its totals, the answer with its interval, advice; and the plain record for JSON."""
+"""Records of a budget: rows, totals, the answer with its interval, advice; and the plain record for JSON."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ class BudgetRow:
 
     @property
     def calibrated_px(self) -> float:
-        """What of it stays once a calibration has taken up what is constant and what is smooth."""
+        """Remaining error after a calibration, without the constant and the smooth part."""
         return 0.0 if self.contribution is None else self.contribution.calibrated_px
 
 
@@ -116,7 +116,7 @@ class Interaction:
 
     @property
     def difference_px(self) -> float:
-        """What the sources do together beyond what they do alone."""
+        """Effect of all sources together minus the sum of each source alone."""
         return self.together.total_px - self.sum_px
 
     @property
@@ -246,7 +246,7 @@ class Budget:
 
     @property
     def verdict(self) -> Combined:
-        """One target in one frame, from what is measured and modelled."""
+        """One target in one frame, with the measured and modelled sources."""
         return self.verdicts[0]
 
     def of_status(self, *status: str) -> tuple[BudgetRow, ...]:
@@ -255,7 +255,7 @@ class Budget:
 
     @property
     def largest(self) -> tuple[BudgetRow, ...]:
-        """What the verdict rests on, largest first."""
+        """The contributions of the verdict, largest first."""
         return tuple(r for r in self.of_status(*DECIDED) if r.total_px > 0)
 
     @property

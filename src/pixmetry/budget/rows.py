@@ -30,7 +30,7 @@ SMALL = 0.05  # of the total with it: what its standard error may be before more
 
 @dataclass(frozen=True)
 class Known:
-    """What is known of the sources of one camera.
+    """Known parameters and estimates of the sources of one camera.
 
     Parameters
     ----------
@@ -54,13 +54,13 @@ class Known:
 
     @property
     def sources(self) -> list[tuple[str, Source]]:
-        """What has a row: the chain, then what the catalogue has beyond it."""
+        """The sources with a row: those of the chain, then the others of the catalogue."""
         named = [(e.name, e.source) for e in self.camera.active]
         there = {source.id for _, source in named}
         return named + [(i, s) for i, s in sources().items() if i not in there]
 
     def has(self, name: str) -> bool:
-        """Whether it stands in the chain, switched on."""
+        """Whether it is in the chain and switched on."""
         return any(e.name == name for e in self.camera.active)
 
     def estimates_of(self, name: str) -> Estimates | None:
@@ -98,7 +98,7 @@ def as_measured(camera: Camera, estimates_by_source: dict[str, Estimates]) -> Ca
 
 
 def rows_by_formula(known: Known, probes: Probes, say: Callable[[str], None]) -> Iterator[BudgetRow]:
-    """A row for every source, with its status, and its contribution where a formula says what it is."""
+    """A row for every source, with its status, and its contribution if there is a formula."""
     for name, source in known.sources:
         say(name)
         if known.geometry is not None and source.id in TAKEN_UP:

@@ -91,7 +91,7 @@ def calibrated_geometry(
 def with_pitch(
     model: CameraModel, names: tuple[str, ...], covariance: np.ndarray, pitch_um: tuple[float, float]
 ) -> tuple[CameraModel, np.ndarray]:
-    """A model in pixels and the covariance of some of its parameters with lengths in mm; the camera sees what it saw.
+    """A model in pixels, and the covariance of some of its parameters, with lengths in mm; the images of points do not change.
 
     Raises
     ------
@@ -203,7 +203,7 @@ def _fitted(model: CameraModel) -> tuple[np.ndarray, float]:
 
 
 def calibrated_camera(camera: Camera, geometry: CameraGeometry) -> Camera:
-    """The camera with a calibrated lens and affinity in place of what it had, and without what the calibration takes up with them.
+    """The camera with the calibrated lens and affinity, and without the sources that the calibration includes.
 
     Parameters
     ----------

@@ -129,7 +129,7 @@ def opencv_form(model: CameraModel, tolerance_px: float = 0.0) -> dict[str, Any]
 
 
 def opencv_text(model: CameraModel, ending: str, tolerance_px: float = 0.0) -> str:
-    """What a file of OpenCV's FileStorage holds of a camera.
+    """Camera of a file in OpenCV's FileStorage format.
 
     Parameters
     ----------

@@ -218,7 +218,7 @@ def _camera_files(calibration: Calibration, project: Project | None) -> tuple[di
 
 
 def _steps(told: Progress) -> Callable[[str], None]:
-    """A callable that tells the begin of a step, and with it the end of the one before."""
+    """A callable that reports the start of a step, and so the end of the previous one."""
     before = ""
 
     def step(what: str) -> None:
@@ -253,7 +253,7 @@ def _project(source: str | Path | Sequence[str | Path], pictures: Mapping[str, A
 
 
 def _sources(source: str | Path | Network | Sequence[str | Path]) -> list[str | Path]:
-    """What is calibrated: a project file, the folders of pictures, or the names of the cameras of a network."""
+    """Inputs that identify a calibration: the project file, the folders of pictures, or the names of a network's cameras."""
     if isinstance(source, Network):
         return [model.name for model in source.cameras]
     given = [Path(source)] if isinstance(source, str | Path) else [Path(part) for part in source]

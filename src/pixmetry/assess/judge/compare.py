@@ -28,7 +28,7 @@ JUDGED_FLEET = 5  # cameras; among 4 it takes 50 spreads to stand out of 35 valu
 
 @dataclass(frozen=True)
 class Comparison:
-    """Two files beside each other."""
+    """Comparison of two files."""
 
     names: tuple[str, str]
     kind: str
@@ -59,7 +59,7 @@ class Comparison:
 
 @dataclass(frozen=True)
 class Fleet:
-    """Three or more cameras beside each other."""
+    """Comparison of three or more cameras."""
 
     names: tuple[str, ...]
     kind: str
@@ -148,7 +148,7 @@ def compare(
 
 
 def _families(rows: Sequence[Difference]) -> list[Any]:
-    """Rows that say the same thing: by their keys, or by their numbers where several parts of an assessment hold one value."""
+    """Rows that state the same quantity: by their keys, or by their numbers if several parts of an assessment have the same value."""
     first: dict[Any, Any] = {}
     found = []
     for row in rows:
@@ -158,7 +158,7 @@ def _families(rows: Sequence[Difference]) -> list[Any]:
 
 
 def _how(key: str, a: str, b: str) -> Difference:
-    """A row for what is no number."""
+    """A row for an entry that is not a number."""
     verdict, reason = ("equal", a) if a == b else ("differs", f"{a} in A, {b} in B")
     return Difference(MONO, f"budget.{key}", "", None, None, verdict=verdict, reason=reason)
 
@@ -169,7 +169,7 @@ def _check_level(level: float) -> None:
 
 
 def _notes(subjects: Sequence[Subject], passed_over: frozenset[str] = frozenset()) -> list[str]:
-    """What the reader must know before believing the rest."""
+    """Notes on differences between the files that affect the comparison."""
     notes = []
     releases = list(dict.fromkeys(s.release or "not stated" for s in subjects))
     if len(releases) > 1:
@@ -192,7 +192,7 @@ def _notes(subjects: Sequence[Subject], passed_over: frozenset[str] = frozenset(
 
 
 def compare_fleet(sources: Iterable[DataSheet | str | Path], *, level: float = 0.95, names: Sequence[str] | None = None) -> Fleet:
-    """Hold each camera of a fleet against the fleet.
+    """Compare each camera of a fleet with the fleet.
 
     Parameters
     ----------
@@ -257,7 +257,7 @@ def compare_fleet(sources: Iterable[DataSheet | str | Path], *, level: float = 0
 
 
 def check_limits(source: DataSheet | str | Path, limits: Limits | str | Path) -> tuple[Checked, ...]:
-    """Hold the values of one camera against limits; each key in every channel.
+    """Check the values of one camera against limits, each key in every channel.
 
     Parameters
     ----------

@@ -28,7 +28,7 @@ Rule = Literal["guarded_acceptance", "simple_acceptance", "guarded_rejection"]
 
 @dataclass(frozen=True)
 class Judgement:
-    """What a decision rule says of one value; ``acceptance`` is NaN where no value at all would be accepted."""
+    """Decision of a rule on one value; ``acceptance`` is NaN where no value at all would be accepted."""
 
     verdict: str  # "pass", "fail" or "undecided"
     probability: float  # that the quantity lies within the limits; NaN where nothing is known of it
@@ -56,7 +56,7 @@ class Limit(Model):
 
 
 class Limits(Model):
-    """What a camera is held against: a file of limits."""
+    """A file of limits."""
 
     schema_: Literal["pixmetry/limits/1"] = Field(alias="schema")
     confidence: float = 0.95
@@ -73,13 +73,13 @@ class Limits(Model):
         return found
 
     def place(self, key: str) -> str:
-        """Where the limit of a key stands: file and line, as far as they are known."""
+        """File and line of the limit of a key, as far as they are known."""
         return f"{self._places.get(key, 'limits')}: {key}"
 
 
 @dataclass(frozen=True)
 class Checked:
-    """One value beside its limit."""
+    """One value with its limit and the decision."""
 
     key: str
     channel: str
@@ -236,7 +236,7 @@ def judge_value(value: Number, limit: Limit, rule: str, confidence: float) -> Ju
 
 
 def check(values: Mapping[tuple[str, str], Number], limits: Limits) -> tuple[Checked, ...]:
-    """Hold values against a file of limits: each key in every channel.
+    """Check values against a file of limits, each key in every channel.
 
     Parameters
     ----------

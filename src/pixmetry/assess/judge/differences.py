@@ -136,7 +136,7 @@ def _known(dof: float) -> float:
 
 
 def _sides(a: Number, b: Number) -> set[int]:
-    """Signs of b − a that tell of a change: upwards only from an upper limit, or to a lower one; both where no sign does."""
+    """Signs of b − a that show a change: only upwards from an upper limit or to a lower limit; both if neither is a limit."""
     own = {1 if a.is_upper_limit else -1 if a.is_lower_limit else 0, -1 if b.is_upper_limit else 1 if b.is_lower_limit else 0}
     return own - {0}
 
@@ -149,7 +149,7 @@ def _limits_text(a: Number, b: Number) -> str:
 
 
 def _chance(row: Difference, toward: int) -> float:
-    """Chance of such a difference where nothing changed; beside a limit only what lies beyond it, with the sign ``toward``, counts."""
+    """Probability of such a difference without a change; next to a limit only the part beyond it, with the sign ``toward``, counts."""
     if toward:
         return upper_tail(toward * row.in_u, row.dof)
     return 2 * upper_tail(abs(row.in_u), row.dof)

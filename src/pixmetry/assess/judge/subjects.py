@@ -1,4 +1,4 @@
-"""What is compared, or held against limits: the numbers of a data sheet, of an assessment or of a calibration, read from their files."""
+"""Values to be compared or checked: those of a data sheet, an assessment or a calibration, read from their files."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ RESULT_FILES = ("results.json", "calibration.json")
 
 
 def load_subject(source: DataSheet | str | Path, name: str = "") -> Subject:
-    """Read what is to be compared: a data sheet, its file, or the results of an assessment or of a calibration, or their folder.
+    """Read the values to be compared: from a data sheet, its file, or the results of an assessment or calibration, or their folder.
 
     Raises
     ------
@@ -154,7 +154,7 @@ def _of_calibration(record: Mapping[str, Any], name: str, where: str) -> Subject
 
 
 def _of_lines(record: Mapping[str, Any], name: str, where: str) -> Subject:
-    """Lens parameters that straight lines tell."""
+    """Lens parameters that straight lines determine."""
     try:
         values = {(MONO, e["name"]): Number.from_record(e) for e in record["parameters"]}
         return Subject(name, "calibration from straight lines", "", _camera_facts(record["cameras"]), values, {})

@@ -49,7 +49,7 @@ Pitch = tuple[float, float] | None
 
 
 def verdict_section(budget: Budget) -> Section:
-    """The answer: an interval, the standard uncertainty behind it, what a calibration leaves, and what more frames would give."""
+    """The answer: an interval, its standard uncertainty, the total after a calibration, and the totals for more frames."""
     pitch, one, every = budget.pitch_um, budget.verdict, budget.with_accepted[0]
     section = Section("Uncertainty of a coordinate", name="verdict")
     parts: list[Text | Sequence[Reading]] = []
@@ -130,7 +130,7 @@ def _ladder(budget: Budget) -> Table:
 
 
 def _shares(rows: Sequence[BudgetRow]) -> str:
-    """How the square of the sum divides into what changes in time, from place to place, smoothly, not at all, and what drifts."""
+    """Shares of the squared total: parts in time, from place to place, smooth, constant, and drifting."""
     parts = np.zeros(5)
     for row in rows:
         c = row.contribution
@@ -158,7 +158,7 @@ def _accepted(rows: Sequence[BudgetRow]) -> str:
 
 
 def largest_section(budget: Budget) -> Section:
-    """The largest contributions with what to do, and the largest of what was only accepted."""
+    """The largest contributions with advice, and the largest accepted sources."""
     section = Section("The largest contributions, and what to do", name="largest")
     rows = {r.name: r for r in budget.rows}
     known = [a for a in budget.advice if a.status != "accepted"]
@@ -212,7 +212,7 @@ def _monte_carlo_note(budget: Budget) -> str:
 
 
 def sources_section(budget: Budget, unmeasured: Mapping[str, str]) -> Section:
-    """All sources in the budget's own order; those that do not count are folded away."""
+    """All sources in the order of the budget; those that do not count are collapsed."""
     section = Section("All error sources", name="sources").add_text(SOURCES.format(_monte_carlo_note(budget)), style="small soft")
     counting = [r for r in budget.rows if r.counts]
     section.add(_source_table("Error sources that count", counting, unmeasured))
@@ -261,14 +261,14 @@ def _with_error(axis: Any) -> str:
 
 
 def _reason(row: BudgetRow, unmeasured: Mapping[str, str]) -> str:
-    """Why something is missing; nothing where all is there."""
+    """Why something is missing; empty if nothing is missing."""
     if row.status in DECIDED and row.contribution is not None:
         return ""
     return unmeasured.get(row.source_id, row.reason) if row.status == "accepted" else row.reason
 
 
 def _known(row: BudgetRow) -> str:
-    """Relative uncertainty of a measured contribution that comes of its parameters."""
+    """Relative uncertainty of a measured contribution from the uncertainty of its parameters."""
     if row.u_of_total_px <= 0 or row.total_px <= 0:
         return ""
     share = row.u_of_total_px / row.total_px
@@ -276,7 +276,7 @@ def _known(row: BudgetRow) -> str:
 
 
 def sum_section(budget: Budget) -> Section:
-    """The sum of all, beside one simulation with all of them, and how classes combine."""
+    """The sum of all contributions, one simulation of all sources, and how classes combine."""
     section = Section("The sum of the contributions, and one simulation of all sources", name="sum")
     columns: list[Column | str] = ["One target, one frame", Column("x", "right"), Column("y", "right")]
     section.add_table("Sum of the budget and Monte Carlo", columns, _sums(budget)).add_text(_interaction(budget))
@@ -312,7 +312,7 @@ def _sum_of(results: list[MonteCarlo], axis: str) -> float:
 
 
 def _interaction(budget: Budget) -> str:
-    """Everything at once against everything alone, and whether the difference can be told from chance."""
+    """All sources at once compared with each source alone, and whether the difference is significant."""
     found, analytic_px = budget.interaction, (budget.sums[0] if budget.sums else budget.verdict).total_px
     if found is None:
         return "There is no Monte Carlo."

@@ -75,7 +75,7 @@ def _unsaturated(seen: Observations) -> np.ndarray:
 
 
 def variance_against_mean(seen: Observations, standard: Results) -> Figure:
-    """Photon-transfer curve with the joint fit and the standard's line, and what the fit leaves."""
+    """Photon-transfer curve with the joint fit, the standard's line and the residuals of the fit."""
     pt, fit = seen.series, seen.fit
     curve, good = Curve.of(fit, pt.bits), _unsaturated(seen)
     mean, var = pt.bright.mean_dn - curve.offset_dn, pt.bright.ms_pixel_dn2
@@ -112,7 +112,7 @@ def variance_against_mean(seen: Observations, standard: Results) -> Figure:
 
 
 def _light_as_signal(seen: Observations) -> np.ndarray:
-    """What a straight camera would give for each bright level, DN above black."""
+    """Mean of each bright level in a linear camera, DN above black."""
     pt, fit = seen.series, seen.fit
     bright = pt.bright
     if bright.photons is None or light_scale(bright)[1]:
@@ -240,7 +240,7 @@ def map_picture(values: np.ndarray, name: str, title: str, unit: str, words: str
 
 
 def dark_codes(histogram: CodeHistogram) -> Figure:
-    """Histogram of all dark codes beside the normal law of the same spread."""
+    """Histogram of all dark codes with the normal distribution of the same spread."""
     counts = np.asarray(histogram.dark_counts, float)
     present = np.flatnonzero(counts)
     codes = np.arange(present[0], present[-1] + 1)

@@ -1,4 +1,4 @@
-"""The tables of measured camera values: beside those of EMVA 1288, and beside those of the digital twin."""
+"""The tables of measured camera values, with those of EMVA 1288 and of the digital twin."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ PERCENT, PER_1000_PX = (100.0, "%"), (1e5, "%/1000 px")
 
 @dataclass(frozen=True)
 class Caption:
-    """How one estimate is shown: its name in words, the key of the standard's value beside it, factor and unit of the display."""
+    """Display of one estimate: its name in words, the key of the standard's value, factor and unit."""
 
     title: str
     standard: str = ""

@@ -98,7 +98,7 @@ def _values(assessment: Assessment) -> Section:
 
 
 def _words(assessment: Assessment) -> Section:
-    """Notes, what the numbers could be mistaken for, methods."""
+    """Notes, confounders, methods."""
     section = Section("Notes, and what the numbers could be mistaken for", name="notes")
     if notes := _notes(assessment):
         section.add(Points(notes, style=""))
@@ -130,7 +130,7 @@ def _facts(assessment: Assessment) -> list[tuple[str, str]]:
 
 
 def _named(assessment: Assessment) -> list[tuple[str, str]]:
-    """What the manifest says of camera and measurement, as far as it does."""
+    """Camera and measurement as stated in the manifest."""
     campaign, facts = assessment.campaign, assessment.campaign.camera
     known = {
         "Vendor, model": ", ".join(filter(None, (facts.vendor, facts.model))),
@@ -167,7 +167,7 @@ def _shared(assessment: Assessment) -> list[Estimates]:
 
 
 def _confounders(assessment: Assessment) -> list[str]:
-    """What the shared estimates could be mistaken for, then what each source adds to that."""
+    """Confounders of the shared estimates, then those of each source."""
     from pixmetry.camera.catalogue import get_source
 
     shared = [c for s in _shared(assessment) for c in s.confounders]

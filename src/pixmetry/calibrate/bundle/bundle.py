@@ -106,7 +106,7 @@ def adjust(
 
 
 def _in_order(layout: Layout, start: State) -> State:
-    """Fixed coordinates are those of the network; per-image parameters lose what is common to a camera's images."""
+    """Fixed coordinates are those of the network; per-image parameters have mean zero over a camera's images."""
     x_scale, x_shift = start.x_scale.copy(), start.x_shift_px.copy()
     for place, values in zip(layout.extra, (x_scale, x_shift), strict=True):
         for k in range(len(layout.free)) if place >= 0 else ():
@@ -161,7 +161,7 @@ def _turns(w: Array) -> Array:
 def _iterate(
     layout: Layout, datum: Datum, now: Linearised, loss: Loss, most: int, work: np.ndarray
 ) -> tuple[Linearised, Solved | None, Linearised, list[float]]:
-    """Step until the last one is small; gives the equations of that step, their solution (None: it was not reached), and what is after."""
+    """Iterate until the step is small; returns the equations of the last step, their solution (None: not reached), and the new state."""
     dof = max(1, _dof(layout, datum))
     tolerance = LEFT if loss.kind == "none" else LEFT_ROBUST
     damping, costs, before, placed = 0.0, [now.cost], 0.0, True
@@ -283,7 +283,7 @@ def _result(
 
 
 def _of_determined(layout: Layout, state: State) -> State:
-    """NaN for images and points that took no part, but for wholly known points; what is fixed keeps its digits."""
+    """NaN for images and points that were not used, except completely known points; fixed values keep their digits."""
     images, points = layout.image_col >= 0, layout.determined
     partly: Flags = np.any(np.isinf(layout.network.u_xyz), axis=1)
     known = np.where(partly[:, None] & ~points[:, None], np.nan, layout.network.xyz)

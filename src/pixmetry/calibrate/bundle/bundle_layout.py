@@ -20,7 +20,7 @@ LEAST_IN_IMAGE = 3  # image points: six numbers for six parameters of the pose
 
 @dataclass(frozen=True)
 class Layout:
-    """Observations sorted by point and image, and where each unknown stands.
+    """Observations sorted by point and image, and the index of each unknown.
 
     Parameters
     ----------

@@ -49,7 +49,7 @@ class Linearised:
 
 @dataclass
 class Solved:
-    """A step, and what it was found with."""
+    """A step, with its normal equations."""
 
     step: Array
     points: Array
@@ -172,7 +172,7 @@ def rows_of(layout: Layout, Z: Eliminated, which: np.ndarray) -> np.ndarray:
 
 
 def dense(layout: Layout) -> bool:
-    """Whether points see so many images that products of whole rows are quicker than gathering."""
+    """Whether points are in so many images that products of whole rows are faster than gathering."""
     rows = np.diff(layout.first)[layout.eliminated] * layout.per_image + layout.camera_count.max(initial=0)
     return float((rows.astype(float) ** 2).sum()) * DENSE_GAIN > len(rows) * float(len(layout.columns)) ** 2
 

@@ -1,1 +1,1 @@
-"""What a calibration's numbers are worth: tests, gross errors, control, variance components, hold-out."""
+"""Quality of a calibration: tests, gross errors, control points, variance components, cross-validation."""

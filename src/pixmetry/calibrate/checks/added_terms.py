@@ -215,7 +215,7 @@ class AddedTerms:
         return self._blocks @ by_camera, self._blocks @ points
 
     def _factorise(self, network: Network, state: State) -> None:
-        """Eliminate the points that no bar joins; factors of what is left."""
+        """Eliminate the points without scale bars, and factorise the reduced system."""
         from scipy import linalg, sparse
 
         count = 3 * len(network.points)

@@ -36,7 +36,7 @@ NAMED = 5
 
 @dataclass(frozen=True)
 class CheckPoints:
-    """Coordinates of points that are compared with those of an adjustment, and take no part in it.
+    """Coordinates of points that are compared with an adjustment, and are not used in it.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ def with_check_points(calibration: Calibration, checks: CheckPoints, *, a_priori
 def check_record(adjustment: Adjustment, checks: CheckPoints, *, a_priori: bool = False) -> CheckRecord:
     """Compare check points with an adjustment.
 
-    Where they tell nothing, ratios are NaN and ``chi2``, ``p``, ``worst`` None.
+    If they test nothing, ratios are NaN and ``chi2``, ``p``, ``worst`` None.
     """
     from scipy import stats
 

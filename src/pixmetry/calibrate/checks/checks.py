@@ -1,4 +1,4 @@
-"""What a network must fulfil before an adjustment, and what an adjusted one does not determine well.
+"""Requirements of a network before an adjustment, and values that an adjusted network determines badly.
 
 `check_network` stops what cannot be adjusted (wrong units, one image of a plane, points on a line, groups of images without a tie) and
 names what will be left out. `check_determined` looks at an adjustment: a principal distance that only goes with the distances to the
@@ -214,7 +214,7 @@ def _check_one_image(network: Network, usable: np.ndarray) -> None:
 
 
 def _check_ties(network: Network, usable: np.ndarray, findings: list[Finding]) -> None:
-    """Groups of images that share too few points to hold each other."""
+    """Groups of images that share too few points to be connected."""
     fixed = network.control
     images = np.flatnonzero(usable)
     control = np.bincount(network.image[fixed[network.point]], minlength=len(usable))[images] >= FEWEST
@@ -254,7 +254,7 @@ def _joined(network: Network, images: Ints, label: Ints) -> Ints:
 
 
 def check_determined(adjustment: Adjustment) -> tuple[Finding, ...]:
-    """Examine what an adjustment determines only badly, and what it left out.
+    """Find values that an adjustment determines badly, and data that it left out.
 
     Returns
     -------
@@ -367,7 +367,7 @@ def _median(values: list[float]) -> float:
 
 
 def _rolled(rotation: np.ndarray) -> bool:
-    """Whether the rows of the images stand in more than one direction of the object: some at least 45° from others."""
+    """Whether the rows of the images have different directions in the object, some at least 45° from others."""
     x = rotation[:, 0]
     return bool(len(x) and np.min(np.abs(x @ x.T)) < np.cos(np.deg2rad(45)))
 

@@ -31,7 +31,7 @@ AT_ONCE = 4000  # points
 
 @dataclass(frozen=True)
 class Mended:
-    """Points of few rays whose rays were chosen anew.
+    """Points with few rays, whose rays were selected again.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ class _Rays:
 
 @dataclass(frozen=True)
 class _Sets:
-    """All sets of so many of m rays, intersected; χ² is infinite where they do not meet before the cameras."""
+    """All subsets of a given number of m rays, intersected; χ² is infinite if they do not meet in front of the cameras."""
 
     member: np.ndarray
     chi2: np.ndarray
@@ -94,7 +94,7 @@ class _Sets:
 
 @dataclass(frozen=True)
 class _Choice:
-    """Of points, the best of their largest sets that agree, and the best of those beside it that lie elsewhere (``worse``: by how much)."""
+    """For each point the best of its largest consistent subsets, and the best one elsewhere (``worse``: by how much)."""
 
     rays: _Rays
     best: np.ndarray

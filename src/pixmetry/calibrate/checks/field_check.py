@@ -1,4 +1,4 @@
-"""Is the test field what it is said to be? Adjusted with its nominal coordinates fixed and free, and judged by images left out."""
+"""Test of the nominal coordinates of a test field: adjusted with fixed and with free coordinates, compared on images left out."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ PLACES = {"c": 0, "xp": 1, "yp": 2}
 
 @dataclass(frozen=True)
 class FieldCheck:
-    """Which adjustment stands, and why.
+    """The accepted adjustment, and the reason.
 
     Parameters
     ----------
@@ -50,8 +50,8 @@ class FieldCheck:
 def check_field(fixed: Adjustment, folds: int = 5, seed: int = 0, level: float = 0.01) -> FieldCheck:
     """Adjust once more with the points free that were fixed, and choose.
 
-    Free points fit better in any case. They stand if images that were left out fit better as well (paired over images), and if the F-test
-    of the given coordinates fails: both at the level given.
+    Free points fit better in any case. They are accepted if images that were left out fit better as well (paired over images), and if
+    the F-test of the given coordinates fails, both at the given level.
 
     Parameters
     ----------

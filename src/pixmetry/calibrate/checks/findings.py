@@ -1,4 +1,4 @@
-"""What the reader of a calibration must know, in sentences, most important first."""
+"""Findings of a calibration in sentences, most important first."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def in_order(findings: Iterable[Finding]) -> tuple[Finding, ...]:
 
 
 def findings_of(adjustment: Adjustment, tests: Tests) -> list[Finding]:
-    """What the records of one adjustment say."""
+    """Findings from the records of one adjustment."""
     images = tests.images or ()
     found = [
         *known_findings(tests.known or KnownRecord(), adjustment.network.unit),
@@ -101,7 +101,7 @@ def in_the_shadow(patterns: Iterable[Finding]) -> list[Finding]:
 
 
 def parameter_findings(parameters: Sequence[ParameterTest]) -> list[Finding]:
-    """Parameters that are not significant, and pairs that cannot be told apart."""
+    """Parameters that are not significant, and pairs that cannot be separated."""
     found = []
     for camera in dict.fromkeys(p.camera for p in parameters):
         mine = [p for p in parameters if p.camera == camera]
@@ -298,7 +298,7 @@ def _what_was_done(gross: Contradicted) -> str:
 
 
 def _group_finding(group: KnownGroup, noun: str) -> Finding:
-    """A group that scatters otherwise than stated; what stands out comes before new uncertainties for all."""
+    """A group with another scatter than stated; outliers are named before new uncertainties for all."""
     text = f"The {noun}s scatter {np.sqrt(group.factor):.2g} times as much as their stated uncertainties."
     if group.factor <= 1:
         return Finding("known_uncertainty", text, "Correct their uncertainties.", "note")
@@ -321,7 +321,7 @@ def lost_control_findings(adjustment: Adjustment) -> list[Finding]:
 
 
 def drift_findings(images: Sequence[ImageRecord], adjustment: Adjustment) -> list[Finding]:
-    """What the images' own x-scales and x-shifts say, where they were estimated."""
+    """Findings on the x-scales and x-shifts of the images, if they were estimated."""
     from scipy import stats
 
     found = []

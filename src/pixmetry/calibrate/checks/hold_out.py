@@ -1,4 +1,4 @@
-"""Images left out of the adjustment: what it is worth where it was not fitted."""
+"""Cross-validation: the fit of images that were left out of the adjustment."""
 
 from __future__ import annotations
 
@@ -250,7 +250,7 @@ def expected_median_px(adjustment: Adjustment, folds: int, seed: int = 0) -> flo
 
 
 def hold_out_record(fixed: LeftOut | None, free: LeftOut | None = None) -> HoldOut:
-    """How well images that were left out fit, beside the fit of all.
+    """Fit of images that were left out, compared with the fit of all.
 
     Parameters
     ----------

@@ -60,7 +60,7 @@ class Raised:
 
 @dataclass(frozen=True)
 class KnownFaults:
-    """What a network contradicts of what was known.
+    """Known values that a network contradicts.
 
     Parameters
     ----------
@@ -260,7 +260,7 @@ def check_known(
 
 
 def _wrong_points(checked: CheckedKnown) -> int:
-    """Control points that are contradicted, or may be what is wrong instead."""
+    """Control points that are contradicted, or that may be wrong instead."""
     names = (name for found in checked.faults.control_points for name in (found.name, *(found.rivals or ())))
     return len({name.rpartition(" ")[0] for name in names})
 
@@ -393,7 +393,7 @@ def _to_scale_of_control(state: State, network: Network) -> tuple[State, bool]:
 
 
 def _enlarged(state: State, network: Network, scale: float) -> State:
-    """The state enlarged about the middle of what is known of the points; what is held stays."""
+    """The state scaled about the middle of the known points; fixed values stay."""
     known = np.isfinite(network.u_xyz).any(axis=1) & state.located
     middle = state.xyz[known].mean(axis=0) if known.any() else np.zeros(3)
     xyz = np.where(network.u_xyz == 0, state.xyz, middle + scale * (state.xyz - middle))
@@ -401,7 +401,7 @@ def _enlarged(state: State, network: Network, scale: float) -> State:
 
 
 def _without(checked: CheckedKnown, known: Known, found: list[Contradicted], kind: Kind) -> CheckedKnown:
-    """Leave out what is contradicted most, or, where it cannot be told from others, give all of these the uncertainty of their error."""
+    """Leave out the value that is contradicted most; if it cannot be separated from others, give all of them the uncertainty of their error."""
     wrong = [known.name.index(one.name) for one in found]
     going: list[int] = []
     if kind == "scale_bars":

@@ -117,7 +117,7 @@ def jointly(network: Network, state: State) -> Network:
 
 
 def contradicted(known: Known, sigma0: float, dof: float, false_alarms: float = 0.01) -> list[Contradicted]:
-    """What the network contradicts, worst first.
+    """Values that the network contradicts, worst first.
 
     Parameters
     ----------

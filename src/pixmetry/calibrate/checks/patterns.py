@@ -151,7 +151,7 @@ def residual_patterns(adjustment: Adjustment, level: float = 0.01) -> tuple[Patt
 
 
 def _worded(found: Pattern) -> Pattern:
-    """The pattern with its source and what is said of it."""
+    """The pattern with its possible cause, its sentence and its advice."""
     what, source, advice = MEANING[found.name]
     number = f"{found.amplitude_px:.4f} px" if found.u_px is None else f"{found.amplitude_px:.4f} ± {found.u_px:.4f} px"
     period = "" if found.period_px is None else f", period {found.period_px:.3g} px"

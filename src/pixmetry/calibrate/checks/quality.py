@@ -1,4 +1,4 @@
-"""What the numbers of an adjustment are worth: significance, correlations, residuals by axis and camera, and images one by one."""
+"""Quality of an adjustment: significance, correlations, residuals by axis and camera, and by image."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def parameter_records(adjustment: Adjustment) -> tuple[ParameterTest, ...]:
 
 
 def group_records(adjustment: Adjustment) -> tuple[GroupTest, ...]:
-    """Joint F-tests against 0 of parameters that can stand for each other, as the radial ones can."""
+    """Joint F-tests against 0 of parameters that can replace each other, such as the radial ones."""
     from scipy import stats
 
     out = []
@@ -170,7 +170,7 @@ def p_words(p: float) -> str:
 
 
 def plain(value: float, digits: int) -> str:
-    """A number to so many digits for a sentence, without a power of ten as long as it is below a million: 2300 px, not 2.3e+03 px."""
+    """A number rounded to some digits for a sentence, without a power of ten below a million: 2300 px, not 2.3e+03 px."""
     rounded = float(f"{value:.{digits}g}")
     return f"{rounded:.0f}" if 10.0**digits <= abs(rounded) < 1e6 else f"{value:.{digits}g}"
 

@@ -125,7 +125,7 @@ def _left_out(hats: Any, v: np.ndarray, roughness: np.ndarray, penalty: float, f
 
 
 def _fitted(hats: Any, v: np.ndarray, roughness: np.ndarray, penalty: float, shape: tuple[int, int]) -> list[np.ndarray]:
-    """What a `ResidualGrid` holds at its nodes: dx, dy, u and n, shape (rows, cols) each."""
+    """Values of a `ResidualGrid` at its nodes: dx, dy, u and n, shape (rows, cols) each."""
     from scipy import linalg
 
     values, factor = _solved(hats, v, roughness, penalty)
@@ -140,7 +140,7 @@ def _fitted(hats: Any, v: np.ndarray, roughness: np.ndarray, penalty: float, sha
 
 
 def at(grid: ResidualGrid, x_px: np.ndarray, y_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """What a grid says of the residual (measured less computed) at some places, px; beyond its edge, what it says there.
+    """Residual (measured minus computed) by the grid at some positions, px; beyond the edge, the value at the edge.
 
     Parameters
     ----------
@@ -155,8 +155,7 @@ def at(grid: ResidualGrid, x_px: np.ndarray, y_px: np.ndarray) -> tuple[np.ndarr
 
 
 def corrected(grid: ResidualGrid, x_px: np.ndarray, y_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Image coordinates corrected by the grid of their camera, as they were measured less what the grid says: what the parameters of the
-    camera then stand for.
+    """Image coordinates minus the correction grid of their camera; the parameters of the camera describe the corrected coordinates.
 
     Parameters
     ----------

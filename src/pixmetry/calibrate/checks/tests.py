@@ -1,4 +1,4 @@
-"""All tests of one adjustment that stands."""
+"""All tests of an accepted adjustment."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def sizes(adjustment: Adjustment) -> Sizes:
 
 
 def network_record(adjustment: Adjustment, stated: Mapping[str, float] | None = None, *, a_priori: bool = False) -> NetworkRecord:
-    """What the network is made of, with the ``stated`` uncertainties of bars, by name, where they were raised."""
+    """Size and redundancy of the network, and its scale bars; ``stated``: their uncertainties, by name, if these were raised."""
     network, used = adjustment.network, adjustment.used
     rays = np.bincount(network.point[used], minlength=len(network.points))
     rays = rays[rays > 0]

@@ -161,7 +161,7 @@ def _csv(comments: Iterable[str], columns: Mapping[str, Any]) -> str:
 
 
 def _texts(values: Any) -> list[Any]:
-    """Ten digits of a number, empty where there is none; names as cells may hold them."""
+    """A number with ten digits, empty if there is none; names in a form that is safe in cells."""
     plain = values.tolist() if isinstance(values, np.ndarray) else values
     return [cell(v) if isinstance(v, str) else ("" if math.isnan(v) else f"{v:.10g}") if isinstance(v, float) else v for v in plain]
 
@@ -241,7 +241,7 @@ def _outputs(opencv: Iterable[Path], colmap: Path | None) -> list[Output]:
 
 
 def _opencv_places(cameras: list[CameraModel], opencv: Path | None) -> list[Path]:
-    """The file of each camera; of several, its name stands before the ending."""
+    """The file of each camera; with several cameras the name is before the ending."""
     if opencv is None or len(cameras) == 1:
         return [] if opencv is None else [opencv]
     owns = [re.sub(r"[^A-Za-z0-9._-]+", "_", model.name) for model in cameras]

@@ -254,7 +254,7 @@ def _numbered(good: list[Seen], kind: str) -> tuple[list[Seen], tuple[Finding, .
 
 
 def _gathered(good: list[Seen], kind: str) -> ImageObservations:
-    """All images under each other; the keys of the points stand in the place of their coordinates."""
+    """All images in one table; keys of points take the place of coordinates."""
     image = np.repeat(np.arange(len(good)), [len(s.keys) for s in good])
     keys, x, y, covariance = (np.concatenate([getattr(s, name) for s in good]) for name in ("keys", "x_px", "y_px", "covariance_px2"))
     unique, point = np.unique(keys, axis=0, return_inverse=True)

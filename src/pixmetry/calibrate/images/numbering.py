@@ -1,4 +1,4 @@
-"""Which point of a board is which, over all images of it: boards that look the same after a turn are told apart as far as they can be."""
+"""Numbering of the points of a board over all its images; boards that look the same after a rotation are resolved if possible."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MARK_AROUND = 9  # dots, itself among them
 
 @dataclass(frozen=True)
 class Marks:
-    """What tells one turn of a board from another: values at cells of a grid of ``rows`` × ``cols``; arrays of shape (m,)."""
+    """Features that distinguish the rotations of a board: values at cells of a grid of ``rows`` × ``cols``; arrays of shape (m,)."""
 
     row: np.ndarray
     col: np.ndarray

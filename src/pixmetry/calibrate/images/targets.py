@@ -1,4 +1,4 @@
-"""The targets of a calibration in one image: located, identified as far as one image tells, or a reason why not."""
+"""The targets of a calibration in one image: located and identified as far as one image allows, or the reason why not."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ UNUSABLE = Flag.NOT_CONVERGED | Flag.BORDER
 
 @dataclass(frozen=True)
 class Wanted:
-    """What is looked for in all images.
+    """The targets to be found in all images.
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ class Seen:
 
 
 def see(name: str, source: Path | np.ndarray, wanted: Wanted) -> Seen:
-    """Read one image and find in it what is wanted.
+    """Read one image and find its targets.
 
     Raises
     ------

@@ -16,7 +16,7 @@ SIGNIFICANT = 3.29  # standard deviations: 1e-3, two-sided
 
 @dataclass(frozen=True)
 class AxisResiduals:
-    """Residuals across the lines that tell about x, or about y.
+    """Residuals across the lines that determine x, or y.
 
     Parameters
     ----------

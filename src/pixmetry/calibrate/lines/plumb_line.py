@@ -1,4 +1,4 @@
-"""Plumb-line calibration: what is straight in object space is straight in the corrected image.
+"""Plumb-line calibration: straight lines in space are straight in the corrected image.
 
 Each position (x, y) that was measured on a line is corrected (`pixmetry.calibrate.bundle.model`, image to object) and must fulfil
 
@@ -135,7 +135,7 @@ class LineCalibration:
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
     def camera(self) -> CameraModel:
-        """The camera; its c is 0 unless it was given: lines do not tell it."""
+        """The camera; its c is 0 unless it was given, because lines do not determine it."""
         return self.result.camera
 
     def curves(self) -> DistortionCurves:

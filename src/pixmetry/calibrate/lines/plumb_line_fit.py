@@ -171,7 +171,7 @@ class LineFit:
         return [self.names[int(np.argmin(left / np.maximum(whole, 1e-300)))]]
 
     def solve(self) -> None:
-        """Iterate until the conditions hold as well as they can."""
+        """Iterate until the conditions converge."""
         cost = np.inf
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # where the lines do not tell; that is said below
             for _ in range(STEPS):
@@ -197,7 +197,7 @@ class LineFit:
         return float(self.weight @ left**2)
 
     def leverage(self) -> Array:
-        """Share of each position's variance that the fit takes up, were its weight that of a used one; shape (n,)."""
+        """Leverage of each position: share of its variance that the fit absorbs, with the weight of a used position; shape (n,)."""
         inverse, line = self.inverse(), self.table.line_of
         own = 1.0 / self.variance
         of_parameters = np.einsum("np,pq,nq->n", self.a_left, inverse, self.a_left)
@@ -212,7 +212,7 @@ class LineFit:
         return statistic
 
     def axis_of_line(self) -> Ints:
-        """0 for lines that tell about x, 1 for those about y."""
+        """0 for lines that determine x, 1 for those that determine y."""
         steep: Flags = np.abs(np.cos(self.theta)) < np.abs(np.sin(self.theta))
         return steep.astype(np.int64)
 
@@ -249,7 +249,7 @@ def adjust_lines(fit: LineFit, loss: str, loss_scale: float, reject: bool) -> No
 
 
 def _check_directions(theta: np.ndarray, free: list[str]) -> None:
-    """Refuse the tangential parameter that lines of one direction do not tell: what it does along them keeps them straight."""
+    """Refuse the tangential parameter that lines of one direction do not determine: it moves points along the lines, which stay straight."""
     mean = np.mean(np.exp(2j * theta))
     if abs(mean) < ONE_DIRECTION:
         return

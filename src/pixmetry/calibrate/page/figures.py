@@ -1,5 +1,5 @@
-"""Figures of one calibrated camera: residual vectors and what residuals hang on, distortion curves, correlations, projection
-uncertainty; and what the figures of a calibration share."""
+"""Figures of one calibrated camera: residuals, distortion curves, correlations, projection uncertainty; and parts that several figures
+share."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def enlargement(dx: np.ndarray, dy: np.ndarray, extent: float, share: float = 0.
 
 
 def even_choice(items: np.ndarray, most: int) -> np.ndarray:
-    """At most so many items, every k-th of them."""
+    """Every k-th item, at most a given number."""
     return items[:: max(1, -(-len(items) // most))]
 
 
@@ -157,7 +157,7 @@ def residual_vectors(r: Residuals, name: str) -> Figure:
 
 
 def cell_means(r: Residuals, per_cell: float = 12.0) -> dict[str, np.ndarray]:
-    """Mean residual in square cells with about so many points: their places, means, and points in each."""
+    """Mean residual in square cells with a given mean number of points: positions, means, and number of points."""
     cell = np.sqrt(per_cell * r.sensor.cols * r.sensor.rows / max(len(r), 1))
     cell = float(np.clip(cell, r.sensor.cols / 24, r.sensor.cols / 3))
     col, row = ((v + 0.5) // cell for v in (r.x, r.y))
@@ -185,7 +185,7 @@ def mean_vectors(r: Residuals, name: str) -> Figure | None:
 
 
 def grid_vectors(grid: ResidualGrid, sensor: Sensor, name: str) -> Figure | None:
-    """The correction grid: what the parameters leave over, at its nodes."""
+    """The correction grid at its nodes."""
     x, y = np.meshgrid(grid.x_px, grid.y_px)
     dx, dy = grid.dx_px, grid.dy_px
     good = np.isfinite(dx + dy)

@@ -1,4 +1,4 @@
-"""What a calibration from straight lines is worth: its page, and its words for the terminal."""
+"""Page of a calibration from straight lines, and its summary for the terminal."""
 
 from __future__ import annotations
 
@@ -132,7 +132,7 @@ def drawn_lines(calibration: LineCalibration) -> list[Figure]:
 
 
 def worth(calibration: LineCalibration) -> str:
-    """One sentence on what is left over."""
+    """One sentence on the remaining residuals."""
     parts = [f"{length(a.rms_px, a.rms_um)} rms in {name}" for name, a in calibration.result.axes.items()]
     n, lines = int(calibration.result.used.sum()), len(calibration.result.lines)
     return f"{n} positions on {lines} lines lie on straight lines in the corrected image to {' and '.join(parts)}."

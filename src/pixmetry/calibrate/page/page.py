@@ -94,7 +94,7 @@ def page_of(calibration: Calibration) -> Page:
 
 
 def _channel(section: Section, calibration: Calibration, k: int) -> Section:
-    """Where what belongs to one camera goes: a section of its own where there are several."""
+    """The section for the parts of one camera: a separate one if there are several cameras."""
     cameras = calibration.adjustment.network.cameras
     return section if len(cameras) == 1 else section.add_section(cameras[k].name)
 
@@ -435,7 +435,7 @@ def _sheets(calibration: Calibration, r: Residuals, name: str) -> dict[str, Any]
 
 
 def _short(name: str, most: int = 22) -> str:
-    """An image's name as far as there is room; its end tells more than its beginning."""
+    """The end of an image's name, as far as there is room."""
     return name if len(name) <= most else "…" + name[1 - most :]
 
 

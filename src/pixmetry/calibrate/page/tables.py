@@ -44,7 +44,7 @@ NOT_SIGNIFICANT = 0.05
 
 
 def value(number: Any, digits: int = 3) -> str:
-    """A number to so many digits; a dash where there is none."""
+    """A number rounded to some digits; a dash if there is none."""
     return NONE if number is None else significant(float(number), digits)
 
 
@@ -182,7 +182,7 @@ def hold_out(found: HoldOut | None) -> list[list[str]]:
 
 
 def moved(compared: FieldComparison) -> list[list[str]]:
-    """By how much interior parameters moved when the field was set free, beside their formal u; by camera where there are several."""
+    """Change of the interior parameters with a free test field, with their formal u; by camera if there are several."""
     cameras = compared.cameras if len(compared.cameras) > 1 else {"": compared.first}
     rows = []
     for name, record in cameras.items():
@@ -231,7 +231,7 @@ def scale_bars(calibration: Calibration) -> list[list[str]]:
 
 
 def network_facts(calibration: Calibration) -> list[tuple[str, str]]:
-    """What the network is made of."""
+    """Numbers of the network: images, points, observations."""
     adjustment = calibration.adjustment
     net = adjustment.network
     images_count, points_count, used = counts(calibration)

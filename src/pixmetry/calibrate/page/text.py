@@ -1,4 +1,4 @@
-"""What a calibration is worth, in words: the sentences that its page, its terminal summary and its tables share."""
+"""Result of a calibration in words: the sentences of its page, its terminal summary and its tables."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def sentence(text: str) -> str:
 
 
 def of_camera(test: Mapping[str, T] | None, camera: str) -> T | None:
-    """What a test says of a camera; None where it was not made."""
+    """Record of a test for a camera; None if it was not made."""
     return None if test is None else test.get(camera)
 
 
@@ -112,7 +112,7 @@ def length(px: float, um: float | None) -> str:
 
 
 def worth(calibration: Calibration, camera: int) -> str:
-    """One sentence on what the calibration of a camera is worth."""
+    """One sentence on the accuracy of the calibration of a camera."""
     found = residual_record(calibration, camera)
     name = calibration.adjustment.network.cameras[camera].name
     if found.n == 0:
@@ -129,7 +129,7 @@ def worth(calibration: Calibration, camera: int) -> str:
 
 
 def sigma0_text(calibration: Calibration) -> str:
-    """By how much the image coordinates scatter, beside what was stated of them."""
+    """Scatter of the image coordinates, compared with their stated uncertainties."""
     adjustment = calibration.adjustment
     models = adjustment.network.cameras
     parts = [(model.name, of_camera(calibration.tests.variance_components, model.name)) for model in models]
