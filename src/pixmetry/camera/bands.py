@@ -56,7 +56,7 @@ def _same_span(needed: Windows, given: Windows, axis: int) -> bool:
 
 
 def stitch(parts: Iterable[Signal], grid: Grid, axis: int) -> Signal:
-    """Join bands along an axis; each is let go of as soon as it is copied, so that few of them exist at a time."""
+    """Join bands along an axis; each is released as soon as it is copied, so that only few are in memory at a time."""
     parts = iter(parts)
     first = next(parts)
     if first.data.shape == grid.size:

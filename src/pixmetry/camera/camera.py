@@ -252,7 +252,7 @@ class Camera:
             yield from imap_tiles(whole, numbers, threads)
 
     def _with_memory(self, task: _Task, numbers: Sequence[int], grid_of: Callable[[int], Grid], last_memory: int) -> Iterator[Signal]:
-        """Run frames 0, 1, 2 … in order through everything up to the last source with a memory, the rest as far as it is wanted."""
+        """Run frames 0, 1, 2 … in order through all sources up to the last one with a memory; run the others only for the wanted frames."""
         rising = numbers.step > 0 if isinstance(numbers, range) else numbers == sorted(set(numbers))
         if numbers and (not rising or numbers[0] < 0):
             raise InputError("a camera with a memory needs frame numbers that rise from 0", value=list(numbers[:5]))
@@ -287,7 +287,7 @@ class Camera:
         quiet: bool = False,
         **schedule: Any,
     ) -> np.ndarray:
-        """Expose many small windows, each of its own frame, as one batch.
+        """Expose many small windows, each of another frame, in one batch.
 
         Parameters
         ----------
@@ -467,7 +467,7 @@ class Camera:
         return x, y
 
     def truth(self, frame: int = 0, seed: int = 0, **schedule: Any) -> dict[str, dict[str, np.ndarray]]:
-        """Return what the sources did in one frame, by the name of the source: maps, masks, shifts of rows (see `Source.truth`)."""
+        """Return the true effects of the sources in one frame, by name of the source: maps, masks, shifts of rows (see `Source.truth`)."""
         told: dict[str, dict[str, np.ndarray]] = {}
         streams = self.streams(seed)
         for link in self.links:
@@ -571,7 +571,7 @@ def _grid_at(grid: Grid, windows: Windows) -> Grid:
 
 
 def _check_size(name: str, rows: int, cols: int, frames: int = 1) -> None:
-    """Refuse frames for which there is no memory: what goes into a source and what comes out are there at once, in single precision."""
+    """Refuse frames that do not fit into memory: input and output of a source exist at the same time, in single precision."""
     what = f"{f'{frames} frames' if frames > 1 else 'a frame'} of {cols} x {rows} pixels"
     check_memory(8.0 * frames * rows * cols, what, where=name, remedy="expose a window, or fewer frames at a time")
 

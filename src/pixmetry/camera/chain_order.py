@@ -88,7 +88,7 @@ def check_chain(chain: Sequence[Element], where: str = "camera") -> None:
 
 
 def _check_bits(chain: Sequence[Element], where: str) -> None:
-    """Refuse steps on codes that would cut off all codes but the lowest, because they are told of fewer bits than the converter has."""
+    """Refuse steps on codes that would cut off all codes but the lowest, because they assume fewer bits than the converter has."""
     converter: Element | None = None
     for element in chain:
         bits = getattr(element.params, "bits", None)

@@ -1,4 +1,4 @@
-"""How an error source reaches a target's position: the linear response of an estimator, and the contribution that comes of it.
+"""Effect of an error source on a target's position: the linear response of an estimator, and the resulting contribution.
 
 A contribution has four parts. What is *constant* over the frame and in time moves the principal point; what changes *smoothly* over the
 frame deforms the image: a calibration of the camera takes up both. What changes from *place* to place within a few pixels (with the phase
@@ -89,7 +89,7 @@ class Contribution:
 
     @property
     def calibrated_px(self) -> float:
-        """What of the total stays once a calibration has taken up what is constant and what is smooth; of the classes D and O, all."""
+        """Remaining total after a calibration, without the constant and the smooth part; for the classes D and O, the whole total."""
         if self.gum_class in UNSTEADY:
             return self.total_px
         return float(np.sqrt(0.5 * sum(v**2 for v in (*self.place_px, *(self.time_px or ())))))

@@ -1,4 +1,4 @@
-"""The conversions that a camera puts into its chain by itself: looking at the scene, holding pixels on the line, sampling the line."""
+"""The conversions that a camera inserts into its chain: sampling of the scene by pixels, the video line, sampling of the line."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class LineSources:
 
     @cached_property
     def line(self) -> Line:
-        """The line as it is without any draw, for its geometry; made once, whatever the number of windows."""
+        """The line without random draws, for its geometry; made once for any number of windows."""
         zero = np.zeros(1)
         return self.line_at(Signal(np.zeros((1, 1, 1), np.float32), Kind.DN, Grid.whole([0], (1, 1)), (1, 1), zero, zero, zero))
 

@@ -34,7 +34,7 @@ def image_shift(pull: Pull, signal: Signal) -> dict[str, np.ndarray]:
 
 
 def map_shifts(pull: Pull, probe: Probe) -> tuple[np.ndarray, np.ndarray]:
-    """Displacements of targets at `PLACES` × `PLACES` places, wherever the target's window fits into the frame; flat arrays."""
+    """Displacements of targets at `PLACES` × `PLACES` positions at which the target's window fits into the frame; flat arrays."""
     axes = []
     size = min(probe.signal_dn.shape[1:])  # windows of a video line are wider than the estimator needs
     for side in probe.frame_shape:

@@ -187,7 +187,7 @@ class Light:
         return self.seen_at(times, np.broadcast_to(weights, times.shape))
 
     def jittered(self, dx_px: np.ndarray, dy_px: np.ndarray) -> Light:
-        """Return the light with every pixel moved by an amount of its own; arrays of shape (n, rows, cols), added to those before."""
+        """Return the light with every pixel shifted by its own amount; arrays of shape (n, rows, cols), added to those before."""
         before = (0.0, 0.0) if self.jitter_px is None else self.jitter_px
         return replace(self, jitter_px=(before[0] + np.asarray(dx_px, float), before[1] + np.asarray(dy_px, float)))
 
@@ -239,7 +239,7 @@ class Light:
     # ---- sampling ---------------------------------------------------------------------------------------------------------------
 
     def fingerprint(self) -> bytes | None:
-        """What tells whether two exposures of the same windows see the same; None if the scene may change.
+        """Key that is equal for two exposures with the same light in the same windows; None if the scene may change.
 
         Coordinate maps are compared at 81 places of the frame: smooth maps that agree there to the last bit are the same.
         """
@@ -442,7 +442,7 @@ class Light:
         return count
 
     def _nodes(self, cell: tuple[float, float], dots: Any, boxes: int = 0) -> Iterator[tuple[float, float, float]]:
-        """Offsets and weights that stand for the aperture and the dots; or for the dots and the aperture cut into ``boxes``²."""
+        """Offsets and weights of the aperture and the dots; or of the dots and the aperture divided into ``boxes``² parts."""
         fine = self._smooth_px2**0.5
         axes = []
         for size in cell:

@@ -124,7 +124,7 @@ class Line:
         return replace(self, warps=(*self.warps, warp))
 
     def limited(self) -> Line:
-        """Return the line with the bandwidth that it has at least: one without a filter that lets no step through goes by ramps."""
+        """Return the line with limited bandwidth: a line without a filter that smooths steps becomes a line of ramps."""
         slow = any(len(poles) > len(zeros) for zeros, poles in self.filters)
         return self if slow else replace(self, ramps=True)
 
@@ -250,7 +250,7 @@ def group_delay_s(zeros: Any, poles: Any) -> float:
 
 
 def reach_px(zeros: Any, poles: Any, share: float, pixel_hz: float = 14.1875e6) -> int:
-    """Pixels until what is left of a filter's step response has fallen below ``share`` of it.
+    """Pixels until the remaining deviation of a filter's step response is below ``share`` of the step.
 
     From the slowest pole: its mode falls as e^(−|Re p| t), with room for the size that several equal poles may give it.
     """
@@ -384,7 +384,7 @@ def _cascade(sections: list[Section]) -> Section:
 
 
 def _sections(zeros: np.ndarray, poles: np.ndarray) -> list[Section]:
-    """Sections of first and second order of gain 1 at frequency 0; zeros go with poles two by two, a last one with what is free."""
+    """Sections of first and second order of gain 1 at frequency 0; zeros are combined with poles in pairs, a single zero with a pole."""
     pole_pairs, pole = _paired(poles)
     zero_pairs, zero = _paired(zeros)
     numerators = [(-(1 / z[0] + 1 / z[1]).real, (1 / (z[0] * z[1])).real) for z in zero_pairs]

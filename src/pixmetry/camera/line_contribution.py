@@ -1,4 +1,4 @@
-"""What a source of the video line does to a target: seen through the rest of the line, with the source and without."""
+"""Contribution of a source of the video line: the target behind the rest of the line, with the source and without."""
 
 from __future__ import annotations
 

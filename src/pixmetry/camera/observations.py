@@ -1,4 +1,4 @@
-"""Observations: what a camera's frames are reduced to, once, before anything is measured from them.
+"""Observations: reduced data of a camera's frames, computed once before any measurement.
 
 Records only. They are made by ``pixmetry.observe`` from streams of frames and read by the sources' ``measure``. All values are
 in DN of the stored frames unless the name says otherwise; variances in DN². Where temporal statistics come from pairs of frames,
@@ -56,7 +56,7 @@ class PhotonTransfer:
 
 @dataclass(frozen=True)
 class StackMoments:
-    """Moments of L frames taken at one setting (EMVA 1288 R4.0 §8): the mean image and how much noise is left in it."""
+    """Moments of L frames taken at one setting (EMVA 1288 R4.0 §8): the mean image and its remaining noise."""
 
     n_frames: int
     exposure_s: float
@@ -112,7 +112,7 @@ class CodeHistogram:
 
 @dataclass(frozen=True)
 class CodeErrors:
-    """What a light sweep tells of the converter's codes; all arrays have one entry per tested code, or per missing code."""
+    """Results of a light sweep on the converter's codes; all arrays have one entry per tested code, or per missing code."""
 
     codes: np.ndarray  # int64, the codes that were covered evenly enough to be tested
     dnl_lsb: np.ndarray
@@ -124,7 +124,7 @@ class CodeErrors:
 
 @dataclass(frozen=True)
 class DefectList:
-    """Pixels that stand out from the others; arrays have shape (defects,).
+    """Pixels that differ from the others; arrays have shape (defects,).
 
     ``kind`` is one of ``hot`` and ``cold`` (dark value), ``dead`` (less than half the response), ``gain`` (response off), ``stuck``
     (no response, no noise) and ``noisy`` (temporal noise); a pixel is listed once, under the worst of these.
@@ -171,7 +171,7 @@ class PatternList:
     moving_limit_dn: float  # the same for moving patterns; nan if the frames were not searched
 
     def strongest(self) -> PatternList:
-        """The strongest alone (or none): the one that the budget has a row for; the others stay in the noise that they make."""
+        """The strongest pattern only (or none), which has a row in the budget; the others count as part of the noise."""
         values = {f.name: getattr(self, f.name) for f in fields(self)}
         first: dict[str, Any] = {name: value[:1] for name, value in values.items() if isinstance(value, np.ndarray)}
         return replace(self, **first)
@@ -186,7 +186,7 @@ TAKEN_UP = (LENS, AFFINITY, "optics.cover_glass", "sensor.pixel_pitch", "sensor.
 
 @dataclass(frozen=True)
 class CameraGeometry:
-    """What a calibration with targets found of a camera's geometry, and what it left over.
+    """Geometry of a camera from a calibration with targets, and the remaining errors.
 
     Parameters
     ----------
@@ -231,7 +231,7 @@ class Storage:
 
 @dataclass(frozen=True)
 class Observations:
-    """Everything one campaign's frames were reduced to; what is not there is ``None``.
+    """All reduced data of one campaign; missing data are ``None``.
 
     ``photon_transfer_fit`` is the joint estimate made once from ``photon_transfer`` (and the stacks), which many sources read.
     """
@@ -274,7 +274,7 @@ class Observations:
         return self.dark_stack, self.bright_stack
 
     def fitted(self, names: Mapping[str, str], what: str, *, where: str, remedy: str) -> Estimates:
-        """Take a source's parameters ``{parameter: fitted name}`` out of the joint fit that holds the first of them, with their covariance.
+        """Take a source's parameters ``{parameter: fitted name}`` with their covariance from the joint fit that has the first of them.
 
         Raises
         ------

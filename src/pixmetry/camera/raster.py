@@ -50,7 +50,7 @@ def kernel_of(transfer: Transfer, half_cells: int) -> np.ndarray:
 
 
 def spread_of(transfer: Transfer, reach_px: float, beyond: Beyond, pitch_um: tuple[float, float]) -> tuple[np.ndarray, np.ndarray | None]:
-    """A point spread with a long tail: its kernel on the fine raster, and Gaussians for what goes beyond that.
+    """A point spread with a long tail: its kernel on the fine raster, and Gaussians for the tail beyond.
 
     Parameters
     ----------

@@ -13,7 +13,7 @@ from pixmetry.core.random import Grid
 
 
 class Kind(StrEnum):
-    """What the numbers of a signal mean.
+    """Meaning of the numbers of a signal.
 
     ``PHOTONS`` mean photons per pixel and exposure; ``ELECTRONS`` charge (mean before, a sample after the shot noise); ``DN`` the
     analogue signal in units of the converter's step, black at 0; ``CODES`` stored whole numbers.
@@ -88,7 +88,7 @@ class Windows:
 
 @dataclass(frozen=True)
 class Clock:
-    """How a camera reads out: pixel clock, and time from line to line of one field (CCIR unless told otherwise)."""
+    """How a camera reads out: pixel clock, and time from line to line of one field (CCIR by default)."""
 
     pixel_hz: float = 14.1875e6
     line_s: float = 64e-6

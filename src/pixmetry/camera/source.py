@@ -168,7 +168,7 @@ class Source:
 
     @property
     def stage(self) -> str:
-        """The folder of the chain that holds it."""
+        """Stage of the source: the folder of its module."""
         return self.id.split(".")[0]
 
     @property
@@ -191,7 +191,7 @@ class Source:
         return windows if self.context is None else self.context(params, windows, frame_shape)
 
     def make(self, values: Mapping[str, Any] | None = None, where: str = "") -> Parameters:
-        """Validated parameters from plain values; ``InputError`` says what is wrong."""
+        """Validated parameters from plain values; ``InputError`` states the error."""
         from pixmetry.core.config import validate
 
         return validate(self.parameters, dict(values or {}), where or self.id)

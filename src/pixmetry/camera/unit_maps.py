@@ -1,4 +1,4 @@
-"""What was measured in one unit of a camera, pixel by pixel or code by code, in place of patterns that are drawn; and its file.
+"""Measured maps of one unit of a camera, by pixel or by code, in place of random patterns; and their file.
 
 The arrays stand beside the camera file in an NPZ archive. The camera file names each with a digest of its content, so that the archive of
 another camera, or a damaged one, is found out.
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class MeasuredUnit:
-    """The unit of which a camera's elements hold maps: they take the place of what its seed would draw; other seeds draw.
+    """The unit whose maps the elements of a camera contain. They replace the random patterns of its seed; other seeds draw patterns.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ def check_maps(element: Element, where: str) -> None:
 
 
 def maps_file(camera_file: str | Path) -> Path:
-    """Where the maps of a camera file stand: ``camera.maps.npz`` beside ``camera.yaml``."""
+    """Path of the maps of a camera file: ``camera.maps.npz`` beside ``camera.yaml``."""
     return Path(camera_file).with_suffix(".maps.npz")
 
 

@@ -31,7 +31,7 @@ def wave(signal: Signal, frequency_x: float, frequency_y: float, phase: np.ndarr
 
 
 def without_wave(signal: Signal, frequency_x: float, frequency_y: float, most_dn: float = np.inf) -> np.ndarray | None:
-    """Fit amplitude and phase of a sinusoid to the background of every window, and return the data less what is significant of it.
+    """Fit amplitude and phase of a sinusoid to the background of every window, and return the data minus its significant part.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ def without_wave(signal: Signal, frequency_x: float, frequency_y: float, most_dn
 
 
 def _background_wave(data: np.ndarray, row: np.ndarray, col: np.ndarray) -> complex:
-    """What is significant of the complex amplitude a of Re(a z), z = row × col, in one window."""
+    """Significant part of the complex amplitude a of Re(a z), z = row × col, in one window."""
     amplitude = 0j
     for _ in range(2):
         target, sigma = _targets(data - np.outer(amplitude * row, col).real if amplitude else data)

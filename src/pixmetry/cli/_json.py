@@ -11,14 +11,14 @@ import click
 
 
 def json_option(what: str, parameter: str = "json_file") -> Callable[[Any], Any]:
-    """The option ``--json FILE`` of a command, as this parameter of it; ``what`` says in words what is written."""
+    """The option ``--json FILE`` of a command, under this name of the parameter; ``what`` describes the content in words."""
     kind = click.Path(path_type=Path, allow_dash=True)
     text = f"Also write {what} as JSON into this file. With - only the JSON is printed."
     return click.option("--json", parameter, type=kind, metavar="FILE", help=text)
 
 
 class JsonResult:
-    """Where a command's result goes as JSON.
+    """Output of a command's result as JSON.
 
     Parameters
     ----------

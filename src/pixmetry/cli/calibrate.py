@@ -156,7 +156,7 @@ def calibrate(
 
 
 def _summary(calibration: Any, report: Path) -> str:
-    """What is printed."""
+    """The text for the terminal."""
     from pixmetry.calibrate.lines.plumb_line import LineCalibration
 
     if isinstance(calibration, LineCalibration):

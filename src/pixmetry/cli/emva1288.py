@@ -263,7 +263,7 @@ def _refuse_sheets(campaigns: Sequence[Path]) -> None:
 
 
 def _known_cameras(source: Path | None, bayer: str | None, more: dict[str, Any]) -> tuple[dict[str, KnownCamera], dict[str, Any]]:
-    """What a data sheet says of a camera, or a look at the frames of a campaign, by channel; and its name and colour filter."""
+    """Known values of a camera by channel, from a data sheet or from a few frames of a campaign; and its name and colour filter."""
     from pixmetry.emva.planning.planning import camera_from_sheet
     from pixmetry.emva.planning.preflight import camera_from_preflight, preflight_campaign
     from pixmetry.files import load_campaign

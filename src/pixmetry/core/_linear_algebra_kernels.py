@@ -81,7 +81,7 @@ def solve(matrix: Array, n: int, right: Array, damping: float, factor: Factor, o
 
 @jit
 def invert_root(factor: Factor, n: int, out: Array) -> None:
-    """Put the lower triangle R with M⁻¹ = Rᵀ R into ``out``, shape (n, n) or more; what is above its diagonal stays."""
+    """Put the lower triangle R with M⁻¹ = Rᵀ R into ``out``, shape (n, n) or more; the part above its diagonal is not changed."""
     lower, scale = factor.lower, factor.scale
     for i in range(n):
         out[i, i] = 1.0 / lower[i, i]

@@ -26,7 +26,7 @@ _W0, _W1 = np.uint64(0x9E3779B9), np.uint64(0xBB67AE85)
 def _round(
     c0: np.uint64, c1: np.uint64, c2: np.uint64, c3: np.uint64, k0: np.uint64, k1: np.uint64
 ) -> tuple[np.uint64, np.uint64, np.uint64, np.uint64]:
-    """One round on 32-bit words held in uint64. High halves of c1 and c3 may hold rubbish; it is masked before it matters."""
+    """One round on 32-bit words held in uint64. High halves of c1 and c3 may be invalid; they are masked before use."""
     p0 = _M0 * c0
     p1 = _M1 * c2
     return ((p1 >> _32) ^ c1 ^ k0) & _LOW, p1 & _LOW, ((p0 >> _32) ^ c3 ^ k1) & _LOW, p0 & _LOW
@@ -233,7 +233,7 @@ def fold(numerator: np.uint64) -> tuple[np.float32, np.float32]:
 
 @jit(forceinline=True)
 def poisson_fast(mean: np.float32, p: np.float32, x: np.float32) -> np.float32:
-    """Poisson quantile in float32 at u with (p, x) = fold(u), or NaN where its error bound does not tell between two integers.
+    """Poisson quantile in float32 at u with (p, x) = fold(u), or NaN if its error bound cannot decide between two integers.
 
     Expansion of the quantile in powers of 1 / sqrt(mean): Giles (2016), ACM TOMS 42(1), Algorithm 955, carried to 1 / mean.
     """
@@ -350,7 +350,7 @@ def _tail(n: float, mean: float, upper: bool) -> float:
 
 @jit
 def _settle(n: float, mean: float, p: float, upper: bool) -> float:
-    """Move from a guess to the smallest n with P(N <= n) >= u, told from the tail: p = u, or 1 - u if upper."""
+    """Move from a guess to the smallest n with P(N <= n) >= u, counted from the tail: p = u, or 1 - u if upper."""
     if upper:
         while _tail(n, mean, True) > p:
             n += 1.0

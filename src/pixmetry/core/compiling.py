@@ -1,4 +1,4 @@
-"""Whoever waits while kernels are compiled is told so: once, and only when it takes a while."""
+"""A message to the user while kernels are compiled: once, and only if it takes more than a second."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _first_s: float | None = None
 
 
 def tell_when_compiling(told: Callable[[], None] | None) -> None:
-    """Have a function called once, as soon as kernels have been compiled for more than a second and a half; None: no more.
+    """Register a function that is called once, as soon as kernels have been compiled for more than a second and a half; None: none.
 
     It is called from the thread that compiles. Kernels that come from the cache on disk are not compiled.
     """

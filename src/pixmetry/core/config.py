@@ -29,7 +29,7 @@ AnyModel = TypeVar("AnyModel", bound=BaseModel)
 
 
 class Settings(dict[str, Any]):
-    """A mapping read from YAML that remembers on which line each value stands.
+    """A mapping read from YAML that knows the line of each value.
 
     Attributes
     ----------
@@ -110,7 +110,7 @@ def _syntax_error(problem: Any, path: str | Path) -> InputError:
 
 
 def _lines(node: Any, at: tuple[str | int, ...], seen: set[int]) -> Iterator[tuple[tuple[str | int, ...], int]]:
-    """Walk a composed YAML tree and yield (path, line) pairs; what an alias repeats is walked once (it may hold itself)."""
+    """Walk a composed YAML tree and yield (path, line) pairs; a repeated alias is walked once (it may contain itself)."""
     from ruamel.yaml.nodes import MappingNode, SequenceNode
 
     if id(node) in seen:
@@ -159,7 +159,7 @@ def _of_schema(error: Any) -> bool:
 
 
 def _place_in(data: Any, error: Any) -> tuple[str | int, ...]:
-    """Keys and positions of a problem as they stand in the data: pydantic names the members of unions between them."""
+    """Keys and positions of a problem as in the data: pydantic names the members of unions between them."""
     loc: list[str | int] = []
     parts = error["loc"]
     for k, part in enumerate(parts):

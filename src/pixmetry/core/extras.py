@@ -1,4 +1,4 @@
-"""Packages that only some jobs need: each comes with an extra of the installation, and who lacks one is told how to get it."""
+"""Packages that only some jobs need: each comes with an extra of the installation; the error for a missing one names the extra."""
 
 from __future__ import annotations
 

@@ -208,12 +208,12 @@ class _Store:
             part.unlink(missing_ok=True)
 
     def flush(self) -> None:
-        """Remove what is kept of this kernel; Numba calls it before it compiles all again."""
+        """Remove the stored code of this kernel; Numba calls it before it compiles again."""
         for file in self.folder.glob(f"{self.function.__name__}-*.nbc"):
             file.unlink(missing_ok=True)
 
     def _key(self, signature: Any, codegen: Any) -> str | None:
-        """Name all that the compiled code depends on beside the sources; None when an argument is a function, which has no lasting name."""
+        """Name everything besides the sources that the compiled code depends on; None if an argument is a function, which has no name."""
         from numba.core.serialize import dumps
         from numba.core.sigutils import normalize_signature
 
@@ -269,7 +269,7 @@ def _watch_numba() -> None:
 
 
 def _cache_folder(function: Callable[..., Any]) -> Path | None:
-    """Return the folder for the compiled code of a function, or None when its source cannot be trusted to stand still."""
+    """Return the folder for the compiled code of a function, or None if its source may change."""
     try:
         sources = _sources_of(function)
     except (OSError, SyntaxError):

@@ -75,7 +75,7 @@ def _of_system() -> int | None:
 
 
 def _of_group() -> int | None:
-    """What a container leaves; pages of files that it holds can be given back."""
+    """Free memory of a container; its cached file pages count as free."""
     for limit, usage, held in _GROUP:
         try:
             most = int((root := Path("/sys/fs/cgroup") / limit).read_text())

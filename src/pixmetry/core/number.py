@@ -96,7 +96,7 @@ class Number:
 
     @classmethod
     def not_available(cls, unit: str, reason: str, method: str = "", name: str = "") -> Number:
-        """What stands for a number that cannot be had."""
+        """Text in place of a number that is not available."""
         return cls(math.nan, math.nan, math.nan, unit, method, reason, NOT_AVAILABLE, name)
 
     @property
@@ -302,7 +302,7 @@ class Estimates:
 
     @classmethod
     def empty(cls) -> Estimates:
-        """A set with nothing in it."""
+        """An empty set."""
         return cls((), np.zeros(0), np.zeros((0, 0)), np.zeros(0), ())
 
     def to_records(self) -> list[dict[str, Any]]:

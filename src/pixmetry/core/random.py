@@ -290,7 +290,7 @@ class Stream:
 
 
 class _Quiet:
-    """A stream whose temporal draws are at their mean; what is fixed in the unit is drawn as always."""
+    """A stream whose temporal draws equal their mean; fixed patterns of the unit are drawn as usual."""
 
     quiet = True
 
@@ -362,5 +362,5 @@ def _key(seed: int, life: str, name: str, kind: str, draw: int) -> np.uint64:
 
 
 def generator(seed: int, name: str) -> Generator:
-    """A generator for draws that have no place on a sensor, such as those of a result's uncertainty; of its own for each seed and name."""
+    """A generator for draws without a position on a sensor, such as those of a result's uncertainty; another one for each seed and name."""
     return Generator(Philox(key=int(_key(seed, "result", name, "", 0))))

@@ -1,4 +1,4 @@
-"""What the dark levels tell of the temporal noise without light, and what quantisation and clipping at black hide of noise and pattern."""
+"""Temporal noise without light from the dark levels, and the parts of noise and pattern that quantisation and clipping at black hide."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class DarkNoise:
 
     @property
     def blind(self) -> bool:
-        """Whether so many are that the dark frames tell nothing of noise and pattern."""
+        """Whether so many pixels are clipped that the dark frames show neither noise nor pattern."""
         return self.black > MOSTLY_BLACK
 
 

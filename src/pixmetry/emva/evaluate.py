@@ -78,7 +78,7 @@ def evaluate(m: Measurement, release: str, *, draws: int = 4000) -> Results:
 
 
 def standard_values(m: Measurement, release: str, *, draws: int = 4000) -> Results:
-    """What a release itself says of one channel: :func:`evaluate` without curves and without what stands beside the standard.
+    """Values of a release for one channel: :func:`evaluate` without curves and without what stands beside the standard.
 
     Parameters
     ----------
@@ -105,7 +105,7 @@ def _check_release(release: str) -> None:
 
 
 def _by_release(m: Measurement, release: str, draws: int, with_curves: bool = True) -> Results:
-    """What the release itself says; where there is no series for it, what needs none."""
+    """Values of the release; without a series, only those that need none."""
     try:
         formulas = Formulas.of(m, release)
         scatter = scatter_of(m, formulas.series)
@@ -150,7 +150,7 @@ def _case(m: Measurement, formulas: Formulas, measured: Values, squares: Values,
 
 
 def _nonlinear(m: Measurement, release: str) -> Results:
-    """What stands beside it."""
+    """Values in addition to the standard."""
     values, notes = nonlinear_values(m)
     return Results(release, values, notes=notes)
 
@@ -236,7 +236,7 @@ def _stack_draws(formulas: Formulas, scatter: Scatter, draws: int, still: int, r
 
 
 def _rows(drawn: tuple[Values, Values], rows: slice, total: int) -> tuple[Values, Values]:
-    """Some of the draws; a value that is one for all of them stands for each."""
+    """Some of the draws; a value that is equal for all draws is kept as one value."""
     values, squares = ({k: np.broadcast_to(v, (total,))[rows] for k, v in part.items()} for part in drawn)
     return values, squares
 
@@ -259,7 +259,7 @@ def _deviations(centre: tuple[Values, Values], drawn: tuple[Values, Values]) -> 
 
 
 def _value(key: str, case: Case) -> Number:
-    """One value with its uncertainty, or the limit or reason that stands for it."""
+    """One value with its uncertainty, or the limit or reason in its place."""
     formulas, measured, squares, spread, noise = case.formulas, case.measured, case.squares, case.spread, case.noise
     unit, method, reason = KEYS[key].unit, _method(key, formulas.release), reason_for(key, case)
     if key not in measured or key not in spread.u or is_blind(key, case) or breaks_the_split(key, case):

@@ -35,7 +35,7 @@ class Formulas:
 
     @classmethod
     def of(cls, m: Measurement, release: str) -> Formulas:
-        """Prepare the series and the stacks, and find out what the measurement carries."""
+        """Prepare the series and the stacks, and find the values that the measurement allows."""
         missing = {}
         stacks = None
         try:
@@ -50,7 +50,7 @@ class Formulas:
 
     @cached_property
     def plan(self) -> Plan:
-        """What the General model chooses from the measured series; ``MeasureError`` where that carries no characteristic curve."""
+        """Choices of the General model from the measured series; ``MeasureError`` if the series gives no characteristic curve."""
         return make_plan(self.series)
 
     @property
@@ -99,7 +99,7 @@ class Formulas:
 
 @dataclass(frozen=True)
 class Spread:
-    """What draws of the inputs tell, by key; of the measured values and of the variances behind roots."""
+    """Spread of the draws by key, for the measured values and for the variances behind roots."""
 
     u: dict[str, float]
     u_square: dict[str, float]

@@ -63,7 +63,7 @@ def is_curved(series: Series) -> bool:
 
 
 def level_free_values(series: Series, least_dark_var_dn2: float = MINIMUM_DARK_VAR_DN2) -> dict[str, np.ndarray]:
-    """What holds whatever the response: dark noise and dark current in codes; arguments and shapes as of ``temporal_values``."""
+    """Values that hold for any response: dark noise and dark current in codes; arguments and shapes as of ``temporal_values``."""
     _, mean_slope, var, _ = dark_line(series)
     return {
         "index_start": np.zeros(np.shape(var), dtype=int),
@@ -73,12 +73,12 @@ def level_free_values(series: Series, least_dark_var_dn2: float = MINIMUM_DARK_V
 
 
 def is_level_free(key: str) -> bool:
-    """Whether a spatial value holds whatever the response: variances, and the pattern in the dark, in codes."""
+    """Whether a spatial value holds for any response: variances, and the pattern in the dark, in codes."""
     return KEYS[key].unit in IN_CODES
 
 
 def linear_model(results: Results) -> str:
-    """What the frames say of the Linear model.
+    """Verdict of the frames on the Linear model.
 
     Returns
     -------

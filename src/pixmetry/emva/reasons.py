@@ -1,4 +1,4 @@
-"""Why a value is missing, a limit, or not what it seems, in words; and notes on a whole measurement."""
+"""Reasons in words why a value is missing, is a limit, or needs care; and notes on a whole measurement."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def is_bound(key: str) -> bool:
 
 
 def is_blind(key: str, case: Case) -> bool:
-    """Whether the dark frames, clipped at black, tell nothing of a value; the reference implementation gives it all the same."""
+    """Whether dark frames clipped at black cannot show a value; the reference implementation gives it anyway."""
     dark = is_bound(key) or key.startswith("DR") or key in DARK_PATTERN + GENERAL_ON_DARK_NOISE or KEYS[key].section == "dark_current"
     return dark and case.noise.blind and case.formulas.release != "reference"
 
@@ -112,12 +112,12 @@ def breaks_the_split(key: str, case: Case) -> bool:
 
 
 def reason_for(key: str, case: Case) -> str:
-    """What the reader should know about one value; empty where there is nothing to say."""
+    """The reason of one value; empty if there is none."""
     return next((said for rule in RULES if (said := rule(key, case)) is not None), "")
 
 
 def _lacking(key: str, case: Case) -> str | None:
-    """What the measurement does not carry."""
+    """The reason for a value that the measurement does not allow."""
     bright, formulas = case.m.transfer.bright, case.formulas
     if KEYS[key].section in formulas.missing:
         return formulas.missing[KEYS[key].section]
@@ -133,7 +133,7 @@ def _lacking(key: str, case: Case) -> str | None:
 
 
 def _clipped(key: str, case: Case) -> str | None:
-    """Black is cut off: what the dark frames show is brighter and calmer than the camera is."""
+    """Black is cut off: the dark frames are brighter and have less noise than the camera."""
     touched = is_bound(key) or key in DARK_PATTERN or KEYS[key].section == "dark_current" or key.startswith(ON_DARK_LEVELS)
     if not (case.noise.clipped and touched):
         return None
@@ -311,13 +311,13 @@ def _nearest_text(bright_s: np.ndarray, dark_s: np.ndarray) -> str:
 
 
 def ends_early(formulas: Formulas, measured: Values) -> bool:
-    """Whether the last level of the series, still below saturation, stands for it."""
+    """Whether the last level of the series, below saturation, takes its place."""
     at = int(measured.get("index_u_ysat", -1))
     return at == formulas.series.mean_dn.size - 1 and bool(formulas.series.fraction_max[at] < SATURATED_FRACTION / 2)
 
 
 def notes_of(case: Case, values: dict[str, Number], linear: str) -> tuple[str, ...]:
-    """What the reader should know about the measurement as a whole; ``linear`` is what ``linear_model`` says of it."""
+    """Notes on the measurement as a whole; ``linear`` is the result of ``linear_model``."""
     m, formulas, measured = case.m, case.formulas, case.measured
     series, notes = formulas.series, []
     if linear == FAILS:

@@ -1,4 +1,4 @@
-"""What a test by EMVA 1288 starts from and what it ends with. Records only."""
+"""Input and result of a test by EMVA 1288. Records only."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class FrameProducts:
 
 @dataclass(frozen=True)
 class Measurement:
-    """What the frames of one channel of one camera were reduced to."""
+    """Reduced data of the frames of one channel of one camera."""
 
     transfer: PhotonTransfer  # bright levels by exposure, then photons; dark levels by exposure
     dark_stack: StackMoments | None = None

@@ -1,4 +1,4 @@
-"""From frames to what a test by EMVA 1288 starts from, in one pass over the frames; a mosaic camera phase by phase."""
+"""From frames to the input of a test by EMVA 1288, in one pass over the frames; a mosaic camera phase by phase."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ STACK_REMEDY = "take 16 or more dark frames, and as many at half of saturation, 
 
 @dataclass(frozen=True)
 class Phase:
-    """One place of a mosaic's cell of 2 x 2 pixels; what is left of a cell at the edge of a frame is cut off."""
+    """One position of a mosaic's cell of 2 x 2 pixels; incomplete cells at the edge of a frame are cut off."""
 
     row: int
     col: int

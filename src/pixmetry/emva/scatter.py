@@ -1,4 +1,4 @@
-"""How the levels of an exposure series scatter, read from the series itself.
+"""Scatter of the levels of an exposure series, estimated from the series itself.
 
 Four independent causes:
 

@@ -1,4 +1,4 @@
-"""The exposure series as EMVA 1288 takes it: bright levels in order of their light, each beside the dark level of its exposure."""
+"""The exposure series of EMVA 1288: bright levels in order of their light, each with the dark level of its exposure."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def count_exposures(exposure_s: np.ndarray) -> int:
 
 
 def light_of(series: Series) -> tuple[np.ndarray, str] | None:
-    """What the light of a level is counted by, and its unit: photons, else seconds of exposure; ``None`` where neither tells it."""
+    """The measure of the light of a level, and its unit: photons, otherwise seconds of exposure; ``None`` if neither is known."""
     if series.photons is not None:
         return series.photons, "photon"
     if exposure_varies(series.exposure_s):

@@ -10,7 +10,7 @@ from pixmetry.observe.stack import EQUAL_EXPOSURE, SATURATED_FRACTION
 
 
 class Key(NamedTuple):
-    """What a key stands for; ``unit`` in plain text, ``clause`` of EMVA 1288 R4.0 Linear."""
+    """Meaning of a key; ``unit`` in plain text, ``clause`` of EMVA 1288 R4.0 Linear."""
 
     section: str
     title: str
@@ -105,7 +105,7 @@ def goes_with_photons(name: str) -> bool:
 
 
 def key_of(name: str) -> Key:
-    """What a key stands for, with or without the suffix ``_nonlinear``."""
+    """Meaning of a key, with or without the suffix ``_nonlinear``."""
     if name in KEYS:
         return KEYS[name]
     base = KEYS[name.removesuffix(NONLINEAR)]

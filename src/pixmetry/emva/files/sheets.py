@@ -76,7 +76,7 @@ def write_files(sheet: DataSheet, files: Mapping[str, Path], inputs: Iterable[Pa
 
 
 def content_of(sheet: DataSheet, kind: str) -> bytes:
-    """Return what a file of this kind holds of a data sheet."""
+    """Return the data sheet of a file of this kind."""
     if kind in ("pdf", "report"):
         from pixmetry.emva.page.page import page_of
         from pixmetry.report import html_of, pdf_of

@@ -141,7 +141,7 @@ def general_evaluation(series: Series, plan: Plan | None = None) -> tuple[dict[s
 
 
 def general_notes(plan: Plan) -> tuple[str, ...]:
-    """What the reader of the values of one series should know: what was extrapolated, and what ended the series.
+    """Notes on the values of one series: extrapolations, and the reason for the end of the series.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""The smooth curves of EMVA 1288 R4.0 General: which levels they go through, how stiff they are, and what is read from them."""
+"""The smooth curves of EMVA 1288 R4.0 General: their levels, their stiffness, and the values that follow from them."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Levels:
 
 @dataclass(frozen=True)
 class Plan:
-    """What is chosen once, from one series: its levels, and how their curves are smoothed."""
+    """Choices that are made once from one series: its levels, and the smoothing of their curves."""
 
     order: np.ndarray  # of the levels
     end: ResponseEnd

@@ -1,4 +1,4 @@
-"""The values of a data sheet with the camera's non-linearity taken into account, to stand beside the standard's."""
+"""The values of a data sheet with the camera's non-linearity taken into account, for comparison with the standard's values."""
 
 from __future__ import annotations
 

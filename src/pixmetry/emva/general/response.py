@@ -41,7 +41,7 @@ class ScatterFit:
 
     @property
     def standardised(self) -> np.ndarray:
-        """Residuals over their standard deviations, freed of what the fit took."""
+        """Residuals over their standard deviations, corrected for the degrees of freedom of the fit."""
         z = np.divide(self.fit.residuals, self.u, out=np.zeros_like(self.u), where=self.u > 0)
         return z / np.sqrt(np.maximum(1 - self.fit.leverage, 0.05))
 

@@ -1,4 +1,4 @@
-"""What a data sheet by EMVA 1288 says in words and numbers, camera and conditions included; HTML page and PDF lay out the same text."""
+"""Text and numbers of a data sheet by EMVA 1288, with camera and conditions; HTML page and PDF have the same text."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ class MainRow:
 
 
 def release_title(release: str) -> str:
-    """The document that a data sheet goes by, in words."""
+    """The document of the standard that applies, in words."""
     return RELEASE_TITLES.get(release, release)
 
 
@@ -103,7 +103,7 @@ def symbol_parts(symbol: str) -> tuple[str, str]:
 
 
 def describe(name: str, unit: str) -> Key:
-    """What a key stands for; one that no list knows stands for itself."""
+    """Meaning of a key; an unknown key is returned unchanged."""
     return key_of(name) if name.removesuffix(NONLINEAR) in KEYS else Key("other", name, "", unit)
 
 
@@ -114,7 +114,7 @@ def say(results: Results, key: str) -> str:
 
 
 def dof_text(value: Number) -> str:
-    """Degrees of freedom; beyond a thousand they make no difference, and a dash stands where there is no uncertainty."""
+    """Degrees of freedom; above a thousand they make no difference. A dash if there is no uncertainty."""
     if value.dof != value.dof or not value.u > 0:
         return NONE
     if value.dof > MANY_DOF:
@@ -143,7 +143,7 @@ def _without_unit(number: PrintedNumber, unit: str) -> PrintedNumber:
 
 
 def main_keys(channels: Sequence[Results]) -> tuple[str, ...]:
-    """Which values the first page holds: General's too where a channel goes by that document."""
+    """Values of the first page; those of General as well if it applies to a channel."""
     linearity = () if any("LE" in r.values for r in channels) else ("LE_min", "LE_max")
     return (*MAIN, *linearity, *(GENERAL if any(departs(r) for r in channels) else ()))
 
@@ -165,7 +165,7 @@ def _method(name: str, value: Number) -> str:
 
 
 def all_rows(results: Results, methods: Sequence[str]) -> dict[str, list[Row]]:
-    """All values of a channel by section; a ``_nonlinear`` value stands beside the standard's."""
+    """All values of a channel by section; a ``_nonlinear`` value is in the row of the standard's value."""
     sections: dict[str, list[Row]] = {title: [] for title in SECTIONS.values()}
     for name, value in results.values.items():
         if name.endswith(NONLINEAR) and name.removesuffix(NONLINEAR) in results.values:
@@ -197,7 +197,7 @@ def all_rows(results: Results, methods: Sequence[str]) -> dict[str, list[Row]]:
 
 
 def worst_of(channels: Sequence[Results]) -> Results:
-    """The channel that decides which document a camera goes by: the one that is least a linear camera's."""
+    """The channel that decides on the document of a camera: the one with the largest departure from a linear camera."""
 
     def gravity(results: Results) -> tuple[int, float]:
         departure = results.values.get("PTC_linearity")
@@ -224,7 +224,7 @@ def headline_keys(channels: Sequence[Results]) -> tuple[str, ...]:
 
 
 def document(results: Results) -> str:
-    """Which document of the standard this camera goes by, and why."""
+    """The document of the standard that applies to this camera, and the reason."""
     if results.release == "3.1":
         return "Release 3.1 has one document, for linear cameras."
     if results.release == "reference":

@@ -1,4 +1,4 @@
-"""What the plots of an EMVA 1288 data sheet share: each draws into axes that it is given, on a page or on paper."""
+"""Common parts of the plots of an EMVA 1288 data sheet; each draws into given axes, for the page or the PDF."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ MARGINS_IN = {"left": 0.62, "right": 0.08, "bottom": 0.42, "top": 0.22}  # room 
 
 @dataclass(frozen=True)
 class Plot:
-    """One plot: what it is called, what it shows in words, and how it is drawn; without ``draw`` the caption says what it needs."""
+    """One plot: its name, its description in words, and the function that draws it; without ``draw`` the caption states what it needs."""
 
     name: str
     group: str

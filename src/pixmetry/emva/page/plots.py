@@ -123,7 +123,7 @@ def _photon_transfer(c: Curve, r: Results) -> Drawn:
 
 
 def _end(r: Results) -> str:
-    """What the brightest level is that counts: saturation, or just the last one."""
+    """Name of the brightest level that counts: saturation, or the last level."""
     capacity = r.values.get("u_p_sat")
     return "last level" if capacity is not None and capacity.is_lower_limit else "saturation"
 

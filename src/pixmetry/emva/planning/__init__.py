@@ -1,1 +1,1 @@
-"""Before a test: how many frames, and whether the set-up is fit for it."""
+"""Before a test: the number of frames, and a check of the set-up."""

@@ -1,4 +1,4 @@
-"""What is known of a camera and its light before a test: typed, or taken from an earlier test's results."""
+"""Known values of a camera and its light before a test: given, or from the results of an earlier test."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ class KnownCamera:
 
 
 def camera_from_results(values: Mapping[str, Any], rows: int, cols: int, bits: int, **more: Any) -> KnownCamera:
-    """Take what a test found as what is known.
+    """Take the results of a test as known values.
 
     Parameters
     ----------
@@ -130,7 +130,7 @@ def number_in(value: Any, name: str = "value") -> float:
 
 
 def first_to_saturate(cameras: Mapping[str, KnownCamera]) -> str:
-    """Of the channels of a camera the one that one light saturates first: a series is planned for it."""
+    """The channel of a camera that saturates first; the series is planned for it."""
 
     def order(channel: str) -> tuple[float, float]:
         camera = cameras[channel]

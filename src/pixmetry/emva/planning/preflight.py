@@ -46,7 +46,7 @@ class BrightLevel(NamedTuple):
 
 @dataclass(frozen=True)
 class Preflight:
-    """Checks of a few frames, and what the frames were reduced to."""
+    """Checks of a few frames, and the reduced data of the frames."""
 
     checks: tuple[Check, ...]
     frames: Frames
@@ -102,7 +102,7 @@ def preflight_record(result: Preflight) -> dict[str, Any]:
 
 
 def preflight_text(result: Preflight) -> str:
-    """The checks as a table, what is wrong below it."""
+    """The checks as a table, with explanations below it."""
     dark, bright = result.frames.dark, result.frames.bright
     levels = f"{sum(g.n_frames for g in bright)} bright frames at {len(bright)} level{'s'[: len(bright) > 1]}"
     lines = [f"Preflight of {dark.n_frames} dark and {levels}: {result.verdict}", ""]
@@ -189,7 +189,7 @@ REACH = 0.7  # of the brightest level's signal
 
 
 class Look(NamedTuple):
-    """What the first frame of a group tells of it, as far as a stack is chosen by it."""
+    """Properties of a group from its first frame, for the choice of a stack."""
 
     exposure_s: float
     n_frames: int
