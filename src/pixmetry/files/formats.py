@@ -119,7 +119,7 @@ def frame_name(path: Path) -> str:
 
 
 def frames_of(path: Path, raw: RawLayout | None = None) -> list[Path]:
-    """Name the frames of a file: the file itself where it holds one.
+    """Names of the frames in a file; a file with one frame is its own name.
 
     Raises
     ------
@@ -133,7 +133,7 @@ def frames_of(path: Path, raw: RawLayout | None = None) -> list[Path]:
 
 
 def raw_file(path: Path, raw: RawLayout | None) -> bool:
-    """Whether a file holds values without a header: where a layout is given, any whose ending is not that of a format with one."""
+    """Whether a file has no header: if a layout is given, every file whose ending is not that of a format with a header."""
     return raw is not None and path.suffix.lower() not in PICTURE_ENDINGS
 
 
@@ -161,7 +161,7 @@ def read_stacked(path: Path, raw: RawLayout | None = None) -> tuple[Decoded, str
 
 
 def opened(path: Path, raw: RawLayout | None = None) -> FrameFile:
-    """Open a file that may hold several frames; what was parsed is kept, as long as the file does not change.
+    """Open a file that may have several frames; the parsed header is kept as long as the file does not change.
 
     Raises
     ------

@@ -100,7 +100,7 @@ def read_picture(path: str | Path, channel: str | None = None, raw: RawLayout | 
 
 
 def load_picture(path: Path, channel: str | None = None, raw: RawLayout | None = None) -> Decoded:
-    """As `read_picture`, with what is to be said of the file: that it was stored with loss, or is to be turned for display."""
+    """As `read_picture`, with notes on the file: stored with loss, or to be rotated for display."""
     if channel is not None and channel not in CHANNELS:
         raise InputError("no such channel", value=channel, allowed=", ".join(CHANNELS))
     if is_entry(path):
@@ -304,7 +304,7 @@ class FrameReader:
 
     @property
     def storage(self) -> Storage:
-        """Whether the frames that were read so far were stored without loss; what the manifest states goes beyond the files."""
+        """Whether the frames read so far were stored without loss; a statement of the manifest has priority over the files."""
         stated = self.campaign.camera.lossless
         if False in self._coders:
             return Storage(False, "proven")

@@ -395,7 +395,7 @@ def _few(names: Sequence[str]) -> str:
 
 
 def files_in(folder: Path) -> list[str]:
-    """Names of all files in a folder and below, with slashes, and of links; what file managers leave is not named."""
+    """Names of all files in a folder and below, with slashes, and of links; files of file managers are left out."""
     own = re.compile(_form(folder))
     found = []
     for at, folders, files in os.walk(folder, onerror=_raised):
@@ -418,7 +418,7 @@ def own_files(folder: str | Path) -> frozenset[str]:
 
 
 def _marker(target: Path) -> dict[str, Any] | None:
-    """What an earlier run noted of what it wrote; None if there is no such note, or not one of ours."""
+    """Record of an earlier run about the files that it wrote; None if there is none, or another kind of record."""
     try:
         marker = json.loads((target / MARKER).read_text(encoding="utf-8"))
         check_record(marker, MARKER)
@@ -432,7 +432,7 @@ def _names(of: Sequence[str | Path]) -> list[str]:
 
 
 def _job(target: Path, of: Sequence[str | Path]) -> str:
-    """A digest of what a result is of: names, and places of files as they are seen from the result, so that both may be moved together."""
+    """A digest of the inputs of a result: names, and paths relative to the result, so that both can be moved together."""
     if not of:
         return ""
     try:
@@ -443,7 +443,7 @@ def _job(target: Path, of: Sequence[str | Path]) -> str:
 
 
 def _place(target: Path) -> Path:
-    """Where the temporary folder is made: beside the wanted one, or in it where that one cannot be swapped."""
+    """Place of the temporary folder: beside the wanted folder, or inside of it if that one cannot be swapped."""
     here = Path(os.path.realpath(os.curdir))
     fixed = target.is_dir() and (os.path.ismount(target) or here.is_relative_to(target) or not os.access(target.parent, os.W_OK | os.X_OK))
     return target if fixed else target.parent
@@ -540,7 +540,7 @@ def _temporary(target: Path) -> list[tuple[Path, int, str]]:
 
 
 def _clean_stale(target: Path) -> None:
-    """Remove what killed runs on this machine left; a result that was set aside and never replaced goes back to its place."""
+    """Remove the temporary folders of killed runs on this machine; a result that was moved away and not replaced is moved back."""
     left = [item for item in _temporary(target) if not _alive(item[0], item[1])]
     for path, _, what in sorted(left, key=lambda item: not item[2]):  # what was set aside first
         partial = path.with_name(path.name.removesuffix(what))
@@ -571,7 +571,7 @@ def _locked(folder: Path) -> int | None:
 
 
 def _alive(folder: Path, pid: int) -> bool:
-    """Whether the run that made a temporary folder goes on: its lock tells, and where there are no locks, its process."""
+    """Whether the run that made a temporary folder is still active: by its lock, or by its process if there are no locks."""
     if not folder.exists():
         return False
     try:

@@ -143,5 +143,5 @@ def parse_raw(text: str) -> RawLayout:
 
 
 def layout_of(raw: str | RawLayout | None) -> RawLayout | None:
-    """The layout that an option ``raw`` means: one as it is, a text read by `parse_raw`, None where there is none."""
+    """The layout of an option ``raw``: a layout is returned unchanged, a text is read by `parse_raw`, None stays None."""
     return parse_raw(raw) if isinstance(raw, str) else raw

@@ -1,4 +1,4 @@
-"""The keys of a campaign's manifest, and what each may hold."""
+"""The keys of a campaign's manifest, and their allowed values."""
 
 from __future__ import annotations
 

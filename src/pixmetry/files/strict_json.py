@@ -18,7 +18,7 @@ SHORT = 130  # characters of a record that stays on one line
 
 
 def plain(value: Any, at: str = "$") -> Any:
-    """A value as JSON can hold it: NumPy's become plain, records mappings, tuples lists.
+    """A value in a form for JSON: NumPy values become plain ones, records mappings, tuples lists.
 
     Raises
     ------
@@ -107,7 +107,7 @@ def parse_json(raw: bytes, where: str, remedy: str = "check the file") -> dict[s
 
 
 def starts_with(raw: bytes, mark: bytes) -> bool:
-    """Whether a text in any encoding begins with a mark, blanks aside."""
+    """Whether a text in any encoding begins with a mark, apart from blanks."""
     return raw[:64].lstrip(b"\x00 \t\r\n\xef\xbb\xbf\xff\xfe").startswith(mark)
 
 

@@ -54,7 +54,7 @@ class TiffPage(NamedTuple):
 
     @property
     def kind(self) -> tuple[Any, ...]:
-        """What all frames of a stack must have in common."""
+        """Properties that all frames of a stack must have in common."""
         return self.shaped, self.dtype, self.photometric, self.bits
 
     def image(self, read: Read) -> np.ndarray:
@@ -94,7 +94,7 @@ class TiffPage(NamedTuple):
         return image
 
     def _looked_up(self, index: np.ndarray) -> np.ndarray:
-        """Colours of a palette, of 8 bits where they are no more; grey where they are."""
+        """Colours of a palette: with 8 bits if this is enough, and as grey values if all colours are grey."""
         colours = self.palette
         if colours is None:
             raise ValueError("the palette is missing")

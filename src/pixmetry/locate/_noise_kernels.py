@@ -1,4 +1,4 @@
-"""Kernels of a pixel's noise: the law of its variance, and what the ends of the scale make of mean and variance."""
+"""Kernels of a pixel's noise: the law of its variance, and mean and variance at the ends of the scale."""
 
 from __future__ import annotations
 

@@ -46,7 +46,7 @@ def methods() -> dict[str, Method]:
 
 
 def estimators(kind: str) -> dict[str, str]:
-    """Return the estimators there are for a kind of target, each with a line on what it is.
+    """Return the estimators for a kind of target, each with a description in one line.
 
     Raises
     ------

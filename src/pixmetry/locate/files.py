@@ -1,4 +1,4 @@
-"""Image files in, one table out: which files are meant, and what is written, whole or not at all."""
+"""Image files in, one table out: selection of the files, and output that is written whole or not at all."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def locate_files(
 
 
 def frames_inside(path: str | Path) -> Path:
-    """Name the folder or store that holds the frames: a folder without images of its own may be what `simulate` wrote."""
+    """The folder or store with the frames; a folder without images may be the output of `simulate`."""
     folder = Path(path)
     if not folder.is_dir() or folder.suffix.lower() == ".zarr" or any(p.suffix.lower() in PICTURE_ENDINGS for p in folder.iterdir()):
         return folder

@@ -1,4 +1,4 @@
-"""A frame as it is measured: grey values that kernels can read, and where their scale ends."""
+"""A frame for the measurement: grey values for the kernels, and the ends of their scale."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ FAINTEST = 0.05  # height of lines and edges over that of the frame's strongest
 
 @dataclass(frozen=True)
 class Task:
-    """One frame and what is wanted of it, as `locate` was told."""
+    """One frame and the options of `locate` for it."""
 
     frame: np.ndarray
     kind: str
@@ -137,7 +137,7 @@ def locate_chessboard(task: Task) -> tuple[dict[str, np.ndarray], dict[str, Any]
 
 
 def _noise_for(task: Task, kind: str, targets: Targets | np.ndarray) -> NoiseModel:
-    """The noise model that was given, with the scale's ends; else what the image tells, at targets or by the spread beside them."""
+    """The given noise model, with the ends of the scale; otherwise the noise of the image, at targets or from the spread beside them."""
     if task.noise is not None:
         given = replace(task.noise, low_dn=max(task.low_dn, task.noise.low_dn), high_dn=min(task.high_dn, task.noise.high_dn))
         if not isinstance(targets, Targets) or not len(targets):

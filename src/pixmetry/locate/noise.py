@@ -223,7 +223,7 @@ def camera_noise(camera: Camera) -> CameraNoise:
 
 
 def _pattern_dn2(stack: np.ndarray) -> float:
-    """Variance of the mean image without the means of its rows and columns, less what the temporal noise leaves in it."""
+    """Variance of the mean image without the means of its rows and columns, minus the remaining temporal noise."""
     mean = stack.mean(axis=0)
     mean = mean - mean.mean(axis=1, keepdims=True) - mean.mean(axis=0, keepdims=True) + mean.mean()
     rows, cols = mean.shape

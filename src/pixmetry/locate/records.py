@@ -1,4 +1,4 @@
-"""Positions found in images, as a table that goes to disk with its origin, its units and the noise model behind its covariances."""
+"""Positions in images as a table, with origin, units and noise model in its files."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ class Located:
         return output.path
 
     def content(self, ending: str) -> bytes:
-        """Return what the file with this ending (``.csv``, ``.parquet``, ``.json``) holds."""
+        """Return the content of the file with this ending (``.csv``, ``.parquet``, ``.json``)."""
         return {".csv": self._csv, ".parquet": self._parquet, ".json": self._json}[ending.lower()]()
 
     def to_dataframe(self) -> Any:

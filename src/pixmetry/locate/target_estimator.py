@@ -1,4 +1,4 @@
-"""The estimators of `pixmetry locate` on windows of one target each: what a budget propagates is what is run on images."""
+"""The estimators of `pixmetry locate` on windows of one target each: a budget propagates the same code that runs on images."""
 
 from __future__ import annotations
 
@@ -201,7 +201,7 @@ class TargetEstimator:
         return replace(found, x_px=x, y_px=y)
 
     def _targets(self, data: np.ndarray) -> Targets:
-        """The targets as a search would find them: rough centres from the images, the rest from what is known."""
+        """The targets as after detection: rough centres from the images, other values from the known target."""
         n, rows, cols = data.shape
         radius, edge, amplitude = self._size()
         y, x = np.arange(rows)[:, None], np.arange(cols)

@@ -40,7 +40,7 @@ def fixed(value: float, decimals: int) -> str:
 
 
 def significant(value: float, digits: int = 3) -> str:
-    """A number with so many significant digits, without an exponent between 0.0001 and a million."""
+    """A number with a given number of significant digits, without an exponent between 0.0001 and a million."""
     if not isfinite(value):
         return NONE
     if value == 0:
@@ -52,7 +52,7 @@ def significant(value: float, digits: int = 3) -> str:
 
 
 def short(value: float, digits: int = 4) -> str:
-    """So many digits without the zeros at the end; a whole number as it is."""
+    """Significant digits without the zeros at the end; a whole number unchanged."""
     if isfinite(value) and value == int(value) and abs(value) < 1e6:
         return fixed(value, 0)
     text = significant(value, digits)
@@ -147,7 +147,7 @@ def length_um(value_px: float, pitch_um: float | None) -> str:
 
 
 def percent(share: float) -> str:
-    """A share of one as percent: whole above ten, one decimal below, ``<0.1`` for what is less."""
+    """A share of one as percent: whole above ten, one decimal below, ``<0.1`` for smaller shares."""
     if not isfinite(share):
         return NONE
     value = 100 * share
@@ -157,7 +157,7 @@ def percent(share: float) -> str:
 
 
 def signed(value: float, formatter: Callable[[float], str]) -> str:
-    """Format with an explicit sign; what is too small to be shown is 0."""
+    """Format with an explicit sign; a value too small to be shown is 0."""
     text = formatter(abs(value))
     if text == NONE:
         return text

@@ -76,14 +76,14 @@ class Points:
 
 @dataclass(frozen=True)
 class Facts:
-    """Labels with what they stand for."""
+    """Labels with their values."""
 
     pairs: Sequence[tuple[str, str]]
 
 
 @dataclass(frozen=True)
 class Reading:
-    """One number of an answer, in large type: what it is, the number, and small print behind it."""
+    """One number of an answer, in large type: label, number, and a note in small type."""
 
     label: Inline
     value: str
@@ -92,7 +92,7 @@ class Reading:
 
 @dataclass(frozen=True)
 class Answer:
-    """What a reader came for: sentences, and rows of readings; it stands out at the top of a page."""
+    """The main result at the top of a page: sentences, and rows of readings."""
 
     parts: Sequence[Text | Sequence[Reading]]
 
@@ -134,7 +134,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Table:
-    """A table; the first cell of each row is its heading, ``label`` says what it holds to those who do not see it."""
+    """A table; the first cell of each row is its heading, ``label`` describes it for screen readers."""
 
     label: str
     columns: Sequence[Column | str]

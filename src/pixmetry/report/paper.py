@@ -29,7 +29,7 @@ PDF_STYLE: Any = STYLE | {"pdf.fonttype": 42, "pdf.compression": 9, "font.family
 
 @dataclass(frozen=True)
 class Type:
-    """How a style of words is set: face, size beside that of the text, by how much of it lower, colour."""
+    """Type of a style of words: face, size relative to the text, shift below the line, colour."""
 
     face: str = "normal"
     size: float = 1.0
@@ -227,7 +227,7 @@ class Paper:
         self.paragraph(bold, size, space=0.25 * size)
 
     def facts(self, pairs: Sequence[tuple[str, str]], columns: int = 5, size: float = 7.2) -> None:
-        """Labels with what they stand for, in a grid."""
+        """Labels with their values, in a grid."""
         width = INNER / columns
         for first in range(0, len(pairs), columns):
             row = [(label, lines_of(text, width - 8, size)) for label, text in pairs[first : first + columns]]
@@ -309,7 +309,7 @@ class _Laid:
         return [LEFT + sum(self.widths[:k]) for k in range(len(self.widths))]
 
     def places(self) -> list[float]:
-        """Where text stands: at the left ends, or of numbers at the right ones."""
+        """Position of text: left-aligned, or right-aligned for numbers."""
         both = zip(self.lefts(), self.widths, self.columns, strict=True)
         return [left + (width - PAD if column.align == "right" else 0.0) for left, width, column in both]
 

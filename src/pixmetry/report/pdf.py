@@ -206,7 +206,7 @@ def _table(sheets: Paper, table: Table, folded: bool, lead: float) -> None:
 
 
 def _figures(sheets: Paper, figures: Sequence[Figure], shrink: float) -> None:
-    """Two figures beside each other with titles and captions, row by row; a wide one alone."""
+    """Two figures side by side with titles and captions, row by row; a wide figure alone."""
     row: list[Figure] = []
     for figure in figures:
         if figure.drawing is None:

@@ -38,7 +38,7 @@ def provenance_section(record: Mapping[str, Any], licence: str = "", more: Seque
 
 
 def provenance_facts(record: Mapping[str, Any], more: Sequence[tuple[str, str]] = ()) -> list[tuple[str, str]]:
-    """Versions, platform, seed and time of a provenance record, as far as they are known; ``more`` stands behind the first."""
+    """Versions, platform, seed and time of a provenance record, as far as they are known; ``more`` follows the first."""
     libraries = ", ".join(f"{name} {version}" for name, version in (record.get("libraries") or {}).items())
     rows = [
         ("pixmetry", record.get("pixmetry", "")),

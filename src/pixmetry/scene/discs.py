@@ -113,7 +113,7 @@ class Discs:
 
     @property
     def smooth_px(self) -> float:
-        """Blur of its own."""
+        """Own blur of the discs."""
         return self.blur_px
 
     def radiance(self, at: Points) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Scenes from YAML files, schema ``pixmetry/scene/1``: what such a file may hold (keys, units, ranges), and the scene that it makes."""
+"""Scenes from YAML files, schema ``pixmetry/scene/1``: keys, units and ranges of the file, and the scene that it describes."""
 
 from __future__ import annotations
 
@@ -181,7 +181,7 @@ def _of_kind(kinds: Mapping[str, type[Model]], data: Any, what: str) -> Model:
 
 
 class PoseModel(Model):
-    """Where a plate stands before a pinhole camera."""
+    """Pose of a plate in front of a pinhole camera."""
 
     principal_distance_px: float = Field(gt=0, le=1e7)
     principal_x_px: float | None = Field(default=None, ge=-1e5, le=1e5)

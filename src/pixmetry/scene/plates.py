@@ -15,7 +15,7 @@ from pixmetry.scene.shapes import Shapes
 
 @dataclass(frozen=True)
 class Pose:
-    """Where a plate stands before the camera.
+    """Pose of a plate in front of the camera.
 
     The camera looks along z, x to the right and y down. A point X of the plate (X, Y, 0) lies at R X + t, with R = Rz(κ) Ry(φ) Rx(ω), and
     is seen at principal point + c (x/z, y/z).

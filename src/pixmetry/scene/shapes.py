@@ -106,7 +106,7 @@ class Shapes:
         return {}
 
     def _arrays(self, s: float) -> Prepared:
-        """What the kernels take for a blur ``s``."""
+        """Kernel parameters of a blur ``s``."""
         found = self._sets.get(s)
         if found is None:
             total = (self.oval[:, 2:] ** 2).sum(axis=1)

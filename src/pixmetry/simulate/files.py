@@ -118,7 +118,7 @@ class TruthWriter:
         self.frames.append({"file": file, "frame": number, **times})
 
     def _placed(self, seen: Sequence[Mapping[str, Any]], number: int, schedule: Mapping[str, Any]) -> list[dict[str, Any]]:
-        """The targets in the image that is written; what the scene tells of their places goes under names with ``scene_``."""
+        """The targets in the written image; their positions in the scene have names with ``scene_``."""
         row0, col0, rows, cols = self.window
         out: list[dict[str, Any]] = [{} for _ in seen]
         for px, py in _places(seen):
@@ -142,7 +142,7 @@ class TruthWriter:
         return [_merged([frame[k] if k < len(frame) else {} for frame in self._targets]) for k in range(most)]
 
     def record(self) -> dict[str, Any]:
-        """Return what ``truth.json`` holds of frames and targets."""
+        """Return frames and targets for ``truth.json``."""
         row0, col0, rows, cols = self.window
         return {
             "schema": TRUTH_SCHEMA,
@@ -157,13 +157,13 @@ class TruthWriter:
         }
 
     def close(self) -> None:
-        """Write what is the same in all frames, and the description of the store."""
+        """Write the arrays that are equal in all frames, and the description of the store."""
         if self._arrays is not None:
             self._arrays.close({k: v for k, v in self.record().items() if k not in ("targets", "frames")})
 
 
 def targets_of(scene: Any, time_s: float, frame: int) -> list[dict[str, Any]]:
-    """What a scene tells of its targets at a time: records with ``x_px`` and ``y_px`` in the scene's plane; none if it has none."""
+    """Targets of a scene at a time: records with ``x_px`` and ``y_px`` in the scene's plane; none if it has none."""
     return [dict(t) for t in scene.targets(time_s, frame)] if hasattr(scene, "targets") else []
 
 

@@ -1,4 +1,4 @@
-"""The page that walks one target through a camera: its image after every source, and where its centre goes."""
+"""The page of one target in a camera: its image after every source, and the shift of its centre."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a camera can make of a target: the bound, the estimators beside it, and what limits them, as one plain record."""
+"""Accuracy that a camera allows for a target: the bound, the estimators, and their limits, as one plain record."""
 
 from __future__ import annotations
 
@@ -135,7 +135,7 @@ def bound(
     rounded: bool = True,
     pattern_dn: float = 0.0,
 ) -> Possible:
-    """Say how well a target can be located, what estimators give, and what limits the one that is named.
+    """Compute how well a target can be located, the errors of estimators, and the causes of the error of one of them.
 
     Parameters
     ----------
@@ -204,7 +204,7 @@ def bound(
 
 
 def limits(chosen: Prediction, images: Images, pixels: PixelNoise, unknowns: tuple[str, ...]) -> tuple[Limit, ...]:
-    """Split an estimator's variance: noise of the pixels if all but the place were known, other unknowns, what it wastes, sampling.
+    """Split an estimator's variance: noise of the pixels with known shape, other unknowns, loss of the estimator, sampling.
 
     Notes
     -----
@@ -245,7 +245,7 @@ def frames_worth(u_of: Callable[[int], float]) -> int | None:
 
 
 def closed_forms(images: Images, noise: NoiseModel, frames: int = 1) -> dict[str, float]:
-    """Closed forms for this target and noise, each under a name that says what it holds for."""
+    """Closed forms for this target and noise; each name states the assumptions."""
     p, a, gain = images.parameters, images.aperture_px, noise.slope_dn
     amplitude, blur, ground = p["amplitude_dn"], p["blur_px"], p["background_dn"]
     edge = float(np.sqrt(noise.variance_dn2(ground + amplitude / 2) / frames))

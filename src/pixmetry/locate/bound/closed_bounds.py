@@ -1,4 +1,4 @@
-"""Cramér–Rao bounds in closed form: what the exact sums over pixels come near to where a target is large, or well sampled.
+"""Cramér–Rao bounds in closed form: limits of the exact sums over pixels for large or well sampled targets.
 
 All are standard deviations of one coordinate in pixels. `blur_px` is the standard deviation of the target's edge or spot without the
 pixel; the pixel of width a adds a²/12 to its square. Noise and amplitude are in the same unit.

@@ -244,7 +244,7 @@ def kept_rounding_dn2(sigma: np.ndarray) -> np.ndarray:
 
 
 def _censored(mean: np.ndarray, sigma: np.ndarray, low: float, high: float) -> np.ndarray:
-    """1/σ² of the values in between, and what the two ends tell: φ²/P each."""
+    """1/σ² of the values in between, and the information of the two ends: φ²/P each."""
     from scipy.special import log_ndtr, ndtr
 
     out = 1 / sigma**2

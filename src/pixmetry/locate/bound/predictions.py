@@ -62,7 +62,7 @@ class PixelNoise:
 
     @property
     def tells(self) -> np.ndarray:
-        """1 where a value tells of its mean, 0 where it is cut off at an end of the scale."""
+        """1 where a value depends on its mean, 0 where it is cut off at an end of the scale."""
         return (self.ideal < 20 * (self.read + self.shot + self.rounding + self.kept)).astype(float)
 
     def for_the_best(self) -> PixelNoise:

@@ -81,7 +81,7 @@ def moment_positions(frame: np.ndarray, targets: Targets, noise: NoiseModel, nam
 
 
 class Prepared:
-    """The record of each target that the kernels read, and what is common to all."""
+    """The input of the kernels for each target, and the common input."""
 
     def __init__(self, record: np.ndarray, noise: Noise, flags: np.ndarray, usable: np.ndarray) -> None:
         self.record, self.noise, self.flags, self.usable = record, noise, flags, usable
@@ -149,7 +149,7 @@ def positions(
     s_curve_px: np.ndarray,
     thresholded: bool = False,
 ) -> Positions:
-    """Put together what the kernels found; ``result``: x, y, var x, cov, var y, relative standard deviation of the weights' sum."""
+    """Combine the results of the kernels; ``result``: x, y, var x, cov, var y, relative standard deviation of the weights' sum."""
     record = work.record
     lost = ~at_rest | ~work.usable
     result[lost] = np.nan
@@ -171,7 +171,7 @@ def positions(
 
 
 def row_shift_variance(targets: Targets, noise: NoiseModel) -> np.ndarray:
-    """Variance of x by rows that are shifted against each other in px², shape (n,).
+    """Variance of x from rows that are shifted against each other, px², shape (n,).
 
     An operator answers to the shift of a row by the row's share of what it looks at: of the target's area, of its edges' steepness along x,
     or of its perimeter's. All three go with the length of the row inside the target.

@@ -1,4 +1,4 @@
-"""Where a circle's centre is seen: beside the centre of the ellipse as which perspective shows the circle, and by how much.
+"""Image of a circle's centre: its distance from the centre of the ellipse that is the perspective image of the circle.
 
 A camera with matrix K sees a plane with normal n; the plane's horizon is the line l = K⁻ᵀ n, and the image of the circle's centre is the
 pole of that line with respect to the imaged ellipse C: c ~ C⁻¹ l. With centre p and shape matrix S of the ellipse,

@@ -22,7 +22,7 @@ def mark(row, low, low_step, high, high_step, f, sides):
 
 @jit
 def at_columns(nodes, i, col_scale, value, step):
-    """Row i of a map at every column, and what is added to come to row i + 1."""
+    """Row i of a map at every column, and the increments to row i + 1."""
     tiles, k, begin = nodes.shape[1], min(i + 1, nodes.shape[0] - 1), 0
     for j in range(max(tiles - 1, 1)):
         m = min(j + 1, tiles - 1)

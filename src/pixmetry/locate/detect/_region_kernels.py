@@ -267,7 +267,7 @@ def smooth_heights(frame, nodes, row_scale, col_scale, sign, first_row, stop_row
 
 @jit
 def add_faint(frame, nodes, row_scale, col_scale, region, out, found):
-    """Measure a region whose half height is in the noise: among smoothed heights, in a window that grows until it holds all of it."""
+    """Measure a region whose half height is in the noise: with smoothed heights, in a window that grows until it contains the region."""
     rows, cols = frame.shape
     first_row, stop_row, first_col, stop_col = region[0, 0], region[len(region) - 1, 0] + 1, region[0, 1], region[0, 2]
     for i in range(len(region)):
@@ -366,7 +366,7 @@ def waisted(target):
 
 @jit
 def simple(region, target):
-    """Whether a region is hardly larger than its target and the target's shape that of an ellipse: there is nothing else in it."""
+    """Whether a region contains only its target: it is hardly larger, and the target has the shape of an ellipse."""
     margin = 2.0 + 3.0 * target[5]
     first_col, stop_col = region[0, 1], region[0, 2]
     for i in range(len(region)):

@@ -30,7 +30,7 @@ CHUNK = 128
 
 @dataclass(frozen=True)
 class Codes:
-    """What the rings about some targets say, arrays of shape (n,).
+    """Codes of the rings around targets, arrays of shape (n,).
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Find targets: regions that stand out from the background, their size and shape."""
+"""Find targets: regions above (or below) the background, their size and shape."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ BEYOND_DN = 1e30  # no grey value is so far from the background
 
 @dataclass(frozen=True)
 class Regions(Targets):
-    """Targets with what their regions above half height look like; further arrays of shape (n,).
+    """Targets with the properties of their regions above half height; further arrays of shape (n,).
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ def detect(
     threshold_sigma: float = THRESHOLD_SIGMA,
     threads: int | None = None,
 ) -> Detection:
-    """Find what stands out from the background.
+    """Find regions above (or below) the background.
 
     Parameters
     ----------
@@ -195,7 +195,7 @@ def _fits_box(targets: Regions) -> np.ndarray:
 
 
 def _genuine(targets: Regions) -> Regions:
-    """Leave out what other targets cause."""
+    """Leave out false targets that other targets cause."""
     from pixmetry.locate.detect._region_kernels import REACH, spurious
 
     t = targets

@@ -106,7 +106,7 @@ def order_grid(x_px: np.ndarray, y_px: np.ndarray, *, pattern: tuple[int, int] |
 
 
 def eight_bit(frame: np.ndarray) -> np.ndarray:
-    """Return a frame as uint8 for finders that take nothing else: between its 0.1 and 99.9 % quantiles. uint8 comes back as it is."""
+    """Return a frame as uint8 for finders that need it: between its 0.1 and 99.9 % quantiles. A frame of uint8 is returned unchanged."""
     if frame.dtype == np.uint8:
         return frame
     low, high = np.quantile(frame, (0.001, 0.999))
@@ -282,7 +282,7 @@ def _without_outliers(place: np.ndarray, index: np.ndarray) -> np.ndarray:
 def _numbered(
     place: np.ndarray, index: np.ndarray, pattern: tuple[int, int] | None, asymmetric: bool
 ) -> tuple[np.ndarray, tuple[int, int], str]:
-    """Choose the axes and the origin of a numbering: (row, col) from 0, its extent (rows, cols), and what is not as asked."""
+    """Choose the axes and the origin of a numbering: (row, col) from 0, its extent (rows, cols), and a message if it differs."""
     known = index[:, 0] > -LARGEST_INDEX
     cells, dots = index[known], place[known]
     entries = (-2, -1, 0, 1, 2)

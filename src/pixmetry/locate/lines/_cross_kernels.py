@@ -108,7 +108,7 @@ class Turn(NamedTuple):
 
 @jit
 def turn_of(p: Array, angles: Array, aperture: float) -> Turn:
-    """The directions of a cross, and what the pixel is across them."""
+    """The directions of a cross, and the width of the pixel across them."""
     c1, s1 = math.cos(angles[0] + p[ANGLE_1]), math.sin(angles[0] + p[ANGLE_1])
     c2, s2 = math.cos(angles[1] + p[ANGLE_2]), math.sin(angles[1] + p[ANGLE_2])
     a1, b1 = aperture * max(abs(c1), abs(s1)), aperture * min(abs(c1), abs(s1))

@@ -139,7 +139,7 @@ def walk(points, used, kind, row, col, ahead, xs, ys, n):
 
 @jit
 def take(points, used, kind, row, col):
-    """Mark a point, and those beside it that tell of the same line."""
+    """Mark a point, and neighbouring points of the same line."""
     rows, cols = used.shape
     for r in range(max(0, row - 1), min(rows, row + 2)):
         for c in range(max(0, col - 1), min(cols, col + 2)):
@@ -353,7 +353,7 @@ def describe(frame, kind, state, scale, total, hits):
 
 @jit
 def follow(frame, kind, state, most_turn):
-    """Follow a line or edge both ways as far as it goes, and lay it anew through where it passes, in place; False if it is none."""
+    """Follow a line or edge in both directions to its ends, and fit it again to its points, in place; False if it is not a line."""
     rows, cols = frame.shape
     room = int(2 * math.hypot(rows, cols)) + 64
     strong, middle, aside, smooth = np.empty(room), np.empty(room), np.empty(room), np.empty(room)
@@ -467,7 +467,7 @@ def reach_of(smooth, middle, n, begin, ahead, amplitude, kind):
 
 @jit
 def good_share(frame, kind, state):
-    """Return the share of samples along a line that stand out as the line does; those in which another line passes do not count."""
+    """Return the share of samples along a line with the height of the line; samples with another line do not count."""
     n = int(state[5] - state[4]) + 1
     strong, middle, aside = np.empty(n), np.empty(n), np.empty(n)
     sample(frame, kind, state, int(math.ceil(state[4])), n, strong, middle, aside)
@@ -514,7 +514,7 @@ def strength(frame, kind, state):
 
 @jit
 def refine(frame, kind, states, scales, first, stop, most_turn, strengths):
-    """Describe and follow lines or edges; ``strengths`` tells their amplitudes over their standard deviations, 0 for what is no line."""
+    """Describe and follow lines or edges; ``strengths``: their amplitudes over their standard deviations, 0 if it is not a line."""
     total, hits = np.empty(SAMPLES), np.empty(SAMPLES)
     for i in range(first, stop):
         describe(frame, kind, states[i], scales[i], total, hits)

@@ -82,7 +82,7 @@ class Line(NamedTuple):
 
 @jit
 def covered(other: Array, reach: float, angle: float, d: float, col: float, row: float) -> bool:
-    """Whether a pixel, at distance d from a line of some angle, belongs to another line, too near to it to tell of the first."""
+    """Whether a pixel, at distance d from a line of some angle, belongs to another line that is too close."""
     co, so = math.cos(other[2]), math.sin(other[2])
     u, v = col - other[0], row - other[1]
     t = co * u + so * v
@@ -286,7 +286,7 @@ def take_in(active: Ints, count: int, extra: Ints, most: int) -> int:
 
 @jit
 def fit_one(line: Line, choose: bool, options: Ints, p: Array, active: Ints) -> tuple[int, int, bool]:
-    """Fit one line and choose what it is made of; return section, count of unknowns, and whether it rests.
+    """Fit one line and choose its section; return section, number of unknowns, and whether it converged.
 
     ``options`` and ``choose`` as in `How`.
     """

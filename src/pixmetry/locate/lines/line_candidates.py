@@ -69,7 +69,7 @@ class LineCandidates:
 
     @classmethod
     def of(cls, **columns: object) -> LineCandidates:
-        """Candidates from columns or numbers; what is not given is 0 (the blur: 1 px)."""
+        """Candidates from columns or numbers; missing values are 0 (the blur: 1 px)."""
         given = {"blur_px": 1.0} | columns
         n = np.size(np.asarray(given["x1_px"]))
         filled = {f.name: np.broadcast_to(np.asarray(given.get(f.name, 0.0), float).ravel(), n).copy() for f in fields(cls)}

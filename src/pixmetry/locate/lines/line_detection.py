@@ -140,7 +140,7 @@ def _noise_map(light: np.ndarray, noise: NoiseModel | None, least_dn: float) -> 
 
 
 def _points(light: np.ndarray, sigma: np.ndarray, kind: int, polarity: int, threads: int | None) -> tuple[np.ndarray, np.ndarray]:
-    """Points on ridges or steps, shape (rows, cols, 5), and the scale that told of each."""
+    """Points on ridges or steps, shape (rows, cols, 5), and the scale at which each was found."""
     cv2 = import_extra("cv2")
 
     rows = light.shape[0]
@@ -177,7 +177,7 @@ def _gaussians(s: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _strengths(light: np.ndarray, kind: int, states: np.ndarray, scales: np.ndarray, threads: int | None) -> np.ndarray:
-    """Describe and follow lines, in place; return how they stand out, 0 for what is none."""
+    """Describe and follow lines, in place; return their strengths, 0 if it is not a line."""
     out = np.zeros(len(states))
     scales = np.ascontiguousarray(scales, float)
     parts = [(first, min(first + 16, len(states))) for first in range(0, len(states), 16)]
@@ -234,7 +234,7 @@ def _aside(long: np.ndarray, other: np.ndarray) -> tuple[float, float]:
 
 
 def _beside_stronger(weak: np.ndarray, states: np.ndarray) -> bool:
-    """Whether a line that is much lower than others lies mostly in their corners: what is left between them looks like one."""
+    """Whether a line that is much lower than others lies mostly in their corners, where residuals look like a line."""
     strong = states[np.abs(states[:, 7]) > STRONGER * abs(weak[7])]
     if not len(strong):
         return False
@@ -259,7 +259,7 @@ def _same(long: np.ndarray, other: np.ndarray, kind: int, standing: float, other
 
 
 def _hidden(gap: np.ndarray, line: np.ndarray, kind: int, standing: float, line_standing: float) -> bool:
-    """Whether one is the gap beside a line of the other polarity: less of it stands out from the usual grey value."""
+    """Whether one is the gap beside a line of the other polarity: less of it differs from the median grey value."""
     if kind != kernels.LINE or gap[7] * line[7] > 0 or standing >= line_standing:
         return False
     distance, share = _aside(line, gap)

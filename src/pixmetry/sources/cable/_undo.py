@@ -1,4 +1,4 @@
-"""Taking what a cable did to the line out of the samples of it, whatever filters stand before and behind.
+"""Correction of samples of the line for a cable, with any filters before and behind it.
 
 The samples of a row are y = A x, with x the pixels that were held and A what the whole line makes of each of them: the line is exact, so
 A is. Without the cable they would have been B x. So the correction is y − (A − B) x̂, with x̂ the pixels of least squares, min |A x − y|²

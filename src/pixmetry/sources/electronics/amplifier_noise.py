@@ -1,4 +1,4 @@
-"""Amplifier noise: what the read-out electronics add to every pixel, new in every frame."""
+"""Amplifier noise: noise of the read-out electronics, independent in every pixel and frame."""
 
 from __future__ import annotations
 

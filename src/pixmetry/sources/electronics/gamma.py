@@ -24,7 +24,7 @@ LIGHT_RATIO = 2.0  # at least, between the brightest and the darkest of them
 
 
 class Gamma(Parameters):
-    """The setting, and the signal that it leaves as it is."""
+    """The setting, and the signal that it does not change."""
 
     gamma: float = quantity(1.0, "1", "exponent of the curve: 1 is linear, 0.45 is the usual other setting", ge=LOWEST, le=HIGHEST)
     reference_dn: float = quantity(4095.0, "DN", "signal above black at which the curve meets the straight line", gt=0, le=1e9)

@@ -48,7 +48,7 @@ def joined(params: HdrGain, lower: np.ndarray, upper: np.ndarray, slope: np.ndar
 
 
 def forward(params: HdrGain, signal: Signal, stream: Stream) -> Signal:
-    """Replace what is above the switch by the reading of the upper part."""
+    """Replace the signal above the switch by the reading of the upper part."""
     if params.switch_dn >= BOUNDLESS_DN:
         return signal
     upper = signal.data

@@ -117,7 +117,7 @@ def slope(data: np.ndarray) -> np.ndarray:
 
 
 def _drifted(params: Adc, data: np.ndarray, temperature_c: np.ndarray) -> np.ndarray:
-    """Data of which the converter at the reference temperature makes what it makes of the true ones at theirs."""
+    """Equivalent data: at its reference temperature the converter gives the same codes for them as for the true data at theirs."""
     warmer = (temperature_c - params.reference_temperature_c)[:, None, None]
     added = params.offset_drift_dn_per_k * warmer / (1 + params.gain_error_rel)
     return data * (1 + params.gain_drift_per_k * warmer).astype(np.float32) + added.astype(np.float32)

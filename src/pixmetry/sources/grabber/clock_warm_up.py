@@ -1,4 +1,4 @@
-"""Warm-up of the grabber's clock: until it has settled, samples lie too close or too far apart, and lines begin late."""
+"""Warm-up of the grabber's clock: until it is stable, samples are too close or too far apart, and lines start late."""
 
 from __future__ import annotations
 

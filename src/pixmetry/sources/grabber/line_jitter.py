@@ -1,4 +1,4 @@
-"""Line jitter: the sampling clock is locked anew in every line, and each time a little early or late."""
+"""Line jitter: the sampling clock is locked again in every line, each time slightly early or late."""
 
 from __future__ import annotations
 

@@ -47,7 +47,7 @@ def reshape(params: WindowOffset, frame_shape: tuple[int, int]) -> tuple[int, in
 def place(
     params: WindowOffset, x: np.ndarray, y: np.ndarray, frame_shape: tuple[int, int], frame: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Where points of the image lie in what is stored."""
+    """Positions of points of the image in the stored window."""
     row, col = params.row_offset, params.col_offset
     return x - col, y - row
 

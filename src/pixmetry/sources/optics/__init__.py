@@ -1,1 +1,1 @@
-"""Sources of the lens and what stands in front of the sensor."""
+"""Sources of the lens and of plates in front of the sensor."""

@@ -1,4 +1,4 @@
-"""Lens distortion: the image of a point lies off its ideal place, by Brown's polynomial."""
+"""Lens distortion: the image of a point is shifted from its ideal position, by Brown's polynomial."""
 
 from __future__ import annotations
 

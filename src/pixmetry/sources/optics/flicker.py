@@ -87,7 +87,7 @@ class LampLight(Light):
         return False
 
     def fingerprint(self) -> bytes | None:
-        """What tells whether two exposures see the same: the lamps' light is part of it."""
+        """Key that is equal for two exposures with the same light; it includes the lamp's light."""
         return self._lit().fingerprint()
 
     def photons(self) -> np.ndarray:

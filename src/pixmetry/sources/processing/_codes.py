@@ -1,4 +1,4 @@
-"""What the steps of a camera's digital processing share: codes with a border for filters, and results stored as codes."""
+"""Common parts of a camera's digital processing: codes with a border for filters, and results stored as codes."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ def bordered(codes: np.ndarray, reach: int) -> np.ndarray:
 
 
 def stored(values: np.ndarray, bits: int) -> np.ndarray:
-    """Round once, halves up, and hold at the ends of the range; uint16."""
+    """Round once, halves up, and clip to the range; uint16."""
     return np.clip(np.floor(np.asarray(values, float) + 0.5), 0, 2**bits - 1).astype(np.uint16)
 
 
 def surround(windows: Windows, reach: int, frame_shape: tuple[int, int]) -> Windows:
-    """Windows with so many pixels more on each side, as far as there are."""
+    """Windows enlarged by a number of pixels on each side, as far as the frame reaches."""
     return windows.expand(reach, reach, reach, reach, frame_shape)

@@ -23,7 +23,7 @@ ACROSS = np.array([[0, 0, -1.5, 0, 0], [0, 2, 0, 2, 0], [-1.5, 0, 6, 0, -1.5], [
 
 
 class Demosaic(Parameters):
-    """The mosaic, how it is filled in, and what is put out."""
+    """The mosaic, its interpolation, and the stored colour."""
 
     method: Literal["off", "bilinear", "malvar"] = quantity("off", "1", "malvar: linear with 5 × 5 weights by Malvar, He and Cutler")
     output: Literal["luma", "red", "green", "blue"] = quantity("luma", "1", "one colour, or 0.299 R + 0.587 G + 0.114 B")

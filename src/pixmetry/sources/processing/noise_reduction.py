@@ -33,7 +33,7 @@ def half_weights(params: NoiseReduction) -> np.ndarray:
 
 
 def forward(params: NoiseReduction, signal: Signal, stream: Stream) -> Signal:
-    """Filter every frame by itself; beyond the frame it is mirrored."""
+    """Filter every frame separately, mirrored at its border."""
     if params.method == "off":
         return signal
     m = params.radius_px

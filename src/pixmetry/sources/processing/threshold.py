@@ -12,7 +12,7 @@ class Threshold(Parameters):
 
 
 def propagate(params: Threshold, probe: Probe) -> Contribution:
-    """The S-curve itself: what the estimator gives less the truth, at each phase."""
+    """The S-curve: estimated minus true position at each phase."""
     method = "the estimator on noise-free targets at the probe's phases"
     return probe.from_shifts(probe.x_hat_px - probe.x_px, probe.y_hat_px - probe.y_px, "F", model_error=0.05, method=method)
 

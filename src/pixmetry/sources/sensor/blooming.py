@@ -1,4 +1,4 @@
-"""Blooming: charge that a full pixel of a CCD cannot hold spills along its column.
+"""Blooming: excess charge of a full pixel of a CCD spills along its column.
 
 A pixel that holds more than the full well gives its excess to the neighbours in the column, a part of it to the drain, until no pixel
 holds too much. The end does not depend on the order of the spilling, and is found directly. Channel stops keep charge in its column.
@@ -20,7 +20,7 @@ UNLIMITED_E = 1e9
 
 
 class Blooming(Parameters):
-    """Capacity of a pixel, and where the charge goes that it cannot hold."""
+    """Capacity of a pixel, and the paths of its excess charge."""
 
     full_well_e: float = quantity(20_000.0, "e-", "most electrons that a pixel holds", gt=1, le=UNLIMITED_E)
     up_share: float = quantity(0.5, "1", "share of the spilled charge that goes to the row above (with the smaller number)", ge=0, le=1)

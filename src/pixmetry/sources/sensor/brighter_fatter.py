@@ -1,4 +1,4 @@
-"""Brighter-fatter effect: charge that a pixel holds repels what comes after it into the neighbours."""
+"""Brighter-fatter effect: the charge of a pixel repels further charge into its neighbours."""
 
 from __future__ import annotations
 

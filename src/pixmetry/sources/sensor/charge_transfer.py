@@ -33,7 +33,7 @@ SMALL_E = 1000.0  # packet for which the stated tail of traps holds
 
 
 class ChargeTransfer(Parameters):
-    """Inefficiency per transfer, in columns and in the register, and where the lost charge goes."""
+    """Inefficiency per transfer, in columns and in the register, and the release of the deferred charge."""
 
     parallel_cti: float = quantity(0.0, "1", "share left behind per transfer down a column", ge=0, le=0.01)
     serial_cti: float = quantity(0.0, "1", "share left behind per transfer along the register", ge=0, le=0.01)
@@ -272,7 +272,7 @@ def _only(params: ChargeTransfer, serial: bool) -> ChargeTransfer:
 
 
 def _added_dn(params: ChargeTransfer, probe: Probe) -> np.ndarray:
-    """What transfer adds to the target at the centre of the frame; the even background around it keeps its level."""
+    """Signal that the transfer adds to a target at the centre of the frame; the uniform background keeps its level."""
     left = _reach_px(params)
     up = params.rows_per_line * left
     phases, rows, cols = probe.signal_dn.shape

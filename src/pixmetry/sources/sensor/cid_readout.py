@@ -1,4 +1,4 @@
-"""Read-out of a charge injection device: non-destructive reads, cross-talk of row and column electrodes, and what the clearing leaves."""
+"""Read-out of a charge injection device: non-destructive reads, cross-talk of row and column electrodes, charge left by clearing."""
 
 from __future__ import annotations
 

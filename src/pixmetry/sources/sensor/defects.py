@@ -1,4 +1,4 @@
-"""Defect pixels: hot ones with far too much dark charge, dead ones with hardly any response, and what else is found off the others."""
+"""Defect pixels: hot ones with far too much dark charge, dead ones with hardly any response, and other pixels that differ."""
 
 from __future__ import annotations
 

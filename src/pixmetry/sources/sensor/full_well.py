@@ -1,4 +1,4 @@
-"""Full well: a pixel holds only so many electrons; above that it answers no more light."""
+"""Full well: the largest number of electrons in a pixel; above it more light has no effect."""
 
 from __future__ import annotations
 

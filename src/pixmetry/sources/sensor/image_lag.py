@@ -19,7 +19,7 @@ class ImageLag(Parameters):
 
 
 def left_behind(params: ImageLag, charge: np.ndarray) -> np.ndarray:
-    """Mean charge that stays, in electrons: what the pocket takes, never more than there is, and a share of the rest."""
+    """Mean charge that stays, in electrons: the charge of the pocket, at most all charge, and a share of the rest."""
     above = np.maximum(charge, 0)
     pocket = np.minimum(-params.pocket_e * np.expm1(-above / params.pocket_fill_e), above)
     left: Singles = (pocket + params.lag_rel * (charge - pocket)).astype(np.float32)

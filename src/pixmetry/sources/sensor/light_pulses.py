@@ -15,7 +15,7 @@ from pixmetry.core.random import Stream
 
 
 class LightPulses(Parameters):
-    """A pulse for each field, and the steady light beside them."""
+    """One pulse for each field, and additional steady light."""
 
     separation_s: float = quantity(1e-3, "s", "time from the middle of the first pulse to the middle of the second", ge=0, le=1)
     pulse_s: float = quantity(20e-6, "s", "length of a pulse", ge=0, le=1)

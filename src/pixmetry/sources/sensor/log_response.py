@@ -1,4 +1,4 @@
-"""Logarithmic response of a CMOS pixel: its voltage follows the logarithm of the photocurrent, with a line, slope and foot of its own."""
+"""Logarithmic response of a CMOS pixel: its voltage is the logarithm of the photocurrent, with its own offset, slope and dark light."""
 
 from __future__ import annotations
 
