@@ -43,7 +43,7 @@ def test_what_is_no_frame_is_told(result: Path, files: list[Path], tmp_path: Pat
         (frame.astype(float), "no frames of stored codes"),
         (frame[0], "no frames of stored codes"),
         (frame[:-1], "pixels"),
-        (np.full(frame.shape, 70000), "does not store"),
+        (np.full(frame.shape, 70000), "cannot store"),
     ):
         with pytest.raises(InputError, match=words):
             pixmetry.correct(bad, result)

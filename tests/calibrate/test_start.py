@@ -185,7 +185,7 @@ def test_mirrored_coordinates_of_a_shallow_field_are_named(rng: np.random.Genera
         if field == "plane":
             start_values(turned)
         else:
-            with pytest.raises(InputError, match="fit only mirrored.*y counts upwards"):
+            with pytest.raises(InputError, match="only if one of them is mirrored.*y counts upwards"):
                 start_values(turned)
 
 

@@ -66,7 +66,7 @@ DISC = {"targets": [{"kind": "disc", "x_px": 20.3, "y_px": 18.7, "diameter_px": 
     [
         ({"targets": [{"kind": "disk", "x_px": 1, "y_px": 1}]}, "disc, ellipse"),
         ({"targets": [{"x_px": 1, "y_px": 1}]}, "lacks its kind"),
-        ({"targets": ["disc"]}, "holds no keys"),
+        ({"targets": ["disc"]}, "has no keys"),
         ({"targets": [{"kind": "disc", "x_px": 1, "y_px": 1}]}, "diameter_px.*missing"),
         ({"targets": [{"kind": "disc", "x_px": 1, "y_px": 1, "diameter": 7}]}, "lacks its unit.*diameter_px"),
         ({"targets": [{"kind": "disc", "x_px": 1, "y_px": 1, "diameter_px": -7}]}, "diameter_px.*greater than 0"),
