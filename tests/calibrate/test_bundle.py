@@ -343,7 +343,7 @@ def test_rays_that_hardly_meet_do_not_determine_a_point(rng):
     position[network.image[there[1]]] = position[network.image[there[0]]]
     used = (network.point != point) | np.isin(np.arange(len(network)), there)
     found = adjust(network, replace(truth, position=position), used=used)
-    assert np.isnan(found.state.xyz[point]).all() and any("hardly meet" in note for note in found.notes)
+    assert np.isnan(found.state.xyz[point]).all() and any("almost parallel" in note for note in found.notes)
 
 
 def test_a_point_behind_a_camera_comes_back(rng):

@@ -264,7 +264,7 @@ def test_bad_input_has_a_clear_outcome() -> None:
         (lambda: Pinhole(0.0, 1.0, 1.0), "camera cannot be used"),
         (lambda: Ellipses(1.0, 1.0, np.nan, 1.0, 0.0), "finite"),
         (lambda: Ellipses(1.0, 1.0, 2.0, 0.0, 0.0), "no extent"),
-        (lambda: corrected(good, CAMERA, (0, 0, 0)), "no direction"),
+        (lambda: corrected(good, CAMERA, (0, 0, 0)), "not a direction"),
         (lambda: corrected(good, CAMERA, (1.0, 0.0, 0.0)), "horizon"),
         (lambda: circle_seen(np.zeros((3, 3)), 0, 0, 1), "cannot be projected"),
         (lambda: circle_seen(np.array([[1.0, 0, 0], [0, 1, 0], [0.3, 0, 1]]), 0, 0, 5.0), "horizon"),

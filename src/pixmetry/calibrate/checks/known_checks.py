@@ -401,7 +401,7 @@ def _enlarged(state: State, network: Network, scale: float) -> State:
 
 
 def _without(checked: CheckedKnown, known: Known, found: list[Contradicted], kind: Kind) -> CheckedKnown:
-    """Leave out the value that is contradicted most; if it cannot be separated from others, give all of them the uncertainty of their error."""
+    """Leave out the value that is contradicted most; if others may be wrong instead, give all of them the uncertainty of their error."""
     wrong = [known.name.index(one.name) for one in found]
     going: list[int] = []
     if kind == "scale_bars":

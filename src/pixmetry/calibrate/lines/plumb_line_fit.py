@@ -249,7 +249,7 @@ def adjust_lines(fit: LineFit, loss: str, loss_scale: float, reject: bool) -> No
 
 
 def _check_directions(theta: np.ndarray, free: list[str]) -> None:
-    """Refuse the tangential parameter that lines of one direction do not determine: it moves points along the lines, which stay straight."""
+    """Refuse the tangential parameter that lines of one direction do not determine: it moves points along these lines."""
     mean = np.mean(np.exp(2j * theta))
     if abs(mean) < ONE_DIRECTION:
         return
