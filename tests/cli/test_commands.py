@@ -17,7 +17,7 @@ from click.testing import CliRunner, Result
 
 from pixmetry.camera.camera import load_camera
 from pixmetry.camera.catalogue import sources
-from pixmetry.cli import main
+from pixmetry.cli import COMMANDS, main
 from pixmetry.files import load_campaign, read_frame
 
 CAMERA = """\
@@ -76,8 +76,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (folder / name).write_text(text)
     done = run("simulate", folder / "camera.yaml", folder / "series.yaml", "-o", folder / "campaign", "--format", "png")
     assert done.exit_code == 0, done.output
-    done = run("assess", folder / "campaign", "-o", folder / "result", "--trials", 400)
-    assert done.exit_code == 0, done.output
+    done = run("assess", folder / "campaign", "-o", folder / "result", "--trials", 400, "--pdf", folder / "page.pdf")
+    assert done.exit_code == 0 and f"pdf: {folder / 'page.pdf'}" in done.output, done.output
     return folder
 
 
@@ -275,8 +275,16 @@ def test_the_frames_of_a_campaign_are_never_replaced_by_its_results(folder: Path
     refused(run("simulate", folder / "camera.yaml", folder / "discs.yaml", "-o", folder / "result"), "assessment")
     assert sorted(p.name for p in (folder / "campaign").rglob("*")) == before
     assert (folder / "result" / "results.json").is_file()
-    again = run("assess", folder / "campaign", "-o", folder / "result", "--trials", 400)
-    assert again.exit_code == 0, again.output
+
+
+def test_the_page_is_written_as_pdf_too(folder: Path, tmp_path: Path) -> None:
+    """And no PDF of another hand is lost; that of `pixmetry chain`: tests/simulate/test_chain.py."""
+    made = (folder / "page.pdf").read_bytes()
+    assert made.startswith(b"%PDF-1")
+    other = tmp_path / "page.pdf"
+    other.write_bytes(b"%PDF-1.4 of somebody else")
+    refused(run("assess", folder / "campaign", "-o", tmp_path / "out", "--pdf", other), "no result of this kind")
+    assert other.read_bytes() == b"%PDF-1.4 of somebody else" and not (tmp_path / "out").exists()
 
 
 def test_a_copied_frame_is_found(folder: Path, tmp_path: Path) -> None:
@@ -289,15 +297,24 @@ def test_a_copied_frame_is_found(folder: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
+def test_every_command_with_a_page_writes_it_as_pdf() -> None:
+    having = {name for name in COMMANDS if any("--pdf" in option.opts for option in main.get_command(None, name).params)}
+    assert having == {"assess", "calibrate", "chain", "emva1288"}
+
+
 def test_values_that_do_not_fill_their_bits_are_noted(folder: Path, tmp_path: Path) -> None:
+    """And an earlier assessment is replaced by a new one."""
     import shutil
 
     shutil.copytree(folder / "campaign", tmp_path / "campaign")
+    shutil.copytree(folder / "result", tmp_path / "out")
     manifest = tmp_path / "campaign" / "campaign.yaml"
     manifest.write_text(manifest.read_text().replace("bits: 12", "bits: 16"))
     done = run("assess", manifest, "-o", tmp_path / "out", "--trials", 400)
     assert done.exit_code == 0, done.output
     assert "bits: 12" in " ".join(done.output.split())
+    before, after = ((path / "results.json").read_text() for path in (folder / "result", tmp_path / "out"))
+    assert "bits: 12" in after and "bits: 12" not in before
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "latin-1", "cp1252", "utf-8"])

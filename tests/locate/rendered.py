@@ -12,6 +12,7 @@ All images are of unit amplitude on zero: ``background + amplitude * disc(...)``
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -29,23 +30,36 @@ def window(x: float, y: float, reach: float, shape: tuple[int, int] | None = Non
     return rows, cols
 
 
+@lru_cache
+def gauss_legendre(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes between -1 and 1, and their weights; NumPy finds them anew in every call, which takes longer than the integral."""
+    return np.polynomial.legendre.leggauss(count)
+
+
 def _nodes(aperture: float, blur: float) -> tuple[np.ndarray, np.ndarray]:
     """Offsets within a pixel and their weights: Gauss–Legendre, in pieces that are not wider than three standard deviations."""
     if aperture == 0:
         return np.zeros(1), np.ones(1)
     pieces = max(1, int(np.ceil(aperture / (3 * blur))))
-    at, weight = np.polynomial.legendre.leggauss(7)
+    at, weight = gauss_legendre(7)
     middles = (np.arange(pieces) + 0.5) / pieces - 0.5
     offsets = (middles[:, None] + at / (2 * pieces)).ravel() * aperture
     return offsets, np.tile(weight / (2 * pieces), pieces)
 
 
-def over_pixels(function: Callable[[np.ndarray, np.ndarray], np.ndarray], at: Window, aperture: float, blur: float) -> np.ndarray:
-    """Mean over the pixels' squares of a function of (x, y) that varies over ``blur`` or more; shape (rows, cols)."""
+def over_pixels(
+    function: Callable[[np.ndarray, np.ndarray], np.ndarray], at: Window, aperture: float, blur: float, near: np.ndarray | None = None
+) -> np.ndarray:
+    """Mean over the pixels' squares of a function of (x, y) that varies over ``blur`` or more; shape (rows, cols).
+
+    Elsewhere than ``near`` (rows, cols) it is 0.
+    """
     offset, weight = _nodes(aperture, blur)
-    x, y = (at[1][:, None] + offset).ravel(), (at[0][:, None] + offset).ravel()
-    fine = function(x[None, :], y[:, None]) * np.ones((len(y), len(x)))
-    return np.einsum("risj,i,j->rs", fine.reshape(len(at[0]), len(offset), len(at[1]), len(offset)), weight, weight)
+    out = np.zeros((len(at[0]), len(at[1])))
+    row, col = np.nonzero(np.ones(out.shape, bool) if near is None else near)
+    fine = function(at[1][col][:, None, None] + offset, at[0][row][:, None, None] + offset[:, None])
+    out[row, col] = np.einsum("pij,i,j->p", fine, weight, weight)
+    return out
 
 
 def _density(t: np.ndarray) -> np.ndarray:
@@ -77,7 +91,7 @@ def ellipse(
     q = c * s * (semi_major**-2 - semi_minor**-2)
     high = np.sqrt((semi_major * s) ** 2 + (semi_minor * c) ** 2)
     count = int(24 + 6 * high / blur)
-    t, w = np.polynomial.legendre.leggauss(count)
+    t, w = gauss_legendre(count)
     t, w = 0.5 * np.pi * t, 0.5 * np.pi * w
     v = high * np.sin(t)
     half = np.cos(t) / np.sqrt(p)
@@ -136,18 +150,21 @@ def _along_and_off(x: np.ndarray, y: np.ndarray, x0: float, y0: float, angle_deg
     return (x - x0) * c + (y - y0) * s, (y - y0) * c - (x - x0) * s
 
 
+def _near_line(at: Window, x: float, y: float, angle_deg: float, reach: float) -> np.ndarray:
+    """Which pixels have a part within reach of a line."""
+    return np.abs(_along_and_off(at[1], at[0][:, None], x, y, angle_deg)[1]) < reach + 0.75
+
+
 def bar(x: float, y: float, angle_deg: float, length: float, width: float, blur: float, at: Window, *, aperture: float = 1.0) -> np.ndarray:
     """A blurred rectangle about (x, y), its long side turned by the angle from x towards y; the length may be infinite."""
 
     def value(px: np.ndarray, py: np.ndarray) -> np.ndarray:
         along, off = _along_and_off(px, py, x, y, angle_deg)
-        near = np.abs(off) < width / 2 + 9 * blur  # beyond it there is less than 1e-18
-        along, off, out = along[near], off[near], np.zeros(near.shape)
         ends = ndtr((along + length / 2) / blur) - ndtr((along - length / 2) / blur)
-        out[near] = ends * (ndtr((off + width / 2) / blur) - ndtr((off - width / 2) / blur))
-        return out
+        return ends * (ndtr((off + width / 2) / blur) - ndtr((off - width / 2) / blur))
 
-    return over_pixels(value, at, aperture, blur)
+    near = _near_line(at, x, y, angle_deg, width / 2 + 9 * blur)  # beyond it there is less than 1e-18
+    return over_pixels(value, at, aperture, blur, near)
 
 
 def gaussian_line(
@@ -157,12 +174,10 @@ def gaussian_line(
 
     def value(px: np.ndarray, py: np.ndarray) -> np.ndarray:
         along, off = _along_and_off(px, py, x, y, angle_deg)
-        near = np.abs(off) < 9 * sigma  # beyond it there is less than 1e-17
-        along, off, out = along[near], off[near], np.zeros(near.shape)
-        out[near] = np.exp(-0.5 * (off / sigma) ** 2) * (ndtr((along + length / 2) / sigma) - ndtr((along - length / 2) / sigma))
-        return out
+        return np.exp(-0.5 * (off / sigma) ** 2) * (ndtr((along + length / 2) / sigma) - ndtr((along - length / 2) / sigma))
 
-    return over_pixels(value, at, aperture, sigma)
+    near = _near_line(at, x, y, angle_deg, 9 * sigma)  # beyond it there is less than 1e-17
+    return over_pixels(value, at, aperture, sigma, near)
 
 
 def edge(x: float, y: float, angle_deg: float, blur: float, at: Window, *, aperture: float = 1.0) -> np.ndarray:

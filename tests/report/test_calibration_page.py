@@ -79,6 +79,7 @@ def residuals(x: np.ndarray, y: np.ndarray, dx: np.ndarray, dy: np.ndarray, imag
     return Residuals(x, y, dx, dy, np.zeros(len(x), int) if image is None else image, Sensor(1000, 800))
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_verdict_comes_first_in_px_and_um(whole: Calibration, rng: np.random.Generator) -> None:
     """0.03 and 0.05 px of 5.5 µm pixels are 0.165 and 0.275 µm."""
     text = worth(with_residuals(whole, 0.03, -0.05), 0).replace("\u00a0", " ")
@@ -118,6 +119,7 @@ def test_every_record_is_on_the_page(whole: Calibration, page: Page) -> None:
     assert "image_coordinates.csv" in text and "pixmetry calibrate project.yaml" in text and "field = auto" in text
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_gross_errors_are_listed_worst_first(whole: Calibration, rng: np.random.Generator) -> None:
     one = whole.tests.gross_errors[0]
     records = [replace(one, image="mild", statistic=40.0), replace(one, image="awful", statistic=900.0)]
@@ -139,6 +141,7 @@ def test_for_which_y_the_signs_are_is_said_for_each_camera(page: Page) -> None:
     assert page.text.count("B2 and P2 are for y down. For y up both change their sign") == 1
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_curve_of_terms_that_are_not_there_is_not_drawn(whole: Calibration) -> None:
     """Two curves of ten parameters; without P none tangential, without K none radial; held at a value they are drawn."""
     adjustment = whole.adjustment
@@ -157,6 +160,7 @@ def test_a_curve_of_terms_that_are_not_there_is_not_drawn(whole: Calibration) ->
     assert kinds(p, zero=True) == [True, False] and kinds(k, zero=True) == [False, True]
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_long_table_says_that_it_scrolls(whole: Calibration) -> None:
     records = whole.tests.gross_errors
     many = [replace(records[0], point=f"P{i}") for i in range(30)]
@@ -232,6 +236,7 @@ def test_the_page_is_whole_for_every_kind(rng: np.random.Generator, make: Any, p
     assert all(href.startswith("data:") for href in re.findall(r'(?:src|href)="([^"#]+)"', text))
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_without_covariance_nothing_is_claimed(rng: np.random.Generator) -> None:
     plain = calibrations.bare(rng, covariance=False, images=4)
     text = Page(html_of(page_of(plain))).text
@@ -243,6 +248,7 @@ def test_without_covariance_nothing_is_claimed(rng: np.random.Generator) -> None
     assert "nan" not in summary_text(nothing)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_fixed_points_have_no_ellipsoids(rng: np.random.Generator) -> None:
     plain = calibrations.bare(rng, plane=True, images=4)
     assert plan_views(plain.adjustment) == []
@@ -269,6 +275,7 @@ def test_images_and_points_that_are_not_determined_are_left_out(rng: np.random.G
     assert len(Residuals.of(changed, 0)) == int((adjustment.used & ~out).sum())
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_camera_without_used_coordinates_says_so(rng: np.random.Generator) -> None:
     plain = calibrations.bare(rng, cameras=2, images=6)
     adjustment = plain.adjustment
@@ -488,6 +495,7 @@ CHECKED = {
 }  # fmt: skip
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_check_points_are_listed(whole: Calibration, page: Page) -> None:
     assert "Check points" not in page.text
     checked = with_tests(whole, check_points=read_record(CheckRecord, CHECKED))

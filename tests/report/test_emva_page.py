@@ -66,6 +66,12 @@ def axes_of(plot: object) -> object:
     return axes
 
 
+@lru_cache(maxsize=1)
+def all_axes() -> list[tuple[object, object]]:
+    """Every plot that is drawn of the sheet, with its axes, to be looked at."""
+    return [(p, axes_of(p)) for p in all_plots(results()) if p.draw]
+
+
 def plot(title: str, channel: object = None) -> object:
     return next(p for p in all_plots(channel or results()) if p.title == title)
 
@@ -91,6 +97,7 @@ def test_a_lower_limit_is_rounded_down_and_marked(value: float, u: float, unit: 
     assert printed_number(Number(value, u, 40.0, unit, kind=LOWER_LIMIT)).value == f">\u00a0{text}"
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_capacity_that_was_not_reached_is_a_lower_limit_everywhere() -> None:
     found = Page(html_of(page_of(with_value("u_e_sat", Number(13987.6, 24.0, 40.0, "e⁻", "", "the series ends", kind=LOWER_LIMIT))))).text
     assert found.count("> 13980 (95 %) e⁻") == 3
@@ -122,6 +129,7 @@ def test_every_value_is_in_the_table_of_all_values() -> None:
     assert sorted(keys) == sorted(k for k in results().values if not k.endswith("_nonlinear"))
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_key_that_no_list_knows_is_shown() -> None:
     text = Page(html_of(page_of(with_value("extra_value", Number(3.25, 0.1, 5.0, "DN"))))).text
     assert "extra_value" in text
@@ -211,10 +219,8 @@ TITLES = {
 def test_every_plot_of_the_standard_is_there_and_says_what_to_see() -> None:
     plots = all_plots(results())
     assert {p.title for p in plots} == TITLES
-    drawn = [p for p in plots if p.draw]
     assert {p.title for p in plots if not p.draw} == {"Dark current against temperature"}
-    for p in drawn:
-        axes = axes_of(p)
+    for p, axes in all_axes():
         assert len(p.alt) > 30
         assert p.caption[-1] == "."
         assert ". " not in p.caption.replace("dB. ", "")  # one sentence
@@ -224,15 +230,13 @@ def test_every_plot_of_the_standard_is_there_and_says_what_to_see() -> None:
 
 
 def test_tick_labels_stay_clear_of_the_label_of_their_axis() -> None:
-    for p in all_plots(results()):
-        if p.draw:
-            axes = axes_of(p)
-            ticks = [t.get_window_extent() for t in axes.get_yticklabels() if t.get_text()]
-            low, high = axes.bbox.y0 - 1, axes.bbox.y1 + 1
-            left = min(t.x0 for t in ticks if low <= (t.y0 + t.y1) / 2 <= high)
-            assert axes.yaxis.label.get_window_extent().x1 <= left
-            assert axes.yaxis.label.get_window_extent().x0 >= 0
-            assert axes.xaxis.label.get_window_extent().y0 >= 0
+    for _, axes in all_axes():
+        ticks = [t.get_window_extent() for t in axes.get_yticklabels() if t.get_text()]
+        low, high = axes.bbox.y0 - 1, axes.bbox.y1 + 1
+        left = min(t.x0 for t in ticks if low <= (t.y0 + t.y1) / 2 <= high)
+        assert axes.yaxis.label.get_window_extent().x1 <= left
+        assert axes.yaxis.label.get_window_extent().x0 >= 0
+        assert axes.xaxis.label.get_window_extent().y0 >= 0
     assert MARGINS_IN["left"] < 0.7
 
 
@@ -337,6 +341,7 @@ def test_levels_beyond_saturation_have_no_signal_to_noise_ratio() -> None:
     assert len(shown) == np.sum(mean <= K * emva_sheets.SATURATION_E) < emva_sheets.LEVELS
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_colour_has_its_channels_side_by_side_and_all_plots_of_each() -> None:
     found = Page(html_of(page_of(emva_sheets.colour_sheet())))
     figures = [a for a in found.of("svg") if "figure" in a.get("class", "")]
@@ -424,6 +429,7 @@ def test_a_camera_has_one_verdict_that_of_its_worst_channel() -> None:
     assert document_lines([bent(1.2)])[0].startswith("Release 4.0 Linear applies")
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_headline_is_of_the_document_that_applies_and_has_its_u() -> None:
     assert "η 45.00 ± 0.23 %" in page().text[: page().text.index("Quantity")]
     text = Page(html_of(page_of(sheet(bent(5.0))))).text

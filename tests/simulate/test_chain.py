@@ -108,17 +108,22 @@ def test_the_command_writes_a_page_and_replaces_only_its_own(tmp_path: Path) -> 
     from pixmetry.cli import main
     from pixmetry.core.config import dump_yaml
 
-    scene, page = tmp_path / "scene.yaml", tmp_path / "page.html"
+    scene, page, pdf = tmp_path / "scene.yaml", tmp_path / "page.html", tmp_path / "page.pdf"
     dump_yaml(SCENE, scene)
     small = replace(load_camera("imx264_like"), frame_shape=(90, 110))
     small.save(tmp_path / "camera.yaml")
     arguments = ["chain", str(tmp_path / "camera.yaml"), str(scene), "-o", str(page)]
-    for _ in range(2):
-        done = CliRunner().invoke(main, arguments)
+    for more in ([], ["--pdf", str(pdf)]):
+        done = CliRunner().invoke(main, [*arguments, *more])
         assert done.exit_code == 0 and str(page) in done.output
+    assert pdf.read_bytes().startswith(b"%PDF-1") and f"pdf: {pdf}" in done.output
     text = page.read_text()
     assert len(re.findall(r'<figure id="source-', text)) == 1 + len(small.chain)
     assert "http" not in re.sub(r"http://www\.w3\.org/\S+", "", text)  # asks for nothing from anywhere
     refused = CliRunner().invoke(main, [*arguments[:-1], str(scene)])
     assert refused.exit_code == 2 and "would overwrite an input" in refused.output and "discs" in scene.read_text()
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["camera.yaml", "page.html", "scene.yaml"]
+    pdf.write_bytes(b"%PDF-1.4 of somebody else")
+    refused = CliRunner().invoke(main, [*arguments, "--pdf", str(pdf)])
+    assert refused.exit_code == 2 and "no result of this kind" in refused.output
+    assert pdf.read_bytes() == b"%PDF-1.4 of somebody else"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["camera.yaml", "page.html", "page.pdf", "scene.yaml"]
