@@ -353,12 +353,12 @@ def cross_frame(x: float, y: float, first: float, second: float, width: float, u
 
 
 def test_crosses_have_true_covariances(rng: np.random.Generator) -> None:
-    """Sums and unions, thin and wide, at any angle of 40° or more; whitened errors of 60 crosses.
+    """Sums and unions, thin and wide, at any angle of 40° or more; whitened errors of 60 crosses and of the angles of their bars.
 
     About one line in a thousand is found as two, on both sides of the crossing, and then there is no cross (6 of 3500): four of 60 may be
     missed, five are by chance once in 10⁷ runs; a fifth missed would be caught with 99 %.
     """
-    z, height, missed = [], 100.0, 0
+    z, turns, height, missed = [], [], 100.0, 0
     for k in range(60):
         x, y = 50 + rng.uniform(-2, 2, 2)
         first = rng.uniform(-90, 90)
@@ -372,10 +372,14 @@ def test_crosses_have_true_covariances(rng: np.random.Generator) -> None:
         p = cross_positions(frame, found, WHITE)
         cov = np.array([[p.var_x_px2[0], p.cov_xy_px2[0]], [p.cov_xy_px2[0], p.var_y_px2[0]]])
         z.append(np.linalg.solve(np.linalg.cholesky(cov), [p.x_px[0] - x, p.y_px[0] - y]))
+        for side in (1, 2):
+            off = (p.more[f"angle{side}_deg"][0] - np.array([first, second]) + 90) % 180 - 90
+            turns.append(off[np.argmin(np.abs(off))] / np.sqrt(p.more[f"var_angle{side}_deg2"][0]))
         if k % 2:
             assert p.more["overlap_dn"][0] == pytest.approx(-height if k % 4 < 2 else 0.0, abs=8.0)
     assert missed <= 4
     assert_normal(np.ravel(z))
+    assert_normal(np.array(turns), "angles")
 
 
 def test_detection_finds_lines_where_they_are(rng: np.random.Generator) -> None:
