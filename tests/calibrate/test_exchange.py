@@ -102,7 +102,7 @@ def test_colmap_sees_the_same_pixels_half_a_pixel_further(kind: str, rng: np.ran
 
 def test_what_cannot_be_read_is_refused(tmp_path: Path) -> None:
     refusals = {
-        "1 OPENCV_FISHEYE 752 582 900 900 376 291 0 0 0 0": "would be lost",
+        "1 OPENCV_FISHEYE 752 582 900 900 376 291 0 0 0 0": "cannot represent",
         "1 FULL_OPENCV 752 582 900 900 376 291 0 0 0 0 0 0.1 0 0": "rational",
         "1 RADIAL 752 582 900 376 291 0": "5 parameters",
         "1 RADIAL": "not a line",
