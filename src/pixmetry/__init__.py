@@ -23,6 +23,7 @@ _HOMES = {
     "add_source_file": "pixmetry.camera.catalogue",
     "assess": "pixmetry.assess.job",
     "bound": "pixmetry.locate.bound.bound",
+    "budget": "pixmetry.budget.job",
     "calibrate": "pixmetry.calibrate.job",
     "campaign_of_arrays": "pixmetry.files",
     "chain": "pixmetry.simulate.chain",
@@ -51,6 +52,7 @@ __all__ = [
     "add_source_file",
     "assess",
     "bound",
+    "budget",
     "calibrate",
     "campaign_of_arrays",
     "chain",
@@ -72,6 +74,7 @@ if TYPE_CHECKING:
     from pixmetry.assess.correct import correct
     from pixmetry.assess.job import assess
     from pixmetry.assess.judge.compare import check_limits, compare, compare_fleet
+    from pixmetry.budget.job import budget
     from pixmetry.calibrate.files.record import read_calibration
     from pixmetry.calibrate.job import calibrate
     from pixmetry.camera.camera import Camera, load_camera

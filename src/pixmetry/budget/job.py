@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from pixmetry.budget.advice import advise
+from pixmetry.budget.answer import with_shares
+from pixmetry.budget.camera_budget import CameraBudget
+from pixmetry.budget.cameras import camera_of
 from pixmetry.budget.combine import combine, together_with
 from pixmetry.budget.headline import dof_of, headline, interval_of
 from pixmetry.budget.monte_carlo import Trials
@@ -21,6 +25,9 @@ from pixmetry.budget.rows import (
     rows_by_formula,
     without_accepted,
 )
+from pixmetry.budget.scenario import Scenario, read_scenario
+from pixmetry.budget.setting import Setting
+from pixmetry.budget.table import Table
 from pixmetry.camera.camera import Camera
 from pixmetry.camera.observations import TAKEN_UP, CameraGeometry
 from pixmetry.core.number import Estimates
@@ -133,4 +140,57 @@ def compute_budget(
     )
 
 
-__all__ = ["DECIDED", "Budget", "BudgetRow", "Interaction", "compute_budget"]
+def budget(
+    camera: str | Path | Camera | Sequence[str | Path | Camera],
+    scenario: str | Path | Mapping[str, Any] | Scenario | None = None,
+    *,
+    estimator: Estimator | str | None = None,
+    trials: int = 0,
+    seed: int = 0,
+    progress: Callable[[str], None] | None = None,
+) -> CameraBudget:
+    """Budget every error source of a camera for a measurement, on paper: before and after calibration.
+
+    Parameters
+    ----------
+    camera : path, name of a preset, Camera, or several
+        A preset, a camera file, a data sheet, the ``camera.yaml`` of an assessment; of several, what was measured replaces what a sheet
+        says, and both are compared.
+    scenario : path, mapping or Scenario, optional
+        What is measured and how, schema ``pixmetry/scenario/1``; whatever it leaves open has a default.
+    estimator : Estimator or str, optional
+        By default what `pixmetry.locate` takes for such a target.
+    trials : int
+        Windows of a Monte Carlo with all sources of the chain at once; 0 for none.
+    seed : int
+    progress : callable, optional
+        Called with the name of what is being done.
+
+    Returns
+    -------
+    CameraBudget
+
+    Raises
+    ------
+    InputError
+        If camera or scenario cannot be used, or the target is not seen.
+
+    Examples
+    --------
+    >>> import pixmetry
+    >>> found = pixmetry.budget("imx264_like", {"calibration": {"model": "lens"}})
+    >>> found.one.after_px[0] < found.one.before_px[0]
+    True
+    """
+    known, disagreements = camera_of(camera)
+    setting = Setting(known, read_scenario(scenario))
+    law = TargetEstimator(estimator) if isinstance(estimator, str) else estimator or TargetEstimator()
+    table = Table(setting, law, seed, progress or (lambda text: None))
+    rows = with_shares(table.rows())
+    together = None
+    if trials:
+        together = Trials(setting.camera, setting.target, law, setting.facts, trials, seed=seed).of()
+    return CameraBudget(setting, resolve(law, setting.target, setting.facts), tuple(rows), disagreements, together)
+
+
+__all__ = ["DECIDED", "Budget", "BudgetRow", "Interaction", "budget", "compute_budget"]

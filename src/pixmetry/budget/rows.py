@@ -127,6 +127,8 @@ def _with_status(row: BudgetRow, source: Source, known: Known) -> BudgetRow:
 
 def _beyond(source: Source, known: Known) -> str:
     """Why a camera does not have this source, if nothing says that it has; empty if it may have it."""
+    if source.part_of:
+        return f"it counts in the row of {sources()[source.part_of].title}"
     if source.option:
         return f"only in a camera with {source.option}"
     if source.stage == "storage" and known.camera.facts.get("lossless"):

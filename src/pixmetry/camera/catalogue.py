@@ -14,7 +14,7 @@ from types import ModuleType
 from pixmetry.camera.source import Source
 from pixmetry.core.errors import ChainError, InputError
 
-STAGES = ("optics", "sensor", "electronics", "cable", "grabber", "processing", "storage")
+STAGES = ("scene", "optics", "sensor", "electronics", "cable", "grabber", "processing", "storage")
 ENTRY_POINTS = "pixmetry.sources"
 
 

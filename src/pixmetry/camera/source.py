@@ -103,6 +103,8 @@ class Source:
     option : str
         What a camera must have for this source to be in it, where most have not: ``a colour mosaic``. A budget counts it only where the
         camera's chain holds it.
+    part_of : str
+        Id of the source whose row in a budget holds it already: its own row is told, and does not count.
     held_by : tuple of str
         Sources under whose names frames without targets show all of it. A budget in which these are measured does not count it once more.
     gum_class : str
@@ -152,6 +154,7 @@ class Source:
     start: Callable[[Any], Any] | None = None
     applies_to: tuple[str, ...] = ()
     option: str = ""
+    part_of: str = ""
     held_by: tuple[str, ...] = ()
     reasons: Mapping[str, str] = field(default_factory=dict)
 

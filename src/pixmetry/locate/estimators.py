@@ -40,7 +40,7 @@ def methods() -> dict[str, Method]:
     --------
     >>> from pixmetry.locate.estimators import methods
     >>> methods()["centroid"].text
-    'centroid of grey values above the background; best for small targets under shot noise'
+    'centroid of grey values above the background; best for small targets with shot noise'
     """
     return {method.name: method for module in MODULES for method in import_module(module).METHODS}
 

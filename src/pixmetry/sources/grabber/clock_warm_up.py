@@ -22,7 +22,7 @@ class ClockWarmUp(Parameters):
     delay_ns: float = quantity(0.0, "ns", "delay of the lines when switched on", ge=-1e4, le=1e4)
     delay_tau_s: float = quantity(820.0, "s", "time constant with which this delay decreases", gt=1, le=1e6)
     lock_us: float = quantity(10.5, "µs", "distance from the point where the clock is locked in each line to the first pixel", ge=0, le=60)
-    on_for_s: float = quantity(0.0, "s", "time between switching on and frame 0", ge=0, le=1e7)
+    on_for_s: float = quantity(0.0, "s", "time between switching on and frame 0", ge=0, le=1e8)
 
     def scale(self, time_s: np.ndarray) -> np.ndarray:
         """Relative error of the frequency at times of the sequence, δ0 e^(−t/τ)."""

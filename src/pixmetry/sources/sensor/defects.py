@@ -21,6 +21,7 @@ MOST = 0.1  # share of defects beyond which it is not clear what the good pixels
 LOOK_BACK = (8, 256)  # frames looked at together for the last draw of a blinking pixel: at first, and at most
 FOUND_95 = 1.645  # standard deviations above the limit at which 95 of 100 defects are found
 PHASES = 6  # places within the pixel at which a defect is tried
+SMALL = 0.01  # of the largest shift: what is left out
 NODES = 7  # of the Gauss–Hermite quadrature over the logarithm of the excess
 NEIGHBOURS = [(dr, dc) for dr in (-1, 0, 1) for dc in (-1, 0, 1) if (dr, dc) != (0, 0)]
 Listed = tuple[NonNegativeInt, NonNegativeInt, NonNegativeFloat, float]
@@ -425,7 +426,8 @@ def _mean_square_dn2(params: Defects, name: str, probe: Probe) -> np.ndarray | f
 def _of_singles(probe: Probe, phase: int, cases: list[tuple[float, np.ndarray]]) -> np.ndarray:
     """Sum over pixels and cases, each with its weight, of the second and fourth power of the shift when one pixel has its changed value.
 
-    Pixels that the estimator does not read are found once, by their largest change in any case, which then does not move it at all.
+    Pixels that the estimator hardly reads are found once, by their largest change in any case, and left out: a shift of 1 % of the
+    largest is 1e-4 of its square.
     """
     base = probe.signal_dn[phase].ravel()
     changed = [(weight, np.minimum(values.ravel(), probe.saturation_dn)) for weight, values in cases]
@@ -440,7 +442,9 @@ def _of_singles(probe: Probe, phase: int, cases: list[tuple[float, np.ndarray]])
     values = np.stack([v for _, v in changed])
     largest = values[np.abs(values - base).argmax(axis=0), np.arange(base.size)]
     read = np.flatnonzero(largest != base)
-    read = read[(shifts(read, largest) != 0).any(axis=0)] if len(read) and len(changed) > 1 else read
+    if len(read) and len(changed) > 1:
+        most = np.abs(shifts(read, largest)).max(axis=0)
+        read = read[~(most <= SMALL * np.nanmax(most))]  # a lost target stays in
     moments = np.zeros((2, 2))
     for weight, one in changed:
         at = read[one[read] != base[read]]

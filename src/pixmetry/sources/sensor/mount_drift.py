@@ -27,6 +27,7 @@ class MountDrift(Parameters):
     slow_s: float = quantity(1800.0, "s", "slow time constant (the body)", gt=0, le=1e6)
     sag_px: float = quantity(0.0, "px", "displacement by the camera's weight, camera level", ge=-10, le=10)
     roll_deg: float = quantity(0.0, "deg", "roll of the camera about its axis since the calibration", ge=-180, le=180)
+    on_for_s: float = quantity(0.0, "s", "how long it had been on when frame 0 was taken", ge=0, le=1e8)
 
 
 def settled(params: MountDrift, time_s: np.ndarray) -> np.ndarray:
@@ -37,7 +38,7 @@ def settled(params: MountDrift, time_s: np.ndarray) -> np.ndarray:
 
 def pull_of(params: MountDrift, time_s: np.ndarray, frame_shape: tuple[int, int]) -> Pull:
     """The map from displaced to first places: x' = A x + t about the frame's centre, inverted."""
-    p, roll = settled(params, time_s), np.radians(params.roll_deg)
+    p, roll = settled(params, time_s + params.on_for_s), np.radians(params.roll_deg)
     turn = params.rotation_rad * p
     grown = 1 + params.scale_rel * p
     cos, sin = grown * np.cos(turn), grown * np.sin(turn)

@@ -1,0 +1,137 @@
+"""The answer of a table of error sources: their sum, the interval that ignorance leaves, what to measure and to change next."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pixmetry.budget.table import AT_BOUND, COUNTED, TYPICAL, Pair, Parts, SourceRow
+
+SIGNED = ("measured", "from the sheet", "described")  # their signs are this camera's; those of typical values are not known
+
+
+@dataclass(frozen=True)
+class Answer:
+    """Standard uncertainty of a position in px, in x and y, for means over so many frames and targets.
+
+    Parameters
+    ----------
+    before_px, after_px : (float, float)
+        Without a calibration, and with that of the scenario.
+    least_px, most_px : (float, float)
+        After the calibration: with nothing but what is known of this camera, and with everything that is not measured at its bound.
+    frames, targets : int
+    """
+
+    before_px: Pair
+    after_px: Pair
+    least_px: Pair
+    most_px: Pair
+    frames: int = 1
+    targets: int = 1
+
+    @property
+    def after_rms_px(self) -> float:
+        """Root mean square over x and y."""
+        return rms(self.after_px)
+
+    @property
+    def most_rms_px(self) -> float:
+        """Root mean square over x and y."""
+        return rms(self.most_px)
+
+
+@dataclass(frozen=True)
+class Next:
+    """One thing to do next: measure a source, or change something about it.
+
+    ``now_px`` is the upper end of the interval (to measure) or the total (to change), ``then_px`` what it would be; rms over x and y.
+    """
+
+    name: str
+    source_id: str
+    title: str
+    text: str
+    now_px: float
+    then_px: float
+
+    @property
+    def gain_px(self) -> float:
+        """By how much it falls."""
+        return self.now_px - self.then_px
+
+
+def rms(pair: Pair) -> float:
+    """Root mean square of two values."""
+    return float(np.sqrt(0.5 * (pair[0] ** 2 + pair[1] ** 2)))
+
+
+def sum_of(parts: Iterable[tuple[Parts, bool]], frames: int = 1, targets: int = 1) -> Pair:
+    """Parts of several sources together, in x and y; what is constant adds with its sign where that is known, all else as squares.
+
+    Notes
+    -----
+    u² = Σ place²/targets + Σ time²/(frames targets) + Σ smooth² + (Σ constant)², JCGM 100:2008, 5.1.2.
+    """
+    squares, constant = np.zeros(2), np.zeros(2)
+    for part, sign_known in parts:
+        fixed = np.array(part.constant_px)
+        rest = np.square(replace(part, constant_px=(0.0, 0.0)).axes_px(frames, targets))
+        squares += rest if sign_known else rest + fixed**2
+        constant += fixed if sign_known else 0.0
+    x, y = (float(v) for v in np.sqrt(squares + constant**2))
+    return x, y
+
+
+def answer_of(rows: Sequence[SourceRow], frames: int = 1, targets: int = 1) -> Answer:
+    """Put the rows together for means over so many frames and targets."""
+    counted = [r for r in rows if r.status in COUNTED]
+    known = [r for r in counted if r.status != TYPICAL]
+
+    def together(of: Iterable[tuple[Parts | None, bool]]) -> Pair:
+        return sum_of(((p, s) for p, s in of if p is not None), frames, targets)
+
+    return Answer(
+        before_px=together((r.before, r.status in SIGNED) for r in counted),
+        after_px=together((r.after, r.status in SIGNED) for r in counted),
+        least_px=together((r.after, True) for r in known),
+        most_px=together((r.largest if r.largest is not None else r.after, r.status in SIGNED) for r in rows if _may_count(r)),
+        frames=frames,
+        targets=targets,
+    )
+
+
+def _may_count(row: SourceRow) -> bool:
+    return row.status in (*COUNTED, AT_BOUND)
+
+
+def with_shares(rows: Sequence[SourceRow]) -> list[SourceRow]:
+    """The rows in the order in which they matter after the calibration, each with its share of the square of the whole."""
+    whole = sum(r.after_px**2 for r in rows if r.counts)
+    shared = [replace(r, share=r.after_px**2 / whole if whole and r.counts else 0.0) for r in rows]
+    return sorted(shared, key=lambda r: (not r.counts, r.status not in COUNTED, -r.after_px, -r.largest_px, -r.before_px))
+
+
+def to_measure(rows: Sequence[SourceRow], frames: int = 1, targets: int = 1) -> list[Next]:
+    """What to measure next: by how much the upper end of the interval falls if a source is found to be as usual (or not there)."""
+    now = answer_of(rows, frames, targets).most_rms_px
+    found = []
+    for row in rows:
+        if row.largest is None or row.status not in (TYPICAL, AT_BOUND):
+            continue
+        then = answer_of([replace(r, largest=None) if r is row else r for r in rows], frames, targets).most_rms_px
+        found.append(Next(row.name, row.source_id, row.title, "", now, then))
+    return sorted((n for n in found if n.gain_px > 0), key=lambda n: n.then_px)
+
+
+def to_change(rows: Sequence[SourceRow], frames: int = 1, targets: int = 1) -> list[Next]:
+    """What to change next: by how much the total falls without a source."""
+    now = answer_of(rows, frames, targets).after_rms_px
+    found = []
+    for row in rows:
+        if row.counts:
+            then = answer_of([r for r in rows if r is not row], frames, targets).after_rms_px
+            found.append(Next(row.name, row.source_id, row.title, row.advice, now, then))
+    return sorted((n for n in found if n.gain_px > 0), key=lambda n: n.then_px)

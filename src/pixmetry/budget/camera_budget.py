@@ -1,0 +1,175 @@
+"""The budget of a camera in a scenario: every error source before and after calibration, the answer, and what to do next."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from html import escape
+from typing import Any
+
+import numpy as np
+
+from pixmetry.budget.answer import Answer, Next, answer_of, rms, to_change, to_measure
+from pixmetry.budget.cameras import Disagreement
+from pixmetry.budget.monte_carlo import MonteCarlo
+from pixmetry.budget.object_space import point_covariance
+from pixmetry.budget.scenario import Scenario
+from pixmetry.budget.setting import Setting
+from pixmetry.budget.table import SourceRow
+from pixmetry.core.errors import InputError
+from pixmetry.locate.estimator import Estimator
+
+SCHEMA = "pixmetry/camera_budget/1"
+SHOWN = 12  # rows in a notebook
+
+
+@dataclass(frozen=True, eq=False)
+class CameraBudget:
+    """Every error source of a camera in a scenario, and what they come to.
+
+    Parameters
+    ----------
+    setting : Setting
+        Camera and scenario.
+    estimator : Estimator
+        As it was resolved for this target.
+    rows : tuple of SourceRow
+        What counts first, largest after the calibration first.
+    disagreements : tuple of Disagreement
+        Where several descriptions of the camera were given: every parameter that two of them know.
+    together : MonteCarlo, optional
+        All sources of the camera's chain at once, with the target at rest.
+    """
+
+    setting: Setting
+    estimator: Estimator
+    rows: tuple[SourceRow, ...]
+    disagreements: tuple[Disagreement, ...] = ()
+    together: MonteCarlo | None = None
+
+    @property
+    def camera(self) -> str:
+        """Its name."""
+        return self.setting.described.name
+
+    @property
+    def scenario(self) -> Scenario:
+        """What is measured and how."""
+        return self.setting.scenario
+
+    @cached_property
+    def one(self) -> Answer:
+        """One target in one frame."""
+        return answer_of(self.rows)
+
+    @cached_property
+    def answer(self) -> Answer:
+        """The mean over the frames and targets of the scenario."""
+        return answer_of(self.rows, self.scenario.count.frames, self.scenario.count.targets)
+
+    @cached_property
+    def to_measure(self) -> tuple[Next, ...]:
+        """What to measure next, by how much it narrows the interval."""
+        return tuple(to_measure(self.rows))
+
+    @cached_property
+    def to_change(self) -> tuple[Next, ...]:
+        """What to change next, by how much it lowers the total."""
+        return tuple(to_change(self.rows))
+
+    def um(self, pair_px: tuple[float, float]) -> tuple[float, float] | None:
+        """A pair of lengths in µm on the sensor; None where the pitch is not known."""
+        pitch = self.setting.described.pitch_um
+        return None if pitch is None else (pair_px[0] * pitch[0], pair_px[1] * pitch[1])
+
+    def mm(self, pair_px: tuple[float, float]) -> tuple[float, float] | None:
+        """A pair of lengths in mm on the object, across the line of sight; None where the scale is not known."""
+        scale, pitch = self.setting.px_per_mm, self.setting.described.pitch_um
+        if scale is None:
+            return None
+        return pair_px[0] / scale, pair_px[1] / scale * (pitch[1] / pitch[0] if pitch else 1.0)
+
+    def point_mm(self, pair_px: tuple[float, float] | None = None) -> np.ndarray | None:
+        """Covariance in mm² of a point in space by the scenario's rays, shape (3, 3): along the base, across it, along the line of sight.
+
+        None where the scale is not known, or there is one ray only.
+        """
+        pair = self.answer.after_px if pair_px is None else pair_px
+        across = self.mm(pair)
+        count = self.scenario.count
+        if across is None or count.rays < 2 or min(across) <= 0:
+            return None
+        return point_covariance(across, 1.0, count.rays, count.base_to_height)
+
+    def __repr__(self) -> str:
+        one = self.one
+        return (
+            f"CameraBudget({self.camera!r}: {rms(one.before_px):.2g} px before, {rms(one.after_px):.2g} px after calibration "
+            f"[{rms(one.least_px):.2g} to {rms(one.most_px):.2g}], {sum(r.counts for r in self.rows)} of {len(self.rows)} sources count)"
+        )
+
+    def _repr_html_(self) -> str:
+        rows = [r for r in self.rows if r.counts][:SHOWN]
+        cells = ((escape(r.title), r.status, *(f"{1e3 * v:.2g}" for v in (r.before_px, r.after_px, r.largest_px))) for r in rows)
+        body = "".join(f"<tr>{''.join(f'<td>{c}</td>' for c in row)}</tr>" for row in cells)
+        head = "".join(f"<th>{h}</th>" for h in ("source", "known", "before / mpx", "after / mpx", "at most / mpx"))
+        return f"<p>{escape(repr(self))}</p><table><tr>{head}</tr>{body}</table>"
+
+    def to_dataframe(self) -> Any:
+        """Return the rows as a ``pandas.DataFrame``: totals in px, one target in one frame.
+
+        Raises
+        ------
+        InputError
+            If pandas is not installed.
+        """
+        try:
+            import pandas  # type: ignore[import-untyped]
+        except ImportError:
+            raise InputError("pandas is not installed", where="to_dataframe", remedy="install it: pip install pandas") from None
+        names = [
+            "name",
+            "number",
+            "stars",
+            "own_stars",
+            "title",
+            "status",
+            "gum_class",
+            "before_px",
+            "after_px",
+            "largest_px",
+            "share",
+            "how",
+        ]
+        return pandas.DataFrame({n: [getattr(r, n) for r in self.rows] for n in names})
+
+    def to_record(self) -> dict[str, Any]:
+        """Return the plain record for JSON."""
+        covariance = self.point_mm()
+        return {
+            "schema": SCHEMA,
+            "camera": self.camera,
+            "scenario": {name: {"value": value, "given": given} for name, (value, given) in self.scenario.told.items()},
+            "target": asdict(self.setting.target),
+            "estimator": {"name": self.estimator.name} | asdict(self.estimator),
+            "pitch_um": self.setting.described.pitch_um,
+            "px_per_mm": self.setting.px_per_mm,
+            "one_target_one_frame": self._answer_record(self.one),
+            "answer": self._answer_record(self.answer),
+            "point_covariance_mm2": None if covariance is None else covariance.tolist(),
+            "rows": [_row_record(r) for r in self.rows],
+            "to_measure": [asdict(n) for n in self.to_measure],
+            "to_change": [asdict(n) for n in self.to_change],
+            "descriptions": [asdict(d) | {"agree": d.agree} for d in self.disagreements],
+        }
+
+    def _answer_record(self, answer: Answer) -> dict[str, Any]:
+        record = asdict(answer)
+        for name in ("before", "after", "least", "most"):
+            pair = record[f"{name}_px"]
+            record[f"{name}_um"], record[f"{name}_mm"] = self.um(pair), self.mm(pair)
+        return record
+
+
+def _row_record(row: SourceRow) -> dict[str, Any]:
+    return asdict(row) | {n: getattr(row, n) for n in ("before_px", "after_px", "largest_px", "own_stars", "counts", "taken_up")}

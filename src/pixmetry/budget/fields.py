@@ -1,0 +1,155 @@
+"""Where a camera shows points of the whole frame, and what a calibration leaves of that.
+
+A *field* is the displacement of points at many places of the frame, in pixels of the sensor: where a frame shows them less where they
+belong. It is exact: the camera's own maps give it, no image is needed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pixmetry.camera.camera import Camera
+
+SIDE = 20  # places along each side of the frame
+
+
+@dataclass(frozen=True)
+class Places:
+    """Places that are spread over a sensor, and the corners of the cells of a residual grid around each.
+
+    ``x_px`` and ``y_px`` have the shape (5, n): the places, and the four corners of the cell that each lies in; ``weights`` (4, n) are
+    those of the corners in the bilinear interpolation at the place.
+    """
+
+    x_px: np.ndarray
+    y_px: np.ndarray
+    weights: np.ndarray
+    frame_shape: tuple[int, int]
+
+    @classmethod
+    def over(cls, frame_shape: tuple[int, int], grid_px: float) -> Places:
+        """Places for a sensor of this size and a grid of this spacing (one cell over the frame, where it is larger)."""
+        rows, cols = frame_shape
+        n = np.arange(SIDE * SIDE)
+        # an additive recurrence with irrational steps: even over the frame, and over the cells of a grid of any spacing
+        share = np.stack([(0.5 + n * 0.7548776662466927) % 1, (0.5 + n * 0.5698402909980532) % 1])
+        ends = np.array([[cols - 1.0], [rows - 1.0]])
+        at = share * ends
+        cells = np.maximum(np.ceil(ends / grid_px), 1.0)
+        step = ends / cells
+        cell = np.minimum(np.floor(at / np.where(step > 0, step, 1.0)), cells - 1)
+        low, high = cell * step, (cell + 1) * step
+        part = np.divide(at - low, step, out=np.zeros_like(at), where=step > 0)
+        x = np.stack([at[0], low[0], high[0], low[0], high[0]])
+        y = np.stack([at[1], low[1], low[1], high[1], high[1]])
+        u, v = part
+        return cls(x, y, np.stack([(1 - u) * (1 - v), u * (1 - v), (1 - u) * v, u * v]), frame_shape)
+
+
+def field_of(camera: Camera, places: Places, known_layout: bool = True) -> np.ndarray:
+    """Displacement of all places of the grid in x and y, shape (2, 5, n), px of the sensor; NaN where a place is not in the frame.
+
+    ``known_layout``: how the camera lays out its frames (clock of the samples, offsets, fields) is accounted for, as in `Camera.layout`.
+    Without, the middle of the frame is taken for that of the sensor, and a row of samples for all of a row of the sensor.
+    """
+    x, y = places.x_px.ravel(), places.y_px.ravel()
+    seen = camera.true_positions(x, y, temperature_c=camera.temperature_c)
+    back = []
+    laid_out = camera.layout([0.0, 1.0], [0.0, 1.0])
+    resampled = any(e.source.id == "grabber.sampling_clock" for e in camera.active)
+    for axis, (at, ends) in enumerate(zip(seen, laid_out, strict=True)):
+        size, shown = places.frame_shape[1 - axis], camera.output_shape[1 - axis]
+        if known_layout:
+            back.append((at - ends[0]) / (ends[1] - ends[0]))
+        else:
+            step = size / shown if resampled and axis == 0 else max(round(size / shown), 1)
+            back.append((at - (shown - 1) / 2) * step + (size - 1) / 2)
+    field = np.stack([back[0] - x, back[1] - y]).reshape(2, *places.x_px.shape)
+    rows, cols = camera.output_shape
+    outside = ((np.abs(seen[0] - (cols - 1) / 2) > cols / 2) | (np.abs(seen[1] - (rows - 1) / 2) > rows / 2)).reshape(places.x_px.shape)
+    field[:, 0, outside[0]] = np.nan  # the corners of a grid may lie beyond
+    return field
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What positions are corrected for.
+
+    Parameters
+    ----------
+    model : {"none", "principal_point_and_scale", "lens", "residual_grid"}
+        Nothing; a shift and a scale of each axis; an affine map, radial terms up to the seventh power, decentring and the two terms of
+        a small rotation of the camera (D. C. Brown, Photogrammetric Engineering 37(8), 1971); these, and a grid of what is left,
+        interpolated bilinearly.
+    every_image : bool
+        A shift and the scales are fitted in every image again.
+    places : Places
+    aspect : float
+        Pitch in y over that in x.
+    """
+
+    model: str
+    every_image: bool
+    places: Places
+    aspect: float = 1.0
+
+    def left(self, now: np.ndarray, then: np.ndarray) -> np.ndarray:
+        """What stays of a field when it was calibrated as it was ``then``; shape (2, n), at the places themselves.
+
+        The polynomials are of the measured places, as those of photogrammetric calibrations are: places and displacement together.
+        """
+        square = np.array([1.0, self.aspect])[:, None, None]  # all lengths in pixels along x
+        now, then = now * square, then * square
+        found = now[:, 0]
+        if self.model != "none":
+            found = found - self._modelled(then)
+        if self.every_image:
+            scales = _scales(*self._unit(np.zeros_like(now)))[:, :, 0]
+            found = found - _followed(found, scales, scales)
+        return found / square[:, 0]
+
+    def _modelled(self, then: np.ndarray) -> np.ndarray:
+        x, y = self._unit(then)
+        basis = _scales(x, y) if self.model == "principal_point_and_scale" else _lens(x, y)
+        smooth = _followed(then[:, 0], basis[:, :, 0], basis)
+        if self.model != "residual_grid":
+            return smooth[:, 0]
+        return smooth[:, 0] + np.einsum("kn,akn->an", self.places.weights, (then - smooth)[:, 1:])
+
+    def _unit(self, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Measured places, over half the frame's longer side."""
+        rows, cols = self.places.frame_shape
+        scale = max(rows, cols) / 2
+        x, y = self.places.x_px - (cols - 1) / 2, self.aspect * (self.places.y_px - (rows - 1) / 2)
+        return (x + moved[0]) / scale, (y + moved[1]) / scale
+
+
+def _scales(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Shifts and scales, shape (4, 2, …)."""
+    one, zero = np.ones_like(x), np.zeros_like(x)
+    return np.array([[one, zero], [zero, one], [x, zero], [zero, y]])
+
+
+def _lens(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """What a self-calibration takes up, shape (13, 2, …)."""
+    zero, r2 = np.zeros_like(x), x**2 + y**2
+    affine = [[y, zero], [zero, x]]
+    radial = [[x * r2**k, y * r2**k] for k in (1, 2, 3)]
+    decentring = [[r2 + 2 * x * x, 2 * x * y], [2 * x * y, r2 + 2 * y * y]]
+    rotation = [[x * x, x * y], [x * y, y * y]]  # of the camera, or a tilt of the sensor: the exterior orientation takes it up
+    return np.concatenate([_scales(x, y), np.array(affine + radial + decentring + rotation)])
+
+
+def _followed(values: np.ndarray, basis: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """What a basis (k, 2, n) follows of values (2, n) by least squares over the places that are seen; at other places, as ``at`` (k, …)."""
+    seen = np.isfinite(values)
+    columns = np.where(seen[None], basis, 0.0).reshape(len(basis), -1).T
+    found = np.linalg.lstsq(columns, np.where(seen, values, 0.0).ravel(), rcond=None)[0]
+    return np.asarray(np.tensordot(found, at, axes=1))
+
+
+def spread_of(field: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and standard deviation of a field over the frame, each of shape (2,); places that are not seen are left out."""
+    return np.nanmean(field, axis=1), np.nanstd(field, axis=1)

@@ -1,0 +1,315 @@
+"""The page of a camera's budget: the answer with its interval, what matters, what to do next, every row, the handbook's table beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import groupby
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pixmetry.budget.answer import Answer as Totals
+from pixmetry.budget.answer import Next, rms
+from pixmetry.budget.camera_budget import CameraBudget
+from pixmetry.budget.table import ABSENT, Parts, SourceRow
+from pixmetry.camera.catalogue import STAGES, get_source
+from pixmetry.report import Answer, Column, Figure, Page, Points, Reading, Row, Run, Section, Table, Text, strong
+from pixmetry.report.drawing import BLUE, INK, SOFT, canvas
+from pixmetry.report.numbers import NONE, length_mpx, length_px, length_um, percent, significant
+
+if TYPE_CHECKING:
+    from matplotlib.patches import Patch
+
+KIND = "error budget"
+TITLE = f"<title>: {KIND}</title>"  # ends so
+FOOTER = "All lengths are standard uncertainties (k = 1), bias included; x runs along rows, y along columns."
+LISTED = 8  # things to do
+WORTH = 0.01  # gain over what is now, from which on something is worth doing
+MOST_BARS = 14
+ALIKE = 1  # stars by which two judgements may differ without a word
+HOW_TO_READ = (
+    "One target in one frame, in thousandths of a pixel; the largest after the calibration first. “Before” is without any calibration, "
+    "“after” is what that of the scenario leaves. “At most” is what a sound camera can have where nothing was measured. Random part and "
+    "bias are added as squares."
+)
+STAR_SCALE = "Stars are by the total before calibration: ★ from 0.005 px, ★★ 0.03, ★★★ 0.1, ★★★★ 0.3, ★★★★★ 1 px."
+
+
+def page_of(budget: CameraBudget) -> Page:
+    """The page of a camera's budget.
+
+    Parameters
+    ----------
+    budget : CameraBudget
+
+    Returns
+    -------
+    Page
+    """
+    page = Page(budget.camera, KIND, "pixmetry error budget", _facts(budget), FOOTER)
+    page.sections += [
+        _answer(budget),
+        _next("What to change next", "change", budget.to_change, "the total falls from {} to {} px"),
+        _next("What to measure next", "measure", budget.to_measure, "the upper end of the interval falls from {} to {} px"),
+        _all_rows(budget),
+        _handbook(budget),
+        _scenario(budget),
+    ]
+    if budget.disagreements:
+        page.sections.insert(3, _descriptions(budget))
+    return page
+
+
+def _facts(budget: CameraBudget) -> list[tuple[str, str]]:
+    setting, camera = budget.setting, budget.setting.described
+    rows, cols = camera.frame_shape
+    facts = [("Camera", f"{camera.name}, {cols} × {rows} px")]
+    if camera.pitch_um is not None:
+        facts.append(("Pixel pitch", f"{camera.pitch_um[0]:g} × {camera.pitch_um[1]:g} µm"))
+    facts += [("Target", setting.target.describe()), ("Estimator", budget.estimator.describe())]
+    facts.append(("Calibration", budget.scenario.calibration.model.replace("_", " ")))
+    if setting.px_per_mm is not None:
+        facts.append(("Scale", f"{significant(setting.px_per_mm)} px for a millimetre on the object"))
+    return facts
+
+
+# ---- the answer --------------------------------------------------------------------------------------------------------------------
+
+
+def _answer(budget: CameraBudget) -> Section:
+    one, mean, count = budget.one, budget.answer, budget.scenario.count
+    section = Section("Uncertainty of a position", name="answer")
+    parts: list[Text | Sequence[Reading]] = [Text("One target in one frame, after the calibration:"), _readings(budget, one.after_px)]
+    parts.append(Text(_interval(one)))
+    if (count.frames, count.targets) != (1, 1):
+        parts += [Text(f"Mean over {_many(count.frames, 'frame')} and {_many(count.targets, 'target')}:"), _readings(budget, mean.after_px)]
+    covariance = budget.point_mm()
+    if covariance is not None:
+        along, across, depth = np.sqrt(np.diag(covariance))
+        parts.append(Text(f"A point on the object, by {count.rays} rays with a base of {count.base_to_height:g} of the distance:"))
+        parts.append([Reading(n, f"{significant(float(v), 2)} mm") for n, v in (("X", along), ("Y", across), ("Z (depth)", depth))])
+    parts.append(Text(f"Without any calibration: x {length_px(one.before_px[0])} px, y {length_px(one.before_px[1])} px.", "second"))
+    section.add(Answer(parts))
+    if budget.together is not None:
+        t = budget.together
+        section.add_text(
+            strong("Check by simulation:"),
+            f" all sources of the chain at once, the target at rest, {t.trials} windows: {length_px(t.total_px)} ± "
+            f"{length_px(t.se_total_px)} px before a calibration, {length_px(t.calibrated_px)} ± {length_px(t.se_calibrated_px)} px after.",
+        )
+    section.add(_chain(budget), _bars(budget))
+    return section
+
+
+def _many(count: int, what: str) -> str:
+    return f"{count} {what}{'' if count == 1 else 's'}"
+
+
+def _interval(one: Totals) -> str:
+    least, most = rms(one.least_px), rms(one.most_px)
+    return (
+        f"Between {length_px(least)} px (only what is known of this camera) and {length_px(most)} px (everything that "
+        "is not measured at the largest of a sound camera), rms of x and y."
+    )
+
+
+def _readings(budget: CameraBudget, pair: tuple[float, float]) -> list[Reading]:
+    um, mm = budget.um(pair), budget.mm(pair)
+    found = []
+    for k, axis in enumerate("xy"):
+        parts = [f"{length_px(pair[k])} px"]
+        parts += [f"{length_um(pair[k], um[k] / pair[k])} µm"] if um is not None and pair[k] else []
+        parts += [f"{significant(mm[k], 2)} mm"] if mm is not None else []
+        found.append(Reading(axis, " = ".join(parts)))
+    return found
+
+
+def _chain(budget: CameraBudget) -> Figure:
+    """The links of the chain in the order of the light, each with what it leaves."""
+    counting = [r for r in budget.rows if r.counts]
+    there = {r.source_id.split(".")[0] for r in budget.rows if r.status != ABSENT}
+    stages = [s for s in STAGES if s in there]
+    whole = sum(r.after_px**2 for r in counting) or 1.0
+    with canvas(1.15) as (figure, axes):
+        axes.set_axis_off()
+        axes.set_xlim(0, len(stages))
+        axes.set_ylim(0, 1)
+        words = []
+        for k, stage in enumerate(stages):
+            part = sum(r.after_px**2 for r in counting if r.source_id.startswith(f"{stage}."))
+            share = part / whole
+            axes.add_patch(_box(k, share))
+            axes.text(k + 0.5, 0.7, stage, ha="center", va="center", color=INK)
+            axes.text(k + 0.5, 0.45, f"{percent(share)} %", ha="center", va="center", color=INK, fontweight="bold")
+            axes.text(k + 0.5, 0.22, f"{length_mpx(float(np.sqrt(part)))} mpx", ha="center", va="center", color=SOFT, fontsize=6.5)
+            words.append(f"{stage} {percent(share)} %")
+            if k:
+                axes.annotate("", (k + 0.08, 0.5), (k - 0.08, 0.5), arrowprops={"arrowstyle": "->", "color": SOFT, "lw": 0.8})
+    alt = "Shares of the links of the chain: " + ", ".join(words) + "."
+    return Figure(figure, "chain", alt, "Share of each link in the square of the total after the calibration, and its part in 10⁻³ px.")
+
+
+def _box(at: int, share: float) -> Patch:
+    from matplotlib.patches import FancyBboxPatch
+
+    return FancyBboxPatch(
+        (at + 0.1, 0.08), 0.8, 0.84, boxstyle="round,pad=0,rounding_size=0.06", facecolor=BLUE, alpha=0.06 + 0.5 * share, edgecolor=SOFT
+    )
+
+
+def _bars(budget: CameraBudget) -> Figure:
+    """The largest sources, before and after the calibration."""
+    largest = sorted((r for r in budget.rows if r.counts or r.before_px), key=lambda r: -max(r.after_px, 1e-3 * r.before_px))[:MOST_BARS]
+    floor = 1e-4  # below that nothing matters
+    with canvas(0.4 + 0.19 * len(largest)) as (figure, axes):
+        for k, row in enumerate(reversed(largest)):
+            axes.plot([max(row.before_px, floor)], [k], "o", markerfacecolor="none", color=SOFT)
+            if row.largest_px > max(row.after_px, floor):
+                axes.plot(
+                    [max(row.after_px, floor), max(row.largest_px, floor)],
+                    [k, k],
+                    color=BLUE,
+                    alpha=0.35,
+                    linewidth=4,
+                    solid_capstyle="butt",
+                )
+            axes.plot([max(row.after_px, floor)], [k], "o", color=BLUE)
+        axes.set_xscale("log")
+        axes.set_yticks(range(len(largest)), [r.title for r in reversed(largest)])
+        axes.set_xlabel("px, one target in one frame")
+    top = ", ".join(f"{r.title} {length_px(r.after_px)} px" for r in largest[:3])
+    caption = "Open: before any calibration; filled: after it; band: up to the largest of a sound camera, where it was not measured."
+    return Figure(figure, "largest", f"The largest sources before and after calibration: {top}.", caption)
+
+
+# ---- what to do --------------------------------------------------------------------------------------------------------------------
+
+
+def _next(title: str, name: str, steps: Sequence[Next], words: str) -> Section:
+    section = Section(title, name=name)
+    if not steps:
+        return section.add_text("Nothing that would make a difference.")
+    items = [
+        [
+            *strong_words(step.title),
+            f" {step.text} ".replace("  ", " "),
+            f"({words.format(length_px(step.now_px, 3), length_px(step.then_px, 3))})",
+        ]
+        for step in steps[:LISTED]
+    ]
+    return section.add(Points(items, numbered=True))
+
+
+def strong_words(title: str) -> list[Run | str]:
+    """A title in bold with its colon."""
+    return [strong(f"{title}:")]
+
+
+# ---- the rows ----------------------------------------------------------------------------------------------------------------------
+
+
+def _all_rows(budget: CameraBudget) -> Section:
+    section = Section("All error sources", name="sources").add_text(HOW_TO_READ, style="small soft")
+    groups = {key: list(rows) for key, rows in groupby(sorted(budget.rows, key=_group), key=_group)}
+    section.add(_table("Error sources that count", groups.get(0, [])))
+    for key, words in ((1, "that may be there, at most"), (2, "that do nothing here"), (3, "that are not in this camera")):
+        if rows := groups.get(key, []):
+            section.add_section(f"{_many(len(rows), 'source')} {words}", _table(f"Error sources {words}", rows), fold=True)
+    return section
+
+
+def _group(row: SourceRow) -> int:
+    return 3 if row.status == ABSENT else 0 if row.counts or row.before_px >= 1e-4 else 1 if row.largest_px > 0 else 2
+
+
+def _table(label: str, rows: Sequence[SourceRow]) -> Table:
+    numbers = [Column(axis, "right", group=group) for group in ("Before / 10⁻³ px", "After / 10⁻³ px") for axis in "xy"]
+    columns: list[Column | str] = ["Source", "Row", "Known", "Class", *numbers, Column("At most", "right"), Column("Share", "right")]
+    return Table(label, columns, [_cells(r) for r in rows])
+
+
+def _cells(row: SourceRow) -> Row:
+    def pair(parts: Parts | None) -> list[str]:
+        return [NONE, NONE] if parts is None else [length_mpx(v) for v in parts.axes_px()]
+
+    name = row.name if row.name == row.source_id else f"{row.source_id} ({row.name})"
+    cells = [
+        [row.title, "\n", Run(name, "small mono")],
+        f"{row.number} {'★' * row.stars}".strip() if row.number else NONE,
+        "taken up by the calibration" if row.taken_up else row.status,
+        row.gum_class,
+        *pair(row.before),
+        *pair(row.after),
+        length_mpx(row.largest_px) if row.largest is not None else "",
+        f"{percent(row.share)} %" if row.counts else "",
+    ]
+    return Row(cells, "; ".join(w for w in (row.how, row.reason) if w))
+
+
+def _handbook(budget: CameraBudget) -> Section:
+    """The handbook's table again: its stars and ours."""
+    section = Section("The handbook's error table, for this camera", name="handbook")
+    section.add_text(STAR_SCALE, style="small soft")
+    rows = sorted((r for r in budget.rows if r.number), key=lambda r: (r.number, -r.before_px))
+    columns: list[Column | str] = [
+        "Row",
+        "Source",
+        "Handbook",
+        "Here",
+        Column("Before / px", "right"),
+        Column("After / px", "right"),
+        "Why they differ",
+    ]
+    cells = [
+        [
+            str(r.number),
+            r.title,
+            "★" * r.stars or NONE,
+            NONE if r.before is None else "★" * r.own_stars or "none",
+            NONE if r.before is None else length_px(r.before_px),
+            NONE if r.after is None else length_px(r.after_px),
+            why_differ(r),
+        ]
+        for r in rows
+    ]
+    return section.add(Table("The handbook's error table", columns, cells))
+
+
+def why_differ(row: SourceRow) -> str:
+    """A sentence where the handbook's judgement and this one differ by two stars or more; empty where they do not."""
+    if row.before is None:
+        return row.reason
+    difference = row.own_stars - row.stars
+    if abs(difference) <= ALIKE:
+        return ""
+    source = get_source(row.source_id)
+    head = "More than the handbook says" if difference > 0 else "Less than the handbook says"
+    if row.reason and not row.before_px:
+        return f"{head}: {row.reason}."
+    return f"{head}; usual size: {source.typical_size}."
+
+
+# ---- what it rests on --------------------------------------------------------------------------------------------------------------
+
+
+def _scenario(budget: CameraBudget) -> Section:
+    section = Section("What is measured, and how", name="scenario")
+    section.add_text("The scenario; what was not given has its default.", style="small soft")
+    rows = [[Run(name, "mono"), str(value), "given" if given else "default"] for name, (value, given) in budget.scenario.told.items()]
+    return section.add_section("Entries of the scenario", Table("Scenario", ["Entry", "Value", ""], rows), fold=True)
+
+
+def _descriptions(budget: CameraBudget) -> Section:
+    section = Section("Sheet and measurement", name="descriptions")
+    rows = [
+        [
+            [d.name, "\n", Run(d.parameter, "small mono")],
+            significant(d.first, 4),
+            significant(d.second, 4),
+            d.unit,
+            "agree" if d.agree else Run("differ", "status differ"),
+        ]
+        for d in budget.disagreements
+    ]
+    columns: list[Column | str] = ["Parameter", Column("First", "right"), Column("Second", "right"), "Unit", ""]
+    return section.add(Table("Values that two descriptions know", columns, rows))

@@ -1,0 +1,407 @@
+"""The table of error sources: a row for each, for one camera in one scenario, before and after a calibration.
+
+Each row is computed by the fastest way that is exact enough: the displacement of points over the frame for what moves whole parts of the
+image; times and speed for what looks at another time; a closed form (`Source.propagate`) in the camera's own chain and clock; else a Monte
+Carlo of that chain with the source and without it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from pixmetry.budget.fields import Calibration, Places, field_of, spread_of
+from pixmetry.budget.monte_carlo import Trials, missed, put
+from pixmetry.budget.motion import LAGS, OF_MOTION, STILL, motion_contribution
+from pixmetry.budget.parameters import applies, u_of_total, with_estimates
+from pixmetry.budget.probe import Probes
+from pixmetry.budget.setting import Setting
+from pixmetry.camera.camera import Camera, Element, pitch_values
+from pixmetry.camera.catalogue import get_source, sources
+from pixmetry.camera.contribution import UNSTEADY, Contribution
+from pixmetry.camera.source import Source
+from pixmetry.core.errors import InputError
+from pixmetry.core.number import Estimates
+from pixmetry.locate.estimator import Estimator
+
+MEASURED, SHEET, DESCRIBED, TYPICAL = "measured", "from the sheet", "described", "typical"
+AT_BOUND, ABSENT, ELSEWHERE = "at its bound", "not in this camera", "in another row"
+COUNTED = (MEASURED, SHEET, DESCRIBED, TYPICAL)  # what the answer rests on; what is at its bound only widens the interval
+KNOWN_FROM = {"measured": MEASURED, "sheet": SHEET, "typical": TYPICAL, "": DESCRIBED}
+FIELD, TIMES, FORMULA, SIMULATED = "displacement of points over the frame", "times and speed", "closed form", "simulated with and without"
+WINDOWS, UNITS = 256, 4  # of a source that has to be simulated
+STARS_PX = (0.005, 0.03, 0.1, 0.3, 1.0)  # from so much on, one star more
+SETTINGS = (  # what a user switches on; a camera that is described without it has it off
+    "electronics.agc",
+    "electronics.gamma",
+    "grabber.low_pass",
+    "optics.flicker",
+    "optics.olpf",
+    "sensor.read_out",
+    "sensor.rolling_shutter",
+    "storage.jpeg",
+)
+VIEW_POINT = "scene.view_point"
+AVERAGED = ("scene.speckle", VIEW_POINT)  # of the object's errors those that another target has otherwise
+Pair = tuple[float, float]
+NOTHING: Pair = (0.0, 0.0)
+
+
+def stars_of(total_px: float) -> int:
+    """How much an effect matters, in the handbook's stars: none below 1/200 px, five from 1 px on.
+
+    Examples
+    --------
+    >>> [stars_of(px) for px in (0.001, 0.01, 0.05, 0.2, 0.5, 4.0)]
+    [0, 1, 2, 3, 4, 5]
+    """
+    return sum(total_px >= limit for limit in STARS_PX)
+
+
+@dataclass(frozen=True)
+class Parts:
+    """What a source does to a position, in px, by what averages it away; each in x and y, k = 1.
+
+    Parameters
+    ----------
+    constant_px : (float, float)
+        The same for all targets, places and frames, with its sign.
+    smooth_px : (float, float)
+        Changes slowly over the frame: standard deviation over it.
+    place_px : (float, float)
+        Changes from target to target: with the phase in the pixel, with the pixels that it falls on.
+    time_px : (float, float)
+        Changes from frame to frame.
+    """
+
+    constant_px: Pair = NOTHING
+    smooth_px: Pair = NOTHING
+    place_px: Pair = NOTHING
+    time_px: Pair = NOTHING
+
+    def axes_px(self, frames: int = 1, targets: int = 1) -> Pair:
+        """Everything together in x and y, as squares, for means over so many frames and targets."""
+        x, y = (
+            float(np.sqrt(c**2 + s**2 + p**2 / targets + t**2 / (frames * targets)))
+            for c, s, p, t in zip(self.constant_px, self.smooth_px, self.place_px, self.time_px, strict=True)
+        )
+        return x, y
+
+    @property
+    def total_px(self) -> float:
+        """Root mean square over x and y of one target in one frame."""
+        x, y = self.axes_px()
+        return float(np.sqrt(0.5 * (x**2 + y**2)))
+
+
+@dataclass(frozen=True)
+class SourceRow:
+    """One error source in the table.
+
+    Parameters
+    ----------
+    name, source_id, title : str
+    number, stars : int
+        Of the handbook's error table; 0 for a source that is not in it.
+    status : str
+        Whence its parameters are known; ``at its bound`` where only the largest to expect of a sound camera says something; ``not in this
+        camera``.
+    gum_class : str
+    before, after : Parts, optional
+        Without any calibration, and with that of the scenario.
+    largest : Parts, optional
+        What is left after the calibration at most, for a source that is not measured: at its bound.
+    u_of_total_px : float
+        Standard uncertainty of the total before the calibration that comes of the parameters' uncertainties.
+    how, method, reason, advice : str
+    in_camera : bool
+        Whether it stands in the camera's chain.
+    share : float
+        Part of the square of the whole, after the calibration.
+    """
+
+    name: str
+    source_id: str
+    title: str
+    number: int
+    stars: int
+    status: str
+    gum_class: str
+    before: Parts | None = None
+    after: Parts | None = None
+    largest: Parts | None = None
+    u_of_total_px: float = 0.0
+    how: str = ""
+    method: str = ""
+    reason: str = ""
+    advice: str = ""
+    in_camera: bool = False
+    share: float = 0.0
+
+    @property
+    def before_px(self) -> float:
+        """Total without a calibration, one target in one frame."""
+        return 0.0 if self.before is None else self.before.total_px
+
+    @property
+    def after_px(self) -> float:
+        """Total with the calibration, one target in one frame."""
+        return 0.0 if self.after is None else self.after.total_px
+
+    @property
+    def largest_px(self) -> float:
+        """The same at most, where the source is not measured; else `after_px`."""
+        return self.after_px if self.largest is None else self.largest.total_px
+
+    @property
+    def own_stars(self) -> int:
+        """How much it matters here, before a calibration."""
+        return stars_of(self.before_px)
+
+    @property
+    def counts(self) -> bool:
+        """Whether the answer holds it."""
+        return self.status in COUNTED and self.after_px > 0
+
+    @property
+    def taken_up(self) -> bool:
+        """Whether the calibration leaves nothing of it to speak of."""
+        return self.before_px > 0 and self.after_px <= 1e-3 * self.before_px
+
+
+@dataclass
+class Table:
+    """Makes the rows of a camera in a scenario.
+
+    Parameters
+    ----------
+    setting : Setting
+    estimator : Estimator
+    seed : int
+    say : callable, optional
+        Called with the name of what is being done.
+    """
+
+    setting: Setting
+    estimator: Estimator
+    seed: int = 0
+    say: Callable[[str], None] = lambda text: None
+
+    def rows(self, only: Collection[str] | None = None) -> list[SourceRow]:
+        """Rows of the chain, then of what the catalogue has beyond it: all, or ``only`` those of these ids."""
+        camera = self.setting.camera
+        rows = [self.row(e, in_camera=True) for e in camera.active if only is None or e.source.id in only]
+        there = {e.source.id for e in camera.active}
+        # switched off: what was measured and is not significant
+        off = {e.source.id: e for e in camera.chain if not e.on and len(e.estimates) and e.source.id not in there}
+        for source in sources().values():
+            if source.id not in there and (only is None or source.id in only):
+                usual = Element(source.id, source, self._own(source, self._usual(source)))
+                rows.append(self.row(off.get(source.id, usual), in_camera=False))
+        return rows
+
+    # ---- one row --------------------------------------------------------------------------------------------------------------
+
+    def row(self, element: Element, in_camera: bool) -> SourceRow:
+        """The row of one source."""
+        source = element.source
+        self.say(element.name)
+        row = SourceRow(
+            element.name,
+            source.id,
+            source.title,
+            source.number,
+            source.stars,
+            "",
+            source.gum_class,
+            advice=source.advice,
+            in_camera=in_camera,
+        )
+        estimates = element.estimates if len(element.estimates) else None
+        absent = "" if in_camera or estimates is not None else self._absent(source)
+        if absent:
+            return replace(row, status=ABSENT, reason=absent)
+        if estimates is not None:
+            element = replace(element, params=with_estimates(source, element.params, estimates), on=True)
+        told = in_camera or estimates is not None or source.id in self.setting.brought_in
+        known_from = element.known_from if told else "typical"
+        row = replace(row, status=KNOWN_FROM[known_from], reason="" if estimates is None else estimates.method)
+        if source.id in OF_MOTION and not self.setting.moves:
+            return replace(row, before=Parts(), after=Parts(), how=TIMES, reason=STILL)
+        row = self._computed(row, element, in_camera, estimates)
+        if source.part_of:
+            return replace(row, status=ELSEWHERE, reason=f"it counts in the row of {get_source(source.part_of).title}")
+        if row.status != TYPICAL or row.before is None:
+            return row
+        bound = self._own(source, source.bound_of(self.setting.camera.frame_shape))
+        largest = self._computed(row, replace(element, params=bound), in_camera, None)
+        if row.before.total_px == 0 and largest.before is not None and largest.before.total_px > 0:
+            row = replace(row, status=AT_BOUND)
+        return replace(row, largest=largest.after)
+
+    def _usual(self, source: Source) -> Any:
+        """Usual parameters, of object and light those of the scenario."""
+        s = self.setting
+        if source.id in s.brought_in:
+            return source.make({**source.typical.model_dump(), **s.brought_in[source.id]})
+        if source.id == VIEW_POINT:
+            return source.make({"gradient_rel_per_px": s.gradient_rel_per_px, "view_angle_deg": s.scenario.target.view_angle_deg})
+        return source.typical
+
+    def _own(self, source: Source, params: Any) -> Any:
+        """Parameters of a source that the description does not hold, with what the camera and the scenario tell of them."""
+        s = self.setting
+        clock = {"line_time_us": 1e6 * s.camera.line_period_s, "pixel_time_ns": 1e9 / s.camera.pixel_clock_hz}
+        known: dict[str, Any] = pitch_values(s.camera.pitch_um) | clock | {"bits": s.facts.bits, "reference_dn": s.facts.saturation_dn}
+        known |= {"f_number": s.f_number, "wavelength_nm": s.scenario.light.wavelength_nm}
+        if s.f_mm is not None:
+            known["principal_distance_mm"] = s.f_mm
+            if s.camera.pitch_um is not None:
+                known["principal_distance_px"] = 1e3 * s.f_mm / s.camera.pitch_um[0]
+        if source.id == VIEW_POINT:
+            known["diameter_px"] = s.target.diameter_px
+        own = {name: value for name, value in known.items() if name in type(params).model_fields}
+        try:
+            return source.make({**params.model_dump(), **own})
+        except InputError:  # out of the source's own range
+            return params
+
+    def _absent(self, source: Source) -> str:
+        """Why a camera of which nothing says that it has this source has it not; empty where it may."""
+        facts = self.setting.camera.facts
+        if not applies(source, facts):
+            return f"only in a camera that is {' or '.join(source.applies_to)}"
+        if source.id in self.setting.brought_in:
+            return ""
+        if source.option:
+            return f"only in a camera with {source.option}"
+        if source.id in SETTINGS:
+            return "a setting; the camera is described without it"
+        if source.stage == "storage" and facts.get("lossless"):
+            return "only in frames that were stored with loss; these are not"
+        measured = {e.source.id for e in self.setting.camera.chain if e.known_from == "measured"}
+        if source.held_by and measured.issuperset(source.held_by):
+            where = ", ".join(get_source(h).title for h in source.held_by)
+            return f"what of it is in the frames was measured, and counts, as: {where}"
+        return ""
+
+    def _computed(self, row: SourceRow, element: Element, in_camera: bool, measured: Estimates | None) -> SourceRow:
+        """The row with what the source does with these parameters."""
+        source = element.source
+        if source.id in OF_MOTION:
+            return self._of_motion(row, element)
+        moved = self._moved(element, in_camera) if source.gum_class in ("G", "D") else None
+        if moved is not None:
+            return replace(row, before=moved[0], after=moved[1], how=FIELD, method="exact map of the camera")
+        if source.propagate is not None:
+            probe = self.probes.of(element.name, source)
+            found = source.propagate(element.params, probe)
+            u = 0.0 if measured is None else u_of_total(source, element.params, measured, probe)
+            return self._with(replace(row, u_of_total_px=u, how=FORMULA), found, "no target is found behind it")
+        if source.forward is None or source.essential and source.ideal is None:
+            return replace(row, before=Parts(), after=Parts(), reason=source.reasons["propagate"])
+        try:
+            found = self._simulated(element)
+        except InputError as problem:
+            return replace(row, reason=f"not computed: {problem}")
+        return self._with(replace(row, how=SIMULATED), found, "no target is found behind it")
+
+    def _with(self, row: SourceRow, found: Contribution | None, else_reason: str) -> SourceRow:
+        if found is None or not np.isfinite(found.total_px):
+            return replace(row, reason=else_reason)
+        before = parts_of(found, row.source_id)
+        return replace(row, before=before, after=self._left(before, found.gum_class), method=found.method)
+
+    def _left(self, before: Parts, gum_class: str) -> Parts:
+        """What the scenario's calibration leaves of a contribution that is no map of points."""
+        model = self.setting.scenario.calibration.model
+        if model == "none" or gum_class in UNSTEADY:
+            return before
+        return replace(before, constant_px=NOTHING, smooth_px=before.smooth_px if model == "principal_point_and_scale" else NOTHING)
+
+    def _of_motion(self, row: SourceRow, element: Element) -> SourceRow:
+        camera = self.setting.camera
+        if element.source.id in LAGS and element.source.forward is None:
+            return row
+        return self._with(replace(row, how=TIMES), motion_contribution(element, self.setting, camera), "")
+
+    # ---- maps -----------------------------------------------------------------------------------------------------------------
+
+    @cached_property
+    def calibration(self) -> Calibration:
+        """What positions are corrected for."""
+        told = self.setting.scenario.calibration
+        pitch = self.setting.camera.pitch_um
+        places = Places.over(self.setting.camera.frame_shape, told.grid_px)
+        return Calibration(told.model, told.every_image, places, 1.0 if pitch is None else pitch[1] / pitch[0])
+
+    def _difference(self, pair: tuple[Camera, Camera]) -> np.ndarray:
+        """Displacement by what one camera has beyond another, shape (2, 5, n)."""
+        known = all(np.array_equal(a, b) for a, b in zip(*(c.layout([0.0, 1.0], [0.0, 1.0]) for c in pair), strict=True))
+        first, second = (self._field(c, known) for c in pair)
+        return first - second
+
+    def _field(self, camera: Camera, known_layout: bool) -> np.ndarray:
+        key = (camera is self.setting.camera, camera is self.setting.calibrated, known_layout)
+        if not any(key[:2]):
+            return field_of(camera, self.calibration.places, known_layout)
+        if key not in self._fields:
+            self._fields[key] = field_of(camera, self.calibration.places, known_layout)
+        return self._fields[key]
+
+    @cached_property
+    def _fields(self) -> dict[tuple[bool, bool, bool], np.ndarray]:
+        return {}
+
+    def _moved(self, element: Element, in_camera: bool) -> tuple[Parts, Parts] | None:
+        """What a map of points is before and after the calibration; None where it moves none."""
+        cameras = (self.setting.camera, self.setting.calibrated)
+        try:
+            pairs = [(c, missed(c, [element.name])) if in_camera else (put(c, element), c) for c in cameras]
+            now, then = (self._difference(pair) for pair in pairs)
+        except InputError:
+            return None
+        if not max(np.nanmax(np.abs(now), initial=0.0), np.nanmax(np.abs(then), initial=0.0)) > 1e-9:
+            return None
+        if element.source.gum_class == "G":  # it stays as it was: what drifts beside it has a row of its own
+            now = then
+        return _of_field(now[:, 0]), _of_field(self.calibration.left(now, then))
+
+    # ---- simulation -----------------------------------------------------------------------------------------------------------
+
+    @cached_property
+    def probes(self) -> Probes:
+        """The target as each source meets it."""
+        return Probes(self.setting.camera, self.setting.facts, self.setting.target, self.estimator)
+
+    @cached_property
+    def _trials(self) -> Trials:
+        s = self.setting
+        return Trials(s.camera, s.target, self.estimator, s.facts, WINDOWS, UNITS, seed=self.seed)
+
+    def _simulated(self, element: Element) -> Contribution | None:
+        return self._trials.alone(element).contribution(element.source.gum_class)
+
+
+def _of_field(field_px: np.ndarray) -> Parts:
+    mean, spread = spread_of(field_px)
+    return Parts(constant_px=(float(mean[0]), float(mean[1])), smooth_px=(float(spread[0]), float(spread[1])))
+
+
+def parts_of(found: Contribution, source_id: str = "") -> Parts:
+    """The parts of a contribution."""
+    assert found.smooth_px is not None and found.time_px is not None
+    time, place = found.time_px, found.place_px
+    if source_id in AVERAGED:  # another for every target
+        return Parts(found.bias_px, place_px=found.u_px)
+    if found.gum_class in UNSTEADY:  # the next frames and targets share it
+        u = found.u_px
+        return Parts(found.bias_px, (float(u[0]), float(u[1])))
+    return Parts(found.bias_px, found.smooth_px, place, time)
+
+
+__all__ = ["Parts", "SourceRow", "Table", "stars_of"]

@@ -1,0 +1,160 @@
+"""``pixmetry budget``: every error source of a camera, before and after calibration, ranked."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from pixmetry.cli._console import console as plain_console
+from pixmetry.cli._console import echo
+from pixmetry.cli._json import JsonResult, json_option
+from pixmetry.cli._pdf import check_pdf, pdf_option, put_pdf
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from pixmetry.budget.camera_budget import CameraBudget
+
+SHOWN = 20  # rows on the terminal
+
+
+@click.command()
+@click.argument("cameras", nargs=-1, required=True, metavar="CAMERA...")
+@click.option(
+    "--scenario",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="What is measured, and how (YAML). Every entry has a default; --all prints them.",
+)
+@click.option(
+    "--set",
+    "settings",
+    multiple=True,
+    metavar="KEY=VALUE",
+    help="Change an entry of the scenario, such as motion.speed_px_per_s=50, or a parameter of the camera. May be repeated.",
+)
+@click.option("--estimator", metavar="NAME", help="Estimator of the target's position. Default: what `pixmetry locate` takes.")
+@click.option(
+    "--trials", type=click.IntRange(0), default=0, show_default=True, help="Windows of a simulation of all sources at once; 0: none."
+)
+@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the simulations.")
+@click.option("--next", "what_next", is_flag=True, help="Show only what to measure and what to change next.")
+@click.option("--all", "everything", is_flag=True, help="Show all rows, also of what is not in this camera.")
+@click.option("--html", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE", help="Write the page of the budget (HTML).")
+@pdf_option()
+@json_option("the budget")
+def budget(
+    cameras: tuple[str, ...],
+    scenario: Path | None,
+    settings: tuple[str, ...],
+    estimator: str | None,
+    trials: int,
+    seed: int,
+    what_next: bool,
+    everything: bool,
+    html: Path | None,
+    pdf: Path | None,
+    json_file: Path | None,
+) -> None:
+    """Budget every error source of a camera for a measurement, before and after calibration.
+
+    CAMERA is the name of a preset, a data sheet, or a camera file, such as the camera.yaml of an assessment. Of several, what was measured
+    replaces what a sheet says, and both are compared. A scenario says what is measured and how: target, distance, light, motion, warm-up,
+    calibration; what it leaves open has a default, which is printed with --all.
+
+    Example: pixmetry budget imx264_like --set object.distance_mm=2000 --set object.f_mm=25 --html budget.html
+    """
+    from pixmetry.budget.cameras import camera_of
+    from pixmetry.budget.changes import changed
+    from pixmetry.budget.job import budget as budget_of
+    from pixmetry.budget.page import TITLE, page_of
+    from pixmetry.budget.scenario import read_scenario
+    from pixmetry.camera.overrides import parse_overrides
+    from pixmetry.files.output import Output, check_files, page_mark, write_page
+    from pixmetry.report import html_of
+
+    inputs = [Path(c) for c in cameras if Path(c).is_file()] + ([scenario] if scenario else [])
+    written = JsonResult(json_file, "pixmetry/camera_budget/1", inputs=inputs)
+    if html is not None:
+        check_files([Output(html, page_mark(TITLE))], inputs)
+    check_pdf(pdf, inputs)
+    given = cameras[0] if len(cameras) == 1 else list(cameras)
+    if settings:
+        camera, asked = changed(camera_of(given)[0], read_scenario(scenario), parse_overrides(settings))
+        found = budget_of(camera, asked, estimator=estimator, trials=trials, seed=seed)
+    else:
+        found = budget_of(given, scenario, estimator=estimator, trials=trials, seed=seed)
+    console = plain_console(width=116, quiet=written.printed)
+    if what_next:
+        print_next(found, console)
+    else:
+        print_budget(found, console, everything)
+    written.put({k: v for k, v in found.to_record().items() if k != "schema"})
+    if html is not None:
+        echo(f"page: {write_page(html, html_of(page_of(found)))}", err=written.printed)
+    put_pdf(pdf, lambda: page_of(found))
+
+
+def print_budget(found: CameraBudget, console: Console, everything: bool = False) -> None:
+    """The answer, the rows, and what to do next."""
+    from rich.table import Table
+
+    from pixmetry.budget.answer import rms
+    from pixmetry.report.numbers import length_mpx, length_px, percent
+
+    one = found.one
+    console.print(f"{found.camera}: {found.setting.target.describe()}; {found.estimator.describe()}", markup=False)
+    lengths = [f"{axis} {length_px(v)} px" for axis, v in zip("xy", one.after_px, strict=True)]
+    console.print(
+        f"One target in one frame, after calibration ({found.scenario.calibration.model.replace('_', ' ')}): {', '.join(lengths)}",
+        markup=False,
+    )
+    console.print(
+        f"between {length_px(rms(one.least_px))} px (only what is known) and {length_px(rms(one.most_px))} px (the rest at its bound); "
+        f"without calibration {length_px(rms(one.before_px))} px",
+        markup=False,
+    )
+    mm = found.mm(found.answer.after_px)
+    if mm is not None:
+        console.print(f"on the object: {mm[0]:.2g} mm × {mm[1]:.2g} mm", markup=False)
+    covariance = found.point_mm()
+    if covariance is not None:
+        x, y, z = covariance.diagonal() ** 0.5
+        console.print(f"a point by {found.scenario.count.rays} rays: X {x:.2g} mm, Y {y:.2g} mm, Z {z:.2g} mm (depth)", markup=False)
+    table = Table(box=None, pad_edge=False)
+    for heading in ("row", "source", "known", "handbook", "here"):
+        table.add_column(heading)
+    for heading in ("before /mpx", "after /mpx", "at most /mpx", "share"):
+        table.add_column(heading, justify="right")
+    rows = found.rows if everything else [r for r in found.rows if r.counts or r.before_px >= 1e-4][:SHOWN]
+    for r in rows:
+        known = "taken up" if r.taken_up else r.status
+        share = f"{percent(r.share)} %" if r.counts else ""
+        most = length_mpx(r.largest_px) if r.largest is not None else ""
+        cells = (str(r.number or ""), r.title, known, "*" * r.stars, "*" * r.own_stars, length_mpx(r.before_px), length_mpx(r.after_px))
+        table.add_row(*cells, most, share)
+    console.print(table)
+    if not everything and len(found.rows) > len(rows):
+        console.print(f"{len(found.rows) - len(rows)} more rows: --all, or the page (--html FILE)", markup=False)
+    if everything:
+        for name, (value, was_given) in found.scenario.told.items():
+            console.print(f"{name}: {value}{'' if was_given else ' (default)'}", markup=False)
+    for d in found.disagreements:
+        if not d.agree:
+            console.print(
+                f"{d.name} {d.parameter}: {d.first:.4g} {d.first_from}, {d.second:.4g} {d.second_from}: they differ", markup=False
+            )
+
+
+def print_next(found: CameraBudget, console: Console) -> None:
+    """What to measure and what to change next."""
+    from pixmetry.report.numbers import length_px
+
+    for title, steps in (("To measure next (upper end of the interval)", found.to_measure), ("To change next (total)", found.to_change)):
+        console.print(title, markup=False)
+        for step in steps[:8]:
+            console.print(
+                f"  {length_px(step.now_px, 3)} -> {length_px(step.then_px, 3)} px  {step.title}. {step.text}".rstrip(), markup=False
+            )

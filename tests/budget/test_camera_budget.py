@@ -1,0 +1,187 @@
+"""The budget of a camera in a scenario: every row, in every preset; what calibrations, states and several descriptions make of it."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import replace
+from functools import cache
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import pixmetry
+from pixmetry.budget.answer import answer_of, rms
+from pixmetry.budget.camera_budget import CameraBudget
+from pixmetry.budget.cameras import camera_of
+from pixmetry.budget.scenario import Scenario, read_scenario
+from pixmetry.budget.setting import Setting
+from pixmetry.budget.table import ABSENT, AT_BOUND, COUNTED, ELSEWHERE, MEASURED, SHEET, TYPICAL, Table
+from pixmetry.camera.camera import Camera, load_camera
+from pixmetry.camera.catalogue import sources
+from pixmetry.core.errors import InputError
+from pixmetry.core.number import Estimates
+from pixmetry.locate.target_estimator import TargetEstimator
+
+PRESETS = ("imx264_like", "pulnix_tm6cn_epix_512", "ft_ccd_generic", "cmos_log_fuga15")
+SHAPE = (240, 320)  # of the presets here, but for those with a grabber of their own size
+
+
+@cache
+def camera(name: str) -> Camera:
+    found = load_camera(name)
+    return found if "epix" in name else replace(found, frame_shape=SHAPE)
+
+
+@cache
+def budget_of(name: str) -> CameraBudget:
+    return pixmetry.budget(camera(name), {"motion": {"speed_px_per_s": 20.0}, "light": {"source": "laser"}})
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_every_source_has_a_row_that_says_what_it_does_or_why_not(name: str) -> None:
+    found = budget_of(name)
+    assert {r.source_id for r in found.rows} == set(sources())
+    for row in found.rows:
+        assert row.status in (*COUNTED, AT_BOUND, ABSENT, ELSEWHERE)
+        assert row.before is not None and row.after is not None and row.how or row.reason, row.name
+        for parts in (row.before, row.after, row.largest):
+            if parts is not None:
+                assert np.isfinite([*parts.constant_px, *parts.smooth_px, *parts.place_px, *parts.time_px]).all(), row.name
+        if row.gum_class not in ("D", "O"):
+            assert row.after_px <= row.before_px * (1 + 1e-9) + 1e-6, row.name
+        assert 0 <= row.share <= 1 and 0 <= row.own_stars <= 5
+    assert sum(r.share for r in found.rows) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_the_interval_holds_the_answer_and_things_to_do_lower_it(name: str) -> None:
+    found = budget_of(name)
+    one = found.one
+    for least, after, most in zip(one.least_px, one.after_px, one.most_px, strict=True):
+        assert 0 < least <= after <= most * (1 + 1e-9)
+    assert rms(one.after_px) <= rms(one.before_px)
+    for steps, now in ((found.to_measure, one.most_rms_px), (found.to_change, one.after_rms_px)):
+        assert all(s.now_px == pytest.approx(now) and s.then_px < s.now_px for s in steps)
+        assert [s.then_px for s in steps] == sorted(s.then_px for s in steps)
+    averaged = answer_of(found.rows, frames=16, targets=4)
+    assert rms(averaged.after_px) < rms(one.after_px)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_the_record_is_json_and_the_table_a_data_frame(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = budget_of(name)
+    monkeypatch.setitem(sys.modules, "pandas", SimpleNamespace(DataFrame=dict))  # which holds columns as pandas does
+    record = json.loads(json.dumps(found.to_record(), allow_nan=False))
+    assert record["schema"] == "pixmetry/camera_budget/1" and len(record["rows"]) == len(sources())
+    assert found.to_dataframe()["title"] == [r.title for r in found.rows]
+    assert found.camera in repr(found) and "<table>" in found._repr_html_()
+
+
+def left_px(cam: Camera, source_id: str, scenario: dict[str, object]) -> float:
+    """What one source leaves after the calibration; the others are not computed."""
+    table = Table(Setting(cam, read_scenario(scenario)), TargetEstimator())
+    return next(r.after_px for r in table.rows([source_id]))
+
+
+def test_a_cold_grabber_is_off_and_a_warm_one_is_not() -> None:
+    """With everything else as it is: a scale that is off by 0.71 % e^(−t/820 s) of 149 + x pixels."""
+    cam, name = camera("pulnix_tm6cn_epix_512"), "grabber.clock_warm_up"
+    x = np.linspace(0, 720, 2000)  # what the 512 samples still show
+    expected = np.sqrt(0.5 * np.mean(((149 + x) * 0.0071) ** 2))
+    assert left_px(cam, name, {"state": {"grabber_on_min": 0.0}}) == pytest.approx(expected, rel=0.02)
+    assert left_px(cam, name, {"state": {"grabber_on_min": 120.0}}) < 1e-3
+    assert left_px(cam, name, {"state": {"grabber_on_min": 0.0}, "calibration": {"every_image": True}}) < 0.01
+
+
+def test_what_is_calibrated_decides_what_is_left() -> None:
+    models = ("none", "principal_point_and_scale", "lens")
+    found = [rms(pixmetry.budget(camera("imx264_like"), {"calibration": {"model": m}}).one.after_px) for m in models]
+    assert found[0] > found[1] > found[2]
+
+
+@pytest.mark.parametrize(
+    ("source_id", "scenario"),
+    [
+        ("sensor.trigger_jitter", {"motion": {"speed_px_per_s": 500.0}}),
+        ("scene.speckle", {"light": {"source": "laser", "wavelength_nm": 650.0, "f_number": 8.0}}),
+        ("storage.jpeg", {"storage": {"format": "jpeg", "quality": 50}}),
+        ("scene.view_point", {"target": {"surface": "glossy"}}),
+    ],
+)
+def test_motion_light_and_storage_bring_their_sources_in(source_id: str, scenario: dict[str, object]) -> None:
+    usual = left_px(camera("imx264_like"), source_id, {"target": {"surface": "retro"}})
+    assert left_px(camera("imx264_like"), source_id, scenario) > 3 * usual
+
+
+def measured(value: float, u: float) -> Camera:
+    """The camera with a PRNU that was measured."""
+    found = camera("imx264_like").with_parameters("sensor.prnu", pixel_std_rel=value, row_std_rel=0.0, col_std_rel=0.0)
+    estimates = Estimates.from_rows([("pixel_std_rel", value, u, 100.0, "1")], method="a test")
+    chain = tuple(replace(e, known_from="measured", estimates=estimates) if e.source.id == "sensor.prnu" else e for e in found.chain)
+    return replace(found, name="measured", chain=chain)
+
+
+def sheet(value: float) -> Camera:
+    found = camera("imx264_like").with_parameters("sensor.prnu", pixel_std_rel=value, row_std_rel=0.0, col_std_rel=0.0)
+    return replace(found, chain=tuple(replace(e, known_from="sheet") if e.source.id == "sensor.prnu" else e for e in found.chain))
+
+
+def test_what_was_measured_goes_before_the_sheet_and_is_compared_with_it() -> None:
+    joined, compared = camera_of([sheet(0.005), measured(0.01, 0.0002)])
+    assert joined["sensor.prnu"].params.pixel_std_rel == 0.01 and joined["sensor.prnu"].known_from == "measured"
+    of_prnu = [d for d in compared if d.parameter == "pixel_std_rel"]
+    assert len(of_prnu) == 1 and not of_prnu[0].agree
+    assert all(d.agree for d in camera_of([sheet(0.0101), measured(0.01, 0.0002)])[1])
+    row, alone = (next(r for r in Table(Setting(c, Scenario()), TargetEstimator()).rows(["sensor.prnu"])) for c in (joined, sheet(0.005)))
+    assert row.status == MEASURED and row.largest is None
+    assert row.u_of_total_px == pytest.approx(0.02 * row.before_px, rel=0.01)  # 2 % of the value
+    assert alone.status == SHEET and row.before_px == pytest.approx(2 * alone.before_px, rel=0.01)
+
+
+def test_descriptions_of_different_sensors_are_refused() -> None:
+    with pytest.raises(InputError, match="different sensors"):
+        camera_of([camera("imx264_like"), camera("pulnix_tm6cn_epix_512")])
+
+
+def test_a_measured_source_leaves_the_interval_and_the_list_of_what_to_measure() -> None:
+    found = pixmetry.budget(measured(0.01, 0.0002))
+    assert "sensor.prnu" not in [n.source_id for n in found.to_measure]
+    assert all(next(r for r in found.rows if r.name == n.name).status in (TYPICAL, AT_BOUND) for n in found.to_measure)
+
+
+def test_lengths_on_the_object_follow_the_scale() -> None:
+    near, far = (pixmetry.budget(camera("imx264_like"), {"object": {"distance_mm": d, "f_mm": 25.0}}) for d in (1025.0, 2025.0))
+    assert near.setting.px_per_mm == pytest.approx(25 / 1000 / 3.45e-3)
+    assert near.mm(near.one.after_px)[0] == pytest.approx(near.one.after_px[0] * 1000 / 25 * 3.45e-3)
+    ratio = np.sqrt(np.diag(far.point_mm())[2] / np.diag(near.point_mm())[2]) / (rms(far.answer.after_px) / rms(near.answer.after_px))
+    assert ratio == pytest.approx(2.0, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"target": {"diameter_mm": 5.0}}, "scale of the image"),
+        ({"motion": {"speed_mm_per_s": 5.0}}, "scale of the image"),
+        ({"target": {"diameter_mm": 5.0, "diameter_px": 7.0}}, "say the same"),
+        ({"object": {"distance_mm": 10.0, "f_mm": 25.0}, "target": {"diameter_mm": 1.0}}, "nearer than the focal length"),
+        ({"calibration": {"model": "magic"}}, "principal_point_and_scale"),
+        ({"speed": 3}, "speed"),
+    ],
+)
+def test_a_scenario_that_cannot_be_used_is_refused_in_words(given: dict[str, object], words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        found = pixmetry.budget(camera("imx264_like"), given)
+        found.setting.target, found.setting.velocity_px_per_s  # noqa: B018
+
+
+def test_a_scenario_file_and_its_defaults(tmp_path) -> None:
+    path = tmp_path / "scenario.yaml"
+    path.write_text("schema: pixmetry/scenario/1\nmotion: {speed_px_per_s: 50}\n", encoding="utf-8")
+    found = read_scenario(path)
+    assert found.told["motion.speed_px_per_s"] == (50.0, True) and found.told["count.rays"] == (2, False)
+    assert read_scenario(None) == Scenario()
+    path.write_text("schema: pixmetry/scenario/1\nmotion: {speed: 50}\n", encoding="utf-8")
+    with pytest.raises(InputError, match="line 2"):
+        read_scenario(path)
