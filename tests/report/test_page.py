@@ -13,9 +13,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pixmetry.assess.page.figures import Curve, all_pictures, nonlinearity
+from pixmetry.assess.page.figures import Curve, all_pictures, nonlinearity, target_picture
 from pixmetry.assess.page.measured import table
 from pixmetry.assess.page.page import page_of, write_report
+from pixmetry.budget.monte_carlo import Crop
 from pixmetry.camera.observations import Observations
 from pixmetry.report import html_of
 from pixmetry.report.drawing import thumbnail
@@ -247,3 +248,17 @@ def test_importing_the_page_is_cheap_and_knows_nothing_of_the_job() -> None:
     code = f"import sys, pixmetry.assess.page.page; print([m for m in {heavy} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_the_page_shows_the_target_with_its_centres() -> None:
+    """The uncertainty is enlarged by a power of ten, so that it is seen; a target that was not found has no measured centre."""
+    pixels = np.full((24, 24), 100.0)
+    pixels[9:16, 9:16] = 2000.0
+    budget = simulated.budget()
+    for x_hat_px, words in ((12.03, "The measured centre is 0.050 px from the true one."), (np.nan, "The target was not found here.")):
+        drawn = target_picture(Crop(pixels, 12.0, 11.5, x_hat_px, 11.54), budget)
+        assert words in drawn.alt and words in drawn.caption
+        lost = np.isnan(x_hat_px)
+        assert ("enlarged 10 times" in drawn.caption) != lost and len(drawn.drawing.axes[0].patches) == (0 if lost else 1)
+    found = page_of(replace(simulated.assessment(), crop=Crop(pixels, 12.0, 11.5, 12.03, 11.54)))
+    assert html_of(found).count('<figure id="target">') == 1

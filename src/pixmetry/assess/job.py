@@ -14,8 +14,11 @@ from pixmetry.assess.digital_twin import ASSUMED_RANGE_E, digital_twin, of_unit,
 from pixmetry.assess.page.page import write_report
 from pixmetry.assess.results import Assessment
 from pixmetry.budget.job import compute_budget
+from pixmetry.budget.monte_carlo import Crop, Trials
 from pixmetry.budget.parameters import with_estimates
 from pixmetry.budget.probe import Target, parse_target
+from pixmetry.budget.records import Budget
+from pixmetry.camera.camera import Camera
 from pixmetry.camera.catalogue import sources
 from pixmetry.camera.geometry import frame_centre
 from pixmetry.camera.observations import CameraGeometry, Observations
@@ -144,12 +147,21 @@ def assess(
     twin = of_unit(camera, seen)
     tested = self_test(twin, frames, seen, standard, seed)
     told("testing the digital twin", 1, 1)
-    assessment = Assessment(frames, seen, estimates, unmeasured, standard, twin, budget, record, tested)
+    crop = crop_of(twin, budget, seed)
+    assessment = Assessment(frames, seen, estimates, unmeasured, standard, twin, budget, record, tested, crop)
     if output is not None:
         told("writing the report", 0, 1)
         write_results(assessment, output, _inputs(frames, calibration))
         told("writing the report", 1, 1)
     return assessment
+
+
+def crop_of(twin: Camera, budget: Budget, seed: int) -> Crop | None:
+    """The target of a budget as the twin shows it; None where its frames are too small for it."""
+    try:
+        return Trials(twin, budget.target, budget.estimator, budget.facts, trials=1, units=1, frames=1, seed=seed).crop()
+    except InputError:
+        return None
 
 
 def _geometry_for(campaign: Campaign, calibration: str | Path | CameraGeometry) -> CameraGeometry:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from pixmetry.assess.digital_twin import SelfTest
+from pixmetry.budget.monte_carlo import Crop
 from pixmetry.budget.records import SUM, Budget
 from pixmetry.camera.camera import Camera
 from pixmetry.camera.observations import Observations, StackMoments
@@ -39,6 +40,8 @@ class Assessment:
     provenance : dict
     self_test : SelfTest
         The twin beside the camera.
+    crop : Crop, optional
+        The target of the budget as the twin shows it.
     """
 
     campaign: Campaign
@@ -50,6 +53,7 @@ class Assessment:
     budget: Budget
     provenance: dict[str, Any]
     self_test: SelfTest = SelfTest()
+    crop: Crop | None = None
 
     def to_record(self) -> dict[str, Any]:
         """Return the plain record of ``results.json``."""

@@ -32,6 +32,7 @@ from pixmetry.core.errors import ChainError, InputError
 from pixmetry.core.random import Grid, Streams
 from pixmetry.locate.estimator import Estimator
 
+Pair = tuple[np.ndarray, np.ndarray]  # x and y
 UNIT_STRIDE = 1_000_003  # between the unit seeds of cameras of one type
 
 
@@ -118,6 +119,27 @@ class MonteCarlo:
         return float(np.sqrt(sum((a.u * a.se_u) ** 2 + (a.bias * a.se_bias) ** 2 for a in (self.x, self.y))) / (2 * self.total_px))
 
 
+@dataclass(frozen=True, eq=False)
+class Crop:
+    """One target as a camera shows it.
+
+    Parameters
+    ----------
+    data_dn : ndarray, shape (rows, cols)
+        A window of a frame.
+    x_px, y_px : float
+        Where the target belongs in it, in px of the window.
+    x_hat_px, y_hat_px : float
+        Where the estimator puts it; NaN where it finds none.
+    """
+
+    data_dn: np.ndarray
+    x_px: float
+    y_px: float
+    x_hat_px: float
+    y_hat_px: float
+
+
 @dataclass
 class Trials:
     """The design of a Monte Carlo: which target, at which places, in how many units and frames; the same for every set of sources.
@@ -177,7 +199,22 @@ class Trials:
             self._found[key] = np.stack([x for x, _ in parts]), np.stack([y for _, y in parts])
         return self._found[key]
 
+    def crop(self) -> Crop:
+        """The first target of the first unit, as the camera shows it with all its sources."""
+        facts = replace(self.facts, dn_per_photon=self.facts.dn_per_photon * passed_light(self.camera))
+        windows, (col0, row0), (x, y), (x_hat, y_hat) = self._located(self.camera, 0, facts)
+        at = (float(v[0]) for v in (x - col0, y - row0, x_hat, y_hat))
+        return Crop(windows[0].astype(float), *at)
+
     def _unit(self, camera: Camera, unit: int, facts: Facts) -> tuple[np.ndarray, np.ndarray]:
+        """Positions found less the true ones, px of the sensor, each (places, frames)."""
+        _, firsts, belongs, found = self._located(camera, unit, facts)
+        parts = zip(found, firsts, belongs, _layout(camera), strict=True)
+        dx, dy = (((hat + first - at) / step).reshape(self.places, self.frames) for hat, first, at, (_, step) in parts)
+        return dx, dy
+
+    def _located(self, camera: Camera, unit: int, facts: Facts) -> tuple[np.ndarray, Pair, Pair, Pair]:
+        """Windows of one unit, the first column and row of each, where their targets belong in the frame and are found in the window."""
         n, middle = self.places * self.frames, self.side // 2
         shown = [np.repeat(first[unit] + middle + part[unit], self.frames) for first, part in ((self.col0, self.dx), (self.row0, self.dy))]
         x, y = ((at - start) / step for at, (start, step) in zip(shown, _layout(self.camera), strict=True))
@@ -199,10 +236,7 @@ class Trials:
         )
         if windows.dtype.kind == "f":  # without a converter in the chain the scale has an end all the same
             windows = np.minimum(windows, np.float32(self.facts.saturation_dn))
-        found = self._as_seen(camera, facts, frozen).locate(windows)
-        parts = zip(found, (col0, row0), belongs, _layout(camera), strict=True)
-        dx, dy = (((hat + first - at) / step).reshape(self.places, self.frames) for hat, first, at, (_, step) in parts)
-        return dx, dy
+        return windows, (col0, row0), belongs, self._as_seen(camera, facts, frozen).locate(windows)
 
     def _moved(self, camera: Camera, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """By how much targets are seen elsewhere than they belong (a lens, a drift, a cold clock): windows follow, errors do not."""

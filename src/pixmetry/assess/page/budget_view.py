@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from pixmetry.assess.page.figures import link_shares, pareto
+from pixmetry.assess.page.figures import link_shares, pareto, target_picture
 from pixmetry.budget.combine import Combined
-from pixmetry.budget.monte_carlo import MonteCarlo
+from pixmetry.budget.monte_carlo import Crop, MonteCarlo
 from pixmetry.budget.probe import phases_for
 from pixmetry.budget.records import DECIDED, SUM, Budget, BudgetRow
 from pixmetry.camera.catalogue import get_source
@@ -48,7 +48,7 @@ NAMED = 6  # accepted sources that the verdict names
 Pitch = tuple[float, float] | None
 
 
-def verdict_section(budget: Budget) -> Section:
+def verdict_section(budget: Budget, crop: Crop | None = None) -> Section:
     """The answer: an interval, its standard uncertainty, the total after a calibration, and the totals for more frames."""
     pitch, one, every = budget.pitch_um, budget.verdict, budget.with_accepted[0]
     section = Section("Uncertainty of a coordinate", name="verdict")
@@ -72,7 +72,7 @@ def verdict_section(budget: Budget) -> Section:
     target, estimator = budget.target.describe(), budget.estimator.describe()
     section.add(Answer(parts))
     section.add_text(strong("Target:"), f" {target}. ", strong("Estimator:"), f" {estimator}. {places}")
-    section.add(link_shares(budget), pareto(budget))
+    section.add(None if crop is None else target_picture(crop, budget), link_shares(budget), pareto(budget))
     section.add(_ladder(budget))
     if pitch is None:
         words = " the pixel pitch of this camera was not given, so lengths are in pixels only. Add "

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pixmetry.budget.job import Budget, BudgetRow
+from pixmetry.budget.monte_carlo import Crop
 from pixmetry.camera.observations import CodeHistogram, Observations, Spectra
 from pixmetry.core.number import Estimates
 from pixmetry.emva.records import Results
@@ -19,6 +20,8 @@ from pixmetry.report.numbers import length_px, percent, significant
 from pixmetry.report.page import Figure
 
 MOST_BARS = 10
+SHOWN_DIAMETERS = 1.0  # of the target, to each side of its centre
+ELLIPSE_SHARE = 0.7  # of the target's diameter, up to which the semi-axis of its uncertainty is enlarged
 LONG_TITLE = 34  # characters of a source's title that have room beside its bar
 
 
@@ -291,6 +294,42 @@ def all_pictures(seen: Observations, standard: Results, maps: Mapping[str, np.nd
     if seen.histogram is not None and seen.histogram.dark_counts.sum() > 0:
         made.append(dark_codes(seen.histogram))
     return {p.name: p for p in made}
+
+
+def target_picture(crop: Crop, budget: Budget) -> Figure:
+    """The pixels of the budget's target as the twin shows it, its measured centre, and the ellipse of its uncertainty, enlarged."""
+    from matplotlib.patches import Ellipse
+
+    rows, cols = crop.data_dn.shape
+    u_x, u_y = budget.verdict.total_x_px, budget.verdict.total_y_px
+    largest = max(u_x, u_y)
+    times = 10.0 ** np.floor(np.log10(ELLIPSE_SHARE * budget.target.diameter_px / largest)) if largest > 0 else 1.0
+    where = (crop.x_hat_px, crop.y_hat_px)
+    with canvas(3.1) as (figure, axes):
+        image = axes.imshow(crop.data_dn, cmap="gray", interpolation="none", extent=(-0.5, cols - 0.5, rows - 0.5, -0.5))
+        bar = figure.colorbar(image, ax=axes, shrink=0.85, aspect=18, pad=0.02)
+        bar.set_label("DN")
+        bar.outline.set_linewidth(0.4)
+        half = min(SHOWN_DIAMETERS * budget.target.diameter_px + 2, 0.5 * min(rows, cols))
+        axes.set_xlim(max(crop.x_px - half, -0.5), min(crop.x_px + half, cols - 0.5))
+        axes.set_ylim(min(crop.y_px + half, rows - 0.5), max(crop.y_px - half, -0.5))
+        axes.plot(crop.x_px, crop.y_px, "+", color=RED, markersize=11, markeredgewidth=1.4, label="true centre")
+        if np.isfinite(where).all():
+            axes.plot(*where, "x", color=BLUE, markersize=8, markeredgewidth=1.4, label="measured centre")
+            axes.add_patch(Ellipse(where, 2 * times * u_x, 2 * times * u_y, fill=False, color=BLUE, linewidth=1.2))
+        axes.grid(False)
+        axes.tick_params(length=2)
+        axes.set_xlabel("x / px")
+        axes.set_ylabel("y / px")
+        figure.legend(loc="outside upper center", ncols=2)
+        off = length_px(float(np.hypot(where[0] - crop.x_px, where[1] - crop.y_px)))
+        found, ellipse = "The target was not found here.", ""
+        if np.isfinite(where).all():
+            found = f"The measured centre is {off} px from the true one."
+            ellipse = f" The ellipse is its standard uncertainty (k = 1){f', enlarged {times:g} times' if times != 1 else ''}."
+        caption = f"The target of the budget in one frame, simulated with the digital twin of the camera. {found}{ellipse}"
+        alt = f"Pixels of a simulated target, {cols} × {rows}. {found}"
+        return Figure(figure, "target", alt, caption)
 
 
 def link_shares(budget: Budget) -> Figure | None:

@@ -58,7 +58,7 @@ def page_of(assessment: Assessment) -> Page:
     budget, name = assessment.budget, assessment.campaign.camera.name
     page = Page(name, "uncertainty of its image coordinates", "pixmetry camera assessment", _facts(assessment), FOOTER)
     page.sections += [
-        budget_view.verdict_section(budget),
+        budget_view.verdict_section(budget, assessment.crop),
         budget_view.largest_section(budget),
         _plots(assessment),
         _values(assessment),
