@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from pixmetry.budget.combine import combine
+from pixmetry.budget.headline import dof_of
+from pixmetry.budget.records import MONTE_CARLO, SUM, BudgetRow, Headline
 from pixmetry.camera.contribution import CLASSES, Contribution, smooth_part
 from pixmetry.core.errors import InputError
 
@@ -83,3 +85,17 @@ def test_every_class_has_a_rule_and_nothing_gives_nothing() -> None:
     assert combine([]).total_px == 0
     with pytest.raises(InputError):
         combine(ROWS, frames=0)
+
+
+def test_degrees_of_freedom_are_those_of_what_the_parts_are_uncertain_by() -> None:
+    """A part known to 10 % has ½/0.1² = 50 (JCGM 100:2008, G.4.2), two such parts of equal size 4/(1/50 + 1/50) = 100 (G.4.1)."""
+    parts = [Contribution(0.03, 0.04, kind, model_error=0.0, floor_px=0.0) for kind in "TF"]
+    rows = [BudgetRow("a", "a", "a", "measured", part, u_of_total_px=0.1 * part.total_px) for part in parts]
+    found = Headline(SUM, 0.0, float("nan"), float("nan"), 0.0, "")
+    assert dof_of(rows[:1], combine(parts[:1]), found) == pytest.approx((50.0, 50.0))
+    assert dof_of(rows, combine(parts), found) == pytest.approx((100.0, 100.0))
+    exact = BudgetRow("c", "c", "c", "modelled", Contribution(0.04, 0.03, "T", model_error=0.0, floor_px=0.0))
+    both = combine([parts[0], exact.part])  # squares in x 9 + 16, in y 16 + 9
+    assert dof_of([rows[0], exact], both, found) == pytest.approx((50 * (25 / 9) ** 2, 50 * (25 / 16) ** 2))
+    simulated = Headline(MONTE_CARLO, 0.0, 0.05, 0.001, 0.0, "")
+    assert dof_of(rows, combine(parts), simulated) == pytest.approx((0.5 * 50**2,) * 2)
