@@ -154,6 +154,7 @@ def test_results_are_input_again(done: tuple[Path, Path, Result], simulated: Sim
     assert np.abs((again.adjustment.state.interior[0] - stored.cameras[0].values)[:10] / u).max() < 1
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_fewer_parameters_and_terms_of_images(simulated: Simulated, tmp_path: Path) -> None:
     path = project(tmp_path, simulated.network)
     result = run(path, "-o", tmp_path / "r", "--free", "c,xp,yp,k1,k2", "--per-image", "x_scale", "--folds", 0, "--json", "-")
@@ -168,6 +169,7 @@ def test_fewer_parameters_and_terms_of_images(simulated: Simulated, tmp_path: Pa
     assert len(rows) == 12 and all(float(row["u_x_scale"]) > 0 for row in rows)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_an_earlier_result_is_replaced_and_nothing_else(done: tuple[Path, Path, Result], simulated: Simulated, tmp_path: Path) -> None:
     path = project(tmp_path, simulated.network)
     (tmp_path / "photos").mkdir()
@@ -183,6 +185,7 @@ def test_an_earlier_result_is_replaced_and_nothing_else(done: tuple[Path, Path, 
     refused(run(moved / "project.yaml", "-o", moved / "result"), "holds a file that is read", "residuals.csv")
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_pictures_of_a_board_alone(tmp_path: Path, rng: np.random.Generator) -> None:
     """Drawn without distortion by a pinhole of known focal length; u is that of the located corners with sigma0."""
     for k, (roll, tilt_x, tilt_y) in enumerate([(3, 0, 8), (85, 25, -10), (4, -28, 8), (178, 12, 30), (2, -10, -32), (-88, 20, 24)]):
@@ -211,6 +214,7 @@ def by_hand(request: pytest.FixtureRequest) -> Calibration:
     return replace(found, adjustment=replace(found.adjustment, covariance=lower + np.tril(lower, -1).T))
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_inverse_read_after_write(by_hand: Calibration, tmp_path: Path) -> None:
     a = by_hand.adjustment
     write_results(by_hand, tmp_path / "r")
@@ -238,6 +242,7 @@ def test_any_symmetric_matrix_comes_back_bit_for_bit(rng: np.random.Generator) -
     assert np.array_equal(unpacked(json.loads(json.dumps(packed(matrix)))), matrix)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_an_image_a_point_and_a_camera_of_one_name(by_hand: Calibration, tmp_path: Path) -> None:
     """Photos are numbered, so are points and cameras: the camera's covariance holds its own parameters only."""
     a = by_hand.adjustment
@@ -323,6 +328,7 @@ def test_one_image_is_not_a_network(tmp_path: Path, simulated: Simulated) -> Non
 # --- the page of documentation ----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_one_blunder_outside_of_the_frame_is_a_gross_error(simulated: Simulated, tmp_path: Path) -> None:
     net = simulated.network
     x = net.x_px.copy()
@@ -374,6 +380,7 @@ def test_a_camera_that_no_image_names(simulated: Simulated, tmp_path: Path) -> N
     assert calibrated_geometry(tmp_path / "r", "A").u_x_px > 0
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_control_points_are_listed_given_less_adjusted(simulated: Simulated, tmp_path: Path) -> None:
     rng = np.random.default_rng(8)  # what is tested does not depend on the draw
     truth, names = simulated.truth.xyz, simulated.network.points
@@ -395,6 +402,7 @@ def test_control_points_are_listed_given_less_adjusted(simulated: Simulated, tmp
     assert "Control points" in page and f"{names[0]} X" in page and re.search(rf"{names[3]}( X)? \(left out\)", page)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_check_points_of_a_project(simulated: Simulated, tmp_path: Path, rng: np.random.Generator) -> None:
     """They change nothing; the record, the page and the terminal say by how much they differ; the one that is wrong by 1 mm is named."""
     truth, names = simulated.truth.xyz, simulated.network.points
@@ -430,6 +438,7 @@ def test_check_points_of_a_project(simulated: Simulated, tmp_path: Path, rng: np
     assert "12 check points with 35 coordinates" in page and "12 check points with 35 coordinates" in " ".join(result.output.split())
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_single_coordinates_may_be_known(simulated: Simulated, tmp_path: Path, rng: np.random.Generator) -> None:
     """Four whole points, heights and places of others, all with other cells empty; the truth of the other points as exact check points."""
     truth, names = simulated.truth.xyz, simulated.network.points
@@ -490,6 +499,7 @@ def test_the_page_names_every_key_and_no_other() -> None:
     assert told == allowed, told ^ allowed
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_example_of_other_programs_runs(by_hand: Calibration, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     write_results(by_hand, "result")

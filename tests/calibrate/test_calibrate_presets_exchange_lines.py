@@ -89,6 +89,7 @@ def test_the_file_works_with_simulate(sony: tuple[Path, Simulated], tmp_path: Pa
     assert ran.exit_code == 0, ran.output
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_several_cameras_have_a_file_each(tmp_path: Path, rng: np.random.Generator) -> None:
     simulated = simulate(rng, images=24, points=60, sensor=SENSOR, cameras=2)
     network = simulated.network
@@ -107,6 +108,7 @@ def test_several_cameras_have_a_file_each(tmp_path: Path, rng: np.random.Generat
     assert [line.split()[0] for line in cameras] == ["1", "2"] and result.output.count("px are lost") == 4
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_another_pixel_grid_gets_no_camera_file_but_a_reason(tmp_path: Path, rng: np.random.Generator) -> None:
     """The grabber's samples are 14.1875/10 pixels apart: pitch 12.20125 µm, 512 × 512."""
     grid = stored_grid(load_camera("pulnix_tm6cn_epix_512"))
@@ -135,6 +137,7 @@ def test_which_presets_store_the_sensors_own_pixels(name: str, pitch: tuple[floa
     assert grid.pitch_um == pytest.approx(pitch, rel=1e-12) and (changed in grid.changed if changed else grid.changed == "")
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_model_that_the_sources_cannot_hold_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator) -> None:
     def cannot(*_: object, **__: object) -> Camera:
         raise InputError("the sources' lens cannot hold this model", value="up to 0.2 px apart", remedy="free fewer terms")
@@ -160,6 +163,7 @@ def test_another_size_than_the_presets_is_refused(tmp_path: Path, rng: np.random
     assert not (tmp_path / "r").exists()
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_pictures_of_a_board_with_a_camera_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator) -> None:
     """Its pitch makes lengths millimetres, its file comes back with the lens; the same pictures and a larger camera are refused."""
     monkeypatch.chdir(tmp_path)
@@ -220,6 +224,7 @@ def test_export_without_a_loss_and_the_way_back(vision: tuple[Path, Path], tmp_p
     assert np.abs(off / np.sqrt(np.diag(stored.interior_covariance()[1]))[:3]).max() < 0.01
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_loss_is_refused_after_the_results_are_written(sony: tuple[Path, Simulated], tmp_path: Path, rng: np.random.Generator) -> None:
     """Corrections from image to object, and shear: one line says how much, what to allow, and allowing that is enough."""
     path = sony[0] / "project.yaml"
@@ -421,6 +426,7 @@ def with_wires(path: Path, rng: np.random.Generator, size: tuple[int, int] = (CO
     return path
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_pictures_of_wires_give_the_lens(tmp_path: Path, rng: np.random.Generator) -> None:
     """Located without being told anything: four parameters cover their truth, which they know to 0.001 px in the corner."""
     files = [with_wires(tmp_path / "a.npy", rng), with_wires(tmp_path / "b.npy", rng, steep=False)]
@@ -460,6 +466,7 @@ def test_what_has_no_meaning_with_lines_is_told(
     assert not (tmp_path / "r").exists()
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_stray_position_outside_of_the_frame_is_told_and_rejected(tmp_path: Path, rng: np.random.Generator) -> None:
     positions = lines(rng)
     positions["x_px"][7] = 5000
