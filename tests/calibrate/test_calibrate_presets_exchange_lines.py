@@ -287,7 +287,7 @@ STARTS = {
         ("start_from: empty.yaml", ("empty.yaml",)),
         ("start_from: words.yaml", ("words.yaml", "OpenCV")),
         ("start_from: other.yaml", ("other.yaml", "camera_matrix")),
-        ("start_from: fisheye.txt", ("OPENCV_FISHEYE", "lost")),
+        ("start_from: fisheye.txt", ("OPENCV_FISHEYE", "cannot represent")),
         ("start_from: two.txt", ("two.txt", "1, 2", "name")),
         ("start_from: none.txt", ("none.txt",)),
         ("start_from: results.json", ("results.json", "pixmetry/results/1")),

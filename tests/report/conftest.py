@@ -1,9 +1,8 @@
-"""A real browser, at the width of a phone and of a desk; and pages whose figures are left blank, for tests of words alone."""
+"""A real browser, at the width of a phone and of a desk."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -11,13 +10,6 @@ import pytest
 
 CHROMIUM = Path("/usr/bin/chromium")
 WIDTHS = (390, 1280)
-
-
-@pytest.fixture
-def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Figures of a page keep their place, title, caption and description; what is in them is not drawn, which is most of a page's time."""
-    blank = '<svg class="figure" role="img" aria-label="{}"></svg>'
-    monkeypatch.setattr("pixmetry.report.drawing.svg_of", lambda drawing, name, alt: blank.format(escape(alt)))
 
 
 @pytest.fixture(scope="module")
