@@ -88,7 +88,7 @@ def test_flat_board_stands(rng):
     simulated, _ = bent(rng, lambda x, y: np.zeros((len(x), 3)))
     check = check_field(adjusted(simulated.network, simulated), level=RATE)
     assert check.verdict == "fixed" and check.adjustment is check.fixed and check.findings[0].level == "note"
-    assert "stand" in check.field.text and check.hold_out.free.left_out_rms_px > check.hold_out.fixed.left_out_rms_px * 0.97
+    assert "are accepted" in check.field.text and check.hold_out.free.left_out_rms_px > check.hold_out.fixed.left_out_rms_px * 0.97
 
 
 def test_stat_f_test_of_a_true_field_is_fair(rng):
@@ -133,7 +133,7 @@ def test_too_few_images_leave_the_field_untested(rng):
     camera = simulated.network.cameras[0]
     few = replace(camera, values=simulated.truth.interior[0], free=np.array(NAMES) == "xp")
     check = check_field(adjusted(replace(simulated.network, cameras=(few,)), start_flat(simulated)))
-    assert check.verdict == "fixed" and check.hold_out is None and "untested" in check.field.text
+    assert check.verdict == "fixed" and check.hold_out is None and "were not tested" in check.field.text
 
 
 def test_free_points_are_no_field(rng):

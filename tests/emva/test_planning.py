@@ -229,7 +229,7 @@ def test_wishes_are_read() -> None:
     for text in ("K", "K=x", "=", "K=0.1 DN"):
         with pytest.raises(InputError, match="cannot be read"):
             parse_wanted(CCD, [text])
-    with pytest.raises(InputError, match="not known"):
+    with pytest.raises(InputError, match="unknown or zero"):
         parse_wanted(replace(CCD, dsnu_row_e=0.0), ["DSNU1288_row=5%"])
 
 
