@@ -363,9 +363,9 @@ FAULTS = (
         "tests/calibrate/test_snooping.py",
     ),
     Fault(
-        "area inside a circle's contour",
-        "np.column_stack([-np.sin(t), np.cos(t)]) * (2 * np.pi / CIRCLE_NODES)",
-        "np.column_stack([-np.sin(t), np.cos(t)]) * (np.pi / CIRCLE_NODES)",
+        "a circle's diameter for its radius",
+        "network.diameter[point] / 2)",
+        "network.diameter[point])",
         "tests/calibrate/test_eccentric.py",
     ),
     Fault(
