@@ -353,6 +353,8 @@ def test_applies_reads_interface_and_sensor() -> None:
     assert applies(source, {"interface": "analogue"}) and not applies(source, {"interface": "digital"})
     assert applies(source, {})  # not told: it may be there
     assert applies(get_source("sensor.prnu"), {"interface": "digital", "sensor": "cmos"})
+    for name, sensors in (("sensor.blooming", {"ccd"}), ("sensor.smear", {"ccd"}), ("electronics.telegraph_noise", {"cmos"})):
+        assert {kind for kind in ("ccd", "cmos", "cid") if applies(get_source(name), {"sensor": kind})} == sensors, name
 
 
 def test_variance_of_a_limit_is_that_of_numbers_spread_evenly_below_it() -> None:

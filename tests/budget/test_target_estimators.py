@@ -111,7 +111,7 @@ def test_a_target_is_where_locate_finds_it(seed: int, rng: np.random.Generator) 
 
 
 def test_an_estimator_without_a_target_and_a_window_too_small_are_refused() -> None:
-    with pytest.raises(InputError, match="not known"):
+    with pytest.raises(InputError, match="needs a target"):
         TargetEstimator().locate(np.zeros((1, 40, 40)))
     facts = facts_of(noisy_camera(), Target())
     with pytest.raises(InputError, match="fit"):

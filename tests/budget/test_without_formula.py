@@ -114,8 +114,19 @@ def test_every_source_of_the_presets_has_a_contribution_or_cannot_be_left_out() 
         bare = row.source_id in told
         assert row.contribution is not None or bare or row.status in ("not applicable", "left to calibration"), (row.name, row.reason)
         assert row.contribution is None or np.isfinite(row.total_px)
-    at_rest = next(r for r in budget.rows if r.name == "sensor.exposure")
-    assert at_rest.total_px < 1e-6 and "at rest" in at_rest.reason
+
+
+@pytest.mark.parametrize(
+    "name", ["sensor.exposure", "sensor.interlace", "sensor.light_pulses", "sensor.rolling_shutter", "sensor.trigger_jitter"]
+)
+def test_what_moves_moving_targets_only_is_refused_with_the_reason(name: str) -> None:
+    """In the camera or not: neither a contribution of 0, as if it were known of a moving target, nor left to a calibration."""
+    plain = camera(element("optics.point_spread", sigma_px=0.5))
+    for cam in (plain, put(plain, element(name))):
+        budget = compute_budget(cam, None, {"noise_dn": 0.6}, TARGET, FixedCentroid(), trials=0)
+        row = next(r for r in budget.rows if r.name == name)
+        assert row.contribution is None and row.status == "not applicable" and not row.counts
+        assert name == "sensor.light_pulses" and cam is plain or ("at rest" in row.reason and "speed" in row.reason)
 
 
 def test_a_chain_without_a_place_says_so() -> None:

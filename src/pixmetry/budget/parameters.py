@@ -15,8 +15,8 @@ from pixmetry.core.number import Estimates
 
 
 def applies(source: Source, facts: Mapping[str, Any]) -> bool:
-    """Whether a camera of this interface (digital, analogue) and sensor (ccd, cmos) can have the source; unknown counts as yes."""
-    for kinds, fact in ((("digital", "analogue"), "interface"), (("ccd", "cmos"), "sensor")):
+    """Whether a camera of this interface (digital, analogue) and sensor (ccd, cmos, cid) can have the source; unknown counts as yes."""
+    for kinds, fact in ((("digital", "analogue"), "interface"), (("ccd", "cmos", "cid"), "sensor")):
         wanted = [k for k in source.applies_to if k in kinds]
         told = str(facts.get(fact, "")).lower()
         if wanted and told in kinds and told not in wanted:

@@ -33,7 +33,8 @@ class BudgetRow:
     status : {"measured", "modelled", "calibrated", "accepted", "not applicable", "left to calibration"}
         Its parameters were estimated in this campaign; it is known without (from the camera's description, or it has no parameters);
         positions are corrected for it by a calibration, and what that leaves counts; the campaign could not tell, and it is taken at the
-        largest to expect of a sound camera; such a camera cannot have it; only a calibration with targets can tell.
+        largest to expect of a sound camera; such a camera cannot have it, or it acts on moving targets only; only a calibration with
+        targets can tell.
     contribution : Contribution, optional
     u_of_total_px : float
         Uncertainty of the contribution's total that comes of its parameters' uncertainty.

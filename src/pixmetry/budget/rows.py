@@ -116,6 +116,10 @@ def _with_status(row: BudgetRow, source: Source, known: Known) -> BudgetRow:
         return replace(row, status="not applicable", reason=f"only in a camera that is {' or '.join(source.applies_to)}")
     if beyond:
         return replace(row, status="not applicable", reason=beyond)
+    of_motion = Kind.LIGHT in source.consumes and source.gum_class == "O" and source.propagate is None
+    if of_motion:  # a calibration takes nothing up of how an object moves
+        reason = f"a target at rest is not moved by it; for a moving one: {source.reasons['propagate']}"
+        return replace(row, status="not applicable", reason=reason)
     if Kind.LIGHT in source.consumes and not (row.in_camera or measured is not None):
         return replace(row, status="left to calibration", reason=CALIBRATED)
     if measured is not None:

@@ -99,7 +99,7 @@ class Source:
     start : callable, optional
         ``start(params)``: the state before frame 0, for a source with a memory; None where it has none with these parameters.
     applies_to : tuple of str
-        Kinds of camera that can have it: of ``digital``, ``analogue``, ``ccd``, ``cmos``; empty for all.
+        Kinds of camera that can have it: of ``digital``, ``analogue``, ``ccd``, ``cmos``, ``cid``; empty for all.
     option : str
         What a camera must have for this source to be in it, where most have not: ``a colour mosaic``. A budget counts it only where the
         camera's chain holds it.

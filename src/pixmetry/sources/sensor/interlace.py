@@ -80,7 +80,7 @@ SOURCE = Source(
     bound=Interlace(integration="field"),
     forward=forward,
     truth=truth,
-    applies_to=("analogue", "ccd"),
+    applies_to=("analogue", "ccd", "cid"),
     gum_class="O",
     equation="row r looks at t + t_field (r mod 2);  v t_field = x_second − x_first;  mid-time t + t_exp/2 + t_field/2",
     typical_size="fields 1 px apart at 50 px/s; a disc of 7 px splits at 350 px/s; the centre in the frame is right to 0.003 px",

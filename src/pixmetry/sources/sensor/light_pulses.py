@@ -66,7 +66,7 @@ SOURCE = Source(
     bound=LightPulses(separation_s=1.6e-3, ambient_share=0.2),
     forward=forward,
     truth=truth,
-    applies_to=("analogue", "ccd"),
+    applies_to=("analogue", "ccd", "cid"),
     option="pulsed light",
     gum_class="O",
     equation="field 1: (1 − a) L(t_e − δt/2) + a ∫L;  field 2: (1 − a) L(t_e + δt/2) + a ∫L;  fields lie v δt apart",

@@ -62,7 +62,7 @@ SOURCE = Source(
     bound=RollingShutter(row_time_s=30e-6),
     forward=forward,
     truth=truth,
-    applies_to=("cmos",),
+    applies_to=("cmos", "cid"),
     gum_class="O",
     equation="row r looks at t + r t_row;  shift v t_row (r − r0);  after a global reset row r gathers for t_exp + r t_row",
     typical_size="1.02 px from the first to the last of 2048 rows at 50 px/s and 10 µs",
