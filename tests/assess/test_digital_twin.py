@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from chance import rng_of
-from pixmetry.assess.digital_twin import best_values, digital_twin, expose, exposures_of, fewer, middle_window, of_unit, self_test
+from pixmetry.assess.digital_twin import best_values, digital_twin, of_unit
 from pixmetry.assess.job import assess, by_the_standard, measure_sources
 from pixmetry.assess.page.measured import twin_sentence
+from pixmetry.assess.self_test import expose, exposures_of, fewer, middle_window, self_test
 from pixmetry.camera.camera import Camera, Element
 from pixmetry.camera.catalogue import get_source
 from pixmetry.camera.observations import Observations

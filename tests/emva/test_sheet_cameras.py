@@ -12,7 +12,7 @@ import pytest
 from scipy import stats
 
 from data_sheets import measured, sheet, value
-from pixmetry.assess.digital_twin import Exposure, expose
+from pixmetry.assess.self_test import Exposure, expose
 from pixmetry.camera.camera import Camera
 from pixmetry.camera.data_sheet import camera_of_data_sheet
 from pixmetry.core.errors import InputError

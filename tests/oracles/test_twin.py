@@ -18,8 +18,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pixmetry.assess.digital_twin import digital_twin, expose, exposures_of, light_of, of_unit
+from pixmetry.assess.digital_twin import digital_twin, of_unit
 from pixmetry.assess.job import measure_sources, observe_campaign
+from pixmetry.assess.self_test import expose, exposures_of, light_of
 from pixmetry.emva.evaluate import standard_values
 from pixmetry.emva.records import Measurement
 from pixmetry.emva.reduction import measure_frames

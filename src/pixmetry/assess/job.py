@@ -10,9 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from pixmetry.assess.digital_twin import ASSUMED_RANGE_E, digital_twin, of_unit, self_test
+from pixmetry.assess.digital_twin import ASSUMED_RANGE_E, digital_twin, of_unit
 from pixmetry.assess.page.page import write_report
 from pixmetry.assess.results import Assessment
+from pixmetry.assess.self_test import self_test
 from pixmetry.budget.job import compute_budget
 from pixmetry.budget.monte_carlo import Crop, Trials
 from pixmetry.budget.parameters import with_estimates

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from pixmetry.assess.digital_twin import SelfTest
+from pixmetry.assess.self_test import SelfTest
 from pixmetry.budget.monte_carlo import Crop
 from pixmetry.budget.records import SUM, Budget
 from pixmetry.camera.camera import Camera

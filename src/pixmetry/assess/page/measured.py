@@ -17,7 +17,7 @@ from pixmetry.report import Column, Run, Section, Table, Text, strong
 from pixmetry.report.numbers import MINUS, NONE, PrintedNumber, limit, printed_number, significant, uncertain
 
 if TYPE_CHECKING:
-    from pixmetry.assess.digital_twin import SelfTest
+    from pixmetry.assess.self_test import SelfTest
 
 STANDARD_ONLY = {
     "SNR_max": "Largest signal-to-noise ratio",
