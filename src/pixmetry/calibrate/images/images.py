@@ -169,14 +169,6 @@ def observations_of(
     seen = _of_one_size(seen)
     good = [s for s in seen if not s.reason]
     _check_enough(seen, good, wanted, least_images)
-    lost = [Finding("image_left_out", f"{s.name} was left out: {s.reason}.", level="warning") for s in seen if s.reason]
-    notes = [Finding("targets", f"{s.name}: {s.note}.") for s in good if s.note]
-    lossy = [s.name for s in good if s.lossy]
-    if lossy:
-        text = (
-            f"{len(lossy)} of {len(good)} images were stored with loss (JPEG): its blocks shift edges, and the noise is that of the coder."
-        )
-        notes.append(Finding("targets", text, "Store images of a test field without loss."))
     good, numbering = _numbered(good, kind)
     out = _gathered(good, kind)
     names, xyz = _nominal(out.xyz, kind, step, side)
@@ -187,8 +179,24 @@ def observations_of(
         diameter=None if diameter is None or kind not in ("dots", "coded") else np.full(len(names), float(diameter)),
         normal=np.tile([0.0, 0.0, 1.0], (len(names), 1)) if kind == "dots" else None,
         left_out=tuple((s.name, s.reason) for s in seen if s.reason),
-        findings=(*lost, *numbering, *notes, *out.findings),
+        findings=(*_lost_images(seen), *numbering, *_notes(good), *out.findings),
     )
+
+
+def _lost_images(seen: list[Seen]) -> list[Finding]:
+    return [Finding("image_left_out", f"{s.name} was left out: {s.reason}.", level="warning") for s in seen if s.reason]
+
+
+def _notes(good: list[Seen]) -> list[Finding]:
+    """What else is to be said about the images that are used."""
+    notes = [Finding("targets", f"{s.name}: {s.note}.") for s in good if s.note]
+    lossy = [s.name for s in good if s.lossy]
+    if lossy:
+        text = (
+            f"{len(lossy)} of {len(good)} images were stored with loss (JPEG): its blocks shift edges, and the noise is that of the coder."
+        )
+        notes.append(Finding("targets", text, "Store images of a test field without loss."))
+    return notes
 
 
 def _checked_lengths(
