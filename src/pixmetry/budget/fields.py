@@ -12,6 +12,7 @@ import numpy as np
 
 from pixmetry.camera.camera import Camera
 
+SAME_CLOCK = 0.005  # relative difference of clocks that are meant to be one
 SIDE = 20  # places along each side of the frame
 
 
@@ -52,13 +53,15 @@ def field_of(camera: Camera, places: Places, known_layout: bool = True) -> np.nd
     """Displacement of all places of the grid in x and y, shape (2, 5, n), px of the sensor; NaN where a place is not in the frame.
 
     ``known_layout``: how the camera lays out its frames (clock of the samples, offsets, fields) is accounted for, as in `Camera.layout`.
-    Without, the middle of the frame is taken for that of the sensor, and a row of samples for all of a row of the sensor.
+    Without, the middle of the frame is taken for that of the sensor; of a grabber with a clock of its own, a row of samples for all of
+    a row of the sensor.
     """
     x, y = places.x_px.ravel(), places.y_px.ravel()
     seen = camera.true_positions(x, y, temperature_c=camera.temperature_c)
     back = []
     laid_out = camera.layout([0.0, 1.0], [0.0, 1.0])
-    resampled = any(e.source.id == "grabber.sampling_clock" for e in camera.active)
+    clocks = [1e6 * e.params.clock_mhz for e in camera.active if e.source.id == "grabber.sampling_clock"]
+    resampled = any(abs(hz / camera.pixel_clock_hz - 1) > SAME_CLOCK for hz in clocks)
     for axis, (at, ends) in enumerate(zip(seen, laid_out, strict=True)):
         size, shown = places.frame_shape[1 - axis], camera.output_shape[1 - axis]
         if known_layout:

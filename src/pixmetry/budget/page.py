@@ -139,7 +139,7 @@ def _chain(budget: CameraBudget) -> Figure:
             part = sum(r.after_px**2 for r in counting if r.source_id.startswith(f"{stage}."))
             share = part / whole
             axes.add_patch(_box(k, share))
-            axes.text(k + 0.5, 0.7, stage, ha="center", va="center", color=INK)
+            axes.text(k + 0.5, 0.7, stage, ha="center", va="center", color=INK, fontsize=6)
             axes.text(k + 0.5, 0.45, f"{percent(share)} %", ha="center", va="center", color=INK, fontweight="bold")
             axes.text(k + 0.5, 0.22, f"{length_mpx(float(np.sqrt(part)))} mpx", ha="center", va="center", color=SOFT, fontsize=6.5)
             words.append(f"{stage} {percent(share)} %")
@@ -189,20 +189,12 @@ def _next(title: str, name: str, steps: Sequence[Next], words: str) -> Section:
     section = Section(title, name=name)
     if not steps:
         return section.add_text("Nothing that would make a difference.")
-    items = [
-        [
-            *strong_words(step.title),
-            f" {step.text} ".replace("  ", " "),
-            f"({words.format(length_px(step.now_px, 3), length_px(step.then_px, 3))})",
-        ]
-        for step in steps[:LISTED]
-    ]
-    return section.add(Points(items, numbered=True))
-
-
-def strong_words(title: str) -> list[Run | str]:
-    """A title in bold with its colon."""
-    return [strong(f"{title}:")]
+    items = []
+    for step in steps[:LISTED]:
+        if step.gain_px >= WORTH * step.now_px:
+            numbers = words.format(length_px(step.now_px, 3), length_px(step.then_px, 3))
+            items.append([strong(f"{step.title}:"), f" {step.text} ".replace("  ", " "), f"({numbers})"])
+    return section.add(Points(items, numbered=True) if items else Text("No single source makes a difference of 1 %."))
 
 
 # ---- the rows ----------------------------------------------------------------------------------------------------------------------

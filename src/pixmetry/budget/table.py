@@ -35,10 +35,13 @@ KNOWN_FROM = {"measured": MEASURED, "sheet": SHEET, "typical": TYPICAL, "": DESC
 FIELD, TIMES, FORMULA, SIMULATED = "displacement of points over the frame", "times and speed", "closed form", "simulated with and without"
 WINDOWS, UNITS = 256, 4  # of a source that has to be simulated
 STARS_PX = (0.005, 0.03, 0.1, 0.3, 1.0)  # from so much on, one star more
-SETTINGS = (  # what a user switches on; a camera that is described without it has it off
+SETTINGS = (  # what a user switches on, or a grabber with a clock of its own has; a camera that is described without it has it not
     "electronics.agc",
     "electronics.gamma",
+    "grabber.clock_warm_up",
     "grabber.low_pass",
+    "grabber.sampling_clock",
+    "grabber.window_offset",
     "optics.flicker",
     "optics.olpf",
     "sensor.read_out",
@@ -280,7 +283,7 @@ class Table:
         if source.option:
             return f"only in a camera with {source.option}"
         if source.id in SETTINGS:
-            return "a setting; the camera is described without it"
+            return "the camera is described without it"
         if source.stage == "storage" and facts.get("lossless"):
             return "only in frames that were stored with loss; these are not"
         measured = {e.source.id for e in self.setting.camera.chain if e.known_from == "measured"}
