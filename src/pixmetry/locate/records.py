@@ -69,10 +69,10 @@ class Located:
         return self.columns[name]
 
     def __getattr__(self, name: str) -> np.ndarray:
-        try:
-            return self.__dict__["columns"][name]
-        except KeyError:
-            raise AttributeError(f"no column {name!r}; there are {', '.join(self.__dict__.get('columns', ()))}") from None
+        columns: dict[str, np.ndarray] = self.__dict__.get("columns", {})  # a copy in the making has none yet
+        if name not in columns:
+            raise AttributeError(f"no column {name!r}; there are {', '.join(columns)}")
+        return columns[name]
 
     def __repr__(self) -> str:
         return f"<Located: {len(self)} of kind {self.kind} in {len(self.images)} image{'s' * (len(self.images) != 1)}>"
@@ -172,7 +172,7 @@ class Located:
         return self._csv().decode()
 
     def _rows(self) -> list[list[Any]]:
-        columns = []
+        columns: list[list[Any]] = []
         for name, values in self.columns.items():
             if name == "flags":
                 columns.append(self.flag_words)

@@ -272,4 +272,5 @@ def _of_codes(mean: np.ndarray, sigma: np.ndarray, low: float, high: float) -> n
     share = np.where(right, ndtr(-lower) - ndtr(-upper), ndtr(upper) - ndtr(lower))
     density = np.exp(-0.5 * z**2) / np.sqrt(2 * np.pi) / sigma[..., None]
     change = density[..., :-1] - density[..., 1:]
-    return np.divide(change**2, share, out=np.zeros_like(share), where=share > 1e-300).sum(axis=-1)
+    information: np.ndarray = np.divide(change**2, share, out=np.zeros_like(share), where=share > 1e-300).sum(axis=-1)
+    return information

@@ -63,7 +63,8 @@ class PixelNoise:
     @property
     def tells(self) -> np.ndarray:
         """1 where a value depends on its mean, 0 where it is cut off at an end of the scale."""
-        return (self.ideal < 20 * (self.read + self.shot + self.rounding + self.kept)).astype(float)
+        tells: np.ndarray = (self.ideal < 20 * (self.read + self.shot + self.rounding + self.kept)).astype(float)
+        return tells
 
     def for_the_best(self) -> PixelNoise:
         """The same for an estimator that knows the law of the codes: no smaller variance is possible."""

@@ -130,7 +130,8 @@ def _draw(kind: str | Profile, parameters: Mapping[str, float] | None, x: float,
         at = (np.arange(side)[:, None] + 0.5 * aperture * nodes).ravel()
         fine = np.broadcast_to(kind(at[None, :] - x, at[:, None] - y), (len(at), len(at)))
         cells = fine.reshape(side, len(nodes), side, len(nodes))
-        return np.einsum("risj,i,j->rs", cells, weights / 2, weights / 2)
+        light: np.ndarray = np.einsum("risj,i,j->rs", cells, weights / 2, weights / 2)
+        return light
     from pixmetry.locate.template.template import PARAMETERS, model
 
     given = dict(parameters or {}) | {"x_px": x, "y_px": y}

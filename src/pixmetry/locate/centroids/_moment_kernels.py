@@ -7,9 +7,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from pixmetry.core.arrays import Array
+from pixmetry.core.arrays import Array, Flags, Ints
 from pixmetry.core.jit import jit
-from pixmetry.locate._noise_kernels import variance_at
+from pixmetry.locate._noise_kernels import Noise, variance_at
 
 CENTROID, SQUARED, SOFT, HARD, WINDOWED = 0, 1, 2, 3, 4
 # columns of a target's record: rough centre, half axes and angle, reach of its light, margins of window and annulus, sign, threshold in DN,
@@ -24,7 +24,7 @@ SUMS = {"reassoc", "contract", "nsz"}  # sums may be taken in any order, so that
 
 
 @jit(inline="always")
-def quadratic_form(major, minor, angle):
+def quadratic_form(major: float, minor: float, angle: float) -> tuple[float, float, float]:
     """Return p, q, r of the ellipse p x² + 2 q x y + r y² = 1."""
     c, s = math.cos(angle), math.sin(angle)
     a, b = 1.0 / (major * major), 1.0 / (minor * minor)
@@ -32,7 +32,7 @@ def quadratic_form(major, minor, angle):
 
 
 @jit(inline="always")
-def chord(p, q, r, dy):
+def chord(p: float, q: float, r: float, dy: float) -> tuple[float, float]:
     """Return middle and half length of the ellipse's chord at height dy; half is −1 where there is none."""
     root = q * q * dy * dy - p * (r * dy * dy - 1.0)
     if root <= 0.0:
@@ -41,7 +41,7 @@ def chord(p, q, r, dy):
 
 
 @jit
-def limit_margins(record, start, index):
+def limit_margins(record: Array, start: Ints, index: Ints) -> Array:
     """Return how far a window may reach beyond each half-height edge: a little less than halfway to that of the nearest neighbour."""
     n = record.shape[0]
     free = np.full(n, np.inf)
@@ -60,7 +60,7 @@ def limit_margins(record, start, index):
 
 
 @jit
-def list_holes(record, i, start, index, holes):
+def list_holes(record: Array, i: int, start: Ints, index: Ints, holes: Array) -> int:
     """Write the ellipses that are not background around target i: its own light and its neighbours'; return how many."""
     holes[0, 0], holes[0, 1] = record[i, X], record[i, Y]
     reach = record[i, INNER]
@@ -79,7 +79,7 @@ def list_holes(record, i, start, index, holes):
 
 
 @jit
-def cut_row(row, holes, count, cuts):
+def cut_row(row: int, holes: Array, count: int, cuts: Ints) -> int:
     """Write the first and last column of each hole in a row, by their first; return how many there are."""
     found = 0
     for h in range(count):
@@ -97,7 +97,9 @@ def cut_row(row, holes, count, cuts):
 
 
 @jit(fastmath=SUMS)
-def fit_ground(frame, record, i, holes, count, cuts, noise, clip):
+def fit_ground(
+    frame: np.ndarray, record: Array, i: int, holes: Array, count: int, cuts: Ints, noise: Noise, clip: float
+) -> tuple[float, float]:
     """Fit a plane to the pixels about target i that are in none of the holes; write level, slopes and covariance into the record.
 
     Residuals are taken from the record's plane. With ``clip`` > 0 only those within that many standard deviations count.
@@ -177,7 +179,7 @@ def fit_ground(frame, record, i, holes, count, cuts, noise, clip):
 
 
 @jit
-def fit_grounds(frame, record, first, stop, start, index, noise):
+def fit_grounds(frame: np.ndarray, record: Array, first: int, stop: int, start: Ints, index: Ints, noise: Noise) -> None:
     """Fit the background of targets first … stop; once more without outliers where the residuals are larger than the noise."""
     holes, cuts = np.empty((64, 5)), np.empty((64, 2), np.int64)
     for i in range(first, stop):
@@ -192,7 +194,7 @@ def fit_grounds(frame, record, first, stop, start, index, noise):
 
 
 @jit(inline="always")
-def weigh(value, level, law, threshold, sign, noise):
+def weigh(value: float, level: float, law: int, threshold: float, sign: float, noise: Noise) -> tuple[float, float, float]:
     """Return f, f' and the variance of f of one pixel."""
     v = variance_at(level, noise)
     if law == SQUARED:
@@ -209,7 +211,7 @@ def weigh(value, level, law, threshold, sign, noise):
 
 
 @jit(fastmath=SUMS)
-def window_sums(frame, record, i, law, cx, cy, noise, out):
+def window_sums(frame: np.ndarray, record: Array, i: int, law: int, cx: float, cy: float, noise: Noise, out: Array) -> None:
     """Sums over an elliptic window about (cx, cy), its edge pixels counted by the part of their width that lies inside.
 
     ``out``: Σf, Σfx, Σfy | Σf', Σf'x, Σf'y, Σf'xx, Σf'xy, Σf'yy | the same six of w² Var f; x and y from (cx, cy).
@@ -277,7 +279,7 @@ def window_sums(frame, record, i, law, cx, cy, noise, out):
 
 
 @jit
-def ground_variance(record, i, ax, ay, result):
+def ground_variance(record: Array, i: int, ax: Array, ay: Array, result: Array) -> None:
     """Add the variance from the background's plane, with the position's slopes by level and the two inclinations, to a covariance."""
     c00, c01, c02 = record[i, C00], record[i, C01], record[i, C02]
     c11, c12, c22 = record[i, C11], record[i, C12], record[i, C22]
@@ -290,7 +292,7 @@ def ground_variance(record, i, ax, ay, result):
 
 
 @jit
-def moment_of(frame, record, i, law, noise, sums, result):
+def moment_of(frame: np.ndarray, record: Array, i: int, law: int, noise: Noise, sums: Array, result: Array) -> bool:
     """Position and covariance of one target by Σ f x / Σ f, the window following the estimate; return whether it came to rest.
 
     ``result``: x, y, var x, cov, var y, relative standard deviation of Σ f.
@@ -335,7 +337,7 @@ def moment_of(frame, record, i, law, noise, sums, result):
 
 
 @jit
-def windowed_of(frame, record, i, noise, weights, result):
+def windowed_of(frame: np.ndarray, record: Array, i: int, noise: Noise, weights: Array, result: Array) -> bool:
     """Position and covariance of one target by the iterated Gaussian window Σ w(x − x̂) I (x − x̂) = 0; return whether it came to rest."""
     spread, sign = record[i, SPREAD], record[i, SIGN]
     reach = record[i, MAJOR] + record[i, MARGIN]
@@ -417,7 +419,7 @@ def windowed_of(frame, record, i, noise, weights, result):
 
 
 @jit
-def moments(frame, record, first, stop, law, noise, result, at_rest):
+def moments(frame: np.ndarray, record: Array, first: int, stop: int, law: int, noise: Noise, result: Array, at_rest: Flags) -> None:
     """Positions of targets first … stop; `result` (n, 6), `at_rest` (n,)."""
     sums = np.empty(15)
     widest = 0.0
@@ -432,7 +434,7 @@ def moments(frame, record, first, stop, law, noise, result, at_rest):
 
 
 @jit(inline="always")
-def scaled_bessel(x):
+def scaled_bessel(x: float) -> float:
     """I0(x) e^−x: Abramowitz & Stegun 9.8.1 and 9.8.2, relative error below 2e-7."""
     if x < 3.75:
         t = (x / 3.75) ** 2
@@ -444,7 +446,7 @@ def scaled_bessel(x):
 
 
 @jit
-def disc_profile(radius, blur, nodes, weights, step, profile):
+def disc_profile(radius: float, blur: float, nodes: Array, weights: Array, step: float, profile: Array) -> None:
     """Write a disc blurred by a Gaussian at the radii (j + ½)·step: ∫ (r'/s²) exp(−(r − r')²/2s²) I0e(r r'/s²) dr' from 0 to R."""
     for j in range(profile.shape[0]):
         r = (j + 0.5) * step
@@ -463,7 +465,22 @@ def disc_profile(radius, blur, nodes, weights, step, profile):
 
 
 @jit
-def best_thresholds(shape, first, stop, law, multiples, noise, nodes, weights, step, shells, many, bessel2, neumann2, out):
+def best_thresholds(
+    shape: Array,
+    first: int,
+    stop: int,
+    law: int,
+    multiples: Array,
+    noise: Noise,
+    nodes: Array,
+    weights: Array,
+    step: float,
+    shells: Array,
+    many: Array,
+    bessel2: Array,
+    neumann2: Array,
+    out: Array,
+) -> None:
     """Choose for classes first … stop of targets the threshold with the least variance from noise and sub-pixel phase together.
 
     ``shape`` (classes, 7): radius, blur, amplitude, sign, background, window, spread of the Gaussian window. ``multiples``: thresholds in
@@ -504,7 +521,21 @@ def best_thresholds(shape, first, stop, law, multiples, noise, nodes, weights, s
 
 
 @jit
-def phase_and_noise(profile, law, threshold, amplitude, sign, level, noise, spread, step, shells, many, bessel2, neumann2):
+def phase_and_noise(
+    profile: Array,
+    law: int,
+    threshold: float,
+    amplitude: float,
+    sign: float,
+    level: float,
+    noise: Noise,
+    spread: float,
+    step: float,
+    shells: Array,
+    many: Array,
+    bessel2: Array,
+    neumann2: Array,
+) -> tuple[float, float, float]:
     """Return the variance over the sub-pixel phase, the noise sum Σ (x − x̂)² (Var f − f'² σ²), and the noise variance of a round target.
 
     With h(r) the mean of f at a radius, noise included, Poisson's sum gives an error of 2 S(q) sin(2π k·c) k/|k| / ∫h for each pair ±k of
@@ -556,7 +587,9 @@ def phase_and_noise(profile, law, threshold, amplitude, sign, level, noise, spre
 
 
 @jit(inline="always")
-def mean_response(value, radius2, law, threshold, sign, level, noise, spread):
+def mean_response(
+    value: float, radius2: float, law: int, threshold: float, sign: float, level: float, noise: Noise, spread: float
+) -> float:
     """Mean of f over the noise at a mean grey value; for the Gaussian window times its weight."""
     if law == SQUARED:
         return value * value
@@ -575,7 +608,21 @@ def mean_response(value, radius2, law, threshold, sign, level, noise, spread):
 
 
 @jit
-def square_pixel_variance(radius, blur, law, threshold, amplitude, sign, level, noise, window, spread, nodes, weights, step):
+def square_pixel_variance(
+    radius: float,
+    blur: float,
+    law: int,
+    threshold: float,
+    amplitude: float,
+    sign: float,
+    level: float,
+    noise: Noise,
+    window: float,
+    spread: float,
+    nodes: Array,
+    weights: Array,
+    step: float,
+) -> float:
     """Variance over the phase along x of a disc averaged over square pixels: S(k) = ∬ x h sin(2πk x) cos(2πl y) on a grid of eighths."""
     optical = math.sqrt(max(blur * blur - 1.0 / 12.0, 0.01))
     n = int(window / step) + 1

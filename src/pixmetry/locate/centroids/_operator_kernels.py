@@ -8,7 +8,7 @@ import numpy as np
 
 from pixmetry.core._least_squares_kernels import FREE, Rest, descent_of
 from pixmetry.core._linear_algebra_kernels import factor_for, factorise, invert_root, substitute
-from pixmetry.core.arrays import Array, Ints
+from pixmetry.core.arrays import Array, Flags, Ints, Singles
 from pixmetry.core.jit import jit
 from pixmetry.locate._noise_kernels import Noise, variance_at
 from pixmetry.locate.centroids._moment_kernels import (
@@ -40,7 +40,7 @@ GAUSSIAN_REST = 1e-10  # of the squared residuals: fall at which the fit of a Ga
 
 
 @jit
-def cut_window(frame, record, i, cx, cy, noise, patch, box):
+def cut_window(frame: np.ndarray, record: Array, i: int, cx: float, cy: float, noise: Noise, patch: Array, box: Ints) -> bool:
     """Copy the window about (cx, cy), less the background and positive towards the target, with a rim of 2; ``box`` is its place.
 
     ``patch`` (3, side, side): value, variance, and 1 inside the window's ellipse. Return False where it does not fit.
@@ -67,15 +67,15 @@ def cut_window(frame, record, i, cx, cy, noise, patch, box):
 
 
 @jit
-def perimeter_pixel(mask, a, b):
+def perimeter_pixel(mask: Array, a: int, b: int) -> bool:
     """Tell whether a pixel above the threshold has a neighbour of four that is not."""
     if mask[a, b] == 0.0:
         return False
-    return mask[a - 1, b] == 0.0 or mask[a + 1, b] == 0.0 or mask[a, b - 1] == 0.0 or mask[a, b + 1] == 0.0
+    return bool(mask[a - 1, b] == 0.0 or mask[a + 1, b] == 0.0 or mask[a, b - 1] == 0.0 or mask[a, b + 1] == 0.0)
 
 
 @jit
-def perimeter_sums(mask, a, b, sums):
+def perimeter_sums(mask: Array, a: int, b: int, sums: Array) -> None:
     """Number and sums of the places of the perimeter's pixels among one pixel and its four neighbours."""
     sums[:] = 0.0
     for k in range(5):
@@ -95,7 +95,7 @@ def perimeter_sums(mask, a, b, sums):
 
 
 @jit
-def perimeter_of(patch, box, threshold, result):
+def perimeter_of(patch: Array, box: Ints, threshold: float, result: Array) -> bool:
     """Mean place of the perimeter's pixels; the covariance is that of pixels which noise may take over the threshold."""
     rows, cols = box[1] - box[0], box[3] - box[2]
     mask = np.zeros((rows, cols))
@@ -136,7 +136,7 @@ def perimeter_of(patch, box, threshold, result):
 
 
 @jit
-def scharr(value, a, b):
+def scharr(value: Array, a: int, b: int) -> tuple[float, float]:
     """Gradient of a pixel by Scharr's 3 × 3 masks."""
     gx = 3.0 * (value[a - 1, b + 1] - value[a - 1, b - 1] + value[a + 1, b + 1] - value[a + 1, b - 1])
     gx += 10.0 * (value[a, b + 1] - value[a, b - 1])
@@ -146,7 +146,7 @@ def scharr(value, a, b):
 
 
 @jit
-def forstner_of(patch, box, answer):
+def forstner_of(patch: Array, box: Ints, answer: Array) -> tuple[bool, float, float]:
     """Point nearest to all lines along the gradients, weighted by their squares; ``answer`` (2, side, side): slopes by pixel.
 
     Return found, x, y. The noise of the gradients adds a multiple of the unit matrix that would pull to the window's centre; it is
@@ -197,7 +197,7 @@ def forstner_of(patch, box, answer):
 
 
 @jit
-def largest_eigenvector(m, vector):
+def largest_eigenvector(m: Array, vector: Array) -> None:
     """Write the eigenvector of the largest eigenvalue of a symmetric 3 × 3 matrix: the roots of the cubic by their cosines."""
     mean = (m[0, 0] + m[1, 1] + m[2, 2]) / 3.0
     off = m[0, 1] ** 2 + m[0, 2] ** 2 + m[1, 2] ** 2
@@ -220,7 +220,7 @@ def largest_eigenvector(m, vector):
 
 
 @jit
-def fit_conic(px, py, count):
+def fit_conic(px: Array, py: Array, count: int) -> Array:
     """Direct least-squares ellipse through points: the conic a x² + b xy + c y² + d x + e y + f with 4ac − b² > 0.
 
     Fitzgibbon, Pilu, Fisher 1999, with the linear part eliminated first (Halíř, Flusser 1998). The reduced scatter matrix is positive
@@ -268,7 +268,7 @@ def fit_conic(px, py, count):
 
 
 @jit
-def edges_of(patch, box, record, i, cx, cy, answer):
+def edges_of(patch: Array, box: Ints, record: Array, i: int, cx: float, cy: float, answer: Array) -> tuple[bool, float, float]:
     """Ellipse through the edges on rays from (cx, cy); an edge lies where a step of full height would hold the ray's light.
 
     Return found, x, y; ``answer`` gets the slopes by pixel, for rays that follow the estimate.
@@ -446,7 +446,7 @@ def gaussian_of(patch: Array, box: Ints, record: Array, i: int, cx: float, cy: f
 
 
 @jit
-def propagate(answer, patch, record, i, box, result):
+def propagate(answer: Array, patch: Array, record: Array, i: int, box: Ints, result: Array) -> None:
     """Covariance from the slopes by pixel: the pixels' own variance and that of the background's plane."""
     xx, xy, yy = 0.0, 0.0, 0.0
     ax, ay = np.zeros(3), np.zeros(3)
@@ -467,7 +467,18 @@ def propagate(answer, patch, record, i, box, result):
 
 
 @jit
-def operator_of(frame, record, i, operator, noise, patch, answer, box, sums, result):
+def operator_of(
+    frame: np.ndarray,
+    record: Array,
+    i: int,
+    operator: int,
+    noise: Noise,
+    patch: Array,
+    answer: Array,
+    box: Ints,
+    sums: Array,
+    result: Array,
+) -> bool:
     """Position and covariance of one target by an operator; its window follows the squared centroid, then the estimate."""
     moment_of(frame, record, i, SQUARED, noise, sums, result)
     cx, cy = result[0], result[1]
@@ -503,7 +514,7 @@ def operator_of(frame, record, i, operator, noise, patch, answer, box, sums, res
 
 
 @jit
-def operators(frame, record, first, stop, operator, noise, result, at_rest):
+def operators(frame: np.ndarray, record: Array, first: int, stop: int, operator: int, noise: Noise, result: Array, at_rest: Flags) -> None:
     """Positions of targets first … stop; `result` (n, 6), `at_rest` (n,)."""
     widest = 0.0
     for i in range(first, stop):
@@ -516,7 +527,9 @@ def operators(frame, record, first, stop, operator, noise, result, at_rest):
 
 
 @jit
-def draw_target(image, x, y, major, minor, angle, edge, profile, step):
+def draw_target(
+    image: Singles, x: float, y: float, major: float, minor: float, angle: float, edge: float, profile: Array, step: float
+) -> None:
     """Draw a target by its radial profile, averaged over 5 × 5 places in each pixel.
 
     ``edge`` is the profile's own radius; an ellipse has it along the normals to its outline.
@@ -546,7 +559,9 @@ def draw_target(image, x, y, major, minor, angle, edge, profile, step):
 
 
 @jit
-def phase_variances(shape, first, stop, operator, phases, nodes, weights, columns, out):
+def phase_variances(
+    shape: Array, first: int, stop: int, operator: int, phases: Array, nodes: Array, weights: Array, columns: int, out: Array
+) -> None:
     """Variance over the sub-pixel phase of an operator for classes first … stop of targets, noise-free.
 
     ``shape`` (classes, 8): radius and blur (without the pixel) of the profile, half axes and angle at half height, blur with the pixel,

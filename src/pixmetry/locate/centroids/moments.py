@@ -233,7 +233,8 @@ def _phase_variance(work: Prepared, law: int, threads: int | None) -> np.ndarray
     run_slices(lambda a, b: k.best_thresholds(shape, a, b, law, multiples, work.noise, *tables, out), len(shape), threads)
     record[:, k.THRESHOLD] = np.minimum(out[of, 0] * deviation, 0.5 * work.amplitude)
     record[:, k.EXCESS] = out[of, 2]
-    return out[of, 1]
+    phase: np.ndarray = out[of, 1]
+    return phase
 
 
 def _centroid_phase_variance(radius: np.ndarray, blur: np.ndarray) -> np.ndarray:

@@ -91,7 +91,8 @@ def _phase_variance(work: Prepared, operator: int, threads: int | None) -> np.nd
     nodes, weights = np.polynomial.legendre.leggauss(12)
     out = np.zeros(len(shape))
     run_slices(lambda a, b: o.phase_variances(shape, a, b, operator, phases, nodes, weights, COLUMNS, out), len(shape), threads)
-    return out[of]
+    phase: np.ndarray = out[of]
+    return phase
 
 
 def _measure(name: str, frame: np.ndarray, targets: Targets, noise: NoiseModel, how: Settings) -> Positions:

@@ -97,7 +97,8 @@ def homography_of(camera: Pinhole, normal: ArrayLike, centre: ArrayLike) -> np.n
     n = unit(normal)
     first = np.cross(n, np.eye(3)[np.argmin(np.abs(n))])
     first /= np.linalg.norm(first)
-    return camera.matrix @ np.column_stack([first, np.cross(n, first), np.asarray(centre, float)])
+    map_of_plane: np.ndarray = camera.matrix @ np.column_stack([first, np.cross(n, first), np.asarray(centre, float)])
+    return map_of_plane
 
 
 def corrected(
@@ -129,7 +130,7 @@ def corrected(
     if normal is None and coplanar:
         normal = common_plane(ellipses, camera, hint)
         if normal.other_normal is not None and hint is None:
-            raise _ambiguous(ellipses, camera, normal)
+            raise _ambiguous(ellipses, camera, (normal.normal, normal.other_normal))
     if normal is None:
         if hint is None:
             raise InputError("each circle alone has two possible planes", where="eccentricity", remedy="give the normal, or a hint of it")
@@ -211,7 +212,8 @@ def _shifts(conics: np.ndarray, camera: Pinhole, normal: np.ndarray) -> np.ndarr
     reach = matrices(conics) @ slope
     if ((slope * reach).sum(axis=(1, 2)) >= height**2).any():
         raise InputError("the plane's horizon crosses an ellipse", where="eccentricity", remedy="check the normal and the camera's numbers")
-    return -reach[:, :, 0] / height[:, None]
+    shifts: np.ndarray = -reach[:, :, 0] / height[:, None]
+    return shifts
 
 
 def _with_covariance(ellipses: Ellipses, camera: Pinhole, shift: Callable[[np.ndarray], np.ndarray], plane: Plane | None) -> Centres:
@@ -221,7 +223,7 @@ def _with_covariance(ellipses: Ellipses, camera: Pinhole, shift: Callable[[np.nd
     if ellipses.conic_covariance is None:
         covariance = np.full((len(ellipses), 2, 2), np.nan)
     else:
-        covariance = spread(ellipses, lambda p: p[:, :2] + shift(p))
+        covariance = spread(start, ellipses.conic_covariance, lambda p: p[:, :2] + shift(p))
         if plane is not None:
             values, axes = np.linalg.eigh(np.nan_to_num(plane.covariance, nan=0.0, posinf=0.0))
             for size, axis in zip(np.minimum(np.sqrt(np.maximum(values, 0.0)), LARGEST_STEP), axes.T, strict=True):
@@ -230,12 +232,12 @@ def _with_covariance(ellipses: Ellipses, camera: Pinhole, shift: Callable[[np.nd
     return Centres(place[:, 0], place[:, 1], moved[:, 0], moved[:, 1], covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1])
 
 
-def _ambiguous(ellipses: Ellipses, camera: Pinhole, plane: Plane) -> InputError:
-    two = [np.hypot(*(_shifts(ellipses.conics, camera, n)).T).max() for n in (plane.normal, plane.other_normal)]
+def _ambiguous(ellipses: Ellipses, camera: Pinhole, normals: tuple[np.ndarray, np.ndarray]) -> InputError:
+    two = [np.hypot(*(_shifts(ellipses.conics, camera, n)).T).max() for n in normals]
     return InputError(
         "two planes explain these ellipses equally well",
         where="eccentricity",
-        value=[n.round(4).tolist() for n in (plane.normal, plane.other_normal)],
+        value=[n.round(4).tolist() for n in normals],
         remedy=f"give the normal or a hint of it; the corrections are up to {two[0]:.4f} px or {two[1]:.4f} px",
     )
 
@@ -334,7 +336,8 @@ def _cones(conics: np.ndarray, camera: Pinhole) -> np.ndarray:
     conic[:, 2:, :2] = conic[:, :2, 2:].swapaxes(1, 2)
     conic[:, 2, 2] = (place.swapaxes(1, 2) @ inverse @ place)[:, 0, 0] - 1.0
     size = np.sqrt(np.linalg.det(matrices(conics))) / camera.principal_distance_px**2
-    return k @ conic @ k * size[:, None, None]
+    cones: np.ndarray = k @ conic @ k * size[:, None, None]
+    return cones
 
 
 def _residuals(cones: np.ndarray, normal: np.ndarray) -> np.ndarray:
@@ -343,14 +346,15 @@ def _residuals(cones: np.ndarray, normal: np.ndarray) -> np.ndarray:
     first /= np.linalg.norm(first)
     basis = np.stack([first, np.cross(normal, first)])
     cut = basis @ cones @ basis.T
-    return np.stack([cut[:, 0, 0] - cut[:, 1, 1], 2 * cut[:, 0, 1]], axis=1) / (cut[:, 0, 0] + cut[:, 1, 1])[:, None]
+    shape: np.ndarray = np.stack([cut[:, 0, 0] - cut[:, 1, 1], 2 * cut[:, 0, 1]], axis=1) / (cut[:, 0, 0] + cut[:, 1, 1])[:, None]
+    return shape
 
 
 def _weights(ellipses: Ellipses, camera: Pinhole, normal: np.ndarray) -> np.ndarray:
     """Inverse covariances of the residuals, shape (n, 2, 2)."""
     if ellipses.conic_covariance is None:
         return ellipses.semi_minor_px[:, None, None] ** 2 * np.eye(2)
-    covariance = spread(ellipses, lambda p: _residuals(_cones(p, camera), normal))
+    covariance = spread(ellipses.conics, ellipses.conic_covariance, lambda p: _residuals(_cones(p, camera), normal))
     floor = 1e-24 * np.eye(2)  # a covariance of zero is an exact ellipse
     return np.linalg.inv(covariance + floor)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -92,7 +92,9 @@ class Ellipses:
 
     def __getitem__(self, which: np.ndarray | slice) -> Ellipses:
         """A part of them, by mask, index array or slice."""
-        return Ellipses(**{f.name: None if getattr(self, f.name) is None else getattr(self, f.name)[which] for f in fields(self)})
+        covariance = None if self.conic_covariance is None else self.conic_covariance[which]
+        x, y, major, minor, angle = (getattr(self, name)[which] for name in NAMES)
+        return Ellipses(x, y, major, minor, angle, covariance)
 
     @property
     def conics(self) -> np.ndarray:
@@ -197,20 +199,19 @@ def _outline_information(a: np.ndarray, b: np.ndarray, angle_deg: np.ndarray) ->
     return (normal * length[:, None]) @ normal.swapaxes(1, 2), (shape * length[:, None]) @ shape.swapaxes(1, 2)
 
 
-def spread(ellipses: Ellipses, function: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-    """Covariance, shape (n, m, m), of a function (n, m) of the ellipses' conics (n, 5).
+def spread(conics: np.ndarray, covariance: np.ndarray, function: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """Covariance, shape (n, m, m), of a function (n, m) of conics, shape (n, 5), with a covariance of shape (n, 5, 5).
 
     From steps of one standard deviation along the principal directions of their covariance, both ways, so that it stays of the right size
     where the function bends.
     """
-    values, axes = np.linalg.eigh(ellipses.conic_covariance)
-    start = ellipses.conics
-    middle = function(start)
+    values, axes = np.linalg.eigh(covariance)
+    middle = function(conics)
     total = np.zeros((*middle.shape, middle.shape[-1]))
     for k in range(5):
         step = np.sqrt(np.maximum(values[:, k], 0.0))[:, None] * axes[:, :, k]
         for sign in (-1, 1):
-            moved = function(start + sign * step) - middle
+            moved = function(conics + sign * step) - middle
             total += 0.5 * moved[:, :, None] * moved[:, None, :]
     return total
 
@@ -227,4 +228,5 @@ def unit(direction: ArrayLike) -> np.ndarray:
     length = np.linalg.norm(n, axis=-1, keepdims=True)
     if n.shape[-1:] != (3,) or not (np.isfinite(n).all() and (length > 0).all()):
         raise InputError("the normal of a plane is not a direction", where="eccentricity", allowed="three finite numbers, not all 0")
-    return n / length
+    along: np.ndarray = n / length
+    return along

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from pixmetry.core.arrays import Array, Flags, Ints, Singles
 from pixmetry.core.jit import jit
 
 ROWS_SEEN = 6  # of a tile, spread over it: its statistics look at these only, and at whole rows because those load fast
@@ -20,7 +21,7 @@ SUM_FREELY = {"reassoc", "nsz"}  # a clipped sum is not sensitive to the order o
 
 
 @jit
-def median_of(values, low, high, grain):
+def median_of(values: Singles, low: np.float32, high: np.float32, grain: np.float32) -> np.float32:
     """Median of values between low and high, by halving: to 2⁻¹⁶ of their range, or the grain."""
     for _ in range(HALVINGS):
         if high - low <= grain:
@@ -37,7 +38,7 @@ def median_of(values, low, high, grain):
 
 
 @jit(fastmath=SUM_FREELY | {"nnan"})
-def least_and_most(values):
+def least_and_most(values: Singles) -> tuple[np.float32, np.float32]:
     """The smallest and the largest of the values."""
     least, most = values[0], values[0]
     for i in range(len(values)):
@@ -46,7 +47,7 @@ def least_and_most(values):
 
 
 @jit(fastmath=SUM_FREELY)
-def clipped_moments(values, centre, limit):
+def clipped_moments(values: Singles, centre: np.float32, limit: np.float32) -> tuple[np.float32, np.float32, np.float32]:
     """Number, mean and mean square about ``centre`` of the values within ``limit`` of it."""
     kept, total, square = np.float32(0.0), np.float32(0.0), np.float32(0.0)
     for i in range(len(values)):
@@ -60,7 +61,7 @@ def clipped_moments(values, centre, limit):
 
 
 @jit
-def clipped_rms(values, grain):
+def clipped_rms(values: Singles, grain: np.float32) -> float:
     """Root mean square of values ≥ 0, of which those beyond three times it are left out; it starts from their median."""
     if len(values) == 0:
         return 0.0
@@ -73,17 +74,19 @@ def clipped_rms(values, grain):
         if CLIP * rms >= limit:
             break
         limit = np.float32(CLIP) * rms + grain
-    return rms
+    return float(rms)
 
 
 @jit
-def row_step(rows, wide):
+def row_step(rows: int, wide: int) -> int:
     """Every how many rows of a tile its statistics look."""
     return max(rows // ROWS_SEEN, rows * wide // MOST_SEEN + 1, 1)
 
 
 @jit
-def seen(frame, first_row, stop_row, first_col, stop_col, values, steps):
+def seen(
+    frame: np.ndarray, first_row: int, stop_row: int, first_col: int, stop_col: int, values: Singles, steps: Singles
+) -> tuple[int, int]:
     """Copy the rows of a tile that its statistics look at, and the absolute differences along them; return how many there are."""
     wide = stop_col - first_col
     step = row_step(stop_row - first_row, wide)
@@ -100,7 +103,7 @@ def seen(frame, first_row, stop_row, first_col, stop_col, values, steps):
 
 
 @jit
-def lone_pixels(frame, first_row, stop_row, first_col, stop_col, end_dn):
+def lone_pixels(frame: np.ndarray, first_row: int, stop_row: int, first_col: int, stop_col: int, end_dn: float) -> tuple[int, int, float]:
     """Among pixels whose four neighbours are all at an end of the scale: how many, how many that are not, and how far these are from it.
 
     Neighbours at the end say nothing about the noise of the pixel, but that there is no target: so these pixels show the background's.
@@ -117,7 +120,9 @@ def lone_pixels(frame, first_row, stop_row, first_col, stop_col, end_dn):
 
 
 @jit
-def tile_levels(frame, edge_row, edge_col, first, stop, low_dn, high_dn, grain):
+def tile_levels(
+    frame: np.ndarray, edge_row: Ints, edge_col: Ints, first: int, stop: int, low_dn: float, high_dn: float, grain: np.float32
+) -> Array:
     """Medians of the tiles of some tile rows, and their noise; shape (6, stop − first, columns).
 
     Median; standard deviation from the clipped differences of horizontal neighbours; the end of the scale, −1 or 1, at which many of the
@@ -144,7 +149,9 @@ def tile_levels(frame, edge_row, edge_col, first, stop, low_dn, high_dn, grain):
 
 
 @jit
-def tile_moments(frame, edge_row, edge_col, first, stop, start, slope_x, slope_y, noise):
+def tile_moments(
+    frame: np.ndarray, edge_row: Ints, edge_col: Ints, first: int, stop: int, start: Array, slope_x: Array, slope_y: Array, noise: Array
+) -> Array:
     """Clipped mean, standard deviation and share kept about a plane of given slopes, tile by tile; shape (3, stop − first, columns)."""
     columns = len(edge_col) - 1
     out = np.zeros((3, stop - first, columns))
@@ -173,7 +180,7 @@ def tile_moments(frame, edge_row, edge_col, first, stop, start, slope_x, slope_y
 
 
 @jit
-def settle(offset, plausible, jump):
+def settle(offset: Array, plausible: Flags, jump: float) -> None:
     """Tell background from targets that fill whole tiles, and fill in the background under these.
 
     ``offset`` is how far the tiles lie from a smooth surface; it is background where it is small, and next to background where it goes on
@@ -181,7 +188,7 @@ def settle(offset, plausible, jump):
     """
     rows, cols = offset.shape
     known = plausible & (np.abs(offset) < jump)
-    changed = known.any()
+    changed = bool(known.any())
     if not changed:
         offset[:] = 0.0
         return
@@ -216,7 +223,7 @@ def settle(offset, plausible, jump):
 
 
 @jit
-def from_around(offset, known, r, c):
+def from_around(offset: Array, known: Flags, r: int, c: int) -> tuple[float, float]:
     """What the known neighbours make of a tile: the mean of two that face each other, the straight line through two, or one alone.
 
     Each counts ten times as much as the next.
@@ -239,7 +246,7 @@ def from_around(offset, known, r, c):
 
 
 @jit
-def goes_on(offset, known, r, c, jump):
+def goes_on(offset: Array, known: Flags, r: int, c: int, jump: float) -> bool:
     """Whether a tile goes on from a known neighbour, at its level or straight on from the one behind it."""
     rows, cols = offset.shape
     for dr, dc in ((-1, 0), (1, 0), (0, -1), (0, 1)):
@@ -255,7 +262,7 @@ def goes_on(offset, known, r, c, jump):
 
 
 @jit
-def group_medians(values, side):
+def group_medians(values: Array, side: int) -> Array:
     """Medians of square groups of tiles."""
     rows, cols = (values.shape[0] + side - 1) // side, (values.shape[1] + side - 1) // side
     out = np.empty((rows, cols))
@@ -266,7 +273,7 @@ def group_medians(values, side):
 
 
 @jit
-def map_at(nodes, row_scale, col_scale, x, y):
+def map_at(nodes: Array, row_scale: float, col_scale: float, x: float, y: float) -> tuple[float, float, float]:
     """Value and slopes along x and y of a map between the middles of its tiles, straight on beyond the outermost ones."""
     rows, cols = nodes.shape
     v, u = (y + 0.5) * row_scale - 0.5, (x + 0.5) * col_scale - 0.5
@@ -281,7 +288,7 @@ def map_at(nodes, row_scale, col_scale, x, y):
 
 
 @jit
-def map_values(nodes, row_scale, col_scale, x, y):
+def map_values(nodes: Array, row_scale: float, col_scale: float, x: Array, y: Array) -> Array:
     """`map_at` for arrays; shape (3, n)."""
     out = np.empty((3, len(x)))
     for i in range(len(x)):

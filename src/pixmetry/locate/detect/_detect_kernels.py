@@ -3,17 +3,25 @@
 from __future__ import annotations
 
 import math
+from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
+from pixmetry.core.arrays import Array, Ints, Singles
 from pixmetry.core.jit import jit
 
 WORD, ONES = 8, 0x0101010101010101  # pixels that are compared at once, and a 1 in each of them
 RUN = 5  # numbers of a run: row, first column, stop column, sign, and where the heights of its pixels are
 
+Runs = NDArray[np.int32]  # shape (n, RUN), or a number of each run
+Item = TypeVar("Item", bound=np.generic)
+
 
 @jit
-def mark(row, low, low_step, high, high_step, f, sides):
+def mark(
+    row: np.ndarray, low: Singles, low_step: Singles, high: Singles, high_step: Singles, f: np.float32, sides: NDArray[np.int8]
+) -> None:
     """Write 1 where a pixel is above high + f·high_step, −1 where it is below low + f·low_step, and 0 in between."""
     for c in range(len(row)):
         v = np.float32(row[c])
@@ -21,7 +29,7 @@ def mark(row, low, low_step, high, high_step, f, sides):
 
 
 @jit
-def at_columns(nodes, i, col_scale, value, step):
+def at_columns(nodes: Array, i: int, col_scale: float, value: Singles, step: Singles) -> None:
     """Row i of a map at every column, and the increments to row i + 1."""
     tiles, k, begin = nodes.shape[1], min(i + 1, nodes.shape[0] - 1), 0
     for j in range(max(tiles - 1, 1)):
@@ -39,7 +47,7 @@ def at_columns(nodes, i, col_scale, value, step):
 
 
 @jit
-def find_runs(frame, low, high, row_scale, col_scale, first, stop):
+def find_runs(frame: np.ndarray, low: Array, high: Array, row_scale: float, col_scale: float, first: int, stop: int) -> Runs:
     """Runs of pixels below the map low or above the map high in the rows first … stop; shape (n, RUN)."""
     columns, tiles = frame.shape[1], low.shape[0]
     runs, n = np.empty((4 * columns, RUN), np.int32), 0
@@ -73,7 +81,7 @@ def find_runs(frame, low, high, row_scale, col_scale, first, stop):
 
 
 @jit
-def doubled(table):
+def doubled(table: NDArray[Item]) -> NDArray[Item]:
     """The table with as many rows again."""
     more = np.empty((2 * len(table), table.shape[1]), table.dtype)
     more[: len(table)] = table
@@ -81,7 +89,7 @@ def doubled(table):
 
 
 @jit
-def root(parent, i):
+def root(parent: Runs, i: int) -> int:
     """The first member of i's set; the path to it is halved."""
     while parent[i] != i:
         parent[i] = parent[parent[i]]
@@ -90,7 +98,7 @@ def root(parent, i):
 
 
 @jit
-def join_runs(runs, parent, touches):
+def join_runs(runs: Runs, parent: Runs, touches: Runs) -> None:
     """Join runs of one sign that touch (corners count) in neighbouring rows; count the touches of each set at its root.
 
     The runs are in order of row and column. As a graph (a run is a node, a touch an edge) a set is planar, and what its
@@ -129,7 +137,7 @@ def join_runs(runs, parent, touches):
 
 
 @jit
-def group_runs(runs):
+def group_runs(runs: Runs) -> tuple[Runs, Ints]:
     """Put the runs of each region together: the runs by region, each in order of row and column, and where each region starts."""
     n = len(runs)
     parent, label = np.empty(n, np.int32), np.empty(n, np.int32)
@@ -157,7 +165,7 @@ def group_runs(runs):
 
 
 @jit
-def boxes_in_reach(box, reach):
+def boxes_in_reach(box: Ints, reach: float) -> tuple[Ints, Ints]:
     """For each box (first row, stop row, first column, stop column) the others whose gap is at most ``reach`` in rows and in columns.
 
     The boxes are put into square cells as large as their mean side and the reach, each into all the cells that it touches when grown
@@ -215,7 +223,19 @@ def boxes_in_reach(box, reach):
 
 
 @jit
-def sample_rings(frame, x, y, semi_major, semi_minor, angle, radii, directions, start, stop, out):
+def sample_rings(
+    frame: np.ndarray,
+    x: Array,
+    y: Array,
+    semi_major: Array,
+    semi_minor: Array,
+    angle: Array,
+    radii: Array,
+    directions: Array,
+    start: int,
+    stop: int,
+    out: Array,
+) -> None:
     """Interpolate linearly at centre + M (ρ cos φ, ρ sin φ), with M the map of the unit circle to the target's outline.
 
     out (n, len(radii), len(directions)) becomes NaN outside the frame. M is the symmetric map that has the ellipse's axes.

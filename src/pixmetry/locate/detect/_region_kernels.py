@@ -6,9 +6,10 @@ import math
 
 import numpy as np
 
+from pixmetry.core.arrays import Array, Flags, Ints, Singles
 from pixmetry.core.jit import jit
 from pixmetry.locate.detect._background_kernels import map_at
-from pixmetry.locate.detect._detect_kernels import RUN, doubled, group_runs, join_runs
+from pixmetry.locate.detect._detect_kernels import RUN, Runs, doubled, group_runs, join_runs
 
 STRETCH = 32  # pixels over which the background is taken as straight
 PROMINENT = 1.4  # height of a summit over that of the saddle to a higher one, for both to be targets
@@ -23,7 +24,7 @@ BORDER, SATURATED, CLIPPED, OVERLAPPING = 1, 2, 4, 16  # of `targets.Flag`
 
 
 @jit
-def heights(frame, nodes, row_scale, col_scale, runs, out):
+def heights(frame: np.ndarray, nodes: Array, row_scale: float, col_scale: float, runs: Runs, out: Singles) -> int:
     """How far the pixels of the runs lie beyond the background, on the runs' side of it; and where in ``out`` each run's are."""
     n = 0
     for i in range(len(runs)):
@@ -41,7 +42,7 @@ def heights(frame, nodes, row_scale, col_scale, runs, out):
 
 
 @jit
-def top_of(runs, height):
+def top_of(runs: Runs, height: Singles) -> tuple[float, float]:
     """Greatest height in the runs; and that of their plateau, the mean of what is above three quarters of the third greatest.
 
     Defective pixels are not of the plateau; where there are too few pixels to tell, all count.
@@ -68,7 +69,7 @@ def top_of(runs, height):
 
 
 @jit
-def cut_runs(runs, height, level, parts):
+def cut_runs(runs: Runs, height: Singles, level: float, parts: Runs) -> int:
     """Write those parts of the runs that are higher than a level into a table with room for them; return their number."""
     n = 0
     for i in range(len(runs)):
@@ -88,7 +89,7 @@ def cut_runs(runs, height, level, parts):
 
 
 @jit
-def count_joined(parts, parent, touches):
+def count_joined(parts: Runs, parent: Runs, touches: Runs) -> tuple[int, int]:
     """Join the parts; return the number of separate ones and of the holes in them."""
     join_runs(parts, parent, touches)
     separate, holes = 0, 0
@@ -100,7 +101,7 @@ def count_joined(parts, parent, touches):
 
 
 @jit
-def describe(parts, height, level, top, holes, out):
+def describe(parts: Runs, height: Singles, level: float, top: float, holes: int, out: Array) -> None:
     """Fill in x, y, axes, angle, blur, amplitude, box, area, fill and holes of a connected part of a region."""
     area, steep, weight, wx, wy = 0.0, 0.0, 0.0, 0.0, 0.0
     sx, sy, sxx, sxy, syy = 0.0, 0.0, 0.0, 0.0, 0.0
@@ -143,7 +144,7 @@ def describe(parts, height, level, top, holes, out):
 
 
 @jit
-def rough_blur(area, steep, radius):
+def rough_blur(area: float, steep: float, radius: float) -> float:
     """Standard deviation of a Gaussian edge of which ``steep`` pixels lie between half and three quarters of the height.
 
     That is 0.6745 of it, all around; of a Gaussian spot, where the plateau is missing, the area tells more.
@@ -154,7 +155,7 @@ def rough_blur(area, steep, radius):
 
 
 @jit
-def state(frame, out, reach, low_dn, high_dn):
+def state(frame: np.ndarray, out: Array, reach: int, low_dn: float, high_dn: float) -> int:
     """Flags of a box: whether it reaches the border, and whether grey values in it and just around it are at the ends of the scale."""
     flags = 0
     first_row, stop_row = int(out[7]) - reach, int(out[8]) + reach
@@ -173,7 +174,7 @@ def state(frame, out, reach, low_dn, high_dn):
 
 
 @jit
-def largest(runs):
+def largest(runs: Runs) -> Runs:
     """Of a table of runs those of the set with most pixels."""
     grouped, start = group_runs(runs)
     best, most = 0, 0
@@ -185,7 +186,7 @@ def largest(runs):
 
 
 @jit
-def add_target(runs, height, level, out, found):
+def add_target(runs: Runs, height: Singles, level: float, out: Array, found: int) -> tuple[Array, int]:
     """Measure a part of a region, at its own half height if that is above the level, and write it behind those found."""
     top = top_of(runs, height)[1]
     parts = np.empty((np.sum(runs[:, 2] - runs[:, 1]) + 1, RUN), np.int32)
@@ -200,7 +201,7 @@ def add_target(runs, height, level, out, found):
 
 
 @jit
-def summits(runs, height, n, least, seed, least_area, out, found):
+def summits(runs: Runs, height: Singles, n: int, least: float, seed: float, least_area: int, out: Array, found: int) -> tuple[Array, int]:
     """Targets of a region that may hold several, of any heights.
 
     From the top down, level by level, a connected part is a target when it has come down to half its height with no target in it yet; and
@@ -250,7 +251,19 @@ def summits(runs, height, n, least, seed, least_area, out, found):
 
 
 @jit
-def smooth_heights(frame, nodes, row_scale, col_scale, sign, first_row, stop_row, first_col, stop_col, runs, out):
+def smooth_heights(
+    frame: np.ndarray,
+    nodes: Array,
+    row_scale: float,
+    col_scale: float,
+    sign: int,
+    first_row: int,
+    stop_row: int,
+    first_col: int,
+    stop_col: int,
+    runs: Runs,
+    out: Singles,
+) -> None:
     """Heights of a window in the mean of 3 × 3 pixels, and its rows as runs."""
     wide = stop_col - first_col
     for r in range(first_row, stop_row):
@@ -266,7 +279,9 @@ def smooth_heights(frame, nodes, row_scale, col_scale, sign, first_row, stop_row
 
 
 @jit
-def add_faint(frame, nodes, row_scale, col_scale, region, out, found):
+def add_faint(
+    frame: np.ndarray, nodes: Array, row_scale: float, col_scale: float, region: Runs, out: Array, found: int
+) -> tuple[Array, int]:
     """Measure a region whose half height is in the noise: with smoothed heights, in a window that grows until it contains the region."""
     rows, cols = frame.shape
     first_row, stop_row, first_col, stop_col = region[0, 0], region[len(region) - 1, 0] + 1, region[0, 1], region[0, 2]
@@ -303,7 +318,7 @@ def add_faint(frame, nodes, row_scale, col_scale, region, out, found):
 
 
 @jit
-def around(runs, middle):
+def around(runs: Runs, middle: Runs) -> Runs:
     """Of a table of runs those of the set that meets another run; none if none does."""
     grouped, start = group_runs(runs)
     for k in range(len(start) - 1):
@@ -314,7 +329,20 @@ def around(runs, middle):
 
 
 @jit
-def measure_regions(frame, nodes, least, row_scale, col_scale, runs, start, first, stop, least_area, low_dn, high_dn):
+def measure_regions(
+    frame: np.ndarray,
+    nodes: Array,
+    least: Array,
+    row_scale: float,
+    col_scale: float,
+    runs: Runs,
+    start: Ints,
+    first: int,
+    stop: int,
+    least_area: int,
+    low_dn: float,
+    high_dn: float,
+) -> Array:
     """Targets of the regions first … stop, shape (n, FIELDS): what `describe` says, then flags, sign and region.
 
     ``least`` is the map of the threshold's height; a region counts if it has ``least_area`` pixels and its top is SEED times as high.
@@ -359,13 +387,13 @@ def measure_regions(frame, nodes, least, row_scale, col_scale, runs, start, firs
 
 
 @jit
-def waisted(target):
+def waisted(target: Array) -> bool:
     """Whether a target's fill is that of two or three discs that touch: equal ones have 0.89 and 0.77."""
-    return target[13] == 0.0 and 0.7 < target[12] < 0.95 - 0.5 / target[11] and target[11] >= SOLID
+    return bool(target[13] == 0.0 and 0.7 < target[12] < 0.95 - 0.5 / target[11] and target[11] >= SOLID)
 
 
 @jit
-def simple(region, target):
+def simple(region: Runs, target: Array) -> bool:
     """Whether a region contains only its target: it is hardly larger, and the target has the shape of an ellipse."""
     margin = 2.0 + 3.0 * target[5]
     first_col, stop_col = region[0, 1], region[0, 2]
@@ -373,11 +401,13 @@ def simple(region, target):
         first_col, stop_col = min(first_col, region[i, 1]), max(stop_col, region[i, 2])
     close = target[7] - region[0, 0] <= margin and region[len(region) - 1, 0] + 1 - target[8] <= margin
     close = close and target[9] - first_col <= margin and stop_col - target[10] <= margin
-    return close and (target[12] > 0.9 or target[11] < 20.0)
+    return bool(close and (target[12] > 0.9 or target[11] < 20.0))
 
 
 @jit
-def spurious(x, y, major, minor, angle, blur, amplitude, box, start, index):
+def spurious(
+    x: Array, y: Array, major: Array, minor: Array, angle: Array, blur: Array, amplitude: Array, box: Ints, start: Ints, index: Ints
+) -> Flags:
     """Targets that are another one's doing: the same one found twice, the halo of a sharpened edge, the ringing of a compressed one.
 
     ``start`` and ``index`` say which targets are near each other. A halo has the other sign, less than HALO of the height, and lies at the

@@ -158,7 +158,13 @@ def before_clipping(lone: np.ndarray, lit: np.ndarray, light: np.ndarray, least:
 
 
 def _in_bands(
-    kernel: Callable[..., np.ndarray], bands: list, threads: int | None, frame: np.ndarray, rows: Any, cols: Any, *more: Any
+    kernel: Callable[..., np.ndarray],
+    bands: list[tuple[int, int]],
+    threads: int | None,
+    frame: np.ndarray,
+    rows: Any,
+    cols: Any,
+    *more: Any,
 ) -> np.ndarray:
     return np.concatenate(map_tiles(lambda band: kernel(frame, rows, cols, *band, *more), bands, threads), axis=1)
 
@@ -178,7 +184,8 @@ def _noise(spread: np.ndarray, usual: float, floor: float, cut: np.ndarray) -> n
     """Smooth the map of the noise; it is not smooth where the scale cuts off a part of the frame."""
     if not cut.any():
         spread = np.clip(_surface(spread, 0.1 * usual, 2), 0.5 * usual, 2 * usual)
-    return np.maximum(spread, floor)
+    smooth: np.ndarray = np.maximum(spread, floor)
+    return smooth
 
 
 def _surface(level: np.ndarray, noise: float, degree: int) -> np.ndarray:

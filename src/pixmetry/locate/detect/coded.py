@@ -206,7 +206,8 @@ def code_svg(number: int, disc_mm: float = 10.0, *, bits: int = BITS, bright: bo
 
 
 def _ones(words: np.ndarray, bits: int) -> np.ndarray:
-    return (words[..., None] >> np.arange(bits) & 1).sum(axis=-1)
+    ones: np.ndarray = (words[..., None] >> np.arange(bits) & 1).sum(axis=-1)
+    return ones
 
 
 def _smooth(ring: np.ndarray) -> np.ndarray:

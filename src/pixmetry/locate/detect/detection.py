@@ -143,7 +143,8 @@ def _tame(sigma_dn: np.ndarray) -> np.ndarray:
     """The map of the noise, without steps so steep that it would fall below 0 where it is continued to the frame's border."""
     from scipy.ndimage import maximum_filter
 
-    return np.maximum(sigma_dn, STEEPEST * maximum_filter(sigma_dn, 3))
+    tame: np.ndarray = np.maximum(sigma_dn, STEEPEST * maximum_filter(sigma_dn, 3))
+    return tame
 
 
 def select(targets: Regions, kind: str) -> np.ndarray:
@@ -181,7 +182,8 @@ def neighbours(targets: Targets, reach_px: float) -> tuple[np.ndarray, np.ndarra
 
 def _least_fill(targets: Regions) -> np.ndarray:
     noise = (targets.sigma_dn / targets.amplitude_dn) ** 2
-    return 0.975 - 1.5 / targets.area_px - 2 * noise
+    least: np.ndarray = 0.975 - 1.5 / targets.area_px - 2 * noise
+    return least
 
 
 def _fits_box(targets: Regions) -> np.ndarray:
@@ -191,7 +193,8 @@ def _fits_box(targets: Regions) -> np.ndarray:
     wide = 2 * np.hypot(targets.semi_major_px * cosine, targets.semi_minor_px * sine)
     high = 2 * np.hypot(targets.semi_major_px * sine, targets.semi_minor_px * cosine)
     gaps = np.abs(targets.col_stop - targets.col_first - wide), np.abs(targets.row_stop - targets.row_first - high)
-    return np.maximum(*gaps) < 1.5 + 0.15 * np.minimum(wide, high)
+    fits: np.ndarray = np.maximum(*gaps) < 1.5 + 0.15 * np.minimum(wide, high)
+    return fits
 
 
 def _genuine(targets: Regions) -> Regions:

@@ -117,7 +117,8 @@ def _through(cells: np.ndarray, places: np.ndarray, asked: np.ndarray) -> np.nda
     )
     h = np.append(np.linalg.lstsq(design, np.concatenate([u, v]), rcond=None)[0], 1.0).reshape(3, 3)
     image = np.column_stack([asked, np.ones(len(asked))]) @ h.T
-    return image[:, :2] / image[:, 2:] * size + middle
+    place: np.ndarray = image[:, :2] / image[:, 2:] * size + middle
+    return place
 
 
 def square_corners(

@@ -139,7 +139,8 @@ def cross_pixel(section: int, p: Array, dx: float, dy: float, turn: Turn, out: A
     out[SIGMA_2], out[WIDTH_2] = (p[HEIGHT_2] + p[OVERLAP] * h1) * by_s2, (p[HEIGHT_2] + p[OVERLAP] * h1) * by_w2
     out[OVERLAP], out[SLOPE_X], out[SLOPE_Y] = both, dx, dy
     ground = p[BACKGROUND] + p[SLOPE_X] * dx + p[SLOPE_Y] * dy
-    return ground + p[HEIGHT_1] * h1 + p[HEIGHT_2] * h2 + p[OVERLAP] * both
+    level: float = ground + p[HEIGHT_1] * h1 + p[HEIGHT_2] * h2 + p[OVERLAP] * both
+    return level
 
 
 @jit

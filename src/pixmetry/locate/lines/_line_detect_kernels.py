@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from pixmetry.core.arrays import Array, Flags, Ints, Singles
 from pixmetry.core.jit import jit
 from pixmetry.locate.lines._line_kernels import Lines, Pixels, gather
 from pixmetry.locate.lines._profile_kernels import BAR, EDGE, GAUSSIAN, profile
@@ -22,7 +23,21 @@ STATE = 11  # x, y, angle, curvature, least, greatest place along, background, a
 
 
 @jit
-def ridge_points(gx, gy, gxx, gxy, gyy, noise, unit, scale, polarity, least, first, stop, points):
+def ridge_points(
+    gx: Singles,
+    gy: Singles,
+    gxx: Singles,
+    gxy: Singles,
+    gyy: Singles,
+    noise: Singles,
+    unit: float,
+    scale: float,
+    polarity: int,
+    least: float,
+    first: int,
+    stop: int,
+    points: Singles,
+) -> None:
     """Keep the pixels that a ridge of the smoothed frame passes through, where it is stronger than what another scale found.
 
     C. Steger, IEEE Trans. PAMI 20(2), 113 (1998): the first derivative along the direction of greatest curvature vanishes within the
@@ -54,7 +69,9 @@ def ridge_points(gx, gy, gxx, gxy, gyy, noise, unit, scale, polarity, least, fir
 
 
 @jit
-def step_points(gx, gy, noise, unit, scale, least, first, stop, points):
+def step_points(
+    gx: Singles, gy: Singles, noise: Singles, unit: float, scale: float, least: float, first: int, stop: int, points: Singles
+) -> None:
     """Keep the pixels at which the gradient is greatest along its own direction; the brighter side lies towards (−sin, cos)."""
     rows, cols = gx.shape
     weight = math.sqrt(scale)
@@ -75,7 +92,7 @@ def step_points(gx, gy, noise, unit, scale, least, first, stop, points):
 
 
 @jit
-def slope_at(gx, gy, x, y):
+def slope_at(gx: Singles, gy: Singles, x: float, y: float) -> float:
     """Size of the gradient between pixels."""
     c, r = min(int(x), gx.shape[1] - 2), min(int(y), gx.shape[0] - 2)
     f, g = x - c, y - r
@@ -85,7 +102,7 @@ def slope_at(gx, gy, x, y):
 
 
 @jit
-def turn_between(a, b, kind):
+def turn_between(a: float, b: float, kind: int) -> float:
     """Angle between two directions; lines have no sense of direction, but a polarity; edges have one."""
     if kind == LINE:
         if (a > 6.0) != (b > 6.0):
@@ -97,7 +114,7 @@ def turn_between(a, b, kind):
 
 
 @jit
-def walk(points, used, kind, row, col, ahead, xs, ys, n):
+def walk(points: Singles, used: Flags, kind: int, row: int, col: int, ahead: float, xs: Array, ys: Array, n: int) -> int:
     """Follow a chain from a point, along its direction or against it; return the number of points so far."""
     rows, cols = used.shape
     angle = points[row, col, 3]
@@ -138,7 +155,7 @@ def walk(points, used, kind, row, col, ahead, xs, ys, n):
 
 
 @jit
-def take(points, used, kind, row, col):
+def take(points: Singles, used: Flags, kind: int, row: int, col: int) -> None:
     """Mark a point, and neighbouring points of the same line."""
     rows, cols = used.shape
     for r in range(max(0, row - 1), min(rows, row + 2)):
@@ -149,7 +166,7 @@ def take(points, used, kind, row, col):
 
 
 @jit
-def chains(points, seeds, kind, least):
+def chains(points: Singles, seeds: Ints, kind: int, least: int) -> tuple[Array, Array, Ints, Ints]:
     """Follow chains from seeds (indices into the frame, strongest first); return their points, where each starts, and their seeds."""
     rows, cols = points.shape[0], points.shape[1]
     used = np.zeros((rows, cols), np.bool_)
@@ -185,7 +202,7 @@ def chains(points, seeds, kind, least):
 
 
 @jit
-def parabola(t, d, n, curved, out):
+def parabola(t: Array, d: Array, n: int, curved: bool, out: Array) -> None:
     """Fit d = a + b t + c t²/2 by least squares into ``out``; without c where not ``curved``."""
     out[:] = 0.0
     scale = max(abs(t[0]), abs(t[n - 1]), 1.0)
@@ -208,7 +225,7 @@ def parabola(t, d, n, curved, out):
 
 
 @jit
-def pieces(x, y, start, least, tolerance, most_turn, found):
+def pieces(x: Array, y: Array, start: Ints, least: int, tolerance: float, most_turn: float, found: Array) -> int:
     """Cut chains into stretches that a parabola fits; return their number.
 
     Rows of ``found``: x, y, angle, curvature, least and greatest place along, chain.
@@ -255,7 +272,7 @@ def pieces(x, y, start, least, tolerance, most_turn, found):
 
 
 @jit
-def grey(frame, x, y):
+def grey(frame: np.ndarray, x: float, y: float) -> float:
     """Grey value between pixels (bilinear); NaN outside the frame."""
     rows, cols = frame.shape
     if not (-0.5 <= x <= cols - 0.5 and -0.5 <= y <= rows - 0.5):
@@ -264,11 +281,12 @@ def grey(frame, x, y):
     c, r = min(int(x), max(cols - 2, 0)), min(int(y), max(rows - 2, 0))
     f, g = x - c, y - r
     c2, r2 = min(c + 1, cols - 1), min(r + 1, rows - 1)
-    return (1 - g) * ((1 - f) * frame[r, c] + f * frame[r, c2]) + g * ((1 - f) * frame[r2, c] + f * frame[r2, c2])
+    value: float = (1 - g) * ((1 - f) * frame[r, c] + f * frame[r, c2]) + g * ((1 - f) * frame[r2, c] + f * frame[r2, c2])
+    return value
 
 
 @jit
-def section_of(frame, state, reach, total, hits):
+def section_of(frame: np.ndarray, state: Array, reach: float, total: Array, hits: Array) -> None:
     """Average the grey values across a line, at `SAMPLES` places from −reach to reach, over its length."""
     total[:] = 0.0
     hits[:] = 0.0
@@ -289,7 +307,7 @@ def section_of(frame, state, reach, total, hits):
 
 
 @jit
-def width_at(total, peak, base, share, step):
+def width_at(total: Array, peak: float, base: float, share: float, step: float) -> float:
     """Width of a section at a share of its height, about its middle; ``step`` is the distance of its samples."""
     middle, level = SAMPLES // 2, base + share * (peak - base)
     up = 1.0 if peak > base else -1.0
@@ -307,7 +325,7 @@ def width_at(total, peak, base, share, step):
 
 
 @jit
-def describe(frame, kind, state, scale, total, hits):
+def describe(frame: np.ndarray, kind: int, state: Array, scale: float, total: Array, hits: Array) -> None:
     """Measure background, amplitude, blur and width of a line or edge from its mean section."""
     middle = SAMPLES // 2
     reach = (4.0 if kind == LINE else 4.5) * scale + 2.0
@@ -352,7 +370,7 @@ def describe(frame, kind, state, scale, total, hits):
 
 
 @jit
-def follow(frame, kind, state, most_turn):
+def follow(frame: np.ndarray, kind: int, state: Array, most_turn: float) -> bool:
     """Follow a line or edge in both directions to its ends, and fit it again to its points, in place; False if it is not a line."""
     rows, cols = frame.shape
     room = int(2 * math.hypot(rows, cols)) + 64
@@ -405,7 +423,7 @@ def follow(frame, kind, state, most_turn):
 
 
 @jit
-def sample(frame, kind, state, first, n, strong, middle, aside):
+def sample(frame: np.ndarray, kind: int, state: Array, first: int, n: int, strong: Array, middle: Array, aside: Array) -> None:
     """Sample a line every pixel along it: how it stands out, how its middle does, and its distance from where it was laid."""
     sign = 1.0 if state[7] > 0.0 else -1.0
     blur = math.hypot(state[8], 0.2887)
@@ -448,7 +466,7 @@ def sample(frame, kind, state, first, n, strong, middle, aside):
 
 
 @jit
-def reach_of(smooth, middle, n, begin, ahead, amplitude, kind):
+def reach_of(smooth: Array, middle: Array, n: int, begin: int, ahead: int, amplitude: float, kind: int) -> int:
     """Return the last sample from the middle on that belongs to the line; a few that fail, or a crossing, are passed over."""
     i = min(max(begin, 0), n - 1)
     last, failed, crossing = i, 0, 0
@@ -466,7 +484,7 @@ def reach_of(smooth, middle, n, begin, ahead, amplitude, kind):
 
 
 @jit
-def good_share(frame, kind, state):
+def good_share(frame: np.ndarray, kind: int, state: Array) -> float:
     """Return the share of samples along a line with the height of the line; samples with another line do not count."""
     n = int(state[5] - state[4]) + 1
     strong, middle, aside = np.empty(n), np.empty(n), np.empty(n)
@@ -485,7 +503,7 @@ def good_share(frame, kind, state):
 
 
 @jit
-def strength(frame, kind, state):
+def strength(frame: np.ndarray, kind: int, state: Array) -> float:
     """Return the amplitude that a least-squares fit of the line's section and a background gives, over its standard deviation."""
     c, s = math.cos(state[2]), math.sin(state[2])
     a, b = max(abs(c), abs(s)), min(abs(c), abs(s))
@@ -509,11 +527,12 @@ def strength(frame, kind, state):
     if n < 9:
         return 0.0
     energy = sums[1] - sums[0] * sums[0] / n
-    return (sums[3] - sums[0] * sums[2] / n) / math.sqrt(max(energy, 1e-12)) / max(state[10], 1e-9)
+    found: float = (sums[3] - sums[0] * sums[2] / n) / math.sqrt(max(energy, 1e-12)) / max(state[10], 1e-9)
+    return found
 
 
 @jit
-def refine(frame, kind, states, scales, first, stop, most_turn, strengths):
+def refine(frame: np.ndarray, kind: int, states: Array, scales: Array, first: int, stop: int, most_turn: float, strengths: Array) -> None:
     """Describe and follow lines or edges; ``strengths``: their amplitudes over their standard deviations, 0 if it is not a line."""
     total, hits = np.empty(SAMPLES), np.empty(SAMPLES)
     for i in range(first, stop):

@@ -55,17 +55,20 @@ class LineCandidates:
     @property
     def angle_rad(self) -> np.ndarray:
         """Direction from end 1 to end 2, from x towards y."""
-        return np.arctan2(self.y2_px - self.y1_px, self.x2_px - self.x1_px)
+        angle: np.ndarray = np.arctan2(self.y2_px - self.y1_px, self.x2_px - self.x1_px)
+        return angle
 
     @property
     def length_px(self) -> np.ndarray:
         """Distance of the ends."""
-        return np.hypot(self.x2_px - self.x1_px, self.y2_px - self.y1_px)
+        length: np.ndarray = np.hypot(self.x2_px - self.x1_px, self.y2_px - self.y1_px)
+        return length
 
     @property
     def core_px(self) -> np.ndarray:
         """How far to either side the line changes grey values: half its width and 3.5 standard deviations of blur and pixel."""
-        return 0.5 * self.width_px + 3.5 * np.hypot(self.blur_px, 0.2887) + 0.3
+        core: np.ndarray = 0.5 * self.width_px + 3.5 * np.hypot(self.blur_px, 0.2887) + 0.3
+        return core
 
     @classmethod
     def of(cls, **columns: object) -> LineCandidates:

@@ -126,7 +126,8 @@ def _noise_map(light: np.ndarray, noise: NoiseModel | None, least_dn: float) -> 
     cv2 = import_extra("cv2")
 
     if noise is not None:
-        return np.sqrt(noise.variance_dn2(cv2.GaussianBlur(light, (0, 0), 2.0))).astype(np.float32)
+        known: np.ndarray = np.sqrt(noise.variance_dn2(cv2.GaussianBlur(light, (0, 0), 2.0))).astype(np.float32)
+        return known
     mask = np.array([1.0, -2.0, 1.0], np.float32)
     rough = np.abs(cv2.sepFilter2D(light, cv2.CV_32F, mask, mask)) / 6.0
     rows, cols = max(light.shape[0] // BLOCK, 1), max(light.shape[1] // BLOCK, 1)
@@ -136,7 +137,8 @@ def _noise_map(light: np.ndarray, noise: NoiseModel | None, least_dn: float) -> 
     block = np.maximum(block, max(0.7 * float(np.median(block)), least_dn)).astype(np.float32)
     if min(block.shape) > 2:
         block = cv2.medianBlur(block, 3)
-    return cv2.resize(block, light.shape[::-1], interpolation=cv2.INTER_LINEAR)
+    sigma: np.ndarray = cv2.resize(block, light.shape[::-1], interpolation=cv2.INTER_LINEAR)
+    return sigma
 
 
 def _points(light: np.ndarray, sigma: np.ndarray, kind: int, polarity: int, threads: int | None) -> tuple[np.ndarray, np.ndarray]:
@@ -150,7 +152,8 @@ def _points(light: np.ndarray, sigma: np.ndarray, kind: int, polarity: int, thre
         g, g1, g2 = _gaussians(s)
 
         def smoothed(along_x: np.ndarray, along_y: np.ndarray) -> np.ndarray:
-            return cv2.sepFilter2D(light, cv2.CV_32F, along_x[::-1], along_y[::-1], borderType=cv2.BORDER_REPLICATE)
+            smooth: np.ndarray = cv2.sepFilter2D(light, cv2.CV_32F, along_x[::-1], along_y[::-1], borderType=cv2.BORDER_REPLICATE)
+            return smooth
 
         gx, gy = smoothed(g1, g), smoothed(g, g1)
         before = points[:, :, 4].copy()
@@ -189,7 +192,8 @@ def _long_enough(states: np.ndarray, kind: int, least_length_px: float) -> np.nd
     """Whether lines have the length that was asked for, and are three times as long as wide."""
     length, blur = states[:, 5] - states[:, 4], np.hypot(states[:, 8], 0.2887)
     wide = np.maximum(states[:, 9], 2.355 * blur) if kind == kernels.LINE else 1.5 * blur
-    return (length >= least_length_px) & (length >= 3.0 * wide)
+    long: np.ndarray = (length >= least_length_px) & (length >= 3.0 * wide)
+    return long
 
 
 def _once(states: np.ndarray, kind: int, light: np.ndarray) -> np.ndarray:
@@ -217,7 +221,8 @@ def _usual_levels(light: np.ndarray) -> np.ndarray:
     """Median grey value of the neighbourhood, by blocks."""
     rows, cols = (max(side // 128, 1) for side in light.shape)
     tall, wide = light.shape[0] // rows, light.shape[1] // cols
-    return np.median(light[: rows * tall, : cols * wide].reshape(rows, tall, cols, wide), axis=(1, 3))
+    usual: np.ndarray = np.median(light[: rows * tall, : cols * wide].reshape(rows, tall, cols, wide), axis=(1, 3))
+    return usual
 
 
 def _aside(long: np.ndarray, other: np.ndarray) -> tuple[float, float]:
@@ -254,7 +259,7 @@ def _same(long: np.ndarray, other: np.ndarray, kind: int, standing: float, other
         return False
     alike = math.cos(long[2] - other[2]) * long[7] * other[7] > 0 if kind == kernels.STEP else long[7] * other[7] > 0
     if alike:
-        return distance < 1.5 + 0.5 * max(long[9], other[9]) + (math.hypot(long[8], 0.3) if kind == kernels.LINE else 0.0)
+        return bool(distance < 1.5 + 0.5 * max(long[9], other[9]) + (math.hypot(long[8], 0.3) if kind == kernels.LINE else 0.0))
     return _hidden(other, long, kind, other_standing, standing)
 
 

@@ -272,11 +272,13 @@ def oriented(places: np.ndarray, p: np.ndarray, angle: np.ndarray, cov: np.ndarr
 
 
 def _slope_x(p: np.ndarray, angle: np.ndarray) -> np.ndarray:
-    return p[:, kernels.ALONG] * np.cos(angle) - p[:, kernels.ACROSS] * np.sin(angle)
+    slope: np.ndarray = p[:, kernels.ALONG] * np.cos(angle) - p[:, kernels.ACROSS] * np.sin(angle)
+    return slope
 
 
 def _slope_y(p: np.ndarray, angle: np.ndarray) -> np.ndarray:
-    return p[:, kernels.ALONG] * np.sin(angle) + p[:, kernels.ACROSS] * np.cos(angle)
+    slope: np.ndarray = p[:, kernels.ALONG] * np.sin(angle) + p[:, kernels.ACROSS] * np.cos(angle)
+    return slope
 
 
 def _flags(fit: Fit, candidates: LineCandidates, more: dict[str, np.ndarray]) -> np.ndarray:

@@ -147,7 +147,8 @@ def pixel(x: float, y: float, p: Array, edges: Edges, unknowns: int, d: Array) -
     u, v = c1 * x + s1 * y, c2 * x + s2 * y
     if abs(u) > near and abs(v) > near and unknowns == PLAIN:
         d[5], d[6] = 1.0, math.copysign(1.0, u * v)
-        return p[5] + contrast * d[6]
+        far: float = p[5] + contrast * d[6]
+        return far
     for node in range(side * side):
         i, j = node // side, node % side
         weight = (1.0 - 2.0 * outer if side == 3 and i == 1 else outer) * (1.0 - 2.0 * outer if side == 3 and j == 1 else outer)
@@ -184,7 +185,8 @@ def pixel(x: float, y: float, p: Array, edges: Edges, unknowns: int, d: Array) -
         d[1] -= p[8]
         d[7], d[8] = x, y
         light = p[7] * x + p[8] * y + cx * d[9] + cy * d[10]
-    return value + light
+    level: float = value + light
+    return level
 
 
 @jit

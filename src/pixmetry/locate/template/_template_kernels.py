@@ -305,10 +305,10 @@ def allowed(kind: int, p: Array, start: Array, largest: float, broadest: float) 
     if not (longest_px(kind, p) < largest and p[2 + s] < broadest):
         return False
     if s == 1:
-        return p[2] > 0.0
+        return bool(p[2] > 0.0)
     if s == 2:
-        return p[2] > p[3] > 0.0
-    return s == 0 or (p[2] > 0.0 and p[3] > 0.0 and p[2] * p[3] > p[4] * p[4])
+        return bool(p[2] > p[3] > 0.0)
+    return s == 0 or bool(p[2] > 0.0 and p[3] > 0.0 and p[2] * p[3] > p[4] * p[4])
 
 
 @jit
@@ -340,8 +340,8 @@ def longest_px(kind: int, p: Array) -> float:
     if kind == SPOT:
         return 0.0
     if SHAPES[kind] == 3:
-        return 0.5 * (abs(p[2] + p[3]) + math.hypot(p[2] - p[3], 2.0 * p[4]))
-    return p[2]
+        return 0.5 * float(abs(p[2] + p[3]) + math.hypot(p[2] - p[3], 2.0 * p[4]))
+    return float(p[2])
 
 
 @jit
@@ -429,7 +429,7 @@ def place_covariance(count: int, system: System, out: Array) -> bool:
 def place_at_rest(step: Array, c: Array) -> bool:
     """Whether a step in x and y is small against their covariance c."""
     det = c[0] * c[2] - c[1] * c[1]
-    return step[0] * step[0] * c[2] - 2.0 * step[0] * step[1] * c[1] + step[1] * step[1] * c[0] < AT_REST * det
+    return bool(step[0] * step[0] * c[2] - 2.0 * step[0] * step[1] * c[1] + step[1] * step[1] * c[0] < AT_REST * det)
 
 
 @jit

@@ -85,7 +85,8 @@ def chessboard_reach_px(grid: Grid, most_px: float = REACH_PX) -> np.ndarray:
     along_col, along_row = np.gradient(place, axis=1), np.gradient(place, axis=0)
     area = np.abs(along_col[..., 0] * along_row[..., 1] - along_col[..., 1] * along_row[..., 0])
     next_edge = area / np.maximum(np.hypot(*np.moveaxis(along_col, 2, 0)), np.hypot(*np.moveaxis(along_row, 2, 0)))
-    return np.clip(next_edge.ravel() - CLEARANCE_PX, LEAST_REACH_PX, most_px)
+    reach: np.ndarray = np.clip(next_edge.ravel() - CLEARANCE_PX, LEAST_REACH_PX, most_px)
+    return reach
 
 
 def corner_positions(
@@ -168,7 +169,8 @@ def default_reach_px(x_px: np.ndarray, y_px: np.ndarray) -> np.ndarray:
         return np.full(len(x_px), REACH_PX)
     place = np.stack([x_px, y_px], axis=1)
     nearest = cKDTree(place).query(place, k=2)[0][:, 1]
-    return np.clip(0.85 * nearest - CLEARANCE_PX, LEAST_REACH_PX, REACH_PX)
+    reach: np.ndarray = np.clip(0.85 * nearest - CLEARANCE_PX, LEAST_REACH_PX, REACH_PX)
+    return reach
 
 
 def _positions(reach: np.ndarray, fits: kernels.Fits) -> Positions:

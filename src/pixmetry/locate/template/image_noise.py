@@ -220,10 +220,11 @@ def _fitted(left: Leftovers, guess: NoiseModel, least: float) -> NoiseModel:
     if np.count_nonzero(inside) < LEAST_PIXELS:
         return guess
     ends = np.array([level[inside].min(), level[inside].max()])
-    law = _law(level[flat], residual[flat], None, ends, least) if np.count_nonzero(flat) >= LEAST_PIXELS else None
-    certain = law is not None and law.vague < FEW
-    if not certain:
-        law = _law(level[inside], residual[inside], left.steep[inside], ends, least)
+    level_law = _law(level[flat], residual[flat], None, ends, least) if np.count_nonzero(flat) >= LEAST_PIXELS else None
+    if level_law is not None and level_law.vague < FEW:
+        certain, law = True, level_law
+    else:
+        certain, law = False, _law(level[inside], residual[inside], left.steep[inside], ends, least)
     if law.vague > VAGUEST:
         law = _law(level[inside], residual[inside], None, ends, least)
     if law.clear or (law.slope > 0.0 and law.vague > VAGUE):

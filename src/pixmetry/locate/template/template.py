@@ -246,7 +246,8 @@ def _significant(fall: np.ndarray, good: np.ndarray, degrees: int) -> np.ndarray
     count = int(good.sum())
     if count >= POOL and np.median(fall[good]) > middle + POOLED_SIGMA * width / np.sqrt(count):
         return good.copy()
-    return np.nan_to_num(fall) > RATE_FALL[degrees]
+    planes: np.ndarray = np.nan_to_num(fall) > RATE_FALL[degrees]
+    return planes
 
 
 def _check(kind: str, light_on: str, aperture_px: float) -> None:

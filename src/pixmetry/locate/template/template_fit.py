@@ -231,4 +231,5 @@ def efficiency(sigma_e: float) -> np.ndarray:
     density = poisson @ read
     along = (poisson * n) @ read
     information = (np.where(density > 1e-290, along**2 / np.maximum(density, 1e-290), 0.0).sum(axis=1) * step) / mean**2 - 1
-    return information * (mean + sigma**2)
+    efficiency: np.ndarray = information * (mean + sigma**2)
+    return efficiency

@@ -155,7 +155,7 @@ def axes_of(parameters: Mapping[str, float]) -> tuple[float, float, float]:
 
 def line_length_px(images: Images) -> float:
     """Length over which a line is seen: pixels over the window's width."""
-    return images.mean.shape[1] / images.window_px
+    return float(images.mean.shape[1] / images.window_px)
 
 
 def _line_images(kind: str, parameters: Mapping[str, float], aperture: float, window: int | None, places: np.ndarray) -> Images:
