@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,30 @@ EXCESS, AMPLITUDE = 21, 22
 COLUMNS = 23
 SHARP_PX = 0.6  # blur, pixel included, below which the pixel's square shape matters
 SUMS = {"reassoc", "contract", "nsz"}  # sums may be taken in any order, so that they fill the vector registers
+
+
+class Response(NamedTuple):
+    """What a law makes of the grey values of one round target."""
+
+    law: int
+    threshold: float  # DN above the background
+    amplitude: float  # height over the background, DN, above 0
+    sign: float  # 1 bright, −1 dark
+    level: float  # of the background, DN
+    noise: Noise
+    spread: float  # standard deviation of the Gaussian window, px
+
+
+class Tables(NamedTuple):
+    """What integrals over a round target, and over the phase within the pixel, have in common."""
+
+    nodes: Array  # of a quadrature over −1 … 1, shape (q,)
+    weights: Array
+    step: float  # from radius to radius of a profile, px
+    shells: Array  # moduli of the pixel lattice's frequencies, shape (m,), 1/px
+    many: Array  # how many frequencies have each
+    bessel2: Array  # J₂(2π · shell · radius), shape (m, radii)
+    neumann2: Array  # Y₂ of the same
 
 
 @jit(inline="always")
@@ -465,22 +490,7 @@ def disc_profile(radius: float, blur: float, nodes: Array, weights: Array, step:
 
 
 @jit
-def best_thresholds(
-    shape: Array,
-    first: int,
-    stop: int,
-    law: int,
-    multiples: Array,
-    noise: Noise,
-    nodes: Array,
-    weights: Array,
-    step: float,
-    shells: Array,
-    many: Array,
-    bessel2: Array,
-    neumann2: Array,
-    out: Array,
-) -> None:
+def best_thresholds(shape: Array, first: int, stop: int, law: int, multiples: Array, noise: Noise, tables: Tables, out: Array) -> None:
     """Choose for classes first … stop of targets the threshold with the least variance from noise and sub-pixel phase together.
 
     ``shape`` (classes, 7): radius, blur, amplitude, sign, background, window, spread of the Gaussian window. ``multiples``: thresholds in
@@ -489,9 +499,9 @@ def best_thresholds(
     """
     for i in range(first, stop):
         amplitude, sign, level = shape[i, 2], shape[i, 3], shape[i, 4]
-        n = min(max(int(shape[i, 5] / step), 8), bessel2.shape[1])
+        n = min(max(int(shape[i, 5] / tables.step), 8), tables.bessel2.shape[1])
         profile = np.empty(n)
-        disc_profile(shape[i, 0], shape[i, 1], nodes, weights, step, profile)
+        disc_profile(shape[i, 0], shape[i, 1], tables.nodes, tables.weights, tables.step, profile)
         top = profile[0]
         for j in range(n):
             profile[j] /= top
@@ -501,47 +511,32 @@ def best_thresholds(
             threshold = multiples[m] * deviation
             if m > 0 and threshold > 0.5 * amplitude:
                 break
-            phase, excess, random = phase_and_noise(
-                profile, law, threshold, amplitude, sign, level, noise, shape[i, 6], step, shells, many, bessel2, neumann2
-            )
+            response = Response(law, threshold, amplitude, sign, level, noise, shape[i, 6])
+            phase, excess, random = phase_and_noise(profile, response, tables)
             if phase + random < least:
                 least = phase + random
                 out[i, 0], out[i, 1], out[i, 2] = multiples[m], phase, excess / deviation**2
         if shape[i, 1] < SHARP_PX:
             # the square pixel counts: the phases of a radius and of one a quarter of a pixel larger, where S-curves of one cycle swing over
             pair = 0.0
+            best = Response(law, out[i, 0] * deviation, amplitude, sign, level, noise, shape[i, 6])
             for size in range(2):
-                pair += square_pixel_variance(
-                    shape[i, 0] + 0.25 * size, shape[i, 1], law, out[i, 0] * deviation, amplitude, sign, level, noise,
-                    shape[i, 5], shape[i, 6], nodes, weights, step,
-                )  # fmt: skip
+                pair += square_pixel_variance(shape[i, 0] + 0.25 * size, shape[i, 1], best, shape[i, 5], tables)
             out[i, 1] = pair
         if law in (SQUARED, WINDOWED):
             out[i, 1] *= 0.5  # the mean over radii; a threshold's depends on the outline so finely that the most is taken
 
 
 @jit
-def phase_and_noise(
-    profile: Array,
-    law: int,
-    threshold: float,
-    amplitude: float,
-    sign: float,
-    level: float,
-    noise: Noise,
-    spread: float,
-    step: float,
-    shells: Array,
-    many: Array,
-    bessel2: Array,
-    neumann2: Array,
-) -> tuple[float, float, float]:
+def phase_and_noise(profile: Array, response: Response, tables: Tables) -> tuple[float, float, float]:
     """Return the variance over the sub-pixel phase, the noise sum Σ (x − x̂)² (Var f − f'² σ²), and the noise variance of a round target.
 
     With h(r) the mean of f at a radius, noise included, Poisson's sum gives an error of 2 S(q) sin(2π k·c) k/|k| / ∫h for each pair ±k of
     the lattice's frequencies, q = |k|, S(q) = ∫ x h sin(2πqx) = −(1/q) ∫ h'(r) r² J2(2πqr) dr. S swings with the radius like a cosine; the
     modulus of J2 + iY2 in its place is the most that it can be near this radius. The pixel counts as a part of a Gaussian blur.
     """
+    law, threshold, amplitude, sign, level, noise, spread = response
+    step, shells, many, bessel2, neumann2 = tables.step, tables.shells, tables.many, tables.bessel2, tables.neumann2
     n = profile.shape[0]
     mean = np.empty(n)
     total, exact, linear, pull = 0.0, 0.0, 0.0, 0.0
@@ -587,15 +582,14 @@ def phase_and_noise(
 
 
 @jit(inline="always")
-def mean_response(
-    value: float, radius2: float, law: int, threshold: float, sign: float, level: float, noise: Noise, spread: float
-) -> float:
+def mean_response(value: float, radius2: float, response: Response) -> float:
     """Mean of f over the noise at a mean grey value; for the Gaussian window times its weight."""
+    law, threshold = response.law, response.threshold
     if law == SQUARED:
         return value * value
     if law == WINDOWED:
-        return value * math.exp(-0.5 * radius2 / (spread * spread))
-    s = math.sqrt(max(variance_at(level + sign * value, noise), 1e-12))
+        return value * math.exp(-0.5 * radius2 / (response.spread * response.spread))
+    s = math.sqrt(max(variance_at(response.level + response.sign * value, response.noise), 1e-12))
     z = (value - threshold) / s
     if z > 8.0:
         share, density = 1.0, 0.0
@@ -608,27 +602,14 @@ def mean_response(
 
 
 @jit
-def square_pixel_variance(
-    radius: float,
-    blur: float,
-    law: int,
-    threshold: float,
-    amplitude: float,
-    sign: float,
-    level: float,
-    noise: Noise,
-    window: float,
-    spread: float,
-    nodes: Array,
-    weights: Array,
-    step: float,
-) -> float:
+def square_pixel_variance(radius: float, blur: float, response: Response, window: float, tables: Tables) -> float:
     """Variance over the phase along x of a disc averaged over square pixels: S(k) = ∬ x h sin(2πk x) cos(2πl y) on a grid of eighths."""
+    law, amplitude, spread, step = response.law, response.amplitude, response.spread, tables.step
     optical = math.sqrt(max(blur * blur - 1.0 / 12.0, 0.01))
     n = int(window / step) + 1
     wide = n + 4
     profile = np.empty(int(1.5 * wide) + 2)
-    disc_profile(radius, optical, nodes, weights, step, profile)
+    disc_profile(radius, optical, tables.nodes, tables.weights, step, profile)
     sharp, flat = np.empty((wide, wide)), np.empty((wide, n))
     for a in range(wide):
         for b in range(wide):
@@ -660,7 +641,7 @@ def square_pixel_variance(
             radius2 = float(a * a + b * b) * step * step
             if radius2 > window * window:
                 break
-            h = mean_response(amplitude * value / top, radius2, law, threshold, sign, level, noise, spread)
+            h = mean_response(amplitude * value / top, radius2, response)
             times = 1.0 if b == 0 else 2.0
             line += times * h * (1.0 - radius2 / (2.0 * spread * spread) if law == WINDOWED else 1.0)
             x = 2.0 * b * step * h

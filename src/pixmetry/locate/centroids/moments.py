@@ -230,7 +230,7 @@ def _phase_variance(work: Prepared, law: int, threads: int | None) -> np.ndarray
     out = np.zeros((len(shape), 3))
     multiples = MULTIPLES if law in (k.SOFT, k.HARD) else np.zeros(1)
     tables = _tables()
-    run_slices(lambda a, b: k.best_thresholds(shape, a, b, law, multiples, work.noise, *tables, out), len(shape), threads)
+    run_slices(lambda a, b: k.best_thresholds(shape, a, b, law, multiples, work.noise, tables, out), len(shape), threads)
     record[:, k.THRESHOLD] = np.minimum(out[of, 0] * deviation, 0.5 * work.amplitude)
     record[:, k.EXCESS] = out[of, 2]
     phase: np.ndarray = out[of, 1]
@@ -253,7 +253,7 @@ def _centroid_phase_variance(radius: np.ndarray, blur: np.ndarray) -> np.ndarray
 
 
 @lru_cache(1)
-def _tables() -> tuple[np.ndarray, np.ndarray, float, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _tables() -> k.Tables:
     """Quadrature nodes, step, the lattice's frequencies by distance with their number, and J2, Y2 between the steps."""
     from scipy.special import jv, yn
 
@@ -261,9 +261,9 @@ def _tables() -> tuple[np.ndarray, np.ndarray, float, np.ndarray, np.ndarray, np
     grid = np.arange(-4, 5)
     squares, many = np.unique(np.add.outer(grid**2, grid**2), return_counts=True)
     keep = (squares > 0) & (squares <= 16)
-    shells, many = np.sqrt(squares[keep]), many[keep].astype(float)
+    shells, count = np.sqrt(squares[keep]), many[keep].astype(float)
     z = 2 * math.pi * shells[:, None] * (np.arange(int(LARGEST_PX / STEP_PX)) + 1) * STEP_PX
-    return nodes, weights, STEP_PX, shells, many, jv(2, z), yn(2, z)
+    return k.Tables(nodes, weights, STEP_PX, shells, count, jv(2, z), yn(2, z))
 
 
 def equivalent_disc(half_height_px: np.ndarray, blur_px: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

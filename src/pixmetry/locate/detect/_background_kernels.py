@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,6 +19,14 @@ HALVINGS = 16
 MANY = 0.25  # share of a tile's pixels at an end of the scale from which on its background is taken as clipped there
 SWEEPS = 30  # of relaxation, over what is filled in
 SUM_FREELY = {"reassoc", "nsz"}  # a clipped sum is not sensitive to the order of its terms, and four times as fast in any order
+
+
+class Map(NamedTuple):
+    """Values at the middles of tiles, which a map joins."""
+
+    nodes: Array  # shape (rows, columns) of tiles
+    row_scale: float  # tiles per pixel along y
+    col_scale: float  # and along x
 
 
 @jit
@@ -273,8 +282,9 @@ def group_medians(values: Array, side: int) -> Array:
 
 
 @jit
-def map_at(nodes: Array, row_scale: float, col_scale: float, x: float, y: float) -> tuple[float, float, float]:
+def map_at(tiles: Map, x: float, y: float) -> tuple[float, float, float]:
     """Value and slopes along x and y of a map between the middles of its tiles, straight on beyond the outermost ones."""
+    nodes, row_scale, col_scale = tiles
     rows, cols = nodes.shape
     v, u = (y + 0.5) * row_scale - 0.5, (x + 0.5) * col_scale - 0.5
     i = min(max(int(math.floor(v)), 0), max(rows - 2, 0))
@@ -288,9 +298,9 @@ def map_at(nodes: Array, row_scale: float, col_scale: float, x: float, y: float)
 
 
 @jit
-def map_values(nodes: Array, row_scale: float, col_scale: float, x: Array, y: Array) -> Array:
+def map_values(tiles: Map, x: Array, y: Array) -> Array:
     """`map_at` for arrays; shape (3, n)."""
     out = np.empty((3, len(x)))
     for i in range(len(x)):
-        out[0, i], out[1, i], out[2, i] = map_at(nodes, row_scale, col_scale, x[i], y[i])
+        out[0, i], out[1, i], out[2, i] = map_at(tiles, x[i], y[i])
     return out

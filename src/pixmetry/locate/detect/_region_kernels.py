@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from pixmetry.core.arrays import Array, Flags, Ints, Singles
 from pixmetry.core.jit import jit
-from pixmetry.locate.detect._background_kernels import map_at
+from pixmetry.locate.detect._background_kernels import Map, map_at
 from pixmetry.locate.detect._detect_kernels import RUN, Runs, doubled, group_runs, join_runs
 
 STRETCH = 32  # pixels over which the background is taken as straight
@@ -23,8 +24,28 @@ FIELDS = 17  # of a target: see `describe` and `measure_regions`
 BORDER, SATURATED, CLIPPED, OVERLAPPING = 1, 2, 4, 16  # of `targets.Flag`
 
 
+class GroupedRuns(NamedTuple):
+    """Runs of pixels, region by region."""
+
+    runs: Runs  # shape (n, RUN)
+    start: Ints  # region g has runs[start[g]:start[g + 1]]
+
+
+class Outlines(NamedTuple):
+    """Targets as they were found, arrays of shape (n,)."""
+
+    x: Array  # px
+    y: Array
+    major: Array  # half axes, px
+    minor: Array
+    angle: Array  # degrees
+    blur: Array  # px
+    amplitude: Array  # DN
+    box: Ints  # shape (n, 4): first and stop row, first and stop column
+
+
 @jit
-def heights(frame: np.ndarray, nodes: Array, row_scale: float, col_scale: float, runs: Runs, out: Singles) -> int:
+def heights(frame: np.ndarray, ground: Map, runs: Runs, out: Singles) -> int:
     """How far the pixels of the runs lie beyond the background, on the runs' side of it; and where in ``out`` each run's are."""
     n = 0
     for i in range(len(runs)):
@@ -32,7 +53,7 @@ def heights(frame: np.ndarray, nodes: Array, row_scale: float, col_scale: float,
         runs[i, 4] = n
         for begin in range(runs[i, 1], runs[i, 2], STRETCH):
             end = min(begin + STRETCH, runs[i, 2])
-            value, slope_x, _ = map_at(nodes, row_scale, col_scale, float(begin), float(r))
+            value, slope_x, _ = map_at(ground, float(begin), float(r))
             level, slope = np.float32(value), np.float32(slope_x)
             row, height = frame[r, begin:end], out[n : n + end - begin]
             for c in range(len(row)):
@@ -251,20 +272,9 @@ def summits(runs: Runs, height: Singles, n: int, least: float, seed: float, leas
 
 
 @jit
-def smooth_heights(
-    frame: np.ndarray,
-    nodes: Array,
-    row_scale: float,
-    col_scale: float,
-    sign: int,
-    first_row: int,
-    stop_row: int,
-    first_col: int,
-    stop_col: int,
-    runs: Runs,
-    out: Singles,
-) -> None:
+def smooth_heights(frame: np.ndarray, ground: Map, sign: int, box: tuple[int, int, int, int], runs: Runs, out: Singles) -> None:
     """Heights of a window in the mean of 3 × 3 pixels, and its rows as runs."""
+    first_row, stop_row, first_col, stop_col = box
     wide = stop_col - first_col
     for r in range(first_row, stop_row):
         i = r - first_row
@@ -275,13 +285,11 @@ def smooth_heights(
                 for x in range(max(c - 1, 0), min(c + 2, frame.shape[1])):
                     total += float(frame[y, x])
                     n += 1
-            out[i * wide + c - first_col] = sign * (total / n - map_at(nodes, row_scale, col_scale, float(c), float(r))[0])
+            out[i * wide + c - first_col] = sign * (total / n - map_at(ground, float(c), float(r))[0])
 
 
 @jit
-def add_faint(
-    frame: np.ndarray, nodes: Array, row_scale: float, col_scale: float, region: Runs, out: Array, found: int
-) -> tuple[Array, int]:
+def add_faint(frame: np.ndarray, ground: Map, region: Runs, out: Array, found: int) -> tuple[Array, int]:
     """Measure a region whose half height is in the noise: with smoothed heights, in a window that grows until it contains the region."""
     rows, cols = frame.shape
     first_row, stop_row, first_col, stop_col = region[0, 0], region[len(region) - 1, 0] + 1, region[0, 1], region[0, 2]
@@ -294,7 +302,7 @@ def add_faint(
         a, b = max(first_row - grown, 0), min(stop_row + grown, rows)
         c, d = max(first_col - grown, 0), min(stop_col + grown, cols)
         window, height = np.empty((b - a, RUN), np.int32), np.empty((b - a) * (d - c), np.float32)
-        smooth_heights(frame, nodes, row_scale, col_scale, region[0, 3], a, b, c, d, window, height)
+        smooth_heights(frame, ground, region[0, 3], (a, b, c, d), window, height)
         own = region.copy()
         for i in range(len(own)):
             own[i, 4] = (own[i, 0] - a) * (d - c) + own[i, 1] - c
@@ -330,23 +338,14 @@ def around(runs: Runs, middle: Runs) -> Runs:
 
 @jit
 def measure_regions(
-    frame: np.ndarray,
-    nodes: Array,
-    least: Array,
-    row_scale: float,
-    col_scale: float,
-    runs: Runs,
-    start: Ints,
-    first: int,
-    stop: int,
-    least_area: int,
-    low_dn: float,
-    high_dn: float,
+    frame: np.ndarray, regions: GroupedRuns, least: Map, ground: Map, span: tuple[int, int], least_area: int, ends: tuple[float, float]
 ) -> Array:
-    """Targets of the regions first … stop, shape (n, FIELDS): what `describe` says, then flags, sign and region.
+    """Targets of the regions ``span[0]`` to ``span[1]``, shape (n, FIELDS): what `describe` says, then flags, sign and region.
 
     ``least`` is the map of the threshold's height; a region counts if it has ``least_area`` pixels and its top is SEED times as high.
+    ``ends``: grey values at which the scale ends.
     """
+    (runs, start), (first, stop) = regions, span
     most_pixels = 0
     for g in range(first, stop):
         most_pixels = max(most_pixels, np.sum(runs[start[g] : start[g + 1], 2] - runs[start[g] : start[g + 1], 1]))
@@ -360,15 +359,15 @@ def measure_regions(
             area += region[i, 2] - region[i, 1]
         if area < least_area:
             continue
-        n = heights(frame, nodes, row_scale, col_scale, region, height)
+        n = heights(frame, ground, region, height)
         most, top = top_of(region, height)
-        low = max(map_at(least, row_scale, col_scale, float(region[0, 1]), float(region[0, 0]))[0], LEAST_LEVEL)
+        low = max(map_at(least, float(region[0, 1]), float(region[0, 0]))[0], LEAST_LEVEL)
         if most < SEED * low:
             continue
         born = found
         level = 0.5 * top
         if level < low:
-            out, found = add_faint(frame, nodes, row_scale, col_scale, region, out, born)
+            out, found = add_faint(frame, ground, region, out, born)
         else:
             parts = table[: cut_runs(region, height, level, table)]
             separate, holes = count_joined(parts, parent, touches)
@@ -381,7 +380,7 @@ def measure_regions(
                 out, found = summits(region, height, n, low, SEED * low, least_area, out, born)
         for k in range(born, found):
             several = found - born > 1 or (level >= low and waisted(out[k]))
-            out[k, 14] = state(frame, out[k], 2, low_dn, high_dn) | (OVERLAPPING if several else 0)
+            out[k, 14] = state(frame, out[k], 2, ends[0], ends[1]) | (OVERLAPPING if several else 0)
             out[k, 15], out[k, 16] = region[0, 3], g
     return out[:found]
 
@@ -405,14 +404,13 @@ def simple(region: Runs, target: Array) -> bool:
 
 
 @jit
-def spurious(
-    x: Array, y: Array, major: Array, minor: Array, angle: Array, blur: Array, amplitude: Array, box: Ints, start: Ints, index: Ints
-) -> Flags:
+def spurious(targets: Outlines, start: Ints, index: Ints) -> Flags:
     """Targets that are another one's doing: the same one found twice, the halo of a sharpened edge, the ringing of a compressed one.
 
     ``start`` and ``index`` say which targets are near each other. A halo has the other sign, less than HALO of the height, and lies at the
     edge; ringing has less than RINGING of the height and lies within REACH pixels, a block of the coder.
     """
+    x, y, major, minor, angle, blur, amplitude, box = targets
     drop = np.zeros(len(x), np.bool_)
     for i in range(len(x)):
         for k in range(start[i], start[i + 1]):

@@ -60,10 +60,10 @@ class Background:
         return self.at(x.ravel(), y.ravel())[0].reshape(self.shape)
 
     def _map(self, nodes: np.ndarray, x_px: np.ndarray, y_px: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        from pixmetry.locate.detect._background_kernels import map_values
+        from pixmetry.locate.detect._background_kernels import Map, map_values
 
         x, y = (np.atleast_1d(np.asarray(a, float)) for a in (x_px, y_px))
-        value, slope_x, slope_y = map_values(nodes, *self.scales, x, y)
+        value, slope_x, slope_y = map_values(Map(nodes, *self.scales), x, y)
         return value, slope_x, slope_y
 
 

@@ -113,8 +113,9 @@ def detect(
     What others cause is left out: less than 0.4 of another target's height, on the other side of the background and at its edge (the halo
     of a sharpening filter), or less than 0.08 of it within 12 pixels (stray light, and ringing in a coder's block).
     """
+    from pixmetry.locate.detect._background_kernels import Map
     from pixmetry.locate.detect._detect_kernels import find_runs, group_runs
-    from pixmetry.locate.detect._region_kernels import measure_regions
+    from pixmetry.locate.detect._region_kernels import GroupedRuns, measure_regions
 
     if polarity not in POLARITIES:
         raise InputError("no such polarity", value=polarity, allowed=", ".join(POLARITIES))
@@ -128,8 +129,9 @@ def detect(
     bands = bands_of(frame.shape[0], threads)
     runs, start = group_runs(np.concatenate(map_tiles(lambda b: find_runs(frame, low, high, *ground.scales, *b), bands, threads)))
     shares = np.searchsorted(start, np.linspace(0, len(runs), len(bands) + 1)).tolist()
+    regions, least, level = GroupedRuns(runs, start), Map(reach, *ground.scales), Map(ground.level_dn, *ground.scales)
     parts = map_tiles(
-        lambda b: measure_regions(frame, ground.level_dn, reach, *ground.scales, runs, start, *b, least_area_px, *ends),
+        lambda b: measure_regions(frame, regions, least, level, b, least_area_px, (ends[0], ends[1])),
         zip(shares[:-1], [*shares[1:-1], len(start) - 1], strict=True),
         threads,
     )
@@ -199,11 +201,12 @@ def _fits_box(targets: Regions) -> np.ndarray:
 
 def _genuine(targets: Regions) -> Regions:
     """Leave out false targets that other targets cause."""
-    from pixmetry.locate.detect._region_kernels import REACH, spurious
+    from pixmetry.locate.detect._region_kernels import REACH, Outlines, spurious
 
     t = targets
     box = np.stack([t.row_first, t.row_stop, t.col_first, t.col_stop], axis=1)
-    drop = spurious(t.x_px, t.y_px, t.semi_major_px, t.semi_minor_px, t.angle_deg, t.blur_px, t.amplitude_dn, box, *neighbours(t, REACH))
+    outlines = Outlines(t.x_px, t.y_px, t.semi_major_px, t.semi_minor_px, t.angle_deg, t.blur_px, t.amplitude_dn, box)
+    drop = spurious(outlines, *neighbours(t, REACH))
     return t[~drop] if drop.any() else t
 
 
