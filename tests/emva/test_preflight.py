@@ -8,7 +8,7 @@ import pytest
 
 from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.emva.planning.planning import plan_for
-from pixmetry.emva.planning.preflight import BrightLevel, _numbers, camera_from_preflight, preflight, preflight_text
+from pixmetry.emva.planning.preflight import BrightLevel, _numbers, camera_from_preflight, preflight, preflight_record, preflight_text
 from pixmetry.emva.planning.preflight_checks import Z
 
 SHAPE = (100, 140)
@@ -100,6 +100,10 @@ def test_black_level_too_low(rng: np.random.Generator) -> None:
     assert result["underflow"].value == pytest.approx(10.7, abs=1.5)
     assert result.verdict == "fail"
     assert "black level" in preflight_text(result)
+    finding = next(f for f in result.findings if f.kind == "underflow")
+    assert finding.level == "error" and finding.advice and finding.numbers["underflow"].value == result["underflow"].value
+    assert {f.kind for f in result.findings if f.level != "note"} == set(found(result))
+    assert preflight_record(result)["findings"] == [f.to_record() for f in result.findings]
 
 
 def test_exposure_wrong(rng: np.random.Generator) -> None:

@@ -54,3 +54,29 @@ class Finding:
         """The finding of its record; ``KeyError``, ``TypeError`` or ``ValueError`` where the record is none."""
         numbers = {name: Number.from_record(v) if isinstance(v, Mapping) else v for name, v in record.get("numbers", {}).items()}
         return cls(record["kind"], record["text"], record["advice"], record["level"], numbers)
+
+
+def sentence(text: str) -> str:
+    """A text with a capital at its beginning, unless that is a symbol or a name, and a full stop at its end.
+
+    Examples
+    --------
+    >>> sentence("the light drifts")
+    'The light drifts.'
+    """
+    if not text:
+        return ""
+    first = text[0] if text[1:2] == " " or text.split()[0].endswith(":") else text[0].upper()
+    return f"{first}{text[1:].rstrip('.')}."
+
+
+def finding_lines(finding: Finding) -> list[str]:
+    """A finding for a terminal: what was found, and below it what to do.
+
+    Examples
+    --------
+    >>> finding_lines(Finding("drift", "the light drifts", "Let the lamp warm up.", "warning"))
+    ['Warning: The light drifts.', '  To do: Let the lamp warm up.']
+    """
+    lines = [f"{finding.level.capitalize()}: {sentence(finding.text)}"]
+    return [*lines, f"  To do: {sentence(finding.advice)}"] if finding.advice else lines

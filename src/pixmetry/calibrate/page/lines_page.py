@@ -10,7 +10,8 @@ import numpy as np
 from pixmetry.calibrate.bundle.model import NAMES
 from pixmetry.calibrate.page.figures import correlation_map, curve_pictures, enlargement, frame, frame_height, length_key
 from pixmetry.calibrate.page.page import FOOTER, camera_facts, number_table, typeset_findings
-from pixmetry.calibrate.page.text import DIRECTIONS, TITLES, folded, length, p_text, sentence, symbol, typeset
+from pixmetry.calibrate.page.text import DIRECTIONS, TITLES, folded, length, p_text, symbol, typeset
+from pixmetry.core.finding import finding_lines, sentence
 from pixmetry.report import Answer, Figure, Page, Reading, Section, Text, html_of
 from pixmetry.report.drawing import BLUE, RED, SOFT, canvas
 from pixmetry.report.numbers import NO_BREAK, NONE, THIN, fixed, length_px, significant, uncertain
@@ -188,8 +189,7 @@ def summary_text(calibration: LineCalibration) -> str:
     if test is not None and not any(test.text == f.text for f in calibration.findings):
         lines += ["", sentence(test.text)]
     for finding in calibration.findings:
-        lines += ["", f"{'Warning' if finding.level == 'warning' else 'Note'}: {sentence(finding.text)}"]
-        lines += [f"  To do: {finding.advice}"] if finding.advice else []
+        lines += ["", *finding_lines(finding)]
     return "\n".join(part for line in lines for part in folded(line)).replace(NO_BREAK, " ").replace(THIN, " ")
 
 

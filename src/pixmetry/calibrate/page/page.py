@@ -17,12 +17,12 @@ from pixmetry.calibrate.page.text import (
     p_text,
     projection_levels,
     residual_record,
-    sentence,
     sigma0_text,
     symbol,
     typeset,
     worth,
 )
+from pixmetry.core.finding import sentence
 from pixmetry.report import Answer, Column, Figure, Page, Points, Reading, Row, Run, Section, Table, Text, html_of, strong
 from pixmetry.report.numbers import NONE, fixed, length_px, significant
 from pixmetry.report.page import LONG, Inline

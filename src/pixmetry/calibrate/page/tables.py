@@ -19,11 +19,11 @@ from pixmetry.calibrate.page.text import (
     parameter_records,
     placed,
     residual_record,
-    sentence,
     shown,
     symbol,
     typeset,
 )
+from pixmetry.core.finding import sentence
 from pixmetry.report.numbers import NO_BREAK, NONE, fixed, length_px, signed, significant, uncertain
 
 if TYPE_CHECKING:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
+from pixmetry.core.finding import finding_lines, sentence
 from pixmetry.report.numbers import (
     MINUS,
     NO_BREAK,
@@ -62,14 +63,6 @@ def typeset(text: str) -> str:
     """A sentence made for a terminal, with true minus signs and powers of ten."""
     text = re.sub(r"(\d)e([+-]?\d+)\b", lambda m: f"{m[1]}{THIN}×{THIN}10{str(int(m[2])).translate(SUPERSCRIPT)}", text)
     return re.sub(r"(?<![\w.⁻])-(?=\d)", MINUS, text)
-
-
-def sentence(text: str) -> str:
-    """A text with a capital at its beginning, unless that is a symbol or a name, and a full stop at its end."""
-    if not text:
-        return ""
-    first = text[0] if text[1:2] == " " or text.split()[0].endswith(":") else text[0].upper()
-    return f"{first}{text[1:].rstrip('.')}."
 
 
 def of_camera(test: Mapping[str, T] | None, camera: str) -> T | None:
@@ -228,10 +221,7 @@ def summary_text(calibration: Calibration) -> str:
     if calibration.tests.check_points is not None:
         lines += ["", sentence(calibration.tests.check_points.text)]
     for finding in calibration.findings:
-        mark = "Warning" if finding.level == "warning" else "Note"
-        lines += ["", f"{mark}: {sentence(finding.text)}"]
-        if finding.advice:
-            lines.append(f"  To do: {finding.advice}")
+        lines += ["", *finding_lines(finding)]
     return "\n".join(part for line in lines for part in folded(line)).replace(NO_BREAK, " ").replace(THIN, " ")
 
 

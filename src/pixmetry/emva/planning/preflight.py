@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pixmetry.core.errors import InputError, MeasureError
+from pixmetry.core.finding import Finding, finding_lines
 from pixmetry.emva.files.keys import FIT_RANGE, QUANTISATION_DN2
 from pixmetry.emva.planning.known_camera import KnownCamera
 from pixmetry.emva.planning.preflight_checks import (
@@ -57,6 +58,11 @@ class Preflight:
         worst = max((c.verdict for c in self.checks), key=VERDICTS.index)
         return "ok" if worst == "not judged" else worst
 
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What the checks found that are not ok."""
+        return tuple(c.finding for c in self.checks if c.finding is not None)
+
     def __getitem__(self, name: str) -> Check:
         return {c.name: c for c in self.checks}[name]
 
@@ -98,7 +104,8 @@ def preflight_record(result: Preflight) -> dict[str, Any]:
     """The checks as plain data, ready for JSON; ``null`` is a number that is not known."""
     checks = [{key: plain(item) for key, item in vars(c).items()} for c in result.checks]
     frames = {"dark": result.frames.dark.n_frames, "bright": [g.n_frames for g in result.frames.bright]}
-    return {"verdict": result.verdict, "frames": frames, "checks": checks}
+    findings = [finding.to_record() for finding in result.findings]
+    return {"verdict": result.verdict, "frames": frames, "checks": checks, "findings": findings}
 
 
 def preflight_text(result: Preflight) -> str:
@@ -109,9 +116,8 @@ def preflight_text(result: Preflight) -> str:
     for c in result.checks:
         value, spread = _numbers(c.value, c.u)
         lines.append(f"  {c.verdict:<11}{c.title:<44}{value:>9} {spread:<10}{c.unit:<6}{c.limit}")
-    for c in result.checks:
-        if c.reason:
-            lines += ["", f"{c.verdict}: {c.title}: {c.reason}." + (f" {c.remedy}." if c.remedy else "")]
+    for finding in result.findings:
+        lines += ["", *finding_lines(finding)]
     return "\n".join(lines) + "\n"
 
 

@@ -13,6 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from pixmetry.core.errors import InputError
+from pixmetry.core.finding import ERROR, NOTE, WARNING, Finding
+from pixmetry.core.number import Number
 from pixmetry.emva.files.keys import MINIMUM_DARK_VAR_DN2, SATURATED_FRACTION, UNDERFLOW_FRACTION
 from pixmetry.observe.moments import LevelAccumulator, MeanSquares, check_frame
 from pixmetry.observe.surface import Surface, cross_strata, fill, fit_surface
@@ -119,6 +121,7 @@ def _steps(difference: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 FALSE_ALARM = 1e-6  # of one check
 Z = 4.76  # the normal distribution is beyond it, on one side, with that probability
 NAN = math.nan
+LEVEL_OF = {"not judged": NOTE, "warn": WARNING, "fail": ERROR}
 
 
 @dataclass(frozen=True)
@@ -134,6 +137,14 @@ class Check:
     verdict: str
     reason: str = ""
     remedy: str = ""
+
+    @property
+    def finding(self) -> Finding | None:
+        """What was found; None where all is well."""
+        if self.verdict == "ok":
+            return None
+        number = Number(self.value, self.u, unit=self.unit or "1")
+        return Finding(self.name, f"{self.title}: {self.reason}", self.remedy, LEVEL_OF[self.verdict], {self.name: number})
 
 
 @dataclass(frozen=True)
