@@ -9,7 +9,8 @@ import numpy as np
 from pixmetry.emva.records import Measurement, Series
 from pixmetry.emva.series import light_of
 from pixmetry.emva.spatial.high_pass import passed_power
-from pixmetry.emva.spatial.spatial import SpatialInputs, spatial_variances
+from pixmetry.emva.spatial.spatial import spatial_variances
+from pixmetry.emva.spatial.spatial_inputs import SpatialInputs
 from pixmetry.emva.temporal import dark_line, linearity_line
 
 MAX_BINS = 256

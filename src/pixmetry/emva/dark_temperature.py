@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pixmetry.core.arrays import Array
 from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.core.number import Estimates, Number
 from pixmetry.core.progress import Progress
@@ -28,9 +29,9 @@ METHOD = "weighted least squares of µ_I(T) = µ_ref 2^((T − T_ref)/T_d) (EMVA
 
 
 def fit_dark_temperature(
-    temperature_c: np.ndarray,
-    dark_current: np.ndarray,
-    u: np.ndarray,
+    temperature_c: Array,
+    dark_current: Array,
+    u: Array,
     *,
     reference_c: float,
     unit: str = "e⁻/s",
@@ -94,7 +95,7 @@ def fit_dark_temperature(
     )
 
 
-def _checked(temperature_c: np.ndarray, dark_current: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _checked(temperature_c: Array, dark_current: Array, u: Array) -> tuple[Array, Array, Array]:
     """The three arrays as floats, or the reason why they cannot be fitted."""
     t, y, s = (np.asarray(values, dtype=float) for values in (temperature_c, dark_current, u))
     if not (t.ndim == 1 and t.shape == y.shape == s.shape):
@@ -107,7 +108,7 @@ def _checked(temperature_c: np.ndarray, dark_current: np.ndarray, u: np.ndarray)
     return t, y, s
 
 
-def check_temperatures(temperature_c: np.ndarray) -> None:
+def check_temperatures(temperature_c: Array) -> None:
     """Refuse temperatures from which no law can follow.
 
     Raises
@@ -134,13 +135,13 @@ def check_temperatures(temperature_c: np.ndarray) -> None:
         )
 
 
-def _model(t: np.ndarray, log_current: float, growth: float, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _model(t: Array, log_current: float, growth: float, s: Array) -> tuple[Array, Array]:
     """Currents by the law and their derivatives over u, shape (n, 2)."""
     model = np.exp(np.clip(log_current + growth * t, -700, 700))
     return model, np.stack([model, model * t], axis=1) / s[:, None]
 
 
-def _solve(t: np.ndarray, y: np.ndarray, s: np.ndarray) -> tuple[float, float]:
+def _solve(t: Array, y: Array, s: Array) -> tuple[float, float]:
     """Logarithm of the current at t = 0 and its growth: the growth by search, the current in closed form, then Gauss and Newton.
 
     For a given growth b the law is linear in its factor A: A = Σ w y e^(bt)/Σ w e^(2bt), and what is left is smallest where
@@ -163,7 +164,7 @@ def _solve(t: np.ndarray, y: np.ndarray, s: np.ndarray) -> tuple[float, float]:
     return log_current, growth
 
 
-def law_at(fit: Estimates, temperature_c: np.ndarray, *, reference_c: float) -> np.ndarray:
+def law_at(fit: Estimates, temperature_c: Array, *, reference_c: float) -> Array:
     """Dark current by the law, shape as ``temperature_c``, in the unit of the fit.
 
     Parameters
@@ -175,7 +176,8 @@ def law_at(fit: Estimates, temperature_c: np.ndarray, *, reference_c: float) -> 
         That of the fit.
     """
     at, step = fit.select(["dark_current_ref", "doubling_temperature_k"]).values
-    return at * 2.0 ** ((np.asarray(temperature_c, dtype=float) - reference_c) / step)
+    law: Array = at * 2.0 ** ((np.asarray(temperature_c, dtype=float) - reference_c) / step)
+    return law
 
 
 def dark_current_law(
@@ -263,7 +265,7 @@ def _current(sheet: DataSheet, campaign: Campaign) -> Number:
     return found
 
 
-def _with_law(sheet: DataSheet, temperature_c: np.ndarray, currents: Sequence[Number]) -> tuple[DataSheet, Estimates]:
+def _with_law(sheet: DataSheet, temperature_c: Array, currents: Sequence[Number]) -> tuple[DataSheet, Estimates]:
     """Fit the dark currents against temperature, and add values, curve and a note to the sheet of the first temperature."""
     current, u = np.array([v.value for v in currents]), np.array([v.u for v in currents])
     reference_c = float(temperature_c[0])

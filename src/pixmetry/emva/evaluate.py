@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from numpy.random import Generator
 
 from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.core.number import ONE_SIDED_95, TWO_SIDED_95, UPPER_LIMIT, VALUE, Number
-from pixmetry.core.random import Generator, generator
+from pixmetry.core.random import generator
 from pixmetry.core.threads import map_tiles, single_threaded_blas
 from pixmetry.emva.curves import dark_signal, spatial_curves, temporal_curves
 from pixmetry.emva.dark_noise import DarkNoise, pattern_limit_dn2
@@ -72,9 +74,14 @@ def evaluate(m: Measurement, release: str, *, draws: int = 4000) -> Results:
     """
     _check_release(release)
     with single_threaded_blas():
-        standard, beside = map_tiles(lambda job: job(), (lambda: _by_release(m, release, draws), lambda: _nonlinear(m, release)))
+        parts: tuple[Callable[[], Results], ...] = (lambda: _by_release(m, release, draws), lambda: _nonlinear(m, release))
+        standard, beside = map_tiles(_call, parts)
     notes = tuple(dict.fromkeys((*m.notes, *standard.notes, *beside.notes)))
     return replace(standard, values={**standard.values, **beside.values}, notes=notes)
+
+
+def _call(job: Callable[[], Results]) -> Results:
+    return job()
 
 
 def standard_values(m: Measurement, release: str, *, draws: int = 4000) -> Results:

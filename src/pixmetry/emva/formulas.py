@@ -7,6 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
+from pixmetry.core.arrays import Array
 from pixmetry.core.errors import MeasureError, PixmetryError
 from pixmetry.emva.files.keys import KEYS, OVER_TEMPERATURES
 from pixmetry.emva.general.general import general_evaluation
@@ -18,7 +19,7 @@ from pixmetry.emva.spatial.spatial import snr_total_max, spatial_evaluation
 from pixmetry.emva.spatial.spatial_inputs import SpatialInputs
 from pixmetry.emva.temporal import dark_line, temporal_values
 
-Values = dict[str, np.ndarray]
+Values = dict[str, Array]
 DARK_VARIANCE = "dark_variance"  # at zero exposure, DN², not held at its least
 
 
@@ -54,12 +55,12 @@ class Formulas:
         return make_plan(self.series)
 
     @property
-    def vectors(self) -> tuple[np.ndarray, np.ndarray]:
+    def vectors(self) -> tuple[Array, Array]:
         """The measured statistics of the dark and the bright stack; empty without stacks."""
         return (np.zeros(0), np.zeros(0)) if self.stacks is None else (self.stacks[0].vector, self.stacks[1].vector)
 
     def at(
-        self, series: Series, dark_vectors: np.ndarray, bright_vectors: np.ndarray, general: Series | None = None
+        self, series: Series, dark_vectors: Array, bright_vectors: Array, general: Series | None = None
     ) -> tuple[Values, Values]:
         """Values by key, and for those that are roots of a variance that may be negative, that variance (``DARK_VARIANCE``: of the dark).
 

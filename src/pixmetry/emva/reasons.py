@@ -361,7 +361,7 @@ def _swept_dark_current(series: Series, plan: Plan) -> tuple[str, ...]:
     Of y = f(N + D t) − f(D t) over the photons, the second term takes the slope of the dark mean off that of f at constant exposure.
     """
     curve, slope = general_curve(plan), float(dark_line(series)[1])
-    if "photons" not in curve or math.isnan(slope):
+    if series.photons is None or math.isnan(slope):
         return ()
     last = int(np.argmax(series.photons))
     share = slope * series.exposure_s[last] / float(curve["photons"][-1]) / float(curve["slope"][-1])

@@ -6,9 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
-
 from pixmetry.camera.observations import PhotonTransfer, StackMoments
+from pixmetry.core.arrays import Array
 from pixmetry.core.number import Number
 
 RELEASES = ("4.0", "3.1", "reference")
@@ -23,10 +22,10 @@ class FrameProducts:
     (L,), the frame means. ``high_passed`` holds the same of frames from which the illumination was taken (R4.0 §8.1).
     """
 
-    pixel_dn2: np.ndarray
-    row_dn2: np.ndarray
-    col_dn2: np.ndarray
-    means_dn: np.ndarray
+    pixel_dn2: Array
+    row_dn2: Array
+    col_dn2: Array
+    means_dn: Array
     high_passed: FrameProducts | None = None
 
 
@@ -53,20 +52,20 @@ class Series:
     Arrays of measured values have shape (..., levels): leading axes are draws of a simulation or of a bootstrap.
     """
 
-    exposure_s: np.ndarray
-    photons: np.ndarray | None
-    mean_dn: np.ndarray
-    var_dn2: np.ndarray  # temporal
-    spatial_var_dn2: np.ndarray  # of the image behind the noise, from two frames (R4.0 eq. 32)
-    dark_mean_dn: np.ndarray  # of the dark level with the exposure of the bright one
-    dark_var_dn2: np.ndarray
-    dark_spatial_var_dn2: np.ndarray
-    fraction_min: np.ndarray  # share of pixels at the lowest code
-    fraction_max: np.ndarray
+    exposure_s: Array
+    photons: Array | None
+    mean_dn: Array
+    var_dn2: Array  # temporal
+    spatial_var_dn2: Array  # of the image behind the noise, from two frames (R4.0 eq. 32)
+    dark_mean_dn: Array  # of the dark level with the exposure of the bright one
+    dark_var_dn2: Array
+    dark_spatial_var_dn2: Array
+    fraction_min: Array  # share of pixels at the lowest code
+    fraction_max: Array
     # the dark series by itself, shape (..., dark levels)
-    dark_exposure_s: np.ndarray
-    own_dark_mean_dn: np.ndarray
-    own_dark_var_dn2: np.ndarray
+    dark_exposure_s: Array
+    own_dark_mean_dn: Array
+    own_dark_var_dn2: Array
 
 
 @dataclass(frozen=True)
@@ -75,7 +74,7 @@ class Results:
 
     release: str
     values: Mapping[str, Number]
-    curves: Mapping[str, Mapping[str, np.ndarray]] = field(default_factory=dict)
+    curves: Mapping[str, Mapping[str, Array]] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     channel: str = MONO
 

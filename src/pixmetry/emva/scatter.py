@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pixmetry.camera.observations import LevelMoments
+from pixmetry.core.arrays import Array, Flags
 from pixmetry.core.errors import MeasureError
 from pixmetry.emva.general.response import ScatterFit, fit_scatter
 from pixmetry.emva.linear_model import following, is_curved
@@ -50,23 +51,23 @@ class Scatter:
     """
 
     centre: Series
-    weights: np.ndarray  # of the dark levels for each bright one
-    u_light: np.ndarray
-    light_slope: np.ndarray
-    u_variance: np.ndarray
-    u_spatial: np.ndarray
-    spatial_share: np.ndarray
-    own_dark_spatial_dn2: np.ndarray
-    u_dark_spatial: np.ndarray
-    dark_spatial_share: np.ndarray
-    u_dark_mean: np.ndarray
-    u_dark_variance: np.ndarray
-    z_light: np.ndarray
-    z_variance: np.ndarray
-    z_dark_mean: np.ndarray
-    z_dark_variance: np.ndarray
+    weights: Array  # of the dark levels for each bright one
+    u_light: Array
+    light_slope: Array
+    u_variance: Array
+    u_spatial: Array
+    spatial_share: Array
+    own_dark_spatial_dn2: Array
+    u_dark_spatial: Array
+    dark_spatial_share: Array
+    u_dark_mean: Array
+    u_dark_variance: Array
+    z_light: Array
+    z_variance: Array
+    z_dark_mean: Array
+    z_dark_variance: Array
     wave_dn2: float  # scatter of the dark variances beyond sampling, where the dark levels themselves show it
-    pixels: np.ndarray  # of a level, all frames together, shape (levels,)
+    pixels: Array  # of a level, all frames together, shape (levels,)
     dof: dict[str, float]
 
 
@@ -161,19 +162,20 @@ def scatter_of(m: Measurement, series: Series) -> Scatter:
     )
 
 
-def unsaturated(series: Series) -> np.ndarray:
+def unsaturated(series: Series) -> Flags:
     """Levels below both the top code and the maximum of the variance, shape (levels,), bool.
 
     Of a camera that is not linear at all the variance tells no end: its response does.
     """
-    below = series.fraction_max <= USABLE_FRACTION
+    below: Flags = series.fraction_max <= USABLE_FRACTION
     if is_curved(series):
-        return below & following(series)
+        below &= following(series)
+        return below
     peak = int(np.argmax(np.where(below, series.var_dn2, -np.inf)))
     return below & (np.arange(below.size) <= peak)
 
 
-def sampling_u(levels: LevelMoments, shape: tuple[int, int]) -> np.ndarray:
+def sampling_u(levels: LevelMoments, shape: tuple[int, int]) -> Array:
     """Standard deviation of the temporal variances by sampling alone, DN², shape (levels,).
 
     The variance is made of three independent mean squares with (M−1)(N−1), M−1 and N−1 degrees of freedom for each frame beyond the first;
@@ -189,15 +191,16 @@ def sampling_u(levels: LevelMoments, shape: tuple[int, int]) -> np.ndarray:
     )
     variance = sum((size * lines * ms / (rows * cols)) ** 2 * (2 + kurtosis) / (lines * more) for ms, lines, size, kurtosis in parts)
     # one pixel that toggled once: no variance is known better than to that
-    return np.hypot(np.sqrt(variance), (levels.fraction_max < 1) / (rows * cols * levels.n_frames))
+    u: Array = np.hypot(np.sqrt(variance), (levels.fraction_max < 1) / (rows * cols * levels.n_frames))
+    return u
 
 
 @dataclass(frozen=True)
 class _Curve:
     """A smooth curve of means: values, standardised residuals, degrees of freedom, and the relative scatter of the light."""
 
-    values: np.ndarray
-    z: np.ndarray
+    values: Array
+    z: Array
     dof: float
     excess: float = 0.0
 
@@ -225,7 +228,7 @@ def _dark_mean(m: Measurement, series: Series, dark: LevelMoments) -> tuple[_Cur
     return _Curve(fitted, residuals, dof), wander, dof
 
 
-def _light(series: Series, bright: LevelMoments, signal: np.ndarray, used: np.ndarray, sigma: np.ndarray, wander: float) -> _Curve:
+def _light(series: Series, bright: LevelMoments, signal: Array, used: Flags, sigma: Array, wander: float) -> _Curve:
     """Smooth signal over the light, at the fitted levels, and the relative scatter of the light."""
     known = light_of(series)
     y = signal[used]
@@ -242,7 +245,7 @@ def _light(series: Series, bright: LevelMoments, signal: np.ndarray, used: np.nd
     return _Curve(scatter.fit.values, scatter.standardised, scatter.dof, scatter.excess)
 
 
-def _finer(series: Series, light: np.ndarray) -> np.ndarray:
+def _finer(series: Series, light: Array) -> Array:
     """The light; by exposure where the photons are proportional to it, since they are often rounded."""
     if series.photons is None or not exposure_varies(series.exposure_s):
         return light
@@ -250,7 +253,7 @@ def _finer(series: Series, light: np.ndarray) -> np.ndarray:
     return series.exposure_s if np.all(np.abs(light - ratio * series.exposure_s) <= np.maximum(1.0, 1e-3 * light)) else light
 
 
-def _dark_variance(series: Series, sampled: np.ndarray, bright: ScatterFit) -> ScatterFit:
+def _dark_variance(series: Series, sampled: Array, bright: ScatterFit) -> ScatterFit:
     """Line of the dark variance over exposure; few levels scatter beyond sampling as the bright ones do."""
     t, y = series.dark_exposure_s, series.own_dark_var_dn2
     degree = 1 if count_exposures(t) >= MINIMUM_EXPOSURES else 0
@@ -260,14 +263,14 @@ def _dark_variance(series: Series, sampled: np.ndarray, bright: ScatterFit) -> S
     return ScatterFit(found.fit, bright.excess, np.hypot(sampled, bright.excess * y), bright.dof)
 
 
-def _light_share(light: np.ndarray, u_light: np.ndarray) -> np.ndarray:
+def _light_share(light: Array, u_light: Array) -> Array:
     """Share of a level's deviation that is due to the light, the rest being wander of the black level: regression of one on both."""
     return np.divide(light**2, u_light**2, out=np.zeros_like(light), where=u_light > 0)
 
 
 def spatial_scatter(
-    levels: LevelMoments, shape: tuple[int, int], u_var: np.ndarray, wave_dn2: np.ndarray | float = 0.0
-) -> tuple[np.ndarray, np.ndarray]:
+    levels: LevelMoments, shape: tuple[int, int], u_var: Array, wave_dn2: Array | float = 0.0
+) -> tuple[Array, Array]:
     """How the spatial variance of a level scatters by the noise of its F frames, beside what goes with its temporal variance.
 
     It is the mean of ⟨y_k y_l⟩ − µ_k µ_l over the pairs of frames: Var = 4 s²σ²/(F n) + 2 σ⁴/(F (F − 1) n), for pixels, rows and columns.
@@ -291,5 +294,5 @@ def spatial_scatter(
     return np.sqrt(np.maximum(4 * pattern * white / (frames * pixels) + common - share**2 * u_var**2, 0.0)), share
 
 
-def _sorted(levels: LevelMoments, order: np.ndarray) -> LevelMoments:
+def _sorted(levels: LevelMoments, order: Array) -> LevelMoments:
     return replace(levels, **{k: v[order] for k, v in vars(levels).items() if v is not None})

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from pixmetry.camera.observations import LevelMoments
+from pixmetry.core.arrays import Array, Flags
 from pixmetry.core.errors import MeasureError
 from pixmetry.emva.files.keys import EQUAL_EXPOSURE
 from pixmetry.emva.records import Measurement, Series
@@ -47,8 +48,9 @@ def series_of(m: Measurement) -> Series:
     hot = min(float(dark.fraction_max.max()), 0.5)
     weights = pairing(bright.exposure_s[b], dark.exposure_s[d])
 
-    def beside(values: np.ndarray) -> np.ndarray:
-        return weights @ values[d]
+    def beside(values: Array) -> Array:
+        found: Array = weights @ values[d]
+        return found
 
     return Series(
         exposure_s=bright.exposure_s[b],
@@ -82,12 +84,12 @@ def dark_order(dark: LevelMoments) -> np.ndarray:
     return np.argsort(dark.exposure_s, kind="stable")
 
 
-def exposure_varies(exposure_s: np.ndarray) -> bool:
+def exposure_varies(exposure_s: Array) -> bool:
     """Whether these exposures are more than one."""
     return float(np.ptp(exposure_s)) > EQUAL_EXPOSURE * float(np.max(exposure_s))
 
 
-def first_of_equal(exposure_s: np.ndarray) -> np.ndarray:
+def first_of_equal(exposure_s: Array) -> Array:
     """For exposures in ascending order: the index of the first of those that are equal to each but for the noise of clocks."""
     first = np.zeros(exposure_s.size, dtype=int)
     for i in range(1, exposure_s.size):
@@ -96,12 +98,12 @@ def first_of_equal(exposure_s: np.ndarray) -> np.ndarray:
     return first
 
 
-def count_exposures(exposure_s: np.ndarray) -> int:
+def count_exposures(exposure_s: Array) -> int:
     """How many different exposures there are; argument in ascending order."""
     return int(np.unique(first_of_equal(exposure_s)).size)
 
 
-def light_of(series: Series) -> tuple[np.ndarray, str] | None:
+def light_of(series: Series) -> tuple[Array, str] | None:
     """The measure of the light of a level, and its unit: photons, otherwise seconds of exposure; ``None`` if neither is known."""
     if series.photons is not None:
         return series.photons, "photon"
@@ -110,7 +112,7 @@ def light_of(series: Series) -> tuple[np.ndarray, str] | None:
     return None
 
 
-def pairing(bright_s: np.ndarray, dark_s: np.ndarray) -> np.ndarray:
+def pairing(bright_s: Array, dark_s: Array) -> Array:
     """Weights of the dark levels for each bright one, shape (bright, dark); each row sums to one.
 
     The mean of the dark levels of the same exposure; where there is none, the line between the dark levels on either side; beyond the
@@ -139,8 +141,9 @@ def pairing(bright_s: np.ndarray, dark_s: np.ndarray) -> np.ndarray:
     return weights
 
 
-def without_dark(bright_s: np.ndarray, dark_s: np.ndarray) -> np.ndarray:
+def without_dark(bright_s: Array, dark_s: Array) -> Flags:
     """Bright levels whose dark values are those of another exposure, as too few tell how these change; shape (bright,), bool."""
     far = np.abs(dark_s[None] - bright_s[:, None]).min(axis=1) > np.maximum(EQUAL_EXPOSURE * bright_s, 1e-15)
-    outside = (bright_s < dark_s.min()) | (bright_s > dark_s.max())
-    return far & outside & (count_exposures(dark_s) < MINIMUM_EXPOSURES)
+    outside: Flags = (bright_s < dark_s.min()) | (bright_s > dark_s.max())
+    found: Flags = far & outside & (count_exposures(dark_s) < MINIMUM_EXPOSURES)
+    return found

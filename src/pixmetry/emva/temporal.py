@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from pixmetry.core.arrays import Array, Flags
 from pixmetry.core.errors import MeasureError
 from pixmetry.emva.files.keys import FIT_RANGE, MINIMUM_DARK_VAR_DN2, QUANTISATION_DN2, SATURATED_FRACTION
 from pixmetry.emva.general.response import slope_matrix
@@ -19,7 +20,7 @@ MINIMUM_LINE = 3  # levels that a straight line can leave something of
 @np.errstate(divide="ignore", invalid="ignore")  # draws of too few levels, or without light, are NaN
 def temporal_values(
     series: Series, release: str, pixel_area_um2: float | None = None, least_dark_var_dn2: float = MINIMUM_DARK_VAR_DN2
-) -> dict[str, np.ndarray]:
+) -> dict[str, Array]:
     """All values that the exposure series carries.
 
     Parameters
@@ -100,7 +101,8 @@ def saturation_index(series: Series, release: str) -> np.ndarray:
     if release == "reference":
         return _walk_back(var)
     if release == "3.1":
-        return np.argmax(var, axis=-1)
+        highest: np.ndarray = np.argmax(var, axis=-1)
+        return highest
     below = series.fraction_max <= SATURATED_FRACTION
     top = np.where(below.any(axis=-1), _last(below), 0)
     reached = np.arange(var.shape[-1]) <= top[..., None]
@@ -109,7 +111,7 @@ def saturation_index(series: Series, release: str) -> np.ndarray:
     return np.where(_at(var, top) < KNEE * _at(var, peak), peak, top)
 
 
-def _walk_back(var: np.ndarray) -> np.ndarray:
+def _walk_back(var: Array) -> np.ndarray:
     """Saturation as the public implementation 1.0.2 finds it.
 
     From the last level backwards each level takes over as long as its variance, or that of the next darker one, is not below that of
@@ -126,8 +128,8 @@ def _walk_back(var: np.ndarray) -> np.ndarray:
 
 
 def _capacity(
-    release: str, dark_var: np.ndarray, gain: np.ndarray, responsivity: np.ndarray, light_sat: np.ndarray, photons: bool
-) -> dict[str, np.ndarray]:
+    release: str, dark_var: Array, gain: Array, responsivity: Array, light_sat: Array, photons: bool
+) -> dict[str, Array]:
     """Dark noise, threshold, capacity and what follows from them; in photons only where these are known."""
     noise_e = np.sqrt(dark_var) / gain  # with that of quantisation
     e_min = np.sqrt(noise_e**2 + 0.25) + 0.5 if release == "4.0" else noise_e + 0.5
@@ -153,7 +155,7 @@ def _capacity(
 
 
 @np.errstate(divide="ignore", invalid="ignore")  # as above
-def linearity_line(light: np.ndarray, signal: np.ndarray, sat: np.ndarray, last: np.ndarray) -> dict[str, np.ndarray]:
+def linearity_line(light: Array, signal: Array, sat: Array, last: Array) -> dict[str, Array]:
     """Straight line of the signal over the light from 5 to 95 % of saturation with weights 1/y² (R4.0 eq. 58 to 63), and what is left.
 
     ``sat`` and ``last`` are the levels of saturation and of 95 % of it.
@@ -177,7 +179,7 @@ def linearity_line(light: np.ndarray, signal: np.ndarray, sat: np.ndarray, last:
     enough = used.sum(axis=-1) >= MINIMUM_LINE
     inside = np.where(used, deviation, 0.0)
 
-    def checked(values: np.ndarray) -> np.ndarray:
+    def checked(values: Array) -> Array:
         return np.where(enough, values, np.nan)
 
     return {
@@ -193,7 +195,7 @@ def linearity_line(light: np.ndarray, signal: np.ndarray, sat: np.ndarray, last:
     }
 
 
-def dark_line(series: Series) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def dark_line(series: Series) -> tuple[Array, Array, Array, Array]:
     """Dark mean and its slope, dark variance and its slope: at zero exposure (DN, DN/s, DN², DN²/s), each of shape (...).
 
     With fewer than three exposures the mean of the shortest, and NaN for the slopes.
@@ -211,7 +213,7 @@ def dark_line(series: Series) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nd
     return out[0], out[1], out[2], out[3]
 
 
-def slope_departures(series: Series, gain: np.ndarray, last_fit: np.ndarray) -> np.ndarray:
+def slope_departures(series: Series, gain: Array, last_fit: Array) -> Array:
     """Deviations of the photon transfer's local slope from K over the range of the fit, % (R4.0 eq. 51), shape (..., levels).
 
     ``last_fit`` is the last level of the range. With too few levels the last axis is empty.
@@ -235,18 +237,19 @@ def slope_departures(series: Series, gain: np.ndarray, last_fit: np.ndarray) -> 
     return 100 * slopes / np.asarray(gain)[..., None]
 
 
-def _at(values: np.ndarray, index: np.ndarray) -> np.ndarray:
+def _at(values: Array, index: np.ndarray) -> Array:
     """Values at one level each, shape (...)."""
     shape = np.broadcast_shapes(values.shape[:-1], index.shape)
     values, index = np.broadcast_to(values, (*shape, values.shape[-1])), np.broadcast_to(index, shape)
     return np.take_along_axis(values, index[..., None], axis=-1)[..., 0]
 
 
-def _last(flags: np.ndarray) -> np.ndarray:
+def _last(flags: Flags) -> np.ndarray:
     """Index of the last level that is True; -1 where none is."""
     backwards = np.argmax(flags[..., ::-1], axis=-1)
     return np.where(flags.any(axis=-1), flags.shape[-1] - 1 - backwards, -1)
 
 
-def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return np.einsum("...i,...i->...", *np.broadcast_arrays(a, b))
+def _dot(a: Array, b: Array) -> Array:
+    found: Array = np.einsum("...i,...i->...", *np.broadcast_arrays(a, b))
+    return found

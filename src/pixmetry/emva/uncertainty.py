@@ -11,8 +11,9 @@ from dataclasses import replace
 from statistics import NormalDist
 
 import numpy as np
+from numpy.random import Generator
 
-from pixmetry.core.random import Generator
+from pixmetry.core.arrays import Array
 from pixmetry.emva.records import Series
 from pixmetry.emva.scatter import Scatter
 
@@ -46,7 +47,7 @@ def draw_blocks(s: Scatter, blocks: Iterable[tuple[int, Iterable[str]]], rng: Ge
     plan = [(n, frozenset(groups)) for n, groups in blocks]
     total = sum(n for n, _ in plan)
 
-    def noise(group: str, u: np.ndarray) -> np.ndarray:
+    def noise(group: str, u: Array) -> Array:
         if not any(group in on for _, on in plan):
             return np.zeros((1, u.size))
         out = np.zeros((total, u.size))
@@ -70,7 +71,7 @@ def draw_blocks(s: Scatter, blocks: Iterable[tuple[int, Iterable[str]]], rng: Ge
     )
 
 
-def add_wave(vectors: np.ndarray, s: Scatter, frames: int, rng: Generator) -> np.ndarray:
+def add_wave(vectors: Array, s: Scatter, frames: int, rng: Generator) -> Array:
     """Draws of a dark stack's statistics (``SpatialInputs.draws``) with what a wave through the frames adds to their scatter.
 
     A wave that moves from frame to frame (interference on the video signal) makes the product of two frames scatter: p cos Δφ for a wave
@@ -116,13 +117,13 @@ def bootstrap_series(s: Scatter, draws: int, rng: Generator) -> Series:
 
 def _moved(
     s: Scatter,
-    light: np.ndarray,
-    variance: np.ndarray,
-    dark_mean: np.ndarray,
-    dark_variance: np.ndarray,
-    spatial: np.ndarray,
-    dark_spatial: np.ndarray,
-    counts: np.ndarray,
+    light: Array,
+    variance: Array,
+    dark_mean: Array,
+    dark_variance: Array,
+    spatial: Array,
+    dark_spatial: Array,
+    counts: Array,
 ) -> Series:
     """The centre with these changes: of the level means by the light, of the variances for themselves, of the dark levels."""
     c = s.centre
@@ -142,7 +143,7 @@ def _moved(
     )
 
 
-def _beside(own: np.ndarray, weights: np.ndarray) -> np.ndarray:
+def _beside(own: Array, weights: Array) -> Array:
     """Dark values for the bright levels; a plain look-up where each has one dark level of its own."""
     one = weights.argmax(axis=1)
     if (weights[np.arange(one.size), one] == 1).all():
@@ -155,7 +156,7 @@ def _ends_in_sight(s: Scatter) -> np.ndarray:
     return np.flatnonzero((s.centre.fraction_max > 0) & (s.centre.fraction_max < 0.5))
 
 
-def _top_shares(s: Scatter, light: np.ndarray, counts: np.ndarray) -> np.ndarray:
+def _top_shares(s: Scatter, light: Array, counts: Array) -> Array:
     """Share of pixels at the top code when the light moves: the normal tail moves with it, and the count scatters."""
     share, moving = s.centre.fraction_max, _ends_in_sight(s)
     draws = max(light.shape[0], counts.shape[0])

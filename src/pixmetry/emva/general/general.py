@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from pixmetry.core.arrays import Array
 from pixmetry.core.errors import MeasureError
 from pixmetry.emva.general.general_model import (
     Levels,
@@ -29,7 +30,7 @@ SMALLEST_THRESHOLD, GRID = 1e-7, 500  # of the largest light; where the threshol
 OFF_THE_CURVE = 0.01  # relative
 
 
-def _threshold(plan: Plan, d: Levels) -> np.ndarray:
+def _threshold(plan: Plan, d: Levels) -> Array:
     """Light at which noise and signal at the input are equal, shape (...,).
 
     p² s² = σ²_dark + p q with the slope s and the growth q of the variance, both at p: for constant s and q the positive root of a
@@ -37,16 +38,16 @@ def _threshold(plan: Plan, d: Levels) -> np.ndarray:
     the plan was made from is bracketed, then iterated; each draw goes on from there with s and q to first order in p.
     """
 
-    def at(light: float) -> tuple[np.ndarray, np.ndarray]:
+    def at(light: float) -> tuple[Array, Array]:
         p = np.array([light])
         return slope_rows(plan.ratio, p)[0], plan.growth.rows(p)[0]
 
-    def change_at(light: float) -> tuple[np.ndarray, np.ndarray]:
+    def change_at(light: float) -> tuple[Array, Array]:
         h = 1e-3 * max(light, 1e-9)
         around = np.array([max(light - h, 0.0), light + h])
         return np.diff(slope_rows(plan.ratio, around), axis=0)[0] / np.ptp(around), plan.growth.rows(np.array([light]), 1)[0]
 
-    def root(slope: np.ndarray, growth: np.ndarray, dark: np.ndarray) -> np.ndarray:
+    def root(slope: Array, growth: Array, dark: Array) -> Array:
         with np.errstate(divide="ignore", invalid="ignore"):
             found = (growth + np.sqrt(growth**2 + 4 * slope**2 * dark)) / (2 * slope**2)
         return np.where((slope > 0) & (found > 0), found, np.nan)
@@ -76,7 +77,7 @@ def _threshold(plan: Plan, d: Levels) -> np.ndarray:
     return p
 
 
-def general_evaluation(series: Series, plan: Plan | None = None) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+def general_evaluation(series: Series, plan: Plan | None = None) -> tuple[dict[str, Array], dict[str, Array]]:
     """The values of the General model, and for those that are roots of a variance that may be negative that variance.
 
     Parameters
@@ -176,14 +177,15 @@ def general_notes(plan: Plan) -> tuple[str, ...]:
     return tuple(notes)
 
 
-def _dark_square(plan: Plan, d: Levels, half: np.ndarray) -> np.ndarray:
+def _dark_square(plan: Plan, d: Levels, half: Array) -> Array:
     """Variance of the dark pattern at the input, in units of the largest light."""
     slope_at_zero = ratios(d) @ plan.ratio.rows(np.zeros(1))[0]
     used = (d.light <= half[..., None]) | (np.arange(d.light.size) == 0)
-    return np.sum(np.where(used, d.dark_spatial_dn2, 0.0), axis=-1) / used.sum(axis=-1) / slope_at_zero**2
+    square: Array = np.sum(np.where(used, d.dark_spatial_dn2, 0.0), axis=-1) / used.sum(axis=-1) / slope_at_zero**2
+    return square
 
 
-def _interpolated(values: np.ndarray, light: np.ndarray, at: np.ndarray) -> np.ndarray:
+def _interpolated(values: Array, light: Array, at: Array) -> Array:
     """Values at a light of each draw, on the straight line between the two nearest levels."""
     shape = np.broadcast_shapes(values.shape[:-1], at.shape)
     values, at = np.broadcast_to(values, (*shape, light.size)), np.broadcast_to(at, shape)
@@ -194,7 +196,7 @@ def _interpolated(values: np.ndarray, light: np.ndarray, at: np.ndarray) -> np.n
     return lower + share * (upper - lower)
 
 
-def general_curve(plan: Plan) -> dict[str, np.ndarray]:
+def general_curve(plan: Plan) -> dict[str, Array]:
     """The characteristic curve of one series and the noise that it sees at the input.
 
     Returns

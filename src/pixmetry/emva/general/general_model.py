@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from pixmetry.core.arrays import Array
 from pixmetry.core.errors import MeasureError
 from pixmetry.core.random import generator
 from pixmetry.emva.general.response import ResponseEnd, ResponseSpline, end_of, smooth_despite_setting, smooth_response
@@ -21,30 +22,30 @@ MEASURED = ("mean_dn", "var_dn2", "spatial_var_dn2", "dark_mean_dn", "dark_var_d
 class Levels:
     """The lit levels that follow the response, by light; light in units of the largest; measured values have shape (..., levels)."""
 
-    light: np.ndarray
-    scale: np.ndarray  # light at one, shape (...,)
+    light: Array
+    scale: Array  # light at one, shape (...,)
     has_photons: bool
-    signal_dn: np.ndarray
-    var_dn2: np.ndarray
-    spatial_dn2: np.ndarray
-    dark_var_dn2: np.ndarray
-    dark_spatial_dn2: np.ndarray
-    fraction_max: np.ndarray
-    mean_dn: np.ndarray
+    signal_dn: Array
+    var_dn2: Array
+    spatial_dn2: Array
+    dark_var_dn2: Array
+    dark_spatial_dn2: Array
+    fraction_max: Array
+    mean_dn: Array
 
 
 @dataclass(frozen=True)
 class Plan:
     """Choices that are made once from one series: its levels, and the smoothing of their curves."""
 
-    order: np.ndarray  # of the levels
+    order: Array  # of the levels
     end: ResponseEnd
     ratio: ResponseSpline
     growth: ResponseSpline  # of the variance above the dark one, per light
     levels: Levels  # of that one series
-    slopes: np.ndarray  # matrix from response ratios to the slopes at the levels
-    grown: np.ndarray  # matrix from growths of the variance to the smooth ones
-    patterned: np.ndarray  # the same for the spatial variance
+    slopes: Array  # matrix from response ratios to the slopes at the levels
+    grown: Array  # matrix from growths of the variance to the smooth ones
+    patterned: Array  # the same for the spatial variance
 
 
 def mean_of_draws(series: Series) -> Series:
@@ -52,18 +53,19 @@ def mean_of_draws(series: Series) -> Series:
     return replace(series, **light, **{name: _nominal(np.asarray(getattr(series, name), dtype=float)) for name in MEASURED})
 
 
-def _nominal(values: np.ndarray) -> np.ndarray:
+def _nominal(values: Array) -> Array:
     """Mean over the draws."""
-    return values.reshape(-1, values.shape[-1]).mean(axis=0)
+    mean: Array = values.reshape(-1, values.shape[-1]).mean(axis=0)
+    return mean
 
 
-def light_axis(series: Series) -> np.ndarray:
+def light_axis(series: Series) -> Array:
     """What General counts the light by: photons, else the exposure; shape (levels,)."""
     return np.asarray(series.exposure_s if series.photons is None else series.photons, dtype=float)
 
 
-def levels_of(series: Series, order: np.ndarray) -> Levels:
-    def take(values: np.ndarray) -> np.ndarray:
+def levels_of(series: Series, order: Array) -> Levels:
+    def take(values: Array) -> Array:
         return np.asarray(values, dtype=float)[..., order]
 
     light = take(light_axis(series))
@@ -117,15 +119,15 @@ def make_plan(series: Series) -> Plan:
     return Plan(order, end, ratio, growth, d, slope_rows(ratio, d.light), growth.rows(d.light), pattern.rows(d.light))
 
 
-def ratios(d: Levels) -> np.ndarray:
+def ratios(d: Levels) -> Array:
     return d.signal_dn / d.light
 
 
-def growths(d: Levels) -> np.ndarray:
+def growths(d: Levels) -> Array:
     return (d.var_dn2 - d.dark_var_dn2) / d.light
 
 
-def patterns(d: Levels) -> np.ndarray:
+def patterns(d: Levels) -> Array:
     return (d.spatial_dn2 - d.dark_spatial_dn2) / d.light**2
 
 
@@ -146,6 +148,6 @@ def with_setting_errors(plan: Plan, d: Levels) -> Levels:
     return replace(d, signal_dn=signal)
 
 
-def slope_rows(ratio: ResponseSpline, light: np.ndarray) -> np.ndarray:
+def slope_rows(ratio: ResponseSpline, light: Array) -> Array:
     """Matrix from response ratios to the slope of the response, shape (light, levels)."""
     return ratio.rows(light) + light[:, None] * ratio.rows(light, 1)

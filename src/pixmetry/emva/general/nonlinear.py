@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from pixmetry.core.arrays import Array
 from pixmetry.core.errors import PixmetryError
 from pixmetry.core.number import UPPER_LIMIT, VALUE, Estimates, Number
 from pixmetry.core.threads import single_threaded_blas
@@ -78,7 +79,7 @@ class _Propagation:
     """
 
     source: Estimates
-    covariance: np.ndarray
+    covariance: Array
     method: str
     values: dict[str, Number] = field(default_factory=dict)
 
@@ -92,11 +93,12 @@ class _Propagation:
         u, dof = math.sqrt(max(shares.sum(), 0.0)), 1 / inverse if inverse > 0 else math.inf
         self.values[name] = Number(float(value), u, dof, key_of(name).unit, self.method, reason.replace(" e-", " e⁻"), kind)
 
-    def _dof(self) -> np.ndarray:
+    def _dof(self) -> Array:
         """Degrees of freedom of each estimate, more where something known was added to its variance."""
         own = np.diag(self.source.covariance)
-        grown = np.divide(np.diag(self.covariance), own, out=np.ones_like(own), where=own > 0)
-        return self.source.dof * grown**2
+        grown: Array = np.divide(np.diag(self.covariance), own, out=np.ones_like(own), where=own > 0)
+        dof: Array = self.source.dof * grown**2
+        return dof
 
 
 def _temporal(fit: Estimates, photons_u_rel: float) -> dict[str, Number]:

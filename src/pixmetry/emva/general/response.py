@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pixmetry.core.arrays import Array
 from pixmetry.emva.files.keys import SATURATED_FRACTION
 from pixmetry.emva.records import Series
 
@@ -20,10 +21,10 @@ HIGHEST_DEGREE = 7
 class SmoothFit:
     """Weighted least-squares polynomial. ``values``, ``slopes``, ``residuals`` (of the ordinates) and ``leverage`` have shape (n,)."""
 
-    values: np.ndarray
-    slopes: np.ndarray
-    residuals: np.ndarray
-    leverage: np.ndarray
+    values: Array
+    slopes: Array
+    residuals: Array
+    leverage: Array
     dof: int
 
 
@@ -36,22 +37,22 @@ class ScatterFit:
 
     fit: SmoothFit
     excess: float
-    u: np.ndarray
+    u: Array
     dof: float
 
     @property
-    def standardised(self) -> np.ndarray:
+    def standardised(self) -> Array:
         """Residuals over their standard deviations, corrected for the degrees of freedom of the fit."""
         z = np.divide(self.fit.residuals, self.u, out=np.zeros_like(self.u), where=self.u > 0)
         return z / np.sqrt(np.maximum(1 - self.fit.leverage, 0.05))
 
 
-def fit_smooth(x: np.ndarray, y: np.ndarray, sigma: np.ndarray, degree: int) -> SmoothFit:
+def fit_smooth(x: Array, y: Array, sigma: Array, degree: int) -> SmoothFit:
     """Polynomial of a degree in x with weights 1/sigma², by orthogonal factors of its Chebyshev basis."""
     return _fit_basis(_basis(x, degree), y, sigma)
 
 
-def _fit_basis(bases: tuple[np.ndarray, np.ndarray], y: np.ndarray, sigma: np.ndarray) -> SmoothFit:
+def _fit_basis(bases: tuple[Array, Array], y: Array, sigma: Array) -> SmoothFit:
     basis, derivative = bases
     q, r = np.linalg.qr(basis / sigma[:, None])
     coefficients = np.linalg.solve(r, q.T @ (y / sigma))
@@ -59,16 +60,17 @@ def _fit_basis(bases: tuple[np.ndarray, np.ndarray], y: np.ndarray, sigma: np.nd
     return SmoothFit(values, derivative @ coefficients, y - values, (q**2).sum(axis=1), y.size - basis.shape[1])
 
 
-def _basis(x: np.ndarray, degree: int) -> tuple[np.ndarray, np.ndarray]:
+def _basis(x: Array, degree: int) -> tuple[Array, Array]:
     """Chebyshev polynomials over the range of ``x`` and their derivatives, each of shape (n, degree + 1)."""
     low, high = float(x.min()), float(x.max())
     half = max(0.5 * (high - low), 1e-300)
     place = (x - 0.5 * (low + high)) / half
     derivatives = np.polynomial.chebyshev.chebder(np.eye(degree + 1)) if degree else np.zeros((1, 1))
-    return np.polynomial.chebyshev.chebvander(place, degree), np.polynomial.chebyshev.chebval(place, derivatives).T / half
+    basis: Array = np.asarray(np.polynomial.chebyshev.chebvander(place, degree), dtype=float)
+    return basis, np.asarray(np.polynomial.chebyshev.chebval(place, derivatives).T / half, dtype=float)
 
 
-def choose_degree(x: np.ndarray, y: np.ndarray, sigma: np.ndarray, start: int = 3) -> int:
+def choose_degree(x: Array, y: Array, sigma: Array, start: int = 3) -> int:
     """Degree of the polynomial that follows the levels without following their noise.
 
     A cubic; a higher degree where Akaike's criterion, corrected for small samples (Hurvich & Tsai 1989), asks for it: a camera with a
@@ -89,7 +91,7 @@ def choose_degree(x: np.ndarray, y: np.ndarray, sigma: np.ndarray, start: int = 
     return chosen
 
 
-def fit_scatter(x: np.ndarray, y: np.ndarray, sigma: np.ndarray, shape: np.ndarray, degree: int | None = None) -> ScatterFit:
+def fit_scatter(x: Array, y: Array, sigma: Array, shape: Array, degree: int | None = None) -> ScatterFit:
     """Smooth curve with weights that hold an excess scatter: u² = sigma² + τ² shape².
 
     Parameters
@@ -140,12 +142,12 @@ CAUTION = 1.4  # degrees of freedom count this much in cross-validation, which f
 class ResponseSpline:
     """A smoother that is linear in the data: coefficients = matrix @ values at the levels."""
 
-    knots: np.ndarray
-    matrix: np.ndarray  # shape (coefficients, levels)
+    knots: Array
+    matrix: Array  # shape (coefficients, levels)
     span: float  # largest abscissa
     unit: float  # light p₁ of the abscissa z = log(1 + p/p₁)/span
 
-    def rows(self, light: np.ndarray, derivative: int = 0) -> np.ndarray:
+    def rows(self, light: Array, derivative: int = 0) -> Array:
         """Matrix from values at the levels to the spline or its slope by light, shape (light, levels)."""
         z = np.log1p(light / self.unit) / self.span
         basis = _spline_basis(z, self.knots, derivative)
@@ -154,7 +156,7 @@ class ResponseSpline:
         return basis @ self.matrix
 
 
-def _spline_basis(z: np.ndarray, knots: np.ndarray, derivative: int = 0) -> np.ndarray:
+def _spline_basis(z: Array, knots: Array, derivative: int = 0) -> Array:
     """Powers and truncated powers of a cubic spline on [0, 1], or their derivatives, shape (z, 4 + knots)."""
     factor = {0: 1.0, 1: 3.0, 2: 6.0}[derivative]
     power = 3 - derivative
@@ -162,7 +164,7 @@ def _spline_basis(z: np.ndarray, knots: np.ndarray, derivative: int = 0) -> np.n
     return np.hstack([polynomial, factor * np.maximum(z[:, None] - knots, 0.0) ** power])
 
 
-def _power(z: np.ndarray, n: int, derivative: int) -> np.ndarray:
+def _power(z: Array, n: int, derivative: int) -> Array:
     coefficient = 1.0
     for k in range(derivative):
         coefficient *= n - k
@@ -180,7 +182,7 @@ class Smoothing:
     misfit: float
 
 
-def smooth_response(light: np.ndarray, values: np.ndarray, weights: np.ndarray) -> Smoothing:
+def smooth_response(light: Array, values: Array, weights: Array) -> Smoothing:
     """Penalised regression spline; the penalty is the integrated square of its second derivative by the abscissa.
 
     Parameters
@@ -220,7 +222,7 @@ def smooth_response(light: np.ndarray, values: np.ndarray, weights: np.ndarray) 
     return Smoothing(spline, likely)
 
 
-def smooth_despite_setting(light: np.ndarray, values: np.ndarray, weights: np.ndarray) -> ResponseSpline:
+def smooth_despite_setting(light: Array, values: Array, weights: Array) -> ResponseSpline:
     """The same, with less weight for the darkest levels where it is plain that their light is not what it was set to.
 
     A shutter that opens late, or light that leaks in, changes the light of all levels by amounts of one size, so that the darkest levels
@@ -237,7 +239,7 @@ def smooth_despite_setting(light: np.ndarray, values: np.ndarray, weights: np.nd
     return best.spline
 
 
-def slope_matrix(x: np.ndarray, weights: np.ndarray, dof: float) -> np.ndarray:
+def slope_matrix(x: Array, weights: Array, dof: float) -> Array:
     """The matrix that takes ordinates to the slopes, at the same places, of the smoothing spline through them.
 
     Parameters
@@ -284,7 +286,7 @@ def slope_matrix(x: np.ndarray, weights: np.ndarray, dof: float) -> np.ndarray:
     return slope / scale
 
 
-def _penalty(energy: np.ndarray, dof: float) -> float:
+def _penalty(energy: Array, dof: float) -> float:
     """λ for which Σ 1/(1 + λ energy) is ``dof``, by bisection of its logarithm."""
     bent = energy[2:]
     low, high = -np.log(bent.max()) - 30, -np.log(bent.min()) + 30
@@ -319,14 +321,14 @@ class ResponseEnd:
         """Whether the series reaches its end."""
         return self.clips or bool(np.isfinite(self.plateau_dn))
 
-    def saturation(self, mean_dn: np.ndarray, fraction_max: np.ndarray) -> np.ndarray:
+    def saturation(self, mean_dn: Array, fraction_max: Array) -> Array:
         """Highest level with few enough pixels at the end, shape (...); arguments of shape (..., levels)."""
         below = (fraction_max <= SATURATED_FRACTION) & (self.plateau_dn - mean_dn >= SATURATED_DEVIATE * self.noise_dn)
         below = below[..., : self.seen]
         return np.where(below.any(axis=-1), self.seen - 1 - np.argmax(below[..., ::-1], axis=-1), 0)
 
 
-def end_of(series: Series, light: np.ndarray) -> tuple[np.ndarray, ResponseEnd]:
+def end_of(series: Series, light: Array) -> tuple[np.ndarray, ResponseEnd]:
     """The lit levels of one series (no draws) in order of their light, as indices, and what ends them; light of shape (levels,)."""
     order = np.argsort(light, kind="stable")
     order = order[light[order] > 0]
@@ -334,7 +336,7 @@ def end_of(series: Series, light: np.ndarray) -> tuple[np.ndarray, ResponseEnd]:
     return order, find_end(*(np.asarray(values, dtype=float)[order] for values in known))
 
 
-def find_end(light: np.ndarray, mean_dn: np.ndarray, var_dn2: np.ndarray, spatial_dn2: np.ndarray, fraction_max: np.ndarray) -> ResponseEnd:
+def find_end(light: Array, mean_dn: Array, var_dn2: Array, spatial_dn2: Array, fraction_max: Array) -> ResponseEnd:
     """Find the end of the response in one series; arrays of shape (levels,), in rising order of light.
 
     Notes

@@ -201,8 +201,7 @@ def worst_of(channels: Sequence[Results]) -> Results:
 
     def gravity(results: Results) -> tuple[int, float]:
         departure = results.values.get("PTC_linearity")
-        known = departure is not None and isfinite(departure.value)
-        return GRAVITY.index(linear_model(results)), departure.value if known else 0.0
+        return GRAVITY.index(linear_model(results)), departure.value if departure is not None and isfinite(departure.value) else 0.0
 
     return max(channels, key=gravity)
 

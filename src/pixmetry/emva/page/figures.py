@@ -48,7 +48,8 @@ def fill(plot: Plot, axes: Axes, box_in: tuple[float, float, float, float]) -> N
     m, (across, up) = MARGINS_IN, figure.get_size_inches()
     inner = (width - m["left"] - m["right"], height - m["bottom"] - m["top"])
     axes.set_position(((left + m["left"]) / across, (bottom + m["bottom"]) / up, inner[0] / across, inner[1] / up))
-    plot.draw(axes)
+    if plot.draw is not None:
+        plot.draw(axes)
     axes.set_title(plot.title, loc="left", fontweight="bold", y=1.0)  # a place of its own spares the search for one
     middle = bottom + m["bottom"] + inner[1] / 2
     axes.yaxis.set_label_coords((left + 0.13) / across, middle / up, transform=figure.transFigure)

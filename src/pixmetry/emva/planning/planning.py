@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from pixmetry.core.arrays import Array
 from pixmetry.core.errors import InputError
 from pixmetry.emva.files.keys import FIT_RANGE, KEYS, MINIMUM_DARK_VAR_DN2, QUANTISATION_DN2
 from pixmetry.emva.planning.known_camera import KnownCamera, camera_from_results, number_in
@@ -53,17 +54,17 @@ class Plan:
             raise InputError("too few levels or frames", where="plan", value=numbers, allowed="2 or more of each")
 
     @property
-    def fractions(self) -> np.ndarray:
+    def fractions(self) -> Array:
         """Signal of the bright levels over saturation, shape (levels,)."""
         return TOP * np.arange(1, self.levels + 1) / self.levels
 
     @property
-    def dark_fractions(self) -> np.ndarray:
+    def dark_fractions(self) -> Array:
         """Exposures of the dark levels over ``exposure_sat_s``."""
         return self.fractions if self.sweep == "exposure" else np.arange(1, self.dark_levels + 1) / self.dark_levels
 
     @property
-    def bright_exposures(self) -> np.ndarray:
+    def bright_exposures(self) -> Array:
         """Exposures of the bright levels over ``exposure_sat_s``, shape (levels,)."""
         return self.fractions if self.sweep == "exposure" else np.ones(self.levels)
 
@@ -119,18 +120,18 @@ def predicted_u(camera: KnownCamera, plan: Plan) -> dict[str, float]:
     return u | _spatial_u(camera, plan, u["K"])
 
 
-def _strata_dof(rows: int, cols: int) -> np.ndarray:
+def _strata_dof(rows: int, cols: int) -> Array:
     return np.array([(rows - 1) * (cols - 1), rows - 1, cols - 1], dtype=float)
 
 
-def _temporal_strata(camera: KnownCamera, white_dn2: np.ndarray | float) -> np.ndarray:
+def _temporal_strata(camera: KnownCamera, white_dn2: Array | float) -> Array:
     """Expected temporal mean squares of one frame (pixel, row, column), shape (3, …), DN²."""
     k2 = camera.gain_dn_per_e**2
     white = np.asarray(white_dn2, dtype=float)
     return np.stack([white, white + camera.cols * k2 * camera.row_noise_e**2, white + camera.rows * k2 * camera.col_noise_e**2])
 
 
-def _variance_scatter(camera: KnownCamera, white_dn2: np.ndarray, n_frames: int) -> np.ndarray:
+def _variance_scatter(camera: KnownCamera, white_dn2: Array, n_frames: int) -> Array:
     """Variance of the temporal variance of levels, DN⁴."""
     squares, dof = _temporal_strata(camera, white_dn2), _strata_dof(camera.rows, camera.cols)
     size = camera.rows * camera.cols
@@ -165,11 +166,11 @@ def _series_u(camera: KnownCamera, plan: Plan) -> dict[str, float]:
 
 
 @lru_cache(maxsize=8)
-def _filtered_dof(rows: int, cols: int) -> np.ndarray:
+def _filtered_dof(rows: int, cols: int) -> Array:
     return pattern_gains((rows, cols), filtered=True).dof
 
 
-def _stack_strata(camera: KnownCamera, parts_dn2: np.ndarray, white_dn2: float, dark_white_dn2: float, n_frames: int) -> np.ndarray:
+def _stack_strata(camera: KnownCamera, parts_dn2: Array, white_dn2: float, dark_white_dn2: float, n_frames: int) -> Array:
     """Variances of the three parts and of the total of the spatial variance (pixel, row, column, total), DN⁴.
 
     What scatters more than white noise in the dark (a wave on the signal) does so by as much in the light.
@@ -182,10 +183,11 @@ def _stack_strata(camera: KnownCamera, parts_dn2: np.ndarray, white_dn2: float, 
     left = 2 * (temporal**2 + wave) * n_frames / (n_frames - 1)
     scatter = (4 * fixed * temporal + left) / dof
     split = np.array([[1.0, 0, 0], [-1 / camera.cols, 1 / camera.cols, 0], [-1 / camera.rows, 0, 1 / camera.rows]])
-    return np.vstack([split, split.sum(axis=0)]) ** 2 @ scatter
+    found: Array = np.vstack([split, split.sum(axis=0)]) ** 2 @ scatter
+    return found
 
 
-def _dark_strata(camera: KnownCamera, plan: Plan) -> tuple[np.ndarray, np.ndarray]:
+def _dark_strata(camera: KnownCamera, plan: Plan) -> tuple[Array, Array]:
     """Squares of the dark pattern's parts (pixel, row, column), DN², and the variances of what the dark stack tells of them, DN⁴."""
     parts = (camera.gain_dn_per_e * np.array([camera.dsnu_pixel_e, camera.dsnu_row_e, camera.dsnu_col_e])) ** 2
     white = float(camera.dark_var_dn2(plan.stack_exposure * (camera.exposure_sat_s or 0.0)))
@@ -208,10 +210,10 @@ def _spatial_u(camera: KnownCamera, plan: Plan, u_gain: float) -> dict[str, floa
 
 
 @lru_cache(maxsize=1)
-def _normal_quantiles() -> np.ndarray:
+def _normal_quantiles() -> Array:
     from scipy.special import ndtri
 
-    z = ndtri((np.arange(ROOT_POINTS) + 0.5) / ROOT_POINTS)
+    z: Array = ndtri((np.arange(ROOT_POINTS) + 0.5) / ROOT_POINTS)
     return z / math.sqrt(np.mean(z**2))
 
 
@@ -387,7 +389,7 @@ def _exposure_sat_s(values: Mapping[str, Any], conditions: Mapping[str, Any]) ->
     saturation = number_in(values.get("u_p_sat"))
     if len(exposures) < 2 or len(photons) < 2 or not saturation > 0 or not max(photons) > 0:
         return None
-    return saturation * max(exposures) / max(photons)
+    return float(saturation * max(exposures) / max(photons))
 
 
 CAMPAIGN_SCHEMA = "pixmetry/campaign/1"

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from pixmetry.core.arrays import Array
 from pixmetry.core.jit import jit
 
 
 @jit
-def subtract_low_pass(image, weights, line, out):
+def subtract_low_pass(image: Array, weights: Array, line: Array, out: Array) -> None:
     """out = image less its separable convolution with ``weights`` (odd, symmetric) along both axes, where that lies in the image.
 
     ``line`` is room for one row of the image.

@@ -7,9 +7,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.random import Generator
 
-from pixmetry.core.errors import MeasureError
-from pixmetry.core.random import Generator
+from pixmetry.core.arrays import Array
+from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.core.threads import single_threaded_blas
 from pixmetry.emva.records import FrameProducts
 from pixmetry.emva.spatial._kernels import subtract_low_pass
@@ -20,7 +21,7 @@ BLOCK_BYTES = 48e6  # of all frames' share of a block of pixels, as float64
 MINIMUM_FRAMES = 4  # below that the scatter of the frames' products has no degree of freedom
 
 
-def frame_products(frames: Iterable[np.ndarray], bits: int) -> FrameProducts:
+def frame_products(frames: Iterable[Array], bits: int) -> FrameProducts:
     """Products of all pairs of frames, summed over the pixels, over the row means and over the column means.
 
     Parameters
@@ -67,7 +68,7 @@ def _products(stored: np.ndarray, margin: int) -> FrameProducts:
     height, width = _block_shape(count, rows, cols, margin)
     pixel, row, col = np.zeros((3, count, count))
     means = np.zeros(count)
-    offset = None
+    offset = 0.0
     with tempfile.TemporaryFile(prefix="pixmetry-columns-") as file:
         columns = np.memmap(file, dtype=float, mode="w+", shape=(count, cols))
         for top in range(0, rows, height):
@@ -75,7 +76,7 @@ def _products(stored: np.ndarray, margin: int) -> FrameProducts:
             for left in range(0, cols, width):
                 block = _block(stored, slice(top, min(top + height, rows)), slice(left, min(left + width, cols)), margin)
                 # near the mean, so that the products lose no digits when the means are taken off
-                offset = block.mean() if offset is None else offset
+                offset = offset if top or left else float(block.mean())
                 block -= offset
                 flat = block.reshape(count, -1)
                 pixel += flat @ flat.T
@@ -100,7 +101,7 @@ def _block_shape(count: int, rows: int, cols: int, margin: int) -> tuple[int, in
     return height, min(pixels // height, cols)
 
 
-def _block(stored: np.ndarray, rows: slice, cols: slice, margin: int) -> np.ndarray:
+def _block(stored: Array, rows: slice, cols: slice, margin: int) -> Array:
     """A block of pixels of all frames, float64, [frame, row, col]; with a margin of the high-passed ones."""
     found = stored[:, rows.start : rows.stop + 2 * margin, cols.start : cols.stop + 2 * margin]
     if not margin:
@@ -111,7 +112,7 @@ def _block(stored: np.ndarray, rows: slice, cols: slice, margin: int) -> np.ndar
     return block
 
 
-def deviations(products: FrameProducts, shape: tuple[int, int], gains: np.ndarray | None, n: int, rng: Generator) -> np.ndarray:
+def deviations(products: FrameProducts, shape: tuple[int, int], gains: Array | None, n: int, rng: Generator) -> Array:
     """Bootstrap over the frames: by how much the vector of ``SpatialInputs`` would come out elsewhere, shape (n, 8).
 
     With ``gains`` (of ``high_pass.pattern_gains``) for high-passed images, without for images as they are.
@@ -139,7 +140,11 @@ def deviations(products: FrameProducts, shape: tuple[int, int], gains: np.ndarra
     rows, cols = shape
     weights = rng.standard_normal((n, frames))
     raw = [Products.of(q).deviate(weights) for q in strata(products)]
-    image = [Products.of(q).deviate(weights) for q in strata(products.high_passed)] if gains is not None else raw
+    image = raw
+    if gains is not None:
+        if products.high_passed is None:
+            raise InputError("no products of high-passed frames", where="bootstrap", remedy="make them of frames of 24 x 24 pixels or more")
+        image = [Products.of(q).deviate(weights) for q in strata(products.high_passed)]
     out = np.empty((n, 8))
     scale = np.sqrt(frames / (frames - 1))
     means = products.means_dn - products.means_dn.mean()
@@ -155,7 +160,7 @@ def deviations(products: FrameProducts, shape: tuple[int, int], gains: np.ndarra
     return out
 
 
-def strata(products: FrameProducts) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def strata(products: FrameProducts) -> tuple[Array, Array, Array]:
     """Products of the frames in the strata pixel, row, column, each of shape (L, L), per pixel of the frame."""
     return products.pixel_dn2 - products.row_dn2 - products.col_dn2, products.row_dn2, products.col_dn2
 
@@ -166,14 +171,14 @@ class Products:
 
     pattern: float  # U
     temporal: float  # T
-    linear: np.ndarray  # g_k as far as it shows, shape (L,)
-    own: np.ndarray  # Q_kk
-    degenerate: np.ndarray  # h_kl, zero for k = l
+    linear: Array  # g_k as far as it shows, shape (L,)
+    own: Array  # Q_kk
+    degenerate: Array  # h_kl, zero for k = l
     zeta1: float  # not negative
     zeta2: float
 
     @classmethod
-    def of(cls, q: np.ndarray) -> Products:
+    def of(cls, q: Array) -> Products:
         """Split the products of frames, shape (L, L)."""
         count = q.shape[0]
         own = np.diag(q)
@@ -187,7 +192,7 @@ class Products:
         zeta1 = float(a @ a - zeta2 * (count - 2) / (count - 1)) * (count - 1) / (count - 2) ** 2
         return cls(pattern, float(own.mean()) - pattern, linear, own, h, max(zeta1, 0.0), zeta2)
 
-    def deviate(self, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def deviate(self, weights: Array) -> tuple[Array, Array]:
         """Deviations of U and T for weights of shape (draws, L)."""
         count = self.own.size
         observed = float(self.linear @ self.linear) / count

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pixmetry.core.arrays import Array
 from pixmetry.core.errors import MeasureError
 from pixmetry.emva.spatial._kernels import subtract_low_pass
 
@@ -18,7 +19,7 @@ MINIMUM_SIDE = 24  # leaves 6 x 6 pixels; below that rows, columns and pixels ca
 LOW_PASS = np.convolve(np.convolve(np.ones(7) / 7, np.ones(11) / 11), [0.25, 0.5, 0.25])  # along one axis, shape (19,)
 
 
-def high_pass(image: np.ndarray) -> np.ndarray:
+def high_pass(image: Array) -> Array:
     """The image less its smoothed self.
 
     Parameters
@@ -40,14 +41,15 @@ def high_pass(image: np.ndarray) -> np.ndarray:
     return out
 
 
-def passed_power(frequency: np.ndarray) -> np.ndarray:
+def passed_power(frequency: Array) -> Array:
     """Share of the power of white noise that passes, against the frequency (1/px) along one axis and averaged over that along the other.
 
     The transfer function is 1 − G(f) G(f'), with G of the low-pass g along one axis; the mean of its square over f' is
     1 − 2 g₀ G(f) + G²(f) Σg².
     """
-    transfer = np.cos(2 * np.pi * np.outer(frequency, np.arange(-MARGIN, MARGIN + 1))) @ LOW_PASS
-    return 1 - 2 * LOW_PASS[MARGIN] * transfer + transfer**2 * (LOW_PASS @ LOW_PASS)
+    transfer: Array = np.cos(2 * np.pi * np.outer(frequency, np.arange(-MARGIN, MARGIN + 1))) @ LOW_PASS
+    power: Array = 1 - 2 * LOW_PASS[MARGIN] * transfer + transfer**2 * (LOW_PASS @ LOW_PASS)
+    return power
 
 
 def check_size(shape: tuple[int, ...]) -> None:
@@ -71,8 +73,8 @@ class PatternGains:
     ``dof``, shape (3,): effective degrees of freedom of white noise in the strata pixel, row, column.
     """
 
-    matrix: np.ndarray
-    dof: np.ndarray
+    matrix: Array
+    dof: Array
 
 
 def pattern_gains(shape: tuple[int, int], filtered: bool) -> PatternGains:
@@ -126,7 +128,7 @@ def pattern_gains(shape: tuple[int, int], filtered: bool) -> PatternGains:
     return PatternGains(matrix, dof)
 
 
-def _autocovariance(filtered: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _autocovariance(filtered: bool) -> tuple[Array, Array, Array]:
     """Lags, ρ(i, j) of a white field and ρ₁(i) of a white line; without the filter a delta."""
     if not filtered:
         return np.zeros(1), np.ones((1, 1)), np.ones(1)
@@ -139,5 +141,6 @@ def _autocovariance(filtered: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     return np.arange(-reach, reach + 1.0), rho, delta - 2 * low + twice
 
 
-def _mean_weights(n: int, lag: np.ndarray) -> np.ndarray:
-    return np.maximum(n - np.abs(lag), 0.0) / n**2
+def _mean_weights(n: int, lag: Array) -> Array:
+    left: Array = np.maximum(n - np.abs(lag), 0.0)
+    return left / n**2

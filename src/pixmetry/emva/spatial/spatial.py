@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from pixmetry.core.arrays import Array
 from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.emva.records import RELEASES
 from pixmetry.emva.spatial.spatial_inputs import SpatialInputs
@@ -18,7 +19,7 @@ from pixmetry.emva.spatial.spatial_inputs import SpatialInputs
 PARTS = ("", "_row", "_col", "_pixel")
 
 
-def spatial_variances(inputs: SpatialInputs, vectors: np.ndarray, release: str, tag: str = "") -> dict[str, np.ndarray]:
+def spatial_variances(inputs: SpatialInputs, vectors: Array, release: str, tag: str = "") -> dict[str, Array]:
     """All spatial variances of one stack, DN²; ``tag`` is appended to the keys.
 
     Parameters
@@ -73,11 +74,11 @@ def spatial_variances(inputs: SpatialInputs, vectors: np.ndarray, release: str, 
 def spatial_evaluation(
     dark: SpatialInputs,
     bright: SpatialInputs,
-    dark_vectors: np.ndarray,
-    bright_vectors: np.ndarray,
+    dark_vectors: Array,
+    bright_vectors: Array,
     release: str,
-    gain_dn_per_e: np.ndarray | float,
-) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    gain_dn_per_e: Array | float,
+) -> tuple[dict[str, Array], dict[str, Array]]:
     """All spatial values of a release, for one vector of each stack or for many draws, and the variances behind the roots.
 
     Parameters
@@ -109,7 +110,7 @@ def spatial_evaluation(
         return variances | {key: np.sqrt(square) for key, square in squares.items()}, squares
 
 
-def _squares(values: dict[str, np.ndarray], light_dn: np.ndarray, gain: np.ndarray | float) -> dict[str, np.ndarray]:
+def _squares(values: dict[str, Array], light_dn: Array, gain: Array | float) -> dict[str, Array]:
     """EMVA 1288 R4.0 eq. 66 and 67 before the root is taken."""
     squares = {f"DSNU1288{part}": values[f"s_2_y{part}_dark"] / np.square(gain) for part in PARTS}
     squares["DSNU1288_DN"] = values["s_2_y_dark"]
@@ -130,8 +131,8 @@ def _check(dark: SpatialInputs, bright: SpatialInputs, release: str) -> None:
 
 
 def snr_total_max(
-    u_e_sat: np.ndarray, dark_noise_e2: np.ndarray, dsnu2_e2: np.ndarray | float, prnu2_percent2: np.ndarray | float
-) -> np.ndarray:
+    u_e_sat: Array, dark_noise_e2: Array, dsnu2_e2: Array | float, prnu2_percent2: Array | float
+) -> Array:
     """Largest signal-to-noise ratio with non-uniformity: EMVA 1288 R4.0 eq. 69 at saturation, where it is largest.
 
     Parameters

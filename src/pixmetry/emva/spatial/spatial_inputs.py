@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.random import Generator
 
 from pixmetry.camera.observations import StackMoments
+from pixmetry.core.arrays import Array
 from pixmetry.core.errors import InputError, MeasureError
-from pixmetry.core.random import Generator
 from pixmetry.emva.records import FrameProducts
 from pixmetry.emva.spatial.frame_products import Products, deviations, strata
 from pixmetry.emva.spatial.high_pass import MARGIN, pattern_gains
@@ -29,19 +30,19 @@ class SpatialInputs:
     and the variances of the temporal white, row and column noise of one frame.
     """
 
-    vector: np.ndarray
+    vector: Array
     shape: tuple[int, int]  # of the frame
     n_frames: int
     high_passed: bool
-    gains: np.ndarray  # shape (3, 3), see ``high_pass.PatternGains``
-    dof: np.ndarray  # shape (3,), of white noise in the strata pixel, row, column of the image
+    gains: Array  # shape (3, 3), see ``high_pass.PatternGains``
+    dof: Array  # shape (3,), of white noise in the strata pixel, row, column of the image
     ms_frame_dn2: float
     uneven_first: float  # ⟨F²σ²⟩/(⟨F²⟩⟨σ²⟩) over the pixels: above 1 where those that stand out are also noisy
     uneven_second: float  # ⟨σ⁴⟩/⟨σ²⟩²
-    image_dn: np.ndarray = field(repr=False, compare=False)  # the image that ``vector`` tells of
+    image_dn: Array = field(repr=False, compare=False)  # the image that ``vector`` tells of
     # in the strata pixel, row, column, each of shape (3,); from the products of frames where there are any
-    coherence: np.ndarray | None = None  # variance of the product of two frames' noise over that of white noise, v²/ν
-    first_extra: np.ndarray | None = None  # variance of the term pattern times noise beyond that of white noise, DN⁴
+    coherence: Array | None = None  # variance of the product of two frames' noise over that of white noise, v²/ν
+    first_extra: Array | None = None  # variance of the term pattern times noise beyond that of white noise, DN⁴
 
     @classmethod
     def of(cls, stack: StackMoments, high_pass: bool, products: FrameProducts | None = None) -> SpatialInputs:
@@ -104,7 +105,7 @@ class SpatialInputs:
             raise InputError("the frame products contain no high-passed frames", remedy="make them from frames of 24 x 24 pixels or more")
         return products.high_passed
 
-    def draws(self, n: int, rng: Generator, dark_mean_dn: float | None = None) -> np.ndarray:
+    def draws(self, n: int, rng: Generator, dark_mean_dn: float | None = None) -> Array:
         """The vector as it would scatter in repeated measurements of this sensor: the pattern stays, the temporal noise is new.
 
         Parameters
@@ -145,18 +146,18 @@ class SpatialInputs:
         out[:, 5:] = temporal
         return out
 
-    def _left(self) -> np.ndarray:
+    def _left(self) -> Array:
         """Temporal noise left in the strata of the mean image: what white, row and column noise of variance t/L shows there."""
         return np.maximum(TO_STRATA @ self.gains @ self.vector[5:] / self.n_frames, 0.0)
 
-    def _pattern(self) -> np.ndarray:
+    def _pattern(self) -> Array:
         """Mean square of the pattern in the strata, not below zero."""
         return np.maximum(TO_STRATA @ self.vector[1:4] - self._left(), 0.0)
 
-    def _first_order(self, left: np.ndarray, pattern: np.ndarray) -> np.ndarray:
+    def _first_order(self, left: Array, pattern: Array) -> Array:
         return 4 * pattern * left * [self.uneven_first, 1.0, 1.0] / self.dof
 
-    def _temporal_draws(self, n: int, rng: Generator) -> tuple[np.ndarray, np.ndarray]:
+    def _temporal_draws(self, n: int, rng: Generator) -> tuple[Array, Array]:
         """Draws of the temporal white, row and column variances, and the deviation that these give σ²_y.stack."""
         rows, cols = self.shape
         white, row, col = self.vector[5:]
@@ -174,7 +175,7 @@ class SpatialInputs:
         out = np.stack([deviation[:, 0], deviation[:, 2] - whole / cols, deviation[:, 3] - whole / rows], axis=1)
         return self.vector[5:] + out, deviation @ (lines * [1.0, 1.0, cols, rows] / (rows * cols))
 
-    def bootstrap(self, products: FrameProducts, n: int, rng: Generator) -> np.ndarray:
+    def bootstrap(self, products: FrameProducts, n: int, rng: Generator) -> Array:
         """The vector as a bootstrap over the L frames lets it scatter, shape (n, 8); see ``frame_products.deviations``.
 
         Raises
