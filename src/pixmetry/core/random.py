@@ -17,7 +17,8 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.random import Generator, Philox
+from numpy.random import Generator as Generator
+from numpy.random import Philox
 from numpy.typing import ArrayLike, NDArray
 
 from pixmetry.core import _binomial_kernels as binomial_kernels

@@ -7,11 +7,10 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from numpy.random import Generator
 
 from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.core.number import ONE_SIDED_95, TWO_SIDED_95, UPPER_LIMIT, VALUE, Number
-from pixmetry.core.random import generator
+from pixmetry.core.random import Generator, generator
 from pixmetry.core.threads import map_tiles, single_threaded_blas
 from pixmetry.emva.curves import dark_signal, spatial_curves, temporal_curves
 from pixmetry.emva.dark_noise import DarkNoise, pattern_limit_dn2

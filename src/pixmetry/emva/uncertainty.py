@@ -11,9 +11,9 @@ from dataclasses import replace
 from statistics import NormalDist
 
 import numpy as np
-from numpy.random import Generator
 
 from pixmetry.core.arrays import Array
+from pixmetry.core.random import Generator
 from pixmetry.emva.records import Series
 from pixmetry.emva.scatter import Scatter
 

@@ -7,10 +7,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.random import Generator
 
 from pixmetry.core.arrays import Array
 from pixmetry.core.errors import InputError, MeasureError
+from pixmetry.core.random import Generator
 from pixmetry.core.threads import single_threaded_blas
 from pixmetry.emva.records import FrameProducts
 from pixmetry.emva.spatial._kernels import subtract_low_pass

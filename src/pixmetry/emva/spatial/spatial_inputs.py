@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.random import Generator
 
 from pixmetry.camera.observations import StackMoments
 from pixmetry.core.arrays import Array
 from pixmetry.core.errors import InputError, MeasureError
+from pixmetry.core.random import Generator
 from pixmetry.emva.records import FrameProducts
 from pixmetry.emva.spatial.frame_products import Products, deviations, strata
 from pixmetry.emva.spatial.high_pass import MARGIN, pattern_gains
