@@ -54,6 +54,16 @@ def test_all_shows_every_row_and_the_defaults() -> None:
     assert "not in this camera" in told.output and "count.rays: 2 (default)" in told.output
 
 
+def test_a_range_of_an_entry_is_a_table_and_a_figure(tmp_path: Path) -> None:
+    page, data = tmp_path / "b.html", tmp_path / "b.json"
+    told = run("imx264_like", *SMALL, "--vary", "target.diameter_px=5,10", "--html", page, "--json", data)
+    assert told.exit_code == 0, told.output
+    steps = json.loads(data.read_text(encoding="utf-8"))["sweep"]["steps"]
+    assert [s["value"] for s in steps] == [5.0, 10.0]
+    assert steps[1]["answer"]["least_px"][0] < steps[0]["answer"]["least_px"][0]  # a larger target is better known
+    assert "target.diameter_px" in told.output and "Over target.diameter_px" in page.read_text(encoding="utf-8")
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -62,6 +72,8 @@ def test_all_shows_every_row_and_the_defaults() -> None:
         (("imx264_like", "--set", "motion.sped=3"), "sped"),
         (("imx264_like", "--set", "target.diameter_px=600"), "diameter_px"),
         (("imx264_like", "--estimator", "magic"), "estimator"),
+        (("imx264_like", "--vary", "target.diameter_px=3"), "FROM:TO"),
+        (("imx264_like", "--vary", "target.diameter=3:4"), "diameter_px"),
     ],
 )
 def test_what_cannot_be_used_is_told_in_one_line(arguments: tuple[str, ...], words: str) -> None:

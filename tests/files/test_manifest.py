@@ -64,7 +64,7 @@ def test_manifest_gives_what_it_says(tmp_path: Path) -> None:
         (HEAD.replace("bits: 12", "bits: 24") + DARK + BRIGHT, ["bits", "24", "less than or equal to 16"]),
         (HEAD.replace("pitch_um: 5.0", "pitch: 5.0") + DARK + BRIGHT, ["pitch", "lacks its unit", "pitch_um"]),
         (HEAD.replace("pitch_um", "pitch_x_um") + DARK + BRIGHT, ["pitch", "one direction"]),
-        (HEAD.replace("sensor: cmos", "sensor: film") + DARK + BRIGHT, ["sensor", "'ccd' or 'cmos'"]),
+        (HEAD.replace("sensor: cmos", "sensor: film") + DARK + BRIGHT, ["sensor", "'ccd', 'cmos' or 'cid'"]),
         (HEAD.replace("campaign/1", "campaign/9") + DARK + BRIGHT, ["schema", "pixmetry/campaign/9", "pixmetry/campaign/1"]),
         (HEAD.replace("schema: pixmetry/campaign/1\n", "") + DARK + BRIGHT, ["'schema' is missing"]),
         (HEAD + DARK + BRIGHT + "emva_descriptor: set.txt\n", ["listed twice"]),

@@ -143,7 +143,7 @@ def test_every_job_has_its_page_on_paper(rng: np.random.Generator) -> None:
     from report import calibrations
 
     said = " ".join(" ".join(texts_of(page_of(simulated.assessment()))).split())
-    for words in ("0.050 px = 0.370 µm", "Temporal row and column noise", "only in a camera that is analogue", "One target in one frame"):
+    for words in ("0.050 px = 0.370 µm", "Temporal row and column noise", "only in a camera that is analogue", "one target in one frame"):
         assert words in said
     few = calibrations.bare(rng, images=4)
     assert "Principal distance" in " ".join(texts_of(calibration_page(few)))

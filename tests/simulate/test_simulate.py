@@ -364,18 +364,19 @@ def test_a_series_tells_the_temperature_at_which_it_was_taken(folder: Path) -> N
 
 
 def test_a_wrong_target_names_its_scene_file(folder: Path) -> None:
-    (folder / "ring.yaml").write_text(
-        "schema: pixmetry/scene/1\ntargets: [{kind: ring, x_px: 5, y_px: 9, diameter_px: 7, inner_px: 9}]\n"
-    )
+    (folder / "ring.yaml").write_text("schema: pixmetry/scene/1\ntargets: [{kind: ring, x_px: 5, y_px: 9, diameter_px: 7, inner_px: 9}]\n")
     for command in ("simulate", "chain"):
         result = CliRunner().invoke(main, [command, str(folder / "camera.yaml"), str(folder / "ring.yaml"), "-o", str(folder / "out")])
         assert result.exit_code == 2 and "ring.yaml: ring.inner_px" in result.output
 
 
 def test_swapped_files_are_told_by_their_schema(folder: Path) -> None:
-    for command in (["simulate", "scene.yaml", "camera.yaml"], ["simulate", "camera.yaml", "camera.yaml"]):
-        result = CliRunner().invoke(main, [command[0], *(str(folder / name) for name in command[1:]), "-o", str(folder / "out")])
-        assert result.exit_code == 2 and "a file of another kind" in result.output and "to do: name a file of that schema" in result.output
+    for camera, scene, remedy in (
+        ("scene", "camera", "name a camera file, a data-sheet file"),
+        ("camera", "camera", "name a file of that schema"),
+    ):
+        result = CliRunner().invoke(main, ["simulate", *(str(folder / f"{n}.yaml") for n in (camera, scene)), "-o", str(folder / "out")])
+        assert result.exit_code == 2 and "a file of another kind" in result.output and f"to do: {remedy}" in result.output
 
 
 def test_a_scene_pair_that_is_one_number_is_explained(folder: Path) -> None:

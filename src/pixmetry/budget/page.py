@@ -11,11 +11,13 @@ import numpy as np
 from pixmetry.budget.answer import Answer as Totals
 from pixmetry.budget.answer import Next, rms
 from pixmetry.budget.camera_budget import CameraBudget
+from pixmetry.budget.sweep import WIDE, Sweep
 from pixmetry.budget.table import ABSENT, Parts, SourceRow
 from pixmetry.camera.catalogue import STAGES, get_source
 from pixmetry.report import Answer, Column, Figure, Page, Points, Reading, Row, Run, Section, Table, Text, strong
 from pixmetry.report.drawing import BLUE, INK, SOFT, canvas
 from pixmetry.report.numbers import NONE, length_mpx, length_px, length_um, percent, significant
+from pixmetry.report.page import Inline
 
 if TYPE_CHECKING:
     from matplotlib.patches import Patch
@@ -35,12 +37,14 @@ HOW_TO_READ = (
 STAR_SCALE = "Stars are by the total before calibration: ★ from 0.005 px, ★★ 0.03, ★★★ 0.1, ★★★★ 0.3, ★★★★★ 1 px."
 
 
-def page_of(budget: CameraBudget) -> Page:
+def page_of(budget: CameraBudget, sweep: Sweep | None = None) -> Page:
     """The page of a camera's budget.
 
     Parameters
     ----------
     budget : CameraBudget
+    sweep : Sweep, optional
+        The answer over a range of one entry.
 
     Returns
     -------
@@ -57,6 +61,8 @@ def page_of(budget: CameraBudget) -> Page:
     ]
     if budget.disagreements:
         page.sections.insert(3, _descriptions(budget))
+    if sweep is not None:
+        page.sections.insert(1, _sweep(sweep))
     return page
 
 
@@ -182,6 +188,38 @@ def _bars(budget: CameraBudget) -> Figure:
     return Figure(figure, "largest", f"The largest sources before and after calibration: {top}.", caption)
 
 
+def _sweep(sweep: Sweep) -> Section:
+    """The answer over a range of one entry."""
+    values = [s.value for s in sweep.steps]
+    with canvas(2.2) as (figure, axes):
+        axes.fill_between(
+            values, *([rms(getattr(s.answer, n)) for s in sweep.steps] for n in ("least_px", "most_px")), color=BLUE, alpha=0.15
+        )
+        axes.plot(values, [rms(s.answer.after_px) for s in sweep.steps], "o-", color=BLUE, label="after calibration")
+        axes.set_yscale("log")
+        if min(values) > 0 and max(values) / min(values) >= WIDE:
+            axes.set_xscale("log")
+            axes.set_xticks(values, [f"{v:g}" for v in values], minor=False)
+            axes.minorticks_off()
+        axes.set_xlabel(sweep.key)
+        axes.set_ylabel("px, rms of x and y")
+    low = min(sweep.steps, key=lambda s: rms(s.answer.after_px))
+    alt = f"Total after calibration over {sweep.key}; smallest at {low.value:g}."
+    section = Section(f"Over {sweep.key}", name="sweep")
+    section.add(Figure(figure, "sweep", alt, "Line: after the calibration; band: the interval."))
+    columns = [
+        Column(sweep.key, "right"),
+        *(Column(f"{n} / px", "right") for n in ("After", "At least", "At most")),
+        Column("Largest source"),
+    ]
+    cells = [[f"{s.value:g}", *(length_px(rms(p)) for p in _three(s.answer)), s.largest] for s in sweep.steps]
+    return section.add(Table(f"Total over {sweep.key}", columns, cells))
+
+
+def _three(answer: Totals) -> tuple[tuple[float, float], ...]:
+    return answer.after_px, answer.least_px, answer.most_px
+
+
 # ---- what to do --------------------------------------------------------------------------------------------------------------------
 
 
@@ -189,7 +227,7 @@ def _next(title: str, name: str, steps: Sequence[Next], words: str) -> Section:
     section = Section(title, name=name)
     if not steps:
         return section.add_text("Nothing that would make a difference.")
-    items = []
+    items: list[Inline] = []
     for step in steps[:LISTED]:
         if step.gain_px >= WORTH * step.now_px:
             numbers = words.format(length_px(step.now_px, 3), length_px(step.then_px, 3))

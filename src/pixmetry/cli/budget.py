@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,6 +17,9 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from pixmetry.budget.camera_budget import CameraBudget
+    from pixmetry.budget.scenario import Scenario
+    from pixmetry.budget.sweep import Sweep
+    from pixmetry.camera.camera import Camera
 
 SHOWN = 20  # rows on the terminal
 
@@ -35,6 +39,11 @@ SHOWN = 20  # rows on the terminal
     metavar="KEY=VALUE",
     help="Change an entry of the scenario, such as motion.speed_px_per_s=50, or a parameter of the camera. May be repeated.",
 )
+@click.option(
+    "--vary",
+    metavar="KEY=FROM:TO[:STEPS]",
+    help="Also budget over a range of one entry, such as light.f_number=2.8:16, or over values, such as target.diameter_px=5,7,10.",
+)
 @click.option("--estimator", metavar="NAME", help="Estimator of the target's position. Default: what `pixmetry locate` takes.")
 @click.option(
     "--trials", type=click.IntRange(0), default=0, show_default=True, help="Windows of a simulation of all sources at once; 0: none."
@@ -49,6 +58,7 @@ def budget(
     cameras: tuple[str, ...],
     scenario: Path | None,
     settings: tuple[str, ...],
+    vary: str | None,
     estimator: str | None,
     trials: int,
     seed: int,
@@ -71,6 +81,7 @@ def budget(
     from pixmetry.budget.job import budget as budget_of
     from pixmetry.budget.page import TITLE, page_of
     from pixmetry.budget.scenario import read_scenario
+    from pixmetry.budget.sweep import parse_sweep, sweep_of
     from pixmetry.camera.overrides import parse_overrides
     from pixmetry.files.output import Output, check_files, page_mark, write_page
     from pixmetry.report import html_of
@@ -80,21 +91,27 @@ def budget(
     if html is not None:
         check_files([Output(html, page_mark(TITLE))], inputs)
     check_pdf(pdf, inputs)
-    given = cameras[0] if len(cameras) == 1 else list(cameras)
-    if settings:
-        camera, asked = changed(camera_of(given)[0], read_scenario(scenario), parse_overrides(settings))
-        found = budget_of(camera, asked, estimator=estimator, trials=trials, seed=seed)
-    else:
-        found = budget_of(given, scenario, estimator=estimator, trials=trials, seed=seed)
+    span = None if vary is None else parse_sweep(vary)
+    known, compared = camera_of(list(cameras))
+    camera, asked = changed(known, read_scenario(scenario), parse_overrides(settings))
+
+    def budgeted(one: Camera, of: Scenario) -> CameraBudget:
+        return budget_of(one, of, estimator=estimator, seed=seed)
+
+    sweep = None if span is None else sweep_of(camera, asked, *span, budgeted)
+    found = replace(budget_of(camera, asked, estimator=estimator, trials=trials, seed=seed), disagreements=compared)
     console = plain_console(width=116, quiet=written.printed)
     if what_next:
         print_next(found, console)
     else:
         print_budget(found, console, everything)
-    written.put({k: v for k, v in found.to_record().items() if k != "schema"})
+    if sweep is not None:
+        print_sweep(sweep, console)
+    record = {k: v for k, v in found.to_record().items() if k != "schema"}
+    written.put(record if sweep is None else record | {"sweep": sweep.to_record()})
     if html is not None:
-        echo(f"page: {write_page(html, html_of(page_of(found)))}", err=written.printed)
-    put_pdf(pdf, lambda: page_of(found))
+        echo(f"page: {write_page(html, html_of(page_of(found, sweep)))}", err=written.printed)
+    put_pdf(pdf, lambda: page_of(found, sweep))
 
 
 def print_budget(found: CameraBudget, console: Console, everything: bool = False) -> None:
@@ -158,3 +175,14 @@ def print_next(found: CameraBudget, console: Console) -> None:
             console.print(
                 f"  {length_px(step.now_px, 3)} -> {length_px(step.then_px, 3)} px  {step.title}. {step.text}".rstrip(), markup=False
             )
+
+
+def print_sweep(sweep: Sweep, console: Console) -> None:
+    """The answer over a range of one entry."""
+    from pixmetry.budget.answer import rms
+    from pixmetry.report.numbers import length_px
+
+    console.print(f"{sweep.key}: after calibration (least to most), px", markup=False)
+    for step in sweep.steps:
+        after, least, most = (length_px(rms(p)) for p in (step.answer.after_px, step.answer.least_px, step.answer.most_px))
+        console.print(f"  {step.value:<10g} {after} ({least} to {most})  {step.largest}", markup=False)

@@ -146,6 +146,7 @@ def jobs_in(folder: Path) -> Iterator[Job]:
         yield "calibrate", partial(_numbered, folder / "boards" / kind, copies)
         yield command("calibrate", copies, "--kind", kind, *options, "--pitch-mm", 20, "-o", folder / f"calibrated-{kind}")
     yield from _locating()
+    yield command("budget", "pulnix_tm6cn_epix_512", "--set", "motion.speed_px_per_s=20", "--set", "light.source=laser")
     for kind in BOUNDS:
         yield command("bound", "--kind", *kind.split(), "--blur", 0.7, "--amplitude", 150, "--camera", PRESET)
 

@@ -39,7 +39,7 @@ class CameraModel(Model):
     pitch_x_um: Pitch | None = None
     pitch_y_um: Pitch | None = None
     interface: Literal["digital", "analogue"] = "digital"
-    sensor: Literal["ccd", "cmos"] | None = None
+    sensor: Literal["ccd", "cmos", "cid"] | None = None
     temperature_c: Annotated[float, Field(ge=-273.15)] | None = None
     pixel_clock_mhz: Positive | None = None
     cfa: Literal["RGGB", "BGGR", "GRBG", "GBRG"] | None = None

@@ -1,0 +1,96 @@
+"""A budget over a range of one entry, as ``light.f_number=2.8:16``, or over values of it, as ``target.diameter_px=5,7,10``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from pixmetry.budget.answer import Answer
+from pixmetry.budget.camera_budget import CameraBudget
+from pixmetry.budget.changes import changed
+from pixmetry.budget.scenario import Scenario
+from pixmetry.camera.camera import Camera
+from pixmetry.camera.overrides import parse_override
+from pixmetry.core.errors import InputError
+
+STEPS, MOST = 5, 200
+WIDE = 3.0  # ratio of both ends from which on steps are in proportion
+
+
+@dataclass(frozen=True)
+class Step:
+    """One value, what the budget comes to, and its largest source."""
+
+    value: float
+    answer: Answer
+    largest: str
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """Answers of one target in one frame over the values of one entry."""
+
+    key: str
+    steps: tuple[Step, ...]
+
+    def to_record(self) -> dict[str, Any]:
+        """Return the plain record for JSON."""
+        return asdict(self)
+
+
+def parse_sweep(text: str) -> tuple[str, tuple[float, ...]]:
+    """Read ``KEY=FROM:TO``, ``KEY=FROM:TO:STEPS`` or ``KEY=VALUE,VALUE,…``; steps are in proportion where the ends are far apart.
+
+    Raises
+    ------
+    InputError
+
+    Examples
+    --------
+    >>> parse_sweep("light.f_number=2:32:5")
+    ('light.f_number', (2.0, 4.0, 8.0, 16.0, 32.0))
+    >>> parse_sweep("target.diameter_px=5,7")
+    ('target.diameter_px', (5.0, 7.0))
+    """
+    form = InputError(
+        "not a range", value=text, allowed="KEY=FROM:TO, KEY=FROM:TO:STEPS or KEY=VALUE,VALUE, such as target.diameter_px=3:12"
+    )
+    key, _, value = (part.strip() for part in text.partition("="))
+    parts = value.split(":") if ":" in value else value.split(",")
+    numbers = [parse_override(f"x={part.strip()}")[1] for part in parts if part.strip()]
+    if (
+        not key
+        or len(numbers) < 2
+        or len(numbers) != len(parts)
+        or any(isinstance(n, bool) or not isinstance(n, int | float) for n in numbers)
+    ):
+        raise form
+    if ":" not in value:
+        return key, tuple(float(n) for n in numbers)
+    first, last, count = float(numbers[0]), float(numbers[1]), int(numbers[2]) if len(numbers) > 2 else STEPS
+    if len(numbers) > 3 or not 2 <= count <= MOST or first == last:
+        raise form
+    wide = first > 0 and last > 0 and max(first, last) / min(first, last) >= WIDE
+    values = np.geomspace(first, last, count) if wide else np.linspace(first, last, count)
+    return key, tuple(float(f"{v:.6g}") for v in values)
+
+
+def sweep_of(
+    camera: Camera, scenario: Scenario, key: str, values: Sequence[float], budget_of: Callable[[Camera, Scenario], CameraBudget]
+) -> Sweep:
+    """Budget the camera with each of these values.
+
+    Raises
+    ------
+    InputError
+        If there is no such entry, or a value is out of its range.
+    """
+    settings = [changed(camera, scenario, {key: value}) for value in values]  # before the work
+    steps = []
+    for value, (one, asked) in zip(values, settings, strict=True):
+        found = budget_of(one, asked)
+        steps.append(Step(value, found.one, next((r.title for r in found.rows if r.counts), "")))
+    return Sweep(key, tuple(steps))
