@@ -69,13 +69,13 @@ class CameraBudget:
 
     @cached_property
     def to_measure(self) -> tuple[Next, ...]:
-        """What to measure next, by how much it narrows the interval."""
-        return tuple(to_measure(self.rows))
+        """What to measure next, by how much it narrows the interval of the mean over the scenario's frames and targets."""
+        return tuple(to_measure(self.rows, self.scenario.count.frames, self.scenario.count.targets))
 
     @cached_property
     def to_change(self) -> tuple[Next, ...]:
-        """What to change next, by how much it lowers the total."""
-        return tuple(to_change(self.rows))
+        """What to change next, by how much it lowers the total of that mean."""
+        return tuple(to_change(self.rows, self.scenario.count.frames, self.scenario.count.targets))
 
     def um(self, pair_px: tuple[float, float]) -> tuple[float, float] | None:
         """A pair of lengths in µm on the sensor; None where the pitch is not known."""
@@ -157,6 +157,7 @@ class CameraBudget:
             "one_target_one_frame": self._answer_record(self.one),
             "answer": self._answer_record(self.answer),
             "point_covariance_mm2": None if covariance is None else covariance.tolist(),
+            "together": None if self.together is None else _together_record(self.together),
             "rows": [_row_record(r) for r in self.rows],
             "to_measure": [asdict(n) for n in self.to_measure],
             "to_change": [asdict(n) for n in self.to_change],
@@ -169,6 +170,12 @@ class CameraBudget:
             pair = record[f"{name}_px"]
             record[f"{name}_um"], record[f"{name}_mm"] = self.um(pair), self.mm(pair)
         return record
+
+
+def _together_record(found: MonteCarlo) -> dict[str, Any]:
+    names = ("total_px", "se_total_px", "calibrated_px", "se_calibrated_px", "trials", "lost")
+    values = {n: getattr(found, n) for n in names}
+    return {n: v if np.isfinite(v) else None for n, v in values.items()}
 
 
 def _row_record(row: SourceRow) -> dict[str, Any]:

@@ -81,22 +81,34 @@ def camera_of(given: str | Path | Camera | Sequence[str | Path | Camera]) -> tup
 
 
 def _joined(one: Camera, other: Camera) -> Camera:
-    """The first camera with what the other one knows better."""
-    mine = {e.source.id: e for e in one.chain}
-    for element in other.chain:
-        own = mine.get(element.source.id)
-        if own is None or RANK[element.known_from] > RANK[own.known_from]:
-            mine[element.source.id] = element if own is None else replace(element, name=own.name)
-    ordered = in_order(e.source for e in mine.values())
+    """The first camera with what the other one knows better, all elements of a source together."""
+    mine, theirs = _by_source(one), _by_source(other)
+    for source_id, elements in theirs.items():
+        if source_id not in mine or _rank(elements) > _rank(mine[source_id]):
+            mine[source_id] = elements
+    ordered = in_order(elements[0].source for elements in mine.values())
     facts = {**other.facts, **one.facts}
-    return replace(one, chain=tuple(mine[s.id] for s in ordered), pitch_um=one.pitch_um or other.pitch_um, facts=facts)
+    chain = tuple(e for s in ordered for e in mine[s.id])
+    return replace(one, chain=chain, pitch_um=one.pitch_um or other.pitch_um, facts=facts)
+
+
+def _by_source(camera: Camera) -> dict[str, list[Element]]:
+    found: dict[str, list[Element]] = {}
+    for element in camera.chain:
+        found.setdefault(element.source.id, []).append(element)
+    return found
+
+
+def _rank(elements: Sequence[Element]) -> int:
+    return max(RANK[e.known_from] for e in elements)
 
 
 def _compared(one: Camera, other: Camera) -> list[Disagreement]:
-    theirs = {e.source.id: e for e in other.chain}
+    theirs = _by_source(other)
     found = []
     for element in one.chain:
-        second = theirs.get(element.source.id)
+        there = theirs.get(element.source.id, [])
+        second = there[0] if len(there) == 1 else next((e for e in there if e.name == element.name), None)
         if second is None or not {element.known_from, second.known_from} <= {"measured", "sheet"}:
             continue
         for name in type(element.params).model_fields:

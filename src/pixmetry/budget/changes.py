@@ -28,7 +28,7 @@ def changed(camera: Camera, scenario: Scenario, settings: Mapping[str, Any]) -> 
     own: dict[str, Any] = {}
     for key, value in settings.items():
         part, _, entry = key.partition(".")
-        if part in record and entry:
+        if part in record and entry and "." not in entry:  # storage.jpeg.quality is the camera's
             record[part][entry] = value
         else:
             own[key] = value

@@ -117,9 +117,10 @@ class Calibration:
         x, y = self._unit(then)
         basis = _scales(x, y) if self.model == "principal_point_and_scale" else _lens(x, y)
         smooth = _followed(then[:, 0], basis[:, :, 0], basis)
-        if self.model != "residual_grid":
-            return smooth[:, 0]
-        return smooth[:, 0] + np.einsum("kn,akn->an", self.places.weights, (then - smooth)[:, 1:])
+        rest = then - smooth
+        grid = np.einsum("kn,akn->an", self.places.weights, np.nan_to_num(rest[:, 1:]))
+        helps = np.nansum((rest[:, 0] - grid) ** 2) < np.nansum(rest[:, 0] ** 2)  # one with cells too large does not
+        return smooth[:, 0] + grid if self.model == "residual_grid" and helps else smooth[:, 0]
 
     def _unit(self, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Measured places, over half the frame's longer side."""

@@ -184,6 +184,7 @@ def budget(
     """
     known, disagreements = camera_of(camera)
     setting = Setting(known, read_scenario(scenario))
+    setting.check()  # before the work
     law = TargetEstimator(estimator) if isinstance(estimator, str) else estimator or TargetEstimator()
     table = Table(setting, law, seed, progress or (lambda text: None))
     rows = with_shares(table.rows())

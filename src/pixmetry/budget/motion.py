@@ -10,15 +10,18 @@ from typing import Any
 
 import numpy as np
 
+from pixmetry.budget.probe import make_probe, seen_at
 from pixmetry.budget.setting import Setting
 from pixmetry.camera.camera import Camera, Element
 from pixmetry.camera.contribution import Contribution
 from pixmetry.core.random import Grid
+from pixmetry.locate.estimator import Estimator
 
 FRAMES = 256  # for what is drawn anew in every frame
 LOOKS = ("sensor.exposure", "sensor.interlace", "sensor.light_pulses", "sensor.rolling_shutter", "sensor.trigger_jitter")
 LAGS = {"sensor.image_lag": "lag_rel", "processing.temporal_noise_reduction": "alpha"}  # with the share of the frame before
 OF_MOTION = (*LOOKS, *LAGS)
+LAG_PHASES, GHOSTS, SMALLEST_GHOST = 3, 60, 1e-5  # places within the pixel; earlier frames at most, and their smallest share
 STILL = "nothing moves in this scenario"
 
 
@@ -32,26 +35,45 @@ NOWHERE: Any = _Nowhere()
 
 
 def motion_contribution(element: Element, setting: Setting, camera: Camera) -> Contribution:
-    """What a source that looks at other times, or remembers the frame before, does to a moving target.
+    """What a source that looks at other times does to a moving target.
 
     Notes
     -----
-    Looks: the mean over the rows of a target, so over both fields, of v τ + a ⟨τ²⟩/2. It is constant for targets of one speed, and changes
-    over the frame with a rolling shutter. A share q of the frame before, in every frame again, holds the target back by v T q/(1 − q), the
-    first moment of the geometric series; T is the time from frame to frame.
+    The mean over the rows of a target, so over both fields, of v τ + a ⟨τ²⟩/2. It is constant for targets of one speed, and changes over
+    the frame with a rolling shutter.
     """
     v, a = setting.velocity_px_per_s, setting.acceleration_px_per_s2
-    if element.source.id in LAGS:
-        share = float(getattr(element.params, LAGS[element.source.id]))
-        period = float(camera.facts.get("frame_period_s", max(camera.exposure_s, 0.04)))
-        bias = -v * period * share / (1 - share)
-        return _of(bias, np.zeros(2), np.zeros(2), "the first moment of what stays of earlier frames, at the target's speed")
     delay, spread2 = _delays(element, camera)
     shift = _in_pairs(delay * v[:, None, None] + 0.5 * (delay**2 + spread2) * a[:, None, None])
     mean = shift.mean(axis=(1, 2))
     time = shift.mean(axis=2).std(axis=1)
     smooth = shift.mean(axis=1).std(axis=1)
     return _of(mean, time, smooth, "times at which the rows look, and the target's speed")
+
+
+def lag_contribution(element: Element, setting: Setting, estimator: Estimator) -> Contribution:
+    """What a source that keeps a share q of the frame before, in every frame again, does to a moving target.
+
+    Notes
+    -----
+    The frame shows Σ (1 − q) qᵏ of the target k frames ago. The estimator is asked on that, at phases of the pixel. Ghosts that overlap the
+    target hold it back by v T q/(1 − q), the first moment of the series; those beyond its window do nothing.
+    """
+    share = float(getattr(element.params, LAGS[element.source.id]))
+    probe = make_probe(setting.facts, setting.target, estimator, LAG_PHASES)
+    assert probe.locate is not None
+    step = setting.velocity_px_per_s * setting.frame_period_s
+    signal, left = np.zeros_like(probe.signal_dn), 1.0  # of the light, what is still to be shown
+    for k in range(GHOSTS):
+        last = left * share < SMALLEST_GHOST or k == GHOSTS - 1
+        x, y = probe.x_px - k * step[0], probe.y_px - k * step[1]
+        signal += (left if last else left * (1 - share)) * seen_at(setting.facts, setting.target, x, y, probe.signal_dn.shape[1:])
+        left *= share
+        if last:
+            break
+    dx, dy = probe.moved(signal)
+    zero = np.zeros(2)
+    return _of(np.array([np.mean(dx), np.mean(dy)]), zero, zero, "the estimator on the target with what stays of earlier frames")
 
 
 def _of(bias: np.ndarray, time: np.ndarray, smooth: np.ndarray, method: str) -> Contribution:

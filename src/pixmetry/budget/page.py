@@ -325,7 +325,10 @@ def why_differ(row: SourceRow) -> str:
 def _scenario(budget: CameraBudget) -> Section:
     section = Section("What is measured, and how", name="scenario")
     section.add_text("The scenario; what was not given has its default.", style="small soft")
-    rows = [[Run(name, "mono"), str(value), "given" if given else "default"] for name, (value, given) in budget.scenario.told.items()]
+    rows = [
+        [Run(name, "mono"), "not given" if value is None else str(value), "given" if given else "default"]
+        for name, (value, given) in budget.scenario.told.items()
+    ]
     return section.add_section("Entries of the scenario", Table("Scenario", ["Entry", "Value", ""], rows), fold=True)
 
 

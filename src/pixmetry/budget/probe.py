@@ -295,7 +295,7 @@ def _lattice(phases: int) -> tuple[np.ndarray, np.ndarray]:
     return dx, dy
 
 
-def _seen(facts: Facts, target: Target, x: np.ndarray, y: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+def seen_at(facts: Facts, target: Target, x: np.ndarray, y: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     """Linear DN of windows of this shape, with the target at (x, y) in window coordinates; (p, rows, cols)."""
     n = len(x)
     zero = np.zeros(n, np.int64)
@@ -318,7 +318,7 @@ def make_probe(facts: Facts, target: Target, estimator: Estimator, phases: int |
     side = window_side(estimator)
     dx, dy = _lattice(phases or phases_for(estimator))
     x, y = side // 2 + dx, side // 2 + dy
-    signal = _seen(facts, target, x, y, (side, side))
+    signal = seen_at(facts, target, x, y, (side, side))
     x_hat, y_hat = estimator.locate(signal)
     gx, gy = estimator.gradient(signal)
     return Probe(
@@ -416,9 +416,9 @@ class Probes:
             x_hat, y_hat = self._at_level(level).locate(samples_dn)
             return line.pixels(x_hat + first_sample[which]) - first[which], y_hat
 
-        held = Held(line, pixels, samples, nothing, nothing, located, ahead, self._rows_seen())
+        held = Held(line, pixels, samples, nothing, nothing, located, ahead, self._rowsseen_at())
         background = self.bare.background_dn
-        signal = self._curved(_seen(facts, self.target, x - first, y - row, (self.side, width)))
+        signal = self._curved(seen_at(facts, self.target, x - first, y - row, (self.side, width)))
         seen = held.read(line, signal, background)
         gx, gy = self._at_level(line.level).gradient(seen)
         held = replace(held, gx=gx / step, gy=gy)
@@ -513,7 +513,7 @@ class Probes:
         light = np.concatenate([[0.0], self.curve.saturating * np.geomspace(1e-9, 4.0, 40_000)])
         return self.curve.of(light), light
 
-    def _rows_seen(self) -> tuple[int, int]:
+    def _rowsseen_at(self) -> tuple[int, int]:
         """Rows of the sensor that are put out: those that lie in the frame of the output."""
         rows = self.camera.frame_shape[0]
         _, at = self.camera.layout(np.zeros(rows), np.arange(rows))

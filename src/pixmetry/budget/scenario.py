@@ -41,9 +41,9 @@ class ObjectModel(Model):
 class LightModel(Model):
     """What lights it."""
 
-    source: Literal["lamp", "led", "strobe", "laser"] = Field(default="led", description="a laser makes speckle; a lamp on mains flickers")
+    source: Literal["lamp", "led", "laser"] = Field(default="led", description="a laser makes speckle; a lamp on mains flickers")
     wavelength_nm: float = Field(default=550.0, ge=200, le=1100, description="mean wavelength")
-    f_number: float | None = Field(default=None, gt=0.3, le=256, description="of the lens, where the camera does not tell it")
+    f_number: float | None = Field(default=None, ge=0.7, le=64, description="of the lens, where the camera does not tell it")
     speckle_contrast_rel: float | None = Field(default=None, ge=0, le=1, description="of a laser spot; 1 for a rough surface at rest")
     mains_hz: float = Field(default=50.0, gt=0, le=1000, description="of the supply; a lamp flickers at twice this frequency")
 
@@ -56,6 +56,7 @@ class MotionModel(Model):
     acceleration_px_per_s2: float | None = Field(default=None, ge=0, le=1e9)
     acceleration_mm_per_s2: float | None = Field(default=None, ge=0, le=1e10, description="on the object")
     direction_deg: float = Field(default=0.0, ge=-360, le=360, description="0: along the rows; 90: down the columns")
+    frame_period_s: float | None = Field(default=None, gt=0, le=1e6, description="from frame to frame, where the camera does not tell it")
 
 
 class StateModel(Model):
@@ -64,6 +65,7 @@ class StateModel(Model):
     camera_on_min: float = Field(default=120.0, ge=0, le=1e6, description="time since the camera was switched on")
     grabber_on_min: float = Field(default=120.0, ge=0, le=1e6, description="time since the frame grabber was switched on")
     temperature_change_k: float = Field(default=0.0, ge=-100, le=100, description="of the surroundings, since the calibration")
+    warm_up_k: float = Field(default=10.0, ge=0, le=100, description="by which a camera that does not tell it warms itself (assumed)")
 
 
 class CountModel(Model):
@@ -131,16 +133,14 @@ class Scenario(Model):
 
     @property
     def told(self) -> dict[str, tuple[Any, bool]]:
-        """Every entry that has a value by its name, as ``motion.direction_deg``: the value, and whether the user gave it."""
+        """Every entry by its name, as ``motion.direction_deg``: its value (None if not given), and whether the user gave it."""
         found: dict[str, tuple[Any, bool]] = {}
         for part in type(self).model_fields:
             if part == "schema_":
                 continue
             model = getattr(self, part)
             for name in type(model).model_fields:
-                value = getattr(model, name)
-                if value is not None:
-                    found[f"{part}.{name}"] = value, name in model.model_fields_set
+                found[f"{part}.{name}"] = getattr(model, name), name in model.model_fields_set
         return found
 
 

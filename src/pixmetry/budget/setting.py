@@ -16,17 +16,26 @@ from pixmetry.core.errors import InputError
 
 DEFAULT_DIAMETER_PX = 7.0
 DEFAULT_F_NUMBER = 8.0
+LARGEST_PX = 80.0  # diameter of a target: what each of its pixels does is computed
+FRAME_PERIOD_S = 0.04  # of a camera that tells none, unless it exposes longer
+SAME_SCALE = 0.1  # relative difference of two statements of the scale that may stand beside each other
 
 
-def in_state(camera: Camera, camera_on_min: float, grabber_on_min: float, temperature_change_k: float = 0.0) -> Camera:
-    """The camera so long after switching on, in surroundings that are warmer by so much; its frames no longer warm up."""
-    on_s = {"grabber.clock_warm_up": 60.0 * grabber_on_min, "sensor.mount_drift": 60.0 * camera_on_min}
-    chain = tuple(_on_longer(e, on_s.get(e.source.id, 0.0)) for e in camera.chain)
-    colder = camera.warm_up_k * float(np.exp(-60.0 * camera_on_min / camera.warm_up_s))
+def in_state(
+    camera: Camera, camera_on_min: float, grabber_on_min: float, temperature_change_k: float = 0.0, warm_up_k: float = 0.0
+) -> Camera:
+    """The camera so long after switching on, in surroundings that are warmer by so much; its frames no longer warm up.
+
+    ``warm_up_k`` is by how much a camera that does not tell it warms itself.
+    """
+    chain = tuple(_on_longer(e, camera_on_min, grabber_on_min) for e in camera.chain)
+    colder = (camera.warm_up_k or warm_up_k) * float(np.exp(-60.0 * camera_on_min / camera.warm_up_s))
     return replace(camera, chain=chain, temperature_c=camera.temperature_c - colder + temperature_change_k, warm_up_k=0.0)
 
 
-def _on_longer(element: Element, by_s: float) -> Element:
+def _on_longer(element: Element, camera_on_min: float, grabber_on_min: float) -> Element:
+    """The element as old as camera and grabber are."""
+    by_s = {"grabber.clock_warm_up": 60.0 * grabber_on_min, "sensor.mount_drift": 60.0 * camera_on_min}.get(element.source.id, 0.0)
     if not by_s:
         return element
     return replace(element, params=element.params.model_copy(update={"on_for_s": element.params.on_for_s + by_s}))
@@ -51,22 +60,52 @@ class Setting:
     described: Camera
     scenario: Scenario
 
+    def check(self) -> None:
+        """Refuse a scenario that cannot be used with this camera.
+
+        Raises
+        ------
+        InputError
+        """
+        for name in ("camera", "target", "px_per_mm", "velocity_px_per_s", "acceleration_px_per_s2"):
+            getattr(self, name)
+
     @cached_property
     def camera(self) -> Camera:
         """In the state of the measurement."""
         state = self.scenario.state
-        return in_state(self._stored, state.camera_on_min, state.grabber_on_min, state.temperature_change_k)
+        return in_state(self._stored, state.camera_on_min, state.grabber_on_min, state.temperature_change_k, state.warm_up_k)
 
     @cached_property
     def calibrated(self) -> Camera:
         """In the state in which it was calibrated."""
         then = self.scenario.calibration
-        return in_state(self._stored, then.camera_on_min, then.grabber_on_min)
+        return in_state(self._stored, then.camera_on_min, then.grabber_on_min, warm_up_k=self.scenario.state.warm_up_k)
+
+    def aged(self, element: Element, camera: Camera) -> Element:
+        """A source that the chain does not hold like that, as old as `camera` or `calibrated` is."""
+        age = self.scenario.calibration if camera is self.calibrated else self.scenario.state
+        return _on_longer(element, age.camera_on_min, age.grabber_on_min)
 
     @cached_property
     def _stored(self) -> Camera:
-        facts = {**self.described.facts, "lossless": self.scenario.storage.format == "lossless"}
-        return replace(self.described, facts=facts)
+        """As described, its frames stored as the scenario says."""
+        asked = self.scenario.storage
+        if asked.format == "tape" and self.described.facts.get("interface") == "digital":
+            raise InputError("a digital camera is not stored on tape", where="storage.format", value="tape", allowed="lossless or jpeg")
+        chain = self.described.chain
+        if "format" in asked.model_fields_set:
+            chain = tuple(self._as_stored(e) for e in chain)
+        lossless = asked.format == "lossless" and not any(e.on and e.source.stage == "storage" for e in chain)
+        return replace(self.described, chain=chain, facts={**self.described.facts, "lossless": lossless})
+
+    def _as_stored(self, element: Element) -> Element:
+        asked = self.scenario.storage
+        if element.source.stage != "storage":
+            return element
+        if element.source.id != f"storage.{asked.format}":
+            return replace(element, on=False)
+        return replace(element, on=True, params=element.source.make({**element.params.model_dump(), **self.brought_in[element.source.id]}))
 
     @cached_property
     def target(self) -> Target:
@@ -75,6 +114,14 @@ class Setting:
         diameter = t.diameter_px
         if t.diameter_mm is not None:
             diameter = t.diameter_mm * self.needed_scale("target.diameter_mm")
+        most = min(LARGEST_PX, min(self.described.frame_shape) / 3)
+        if diameter is not None and diameter > most:
+            raise InputError(
+                "the target is too large for a budget",
+                where="target.diameter_px" if t.diameter_mm is None else "target.diameter_mm",
+                value=f"{diameter:.3g} px",
+                allowed=f"up to {most:.3g} px: a third of the frame, and {LARGEST_PX:g} px",
+            )
         return Target("disc", DEFAULT_DIAMETER_PX if diameter is None else diameter, t.blur_px, t.peak_rel, t.background_rel)
 
     @cached_property
@@ -109,10 +156,9 @@ class Setting:
         A thin lens of focal length f images at the scale f/(Z − f); a field of view gives the same directly.
         """
         o = self.scenario.object
-        if o.field_mm is not None:
-            return self.described.frame_shape[1] / o.field_mm
+        by_field = None if o.field_mm is None else self.described.frame_shape[1] / o.field_mm
         if o.distance_mm is None or self.f_mm is None or self.described.pitch_um is None:
-            return None
+            return by_field
         if o.distance_mm <= self.f_mm:
             raise InputError(
                 "the object is nearer than the focal length",
@@ -120,16 +166,30 @@ class Setting:
                 value=o.distance_mm,
                 allowed=f"above {self.f_mm:g} mm",
             )
-        return self.f_mm / (o.distance_mm - self.f_mm) * 1e3 / self.described.pitch_um[0]
+        by_lens = self.f_mm / (o.distance_mm - self.f_mm) * 1e3 / self.described.pitch_um[0]
+        if by_field is not None and abs(by_field / by_lens - 1) > SAME_SCALE:
+            raise InputError(
+                "field, distance and focal length contradict each other",
+                where="object.field_mm",
+                value=f"{by_field:.3g} px/mm by the field, {by_lens:.3g} px/mm by distance and lens",
+                remedy="leave one of the three out",
+            )
+        return by_lens if by_field is None else by_field
 
-    @cached_property
-    def distance_mm(self) -> float | None:
-        """From the lens to the object, given or from field and focal length."""
-        o = self.scenario.object
-        if o.distance_mm is not None or o.field_mm is None or self.f_mm is None or self.described.pitch_um is None:
-            return o.distance_mm
-        scale = self.described.frame_shape[1] * self.described.pitch_um[0] * 1e-3 / o.field_mm
-        return self.f_mm * (1 + 1 / scale)
+    @property
+    def chief_ray_deg(self) -> float | None:
+        """Angle of the light in the frame's corners, with the exit pupil at the focal length; None where that is unknown."""
+        pitch = self.described.pitch_um
+        if self.f_mm is None or pitch is None:
+            return None
+        rows, cols = self.described.frame_shape
+        return float(np.degrees(np.arctan(0.5e-3 * np.hypot(cols * pitch[0], rows * pitch[1]) / self.f_mm)))
+
+    @property
+    def frame_period_s(self) -> float:
+        """From frame to frame."""
+        told = self.scenario.motion.frame_period_s or self.described.facts.get("frame_period_s")
+        return float(told or max(self.described.exposure_s, FRAME_PERIOD_S))
 
     def needed_scale(self, asked_by: str) -> float:
         """Pixels for a millimetre on the object, for an entry that cannot be used without."""
@@ -143,9 +203,12 @@ class Setting:
         return self.px_per_mm
 
     def _along(self, px: float | None, mm: float | None, name: str) -> np.ndarray:
-        size = px if px is not None else 0.0 if mm is None else mm * self.needed_scale(f"motion.{name}")
         angle = np.radians(self.scenario.motion.direction_deg)
-        return size * np.array([np.cos(angle), np.sin(angle)])
+        along = np.array([np.cos(angle), np.sin(angle)])
+        if px is not None or mm is None:
+            return (px or 0.0) * along
+        pitch = self.described.pitch_um or (1.0, 1.0)
+        return mm * self.needed_scale(f"motion.{name}") * along * np.array([1.0, pitch[0] / pitch[1]])
 
     @cached_property
     def velocity_px_per_s(self) -> np.ndarray:
@@ -184,4 +247,12 @@ class Setting:
             found["storage.jpeg"] = {"quality": storage.quality}
         if storage.format == "tape":
             found["storage.tape"] = {}
+        if self.scenario.target.model_fields_set & {"gradient_rel_per_px", "view_angle_deg"}:
+            t = self.scenario.target
+            found["scene.view_point"] = {"gradient_rel_per_px": self.gradient_rel_per_px, "view_angle_deg": t.view_angle_deg}
         return found
+
+    @property
+    def told_by_scenario(self) -> set[str]:
+        """Those of them whose size it tells; of the others it only tells that they are there."""
+        return set(self.brought_in) & {"storage.jpeg", "scene.view_point"}

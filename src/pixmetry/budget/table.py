@@ -16,7 +16,7 @@ import numpy as np
 
 from pixmetry.budget.fields import Calibration, Places, field_of, spread_of
 from pixmetry.budget.monte_carlo import Trials, missed, put
-from pixmetry.budget.motion import LAGS, OF_MOTION, STILL, motion_contribution
+from pixmetry.budget.motion import LAGS, OF_MOTION, STILL, lag_contribution, motion_contribution
 from pixmetry.budget.parameters import applies, u_of_total, with_estimates
 from pixmetry.budget.probe import Probes
 from pixmetry.budget.setting import Setting
@@ -24,7 +24,7 @@ from pixmetry.camera.camera import Camera, Element, pitch_values
 from pixmetry.camera.catalogue import get_source, sources
 from pixmetry.camera.contribution import UNSTEADY, Contribution
 from pixmetry.camera.source import Source
-from pixmetry.core.errors import InputError
+from pixmetry.core.errors import ChainError, InputError
 from pixmetry.core.number import Estimates
 from pixmetry.locate.estimator import Estimator
 
@@ -50,6 +50,8 @@ SETTINGS = (  # what a user switches on, or a grabber with a clock of its own ha
 )
 VIEW_POINT = "scene.view_point"
 AVERAGED = ("scene.speckle", VIEW_POINT)  # of the object's errors those that another target has otherwise
+COVERAGE = 2.0  # standard uncertainties of what was measured, at the upper end of the interval
+NOTHING_PX = 1e-9  # below it a shift is rounding
 Pair = tuple[float, float]
 NOTHING: Pair = (0.0, 0.0)
 
@@ -86,6 +88,17 @@ class Parts:
     place_px: Pair = NOTHING
     time_px: Pair = NOTHING
 
+    def scaled(self, factor: float) -> Parts:
+        """All parts so many times as large."""
+        c, s, p, t = ((factor * v[0], factor * v[1]) for v in (self.constant_px, self.smooth_px, self.place_px, self.time_px))
+        return Parts(c, s, p, t)
+
+    def or_more(self, other: Parts) -> Parts:
+        """The larger of the two, part by part; a constant keeps its sign."""
+        pairs = ((getattr(self, name), getattr(other, name)) for name in ("constant_px", "smooth_px", "place_px", "time_px"))
+        c, s, p, t = ((max(a[0], b[0], key=abs), max(a[1], b[1], key=abs)) for a, b in pairs)
+        return Parts(c, s, p, t)
+
     def axes_px(self, frames: int = 1, targets: int = 1) -> Pair:
         """Everything together in x and y, as squares, for means over so many frames and targets."""
         x, y = (
@@ -98,7 +111,8 @@ class Parts:
     def total_px(self) -> float:
         """Root mean square over x and y of one target in one frame."""
         x, y = self.axes_px()
-        return float(np.sqrt(0.5 * (x**2 + y**2)))
+        total = float(np.sqrt(0.5 * (x**2 + y**2)))
+        return total if total > NOTHING_PX else 0.0
 
 
 @dataclass(frozen=True)
@@ -199,12 +213,11 @@ class Table:
         camera = self.setting.camera
         rows = [self.row(e, in_camera=True) for e in camera.active if only is None or e.source.id in only]
         there = {e.source.id for e in camera.active}
-        # switched off: what was measured and is not significant
-        off = {e.source.id: e for e in camera.chain if not e.on and len(e.estimates) and e.source.id not in there}
+        off = {e.source.id: e for e in camera.chain if not e.on}  # measured and not significant, or switched off
         for source in sources().values():
             if source.id not in there and (only is None or source.id in only):
                 usual = Element(source.id, source, self._own(source, self._usual(source)))
-                rows.append(self.row(off.get(source.id, usual), in_camera=False))
+                rows.append(self.row(usual if source.id in self.setting.brought_in else off.get(source.id, usual), in_camera=False))
         return rows
 
     # ---- one row --------------------------------------------------------------------------------------------------------------
@@ -226,11 +239,13 @@ class Table:
         )
         estimates = element.estimates if len(element.estimates) else None
         absent = "" if in_camera or estimates is not None else self._absent(source)
+        if not element.on and estimates is None:
+            absent = "switched off in the description of this camera"
         if absent:
             return replace(row, status=ABSENT, reason=absent)
         if estimates is not None:
             element = replace(element, params=with_estimates(source, element.params, estimates), on=True)
-        told = in_camera or estimates is not None or source.id in self.setting.brought_in
+        told = in_camera or estimates is not None or source.id in self.setting.told_by_scenario
         known_from = element.known_from if told else "typical"
         row = replace(row, status=KNOWN_FROM[known_from], reason="" if estimates is None else estimates.method)
         if source.id in OF_MOTION and not self.setting.moves:
@@ -238,13 +253,18 @@ class Table:
         row = self._computed(row, element, in_camera, estimates)
         if source.part_of:
             return replace(row, status=ELSEWHERE, reason=f"it counts in the row of {get_source(source.part_of).title}")
-        if row.status != TYPICAL or row.before is None:
+        if row.before is None or row.after is None:
             return row
+        if row.status != TYPICAL:
+            u_rel = row.u_of_total_px / row.before_px if row.before_px else 0.0
+            return replace(row, largest=row.after.scaled(1 + COVERAGE * u_rel)) if u_rel else row
         bound = self._own(source, source.bound_of(self.setting.camera.frame_shape))
         largest = self._computed(row, replace(element, params=bound), in_camera, None)
-        if row.before.total_px == 0 and largest.before is not None and largest.before.total_px > 0:
+        if largest.before is None or largest.after is None:
+            return row
+        if row.before_px == 0 and largest.before_px > 0:
             row = replace(row, status=AT_BOUND)
-        return replace(row, largest=largest.after)
+        return replace(row, largest=row.after.or_more(largest.after))
 
     def _usual(self, source: Source) -> Any:
         """Usual parameters, of object and light those of the scenario."""
@@ -267,11 +287,15 @@ class Table:
                 known["principal_distance_px"] = 1e3 * s.f_mm / s.camera.pitch_um[0]
         if source.id == VIEW_POINT:
             known["diameter_px"] = s.target.diameter_px
-        own = {name: value for name, value in known.items() if name in type(params).model_fields}
-        try:
-            return source.make({**params.model_dump(), **own})
-        except InputError:  # out of the source's own range
-            return params
+        if s.chief_ray_deg is not None:
+            known["chief_ray_deg"] = s.chief_ray_deg
+        for name, value in known.items():
+            if name in type(params).model_fields:
+                try:
+                    params = source.make({**params.model_dump(), name: value})
+                except InputError:  # out of the source's own range: it keeps its usual value
+                    continue
+        return params
 
     def _absent(self, source: Source) -> str:
         """Why a camera of which nothing says that it has this source has it not; empty where it may."""
@@ -309,7 +333,7 @@ class Table:
             return replace(row, before=Parts(), after=Parts(), reason=source.reasons["propagate"])
         try:
             found = self._simulated(element)
-        except InputError as problem:
+        except (InputError, ChainError) as problem:
             return replace(row, reason=f"not computed: {problem}")
         return self._with(replace(row, how=SIMULATED), found, "no target is found behind it")
 
@@ -327,10 +351,10 @@ class Table:
         return replace(before, constant_px=NOTHING, smooth_px=before.smooth_px if model == "principal_point_and_scale" else NOTHING)
 
     def _of_motion(self, row: SourceRow, element: Element) -> SourceRow:
-        camera = self.setting.camera
-        if element.source.id in LAGS and element.source.forward is None:
-            return row
-        return self._with(replace(row, how=TIMES), motion_contribution(element, self.setting, camera), "")
+        s = self.setting
+        lag = element.source.id in LAGS
+        found = lag_contribution(element, s, self.estimator) if lag else motion_contribution(element, s, s.camera)
+        return self._with(replace(row, how=TIMES), found, "no target is found behind it")
 
     # ---- maps -----------------------------------------------------------------------------------------------------------------
 
@@ -360,13 +384,20 @@ class Table:
     def _fields(self) -> dict[tuple[bool, bool, bool], np.ndarray]:
         return {}
 
+    def _with_and_without(self, camera: Camera, element: Element, in_camera: bool) -> tuple[Camera, Camera]:
+        """A camera in one of the two states with the source, as old as the camera is then, and without it."""
+        if in_camera and element.params == self.setting.camera[element.name].params:
+            return camera, missed(camera, [element.name])
+        aged = self.setting.aged(element, camera)
+        return put(camera, aged), missed(camera, [element.name]) if in_camera else camera
+
     def _moved(self, element: Element, in_camera: bool) -> tuple[Parts, Parts] | None:
         """What a map of points is before and after the calibration; None where it moves none."""
         cameras = (self.setting.camera, self.setting.calibrated)
         try:
-            pairs = [(c, missed(c, [element.name])) if in_camera else (put(c, element), c) for c in cameras]
+            pairs = [self._with_and_without(c, element, in_camera) for c in cameras]
             now, then = (self._difference(pair) for pair in pairs)
-        except InputError:
+        except (InputError, ChainError):
             return None
         if not max(np.nanmax(np.abs(now), initial=0.0), np.nanmax(np.abs(then), initial=0.0)) > 1e-9:
             return None
@@ -399,6 +430,8 @@ def parts_of(found: Contribution, source_id: str = "") -> Parts:
     """The parts of a contribution."""
     assert found.smooth_px is not None and found.time_px is not None
     time, place = found.time_px, found.place_px
+    if source_id in OF_MOTION:
+        return Parts(found.bias_px, found.smooth_px, place, time)
     if source_id in AVERAGED:  # another for every target
         return Parts(found.bias_px, place_px=found.u_px)
     if found.gum_class in UNSTEADY:  # the next frames and targets share it

@@ -133,9 +133,22 @@ def print_budget(found: CameraBudget, console: Console, everything: bool = False
         f"without calibration {length_px(rms(one.before_px))} px",
         markup=False,
     )
-    mm = found.mm(found.answer.after_px)
+    count, mean = found.scenario.count, found.answer.after_px
+    if (count.frames, count.targets) != (1, 1):
+        of = f"{count.frames} frames and {count.targets} targets"
+        console.print(f"mean over {of}: x {length_px(mean[0])} px, y {length_px(mean[1])} px", markup=False)
+    mm = found.mm(mean)
     if mm is not None:
         console.print(f"on the object: {mm[0]:.2g} mm × {mm[1]:.2g} mm", markup=False)
+    elif found.scenario.object.distance_mm is not None:
+        console.print("on the object: not known without focal length (object.f_mm) and pixel pitch", markup=False)
+    if found.together is not None:
+        t = found.together
+        console.print(
+            f"all sources of the chain at once, simulated: {length_px(t.total_px)} ± {length_px(t.se_total_px)} px, after a calibration "
+            f"{length_px(t.calibrated_px)} ± {length_px(t.se_calibrated_px)} px",
+            markup=False,
+        )
     covariance = found.point_mm()
     if covariance is not None:
         x, y, z = covariance.diagonal() ** 0.5
@@ -157,7 +170,7 @@ def print_budget(found: CameraBudget, console: Console, everything: bool = False
         console.print(f"{len(found.rows) - len(rows)} more rows: --all, or the page (--html FILE)", markup=False)
     if everything:
         for name, (value, was_given) in found.scenario.told.items():
-            console.print(f"{name}: {value}{'' if was_given else ' (default)'}", markup=False)
+            console.print(f"{name}: {'not given' if value is None else value}{'' if was_given else ' (default)'}", markup=False)
     for d in found.disagreements:
         if not d.agree:
             console.print(

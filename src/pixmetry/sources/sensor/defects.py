@@ -21,6 +21,7 @@ MOST = 0.1  # share of defects beyond which it is not clear what the good pixels
 LOOK_BACK = (8, 256)  # frames looked at together for the last draw of a blinking pixel: at first, and at most
 FOUND_95 = 1.645  # standard deviations above the limit at which 95 of 100 defects are found
 PHASES = 6  # places within the pixel at which a defect is tried
+MOST_TRIED = 2500  # pixels of a window, or clusters, that are tried one by one
 SMALL = 0.01  # of the largest shift: what is left out
 NODES = 7  # of the Gauss–Hermite quadrature over the logarithm of the excess
 NEIGHBOURS = [(dr, dc) for dr in (-1, 0, 1) for dc in (-1, 0, 1) if (dr, dc) != (0, 0)]
@@ -378,12 +379,14 @@ def _of_groups(params: Defects, probe: Probe, phase: int) -> np.ndarray:
         moments += params.column_fraction * _powers(probe, phase, groups, params.column_gain_rel * base + k * params.column_e)
     if params.cluster_fraction:
         reach = int(params.cluster_radius_px)
-        centres = [(r, c) for r in range(-reach, rows + reach) for c in range(-reach, cols + reach)]
+        every = [(r, c) for r in range(-reach, rows + reach) for c in range(-reach, cols + reach)]
+        centres = [every[i] for i in _thinned(np.arange(len(every)))]
         groups = np.zeros((len(centres), rows + 4 * reach, cols + 4 * reach), bool)
         for dr, dc in disc(params.cluster_radius_px):
             groups[np.arange(len(centres)), [r + dr + 2 * reach for r, _ in centres], [c + dc + 2 * reach for _, c in centres]] = True
         inner = np.ascontiguousarray(groups[:, 2 * reach : 2 * reach + rows, 2 * reach : 2 * reach + cols])
-        moments += params.cluster_fraction * _powers(probe, phase, inner, params.cluster_gain_rel * base)
+        share = params.cluster_fraction * len(every) / len(centres)
+        moments += share * _powers(probe, phase, inner, params.cluster_gain_rel * base)
     return moments
 
 
@@ -441,7 +444,8 @@ def _of_singles(probe: Probe, phase: int, cases: list[tuple[float, np.ndarray]])
         return np.zeros((2, 2))
     values = np.stack([v for _, v in changed])
     largest = values[np.abs(values - base).argmax(axis=0), np.arange(base.size)]
-    read = np.flatnonzero(largest != base)
+    read = _thinned(np.flatnonzero(largest != base))
+    share = len(read) / max(np.count_nonzero(largest != base), 1)
     if len(read) and len(changed) > 1:
         most = np.abs(shifts(read, largest)).max(axis=0)
         read = read[~(most <= SMALL * np.nanmax(most))]  # a lost target stays in
@@ -451,7 +455,15 @@ def _of_singles(probe: Probe, phase: int, cases: list[tuple[float, np.ndarray]])
         if len(at):
             moved = shifts(at, one)
             moments += weight * np.nansum([moved**2, moved**4], axis=2)  # a target that is lost with its only pixel has no position
-    return moments
+    return moments / share if share else moments
+
+
+def _thinned(at: np.ndarray) -> np.ndarray:
+    """At most `MOST_TRIED` of these indices, spread evenly over them without a period: of a large window, some pixels stand for all."""
+    if len(at) <= MOST_TRIED:
+        return at
+    order = np.argsort((np.arange(len(at)) * 0.6180339887498949) % 1)
+    return np.asarray(np.sort(at[order[:MOST_TRIED]]))
 
 
 # what describes the single pixels that are drawn, and not those of a measured unit
