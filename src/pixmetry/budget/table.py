@@ -260,11 +260,10 @@ class Table:
             return replace(row, largest=row.after.scaled(1 + COVERAGE * u_rel)) if u_rel else row
         bound = self._own(source, source.bound_of(self.setting.camera.frame_shape))
         largest = self._computed(row, replace(element, params=bound), in_camera, None)
-        if largest.before is None or largest.after is None:
+        if largest.after is None:
             return row
-        if row.before_px == 0 and largest.before_px > 0:
-            row = replace(row, status=AT_BOUND)
-        return replace(row, largest=row.after.or_more(largest.after))
+        status = AT_BOUND if row.before_px == 0 and largest.before_px > 0 else row.status
+        return replace(row, status=status, largest=row.after.or_more(largest.after))
 
     def _usual(self, source: Source) -> Any:
         """Usual parameters, of object and light those of the scenario."""
@@ -332,10 +331,10 @@ class Table:
         if source.forward is None or source.essential and source.ideal is None:
             return replace(row, before=Parts(), after=Parts(), reason=source.reasons["propagate"])
         try:
-            found = self._simulated(element)
+            simulated = self._simulated(element)
         except (InputError, ChainError) as problem:
             return replace(row, reason=f"not computed: {problem}")
-        return self._with(replace(row, how=SIMULATED), found, "no target is found behind it")
+        return self._with(replace(row, how=SIMULATED), simulated, "no target is found behind it")
 
     def _with(self, row: SourceRow, found: Contribution | None, else_reason: str) -> SourceRow:
         if found is None or not np.isfinite(found.total_px):
@@ -428,7 +427,6 @@ def _of_field(field_px: np.ndarray) -> Parts:
 
 def parts_of(found: Contribution, source_id: str = "") -> Parts:
     """The parts of a contribution."""
-    assert found.smooth_px is not None and found.time_px is not None
     time, place = found.time_px, found.place_px
     if source_id in OF_MOTION:
         return Parts(found.bias_px, found.smooth_px, place, time)

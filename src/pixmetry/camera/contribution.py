@@ -25,6 +25,7 @@ CLASSES = ("T", "Tr", "F", "G", "D", "O")
 
 
 UNSTEADY = ("D", "O")  # classes of which a calibration takes nothing up: the next image has them otherwise
+BY_CLASS = (float("nan"), float("nan"))  # parts that are not given: the class says which they are
 SMOOTH_ORDER = 3  # of the polynomial in the place that a calibration is taken to follow
 
 
@@ -50,16 +51,15 @@ class Contribution:
     model_error: float = 0.1
     floor_px: float = 2e-4
     method: str = ""
-    time_px: tuple[float, float] | None = None
-    smooth_px: tuple[float, float] | None = None
+    time_px: tuple[float, float] = BY_CLASS
+    smooth_px: tuple[float, float] = BY_CLASS
     kurtosis: float = 3.0
 
     def __post_init__(self) -> None:
-        smooth = self.smooth_px
-        if smooth is None:
-            smooth = self.u_px if self.gum_class == "G" and self.time_px is None else (0.0, 0.0)
-        time = self.time_px
-        if time is None:
+        smooth, time = self.smooth_px, self.time_px
+        if smooth is BY_CLASS:
+            smooth = self.u_px if self.gum_class == "G" and time is BY_CLASS else (0.0, 0.0)
+        if time is BY_CLASS:
             (u_x, u_y), (smooth_x, smooth_y) = self.u_px, smooth
             time = (0.0, 0.0) if self.gum_class in ("F", "G") else (_less(u_x, smooth_x), _less(u_y, smooth_y))
         object.__setattr__(self, "smooth_px", smooth)
@@ -78,7 +78,7 @@ class Contribution:
     @property
     def place_px(self) -> tuple[float, float]:
         """Part of ``u`` in x and y that changes from place to place, and not smoothly."""
-        parts = zip(self.u_px, self.time_px or (), self.smooth_px or (), strict=True)
+        parts = zip(self.u_px, self.time_px, self.smooth_px, strict=True)
         x, y = (_less(u, float(np.hypot(time, smooth))) for u, time, smooth in parts)
         return x, y
 
@@ -92,7 +92,7 @@ class Contribution:
         """Remaining total after a calibration, without the constant and the smooth part; for the classes D and O, the whole total."""
         if self.gum_class in UNSTEADY:
             return self.total_px
-        return float(np.sqrt(0.5 * sum(v**2 for v in (*self.place_px, *(self.time_px or ())))))
+        return float(np.sqrt(0.5 * sum(v**2 for v in (*self.place_px, *self.time_px))))
 
 
 def _less(whole: float, part: float) -> float:

@@ -444,8 +444,9 @@ def _of_singles(probe: Probe, phase: int, cases: list[tuple[float, np.ndarray]])
         return np.zeros((2, 2))
     values = np.stack([v for _, v in changed])
     largest = values[np.abs(values - base).argmax(axis=0), np.arange(base.size)]
-    read = _thinned(np.flatnonzero(largest != base))
-    share = len(read) / max(np.count_nonzero(largest != base), 1)
+    every = np.flatnonzero(largest != base)
+    read = _thinned(every)
+    share = len(read) / max(len(every), 1)
     if len(read) and len(changed) > 1:
         most = np.abs(shifts(read, largest)).max(axis=0)
         read = read[~(most <= SMALL * np.nanmax(most))]  # a lost target stays in
