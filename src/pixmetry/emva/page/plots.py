@@ -143,7 +143,7 @@ def _off_the_line(c: Curve, r: Results) -> Drawn:
         span = 1.4 * max(float((np.abs(off) + bars)[inner].max(initial=0.0)), 0.2)
         axes.set_ylim(-span, 1.4 * span)  # the darkest levels may stick out: their relative error has no bound
         axes.set_xlabel("mean above dark / DN")
-        axes.set_ylabel("deviation of the variance from the line / %")
+        axes.set_ylabel("variance off the line / %")
         axes.legend(loc="upper center", ncols=2)
 
     departure = say(r, "PTC_linearity")
