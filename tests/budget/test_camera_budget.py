@@ -178,6 +178,15 @@ def test_a_camera_joined_with_itself_is_itself() -> None:
     assert all(d.agree for d in compared)
 
 
+def test_the_aperture_of_the_scenario_is_that_of_the_lens_in_the_chain() -> None:
+    source = get_source("optics.point_spread")
+    lens = Element("lens", source, source.make({"model": "diffraction", "f_number": 4.0}), known_from="sheet")
+    cam = replace(camera("imx264_like"), chain=(lens, *camera("imx264_like").chain))
+    stopped_down = Setting(cam, read_scenario({"light": {"f_number": 16.0}})).camera["lens"]
+    assert stopped_down.params.f_number == 16.0 and stopped_down.known_from == "sheet"
+    assert Setting(cam, Scenario()).camera["lens"].params.f_number == 4.0
+
+
 def test_the_chief_ray_follows_the_lens() -> None:
     near, far = (left_px(camera("imx264_like"), "sensor.unflatness", {"object": {"f_mm": f}}) for f in (4.0, 50.0))
     assert near > 5 * far

@@ -16,7 +16,7 @@ from pixmetry.budget.object_space import point_covariance
 from pixmetry.budget.scenario import Scenario
 from pixmetry.budget.setting import Setting
 from pixmetry.budget.table import SourceRow
-from pixmetry.core.errors import InputError
+from pixmetry.core.data_frame import data_frame
 from pixmetry.locate.estimator import Estimator
 
 SCHEMA = "pixmetry/camera_budget/1"
@@ -123,10 +123,6 @@ class CameraBudget:
         InputError
             If pandas is not installed.
         """
-        try:
-            import pandas  # type: ignore[import-untyped]
-        except ImportError:
-            raise InputError("pandas is not installed", where="to_dataframe", remedy="install it: pip install pandas") from None
         names = [
             "name",
             "number",
@@ -141,7 +137,7 @@ class CameraBudget:
             "share",
             "how",
         ]
-        return pandas.DataFrame({n: [getattr(r, n) for r in self.rows] for n in names})
+        return data_frame({n: [getattr(r, n) for r in self.rows] for n in names})
 
     def to_record(self) -> dict[str, Any]:
         """Return the plain record for JSON."""

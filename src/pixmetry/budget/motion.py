@@ -12,7 +12,7 @@ import numpy as np
 
 from pixmetry.budget.probe import make_probe, seen_at
 from pixmetry.budget.setting import Setting
-from pixmetry.camera.camera import Camera, Element
+from pixmetry.camera.camera import NOWHERE, Camera, Element
 from pixmetry.camera.contribution import Contribution
 from pixmetry.core.random import Grid
 from pixmetry.locate.estimator import Estimator
@@ -23,15 +23,6 @@ LAGS = {"sensor.image_lag": "lag_rel", "processing.temporal_noise_reduction": "a
 OF_MOTION = (*LOOKS, *LAGS)
 LAG_PHASES, GHOSTS, SMALLEST_GHOST = 3, 60, 1e-5  # places within the pixel; earlier frames at most, and their smallest share
 STILL = "nothing moves in this scenario"
-
-
-class _Nowhere:
-    """A scene of which only times are asked."""
-
-    moving = False
-
-
-NOWHERE: Any = _Nowhere()
 
 
 def motion_contribution(element: Element, setting: Setting, camera: Camera) -> Contribution:

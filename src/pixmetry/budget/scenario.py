@@ -43,7 +43,7 @@ class LightModel(Model):
 
     source: Literal["lamp", "led", "laser"] = Field(default="led", description="a laser makes speckle; a lamp on mains flickers")
     wavelength_nm: float = Field(default=550.0, ge=200, le=1100, description="mean wavelength")
-    f_number: float | None = Field(default=None, ge=0.7, le=64, description="of the lens, where the camera does not tell it")
+    f_number: float | None = Field(default=None, ge=0.7, le=64, description="of the lens, in place of what the camera tells")
     speckle_contrast_rel: float | None = Field(default=None, ge=0, le=1, description="of a laser spot; 1 for a rough surface at rest")
     mains_hz: float = Field(default=50.0, gt=0, le=1000, description="of the supply; a lamp flickers at twice this frequency")
 

@@ -89,15 +89,22 @@ class Setting:
 
     @cached_property
     def _stored(self) -> Camera:
-        """As described, its frames stored as the scenario says."""
+        """As described, with the aperture and the storage of the scenario."""
         asked = self.scenario.storage
         if asked.format == "tape" and self.described.facts.get("interface") == "digital":
             raise InputError("a digital camera is not stored on tape", where="storage.format", value="tape", allowed="lossless or jpeg")
-        chain = self.described.chain
+        chain = tuple(self._with_aperture(e) for e in self.described.chain)
         if "format" in asked.model_fields_set:
             chain = tuple(self._as_stored(e) for e in chain)
         lossless = asked.format == "lossless" and not any(e.on and e.source.stage == "storage" for e in chain)
         return replace(self.described, chain=chain, facts={**self.described.facts, "lossless": lossless})
+
+    def _with_aperture(self, element: Element) -> Element:
+        """The element at the f-number that the scenario gives, if it has one."""
+        told = self.scenario.light.f_number
+        if told is None or "f_number" not in type(element.params).model_fields:
+            return element
+        return replace(element, params=element.source.make({**element.params.model_dump(), "f_number": told}, where="light.f_number"))
 
     def _as_stored(self, element: Element) -> Element:
         asked = self.scenario.storage

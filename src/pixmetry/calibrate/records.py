@@ -15,7 +15,8 @@ from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 import numpy as np
 
 from pixmetry.calibrate.bundle.network import Adjustment
-from pixmetry.calibrate.tables import TABLES, frame_of
+from pixmetry.calibrate.tables import TABLES
+from pixmetry.core.data_frame import data_frame
 from pixmetry.core.errors import InputError
 from pixmetry.core.finding import Finding
 
@@ -1169,4 +1170,4 @@ class Calibration:
         InputError
             If there is no such table, or pandas is not installed.
         """
-        return frame_of(self.columns(table))
+        return data_frame(self.columns(table))

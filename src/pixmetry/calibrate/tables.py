@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from importlib import import_module
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from pixmetry.calibrate.bundle.model import NAMES
 from pixmetry.calibrate.bundle.network import Adjustment
-from pixmetry.core.errors import InputError
 
 
 def parameter_columns(a: Adjustment) -> dict[str, Any]:
@@ -86,19 +84,3 @@ TABLES: dict[str, Callable[[Adjustment], dict[str, Any]]] = {
     "poses": pose_columns,
     "residuals": residual_columns,
 }
-
-
-def frame_of(columns: Mapping[str, Any]) -> Any:
-    """Columns as a `pandas.DataFrame`.
-
-    Raises
-    ------
-    InputError
-        If pandas is not installed.
-    """
-    try:
-        pandas = import_module("pandas")
-    except ImportError:
-        what = "the package pandas is not installed, and is needed for data frames"
-        raise InputError(what, remedy="pip install pandas, or read the CSV files of the results") from None
-    return pandas.DataFrame({name: list(values) for name, values in columns.items()})

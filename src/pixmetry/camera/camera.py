@@ -443,7 +443,7 @@ class Camera:
         """
         x, y = (np.atleast_1d(np.asarray(v, float)) for v in (x_px, y_px))
         streams = self.streams(seed)
-        signal = self.signal(_NOTHING, Grid.whole([frame], (1, 1)), **schedule)
+        signal = self.signal(NOWHERE, Grid.whole([frame], (1, 1)), **schedule)
         for link in self.links:
             if Kind.LIGHT in link.source.consumes and link.source is not LOOK:
                 signal, _ = run(link.source, link.params, signal, streams.of(link.name))
@@ -474,7 +474,7 @@ class Camera:
             if link.source.truth is None:
                 continue
             grid = Grid.whole([frame], link.shape)
-            signal = self.signal(_NOTHING, grid, **schedule)
+            signal = self.signal(NOWHERE, grid, **schedule)
             told[link.name] = dict(link.source.truth(link.params, replace(signal, frame_shape=link.shape), streams.of(link.name)))
         return told
 
@@ -543,12 +543,12 @@ class _Task:
 
 
 class _NoScene:
-    """Nothing to see: for questions of geometry."""
+    """Nothing to see: for questions of geometry and of times."""
 
     moving = False
 
 
-_NOTHING: Any = _NoScene()
+NOWHERE: Any = _NoScene()
 
 
 def _sub_grid(grid: Grid, index: np.ndarray) -> Grid:

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from pixmetry.core.data_frame import data_frame
 from pixmetry.core.errors import InputError
 from pixmetry.core.extras import import_extra
 from pixmetry.core.plain_text import cell, comment
@@ -125,11 +126,7 @@ class Located:
         InputError
             If pandas is not installed.
         """
-        try:
-            import pandas  # type: ignore[import-untyped]
-        except ImportError:
-            raise InputError("pandas is not installed", where="to_dataframe", remedy="install it: pip install pandas") from None
-        return pandas.DataFrame({**self.columns, "flags": self.flag_words})
+        return data_frame({**self.columns, "flags": self.flag_words})
 
     def plot(self, frame: np.ndarray | None = None, axes: Any = None) -> Any:
         """Draw outlines, centres or lines into Matplotlib axes, over the frame where it is given, and return the axes.
