@@ -18,7 +18,7 @@ from pixmetry.budget.cameras import camera_of
 from pixmetry.budget.motion import lag_contribution
 from pixmetry.budget.scenario import Scenario, read_scenario
 from pixmetry.budget.setting import Setting
-from pixmetry.budget.table import ABSENT, AT_BOUND, COUNTED, ELSEWHERE, MEASURED, SHEET, TYPICAL, Table
+from pixmetry.budget.table import ABSENT, AT_BOUND, COUNTED, ELSEWHERE, MEASURED, SHEET, TYPICAL, SourceRow, Table
 from pixmetry.camera.camera import Camera, Element, load_camera
 from pixmetry.camera.catalogue import get_source, sources
 from pixmetry.core.errors import InputError
@@ -264,3 +264,49 @@ def test_a_scenario_file_and_its_defaults(tmp_path) -> None:
     path.write_text("schema: pixmetry/scenario/1\nmotion: {speed: 50}\n", encoding="utf-8")
     with pytest.raises(InputError, match="line 2"):
         read_scenario(path)
+
+
+def test_what_is_measured_as_nothing_may_be_there_within_its_uncertainty() -> None:
+    """Scales of x and y that differ by 0 ± u stretch a frame of 320 columns by u · 320/√12 px (rms); the upper end holds twice that."""
+    u = 1e-3
+    estimates = Estimates.from_rows([("b1", 0.0, u, 100.0, "1")])
+    affinity = Element(
+        "affinity", get_source("sensor.affinity"), get_source("sensor.affinity").make({}), known_from="measured", estimates=estimates
+    )
+    cam = camera("imx264_like")
+    setting = Setting(replace(cam, chain=(affinity, *cam.chain)), Scenario.model_validate({"calibration": {"model": "none"}}))
+    (row,) = Table(setting, TargetEstimator()).rows(["sensor.affinity"])
+    stretched = u * SHAPE[1] / np.sqrt(12)
+    assert row.status == MEASURED and row.after_px == 0
+    assert row.u_of_total_px == pytest.approx(stretched / np.sqrt(2), rel=0.01)  # rms over x and y
+    assert row.largest is not None and row.largest.smooth_px == pytest.approx((2 * stretched, 0.0), rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("source_id", "name", "value", "u", "scenario"),
+    [
+        ("optics.distortion", "k1_per_mm2", 1e-4, 1e-5, {}),
+        ("sensor.trigger_jitter", "jitter_s", 1e-6, 2e-7, {"motion": {"speed_px_per_s": 2000.0}}),
+        ("sensor.pixel_aperture", "width_x_px", 0.7, 0.1, {}),
+    ],
+)
+def test_the_uncertainty_of_a_measured_value_without_a_closed_form_is_in_the_interval(
+    source_id: str, name: str, value: float, u: float, scenario: dict[str, object]
+) -> None:
+    """It is the root mean square of the changes of the row if the value is larger and smaller by u."""
+
+    def row_of(at: float, u: float = 0.0) -> SourceRow:
+        source = get_source(source_id)
+        estimates = Estimates.from_rows([(name, at, u, 100.0, source.units[name])])
+        params = source.make({**source.typical.model_dump(), name: at})
+        cam = camera("imx264_like")
+        chain = tuple(e for e in cam.chain if e.source.id != source_id)
+        setting = Setting(replace(cam, chain=chain), Scenario.model_validate(scenario))
+        return Table(setting, TargetEstimator()).row(
+            Element(source_id, source, params, known_from="measured", estimates=estimates), in_camera=False
+        )
+
+    row, low, high = row_of(value, u), row_of(value - u), row_of(value + u)
+    change = rms((high.before_px - row.before_px, low.before_px - row.before_px))
+    assert change > 0 and row.u_of_total_px == pytest.approx(change, rel=1e-6)
+    assert row.largest_px > row.after_px

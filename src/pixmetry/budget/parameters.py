@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -49,32 +49,65 @@ def covariance_of(estimates: Estimates) -> np.ndarray:
 
 
 def u_of_total(source: Source, params: Any, estimates: Estimates, probe: Probe) -> float:
-    """Standard uncertainty of a contribution's total in px that comes of the parameters' uncertainty.
-
-    First-order propagation (JCGM 100:2008, 5.2.2) with derivatives by central differences over ± u, one-sided where the
-    model allows no other side.
-    """
-    if source.propagate is None:
+    """Standard uncertainty of a contribution's total in px that comes of the parameters' uncertainty: see `u_from_parameters`."""
+    propagate = source.propagate
+    if propagate is None:
         return 0.0
-    covariance = covariance_of(estimates)
-    slopes = np.zeros(len(estimates))
-    for i, name in enumerate(estimates.names):
-        step = float(np.sqrt(covariance[i, i]))
-        if step == 0:
-            continue
-        here = getattr(params, name)
-        ends = [_moved(source, params, name, here + s * step) for s in (-1, 1)]
-        totals = [source.propagate(p, probe).total_px for p in ends]
-        span = getattr(ends[1], name) - getattr(ends[0], name)
-        slopes[i] = (totals[1] - totals[0]) / span if span else 0.0
-    return float(np.sqrt(max(slopes @ covariance @ slopes, 0.0)))
+    return float(u_from_parameters(lambda p: np.array([propagate(p, probe).total_px]), source, params, estimates)[0])
 
 
-def _moved(source: Source, params: Any, name: str, value: float) -> Any:
+def u_from_parameters(values_of: Callable[[Any], np.ndarray], source: Source, params: Any, estimates: Estimates) -> np.ndarray:
+    """Standard uncertainties of values that come of the uncertainty of a source's parameters.
+
+    Parameters
+    ----------
+    values_of : callable
+        Gives the values, an array of shape (n,), for a set of parameters.
+    source : Source
+    params : BaseModel
+        The best estimates.
+    estimates : Estimates
+        With their covariance C.
+
+    Returns
+    -------
+    ndarray, shape (n,), float64
+        In the units of the values.
+
+    Notes
+    -----
+    The parameters are moved by plus and minus each column of a root of C (C = L Lᵀ; one-sided where the model allows no other side). The
+    root mean square of the two changes counts (JCGM 100:2008, 5.1.3, note 2, and 5.2.2). For a slope that is the central difference. An
+    amount has none: an aberration of 0 ± u moves points by as much on either side.
+    """
+    here = values_of(params)
+    squares = np.zeros_like(here)
+    for step in _root_of(covariance_of(estimates)).T:
+        ends = (_moved(source, params, estimates.names, sign * step) for sign in (1.0, -1.0) if step.any())
+        changes = [values_of(p) - here for p in ends if p is not None]
+        squares += np.mean(np.square(changes), axis=0) if changes else 0.0
+    u: np.ndarray = np.sqrt(squares)
+    return u
+
+
+def _root_of(covariance: np.ndarray) -> np.ndarray:
+    """A matrix L with L Lᵀ the covariance; of uncorrelated values the diagonal matrix of their uncertainties."""
+    u = np.sqrt(np.diag(covariance))
+    if not np.any(covariance - np.diag(u**2)):
+        return np.diag(u)
+    scale = np.where(u > 0, u, 1.0)
+    lengths, directions = np.linalg.eigh(covariance / np.outer(scale, scale))
+    root: np.ndarray = scale[:, None] * directions * np.sqrt(np.maximum(lengths, 0.0))
+    return root
+
+
+def _moved(source: Source, params: Any, names: Sequence[str], steps: np.ndarray) -> Any | None:
+    """The parameters so far away; None where the model does not allow it."""
+    own = params.model_dump()
     try:
-        return source.make({**params.model_dump(), name: value})
+        return source.make({**own, **{name: own[name] + step for name, step in zip(names, steps.tolist(), strict=True) if step}})
     except InputError:
-        return params
+        return None
 
 
 def base_of(source: Source, camera: Camera, name: str) -> Any:

@@ -7,7 +7,7 @@ Carlo of that chain with the source and without it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -17,7 +17,7 @@ import numpy as np
 from pixmetry.budget.fields import Calibration, Places, field_of, spread_of
 from pixmetry.budget.monte_carlo import Trials, missed, put
 from pixmetry.budget.motion import LAGS, OF_MOTION, STILL, lag_contribution, motion_contribution
-from pixmetry.budget.parameters import applies, u_of_total, with_estimates
+from pixmetry.budget.parameters import applies, u_from_parameters, with_estimates
 from pixmetry.budget.probe import Probes
 from pixmetry.budget.setting import Setting
 from pixmetry.camera.camera import Camera, Element, pitch_values
@@ -88,10 +88,16 @@ class Parts:
     place_px: Pair = NOTHING
     time_px: Pair = NOTHING
 
-    def scaled(self, factor: float) -> Parts:
-        """All parts so many times as large."""
-        c, s, p, t = ((factor * v[0], factor * v[1]) for v in (self.constant_px, self.smooth_px, self.place_px, self.time_px))
-        return Parts(c, s, p, t)
+    @classmethod
+    def of(cls, values_px: Sequence[float]) -> Parts:
+        """From all values one after the other: see `values_px`."""
+        c, s, p, t = ((float(values_px[i]), float(values_px[i + 1])) for i in range(0, 8, 2))
+        return cls(c, s, p, t)
+
+    @property
+    def values_px(self) -> tuple[float, ...]:
+        """All values one after the other: constant in x and y, smooth, place, time."""
+        return (*self.constant_px, *self.smooth_px, *self.place_px, *self.time_px)
 
     def or_more(self, other: Parts) -> Parts:
         """The larger of the two, part by part; a constant keeps its sign."""
@@ -250,16 +256,15 @@ class Table:
         row = replace(row, status=KNOWN_FROM[known_from], reason="" if estimates is None else estimates.method)
         if source.id in OF_MOTION and not self.setting.moves:
             return replace(row, before=Parts(), after=Parts(), how=TIMES, reason=STILL)
-        row = self._computed(row, element, in_camera, estimates)
+        row = self._computed(row, element, in_camera)
         if source.part_of:
             return replace(row, status=ELSEWHERE, reason=f"it counts in the row of {get_source(source.part_of).title}")
         if row.before is None or row.after is None:
             return row
         if row.status != TYPICAL:
-            u_rel = row.u_of_total_px / row.before_px if row.before_px else 0.0
-            return replace(row, largest=row.after.scaled(1 + COVERAGE * u_rel)) if u_rel else row
+            return row if estimates is None else self._with_uncertainty(row, element, in_camera, estimates)
         bound = self._own(source, source.bound_of(self.setting.camera.frame_shape))
-        largest = self._computed(row, replace(element, params=bound), in_camera, None)
+        largest = self._computed(row, replace(element, params=bound), in_camera)
         if largest.after is None:
             return row
         status = AT_BOUND if row.before_px == 0 and largest.before_px > 0 else row.status
@@ -315,7 +320,7 @@ class Table:
             return f"what of it is in the frames was measured, and counts, as: {where}"
         return ""
 
-    def _computed(self, row: SourceRow, element: Element, in_camera: bool, measured: Estimates | None) -> SourceRow:
+    def _computed(self, row: SourceRow, element: Element, in_camera: bool) -> SourceRow:
         """The row with what the source does with these parameters."""
         source = element.source
         if source.id in OF_MOTION:
@@ -326,8 +331,7 @@ class Table:
         if source.propagate is not None:
             probe = self.probes.of(element.name, source)
             found = source.propagate(element.params, probe)
-            u = 0.0 if measured is None else u_of_total(source, element.params, measured, probe)
-            return self._with(replace(row, u_of_total_px=u, how=FORMULA), found, "no target is found behind it")
+            return self._with(replace(row, how=FORMULA), found, "no target is found behind it")
         if source.forward is None or source.essential and source.ideal is None:
             return replace(row, before=Parts(), after=Parts(), reason=source.reasons["propagate"])
         try:
@@ -335,6 +339,19 @@ class Table:
         except (InputError, ChainError) as problem:
             return replace(row, reason=f"not computed: {problem}")
         return self._with(replace(row, how=SIMULATED), simulated, "no target is found behind it")
+
+    def _with_uncertainty(self, row: SourceRow, element: Element, in_camera: bool, estimates: Estimates) -> SourceRow:
+        """The row with what the uncertainty of its measured parameters does to it."""
+
+        values = _values_of(row)
+
+        def values_of(params: Any) -> np.ndarray:
+            moved = self._computed(row, replace(element, params=params), in_camera)
+            return values if moved.after is None else _values_of(moved)  # so far away that no target is found: as here
+
+        u = u_from_parameters(values_of, element.source, element.params, estimates)
+        largest = np.sign(values) * (np.abs(values) + COVERAGE * u)
+        return replace(row, u_of_total_px=float(u[0]), largest=Parts.of(np.where(values == 0, COVERAGE * u, largest)[1:].tolist()))
 
     def _with(self, row: SourceRow, found: Contribution | None, else_reason: str) -> SourceRow:
         if found is None or not np.isfinite(found.total_px):
@@ -418,6 +435,11 @@ class Table:
 
     def _simulated(self, element: Element) -> Contribution | None:
         return self._trials.alone(element).contribution(element.source.gum_class)
+
+
+def _values_of(row: SourceRow) -> np.ndarray:
+    """Total before the calibration, and all that is left after it."""
+    return np.array([row.before_px, *(row.after or Parts()).values_px])
 
 
 def _of_field(field_px: np.ndarray) -> Parts:
