@@ -29,6 +29,7 @@ _HOMES = {
     "chain": "pixmetry.simulate.chain",
     "check_limits": "pixmetry.assess.judge.compare",
     "compare": "pixmetry.assess.judge.compare",
+    "compare_budgets": "pixmetry.budget.compare",
     "compare_fleet": "pixmetry.assess.judge.compare",
     "correct": "pixmetry.assess.correct",
     "emva1288": "pixmetry.emva.job",
@@ -58,6 +59,7 @@ __all__ = [
     "chain",
     "check_limits",
     "compare",
+    "compare_budgets",
     "compare_fleet",
     "correct",
     "emva1288",
@@ -74,6 +76,7 @@ if TYPE_CHECKING:
     from pixmetry.assess.correct import correct
     from pixmetry.assess.job import assess
     from pixmetry.assess.judge.compare import check_limits, compare, compare_fleet
+    from pixmetry.budget.compare import compare_budgets
     from pixmetry.budget.job import budget
     from pixmetry.calibrate.files.record import read_calibration
     from pixmetry.calibrate.job import calibrate

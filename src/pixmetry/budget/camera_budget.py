@@ -148,6 +148,7 @@ class CameraBudget:
             "scenario": {name: {"value": value, "given": given} for name, (value, given) in self.scenario.told.items()},
             "target": asdict(self.setting.target),
             "estimator": {"name": self.estimator.name} | asdict(self.estimator),
+            "frame_shape": self.setting.described.frame_shape,
             "pitch_um": self.setting.described.pitch_um,
             "px_per_mm": self.setting.px_per_mm,
             "one_target_one_frame": self._answer_record(self.one),

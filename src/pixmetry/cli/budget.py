@@ -14,9 +14,12 @@ from pixmetry.cli._json import JsonResult, json_option
 from pixmetry.cli._pdf import check_pdf, pdf_option, put_pdf
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from rich.console import Console
 
     from pixmetry.budget.camera_budget import CameraBudget
+    from pixmetry.budget.compare import BudgetComparison
     from pixmetry.budget.scenario import Scenario
     from pixmetry.budget.sweep import Sweep
     from pixmetry.camera.camera import Camera
@@ -49,6 +52,9 @@ SHOWN = 20  # rows on the terminal
     "--trials", type=click.IntRange(0), default=0, show_default=True, help="Windows of a simulation of all sources at once; 0: none."
 )
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the simulations.")
+@click.option(
+    "--compare", "side_by_side", is_flag=True, help="The CAMERAs are different ones: budget each, and say which is the best and why."
+)
 @click.option("--next", "what_next", is_flag=True, help="Show only what to measure and what to change next.")
 @click.option("--all", "everything", is_flag=True, help="Show all rows, also of what is not in this camera.")
 @click.option("--html", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE", help="Write the page of the budget (HTML).")
@@ -62,6 +68,7 @@ def budget(
     estimator: str | None,
     trials: int,
     seed: int,
+    side_by_side: bool,
     what_next: bool,
     everything: bool,
     html: Path | None,
@@ -71,21 +78,37 @@ def budget(
     """Budget every error source of a camera for a measurement, before and after calibration.
 
     CAMERA is the name of a preset, a data sheet, or a camera file, such as the camera.yaml of an assessment. Of several, what was measured
-    replaces what a sheet says, and both are compared. A scenario says what is measured and how: target, distance, light, motion, warm-up,
+    replaces what a sheet says, and both are compared; with --compare they are different cameras, or one camera with different lenses, and
+    the best is named. A scenario says what is measured and how: target, distance, light, motion, warm-up,
     calibration; what it leaves open has a default, which is printed with --all.
 
     Example: pixmetry budget imx264_like --set object.distance_mm=2000 --set object.f_mm=25 --html budget.html
     """
     from pixmetry.budget.cameras import camera_of
     from pixmetry.budget.changes import changed
+    from pixmetry.budget.compare import compare_budgets
     from pixmetry.budget.job import budget as budget_of
     from pixmetry.budget.page import TITLE, page_of
     from pixmetry.budget.scenario import read_scenario
     from pixmetry.budget.sweep import parse_sweep, sweep_of
     from pixmetry.camera.overrides import parse_overrides
+    from pixmetry.cli.compare import put_budgets, refuse_beside_budgets
+    from pixmetry.core.errors import InputError
     from pixmetry.files.output import Output, check_files, page_mark, write_page
     from pixmetry.report import html_of
 
+    if side_by_side:
+        refuse_beside_budgets({"--vary": vary is not None, "--trials": trials > 0, "--next": what_next})
+        asked_of_all, changes = read_scenario(scenario), parse_overrides(settings)
+        if len(cameras) < 2:
+            raise InputError("one camera cannot be compared", where="--compare", value=cameras[0], remedy="name two cameras or more")
+        pairs = [changed(camera_of(one)[0], asked_of_all, changes) for one in cameras]
+
+        def all_compared() -> BudgetComparison:
+            return compare_budgets([budget_of(*pair, estimator=estimator, seed=seed) for pair in pairs], names_of_cameras(cameras))
+
+        put_budgets(all_compared, [Path(c) for c in (*cameras, scenario or "") if Path(c).is_file()], html, pdf, json_file, everything)
+        return
     inputs = [Path(c) for c in cameras if Path(c).is_file()] + ([scenario] if scenario else [])
     written = JsonResult(json_file, "pixmetry/camera_budget/1", inputs=inputs)
     if html is not None:
@@ -112,6 +135,13 @@ def budget(
     if html is not None:
         echo(f"page: {write_page(html, html_of(page_of(found, sweep)))}", err=written.printed)
     put_pdf(pdf, lambda: page_of(found, sweep))
+
+
+def names_of_cameras(given: Sequence[str]) -> list[str]:
+    """What cameras are called beside each other: their files, as short as they still differ."""
+    from pixmetry.core.plain_text import ends_of_paths
+
+    return [end.removesuffix(".yaml").removesuffix(".yml") for end in ends_of_paths(given)]
 
 
 def print_budget(found: CameraBudget, console: Console, everything: bool = False) -> None:

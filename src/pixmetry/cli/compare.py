@@ -1,4 +1,4 @@
-"""``pixmetry compare``: changes in units of their uncertainty, cameras that stand out, and limits that hold."""
+"""``pixmetry compare``: changes in units of their uncertainty, cameras that stand out, limits that hold, and the better of budgets."""
 
 from __future__ import annotations
 
@@ -9,20 +9,24 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from pixmetry.cli._console import console as plain_console
+from pixmetry.cli._console import echo
 from pixmetry.cli._json import JsonResult, json_option
+from pixmetry.cli._pdf import check_pdf, pdf_option, put_pdf
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from rich.console import Console
 
     from pixmetry.assess.judge.compare import Comparison, Fleet
     from pixmetry.assess.judge.conformity import Checked
+    from pixmetry.budget.compare import BudgetComparison
     from pixmetry.core.number import Number
 
 EXIT_DIFFERENT = 1
 SCHEMA = "pixmetry/compared/1"
 QUIET = ("same", "equal", "setting")
+LARGEST_SOURCES = 8  # of a comparison of budgets, without --all
 LARGEST = 3  # number of differences that are shown although they are not significant
 
 
@@ -41,23 +45,45 @@ LARGEST = 3  # number of differences that are shown although they are not signif
     is_flag=True,
     help="Both measurements used the same calibration of the light: leave its uncertainty out of the differences.",
 )
-@click.option("--all", "everything", is_flag=True, help="Also show the values that did not change.")
+@click.option("--all", "everything", is_flag=True, help="Also show the values that did not change; of budgets, all sources.")
+@click.option("--html", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE", help="Write the page of a comparison of budgets.")
+@pdf_option()
 @json_option("the comparison")
-def compare(files: tuple[Path, ...], limits: Path | None, level: float, same_light: bool, everything: bool, json_file: Path | None) -> None:
+def compare(
+    files: tuple[Path, ...],
+    limits: Path | None,
+    level: float,
+    same_light: bool,
+    everything: bool,
+    html: Path | None,
+    pdf: Path | None,
+    json_file: Path | None,
+) -> None:
     """Compare measurements with each other, with a fleet of cameras, or with limits.
 
     FILES are EMVA 1288 data sheets (JSON or XML), assessments (results.json or its folder) or calibrations (calibration.json or its
     folder). Two files are compared with each other. Of three files or more, each is compared with the median of all. With --limits one file
     is enough.
 
-    Exit status: 0 if nothing changed and all limits hold; 1 if a value changed, stands out, fails or is undecided; 2 after an error.
+    Of error budgets (`pixmetry budget --json`), two or more, the best one is named, how sure that is, and what makes the difference.
+
+    Exit status: 0 if nothing changed and all limits hold, and of budgets always; 1 if a value changed, stands out, fails or is undecided; 2
+    after an error.
     """
     from pixmetry.assess.judge.compare import check_limits, compare_fleet
     from pixmetry.assess.judge.compare import compare as compare_two
+    from pixmetry.budget.compare import compare_budgets, is_budget_file
     from pixmetry.core.errors import InputError
 
     if len(files) == 1 and limits is None:
         raise InputError("one file cannot be compared", where=str(files[0]), remedy="name a second one, or --limits")
+    if any(is_budget_file(path) for path in files):
+        refuse_beside_budgets({"--limits": limits is not None, "--same-light": same_light})
+        put_budgets(lambda: compare_budgets(files), files, html, pdf, json_file, everything)
+        return
+    for option, file in (("--html", html), ("--pdf", pdf)):
+        if file is not None:
+            raise InputError("is for error budgets", where=option, remedy="leave it out, or name files of `pixmetry budget --json`")
     if same_light and len(files) != 2:
         raise InputError("is for two files", where="--same-light", remedy="leave it out")
     written = JsonResult(json_file, SCHEMA, inputs=files)
@@ -81,6 +107,78 @@ def compare(files: tuple[Path, ...], limits: Path | None, level: float, same_lig
     written.put(record)
     if not good:
         click.get_current_context().exit(EXIT_DIFFERENT)
+
+
+def refuse_beside_budgets(given: Mapping[str, bool]) -> None:
+    """Refuse options that a comparison of budgets does not have."""
+    from pixmetry.core.errors import InputError
+
+    for option, is_given in given.items():
+        if is_given:
+            raise InputError("is not for a comparison of error budgets", where=option, remedy="leave it out")
+
+
+def put_budgets(
+    compared: Callable[[], BudgetComparison],
+    inputs: Sequence[Path],
+    html: Path | None,
+    pdf: Path | None,
+    json_file: Path | None,
+    everything: bool = False,
+) -> None:
+    """Compare budgets, print the comparison, and write what was asked for."""
+    from pixmetry.budget.compare_page import TITLE, page_of
+    from pixmetry.files.output import Output, check_files, page_mark, write_page
+    from pixmetry.report import html_of
+
+    written = JsonResult(json_file, SCHEMA, inputs=inputs)
+    if html is not None:
+        check_files([Output(html, page_mark(TITLE))], inputs)
+    check_pdf(pdf, inputs)
+    found = compared()
+    print_budgets(found, plain_console(width=116, quiet=written.printed), everything)
+    written.put({"comparison": found.to_record()})
+    if html is not None:
+        echo(f"page: {write_page(html, html_of(page_of(found)))}", err=written.printed)
+    put_pdf(pdf, lambda: page_of(found))
+
+
+def print_budgets(found: BudgetComparison, console: Console, everything: bool = False) -> None:
+    """Print budgets side by side, the verdict, the sources that differ most, and what was not the same."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    from pixmetry.budget.compare_page import length_of, sentences, settings_of
+    from pixmetry.report.numbers import percent, significant
+
+    unit, order = found.unit, [rank.side for rank in found.ranks]
+    table = Table(box=None, pad_edge=False)
+    table.add_column("budget", no_wrap=True)
+    in_px = [] if unit == "px" else ["after /px"]
+    for heading in (f"before /{unit}", f"after /{unit}", f"at least /{unit}", f"at most /{unit}", *in_px, "times the best"):
+        table.add_column(heading, justify="right")
+    for rank in found.ranks:
+        side = found.sides[rank.side]
+        answer = side.answer
+        pairs = (answer.before_px, answer.after_px, answer.least_px, answer.most_px)
+        cells = [length_of(side, pair, unit) for pair in pairs] + [length_of(side, answer.after_px, "px") for _ in in_px]
+        table.add_row(escape(side.name), *cells, significant(rank.ratio, 3))
+    console.print(table)
+    for words in sentences(found):
+        console.print(words, markup=False, soft_wrap=True)
+    scale, small = (1e3, "mpx") if unit == "px" else (1e3, "µm")
+    table = Table(box=None, pad_edge=False)
+    table.add_column("source")
+    for k in order:
+        table.add_column(f"{escape(found.sides[k].name)} /{small}", justify="right")
+    for k in order[1:]:
+        table.add_column("share" if len(order) == 2 else f"share {escape(found.sides[k].name)}", justify="right")
+    for row in found.rows if everything else found.rows[:LARGEST_SOURCES]:
+        shares = ["" if isnan(row.shares[k]) else f"{percent(row.shares[k])} %" for k in order[1:]]
+        table.add_row(escape(row.title), *(significant(scale * row.sizes[k], 2) for k in order), *shares)
+    console.print(table)
+    for key, values in settings_of(found):
+        console.print(f"not the same: {key}: {', '.join(values[k] for k in order)}", markup=False, soft_wrap=True)
 
 
 def print_comparison(result: Comparison | Fleet, console: Console, everything: bool = False) -> None:
@@ -142,13 +240,14 @@ def _print_fleet(result: Fleet, console: Console, everything: bool) -> None:
     from rich.markup import escape
     from rich.table import Table
 
+    from pixmetry.core.plain_text import ends_of_paths
     from pixmetry.report.numbers import pretty_unit, signed, significant
 
     table = Table(box=None, pad_edge=False)
     for name in ("key", "unit", "median", "spread", "u", "farthest", "in spreads", "stands out"):
         numeric = name in ("median", "spread", "u", "in spreads")
         table.add_column(name, justify="right" if numeric else "left", no_wrap=numeric, overflow="fold")
-    names = _last_parts(result.names)
+    names = ends_of_paths(result.names)
     for row in result.rows:
         out = [name for name, far in zip(names, row.stands_out, strict=True) if far]
         if not out and not everything:
@@ -167,16 +266,6 @@ def _print_fleet(result: Fleet, console: Console, everything: bool) -> None:
         f"(if all cameras are alike, the chance that any stands out is at most {chance}).",
         soft_wrap=True,
     )
-
-
-def _last_parts(names: Sequence[str]) -> list[str]:
-    """The shortest ends of the paths that still differ from each other."""
-    parts = [Path(name).parts for name in names]
-    for n in range(1, max(map(len, parts), default=0)):
-        short = ["/".join(p[-n:]) for p in parts]
-        if len(set(short)) == len(set(names)):
-            return short
-    return list(names)
 
 
 def print_limits(name: str, rows: Sequence[Checked], console: Console) -> None:

@@ -7,6 +7,8 @@ A file may be called ``\\x1b[2Jx.png`` and a point ``=1+2``. On a terminal the f
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
+from pathlib import Path
 
 # C0, DEL, C1, line and paragraph separators, and what turns the direction of writing
 _CONTROL = re.compile("[\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]")
@@ -49,6 +51,16 @@ def name_of(text: str) -> str:
     if text.startswith("'") and _FORMULA.match(text) and not _NUMBER.fullmatch(text[1:]):
         text = text[1:]
     return _WRITTEN.sub(_char, text)
+
+
+def ends_of_paths(names: Sequence[str]) -> list[str]:
+    """The shortest ends of the paths that still differ from each other."""
+    parts = [Path(name).parts for name in names]
+    for n in range(1, max(map(len, parts), default=0)):
+        short = ["/".join(p[-n:]) for p in parts]
+        if len(set(short)) == len(set(names)):
+            return short
+    return list(names)
 
 
 def _code(found: re.Match[str]) -> str:
