@@ -124,9 +124,9 @@ def test_command_with_files_and_with_cameras(tmp_path: Path, budget: CameraBudge
     quiet = [replace(r, after=r.after.scaled(0.5)) if r.after else r for r in budget.rows]
     write_json(files[1], replace(budget, rows=tuple(quiet)).to_record())
     page, data = tmp_path / "c.html", tmp_path / "c.json"
-    told = run("compare", *files, "--html", page, "--json", data)
+    told = run("compare", *files, "--html", page, "--json", data, "--pdf", tmp_path / "c.pdf")
     assert told.exit_code == 0, told.output
-    assert "after is better than before, 2.00 times" in told.output
+    assert "after is better than before, 2.00 times" in told.output and (tmp_path / "c.pdf").read_bytes().startswith(b"%PDF")
     record = json.loads(data.read_text(encoding="utf-8"))["comparison"]
     assert record["best"] == "after" and record["ranks"][1]["ratio"] == pytest.approx(2.0) and "<svg" in page.read_text(encoding="utf-8")
     sheets = [tmp_path / "16.yaml", tmp_path / "25.yaml"]

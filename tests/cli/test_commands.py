@@ -299,7 +299,7 @@ def test_a_copied_frame_is_found(folder: Path, tmp_path: Path) -> None:
 
 def test_every_command_with_a_page_writes_it_as_pdf() -> None:
     having = {name for name in COMMANDS if any("--pdf" in option.opts for option in main.get_command(None, name).params)}
-    assert having == {"assess", "budget", "calibrate", "chain", "emva1288"}
+    assert having == {"assess", "budget", "calibrate", "chain", "compare", "emva1288"}
 
 
 def test_values_that_do_not_fill_their_bits_are_noted(folder: Path, tmp_path: Path) -> None:
