@@ -100,8 +100,13 @@ def run_slices(function: Callable[[int, int], None], n: int, threads: int | None
     map_tiles(lambda span: function(int(span[0]), int(span[1])), list(zip(ends[:-1], ends[1:], strict=True)), threads)
 
 
-def prepare(frame: np.ndarray, targets: Targets, noise: NoiseModel, *, margin: float, threads: int | None = None) -> Prepared:
-    """Lay out windows, and fit the background around each target; ``margin`` of the window in standard deviations of the edge."""
+def prepare(
+    frame: np.ndarray, targets: Targets, noise: NoiseModel, *, margin: float, rim_px: float = 0.0, threads: int | None = None
+) -> Prepared:
+    """Lay out windows, and fit the background around each target; ``margin`` of the window in standard deviations of the edge.
+
+    ``rim_px``: how far inside the frame's border windows end.
+    """
     from pixmetry.locate.detect.detection import neighbours
 
     n = len(targets)
@@ -131,7 +136,7 @@ def prepare(frame: np.ndarray, targets: Targets, noise: NoiseModel, *, margin: f
     flags = targets.flags.astype(np.uint32)
     flags = flags | np.where(edge < 1.5 * blur, np.uint32(Flag.BORDER), np.uint32(0))
     flags = flags | np.where(free < 1.5 * blur, np.uint32(Flag.OVERLAPPING), np.uint32(0))
-    record[:, k.MARGIN] = np.minimum(wanted, np.maximum(np.minimum(edge, free), blur))
+    record[:, k.MARGIN] = np.minimum(wanted, np.maximum(np.minimum(edge - rim_px, free), blur))
     work = Prepared(record, noise.numbers(), flags, usable)
     work.radius, work.blur, spread = equivalent_disc(np.sqrt(major * minor), blur)
     work.amplitude = record[:, k.AMPLITUDE]

@@ -17,6 +17,7 @@ from pixmetry.locate.noise import NoiseModel
 OPERATORS = {"perimeter": o.PERIMETER, "forstner": o.FORSTNER, "ellipse_edges": o.ELLIPSE_EDGES, "gaussian": o.GAUSSIAN}
 ASTRAY_PX = 1.0
 MARGINS = {"perimeter": 3.0, "forstner": 3.0, "ellipse_edges": 3.0, "gaussian": 4.0}
+RIM_PX = 2.0  # between window and border: 1.5 that gradients and rays read around the window, and a window's way from the rough centre
 
 
 def operator_positions(frame: np.ndarray, targets: Targets, noise: NoiseModel, name: str, *, threads: int | None = None) -> Positions:
@@ -60,7 +61,7 @@ def operator_positions(frame: np.ndarray, targets: Targets, noise: NoiseModel, n
     if name not in OPERATORS:
         raise InputError("no such operator", value=name, allowed=", ".join(OPERATORS))
     operator, n = OPERATORS[name], len(targets)
-    work = prepare(frame, targets, noise, margin=MARGINS[name], threads=threads)
+    work = prepare(frame, targets, noise, margin=MARGINS[name], rim_px=RIM_PX, threads=threads)
     s_curve = np.sqrt(_phase_variance(work, operator, threads))
     result, at_rest = np.full((n, 6), np.nan), np.zeros(n, bool)
     work.over(lambda a, b: o.operators(frame, work.record, a, b, operator, work.noise, result, at_rest), threads)
