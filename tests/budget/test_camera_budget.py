@@ -16,15 +16,17 @@ from pixmetry.budget.answer import answer_of, rms
 from pixmetry.budget.camera_budget import CameraBudget
 from pixmetry.budget.cameras import camera_of
 from pixmetry.budget.motion import lag_contribution
+from pixmetry.budget.page import page_of
 from pixmetry.budget.scenario import Scenario, read_scenario
 from pixmetry.budget.setting import Setting
 from pixmetry.budget.table import ABSENT, AT_BOUND, COUNTED, ELSEWHERE, MEASURED, SHEET, TYPICAL, SourceRow, Table
 from pixmetry.camera.camera import Camera, Element, load_camera
 from pixmetry.camera.catalogue import get_source, sources
-from pixmetry.core.errors import InputError
+from pixmetry.core.errors import InputError, ParameterError
 from pixmetry.core.number import Estimates
 from pixmetry.locate.centroids.fixed import FixedCentroid
 from pixmetry.locate.target_estimator import TargetEstimator
+from pixmetry.report.html import html_of
 
 PRESETS = ("imx264_like", "pulnix_tm6cn_epix_512", "ft_ccd_generic", "cmos_log_fuga15")
 SHAPE = (240, 320)  # of the presets here, but for those with a grabber of their own size
@@ -310,3 +312,30 @@ def test_the_uncertainty_of_a_measured_value_without_a_closed_form_is_in_the_int
     change = rms((high.before_px - row.before_px, low.before_px - row.before_px))
     assert change > 0 and row.u_of_total_px == pytest.approx(change, rel=1e-6)
     assert row.largest_px > row.after_px
+
+
+@pytest.mark.parametrize(("side", "pitch_um"), [((10652, 14204), 3.76), ((200, 300), 3.76), ((1, 2048), 14.0), ((6000, 8000), 0.8)])
+def test_usual_lenses_and_sensors_grow_with_the_format(side: tuple[int, int], pitch_um: float) -> None:
+    """A lens has as many percent of distortion in the corner of any format, here at most 0.8 %."""
+    cam = replace(camera("imx264_like"), frame_shape=side, pitch_um=(pitch_um, pitch_um))
+    setting = Setting(cam, Scenario.model_validate({"calibration": {"model": "none"}}))
+    (row,) = Table(setting, TargetEstimator()).rows(["optics.distortion"])
+    corner_px = 0.5 * np.hypot(*side)
+    assert row.reason == "" and 0.2 * 0.008 * corner_px < row.before_px < 0.008 * corner_px
+
+
+def test_what_cannot_be_computed_is_left_out_and_said() -> None:
+    """A source whose model does not hold for this camera loses its own row only; record and page say that the answer lacks it."""
+    prnu, whole = get_source("sensor.prnu"), pixmetry.budget(camera("imx264_like"))
+
+    def refuse(*given: object) -> None:
+        raise ParameterError("the model does not hold here")
+
+    broken = replace(prnu, propagate=refuse)
+    cam = camera("imx264_like")
+    chain = tuple(replace(e, source=broken) if e.source.id == prnu.id else e for e in cam.chain)
+    found = pixmetry.budget(replace(cam, chain=chain))
+    (name,) = found.to_record()["left_out"]
+    assert [r.source_id for r in found.left_out] == [prnu.id] and name == found.left_out[0].name
+    assert "does not hold here" in html_of(page_of(found)) and whole.left_out == ()
+    assert 0 < found.one.after_px[0] < whole.one.after_px[0]

@@ -15,7 +15,7 @@ from pixmetry.budget.monte_carlo import MonteCarlo
 from pixmetry.budget.object_space import point_covariance
 from pixmetry.budget.scenario import Scenario
 from pixmetry.budget.setting import Setting
-from pixmetry.budget.table import SourceRow
+from pixmetry.budget.table import COUNTED, SourceRow
 from pixmetry.core.data_frame import data_frame
 from pixmetry.locate.estimator import Estimator
 
@@ -66,6 +66,11 @@ class CameraBudget:
     def answer(self) -> Answer:
         """The mean over the frames and targets of the scenario."""
         return answer_of(self.rows, self.scenario.count.frames, self.scenario.count.targets)
+
+    @property
+    def left_out(self) -> tuple[SourceRow, ...]:
+        """Sources of this camera that could not be computed: the answer lacks them."""
+        return tuple(r for r in self.rows if r.status in COUNTED and r.after is None)
 
     @cached_property
     def to_measure(self) -> tuple[Next, ...]:
@@ -154,6 +159,7 @@ class CameraBudget:
             "one_target_one_frame": self._answer_record(self.one),
             "answer": self._answer_record(self.answer),
             "point_covariance_mm2": None if covariance is None else covariance.tolist(),
+            "left_out": [r.name for r in self.left_out],
             "together": None if self.together is None else _together_record(self.together),
             "rows": [_row_record(r) for r in self.rows],
             "to_measure": [asdict(n) for n in self.to_measure],

@@ -96,6 +96,8 @@ def _answer(budget: CameraBudget) -> Section:
         parts.append([Reading(n, f"{significant(float(v), 2)} mm") for n, v in (("X", along), ("Y", across), ("Z (depth)", depth))])
     parts.append(Text(f"Without any calibration: x {length_px(one.before_px[0])} px, y {length_px(one.before_px[1])} px.", "second"))
     section.add(Answer(parts))
+    for row in budget.left_out:
+        section.add_text(strong("Not in the answer:"), f" {row.title} ({row.reason}).")
     if budget.together is not None:
         t = budget.together
         section.add_text(

@@ -24,7 +24,7 @@ from pixmetry.camera.camera import Camera, Element, pitch_values
 from pixmetry.camera.catalogue import get_source, sources
 from pixmetry.camera.contribution import UNSTEADY, Contribution
 from pixmetry.camera.source import Source
-from pixmetry.core.errors import ChainError, InputError
+from pixmetry.core.errors import InputError, PixmetryError
 from pixmetry.core.number import Estimates
 from pixmetry.locate.estimator import Estimator
 
@@ -50,6 +50,16 @@ SETTINGS = (  # what a user switches on, or a grabber with a clock of its own ha
 )
 VIEW_POINT = "scene.view_point"
 AVERAGED = ("scene.speckle", VIEW_POINT)  # of the object's errors those that another target has otherwise
+STATED_HALF_DIAGONAL_MM = 4.0  # the half-inch format, for which the catalogue gives usual values
+OF_THE_FORMAT = {  # powers of the format: a lens of the same design; a sensor as flat for its size
+    "k1_per_mm2": -2,
+    "k2_per_mm4": -4,
+    "k3_per_mm6": -6,
+    "p1_per_mm": -1,
+    "p2_per_mm": -1,
+    "principal_distance_mm": 1,
+    **dict.fromkeys(("bow_x_um", "bow_y_um", "twist_um", "skew_x_um", "skew_y_um"), 1),
+}
 COVERAGE = 2.0  # standard uncertainties of what was measured, at the upper end of the interval
 NOTHING_PX = 1e-9  # below it a shift is rounding
 Pair = tuple[float, float]
@@ -282,6 +292,7 @@ class Table:
     def _own(self, source: Source, params: Any) -> Any:
         """Parameters of a source that the description does not hold, with what the camera and the scenario tell of them."""
         s = self.setting
+        params = self._for_this_format(source, params)
         clock = {"line_time_us": 1e6 * s.camera.line_period_s, "pixel_time_ns": 1e9 / s.camera.pixel_clock_hz}
         known: dict[str, Any] = pitch_values(s.camera.pitch_um) | clock | {"bits": s.facts.bits, "reference_dn": s.facts.saturation_dn}
         known |= {"f_number": s.f_number, "wavelength_nm": s.scenario.light.wavelength_nm}
@@ -299,6 +310,20 @@ class Table:
                     params = source.make({**params.model_dump(), name: value})
                 except InputError:  # out of the source's own range: it keeps its usual value
                     continue
+        return params
+
+    def _for_this_format(self, source: Source, params: Any) -> Any:
+        """Usual parameters of a lens and a sensor of this format: in the corner the same angle, as many percent of distortion."""
+        pitch, (rows, cols) = self.setting.camera.pitch_um, self.setting.camera.frame_shape
+        own = params.model_dump()
+        if pitch is None or not OF_THE_FORMAT.keys() & own.keys():
+            return params
+        scale = 0.5e-3 * float(np.hypot(cols * pitch[0], rows * pitch[1])) / STATED_HALF_DIAGONAL_MM
+        for name in OF_THE_FORMAT.keys() & own.keys():
+            try:
+                params = source.make({**params.model_dump(), name: own[name] * scale ** OF_THE_FORMAT[name]})
+            except InputError:  # a format beyond the source's own range: it keeps its usual value
+                continue
         return params
 
     def _absent(self, source: Source) -> str:
@@ -328,17 +353,17 @@ class Table:
         moved = self._moved(element, in_camera) if source.gum_class in ("G", "D") else None
         if moved is not None:
             return replace(row, before=moved[0], after=moved[1], how=FIELD, method="exact map of the camera")
-        if source.propagate is not None:
-            probe = self.probes.of(element.name, source)
-            found = source.propagate(element.params, probe)
-            return self._with(replace(row, how=FORMULA), found, "no target is found behind it")
-        if source.forward is None or source.essential and source.ideal is None:
+        if source.propagate is None and (source.forward is None or source.essential and source.ideal is None):
             return replace(row, before=Parts(), after=Parts(), reason=source.reasons["propagate"])
         try:
-            simulated = self._simulated(element)
-        except (InputError, ChainError) as problem:
+            if source.propagate is not None:
+                how = FORMULA
+                found: Contribution | None = source.propagate(element.params, self.probes.of(element.name, source))
+            else:
+                how, found = SIMULATED, self._simulated(element)
+        except PixmetryError as problem:
             return replace(row, reason=f"not computed: {problem}")
-        return self._with(replace(row, how=SIMULATED), simulated, "no target is found behind it")
+        return self._with(replace(row, how=how), found, "no target is found behind it")
 
     def _with_uncertainty(self, row: SourceRow, element: Element, in_camera: bool, estimates: Estimates) -> SourceRow:
         """The row with what the uncertainty of its measured parameters does to it."""
@@ -413,7 +438,7 @@ class Table:
         try:
             pairs = [self._with_and_without(c, element, in_camera) for c in cameras]
             now, then = (self._difference(pair) for pair in pairs)
-        except (InputError, ChainError):
+        except PixmetryError:
             return None
         if not max(np.nanmax(np.abs(now), initial=0.0), np.nanmax(np.abs(then), initial=0.0)) > 1e-9:
             return None

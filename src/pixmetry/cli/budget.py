@@ -183,6 +183,8 @@ def print_budget(found: CameraBudget, console: Console, everything: bool = False
     if covariance is not None:
         x, y, z = covariance.diagonal() ** 0.5
         console.print(f"a point by {found.scenario.count.rays} rays: X {x:.2g} mm, Y {y:.2g} mm, Z {z:.2g} mm (depth)", markup=False)
+    for row in found.left_out:
+        console.print(f"not in the answer: {row.title} ({row.reason})", markup=False)
     table = Table(box=None, pad_edge=False)
     for heading in ("row", "source", "known", "handbook", "here"):
         table.add_column(heading)
