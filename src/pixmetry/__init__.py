@@ -32,6 +32,7 @@ _HOMES = {
     "compare_budgets": "pixmetry.budget.compare",
     "compare_fleet": "pixmetry.assess.judge.compare",
     "correct": "pixmetry.assess.correct",
+    "corrected": "pixmetry.assess.corrected",
     "emva1288": "pixmetry.emva.job",
     "load_camera": "pixmetry.camera.camera",
     "load_campaign": "pixmetry.files",
@@ -62,6 +63,7 @@ __all__ = [
     "compare_budgets",
     "compare_fleet",
     "correct",
+    "corrected",
     "emva1288",
     "load_camera",
     "load_campaign",
@@ -74,6 +76,7 @@ __all__ = [
 
 if TYPE_CHECKING:
     from pixmetry.assess.correct import correct
+    from pixmetry.assess.corrected import corrected
     from pixmetry.assess.job import assess
     from pixmetry.assess.judge.compare import check_limits, compare, compare_fleet
     from pixmetry.budget.compare import compare_budgets

@@ -34,8 +34,8 @@ def motion_contribution(element: Element, setting: Setting, camera: Camera) -> C
     the frame with a rolling shutter.
     """
     v, a = setting.velocity_px_per_s, setting.acceleration_px_per_s2
-    delay, spread2 = _delays(element, camera)
-    shift = _in_pairs(delay * v[:, None, None] + 0.5 * (delay**2 + spread2) * a[:, None, None])
+    delay, spread2 = row_delays(element, camera)
+    shift = in_pairs(delay * v[:, None, None] + 0.5 * (delay**2 + spread2) * a[:, None, None])
     mean = shift.mean(axis=(1, 2))
     time = shift.mean(axis=2).std(axis=1)
     smooth = shift.mean(axis=1).std(axis=1)
@@ -74,8 +74,11 @@ def _of(bias: np.ndarray, time: np.ndarray, smooth: np.ndarray, method: str) -> 
     return Contribution(float(u[0]), float(u[1]), "O", float(bias[0]), float(bias[1]), **text, **parts)
 
 
-def _delays(element: Element, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Times of rows after the middle of the exposure of those that look first, and the variance within the exposure, (frames, rows)."""
+def row_delays(element: Element, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Times of rows after the middle of the exposure of those that look first, and the variance within the exposure, (frames, rows).
+
+    Of a source that draws them anew in every frame, those of `FRAMES` frames; else of one.
+    """
     rows, cols = camera.frame_shape
     frames = FRAMES if element.source.id == "sensor.trigger_jitter" else 1
     grid = Grid.whole(list(range(frames)), (rows, cols))
@@ -93,7 +96,7 @@ def _delays(element: Element, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     return delay, variance
 
 
-def _in_pairs(values: np.ndarray) -> np.ndarray:
+def in_pairs(values: np.ndarray) -> np.ndarray:
     """Means over pairs of rows, the last axis: a target covers rows of both fields."""
     even = values.shape[-1] // 2 * 2
     return values[..., :even].reshape(*values.shape[:-1], -1, 2).mean(axis=-1) if even else values

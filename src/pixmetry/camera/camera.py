@@ -420,7 +420,9 @@ class Camera:
 
     # ---- geometry -------------------------------------------------------------------------------------------------------------
 
-    def true_positions(self, x_px: Any, y_px: Any, frame: int = 0, seed: int = 0, **schedule: Any) -> tuple[np.ndarray, np.ndarray]:
+    def true_positions(
+        self, x_px: Any, y_px: Any, frame: Any = 0, seed: int = 0, time_s: Any = None, **schedule: Any
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return where points of the scene's plane lie in a frame that the camera puts out.
 
         Every geometric effect of that frame counts: distortion, tilt, drift, the clock of the samples and its warm-up, offsets. What
@@ -431,29 +433,86 @@ class Camera:
         ----------
         x_px, y_px : array_like, shape (k,)
             In pixels of the ideal camera.
-        frame, seed : int
-            Of the exposure.
+        frame : int, or array_like of int, shape (k,)
+            Of the exposure: one for all points, or one for each.
+        seed : int
+        time_s : float, or array_like, shape (k,), optional
+            When the exposure begins; by default the number of the frame times the frame period.
         **schedule
-            As for `expose`.
+            As for `expose`; with a frame for each point, also arrays of shape (k,).
 
         Returns
         -------
         x_px, y_px : ndarray, shape (k,)
             NaN for points that are seen nowhere.
         """
-        x, y = (np.atleast_1d(np.asarray(v, float)) for v in (x_px, y_px))
+        x, y, signal = self._points(x_px, y_px, frame, time_s, schedule)
+        at = np.asarray(frame)
         streams = self.streams(seed)
-        signal = self.signal(NOWHERE, Grid.whole([frame], (1, 1)), **schedule)
         for link in self.links:
             if Kind.LIGHT in link.source.consumes and link.source is not LOOK:
                 signal, _ = run(link.source, link.params, signal, streams.of(link.name))
             elif link.source is LOOK:
-                x, y = (v[0, :, 0] for v in signal.own_light.placed(x[None, :, None], y[None, :, None]))
+                x, y = _by_window(signal.own_light.placed, x, y, signal)
             elif link.source is SAMPLE:
                 x = link.params.line_at(signal).placed(x, warped=True)
             elif link.source.place is not None:
-                x, y = link.source.place(link.params, x, y, link.shape, frame)
+                x, y = link.source.place(link.params, x, y, link.shape, at)
         return x, y
+
+    def ideal_positions(
+        self, x_px: Any, y_px: Any, frame: Any = 0, seed: int = 0, time_s: Any = None, **schedule: Any
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the points of the scene's plane that are seen at places of a frame: the inverse of `true_positions`, same parameters.
+
+        Examples
+        --------
+        >>> from pixmetry.camera.camera import load_camera
+        >>> camera = load_camera("pulnix_tm6cn_epix_512")
+        >>> x, y = camera.true_positions([300.0], [200.0], frame=5)
+        >>> [round(float(v[0]), 9) for v in camera.ideal_positions(x, y, frame=5)]
+        [300.0, 200.0]
+        """
+        at = self.sensor_places(x_px, y_px, frame, time_s, **schedule)
+        return self.scene_places(*at, frame, seed, time_s, **schedule)
+
+    def scene_places(
+        self, x_px: Any, y_px: Any, frame: Any = 0, seed: int = 0, time_s: Any = None, **schedule: Any
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the points of the scene's plane at which places on the pixel grid of the sensor look; parameters as in `true_positions`."""
+        x, y, signal = self._points(x_px, y_px, frame, time_s, schedule)
+        streams = self.streams(seed)
+        for link in self.links:
+            if Kind.LIGHT in link.source.consumes and link.source is not LOOK:
+                signal, _ = run(link.source, link.params, signal, streams.of(link.name))
+        return _by_window(signal.own_light.pulled, x, y, signal) if signal.light is not None else (x, y)
+
+    def sensor_places(self, x_px: Any, y_px: Any, frame: Any = 0, time_s: Any = None, **schedule: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Return where places of a frame lie on the pixel grid of the sensor; parameters as in `true_positions`."""
+        x, y, signal = self._points(x_px, y_px, frame, time_s, schedule)
+        at = np.asarray(frame)
+        for link in reversed(self.links):
+            if link.source is SAMPLE:
+                x = link.params.line_at(signal).pixels(x, warped=True)
+            elif link.source.place is not None:  # an offset and a step along each axis
+                ends = [link.source.place(link.params, np.full_like(x, v), np.full_like(y, v), link.shape, at) for v in (0.0, 1.0)]
+                x, y = ((v - first) / (second - first) for v, first, second in zip((x, y), *ends, strict=True))
+        return x, y
+
+    def _points(self, x_px: Any, y_px: Any, frame: Any, time_s: Any, schedule: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray, Signal]:
+        """Points of shape (k,), and a signal at the times of their frames: one window for all of them, or one for each."""
+        x, y = (np.atleast_1d(np.asarray(v, float)) for v in (x_px, y_px))
+        one = np.ndim(frame) == 0 and np.ndim(time_s) == 0 and all(np.ndim(v) == 0 for v in schedule.values())
+        numbers = np.atleast_1d(frame) if one else np.broadcast_to(frame, x.shape)
+        zero = np.zeros(len(numbers), np.int64)
+        signal = self.signal(NOWHERE, Grid(numbers, zero, zero, (1, 1)), **schedule)
+        if time_s is not None:
+            begins = np.broadcast_to(np.asarray(time_s, float), signal.time_s.shape)
+            temperature = signal.temperature_c
+            if schedule.get("temperature_c") is None:
+                temperature = self.temperature_c - self.warm_up_k * np.exp(-begins / self.warm_up_s)
+            signal = replace(signal, time_s=begins, temperature_c=temperature, light=replace(signal.own_light, time_s=begins))
+        return x, y, signal
 
     def layout(self, x_px: Any, y_px: Any, frame: Any = 0) -> tuple[np.ndarray, np.ndarray]:
         """Return where places on the pixel grid belong in the frames that are put out: clock of the samples, offsets, fields.
@@ -540,6 +599,15 @@ class _Task:
     def take(self, index: np.ndarray) -> _Task:
         """The task of some windows of the batch: values that are given window by window are picked."""
         return replace(self, schedule={k: np.asarray(v)[index] if np.size(v) > 1 else v for k, v in self.schedule.items()})
+
+
+def _by_window(
+    moved: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]], x: np.ndarray, y: np.ndarray, signal: Signal
+) -> tuple[np.ndarray, np.ndarray]:
+    """A map of the light at points of shape (k,): all in the one window, or each in its own."""
+    shape = (-1, 1, 1) if len(signal.grid.frame) == len(x) else (1, -1, 1)
+    u, v = moved(x.reshape(shape), y.reshape(shape))
+    return np.broadcast_to(u, x.reshape(shape).shape).ravel(), np.broadcast_to(v, x.reshape(shape).shape).ravel()
 
 
 class _NoScene:

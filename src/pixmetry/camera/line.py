@@ -230,17 +230,24 @@ class Line:
         """Columns of the samples at which places on the pixel grid are seen.
 
         Delays of rows and of filters are errors, not geometry. With ``warped``, delays that change along the line count: those of the
-        first window.
+        one window, or of a window for each place.
         """
         due = (np.asarray(x, float) + 0.5) / self.pixel_clock_hz
         at = due
         for _ in range(30 if warped and self.warps else 0):  # each turn is nearer by the share that a delay grows along the line
-            at = due + sum(np.broadcast_to(warp(at[None, None, :]), (1, 1, len(at)))[0, 0] for warp in self.warps)
+            at = due + self._warped_s(at)
         return (at - self.start_s) * self.sample_clock_hz - 0.5
 
-    def pixels(self, col: np.ndarray) -> np.ndarray:
+    def pixels(self, col: np.ndarray, warped: bool = False) -> np.ndarray:
         """Place on the pixel grid at which a sample looks, the inverse of `placed`."""
-        return ((col + 0.5) / self.sample_clock_hz + self.start_s) * self.pixel_clock_hz - 0.5
+        at = (col + 0.5) / self.sample_clock_hz + self.start_s
+        if warped and self.warps:
+            at = at - self._warped_s(at)
+        return at * self.pixel_clock_hz - 0.5
+
+    def _warped_s(self, at: np.ndarray) -> Any:
+        """Delays at sampling times of shape (k,)."""
+        return sum(np.broadcast_to(warp(at[:, None, None]), (len(at), 1, 1))[:, 0, 0] for warp in self.warps)
 
 
 def group_delay_s(zeros: Any, poles: Any) -> float:

@@ -7,8 +7,8 @@ from dataclasses import fields, replace
 from difflib import get_close_matches
 from typing import Any
 
-from pixmetry.camera.camera import Camera, pitch_values
-from pixmetry.camera.catalogue import sources
+from pixmetry.camera.camera import Camera, Element, in_order, pitch_values
+from pixmetry.camera.catalogue import get_source, sources
 from pixmetry.core.errors import InputError
 
 PERIOD = "frame_period_s"  # stands among the facts of a camera
@@ -87,6 +87,24 @@ def changed_camera(camera: Camera, overrides: Mapping[str, Any] | None = None, o
         camera = replace(camera, chain=tuple(e.with_params(changed.get(e.name, e.params)) for e in camera.chain))
     names = [_known(camera, name) for name in off]
     return _with_own(camera, own).switched(off=names)
+
+
+def with_source(camera: Camera, source_id: str) -> Camera:
+    """Return the camera with one more source, at its place in the chain, with parameters that change nothing where it has such.
+
+    Raises
+    ------
+    InputError, ChainError
+        If there is no such source, or it cannot stand in this chain.
+    """
+    source = get_source(source_id)
+    known = pitch_values(camera.pitch_um)
+    none = {} if source.neutral is None else source.neutral.model_dump()
+    params = source.make({**none, **{name: value for name, value in known.items() if name in source.parameters.model_fields}})
+    order = [s.id for s in in_order([*(e.source for e in camera.chain), source])]
+    later = set(order[order.index(source.id) + 1 :])
+    at = next((i for i, e in enumerate(camera.chain) if e.source.id in later), len(camera.chain))
+    return replace(camera, chain=(*camera.chain[:at], Element(source.id, source, params), *camera.chain[at:]))
 
 
 def _known(camera: Camera, name: str, parameter: str = "") -> str:

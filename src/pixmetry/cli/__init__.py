@@ -40,6 +40,7 @@ COMMANDS = {
     "bound": "Compute how well a target can be located (Cramér–Rao bound), and what limits it.",
     "budget": "Budget every error source of a camera for a measurement, before and after calibration.",
     "correct": "Correct frames with the results of an assessment.",
+    "corrected": "Correct positions for what is known of their camera's geometry.",
     "compare": "Compare measurements with each other, with a fleet of cameras, or with limits.",
     "warm-up": "Compile the kernels of all commands, so that no command waits for it later.",
 }

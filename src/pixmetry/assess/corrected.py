@@ -1,0 +1,612 @@
+"""Correction of positions: from where a frame shows targets to where the camera would show them without what is known of it.
+
+There is no second set of formulas. The camera's own maps are followed backwards, from the frame to the scene's plane, and forwards again
+through the camera without the sources that are corrected; with all of them corrected, the positions are those of the ideal camera, in
+pixels of the sensor. What a source's parameters leave uncertain is the change of that whole map along the principal directions of their
+covariance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pixmetry.assess.position_tables import MARK, Positions, read_positions
+from pixmetry.budget.changes import changed
+from pixmetry.budget.motion import LOOKS, in_pairs, row_delays
+from pixmetry.budget.scenario import Scenario, read_scenario
+from pixmetry.budget.setting import Setting, in_state
+from pixmetry.camera.camera import Camera, Element, load_camera
+from pixmetry.camera.catalogue import sources
+from pixmetry.camera.overrides import with_source
+from pixmetry.camera.provenance import TYPICAL
+from pixmetry.core.errors import InputError
+from pixmetry.files.output import Output, check_files, write_together
+
+CORRECTED_SCHEMA = "pixmetry/corrected/1"
+NOTHING_PX = 1e-9  # a smaller displacement is none
+STEP_PX = 0.25  # for derivatives by place
+STATE = ("state.camera_on_min", "state.grabber_on_min", "state.temperature_change_k", "state.warm_up_k")
+SPEED = ("motion.speed_px_per_s", "motion.speed_mm_per_s")
+
+
+@dataclass(frozen=True)
+class SourceCorrection:
+    """What was done about one error source.
+
+    Parameters
+    ----------
+    name, title : str
+        In the chain of the camera, and in words.
+    applied : bool
+    text : str
+        By what the correction is known, or why there is none.
+    shift_px : (float, float)
+        Largest displacement that was taken off, in x and y.
+    u_px : (float, float)
+        Largest standard uncertainty of the correction, in x and y.
+    """
+
+    name: str
+    title: str
+    applied: bool
+    text: str
+    shift_px: tuple[float, float] = (0.0, 0.0)
+    u_px: tuple[float, float] = (0.0, 0.0)
+
+    def to_record(self) -> dict[str, Any]:
+        """Plain record for JSON."""
+        return {
+            "name": self.name,
+            "title": self.title,
+            "applied": self.applied,
+            "text": self.text,
+            "largest_shift_px": list(self.shift_px),
+            "largest_u_px": list(self.u_px),
+        }
+
+
+@dataclass(frozen=True)
+class CorrectedPositions:
+    """Corrected positions, a row for each of the table.
+
+    Parameters
+    ----------
+    x_px, y_px : ndarray, shape (n,)
+        In pixels, from the centre of the top-left pixel; NaN where the table has no position, or the camera cannot show one there.
+    measured : Positions
+        The table.
+    covariance_px2 : ndarray, shape (n, 3), or None
+        var x, cov xy, var y of each position, that of the correction included; None where the table tells none.
+    correction_px2 : ndarray, shape (n, 3)
+        The same of the correction alone.
+    effects_px : ndarray, shape (k, n, 2)
+        What each independent cause of the correction's uncertainty does to all positions at once, as large as its standard uncertainty.
+    sources : tuple of SourceCorrection
+    notes : tuple of str
+    camera : str
+    """
+
+    x_px: np.ndarray
+    y_px: np.ndarray
+    measured: Positions
+    covariance_px2: np.ndarray | None
+    correction_px2: np.ndarray
+    effects_px: np.ndarray
+    sources: tuple[SourceCorrection, ...]
+    notes: tuple[str, ...] = ()
+    camera: str = ""
+
+    def __len__(self) -> int:
+        return len(self.x_px)
+
+    def __repr__(self) -> str:
+        done = [s.name for s in self.sources if s.applied]
+        return f"<CorrectedPositions: {len(self)} by {', '.join(done) or 'nothing'}>"
+
+    @property
+    def shift_px(self) -> np.ndarray:
+        """Corrected less measured, shape (n, 2)."""
+        return np.stack([self.x_px - self.measured.x_px, self.y_px - self.measured.y_px], axis=1)
+
+    @property
+    def correction_covariance_px2(self) -> np.ndarray:
+        """Covariance of the correction of all positions, x and y of one after the other, shape (2 n, 2 n)."""
+        flat = np.nan_to_num(self.effects_px.reshape(len(self.effects_px), -1))
+        return np.asarray(flat.T @ flat)
+
+    @property
+    def common_u_px(self) -> tuple[float, float]:
+        """Standard uncertainty of the correction of the mean of all positions: what no number of targets averages."""
+        seen = np.isfinite(self.x_px)
+        mean = self.effects_px[:, seen].mean(axis=1) if seen.any() else np.zeros((len(self.effects_px), 2))
+        x, y = np.sqrt((mean**2).sum(axis=0))
+        return float(x), float(y)
+
+    @property
+    def columns(self) -> dict[str, Any]:
+        """The columns of the table, with the corrected positions in place of the measured ones."""
+        return self.measured.replaced(self.x_px, self.y_px, self.covariance_px2, self.correction_px2)
+
+    def content(self) -> bytes:
+        """The table as a file, in the form in which it came."""
+        done = "; ".join(s.name for s in self.sources if s.applied)
+        return self.measured.content(self.columns, f"{done or 'nothing'} corrected by {self.camera}; x and y in px of the ideal camera")
+
+    def write(self, path: str | Path) -> Path:
+        """Write the table in the form in which it came; it appears whole or not at all.
+
+        Raises
+        ------
+        InputError
+            If there is another file of that name, or it cannot be written.
+        """
+        inputs = [Path(self.measured.source)] if self.measured.form else []
+        write_together([checked_output(path, inputs)], [self.content()], inputs)
+        return Path(path)
+
+    def to_record(self) -> dict[str, Any]:
+        """Plain record for JSON: what was corrected, without the table."""
+        return {
+            "schema": CORRECTED_SCHEMA,
+            "camera": self.camera,
+            "positions": len(self),
+            "lost": int(np.sum(~np.isfinite(self.x_px))),
+            "common_u_px": list(self.common_u_px),
+            "sources": [s.to_record() for s in self.sources],
+            "notes": list(self.notes),
+        }
+
+
+def checked_output(path: str | Path, inputs: Iterable[Path] = ()) -> Output:
+    """Refuse a name under which a table cannot be written, before any work is done.
+
+    Raises
+    ------
+    InputError
+    """
+    output = Output(Path(path), MARK, True)
+    check_files([output], inputs)
+    return output
+
+
+def corrected(
+    table: Any,
+    with_: Camera | str | Path,
+    output: str | Path | None = None,
+    *,
+    scenario: Scenario | Mapping[str, Any] | str | Path | None = None,
+    settings: Mapping[str, Any] | None = None,
+    u: Mapping[str, float] | None = None,
+    only: Iterable[str] = (),
+    skip: Iterable[str] = (),
+    x: str | None = None,
+    y: str | None = None,
+    origin: str = "first_pixel",
+) -> CorrectedPositions:
+    """Correct positions for all that the description of their camera knows of its geometry.
+
+    Parameters
+    ----------
+    table : path, Located, mapping of columns, or array_like of shape (n, 2)
+        CSV or JSON of `pixmetry locate`, or any CSV with columns for x and y. Columns that count where they are there: ``frame`` (number of
+        the frame; without it images are numbered in their order), ``time_s`` (since the first frame), ``temperature_c`` (of the sensor),
+        ``vx_px_per_s`` and ``vy_px_per_s`` (speed of the target), and the uncertainties of x and y.
+    with_ : Camera or str or path
+        A camera, the name of a preset, a data sheet, or the ``camera.yaml`` of an assessment.
+    output : path, optional
+        Where the table goes, in the form in which it came.
+    scenario : Scenario, mapping or path, optional
+        State and motion of the measurement, as of `pixmetry.budget`. Without one the camera is in the state that its description has.
+    settings : mapping, optional
+        Changes by name: entries of the scenario such as ``state.grabber_on_min``, parameters such as ``optics.cover_glass.thickness_um``,
+        values of the camera such as ``temperature_c``. A source that is not in the camera is put into it.
+    u : mapping, optional
+        Standard uncertainties by the same names, for what the description does not tell.
+    only, skip : iterable of str
+        Names of sources. What is only typical of such a camera, or was drawn at random, is corrected only if it is named.
+    x, y : str, optional
+        Names of the columns.
+    origin : {"first_pixel", "corner", "one"}
+        What the table calls the centre of the top-left pixel: (0, 0), (0.5, 0.5) or (1, 1).
+
+    Returns
+    -------
+    CorrectedPositions
+
+    Raises
+    ------
+    InputError
+        If the table or the description cannot be used, or no source has such a name.
+
+    Notes
+    -----
+    With the map M of the camera from the scene's plane to the frame and M₀ that without the corrected sources, a position p becomes
+    p' = M₀(M⁻¹(p)). Its covariance is J C Jᵀ + Σ dₖ dₖᵀ (JCGM 102, 6.2), with J = ∂p'/∂p by differences, and dₖ the change of p' along the
+    k-th principal direction of the parameters' covariance. A target that moves by v is seen at the time of its row: v τ(row) is taken off.
+
+    Examples
+    --------
+    >>> import pixmetry
+    >>> camera = pixmetry.load_camera("pulnix_tm6cn_epix_512")
+    >>> seen = camera.true_positions([300.0, 420.0], [200.0, 250.0])     # the grabber was just switched on
+    >>> found = pixmetry.corrected({"x_px": seen[0], "y_px": seen[1]}, camera, u={"grabber.clock_warm_up.scale_error_rel": 1e-4})
+    >>> found.x_px.round(6), found.y_px.round(6)
+    (array([300., 420.]), array([200., 250.]))
+    >>> print(f"{found.common_u_px[0]:.3f} px")
+    0.051 px
+    """
+    asked = read_scenario(scenario)
+    case = _Case.of(read_positions(table, x=x, y=y, origin=origin), with_, asked, dict(settings or {}), scenario is not None, dict(u or {}))
+    found = _corrected(case, _known_names(case.camera, only), _known_names(case.camera, skip))
+    if output is not None:
+        found.write(output)
+    return found
+
+
+# ---- what is known of the camera in its state ----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Case:
+    """Positions, their camera in its state, and how fast the targets move."""
+
+    table: Positions
+    described: Camera
+    scenario: Scenario
+    settings: Mapping[str, Any]
+    in_state: bool
+    u: Mapping[str, float]
+
+    @classmethod
+    def of(
+        cls, table: Positions, with_: Camera | str | Path, scenario: Scenario, settings: dict[str, Any], told: bool, u: dict[str, float]
+    ) -> _Case:
+        camera = with_ if isinstance(with_, Camera) else load_camera(with_)
+        camera = with_missing(camera, [*settings, *u])
+        case = cls(table, camera, scenario, settings, told or any(key in STATE for key in (*settings, *u)), u)
+        for key, value in u.items():
+            if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < np.inf:
+                raise InputError("no standard uncertainty", where=key, value=value, allowed="a number of 0 or more")
+            case.nominal(key)
+        return case
+
+    @cached_property
+    def camera(self) -> Camera:
+        """In the state of the measurement."""
+        return self._built({})[0]
+
+    def _built(self, moved: Mapping[str, Any]) -> tuple[Camera, Scenario]:
+        camera, scenario = changed(self.described, self.scenario, {**self.settings, **moved})
+        if self.in_state:
+            s = scenario.state
+            camera = in_state(camera, s.camera_on_min, s.grabber_on_min, s.temperature_change_k, s.warm_up_k)
+        return camera, scenario
+
+    def nominal(self, key: str) -> float:
+        """The value behind a name of the settings."""
+        camera, scenario = changed(self.described, self.scenario, self.settings)
+        told, (name, _, parameter) = scenario.told, key.rpartition(".")
+        if key in told:
+            value = told[key][0]
+        elif name and name in camera and parameter in type(camera[name].params).model_fields:
+            value = getattr(camera[name].params, parameter)
+        elif not name and isinstance(getattr(camera, key, None), int | float):
+            value = getattr(camera, key)
+        else:
+            allowed = "an entry of the scenario (state.…, motion.…), NAME.PARAMETER of a source, or temperature_c"
+            raise InputError("no number has this name", where="u", value=key, allowed=allowed)
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise InputError("an uncertainty of what has no value", where="u", value=key, remedy="give its value too")
+        return float(value)
+
+    def at(self, moved: Mapping[str, Any]) -> _Moment:
+        """The camera with some of the settings changed, at the times of the table."""
+        camera, scenario = (self.camera, changed(self.described, self.scenario, self.settings)[1]) if not moved else self._built(moved)
+        return _Moment(camera, *self._speed(camera, scenario), self.schedule)
+
+    def _speed(self, camera: Camera, scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
+        """Of the targets and its rate, shape (n, 2) each; NaN where nothing tells it."""
+        own = [self.table.numbers(name) for name in ("vx_px_per_s", "vy_px_per_s")]
+        n = len(self.table)
+        if own[0] is not None or own[1] is not None:
+            v = np.stack([np.zeros(n) if one is None else one for one in own], axis=1)
+            return v, np.zeros((n, 2))
+        m = scenario.motion
+        if m.speed_px_per_s is None and m.speed_mm_per_s is None:
+            return np.full((n, 2), np.nan), np.zeros((n, 2))
+        setting = Setting(camera, scenario)
+        return np.tile(setting.velocity_px_per_s, (n, 1)), np.tile(setting.acceleration_px_per_s2, (n, 1))
+
+    @cached_property
+    def schedule(self) -> dict[str, Any]:
+        """Frame, time and temperature of every position, as `Camera.true_positions` takes them."""
+        table = self.table
+        frame, time, temperature = (table.numbers(name) for name in ("frame", "time_s", "temperature_c"))
+        whole: Any = 0
+        if frame is not None:
+            if (np.nan_to_num(frame) != np.rint(np.nan_to_num(frame))).any() or (np.nan_to_num(frame) < 0).any():
+                raise InputError("'frame' is no number of a frame", where=table.source, allowed="0, 1, 2 …", remedy="rename the column")
+            whole = np.nan_to_num(frame).astype(np.int64)
+        elif "image" in table.columns:
+            order = {name: k for k, name in enumerate(dict.fromkeys(table.columns["image"]))}
+            whole = np.array([order[name] for name in table.columns["image"]], np.int64)
+        found: dict[str, Any] = {"frame": whole}
+        if time is not None:
+            found["time_s"] = np.nan_to_num(time)
+        if temperature is not None:
+            found["temperature_c"] = np.nan_to_num(temperature)
+        elif self.in_state:
+            found["temperature_c"] = self.camera.temperature_c
+        return found
+
+    def said(self) -> list[str]:
+        """What was taken for granted of the times."""
+        notes = []
+        if "time_s" not in self.schedule and np.max(self.schedule["frame"], initial=0) > 0:
+            period = self.camera.facts.get("frame_period_s", 0.04)
+            how = "by the column frame" if "frame" in self.table.columns else "in the order of the images"
+            notes.append(f"frames are numbered {how}, {period:g} s apart; a column time_s tells other times")
+        drifts = [e.name for e in self.camera.active if e.source.gum_class == "D" and hasattr(e.params, "on_for_s")]
+        if drifts and not self.in_state and all(self.camera[name].params.on_for_s == 0 for name in drifts):
+            notes.append(
+                f"{', '.join(drifts)}: switched on when frame 0 was taken, as the description says; state.camera_on_min and "
+                "state.grabber_on_min tell other times"
+            )
+        return notes
+
+
+@dataclass(frozen=True)
+class _Moment:
+    """A camera, the speed of each target and its rate in px of the sensor, and the times of the positions."""
+
+    camera: Camera
+    velocity: np.ndarray
+    acceleration: np.ndarray
+    schedule: Mapping[str, Any]
+
+    def with_camera(self, camera: Camera) -> _Moment:
+        """The same with another camera."""
+        return replace(self, camera=camera)
+
+    def ideal(self, x: np.ndarray, y: np.ndarray, looks: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
+        """Points of the scene at which places of the frames look, with the motion taken off for the sources named ``looks``."""
+        times = {name: value for name, value in self.schedule.items() if name != "temperature_c"}
+        u, v = self.camera.sensor_places(x, y, **times)
+        shift = self.delayed(v, looks)
+        return self.camera.scene_places(u - shift[:, 0], v - shift[:, 1], **self.schedule)
+
+    def delayed(self, row: np.ndarray, looks: Sequence[str]) -> np.ndarray:
+        """How far targets have moved when their rows look, shape (n, 2)."""
+        if not looks:
+            return np.zeros((len(row), 2))
+        delay = np.zeros(len(row))
+        for name in looks:
+            pairs = in_pairs_at(row_delays(self.camera[name], self.camera)[0][0])
+            delay += np.interp(np.nan_to_num(row), *pairs)
+        return self.velocity * delay[:, None] + 0.5 * self.acceleration * (delay**2)[:, None]
+
+
+def in_pairs_at(delay_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and times of the rows of a frame for a target that covers several: means over pairs of rows, half a row below the first."""
+    if len(delay_s) < 2:
+        return np.zeros(1), delay_s[:1]
+    return np.arange(len(delay_s) - 1) + 0.5, 0.5 * (delay_s[1:] + delay_s[:-1])
+
+
+def with_missing(camera: Camera, keys: Iterable[str]) -> Camera:
+    """The camera with the sources that settings name and it does not hold; a source that is off is switched on."""
+    for key in keys:
+        name = key.rpartition(".")[0]
+        if name in camera:
+            camera = replace(camera, chain=tuple(replace(e, on=e.on or e.name == name) for e in camera.chain))
+        elif name in sources() and not any(e.source.id == name for e in camera.chain):
+            camera = with_source(camera, name)
+    return camera
+
+
+def _known_names(camera: Camera, names: Iterable[str]) -> tuple[str, ...]:
+    """Names of the chain; ids stand for all elements of their source."""
+    found: list[str] = []
+    for name in names:
+        there = [e.name for e in camera.active if name in (e.name, e.source.id)]
+        if not there:
+            allowed = ", ".join(e.name for e in camera.active)
+            raise InputError(f"{camera.name} has no source named {name!r} that is on", allowed=allowed, remedy="take one of its own")
+        found += there
+    return tuple(found)
+
+
+# ---- the correction ------------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Selection:
+    """Sources to take off, those among them that look at other times, those that are left out of the camera, and the reasons."""
+
+    applied: tuple[str, ...]
+    looks: tuple[str, ...]
+    unknown: tuple[str, ...]
+    reasons: Mapping[str, str] = field(default_factory=dict)
+
+
+def _corrected(case: _Case, only: tuple[str, ...], skip: tuple[str, ...]) -> CorrectedPositions:
+    now, table = case.at({}), case.table
+    chosen = _selected(now, only, skip)
+
+    def mapped(moment: _Moment, without: tuple[str, ...] = ()) -> np.ndarray:
+        return _mapped(moment, chosen, table.x_px, table.y_px, without)
+
+    at = mapped(now)
+    effects: list[tuple[str, np.ndarray]] = []
+    for name, plus, minus in _causes(case, chosen):
+        sides = 2 - (plus is None) - (minus is None)  # at the end of its range a value can only go one way
+        if sides:
+            effects.append((name, ((at if plus is None else mapped(plus)) - (at if minus is None else mapped(minus))) / sides))
+    shifts = {name: mapped(now, (name,)) - at for name in chosen.applied}
+    all_effects = np.array([effect for _, effect in effects]).reshape(-1, len(table), 2)
+    dx, dy = all_effects[:, :, 0], all_effects[:, :, 1]
+    correction = np.stack([(dx**2).sum(axis=0), (dx * dy).sum(axis=0), (dy**2).sum(axis=0)], axis=1)
+    told = tuple(_told(e, chosen, shifts, effects) for e in now.camera.active if e.name in chosen.applied or e.name in chosen.reasons)
+    notes = case.said()
+    lost = int(np.sum(np.isnan(at[:, 0]) & np.isfinite(table.x_px)))
+    if lost:
+        notes.append(f"{lost} positions lie where the camera shows nothing: they stay as they were")
+    return CorrectedPositions(
+        at[:, 0], at[:, 1], table, _carried(table, correction, lambda x, y: _mapped(now, chosen, x, y)), correction, all_effects, told,
+        tuple(notes), now.camera.name,
+    )  # fmt: skip
+
+
+def _mapped(moment: _Moment, chosen: _Selection, x: np.ndarray, y: np.ndarray, without: tuple[str, ...] = ()) -> np.ndarray:
+    """Corrected positions, shape (n, 2); all sources but those of ``without`` are taken off."""
+    whole = moment.camera.switched(off=chosen.unknown)
+    looks = tuple(name for name in chosen.looks if name not in without)
+    ideal = moment.with_camera(whole).ideal(x, y, looks)
+    rest = whole.switched(off=[name for name in chosen.applied if name not in without])
+    return np.stack(rest.true_positions(*ideal, **moment.schedule), axis=1)
+
+
+def _selected(now: _Moment, only: tuple[str, ...], skip: tuple[str, ...]) -> _Selection:
+    """Which sources are taken off, and why others are not."""
+    camera, reasons = now.camera, {}
+    applied, looks, unknown = [], [], []
+    for element in camera.active:
+        moves, drawn, times = _moves(element, now)
+        if not moves and not times:
+            if element.name in only:
+                reasons[element.name] = "moves no position here"
+            continue
+        named = element.name in only
+        if element.name in skip or (only and not named):
+            reasons[element.name] = "left out, as asked"
+        elif drawn and not named:
+            reasons[element.name] = "drawn at random: what it does in these frames is not known"
+            unknown.append(element.name)
+        elif element.known_from == TYPICAL and not named:
+            reasons[element.name] = "its parameters are only typical of such a camera; name it under `only` to take it off all the same"
+            unknown.append(element.name)
+        elif times and not np.isfinite(now.velocity).all():
+            reasons[element.name] = "needs the speed of the targets: columns vx_px_per_s and vy_px_per_s, or motion.speed_px_per_s"
+        elif times and drawn:
+            reasons[element.name] = "drawn anew in every frame, which does not tell its delay"
+        else:
+            applied.append(element.name)
+            looks += [element.name] if times else []
+    return _Selection(tuple(applied), tuple(looks), tuple(unknown), reasons)
+
+
+def _moves(element: Element, now: _Moment) -> tuple[bool, bool, bool]:
+    """Whether a source moves places of the frame, or may by what is uncertain of it; whether it draws how; whether it looks at other times."""
+    alone = now.camera.switched(on=[element.name])
+    x, y, schedule = _lattice(now)
+    bare = np.stack(now.camera.switched(on=[]).true_positions(x, y, **schedule))
+
+    def differ(one: np.ndarray, other: np.ndarray) -> bool:
+        return bool((np.abs(np.nan_to_num(one - other, nan=1.0)) > NOTHING_PX).any())
+
+    seen = np.stack(alone.true_positions(x, y, **schedule))
+    others = [
+        replace(alone, unit_seed=alone.unit_seed + 1).true_positions(x, y, **schedule),
+        alone.true_positions(x, y, seed=1, **schedule),
+    ]
+    drawn = any(differ(np.stack(other), seen) for other in others)
+    steps = [_or_none(_stepped, now, element.name, [e.name], np.array([e.u])) for e in element.estimates if e.u > 0]
+    uncertain = [one for one in steps if one is not None]
+    moves = differ(seen, bare) or any(
+        differ(np.stack(one.camera.switched(on=[element.name]).true_positions(x, y, **schedule)), bare) for one in uncertain
+    )
+    times = False
+    if element.source.id in LOOKS:
+        delay = row_delays(element, now.camera)[0]
+        times, drawn = bool(np.any(in_pairs(delay))), drawn or len(delay) > 1
+    return moves, drawn, times
+
+
+def _lattice(now: _Moment) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
+    """Places all over the sensor at the times of the first position, of the last, and of one between."""
+    rows, cols = now.camera.frame_shape
+    side = (np.arange(5) + 0.5) / 5
+    y, x = (np.tile(v.ravel(), 3) for v in np.meshgrid(side * (rows - 1), side * (cols - 1), indexing="ij"))
+    pick = np.repeat([0.0, 0.5, 1.0], len(side) ** 2)
+    schedule = {}
+    for name, value in now.schedule.items():
+        values = np.sort(np.atleast_1d(value))
+        schedule[name] = values[np.rint(pick * (len(values) - 1)).astype(int)] if len(values) else np.zeros(len(pick), np.int64)
+    return x, y, schedule
+
+
+def _causes(case: _Case, chosen: _Selection) -> Iterator[tuple[str, _Moment | None, _Moment | None]]:
+    """The name of every independent cause of uncertainty, and what is known with it one standard uncertainty larger and smaller.
+
+    None where it would leave its range.
+    """
+    for key, u in case.u.items():
+        if u:
+            value, name = case.nominal(key), key.rpartition(".")[0]
+            yield name if name in case.camera else key, _or_none(case.at, {key: value + u}), _or_none(case.at, {key: value - u})
+    now = case.at({})
+    for name in chosen.applied:
+        element = now.camera[name]
+        known = [n for n in element.estimates.names if f"{name}.{n}" not in case.u]
+        if not known:
+            continue
+        estimates = element.estimates.select(known)
+        scale = np.where(estimates.u > 0, estimates.u, 1.0)
+        power, directions = np.linalg.eigh(estimates.covariance / np.outer(scale, scale))
+        for p, direction in zip(power, directions.T, strict=True):
+            step = np.sqrt(max(p, 0.0)) * direction * estimates.u
+            if np.any(step):
+                yield name, _or_none(_stepped, now, name, known, step), _or_none(_stepped, now, name, known, -step)
+
+
+def _or_none(made: Callable[..., _Moment], *arguments: Any) -> _Moment | None:
+    """What is made of the arguments; None where a value leaves its range."""
+    try:
+        return made(*arguments)
+    except InputError:
+        return None
+
+
+def _stepped(now: _Moment, name: str, names: Sequence[str], step: np.ndarray) -> _Moment:
+    """What is known with some parameters of a source changed together."""
+    element = now.camera[name]
+    own = element.params.model_dump()
+    params = element.source.make({**own, **{n: own[n] + float(s) for n, s in zip(names, step, strict=True)}}, where=name)
+    chain = tuple(replace(e, params=params) if e.name == name else e for e in now.camera.chain)
+    return now.with_camera(replace(now.camera, chain=chain))
+
+
+def _carried(table: Positions, correction: np.ndarray, mapped: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> np.ndarray | None:
+    """Covariance of each corrected position: that of the measured one through the map, and that of the correction."""
+    if table.covariance_px2 is None:
+        return None
+    x, y = table.x_px, table.y_px
+    along_x = (mapped(x + STEP_PX, y) - mapped(x - STEP_PX, y)) / (2 * STEP_PX)
+    along_y = (mapped(x, y + STEP_PX) - mapped(x, y - STEP_PX)) / (2 * STEP_PX)
+    j = np.stack([along_x, along_y], axis=2)  # (n, out, in)
+    var_x, cov, var_y = table.covariance_px2.T
+    c = np.stack([np.stack([var_x, cov], 1), np.stack([cov, var_y], 1)], axis=1)
+    out = j @ c @ np.swapaxes(j, 1, 2)
+    return np.asarray(np.stack([out[:, 0, 0], out[:, 0, 1], out[:, 1, 1]], axis=1) + correction)
+
+
+def _told(
+    element: Element, chosen: _Selection, shifts: Mapping[str, np.ndarray], effects: Sequence[tuple[str, np.ndarray]]
+) -> SourceCorrection:
+    """What was done about a source, in numbers and words."""
+    if element.name in chosen.reasons:
+        return SourceCorrection(element.name, element.source.title, False, chosen.reasons[element.name])
+    own = [effect for name, effect in effects if name == element.name]
+    u = np.sqrt(np.nan_to_num(np.array(own) ** 2).sum(axis=0)) if own else np.zeros((1, 2))
+    known = f"by {element.known_from or 'described'} parameters"
+    text = known if own else f"{known}, whose uncertainty is not stated: that of the correction lacks it"
+    shift, largest = np.nanmax(np.abs(np.nan_to_num(shifts[element.name])), axis=0), u.max(axis=0)
+    return SourceCorrection(
+        element.name, element.source.title, True, text, (float(shift[0]), float(shift[1])), (float(largest[0]), float(largest[1]))
+    )
