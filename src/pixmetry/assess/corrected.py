@@ -9,7 +9,7 @@ covariance.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -30,9 +30,10 @@ from pixmetry.files.output import Output, check_files, write_together
 
 CORRECTED_SCHEMA = "pixmetry/corrected/1"
 NOTHING_PX = 1e-9  # a smaller displacement is none
+NO_TIME_S = 1e-9  # after the time of the frame
 STEP_PX = 0.25  # for derivatives by place
+SPEED = "the speed of the targets: columns vx_px_per_s and vy_px_per_s, or motion.speed_px_per_s"
 STATE = ("state.camera_on_min", "state.grabber_on_min", "state.temperature_change_k", "state.warm_up_k")
-SPEED = ("motion.speed_px_per_s", "motion.speed_mm_per_s")
 
 
 @dataclass(frozen=True)
@@ -87,6 +88,8 @@ class CorrectedPositions:
         The same of the correction alone.
     effects_px : ndarray, shape (k, n, 2)
         What each independent cause of the correction's uncertainty does to all positions at once, as large as its standard uncertainty.
+    causes : tuple of str
+        Names of these: of sources, or of the state and the motion of the measurement.
     sources : tuple of SourceCorrection
     notes : tuple of str
     camera : str
@@ -98,6 +101,7 @@ class CorrectedPositions:
     covariance_px2: np.ndarray | None
     correction_px2: np.ndarray
     effects_px: np.ndarray
+    causes: tuple[str, ...]
     sources: tuple[SourceCorrection, ...]
     notes: tuple[str, ...] = ()
     camera: str = ""
@@ -127,6 +131,17 @@ class CorrectedPositions:
         mean = self.effects_px[:, seen].mean(axis=1) if seen.any() else np.zeros((len(self.effects_px), 2))
         x, y = np.sqrt((mean**2).sum(axis=0))
         return float(x), float(y)
+
+    @property
+    def state_u_px(self) -> dict[str, tuple[float, float]]:
+        """Largest standard uncertainty of the correction by causes that are no sources: state and motion of the measurement."""
+        own = {s.name for s in self.sources}
+        found = {}
+        for name in dict.fromkeys(cause for cause in self.causes if cause not in own):
+            of_it = np.array([effect for cause, effect in zip(self.causes, self.effects_px, strict=True) if cause == name])
+            u = np.sqrt((np.nan_to_num(of_it) ** 2).sum(axis=0)).max(axis=0, initial=0.0)
+            found[name] = (float(u[0]), float(u[1]))
+        return found
 
     @property
     def columns(self) -> dict[str, Any]:
@@ -159,6 +174,7 @@ class CorrectedPositions:
             "lost": int(np.sum(~np.isfinite(self.x_px))),
             "common_u_px": list(self.common_u_px),
             "sources": [s.to_record() for s in self.sources],
+            "largest_u_px_by_state": {name: list(u) for name, u in self.state_u_px.items()},
             "notes": list(self.notes),
         }
 
@@ -262,14 +278,17 @@ class _Case:
     settings: Mapping[str, Any]
     in_state: bool
     u: Mapping[str, float]
+    added: frozenset[str]
 
     @classmethod
     def of(
         cls, table: Positions, with_: Camera | str | Path, scenario: Scenario, settings: dict[str, Any], told: bool, u: dict[str, float]
     ) -> _Case:
         camera = with_ if isinstance(with_, Camera) else load_camera(with_)
-        camera = with_missing(camera, [*settings, *u])
-        case = cls(table, camera, scenario, settings, told or any(key in STATE for key in (*settings, *u)), u)
+        before = {e.name for e in camera.chain}
+        camera = with_missing(camera, [*settings, *u], scenario.object.f_mm)
+        added = frozenset(e.name for e in camera.chain if e.name not in before)
+        case = cls(table, camera, scenario, settings, told or any(key in STATE for key in (*settings, *u)), u, added)
         for key, value in u.items():
             if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < np.inf:
                 raise InputError("no standard uncertainty", where=key, value=value, allowed="a number of 0 or more")
@@ -341,8 +360,6 @@ class _Case:
             found["time_s"] = np.nan_to_num(time)
         if temperature is not None:
             found["temperature_c"] = np.nan_to_num(temperature)
-        elif self.in_state:
-            found["temperature_c"] = self.camera.temperature_c
         return found
 
     def said(self) -> list[str]:
@@ -352,6 +369,13 @@ class _Case:
             period = self.camera.facts.get("frame_period_s", 0.04)
             how = "by the column frame" if "frame" in self.table.columns else "in the order of the images"
             notes.append(f"frames are numbered {how}, {period:g} s apart; a column time_s tells other times")
+        for element in self.described.active:
+            if element.name in self.added:
+                told = {key.rpartition(".")[2] for key in self.settings if key.rpartition(".")[0] == element.name}
+                own = {n: v for n, v in element.params.model_dump().items() if n not in told and isinstance(v, float) and v}
+                if own:
+                    values = ", ".join(f"{n} {v:g}" for n, v in own.items())
+                    notes.append(f"{element.name}: not told, so taken from camera, lens or catalogue: {values}")
         drifts = [e.name for e in self.camera.active if e.source.gum_class == "D" and hasattr(e.params, "on_for_s")]
         if drifts and not self.in_state and all(self.camera[name].params.on_for_s == 0 for name in drifts):
             notes.append(
@@ -385,28 +409,35 @@ class _Moment:
         """How far targets have moved when their rows look, shape (n, 2)."""
         if not looks:
             return np.zeros((len(row), 2))
-        delay = np.zeros(len(row))
+        delay, variance = np.zeros(len(row)), np.zeros(len(row))
         for name in looks:
-            pairs = in_pairs_at(row_delays(self.camera[name], self.camera)[0][0])
-            delay += np.interp(np.nan_to_num(row), *pairs)
-        return self.velocity * delay[:, None] + 0.5 * self.acceleration * (delay**2)[:, None]
+            for total, of_rows in zip((delay, variance), row_delays(self.camera[name], self.camera), strict=True):
+                total += np.interp(np.nan_to_num(row), *in_pairs_at(of_rows[0]))
+        return self.velocity * delay[:, None] + 0.5 * self.acceleration * (delay**2 + variance)[:, None]
 
 
-def in_pairs_at(delay_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows and times of the rows of a frame for a target that covers several: means over pairs of rows, half a row below the first."""
-    if len(delay_s) < 2:
-        return np.zeros(1), delay_s[:1]
-    return np.arange(len(delay_s) - 1) + 0.5, 0.5 * (delay_s[1:] + delay_s[:-1])
+def in_pairs_at(of_rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and values of the rows of a frame for a target that covers several: means over neighbours, half a row below the first."""
+    if len(of_rows) < 2:
+        return np.zeros(1), of_rows[:1]
+    return np.arange(len(of_rows) - 1) + 0.5, 0.5 * (of_rows[1:] + of_rows[:-1])
 
 
-def with_missing(camera: Camera, keys: Iterable[str]) -> Camera:
-    """The camera with the sources that settings name and it does not hold; a source that is off is switched on."""
+def with_missing(camera: Camera, keys: Iterable[str], f_mm: float | None = None) -> Camera:
+    """The camera with the sources that settings name and it does not hold; a source that is off is switched on.
+
+    The exit pupil of a lens of known focal length is taken to be that far from the sensor.
+    """
+    lens = Setting(camera, Scenario.model_validate({"object": {"f_mm": f_mm}}))
     for key in keys:
         name = key.rpartition(".")[0]
         if name in camera:
             camera = replace(camera, chain=tuple(replace(e, on=e.on or e.name == name) for e in camera.chain))
         elif name in sources() and not any(e.source.id == name for e in camera.chain):
             camera = with_source(camera, name)
+            by_lens = {"principal_distance_mm": lens.f_mm, "chief_ray_deg": lens.chief_ray_deg}
+            own = {n: v for n, v in by_lens.items() if v is not None and n in sources()[name].parameters.model_fields}
+            camera = camera.with_parameters(name, **own)
     return camera
 
 
@@ -427,12 +458,13 @@ def _known_names(camera: Camera, names: Iterable[str]) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class _Selection:
-    """Sources to take off, those among them that look at other times, those that are left out of the camera, and the reasons."""
+    """Sources to take off, those of them whose times count, those that are left out of the camera; reasons; what is said beside."""
 
     applied: tuple[str, ...]
     looks: tuple[str, ...]
     unknown: tuple[str, ...]
-    reasons: Mapping[str, str] = field(default_factory=dict)
+    reasons: Mapping[str, str]
+    half: Mapping[str, str]
 
 
 def _corrected(case: _Case, only: tuple[str, ...], skip: tuple[str, ...]) -> CorrectedPositions:
@@ -457,10 +489,9 @@ def _corrected(case: _Case, only: tuple[str, ...], skip: tuple[str, ...]) -> Cor
     lost = int(np.sum(np.isnan(at[:, 0]) & np.isfinite(table.x_px)))
     if lost:
         notes.append(f"{lost} positions lie where the camera shows nothing: they stay as they were")
-    return CorrectedPositions(
-        at[:, 0], at[:, 1], table, _carried(table, correction, lambda x, y: _mapped(now, chosen, x, y)), correction, all_effects, told,
-        tuple(notes), now.camera.name,
-    )  # fmt: skip
+    covariance = _carried(table, correction, lambda x, y: _mapped(now, chosen, x, y))
+    causes = tuple(name for name, _ in effects)
+    return CorrectedPositions(at[:, 0], at[:, 1], table, covariance, correction, all_effects, causes, told, tuple(notes), now.camera.name)
 
 
 def _mapped(moment: _Moment, chosen: _Selection, x: np.ndarray, y: np.ndarray, without: tuple[str, ...] = ()) -> np.ndarray:
@@ -474,9 +505,12 @@ def _mapped(moment: _Moment, chosen: _Selection, x: np.ndarray, y: np.ndarray, w
 
 def _selected(now: _Moment, only: tuple[str, ...], skip: tuple[str, ...]) -> _Selection:
     """Which sources are taken off, and why others are not."""
-    camera, reasons = now.camera, {}
-    applied, looks, unknown = [], [], []
-    for element in camera.active:
+    applied: list[str] = []
+    looks: list[str] = []
+    unknown: list[str] = []
+    reasons: dict[str, str] = {}
+    half: dict[str, str] = {}
+    for element in now.camera.active:
         moves, drawn, times = _moves(element, now)
         if not moves and not times:
             if element.name in only:
@@ -491,18 +525,21 @@ def _selected(now: _Moment, only: tuple[str, ...], skip: tuple[str, ...]) -> _Se
         elif element.known_from == TYPICAL and not named:
             reasons[element.name] = "its parameters are only typical of such a camera; name it under `only` to take it off all the same"
             unknown.append(element.name)
-        elif times and not np.isfinite(now.velocity).all():
-            reasons[element.name] = "needs the speed of the targets: columns vx_px_per_s and vy_px_per_s, or motion.speed_px_per_s"
         elif times and drawn:
             reasons[element.name] = "drawn anew in every frame, which does not tell its delay"
+        elif times and not moves and not np.isfinite(now.velocity).all():
+            reasons[element.name] = f"needs {SPEED}"
         else:
             applied.append(element.name)
-            looks += [element.name] if times else []
-    return _Selection(tuple(applied), tuple(looks), tuple(unknown), reasons)
+            if times and np.isfinite(now.velocity).all():
+                looks.append(element.name)
+            elif times:
+                half[element.name] = f"; what it does to targets that move needs {SPEED}"
+    return _Selection(tuple(applied), tuple(looks), tuple(unknown), reasons, half)
 
 
 def _moves(element: Element, now: _Moment) -> tuple[bool, bool, bool]:
-    """Whether a source moves places of the frame, or may by what is uncertain of it; whether it draws how; whether it looks at other times."""
+    """Whether a source moves places of the frame, or may; whether it draws how; whether it looks at other times."""
     alone = now.camera.switched(on=[element.name])
     x, y, schedule = _lattice(now)
     bare = np.stack(now.camera.switched(on=[]).true_positions(x, y, **schedule))
@@ -523,8 +560,9 @@ def _moves(element: Element, now: _Moment) -> tuple[bool, bool, bool]:
     )
     times = False
     if element.source.id in LOOKS:
-        delay = row_delays(element, now.camera)[0]
-        times, drawn = bool(np.any(in_pairs(delay))), drawn or len(delay) > 1
+        delay, variance = row_delays(element, now.camera)
+        accelerated = np.any(np.nan_to_num(now.acceleration)) and variance.any()
+        times, drawn = bool((np.abs(in_pairs(delay)) > NO_TIME_S).any() or accelerated), drawn or len(delay) > 1
     return moves, drawn, times
 
 
@@ -606,6 +644,7 @@ def _told(
     u = np.sqrt(np.nan_to_num(np.array(own) ** 2).sum(axis=0)) if own else np.zeros((1, 2))
     known = f"by {element.known_from or 'described'} parameters"
     text = known if own else f"{known}, whose uncertainty is not stated: that of the correction lacks it"
+    text += chosen.half.get(element.name, "")
     shift, largest = np.nanmax(np.abs(np.nan_to_num(shifts[element.name])), axis=0), u.max(axis=0)
     return SourceCorrection(
         element.name, element.source.title, True, text, (float(shift[0]), float(shift[1])), (float(largest[0]), float(largest[1]))

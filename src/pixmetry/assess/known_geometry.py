@@ -1,4 +1,4 @@
-"""What is known of a camera's geometry beside its description, as settings of its sources: cover glass, clock, height of the surface, speed."""
+"""What is known of a camera's geometry beside its description, as settings: cover glass, clock, height, speed."""
 
 from __future__ import annotations
 

@@ -187,9 +187,8 @@ def _uncertainty(read: Positions, lost: np.ndarray) -> tuple[tuple[str, ...], np
             bad = np.flatnonzero((~np.isfinite(np.array(values)) | (np.array(values[:2]) < 0).any(axis=0)).any(axis=0) & ~lost)
             if len(bad):
                 where = f"{read.source}, row {bad[0] + 1}"
-                raise InputError(
-                    "no uncertainty", where=where, value=f"{one}, {other}", allowed="numbers of 0 or more", remedy="correct it"
-                )
+                what = f"'{one}' and '{other}' hold no uncertainty"
+                raise InputError(what, where=where, allowed="numbers of 0 or more", remedy="correct it")
             covariance = np.zeros((len(lost), 3))
             covariance[:, 0], covariance[:, 2] = values[0], values[1]
             if mixed is not None:

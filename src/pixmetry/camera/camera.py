@@ -447,7 +447,7 @@ class Camera:
             NaN for points that are seen nowhere.
         """
         x, y, signal = self._points(x_px, y_px, frame, time_s, schedule)
-        at = np.asarray(frame)
+        at: Any = np.asarray(frame)
         streams = self.streams(seed)
         for link in self.links:
             if Kind.LIGHT in link.source.consumes and link.source is not LOOK:
@@ -479,7 +479,7 @@ class Camera:
     def scene_places(
         self, x_px: Any, y_px: Any, frame: Any = 0, seed: int = 0, time_s: Any = None, **schedule: Any
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the points of the scene's plane at which places on the pixel grid of the sensor look; parameters as in `true_positions`."""
+        """Return the points of the scene's plane that places on the sensor's pixel grid look at; parameters as in `true_positions`."""
         x, y, signal = self._points(x_px, y_px, frame, time_s, schedule)
         streams = self.streams(seed)
         for link in self.links:
@@ -490,7 +490,7 @@ class Camera:
     def sensor_places(self, x_px: Any, y_px: Any, frame: Any = 0, time_s: Any = None, **schedule: Any) -> tuple[np.ndarray, np.ndarray]:
         """Return where places of a frame lie on the pixel grid of the sensor; parameters as in `true_positions`."""
         x, y, signal = self._points(x_px, y_px, frame, time_s, schedule)
-        at = np.asarray(frame)
+        at: Any = np.asarray(frame)
         for link in reversed(self.links):
             if link.source is SAMPLE:
                 x = link.params.line_at(signal).pixels(x, warped=True)

@@ -40,9 +40,7 @@ if TYPE_CHECKING:
 @click.option(
     "--clock-ratio", type=click.FloatRange(0, min_open=True), metavar="RATIO", help="Camera's pixel clock over the grabber's clock."
 )
-@click.option(
-    "--height-map", type=click.Path(path_type=Path), metavar="FILE", help="Height of the sensor's surface in µm: NPY, TIFF, or CSV."
-)
+@click.option("--height-map", type=click.Path(path_type=Path), metavar="FILE", help="Height of the sensor in µm: NPY, TIFF, or CSV.")
 @click.option("--only", multiple=True, metavar="ID", help="Correct only this source. May be repeated.")
 @click.option("--skip", multiple=True, metavar="ID", help="Leave this source in the positions. May be repeated.")
 @click.option("--list", "listed", is_flag=True, help="Only list what would be corrected, and what not.")
@@ -138,6 +136,8 @@ def print_correction(found: CorrectedPositions, err: bool = False) -> None:
             echo(f"{s.name}: not corrected: {s.text}", err=err)
     if not any(s.applied for s in found.sources):
         echo("nothing was corrected: the description knows nothing that moves points", err=err)
+    for name, u in found.state_u_px.items():
+        echo(f"{name}: u of the correction up to {length_px(u[0])} px in x, {length_px(u[1])} px in y", err=err)
     x, y = found.common_u_px
     if x or y:
         echo(f"common to all positions: u {length_px(x)} px in x, {length_px(y)} px in y; no number of targets averages it", err=err)

@@ -1,0 +1,334 @@
+"""Corrected positions: what the camera does to points is taken off again, and what is left is within the stated covariance."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import pixmetry
+from pixmetry.assess.known_geometry import height_settings
+from pixmetry.camera.camera import Camera, load_camera
+from pixmetry.camera.catalogue import sources
+from pixmetry.camera.overrides import with_source
+from pixmetry.camera.signal import Kind
+from pixmetry.cli import main
+from pixmetry.core.errors import InputError
+from pixmetry.core.number import Estimates
+from pixmetry.scene.discs import Discs
+from pixmetry.scene.motion import Motion
+from pixmetry.scene.picture import Picture
+from pixmetry.scene.uniform import Uniform
+from pixmetry.sources.sensor.unflatness import height_um
+
+ANALOGUE, DIGITAL, FIELDS = "pulnix_tm6cn_epix_512", "imx264_like", "sony_xc8500_field"
+
+
+def points(camera: Camera, n: int = 30) -> tuple[np.ndarray, np.ndarray]:
+    """Places over the frame, away from its border."""
+    rows, cols = camera.frame_shape
+    k = np.arange(n)
+    return 0.15 * cols + 0.7 * cols * ((0.5 + k * 0.7549) % 1), 0.15 * rows + 0.7 * rows * ((0.5 + k * 0.5698) % 1)
+
+
+def host(source_id: str) -> Camera:
+    """A preset with the source at its bound in the whole chain."""
+    source = sources()[source_id]
+    analogue = source.applies_to and "digital" not in source.applies_to and "cmos" not in source.applies_to
+    camera = load_camera(ANALOGUE if analogue else DIGITAL)
+    if not any(e.source.id == source_id for e in camera.chain):
+        camera = with_source(camera, source_id)
+    name = next(e.name for e in camera.chain if e.source.id == source_id)
+    own = camera[name].params.model_dump()
+    known = {n: own[n] for n in ("pitch_x_um", "pitch_y_um", "pitch_um", "line_time_us", "pixel_time_ns") if n in own}
+    params = source.make({**source.bound.model_dump(), **known})
+    return replace(camera, chain=tuple(replace(e, on=True, params=params) if e.name == name else e for e in camera.chain))
+
+
+def moved_by(camera: Camera, source_id: str, **kw: Any) -> float:
+    """The largest displacement by a source, in the chain."""
+    x, y = points(camera)
+    off = [e.name for e in camera.chain if e.source.id == source_id]
+    seen, without = (np.stack(c.true_positions(x, y, **kw)) for c in (camera, camera.switched(off=off)))
+    return float(np.nanmax(np.abs(seen - without)))
+
+
+def moving_sources() -> list[str]:
+    """All sources of the catalogue that move points in the maps of a camera, by what they do and not by a list.
+
+    Sources of numbers that do not say where they put points move none.
+    """
+    found = []
+    for source_id, source in sources().items():
+        may = source.place is not None or {Kind.LIGHT, Kind.VIDEO} & set(source.consumes)
+        if source.forward is not None and may and moved_by(host(source_id), source_id, frame=3) > 1e-9:
+            found.append(source_id)
+    return found
+
+
+MOVING = moving_sources()
+
+
+@pytest.mark.parametrize("source_id", MOVING)
+def test_every_source_that_moves_points_is_corrected_in_the_whole_chain(source_id: str) -> None:
+    camera = host(source_id)
+    x, y = points(camera)
+    table = dict(zip(("x_px", "y_px"), camera.true_positions(x, y, frame=3), strict=True)) | {"frame": np.full(len(x), 3)}
+    before = np.hypot(table["x_px"] - x, table["y_px"] - y)
+    found = pixmetry.corrected(table, camera, only=[e.name for e in camera.active if e.source.id != "sensor.exposure"])
+    assert any(s.name == source_id and s.applied and max(s.shift_px) > 0 for s in found.sources)
+    left = np.hypot(found.x_px - x, found.y_px - y)
+    assert np.max(left) < 1e-6 < np.max(before)
+    alone = pixmetry.corrected(table, camera, only=[source_id])  # the others stay in
+    without = camera.switched(off=[source_id]).true_positions(x, y, frame=3)
+    assert np.stack([alone.x_px, alone.y_px]) == pytest.approx(np.stack(without), abs=1e-6)
+
+
+def test_no_source_says_that_positions_are_corrected_and_cannot_be_reached() -> None:
+    words = ("positions are corrected", "coordinates are", "positions are multiplied")
+    said = {i for i, s in sources().items() if s.forward is not None and any(w in s.reasons.get("correct", "") for w in words)}
+    assert len(said) >= 13
+    assert said <= set(MOVING)
+
+
+@pytest.mark.parametrize("source_id", ["sensor.interlace", "sensor.rolling_shutter"])
+def test_what_looks_at_other_times_is_corrected_by_the_speed(source_id: str) -> None:
+    """Discs that move through the rows' times are located in frames; the speed brings them back to where they were."""
+    camera = host(source_id)
+    kept = (source_id, "sensor.exposure")
+    camera = replace(camera, frame_shape=(240, 200), chain=tuple(e for e in camera.chain if e.source.id in kept), exposure_s=0.01)
+    v = (400.0, -90.0)
+    x, y = (a.ravel() for a in np.meshgrid([40.0, 100.0, 160.0], [40.0, 100.0, 160.0, 205.0]))
+    middle = 0.5 * camera.exposure_s
+    motion = Motion(v)
+    discs = Discs(x - v[0] * middle, y - v[1] * middle, diameter_px=9.0, blur_px=1.0, peak_photons=1e4)
+    data = camera.expose(Picture((discs.layer(motion),), Uniform(0.0)), 1, quiet=True).data[0].astype(float)
+    seen = np.array([_centroid(data, round(a), round(b)) for a, b in zip(x, y, strict=True)])
+    table = {"x_px": seen[:, 0], "y_px": seen[:, 1], "vx_px_per_s": np.full(len(x), v[0]), "vy_px_per_s": np.full(len(x), v[1])}
+    found = pixmetry.corrected(table, camera)
+    assert any(s.applied and s.name == source_id for s in found.sources)
+    before, left = (np.abs(c - np.stack([x, y], 1)) for c in (seen, np.stack([found.x_px, found.y_px], 1)))
+    assert left.max() < 0.04 < before.max()
+    untold = pixmetry.corrected(seen, camera)
+    assert any("needs the speed" in s.text for s in untold.sources if s.name == source_id)
+
+
+def _centroid(data: np.ndarray, x: int, y: int, half: int = 20) -> tuple[float, float]:
+    part = data[y - half : y + half + 1, x - half : x + half + 1]
+    total, at = part.sum(), np.arange(-half, half + 1)
+    return x + float((part.sum(axis=0) * at).sum() / total), y + float((part.sum(axis=1) * at).sum() / total)
+
+
+def test_located_discs_of_a_grabber_that_warms_up_are_brought_back() -> None:
+    """The whole chain, through the locator: 20 minutes of warm-up, 2.5 px, are taken off, and a constant delay by the filters stays."""
+    camera = load_camera(ANALOGUE)
+    x, y = (a.ravel() for a in np.meshgrid(np.arange(90.0, 660, 90), np.arange(90.0, 500, 90)))
+    scene = Discs(x, y, diameter_px=10.0, blur_px=0.7, peak_photons=40000.0, background=Uniform(4000.0))
+    errors, raw = [], []
+    for number in (0, 30000):
+        found = pixmetry.locate(camera.expose(scene, [number], quiet=True).data[0], kind="disc")
+        told = pixmetry.corrected({"x_px": found.x_px, "y_px": found.y_px, "frame": np.full(len(found), number)}, camera)
+        distance = np.hypot(told.x_px[:, None] - x, told.y_px[:, None] - y)
+        nearest = np.argmin(distance, axis=0)
+        assert len(found) == len(x) == len(set(nearest))
+        errors.append(np.stack([told.x_px[nearest] - x, told.y_px[nearest] - y], 1))
+        raw.append(np.stack([found.x_px[nearest], found.y_px[nearest]], 1))
+    drift, left = raw[1] - raw[0], errors[1] - errors[0]
+    assert np.abs(drift[:, 0]).mean() > 1.5
+    assert np.abs(left).max() < 0.03
+    delay = np.median(errors[1], axis=0)
+    assert 0.2 < delay[0] < 2.0 and abs(delay[1]) < 0.03
+    assert np.abs(errors[1] - delay).max() < 0.06
+
+
+def uncertain(camera: Camera, name: str, **u: float) -> Camera:
+    """The camera with standard uncertainties of parameters, correlated by 0.6 where they are two."""
+    params = camera[name].params
+    names, values = tuple(u), np.array(list(u.values()))
+    correlation = np.full((len(u), len(u)), 0.6)
+    np.fill_diagonal(correlation, 1.0)
+    estimates = Estimates(
+        names=names,
+        values=np.array([getattr(params, n) for n in names]),
+        covariance=correlation * np.outer(values, values),
+        dof=np.full(len(names), np.inf),
+        units=tuple(camera[name].source.units[n] for n in names),
+    )
+    return replace(
+        camera, chain=tuple(replace(e, estimates=estimates, known_from="measured") if e.name == name else e for e in camera.chain)
+    )
+
+
+def test_the_covariance_is_that_of_cameras_drawn_from_what_is_known(rng: np.random.Generator) -> None:
+    """Positions seen by 400 true cameras, corrected by the one that is described: u and the correlations between points are as stated."""
+    camera = load_camera(DIGITAL)
+    for source_id in ("optics.distortion", "sensor.thermal_expansion"):
+        camera = with_source(camera, source_id) if source_id not in camera else camera
+    camera = camera.with_parameters("optics.distortion", k1_per_mm2=-5e-4).with_parameters(
+        "sensor.thermal_expansion", reference_c=20.0, mount_per_k=23e-6
+    )
+    camera = uncertain(camera, "optics.distortion", k1_per_mm2=2e-5, k2_per_mm4=4e-7)
+    camera = uncertain(camera, "sensor.thermal_expansion", mount_per_k=3e-6)
+    camera = replace(camera, temperature_c=35.0)
+    x, y = points(camera, 6)
+    seen = camera.true_positions(x, y)
+    told = pixmetry.corrected({"x_px": seen[0], "y_px": seen[1]}, camera)
+    trials, n = 400, len(x)
+    errors = np.empty((trials, 2 * n))
+    for k in range(trials):
+        one = camera
+        for name, e in camera.estimates.items():
+            drawn = rng.multivariate_normal(e.values, e.covariance)
+            one = one.with_parameters(name, **dict(zip(e.names, map(float, drawn), strict=True)))
+        # M₀(M⁻¹(p)) by the described camera of what the drawn one shows
+        u, v = camera.ideal_positions(*one.true_positions(x, y))
+        errors[k] = np.stack([u - x, v - y], 1).ravel()
+    covariance = told.correction_covariance_px2
+    assert told.correction_px2.max() > 0.02**2
+    # whitened errors: three independent causes, each of variance 1 within six standard errors √(2/400) = 0.071
+    power, directions = np.linalg.eigh(covariance)
+    assert np.sum(power > 1e-6 * power[-1]) == 3
+    scores = (errors @ directions[:, -3:]) / np.sqrt(power[-3:])
+    assert scores.var(axis=0) == pytest.approx(np.ones(3), abs=6 * 0.071 + 0.03)
+    off = np.corrcoef(scores.T)[np.triu_indices(3, 1)]
+    assert np.abs(off).max() < 6 / np.sqrt(trials)
+    mean = errors.reshape(trials, n, 2).mean(axis=1).std(axis=0)
+    assert mean == pytest.approx(np.array(told.common_u_px), rel=6 * 0.036 + 0.03, abs=1e-4)
+
+
+def test_the_measured_covariance_goes_through_the_map_and_grows() -> None:
+    camera = load_camera(ANALOGUE)
+    x, y = points(camera, 5)
+    seen = camera.true_positions(x, y)
+    table = {"x_px": seen[0], "y_px": seen[1], "var_x_px2": np.full(5, 1e-4), "cov_xy_px2": np.zeros(5), "var_y_px2": np.full(5, 4e-4)}
+    plain = pixmetry.corrected(table, camera)
+    # 14.1875 MHz over 10 MHz, less the grabber that is too fast by 0.7 %
+    assert np.sqrt(plain.covariance_px2[:, 0]) == pytest.approx(np.full(5, 0.01 * 1.41875 / 1.0071), rel=1e-3)
+    told = pixmetry.corrected(table, camera, u={"state.temperature_change_k": 5.0, "grabber.clock_warm_up.delay_ns": 10.0})
+    assert np.all(told.covariance_px2[:, 0] > plain.covariance_px2[:, 0])
+    own = told.effects_px[list(told.causes).index("grabber.clock_warm_up")]
+    assert np.abs(own[:, 0]) == pytest.approx(np.full(5, 10e-9 * 14.1875e6 * np.exp(-7200 / 820)), rel=0.02)
+    assert told.columns["var_x_px2"] == pytest.approx(told.covariance_px2[:, 0])
+    assert told.state_u_px["state.temperature_change_k"][0] > 0
+
+
+def test_what_is_only_typical_or_drawn_is_left_unless_it_is_named() -> None:
+    camera = load_camera(DIGITAL)
+    for source_id, params in (
+        ("optics.distortion", {"k1_per_mm2": -5e-4}),
+        ("sensor.stabilisation", {"shift_std_px": 1.0}),
+    ):
+        camera = with_source(camera, source_id).with_parameters(source_id, **params)
+    chain = tuple(replace(e, known_from="typical") if e.name == "optics.distortion" else e for e in camera.chain)
+    camera = replace(camera, chain=chain)
+    found = pixmetry.corrected([[100.0, 200.0], [1500.0, 900.0]], camera)
+    why = {s.name: s.text for s in found.sources if not s.applied}
+    assert "only typical" in why["optics.distortion"] and "drawn at random" in why["sensor.stabilisation"]
+    assert np.abs(found.shift_px).max() < 0.5  # neither of the two
+    named = pixmetry.corrected([[100.0, 200.0], [1500.0, 900.0]], camera, only=["optics.distortion"])
+    assert np.abs(named.shift_px).max() > 1 and [s.name for s in named.sources if s.applied] == ["optics.distortion"]
+
+
+def test_a_height_map_gives_the_surface_that_made_it(tmp_path: Path) -> None:
+    source = sources()["sensor.unflatness"]
+    params = source.make({"bow_x_um": 12.0, "bow_y_um": -7.0, "twist_um": 4.0, "skew_x_um": 2.0, "more_um": [[0, 0], [0, 0, 3.0]]})
+    camera = load_camera(DIGITAL)
+    rows, cols = camera.frame_shape
+    y, x = np.meshgrid((np.arange(12) + 0.5) / 12 * rows - 0.5, (np.arange(16) + 0.5) / 16 * cols - 0.5, indexing="ij")
+    height = height_um(params, x, y, (rows, cols))
+    np.save(tmp_path / "height.npy", height)
+    lines = [f"{a:.6f},{b:.6f},{h:.9f}" for a, b, h in zip(x.ravel(), y.ravel(), height.ravel(), strict=True)]
+    (tmp_path / "height.csv").write_text("x_px,y_px,height_um\n" + "\n".join(lines) + "\n")
+    for name in ("height.npy", "height.csv"):
+        settings = height_settings(tmp_path / name, camera)
+        found = pixmetry.corrected([[300.0, 400.0], [2000.0, 1500.0]], camera, settings=settings, only=["sensor.unflatness"])
+        told = {key.rpartition(".")[2]: value for key, value in settings.items()}
+        again = height_um(source.make(told), x, y, (rows, cols))
+        assert again == pytest.approx(height, abs=1e-6)
+        assert np.abs(found.shift_px).max() > 0.1
+    np.save(tmp_path / "few.npy", height[:1])
+    with pytest.raises(InputError, match="too few heights"):
+        height_settings(tmp_path / "few.npy", camera)
+
+
+def run(*arguments: object) -> tuple[int, str]:
+    done = CliRunner().invoke(main, ["corrected", *map(str, arguments)])
+    return done.exit_code, done.output
+
+
+def test_a_table_of_another_program_keeps_all_it_holds(tmp_path: Path) -> None:
+    text = "# survey 7\nname;X;Y;sigma_x;sigma_y;note\na;100.5;200.5;0.01;0.02;left\nb;;;;;lost\nc;400.5;300.5;0.01;0.02;right\n"
+    (tmp_path / "other.csv").write_text(text)
+    code, said = run(
+        tmp_path / "other.csv", "--with", ANALOGUE, "--origin", "corner", "-o", tmp_path / "out.csv", "--json", tmp_path / "r.json"
+    )
+    assert code == 0, said
+    assert "grabber.sampling_clock: corrected" in said and "switched on when frame 0 was taken" in said
+    lines = (tmp_path / "out.csv").read_text().splitlines()
+    assert lines[1] == "# survey 7" and lines[2] == "name;X;Y;sigma_x;sigma_y;note"
+    a, b, c = (line.split(";") for line in lines[3:])
+    assert (a[0], a[5], b, c[5]) == ("a", "left", ["b", "", "", "", "", "lost"], "right")
+    x, y = load_camera(ANALOGUE).ideal_positions([100.0, 400.0], [200.0, 300.0])
+    assert [float(v) - 0.5 for v in (a[1], c[1])] == pytest.approx(list(x)) and [float(v) - 0.5 for v in (a[2], c[2])] == pytest.approx(
+        list(y)
+    )
+    assert float(a[3]) == pytest.approx(0.01 * 1.41875 / 1.0071, rel=1e-3)
+    record = json.loads((tmp_path / "r.json").read_text())
+    assert record["schema"] == "pixmetry/corrected/1" and any(s["applied"] for s in record["sources"])
+    again, _ = run(tmp_path / "other.csv", "--with", ANALOGUE, "--origin", "corner", "-o", tmp_path / "out.csv")
+    assert again == 0  # its own earlier result is replaced
+    code, said = run(tmp_path / "other.csv", "--with", ANALOGUE, "-o", tmp_path / "other.csv")
+    assert code == 2 and "overwrite an input" in said
+    assert (tmp_path / "other.csv").read_text() == text
+
+
+def test_tables_of_locate_come_back_in_their_form(tmp_path: Path) -> None:
+    camera = load_camera(DIGITAL)
+    frame = camera.expose(Discs([60.0, 130.0], [50.0, 90.0], peak_photons=9000.0), 1, window=(0, 0, 150, 200)).data[0]
+    table = pixmetry.locate(frame)
+    for name in ("table.csv", "table.json"):
+        table.write(tmp_path / name)
+        code, said = run(tmp_path / name, "--with", DIGITAL, "--temperature-k", 10, "--cover-glass", "0.75", "-o", tmp_path / f"out_{name}")
+        assert code == 0, said
+        assert "optics.cover_glass: corrected" in said and "not told" in said
+    record = json.loads((tmp_path / "out_table.json").read_text())
+    assert record["schema"] == "pixmetry/located/1" and record["columns"] == list(table.columns)
+    found = pixmetry.corrected(tmp_path / "out_table.csv", DIGITAL, skip=[e.name for e in camera.active])
+    assert [t["x_px"] for t in record["targets"]] == pytest.approx(list(found.measured.x_px), abs=1e-6)
+    direct = pixmetry.corrected(table, DIGITAL, settings={"state.temperature_change_k": 10.0, "optics.cover_glass.thickness_um": 750.0})
+    assert direct.x_px == pytest.approx(found.measured.x_px, abs=1e-6)
+    code, said = run(tmp_path / "table.csv", "--with", DIGITAL, "--list")
+    assert code == 0 and "x_px" not in said
+
+
+@pytest.mark.parametrize(
+    ("content", "arguments", "words"),
+    [
+        ("a,b\n1,2\n", (), ("no column with x", "--x NAME")),
+        ("x,y\n1,zwei\n", (), ("'y' is no number", "row 1")),
+        ("x,y,frame\n1,2,0.5\n", (), ("'frame' is no number of a frame",)),
+        ("x,y,var_x,var_y\n1,2,-1,1\n", (), ("hold no uncertainty",)),
+        ("x,y\n1,2\n", ("--u", "optics.nothing=1"), ("no number has this name",)),
+        ("x,y\n1,2\n", ("--u", "motion.speed_px_per_s=1"), ("has no value",)),
+        ("x,y\n1,2\n", ("--only", "sensor.tilt"), ("no source named 'sensor.tilt'",)),
+        ("x,y\n1,2\n", ("--cover-glass", "750"), ("no cover glass is so thick",)),
+        ("x,y\n1,2\n", ("--speed", "fast"), ("cannot be read",)),
+    ],
+)
+def test_what_cannot_be_used_is_told(content: str, arguments: tuple[str, ...], words: tuple[str, ...], tmp_path: Path) -> None:
+    (tmp_path / "t.csv").write_text(content)
+    code, said = run(tmp_path / "t.csv", "--with", DIGITAL, *arguments)
+    assert code == 2, said
+    assert all(word in said for word in words), said
+
+
+def test_positions_where_the_camera_shows_nothing_stay_and_are_told() -> None:
+    camera = with_source(load_camera(DIGITAL), "optics.distortion").with_parameters("optics.distortion", k1_per_mm2=-5e-4)
+    found = pixmetry.corrected([[1200.0, 1000.0], [1e7, 1e7], [np.nan, 3.0]], camera)
+    assert np.isfinite(found.x_px[0]) and np.isnan(found.x_px[2])
+    assert len(found.columns["x_px"]) == 3
