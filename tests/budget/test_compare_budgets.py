@@ -121,7 +121,7 @@ def test_pixels_of_two_sizes_are_told(budget: CameraBudget) -> None:
 def test_command_with_files_and_with_cameras(tmp_path: Path, budget: CameraBudget) -> None:
     files = [tmp_path / "before.json", tmp_path / "after.json"]
     write_json(files[0], budget.to_record())
-    quiet = [replace(r, after=r.after.scaled(0.5)) if r.after else r for r in budget.rows]
+    quiet = [replace(r, after=Parts.of([0.5 * v for v in r.after.values_px])) if r.after else r for r in budget.rows]
     write_json(files[1], replace(budget, rows=tuple(quiet)).to_record())
     page, data = tmp_path / "c.html", tmp_path / "c.json"
     told = run("compare", *files, "--html", page, "--json", data, "--pdf", tmp_path / "c.pdf")
