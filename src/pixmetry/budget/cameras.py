@@ -5,16 +5,25 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from pixmetry.camera.camera import Camera, Element, load_camera
 from pixmetry.camera.chain_order import in_order
 from pixmetry.core.errors import InputError
+from pixmetry.emva.files.json_format import SCHEMA as RESULT
+from pixmetry.emva.files.json_format import is_xml
+from pixmetry.emva.files.sheet_camera import camera_of_sheet
+from pixmetry.emva.files.sheets import read_sheet
+from pixmetry.emva.records import DataSheet
+from pixmetry.files.strict_json import starts_with
 
 RANK = {"measured": 3, "sheet": 2, "": 1, "typical": 0}  # what goes before what
+GAIN, CONVERTER = "electronics.gain", "grabber.adc"
+HEAD_BYTES = 200  # of a file, in which it says what it is
 COVERAGE = 2.0  # expanded uncertainties beyond which two values contradict each other
-SHEET_U_REL = 0.1  # of a value of a data sheet that states no uncertainty: assumed
+SHEET_U_REL = 0.1  # of a value that states no uncertainty: assumed
 
 
 @dataclass(frozen=True)
@@ -52,7 +61,8 @@ def camera_of(given: str | Path | Camera | Sequence[str | Path | Camera]) -> tup
     Parameters
     ----------
     given : path, name of a preset, Camera, or several of them
-        Camera files, data sheets, presets.
+        Camera files, data sheets, presets, and results of a test by EMVA 1288 (JSON or XML). What such a result does not say of the
+        format (bits, rows, columns, pitch), the first of the others tells.
 
     Returns
     -------
@@ -68,8 +78,12 @@ def camera_of(given: str | Path | Camera | Sequence[str | Path | Camera]) -> tup
     """
     several = [given] if isinstance(given, str | Path | Camera) else list(given)
     if not several:
-        raise InputError("no camera is given", allowed="a preset, a camera file or a data sheet")
-    cameras = [c if isinstance(c, Camera) else load_camera(c) for c in several]
+        raise InputError("no camera is given", allowed="a preset, a camera file, a data sheet or a result of EMVA 1288")
+    read = [_read(c) for c in several]
+    format_of = next((c for c in read if isinstance(c, Camera)), None)
+    cameras = [
+        c if isinstance(c, Camera) else _camera_of_result(c, Path(str(name)), format_of) for c, name in zip(read, several, strict=True)
+    ]
     camera, found = cameras[0], []
     for other in cameras[1:]:
         if other.frame_shape != camera.frame_shape:
@@ -80,12 +94,48 @@ def camera_of(given: str | Path | Camera | Sequence[str | Path | Camera]) -> tup
     return camera, tuple(found)
 
 
+def _read(given: str | Path | Camera) -> Camera | DataSheet:
+    """A camera, or the result of a test by EMVA 1288."""
+    if isinstance(given, Camera):
+        return given
+    path = Path(given)
+    if path.is_file():
+        with path.open("rb") as file:
+            head = file.read(HEAD_BYTES)
+        if starts_with(head.lower(), b"<!doctype html") or starts_with(head.lower(), b"<html"):
+            remedy = "name the camera file, the data-sheet file, or the JSON or XML of the test"
+            raise InputError("a page for reading, not a camera", where=str(path), remedy=remedy)
+        if is_xml(head) or starts_with(head, b"{") and RESULT.partition("/1")[0].encode() in head:
+            return read_sheet(path)
+    return load_camera(given)
+
+
+def _camera_of_result(sheet: DataSheet, path: Path, known: Camera | None) -> Camera:
+    """The camera of the result of a test; its frames may be a window of those of the known camera."""
+    if known is None:
+        return camera_of_sheet(sheet, told={"name": path.stem})
+    rows, cols = known.frame_shape
+    told: dict[str, Any] = {"name": path.stem, "rows": rows, "cols": cols, "bits": known.facts.get("bits")}
+    if known.pitch_um is not None:
+        told |= {"pitch_x_um": known.pitch_um[0], "pitch_y_um": known.pitch_um[1]}
+    own = sheet.camera
+    window = own.get("sensor_rows") is None and all(
+        own.get(name) is None or own[name] <= whole for name, whole in (("rows", rows), ("cols", cols))
+    )
+    if window:
+        sheet = replace(sheet, camera={**own, "rows": rows, "cols": cols})
+    return camera_of_sheet(sheet, told={key: value for key, value in told.items() if value is not None})
+
+
 def _joined(one: Camera, other: Camera) -> Camera:
     """The first camera with what the other one knows better, all elements of a source together."""
     mine, theirs = _by_source(one), _by_source(other)
     for source_id, elements in theirs.items():
         if source_id not in mine or _rank(elements) > _rank(mine[source_id]):
             mine[source_id] = elements
+            if source_id == GAIN and _rank(theirs.get(CONVERTER, ())) >= _rank(mine.get(CONVERTER, ())):
+                mine[CONVERTER], bits = theirs[CONVERTER], other.facts.get("bits")  # the gain belongs to its steps and its black
+                one = replace(one, facts={**one.facts, **({} if bits is None else {"bits": bits})})
     ordered = in_order(elements[0].source for elements in mine.values())
     facts = {**other.facts, **one.facts}
     chain = tuple(e for s in ordered for e in mine[s.id])
@@ -100,7 +150,7 @@ def _by_source(camera: Camera) -> dict[str, list[Element]]:
 
 
 def _rank(elements: Sequence[Element]) -> int:
-    return max(RANK[e.known_from] for e in elements)
+    return max((RANK[e.known_from] for e in elements), default=-1)
 
 
 def _compared(one: Camera, other: Camera) -> list[Disagreement]:
@@ -127,8 +177,9 @@ def _value(element: Element, name: str) -> tuple[float, float] | None:
         number = element.estimates[name]
         return None if number.kind != "value" else (number.value, number.u)
     value = getattr(element.params, name)
-    if element.known_from != "sheet" or isinstance(value, bool | str) or value is None:
+    states_u = element.known_from == "measured" and len(element.estimates) > 0
+    if element.known_from not in ("sheet", "measured") or states_u or isinstance(value, bool | str) or value is None:
         return None
     if getattr(element.source.neutral, name, None) == value or value == type(element.params).model_fields[name].default:
-        return None  # the sheet does not tell it
+        return None  # the description does not tell it
     return float(value), SHEET_U_REL * abs(float(value))

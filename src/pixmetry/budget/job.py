@@ -154,8 +154,8 @@ def budget(
     Parameters
     ----------
     camera : path, name of a preset, Camera, or several
-        A preset, a camera file, a data sheet, the ``camera.yaml`` of an assessment; of several, what was measured replaces what a sheet
-        says, and both are compared.
+        A preset, a camera file, a data sheet, the ``camera.yaml`` of an assessment, the result of a test by EMVA 1288; of several, what
+        was measured replaces what a sheet says, and both are compared.
     scenario : path, mapping or Scenario, optional
         What is measured and how, schema ``pixmetry/scenario/1``; whatever it leaves open has a default.
     estimator : Estimator or str, optional

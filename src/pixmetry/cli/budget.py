@@ -77,10 +77,10 @@ def budget(
 ) -> None:
     """Budget every error source of a camera for a measurement, before and after calibration.
 
-    CAMERA is the name of a preset, a data sheet, or a camera file, such as the camera.yaml of an assessment. Of several, what was measured
-    replaces what a sheet says, and both are compared; with --compare they are different cameras, or one camera with different lenses, and
-    the best is named. A scenario says what is measured and how: target, distance, light, motion, warm-up,
-    calibration; what it leaves open has a default, which is printed with --all.
+    CAMERA is the name of a preset, a data sheet, a camera file, such as the camera.yaml of an assessment, or the result of a test by EMVA
+    1288 (JSON or XML). Of several, what was measured replaces what a sheet says, and both are compared. With --compare they are different
+    cameras, or one camera with different lenses, and the best is named. A scenario says what is measured and how: target, distance, light,
+    motion, warm-up, calibration; what it leaves open has a default, which is printed with --all.
 
     Example: pixmetry budget imx264_like --set object.distance_mm=2000 --set object.f_mm=25 --html budget.html
     """

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -35,7 +36,7 @@ FORMAT = ("bits", "rows", "cols")
 GREEN = "Gr"  # the channel of a colour camera that is taken, where none is named
 
 
-def camera_of_sheet(sheet: DataSheet, channel: str = "") -> Camera:
+def camera_of_sheet(sheet: DataSheet, channel: str = "", told: Mapping[str, Any] | None = None) -> Camera:
     """Build a camera of the result of a test by EMVA 1288.
 
     Parameters
@@ -44,17 +45,21 @@ def camera_of_sheet(sheet: DataSheet, channel: str = "") -> Camera:
         From `pixmetry.emva.files.sheets.read_sheet`, or of `pixmetry.emva1288`.
     channel : str
         Of a colour camera: ``R``, ``Gr``, ``Gb`` or ``B``; by default ``Gr``.
+    told : mapping, optional
+        What is known of the camera from elsewhere, as ``bits``, ``rows``, ``cols``, ``pitch_x_um``, ``name``; what the sheet says of these
+        goes before it.
 
     Returns
     -------
     Camera
         Its elements are known from ``measured`` where the sheet has a value, with u and degrees of freedom; limits stay limits. The
-        rest is ``typical``, as in `pixmetry.camera.data_sheet.camera_of_data_sheet`.
+        rest is ``typical``, as in `pixmetry.camera.data_sheet.camera_of_data_sheet`. Its frames are those of the whole sensor, where the
+        sheet tells its size beside that of the frames of the test.
 
     Raises
     ------
     InputError
-        If the sheet does not say bits, rows and columns (that of another program may not), or a value cannot be a camera's.
+        If nothing tells bits, rows and columns (the sheet of another program may not), or a value cannot be a camera's.
 
     Examples
     --------
@@ -66,11 +71,12 @@ def camera_of_sheet(sheet: DataSheet, channel: str = "") -> Camera:
     >>> camera["electronics.gain"].known_from, camera.estimates["electronics.gain"]["gain_dn_per_e"].u
     ('measured', 0.002)
     """
-    about = dict(sheet.camera)
+    about = {**(told or {}), **{key: value for key, value in sheet.camera.items() if value is not None}}
+    about |= {key: about[f"sensor_{key}"] for key in ("rows", "cols") if about.get(f"sensor_{key}") is not None}
     name = str(about.get("name") or about.get("model") or "camera of a data sheet")
     missing = [key for key in FORMAT if about.get(key) is None]
     if missing:
-        remedy = "name the JSON or XML of `pixmetry emva1288`, or write a data-sheet file with these values and the sheet's"
+        remedy = "name a data-sheet file or a preset of the camera beside it, or the JSON or XML of `pixmetry emva1288`"
         raise InputError(f"a data sheet that does not say {' and '.join(missing)}", where=name, remedy=remedy)
     results = _results_of(sheet, channel, name)
     same = ("bits", "rows", "cols", "interface", "sensor", "temperature_c", "wavelength_nm")
