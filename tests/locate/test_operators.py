@@ -115,6 +115,22 @@ def test_the_forstner_point_is_that_of_plain_numpy(rng: np.random.Generator) -> 
     assert (found.x_px[0], found.y_px[0]) == pytest.approx(tuple(point), abs=1.5e-3)
 
 
+@pytest.mark.parametrize("rough_blur_px", [0.6, 1.8])
+@pytest.mark.parametrize("name", OPERATORS)
+def test_a_disc_near_the_border_is_found(name: str, rough_blur_px: float, rng: np.random.Generator) -> None:
+    """A rough blur may be three times too large; the window, which is then wider than the room beside the disc, ends before the border."""
+    for side in range(4):
+        for gap in (6.0, 7.5, 9.0):
+            place = rng.uniform(24.0, 25.0), gap + rng.uniform(0.0, 0.5)
+            y, x = (place, place[::-1], (place[0], 48.0 - place[1]), (48.0 - place[1], place[0]))[side]
+            at = rendered.window(x, y, 6.0, (49, 49))
+            image = rendered.expose(rendered.planted((49, 49), 10.0, 160.0, [(at, rendered.disc(x, y, 2.0, 0.5, at))]), rng, read_dn=4.0)
+            targets = rough_targets(np.array([x]), np.array([y]), 2.1, 2.1, rough_blur_px, 160.0, 10.0, rng)
+            found = operator_positions(image, targets, NoiseModel(16 + 1 / 12), name)
+            assert math.hypot(found.x_px[0] - x, found.y_px[0] - y) < 6.0 * math.hypot(*np.sqrt([found.var_x_px2[0], found.var_y_px2[0]]))
+            assert not found.flags[0] & Flag.NOT_CONVERGED
+
+
 def test_bad_input(rng: np.random.Generator) -> None:
     targets = rough_targets(np.array([20.0, 1.0]), np.array([20.0, 20.0]), 3.0, 3.0, 0.8, 100.0, 10.0, rng)
     flat = np.full((40, 40), 10, np.uint8)
