@@ -85,6 +85,11 @@ def sum_of(parts: Iterable[tuple[Parts, bool]], frames: int = 1, targets: int = 
     return x, y
 
 
+def together_of(constants: Iterable[tuple[Pair, bool]]) -> Pair:
+    """Constants together: those whose signs are known with these, the others as squares."""
+    return sum_of((Parts(constant_px=c), known) for c, known in constants)
+
+
 def answer_of(rows: Sequence[SourceRow], frames: int = 1, targets: int = 1) -> Answer:
     """Put the rows together for means over so many frames and targets."""
     counted = [r for r in rows if r.status in COUNTED]

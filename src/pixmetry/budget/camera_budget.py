@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from html import escape
 from typing import Any
@@ -12,7 +12,7 @@ import numpy as np
 from pixmetry.budget.answer import Answer, Next, answer_of, rms, to_change, to_measure
 from pixmetry.budget.cameras import Disagreement
 from pixmetry.budget.monte_carlo import MonteCarlo
-from pixmetry.budget.object_space import point_covariance
+from pixmetry.budget.object_space import SpacePoint, point_of
 from pixmetry.budget.scenario import Scenario
 from pixmetry.budget.setting import Setting
 from pixmetry.budget.table import COUNTED, SourceRow
@@ -94,17 +94,10 @@ class CameraBudget:
             return None
         return pair_px[0] / scale, pair_px[1] / scale * (pitch[1] / pitch[0] if pitch else 1.0)
 
-    def point_mm(self, pair_px: tuple[float, float] | None = None) -> np.ndarray | None:
-        """Covariance in mm² of a point in space by the scenario's rays, shape (3, 3): along the base, across it, along the line of sight.
-
-        None where the scale is not known, or there is one ray only.
-        """
-        pair = self.answer.after_px if pair_px is None else pair_px
-        across = self.mm(pair)
-        count = self.scenario.count
-        if across is None or count.rays < 2 or min(across) <= 0:
-            return None
-        return point_covariance(across, 1.0, count.rays, count.base_to_height)
+    @cached_property
+    def point(self) -> SpacePoint | None:
+        """Points in space by the scenario's rays, means over its frames and targets; None where the scale is not known, or of one ray."""
+        return point_of(self.rows, self.setting, self.scenario.count.frames, self.scenario.count.targets)
 
     def __repr__(self) -> str:
         one = self.one
@@ -146,7 +139,6 @@ class CameraBudget:
 
     def to_record(self) -> dict[str, Any]:
         """Return the plain record for JSON."""
-        covariance = self.point_mm()
         return {
             "schema": SCHEMA,
             "camera": self.camera,
@@ -158,7 +150,7 @@ class CameraBudget:
             "px_per_mm": self.setting.px_per_mm,
             "one_target_one_frame": self._answer_record(self.one),
             "answer": self._answer_record(self.answer),
-            "point_covariance_mm2": None if covariance is None else covariance.tolist(),
+            "point": None if self.point is None else {n: v.tolist() for n, v in vars(self.point).items()},
             "left_out": [r.name for r in self.left_out],
             "together": None if self.together is None else _together_record(self.together),
             "rows": [_row_record(r) for r in self.rows],
@@ -182,4 +174,5 @@ def _together_record(found: MonteCarlo) -> dict[str, Any]:
 
 
 def _row_record(row: SourceRow) -> dict[str, Any]:
-    return asdict(row) | {n: getattr(row, n) for n in ("before_px", "after_px", "largest_px", "own_stars", "counts", "taken_up")}
+    values = {n: v for n, v in asdict(replace(row, fields_px=None)).items() if n != "fields_px"}
+    return values | {n: getattr(row, n) for n in ("before_px", "after_px", "largest_px", "own_stars", "counts", "taken_up")}

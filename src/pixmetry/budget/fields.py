@@ -21,23 +21,28 @@ class Places:
     """Places that are spread over a sensor, and the corners of the cells of a residual grid around each.
 
     ``x_px`` and ``y_px`` have the shape (5, n): the places, and the four corners of the cell that each lies in; ``weights`` (4, n) are
-    those of the corners in the bilinear interpolation at the place.
+    those of the corners in the bilinear interpolation at the place. The first ``even`` of them are spread evenly over the frame:
+    calibrations are fitted to these.
     """
 
     x_px: np.ndarray
     y_px: np.ndarray
     weights: np.ndarray
     frame_shape: tuple[int, int]
+    even: int = SIDE * SIDE
 
     @classmethod
-    def over(cls, frame_shape: tuple[int, int], grid_px: float) -> Places:
-        """Places for a sensor of this size and a grid of this spacing (one cell over the frame, where it is larger)."""
+    def over(cls, frame_shape: tuple[int, int], grid_px: float, also_px: np.ndarray | None = None) -> Places:
+        """Places for a sensor of this size and a grid of this spacing (one cell over the frame, where it is larger).
+
+        ``also_px``, shape (2, k): more places, behind those that are spread evenly.
+        """
         rows, cols = frame_shape
         n = np.arange(SIDE * SIDE)
         # an additive recurrence with irrational steps: even over the frame, and over the cells of a grid of any spacing
         share = np.stack([(0.5 + n * 0.7548776662466927) % 1, (0.5 + n * 0.5698402909980532) % 1])
         ends = np.array([[cols - 1.0], [rows - 1.0]])
-        at = share * ends
+        at = share * ends if also_px is None else np.concatenate([share * ends, also_px], axis=1)
         cells = np.maximum(np.ceil(ends / grid_px), 1.0)
         step = ends / cells
         cell = np.minimum(np.floor(at / np.where(step > 0, step, 1.0)), cells - 1)
@@ -83,9 +88,8 @@ class Calibration:
     Parameters
     ----------
     model : {"none", "principal_point_and_scale", "lens", "residual_grid"}
-        Nothing; a shift and a scale of each axis; an affine map, radial terms up to the seventh power, decentring and the two terms of
-        a small rotation of the camera (D. C. Brown, Photogrammetric Engineering 37(8), 1971); these, and a grid of what is left,
-        interpolated bilinearly.
+        Nothing; a shift and a scale of each axis, and a small rotation of the camera; these, shear, radial terms up to the seventh power
+        and decentring (D. C. Brown, Photogrammetric Engineering 37(8), 1971); these, and a grid of what is left, interpolated bilinearly.
     every_image : bool
         A shift and the scales are fitted in every image again.
     places : Places
@@ -110,17 +114,22 @@ class Calibration:
             found = found - self._modelled(then)
         if self.every_image:
             scales = _scales(*self._unit(np.zeros_like(now)))[:, :, 0]
-            found = found - _followed(found, scales, scales)
+            found = found - self._followed(found, scales, scales)
         return found / square[:, 0]
 
     def _modelled(self, then: np.ndarray) -> np.ndarray:
         x, y = self._unit(then)
-        basis = _scales(x, y) if self.model == "principal_point_and_scale" else _lens(x, y)
-        smooth = _followed(then[:, 0], basis[:, :, 0], basis)
+        basis = _oriented(x, y) if self.model == "principal_point_and_scale" else _lens(x, y)
+        smooth = self._followed(then[:, 0], basis[:, :, 0], basis)
         rest = then - smooth
         grid = np.einsum("kn,akn->an", self.places.weights, np.nan_to_num(rest[:, 1:]))
-        helps = np.nansum((rest[:, 0] - grid) ** 2) < np.nansum(rest[:, 0] ** 2)  # one with cells too large does not
+        n = self.places.even
+        helps = np.nansum((rest[:, 0] - grid)[:, :n] ** 2) < np.nansum(rest[:, 0, :n] ** 2)  # one with cells too large does not
         return smooth[:, 0] + grid if self.model == "residual_grid" and helps else smooth[:, 0]
+
+    def _followed(self, values: np.ndarray, basis: np.ndarray, at: np.ndarray) -> np.ndarray:
+        n = self.places.even
+        return _followed(values[:, :n], basis[..., :n], at)
 
     def _unit(self, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Measured places, over half the frame's longer side."""
@@ -136,14 +145,18 @@ def _scales(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return np.array([[one, zero], [zero, one], [x, zero], [zero, y]])
 
 
+def _oriented(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Shifts, scales, and a small rotation of the camera (or a tilt of the sensor), which the exterior orientation takes up; (7, 2, …)."""
+    return np.concatenate([_scales(x, y), np.array([[y, -x], [x * x, x * y], [x * y, y * y]])])
+
+
 def _lens(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """What a self-calibration takes up, shape (13, 2, …)."""
-    zero, r2 = np.zeros_like(x), x**2 + y**2
-    affine = [[y, zero], [zero, x]]
+    r2 = x**2 + y**2
+    shear = [[y, x]]
     radial = [[x * r2**k, y * r2**k] for k in (1, 2, 3)]
     decentring = [[r2 + 2 * x * x, 2 * x * y], [2 * x * y, r2 + 2 * y * y]]
-    rotation = [[x * x, x * y], [x * y, y * y]]  # of the camera, or a tilt of the sensor: the exterior orientation takes it up
-    return np.concatenate([_scales(x, y), np.array(affine + radial + decentring + rotation)])
+    return np.concatenate([_oriented(x, y), np.array(shear + radial + decentring)])
 
 
 def _followed(values: np.ndarray, basis: np.ndarray, at: np.ndarray) -> np.ndarray:

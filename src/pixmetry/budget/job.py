@@ -8,6 +8,7 @@ from typing import Any
 
 from pixmetry.budget.advice import advise
 from pixmetry.budget.answer import with_shares
+from pixmetry.budget.calibration_noise import calibration_row
 from pixmetry.budget.camera_budget import CameraBudget
 from pixmetry.budget.cameras import camera_of
 from pixmetry.budget.combine import combine, together_with
@@ -187,7 +188,8 @@ def budget(
     setting.check()  # before the work
     law = TargetEstimator(estimator) if isinstance(estimator, str) else estimator or TargetEstimator()
     table = Table(setting, law, seed, progress or (lambda text: None))
-    rows = with_shares(table.rows())
+    rows = table.rows()
+    rows = with_shares([*rows, calibration_row(rows, setting)])
     together = None
     if trials:
         together = Trials(setting.camera, setting.target, law, setting.facts, trials, seed=seed).of()

@@ -10,7 +10,9 @@ import numpy as np
 
 from pixmetry.budget.answer import Answer as Totals
 from pixmetry.budget.answer import Next, rms
+from pixmetry.budget.calibration_noise import CALIBRATION
 from pixmetry.budget.camera_budget import CameraBudget
+from pixmetry.budget.object_space import SpacePoint
 from pixmetry.budget.sweep import WIDE, Sweep
 from pixmetry.budget.table import ABSENT, Parts, SourceRow
 from pixmetry.camera.catalogue import STAGES, get_source
@@ -28,6 +30,7 @@ FOOTER = "All lengths are standard uncertainties (k = 1), bias included; x runs 
 LISTED = 8  # things to do
 WORTH = 0.01  # gain over what is now, from which on something is worth doing
 MOST_BARS = 14
+AXES = ("X", "Y", "Z (depth)")
 ALIKE = 1  # stars by which two judgements may differ without a word
 HOW_TO_READ = (
     "One target in one frame, in thousandths of a pixel; the largest after the calibration first. “Before” is without any calibration, "
@@ -89,11 +92,11 @@ def _answer(budget: CameraBudget) -> Section:
     parts.append(Text(_interval(one)))
     if (count.frames, count.targets) != (1, 1):
         parts += [Text(f"Mean over {_many(count.frames, 'frame')} and {_many(count.targets, 'target')}:"), _readings(budget, mean.after_px)]
-    covariance = budget.point_mm()
-    if covariance is not None:
-        along, across, depth = np.sqrt(np.diag(covariance))
+    point = budget.point
+    if point is not None:
         parts.append(Text(f"A point on the object, by {count.rays} rays with a base of {count.base_to_height:g} of the distance:"))
-        parts.append([Reading(n, f"{significant(float(v), 2)} mm") for n, v in (("X", along), ("Y", across), ("Z (depth)", depth))])
+        parts.append([Reading(n, f"{significant(float(v), 2)} mm") for n, v in zip(AXES, point.u_mm, strict=True)])
+        parts.append(Text(_about_points(budget, point), "second"))
     parts.append(Text(f"Without any calibration: x {length_px(one.before_px[0])} px, y {length_px(one.before_px[1])} px.", "second"))
     section.add(Answer(parts))
     for row in budget.left_out:
@@ -107,6 +110,14 @@ def _answer(budget: CameraBudget) -> Section:
         )
     section.add(_chain(budget), _bars(budget))
     return section
+
+
+def _about_points(budget: CameraBudget, point: SpacePoint) -> str:
+    """What the numbers of a point in space rest on."""
+    count = budget.scenario.count
+    worst = ", ".join(f"{n[0]} {significant(float(v), 2)} mm" for n, v in zip(AXES, point.worst_mm, strict=True))
+    posed = f"images oriented by {count.points} points that all of them see" if count.points else "orientations known"
+    return f"Mean over the object; at its worst place {worst}. With {posed}. Scale and coordinate system of the object are not in it."
 
 
 def _many(count: int, what: str) -> str:
@@ -136,7 +147,7 @@ def _chain(budget: CameraBudget) -> Figure:
     """The links of the chain in the order of the light, each with what it leaves."""
     counting = [r for r in budget.rows if r.counts]
     there = {r.source_id.split(".")[0] for r in budget.rows if r.status != ABSENT}
-    stages = [s for s in STAGES if s in there]
+    stages = [s for s in (*STAGES, CALIBRATION) if s in there]
     whole = sum(r.after_px**2 for r in counting) or 1.0
     with canvas(1.15) as (figure, axes):
         axes.set_axis_off()
@@ -144,7 +155,7 @@ def _chain(budget: CameraBudget) -> Figure:
         axes.set_ylim(0, 1)
         words = []
         for k, stage in enumerate(stages):
-            part = sum(r.after_px**2 for r in counting if r.source_id.startswith(f"{stage}."))
+            part = sum(r.after_px**2 for r in counting if r.source_id.split(".")[0] == stage)
             share = part / whole
             axes.add_patch(_box(k, share))
             axes.text(k + 0.5, 0.7, stage, ha="center", va="center", color=INK, fontsize=6)

@@ -15,6 +15,7 @@ Surface = Literal["retro", "diffuse", "glossy"]
 # Relative change of brightness across a target, per pixel, by its surface: a retro-reflective target looks the same from everywhere, a
 # glossy one not. Assumed values, to be replaced by what a plane fitted to the target's own pixels shows.
 GRADIENT_PER_PX = {"retro": 0.0005, "diffuse": 0.002, "glossy": 0.01}
+LEAST_POINTS = 8  # that orient images
 
 
 class TargetModel(Model):
@@ -36,6 +37,7 @@ class ObjectModel(Model):
     distance_mm: float | None = Field(default=None, gt=0, le=1e8, description="from the lens to the object")
     field_mm: float | None = Field(default=None, gt=0, le=1e8, description="width of the object that fills a row of the frame")
     f_mm: float | None = Field(default=None, gt=0, le=1e5, description="principal distance, where the camera does not tell its lens")
+    filled_rel: float = Field(default=0.8, gt=0.01, le=0.95, description="part of the frame's width and height that its points fill")
 
 
 class LightModel(Model):
@@ -75,6 +77,10 @@ class CountModel(Model):
     targets: int = Field(default=1, ge=1, le=1_000_000, description="targets of which the mean is taken")
     rays: int = Field(default=2, ge=1, le=10_000, description="images in which a point is seen; 1: no depth")
     base_to_height: float = Field(default=0.5, gt=0, le=10, description="distance of the outermost cameras over that of the object")
+    arrangement: Literal["circle", "row"] = Field(default="circle", description="of the cameras, with the base as its diameter or length")
+    points: int = Field(
+        default=50, ge=0, le=10_000, description="that all images see, and by which these are oriented; 0: orientations are known"
+    )
 
 
 class CalibrationModel(Model):
@@ -86,6 +92,12 @@ class CalibrationModel(Model):
     )
     grid_px: float = Field(default=100.0, ge=4, le=1e5, description="spacing of the residual grid")
     every_image: bool = Field(default=False, description="shift and scales are determined anew in every image")
+    images: int = Field(default=20, ge=3, le=100_000, description="oblique images, rolled by quarters, from which it was made")
+    targets: int = Field(default=100, ge=8, le=1_000_000, description="of each of them, all over the frame")
+    field: Literal["flat", "deep"] = Field(default="flat", description="its targets lie in a plane, or also a quarter of its width deep")
+    noise_px: float | None = Field(
+        default=None, ge=0, le=10, description="standard deviation of their image coordinates; not given: as in the measurement"
+    )
     camera_on_min: float = Field(default=120.0, ge=0, le=1e6, description="time since switching on at which it was made")
     grabber_on_min: float = Field(default=120.0, ge=0, le=1e6)
 
@@ -119,6 +131,8 @@ class Scenario(Model):
 
     @model_validator(mode="after")
     def _one_unit_each(self) -> Scenario:
+        if 0 < self.count.points < LEAST_POINTS:
+            raise ValueError(f"count.points: at least {LEAST_POINTS} orient images; 0 where orientations are known")
         pairs = (
             (self.target, "diameter_px", "diameter_mm"),
             (self.motion, "speed_px_per_s", "speed_mm_per_s"),

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from pixmetry.budget.networks import Images, measuring
 from pixmetry.budget.probe import Facts, Target, facts_of
 from pixmetry.budget.scenario import GRADIENT_PER_PX, Scenario
 from pixmetry.camera.camera import Camera, Element
@@ -18,6 +19,7 @@ DEFAULT_DIAMETER_PX = 7.0
 DEFAULT_F_NUMBER = 8.0
 LARGEST_PX = 80.0  # diameter of a target: what each of its pixels does is computed
 FRAME_PERIOD_S = 0.04  # of a camera that tells none, unless it exposes longer
+MOST_RAYS, MOST_POINTS = 12, 50  # of a network that is adjusted
 SAME_SCALE = 0.1  # relative difference of two statements of the scale that may stand beside each other
 
 
@@ -182,6 +184,44 @@ class Setting:
                 remedy="leave one of the three out",
             )
         return by_lens if by_field is None else by_field
+
+    @property
+    def aspect(self) -> float:
+        """Pitch in y over that in x; 1 where it is not known."""
+        pitch = self.described.pitch_um
+        return 1.0 if pitch is None else pitch[1] / pitch[0]
+
+    def from_middle(self, x_px: np.ndarray, y_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Places from the middle of the frame, in pixels along x."""
+        rows, cols = self.described.frame_shape
+        return x_px - (cols - 1) / 2, self.aspect * (y_px - (rows - 1) / 2)
+
+    @property
+    def c_px(self) -> float:
+        """Principal distance over the pitch along x; of a lens that nothing tells, twice the longer side of the frame."""
+        o, pitch = self.scenario.object, self.described.pitch_um
+        if o.distance_mm is not None and self.px_per_mm is not None:
+            return self.px_per_mm * o.distance_mm
+        if self.f_mm is None or pitch is None:
+            return 2.0 * max(self.described.frame_shape)
+        return 1e3 * self.f_mm / pitch[0] + self.f_mm * (self.px_per_mm or 0.0)  # f (1 + magnification)
+
+    @cached_property
+    def network(self) -> Images | None:
+        """Images of the scenario's points; None where one ray tells no depth."""
+        count = self.scenario.count
+        if count.rays < 2:
+            return None
+        return measuring(
+            self.c_px,
+            self.described.frame_shape,
+            self.aspect,
+            min(count.rays, MOST_RAYS),
+            count.base_to_height,
+            count.arrangement,
+            min(count.points or MOST_POINTS, MOST_POINTS),
+            self.scenario.object.filled_rel,
+        )
 
     @property
     def chief_ray_deg(self) -> float | None:

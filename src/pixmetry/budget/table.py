@@ -8,7 +8,7 @@ Carlo of that chain with the source and without it.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -153,6 +153,8 @@ class SourceRow:
     how, method, reason, advice : str
     in_camera : bool
         Whether it stands in the camera's chain.
+    fields_px : ndarray, shape (k, 2, m), optional
+        What is left after the calibration at the image points of the scenario's network, where that is the same in every image.
     share : float
         Part of the square of the whole, after the calibration.
     """
@@ -174,6 +176,7 @@ class SourceRow:
     advice: str = ""
     in_camera: bool = False
     share: float = 0.0
+    fields_px: np.ndarray | None = field(default=None, repr=False, compare=False)
 
     @property
     def before_px(self) -> float:
@@ -204,6 +207,17 @@ class SourceRow:
     def taken_up(self) -> bool:
         """Whether the calibration leaves nothing of it to speak of."""
         return self.before_px > 0 and self.after_px <= 1e-3 * self.before_px
+
+
+def independent_px(rows: Sequence[SourceRow], frames: int = 1, targets: int = 1) -> Pair:
+    """Standard deviation in x and y of what is another at every image point, after the calibration."""
+    variance = np.zeros(2)
+    for row in rows:
+        if row.status in COUNTED and row.after is not None:
+            variance += np.square(row.after.place_px) / targets + np.square(row.after.time_px) / (frames * targets)
+            variance += 0.0 if row.fields_px is not None else np.square(row.after.smooth_px)
+    x, y = (float(v) for v in np.sqrt(variance))
+    return x, y
 
 
 @dataclass
@@ -352,7 +366,8 @@ class Table:
             return self._of_motion(row, element)
         moved = self._moved(element, in_camera) if source.gum_class in ("G", "D") else None
         if moved is not None:
-            return replace(row, before=moved[0], after=moved[1], how=FIELD, method="exact map of the camera")
+            before, after, seen = moved
+            return replace(row, before=before, after=after, how=FIELD, method="exact map of the camera", fields_px=seen)
         if source.propagate is None and (source.forward is None or source.essential and source.ideal is None):
             return replace(row, before=Parts(), after=Parts(), reason=source.reasons["propagate"])
         try:
@@ -403,9 +418,9 @@ class Table:
     def calibration(self) -> Calibration:
         """What positions are corrected for."""
         told = self.setting.scenario.calibration
-        pitch = self.setting.camera.pitch_um
-        places = Places.over(self.setting.camera.frame_shape, told.grid_px)
-        return Calibration(told.model, told.every_image, places, 1.0 if pitch is None else pitch[1] / pitch[0])
+        network = self.setting.network
+        places = Places.over(self.setting.camera.frame_shape, told.grid_px, None if network is None else network.places_px)
+        return Calibration(told.model, told.every_image, places, self.setting.aspect)
 
     def _difference(self, pair: tuple[Camera, Camera]) -> np.ndarray:
         """Displacement by what one camera has beyond another, shape (2, 5, n)."""
@@ -432,8 +447,8 @@ class Table:
         aged = self.setting.aged(element, camera)
         return put(camera, aged), missed(camera, [element.name]) if in_camera else camera
 
-    def _moved(self, element: Element, in_camera: bool) -> tuple[Parts, Parts] | None:
-        """What a map of points is before and after the calibration; None where it moves none."""
+    def _moved(self, element: Element, in_camera: bool) -> tuple[Parts, Parts, np.ndarray] | None:
+        """What a map of points is before and after the calibration, and left of it in the network's images; None where it moves none."""
         cameras = (self.setting.camera, self.setting.calibrated)
         try:
             pairs = [self._with_and_without(c, element, in_camera) for c in cameras]
@@ -444,7 +459,8 @@ class Table:
             return None
         if element.source.gum_class == "G":  # it stays as it was: what drifts beside it has a row of its own
             now = then
-        return _of_field(now[:, 0]), _of_field(self.calibration.left(now, then))
+        left, n = self.calibration.left(now, then), self.calibration.places.even
+        return _of_field(now[:, 0, :n]), _of_field(left[:, :n]), np.nan_to_num(left[None, :, n:])
 
     # ---- simulation -----------------------------------------------------------------------------------------------------------
 
@@ -485,4 +501,4 @@ def parts_of(found: Contribution, source_id: str = "") -> Parts:
     return Parts(found.bias_px, found.smooth_px, place, time)
 
 
-__all__ = ["Parts", "SourceRow", "Table", "stars_of"]
+__all__ = ["Parts", "SourceRow", "Table", "independent_px", "stars_of"]

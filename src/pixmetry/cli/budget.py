@@ -179,10 +179,11 @@ def print_budget(found: CameraBudget, console: Console, everything: bool = False
             f"{length_px(t.calibrated_px)} ± {length_px(t.se_calibrated_px)} px",
             markup=False,
         )
-    covariance = found.point_mm()
-    if covariance is not None:
-        x, y, z = covariance.diagonal() ** 0.5
-        console.print(f"a point by {found.scenario.count.rays} rays: X {x:.2g} mm, Y {y:.2g} mm, Z {z:.2g} mm (depth)", markup=False)
+    point = found.point
+    if point is not None:
+        (x, y, z), worst = point.u_mm, point.worst_mm.max()
+        text = f"a point by {found.scenario.count.rays} rays: X {x:.2g} mm, Y {y:.2g} mm, Z {z:.2g} mm (depth); at worst {worst:.2g} mm"
+        console.print(text, markup=False)
     for row in found.left_out:
         console.print(f"not in the answer: {row.title} ({row.reason})", markup=False)
     table = Table(box=None, pad_edge=False)
