@@ -100,7 +100,7 @@ def test_lenses_are_compared_on_the_object_and_scenarios_that_differ_are_told(tm
     told = found.best.size(found.best.answer.after_px, "mm")
     x, y = lenses[1].mm(lenses[1].one.after_px)
     assert told == pytest.approx((0.5 * (x**2 + y**2)) ** 0.5)
-    assert found.best.depth_mm == pytest.approx(lenses[1].point_mm()[2, 2] ** 0.5)
+    assert found.best.depth_mm == pytest.approx(lenses[1].point.u_mm[2])
     for r in found.rows:
         assert len(r.sizes) == len(r.shares) == 2
     assert sum(r.shares[0] for r in found.rows) == pytest.approx(1.0)

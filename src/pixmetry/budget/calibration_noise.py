@@ -57,7 +57,7 @@ def calibration_row(rows: Sequence[SourceRow], setting: Setting) -> SourceRow:
         fields_px=modes[..., places:],
     )
     more = np.sqrt(told.images * told.targets / FEW)
-    return row if known or more <= 1 else replace(row, largest=after.scaled(more))
+    return row if known or more <= 1 else replace(row, largest=Parts.of([more * v for v in after.values_px]))
 
 
 def modes_of(setting: Setting, sigma_px: Pair) -> tuple[np.ndarray, int]:

@@ -209,7 +209,7 @@ def _side(record: Mapping[str, Any], name: str, where: str) -> BudgetSide:
     try:
         answer, scale, pitch = record["answer"], record["px_per_mm"], record["pitch_um"]
         mm = None if scale is None else (1 / scale, 1 / scale * (pitch[1] / pitch[0] if pitch else 1.0))
-        depth = record["point_covariance_mm2"]
+        point = record["point"]
         side = BudgetSide(
             name=name,
             camera=str(record["camera"]),
@@ -220,7 +220,7 @@ def _side(record: Mapping[str, Any], name: str, where: str) -> BudgetSide:
             targets=int(answer["targets"]),
             um_per_px=None if pitch is None else (float(pitch[0]), float(pitch[1])),
             mm_per_px=mm,
-            depth_mm=None if depth is None else float(depth[2][2]) ** 0.5,
+            depth_mm=None if point is None else float(point["covariance_mm2"][2][2]) ** 0.5,
             frame_shape=(int(record["frame_shape"][0]), int(record["frame_shape"][1])),
         )
         told, found = answer["after_px"], side.answer.after_px
@@ -232,7 +232,7 @@ def _side(record: Mapping[str, Any], name: str, where: str) -> BudgetSide:
 
 
 def _row(record: Mapping[str, Any]) -> SourceRow:
-    fields: dict[str, Any] = {name: record[name] for name in SourceRow.__dataclass_fields__}
+    fields: dict[str, Any] = {name: record[name] for name in SourceRow.__dataclass_fields__ if name != "fields_px"}
     fields |= {name: _parts(fields[name]) for name in PARTS}
     return SourceRow(**fields)
 
