@@ -12,6 +12,7 @@ from pixmetry.core.errors import InputError
 from pixmetry.files import EXAMPLE, FrameReader, load_campaign, photons_from_irradiance, write_manifest
 
 DARK = "frames:\n  - {kind: dark, exposure_s: 0.01, files: [d_0.png, d_1.png]}\n"
+EDGE = "  - {kind: edge, files: [b_0.png]}\n"
 BRIGHT = "  - {kind: bright, exposure_s: 0.01, files: [b_0.png, b_1.png]}\n"
 
 
@@ -39,6 +40,18 @@ def test_manifest_gives_what_it_says(tmp_path: Path) -> None:
         assert campaign.frame_count == 4
 
 
+def test_edges_alone_or_beside_are_a_campaign(tmp_path: Path) -> None:
+    """One frame is enough, and no exposure time is needed; written again it is the same."""
+    for rest, kinds in (("", ["edge"]), (DARK.removeprefix("frames:\n"), ["dark", "edge"])):
+        campaign = load_campaign(put_campaign(tmp_path, HEAD + "frames:\n" + EDGE + rest))
+        assert [g.kind for g in campaign.groups] == kinds
+        assert [g.kind for g in campaign.field_groups] == kinds[:-1]
+        edge = campaign.groups[-1]
+        assert (edge.exposure_s, edge.photons, edge.role, edge.label, len(edge.paths)) == (0.0, None, "target", "edge", 1)
+        write_manifest(campaign, tmp_path / "again.yaml")
+        assert load_campaign(tmp_path / "again.yaml").groups == campaign.groups
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
@@ -55,7 +68,10 @@ def test_manifest_gives_what_it_says(tmp_path: Path) -> None:
         (HEAD + DARK + BRIGHT.replace("exposure_s", "exposure_ms"), ["another unit", "exposure_s"]),
         (HEAD + DARK + BRIGHT.replace("0.01", ".nan"), ["exposure_s", "not a finite number"]),
         (HEAD + DARK + BRIGHT.replace("0.01", "-1"), ["exposure_s", "-1", "greater than or equal to 0"]),
-        (HEAD + DARK + BRIGHT.replace("kind: bright", "kind: light"), ["kind", "'light'", "'dark' or 'bright'"]),
+        (HEAD + DARK + BRIGHT.replace("kind: bright", "kind: light"), ["kind", "'light'", "'dark', 'bright' or 'edge'"]),
+        (HEAD + DARK + EDGE.replace("}", ", role: stack}"), ["role belongs to dark and bright frames", "line 5"]),
+        (HEAD + DARK + EDGE.replace("}", ", photons: 5}"), ["photons belongs to dark and bright frames"]),
+        (HEAD + DARK + BRIGHT.replace("exposure_s: 0.01, ", ""), ["bright group without exposure time", "add exposure_s"]),
         (HEAD + DARK + BRIGHT.replace("kind:", "knd:"), ["unknown key", "did you mean `kind`"]),
         (HEAD + DARK + BRIGHT.replace("exposure_s: 0.01", "exposure_s: 0"), ["without exposure", "kind: dark"]),
         (HEAD + DARK.replace("0.01", "0.01, photons: 5") + BRIGHT, ["dark group has light"]),

@@ -12,7 +12,7 @@ import numpy as np
 from pixmetry.budget.parameters import applies
 from pixmetry.camera.camera import Camera, Element, in_order
 from pixmetry.camera.catalogue import get_source, sources
-from pixmetry.camera.observations import Observations, PatternList, PhotonTransfer
+from pixmetry.camera.observations import Observations, PatternList
 from pixmetry.camera.provenance import DESCRIBED, MEASURED, TYPICAL
 from pixmetry.camera.source import Source
 from pixmetry.camera.unit_maps import MeasuredUnit
@@ -23,6 +23,7 @@ from pixmetry.observe.converter_bend import ConverterBend, converter_bend
 from pixmetry.observe.linearity import Linearity
 from pixmetry.observe.unit_maps import UnitMaps, threshold_errors, unit_maps
 
+ASSUMED_EXPOSURE_S = 0.01
 ASSUMED_RANGE_E = 5000.0  # electrons for a full range where the gain is not known: the shot noise of most cameras is less
 ALWAYS = ("sensor.quantum_efficiency", "sensor.shot_noise", "grabber.adc")  # what every twin has, measured or not
 SIGNIFICANT_U = 1.96  # below so many u from nothing a value is not simulated
@@ -56,7 +57,7 @@ def digital_twin(campaign: Campaign, estimates: Mapping[str, Estimates], observa
     stack = observations.bright_stack
     if not any(element.name == "electronics.gain" for element in elements):
         elements = _with_assumed_gain(elements, campaign.bits)
-    exposure = stack.exposure_s if stack is not None else _middle_exposure_s(observations.series)
+    exposure = stack.exposure_s if stack is not None else _middle_exposure_s(campaign)
     photons_known = "sensor.quantum_efficiency" in estimates
     return Camera(
         name=facts.name,
@@ -84,9 +85,11 @@ def _with_assumed_gain(elements: list[Element], bits: int) -> list[Element]:
     return [by_name[s.id] for s in in_order([e.source for e in elements] + [source])]
 
 
-def _middle_exposure_s(transfer: PhotonTransfer) -> float:
-    exposures = transfer.bright.exposure_s if transfer.bright.exposure_s.size else transfer.dark.exposure_s
-    return float(np.median(exposures))
+def _middle_exposure_s(campaign: Campaign) -> float:
+    """The median exposure of the brightest kind of frames; an assumed one where none was said, as of pictures of targets."""
+    known = [[g.exposure_s for g in groups] for groups in (campaign.levels("bright"), campaign.levels("dark"))]
+    targets = [g.exposure_s for g in campaign.groups if g.exposure_s > 0]
+    return float(np.median(next(filter(None, [*known, targets]), [ASSUMED_EXPOSURE_S])))
 
 
 def best_values(source: Source, estimates: Estimates) -> dict[str, float]:

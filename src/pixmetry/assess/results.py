@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,7 @@ from pixmetry.assess.self_test import SelfTest
 from pixmetry.budget.monte_carlo import Crop
 from pixmetry.budget.records import SUM, Budget
 from pixmetry.camera.camera import Camera
-from pixmetry.camera.observations import Observations, StackMoments
+from pixmetry.camera.observations import EdgeResponse, Observations, SlantedEdges, StackMoments
 from pixmetry.core.number import Estimates
 from pixmetry.emva.files.json_format import value_record
 from pixmetry.emva.records import Results
@@ -93,6 +93,7 @@ class Assessment:
                 "confounders": list(fit.confounders),
             },
             "spatial": self.observations.spatial_fit.to_records() if self.observations.spatial_fit is not None else [],
+            "edges": None if self.observations.edges is None else edges_record(self.observations.edges),
             "emva1288": {
                 "release": self.standard.release,
                 "results": {key: value_record(value) for key, value in self.standard.values.items()},
@@ -141,6 +142,30 @@ class Assessment:
             if seen.dark_stack is not None and seen.bright_stack is not None and seen.spatial_fit is not None:
                 maps["prnu_rel"] = _response_map(seen.dark_stack, seen.bright_stack, mask).astype(np.float32)
         return maps
+
+
+def edges_record(found: SlantedEdges) -> dict[str, Any]:
+    """The plain record of slanted edges: counts, values, the mean responses, and every edge in a line."""
+
+    def mean(response: EdgeResponse | None) -> dict[str, Any] | None:
+        if response is None:
+            return None
+        return {"edges": response.edges, "sfr": response.sfr.tolist(), "u": np.sqrt(np.diag(response.covariance)).tolist()}
+
+    names = (
+        *("picture", "across", "x_px", "y_px", "angle_deg", "u_angle_deg", "order", "rows", "low_dn", "high_dn", "rising", "noise_dn"),
+        *("sfr50", "u_sfr50", "asymmetry", "u_asymmetry"),
+    )
+    each = [{name: getattr(e, name) for name in names} for e in found.edges]
+    return {
+        "measured": len(found.edges),
+        "refused": [asdict(r) for r in found.refused],
+        "values": found.fit.to_records(),
+        "frequency_cycles_per_px": found.frequency.tolist(),
+        "x": mean(found.x),
+        "y": mean(found.y),
+        "edges": [{k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in e.items()} for e in each],
+    }
 
 
 def _response_map(dark: StackMoments, bright: StackMoments, mask: np.ndarray) -> np.ndarray:

@@ -100,7 +100,7 @@ class SelfTest:
 
 def exposures_of(campaign: Campaign) -> list[Exposure]:
     """The exposures of a campaign."""
-    return [Exposure(g.kind, g.role, g.exposure_s, g.photons, len(g.paths)) for g in campaign.groups]
+    return [Exposure(g.kind, g.role, g.exposure_s, g.photons, len(g.paths)) for g in campaign.field_groups]
 
 
 def expose(

@@ -180,6 +180,109 @@ class PatternList:
         return len(self.amplitude_dn)
 
 
+@dataclass(frozen=True)
+class SlantedEdge:
+    """One slanted edge and its edge response; lengths and frequencies are along the edge's normal.
+
+    Parameters
+    ----------
+    picture : int
+        In which picture of edges it is.
+    across : {"x", "y"}
+        What the step goes along: x of a nearly vertical edge, y of a nearly horizontal one.
+    x_px, y_px : float
+        Its middle.
+    angle_deg, u_angle_deg : float
+        Angle to the columns (``across`` x) or rows, with the sign of dx/dy or dy/dx.
+    order : int
+        Order of the polynomial that it follows.
+    rows : int
+        Rows (columns, of a nearly horizontal edge) that were used.
+    half_px : float
+        How far from the edge pixels were used.
+    low_dn, high_dn : float
+        Levels of the two sides, and ``rising``: whether the light grows with x or y.
+    noise_dn : float
+        Standard deviation of a pixel about the edge's mean curve.
+    distance_px, spread_rel : ndarray, shape (bins,)
+        Edge spread function: 0 on the dark side, 1 on the bright one.
+    sfr, u_sfr : ndarray, shape (frequencies,)
+        e-SFR, the modulus of the response.
+    sfr50, u_sfr50 : float
+        Frequency at which it is one half, cycles/px; NaN where it never is.
+    asymmetry, u_asymmetry : float
+        (d₉₀ + d₁₀ − 2 d₅₀)/(d₉₀ − d₁₀) of the distances at which 10, 50 and 90 % of the step are reached, counted towards growing x or y.
+    """
+
+    picture: int
+    across: str
+    x_px: float
+    y_px: float
+    angle_deg: float
+    u_angle_deg: float
+    order: int
+    rows: int
+    half_px: float
+    low_dn: float
+    high_dn: float
+    rising: bool
+    noise_dn: float
+    distance_px: np.ndarray
+    spread_rel: np.ndarray
+    sfr: np.ndarray
+    u_sfr: np.ndarray
+    sfr50: float
+    u_sfr50: float
+    asymmetry: float
+    u_asymmetry: float
+
+
+@dataclass(frozen=True)
+class RefusedEdge:
+    """An edge that was found and cannot be measured; ``reason`` says why."""
+
+    picture: int
+    across: str
+    x_px: float
+    y_px: float
+    angle_deg: float
+    rows: int
+    reason: str
+
+
+@dataclass(frozen=True)
+class EdgeResponse:
+    """Mean e-SFR of all edges of one direction: shape (frequencies,), and its covariance, (frequencies, frequencies)."""
+
+    sfr: np.ndarray
+    covariance: np.ndarray
+    edges: int
+
+
+@dataclass(frozen=True)
+class SlantedEdges:
+    """Slanted edges of all pictures, and what they have in common.
+
+    Parameters
+    ----------
+    frequency : ndarray, shape (frequencies,)
+        Cycles per pixel, along the edge's normal.
+    edges : tuple of SlantedEdge
+    refused : tuple of RefusedEdge
+    x, y : EdgeResponse or None
+        Of steps along x (nearly vertical edges) and along y.
+    fit : Estimates
+        ``sfr50_x``, ``sfr50_y``, ``asymmetry_x``, ``asymmetry_y``, as far as there are edges for them.
+    """
+
+    frequency: np.ndarray
+    edges: tuple[SlantedEdge, ...]
+    refused: tuple[RefusedEdge, ...]
+    x: EdgeResponse | None
+    y: EdgeResponse | None
+    fit: Estimates
+
+
 LENS, AFFINITY = "optics.distortion", "sensor.affinity"
 TAKEN_UP = (LENS, AFFINITY, "optics.cover_glass", "sensor.pixel_pitch", "sensor.tilt")  # by a calibration, in the first two
 
@@ -247,6 +350,7 @@ class Observations:
     defects: DefectList | None = None
     patterns: PatternList | None = None
     code_errors: CodeErrors | None = None
+    edges: SlantedEdges | None = None
     temperature_c: float | None = None
     geometry: CameraGeometry | None = None
     storage: Storage = Storage()

@@ -70,7 +70,7 @@ def assess(
     pdf: Path | None,
     threads: int | None,
 ) -> None:
-    """Assess a camera from dark and bright frames: error sources, error budget, advice, report.
+    """Assess a camera from dark and bright frames and edges: error sources, error budget, advice, report.
 
     CAMPAIGN is a manifest (YAML), an EMVA 1288 descriptor file, or a folder that holds one of them. Without CAMPAIGN the packaged example
     is assessed: a crop of a real CCD camera's data set.
@@ -130,6 +130,10 @@ def print_summary(assessment: Assessment) -> None:
         table.add_row(row.title, row.status, c.gum_class, *numbers, f"{100 * row.share:.0f} %", f"{c.calibrated_px:.5f}")
     console.print(table)
     console.print("constant: the same all over the frame. calibrated: what a calibration of the camera leaves (rms of x and y).")
+    if assessment.observations.edges is not None:
+        from pixmetry.assess.page.edges import summary_sentence
+
+        console.print(f"\nSlanted edges: {summary_sentence(assessment.observations.edges)}", markup=False)
     worst = assessment.budget.with_accepted[0].total_px
     accepted = [r.title for r in assessment.budget.accepted]
     if accepted:

@@ -158,12 +158,12 @@ def measure_campaign(
         nonlocal done
         done += count
         if progress is not None:
-            progress("reading frames", done, campaign.frame_count)
+            progress("reading frames", done, sum(len(g.paths) for g in campaign.field_groups))
 
     reader = FrameReader(campaign)
 
     def groups() -> Iterator[Group]:
-        for g in campaign.groups:
+        for g in campaign.field_groups:
             yield Group(g.kind, g.role, g.exposure_s, g.photons, [partial(reader.fetch, path) for path in g.paths])
 
     cfa = bayer or facts.cfa

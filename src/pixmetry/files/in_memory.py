@@ -22,8 +22,8 @@ class Frames:
 
     Parameters
     ----------
-    kind : {"dark", "bright"}
-    exposure_s : float
+    kind : {"dark", "bright", "edge"}
+    exposure_s : float, or None of a target
     data : ndarray, shape (frames, rows, cols), or sequence of ndarray of shape (rows, cols)
         Stored values, whole numbers from 0 to 65535, in the order in which the frames were taken. They are not copied.
     photons : float, optional
@@ -39,7 +39,7 @@ class Frames:
     """
 
     kind: str
-    exposure_s: float
+    exposure_s: float | None
     data: np.ndarray | Sequence[np.ndarray]
     photons: float | None = None
     role: str | None = None
@@ -51,7 +51,7 @@ def campaign_of_arrays(groups: Iterable[Frames], *, optics: Mapping[str, Any] | 
     Parameters
     ----------
     groups : iterable of Frames
-        One for each exposure time and light, dark and bright.
+        One for each exposure time and light, dark and bright; one for each picture of edges (frames in which nothing moved).
     optics : mapping, optional
         Of the manifest's keys under ``optics``: ``wavelength_nm``, ``f_number``, ``focal_length_mm``, ``irradiance_uw_per_cm2``,
         ``light_source``.
@@ -100,7 +100,7 @@ def campaign_of_arrays(groups: Iterable[Frames], *, optics: Mapping[str, Any] | 
         eight = eight and all(frame.dtype == np.uint8 for frame in data)
         paths = tuple(folder / str(k) for k in range(len(data)))
         photons = photons_of(checked, light, facts, str(folder))
-        made.append(FrameGroup(checked.kind, checked.exposure_s, photons, paths, checked.role or role_of(paths)))
+        made.append(FrameGroup(checked.kind, checked.exposure_s or 0.0, photons, paths, checked.role or role_of(checked.kind, paths)))
     if len(shapes) > 1:
         raise InputError("frames of several sizes", where=NAME, value=sorted(shapes), allowed="one size for all frames")
     ordered, findings = check_groups(tuple(made), NAME)

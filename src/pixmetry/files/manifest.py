@@ -13,7 +13,7 @@ from pixmetry.files.files import find_file, find_files
 from pixmetry.files.formats import frames_of
 from pixmetry.files.images import check_frame, load_frame
 from pixmetry.files.raw_values import RawLayout
-from pixmetry.files.records import STACK_FRAMES, CameraFacts, Campaign, FrameGroup, OpticsFacts, check_groups
+from pixmetry.files.records import STACK_FRAMES, TARGETS, CameraFacts, Campaign, FrameGroup, OpticsFacts, check_groups
 
 if TYPE_CHECKING:
     from pixmetry.files.schema import CameraModel, GroupModel, ManifestModel, OpticsModel
@@ -168,7 +168,7 @@ def _from_manifest(
     for i, group in enumerate(model.frames):
         paths = find_files(source.parent, group.files, _place(source, lines, "frames", i, "files"), raw)
         photons = photons_of(group, model.optics, camera, _place(source, lines, "frames", i))
-        groups.append(FrameGroup(group.kind, group.exposure_s, photons, paths, group.role or role_of(paths)))
+        groups.append(FrameGroup(group.kind, group.exposure_s or 0.0, photons, paths, group.role or role_of(group.kind, paths)))
     return {"camera": camera, "groups": tuple(groups), "licence": model.licence}
 
 
@@ -185,8 +185,10 @@ def _place(source: Path, lines: Mapping[tuple[str | int, ...], int], *loc: str |
     return f"{source}, line {lines[loc]}" if loc in lines else str(source)
 
 
-def role_of(paths: tuple[Path, ...]) -> str:
-    """Whether a group is a stack or a level, where nobody said."""
+def role_of(kind: str, paths: tuple[Path, ...]) -> str:
+    """Whether a group is a target, a stack or a level, where nobody said."""
+    if kind in TARGETS:
+        return "target"
     return "stack" if len(paths) >= STACK_FRAMES else "level"
 
 
@@ -194,13 +196,15 @@ def photons_of(group: GroupModel, optics: OpticsModel, camera: CameraFacts, wher
     """Photons per pixel and exposure of a group: as stated, else from the irradiance; None where neither is known."""
     if group.kind == "dark":
         return 0.0
+    if group.kind in TARGETS:
+        return None
     irradiance = group.irradiance_uw_per_cm2 or optics.irradiance_uw_per_cm2
     if group.photons is not None or irradiance is None:
         return group.photons
     if camera.pitch_x_um is None or camera.pitch_y_um is None or optics.wavelength_nm is None:
         missing = "wavelength_nm under optics" if optics.wavelength_nm is None else "pitch_um under camera"
         raise InputError("photons do not follow from the irradiance alone", where=where, remedy=f"add {missing}, or give photons")
-    return photons_from_irradiance(irradiance, group.exposure_s, camera.pitch_x_um * camera.pitch_y_um, optics.wavelength_nm)
+    return photons_from_irradiance(irradiance, group.exposure_s or 0.0, camera.pitch_x_um * camera.pitch_y_um, optics.wavelength_nm)
 
 
 def _from_descriptor(source: Path, text: bytes, camera: CameraFacts | None, raw: RawLayout | None) -> dict[str, Any]:
@@ -212,7 +216,7 @@ def _from_descriptor(source: Path, text: bytes, camera: CameraFacts | None, raw:
     for group in descriptor.groups:
         files = (find_file(source.parent, text, f"{source}, line {line}") for text, line in group.files)
         paths = tuple(frame for file in files for frame in frames_of(file, raw))
-        groups.append(FrameGroup(group.kind, group.exposure_s, group.photons, paths, role_of(paths)))
+        groups.append(FrameGroup(group.kind, group.exposure_s, group.photons, paths, role_of(group.kind, paths)))
     return {
         "camera": camera or CameraFacts(name=source.parent.resolve().name or source.stem, bits=descriptor.bits),
         "groups": tuple(groups),
@@ -248,8 +252,11 @@ def write_manifest(campaign: Campaign, path: str | Path) -> None:
             )
         photons = group.photons if group.kind == "bright" else None
         files = [p.relative_to(base).as_posix() for p in group.paths]
-        frames.append({"kind": group.kind, "exposure_s": group.exposure_s, "photons": photons, "role": group.role, "files": files})
+        told: dict[str, Any] = {"kind": group.kind, "exposure_s": group.exposure_s, "photons": photons, "role": group.role}
+        if group.kind in TARGETS:
+            told |= {"exposure_s": group.exposure_s or None, "role": None}
+        frames.append({**told, "files": files})
     manifest = {"schema": CAMPAIGN_SCHEMA, "camera": asdict(campaign.camera), "optics": asdict(campaign.optics), "frames": frames}
-    told = {name: getattr(campaign, name) or None for name in ("licence", "notes", "operator")}
+    texts = {name: getattr(campaign, name) or None for name in ("licence", "notes", "operator")}
     layout = None if campaign.raw is None else asdict(campaign.raw)
-    dump_yaml({**manifest, "raw": layout, **told}, path)
+    dump_yaml({**manifest, "raw": layout, **texts}, path)

@@ -15,7 +15,8 @@ from pixmetry.files.formats import is_frame
 from pixmetry.files.raw_values import RawLayout
 
 STACK_FRAMES = 8  # from this many frames on, a group is a stack: its mean image serves the spatial measurements
-KINDS = ("dark", "bright")
+KINDS = ("dark", "bright")  # frames of an even field, from which noise is measured
+TARGETS = ("edge",)  # pictures of something to be measured: one frame is enough
 
 
 @dataclass(frozen=True)
@@ -64,14 +65,16 @@ class FrameGroup:
     Parameters
     ----------
     kind : str
-        ``"dark"`` or ``"bright"``.
+        ``"dark"``, ``"bright"``, or one of ``TARGETS``.
     exposure_s : float
+        0 where it was not said, which only a picture of a target may do.
     photons : float or None
         Mean number of photons per pixel and exposure; None where it is not known. A dark group has 0.
     paths : tuple of Path
         The image files, in the order in which they were taken.
     role : str
-        ``"level"`` (a point of the photon-transfer series) or ``"stack"`` (many frames for the mean image).
+        ``"level"`` (a point of the photon-transfer series), ``"stack"`` (many frames for the mean image) or ``"target"`` (frames of a
+        target that did not move between them).
     """
 
     kind: str
@@ -83,7 +86,7 @@ class FrameGroup:
     @property
     def label(self) -> str:
         """Short text for messages, e.g. ``bright, exposure 0.004 s``."""
-        return f"{self.kind}, exposure {self.exposure_s:g} s"
+        return self.kind if self.kind in TARGETS and not self.exposure_s else f"{self.kind}, exposure {self.exposure_s:g} s"
 
 
 @dataclass(frozen=True)
@@ -95,7 +98,7 @@ class Campaign:
     camera : CameraFacts
     optics : OpticsFacts
     groups : tuple of FrameGroup
-        Dark before bright, then by exposure and photons.
+        Dark, bright, then pictures of targets; each by exposure and photons.
     frame_shape : tuple of int
         Rows and columns of every frame.
     frame_dtype : str
@@ -166,6 +169,11 @@ class Campaign:
             where = ": ".join(filter(None, (str(self.source_path), problem.where)))
             raise type(problem)(problem.what, where=where, value=problem.value, allowed=problem.allowed, remedy=problem.remedy) from None
 
+    @property
+    def field_groups(self) -> tuple[FrameGroup, ...]:
+        """The groups of dark and bright frames."""
+        return tuple(g for g in self.groups if g.kind in KINDS)
+
     def levels(self, kind: str) -> tuple[FrameGroup, ...]:
         """Return the groups of the photon-transfer series, by rising exposure; where there are only stacks, these."""
         groups = tuple(g for g in self.groups if g.kind == kind)
@@ -179,13 +187,13 @@ class Campaign:
 def check_groups(groups: tuple[FrameGroup, ...], where: str) -> tuple[tuple[FrameGroup, ...], tuple[str, ...]]:
     """Sort groups, put right what needs no question, and refuse what cannot be a campaign.
 
-    A group of one frame is left out, for noise is measured from differences. Of two groups of one condition the one of more frames is a
-    stack; dark levels of one exposure are taken together.
+    A dark or bright group of one frame is left out, for noise is measured from differences. Of two groups of one condition the one of more
+    frames is a stack; dark levels of one exposure are taken together. Pictures of targets stay as they are.
 
     Returns
     -------
     tuple
-        The groups, dark before bright, then by exposure and photons, and notes on what was left out, put together or looks wrong.
+        The groups, dark, bright, then targets, each by exposure and photons, and notes on what was left out, put together or looks wrong.
 
     Raises
     ------
@@ -193,10 +201,12 @@ def check_groups(groups: tuple[FrameGroup, ...], where: str) -> tuple[tuple[Fram
         No frames, nothing but single frames, a file listed twice, or two bright groups of one condition.
     """
     if not groups:
-        raise InputError("no frames are listed", where=where, remedy="list dark and bright frames with their exposure times")
+        raise InputError("no frames are listed", where=where, remedy="list dark and bright frames with their exposure times, or edges")
     _refuse_repeated_files(groups, where)
-    single = [g for g in groups if len(g.paths) < 2]
-    if len(single) == len(groups):
+    targets = sorted((g for g in groups if g.kind in TARGETS), key=_order)
+    fields = [g for g in groups if g.kind not in TARGETS]
+    single = [g for g in fields if len(g.paths) < 2]
+    if not targets and len(single) == len(fields):
         raise InputError(
             f"only 1 frame in group ({single[0].label}), and in every other",
             where=where,
@@ -205,8 +215,8 @@ def check_groups(groups: tuple[FrameGroup, ...], where: str) -> tuple[tuple[Fram
         )
     notes = [f"only 1 frame in group ({g.label}): it is left out, noise is measured from the difference of two" for g in single]
     notes += [f"no {kind} frames: values that need them are not measured" for kind in KINDS if all(g.kind != kind for g in groups)]
-    ordered = sorted((g for g in groups if len(g.paths) > 1), key=lambda g: (g.kind != "dark", g.exposure_s, g.photons or 0.0))
-    groups, told = _of_different_conditions(ordered, where)
+    series, told = _of_different_conditions(sorted((g for g in fields if len(g.paths) > 1), key=_order), where)
+    groups = (*series, *targets)
     return groups, (*notes, *told, *_doubtful_photons([g for g in groups if g.kind == "bright" and g.role == "level"]))
 
 
@@ -239,7 +249,11 @@ def _of_different_conditions(groups: list[FrameGroup], where: str) -> tuple[tupl
                 remedy="put their files into one group, or correct the exposure",
             )
         seen[_condition(group)] = group
-    return tuple(sorted(seen.values(), key=lambda g: (g.kind != "dark", g.exposure_s, g.photons or 0.0))), notes
+    return tuple(sorted(seen.values(), key=_order)), notes
+
+
+def _order(group: FrameGroup) -> tuple[int, float, float]:
+    return (*KINDS, *TARGETS).index(group.kind), group.exposure_s, group.photons or 0.0
 
 
 def _condition(group: FrameGroup) -> tuple[str, str, float, float | None]:

@@ -9,6 +9,7 @@ from pydantic import BeforeValidator, Field, model_validator
 from pixmetry.core.config import Model
 from pixmetry.core.errors import InputError
 from pixmetry.files.raw_values import RawLayout
+from pixmetry.files.records import TARGETS
 
 CAMPAIGN_SCHEMA = "pixmetry/campaign/1"
 
@@ -85,12 +86,24 @@ class OpticsModel(Model):
 class GroupModel(Model):
     """Frames under one condition."""
 
-    kind: Literal["dark", "bright"]
-    exposure_s: Annotated[float, Field(ge=0)]
+    kind: Literal["dark", "bright", "edge"]
+    exposure_s: Annotated[float, Field(ge=0)] | None = None
     photons: Annotated[float, Field(ge=0)] | None = None
     irradiance_uw_per_cm2: Positive | None = None
     role: Literal["level", "stack"] | None = None
     files: Names
+
+    @model_validator(mode="after")
+    def _target(self) -> GroupModel:
+        if self.kind not in TARGETS:
+            if self.exposure_s is None:
+                raise InputError(f"a {self.kind} group without exposure time", allowed="0 or more seconds", remedy="add exposure_s")
+            return self
+        wrong = [name for name in ("photons", "irradiance_uw_per_cm2", "role") if getattr(self, name) is not None]
+        if wrong:
+            what = f"{wrong[0]} belongs to dark and bright frames, not to pictures of a target"
+            raise InputError(what, allowed="kind, exposure_s, files", remedy="delete it")
+        return self
 
     @model_validator(mode="after")
     def _light(self) -> GroupModel:

@@ -23,10 +23,11 @@ from pixmetry.core.number import ONE_SIDED_95, Estimates
 from pixmetry.core.threads import single_threaded_blas
 from pixmetry.observe import photon_transfer_model as model
 from pixmetry.observe.defects import find_defects, without_hot_pixels
+from pixmetry.observe.edges import Picture, edge_notes, find_edges
 from pixmetry.observe.histogram import HistogramAccumulator, code_errors, sweep_histogram
 from pixmetry.observe.linearity import Linearity
 from pixmetry.observe.moments import LevelSummary
-from pixmetry.observe.one_pass import Group, Level, photon_transfer, reduce_groups, refuse_copies
+from pixmetry.observe.one_pass import Group, Level, photon_transfer, reduce_groups, refuse_copies, without_levels
 from pixmetry.observe.patterns import find_phase_patterns
 from pixmetry.observe.photon_transfer_fit import fit_photon_transfer
 from pixmetry.observe.photon_transfer_levels import (
@@ -83,15 +84,19 @@ def observe(
     Raises
     ------
     MeasureError
-        If all bright frames are saturated, black or copies.
+        If there are no frames, or all bright frames are saturated, black or copies.
     """
     levels: dict[str, list[Level]] = {"dark": [], "bright": []}
     stacked: dict[str, list[Level]] = {"dark": [], "bright": []}
     stacks: dict[str, dict[float, _Stack]] = {"dark": {}, "bright": {}}
     histogram = HistogramAccumulator(bits)
+    pictures: list[Picture] = []
     shape = None
     for group, [(sums, found)] in reduce_groups(groups, bits, threads=threads, on_frames=on_frames):
         shape = found
+        if group.role == "target" and not isinstance(sums, LevelSummary):
+            pictures.append(Picture.of(group.kind, sums.moments, bits))
+            continue
         condition = (group.kind, group.role, group.exposure_s, group.photons)
         if isinstance(sums, LevelSummary):
             histogram.add_counts(sums.counts, dark=group.kind == "dark", level=condition)
@@ -104,9 +109,18 @@ def observe(
             if kept is None or sums.moments.n_frames > kept.moments.n_frames:
                 stack = sums.moments.result(group.exposure_s)
                 stacks[group.kind][group.exposure_s] = _Stack(stack, sums.spectra.result(stack.mean_map_dn))
+    edges = find_edges([p for p in pictures if p.kind == "edge"])
     levels = {kind: found or stacked[kind] for kind, found in levels.items()}  # where there are only stacks, these
+    if pictures and shape is not None and not (levels["dark"] or levels["bright"]):
+        return Observations(
+            photon_transfer=without_levels(shape, bits),
+            photon_transfer_fit=Estimates.empty(),
+            edges=edges,
+            temperature_c=temperature_c,
+            notes=tuple(edge_notes(edges)),
+        )
     counts = histogram.result()
-    notes = _code_notes(counts)
+    notes = [*_code_notes(counts), *edge_notes(edges)]
     sweep = [level.summary for level in levels["bright"]]
     dark, bright = _pair(list(stacks["dark"].values()), list(stacks["bright"].values()))
     dark_stack, bright_stack = (None if s is None else s.moments for s in (dark, bright))
@@ -134,6 +148,7 @@ def observe(
         defects=defects,
         patterns=patterns,
         code_errors=codes,
+        edges=edges,
         temperature_c=temperature_c,
         notes=tuple(notes),
     )

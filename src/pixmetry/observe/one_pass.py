@@ -30,8 +30,8 @@ def whole(frame: np.ndarray) -> np.ndarray:
 class Group:
     """Frames of one condition; a frame may be given as a function that fetches it, which is then called in a thread."""
 
-    kind: str  # "dark" or "bright"
-    role: str  # "level" or "stack"
+    kind: str  # "dark", "bright", or that of a target such as "edge"
+    role: str  # "level", "stack" or "target"
     exposure_s: float
     photons: float | None
     frames: Iterable[Frame]
@@ -186,6 +186,11 @@ def photon_transfer(dark: Sequence[Level], bright: Sequence[Level], shape: tuple
         raise MeasureError("no frames", where="photon transfer", remedy="add groups of two frames or more")
     tails = [level.summary.tail or tail_of_counts(level.summary.counts) for level in dark]
     return PhotonTransfer(_moments(bright), _moments(dark), shape, bits, np.array(tails).reshape(-1, 3))
+
+
+def without_levels(shape: tuple[int, int], bits: int) -> PhotonTransfer:
+    """The series of a camera of which there are only pictures of targets: no dark and no bright level."""
+    return PhotonTransfer(_moments([]), _moments([]), shape, bits, np.zeros((0, 3)))
 
 
 def _moments(levels: Sequence[Level]) -> LevelMoments:

@@ -59,7 +59,7 @@ class StackAccumulator(FrameMoments):
 class GroupReduction:
     """All accumulators of one group of frames; each frame is read once.
 
-    ``spectra`` is ``None`` for the short groups of an exposure series.
+    ``spectra`` is ``None`` for the short groups of an exposure series, and for pictures of targets.
     """
 
     moments: LevelAccumulator | StackAccumulator
@@ -74,12 +74,14 @@ class GroupReduction:
 
 
 def new_group(bits: int, kind: str, spectra_pairs: int = 8) -> GroupReduction:
-    """Empty accumulators for a group: ``kind`` is ``"level"`` (few frames of an exposure series) or ``"stack"`` (many)."""
+    """Empty accumulators for a group: a ``"level"`` (few frames of an exposure series), a ``"stack"`` (many), or a ``"target"`` (any)."""
     if kind == "level":
         return GroupReduction(LevelAccumulator(bits))
     if kind == "stack":
         return GroupReduction(StackAccumulator(bits), SpectraAccumulator(spectra_pairs))
-    raise InputError("no such kind of group", where="kind", value=kind, allowed="level, stack")
+    if kind == "target":
+        return GroupReduction(StackAccumulator(bits))
+    raise InputError("no such kind of group", where="kind", value=kind, allowed="level, stack, target")
 
 
 class Candidate(Protocol):

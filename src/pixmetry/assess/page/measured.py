@@ -89,12 +89,21 @@ SPATIAL = {
 }
 
 
+EDGES = {
+    "sfr50_x": Caption("Frequency of half response, along x"),
+    "sfr50_y": Caption("Frequency of half response, along y"),
+    "asymmetry_x": Caption("Asymmetry of the edge, along x"),
+    "asymmetry_y": Caption("Asymmetry of the edge, along y"),
+}
+
+
 def table(seen: Observations, standard: Results) -> dict[str, list[Row]]:
     """Rows by heading, in the order in which a data sheet gives them."""
     groups = {
         "Photon transfer": _rows(seen.photon_transfer_fit, TRANSFER, standard),
         "Fixed pattern": _rows(seen.spatial_fit, SPATIAL, standard),
         "Converter, defects, patterns": [*_codes(seen), *_defects(seen), *_patterns(seen)],
+        "Slanted edges": _rows(None if seen.edges is None else seen.edges.fit, EDGES),
         "By EMVA 1288 alone": [
             Row(title, key, PrintedNumber("", NONE, ""), "", said, "")
             for key, title in STANDARD_ONLY.items()

@@ -62,6 +62,7 @@ def page_of(assessment: Assessment) -> Page:
         budget_view.largest_section(budget),
         _plots(assessment),
         _values(assessment),
+        *_edges(assessment),
         budget_view.sources_section(budget, assessment.unmeasured),
         budget_view.sum_section(budget),
         _words(assessment),
@@ -80,6 +81,13 @@ def _plots(assessment: Assessment) -> Section:
     if noise := [p for name, p in pictures.items() if name not in TRANSFER]:
         section.add_section("Noise and fixed pattern", *noise)
     return section
+
+
+def _edges(assessment: Assessment) -> list[Section]:
+    from pixmetry.assess.page.edges import edges_section
+
+    found = assessment.observations.edges
+    return [] if found is None else [edges_section(found)]
 
 
 def _values(assessment: Assessment) -> Section:
@@ -114,7 +122,7 @@ def _facts(assessment: Assessment) -> list[tuple[str, str]]:
     pitch = "not given"
     if facts.pitch_x_um is not None:
         pitch = f"{facts.pitch_x_um:g} × {facts.pitch_y_um or facts.pitch_x_um:g} µm"
-    dark, bright = (sum(len(g.paths) for g in campaign.groups if g.kind == kind) for kind in ("dark", "bright"))
+    dark, bright, edge = (sum(len(g.paths) for g in campaign.groups if g.kind == kind) for kind in ("dark", "bright", "edge"))
     temperature = "not given" if facts.temperature_c is None else f"{significant(facts.temperature_c)} °C"
     return [
         *_named(assessment),
@@ -123,7 +131,7 @@ def _facts(assessment: Assessment) -> list[tuple[str, str]]:
         ("Pixel pitch", pitch),
         ("Interface, sensor", f"{facts.interface}, {facts.sensor.upper() if facts.sensor else 'sensor not given'}"),
         ("Temperature", temperature),
-        ("Frames read", f"{dark} dark, {bright} bright"),
+        ("Frames read", ", ".join([f"{dark} dark", f"{bright} bright", *([f"{edge} of edges"] if edge else [])])),
         ("Stored", _stored(assessment.observations.storage)),
         ("Assessed (UTC)", assessment.provenance["time_utc"].replace("T", " ")[:16]),
     ]
