@@ -1,73 +1,227 @@
-"""Correction of frames with what an assessment of their camera measured."""
+"""Correction of frames with what is known of their camera: measured by an assessment, or described."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from inspect import getdoc
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from pixmetry.camera.camera import Camera, load_camera
+from pixmetry.camera.camera import Camera, Element, load_camera
 from pixmetry.camera.conversions import SAMPLE, LineSources
 from pixmetry.camera.line import Line
+from pixmetry.camera.overrides import changed_camera, with_source
+from pixmetry.camera.provenance import MEASURED, TYPICAL
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.core.checksums import check_file, check_record
-from pixmetry.core.errors import InputError
+from pixmetry.core.errors import InputError, ParameterError
 from pixmetry.core.progress import Progress, no_progress
-from pixmetry.core.random import Grid
+from pixmetry.core.random import Grid, Streams
 from pixmetry.core.threads import imap_tiles
 from pixmetry.files import InputHashes, provenance_record, read_maps, staged_output, write_json
 from pixmetry.files.formats import is_frame
 from pixmetry.files.images import LoadedFrame, check_frame, load_frame, picture_files
 from pixmetry.files.raw_values import RawLayout, layout_of
+from pixmetry.observe.surface import fit_surface
 
-NOT_THE_CAMERA = ("optics",)  # light and lens of the campaign are not those of the frames to correct
+MAP_OF = {"sensor.dsnu": "dark_dn", "sensor.prnu": "prnu_rel", "sensor.defects": "defects"}  # maps in stored pixels and DN above black
+SUPPLY = {
+    "dark_dn": "dark frames: give some (--dark, in Python dark=)",
+    "prnu_rel": "frames of an even field: give some (--flat, in Python flat=)",
+    "defects": "a mask of the defect pixels: give one (--defects, in Python defects=)",
+}
+SURFACE_DEGREE, SMALLEST = 4, 12  # of the light of a flat field, and the rows and columns that it needs
+WHOLE_PX = 0.01  # by which a place on the pixel grid may be off
 
 
-def correct_signal(camera: Camera, signal: Signal, maps: Mapping[str, np.ndarray]) -> tuple[Signal, dict[str, str]]:
-    """Correct a batch of stored codes, source by source.
+@dataclass(frozen=True)
+class FrameCorrection:
+    """What was done about one error source.
+
+    Parameters
+    ----------
+    name, title : str
+        In the chain of the camera, and in words.
+    corrected : bool
+    text : str
+        What was done, or why nothing was.
+    does, leaves : str
+        How the correction works, and what it leaves.
+    noise_rel : float
+        By how much it raises white noise, on average over the frame; NaN where this was not computed.
+    """
+
+    name: str
+    title: str
+    corrected: bool
+    text: str
+    does: str = ""
+    leaves: str = ""
+    noise_rel: float = float("nan")
+
+    def to_record(self) -> dict[str, Any]:
+        """Plain record for JSON."""
+        noise = None if np.isnan(self.noise_rel) else self.noise_rel
+        record = {"title": self.title, "corrected": self.corrected, "text": self.text}
+        return record | ({"does": self.does, "leaves": self.leaves, "noise_rel": noise} if self.corrected else {})
+
+
+def correct_signal(
+    camera: Camera,
+    signal: Signal,
+    maps: Mapping[str, np.ndarray],
+    *,
+    only: Iterable[str] = (),
+    skip: Iterable[str] = (),
+    until: str | None = None,
+    weigh: bool = False,
+) -> tuple[Signal, tuple[FrameCorrection, ...]]:
+    """Correct a batch of stored codes, source by source, the last error first.
 
     Parameters
     ----------
     camera : Camera
-        With the measured parameters (the digital twin).
+        With the known parameters.
     signal : Signal
-        Codes.
+        Codes, in pixels as they are stored.
     maps : mapping of ndarray
-        Measured pixel by pixel: ``dark_dn``, ``prnu_rel``, ``defects``.
+        Known pixel by pixel: ``dark_dn``, ``prnu_rel``, ``defects``.
+    only, skip : iterable of str
+        Names of sources. The converter is always undone.
+    until : str, optional
+        Name of the source before which to stop: what is made of it is what that source put out.
+    weigh : bool
+        Whether to compute what each correction does to white noise, in as much time again.
 
     Returns
     -------
     Signal
         DN above black, float32.
-    dict
-        By source, what was done, or why nothing was.
+    tuple of FrameCorrection
     """
-    done: dict[str, str] = {}
-    for element in reversed(camera.active):  # the last error is taken out first
-        source = element.source
-        if source.stage in NOT_THE_CAMERA:
-            done[element.name] = "not corrected: these frames have another light and lens than the campaign"
-        elif source.correct is None:
-            done[element.name] = f"not corrected: {source.reasons['correct']}"
-        else:
-            try:
-                given = replace(signal, line=_rest_of_line(camera, element.name, done, signal))
-                corrected = source.correct(element.params, given, maps)
-                done[element.name] = "nothing to correct" if corrected is given else "corrected"
-                signal = replace(corrected, line=None)
-            except InputError as problem:
-                done[element.name] = f"not corrected: {problem}"
-    return signal, done
+    chosen = tuple(only), tuple(skip)
+    steps: list[FrameCorrection] = []
+    for element in reversed(camera.active):
+        if element.name == until:
+            break
+        why_not = _reason(element, maps, *chosen)
+        if why_not:
+            steps.append(FrameCorrection(element.name, element.source.title, False, why_not))
+            continue
+        done = {step.name for step in steps if step.corrected}
+
+        def undone(given: Signal, element: Element = element, done: frozenset[str] = frozenset(done)) -> Signal:
+            return _undone(camera, element, given, maps, done)
+
+        try:
+            corrected = undone(signal)
+            noise_rel = _noise_rel(undone, signal, corrected) if weigh and corrected is not signal else float("nan")
+            steps.append(_told(element, corrected is not signal, noise_rel))
+            signal = corrected
+        except (InputError, ParameterError) as problem:
+            steps.append(FrameCorrection(element.name, element.source.title, False, f"not corrected: {problem}"))
+    return signal, tuple(steps)
 
 
-def _rest_of_line(camera: Camera, name: str, done: Mapping[str, str], signal: Signal) -> Line | None:
+def _reason(element: Element, maps: Mapping[str, np.ndarray], only: tuple[str, ...], skip: tuple[str, ...]) -> str:
+    """Why a source is not corrected; empty where it is."""
+    source, named = element.source, element.name in only
+    needs = MAP_OF.get(source.id)
+    if source.correct is None:
+        return f"not corrected: {source.reasons['correct']}"
+    if source.produces is Kind.CODES:
+        return ""  # what goes on is in DN
+    if element.name in skip or (only and not named):
+        return "not corrected: left out, as asked"
+    if needs is not None and needs not in maps:
+        return f"not corrected: needs {SUPPLY[needs]}; an assessment of the camera measures it"
+    if source.stage == "optics" and element.known_from == MEASURED and not named:
+        return "not corrected: these frames have another light and lens than the campaign"
+    if element.known_from == TYPICAL and needs is None and not named:
+        return "not corrected: its parameters are only typical of such a camera; name it under `only` to correct it all the same"
+    return ""
+
+
+def _told(element: Element, changed: bool, noise_rel: float) -> FrameCorrection:
+    """What was done by the source's own words."""
+    source = element.source
+    if not changed:
+        return FrameCorrection(element.name, source.title, False, "nothing to correct")
+    text = "corrected by typical parameters" if element.known_from == TYPICAL and source.id not in MAP_OF else "corrected"
+    does = (getdoc(source.correct) or "").partition("\n")[0]
+    return FrameCorrection(element.name, source.title, True, text, does, source.leaves, noise_rel)
+
+
+def _undone(camera: Camera, element: Element, signal: Signal, maps: Mapping[str, np.ndarray], done: frozenset[str]) -> Signal:
+    """The signal without a source: in its own pixels, and in electrons where it works on those; the same object if nothing is to do."""
+    source = element.source
+    assert source.correct is not None
+    given = signal
+    if source.id not in MAP_OF and Kind.VIDEO not in source.consumes:
+        on_sensor = _on_grid_of(camera, element, signal)
+        if on_sensor is None and not _by_value(element):
+            raise InputError("the stored pixels are not those of the sensor: the frame grabber samples them anew, or stores other rows")
+        given = signal if on_sensor is None else on_sensor
+    gain = next((e.params.gain_dn_per_e for e in camera.active if e.source.id == "electronics.gain"), None)
+    in_electrons = gain and Kind.ELECTRONS in source.consumes and source.id not in MAP_OF and given.kind is Kind.DN
+    if in_electrons:
+        given = given.with_data((given.data / np.float32(gain)).astype(np.float32), Kind.ELECTRONS)
+    given = replace(given, line=_rest_of_line(camera, element.name, done, signal))
+    corrected = source.correct(element.params, given, maps)
+    if corrected is given or (source.neutral is not None and element.params == source.neutral and source.id not in MAP_OF):
+        return signal
+    data = corrected.data * np.float32(gain) if in_electrons else corrected.data
+    return signal.with_data(data, Kind.DN if in_electrons else corrected.kind)
+
+
+def _on_grid_of(camera: Camera, element: Element, signal: Signal) -> Signal | None:
+    """The stored pixels as a window of the frame that a source saw; None where they are no pixels of it."""
+    links = camera.links
+    at = next(i for i, link in enumerate(links) if link.name == element.name)
+    x = y = np.array([0.0, 1.0])
+    for link in links[at + 1 :]:
+        if link.source is SAMPLE:
+            x = link.params.line.placed(x)
+        elif link.source.place is not None:
+            x, y = link.source.place(link.params, x, y, link.shape, 0)
+    if abs(x[1] - x[0] - 1) > 1e-9 or abs(y[1] - y[0] - 1) > 1e-9 or max(abs(v[0] - np.rint(v[0])) for v in (x, y)) > WHOLE_PX:
+        return None
+    row0, col0, shape = -int(np.rint(y[0])), -int(np.rint(x[0])), links[at].shape_out
+    rows, cols = signal.data.shape[1:]
+    first, left = row0 + signal.grid.row0, col0 + signal.grid.col0
+    if (first < 0).any() or (left < 0).any() or (first + rows > shape[0]).any() or (left + cols > shape[1]).any():
+        return None
+    return replace(signal, grid=Grid(signal.grid.frame, first, left, (rows, cols)), frame_shape=shape)
+
+
+def _by_value(element: Element) -> bool:
+    """Whether a correction looks at each value alone: then the values of exchanged pixels are exchanged, and nothing else."""
+    assert element.source.correct is not None
+    ramp = (np.arange(48, dtype=np.float32) * 7 % 48 * 4).reshape(1, 6, 8)
+    one, exchanged = (_signal_of(data, (6, 8), Kind.DN) for data in (ramp, np.roll(ramp[:, ::-1, ::-1], 3, axis=2)))
+    try:
+        straight, turned = (element.source.correct(element.params, s, {}).data for s in (one, exchanged))
+    except (InputError, ParameterError):
+        return False
+    return bool(np.array_equal(np.roll(straight[:, ::-1, ::-1], 3, axis=2), turned))
+
+
+def _noise_rel(undone: Any, signal: Signal, corrected: Signal) -> float:
+    """What a correction makes of white noise of 1 DN: the standard deviation of the change that it brings, over the frame."""
+    noise = Streams(0, 0).of("noise of a correction").normal(signal.grid)
+    noisy = undone(signal.with_data((signal.data + noise).astype(np.float32)))
+    return float(np.std(noisy.data.astype(float) - corrected.data) / np.std(noise))
+
+
+def _rest_of_line(camera: Camera, name: str, done: frozenset[str], signal: Signal) -> Line | None:
     """The line that still acts on samples as they are stored, without the source of that name; None for one that is not on a line."""
     for i, link in enumerate(camera.links):
         if link.source is SAMPLE and name in (on_line.name for on_line in link.params.links):
-            others = [e for e in link.params.links if e.name != name and done.get(e.name) != "corrected"]
+            others = [e for e in link.params.links if e.name != name and e.name not in done]
             line = LineSources(tuple(others), link.params.pixel_hz).line_at(signal)
             first = np.zeros(1)  # sample of the line that is stored first
             for later in camera.links[i + 1 :]:
@@ -89,38 +243,70 @@ class Correction:
         The corrected frames, DN above black; None where they were written to files.
     output : Path, optional
         Their folder.
+    steps : tuple of FrameCorrection
+        What was done to the first frame, in this order, with what it leaves and what it does to noise.
+    clipped : ndarray of bool, shape (n, rows, cols), or None
+        Pixels that were stored at an end of the range: what is behind them is not known, and their values are limits.
+    clipped_pixels : int
+        How many these are, in all frames.
     """
 
     sources: Mapping[str, str]
     frames: np.ndarray | None = None
     output: Path | None = None
+    steps: tuple[FrameCorrection, ...] = ()
+    clipped: np.ndarray | None = None
+    clipped_pixels: int = 0
 
     def __repr__(self) -> str:
         done = [name for name, text in self.sources.items() if text.startswith("corrected")]
         return f"<Correction of {', '.join(done) or 'nothing'}; {len(self.sources) - len(done)} sources not corrected>"
 
+    @property
+    def noise_rel(self) -> float:
+        """By how much all corrections together raise white noise; NaN where it was not computed."""
+        known = [s.noise_rel for s in self.steps if s.corrected]
+        return float(np.prod(known)) if known else float("nan")
+
 
 def correct(
     frames: np.ndarray | str | Path | Sequence[str | Path],
-    results: str | Path,
+    with_: Camera | str | Path,
     output: str | Path | None = None,
     *,
+    dark: Any = None,
+    flat: Any = None,
+    defects: Any = None,
+    settings: Mapping[str, Any] | None = None,
+    only: Iterable[str] = (),
+    skip: Iterable[str] = (),
     raw: str | RawLayout | None = None,
     progress: Progress | None = None,
 ) -> Correction:
-    """Correct frames with the results of an assessment of their camera.
+    """Correct frames with what is known of their camera.
 
     Parameters
     ----------
     frames : ndarray, shape (rows, cols) or (n, rows, cols), or path or sequence of path
         Stored codes; or image files, folders of them, stores (``frames.zarr``) or single frames of a store (``frames.zarr/7``). The frames
         of a file with several are written one by one: ``stack.tif`` becomes ``stack_0.tif``, ``stack_1.tif`` …
-    results : path
-        ``results.json`` of the assessment, or its folder; ``camera.yaml`` and ``maps.zarr.zip`` stand beside it.
+    with_ : Camera or str or path
+        ``results.json`` of an assessment, or its folder (``camera.yaml`` and ``maps.zarr.zip`` stand beside it); or a camera, a camera
+        file, the name of a preset, or a data sheet.
     output : path, optional
         Folder for the corrected frames of files, under their own names as TIFF of 32-bit floats in DN above black (rounding them again
         would add noise, and clipping at black would cut it in half); ``correction.json`` says what was done. Needed for files, and for
         files only.
+    dark, flat : ndarray, shape (n, rows, cols), or path or sequence of path, optional
+        Dark frames, and frames of an even field, of this camera: their means take the place of its dark pattern and of its relative
+        response, which a description does not hold.
+    defects : ndarray of bool, shape (rows, cols), or path, optional
+        Mask of defect pixels; an image that is not 0 there.
+    settings : mapping, optional
+        Changes to the camera by name, such as ``exposure_s``, or a parameter such as ``sensor.smear.transfer_s``. A source that is not in
+        the camera is put into it.
+    only, skip : iterable of str
+        Names of sources. What is only typical of such a camera is corrected only if it is named; so is the light of a campaign.
     raw : str or RawLayout, optional
         Of files without a header: ``"1920x1200:Mono12p"``.
     progress : callable, optional
@@ -137,82 +323,248 @@ def correct(
 
     Examples
     --------
-    >>> import tempfile, numpy as np, pixmetry
-    >>> folder = tempfile.mkdtemp() + "/result"
-    >>> assessment = pixmetry.assess(output=folder, trials=0)  # of the packaged example
-    >>> frame = np.full((60, 60), 200, np.uint16)
-    >>> correction = correct(frame, folder)
-    >>> correction.frames.shape, correction.frames.dtype
-    ((1, 60, 60), dtype('float32'))
+    >>> import numpy as np, pixmetry
+    >>> camera = pixmetry.load_camera("ft_ccd_generic")
+    >>> frame = np.full(camera.output_shape, 200, np.uint16)
+    >>> correction = correct(frame, camera, settings={"sensor.smear.transfer_s": 0.001})
+    >>> correction.sources["sensor.smear"], correction.frames.shape == (1, *frame.shape)
+    ('corrected', True)
+    >>> print(correction.sources["sensor.dsnu"])
+    not corrected: needs dark frames: give some (--dark, in Python dark=); an assessment of the camera measures it
     """
     if isinstance(frames, np.ndarray):
         if output is not None:
             remedy = "leave output away, or name files"
             raise InputError("a folder for corrected frames goes with files, not with arrays", where="output", value=output, remedy=remedy)
-        return _correct_array(frames, *_load(Path(results)))
-    if output is None:
+    elif output is None:
         remedy = "name one, or give the frames as an array"
         raise InputError("the folder for the corrected frames is missing", where="output", remedy=remedy)
-    return _correct_files([frames] if isinstance(frames, str | Path) else frames, Path(results), Path(output), raw, progress)
+    layout = layout_of(raw)
+    known = known_of(with_, dark=dark, flat=flat, defects=defects, settings=settings, only=only, skip=skip, raw=layout)
+    if isinstance(frames, np.ndarray):
+        return _correct_array(frames, known)
+    assert output is not None
+    return _correct_files([frames] if isinstance(frames, str | Path) else frames, known, Path(output), layout, progress)
 
 
-def _correct_array(frames: np.ndarray, bits: int, camera: Camera, maps: Mapping[str, np.ndarray]) -> Correction:
+@dataclass(frozen=True)
+class Known:
+    """What is known of a camera, and what of it is wanted."""
+
+    camera: Camera
+    bits: int
+    maps: Mapping[str, np.ndarray]
+    only: tuple[str, ...] = ()
+    skip: tuple[str, ...] = ()
+    files: tuple[Path, ...] = ()
+
+    def corrected(self, frame: np.ndarray, weigh: bool = False) -> tuple[Signal, tuple[FrameCorrection, ...]]:
+        """A frame of codes without what is known."""
+        signal = _as_signal(frame, self.camera)
+        return correct_signal(self.camera, signal, self.maps, only=self.only, skip=self.skip, weigh=weigh)
+
+    def listed(self) -> tuple[FrameCorrection, ...]:
+        """What would be done to an even frame at half of the range."""
+        return self.corrected(np.full(self.camera.output_shape, 2 ** (self.bits - 1), np.uint8 if self.bits <= 8 else np.uint16), True)[1]
+
+
+def known_of(
+    with_: Camera | str | Path,
+    *,
+    dark: Any = None,
+    flat: Any = None,
+    defects: Any = None,
+    settings: Mapping[str, Any] | None = None,
+    only: Iterable[str] = (),
+    skip: Iterable[str] = (),
+    raw: RawLayout | None = None,
+) -> Known:
+    """What is known of a camera, for `correct`; parameters and errors are those of it."""
+    files: tuple[Path, ...] = ()
+    maps: dict[str, np.ndarray] = {}
+    bits: int | None = None
+    if isinstance(with_, Camera):
+        camera = with_
+    elif Path(with_).is_dir() or Path(with_).suffix.lower() == ".json":
+        bits, camera, maps = _load(Path(with_))
+        files = (Path(with_),)
+    else:
+        camera = load_camera(with_)
+        files = (Path(with_),) if Path(with_).is_file() else ()
+    for source_id in (
+        *(key.rpartition(".")[0] for key in settings or {}),
+        *(i for i, m in zip(MAP_OF, (dark, flat, defects), strict=True) if m is not None),
+    ):
+        camera = _with(camera, source_id)
+    camera = changed_camera(camera, settings)
+    known = Known(
+        camera, _bits_of(camera) if bits is None else bits, {**_own_maps(camera), **maps}, _names(camera, only), _names(camera, skip), files
+    )
+    return _with_maps(known, dark, flat, defects, raw)
+
+
+def _with(camera: Camera, name: str) -> Camera:
+    """The camera with a source that it does not hold, or that is off."""
+    there = [e.name for e in camera.chain if name in (e.name, e.source.id)]
+    if not there:
+        return with_source(camera, name) if name and "." in name else camera
+    return replace(camera, chain=tuple(replace(e, on=e.on or e.name in there) for e in camera.chain))
+
+
+def _names(camera: Camera, names: Iterable[str]) -> tuple[str, ...]:
+    found: list[str] = []
+    for name in names:
+        there = [e.name for e in camera.active if name in (e.name, e.source.id)]
+        if not there:
+            allowed = ", ".join(e.name for e in camera.active)
+            raise InputError(f"{camera.name} has no source named {name!r} that is on", allowed=allowed, remedy="take one of its own")
+        found += there
+    return tuple(found)
+
+
+def _bits_of(camera: Camera) -> int:
+    """Bits of the frames that a camera stores."""
+    told = camera.facts.get("bits") or next((e.params.bits for e in camera.active if e.source.produces is Kind.CODES), None)
+    if told is None:
+        remedy = "add `- source: grabber.adc` with its bits to the chain"
+        raise InputError("the camera has no converter: its frames are not whole numbers", where=camera.name, remedy=remedy)
+    return int(told)
+
+
+def _own_maps(camera: Camera) -> dict[str, np.ndarray]:
+    """Maps that were measured in the unit of a camera file."""
+    if camera.measured is None or camera.unit_seed != camera.measured.unit_seed or camera.output_shape != camera.measured.frame_shape:
+        return {}
+    found = {}
+    gain = next((e.params.gain_dn_per_e for e in camera.active if e.source.id == "electronics.gain"), None)
+    told = camera.truth()
+    for element in camera.active:
+        name = MAP_OF.get(element.source.id)
+        if name is None or not element.maps:
+            continue
+        own = told[element.name]
+        if name == "prnu_rel":
+            found[name] = own["prnu_rel"]
+        elif name == "defects":
+            found[name] = np.any([np.asarray(mask, bool) for mask in own.values()], axis=0)
+        elif gain is not None:
+            found[name] = own["dsnu_e"] * gain
+    return found
+
+
+def _with_maps(known: Known, dark: Any, flat: Any, defects: Any, raw: RawLayout | None) -> Known:
+    """The same with maps from frames."""
+    shape = known.camera.output_shape
+    for given, source_id, what in ((dark, "sensor.dsnu", "dark"), (flat, "sensor.prnu", "flat")):
+        if given is None:
+            continue
+        mean = _mean_frame(given, known, what, raw)
+        until = next(e.name for e in known.camera.active if e.source.id == source_id)
+        signal = _signal_of(mean[None], shape, Kind.CODES, known.camera)
+        found = correct_signal(known.camera, signal, known.maps, skip=known.skip, until=until)[0].data[0].astype(float)
+        if what == "flat":
+            light = fit_surface(found, SURFACE_DEGREE if min(shape) >= SMALLEST else 0).values
+            if light.min() <= 0:
+                remedy = "give frames of an even field, well above the dark"
+                raise InputError("the flat frames hold no light everywhere", where="flat", value=f"{light.min():.3g} DN", remedy=remedy)
+            found = np.maximum(found / light, 1e-3)
+        known = replace(known, maps={**known.maps, MAP_OF[source_id]: found.astype(np.float32)})
+    if defects is None:
+        return known
+    mask = np.asarray(defects) if isinstance(defects, np.ndarray) else load_frame(Path(defects), raw=raw).array
+    if mask.shape != shape:
+        raise InputError("the mask has another size than the frames", where="defects", value=mask.shape, allowed=str(shape))
+    return replace(known, maps={**known.maps, "defects": mask != 0})
+
+
+def _mean_frame(given: Any, known: Known, what: str, raw: RawLayout | None) -> np.ndarray:
+    """Mean of frames, in codes."""
+    shape = known.camera.output_shape
+    if isinstance(given, np.ndarray):
+        stack = given[None] if given.ndim == 2 else given
+        if stack.ndim != 3 or stack.shape[1:] != shape or not len(stack):
+            raise InputError("no frames of this camera", where=what, value=f"shape {given.shape}", allowed=f"(n, {shape[0]}, {shape[1]})")
+        return np.asarray(stack.mean(axis=0), np.float32)
+    files = picture_files([given] if isinstance(given, str | Path) else given, raw=raw)
+    total = np.zeros(shape)
+    for path in files:
+        frame = load_frame(path, raw=raw).array
+        check_frame(frame, str(path), bits=known.bits, shape=shape)
+        total += frame
+    return (total / len(files)).astype(np.float32)
+
+
+def _correct_array(frames: np.ndarray, known: Known) -> Correction:
     stack = frames[None] if frames.ndim == 2 else frames
     if stack.ndim != 3 or stack.dtype.kind not in "ui":
         allowed = "whole numbers of shape (rows, cols) or (n, rows, cols)"
         raise InputError("no frames of stored codes", where="frames", value=f"{frames.dtype} of shape {frames.shape}", allowed=allowed)
-    top = 2**bits - 1
+    top = 2**known.bits - 1
     if stack.size and (int(stack.min()) < 0 or int(stack.max()) > top):
         raise InputError("values that this camera cannot store", where="frames", value=int(stack.max()), allowed=f"0 to {top}")
-    stack = stack.astype(np.uint8 if bits <= 8 else np.uint16)
-    done: dict[str, list[str]] = {}
+    stack = stack.astype(np.uint8 if known.bits <= 8 else np.uint16)
+    said: list[tuple[FrameCorrection, ...]] = []
     out = np.empty(stack.shape, np.float32)
     for i, frame in enumerate(stack):
-        check_frame(frame, f"frames[{i}]", bits=bits, shape=camera.output_shape)
-        corrected, said = correct_signal(camera, _as_signal(frame, camera), maps)
+        check_frame(frame, f"frames[{i}]", bits=known.bits, shape=known.camera.output_shape)
+        corrected, steps = known.corrected(frame, weigh=i == 0)
         out[i] = corrected.data[0]
-        for name, text in said.items():
-            done.setdefault(name, []).append(text)
-    return Correction({name: _together(texts) for name, texts in done.items()}, out)
+        said.append(steps)
+    clipped = (stack == 0) | (stack == top)
+    return Correction(_together(said), out, steps=said[0] if said else (), clipped=clipped, clipped_pixels=int(clipped.sum()))
 
 
 def _correct_files(
-    frames: Sequence[str | Path], results: Path, output: Path, raw: str | RawLayout | None, progress: Progress | None
+    frames: Sequence[str | Path], known: Known, output: Path, layout: RawLayout | None, progress: Progress | None
 ) -> Correction:
     from tifffile import imwrite
 
-    bits, camera, maps = _load(results)
-    layout = layout_of(raw)
     files = _named_once(picture_files(frames, raw=layout))
     hashes = InputHashes(files[0].parent)
     told = progress or no_progress
-    done: dict[str, list[str]] = {}
+    top = 2**known.bits - 1
 
-    def work(path: Path) -> tuple[Path, LoadedFrame, np.ndarray, dict[str, str]]:
+    def work(path: Path) -> tuple[Path, LoadedFrame, np.ndarray, tuple[FrameCorrection, ...], int]:
         loaded = load_frame(path, raw=layout)
         frame = loaded.array
-        check_frame(frame, str(path), bits=bits, shape=camera.output_shape)
-        corrected, said = correct_signal(camera, _as_signal(frame, camera), maps)
-        return path, loaded, corrected.data[0], said
+        check_frame(frame, str(path), bits=known.bits, shape=known.camera.output_shape)
+        corrected, steps = known.corrected(frame, weigh=path == files[0])
+        return path, loaded, corrected.data[0], steps, int(((frame == 0) | (frame == top)).sum())
 
-    of = [results, *dict.fromkeys(path if path.is_dir() else path.parent for path in map(Path, frames))]
-    with staged_output(output, "correction", of, [*files, results]) as folder:
-        for i, (path, loaded, data, said) in enumerate(imap_tiles(work, files)):
-            for name, text in said.items():
-                done.setdefault(name, []).append(text)
+    said: list[tuple[FrameCorrection, ...]] = []
+    clipped: dict[str, int] = {}
+    of = [*known.files, *dict.fromkeys(path if path.is_dir() else path.parent for path in map(Path, frames))]
+    with staged_output(output, "correction", of, [*files, *known.files]) as folder:
+        for i, (path, loaded, data, steps, at_ends) in enumerate(imap_tiles(work, files)):
+            said.append(steps)
+            if at_ends:
+                clipped[path.name] = at_ends
             hashes.add(path, loaded.sha256, loaded.size_bytes)
             imwrite(folder / f"{_stem(path)}.tif", data.astype(np.float32))
             told("correcting frames", i + 1, len(files))
-        told_of = {name: _together(texts) for name, texts in done.items()}
-        write_json(
-            folder / "correction.json",
-            {"schema": "pixmetry/correction/1", "unit": "DN above black", "sources": told_of, "provenance": provenance_record(hashes)},
-        )
-    return Correction(told_of, output=output)
+        correction = Correction(_together(said), output=output, steps=said[0], clipped_pixels=sum(clipped.values()))
+        record = {
+            "schema": "pixmetry/correction/1",
+            "unit": "DN above black",
+            "sources": correction.sources,
+            "steps": {step.name: step.to_record() for step in correction.steps},
+            "noise_rel": None if np.isnan(correction.noise_rel) else correction.noise_rel,
+            "clipped_pixels": clipped,
+            "provenance": provenance_record(hashes),
+        }
+        write_json(folder / "correction.json", record)
+    return correction
 
 
-def _together(texts: Sequence[str]) -> str:
-    """What was done to all frames in a sentence, with the number of frames where it is not the same for all."""
+def _together(said: Sequence[tuple[FrameCorrection, ...]]) -> dict[str, str]:
+    """What was done to all frames in a sentence a source, with the number of frames where it is not the same for all."""
+    by_name: dict[str, list[str]] = {}
+    for step in (step for steps in said for step in steps):
+        by_name.setdefault(step.name, []).append(step.text)
+    return {name: _sentence(texts) for name, texts in by_name.items()}
+
+
+def _sentence(texts: Sequence[str]) -> str:
     counts = {text: texts.count(text) for text in dict.fromkeys(texts)}
     return texts[0] if len(counts) == 1 else "; ".join(f"{text} ({count} of {len(texts)} frames)" for text, count in counts.items())
 
@@ -260,6 +612,11 @@ def _stem(path: Path) -> str:
 
 
 def _as_signal(frame: np.ndarray, camera: Camera) -> Signal:
-    one = np.ones(1)
-    grid = Grid.whole([0], frame.shape)
-    return Signal(frame[None], Kind.CODES, grid, camera.output_shape, camera.exposure_s * one, 0 * one, camera.temperature_c * one)
+    return _signal_of(frame[None], camera.output_shape, Kind.CODES, camera)
+
+
+def _signal_of(data: np.ndarray, shape: tuple[int, int], kind: Kind, camera: Camera | None = None) -> Signal:
+    one = np.ones(len(data))
+    exposure_s, temperature_c = (0.01, 20.0) if camera is None else (camera.exposure_s, camera.temperature_c)
+    grid = Grid.whole([0] * len(data), data.shape[1:])
+    return Signal(data, kind, grid, shape, exposure_s * one, 0 * one, temperature_c * one)

@@ -112,6 +112,8 @@ class Source:
     equation, typical_size : str
         For the listing and the docs.
     references : tuple of str
+    leaves : str
+        What ``correct`` leaves of it, or adds.
     advice : str
         What to do about it when it is among the largest.
     reasons : mapping
@@ -154,6 +156,7 @@ class Source:
     start: Callable[[Any], Any] | None = None
     applies_to: tuple[str, ...] = ()
     option: str = ""
+    leaves: str = ""
     part_of: str = ""
     held_by: tuple[str, ...] = ()
     reasons: Mapping[str, str] = field(default_factory=dict)

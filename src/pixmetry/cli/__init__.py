@@ -39,7 +39,7 @@ COMMANDS = {
     "calibrate": "Calibrate a camera from images of a test field or from a table of image coordinates.",
     "bound": "Compute how well a target can be located (Cramér–Rao bound), and what limits it.",
     "budget": "Budget every error source of a camera for a measurement, before and after calibration.",
-    "correct": "Correct frames with the results of an assessment.",
+    "correct": "Correct frames for what is known of their camera, measured or described.",
     "corrected": "Correct positions for what is known of their camera's geometry.",
     "compare": "Compare measurements with each other, with a fleet of cameras, or with limits.",
     "warm-up": "Compile the kernels of all commands, so that no command waits for it later.",

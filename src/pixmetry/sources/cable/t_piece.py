@@ -122,6 +122,7 @@ SOURCE = Source(
     equation="y' = T [y + T' Γ_e Σ_k (Γ' Γ_e)^k y(t − (k+1)τ)],  T = 2Y_0/(Y_0 + Y_L + Y_b),  T' = 2Y_b/(Y_0 + Y_L + Y_b),  Γ' = T' − 1",
     typical_size="level 2/3 when terminated twice; an open stub of matched cable moves a target by τ/4: 0.036 px per metre at 14.19 MHz",
     references=("D. M. Pozar, Microwave Engineering, 4th ed., §2.3 and §4.1 (reflection, and junctions of lines)",),
+    leaves="detail that the bandwidth of the line has lost; noise, raised a little",
     advice="Remove T-pieces. Or loop the signal through inputs of high impedance, with one termination at the end of the line.",
     reasons={"measure": "needs the image of a sharp edge, and the level without the branch: dark and flat frames do not show them"},
 )

@@ -151,6 +151,7 @@ SOURCE = Source(
     equation="y' = (1 − ρ) Σ_k ρ^k y(t − kτ),  ρ = Γ_S Γ_L e^(−2αL),  τ = 2L/(0.66 c);  skin effect: e^(−√(sT))",
     typical_size="0.030 px for 5 m of 50 Ω cable between 75 Ω ends at 14.19 MHz",
     references=("D. M. Pozar, Microwave Engineering, 4th ed., §2.3 (reflection on a terminated line)",),
+    leaves="detail that the bandwidth of the line has lost; noise, raised a little",
     advice="Use 75 Ω cable with 75 Ω at both ends, short, without T-pieces; or a digital camera.",
     reasons={"measure": "needs the image of a sharp edge or line: dark and flat frames do not show it"},
 )

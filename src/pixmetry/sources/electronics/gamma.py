@@ -176,5 +176,6 @@ SOURCE = Source(
     equation="y = y_max (x/y_max)^γ,  γ = 0.45 or 1;  bt709: y/y_max = 1.099 (x/y_max)^γ − 0.099, below 0.018 4.5 x/y_max",
     typical_size="0.0017 px for 0.45 on a disc of 7 px, if the threshold follows the light",
     references=("ITU-R BT.709-6, item 1.2 (exponent 0.45, toe)", "EMVA 1288 R4.0 Linear, §6.7 (linearity error)"),
+    leaves="rounding, which is coarser where the curve is flat",
     advice="Set the camera to gamma 1. If this is impossible, apply the inverse curve before any other step.",
 )

@@ -120,6 +120,7 @@ SOURCE = Source(
     equation="y = x below s;  above: (1 + m + m_col) x + o + noise, in steps of the ratio;  knee: s + (1 + m)(x − s)",
     typical_size="below 0.002 px for 2 % of mismatch on a disc of 7 px",
     references=("EMVA 1288 R4.0 General (cameras with a non-linear response)",),
+    leaves="pixels near the switch that were read on the other side of it by noise",
     advice="Expose so that the whole target is below or above the change of gain. Calibrate the ratio of the gains column by column.",
     reasons={"measure": "needs flat fields at fine steps of light below and above the change of gain, and its known level"},
 )

@@ -110,5 +110,6 @@ SOURCE = Source(
     equation="y = x (1 + a1 w + a2 w² + a3 w³),  w = x/x_ref",
     typical_size="below 0.001 px for 2 % on a disc of 7 px",
     references=("EMVA 1288 R4.0 Linear, §6.7 (linearity error)", "F. Wang, A. Theuwissen, Electronic Imaging 2017 (CMOS non-linearity)"),
+    leaves="the deviation of the real curve from the polynomial",
     advice="Stay below 80 % of saturation; correct with the measured curve.",
 )

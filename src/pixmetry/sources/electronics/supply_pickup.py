@@ -162,6 +162,7 @@ SOURCE = Source(
         "EMVA 1288 R4.0 Linear, §8.4 (spectrograms show periodic disturbances)",
         "C. E. Shannon, Proc. IRE 37, 1949, 10 (sampling: the frequency that is seen)",
     ),
+    leaves="what is below the noise of the background, and the same wave in the scene itself",
     advice=(
         "Filter and shield the supply. Against mains, choose a frame rate at which the stripes roll, and average over a "
         "beat. A known frequency can be fitted and subtracted in every frame."

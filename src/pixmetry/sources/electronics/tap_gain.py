@@ -123,6 +123,7 @@ SOURCE = Source(
     equation="y = x (1 ± Δg/2 ± Δg_oe/2 + g1 x/x_ref)",
     typical_size="(D/3π) Δg = 0.74 px · Δg for a border through a disc of 7 px: 0.007 px for 1 %",
     references=("ISO 14524:2009 (opto-electronic conversion function)", "EMVA 1288 R4.0 Linear, §8.2 (column split)"),
+    leaves="the deviation of the taps' real curves from the model",
     advice="Balance the taps with a flat field: one gain for each tap, from the means of the columns on both sides of the border.",
     reasons={"measure": "not measured: needs the column means of a bright stack beside each border; the PRNU contains the stripes"},
 )

@@ -195,6 +195,7 @@ SOURCE = Source(
     equation="code = #{k : T_k ≤ (1 + g) y + b},  T_k = k − 1/2 + A sin(2πm k/2^bits) + (s_DNL/√2) n_k;  σ² = 1/12 + s_DNL²/2 + (j dy/dc)²",
     typical_size="0.003 px at 8 bit on a disc of 7 px of 150 DN (centroid)",
     references=("IEEE Std 1241-2010, §4 (code transition levels, DNL, INL)", "EMVA 1288 R4.0 Linear, §2.2 (σ_q² = 1/12)"),
+    leaves="the rounding, and errors of single codes",
     advice="Use the whole range of the converter. Keep at least 0.5 DN of noise as dither, or take a converter with more bits.",
     reasons={"neutral": "it turns the analogue signal into whole codes, and this always rounds"},
 )

@@ -149,6 +149,7 @@ SOURCE = Source(
     equation="y' = y − s + b + d (T − T_0) + s_n n_r,  ds/dt = (y − s)/τ,  s at a line's start: (1 − k) of the line before",
     typical_size="with black 6 DN below the first code a Gaussian spot (σ = 1.5 px, 150 DN) swings by 0.0075 px over the pixel",
     references=("EMVA 1288 R4.0 Linear, §6.1 (black level: at most 0.5 % of the pixels at code 0)",),
+    leaves="the noise of the lines' black level",
     advice="Set black at least three standard deviations of the noise above code 0. Subtract it, and use a soft threshold.",
     reasons={
         "measure": "dark frames show it in the black level of grabber.adc and in electronics.row_noise, and cannot separate it from these"

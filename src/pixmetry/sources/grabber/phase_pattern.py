@@ -123,5 +123,6 @@ SOURCE = Source(
     equation="y' = y + A sin(2π(ν_x c + ν_y r) + φ_frame)",
     typical_size="0.04 px per DN at 0.05 cycles per pixel, 0.002 px at 0.42, on a disc of 7 px of 150 DN (centroid, window radius 6)",
     references=("EMVA 1288 R4.0 Linear, §8.4 (spectrograms)", "A. Schuster, Terr. Magn. 3, 1898, 13 (periodogram)"),
+    leaves="what is below the noise of the background, and the same wave in the scene itself",
     advice="Find the source by its frequency and shield it, synchronise the clocks, or fit and subtract the wave in every frame.",
 )

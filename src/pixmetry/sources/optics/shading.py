@@ -124,5 +124,6 @@ SOURCE = Source(
     equation="µ' = µ (1 + g_x (x − x_c) + g_y (y − y_c) − k (r² − ⟨r²⟩)/r_corner²);  Δx = g ⟨x²⟩",
     typical_size="0.004 to 0.011 px for 0.1 to 0.3 % per px on a disc of 7 px (centroid)",
     references=("ISO 17957:2015 (shading)", "JCGM 100:2008, 5.1.2"),
+    leaves="the noise of dim corners, raised with the signal; light from another lamp or lens is shaded in another way",
     advice="Light the object evenly, stop the lens down, and divide by a flat field.",
 )

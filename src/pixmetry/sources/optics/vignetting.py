@@ -62,6 +62,7 @@ SOURCE = Source(
     equation="µ' = µ cos⁴θ · (2/π)(acos s − s √(1 − s²)),  tan θ = r/c,  s = s_corner r/r_corner;  Δx = g ⟨x²⟩",
     typical_size="0.004 to 0.011 px for 0.1 to 0.3 % per px on a disc of 7 px (centroid)",
     references=("ISO 17957:2015 (shading)", "M. Reiss, The cos⁴ law of illumination, JOSA 35 (1945) 283–288"),
+    leaves="the noise of the corners, raised with the signal",
     advice="Stop the lens down, take a lens with a longer focal length, or divide by a flat field.",
     reasons={"measure": "a flat field shows the sum of all shading, which optics.shading measures"},
 )

@@ -99,6 +99,7 @@ SOURCE = Source(
     equation="µ' = µ τ_colour(row mod 2, col mod 2)",
     typical_size="0.01 px unbalanced on a disc of 7 px; none for a grey scene once the colours are balanced",
     references=("B. E. Bayer, US patent 3 971 065, 1976", "H. S. Malvar, L. He, R. Cutler, ICASSP 2004 (layout of the mosaic)"),
+    leaves="the colour of scenes that are not grey, as a pattern of the mosaic; more noise in the weak colours",
     advice="Use a monochrome sensor. Otherwise balance the colours of the raw mosaic, and locate targets in it without interpolation.",
     reasons={"measure": "not measured: needs the means of a grey flat field at the four positions of the pattern; the PRNU contains them"},
 )

@@ -102,6 +102,7 @@ SOURCE = Source(
         "P. Antilogus et al., JINST 9, C03048, 2014 (borders that move with the charge)",
         "P. Astier et al., A&A 629, A36, 2019 (its photon transfer)",
     ),
+    leaves="what charge moves beyond the reach of the model; full pixels, whose charge is not known",
     advice="Calibrate and measure at the same brightness. Correct in electrons with the measured loss of area.",
     reasons={"measure": "needs the covariances of neighbouring pixels in pairs of flat fields at several levels"},
 )

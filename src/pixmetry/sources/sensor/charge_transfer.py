@@ -325,6 +325,7 @@ SOURCE = Source(
         "R. Massey et al., MNRAS 401, 371, 2010 (trails and their iterative removal)",
         "R. Massey et al., MNRAS 439, 887, 2014 (traps filled up to the height of the packet)",
     ),
+    leaves="the noise of the transfer, and traps that the model does not hold",
     advice="Clock more slowly, keep a background of some hundred electrons, and correct with the measured inefficiency.",
     reasons={"measure": "needs overscan pixels, or one target at many distances from the output: dark and flat frames do not show it"},
 )

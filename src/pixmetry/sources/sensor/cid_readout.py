@@ -142,6 +142,7 @@ SOURCE = Source(
     equation="σ² = σ_read²/N + σ_floor²;  y = q + κ_r ⟨q⟩_row + κ_c ⟨q⟩_col;  q(t) joined by r q(t−1)",
     typical_size="0.003 px for 16 reads of 200 e- on a disc of 7 px at 15 000 electrons",
     references=("J. R. Janesick, Scientific Charge-Coupled Devices, SPIE Press 2001, ch. 6 (averaging of samples)",),
+    leaves="the noise of the reset and of the lines",
     advice="Increase the number of reads until the noise falls no further. Clear twice after a bright frame.",
     reasons={"measure": "needs the noise at several numbers of reads, and one bright spot on a dark field for the cross-talk"},
 )

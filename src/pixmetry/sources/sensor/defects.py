@@ -493,5 +493,6 @@ SOURCE = Source(
     equation="hot: n + m e^(s z);  dead: g n;  cold: n − c;  response: (1 + r z) n;  noisy: n + s z;  one pixel of error v: Δ = v d/S",
     typical_size="0.03 px for one pixel that is 50 DN off at the edge of a disc of 7 px",
     references=("EMVA 1288 R4.0 Linear, §8.4 (defect pixels)",),
+    leaves="detail of the scene at the replaced pixels",
     advice="List the defects and leave them out of the fit, or replace them by the median of their neighbours.",
 )

@@ -107,5 +107,6 @@ SOURCE = Source(
     equation="n' = n + s_pixel n_rc + s_row n_r + s_col n_c",
     typical_size="0.0055 px per DN of pixel DSNU on a disc of 7 px in a window of radius 6 px (centroid)",
     references=("EMVA 1288 R4.0 Linear, §8.2, eq. 33–42, 66", "JCGM 102:2011, 6.2.1.3"),
+    leaves="the noise of the dark frame, and dark current of another exposure time or temperature",
     advice="Subtract the mean of L dark frames; noise/√L remains.",
 )

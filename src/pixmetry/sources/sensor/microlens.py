@@ -47,6 +47,7 @@ SOURCE = Source(
     equation="µ' = µ exp(−(θ − θ_design)²/(2 θ₀²)),  tan θ = tan θ_corner · r/r_corner;  Δx = g ⟨x²⟩",
     typical_size="0.0036 px for a gradient of 0.1 % per px on a disc of 7 px (centroid)",
     references=("P. B. Catrysse, B. A. Wandell, Optical efficiency of image sensor pixels, JOSA A 19 (2002) 1610–1620", "EMVA 1288 R4.0"),
+    leaves="the noise of the corners, raised with the signal",
     advice="Use a lens with an exit pupil that matches the sensor. Calibrate and take flat fields at the working aperture.",
     reasons={"measure": "a flat field shows the sum of all shading, which optics.shading measures"},
 )

@@ -80,6 +80,7 @@ SOURCE = Source(
     equation="I(r) = E t_exp + PLS E (t_wait + r t_row)",
     typical_size="28 % from the first to the last row at 1/700, 20 ms of read-out and 0.1 ms of exposure: 0.0005 px on a disc of 7 px",
     references=("S. Lauxtermann et al., Int. Image Sensor Workshop 2007 (comparison of global shutter pixels)",),
+    leaves="ghosts of targets that moved while rows waited",
     advice="Use a strobe as the only light, or expose longer.",
     reasons={
         "measure": "needs frames of the shortest exposure under steady light: their slope along the rows",

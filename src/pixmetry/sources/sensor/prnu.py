@@ -109,5 +109,6 @@ SOURCE = Source(
     equation="µ' = µ (1 + s_pixel n_rc + s_row n_r + s_col n_c)",
     typical_size="0.0023 px per 1 % of pixel PRNU on a disc of 7 px (centroid)",
     references=("EMVA 1288 R4.0 Linear, §8.2, eq. 33–42, 67", "JCGM 100:2008, 5.1.2"),
+    leaves="the noise of the flat field, and response to light of another colour",
     advice="Divide the frames by a flat field of at least L = 10 (σ / (µ PRNU))² frames.",
 )

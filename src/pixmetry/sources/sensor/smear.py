@@ -117,6 +117,7 @@ SOURCE = Source(
         "F. A. Iglesias, A. Feller, K. Nagaraju, Appl. Opt. 54, 5970, 2015 (smear of shutterless sensors and its removal)",
         "J. R. Janesick, Scientific Charge-Coupled Devices, SPIE Press 2001",
     ),
+    leaves="the noise of the smear's charge, and light that has changed since",
     advice="Use a strobe, a shutter or an interline sensor. Or subtract the streak that covered rows show.",
     reasons={
         "measure": "needs covered rows above and below the image, or one bright target on black",
