@@ -51,3 +51,15 @@ def test_what_is_no_frame_is_told(result: Path, files: list[Path], tmp_path: Pat
         pixmetry.correct(frame, result, tmp_path / "out")
     with pytest.raises(InputError, match="folder for the corrected frames is missing"):
         pixmetry.correct(files, result)
+
+
+def test_the_camera_file_of_a_unit_brings_its_maps(result: Path) -> None:
+    """The maps of the digital twin are those of the results, with the spread that noise adds to these taken out."""
+    paths = [path for path in pixmetry.load_campaign().files if path.suffix == ".png"]
+    frame = max((pixmetry.read_frame(path)[None] for path in paths), key=lambda data: data.mean() * (data.max() < 250))
+    measured, described = pixmetry.correct(frame, result), pixmetry.correct(frame, result / "camera.yaml")
+    for name in ("sensor.dsnu", "sensor.prnu"):
+        assert measured.sources[name] == described.sources[name] == "corrected"
+    taken = [(c.frames - frame).ravel() for c in (measured, described)]
+    assert np.corrcoef(*taken)[0, 1] > 0.3  # of 3600 pixels: 0.017 by chance
+    assert np.std(taken[1]) < np.std(taken[0])

@@ -35,6 +35,9 @@ SUPPLY = {
     "defects": "a mask of the defect pixels: give one (--defects, in Python defects=)",
 }
 SURFACE_DEGREE, SMALLEST = 4, 12  # of the light of a flat field, and the rows and columns that it needs
+LEAST_RESPONSE = 0.1  # of a pixel that is divided by it; one with less is a defect
+BY_VALUE = ("electronics.gamma", "electronics.hdr_gain", "electronics.nonlinearity")  # ask for no place
+HIDDEN_BY = {"sensor.bayer_mosaic": "processing.demosaic"}  # what is not there any more behind another source
 WHOLE_PX = 0.01  # by which a place on the pixel grid may be off
 
 
@@ -120,7 +123,7 @@ def correct_signal(
         try:
             corrected = undone(signal)
             noise_rel = _noise_rel(undone, signal, corrected) if weigh and corrected is not signal else float("nan")
-            steps.append(_told(element, corrected is not signal, noise_rel))
+            steps.append(_told(element, corrected is not signal, noise_rel, _since(camera, element)))
             signal = corrected
         except (InputError, ParameterError) as problem:
             steps.append(FrameCorrection(element.name, element.source.title, False, f"not corrected: {problem}"))
@@ -146,12 +149,24 @@ def _reason(element: Element, maps: Mapping[str, np.ndarray], only: tuple[str, .
     return ""
 
 
-def _told(element: Element, changed: bool, noise_rel: float) -> FrameCorrection:
+def _since(camera: Camera, element: Element) -> str:
+    """What has changed the values since and cannot be undone, in words; empty if nothing has."""
+    at = next(i for i, link in enumerate(camera.links) if link.name == element.name)
+    later = camera.links[at + 1 :]
+    mixed = [link.name for link in later if link.source.stage in ("processing", "storage") and link.source.correct is None]
+    if Kind.VIDEO not in element.source.consumes and any(link.source is SAMPLE and not link.params.line.plain for link in later):
+        mixed.insert(0, "the video line")
+    return ", ".join(mixed)
+
+
+def _told(element: Element, changed: bool, noise_rel: float, since: str) -> FrameCorrection:
     """What was done by the source's own words."""
     source = element.source
     if not changed:
         return FrameCorrection(element.name, source.title, False, "nothing to correct")
     text = "corrected by typical parameters" if element.known_from == TYPICAL and source.id not in MAP_OF else "corrected"
+    if since and source.id not in MAP_OF:
+        text += f", as far as it is not changed since by {since}"
     does = (getdoc(source.correct) or "").partition("\n")[0]
     return FrameCorrection(element.name, source.title, True, text, does, source.leaves, noise_rel)
 
@@ -160,10 +175,12 @@ def _undone(camera: Camera, element: Element, signal: Signal, maps: Mapping[str,
     """The signal without a source: in its own pixels, and in electrons where it works on those; the same object if nothing is to do."""
     source = element.source
     assert source.correct is not None
-    given = signal
+    given, hidden_by = signal, HIDDEN_BY.get(source.id)
+    if any(e.source.id == hidden_by for e in camera.active):
+        raise InputError(f"{hidden_by} has changed the pixels since, and cannot be undone")
     if source.id not in MAP_OF and Kind.VIDEO not in source.consumes:
         on_sensor = _on_grid_of(camera, element, signal)
-        if on_sensor is None and not _by_value(element):
+        if on_sensor is None and source.id not in BY_VALUE:
             raise InputError("the stored pixels are not those of the sensor: the frame grabber samples them anew, or stores other rows")
         given = signal if on_sensor is None else on_sensor
     gain = next((e.params.gain_dn_per_e for e in camera.active if e.source.id == "electronics.gain"), None)
@@ -196,18 +213,6 @@ def _on_grid_of(camera: Camera, element: Element, signal: Signal) -> Signal | No
     if (first < 0).any() or (left < 0).any() or (first + rows > shape[0]).any() or (left + cols > shape[1]).any():
         return None
     return replace(signal, grid=Grid(signal.grid.frame, first, left, (rows, cols)), frame_shape=shape)
-
-
-def _by_value(element: Element) -> bool:
-    """Whether a correction looks at each value alone: then the values of exchanged pixels are exchanged, and nothing else."""
-    assert element.source.correct is not None
-    ramp = (np.arange(48, dtype=np.float32) * 7 % 48 * 4).reshape(1, 6, 8)
-    one, exchanged = (_signal_of(data, (6, 8), Kind.DN) for data in (ramp, np.roll(ramp[:, ::-1, ::-1], 3, axis=2)))
-    try:
-        straight, turned = (element.source.correct(element.params, s, {}).data for s in (one, exchanged))
-    except (InputError, ParameterError):
-        return False
-    return bool(np.array_equal(np.roll(straight[:, ::-1, ::-1], 3, axis=2), turned))
 
 
 def _noise_rel(undone: Any, signal: Signal, corrected: Signal) -> float:
@@ -453,8 +458,13 @@ def _own_maps(camera: Camera) -> dict[str, np.ndarray]:
 
 
 def _with_maps(known: Known, dark: Any, flat: Any, defects: Any, raw: RawLayout | None) -> Known:
-    """The same with maps from frames."""
+    """The same with maps from frames: the mask first, so that the others are without defects."""
     shape = known.camera.output_shape
+    if defects is not None:
+        mask = np.asarray(defects) if isinstance(defects, np.ndarray) else load_frame(Path(defects), raw=raw).array
+        if mask.shape != shape:
+            raise InputError("the mask has another size than the frames", where="defects", value=mask.shape, allowed=str(shape))
+        known = replace(known, maps={**known.maps, "defects": mask != 0})
     for given, source_id, what in ((dark, "sensor.dsnu", "dark"), (flat, "sensor.prnu", "flat")):
         if given is None:
             continue
@@ -463,18 +473,19 @@ def _with_maps(known: Known, dark: Any, flat: Any, defects: Any, raw: RawLayout 
         signal = _signal_of(mean[None], shape, Kind.CODES, known.camera)
         found = correct_signal(known.camera, signal, known.maps, skip=known.skip, until=until)[0].data[0].astype(float)
         if what == "flat":
-            light = fit_surface(found, SURFACE_DEGREE if min(shape) >= SMALLEST else 0).values
-            if light.min() <= 0:
-                remedy = "give frames of an even field, well above the dark"
-                raise InputError("the flat frames hold no light everywhere", where="flat", value=f"{light.min():.3g} DN", remedy=remedy)
-            found = np.maximum(found / light, 1e-3)
+            found = _response_of(found)
         known = replace(known, maps={**known.maps, MAP_OF[source_id]: found.astype(np.float32)})
-    if defects is None:
-        return known
-    mask = np.asarray(defects) if isinstance(defects, np.ndarray) else load_frame(Path(defects), raw=raw).array
-    if mask.shape != shape:
-        raise InputError("the mask has another size than the frames", where="defects", value=mask.shape, allowed=str(shape))
-    return replace(known, maps={**known.maps, "defects": mask != 0})
+    return known
+
+
+def _response_of(flat_dn: np.ndarray) -> np.ndarray:
+    """Relative response of every pixel, by the mean frame of an even field over its smooth light; 1 for pixels that hardly respond."""
+    light = fit_surface(flat_dn, SURFACE_DEGREE if min(flat_dn.shape) >= SMALLEST else 0).values
+    if light.min() <= 0:
+        remedy = "give frames of an even field, well above the dark"
+        raise InputError("the flat frames hold no light everywhere", where="flat", value=f"{light.min():.3g} DN", remedy=remedy)
+    response = flat_dn / light
+    return np.where(response < LEAST_RESPONSE, 1.0, response)
 
 
 def _mean_frame(given: Any, known: Known, what: str, raw: RawLayout | None) -> np.ndarray:

@@ -9,6 +9,7 @@ from typing import Any
 
 from pixmetry.camera.camera import Camera, Element, in_order, pitch_values
 from pixmetry.camera.catalogue import get_source, sources
+from pixmetry.camera.signal import Kind
 from pixmetry.core.errors import InputError
 
 PERIOD = "frame_period_s"  # stands among the facts of a camera
@@ -98,7 +99,10 @@ def with_source(camera: Camera, source_id: str) -> Camera:
         If there is no such source, or it cannot stand in this chain.
     """
     source = get_source(source_id)
-    known = pitch_values(camera.pitch_um)
+    known: dict[str, float] = pitch_values(camera.pitch_um)
+    bits = next((e.params.bits for e in camera.active if e.source.produces is Kind.CODES), None)
+    if bits is not None:
+        known |= {"bits": bits, "reference_dn": 2.0**bits - 1}
     none = {} if source.neutral is None else source.neutral.model_dump()
     params = source.make({**none, **{name: value for name, value in known.items() if name in source.parameters.model_fields}})
     order = [s.id for s in in_order([*(e.source for e in camera.chain), source])]

@@ -10,7 +10,7 @@ import click
 from pixmetry.cli._console import echo
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from pixmetry.assess.correct import FrameCorrection
 
@@ -86,7 +86,7 @@ def correct(
     echo(f"corrected frames: {output}")
 
 
-def print_steps(steps: Sequence[FrameCorrection], sources: dict[str, str] | None = None) -> None:
+def print_steps(steps: Sequence[FrameCorrection], sources: Mapping[str, str] | None = None) -> None:
     """What was done, in its order, what it leaves and what it does to noise; and what was not done, with the reason."""
     for step in steps:
         text = (sources or {}).get(step.name, step.text)

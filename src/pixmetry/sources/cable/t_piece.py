@@ -71,7 +71,7 @@ def forward(params: TPiece, signal: Signal, stream: Stream) -> Signal:
 
 
 def correct(params: TPiece, signal: Signal, maps: Mapping[str, np.ndarray]) -> Signal:
-    """Bring the level back and take the echoes out, with the filters of the line that the signal names: see `cable._undo`."""
+    """Bring the level back and take the echoes out, behind the other filters of the line (`cable._undo`)."""
     if params.branch == "none":
         return signal
     return without(signal, lambda line: line.echoed(*echoes(params)))

@@ -93,7 +93,7 @@ def _through(params: Termination, line: Line) -> Line:
 
 
 def correct(params: Termination, signal: Signal, maps: Mapping[str, np.ndarray]) -> Signal:
-    """Take echoes and skin effect out, with the filters of the line that the signal names: see `cable._undo`."""
+    """Take echoes and skin effect out, behind the other filters of the line (`cable._undo`)."""
     if abs(params.ghost) < 1e-12 and not params.skin_db:
         return signal
     return without(signal, lambda line: _through(params, line))
