@@ -332,3 +332,55 @@ def test_positions_where_the_camera_shows_nothing_stay_and_are_told() -> None:
     found = pixmetry.corrected([[1200.0, 1000.0], [1e7, 1e7], [np.nan, 3.0]], camera)
     assert np.isfinite(found.x_px[0]) and np.isnan(found.x_px[2])
     assert len(found.columns["x_px"]) == 3
+
+
+def test_what_changes_from_image_to_image_is_fitted_to_reference_positions(rng: np.random.Generator, tmp_path: Path) -> None:
+    """A grabber of unknown warm-up: scales of three images by nine of 30 targets; the others are right within the stated covariance."""
+    camera = load_camera(ANALOGUE).switched(off=["sensor.thermal_expansion"])
+    x, y = points(camera)
+    u, rows = 0.01, []
+    for image in range(3):
+        seen = camera.true_positions(x, y, frame=9000 * image)
+        noise = u * rng.standard_normal((2, len(x)))
+        rows += [(f"im{image}", f"p{k}", *v) for k, v in enumerate(zip(*(np.stack(seen) + noise), strict=True))]
+    image, point, px, py = (list(v) for v in zip(*rows, strict=True))
+    n = len(rows)
+    table = {"image": image, "point": point, "x_px": px, "y_px": py, "u_x_px": np.full(n, u), "u_y_px": np.full(n, u)}
+    control = {"point": [f"p{k}" for k in range(9)], "x_px": x[:9], "y_px": y[:9]}
+    unaware = camera.switched(off=["grabber.clock_warm_up"])
+    plain, found = (pixmetry.corrected(table, unaware, reference=r) for r in (None, control))
+    free = np.array([int(p[1:]) >= 9 for p in point])
+    aim = np.stack([np.tile(x, 3), np.tile(y, 3)], 1)
+    before, left = (np.stack([c.x_px, c.y_px], 1) - aim for c in (plain, found))
+    assert np.abs(before[free, 0]).mean() > 1 > 0.12 > np.abs(left[free]).max()  # 126 numbers of u 0.018 px at most
+    z2 = (left[free, 0] ** 2 / found.covariance_px2[free, 0]).mean()
+    # 63 normal scores, of which the fits correlate some: a mean square of 1 to 6 x sqrt(2/63) x 1.3
+    assert abs(z2 - 1) < 6 * 1.3 * np.sqrt(2 / 63) and z2 > 0.2
+    assert np.all(found.covariance_px2[:, 0] > plain.covariance_px2[:, 0])
+    assert found.causes.count("per image: scale") == 12 and "im2" in found.notes[-1]
+    wide = pixmetry.corrected(table, unaware, reference=control, u={"grabber.sampling_clock.clock_mhz": 0.01})
+    alone = wide.effects_px[list(wide.causes).index("grabber.sampling_clock")]
+    assert np.abs(alone[:, 0]).max() < 0.01  # a wrong clock is a scale, which every image tells
+    few = pixmetry.corrected(table, unaware, reference={"point": ["p1"], "x_px": x[1:2], "y_px": y[1:2]})
+    assert "too few" in few.notes[-1] and few.x_px == pytest.approx(plain.x_px)
+    with pytest.raises(InputError, match="no column names"):
+        pixmetry.corrected(table, unaware, reference={"spot": ["a"], "x_px": [1.0], "y_px": [2.0]})
+    with pytest.raises(InputError, match="no target of the table"):
+        pixmetry.corrected(table, unaware, reference={"point": ["a"], "x_px": [1.0], "y_px": [2.0]})
+
+
+def test_the_pose_of_a_stabilised_sensor_is_fitted(rng: np.random.Generator) -> None:
+    camera = with_source(load_camera(DIGITAL), "sensor.stabilisation")
+    camera = camera.with_parameters("sensor.stabilisation", shift_std_px=0.5, roll_std_rad=1e-3)
+    x, y = points(camera, 12)
+    seen = np.stack(camera.true_positions(x, y, frame=4)) + 0.005 * rng.standard_normal((2, 12))
+    names = [f"t{k}" for k in range(12)]
+    found = pixmetry.corrected(
+        {"name": names, "x_px": seen[0], "y_px": seen[1]},
+        camera,
+        reference={"name": names[:6], "x_px": x[:6], "y_px": y[:6]},
+        per_image="pose",
+    )
+    left = np.stack([found.x_px - x, found.y_px - y])
+    assert np.abs(seen - np.stack([x, y])).max() > 0.1 > 0.06 > np.abs(left[:, 6:]).max()
+    assert 1e-4 < np.sqrt(found.correction_px2[6:, [0, 2]]).max() < 0.05

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from pixmetry.assess.per_image import MODELS, fit_per_image
 from pixmetry.assess.position_tables import MARK, Positions, read_positions
 from pixmetry.budget.changes import changed
 from pixmetry.budget.motion import LOOKS, in_pairs, row_delays
@@ -204,6 +205,9 @@ def corrected(
     x: str | None = None,
     y: str | None = None,
     origin: str = "first_pixel",
+    reference: Any = None,
+    per_image: str = "scale",
+    match: str | None = None,
 ) -> CorrectedPositions:
     """Correct positions for all that the description of their camera knows of its geometry.
 
@@ -260,6 +264,8 @@ def corrected(
     asked = read_scenario(scenario)
     case = _Case.of(read_positions(table, x=x, y=y, origin=origin), with_, asked, dict(settings or {}), scenario is not None, dict(u or {}))
     found = _corrected(case, _known_names(case.camera, only), _known_names(case.camera, skip))
+    if reference is not None:
+        found = _fitted(found, read_positions(reference, origin=origin), per_image, case.camera.frame_shape, match)
     if output is not None:
         found.write(output)
     return found
@@ -482,8 +488,7 @@ def _corrected(case: _Case, only: tuple[str, ...], skip: tuple[str, ...]) -> Cor
             effects.append((name, ((at if plus is None else mapped(plus)) - (at if minus is None else mapped(minus))) / sides))
     shifts = {name: mapped(now, (name,)) - at for name in chosen.applied}
     all_effects = np.array([effect for _, effect in effects]).reshape(-1, len(table), 2)
-    dx, dy = all_effects[:, :, 0], all_effects[:, :, 1]
-    correction = np.stack([(dx**2).sum(axis=0), (dx * dy).sum(axis=0), (dy**2).sum(axis=0)], axis=1)
+    correction = _summed(all_effects)
     told = tuple(_told(e, chosen, shifts, effects) for e in now.camera.active if e.name in chosen.applied or e.name in chosen.reasons)
     notes = case.said()
     lost = int(np.sum(np.isnan(at[:, 0]) & np.isfinite(table.x_px)))
@@ -492,6 +497,39 @@ def _corrected(case: _Case, only: tuple[str, ...], skip: tuple[str, ...]) -> Cor
     covariance = _carried(table, correction, lambda x, y: _mapped(now, chosen, x, y))
     causes = tuple(name for name, _ in effects)
     return CorrectedPositions(at[:, 0], at[:, 1], table, covariance, correction, all_effects, causes, told, tuple(notes), now.camera.name)
+
+
+def _summed(effects_px: np.ndarray) -> np.ndarray:
+    """var x, cov xy and var y of each position by independent causes, shape (n, 3)."""
+    dx, dy = effects_px[:, :, 0], effects_px[:, :, 1]
+    return np.stack([(dx**2).sum(axis=0), (dx * dy).sum(axis=0), (dy**2).sum(axis=0)], axis=1)
+
+
+def _fitted(
+    found: CorrectedPositions, reference: Positions, model: str, frame_shape: tuple[int, int], match: str | None
+) -> CorrectedPositions:
+    """The same without what positions of an image have in common against a reference."""
+    at = np.stack([found.x_px, found.y_px], axis=1)
+    own = None if found.covariance_px2 is None else found.covariance_px2 - found.correction_px2
+    fit = fit_per_image(at, own, found.effects_px, found.measured, reference, model, frame_shape, match)
+    name = f"per image: {model}"
+    correction = _summed(fit.effects_px)
+    by_fit = _summed(fit.effects_px[len(fit.effects_px) - fit.fitted :])
+    shift, u = np.abs(np.nan_to_num(fit.shift_px)).max(axis=0), np.sqrt(np.nan_to_num(by_fit[:, [0, 2]])).max(axis=0, initial=0.0)
+    text = f"by {fit.targets} reference positions in {fit.images} images"
+    sizes = (float(shift[0]), float(shift[1])), (float(u[0]), float(u[1]))
+    step = SourceCorrection(name, f"What {MODELS[model]} of each image tell", fit.images > 0, text, *sizes)
+    return replace(
+        found,
+        x_px=found.x_px - fit.shift_px[:, 0],
+        y_px=found.y_px - fit.shift_px[:, 1],
+        covariance_px2=None if own is None else own + correction,
+        correction_px2=correction,
+        effects_px=fit.effects_px,
+        causes=(*found.causes, *([name] * fit.fitted)),
+        sources=(*found.sources, step),
+        notes=(*found.notes, *fit.notes),
+    )
 
 
 def _mapped(moment: _Moment, chosen: _Selection, x: np.ndarray, y: np.ndarray, without: tuple[str, ...] = ()) -> np.ndarray:

@@ -41,6 +41,15 @@ if TYPE_CHECKING:
     "--clock-ratio", type=click.FloatRange(0, min_open=True), metavar="RATIO", help="Camera's pixel clock over the grabber's clock."
 )
 @click.option("--height-map", type=click.Path(path_type=Path), metavar="FILE", help="Height of the sensor in µm: NPY, TIFF, or CSV.")
+@click.option("--reference", type=click.Path(path_type=Path), metavar="FILE", help="Table of where targets should be, by name.")
+@click.option(
+    "--per-image",
+    type=click.Choice(["shift", "scale", "pose"]),
+    default="scale",
+    show_default=True,
+    help="What of each image is fitted to the reference: a shift; also scales along the axes; or a shift and a rotation.",
+)
+@click.option("--match", metavar="COLUMN", help="Column that names targets in both tables. Default: point, name, label, id or target.")
 @click.option("--only", multiple=True, metavar="ID", help="Correct only this source. May be repeated.")
 @click.option("--skip", multiple=True, metavar="ID", help="Leave this source in the positions. May be repeated.")
 @click.option("--list", "listed", is_flag=True, help="Only list what would be corrected, and what not.")
@@ -67,6 +76,9 @@ def corrected(
     cover_glass: str | None,
     clock_ratio: float | None,
     height_map: Path | None,
+    reference: Path | None,
+    per_image: str,
+    match: str | None,
     only: tuple[str, ...],
     skip: tuple[str, ...],
     listed: bool,
@@ -90,7 +102,7 @@ def corrected(
     from pixmetry.camera.camera import load_camera
     from pixmetry.camera.overrides import parse_overrides
 
-    inputs = [path for path in (table, scenario, height_map, Path(camera)) if path is not None and path.is_file()]
+    inputs = [path for path in (table, scenario, height_map, reference, Path(camera)) if path is not None and path.is_file()]
     written = JsonResult(json_file, CORRECTED_SCHEMA, inputs=inputs)
     if output is not None:
         checked_output(output, inputs)
@@ -110,7 +122,19 @@ def corrected(
         asked |= height_settings(height_map, known)
     asked |= parse_overrides(settings)
     found = run(
-        table, known, scenario=scenario, settings=asked, u=parse_overrides(uncertainties), only=only, skip=skip, x=x, y=y, origin=origin
+        table,
+        known,
+        scenario=scenario,
+        settings=asked,
+        u=parse_overrides(uncertainties),
+        only=only,
+        skip=skip,
+        x=x,
+        y=y,
+        origin=origin,
+        reference=reference,
+        per_image=per_image,
+        match=match,
     )
     if output is not None and not listed:
         found.write(output)
