@@ -427,7 +427,8 @@ class Probes:
 
         def locate(signal_dn: np.ndarray, phase: int | None = None) -> tuple[np.ndarray, np.ndarray]:
             which = slice(None) if phase is None else np.full(len(signal_dn), phase)
-            return located(held.read(line, signal_dn, background, which), line.level, which)
+            samples_dn = (signal_dn - background) @ (answer if phase is None else answer[phase]) + background * line.level
+            return located(samples_dn, line.level, which)
 
         x_hat, y_hat = located(seen, line.level)
         return replace(

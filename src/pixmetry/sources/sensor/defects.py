@@ -7,6 +7,7 @@ from statistics import NormalDist
 
 import numpy as np
 from pydantic import NonNegativeFloat, NonNegativeInt
+from scipy.ndimage import binary_dilation
 
 from pixmetry.camera.contribution import Contribution, Probe
 from pixmetry.camera.observations import Observations
@@ -21,6 +22,7 @@ MOST = 0.1  # share of defects beyond which it is not clear what the good pixels
 LOOK_BACK = (8, 256)  # frames looked at together for the last draw of a blinking pixel: at first, and at most
 FOUND_95 = 1.645  # standard deviations above the limit at which 95 of 100 defects are found
 PHASES = 6  # places within the pixel at which a defect is tried
+ROUND_PX = 3  # about the pixels that matter at one place within the pixel, those that may at another
 MOST_TRIED = 2500  # pixels of a window, or clusters, that are tried one by one
 SMALL = 0.01  # of the largest shift: what is left out
 NODES = 7  # of the Gauss–Hermite quadrature over the logarithm of the excess
@@ -353,9 +355,13 @@ def propagate(params: Defects, probe: Probe) -> Contribution:
         return probe.contribution((float(u_x), float(u_y)), "F", model_error=0.05, method=method + ", first order")
     few = np.unique(np.linspace(0, len(probe.signal_dn) - 1, PHASES).round().astype(int))
     moments = np.zeros((2, 2))  # second and fourth; x and y
+    near: Array | None = None  # pixels about the target that the estimator reads, as found in the first phase
     for phase in few:
         cases = [(s * w, c) for name, s in _shares(params) for w, c in _cases(params, name, probe.signal_dn[phase], probe.gain_dn_per_e)]
-        moments += _of_singles(probe, phase, cases)
+        singles, read = _of_singles(probe, phase, cases, None if near is None else _about(probe, phase, near, -1))
+        if near is None and read.size <= MOST_TRIED:
+            near = _about(probe, phase, binary_dilation(read, iterations=ROUND_PX), 1)
+        moments += singles
         moments += _of_groups(params, probe, phase)
     second, fourth = moments / len(few)
     u_x, u_y = np.sqrt(second)
@@ -426,11 +432,17 @@ def _mean_square_dn2(params: Defects, name: str, probe: Probe) -> np.ndarray | f
     return others
 
 
-def _of_singles(probe: Probe, phase: int, cases: list[tuple[float, np.ndarray]]) -> np.ndarray:
+def _about(probe: Probe, phase: int, mask: Array, sign: int) -> Array:
+    """A mask of pixels moved so that the target of a phase comes to pixel (0, 0) (sign 1), or from there to the target (sign −1)."""
+    row, col = (int(np.rint(at[phase])) for at in (probe.y_px, probe.x_px))
+    return np.roll(mask, (-sign * row, -sign * col), axis=(0, 1))
+
+
+def _of_singles(probe: Probe, phase: int, cases: list[tuple[float, np.ndarray]], tried: Array | None = None) -> tuple[Array, Array]:
     """Sum over pixels and cases, each with its weight, of the second and fourth power of the shift when one pixel has its changed value.
 
     Pixels that the estimator hardly reads are found once, by their largest change in any case, and left out: a shift of 1 % of the
-    largest is 1e-4 of its square.
+    largest is 1e-4 of its square. With ``tried`` only these pixels are. Also returns a mask of those that were not left out.
     """
     base = probe.signal_dn[phase].ravel()
     changed = [(weight, np.minimum(values.ravel(), probe.saturation_dn)) for weight, values in cases]
@@ -441,10 +453,10 @@ def _of_singles(probe: Probe, phase: int, cases: list[tuple[float, np.ndarray]])
         return np.array(probe.moved(windows.reshape(-1, *probe.signal_dn.shape[1:]), phase))
 
     if not changed:
-        return np.zeros((2, 2))
+        return np.zeros((2, 2)), np.zeros(probe.signal_dn.shape[1:], bool)
     values = np.stack([v for _, v in changed])
     largest = values[np.abs(values - base).argmax(axis=0), np.arange(base.size)]
-    every = np.flatnonzero(largest != base)
+    every = np.flatnonzero((largest != base) & (True if tried is None else tried.ravel()))
     read = _thinned(every)
     share = len(read) / max(len(every), 1)
     if len(read) and len(changed) > 1:
@@ -456,7 +468,9 @@ def _of_singles(probe: Probe, phase: int, cases: list[tuple[float, np.ndarray]])
         if len(at):
             moved = shifts(at, one)
             moments += weight * np.nansum([moved**2, moved**4], axis=2)  # a target that is lost with its only pixel has no position
-    return moments / share if share else moments
+    kept = np.zeros(base.shape, bool)
+    kept[read] = True
+    return moments / share if share else moments, kept.reshape(probe.signal_dn.shape[1:])
 
 
 def _thinned(at: np.ndarray) -> np.ndarray:
