@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from pixmetry.camera.noise_covariance import NoiseCovariance, NoiseFilter
 from pixmetry.core.errors import MeasureError
 from pixmetry.core.number import Estimates
 
@@ -351,6 +352,8 @@ class Observations:
     patterns: PatternList | None = None
     code_errors: CodeErrors | None = None
     edges: SlantedEdges | None = None
+    noise_covariance: NoiseCovariance | None = None
+    noise_filter: NoiseFilter | None = None
     temperature_c: float | None = None
     geometry: CameraGeometry | None = None
     storage: Storage = Storage()

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pixmetry.camera.noise_covariance import WHITE, NoiseFilter
 from pixmetry.camera.observations import (
     CodeErrors,
     CodeHistogram,
@@ -27,9 +28,10 @@ from pixmetry.observe.edges import Picture, edge_notes, find_edges
 from pixmetry.observe.histogram import HistogramAccumulator, code_errors, sweep_histogram
 from pixmetry.observe.linearity import Linearity
 from pixmetry.observe.moments import LevelSummary
+from pixmetry.observe.noise_covariance import CorrelatedGroup, LagProducts, noise_covariance
+from pixmetry.observe.noise_filter import find_noise_filter, fit_unfiltered
 from pixmetry.observe.one_pass import Group, Level, photon_transfer, reduce_groups, refuse_copies, without_levels
 from pixmetry.observe.patterns import find_phase_patterns
-from pixmetry.observe.photon_transfer_fit import fit_photon_transfer
 from pixmetry.observe.photon_transfer_levels import (
     MINIMUM_LEVELS,
     NONLINEARITY_PRIOR,
@@ -92,7 +94,8 @@ def observe(
     histogram = HistogramAccumulator(bits)
     pictures: list[Picture] = []
     shape = None
-    for group, [(sums, found)] in reduce_groups(groups, bits, threads=threads, on_frames=on_frames):
+    correlated: list[CorrelatedGroup] = []
+    for group, [(sums, found, products)] in reduce_groups(groups, bits, lags=True, threads=threads, on_frames=on_frames):
         shape = found
         if group.role == "target" and not isinstance(sums, LevelSummary):
             pictures.append(Picture.of(group.kind, sums.moments, bits))
@@ -102,9 +105,12 @@ def observe(
             histogram.add_counts(sums.counts, dark=group.kind == "dark", level=condition)
             refuse_copies(group, sums, bits)
             levels[group.kind].append(Level(sums, group.exposure_s, group.photons))
+            correlated.append(_correlated(group, sums, products))
         elif isinstance(sums.moments, StackAccumulator) and sums.spectra is not None:
             histogram.add_counts(sums.moments.counts, dark=group.kind == "dark", level=condition)
-            stacked[group.kind].append(Level(sums.moments.summary(), group.exposure_s, group.photons))
+            summary = sums.moments.summary()
+            stacked[group.kind].append(Level(summary, group.exposure_s, group.photons))
+            correlated.append(_correlated(group, summary, products))
             kept = stacks[group.kind].get(group.exposure_s)
             if kept is None or sums.moments.n_frames > kept.moments.n_frames:
                 stack = sums.moments.result(group.exposure_s)
@@ -127,7 +133,9 @@ def observe(
     transfer = photon_transfer(levels["dark"], levels["bright"], shape, bits)
     codes = _codes(sweep_histogram(sweep, bits), notes)
     with single_threaded_blas():
-        fit = _transfer_fit(transfer, dark_stack, bright_stack, _dnl_lsb(codes), notes)
+        noise = noise_covariance(correlated)
+        noise_filter = find_noise_filter(noise)
+        fit = _transfer_fit(transfer, dark_stack, bright_stack, _dnl_lsb(codes), noise_filter, notes)
     if dark and not bright:
         notes.append("no stack of bright frames: PRNU is not measured (take 16 or more at half of saturation)")
     if dark and bright and not same_exposure(dark.moments, bright.moments):
@@ -149,21 +157,43 @@ def observe(
         patterns=patterns,
         code_errors=codes,
         edges=edges,
+        noise_covariance=noise,
+        noise_filter=noise_filter,
         temperature_c=temperature_c,
         notes=tuple(notes),
     )
 
 
+def _correlated(group: Group, level: LevelSummary, products: LagProducts) -> CorrelatedGroup:
+    """What the record of the noise's autocovariance needs of a group."""
+    clipped = float((level.counts[0] + level.counts[-1]) / level.counts.sum())
+    return CorrelatedGroup(
+        bright=group.kind == "bright",
+        stack=group.role == "stack",
+        exposure_s=group.exposure_s,
+        mean_dn=level.mean_dn,
+        clipped=clipped,
+        products=products,
+        var_dn2=level.squares.pixel_dn2,
+        n_frames=level.n_frames,
+    )
+
+
 def _transfer_fit(
-    transfer: PhotonTransfer, dark: StackMoments | None, bright: StackMoments | None, dnl_lsb: float, notes: list[str]
+    transfer: PhotonTransfer,
+    dark: StackMoments | None,
+    bright: StackMoments | None,
+    dnl_lsb: float,
+    noise_filter: NoiseFilter | None,
+    notes: list[str],
 ) -> Estimates:
     """The joint fit; where the frames carry none, what they tell nevertheless, and a note."""
     if transfer.bright.mean_dn.size:
         refuse_dead_series(transfer)
     try:
-        return fit_photon_transfer(transfer, dark, bright, dnl_lsb)
+        return fit_unfiltered(transfer, dark, bright, dnl_lsb, noise_filter)
     except MeasureError as problem:
-        found = partial_transfer(transfer, dark, straight=is_short(transfer))
+        found = partial_transfer(transfer, dark, straight=is_short(transfer) and (noise_filter is None or noise_filter.kind == WHITE))
         if not len(found) and not transfer.bright.mean_dn.size:
             raise
         missing = "non-linearity, saturation" if "gain_dn_per_e" in found else "gain, noise in electrons, non-linearity, saturation"

@@ -15,6 +15,7 @@ from pixmetry.core.errors import MeasureError
 from pixmetry.core.threads import imap_tiles
 from pixmetry.observe.defects import tail_of_counts
 from pixmetry.observe.moments import LevelAccumulator, LevelSummary, level_moments, summarize_pair
+from pixmetry.observe.noise_covariance import LagProducts, lag_products
 from pixmetry.observe.stack import GroupReduction, new_group
 
 Frame = np.ndarray | Callable[[], np.ndarray]
@@ -50,6 +51,7 @@ class Reduced(NamedTuple):
 
     sums: GroupReduction | LevelSummary
     shape: tuple[int, int]
+    products: LagProducts
 
 
 def reduce_groups(
@@ -58,6 +60,7 @@ def reduce_groups(
     *,
     parts: Sequence[Part] = (whole,),
     spectra_pairs: int = 8,
+    lags: bool = False,
     threads: int | None = None,
     on_frames: Callable[[int], object] | None = None,
 ) -> Iterator[tuple[Group, list[Reduced]]]:
@@ -73,6 +76,8 @@ def reduce_groups(
         Each takes its part out of a frame, such as one phase of a colour filter; the parts are reduced apart.
     spectra_pairs : int
         Frame pairs of a stack that enter the temporal spectra.
+    lags : bool
+        Whether the products of the noise of neighbouring pixels are summed.
     threads : int, optional
     on_frames : callable, optional
         Called with the number of frames that were done since the last call.
@@ -88,7 +93,7 @@ def reduce_groups(
         If a frame cannot be fetched or does not fit.
     """
     done: list[Reduced] = []
-    for task in imap_tiles(_Task.run, _tasks(groups, bits, parts, spectra_pairs), threads):
+    for task in imap_tiles(_Task.run, _tasks(groups, bits, parts, spectra_pairs, lags), threads):
         if on_frames is not None:
             on_frames(len(task.frames))
         done = task.results() if task.last else done
@@ -99,8 +104,9 @@ def reduce_groups(
 class _Sums:
     """Running sums of one part of the frames of one group, shared by the threads."""
 
-    def __init__(self, part: Part, group: Group, bits: int, spectra_pairs: int) -> None:
-        self.part, self.bits = part, bits
+    def __init__(self, part: Part, group: Group, bits: int, spectra_pairs: int, lags: bool) -> None:
+        self.part, self.bits, self.lags = part, bits, lags
+        self.products = LagProducts()
         self.reduction = new_group(bits, group.role, spectra_pairs)
         self.summary: Reduced | None = None
         self._lock = threading.Lock()
@@ -108,17 +114,22 @@ class _Sums:
     def add(self, first_index: int, frames: Sequence[np.ndarray], alone: bool) -> None:
         own = [np.ascontiguousarray(self.part(frame)) for frame in frames]
         if alone:
-            self.summary = Reduced(summarize_pair(own[0], own[1], self.bits), (own[0].shape[0], own[0].shape[1]))
-            return
-        with self._lock:
-            for offset, frame in enumerate(own):
-                self.reduction.add(frame, first_index + offset)
+            shape = (own[0].shape[0], own[0].shape[1])
+            self.summary = Reduced(summarize_pair(own[0], own[1], self.bits), shape, self.products)
+        else:
+            with self._lock:
+                for offset, frame in enumerate(own):
+                    self.reduction.add(frame, first_index + offset)
+        if self.lags and len(own) == 2:  # frames that were summed have the right shape
+            products = lag_products(own[0], own[1])
+            with self._lock:
+                self.products.add(first_index // 2, products, (own[0].shape[0], own[0].shape[1]))
 
     def result(self) -> Reduced:
         if self.summary is not None:
             return self.summary
         moments = self.reduction.moments
-        return Reduced(moments.summary() if isinstance(moments, LevelAccumulator) else self.reduction, moments.shape)
+        return Reduced(moments.summary() if isinstance(moments, LevelAccumulator) else self.reduction, moments.shape, self.products)
 
 
 @dataclass
@@ -142,9 +153,9 @@ class _Task:
         return [sums.result() for sums in self.sums]
 
 
-def _tasks(groups: Iterable[Group], bits: int, parts: Sequence[Part], spectra_pairs: int) -> Iterator[_Task]:
+def _tasks(groups: Iterable[Group], bits: int, parts: Sequence[Part], spectra_pairs: int, lags: bool) -> Iterator[_Task]:
     for group in groups:
-        sums = [_Sums(part, group, bits, spectra_pairs) for part in parts]
+        sums = [_Sums(part, group, bits, spectra_pairs, lags) for part in parts]
         frames, index = iter(group.frames), 0
         pair = list(islice(frames, 2))
         while True:

@@ -1,0 +1,386 @@
+"""From the autocovariance of the noise to what filtered it, and to the variance that the shot noise had before.
+
+The part of the noise that grows with light is white where it arises. Behind a linear filter h of unit sum its autocovariance is that of h,
+and the sum over all lags is the variance before (the power at frequency zero passes unchanged). A median, a coder or a demosaicking has no
+such law: then the noise does not tell the gain.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
+
+import numpy as np
+
+from pixmetry.camera.noise_covariance import (
+    CHARGE,
+    LAGS,
+    LINEAR,
+    REACH,
+    UNKNOWN,
+    WHITE,
+    NoiseCovariance,
+    NoiseFilter,
+    blur_kernel,
+    charge_response,
+    response_to_white,
+    sampling_covariance,
+    unsharp_kernel,
+)
+from pixmetry.camera.observations import LevelMoments, PhotonTransfer, StackMoments
+from pixmetry.core.arrays import Array
+from pixmetry.core.errors import MeasureError
+from pixmetry.core.number import Estimates, effective_dof
+from pixmetry.observe.photon_transfer_fit import fit_photon_transfer
+from pixmetry.observe.photon_transfer_model import QUANTISATION_DN2
+
+MOST_CLIPPED = 0.002  # share of the pixels at the ends of the codes
+FOUND_Z = 4.5  # of any of the near lags; a false finding in 1e-4 of cameras
+FIT_LEVEL = 1e-4  # chance of a worse fit below which a family is refused
+NEAR = tuple(k for k, (j, i) in enumerate(LAGS) if 0 < max(abs(j), abs(i)) <= 2)
+SHARPENING, BLUR, KERNEL, LINE, LOSS = (
+    "unsharp mask",
+    "Gaussian blur",
+    "kernel of 3 × 3",
+    "filter along the row",
+    "charge that repels charge",
+)
+BLUR_RADII = (1, 2, 3)
+REACHES = (0.0, 0.4, 0.7, 1.0)  # px, of the repulsion that is looked for
+SMALL = 0.05  # relative change of the gain up to which a correlation of unknown origin is taken as linear, at a u of its own size
+MOST_GROWTH = 0.2  # of the correlation, summed, from dark to bright: more than repelled charge does
+RESOLVED = 10.0  # u of the shot variance of a level that counts
+
+
+@dataclass(frozen=True)
+class _ShotPart:
+    """Autocovariance of the shot noise at all lags but (0, 0), fitted over the levels by its variance S: c = r S + q S²."""
+
+    constant: np.ndarray  # r where q is taken as zero, shape (40,)
+    constant_covariance: np.ndarray
+    growing: np.ndarray  # q where r is taken as zero, 1/DN²
+    growing_covariance: np.ndarray
+    both: np.ndarray  # r, then q, shape (80,); r alone, shape (40,), with fewer than three levels
+    both_covariance: np.ndarray
+    gain: np.ndarray  # what makes r and q of the levels, shape (2, levels) or (1, levels)
+    shot_dn2: np.ndarray  # S of the levels
+
+
+def _shot_part(seen: NoiseCovariance) -> _ShotPart | None:
+    pooled, pixels = seen.pooled_dn2(), float(np.prod(seen.frame_shape))
+    used = seen.clipped <= MOST_CLIPPED
+    bright, dark = used & seen.bright, used & ~seen.bright
+    if not (bright.any() and dark.any()):
+        return None
+    pairs = seen.n_pairs.astype(float)
+    black = np.average(pooled[dark], axis=0, weights=pairs[dark])
+    black_covariance = sampling_covariance(black) / (pairs[dark].sum() * pixels)
+    total, n = pooled[bright], pairs[bright] * pixels
+    keep = total[:, 0] - black[0] > RESOLVED * np.sqrt(2 / n) * total[:, 0]
+    total, n = total[keep], n[keep]
+    shot = total - black
+    s = shot[:, 0]
+    if s.size == 0:
+        return None
+    noise = [sampling_covariance(c) / m for c, m in zip(total, n, strict=True)]
+    weight = n / total[:, 0] ** 2
+
+    def solve(design: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """What makes the coefficients of the levels; these, by column of the design and lag; their covariance."""
+        gain = np.linalg.solve(design.T @ (weight[:, None] * design), design.T * weight)
+        values = gain @ shot[:, 1:]
+        covariance = np.zeros((values.size, values.size))
+        of_black = np.zeros((values.size, len(LAGS)))
+        for level, own in enumerate(noise):
+            # a variance of a level that is high by chance makes the ratios of all lags to it too low
+            slope = np.hstack([-(design @ values)[level][:, None] / s[level], np.eye(len(LAGS) - 1)])
+            covariance += np.kron(np.outer(gain[:, level], gain[:, level]), slope @ own @ slope.T)
+            of_black += np.kron(gain[:, level][:, None], slope)
+        return gain, values.ravel(), covariance + of_black @ black_covariance @ of_black.T
+
+    constant, growing = solve(s[:, None])[1:], solve(s[:, None] ** 2)[1:]
+    gain, both, both_covariance = solve(np.stack([s, s**2], axis=1) if s.size > 2 else s[:, None])
+    return _ShotPart(*constant, *growing, both, both_covariance, gain, s)
+
+
+@dataclass(frozen=True)
+class _Family:
+    """A set of ways of the shot noise through the camera."""
+
+    kind: str
+    name: str
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    starts: tuple[tuple[float, ...], ...]
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    law: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]  # parameters, S -> variance before, autocovariance behind
+
+
+def _of_kernel(kernel_of: Callable[..., np.ndarray]) -> Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
+    def law(p: np.ndarray, shot_dn2: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        correlation, power = response_to_white(kernel_of(*p.tolist()))
+        return shot_dn2 / power, np.outer(shot_dn2, correlation[1:])
+
+    return law
+
+
+def _small_kernel(edge: float, corner: float) -> np.ndarray:
+    """Kernel of 3 × 3 of unit sum, by its weights beside the middle and at the corners."""
+    return np.array([[corner, edge, corner], [edge, 1 - 4 * edge - 4 * corner, edge], [corner, edge, corner]])
+
+
+def _along_row(p: np.ndarray, shot_dn2: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Any correlation along the row and none between rows, as behind an analogue line."""
+    correlation = np.zeros(len(LAGS) - 1)
+    correlation[:REACH] = p
+    return shot_dn2 * (1 + 2 * p.sum()), np.outer(shot_dn2, correlation)
+
+
+def _blur(radius_px: int) -> _Family:
+    law = _of_kernel(lambda sigma_px: blur_kernel(sigma_px, radius_px))
+    return _Family(LINEAR, f"{BLUR} of radius {radius_px} px", ("sigma_px",), ("px",), ((0.4,), (1.0,)), (0.15,), (16.0,), law)
+
+
+def _families(largest_shot_dn2: float) -> tuple[_Family, ...]:
+    def charge(p: np.ndarray, shot_dn2: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return charge_response(p[0] / largest_shot_dn2, p[1], shot_dn2)
+
+    three, four = ("amount", "sigma_px"), tuple(f"correlation_{k}" for k in range(1, REACH + 1))
+    sharpening = _of_kernel(unsharp_kernel)
+    return (
+        _Family(CHARGE, LOSS, ("loss", "field_px"), ("1", "px"), ((0.03, 0.1), (0.03, 0.6)), (-0.5, 0.0), (0.5, 1.0), charge),
+        _Family(LINEAR, SHARPENING, three, ("1", "px"), ((0.3, 0.7), (0.5, 1.2), (1.0, 2.0)), (1e-4, 0.3), (10.0, 2.6), sharpening),
+        *(_blur(radius) for radius in BLUR_RADII),
+        _Family(
+            LINEAR, KERNEL, ("edge", "corner"), ("1", "1"), ((0.1, 0.05), (-0.1, -0.05)), (-1, -1), (0.3, 0.3), _of_kernel(_small_kernel)
+        ),
+        _Family(LINEAR, LINE, four, ("1",) * REACH, ((0.0,) * REACH,), (-1.0,) * REACH, (1.0,) * REACH, _along_row),
+    )
+
+
+@dataclass(frozen=True)
+class _Match:
+    """A family with its best parameters."""
+
+    family: _Family
+    values: np.ndarray
+    covariance: np.ndarray
+    cost: float  # χ²/2
+    chance: float  # of a worse fit
+    correlation: np.ndarray  # of the family in the dark, shape (40,)
+    factor: float  # variance before over variance behind, in the mean of the levels
+    u_factor: float
+
+
+def _derivatives(law: Callable[[np.ndarray], np.ndarray], at: np.ndarray) -> Array:
+    """Central differences, shape (values, parameters)."""
+    steps = 1e-4 * np.maximum(np.abs(at), 0.1)
+    return np.stack([(law(at + h) - law(at - h)) / (2 * h.sum()) for h in np.diag(steps)], axis=1)
+
+
+def _match(family: _Family, part: _ShotPart, constant_alone: bool = False) -> _Match:
+    """Generalised least squares on r and q; or on r, with q free, for a filter behind something that grows with the signal."""
+    from scipy.optimize import least_squares
+    from scipy.special import gammaincc
+
+    n = len(LAGS) - 1 if constant_alone else part.both.size
+    values, covariance, gain = part.both[:n], part.both_covariance[:n, :n], part.gain[: n // (len(LAGS) - 1)]
+    root = np.linalg.inv(np.linalg.cholesky(covariance + 1e-9 * np.diag(np.diag(covariance))))
+
+    def predicted(p: np.ndarray) -> Array:
+        return (gain @ family.law(p, part.shot_dn2)[1]).ravel()
+
+    def factor(p: np.ndarray) -> Array:
+        return np.array([family.law(p, part.shot_dn2)[0].sum() / part.shot_dn2.sum()])
+
+    bounds = (family.low, family.high)
+    found = min((least_squares(lambda p: root @ (values - predicted(p)), x0, bounds=bounds) for x0 in family.starts), key=lambda f: f.cost)
+    slopes = root @ _derivatives(predicted, found.x)
+    own = np.linalg.pinv(slopes.T @ slopes, rcond=1e-10)
+    change = _derivatives(factor, found.x)[0]
+    chance = float(gammaincc((n - found.x.size) / 2, found.cost))
+    correlation = family.law(found.x, np.full(1, 1e-9))[1][0] / 1e-9
+    return _Match(
+        family, found.x, own, float(found.cost), chance, correlation, float(factor(found.x)[0]), float(np.sqrt(change @ own @ change))
+    )
+
+
+def find_noise_filter(seen: NoiseCovariance | None) -> NoiseFilter | None:
+    """What filtered the noise of a campaign; None where it holds no shot noise to tell it by.
+
+    Parameters
+    ----------
+    seen : NoiseCovariance or None
+
+    Returns
+    -------
+    NoiseFilter or None
+
+    Notes
+    -----
+    Nothing is said to be found unless a lag of up to two pixels, or the pattern of repelled charge, stands out by `FOUND_Z` u. Families
+    are fitted by generalised least squares with Bartlett's covariance; one that fits worse than by a chance of `FIT_LEVEL` is refused. Of
+    those that are left the best fit counts, and what another that fits nearly as well would make of the gain adds to u.
+    """
+    part = None if seen is None else _shot_part(seen)
+    if part is None:
+        return None
+    plain = NoiseFilter(
+        kind=WHITE,
+        name="neighbours are not correlated",
+        correlation=np.concatenate([[1.0], part.constant]),
+        covariance=part.constant_covariance,
+        growth_per_dn2=np.concatenate([[0.0], part.growing]),
+        growth_covariance=part.growing_covariance,
+        shot_dn2=part.shot_dn2,
+    )
+    return _explained(plain, part) if _largest_z(part) > FOUND_Z else plain
+
+
+def _largest_z(part: _ShotPart) -> float:
+    """How many u the largest near lag lies from zero, or the sum over the lags that repelled charge makes, of any reach."""
+    near = [k - 1 for k in NEAR]
+    single = np.abs(part.constant[near]) / np.sqrt(np.diag(part.constant_covariance)[near])
+    weak = 1e-3 / float(part.shot_dn2.max())
+    patterns = np.stack([charge_response(weak, reach, np.ones(1))[1][0] for reach in REACHES], axis=1)
+    weighed = np.linalg.solve(part.growing_covariance, patterns)
+    together = (weighed * part.growing[:, None]).sum(axis=0) / np.sqrt((weighed * patterns).sum(axis=0))
+    return float(max(single.max(), together.max()))
+
+
+def _explained(plain: NoiseFilter, part: _ShotPart) -> NoiseFilter:
+    """The family that explains the correlation, or what is known without one."""
+    families = _families(float(part.shot_dn2.max()))
+    matches = [m for m in (_match(family, part) for family in families) if m.chance > FIT_LEVEL]
+    if matches:
+        best = min(matches, key=lambda m: m.cost + m.values.size)
+        rivals = [m for m in matches if m.cost + m.values.size < best.cost + best.values.size + 3.0]
+        doubt = max(abs(m.factor - best.factor) for m in rivals)
+        return _as_found(plain, best, doubt)
+    growth = _growth(part)
+    if part.both.size > len(LAGS) and -3 * growth[1] < growth[0] < MOST_GROWTH:
+        filters = [m for m in (_match(f, part, constant_alone=True) for f in families if f.kind == LINEAR) if m.chance > FIT_LEVEL]
+        if filters:
+            best = min(filters, key=lambda m: m.cost + m.values.size)
+            name = f"{best.family.name}, behind something that grows with the signal"
+            return replace(_as_found(plain, best, growth[1]), name=name, growth=growth[0])
+    near = np.array([max(abs(j), abs(i)) <= 2 for j, i in LAGS[1:]])
+    share = 2 * float(part.constant[near].sum())
+    u_share = 2 * float(np.sqrt(part.constant_covariance[np.ix_(near, near)].sum()))
+    return replace(plain, kind=UNKNOWN, name="no linear filter fits", factor=1 + share, u_factor=float(np.hypot(share, u_share)))
+
+
+def _as_found(plain: NoiseFilter, best: _Match, doubt: float) -> NoiseFilter:
+    """What is known with the family that fits best."""
+    fit = Estimates(best.family.names, best.values, best.covariance, np.full(best.values.size, np.inf), best.family.units)
+    return replace(
+        plain,
+        kind=best.family.kind,
+        name=best.family.name,
+        fit=fit,
+        factor=best.factor,
+        u_factor=float(np.hypot(best.u_factor, doubt)),
+        row_factor=_line_factor(best.correlation, axis=0),
+        column_factor=_line_factor(best.correlation, axis=1),
+    )
+
+
+def _line_factor(correlation: np.ndarray, axis: int) -> float:
+    """1 + the correlations along a row (axis 0: lags of no row) or a column, on both sides."""
+    return 1 + 2 * float(sum(value for lag, value in zip(LAGS[1:], correlation, strict=True) if lag[axis] == 0))
+
+
+def _growth(part: _ShotPart) -> tuple[float, float]:
+    """What the sum over the near lags gains from the dark to the brightest level, over the variance; with u."""
+    if part.both.size == len(LAGS) - 1:
+        return 0.0, 0.0
+    near = np.concatenate([np.zeros(len(LAGS) - 1, bool), [max(abs(j), abs(i)) <= 2 for j, i in LAGS[1:]]])
+    scale = 2 * float(part.shot_dn2.max())
+    return scale * float(part.both[near].sum()), scale * float(np.sqrt(part.both_covariance[np.ix_(near, near)].sum()))
+
+
+L = TypeVar("L", LevelMoments, StackMoments)
+
+
+def before_filter(
+    series: PhotonTransfer, dark: StackMoments | None, bright: StackMoments | None, found: NoiseFilter, shift: float = 0.0
+) -> tuple[PhotonTransfer, StackMoments | None, StackMoments | None]:
+    """The white mean squares of levels and stacks as they were before the filter; nothing else is changed.
+
+    A filter of codes has smoothed the noise in the dark and the rounding of the converter with it, and rounds once more; one in front of
+    the converter has not. ``shift`` is added to the factor.
+    """
+    levels = series.dark.ms_pixel_dn2 if series.dark.ms_pixel_dn2.size else np.array([np.nan if dark is None else dark.ms_pixel_dn2])
+    black = float(np.average(levels, weights=series.dark.n_frames - 1.0 if series.dark.ms_pixel_dn2.size else None))
+    after = QUANTISATION_DN2 if found.name == LINE else 0.0
+
+    def unfiltered_lines(ms_dn2: np.ndarray, var_dn2: np.ndarray, before_dn2: np.ndarray, of_line: float, pixels: int) -> np.ndarray:
+        """Mean squares of rows or columns: the white noise before, and what lines have in common before the filter across them."""
+        if found.kind == CHARGE:
+            return ms_dn2
+        in_common = ms_dn2 - var_dn2 * of_line / pixels
+        unfiltered: Array = before_dn2 / pixels + in_common * (found.factor + shift) / of_line
+        return unfiltered
+
+    def unfiltered_level(level: L, white_dn2: Any) -> L:
+        rows, cols = series.frame_shape
+        return replace(
+            level,
+            ms_pixel_dn2=white_dn2,
+            ms_row_dn2=unfiltered_lines(level.ms_row_dn2, level.ms_pixel_dn2, white_dn2, found.row_factor, cols),
+            ms_col_dn2=unfiltered_lines(level.ms_col_dn2, level.ms_pixel_dn2, white_dn2, found.column_factor, rows),
+        )
+
+    def unfiltered_dark(var_dn2: np.ndarray) -> np.ndarray:
+        if found.kind == CHARGE:
+            return var_dn2
+        unfiltered: Array = np.maximum(var_dn2 - QUANTISATION_DN2, 0.0) * (found.factor + shift) + after
+        return unfiltered
+
+    def unfiltered(var_dn2: np.ndarray) -> np.ndarray:
+        shot = np.asarray(var_dn2 - black)
+        return unfiltered_dark(np.asarray(black)) + np.where(shot > 0, found.variance_before(np.maximum(shot, 0.0), shift), shot)
+
+    before = replace(
+        series,
+        dark=unfiltered_level(series.dark, unfiltered_dark(series.dark.ms_pixel_dn2)),
+        bright=unfiltered_level(series.bright, unfiltered(series.bright.ms_pixel_dn2)),
+    )
+    stacks = [
+        None if stack is None else unfiltered_level(stack, float(law(np.asarray(stack.ms_pixel_dn2))))
+        for stack, law in ((dark, unfiltered_dark), (bright, unfiltered))
+    ]
+    return before, stacks[0], stacks[1]
+
+
+def fit_unfiltered(
+    series: PhotonTransfer, dark: StackMoments | None, bright: StackMoments | None, dnl_lsb: float, found: NoiseFilter | None
+) -> Estimates:
+    """The joint fit of `fit_photon_transfer` to the variances before the filter, with the filter's u.
+
+    Raises
+    ------
+    MeasureError
+        As there; and behind a filter that is not linear, where no variance tells the gain.
+    """
+    if found is None or found.kind == WHITE:
+        return fit_photon_transfer(series, dark, bright, dnl_lsb)
+    if found.kind == UNKNOWN and abs(found.factor - 1) > SMALL:
+        raise MeasureError(
+            "the noise of neighbouring pixels is correlated, and not as behind a linear filter: a median or another noise reduction, a "
+            "coder such as JPEG, or a demosaicking changed it, and its variance does not tell the gain",
+            where="photon transfer",
+            value=f"correlation of neighbours {found.correlation[1]:.2g}",
+            allowed="none, or that of a linear filter",
+            remedy="take raw frames without noise reduction, sharpening, demosaicking and compression",
+        )
+    here = fit_photon_transfer(*before_filter(series, dark, bright, found), dnl_lsb)
+    there = fit_photon_transfer(*before_filter(series, dark, bright, found, found.u_factor), dnl_lsb)
+    change = np.array([there[n].value - here[n].value if n in there and there[n].kind == here[n].kind else 0.0 for n in here.names])
+    times = f"the shot variance before it is {found.factor:.4g} ± {found.u_factor:.2g} times that behind it"
+    why = f"corrected for what correlates neighbouring pixels ({found.name}): {times}"
+    reason = "; ".join(filter(None, (why, here.reasons.get("gain_dn_per_e", ""))))
+    dof = effective_dof(np.stack([here.u**2, change**2], axis=1), np.stack([here.dof, np.full(len(here), np.inf)], axis=1))
+    return replace(here, covariance=here.covariance + np.outer(change, change), dof=dof, reasons={**here.reasons, "gain_dn_per_e": reason})
