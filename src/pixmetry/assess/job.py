@@ -299,7 +299,10 @@ def by_the_standard(campaign: Campaign, observations: Observations) -> Results:
 
 
 def measure_sources(observations: Observations) -> tuple[dict[str, Estimates], dict[str, str]]:
-    """Let every source measure its parameters from the observations: estimates, and by source the reason if there are none."""
+    """Let every source measure its parameters from the observations: estimates, and by source the reason if there are none.
+
+    A source that most cameras have not, and of which only limits are known, is not taken into the camera: its limits are the reason.
+    """
     estimates, unmeasured = {}, {}
     for source in sources().values():
         if source.measure is None:
@@ -308,6 +311,9 @@ def measure_sources(observations: Observations) -> tuple[dict[str, Estimates], d
         try:
             found = source.measure(observations)
             with_estimates(source, source.typical, found)  # outside the model's range it is no measurement of this effect
+            if source.option and found.limits == frozenset(found.names):  # most cameras have none: what was not found is not in this one
+                unmeasured[source.id] = "not found: " + ", ".join(f"{e.name} is below {e.value:.2g} {e.unit} (95 %)" for e in found)
+                continue
             estimates[source.id] = found
         except (MeasureError, InputError) as problem:
             unmeasured[source.id] = str(problem)

@@ -316,13 +316,12 @@ def before_filter(
     black = float(np.average(levels, weights=series.dark.n_frames - 1.0 if series.dark.ms_pixel_dn2.size else None))
     after = QUANTISATION_DN2 if found.name == LINE else 0.0
 
-    def unfiltered_lines(ms_dn2: np.ndarray, var_dn2: np.ndarray, before_dn2: np.ndarray, of_line: float, pixels: int) -> np.ndarray:
+    def unfiltered_lines(ms_dn2: Any, var_dn2: Any, before_dn2: Any, of_line: float, pixels: int) -> Any:
         """Mean squares of rows or columns: the white noise before, and what lines have in common before the filter across them."""
         if found.kind == CHARGE:
             return ms_dn2
         in_common = ms_dn2 - var_dn2 * of_line / pixels
-        unfiltered: Array = before_dn2 / pixels + in_common * (found.factor + shift) / of_line
-        return unfiltered
+        return before_dn2 / pixels + in_common * (found.factor + shift) / of_line
 
     def unfiltered_level(level: L, white_dn2: Any) -> L:
         rows, cols = series.frame_shape

@@ -56,7 +56,8 @@ METHOD = (
     "level means and white mean squares, wander and lamp noise by REML, dof by Satterthwaite (EMVA 1288 R4.0 §6-7 for the quantities)"
 )
 CONFOUNDERS = (
-    "gain: any filter in the camera, the brighter-fatter effect, and traps of a CCD that fill at once lower the variance and so the gain",
+    "gain: a filter in the camera, or the brighter-fatter effect, that correlates neighbours too little to be found; traps of a CCD that "
+    "fill at once: these lower the variance and so the gain",
     "non-linearity: a lamp whose light is not proportional to exposure looks like a non-linear camera",
     "dark noise: includes the shot noise of dark current that does not grow with exposure",
     "row noise: mains flicker under a rolling shutter looks like row noise in bright frames; dark frames are used here",

@@ -7,9 +7,9 @@ from typing import Literal
 
 import numpy as np
 
+from pixmetry.camera.noise_covariance import gaussian_half
 from pixmetry.camera.signal import Kind, Signal, Windows
 from pixmetry.camera.source import Parameters, Source, quantity
-from pixmetry.core.arrays import Array
 from pixmetry.core.random import Stream
 from pixmetry.sources.processing._codes import bits_of_camera, bordered, stored, surround
 from pixmetry.sources.processing._kernels import bilateral, blur, median
@@ -27,9 +27,7 @@ class NoiseReduction(Parameters):
 
 def half_weights(params: NoiseReduction) -> np.ndarray:
     """Gaussian weights from the middle outwards, shape (radius + 1,), of sum 1 over both sides."""
-    half = np.exp(-0.5 * (np.arange(params.radius_px + 1) / params.sigma_px) ** 2)
-    weights: Array = half / (2 * half.sum() - half[0])
-    return weights
+    return gaussian_half(params.sigma_px, params.radius_px)
 
 
 def forward(params: NoiseReduction, signal: Signal, stream: Stream) -> Signal:

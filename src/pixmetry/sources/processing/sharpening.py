@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
 from pixmetry.camera.contribution import Contribution, Probe
+from pixmetry.camera.noise_covariance import CHARGE, WHITE, gaussian_half, response_to_white, unsharp_kernel
+from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal, Windows
 from pixmetry.camera.source import Parameters, Source, quantity
-from pixmetry.core.arrays import Array
+from pixmetry.core.errors import MeasureError
+from pixmetry.core.number import ONE_SIDED_95, Estimates
 from pixmetry.core.random import Stream
 from pixmetry.sources.processing._codes import bits_of_camera, bordered, stored, surround
 from pixmetry.sources.processing._kernels import blur
+
+WEAK = 1e-3
+METHOD = "autocovariance of the shot noise of flat-field pairs, up to 4 px, against that of an unsharp mask"
+CONFOUNDERS = ("sharpening: a filter with the same power spectrum; noise does not tell the sign of its phase, edges do",)
 
 
 class Sharpening(Parameters):
@@ -25,9 +33,7 @@ class Sharpening(Parameters):
 
 def gaussian(sigma_px: float) -> np.ndarray:
     """Sampled Gaussian from its middle to three standard deviations, shape (m + 1,), of sum 1 over both sides."""
-    half = np.exp(-0.5 * (np.arange(math.ceil(3 * sigma_px) + 1) / sigma_px) ** 2)
-    weights: Array = half / (2 * half.sum() - half[0])
-    return weights
+    return gaussian_half(sigma_px, math.ceil(3 * sigma_px))
 
 
 def forward(params: Sharpening, signal: Signal, stream: Stream) -> Signal:
@@ -42,6 +48,29 @@ def forward(params: Sharpening, signal: Signal, stream: Stream) -> Signal:
 def context(params: Sharpening, windows: Windows, frame_shape: tuple[int, int]) -> Windows:
     """Three standard deviations on each side."""
     return surround(windows, math.ceil(3 * params.sigma_px), frame_shape) if params.amount else windows
+
+
+def measure(observations: Observations) -> Estimates:
+    """Read strength and width off the correlation of the shot noise of neighbouring pixels, which a mask makes negative.
+
+    The part of the noise that grows with light tells it: what arises behind the filter, such as its rounding, does not.
+    """
+    found = observations.noise_filter
+    if found is None:
+        remedy = "take pairs of flat fields and of dark frames, bright enough that the shot noise exceeds the noise in the dark"
+        raise MeasureError("needs the shot noise of flat fields", where="processing.sharpening", remedy=remedy)
+    if found.kind in (WHITE, CHARGE):
+        shape = (response_to_white(unsharp_kernel(WEAK, 1.0))[0][1:]) / WEAK
+        weighed = np.linalg.solve(found.covariance, shape)
+        u = float(shape @ weighed) ** -0.5
+        amount = float(weighed @ found.correlation[1:]) * u**2
+        reasons = {"amount": "neighbours have no negative correlation; 95 % upper limit for a mask of 1 px"}
+        row = ("amount", max(amount, 0.0) + ONE_SIDED_95 * u, u, math.inf, "1")
+        return Estimates.from_rows([row], method=METHOD, confounders=CONFOUNDERS, limits=frozenset({"amount"}), reasons=reasons)
+    if "amount" not in found.fit:
+        what = f"what correlates neighbouring pixels ({found.name}) is no sharpening, and hides a weak one"
+        raise MeasureError(what, where="processing.sharpening", remedy="switch off every filter in the camera, and take raw frames")
+    return replace(found.fit, method=METHOD, confounders=CONFOUNDERS)
 
 
 def propagate(params: Sharpening, probe: Probe) -> Contribution:
@@ -79,6 +108,7 @@ SOURCE = Source(
     typical=Sharpening(amount=0.5),
     bound=Sharpening(amount=2.0, sigma_px=1.5),
     forward=forward,
+    measure=measure,
     propagate=propagate,
     context=context,
     option="sharpening in the camera",
@@ -88,7 +118,6 @@ SOURCE = Source(
     references=("R. C. Gonzalez, R. E. Woods, Digital Image Processing, 4th ed., Pearson 2018, §3.6 (unsharp masking)", "ISO 12233:2023"),
     advice="Switch it off.",
     reasons={
-        "measure": "not measured: needs the slanted edge's response above 1 and the correlation of the noise of neighbours",
         "correct": "codes cut off at the ends of the range are lost; the others would need a deconvolution without amplified noise",
     },
 )

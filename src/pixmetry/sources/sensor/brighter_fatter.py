@@ -7,14 +7,19 @@ from collections.abc import Mapping
 import numpy as np
 
 from pixmetry.camera.contribution import Contribution, Probe
+from pixmetry.camera.noise_covariance import CHARGE, WHITE, NoiseFilter, charge_response
+from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal, Windows
 from pixmetry.camera.source import Parameters, Source, quantity
-from pixmetry.core.errors import ParameterError
+from pixmetry.core.errors import MeasureError, ParameterError
+from pixmetry.core.number import ONE_SIDED_95, Estimates
 from pixmetry.core.random import Stream
 from pixmetry.sources.sensor._charge_kernels import move_borders
 
 ITERATIONS = 5
 RADIUS = 2  # px over which the field of a packet is felt
+METHOD = "growth with the signal of the autocovariance of flat-field pairs, up to 4 px (P. Astier et al., A&A 629, A36, 2019)"
+CONFOUNDERS = ("brighter-fatter effect: a smoothing filter in the camera whose noise is far above that of the dark frames",)
 FARTHEST = 0.5  # px by which a border moves at most
 
 
@@ -56,16 +61,64 @@ def correct(params: BrighterFatter, signal: Signal, maps: Mapping[str, np.ndarra
     ParameterError
         If the signal is not in electrons.
     """
+    if not params.area_loss_per_e:
+        return signal
     if signal.kind != Kind.ELECTRONS:
         raise ParameterError("the shift of borders needs a signal in electrons", value=str(signal.kind), remedy="divide by the gain")
     y = signal.data.astype(np.float32)
-    if not params.area_loss_per_e:
-        return signal.with_data(y)
     w = weights(params)
     x = y
     for _ in range(ITERATIONS):
         x = x + (y - move_borders(x, w, params.area_loss_per_e / (4 * (1 - w[1])), FARTHEST))
     return signal.with_data(x)
+
+
+def measure(observations: Observations) -> Estimates:
+    """Read how the correlation of neighbouring pixels grows with the light of flat fields; the gain turns the signal into electrons.
+
+    The loss of variance b for each DN² of shot variance is a/K². A reach of the repulsion, or a loss, that does not stand out by three u is
+    a 95 % limit; the limit of the loss is that of the reach for which it is largest.
+    """
+    found, fit = observations.noise_filter, observations.photon_transfer_fit
+    where, remedy = "sensor.brighter_fatter", "take pairs of flat fields at ten levels or more, raw and without any filter in the camera"
+    if found is not None and (found.kind not in (WHITE, CHARGE) or (found.kind == CHARGE and found.fit["loss"].value < 0)):
+        what = f"what correlates neighbouring pixels ({found.name}) hides how their correlation grows with the signal"
+        raise MeasureError(what, where=where, remedy=remedy)
+    if found is None or fit is None or "gain_dn_per_e" not in fit:
+        raise MeasureError("needs the shot noise of flat fields and the gain", where=where, remedy=remedy)
+    gain, brightest = fit["gain_dn_per_e"], float(found.shot_dn2.max())
+    reaches = np.linspace(0.0, 1.0, 21)
+    losses, u_losses, misfits = np.array([_loss_at(found, float(reach), brightest) for reach in reaches]).T
+    per_dn2 = gain.value**2 / brightest
+    if found.kind == WHITE:
+        limit, u = max(((max(a, 0.0) + ONE_SIDED_95 * u) * per_dn2, u * per_dn2) for a, u in zip(losses, u_losses, strict=True))
+        why = {"area_loss_per_e": "the correlation of neighbours does not grow with the light; 95 % upper limit, for any reach up to 1 px"}
+        row = ("area_loss_per_e", min(limit, 1e-5), u, np.inf, "1/e-")
+        return Estimates.from_rows([row], method=METHOD, confounders=CONFOUNDERS, limits=frozenset({"area_loss_per_e"}), reasons=why)
+    loss, reach = found.fit["loss"], found.fit["field_px"]
+    u_area = per_dn2 * float(np.hypot(loss.u, 2 * loss.value * gain.u / gain.value))
+    limits, reasons, field, u_field = frozenset[str](), {}, reach.value, reach.u
+    if misfits[0] - misfits.min() < 9.0:
+        within = reaches[misfits < misfits.min() + ONE_SIDED_95**2]
+        field, limits = float(within.max()), frozenset({"field_px"})
+        u_field = float(max(field - reach.value, 0.05) / ONE_SIDED_95)
+        reasons = {"field_px": "neighbours that do not touch the pixel gain nothing; 95 % upper limit"}
+    names, units, values = ("area_loss_per_e", "field_px"), ("1/e-", "px"), np.array([loss.value * per_dn2, field])
+    covariance = np.diag([u_area**2, u_field**2])
+    if not limits:
+        covariance[0, 1] = covariance[1, 0] = found.fit.covariance[0, 1] * per_dn2
+    return Estimates(names, values, covariance, np.full(2, np.inf), units, METHOD, CONFOUNDERS, limits, reasons=reasons)
+
+
+def _loss_at(found: NoiseFilter, reach_px: float, brightest_dn2: float) -> tuple[float, float, float]:
+    """Loss of variance at the brightest level if the repulsion has this reach, its u, and χ²: least squares on all lags."""
+    weak = 1e-4
+    pattern = charge_response(weak / brightest_dn2, reach_px, np.array([brightest_dn2]))[1][0] / (weak * brightest_dn2**2)
+    weighed = np.linalg.solve(found.growth_covariance, pattern)
+    power = float(pattern @ weighed)
+    loss = float(weighed @ found.growth_per_dn2[1:]) / power
+    left = found.growth_per_dn2[1:] - loss * pattern
+    return loss, power**-0.5, float(left @ np.linalg.solve(found.growth_covariance, left))
 
 
 def propagate(params: BrighterFatter, probe: Probe) -> Contribution:
@@ -93,6 +146,7 @@ SOURCE = Source(
     bound=BrighterFatter(area_loss_per_e=3e-6, field_px=0.5),
     forward=forward,
     context=context,
+    measure=measure,
     correct=correct,
     propagate=propagate,
     gum_class="F",
@@ -104,5 +158,4 @@ SOURCE = Source(
     ),
     leaves="what charge moves beyond the reach of the model; full pixels, whose charge is not known",
     advice="Calibrate and measure at the same brightness. Correct in electrons with the measured loss of area.",
-    reasons={"measure": "needs the covariances of neighbouring pixels in pairs of flat fields at several levels"},
 )
