@@ -20,7 +20,9 @@ EXACT = ("template", "poisson_gaussian", "centroid", "squared_centroid", "window
 COVERING = ("soft_threshold", "hard_threshold", "perimeter", "forstner", "ellipse_edges", "gaussian")
 TOO_LARGE = ("squared_centroid", "windowed_centroid")  # on discs of a pixel's size: the S-curve of a rougher shape than theirs is in u
 LEAST_RADIUS = {"ellipse_edges": 1.5}  # px: below it neighbouring rays see the same few pixels
-MOST_LOST = 4  # of 450 targets that these two do not find again, and say so
+# Of 450 targets that thresholds and operators do not find again, and say so. None of 16200 was lost, so that the rate is below 2e-4; five
+# of 450 are lost once in 10⁶ runs at a rate of 3e-4. Of the others none of 27000 was lost or unsure, and nothing is known that loses them.
+MOST_LOST = 4
 CELLS = (
     Case(),
     Case(radius=1.0, blur=0.8, read_dn=0.5),
@@ -47,7 +49,7 @@ def test_thresholds_and_operators_cover(case: Case, rng: np.random.Generator):
     """Of 900 coordinates, at least as many within 1 u and 2 u as promised; 61 % for 68.3 % and 91 % for 95.4 % would be caught."""
     names = tuple(name for name in COVERING if case.radius >= LEAST_RADIUS.get(name, 0.0))
     for name, out in coverage_cells.collect_all(coverage_cells.make_frame(case, rng, 225), rng, names, draws=2).items():
-        assert out.false == 0 and out.missed <= MOST_LOST * (name in ("gaussian", "perimeter")), name
+        assert out.false == 0 and out.missed <= MOST_LOST, name
         assert coverage_cells.under_covered(out.z, RATE / len(COVERING)) == [], name
 
 

@@ -99,7 +99,8 @@ def test_rows_that_jitter_are_in_the_uncertainty(law, rng: np.random.Generator) 
     """100 discs, rows shifted by 0.2 px: error/u in x is 1 (it was 8 and more) and in y stays 1.
 
     Its standard error is 7 %; that of the size of the shifts, from 100 discs of some ten rows, a few per cent. Errors of u by 45 % would be
-    caught. What a field's rows share is inferred from what the fields do not share.
+    caught. What a field's rows share is inferred from what the fields do not share. Some disc in ten thousand is so ragged that it is not
+    taken for one: four of a hundred are so once in 10⁶ runs even if it is one in 1400.
     """
     frame, x, y = shifted_frame(rng, 100, law(rng, 100))
     for name in ("template", "soft_threshold", "ellipse_edges"):
@@ -110,7 +111,7 @@ def test_rows_that_jitter_are_in_the_uncertainty(law, rng: np.random.Generator) 
             [(table.x_px[good] - x[near]) / np.sqrt(table.var_x_px2[good]), (table.y_px[good] - y[near]) / np.sqrt(table.var_y_px2[good])]
         )
         zx, zy = np.sqrt((z**2).mean(axis=1))
-        assert good.sum() == 100 and 0.55 < zx < 1.45, name
+        assert good.sum() >= 97 and 0.55 < zx < 1.45, name
         assert zy < 1.45, name
     assert "rows shifted" in table.images[0]["noise_model"]
     given = locate(frame, noise=NoiseModel(1.2**2 + 1 / 12))
