@@ -13,6 +13,8 @@ from click.testing import CliRunner
 
 import pixmetry
 from pixmetry.assess.known_geometry import height_settings
+from pixmetry.calibrate.bundle.model import CameraModel, Sensor
+from pixmetry.calibrate.calibrated_camera import calibrated_camera, geometry_of
 from pixmetry.camera.camera import Camera, load_camera
 from pixmetry.camera.catalogue import sources
 from pixmetry.camera.overrides import with_source
@@ -384,3 +386,27 @@ def test_the_pose_of_a_stabilised_sensor_is_fitted(rng: np.random.Generator) -> 
     left = np.stack([found.x_px - x, found.y_px - y])
     assert np.abs(seen - np.stack([x, y])).max() > 0.1 > 0.06 > np.abs(left[:, 6:]).max()
     assert 1e-4 < np.sqrt(found.correction_px2[6:, [0, 2]]).max() < 0.05
+
+
+def test_a_calibrated_lens_is_taken_off_as_the_bundle_does_it(tmp_path: Path) -> None:
+    """The bundle's own formula for directions is the oracle; the file of the camera carries the covariance of the calibration."""
+    camera = load_camera("pulnix_tm6cn")
+    rows, cols = camera.frame_shape
+    names, u = ("c", "k1", "p1", "b1"), np.array([1e-3, 2e-6, 1e-6, 2e-6])
+    model = CameraModel.of(Sensor(cols, rows, *camera.pitch_um), c=12.0, xp=380.0, yp=287.0, b1=1e-3, b2=-5e-4, k1=-1.5e-3, p1=3e-5)
+    geometry = geometry_of(model, names, np.diag(u**2), dof=300)
+    calibrated_camera(camera, geometry).save(tmp_path / "camera.yaml")
+    x, y = points(camera)
+    found = pixmetry.corrected({"x_px": x, "y_px": y}, tmp_path / "camera.yaml", only=["optics.distortion", "sensor.affinity"])
+    c, cx, cy = (geometry.lens[n].value for n in ("principal_distance_mm", "centre_x_px", "centre_y_px"))
+    a, b = model.direction_of(x, y)
+    ideal = np.stack([(cols - 1) / 2 + cx + c / (camera.pitch_um[0] / 1000) * a, (rows - 1) / 2 + cy + c / (camera.pitch_um[1] / 1000) * b])
+    # what else the chain moves stays in, by thousandths of what it moves
+    assert np.stack([found.x_px, found.y_px]) == pytest.approx(ideal, abs=0.03)
+    assert np.abs(found.shift_px).max() > 1
+    told = {s.name: s for s in found.sources if s.applied}
+    assert set(told) == {"optics.distortion", "sensor.affinity"}
+    # K1 alone: r³ u(K1), and c along with it
+    r = np.hypot((x - 380.0) * 8.6e-3, (y - 287.0) * 8.3e-3).max()
+    assert max(told["optics.distortion"].u_px) == pytest.approx(r**3 * 2e-6 / 8.5e-3, rel=0.5)
+    assert all("by measured parameters" in s.text and "not stated" not in s.text for s in told.values())

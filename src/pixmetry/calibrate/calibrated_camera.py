@@ -18,6 +18,7 @@ from pixmetry.calibrate.records import Calibration
 from pixmetry.camera.camera import Camera, Element
 from pixmetry.camera.catalogue import get_source
 from pixmetry.camera.observations import AFFINITY, LENS, TAKEN_UP, CameraGeometry, Observations
+from pixmetry.camera.provenance import MEASURED
 from pixmetry.core.errors import InputError
 from pixmetry.core.number import Estimates
 
@@ -214,7 +215,8 @@ def calibrated_camera(camera: Camera, geometry: CameraGeometry) -> Camera:
     Returns
     -------
     Camera
-        Its facts have ``calibration`` and ``principal_distance_mm``.
+        Its facts have ``calibration`` and ``principal_distance_mm``; lens and affinity have their uncertainties, each with its own
+        covariance. That between the two is not kept.
 
     Raises
     ------
@@ -231,7 +233,8 @@ def calibrated_camera(camera: Camera, geometry: CameraGeometry) -> Camera:
     for name in (AFFINITY, LENS):
         source = get_source(name, "calibrated camera")
         assert source.measure is not None  # both can be read from a geometry
-        values = {e.name: e.value for e in source.measure(seen)}
-        chain.insert(at, Element(name, source, source.make(values, where=f"{geometry.origin}, {name}")))
+        found = source.measure(seen)
+        params = source.make({e.name: e.value for e in found}, where=f"{geometry.origin}, {name}")
+        chain.insert(at, Element(name, source, params, known_from=MEASURED, estimates=found))
     facts = {"calibration": geometry.origin, "principal_distance_mm": geometry.lens["principal_distance_mm"].value}
     return replace(camera, chain=tuple(chain), facts={**camera.facts, **facts})
