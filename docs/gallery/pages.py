@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from gallery import line_jitter_page, offset_page, threshold_page
+from gallery import error_table_page, line_jitter_page, offset_page, threshold_page
 from gallery.page import Page, table
 
 INDEX = """# The handbook's experiments, repeated
@@ -28,6 +28,12 @@ EXPERIMENTS = (
         "why lines have a periodic error when the converter cuts off values below black",
     ),
     ("Note 19, Table 3.2", "line-jitter", "Line jitter", "whether the residuals of straight lines show the jitter of a frame grabber"),
+    (
+        "Tables 3.1 and 3.2",
+        "error-table",
+        "The error table",
+        "the chapter's 39 rows for its own camera, and its residual after a calibration",
+    ),
 )
 
 
@@ -35,7 +41,7 @@ def all_pages() -> list[Page]:
     """Run every experiment; the front page comes first."""
     rows = [[where, f"[{title}]({name}.md)", what] for where, name, title, what in EXPERIMENTS]
     index = Page("index", INDEX.format(pages=table(["chapter", "page", "what it shows"], rows, 3)))
-    return [index, threshold_page.page(), offset_page.page(), line_jitter_page.page()]
+    return [index, threshold_page.page(), offset_page.page(), line_jitter_page.page(), error_table_page.page()]
 
 
 def write(folder: Path) -> list[Path]:

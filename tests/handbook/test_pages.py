@@ -32,7 +32,7 @@ def pages() -> dict[str, Page]:
     return {page.name: page for page in all_pages()}
 
 
-@pytest.mark.parametrize("name", ["index", "threshold", "offset", "line-jitter"])
+@pytest.mark.parametrize("name", ["index", "threshold", "offset", "line-jitter", "error-table"])
 def test_the_page_is_what_the_script_writes(name: str, pages: dict[str, Page]) -> None:
     wrong = differences((FOLDER / f"{name}.md").read_text(encoding="utf-8"), pages[name].text)
     assert not wrong, f"run make handbook: {wrong[:5]}"

@@ -12,10 +12,11 @@ from pixmetry.budget.answer import Answer as Totals
 from pixmetry.budget.answer import Next, rms
 from pixmetry.budget.calibration_noise import CALIBRATION
 from pixmetry.budget.camera_budget import CameraBudget
+from pixmetry.budget.handbook import why_differ
 from pixmetry.budget.object_space import SpacePoint
 from pixmetry.budget.sweep import WIDE, Sweep
 from pixmetry.budget.table import ABSENT, Parts, SourceRow
-from pixmetry.camera.catalogue import STAGES, get_source
+from pixmetry.camera.catalogue import STAGES
 from pixmetry.report import Answer, Column, Figure, Page, Points, Reading, Row, Run, Section, Table, Text, strong
 from pixmetry.report.drawing import BLUE, INK, SOFT, canvas
 from pixmetry.report.numbers import NONE, length_mpx, length_px, length_um, percent, significant
@@ -31,7 +32,6 @@ LISTED = 8  # things to do
 WORTH = 0.01  # gain over what is now, from which on something is worth doing
 MOST_BARS = 14
 AXES = ("X", "Y", "Z (depth)")
-ALIKE = 1  # stars by which two judgements may differ without a word
 HOW_TO_READ = (
     "One target in one frame, in thousandths of a pixel; the largest after the calibration first. “Before” is without any calibration, "
     "“after” is what that of the scenario leaves. “At most” is what a sound camera can have where nothing was measured. Random part and "
@@ -316,20 +316,6 @@ def _handbook(budget: CameraBudget) -> Section:
         for r in rows
     ]
     return section.add(Table("The handbook's error table", columns, cells))
-
-
-def why_differ(row: SourceRow) -> str:
-    """A sentence where the handbook's judgement and this one differ by two stars or more; empty where they do not."""
-    if row.before is None:
-        return row.reason
-    difference = row.own_stars - row.stars
-    if abs(difference) <= ALIKE:
-        return ""
-    source = get_source(row.source_id)
-    head = "More than the handbook says" if difference > 0 else "Less than the handbook says"
-    if row.reason and not row.before_px:
-        return f"{head}: {row.reason}."
-    return f"{head}; usual size: {source.typical_size}."
 
 
 # ---- what it rests on --------------------------------------------------------------------------------------------------------------
