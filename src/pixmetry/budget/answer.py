@@ -8,7 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pixmetry.budget.table import AT_BOUND, COUNTED, TYPICAL, Pair, Parts, SourceRow
+from pixmetry.camera.catalogue import sources
 
+WORTH = 0.01  # gain over what is now, from which on something is worth doing
 SIGNED = ("measured", "from the sheet", "described")  # their signs are this camera's; those of typical values are not known
 
 
@@ -61,6 +63,52 @@ class Next:
     def gain_px(self) -> float:
         """By how much it falls."""
         return self.now_px - self.then_px
+
+    @property
+    def is_worth_it(self) -> bool:
+        """Whether it makes a difference of 1 % or more."""
+        return self.gain_px >= WORTH * self.now_px
+
+
+@dataclass(frozen=True)
+class Goal:
+    """What is wanted beside what is reached: standard uncertainties (k = 1), the larger of x and y.
+
+    Parameters
+    ----------
+    wanted, reached, least, most : float
+        In ``unit``: after the calibration, with nothing but what is known of this camera, and with everything else at its bound.
+    unit : {"px", "mm"}
+    next_title : str
+        The source whose measurement lowers ``most`` most; empty where there is none.
+    """
+
+    wanted: float
+    reached: float
+    least: float
+    most: float
+    unit: str
+    next_title: str = ""
+
+    @property
+    def verdict(self) -> str:
+        """``met`` whatever is not measured; ``met as far as known``; ``not met as far as known``; ``not met``."""
+        if self.reached <= self.wanted:
+            return "met" if self.most <= self.wanted else "met as far as known"
+        return "not met" if self.least > self.wanted else "not met as far as known"
+
+    @property
+    def text(self) -> str:
+        """The same in a sentence or two."""
+        wanted, reached, least, most = (f"{v:.2g} {self.unit}" for v in (self.wanted, self.reached, self.least, self.most))
+        first = f" Measure first: {self.next_title}." if self.next_title else ""
+        aim = f"{wanted} in x and y"
+        return {
+            "met": f"{aim} is met: {reached}, and no more than {most} whatever is not measured.",
+            "met as far as known": f"{aim} is met as far as one knows: {reached}. What is not measured can raise it to {most}.{first}",
+            "not met as far as known": f"{aim} is not met as far as one knows: {reached}. What is known alone leaves {least}.{first}",
+            "not met": f"{aim} is not met: {reached}, and no less than {least} however good the rest is.",
+        }[self.verdict]
 
 
 def rms(pair: Pair) -> float:
@@ -127,8 +175,19 @@ def to_measure(rows: Sequence[SourceRow], frames: int = 1, targets: int = 1) -> 
         if row.largest is None or row.status not in (TYPICAL, AT_BOUND):
             continue
         then = answer_of([replace(r, largest=None) if r is row else r for r in rows], frames, targets).most_rms_px
-        found.append(Next(row.name, row.source_id, row.title, "", now, then))
+        found.append(Next(row.name, row.source_id, row.title, how_to_measure(row.source_id), now, then))
     return sorted((n for n in found if n.gain_px > 0), key=lambda n: n.then_px)
+
+
+def how_to_measure(source_id: str) -> str:
+    """A sentence on how a source is measured; empty for what is no source of the catalogue."""
+    source = sources().get(source_id)
+    if source is None:
+        return ""
+    if source.measure is not None:
+        return "`pixmetry assess` measures it."
+    reason = source.reasons["measure"].removeprefix("not measured: ")
+    return f"{reason[0].upper()}{reason[1:].rstrip('.')}."
 
 
 def to_change(rows: Sequence[SourceRow], frames: int = 1, targets: int = 1) -> list[Next]:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from pixmetry.budget.answer import Answer, Next, answer_of, rms, to_change, to_measure
+from pixmetry.budget.answer import Answer, Goal, Next, answer_of, rms, to_change, to_measure
 from pixmetry.budget.cameras import Disagreement
 from pixmetry.budget.monte_carlo import MonteCarlo
 from pixmetry.budget.object_space import SpacePoint, point_of
@@ -71,6 +71,19 @@ class CameraBudget:
     def left_out(self) -> tuple[SourceRow, ...]:
         """Sources of this camera that could not be computed: the answer lacks them."""
         return tuple(r for r in self.rows if r.status in COUNTED and r.after is None)
+
+    @cached_property
+    def goal(self) -> Goal | None:
+        """What the scenario wants beside what is reached; None where it wants nothing."""
+        wanted, a = self.scenario.goal, self.answer
+        pairs = (a.after_px, a.least_px, a.most_px)
+        if wanted.u_px is not None:
+            unit, aim, (reached, least, most) = "px", wanted.u_px, (max(p) for p in pairs)
+        elif wanted.u_mm is not None:
+            unit, aim, (reached, least, most) = "mm", wanted.u_mm, (max(self.mm(p) or p) for p in pairs)
+        else:
+            return None
+        return Goal(aim, reached, least, most, unit, self.to_measure[0].title if self.to_measure else "")
 
     @cached_property
     def to_measure(self) -> tuple[Next, ...]:
@@ -154,6 +167,7 @@ class CameraBudget:
             "left_out": [r.name for r in self.left_out],
             "together": None if self.together is None else _together_record(self.together),
             "rows": [_row_record(r) for r in self.rows],
+            "goal": None if self.goal is None else asdict(self.goal) | {"verdict": self.goal.verdict},
             "to_measure": [asdict(n) for n in self.to_measure],
             "to_change": [asdict(n) for n in self.to_change],
             "descriptions": [asdict(d) | {"agree": d.agree} for d in self.disagreements],

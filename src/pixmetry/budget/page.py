@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import groupby
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,18 +17,15 @@ from pixmetry.budget.sweep import WIDE, Sweep
 from pixmetry.budget.table import ABSENT, Parts, SourceRow
 from pixmetry.camera.catalogue import STAGES
 from pixmetry.report import Answer, Column, Figure, Page, Points, Reading, Row, Run, Section, Table, Text, strong
-from pixmetry.report.drawing import BLUE, INK, SOFT, canvas
+from pixmetry.report.blocks import Block, block_diagram
+from pixmetry.report.drawing import BLUE, SOFT, canvas
 from pixmetry.report.numbers import NONE, length_mpx, length_px, length_um, percent, significant
 from pixmetry.report.page import Inline
-
-if TYPE_CHECKING:
-    from matplotlib.patches import Patch
 
 KIND = "error budget"
 TITLE = f"<title>: {KIND}</title>"  # ends so
 FOOTER = "All lengths are standard uncertainties (k = 1), bias included; x runs along rows, y along columns."
 LISTED = 8  # things to do
-WORTH = 0.01  # gain over what is now, from which on something is worth doing
 MOST_BARS = 14
 AXES = ("X", "Y", "Z (depth)")
 HOW_TO_READ = (
@@ -98,6 +94,8 @@ def _answer(budget: CameraBudget) -> Section:
         parts.append([Reading(n, f"{significant(float(v), 2)} mm") for n, v in zip(AXES, point.u_mm, strict=True)])
         parts.append(Text(_about_points(budget, point), "second"))
     parts.append(Text(f"Without any calibration: x {length_px(one.before_px[0])} px, y {length_px(one.before_px[1])} px.", "second"))
+    if budget.goal is not None:
+        parts.insert(2, Text(strong(budget.goal.text)))
     section.add(Answer(parts))
     for row in budget.left_out:
         section.add_text(strong("Not in the answer:"), f" {row.title} ({row.reason}).")
@@ -147,33 +145,15 @@ def _chain(budget: CameraBudget) -> Figure:
     """The links of the chain in the order of the light, each with what it leaves."""
     counting = [r for r in budget.rows if r.counts]
     there = {r.source_id.split(".")[0] for r in budget.rows if r.status != ABSENT}
-    stages = [s for s in (*STAGES, CALIBRATION) if s in there]
     whole = sum(r.after_px**2 for r in counting) or 1.0
-    with canvas(1.15) as (figure, axes):
-        axes.set_axis_off()
-        axes.set_xlim(0, len(stages))
-        axes.set_ylim(0, 1)
-        words = []
-        for k, stage in enumerate(stages):
-            part = sum(r.after_px**2 for r in counting if r.source_id.split(".")[0] == stage)
-            share = part / whole
-            axes.add_patch(_box(k, share))
-            axes.text(k + 0.5, 0.7, stage, ha="center", va="center", color=INK, fontsize=6)
-            axes.text(k + 0.5, 0.45, f"{percent(share)} %", ha="center", va="center", color=INK, fontweight="bold")
-            axes.text(k + 0.5, 0.22, f"{length_mpx(float(np.sqrt(part)))} mpx", ha="center", va="center", color=SOFT, fontsize=6.5)
-            words.append(f"{stage} {percent(share)} %")
-            if k:
-                axes.annotate("", (k + 0.08, 0.5), (k - 0.08, 0.5), arrowprops={"arrowstyle": "->", "color": SOFT, "lw": 0.8})
-    alt = "Shares of the links of the chain: " + ", ".join(words) + "."
-    return Figure(figure, "chain", alt, "Share of each link in the square of the total after the calibration, and its part in 10⁻³ px.")
-
-
-def _box(at: int, share: float) -> Patch:
-    from matplotlib.patches import FancyBboxPatch
-
-    return FancyBboxPatch(
-        (at + 0.1, 0.08), 0.8, 0.84, boxstyle="round,pad=0,rounding_size=0.06", facecolor=BLUE, alpha=0.06 + 0.5 * share, edgecolor=SOFT
-    )
+    parts = {stage: sum(r.after_px**2 for r in counting if r.source_id.split(".")[0] == stage) for stage in there}
+    blocks = [
+        Block(stage, parts[stage] / whole, [f"{length_mpx(float(np.sqrt(parts[stage])))} mpx"])
+        for stage in (*STAGES, CALIBRATION)
+        if stage in there
+    ]
+    caption = "Share of each link in the square of the total after the calibration, and its part in 10⁻³ px."
+    return block_diagram(blocks, "chain", "the links of the chain", caption)
 
 
 def _bars(budget: CameraBudget) -> Figure:
@@ -223,9 +203,14 @@ def _sweep(sweep: Sweep) -> Section:
     columns = [
         Column(sweep.key, "right"),
         *(Column(f"{n} / px", "right") for n in ("After", "At least", "At most")),
-        Column("Largest source"),
     ]
-    cells = [[f"{s.value:g}", *(length_px(rms(p)) for p in _three(s.answer)), s.largest] for s in sweep.steps]
+    in_mm = any(s.after_mm is not None for s in sweep.steps)
+    columns += [Column("After / mm", "right")] if in_mm else []
+    columns.append(Column("Largest source"))
+    cells = []
+    for s in sweep.steps:
+        mm = [] if not in_mm else [NONE if s.after_mm is None else significant(s.after_mm, 2)]
+        cells.append([f"{s.value:g}", *(length_px(rms(p)) for p in _three(s.answer)), *mm, s.largest])
     return section.add(Table(f"Total over {sweep.key}", columns, cells))
 
 
@@ -242,7 +227,7 @@ def _next(title: str, name: str, steps: Sequence[Next], words: str) -> Section:
         return section.add_text("Nothing that would make a difference.")
     items: list[Inline] = []
     for step in steps[:LISTED]:
-        if step.gain_px >= WORTH * step.now_px:
+        if step.is_worth_it:
             numbers = words.format(length_px(step.now_px, 3), length_px(step.then_px, 3))
             items.append([strong(f"{step.title}:"), f" {step.text} ".replace("  ", " "), f"({numbers})"])
     return section.add(Points(items, numbered=True) if items else Text("No single source makes a difference of 1 %."))

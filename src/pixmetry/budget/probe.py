@@ -67,7 +67,7 @@ class Target:
     def describe(self) -> str:
         """Say it in words."""
         return (
-            f"{self.kind} of {self.diameter_px:g} px, blur {self.blur_px:g} px, {100 * self.peak_rel:g} % of saturation "
+            f"{self.kind} of {self.diameter_px:.3g} px, blur {self.blur_px:.3g} px, {100 * self.peak_rel:g} % of saturation "
             f"on a background of {100 * self.background_rel:g} %"
         )
 

@@ -109,6 +109,13 @@ class StorageModel(Model):
     quality: int = Field(default=90, ge=1, le=100, description="of JPEG")
 
 
+class GoalModel(Model):
+    """What is wanted: the standard uncertainty (k = 1) of a position in x and in y, of the mean over frames and targets."""
+
+    u_px: float | None = Field(default=None, gt=0, le=1e3)
+    u_mm: float | None = Field(default=None, gt=0, le=1e5, description="on the object, in place of u_px")
+
+
 class Scenario(Model):
     """What is measured and how; every entry has a default that is printed with the result.
 
@@ -128,6 +135,7 @@ class Scenario(Model):
     count: CountModel = CountModel()
     calibration: CalibrationModel = CalibrationModel()
     storage: StorageModel = StorageModel()
+    goal: GoalModel = GoalModel()
 
     @model_validator(mode="after")
     def _one_unit_each(self) -> Scenario:
@@ -135,6 +143,7 @@ class Scenario(Model):
             raise ValueError(f"count.points: at least {LEAST_POINTS} orient images; 0 where orientations are known")
         pairs = (
             (self.target, "diameter_px", "diameter_mm"),
+            (self.goal, "u_px", "u_mm"),
             (self.motion, "speed_px_per_s", "speed_mm_per_s"),
             (self.motion, "acceleration_px_per_s2", "acceleration_mm_per_s2"),
         )

@@ -71,6 +71,8 @@ class Setting:
         """
         for name in ("camera", "target", "px_per_mm", "velocity_px_per_s", "acceleration_px_per_s2"):
             getattr(self, name)
+        if self.scenario.goal.u_mm is not None:
+            self.needed_scale("goal.u_mm")
 
     @cached_property
     def camera(self) -> Camera:

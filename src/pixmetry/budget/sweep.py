@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from pixmetry.budget.answer import Answer
+from pixmetry.budget.answer import Answer, rms
 from pixmetry.budget.camera_budget import CameraBudget
 from pixmetry.budget.changes import changed
 from pixmetry.budget.scenario import Scenario
@@ -22,11 +22,12 @@ WIDE = 3.0  # ratio of both ends from which on steps are in proportion
 
 @dataclass(frozen=True)
 class Step:
-    """One value, what the budget comes to, and its largest source."""
+    """One value, what the budget comes to (on the object in mm, rms of x and y, where the scale is known), and its largest source."""
 
     value: float
     answer: Answer
     largest: str
+    after_mm: float | None = None
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,8 @@ def parse_sweep(text: str) -> tuple[str, tuple[float, ...]]:
         raise form
     wide = first > 0 and last > 0 and max(first, last) / min(first, last) >= WIDE
     values = np.geomspace(first, last, count) if wide else np.linspace(first, last, count)
-    return key, tuple(float(f"{v:.6g}") for v in values)
+    between = (float(f"{v:.3g}") for v in values[1:-1])  # whoever gives ends only wants round values between them
+    return key, (first, *between, last)
 
 
 def sweep_of(
@@ -92,5 +94,6 @@ def sweep_of(
     steps = []
     for value, (one, asked) in zip(values, settings, strict=True):
         found = budget_of(one, asked)
-        steps.append(Step(value, found.one, next((r.title for r in found.rows if r.counts), "")))
+        mm = found.mm(found.one.after_px)
+        steps.append(Step(value, found.one, next((r.title for r in found.rows if r.counts), ""), None if mm is None else rms(mm)))
     return Sweep(key, tuple(steps))

@@ -172,6 +172,8 @@ def print_budget(found: CameraBudget, console: Console, everything: bool = False
         console.print(f"on the object: {mm[0]:.2g} mm × {mm[1]:.2g} mm", markup=False)
     elif found.scenario.object.distance_mm is not None:
         console.print("on the object: not known without focal length (object.f_mm) and pixel pitch", markup=False)
+    if found.goal is not None:
+        console.print(found.goal.text, markup=False)
     if found.together is not None:
         t = found.together
         console.print(
@@ -217,7 +219,10 @@ def print_next(found: CameraBudget, console: Console) -> None:
 
     for title, steps in (("To measure next (upper end of the interval)", found.to_measure), ("To change next (total)", found.to_change)):
         console.print(title, markup=False)
-        for step in steps[:8]:
+        worth = [step for step in steps[:SHOWN] if step.is_worth_it]
+        if not worth:
+            console.print("  no single source makes a difference of 1 %", markup=False)
+        for step in worth:
             console.print(
                 f"  {length_px(step.now_px, 3)} -> {length_px(step.then_px, 3)} px  {step.title}. {step.text}".rstrip(), markup=False
             )
@@ -228,7 +233,9 @@ def print_sweep(sweep: Sweep, console: Console) -> None:
     from pixmetry.budget.answer import rms
     from pixmetry.report.numbers import length_px
 
-    console.print(f"{sweep.key}: after calibration (least to most), px", markup=False)
+    in_mm = "; mm on the object" if any(s.after_mm is not None for s in sweep.steps) else ""
+    console.print(f"{sweep.key}: after calibration (least to most), px{in_mm}", markup=False)
     for step in sweep.steps:
         after, least, most = (length_px(rms(p)) for p in (step.answer.after_px, step.answer.least_px, step.answer.most_px))
-        console.print(f"  {step.value:<10g} {after} ({least} to {most})  {step.largest}", markup=False)
+        mm = "" if step.after_mm is None else f"  {step.after_mm:.2g} mm"
+        console.print(f"  {step.value:<10g} {after} ({least} to {most}){mm}  {step.largest}", markup=False)
