@@ -304,6 +304,14 @@ def test_tables_of_locate_come_back_in_their_form(tmp_path: Path) -> None:
     assert [t["x_px"] for t in record["targets"]] == pytest.approx(list(found.measured.x_px), abs=1e-6)
     direct = pixmetry.corrected(table, DIGITAL, settings={"state.temperature_change_k": 10.0, "optics.cover_glass.thickness_um": 750.0})
     assert direct.x_px == pytest.approx(found.measured.x_px, abs=1e-6)
+    (tmp_path / "blanks.txt").write_text("x y note\n100 200 a\nnan nan b\n")
+    for more, columns in (((), "x y note"), (("--u", "state.temperature_change_k=1"), "x y note correction_var_x_px2")):
+        code, said = run(tmp_path / "blanks.txt", "--with", ANALOGUE, "-o", tmp_path / "out.txt", *more)
+        assert code == 0, said
+        first, header, *rows = (tmp_path / "out.txt").read_text().splitlines()
+        assert (
+            "lacks the uncertainty of" in first and header.startswith(columns) and {len(r.split()) for r in rows} == {len(header.split())}
+        )
     code, said = run(tmp_path / "table.csv", "--with", DIGITAL, "--list")
     assert code == 0 and "x_px" not in said
 
@@ -313,6 +321,7 @@ def test_tables_of_locate_come_back_in_their_form(tmp_path: Path) -> None:
     [
         ("a,b\n1,2\n", (), ("no column with x", "--x NAME")),
         ("x,y\n1,zwei\n", (), ("'y' is no number", "row 1")),
+        ("x;y\n1,5;2\n", (), ("write the decimal point as a point: 1.5",)),
         ("x,y,frame\n1,2,0.5\n", (), ("'frame' is no number of a frame",)),
         ("x,y,var_x,var_y\n1,2,-1,1\n", (), ("hold no uncertainty",)),
         ("x,y\n1,2\n", ("--u", "optics.nothing=1"), ("no number has this name",)),
@@ -359,7 +368,10 @@ def test_what_changes_from_image_to_image_is_fitted_to_reference_positions(rng: 
     # 63 normal scores, of which the fits correlate some: a mean square of 1 to 6 x sqrt(2/63) x 1.3
     assert abs(z2 - 1) < 6 * 1.3 * np.sqrt(2 / 63) and z2 > 0.2
     assert np.all(found.covariance_px2[:, 0] > plain.covariance_px2[:, 0])
-    assert found.causes.count("per image: scale") == 12 and "im2" in found.notes[-1]
+    assert found.image_effects_px.shape == (4, n, 2) and "im2" in found.notes[-1]
+    whole = found.correction_covariance_px2
+    assert whole[::2, ::2].diagonal() == pytest.approx(found.correction_px2[:, 0]) and np.all(whole[:60, 60:] == 0)
+    assert np.array(found.common_u_px) == pytest.approx(np.sqrt([whole[i::2, i::2].mean() for i in (0, 1)]))
     wide = pixmetry.corrected(table, unaware, reference=control, u={"grabber.sampling_clock.clock_mhz": 0.01})
     alone = wide.effects_px[list(wide.causes).index("grabber.sampling_clock")]
     assert np.abs(alone[:, 0]).max() < 0.01  # a wrong clock is a scale, which every image tells

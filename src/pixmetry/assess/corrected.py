@@ -94,6 +94,9 @@ class CorrectedPositions:
     sources : tuple of SourceCorrection
     notes : tuple of str
     camera : str
+    image_effects_px : ndarray, shape (p, n, 2), optional
+        The same as ``effects_px`` of what was fitted in each image; the causes of two images are independent of each other.
+    image_of : ndarray of int, shape (n,), optional
     """
 
     x_px: np.ndarray
@@ -106,6 +109,8 @@ class CorrectedPositions:
     sources: tuple[SourceCorrection, ...]
     notes: tuple[str, ...] = ()
     camera: str = ""
+    image_effects_px: np.ndarray | None = None
+    image_of: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.x_px)
@@ -122,15 +127,25 @@ class CorrectedPositions:
     @property
     def correction_covariance_px2(self) -> np.ndarray:
         """Covariance of the correction of all positions, x and y of one after the other, shape (2 n, 2 n)."""
-        flat = np.nan_to_num(self.effects_px.reshape(len(self.effects_px), -1))
-        return np.asarray(flat.T @ flat)
+        flat = np.nan_to_num(self.effects_px.reshape(len(self.effects_px), 2 * len(self)))
+        total = np.asarray(flat.T @ flat)
+        if self.image_effects_px is not None and self.image_of is not None:
+            own = np.nan_to_num(self.image_effects_px.reshape(len(self.image_effects_px), 2 * len(self)))
+            image = np.repeat(self.image_of, 2)
+            total = total + (own.T @ own) * (image[:, None] == image)
+        return total
 
     @property
     def common_u_px(self) -> tuple[float, float]:
         """Standard uncertainty of the correction of the mean of all positions: what no number of targets averages."""
         seen = np.isfinite(self.x_px)
         mean = self.effects_px[:, seen].mean(axis=1) if seen.any() else np.zeros((len(self.effects_px), 2))
-        x, y = np.sqrt((mean**2).sum(axis=0))
+        square = (mean**2).sum(axis=0)
+        if self.image_effects_px is not None and self.image_of is not None:
+            for image in np.unique(self.image_of[seen]):
+                part = self.image_effects_px[:, seen & (self.image_of == image)].sum(axis=1) / seen.sum()
+                square = square + (part**2).sum(axis=0)
+        x, y = np.sqrt(square)
         return float(x), float(y)
 
     @property
@@ -147,12 +162,16 @@ class CorrectedPositions:
     @property
     def columns(self) -> dict[str, Any]:
         """The columns of the table, with the corrected positions in place of the measured ones."""
-        return self.measured.replaced(self.x_px, self.y_px, self.covariance_px2, self.correction_px2)
+        correction = self.correction_px2 if self.correction_px2.any() else None
+        return self.measured.replaced(self.x_px, self.y_px, self.covariance_px2, correction)
 
     def content(self) -> bytes:
         """The table as a file, in the form in which it came."""
-        done = "; ".join(s.name for s in self.sources if s.applied)
-        return self.measured.content(self.columns, f"{done or 'nothing'} corrected by {self.camera}; x and y in px of the ideal camera")
+        done, silent = ([s.name for s in self.sources if s.applied and yes(s)] for yes in (lambda s: True, lambda s: not any(s.u_px)))
+        told = f"{', '.join(done) or 'nothing'} corrected; x and y are those that {self.camera} would show without"
+        if silent:
+            told += f"; the covariance lacks the uncertainty of {', '.join(silent)}, which is not stated"
+        return self.measured.content(self.columns, told)
 
     def write(self, path: str | Path) -> Path:
         """Write the table in the form in which it came; it appears whole or not at all.
@@ -371,6 +390,11 @@ class _Case:
     def said(self) -> list[str]:
         """What was taken for granted of the times."""
         notes = []
+        if self.in_state:
+            told = {name for name, (_, given) in changed(self.described, self.scenario, self.settings)[1].told.items() if given}
+            assumed = [f"{key} {self.nominal(key):g}" for key in STATE[:3] if key not in told]
+            if assumed:
+                notes.append(f"not told, so assumed: {', '.join(assumed)}")
         if "time_s" not in self.schedule and np.max(self.schedule["frame"], initial=0) > 0:
             period = self.camera.facts.get("frame_period_s", 0.04)
             how = "by the column frame" if "frame" in self.table.columns else "in the order of the images"
@@ -513,8 +537,8 @@ def _fitted(
     own = None if found.covariance_px2 is None else found.covariance_px2 - found.correction_px2
     fit = fit_per_image(at, own, found.effects_px, found.measured, reference, model, frame_shape, match)
     name = f"per image: {model}"
-    correction = _summed(fit.effects_px)
-    by_fit = _summed(fit.effects_px[len(fit.effects_px) - fit.fitted :])
+    by_fit = _summed(fit.own_effects_px)
+    correction = _summed(fit.effects_px) + by_fit
     shift, u = np.abs(np.nan_to_num(fit.shift_px)).max(axis=0), np.sqrt(np.nan_to_num(by_fit[:, [0, 2]])).max(axis=0, initial=0.0)
     text = f"by {fit.targets} reference positions in {fit.images} images"
     sizes = (float(shift[0]), float(shift[1])), (float(u[0]), float(u[1]))
@@ -526,7 +550,8 @@ def _fitted(
         covariance_px2=None if own is None else own + correction,
         correction_px2=correction,
         effects_px=fit.effects_px,
-        causes=(*found.causes, *([name] * fit.fitted)),
+        image_effects_px=fit.own_effects_px,
+        image_of=fit.image_of,
         sources=(*found.sources, step),
         notes=(*found.notes, *fit.notes),
     )

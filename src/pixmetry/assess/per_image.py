@@ -23,10 +23,10 @@ class PerImage:
     shift_px : ndarray, shape (n, 2)
         To be taken off each position; 0 in images without a fit.
     effects_px : ndarray, shape (k, n, 2)
-        What each independent cause of uncertainty does to all positions: the earlier ones, as far as the fit does not follow them, and
-        those of the fits.
-    fitted : int
-        How many of the causes are the fits', at the end.
+        What each independent cause of uncertainty does to all positions, as far as the fits do not follow it.
+    own_effects_px : ndarray, shape (p, n, 2)
+        The same of the independent causes of each fit; those of two images are independent of each other.
+    image_of : ndarray of int, shape (n,)
     targets, images : int
         Reference positions and images that were used.
     notes : tuple of str
@@ -34,7 +34,8 @@ class PerImage:
 
     shift_px: np.ndarray
     effects_px: np.ndarray
-    fitted: int
+    own_effects_px: np.ndarray
+    image_of: np.ndarray
     targets: int
     images: int
     notes: tuple[str, ...]
@@ -79,17 +80,19 @@ def fit_per_image(
     if model not in MODELS:
         raise InputError("no such model", where="per_image", value=model, allowed=", ".join(MODELS))
     aim, known = _aims(table, reference, match)
-    images = [str(v) for v in table.columns["image"]] if "image" in table.columns else [""] * len(table)
+    names, image_of = np.unique([str(v) for v in table.columns.get("image", [""] * len(table))], return_inverse=True)
     basis = _basis(at_px, model, frame_shape)
     shift, effects = np.zeros_like(at_px), np.array(effects_px)
-    own: list[np.ndarray] = []
+    own = np.zeros((len(basis), *at_px.shape))
     notes: list[str] = []
     used = fits = 0
-    for image in dict.fromkeys(images):
-        mine = np.array([name == image for name in images])
-        by = mine & known & np.isfinite(at_px).all(axis=1)
+    order = np.argsort(image_of, kind="stable")
+    parts = np.split(order, np.flatnonzero(np.diff(image_of[order])) + 1)
+    usable = known & np.isfinite(at_px).all(axis=1)
+    for image, mine in zip(names, parts, strict=True):
+        by = mine[usable[mine]]
         a = basis[:, by].reshape(len(basis), -1).T
-        count, needed = int(by.sum()), len(basis) + (covariance_px2 is None)
+        count, needed = len(by), len(basis) + (covariance_px2 is None)
         named = f"image {image}: " if image else ""
         if 2 * count < needed or np.linalg.matrix_rank(a) < len(basis):
             notes.append(f"{named}{count} reference positions are too few for {MODELS[model]}: its positions are without it")
@@ -105,13 +108,9 @@ def fit_per_image(
         for effect in effects:
             effect[mine] -= np.tensordot(solve @ effect[by].ravel(), basis[:, mine], axes=1)
         power, directions = np.linalg.eigh(spread * (s2 if covariance_px2 is None else max(s2, 1.0)))
-        for p, direction in zip(power, directions.T, strict=True):
-            one = np.zeros_like(at_px)
-            one[mine] = np.tensordot(np.sqrt(max(p, 0.0)) * direction, basis[:, mine], axes=1)
-            own.append(one)
+        own[:, mine] = np.tensordot((directions * np.sqrt(np.maximum(power, 0.0))).T, basis[:, mine], axes=1)
         notes.append(f"{named}{MODELS[model]} by {count} reference positions, which fit to {np.sqrt(np.mean(left**2)):.2g} px")
-    stacked = np.concatenate([effects.reshape(-1, *at_px.shape), np.array(own).reshape(-1, *at_px.shape)])
-    return PerImage(shift, stacked, len(own), used, fits, tuple(notes))
+    return PerImage(shift, effects, own, image_of.ravel(), used, fits, tuple(notes))
 
 
 def _aims(table: Positions, reference: Positions, match: str | None) -> tuple[np.ndarray, np.ndarray]:

@@ -94,15 +94,18 @@ class Positions:
             raise InputError(f"'{name}' has no value", where=where, allowed="a number in every row", remedy="fill it, or delete the column")
         return values
 
-    def replaced(self, x_px: np.ndarray, y_px: np.ndarray, covariance_px2: np.ndarray | None, correction_px2: np.ndarray) -> dict[str, Any]:
+    def replaced(
+        self, x_px: np.ndarray, y_px: np.ndarray, covariance_px2: np.ndarray | None, correction_px2: np.ndarray | None
+    ) -> dict[str, Any]:
         """All columns with other positions; covariances in the columns that hold them, or those of the correction in new ones."""
         columns: dict[str, Any] = dict(self.columns)
         lost = ~(np.isfinite(x_px) & np.isfinite(y_px))
         for name, values in zip(self.names, (x_px, y_px), strict=True):
             old = self.columns[name]
             columns[name] = [old[i] if lost[i] else float(v) + self.first for i, v in enumerate(values)]
+        new: dict[str, np.ndarray] = {}
         if covariance_px2 is None:
-            new = dict(zip(OF_CORRECTION, correction_px2.T, strict=True))
+            new = {} if correction_px2 is None else dict(zip(OF_CORRECTION, correction_px2.T, strict=True))
         else:
             var_x, cov, var_y = covariance_px2.T
             deviations = bool(self.uncertainty) and self.uncertainty[0] not in _named(VARIANCES, "x")
@@ -126,7 +129,7 @@ class Positions:
             text.write(f"{line}\n")
         writer = csv.writer(text, lineterminator="\n", delimiter=self.parted_by)
         writer.writerow(columns)
-        writer.writerows([[_written(v) for v in row] for row in zip(*columns.values(), strict=True)])
+        writer.writerows([[_written(v, self.parted_by) for v in row] for row in zip(*columns.values(), strict=True)])
         return text.getvalue().encode()
 
 
@@ -221,6 +224,8 @@ def _floats(values: Sequence[Any], name: str, source: str) -> np.ndarray:
             out[i] = float(value)
         except (TypeError, ValueError):
             remedy = "correct it, or leave the place empty"
+            if isinstance(value, str) and re.fullmatch(r"[+-]?\d*,\d+", value.strip()):
+                remedy = f"write the decimal point as a point: {value.strip().replace(',', '.')}"
             raise InputError(f"'{name}' is no number", where=f"{source}, row {i + 1}", value=value, remedy=remedy) from None
     return out
 
@@ -253,7 +258,9 @@ def _of_json(path: Path) -> Positions:
     return Positions(nothing, nothing, None, columns, form="json", record=head, source=str(path))
 
 
-def _written(value: Any) -> Any:
+def _written(value: Any, parted_by: str) -> Any:
+    if parted_by == " " and value in (None, ""):
+        return "nan"  # an empty place would shift those behind it
     if isinstance(value, str):
         return cell(value)
     return "" if value is None else f"{value:.10g}" if isinstance(value, float) else value

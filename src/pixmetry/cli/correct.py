@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 
     from pixmetry.assess.correct import FrameCorrection
 
+IN_POSITIONS = ("positions are", "coordinates are")  # in the reasons of sources that move points
+
 
 @click.command()
 @click.argument("frames", nargs=-1, type=click.Path(path_type=Path))
@@ -94,3 +96,5 @@ def print_steps(steps: Sequence[FrameCorrection], sources: Mapping[str, str] | N
             echo(f"{step.name}: {text} (noise × {step.noise_rel:.3g}). {step.does} Left: {step.leaves or 'not told'}.")
         else:
             echo(f"{step.name}: {text}")
+    if any(word in step.text for step in steps for word in IN_POSITIONS):
+        echo("what moves points is corrected in the positions: see `pixmetry corrected`")

@@ -62,6 +62,7 @@ def _details(source: Source) -> dict[str, Any]:
         "bound_of_frame": "" if source.bound_over is None else "{} × {} px".format(*STATED_FRAME[::-1]),
         "typical_size": source.typical_size,
         "advice": source.advice,
+        "leaves": source.leaves,
         "references": list(source.references),
     }
 
@@ -110,5 +111,6 @@ def _explain(record: dict[str, Any]) -> None:
         if record["bound_of_frame"]:
             console.print(f"The bound holds for the whole frame; the numbers in the table are for a frame of {record['bound_of_frame']}.\n")
     for verb, has in record["verbs"].items():
-        console.print(f"{verb:<12}  {'yes' if has else 'no: ' + escape(record['reasons'][verb])}")
+        left = f"; left: {escape(record['leaves'])}" if verb == "correct" and has else ""
+        console.print(f"{verb:<12}  {'yes' + left if has else 'no: ' + escape(record['reasons'][verb])}")
     console.print("\nreferences: " + escape("; ".join(record["references"])))
