@@ -8,10 +8,11 @@ from dataclasses import replace
 import numpy as np
 
 from pixmetry.budget.fields import Places
+from pixmetry.budget.measured_calibration import MeasuredCalibration
 from pixmetry.budget.motion import OF_MOTION
 from pixmetry.budget.networks import DEPTH, FOUR, TEN, calibrating, interior_basis, solve
 from pixmetry.budget.setting import Setting
-from pixmetry.budget.table import ABSENT, DESCRIBED, FORMULA, TYPICAL, Pair, Parts, SourceRow, independent_px
+from pixmetry.budget.table import ABSENT, DESCRIBED, FORMULA, MEASURED, NOTHING, TYPICAL, Pair, Parts, SourceRow, independent_px
 
 CALIBRATION = "calibration"  # name of the row
 TITLE = "Noise of the calibration"
@@ -42,6 +43,8 @@ def calibration_row(rows: Sequence[SourceRow], setting: Setting) -> SourceRow:
     row = SourceRow(CALIBRATION, CALIBRATION, TITLE, 0, 0, "", "G", Parts(), Parts(), advice=ADVICE)
     if told.model == "none":
         return replace(row, status=ABSENT, reason="nothing was calibrated")
+    if setting.made is not None:
+        return _of_made(row, setting, setting.made)
     still = [r for r in rows if r.source_id not in OF_MOTION]
     sigma = independent_px(still) if told.noise_px is None else (told.noise_px, told.noise_px)
     known = bool(told.model_fields_set & {"images", "targets", "noise_px"})
@@ -60,6 +63,30 @@ def calibration_row(rows: Sequence[SourceRow], setting: Setting) -> SourceRow:
     return row if known or more <= 1 else replace(row, largest=Parts.of([more * v for v in after.values_px]))
 
 
+def _of_made(row: SourceRow, setting: Setting, made: MeasuredCalibration) -> SourceRow:
+    """The row of a calibration that was made; what its residuals have in common by place may be in no other row, and is the upper end."""
+    places, x, y = _places(setting)
+    modes = made.displacements(places.x_px[0], places.y_px[0]) * np.array([1.0, setting.aspect])[:, None]
+    modes = unrotated(modes, x / made.camera.c_px[0], y / made.camera.c_px[0], places.even) / np.array([1.0, setting.aspect])[:, None]
+    after = parts_of_modes(modes[..., : places.even])
+    (x_px, y_px), (left_x, left_y) = after.smooth_px, made.left_px
+    largest = replace(after, smooth_px=(float(np.hypot(x_px, left_x)), float(np.hypot(y_px, left_y))))
+    common = f"; its residuals have {made.left_px[0]:.2g} px in x and {made.left_px[1]:.2g} px in y in common by place"
+    reason = f"calibration of {made.camera.name}, {made.images} images{common if any(made.left_px) else ''}"
+    if made.finding is not None:
+        reason += f"; {made.finding.text}"
+    found = replace(row, status=MEASURED, how=FORMULA, method="covariance of the interior parameters", reason=reason, after=after)
+    return replace(found, largest=largest, fields_px=modes[..., places.even :])
+
+
+def _places(setting: Setting) -> tuple[Places, np.ndarray, np.ndarray]:
+    """Places over the frame and in the network, and where they are from the middle of the frame, in pixels along x."""
+    network = setting.network
+    also = None if network is None else network.places_px
+    places = Places.over(setting.described.frame_shape, setting.scenario.calibration.grid_px, also)
+    return places, *setting.from_middle(places.x_px[0], places.y_px[0])
+
+
 def modes_of(setting: Setting, sigma_px: Pair) -> tuple[np.ndarray, int]:
     """Independent displacements by the parameters' noise, shape (k, 2, n), px: at so many places over the frame, then in the network."""
     told, frame, aspect = setting.scenario.calibration, setting.described.frame_shape, setting.aspect
@@ -67,9 +94,7 @@ def modes_of(setting: Setting, sigma_px: Pair) -> tuple[np.ndarray, int]:
     network, factor = calibrating(setting.c_px, frame, aspect, told.images, told.targets, DEPTH if told.field == "deep" else 0.0)
     which = FOUR if told.model == "principal_point_and_scale" else TEN
     covariance = factor * solve(network, sigma, which).interior_covariance
-    also = None if setting.network is None else setting.network.places_px
-    places = Places.over(frame, told.grid_px, also)
-    x, y = setting.from_middle(places.x_px[0], places.y_px[0])
+    places, x, y = _places(setting)
     half = max(frame) / 2
     basis = interior_basis(x / half, y / half)[which]
     modes = np.tensordot(np.linalg.cholesky(covariance).T, basis, axes=1)
@@ -84,7 +109,7 @@ def unrotated(modes: np.ndarray, u: np.ndarray, v: np.ndarray, even: int) -> np.
     return np.asarray(modes - np.tensordot(found.T, turned, axes=1))
 
 
-def parts_of_modes(modes: np.ndarray, place_px: Pair) -> Parts:
+def parts_of_modes(modes: np.ndarray, place_px: Pair = NOTHING) -> Parts:
     """Root mean square over the frame, as what changes slowly over it."""
     x, y = (float(v) for v in np.sqrt(np.mean(np.sum(modes**2, axis=0), axis=-1)))
     return Parts(smooth_px=(x, y), place_px=place_px)

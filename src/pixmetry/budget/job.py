@@ -13,6 +13,7 @@ from pixmetry.budget.camera_budget import CameraBudget
 from pixmetry.budget.cameras import camera_of
 from pixmetry.budget.combine import combine, together_with
 from pixmetry.budget.headline import dof_of, headline, interval_of
+from pixmetry.budget.measured_calibration import as_calibrated, measured_calibration, with_lens
 from pixmetry.budget.monte_carlo import Trials
 from pixmetry.budget.probe import Probes, Target, facts_of, resolve
 from pixmetry.budget.records import DECIDED, Budget, BudgetRow, Interaction
@@ -29,6 +30,8 @@ from pixmetry.budget.rows import (
 from pixmetry.budget.scenario import Scenario, read_scenario
 from pixmetry.budget.setting import Setting
 from pixmetry.budget.table import Table
+from pixmetry.calibrate.files.record import StoredCalibration
+from pixmetry.calibrate.records import Calibration
 from pixmetry.camera.camera import Camera
 from pixmetry.camera.observations import TAKEN_UP, CameraGeometry
 from pixmetry.core.number import Estimates
@@ -145,6 +148,7 @@ def budget(
     camera: str | Path | Camera | Sequence[str | Path | Camera],
     scenario: str | Path | Mapping[str, Any] | Scenario | None = None,
     *,
+    calibration: str | Path | StoredCalibration | Calibration | None = None,
     estimator: Estimator | str | None = None,
     trials: int = 0,
     seed: int = 0,
@@ -159,6 +163,9 @@ def budget(
         was measured replaces what a sheet says, and both are compared.
     scenario : path, mapping or Scenario, optional
         What is measured and how, schema ``pixmetry/scenario/1``; whatever it leaves open has a default.
+    calibration : path, StoredCalibration or Calibration, optional
+        A ``calibration.json`` of `pixmetry.calibrate` or its folder, or what that returned: its lens takes the place of the camera's, the
+        scenario takes over what was calibrated, and the covariance of its parameters is the calibration's noise.
     estimator : Estimator or str, optional
         By default what `pixmetry.locate` takes for such a target.
     trials : int
@@ -174,7 +181,7 @@ def budget(
     Raises
     ------
     InputError
-        If camera or scenario cannot be used, or the target is not seen.
+        If camera, scenario or calibration cannot be used, the calibration is of a sensor of another format, or the target is not seen.
 
     Examples
     --------
@@ -184,7 +191,12 @@ def budget(
     True
     """
     known, disagreements = camera_of(camera)
-    setting = Setting(known, read_scenario(scenario))
+    asked, made = read_scenario(scenario), None
+    if calibration is not None:
+        made = measured_calibration(calibration, known)
+        known, made = with_lens(known, calibration, made)
+        asked = as_calibrated(asked, made)
+    setting = Setting(known, asked, made)
     setting.check()  # before the work
     law = TargetEstimator(estimator) if isinstance(estimator, str) else estimator or TargetEstimator()
     table = Table(setting, law, seed, progress or (lambda text: None))

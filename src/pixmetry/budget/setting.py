@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from pixmetry.budget.measured_calibration import MeasuredCalibration
 from pixmetry.budget.networks import Images, measuring
 from pixmetry.budget.probe import Facts, Target, facts_of
 from pixmetry.budget.scenario import GRADIENT_PER_PX, Scenario
@@ -52,6 +53,8 @@ class Setting:
     described : Camera
         As it was given.
     scenario : Scenario
+    made : MeasuredCalibration, optional
+        The calibration that was made; without one, the scenario's.
 
     Raises
     ------
@@ -61,6 +64,7 @@ class Setting:
 
     described: Camera
     scenario: Scenario
+    made: MeasuredCalibration | None = None
 
     def check(self) -> None:
         """Refuse a scenario that cannot be used with this camera.

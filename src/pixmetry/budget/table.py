@@ -23,6 +23,7 @@ from pixmetry.budget.setting import Setting
 from pixmetry.camera.camera import Camera, Element, pitch_values
 from pixmetry.camera.catalogue import get_source, sources
 from pixmetry.camera.contribution import UNSTEADY, Contribution
+from pixmetry.camera.observations import TAKEN_UP
 from pixmetry.camera.source import Source
 from pixmetry.core.errors import InputError, PixmetryError
 from pixmetry.core.number import Estimates
@@ -347,6 +348,8 @@ class Table:
             return f"only in a camera that is {' or '.join(source.applies_to)}"
         if source.id in self.setting.brought_in:
             return ""
+        if self.setting.made is not None and self.setting.made.finding is None and source.id in TAKEN_UP:
+            return "it is part of the lens that was calibrated"
         if source.option:
             return f"only in a camera with {source.option}"
         if source.id in SETTINGS:

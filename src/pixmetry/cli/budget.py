@@ -43,6 +43,12 @@ SHOWN = 20  # rows on the terminal
     help="Change an entry of the scenario, such as motion.speed_px_per_s=50, or a parameter of the camera. May be repeated.",
 )
 @click.option(
+    "--calibration",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="A calibration.json of `pixmetry calibrate`, or its folder: its lens, what was calibrated, and how well.",
+)
+@click.option(
     "--vary",
     metavar="KEY=FROM:TO[:STEPS]",
     help="Also budget over a range of one entry, such as light.f_number=2.8:16, or over values, such as target.diameter_px=5,7,10.",
@@ -64,6 +70,7 @@ def budget(
     cameras: tuple[str, ...],
     scenario: Path | None,
     settings: tuple[str, ...],
+    calibration: Path | None,
     vary: str | None,
     estimator: str | None,
     trials: int,
@@ -100,6 +107,9 @@ def budget(
     if side_by_side:
         refuse_beside_budgets({"--vary": vary is not None, "--trials": trials > 0, "--next": what_next})
         asked_of_all, changes = read_scenario(scenario), parse_overrides(settings)
+        if calibration is not None:
+            remedy = "write the budget of each camera with --json, and compare these files"
+            raise InputError("a calibration belongs to one camera", where="--calibration", value=str(calibration), remedy=remedy)
         if len(cameras) < 2:
             raise InputError("one camera cannot be compared", where="--compare", value=cameras[0], remedy="name two cameras or more")
         pairs = [changed(camera_of(one)[0], asked_of_all, changes) for one in cameras]
@@ -109,7 +119,7 @@ def budget(
 
         put_budgets(all_compared, [Path(c) for c in (*cameras, scenario or "") if Path(c).is_file()], html, pdf, json_file, everything)
         return
-    inputs = [Path(c) for c in cameras if Path(c).is_file()] + ([scenario] if scenario else [])
+    inputs = [Path(c) for c in cameras if Path(c).is_file()] + [p for p in (scenario, calibration) if p is not None]
     written = JsonResult(json_file, "pixmetry/camera_budget/1", inputs=inputs)
     if html is not None:
         check_files([Output(html, page_mark(TITLE))], inputs)
@@ -119,10 +129,12 @@ def budget(
     camera, asked = changed(known, read_scenario(scenario), parse_overrides(settings))
 
     def budgeted(one: Camera, of: Scenario) -> CameraBudget:
-        return budget_of(one, of, estimator=estimator, seed=seed)
+        return budget_of(one, of, calibration=calibration, estimator=estimator, seed=seed)
 
     sweep = None if span is None else sweep_of(camera, asked, *span, budgeted)
-    found = replace(budget_of(camera, asked, estimator=estimator, trials=trials, seed=seed), disagreements=compared)
+    found = replace(
+        budget_of(camera, asked, calibration=calibration, estimator=estimator, trials=trials, seed=seed), disagreements=compared
+    )
     console = plain_console(width=116, quiet=written.printed)
     if what_next:
         print_next(found, console)
