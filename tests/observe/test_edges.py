@@ -12,16 +12,14 @@ from observe.edge_pictures import one_edge, response, squares, stored
 from pixmetry.camera.observations import SlantedEdges
 from pixmetry.core.threads import set_threads
 from pixmetry.observe._edge_kernels import find_steps
-from pixmetry.observe.edges import Picture, edge_notes, find_edges
+from pixmetry.observe.edges import Picture, edge_notes, responses_of, search_edges
 
 LIMIT = 5.5  # u; beyond it once in 3e7
 DATA = os.environ.get("PIXMETRY_DATA", "")
 
 
 def seen(*frames: np.ndarray, top: float = 4095.0) -> SlantedEdges:
-    found = find_edges([Picture("edge", np.asarray(f, np.float32), 1, top) for f in frames])
-    assert found is not None
-    return found
+    return responses_of(search_edges([Picture("edge", np.asarray(f, np.float32), 1, top) for f in frames]))
 
 
 def test_all_sides_of_turned_squares_are_found_and_their_response_is_the_closed_form(rng: np.random.Generator):
@@ -103,7 +101,7 @@ def test_edges_that_cannot_be_measured_say_why(make, words: str, rng: np.random.
 
 
 def test_pictures_without_edges(rng: np.random.Generator):
-    assert find_edges([]) is None
+    assert edge_notes(None) == []
     for frame in (np.zeros((60, 80)), 500 + 5 * rng.standard_normal((200, 300)), np.ones((1, 1)), np.ones((3, 7)), np.ones((400, 2))):
         found = seen(frame)
         assert not found.edges and not found.refused and not len(found.fit) and "no edge was found" in edge_notes(found)[0]

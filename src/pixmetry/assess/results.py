@@ -161,6 +161,13 @@ def edges_record(found: SlantedEdges) -> dict[str, Any]:
         "measured": len(found.edges),
         "refused": [asdict(r) for r in found.refused],
         "values": found.fit.to_records(),
+        "optics": {
+            "estimates": found.optics.to_records(),
+            "names": list(found.optics.names),
+            "covariance": found.optics.covariance.tolist(),
+            "confounders": list(found.optics.confounders),
+            "not_told": {name: why for name, why in found.optics.reasons.items() if name not in found.optics},
+        },
         "frequency_cycles_per_px": found.frequency.tolist(),
         "x": mean(found.x),
         "y": mean(found.y),

@@ -274,6 +274,8 @@ class SlantedEdges:
         Of steps along x (nearly vertical edges) and along y.
     fit : Estimates
         ``sfr50_x``, ``sfr50_y``, ``asymmetry_x``, ``asymmetry_y``, as far as there are edges for them.
+    optics : Estimates
+        Lens, pixel and optical low-pass filter, fitted together: see `pixmetry.observe.edge_fit`.
     """
 
     frequency: np.ndarray
@@ -282,6 +284,7 @@ class SlantedEdges:
     x: EdgeResponse | None
     y: EdgeResponse | None
     fit: Estimates
+    optics: Estimates
 
 
 LENS, AFFINITY = "optics.distortion", "sensor.affinity"
@@ -393,6 +396,25 @@ class Observations:
             if fit is not None and first in fit:
                 return fit.select(names)
         raise MeasureError(what, where=where, remedy=remedy)
+
+    def edge_optics(self, names: Mapping[str, str], *, where: str) -> Estimates:
+        """Take a source's parameters ``{parameter: fitted name}`` that slanted edges tell, with their covariance.
+
+        Raises
+        ------
+        MeasureError
+            Without edges, or with the reason why they do not tell any of these.
+        """
+        remedy = "take frames of slanted edges (kind: edge in the manifest)"
+        if self.edges is None or not self.edges.edges:
+            raise MeasureError("not measured: needs slanted edges", where=where, remedy=remedy)
+        optics = self.edges.optics
+        known = {name: fitted for name, fitted in names.items() if fitted in optics}
+        if not known:
+            own = [optics.reasons.get(fitted, "") for fitted in names.values()]
+            why = next(filter(None, [*own, *optics.reasons.values()]), "no edges of this direction")
+            raise MeasureError(f"not told by the slanted edges: {why}", where=where)
+        return optics.select(known)
 
     def calibrated(self, names: Mapping[str, str] | Iterable[str], *, where: str) -> Estimates:
         """Take a source's parameters out of the calibrated geometry, with their covariance.

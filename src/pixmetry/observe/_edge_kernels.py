@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from pixmetry.core.arrays import Array, Ints, Singles
 from pixmetry.core.jit import jit
 
 GAP_ROWS = 3  # over which a chain goes on without a step
+ROOT_HALF, ROOT_2PI = 0.7071067811865476, 0.3989422804014327  # 1/√2, 1/√(2π)
 LINK_PX = 1.6  # farthest from the step in the row before: an edge at 45 degrees moves by 1
 
 
@@ -168,3 +171,147 @@ def row_shifts(
                 product += steep * (frame[first + k, c] - value)
                 square += steep * steep
         shift[k] = -product / square / cosine if square > 0 else 0.0
+
+
+@jit
+def edge_table(z0: float, step: float, sigma: float, wide: float, narrow: float, far: float, near: float, out: Array) -> None:
+    """Edge spread of a Gaussian, two boxes and two pairs of images, with its derivatives, over distances along the normal.
+
+    Parameters
+    ----------
+    z0, step : float
+        First distance and step, px.
+    sigma : float
+        Standard deviation of the Gaussian, px.
+    wide, narrow : float
+        Widths of the boxes along the normal, px: the pixel's sides times cosine and sine of the edge's angle.
+    far, near : float
+        Distances of the images of each pair along the normal, px, likewise.
+    out : ndarray, shape (7, n)
+        Set to the spread (0 to 1) and its derivatives by distance, sigma², wide, narrow, far, near.
+
+    Notes
+    -----
+    With F₂ the second integral of the normal distribution, F₂' = F₁ = zΦ + σφ, F₂ = ((z² + σ²)Φ + zσφ)/2 and ∂F₂/∂σ² = Φ/2, the boxes make
+    differences: E(z) = Σ ±F₂(z ± wide/2 ± narrow/2)/(wide narrow), averaged over z ± far/2 ± near/2.
+    """
+    area = wide * narrow
+    for i in range(out.shape[1]):
+        z = z0 + i * step
+        for k in range(7):
+            out[k, i] = 0.0
+        for image in range(4):
+            along = 0.5 if image % 2 else -0.5
+            across = 0.5 if image // 2 else -0.5
+            at = z + along * far + across * near
+            value, slope, bend, by_wide, by_narrow = 0.0, 0.0, 0.0, 0.0, 0.0
+            for corner in range(4):
+                first = 0.5 if corner % 2 else -0.5
+                second = 0.5 if corner // 2 else -0.5
+                sign = 1.0 if first * second > 0 else -1.0
+                x = at + first * wide + second * narrow
+                share = 0.5 * math.erfc(-x / sigma * ROOT_HALF)
+                density = math.exp(-0.5 * (x / sigma) ** 2) * ROOT_2PI
+                one = x * share + sigma * density
+                value += sign * 0.5 * ((x * x + sigma * sigma) * share + x * sigma * density)
+                slope += sign * one
+                bend += sign * share
+                by_wide += sign * first * one
+                by_narrow += sign * second * one
+            value, slope, bend = value / area, slope / area, 0.5 * bend / area
+            out[0, i] += 0.25 * value
+            out[1, i] += 0.25 * slope
+            out[2, i] += 0.25 * bend
+            out[3, i] += 0.25 * (by_wide / area - value / wide)
+            out[4, i] += 0.25 * (by_narrow / area - value / narrow)
+            out[5, i] += 0.25 * along * slope
+            out[6, i] += 0.25 * across * slope
+
+
+@jit
+def edge_normal(
+    values: Array,
+    place: Array,
+    centre: Array,
+    cosine: float,
+    half: float,
+    levels: Array,
+    variances: Array,
+    order: int,
+    table: Array,
+    z0: float,
+    step: float,
+    matrix: Array,
+    right: Array,
+) -> float:
+    """Normal equations of one edge: weighted least squares of its pixels.
+
+    Parameters
+    ----------
+    values, place : ndarray, shape (rows, width)
+        Pixels (DN) and their columns (px); NaN where there is none.
+    centre : ndarray, shape (rows,)
+        Column of the edge.
+    cosine, half : float
+        Of the angle to the columns; farthest distance along the normal, px.
+    levels, variances : ndarray, shape (2,)
+        Levels left and right of the edge (DN), and the variance of a pixel on each (DN²).
+    order : int
+        Of the polynomial of the edge's line over −1 … 1.
+    table : ndarray, shape (1 + 1 + shared, n)
+        Spread, its derivative by distance, and its derivatives by the shared parameters.
+    z0, step : float
+        Of the table, px.
+    matrix, right : ndarray, shape (order + 3 + shared,) twice and once
+        Set to the normal matrix and the right side: line, left level, right level, shared parameters.
+
+    Returns
+    -------
+    float
+        χ².
+    """
+    rows, width = values.shape
+    own, shared = order + 3, table.shape[0] - 2
+    n = own + shared
+    matrix[:] = 0.0
+    right[:] = 0.0
+    gradient = np.zeros(n)
+    height = levels[1] - levels[0]
+    total = 0.0
+    last = table.shape[1] - 1
+    for r in range(rows):
+        t = (2.0 * r - (rows - 1)) / (rows - 1)
+        for c in range(width):
+            z = (place[r, c] - centre[r]) * cosine
+            if abs(z) > half or np.isnan(values[r, c]):
+                continue
+            at = (z - z0) / step
+            k = min(max(int(np.floor(at)), 1), last - 2)
+            u = at - k
+            # cubic through four points
+            w0, w1 = -u * (u - 1) * (u - 2) / 6, (u + 1) * (u - 1) * (u - 2) / 2
+            w2, w3 = -(u + 1) * u * (u - 2) / 2, (u + 1) * u * (u - 1) / 6
+            share = w0 * table[0, k - 1] + w1 * table[0, k] + w2 * table[0, k + 1] + w3 * table[0, k + 2]
+            steep = w0 * table[1, k - 1] + w1 * table[1, k] + w2 * table[1, k + 1] + w3 * table[1, k + 2]
+            weight = 1.0 / (variances[0] + (variances[1] - variances[0]) * min(max(share, 0.0), 1.0))
+            residual = values[r, c] - levels[0] - height * share
+            power = -height * steep * cosine
+            for j in range(order + 1):
+                gradient[j] = power
+                power *= t
+            gradient[order + 1] = 1 - share
+            gradient[order + 2] = share
+            for j in range(shared):
+                gradient[own + j] = height * (
+                    w0 * table[2 + j, k - 1] + w1 * table[2 + j, k] + w2 * table[2 + j, k + 1] + w3 * table[2 + j, k + 2]
+                )
+            total += weight * residual * residual
+            for i in range(n):
+                scaled = weight * gradient[i]
+                right[i] += scaled * residual
+                for j in range(i + 1):
+                    matrix[i, j] += scaled * gradient[j]
+    for i in range(n):
+        for j in range(i):
+            matrix[j, i] = matrix[i, j]
+    return total

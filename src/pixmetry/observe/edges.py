@@ -111,8 +111,16 @@ def line_at(line: Array, rows: int) -> Array:
     return np.asarray(np.polynomial.polynomial.polyval(t, line), float)
 
 
-def find_edges(pictures: Sequence[Picture]) -> SlantedEdges | None:
-    """Find the slanted edges of pictures and measure their e-SFR; None where there are no pictures.
+@dataclass(frozen=True)
+class Search:
+    """Edges that can be measured, each with its fine curve, and those that cannot."""
+
+    measured: tuple[tuple[Region, Spread], ...]
+    refused: tuple[RefusedEdge, ...]
+
+
+def search_edges(pictures: Sequence[Picture]) -> Search:
+    """Find the slanted edges of pictures.
 
     Parameters
     ----------
@@ -120,19 +128,16 @@ def find_edges(pictures: Sequence[Picture]) -> SlantedEdges | None:
 
     Returns
     -------
-    SlantedEdges
+    Search
 
     Notes
     -----
     Edges are found at up to 45 degrees, and those that cannot be measured come back with the reason. Bins of 1/4 px are corrected for
     their uneven filling (with the curve's own slope), for their width and for the difference of neighbours (both sinc(ν/4)). The window
-    is Tukey's.
-    u comes from the scatter of the pixels about the mean curve, with the correlation of neighbours, carried on linearly. The place of an
-    edge moves only the phase; an error δ of its slope adds (δ rows)²/12 to the variance of its spread, which is left out.
+    is Tukey's. u comes from the scatter of the pixels about the mean curve, with the correlation of neighbours, carried on linearly. The
+    place of an edge moves only the phase; an error δ of its slope adds (δ rows)²/12 to the variance of its spread, which is left out.
     """
-    if not pictures:
-        return None
-    measured: list[tuple[Region, _Spread]] = []
+    measured: list[tuple[Region, Spread]] = []
     refused: list[RefusedEdge] = []
     for number, picture in enumerate(pictures):
         for across in ("x", "y"):
@@ -143,9 +148,15 @@ def find_edges(pictures: Sequence[Picture]) -> SlantedEdges | None:
                     refused.append(result)
                 else:
                     measured.append(result)
-    edges = tuple(_edge_of(region, spread) for region, spread in measured)
-    of_x, of_y = (_mean_response([s for r, s in measured if r.across == axis]) for axis in "xy")
-    return SlantedEdges(FREQUENCY, edges, tuple(refused), of_x, of_y, _summary(edges, {"x": of_x, "y": of_y}))
+    return Search(tuple(measured), tuple(refused))
+
+
+def responses_of(found: Search, optics: Estimates | None = None) -> SlantedEdges:
+    """The e-SFR of every edge and of both directions, with what was fitted to all edges together."""
+    edges = tuple(_edge_of(region, spread) for region, spread in found.measured)
+    of_x, of_y = (_mean_response([s for r, s in found.measured if r.across == axis]) for axis in "xy")
+    summary = _summary(edges, {"x": of_x, "y": of_y})
+    return SlantedEdges(FREQUENCY, edges, found.refused, of_x, of_y, summary, Estimates.empty() if optics is None else optics)
 
 
 # ---- finding --------------------------------------------------------------------------------------------------------------------------
@@ -201,7 +212,7 @@ def _threshold(frame: Singles) -> float:
 
 def _measured(
     frame: Singles, picture: Picture, number: int, across: str, chains: _Chains, chain: int
-) -> tuple[Region, _Spread] | RefusedEdge:
+) -> tuple[Region, Spread] | RefusedEdge:
     """Measure the edge of one chain, or say why not."""
     row, col = chains.steps(chain)
     slope = _robust_slope(row, col)
@@ -350,7 +361,7 @@ def _curve(sums: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class _Spread:
+class Spread:
     """The finely sampled edge: values in DN at distances (px), with the variance of each, and its frequency response."""
 
     distance_px: Array
@@ -362,6 +373,8 @@ class _Spread:
     response: np.ndarray  # shape (frequencies,), complex
     variance_dn2: Array  # of the values
     neighbour_rel: float  # covariance of values four bins apart over their variance
+    along_rel: float  # correlation of pixels that follow each other along the edge
+    variances_dn2: tuple[float, float]  # of a pixel on either side
 
     @cached_property
     def modulus(self) -> Array:
@@ -389,7 +402,7 @@ class _Spread:
         return np.asarray(own, float)
 
 
-def _spread_of(region: Region) -> _Spread:
+def _spread_of(region: Region) -> Spread:
     sums = _binned(region)
     if (sums[0, 4:-4] < 1).any():
         raise _Refused("its rows do not meet all parts of a pixel alike: take a longer edge, or another angle")
@@ -415,7 +428,7 @@ def _spread_of(region: Region) -> _Spread:
     jacobian[:, 1:] += by_step
     jacobian[:, :-1] -= by_step
     noise = float(np.sqrt(0.5 * (variances[0] + variances[1])))
-    return _Spread(distance - centre, curve, left, height, noise, jacobian, response, variance, beside)
+    return Spread(distance - centre, curve, left, height, noise, jacobian, response, variance, beside, along, variances)
 
 
 @lru_cache(maxsize=32)
@@ -511,7 +524,7 @@ def _check_light(region: Region, picture: Picture) -> None:
 # ---- results --------------------------------------------------------------------------------------------------------------------------
 
 
-def _edge_of(region: Region, spread: _Spread) -> SlantedEdge:
+def _edge_of(region: Region, spread: Spread) -> SlantedEdge:
     middle_row, middle_col = region.first + 0.5 * (region.rows - 1), float(region.line[0])
     x, y = (middle_col, middle_row) if region.across == "x" else (middle_row, middle_col)
     modulus, covariance = spread.modulus, spread.covariance
@@ -560,7 +573,7 @@ def half_frequency(modulus: Array, covariance: Array) -> tuple[float, float]:
     return float(FREQUENCY[k - 1] + part * step), float(np.sqrt(max(variance, 0.0)) / abs(steep)) if steep else float("nan")
 
 
-def _asymmetry(spread: _Spread) -> tuple[float, float]:
+def _asymmetry(spread: Spread) -> tuple[float, float]:
     """Asymmetry of the line spread from three distances, with u from the noise there and the slope."""
     share = (spread.value_dn - spread.low_dn) / spread.height
     rising = np.maximum.accumulate(share)
@@ -581,7 +594,7 @@ def _asymmetry(spread: _Spread) -> tuple[float, float]:
     return float(skew), float(np.sqrt(by**2 @ np.array(variances) + OF_SAMPLING**2))
 
 
-def _mean_response(spreads: Sequence[_Spread]) -> EdgeResponse | None:
+def _mean_response(spreads: Sequence[Spread]) -> EdgeResponse | None:
     """Mean of the complex responses, weighted by their noise; the covariance is at least that of their scatter."""
     if not spreads:
         return None

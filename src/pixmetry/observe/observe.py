@@ -16,6 +16,7 @@ from pixmetry.camera.observations import (
     Observations,
     PatternList,
     PhotonTransfer,
+    SlantedEdges,
     Spectra,
     StackMoments,
 )
@@ -24,7 +25,8 @@ from pixmetry.core.number import ONE_SIDED_95, Estimates
 from pixmetry.core.threads import single_threaded_blas
 from pixmetry.observe import photon_transfer_model as model
 from pixmetry.observe.defects import find_defects, without_hot_pixels
-from pixmetry.observe.edges import Picture, edge_notes, find_edges
+from pixmetry.observe.edge_fit import fit_edges
+from pixmetry.observe.edges import Picture, edge_notes, responses_of, search_edges
 from pixmetry.observe.histogram import HistogramAccumulator, code_errors, sweep_histogram
 from pixmetry.observe.linearity import Linearity
 from pixmetry.observe.moments import LevelSummary
@@ -115,7 +117,7 @@ def observe(
             if kept is None or sums.moments.n_frames > kept.moments.n_frames:
                 stack = sums.moments.result(group.exposure_s)
                 stacks[group.kind][group.exposure_s] = _Stack(stack, sums.spectra.result(stack.mean_map_dn))
-    edges = find_edges([p for p in pictures if p.kind == "edge"])
+    edges = _edges([p for p in pictures if p.kind == "edge"])
     levels = {kind: found or stacked[kind] for kind, found in levels.items()}  # where there are only stacks, these
     if pictures and shape is not None and not (levels["dark"] or levels["bright"]):
         return Observations(
@@ -177,6 +179,14 @@ def _correlated(group: Group, level: LevelSummary, products: LagProducts) -> Cor
         var_dn2=level.squares.pixel_dn2,
         n_frames=level.n_frames,
     )
+
+
+def _edges(pictures: list[Picture]) -> SlantedEdges | None:
+    if not pictures:
+        return None
+    with single_threaded_blas():
+        found = search_edges(pictures)
+        return responses_of(found, fit_edges(found.measured))
 
 
 def _transfer_fit(

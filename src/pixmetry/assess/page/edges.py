@@ -10,7 +10,7 @@ import numpy as np
 from pixmetry.camera.observations import SlantedEdge, SlantedEdges
 from pixmetry.report import Column, Section, Table
 from pixmetry.report.drawing import BLUE, GRID, INK, RED, SOFT, canvas, line
-from pixmetry.report.numbers import significant, uncertain
+from pixmetry.report.numbers import printed_number, significant, uncertain
 from pixmetry.report.page import Figure
 
 MOST_ROWS = 60  # of the table; the record has all
@@ -51,7 +51,24 @@ def summary_sentence(found: SlantedEdges) -> str:
     if not counts:
         return f"No edge could be measured; {len(found.refused)} were refused." if found.refused else "No edge was found."
     half = f" The response falls to one half at {' and '.join(halves)}." if halves else ""
-    return f"{len(found.edges)} edges were measured ({', '.join(counts)}); {len(found.refused)} were refused.{half}"
+    told = f"{len(found.edges)} edges were measured ({', '.join(counts)}); {len(found.refused)} were refused.{half}"
+    return " ".join([told, *_parts_of_blur(found)])
+
+
+def _parts_of_blur(found: SlantedEdges) -> list[str]:
+    """What the joint fit says of lens, pixel and plate, in a sentence; or why it cannot."""
+    optics = found.optics
+    if "sigma_px" not in optics:
+        why = optics.reasons.get("spread_var_px2", "")
+        return [f"Lens and pixel are not told apart: {why}."] if why else []
+    words = {"sigma_px": "lens", "width_x_px": "pixel in x", "width_y_px": "pixel in y"}
+    words |= {"separation_x_px": "low-pass filter in x", "separation_y_px": "low-pass filter in y"}
+    parts = []
+    for name, word in words.items():
+        if name in optics:
+            number = printed_number(optics[name])
+            parts.append(f"{word} {number.value}{'' if optics[name].is_limit else f' ± {number.u}'} px")
+    return [f"Fitted together: {', '.join(parts)}."]
 
 
 def _row(edge: SlantedEdge) -> list[Any]:

@@ -96,6 +96,15 @@ EDGES = {
     "asymmetry_y": Caption("Asymmetry of the edge, along y"),
 }
 
+OPTICS = {
+    "spread_var_px2": Caption("Variance of the spread: lens, pixel and plate"),
+    "sigma_px": Caption("Lens, standard deviation of a Gaussian"),
+    "width_x_px": Caption("Light-sensitive width of the pixel"),
+    "width_y_px": Caption("Light-sensitive height of the pixel"),
+    "separation_x_px": Caption("Optical low-pass filter, separation along x"),
+    "separation_y_px": Caption("Optical low-pass filter, separation along y"),
+}
+
 
 def table(seen: Observations, standard: Results) -> dict[str, list[Row]]:
     """Rows by heading, in the order in which a data sheet gives them."""
@@ -103,7 +112,7 @@ def table(seen: Observations, standard: Results) -> dict[str, list[Row]]:
         "Photon transfer": _rows(seen.photon_transfer_fit, TRANSFER, standard),
         "Fixed pattern": _rows(seen.spatial_fit, SPATIAL, standard),
         "Converter, defects, patterns": [*_codes(seen), *_defects(seen), *_patterns(seen)],
-        "Slanted edges": _rows(None if seen.edges is None else seen.edges.fit, EDGES),
+        "Slanted edges": [] if seen.edges is None else [*_rows(seen.edges.fit, EDGES), *_rows(seen.edges.optics, OPTICS)],
         "By EMVA 1288 alone": [
             Row(title, key, PrintedNumber("", NONE, ""), "", said, "")
             for key, title in STANDARD_ONLY.items()

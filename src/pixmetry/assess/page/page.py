@@ -171,7 +171,8 @@ def _notes(assessment: Assessment) -> list[str]:
 def _shared(assessment: Assessment) -> list[Estimates]:
     """The estimates that many sources read."""
     seen = assessment.observations
-    return [s for s in (seen.photon_transfer_fit, seen.spatial_fit) if s is not None]
+    optics = None if seen.edges is None or not len(seen.edges.optics) else seen.edges.optics
+    return [s for s in (seen.photon_transfer_fit, seen.spatial_fit, optics) if s is not None]
 
 
 def _confounders(assessment: Assessment) -> list[str]:

@@ -6,8 +6,10 @@ from typing import Literal
 
 import numpy as np
 
+from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
 
 
@@ -39,6 +41,12 @@ def forward(params: OpticalLowPass, signal: Signal, stream: Stream) -> Signal:
     return signal.with_light(signal.own_light.spread(*dots(params)))
 
 
+def measure(observations: Observations) -> Estimates:
+    """Distances of the images of a birefringent plate, from slanted edges; upper limits where they do not need one."""
+    names = ("separation_x_px", "separation_y_px")
+    return observations.edge_optics({name: name for name in names}, where="optics.olpf")
+
+
 SOURCE = Source(
     id="optics.olpf",
     title="Optical low-pass filter (diffuser)",
@@ -51,13 +59,13 @@ SOURCE = Source(
     typical=OpticalLowPass(separation_x_px=1.0, separation_y_px=1.0),
     bound=OpticalLowPass(separation_x_px=1.5, separation_y_px=1.5),
     forward=forward,
+    measure=measure,
     gum_class="F",
     equation="PSF = ¼ Σ δ(x ± d_x/2, y ± d_y/2),  MTF = |cos(π d_x ν_x) cos(π d_y ν_y)|,  d = t (n_e² − n_o²)/(n_e² + n_o²)",
     typical_size="none by itself (symmetric); adds d²/4 px² to the variance of the spread and removes the error of an undersampled target",
     references=("J. E. Greivenkamp, Color dependent optical prefilter, Applied Optics 29 (1990) 676–684", "ISO 12233:2023 (SFR)"),
     advice="If targets are sharper than about 0.5 px and less than 3 px wide: add such a filter, defocus slightly, or stop down.",
     reasons={
-        "measure": "not measured: needs the slanted-edge experiment (the zero of the cosine at 1/(2 d))",
         "correct": "a symmetric spread moves no centre; frames are not deconvolved",
         "propagate": "it only changes the undersampling; that needs the spread in front of the plate, which the probe does not contain",
     },

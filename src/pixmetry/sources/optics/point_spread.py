@@ -8,11 +8,13 @@ from typing import Literal
 import numpy as np
 
 from pixmetry.camera.light import FINE
+from pixmetry.camera.observations import Observations
 from pixmetry.camera.raster import kernel_of, spread_of
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
 from pixmetry.core.arrays import Array
 from pixmetry.core.errors import ParameterError
+from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
 
 NODES = 40  # of each integral over the common part of two pupils: 1e-6 for a wave of aberration (root mean square)
@@ -131,6 +133,11 @@ def forward(params: PointSpread, signal: Signal, stream: Stream) -> Signal:
     return signal.with_light(light.convolved(*kernel(params)))
 
 
+def measure(observations: Observations) -> Estimates:
+    """Standard deviation of a Gaussian lens, from slanted edges."""
+    return observations.edge_optics({"sigma_px": "sigma_px"}, where="optics.point_spread")
+
+
 SOURCE = Source(
     id="optics.point_spread",
     title="Point spread of the lens",
@@ -143,6 +150,7 @@ SOURCE = Source(
     typical=PointSpread(sigma_px=0.6),
     bound=PointSpread(sigma_px=1.5),
     forward=forward,
+    measure=measure,
     gum_class="F",
     equation="OTF(ν) = (1/π) ∬ exp 2πi (W(p − λNν) − W(p + λNν)) dp;  clear: (2/π)(acos s − s √(1 − s²)), s = λNν",
     typical_size="periodic error OTF(1)/π of a point under full pixels: 0.08 px at f/4 with 3.45 µm, 1e-6 px at σ = 0.8 px",
@@ -152,7 +160,6 @@ SOURCE = Source(
     ),
     advice="If targets are only a few pixels wide: stop down until λN is at least the pixel pitch, or defocus slightly.",
     reasons={
-        "measure": "not measured: needs the slanted-edge experiment",
         "correct": "frames are not deconvolved; a symmetric spread moves no centre",
         "propagate": "it only changes the undersampling; that needs the target before the spread, which the probe does not contain",
     },

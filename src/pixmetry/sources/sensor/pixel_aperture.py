@@ -9,8 +9,10 @@ import numpy as np
 
 from pixmetry.camera.geometry import image_shift
 from pixmetry.camera.light import Pull
+from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
 
 
@@ -51,6 +53,13 @@ def truth(params: PixelAperture, signal: Signal, stream: Stream) -> Mapping[str,
     return {name: shift[0] for name, shift in image_shift(pull_of(params), signal).items()}
 
 
+def measure(observations: Observations) -> Estimates:
+    """Width and height from slanted edges. Noise about a full pixel may give more than 1, which no pixel has: then it is 1 with that u."""
+    names = ("width_x_px", "width_y_px")
+    found = observations.edge_optics({name: name for name in names}, where="sensor.pixel_aperture")
+    return replace(found, values=np.minimum(found.values, 1.0))
+
+
 SOURCE = Source(
     id="sensor.pixel_aperture",
     title="Light-sensitive area smaller than the pitch",
@@ -65,6 +74,7 @@ SOURCE = Source(
     typical=PixelAperture(width_x_px=0.6, width_y_px=0.8),
     bound=PixelAperture(width_x_px=0.4, width_y_px=0.6),
     forward=forward,
+    measure=measure,
     truth=truth,
     gum_class="F",
     equation="s = I ∗ box(a_x, a_y) at the pixel;  MTF = |sinc(a ν)|;  periodic error a₁ = |H'(1)|/(π H(0))",
@@ -72,7 +82,6 @@ SOURCE = Source(
     references=("S. K. Park, R. Schowengerdt, M.-A. Kaczynski, MTF for sampled imaging systems, Applied Optics 23 (1984) 2572–2582",),
     advice="Widen the target's image to a spread of 0.6 px or more, or take a sensor with microlenses.",
     reasons={
-        "measure": "needs the slanted-edge experiment above half the sampling frequency, or targets moved by parts of a pixel",
         "correct": "light between the pixels is not recorded; shifted frames can be interleaved instead",
         "propagate": "it only changes the undersampling; that needs the spread in front of the pixel, which the probe does not contain",
     },
