@@ -483,6 +483,38 @@ FAULTS = (
     ),
     Fault("blur of an MTF", "math.sqrt(slope / (2 * np.pi**2))", "math.sqrt(slope / np.pi**2)", "tests/camera/test_data_sheet.py"),
     Fault("distortion at the corner", "-distortion_rel / ((1 + dist", "-distortion_rel / ((1 - dist", "tests/camera/test_data_sheet.py"),
+    # corrections of positions and frames
+    Fault(
+        "a target that moves is put where it goes",
+        "scene_places(u - shift[:, 0], v - shift[:, 1]",
+        "scene_places(u + shift[:, 0], v + shift[:, 1]",
+        "tests/assess/test_corrected.py",
+    ),
+    Fault(
+        "half of a cause of uncertainty",
+        "(at if minus is None else mapped(minus))) / sides",
+        "(at if minus is None else mapped(minus))) / (2 * sides)",
+        "tests/assess/test_corrected.py",
+    ),
+    Fault("measured covariance not through the map", "out = j @ c @ np.swapaxes(j, 1, 2)", "out = c", "tests/assess/test_corrected.py"),
+    Fault(
+        "warm-up of the clock backwards",
+        "            at = at - self._warped_s(at)",
+        "            at = at + self._warped_s(at)",
+        "tests/assess/test_corrected.py",
+    ),
+    Fault(
+        "gain of a correction in electrons",
+        "data = corrected.data * np.float32(gain) if",
+        "data = corrected.data * np.float32(2 * gain) if",
+        "tests/assess/test_correct_catalogue.py",
+    ),
+    Fault(
+        "covariance of a fit without its weights",
+        "spread = np.linalg.inv(a.T @ weight.T @ weight @ a)",
+        "spread = 4 * np.linalg.inv(a.T @ weight.T @ weight @ a)",
+        "tests/assess/test_corrected.py",
+    ),
     Fault("estimates of what changed stay", "names if name not in changed", "names if name in changed", "tests/camera/test_provenance.py"),
 )
 

@@ -338,11 +338,13 @@ def test_what_cannot_be_used_is_told(content: str, arguments: tuple[str, ...], w
     assert all(word in said for word in words), said
 
 
-def test_positions_where_the_camera_shows_nothing_stay_and_are_told() -> None:
-    camera = with_source(load_camera(DIGITAL), "optics.distortion").with_parameters("optics.distortion", k1_per_mm2=-5e-4)
-    found = pixmetry.corrected([[1200.0, 1000.0], [1e7, 1e7], [np.nan, 3.0]], camera)
-    assert np.isfinite(found.x_px[0]) and np.isnan(found.x_px[2])
-    assert len(found.columns["x_px"]) == 3
+def test_positions_that_the_correction_loses_are_empty_and_those_outside_of_the_frame_are_told() -> None:
+    table = {"x_px": [1200.0, np.inf, 11000.0], "y_px": [1000.0, 3.0, 1000.0], "u_x_px": [0.1] * 3, "u_y_px": [0.1] * 3}
+    found = pixmetry.corrected(table, DIGITAL)
+    assert "1 positions lie outside of the frame of 2448 × 2048 pixels" in found.notes[-1]
+    assert np.isnan(found.x_px[1]) and found.columns["x_px"][1] == np.inf
+    lost = replace(found, x_px=np.array([1200.0, np.nan, np.nan]))
+    assert lost.columns["x_px"] == [1200.0, np.inf, None] and lost.columns["u_x_px"] == pytest.approx([0.1, 0.1, None])
 
 
 def test_what_changes_from_image_to_image_is_fitted_to_reference_positions(rng: np.random.Generator, tmp_path: Path) -> None:

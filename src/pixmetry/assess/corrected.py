@@ -515,9 +515,13 @@ def _corrected(case: _Case, only: tuple[str, ...], skip: tuple[str, ...]) -> Cor
     correction = _summed(all_effects)
     told = tuple(_told(e, chosen, shifts, effects) for e in now.camera.active if e.name in chosen.applied or e.name in chosen.reasons)
     notes = case.said()
+    rows, cols = now.camera.output_shape
+    beyond = (np.abs(table.x_px - (cols - 1) / 2) > cols / 2) | (np.abs(table.y_px - (rows - 1) / 2) > rows / 2)
+    if beyond.any():
+        notes.append(f"{beyond.sum()} positions lie outside of the frame of {cols} × {rows} pixels, where the description need not hold")
     lost = int(np.sum(np.isnan(at[:, 0]) & np.isfinite(table.x_px)))
     if lost:
-        notes.append(f"{lost} positions lie where the camera shows nothing: they stay as they were")
+        notes.append(f"{lost} positions lie where the camera shows nothing: they are empty")
     covariance = _carried(table, correction, lambda x, y: _mapped(now, chosen, x, y))
     causes = tuple(name for name, _ in effects)
     return CorrectedPositions(at[:, 0], at[:, 1], table, covariance, correction, all_effects, causes, told, tuple(notes), now.camera.name)

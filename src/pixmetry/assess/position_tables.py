@@ -97,12 +97,19 @@ class Positions:
     def replaced(
         self, x_px: np.ndarray, y_px: np.ndarray, covariance_px2: np.ndarray | None, correction_px2: np.ndarray | None
     ) -> dict[str, Any]:
-        """All columns with other positions; covariances in the columns that hold them, or those of the correction in new ones."""
+        """All columns with other positions; covariances in the columns that hold them, or those of the correction in new ones.
+
+        A row without a position stays as it is; one whose position is lost by the correction is empty there.
+        """
         columns: dict[str, Any] = dict(self.columns)
-        lost = ~(np.isfinite(x_px) & np.isfinite(y_px))
+        lost, none = ~(np.isfinite(x_px) & np.isfinite(y_px)), ~np.isfinite(self.x_px)
+
+        def column(name: str, values: np.ndarray) -> list[Any]:
+            old = self.columns.get(name, [None] * len(self))
+            return [old[i] if none[i] else None if lost[i] else float(v) for i, v in enumerate(values)]
+
         for name, values in zip(self.names, (x_px, y_px), strict=True):
-            old = self.columns[name]
-            columns[name] = [old[i] if lost[i] else float(v) + self.first for i, v in enumerate(values)]
+            columns[name] = column(name, values + self.first)
         new: dict[str, np.ndarray] = {}
         if covariance_px2 is None:
             new = {} if correction_px2 is None else dict(zip(OF_CORRECTION, correction_px2.T, strict=True))
@@ -110,9 +117,7 @@ class Positions:
             var_x, cov, var_y = covariance_px2.T
             deviations = bool(self.uncertainty) and self.uncertainty[0] not in _named(VARIANCES, "x")
             new = dict(zip(self.uncertainty, [np.sqrt(var_x), np.sqrt(var_y)] if deviations else [var_x, var_y, cov], strict=False))
-        for name, values in new.items():
-            columns[name] = [None if lost[i] and name not in self.columns else self.columns[name][i] if lost[i] else float(v)
-                             for i, v in enumerate(values)]  # fmt: skip
+        columns |= {name: column(name, values) for name, values in new.items()}
         return columns
 
     def content(self, columns: Mapping[str, Sequence[Any]], told: str) -> bytes:
