@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from pixmetry.budget.parameters import UNSTATED_U_REL, told_values
 from pixmetry.camera.camera import Camera, Element, load_camera
 from pixmetry.camera.chain_order import in_order
 from pixmetry.core.errors import InputError
@@ -23,7 +24,6 @@ RANK = {"measured": 3, "sheet": 2, "": 1, "typical": 0}  # what goes before what
 GAIN, CONVERTER = "electronics.gain", "grabber.adc"
 HEAD_BYTES = 200  # of a file, in which it says what it is
 COVERAGE = 2.0  # expanded uncertainties beyond which two values contradict each other
-SHEET_U_REL = 0.1  # of a value that states no uncertainty: assumed
 
 
 @dataclass(frozen=True)
@@ -176,10 +176,8 @@ def _value(element: Element, name: str) -> tuple[float, float] | None:
     if name in element.estimates.names:
         number = element.estimates[name]
         return None if number.kind != "value" else (number.value, number.u)
-    value = getattr(element.params, name)
     states_u = element.known_from == "measured" and len(element.estimates) > 0
-    if element.known_from not in ("sheet", "measured") or states_u or isinstance(value, bool | str) or value is None:
+    value = told_values(element).get(name)
+    if element.known_from not in ("sheet", "measured") or states_u or value is None:
         return None
-    if getattr(element.source.neutral, name, None) == value or value == type(element.params).model_fields[name].default:
-        return None  # the description does not tell it
-    return float(value), SHEET_U_REL * abs(float(value))
+    return value, UNSTATED_U_REL * abs(value)

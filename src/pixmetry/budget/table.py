@@ -17,7 +17,7 @@ import numpy as np
 from pixmetry.budget.fields import Calibration, Places, field_of, spread_of
 from pixmetry.budget.monte_carlo import Trials, missed, put
 from pixmetry.budget.motion import LAGS, OF_MOTION, STILL, lag_contribution, motion_contribution
-from pixmetry.budget.parameters import applies, u_from_parameters, with_estimates
+from pixmetry.budget.parameters import UNSTATED, applies, assumed_estimates, u_from_parameters, with_estimates
 from pixmetry.budget.probe import Probes
 from pixmetry.budget.setting import Setting
 from pixmetry.camera.camera import Camera, Element, pitch_values
@@ -50,6 +50,8 @@ SETTINGS = (  # what a user switches on, or a grabber with a clock of its own ha
     "storage.jpeg",
 )
 VIEW_POINT = "scene.view_point"
+SHOT_NOISE = "sensor.shot_noise"
+HALF_CAPACITY = 0.5  # of the usual saturation capacity: the least of a sound camera that does not tell its own (assumed)
 AVERAGED = ("scene.speckle", VIEW_POINT)  # of the object's errors those that another target has otherwise
 STATED_HALF_DIAGONAL_MM = 4.0  # the half-inch format, for which the catalogue gives usual values
 OF_THE_FORMAT = {  # powers of the format: a lens of the same design; a sensor as flat for its size
@@ -286,7 +288,12 @@ class Table:
             return replace(row, status=ELSEWHERE, reason=f"it counts in the row of {get_source(source.part_of).title}")
         if row.before is None or row.after is None:
             return row
+        if source.id == SHOT_NOISE:
+            return self._with_capacity(row)
         if row.status != TYPICAL:
+            if estimates is None and row.status in (SHEET, MEASURED):
+                estimates = assumed_estimates(element)
+                return self._with_uncertainty(replace(row, reason=UNSTATED), element, in_camera, estimates) if len(estimates) else row
             return row if estimates is None else self._with_uncertainty(row, element, in_camera, estimates)
         bound = self._own(source, source.bound_of(self.setting.camera.frame_shape))
         largest = self._computed(row, replace(element, params=bound), in_camera)
@@ -294,6 +301,21 @@ class Table:
             return row
         status = AT_BOUND if row.before_px == 0 and largest.before_px > 0 else row.status
         return replace(row, status=status, largest=row.after.or_more(largest.after))
+
+    def _with_capacity(self, row: SourceRow) -> SourceRow:
+        """The row of shot noise with what is not known of the electrons of a full pixel, of whose root it is the inverse.
+
+        They are those of the full well or, where the converter is full before, of its range over the gain.
+        """
+        on = {e.source.id: e for e in self.setting.camera.active}
+        first = on.get("sensor.full_well") or on.get("electronics.gain")
+        if first is None or row.after is None or not first.known_from:
+            return row
+        if first.known_from == "typical":
+            words = "the saturation capacity is not stated, and taken as usual; at most as with half of it"
+            return replace(row, status=TYPICAL, largest=Parts.of([v * HALF_CAPACITY**-0.5 for v in row.after.values_px]), reason=words)
+        u_rel = max((_relative_u(first, name) for name in ("full_well_e", "gain_dn_per_e")), default=0.0)
+        return replace(row, largest=Parts.of([v * (1 + 0.5 * COVERAGE * u_rel) for v in row.after.values_px])) if u_rel else row
 
     def _usual(self, source: Source) -> Any:
         """Usual parameters, of object and light those of the scenario."""
@@ -479,6 +501,14 @@ class Table:
 
     def _simulated(self, element: Element) -> Contribution | None:
         return self._trials.alone(element).contribution(element.source.gum_class)
+
+
+def _relative_u(element: Element, name: str) -> float:
+    """Relative standard uncertainty of a parameter: as stated, or as assumed of one that states none."""
+    estimates = element.estimates if len(element.estimates) else assumed_estimates(element)
+    if name not in estimates.names or estimates[name].is_limit or not estimates[name].value:
+        return 0.0
+    return float(estimates[name].u / abs(estimates[name].value))
 
 
 def _values_of(row: SourceRow) -> np.ndarray:
