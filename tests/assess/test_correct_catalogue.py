@@ -191,6 +191,15 @@ def test_pixels_that_a_grabber_sampled_anew_are_not_taken_for_the_sensors() -> N
     assert "processing.demosaic has changed the pixels" in told["sensor.bayer_mosaic"]
 
 
+def test_dark_frames_take_the_fixed_pattern_of_a_grabber_out_of_its_samples() -> None:
+    """In stored pixels, whatever clock took them: 4 DN of settling at the top are left to the rounding."""
+    camera = replace(load_camera("pulnix_tm6cn_epix_512"), warm_up_k=0.0)
+    dark, frame = (camera.expose(Uniform(level), 1, quiet=True).data for level in (0.0, 20000.0))
+    plain, found = (pixmetry.correct(frame, camera, dark=d) for d in (None, dark))
+    top, middle = (float(np.ptp(c.frames[0, :120].mean(axis=1))) for c in (plain, found))
+    assert found.sources["sensor.dsnu"] == "corrected" and top > 2.5 > 1.0 > middle
+
+
 def test_values_at_the_ends_of_the_range_are_marked() -> None:
     camera = small(DIGITAL)
     frame = frames_of(camera, None)[0]

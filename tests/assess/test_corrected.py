@@ -270,7 +270,11 @@ def test_a_table_of_another_program_keeps_all_it_holds(tmp_path: Path) -> None:
         tmp_path / "other.csv", "--with", ANALOGUE, "--origin", "corner", "-o", tmp_path / "out.csv", "--json", tmp_path / "r.json"
     )
     assert code == 0, said
-    assert "grabber.sampling_clock: corrected" in said and "switched on when frame 0 was taken" in said
+    assert (
+        "grabber.sampling_clock: corrected" in said
+        and "switched on when frame 0 was taken" in said
+        and "warms up by 20 K from frame 0" in said
+    )
     lines = (tmp_path / "out.csv").read_text().splitlines()
     assert lines[1] == "# survey 7" and lines[2] == "name;X;Y;sigma_x;sigma_y;note"
     a, b, c = (line.split(";") for line in lines[3:])

@@ -412,6 +412,11 @@ class _Case:
                 f"{', '.join(drifts)}: switched on when frame 0 was taken, as the description says; state.camera_on_min and "
                 "state.grabber_on_min tell other times"
             )
+        if self.camera.warm_up_k and "temperature_c" not in self.schedule:
+            notes.append(
+                f"the sensor warms up by {self.camera.warm_up_k:g} K from frame 0 on, as the description says; a column temperature_c or "
+                "state.camera_on_min tell otherwise"
+            )
         return notes
 
 
@@ -458,7 +463,8 @@ def with_missing(camera: Camera, keys: Iterable[str], f_mm: float | None = None)
 
     The exit pupil of a lens of known focal length is taken to be that far from the sensor.
     """
-    lens = Setting(camera, Scenario.model_validate({"object": {"f_mm": f_mm}}))
+    known = camera.facts.get("principal_distance_mm") if f_mm is None else f_mm
+    lens = Setting(camera, Scenario.model_validate({"object": {"f_mm": known}}))
     for key in keys:
         name = key.rpartition(".")[0]
         if name in camera:
