@@ -40,14 +40,14 @@ def campaign(rng: np.random.Generator, filtered: Callable[[np.ndarray], np.ndarr
 def test_covariance_is_that_of_plain_sums(rng):
     """The kernel's products against slices, and the correction for the means: white noise has none at any lag."""
     first, second = (rng.integers(0, 4000, (41, 57)).astype(np.uint16) for _ in range(2))
-    noise = (second.astype(float) - first) / np.sqrt(2)
+    noise = ((second.astype(float) - first) / np.sqrt(2))[5:-5, 5:-5]  # without the margin of an eighth of the rows
     noise -= noise.mean(axis=1, keepdims=True)
     noise -= noise.mean(axis=0)
     sums = lag_products(first, second)
     for j, i in ((0, 0), (0, 1), (2, -3), (4, 4)):
         for r in (0, 1):
             for c in (0, 1):
-                at = [(y, x) for y in range(r, 41 - j, 2) for x in range(c, 57, 2) if 0 <= x + i < 57]
+                at = [(y, x) for y in range(r, 31 - j, 2) for x in range(c, 47, 2) if 0 <= x + i < 47]
                 expected = sum(noise[y, x] * noise[y + j, x + i] for y, x in at)
                 assert sums[r, c, j, 4 + i] == pytest.approx(expected, rel=1e-4, abs=2.0)
 
@@ -57,7 +57,7 @@ def test_covariance_of_small_frames_has_no_bias(rng):
     products = LagProducts()
     for k in range(400):
         first, second = (np.rint(rng.normal(2000, 20, (24, 20))).astype(np.uint16) for _ in range(2))
-        products.add(k, lag_products(first, second), (24, 20))
+        products.add(k, lag_products(first, second), first)
     mean = products.covariance_dn2().mean(axis=(0, 1))
     u = 400 / np.sqrt(400 * 24 * 20)
     assert mean[0, 4] == pytest.approx(400 + 1 / 12, abs=Z * np.sqrt(2) * u)
@@ -99,7 +99,7 @@ def test_gain_and_dark_noise_behind_a_linear_filter(rng, name):
     fit = campaign(rng, LINEAR_FILTERS[name]).photon_transfer_fit
     gain, noise = fit["gain_dn_per_e"], fit["dark_noise_e"]
     assert abs(gain.value - GAIN) < Z * gain.u
-    assert gain.u < 0.02 * GAIN
+    assert gain.u < 0.04 * GAIN
     assert abs(noise.value - NOISE_E) < Z * noise.u
     assert ("corrected" in gain.reason) == (name != "none")
 

@@ -9,6 +9,7 @@ import numpy as np
 from pixmetry.core.arrays import Array
 from pixmetry.core.number import Estimates
 
+ROUNDED_AWAY = 2.0
 REACH = 4  # px; farthest lag to each side
 LAGS = tuple((j, i) for j in range(REACH + 1) for i in range(-REACH, REACH + 1) if j > 0 or i >= 0)  # rows and columns; (0, 0) first
 WHITE, LINEAR, CHARGE, UNKNOWN = "white", "linear", "charge", "unknown"
@@ -26,29 +27,39 @@ class NoiseCovariance:
         False: dark frames.
     stack : ndarray, shape (groups,), bool
         Whether the group is a stack of many frames.
-    exposure_s, mean_dn : ndarray, shape (groups,)
+    exposure_s, mean_dn, inner_mean_dn : ndarray, shape (groups,)
+        The means of the frame, and inside of the margin.
     clipped : ndarray, shape (groups,)
         Share of the pixels at the lowest or the highest code.
     n_pairs : ndarray, shape (groups,)
     covariance_dn2 : ndarray, shape (groups, 2, 2, 5, 9), DN²
         ``[g, r, c, j, 4 + i]``: mean product of the noise at (y, x) and at (y + j, x + i) over the pixels of row parity r and column
         parity c, for one frame (half of that of a difference).
-    stack_var_dn2 : ndarray, shape (groups,), DN²
-        White temporal variance over all frames of a stack, without what is common to rows, columns and frames; NaN of a level.
-    n_frames : ndarray, shape (groups,)
+    var_dn2 : ndarray, shape (groups,), DN²
+        White temporal variance over the whole frame; the other values are from inside of a margin, where filters see no border.
+    successive_dn2 : ndarray, shape (groups, 2), DN²
+        Half the mean square of the difference of each frame from the next, and from the next but one, without what rows and columns have
+        in common; NaN where the frames are no stack.
+    n_successive : ndarray, shape (groups,)
+        Number of frames, one after the other, that this is from.
     frame_shape : (int, int)
+        Without the margin.
+    margin_px : int
     """
 
     bright: np.ndarray
     stack: np.ndarray
     exposure_s: np.ndarray
     mean_dn: np.ndarray
+    inner_mean_dn: np.ndarray
     clipped: np.ndarray
     n_pairs: np.ndarray
     covariance_dn2: np.ndarray
-    stack_var_dn2: np.ndarray
-    n_frames: np.ndarray
+    var_dn2: np.ndarray
+    successive_dn2: np.ndarray
+    n_successive: np.ndarray
     frame_shape: tuple[int, int]
+    margin_px: int
 
     def pooled_dn2(self) -> np.ndarray:
         """Mean over the four places of the pattern at each of `LAGS`, shape (groups, 41), DN²."""
@@ -78,7 +89,8 @@ class NoiseFilter:
     fit : Estimates
         Parameters of that family, as the module that found it names them.
     factor, u_factor : float
-        Variance of the shot noise before the filter over that of one pixel behind it, in the mean of the levels.
+        Variance of the shot noise before the filter over that of one pixel of the frame behind it, in the mean of the levels. Of
+        ``"white"`` 1, and what a correlation that may be there would change.
     row_factor, column_factor : float
         Variance of the means of rows and of columns behind the filter, over that of independent pixels with the variance behind it.
     growth : float
@@ -142,6 +154,37 @@ def sampling_covariance(autocovariance: np.ndarray) -> np.ndarray:
         folded[minus[..., 0] + 2 * REACH, minus[..., 1] + 2 * REACH] + folded[plus[..., 0] + 2 * REACH, plus[..., 1] + 2 * REACH]
     )
     return covariance
+
+
+def frame_correlation(seen: NoiseCovariance, group: int) -> tuple[float, float]:
+    """Correlation α of the noise of successive frames of one stack, if each frame holds a share α of the one before; and its u.
+
+    With D_j half the mean square of differences j frames apart, D₂/D₁ = (1 − α²)/(1 − α) = 1 + α. The rounding of every frame, 1/12, is
+    no part of that. u is that of the ratio of two quadratic forms of normal noise, Var xᵀAx = 2 tr(AΣAΣ), for independent pixels; pixels
+    that neighbours correlate count for fewer. A share too small to move a code is rounded away: that may take up to twice the rounding's
+    share of the noise from α, and enters u.
+    """
+    one, two = np.maximum(seen.successive_dn2[group] - 1 / 12, 1e-9)
+    alpha = two / one - 1
+    frames = int(seen.n_successive[group])
+    held = float(np.clip(alpha, -0.9, 0.98))
+    scale = one / (1 - held)  # variance of the noise
+    sigma = scale * held ** np.abs(np.subtract.outer(np.arange(frames), np.arange(frames))) + np.eye(frames) / 12
+    forms = []
+    for lag in (1, 2):
+        steps = np.eye(frames - lag, frames, lag) - np.eye(frames - lag, frames)
+        forms.append(steps.T @ steps / (2 * (frames - lag)))
+    ratio = (forms[1] - (1 + alpha) * forms[0]) / one @ sigma
+    pooled = seen.pooled_dn2()[group]
+    fewer = float((plane_of(pooled) ** 2).sum() / pooled[0] ** 2)
+    scatter = float(np.sqrt(2 * np.trace(ratio @ ratio) * fewer / np.prod(seen.frame_shape)))
+    return alpha, float(np.hypot(scatter, ROUNDED_AWAY / 12 / one))
+
+
+def frames_share_noise(seen: NoiseCovariance) -> bool:
+    """Whether the noise of successive bright frames is so correlated that the mean squares of their differences are too small."""
+    groups = np.flatnonzero(seen.bright & (seen.n_successive > 3) & (seen.clipped <= 0.002))
+    return any(alpha > max(5 * u, 0.005) for alpha, u in (frame_correlation(seen, int(g)) for g in groups))
 
 
 def plane_of(values: np.ndarray) -> np.ndarray:

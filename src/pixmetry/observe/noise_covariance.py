@@ -11,20 +11,30 @@ from pixmetry.camera.noise_covariance import LAGS, REACH, NoiseCovariance, plane
 from pixmetry.core.arrays import Array
 from pixmetry.observe._covariance_kernels import sum_lag_products
 
+MARGIN_PX = 8
+FIRST_FRAME, MOST_FRAMES = 4, 32  # of a stack whose succession is looked at; the first ones may hold what was before them
 ROUNDS = 4  # of the correction for the means that are taken out; each is smaller by the share of a line that the lags are
 
 
 @dataclass
 class LagProducts:
-    """Products of the noise of frame pairs at small lags; by the number of the pair, so that their sum does not depend on the order."""
+    """Products of the noise of frame pairs at small lags, inside of a margin; by the number of the pair, for a sum of any order."""
 
     by_pair: dict[int, np.ndarray] = field(default_factory=dict)  # each of shape (2, 2, 5, 9), as `sum_lag_products` has them
-    shape: tuple[int, int] = (0, 0)
+    _means: dict[int, float] = field(default_factory=dict)
+    margin_px: int = 0
+    shape: tuple[int, int] = (0, 0)  # of the frames, without their margin
 
-    def add(self, pair: int, products: np.ndarray, shape: tuple[int, int]) -> None:
-        """Add the products of one pair."""
+    def add(self, pair: int, products: np.ndarray, first: np.ndarray) -> None:
+        """Add the products of one pair of frames, of which this is the first."""
+        m = margin_px(first.shape)
         self.by_pair[pair] = products
-        self.shape = shape
+        self.margin_px, self.shape = m, (first.shape[0] - 2 * m, first.shape[1] - 2 * m)
+        self._means[pair] = float(first[m : first.shape[0] - m, m : first.shape[1] - m].mean())
+
+    def mean_dn(self) -> float:
+        """Mean of the frames inside of the margin, DN."""
+        return float(np.mean([self._means[k] for k in sorted(self._means)]))
 
     def covariance_dn2(self) -> np.ndarray:
         """Mean products, shape (2, 2, 5, 9), DN²; see `NoiseCovariance`.
@@ -47,6 +57,53 @@ class LagProducts:
         return corrected
 
 
+class FrameSuccession:
+    """Differences of frames one and two apart; frames may come in any order, and few are held."""
+
+    def __init__(self) -> None:
+        self._waiting: dict[int, np.ndarray] = {}
+        self._squares: dict[tuple[int, int], float] = {}  # by first frame and distance
+
+    def due(self, index: int, frame: np.ndarray) -> list[tuple[tuple[int, int], np.ndarray, np.ndarray]]:
+        """Pairs of frames whose difference is now to be taken, with their keys for `put`."""
+        if not FIRST_FRAME <= index < FIRST_FRAME + MOST_FRAMES:
+            return []
+        waiting = self._waiting
+        waiting[index] = frame
+        keys = [(i, lag) for lag in (1, 2) for i in (index - lag, index) if i in waiting and i + lag in waiting]
+        found = [((i, lag), waiting[i], waiting[i + lag]) for i, lag in keys]
+        around = range(index - 2, index + 3)
+        for i in around:  # a frame with all of its neighbours is no longer needed
+            if all(j in waiting or (j, -1) in self._squares for j in (i - 2, i - 1, i, i + 1, i + 2) if j >= FIRST_FRAME):
+                self._squares[i, -1] = 0.0
+        for i in [i for i in waiting if (i, -1) in self._squares]:
+            del waiting[i]
+        return found
+
+    def put(self, key: tuple[int, int], square_dn2: float) -> None:
+        """Keep half the mean square of one difference."""
+        self._squares[key] = square_dn2
+
+    def result(self) -> tuple[np.ndarray, int]:
+        """Means over the pairs one and two frames apart, shape (2,), NaN without any; and the number of frames."""
+        means = np.full(2, np.nan)
+        for lag in (1, 2):
+            values = [self._squares[key] for key in sorted(self._squares) if key[1] == lag]
+            if values:
+                means[lag - 1] = np.mean(values)
+        frames = sum(1 for key in self._squares if key[1] == 1) + 1
+        return means, frames if np.isfinite(means).all() else 0
+
+
+def white_square(first: np.ndarray, second: np.ndarray) -> float:
+    """Half the mean square of the difference of two frames, DN², without what rows and columns have in common."""
+    noise = np.subtract(second, first, dtype=np.float32)
+    noise -= noise.mean(axis=1, dtype=float)[:, None].astype(np.float32)
+    noise -= noise.mean(axis=0, dtype=float).astype(np.float32)
+    rows, cols = noise.shape
+    return float(np.einsum("ij,ij->", noise, noise, dtype=float)) / (2 * (rows - 1) * (cols - 1))
+
+
 def _counts(shape: tuple[int, int]) -> np.ndarray:
     """Number of products at each lag by the parities of row and column, shape (2, 2, 5, 9)."""
     rows, cols = (np.arange(n) for n in shape)
@@ -54,6 +111,11 @@ def _counts(shape: tuple[int, int]) -> np.ndarray:
     along = [[np.sum((cols % 2 == p) & (cols + i >= 0) & (cols + i < shape[1])) for i in range(-REACH, REACH + 1)] for p in (0, 1)]
     counts: Array = down[:, None, :, None] * np.array(along)[None, :, None, :]
     return counts
+
+
+def margin_px(shape: tuple[int, ...]) -> int:
+    """Width of the border that is left out: filters repeat or mirror the frame there."""
+    return min(MARGIN_PX, min(shape) // 8)
 
 
 def lag_products(first: np.ndarray, second: np.ndarray) -> np.ndarray:
@@ -66,12 +128,14 @@ def lag_products(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     Returns
     -------
     ndarray, shape (2, 2, 5, 9), float64, DN²
-        Of their difference over √2, less its row and column means; see `sum_lag_products`.
+        Of their difference over √2 inside of the margin, less its row and column means; see `sum_lag_products`.
     """
-    rows, cols = first.shape
+    m = margin_px(first.shape)
+    inner = slice(m, first.shape[0] - m), slice(m, first.shape[1] - m)
+    rows, cols = first.shape[0] - 2 * m, first.shape[1] - 2 * m
     padded = np.zeros((rows + REACH, cols + 2 * REACH), np.float32)
     noise = padded[:rows, REACH : REACH + cols]
-    np.subtract(second, first, out=noise, dtype=np.float32)
+    np.subtract(second[inner], first[inner], out=noise, dtype=np.float32)
     noise -= noise.mean(axis=1, dtype=float)[:, None].astype(np.float32)
     noise -= noise.mean(axis=0, dtype=float).astype(np.float32)
     sums = np.empty((2, 2, REACH + 1, 2 * REACH + 1))
@@ -90,8 +154,8 @@ class CorrelatedGroup:
     mean_dn: float
     clipped: float
     products: LagProducts
+    succession: FrameSuccession
     var_dn2: float
-    n_frames: int
 
 
 def noise_covariance(groups: Sequence[CorrelatedGroup]) -> NoiseCovariance | None:
@@ -99,6 +163,7 @@ def noise_covariance(groups: Sequence[CorrelatedGroup]) -> NoiseCovariance | Non
     used = [g for g in groups if g.products.by_pair and min(g.products.shape) > 4 * REACH]
     if not used:
         return None
+    successions = [g.succession.result() for g in used]
     return NoiseCovariance(
         bright=np.array([g.bright for g in used]),
         stack=np.array([g.stack for g in used]),
@@ -107,7 +172,10 @@ def noise_covariance(groups: Sequence[CorrelatedGroup]) -> NoiseCovariance | Non
         clipped=np.array([g.clipped for g in used]),
         n_pairs=np.array([len(g.products.by_pair) for g in used]),
         covariance_dn2=np.array([g.products.covariance_dn2() for g in used]),
-        stack_var_dn2=np.array([g.var_dn2 if g.stack else np.nan for g in used]),
-        n_frames=np.array([g.n_frames for g in used]),
+        inner_mean_dn=np.array([g.products.mean_dn() for g in used]),
+        var_dn2=np.array([g.var_dn2 for g in used]),
+        successive_dn2=np.array([mean for mean, _ in successions]),
+        n_successive=np.array([frames for _, frames in successions]),
         frame_shape=used[0].products.shape,
+        margin_px=used[0].products.margin_px,
     )

@@ -33,10 +33,11 @@ from pixmetry.core.arrays import Array
 from pixmetry.core.errors import MeasureError
 from pixmetry.core.number import Estimates, effective_dof
 from pixmetry.observe.photon_transfer_fit import fit_photon_transfer
-from pixmetry.observe.photon_transfer_model import QUANTISATION_DN2
+from pixmetry.observe.photon_transfer_model import MINIMUM_DARK_VAR_DN2, QUANTISATION_DN2
 
 MOST_CLIPPED = 0.002  # share of the pixels at the ends of the codes
-FOUND_Z = 4.5  # of any of the near lags; a false finding in 1e-4 of cameras
+FOUND_Z, FOUND_PATTERN_Z = 4.2, 3.5  # of one of the twelve near lags; of the pattern of repelled charge: false in 1e-3 of cameras
+DOUBT_Z = 1.645  # of the nearest neighbours together, or of that pattern: from here on the gain's u holds what they would change
 FIT_LEVEL = 1e-4  # chance of a worse fit below which a family is refused
 NEAR = tuple(k for k, (j, i) in enumerate(LAGS) if 0 < max(abs(j), abs(i)) <= 2)
 SHARPENING, BLUR, KERNEL, LINE, LOSS = (
@@ -65,12 +66,17 @@ class _ShotPart:
     both_covariance: np.ndarray
     gain: np.ndarray  # what makes r and q of the levels, shape (2, levels) or (1, levels)
     shot_dn2: np.ndarray  # S of the levels
+    inner: float  # shot variance inside of the margin over that of the whole frame, at equal light
+    u_inner: float
 
 
 def _shot_part(seen: NoiseCovariance) -> _ShotPart | None:
     pooled, pixels = seen.pooled_dn2(), float(np.prod(seen.frame_shape))
     used = seen.clipped <= MOST_CLIPPED
     bright, dark = used & seen.bright, used & ~seen.bright
+    if not dark.any() and bright.sum() > 1:  # black is clipped: what the darkest of the light levels has more
+        dark = bright & (seen.mean_dn == seen.mean_dn[bright].min())
+        bright = bright & ~dark
     if not (bright.any() and dark.any()):
         return None
     pairs = seen.n_pairs.astype(float)
@@ -101,7 +107,19 @@ def _shot_part(seen: NoiseCovariance) -> _ShotPart | None:
 
     constant, growing = solve(s[:, None])[1:], solve(s[:, None] ** 2)[1:]
     gain, both, both_covariance = solve(np.stack([s, s**2], axis=1) if s.size > 2 else s[:, None])
-    return _ShotPart(*constant, *growing, both, both_covariance, gain, s)
+    frame, inside, var = (
+        float((values[bright][keep] - np.average(values[dark], weights=pairs[dark])).sum())
+        for values in (seen.mean_dn, seen.inner_mean_dn, seen.var_dn2)
+    )
+    inner = float(s.sum()) / var * frame / inside
+    return _ShotPart(*constant, *growing, both, both_covariance, gain, s, inner, _u_of_border(seen, n.sum()))
+
+
+def _u_of_border(seen: NoiseCovariance, products: float) -> float:
+    """Scatter of a variance inside of the margin over that of the whole frame, from the share of the pixels that are left out."""
+    rows, cols = seen.frame_shape
+    left_out = 1 - rows * cols / ((rows + 2 * seen.margin_px) * (cols + 2 * seen.margin_px))
+    return float(np.sqrt(2 * left_out / products))
 
 
 @dataclass(frozen=True)
@@ -236,18 +254,36 @@ def find_noise_filter(seen: NoiseCovariance | None) -> NoiseFilter | None:
         growth_covariance=part.growing_covariance,
         shot_dn2=part.shot_dn2,
     )
-    return _explained(plain, part) if _largest_z(part) > FOUND_Z else plain
+    stands_out, doubt = _largest_z(part)
+    return _explained(plain, part) if stands_out > 1 else replace(plain, u_factor=doubt)
 
 
-def _largest_z(part: _ShotPart) -> float:
-    """How many u the largest near lag lies from zero, or the sum over the lags that repelled charge makes, of any reach."""
+def _largest_z(part: _ShotPart) -> tuple[float, float]:
+    """How far correlation stands out, and what a correlation that is too weak to be found would make of the variance.
+
+    Returns
+    -------
+    float
+        Over `FOUND_Z` for a single near lag, or over `FOUND_PATTERN_Z` for the pattern that repelled charge of any reach makes: the largest
+        of these quotients.
+    float
+        Change of the factor by the nearest neighbours' correlation, or by that pattern, where one is over `DOUBT_Z`; else 0.
+    """
     near = [k - 1 for k in NEAR]
     single = np.abs(part.constant[near]) / np.sqrt(np.diag(part.constant_covariance)[near])
-    weak = 1e-3 / float(part.shot_dn2.max())
-    patterns = np.stack([charge_response(weak, reach, np.ones(1))[1][0] for reach in REACHES], axis=1)
+    weak, largest = 1e-3, float(part.shot_dn2.max())
+    responses = [charge_response(weak / largest, reach, np.array([largest]))[1][0] for reach in REACHES]
+    patterns = np.stack(responses, axis=1) / (weak * largest**2)
     weighed = np.linalg.solve(part.growing_covariance, patterns)
-    together = (weighed * part.growing[:, None]).sum(axis=0) / np.sqrt((weighed * patterns).sum(axis=0))
-    return float(max(single.max(), together.max()))
+    power = (weighed * patterns).sum(axis=0)
+    losses = (weighed * part.growing[:, None]).sum(axis=0) / power
+    together = losses * np.sqrt(power)
+    beside = [LAGS.index((0, 1)) - 1, LAGS.index((1, 0)) - 1]
+    share = 2 * float(part.constant[beside].sum())
+    u_share = 2 * float(np.sqrt(part.constant_covariance[np.ix_(beside, beside)].sum()))
+    mean = float((part.shot_dn2**2).sum() / part.shot_dn2.sum() / largest)
+    changes = [loss * mean for loss, z in zip(losses, together, strict=True) if z > DOUBT_Z] + [share] * (abs(share) > DOUBT_Z * u_share)
+    return max(float(single.max()) / FOUND_Z, float(together.max()) / FOUND_PATTERN_Z), max(map(abs, changes), default=0.0)
 
 
 def _explained(plain: NoiseFilter, part: _ShotPart) -> NoiseFilter:
@@ -255,33 +291,39 @@ def _explained(plain: NoiseFilter, part: _ShotPart) -> NoiseFilter:
     families = _families(float(part.shot_dn2.max()))
     matches = [m for m in (_match(family, part) for family in families) if m.chance > FIT_LEVEL]
     if matches:
-        best = min(matches, key=lambda m: m.cost + m.values.size)
-        rivals = [m for m in matches if m.cost + m.values.size < best.cost + best.values.size + 3.0]
+        best = min(matches, key=_price)
+        rivals = [m for m in matches if _price(m) < _price(best) + 3.0]
         doubt = max(abs(m.factor - best.factor) for m in rivals)
-        return _as_found(plain, best, doubt)
+        return _as_found(plain, best, part, doubt)
     growth = _growth(part)
     if part.both.size > len(LAGS) and -3 * growth[1] < growth[0] < MOST_GROWTH:
         filters = [m for m in (_match(f, part, constant_alone=True) for f in families if f.kind == LINEAR) if m.chance > FIT_LEVEL]
         if filters:
-            best = min(filters, key=lambda m: m.cost + m.values.size)
+            best = min(filters, key=_price)
             name = f"{best.family.name}, behind something that grows with the signal"
-            return replace(_as_found(plain, best, growth[1]), name=name, growth=growth[0])
+            return replace(_as_found(plain, best, part, growth[1]), name=name, growth=growth[0])
     near = np.array([max(abs(j), abs(i)) <= 2 for j, i in LAGS[1:]])
     share = 2 * float(part.constant[near].sum())
     u_share = 2 * float(np.sqrt(part.constant_covariance[np.ix_(near, near)].sum()))
     return replace(plain, kind=UNKNOWN, name="no linear filter fits", factor=1 + share, u_factor=float(np.hypot(share, u_share)))
 
 
-def _as_found(plain: NoiseFilter, best: _Match, doubt: float) -> NoiseFilter:
-    """What is known with the family that fits best."""
+def _price(match: _Match) -> float:
+    """χ²/2 and the number of parameters (Akaike); a filter without a name only counts where it fits far better."""
+    return match.cost + match.values.size + 3.0 * (match.family.name in (KERNEL, LINE))
+
+
+def _as_found(plain: NoiseFilter, best: _Match, part: _ShotPart, doubt: float) -> NoiseFilter:
+    """What is known with the family that fits best; repelled charge sees no border."""
+    inner, u_inner = (1.0, 0.0) if best.family.kind == CHARGE else (part.inner, part.u_inner)
     fit = Estimates(best.family.names, best.values, best.covariance, np.full(best.values.size, np.inf), best.family.units)
     return replace(
         plain,
         kind=best.family.kind,
         name=best.family.name,
         fit=fit,
-        factor=best.factor,
-        u_factor=float(np.hypot(best.u_factor, doubt)),
+        factor=best.factor * inner,
+        u_factor=float(np.linalg.norm([best.u_factor, doubt, u_inner])),
         row_factor=_line_factor(best.correlation, axis=0),
         column_factor=_line_factor(best.correlation, axis=1),
     )
@@ -318,7 +360,7 @@ def before_filter(
 
     def unfiltered_lines(ms_dn2: Any, var_dn2: Any, before_dn2: Any, of_line: float, pixels: int) -> Any:
         """Mean squares of rows or columns: the white noise before, and what lines have in common before the filter across them."""
-        if found.kind == CHARGE:
+        if found.kind in (CHARGE, WHITE):
             return ms_dn2
         in_common = ms_dn2 - var_dn2 * of_line / pixels
         return before_dn2 / pixels + in_common * (found.factor + shift) / of_line
@@ -333,7 +375,7 @@ def before_filter(
         )
 
     def unfiltered_dark(var_dn2: np.ndarray) -> np.ndarray:
-        if found.kind == CHARGE:
+        if found.kind in (CHARGE, WHITE):
             return var_dn2
         unfiltered: Array = np.maximum(var_dn2 - QUANTISATION_DN2, 0.0) * (found.factor + shift) + after
         return unfiltered
@@ -364,7 +406,7 @@ def fit_unfiltered(
     MeasureError
         As there; and behind a filter that is not linear, where no variance tells the gain.
     """
-    if found is None or found.kind == WHITE:
+    if found is None or (found.kind == WHITE and found.u_factor == 0):
         return fit_photon_transfer(series, dark, bright, dnl_lsb)
     if found.kind == UNKNOWN and abs(found.factor - 1) > SMALL:
         raise MeasureError(
@@ -380,6 +422,27 @@ def fit_unfiltered(
     change = np.array([there[n].value - here[n].value if n in there and there[n].kind == here[n].kind else 0.0 for n in here.names])
     times = f"the shot variance before it is {found.factor:.4g} ± {found.u_factor:.2g} times that behind it"
     why = f"corrected for what correlates neighbouring pixels ({found.name}): {times}"
+    if found.kind == WHITE:
+        why = f"u contains {found.u_factor:.2g} of the shot variance for a correlation of neighbours that is too weak to be told from none"
     reason = "; ".join(filter(None, (why, here.reasons.get("gain_dn_per_e", ""))))
+    here = _with_hidden_noise(here, series, found)
     dof = effective_dof(np.stack([here.u**2, change**2], axis=1), np.stack([here.dof, np.full(len(here), np.inf)], axis=1))
     return replace(here, covariance=here.covariance + np.outer(change, change), dof=dof, reasons={**here.reasons, "gain_dn_per_e": reason})
+
+
+def _with_hidden_noise(fit: Estimates, series: PhotonTransfer, found: NoiseFilter) -> Estimates:
+    """The noise in the dark as a limit where the filter made it smaller than rounding shows: 0.40/K behind it (EMVA 1288 R4.0 eq. 54)."""
+    levels = series.dark.ms_pixel_dn2
+    if found.kind != LINEAR or not levels.size or levels.mean() >= MINIMUM_DARK_VAR_DN2:
+        return fit
+    bound = 0.40 * float(np.sqrt(found.factor)) / fit["gain_dn_per_e"].value
+    names = [n for n in ("dark_noise_e", "row_noise_e", "column_noise_e") if n in fit]
+    values, covariance = fit.values.copy(), fit.covariance.copy()
+    for i in map(fit.index, names):
+        values[i] = bound
+        covariance[i], covariance[:, i] = 0.0, 0.0
+        covariance[i, i] = bound**2 / 12
+    why = f"behind the filter the dark variance is below {MINIMUM_DARK_VAR_DN2} DN², where rounding hides it: bound 0.40 DN there"
+    return replace(
+        fit, values=values, covariance=covariance, limits=fit.limits | set(names), reasons={**fit.reasons, **dict.fromkeys(names, why)}
+    )

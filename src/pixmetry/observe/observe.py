@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pixmetry.camera.noise_covariance import WHITE, NoiseFilter
+from pixmetry.camera.noise_covariance import WHITE, NoiseCovariance, NoiseFilter, frames_share_noise
 from pixmetry.camera.observations import (
     CodeErrors,
     CodeHistogram,
@@ -30,7 +30,7 @@ from pixmetry.observe.edges import Picture, edge_notes, responses_of, search_edg
 from pixmetry.observe.histogram import HistogramAccumulator, code_errors, sweep_histogram
 from pixmetry.observe.linearity import Linearity
 from pixmetry.observe.moments import LevelSummary
-from pixmetry.observe.noise_covariance import CorrelatedGroup, LagProducts, noise_covariance
+from pixmetry.observe.noise_covariance import CorrelatedGroup, FrameSuccession, LagProducts, noise_covariance
 from pixmetry.observe.noise_filter import find_noise_filter, fit_unfiltered
 from pixmetry.observe.one_pass import Group, Level, photon_transfer, reduce_groups, refuse_copies, without_levels
 from pixmetry.observe.patterns import find_phase_patterns
@@ -97,7 +97,7 @@ def observe(
     pictures: list[Picture] = []
     shape = None
     correlated: list[CorrelatedGroup] = []
-    for group, [(sums, found, products)] in reduce_groups(groups, bits, lags=True, threads=threads, on_frames=on_frames):
+    for group, [(sums, found, products, succession)] in reduce_groups(groups, bits, lags=True, threads=threads, on_frames=on_frames):
         shape = found
         if group.role == "target" and not isinstance(sums, LevelSummary):
             pictures.append(Picture.of(group.kind, sums.moments, bits))
@@ -107,12 +107,12 @@ def observe(
             histogram.add_counts(sums.counts, dark=group.kind == "dark", level=condition)
             refuse_copies(group, sums, bits)
             levels[group.kind].append(Level(sums, group.exposure_s, group.photons))
-            correlated.append(_correlated(group, sums, products))
+            correlated.append(_correlated(group, sums, products, succession))
         elif isinstance(sums.moments, StackAccumulator) and sums.spectra is not None:
             histogram.add_counts(sums.moments.counts, dark=group.kind == "dark", level=condition)
             summary = sums.moments.summary()
             stacked[group.kind].append(Level(summary, group.exposure_s, group.photons))
-            correlated.append(_correlated(group, summary, products))
+            correlated.append(_correlated(group, summary, products, succession))
             kept = stacks[group.kind].get(group.exposure_s)
             if kept is None or sums.moments.n_frames > kept.moments.n_frames:
                 stack = sums.moments.result(group.exposure_s)
@@ -137,7 +137,7 @@ def observe(
     with single_threaded_blas():
         noise = noise_covariance(correlated)
         noise_filter = find_noise_filter(noise)
-        fit = _transfer_fit(transfer, dark_stack, bright_stack, _dnl_lsb(codes), noise_filter, notes)
+        fit = _transfer_fit(transfer, dark_stack, bright_stack, _dnl_lsb(codes), noise, noise_filter, notes)
     if dark and not bright:
         notes.append("no stack of bright frames: PRNU is not measured (take 16 or more at half of saturation)")
     if dark and bright and not same_exposure(dark.moments, bright.moments):
@@ -166,7 +166,7 @@ def observe(
     )
 
 
-def _correlated(group: Group, level: LevelSummary, products: LagProducts) -> CorrelatedGroup:
+def _correlated(group: Group, level: LevelSummary, products: LagProducts, succession: FrameSuccession) -> CorrelatedGroup:
     """What the record of the noise's autocovariance needs of a group."""
     clipped = float((level.counts[0] + level.counts[-1]) / level.counts.sum())
     return CorrelatedGroup(
@@ -176,8 +176,8 @@ def _correlated(group: Group, level: LevelSummary, products: LagProducts) -> Cor
         mean_dn=level.mean_dn,
         clipped=clipped,
         products=products,
+        succession=succession,
         var_dn2=level.squares.pixel_dn2,
-        n_frames=level.n_frames,
     )
 
 
@@ -194,16 +194,25 @@ def _transfer_fit(
     dark: StackMoments | None,
     bright: StackMoments | None,
     dnl_lsb: float,
+    noise: NoiseCovariance | None,
     noise_filter: NoiseFilter | None,
     notes: list[str],
 ) -> Estimates:
     """The joint fit; where the frames carry none, what they tell nevertheless, and a note."""
     if transfer.bright.mean_dn.size:
         refuse_dead_series(transfer)
+    independent = noise is None or not frames_share_noise(noise)
     try:
+        if not independent:
+            raise MeasureError(
+                "the noise of successive frames is correlated, as behind temporal noise reduction: their differences do not tell the gain",
+                where="photon transfer",
+                remedy="switch temporal noise reduction off",
+            )
         return fit_unfiltered(transfer, dark, bright, dnl_lsb, noise_filter)
     except MeasureError as problem:
-        found = partial_transfer(transfer, dark, straight=is_short(transfer) and (noise_filter is None or noise_filter.kind == WHITE))
+        straight = is_short(transfer) and independent and (noise_filter is None or noise_filter.kind == WHITE)
+        found = partial_transfer(transfer, dark, straight=straight)
         if not len(found) and not transfer.bright.mean_dn.size:
             raise
         missing = "non-linearity, saturation" if "gain_dn_per_e" in found else "gain, noise in electrons, non-linearity, saturation"

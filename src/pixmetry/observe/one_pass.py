@@ -15,7 +15,7 @@ from pixmetry.core.errors import MeasureError
 from pixmetry.core.threads import imap_tiles
 from pixmetry.observe.defects import tail_of_counts
 from pixmetry.observe.moments import LevelAccumulator, LevelSummary, level_moments, summarize_pair
-from pixmetry.observe.noise_covariance import LagProducts, lag_products
+from pixmetry.observe.noise_covariance import FrameSuccession, LagProducts, lag_products, white_square
 from pixmetry.observe.stack import GroupReduction, new_group
 
 Frame = np.ndarray | Callable[[], np.ndarray]
@@ -52,6 +52,7 @@ class Reduced(NamedTuple):
     sums: GroupReduction | LevelSummary
     shape: tuple[int, int]
     products: LagProducts
+    succession: FrameSuccession
 
 
 def reduce_groups(
@@ -105,8 +106,8 @@ class _Sums:
     """Running sums of one part of the frames of one group, shared by the threads."""
 
     def __init__(self, part: Part, group: Group, bits: int, spectra_pairs: int, lags: bool) -> None:
-        self.part, self.bits, self.lags = part, bits, lags
-        self.products = LagProducts()
+        self.part, self.bits, self.lags, self.stack = part, bits, lags, group.role == "stack"
+        self.products, self.succession = LagProducts(), FrameSuccession()
         self.reduction = new_group(bits, group.role, spectra_pairs)
         self.summary: Reduced | None = None
         self._lock = threading.Lock()
@@ -115,21 +116,27 @@ class _Sums:
         own = [np.ascontiguousarray(self.part(frame)) for frame in frames]
         if alone:
             shape = (own[0].shape[0], own[0].shape[1])
-            self.summary = Reduced(summarize_pair(own[0], own[1], self.bits), shape, self.products)
+            self.summary = Reduced(summarize_pair(own[0], own[1], self.bits), shape, self.products, self.succession)
         else:
+            due = []
             with self._lock:
                 for offset, frame in enumerate(own):
                     self.reduction.add(frame, first_index + offset)
+                    if self.lags and self.stack:
+                        due += self.succession.due(first_index + offset, frame)
+            for key, first, second in due:
+                self.succession.put(key, white_square(first, second))
         if self.lags and len(own) == 2:  # frames that were summed have the right shape
             products = lag_products(own[0], own[1])
             with self._lock:
-                self.products.add(first_index // 2, products, (own[0].shape[0], own[0].shape[1]))
+                self.products.add(first_index // 2, products, own[0])
 
     def result(self) -> Reduced:
         if self.summary is not None:
             return self.summary
         moments = self.reduction.moments
-        return Reduced(moments.summary() if isinstance(moments, LevelAccumulator) else self.reduction, moments.shape, self.products)
+        sums = moments.summary() if isinstance(moments, LevelAccumulator) else self.reduction
+        return Reduced(sums, moments.shape, self.products, self.succession)
 
 
 @dataclass

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from pixmetry.camera.noise_covariance import UNKNOWN
 from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.errors import MeasureError
 from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
 
@@ -23,7 +25,12 @@ def forward(params: Gain, signal: Signal, stream: Stream) -> Signal:
 
 
 def measure(observations: Observations) -> Estimates:
-    """Read the gain from the photon transfer: the slope of temporal variance against mean."""
+    """Read the gain from the photon transfer: the slope of temporal variance against mean, before what filtered the noise."""
+    found, fit = observations.noise_filter, observations.photon_transfer_fit
+    if found is not None and found.kind == UNKNOWN and (fit is None or "gain_dn_per_e" not in fit):
+        what = "the noise of neighbouring pixels is correlated, and not as behind a linear filter: its variance does not tell the gain"
+        remedy = "take raw frames without noise reduction, demosaicking and compression"
+        raise MeasureError(what, where="electronics.gain", remedy=remedy)
     return observations.fitted(
         {"gain_dn_per_e": "gain_dn_per_e"},
         "the gain needs a photon-transfer series",

@@ -4,10 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 
+from pixmetry.camera.noise_covariance import frame_correlation
+from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.errors import MeasureError
+from pixmetry.core.number import ONE_SIDED_95, Estimates
 from pixmetry.core.random import Stream
 from pixmetry.sources.processing._codes import bits_of_camera, stored
+
+MOST_CLIPPED, LEAST_DN2, NOT_SIGNIFICANT = 0.002, 0.3, 3.0
+METHOD = "ratio of the mean squares of frame differences two and one frames apart, over stacks of a steady scene"
+CONFOUNDERS = ("temporal noise reduction: pixels that blink or drift slowly; image lag of a kind that shares each charge out",)
 
 
 class TemporalNoiseReduction(Parameters):
@@ -40,6 +48,32 @@ def forward(params: TemporalNoiseReduction, signal: Signal, stream: Stream, stat
     return signal.with_data(out), kept
 
 
+def measure(observations: Observations) -> Estimates:
+    """Read α off the stacks: half the mean square of differences of frames two apart over that of one apart, less 1, is α.
+
+    Both stacks tell it, weighted by their u. Lag of the sensor, dark current that drifts and traps that blink act on one of them: where
+    the two differ by more than their u allow, u is widened (Birge's ratio).
+    """
+    seen, where = observations.noise_covariance, "processing.temporal_noise_reduction"
+    groups = [] if seen is None else np.flatnonzero((seen.n_successive > 3) & (seen.clipped <= MOST_CLIPPED)).tolist()
+    if seen is None or not groups:
+        remedy = "take 16 or more frames of each, one directly after the other, and not clipped"
+        raise MeasureError("needs a stack of dark or bright frames in the order in which they were taken", where=where, remedy=remedy)
+    if (seen.successive_dn2[groups, 0] < LEAST_DN2).all():
+        remedy = "take bright frames at half of saturation, or set a higher gain"
+        raise MeasureError("rounding hides the noise of the frames", where=where, remedy=remedy)
+    parts = np.array([frame_correlation(seen, g) for g in groups if seen.successive_dn2[g, 0] >= LEAST_DN2])
+    weight = parts[:, 1] ** -2.0
+    alpha, u = float(weight @ parts[:, 0] / weight.sum()), float(weight.sum() ** -0.5)
+    if len(parts) > 1:
+        u *= max(1.0, float(np.sqrt((weight * (parts[:, 0] - alpha) ** 2).sum() / (len(parts) - 1))))
+    if alpha > NOT_SIGNIFICANT * u:
+        return Estimates.from_rows([("alpha", min(alpha, 0.98), u, np.inf, "1")], method=METHOD, confounders=CONFOUNDERS)
+    why = {"alpha": "successive frames are not correlated; 95 % upper limit"}
+    row = ("alpha", max(alpha, 0.0) + ONE_SIDED_95 * u, u, np.inf, "1")
+    return Estimates.from_rows([row], method=METHOD, confounders=CONFOUNDERS, limits=frozenset({"alpha"}), reasons=why)
+
+
 SOURCE = Source(
     id="processing.temporal_noise_reduction",
     title="Temporal noise reduction",
@@ -52,6 +86,7 @@ SOURCE = Source(
     typical=TemporalNoiseReduction(alpha=0.5),
     bound=TemporalNoiseReduction(alpha=0.8),
     forward=forward,
+    measure=measure,
     start=start,
     option="noise reduction in the camera",
     gum_class="O",
@@ -60,7 +95,6 @@ SOURCE = Source(
     references=("A. V. Oppenheim, R. W. Schafer, Discrete-Time Signal Processing, Pearson 2010, §5.1 (group delay of a recursive filter)",),
     advice="Switch it off. Average frames afterwards, with the known motion.",
     reasons={
-        "measure": "not measured: needs the correlation of the noise of successive frames of a steady scene: it is α",
         "propagate": "a target at rest is not shifted; the shift of a moving one, v α/(1 − α) T_f, needs its speed, which the probe lacks",
         "correct": "x = (y − α y_before)/(1 − α) needs the whole sequence without a gap",
     },
