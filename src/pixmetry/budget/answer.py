@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from pixmetry.budget.calibration_noise import CALIBRATION
 from pixmetry.budget.table import AT_BOUND, COUNTED, TYPICAL, Pair, Parts, SourceRow
 from pixmetry.camera.catalogue import sources
 
@@ -180,7 +181,9 @@ def to_measure(rows: Sequence[SourceRow], frames: int = 1, targets: int = 1) -> 
 
 
 def how_to_measure(source_id: str) -> str:
-    """A sentence on how a source is measured; empty for what is no source of the catalogue."""
+    """A sentence on how a source, or the calibration's noise, is measured; empty for what is neither."""
+    if source_id == CALIBRATION:
+        return "Give its calibration.json, or say how many images and targets it was made of."
     source = sources().get(source_id)
     if source is None:
         return ""
