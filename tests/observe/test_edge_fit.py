@@ -68,7 +68,7 @@ def test_blur_hides_the_aperture(rng: np.random.Generator):
     _, edges = found_in(stored_picture(rng, clean_squares(rng, camera(0.9))))
     assert not set(FULL) & set(edges.optics.names)
     assert "hides the aperture" in edges.optics.reasons["width_x_px"]
-    assert abs(edges.optics["sigma_px"].value - 0.9) < 3 * edges.optics["sigma_px"].u < 0.09
+    assert abs(edges.optics["sigma_px"].value - 0.9) < LIMIT * edges.optics["sigma_px"].u < LIMIT * 0.03
     measure = get_source("sensor.pixel_aperture").measure
     assert measure is not None
     with pytest.raises(MeasureError, match="hides the aperture"):
