@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from observe.edge_pictures import squares, stored
+from observe.edge_pictures import one_edge, squares, stored
 from pixmetry import Frames, assess, campaign_of_arrays, emva1288
 from pixmetry.assess.job import observe_campaign
 from pixmetry.core.errors import InputError, MeasureError
@@ -61,6 +61,16 @@ def test_frames_of_a_group_are_averaged(rng: np.random.Generator):
     _, seen = observe_campaign(campaign_of_arrays([Frames("edge", None, frames)], bits=12), no_progress)
     assert seen.edges is not None
     assert np.mean([e.noise_dn for e in seen.edges.edges]) == pytest.approx(6.0, rel=0.1)
+    assert not any("moved" in note for note in seen.notes)
+
+
+def test_a_chart_that_moved_between_the_frames_is_told(rng: np.random.Generator):
+    """Two frames 0.4 px apart, which is an rms of 0.28 px."""
+    frames = np.array([stored(one_edge(rng, sigma=0.7, at_px=at)) for at in (49.1, 49.5)])
+    _, seen = observe_campaign(campaign_of_arrays([Frames("edge", None, frames)], bits=12), no_progress)
+    (note,) = [note for note in seen.notes if "moved" in note]
+    assert "picture 1" in note
+    assert float(note.split("about ")[1].split(" px")[0]) == pytest.approx(0.4 / np.sqrt(2), abs=0.05)
 
 
 def test_edges_through_a_mosaic_are_left_out_with_a_note(rng: np.random.Generator):

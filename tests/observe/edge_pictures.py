@@ -21,12 +21,21 @@ def response(frequency: np.ndarray, sigma: float, width: float = 1.0) -> np.ndar
 
 
 def one_edge(
-    rng: np.random.Generator, angle_deg: float = 5.0, shape=(120, 100), sigma=0.5, low=200.0, high=1200.0, noise=5.0, bend_px=0.0
+    rng: np.random.Generator,
+    angle_deg: float = 5.0,
+    shape=(120, 100),
+    sigma=0.5,
+    low=200.0,
+    high=1200.0,
+    noise=5.0,
+    bend_px=0.0,
+    at_px=None,
 ) -> np.ndarray:
-    """A nearly vertical edge through the middle, brighter to the right; ``bend_px`` bows it at the ends."""
+    """A nearly vertical edge through the middle, or ``at_px``, brighter to the right; ``bend_px`` bows it at the ends."""
     y, x = np.mgrid[0 : shape[0], 0 : shape[1]].astype(float)
     t = (y - 0.5 * (shape[0] - 1)) / (0.5 * shape[0])
-    at = 0.5 * (shape[1] - 1) + rng.uniform(-0.5, 0.5) + np.tan(np.radians(angle_deg)) * (y - 0.5 * (shape[0] - 1)) + bend_px * t**2
+    middle = 0.5 * (shape[1] - 1) + rng.uniform(-0.5, 0.5) if at_px is None else at_px
+    at = middle + np.tan(np.radians(angle_deg)) * (y - 0.5 * (shape[0] - 1)) + bend_px * t**2
     clean = low + (high - low) * spread((x - at) * np.cos(np.radians(angle_deg)), sigma)
     return clean + noise * rng.standard_normal(shape)
 

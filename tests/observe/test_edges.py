@@ -12,6 +12,7 @@ from observe.edge_pictures import one_edge, response, squares, stored
 from pixmetry.camera.observations import SlantedEdges
 from pixmetry.core.threads import set_threads
 from pixmetry.observe._edge_kernels import find_steps
+from pixmetry.observe.edge_fit import fit_edges
 from pixmetry.observe.edges import Picture, edge_notes, responses_of, search_edges
 
 LIMIT = 5.5  # u; beyond it once in 3e7
@@ -154,3 +155,6 @@ def test_published_edges_of_sfrmat5(name: str, axis: str):
     assert edge.across == axis
     assert abs(edge.angle_deg) == pytest.approx(5.38, abs=0.05)
     assert edge.sfr50 == pytest.approx(0.2025, abs=0.004) and edge.u_sfr50 < 0.004
+    optics = fit_edges(search_edges([Picture("edge", np.asarray(frame, np.float32), 1, 255.0)]).measured)
+    assert optics.names == ("spread_var_px2",)  # a colour camera's picture: what was filtered is not taken for the lens
+    assert "correlated" in optics.reasons["spread_var_px2"]

@@ -44,6 +44,11 @@ from pixmetry.locate.target_estimator import TargetEstimator, parse_estimator
 from pixmetry.observe.observe import Group, observe
 
 KIND = "assessment"
+SPREADING = ("optics.point_spread", "optics.olpf", "sensor.pixel_aperture")
+TARGET_BEFORE_LENS = (
+    "Lens, pixel aperture or optical low-pass filter were measured from edges. The Monte Carlo shows the target through them, so its image "
+    "is blurrier there than the stated target, on which the sum of the contributions rests; the two may differ by that."
+)
 
 
 
@@ -126,6 +131,8 @@ def assess(
         note = f"The gain is not measured. For the shot noise it is {assumed}, which bounds it; electrons are DN over that gain."
         seen = replace(seen, notes=(*seen.notes, note))
     estimates, unmeasured = without_noise(seen, estimates, unmeasured)
+    if any(source in estimates for source in SPREADING):
+        seen = replace(seen, notes=(*seen.notes, TARGET_BEFORE_LENS))
     camera = digital_twin(frames, estimates, seen)
     steps = len(camera.active) + len(sources()) + 2
     done = itertools.count(1)

@@ -34,6 +34,7 @@ MOST_ROWS = 4000  # of the edges of each direction that enter the fit
 FOUND_CHI2 = 25.0  # by which χ² must fall for a source to count as present
 SEARCH_STEP_PX = 0.02  # to which the widest possible plate is found
 LARGEST_U_A = 0.2  # of a width that is given as a value
+FILTERED_REL = 0.15  # correlation of the noise of neighbouring pixels, from which on they were filtered
 MISFIT = 4.0  # χ² per bin of the mean residuals, from which on the model does not describe the edges
 MISFIT_BINS_PX = 0.25
 METHOD = "joint fit of a Gaussian, a rectangular aperture and a birefringent plate to the pixels of slanted edges"
@@ -90,12 +91,19 @@ def fit_edges(measured: Sequence[tuple[Region, Spread]]) -> Estimates:
     sharp = _with(plain.parameters, free_a, 0.8)
     plate = _best_fit(plain.edges, [_with(sharp, free_d, d) for d in STARTS_D], [V, *free_a, *free_d])
     scale = max(plate.chi2 / plate.dof, 1.0)
+    filtered = float(np.median([max(abs(s.along_rel), abs(s.neighbour_rel)) for _, s in measured]))
+    if filtered > FILTERED_REL:
+        told = (
+            f"the noise of neighbouring pixels is correlated by {filtered:.2f}: a filter (sharpening, demosaicing, noise reduction) lies "
+            "behind the pixels, and the edges show it together with lens and pixel"
+        )
+        return _of_wrong_model(min(plain, plate, key=lambda f: f.chi2), told)
     present = (plain.chi2 - plate.chi2) / scale > FOUND_CHI2
     if present:
         return _estimates(plate, axes)
     wrong = misfit(plain)
     if wrong > MISFIT:
-        return _of_wrong_model(plain, wrong)
+        return _of_wrong_model(plain, _misfit_text(wrong))
     return _estimates(plain, axes, _possible_plates(plain, free_a, scale))
 
 
@@ -124,7 +132,7 @@ def _edge(region: Region, spread: Spread) -> _Edge:
     values, distance = pixels_of(region, half)
     place = distance / region.cosine + region.centre[:, None]
     left, right = spread.low_dn, spread.low_dn + spread.height
-    coloured = (1 + 2 * spread.along_rel) * (1 + 2 * spread.neighbour_rel)
+    coloured = (1 + 2 * max(spread.along_rel, 0.0)) * (1 + 2 * max(spread.neighbour_rel, 0.0))
     levels = np.array([left, right])
     return _Edge(values, place, region.line, levels, np.array(spread.variances_dn2), "xy".index(region.across), coloured)
 
@@ -320,13 +328,16 @@ def _possible_plates(plain: _Fit, free_a: Sequence[int], scale: float) -> list[_
     return [*(f for f in between if fits(f)), near]
 
 
-def _of_wrong_model(fit: _Fit, wrong: float) -> Estimates:
-    """v alone, where the edges have another shape."""
-    told = (
+def _misfit_text(wrong: float) -> str:
+    return (
         f"the edges do not follow a Gaussian lens, a rectangular aperture and a birefringent plate (χ² of the mean residuals {wrong:.0f} "
         "per bin): another lens, diffraction, sharpening, gamma, or a printed edge that is not sharp"
     )
-    u = float(np.sqrt(fit.covariance[0, 0] * _scale(fit) * wrong))
+
+
+def _of_wrong_model(fit: _Fit, told: str) -> Estimates:
+    """v alone, where its parts are not those of the model; its u grows with the misfit."""
+    u = float(np.sqrt(fit.covariance[0, 0] * _scale(fit) * max(misfit(fit), 1.0)))
     row = ("spread_var_px2", float(fit.parameters[V]), u, float(fit.dof), "px²")
     return Estimates.from_rows([row], method=METHOD, reasons={"spread_var_px2": told})
 
@@ -340,7 +351,7 @@ def _estimates(best: _Fit, axes: Sequence[int], possible: Sequence[_Fit] = ()) -
     """Values with their covariance; ``possible`` are fits with a plate where none was found, the widest last."""
     wrong = misfit(best)
     if wrong > MISFIT:
-        return _of_wrong_model(best, wrong)
+        return _of_wrong_model(best, _misfit_text(wrong))
     free = list(best.free)
     values, joint = _derived(best)
     widest = 0.0

@@ -38,6 +38,7 @@ NEIGHBOUR_SHARE = 0.03  # of the rows with another step, from which on it is ano
 TILE_ROWS = 256
 STEP_SIGMAS, LEAST_STEP_DN, LEAST_STEP_REL = 8.0, 2.0, 0.02  # of noise; absolute; of the range of values
 OF_SAMPLING = 0.005  # u of an asymmetry from the bins of 1/4 px: the scatter over places of simulated symmetric edges without noise
+MOVED_PX = 0.05  # rms, from which on a motion between frames is told
 ALPHA = 0.5  # of the Tukey window: this share of its length is tapered
 MOST_STEPS = 20  # places a row, on average, that are kept
 FITTED = "e-SFR: edge spread in bins of 1/4 px, ISO 12233:2023"
@@ -51,12 +52,15 @@ class Picture:
     data: Singles
     n_frames: int
     top_dn: float
+    var_dn2: Singles | None = None  # temporal variance of each pixel, of two frames or more
 
     @classmethod
     def of(cls, kind: str, moments: object, bits: int) -> Picture:
         """From the sums of a group."""
         assert isinstance(moments, StackAccumulator)
-        return cls(kind, moments.mean_map_dn().astype(np.float32), moments.n_frames, 2.0**bits - 1)
+        frames = moments.n_frames
+        variance = (moments.deviation_map_dn2() / (frames - 1)).astype(np.float32) if frames > 1 else None
+        return cls(kind, moments.mean_map_dn().astype(np.float32), frames, 2.0**bits - 1, variance)
 
 
 @dataclass(frozen=True)
@@ -149,6 +153,38 @@ def search_edges(pictures: Sequence[Picture]) -> Search:
                 else:
                     measured.append(result)
     return Search(tuple(measured), tuple(refused))
+
+
+def motion_notes(pictures: Sequence[Picture], found: Search) -> list[str]:
+    """A note for each picture whose edges moved between its frames: their mean is blurred by that.
+
+    A shift of variance s² between frames adds s² (dI/dx)² to the temporal variance at the edge; what noise has there is the mean of both
+    sides. The root mean square shift is taken over all edges of a picture.
+    """
+    notes = []
+    for number, picture in enumerate(pictures):
+        if picture.var_dn2 is None:
+            continue
+        excess, steep, weight = 0.0, 0.0, 0.0
+        for region, spread in found.measured:
+            if region.picture != number:
+                continue
+            var = picture.var_dn2 if region.across == "x" else picture.var_dn2.T
+            own, distance = pixels_of(replace(region, frame=var))
+            slope = np.interp(distance, spread.distance_px[1:], np.diff(spread.value_dn) / STEP_PX)
+            near, far = np.abs(distance) < 1.5, np.abs(distance) > 4
+            noise = float(np.nanmean(own[far]))
+            square = slope[near] ** 2
+            excess += float((square * (own[near] - noise)).sum())
+            steep += float((square**2).sum())
+            weight += float((square**2).sum()) * 2 * noise**2 / (picture.n_frames - 1)
+        shift2 = excess / steep if steep else 0.0
+        if shift2 > MOVED_PX**2 and excess > 5 * np.sqrt(weight):
+            notes.append(
+                f"the edges of picture {number + 1} moved by about {np.sqrt(shift2):.2f} px (rms) between its frames: the mean is blurred "
+                "by that; mount camera and chart firmly, or list each frame as a group of its own"
+            )
+    return notes
 
 
 def responses_of(found: Search, optics: Estimates | None = None) -> SlantedEdges:
@@ -395,7 +431,7 @@ class Spread:
         along = (self.jacobian * phase.conj()[:, None]).real  # the change along the response changes its modulus
         root = along * np.sqrt(self.variance_dn2)
         own = root @ root.T
-        if self.neighbour_rel:
+        if self.neighbour_rel > 0:
             lag = int(round(1 / STEP_PX))
             cross = root[:, :-lag] @ root[:, lag:].T
             own = own + self.neighbour_rel * (cross + cross.T)
@@ -414,7 +450,7 @@ def _spread_of(region: Region) -> Spread:
     height = right - left
     variances, along, beside = _noise(region, curve)
     share = np.clip((curve - left) / height, 0, 1)
-    variance = ((1 - share) * variances[0] + share * variances[1]) / n * (1 + 2 * along)
+    variance = ((1 - share) * variances[0] + share * variances[1]) / n * (1 + 2 * max(along, 0.0))
     centre = float(np.interp(0.5, *_rising(share, distance)))
     reach = region.half_px - abs(centre) - 0.5
     middle = 0.5 * (distance[1:] + distance[:-1]) - centre
@@ -464,14 +500,14 @@ def _noise(region: Region, curve: Array) -> tuple[tuple[float, float], float, fl
 
 
 def _correlation(a: Array, b: Array) -> float:
-    """Correlation of neighbours; 0 where it is not significant or negative."""
+    """Correlation of neighbours; 0 where it is not significant."""
     both = np.isfinite(a) & np.isfinite(b)
     n = int(both.sum())
     if n < 30:
         return 0.0
     scale = float(np.sqrt((a[both] ** 2).mean() * (b[both] ** 2).mean()))
     r = float((a[both] * b[both]).mean()) / scale if scale > 0 else 0.0
-    return r if r > 3 / np.sqrt(n) else 0.0
+    return r if abs(r) > 3 / np.sqrt(n) else 0.0
 
 
 def pixels_of(region: Region, half_px: float | None = None) -> tuple[Array, Array]:

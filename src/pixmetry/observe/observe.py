@@ -26,7 +26,7 @@ from pixmetry.core.threads import single_threaded_blas
 from pixmetry.observe import photon_transfer_model as model
 from pixmetry.observe.defects import find_defects, without_hot_pixels
 from pixmetry.observe.edge_fit import fit_edges
-from pixmetry.observe.edges import Picture, edge_notes, responses_of, search_edges
+from pixmetry.observe.edges import Picture, edge_notes, motion_notes, responses_of, search_edges
 from pixmetry.observe.histogram import HistogramAccumulator, code_errors, sweep_histogram
 from pixmetry.observe.linearity import Linearity
 from pixmetry.observe.moments import LevelSummary
@@ -117,7 +117,7 @@ def observe(
             if kept is None or sums.moments.n_frames > kept.moments.n_frames:
                 stack = sums.moments.result(group.exposure_s)
                 stacks[group.kind][group.exposure_s] = _Stack(stack, sums.spectra.result(stack.mean_map_dn))
-    edges = _edges([p for p in pictures if p.kind == "edge"])
+    edges, told_of_edges = _edges([p for p in pictures if p.kind == "edge"])
     levels = {kind: found or stacked[kind] for kind, found in levels.items()}  # where there are only stacks, these
     if pictures and shape is not None and not (levels["dark"] or levels["bright"]):
         return Observations(
@@ -125,10 +125,10 @@ def observe(
             photon_transfer_fit=Estimates.empty(),
             edges=edges,
             temperature_c=temperature_c,
-            notes=tuple(edge_notes(edges)),
+            notes=tuple(told_of_edges),
         )
     counts = histogram.result()
-    notes = [*_code_notes(counts), *edge_notes(edges)]
+    notes = [*_code_notes(counts), *told_of_edges]
     sweep = [level.summary for level in levels["bright"]]
     dark, bright = _pair(list(stacks["dark"].values()), list(stacks["bright"].values()))
     dark_stack, bright_stack = (None if s is None else s.moments for s in (dark, bright))
@@ -181,12 +181,14 @@ def _correlated(group: Group, level: LevelSummary, products: LagProducts, succes
     )
 
 
-def _edges(pictures: list[Picture]) -> SlantedEdges | None:
+def _edges(pictures: list[Picture]) -> tuple[SlantedEdges | None, list[str]]:
+    """The edges, and notes on them."""
     if not pictures:
-        return None
+        return None, []
     with single_threaded_blas():
-        found = search_edges(pictures)
-        return responses_of(found, fit_edges(found.measured))
+        search = search_edges(pictures)
+        edges = responses_of(search, fit_edges(search.measured))
+    return edges, [*edge_notes(edges), *motion_notes(pictures, search)]
 
 
 def _transfer_fit(

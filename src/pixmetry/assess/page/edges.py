@@ -66,8 +66,9 @@ def _parts_of_blur(found: SlantedEdges) -> list[str]:
     parts = []
     for name, word in words.items():
         if name in optics:
-            number = printed_number(optics[name])
-            parts.append(f"{word} {number.value}{'' if optics[name].is_limit else f' ± {number.u}'} px")
+            value = optics[name]
+            number = printed_number(value) if value.is_limit else uncertain(value.value, value.u, "px")
+            parts.append(f"{word} {number.value}{'' if value.is_limit else f' ± {number.u}'} px")
     return [f"Fitted together: {', '.join(parts)}."]
 
 
