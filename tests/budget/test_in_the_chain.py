@@ -1,8 +1,9 @@
 """What every source is said to do to a target, against the camera with it and without: in its own chain, at its own clock.
 
 The cameras are analogue: a Butterworth filter of 5 MHz stands on the line, whatever else is on it, and one grabber samples with a clock
-of its own. Pixel clocks from 10 to 28.4 MHz, and frames of several sizes. Sources of the line are tried at every clock, the others at one
-each, in turn. What a propagator predicts must be what the Monte Carlo of the same chain shows, within the error that it declares.
+of its own. Pixel clocks from 10 to 28.4 MHz, and frames of several sizes. Sources of the line are tried at every clock; each source of
+the catalogue is tried in `test_rows_against_brute_force`. What a propagator predicts must be what the Monte Carlo of the same chain
+shows, within the error that it declares.
 
 A false failure in 1e-6 of the comparisons: 8 standard errors, the quantile of Student's t for the 16 units of which a mean may be (for
 means over the places it is more than enough). With 192 places a standard deviation is known to 5 %: an error of a factor of 1.4
@@ -11,14 +12,10 @@ beyond the declared one is seen, and for filters and cables, which are nearly co
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import cache
-
 import numpy as np
 import pytest
 
 from budget.cameras import camera
-from chance import rng_of
 from pixmetry.budget.monte_carlo import Trials
 from pixmetry.budget.probe import Facts, Probes, Target, facts_of
 from pixmetry.camera.camera import Camera, Element, in_order
@@ -32,7 +29,6 @@ OWN_CLOCK = 14.75e6  # of the pixels, where the grabber's is another
 QUANTILE = 8.0
 CASES = {i: s for i, s in sources().items() if s.forward is not None and s.propagate is not None and s.ideal is None}
 ON_LINE = [i for i, s in CASES.items() if Kind.VIDEO in s.consumes and i != "grabber.low_pass"]
-OFF_LINE = [i for i, s in CASES.items() if Kind.VIDEO not in s.consumes]
 TARGET, LAW = Target(peak_rel=0.7, background_rel=0.05), FixedCentroid(threshold_dn=12.0)
 
 
@@ -58,20 +54,6 @@ def chain(*sources: str, clock_hz: float) -> Camera:
 
 def known(cam: Camera) -> Facts:
     return facts_of(cam, TARGET, {"noise_dn": 0.6})
-
-
-@pytest.fixture(scope="module")
-def everything(request: pytest.FixtureRequest) -> Callable[[float], tuple[Trials, Probes]]:
-    """All sources that are not on the line, in one chain: what each is compared with is run once."""
-    seed = int(rng_of(request).integers(2**31))
-
-    @cache
-    def at_clock(clock_hz: float) -> tuple[Trials, Probes]:
-        cam = chain(*OFF_LINE, clock_hz=clock_hz)
-        facts = known(cam)
-        return Trials(cam, TARGET, LAW, facts, trials=384, units=16, seed=seed), Probes(cam, facts, TARGET, LAW)
-
-    return at_clock
 
 
 def agree(source: Source, cam: Camera, trials: Trials, probes: Probes) -> None:
@@ -121,9 +103,3 @@ def test_a_source_of_the_line_behind_the_rest_of_it(source_id: str, clock_hz: fl
     facts = known(cam)
     trials = Trials(cam, TARGET, LAW, facts, trials=192, units=8, seed=seed)
     agree(get_source(source_id), cam, trials, Probes(cam, facts, TARGET, LAW))
-
-
-@pytest.mark.parametrize(("source_id", "clock_hz"), [(s, list(CLOCKS)[i % len(CLOCKS)]) for i, s in enumerate(OFF_LINE)])
-def test_a_source_ahead_of_the_line_or_behind_it(everything, source_id: str, clock_hz: float) -> None:
-    trials, probes = everything(clock_hz)
-    agree(get_source(source_id), trials.camera, trials, probes)

@@ -54,15 +54,15 @@ class Places:
         return cls(x, y, np.stack([(1 - u) * (1 - v), u * (1 - v), (1 - u) * v, u * v]), frame_shape)
 
 
-def field_of(camera: Camera, places: Places, known_layout: bool = True) -> np.ndarray:
+def field_of(camera: Camera, places: Places, known_layout: bool = True, seed: int = 0) -> np.ndarray:
     """Displacement of all places of the grid in x and y, shape (2, 5, n), px of the sensor; NaN where a place is not in the frame.
 
     ``known_layout``: how the camera lays out its frames (clock of the samples, offsets, fields) is accounted for, as in `Camera.layout`.
     Without, the middle of the frame is taken for that of the sensor; of a grabber with a clock of its own, a row of samples for all of
-    a row of the sensor.
+    a row of the sensor. ``seed``: of the exposure, for what is drawn anew in every one.
     """
     x, y = places.x_px.ravel(), places.y_px.ravel()
-    seen = camera.true_positions(x, y, temperature_c=camera.temperature_c)
+    seen = camera.true_positions(x, y, seed=seed, temperature_c=camera.temperature_c)
     back = []
     laid_out = camera.layout([0.0, 1.0], [0.0, 1.0])
     clocks = [1e6 * e.params.clock_mhz for e in camera.active if e.source.id == "grabber.sampling_clock"]

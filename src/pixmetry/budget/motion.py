@@ -22,6 +22,8 @@ LOOKS = ("sensor.exposure", "sensor.interlace", "sensor.light_pulses", "sensor.r
 LAGS = {"sensor.image_lag": "lag_rel", "processing.temporal_noise_reduction": "alpha"}  # with the share of the frame before
 OF_MOTION = (*LOOKS, *LAGS)
 LAG_PHASES, GHOSTS, SMALLEST_GHOST = 3, 60, 1e-5  # places within the pixel; earlier frames at most, and their smallest share
+FLOOR_PX, COMB_REL = 2e-3, 0.05  # of what is told; of the distance between what two rows show
+SHORT_PX, LAG_ERROR, STREAK_ERROR = 0.5, 0.05, 0.6  # shift up to which ghosts overlap the target; relative errors up to it and beyond
 STILL = "nothing moves in this scenario"
 
 
@@ -39,7 +41,9 @@ def motion_contribution(element: Element, setting: Setting, camera: Camera) -> C
     mean = shift.mean(axis=(1, 2))
     time = shift.mean(axis=2).std(axis=1)
     smooth = shift.mean(axis=1).std(axis=1)
-    return _of(mean, time, smooth, "times at which the rows look, and the target's speed")
+    # rows of two fields show a target twice, and what is found of such a comb hangs on its place in the pixel
+    comb = COMB_REL * float(np.hypot(*v)) * float(np.abs(np.diff(delay, axis=1)).max(initial=0.0))
+    return _of(mean, time, smooth, "times at which the rows look, and the target's speed", floor_px=max(FLOOR_PX, comb))
 
 
 def lag_contribution(element: Element, setting: Setting, estimator: Estimator) -> Contribution:
@@ -53,24 +57,35 @@ def lag_contribution(element: Element, setting: Setting, estimator: Estimator) -
     share = float(getattr(element.params, LAGS[element.source.id]))
     probe = make_probe(setting.facts, setting.target, estimator, LAG_PHASES)
     assert probe.locate is not None
-    step = setting.velocity_px_per_s * setting.frame_period_s
+    v, a, period = setting.velocity_px_per_s, setting.acceleration_px_per_s2, setting.frame_period_s
     signal, left = np.zeros_like(probe.signal_dn), 1.0  # of the light, what is still to be shown
     for k in range(GHOSTS):
         last = left * share < SMALLEST_GHOST or k == GHOSTS - 1
-        x, y = probe.x_px - k * step[0], probe.y_px - k * step[1]
+        ago = v * k * period - 0.5 * a * (k * period) ** 2
+        x, y = probe.x_px - ago[0], probe.y_px - ago[1]
         signal += (left if last else left * (1 - share)) * seen_at(setting.facts, setting.target, x, y, probe.signal_dn.shape[1:])
         left *= share
         if last:
             break
-    dx, dy = probe.moved(signal)
-    zero = np.zeros(2)
-    return _of(np.array([np.mean(dx), np.mean(dy)]), zero, zero, "the estimator on the target with what stays of earlier frames")
+    shifts = np.array(probe.moved(signal))
+    bias, zero = shifts.mean(axis=1), np.zeros(2)
+    method = "the estimator on the target with what stays of earlier frames"
+    # of a streak that is longer, what is found hangs on where the search begins
+    return _of(bias, zero, zero, method, shifts.std(axis=1), LAG_ERROR if np.abs(bias).max() <= SHORT_PX else STREAK_ERROR)
 
 
-def _of(bias: np.ndarray, time: np.ndarray, smooth: np.ndarray, method: str) -> Contribution:
-    u = np.hypot(time, smooth)
+def _of(
+    bias: np.ndarray,
+    time: np.ndarray,
+    smooth: np.ndarray,
+    method: str,
+    place: np.ndarray | float = 0.0,
+    model_error: float = LAG_ERROR,
+    floor_px: float = FLOOR_PX,
+) -> Contribution:
+    u = np.sqrt(time**2 + smooth**2 + np.square(place))
     parts: dict[str, Any] = {"time_px": tuple(time.tolist()), "smooth_px": tuple(smooth.tolist())}
-    text: dict[str, Any] = {"model_error": 0.05, "floor_px": 2e-3, "method": method}
+    text: dict[str, Any] = {"model_error": model_error, "floor_px": floor_px, "method": method}
     return Contribution(float(u[0]), float(u[1]), "O", float(bias[0]), float(bias[1]), **text, **parts)
 
 

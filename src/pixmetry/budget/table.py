@@ -64,6 +64,9 @@ OF_THE_FORMAT = {  # powers of the format: a lens of the same design; a sensor a
     **dict.fromkeys(("bow_x_um", "bow_y_um", "twist_um", "skew_x_um", "skew_y_um"), 1),
 }
 COVERAGE = 2.0  # standard uncertainties of what was measured, at the upper end of the interval
+FIELD_ERROR, FIELD_FLOOR_PX = 0.02, 1e-3  # of the displacement of points: a target is not a point, its light is stretched too
+MAP, DRAWN_ANEW = "exact map of the camera", "displacement drawn anew in every frame"
+DRAWN = 16  # frames of such a displacement
 NOTHING_PX = 1e-9  # below it a shift is rounding
 Pair = tuple[float, float]
 NOTHING: Pair = (0.0, 0.0)
@@ -154,6 +157,10 @@ class SourceRow:
     u_of_total_px : float
         Standard uncertainty of the total before the calibration that comes of the parameters' uncertainties.
     how, method, reason, advice : str
+    model_error, floor_px : float
+        How far the parts before the calibration may be off: relative, or so many px where that is more.
+    kurtosis : float
+        Of the shift, see `Contribution`.
     in_camera : bool
         Whether it stands in the camera's chain.
     fields_px : ndarray, shape (k, 2, m), optional
@@ -177,6 +184,9 @@ class SourceRow:
     method: str = ""
     reason: str = ""
     advice: str = ""
+    model_error: float = 0.0
+    floor_px: float = 0.0
+    kurtosis: float = 3.0
     in_camera: bool = False
     share: float = 0.0
     fields_px: np.ndarray | None = field(default=None, repr=False, compare=False)
@@ -392,7 +402,8 @@ class Table:
         moved = self._moved(element, in_camera) if source.gum_class in ("G", "D") else None
         if moved is not None:
             before, after, seen = moved
-            return replace(row, before=before, after=after, how=FIELD, method="exact map of the camera", fields_px=seen)
+            row = replace(row, before=before, after=after, how=FIELD, method=DRAWN_ANEW if seen is None else MAP, fields_px=seen)
+            return replace(row, model_error=FIELD_ERROR, floor_px=FIELD_FLOOR_PX)
         if source.propagate is None and (source.forward is None or source.essential and source.ideal is None):
             return replace(row, before=Parts(), after=Parts(), reason=source.reasons["propagate"])
         try:
@@ -422,7 +433,8 @@ class Table:
         if found is None or not np.isfinite(found.total_px):
             return replace(row, reason=else_reason)
         before = parts_of(found, row.source_id)
-        return replace(row, before=before, after=self._left(before, found.gum_class), method=found.method)
+        told = {name: getattr(found, name) for name in ("method", "model_error", "floor_px", "kurtosis")}
+        return replace(row, before=before, after=self._left(before, found.gum_class), **told)
 
     def _left(self, before: Parts, gum_class: str) -> Parts:
         """What the scenario's calibration leaves of a contribution that is no map of points."""
@@ -472,7 +484,7 @@ class Table:
         aged = self.setting.aged(element, camera)
         return put(camera, aged), missed(camera, [element.name]) if in_camera else camera
 
-    def _moved(self, element: Element, in_camera: bool) -> tuple[Parts, Parts, np.ndarray] | None:
+    def _moved(self, element: Element, in_camera: bool) -> tuple[Parts, Parts, np.ndarray | None] | None:
         """What a map of points is before and after the calibration, and left of it in the network's images; None where it moves none."""
         cameras = (self.setting.camera, self.setting.calibrated)
         try:
@@ -482,10 +494,30 @@ class Table:
             return None
         if not max(np.nanmax(np.abs(now), initial=0.0), np.nanmax(np.abs(then), initial=0.0)) > 1e-9:
             return None
+        anew = self._drawn_anew(element, pairs[0])
+        if anew is not None:
+            return anew
         if element.source.gum_class == "G":  # it stays as it was: what drifts beside it has a row of its own
             now = then
         left, n = self.calibration.left(now, then), self.calibration.places.even
         return _of_field(now[:, 0, :n]), _of_field(left[:, :n]), np.nan_to_num(left[None, :, n:])
+
+    def _drawn_anew(self, element: Element, pair: tuple[Camera, Camera]) -> tuple[Parts, Parts, None] | None:
+        """The same of a displacement that is another one in every frame, by its formula; None where all frames have the same.
+
+        A calibration in every image leaves the share of it that it leaves of some draws.
+        """
+        source, places = element.source, self.calibration.places
+        if source.gum_class != "D" or source.propagate is None:
+            return None
+        if np.array_equal(field_of(pair[0], places), field_of(pair[0], places, seed=1), equal_nan=True):
+            return None
+        without = field_of(pair[1], places)
+        draws = [field_of(pair[0], places, seed=seed) - without for seed in range(DRAWN)]
+        left = [self.calibration.left(d, np.zeros_like(d)) for d in draws]
+        share = np.sqrt(np.nanmean(np.square(left)) / np.nanmean(np.square([d[:, 0] for d in draws])))
+        before = parts_of(source.propagate(element.params, self.probes.of(element.name, source)))
+        return before, Parts.of((share * np.array(before.values_px)).tolist()), None
 
     # ---- simulation -----------------------------------------------------------------------------------------------------------
 

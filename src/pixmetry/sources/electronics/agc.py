@@ -59,8 +59,23 @@ def context(params: Agc, windows: Windows, frame_shape: tuple[int, int]) -> Wind
 
 
 def propagate(params: Agc, probe: Probe) -> Contribution:
-    """A common factor moves no centroid whose background and threshold follow it; noise grows with the gain as the signal does."""
-    return probe.contribution((0.0, 0.0), "F", method="a common factor; background and threshold follow it")
+    """A common factor moves no centroid whose background and threshold follow it, unless it lifts the target beyond the scale's end.
+
+    The gain is that of a frame which is background but for a target. What the scale's end cuts off is cut off behind the line.
+    """
+    if params.kappa == 0:
+        return probe.contribution((0.0, 0.0), "F", method="the gain is locked")
+    lowest, highest = (10 ** (db / 20) for db in (params.lowest_db, params.highest_db))
+    gain = float(np.clip(params.target_dn / max(probe.background_dn, DARKEST_DN), lowest, highest))
+    end = probe.saturation_dn / gain
+    if probe.held is None:
+        dx, dy = probe.moved(np.minimum(probe.signal_dn, end))
+    else:
+        held = probe.held
+        seen = held.read(held.line, probe.signal_dn, probe.background_dn)
+        x, y = held.locate(np.minimum(seen, end * held.line.level), held.line.level)
+        dx, dy = x - probe.x_hat_px, y - probe.y_hat_px
+    return probe.from_shifts(dx, dy, "F", model_error=0.3, method="a common factor; what it lifts beyond the scale's end is cut off")
 
 
 SOURCE = Source(
