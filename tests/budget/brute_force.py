@@ -274,7 +274,7 @@ class BruteForce:
     def places_of_fields(self) -> Places:
         """The same places for a table."""
         x, y = (np.broadcast_to(v.ravel(), (5, v.size)) for v in self.at)
-        return Places(x, y, np.full((4, x.shape[1]), 0.25), self.setting.camera.frame_shape)
+        return Places(x, y, np.full((4, x.shape[1]), 0.25), self.setting.camera.frame_shape, even=x.shape[1])
 
     # ---- positions --------------------------------------------------------------------------------------------------------------------
 
