@@ -104,6 +104,19 @@ def test_dark_and_missing_targets() -> None:
     assert chain(camera(), faint).steps[-1].error is None
 
 
+def test_what_is_constant_stands_apart_from_what_varies() -> None:
+    """A shift is the same for all targets, photon noise differs from frame to frame, and sensitivities go with the place."""
+    found = chain(camera(), SCENE, seed=4, draws=8)
+    assert found.draws == 8
+    by_name = {s.name: s for s in found.spread}
+    shift, shot, prnu = by_name["lens shift"], by_name["sensor.shot_noise"], by_name["sensor.prnu"]
+    assert np.hypot(*shift.constant) == pytest.approx(0.25, abs=0.01) and max(*shift.place, *shift.time) < 0.01
+    assert shot.constant == shot.place == (0.0, 0.0) and min(shot.time) > 1e-4 and max(shot.time) < 0.05
+    assert min(prnu.place) > 1e-5 and prnu.time == (0.0, 0.0)
+    single = chain(camera(), SCENE, seed=4)
+    assert single.spread == () and single.draws == 1
+
+
 def test_the_command_writes_a_page_and_replaces_only_its_own(tmp_path: Path) -> None:
     from pixmetry.cli import main
     from pixmetry.core.config import dump_yaml
@@ -119,6 +132,7 @@ def test_the_command_writes_a_page_and_replaces_only_its_own(tmp_path: Path) -> 
     assert pdf.read_bytes().startswith(b"%PDF-1") and f"pdf: {pdf}" in done.output
     text = page.read_text()
     assert len(re.findall(r'<figure id="source-', text)) == 1 + len(small.chain)
+    assert "From frame to frame" in text and "the links of the chain" in text
     assert "http" not in re.sub(r"http://www\.w3\.org/\S+", "", text)  # asks for nothing from anywhere
     refused = CliRunner().invoke(main, [*arguments[:-1], str(scene)])
     assert refused.exit_code == 2 and "would overwrite an input" in refused.output and "discs" in scene.read_text()

@@ -28,6 +28,13 @@ from pixmetry.cli._pdf import check_pdf, pdf_option, put_pdf
     help="Seed of the temporal noise. Another seed gives other noise of the same camera.",
 )
 @click.option(
+    "--draws",
+    type=click.IntRange(1),
+    default=4,
+    show_default=True,
+    help="Exposures, each of another target: they say what is constant and what varies. 1: one target in one frame alone.",
+)
+@click.option(
     "--set",
     "settings",
     multiple=True,
@@ -43,6 +50,7 @@ def chain(
     target: int | None,
     frame: int,
     seed: int,
+    draws: int,
     settings: tuple[str, ...],
     off: tuple[str, ...],
     pdf: Path | None,
@@ -51,6 +59,8 @@ def chain(
 
     CAMERA is a camera file or the name of a preset. SCENE is a scene file. For every error source in the order of the light, the page shows
     the image of the target and its profiles after this source, by how much the source moved the centre, and how far it has moved so far.
+    Over several targets and exposures it says by how much each source moves all centres alike, and what varies from target to target and
+    from frame to frame.
     """
     from pixmetry.camera.camera import load_camera
     from pixmetry.camera.overrides import changed_camera, parse_overrides
@@ -61,6 +71,6 @@ def chain(
     check_files([Output(output, page_mark(TITLE))], [scene, Path(camera)])  # before the work
     check_pdf(pdf, [scene, Path(camera)])
     changed = changed_camera(load_camera(camera), parse_overrides(settings), off)
-    walk = follow(changed, scene, target=target, frame=frame, seed=seed)
+    walk = follow(changed, scene, target=target, frame=frame, seed=seed, draws=draws)
     echo(f"page: {write_chain_page(walk, output)}")
     put_pdf(pdf, lambda: page_of(walk))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from pixmetry.core.random import Grid
 UNITS = {Kind.PHOTONS: "photons", Kind.ELECTRONS: "electrons", Kind.DN: "DN", Kind.CODES: "DN"}
 LEVEL = 0.2  # of the contrast: what stands above it is weighed for the centre
 MARGIN_PX = 8  # around the target
+DRAW_STRIDE = 1_000_003  # between the seeds of several draws
 
 
 @dataclass(frozen=True)
@@ -57,14 +58,44 @@ class Step:
 
 
 @dataclass(frozen=True)
+class Spread:
+    """What a source moves centres by, over several targets and exposures, in px in x and y.
+
+    Parameters
+    ----------
+    name, title, source_id : str
+    constant : (float, float)
+        Mean over the targets.
+    place : (float, float)
+        Standard deviation from target to target, as expected of this unit; 0 of a scene with one target.
+    time : (float, float)
+        Standard deviation of single exposures about what is expected.
+    """
+
+    name: str
+    title: str
+    source_id: str
+    constant: tuple[float, float]
+    place: tuple[float, float]
+    time: tuple[float, float]
+
+    @property
+    def square(self) -> float:
+        """Everything together, squared."""
+        return float(sum(v**2 for pair in (self.constant, self.place, self.time) for v in pair))
+
+
+@dataclass(frozen=True)
 class Walk:
-    """All steps of one target in one frame of one camera."""
+    """All steps of one target in one frame of one camera; ``spread`` is over ``draws`` targets and exposures."""
 
     camera: Camera
     target: Mapping[str, Any]
     frame: int
     seed: int
     steps: tuple[Step, ...]
+    spread: tuple[Spread, ...] = ()
+    draws: int = 1
 
     def movers(self) -> list[Step]:
         """The sources that moved the centre in this frame, the strongest first."""
@@ -72,7 +103,7 @@ class Walk:
         return [step for px, step in sorted(by, key=lambda pair: -pair[0]) if px > 1e-6]
 
 
-def chain(camera: str | Path | Camera, scene: Any, *, target: int | None = None, frame: int = 0, seed: int = 0) -> Walk:
+def chain(camera: str | Path | Camera, scene: Any, *, target: int | None = None, frame: int = 0, seed: int = 0, draws: int = 1) -> Walk:
     """Follow one target through a camera.
 
     Parameters
@@ -84,6 +115,8 @@ def chain(camera: str | Path | Camera, scene: Any, *, target: int | None = None,
         Which of the scene's targets; by default the one nearest to the middle of the frame.
     frame, seed : int
         Of the exposure.
+    draws : int
+        With more than one, as many exposures, each of the next target of the scene, say what is constant and what varies.
 
     Returns
     -------
@@ -111,6 +144,44 @@ def chain(camera: str | Path | Camera, scene: Any, *, target: int | None = None,
 
         where = "scene" if isinstance(scene, Mapping) else str(scene)
         scene = build_scene(read_scene(scene), camera.frame_shape, where)
+    first = _walk(camera, scene, target, frame, seed)
+    if draws < 2 or not first.target["found"]:
+        return first
+    others = _others(scene, camera, first.target, frame)
+    walks = [first]
+    for k in range(1, draws):
+        try:
+            walks.append(_walk(camera, scene, others[k % len(others)], frame, seed + k * DRAW_STRIDE))
+        except InputError:  # that target is not in the frame
+            continue
+    return replace(first, spread=_spread_of(walks), draws=len(walks))
+
+
+def _others(scene: Any, camera: Camera, chosen: Mapping[str, Any], frame: int) -> list[int]:
+    """Numbers of the scene's targets, the nearest to the chosen one first."""
+    exposed = camera.signal(scene, Grid(np.array([frame]), np.zeros(1, int), np.zeros(1, int), (1, 1)))
+    offered = list(scene.targets(float(exposed.time_s[0] + 0.5 * exposed.exposure_s[0]), frame))
+    return np.argsort([np.hypot(t["x_px"] - chosen["x_px"], t["y_px"] - chosen["y_px"]) for t in offered], kind="stable").tolist()
+
+
+def _spread_of(walks: Sequence[Walk]) -> tuple[Spread, ...]:
+    """Mean over the targets, deviation from target to target, and of single exposures about what is expected."""
+    found = []
+    for position, step in enumerate(walks[0].steps[1:], start=1):
+        steps = [w.steps[position] for w in walks]
+        seen = [(s.moved, s.expected_moved) for s in steps if s.moved is not None and s.expected_moved is not None]
+        if not seen:
+            continue
+        moved, expected = (np.array(v) for v in zip(*seen, strict=True))
+        place = np.std(expected, axis=0, ddof=1) if len(expected) > 1 else np.zeros(2)
+        pairs = (expected.mean(axis=0), place, np.sqrt(np.mean((moved - expected) ** 2, axis=0)))
+        constant, place_px, time = ((float(p[0]), float(p[1])) for p in pairs)
+        found.append(Spread(step.name, step.title, step.source_id, constant, place_px, time))
+    return tuple(found)
+
+
+def _walk(camera: Camera, scene: Any, target: int | None, frame: int, seed: int) -> Walk:
+    """Follow one target through one exposure."""
     chosen = _choose(scene, camera, target, frame, seed)
     half = int(np.ceil(0.5 * chosen["size_px"])) + MARGIN_PX
     former = (1.0, 1.0)

@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pixmetry.report import Answer, Column, Figure, Page, Reading, Run, Section, Text, html_of, strong
+from pixmetry.camera.catalogue import STAGES
+from pixmetry.report import Answer, Column, Figure, Page, Reading, Run, Section, Table, Text, html_of, strong
+from pixmetry.report.blocks import Block, block_diagram
 from pixmetry.report.drawing import BLUE, INK, RED, SOFT, canvas
 from pixmetry.report.numbers import NONE, length_px, significant
 
@@ -16,6 +18,7 @@ if TYPE_CHECKING:
     from pixmetry.simulate.chain import Step, Walk
 
 SHOWN = 5  # movers in the summary
+SPREAD_SHOWN, SMALL_PX = 12, 1e-6  # sources in the table of what varies, and from which size on
 KIND = "one target through the chain"
 TITLE = f"<title>: {KIND}</title>"  # ends so
 KEY = "blue +: true centre; red ×: centre found; blue line: the row through it; red dashes: the column through it"
@@ -80,8 +83,29 @@ def _result(section: Section, walk: Walk) -> None:
             [[(s.title + " ", Run(s.name, "chip")), *_pair(s.moved), *_pair(s.expected_moved)] for s in movers],
             caption="The sources that moved the centre most in this frame, in px.",
         )
+    if walk.spread:
+        section.add(*_spread(walk))
     section.add(_path(walk))
     section.add_text(strong("How it is measured."), HOW, style="soft")
+
+
+def _spread(walk: Walk) -> list[Figure | Table]:
+    """What is constant and what varies, by link and by source."""
+    whole = sum(s.square for s in walk.spread) or 1.0
+    parts = {stage: sum(s.square for s in walk.spread if s.source_id.split(".")[0] == stage) for stage in STAGES}
+    there = {s.source_id.split(".")[0] for s in walk.spread}
+    blocks = [
+        Block(stage, parts[stage] / whole, [f"{length_px(float(np.sqrt(0.5 * parts[stage])))} px"]) for stage in STAGES if stage in there
+    ]
+    caption = "Share of each link in the sum of squares of all moves, constant and varying; below, the root mean square of x and y."
+    largest = sorted((s for s in walk.spread if s.square > SMALL_PX**2), key=lambda s: -s.square)[:SPREAD_SHOWN]
+    groups = ("Constant", "From target to target ±", "From frame to frame ±")
+    columns: list[Column | str] = ["Source", *(Column(axis, "right", group=group) for group in groups for axis in "xy")]
+    rows = [
+        [(s.title + " ", Run(s.name, "chip")), *(length_px(v) for pair in (s.constant, s.place, s.time) for v in pair)] for s in largest
+    ]
+    words = f"What is constant and what varies, in px, over {walk.draws} exposures, each of another target; so few give rough deviations."
+    return [block_diagram(blocks, "chain", "the links of the chain", caption), Table("Constant and varying moves", columns, rows, words)]
 
 
 def _facts(walk: Walk) -> list[tuple[str, str]]:
