@@ -14,7 +14,9 @@ import pixmetry
 from pixmetry.budget.camera_budget import CameraBudget
 from pixmetry.budget.compare import LIKELY, OPEN, SAME, SURE, compare_budgets
 from pixmetry.budget.compare_page import page_of, sentences
+from pixmetry.budget.scenario import Scenario
 from pixmetry.budget.table import AT_BOUND, MEASURED, TYPICAL, Parts, SourceRow
+from pixmetry.budget.table import SHEET as FROM_SHEET
 from pixmetry.camera.camera import load_camera
 from pixmetry.cli import main
 from pixmetry.core.errors import InputError
@@ -160,3 +162,24 @@ def test_what_cannot_be_compared_is_told_in_one_line(tmp_path: Path, budget: Cam
         assert told.exit_code == 2 and words in told.output and len(told.output.strip().splitlines()) == 1, (arguments, told.output)
     with pytest.raises(InputError, match="one budget"):
         compare_budgets([budget])
+
+
+def test_lenses_on_one_camera_do_not_share_what_is_not_known_of_the_lens(budget: CameraBudget) -> None:
+    """Two budgets of one camera: an unmeasured distortion is the same in both with one lens, and another with another lens."""
+    lens = row("optics.distortion", TYPICAL, 0.001, 0.05)
+    better, worse = (given(budget, [row("noise", MEASURED, size), lens]) for size in (0.003, 0.006))
+    assert compare_budgets([better, worse]).ranks[1].verdict == SURE
+    other = replace(worse, setting=replace(worse.setting, scenario=Scenario.model_validate({"object": {"f_mm": 33.0}})))
+    found = compare_budgets([better, other]).ranks[1]
+    assert found.verdict == LIKELY and found.open_sources == (lens.title,)
+
+
+@pytest.mark.parametrize("status", [MEASURED, FROM_SHEET])
+def test_a_number_with_an_uncertainty_may_be_smaller_as_well_as_larger(budget: CameraBudget, status: str) -> None:
+    """.0030 up to .0036 beside .0037 up to .0080 overlap, for the second may be as small as 0; up to .0038 it may not."""
+    better = given(budget, [row("noise", status, 0.0030, 0.0036)])
+    verdicts = [
+        compare_budgets([better, given(budget, [row("noise", status, 0.0037, most)], "two")]).ranks[1] for most in (0.0080, 0.0037001)
+    ]
+    assert [r.verdict for r in verdicts] == [LIKELY, SURE]
+    assert verdicts[0].open_sources == ("Noise",)

@@ -161,6 +161,7 @@ class CameraBudget:
             "frame_shape": self.setting.described.frame_shape,
             "pitch_um": self.setting.described.pitch_um,
             "px_per_mm": self.setting.px_per_mm,
+            "lens": self.setting.lens,
             "one_target_one_frame": self._answer_record(self.one),
             "answer": self._answer_record(self.answer),
             "point": None if self.point is None else {n: v.tolist() for n, v in vars(self.point).items()},

@@ -25,6 +25,7 @@ COMPARED_SCHEMA = "pixmetry/budget_comparison/1"
 SURE, LIKELY, OPEN, SAME = "sure", "likely", "open", "the same"
 ALIKE = 0.01  # relative difference of two totals that nobody would notice
 PARTS = ("before", "after", "largest")
+OF_THE_LENS = ("optics.", "sensor.tilt", "calibration")  # what another lens on the same camera has anew
 REMEDY = "name a file that `pixmetry budget --json` wrote"
 
 
@@ -48,6 +49,8 @@ class BudgetSide:
         Standard uncertainty along the line of sight of a point in space.
     frame_shape : (int, int)
         Rows and columns.
+    lens : mapping
+        Focal length and description of the optics, by which lenses are told apart.
     """
 
     name: str
@@ -61,6 +64,7 @@ class BudgetSide:
     mm_per_px: Pair | None
     depth_mm: float | None
     frame_shape: tuple[int, int]
+    lens: Mapping[str, Any]
 
     @property
     def field_mm(self) -> Pair | None:
@@ -222,6 +226,7 @@ def _side(record: Mapping[str, Any], name: str, where: str) -> BudgetSide:
             mm_per_px=mm,
             depth_mm=None if point is None else float(point["covariance_mm2"][2][2]) ** 0.5,
             frame_shape=(int(record["frame_shape"][0]), int(record["frame_shape"][1])),
+            lens=dict(record["lens"]),
         )
         told, found = answer["after_px"], side.answer.after_px
         if not np.allclose(told, found, rtol=1e-6, atol=1e-12):
@@ -267,9 +272,11 @@ def compare_budgets(sources: Iterable[CameraBudget | str | Path], names: Sequenc
     Notes
     -----
     The total after the calibration is compared, for the mean over the frames and targets of the scenario: in mm on the object where all
-    budgets know the scale, else in px. The verdict is "sure" where the upper end of the better one lies below the lower end of the other.
-    Two budgets of one camera (by its name) share what is not known of it, those of two cameras what is not known of the object: a source
-    that both know alike, and not by measurement, is put at the same end in both, the one that speaks more for the worse budget.
+    budgets know the scale, else in px. The verdict is "sure" where the upper end of the better one lies below the lower end of the
+    other; at the lower end, what is measured or stated with an uncertainty is as much smaller as it is larger at the upper one. Two
+    budgets of one camera (by its name, format and pitch) share what is not known of it, but for that of another lens; those of two
+    cameras what is not known of the object: a source that both know alike, and not by measurement, is put at the same end in both, the
+    one that speaks more for the worse budget.
 
     Examples
     --------
@@ -311,26 +318,31 @@ def _rank(sides: Sequence[BudgetSide], best: int, other: int, totals: Sequence[f
     turning = {name for name in common if largest[0].get(name, 0.0) > largest[1].get(name, 0.0)}  # what would help the worse one most
     if better.size(_total(better, common - turning), unit) < worse.size(_total(worse, _ids(worse) - turning), unit):
         return Rank(other, ratio, SURE, overlaps=ends[1][0] >= ends[0][1])
+    likely = ratio > 1 + ALIKE and all(a < b for a, b in ends)
+    return Rank(other, ratio, LIKELY if likely else OPEN, open_sources=_widest(sides, common) or _widest(sides, frozenset()))
+
+
+def _widest(sides: Iterable[BudgetSide], but: frozenset[str]) -> tuple[str, ...]:
+    """Titles of the sources whose size is least known, but for some; the widest first."""
     widths: dict[str, float] = {}
-    for side in (better, worse):
+    for side in sides:
         for row in side.rows:
-            if row.status in (TYPICAL, AT_BOUND) and row.source_id not in common:
+            if row.largest is not None and row.source_id not in but:
                 known = 0.0 if row.status == AT_BOUND else row.after_px
                 widths[row.title] = max(widths.get(row.title, 0.0), row.largest_px**2 - known**2)
-    wide = sorted((title for title, width in widths.items() if width > 0), key=lambda t: -widths[t])
-    likely = ratio > 1 + ALIKE and all(a < b for a, b in ends)
-    return Rank(other, ratio, LIKELY if likely else OPEN, open_sources=tuple(wide[:3]))
+    return tuple(sorted((title for title, width in widths.items() if width > 0), key=lambda t: -widths[t])[:3])
 
 
 def _common(one: BudgetSide, two: BudgetSide) -> frozenset[str]:
     """Ids of the sources that two budgets know alike, and not by measurement, and that are the same in both.
 
-    In one camera these are all; in two cameras those of the object, if it is the same in both scenarios.
+    In one camera these are all, with two lenses all but those of the lens; in two cameras those of the object, if it is the same in both
+    scenarios.
     """
     known = [{r.source_id: r.status for r in side.rows if r.status in (TYPICAL, AT_BOUND)} for side in (one, two)]
     alike = frozenset(name for name, status in known[0].items() if known[1].get(name) == status)
-    if one.camera == two.camera:
-        return alike
+    if (one.camera, one.frame_shape, one.um_per_px) == (two.camera, two.frame_shape, two.um_per_px):
+        return alike if one.lens == two.lens else frozenset(name for name in alike if not name.startswith(OF_THE_LENS))
     same_object = all(two.scenario.get(key) == value for key, value in one.scenario.items() if key.startswith(("target.", "light.")))
     return frozenset(name for name in alike if same_object and name.startswith("scene."))
 
@@ -346,8 +358,16 @@ def _at_bounds(rows: Iterable[SourceRow]) -> tuple[SourceRow, ...]:
 
 def _total(side: BudgetSide, at_least: Collection[str]) -> Pair:
     """Total after the calibration with everything at its bound, but these sources at the lower end: without what is not known."""
-    low = [r for r in side.rows if r.source_id in at_least and r.status != TYPICAL]
+    low = [_lowered(r) for r in side.rows if r.source_id in at_least and r.status != TYPICAL]
     return answer_of([*low, *_at_bounds(r for r in side.rows if r.source_id not in at_least)], side.frames, side.targets).after_px
+
+
+def _lowered(row: SourceRow) -> SourceRow:
+    """What is known with an uncertainty as far below as it may lie above."""
+    if row.after is None or row.largest is None or row.status == AT_BOUND:
+        return row
+    lower = [2 * abs(a) - abs(most) for a, most in zip(row.after.values_px, row.largest.values_px, strict=True)]
+    return replace(row, after=Parts.of([max(v, 0.0) * (1 if a >= 0 else -1) for v, a in zip(lower, row.after.values_px, strict=True)]))
 
 
 def _rows(sides: Sequence[BudgetSide], best: int, totals: Sequence[float], unit: str) -> tuple[SourceDifference, ...]:

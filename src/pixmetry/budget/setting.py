@@ -156,6 +156,12 @@ class Setting:
         told = self.scenario.light.f_number
         return (told if told is not None else self._lens("f_number")) or DEFAULT_F_NUMBER
 
+    @property
+    def lens(self) -> dict[str, Any]:
+        """Focal length and the description of the optics, whatever its aperture is set to: what another lens has otherwise."""
+        optics = [e for e in self.described.chain if e.source.stage == "optics"]
+        return {"f_mm": self.f_mm, "optics": {e.name: {"source": e.source.id} | e.params.model_dump(mode="json") for e in optics}}
+
     def _lens(self, name: str) -> float | None:
         """What the camera's facts tell of its lens."""
         lens = self.described.facts.get("lens")
