@@ -7,9 +7,21 @@ from collections.abc import Mapping
 import numpy as np
 
 from pixmetry.camera.contribution import Contribution, Probe
+from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.errors import MeasureError
+from pixmetry.core.number import ONE_SIDED_95, Estimates
 from pixmetry.core.random import Stream
+
+SIDE_COLS = 8  # columns on each side of a border
+LEAST_COLS, MOST_CLIPPED, FOUND_Z = 96, 0.002, 5.0
+TAPS = (2, 3, 4, 6, 8)  # that are looked for
+STRIPE_SUM = 4.0  # at most: the differences of neighbouring columns share them
+METHOD = "column medians of bright less dark stack: steps at the borders of equal parts, and odd columns against even ones"
+CONFOUNDERS = (
+    "gain of the taps: the columns' own pattern (PRNU), which holds the stripes too; a step of the light exactly at a border",
+)
 
 
 class TapGain(Parameters):
@@ -64,6 +76,62 @@ def truth(params: TapGain, signal: Signal, stream: Stream) -> Mapping[str, np.nd
     return {"tap": tap_of(params, cols, len(cols)), "gain": column_gain(params, cols, len(cols))}
 
 
+def measure(observations: Observations) -> Estimates:
+    """Read steps at the borders of two, three, four … taps, and stripes of odd columns, off the column means of the stacks' difference.
+
+    A step is what straight lines through `SIDE_COLS` columns on either side leave between them; what the same rule finds at places that are
+    no border is its scatter, so the columns' own patterns and the light's slope are in u.
+    """
+    where = "electronics.tap_gain"
+    dark, bright = observations.stacks
+    light = bright.mean_map_dn - dark.mean_map_dn
+    cols = light.shape[1]
+    if cols < LEAST_COLS or bright.fraction_max > MOST_CLIPPED or np.median(light) <= 0:
+        what = f"needs a stack of bright frames, not saturated, of {LEAST_COLS} columns or more"
+        raise MeasureError(what, where=where, value=f"{cols} columns", remedy="take 16 or more bright frames at half of saturation")
+    means = np.median(light, axis=0)
+    means = means / means.mean()
+    smooth = np.convolve(means, [0.25, 0.5, 0.25], mode="valid")
+    stripes = (means[1:-1] - smooth) * np.where(np.arange(1, cols - 1) % 2, 2.0, -2.0)  # each column's odd-even difference
+    odd_even, u_odd_even = float(stripes.mean()), float(np.sqrt(np.mean((stripes - stripes.mean()) ** 2) * STRIPE_SUM / stripes.size))
+    even = means - odd_even * (np.arange(cols) % 2 - 0.5)
+    at = np.arange(SIDE_COLS, cols - SIDE_COLS + 1)
+    jumps = np.array([_jump(even[c - SIDE_COLS : c + SIDE_COLS]) for c in at])
+    borders = {taps: [-(-k * cols // taps) for k in range(1, taps)] for taps in TAPS if cols // taps >= 3 * SIDE_COLS}
+    near = np.array([min(abs(c - b) for part in borders.values() for b in part) < SIDE_COLS for c in at])
+    quiet = jumps[~near] if np.count_nonzero(~near) > 4 * SIDE_COLS else jumps
+    scatter = 1.4826 * float(np.median(np.abs(quiet - np.median(quiet))))
+    dof = max(quiet.size / (2 * SIDE_COLS), 2.0)
+    found = {}
+    for taps, places in borders.items():
+        signs = np.where(np.arange(len(places)) % 2, -1.0, 1.0)
+        found[taps] = float(np.mean(signs * jumps[np.array(places) - SIDE_COLS])), scatter / float(np.sqrt(len(places)))
+    taps = max(found, key=lambda t: abs(found[t][0]) / found[t][1])
+    limits, reasons = set(), {}
+    step, u_step = found[taps]
+    if abs(step) < FOUND_Z * u_step:
+        taps, (step, u_step) = 2, found[2]
+        step = abs(step) + ONE_SIDED_95 * u_step
+        limits.add("step_rel")
+        reasons["step_rel"] = f"no border of {', '.join(map(str, found))} taps stands out of the columns; 95 % limit for two taps"
+    if abs(odd_even) < FOUND_Z * u_odd_even:
+        odd_even = abs(odd_even) + ONE_SIDED_95 * u_odd_even
+        limits.add("odd_even_rel")
+        reasons["odd_even_rel"] = "odd and even columns do not differ by more than their own pattern; 95 % limit of its size"
+    rows = [("step_rel", step, u_step, dof, "1"), ("odd_even_rel", odd_even, u_odd_even, float(stripes.size), "1")]
+    if "step_rel" not in limits:
+        rows.append(("taps", float(taps), 0.0, np.inf, "1"))
+    return Estimates.from_rows(rows, method=METHOD, confounders=CONFOUNDERS, limits=frozenset(limits), reasons=reasons)
+
+
+def _jump(values: np.ndarray) -> float:
+    """What straight lines through the two halves leave between them, over their mean."""
+    half = len(values) // 2
+    x = np.arange(half) - (half - 1) / 2
+    left, right = (part.mean() + (part @ x) / (x @ x) * reach for part, reach in ((values[:half], half / 2), (values[half:], -half / 2)))
+    return float(right - left)
+
+
 def propagate(params: TapGain, probe: Probe) -> Contribution:
     """Propagator P2 with e = x (g − 1): a border is anywhere in the frame, hence in a given column with probability (taps − 1)/columns.
 
@@ -115,6 +183,7 @@ SOURCE = Source(
     typical=TapGain(step_rel=0.01, odd_even_rel=0.002),
     bound=TapGain(taps=4, step_rel=0.03, odd_even_rel=0.01, slope_rel=0.01),
     forward=forward,
+    measure=measure,
     correct=correct,
     propagate=propagate,
     truth=truth,
@@ -125,5 +194,4 @@ SOURCE = Source(
     references=("ISO 14524:2009 (opto-electronic conversion function)", "EMVA 1288 R4.0 Linear, §8.2 (column split)"),
     leaves="the deviation of the taps' real curves from the model",
     advice="Balance the taps with a flat field: one gain for each tap, from the means of the columns on both sides of the border.",
-    reasons={"measure": "not measured: needs the column means of a bright stack beside each border; the PRNU contains the stripes"},
 )
