@@ -36,6 +36,7 @@ SEARCH_STEP_PX = 0.02  # to which the widest possible plate is found
 LARGEST_U_A = 0.2  # of a width that is given as a value
 FILTERED_REL = 0.15  # correlation of the noise of neighbouring pixels, from which on they were filtered
 MISFIT = 4.0  # χ² per bin of the mean residuals, from which on the model does not describe the edges
+IMPOSSIBLE_U = 4.0  # by which a pixel may seem wider than its pitch
 MISFIT_BINS_PX = 0.25
 METHOD = "joint fit of a Gaussian, a rectangular aperture and a birefringent plate to the pixels of slanted edges"
 
@@ -363,6 +364,10 @@ def _estimates(best: _Fit, axes: Sequence[int], possible: Sequence[_Fit] = ()) -
     labels = [*(NAMES[k] for k in free), "sigma_px"]
     u = np.sqrt(np.diag(joint))
     hidden = [i for i, k in enumerate(free) if k in (AX, AY) and u[i] > LARGEST_U_A]
+    wide = [float(values[i]) for i, k in enumerate(free) if k in (AX, AY) and values[i] - 1 > IMPOSSIBLE_U * u[i]]
+    if wide:
+        told = f"the pixel would be {max(wide):.2f} of its pitch wide, which no pixel is: sharpening, another lens, or gamma"
+        return _of_wrong_model(best, told)
     advice = "focus better, or take more edges with less noise"
     reasons = {labels[i]: f"the blur hides the aperture (u would be {u[i]:.2f} px): {advice}" for i in hidden}
     if hidden:  # σ² = v − a²/12 with an aperture anywhere between none and all of the pixel
