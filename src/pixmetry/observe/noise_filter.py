@@ -24,6 +24,7 @@ from pixmetry.camera.noise_covariance import (
     NoiseFilter,
     blur_kernel,
     charge_response,
+    plane_of,
     response_to_white,
     sampling_covariance,
     unsharp_kernel,
@@ -427,7 +428,10 @@ def fit_unfiltered(
     reason = "; ".join(filter(None, (why, here.reasons.get("gain_dn_per_e", ""))))
     here = _with_hidden_noise(here, series, found)
     dof = effective_dof(np.stack([here.u**2, change**2], axis=1), np.stack([here.dof, np.full(len(here), np.inf)], axis=1))
-    return replace(here, covariance=here.covariance + np.outer(change, change), dof=dof, reasons={**here.reasons, "gain_dn_per_e": reason})
+    # variances of correlated pixels scatter like those of fewer pixels (Bartlett)
+    fewer = float((plane_of(found.correlation) ** 2).sum()) if found.kind == LINEAR else 1.0
+    covariance = fewer * here.covariance + np.outer(change, change)
+    return replace(here, covariance=covariance, dof=dof, reasons={**here.reasons, "gain_dn_per_e": reason})
 
 
 def _with_hidden_noise(fit: Estimates, series: PhotonTransfer, found: NoiseFilter) -> Estimates:
