@@ -147,6 +147,9 @@ def jobs_in(folder: Path) -> Iterator[Job]:
         yield command("calibrate", copies, "--kind", kind, *options, "--pitch-mm", 20, "-o", folder / f"calibrated-{kind}")
     yield from _locating()
     yield command("budget", "pulnix_tm6cn_epix_512", "--set", "motion.speed_px_per_s=20", "--set", "light.source=laser")
+    positions = folder / "positions.csv"
+    positions.write_text("x_px,y_px\n100.0,200.0\n300.5,250.25\n")
+    yield command("corrected", positions, "--with", "pulnix_tm6cn_epix_512", "-o", folder / "corrected.csv")
     for kind in BOUNDS:
         yield command("bound", "--kind", *kind.split(), "--blur", 0.7, "--amplitude", 150, "--camera", PRESET)
 
