@@ -428,3 +428,158 @@ def test_a_calibrated_lens_is_taken_off_as_the_bundle_does_it(tmp_path: Path) ->
     r = np.hypot((x - 380.0) * 8.6e-3, (y - 287.0) * 8.3e-3).max()
     assert max(told["optics.distortion"].u_px) == pytest.approx(r**3 * 2e-6 / 8.5e-3, rel=0.5)
     assert all("by measured parameters" in s.text and "not stated" not in s.text for s in told.values())
+
+
+def four(shift_px: float = 0.0, **more: Any) -> dict[str, Any]:
+    """Four named targets, with a shift in x."""
+    x, y = np.array([300.0, 900.0, 1500.0, 2100.0]), np.array([300.0, 1700.0, 900.0, 400.0])
+    return {"point": ["a", "b", "c", "d"], "x_px": x + shift_px, "y_px": y, **more}
+
+
+def stacked(*tables: dict[str, Any]) -> dict[str, Any]:
+    return {name: [v for t in tables for v in t[name]] for name in tables[0]}
+
+
+def test_frames_and_images_are_fitted_one_by_one() -> None:
+    shifts = (1.0, 5.0, -2.0, 0.5)
+    names = [("m", 0), ("m", 1), ("n", 0), ("n", 1)]
+    tables = [four(s, image=[i] * 4, frame=[k] * 4) for s, (i, k) in zip(shifts, names, strict=True)]
+    both = stacked(*tables)
+    frames = stacked(*({**t, "frame": [k] * 4} for k, t in enumerate(tables)))
+    frames = {name: values for name, values in frames.items() if name != "image"}
+    for table, told in ((both, "image n, frame 1"), (frames, "frame 3")):
+        found = pixmetry.corrected(table, DIGITAL, reference=four(), per_image="shift")
+        assert found.x_px == pytest.approx(np.tile(four()["x_px"], 4), abs=1e-6)
+        assert any(note.startswith(f"{told}: shift by 4") for note in found.notes)
+
+
+def test_the_uncertainty_of_the_reference_is_in_every_image_alike() -> None:
+    own = {"u_x_px": np.full(4, 0.02), "u_y_px": np.full(4, 0.02)}
+    table = stacked(four(1.0, frame=[0] * 4, **own), four(5.0, frame=[1] * 4, **own))
+    wide = four(u_x_px=np.full(4, 0.5), u_y_px=np.full(4, 0.5))
+    plain, told = (pixmetry.corrected(table, DIGITAL, reference=r, per_image="shift") for r in (four(), wide))
+    assert plain.correction_px2[:, 0] == pytest.approx(np.full(8, 0.02**2 / 4), rel=1e-3)
+    assert told.correction_px2[:, 0] == pytest.approx(np.full(8, (0.02**2 + 0.5**2) / 4), rel=1e-3)
+    whole = told.correction_covariance_px2
+    assert whole[0, 8] == pytest.approx(0.5**2 / 4, rel=1e-3) and told.common_u_px[0] == pytest.approx(0.25, rel=1e-2)
+
+
+def test_an_uncertainty_of_0_has_no_weight_and_numbers_as_names_are_told_apart() -> None:
+    ids = [1234567.0, 1234568.0, 1234569.0, 3.0]
+    u = {"u_x_px": [0.0, 0.1, 0.1, 0.1], "u_y_px": [0.1] * 4, "id": ids}
+    table, control = ({**four(shift, **u), "point": ids} for shift in (1.0, 0.0))
+    found = pixmetry.corrected(table, DIGITAL, reference={**control, "u_x_px": [0.0] * 4, "u_y_px": [0.0] * 4}, per_image="shift")
+    assert found.x_px == pytest.approx(control["x_px"], abs=1e-6)
+    assert any("has no weight" in note for note in found.notes)
+
+
+@pytest.mark.parametrize(
+    ("key", "u"),
+    [("optics.cover_glass.thickness_um", 20.0), ("sensor.affinity.b1", 1e-4), ("state.temperature_change_k", 3.0)],
+)
+def test_the_uncertainty_of_what_moves_nothing_is_not_lost(key: str, u: float) -> None:
+    """What a change by u does, as for a value that is not 0."""
+    camera = load_camera(DIGITAL)
+    if key.startswith("state"):
+        params = {"reference_c": camera.temperature_c, "mount_per_k": 23e-6}
+        camera = with_source(camera, "sensor.thermal_expansion").with_parameters("sensor.thermal_expansion", **params)
+    at = [[100.0, 100.0], [2300.0, 1900.0]]
+    found = pixmetry.corrected(at, camera, u={key: u})
+    moved = pixmetry.corrected(at, camera, settings={key: u}, u={key: 0.0})
+    still = pixmetry.corrected(at, camera, settings={key: 0.0}, only=[s.name for s in moved.sources if s.applied])
+    change = np.abs(moved.x_px - still.x_px)
+    assert change.min() > 1e-3
+    assert np.sqrt(found.correction_px2[:, 0]) == pytest.approx(change, rel=0.05)
+
+
+def test_an_uncertainty_larger_than_the_range_is_refused_and_what_has_no_effect_is_told() -> None:
+    at = [[100.0, 100.0], [2300.0, 1900.0]]
+    with pytest.raises(InputError, match="on both sides"):
+        pixmetry.corrected(at, DIGITAL, settings={"optics.cover_glass.index": 1.5}, u={"optics.cover_glass.index": 50.0})
+    camera = load_camera(DIGITAL)
+    without = camera.switched(off=[e.name for e in camera.active if e.source.id == "sensor.thermal_expansion"])
+    warm = pixmetry.corrected(at, without, settings={"state.temperature_change_k": 5.0})
+    assert "state.temperature_change_k has no effect on these positions" in warm.notes
+    table = {"x_px": [100.0, 2300.0], "y_px": [100.0, 1900.0], "temperature_c": [30.0, 40.0]}
+    told = with_source(without, "sensor.thermal_expansion").with_parameters("sensor.thermal_expansion", mount_per_k=23e-6)
+    hidden = pixmetry.corrected(table, told, settings={"state.temperature_change_k": 5.0}, u={"temperature_c": 2.0})
+    assert "state.temperature_change_k has no effect on these positions: the column temperature_c tells the temperature" in hidden.notes
+    warmer = pixmetry.corrected({**table, "temperature_c": [32.0, 42.0]}, told, settings={"state.temperature_change_k": 5.0})
+    assert np.sqrt(hidden.correction_px2[:, 0]) == pytest.approx(np.abs(warmer.x_px - hidden.x_px), rel=1e-3)
+    assert np.abs(warmer.x_px - hidden.x_px).min() > 1e-3
+
+
+def test_speeds_of_a_table_are_those_of_its_pixels() -> None:
+    """100 px/s of the sensor are 70.5 px/s in frames whose pixels are wider by 1.41875."""
+    at = {"x_px": [200.0, 200.0], "y_px": [200.0, 203.0]}
+    still, sensor = (pixmetry.corrected(at, ANALOGUE, settings={"motion.speed_px_per_s": v}) for v in (0.0, 100.0))
+    frame = pixmetry.corrected({**at, "vx_px_per_s": [100 / 1.41875] * 2, "vy_px_per_s": [0.0] * 2}, ANALOGUE)
+    taken = sensor.x_px - still.x_px
+    assert np.abs(taken).max() > 0.5
+    assert frame.x_px - still.x_px == pytest.approx(taken, rel=0.01)
+
+
+def test_only_corrected_tables_are_replaced_and_in_their_form(tmp_path: Path) -> None:
+    located = "# pixmetry pixmetry/located/1; kind disc\nx_px,y_px\n100,200\n"
+    for name in ("t.csv", "precious.csv"):
+        (tmp_path / name).write_text(located)
+    code, said = run(tmp_path / "t.csv", "--with", ANALOGUE, "-o", tmp_path / "precious.csv")
+    assert code == 2 and "no result of this kind" in said and (tmp_path / "precious.csv").read_text() == located
+    (tmp_path / "precious.json").write_text(json.dumps({"schema": "pixmetry/located/1", "targets": [{"x_px": 1, "y_px": 2}]}, indent=1))
+    (tmp_path / "list.json").write_text(json.dumps([{"x": 100, "y": 200, "note": "'-1"}]))
+    for table, output, words in (
+        ("t.csv", "precious.json", "written as CSV"),
+        ("t.csv", "new.parquet", "written as CSV"),
+        ("list.json", "new.csv", "written as JSON"),
+        ("list.json", "precious.json", "no result of this kind"),
+    ):
+        code, said = run(tmp_path / table, "--with", ANALOGUE, "-o", tmp_path / output)
+        assert code == 2 and words in said
+    (tmp_path / "truth.csv").write_text("# pixmetry pixmetry/truth/1\nx,y\n1,2\n")
+    for table, output in (("list.json", "out.json"), ("truth.csv", "out.csv"), ("precious.json", "out2.json"), ("t.csv", "out2.csv")):
+        for _ in range(2):  # its own result is replaced
+            code, said = run(tmp_path / table, "--with", ANALOGUE, "-o", tmp_path / output)
+            assert code == 0, said
+        code, said = run(tmp_path / output, "--with", ANALOGUE, "-o", tmp_path / f"twice_{output}")
+        assert code == 2 and "corrected for it before" in said and "--skip grabber.sampling_clock" in said
+        skip = [w for w in said.split() if "." in w and w in {e.name for e in load_camera(ANALOGUE).active}]
+        code, said = run(tmp_path / output, "--with", ANALOGUE, "--list", *(a for name in skip for a in ("--skip", name)))
+        assert code == 0, said
+    record = json.loads((tmp_path / "out.json").read_text())
+    assert record["targets"][0]["note"] == "'-1" and record["corrected"].startswith("sensor.")
+
+
+@pytest.mark.parametrize("mark", [",", ";", "\t"])
+def test_what_is_not_corrected_stays_as_it_was_written(mark: str, tmp_path: Path) -> None:
+    head = ["=name", "x", '"a note"', "y", "temp", "", "-"]
+    rows = [["-A1", "100.50", f'"b{mark} ""c"""', "200.25", '"-5,3"', "@ok", "-"], ["+B", "", "-inf", "", " 007 ", "'=1", "1e3"]]
+    (tmp_path / "t.csv").write_text("".join(mark.join(r) + "\n" for r in (head, *rows)))
+    code, said = run(tmp_path / "t.csv", "--with", ANALOGUE, "-o", tmp_path / "out.csv", "--u", "grabber.sampling_clock.clock_mhz=0.01")
+    assert code == 0, said
+    _, first, one, other = (tmp_path / "out.csv").read_text().splitlines()
+    new = mark + mark.join(("correction_var_x_px2", "correction_cov_xy_px2", "correction_var_y_px2"))
+    assert first == mark.join(head) + new and other == mark.join(rows[1]) + 3 * mark
+    x = pixmetry.corrected([[100.5, 200.25]], ANALOGUE).x_px[0]
+    assert one.startswith(f"-A1{mark}{x:.10g}{mark}{rows[0][2]}{mark}") and f'{mark}"-5,3"{mark}@ok{mark}-{mark}' in one
+
+
+def test_all_columns_of_uncertainty_are_kept_up_to_date() -> None:
+    at = {"x_px": [150.0], "y_px": [100.0]}
+    full = pixmetry.corrected({**at, "u_x_px": [0.1], "u_y_px": [0.2], "cov_xy_px2": [0.005]}, ANALOGUE)
+    var = pixmetry.corrected({**at, "var_x_px2": [0.01], "var_y_px2": [0.04], "cov_xy_px2": [0.005], "u_x": [9.0], "u_y": [9.0]}, ANALOGUE)
+    assert full.covariance_px2 == pytest.approx(var.covariance_px2) and abs(full.covariance_px2[0, 1]) > 0.004
+    assert var.columns["u_x"] == pytest.approx(np.sqrt(var.columns["var_x_px2"]))
+    assert full.columns["cov_xy_px2"] == pytest.approx(full.covariance_px2[:, 1])
+    glass = {"settings": {"optics.cover_glass.thickness_um": 700}, "u": {"optics.cover_glass.thickness_um": 100}}
+    none = pixmetry.corrected({"x_px": [150.0], "y_px": [100.0], "u_x_px": [1e-3], "u_y_px": [1e-3]}, DIGITAL, **glass)
+    assert none.columns["cov_xy_px2"] == pytest.approx(none.covariance_px2[:, 1])
+    with pytest.raises(InputError, match="'cov_xy_px2' is no covariance"):
+        pixmetry.corrected({**at, "var_x_px2": [0.01], "var_y_px2": [0.01], "cov_xy_px2": [0.05]}, ANALOGUE)
+
+
+def test_an_image_without_targets_gives_an_empty_table() -> None:
+    for table in (np.zeros((0, 2)), {"x_px": [], "y_px": []}):
+        found = pixmetry.corrected(table, ANALOGUE, u={"grabber.sampling_clock.clock_mhz": 0.01})
+        assert len(found) == 0 and found.columns["x_px"] == [] and found.common_u_px == (0.0, 0.0)
+    empty = {"x_px": [], "y_px": [], "point": []}
+    assert len(pixmetry.corrected(empty, ANALOGUE, reference=four(), per_image="shift")) == 0

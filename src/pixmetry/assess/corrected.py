@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from pixmetry.assess.per_image import MODELS, fit_per_image
-from pixmetry.assess.position_tables import MARK, Positions, read_positions
+from pixmetry.assess.position_tables import Positions, check_form, mark_of, read_positions
 from pixmetry.budget.changes import changed
 from pixmetry.budget.motion import LOOKS, in_pairs, row_delays
 from pixmetry.budget.scenario import Scenario, read_scenario
@@ -33,6 +33,7 @@ CORRECTED_SCHEMA = "pixmetry/corrected/1"
 NOTHING_PX = 1e-9  # a smaller displacement is none
 NO_TIME_S = 1e-9  # after the time of the frame
 STEP_PX = 0.25  # for derivatives by place
+SPEED_COLUMNS = ("vx_px_per_s", "vy_px_per_s")
 SPEED = "the speed of the targets: columns vx_px_per_s and vy_px_per_s, or motion.speed_px_per_s"
 STATE = ("state.camera_on_min", "state.grabber_on_min", "state.temperature_change_k", "state.warm_up_k")
 
@@ -182,7 +183,7 @@ class CorrectedPositions:
             If there is another file of that name, or it cannot be written.
         """
         inputs = [Path(self.measured.source)] if self.measured.form else []
-        write_together([checked_output(path, inputs)], [self.content()], inputs)
+        write_together([checked_output(path, self.measured.form, inputs)], [self.content()], inputs)
         return Path(path)
 
     def to_record(self) -> dict[str, Any]:
@@ -199,14 +200,15 @@ class CorrectedPositions:
         }
 
 
-def checked_output(path: str | Path, inputs: Iterable[Path] = ()) -> Output:
-    """Refuse a name under which a table cannot be written, before any work is done.
+def checked_output(path: str | Path, form: str, inputs: Iterable[Path] = ()) -> Output:
+    """Refuse a name under which a table of a form cannot be written, before any work is done.
 
     Raises
     ------
     InputError
     """
-    output = Output(Path(path), MARK, True)
+    check_form(Path(path), form)
+    output = Output(Path(path), mark_of(form), True)
     check_files([output], inputs)
     return output
 
@@ -235,13 +237,15 @@ def corrected(
     table : path, Located, mapping of columns, or array_like of shape (n, 2)
         CSV or JSON of `pixmetry locate`, or any CSV with columns for x and y. Columns that count where they are there: ``frame`` (number of
         the frame; without it images are numbered in their order), ``time_s`` (since the first frame), ``temperature_c`` (of the sensor),
-        ``vx_px_per_s`` and ``vy_px_per_s`` (speed of the target), and the uncertainties of x and y.
+        ``vx_px_per_s`` and ``vy_px_per_s`` (speed of the target in pixels of the frames, as x and y are), and the uncertainties of x and
+        y.
     with_ : Camera or str or path
         A camera, the name of a preset, a data sheet, or the ``camera.yaml`` of an assessment.
     output : path, optional
         Where the table goes, in the form in which it came.
     scenario : Scenario, mapping or path, optional
-        State and motion of the measurement, as of `pixmetry.budget`. Without one the camera is in the state that its description has.
+        State and motion of the measurement, as of `pixmetry.budget`; its speed is in pixels of the sensor. Without one the
+        camera is in the state that its description has.
     settings : mapping, optional
         Changes by name: entries of the scenario such as ``state.grabber_on_min``, parameters such as ``optics.cover_glass.thickness_um``,
         values of the camera such as ``temperature_c``. A source that is not in the camera is put into it.
@@ -352,13 +356,29 @@ class _Case:
     def at(self, moved: Mapping[str, Any]) -> _Moment:
         """The camera with some of the settings changed, at the times of the table."""
         camera, scenario = (self.camera, changed(self.described, self.scenario, self.settings)[1]) if not moved else self._built(moved)
-        return _Moment(camera, *self._speed(camera, scenario), self.schedule)
+        schedule = self.schedule
+        if "temperature_c" in moved and "temperature_c" in schedule:  # an error of the thermometer
+            schedule = {**schedule, "temperature_c": schedule["temperature_c"] + moved["temperature_c"] - self.nominal("temperature_c")}
+        return _Moment(camera, *self._speed(camera, scenario), schedule, self.speed_columns)
+
+    @property
+    def speed_columns(self) -> bool:
+        """Whether the table tells the speed of its targets."""
+        return any(name in self.table.columns for name in SPEED_COLUMNS)
+
+    def hidden_by(self, key: str) -> str:
+        """Which columns tell what a setting would, in words; empty if none does."""
+        if "temperature_c" in self.table.columns and key in ("temperature_c", "state.temperature_change_k", "state.warm_up_k"):
+            return ": the column temperature_c tells the temperature"
+        if self.speed_columns and key.startswith("motion."):
+            return ": the columns vx_px_per_s and vy_px_per_s tell the speed"
+        return ""
 
     def _speed(self, camera: Camera, scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
         """Of the targets and its rate, shape (n, 2) each; NaN where nothing tells it."""
-        own = [self.table.numbers(name) for name in ("vx_px_per_s", "vy_px_per_s")]
+        own = [self.table.numbers(name) for name in SPEED_COLUMNS]
         n = len(self.table)
-        if own[0] is not None or own[1] is not None:
+        if self.speed_columns:
             v = np.stack([np.zeros(n) if one is None else one for one in own], axis=1)
             return v, np.zeros((n, 2))
         m = scenario.motion
@@ -422,12 +442,16 @@ class _Case:
 
 @dataclass(frozen=True)
 class _Moment:
-    """A camera, the speed of each target and its rate in px of the sensor, and the times of the positions."""
+    """A camera, the speed of each target and its rate, and the times of the positions.
+
+    The speed is in px of the frames if ``in_frame``, as positions of a table are; else it is in px of the sensor.
+    """
 
     camera: Camera
     velocity: np.ndarray
     acceleration: np.ndarray
     schedule: Mapping[str, Any]
+    in_frame: bool = False
 
     def with_camera(self, camera: Camera) -> _Moment:
         """The same with another camera."""
@@ -437,18 +461,25 @@ class _Moment:
         """Points of the scene at which places of the frames look, with the motion taken off for the sources named ``looks``."""
         times = {name: value for name, value in self.schedule.items() if name != "temperature_c"}
         u, v = self.camera.sensor_places(x, y, **times)
-        shift = self.delayed(v, looks)
+        velocity = self.velocity
+        if self.in_frame and looks:
+            along = []
+            for dx, dy in ((STEP_PX, 0.0), (0.0, STEP_PX)):
+                ahead, behind = (np.stack(self.camera.sensor_places(x + k * dx, y + k * dy, **times)) for k in (1, -1))
+                along.append((ahead - behind) / (2 * STEP_PX))
+            velocity = (along[0] * velocity[:, 0] + along[1] * velocity[:, 1]).T
+        shift = self.delayed(v, looks, velocity)
         return self.camera.scene_places(u - shift[:, 0], v - shift[:, 1], **self.schedule)
 
-    def delayed(self, row: np.ndarray, looks: Sequence[str]) -> np.ndarray:
-        """How far targets have moved when their rows look, shape (n, 2)."""
+    def delayed(self, row: np.ndarray, looks: Sequence[str], velocity: np.ndarray) -> np.ndarray:
+        """How far targets have moved on the sensor when their rows look, shape (n, 2)."""
         if not looks:
             return np.zeros((len(row), 2))
         delay, variance = np.zeros(len(row)), np.zeros(len(row))
         for name in looks:
             for total, of_rows in zip((delay, variance), row_delays(self.camera[name], self.camera), strict=True):
                 total += np.interp(np.nan_to_num(row), *in_pairs_at(of_rows[0]))
-        return self.velocity * delay[:, None] + 0.5 * self.acceleration * (delay**2 + variance)[:, None]
+        return velocity * delay[:, None] + 0.5 * self.acceleration * (delay**2 + variance)[:, None]
 
 
 def in_pairs_at(of_rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -505,22 +536,32 @@ class _Selection:
 
 def _corrected(case: _Case, only: tuple[str, ...], skip: tuple[str, ...]) -> CorrectedPositions:
     now, table = case.at({}), case.table
-    chosen = _selected(now, only, skip)
+    asked = list(_asked_causes(case))
+    chosen = _selected(now, only, skip, [one for _, _, *both in asked for one in both if one is not None])
+    _refuse_twice(table, chosen.applied)
+    notes = case.said()
 
     def mapped(moment: _Moment, without: tuple[str, ...] = ()) -> np.ndarray:
         return _mapped(moment, chosen, table.x_px, table.y_px, without)
 
     at = mapped(now)
     effects: list[tuple[str, np.ndarray]] = []
-    for name, plus, minus in _causes(case, chosen):
+    idle: list[str] = []
+    for key, name, plus, minus in (*asked, *_stated_causes(now, chosen, case.u)):
         sides = 2 - (plus is None) - (minus is None)  # at the end of its range a value can only go one way
         if sides:
             effects.append((name, ((at if plus is None else mapped(plus)) - (at if minus is None else mapped(minus))) / sides))
+            if key and not (np.abs(effects[-1][1]) > NOTHING_PX).any():
+                idle.append(f"the uncertainty of {key}")
+        else:
+            notes.append(f"{name}: the covariance lacks a stated uncertainty, with which the values leave their range")
+    idle += [key for key in case.settings if _is_idle(case, key, lambda moment: mapped(moment) - at)]
+    if len(table):
+        notes += [f"{key} has no effect on these positions{case.hidden_by(key.rpartition(' ')[2])}" for key in idle]
     shifts = {name: mapped(now, (name,)) - at for name in chosen.applied}
-    all_effects = np.array([effect for _, effect in effects]).reshape(-1, len(table), 2)
+    all_effects = np.array([effect for _, effect in effects]).reshape(len(effects), len(table), 2)
     correction = _summed(all_effects)
     told = tuple(_told(e, chosen, shifts, effects) for e in now.camera.active if e.name in chosen.applied or e.name in chosen.reasons)
-    notes = case.said()
     rows, cols = now.camera.output_shape
     beyond = (np.abs(table.x_px - (cols - 1) / 2) > cols / 2) | (np.abs(table.y_px - (rows - 1) / 2) > rows / 2)
     if beyond.any():
@@ -531,6 +572,14 @@ def _corrected(case: _Case, only: tuple[str, ...], skip: tuple[str, ...]) -> Cor
     covariance = _carried(table, correction, lambda x, y: _mapped(now, chosen, x, y))
     causes = tuple(name for name, _ in effects)
     return CorrectedPositions(at[:, 0], at[:, 1], table, covariance, correction, all_effects, causes, told, tuple(notes), now.camera.name)
+
+
+def _refuse_twice(table: Positions, names: Sequence[str]) -> None:
+    """Refuse a table from which a source was taken off before."""
+    again = [name for name in names if name in table.corrected_before]
+    if again:
+        remedy = f"take the table as it was measured, or leave them: {' '.join(f'--skip {name}' for name in again)}"
+        raise InputError("positions that were corrected for it before", where=table.source, value=", ".join(again), remedy=remedy)
 
 
 def _summed(effects_px: np.ndarray) -> np.ndarray:
@@ -548,8 +597,13 @@ def _fitted(
     fit = fit_per_image(at, own, found.effects_px, found.measured, reference, model, frame_shape, match)
     name = f"per image: {model}"
     by_fit = _summed(fit.own_effects_px)
+    shared = np.concatenate([fit.effects_px, fit.reference_effects_px])
+    by_fit = by_fit + _summed(fit.reference_effects_px)
     correction = _summed(fit.effects_px) + by_fit
-    shift, u = np.abs(np.nan_to_num(fit.shift_px)).max(axis=0), np.sqrt(np.nan_to_num(by_fit[:, [0, 2]])).max(axis=0, initial=0.0)
+    shift, u = (
+        np.abs(np.nan_to_num(fit.shift_px)).max(axis=0, initial=0.0),
+        np.sqrt(np.nan_to_num(by_fit[:, [0, 2]])).max(axis=0, initial=0.0),
+    )
     text = f"by {fit.targets} reference positions in {fit.images} images"
     sizes = (float(shift[0]), float(shift[1])), (float(u[0]), float(u[1]))
     step = SourceCorrection(name, f"What {MODELS[model]} of each image tell", fit.images > 0, text, *sizes)
@@ -559,7 +613,8 @@ def _fitted(
         y_px=found.y_px - fit.shift_px[:, 1],
         covariance_px2=None if own is None else own + correction,
         correction_px2=correction,
-        effects_px=fit.effects_px,
+        effects_px=shared,
+        causes=(*found.causes, *[name] * len(fit.reference_effects_px)),
         image_effects_px=fit.own_effects_px,
         image_of=fit.image_of,
         sources=(*found.sources, step),
@@ -576,15 +631,27 @@ def _mapped(moment: _Moment, chosen: _Selection, x: np.ndarray, y: np.ndarray, w
     return np.stack(rest.true_positions(*ideal, **moment.schedule), axis=1)
 
 
-def _selected(now: _Moment, only: tuple[str, ...], skip: tuple[str, ...]) -> _Selection:
-    """Which sources are taken off, and why others are not."""
+def _is_idle(case: _Case, key: str, change: Callable[[_Moment], np.ndarray]) -> bool:
+    """Whether positions are where they were without a setting that is not the value which holds without it."""
+    without = replace(case, settings={name: value for name, value in case.settings.items() if name != key})
+    try:
+        if without.nominal(key) == case.nominal(key):
+            return False
+    except InputError:  # no number stands there
+        pass
+    moment = _or_none(without.at, {})
+    return moment is not None and not (np.abs(np.nan_to_num(change(moment), nan=1.0)) > NOTHING_PX).any()
+
+
+def _selected(now: _Moment, only: tuple[str, ...], skip: tuple[str, ...], uncertain: Sequence[_Moment] = ()) -> _Selection:
+    """Which sources are taken off, and why others are not; ``uncertain`` is what else may be, by the uncertainties that were given."""
     applied: list[str] = []
     looks: list[str] = []
     unknown: list[str] = []
     reasons: dict[str, str] = {}
     half: dict[str, str] = {}
     for element in now.camera.active:
-        moves, drawn, times = _moves(element, now)
+        moves, drawn, times = _moves(element, now, uncertain)
         if not moves and not times:
             if element.name in only:
                 reasons[element.name] = "moves no position here"
@@ -611,7 +678,7 @@ def _selected(now: _Moment, only: tuple[str, ...], skip: tuple[str, ...]) -> _Se
     return _Selection(tuple(applied), tuple(looks), tuple(unknown), reasons, half)
 
 
-def _moves(element: Element, now: _Moment) -> tuple[bool, bool, bool]:
+def _moves(element: Element, now: _Moment, uncertain: Sequence[_Moment]) -> tuple[bool, bool, bool]:
     """Whether a source moves places of the frame, or may; whether it draws how; whether it looks at other times."""
     alone = now.camera.switched(on=[element.name])
     x, y, schedule = _lattice(now)
@@ -627,15 +694,19 @@ def _moves(element: Element, now: _Moment) -> tuple[bool, bool, bool]:
     ]
     drawn = any(differ(np.stack(other), seen) for other in others)
     steps = [_or_none(_stepped, now, element.name, [e.name], np.array([e.u])) for e in element.estimates if e.u > 0]
-    uncertain = [one for one in steps if one is not None]
-    moves = differ(seen, bare) or any(
-        differ(np.stack(one.camera.switched(on=[element.name]).true_positions(x, y, **schedule)), bare) for one in uncertain
-    )
+    others_of = [one for one in steps if one is not None] + list(uncertain)
+
+    def moves_in(one: _Moment) -> bool:
+        x, y, schedule = _lattice(one)
+        return differ(*(np.stack(one.camera.switched(on=on).true_positions(x, y, **schedule)) for on in ([element.name], [])))
+
+    moves = differ(seen, bare) or any(moves_in(one) for one in others_of)
     times = False
     if element.source.id in LOOKS:
-        delay, variance = row_delays(element, now.camera)
-        accelerated = np.any(np.nan_to_num(now.acceleration)) and variance.any()
-        times, drawn = bool((np.abs(in_pairs(delay)) > NO_TIME_S).any() or accelerated), drawn or len(delay) > 1
+        for one in (now, *others_of):
+            delay, variance = row_delays(one.camera[element.name], one.camera)
+            accelerated = np.any(np.nan_to_num(one.acceleration)) and variance.any()
+            times, drawn = times or bool((np.abs(in_pairs(delay)) > NO_TIME_S).any() or accelerated), drawn or len(delay) > 1
     return moves, drawn, times
 
 
@@ -652,19 +723,34 @@ def _lattice(now: _Moment) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
     return x, y, schedule
 
 
-def _causes(case: _Case, chosen: _Selection) -> Iterator[tuple[str, _Moment | None, _Moment | None]]:
-    """The name of every independent cause of uncertainty, and what is known with it one standard uncertainty larger and smaller.
+def _asked_causes(case: _Case) -> Iterator[tuple[str, str, _Moment | None, _Moment | None]]:
+    """Of each uncertainty that was given: its key, the name of its cause, and what is known with the value larger and smaller by it.
 
-    None where it would leave its range.
+    None where the value would leave its range.
+
+    Raises
+    ------
+    InputError
+        If it leaves it on both sides.
     """
     for key, u in case.u.items():
         if u:
             value, name = case.nominal(key), key.rpartition(".")[0]
-            yield name if name in case.camera else key, _or_none(case.at, {key: value + u}), _or_none(case.at, {key: value - u})
-    now = case.at({})
+            plus, minus = (_or_none(case.at, {key: value + sign * u}) for sign in (1, -1))
+            if plus is None and minus is None:
+                try:
+                    case.at({key: value + u})
+                except InputError as problem:
+                    what = f"an uncertainty with which {value:g} leaves its range on both sides ({problem})"
+                    raise InputError(what, where=key, value=u, remedy="give a smaller one") from None
+            yield key, name if name in case.camera else key, plus, minus
+
+
+def _stated_causes(now: _Moment, chosen: _Selection, told: Iterable[str]) -> Iterator[tuple[str, str, _Moment | None, _Moment | None]]:
+    """The same of the uncertainties that the description states, along the principal directions of each source's covariance; no key."""
     for name in chosen.applied:
         element = now.camera[name]
-        known = [n for n in element.estimates.names if f"{name}.{n}" not in case.u]
+        known = [n for n in element.estimates.names if f"{name}.{n}" not in told]
         if not known:
             continue
         estimates = element.estimates.select(known)
@@ -673,7 +759,7 @@ def _causes(case: _Case, chosen: _Selection) -> Iterator[tuple[str, _Moment | No
         for p, direction in zip(power, directions.T, strict=True):
             step = np.sqrt(max(p, 0.0)) * direction * estimates.u
             if np.any(step):
-                yield name, _or_none(_stepped, now, name, known, step), _or_none(_stepped, now, name, known, -step)
+                yield "", name, _or_none(_stepped, now, name, known, step), _or_none(_stepped, now, name, known, -step)
 
 
 def _or_none(made: Callable[..., _Moment], *arguments: Any) -> _Moment | None:
@@ -718,7 +804,7 @@ def _told(
     known = f"by {element.known_from or 'described'} parameters"
     text = known if own else f"{known}, whose uncertainty is not stated: that of the correction lacks it"
     text += chosen.half.get(element.name, "")
-    shift, largest = np.nanmax(np.abs(np.nan_to_num(shifts[element.name])), axis=0), u.max(axis=0)
+    shift, largest = np.abs(np.nan_to_num(shifts[element.name])).max(axis=0, initial=0.0), u.max(axis=0, initial=0.0)
     return SourceCorrection(
         element.name, element.source.title, True, text, (float(shift[0]), float(shift[1])), (float(largest[0]), float(largest[1]))
     )

@@ -51,7 +51,6 @@ TARGET_BEFORE_LENS = (
 )
 
 
-
 def assess(
     campaign: str | Path | Campaign | None = None,
     output: str | Path | None = None,

@@ -35,7 +35,9 @@ if TYPE_CHECKING:
 )
 @click.option("--on-for-s", type=click.FloatRange(0), metavar="S", help="Time since camera and grabber were switched on.")
 @click.option("--temperature-k", type=float, metavar="K", help="Change of the temperature since the calibration.")
-@click.option("--speed", metavar="PX/S[,DEG]", help="Speed of the targets in the image, and its direction (0: to the right, 90: down).")
+@click.option(
+    "--speed", metavar="PX/S[,DEG]", help="Speed of the targets in pixels of the sensor, and its direction (0: to the right, 90: down)."
+)
 @click.option("--cover-glass", metavar="MM[,INDEX]", help="Thickness of the plate in front of the sensor, and its refractive index.")
 @click.option(
     "--clock-ratio", type=click.FloatRange(0, min_open=True), metavar="RATIO", help="Camera's pixel clock over the grabber's clock."
@@ -99,13 +101,14 @@ def corrected(
     from pixmetry.assess.corrected import CORRECTED_SCHEMA, checked_output
     from pixmetry.assess.corrected import corrected as run
     from pixmetry.assess.known_geometry import clock_settings, glass_settings, height_settings, speed_settings
+    from pixmetry.assess.position_tables import form_of
     from pixmetry.camera.camera import load_camera
     from pixmetry.camera.overrides import parse_overrides
 
     inputs = [path for path in (table, scenario, height_map, reference, Path(camera)) if path is not None and path.is_file()]
     written = JsonResult(json_file, CORRECTED_SCHEMA, inputs=inputs)
     if output is not None:
-        checked_output(output, inputs)
+        checked_output(output, form_of(table), inputs)
     known = load_camera(camera)
     asked: dict[str, Any] = {}
     if on_for_s is not None:
