@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,9 @@ import pytest
 from tifffile import imread
 
 import pixmetry
+from pixmetry.assess.correct import _bits_of, _response_of
+from pixmetry.camera.camera import load_camera
+from pixmetry.camera.overrides import with_source
 from pixmetry.core.errors import InputError
 
 
@@ -63,3 +67,42 @@ def test_the_camera_file_of_a_unit_brings_its_maps(result: Path) -> None:
     taken = [(c.frames - frame).ravel() for c in (measured, described)]
     assert np.corrcoef(*taken)[0, 1] > 0.3  # of 3600 pixels: 0.017 by chance
     assert np.std(taken[1]) < np.std(taken[0])
+
+
+def test_flat_frames_of_a_mosaic_tell_the_response_of_each_colour_by_itself() -> None:
+    """Filters are no unevenness: what the flat field of a mosaic corrects leaves the colours apart, and evens the pixels of each."""
+    row, col = np.indices((64, 64))
+    colour = np.array([[0.4, 1.0], [1.0, 0.6]])[row % 2, col % 2]
+    light = 1 - 0.2 * ((row - 31.5) ** 2 + (col - 31.5) ** 2) / 64**2
+    uneven = 1 + 0.01 * ((7 * row * row + 13 * col * col + 5 * row * col) % 11 - 5.0)
+    found = _response_of(2500 * colour * light * uneven, True)
+    for i, j in np.ndindex(2, 2):
+        part, aim = found[i::2, j::2], uneven[i::2, j::2]
+        assert part.mean() == pytest.approx(1.0, abs=1e-6)
+        assert np.corrcoef(part.ravel(), aim.ravel())[0, 1] > 0.99
+    camera = replace(with_source(load_camera("imx264_like"), "sensor.bayer_mosaic"), frame_shape=(64, 64))
+    black = float(np.median(pixmetry.correct(np.zeros((64, 64), np.uint16), camera).frames))
+    flat, frame = (np.rint(level * colour * uneven - black).astype(np.uint16) for level in (2500, 1000))
+    corrected = pixmetry.correct(frame, camera, flat=flat).frames[0]
+    assert [corrected[i::2, j::2].mean() for i, j in np.ndindex(2, 2)] == pytest.approx([400, 1000, 1000, 600], rel=0.01)
+    assert corrected[::2, ::2].std() < 0.2 * frame[::2, ::2].std()
+
+
+def test_dark_and_flat_arrays_are_checked() -> None:
+    camera = load_camera("ft_ccd_generic")
+    shape = camera.output_shape
+    frame, top = np.full(shape, 100, np.uint16), 2 ** _bits_of(camera) - 1
+    hole = np.full(shape, 50.0)
+    hole[3, 4] = np.nan
+    clipped = np.full(shape, top // 2, np.uint16)
+    clipped[: shape[0] // 4] = top
+    for maps, words in (
+        ({"dark": hole}, "cannot store"),
+        ({"flat": np.full(shape, top + 1.0)}, "cannot store"),
+        ({"flat": clipped}, "clipped"),
+    ):
+        with pytest.raises(InputError, match=words):
+            pixmetry.correct(frame.astype(np.uint8 if top < 256 else np.uint16), camera, **maps)
+    clipped[shape[0] // 400 :] = top // 2  # single hot pixels are no reason
+    clipped[0, :5] = top
+    pixmetry.correct(frame.astype(np.uint8 if top < 256 else np.uint16), camera, flat=clipped)

@@ -583,3 +583,30 @@ def test_an_image_without_targets_gives_an_empty_table() -> None:
         assert len(found) == 0 and found.columns["x_px"] == [] and found.common_u_px == (0.0, 0.0)
     empty = {"x_px": [], "y_px": [], "point": []}
     assert len(pixmetry.corrected(empty, ANALOGUE, reference=four(), per_image="shift")) == 0
+
+
+def test_a_measured_lens_holds_the_cover_glass() -> None:
+    camera = with_source(load_camera(DIGITAL), "optics.distortion").with_parameters("optics.distortion", k1_per_mm2=-5e-4)
+    measured = uncertain(camera, "optics.distortion", k1_per_mm2=2e-5)
+    at, glass = [[100.0, 100.0], [2300.0, 1900.0]], {"optics.cover_glass.thickness_um": 750.0}
+    plain, told, named = (
+        pixmetry.corrected(at, measured, settings=s, only=o)
+        for s, o in (({}, ()), (glass, ()), (glass, ("optics.distortion", "optics.cover_glass")))
+    )
+    assert told.x_px == pytest.approx(plain.x_px, abs=1e-9) and np.abs(named.x_px - plain.x_px).max() > 0.01
+    assert any("the lens was measured with it" in s.text for s in told.sources if s.name == "optics.cover_glass")
+    assert any(s.applied for s in pixmetry.corrected(at, camera, settings=glass).sources if s.name == "optics.cover_glass")
+
+
+def test_a_limit_is_a_rectangular_distribution() -> None:
+    camera = with_source(load_camera(DIGITAL), "sensor.affinity")
+    limit = 6e-4
+    estimates = Estimates.from_rows([("b1", limit, 0.0, np.inf, "1")], limits=frozenset({"b1"}))
+    chain = tuple(replace(e, estimates=estimates, known_from="measured") if e.name == "sensor.affinity" else e for e in camera.chain)
+    at = [[100.0, 100.0], [2300.0, 1900.0]]
+    found = pixmetry.corrected(at, replace(camera, chain=chain))
+    one, small = (pixmetry.corrected(at, camera, settings={"sensor.affinity.b1": v}) for v in (limit / 3**0.5, limit / 12**0.5))
+    assert np.abs(one.shift_px[:, 0]).min() > 0.1
+    assert found.x_px == pytest.approx(one.x_px, abs=1e-6)
+    assert np.sqrt(found.correction_px2[:, 0]) == pytest.approx(np.abs(small.shift_px[:, 0]), rel=0.01)
+    assert any("b1 is only known to be at most 0.0006" in note for note in found.notes)

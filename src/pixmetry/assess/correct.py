@@ -36,6 +36,7 @@ SUPPLY = {
 }
 SURFACE_DEGREE, SMALLEST = 4, 12  # of the light of a flat field, and the rows and columns that it needs
 LEAST_RESPONSE = 0.1  # of a pixel that is divided by it; one with less is a defect
+MOST_CLIPPED = 0.01  # of the values of dark or flat frames: hot pixels
 BY_VALUE = ("electronics.gamma", "electronics.hdr_gain", "electronics.nonlinearity")  # ask for no place
 HIDDEN_BY = {"sensor.bayer_mosaic": "processing.demosaic"}  # what is not there any more behind another source
 WHOLE_PX = 0.01  # by which a place on the pixel grid may be off
@@ -473,13 +474,27 @@ def _with_maps(known: Known, dark: Any, flat: Any, defects: Any, raw: RawLayout 
         signal = _signal_of(mean[None], shape, Kind.CODES, known.camera)
         found = correct_signal(known.camera, signal, known.maps, skip=known.skip, until=until)[0].data[0].astype(float)
         if what == "flat":
-            found = _response_of(found)
+            found = _response_of(found, _is_mosaic(known.camera))
         known = replace(known, maps={**known.maps, MAP_OF[source_id]: found.astype(np.float32)})
     return known
 
 
-def _response_of(flat_dn: np.ndarray) -> np.ndarray:
-    """Relative response of every pixel, by the mean frame of an even field over its smooth light; 1 for pixels that hardly respond."""
+def _is_mosaic(camera: Camera) -> bool:
+    """Whether neighbours of the frame have colour filters of their own."""
+    there = {e.source.id for e in camera.active}
+    return any(name in there and other not in there for name, other in HIDDEN_BY.items())
+
+
+def _response_of(flat_dn: np.ndarray, mosaic: bool = False) -> np.ndarray:
+    """Relative response of every pixel, by the mean frame of an even field over its smooth light; 1 for pixels that hardly respond.
+
+    In a mosaic the pixels of each colour are held against the light that they see.
+    """
+    if mosaic:
+        out = np.empty_like(flat_dn)
+        for i, j in np.ndindex(2, 2):
+            out[i::2, j::2] = _response_of(flat_dn[i::2, j::2])
+        return out
     light = fit_surface(flat_dn, SURFACE_DEGREE if min(flat_dn.shape) >= SMALLEST else 0).values
     if light.min() <= 0:
         remedy = "give frames of an even field, well above the dark"
@@ -495,14 +510,33 @@ def _mean_frame(given: Any, known: Known, what: str, raw: RawLayout | None) -> n
         stack = given[None] if given.ndim == 2 else given
         if stack.ndim != 3 or stack.shape[1:] != shape or not len(stack):
             raise InputError("no frames of this camera", where=what, value=f"shape {given.shape}", allowed=f"(n, {shape[0]}, {shape[1]})")
+        top = 2**known.bits - 1
+        if stack.dtype.kind not in "uif" or not np.isfinite(stack).all() or stack.min() < 0 or stack.max() > top:
+            raise InputError("values that this camera cannot store", where=what, allowed=f"numbers from 0 to {top}", remedy="correct them")
+        _refuse_clipped(int((stack == top).sum()), stack.size, what)
         return np.asarray(stack.mean(axis=0), np.float32)
     files = picture_files([given] if isinstance(given, str | Path) else given, raw=raw)
-    total = np.zeros(shape)
+    total, at_top = np.zeros(shape), 0
     for path in files:
         frame = load_frame(path, raw=raw).array
         check_frame(frame, str(path), bits=known.bits, shape=shape)
         total += frame
+        at_top += int((frame == 2**known.bits - 1).sum())
+    _refuse_clipped(at_top, total.size * len(files), what)
     return (total / len(files)).astype(np.float32)
+
+
+def _refuse_clipped(at_top: int, values: int, what: str) -> None:
+    """Refuse frames of which more than single pixels are at the upper end of the range: their mean is that of no light."""
+    if at_top > MOST_CLIPPED * values:
+        allowed = f"at most {100 * MOST_CLIPPED:g} % at the upper end of the range"
+        raise InputError(
+            "frames that are clipped",
+            where=what,
+            value=f"{100 * at_top / values:.3g} % of values",
+            allowed=allowed,
+            remedy="expose them less",
+        )
 
 
 def _correct_array(frames: np.ndarray, known: Known) -> Correction:

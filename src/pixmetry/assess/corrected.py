@@ -20,12 +20,14 @@ from pixmetry.assess.per_image import MODELS, fit_per_image
 from pixmetry.assess.position_tables import Positions, check_form, mark_of, read_positions
 from pixmetry.budget.changes import changed
 from pixmetry.budget.motion import LOOKS, in_pairs, row_delays
+from pixmetry.budget.parameters import covariance_of, with_estimates
 from pixmetry.budget.scenario import Scenario, read_scenario
 from pixmetry.budget.setting import Setting, in_state
 from pixmetry.camera.camera import Camera, Element, load_camera
 from pixmetry.camera.catalogue import sources
+from pixmetry.camera.observations import AFFINITY, LENS, TAKEN_UP
 from pixmetry.camera.overrides import with_source
-from pixmetry.camera.provenance import TYPICAL
+from pixmetry.camera.provenance import MEASURED, TYPICAL
 from pixmetry.core.errors import InputError
 from pixmetry.files.output import Output, check_files, write_together
 
@@ -315,7 +317,7 @@ class _Case:
     ) -> _Case:
         camera = with_ if isinstance(with_, Camera) else load_camera(with_)
         before = {e.name for e in camera.chain}
-        camera = with_missing(camera, [*settings, *u], scenario.object.f_mm)
+        camera = with_missing(_with_limits(camera), [*settings, *u], scenario.object.f_mm)
         added = frozenset(e.name for e in camera.chain if e.name not in before)
         case = cls(table, camera, scenario, settings, told or any(key in STATE for key in (*settings, *u)), u, added)
         for key, value in u.items():
@@ -420,6 +422,10 @@ class _Case:
             how = "by the column frame" if "frame" in self.table.columns else "in the order of the images"
             notes.append(f"frames are numbered {how}, {period:g} s apart; a column time_s tells other times")
         for element in self.described.active:
+            for e in element.estimates:
+                if e.kind == "upper_limit" and f"{element.name}.{e.name}" not in (*self.settings, *self.u):
+                    taken = f"{e.representative:.4g} ± {e.value / 12**0.5:.2g}, as of all values up to it"
+                    notes.append(f"{element.name}: {e.name} is only known to be at most {e.value:.4g}; taken is {taken}")
             if element.name in self.added:
                 told = {key.rpartition(".")[2] for key in self.settings if key.rpartition(".")[0] == element.name}
                 own = {n: v for n, v in element.params.model_dump().items() if n not in told and isinstance(v, float) and v}
@@ -487,6 +493,15 @@ def in_pairs_at(of_rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     if len(of_rows) < 2:
         return np.zeros(1), of_rows[:1]
     return np.arange(len(of_rows) - 1) + 0.5, 0.5 * (of_rows[1:] + of_rows[:-1])
+
+
+def _with_limits(camera: Camera) -> Camera:
+    """The camera with the representative value of what is only known to be at most a limit."""
+    chain = []
+    for e in camera.chain:
+        limits = [one.name for one in e.estimates if one.kind == "upper_limit"]
+        chain.append(replace(e, params=with_estimates(e.source, e.params, e.estimates.select(limits))) if limits else e)
+    return replace(camera, chain=tuple(chain))
 
 
 def with_missing(camera: Camera, keys: Iterable[str], f_mm: float | None = None) -> Camera:
@@ -650,6 +665,7 @@ def _selected(now: _Moment, only: tuple[str, ...], skip: tuple[str, ...], uncert
     unknown: list[str] = []
     reasons: dict[str, str] = {}
     half: dict[str, str] = {}
+    lens = any(e.source.id == LENS and e.known_from == MEASURED for e in now.camera.active)
     for element in now.camera.active:
         moves, drawn, times = _moves(element, now, uncertain)
         if not moves and not times:
@@ -661,6 +677,9 @@ def _selected(now: _Moment, only: tuple[str, ...], skip: tuple[str, ...], uncert
             reasons[element.name] = "left out, as asked"
         elif drawn and not named:
             reasons[element.name] = "drawn at random: what it does in these frames is not known"
+            unknown.append(element.name)
+        elif lens and element.source.id in set(TAKEN_UP) - {LENS, AFFINITY} and element.known_from != MEASURED and not named:
+            reasons[element.name] = "the lens was measured with it, and holds what it does; name it under `only` if the lens does not"
             unknown.append(element.name)
         elif element.known_from == TYPICAL and not named:
             reasons[element.name] = "its parameters are only typical of such a camera; name it under `only` to take it off all the same"
@@ -693,7 +712,8 @@ def _moves(element: Element, now: _Moment, uncertain: Sequence[_Moment]) -> tupl
         alone.true_positions(x, y, seed=1, **schedule),
     ]
     drawn = any(differ(np.stack(other), seen) for other in others)
-    steps = [_or_none(_stepped, now, element.name, [e.name], np.array([e.u])) for e in element.estimates if e.u > 0]
+    known_u = zip(element.estimates.names, np.sqrt(np.diag(covariance_of(element.estimates))), strict=True)
+    steps = [_or_none(_stepped, now, element.name, [name], np.array([u])) for name, u in known_u if u > 0]
     others_of = [one for one in steps if one is not None] + list(uncertain)
 
     def moves_in(one: _Moment) -> bool:
@@ -754,10 +774,12 @@ def _stated_causes(now: _Moment, chosen: _Selection, told: Iterable[str]) -> Ite
         if not known:
             continue
         estimates = element.estimates.select(known)
-        scale = np.where(estimates.u > 0, estimates.u, 1.0)
-        power, directions = np.linalg.eigh(estimates.covariance / np.outer(scale, scale))
+        covariance = covariance_of(estimates)
+        u = np.sqrt(np.diag(covariance))
+        scale = np.where(u > 0, u, 1.0)
+        power, directions = np.linalg.eigh(covariance / np.outer(scale, scale))
         for p, direction in zip(power, directions.T, strict=True):
-            step = np.sqrt(max(p, 0.0)) * direction * estimates.u
+            step = np.sqrt(max(p, 0.0)) * direction * u
             if np.any(step):
                 yield "", name, _or_none(_stepped, now, name, known, step), _or_none(_stepped, now, name, known, -step)
 
