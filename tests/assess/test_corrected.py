@@ -12,7 +12,7 @@ import pytest
 from click.testing import CliRunner
 
 import pixmetry
-from pixmetry.assess.known_geometry import height_settings
+from pixmetry.assess.known_geometry import height_map_of
 from pixmetry.calibrate.bundle.model import CameraModel, Sensor
 from pixmetry.calibrate.calibrated_camera import calibrated_camera, geometry_of
 from pixmetry.camera.camera import Camera, load_camera
@@ -247,7 +247,7 @@ def test_a_height_map_gives_the_surface_that_made_it(tmp_path: Path) -> None:
     lines = [f"{a:.6f},{b:.6f},{h:.9f}" for a, b, h in zip(x.ravel(), y.ravel(), height.ravel(), strict=True)]
     (tmp_path / "height.csv").write_text("x_px,y_px,height_um\n" + "\n".join(lines) + "\n")
     for name in ("height.npy", "height.csv"):
-        settings = height_settings(tmp_path / name, camera)
+        settings = height_map_of(tmp_path / name, camera).settings
         found = pixmetry.corrected([[300.0, 400.0], [2000.0, 1500.0]], camera, settings=settings, only=["sensor.unflatness"])
         told = {key.rpartition(".")[2]: value for key, value in settings.items()}
         again = height_um(source.make(told), x, y, (rows, cols))
@@ -255,7 +255,7 @@ def test_a_height_map_gives_the_surface_that_made_it(tmp_path: Path) -> None:
         assert np.abs(found.shift_px).max() > 0.1
     np.save(tmp_path / "few.npy", height[:1])
     with pytest.raises(InputError, match="too few heights"):
-        height_settings(tmp_path / "few.npy", camera)
+        height_map_of(tmp_path / "few.npy", camera)
 
 
 def run(*arguments: object) -> tuple[int, str]:
@@ -610,3 +610,43 @@ def test_a_limit_is_a_rectangular_distribution() -> None:
     assert found.x_px == pytest.approx(one.x_px, abs=1e-6)
     assert np.sqrt(found.correction_px2[:, 0]) == pytest.approx(np.abs(small.shift_px[:, 0]), rel=0.01)
     assert any("b1 is only known to be at most 0.0006" in note for note in found.notes)
+
+
+def test_a_height_map_is_without_its_plane_and_tells_what_it_knows(rng: np.random.Generator, tmp_path: Path) -> None:
+    camera = load_camera(DIGITAL)
+    rows, cols = camera.frame_shape
+    np.save(tmp_path / "raised.npy", 500 + np.linspace(0, 20, 400).reshape(20, 20))
+    raised = height_map_of(tmp_path / "raised.npy", camera)
+    at = [[100.0, 100.0], [2300.0, 1900.0]]
+    assert np.abs(pixmetry.corrected(at, camera, settings=raised.settings).shift_px).max() < 1e-4
+    assert "510 µm of piston" in raised.notes[0]
+    # a bow of 10 µm under noise of 1 µm: five standard uncertainties at most, no order by chance
+    y, x = np.meshgrid((np.arange(20) + 0.5) / 20 * rows - 0.5, (np.arange(20) + 0.5) / 20 * cols - 0.5, indexing="ij")
+    params = sources()["sensor.unflatness"].make({"bow_x_um": 10.0})
+    np.save(tmp_path / "bow.npy", height_um(params, x, y, (rows, cols)) + rng.standard_normal((20, 20)))
+    bow = height_map_of(tmp_path / "bow.npy", camera)
+    u = bow.u["sensor.unflatness.bow_x_um"]
+    assert u == pytest.approx(np.sqrt(5 / 400), rel=0.3)  # 1 µm over the root of n ⟨P₂²⟩ = n/5
+    assert abs(bow.settings["sensor.unflatness.bow_x_um"] - 10) < 6 * u
+    assert np.shape(bow.settings["sensor.unflatness.more_um"])[0] <= 4  # chance adds an order with 8e-5, and two with 2e-8
+    found = pixmetry.corrected(at, camera, settings=bow.settings, u=bow.u)
+    assert found.correction_px2.min(axis=0)[0] > 0
+    k = np.arange(200)
+    part = {"inner": (0.25 + 0.5 * (k * 0.7549 % 1), 0.25 + 0.5 * (k * 0.5698 % 1)), "line": (k / 200, k / 200)}
+    corner = 0.25 * part["inner"][0], 0.25 * part["inner"][1]
+    for name, (a, b) in (part | {"corner": corner}).items():
+        lines = "".join(f"{s * cols:.3f},{t * rows:.3f},{h:.3f}\n" for s, t, h in zip(a, b, rng.standard_normal(200), strict=True))
+        (tmp_path / f"{name}.csv").write_text("x_px,y_px,height_um\n" + lines)
+    for name in ("line", "corner"):
+        with pytest.raises(InputError, match="do not tell the surface"):
+            height_map_of(tmp_path / f"{name}.csv", camera)
+    inner = height_map_of(tmp_path / "inner.csv", camera)
+    assert "does not reach the edges" in inner.notes[-1]
+    assert np.abs(pixmetry.corrected(at, camera, settings=inner.settings).shift_px).max() < 0.5
+    code, said = run(_table(tmp_path), "--with", DIGITAL, "--height-map", tmp_path / "bow.npy")
+    assert code == 0 and "left out is its plane" in said, said
+
+
+def _table(folder: Path) -> Path:
+    (folder / "at.csv").write_text("x,y\n100,100\n")
+    return folder / "at.csv"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -100,7 +101,7 @@ def corrected(
     """
     from pixmetry.assess.corrected import CORRECTED_SCHEMA, checked_output
     from pixmetry.assess.corrected import corrected as run
-    from pixmetry.assess.known_geometry import clock_settings, glass_settings, height_settings, speed_settings
+    from pixmetry.assess.known_geometry import clock_settings, glass_settings, height_map_of, speed_settings
     from pixmetry.assess.position_tables import form_of
     from pixmetry.camera.camera import load_camera
     from pixmetry.camera.overrides import parse_overrides
@@ -121,15 +122,16 @@ def corrected(
         asked |= glass_settings(cover_glass)
     if clock_ratio is not None:
         asked |= clock_settings(clock_ratio, known)
-    if height_map is not None:
-        asked |= height_settings(height_map, known)
+    heights = None if height_map is None else height_map_of(height_map, known)
+    if heights is not None:
+        asked |= heights.settings
     asked |= parse_overrides(settings)
     found = run(
         table,
         known,
         scenario=scenario,
         settings=asked,
-        u=parse_overrides(uncertainties),
+        u={**({} if heights is None else heights.u), **parse_overrides(uncertainties)},
         only=only,
         skip=skip,
         x=x,
@@ -139,6 +141,8 @@ def corrected(
         per_image=per_image,
         match=match,
     )
+    if heights is not None:
+        found = replace(found, notes=(*found.notes, *heights.notes))
     if output is not None and not listed:
         found.write(output)
     on_paper = output is None and not listed and not written.printed
