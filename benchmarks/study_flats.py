@@ -41,7 +41,7 @@ def scores_of(kind: str, seed: int, shape: tuple[int, int], levels: int, index: 
             rows.append((name, "missing", 0.0, 0.0))
             continue
         e = found[name]
-        score = float(true <= e.value) if e.is_limit else (e.value - true) / e.u
+        score = float(true <= e.value) if e.is_limit else (e.value - true) / (e.u or 1.0)
         rows.append((name, e.kind, score, e.u / (abs(true) or 1.0)))
     return rows
 
