@@ -23,11 +23,16 @@ from pixmetry.observe.edges import Region, Spread, line_at, pixels_of
 HALF_PX = 12.0  # pixels so far from each edge enter
 TABLE_PX = 1 / 16  # step of the tables of the spread
 REACH_PX = HALF_PX + 0.25
-NAMES = ("spread_var_px2", "width_x_px", "width_y_px", "separation_x_px", "separation_y_px")
-V, AX, AY, DX, DY = range(5)
-LOWEST = np.array([1e-3, 0.05, 0.05, 0.02, 0.02])  # of a plate that is free: at 0 nothing depends on it
-HIGHEST = np.array([25.0, 1.5, 1.5, 4.0, 4.0])  # of a width: more than the pixel, so that noise about a full pixel is not cut off
+NAMES = ("spread_var_px2", "width_x_px", "width_y_px", "separation_x_px", "separation_y_px", "amount")
+V, AX, AY, DX, DY, S = range(6)
+LOWEST = np.array([1e-3, 0.05, 0.05, 0.02, 0.02, -1.0])  # of a plate that is free: at 0 nothing depends on it
+HIGHEST = np.array([25.0, 1.5, 1.5, 4.0, 4.0, 2.0])  # of a width: more than the pixel, so that noise about a full pixel is not cut off
 LEAST_SIGMA_PX = 0.03
+MASK_PX, AMOUNT_U = (
+    1.0,
+    0.3,
+)  # of a sharpening that nobody tells: its usual radius, and how strong it usually is (standard deviation about 0)
+SHARPENED = 4.0  # u of its amount, from which on it is there
 STARTS_A, STARTS_D = (0.6, 1.0), (0.5, 1.0, 1.5)  # widths and separations from which the fits begin
 ITERATIONS, TRIAL_ITERATIONS, CONVERGED = 40, 7, 1e-3  # the last in χ²
 MOST_ROWS = 4000  # of the edges of each direction that enter the fit
@@ -78,9 +83,12 @@ def fit_edges(measured: Sequence[tuple[Region, Spread]]) -> Estimates:
     -----
     Levenberg–Marquardt on (v, a, d) from several starts; the parameters of each edge are eliminated (Schur complement). Weights are the
     variances on both sides of the edge, in between by the share of the step. The covariance is multiplied by χ²/dof if that is above 1,
-    and by the correlation of neighbouring pixels. Of many edges the strongest enter, 4000 rows for each direction. A plate counts as
-    present if χ² falls by 25. If it does not, the plate is anything between none and the widest that raises χ² by 2.71 with all else
-    fitted again: the other values are the middles of what these fits span, and half of the span counts in their u.
+    and by the correlation of neighbouring pixels. Of many edges the strongest enter, 4000 rows for each direction.
+
+    A weak sharpening (unsharp mask of 1 px, amount 0 ± 0.3) is always among the unknowns: what it could do is in the u of the others. If
+    it is there, v alone is given, as it was before the mask. A plate counts as present if χ² falls by 25. If it does not, the plate is
+    anything between none and the widest that raises χ² by 2.71 with all else fitted again: the other values are the middles of what these
+    fits span, and half of the span counts in their u.
     """
     if not measured:
         return Estimates.empty()
@@ -88,9 +96,9 @@ def fit_edges(measured: Sequence[tuple[Region, Spread]]) -> Estimates:
     axes = sorted({e.main for e in edges})
     free_a, free_d = [AX + m for m in axes], [DX + m for m in axes]
     start = _start(edges, free_a)
-    plain = _best_fit(edges, [_with(start, free_a, a) for a in STARTS_A], [V, *free_a])
+    plain = _best_fit(edges, [_with(start, free_a, a) for a in STARTS_A], [V, *free_a, S])
     sharp = _with(plain.parameters, free_a, 0.8)
-    plate = _best_fit(plain.edges, [_with(sharp, free_d, d) for d in STARTS_D], [V, *free_a, *free_d])
+    plate = _best_fit(plain.edges, [_with(sharp, free_d, d) for d in STARTS_D], [V, *free_a, *free_d, S])
     scale = max(plate.chi2 / plate.dof, 1.0)
     filtered = float(np.median([max(abs(s.along_rel), abs(s.neighbour_rel)) for _, s in measured]))
     if filtered > FILTERED_REL:
@@ -151,7 +159,7 @@ def _start(edges: Sequence[_Edge], free_a: Sequence[int]) -> Array:
         # second moment of the line spread: 2 ∫ z (H(z) − E(z)) dz
         found.append(float(2 * (places * ((places > 0) - shares) * widths).sum()))
     v = float(np.clip(np.median(found), 0.12, 20))
-    return np.array([v, 1.0, 1.0, 0.0, 0.0])
+    return np.array([v, 1.0, 1.0, 0.0, 0.0, 0.0])
 
 
 def _with(parameters: Array, which: Sequence[int], value: float) -> Array:
@@ -182,7 +190,7 @@ def _of_others(p: Array) -> float:
 
 @dataclass(frozen=True)
 class _Fit:
-    """A fit: all five parameters, which of them were free, their covariance (free ones only, without scale), and the edges as fitted."""
+    """A fit: all six parameters, which of them were free, their covariance (free ones only, without scale), and the edges as fitted."""
 
     parameters: Array
     free: tuple[int, ...]
@@ -199,9 +207,12 @@ def _tables(edge: _Edge, p: Array, free: Sequence[int]) -> Array:
     main, other = edge.main, 1 - edge.main
     sigma = np.sqrt(max(p[V] - _of_others(p), LEAST_SIGMA_PX**2))
     n = int(2 * REACH_PX / TABLE_PX) + 1
-    raw = np.empty((7, n))
-    edge_table(-REACH_PX, TABLE_PX, float(sigma), float(p[AX + main] * cosine), float(p[AX + other] * sine), float(p[DX + main] * cosine),
-               float(p[DX + other] * sine), raw)  # fmt: skip
+    raw, blurred = np.empty((2, 7, n))
+    for out, width in ((raw, sigma), (blurred, np.hypot(sigma, MASK_PX))):
+        edge_table(-REACH_PX, TABLE_PX, float(width), float(p[AX + main] * cosine), float(p[AX + other] * sine),
+                   float(p[DX + main] * cosine), float(p[DX + other] * sine), out)  # fmt: skip
+    by_amount = raw[0] - blurred[0]
+    raw = raw + p[S] * (raw - blurred)
     by_var = raw[2]
     full = {
         V: by_var,
@@ -209,6 +220,7 @@ def _tables(edge: _Edge, p: Array, free: Sequence[int]) -> Array:
         AX + other: raw[4] * sine - p[AX + other] / 12 * by_var,
         DX + main: raw[5] * cosine - p[DX + main] / 4 * by_var,
         DX + other: raw[6] * sine - p[DX + other] / 4 * by_var,
+        S: by_amount,
     }
     # a tied parameter goes with the free one
     for first, second in ((AX, AY), (DX, DY)):
@@ -232,10 +244,11 @@ def _fit(edges: Sequence[_Edge], start: Array, free: Sequence[int], iterations: 
     """Levenberg–Marquardt; every trial takes the step of the shared parameters and the steps of each edge that belong to it."""
     p, now = _tied(start, free), list(edges)
     shared, damping = len(free), 1e-3
+    prior = np.array([AMOUNT_U**-2 if k == S else 0.0 for k in free])
     found = map_tiles(partial(_normal, p=p, free=free), now)
-    chi2 = sum(c for *_, c in found)
+    chi2 = sum(c for *_, c in found) + float(prior @ p[list(free)] ** 2)
     for _turn in range(iterations):
-        reduced, right = np.zeros((shared, shared)), np.zeros(shared)
+        reduced, right = np.diag(prior * (1 + damping)), -prior * p[list(free)]
         solved = []
         for matrix, side, _ in found:
             own = len(side) - shared
@@ -255,7 +268,7 @@ def _fit(edges: Sequence[_Edge], start: Array, free: Sequence[int], iterations: 
             change = both[:, -1] - both[:, :-1] @ taken
             moved.append(replace(e, line=e.line + change[: len(e.line)], levels=e.levels + change[len(e.line) :]))
         tried = map_tiles(partial(_normal, p=trial, free=free), moved)
-        after = sum(c for *_, c in tried)
+        after = sum(c for *_, c in tried) + float(prior @ trial[list(free)] ** 2)
         if after <= chi2:
             gone = chi2 - after
             p, now, found, chi2, damping = trial, moved, tried, after, max(damping / 10, 1e-9)
@@ -265,7 +278,7 @@ def _fit(edges: Sequence[_Edge], start: Array, free: Sequence[int], iterations: 
             damping *= 10
             if damping > 1e8:
                 break
-    information = np.zeros((shared, shared))
+    information = np.diag(prior)
     for matrix, side, _ in found:
         own = len(side) - shared
         information += matrix[own:, own:] - matrix[own:, :own] @ np.linalg.solve(matrix[:own, :own], matrix[:own, own:])
@@ -307,7 +320,7 @@ def _possible_plates(plain: _Fit, free_a: Sequence[int], scale: float) -> list[_
     They are given by rising separation. Between the ends the other values need not be in order: σ falls at first, and rises again as the
     plate takes the place of the aperture.
     """
-    free, near = [V, *free_a], plain
+    free, near = [V, *free_a, S], plain
 
     def at(d: float, near: _Fit) -> _Fit:
         start = near.parameters.copy()
@@ -337,8 +350,12 @@ def _misfit_text(wrong: float) -> str:
 
 
 def _of_wrong_model(fit: _Fit, told: str) -> Estimates:
-    """v alone, where its parts are not those of the model; its u grows with the misfit."""
+    """v alone, where its parts are not those of the model; its u grows with the misfit, and by a third of what a mask took from it.
+
+    A mask of radius r and amount s takes s r² from v; one of another radius than is fitted, 0.7 to 2 px, leaves up to a third of that.
+    """
     u = float(np.sqrt(fit.covariance[0, 0] * _scale(fit) * max(misfit(fit), 1.0)))
+    u = float(np.hypot(u, abs(fit.parameters[S]) * MASK_PX**2 / 3))
     row = ("spread_var_px2", float(fit.parameters[V]), u, float(fit.dof), "px²")
     return Estimates.from_rows([row], method=METHOD, reasons={"spread_var_px2": told})
 
@@ -355,6 +372,11 @@ def _estimates(best: _Fit, axes: Sequence[int], possible: Sequence[_Fit] = ()) -
         return _of_wrong_model(best, _misfit_text(wrong))
     free = list(best.free)
     values, joint = _derived(best)
+    amount, u_amount = values[free.index(S)], np.sqrt(joint[free.index(S), free.index(S)])
+    if abs(amount) > SHARPENED * u_amount:
+        what = "sharpened" if amount > 0 else "smoothed"
+        mask = f"the edges are {what} behind the pixels (an unsharp mask of {MASK_PX:g} px fits with amount {amount:+.2f} ± {u_amount:.3f})"
+        return _of_wrong_model(best, mask)
     widest = 0.0
     if possible:  # the truth is any of these: the middle of what they span, and half of the span as u
         widest = float(possible[-1].parameters[DX])
@@ -378,7 +400,7 @@ def _estimates(best: _Fit, axes: Sequence[int], possible: Sequence[_Fit] = ()) -
         joint[-1, :] = joint[:, -1] = 0.0
         joint[-1, -1] = spread / (4 * values[-1] ** 2)
         reasons["sigma_px"] = "the blur hides the aperture, which is taken as anything between none and all of the pixel"
-    kept = [i for i in range(len(labels)) if i not in hidden]
+    kept = [i for i in range(len(labels)) if i not in hidden and labels[i] != NAMES[S]]
     limits = set()
     sigma, u_sigma = float(values[-1]), float(np.sqrt(joint[-1, -1]))
     if sigma < 3 * u_sigma:
@@ -394,8 +416,8 @@ def _estimates(best: _Fit, axes: Sequence[int], possible: Sequence[_Fit] = ()) -
         return out
     limit = widest + SEARCH_STEP_PX
     rows = [(NAMES[DX + m], limit, limit / ONE_SIDED_95, float(best.dof), "px") for m in axes]
-    told = dict.fromkeys((r[0] for r in rows), f"χ² falls by less than {FOUND_CHI2:g} with a plate; 95 % upper limit")
-    return out.join(Estimates.from_rows(rows, method=METHOD, limits=frozenset(told), reasons=told))
+    why = dict.fromkeys((r[0] for r in rows), f"χ² falls by less than {FOUND_CHI2:g} with a plate; 95 % upper limit")
+    return out.join(Estimates.from_rows(rows, method=METHOD, limits=frozenset(why), reasons=why))
 
 
 def _derived(fit: _Fit) -> tuple[Array, Array]:
@@ -405,8 +427,8 @@ def _derived(fit: _Fit) -> tuple[Array, Array]:
     jacobian = np.zeros((len(free) + 1, len(free)))
     jacobian[:-1] = np.eye(len(free))
     for i, k in enumerate(free):
-        if k == V:
-            by = 1.0
+        if k in (V, S):
+            by = float(k == V)
         else:
             tied = (AX if k == AY else AY if k == AX else DX if k == DY else DY) not in free
             by = -float(p[k]) / (12 if k in (AX, AY) else 4) * (2 if tied else 1)
