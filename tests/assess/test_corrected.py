@@ -504,6 +504,8 @@ def test_an_uncertainty_larger_than_the_range_is_refused_and_what_has_no_effect_
     told = with_source(without, "sensor.thermal_expansion").with_parameters("sensor.thermal_expansion", mount_per_k=23e-6)
     hidden = pixmetry.corrected(table, told, settings={"state.temperature_change_k": 5.0}, u={"temperature_c": 2.0})
     assert "state.temperature_change_k has no effect on these positions: the column temperature_c tells the temperature" in hidden.notes
+    none = pixmetry.corrected(table, without, u={"temperature_c": 2.0})
+    assert "the uncertainty of temperature_c has no effect on these positions" in none.notes
     warmer = pixmetry.corrected({**table, "temperature_c": [32.0, 42.0]}, told, settings={"state.temperature_change_k": 5.0})
     assert np.sqrt(hidden.correction_px2[:, 0]) == pytest.approx(np.abs(warmer.x_px - hidden.x_px), rel=1e-3)
     assert np.abs(warmer.x_px - hidden.x_px).min() > 1e-3

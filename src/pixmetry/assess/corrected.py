@@ -561,18 +561,18 @@ def _corrected(case: _Case, only: tuple[str, ...], skip: tuple[str, ...]) -> Cor
 
     at = mapped(now)
     effects: list[tuple[str, np.ndarray]] = []
-    idle: list[str] = []
+    idle: list[tuple[str, str]] = []  # what has no effect, and why if columns of the table tell it
     for key, name, plus, minus in (*asked, *_stated_causes(now, chosen, case.u)):
         sides = 2 - (plus is None) - (minus is None)  # at the end of its range a value can only go one way
         if sides:
             effects.append((name, ((at if plus is None else mapped(plus)) - (at if minus is None else mapped(minus))) / sides))
             if key and not (np.abs(effects[-1][1]) > NOTHING_PX).any():
-                idle.append(f"the uncertainty of {key}")
+                idle.append((f"the uncertainty of {key}", "" if key == "temperature_c" else case.hidden_by(key)))
         else:
             notes.append(f"{name}: the covariance lacks a stated uncertainty, with which the values leave their range")
-    idle += [key for key in case.settings if _is_idle(case, key, lambda moment: mapped(moment) - at)]
+    idle += [(key, case.hidden_by(key)) for key in case.settings if _is_idle(case, key, lambda moment: mapped(moment) - at)]
     if len(table):
-        notes += [f"{key} has no effect on these positions{case.hidden_by(key.rpartition(' ')[2])}" for key in idle]
+        notes += [f"{what} has no effect on these positions{why}" for what, why in idle]
     shifts = {name: mapped(now, (name,)) - at for name in chosen.applied}
     all_effects = np.array([effect for _, effect in effects]).reshape(len(effects), len(table), 2)
     correction = _summed(all_effects)
@@ -762,7 +762,7 @@ def _asked_causes(case: _Case) -> Iterator[tuple[str, str, _Moment | None, _Mome
                     case.at({key: value + u})
                 except InputError as problem:
                     what = f"an uncertainty with which {value:g} leaves its range on both sides ({problem})"
-                    raise InputError(what, where=key, value=u, remedy="give a smaller one") from None
+                    raise InputError(what, where=key, value=u, remedy="give one that the value can have") from None
             yield key, name if name in case.camera else key, plus, minus
 
 

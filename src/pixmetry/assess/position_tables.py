@@ -271,7 +271,9 @@ def _uncertainty(read: Positions, lost: np.ndarray) -> tuple[dict[str, str], np.
             f"{read.source}, row {beyond[0] + 1}",
             f"at most the product of the standard uncertainties of '{' and '.join(pair)}'",
         )
-        raise InputError(f"'{mixed}' is no covariance", where=where, value=covariance[beyond[0], 1], allowed=allowed, remedy="correct it")
+        raise InputError(
+            f"'{mixed}' is no covariance", where=where, value=float(covariance[beyond[0], 1]), allowed=allowed, remedy="correct it"
+        )
     names = {name: f"{kind}_{axis}" for kind, *both in pairs for name, axis in zip(both, "xy", strict=True)}
     return names | ({} if mixed is None else {mixed: "cov"}), covariance
 
