@@ -60,8 +60,9 @@ def test_covariance_of_small_frames_has_no_bias(rng):
         products.add(k, lag_products(first, second), first)
     mean = products.covariance_dn2().mean(axis=(0, 1))
     u = 400 / np.sqrt(400 * 24 * 20)
-    assert mean[0, 4] == pytest.approx(400 + 1 / 12, abs=Z * np.sqrt(2) * u)
-    assert np.abs([mean[0, 5], mean[1, 4], mean[1, 5], mean[0, 6]]).max() < 1.2 * Z * u
+    # the correction itself has noise: over 60 repetitions the values scatter by 1.7 u, not by √2 u and u
+    assert mean[0, 4] == pytest.approx(400 + 1 / 12, abs=1.75 * Z * u)
+    assert np.abs([mean[0, 5], mean[1, 4], mean[1, 5], mean[0, 6]]).max() < 1.75 * Z * u
 
 
 def test_bartletts_formula_gives_the_scatter_of_lag_products(rng):

@@ -284,7 +284,7 @@ def compare_budgets(sources: Iterable[CameraBudget | str | Path], names: Sequenc
     >>> lenses = [{"object": {"distance_mm": 2000, "f_mm": f}} for f in (16, 50)]
     >>> found = pixmetry.compare_budgets([pixmetry.budget("imx264_like", lens) for lens in lenses], names=["16 mm", "50 mm"])
     >>> found.best.name, found.ranks[1].verdict, found.settings["object.f_mm"]
-    ('50 mm', 'sure', (16.0, 50.0))
+    ('50 mm', 'likely', (16.0, 50.0))
     """
     given = list(sources)
     if len(given) < 2:

@@ -13,7 +13,6 @@ from pixmetry.observe._covariance_kernels import sum_lag_products
 
 MARGIN_PX = 8
 FIRST_FRAME, MOST_FRAMES = 4, 32  # of a stack whose succession is looked at; the first ones may hold what was before them
-ROUNDS = 4  # of the correction for the means that are taken out; each is smaller by the share of a line that the lags are
 
 
 @dataclass
@@ -42,17 +41,16 @@ class LagProducts:
         Notes
         -----
         Without the means of rows and columns a product at lag (j, i) is too small by Σ_i C(j, i)/N + Σ_j C(j, i)/M − ΣΣ C/(MN) for N
-        columns and M rows (as the n − 1 of a variance, for each lag). The sums over the lags within reach are put in, of what was
-        corrected so far.
+        columns and M rows (as the n − 1 of a variance, for each lag). These equations are solved for the lags within reach.
         """
         (rows, cols), total = self.shape, np.sum([self.by_pair[k] for k in sorted(self.by_pair)], axis=0)
         mean = total / (len(self.by_pair) * _counts(self.shape))
         down, along = np.array(LAGS).T
         pooled = plane_of(mean.mean(axis=(0, 1))[down, along + REACH])
-        found = pooled
-        for _ in range(ROUNDS):
-            lines = found.sum(axis=1, keepdims=True) / cols + found.sum(axis=0, keepdims=True) / rows - found.sum() / (rows * cols)
-            found = pooled + lines
+        n, m = pooled.shape
+        over_row, over_column = np.kron(np.eye(n), np.ones((m, m))) / cols, np.kron(np.ones((n, n)), np.eye(m)) / rows
+        lost = over_row + over_column - np.ones((n * m, n * m)) / (rows * cols)
+        found = np.linalg.solve(np.eye(n * m) - lost, pooled.ravel()).reshape(n, m)
         corrected: Array = mean + (found - pooled)[REACH:]
         return corrected
 
