@@ -10,6 +10,7 @@ import numpy as np
 from pixmetry.assess.job import measure_sources
 from pixmetry.camera.camera import Camera, Element, in_order
 from pixmetry.camera.catalogue import sources
+from pixmetry.core.errors import MeasureError
 from pixmetry.core.number import Number
 from pixmetry.observe.observe import Group, observe
 from pixmetry.scene.files import SeriesModel
@@ -96,6 +97,6 @@ def measured(case: FlatCase, seed: int) -> dict[str, Number]:
         if name not in found and source.measure is not None:
             try:
                 found[name] = source.measure(seen)
-            except Exception:  # the reason is in the table of what was not measured
+            except MeasureError:  # the reason is in the table of what was not measured
                 continue
     return {f"{name}.{e.name}": e for name, estimates in found.items() for e in estimates}
