@@ -152,13 +152,21 @@ def _plain(value: Any) -> Any:
 
 def _compile(function: Callable[..., Any], options: dict[str, Any]) -> Any:
     import numba
+    from numba.core.types import unliteral
 
     _teach_numba()
     config: Any = numba.config
     dispatcher = numba.njit(**options | {"cache": False})(function)
-    folder = _cache_folder(function) if options["cache"] and not config.DISABLE_JIT else None
+    if config.DISABLE_JIT:
+        return dispatcher
+    folder = _cache_folder(function) if options["cache"] else None
     if folder is not None:
         dispatcher._cache = _Store(function, folder)
+    template = dispatcher.get_call_template
+    # where a kernel calls another with constants, Numba would compile that one for each of them
+    dispatcher.get_call_template = lambda args, named: template(
+        [unliteral(kind) for kind in args], {name: unliteral(kind) for name, kind in named.items()}
+    )
     return dispatcher
 
 
