@@ -287,7 +287,7 @@ def observe_campaign(campaign: Campaign, progress: Progress) -> tuple[InputHashe
 
     def groups() -> Iterator[Group]:
         for g in chosen:
-            yield Group(g.kind, g.role, g.exposure_s, g.photons, [partial(reader.fetch, path) for path in g.paths])
+            yield Group(g.kind, g.role, g.exposure_s, g.photons, [partial(reader.fetch, path) for path in g.paths], g.facts)
 
     seen = observe(groups(), campaign.bits, campaign.camera.temperature_c, on_frames=on_frames)
     return reader.hashes, replace(seen, storage=reader.storage, notes=(*campaign.findings, *left_out, *seen.notes))

@@ -405,16 +405,8 @@ class Observations:
         MeasureError
             Without edges, or with the reason why they do not tell any of these.
         """
-        remedy = "take frames of slanted edges (kind: edge in the manifest)"
-        if self.edges is None or not self.edges.edges:
-            raise MeasureError("not measured: needs slanted edges", where=where, remedy=remedy)
-        optics = self.edges.optics
-        known = {name: fitted for name, fitted in names.items() if fitted in optics}
-        if not known:
-            own = [optics.reasons.get(fitted, "") for fitted in names.values()]
-            why = next(filter(None, [*own, *optics.reasons.values()]), "no edges of this direction")
-            raise MeasureError(f"not told by the slanted edges: {why}", where=where)
-        return optics.select(known)
+        optics = None if self.edges is None or not self.edges.edges else self.edges.optics
+        return of_pictures(optics, names, where=where, pictures="slanted edges", kind="edge")
 
     def calibrated(self, names: Mapping[str, str] | Iterable[str], *, where: str) -> Estimates:
         """Take a source's parameters out of the calibrated geometry, with their covariance.
@@ -428,3 +420,34 @@ class Observations:
             remedy = "calibrate the camera with images of targets and give the calibration"
             raise MeasureError("needs a calibrated geometry; dark and bright frames show no targets", where=where, remedy=remedy)
         return self.geometry.lens.select(names)
+
+
+def of_pictures(fit: Estimates | None, names: Mapping[str, str], *, where: str, pictures: str, kind: str) -> Estimates:
+    """Take a source's parameters ``{parameter: fitted name}`` out of what pictures of one kind tell, with their covariance.
+
+    Parameters
+    ----------
+    fit : Estimates or None
+        None where there are no such pictures. ``reasons`` of names that it does not hold say why.
+    names : mapping
+    where : str
+        Id of the source.
+    pictures : str
+        What the pictures show, for the message.
+    kind : str
+        As in the manifest.
+
+    Raises
+    ------
+    MeasureError
+        Without pictures, or with the reason why they do not tell any of these.
+    """
+    if fit is None:
+        remedy = f"take frames of {pictures} (kind: {kind} in the manifest)"
+        raise MeasureError(f"not measured: needs {pictures}", where=where, remedy=remedy)
+    known = {name: fitted for name, fitted in names.items() if fitted in fit}
+    if not known:
+        own = [fit.reasons.get(fitted, "") for fitted in names.values()]
+        why = next(filter(None, [*own, *fit.reasons.values()]), f"no {pictures} could be measured")
+        raise MeasureError(f"not told by the {pictures}: {why}", where=where)
+    return fit.select(known)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from pixmetry.camera.group_facts import GroupFacts
 from pixmetry.core.errors import InputError
 from pixmetry.files.manifest import camera_facts, check_window, photons_of, role_of
 from pixmetry.files.records import Campaign, FrameGroup, OpticsFacts, check_groups
@@ -30,6 +31,8 @@ class Frames:
         Mean number of photons per pixel and exposure of a bright group.
     role : {"level", "stack"}, optional
         A point of the photon-transfer series, or many frames for the mean image; by default told from their number.
+    facts : GroupFacts
+        What else is known of the group, as the manifest's ``wavelength_nm``.
 
     Examples
     --------
@@ -43,6 +46,7 @@ class Frames:
     data: np.ndarray | Sequence[np.ndarray]
     photons: float | None = None
     role: str | None = None
+    facts: GroupFacts = GroupFacts()
 
 
 def campaign_of_arrays(groups: Iterable[Frames], *, optics: Mapping[str, Any] | None = None, operator: str = "", **camera: Any) -> Campaign:
@@ -94,13 +98,14 @@ def campaign_of_arrays(groups: Iterable[Frames], *, optics: Mapping[str, Any] | 
             remedy = "give Frames(kind, exposure_s, data), one for each exposure time and light"
             raise InputError("not frames of one condition", where=str(folder), value=type(group).__name__, allowed="Frames", remedy=remedy)
         known = {name: getattr(group, name) for name in ("kind", "exposure_s", "photons", "role")}
-        checked = validate(GroupModel, {**known, "files": ("in memory",)}, str(folder))
+        checked = validate(GroupModel, {**known, **asdict(group.facts), "files": ("in memory",)}, str(folder))
         data = arrays[folder] = _checked(group.data, str(folder))
         shapes |= {frame.shape for frame in data}
         eight = eight and all(frame.dtype == np.uint8 for frame in data)
         paths = tuple(folder / str(k) for k in range(len(data)))
         photons = photons_of(checked, light, facts, str(folder))
-        made.append(FrameGroup(checked.kind, checked.exposure_s or 0.0, photons, paths, checked.role or role_of(checked.kind, paths)))
+        role = checked.role or role_of(checked.kind, paths)
+        made.append(FrameGroup(checked.kind, checked.exposure_s or 0.0, photons, paths, role, checked.facts()))
     if len(shapes) > 1:
         raise InputError("frames of several sizes", where=NAME, value=sorted(shapes), allowed="one size for all frames")
     ordered, findings = check_groups(tuple(made), NAME)

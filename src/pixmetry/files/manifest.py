@@ -155,9 +155,7 @@ def _read_manifest(source: Path) -> tuple[ManifestModel, Mapping[tuple[str | int
     return validate(ManifestModel, data, str(source)), data.lines
 
 
-def _from_manifest(
-    source: Path, model: ManifestModel, lines: Mapping[tuple[str | int, ...], int], raw: RawLayout | None
-) -> dict[str, Any]:
+def _from_manifest(source: Path, model: ManifestModel, lines: Mapping[tuple[str | int, ...], int], raw: RawLayout | None) -> dict[str, Any]:
     camera = camera_facts(model.camera)
     if model.emva_descriptor is not None:
         where = _place(source, lines, "emva_descriptor")
@@ -168,7 +166,8 @@ def _from_manifest(
     for i, group in enumerate(model.frames):
         paths = find_files(source.parent, group.files, _place(source, lines, "frames", i, "files"), raw)
         photons = photons_of(group, model.optics, camera, _place(source, lines, "frames", i))
-        groups.append(FrameGroup(group.kind, group.exposure_s or 0.0, photons, paths, group.role or role_of(group.kind, paths)))
+        role = group.role or role_of(group.kind, paths)
+        groups.append(FrameGroup(group.kind, group.exposure_s or 0.0, photons, paths, role, group.facts()))
     return {"camera": camera, "groups": tuple(groups), "licence": model.licence}
 
 
@@ -255,7 +254,8 @@ def write_manifest(campaign: Campaign, path: str | Path) -> None:
         told: dict[str, Any] = {"kind": group.kind, "exposure_s": group.exposure_s, "photons": photons, "role": group.role}
         if group.kind in TARGETS:
             told |= {"exposure_s": group.exposure_s or None, "role": None}
-        frames.append({**told, "files": files})
+        facts = {name: value for name, value in asdict(group.facts).items() if value is not None}
+        frames.append({**told, **facts, "files": files})
     manifest = {"schema": CAMPAIGN_SCHEMA, "camera": asdict(campaign.camera), "optics": asdict(campaign.optics), "frames": frames}
     texts = {name: getattr(campaign, name) or None for name in ("licence", "notes", "operator")}
     layout = None if campaign.raw is None else asdict(campaign.raw)

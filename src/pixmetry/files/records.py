@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pixmetry.camera.group_facts import GroupFacts
 from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.files.formats import is_frame
 from pixmetry.files.raw_values import RawLayout
@@ -17,6 +18,7 @@ from pixmetry.files.raw_values import RawLayout
 STACK_FRAMES = 8  # from this many frames on, a group is a stack: its mean image serves the spatial measurements
 KINDS = ("dark", "bright")  # frames of an even field, from which noise is measured
 TARGETS = ("edge",)  # pictures of something to be measured: one frame is enough
+FACTS = {"edge": ("wavelength_nm",)}  # what else may be said of a group, by its kind
 
 
 @dataclass(frozen=True)
@@ -75,6 +77,7 @@ class FrameGroup:
     role : str
         ``"level"`` (a point of the photon-transfer series), ``"stack"`` (many frames for the mean image) or ``"target"`` (frames of a
         target that did not move between them).
+    facts : GroupFacts
     """
 
     kind: str
@@ -82,6 +85,7 @@ class FrameGroup:
     photons: float | None
     paths: tuple[Path, ...]
     role: str
+    facts: GroupFacts = GroupFacts()
 
     @property
     def label(self) -> str:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
 
+from pixmetry.camera.group_facts import GroupFacts
 from pixmetry.core.config import Model
 from pixmetry.core.errors import InputError
 from pixmetry.files.raw_values import RawLayout
-from pixmetry.files.records import TARGETS
+from pixmetry.files.records import FACTS, TARGETS
 
 CAMPAIGN_SCHEMA = "pixmetry/campaign/1"
 
@@ -86,15 +88,20 @@ class OpticsModel(Model):
 class GroupModel(Model):
     """Frames under one condition."""
 
-    kind: Literal["dark", "bright", "edge"]
+    kind: Literal["dark", "bright", "edge"]  # records.KINDS and TARGETS
     exposure_s: Annotated[float, Field(ge=0)] | None = None
     photons: Annotated[float, Field(ge=0)] | None = None
     irradiance_uw_per_cm2: Positive | None = None
     role: Literal["level", "stack"] | None = None
+    wavelength_nm: Positive | None = None
     files: Names
 
     @model_validator(mode="after")
     def _target(self) -> GroupModel:
+        allowed = ("kind", "exposure_s", *FACTS.get(self.kind, ()), "files")
+        for name in (f.name for f in fields(GroupFacts)):
+            if name not in allowed and getattr(self, name) is not None:
+                raise InputError(f"{name} is not said of {self.kind} frames", allowed=", ".join(allowed), remedy="delete it")
         if self.kind not in TARGETS:
             if self.exposure_s is None:
                 raise InputError(f"a {self.kind} group without exposure time", allowed="0 or more seconds", remedy="add exposure_s")
@@ -102,8 +109,12 @@ class GroupModel(Model):
         wrong = [name for name in ("photons", "irradiance_uw_per_cm2", "role") if getattr(self, name) is not None]
         if wrong:
             what = f"{wrong[0]} belongs to dark and bright frames, not to pictures of a target"
-            raise InputError(what, allowed="kind, exposure_s, files", remedy="delete it")
+            raise InputError(what, allowed=", ".join(allowed), remedy="delete it")
         return self
+
+    def facts(self) -> GroupFacts:
+        """What it says beside kind, exposure and light."""
+        return GroupFacts(**{f.name: getattr(self, f.name) for f in fields(GroupFacts)})
 
     @model_validator(mode="after")
     def _light(self) -> GroupModel:

@@ -16,7 +16,6 @@ from pixmetry.camera.observations import (
     Observations,
     PatternList,
     PhotonTransfer,
-    SlantedEdges,
     Spectra,
     StackMoments,
 )
@@ -25,8 +24,8 @@ from pixmetry.core.number import ONE_SIDED_95, Estimates
 from pixmetry.core.threads import single_threaded_blas
 from pixmetry.observe import photon_transfer_model as model
 from pixmetry.observe.defects import find_defects, without_hot_pixels
-from pixmetry.observe.edge_fit import fit_edges
-from pixmetry.observe.edges import Picture, edge_notes, motion_notes, responses_of, search_edges
+from pixmetry.observe.experiment import PictureGroup
+from pixmetry.observe.experiments import reduce_pictures
 from pixmetry.observe.histogram import HistogramAccumulator, code_errors, sweep_histogram
 from pixmetry.observe.linearity import Linearity
 from pixmetry.observe.moments import LevelSummary
@@ -94,13 +93,14 @@ def observe(
     stacked: dict[str, list[Level]] = {"dark": [], "bright": []}
     stacks: dict[str, dict[float, _Stack]] = {"dark": {}, "bright": {}}
     histogram = HistogramAccumulator(bits)
-    pictures: list[Picture] = []
+    pictures: list[PictureGroup] = []
     shape = None
     correlated: list[CorrelatedGroup] = []
     for group, [(sums, found, products, succession)] in reduce_groups(groups, bits, lags=True, threads=threads, on_frames=on_frames):
         shape = found
         if group.role == "target" and not isinstance(sums, LevelSummary):
-            pictures.append(Picture.of(group.kind, sums.moments, bits))
+            assert isinstance(sums.moments, StackAccumulator)
+            pictures.append(PictureGroup(group.kind, group.exposure_s, group.facts, sums.moments, sums.of_pictures, bits))
             continue
         condition = (group.kind, group.role, group.exposure_s, group.photons)
         if isinstance(sums, LevelSummary):
@@ -117,18 +117,15 @@ def observe(
             if kept is None or sums.moments.n_frames > kept.moments.n_frames:
                 stack = sums.moments.result(group.exposure_s)
                 stacks[group.kind][group.exposure_s] = _Stack(stack, sums.spectra.result(stack.mean_map_dn))
-    edges, told_of_edges = _edges([p for p in pictures if p.kind == "edge"])
     levels = {kind: found or stacked[kind] for kind, found in levels.items()}  # where there are only stacks, these
     if pictures and shape is not None and not (levels["dark"] or levels["bright"]):
-        return Observations(
-            photon_transfer=without_levels(shape, bits),
-            photon_transfer_fit=Estimates.empty(),
-            edges=edges,
-            temperature_c=temperature_c,
-            notes=tuple(told_of_edges),
+        alone = Observations(
+            photon_transfer=without_levels(shape, bits), photon_transfer_fit=Estimates.empty(), temperature_c=temperature_c
         )
+        with single_threaded_blas():
+            return reduce_pictures(pictures, alone)
     counts = histogram.result()
-    notes = [*_code_notes(counts), *told_of_edges]
+    notes = _code_notes(counts)
     sweep = [level.summary for level in levels["bright"]]
     dark, bright = _pair(list(stacks["dark"].values()), list(stacks["bright"].values()))
     dark_stack, bright_stack = (None if s is None else s.moments for s in (dark, bright))
@@ -146,7 +143,7 @@ def observe(
     dark_spectra, bright_spectra = (None if s is None else s.spectra for s in (dark, bright))
     with single_threaded_blas():
         defects, spatial, patterns = _spatial(dark_stack, bright_stack, dark_spectra, Linearity.of(fit, bits), _dnl_lsb(codes), notes)
-    return Observations(
+    seen = Observations(
         photon_transfer=transfer,
         photon_transfer_fit=fit,
         dark_stack=dark_stack,
@@ -158,12 +155,13 @@ def observe(
         defects=defects,
         patterns=patterns,
         code_errors=codes,
-        edges=edges,
         noise_covariance=noise,
         noise_filter=noise_filter,
         temperature_c=temperature_c,
         notes=tuple(notes),
     )
+    with single_threaded_blas():
+        return reduce_pictures(pictures, seen)
 
 
 def _correlated(group: Group, level: LevelSummary, products: LagProducts, succession: FrameSuccession) -> CorrelatedGroup:
@@ -179,16 +177,6 @@ def _correlated(group: Group, level: LevelSummary, products: LagProducts, succes
         succession=succession,
         var_dn2=level.squares.pixel_dn2,
     )
-
-
-def _edges(pictures: list[Picture]) -> tuple[SlantedEdges | None, list[str]]:
-    """The edges, and notes on them."""
-    if not pictures:
-        return None, []
-    with single_threaded_blas():
-        search = search_edges(pictures)
-        edges = responses_of(search, fit_edges(search.measured))
-    return edges, [*edge_notes(edges), *motion_notes(pictures, search)]
 
 
 def _transfer_fit(

@@ -10,10 +10,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pixmetry.camera.group_facts import GroupFacts
 from pixmetry.camera.observations import LevelMoments, PhotonTransfer
 from pixmetry.core.errors import MeasureError
 from pixmetry.core.threads import imap_tiles
 from pixmetry.observe.defects import tail_of_counts
+from pixmetry.observe.experiments import EXPERIMENTS
 from pixmetry.observe.moments import LevelAccumulator, LevelSummary, level_moments, summarize_pair
 from pixmetry.observe.noise_covariance import FrameSuccession, LagProducts, lag_products, white_square
 from pixmetry.observe.stack import GroupReduction, new_group
@@ -36,6 +38,7 @@ class Group:
     exposure_s: float
     photons: float | None
     frames: Iterable[Frame]
+    facts: GroupFacts = GroupFacts()
 
 
 class Level(NamedTuple):
@@ -109,6 +112,9 @@ class _Sums:
         self.part, self.bits, self.lags, self.stack = part, bits, lags, group.role == "stack"
         self.products, self.succession = LagProducts(), FrameSuccession()
         self.reduction = new_group(bits, group.role, spectra_pairs)
+        experiment = EXPERIMENTS.get(group.kind)
+        if experiment is not None and experiment.sums is not None:
+            self.reduction.of_pictures = experiment.sums()
         self.summary: Reduced | None = None
         self._lock = threading.Lock()
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -55,15 +55,24 @@ class StackAccumulator(FrameMoments):
         )
 
 
+class FrameSums(Protocol):
+    """What one kind of pictures needs of each frame beside the moments; ``add`` is called for one frame at a time, in any order."""
+
+    def add(self, frame: np.ndarray, index: int) -> None:
+        """Add the frame of this index."""
+
+
 @dataclass
 class GroupReduction:
     """All accumulators of one group of frames; each frame is read once.
 
-    ``spectra`` is ``None`` for the short groups of an exposure series, and for pictures of targets.
+    ``spectra`` is ``None`` for the short groups of an exposure series, and for pictures of targets; ``of_pictures`` is what the experiment
+    of a kind of pictures sums.
     """
 
     moments: LevelAccumulator | StackAccumulator
-    spectra: SpectraAccumulator | None = field(default=None)
+    spectra: SpectraAccumulator | None = None
+    of_pictures: FrameSums | None = None
 
     def add(self, frame: np.ndarray, index: int | None = None) -> None:
         """Add one frame; see :meth:`FrameMoments.add`."""
@@ -71,6 +80,8 @@ class GroupReduction:
         self.moments.add(frame, index)
         if self.spectra is not None:
             self.spectra.add(frame, index)
+        if self.of_pictures is not None:
+            self.of_pictures.add(frame, index)
 
 
 def new_group(bits: int, kind: str, spectra_pairs: int = 8) -> GroupReduction:

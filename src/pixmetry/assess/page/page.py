@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pixmetry.files.records import KINDS
 from pixmetry.report import Column, Page, Points, Row, Section, Table, html_of
 from pixmetry.report.numbers import NONE, significant
 from pixmetry.report.provenance import provenance_section
@@ -62,7 +64,7 @@ def page_of(assessment: Assessment) -> Page:
         budget_view.largest_section(budget),
         _plots(assessment),
         _values(assessment),
-        *_edges(assessment),
+        *_pictures(assessment),
         budget_view.sources_section(budget, assessment.unmeasured),
         budget_view.sum_section(budget),
         _words(assessment),
@@ -83,11 +85,12 @@ def _plots(assessment: Assessment) -> Section:
     return section
 
 
-def _edges(assessment: Assessment) -> list[Section]:
+def _pictures(assessment: Assessment) -> list[Section]:
+    """A section for each kind of pictures."""
     from pixmetry.assess.page.edges import edges_section
 
-    found = assessment.observations.edges
-    return [] if found is None else [edges_section(found)]
+    seen = assessment.observations
+    return [] if seen.edges is None else [edges_section(seen.edges)]
 
 
 def _values(assessment: Assessment) -> Section:
@@ -122,7 +125,9 @@ def _facts(assessment: Assessment) -> list[tuple[str, str]]:
     pitch = "not given"
     if facts.pitch_x_um is not None:
         pitch = f"{facts.pitch_x_um:g} × {facts.pitch_y_um or facts.pitch_x_um:g} µm"
-    dark, bright, edge = (sum(len(g.paths) for g in campaign.groups if g.kind == kind) for kind in ("dark", "bright", "edge"))
+    counts = Counter({kind: 0 for kind in KINDS})
+    for group in campaign.groups:
+        counts[group.kind] += len(group.paths)
     temperature = "not given" if facts.temperature_c is None else f"{significant(facts.temperature_c)} °C"
     return [
         *_named(assessment),
@@ -131,7 +136,7 @@ def _facts(assessment: Assessment) -> list[tuple[str, str]]:
         ("Pixel pitch", pitch),
         ("Interface, sensor", f"{facts.interface}, {facts.sensor.upper() if facts.sensor else 'sensor not given'}"),
         ("Temperature", temperature),
-        ("Frames read", ", ".join([f"{dark} dark", f"{bright} bright", *([f"{edge} of edges"] if edge else [])])),
+        ("Frames read", ", ".join(f"{n} {kind}" if kind in KINDS else f"{n} of kind {kind}" for kind, n in counts.items())),
         ("Stored", _stored(assessment.observations.storage)),
         ("Assessed (UTC)", assessment.provenance["time_utc"].replace("T", " ")[:16]),
     ]

@@ -1,0 +1,32 @@
+"""The experiments that pixmetry knows: one for each kind of pictures that a manifest may list (``files.records.TARGETS``)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+
+from pixmetry.camera.observations import Observations
+from pixmetry.observe.edge_fit import fit_edges
+from pixmetry.observe.edges import Picture, edge_notes, motion_notes, responses_of, search_edges
+from pixmetry.observe.experiment import Experiment, PictureGroup
+
+
+def reduce_edges(groups: Sequence[PictureGroup], seen: Observations) -> Observations:
+    """Find and fit the slanted edges of pictures."""
+    pictures = [Picture.of(g.kind, g.moments, g.bits) for g in groups]
+    search = search_edges(pictures)
+    edges = responses_of(search, fit_edges(search.measured))
+    return replace(seen, edges=edges, notes=(*seen.notes, *edge_notes(edges), *motion_notes(pictures, search)))
+
+
+EXPERIMENTS = {e.kind: e for e in (Experiment("edge", reduce_edges),)}
+
+
+def reduce_pictures(groups: Iterable[PictureGroup], seen: Observations) -> Observations:
+    """Reduce the pictures of all kinds, in the order of ``EXPERIMENTS``."""
+    groups = tuple(groups)
+    for kind, experiment in EXPERIMENTS.items():
+        own = [g for g in groups if g.kind == kind]
+        if own:
+            seen = experiment.reduce(own, seen)
+    return seen

@@ -1,0 +1,57 @@
+"""Kinds of pictures: what the manifest lists, what is reduced, and what may be said of them agree."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from typing import get_args
+
+import numpy as np
+import pytest
+
+from pixmetry.camera.group_facts import GroupFacts
+from pixmetry.core.errors import InputError
+from pixmetry.files.images import write_frame
+from pixmetry.files.in_memory import Frames, campaign_of_arrays
+from pixmetry.files.manifest import load_campaign, write_manifest
+from pixmetry.files.records import FACTS, KINDS, TARGETS
+from pixmetry.files.schema import GroupModel
+from pixmetry.observe.experiments import EXPERIMENTS
+
+STATED = {"wavelength_nm": 850.0}  # a lawful value of each fact
+
+
+def test_each_kind_of_the_manifest_has_its_experiment() -> None:
+    assert tuple(EXPERIMENTS) == TARGETS
+    assert get_args(GroupModel.model_fields["kind"].annotation) == (*KINDS, *TARGETS)
+
+
+def test_each_fact_is_a_key_of_the_manifest_and_belongs_to_some_kind() -> None:
+    names = {f.name for f in fields(GroupFacts)}
+    assert names == set(STATED) == {name for allowed in FACTS.values() for name in allowed}
+    assert names <= set(GroupModel.model_fields)
+
+
+@pytest.mark.parametrize("kind, name", [(kind, name) for kind, names in FACTS.items() for name in names])
+def test_a_fact_reaches_the_group_from_arrays_and_through_a_file(kind: str, name: str, tmp_path) -> None:
+    facts = GroupFacts(**{name: STATED[name]})
+    frames = np.arange(2 * 8 * 8, dtype=np.uint16).reshape(2, 8, 8)
+    campaign = campaign_of_arrays([Frames(kind, 0.01, frames, facts=facts)], bits=8, name="a camera")
+    assert campaign.groups[0].facts == facts
+    listed = {"kind": kind, "exposure_s": 0.01, name: STATED[name], "files": ["a.png", "b.png"]}
+    for file, frame in zip(listed["files"], frames, strict=True):
+        write_frame(tmp_path / file, frame, 8)
+    (tmp_path / "campaign.yaml").write_text(
+        f"schema: pixmetry/campaign/1\ncamera: {{name: one, bits: 8}}\nframes: [{listed}]\n".replace("'", '"')
+    )
+    read = load_campaign(tmp_path)
+    assert read.groups[0].facts == facts
+    write_manifest(read, tmp_path / "again.yaml")
+    assert load_campaign(tmp_path / "again.yaml").groups[0].facts == facts
+
+
+def test_a_fact_of_another_kind_is_refused() -> None:
+    frames = np.zeros((2, 8, 8), np.uint16)
+    for name in (f.name for f in fields(GroupFacts)):
+        for kind in (k for k in (*KINDS, *TARGETS) if name not in FACTS.get(k, ())):
+            with pytest.raises(InputError, match=name):
+                campaign_of_arrays([Frames(kind, 0.01, frames, facts=GroupFacts(**{name: STATED[name]}))], bits=8)
