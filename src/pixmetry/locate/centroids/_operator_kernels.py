@@ -367,16 +367,17 @@ def edges_of(patch: Array, box: Ints, record: Array, i: int, cx: float, cy: floa
 
 @jit
 def gaussian_sums(window: Array, p: Array, weight: Array, fresh: Array, active: Ints, normal: Array, right: Array) -> tuple[float, float]:
-    """Normal equations of b + A exp(−½ dᵀPd), all pixels of the window alike; see `descent_of`.
+    """Normal equations of b + A exp(−½ dᵀPd), each pixel by its share in the window; see `descent_of`.
 
-    ``window``, shape (2, rows, cols): grey value and whether it counts; ``p``: A, b, x, y, and P's xx, xy, yy.
+    ``window``, shape (2, rows, cols): grey value and share; ``p``: A, b, x, y, and P's xx, xy, yy.
     """
     normal[:, :] = 0.0
     right[:] = 0.0
     row, total = np.empty(GAUSSIAN_UNKNOWNS), 0.0
     for a in range(window.shape[1]):
         for b in range(window.shape[2]):
-            if window[1, a, b] == 0.0:
+            share = window[1, a, b]
+            if share == 0.0:
                 continue
             dx, dy = b - p[2], a - p[3]
             ux, uy = p[4] * dx + p[5] * dy, p[5] * dx + p[6] * dy
@@ -385,11 +386,12 @@ def gaussian_sums(window: Array, p: Array, weight: Array, fresh: Array, active: 
             row[0], row[1], row[2], row[3] = g, 1.0, f * ux, f * uy
             row[4], row[5], row[6] = -0.5 * f * dx * dx, -f * dx * dy, -0.5 * f * dy * dy
             residual = window[0, a, b] - p[1] - f
-            total += residual * residual
+            total += share * residual * residual
             for m in range(GAUSSIAN_UNKNOWNS):
-                right[m] += row[m] * residual
+                weighted = share * row[m]
+                right[m] += weighted * residual
                 for n in range(m + 1):
-                    normal[m, n] += row[m] * row[n]
+                    normal[m, n] += weighted * row[n]
     fresh[:] = 1.0
     return total, total
 
@@ -408,40 +410,65 @@ descend_gaussian = descent_of(gaussian_sums, gaussian_trial)
 
 
 @jit
-def gaussian_of(patch: Array, box: Ints, record: Array, i: int, cx: float, cy: float, answer: Array) -> tuple[bool, float, float]:
-    """Least-squares b + A exp(−½ dᵀPd), all pixels of the window alike; slopes by pixel in ``answer``.
+def share_of(p: float, q: float, r: float, dx: float, dy: float) -> tuple[float, float, float]:
+    """Share of a pixel in a window about the origin of form p x² + 2 q x y + r y² = 1, which cuts it, and its slopes by the centre."""
+    form = p * dx * dx + 2.0 * q * dx * dy + r * dy * dy
+    gx, gy = p * dx + q * dy, q * dx + r * dy
+    steep = math.hypot(gx, gy)
+    if steep == 0.0:
+        return 1.0, 0.0, 0.0
+    # distance to the outline along its normal, in pixels
+    share = 0.5 + (math.sqrt(form) - form) / steep
+    if share >= 1.0 or share <= 0.0:
+        return min(max(share, 0.0), 1.0), 0.0, 0.0
+    return share, gx / steep, gy / steep
 
-    Return found, x, y. A target is no Gaussian, so the slopes hold the residuals' part of the second derivatives too.
+
+@jit
+def gaussian_of(patch: Array, box: Ints, record: Array, i: int, cx: float, cy: float, answer: Array) -> tuple[bool, float, float]:
+    """Least-squares b + A exp(−½ dᵀPd) in the window about (cx, cy), which cuts pixels at its rim; slopes by pixel in ``answer``.
+
+    Return found, x, y. A target is no Gaussian. So the slopes hold the residuals' part of the second derivatives; and pixels at the rim
+    pull the estimate along when the window moves. Where the window is at rest at the estimate x̂(I, c), x̂ = c, the slopes are
+    (1 − ∂x̂/∂c)⁻¹ ∂x̂/∂I. With M the matrix of second derivatives, ∂x̂/∂c = M⁻¹ B, B = Σ ∂share/∂c residual ∂f/∂x̂; so M − B takes M's place.
     """
     rows, cols = box[1] - box[0], box[3] - box[2]
+    wide, high, angle = record[i, MAJOR] + record[i, MARGIN], record[i, MINOR] + record[i, MARGIN], record[i, ANGLE]
+    wp, wq, wr = quadratic_form(wide, high, angle)
     value = patch[0]
     p, q, r = quadratic_form(record[i, MAJOR] / 1.1774, record[i, MINOR] / 1.1774, record[i, ANGLE])
     at = np.array([record[i, AMPLITUDE], 0.0, cx - box[2], cy - box[0], p, q, r])
     window = np.empty((2, rows, cols))
-    window[0], window[1] = patch[0, :rows, :cols], patch[2, :rows, :cols]
+    window[0] = patch[0, :rows, :cols]
+    normal = np.empty((2, rows, cols))
+    for a in range(rows):
+        for b in range(cols):
+            window[1, a, b], normal[0, a, b], normal[1, a, b] = share_of(wp, wq, wr, box[2] + b - cx, box[0] + a - cy)
     least, active = np.full(GAUSSIAN_UNKNOWNS, -np.inf), np.arange(GAUSSIAN_UNKNOWNS)
     descend_gaussian(window, at, least, active, 1, Rest(0.0, GAUSSIAN_REST, FREE, 0.0))
-    xx, xy, yy = 0.0, 0.0, 0.0
+    xx, xy, yx, yy = 0.0, 0.0, 0.0, 0.0
     answer[:, :rows, :cols] = 0.0
     for a in range(rows):
         for b in range(cols):
-            if patch[2, a, b] == 0.0:
+            share = window[1, a, b]
+            if share == 0.0:
                 continue
             dx, dy = b - at[2], a - at[3]
             ux, uy = at[4] * dx + at[5] * dy, at[5] * dx + at[6] * dy
             f = at[0] * math.exp(-0.5 * (ux * dx + uy * dy))
             residual = value[a, b] - at[1] - f
-            xx += f * ux * f * ux - residual * f * (ux * ux - at[4])
-            xy += f * ux * f * uy - residual * f * (ux * uy - at[5])
-            yy += f * uy * f * uy - residual * f * (uy * uy - at[6])
-            answer[0, a, b], answer[1, a, b] = f * ux, f * uy
-    det = xx * yy - xy * xy
+            xx += share * (f * ux * f * ux - residual * f * (ux * ux - at[4])) - normal[0, a, b] * residual * f * ux
+            xy += share * (f * ux * f * uy - residual * f * (ux * uy - at[5])) - normal[1, a, b] * residual * f * ux
+            yx += share * (f * ux * f * uy - residual * f * (ux * uy - at[5])) - normal[0, a, b] * residual * f * uy
+            yy += share * (f * uy * f * uy - residual * f * (uy * uy - at[6])) - normal[1, a, b] * residual * f * uy
+            answer[0, a, b], answer[1, a, b] = share * f * ux, share * f * uy
+    det = xx * yy - xy * yx
     if not (at[0] > 0.0 and xx > 0.0 and det > 0.0):
         return False, 0.0, 0.0
     for a in range(rows):
         for b in range(cols):
             gx, gy = answer[0, a, b], answer[1, a, b]
-            answer[0, a, b], answer[1, a, b] = (yy * gx - xy * gy) / det, (xx * gy - xy * gx) / det
+            answer[0, a, b], answer[1, a, b] = (yy * gx - xy * gy) / det, (xx * gy - yx * gx) / det
     return True, box[2] + at[2], box[0] + at[3]
 
 
@@ -505,7 +532,7 @@ def operator_of(
         # half steps where full ones swing to and fro
         step = 1.0 if turn < 4 else 0.5
         cx, cy = cx + step * (x - cx), cy + step * (y - cy)
-        if moved < (0.1 if operator == GAUSSIAN else 1e-3):
+        if moved < 1e-3:
             at_rest = True
             break
     propagate(answer, patch, record, i, box, result)

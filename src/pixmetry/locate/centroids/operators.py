@@ -32,7 +32,8 @@ def operator_positions(frame: np.ndarray, targets: Targets, noise: NoiseModel, n
         ``perimeter``: mean place of the pixels above half height that have one of their four neighbours below it.
         ``forstner``: the point nearest to all lines along the gradients (Scharr's), each weighted by the square of its gradient.
         ``ellipse_edges``: rays from the centre, on each the place of the edge by the light along it (a step of full height that holds as
-        much), and an ellipse through these places. ``gaussian``: unweighted least squares of an elliptic Gaussian on a constant.
+        much), and an ellipse through these places. ``gaussian``: unweighted least squares of an elliptic Gaussian on a constant, in a
+        window that is at rest at the estimate and cuts the pixels at its rim.
     threads : int, optional
 
     Returns
@@ -48,9 +49,10 @@ def operator_positions(frame: np.ndarray, targets: Targets, noise: NoiseModel, n
     Notes
     -----
     The covariance is that of the pixels' noise and the background's plane through the operator's slopes by pixel; of the perimeter, which
-    has none, through the chance of each pixel to be taken over the threshold. The variance over the sub-pixel phase is added: that of the
-    operator itself on noise-free images of targets of like size, blur and shape, the largest over half a pixel of sizes,
-    on pixels that are sensitive on their whole square.
+    has none, through the chance of each pixel to be taken over the threshold. The slopes of ``gaussian`` hold that its window follows
+    the estimate (`gaussian_of` in the kernels has the formula): that is 12 % on a disc of radius 12 px and blur 2 px. The variance over
+    the sub-pixel phase is added: that of the operator itself on noise-free images of targets of like size, blur and shape, the largest
+    over half a pixel of sizes, on pixels that are sensitive on their whole square.
 
     References
     ----------
