@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -285,8 +285,20 @@ class FrameReader:
             if campaign.arrays is None and listing is not None and listing.is_file():
                 self.hashes.add_file(listing)
 
-    def fetch(self, path: Path) -> np.ndarray:
-        """Read one frame in the calling thread, and take note of its digest; errors as in `iter_frames`."""
+    def fetch(self, path: Path, borders: Callable[[np.ndarray], object] | None = None) -> np.ndarray:
+        """Read one frame in the calling thread, and take note of its digest; errors as in `iter_frames`.
+
+        Where the camera has covered pixels, ``borders`` is called with the stored frame, and its active area comes back.
+        """
+        stored = self._stored(path)
+        covered = self.campaign.camera.covered
+        if covered is None:
+            return stored
+        if borders is not None:
+            borders(stored)
+        return np.ascontiguousarray(stored[covered.active(stored.shape)])
+
+    def _stored(self, path: Path) -> np.ndarray:
         c = self.campaign
         if c.arrays is not None:
             array = _frame_in_memory(c, path)
@@ -294,7 +306,7 @@ class FrameReader:
             self._coders.add(None)
             return array
         frame = load_frame(path, self._plain_png, c.raw)
-        check_frame(frame.array, str(path), bits=c.bits, shape=c.frame_shape, dtype=c.frame_dtype)
+        check_frame(frame.array, str(path), bits=c.bits, shape=c.stored_shape, dtype=c.frame_dtype)
         self.hashes.add(path, frame.sha256, frame.size_bytes)
         self._coders.add(frame.lossless)
         if frame.lossless is False and c.camera.lossless:

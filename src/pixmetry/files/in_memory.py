@@ -11,7 +11,7 @@ import numpy as np
 
 from pixmetry.camera.group_facts import GroupFacts
 from pixmetry.core.errors import InputError
-from pixmetry.files.manifest import camera_facts, check_window, photons_of, role_of
+from pixmetry.files.manifest import active_shape, camera_facts, check_window, photons_of, role_of
 from pixmetry.files.records import Campaign, FrameGroup, OpticsFacts, check_groups
 
 NAME = "arrays in memory"
@@ -55,7 +55,7 @@ def campaign_of_arrays(groups: Iterable[Frames], *, optics: Mapping[str, Any] | 
     Parameters
     ----------
     groups : iterable of Frames
-        One for each exposure time and light, dark and bright; one for each picture of edges (frames in which nothing moved).
+        One for each exposure time and light, dark and bright; one for each picture of a target (frames in which nothing moved).
     optics : mapping, optional
         Of the manifest's keys under ``optics``: ``wavelength_nm``, ``f_number``, ``focal_length_mm``, ``irradiance_uw_per_cm2``,
         ``light_source``.
@@ -109,7 +109,8 @@ def campaign_of_arrays(groups: Iterable[Frames], *, optics: Mapping[str, Any] | 
     if len(shapes) > 1:
         raise InputError("frames of several sizes", where=NAME, value=sorted(shapes), allowed="one size for all frames")
     ordered, findings = check_groups(tuple(made), NAME)
-    (shape,) = shapes
+    (stored,) = shapes
+    shape = active_shape(facts, stored, NAME)
     check_window(facts, shape, NAME)
     dtype = "uint8" if eight else "uint16"
     told = OpticsFacts(**light.model_dump())

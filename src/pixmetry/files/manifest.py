@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pixmetry.camera.covered import Covered
 from pixmetry.core.errors import InputError
 from pixmetry.files.emva_descriptor import decode_descriptor, is_descriptor, parse_descriptor
 from pixmetry.files.files import find_file, find_files
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 
 EXAMPLE = Path(__file__).resolve().parents[1] / "data" / "emva1288-set-001-crop"
 
+LEAST_ACTIVE = 8  # rows, and columns, between covered borders
 _PLANCK_J_S = 6.62607015e-34  # exact, SI 2019
 _LIGHT_M_PER_S = 299792458.0  # exact
 
@@ -76,7 +78,8 @@ def load_campaign(path: str | Path | None = None) -> Campaign:
         facts["raw"] = None if model.raw is None else RawLayout(**model.raw.model_dump())
         parts = _from_manifest(source, model, lines, facts["raw"])
     groups, findings = check_groups(parts["groups"], str(source))
-    shape, dtype = _discover(groups[0].paths[0], parts, facts.get("raw"))
+    stored, dtype = _discover(groups[0].paths[0], parts, facts.get("raw"))
+    shape = active_shape(parts["camera"], stored, str(source))
     check_window(parts["camera"], shape, str(source))
     return Campaign(
         camera=parts["camera"],
@@ -96,6 +99,22 @@ def _discover(path: Path, parts: Mapping[str, Any], raw: RawLayout | None) -> tu
     array = load_frame(path, raw=raw).array
     check_frame(array, str(path), bits=parts["camera"].bits, shape=parts.get("shape"))
     return (array.shape[0], array.shape[1]), array.dtype.name
+
+
+def active_shape(camera: CameraFacts, stored: tuple[int, int], where: str) -> tuple[int, int]:
+    """Rows and columns of stored frames without their covered borders; refused where these leave too little."""
+    if camera.covered is None:
+        return stored
+    shape = camera.covered.active_shape(stored)
+    if min(shape) < LEAST_ACTIVE:
+        raise InputError(
+            "the covered borders leave too little of the frames",
+            where=where,
+            value=f"{shape[1]} x {shape[0]} of {stored[1]} x {stored[0]} pixels",
+            allowed=f"at least {LEAST_ACTIVE} rows and columns with light",
+            remedy="correct covered under camera: left and right count columns, top and bottom rows",
+        )
+    return shape
 
 
 def check_window(camera: CameraFacts, shape: tuple[int, int], where: str) -> None:
@@ -176,6 +195,8 @@ def camera_facts(model: CameraModel) -> CameraFacts:
     facts = model.model_dump(exclude={"pitch_um"})
     if model.pitch_um is not None:
         facts["pitch_x_um"] = facts["pitch_y_um"] = model.pitch_um
+    if model.covered is not None:
+        facts["covered"] = Covered(**model.covered.model_dump())
     return CameraFacts(**facts)
 
 

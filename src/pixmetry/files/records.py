@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pixmetry.camera.covered import Covered
 from pixmetry.camera.group_facts import GroupFacts
 from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.files.formats import is_frame
@@ -41,6 +42,7 @@ class CameraFacts:
     sensor_rows: int | None = None
     first_col: int | None = None  # place of the frames' first pixel on the sensor, from 0
     first_row: int | None = None
+    covered: Covered | None = None  # borders of the stored frames that no light reaches
     lossless: bool | None = None  # False: somewhere before these files the frames were coded with loss; True: nowhere
 
     @property
@@ -104,7 +106,7 @@ class Campaign:
     groups : tuple of FrameGroup
         Dark, bright, then pictures of targets; each by exposure and photons.
     frame_shape : tuple of int
-        Rows and columns of every frame.
+        Rows and columns of every frame, without covered pixels.
     frame_dtype : str
         ``"uint8"`` or ``"uint16"``, of every frame.
     source_path : Path
@@ -142,6 +144,12 @@ class Campaign:
     def bits(self) -> int:
         """Bits of a stored value."""
         return self.camera.bits
+
+    @property
+    def stored_shape(self) -> tuple[int, int]:
+        """Rows and columns of every stored frame, with covered pixels."""
+        covered = self.camera.covered
+        return self.frame_shape if covered is None else covered.stored_shape(self.frame_shape)
 
     @property
     def base(self) -> Path:

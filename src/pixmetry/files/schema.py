@@ -33,6 +33,15 @@ Names = Annotated[
 ]
 
 
+class CoveredModel(Model):
+    """Columns and rows at the borders of the stored frames that no light reaches."""
+
+    left: Annotated[int, Field(ge=0, le=10_000)] = 0
+    right: Annotated[int, Field(ge=0, le=10_000)] = 0
+    top: Annotated[int, Field(ge=0, le=10_000)] = 0
+    bottom: Annotated[int, Field(ge=0, le=10_000)] = 0
+
+
 class CameraModel(Model):
     """Facts of the camera."""
 
@@ -53,6 +62,7 @@ class CameraModel(Model):
     sensor_rows: Side | None = None
     first_col: Annotated[int, Field(ge=0)] | None = None
     first_row: Annotated[int, Field(ge=0)] | None = None
+    covered: CoveredModel | None = None
     lossless: bool | None = None
 
     @model_validator(mode="after")
