@@ -104,6 +104,8 @@ class NoiseFilter:
     growth_covariance : ndarray, shape (40, 40)
     shot_dn2 : ndarray, shape (levels,)
         Shot variance of the levels that were used, DN².
+    rival : NoiseFilter or None
+        Another kind that fits nearly as well.
     """
 
     kind: str = WHITE
@@ -119,6 +121,7 @@ class NoiseFilter:
     growth_per_dn2: np.ndarray = field(default_factory=lambda: np.zeros(len(LAGS)))
     growth_covariance: np.ndarray = field(default_factory=lambda: np.zeros((len(LAGS) - 1, len(LAGS) - 1)))
     shot_dn2: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    rival: NoiseFilter | None = None
 
     def variance_before(self, shot_dn2: np.ndarray, shift: float = 0.0) -> np.ndarray:
         """Shot variance before the filter from that behind it, DN², any shape; with ``shift`` added to the factor."""
@@ -181,10 +184,19 @@ def frame_correlation(seen: NoiseCovariance, group: int) -> tuple[float, float]:
     return alpha, float(np.hypot(scatter, ROUNDED_AWAY / 12 / one))
 
 
+SHARED_Z, LEAST_SHARED = 5.0, 0.005
+
+
+def shared_by_frames(seen: NoiseCovariance) -> tuple[float, float]:
+    """Correlation of the noise of successive bright frames, and its u: of the stack in which it stands out most; (0, ∞) without a stack."""
+    groups = np.flatnonzero(seen.bright & (seen.n_successive > 3) & (seen.clipped <= 0.002))
+    return max((frame_correlation(seen, int(g)) for g in groups), key=lambda found: found[0] / found[1], default=(0.0, np.inf))
+
+
 def frames_share_noise(seen: NoiseCovariance) -> bool:
     """Whether the noise of successive bright frames is so correlated that the mean squares of their differences are too small."""
-    groups = np.flatnonzero(seen.bright & (seen.n_successive > 3) & (seen.clipped <= 0.002))
-    return any(alpha > max(5 * u, 0.005) for alpha, u in (frame_correlation(seen, int(g)) for g in groups))
+    alpha, u = shared_by_frames(seen)
+    return alpha > max(SHARED_Z * u, LEAST_SHARED)
 
 
 def plane_of(values: np.ndarray) -> np.ndarray:

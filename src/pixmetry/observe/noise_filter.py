@@ -38,7 +38,8 @@ from pixmetry.observe.photon_transfer_model import MINIMUM_DARK_VAR_DN2, QUANTIS
 
 MOST_CLIPPED = 0.002  # share of the pixels at the ends of the codes
 FOUND_Z, FOUND_PATTERN_Z = 4.2, 3.5  # of one of the twelve near lags; of the pattern of repelled charge: false in 1e-3 of cameras
-DOUBT_Z = 1.645  # of the nearest neighbours together, or of that pattern: from here on the gain's u holds what they would change
+PRESENT = 0.05  # chance, before anything is measured, that a camera has a filter, repelled charge, or temporal noise reduction
+LARGEST_SHARE, LARGEST_LOSS, LARGEST_ALPHA = 0.2, 0.1, 0.9  # where they would lie, if there: all sizes up to this are taken as equally likely
 FIT_LEVEL = 1e-4  # chance of a worse fit below which a family is refused
 NEAR = tuple(k for k, (j, i) in enumerate(LAGS) if 0 < max(abs(j), abs(i)) <= 2)
 SHARPENING, BLUR, KERNEL, LINE, LOSS = (
@@ -51,8 +52,10 @@ SHARPENING, BLUR, KERNEL, LINE, LOSS = (
 BLUR_RADII = (1, 2, 3)
 REACHES = (0.0, 0.4, 0.7, 1.0)  # px, of the repulsion that is looked for
 SMALL = 0.05  # relative change of the gain up to which a correlation of unknown origin is taken as linear, at a u of its own size
+RIVAL = 5.0  # by how much of χ²/2 another family may fit worse that is not excluded
 MOST_GROWTH = 0.2  # of the correlation, summed, from dark to bright: more than repelled charge does
 RESOLVED = 10.0  # u of the shot variance of a level that counts
+LEAST_DOUBT = 0.1  # of the gain's u: a smaller part adds less than 0.5 % to it
 
 
 @dataclass(frozen=True)
@@ -268,7 +271,8 @@ def _largest_z(part: _ShotPart) -> tuple[float, float]:
         Over `FOUND_Z` for a single near lag, or over `FOUND_PATTERN_Z` for the pattern that repelled charge of any reach makes: the largest
         of these quotients.
     float
-        Change of the factor by the nearest neighbours' correlation, or by that pattern, where one is over `DOUBT_Z`; else 0.
+        Change of the factor by the nearest neighbours' correlation, or by that pattern, in the root mean square of what may be there; see
+        `unseen_rms`.
     """
     near = [k - 1 for k in NEAR]
     single = np.abs(part.constant[near]) / np.sqrt(np.diag(part.constant_covariance)[near])
@@ -283,8 +287,41 @@ def _largest_z(part: _ShotPart) -> tuple[float, float]:
     share = 2 * float(part.constant[beside].sum())
     u_share = 2 * float(np.sqrt(part.constant_covariance[np.ix_(beside, beside)].sum()))
     mean = float((part.shot_dn2**2).sum() / part.shot_dn2.sum() / largest)
-    changes = [loss * mean for loss, z in zip(losses, together, strict=True) if z > DOUBT_Z] + [share] * (abs(share) > DOUBT_Z * u_share)
-    return max(float(single.max()) / FOUND_Z, float(together.max()) / FOUND_PATTERN_Z), max(map(abs, changes), default=0.0)
+    unseen = [unseen_rms(loss, root, LARGEST_LOSS) * mean for loss, root in zip(losses, power**-0.5, strict=True)]
+    doubt = max(*unseen, unseen_rms(share, u_share, LARGEST_SHARE, both_signs=True))
+    return max(float(single.max()) / FOUND_Z, float(together.max()) / FOUND_PATTERN_Z), doubt
+
+
+def unseen_rms(estimate: float, u: float, largest: float, *, both_signs: bool = False) -> float:
+    """Root mean square of an effect that does not stand out of its uncertainty.
+
+    Parameters
+    ----------
+    estimate, u : float
+        Of its size, where it is there.
+    largest : float
+        If it is there, all sizes up to this are equally likely, before anything is measured.
+    both_signs : bool
+        Whether it may be negative.
+
+    Notes
+    -----
+    With the chance `PRESENT` that the effect is there at all, and the likelihoods of the estimate with and without it, Bayes' rule gives
+    the chance P that it is there, and the root mean square is √(P ⟨x²⟩) over the posterior of its size x. An estimate of zero leaves next to
+    nothing, one of two u a part, and one of four u all of it: an effect found in one camera of ten is not taken for one in every camera.
+
+    Examples
+    --------
+    >>> [round(unseen_rms(z * 0.004, 0.004, 0.9), 4) for z in (0, 2, 3, 4)]
+    [0.0001, 0.0008, 0.004, 0.0145]
+    """
+    low = -largest if both_signs else 0.0
+    x = np.linspace(max(low, estimate - 8 * u), max(min(largest, estimate + 8 * u), low), 801)
+    likely = np.exp(-0.5 * ((x - estimate) / u) ** 2)
+    step = x[1] - x[0]
+    odds = PRESENT / (1 - PRESENT) * float(likely.sum()) * step / (largest - low) / max(float(np.exp(-0.5 * (estimate / u) ** 2)), 1e-300)
+    square = float((likely * x**2).sum() / max(float(likely.sum()), 1e-300))
+    return float(np.sqrt(odds / (1 + odds) * square))
 
 
 def _explained(plain: NoiseFilter, part: _ShotPart) -> NoiseFilter:
@@ -293,9 +330,11 @@ def _explained(plain: NoiseFilter, part: _ShotPart) -> NoiseFilter:
     matches = [m for m in (_match(family, part) for family in families) if m.chance > FIT_LEVEL]
     if matches:
         best = min(matches, key=_price)
-        rivals = [m for m in matches if _price(m) < _price(best) + 3.0]
-        doubt = max(abs(m.factor - best.factor) for m in rivals)
-        return _as_found(plain, best, part, doubt)
+        rivals = [m for m in matches if _price(m) < _price(best) + RIVAL]
+        doubt = max(abs(m.factor - best.factor) for m in rivals if m.family.kind == best.family.kind)
+        others = [m for m in rivals if m.family.kind != best.family.kind]
+        other = _as_found(plain, min(others, key=_price), part, 0.0) if others else None
+        return replace(_as_found(plain, best, part, doubt), rival=other)
     growth = _growth(part)
     if part.both.size > len(LAGS) and -3 * growth[1] < growth[0] < MOST_GROWTH:
         filters = [m for m in (_match(f, part, constant_alone=True) for f in families if f.kind == LINEAR) if m.chance > FIT_LEVEL]
@@ -316,7 +355,11 @@ def _price(match: _Match) -> float:
 
 def _as_found(plain: NoiseFilter, best: _Match, part: _ShotPart, doubt: float) -> NoiseFilter:
     """What is known with the family that fits best; repelled charge sees no border."""
-    inner, u_inner = (1.0, 0.0) if best.family.kind == CHARGE else (part.inner, part.u_inner)
+    if best.family.kind == CHARGE:
+        best = _over_reaches(best, part)
+        inner, u_inner = 1.0, 0.0
+    else:
+        inner, u_inner = part.inner, part.u_inner
     fit = Estimates(best.family.names, best.values, best.covariance, np.full(best.values.size, np.inf), best.family.units)
     return replace(
         plain,
@@ -328,6 +371,30 @@ def _as_found(plain: NoiseFilter, best: _Match, part: _ShotPart, doubt: float) -
         row_factor=_line_factor(best.correlation, axis=0),
         column_factor=_line_factor(best.correlation, axis=1),
     )
+
+
+def _over_reaches(best: _Match, part: _ShotPart) -> _Match:
+    """The same with the u of loss and factor over all reaches of the repulsion, each with its likelihood: far from a parabola."""
+    largest = float(part.shot_dn2.max())
+
+    def at(reach: float) -> _Match:
+        def law(p: np.ndarray, shot_dn2: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            return charge_response(p[0] / largest, reach, shot_dn2)
+
+        return _match(_Family(CHARGE, LOSS, ("loss",), ("1",), ((float(best.values[0]),),), (-0.5,), (0.5,), law), part)
+
+    fixed = [at(reach) for reach in np.linspace(0.0, 1.0, 11).tolist()]
+    u_loss = np.array([m.covariance[0, 0] for m in fixed]) ** 0.5
+    weight = u_loss * np.exp(best.cost - np.array([m.cost for m in fixed]))
+    loss, factor = (np.average(squares, weights=weight) for squares in (
+        [(m.values[0] - best.values[0]) ** 2 + m.covariance[0, 0] for m in fixed],
+        [(m.factor - best.factor) ** 2 + m.u_factor**2 for m in fixed],
+    ))  # fmt: skip
+    covariance = best.covariance.copy()
+    covariance[0] *= np.sqrt(loss / covariance[0, 0])
+    covariance[:, 0] = covariance[0]
+    covariance[0, 0] = loss
+    return replace(best, covariance=covariance, u_factor=float(np.sqrt(factor)))
 
 
 def _line_factor(correlation: np.ndarray, axis: int) -> float:
@@ -398,17 +465,32 @@ def before_filter(
 
 
 def fit_unfiltered(
-    series: PhotonTransfer, dark: StackMoments | None, bright: StackMoments | None, dnl_lsb: float, found: NoiseFilter | None
+    series: PhotonTransfer,
+    dark: StackMoments | None,
+    bright: StackMoments | None,
+    dnl_lsb: float,
+    found: NoiseFilter | None,
+    alpha_rms: float = 0.0,
 ) -> Estimates:
     """The joint fit of `fit_photon_transfer` to the variances before the filter, with the filter's u.
+
+    Parameters
+    ----------
+    series : PhotonTransfer
+    dark, bright : StackMoments or None
+    dnl_lsb : float
+    found : NoiseFilter or None
+    alpha_rms : float
+        Share α of the frame before that may be in each frame unseen: the mean squares of differences are then (1 − α)²/(1 + α) ≈ 1 − 3α of
+        those of the camera.
 
     Raises
     ------
     MeasureError
         As there; and behind a filter that is not linear, where no variance tells the gain.
     """
-    if found is None or (found.kind == WHITE and found.u_factor == 0):
-        return fit_photon_transfer(series, dark, bright, dnl_lsb)
+    if found is None:
+        found = NoiseFilter()
     if found.kind == UNKNOWN and abs(found.factor - 1) > SMALL:
         raise MeasureError(
             "the noise of neighbouring pixels is correlated, and not as behind a linear filter: a median or another noise reduction, a "
@@ -418,20 +500,60 @@ def fit_unfiltered(
             allowed="none, or that of a linear filter",
             remedy="take raw frames without noise reduction, sharpening, demosaicking and compression",
         )
-    here = fit_photon_transfer(*before_filter(series, dark, bright, found), dnl_lsb)
-    there = fit_photon_transfer(*before_filter(series, dark, bright, found, found.u_factor), dnl_lsb)
-    change = np.array([there[n].value - here[n].value if n in there and there[n].kind == here[n].kind else 0.0 for n in here.names])
-    times = f"the shot variance before it is {found.factor:.4g} ± {found.u_factor:.2g} times that behind it"
-    why = f"corrected for what correlates neighbouring pixels ({found.name}): {times}"
-    if found.kind == WHITE:
-        why = f"u contains {found.u_factor:.2g} of the shot variance for a correlation of neighbours that is too weak to be told from none"
-    reason = "; ".join(filter(None, (why, here.reasons.get("gain_dn_per_e", ""))))
+    white = found.kind == WHITE
+    frames = (series, dark, bright)
+    unfiltered = frames if white else before_filter(*frames, found)
+    here = fit_photon_transfer(*unfiltered, dnl_lsb)
+    reasons, changes = [], []
+    if not white:
+        times = f"the shot variance before it is {found.factor:.4g} ± {found.u_factor:.2g} times that behind it"
+        reasons.append(f"corrected for what correlates neighbouring pixels ({found.name}): {times}")
+    u_gain = here["gain_dn_per_e"].u / here["gain_dn_per_e"].value
+    if not white or found.u_factor > LEAST_DOUBT * u_gain:
+        changes.append(_change(here, fit_photon_transfer(*before_filter(*frames, found, found.u_factor), dnl_lsb)))
+        if white:
+            what = "a correlation of neighbours that is too weak to be told from none"
+            reasons.append(f"u contains {found.u_factor:.2g} of the shot variance for {what}")
+    if found.rival is not None:
+        changes.append(_change(here, fit_photon_transfer(*before_filter(*frames, found.rival), dnl_lsb)))
+        reasons.append(f"u contains what it would be with another cause that is not excluded ({found.rival.name})")
+    if 3 * alpha_rms > LEAST_DOUBT * u_gain:
+        changes.append(_change(here, fit_photon_transfer(*_scaled(*unfiltered, 1 + 3 * alpha_rms), dnl_lsb)))
+        what = "a correlation of successive frames that is too weak to be told from none (temporal noise reduction)"
+        reasons.append(f"u contains {3 * alpha_rms:.2g} of all variances for {what}")
     here = _with_hidden_noise(here, series, found)
-    dof = effective_dof(np.stack([here.u**2, change**2], axis=1), np.stack([here.dof, np.full(len(here), np.inf)], axis=1))
+    if not changes:
+        return here
     # variances of correlated pixels scatter like those of fewer pixels (Bartlett)
     fewer = float((plane_of(found.correlation) ** 2).sum()) if found.kind == LINEAR else 1.0
-    covariance = fewer * here.covariance + np.outer(change, change)
+    parts = np.stack([fewer * here.u**2, *(c**2 for c in changes)], axis=1)
+    dof = effective_dof(parts, np.stack([here.dof, *(np.full(len(here), np.inf) for _ in changes)], axis=1))
+    covariance = fewer * here.covariance + sum(np.outer(c, c) for c in changes)
+    reason = "; ".join(filter(None, (*reasons, here.reasons.get("gain_dn_per_e", ""))))
     return replace(here, covariance=covariance, dof=dof, reasons={**here.reasons, "gain_dn_per_e": reason})
+
+
+def _change(here: Estimates, there: Estimates) -> Array:
+    """What another assumption makes of the values; 0 where it makes a limit of them."""
+    same = (there[n].value - here[n].value if n in there and there[n].kind == here[n].kind else 0.0 for n in here.names)
+    return np.array(list(same))
+
+
+def _scaled(
+    series: PhotonTransfer, dark: StackMoments | None, bright: StackMoments | None, factor: float
+) -> tuple[PhotonTransfer, StackMoments | None, StackMoments | None]:
+    """All temporal mean squares of pixels, rows and columns times a factor."""
+
+    def scaled(level: L) -> L:
+        return replace(
+            level,
+            ms_pixel_dn2=level.ms_pixel_dn2 * factor,
+            ms_row_dn2=level.ms_row_dn2 * factor,
+            ms_col_dn2=level.ms_col_dn2 * factor,
+        )
+
+    stacks = [None if stack is None else scaled(stack) for stack in (dark, bright)]
+    return replace(series, dark=scaled(series.dark), bright=scaled(series.bright)), stacks[0], stacks[1]
 
 
 def _with_hidden_noise(fit: Estimates, series: PhotonTransfer, found: NoiseFilter) -> Estimates:

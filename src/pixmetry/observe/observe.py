@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pixmetry.camera.noise_covariance import WHITE, NoiseCovariance, NoiseFilter, frames_share_noise
+from pixmetry.camera.noise_covariance import WHITE, NoiseCovariance, NoiseFilter, frames_share_noise, shared_by_frames
 from pixmetry.camera.observations import (
     CodeErrors,
     CodeHistogram,
@@ -30,7 +30,7 @@ from pixmetry.observe.histogram import HistogramAccumulator, code_errors, sweep_
 from pixmetry.observe.linearity import Linearity
 from pixmetry.observe.moments import LevelSummary
 from pixmetry.observe.noise_covariance import CorrelatedGroup, FrameSuccession, LagProducts, noise_covariance
-from pixmetry.observe.noise_filter import find_noise_filter, fit_unfiltered
+from pixmetry.observe.noise_filter import LARGEST_ALPHA, find_noise_filter, fit_unfiltered, unseen_rms
 from pixmetry.observe.one_pass import Group, Level, photon_transfer, reduce_groups, refuse_copies, without_levels
 from pixmetry.observe.patterns import find_phase_patterns
 from pixmetry.observe.photon_transfer_levels import (
@@ -199,7 +199,9 @@ def _transfer_fit(
                 where="photon transfer",
                 remedy="switch temporal noise reduction off",
             )
-        return fit_unfiltered(transfer, dark, bright, dnl_lsb, noise_filter)
+        alpha, u_alpha = (0.0, np.inf) if noise is None else shared_by_frames(noise)
+        unseen = unseen_rms(alpha, u_alpha, LARGEST_ALPHA) if np.isfinite(u_alpha) else 0.0
+        return fit_unfiltered(transfer, dark, bright, dnl_lsb, noise_filter, unseen)
     except MeasureError as problem:
         straight = is_short(transfer) and independent and (noise_filter is None or noise_filter.kind == WHITE)
         found = partial_transfer(transfer, dark, straight=straight)
