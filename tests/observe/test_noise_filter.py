@@ -43,7 +43,8 @@ def test_covariance_is_that_of_plain_sums(rng):
     noise = ((second.astype(float) - first) / np.sqrt(2))[5:-5, 5:-5]  # without the margin of an eighth of the rows
     noise -= noise.mean(axis=1, keepdims=True)
     noise -= noise.mean(axis=0)
-    sums = lag_products(first, second)
+    sums, mean = lag_products(first, second)
+    assert mean == pytest.approx(first[5:-5, 5:-5].mean())
     for j, i in ((0, 0), (0, 1), (2, -3), (4, 4)):
         for r in (0, 1):
             for c in (0, 1):
@@ -57,7 +58,7 @@ def test_covariance_of_small_frames_has_no_bias(rng):
     products = LagProducts()
     for k in range(400):
         first, second = (np.rint(rng.normal(2000, 20, (24, 20))).astype(np.uint16) for _ in range(2))
-        products.add(k, lag_products(first, second), first)
+        products.add(k, *lag_products(first, second), first.shape)
     mean = products.covariance_dn2().mean(axis=(0, 1))
     u = 400 / np.sqrt(400 * 24 * 20)
     # the correction itself has noise: over 60 repetitions the values scatter by 1.7 u, not by √2 u and u

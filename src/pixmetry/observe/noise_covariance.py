@@ -9,7 +9,7 @@ import numpy as np
 
 from pixmetry.camera.noise_covariance import LAGS, REACH, NoiseCovariance, plane_of
 from pixmetry.core.arrays import Array
-from pixmetry.observe._covariance_kernels import sum_lag_products
+from pixmetry.observe._covariance_kernels import sum_differences, sum_lag_products
 
 MARGIN_PX = 8
 FIRST_FRAME, MOST_FRAMES = 4, 32  # of a stack whose succession is looked at; the first ones may hold what was before them
@@ -24,12 +24,12 @@ class LagProducts:
     margin_px: int = 0
     shape: tuple[int, int] = (0, 0)  # of the frames, without their margin
 
-    def add(self, pair: int, products: np.ndarray, first: np.ndarray) -> None:
-        """Add the products of one pair of frames, of which this is the first."""
-        m = margin_px(first.shape)
+    def add(self, pair: int, products: np.ndarray, mean_dn: float, shape: tuple[int, ...]) -> None:
+        """Add the products of one pair of frames of a shape, and the mean of its first frame inside of the margin."""
+        m = margin_px(shape)
         self.by_pair[pair] = products
-        self.margin_px, self.shape = m, (first.shape[0] - 2 * m, first.shape[1] - 2 * m)
-        self._means[pair] = float(first[m : first.shape[0] - m, m : first.shape[1] - m].mean())
+        self.margin_px, self.shape = m, (shape[0] - 2 * m, shape[1] - 2 * m)
+        self._means[pair] = mean_dn
 
     def mean_dn(self) -> float:
         """Mean of the frames inside of the margin, DN."""
@@ -95,11 +95,12 @@ class FrameSuccession:
 
 def white_square(first: np.ndarray, second: np.ndarray) -> float:
     """Half the mean square of the difference of two frames, DN², without what rows and columns have in common."""
-    noise = np.subtract(second, first, dtype=np.float32)
-    noise -= noise.mean(axis=1, dtype=float)[:, None].astype(np.float32)
-    noise -= noise.mean(axis=0, dtype=float).astype(np.float32)
-    rows, cols = noise.shape
-    return float(np.einsum("ij,ij->", noise, noise, dtype=float)) / (2 * (rows - 1) * (cols - 1))
+    rows, cols = first.shape
+    of_rows, of_cols = np.empty(rows, np.int64), np.empty(cols, np.int64)
+    squares = sum_differences(first, second, of_rows, of_cols)
+    total, by_row, by_col = float(of_rows.sum()), float((of_rows.astype(float) ** 2).sum()), float((of_cols.astype(float) ** 2).sum())
+    white = squares - (rows * by_row + cols * by_col - total**2) / (rows * cols)
+    return white / (2 * (rows - 1) * (cols - 1))
 
 
 def _counts(shape: tuple[int, int]) -> np.ndarray:
@@ -116,7 +117,7 @@ def margin_px(shape: tuple[int, ...]) -> int:
     return min(MARGIN_PX, min(shape) // 8)
 
 
-def lag_products(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+def lag_products(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, float]:
     """Products of the noise of two frames at small lags.
 
     Parameters
@@ -127,19 +128,12 @@ def lag_products(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     -------
     ndarray, shape (2, 2, 5, 9), float64, DN²
         Of their difference over √2 inside of the margin, less its row and column means; see `sum_lag_products`.
+    float
+        Mean of the first frame inside of the margin, DN.
     """
-    m = margin_px(first.shape)
-    inner = slice(m, first.shape[0] - m), slice(m, first.shape[1] - m)
-    rows, cols = first.shape[0] - 2 * m, first.shape[1] - 2 * m
-    padded = np.zeros((rows + REACH, cols + 2 * REACH), np.float32)
-    noise = padded[:rows, REACH : REACH + cols]
-    np.subtract(second[inner], first[inner], out=noise, dtype=np.float32)
-    noise -= noise.mean(axis=1, dtype=float)[:, None].astype(np.float32)
-    noise -= noise.mean(axis=0, dtype=float).astype(np.float32)
     sums = np.empty((2, 2, REACH + 1, 2 * REACH + 1))
-    sum_lag_products(padded, rows, cols, sums)
-    halves: Array = sums / 2
-    return halves
+    mean = sum_lag_products(first, second, margin_px(first.shape), sums)
+    return sums / 2, mean
 
 
 @dataclass(frozen=True)

@@ -39,7 +39,7 @@ from pixmetry.observe.photon_transfer_model import MINIMUM_DARK_VAR_DN2, QUANTIS
 MOST_CLIPPED = 0.002  # share of the pixels at the ends of the codes
 FOUND_Z, FOUND_PATTERN_Z = 4.2, 3.5  # of one of the twelve near lags; of the pattern of repelled charge: false in 1e-3 of cameras
 PRESENT = 0.05  # chance, before anything is measured, that a camera has a filter, repelled charge, or temporal noise reduction
-LARGEST_SHARE, LARGEST_LOSS, LARGEST_ALPHA = 0.2, 0.1, 0.9  # where they would lie, if there: all sizes up to this are taken as equally likely
+LARGEST_SHARE, LARGEST_LOSS, LARGEST_ALPHA = 0.2, 0.1, 0.9  # if there: all sizes up to this are equally likely
 FIT_LEVEL = 1e-4  # chance of a worse fit below which a family is refused
 NEAR = tuple(k for k, (j, i) in enumerate(LAGS) if 0 < max(abs(j), abs(i)) <= 2)
 SHARPENING, BLUR, KERNEL, LINE, LOSS = (
@@ -306,9 +306,9 @@ def unseen_rms(estimate: float, u: float, largest: float, *, both_signs: bool = 
 
     Notes
     -----
-    With the chance `PRESENT` that the effect is there at all, and the likelihoods of the estimate with and without it, Bayes' rule gives
+    With the chance `PRESENT` that the effect is there, and the likelihoods of the estimate with and without it, Bayes' rule gives
     the chance P that it is there, and the root mean square is √(P ⟨x²⟩) over the posterior of its size x. An estimate of zero leaves next to
-    nothing, one of two u a part, and one of four u all of it: an effect found in one camera of ten is not taken for one in every camera.
+    nothing, one of two u a part, and one of four u all of it: what one camera in twenty has is not taken for what every one has.
 
     Examples
     --------

@@ -133,9 +133,9 @@ class _Sums:
             for key, first, second in due:
                 self.succession.put(key, white_square(first, second))
         if self.lags and len(own) == 2:  # frames that were summed have the right shape
-            products = lag_products(own[0], own[1])
+            products, mean = lag_products(own[0], own[1])
             with self._lock:
-                self.products.add(first_index // 2, products, own[0])
+                self.products.add(first_index // 2, products, mean, own[0].shape)
 
     def result(self) -> Reduced:
         if self.summary is not None:
