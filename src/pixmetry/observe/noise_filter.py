@@ -306,14 +306,14 @@ def unseen_rms(estimate: float, u: float, largest: float, *, both_signs: bool = 
 
     Notes
     -----
-    With the chance `PRESENT` that the effect is there, and the likelihoods of the estimate with and without it, Bayes' rule gives
-    the chance P that it is there, and the root mean square is √(P ⟨x²⟩) over the posterior of its size x. An estimate of zero leaves next to
-    nothing, one of two u a part, and one of four u all of it: what one camera in twenty has is not taken for what every one has.
+    With the chance `PRESENT` that the effect is there, and the likelihoods of the estimate with and without it, Bayes' rule gives the chance
+    P of it, and the root mean square is √(P ⟨x²⟩) over the posterior of its size x. An estimate of zero leaves next to nothing, one of two
+    u a part, and one of four u all of it: what one camera in twenty has is not taken for what every one has.
 
     Examples
     --------
     >>> [round(unseen_rms(z * 0.004, 0.004, 0.9), 4) for z in (0, 2, 3, 4)]
-    [0.0001, 0.0008, 0.004, 0.0145]
+    [0.0001, 0.0006, 0.0028, 0.0132]
     """
     low = -largest if both_signs else 0.0
     x = np.linspace(max(low, estimate - 8 * u), max(min(largest, estimate + 8 * u), low), 801)
