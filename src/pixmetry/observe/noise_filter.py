@@ -306,9 +306,9 @@ def unseen_rms(estimate: float, u: float, largest: float, *, both_signs: bool = 
 
     Notes
     -----
-    With the chance `PRESENT` that the effect is there, and the likelihoods of the estimate with and without it, Bayes' rule gives the chance
-    P of it, and the root mean square is √(P ⟨x²⟩) over the posterior of its size x. An estimate of zero leaves next to nothing, one of two
-    u a part, and one of four u all of it: what one camera in twenty has is not taken for what every one has.
+    With the chance `PRESENT` that the effect is there, and the likelihoods of the estimate with and without it, Bayes' rule gives the
+    chance P of it; the root mean square is √(P ⟨x²⟩) over the posterior of its size x. An estimate of zero leaves next to nothing, one of
+    two u a part, and one of four u all of it: what one camera in twenty has is not taken for what every one has.
 
     Examples
     --------
