@@ -281,7 +281,7 @@ def observe_campaign(campaign: Campaign, progress: Progress) -> tuple[InputHashe
 
     reader = FrameReader(campaign)
 
-    chosen = campaign.groups if campaign.camera.cfa is None else campaign.field_groups
+    chosen = [g for g in campaign.groups if campaign.camera.cfa is None or g.kind != "edge"]
     note = "edges are not measured through a colour mosaic: a step of brightness looks jagged there"
     left_out = (note,) if len(chosen) < len(campaign.groups) else ()
 
@@ -290,7 +290,8 @@ def observe_campaign(campaign: Campaign, progress: Progress) -> tuple[InputHashe
             yield Group(g.kind, g.role, g.exposure_s, g.photons, [partial(reader.fetch, path) for path in g.paths], g.facts)
 
     seen = observe(groups(), campaign.bits, campaign.camera.temperature_c, on_frames=on_frames)
-    return reader.hashes, replace(seen, storage=reader.storage, notes=(*campaign.findings, *left_out, *seen.notes))
+    notes = (*campaign.findings, *left_out, *seen.notes)
+    return reader.hashes, replace(seen, storage=reader.storage, sensor=campaign.camera.sensor, notes=notes)
 
 
 def by_the_standard(campaign: Campaign, observations: Observations) -> Results:

@@ -11,7 +11,7 @@ from pixmetry.assess.self_test import SelfTest
 from pixmetry.budget.monte_carlo import Crop
 from pixmetry.budget.records import SUM, Budget
 from pixmetry.camera.camera import Camera
-from pixmetry.camera.observations import EdgeResponse, Observations, SlantedEdges, StackMoments
+from pixmetry.camera.observations import EdgeResponse, LightSteps, Observations, SlantedEdges, StackMoments
 from pixmetry.core.number import Estimates
 from pixmetry.emva.files.json_format import value_record
 from pixmetry.emva.records import Results
@@ -93,6 +93,7 @@ class Assessment:
                 "confounders": list(fit.confounders),
             },
             "spatial": self.observations.spatial_fit.to_records() if self.observations.spatial_fit is not None else [],
+            "light_off": None if self.observations.light_off is None else light_off_record(self.observations.light_off),
             "edges": None if self.observations.edges is None else edges_record(self.observations.edges),
             "emva1288": {
                 "release": self.standard.release,
@@ -173,6 +174,24 @@ def edges_record(found: SlantedEdges) -> dict[str, Any]:
         "y": mean(found.y),
         "edges": [{k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in e.items()} for e in each],
     }
+
+
+def light_off_record(found: LightSteps) -> dict[str, Any]:
+    """The plain record of sequences in which the light went off."""
+    each = [
+        {
+            "bright_frames": s.bright_frames,
+            "signal_dn": s.signal_dn,
+            "shares": s.shares.tolist(),
+            "u_first_two": list(s.u_shares),
+            "noise_correlation": s.noise_correlation if np.isfinite(s.u_noise_correlation) else None,
+            "levels_dn": s.levels_dn.tolist(),
+            "left_dn": s.left_dn.tolist(),
+            "u_left_dn": np.sqrt(np.diag(s.left_covariance_dn2)).tolist(),
+        }
+        for s in found.steps
+    ]
+    return {"values": found.fit.to_records(), "refused": list(found.refused), "sequences": each}
 
 
 def _response_map(dark: StackMoments, bright: StackMoments, mask: np.ndarray) -> np.ndarray:

@@ -160,16 +160,32 @@ def sampling_covariance(autocovariance: np.ndarray) -> np.ndarray:
 
 
 def frame_correlation(seen: NoiseCovariance, group: int) -> tuple[float, float]:
-    """Correlation α of the noise of successive frames of one stack, if each frame holds a share α of the one before; and its u.
+    """Correlation α of the noise of successive frames of one stack, and its u; pixels that neighbours correlate count for fewer."""
+    pooled = seen.pooled_dn2()[group]
+    fewer = float((plane_of(pooled) ** 2).sum() / pooled[0] ** 2)
+    one, two = seen.successive_dn2[group]
+    return successive_correlation(float(one), float(two), int(seen.n_successive[group]), float(np.prod(seen.frame_shape)) / fewer)
 
+
+def successive_correlation(one_dn2: float, two_dn2: float, frames: int, pixels: float) -> tuple[float, float]:
+    """Correlation α of the noise of successive frames, if each frame holds a share α of the one before; and its u.
+
+    Parameters
+    ----------
+    one_dn2, two_dn2 : float
+        Half the mean square of the differences of frames one and two apart.
+    frames : int
+    pixels : float
+        Independent ones.
+
+    Notes
+    -----
     With D_j half the mean square of differences j frames apart, D₂/D₁ = (1 − α²)/(1 − α) = 1 + α. The rounding of every frame, 1/12, is
-    no part of that. u is that of the ratio of two quadratic forms of normal noise, Var xᵀAx = 2 tr(AΣAΣ), for independent pixels; pixels
-    that neighbours correlate count for fewer. A share too small to move a code is rounded away: that may take up to twice the rounding's
-    share of the noise from α, and enters u.
+    no part of that. u is that of the ratio of two quadratic forms of normal noise, Var xᵀAx = 2 tr(AΣAΣ), for independent pixels.
+    A share too small to move a code is rounded away: that may take up to twice the rounding's share of the noise from α, and enters u.
     """
-    one, two = np.maximum(seen.successive_dn2[group] - 1 / 12, 1e-9)
+    one, two = np.maximum(np.array([one_dn2, two_dn2]) - 1 / 12, 1e-9)
     alpha = two / one - 1
-    frames = int(seen.n_successive[group])
     held = float(np.clip(alpha, -0.9, 0.98))
     scale = one / (1 - held)  # variance of the noise
     sigma = scale * held ** np.abs(np.subtract.outer(np.arange(frames), np.arange(frames))) + np.eye(frames) / 12
@@ -178,10 +194,8 @@ def frame_correlation(seen: NoiseCovariance, group: int) -> tuple[float, float]:
         steps = np.eye(frames - lag, frames, lag) - np.eye(frames - lag, frames)
         forms.append(steps.T @ steps / (2 * (frames - lag)))
     ratio = (forms[1] - (1 + alpha) * forms[0]) / one @ sigma
-    pooled = seen.pooled_dn2()[group]
-    fewer = float((plane_of(pooled) ** 2).sum() / pooled[0] ** 2)
-    scatter = float(np.sqrt(2 * np.trace(ratio @ ratio) * fewer / np.prod(seen.frame_shape)))
-    return alpha, float(np.hypot(scatter, ROUNDED_AWAY / 12 / one))
+    scatter = float(np.sqrt(2 * np.trace(ratio @ ratio) / pixels))
+    return float(alpha), float(np.hypot(scatter, ROUNDED_AWAY / 12 / one))
 
 
 SHARED_Z, LEAST_SHARED = 5.0, 0.005

@@ -287,6 +287,50 @@ class SlantedEdges:
     optics: Estimates
 
 
+@dataclass(frozen=True)
+class LightStep:
+    """One sequence of frames in which the light went off.
+
+    Parameters
+    ----------
+    bright_frames : int
+        Frames before the step.
+    signal_dn : float
+        Mean light of the last bright frame, where it is lit.
+    shares : ndarray, shape (frames after the step,)
+        What each of them shows of the last bright frame, over that.
+    u_shares : tuple of float
+        Standard uncertainty of the first two.
+    dof : float
+    noise_correlation, u_noise_correlation : float
+        Correlation of the noise of successive dark frames; its u is infinite where there is too little noise.
+    levels_dn, left_dn : ndarray, shape (levels,)
+        Places of like light: the light, and what the first dark frame shows of it.
+    left_covariance_dn2 : ndarray, shape (levels, levels)
+        Of ``left_dn``.
+    """
+
+    bright_frames: int
+    signal_dn: float
+    shares: np.ndarray
+    u_shares: tuple[float, float]
+    dof: float
+    noise_correlation: float
+    u_noise_correlation: float
+    levels_dn: np.ndarray
+    left_dn: np.ndarray
+    left_covariance_dn2: np.ndarray
+
+
+@dataclass(frozen=True)
+class LightSteps:
+    """All sequences in which the light went off, why others were refused, and ``left_rel``: the share that the next frame shows."""
+
+    steps: tuple[LightStep, ...]
+    refused: tuple[str, ...]
+    fit: Estimates
+
+
 LENS, AFFINITY = "optics.distortion", "sensor.affinity"
 TAKEN_UP = (LENS, AFFINITY, "optics.cover_glass", "sensor.pixel_pitch", "sensor.tilt")  # by a calibration, in the first two
 
@@ -355,6 +399,8 @@ class Observations:
     patterns: PatternList | None = None
     code_errors: CodeErrors | None = None
     edges: SlantedEdges | None = None
+    light_off: LightSteps | None = None
+    sensor: str | None = None  # ccd, cmos or cid, where it was said
     noise_covariance: NoiseCovariance | None = None
     noise_filter: NoiseFilter | None = None
     temperature_c: float | None = None

@@ -9,6 +9,7 @@ from pixmetry.camera.observations import Observations
 from pixmetry.observe.edge_fit import fit_edges
 from pixmetry.observe.edges import Picture, edge_notes, motion_notes, responses_of, search_edges
 from pixmetry.observe.experiment import Experiment, PictureGroup
+from pixmetry.observe.light_off import BlockMeans, reduce_light_off
 
 
 def reduce_edges(groups: Sequence[PictureGroup], seen: Observations) -> Observations:
@@ -19,7 +20,7 @@ def reduce_edges(groups: Sequence[PictureGroup], seen: Observations) -> Observat
     return replace(seen, edges=edges, notes=(*seen.notes, *edge_notes(edges), *motion_notes(pictures, search)))
 
 
-EXPERIMENTS = {e.kind: e for e in (Experiment("edge", reduce_edges),)}
+EXPERIMENTS = {e.kind: e for e in (Experiment("edge", reduce_edges), Experiment("light_off", reduce_light_off, BlockMeans))}
 
 
 def reduce_pictures(groups: Iterable[PictureGroup], seen: Observations) -> Observations:

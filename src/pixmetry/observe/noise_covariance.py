@@ -56,15 +56,22 @@ class LagProducts:
 
 
 class FrameSuccession:
-    """Differences of frames one and two apart; frames may come in any order, and few are held."""
+    """Differences of frames one and two apart; frames may come in any order, and few are held.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    first, most : int
+        The first frame that is looked at, and how many.
+    """
+
+    def __init__(self, first: int = FIRST_FRAME, most: int = MOST_FRAMES) -> None:
+        self._first, self._most = first, most
         self._waiting: dict[int, np.ndarray] = {}
         self._squares: dict[tuple[int, int], float] = {}  # by first frame and distance
 
     def due(self, index: int, frame: np.ndarray) -> list[tuple[tuple[int, int], np.ndarray, np.ndarray]]:
         """Pairs of frames whose difference is now to be taken, with their keys for `put`."""
-        if not FIRST_FRAME <= index < FIRST_FRAME + MOST_FRAMES:
+        if not self._first <= index < self._first + self._most:
             return []
         waiting = self._waiting
         waiting[index] = frame
@@ -72,7 +79,7 @@ class FrameSuccession:
         found = [((i, lag), waiting[i], waiting[i + lag]) for i, lag in keys]
         around = range(index - 2, index + 3)
         for i in around:  # a frame with all of its neighbours is no longer needed
-            if all(j in waiting or (j, -1) in self._squares for j in (i - 2, i - 1, i, i + 1, i + 2) if j >= FIRST_FRAME):
+            if all(j in waiting or (j, -1) in self._squares for j in (i - 2, i - 1, i, i + 1, i + 2) if j >= self._first):
                 self._squares[i, -1] = 0.0
         for i in [i for i in waiting if (i, -1) in self._squares]:
             del waiting[i]

@@ -88,9 +88,11 @@ def _plots(assessment: Assessment) -> Section:
 def _pictures(assessment: Assessment) -> list[Section]:
     """A section for each kind of pictures."""
     from pixmetry.assess.page.edges import edges_section
+    from pixmetry.assess.page.light_off import light_off_section
 
     seen = assessment.observations
-    return [] if seen.edges is None else [edges_section(seen.edges)]
+    edges = [] if seen.edges is None else [edges_section(seen.edges)]
+    return [*edges, *([] if seen.light_off is None else [light_off_section(seen.light_off)])]
 
 
 def _values(assessment: Assessment) -> Section:

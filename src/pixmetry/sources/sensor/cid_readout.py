@@ -7,9 +7,11 @@ from collections.abc import Mapping
 import numpy as np
 
 from pixmetry.camera.contribution import Contribution, Probe
+from pixmetry.camera.observations import Observations, of_pictures
 from pixmetry.camera.signal import Kind, Signal, Windows
 from pixmetry.camera.source import Parameters, Source, quantity
-from pixmetry.core.errors import ParameterError
+from pixmetry.core.errors import MeasureError, ParameterError
+from pixmetry.core.number import Estimates
 from pixmetry.core.random import Grid, Stream
 
 ITERATIONS = 6
@@ -119,6 +121,21 @@ def propagate(params: CidReadout, probe: Probe) -> Contribution:
     )
 
 
+def measure(observations: Observations) -> Estimates:
+    """Share of the charge that remains after clearing, from frames in which the light goes off; only of a camera that is stated as CID."""
+    if observations.sensor != "cid":
+        what = "the camera is not stated to be a charge injection device"
+        raise MeasureError(what, where="sensor.cid_readout", remedy="if it is one, write sensor: cid under camera")
+    steps = observations.light_off
+    return of_pictures(
+        None if steps is None else steps.fit,
+        {"residual": "left_rel"},
+        where="sensor.cid_readout",
+        pictures="a light that goes off",
+        kind="light_off",
+    )
+
+
 SOURCE = Source(
     id="sensor.cid_readout",
     title="Read-out of a charge injection device",
@@ -135,6 +152,7 @@ SOURCE = Source(
     forward=forward,
     start=start,
     context=context,
+    measure=measure,
     correct=correct,
     propagate=propagate,
     option="a charge injection device",
@@ -144,5 +162,4 @@ SOURCE = Source(
     references=("J. R. Janesick, Scientific Charge-Coupled Devices, SPIE Press 2001, ch. 6 (averaging of samples)",),
     leaves="the noise of the reset and of the lines",
     advice="Increase the number of reads until the noise falls no further. Clear twice after a bright frame.",
-    reasons={"measure": "needs the noise at several numbers of reads, and one bright spot on a dark field for the cross-talk"},
 )
