@@ -68,7 +68,7 @@ def flat_frames(rng: np.random.Generator, shape: tuple[int, int] = (96, 128)) ->
 
 
 def test_the_share_is_found_within_its_u(rng: np.random.Generator):
-    """40 cameras with noise common to a frame or not: χ² and mean of the z, mapped from t to normal, 1e-6 each; finds 60 % of u, and 0.8 u."""
+    """40 cameras with noise common to a frame or not: χ² and mean of the z, 1e-6 each; finds 60 % of u, and 0.8 u."""
     z = []
     for k in range(40):
         lag = float(np.exp(rng.uniform(np.log(0.004), np.log(0.08))))
