@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cache, lru_cache
 from typing import Any
 
 import numpy as np
@@ -254,6 +254,21 @@ def group_delay_s(zeros: Any, poles: Any) -> float:
     """Group delay of a filter at frequency 0 in s, −H'(0)/H(0) = Σ 1/z − Σ 1/p."""
     z, p = (np.asarray(v, complex).reshape(-1) for v in (zeros, poles))
     return float((1 / z).sum().real - (1 / p).sum().real)
+
+
+@cache
+def low_pass_poles(kind: str, order: int) -> np.ndarray:
+    """Poles of a low-pass filter of cut-off 1 rad/s: ``rc`` (a chain of equal stages), ``butterworth`` or ``bessel``; none where ``off``."""
+    if kind == "off":
+        return np.zeros(0, complex)
+    if kind == "rc":
+        return -np.ones(order, complex)
+    if kind == "butterworth":
+        unit_poles: np.ndarray = np.exp(1j * np.pi * (0.5 + (np.arange(order) + 0.5) / order))
+        return unit_poles
+    from scipy.signal import besselap
+
+    return np.asarray(besselap(order, norm="mag")[1], complex)
 
 
 def reach_px(zeros: Any, poles: Any, share: float, pixel_hz: float = 14.1875e6) -> int:

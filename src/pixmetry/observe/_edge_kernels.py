@@ -315,3 +315,35 @@ def edge_normal(
         for j in range(i):
             matrix[j, i] = matrix[i, j]
     return total
+
+
+@jit
+def line_taps(poles: Array, residues: Array, delays: Array, amplitudes: Array, taps: Array) -> None:
+    """What each sample of a video line has of the pixels before it.
+
+    Parameters
+    ----------
+    poles, residues : ndarray, shape (k,), complex
+        Of the filters, in radians per pixel period: the response to a step is 1 − Σ residue e^(pole t). None: a ramp over one period.
+    delays, amplitudes : ndarray, shape (e,)
+        Of all paths, in pixel periods.
+    taps : ndarray, shape (n,)
+        Set to S(k + ½) − S(k − ½), with S the response to a step over all paths.
+    """
+    before = 0.0
+    for k in range(-1, taps.size):
+        total = 0.0
+        for e in range(delays.size):
+            t = k + 0.5 - delays[e]
+            if poles.size == 0:
+                total += amplitudes[e] * min(max(t + 0.5, 0.0), 1.0)
+            elif t > 0:
+                value = 1.0
+                for i in range(poles.size):
+                    # the real part; the other half of a conjugate pair has the same
+                    angle = poles[i].imag * t
+                    value -= math.exp(poles[i].real * t) * (residues[i].real * math.cos(angle) - residues[i].imag * math.sin(angle))
+                total += amplitudes[e] * value
+        if k >= 0:
+            taps[k] = total - before
+        before = total

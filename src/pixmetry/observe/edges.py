@@ -24,6 +24,9 @@ STEP_PX = 0.25  # of the bins, as in ISO 12233
 FREQUENCY = np.linspace(0.0, 2.0, 101)  # cycles/px
 LEAST_ROWS, LEAST_CHAIN = 30, 12  # of an edge that is measured; of one that is mentioned
 LEAST_HALF_PX, MOST_HALF_PX = 12.0, 20.0
+MOST_RIGHT_PX = 40.0  # to the right of an edge, as far as another allows: echoes of a video line come so late
+LINE_START_PX = 30  # columns at the left of an analogue picture that are left out: the line comes from black there
+GHOST_SHARE = 0.35  # of an edge's slope: weaker steps behind it, on a video line, are its own echo or ringing
 LEAST_ANGLE_DEG, MOST_ANGLE_DEG = 1.5, 12.0
 LEAST_SNR = 20.0  # height over noise
 CLIPPED_SHARE = 0.002
@@ -84,6 +87,10 @@ class Region:
         Half width, along the normal.
     slope, u_slope : float
         Columns per row in the middle.
+    right_px : float
+        How far to the right, along the normal, there is no other edge, up to `MOST_RIGHT_PX`.
+    scatter_px : float
+        Standard deviation of the rows' places about the polynomial.
     """
 
     frame: Singles
@@ -95,6 +102,8 @@ class Region:
     half_px: float
     slope: float
     u_slope: float
+    right_px: float = LEAST_HALF_PX
+    scatter_px: float = 0.0
 
     @property
     def centre(self) -> Array:
@@ -125,12 +134,14 @@ class Search:
     refused: tuple[RefusedEdge, ...]
 
 
-def search_edges(pictures: Sequence[Picture]) -> Search:
+def search_edges(pictures: Sequence[Picture], analogue: bool = False) -> Search:
     """Find the slanted edges of pictures.
 
     Parameters
     ----------
     pictures : sequence of Picture
+    analogue : bool
+        Whether they came over a video line: then the first 30 columns are left out, and weak steps behind an edge are its echoes.
 
     Returns
     -------
@@ -149,7 +160,7 @@ def search_edges(pictures: Sequence[Picture]) -> Search:
         for across in ("x", "y"):
             frame = picture.data if across == "x" else np.ascontiguousarray(picture.data.T)
             chains = _chains(frame)
-            for result in map_tiles(partial(_measured, frame, picture, number, across, chains), chains.long):
+            for result in map_tiles(partial(_measured, frame, picture, number, across, chains, analogue), chains.long):
                 if isinstance(result, RefusedEdge):
                     refused.append(result)
                 else:
@@ -206,6 +217,7 @@ class _Chains:
 
     row: Ints
     col: Array
+    size: Array
     chain: Ints
     order: Ints  # of the steps by chain, then row
     start: Ints  # first of each chain in that order, and the end
@@ -233,7 +245,7 @@ def _chains(frame: Singles) -> _Chains:
     count = link_steps(row, col, size, chain)
     order = np.argsort(chain, kind="stable")
     start = np.searchsorted(chain[order], np.arange(count + 1))
-    return _Chains(row, col, chain, order, start, np.flatnonzero(np.diff(start) >= LEAST_CHAIN))
+    return _Chains(row, col, size, chain, order, start, np.flatnonzero(np.diff(start) >= LEAST_CHAIN))
 
 
 def _threshold(frame: Singles) -> float:
@@ -249,13 +261,13 @@ def _threshold(frame: Singles) -> float:
 
 
 def _measured(
-    frame: Singles, picture: Picture, number: int, across: str, chains: _Chains, chain: int
+    frame: Singles, picture: Picture, number: int, across: str, chains: _Chains, analogue: bool, chain: int
 ) -> tuple[Region, Spread] | RefusedEdge:
     """Measure the edge of one chain, or say why not."""
     row, col = chains.steps(chain)
     slope = _robust_slope(row, col)
     try:
-        region = _region(frame, number, across, chain, chains)
+        region = _region(frame, number, across, chain, chains, analogue)
         _check_light(region, picture)
         spread = _spread_of(region)
         if abs(spread.height) < LEAST_SNR * spread.noise_dn:
@@ -273,18 +285,20 @@ def _robust_slope(row: Ints, col: Array) -> float:
     return float(np.median((col[half:] - col[: len(col) - half]) / np.maximum(row[half:] - row[: len(row) - half], 1)))
 
 
-def _region(frame: Singles, number: int, across: str, chain: int, chains: _Chains) -> Region:
+def _region(frame: Singles, number: int, across: str, chain: int, chains: _Chains, analogue: bool) -> Region:
     """Rows, width and line of an edge, after the checks that need no light."""
     row, col = chains.steps(chain)
     slope = _robust_slope(row, col)
     angle = abs(float(np.degrees(np.arctan(slope))))
     if angle < LEAST_ANGLE_DEG or angle > MOST_ANGLE_DEG:
         raise _Refused(f"the angle is {angle:.1f} degrees (allowed: {LEAST_ANGLE_DEG:g} to {MOST_ANGLE_DEG:g})")
-    half = _free_half(frame, chain, chains, slope)
+    half, right = _free_reach(frame, chain, chains, slope, analogue and across == "x")
     first, end = int(row[0]), int(row[-1]) + 1
     trim = 4 + int(np.ceil(0.25 * half))
     first = first + trim if first > 2 else first - 1
     end = end - trim if end < frame.shape[0] - 2 else end + 1
+    if analogue and across == "y":
+        first = max(first, LINE_START_PX)
     rows = end - first
     if rows < LEAST_ROWS:
         raise _Refused(f"it is too short: {max(rows, 0)} rows without its ends (at least {LEAST_ROWS})")
@@ -292,26 +306,36 @@ def _region(frame: Singles, number: int, across: str, chain: int, chains: _Chain
     t = (row - (first + 0.5 * (rows - 1))) / (0.5 * (rows - 1))
     line[1] = slope * 0.5 * (rows - 1)
     line[0] = float(np.median(col - line[1] * t))
-    region = Region(frame, number, across, first, line, rows, half, slope, 0.0)
+    region = Region(frame, number, across, first, line, rows, half, slope, 0.0, right)
     return _refined(region)
 
 
-def _free_half(frame: Singles, chain: int, chains: _Chains, slope: float) -> float:
-    """How far from the edge there is no other edge and no border of the frame."""
+def _free_reach(frame: Singles, chain: int, chains: _Chains, slope: float, on_line: bool) -> tuple[float, float]:
+    """How far from the edge there is no other edge and no border of the frame: to both sides, and to the right."""
     row, col = chains.steps(chain)
     a, b = np.searchsorted(chains.row, [row[0] + 8, row[-1] - 7])
     cosine = 1 / np.hypot(1, slope)
     offset = float(np.median(col - slope * row))
-    away = np.abs(chains.col[a:b] - offset - slope * chains.row[a:b])[chains.chain[a:b] != chain] * cosine
-    near = np.sort(away[(away > 2) & (away < MOST_HALF_PX + 6)])
+    others = chains.chain[a:b] != chain
+    away = (chains.col[a:b] - offset - slope * chains.row[a:b])[others] * cosine
+    if on_line:
+        own = float(np.median(np.abs(chains.size[chains.chain == chain])))
+        away = away[(away < 0) | (np.abs(chains.size[a:b][others]) > GHOST_SHARE * own)]
     few = max(3, int(NEIGHBOUR_SHARE * len(row)))
-    half = MOST_HALF_PX if len(near) < few else min(MOST_HALF_PX, float(near[few - 1]) - 4)
-    border = min(float(col.min()), frame.shape[1] - 1 - float(col.max())) * cosine - 0.5
+
+    def free(distances: Array, most: float) -> float:
+        near = np.sort(distances[(distances > 2) & (distances < most + 6)])
+        return most if len(near) < few else min(most, float(near[few - 1]) - 4)
+
+    start = LINE_START_PX if on_line else 0
+    half = free(np.abs(away), MOST_HALF_PX)
+    to_right = (frame.shape[1] - 1 - float(col.max())) * cosine - 0.5
+    border = min((float(col.min()) - start) * cosine - 0.5, to_right)
     if border < LEAST_HALF_PX:
         raise _Refused(f"the border of the frame is {max(border, 0):.0f} px away (at least {LEAST_HALF_PX:g})")
     if half < LEAST_HALF_PX:
         raise _Refused(f"another edge is {half + 4:.0f} px away (at least {LEAST_HALF_PX + 4:g})")
-    return float(min(half, border))
+    return float(min(half, border)), float(min(free(away, MOST_RIGHT_PX), to_right))
 
 
 def _refined(region: Region) -> Region:
@@ -324,7 +348,7 @@ def _refined(region: Region) -> Region:
         slope = float(line[1] / (0.5 * (region.rows - 1)))
         scatter = float(residual.std(ddof=order + 1))
         spread = float(np.sqrt(((t[good] - t[good].mean()) ** 2).sum()))
-        region = replace(region, line=line, slope=slope, u_slope=scatter / spread / (0.5 * (region.rows - 1)))
+        region = replace(region, line=line, slope=slope, u_slope=scatter / spread / (0.5 * (region.rows - 1)), scatter_px=scatter)
         if not np.isfinite(line).all() or np.abs(places - region.centre).max(initial=0.0) > 8:
             raise _Refused("its rows do not follow a line")
     if scatter > SMOOTH_PX:

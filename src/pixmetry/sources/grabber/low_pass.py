@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from functools import cache
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixmetry.camera.contribution import Contribution, Probe
-from pixmetry.camera.line import group_delay_s, reach_px
+from pixmetry.camera.line import group_delay_s, low_pass_poles, reach_px
 from pixmetry.camera.line_contribution import through_line
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
@@ -36,23 +34,8 @@ class LowPass(Parameters):
     @property
     def poles(self) -> np.ndarray:
         """In rad/s."""
-        low_pass = 2e6 * np.pi * self.cutoff_mhz * prototype(self.kind, self.order)
+        low_pass = 2e6 * np.pi * self.cutoff_mhz * low_pass_poles(self.kind, self.order)
         return np.append(low_pass, -self.zeros)
-
-
-@cache
-def prototype(kind: str, order: int) -> np.ndarray:
-    """Poles of the filter of cut-off 1 rad/s."""
-    if kind == "off":
-        return np.zeros(0, complex)
-    if kind == "rc":
-        return -np.ones(order, complex)
-    if kind == "butterworth":
-        unit_poles: NDArray[np.complex128] = np.exp(1j * np.pi * (0.5 + (np.arange(order) + 0.5) / order))
-        return unit_poles
-    from scipy.signal import besselap
-
-    return np.asarray(besselap(order, norm="mag")[1], complex)
 
 
 def forward(params: LowPass, signal: Signal, stream: Stream) -> Signal:
