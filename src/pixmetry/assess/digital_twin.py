@@ -59,7 +59,7 @@ def digital_twin(campaign: Campaign, estimates: Mapping[str, Estimates], observa
         elements = _with_assumed_gain(elements, campaign.bits)
     exposure = stack.exposure_s if stack is not None else _middle_exposure_s(campaign)
     photons_known = "sensor.quantum_efficiency" in estimates
-    return Camera(
+    twin = Camera(
         name=facts.name,
         frame_shape=campaign.frame_shape,
         chain=tuple(elements),
@@ -75,6 +75,7 @@ def digital_twin(campaign: Campaign, estimates: Mapping[str, Estimates], observa
             "photons": "photons" if photons_known else "electrons: no photon count was given, the quantum efficiency is set to 1",
         },
     )
+    return twin if facts.pixel_clock_mhz is None else replace(twin, pixel_clock_hz=1e6 * facts.pixel_clock_mhz)
 
 
 def _with_assumed_gain(elements: list[Element], bits: int) -> list[Element]:

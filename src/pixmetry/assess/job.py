@@ -289,7 +289,7 @@ def observe_campaign(campaign: Campaign, progress: Progress) -> tuple[InputHashe
         for g in chosen:
             yield Group(g.kind, g.role, g.exposure_s, g.photons, [partial(reader.fetch, path) for path in g.paths], g.facts)
 
-    seen = observe(groups(), campaign.bits, campaign.camera.temperature_c, on_frames=on_frames)
+    seen = observe(groups(), campaign.bits, campaign.camera.temperature_c, campaign.stated, on_frames=on_frames)
     notes = (*campaign.findings, *left_out, *seen.notes)
     return reader.hashes, replace(seen, storage=reader.storage, sensor=campaign.camera.sensor, notes=notes)
 

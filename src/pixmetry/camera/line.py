@@ -258,7 +258,7 @@ def group_delay_s(zeros: Any, poles: Any) -> float:
 
 @cache
 def low_pass_poles(kind: str, order: int) -> np.ndarray:
-    """Poles of a low-pass filter of cut-off 1 rad/s: ``rc`` (a chain of equal stages), ``butterworth`` or ``bessel``; none where ``off``."""
+    """Poles of a low-pass filter of cut-off 1 rad/s: ``rc`` (a chain of equal stages), ``butterworth``, ``bessel`` or ``off``."""
     if kind == "off":
         return np.zeros(0, complex)
     if kind == "rc":

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from pixmetry.camera.noise_covariance import NoiseCovariance, NoiseFilter
+from pixmetry.camera.stated import StatedFacts
 from pixmetry.core.errors import MeasureError
 from pixmetry.core.number import Estimates
 
@@ -403,6 +404,7 @@ class Observations:
     sensor: str | None = None  # ccd, cmos or cid, where it was said
     noise_covariance: NoiseCovariance | None = None
     noise_filter: NoiseFilter | None = None
+    stated: StatedFacts = StatedFacts()
     temperature_c: float | None = None
     geometry: CameraGeometry | None = None
     storage: Storage = Storage()

@@ -12,6 +12,7 @@ import numpy as np
 
 from pixmetry.camera.covered import Covered
 from pixmetry.camera.group_facts import GroupFacts
+from pixmetry.camera.stated import StatedFacts
 from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.files.formats import is_frame
 from pixmetry.files.raw_values import RawLayout
@@ -139,6 +140,19 @@ class Campaign:
     raw: RawLayout | None = None
     arrays: Mapping[Path, Sequence[np.ndarray] | np.ndarray] | None = field(default=None, compare=False)
     findings: tuple[str, ...] = ()
+
+    @property
+    def stated(self) -> StatedFacts:
+        """What measurements need of the facts."""
+        c = self.camera
+        return StatedFacts(
+            interface=c.interface,
+            pixel_clock_mhz=c.pixel_clock_mhz,
+            pitch_x_um=c.pitch_x_um,
+            pitch_y_um=c.pitch_y_um or c.pitch_x_um,
+            wavelength_nm=self.optics.wavelength_nm,
+            f_number=self.optics.f_number,
+        )
 
     @property
     def bits(self) -> int:

@@ -12,7 +12,7 @@ from functools import cached_property
 
 import numpy as np
 
-from pixmetry.core.arrays import Array
+from pixmetry.core.arrays import Array, Flags, Ints
 from pixmetry.observe._edge_kernels import bin_edge
 from pixmetry.observe.edges import Region, Spread, pixels_of
 
@@ -152,7 +152,7 @@ def _curve(group: Sequence[tuple[Region, Spread]], right_px: float, correlation:
     kept = [m for m, far in zip(group, reach, strict=True) if far >= right - 1e-9]
     half = np.floor(max(right, LEFT_PX) / BIN_PX) * BIN_PX
     bins = 2 * int(half / BIN_PX) + 1
-    place = (np.arange(bins) - 0.5 * (bins - 1)) * BIN_PX
+    place = np.asarray((np.arange(bins) - 0.5 * (bins - 1)) * BIN_PX, float)
     inside = (place >= -LEFT_PX) & (place <= right)
     edges = [_binned(r, s, bins, half + BIN_PX) for r, s in kept]
     for _ in range(3):
@@ -164,7 +164,7 @@ def _curve(group: Sequence[tuple[Region, Spread]], right_px: float, correlation:
     if filled.sum() < 8 * LEFT_PX:
         return None
     slope = float(np.average([r.slope for r, _ in kept], weights=[r.rows for r, _ in kept]))
-    at = np.flatnonzero(filled)
+    at = np.asarray(np.flatnonzero(filled), np.int64)
     covariance = _covariance(at, variance[at], correlation, slope if kept[0][0].across == "y" else 1.0)
     jitter, u_jitter = _jitter(kept, value, correlation) if kept[0][0].across == "x" else (0.0, 0.0)
     total_rows = int(sum(r.rows for r, _ in kept))
@@ -173,7 +173,7 @@ def _curve(group: Sequence[tuple[Region, Spread]], right_px: float, correlation:
 
 def _mean_curve(edges: Sequence[_Binned]) -> tuple[Array, Array, Array]:
     """Weighted mean of normalised edges at the bins' middles, number of pixels, and the variance of white noise of each bin."""
-    total = weighed = away = squares = 0.0
+    total, weighed, away, squares = np.zeros((4, len(edges[0].count)))
     for e in edges:
         share = np.clip((e.mean - e.low) / e.height, 0, 1)
         var = (e.variances[0] + (e.variances[1] - e.variances[0]) * share) / e.height**2
@@ -193,7 +193,7 @@ def _mean_curve(edges: Sequence[_Binned]) -> tuple[Array, Array, Array]:
     return np.asarray(curve, float), np.asarray(total, float), np.asarray(squares / full**2, float)
 
 
-def _bring_together(edges: Sequence[_Binned], value: Array, place: Array, inside: Array) -> None:
+def _bring_together(edges: Sequence[_Binned], value: Array, place: Array, inside: Flags) -> None:
     """Fit place and levels of each edge to the mean curve."""
     steep = np.gradient(value, BIN_PX)
     for e in edges:
@@ -208,7 +208,7 @@ def _bring_together(edges: Sequence[_Binned], value: Array, place: Array, inside
         e.shift -= mean
 
 
-def _covariance(at: Array, variance: Array, correlation: Array, px_per_px: float) -> Array:
+def _covariance(at: Ints, variance: Array, correlation: Array, px_per_px: float) -> Array:
     """Of bins: a pixel's neighbour along the frame's row lies so many px on, along the direction of the bins."""
     n = len(at)
     share = np.zeros((n, n))

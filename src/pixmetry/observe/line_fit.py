@@ -8,7 +8,7 @@ that nothing comes before its cause, part the two.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import product
@@ -17,7 +17,6 @@ import numpy as np
 
 from pixmetry.camera.line import low_pass_poles
 from pixmetry.core.arrays import Array
-from pixmetry.core.number import Estimates
 from pixmetry.observe._edge_kernels import line_taps
 from pixmetry.observe.edge_curves import BIN_PX, EdgeCurve
 
@@ -101,7 +100,7 @@ def paths_of(delay: float, direct: float, first: float, ratio: float) -> tuple[A
     count = max(1, int(np.ceil(np.log(SMALLEST_PATH) / np.log(abs(ratio)))))
     echoes = direct * (first if first != 1.0 else ratio) * ratio ** np.arange(count)
     echoes[-1] /= 1 - ratio
-    return delay * np.arange(count + 1), np.append(direct, echoes)
+    return np.asarray(delay * np.arange(count + 1), float), np.asarray(np.append(direct, echoes), float)
 
 
 def residues_of(poles: Array) -> Array:
@@ -279,7 +278,8 @@ def fit_model(
     scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
     covariance = np.linalg.pinv(information / np.outer(scale, scale), rcond=1e-10, hermitian=True) / np.outer(scale, scale)
     dof = sum(len(s.value) for s in seen) - n - 3 * len(seen)
-    return LineFit(model, p, tuple(free), dict(zip(names, map(float, q), strict=True)), own, np.asarray(covariance, float), chi2, max(dof, 1))
+    line = dict(zip(names, map(float, q), strict=True))
+    return LineFit(model, p, tuple(free), line, own, np.asarray(covariance, float), chi2, max(dof, 1))
 
 
 def _of_others(p: Array) -> float:

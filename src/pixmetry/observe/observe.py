@@ -19,6 +19,7 @@ from pixmetry.camera.observations import (
     Spectra,
     StackMoments,
 )
+from pixmetry.camera.stated import StatedFacts
 from pixmetry.core.errors import MeasureError
 from pixmetry.core.number import ONE_SIDED_95, Estimates
 from pixmetry.core.threads import single_threaded_blas
@@ -62,6 +63,7 @@ def observe(
     groups: Iterable[Group],
     bits: int,
     temperature_c: float | None = None,
+    stated: StatedFacts | None = None,
     *,
     threads: int | None = None,
     on_frames: Callable[[int], object] | None = None,
@@ -75,6 +77,8 @@ def observe(
     bits : int
         Bits per stored code.
     temperature_c : float, optional
+    stated : StatedFacts, optional
+        What the manifest says of camera and lens.
     threads : int, optional
         The results have the same bits for any number of them.
     on_frames : callable, optional
@@ -89,6 +93,7 @@ def observe(
     MeasureError
         If there are no frames, or all bright frames are saturated, black or copies.
     """
+    told = stated or StatedFacts()
     levels: dict[str, list[Level]] = {"dark": [], "bright": []}
     stacked: dict[str, list[Level]] = {"dark": [], "bright": []}
     stacks: dict[str, dict[float, _Stack]] = {"dark": {}, "bright": {}}
@@ -120,7 +125,10 @@ def observe(
     levels = {kind: found or stacked[kind] for kind, found in levels.items()}  # where there are only stacks, these
     if pictures and shape is not None and not (levels["dark"] or levels["bright"]):
         alone = Observations(
-            photon_transfer=without_levels(shape, bits), photon_transfer_fit=Estimates.empty(), temperature_c=temperature_c
+            photon_transfer=without_levels(shape, bits),
+            photon_transfer_fit=Estimates.empty(),
+            stated=told,
+            temperature_c=temperature_c,
         )
         with single_threaded_blas():
             return reduce_pictures(pictures, alone)
@@ -157,6 +165,7 @@ def observe(
         code_errors=codes,
         noise_covariance=noise,
         noise_filter=noise_filter,
+        stated=told,
         temperature_c=temperature_c,
         notes=tuple(notes),
     )

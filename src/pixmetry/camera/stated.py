@@ -1,0 +1,28 @@
+"""What was said of a camera and its lens before anything was measured, as far as measurements need it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class StatedFacts:
+    """Facts from the manifest of a campaign; None where they were not said.
+
+    Parameters
+    ----------
+    interface : {"digital", "analogue"}
+    pixel_clock_mhz : float or None
+    pitch_x_um, pitch_y_um : float or None
+    wavelength_nm : float or None
+        Of the light.
+    f_number : float or None
+        Working f-number of the lens.
+    """
+
+    interface: str = "digital"
+    pixel_clock_mhz: float | None = None
+    pitch_x_um: float | None = None
+    pitch_y_um: float | None = None
+    wavelength_nm: float | None = None
+    f_number: float | None = None
