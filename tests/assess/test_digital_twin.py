@@ -7,9 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.special import ndtr
 
 from chance import rng_of
-from pixmetry.assess.digital_twin import best_values, digital_twin, of_unit
+from pixmetry.assess.digital_twin import _with_true_black, best_values, digital_twin, of_unit
 from pixmetry.assess.job import assess, by_the_standard, measure_sources
 from pixmetry.assess.page.measured import twin_sentence
 from pixmetry.assess.self_test import expose, exposures_of, fewer, middle_window, self_test
@@ -168,6 +169,25 @@ def test_code_widths_are_those_of_the_converter(both) -> None:
     expected = np.sqrt(true.var() / (true.var() + u**2))
     assert np.corrcoef(true, found)[0, 1] > expected - 6 / np.sqrt(codes.size), expected
     assert found.std() == pytest.approx(true.std(), rel=0.25)
+
+
+def test_uneven_codes_do_not_move_what_is_stored_of_black(both, rng: np.random.Generator) -> None:
+    """The measured black level is that of equal steps. With thresholds of its own at black the twin stores the same mean of the stack.
+
+    The mean of the normal values about the stack's pixels is computed for both kinds of steps; without the shift they differ by 0.1 DN.
+    """
+    _, _, seen, twin = both
+    dark = replace(seen.dark_stack, ms_pixel_dn2=0.7)
+    moved = 0.3 * rng.standard_normal(4095)
+    adc = replace(twin["grabber.adc"], maps={"threshold_lsb": moved})
+    shifted = _with_true_black(adc, replace(seen, dark_stack=dark))
+    assert shifted.maps is adc.maps
+    by_pixel = dark.mean_map_dn.ravel()[:, None] - np.arange(1, 100) + 0.5
+    shift = shifted.params.offset_dn - adc.params.offset_dn
+    std = np.sqrt(0.7 - 1 / 12)
+    equal, uneven = ndtr(by_pixel / std).sum(axis=1).mean(), ndtr((by_pixel + shift - moved[:99]) / std).sum(axis=1).mean()
+    assert uneven == pytest.approx(equal, abs=0.3 * abs(shift) + 0.01)
+    assert _with_true_black(replace(adc, maps={}), seen).params == adc.params
 
 
 def test_a_bend_of_the_converter_is_followed(seed: int) -> None:

@@ -18,6 +18,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy import stats
+from scipy.special import ndtr
 
 from pixmetry.assess.job import measure_sources
 from pixmetry.camera.camera import Camera, Element
@@ -30,6 +31,7 @@ from pixmetry.core.random import Grid
 from pixmetry.observe.observe import Group, observe
 from pixmetry.scene.files import SeriesModel
 from pixmetry.simulate.job import expose_group, plan_series
+from pixmetry.sources.grabber.adc import thresholds
 from pixmetry.sources.sensor import prnu
 from statistical.reference_u import Reference, photon_transfer_u, spatial_u
 
@@ -190,7 +192,10 @@ def _camera(values: dict[str, dict[str, float]], shape: tuple[int, int], series:
 
 
 def _truth(camera: Camera, series: SeriesModel, lamp_rel: float, traits: set[str]) -> dict[str, float]:
-    """Parameters by ``source.parameter``; means over the frame as this unit has them, standard deviations as of its population."""
+    """Parameters by ``source.parameter``; means over the frame as this unit has them, standard deviations as of its population.
+
+    The black level is that of a converter with equal steps that stores the same means in the dark.
+    """
     truth = {f"{e.name}.{k}": float(v) for e in camera.chain for k, v in e.params.model_dump().items() if isinstance(v, int | float)}
     shade, response, extra_e = _unit_maps(camera)
     gain = camera["electronics.gain"].params.gain_dn_per_e
@@ -199,8 +204,8 @@ def _truth(camera: Camera, series: SeriesModel, lamp_rel: float, traits: set[str
     truth["grabber.adc.offset_dn"] += gain * float(extra_e[~hot].sum()) / extra_e.size
     black_dn = truth["grabber.adc.offset_dn"]
     truth["sensor.quantum_efficiency.quantum_efficiency"] *= float((shade * response).mean() / shade.mean())
-    if "DNL" in traits:  # uneven codes move the mean of narrow noise, by .09 DN in one camera of 300: not in the stated u
-        del truth["grabber.adc.offset_dn"]
+    if "DNL" in traits:
+        truth["grabber.adc.offset_dn"] += _stored_by_uneven_codes(camera, series, extra_e[~hot])
     if "converter clips" in traits:
         x = np.linspace(0, 1.5, 200001) * adc.top
         w = x / bend.reference_dn
@@ -217,6 +222,25 @@ def _truth(camera: Camera, series: SeriesModel, lamp_rel: float, traits: set[str
     for name in ("dead_gain_rel", "cold_e", "gain_std_rel", "noisy_std_e"):  # sizes of what these cameras do not have
         del truth[f"sensor.defects.{name}"]
     return truth
+
+
+def _stored_by_uneven_codes(camera: Camera, series: SeriesModel, extra_e: np.ndarray) -> float:
+    """DN that codes of unequal width add to black: at no exposure, on the line through what they add to the means of the dark levels."""
+    adc, gain = camera["grabber.adc"].params, camera["electronics.gain"].params.gain_dn_per_e
+    lines = camera["electronics.row_noise"].params
+    noise_e2 = camera["electronics.amplifier_noise"].params.white_e ** 2 + lines.row_e**2 + lines.column_e**2
+    codes = np.arange(1, adc.top + 1)
+    uneven = thresholds(adc, camera.streams(0).of("grabber.adc"))
+    some_e = np.quantile(extra_e, (np.arange(400) + 0.5) / 400)
+    times = [group.exposure_s for group in plan_series(series) if group.kind == "dark"]
+    added = []
+    for time in times:
+        dark_e = camera["sensor.dark_current"].params.rate_e_per_s * time
+        mean, std = adc.offset_dn + gain * (some_e + dark_e), gain * np.sqrt(noise_e2 + dark_e)
+        near = (codes > mean.min() - 8 * std - 2) & (codes < mean.max() + 8 * std + 2)
+        stored, level = (ndtr((mean[:, None] - t[near]) / std).sum(axis=1).mean() for t in (uneven, codes - 0.5))
+        added.append(float(stored - level))
+    return float(np.polyfit(times, added, 1)[1]) if np.ptp(times) > 0 else float(np.mean(added))
 
 
 def _charge_of(name: str, camera: Camera) -> np.ndarray:

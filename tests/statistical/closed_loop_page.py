@@ -59,7 +59,8 @@ the non-linearity that the data tell less well than to 0.03 and leave to their p
 given as a limit.
 
 For fixed patterns the truth is the standard deviation of the population that the pixels are a sample of; offsets, efficiency and
-responsivity are those of the unit. A full well that the converter hides is compared with the signal at the top code."""
+responsivity are those of the unit. The black level is that of equal steps that store the same dark means.
+A full well that the converter hides is compared with the signal at the top code."""
 
 
 PRIOR = "short or noisy series lean on the priors (light at zero exposure 0 ± 5 %, coefficients 0 ± 0.1), wider than these cameras are"

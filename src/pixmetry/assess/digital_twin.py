@@ -136,7 +136,7 @@ def of_unit(twin: Camera, observations: Observations) -> Camera:
         elif element.source.id == "sensor.full_well" and ("saturation_dn" not in fit or fit["saturation_dn"].value > 2**bits - 1.5):
             chain.append(replace(element, on=False))
         else:
-            chain.append(replace(element, maps=_own_maps(element, maps, bend, observations)))
+            chain.append(_with_true_black(replace(element, maps=_own_maps(element, maps, bend, observations)), observations))
     unit = replace(twin, chain=tuple(chain), measured=MeasuredUnit(twin.unit_seed, twin.frame_shape))
     white = _white_e(unit, bend, observations)
     if white is None:
@@ -163,6 +163,24 @@ def _own_maps(element: Element, maps: UnitMaps, bend: ConverterBend, seen: Obser
         moved = single + bend.displacement_lsb[1:]
         return {"threshold_lsb": moved} if moved.any() else {}
     return {}
+
+
+def _with_true_black(element: Element, seen: Observations) -> Element:
+    """The converter with the black level in front of its own uneven thresholds; measured is that of equal steps that store the same.
+
+    Thresholds that lie d_k too high lower the mean that is stored by Σ d_k p(T_k), with the density p of the dark values.
+    """
+    moved, dark = element.maps.get("threshold_lsb"), seen.dark_stack
+    if moved is None or dark is None:
+        return element
+    std = np.sqrt(max(dark.ms_pixel_dn2 - 1 / 12, 1 / 12))
+    places = np.quantile(dark.mean_map_dn, (np.arange(200) + 0.5) / 200)
+    codes = np.arange(1, moved.size + 1)
+    near = np.abs(codes - places.mean()) < np.ptp(places) + 8 * std + 2
+    density = np.exp(-0.5 * ((codes[near, None] - 0.5 - places) / std) ** 2).mean(axis=1) / (std * np.sqrt(2 * np.pi))
+    black = element.params.model_dump()
+    black["offset_dn"] += float(moved[near] @ density)
+    return replace(element, params=element.source.make(black, where="digital twin, black level"))
 
 
 def _white_e(unit: Camera, bend: ConverterBend, seen: Observations) -> float | None:

@@ -30,6 +30,7 @@ from pixmetry.observe.photon_transfer_levels import (
     refuse_curved,
     refuse_dead_series,
     temporal_row_col_vars,
+    uneven_codes,
     usable_levels,
     with_stacks,
 )
@@ -50,7 +51,7 @@ from pixmetry.observe.stack import SATURATED_FRACTION
 
 ALL_SATURATED = 0.999  # then the mean is the top code that the camera stores, which may lie below 2**bits − 1
 NOT_SIGNIFICANT = 3.0  # a variance below this many u is given as a limit
-ROW_VAR, COL_VAR, SATURATION, LAMP_VAR, DARK_LIMIT, HOT, EXTRAPOLATED = range(12, 19)
+ROW_VAR, COL_VAR, SATURATION, LAMP_VAR, DARK_LIMIT, HOT, EXTRAPOLATED, UNEVEN = range(12, 20)
 METHOD = (
     "joint photon-transfer fit: Poisson electrons, gain and noise before a cubic non-linearity; iterated generalised least squares on "
     "level means and white mean squares, wander and lamp noise by REML, dof by Satterthwaite (EMVA 1288 R4.0 §6-7 for the quantities)"
@@ -60,6 +61,7 @@ CONFOUNDERS = (
     "fill at once: these lower the variance and so the gain",
     "non-linearity: a lamp whose light is not proportional to exposure looks like a non-linear camera",
     "dark noise: includes the shot noise of dark current that does not grow with exposure",
+    "black level: of stored values; where the converter's codes differ in width, the level in front of it is another",
     "row noise: mains flicker under a rolling shutter looks like row noise in bright frames; dark frames are used here",
 )
 UNDAMPED = 8  # iterations before the variance components move by half steps
@@ -97,6 +99,14 @@ def fit_photon_transfer(
         ``nonlinearity_a1``…``a3`` (y = b + x(1 + a₁w + a₂w² + a₃w³), w = x/(2**bits − 1)), ``illumination_noise_rel`` (of the light of
         a level's mean), and where the series carries them ``dark_current_e_per_s``, ``responsivity_dn_per_s``,
         ``quantum_efficiency``, ``saturation_dn``, ``full_well_e``.
+
+    Notes
+    -----
+    The black level is that of a converter with equal steps that stores the same dark means: what dark subtraction takes, and what a
+    twin with equal steps needs. Codes of unequal width move what is stored of black, by a standard deviation of s_DNL / √(4 √π σ) for
+    noise of σ LSB (`rounding_error_vars`); they are no error of this black level, but one of the level in front of the converter. So
+    the dark levels' common departure from the line of the bright ones is shared out: the part of the codes belongs to the black level,
+    that of the rounding does not. What the second is not known of the first enters u.
 
     Raises
     ------
@@ -166,7 +176,7 @@ class _Rows:
 def _augmented(pt: PhotonTransfer, s: Solution, d: model.Levels) -> tuple[np.ndarray, np.ndarray]:
     """Parameters of the fit and the quantities beside it, with their covariance."""
     n = s.p.size
-    values, cov = np.zeros(n + 7), np.zeros((n + 7, n + 7))
+    values, cov = np.zeros(n + 8), np.zeros((n + 8, n + 8))
     dark = ~d.bright
     values[:n], cov[:n, :n] = s.p, s.covariance
     line, line_var = temporal_row_col_vars(pt)
@@ -176,22 +186,31 @@ def _augmented(pt: PhotonTransfer, s: Solution, d: model.Levels) -> tuple[np.nda
     # what rounding and code widths stretch in common is no scatter of the lines
     line_var = line_var + 4 * model.slope_error_var(white, dither, d.dnl_lsb) * line**2
     cov[ROW_VAR, ROW_VAR], cov[COL_VAR, COL_VAR] = line_var
-    converter_vars = model.rounding_error_vars(np.array(white), dither, d.dnl_lsb)
     if s.free[DARK_SLOPE]:
-        _add_rounding_of_slopes(cov, s, converter_vars)
+        _add_converter_to_slopes(cov, s, d, white, dither)
     if model.is_hidden(d):  # the common part is in the fit; levels that pass through few codes do not average the rest
-        cov[OFFSET, OFFSET] += (1 - d.coherence**2) * float(converter_vars[0])
+        cov[OFFSET, OFFSET] += (1 - d.coherence**2) * float(model.rounding_error_vars(np.array(white), dither)[0])
     values[LAMP_VAR], cov[LAMP_VAR, LAMP_VAR] = s.components[1], s.components_cov[1, 1]
     return values, cov
 
 
-def _add_rounding_of_slopes(cov: np.ndarray, s: Solution, converter_vars: tuple[np.ndarray, np.ndarray]) -> None:
+def _add_converter_to_slopes(cov: np.ndarray, s: Solution, d: model.Levels, white: float, dither: float) -> None:
     """Widen the slopes of the dark mean and variance by what the converter does to them while the mean moves over its codes.
 
-    Its errors are waves of one code: over a rise r of the mean they change by at most 2π r of their amplitude, and never by more than
-    twice it.
+    A slope is Σ c_i y_i. Rounding errors of equal steps are a wave of one code, of unknown phase: the slope's variance is theirs times
+    |Σ c_i exp(2πi y_i)|². Those of uneven codes are thresholds' displacements, smoothed by the noise of variance σ²: of means y and y'
+    they correlate as exp(−(y − y')²/4σ²), of variances (1 − (y − y')²/2σ²) times as much. What the fit took as the levels' own is in it.
     """
-    change = np.sqrt(converter_vars) * min(2 * np.pi * abs(s.p[DARK_SLOPE]), 2.0)
+    dark = ~d.bright
+    time = d.time[dark] - d.time[dark].mean()
+    c = time / (time @ time)
+    rise = s.p[DARK_SLOPE] * time
+    wave = abs(c @ np.exp(2j * np.pi * rise)) ** 2
+    apart2 = np.subtract.outer(rise, rise) ** 2 / max(white + dither, model.QUANTISATION_DN2)
+    smooth = np.exp(-apart2 / 4)
+    equal, both = (np.array(model.rounding_error_vars(np.array(white), dither, dnl)) for dnl in (0.0, d.dnl_lsb))
+    total = equal * wave + (both - equal) * np.array([c @ smooth @ c, c @ (smooth * (1 - apart2 / 2)) @ c])
+    change = np.sqrt(np.maximum(total - (1 - d.coherence**2) * both * (c @ c), 0.0))
     for at, extra in zip((DARK_SLOPE, DARK_VAR_SLOPE), change, strict=True):
         cov[at, at] += float(extra) ** 2
     cov[SLOPE, SLOPE] += float(change[0]) ** 2  # where the exposure was swept, what is not the one is the other
@@ -240,7 +259,8 @@ def _estimates(pt: PhotonTransfer, s: Solution, d: model.Levels, axes: _Axes, ho
     rows.add("gain_dn_per_e", p[GAIN], "DN/e-", {GAIN: 1.0}, wide)
     _add_temporal_noise(rows, s, d, values, clipped_black(pt))
     one_time = "" if s.free[DARK_SLOPE] else "contains the dark signal: the dark frames have about one exposure time"
-    rows.add("offset_dn", p[OFFSET], "DN", {OFFSET: 1.0, HOT: 1.0}, one_time)
+    share, cov[UNEVEN, UNEVEN] = uneven_codes(pt, d)
+    rows.add("offset_dn", p[OFFSET] + share * p[Q_MEAN], "DN", {OFFSET: 1.0, Q_MEAN: share, UNEVEN: 1.0, HOT: 1.0}, one_time)
     if s.free[DARK_SLOPE]:
         _add_dark_current(rows, p, axes.time_s)
     for k in range(3):

@@ -282,3 +282,19 @@ def prior_precision(pt: PhotonTransfer, d: model.Levels) -> np.ndarray:
     out[model.Q_MEAN] = 1 / (q_mean + p**2 * dark_var + 1e-12)
     out[model.Q_VAR] = 1 / (q_var + (2 * p * dark_var) ** 2 + 1e-12)
     return out
+
+
+def uneven_codes(pt: PhotonTransfer, d: model.Levels) -> tuple[float, float]:
+    """Share of the uneven codes in what is common to the means of the dark levels, and variance of the part that is not told apart, DN².
+
+    Of a sum Q of two unknowns with variances u and r, the first is expected to be Q u/(u + r), with a variance of u r/(u + r).
+    """
+    dark = ~d.bright
+    if not (d.dnl_lsb and dark.any()):
+        return 0.0, 0.0
+    dither = float(d.dither[dark].mean())
+    white = np.array(model.white_before_rounding(float(d.ms[dark].mean()), dither))
+    both, equal = (float(model.rounding_error_vars(white, dither, dnl)[0]) for dnl in (d.dnl_lsb, 0.0))
+    total = 1 / prior_precision(pt, d)[model.Q_MEAN]
+    share = float(d.coherence**2 * (both - equal) / total)
+    return share, share * (1 - share) * total
