@@ -34,6 +34,15 @@ from pixmetry.locate.estimator import Estimator
 
 Pair = tuple[np.ndarray, np.ndarray]  # x and y
 UNIT_STRIDE = 1_000_003  # between the unit seeds of cameras of one type
+SHAPES_PICTURE = (  # without noise of their own; a target that they have changed answers otherwise to whatever else acts on it
+    "optics.olpf",
+    "optics.point_spread",
+    "sensor.bayer_mosaic",
+    "sensor.infrared_diffusion",
+    "sensor.pixel_aperture",
+    "processing.demosaic",
+    "processing.sharpening",
+)
 
 
 @dataclass(frozen=True)
@@ -267,7 +276,7 @@ class Trials:
     def of(self, only: Iterable[str] | None = None, off: Iterable[str] | None = None) -> MonteCarlo:
         """What some sources do: on an otherwise perfect chain (``only``), or as they are missed in the whole chain (``off``).
 
-        A perfect chain keeps the camera's video line, with all that filters, echoes and samples it: see `helpers_of`.
+        A perfect chain keeps what shapes the picture and the camera's video line: see `helpers_of`.
 
         With neither, what the whole camera and the estimator do against the truth.
         """
@@ -334,11 +343,14 @@ def missed(camera: Camera, off: Iterable[str]) -> Camera:
 def helpers_of(camera: Camera, names: Iterable[str]) -> tuple[str, ...]:
     """What else must be on for some sources to do what they do in this camera.
 
-    What shapes its video line: filters, echoes and the sampling clock, without which delays and noise would be seen by another line. And
-    conversions, although not essential, without which the sources cannot be run: a source of stored codes needs a converter.
+    What shapes its video line: filters, echoes and the sampling clock, without which delays and noise would be seen by another line. What
+    shapes the picture, `SHAPES_PICTURE`: the estimator answers otherwise on a target that is more blurred than it expects, or seen through a
+    mosaic. And conversions, although not essential, without which the sources cannot be run: a source of stored codes needs a converter.
     """
     names = tuple(names)
-    helpers = [e.name for e in camera.active if e.name not in names and shapes_line(e, camera)]
+    helpers = [
+        e.name for e in camera.active if e.name not in names and (e.source.id in SHAPES_PICTURE or shapes_line(e, camera))
+    ]
     try:
         camera.switched(on=(*names, *helpers))
     except ChainError:
