@@ -390,7 +390,18 @@ class Probes:
         if source.stage in AHEAD_OF_LINE:
             return whole
         shape = next((e.shape for e in self.camera.links if e.name == name), self.camera.output_shape)
-        return replace(self._behind(whole), frame_shape=shape)
+        pedestal = self._pedestal_without(name) if source.stage == "grabber" else np.inf
+        return replace(self._behind(whole), frame_shape=shape, pedestal_dn=pedestal)
+
+    def _pedestal_without(self, name: str) -> float:
+        """By how much black lies above code 0 without one of the grabber's sources: mean of dark windows ahead of the converter, and its offset."""
+        active = self.camera.active
+        last = next((i for i, e in enumerate(active) if e.source.produces is Kind.CODES), len(active))
+        ahead = replace(self.camera, chain=tuple(e for e in active[:last] if e.name != name))
+        offset = sum(getattr(e.params, "offset_dn", 0.0) for e in active[last : last + 1] if e.name != name)
+        dark = Uniform(0.0)
+        grid = spread_windows(ahead.output_shape, min(8, *ahead.output_shape), 32)
+        return float(ahead.expose_windows(dark, grid, mode="frozen", background=dark, quiet=True).mean(dtype=float)) + offset
 
     def _make_ahead(self, without: str) -> Probe:
         """Windows of pixels on the line, without one of its sources."""

@@ -145,6 +145,12 @@ class Setting:
         return facts_of(self.camera, self.target)
 
     @property
+    def full_well_e(self) -> float:
+        """Electrons of a full pixel: what the camera's chain tells, else those of its saturation."""
+        told = (getattr(e.params, "full_well_e", None) for e in self.camera.active)
+        return float(next((v for v in told if v is not None), self.facts.saturation_dn / self.facts.gain_dn_per_e))
+
+    @property
     def f_mm(self) -> float | None:
         """Focal length, from the scenario or the camera's lens."""
         told = self.scenario.object.f_mm

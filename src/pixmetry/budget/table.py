@@ -342,7 +342,7 @@ class Table:
         params = self._for_this_format(source, params)
         clock = {"line_time_us": 1e6 * s.camera.line_period_s, "pixel_time_ns": 1e9 / s.camera.pixel_clock_hz}
         known: dict[str, Any] = pitch_values(s.camera.pitch_um) | clock | {"bits": s.facts.bits, "reference_dn": s.facts.saturation_dn}
-        known |= {"f_number": s.f_number, "wavelength_nm": s.scenario.light.wavelength_nm}
+        known |= {"f_number": s.f_number, "wavelength_nm": s.scenario.light.wavelength_nm, "full_well_e": s.full_well_e}
         if s.f_mm is not None:
             known["principal_distance_mm"] = s.f_mm
             if s.camera.pitch_um is not None:

@@ -139,6 +139,9 @@ class Probe:
         Where the scale ends, above black: no pixel is seen brighter.
     pixel_clock_hz : float
         Of the camera.
+    pedestal_dn : float
+        By how much black lies above code 0 at the converter without what the source that is asked for adds: what lies deeper is cut off.
+        Infinite where nothing is.
     held : Held, optional
         The windows on the camera's video line, for the sources of the line (`camera.line`).
 
@@ -165,6 +168,7 @@ class Probe:
     locate: Callable[..., tuple[np.ndarray, np.ndarray]] | None = None
     saturation_dn: float = float("inf")
     pixel_clock_hz: float = 14.1875e6
+    pedestal_dn: float = float("inf")
     held: Held | None = None
 
     def white(self, sigma_dn: np.ndarray | float) -> tuple[float, float]:

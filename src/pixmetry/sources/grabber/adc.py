@@ -149,10 +149,11 @@ def propagate(params: Adc, probe: Probe) -> Contribution:
 
     A threshold displaced by d adds d² to the mean square error of a signal that is spread evenly over its codes. Hence 1/12 for equal
     steps, dnl²/2 for displacements of variance dnl²/2, and two of (1/2)² for each missing code. A slope common to all codes moves no
-    target, and the black level is known.
+    target, and the black level is known: that of the converter on top of what it gets, below whose code 0 a line that swings is cut off.
     """
     variance = 1 / 12 + params.dnl_std_lsb**2 / 2 + (0.5 / params.missing_every if params.missing_every else 0.0)
-    level = probe.signal_dn * (1 + params.gain_error_rel) + params.offset_dn
+    black = params.offset_dn + (probe.pedestal_dn if math.isfinite(probe.pedestal_dn) else 0.0)
+    level = probe.signal_dn * (1 + params.gain_error_rel) + black
     rising = np.sign(np.diff(probe.signal_dn, axis=2, prepend=probe.background_dn))
     stored = np.clip(level - bend(params, level) - 0.5 * params.hysteresis_lsb * rising, 0, params.top)
     dx, dy = probe.field((stored - level) / (1 + params.gain_error_rel))

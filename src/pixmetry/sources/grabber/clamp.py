@@ -106,9 +106,18 @@ def propagate(params: Clamp, probe: Probe) -> Contribution:
     target = np.ascontiguousarray(probe.signal_dn - probe.background_dn, np.float32)
     slope = -loss * probe.background_dn * (np.arange(target.shape[2]) - probe.x_px[:, None])
     dx, dy = probe.field(droop(target, loss, half, *params.carry) - target.astype(float) + slope[:, None, :])
-    method = "offsets that are common to a row, and the field of the droop"
+    black = float(params.black(probe.temperature_c))
+    with_it, without = (probe.moved(_cut_off(probe, pedestal)) for pedestal in (probe.pedestal_dn + black, probe.pedestal_dn))
+    dx, dy = (d + a - b for d, a, b in zip((dx, dy), with_it, without, strict=True))
+    method = "offsets that are common to a row, the field of the droop, and what is cut off at code 0"
     floor_px = 4e-4 if params.droop_rel and params.restored_rel < 1 else 2e-4  # the background settles over the first lines
     return probe.from_shifts(dx, dy, "Tr", beside=u, model_error=0.2, floor_px=floor_px, method=method)
+
+
+def _cut_off(probe: Probe, pedestal_dn: float) -> np.ndarray:
+    """The signal without what lies below code 0, where black is so much above it; the ground keeps its level."""
+    cut: np.ndarray = np.maximum(probe.signal_dn, -pedestal_dn)
+    return cut + min(probe.background_dn + pedestal_dn, 0.0)
 
 
 def _noise(params: Clamp, probe: Probe) -> tuple[float, float]:
