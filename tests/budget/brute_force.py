@@ -14,7 +14,7 @@ import numpy as np
 
 from pixmetry.budget.fields import Places
 from pixmetry.budget.monte_carlo import missed, put
-from pixmetry.budget.motion import FRAMES, GHOSTS, LAGS, OF_MOTION
+from pixmetry.budget.motion import FRAMES, GHOSTS, LAGS, OF_MOTION, PULSES
 from pixmetry.budget.probe import passed_light, resolve
 from pixmetry.budget.setting import Setting
 from pixmetry.budget.table import MAP, Parts, SourceRow, Table
@@ -128,13 +128,13 @@ class Resting(Discs):
 
 @dataclass(frozen=True)
 class Moved:
-    """A scene that is displaced by v τ + a τ²/2; τ counts from the middle of the exposure of one frame (or of each)."""
+    """A scene that is displaced by v τ + a τ²/2; τ counts from so long after the beginning of one frame (or of each)."""
 
     still: Any
     velocity: np.ndarray
     acceleration: np.ndarray
     period_s: float
-    exposure_s: float
+    middle_s: float
     of_frame: int | None = None
     moving = True
 
@@ -144,7 +144,7 @@ class Moved:
 
     def _at(self, at: Points) -> Points:
         frame = at.frame if self.of_frame is None else self.of_frame
-        late = at.time_s - (frame * self.period_s + 0.5 * self.exposure_s)
+        late = at.time_s - (frame * self.period_s + self.middle_s)
         dx, dy = (v * late + 0.5 * a * late**2 for v, a in zip(self.velocity, self.acceleration, strict=True))
         return replace(at, x_px=at.x_px - dx, y_px=np.broadcast_to(at.y_px, at.x_px.shape) - dy)
 
@@ -431,7 +431,10 @@ class BruteForce:
             return discs
         s = self.setting
         period = s.frame_period_s if last else float(s.camera.facts.get("frame_period_s", 0.04))
-        return Moved(discs, s.velocity_px_per_s, s.acceleration_px_per_s2, period, self.facts.exposure_s, last or None)
+        if source.source.id == PULSES and not on:  # frames belong to the middle of the pulses, of whom one would see the target at rest
+            return discs
+        middle = (1.0 if source.source.id == PULSES else 0.5) * self.facts.exposure_s
+        return Moved(discs, s.velocity_px_per_s, s.acceleration_px_per_s2, period, middle, last or None)
 
     # ---- shifts -----------------------------------------------------------------------------------------------------------------------
 
@@ -510,7 +513,7 @@ def _scene_of(source: Element) -> Any:
     """What tells the frames that a source needs from those of the others."""
     if source.source.stage == "scene":
         return source.source.id, source.params
-    return source.source.id in OF_MOTION, source.source.id in LAGS or source.source.start is not None
+    return source.source.id in OF_MOTION, source.source.id == PULSES, source.source.id in LAGS or source.source.start is not None
 
 
 def _near_the_target(data: np.ndarray, diameter_px: float, reach: int) -> tuple[np.ndarray, np.ndarray]:

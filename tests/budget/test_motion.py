@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pixmetry.budget.motion import LOOKS, motion_contribution
+from pixmetry.budget.motion import LOOKS, held_by_pulses, motion_contribution
 from pixmetry.budget.scenario import read_scenario
 from pixmetry.budget.setting import Setting
 from pixmetry.camera.camera import Camera, Element
@@ -97,3 +97,10 @@ def test_the_direction_of_motion_is_that_of_the_shift() -> None:
 def test_every_source_that_looks_tells_its_times() -> None:
     for name in LOOKS:
         assert contribution(camera_of(name, **get_source(name).typical.model_dump()), name).total_px >= 0
+
+
+def test_pulsed_light_takes_over_what_exposure_and_fields_do_to_steady_light() -> None:
+    chain = [Element(i, get_source(i), get_source(i).typical) for i in ("sensor.exposure", "sensor.interlace", "sensor.light_pulses")]
+    camera = Camera("pulsed", SHAPE, tuple(chain), exposure_s=EXPOSURE_S)
+    ids = ("sensor.trigger_jitter", *(e.name for e in chain))
+    assert [held_by_pulses(Element(i, get_source(i), get_source(i).typical), camera) for i in ids] == [False, True, True, False]

@@ -35,8 +35,12 @@ DIGITAL = ("imx264_like", "ft_ccd_generic", "dcs420_like", "cid_generic", "cmos_
 ANALOGUE = "pulnix_tm6cn_epix_512"
 SMALL = (240, 320)  # frames of cameras of which a window needs whole rows and columns
 SMALLEST = (96, 128)  # for sources that have to see all of a frame, frame after frame
-OTHER_TIME = ("sensor.light_pulses",)  # its frames belong to the middle of the pulses: see test_motion
 LOST = ("sensor.log_response",)  # at its bound no target is found
+BY_OTHERS_IN_CHAIN = (  # rows that hang on another source: on the black level, on the mosaic
+    ("grabber.adc", "usual", (ANALOGUE, 28.4, SMALL)),
+    ("grabber.clamp", "bound", (ANALOGUE, 28.4, SMALL)),
+    ("sensor.smear", "bound", ("dcs420_like", None, SMALL)),
+)
 SCENARIO = {
     "motion": {"speed_px_per_s": 60, "acceleration_px_per_s2": 100, "direction_deg": 30},
     "object": {"f_mm": 25, "distance_mm": 2000},
@@ -75,7 +79,7 @@ def cell(request: pytest.FixtureRequest) -> Callable[[Cell], tuple[Table, BruteF
     return made
 
 
-@pytest.mark.parametrize("source_id", [i for i in sources() if i not in OTHER_TIME])
+@pytest.mark.parametrize("source_id", list(sources()))
 def test_a_row_is_what_brute_force_shows(cell: Callable[[Cell], tuple[Table, BruteForce]], source_id: str) -> None:
     source = sources()[source_id]
     at = cell_of(source)
@@ -83,3 +87,13 @@ def test_a_row_is_what_brute_force_shows(cell: Callable[[Cell], tuple[Table, Bru
     for size in ("usual", "bound") if at[1] is None and at[2] != SMALLEST and source_id not in LOST else ("usual",):
         verdict = verdict_of(table, brute, element_of(table, source_id, size), SIGMAS)
         assert not verdict.wrong, f"{at}, {size}: {verdict.wrong}: {verdict.text}"
+
+
+@pytest.mark.parametrize(("source_id", "size", "at"), BY_OTHERS_IN_CHAIN, ids=[name for name, _, _ in BY_OTHERS_IN_CHAIN])
+def test_a_row_holds_what_the_rest_of_the_chain_makes_of_it(
+    cell: Callable[[Cell], tuple[Table, BruteForce]], source_id: str, size: str, at: Cell
+) -> None:
+    """A line that rings at 28 MHz dips below code 0 unless the clamp lifts it; a mosaic makes a smear's shift half as large again."""
+    table, brute = cell(at)
+    verdict = verdict_of(table, brute, element_of(table, source_id, size), SIGMAS)
+    assert not verdict.wrong, f"{at}, {size}: {verdict.wrong}: {verdict.text}"

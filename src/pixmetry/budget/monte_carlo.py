@@ -344,13 +344,11 @@ def helpers_of(camera: Camera, names: Iterable[str]) -> tuple[str, ...]:
     """What else must be on for some sources to do what they do in this camera.
 
     What shapes its video line: filters, echoes and the sampling clock, without which delays and noise would be seen by another line. What
-    shapes the picture, `SHAPES_PICTURE`: the estimator answers otherwise on a target that is more blurred than it expects, or seen through a
-    mosaic. And conversions, although not essential, without which the sources cannot be run: a source of stored codes needs a converter.
+    shapes the picture, `SHAPES_PICTURE`: the estimator answers otherwise on a target that is more blurred than it expects, or seen through
+    a mosaic. And conversions, although not essential, without which the sources cannot be run: a source of stored codes needs a converter.
     """
     names = tuple(names)
-    helpers = [
-        e.name for e in camera.active if e.name not in names and (e.source.id in SHAPES_PICTURE or shapes_line(e, camera))
-    ]
+    helpers = [e.name for e in camera.active if e.name not in names and (e.source.id in SHAPES_PICTURE or shapes_line(e, camera))]
     try:
         camera.switched(on=(*names, *helpers))
     except ChainError:

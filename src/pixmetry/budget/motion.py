@@ -1,7 +1,7 @@
 """What a target's motion makes of the times at which a camera looks: the target is found where it was then.
 
-The position of a frame belongs to the middle of its exposure, of the first rows that are exposed. A row that looks later by a time τ
-shows the target farther along its path, by v τ + a τ²/2.
+The position of a frame belongs to the middle of its exposure, of the first rows that are exposed; with pulsed light, to the middle of its
+pulses. A row that looks later by a time τ shows the target farther along its path, by v τ + a τ²/2.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from pixmetry.budget.monte_carlo import put
 from pixmetry.budget.probe import make_probe, seen_at
 from pixmetry.budget.setting import Setting
 from pixmetry.camera.camera import NOWHERE, Camera, Element
@@ -18,13 +19,23 @@ from pixmetry.core.random import Grid
 from pixmetry.locate.estimator import Estimator
 
 FRAMES = 256  # for what is drawn anew in every frame
-LOOKS = ("sensor.exposure", "sensor.interlace", "sensor.light_pulses", "sensor.rolling_shutter", "sensor.trigger_jitter")
+PULSES = "sensor.light_pulses"
+LOOKS = ("sensor.exposure", "sensor.interlace", PULSES, "sensor.rolling_shutter", "sensor.trigger_jitter")
 LAGS = {"sensor.image_lag": "lag_rel", "processing.temporal_noise_reduction": "alpha"}  # with the share of the frame before
 OF_MOTION = (*LOOKS, *LAGS)
 LAG_PHASES, GHOSTS, SMALLEST_GHOST = 3, 60, 1e-5  # places within the pixel; earlier frames at most, and their smallest share
 FLOOR_PX, COMB_REL = 2e-3, 0.05  # of what is told; of the distance between what two rows show
 SHORT_PX, LAG_ERROR, STREAK_ERROR = 0.5, 0.05, 0.6  # shift up to which ghosts overlap the target; relative errors up to it and beyond
 STILL = "nothing moves in this scenario"
+
+
+class _Moving:
+    """A scene of which only the times count at which it is looked at."""
+
+    moving = True
+
+
+MOVES: Any = _Moving()
 
 
 def motion_contribution(element: Element, setting: Setting, camera: Camera) -> Contribution:
@@ -72,6 +83,59 @@ def lag_contribution(element: Element, setting: Setting, estimator: Estimator) -
     method = "the estimator on the target with what stays of earlier frames"
     # of a streak that is longer, what is found hangs on where the search begins
     return _of(bias, zero, zero, method, shifts.std(axis=1), LAG_ERROR if np.abs(bias).max() <= SHORT_PX else STREAK_ERROR)
+
+
+def pulse_contribution(element: Element, setting: Setting, camera: Camera, estimator: Estimator) -> Contribution:
+    """What pulsed light leaves of a target's motion: its two pulses, and the steady light at the times at which rows look without them.
+
+    Notes
+    -----
+    The estimator is asked on the sum of the target at all these times, row by row, at phases of the pixel, and with either field in the
+    middle row. What exposure and fields do to the steady light is in it.
+    """
+    probe = make_probe(setting.facts, setting.target, estimator, LAG_PHASES)
+    v, a = setting.velocity_px_per_s, setting.acceleration_px_per_s2
+    side = probe.signal_dn.shape[1]
+    late, share = _pulsed_looks(element, camera)
+    shifts = []
+    for first in (0, 1):
+        rows = (first + np.arange(side)) % len(late)
+        signal = np.zeros_like(probe.signal_dn)
+        for row in range(len(late)):
+            mine = rows == row
+            for t, part in zip(late[row], share[row], strict=True):
+                ahead = v * t + 0.5 * a * t**2
+                shown = seen_at(setting.facts, setting.target, probe.x_px + ahead[0], probe.y_px + ahead[1], (side, side))
+                signal[:, mine] += part * shown[:, mine]
+        shifts.append(np.array(probe.moved(signal)))
+    both = np.concatenate(shifts, axis=1)
+    bias, zero = both.mean(axis=1), np.zeros(2)
+    comb = COMB_REL * float(np.hypot(*v)) * float(np.ptp((late * share).sum(axis=1)))
+    method = "the estimator on the target by the light of the pulses and the steady light"
+    return _of(bias, zero, zero, method, both.std(axis=1), floor_px=max(FLOOR_PX, comb))
+
+
+def _pulsed_looks(element: Element, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """When the two rows in the middle of the frame look, from the middle of the pulses, and their shares of the light; (2, k) each."""
+    rows = camera.frame_shape[0]
+    middle = Grid(np.zeros(1, np.int64), np.full(1, rows // 4 * 2), np.zeros(1, np.int64), (2, 1))
+    signal = camera.signal(MOVES, middle, temperature_c=camera.temperature_c)
+    streams = camera.streams(0, quiet=True)
+    for e in put(camera, element).active:
+        if e.source.id in LOOKS:
+            signal = e.source.forward(e.params, signal, streams.of(e.name))  # type: ignore[misc]
+        if e.name == element.name:
+            break
+    assert element.source.truth is not None
+    pulses = element.source.truth(element.params, signal, streams.of(element.name))["pulse_time_s"]
+    times, shares = signal.own_light.moments
+    return times[0] - pulses.mean(), shares[0]
+
+
+def held_by_pulses(element: Element, camera: Camera) -> bool:
+    """Whether pulses of light decide when rows look, of whom this source tells it for steady light: it stands ahead of them."""
+    ids = [e.source.id for e in camera.active]
+    return element.source.id in LOOKS and PULSES in ids and element.source.id in ids[: ids.index(PULSES)]
 
 
 def _of(

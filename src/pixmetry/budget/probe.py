@@ -394,7 +394,7 @@ class Probes:
         return replace(self._behind(whole), frame_shape=shape, pedestal_dn=pedestal)
 
     def _pedestal_without(self, name: str) -> float:
-        """By how much black lies above code 0 without one of the grabber's sources: mean of dark windows ahead of the converter, and its offset."""
+        """By how much black lies above code 0 without one source: mean of dark windows ahead of the converter, and its offset."""
         active = self.camera.active
         last = next((i for i, e in enumerate(active) if e.source.produces is Kind.CODES), len(active))
         ahead = replace(self.camera, chain=tuple(e for e in active[:last] if e.name != name))

@@ -16,7 +16,7 @@ import numpy as np
 
 from pixmetry.budget.fields import Calibration, Places, field_of, spread_of
 from pixmetry.budget.monte_carlo import Trials, missed, put
-from pixmetry.budget.motion import LAGS, OF_MOTION, STILL, lag_contribution, motion_contribution
+from pixmetry.budget.motion import LAGS, OF_MOTION, PULSES, STILL, held_by_pulses, lag_contribution, motion_contribution, pulse_contribution
 from pixmetry.budget.parameters import UNSTATED, applies, assumed_estimates, u_from_parameters, with_estimates
 from pixmetry.budget.probe import Probes
 from pixmetry.budget.setting import Setting
@@ -293,6 +293,9 @@ class Table:
         row = replace(row, status=KNOWN_FROM[known_from], reason="" if estimates is None else estimates.method)
         if source.id in OF_MOTION and not self.setting.moves:
             return replace(row, before=Parts(), after=Parts(), how=TIMES, reason=STILL)
+        if held_by_pulses(element, self.setting.camera):
+            reason = f"pulses of light decide when the rows look: it counts in the row of {get_source(PULSES).title}"
+            return replace(row, status=ELSEWHERE, before=Parts(), after=Parts(), how=TIMES, reason=reason)
         row = self._computed(row, element, in_camera)
         if source.part_of:
             return replace(row, status=ELSEWHERE, reason=f"it counts in the row of {get_source(source.part_of).title}")
@@ -445,8 +448,12 @@ class Table:
 
     def _of_motion(self, row: SourceRow, element: Element) -> SourceRow:
         s = self.setting
-        lag = element.source.id in LAGS
-        found = lag_contribution(element, s, self.estimator) if lag else motion_contribution(element, s, s.camera)
+        if element.source.id in LAGS:
+            found = lag_contribution(element, s, self.estimator)
+        elif element.source.id == PULSES:
+            found = pulse_contribution(element, s, s.camera, self.estimator)
+        else:
+            found = motion_contribution(element, s, s.camera)
         return self._with(replace(row, how=TIMES), found, "no target is found behind it")
 
     # ---- maps -----------------------------------------------------------------------------------------------------------------

@@ -106,7 +106,7 @@ def propagate(params: Clamp, probe: Probe) -> Contribution:
     target = np.ascontiguousarray(probe.signal_dn - probe.background_dn, np.float32)
     slope = -loss * probe.background_dn * (np.arange(target.shape[2]) - probe.x_px[:, None])
     dx, dy = probe.field(droop(target, loss, half, *params.carry) - target.astype(float) + slope[:, None, :])
-    black = float(params.black(probe.temperature_c))
+    black = float(params.black(np.array(probe.temperature_c)))
     with_it, without = (probe.moved(_cut_off(probe, pedestal)) for pedestal in (probe.pedestal_dn + black, probe.pedestal_dn))
     dx, dy = (d + a - b for d, a, b in zip((dx, dy), with_it, without, strict=True))
     method = "offsets that are common to a row, the field of the droop, and what is cut off at code 0"
