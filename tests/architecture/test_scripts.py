@@ -32,6 +32,6 @@ def test_imports_of_the_package_are_there(path: Path) -> None:
 
 
 def test_a_planted_import_of_nothing_is_found() -> None:
-    program = "RUN = \"\"\"\nfrom pixmetry.core.camera import load_camera\n\"\"\"\n"
+    program = 'RUN = """\nfrom pixmetry.core.camera import load_camera\n"""\n'
     text = program + "from pixmetry.core.errors import (\n    InputError,\n    Nothing,\n)\n"
     assert missing(text) == ["pixmetry.core.camera.load_camera", "pixmetry.core.errors.Nothing"]

@@ -54,6 +54,7 @@ def test_rough_poses_are_enough(kind: str, rng: np.random.Generator) -> None:
     result = adjust(stripped(found), state, used=~simulated.gross, covariance=False)
     assert 0.7 < result.sigma0 < 1.3
 
+
 @pytest.mark.parametrize("bars", [0, 2])
 @pytest.mark.parametrize("images", [2, 12])
 def test_the_result_is_in_the_frame_of_the_poses(bars: int, images: int, rng: np.random.Generator) -> None:

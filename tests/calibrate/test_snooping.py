@@ -301,9 +301,7 @@ def search_from(simulated, rows, there):
     used[rows] = there
     snooped = remove_gross_errors(simulated.network, simulated.truth, adjust, used=used, loss="none")
     adjustment, name = snooped.adjustment, simulated.network.points[simulated.network.point[rows[0]]]
-    again = remove_gross_errors(
-        simulated.network, adjustment.state, adjust, used=adjustment.used, loss="none", rejected=snooped.rejected
-    )
+    again = remove_gross_errors(simulated.network, adjustment.state, adjust, used=adjustment.used, loss="none", rejected=snooped.rejected)
     np.testing.assert_array_equal(again.adjustment.used, adjustment.used)
     records = [r for r in gross_error_records(again.adjustment, again.alpha, again.rejected) if r.point == name]
     assert all(r.statistic > r.critical for r in records)

@@ -119,8 +119,8 @@ def test_stat_what_is_beyond_stated_noise_is_added_to_it(rng):
     for letter, beyond in zip("xy", (0.08, 0.05), strict=True):
         assert record.axes[letter].u_beyond_px < 0.06 * beyond
         assert record.axes[letter].beyond_px == pytest.approx(beyond, abs=Z * record.axes[letter].u_beyond_px)
-        total = record.axes[letter].given_px**2 + record.axes[letter].beyond_px**2
-        assert record.axes[letter].sigma_px**2 == pytest.approx(total, rel=5e-3)  # weights and sizes differ by the last step
+        total = record.axes[letter].given_px ** 2 + record.axes[letter].beyond_px ** 2
+        assert record.axes[letter].sigma_px ** 2 == pytest.approx(total, rel=5e-3)  # weights and sizes differ by the last step
         assert record.axes[letter].factor == 1
     assert found.adjustment.sigma0 == pytest.approx(1.0, abs=0.01)
 

@@ -22,8 +22,7 @@ def test_the_frame_is_what_lies_between_the_covered_borders(tmp_path: Path):
     for name, frame in zip("ab", frames, strict=True):
         write_frame(tmp_path / f"{name}.png", frame, 12)
     (tmp_path / "campaign.yaml").write_text(
-        "schema: pixmetry/campaign/1\n"
-        f"camera: {{name: one, bits: 12, covered: {BORDERS}}}\n".replace("'", "")
+        f"schema: pixmetry/campaign/1\ncamera: {{name: one, bits: 12, covered: {BORDERS}}}\n".replace("'", "")
         + 'frames: [{kind: dark, exposure_s: 0.01, files: ["a.png", "b.png"]}]\n'
     )
     read = load_campaign(tmp_path)

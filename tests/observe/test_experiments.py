@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import fields
 from typing import get_args
 
@@ -17,7 +18,15 @@ from pixmetry.files.records import FACTS, KINDS, TARGETS
 from pixmetry.files.schema import GroupModel
 from pixmetry.observe.experiments import EXPERIMENTS
 
-STATED = {"wavelength_nm": 850.0}  # a lawful value of each fact
+STATED = {  # a lawful value of each fact
+    "wavelength_nm": 850.0,
+    "densities": (0.1, 0.5),
+    "luminances": (80.0, 30.5),
+    "u_light_rel": 0.01,
+    "regions": ((0, 0, 3, 3), (4, 4, 3, 3)),
+    "white": True,
+}
+WITH = {"regions": {"densities": (0.1, 0.5)}}  # facts that another one needs
 
 
 def test_each_kind_of_the_manifest_has_its_experiment() -> None:
@@ -33,15 +42,16 @@ def test_each_fact_is_a_key_of_the_manifest_and_belongs_to_some_kind() -> None:
 
 @pytest.mark.parametrize("kind, name", [(kind, name) for kind, names in FACTS.items() for name in names])
 def test_a_fact_reaches_the_group_from_arrays_and_through_a_file(kind: str, name: str, tmp_path) -> None:
-    facts = GroupFacts(**{name: STATED[name]})
+    stated = {name: STATED[name], **WITH.get(name, {})}
+    facts = GroupFacts(**stated)
     frames = np.arange(2 * 8 * 8, dtype=np.uint16).reshape(2, 8, 8)
     campaign = campaign_of_arrays([Frames(kind, 0.01, frames, facts=facts)], bits=8, name="a camera")
     assert campaign.groups[0].facts == facts
-    listed = {"kind": kind, "exposure_s": 0.01, name: STATED[name], "files": ["a.png", "b.png"]}
+    listed = {"kind": kind, "exposure_s": 0.01, **stated, "files": ["a.png", "b.png"]}
     for file, frame in zip(listed["files"], frames, strict=True):
         write_frame(tmp_path / file, frame, 8)
     (tmp_path / "campaign.yaml").write_text(
-        f"schema: pixmetry/campaign/1\ncamera: {{name: one, bits: 8}}\nframes: [{listed}]\n".replace("'", '"')
+        f"schema: pixmetry/campaign/1\ncamera: {{name: one, bits: 8}}\nframes: [{json.dumps(listed)}]\n"
     )
     read = load_campaign(tmp_path)
     assert read.groups[0].facts == facts

@@ -50,12 +50,14 @@ def digital_twin(campaign: Campaign, estimates: Mapping[str, Estimates], observa
         if source.id not in estimates and source.id not in ALWAYS:
             continue
         found = replace(estimates.get(source.id, Estimates.empty()), confounders=())  # results.json holds these, once for all
-        params = source.make({k: v for k, v in known.items() if k in fields} | best_values(source, found), f"digital twin, {source.id}")
+        chosen = {} if observations.response is None else observations.response.choices.get(source.id, {})
+        values = {k: v for k, v in known.items() if k in fields} | best_values(source, found) | dict(chosen)
+        params = source.make(values, f"digital twin, {source.id}")
         known_from = MEASURED if len(found) else TYPICAL if source.measure is not None else DESCRIBED
         elements.append(Element(source.id, source, params, known_from=known_from, estimates=found))
     pitch = None if facts.pitch_x_um is None else (facts.pitch_x_um, facts.pitch_y_um or facts.pitch_x_um)
     stack = observations.bright_stack
-    if not any(element.name == "electronics.gain" for element in elements):
+    if not any(element.name in ("electronics.gain", "sensor.log_response") for element in elements):
         elements = _with_assumed_gain(elements, campaign.bits)
     exposure = stack.exposure_s if stack is not None else _middle_exposure_s(campaign)
     photons_known = "sensor.quantum_efficiency" in estimates

@@ -124,7 +124,7 @@ def assess(
     silent = noise_missing(seen)
     if silent:
         seen = replace(seen, notes=(*seen.notes, silent))
-    if "electronics.gain" not in estimates:
+    if not {"electronics.gain", "sensor.log_response"} & set(estimates):
         estimates, unmeasured = _at_assumed_gain(seen, estimates, unmeasured, frames.bits)
         assumed = f"taken as if {ASSUMED_RANGE_E:g} electrons filled the range, fewer than in most cameras"
         note = f"The gain is not measured. For the shot noise it is {assumed}, which bounds it; electrons are DN over that gain."
@@ -281,8 +281,8 @@ def observe_campaign(campaign: Campaign, progress: Progress) -> tuple[InputHashe
 
     reader = FrameReader(campaign)
 
-    chosen = [g for g in campaign.groups if campaign.camera.cfa is None or g.kind != "edge"]
-    note = "edges are not measured through a colour mosaic: a step of brightness looks jagged there"
+    chosen = [g for g in campaign.groups if campaign.camera.cfa is None or g.kind not in ("edge", "chart")]
+    note = "edges and charts are not measured through a colour mosaic: a step of brightness looks jagged there"
     left_out = (note,) if len(chosen) < len(campaign.groups) else ()
 
     def groups() -> Iterator[Group]:

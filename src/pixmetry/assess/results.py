@@ -12,6 +12,7 @@ from pixmetry.budget.monte_carlo import Crop
 from pixmetry.budget.records import SUM, Budget
 from pixmetry.camera.camera import Camera
 from pixmetry.camera.observations import EdgeResponse, LightSteps, Observations, SlantedEdges, StackMoments
+from pixmetry.camera.response import Response
 from pixmetry.core.number import Estimates
 from pixmetry.emva.files.json_format import value_record
 from pixmetry.emva.records import Results
@@ -95,6 +96,7 @@ class Assessment:
             "spatial": self.observations.spatial_fit.to_records() if self.observations.spatial_fit is not None else [],
             "light_off": None if self.observations.light_off is None else light_off_record(self.observations.light_off),
             "edges": None if self.observations.edges is None else edges_record(self.observations.edges),
+            "response": None if self.observations.response is None else response_record(self.observations.response),
             "emva1288": {
                 "release": self.standard.release,
                 "results": {key: value_record(value) for key, value in self.standard.values.items()},
@@ -192,6 +194,32 @@ def light_off_record(found: LightSteps) -> dict[str, Any]:
         for s in found.steps
     ]
     return {"values": found.fit.to_records(), "refused": list(found.refused), "sequences": each}
+
+
+def response_record(found: Response) -> dict[str, Any]:
+    """The plain record of the response to light: its curve, the patches, and why others were refused."""
+
+    def numbers(values: np.ndarray) -> list[float | None]:
+        return [float(v) if np.isfinite(v) else None for v in values]
+
+    patches = [{k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in asdict(p).items()} for p in found.patches]
+    return {
+        "curve": found.curve or None,
+        "tried": [asdict(f) for f in found.tried],
+        "estimates": found.fit.to_records(),
+        "names": list(found.fit.names),
+        "covariance": found.fit.covariance.tolist(),
+        "not_told": {name: why for name, why in found.fit.reasons.items() if name not in found.fit},
+        "choices": {source: dict(names) for source, names in found.choices.items()},
+        "oecf": {
+            "level_dn": numbers(found.level_dn),
+            "light_rel": numbers(found.light_rel),
+            "u_light_rel": numbers(found.u_light_rel),
+            "gain_dn_per_e": numbers(found.gain_dn_per_e),
+        },
+        "patches": patches,
+        "refused": list(found.refused),
+    }
 
 
 def _response_map(dark: StackMoments, bright: StackMoments, mask: np.ndarray) -> np.ndarray:

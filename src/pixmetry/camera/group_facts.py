@@ -13,6 +13,21 @@ class GroupFacts:
     ----------
     wavelength_nm : float or None
         Of the light.
+    densities : tuple of float or None
+        Optical densities of the patches of a chart (ISO 14524).
+    luminances : tuple of float or None
+        Luminances of the patches of a chart, in any unit.
+    u_light_rel : float or None
+        Relative standard uncertainty of the light of one patch, or of one exposure.
+    regions : tuple of (x, y, width, height) or None
+        Places of the patches in the frame, in the order of their densities; x and y of the first pixel.
+    white : bool or None
+        True: the frames show a white sheet in place of the chart, in the same light.
     """
 
     wavelength_nm: float | None = None
+    densities: tuple[float, ...] | None = None
+    luminances: tuple[float, ...] | None = None
+    u_light_rel: float | None = None
+    regions: tuple[tuple[int, int, int, int], ...] | None = None
+    white: bool | None = None

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from pixmetry.camera.noise_covariance import NoiseCovariance, NoiseFilter
+from pixmetry.camera.response import Response
 from pixmetry.camera.stated import StatedFacts
 from pixmetry.core.errors import MeasureError
 from pixmetry.core.number import Estimates
@@ -385,7 +386,8 @@ class Storage:
 class Observations:
     """All reduced data of one campaign; missing data are ``None``.
 
-    ``photon_transfer_fit`` is the joint estimate made once from ``photon_transfer`` (and the stacks), which many sources read.
+    ``response`` is what patches of known light tell. ``photon_transfer_fit`` is the joint estimate made once from ``photon_transfer`` (and
+    the stacks), which many sources read.
     """
 
     photon_transfer: PhotonTransfer | None = None
@@ -402,6 +404,7 @@ class Observations:
     edges: SlantedEdges | None = None
     light_off: LightSteps | None = None
     sensor: str | None = None  # ccd, cmos or cid, where it was said
+    response: Response | None = None
     noise_covariance: NoiseCovariance | None = None
     noise_filter: NoiseFilter | None = None
     stated: StatedFacts = StatedFacts()
@@ -455,6 +458,18 @@ class Observations:
         """
         optics = None if self.edges is None or not self.edges.edges else self.edges.optics
         return of_pictures(optics, names, where=where, pictures="slanted edges", kind="edge")
+
+    def curve(self, names: Mapping[str, str] | Iterable[str], *, where: str) -> Estimates:
+        """Take a source's parameters ``{parameter: fitted name}`` out of the response that a chart tells, with their covariance.
+
+        Raises
+        ------
+        MeasureError
+            Without patches of known light, or with the reason why they do not tell any of these.
+        """
+        fit = None if self.response is None else self.response.fit
+        mapping = dict(names) if isinstance(names, Mapping) else {n: n for n in names}
+        return of_pictures(fit, mapping, where=where, pictures="patches of known light", kind="chart")
 
     def calibrated(self, names: Mapping[str, str] | Iterable[str], *, where: str) -> Estimates:
         """Take a source's parameters out of the calibrated geometry, with their covariance.

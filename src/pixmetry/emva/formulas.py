@@ -59,9 +59,7 @@ class Formulas:
         """The measured statistics of the dark and the bright stack; empty without stacks."""
         return (np.zeros(0), np.zeros(0)) if self.stacks is None else (self.stacks[0].vector, self.stacks[1].vector)
 
-    def at(
-        self, series: Series, dark_vectors: Array, bright_vectors: Array, general: Series | None = None
-    ) -> tuple[Values, Values]:
+    def at(self, series: Series, dark_vectors: Array, bright_vectors: Array, general: Series | None = None) -> tuple[Values, Values]:
         """Values by key, and for those that are roots of a variance that may be negative, that variance (``DARK_VARIANCE``: of the dark).
 
         Parameters

@@ -268,9 +268,7 @@ def _light_share(light: Array, u_light: Array) -> Array:
     return np.divide(light**2, u_light**2, out=np.zeros_like(light), where=u_light > 0)
 
 
-def spatial_scatter(
-    levels: LevelMoments, shape: tuple[int, int], u_var: Array, wave_dn2: Array | float = 0.0
-) -> tuple[Array, Array]:
+def spatial_scatter(levels: LevelMoments, shape: tuple[int, int], u_var: Array, wave_dn2: Array | float = 0.0) -> tuple[Array, Array]:
     """How the spatial variance of a level scatters by the noise of its F frames, beside what goes with its temporal variance.
 
     It is the mean of ⟨y_k y_l⟩ − µ_k µ_l over the pairs of frames: Var = 4 s²σ²/(F n) + 2 σ⁴/(F (F − 1) n), for pixels, rows and columns.

@@ -127,9 +127,7 @@ def _walk_back(var: Array) -> np.ndarray:
     return index
 
 
-def _capacity(
-    release: str, dark_var: Array, gain: Array, responsivity: Array, light_sat: Array, photons: bool
-) -> dict[str, Array]:
+def _capacity(release: str, dark_var: Array, gain: Array, responsivity: Array, light_sat: Array, photons: bool) -> dict[str, Array]:
     """Dark noise, threshold, capacity and what follows from them; in photons only where these are known."""
     noise_e = np.sqrt(dark_var) / gain  # with that of quantisation
     e_min = np.sqrt(noise_e**2 + 0.25) + 0.5 if release == "4.0" else noise_e + 0.5

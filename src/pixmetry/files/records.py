@@ -19,8 +19,11 @@ from pixmetry.files.raw_values import RawLayout
 
 STACK_FRAMES = 8  # from this many frames on, a group is a stack: its mean image serves the spatial measurements
 KINDS = ("dark", "bright")  # frames of an even field, from which noise is measured
-TARGETS = ("edge", "light_off")  # pictures of something to be measured: one frame may be enough
-FACTS = {"edge": ("wavelength_nm",)}  # what else may be said of a group, by its kind
+TARGETS = ("edge", "light_off", "chart")  # pictures of something to be measured: one frame may be enough
+FACTS = {  # what else may be said of a group, by its kind
+    "edge": ("wavelength_nm",),
+    "chart": ("densities", "luminances", "u_light_rel", "regions", "white"),
+}
 
 
 @dataclass(frozen=True)

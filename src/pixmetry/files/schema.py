@@ -18,6 +18,7 @@ CAMPAIGN_SCHEMA = "pixmetry/campaign/1"
 Positive = Annotated[float, Field(gt=0)]
 Pitch = Annotated[float, Field(ge=0.1, le=1000)]  # µm
 Side = Annotated[int, Field(ge=1, le=1_000_000)]
+FromZero = Annotated[int, Field(ge=0, le=1_000_000)]
 
 
 def _quoted(value: Any) -> Any:
@@ -98,12 +99,17 @@ class OpticsModel(Model):
 class GroupModel(Model):
     """Frames under one condition."""
 
-    kind: Literal["dark", "bright", "edge", "light_off"]  # records.KINDS and TARGETS
+    kind: Literal["dark", "bright", "edge", "light_off", "chart"]  # records.KINDS and TARGETS
     exposure_s: Annotated[float, Field(ge=0)] | None = None
     photons: Annotated[float, Field(ge=0)] | None = None
     irradiance_uw_per_cm2: Positive | None = None
     role: Literal["level", "stack"] | None = None
     wavelength_nm: Positive | None = None
+    densities: Annotated[tuple[Annotated[float, Field(ge=0, le=8)], ...], Field(min_length=1)] | None = None
+    luminances: Annotated[tuple[Positive, ...], Field(min_length=1)] | None = None
+    u_light_rel: Annotated[float, Field(gt=0, le=1)] | None = None
+    regions: Annotated[tuple[tuple[FromZero, FromZero, Side, Side], ...], Field(min_length=1)] | None = None
+    white: bool | None = None
     files: Names
 
     @model_validator(mode="after")
@@ -120,6 +126,26 @@ class GroupModel(Model):
         if wrong:
             what = f"{wrong[0]} belongs to dark and bright frames, not to pictures of a target"
             raise InputError(what, allowed=", ".join(allowed), remedy="delete it")
+        return self
+
+    @model_validator(mode="after")
+    def _chart(self) -> GroupModel:
+        if self.kind != "chart":
+            return self
+        light = self.densities or self.luminances
+        if self.densities and self.luminances:
+            raise InputError("the light of the patches is given twice", allowed="densities or luminances", remedy="delete one of them")
+        if self.white and (light or self.regions):
+            raise InputError(
+                "a white sheet has no patches", allowed="white without densities, luminances and regions", remedy="delete them"
+            )
+        if self.regions and (light is None or len(light) != len(self.regions)):
+            count = 0 if light is None else len(light)
+            what = f"{len(self.regions)} regions and {count} patches"
+            raise InputError(what, allowed="one density or luminance for each region", remedy="list them in the order of the regions")
+        if light is None and not self.white and not self.exposure_s:
+            allowed = "densities or luminances of its patches; or exposure_s, of one scene at several exposures"
+            raise InputError("nothing is known of the light of a chart", allowed=allowed, remedy="add one of them")
         return self
 
     def facts(self) -> GroupFacts:

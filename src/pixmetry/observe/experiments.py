@@ -10,6 +10,8 @@ from pixmetry.observe.edge_fit import fit_edges
 from pixmetry.observe.edges import Picture, edge_notes, motion_notes, responses_of, search_edges
 from pixmetry.observe.experiment import Experiment, PictureGroup
 from pixmetry.observe.light_off import BlockMeans, reduce_light_off
+from pixmetry.observe.patches import find_patches
+from pixmetry.observe.response_fit import response_of, with_response
 
 
 def reduce_edges(groups: Sequence[PictureGroup], seen: Observations) -> Observations:
@@ -20,7 +22,20 @@ def reduce_edges(groups: Sequence[PictureGroup], seen: Observations) -> Observat
     return replace(seen, edges=edges, notes=(*seen.notes, *edge_notes(edges), *motion_notes(pictures, search)))
 
 
-EXPERIMENTS = {e.kind: e for e in (Experiment("edge", reduce_edges), Experiment("light_off", reduce_light_off, BlockMeans))}
+def reduce_charts(groups: Sequence[PictureGroup], seen: Observations) -> Observations:
+    """Fit the response to the patches of charts."""
+    found = find_patches(groups)
+    return with_response(seen, response_of(found, groups[0].bits, seen))
+
+
+EXPERIMENTS = {
+    e.kind: e
+    for e in (
+        Experiment("edge", reduce_edges),
+        Experiment("light_off", reduce_light_off, BlockMeans),
+        Experiment("chart", reduce_charts),
+    )
+}
 
 
 def reduce_pictures(groups: Iterable[PictureGroup], seen: Observations) -> Observations:

@@ -89,10 +89,14 @@ def _pictures(assessment: Assessment) -> list[Section]:
     """A section for each kind of pictures."""
     from pixmetry.assess.page.edges import edges_section
     from pixmetry.assess.page.light_off import light_off_section
+    from pixmetry.assess.page.response import response_section
 
     seen = assessment.observations
-    edges = [] if seen.edges is None else [edges_section(seen.edges)]
-    return [*edges, *([] if seen.light_off is None else [light_off_section(seen.light_off)])]
+    return [
+        *([] if seen.edges is None else [edges_section(seen.edges)]),
+        *([] if seen.response is None else [response_section(seen.response)]),
+        *([] if seen.light_off is None else [light_off_section(seen.light_off)]),
+    ]
 
 
 def _values(assessment: Assessment) -> Section:
@@ -179,7 +183,8 @@ def _shared(assessment: Assessment) -> list[Estimates]:
     """The estimates that many sources read."""
     seen = assessment.observations
     optics = None if seen.edges is None or not len(seen.edges.optics) else seen.edges.optics
-    return [s for s in (seen.photon_transfer_fit, seen.spatial_fit, optics) if s is not None]
+    response = None if seen.response is None or not seen.response.curve else seen.response.fit
+    return [s for s in (seen.photon_transfer_fit, seen.spatial_fit, optics, response) if s is not None]
 
 
 def _confounders(assessment: Assessment) -> list[str]:

@@ -445,9 +445,7 @@ def products(which: Ints, Z: Eliminated, at: Incidence, Q: Array, G: Array) -> N
 
 
 @jit
-def residual_cofactors(
-    linear: Linear, at: Incidence, place: Ints, root: Array, cofactor: Array, Q: Array, G: Array, own: Array
-) -> None:
+def residual_cofactors(linear: Linear, at: Incidence, place: Ints, root: Array, cofactor: Array, Q: Array, G: Array, own: Array) -> None:
     """2 × 2 matrices J Qxx Jᵀ of whitened image coordinates, shape (n, 3) for xx, xy, yy, in units of their own weight.
 
     ``place[i]``: row block of its point in ``G`` = Zᵀ Q (3 points, unknowns), −1 where the point is not eliminated and −2 to pass it over.

@@ -106,9 +106,7 @@ class _Choice:
     worse: np.ndarray
 
 
-def mend(
-    adjustment: Adjustment, used: np.ndarray, allowed: np.ndarray, variance: float, critical: float, false_alarms: float
-) -> Mended:
+def mend(adjustment: Adjustment, used: np.ndarray, allowed: np.ndarray, variance: float, critical: float, false_alarms: float) -> Mended:
     """Choose the rays of points that lost some.
 
     Parameters

@@ -24,9 +24,7 @@ LEVEL = 0.01
 CELLS = (10, 8)  # of the frame, in which residuals have something in common or not
 
 
-def residual_grids(
-    adjustment: Adjustment, nodes: tuple[int, int] | None = None, folds: int = 5, seed: int = 0
-) -> dict[str, ResidualGrid]:
+def residual_grids(adjustment: Adjustment, nodes: tuple[int, int] | None = None, folds: int = 5, seed: int = 0) -> dict[str, ResidualGrid]:
     """Correction grids of the cameras whose left-out images get better by them.
 
     Parameters

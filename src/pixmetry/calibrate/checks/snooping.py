@@ -190,9 +190,7 @@ def gross_error_records(adjustment: Adjustment, alpha: float, rejected: Rejected
     if rejected is not None:
         then = ~np.isfinite(statistic)
         statistic, critical = np.where(then, rejected.statistic, statistic), np.where(then, rejected.critical, critical)
-        residual, error = (
-            np.where(then[:, None], old, new) for old, new in ((rejected.residual_px, residual), (rejected.error_px, error))
-        )
+        residual, error = (np.where(then[:, None], old, new) for old, new in ((rejected.residual_px, residual), (rejected.error_px, error)))
     out = np.flatnonzero(~adjustment.used & np.isfinite(statistic))
     swapped = _swapped(network, out, residual)
     return tuple(
@@ -225,9 +223,7 @@ def _swapped(network: Network, out: np.ndarray, residual_px: np.ndarray) -> dict
     return pairs
 
 
-def _reject(
-    network: Network, state: State, adjust: Adjust, used: np.ndarray, alpha: float, rejected: Rejected
-) -> Adjustment:
+def _reject(network: Network, state: State, adjust: Adjust, used: np.ndarray, alpha: float, rejected: Rejected) -> Adjustment:
     done, worst = 0, np.zeros(1, int)
     while len(worst) and done < PASSES:
         done += 1

@@ -130,9 +130,7 @@ class Sizes:
         return replace(out, covariance_px2=out.covariance_px2 + np.column_stack([added[:, 0], 0 * added[:, 0], added[:, 1]]))
 
 
-def estimate_components(
-    adjustment: Adjustment, adjust: Adjust, *, by_axis: bool = True, given_px2: np.ndarray | None = None
-) -> Components:
+def estimate_components(adjustment: Adjustment, adjust: Adjust, *, by_axis: bool = True, given_px2: np.ndarray | None = None) -> Components:
     """Estimate the components and adjust with them.
 
     Parameters

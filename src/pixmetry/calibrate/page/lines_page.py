@@ -94,10 +94,7 @@ def _residuals(section: Section, calibration: LineCalibration) -> None:
         section.add_text(typeset(sentence(test.text)))
         section.add(number_table("F-test of x against y", heads, f_rows(test)), Text(COUNTING, "small soft"))
     section.add(*drawn_lines(calibration))
-    rows = [
-        [str(r.image), str(r.line), r.axis, fixed(r.angle_deg, 2), str(r.n), length_px(r.rms_px), f"{r.dof:.1f}"]
-        for r in result.lines
-    ]
+    rows = [[str(r.image), str(r.line), r.axis, fixed(r.angle_deg, 2), str(r.n), length_px(r.rms_px), f"{r.dof:.1f}"] for r in result.lines]
     heads = ["Image", "Line", "Axis", "Angle / °", "Positions", "rms / px", "Degrees of freedom"]
     section.add_section(f"Table of the {len(rows)} lines", number_table("Lines", heads, rows, 3), fold=True)
 

@@ -110,9 +110,7 @@ def _to_known(work: Reconstruction, *, scaled: bool) -> None:
     moved(work, scale / size, rotation, shift - scale / size * rotation @ middle)
 
 
-def _nearest(
-    source: Array, target: Array, u: Array, size: float, scaled: bool
-) -> tuple[float, Array, Array, Array]:
+def _nearest(source: Array, target: Array, u: Array, size: float, scaled: bool) -> tuple[float, Array, Array, Array]:
     """Scale, rotation, shift that bring points of extent 1 to coordinates that are known with u (n, 3; ``inf``: not known), and how far
     these remain apart beyond their u, in units of the extent; where they leave something open, the nearest to ``size`` without a turn.
 

@@ -198,9 +198,7 @@ def motions(r: np.ndarray) -> np.ndarray:
     return out
 
 
-def similarity(
-    source: Array, target: Array, weight: Array | None = None, *, scaled: bool = True
-) -> tuple[float, Array, Array]:
+def similarity(source: Array, target: Array, weight: Array | None = None, *, scaled: bool = True) -> tuple[float, Array, Array]:
     """Scale, rotation and shift that take points to others in least squares: target = scale · R source + shift.
 
     S. Umeyama, IEEE PAMI 13 (1991) 376–380.

@@ -130,9 +130,7 @@ def _check(dark: SpatialInputs, bright: SpatialInputs, release: str) -> None:
         raise MeasureError("the bright stack is not brighter than the dark one", value=bright.vector[0], allowed=f"above {dark.vector[0]}")
 
 
-def snr_total_max(
-    u_e_sat: Array, dark_noise_e2: Array, dsnu2_e2: Array | float, prnu2_percent2: Array | float
-) -> Array:
+def snr_total_max(u_e_sat: Array, dark_noise_e2: Array, dsnu2_e2: Array | float, prnu2_percent2: Array | float) -> Array:
     """Largest signal-to-noise ratio with non-uniformity: EMVA 1288 R4.0 eq. 69 at saturation, where it is largest.
 
     Parameters

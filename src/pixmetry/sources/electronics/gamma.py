@@ -9,6 +9,7 @@ import numpy as np
 
 from pixmetry.camera.contribution import Contribution, Probe
 from pixmetry.camera.observations import Observations
+from pixmetry.camera.response import TOES, toe_shape
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
 from pixmetry.core.arrays import Array
@@ -19,7 +20,7 @@ from pixmetry.core.random import Stream
 LOWEST, HIGHEST = 0.3, 1.0  # exponents that a camera can be set to
 DARKEST, BRIGHTEST = 0.1, 0.8  # of the brightest level above black: the levels that are compared with a power curve
 LEVELS = 6  # at least, for the three numbers of a curve
-TOE = 0.018  # share of the reference below which a curve for television is a straight line
+TOE = TOES["bt709"]
 LIGHT_RATIO = 2.0  # at least, between the brightest and the darkest of them
 
 
@@ -31,25 +32,13 @@ class Gamma(Parameters):
     toe: Literal["none", "bt709"] = quantity("none", "1", "bt709: straight below 0.018 of the reference, as in television cameras")
 
 
-def shape(gamma: float, toe: str) -> tuple[float, float]:
-    """Return α and the slope of the toe: y = α x^γ − (α − 1) above the toe, slope · x in it.
-
-    Value and slope are continuous at the joint β: α = 1/(1 − (1 − γ) β^γ), slope = α γ β^(γ−1). For γ = 0.45 these are 1.09914 and
-    4.507, which ITU-R BT.709 prints as 1.099 and 4.5.
-    """
-    if toe == "none":
-        return 1.0, 0.0
-    alpha = 1 / (1 - (1 - gamma) * TOE**gamma)
-    return alpha, alpha * gamma * TOE ** (gamma - 1)
-
-
 def curve_dn(x_dn: np.ndarray, gamma: float, reference_dn: float, toe: str = "none") -> np.ndarray:
     """Apply the curve, odd about black so that noise below black stays below; shape and dtype as given."""
     number = x_dn.dtype.type
     share = np.abs(x_dn) * number(1 / reference_dn)
     y = np.power(share, number(gamma))
     if toe != "none":
-        alpha, slope = shape(gamma, toe)
+        alpha, slope = toe_shape(gamma, toe)
         y = np.where(share < TOE, number(slope) * share, number(alpha) * y - number(alpha - 1))
     curved: np.ndarray = np.copysign(number(reference_dn) * y, x_dn)
     return curved
@@ -57,7 +46,7 @@ def curve_dn(x_dn: np.ndarray, gamma: float, reference_dn: float, toe: str = "no
 
 def straight_dn(y_dn: np.ndarray, gamma: float, reference_dn: float, toe: str) -> np.ndarray:
     """Undo `curve_dn`, in float64."""
-    alpha, slope = shape(gamma, toe)
+    alpha, slope = toe_shape(gamma, toe)
     share = np.abs(y_dn) / reference_dn
     x = np.power((share + (alpha - 1)) / alpha, 1 / gamma)
     if toe != "none":
@@ -80,11 +69,16 @@ def correct(params: Gamma, signal: Signal, maps: Mapping[str, np.ndarray]) -> Si
 
 
 def measure(observations: Observations) -> Estimates:
-    """Give a gamma of 1, with how well the level means agree with it once the measured non-linearity is taken out.
+    """Give the exponent that patches of known light tell; without them a gamma of 1, with how well the level means agree with it.
 
-    Light and dark show one curve: what bend there is `electronics.nonlinearity` holds, and it must not be counted twice. The photon
-    transfer refuses a curve that a gamma setting makes. The agreement is δ of mean = b + c light^(1 + δ), of first order in δ.
+    A chart, or one scene at several exposures, tells any exponent, and of a curve with a toe its reference. Light and dark show one
+    curve: what bend there is `electronics.nonlinearity` holds, and it must not be counted twice. The photon transfer refuses a curve that
+    a gamma setting makes. The agreement is δ of mean = b + c light^(1 + δ), of first order in δ, once the measured non-linearity is taken
+    out.
     """
+    chart = observations.response
+    if chart is not None and (chart.curve or not _has_levels(observations)):
+        return observations.curve(("gamma", "reference_dn"), where="electronics.gamma")
     light, signal = _straight_levels(observations)
     design = np.stack([np.ones_like(light), light, light * np.log(light)], axis=1)
     found = np.linalg.lstsq(design, signal, rcond=None)[0]
@@ -97,6 +91,12 @@ def measure(observations: Observations) -> Estimates:
         confounders=("light that is not proportional to the exposure time looks like a camera with gamma",),
         reasons={"gamma": f"electronics.nonlinearity contains the curvature of the response; beyond it the exponent is {1 + delta:.4g}"},
     )
+
+
+def _has_levels(observations: Observations) -> bool:
+    """Whether there is a photon transfer that tells a bend."""
+    fit = observations.photon_transfer_fit
+    return fit is not None and "nonlinearity_a1" in fit
 
 
 def _straight_levels(observations: Observations) -> tuple[np.ndarray, np.ndarray]:

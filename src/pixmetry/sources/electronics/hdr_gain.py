@@ -8,8 +8,10 @@ from typing import Literal
 import numpy as np
 
 from pixmetry.camera.contribution import Contribution, Probe
+from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.number import Estimates
 from pixmetry.core.random import Grid, Stream
 
 BOUNDLESS_DN = 1e9
@@ -22,7 +24,7 @@ class HdrGain(Parameters):
         "two gains", "1", "two gains: the upper part is read at a low gain; knee: a response with a bend"
     )
     switch_dn: float = quantity(BOUNDLESS_DN, "DN", "signal above black where the upper part begins", gt=0, le=BOUNDLESS_DN)
-    mismatch_rel: float = quantity(0.0, "1", "relative error of the ratio of the two slopes that the camera assumes", ge=-0.5, le=0.5)
+    mismatch_rel: float = quantity(0.0, "1", "relative error of the ratio of the two slopes that the camera assumes", ge=-0.98, le=0.5)
     offset_dn: float = quantity(0.0, "DN", "two gains: error of the upper part's black level", ge=-1e4, le=1e4)
     column_std_rel: float = quantity(0.0, "1", "standard deviation of the ratio from column to column, fixed in the unit", ge=0, le=0.2)
     upper_noise_dn: float = quantity(0.0, "DN", "noise that the read-out of the upper part adds, on this scale", ge=0, le=1e4)
@@ -76,6 +78,11 @@ def correct(params: HdrGain, signal: Signal, maps: Mapping[str, np.ndarray]) -> 
     return signal.with_data(x.astype(np.float32))
 
 
+def measure(observations: Observations) -> Estimates:
+    """Place of a knee, and the slope above it over that below, from patches of known light."""
+    return observations.curve(("switch_dn", "mismatch_rel"), where="electronics.hdr_gain")
+
+
 def propagate(params: HdrGain, probe: Probe) -> Contribution:
     """Propagator P4: the estimator on the target with its upper part changed; P1 for the noise, P2 for the columns of that part."""
     signal = probe.signal_dn
@@ -111,6 +118,7 @@ SOURCE = Source(
     typical=HdrGain(switch_dn=60.0, mismatch_rel=0.02, offset_dn=0.5, column_std_rel=0.002, upper_noise_dn=0.5),
     bound=HdrGain(switch_dn=60.0, mismatch_rel=0.05, offset_dn=2.0, column_std_rel=0.005, upper_noise_dn=2.0, ratio=4),
     forward=forward,
+    measure=measure,
     truth=truth,
     correct=correct,
     propagate=propagate,
@@ -122,5 +130,4 @@ SOURCE = Source(
     references=("EMVA 1288 R4.0 General (cameras with a non-linear response)",),
     leaves="pixels near the switch that were read on the other side of it by noise",
     advice="Expose so that the whole target is below or above the change of gain. Calibrate the ratio of the gains column by column.",
-    reasons={"measure": "needs flat fields at fine steps of light below and above the change of gain, and its known level"},
 )

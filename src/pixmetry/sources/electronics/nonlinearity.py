@@ -60,9 +60,14 @@ def forward(params: Nonlinearity, signal: Signal, stream: Stream) -> Signal:
 
 
 def measure(observations: Observations) -> Estimates:
-    """Read the coefficients from the joint fit to means and variances; its w is 1 at the largest code."""
+    """Read the coefficients from the joint fit to means and variances, or from patches of known light; w is 1 at the largest code."""
+    names = tuple(f"a{k}" for k in (1, 2, 3))
+    if observations.response is not None and "nonlinearity_a1" in observations.response.fit:
+        fit = observations.photon_transfer_fit
+        if fit is None or "nonlinearity_a1" not in fit:
+            return observations.curve({name: f"nonlinearity_{name}" for name in names}, where="electronics.nonlinearity")
     return observations.fitted(
-        {f"a{k}": f"nonlinearity_a{k}" for k in (1, 2, 3)},
+        {name: f"nonlinearity_{name}" for name in names},
         "non-linearity needs a photon-transfer series of known light",
         where="electronics.nonlinearity",
         remedy="take ten light levels or more",

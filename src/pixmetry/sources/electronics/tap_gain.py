@@ -19,9 +19,7 @@ LEAST_COLS, MOST_CLIPPED, FOUND_Z = 96, 0.002, 5.0
 TAPS = (2, 3, 4, 6, 8)  # that are looked for
 STRIPE_SUM = 4.0  # at most: the differences of neighbouring columns share them
 METHOD = "column medians of bright less dark stack: steps at the borders of equal parts, and odd columns against even ones"
-CONFOUNDERS = (
-    "gain of the taps: the columns' own pattern (PRNU), which holds the stripes too; a step of the light exactly at a border",
-)
+CONFOUNDERS = ("gain of the taps: the columns' own pattern (PRNU), which holds the stripes too; a step of the light exactly at a border",)
 
 
 class TapGain(Parameters):

@@ -44,9 +44,7 @@ def reshape(params: WindowOffset, frame_shape: tuple[int, int]) -> tuple[int, in
     return params.rows or frame_shape[0], params.cols or frame_shape[1]
 
 
-def place(
-    params: WindowOffset, x: np.ndarray, y: np.ndarray, frame_shape: tuple[int, int], frame: int
-) -> tuple[np.ndarray, np.ndarray]:
+def place(params: WindowOffset, x: np.ndarray, y: np.ndarray, frame_shape: tuple[int, int], frame: int) -> tuple[np.ndarray, np.ndarray]:
     """Positions of points of the image in the stored window."""
     row, col = params.row_offset, params.col_offset
     return x - col, y - row

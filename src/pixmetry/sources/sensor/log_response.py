@@ -8,8 +8,10 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from pixmetry.camera.contribution import Contribution, Probe
+from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.number import Estimates
 from pixmetry.core.random import Grid, Stream
 
 BOLTZMANN_V_PER_K = 8.617333262e-5  # k/q, CODATA 2018
@@ -85,6 +87,15 @@ def truth(params: LogResponse, signal: Signal, stream: Stream) -> Mapping[str, n
     return {"a_dn": a, "b_dn": b * float(slope_dn(params, one.temperature_c[0])), "c_e": c}
 
 
+def measure(observations: Observations) -> Estimates:
+    """Mean curve from patches of known light: slope (for a slope factor of 1), foot in electrons, and black.
+
+    Spread of the pixels and noise are not told by patches.
+    """
+    names = {"gain_dn_per_v": "gain_dn_per_v", "foot_e": "foot_e"}
+    return observations.curve(names, where="sensor.log_response")
+
+
 def ideal(params: LogResponse) -> LogResponse:
     """The same response in every pixel, without noise."""
     return params.model_copy(update={"offset_std_dn": 0.0, "slope_std_rel": 0.0, "foot_std_rel": 0.0, "noise_dn": 0.0})
@@ -127,6 +138,7 @@ SOURCE = Source(
     bound=LogResponse(offset_std_dn=6.0, slope_std_rel=0.03, foot_std_rel=0.2, noise_dn=1.0),
     ideal=ideal,
     forward=forward,
+    measure=measure,
     propagate=propagate,
     truth=truth,
     applies_to=("cmos",),
@@ -140,7 +152,6 @@ SOURCE = Source(
     ),
     advice="Calibrate a, b and c of every pixel at four uniform levels or more, and invert the response before measuring.",
     reasons={
-        "measure": "needs uniform fields at four levels or more over several decades, read pixel by pixel",
         "correct": "needs the maps of a, b and c of this camera, which dark and flat stacks at one level do not show",
         "neutral": "it is a conversion: without it there is no digital signal",
     },

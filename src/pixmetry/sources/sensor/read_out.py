@@ -77,9 +77,7 @@ def reshape(params: ReadOut, frame_shape: tuple[int, int]) -> tuple[int, int]:
     return (max(1, frame_shape[0] // 2), frame_shape[1]) if params.mode == "field" else frame_shape
 
 
-def place(
-    params: ReadOut, x: np.ndarray, y: np.ndarray, frame_shape: tuple[int, int], frame: int
-) -> tuple[np.ndarray, np.ndarray]:
+def place(params: ReadOut, x: np.ndarray, y: np.ndarray, frame_shape: tuple[int, int], frame: int) -> tuple[np.ndarray, np.ndarray]:
     """Where a place of the frame lies in the field that this frame number holds."""
     if params.mode != "field":
         return x, y
