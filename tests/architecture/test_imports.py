@@ -23,7 +23,7 @@ FLOORS = (
     ("camera",),
     ("sources", "scene", "observe", "files", "report"),
     ("locate",),
-    ("simulate", "emva", "calibrate"),
+    ("simulate", "emva", "calibrate", "series"),
     ("budget",),
     ("assess",),
     ("cli",),

@@ -23,6 +23,12 @@ class GroupFacts:
         Places of the patches in the frame, in the order of their densities; x and y of the first pixel.
     white : bool or None
         True: the frames show a white sheet in place of the chart, in the same light.
+    times_s : tuple of float, or None
+        When each frame of a series was taken.
+    interval_s : float or None
+        Time from frame to frame of a series.
+    on_for_s : float or None
+        How long the camera had been on when the first frame of a series was taken.
     """
 
     wavelength_nm: float | None = None
@@ -31,3 +37,6 @@ class GroupFacts:
     u_light_rel: float | None = None
     regions: tuple[tuple[int, int, int, int], ...] | None = None
     white: bool | None = None
+    times_s: tuple[float, ...] | None = None
+    interval_s: float | None = None
+    on_for_s: float | None = None

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from pixmetry.camera.drift_series import DriftSeries
 from pixmetry.camera.noise_covariance import NoiseCovariance, NoiseFilter
 from pixmetry.camera.response import Response
 from pixmetry.camera.stated import StatedFacts
@@ -410,6 +411,7 @@ class Observations:
     stated: StatedFacts = StatedFacts()
     temperature_c: float | None = None
     geometry: CameraGeometry | None = None
+    drift: DriftSeries | None = None
     storage: Storage = Storage()
     notes: tuple[str, ...] = field(default_factory=tuple)
 

@@ -8,9 +8,11 @@ import numpy as np
 
 from pixmetry.camera.contribution import Contribution, Probe
 from pixmetry.camera.line_contribution import held_of
+from pixmetry.camera.observations import Observations, of_pictures
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
 from pixmetry.core.arrays import Array
+from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
 
 
@@ -83,6 +85,13 @@ def propagate(params: ClockWarmUp, probe: Probe) -> Contribution:
     )  # fmt: skip
 
 
+def measure(observations: Observations) -> Estimates:
+    """Error and delay of the clock when switched on, from a series of a fixed field; camera and grabber warm up together in it."""
+    names = ("scale_error_rel", "scale_tau_s", "delay_ns", "delay_tau_s")
+    fit = None if observations.drift is None else observations.drift.fit
+    return of_pictures(fit, {name: name for name in names}, where="grabber.clock_warm_up", pictures="a fixed field over time", kind="series")
+
+
 SOURCE = Source(
     id="grabber.clock_warm_up",
     title="Warm-up of the frame grabber",
@@ -98,6 +107,7 @@ SOURCE = Source(
     typical=ClockWarmUp(scale_error_rel=0.0071),
     bound=ClockWarmUp(scale_error_rel=0.0071, delay_ns=20.0),
     forward=forward,
+    measure=measure,
     truth=truth,
     propagate=propagate,
     near=near,
@@ -109,7 +119,6 @@ SOURCE = Source(
     references=("H. A. Beyer, IAPRS XXIX-B5, 1992, 561 (line-start lock of frame grabbers)",),
     advice="Wait 90 minutes, or sample with the camera's pixel clock. Otherwise estimate a scale along the row for every image.",
     reasons={
-        "measure": "needs a series of images of targets that starts when the grabber is switched on",
         "correct": "coordinates are corrected, not images: the targets of an image give its scale",
     },
 )

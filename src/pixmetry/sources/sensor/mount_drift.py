@@ -8,8 +8,10 @@ import numpy as np
 
 from pixmetry.camera.geometry import frame_centre, image_shift
 from pixmetry.camera.light import Pull
+from pixmetry.camera.observations import Observations, of_pictures
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
 
 
@@ -72,6 +74,13 @@ def truth(params: MountDrift, signal: Signal, stream: Stream) -> Mapping[str, np
     return image_shift(_pull(params, signal), signal)
 
 
+def measure(observations: Observations) -> Estimates:
+    """Shift, scale and rotation of the image and how fast they settle, from a series of a fixed field."""
+    names = ("shift_x_px", "shift_y_px", "scale_rel", "rotation_rad", "fast_share", "fast_s", "slow_s")
+    fit = None if observations.drift is None else observations.drift.fit
+    return of_pictures(fit, {name: name for name in names}, where="sensor.mount_drift", pictures="a fixed field over time", kind="series")
+
+
 SOURCE = Source(
     id="sensor.mount_drift",
     title="Drift of the sensor in its mount",
@@ -84,6 +93,7 @@ SOURCE = Source(
     typical=MountDrift(shift_x_px=0.2, shift_y_px=0.1, scale_rel=2e-4, rotation_rad=5e-5, sag_px=0.05, roll_deg=90.0),
     bound=MountDrift(shift_x_px=2.0, shift_y_px=2.0, scale_rel=1e-3, rotation_rad=5e-4, sag_px=0.5, roll_deg=180.0),
     forward=forward,
+    measure=measure,
     truth=truth,
     gum_class="D",
     equation="x' = (1 + s p) R(ρ p) [[1 + b₁ p, b₂ p], [0, 1]] x + t p + g(roll),  p = 1 − f e^(−t/τ₁) − (1 − f) e^(−t/τ₂)",
@@ -94,7 +104,6 @@ SOURCE = Source(
     ),
     advice="Wait until the camera is warm. Clamp the lens. Calibrate in the orientation in which you measure.",
     reasons={
-        "measure": "not measured: needs a series of a fixed test field after switching on, and rolled images",
         "correct": "frames are not resampled; positions are corrected instead, from the time or the temperature",
         "propagate": "it depends on the time of the frame, which the probe does not contain",
     },

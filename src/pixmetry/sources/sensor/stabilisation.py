@@ -9,8 +9,10 @@ import numpy as np
 from pixmetry.camera.contribution import Contribution, Probe
 from pixmetry.camera.geometry import frame_centre, image_shift
 from pixmetry.camera.light import Pull
+from pixmetry.camera.observations import Observations, of_pictures
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
 
 
@@ -63,6 +65,13 @@ def propagate(params: Stabilisation, probe: Probe) -> Contribution:
     return Contribution(float(ux), float(uy), "D", model_error=0.05, method="displacement and rotation of the frame")
 
 
+def measure(observations: Observations) -> Estimates:
+    """Scatter of the whole image from frame to frame, from a series of a fixed field."""
+    names = ("shift_std_px", "roll_std_rad")
+    fit = None if observations.drift is None else observations.drift.fit
+    return of_pictures(fit, {name: name for name in names}, where="sensor.stabilisation", pictures="a fixed field over time", kind="series")
+
+
 SOURCE = Source(
     id="sensor.stabilisation",
     title="Stabilised sensor",
@@ -73,6 +82,7 @@ SOURCE = Source(
     typical=Stabilisation(shift_std_px=0.1, roll_std_rad=1e-4),
     bound=Stabilisation(shift_std_px=0.5, roll_std_rad=1e-3),
     forward=forward,
+    measure=measure,
     truth=truth,
     propagate=propagate,
     option="a stabilised sensor",
@@ -82,7 +92,6 @@ SOURCE = Source(
     references=("ISO 20954-1:2019 (image stabilisation performance)",),
     advice="Switch the stabilisation off, or estimate principal point and roll for every image.",
     reasons={
-        "measure": "not measured: needs a series of a fixed test field from a tripod",
         "correct": "frames are not resampled; positions are corrected instead, by the pose of each frame",
     },
 )

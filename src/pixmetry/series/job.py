@@ -1,0 +1,299 @@
+"""A series of frames of a fixed field, from image files to the warm-up of the camera that took them."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pixmetry.camera.drift_series import DriftSeries
+from pixmetry.core.arrays import Array
+from pixmetry.core.errors import InputError, MeasureError
+from pixmetry.core.progress import Progress, no_progress
+from pixmetry.core.threads import imap_tiles, single_threaded_blas
+from pixmetry.files.formats import PICTURE_ENDINGS, frame_name
+from pixmetry.files.images import load_picture, picture_files
+from pixmetry.files.output import check_output, staged_output
+from pixmetry.files.provenance import provenance_record
+from pixmetry.files.raw_values import RawLayout, layout_of
+from pixmetry.files.results import write_record
+from pixmetry.locate.files import frames_inside
+from pixmetry.locate.noise import noise_model
+from pixmetry.series.log import SeriesLog
+from pixmetry.series.modes import field_motion
+from pixmetry.series.track import FrameTargets, find_targets, follow_targets
+from pixmetry.series.warm_up import drift_of
+
+KIND = "series"
+SERIES_SCHEMA = "pixmetry/series/1"
+Fetch = Callable[[], np.ndarray]
+
+
+@dataclass(frozen=True)
+class Series:
+    """A series and the motion of its image.
+
+    Parameters
+    ----------
+    drift : DriftSeries
+    frames : tuple of str
+        Names, in order of time.
+    frame_shape : (int, int)
+    notes : tuple of str
+    provenance : dict
+    """
+
+    drift: DriftSeries
+    frames: tuple[str, ...]
+    frame_shape: tuple[int, int]
+    notes: tuple[str, ...] = ()
+    provenance: dict[str, Any] = field(default_factory=dict)
+
+    def to_record(self) -> dict[str, Any]:
+        """Return the plain record of ``series.json``."""
+        return {
+            "schema": SERIES_SCHEMA,
+            "rows": self.frame_shape[0],
+            "cols": self.frame_shape[1],
+            **drift_record(self.drift),
+            "names": list(self.frames),
+            "notes": list(self.notes),
+            "provenance": self.provenance,
+        }
+
+
+def drift_record(drift: DriftSeries) -> dict[str, Any]:
+    """The plain record of the motion of an image."""
+    return {
+        "targets": drift.targets,
+        "location_factor": drift.location_factor,
+        "estimates": drift.fit.to_records(),
+        "names_of_covariance": list(drift.fit.names),
+        "covariance": drift.fit.covariance.tolist(),
+        "confounders": list(drift.fit.confounders),
+        "not_told": {name: why for name, why in drift.fit.reasons.items() if name not in drift.fit},
+        "stable": drift.stable.to_record(),
+        "tolerance_px": drift.tolerance_px,
+        "modes": list(drift.modes),
+        "time_s": drift.time_s.tolist(),
+        "motion": drift.values.tolist(),
+        "u_motion": drift.u.tolist(),
+        "curve": drift.fitted.tolist(),
+        "from_settled_px": drift.from_settled_px.tolist(),
+        "u_from_settled_px": drift.u_from_settled_px.tolist(),
+    }
+
+
+def series(
+    frames: str | Path | Sequence[str | Path],
+    output: str | Path | None = None,
+    *,
+    interval_s: float | None = None,
+    times: str | Path | None = None,
+    on_for_s: float = 0.0,
+    interface: str = "digital",
+    pixel_clock_mhz: float | None = None,
+    tolerance_px: float = 0.05,
+    raw: str | RawLayout | None = None,
+    progress: Progress | None = None,
+    **options: Any,
+) -> Series:
+    """Measure how the image moves over a series of frames of a fixed field, as while a camera warms up.
+
+    Parameters
+    ----------
+    frames : path, or sequence of path
+        Image files and folders of them, in the order of their names.
+    output : path, optional
+        Folder of the results: ``report.html`` and ``series.json``. Beside it, ``<output>.frames.jsonl`` keeps the targets of every frame;
+        a run that was interrupted goes on from there.
+    interval_s : float, optional
+        Time from frame to frame.
+    times : path, optional
+        CSV file with columns ``file`` and ``time_s``. Without one of both, times are those at which the files were written.
+    on_for_s : float
+        How long camera and frame grabber had been on when the first frame was taken (frame of time 0).
+    interface : {"digital", "analogue"}
+        Of an analogue camera the warm-up of the frame grabber is fitted too.
+    pixel_clock_mhz : float, optional
+        Of the frame grabber; a delay of the lines in ns needs it.
+    tolerance_px : float
+        Displacement of the farthest corner within which the camera is called stable.
+    raw, **options
+        As of `pixmetry.locate`: ``kind``, ``polarity``, ``noise``, ``bits``, ``estimator``.
+    progress : callable (what, done, of), optional
+
+    Returns
+    -------
+    Series
+
+    Raises
+    ------
+    InputError, MeasureError
+        If a file or an option cannot be used, or the frames do not show three targets.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from pixmetry.series.job import measure_series
+    >>> y, x = np.indices((120, 160))
+    >>> def frame(t):  # nine discs that move by up to 0.2 px
+    ...     moved = 0.2 * (1 - np.exp(-t / 600))
+    ...     dots = [np.hypot(x - 30 - 50 * i - moved, y - 20 - 40 * j) for i in range(3) for j in range(3)]
+    ...     grey = 20 + 150 / (1 + np.exp(4 * (np.min(dots, axis=0) - 5)))
+    ...     return np.rint(grey + np.random.default_rng(int(t)).normal(0, 1, grey.shape)).astype(np.uint8)
+    >>> found = measure_series([(str(t), t, lambda t=t: frame(t)) for t in range(0, 3600, 60)])
+    >>> shift = found.drift.fit["shift_x_px"]
+    >>> abs(shift.value - 0.2) < 4 * shift.u
+    True
+    """
+    if interface not in ("digital", "analogue"):
+        raise InputError("no such interface", where="interface", value=interface, allowed="digital, analogue")
+    layout = layout_of(raw)
+    given = [frames] if isinstance(frames, str | Path) else list(frames)
+    files = picture_files([frames_inside(path) for path in given], PICTURE_ENDINGS, layout)
+    model = noise_model(options.pop("noise", None))
+    seconds, notes = times_of(files, interval_s, times)
+    log = None
+    if output is not None:
+        check_output(output, KIND, tuple(map(str, given)), files)
+        told = {name: str(value) for name, value in {**options, "noise": model, "raw": layout}.items() if value is not None}
+        log = SeriesLog(Path(f"{str(output).rstrip('/')}.frames.jsonl"), told)
+    named = [
+        (frame_name(path), on_for_s + time, lambda path=path: load_picture(path, None, layout).array)
+        for path, time in sorted(zip(files, seconds, strict=True), key=lambda pair: pair[1])
+    ]
+    try:
+        found = measure_series(
+            named,
+            analogue=interface == "analogue",
+            pixel_clock_mhz=pixel_clock_mhz,
+            tolerance_px=tolerance_px,
+            log=log,
+            notes=notes,
+            progress=progress,
+            noise=model,
+            **options,
+        )
+    finally:
+        if log is not None:
+            log.close()
+    if output is not None:
+        write_results(found, output, tuple(map(str, given)), files)
+    return found
+
+
+def times_of(files: Sequence[Path], interval_s: float | None, times: str | Path | None) -> tuple[list[float], tuple[str, ...]]:
+    """Seconds of every file after the first one, and a note on where they come from.
+
+    Raises
+    ------
+    InputError
+        If a file has no time in the table, or all files were written at once.
+    """
+    if interval_s is not None and times is not None:
+        raise InputError("times are given twice", allowed="an interval or a table of times", remedy="leave one out")
+    if interval_s is not None:
+        if not interval_s > 0:
+            raise InputError("not an interval", where="interval_s", value=interval_s, allowed="above 0 s")
+        return [interval_s * k for k in range(len(files))], ()
+    if times is not None:
+        return _from_table(files, Path(times)), ()
+    written = np.array([_holder(path).stat().st_mtime for path in files])
+    if np.ptp(written) < 1.0 or len(set(map(_holder, files))) < len(files):
+        remedy = "give the interval from frame to frame, or a table of times"
+        raise InputError("the frames carry no times: their files were written at once", where=str(files[0].parent), remedy=remedy)
+    return list(written - written.min()), ("Times are those at which the files were written; copies may have lost them.",)
+
+
+def _holder(path: Path) -> Path:
+    """The file that holds a frame."""
+    return path if path.exists() else path.parent
+
+
+def _from_table(files: Sequence[Path], table: Path) -> list[float]:
+    try:
+        with table.open(newline="", encoding="utf-8-sig") as file:
+            rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
+        known = {Path(row["file"]).name: float(row["time_s"]) for row in rows}
+    except OSError as problem:
+        raise InputError("file cannot be read", where=str(table), value=problem.strerror, remedy="check the name") from None
+    except (KeyError, ValueError, TypeError, AttributeError, UnicodeDecodeError, csv.Error):
+        raise InputError("not a table of times", where=str(table), allowed="CSV with columns file, time_s", remedy="correct it") from None
+    missing = next((path for path in files if path.name not in known), None)
+    if missing is not None:
+        raise InputError("no time for a frame", where=str(table), value=missing.name, remedy="add its row")
+    first = min(known[path.name] for path in files)
+    return [known[path.name] - first for path in files]
+
+
+def measure_series(
+    frames: Iterable[tuple[str, float, Fetch]],
+    *,
+    analogue: bool = False,
+    pixel_clock_mhz: float | None = None,
+    tolerance_px: float = 0.05,
+    log: SeriesLog | None = None,
+    notes: tuple[str, ...] = (),
+    progress: Progress | None = None,
+    **options: Any,
+) -> Series:
+    """Measure a series whose frames are fetched one by one: names, seconds since switching on, and functions that return the frames.
+
+    In memory are the frames in work, one a thread. Frames that a log holds are not fetched again.
+
+    Raises
+    ------
+    InputError, MeasureError
+        As of `series`.
+    """
+    told, named = progress or no_progress, list(frames)
+    shape = None if log is None else log.shape
+    seen: dict[str, FrameTargets] = {} if log is None else dict(log.done)
+
+    def work(item: tuple[str, float, Fetch]) -> tuple[FrameTargets, tuple[int, int]]:
+        name, time_s, fetch = item
+        array = fetch()
+        if shape is not None and array.shape != shape:
+            raise InputError("a frame of another size", where=name, value=array.shape, allowed=str(shape), remedy="leave it out")
+        return find_targets(array, name, time_s, **options), (array.shape[0], array.shape[1])
+
+    waiting: Iterator[tuple[str, float, Fetch]] = (item for item in named if item[0] not in seen)
+    done = len(named) - sum(item[0] not in seen for item in named)
+    for found, size in imap_tiles(work, waiting):
+        if shape is None:
+            shape = size
+            if log is not None:
+                log.put_shape(size)
+        if log is not None:
+            log.put(found)
+        seen[found.name] = found
+        done += 1
+        told("locating", done, len(named))
+    if shape is None or not named:
+        raise MeasureError("no frames", where="series", remedy="name frames of a fixed field of targets")
+    ordered = [seen[name] for name, _, _ in named]
+    seconds: Array = np.array([time for _, time, _ in named], float)
+    with single_threaded_blas():
+        positions, covariance = follow_targets(ordered)
+        motion = field_motion(positions, covariance, (0.5 * (shape[1] - 1), 0.5 * (shape[0] - 1)), analogue=analogue)
+        drift = drift_of(motion, seconds, shape, clock_mhz=pixel_clock_mhz, tolerance_px=tolerance_px)
+    lost = int((~motion.used).sum())
+    more = (f"{lost} of {len(named)} frames show too few of the targets and are left out.",) if lost else ()
+    names = tuple(name for name, _, _ in named)
+    return Series(drift, names, shape, (*notes, *more), provenance_record(libraries=("numpy", "scipy", "numba")))
+
+
+def write_results(found: Series, output: str | Path, of: Sequence[str], inputs: Iterable[Path]) -> Path:
+    """Write page and record into a folder, whole or not at all; return the path of the page."""
+    from pixmetry.report import html_of
+    from pixmetry.series.page import page_of
+
+    with staged_output(output, KIND, of, inputs) as folder:
+        (folder / "report.html").write_text(html_of(page_of(found)), encoding="utf-8")
+        write_record(folder / "series.json", found.to_record())
+    return Path(output) / "report.html"

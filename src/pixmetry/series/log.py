@@ -1,0 +1,96 @@
+"""The log of a series: a line for each frame, on the disk before the next one is worked on, so that a run that was killed goes on."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from pixmetry.core.errors import InputError
+from pixmetry.files.strict_json import plain
+from pixmetry.series.track import FrameTargets
+
+LOG_SCHEMA = "pixmetry/series-log/1"
+
+
+class SeriesLog:
+    """Targets of the frames so far, in a file of JSON lines.
+
+    Parameters
+    ----------
+    path : Path
+        Made if it does not exist; else the frames in it are taken over.
+    options : mapping
+        What the positions depend on. A log that was begun with others is refused.
+
+    Raises
+    ------
+    InputError
+        If it cannot be written, is no log, or was begun with other options.
+    """
+
+    def __init__(self, path: Path, options: Mapping[str, Any]) -> None:
+        self.path = path
+        self.done: dict[str, FrameTargets] = {}
+        self.shape: tuple[int, int] | None = None
+        head = {"schema": LOG_SCHEMA, "options": plain(dict(options))}
+        whole = self._read(head) if path.exists() and path.stat().st_size else 0
+        try:
+            self._file = path.open("r+b" if whole else "wb")
+            self._file.truncate(whole)  # a line that was cut off when a run was killed
+            self._file.seek(whole)
+            if not whole:
+                self._write(head)
+        except OSError as problem:
+            raise InputError("the log cannot be written", where=str(path), value=problem.strerror, remedy="choose another folder") from None
+
+    def _read(self, head: Mapping[str, Any]) -> int:
+        """Take over the frames of an earlier run; return how many bytes of it are whole lines."""
+        remedy = "choose another output, or delete it to begin anew"
+        raw = self.path.read_bytes()
+        lines = raw.splitlines(keepends=True)
+        if not lines[-1].endswith(b"\n"):
+            lines = lines[:-1]
+        if not lines and not raw.startswith(b'{"schema": "pixmetry/'):
+            raise InputError("not a log of a series", where=str(self.path), remedy=remedy)
+        for number, line in enumerate(lines):
+            try:
+                record = json.loads(line)
+                if number == 0:
+                    known = record["schema"] == LOG_SCHEMA
+                elif "rows" in record:
+                    self.shape = (int(record["rows"]), int(record["cols"]))
+                    continue
+                else:
+                    found = FrameTargets.from_record(record)
+                    self.done[found.name] = found
+                    continue
+            except (ValueError, KeyError, TypeError):
+                raise InputError(f"line {number + 1} is no line of a log", where=str(self.path), remedy=remedy) from None
+            if not known:
+                raise InputError("not a log of a series", where=str(self.path), remedy=remedy)
+            if record["options"] != head["options"]:
+                raise InputError("the log was begun with other options", where=str(self.path), value=record["options"], remedy=remedy)
+        return sum(len(line) for line in lines)
+
+    def put_shape(self, shape: tuple[int, int]) -> None:
+        """Note the size of the frames."""
+        if self.shape is None:
+            self.shape = shape
+            self._write({"rows": shape[0], "cols": shape[1]})
+
+    def put(self, found: FrameTargets) -> None:
+        """Add a frame; it is on the disk when this returns."""
+        self.done[found.name] = found
+        self._write(found.to_record())
+
+    def _write(self, record: Mapping[str, Any]) -> None:
+        self._file.write(json.dumps(record).encode() + b"\n")
+        self._file.flush()
+        os.fsync(self._file.fileno())
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()

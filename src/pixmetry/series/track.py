@@ -1,0 +1,113 @@
+"""Targets of a fixed field, found in every frame and known again from frame to frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from pixmetry.core.arrays import Array
+from pixmetry.core.errors import MeasureError
+from pixmetry.locate.detect.targets import Flag
+from pixmetry.locate.job import locate
+
+NEAR = 0.4  # of the distance to the nearest neighbour, within which a target is the same
+MOST_PX = 25.0  # beyond which it is another, however far its neighbours are
+USELESS = Flag.NOT_CONVERGED | Flag.BORDER
+
+
+@dataclass(frozen=True)
+class FrameTargets:
+    """Targets of one frame: ``positions_px``, shape (n, 2), and ``covariance_px2``, (n, 2, 2)."""
+
+    name: str
+    time_s: float
+    positions_px: Array
+    covariance_px2: Array
+
+    def to_record(self) -> dict[str, Any]:
+        """Plain record, a line of the log."""
+        (xx, xy), (_, yy) = np.moveaxis(self.covariance_px2, 0, -1)
+        rows = np.column_stack([self.positions_px, xx, xy, yy])
+        return {"frame": self.name, "time_s": self.time_s, "targets": rows.tolist()}
+
+    @classmethod
+    def from_record(cls, record: dict[str, Any]) -> FrameTargets:
+        """The targets of a record; ``KeyError``, ``TypeError`` or ``ValueError`` where it is none."""
+        rows = np.array(record["targets"], float).reshape(-1, 5)
+        covariance = rows[:, [2, 3, 3, 4]].reshape(-1, 2, 2)
+        return cls(str(record["frame"]), float(record["time_s"]), rows[:, :2], covariance)
+
+
+def find_targets(frame: np.ndarray, name: str, time_s: float, **options: Any) -> FrameTargets:
+    """Find and measure the targets of one frame, on one thread; ``options`` as of `pixmetry.locate`.
+
+    Raises
+    ------
+    InputError
+        If the frame or an option cannot be used.
+    """
+    found = locate(frame, name=name, threads=1, **options)
+    xx, xy, yy = (np.asarray(found[n], float) for n in ("var_x_px2", "cov_xy_px2", "var_y_px2"))
+    positions = np.column_stack([found["x_px"], found["y_px"]]).astype(float)
+    good = (np.asarray(found["flags"]).astype(int) & int(USELESS) == 0) & np.isfinite(positions).all(axis=1) & (xx > 0) & (yy > 0)
+    covariance = np.stack([xx, xy, xy, yy], axis=1).reshape(-1, 2, 2)
+    return FrameTargets(name, time_s, positions[good], covariance[good])
+
+
+def follow_targets(frames: Sequence[FrameTargets]) -> tuple[Array, Array]:
+    """Know the targets of one frame again in all others.
+
+    Parameters
+    ----------
+    frames : sequence of FrameTargets
+        In order of time.
+
+    Returns
+    -------
+    positions_px, covariance_px2 : ndarray, shape (frames, targets, 2) and (frames, targets, 2, 2)
+        NaN where a target was not found.
+
+    Raises
+    ------
+    MeasureError
+        If the frames show no targets.
+
+    Notes
+    -----
+    The list of targets is that of the first frame with the usual number of them. A target is looked for where it was in the frame before,
+    moved as its fellows were; two belong together if each is the other's nearest, within 0.4 of the distance between neighbours.
+    """
+    counts = np.array([len(f.positions_px) for f in frames])
+    if not counts.size or counts.max() == 0:
+        raise MeasureError("no targets are found in any frame", where="series", remedy="check the kind of target, and that it is in focus")
+    usual = np.bincount(counts[counts > 0]).argmax()
+    start = int(np.flatnonzero(counts == usual)[0])
+    first = frames[start].positions_px
+    gate = MOST_PX if len(first) < 2 else min(MOST_PX, NEAR * float(cKDTree(first).query(first, 2)[0][:, 1].min()))
+    positions = np.full((len(frames), len(first), 2), np.nan)
+    covariance = np.full((len(frames), len(first), 2, 2), np.nan)
+    for order in (range(start, len(frames)), range(start - 1, -1, -1)):
+        last = first.copy()
+        for k in order:
+            found = frames[k]
+            if not len(found.positions_px):
+                continue
+            one, other = _pairs(last, found.positions_px, gate)
+            positions[k, one], covariance[k, one] = found.positions_px[other], found.covariance_px2[other]
+            if one.size:
+                step = np.median(found.positions_px[other] - last[one], axis=0)
+                last = last + step
+                last[one] = found.positions_px[other]
+    return positions, covariance
+
+
+def _pairs(known: Array, found: Array, gate: float) -> tuple[np.ndarray, np.ndarray]:
+    """Indices of those that are each other's nearest within the gate."""
+    there, back = cKDTree(found).query(known)[1], cKDTree(known).query(found)[1]
+    near = np.linalg.norm(found[there] - known, axis=1) < gate
+    one = np.flatnonzero(near & (back[there] == np.arange(len(known))))
+    return one, there[one]
