@@ -39,6 +39,7 @@ _HOMES = {
     "locate": "pixmetry.locate.job",
     "read_calibration": "pixmetry.calibrate.files.record",
     "read_frame": "pixmetry.files",
+    "series": "pixmetry.series.job",
     "simulate": "pixmetry.simulate.job",
     "sources": "pixmetry.camera.catalogue",
 }
@@ -70,6 +71,7 @@ __all__ = [
     "locate",
     "read_calibration",
     "read_frame",
+    "series",
     "simulate",
     "sources",
 ]
@@ -92,6 +94,7 @@ if TYPE_CHECKING:
     from pixmetry.files import Frames, campaign_of_arrays, load_campaign, read_frame
     from pixmetry.locate.bound.bound import bound
     from pixmetry.locate.job import locate
+    from pixmetry.series.job import series
     from pixmetry.simulate.chain import chain
     from pixmetry.simulate.job import simulate
 

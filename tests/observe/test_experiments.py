@@ -14,7 +14,7 @@ from pixmetry.core.errors import InputError
 from pixmetry.files.images import write_frame
 from pixmetry.files.in_memory import Frames, campaign_of_arrays
 from pixmetry.files.manifest import load_campaign, write_manifest
-from pixmetry.files.records import FACTS, KINDS, TARGETS
+from pixmetry.files.records import FACTS, KINDS, LOCATED, TARGETS
 from pixmetry.files.schema import GroupModel
 from pixmetry.observe.experiments import EXPERIMENTS
 
@@ -25,12 +25,15 @@ STATED = {  # a lawful value of each fact
     "u_light_rel": 0.01,
     "regions": ((0, 0, 3, 3), (4, 4, 3, 3)),
     "white": True,
+    "times_s": (0.0, 60.0),
+    "interval_s": 60.0,
+    "on_for_s": 30.0,
 }
-WITH = {"regions": {"densities": (0.1, 0.5)}}  # facts that another one needs
+WITH = {"regions": {"densities": (0.1, 0.5)}, "on_for_s": {"interval_s": 60.0}}  # facts that another one needs
 
 
 def test_each_kind_of_the_manifest_has_its_experiment() -> None:
-    assert tuple(EXPERIMENTS) == TARGETS
+    assert {*EXPERIMENTS, *LOCATED} == set(TARGETS)
     assert get_args(GroupModel.model_fields["kind"].annotation) == (*KINDS, *TARGETS)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -40,8 +40,11 @@ from pixmetry.files import (
     write_maps,
     write_record,
 )
+from pixmetry.files.records import LOCATED, FrameGroup
 from pixmetry.locate.target_estimator import TargetEstimator, parse_estimator
 from pixmetry.observe.observe import Group, observe
+from pixmetry.observe.one_pass import without_levels
+from pixmetry.series.job import measure_series
 
 KIND = "assessment"
 SPREADING = ("optics.point_spread", "optics.olpf", "sensor.pixel_aperture")
@@ -281,17 +284,49 @@ def observe_campaign(campaign: Campaign, progress: Progress) -> tuple[InputHashe
 
     reader = FrameReader(campaign)
 
-    chosen = [g for g in campaign.groups if campaign.camera.cfa is None or g.kind not in ("edge", "chart")]
+    followed = [g for g in campaign.groups if g.kind in LOCATED]
+    shown = [g for g in campaign.groups if g.kind not in LOCATED]
+    chosen = [g for g in shown if campaign.camera.cfa is None or g.kind not in ("edge", "chart")]
     note = "edges and charts are not measured through a colour mosaic: a step of brightness looks jagged there"
-    left_out = (note,) if len(chosen) < len(campaign.groups) else ()
+    left_out = (note,) if len(chosen) < len(shown) else ()
 
     def groups() -> Iterator[Group]:
         for g in chosen:
             yield Group(g.kind, g.role, g.exposure_s, g.photons, [partial(reader.fetch, path) for path in g.paths], g.facts)
 
-    seen = observe(groups(), campaign.bits, campaign.camera.temperature_c, campaign.stated, on_frames=on_frames)
+    if chosen:
+        seen = observe(groups(), campaign.bits, campaign.camera.temperature_c, campaign.stated, on_frames=on_frames)
+    else:
+        alone = without_levels(campaign.frame_shape, campaign.bits)
+        seen = Observations(alone, Estimates.empty(), temperature_c=campaign.camera.temperature_c, stated=campaign.stated)
+    if followed:
+        seen = _with_series(seen, campaign, followed, reader, on_frames)
     notes = (*campaign.findings, *left_out, *seen.notes)
     return reader.hashes, replace(seen, storage=reader.storage, sensor=campaign.camera.sensor, notes=notes)
+
+
+def _with_series(
+    seen: Observations, campaign: Campaign, groups: Sequence[FrameGroup], reader: FrameReader, on_frames: Callable[[int], object]
+) -> Observations:
+    """What the longest series of a fixed field tells."""
+    group = max(groups, key=lambda g: len(g.paths))
+    others = f"of {len(groups)} series the one of the most frames is used" if len(groups) > 1 else ""
+    facts, count = group.facts, len(group.paths)
+    times = facts.times_s or [k * (facts.interval_s or 1.0) for k in range(count)]
+    frames = [
+        (path.name, time + (facts.on_for_s or 0.0), partial(reader.fetch, path)) for path, time in zip(group.paths, times, strict=True)
+    ]
+    try:
+        found = measure_series(
+            sorted(frames, key=lambda frame: frame[1]),
+            analogue=campaign.camera.interface == "analogue",
+            pixel_clock_mhz=campaign.camera.pixel_clock_mhz,
+            progress=lambda what, done, of: (on_frames(1), None)[1],
+            bits=campaign.bits,
+        )
+    except MeasureError as problem:
+        return replace(seen, notes=(*seen.notes, f"the series of a fixed field tells nothing: {problem}"))
+    return replace(seen, drift=found.drift, notes=(*seen.notes, *filter(None, (others, *found.notes))))
 
 
 def by_the_standard(campaign: Campaign, observations: Observations) -> Results:

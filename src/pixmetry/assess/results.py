@@ -17,6 +17,7 @@ from pixmetry.core.number import Estimates
 from pixmetry.emva.files.json_format import value_record
 from pixmetry.emva.records import Results
 from pixmetry.files import Campaign
+from pixmetry.series.records import drift_record
 
 RESULTS_SCHEMA = "pixmetry/results/1"
 
@@ -97,6 +98,7 @@ class Assessment:
             "light_off": None if self.observations.light_off is None else light_off_record(self.observations.light_off),
             "edges": None if self.observations.edges is None else edges_record(self.observations.edges),
             "response": None if self.observations.response is None else response_record(self.observations.response),
+            "series": None if self.observations.drift is None else drift_record(self.observations.drift),
             "emva1288": {
                 "release": self.standard.release,
                 "results": {key: value_record(value) for key, value in self.standard.values.items()},

@@ -34,7 +34,8 @@ class DriftSeries:
     location_factor : float
         Scatter of single targets about the modes over what their covariances say; above 1 all u are enlarged by it.
     fit : Estimates
-        ``shift_x_px``, ``shift_y_px``, ``scale_rel``, ``rotation_rad`` (from switching on to settled), ``fast_share``, ``fast_s``, ``slow_s``;
+        ``shift_x_px``, ``shift_y_px``, ``scale_rel``, ``rotation_rad`` (from switching on to settled), ``fast_share``, ``fast_s``,
+        ``slow_s``;
         of an analogue camera ``scale_error_rel``, ``scale_tau_s``, ``delay_ns``, ``delay_tau_s``; from frame to frame ``shift_std_px``,
         ``roll_std_rad``. ``reasons`` of names that it does not hold say why.
     stable : Number

@@ -275,7 +275,8 @@ def write_manifest(campaign: Campaign, path: str | Path) -> None:
         told: dict[str, Any] = {"kind": group.kind, "exposure_s": group.exposure_s, "photons": photons, "role": group.role}
         if group.kind in TARGETS:
             told |= {"exposure_s": group.exposure_s or None, "role": None}
-        facts = {name: value for name, value in asdict(group.facts).items() if value is not None}
+        stated = {name: value for name, value in asdict(group.facts).items() if value is not None}
+        facts = {name: list(value) if isinstance(value, tuple) else value for name, value in stated.items()}
         frames.append({**told, **facts, "files": files})
     manifest = {"schema": CAMPAIGN_SCHEMA, "camera": asdict(campaign.camera), "optics": asdict(campaign.optics), "frames": frames}
     texts = {name: getattr(campaign, name) or None for name in ("licence", "notes", "operator")}

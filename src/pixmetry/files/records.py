@@ -19,10 +19,12 @@ from pixmetry.files.raw_values import RawLayout
 
 STACK_FRAMES = 8  # from this many frames on, a group is a stack: its mean image serves the spatial measurements
 KINDS = ("dark", "bright")  # frames of an even field, from which noise is measured
-TARGETS = ("edge", "light_off", "chart")  # pictures of something to be measured: one frame may be enough
+TARGETS = ("edge", "light_off", "chart", "series")  # pictures of something to be measured: one frame may be enough
+LOCATED = ("series",)  # kinds whose frames are measured one by one, for their targets
 FACTS = {  # what else may be said of a group, by its kind
     "edge": ("wavelength_nm",),
     "chart": ("densities", "luminances", "u_light_rel", "regions", "white"),
+    "series": ("times_s", "interval_s", "on_for_s"),
 }
 
 
@@ -232,6 +234,7 @@ def check_groups(groups: tuple[FrameGroup, ...], where: str) -> tuple[tuple[Fram
     if not groups:
         raise InputError("no frames are listed", where=where, remedy="list dark and bright frames with their exposure times, or edges")
     _refuse_repeated_files(groups, where)
+    _refuse_other_times(groups, where)
     targets = sorted((g for g in groups if g.kind in TARGETS), key=_order)
     fields = [g for g in groups if g.kind not in TARGETS]
     single = [g for g in fields if len(g.paths) < 2]
@@ -254,6 +257,14 @@ def _refuse_repeated_files(groups: tuple[FrameGroup, ...], where: str) -> None:
     if times > 1:
         remedy = "list each frame once: a frame compared with itself has no noise"
         raise InputError(f"file '{path.name}' is listed {times} times", where=where, allowed="each file once", remedy=remedy)
+
+
+def _refuse_other_times(groups: tuple[FrameGroup, ...], where: str) -> None:
+    for group in groups:
+        times = group.facts.times_s
+        if times is not None and len(times) != len(group.paths):
+            what = f"{len(times)} times for {len(group.paths)} frames"
+            raise InputError(what, where=f"{where}, {group.label}", allowed="times_s with one time for each frame", remedy="correct it")
 
 
 def _of_different_conditions(groups: list[FrameGroup], where: str) -> tuple[tuple[FrameGroup, ...], list[str]]:

@@ -99,7 +99,7 @@ class OpticsModel(Model):
 class GroupModel(Model):
     """Frames under one condition."""
 
-    kind: Literal["dark", "bright", "edge", "light_off", "chart"]  # records.KINDS and TARGETS
+    kind: Literal["dark", "bright", "edge", "light_off", "chart", "series"]  # records.KINDS and TARGETS
     exposure_s: Annotated[float, Field(ge=0)] | None = None
     photons: Annotated[float, Field(ge=0)] | None = None
     irradiance_uw_per_cm2: Positive | None = None
@@ -110,6 +110,9 @@ class GroupModel(Model):
     u_light_rel: Annotated[float, Field(gt=0, le=1)] | None = None
     regions: Annotated[tuple[tuple[FromZero, FromZero, Side, Side], ...], Field(min_length=1)] | None = None
     white: bool | None = None
+    times_s: Annotated[tuple[float, ...], Field(min_length=1)] | None = None
+    interval_s: Positive | None = None
+    on_for_s: Annotated[float, Field(ge=0)] | None = None
     files: Names
 
     @model_validator(mode="after")
@@ -146,6 +149,13 @@ class GroupModel(Model):
         if light is None and not self.white and not self.exposure_s:
             allowed = "densities or luminances of its patches; or exposure_s, of one scene at several exposures"
             raise InputError("nothing is known of the light of a chart", allowed=allowed, remedy="add one of them")
+        return self
+
+    @model_validator(mode="after")
+    def _times(self) -> GroupModel:
+        if self.kind == "series" and (self.times_s is None) == (self.interval_s is None):
+            what = "a series without times" if self.times_s is None else "times are given twice"
+            raise InputError(what, allowed="times_s (one for each frame) or interval_s", remedy="give one of them")
         return self
 
     def facts(self) -> GroupFacts:

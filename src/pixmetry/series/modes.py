@@ -89,7 +89,7 @@ def field_motion(positions_px: Array, covariance_px2: Array, centre_px: tuple[fl
     the motion; an error of it is the same in all frames, so it is taken up by the constant of each mode, which no parameter needs.
     """
     modes = (*CAMERA_MODES, *(GRABBER_MODES if analogue else ()))
-    seen = np.isfinite(positions_px).all(axis=2) & np.isfinite(covariance_px2).all(axis=(2, 3))
+    seen = np.asarray(np.isfinite(positions_px).all(axis=2) & np.isfinite(covariance_px2).all(axis=(2, 3)))
     kept = np.flatnonzero(seen.mean(axis=0) >= LEAST_SHARE)
     if kept.size < LEAST_TARGETS:
         raise MeasureError(
@@ -99,7 +99,7 @@ def field_motion(positions_px: Array, covariance_px2: Array, centre_px: tuple[fl
             remedy="show a field of targets that stays in view",
         )
     positions, covariance, seen = positions_px[:, kept] - np.asarray(centre_px), covariance_px2[:, kept], seen[:, kept]
-    used = np.asarray(seen.sum(axis=1) >= LEAST_TARGETS)
+    used = seen.sum(axis=1) >= LEAST_TARGETS
     if used.sum() < 3:
         raise MeasureError(f"only {used.sum()} frames show the targets", where="series", remedy="take more frames")
     weight = np.zeros_like(covariance)

@@ -15,7 +15,7 @@ from pixmetry.report.page import Answer, Figure, Reading, Text
 from pixmetry.report.provenance import provenance_section
 
 if TYPE_CHECKING:
-    from pixmetry.series.job import Series
+    from pixmetry.series.records import Series
 
 WORDS = {
     "shift_x_px": "Shift along x, from switching on to settled",

@@ -23,6 +23,11 @@ TOLD_SHARE = 0.8  # of the prior's u: what the series narrows less is not told b
 ALIKE = 25.0  # difference of χ² below which a second solution is not excluded
 NOT_APART = 0.99  # correlation from which on two parameters are told only as a sum
 SIGNIFICANT = 3.0
+CONFOUNDERS = (
+    "sensor.thermal_expansion (a logged temperature tells it apart)",
+    "expansion or motion of the target field",
+    "a change of the focus",
+)
 METHOD = "positions of a fixed field of targets over time; exponential curves by generalised least squares"
 ROUNDS = 3  # of weights and curve in turn
 FAST = ("ln fast", "share")
@@ -338,13 +343,9 @@ def _first_scatter(series: Series) -> Array:
 
 
 def _of_rigid(series: Series, variance: Array) -> Array:
-    """Only shift and rotation scatter: both shifts alike."""
-    kept = np.zeros(len(series.modes))
-    at = {mode: k for k, mode in enumerate(series.modes)}
-    shifts = [at["shift_x_px"], at["shift_y_px"]]
-    kept[shifts] = max(float(variance[shifts].mean()), 0.0)
-    kept[at["rotation_rad"]] = max(float(variance[at["rotation_rad"]]), 0.0)
-    return kept
+    """Only shift and rotation scatter."""
+    rigid = np.array([mode in ("shift_x_px", "shift_y_px", "rotation_rad") for mode in series.modes])
+    return np.where(rigid, np.maximum(variance, 0.0), 0.0)
 
 
 def _scatter(series: Series, fit: Fit) -> tuple[Array, Array]:
@@ -354,12 +355,8 @@ def _scatter(series: Series, fit: Fit) -> tuple[Array, Array]:
     known = np.diagonal(series.covariance, axis1=1, axis2=2).mean(axis=0)
     whole = (left**2).sum(axis=0) / (frames - taken)
     u = np.sqrt(2 / (frames - taken)) * whole
-    variance, at = whole - known, {mode: k for k, mode in enumerate(series.modes)}
-    shifts = [at["shift_x_px"], at["shift_y_px"]]
-    u[shifts] = np.linalg.norm(u[shifts]) / 2
-    raw = variance.copy()
-    raw[shifts] = variance[shifts].mean()
-    return _of_rigid(series, raw), np.stack([raw, u])
+    variance = whole - known
+    return _of_rigid(series, variance), np.stack([variance, u])
 
 
 def _widening(series: Series, fit: Fit, scatter: Array) -> float:
@@ -437,7 +434,7 @@ def _estimates(series: Series, fit: Fit, found: Curve, others: Sequence[Fit], u_
     turn = np.array(slopes).reshape(len(rows), len(fit.names))
     estimates = Estimates(
         tuple(r[0] for r in rows), np.array([r[2] for r in rows]), turn @ fit.covariance @ turn.T, np.full(len(rows), float(fit.dof)),
-        tuple(r[1] for r in rows), METHOD, ("expansion or motion of the target field", "a change of the focus"), frozenset(limits),
+        tuple(r[1] for r in rows), METHOD, CONFOUNDERS, frozenset(limits),
         reasons=reasons,
     )  # fmt: skip
     return _apart(estimates, fit).join(_from_frame_to_frame(series, u_scatter))
@@ -479,8 +476,10 @@ def _from_frame_to_frame(series: Series, scatter: Array) -> Estimates:
     """Scatter of the image from frame to frame: values, or limits."""
     at = {mode: k for k, mode in enumerate(series.modes)}
     rows, limits, reasons = [], set(), {}
-    for name, mode, unit in (("shift_std_px", "shift_x_px", "px"), ("roll_std_rad", "rotation_rad", "rad")):
-        variance, u = float(scatter[0, at[mode]]), float(scatter[1, at[mode]])
+    (x, u_x), (y, u_y) = (scatter[:, at[mode]] for mode in ("shift_x_px", "shift_y_px"))
+    alike = abs(x - y) < SIGNIFICANT * np.hypot(u_x, u_y)
+    shift = ((x + y) / 2, np.hypot(u_x, u_y) / 2) if alike else min((x, u_x), (y, u_y))
+    for name, (variance, u), unit in (("shift_std_px", shift, "px"), ("roll_std_rad", scatter[:, at["rotation_rad"]], "rad")):
         if variance > SIGNIFICANT * u:
             std = float(np.sqrt(variance))
             rows.append((name, std, u / (2 * std), float(len(series.time_s)), unit))
@@ -489,6 +488,12 @@ def _from_frame_to_frame(series: Series, scatter: Array) -> Estimates:
             rows.append((name, most, float(np.sqrt(u)) / 2, float(len(series.time_s)), unit))
             limits.add(name)
             reasons[name] = "not more than the noise of the positions"
+        if name == "shift_std_px" and not alike:
+            stds = [float(np.sqrt(max(v, 0.0))) for v in (x, y)]
+            reasons[name] = (
+                f"the image scatters by {stds[0]:.2g} px along x and {stds[1]:.2g} px along y: the smaller one; a sampling clock adds to "
+                "x, a motion of the camera to either"
+            )
     told = ("vibration of the camera or of the targets", "jitter of the trigger of moving targets")
     return Estimates.from_rows(rows, method=METHOD, confounders=told, limits=frozenset(limits), reasons=reasons)
 

@@ -90,12 +90,14 @@ def _pictures(assessment: Assessment) -> list[Section]:
     from pixmetry.assess.page.edges import edges_section
     from pixmetry.assess.page.light_off import light_off_section
     from pixmetry.assess.page.response import response_section
+    from pixmetry.series.page import drift_section
 
     seen = assessment.observations
     return [
         *([] if seen.edges is None else [edges_section(seen.edges)]),
         *([] if seen.response is None else [response_section(seen.response)]),
         *([] if seen.light_off is None else [light_off_section(seen.light_off)]),
+        *([] if seen.drift is None else [drift_section(seen.drift)]),
     ]
 
 

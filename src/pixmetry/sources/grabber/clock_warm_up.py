@@ -88,8 +88,8 @@ def propagate(params: ClockWarmUp, probe: Probe) -> Contribution:
 def measure(observations: Observations) -> Estimates:
     """Error and delay of the clock when switched on, from a series of a fixed field; camera and grabber warm up together in it."""
     names = ("scale_error_rel", "scale_tau_s", "delay_ns", "delay_tau_s")
-    fit = None if observations.drift is None else observations.drift.fit
-    return of_pictures(fit, {name: name for name in names}, where="grabber.clock_warm_up", pictures="a fixed field over time", kind="series")
+    fit, names_of = None if observations.drift is None else observations.drift.fit, {name: name for name in names}
+    return of_pictures(fit, names_of, where="grabber.clock_warm_up", pictures="a fixed field over time", kind="series")
 
 
 SOURCE = Source(

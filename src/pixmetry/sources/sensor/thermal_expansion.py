@@ -84,7 +84,8 @@ SOURCE = Source(
     ),
     advice="Let the camera warm up, keep its temperature constant, and calibrate at the temperature of the measurement.",
     reasons={
-        "measure": "not measured: needs a series of a fixed test field while the camera warms up",
+        "measure": "a series of a fixed field shows it together with the drift of the mount, and it is counted there; both move the image "
+        "alike, and only the temperature of every frame would tell them apart",
         "correct": "frames are not resampled; positions are corrected instead, from the temperature",
     },
 )

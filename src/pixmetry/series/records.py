@@ -1,0 +1,65 @@
+"""What a series is: its frames, and the motion of their image."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from pixmetry.camera.drift_series import DriftSeries
+
+SERIES_SCHEMA = "pixmetry/series/1"
+
+
+@dataclass(frozen=True)
+class Series:
+    """A series and the motion of its image.
+
+    Parameters
+    ----------
+    drift : DriftSeries
+    frames : tuple of str
+        Names, in order of time.
+    frame_shape : (int, int)
+    notes : tuple of str
+    provenance : dict
+    """
+
+    drift: DriftSeries
+    frames: tuple[str, ...]
+    frame_shape: tuple[int, int]
+    notes: tuple[str, ...] = ()
+    provenance: dict[str, Any] = field(default_factory=dict)
+
+    def to_record(self) -> dict[str, Any]:
+        """Return the plain record of ``series.json``."""
+        return {
+            "schema": SERIES_SCHEMA,
+            "rows": self.frame_shape[0],
+            "cols": self.frame_shape[1],
+            **drift_record(self.drift),
+            "names": list(self.frames),
+            "notes": list(self.notes),
+            "provenance": self.provenance,
+        }
+
+
+def drift_record(drift: DriftSeries) -> dict[str, Any]:
+    """The plain record of the motion of an image."""
+    return {
+        "targets": drift.targets,
+        "location_factor": drift.location_factor,
+        "estimates": drift.fit.to_records(),
+        "names_of_covariance": list(drift.fit.names),
+        "covariance": drift.fit.covariance.tolist(),
+        "confounders": list(drift.fit.confounders),
+        "not_told": {name: why for name, why in drift.fit.reasons.items() if name not in drift.fit},
+        "stable": drift.stable.to_record(),
+        "tolerance_px": drift.tolerance_px,
+        "modes": list(drift.modes),
+        "time_s": drift.time_s.tolist(),
+        "motion": drift.values.tolist(),
+        "u_motion": drift.u.tolist(),
+        "curve": drift.fitted.tolist(),
+        "from_settled_px": drift.from_settled_px.tolist(),
+        "u_from_settled_px": drift.u_from_settled_px.tolist(),
+    }

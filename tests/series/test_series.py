@@ -1,0 +1,123 @@
+"""A series from image files to its page: times, a run that was killed, and the same frames in a campaign."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from tests.series.fixed_field import rendered
+
+from pixmetry import assess, campaign_of_arrays, series
+from pixmetry.camera.group_facts import GroupFacts
+from pixmetry.cli import main
+from pixmetry.core.errors import InputError, MeasureError
+from pixmetry.files.images import write_frame
+from pixmetry.files.in_memory import Frames
+from pixmetry.series.job import measure_series
+
+SHAPE = (120, 170)
+PLACES = np.stack(np.meshgrid(np.linspace(25.2, 143.9, 4), np.linspace(22.4, 97.3, 3)), axis=-1).reshape(-1, 2)
+PLACES = PLACES + np.column_stack([np.arange(12) * 0.3 % 1, np.arange(12) * 0.7 % 1])  # at all phases of the pixels
+TIME_S = np.arange(30) * 120.0
+SHIFT = np.array([0.4, -0.25])
+
+
+def frame(k: int, rng: np.random.Generator) -> np.ndarray:
+    """Frame of a field that settles with 900 s."""
+    return rendered(PLACES + SHIFT * (1 - np.exp(-TIME_S[k] / 900.0)), SHAPE, rng)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    made, rng = tmp_path_factory.mktemp("frames"), np.random.default_rng(7)
+    for k in range(len(TIME_S)):
+        write_frame(made / f"frame_{k:03d}.png", frame(k, rng), 8)
+    return made
+
+
+def test_the_shift_of_frames_is_found(rng: np.random.Generator) -> None:
+    frames = [frame(k, rng) for k in range(len(TIME_S))]
+    found = measure_series([(str(k), TIME_S[k], lambda k=k: frames[k]) for k in range(len(frames))]).drift
+    assert found.targets == len(PLACES)
+    for name, truth in zip(("shift_x_px", "shift_y_px"), SHIFT, strict=True):
+        assert abs(found.fit[name].value - truth) < 5.5 * found.fit[name].u < 0.2, name
+    assert abs(np.log(found.fit["slow_s"].value / 900)) < 0.5
+
+
+def test_a_run_that_was_killed_goes_on(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = series(folder, tmp_path / "a", interval_s=120.0)
+    log = tmp_path / "a.frames.jsonl"
+    raw = log.read_bytes()
+    lines = raw.splitlines(keepends=True)
+    assert len(lines) == 2 + len(TIME_S)
+    again = tmp_path / "b.frames.jsonl"
+    again.write_bytes(b"".join(lines[:14]) + lines[14][:40])  # killed while it wrote a line
+    from pixmetry.series import job
+
+    fetched = []
+    load = job.load_picture
+    monkeypatch.setattr(job, "load_picture", lambda path, *rest: (fetched.append(path), load(path, *rest))[1])
+    resumed = series(folder, tmp_path / "b", interval_s=120.0)
+    assert len(fetched) == len(TIME_S) - 12
+    np.testing.assert_array_equal(resumed.drift.values, whole.drift.values)
+    assert sorted(again.read_bytes().splitlines()) == sorted(raw.splitlines())
+
+
+@pytest.mark.parametrize("content", [b"a note of mine\n", b'{"schema": "pixmetry/series-log/1", "options": {"kind": "ring"}}\n', b"x"])
+def test_a_log_of_something_else_is_not_touched(content: bytes, folder: Path, tmp_path: Path) -> None:
+    log = tmp_path / "c.frames.jsonl"
+    log.write_bytes(content)
+    with pytest.raises(InputError, match="log|line"):
+        series(folder, tmp_path / "c", interval_s=120.0)
+    assert log.read_bytes() == content and not (tmp_path / "c").exists()
+
+
+def test_the_command_writes_page_and_record(folder: Path, tmp_path: Path) -> None:
+    table = tmp_path / "times.csv"
+    table.write_text("file,time_s\n" + "".join(f"frame_{k:03d}.png,{5 + TIME_S[k]}\n" for k in range(len(TIME_S))))
+    done = CliRunner().invoke(main, ["series", str(folder), "-o", str(tmp_path / "d"), "--times", str(table)])
+    assert done.exit_code == 0, done.output
+    assert "30 frames over 58.0 min, 12 targets" in done.output and "Shift along x" in done.output
+    record = json.loads((tmp_path / "d" / "series.json").read_text())
+    assert record["schema"] == "pixmetry/series/1" and record["stable"]["unit"] == "s" and len(record["motion"]) == 30
+    page = (tmp_path / "d" / "report.html").read_text()
+    assert "Motion of the image while the camera warms up" in page and "Slow time constant" in page
+
+
+def test_frames_without_times_are_refused(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="carry no times"):
+        series(folder)
+    table = tmp_path / "times.csv"
+    missing = ("file,time_s\nother.png,1\n", "no time for a frame")
+    for text, told in (missing, ("name;t\na;1\n", "not a table"), ("file,time_s\na,x\n", "not a")):
+        table.write_text(text)
+        with pytest.raises(InputError, match=told):
+            series(folder, times=table)
+    with pytest.raises(InputError, match="twice"):
+        series(folder, times=table, interval_s=1.0)
+
+
+def test_frames_that_show_nothing_are_refused(rng: np.random.Generator) -> None:
+    flat = [(str(k), float(k), lambda: rng.normal(100, 2, SHAPE).astype(np.uint8)) for k in range(20)]
+    with pytest.raises(MeasureError, match="no targets|targets are seen"):
+        measure_series(flat)
+
+
+def test_a_series_in_a_campaign_is_measured(rng: np.random.Generator, tmp_path: Path) -> None:
+    frames = np.array([frame(k, rng) for k in range(len(TIME_S))])
+    told = GroupFacts(interval_s=120.0)
+    campaign = campaign_of_arrays([Frames("series", None, frames, facts=told)], bits=8, name="a camera", pitch_um=5.0)
+    found = assess(campaign, tmp_path / "out", trials=0)
+    drift = found.estimates["sensor.mount_drift"]
+    assert abs(drift["shift_x_px"].value - SHIFT[0]) < 5.5 * drift["shift_x_px"].u
+    assert "not found" in found.unmeasured["sensor.stabilisation"]  # no scatter from frame to frame
+    assert "kind: series" not in found.unmeasured["grabber.clock_warm_up"]
+    assert json.loads((tmp_path / "out" / "results.json").read_text())["series"]["targets"] == 12
+    assert "Motion of the image" in (tmp_path / "out" / "report.html").read_text()
+    with pytest.raises(InputError, match="2 times for 30 frames"):
+        campaign_of_arrays([Frames("series", None, frames, facts=GroupFacts(times_s=(0.0, 1.0)))], bits=8)
+    with pytest.raises(InputError, match="without times"):
+        campaign_of_arrays([Frames("series", None, frames)], bits=8)
