@@ -28,6 +28,7 @@ STATED = {  # a lawful value of each fact
     "times_s": (0.0, 60.0),
     "interval_s": 60.0,
     "on_for_s": 30.0,
+    "recorded": True,
 }
 WITH = {"regions": {"densities": (0.1, 0.5)}, "on_for_s": {"interval_s": 60.0}}  # facts that another one needs
 

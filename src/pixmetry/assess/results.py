@@ -11,7 +11,7 @@ from pixmetry.assess.self_test import SelfTest
 from pixmetry.budget.monte_carlo import Crop
 from pixmetry.budget.records import SUM, Budget
 from pixmetry.camera.camera import Camera
-from pixmetry.camera.observations import EdgeResponse, LightSteps, Observations, SlantedEdges, StackMoments
+from pixmetry.camera.observations import EdgeResponse, LightSteps, LineRows, Observations, SlantedEdges, StackMoments
 from pixmetry.camera.response import Response
 from pixmetry.core.number import Estimates
 from pixmetry.emva.files.json_format import value_record
@@ -99,6 +99,7 @@ class Assessment:
             "edges": None if self.observations.edges is None else edges_record(self.observations.edges),
             "response": None if self.observations.response is None else response_record(self.observations.response),
             "series": None if self.observations.drift is None else drift_record(self.observations.drift),
+            "lines": None if self.observations.lines is None else lines_record(self.observations.lines),
             "emva1288": {
                 "release": self.standard.release,
                 "results": {key: value_record(value) for key, value in self.standard.values.items()},
@@ -222,6 +223,31 @@ def response_record(found: Response) -> dict[str, Any]:
         "patches": patches,
         "refused": list(found.refused),
     }
+
+
+def lines_record(found: LineRows) -> dict[str, Any]:
+    """The plain record of the rows of upright lines: what they have in common, and a line for each line."""
+
+    def fitted(fit: Estimates) -> dict[str, Any]:
+        told = {name: why for name, why in fit.reasons.items() if name not in fit}
+        return {"estimates": fit.to_records(), "names": list(fit.names), "covariance": fit.covariance.tolist(), "not_told": told}
+
+    each = [
+        {
+            "picture": line.picture,
+            "kind": line.kind,
+            "x_px": float(np.median(line.place_px)),
+            "first_row": int(line.row[0]),
+            "rows": len(line.row),
+            "frames": len(line.shift_px),
+            "height_dn": line.height_dn,
+            "noise_dn": line.noise_dn,
+            "u_row_px": float(np.sqrt((line.u_px**2).mean())),
+            "rms_px": float(line.shift_px.std()),
+        }
+        for line in found.lines
+    ]
+    return {"jitter": fitted(found.jitter), "taped": fitted(found.taped), "refused": [asdict(r) for r in found.refused], "lines": each}
 
 
 def _response_map(dark: StackMoments, bright: StackMoments, mask: np.ndarray) -> np.ndarray:

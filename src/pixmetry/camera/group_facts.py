@@ -29,6 +29,8 @@ class GroupFacts:
         Time from frame to frame of a series.
     on_for_s : float or None
         How long the camera had been on when the first frame of a series was taken.
+    recorded : bool or None
+        Whether the frames were recorded on video tape and played again.
     """
 
     wavelength_nm: float | None = None
@@ -40,3 +42,4 @@ class GroupFacts:
     times_s: tuple[float, ...] | None = None
     interval_s: float | None = None
     on_for_s: float | None = None
+    recorded: bool | None = None

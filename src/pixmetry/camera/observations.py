@@ -334,6 +334,81 @@ class LightSteps:
     fit: Estimates
 
 
+@dataclass(frozen=True)
+class RowPlaces:
+    """The place of every row of every frame along one upright line or edge.
+
+    Parameters
+    ----------
+    picture : int
+        In which picture of lines it is.
+    kind : {"line", "edge"}
+    row : ndarray, shape (rows,)
+        Rows of the frame that were measured.
+    place_px : ndarray, shape (rows,)
+        Column in the mean of the frames.
+    shift_px : ndarray, shape (frames, rows)
+        Shift of each row of each frame against that.
+    u_px : ndarray, shape (rows,)
+        Standard uncertainty of a row's place in one frame that comes of the noise of the pixels.
+    u_rel : float
+        Relative u of its square.
+    height_dn, noise_dn : float
+        Of the step, or of the line above its sides; standard deviation of a pixel beside it.
+    half_px : int
+        Half of the window that was summed.
+    """
+
+    picture: int
+    kind: str
+    row: np.ndarray
+    place_px: np.ndarray
+    shift_px: np.ndarray
+    u_px: np.ndarray
+    u_rel: float
+    height_dn: float
+    noise_dn: float
+    half_px: int
+
+
+@dataclass(frozen=True)
+class RefusedLine:
+    """A line that was found and cannot be measured; ``reason`` says why."""
+
+    picture: int
+    kind: str
+    x_px: float
+    y_px: float
+    rows: int
+    reason: str
+
+
+@dataclass(frozen=True)
+class LineRows:
+    """Upright lines and edges of all pictures of lines, row by row, and what the rows have in common.
+
+    Parameters
+    ----------
+    lines : tuple of RowPlaces
+    refused : tuple of RefusedLine
+    recorded : tuple of bool
+        By picture, whether it was played from video tape.
+    jitter : Estimates
+        ``white_px``, ``loop_px``, ``loop_rows``, ``interlaced``, ``settling_px``, ``settling_rows`` of the pictures that were not recorded:
+        see `pixmetry.observe.line_jitter`.
+    taped : Estimates
+        The same of the pictures that were played from tape.
+    notes : tuple of str
+    """
+
+    lines: tuple[RowPlaces, ...]
+    refused: tuple[RefusedLine, ...]
+    recorded: tuple[bool, ...]
+    jitter: Estimates = Estimates.empty()
+    taped: Estimates = Estimates.empty()
+    notes: tuple[str, ...] = ()
+
+
 LENS, AFFINITY = "optics.distortion", "sensor.affinity"
 TAKEN_UP = (LENS, AFFINITY, "optics.cover_glass", "sensor.pixel_pitch", "sensor.tilt")  # by a calibration, in the first two
 
@@ -406,10 +481,12 @@ class Observations:
     light_off: LightSteps | None = None
     sensor: str | None = None  # ccd, cmos or cid, where it was said
     response: Response | None = None
+    lines: LineRows | None = None
     noise_covariance: NoiseCovariance | None = None
     noise_filter: NoiseFilter | None = None
     stated: StatedFacts = StatedFacts()
     temperature_c: float | None = None
+    pixel_clock_mhz: float | None = None
     geometry: CameraGeometry | None = None
     drift: DriftSeries | None = None
     storage: Storage = Storage()
@@ -472,6 +549,20 @@ class Observations:
         fit = None if self.response is None else self.response.fit
         mapping = dict(names) if isinstance(names, Mapping) else {n: n for n in names}
         return of_pictures(fit, mapping, where=where, pictures="patches of known light", kind="chart")
+
+    def row_jitter(self, names: Mapping[str, str], *, where: str, taped: bool = False) -> Estimates:
+        """Take a source's parameters ``{parameter: fitted name}`` that the rows of upright lines tell, in px, with their covariance.
+
+        Raises
+        ------
+        MeasureError
+            Without pictures of lines, or with the reason why they do not tell any of these.
+        """
+        fit = None
+        if self.lines is not None and taped in self.lines.recorded:
+            fit = self.lines.taped if taped else self.lines.jitter
+        pictures = "upright lines or edges in 4 frames or more" + (", played from tape and once more directly" if taped else "")
+        return of_pictures(fit, names, where=where, pictures=pictures, kind="line")
 
     def calibrated(self, names: Mapping[str, str] | Iterable[str], *, where: str) -> Estimates:
         """Take a source's parameters out of the calibrated geometry, with their covariance.

@@ -159,7 +159,7 @@ def search_edges(pictures: Sequence[Picture], analogue: bool = False) -> Search:
     for number, picture in enumerate(pictures):
         for across in ("x", "y"):
             frame = picture.data if across == "x" else np.ascontiguousarray(picture.data.T)
-            chains = _chains(frame)
+            chains = step_chains(frame)
             for result in map_tiles(partial(_measured, frame, picture, number, across, chains, analogue), chains.long):
                 if isinstance(result, RefusedEdge):
                     refused.append(result)
@@ -212,7 +212,7 @@ def responses_of(found: Search, optics: Estimates | None = None) -> SlantedEdges
 
 
 @dataclass(frozen=True)
-class _Chains:
+class StepChains:
     """Steps by row; of each its chain. ``long`` numbers the chains that are worth a word."""
 
     row: Ints
@@ -229,7 +229,8 @@ class _Chains:
         return self.row[own], self.col[own]
 
 
-def _chains(frame: Singles) -> _Chains:
+def step_chains(frame: Singles) -> StepChains:
+    """Steep steps along the rows, linked from row to row."""
     threshold = _threshold(frame)
     tiles = range(0, frame.shape[0], TILE_ROWS)
 
@@ -245,7 +246,7 @@ def _chains(frame: Singles) -> _Chains:
     count = link_steps(row, col, size, chain)
     order = np.argsort(chain, kind="stable")
     start = np.searchsorted(chain[order], np.arange(count + 1))
-    return _Chains(row, col, size, chain, order, start, np.flatnonzero(np.diff(start) >= LEAST_CHAIN))
+    return StepChains(row, col, size, chain, order, start, np.flatnonzero(np.diff(start) >= LEAST_CHAIN))
 
 
 def _threshold(frame: Singles) -> float:
@@ -261,11 +262,11 @@ def _threshold(frame: Singles) -> float:
 
 
 def _measured(
-    frame: Singles, picture: Picture, number: int, across: str, chains: _Chains, analogue: bool, chain: int
+    frame: Singles, picture: Picture, number: int, across: str, chains: StepChains, analogue: bool, chain: int
 ) -> tuple[Region, Spread] | RefusedEdge:
     """Measure the edge of one chain, or say why not."""
     row, col = chains.steps(chain)
-    slope = _robust_slope(row, col)
+    slope = robust_slope(row, col)
     try:
         region = _region(frame, number, across, chain, chains, analogue)
         _check_light(region, picture)
@@ -279,16 +280,16 @@ def _measured(
         return RefusedEdge(number, across, *place, float(np.degrees(np.arctan(slope))), len(row), str(why))
 
 
-def _robust_slope(row: Ints, col: Array) -> float:
+def robust_slope(row: Ints, col: Array) -> float:
     """Columns per row: the median over pairs half the chain apart (Theil)."""
     half = len(row) // 2
     return float(np.median((col[half:] - col[: len(col) - half]) / np.maximum(row[half:] - row[: len(row) - half], 1)))
 
 
-def _region(frame: Singles, number: int, across: str, chain: int, chains: _Chains, analogue: bool) -> Region:
+def _region(frame: Singles, number: int, across: str, chain: int, chains: StepChains, analogue: bool) -> Region:
     """Rows, width and line of an edge, after the checks that need no light."""
     row, col = chains.steps(chain)
-    slope = _robust_slope(row, col)
+    slope = robust_slope(row, col)
     angle = abs(float(np.degrees(np.arctan(slope))))
     if angle < LEAST_ANGLE_DEG or angle > MOST_ANGLE_DEG:
         raise _Refused(f"the angle is {angle:.1f} degrees (allowed: {LEAST_ANGLE_DEG:g} to {MOST_ANGLE_DEG:g})")
@@ -310,7 +311,7 @@ def _region(frame: Singles, number: int, across: str, chain: int, chains: _Chain
     return _refined(region)
 
 
-def _free_reach(frame: Singles, chain: int, chains: _Chains, slope: float, on_line: bool) -> tuple[float, float]:
+def _free_reach(frame: Singles, chain: int, chains: StepChains, slope: float, on_line: bool) -> tuple[float, float]:
     """How far from the edge there is no other edge and no border of the frame: to both sides, and to the right."""
     row, col = chains.steps(chain)
     a, b = np.searchsorted(chains.row, [row[0] + 8, row[-1] - 7])

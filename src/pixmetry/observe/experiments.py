@@ -10,6 +10,8 @@ from pixmetry.observe.edge_fit import fit_edges
 from pixmetry.observe.edges import Picture, edge_notes, motion_notes, responses_of, search_edges
 from pixmetry.observe.experiment import Experiment, PictureGroup
 from pixmetry.observe.light_off import BlockMeans, reduce_light_off
+from pixmetry.observe.line_jitter import with_jitter
+from pixmetry.observe.lines import LineFrames, places_of_rows
 from pixmetry.observe.patches import find_patches
 from pixmetry.observe.response_fit import response_of, with_response
 
@@ -28,12 +30,21 @@ def reduce_charts(groups: Sequence[PictureGroup], seen: Observations) -> Observa
     return with_response(seen, response_of(found, groups[0].bits, seen))
 
 
+def reduce_lines(groups: Sequence[PictureGroup], seen: Observations) -> Observations:
+    """Follow upright lines row by row and frame by frame, and fit what the rows have in common."""
+    fit = seen.photon_transfer_fit
+    gain = fit["gain_dn_per_e"].value if fit is not None and "gain_dn_per_e" in fit else None
+    lines = with_jitter(places_of_rows(groups, gain))
+    return replace(seen, lines=lines, notes=(*seen.notes, *lines.notes))
+
+
 EXPERIMENTS = {
     e.kind: e
     for e in (
         Experiment("edge", reduce_edges),
         Experiment("light_off", reduce_light_off, BlockMeans),
         Experiment("chart", reduce_charts),
+        Experiment("line", reduce_lines, LineFrames),
     )
 }
 

@@ -89,6 +89,7 @@ def _pictures(assessment: Assessment) -> list[Section]:
     """A section for each kind of pictures."""
     from pixmetry.assess.page.edges import edges_section
     from pixmetry.assess.page.light_off import light_off_section
+    from pixmetry.assess.page.lines import lines_section
     from pixmetry.assess.page.response import response_section
     from pixmetry.series.page import drift_section
 
@@ -96,6 +97,7 @@ def _pictures(assessment: Assessment) -> list[Section]:
     return [
         *([] if seen.edges is None else [edges_section(seen.edges)]),
         *([] if seen.response is None else [response_section(seen.response)]),
+        *([] if seen.lines is None else [lines_section(seen.lines)]),
         *([] if seen.light_off is None else [light_off_section(seen.light_off)]),
         *([] if seen.drift is None else [drift_section(seen.drift)]),
     ]

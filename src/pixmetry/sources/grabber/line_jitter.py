@@ -9,8 +9,11 @@ import numpy as np
 from pixmetry.camera.contribution import Contribution, Probe, smooth_part
 from pixmetry.camera.line import alike_rows
 from pixmetry.camera.line_contribution import from_row_delays, from_steady_delays
+from pixmetry.camera.observations import Observations
+from pixmetry.camera.row_delays import delays_ns
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.number import Estimates
 from pixmetry.core.random import Grid, Stream
 
 
@@ -73,6 +76,14 @@ def tail(params: LineJitter, pixel_hz: float, row_px: int) -> float:
     return 0.0
 
 
+def measure(observations: Observations) -> Estimates:
+    """Read what all upright lines of a row have in common: independent part, loop and settling, from px to ns by the pixel clock."""
+    names = {"white": "white_ns", "loop": "loop_ns", "settling": "settling_ns"}
+    kept = ("loop_rows", "settling_rows", "interlaced")
+    found = observations.row_jitter({f"{n}_px": f"{n}_px" for n in names} | {n: n for n in kept}, where="grabber.line_jitter")
+    return delays_ns(found, names, observations.pixel_clock_mhz, where="grabber.line_jitter")
+
+
 def propagate(params: LineJitter, probe: Probe) -> Contribution:
     """Independent and carried-on delays by the answer of the camera's line and of the estimator to the delay of each row.
 
@@ -106,6 +117,7 @@ SOURCE = Source(
     typical=LineJitter(white_ns=20.0),
     bound=LineJitter(white_ns=20.0, loop_ns=20.0),
     forward=forward,
+    measure=measure,
     truth=truth,
     propagate=propagate,
     near=near,
@@ -117,7 +129,6 @@ SOURCE = Source(
     references=("H. A. Beyer, IAPRS XXIX-B5, 1992, 561 (shear and jitter of line-locked grabbers; below 0.005 px with the pixel clock)",),
     advice="Sample with the camera's pixel clock, or average frames. A digital camera has no line jitter.",
     reasons={
-        "measure": "needs the image of a steep vertical line or edge in several frames",
         "correct": "needs the shift of every row in the same frame, for instance from a line beside the targets",
     },
 )

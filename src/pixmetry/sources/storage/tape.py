@@ -11,9 +11,13 @@ import numpy as np
 from pixmetry.camera.contribution import Contribution, Probe, smooth_part
 from pixmetry.camera.line import Line, alike_rows, group_delay_s, reach_px
 from pixmetry.camera.line_contribution import from_row_delays, from_steady_delays, held_of, through_line
+from pixmetry.camera.observations import Observations
+from pixmetry.camera.row_delays import added_delays, delays_ns
 from pixmetry.camera.signal import Kind, Signal, Windows
 from pixmetry.camera.source import Parameters, Source, quantity
 from pixmetry.core.arrays import Array, Flags
+from pixmetry.core.errors import MeasureError
+from pixmetry.core.number import Estimates
 from pixmetry.core.random import Grid, Stream
 
 SHARE_BEYOND = 1e-4  # of a step, beyond the near context
@@ -155,6 +159,21 @@ def tail(params: Tape, pixel_hz: float, row_px: int) -> float:
     return SHARE_BEYOND if params.generations else 0.0
 
 
+def measure(observations: Observations) -> Estimates:
+    """What the rows of upright lines move more when they were played from tape than when they came directly: variances are subtracted."""
+    names = {"white_px": "white_px", "loop_px": "loop_px", "loop_rows": "loop_rows"}
+    played = observations.row_jitter(names, where="storage.tape", taped=True)
+    if observations.lines is None or not len(observations.lines.jitter):
+        remedy = "take the same lines directly, without the recorder"
+        raise MeasureError(
+            "not separable from grabber.line_jitter: the lines were played from tape only", where="storage.tape", remedy=remedy
+        )
+    added = added_delays(played, observations.lines.jitter, where="storage.tape")
+    return delays_ns(
+        added, {"white": "white_ns", "loop": "wow_ns", "loop_rows": "wow_rows"}, observations.pixel_clock_mhz, where="storage.tape"
+    )
+
+
 def propagate(params: Tape, probe: Probe) -> Contribution:
     """Noise with its spectrum (P1), delays of the rows behind the bandwidth, and its smear; the heads' step at places down the frame."""
     if params.generations == 0:
@@ -201,6 +220,7 @@ SOURCE = Source(
     typical=Tape(generations=1, bandwidth_mhz=3.0, noise_dn=3.0, white_ns=7.0, wow_ns=5.0, head_switch_ns=100.0),
     bound=Tape(generations=2, bandwidth_mhz=3.0, noise_dn=4.0, white_ns=14.0, wow_ns=14.0, head_switch_ns=100.0),
     forward=forward,
+    measure=measure,
     truth=truth,
     propagate=propagate,
     context=context,
@@ -218,7 +238,6 @@ SOURCE = Source(
     ),
     advice="Digitise directly, not from tape. Otherwise play the tape on the recorder that recorded it, through a time-base corrector.",
     reasons={
-        "measure": "needs a static line and a flat field, recorded and played",
         "correct": "needs the shift of every line in the same frame, for instance from a reference line beside the targets",
     },
 )
