@@ -17,7 +17,8 @@ from pixmetry.scene.files import SeriesModel
 from pixmetry.simulate.job import expose_group, plan_series
 
 GAIN = "electronics.gain.gain_dn_per_e"
-KINDS = ("none", "charge", "sharpening", "blur", "temporal", "taps", "everything")
+KINDS = ("none", "charge", "sharpening", "blur", "temporal", "taps", "everything", "companding", "median", "demosaic")
+OWN = ("brighter_fatter", "sharpening", "temporal_noise_reduction", "tap_gain", "companding", "noise_reduction")
 
 
 @dataclass(frozen=True)
@@ -58,6 +59,16 @@ def flat_case(rng: np.random.Generator, kind: str, shape: tuple[int, int] = (120
         values["processing.noise_reduction"] = {"method": "gaussian", "radius_px": radius, "sigma_px": sigma}
     if kind == "temporal":
         values["processing.temporal_noise_reduction"] = {"alpha": rng.uniform(0.02, 0.4)}
+    if kind == "median":
+        values["processing.noise_reduction"] = {"method": "median", "radius_px": int(rng.integers(1, 3))}
+    if kind == "demosaic":
+        method, colour = str(rng.choice(["bilinear", "malvar"])), str(rng.choice(["green", "red"]))
+        pattern = str(rng.choice(["RGGB", "GRBG"]))
+        values["processing.demosaic"] = {"method": method, "output": colour, "pattern": pattern}
+        shares = {"red": rng.uniform(0.5, 1), "green": 1.0, "blue": rng.uniform(0.4, 1)}
+        values["sensor.bayer_mosaic"] = {"pattern": pattern} | shares
+    if kind == "companding":
+        values["processing.companding"] = {"law": str(rng.choice(["root", "linear"])), "transport_bits": int(rng.integers(8, 11))}
     if kind in ("taps", "everything"):
         step, stripes = rng.uniform(0.005, 0.03) * rng.choice([-1, 1]), rng.uniform(0.001, 0.01) * rng.choice([-1, 1])
         values["electronics.tap_gain"] = {"taps": int(rng.choice([2, 4])), "step_rel": step, "odd_even_rel": stripes}
@@ -73,8 +84,8 @@ def flat_case(rng: np.random.Generator, kind: str, shape: tuple[int, int] = (120
     for source in in_order([every[name] for name in values]):
         own = values[source.id] | ({"bits": bits} if "bits" in source.parameters.model_fields else {})
         chain.append(Element(source.id, source, source.make(own)))
-        if source.id.split(".")[1] in ("brighter_fatter", "sharpening", "temporal_noise_reduction", "tap_gain"):
-            truth |= {f"{source.id}.{k}": float(v) for k, v in values[source.id].items()}
+        if source.id.split(".")[1] in OWN:
+            truth |= {f"{source.id}.{k}": float(v) for k, v in values[source.id].items() if not isinstance(v, str)}
     camera = Camera(f"flat {kind}", shape, tuple(chain), exposure_s=0.01, unit_seed=int(rng.integers(2**31)))
     efficiency = float(values["sensor.quantum_efficiency"]["quantum_efficiency"])
     series = SeriesModel(

@@ -53,7 +53,7 @@ def digital_twin(campaign: Campaign, estimates: Mapping[str, Estimates], observa
         chosen = {} if observations.response is None else observations.response.choices.get(source.id, {})
         values = {k: v for k, v in known.items() if k in fields} | best_values(source, found) | dict(chosen)
         params = source.make(values, f"digital twin, {source.id}")
-        known_from = MEASURED if len(found) else TYPICAL if source.measure is not None else DESCRIBED
+        known_from = MEASURED if len(found) or found.settings else TYPICAL if source.measure is not None else DESCRIBED
         elements.append(Element(source.id, source, params, known_from=known_from, estimates=found))
     pitch = None if facts.pitch_x_um is None else (facts.pitch_x_um, facts.pitch_y_um or facts.pitch_x_um)
     stack = observations.bright_stack
@@ -95,10 +95,10 @@ def _middle_exposure_s(campaign: Campaign) -> float:
     return float(np.median(next(filter(None, [*known, targets]), [ASSUMED_EXPOSURE_S])))
 
 
-def best_values(source: Source, estimates: Estimates) -> dict[str, float]:
-    """Values for a simulation: the estimates; 0 for values that are not significant, except dark noise that rounding hides."""
+def best_values(source: Source, estimates: Estimates) -> dict[str, float | str]:
+    """Values for a simulation: the estimates and settings; 0 for values that are not significant, except dark noise that rounding hides."""
     hidden = {"white_e"}  # the rms of an even spread up to its limit
-    values = {}
+    values: dict[str, float | str] = dict(estimates.settings)
     for e in estimates:
         may_be_none = source.neutral is not None and getattr(source.neutral, e.name) == 0 and _alone(estimates, e.name)
         nothing = e.kind == "upper_limit" or (may_be_none and abs(e.value) < SIGNIFICANT_U * e.u)

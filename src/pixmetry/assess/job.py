@@ -356,7 +356,9 @@ def measure_sources(observations: Observations) -> tuple[dict[str, Estimates], d
         try:
             found = source.measure(observations)
             with_estimates(source, source.typical, found)  # outside the model's range it is no measurement of this effect
-            if source.option and found.limits == frozenset(found.names):  # most cameras have none: what was not found is not in this one
+            if (
+                source.option and found.limits == frozenset(found.names) and not found.settings
+            ):  # most cameras have none: what was not found is not in this one
                 unmeasured[source.id] = "not found: " + ", ".join(f"{e.name} is below {e.value:.2g} {e.unit} (95 %)" for e in found)
                 continue
             estimates[source.id] = found

@@ -37,11 +37,10 @@ def with_estimates(source: Source, base: Any, estimates: Estimates) -> Any:
     A quantity of which only an upper limit L is known may be anywhere from 0 to L: it enters with the root mean square of that rectangular
     distribution, L/√3.
     """
-    values = {}
-    for e in estimates:
-        if e.name not in source.parameters.model_fields:
-            raise InputError(f"{e.name} is no parameter of {source.id}", allowed=", ".join(source.parameters.model_fields))
-        values[e.name] = e.representative
+    values: dict[str, float | str] = {e.name: e.representative for e in estimates} | dict(estimates.settings)
+    for name in values:
+        if name not in source.parameters.model_fields:
+            raise InputError(f"{name} is no parameter of {source.id}", allowed=", ".join(source.parameters.model_fields))
     return source.make({**base.model_dump(), **values}, where=source.id)
 
 

@@ -12,7 +12,8 @@ from pixmetry.core.number import Estimates
 ROUNDED_AWAY = 2.0
 REACH = 4  # px; farthest lag to each side
 LAGS = tuple((j, i) for j in range(REACH + 1) for i in range(-REACH, REACH + 1) if j > 0 or i >= 0)  # rows and columns; (0, 0) first
-WHITE, LINEAR, CHARGE, UNKNOWN = "white", "linear", "charge", "unknown"
+WHITE, LINEAR, CHARGE, MOSAIC, UNKNOWN = "white", "linear", "charge", "mosaic", "unknown"
+MEDIAN = "median"
 
 
 @dataclass(frozen=True)
@@ -82,17 +83,19 @@ class NoiseFilter:
     ----------
     kind : str
         ``"white"``: neighbours are not correlated; ``"linear"``: a linear filter of unit sum smoothed or sharpened all noise;
-        ``"charge"``: the correlation grows in proportion to the signal, as the brighter-fatter effect does; ``"unknown"``: a correlation
-        of neither kind, as behind a median, a coder, or a demosaicking.
+        ``"charge"``: the correlation grows in proportion to the signal, as the brighter-fatter effect does; ``"mosaic"``: a demosaicking,
+        whose original pixels are as the converter gave them; ``"unknown"``: a correlation of no such kind, as behind a median or a coder.
     name : str
         The family of filters that fits, in words; of ``"unknown"`` what speaks against the others.
     fit : Estimates
-        Parameters of that family, as the module that found it names them.
+        Parameters of that family, as the module that found it names them; of a demosaicking the settings.
     factor, u_factor : float
         Variance of the shot noise before the filter over that of one pixel of the frame behind it, in the mean of the levels. Of
         ``"white"`` 1, and what a correlation that may be there would change.
     row_factor, column_factor : float
         Variance of the means of rows and of columns behind the filter, over that of independent pixels with the variance behind it.
+    dark_factor : float or None
+        The same of the noise in the dark, where it is not ``factor``.
     growth : float
         What the factor gains, beside that, from dark to the brightest level.
     correlation : ndarray, shape (41,)
@@ -115,6 +118,7 @@ class NoiseFilter:
     u_factor: float = 0.0
     row_factor: float = 1.0
     column_factor: float = 1.0
+    dark_factor: float | None = None
     growth: float = 0.0
     correlation: np.ndarray = field(default_factory=lambda: np.eye(1, len(LAGS))[0])
     covariance: np.ndarray = field(default_factory=lambda: np.zeros((len(LAGS) - 1, len(LAGS) - 1)))

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from pixmetry.camera.code_table import CodeTable
 from pixmetry.camera.drift_series import DriftSeries
 from pixmetry.camera.noise_covariance import NoiseCovariance, NoiseFilter
 from pixmetry.camera.response import Response
@@ -477,6 +478,7 @@ class Observations:
     defects: DefectList | None = None
     patterns: PatternList | None = None
     code_errors: CodeErrors | None = None
+    code_table: CodeTable | None = None  # of companding, where the codes show one
     edges: SlantedEdges | None = None
     light_off: LightSteps | None = None
     sensor: str | None = None  # ccd, cmos or cid, where it was said

@@ -184,6 +184,8 @@ class Estimates:
         Names whose value is what the quantity is at least.
     reasons : mapping
         By name: why it is a limit, or what the reader should know about it.
+    settings : mapping
+        Parameters that are no numbers, such as a method: those that the data chose. The reasons tell of them.
 
     Examples
     --------
@@ -202,6 +204,7 @@ class Estimates:
     limits: frozenset[str] = frozenset()
     lower_limits: frozenset[str] = frozenset()
     reasons: Mapping[str, str] = field(default_factory=dict)
+    settings: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         n = len(self.names)
@@ -274,6 +277,7 @@ class Estimates:
             limits=frozenset(new for new, old in mapping.items() if old in self.limits),
             lower_limits=frozenset(new for new, old in mapping.items() if old in self.lower_limits),
             reasons={new: self.reasons[old] for new, old in mapping.items() if old in self.reasons},
+            settings=self.settings,
         )
 
     def join(self, *others: Estimates) -> Estimates:
@@ -298,6 +302,7 @@ class Estimates:
             limits=frozenset().union(*(s.limits for s in sets)),
             lower_limits=frozenset().union(*(s.lower_limits for s in sets)),
             reasons={k: v for s in sets for k, v in s.reasons.items()},
+            settings={k: v for s in sets for k, v in s.settings.items()},
         )
 
     @classmethod

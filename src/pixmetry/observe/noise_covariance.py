@@ -120,8 +120,8 @@ def _counts(shape: tuple[int, int]) -> np.ndarray:
 
 
 def margin_px(shape: tuple[int, ...]) -> int:
-    """Width of the border that is left out: filters repeat or mirror the frame there."""
-    return min(MARGIN_PX, min(shape) // 8)
+    """Width of the border that is left out, even, so that a mosaic keeps its phase: filters repeat or mirror the frame there."""
+    return min(MARGIN_PX, min(shape) // 8 // 2 * 2)
 
 
 def lag_products(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, float]:

@@ -17,6 +17,8 @@ from pixmetry.camera.noise_covariance import (
     CHARGE,
     LAGS,
     LINEAR,
+    MEDIAN,
+    MOSAIC,
     REACH,
     UNKNOWN,
     WHITE,
@@ -33,6 +35,7 @@ from pixmetry.camera.observations import LevelMoments, PhotonTransfer, StackMome
 from pixmetry.core.arrays import Array
 from pixmetry.core.errors import MeasureError
 from pixmetry.core.number import Estimates, effective_dof
+from pixmetry.observe.mosaic import find_mosaic, shot_of_places
 from pixmetry.observe.photon_transfer_fit import fit_photon_transfer
 from pixmetry.observe.photon_transfer_model import MINIMUM_DARK_VAR_DN2, QUANTISATION_DN2
 
@@ -54,6 +57,15 @@ REACHES = (0.0, 0.4, 0.7, 1.0)  # px, of the repulsion that is looked for
 SMALL = 0.05  # relative change of the gain up to which a correlation of unknown origin is taken as linear, at a u of its own size
 RIVAL = 5.0  # by how much of χ²/2 another family may fit worse that is not excluded
 MOST_GROWTH = 0.2  # of the correlation, summed, from dark to bright: more than repelled charge does
+# correlation of normal noise behind medians of 3 × 3 and of 5 × 5 pixels, by the smaller and the larger lag: from 2e7 simulated pixels
+MEDIANS = {
+    1: {(0, 1): 0.5715, (0, 2): 0.2708, (1, 1): 0.3665, (1, 2): 0.1783, (2, 2): 0.0882},
+    2: {
+        (0, 1): 0.7345, (0, 2): 0.5334, (0, 3): 0.3476, (0, 4): 0.1708, (1, 1): 0.5719, (1, 2): 0.4206, (1, 3): 0.2760, (1, 4): 0.1363,
+        (2, 2): 0.3118, (2, 3): 0.2058, (2, 4): 0.1022, (3, 3): 0.1366, (3, 4): 0.0684, (4, 4): 0.0346,
+    },
+}  # fmt: skip
+OF_MEDIAN = 0.02  # rounding and the skewness of the shot noise change these
 RESOLVED = 10.0  # u of the shot variance of a level that counts
 LEAST_DOUBT = 0.1  # of the gain's u: a smaller part adds less than 0.5 % to it
 
@@ -247,7 +259,7 @@ def find_noise_filter(seen: NoiseCovariance | None) -> NoiseFilter | None:
     those that are left the best fit counts, and what another that fits nearly as well would make of the gain adds to u.
     """
     part = None if seen is None else _shot_part(seen)
-    if part is None:
+    if seen is None or part is None:
         return None
     plain = NoiseFilter(
         kind=WHITE,
@@ -258,8 +270,35 @@ def find_noise_filter(seen: NoiseCovariance | None) -> NoiseFilter | None:
         growth_covariance=part.growing_covariance,
         shot_dn2=part.shot_dn2,
     )
+    if (mosaic := _of_mosaic(plain, seen, part)) is not None:
+        return mosaic
     stands_out, doubt = _largest_z(part)
     return _explained(plain, part) if stands_out > 1 else replace(plain, u_factor=doubt)
+
+
+def _of_mosaic(plain: NoiseFilter, seen: NoiseCovariance, part: _ShotPart) -> NoiseFilter | None:
+    """A demosaicking: the variance of the original pixels over the mean of all; of the luminance no pixel is original."""
+    used = seen.clipped <= MOST_CLIPPED
+    bright, dark = used & seen.bright, used & ~seen.bright
+    if not (bright.any() and dark.any()):
+        return None
+    shot, black, pixels = shot_of_places(seen, bright, dark)
+    found = find_mosaic(shot, pixels)
+    if found is None:
+        return None
+    settings = {"method": found.method, "output": found.output} | ({} if found.output == "luma" else {"pattern": found.pattern})
+    kept = replace(
+        plain, kind=UNKNOWN, name=f"demosaicking, {found.method}, stored colour {found.output}", fit=replace(plain.fit, settings=settings)
+    )
+    if not found.original.any():
+        return replace(kept, factor=np.inf)
+    of_shot, of_dark = (values[:, :, 0, REACH] for values in (shot, np.maximum(black, 0)))
+    factor = float(of_shot[found.original].mean() / of_shot.mean())
+    rounding = np.where(found.original, 0.0, QUANTISATION_DN2)  # interpolated values were rounded once more
+    dark_factor = float(of_dark[found.original].mean() / max((of_dark - rounding).mean(), 1e-9))
+    share = float(found.original.mean())
+    u_factor = factor * float(np.hypot(np.sqrt(2 / (share * pixels)), part.u_inner))
+    return replace(kept, kind=MOSAIC, factor=factor * part.inner, u_factor=u_factor, dark_factor=dark_factor * part.inner)
 
 
 def _largest_z(part: _ShotPart) -> tuple[float, float]:
@@ -342,10 +381,22 @@ def _explained(plain: NoiseFilter, part: _ShotPart) -> NoiseFilter:
             best = min(filters, key=_price)
             name = f"{best.family.name}, behind something that grows with the signal"
             return replace(_as_found(plain, best, part, growth[1]), name=name, growth=growth[0])
+    if (radius := _median_radius(part)) is not None:
+        fit = Estimates.from_rows([("radius_px", float(radius), 0.0, np.inf, "px")])
+        return replace(plain, kind=UNKNOWN, name=f"{MEDIAN} of radius {radius} px", fit=fit, factor=np.inf)
     near = np.array([max(abs(j), abs(i)) <= 2 for j, i in LAGS[1:]])
     share = 2 * float(part.constant[near].sum())
     u_share = 2 * float(np.sqrt(part.constant_covariance[np.ix_(near, near)].sum()))
     return replace(plain, kind=UNKNOWN, name="no linear filter fits", factor=1 + share, u_factor=float(np.hypot(share, u_share)))
+
+
+def _median_radius(part: _ShotPart) -> int | None:
+    """Radius of the median whose correlation this is, within `OF_MEDIAN`; None of none."""
+    for radius, table in MEDIANS.items():
+        expected = np.array([table.get((min(j, abs(i)), max(j, abs(i))), 0.0) for j, i in LAGS[1:]])
+        if np.abs(part.constant - expected).max() < OF_MEDIAN + 5 * float(np.sqrt(np.diag(part.constant_covariance).max())):
+            return radius
+    return None
 
 
 def _price(match: _Match) -> float:
@@ -425,6 +476,7 @@ def before_filter(
     levels = series.dark.ms_pixel_dn2 if series.dark.ms_pixel_dn2.size else np.array([np.nan if dark is None else dark.ms_pixel_dn2])
     black = float(np.average(levels, weights=series.dark.n_frames - 1.0 if series.dark.ms_pixel_dn2.size else None))
     after = QUANTISATION_DN2 if found.name == LINE else 0.0
+    again = QUANTISATION_DN2 * (0.5 if found.kind == MOSAIC else 1.0)  # one half of the pixels is original
 
     def unfiltered_lines(ms_dn2: Any, var_dn2: Any, before_dn2: Any, of_line: float, pixels: int) -> Any:
         """Mean squares of rows or columns: the white noise before, and what lines have in common before the filter across them."""
@@ -445,7 +497,8 @@ def before_filter(
     def unfiltered_dark(var_dn2: np.ndarray) -> np.ndarray:
         if found.kind in (CHARGE, WHITE):
             return var_dn2
-        unfiltered: Array = np.maximum(var_dn2 - QUANTISATION_DN2, 0.0) * (found.factor + shift) + after
+        factor = found.factor if found.dark_factor is None else found.dark_factor
+        unfiltered: Array = np.maximum(var_dn2 - again, 0.0) * (factor + shift) + after
         return unfiltered
 
     def unfiltered(var_dn2: np.ndarray) -> np.ndarray:
@@ -492,9 +545,11 @@ def fit_unfiltered(
     if found is None:
         found = NoiseFilter()
     if found.kind == UNKNOWN and abs(found.factor - 1) > SMALL:
+        what = "a median or another noise reduction, a coder such as JPEG, or a demosaicking changed it"
+        named = np.isinf(found.factor)
         raise MeasureError(
-            "the noise of neighbouring pixels is correlated, and not as behind a linear filter: a median or another noise reduction, a "
-            "coder such as JPEG, or a demosaicking changed it, and its variance does not tell the gain",
+            "the noise of neighbouring pixels is correlated, and not as behind a linear filter: "
+            f"{f'this is a {found.name}' if named else what}, and its variance does not tell the gain",
             where="photon transfer",
             value=f"correlation of neighbours {found.correlation[1]:.2g}",
             allowed="none, or that of a linear filter",

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pixmetry.camera.noise_covariance import WHITE, NoiseCovariance, NoiseFilter, frames_share_noise, shared_by_frames
+from pixmetry.camera.code_table import CodeTable
+from pixmetry.camera.noise_covariance import MOSAIC, WHITE, NoiseCovariance, NoiseFilter, frames_share_noise, shared_by_frames
 from pixmetry.camera.observations import (
     CodeErrors,
     CodeHistogram,
@@ -24,6 +25,7 @@ from pixmetry.core.errors import MeasureError
 from pixmetry.core.number import ONE_SIDED_95, Estimates
 from pixmetry.core.threads import single_threaded_blas
 from pixmetry.observe import photon_transfer_model as model
+from pixmetry.observe.companding import find_code_table, without_steps
 from pixmetry.observe.defects import find_defects, without_hot_pixels
 from pixmetry.observe.experiment import PictureGroup
 from pixmetry.observe.experiments import reduce_pictures
@@ -138,11 +140,15 @@ def observe(
     dark, bright = _pair(list(stacks["dark"].values()), list(stacks["bright"].values()))
     dark_stack, bright_stack = (None if s is None else s.moments for s in (dark, bright))
     transfer = photon_transfer(levels["dark"], levels["bright"], shape, bits)
-    codes = _codes(sweep_histogram(sweep, bits), notes)
+    table = find_code_table(counts)
+    codes = _codes(sweep_histogram(sweep, bits), notes) if table is None else None  # gaps of a table are no fault of the converter
     with single_threaded_blas():
         noise = noise_covariance(correlated)
         noise_filter = find_noise_filter(noise)
-        fit = _transfer_fit(transfer, dark_stack, bright_stack, _dnl_lsb(codes), noise, noise_filter, notes)
+        fit = _transfer_fit(transfer, (dark_stack, bright_stack), _dnl_lsb(codes), noise, noise_filter, table, notes)
+    if noise_filter is not None and noise_filter.kind == MOSAIC:
+        told = "the gain is that of the original pixels, and the fixed pattern, of interpolated ones too, is smaller than the sensor's"
+        notes.append(f"the frames are not raw ({noise_filter.name}): {told}")
     if dark and not bright:
         notes.append("no stack of bright frames: PRNU is not measured (take 16 or more at half of saturation)")
     if dark and bright and not same_exposure(dark.moments, bright.moments):
@@ -163,6 +169,7 @@ def observe(
         defects=defects,
         patterns=patterns,
         code_errors=codes,
+        code_table=table,
         noise_covariance=noise,
         noise_filter=noise_filter,
         stated=told,
@@ -190,11 +197,11 @@ def _correlated(group: Group, level: LevelSummary, products: LagProducts, succes
 
 def _transfer_fit(
     transfer: PhotonTransfer,
-    dark: StackMoments | None,
-    bright: StackMoments | None,
+    stacks: tuple[StackMoments | None, StackMoments | None],
     dnl_lsb: float,
     noise: NoiseCovariance | None,
     noise_filter: NoiseFilter | None,
+    table: CodeTable | None,
     notes: list[str],
 ) -> Estimates:
     """The joint fit; where the frames carry none, what they tell nevertheless, and a note."""
@@ -210,10 +217,11 @@ def _transfer_fit(
             )
         alpha, u_alpha = (0.0, np.inf) if noise is None else shared_by_frames(noise)
         unseen = unseen_rms(alpha, u_alpha, LARGEST_ALPHA) if np.isfinite(u_alpha) else 0.0
-        return fit_unfiltered(transfer, dark, bright, dnl_lsb, noise_filter, unseen)
+        even, dark, bright = (transfer, *stacks) if table is None else without_steps(transfer, *stacks, table)
+        return fit_unfiltered(even, dark, bright, dnl_lsb, noise_filter, unseen)
     except MeasureError as problem:
-        straight = is_short(transfer) and independent and (noise_filter is None or noise_filter.kind == WHITE)
-        found = partial_transfer(transfer, dark, straight=straight)
+        straight = is_short(transfer) and independent and table is None and (noise_filter is None or noise_filter.kind == WHITE)
+        found = partial_transfer(transfer, stacks[0], straight=straight)
         if not len(found) and not transfer.bright.mean_dn.size:
             raise
         missing = "non-linearity, saturation" if "gain_dn_per_e" in found else "gain, noise in electrons, non-linearity, saturation"

@@ -7,12 +7,17 @@ from typing import Literal
 
 import numpy as np
 
+from pixmetry.camera.code_table import TRUNCATED, CodeTable
 from pixmetry.camera.contribution import Contribution, Probe
+from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
-from pixmetry.core.arrays import Array
+from pixmetry.core.errors import MeasureError
+from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
-from pixmetry.sources.processing._codes import bits_of_camera, stored
+from pixmetry.sources.processing._codes import bits_of_camera
+
+METHOD = "codes that never occur, against the tables of every law and number of bits"
 
 
 class Companding(Parameters):
@@ -27,44 +32,44 @@ class Companding(Parameters):
     bits: int = bits_of_camera()
 
 
-def table(params: Companding) -> np.ndarray:
-    """What becomes of each code, uint16, shape (2^bits,)."""
-    code = np.arange(2**params.bits)
-    lost = params.bits - params.transport_bits
-    if params.law == "off" or (lost <= 0 and params.law != "root"):
-        return code.astype(np.uint16)
-    if params.law == "truncated":
-        return (code >> lost << lost).astype(np.uint16)
-    top, way = 2**params.bits - 1, 2**params.transport_bits - 1
-    power = 0.5 if params.law == "root" else 1.0
-    sent = stored(way * (code / top) ** power, params.transport_bits)
-    return stored(top * (sent / way) ** (1 / power), params.bits)
+def code_table(params: Companding) -> CodeTable:
+    """The table of these parameters."""
+    return CodeTable(params.law, params.bits, params.transport_bits)
 
 
 def forward(params: Companding, signal: Signal, stream: Stream) -> Signal:
     """Look every code up; one beyond the range counts as the highest."""
     if params.law == "off":
         return signal
-    entries = table(params)
+    entries = code_table(params).entries()
     return signal.with_data(np.take(entries, signal.data, mode="clip"))
 
 
-def step_dn(params: Companding, level_dn: np.ndarray) -> np.ndarray:
-    """Width of the step at a level: the inverse of the curve's slope, at least 1."""
-    top, way = 2.0**params.bits - 1, 2.0**params.transport_bits - 1
-    if params.law == "off":
-        return np.ones_like(level_dn)
-    if params.law == "root":
-        step: Array = np.maximum(2 * np.sqrt(np.maximum(level_dn, 0) * top) / way, 1.0)
-        return step
-    if params.law == "truncated":
-        return np.full_like(level_dn, 2.0 ** max(params.bits - params.transport_bits, 0))
-    return np.full_like(level_dn, max(top / way, 1.0))
+def measure(observations: Observations) -> Estimates:
+    """Read the table off the codes that never occur.
+
+    Codes whose lower bits are all zero are no proof of a table: values of a converter of fewer bits that were shifted left look the same.
+    """
+    where, counts, table = "processing.companding", observations.histogram, observations.code_table
+    if counts is None:
+        raise MeasureError("needs dark and bright frames", where=where, remedy="take flat fields at many levels")
+    if table is None:
+        found = np.flatnonzero(counts.counts)
+        what = f"not found: {found.size} of the codes from {found[0]} to {found[-1]} occur, and no table of fewer bits leaves just these"
+        raise MeasureError(what, where=where)
+    if table.law == TRUNCATED:
+        step = 2 ** (table.bits - table.transport_bits)
+        converter = f"the codes of a converter of {table.transport_bits} bits shifted left"
+        what = f"every code is a multiple of {step}: lower bits were cut off, or {converter}; frames do not tell which"
+        raise MeasureError(what, where=where, remedy="see the camera's manual for the pixel format")
+    why = f"law: {table.law}; all codes that occur are on this table"
+    row = ("transport_bits", float(table.transport_bits), 0.0, math.inf, "bit")
+    return Estimates.from_rows([row], method=METHOD, reasons={"transport_bits": why}, settings={"law": table.law})
 
 
 def propagate(params: Companding, probe: Probe) -> Contribution:
     """Propagator P1 with the variance (step² − 1)/12 that wider steps add to that of whole codes; a half step of offset moves nothing."""
-    step = step_dn(params, np.asarray(probe.signal_dn, float))
+    step = code_table(params).step_dn(np.asarray(probe.signal_dn, float))
     u = probe.white(np.sqrt((step**2 - 1) / 12))
     method = "linear response of the estimator to the rounding of the wider steps, as white noise"
     return probe.contribution(u, "F", model_error=0.35, floor_px=math.sqrt(1 / 12) * 1e-3, method=method)
@@ -82,6 +87,7 @@ SOURCE = Source(
     typical=Companding(law="root", bits=12),
     bound=Companding(law="truncated", bits=12),
     forward=forward,
+    measure=measure,
     propagate=propagate,
     option="fewer bits during transport than in the converter",
     gum_class="F",
@@ -90,7 +96,6 @@ SOURCE = Source(
     references=("EMVA 1288 R4.0 Linear, §2.2 (quantisation, step²/12)", "GenICam PFNC 2.4 (Mono8, Mono12)"),
     advice="Use the raw 10 or 12 bits. Otherwise keep the steps smaller than the noise.",
     reasons={
-        "measure": "not measured: needs the gaps of a code histogram over an even spread of levels",
         "correct": "values that rounding merged cannot be separated again",
     },
 )

@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
 
 from pixmetry.camera.contribution import Contribution, Probe
+from pixmetry.camera.mosaic_weights import LUMA, REACH, output_weights
+from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal, Windows
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.errors import MeasureError
+from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
 from pixmetry.sources.processing._codes import bits_of_camera, bordered, surround
 from pixmetry.sources.processing._kernels import filter_by_place
 
-LUMA = {"R": 0.299, "G": 0.587, "B": 0.114}  # ITU-R BT.601
-REACH = 2
-
-# Weights × 8 of Malvar, He and Cutler (2004): the bilinear value plus 1/2, 5/8 or 3/4 of the Laplacian of the pixel's own colour.
-GREEN_AT_OTHER = np.array([[0, 0, -1, 0, 0], [0, 0, 2, 0, 0], [-1, 2, 4, 2, -1], [0, 0, 2, 0, 0], [0, 0, -1, 0, 0]]) / 8
-BESIDE = np.array([[0, 0, 0.5, 0, 0], [0, -1, 0, -1, 0], [-1, 4, 5, 4, -1], [0, -1, 0, -1, 0], [0, 0, 0.5, 0, 0]]) / 8  # in its row
-ACROSS = np.array([[0, 0, -1.5, 0, 0], [0, 2, 0, 2, 0], [-1.5, 0, 6, 0, -1.5], [0, 2, 0, 2, 0], [0, 0, -1.5, 0, 0]]) / 8  # at the corners
+METHOD = "autocovariance of the noise at the four places of the mosaic, against that of each method (H. S. Malvar et al., ICASSP 2004)"
+CONFOUNDERS = ("demosaicking: red and blue sites, which only the colour of the light tells apart; another method with the same weights",)
 
 
 class Demosaic(Parameters):
@@ -34,41 +34,11 @@ class Demosaic(Parameters):
     bits: int = bits_of_camera()
 
 
-def channel_weights(method: str, pattern: str, row: int, col: int, colour: str) -> np.ndarray:
-    """Weights, shape (5, 5), that give a colour at the place (row, col) of the pattern."""
-
-    def at(r: int, c: int) -> str:
-        return pattern[2 * (r % 2) + c % 2]
-
-    here = at(row, col)
-    out = np.zeros((5, 5))
-    if here == colour:
-        out[2, 2] = 1.0
-        return out
-    if method == "malvar":
-        if colour == "G":
-            return GREEN_AT_OTHER
-        if here == "G":
-            return BESIDE if at(row, col + 1) == colour else BESIDE.T
-        return ACROSS
-    near = [(r, c) for r in (-1, 0, 1) for c in (-1, 0, 1) if at(row + r, col + c) == colour]
-    for r, c in near:
-        out[2 + r, 2 + c] = 1 / len(near)
-    return out
-
-
 def weights(params: Demosaic) -> np.ndarray:
     """Weights of the output on the raw mosaic at its four places, white balance included, shape (2, 2, 5, 5)."""
     mix = LUMA if params.output == "luma" else {params.output[0].upper(): 1.0}
     gain = {"R": params.red_gain, "G": params.green_gain, "B": params.blue_gain}
-    out = np.zeros((2, 2, 5, 5))
-    for row in (0, 1):
-        for col in (0, 1):
-            colours = [params.pattern[2 * ((row + r) % 2) + (col + c) % 2] for r in range(-REACH, 3) for c in range(-REACH, 3)]
-            balance = np.array([gain[c] for c in colours]).reshape(5, 5)
-            total = sum(share * channel_weights(params.method, params.pattern, row, col, colour) for colour, share in mix.items())
-            out[row, col] = total * balance
-    return out
+    return output_weights(params.method, params.pattern, mix, gain)
 
 
 def forward(params: Demosaic, signal: Signal, stream: Stream) -> Signal:
@@ -82,6 +52,19 @@ def forward(params: Demosaic, signal: Signal, stream: Stream) -> Signal:
 def context(params: Demosaic, windows: Windows, frame_shape: tuple[int, int]) -> Windows:
     """Two pixels on each side."""
     return windows if params.method == "off" else surround(windows, REACH, frame_shape)
+
+
+def measure(observations: Observations) -> Estimates:
+    """Read method, stored colour and pattern off the noise at the four places of the mosaic; all are names, not numbers.
+
+    Red and blue sites can change their names without a difference to the noise: a stored red is told from green, and not from blue.
+    """
+    found, where = observations.noise_filter, "processing.demosaic"
+    if found is None:
+        raise MeasureError("needs the shot noise of flat fields", where=where, remedy="take pairs of flat fields and of dark frames")
+    if "output" not in found.fit.settings:
+        raise MeasureError("not found: the noise has no period of two pixels that an interpolation of colours would leave", where=where)
+    return replace(found.fit, method=METHOD, confounders=CONFOUNDERS)
 
 
 def propagate(params: Demosaic, probe: Probe) -> Contribution:
@@ -126,6 +109,7 @@ SOURCE = Source(
     typical=Demosaic(method="bilinear"),
     bound=Demosaic(method="bilinear", output="red"),
     forward=forward,
+    measure=measure,
     propagate=propagate,
     context=context,
     option="a colour mosaic",
@@ -138,7 +122,6 @@ SOURCE = Source(
     ),
     advice="Store the raw mosaic, balance its colours, and locate targets in it. Use targets of 7 px or more.",
     reasons={
-        "measure": "not measured: needs the noise spectra at each position of the pattern; the camera's manual states the method",
         "correct": "the raw mosaic is lost, except at the pixels of the colour that is stored",
     },
 )

@@ -3,16 +3,25 @@
 from __future__ import annotations
 
 import math
+import re
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
 
-from pixmetry.camera.noise_covariance import gaussian_half
+from pixmetry.camera.noise_covariance import CHARGE, MEDIAN, WHITE, gaussian_half
+from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal, Windows
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.errors import MeasureError
+from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
 from pixmetry.sources.processing._codes import bits_of_camera, bordered, stored, surround
 from pixmetry.sources.processing._kernels import bilateral, blur, median
+
+METHOD = "autocovariance of the noise of flat-field pairs, against that of each filter"
+CONFOUNDERS = ("noise reduction: a sharpening behind it; optics and pixels do not correlate noise",)
+BLUR_NAME = re.compile(r"Gaussian blur of radius (\d) px")
 
 
 class NoiseReduction(Parameters):
@@ -52,6 +61,26 @@ def context(params: NoiseReduction, windows: Windows, frame_shape: tuple[int, in
     return windows if params.method == "off" else surround(windows, params.radius_px, frame_shape)
 
 
+def measure(observations: Observations) -> Estimates:
+    """Read the filter off the noise: a Gaussian by its fitted width, a median by the correlation that it gives to any normal noise."""
+    found, where = observations.noise_filter, "processing.noise_reduction"
+    remedy = "switch off every other filter in the camera, and take raw frames"
+    if found is None:
+        raise MeasureError("needs the shot noise of flat fields", where=where, remedy="take pairs of flat fields and of dark frames")
+    if found.kind in (WHITE, CHARGE):
+        raise MeasureError("not found: neighbours are not correlated as behind a smoothing filter", where=where)
+    blur = BLUR_NAME.fullmatch(found.name)
+    if blur is not None:
+        sigma, radius = found.fit["sigma_px"], float(blur[1])
+        rows = [("sigma_px", sigma.value, sigma.u, math.inf, "px"), ("radius_px", radius, 0.0, math.inf, "px")]
+        why = {"sigma_px": "method: gaussian"}
+        return Estimates.from_rows(rows, method=METHOD, confounders=CONFOUNDERS, reasons=why, settings={"method": "gaussian"})
+    if found.name.startswith(MEDIAN):
+        why = {"radius_px": "method: median; the noise has its correlation at every lag"}
+        return replace(found.fit, method=METHOD, confounders=CONFOUNDERS, reasons=why, settings={"method": "median"})
+    raise MeasureError(f"what correlates neighbouring pixels is no Gaussian and no median ({found.name})", where=where, remedy=remedy)
+
+
 SOURCE = Source(
     id="processing.noise_reduction",
     title="Spatial noise reduction",
@@ -64,6 +93,7 @@ SOURCE = Source(
     typical=NoiseReduction(method="median"),
     bound=NoiseReduction(method="bilateral", radius_px=2, sigma_px=1.5, range_dn=20.0),
     forward=forward,
+    measure=measure,
     context=context,
     option="noise reduction in the camera",
     gum_class="F",
@@ -75,7 +105,6 @@ SOURCE = Source(
     ),
     advice="Switch it off; average frames instead.",
     reasons={
-        "measure": "not measured: needs the correlation of the noise of neighbours, and the response to an edge at two contrasts",
         "correct": "medians and weights that depend on the grey values have no inverse",
         "propagate": "its effect on an edge depends on the noise there: only a simulation with the camera's noise gives the contribution",
     },
