@@ -147,8 +147,8 @@ def observe(
         noise_filter = find_noise_filter(noise)
         fit = _transfer_fit(transfer, (dark_stack, bright_stack), _dnl_lsb(codes), noise, noise_filter, table, notes)
     if noise_filter is not None and noise_filter.kind == MOSAIC:
-        told = "the gain is that of the original pixels, and the fixed pattern, of interpolated ones too, is smaller than the sensor's"
-        notes.append(f"the frames are not raw ({noise_filter.name}): {told}")
+        meant = "the gain is that of the original pixels, and the fixed pattern, of interpolated ones too, is smaller than the sensor's"
+        notes.append(f"the frames are not raw ({noise_filter.name}): {meant}")
     if dark and not bright:
         notes.append("no stack of bright frames: PRNU is not measured (take 16 or more at half of saturation)")
     if dark and bright and not same_exposure(dark.moments, bright.moments):
