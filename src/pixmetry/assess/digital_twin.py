@@ -50,8 +50,7 @@ def digital_twin(campaign: Campaign, estimates: Mapping[str, Estimates], observa
         if source.id not in estimates and source.id not in ALWAYS:
             continue
         found = replace(estimates.get(source.id, Estimates.empty()), confounders=())  # results.json holds these, once for all
-        chosen = {} if observations.response is None else observations.response.choices.get(source.id, {})
-        values = {k: v for k, v in known.items() if k in fields} | best_values(source, found) | dict(chosen)
+        values = {k: v for k, v in known.items() if k in fields} | best_values(source, found) | dict(observations.choices(source.id))
         params = source.make(values, f"digital twin, {source.id}")
         known_from = MEASURED if len(found) or found.settings else TYPICAL if source.measure is not None else DESCRIBED
         elements.append(Element(source.id, source, params, known_from=known_from, estimates=found))

@@ -11,7 +11,7 @@ from pixmetry.assess.self_test import SelfTest
 from pixmetry.budget.monte_carlo import Crop
 from pixmetry.budget.records import SUM, Budget
 from pixmetry.camera.camera import Camera
-from pixmetry.camera.observations import EdgeResponse, LightSteps, LineRows, Observations, SlantedEdges, StackMoments
+from pixmetry.camera.observations import BrightSpots, EdgeResponse, LightSteps, LineRows, Observations, SlantedEdges, StackMoments
 from pixmetry.camera.response import Response
 from pixmetry.core.number import Estimates
 from pixmetry.emva.files.json_format import value_record
@@ -95,6 +95,7 @@ class Assessment:
                 "confounders": list(fit.confounders),
             },
             "spatial": self.observations.spatial_fit.to_records() if self.observations.spatial_fit is not None else [],
+            "spots": None if self.observations.spots is None else spots_record(self.observations.spots),
             "light_off": None if self.observations.light_off is None else light_off_record(self.observations.light_off),
             "edges": None if self.observations.edges is None else edges_record(self.observations.edges),
             "response": None if self.observations.response is None else response_record(self.observations.response),
@@ -178,6 +179,27 @@ def edges_record(found: SlantedEdges) -> dict[str, Any]:
         "x": mean(found.x),
         "y": mean(found.y),
         "edges": [{k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in e.items()} for e in each],
+    }
+
+
+def spots_record(found: BrightSpots) -> dict[str, Any]:
+    """The plain record of bright spots."""
+    told = [found.level_up_s, found.level_down_s, found.u_level_s]
+    return {
+        "spots": [asdict(s) for s in found.spots],
+        "exposure_s": found.exposure_s.tolist(),
+        "peak_dn": found.peak_dn.tolist(),
+        "saturated": found.saturated.tolist(),
+        "clipped_by_converter": found.clipped,
+        **{
+            name: [float(v) if np.isfinite(v) else None for v in values]
+            for name, values in zip(("level_up_s", "level_down_s", "u_level_s"), told, strict=True)
+        },
+        "smear_rows": found.smear_rows,
+        "smear_store": found.smear_store,
+        "streaks": 0 if found.streaks is None else len(found.streaks),
+        "values": found.fit.to_records(),
+        "not_told": {name: why for name, why in found.fit.reasons.items() if name not in found.fit},
     }
 
 

@@ -292,6 +292,105 @@ class SlantedEdges:
 
 
 @dataclass(frozen=True)
+class Spot:
+    """One bright spot: its centre, its rows and columns (first and one behind the last), and the light of its brightest pixel, DN/s."""
+
+    x_px: float
+    y_px: float
+    rows: tuple[int, int]
+    cols: tuple[int, int]
+    peak_dn_per_s: float
+
+
+@dataclass(frozen=True)
+class SpotStreaks:
+    """Charge that left overexposed spots along their columns, above and below them; one entry a column and exposure.
+
+    Parameters
+    ----------
+    light_dn : ndarray, shape (entries, rows)
+        Light of the spot's rows in that exposure, from exposures that do not saturate.
+    first_row : ndarray, shape (entries,)
+        The row of the frame of ``light_dn[:, 0]``.
+    centre_row : ndarray, shape (entries,)
+        The row of the frame that has most light.
+    column : ndarray, shape (entries,)
+        Number of the column that an entry is of: entries of one column share the error of its light.
+    u_light_rel : ndarray, shape (entries,)
+        Relative standard uncertainty of that.
+    window : ndarray, shape (entries, 2)
+        First row, and one behind the last, that are summed.
+    level_dn : ndarray, shape (entries, 2)
+        Level of the column above and below spot and streak, which the full pixels hold too.
+    up_dn, down_dn : ndarray, shape (entries,)
+        Sum of the window's rows above the centre, and below it.
+    var_dn2 : ndarray, shape (entries,)
+        Variance of either, as expected; its scale is not trusted.
+    """
+
+    light_dn: np.ndarray
+    first_row: np.ndarray
+    centre_row: np.ndarray
+    column: np.ndarray
+    u_light_rel: np.ndarray
+    window: np.ndarray
+    level_dn: np.ndarray
+    up_dn: np.ndarray
+    down_dn: np.ndarray
+    var_dn2: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.up_dn)
+
+
+@dataclass(frozen=True)
+class BrightSpots:
+    """Spots on black at several exposures, and what they leave in the rest of their columns and rows.
+
+    Parameters
+    ----------
+    spots : tuple of Spot
+    exposure_s, peak_dn : ndarray, shape (exposures,)
+        And the brightest pixel, above black.
+    saturated : ndarray, shape (exposures,), bool
+    level_up_s, level_down_s, u_level_s : ndarray, shape (exposures,)
+        Streak above and below, per light of the column in one second, in seconds: smear is the same at all exposures. NaN where a streak of
+        full pixels reaches the frame's end.
+    plateau_dn : float
+        Level above black at which spots saturate; NaN where none does.
+    clipped : bool
+        Whether that is the highest code.
+    streaks : SpotStreaks or None
+        Of spots that are alone in their columns, whose streaks end within the frame.
+    smear_rows, smear_store : str
+        As in ``sensor.smear``: the rows that charge passes, and the side of the storage.
+    fit : Estimates
+        ``smear_s``, ``row_crosstalk``, ``col_crosstalk``, ``plateau_dn``; why others are missing in ``reasons``.
+    frame_rows : int
+    """
+
+    spots: tuple[Spot, ...]
+    exposure_s: np.ndarray
+    peak_dn: np.ndarray
+    saturated: np.ndarray
+    level_up_s: np.ndarray
+    level_down_s: np.ndarray
+    u_level_s: np.ndarray
+    plateau_dn: float
+    clipped: bool
+    streaks: SpotStreaks | None
+    smear_rows: str
+    smear_store: str
+    fit: Estimates
+    frame_rows: int
+
+    @property
+    def choices(self) -> Mapping[str, Mapping[str, str]]:
+        """Parameters that are words, by source."""
+        return {"sensor.smear": {"rows": self.smear_rows, "store": self.smear_store}} if "smear_s" in self.fit else {}
+
+
+@dataclass(frozen=True)
 class LightStep:
     """One sequence of frames in which the light went off.
 
@@ -481,6 +580,7 @@ class Observations:
     code_table: CodeTable | None = None  # of companding, where the codes show one
     edges: SlantedEdges | None = None
     light_off: LightSteps | None = None
+    spots: BrightSpots | None = None
     sensor: str | None = None  # ccd, cmos or cid, where it was said
     response: Response | None = None
     lines: LineRows | None = None
@@ -565,6 +665,11 @@ class Observations:
             fit = self.lines.taped if taped else self.lines.jitter
         pictures = "upright lines or edges in 4 frames or more" + (", played from tape and once more directly" if taped else "")
         return of_pictures(fit, names, where=where, pictures=pictures, kind="line")
+
+    def choices(self, source: str) -> Mapping[str, Any]:
+        """Parameters of a source that are no numbers, such as words, as the pictures tell them."""
+        of_spots = {} if self.spots is None else self.spots.choices.get(source, {})
+        return {**of_spots, **({} if self.response is None else self.response.choices.get(source, {}))}
 
     def calibrated(self, names: Mapping[str, str] | Iterable[str], *, where: str) -> Estimates:
         """Take a source's parameters out of the calibrated geometry, with their covariance.

@@ -19,7 +19,7 @@ from pixmetry.files.raw_values import RawLayout
 
 STACK_FRAMES = 8  # from this many frames on, a group is a stack: its mean image serves the spatial measurements
 KINDS = ("dark", "bright")  # frames of an even field, from which noise is measured
-TARGETS = ("edge", "light_off", "chart", "line", "series")  # pictures of something to be measured: one frame may be enough
+TARGETS = ("edge", "light_off", "chart", "line", "spots", "series")  # pictures of something to be measured: one frame may be enough
 LOCATED = ("series",)  # kinds whose frames are measured one by one, for their targets
 FACTS = {  # what else may be said of a group, by its kind
     "edge": ("wavelength_nm",),

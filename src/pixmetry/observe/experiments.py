@@ -14,6 +14,7 @@ from pixmetry.observe.line_jitter import with_jitter
 from pixmetry.observe.lines import LineFrames, places_of_rows
 from pixmetry.observe.patches import find_patches
 from pixmetry.observe.response_fit import response_of, with_response
+from pixmetry.observe.spots import reduce_spots
 
 
 def reduce_edges(groups: Sequence[PictureGroup], seen: Observations) -> Observations:
@@ -45,6 +46,7 @@ EXPERIMENTS = {
         Experiment("light_off", reduce_light_off, BlockMeans),
         Experiment("chart", reduce_charts),
         Experiment("line", reduce_lines, LineFrames),
+        Experiment("spots", reduce_spots),
     )
 }
 

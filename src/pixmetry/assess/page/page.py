@@ -91,6 +91,7 @@ def _pictures(assessment: Assessment) -> list[Section]:
     from pixmetry.assess.page.light_off import light_off_section
     from pixmetry.assess.page.lines import lines_section
     from pixmetry.assess.page.response import response_section
+    from pixmetry.assess.page.spots import spots_section
     from pixmetry.series.page import drift_section
 
     seen = assessment.observations
@@ -98,6 +99,7 @@ def _pictures(assessment: Assessment) -> list[Section]:
         *([] if seen.edges is None else [edges_section(seen.edges)]),
         *([] if seen.response is None else [response_section(seen.response)]),
         *([] if seen.lines is None else [lines_section(seen.lines)]),
+        *([] if seen.spots is None else [spots_section(seen.spots)]),
         *([] if seen.light_off is None else [light_off_section(seen.light_off)]),
         *([] if seen.drift is None else [drift_section(seen.drift)]),
     ]

@@ -6,17 +6,25 @@ holds too much. The end does not depend on the order of the spilling, and is fou
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
 
 from pixmetry.camera.contribution import Contribution, Probe
+from pixmetry.camera.observations import BrightSpots, Observations, SpotStreaks
 from pixmetry.camera.signal import Kind, Signal, Windows
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.errors import MeasureError
+from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
 from pixmetry.sources.sensor._readout_kernels import spill
 
 UNLIMITED_E = 1e9
+SIGNIFICANT = 3.3
+LEAST_STREAKS = 6  # columns and exposures with a streak
+LEAST_WELLS = 0.5  # of charge that left a spot in a column, for a streak
+METHOD = "charge above and below overexposed spots, fitted by the spilling of their light"
 
 
 class Blooming(Parameters):
@@ -65,6 +73,197 @@ def propagate(params: Blooming, probe: Probe) -> Contribution:
     return probe.from_shifts(dx, dy, "F", model_error=0.5, method="the estimator on the target with the spilled charge within the window")
 
 
+def measure(observations: Observations) -> Estimates:
+    """Share up, drains and full well from the streaks of bright spots at many times the full well.
+
+    The light of every column, from exposures that do not saturate, is spilled by ``forward`` itself, and its parameters are those for
+    which as much charge lies above and below the spot as in the frames.
+    """
+    spots = observations.spots
+    if spots is None:
+        remedy = "take frames of bright spots on black, from half to many times the full well (kind: spots in the manifest)"
+        raise MeasureError("not measured: needs bright spots on black", where="sensor.blooming", remedy=remedy)
+    if not spots.saturated.any():
+        why = next(iter(spots.fit.reasons.values()), "") if not spots.spots else "no spot is saturated"
+        remedy = "add exposures of 2 to 20 times the full well" if spots.spots else ""
+        raise MeasureError(why, where="sensor.blooming", remedy=remedy)
+    if spots.streaks is None:
+        what = "no streak of a spot that is alone in its columns ends within the frame"
+        raise MeasureError(what, where="sensor.blooming", remedy="put the spots in the middle of the frame; add exposures of 2 to 5 times")
+    found = _fitted(spots, spots.streaks)
+    fit = observations.photon_transfer_fit
+    if "full_well_dn" not in found:
+        return found
+    names = tuple("full_well_e" if n == "full_well_dn" else n for n in found.names)
+    if fit is None or "gain_dn_per_e" not in fit:
+        return found.select([n for n in found.names if n != "full_well_dn"])
+    gain, at = fit["gain_dn_per_e"], found.index("full_well_dn")
+    scale = np.ones(len(found))
+    scale[at] = 1 / gain.value
+    covariance = found.covariance * np.outer(scale, scale)
+    covariance[at, at] += (found.values[at] * gain.u / gain.value**2) ** 2
+    units = tuple("e-" if n == "full_well_e" else u for n, u in zip(names, found.units, strict=True))
+    return replace(found, names=names, values=found.values * scale, covariance=covariance, units=units)
+
+
+def _spilled_sums(values: np.ndarray, spots: BrightSpots, streaks: SpotStreaks, factor: np.ndarray) -> np.ndarray:
+    """Charge above and below each spot in DN, shape (entries, 2), of light times ``factor``, for (full well, up, drained, drain ratio)."""
+    top, up, drained, ratio = values
+    entries, height = streaks.light_dn.shape
+    out = np.empty((entries, 2))
+    for i in range(entries):
+        first = int(streaks.first_row[i])
+        column = np.zeros((1, spots.frame_rows, 1), np.float32)
+        centre, (low, high) = int(streaks.centre_row[i]), streaks.window[i]
+        end = min(first + height, spots.frame_rows)
+        above, below = streaks.level_dn[i]
+        column[0, :first, 0], column[0, end:, 0] = above, below
+        passed = np.cumsum(streaks.light_dn[i, : end - first])
+        column[0, first:end, 0] = above + (below - above) * passed / passed[-1]
+        column[0, first:end, 0] += streaks.light_dn[i, : end - first] * factor[i]
+        held = _spilled(Blooming(full_well_e=max(top, 1.01), up_share=up, drained_share=drained, drain_ratio=ratio), column)[0, :, 0]
+        if spots.clipped:
+            held = np.minimum(held, spots.plateau_dn)
+        out[i] = held[low:centre].sum(), held[centre + 1 : high].sum()
+    return out
+
+
+def _fitted(spots: BrightSpots, streaks: SpotStreaks) -> Estimates:
+    """The parameters in DN; those that the streaks do not need are left out, with the reason.
+
+    Raises
+    ------
+    MeasureError
+        If there are too few streaks.
+    """
+    plateau = spots.plateau_dn
+    over = streaks.light_dn.max(axis=1) / plateau
+    one = np.ones(len(streaks))
+    unspilled = _spilled_sums(np.array([plateau, 0.5, 0.0, 1e6]), spots, streaks, one).sum(axis=1)
+    spilled, lost = streaks.up_dn + streaks.down_dn - unspilled, np.maximum(streaks.light_dn - plateau, 0).sum(axis=1)
+    streaked = spilled > LEAST_WELLS * plateau
+    if streaked.sum() < LEAST_STREAKS:
+        expected = lost > LEAST_WELLS * plateau
+        if expected.sum() >= LEAST_STREAKS and not spots.clipped and not streaked.any():
+            ratio, u = float(np.max(over[expected])), float(streaks.u_light_rel[np.argmax(over)])
+            return Estimates.from_rows(
+                [("drain_ratio", ratio, u * ratio, np.inf, "1"), ("full_well_dn", plateau, spots.fit["plateau_dn"].u, np.inf, "DN")],
+                method=METHOD,
+                lower_limits=frozenset({"drain_ratio"}),
+                reasons={"drain_ratio": "no charge left the spots: the drain took all of it up to this over-exposure"},
+            )
+        what = f"{int(streaked.sum())} columns have a streak, {LEAST_STREAKS} are needed"
+        raise MeasureError(what, where="sensor.blooming", remedy="add exposures of 2 to 20 times the full well, or larger spots")
+    return _least_squares(spots, streaks)
+
+
+def _least_squares(spots: BrightSpots, streaks: SpotStreaks) -> Estimates:
+    """Gauss-Newton on (full well, up, drained, drain ratio), as far as they are free, with one factor for the light of each column."""
+    observed = np.stack([streaks.up_dn, streaks.down_dn], axis=1)
+    weight = 1 / streaks.var_dn2[:, None]
+    _, place = np.unique(streaks.column, return_inverse=True)
+    columns = int(place.max()) + 1
+    prior = np.array([streaks.u_light_rel[place == c].min() for c in range(columns)])
+    # full well, up, drained, drain ratio: their steps, and their smallest and largest values
+    steps, low, high = np.array([0.002 * spots.plateau_dn, 0.002, 0.002, 0.01]), np.array([2.0, 0, 0, 1]), np.array([1e6, 1, 0.99, 1e6])
+
+    def chi2_of(values: np.ndarray, factor: np.ndarray) -> float:
+        off = observed - _spilled_sums(values, spots, streaks, factor[place])
+        return float((weight * off**2).sum() + (((factor - 1) / prior) ** 2).sum())
+
+    def solved(values: np.ndarray, free: list[int]) -> tuple[np.ndarray, np.ndarray, float]:
+        factor, best = np.ones(columns), np.inf
+        covariance, dof = np.eye(len(free)), 1.0
+        best = chi2_of(values, factor)
+        for _ in range(25):
+            here = _spilled_sums(values, spots, streaks, factor[place])
+            own = (_spilled_sums(values, spots, streaks, factor[place] * 1.002) - here) / 0.002 / factor[place][:, None]
+            common = []
+            for i in free:
+                moved = values.copy()
+                moved[i] += steps[i] if values[i] + steps[i] <= high[i] else -steps[i]
+                common.append((_spilled_sums(moved, spots, streaks, factor[place]) - here) / (moved[i] - values[i]))
+            jac, off = np.array(common), observed - here
+            g_oo = np.bincount(place, (weight * own**2).sum(axis=1), columns) + prior**-2.0
+            g_co = np.array([np.bincount(place, (weight * j * own).sum(axis=1), columns) for j in jac])
+            r_o = np.bincount(place, (weight * own * off).sum(axis=1), columns) - (factor - 1) / prior**2
+            normal = np.einsum("inm,jnm,nm->ij", jac, jac, np.broadcast_to(weight, off.shape)) - (g_co / g_oo) @ g_co.T
+            right = np.einsum("inm,nm->i", jac, weight * off) - g_co @ (r_o / g_oo)
+            scale = np.sqrt(np.maximum(np.diag(normal), 1e-30))
+            inverse = np.linalg.pinv(normal / np.outer(scale, scale), rcond=1e-10) / np.outer(scale, scale)
+            step = inverse @ right
+            # The light of a column's pixels is uncertain one by one, so its exposures err together: u is the jackknife's over columns,
+            # to first order (MacKinnon and White 1985).
+            alone = np.array([np.bincount(place, (weight * j * off).sum(axis=1), columns) for j in jac]) - g_co / g_oo * r_o
+            share = np.array([[np.bincount(place, (weight * j * k).sum(axis=1), columns) for j in jac] for k in jac])
+            share -= g_co[:, None] * g_co[None] / g_oo
+            pulls = np.array(
+                [inverse @ np.linalg.lstsq(np.eye(len(free)) - share[..., c] @ inverse, alone[:, c])[0] for c in range(columns)]
+            )
+            covariance = pulls.T @ pulls * (columns - 1) / columns
+            dof = float(((pulls**2).sum(axis=0) ** 2 / (pulls**4).sum(axis=0)).min())
+            step_o = (r_o - g_co.T @ step) / g_oo
+            size = 1.0
+            while size > 1e-3:
+                trial = values.copy()
+                trial[free] = np.clip(values[free] + size * step, low[free], high[free])
+                new = chi2_of(trial, factor + size * step_o)
+                if new <= best:
+                    break
+                size /= 2
+            else:
+                break
+            done = best - new < 1e-3
+            values, factor, best = trial, factor + size * step_o, new
+            if done:
+                break
+        return values, covariance, dof
+
+    ups = np.linspace(0.05, 0.95, 19)
+    one = np.ones(columns)
+    ratios = (1.0,) if spots.clipped else (1.0, 1.5, 2.0, 3.0, 5.0, 8.0, 12.0, 20.0)
+    start = min(((u, r) for u in ups for r in ratios), key=lambda p: chi2_of(np.array([spots.plateau_dn, p[0], 0.0, p[1]]), one))
+    values = np.array([spots.plateau_dn, start[0], 0.0, start[1]])
+    free = [0, 1] if spots.clipped else [1, 2, 3]
+    names = ("full_well_dn", "up_share", "drained_share", "drain_ratio")
+    neutral = np.array([np.nan, np.nan, 0.0, 1.0])
+    reasons: dict[str, str] = {}
+    widest = np.zeros(4)  # what is left out as not needed is not known to be none: the others keep the u that they have beside it
+    while True:
+        found, covariance, dof = solved(values, free)
+        u = np.sqrt(np.diag(covariance))
+        widest[free] = np.maximum(widest[free], u)
+        wider = widest[free] / np.maximum(u, 1e-30)
+        covariance, u = covariance * np.outer(wider, wider), widest[free]
+        small = [i for k, i in enumerate(free) if np.isfinite(neutral[i]) and abs(found[i] - neutral[i]) < SIGNIFICANT * u[k]]
+        if not small:
+            break
+        gone = min(small, key=lambda i: abs(found[i] - neutral[i]) / u[free.index(i)])
+        reasons[names[gone]] = f"none is needed: {found[gone]:.3g} ± {u[free.index(gone)]:.2g}"
+        values = found.copy()
+        values[gone] = neutral[gone]
+        free = [i for i in free if i != gone]
+    used = [0, *free] if 0 not in free else free
+    whole = np.zeros((len(used), len(used)))
+    at = [used.index(i) for i in free]
+    whole[np.ix_(at, at)] = covariance
+    if 0 not in free:
+        whole[0, 0] = spots.fit["plateau_dn"].u ** 2
+    drain = "a drain: the converter ends below the full well, and the streaks tell the full well only without a drain"
+    confounders = (drain,) if spots.clipped else ()
+    units = {"full_well_dn": "DN"}
+    return Estimates(
+        tuple(names[i] for i in used),
+        found[used],
+        whole,
+        np.full(len(used), max(dof, 1.0)),
+        tuple(units.get(names[i], "1") for i in used),
+        method=METHOD,
+        confounders=confounders,
+        reasons={n: why for n, why in reasons.items() if n in [names[i] for i in used]},
+    )
+
+
 SOURCE = Source(
     id="sensor.blooming",
     title="Blooming",
@@ -79,6 +278,7 @@ SOURCE = Source(
     typical=Blooming(up_share=0.4),
     bound=Blooming(up_share=0.4, knee_rel=0.2),
     forward=forward,
+    measure=measure,
     propagate=propagate,
     context=context,
     applies_to=("ccd",),
@@ -91,7 +291,6 @@ SOURCE = Source(
     ),
     advice="Lower the exposure until the target peaks at 80 % of the full well; drop targets with streaks.",
     reasons={
-        "measure": "needs a bright spot at exposures up to many times the full well: the lengths of its streaks upwards and downwards",
         "correct": "the original positions of the charge are lost: flag the columns, or fit full pixels as 'at least the full well'",
     },
 )

@@ -122,18 +122,24 @@ def propagate(params: CidReadout, probe: Probe) -> Contribution:
 
 
 def measure(observations: Observations) -> Estimates:
-    """Share of the charge that remains after clearing, from frames in which the light goes off; only of a camera that is stated as CID."""
+    """Cross-talk from bright spots, what clearing leaves from a light that goes off; only of a camera that is stated as CID."""
     if observations.sensor != "cid":
         what = "the camera is not stated to be a charge injection device"
         raise MeasureError(what, where="sensor.cid_readout", remedy="if it is one, write sensor: cid under camera")
-    steps = observations.light_off
-    return of_pictures(
-        None if steps is None else steps.fit,
-        {"residual": "left_rel"},
-        where="sensor.cid_readout",
-        pictures="a light that goes off",
-        kind="light_off",
-    )
+    where, steps, spots = "sensor.cid_readout", observations.light_off, observations.spots
+    parts, problems = [], []
+    talk = {name: name for name in ("row_crosstalk", "col_crosstalk")}
+    for seen, names, pictures, kind in (
+        (spots, talk, "bright spots on black", "spots"),
+        (steps, {"residual": "left_rel"}, "a light that goes off", "light_off"),
+    ):
+        try:
+            parts.append(of_pictures(None if seen is None else seen.fit, names, where=where, pictures=pictures, kind=kind))
+        except MeasureError as problem:
+            problems.append(problem)
+    if not parts:
+        raise problems[0]
+    return Estimates.empty().join(*parts)
 
 
 SOURCE = Source(

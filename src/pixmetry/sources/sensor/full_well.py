@@ -64,6 +64,16 @@ def measure(observations: Observations) -> Estimates:
     fit, transfer = observations.photon_transfer_fit, observations.photon_transfer
     if fit is not None and "full_well_e" in fit:
         return fit.select(["full_well_e"])
+    spots = observations.spots
+    if fit is not None and "gain_dn_per_e" in fit and spots is not None and "plateau_dn" in spots.fit:
+        gain, plateau = fit["gain_dn_per_e"], spots.fit["plateau_dn"]
+        u = float(np.hypot(plateau.u, plateau.value * gain.u / gain.value) / gain.value)
+        return Estimates.from_rows(
+            [("full_well_e", plateau.value / gain.value, u, gain.dof, "e-")],
+            method="level at which overexposed spots stop to grow",
+            lower_limits=frozenset({"full_well_e"}) if spots.clipped else frozenset(),
+            reasons={"full_well_e": "lower bound: the converter ends first"} if spots.clipped else {},
+        )
     if fit is None or transfer is None or not transfer.bright.mean_dn.size:
         raise MeasureError("full well needs a photon-transfer series", where="sensor.full_well", remedy="add levels up to saturation")
     gain, offset = fit["gain_dn_per_e"], fit["offset_dn"]

@@ -10,9 +10,11 @@ from typing import Literal
 
 import numpy as np
 
+from pixmetry.camera.observations import Observations, of_pictures
 from pixmetry.camera.signal import Kind, Signal, Windows
 from pixmetry.camera.source import Parameters, Source, quantity
 from pixmetry.core.arrays import Array
+from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
 from pixmetry.sources.sensor._readout_kernels import add_column_sums, add_rows_passed
 
@@ -90,6 +92,13 @@ def truth(params: Smear, signal: Signal, stream: Stream) -> Mapping[str, np.ndar
     return {"rows_passed": passed, "streak_rel": share(params, signal)[:, None] * passed}
 
 
+def measure(observations: Observations) -> Estimates:
+    """Product of transfer time and leak, as a time at leak 1, from the streaks of bright spots at several exposures."""
+    spots = observations.spots
+    fit = None if spots is None else spots.fit
+    return of_pictures(fit, {"transfer_s": "smear_s"}, where="sensor.smear", pictures="bright spots on black", kind="spots")
+
+
 SOURCE = Source(
     id="sensor.smear",
     title="Smear",
@@ -104,6 +113,7 @@ SOURCE = Source(
     typical=Smear(transfer_s=4e-4, rows="passed"),
     bound=Smear(transfer_s=2e-3, rows="passed"),
     forward=forward,
+    measure=measure,
     correct=correct,
     truth=truth,
     context=context,
@@ -120,7 +130,6 @@ SOURCE = Source(
     leaves="the noise of the smear's charge, and light that has changed since",
     advice="Use a strobe, a shutter or an interline sensor. Or subtract the streak that covered rows show.",
     reasons={
-        "measure": "needs covered rows above and below the image, or one bright target on black",
         "propagate": "needs the light of the whole column: the streaks of other objects in it count as much as the target's own",
     },
 )
