@@ -10,7 +10,9 @@ import pytest
 from files.campaign_files import FRAMES, HEAD, put_campaign, put_frame
 from pixmetry.core.errors import InputError
 from pixmetry.files import EXAMPLE, FrameReader, load_campaign, photons_from_irradiance, write_manifest
+from pixmetry.files.records import KINDS, TARGETS
 
+KINDS_ALLOWED = ", ".join(f"'{kind}'" for kind in (*KINDS, *TARGETS[:-1])) + f" or '{TARGETS[-1]}'"
 DARK = "frames:\n  - {kind: dark, exposure_s: 0.01, files: [d_0.png, d_1.png]}\n"
 EDGE = "  - {kind: edge, files: [b_0.png]}\n"
 BRIGHT = "  - {kind: bright, exposure_s: 0.01, files: [b_0.png, b_1.png]}\n"
@@ -68,7 +70,10 @@ def test_edges_alone_or_beside_are_a_campaign(tmp_path: Path) -> None:
         (HEAD + DARK + BRIGHT.replace("exposure_s", "exposure_ms"), ["another unit", "exposure_s"]),
         (HEAD + DARK + BRIGHT.replace("0.01", ".nan"), ["exposure_s", "not a finite number"]),
         (HEAD + DARK + BRIGHT.replace("0.01", "-1"), ["exposure_s", "-1", "greater than or equal to 0"]),
-        (HEAD + DARK + BRIGHT.replace("kind: bright", "kind: light"), ["kind", "'light'", "'dark', 'bright' or 'edge'"]),
+        (
+            HEAD + DARK + BRIGHT.replace("kind: bright", "kind: light"),
+            ["kind", "'light'", KINDS_ALLOWED],
+        ),
         (HEAD + DARK + EDGE.replace("}", ", role: stack}"), ["role belongs to dark and bright frames", "line 5"]),
         (HEAD + DARK + EDGE.replace("}", ", photons: 5}"), ["photons belongs to dark and bright frames"]),
         (HEAD + DARK + BRIGHT.replace("exposure_s: 0.01, ", ""), ["bright group without exposure time", "add exposure_s"]),

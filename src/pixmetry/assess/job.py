@@ -303,9 +303,7 @@ def observe_campaign(campaign: Campaign, progress: Progress) -> tuple[InputHashe
         seen = _with_series(seen, campaign, followed, reader, on_frames)
     notes = (*campaign.findings, *left_out, *seen.notes)
     facts = campaign.camera
-    return reader.hashes, replace(
-        seen, storage=reader.storage, sensor=facts.sensor, pixel_clock_mhz=facts.pixel_clock_mhz, notes=notes
-    )
+    return reader.hashes, replace(seen, storage=reader.storage, sensor=facts.sensor, pixel_clock_mhz=facts.pixel_clock_mhz, notes=notes)
 
 
 def _with_series(

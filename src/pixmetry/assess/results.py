@@ -11,7 +11,17 @@ from pixmetry.assess.self_test import SelfTest
 from pixmetry.budget.monte_carlo import Crop
 from pixmetry.budget.records import SUM, Budget
 from pixmetry.camera.camera import Camera
-from pixmetry.camera.observations import BrightSpots, EdgeResponse, LightSteps, LineRows, Observations, SlantedEdges, StackMoments
+from pixmetry.camera.observations import (
+    BrightSpots,
+    EdgeResponse,
+    LightSteps,
+    LineRows,
+    Observations,
+    SlantedEdges,
+    StackMoments,
+    Storage,
+    StoredBlocks,
+)
 from pixmetry.camera.response import Response
 from pixmetry.core.number import Estimates
 from pixmetry.emva.files.json_format import value_record
@@ -98,6 +108,7 @@ class Assessment:
             "spots": None if self.observations.spots is None else spots_record(self.observations.spots),
             "light_off": None if self.observations.light_off is None else light_off_record(self.observations.light_off),
             "edges": None if self.observations.edges is None else edges_record(self.observations.edges),
+            "blocks": None if self.observations.blocks is None else blocks_record(self.observations.blocks, self.observations.storage),
             "response": None if self.observations.response is None else response_record(self.observations.response),
             "series": None if self.observations.drift is None else drift_record(self.observations.drift),
             "lines": None if self.observations.lines is None else lines_record(self.observations.lines),
@@ -219,6 +230,20 @@ def light_off_record(found: LightSteps) -> dict[str, Any]:
         for s in found.steps
     ]
     return {"values": found.fit.to_records(), "refused": list(found.refused), "sequences": each}
+
+
+def blocks_record(found: StoredBlocks, storage: Storage) -> dict[str, Any]:
+    """The plain record of the traces of a lossy coder."""
+    return {
+        "values": found.fit.to_records(),
+        "not_told": {name: why for name, why in found.fit.reasons.items() if name not in found.fit},
+        "steps": found.table.astype(int).tolist(),
+        "steps_of_file": None if storage.table is None else list(storage.table),
+        "offset_rows_cols": list(found.offset),
+        "log_likelihood_ratio": found.score,
+        "coefficients": found.coefficients,
+        "repeated_share": found.repeated_share if np.isfinite(found.repeated_share) else None,
+    }
 
 
 def response_record(found: Response) -> dict[str, Any]:

@@ -334,9 +334,11 @@ def put(camera: Camera, element: Element) -> Camera:
 
 
 def missed(camera: Camera, off: Iterable[str]) -> Camera:
-    """The camera without some sources; an essential conversion stays, without its own errors."""
+    """The camera without some sources; an essential conversion stays, without its own errors, and a converter before what takes codes."""
     off = tuple(off)
-    gone = camera.switched(off=[name for name in off if not camera[name].source.essential])
+    coded = any(e.source.consumes == (Kind.CODES,) for e in camera.active if e.name not in off)
+    stays = {e.name for e in camera.active if e.source.essential or (coded and e.source.produces is Kind.CODES)}
+    gone = camera.switched(off=[name for name in off if name not in stays])
     return replace(gone, chain=tuple(ideal_element(e) if e.name in off else e for e in gone.chain))
 
 

@@ -541,6 +541,36 @@ class CameraGeometry:
 
 
 @dataclass(frozen=True)
+class StoredBlocks:
+    """Traces of a lossy coder in textured frames.
+
+    Parameters
+    ----------
+    fit : Estimates
+        ``quality`` of JPEG on the scale of the Independent JPEG Group, or the reason why it is not told.
+    table : ndarray, shape (8, 8)
+        Quantiser steps of the luminance; 0 where a step is not told.
+    offset : tuple of int
+        Row and column of the first whole block in the frames.
+    score : float
+        Logarithm of the likelihood ratio against no coder.
+    coefficients : int
+        That are not zero.
+    repeated_share : float
+        Of blocks of 16 px that are the same in successive frames; NaN where it is not told.
+    notes : tuple of str
+    """
+
+    fit: Estimates
+    table: np.ndarray
+    offset: tuple[int, int]
+    score: float
+    coefficients: int
+    repeated_share: float
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
 class Storage:
     """Whether a lossy coder changed the frames before they were read, and how that is known.
 
@@ -552,10 +582,13 @@ class Storage:
         ``"proven"``: every file says it itself: PNG, BMP, FITS, NPY, raw, Zarr and TIFF without a coder or with a lossless one, True; a
         lossy coder inside a TIFF, False. It holds for the files; a coder before them (a camera that sends JPEG) can only be stated.
         ``"stated"``: ``lossless`` in the manifest says it. ``"unknown"``: neither, as with arrays in memory.
+    table : tuple of int or None
+        Luminance quantiser of frames of kind pattern, row by row, where their files are JPEG.
     """
 
     lossless: bool | None = None
     known: str = "unknown"
+    table: tuple[int, ...] | None = None
 
 
 @dataclass(frozen=True)
@@ -584,6 +617,7 @@ class Observations:
     sensor: str | None = None  # ccd, cmos or cid, where it was said
     response: Response | None = None
     lines: LineRows | None = None
+    blocks: StoredBlocks | None = None
     noise_covariance: NoiseCovariance | None = None
     noise_filter: NoiseFilter | None = None
     stated: StatedFacts = StatedFacts()
@@ -639,6 +673,17 @@ class Observations:
         """
         optics = None if self.edges is None or not self.edges.edges else self.edges.optics
         return of_pictures(optics, names, where=where, pictures="slanted edges", kind="edge")
+
+    def coder(self, names: Iterable[str], *, where: str) -> Estimates:
+        """Take a coder's parameters out of what textured frames, or their files, tell.
+
+        Raises
+        ------
+        MeasureError
+            Without such frames, or with the reason why they do not tell any of these.
+        """
+        fit = None if self.blocks is None else self.blocks.fit
+        return of_pictures(fit, {n: n for n in names}, where=where, pictures="textured frames", kind="pattern")
 
     def curve(self, names: Mapping[str, str] | Iterable[str], *, where: str) -> Estimates:
         """Take a source's parameters ``{parameter: fitted name}`` out of the response that a chart tells, with their covariance.

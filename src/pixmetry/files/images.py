@@ -14,10 +14,12 @@ from pixmetry.core.errors import InputError
 from pixmetry.core.memory import check_memory
 from pixmetry.core.threads import imap_tiles
 from pixmetry.files.formats import ENDINGS, FORMATS, Decoded, decode, frames_of, is_frame, raw_file, read_stacked
+from pixmetry.files.jpeg import SIGNATURE as JPEG
+from pixmetry.files.jpeg import luminance_of, luminance_table
 from pixmetry.files.png import SIGNATURE, PlainPng
 from pixmetry.files.provenance import InputHashes
 from pixmetry.files.raw_values import RawLayout
-from pixmetry.files.records import Campaign, FrameGroup
+from pixmetry.files.records import LOSSY, Campaign, FrameGroup
 from pixmetry.files.zarr_frames import entries, is_entry, lossless_store, read_entry
 
 CHANNELS = {"red": 0, "green": 1, "blue": 2}
@@ -30,6 +32,7 @@ class LoadedFrame(NamedTuple):
     sha256: str
     size_bytes: int
     lossless: bool | None = True
+    table: tuple[int, ...] | None = None  # luminance quantiser of a JPEG
 
 
 def read_frame(path: str | Path) -> np.ndarray:
@@ -57,10 +60,11 @@ def read_frame(path: str | Path) -> np.ndarray:
     return load_frame(Path(path)).array
 
 
-def load_frame(path: Path, plain_png: PlainPng | None = None, raw: RawLayout | None = None) -> LoadedFrame:
+def load_frame(path: Path, plain_png: PlainPng | None = None, raw: RawLayout | None = None, *, lossy: bool = False) -> LoadedFrame:
     """Read one frame and the SHA-256 of its file from the same bytes; errors as in `read_frame`.
 
-    Of a frame in a store or in a file with several, the digest is that of its values.
+    Of a frame in a store or in a file with several, the digest is that of its values. With ``lossy`` JPEG files are taken too: their
+    luminance.
     """
     if is_entry(path):
         array, sha256, size = read_entry(path)
@@ -72,7 +76,10 @@ def load_frame(path: Path, plain_png: PlainPng | None = None, raw: RawLayout | N
     sha256 = hashlib.sha256(data).hexdigest()
     if plain_png is not None and data.startswith(SIGNATURE) and (png := plain_png.decode(data)) is not None:
         return LoadedFrame(png, sha256, len(data))
-    found = decode(data, path)
+    found = decode(data, path, lossy=lossy)
+    if lossy and data.startswith(JPEG) and found.lossless is False:
+        array = found.array if found.array.ndim == 2 else luminance_of(data)
+        return LoadedFrame(_checked(array, path), sha256, len(data), False, luminance_table(data))
     return LoadedFrame(_checked(found.array, path), sha256, len(data), found.lossless)
 
 
@@ -281,6 +288,8 @@ class FrameReader:
         self.hashes = InputHashes(campaign.base)
         self._plain_png = PlainPng()
         self._coders: set[bool | None] = set()
+        self._patterns = {path for group in campaign.groups if group.kind in LOSSY for path in group.paths}
+        self._tables: set[tuple[int, ...]] = set()
         for listing in (campaign.source_path, campaign.descriptor_path):
             if campaign.arrays is None and listing is not None and listing.is_file():
                 self.hashes.add_file(listing)
@@ -303,11 +312,16 @@ class FrameReader:
         if c.arrays is not None:
             array = _frame_in_memory(c, path)
             check_frame(array, str(path), bits=c.bits)
-            self._coders.add(None)
+            if path not in self._patterns:
+                self._coders.add(None)
             return array
-        frame = load_frame(path, self._plain_png, c.raw)
+        frame = load_frame(path, self._plain_png, c.raw, lossy=path in self._patterns)
         check_frame(frame.array, str(path), bits=c.bits, shape=c.stored_shape, dtype=c.frame_dtype)
         self.hashes.add(path, frame.sha256, frame.size_bytes)
+        if path in self._patterns:  # they show a coder; how the others were stored is another question
+            if frame.table is not None:
+                self._tables.add(frame.table)
+            return frame.array
         self._coders.add(frame.lossless)
         if frame.lossless is False and c.camera.lossless:
             remedy = "write `lossless: false`, or store the frames without loss"
@@ -318,11 +332,12 @@ class FrameReader:
     def storage(self) -> Storage:
         """Whether the frames read so far were stored without loss; a statement of the manifest has priority over the files."""
         stated = self.campaign.camera.lossless
+        table = next(iter(self._tables)) if len(self._tables) == 1 else None
         if False in self._coders:
-            return Storage(False, "proven")
+            return Storage(False, "proven", table)
         if stated is not None:
-            return Storage(stated, "stated")
-        return Storage(True, "proven") if self._coders == {True} else Storage()
+            return Storage(stated, "stated", table)
+        return Storage(True, "proven", table) if self._coders == {True} else Storage(table=table)
 
     def frames(self, group: FrameGroup) -> Iterator[np.ndarray]:
         """Yield the frames of one group in order, decoding ahead in threads; errors as in `iter_frames`."""

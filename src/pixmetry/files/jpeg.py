@@ -6,11 +6,14 @@ import re
 import struct
 from typing import NamedTuple
 
+import numpy as np
+
 SIGNATURE = b"\xff\xd8"
 _MARKER = re.compile(rb"\xff+[^\x00\xff\xd0-\xd7]", re.DOTALL)  # in coded data: neither a stuffed byte nor a restart
 _FRAMES = {0xC0, 0xC1, 0xC2, 0xC3, 0xC5, 0xC6, 0xC7, 0xC9, 0xCA, 0xCB, 0xCD, 0xCE, 0xCF}  # SOF0 … SOF15
 _LOSSLESS = {0xC3, 0xC7, 0xCB, 0xCF}
 _ARITHMETIC = range(0xC9, 0xD0)
+_ZIGZAG = sorted(range(64), key=lambda k: (k // 8 + k % 8, (k // 8) if (k // 8 + k % 8) % 2 else (k % 8)))  # T.81, figure A.6
 _EXIF = b"Exif\0\0"
 ORIENTATION = 0x0112
 
@@ -88,3 +91,37 @@ def _orientation(exif: bytes) -> int:
     except struct.error:
         pass
     return 1
+
+
+def luminance_table(raw: bytes) -> tuple[int, ...] | None:
+    """Quantiser of the first component, row by row (T.81, B.2.4.1); None where the stream has none."""
+    at, tables, first = 2, {}, 0
+    while at + 4 <= len(raw) and raw[at] == 0xFF:
+        kind, length = raw[at + 1], int.from_bytes(raw[at + 2 : at + 4], "big")
+        body = raw[at + 4 : at + 2 + length]
+        if kind == 0xDB:
+            while body:
+                wide, number = body[0] >> 4, body[0] & 15
+                size = 64 * (2 if wide else 1)
+                if len(body) < 1 + size:
+                    return None
+                values = struct.unpack_from(">64H" if wide else "64B", body, 1)
+                table = [0] * 64
+                for place, value in zip(_ZIGZAG, values, strict=True):
+                    table[place] = value
+                tables[number] = tuple(table)
+                body = body[1 + size :]
+        elif kind in _FRAMES and len(body) >= 9:
+            first = body[8]
+        elif kind == 0xDA:
+            break
+        at += 2 + length
+    return tables.get(first)
+
+
+def luminance_of(raw: bytes) -> np.ndarray:
+    """The grey values of a JPEG of 8 bits, of a colour one its luminance as it was coded."""
+    import imagecodecs
+
+    image: np.ndarray = imagecodecs.jpeg8_decode(raw, outcolorspace="GRAYSCALE")
+    return image if image.ndim == 2 else image[:, :, 0]

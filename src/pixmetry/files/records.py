@@ -19,8 +19,17 @@ from pixmetry.files.raw_values import RawLayout
 
 STACK_FRAMES = 8  # from this many frames on, a group is a stack: its mean image serves the spatial measurements
 KINDS = ("dark", "bright")  # frames of an even field, from which noise is measured
-TARGETS = ("edge", "light_off", "chart", "line", "spots", "series")  # pictures of something to be measured: one frame may be enough
+TARGETS = (
+    "edge",
+    "light_off",
+    "chart",
+    "line",
+    "spots",
+    "pattern",
+    "series",
+)  # pictures of something to measure; one frame may be enough
 LOCATED = ("series",)  # kinds whose frames are measured one by one, for their targets
+LOSSY = ("pattern",)  # kinds whose files may be JPEG
 FACTS = {  # what else may be said of a group, by its kind
     "edge": ("wavelength_nm",),
     "chart": ("densities", "luminances", "u_light_rel", "regions", "white"),

@@ -99,7 +99,7 @@ class OpticsModel(Model):
 class GroupModel(Model):
     """Frames under one condition."""
 
-    kind: Literal["dark", "bright", "edge", "light_off", "chart", "line", "spots", "series"]  # records.KINDS and TARGETS
+    kind: Literal["dark", "bright", "edge", "light_off", "chart", "line", "spots", "pattern", "series"]  # records.KINDS and TARGETS
     exposure_s: Annotated[float, Field(ge=0)] | None = None
     photons: Annotated[float, Field(ge=0)] | None = None
     irradiance_uw_per_cm2: Positive | None = None

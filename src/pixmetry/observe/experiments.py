@@ -9,6 +9,7 @@ from pixmetry.camera.observations import Observations
 from pixmetry.observe.edge_fit import fit_edges
 from pixmetry.observe.edges import Picture, edge_notes, motion_notes, responses_of, search_edges
 from pixmetry.observe.experiment import Experiment, PictureGroup
+from pixmetry.observe.jpeg_blocks import FirstFrames, reduce_patterns
 from pixmetry.observe.light_off import BlockMeans, reduce_light_off
 from pixmetry.observe.line_jitter import with_jitter
 from pixmetry.observe.lines import LineFrames, places_of_rows
@@ -47,6 +48,7 @@ EXPERIMENTS = {
         Experiment("chart", reduce_charts),
         Experiment("line", reduce_lines, LineFrames),
         Experiment("spots", reduce_spots),
+        Experiment("pattern", reduce_patterns, FirstFrames),
     )
 }
 

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from scipy.fft import dctn
 
+from pixmetry.camera.jpeg_tables import steps
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.core.errors import ParameterError
-from pixmetry.sources.storage.jpeg import Jpeg, block_error, forward, round_trip, steps
+from pixmetry.sources.storage.jpeg import Jpeg, block_error, forward, round_trip
 from source_signals import signal, stream
 
 

@@ -5,40 +5,22 @@ from __future__ import annotations
 import numpy as np
 
 from pixmetry.camera.contribution import Contribution, Probe
+from pixmetry.camera.jpeg_tables import BLOCK, cosines, equivalent_quality, steps
+from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal, Windows
 from pixmetry.camera.source import Parameters, Source, quantity
-from pixmetry.core.arrays import Array, Ints
+from pixmetry.core.arrays import Array
 from pixmetry.core.errors import ParameterError
+from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
 
-BLOCK = 8
 MOST_ROWS = 65_496  # of one JPEG image, a whole number of blocks
-LUMINANCE = np.array(  # ITU-T T.81 (JPEG), Annex K, table K.1
-    [
-        [16, 11, 10, 16, 24, 40, 51, 61],
-        [12, 12, 14, 19, 26, 58, 60, 55],
-        [14, 13, 16, 24, 40, 57, 69, 56],
-        [14, 17, 22, 29, 51, 87, 80, 62],
-        [18, 22, 37, 56, 68, 109, 103, 77],
-        [24, 35, 55, 64, 81, 104, 113, 92],
-        [49, 64, 78, 87, 103, 121, 120, 101],
-        [72, 92, 95, 98, 112, 100, 103, 99],
-    ],
-    dtype=float,
-)
 
 
 class Jpeg(Parameters):
     """Setting of the coder."""
 
     quality: int = quantity(90, "1", "quality on the scale of the Independent JPEG Group", ge=1, le=100)
-
-
-def steps(quality: int) -> np.ndarray:
-    """Quantiser steps of the luminance coefficients, shape (8, 8): the standard table scaled by the Independent JPEG Group's rule."""
-    scale = 5000 // quality if quality < 50 else 200 - 2 * quality
-    quantisers: Ints = np.clip((LUMINANCE * scale + 50) // 100, 1, 255)
-    return quantisers
 
 
 def forward(params: Jpeg, signal: Signal, stream: Stream) -> Signal:
@@ -78,14 +60,6 @@ def context(params: Jpeg, windows: Windows, frame_shape: tuple[int, int]) -> Win
     return windows.aligned(BLOCK, BLOCK, frame_shape)
 
 
-def cosines() -> np.ndarray:
-    """Orthonormal cosine transform of eight samples, shape (8, 8)."""
-    k, x = np.meshgrid(np.arange(BLOCK), np.arange(BLOCK), indexing="ij")
-    matrix: Array = np.sqrt(2 / BLOCK) * np.cos(np.pi * (2 * x + 1) * k / (2 * BLOCK))
-    matrix[0] /= np.sqrt(2)
-    return matrix
-
-
 def block_error(image_dn: np.ndarray, quality: int) -> np.ndarray:
     """Error in DN of images (n, rows, cols) whose raster starts at their first pixel: coefficients rounded to their steps."""
     n, rows, cols = image_dn.shape
@@ -97,6 +71,18 @@ def block_error(image_dn: np.ndarray, quality: int) -> np.ndarray:
     lost = whole * step - coefficients
     error: Array = (transform.T @ lost @ transform).swapaxes(2, 3).reshape(padded.shape)[:, :rows, :cols]
     return error
+
+
+def measure(observations: Observations) -> Estimates:
+    """Quality: from the tables of the files, if they are JPEG; else from the comb of the coefficients of frames that were decoded."""
+    table = observations.storage.table
+    if table is not None:
+        stored = np.array(table).reshape(BLOCK, BLOCK)
+        same = [q for q in range(1, 101) if np.array_equal(steps(q), stored)]
+        value, u = (float(same[0]), 0.0) if same else equivalent_quality(stored)
+        told = {} if same else {"quality": "the file's table is none of the Independent JPEG Group's: the quality whose steps are alike"}
+        return Estimates.from_rows([("quality", value, u, np.inf, "1")], method="quantiser table of the files (ITU-T T.81)", reasons=told)
+    return observations.coder(("quality",), where="storage.jpeg")
 
 
 def propagate(params: Jpeg, probe: Probe) -> Contribution:
@@ -136,6 +122,7 @@ SOURCE = Source(
     typical=Jpeg(quality=90),
     bound=Jpeg(quality=75),
     forward=forward,
+    measure=measure,
     propagate=propagate,
     context=context,
     gum_class="F",
@@ -144,7 +131,6 @@ SOURCE = Source(
     references=("ITU-T T.81 | ISO/IEC 10918-1, Annexes A and K", "Independent JPEG Group, libjpeg, jcparam.c (scaling of the tables)"),
     advice="Store without loss. If there is no choice, use a quality of at least 95 and large targets.",
     reasons={
-        "measure": "the file states the quality; dark and flat frames have too few coefficients to estimate it",
         "correct": "the original coefficients are lost",
         "neutral": "even at quality 100 the coefficients are rounded to whole numbers",
     },

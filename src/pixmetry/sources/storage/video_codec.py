@@ -194,7 +194,7 @@ SOURCE = Source(
     ),
     advice="Record without loss (raw, FFV1). If there is no choice: independently coded pictures (group 1), and a quantiser below 12.",
     reasons={
-        "measure": "the stream states the setting; dark and flat frames cannot distinguish its quantiser from other losses of noise",
+        "measure": "the stream states the setting. Frames of kind pattern show only that blocks repeat, not how coarsely they were rounded",
         "correct": "the rounded values are lost",
         "propagate": "blocks and predictions depend on the whole picture and earlier ones; simulate sequences and locate targets in them",
     },
