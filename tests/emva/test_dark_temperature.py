@@ -7,7 +7,7 @@ import pytest
 from scipy import optimize, stats
 
 from pixmetry.core.errors import InputError, MeasureError
-from pixmetry.emva.dark_temperature import fit_dark_temperature, law_at
+from pixmetry.observe.dark_temperature import fit_dark_temperature, law_at
 
 ALPHA = 1e-6
 T = np.array([-5.0, 5.0, 15.0, 25.0, 35.0, 45.0])

@@ -13,6 +13,7 @@ from pixmetry.budget.records import SUM, Budget
 from pixmetry.camera.camera import Camera
 from pixmetry.camera.observations import (
     BrightSpots,
+    DarkTemperatures,
     EdgeResponse,
     LightSteps,
     LineRows,
@@ -106,6 +107,9 @@ class Assessment:
             },
             "spatial": self.observations.spatial_fit.to_records() if self.observations.spatial_fit is not None else [],
             "spots": None if self.observations.spots is None else spots_record(self.observations.spots),
+            "dark_temperatures": None
+            if self.observations.dark_temperatures is None
+            else dark_temperatures_record(self.observations.dark_temperatures),
             "light_off": None if self.observations.light_off is None else light_off_record(self.observations.light_off),
             "edges": None if self.observations.edges is None else edges_record(self.observations.edges),
             "blocks": None if self.observations.blocks is None else blocks_record(self.observations.blocks, self.observations.storage),
@@ -209,6 +213,18 @@ def spots_record(found: BrightSpots) -> dict[str, Any]:
         "smear_rows": found.smear_rows,
         "smear_store": found.smear_store,
         "streaks": 0 if found.streaks is None else len(found.streaks),
+        "values": found.fit.to_records(),
+        "not_told": {name: why for name, why in found.fit.reasons.items() if name not in found.fit},
+    }
+
+
+def dark_temperatures_record(found: DarkTemperatures) -> dict[str, Any]:
+    """The plain record of the dark current at several temperatures."""
+    return {
+        "temperature_c": found.temperature_c.tolist(),
+        "rate_dn_per_s": found.rate_dn_per_s.tolist(),
+        "u_rate_dn_per_s": found.u_rate_dn_per_s.tolist(),
+        "reference_c": found.reference_c,
         "values": found.fit.to_records(),
         "not_told": {name: why for name, why in found.fit.reasons.items() if name not in found.fit},
     }

@@ -13,6 +13,8 @@ class GroupFacts:
     ----------
     wavelength_nm : float or None
         Of the light.
+    temperature_c : float or None
+        Of the sensor, of dark frames at another temperature than that of the campaign.
     densities : tuple of float or None
         Optical densities of the patches of a chart (ISO 14524).
     luminances : tuple of float or None
@@ -34,6 +36,7 @@ class GroupFacts:
     """
 
     wavelength_nm: float | None = None
+    temperature_c: float | None = None
     densities: tuple[float, ...] | None = None
     luminances: tuple[float, ...] | None = None
     u_light_rel: float | None = None

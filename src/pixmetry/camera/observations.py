@@ -391,6 +391,20 @@ class BrightSpots:
 
 
 @dataclass(frozen=True)
+class DarkTemperatures:
+    """Dark signal a second at several temperatures of the sensor, DN/s, with its u, each of shape (temperatures,), and its law.
+
+    ``fit`` has ``doubling_temperature_k`` and ``dark_current_ref``, the dark signal at ``reference_c``; without them the reason.
+    """
+
+    temperature_c: np.ndarray
+    rate_dn_per_s: np.ndarray
+    u_rate_dn_per_s: np.ndarray
+    reference_c: float
+    fit: Estimates
+
+
+@dataclass(frozen=True)
 class LightStep:
     """One sequence of frames in which the light went off.
 
@@ -614,6 +628,7 @@ class Observations:
     edges: SlantedEdges | None = None
     light_off: LightSteps | None = None
     spots: BrightSpots | None = None
+    dark_temperatures: DarkTemperatures | None = None
     sensor: str | None = None  # ccd, cmos or cid, where it was said
     response: Response | None = None
     lines: LineRows | None = None

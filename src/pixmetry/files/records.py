@@ -26,12 +26,15 @@ TARGETS = (
     "line",
     "spots",
     "pattern",
+    "dark_temperature",
     "series",
 )  # pictures of something to measure; one frame may be enough
 LOCATED = ("series",)  # kinds whose frames are measured one by one, for their targets
 LOSSY = ("pattern",)  # kinds whose files may be JPEG
 FACTS = {  # what else may be said of a group, by its kind
     "edge": ("wavelength_nm",),
+    "dark": ("temperature_c",),  # which makes it the next kind
+    "dark_temperature": ("temperature_c",),
     "chart": ("densities", "luminances", "u_light_rel", "regions", "white"),
     "line": ("wavelength_nm", "recorded"),
     "series": ("times_s", "interval_s", "on_for_s"),

@@ -99,12 +99,14 @@ class OpticsModel(Model):
 class GroupModel(Model):
     """Frames under one condition."""
 
-    kind: Literal["dark", "bright", "edge", "light_off", "chart", "line", "spots", "pattern", "series"]  # records.KINDS and TARGETS
+    # records.KINDS and TARGETS
+    kind: Literal["dark", "bright", "edge", "light_off", "chart", "line", "spots", "pattern", "dark_temperature", "series"]
     exposure_s: Annotated[float, Field(ge=0)] | None = None
     photons: Annotated[float, Field(ge=0)] | None = None
     irradiance_uw_per_cm2: Positive | None = None
     role: Literal["level", "stack"] | None = None
     wavelength_nm: Positive | None = None
+    temperature_c: Annotated[float, Field(ge=-273.15)] | None = None
     densities: Annotated[tuple[Annotated[float, Field(ge=0, le=8)], ...], Field(min_length=1)] | None = None
     luminances: Annotated[tuple[Positive, ...], Field(min_length=1)] | None = None
     u_light_rel: Annotated[float, Field(gt=0, le=1)] | None = None
@@ -115,6 +117,14 @@ class GroupModel(Model):
     on_for_s: Annotated[float, Field(ge=0)] | None = None
     recorded: bool | None = None
     files: Names
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_a_temperature(cls, data: Any) -> Any:
+        """Dark frames that state a temperature are no part of the photon transfer, which has that of the campaign."""
+        if isinstance(data, dict) and data.get("kind") == "dark" and data.get("temperature_c") is not None:
+            return {**data, "kind": "dark_temperature", "role": None}
+        return data
 
     @model_validator(mode="after")
     def _target(self) -> GroupModel:
@@ -130,6 +140,14 @@ class GroupModel(Model):
         if wrong:
             what = f"{wrong[0]} belongs to dark and bright frames, not to pictures of a target"
             raise InputError(what, allowed=", ".join(allowed), remedy="delete it")
+        return self
+
+    @model_validator(mode="after")
+    def _temperature(self) -> GroupModel:
+        if self.kind == "dark_temperature" and (self.temperature_c is None or self.exposure_s is None):
+            missing = "temperature_c" if self.temperature_c is None else "exposure_s"
+            what = f"dark frames at another temperature without {missing}"
+            raise InputError(what, allowed="temperature_c and exposure_s", remedy=f"add {missing}")
         return self
 
     @model_validator(mode="after")

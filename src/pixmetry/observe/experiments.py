@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 from pixmetry.camera.observations import Observations
+from pixmetry.observe.dark_temperature import reduce_dark_temperatures
 from pixmetry.observe.edge_fit import fit_edges
 from pixmetry.observe.edges import Picture, edge_notes, motion_notes, responses_of, search_edges
 from pixmetry.observe.experiment import Experiment, PictureGroup
@@ -49,6 +50,7 @@ EXPERIMENTS = {
         Experiment("line", reduce_lines, LineFrames),
         Experiment("spots", reduce_spots),
         Experiment("pattern", reduce_patterns, FirstFrames),
+        Experiment("dark_temperature", reduce_dark_temperatures),
     )
 }
 

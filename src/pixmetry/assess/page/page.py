@@ -88,6 +88,7 @@ def _plots(assessment: Assessment) -> Section:
 def _pictures(assessment: Assessment) -> list[Section]:
     """A section for each kind of pictures."""
     from pixmetry.assess.page.blocks import blocks_section
+    from pixmetry.assess.page.dark_temperature import dark_temperature_section
     from pixmetry.assess.page.edges import edges_section
     from pixmetry.assess.page.light_off import light_off_section
     from pixmetry.assess.page.lines import lines_section
@@ -102,6 +103,7 @@ def _pictures(assessment: Assessment) -> list[Section]:
         *([] if seen.lines is None else [lines_section(seen.lines)]),
         *([] if seen.spots is None else [spots_section(seen.spots)]),
         *([] if seen.blocks is None else [blocks_section(seen.blocks, seen.storage)]),
+        *([] if seen.dark_temperatures is None else [dark_temperature_section(seen.dark_temperatures)]),
         *([] if seen.light_off is None else [light_off_section(seen.light_off)]),
         *([] if seen.drift is None else [drift_section(seen.drift)]),
     ]

@@ -97,10 +97,26 @@ def measure(observations: Observations) -> Estimates:
         where="sensor.dark_current",
         remedy="take dark frames at six exposure times or more, the longest as long as the camera allows",
     )
+    estimates = _with_doubling(estimates, observations)
     if observations.temperature_c is None:
         return estimates
     note = f"{estimates.reasons.get('rate_e_per_s', '')} holds at a sensor temperature of {observations.temperature_c:g} °C".strip()
-    return replace(estimates, reasons={"rate_e_per_s": note})
+    return replace(estimates, reasons={**estimates.reasons, "rate_e_per_s": note})
+
+
+def _with_doubling(estimates: Estimates, observations: Observations) -> Estimates:
+    """The doubling temperature beside the rate, where dark frames at several temperatures tell it."""
+    seen = observations.dark_temperatures
+    if seen is None:
+        return estimates
+    name = "doubling_temperature_k"
+    if name not in seen.fit:
+        return replace(estimates, confounders=(*estimates.confounders, f"another doubling temperature: {seen.fit.reasons[name]}"))
+    doubling = seen.fit.select({"doubling_c": name})
+    least, most = 1.0, 50.0
+    if not least < doubling["doubling_c"].value <= most:
+        return estimates
+    return estimates.join(doubling)
 
 
 def propagate(params: DarkCurrent, probe: Probe) -> Contribution:
