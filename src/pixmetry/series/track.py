@@ -79,7 +79,8 @@ def follow_targets(frames: Sequence[FrameTargets]) -> tuple[Array, Array]:
     Notes
     -----
     The list of targets is that of the first frame with the usual number of them. A target is looked for where it was in the frame before,
-    moved as its fellows were; two belong together if each is the other's nearest, within 0.4 of the distance between neighbours.
+    moved as all were from the frame before that; two belong together if each is the other's nearest, within 0.4 of the distance between
+    neighbours.
     """
     counts = np.array([len(f.positions_px) for f in frames])
     if not counts.size or counts.max() == 0:
@@ -87,16 +88,15 @@ def follow_targets(frames: Sequence[FrameTargets]) -> tuple[Array, Array]:
     usual = np.bincount(counts[counts > 0]).argmax()
     start = int(np.flatnonzero(counts == usual)[0])
     first = frames[start].positions_px
-    gate = MOST_PX if len(first) < 2 else min(MOST_PX, NEAR * float(cKDTree(first).query(first, 2)[0][:, 1].min()))
     positions = np.full((len(frames), len(first), 2), np.nan)
     covariance = np.full((len(frames), len(first), 2, 2), np.nan)
     for order in (range(start, len(frames)), range(start - 1, -1, -1)):
-        last = first.copy()
+        last, step = first.copy(), np.zeros(2)
         for k in order:
             found = frames[k]
             if not len(found.positions_px):
                 continue
-            one, other = _pairs(last, found.positions_px, gate)
+            one, other = near_pairs(last + step, found.positions_px)
             positions[k, one], covariance[k, one] = found.positions_px[other], found.covariance_px2[other]
             if one.size:
                 step = np.median(found.positions_px[other] - last[one], axis=0)
@@ -105,8 +105,10 @@ def follow_targets(frames: Sequence[FrameTargets]) -> tuple[Array, Array]:
     return positions, covariance
 
 
-def _pairs(known: Array, found: Array, gate: float) -> tuple[np.ndarray, np.ndarray]:
-    """Indices of those that are each other's nearest within the gate."""
+def near_pairs(known: Array, found: Array, gate: float | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Indices of places that are each other's nearest within a distance: by default 0.4 of that between neighbours, 25 px at most."""
+    if gate is None:
+        gate = MOST_PX if len(known) < 2 else min(MOST_PX, NEAR * float(cKDTree(known).query(known, 2)[0][:, 1].min()))
     there, back = cKDTree(found).query(known)[1], cKDTree(known).query(found)[1]
     near = np.linalg.norm(found[there] - known, axis=1) < gate
     one = np.flatnonzero(near & (back[there] == np.arange(len(known))))

@@ -1,0 +1,39 @@
+"""What frames of moving targets tell: when each part of a frame is exposed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pixmetry.core.number import Estimates
+
+
+@dataclass(frozen=True)
+class MotionSeries:
+    """Moving targets, and the times that their places tell.
+
+    Parameters
+    ----------
+    frames, targets : int
+        Frames that were used, and targets in the frame with the most of them.
+    speed_px_s : ndarray, shape (frames, 2)
+        Mean velocity of the targets of every frame.
+    lag_px : ndarray, shape (frames, 2)
+        Mean displacement of the odd rows against the even ones.
+    shear : ndarray, shape (frames, 2)
+        By how much the picture is sheared along x, and stretched along y, per row.
+    u_lag_px, u_shear : ndarray, shape (frames, 2)
+    fit : Estimates
+        ``field_period_s`` (how much later the odd rows are exposed; negative: earlier), ``row_time_s`` (the same from row to row downwards),
+        ``jitter_s``. ``reasons`` of names that it does not hold say why.
+    """
+
+    frames: int
+    targets: int
+    speed_px_s: np.ndarray
+    lag_px: np.ndarray
+    shear: np.ndarray
+    u_lag_px: np.ndarray
+    u_shear: np.ndarray
+    fit: Estimates
