@@ -119,5 +119,5 @@ def test_a_series_in_a_campaign_is_measured(rng: np.random.Generator, tmp_path: 
     assert "Motion of the image" in (tmp_path / "out" / "report.html").read_text()
     with pytest.raises(InputError, match="2 times for 30 frames"):
         campaign_of_arrays([Frames("series", None, frames, facts=GroupFacts(times_s=(0.0, 1.0)))], bits=8)
-    with pytest.raises(InputError, match="without times"):
+    with pytest.raises(InputError, match="kind series without times"):
         campaign_of_arrays([Frames("series", None, frames)], bits=8)

@@ -44,7 +44,7 @@ from pixmetry.files.records import LOCATED, FrameGroup
 from pixmetry.locate.target_estimator import TargetEstimator, parse_estimator
 from pixmetry.observe.observe import Group, observe
 from pixmetry.observe.one_pass import without_levels
-from pixmetry.series.job import measure_series
+from pixmetry.series.job import measure_motion, measure_series
 
 KIND = "assessment"
 SPREADING = ("optics.point_spread", "optics.olpf", "sensor.pixel_aperture")
@@ -299,8 +299,10 @@ def observe_campaign(campaign: Campaign, progress: Progress) -> tuple[InputHashe
     else:
         alone = without_levels(campaign.frame_shape, campaign.bits)
         seen = Observations(alone, Estimates.empty(), temperature_c=campaign.camera.temperature_c, stated=campaign.stated)
-    if followed:
-        seen = _with_series(seen, campaign, followed, reader, on_frames)
+    if still := [g for g in followed if g.kind == "series"]:
+        seen = _with_series(seen, campaign, still, reader, on_frames)
+    if moving := [g for g in followed if g.kind == "motion"]:
+        seen = _with_motion(seen, campaign, moving, reader, on_frames)
     notes = (*campaign.findings, *left_out, *seen.notes)
     facts = campaign.camera
     return reader.hashes, replace(seen, storage=reader.storage, sensor=facts.sensor, pixel_clock_mhz=facts.pixel_clock_mhz, notes=notes)
@@ -312,11 +314,8 @@ def _with_series(
     """What the longest series of a fixed field tells."""
     group = max(groups, key=lambda g: len(g.paths))
     others = f"of {len(groups)} series the one of the most frames is used" if len(groups) > 1 else ""
-    facts, count = group.facts, len(group.paths)
-    times = facts.times_s or [k * (facts.interval_s or 1.0) for k in range(count)]
-    frames = [
-        (path.name, time + (facts.on_for_s or 0.0), partial(reader.fetch, path)) for path, time in zip(group.paths, times, strict=True)
-    ]
+    on_for_s = group.facts.on_for_s or 0.0
+    frames = [(path.name, on_for_s + time, partial(reader.fetch, path)) for path, time in zip(group.paths, _times(group), strict=True)]
     try:
         found = measure_series(
             sorted(frames, key=lambda frame: frame[1]),
@@ -328,6 +327,23 @@ def _with_series(
     except MeasureError as problem:
         return replace(seen, notes=(*seen.notes, f"the series of a fixed field tells nothing: {problem}"))
     return replace(seen, drift=found.drift, notes=(*seen.notes, *filter(None, (others, *found.notes))))
+
+
+def _times(group: FrameGroup) -> Sequence[float]:
+    """Seconds of the frames of a group, as stated."""
+    return group.facts.times_s or [k * (group.facts.interval_s or 1.0) for k in range(len(group.paths))]
+
+
+def _with_motion(
+    seen: Observations, campaign: Campaign, groups: Sequence[FrameGroup], reader: FrameReader, on_frames: Callable[[int], object]
+) -> Observations:
+    """What frames of moving targets tell; each group is a run of frames that were taken one after the other."""
+    runs = [[(path.name, time, partial(reader.fetch, path)) for path, time in zip(g.paths, _times(g), strict=True)] for g in groups]
+    try:
+        found = measure_motion(runs, campaign.frame_shape, on_frames=on_frames, bits=campaign.bits)
+    except MeasureError as problem:
+        return replace(seen, notes=(*seen.notes, f"the frames of moving targets tell nothing: {problem}"))
+    return replace(seen, motion=found)
 
 
 def by_the_standard(campaign: Campaign, observations: Observations) -> Results:

@@ -28,7 +28,7 @@ from pixmetry.core.number import Estimates
 from pixmetry.emva.files.json_format import value_record
 from pixmetry.emva.records import Results
 from pixmetry.files import Campaign
-from pixmetry.series.records import drift_record
+from pixmetry.series.records import drift_record, motion_record
 
 RESULTS_SCHEMA = "pixmetry/results/1"
 
@@ -115,6 +115,7 @@ class Assessment:
             "blocks": None if self.observations.blocks is None else blocks_record(self.observations.blocks, self.observations.storage),
             "response": None if self.observations.response is None else response_record(self.observations.response),
             "series": None if self.observations.drift is None else drift_record(self.observations.drift),
+            "motion": None if self.observations.motion is None else motion_record(self.observations.motion),
             "lines": None if self.observations.lines is None else lines_record(self.observations.lines),
             "emva1288": {
                 "release": self.standard.release,

@@ -25,8 +25,8 @@ class MotionSeries:
         By how much the picture is sheared along x, and stretched along y, per row.
     u_lag_px, u_shear : ndarray, shape (frames, 2)
     fit : Estimates
-        ``field_period_s`` (how much later the odd rows are exposed; negative: earlier), ``row_time_s`` (the same from row to row downwards),
-        ``jitter_s``. ``reasons`` of names that it does not hold say why.
+        ``field_period_s`` (between even and odd rows), ``row_time_s`` (from row to row), ``jitter_s``. ``reasons`` say which rows come
+        first, and of names that it does not hold why.
     """
 
     frames: int

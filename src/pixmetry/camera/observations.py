@@ -15,6 +15,7 @@ import numpy as np
 
 from pixmetry.camera.code_table import CodeTable
 from pixmetry.camera.drift_series import DriftSeries
+from pixmetry.camera.motion_series import MotionSeries
 from pixmetry.camera.noise_covariance import NoiseCovariance, NoiseFilter
 from pixmetry.camera.response import Response
 from pixmetry.camera.stated import StatedFacts
@@ -640,6 +641,7 @@ class Observations:
     pixel_clock_mhz: float | None = None
     geometry: CameraGeometry | None = None
     drift: DriftSeries | None = None
+    motion: MotionSeries | None = None
     storage: Storage = Storage()
     notes: tuple[str, ...] = field(default_factory=tuple)
 

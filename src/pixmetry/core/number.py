@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -284,7 +284,7 @@ class Estimates:
         """Put sets from independent data together (zero covariance between them)."""
         sets = [s for s in (self, *others) if len(s)]
         if not sets:
-            return self
+            return replace(self, reasons={k: v for s in (self, *others) for k, v in s.reasons.items()})
         n = sum(len(s) for s in sets)
         covariance = np.zeros((n, n))
         at = 0
@@ -301,7 +301,7 @@ class Estimates:
             confounders=tuple(dict.fromkeys(c for s in sets for c in s.confounders)),
             limits=frozenset().union(*(s.limits for s in sets)),
             lower_limits=frozenset().union(*(s.lower_limits for s in sets)),
-            reasons={k: v for s in sets for k, v in s.reasons.items()},
+            reasons={k: v for s in (self, *others) for k, v in s.reasons.items()},
             settings={k: v for s in sets for k, v in s.settings.items()},
         )
 

@@ -28,8 +28,9 @@ TARGETS = (
     "pattern",
     "dark_temperature",
     "series",
+    "motion",
 )  # pictures of something to measure; one frame may be enough
-LOCATED = ("series",)  # kinds whose frames are measured one by one, for their targets
+LOCATED = ("series", "motion")  # kinds whose frames are measured one by one, for their targets
 LOSSY = ("pattern",)  # kinds whose files may be JPEG
 FACTS = {  # what else may be said of a group, by its kind
     "edge": ("wavelength_nm",),
@@ -38,6 +39,7 @@ FACTS = {  # what else may be said of a group, by its kind
     "chart": ("densities", "luminances", "u_light_rel", "regions", "white"),
     "line": ("wavelength_nm", "recorded"),
     "series": ("times_s", "interval_s", "on_for_s"),
+    "motion": ("times_s", "interval_s"),
 }
 
 

@@ -100,7 +100,7 @@ class GroupModel(Model):
     """Frames under one condition."""
 
     # records.KINDS and TARGETS
-    kind: Literal["dark", "bright", "edge", "light_off", "chart", "line", "spots", "pattern", "dark_temperature", "series"]
+    kind: Literal["dark", "bright", "edge", "light_off", "chart", "line", "spots", "pattern", "dark_temperature", "series", "motion"]
     exposure_s: Annotated[float, Field(ge=0)] | None = None
     photons: Annotated[float, Field(ge=0)] | None = None
     irradiance_uw_per_cm2: Positive | None = None
@@ -172,8 +172,8 @@ class GroupModel(Model):
 
     @model_validator(mode="after")
     def _times(self) -> GroupModel:
-        if self.kind == "series" and (self.times_s is None) == (self.interval_s is None):
-            what = "a series without times" if self.times_s is None else "times are given twice"
+        if self.kind in ("series", "motion") and (self.times_s is None) == (self.interval_s is None):
+            what = f"frames of kind {self.kind} without times" if self.times_s is None else "times are given twice"
             raise InputError(what, allowed="times_s (one for each frame) or interval_s", remedy="give one of them")
         return self
 

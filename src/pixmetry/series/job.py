@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from pixmetry.camera.motion_series import MotionSeries
 from pixmetry.core.arrays import Array
 from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.core.progress import Progress, no_progress
@@ -23,6 +24,7 @@ from pixmetry.locate.files import frames_inside
 from pixmetry.locate.noise import noise_model
 from pixmetry.series.log import SeriesLog
 from pixmetry.series.modes import field_motion
+from pixmetry.series.motion import Run, find_in_fields, motion_of
 from pixmetry.series.records import Series
 from pixmetry.series.track import FrameTargets, find_targets, follow_targets
 from pixmetry.series.warm_up import drift_of
@@ -229,6 +231,37 @@ def measure_series(
     more = (f"{lost} of {len(named)} frames show too few of the targets and are left out.",) if lost else ()
     names = tuple(name for name, _, _ in named)
     return Series(drift, names, shape, (*notes, *more), provenance_record(libraries=("numpy", "scipy", "numba")))
+
+
+def measure_motion(
+    runs: Iterable[Sequence[tuple[str, float, Fetch]]],
+    frame_shape: tuple[int, int],
+    *,
+    on_frames: Callable[[int], object] | None = None,
+    **options: Any,
+) -> MotionSeries:
+    """Measure frames of moving targets, given as runs of names, seconds, and functions that return the frames.
+
+    Raises
+    ------
+    InputError, MeasureError
+        If a frame cannot be used, or no run shows targets that can be followed.
+    """
+
+    def work(item: tuple[str, float, Fetch]) -> tuple[FrameTargets, FrameTargets]:
+        name, time_s, fetch = item
+        return find_in_fields(fetch(), name, time_s, **options)
+
+    found = []
+    for run in runs:
+        fields = []
+        for both in imap_tiles(work, sorted(run, key=lambda item: item[1])):
+            fields.append(both)
+            if on_frames is not None:
+                on_frames(1)
+        found.append(Run(tuple(even for even, _ in fields), tuple(odd for _, odd in fields)))
+    with single_threaded_blas():
+        return motion_of(found, frame_shape)
 
 
 def write_results(found: Series, output: str | Path, of: Sequence[str], inputs: Iterable[Path]) -> Path:

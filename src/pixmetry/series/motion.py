@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -24,7 +25,9 @@ LEAST_FRAMES = 4  # of a run, for a velocity that may change and a check
 LEAST_PX = 0.05  # from frame to frame, below which nothing moves
 STATIC_LAG_PX = 0.02  # of even against odd rows without motion: what the pixels' phase does to a place
 SIGNIFICANT = 3.0
+SPREAD = 20.0  # of the velocities over the u of one, from which on they differ
 PATH_DEGREE = 2  # of the polynomial over time that each run follows
+FIELDS, ROWS = ("first_field", "even", "odd"), ("first_row", "top", "bottom")  # what the sign of a time says
 METHOD = "places of moving targets in even and odd rows, over successive frames; weighted least squares"
 NOTHING_MOVES = "nothing moves: let the targets move by a pixel or more from frame to frame"
 
@@ -37,7 +40,7 @@ class Run:
     odd: tuple[FrameTargets, ...]
 
 
-def find_in_fields(frame: np.ndarray, name: str, time_s: float, **options: object) -> tuple[FrameTargets, FrameTargets]:
+def find_in_fields(frame: np.ndarray, name: str, time_s: float, **options: Any) -> tuple[FrameTargets, FrameTargets]:
     """Find the targets in the even and in the odd rows of a frame; places count in rows of the frame.
 
     Raises
@@ -47,7 +50,7 @@ def find_in_fields(frame: np.ndarray, name: str, time_s: float, **options: objec
     """
     both = []
     for parity in (0, 1):
-        found = find_targets(np.ascontiguousarray(frame[parity::2]), name, time_s, **options)
+        found = find_targets(np.ascontiguousarray(frame[parity::2]), name, time_s, **{"kind": "ellipse", **options})
         wide = np.array([1.0, 2.0])
         covariance = found.covariance_px2 * wide[:, None] * wide
         both.append(FrameTargets(name, time_s, found.positions_px * wide + [0.0, parity], covariance))
@@ -128,7 +131,7 @@ def _followed(run: Run) -> _Followed | None:
         odd[k, here[one]], odd_covariance[k, here[one]] = found.positions_px[other], found.covariance_px2[other]
     time_s = np.array([f.time_s for f in run.even])
     places, covariance = 0.5 * (even + odd), 0.25 * (even_covariance + odd_covariance)
-    seen = np.isfinite(places).all(axis=2)
+    seen = np.asarray(np.isfinite(places).all(axis=2))
     kept = seen.sum(axis=0) >= LEAST_FRAMES
     if kept.sum() < 3:
         return None
@@ -153,7 +156,7 @@ def _fields(parts: Sequence[_Followed]) -> tuple[Estimates, Array, Array]:
     normal, right = np.diag([0.0, STATIC_LAG_PX**-2, STATIC_LAG_PX**-2]), np.zeros(3)
     rows, lags, u_lags, of_speed = [], [], [], []
     for part in parts:
-        seen = np.isfinite(part.lag).all(axis=2) & np.isfinite(part.speed).all(axis=2)
+        seen = np.asarray(np.isfinite(part.lag).all(axis=2) & np.isfinite(part.speed).all(axis=2))
         weight = np.zeros_like(part.lag_covariance)
         weight[seen] = np.linalg.inv(part.lag_covariance[seen])
         lag, speed = np.where(seen[..., None], part.lag, 0.0), np.where(seen[..., None], part.speed, 0.0)
@@ -177,7 +180,7 @@ def _fields(parts: Sequence[_Followed]) -> tuple[Estimates, Array, Array]:
     lag, u_lag = np.concatenate(lags), np.concatenate(u_lags)
     if not _moves(parts):
         return _untold("field_period_s", NOTHING_MOVES), lag, u_lag
-    return _time("field_period_s", float(found[0]), u, dof, "even and odd rows are exposed together"), lag, u_lag
+    return _time("field_period_s", float(found[0]), u, dof, FIELDS, "even and odd rows are exposed together"), lag, u_lag
 
 
 def _speed_variance(part: _Followed) -> float:
@@ -199,10 +202,13 @@ def _moves(parts: Sequence[_Followed]) -> bool:
     )
 
 
-def _time(name: str, value: float, u: float, dof: float, why: str) -> Estimates:
-    """A time, or its limit."""
+def _time(name: str, value: float, u: float, dof: float, first: tuple[str, str, str], why: str) -> Estimates:
+    """The size of a time, with its sign in words; or its limit."""
     if abs(value) > SIGNIFICANT * u:
-        return Estimates.from_rows([(name, value, u, float(dof), "s")], method=METHOD)
+        which, *rows = first
+        told = {name: f"the {rows[value < 0]} row{'s are' if which == 'first_field' else ' is'} exposed first"}
+        row = (name, abs(value), u, float(dof), "s")
+        return Estimates.from_rows([row], method=METHOD, reasons=told, settings={which: rows[value < 0]})
     limit = abs(value) + ONE_SIDED_95 * u
     return Estimates.from_rows([(name, limit, u, float(dof), "s")], method=METHOD, limits=frozenset([name]), reasons={name: why})
 
@@ -234,7 +240,9 @@ def _rows(parts: Sequence[_Followed], mean_speed: Array, frame_shape: tuple[int,
     normal = np.einsum("kap,kab,kbq->pq", design, weight, design)
     size = np.sqrt(np.diag(normal))
     free = np.linalg.eigvalsh(normal / size / size[:, None])[0]
-    if free < 1e-4:
+    spread = float(np.linalg.norm(mean_speed[used].std(axis=0)))
+    noise = max(float(np.sqrt(_speed_variance(part)) * np.linalg.norm(np.nanmean(part.speed, axis=1), axis=1).mean()) for part in parts)
+    if free < 1e-4 or spread < SPREAD * noise:
         why = "all frames have one velocity: the shear of the shutter is not told from that of the plate; move it at rest, to and fro"
         return _untold("row_time_s", why), shear, u_shear
     cofactor = np.linalg.inv(normal)
@@ -245,7 +253,7 @@ def _rows(parts: Sequence[_Followed], mean_speed: Array, frame_shape: tuple[int,
     of_speed = float(np.mean([_speed_variance(part) for part in parts])) / len(parts)
     value, u = float(found[0]), float(np.sqrt(cofactor[0, 0] * factor + found[0] ** 2 * of_speed))
     value *= 1 + value * float(mean_speed[used, 1].mean())  # for shear and stretch count from the mean plate, which is stretched
-    return _time("row_time_s", value, u, dof, "all rows are exposed together"), shear, u_shear
+    return _time("row_time_s", value, u, dof, ROWS, "all rows are exposed together"), shear, u_shear
 
 
 def _one_plate(parts: Sequence[_Followed], frame_shape: tuple[int, int]) -> FieldMotion:

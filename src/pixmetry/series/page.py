@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pixmetry.camera.drift_series import DriftSeries
-from pixmetry.core.number import LOWER_LIMIT, Number
+from pixmetry.camera.motion_series import MotionSeries
+from pixmetry.core.number import LOWER_LIMIT, Estimates, Number
 from pixmetry.report import Column, Page, Section, Table
 from pixmetry.report.drawing import BLUE, GRID, INK, RED, SOFT, canvas, line
 from pixmetry.report.numbers import significant
@@ -31,6 +32,9 @@ WORDS = {
     "delay_tau_s": "Frame grabber: time constant of the delay",
     "shift_std_px": "Scatter of the whole image from frame to frame, along each axis",
     "roll_std_rad": "Scatter of its rotation",
+    "field_period_s": "Time between even and odd rows",
+    "row_time_s": "Time from row to row",
+    "jitter_s": "Scatter of the time of exposure",
 }
 TITLES = {
     "shift_x_px": "shift x / px",
@@ -48,18 +52,18 @@ def page_of(found: Series) -> Page:
     drift = found.drift
     rows, cols = found.frame_shape
     facts = [
-        ("Frames", f"{len(found.frames)} of {cols} × {rows} pixels"),
+        ("Frames", f"{found.frames[0]} to {found.frames[-1]}, {cols} × {rows} pixels"),
         ("Time", f"{_minutes(drift.time_s[0])} to {_minutes(drift.time_s[-1])} after switching on"),
         ("Targets", str(drift.targets)),
     ]
-    page = Page(found.frames[0], "motion of the image over time", "pixmetry series of a fixed field", facts, FOOTER)
+    page = Page(f"{len(found.frames)} frames", "motion of the image over time", "pixmetry series of a fixed field", facts, FOOTER)
     verdict = page.add_section("Is the camera stable?", name="verdict")
     far, u = (float(v[-1]) for v in (drift.from_settled_px, drift.u_from_settled_px))
     now = Reading("still to go at the end", f"{significant(far, 2)} px", f"± {significant(u, 1)} px")
     verdict.add(Answer([Text(stable_sentence(drift)), [now]]))
     for note in found.notes:
         verdict.add_text(note, style="small soft")
-    page.sections.append(drift_section(drift))
+    page.sections.append(drift_section(drift, own_page=True))
     if (origin := provenance_section(found.provenance)) is not None:
         page.sections.append(origin)
     return page
@@ -80,9 +84,11 @@ def stable_sentence(drift: DriftSeries) -> str:
     return f"{when}, every point stays within {limit} of where it settles{extrapolated}."
 
 
-def drift_section(drift: DriftSeries) -> Section:
+def drift_section(drift: DriftSeries, *, own_page: bool = False) -> Section:
     """Figure and values of a series."""
-    section = Section("Motion of the image while the camera warms up", name="series").add_text(stable_sentence(drift))
+    section = Section("Motion of the image while the camera warms up", name="series")
+    if not own_page:
+        section.add_text(stable_sentence(drift))
     if drift.location_factor > 1.2:
         section.add_text(
             f"Single targets scatter {drift.location_factor:.2g} times more about the motion of the field than the uncertainty of their "
@@ -90,11 +96,45 @@ def drift_section(drift: DriftSeries) -> Section:
             style="small soft",
         )
     section.add(motion_figure(drift))
-    rows: list[list[Any]] = [[WORDS[number.name], number, number.reason] for number in drift.fit]
-    gone = {name: why for name, why in drift.fit.reasons.items() if name not in drift.fit and name in WORDS}
-    rows += [[WORDS[name], Number.not_available("1", why), why] for name, why in gone.items()]
-    section.add(Table("What the series tells", ["Quantity", Column("Value", "number"), "Note"], rows))
+    section.add(_told(drift.fit))
     return section
+
+
+def motion_section(motion: MotionSeries) -> Section:
+    """Figure and values of frames of moving targets."""
+    speed = float(np.nanmax(np.linalg.norm(motion.speed_px_s, axis=1)))
+    text = f"{motion.targets} targets in {motion.frames} frames, at up to {significant(speed)} px/s. "
+    text += "Times are in proportion to the stated time between frames."
+    section = Section("Moving targets", name="motion").add_text(text)
+    section.add(lag_figure(motion), _told(motion.fit))
+    return section
+
+
+def _told(fit: Estimates) -> Table:
+    """Values, limits, and why others are not there."""
+    rows: list[list[Any]] = [[WORDS[number.name], number, number.reason] for number in fit]
+    gone = {name: why for name, why in fit.reasons.items() if name not in fit and name in WORDS}
+    rows += [[WORDS[name], Number.not_available("1", why), why] for name, why in gone.items()]
+    return Table("What the series tells", ["Quantity", Column("Value", "number"), "Note"], rows)
+
+
+def lag_figure(motion: MotionSeries) -> Figure:
+    """Lag of the odd rows, and shear and stretch of the picture, against the velocity."""
+    with canvas(2.6, ncols=2) as (figure, (left, right)):
+        for k, (axis, colour) in enumerate((("x", BLUE), ("y", RED))):
+            style = {"color": colour, "fmt": ".", "markersize": 3, "elinewidth": 0.6}
+            left.errorbar(motion.speed_px_s[:, k], motion.lag_px[:, k], 2 * motion.u_lag_px[:, k], label=f"along {axis}", **style)
+            right.errorbar(motion.speed_px_s[:, k], 1e3 * motion.shear[:, k], 2e3 * motion.u_shear[:, k], **style)
+        left.set_xlabel("velocity / px/s")
+        left.set_ylabel("odd rows less even / px")
+        left.legend(loc="best")
+        right.set_xlabel("velocity / px/s")
+        right.set_ylabel("shear, stretch / px per 1000 rows")
+        caption = (
+            "Left: how far a target in the odd rows lies from its place in the even ones; the slope is the time between the fields. Right: "
+            "shear (along x) and stretch (along y) of the picture of the plate; the slope is the time from row to row. Bars are ± 2 u."
+        )
+        return Figure(figure, "motion", "Lag of the odd rows and shear of the picture against the velocity of the targets.", caption)
 
 
 def motion_figure(drift: DriftSeries) -> Figure:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from pixmetry.camera.drift_series import DriftSeries
+from pixmetry.camera.motion_series import MotionSeries
 
 SERIES_SCHEMA = "pixmetry/series/1"
 
@@ -62,4 +63,19 @@ def drift_record(drift: DriftSeries) -> dict[str, Any]:
         "curve": drift.fitted.tolist(),
         "from_settled_px": drift.from_settled_px.tolist(),
         "u_from_settled_px": drift.u_from_settled_px.tolist(),
+    }
+
+
+def motion_record(motion: MotionSeries) -> dict[str, Any]:
+    """The plain record of frames of moving targets."""
+    return {
+        "frames": motion.frames,
+        "targets": motion.targets,
+        "estimates": motion.fit.to_records(),
+        "not_told": {name: why for name, why in motion.fit.reasons.items() if name not in motion.fit},
+        "speed_px_s": motion.speed_px_s.tolist(),
+        "lag_px": motion.lag_px.tolist(),
+        "u_lag_px": motion.u_lag_px.tolist(),
+        "shear": motion.shear.tolist(),
+        "u_shear": motion.u_shear.tolist(),
     }

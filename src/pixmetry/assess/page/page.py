@@ -94,7 +94,7 @@ def _pictures(assessment: Assessment) -> list[Section]:
     from pixmetry.assess.page.lines import lines_section
     from pixmetry.assess.page.response import response_section
     from pixmetry.assess.page.spots import spots_section
-    from pixmetry.series.page import drift_section
+    from pixmetry.series.page import drift_section, motion_section
 
     seen = assessment.observations
     return [
@@ -106,6 +106,7 @@ def _pictures(assessment: Assessment) -> list[Section]:
         *([] if seen.dark_temperatures is None else [dark_temperature_section(seen.dark_temperatures)]),
         *([] if seen.light_off is None else [light_off_section(seen.light_off)]),
         *([] if seen.drift is None else [drift_section(seen.drift)]),
+        *([] if seen.motion is None else [motion_section(seen.motion)]),
     ]
 
 

@@ -11,9 +11,11 @@ from typing import Literal
 
 import numpy as np
 
+from pixmetry.camera.observations import Observations, of_pictures
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
 from pixmetry.core.arrays import Array
+from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
 
 
@@ -64,6 +66,13 @@ def truth(params: Interlace, signal: Signal, stream: Stream) -> Mapping[str, np.
     return {"delay_s": delay, "field": parity if params.first_field == "even" else 1 - parity}
 
 
+def measure(observations: Observations) -> Estimates:
+    """Delay of one field against the other, from moving targets; which rows come first is among the settings."""
+    fit = None if observations.motion is None else observations.motion.fit
+    found = of_pictures(fit, {"field_period_s": "field_period_s"}, where="sensor.interlace", pictures="moving targets", kind="motion")
+    return replace(found, settings={k: v for k, v in found.settings.items() if k == "first_field"})
+
+
 SOURCE = Source(
     id="sensor.interlace",
     title="Interlacing",
@@ -79,6 +88,7 @@ SOURCE = Source(
     typical=Interlace(),
     bound=Interlace(integration="field"),
     forward=forward,
+    measure=measure,
     truth=truth,
     applies_to=("analogue", "ccd", "cid"),
     gum_class="O",
@@ -91,7 +101,6 @@ SOURCE = Source(
     advice="Use a progressive camera. Or locate targets in each field separately, at the time of that field. Or use one flash for both "
     "fields.",
     reasons={
-        "measure": "needs images of a moving target: the difference of its centres in both fields over the field period is its speed",
         "correct": "needs the speed of every target; locate targets in each field separately instead",
         "propagate": "needs the target's speed, which the probe does not contain; the time of the frame is wrong by up to half a field",
     },

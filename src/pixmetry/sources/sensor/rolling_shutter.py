@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
 
+from pixmetry.camera.observations import Observations, of_pictures
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
 
 
@@ -49,6 +52,13 @@ def truth(params: RollingShutter, signal: Signal, stream: Stream) -> Mapping[str
     return {"read_delay_s": delay, "delay_s": 0.5 * delay, "exposure_rel": 1 + delay / signal.exposure_s[:, None]}
 
 
+def measure(observations: Observations) -> Estimates:
+    """Time from row to row, from moving targets; where the reading begins is among the settings."""
+    fit = None if observations.motion is None else observations.motion.fit
+    found = of_pictures(fit, {"row_time_s": "row_time_s"}, where="sensor.rolling_shutter", pictures="moving targets", kind="motion")
+    return replace(found, settings={k: v for k, v in found.settings.items() if k == "first_row"})
+
+
 SOURCE = Source(
     id="sensor.rolling_shutter",
     title="Rolling shutter",
@@ -61,6 +71,7 @@ SOURCE = Source(
     typical=RollingShutter(row_time_s=10e-6),
     bound=RollingShutter(row_time_s=30e-6),
     forward=forward,
+    measure=measure,
     truth=truth,
     applies_to=("cmos", "cid"),
     gum_class="O",
@@ -69,7 +80,6 @@ SOURCE = Source(
     references=("C. Geyer, M. Meingast, S. Sastry, OMNIVIS 2005 (geometric models of rolling shutters)",),
     advice="Use a global shutter, or a strobe after a global reset. Otherwise model the time of every row.",
     reasons={
-        "measure": "needs a moving edge or flickering light of known frequency: the slope of an edge against its speed",
         "correct": "needs the speed of every target: a target at row r belongs to the time of that row",
         "propagate": "needs the target's speed, which the probe does not contain",
     },

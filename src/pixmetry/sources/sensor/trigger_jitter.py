@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
+from pixmetry.camera.observations import Observations, of_pictures
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
 
 
@@ -39,6 +42,13 @@ def truth(params: TriggerJitter, signal: Signal, stream: Stream) -> Mapping[str,
     return {"delay_s": delay_s(params, signal, stream)[:, None] * np.ones(signal.frame_shape[0])}
 
 
+def measure(observations: Observations) -> Estimates:
+    """Scatter of the time of exposure, from moving targets about their paths; latency and rate need another clock."""
+    fit = None if observations.motion is None else observations.motion.fit
+    found = of_pictures(fit, {"jitter_s": "jitter_s"}, where="sensor.trigger_jitter", pictures="moving targets", kind="motion")
+    return replace(found, settings={})
+
+
 SOURCE = Source(
     id="sensor.trigger_jitter",
     title="Trigger and time-stamp jitter",
@@ -51,6 +61,7 @@ SOURCE = Source(
     typical=TriggerJitter(latency_s=50e-6, jitter_s=10e-6),
     bound=TriggerJitter(latency_s=2e-3, jitter_s=1e-3, clock_error_rel=1e-4),
     forward=forward,
+    measure=measure,
     truth=truth,
     gum_class="O",
     equation="t' = t + t_latency + ε t + σ_t n;  shift v (t' − t)",
@@ -58,7 +69,6 @@ SOURCE = Source(
     references=("IEEE 1588-2019 (precision time protocol)", "GigE Vision 2.0 (time stamps)"),
     advice="Use a hardware trigger and the time stamp of the camera, not of the computer. Synchronise clocks by PTP.",
     reasons={
-        "measure": "needs a moving target of known path, or a clock of light-emitting diodes in the image",
         "correct": "a frame does not contain its delay",
         "propagate": "needs the target's speed, which the probe does not contain: u = v σ_t",
     },
