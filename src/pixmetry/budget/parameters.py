@@ -37,7 +37,7 @@ def with_estimates(source: Source, base: Any, estimates: Estimates) -> Any:
     A quantity of which only an upper limit L is known may be anywhere from 0 to L: it enters with the root mean square of that rectangular
     distribution, L/√3.
     """
-    values: dict[str, float | str] = {e.name: e.representative for e in estimates} | dict(estimates.settings)
+    values: dict[str, float | str | int] = {e.name: e.representative for e in estimates} | dict(estimates.settings)
     for name in values:
         if name not in source.parameters.model_fields:
             raise InputError(f"{name} is no parameter of {source.id}", allowed=", ".join(source.parameters.model_fields))

@@ -185,7 +185,7 @@ class Estimates:
     reasons : mapping
         By name: why it is a limit, or what the reader should know about it.
     settings : mapping
-        Parameters that are no numbers, such as a method: those that the data chose. The reasons tell of them.
+        Parameters that are no measured numbers, such as a method or the kind of a filter: those that the data chose.
 
     Examples
     --------
@@ -204,7 +204,7 @@ class Estimates:
     limits: frozenset[str] = frozenset()
     lower_limits: frozenset[str] = frozenset()
     reasons: Mapping[str, str] = field(default_factory=dict)
-    settings: Mapping[str, str] = field(default_factory=dict)
+    settings: Mapping[str, str | int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         n = len(self.names)

@@ -10,13 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from itertools import product
 
 import numpy as np
 
 from pixmetry.camera.line import low_pass_poles
 from pixmetry.core.arrays import Array
+from pixmetry.core.number import Estimates, Number
 from pixmetry.observe._edge_kernels import line_taps
 from pixmetry.observe.edge_curves import BIN_PX, EdgeCurve
 
@@ -28,10 +29,11 @@ APART = 1e-4  # relative: equal poles are moved so far apart; the step response 
 FILTERS = tuple(product(("butterworth", "bessel"), (2, 3, 4))) + (("rc", 1), ("rc", 2))
 FOUND_CHI2 = 25.0  # by which χ² must rise without a part of the line for it to be there
 LARGEST_U_REL = 1 / 3  # of a value that is given
+LARGEST_U_A = 0.2  # of a width of the pixel that is given
 MISFIT_P = 1e-4  # probability of a larger χ², below which the line is another one
 ITERATIONS, CONVERGED = 40, 1e-3  # the last in χ²
 STEP_REL = 1e-5  # of differences that stand for derivatives
-METHOD = "joint fit of lens, pixel and video line to slanted edges along x and y; models weighted by χ² + 2 parameters (AIC)"
+METHOD = "joint fit of lens, pixel and video line to slanted edges along x and y; the mean of models, by their probability"
 
 
 # ---- what a line does -------------------------------------------------------------------------------------------------------------------
@@ -44,21 +46,38 @@ class LineModel:
     kind: str = "off"
     order: int = 0
     amplifier: bool = False
-    echo: str = ""  # "", "cable" or "branch"
+    echo: str = ""  # of the cable, within the rise of an edge ("near") or behind it ("far"), or of an open branch ("branch")
 
     @property
     def names(self) -> tuple[str, ...]:
         """Free parameters: frequencies over the pixel clock, delays in pixel periods."""
         low_pass = ("cutoff_rel",) if self.order else ()
         amplifier = ("natural_rel", "damping") if self.amplifier else ()
-        return low_pass + amplifier + {"": (), "cable": ("ghost_rel", "echo_px"), "branch": ("branch_px",)}[self.echo]
+        return low_pass + amplifier + {"": (), "branch": ("branch_px",)}.get(self.echo, ("ghost_rel", "echo_px"))
 
     @property
     def parts(self) -> frozenset[str]:
         """Ids of the sources that it needs."""
         told = {"grabber.low_pass": self.order > 0, "electronics.video_amplifier": self.amplifier}
-        told |= {"cable.termination": self.echo == "cable", "cable.t_piece": self.echo == "branch"}
+        told |= {"cable.termination": self.echo in ("near", "far"), "cable.t_piece": self.echo == "branch"}
         return frozenset(name for name, there in told.items() if there)
+
+    def limits(self, name: str) -> tuple[float, float]:
+        """Range in which a parameter is looked for."""
+        low, high = LINE_LIMITS[name]
+        if name == "echo_px":
+            return (low, NEAR_PX) if self.echo == "near" else (NEAR_PX, high)
+        return low, high
+
+    def prior_width(self, name: str, value: float) -> float:
+        """One over the density of the prior: log-uniform within the limits, or uniform where they have both signs."""
+        low, high = self.limits(name)
+        return high - low if low < 0 else float(np.log(high / low)) * value
+
+    def holds(self, other: LineModel) -> bool:
+        """Whether it is the other model, or that with further parts."""
+        same = not other.order or (self.kind, self.order) == (other.kind, other.order)
+        return same and self.amplifier >= other.amplifier and other.echo in ("", self.echo)
 
     def poles(self, q: dict[str, float]) -> Array:
         """Of the filters, in radians per pixel period."""
@@ -73,7 +92,7 @@ class LineModel:
 
     def paths(self, q: dict[str, float]) -> tuple[Array, Array]:
         """Delays in pixel periods and amplitudes of the signal and its echoes."""
-        if self.echo == "cable":
+        if self.echo in ("near", "far"):
             return paths_of(q["echo_px"], 1 - q["ghost_rel"], 1.0, q["ghost_rel"])
         if self.echo == "branch":  # of matched cable: 2/3 [1 + 2/3 Σ (−1/3)^k]
             return paths_of(q["branch_px"], 2 / 3, 2 / 3, -1 / 3)
@@ -127,6 +146,7 @@ def _separated(poles: Array) -> Array:
 OPTICS = ("spread_var_px2", "width_x_px", "width_y_px", "separation_x_px", "separation_y_px")
 OPTICS_LOWEST = np.array([2e-3, 0.05, 0.05, 0.02, 0.02])
 OPTICS_HIGHEST = np.array([25.0, 1.3, 1.3, 4.0, 4.0])
+NEAR_PX = 1.5  # delay of an echo that lies within the rise of an edge
 LINE_LIMITS = {
     "cutoff_rel": (0.04, 4.0),
     "natural_rel": (0.04, 4.0),
@@ -135,7 +155,7 @@ LINE_LIMITS = {
     "echo_px": (0.05, 40.0),
     "branch_px": (0.02, 40.0),
 }
-STARTS = {"cutoff_rel": (0.4,), "natural_rel": (0.4, 0.9), "damping": (0.6,), "ghost_rel": (0.03,), "echo_px": (0.8, 3.0, 9.0)}
+STARTS = {"cutoff_rel": (0.4,), "natural_rel": (0.4, 0.9), "damping": (0.6,), "ghost_rel": (0.03,), "echo_px": (0.7, 3.0, 9.0)}
 STARTS |= {"branch_px": (0.5, 3.0, 9.0)}
 
 
@@ -192,9 +212,16 @@ class LineFit:
     dof: int
 
     @property
-    def cost(self) -> float:
-        """χ² and two for each parameter (H. Akaike, IEEE Trans. Autom. Control 19, 1974, 716)."""
-        return self.chi2 + 2 * len(self.model.names)
+    def occam(self) -> float:
+        """−2 ln of the share of its prior range that the data leave to a model (Laplace): a model that fits by many chances counts less.
+
+        Frequencies, damping and delays are taken as log-uniform, the rest as uniform, over the ranges in which they are looked for.
+        """
+        _, log_det = np.linalg.slogdet(self.covariance)
+        optics = OPTICS_HIGHEST[list(self.free)] - OPTICS_LOWEST[list(self.free)]
+        line = [self.model.prior_width(name, self.line[name]) for name in self.model.names]
+        ranges = np.concatenate([optics, line])
+        return float(2 * np.log(ranges).sum() - log_det - len(ranges) * np.log(2 * np.pi))
 
 
 def fit_model(
@@ -209,8 +236,9 @@ def fit_model(
     """Levenberg–Marquardt from a start; derivatives of the spectra by differences."""
     names = model.names
     k, n = len(free), len(free) + len(names)
-    lows = np.array([*OPTICS_LOWEST[list(free)], *(LINE_LIMITS[name][0] for name in names)])
-    highs = np.array([*OPTICS_HIGHEST[list(free)], *(LINE_LIMITS[name][1] for name in names)])
+    limits = np.array([model.limits(name) for name in names]).reshape(-1, 2)
+    lows = np.concatenate([OPTICS_LOWEST[list(free)], limits[:, 0]])
+    highs = np.concatenate([OPTICS_HIGHEST[list(free)], limits[:, 1]])
 
     def normal(p: Array, q: Array, own: Array) -> tuple[float, list[tuple[Array, Array]]]:
         values = dict(zip(names, q, strict=True))
@@ -275,7 +303,10 @@ def fit_model(
     information = np.zeros((n, n))
     for matrix, _ in parts:
         information += matrix[:n, :n] - matrix[:n, n:] @ np.linalg.solve(matrix[n:, n:] + 1e-12 * np.eye(3), matrix[n:, :n])
-    scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
+    # nothing is known worse than before: a uniform distribution over its range
+    widths = np.array([*(highs - lows)[:k], *(model.prior_width(name, value) for name, value in zip(names, q, strict=True))])
+    information[np.diag_indices(n)] += 12 / widths**2
+    scale = np.sqrt(np.diag(information))
     covariance = np.linalg.pinv(information / np.outer(scale, scale), rcond=1e-10, hermitian=True) / np.outer(scale, scale)
     dof = sum(len(s.value) for s in seen) - n - 3 * len(seen)
     line = dict(zip(names, map(float, q), strict=True))
@@ -291,7 +322,8 @@ def _of_others(p: Array) -> float:
 
 FAR_CHI2 = 150.0  # models so far above the best after a few steps are left there
 TRIAL_ITERATIONS = 7
-SURVIVING = 1e-4  # weight of a model, below which it is left out of the mean
+SURVIVING = 1e-4  # probability of a model over that of the best, below which it is left out of the mean
+CERTAIN = 0.99  # probability that is enough to speak of a part or a kind as known
 STARTS_D = (0.6, 1.1)
 WORDS = {
     "grabber.low_pass": "low-pass filter",
@@ -305,35 +337,54 @@ OF_PART = {
     "cable.termination": ("ghost_rel", "echo_px"),
     "cable.t_piece": ("branch_px",),
 }
-UNITS = {"delay_px": "px", "echo_px": "px", "branch_px": "px"}
 
 
 @dataclass(frozen=True)
 class LineSearch:
-    """All models that were fitted, the best first; ``scale`` is χ² per degree of freedom of the best, or 1 if that is less."""
+    """All models that were fitted; ``scale`` is χ² per degree of freedom of the smallest, or 1 if that is less."""
 
     fits: tuple[LineFit, ...]
     scale: float
     misfit_p: float
 
+    @cached_property
+    def weights(self) -> tuple[tuple[LineFit, float], ...]:
+        """Models with their probabilities, the most probable first; those below `SURVIVING` are left out.
+
+        What the best model may hide, a further part, counts by χ² + 2 k (H. Akaike, IEEE Trans. Autom. Control 19, 1974, 716): every
+        camera has an amplifier and a cable, and a part is not less probable because its parameters could have been anything.
+        """
+        costs = np.array([f.chi2 / self.scale + f.occam for f in self.fits])
+        best = self.fits[int(np.argmin(costs))]
+        for i, f in enumerate(self.fits):
+            if f.model.holds(best.model):
+                more = len(f.model.names) - len(best.model.names)
+                costs[i] = min(costs[i], f.chi2 / self.scale + best.occam + 2 * more)
+        raw = np.exp(-0.5 * (costs - costs.min()))
+        kept = [(self.fits[i], float(raw[i])) for i in np.argsort(costs) if raw[i] > SURVIVING]
+        total = sum(w for _, w in kept)
+        return tuple((f, w / total) for f, w in kept)
+
     @property
     def best(self) -> LineFit:
-        """The model of the smallest χ² + 2 parameters."""
-        return self.fits[0]
+        """The most probable model."""
+        return self.weights[0][0]
 
     @property
     def rivals(self) -> tuple[LineFit, ...]:
-        """Models that the edges do not exclude: χ² within `FOUND_CHI2` of the smallest."""
-        least = min(f.chi2 for f in self.fits)
-        return tuple(f for f in self.fits if f.chi2 - least <= FOUND_CHI2 * self.scale)
+        """Models that are not excluded: the most probable that make up `CERTAIN` of the whole."""
+        total, out = 0.0, []
+        for fit, weight in self.weights:
+            out.append(fit)
+            total += weight
+            if total > CERTAIN:
+                break
+        return tuple(out)
 
-    @property
-    def weights(self) -> tuple[tuple[LineFit, float], ...]:
-        """Models with their weights, e^(−(χ² + 2 parameters)/2), of sum 1."""
-        raw = [np.exp(-0.5 * (f.cost - self.best.cost) / self.scale) for f in self.rivals]
-        kept = [(f, float(w)) for f, w in zip(self.rivals, raw, strict=True) if w > SURVIVING]
-        total = sum(w for _, w in kept)
-        return tuple((f, w / total) for f, w in kept)
+    def fall(self, part: str) -> float:
+        """By how much χ² falls with a part of the line."""
+        least = [min(f.chi2 for f in self.fits if (part in f.model.parts) == there) for there in (False, True)]
+        return max(least[0] - least[1], 0.0) / self.scale
 
 
 def search_models(curves: Sequence[EdgeCurve]) -> LineSearch | None:
@@ -343,7 +394,7 @@ def search_models(curves: Sequence[EdgeCurve]) -> LineSearch | None:
     seen = [_Seen(c) for c in curves]
     optics = np.array([_start_variance(curves), 0.8, 0.8, 0.0, 0.0])
     found = _search(seen, optics, (0, 1, 2))
-    best = found[0]
+    best = min(found, key=lambda f: f.chi2)
     plates = []
     for d in STARTS_D:
         start = best.optics.copy()
@@ -375,7 +426,7 @@ def _search(seen: Sequence[_Seen], optics: Array, free: Sequence[int]) -> list[L
     """All models, those without echoes first; of models that are far from the best only a few steps are taken."""
     own = np.array([[0.0, 0.0, 1.0]] * len(seen))
     out: list[LineFit] = []
-    for echo in ("", "cable", "branch"):
+    for echo in ("", "near", "far", "branch"):
         for (kind, order), amplifier in product((("off", 0), *FILTERS), (False, True)):
             model = LineModel(kind, order, amplifier, echo)
             before = next((f.line for f in out if f.model == replace(model, echo="")), None)
@@ -391,7 +442,7 @@ def _search(seen: Sequence[_Seen], optics: Array, free: Sequence[int]) -> list[L
             again = fit_model(seen, less, fit.optics, free, {name: fit.line[name] for name in less.names}, fit.own)
             if again.chi2 < out[place].chi2:
                 out[place] = again
-    return sorted(out, key=lambda f: f.cost)
+    return out
 
 
 def _parts_left_out(model: LineModel) -> list[LineModel]:
@@ -405,9 +456,10 @@ def _from_starts(
 ) -> LineFit:
     """The fit from the start of the line's parameters that leads to the smallest χ² after a few steps."""
     names = model.names
-    starts = [dict(zip(names, s, strict=True)) for s in product(*(STARTS[name] for name in names))]
+    options = [[v for v in STARTS[name] if model.limits(name)[0] <= v <= model.limits(name)[1]] for name in names]
+    starts = [dict(zip(names, s, strict=True)) for s in product(*options)]
     if before is not None:  # without the echo
-        starts += [start | before for start in starts[: len(STARTS["echo_px"])]]
+        starts += [start | before for start in starts[: len(options[-1])]]
     tried = []
     for values in starts:
         own = own.copy()
@@ -415,3 +467,144 @@ def _from_starts(
         own[:, 0] = [-delay if s.main == 0 else s.curve.slope * delay for s in seen]  # so that the middle of the edge stays in its place
         tried.append(fit_model(seen, model, optics, free, values, own, TRIAL_ITERATIONS))
     return min(tried, key=lambda f: f.chi2)
+
+
+# ---- what is told -----------------------------------------------------------------------------------------------------------------------
+
+
+def line_estimates(found: LineSearch) -> tuple[Estimates, Estimates]:
+    """The line, and lens and pixel in front of it.
+
+    Returns
+    -------
+    line : Estimates
+        ``delay_px`` always: how much later the centroid of anything comes. Of a part that every model needs which the edges allow, its
+        parameters: frequencies over the pixel clock (``cutoff_rel``, ``natural_rel``), ``damping``, ``ghost_rel`` (amplitude of an echo
+        over the one before), ``echo_px`` and ``branch_px`` (delays). ``settings`` has kind and order of the filter. ``reasons`` say why
+        others are missing.
+    optics : Estimates
+        ``spread_var_px2``; ``sigma_px``, ``width_x_px``, ``width_y_px`` and separations as far as they are told.
+
+    Notes
+    -----
+    Values are means over the models, weighted by their probabilities (χ² and the share of the prior range that is left, by Laplace's
+    method), their covariance Σ w (C + d dᵀ) with d from the mean (J. A. Hoeting et al., Statistical Science 14, 1999, 382). So what
+    another part could hide is in u.
+    """
+    if found.misfit_p < MISFIT_P:
+        best = found.best
+        told = (
+            f"no line that was tried describes the edges (χ² {best.chi2:.0f} for {best.dof} degrees of freedom): another filter, a grabber "
+            "that samples at another rate than the pixel clock, gamma, or a lens that is no Gaussian"
+        )
+        every = {name: told for names in OF_PART.values() for name in names} | {"delay_px": told}
+        return replace(Estimates.empty(), reasons=every), replace(Estimates.empty(), reasons={"spread_var_px2": told})
+    present = [p for p in OF_PART if all(p in f.model.parts for f in found.rivals) and found.fall(p) > FOUND_CHI2]
+    kinds = {(f.model.kind, f.model.order) for f in found.rivals}
+    names = tuple(name for part in present for name in OF_PART[part])
+    values, covariance = _mean_of_models(found, names)
+    optics, line = _split(found, names, values, covariance)
+    delay = line["delay_px"]
+    reasons, left_out = {}, []
+    for part, own in OF_PART.items():
+        why = ""
+        if part not in present:
+            why = _reason_of_absence(found, part, delay)
+        elif part == "grabber.low_pass" and len(kinds) > 1:
+            why = f"there is one, and the edges do not tell its kind ({', '.join(sorted(map(_kind_words, kinds)))}); {_delay_words(delay)}"
+        else:
+            bad = [name for name in own if line[name].u > LARGEST_U_REL * abs(line[name].value)]
+            if bad:
+                u = ", ".join(f"{name} {line[name].value:.3g} ± {line[name].u:.2g}" for name in own)
+                why = f"there is one, and the edges hardly tell it apart from the rest of the line ({u}); {_delay_words(delay)}; {NEEDED}"
+        if why:
+            reasons |= dict.fromkeys(own, why)
+            left_out += list(own)
+    line = line.select([name for name in line.names if name not in left_out])
+    settings = {"kind": found.best.model.kind, "order": found.best.model.order} if "cutoff_rel" in line else {}
+    return replace(line, reasons=reasons, settings=settings, confounders=_correlated(line)), optics
+
+
+NEEDED = "take the same edges with the filter of the grabber switched off"
+
+
+def _mean_of_models(found: LineSearch, names: Sequence[str]) -> tuple[Array, Array]:
+    """Mean and covariance of (free optics, σ, these parameters, delay) over the models."""
+    each, covariances, weights = [], [], []
+    for fit, weight in found.weights:
+        value, jacobian = _values(fit, names)
+        each.append(value)
+        covariances.append(jacobian @ fit.covariance @ jacobian.T * found.scale)
+        weights.append(weight)
+    mean = np.average(each, axis=0, weights=weights)
+    total = sum(w * (c + np.outer(v - mean, v - mean)) for v, c, w in zip(each, covariances, weights, strict=True))
+    return np.asarray(mean, float), np.asarray(total, float)
+
+
+def _values(fit: LineFit, names: Sequence[str]) -> tuple[Array, Array]:
+    """(free optics, σ, parameters, delay) of a fit, and their derivatives by what was free."""
+    k, own = len(fit.free), fit.model.names
+
+    def at(x: Array) -> Array:
+        p = fit.optics.copy()
+        p[list(fit.free)] = x[:k]
+        q = dict(zip(own, x[k:], strict=True))
+        sigma = np.sqrt(max(p[0] - _of_others(p), 1e-3))
+        return np.array([*x[:k], sigma, *(q[name] for name in names), fit.model.delay_px(q)])
+
+    x = np.array([*fit.optics[list(fit.free)], *(fit.line[name] for name in own)])
+    here = at(x)
+    steps = np.diag(STEP_REL * np.maximum(np.abs(x), 0.1))
+    jacobian = np.array([(at(x + step) - here) / step.sum() for step in steps]).T
+    return here, np.asarray(jacobian.reshape(len(here), len(x)), float)
+
+
+def _split(found: LineSearch, names: Sequence[str], values: Array, covariance: Array) -> tuple[Estimates, Estimates]:
+    """Optics and line as estimates."""
+    free = found.best.free
+    labels = (*(OPTICS[j] for j in free), "sigma_px", *names, "delay_px")
+    dof = np.full(len(labels), float(found.best.dof))
+    units = tuple("px²" if name == OPTICS[0] else "px" if name.endswith("_px") else "1" for name in labels)
+    whole = Estimates(labels, values, covariance, dof, units, METHOD)
+    optics = whole.select(labels[: len(free) + 1])
+    line = whole.select(labels[len(free) + 1 :])
+    hidden = [name for name in ("width_x_px", "width_y_px") if optics[name].u > LARGEST_U_A]
+    if not hidden:
+        return replace(optics, confounders=_correlated(optics)), line
+    u = max(optics[name].u for name in hidden)
+    why = f"the blur hides the aperture (u would be {u:.2f} px): focus better, or take more edges with less noise"
+    kept = [name for name in optics.names if name not in (*hidden, "sigma_px")]
+    return replace(optics.select(kept), reasons=dict.fromkeys((*hidden, "sigma_px"), why)), line
+
+
+def _reason_of_absence(found: LineSearch, part: str, delay: Number) -> str:
+    """Why a part is not given: the edges do not need it, or another one does as well."""
+    if part not in found.best.model.parts and found.fall(part) < FOUND_CHI2 and not _exchanged(found, part):
+        fall = f"χ² falls by {found.fall(part):.0f} with it, and by {FOUND_CHI2:g} or more where it is seen"
+        return f"the edges do not need it: {fall}"
+    others = sorted({WORDS[p] for f in found.rivals for p in f.model.parts if part not in f.model.parts} - {WORDS[part]})
+    apart = f"not separable from {' and '.join(others)}" if others else "not separable from a line without limit"
+    return f"{apart}; {_delay_words(delay)}; {NEEDED}"
+
+
+def _exchanged(found: LineSearch, part: str) -> bool:
+    """Whether the part can stand for another one: a fit that has it lacks one of the best, and is not excluded by χ²."""
+    most = min(f.chi2 for f in found.fits) + FOUND_CHI2 * found.scale
+    return any(part in f.model.parts and found.best.model.parts - f.model.parts and f.chi2 < most for f in found.fits)
+
+
+def _delay_words(delay: Number) -> str:
+    return f"the whole line delays by {delay.value:.3f} ± {delay.u:.3f} px"
+
+
+def _kind_words(kind: tuple[str, int]) -> str:
+    return "none" if not kind[1] else f"{kind[0]} of order {kind[1]}"
+
+
+def _correlated(found: Estimates) -> tuple[str, ...]:
+    """Pairs of values that are hardly told apart."""
+    scale = np.outer(found.u, found.u)
+    correlation = np.divide(found.covariance, scale, out=np.zeros_like(scale), where=scale > 0)
+    pairs = [(i, j) for i in range(len(found)) for j in range(i) if abs(correlation[i, j]) > 0.9]
+    told = [f"{found.names[j]} and {found.names[i]} from slanted edges are correlated by {correlation[i, j]:+.2f}" for i, j in pairs]
+    return tuple(text for text in told if "delay_px" not in text and "spread_var" not in text)
