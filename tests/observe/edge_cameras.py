@@ -39,3 +39,29 @@ def stored_picture(rng: np.random.Generator, clean: np.ndarray, noise_dn: float 
     """A frame of 8 bits with white noise, as a picture of edges."""
     frame = np.clip(np.rint(clean + noise_dn * rng.standard_normal(clean.shape)), 0, 255).astype(np.float32)
     return Picture("edge", frame, 1, 255.0)
+
+
+DIGITISED: dict[str, dict[str, object]] = {  # what stands in every chain behind the light, here
+    "sensor.quantum_efficiency": {"quantum_efficiency": 1.0},
+    "sensor.shot_noise": {},
+    "sensor.prnu": {"pixel_std_rel": 0.004},
+    "electronics.gain": {"gain_dn_per_e": 0.02},
+    "electronics.amplifier_noise": {"white_e": 60.0},
+    "grabber.adc": {"bits": 8, "offset_dn": 5.0},
+}
+
+
+def stored_squares(rng: np.random.Generator, sources: dict[str, dict[str, object]], cells: int = 5, seed: int = 1) -> Picture:
+    """A frame of 8 bits of five turned squares in a row, 40 px off its left side, through a camera's whole chain."""
+    turn, electrons = np.radians(5.0), 50.0
+    outlines = []
+    for j in range(cells):
+        x, y = 40 + CELL * (j + 0.5) + rng.uniform(-0.5, 0.5), 0.5 * CELL + rng.uniform(-0.5, 0.5)
+        u, v = 0.5 * SIDE * np.array([-1, 1, 1, -1]), 0.5 * SIDE * np.array([-1, -1, 1, 1])
+        corner_x, corner_y = x + u * np.cos(turn) - v * np.sin(turn), y + u * np.sin(turn) + v * np.cos(turn)
+        outlines.append(polygon(corner_x, corner_y, electrons * HEIGHT_DN))
+    values = DIGITISED | sources
+    chain = tuple(Element(s.id, s, s.parameters(**values[s.id])) for s in in_order(get_source(name) for name in values))
+    camera = Camera("squares", (CELL, 70 + cells * CELL), chain, unit_seed=seed)
+    codes = camera.expose(Scene((Shapes.of(outlines),), Uniform(electrons * LOW_DN)), 1).data[0]
+    return Picture("edge", np.asarray(codes, np.float32), 1, 255.0)

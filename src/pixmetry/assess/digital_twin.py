@@ -94,10 +94,10 @@ def _middle_exposure_s(campaign: Campaign) -> float:
     return float(np.median(next(filter(None, [*known, targets]), [ASSUMED_EXPOSURE_S])))
 
 
-def best_values(source: Source, estimates: Estimates) -> dict[str, float | str]:
+def best_values(source: Source, estimates: Estimates) -> dict[str, float | str | int]:
     """Values for a simulation: the estimates and settings; 0 for values that are not significant, except dark noise that rounding hides."""
     hidden = {"white_e"}  # the rms of an even spread up to its limit
-    values: dict[str, float | str] = dict(estimates.settings)
+    values: dict[str, float | str | int] = dict(estimates.settings)
     for e in estimates:
         may_be_none = source.neutral is not None and getattr(source.neutral, e.name) == 0 and _alone(estimates, e.name)
         nothing = e.kind == "upper_limit" or (may_be_none and abs(e.value) < SIGNIFICANT_U * e.u)

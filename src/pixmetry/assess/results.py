@@ -184,17 +184,24 @@ def edges_record(found: SlantedEdges) -> dict[str, Any]:
         "measured": len(found.edges),
         "refused": [asdict(r) for r in found.refused],
         "values": found.fit.to_records(),
-        "optics": {
-            "estimates": found.optics.to_records(),
-            "names": list(found.optics.names),
-            "covariance": found.optics.covariance.tolist(),
-            "confounders": list(found.optics.confounders),
-            "not_told": {name: why for name, why in found.optics.reasons.items() if name not in found.optics},
-        },
+        "optics": _joint_record(found.optics),
+        "line": None if found.line is None else _joint_record(found.line),
         "frequency_cycles_per_px": found.frequency.tolist(),
         "x": mean(found.x),
         "y": mean(found.y),
         "edges": [{k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in e.items()} for e in each],
+    }
+
+
+def _joint_record(found: Estimates) -> dict[str, Any]:
+    """The plain record of values that were fitted together."""
+    return {
+        "estimates": found.to_records(),
+        "names": list(found.names),
+        "settings": dict(found.settings),
+        "covariance": found.covariance.tolist(),
+        "confounders": list(found.confounders),
+        "not_told": {name: why for name, why in found.reasons.items() if name not in found},
     }
 
 

@@ -281,6 +281,8 @@ class SlantedEdges:
         ``sfr50_x``, ``sfr50_y``, ``asymmetry_x``, ``asymmetry_y``, as far as there are edges for them.
     optics : Estimates
         Lens, pixel and optical low-pass filter, fitted together: see `pixmetry.observe.edge_fit`.
+    line : Estimates or None
+        Of an analogue camera its video line, see `pixmetry.observe.line_fit.line_estimates`: delays in pixels, frequencies over the clock.
     """
 
     frequency: np.ndarray
@@ -290,6 +292,7 @@ class SlantedEdges:
     y: EdgeResponse | None
     fit: Estimates
     optics: Estimates
+    line: Estimates | None = None
 
 
 @dataclass(frozen=True)
@@ -701,6 +704,27 @@ class Observations:
         """
         fit = None if self.blocks is None else self.blocks.fit
         return of_pictures(fit, {n: n for n in names}, where=where, pictures="textured frames", kind="pattern")
+
+    def video_line(self, scales: Mapping[str, str], *, where: str) -> tuple[Estimates, float]:
+        """Take fitted values of the video line that slanted edges tell, and the pixel clock in MHz.
+
+        Raises
+        ------
+        MeasureError
+            Without edges, of a digital camera, without a stated pixel clock, or with the reason why the edges do not tell these.
+        """
+        stated = self.stated
+        if self.edges is not None and self.edges.edges and self.edges.line is None:
+            raise MeasureError("the camera is digital: it has no video line", where=where, remedy="state interface: analogue if it has one")
+        line = None if self.edges is None or not self.edges.edges else self.edges.line
+        found = of_pictures(line, scales, where=where, pictures="slanted edges", kind="edge")
+        if stated.pixel_clock_mhz is None:
+            raise MeasureError(
+                "the edges tell it in pixels, and the pixel clock is not stated",
+                where=where,
+                remedy="state pixel_clock_mhz in the manifest",
+            )
+        return found, stated.pixel_clock_mhz
 
     def curve(self, names: Mapping[str, str] | Iterable[str], *, where: str) -> Estimates:
         """Take a source's parameters ``{parameter: fitted name}`` out of the response that a chart tells, with their covariance.

@@ -280,6 +280,19 @@ class Estimates:
             settings=self.settings,
         )
 
+    def scaled(self, factors: Mapping[str, tuple[float, str]]) -> Estimates:
+        """The same set in other units: by name a factor and the new unit.
+
+        Examples
+        --------
+        >>> delay = Estimates.from_rows([("delay", 0.5, 0.01, 40.0, "px")])
+        >>> delay.scaled({"delay": (70.0, "ns")})["delay"].value
+        35.0
+        """
+        by = np.array([factors.get(name, (1.0, ""))[0] for name in self.names])
+        units = tuple(factors.get(name, (1.0, unit))[1] for name, unit in zip(self.names, self.units, strict=True))
+        return replace(self, values=self.values * by, covariance=self.covariance * np.outer(by, by), units=units)
+
     def join(self, *others: Estimates) -> Estimates:
         """Put sets from independent data together (zero covariance between them)."""
         sets = [s for s in (self, *others) if len(s)]

@@ -200,12 +200,12 @@ def motion_notes(pictures: Sequence[Picture], found: Search) -> list[str]:
     return notes
 
 
-def responses_of(found: Search, optics: Estimates | None = None) -> SlantedEdges:
+def responses_of(found: Search, optics: Estimates | None = None, line: Estimates | None = None) -> SlantedEdges:
     """The e-SFR of every edge and of both directions, with what was fitted to all edges together."""
     edges = tuple(_edge_of(region, spread) for region, spread in found.measured)
     of_x, of_y = (_mean_response([s for r, s in found.measured if r.across == axis]) for axis in "xy")
     summary = _summary(edges, {"x": of_x, "y": of_y})
-    return SlantedEdges(FREQUENCY, edges, found.refused, of_x, of_y, summary, Estimates.empty() if optics is None else optics)
+    return SlantedEdges(FREQUENCY, edges, found.refused, of_x, of_y, summary, Estimates.empty() if optics is None else optics, line)
 
 
 # ---- finding --------------------------------------------------------------------------------------------------------------------------

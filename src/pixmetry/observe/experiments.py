@@ -12,6 +12,7 @@ from pixmetry.observe.edges import Picture, edge_notes, motion_notes, responses_
 from pixmetry.observe.experiment import Experiment, PictureGroup
 from pixmetry.observe.jpeg_blocks import FirstFrames, reduce_patterns
 from pixmetry.observe.light_off import BlockMeans, reduce_light_off
+from pixmetry.observe.line_fit import fit_line
 from pixmetry.observe.line_jitter import with_jitter
 from pixmetry.observe.lines import LineFrames, places_of_rows
 from pixmetry.observe.patches import find_patches
@@ -22,8 +23,13 @@ from pixmetry.observe.spots import reduce_spots
 def reduce_edges(groups: Sequence[PictureGroup], seen: Observations) -> Observations:
     """Find and fit the slanted edges of pictures."""
     pictures = [Picture.of(g.kind, g.moments, g.bits) for g in groups]
-    search = search_edges(pictures)
-    edges = responses_of(search, fit_edges(search.measured))
+    analogue = seen.stated.interface == "analogue"
+    search = search_edges(pictures, analogue)
+    if analogue:
+        line, optics = fit_line(search.measured)
+        edges = responses_of(search, optics, line)
+    else:
+        edges = responses_of(search, fit_edges(search.measured))
     return replace(seen, edges=edges, notes=(*seen.notes, *edge_notes(edges), *motion_notes(pictures, search)))
 
 

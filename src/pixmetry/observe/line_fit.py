@@ -19,8 +19,10 @@ from pixmetry.camera.line import low_pass_poles
 from pixmetry.core.arrays import Array
 from pixmetry.core.number import Estimates, Number
 from pixmetry.observe._edge_kernels import line_taps
-from pixmetry.observe.edge_curves import BIN_PX, EdgeCurve
+from pixmetry.observe.edge_curves import BIN_PX, EdgeCurve, curves_of
+from pixmetry.observe.edges import MOST_RIGHT_PX, Region, Spread
 
+SHARPEST_PX2, NEGLIGIBLE = 0.04, 1e-3  # variance of a Gaussian that no lens falls below here; in units of noise
 PERIOD_PX = 128.0  # of the square wave that stands for an edge
 MOST_FREQUENCY = 3.0  # cycles/px
 TAPS = 56
@@ -155,7 +157,7 @@ LINE_LIMITS = {
     "echo_px": (0.05, 40.0),
     "branch_px": (0.02, 40.0),
 }
-STARTS = {"cutoff_rel": (0.4,), "natural_rel": (0.4, 0.9), "damping": (0.6,), "ghost_rel": (0.03,), "echo_px": (0.7, 3.0, 9.0)}
+STARTS = {"cutoff_rel": (0.4,), "natural_rel": (0.4, 0.9), "damping": (0.5,), "ghost_rel": (0.03,), "echo_px": (0.7, 2.0, 4.0, 9.0)}
 STARTS |= {"branch_px": (0.5, 3.0, 9.0)}
 
 
@@ -175,9 +177,15 @@ class _Seen:
         wave = np.exp(2j * np.pi * nu * curve.place_px[:, None]) / (1j * np.pi * nu * PERIOD_PX) * np.sinc(BIN_PX * nu)
         wave = wave * np.exp(-2 * np.pi**2 * curve.jitter_px2 * nu**2)
         # share = ½ + 2 Re Σ over positive odd harmonics
-        self.map = np.asarray(np.concatenate([root @ (2 * wave.real), -(root @ (2 * wave.imag))], axis=1), float)
-        self.ones = root @ np.ones(len(curve.value))
-        self.value = root @ curve.value
+        drawn = np.concatenate([root @ (2 * wave.real), -(root @ (2 * wave.imag))], axis=1)
+        ones, value = root @ np.ones(len(curve.value)), root @ curve.value
+        # what spectra that fall at least as fast as this one can reach; the rest of the curve is noise in every model
+        falls = np.tile(np.exp(-2 * np.pi**2 * SHARPEST_PX2 * nu**2), 2)
+        basis, size, _ = np.linalg.svd(np.column_stack([drawn * falls, ones]), full_matrices=False)
+        basis = basis[:, size > NEGLIGIBLE]
+        self.map: Array = np.asarray(basis.T @ drawn, float)
+        self.ones, self.value = basis.T @ ones, basis.T @ value
+        self.rest = float(value @ value - self.value @ self.value)
         late = 1.0 if curve.across == "x" else -curve.slope
         self.late = np.exp(-2j * np.pi * np.outer(nu * late, np.arange(TAPS)))
         self.main = 0 if curve.across == "x" else 1
@@ -262,7 +270,7 @@ def fit_model(
             drawn = s.drawn(np.array(spectra))
             share = drawn[:, 0] + 0.5 * s.ones
             residual = s.value - low * s.ones - height * share
-            chi2 += float(residual @ residual)
+            chi2 += float(residual @ residual) + s.rest
             jacobian = np.column_stack([height * drawn[:, 1:], s.ones, share])
             parts.append((jacobian.T @ jacobian, jacobian.T @ residual))
         return chi2, parts
@@ -280,8 +288,14 @@ def fit_model(
             right += side[:n] - damped[:n, n:] @ both[:, -1]
             solved.append(both)
         scale = np.sqrt(np.maximum(np.diag(reduced), 1e-300))
-        step = np.linalg.lstsq(reduced / np.outer(scale, scale), right / scale, rcond=1e-12)[0] / scale
+        reduced, right = reduced / np.outer(scale, scale), right / scale
         now = np.concatenate([p[list(free)], q])
+        step = np.linalg.lstsq(reduced, right, rcond=1e-12)[0] / scale
+        held = (now + step < lows) | (now + step > highs)
+        if held.any():  # these go to their limits, the others as is best with that
+            step = np.clip(now + step, lows, highs) - now
+            rest = right - reduced[:, held] @ (step * scale)[held]
+            step[~held] = np.linalg.lstsq(reduced[np.ix_(~held, ~held)], rest[~held], rcond=1e-12)[0] / scale[~held]
         # no parameter more than doubles or falls below a half in one step
         trial = np.clip(now + np.clip(step, -0.5 * np.abs(now) - 0.02, np.abs(now) + 0.02), lows, highs)
         taken = trial - now
@@ -308,7 +322,7 @@ def fit_model(
     information[np.diag_indices(n)] += 12 / widths**2
     scale = np.sqrt(np.diag(information))
     covariance = np.linalg.pinv(information / np.outer(scale, scale), rcond=1e-10, hermitian=True) / np.outer(scale, scale)
-    dof = sum(len(s.value) for s in seen) - n - 3 * len(seen)
+    dof = sum(len(s.curve.value) for s in seen) - n - 3 * len(seen)
     line = dict(zip(names, map(float, q), strict=True))
     return LineFit(model, p, tuple(free), line, own, np.asarray(covariance, float), chi2, max(dof, 1))
 
@@ -320,7 +334,7 @@ def _of_others(p: Array) -> float:
 
 # ---- which model ------------------------------------------------------------------------------------------------------------------------
 
-FAR_CHI2 = 150.0  # models so far above the best after a few steps are left there
+FAR_CHI2, FAR_TIMES = 100.0, 5.0  # models so far above the best after a few steps are left there
 TRIAL_ITERATIONS = 7
 SURVIVING = 1e-4  # probability of a model over that of the best, below which it is left out of the mean
 CERTAIN = 0.99  # probability that is enough to speak of a part or a kind as known
@@ -387,12 +401,28 @@ class LineSearch:
         return max(least[0] - least[1], 0.0) / self.scale
 
 
+def fit_line(measured: Sequence[tuple[Region, Spread]]) -> tuple[Estimates, Estimates]:
+    """Fit the video line of an analogue camera, and lens and pixel in front of it, to slanted edges; see `line_estimates`.
+
+    Parameters
+    ----------
+    measured : sequence of (Region, Spread)
+        The edges, as `pixmetry.observe.edges.search_edges` finds them in pictures of an analogue camera.
+    """
+    found = search_models(curves_of(measured, MOST_RIGHT_PX))
+    if found is not None:
+        return line_estimates(found)
+    told = "edges along x and along y are needed: those along y show lens and pixel without the line"
+    line = {name: told for names in OF_PART.values() for name in names} | {"delay_px": told}
+    return replace(Estimates.empty(), reasons=line), replace(Estimates.empty(), reasons={"spread_var_px2": told})
+
+
 def search_models(curves: Sequence[EdgeCurve]) -> LineSearch | None:
     """Fit all lines that are looked for; None where there are not edges of both directions."""
     if {c.across for c in curves} != {"x", "y"}:
         return None
     seen = [_Seen(c) for c in curves]
-    optics = np.array([_start_variance(curves), 0.8, 0.8, 0.0, 0.0])
+    optics = np.array([_start_variance(curves), 0.9, 0.9, 0.0, 0.0])
     found = _search(seen, optics, (0, 1, 2))
     best = min(found, key=lambda f: f.chi2)
     plates = []
@@ -423,26 +453,42 @@ def _start_variance(curves: Sequence[EdgeCurve]) -> float:
 
 
 def _search(seen: Sequence[_Seen], optics: Array, free: Sequence[int]) -> list[LineFit]:
-    """All models, those without echoes first; of models that are far from the best only a few steps are taken."""
+    """All models, those without echoes first, each with all minima that it has; far from the best only a few steps are taken."""
     own = np.array([[0.0, 0.0, 1.0]] * len(seen))
     out: list[LineFit] = []
+
+    def go_on(fit: LineFit) -> LineFit:
+        best = min((f.chi2 for f in out), default=np.inf)
+        if fit.chi2 > FAR_TIMES * best + FAR_CHI2:
+            return fit_model(seen, fit.model, fit.optics, free, fit.line, fit.own, 1)
+        return fit_model(seen, fit.model, fit.optics, free, fit.line, fit.own)
+
     for echo in ("", "near", "far", "branch"):
         for (kind, order), amplifier in product((("off", 0), *FILTERS), (False, True)):
+            if order == 2 and amplifier:  # two of one kind
+                continue
             model = LineModel(kind, order, amplifier, echo)
             before = next((f.line for f in out if f.model == replace(model, echo="")), None)
-            fit = _from_starts(seen, model, optics, free, before, own)
-            best = min((f.chi2 for f in out), default=np.inf)
-            if fit.chi2 - best < FAR_CHI2 * max(best / fit.dof, 1.0):
-                fit = fit_model(seen, model, fit.optics, free, fit.line, fit.own)
-            out.append(fit)
+            tried = _from_starts(seen, model, optics, before, own)
+            out += _distinct([go_on(fit) for fit in tried[: 3 if echo == "far" else 1]])
     least = min(f.chi2 for f in out)
     for fit in [f for f in out if f.chi2 - least < FAR_CHI2 * max(least / f.dof, 1.0)]:  # each without one of its parts, from where it is
         for less in _parts_left_out(fit.model):
-            place = next(i for i, f in enumerate(out) if f.model == less)
             again = fit_model(seen, less, fit.optics, free, {name: fit.line[name] for name in less.names}, fit.own)
-            if again.chi2 < out[place].chi2:
-                out[place] = again
+            same = [f for f in out if f.model == less]
+            out = [f for f in out if f.model != less] + _distinct([*same, again])
     return out
+
+
+def _distinct(fits: Sequence[LineFit]) -> list[LineFit]:
+    """Fits of one model, the best first, without those that are the same minimum again."""
+    kept: list[LineFit] = []
+    for fit in sorted(fits, key=lambda f: f.chi2):
+        u = np.sqrt(np.diag(fit.covariance))[len(fit.free) :]
+        q = np.array(list(fit.line.values()))
+        if all((np.abs(q - np.array(list(f.line.values()))) > u).any() for f in kept):
+            kept.append(fit)
+    return kept
 
 
 def _parts_left_out(model: LineModel) -> list[LineModel]:
@@ -451,10 +497,8 @@ def _parts_left_out(model: LineModel) -> list[LineModel]:
     return [m for m in options if m != model]
 
 
-def _from_starts(
-    seen: Sequence[_Seen], model: LineModel, optics: Array, free: Sequence[int], before: dict[str, float] | None, own: Array
-) -> LineFit:
-    """The fit from the start of the line's parameters that leads to the smallest χ² after a few steps."""
+def _from_starts(seen: Sequence[_Seen], model: LineModel, optics: Array, before: dict[str, float] | None, own: Array) -> list[LineFit]:
+    """Fits after a few steps from each start of the line's parameters, with the optics as they are, the best first."""
     names = model.names
     options = [[v for v in STARTS[name] if model.limits(name)[0] <= v <= model.limits(name)[1]] for name in names]
     starts = [dict(zip(names, s, strict=True)) for s in product(*options)]
@@ -465,8 +509,8 @@ def _from_starts(
         own = own.copy()
         delay = model.delay_px(values)
         own[:, 0] = [-delay if s.main == 0 else s.curve.slope * delay for s in seen]  # so that the middle of the edge stays in its place
-        tried.append(fit_model(seen, model, optics, free, values, own, TRIAL_ITERATIONS))
-    return min(tried, key=lambda f: f.chi2)
+        tried.append(fit_model(seen, model, optics, (), values, own, TRIAL_ITERATIONS))
+    return sorted(tried, key=lambda f: f.chi2)
 
 
 # ---- what is told -----------------------------------------------------------------------------------------------------------------------
@@ -505,7 +549,8 @@ def line_estimates(found: LineSearch) -> tuple[Estimates, Estimates]:
     values, covariance = _mean_of_models(found, names)
     optics, line = _split(found, names, values, covariance)
     delay = line["delay_px"]
-    reasons, left_out = {}, []
+    reasons: dict[str, str] = {}
+    left_out: list[str] = []
     for part, own in OF_PART.items():
         why = ""
         if part not in present:
@@ -521,7 +566,7 @@ def line_estimates(found: LineSearch) -> tuple[Estimates, Estimates]:
             reasons |= dict.fromkeys(own, why)
             left_out += list(own)
     line = line.select([name for name in line.names if name not in left_out])
-    settings = {"kind": found.best.model.kind, "order": found.best.model.order} if "cutoff_rel" in line else {}
+    settings: dict[str, str | int] = {"kind": found.best.model.kind, "order": found.best.model.order} if "cutoff_rel" in line else {}
     return replace(line, reasons=reasons, settings=settings, confounders=_correlated(line)), optics
 
 
@@ -582,8 +627,9 @@ def _reason_of_absence(found: LineSearch, part: str, delay: Number) -> str:
     if part not in found.best.model.parts and found.fall(part) < FOUND_CHI2 and not _exchanged(found, part):
         fall = f"χ² falls by {found.fall(part):.0f} with it, and by {FOUND_CHI2:g} or more where it is seen"
         return f"the edges do not need it: {fall}"
-    others = sorted({WORDS[p] for f in found.rivals for p in f.model.parts if part not in f.model.parts} - {WORDS[part]})
-    apart = f"not separable from {' and '.join(others)}" if others else "not separable from a line without limit"
+    most = min(f.chi2 for f in found.fits) + FOUND_CHI2 * found.scale
+    others = sorted({WORDS[p] for f in found.fits if part not in f.model.parts and f.chi2 < most for p in f.model.parts})
+    apart = f"not separable from {' and '.join(others)}" if others else "not separable from a line without it"
     return f"{apart}; {_delay_words(delay)}; {NEEDED}"
 
 

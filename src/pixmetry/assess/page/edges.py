@@ -52,7 +52,7 @@ def summary_sentence(found: SlantedEdges) -> str:
         return f"No edge could be measured; {len(found.refused)} were refused." if found.refused else "No edge was found."
     half = f" The response falls to one half at {' and '.join(halves)}." if halves else ""
     told = f"{len(found.edges)} edges were measured ({', '.join(counts)}); {len(found.refused)} were refused.{half}"
-    return " ".join([told, *_parts_of_blur(found)])
+    return " ".join([told, *_parts_of_blur(found), *_line_words(found)])
 
 
 def _parts_of_blur(found: SlantedEdges) -> list[str]:
@@ -70,6 +70,20 @@ def _parts_of_blur(found: SlantedEdges) -> list[str]:
             number = printed_number(value) if value.is_limit else uncertain(value.value, value.u, "px")
             parts.append(f"{word} {number.value}{'' if value.is_limit else f' ± {number.u}'} px")
     return [f"Fitted together: {', '.join(parts)}."]
+
+
+def _line_words(found: SlantedEdges) -> list[str]:
+    """How much the video line of an analogue camera delays, and what was told apart in it."""
+    if found.line is None:
+        return []
+    if "delay_px" not in found.line:
+        return [f"The video line is not told: {next(iter(found.line.reasons.values()), 'no edge could be measured')}."]
+    delay = uncertain(found.line["delay_px"].value, found.line["delay_px"].u, "px")
+    words = {"cutoff_rel": "a low-pass filter", "natural_rel": "the video amplifier", "ghost_rel": "an echo of the cable"}
+    words |= {"branch_px": "an open branch"}
+    parts = [word for name, word in words.items() if name in found.line]
+    told = f"; measured in it: {', '.join(parts)}" if parts else ""
+    return [f"The video line delays by {delay.value} ± {delay.u} px{told}."]
 
 
 def _row(edge: SlantedEdge) -> list[Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -10,8 +11,10 @@ import numpy as np
 from pixmetry.camera.contribution import Contribution, Probe
 from pixmetry.camera.line import SMALLEST_ECHO
 from pixmetry.camera.line_contribution import through_line
+from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
 from pixmetry.sources.cable._undo import without
 
@@ -89,6 +92,13 @@ def tail(params: TPiece, pixel_hz: float, row_px: int) -> float:
     return float(np.abs(amplitude[delay * pixel_hz > near(params, pixel_hz, row_px)[2]]).sum())
 
 
+def measure(observations: Observations) -> Estimates:
+    """Length of an open branch of matched cable, from slanted edges. A second termination changes the level only: they do not show it."""
+    found, clock_mhz = observations.video_line({"length_m": "branch_px"}, where="cable.t_piece")
+    length = found.scaled({"length_m": (1 / (clock_mhz * 1e6 * DELAY_S_PER_M), "m")})
+    return replace(length, settings={"branch": "open"}, reasons={"length_m": "of a branch of 75 Ω, at 0.66 of the speed of light"})
+
+
 def propagate(params: TPiece, probe: Probe) -> Contribution:
     """The target with its echoes, on the rest of the camera's line; the level without the target, and thresholds, follow the load."""
     if params.branch == "none":
@@ -112,6 +122,7 @@ SOURCE = Source(
     typical=TPiece(branch="open", length_m=5.0),
     bound=TPiece(branch="open", length_m=10.0),
     forward=forward,
+    measure=measure,
     correct=correct,
     propagate=propagate,
     near=near,
@@ -124,5 +135,4 @@ SOURCE = Source(
     references=("D. M. Pozar, Microwave Engineering, 4th ed., §2.3 and §4.1 (reflection, and junctions of lines)",),
     leaves="detail that the bandwidth of the line has lost; noise, raised a little",
     advice="Remove T-pieces. Or loop the signal through inputs of high impedance, with one termination at the end of the line.",
-    reasons={"measure": "needs the image of a sharp edge, and the level without the branch: dark and flat frames do not show them"},
 )

@@ -11,8 +11,10 @@ import numpy as np
 from pixmetry.camera.contribution import Contribution, Probe
 from pixmetry.camera.line import SMALLEST_ECHO, Line
 from pixmetry.camera.line_contribution import through_line
+from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
 from pixmetry.sources.cable._undo import without
 
@@ -119,6 +121,38 @@ def tail(params: Termination, pixel_hz: float, row_px: int) -> float:
     return abs(params.ghost) ** first
 
 
+def measure(observations: Observations) -> Estimates:
+    """Length and impedances of a cable that makes the echoes which slanted edges show.
+
+    An echo has an amplitude ρ = Γ_S Γ_L and a delay. For a positive ρ the impedance of the cable is given, between ends of 75 Ω; for a
+    negative one those of the ends, of a cable of 75 Ω. Other impedances of the same ρ make the same echoes.
+    """
+    found, clock_mhz = observations.video_line({"ghost": "ghost_rel", "echo": "echo_px"}, where="cable.termination")
+    ghost, length_m = found["ghost"].value, found["echo"].value / (clock_mhz * 1e6) / DELAY_S_PER_M
+    root = math.sqrt(abs(ghost))
+    units: tuple[str, ...] = ("m", "Ω")
+    by_length = length_m / found["echo"].value
+    if ghost > 0:
+        names: tuple[str, ...] = ("length_m", "line_ohm")
+        values = [length_m, 75 * (1 - root) / (1 + root)]
+        jacobian = np.array([[0.0, by_length], [-75 / (root * (1 + root) ** 2), 0.0]])
+    else:
+        names, units = ("length_m", "source_ohm", "load_ohm"), ("m", "Ω", "Ω")
+        values = [length_m, 75 * (1 + root) / (1 - root), 75 * (1 - root) / (1 + root)]
+        jacobian = np.array([[0.0, by_length], [-75 / (root * (1 - root) ** 2), 0.0], [75 / (root * (1 + root) ** 2), 0.0]])
+    told = f"the echo has an amplitude of {ghost:+.4f}: other impedances of cable and ends make the same one"
+    return Estimates(
+        names,
+        np.array(values),
+        jacobian @ found.covariance @ jacobian.T,
+        np.full(len(names), found.dof.min()),
+        units,
+        found.method,
+        found.confounders,
+        reasons=dict.fromkeys(names[1:], told) | {"length_m": "at 0.66 of the speed of light"},
+    )
+
+
 def propagate(params: Termination, probe: Probe) -> Contribution:
     """The target with its echoes, on the rest of the camera's line; for a centroid over everything the first moment, Δx = ρτ/(1 − ρ)."""
     if abs(params.ghost) < 1e-12 and not params.skin_db:
@@ -142,6 +176,7 @@ SOURCE = Source(
     typical=Termination(length_m=5.0, line_ohm=50.0),
     bound=Termination(length_m=20.0, line_ohm=50.0, load_ohm=1000.0),
     forward=forward,
+    measure=measure,
     correct=correct,
     propagate=propagate,
     near=near,
@@ -153,5 +188,4 @@ SOURCE = Source(
     references=("D. M. Pozar, Microwave Engineering, 4th ed., §2.3 (reflection on a terminated line)",),
     leaves="detail that the bandwidth of the line has lost; noise, raised a little",
     advice="Use 75 Ω cable with 75 Ω at both ends, short, without T-pieces; or a digital camera.",
-    reasons={"measure": "needs the image of a sharp edge or line: dark and flat frames do not show it"},
 )

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
 from pixmetry.camera.contribution import Contribution, Probe
 from pixmetry.camera.line import reach_px
 from pixmetry.camera.line_contribution import through_line
+from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
 
 SHARE_BEYOND = 1e-4  # of a step, beyond the near context
@@ -49,6 +52,13 @@ def tail(params: VideoAmplifier, pixel_hz: float, row_px: int) -> float:
     return SHARE_BEYOND
 
 
+def measure(observations: Observations) -> Estimates:
+    """Natural frequency and damping from slanted edges."""
+    names = {"natural_mhz": "natural_rel", "damping": "damping"}
+    found, clock_mhz = observations.video_line(names, where="electronics.video_amplifier")
+    return replace(found.scaled({"natural_mhz": (clock_mhz, "MHz")}), settings={})
+
+
 def propagate(params: VideoAmplifier, probe: Probe) -> Contribution:
     """The target behind the amplifier, on the rest of the camera's line; for a centroid over everything the first moment, 2ζ/ω0."""
     return through_line(probe, lambda line: line.filtered([], params.poles))
@@ -79,6 +89,7 @@ SOURCE = Source(
     typical=VideoAmplifier(natural_mhz=5.0, damping=0.25),
     bound=VideoAmplifier(natural_mhz=5.0, damping=0.2),
     forward=forward,
+    measure=measure,
     propagate=propagate,
     near=near,
     tail=tail,
@@ -89,7 +100,6 @@ SOURCE = Source(
     references=("K. Ogata, Modern Control Engineering, 5th ed., §5-3 (second-order systems)",),
     advice="Load the output with its 75 Ω; use a camera with a flat video band, or a digital one.",
     reasons={
-        "measure": "needs the image of a sharp edge or line: dark and flat frames do not show it",
         "correct": "inverting a filter from samples at the pixel rate needs the response between the samples, and amplifies the noise",
         "neutral": "every amplifier has an upper frequency limit; switch the source off for a line without limit",
     },

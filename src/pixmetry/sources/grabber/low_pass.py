@@ -9,8 +9,10 @@ import numpy as np
 from pixmetry.camera.contribution import Contribution, Probe
 from pixmetry.camera.line import group_delay_s, low_pass_poles, reach_px
 from pixmetry.camera.line_contribution import through_line
+from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
 
 SHARE_BEYOND = 1e-4  # of a step, beyond the near context
@@ -60,6 +62,12 @@ def delay_s(params: LowPass) -> float:
     return group_delay_s(params.zeros, params.poles)
 
 
+def measure(observations: Observations) -> Estimates:
+    """Kind, order and cut-off from slanted edges: orders 1 to 4 are told apart, all-pass sections are not looked for."""
+    found, clock_mhz = observations.video_line({"cutoff_mhz": "cutoff_rel"}, where="grabber.low_pass")
+    return found.scaled({"cutoff_mhz": (clock_mhz, "MHz")})
+
+
 def propagate(params: LowPass, probe: Probe) -> Contribution:
     """The target behind the filter, on the rest of the camera's line."""
     if params.kind == "off":
@@ -83,6 +91,7 @@ SOURCE = Source(
     typical=LowPass(kind="butterworth", order=3, cutoff_mhz=5.0),
     bound=LowPass(kind="butterworth", order=3, cutoff_mhz=3.0),
     forward=forward,
+    measure=measure,
     propagate=propagate,
     near=near,
     tail=tail,
@@ -97,7 +106,6 @@ SOURCE = Source(
     advice="Switch it off, unless the signal contains frequencies above half the sampling frequency. Calibrate and measure with the "
     "same setting.",
     reasons={
-        "measure": "needs the image of a slanted edge: dark and flat frames do not show it",
         "correct": "inverting a filter from samples at the pixel rate needs the response between the samples, and amplifies the noise",
     },
 )
