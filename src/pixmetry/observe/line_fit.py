@@ -366,7 +366,8 @@ class LineSearch:
         """Models with their probabilities, the most probable first; those below `SURVIVING` are left out.
 
         What the best model may hide, a further part, counts by χ² + 2 k (H. Akaike, IEEE Trans. Autom. Control 19, 1974, 716): every
-        camera has an amplifier and a cable, and a part is not less probable because its parameters could have been anything.
+        camera has an amplifier and a cable, and a part is not less probable because its parameters could have been anything. Another line
+        of more parts than the best needs a χ² that is less by 25: a Butterworth filter of third order is an RC stage and an amplifier too.
         """
         costs = np.array([f.chi2 / self.scale + f.occam for f in self.fits])
         best = self.fits[int(np.argmin(costs))]
@@ -374,6 +375,8 @@ class LineSearch:
             if f.model.holds(best.model):
                 more = len(f.model.names) - len(best.model.names)
                 costs[i] = min(costs[i], f.chi2 / self.scale + best.occam + 2 * more)
+            elif len(f.model.parts) > len(best.model.parts) and best.chi2 - f.chi2 < FOUND_CHI2 * self.scale:
+                costs[i] = np.inf
         raw = np.exp(-0.5 * (costs - costs.min()))
         kept = [(self.fits[i], float(raw[i])) for i in np.argsort(costs) if raw[i] > SURVIVING]
         total = sum(w for _, w in kept)
