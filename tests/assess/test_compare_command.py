@@ -297,6 +297,22 @@ def test_assessments_are_compared(tmp_path: Path) -> None:
     assert compare(one, one).same
 
 
+def test_what_a_calibration_leaves_is_compared(tmp_path: Path) -> None:
+    """A row of which half is left changes by half, with the same relative u; the totals likewise; and the note says both."""
+    for name, left in (("a", 0.006), ("b", 0.009)):
+        budget = json.loads((assessment(tmp_path / name) / "results.json").read_text())
+        for part in ("rows", "verdicts", "with_accepted"):
+            budget["budget"][part][0]["calibrated_px"] = left
+        (tmp_path / name / "results.json").write_text(json.dumps(budget))
+    result = compare(tmp_path / "a", tmp_path / "b")
+    found = {row.key: row for row in result.rows}
+    assert found["budget.sensor.shot_noise"].verdict == found["budget.verdict.1_frames"].verdict == "same"
+    for key in ("budget.sensor.shot_noise.calibrated", "budget.verdict.1_frames.calibrated", "budget.with_accepted.1_frames.calibrated"):
+        assert found[key].verdict == "changed" and found[key].a.value == 0.006
+        assert found[key].b.u == pytest.approx(0.009 * math.hypot(0.05, 0.001 / 0.28))
+    assert any("0.0123, 0.0123 px, 0.006, 0.009 px after a calibration" in note for note in result.notes)
+
+
 def test_the_gain_is_one_cause_for_all_rows_of_a_budget(tmp_path: Path) -> None:
     """Four equal rows scale with the gain together: it moves the total by its own 0.36 %, not by half of that."""
     record = json.loads((assessment(tmp_path / "a") / "results.json").read_text())

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pixmetry.assess.judge.differences import Difference, FleetRow, Subject, decided, difference_of, family, fleet_chance, fleet_row, holm
-from pixmetry.assess.judge.subjects import load_subject
+from pixmetry.assess.judge.subjects import CALIBRATED, load_subject
 from pixmetry.core.errors import InputError
 from pixmetry.emva.files.json_format import value_record
 from pixmetry.emva.records import MONO, DataSheet
@@ -184,11 +184,16 @@ def _notes(subjects: Sequence[Subject], passed_over: frozenset[str] = frozenset(
         notes.append(f"left out, because not all files have them: channels {', '.join(rest)}")
     told = [s.worth for s in subjects if s.worth is not None]
     if len(told) == len(subjects) and len({str(task) for task, _ in told}) == 1:
-        worth = ", ".join(f"{u_px:.3g}" for _, u_px in told)
-        notes.append(f"the standard uncertainty of one coordinate of a target in one frame is {worth} px (k = 1)")
+        before, after = ([px[state] for _, px in told if state in px] for state in ("", CALIBRATED))
+        worth = f"the standard uncertainty of one coordinate of a target in one frame is {_listed(before)} px"
+        notes.append(f"{worth}{f', {_listed(after)} px after a calibration' if len(after) == len(told) else ''} (k = 1)")
     elif len(told) == len(subjects):
         notes.append("target or estimator differ: the uncertainties of a coordinate belong to different tasks")
     return notes
+
+
+def _listed(sizes: Sequence[float]) -> str:
+    return ", ".join(f"{size:.3g}" for size in sizes)
 
 
 def compare_fleet(sources: Iterable[DataSheet | str | Path], *, level: float = 0.95, names: Sequence[str] | None = None) -> Fleet:

@@ -40,7 +40,7 @@ class Subject:
     values: Mapping[tuple[str, str], Number]
     absent: Mapping[str, str]  # by source of an assessment: why it was not measured
     photons_u_rel: float = 0.0
-    worth: tuple[Any, float] | None = None  # of an assessment: target and estimator, and u of its place, px
+    worth: tuple[Any, Mapping[str, float]] | None = None  # of an assessment: target and estimator; u of a place, px, by end of the key
     how: Mapping[str, str] = field(default_factory=dict)  # of an assessment: what is no number, such as the estimator
 
 

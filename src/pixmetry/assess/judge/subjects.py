@@ -19,6 +19,7 @@ from pixmetry.emva.records import MONO, DataSheet
 from pixmetry.files.strict_json import number_in, parse_json
 
 RESULT_FILES = ("results.json", "calibration.json")
+CALIBRATED = ".calibrated"  # end of the key of what a calibration leaves
 
 
 def load_subject(source: DataSheet | str | Path, name: str = "") -> Subject:
@@ -72,7 +73,7 @@ def _of_assessment(record: Mapping[str, Any], name: str, where: str) -> Subject:
         budget = record["budget"]
         values |= _of_budget(budget, _gain_u_rel(groups["photon_transfer"]))
         how = {"estimator": _estimator_text(budget["estimator"]), "target": str(budget["target"]["kind"])}
-        worth = ((budget["target"], how["estimator"]), float(budget["verdicts"][0]["total_px"]))
+        worth = ((budget["target"], how["estimator"]), dict(_sizes(budget["verdicts"][0])))
         placed = {(MONO, key): value for key, value in values.items()}
         return Subject(name, "assessment", "", dict(record["camera"]), placed, dict(record["unmeasured"]), worth=worth, how=how)
     except (KeyError, IndexError, TypeError, AttributeError, ValueError):
@@ -95,7 +96,7 @@ def _of_budget(budget: Mapping[str, Any], gain_u_rel: float) -> dict[str, Number
 
     Of a measured row that is what its parameters leave open, of all others half of what its formula declares to leave open; with both the
     gain's. A total holds the rows', each as far as it counts, the gain's, which all of them share, and the error of chance where it is by
-    Monte Carlo.
+    Monte Carlo. What a calibration leaves of a row is as uncertain, relatively, as the row.
     """
     units = {True: "px", False: "1"}
     values = {f"budget.target.{k}": Number(float(v), 0.0, math.inf, units[k.endswith("_px")]) for k, v in _numbers(budget["target"])}
@@ -106,28 +107,45 @@ def _of_budget(budget: Mapping[str, Any], gain_u_rel: float) -> dict[str, Number
             continue
         formula = 0.5 * max(float(contribution["model_error"]) * total, float(contribution["floor_px"]))
         known = float(row["u_of_total_px"]) if row["status"] == "measured" else formula
-        values[f"budget.{row['name']}"] = Number(total, math.hypot(known, gain_u_rel * total), math.inf, "px", row["status"], "")
         known_rows.append((row, known))
+        for state, size in _sizes(row):
+            left = size / total if total else 1.0
+            values[f"budget.{row['name']}{state}"] = Number(
+                size, left * math.hypot(known, gain_u_rel * total), math.inf, "px", row["status"]
+            )
     by = budget.get("headline") or {}
     chance = float(by.get("se_simulated_px") or 0.0) if by.get("by") == "Monte Carlo" else 0.0
     for group, holds in (("verdicts", False), ("with_accepted", True)):
+        counted = [(row, known) for row, known in known_rows if holds or row["status"] != "accepted"]
         for one in budget.get(group, ()):
-            total, frames = float(one["total_px"]), int(one.get("frames", 1))
-            counted = [(row, known) for row, known in known_rows if holds or row["status"] != "accepted"]
-            square = sum((float(row["total_px"]) * known * _kept(row, frames)) ** 2 for row, known in counted)
-            u = math.hypot(math.sqrt(square) / total if total else 0.0, gain_u_rel * total, chance)
-            key = f"budget.{'verdict' if group == 'verdicts' else group}.{frames}_frames"
-            values[key] = Number(total, u, math.inf, "px", str(by.get("by", "sum")), "")
+            key = f"budget.{'verdict' if group == 'verdicts' else group}.{int(one.get('frames', 1))}_frames"
+            for state, size in _sizes(one):
+                square = sum(_square_u(row, known, int(one.get("frames", 1)), state) for row, known in counted)
+                u = math.hypot(math.sqrt(square) / size if size else 0.0, gain_u_rel * size, chance)
+                values[key + state] = Number(size, u, math.inf, "px", str(by.get("by", "sum")))
     return values
 
 
-def _kept(row: Mapping[str, Any], frames: int) -> float:
-    """Part of the square of a row's total that the mean over several frames keeps; what drifts or is the object's stays whole."""
-    contribution, total = row["contribution"], float(row["total_px"])
-    if frames == 1 or total == 0 or contribution["gum_class"] in ("D", "O"):
+def _sizes(record: Mapping[str, Any]) -> list[tuple[str, float]]:
+    """A total, and what a calibration leaves of it, where the record says so; each with the end of its key."""
+    left = record.get("calibrated_px")
+    return [("", float(record["total_px"])), *([] if left is None else [(CALIBRATED, float(left))])]
+
+
+def _square_u(row: Mapping[str, Any], known: float, frames: int, state: str) -> float:
+    """Square of a row's size times its uncertainty, in the mean over frames."""
+    total = float(row["total_px"])
+    size = dict(_sizes(row)).get(state, total)
+    return (size * known * (size / total if total else 0.0) * _kept(row, frames, size)) ** 2
+
+
+def _kept(row: Mapping[str, Any], frames: int, size: float) -> float:
+    """Part of the square of a row's size that the mean over several frames keeps; what drifts or is the object's stays whole."""
+    contribution = row["contribution"]
+    if frames == 1 or size == 0 or contribution["gum_class"] in ("D", "O"):
         return 1.0
     in_time = 0.5 * sum(float(v) ** 2 for v in contribution["time_px"])
-    return 1.0 - (1.0 - 1.0 / frames) * min(in_time / total**2, 1.0)
+    return 1.0 - (1.0 - 1.0 / frames) * min(in_time / size**2, 1.0)
 
 
 def _numbers(record: Mapping[str, Any]) -> list[tuple[str, float]]:
