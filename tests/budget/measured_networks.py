@@ -21,8 +21,10 @@ from pixmetry.camera.camera import Camera
 FREE = {
     "principal_point_and_scale": ("c", "xp", "yp", "b1"),
     "lens": ("c", "xp", "yp", "b1", "b2", "p1", "p2", "k1", "k2", "k3"),
+    "five_terms": ("c", "xp", "yp", "b1", "b2", "p1", "p2", "k1", "k2", "k3", "k4", "k5"),
     "residual_grid": ("c", "xp", "yp", "b1", "b2", "p1", "p2", "k1", "k2", "k3"),
 }
+GOLDEN = np.pi * (3 - np.sqrt(5))  # turns by this angle stand evenly all round, whatever their number
 QUICK = {"snoop": False, "folds": 0, "variance_components": False, "loss": "none", "eccentricity": False}
 
 
@@ -110,8 +112,13 @@ def similar(found: np.ndarray, true: np.ndarray) -> np.ndarray:
 
 
 def field_of_targets(rng: np.random.Generator, half_mm: np.ndarray, points: int, flat: bool) -> np.ndarray:
-    """Points all over a field, in its own frame."""
-    return rng.uniform(-1, 1, (points, 3)) * [*half_mm, 0.0 if flat else 0.3 * half_mm.max()]
+    """Points all over a field, in its own frame: as on a test field, one at random in each cell of a lattice."""
+    rows = max(1, round(np.sqrt(points * half_mm[1] / half_mm[0])))
+    row, place = np.arange(points) % rows, np.arange(points) // rows
+    in_row = np.bincount(row)[row]
+    x, y = (place + rng.uniform(size=points)) / in_row, (row + rng.uniform(size=points)) / rows
+    at = np.stack([2 * x - 1, 2 * y - 1, rng.uniform(-1, 1, points)], -1)
+    return at * [*half_mm, 0.0 if flat else 0.3 * half_mm.max()]
 
 
 def calibration_shots(
@@ -119,8 +126,8 @@ def calibration_shots(
 ) -> Shots:
     """Oblique images all round a field, rolled by quarters."""
     position = []
-    for _ in range(images):
-        turn, tilt = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(*oblique_deg))
+    for i in range(images):
+        turn, tilt = GOLDEN * i + rng.uniform(-0.3, 0.3), np.radians(rng.uniform(*oblique_deg))
         position.append(-distance_mm * np.array([np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), np.cos(tilt)]))
     rotation = np.stack([looking(p, 0.02 * half_mm.max() * rng.standard_normal(3), i * np.pi / 2) for i, p in enumerate(position)])
     return Shots(rotation, np.array(position), field_of_targets(rng, half_mm, points, flat), np.ones((images, points), bool))

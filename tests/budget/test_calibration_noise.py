@@ -14,12 +14,14 @@ from click.testing import CliRunner
 import pixmetry
 from budget.measured_networks import Measured, calibration_shots
 from pixmetry.budget.calibration_noise import calibration_row
+from pixmetry.budget.fields import Calibration, Places, field_of
 from pixmetry.budget.measured_calibration import as_calibrated, measured_calibration
 from pixmetry.budget.scenario import read_scenario
 from pixmetry.budget.setting import Setting
 from pixmetry.budget.table import ABSENT, DESCRIBED, MEASURED, TYPICAL, Parts, SourceRow
 from pixmetry.calibrate.files.record import calibration_json
-from pixmetry.camera.camera import Camera, load_camera
+from pixmetry.camera.camera import Camera, Element, load_camera
+from pixmetry.camera.catalogue import get_source
 from pixmetry.cli import main
 from pixmetry.core.errors import InputError
 
@@ -85,6 +87,38 @@ def test_a_calibration_that_was_made_brings_lens_noise_and_state(tmp_path: Path)
     assert found.scenario.calibration.model == "lens" and found.point is not None
     told = as_calibrated(read_scenario({"calibration": {"model": "none"}}), measured_calibration(calibration, PRESET))
     assert told.calibration.model == "none"  # what the scenario says goes first
+
+
+def test_a_lens_of_five_radial_terms_is_that_of_the_budget(tmp_path: Path) -> None:
+    """K4 and K5 of a strong lens, from the file of its calibration: the budget's lens is the true one to a few of its u, and is taken up.
+
+    As a lens of three terms it would not be: these leave ten times as much of it, or more.
+    """
+    told = {"k1_per_mm2": -4e-3, "k4_per_mm8": 8e-7, "k5_per_mm10": -4e-8, "pitch_x_um": 5.0, "pitch_y_um": 5.0}
+    lens = get_source("optics.distortion")
+    camera = replace(CAMERA, chain=(Element(lens.id, lens, lens.make(told)),))
+    setting, rng = Setting(camera, read_scenario(OBJECT)), np.random.default_rng(5)
+    shots = calibration_shots(rng, 15, 80, 1000.0, 500 * np.array([800, 600]) / setting.c_px, False)
+    found = {model: Measured(setting, (0.01, 0.01)).calibrated(model, shots, rng) for model in ("lens", "five_terms")}
+    file = tmp_path / "calibration.json"
+    file.write_text(calibration_json(found["five_terms"]), encoding="utf-8")
+    budget = pixmetry.budget(replace(PRESET, chain=(*camera.chain, *PRESET.chain)), OBJECT, calibration=file)
+    rows = {r.name: r for r in budget.rows}
+    assert rows["calibration"].status == rows["optics.distortion"].status == MEASURED
+    measured = budget.setting.described["optics.distortion"].params
+    x, y = np.meshgrid(np.linspace(40, 759, 9), np.linspace(30, 569, 9))
+    seen, true = (np.array(replace(camera, chain=(replace(camera.chain[0], params=p),)).true_positions(x.ravel(), y.ravel()))
+                  for p in (measured, camera.chain[0].params))  # fmt: skip
+    u = np.hypot(*rows["calibration"].after.smooth_px)
+    left = seen - true - (seen - true).mean(axis=1)[:, None]
+    assert rows["optics.distortion"].before_px > 2 and np.sqrt(np.mean(left**2)) < 3 * u < 0.1
+    five = measured_calibration(file, PRESET)
+    assert five.radial == 5 and measured_calibration(found["lens"], PRESET).radial == 3
+    assert rows["optics.distortion"].after_px < 0.002
+    places = Places.over(PRESET.frame_shape, 100.0)
+    field = field_of(camera, places)
+    few, many = (np.nanstd(Calibration("lens", False, places, radial=n).left(field, field)) for n in (3, 5))
+    assert few > 10 * many
 
 
 def test_a_calibration_of_another_sensor_is_refused() -> None:

@@ -6,10 +6,11 @@ belong. It is exact: the camera's own maps give it, no image is needed.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from pixmetry.budget.networks import FOUR, TEN, Images, interior_basis, solve
 from pixmetry.camera.camera import Camera
 
 SAME_CLOCK = 0.005  # relative difference of clocks that are meant to be one
@@ -88,19 +89,26 @@ class Calibration:
     Parameters
     ----------
     model : {"none", "principal_point_and_scale", "lens", "residual_grid"}
-        Nothing; a shift and a scale of each axis, and a small rotation of the camera; these, shear, radial terms up to the seventh power
-        and decentring (D. C. Brown, Photogrammetric Engineering 37(8), 1971); these, and a grid of what is left, interpolated bilinearly.
+        Nothing; a shift and a scale of each axis, and a small rotation of the camera; these, shear, radial terms and decentring (D. C.
+        Brown, Photogrammetric Engineering 37(8), 1971); these, and a grid of what is left, interpolated bilinearly.
     every_image : bool
         A shift and the scales are fitted in every image again.
     places : Places
     aspect : float
         Pitch in y over that in x.
+    radial : int
+        Radial terms of a lens: 3 up to the seventh power, 5 up to the eleventh.
+    images : Images, optional
+        The calibration's own, whose image points are the last of the places. By their adjustment the model is fitted for the places between
+        these and the even ones; poses and points of the calibration take up what they can, and the model the rest.
     """
 
     model: str
     every_image: bool
     places: Places
     aspect: float = 1.0
+    radial: int = 3
+    images: Images | None = None
 
     def left(self, now: np.ndarray, then: np.ndarray) -> np.ndarray:
         """What stays of a field when it was calibrated as it was ``then``; shape (2, n), at the places themselves.
@@ -112,6 +120,9 @@ class Calibration:
         found = now[:, 0]
         if self.model != "none":
             found = found - self._modelled(then)
+            if self.images is not None and self.model != "residual_grid":
+                n, own = self.places.even, found.shape[1] - self.images.image[0].size
+                found[:, n:own] = now[:, 0, n:own] - self._adjusted(self.images, then[:, 0])[:, n:own]
         if self.every_image:
             scales = _scales(*self._unit(np.zeros_like(now)))[:, :, 0]
             found = found - self._followed(found, scales, scales)
@@ -119,13 +130,26 @@ class Calibration:
 
     def _modelled(self, then: np.ndarray) -> np.ndarray:
         x, y = self._unit(then)
-        basis = _oriented(x, y) if self.model == "principal_point_and_scale" else _lens(x, y)
+        basis = _oriented(x, y) if self.model == "principal_point_and_scale" else _lens(x, y, self.radial)
         smooth = self._followed(then[:, 0], basis[:, :, 0], basis)
         rest = then - smooth
         grid = np.einsum("kn,akn->an", self.places.weights, np.nan_to_num(rest[:, 1:]))
         n = self.places.even
         helps = np.nansum((rest[:, 0] - grid)[:, :n] ** 2) < np.nansum(rest[:, 0, :n] ** 2)  # one with cells too large does not
         return smooth[:, 0] + grid if self.model == "residual_grid" and helps else smooth[:, 0]
+
+    def _adjusted(self, images: Images, then: np.ndarray) -> np.ndarray:
+        """What the model says at all places, when the calibration's own images have been adjusted."""
+        half = max(self.places.frame_shape) / 2
+        x, y = (v[0] for v in self._unit(then[:, None]))
+        size = images.image[0].size
+        moved, shape = then[:, -size:].reshape(images.image.shape), images.image.shape[1:]
+        seen = np.isfinite(moved).all(axis=0) & (True if images.seen is None else images.seen)
+        measured = half * np.stack([v[-size:].reshape(shape) for v in (x, y)])
+        which = FOUR if self.model == "principal_point_and_scale" else TEN
+        solved = solve(replace(images, seen=seen, measured=np.where(seen, measured, 0.0)), (1.0, 1.0), which)
+        found = solved.interior @ np.where(seen, moved, 0.0).ravel()
+        return np.asarray(np.tensordot(found, interior_basis(x, y)[which], axes=1))
 
     def _followed(self, values: np.ndarray, basis: np.ndarray, at: np.ndarray) -> np.ndarray:
         n = self.places.even
@@ -150,11 +174,11 @@ def _oriented(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return np.concatenate([_scales(x, y), np.array([[y, -x], [x * x, x * y], [x * y, y * y]])])
 
 
-def _lens(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """What a self-calibration takes up, shape (13, 2, …)."""
+def _lens(x: np.ndarray, y: np.ndarray, terms: int) -> np.ndarray:
+    """What a self-calibration with so many radial terms takes up, shape (10 + terms, 2, …)."""
     r2 = x**2 + y**2
     shear = [[y, x]]
-    radial = [[x * r2**k, y * r2**k] for k in (1, 2, 3)]
+    radial = [[x * r2**k, y * r2**k] for k in range(1, terms + 1)]
     decentring = [[r2 + 2 * x * x, 2 * x * y], [2 * x * y, r2 + 2 * y * y]]
     return np.concatenate([_oriented(x, y), np.array(shear + radial + decentring)])
 

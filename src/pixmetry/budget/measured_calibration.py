@@ -51,6 +51,11 @@ class MeasuredCalibration:
     images: int
     finding: Finding | None = None
 
+    @property
+    def radial(self) -> int:
+        """How many radial terms it has, at least 3: those that were estimated, or held at a value."""
+        return max([3, *(int(n[1]) for n in ("k4", "k5") if n in self.names or self.camera[n])])
+
     def displacements(self, x_px: np.ndarray, y_px: np.ndarray) -> np.ndarray:
         """Independent displacements of places by the noise of the parameters, shape (k, 2, n), px."""
         from pixmetry.calibrate.bundle.model import NAMES

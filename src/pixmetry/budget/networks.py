@@ -11,7 +11,8 @@ from functools import cached_property
 
 import numpy as np
 
-FILLED = 1.0  # of the frame by the targets of a calibration: some of them lie beyond it
+FILLED = 0.9  # of the frame by the targets of a calibration, seen straight on: obliquely, some of them lie beyond it
+SHOWN = 0.94  # of the frame where targets are found: they must be wholly in it
 LEAST_SEEN = 3  # images of each of them
 DEPTH = 0.25  # of the object along the line of sight, over its width
 OBLIQUE_RAD = np.radians(35.0)  # of the images of a calibration
@@ -36,6 +37,8 @@ class Images:
     points : ndarray, shape (n, 3)
     seen : ndarray of bool, shape (m, n), optional
         Which image shows which point; all show all, where it is left out.
+    measured : ndarray, shape (2, m, n), optional
+        Measured places of the image points, as `image`: of these are the polynomials of a lens; without, the displacement is neglected.
     """
 
     c_px: float
@@ -45,6 +48,7 @@ class Images:
     position: np.ndarray
     points: np.ndarray
     seen: np.ndarray | None = None
+    measured: np.ndarray | None = None
 
     @cached_property
     def at(self) -> np.ndarray:
@@ -76,7 +80,7 @@ class Images:
     @cached_property
     def interior(self) -> np.ndarray:
         """Displacements by the interior parameters, shape (10, 2, m, n): x0, y0, c, b1, b2, three radial terms, two of decentring."""
-        return interior_basis(*self.image / (max(self.frame_shape) / 2))
+        return interior_basis(*(self.image if self.measured is None else self.measured) / (max(self.frame_shape) / 2))
 
 
 def interior_basis(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -216,7 +220,7 @@ def calibrating(c_px: float, frame_shape: tuple[int, int], aspect: float, images
     half = np.array([1.0, aspect]) * np.array(frame_shape)[::-1] / 2
     width = FILLED * half / c_px
     field = Images(c_px, frame_shape, aspect, rotation, position, _spread(n) * [*width, depth * width.max()])
-    seen = (np.abs(field.image) < half[:, None, None]).all(axis=0)
+    seen = (np.abs(field.image) < SHOWN * half[:, None, None]).all(axis=0)
     often = np.flatnonzero(seen.sum(axis=0) >= min(LEAST_SEEN, m))
     field = replace(field, points=field.points[often], seen=seen[:, often])
     return field, seen[:, often].sum() / (images * targets)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from pixmetry.budget.measured_calibration import MeasuredCalibration
-from pixmetry.budget.networks import Images, measuring
+from pixmetry.budget.networks import DEPTH, Images, calibrating, measuring
 from pixmetry.budget.probe import Facts, Target, facts_of
 from pixmetry.budget.scenario import GRADIENT_PER_PX, Scenario
 from pixmetry.camera.camera import Camera, Element
@@ -240,6 +240,15 @@ class Setting:
             min(count.points or MOST_POINTS, MOST_POINTS),
             self.scenario.object.filled_rel,
         )
+
+    @cached_property
+    def calibrating(self) -> Images | None:
+        """Images of the scenario's calibration; None without points in space, without a calibration, or of one that was made."""
+        told = self.scenario.calibration
+        if self.network is None or told.model == "none" or self.made is not None:
+            return None
+        depth = DEPTH if told.field == "deep" else 0.0
+        return calibrating(self.c_px, self.described.frame_shape, self.aspect, told.images, told.targets, depth)[0]
 
     @property
     def chief_ray_deg(self) -> float | None:

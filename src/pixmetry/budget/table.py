@@ -58,6 +58,8 @@ OF_THE_FORMAT = {  # powers of the format: a lens of the same design; a sensor a
     "k1_per_mm2": -2,
     "k2_per_mm4": -4,
     "k3_per_mm6": -6,
+    "k4_per_mm8": -8,
+    "k5_per_mm10": -10,
     "p1_per_mm": -1,
     "p2_per_mm": -1,
     "principal_distance_mm": 1,
@@ -462,9 +464,11 @@ class Table:
     def calibration(self) -> Calibration:
         """What positions are corrected for."""
         told = self.setting.scenario.calibration
-        network = self.setting.network
-        places = Places.over(self.setting.camera.frame_shape, told.grid_px, None if network is None else network.places_px)
-        return Calibration(told.model, told.every_image, places, self.setting.aspect)
+        measuring, images = self.setting.network, self.setting.calibrating
+        also = None if measuring is None else np.concatenate([n.places_px for n in (measuring, images) if n is not None], axis=1)
+        places = Places.over(self.setting.camera.frame_shape, told.grid_px, also)
+        made = self.setting.made
+        return Calibration(told.model, told.every_image, places, self.setting.aspect, 3 if made is None else made.radial, images)
 
     def _difference(self, pair: tuple[Camera, Camera]) -> np.ndarray:
         """Displacement by what one camera has beyond another, shape (2, 5, n)."""
@@ -507,7 +511,8 @@ class Table:
         if element.source.gum_class == "G":  # it stays as it was: what drifts beside it has a row of its own
             now = then
         left, n = self.calibration.left(now, then), self.calibration.places.even
-        return _of_field(now[:, 0, :n]), _of_field(left[:, :n]), np.nan_to_num(left[None, :, n:])
+        own = left.shape[1] - (0 if self.calibration.images is None else self.calibration.images.image[0].size)
+        return _of_field(now[:, 0, :n]), _of_field(left[:, :n]), np.nan_to_num(left[None, :, n:own])
 
     def _drawn_anew(self, element: Element, pair: tuple[Camera, Camera]) -> tuple[Parts, Parts, None] | None:
         """The same of a displacement that is another one in every frame, by its formula; None where all frames have the same.

@@ -24,9 +24,10 @@ from pixmetry.core.number import Estimates
 
 GRID = 25  # places along each side of the frame
 LARGEST_PX = 0.05  # two models that differ by more are not the same camera
-POLYNOMIAL = ("p1_per_mm", "p2_per_mm", "k1_per_mm2", "k2_per_mm4", "k3_per_mm6")
+POLYNOMIAL = ("p1_per_mm", "p2_per_mm", "k1_per_mm2", "k2_per_mm4", "k3_per_mm6", "k4_per_mm8", "k5_per_mm10")
+HIGH = {"k4", "k5"}  # of a model without them they are 0
 FITTED = ("principal_distance_mm", "centre_x_px", "centre_y_px", "b1", "b2", *POLYNOMIAL)
-UNITS = ("mm", "px", "px", "1", "1", "1/mm", "1/mm", "1/mm²", "1/mm⁴", "1/mm⁶")
+UNITS = ("mm", "px", "px", "1", "1", "1/mm", "1/mm", "1/mm²", "1/mm⁴", "1/mm⁶", "1/mm⁸", "1/mm¹⁰")
 
 
 def calibrated_geometry(
@@ -144,19 +145,20 @@ def geometry_of(
     Raises
     ------
     InputError
-        If there is no pitch, or three radial and two tangential coefficients cannot hold the model.
+        If there is no pitch, or five radial and two tangential coefficients cannot hold the model.
     """
     if model.sensor.pitch_x_um is None:
         raise InputError("the pixel pitch is not known", where=model.name, remedy="calibrate with pitch_um, so that lengths are in mm")
-    values, largest = _fitted(model)
+    high = bool(HIGH & set(names) or any(model[name] for name in HIGH))
+    values, largest = _fitted(model, high)
     if not largest < LARGEST_PX:
-        what = "the lens of a camera file (K1 to K3, P1, P2, affinity and shear) cannot represent this model"
+        what = "the lens of a camera file (K1 to K5, P1, P2, affinity and shear) cannot represent this model"
         raise InputError(what, where=model.name, value=f"up to {largest:.2g} px apart", allowed=f"up to {LARGEST_PX} px")
     slopes = np.zeros((len(FITTED), len(names)))
     for j, name in enumerate(names):
         step = float(np.sqrt(covariance[j, j]))
         if step:
-            ends = [_fitted(model.with_values(**{name: model[name] + s * step}))[0] for s in (-1, 1)]
+            ends = [_fitted(model.with_values(**{name: model[name] + s * step}), high)[0] for s in (-1, 1)]
             slopes[:, j] = (ends[1] - ends[0]) / (2 * step)
     n = len(FITTED)
     full = np.zeros((n + 2, n + 2))
@@ -172,8 +174,11 @@ def geometry_of(
     return CameraGeometry(lens, *u_px, *left_px, origin)
 
 
-def _fitted(model: CameraModel) -> tuple[np.ndarray, float]:
-    """The sources' parameters that see directions as the model does, and the largest difference over the frame in px."""
+def _fitted(model: CameraModel, high: bool) -> tuple[np.ndarray, float]:
+    """The sources' parameters that see directions as the model does, and the largest difference over the frame in px.
+
+    ``high``: K4 and K5 are among them; else they stay 0.
+    """
     from scipy.optimize import least_squares
 
     sensor = model.sensor
@@ -184,14 +189,15 @@ def _fitted(model: CameraModel) -> tuple[np.ndarray, float]:
     if not np.isfinite(u + v).all():
         raise InputError("the distortion has no inverse in a part of the frame", where=model.name, remedy="use fewer radial parameters")
     reach = float(np.hypot(x0 * mx, y0 * my))
-    scale = np.array([model["c"], 1, 1, 1e-3, 1e-3, 1 / reach, 1 / reach, reach**-2, reach**-4, reach**-6])
+    scale = np.array([model["c"], 1, 1, 1e-3, 1e-3, 1 / reach, 1 / reach, *reach ** (-2.0 * np.arange(1, 6))])
+    count = len(FITTED) if high else len(FITTED) - len(HIGH)
 
     def misses(scaled: np.ndarray) -> np.ndarray:
-        c, cx, cy, b1, b2, p1, p2, k1, k2, k3 = scaled * scale
+        c, cx, cy, b1, b2, p1, p2, k1, k2, k3, k4, k5 = np.concatenate([scaled, np.zeros(len(scale) - count)]) * scale
         a = (x - x0 - b2 * (y - y0)) / (1 + b1)
         a, b = (a - cx) * mx, (y - y0 - cy) * my
         r2 = a * a + b * b
-        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * (k4 + r2 * k5))))
         ideal_a = a * radial + p1 * (r2 + 2 * a * a) + 2 * p2 * a * b
         ideal_b = b * radial + p2 * (r2 + 2 * b * b) + 2 * p1 * a * b
         return np.concatenate([(ideal_a / c - u) * model["c"] / mx, (ideal_b / c - v) * model["c"] / my])
@@ -199,8 +205,8 @@ def _fitted(model: CameraModel) -> tuple[np.ndarray, float]:
     sign = -1.0 if model.direction == "image_to_object" else 1.0
     start = np.zeros(len(FITTED))
     start[:5] = model["c"], model["xp"] - x0, model["yp"] - y0, sign * model["b1"], sign * model["b2"] * my / mx
-    fit = least_squares(misses, start / scale, xtol=1e-14, ftol=1e-14, gtol=1e-14)
-    return fit.x * scale, float(np.hypot(*misses(fit.x).reshape(2, -1)).max())
+    fit = least_squares(misses, (start / scale)[:count], xtol=1e-14, ftol=1e-14, gtol=1e-14)
+    return np.concatenate([fit.x, np.zeros(len(scale) - count)]) * scale, float(np.hypot(*misses(fit.x).reshape(2, -1)).max())
 
 
 def calibrated_camera(camera: Camera, geometry: CameraGeometry) -> Camera:

@@ -538,7 +538,7 @@ class CameraGeometry:
     Parameters
     ----------
     lens : Estimates
-        ``k1_per_mm2``, ``k2_per_mm4``, ``k3_per_mm6``, ``p1_per_mm``, ``p2_per_mm`` (distorted to ideal places), ``centre_x_px``,
+        ``k1_per_mm2`` to ``k5_per_mm10``, ``p1_per_mm``, ``p2_per_mm`` (distorted to ideal places), ``centre_x_px``,
         ``centre_y_px`` (principal point less the frame's centre), ``b1``, ``b2`` (of an image that the lens has distorted before),
         ``principal_distance_mm``, ``pitch_x_um``, ``pitch_y_um``.
     u_x_px, u_y_px : float

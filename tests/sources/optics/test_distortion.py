@@ -17,13 +17,16 @@ CENTRE = np.array([375.5, 290.5])
 
 def brown(x: np.ndarray, y: np.ndarray, p: Distortion) -> tuple[np.ndarray, np.ndarray]:
     r = np.hypot(x, y)
-    radial = p.k1_per_mm2 * r**2 + p.k2_per_mm4 * r**4 + p.k3_per_mm6 * r**6
+    radial = p.k1_per_mm2 * r**2 + p.k2_per_mm4 * r**4 + p.k3_per_mm6 * r**6 + p.k4_per_mm8 * r**8 + p.k5_per_mm10 * r**10
     dx = x * radial + p.p1_per_mm * (r**2 + 2 * x**2) + 2 * p.p2_per_mm * x * y
     dy = y * radial + p.p2_per_mm * (r**2 + 2 * y**2) + 2 * p.p1_per_mm * x * y
     return x + dx, y + dy
 
 
-ALL = dict(k1_per_mm2=-1e-3, k2_per_mm4=3e-5, k3_per_mm6=-1e-6, p1_per_mm=5e-5, p2_per_mm=-8e-5, centre_x_px=12.0, centre_y_px=-7.0)
+ALL = dict(
+    k1_per_mm2=-1e-3, k2_per_mm4=3e-5, k3_per_mm6=-1e-6, k4_per_mm8=2e-8, k5_per_mm10=-3e-10, p1_per_mm=5e-5, p2_per_mm=-8e-5,
+    centre_x_px=12.0, centre_y_px=-7.0,
+)  # fmt: skip
 
 
 @pytest.mark.parametrize("direction", ["image_to_object", "object_to_image"])

@@ -19,6 +19,7 @@ from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
 from pixmetry.sources.optics._distortion_kernels import inverse, polynomial
 
+RADIAL = ("k1_per_mm2", "k2_per_mm4", "k3_per_mm6", "k4_per_mm8", "k5_per_mm10")
 CHECKED_PLACES = 33  # along each side of the frame, where the map must not fold
 
 
@@ -33,6 +34,8 @@ class Distortion(Parameters):
     k1_per_mm2: float = quantity(0.0, "1/mm²", "radial, r³", ge=-0.1, le=0.1)
     k2_per_mm4: float = quantity(0.0, "1/mm⁴", "radial, r⁵", ge=-0.01, le=0.01)
     k3_per_mm6: float = quantity(0.0, "1/mm⁶", "radial, r⁷", ge=-0.001, le=0.001)
+    k4_per_mm8: float = quantity(0.0, "1/mm⁸", "radial, r⁹", ge=-1e-4, le=1e-4)
+    k5_per_mm10: float = quantity(0.0, "1/mm¹⁰", "radial, r¹¹", ge=-1e-5, le=1e-5)
     p1_per_mm: float = quantity(0.0, "1/mm", "tangential, (r² + 2x²) in x and 2xy in y", ge=-0.01, le=0.01)
     p2_per_mm: float = quantity(0.0, "1/mm", "tangential, 2xy in x and (r² + 2y²) in y", ge=-0.01, le=0.01)
     centre_x_px: float = quantity(0.0, "px", "centre of distortion minus the frame's centre, along x", ge=-1000, le=1000)
@@ -41,9 +44,9 @@ class Distortion(Parameters):
     pitch_y_um: float = quantity(8.3, "µm", "pixel pitch along y", gt=0, le=100)
 
     @property
-    def coefficients(self) -> tuple[float, float, float, float, float]:
-        """K1, K2, K3, P1, P2."""
-        return self.k1_per_mm2, self.k2_per_mm4, self.k3_per_mm6, self.p1_per_mm, self.p2_per_mm
+    def coefficients(self) -> tuple[float, ...]:
+        """K1 to K5, P1, P2."""
+        return (*(getattr(self, name) for name in RADIAL), self.p1_per_mm, self.p2_per_mm)
 
 
 def pull_of(params: Distortion, frame_shape: tuple[int, int]) -> Pull:
@@ -90,7 +93,7 @@ def _check(params: Distortion, frame_shape: tuple[int, int]) -> None:
             where="optics.distortion",
             value=params.coefficients,
             allowed="coefficients for which every position in the frame has exactly one ideal position",
-            remedy="reduce K1 to K3 (they refer to millimetres on the sensor), or check the pixel pitch",
+            remedy="reduce K1 to K5 (they refer to millimetres on the sensor), or check the pixel pitch",
         )
 
 
@@ -111,7 +114,7 @@ def propagate(params: Distortion, probe: Probe) -> Contribution:
     return map_contribution(pull_of(params, probe.frame_shape), probe)
 
 
-MEASURED = ("k1_per_mm2", "k2_per_mm4", "k3_per_mm6", "p1_per_mm", "p2_per_mm", "centre_x_px", "centre_y_px", "pitch_x_um", "pitch_y_um")
+MEASURED = (*RADIAL, "p1_per_mm", "p2_per_mm", "centre_x_px", "centre_y_px", "pitch_x_um", "pitch_y_um")
 
 
 def measure(observations: Observations) -> Estimates:
@@ -136,7 +139,7 @@ SOURCE = Source(
     truth=truth,
     propagate=propagate,
     gum_class="G",
-    equation="x' = x (1 + K1 r² + K2 r⁴ + K3 r⁶) + P1 (r² + 2x²) + 2 P2 x y;  y' likewise with P1 and P2 exchanged",
+    equation="x' = x (1 + K1 r² + K2 r⁴ + K3 r⁶ + K4 r⁸ + K5 r¹⁰) + P1 (r² + 2x²) + 2 P2 x y;  y' likewise with P1 and P2 exchanged",
     typical_size="up to 10 µm or more in a corner before calibration, under 0.02 px after it",
     references=(
         "D. C. Brown, Close-range camera calibration, Photogrammetric Engineering 37 (1971) 855–866",
