@@ -54,6 +54,17 @@ def run(*arguments: object) -> Result:
     return CliRunner().invoke(main, [str(a) for a in arguments])
 
 
+def test_exposure_times_that_differ_are_told_and_can_be_made_equal(tmp_path: Path) -> None:
+    """A sheet exposes for 10 ms, an assessed camera as its campaign did: dark current, among others, grows with that."""
+    short, long = (tmp_path / name for name in ("short.yaml", "long.yaml"))
+    short.write_text(SHEET + "exposure_s: 0.001\n", encoding="utf-8")
+    long.write_text(SHEET + "exposure_s: 0.02\n", encoding="utf-8")
+    result = run("budget", short, long, "--compare")
+    assert result.exit_code == 0 and "do not expose equally long" in result.output and "20.0 ms" in result.output
+    equal = run("budget", short, long, "--compare", "--set", "exposure_s=0.005")
+    assert "expose equally" not in equal.output and "the same within 1 %" in equal.output
+
+
 def test_identity_of_one_budget_twice(budget: CameraBudget) -> None:
     found = compare_budgets([budget, budget])
     assert found.ranks[1].verdict == SAME and found.ranks[1].ratio == 1 and not found.settings

@@ -160,6 +160,7 @@ class CameraBudget:
             "estimator": {"name": self.estimator.name} | asdict(self.estimator),
             "frame_shape": self.setting.described.frame_shape,
             "pitch_um": self.setting.described.pitch_um,
+            "exposure_s": self.setting.described.exposure_s,
             "px_per_mm": self.setting.px_per_mm,
             "lens": self.setting.lens,
             "one_target_one_frame": self._answer_record(self.one),

@@ -23,6 +23,8 @@ from pixmetry.files.strict_json import starts_with
 RANK = {"measured": 3, "sheet": 2, "": 1, "typical": 0}  # what goes before what
 GAIN, CONVERTER = "electronics.gain", "grabber.adc"
 HEAD_BYTES = 200  # of a file, in which it says what it is
+TOLD = {"measured", "sheet", ""}  # what a description knows itself; "": as a preset or a camera file describes it
+DESCRIBED = "described"
 COVERAGE = 2.0  # expanded uncertainties beyond which two values contradict each other
 
 
@@ -69,7 +71,7 @@ def camera_of(given: str | Path | Camera | Sequence[str | Path | Camera]) -> tup
     Camera
         That of the first description; a source that another one knows better (measured before sheet before typical) is taken from there.
     tuple of Disagreement
-        Every parameter that two descriptions know, from measurements or data sheets.
+        Every parameter that two descriptions know, one of them at least from a measurement or a data sheet.
 
     Raises
     ------
@@ -159,7 +161,7 @@ def _compared(one: Camera, other: Camera) -> list[Disagreement]:
     for element in one.chain:
         there = theirs.get(element.source.id, [])
         second = there[0] if len(there) == 1 else next((e for e in there if e.name == element.name), None)
-        if second is None or not {element.known_from, second.known_from} <= {"measured", "sheet"}:
+        if second is None or not {element.known_from, second.known_from} <= TOLD or not (element.known_from or second.known_from):
             continue
         for name in type(element.params).model_fields:
             a, b = _value(element, name), _value(second, name)
@@ -167,7 +169,8 @@ def _compared(one: Camera, other: Camera) -> list[Disagreement]:
                 continue
             u = float(np.hypot(a[1], b[1]))
             unit = element.source.units[name]
-            found.append(Disagreement(element.name, name, unit, a[0], b[0], element.known_from, second.known_from, u))
+            origins = (e.known_from or DESCRIBED for e in (element, second))
+            found.append(Disagreement(element.name, name, unit, a[0], b[0], *origins, u))
     return found
 
 
@@ -178,6 +181,6 @@ def _value(element: Element, name: str) -> tuple[float, float] | None:
         return None if number.kind != "value" else (number.value, number.u)
     states_u = element.known_from == "measured" and len(element.estimates) > 0
     value = told_values(element).get(name)
-    if element.known_from not in ("sheet", "measured") or states_u or value is None:
+    if element.known_from not in TOLD or states_u or value is None:
         return None
     return value, UNSTATED_U_REL * abs(value)

@@ -51,6 +51,8 @@ class BudgetSide:
         Rows and columns.
     lens : mapping
         Focal length and description of the optics, by which lenses are told apart.
+    exposure_s : float, optional
+        None in a budget of an earlier version.
     """
 
     name: str
@@ -65,6 +67,7 @@ class BudgetSide:
     depth_mm: float | None
     frame_shape: tuple[int, int]
     lens: Mapping[str, Any]
+    exposure_s: float | None = None
 
     @property
     def field_mm(self) -> Pair | None:
@@ -167,7 +170,7 @@ class BudgetComparison:
         for side in self.sides:
             answer = {n.removesuffix("_px"): getattr(side.answer, n) for n in ("before_px", "after_px", "least_px", "most_px")}
             lengths = {f"{n}_{unit}": side.size(pair, unit) for unit in ("px", "um", "mm") for n, pair in answer.items()}
-            head = {n: getattr(side, n) for n in ("name", "camera", "estimator", "frames", "targets", "depth_mm", "field_mm")}
+            head = {n: getattr(side, n) for n in ("name", "camera", "estimator", "frames", "targets", "depth_mm", "field_mm", "exposure_s")}
             sides.append(head | lengths)
         rest = {n: [asdict(one) for one in getattr(self, n)] for n in ("ranks", "rows")}
         head = {"schema": COMPARED_SCHEMA, "unit": self.unit, "best": self.best.name}
@@ -227,6 +230,7 @@ def _side(record: Mapping[str, Any], name: str, where: str) -> BudgetSide:
             depth_mm=None if point is None else float(point["covariance_mm2"][2][2]) ** 0.5,
             frame_shape=(int(record["frame_shape"][0]), int(record["frame_shape"][1])),
             lens=dict(record["lens"]),
+            exposure_s=None if record.get("exposure_s") is None else float(record["exposure_s"]),
         )
         told, found = answer["after_px"], side.answer.after_px
         if not np.allclose(told, found, rtol=1e-6, atol=1e-12):
@@ -401,7 +405,7 @@ def _by_source(side: BudgetSide, unit: str) -> dict[str, float]:
 
 def _settings(sides: Sequence[BudgetSide]) -> dict[str, tuple[Any, ...]]:
     """What was not the same in all budgets."""
-    told = [{"camera": s.camera, "estimator": s.estimator} | dict(s.scenario) for s in sides]
+    told = [{"camera": s.camera, "estimator": s.estimator, "exposure_s": s.exposure_s} | dict(s.scenario) for s in sides]
     keys = dict.fromkeys(key for one in told for key in one)
     found = {key: tuple(one.get(key) for one in told) for key in keys}
     return {key: values for key, values in found.items() if any(v != values[0] for v in values)}

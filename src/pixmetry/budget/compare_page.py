@@ -51,6 +51,9 @@ def sentences(found: BudgetComparison) -> list[str]:
     if len({s.field_mm and tuple(round(v) for v in s.field_mm) for s in found.sides}) > 1:
         fields = ", ".join(f"{s.name} {field_of(s)}" for s in (found.sides[r.side] for r in found.ranks))
         said.append(f"They do not see the same field: {fields}.")
+    if len({s.exposure_s for s in found.sides}) > 1:
+        times = ", ".join(f"{s.name} {time_of(s)}" for s in (found.sides[r.side] for r in found.ranks))
+        said.append(f"They do not expose equally long: {times}. Dark current and motion differ by that; --set exposure_s=… is for all.")
     if len({(s.frames, s.targets) for s in found.sides}) > 1:
         said.append("The means are over different numbers of frames or targets.")
     if len({s.estimator for s in found.sides}) > 1:
@@ -89,6 +92,11 @@ def length_of(side: BudgetSide, pair_px: tuple[float, float], unit: str) -> str:
 def field_of(side: BudgetSide) -> str:
     """Width and height of the field of view; a dash where the scale is not known."""
     return NONE if side.field_mm is None else f"{side.field_mm[0]:.0f} × {side.field_mm[1]:.0f} mm"
+
+
+def time_of(side: BudgetSide) -> str:
+    """Exposure time; a dash where the budget does not tell it."""
+    return NONE if side.exposure_s is None else f"{significant(1e3 * side.exposure_s, 3)} ms"
 
 
 def settings_of(found: BudgetComparison) -> list[tuple[str, list[str]]]:
