@@ -52,8 +52,8 @@ def with_maps(camera: Camera, f_mm: float, rng: np.random.Generator) -> Camera:
     return replace(camera, chain=tuple(by_id[s.id] for s in in_order(e.source for e in chain)))
 
 
-def study(rng: np.random.Generator, number: int, repeats: int) -> np.ndarray:
-    """One network: predicted over found, in X, Y and Z."""
+def study(rng: np.random.Generator, number: int, repeats: int) -> tuple[np.ndarray, np.ndarray]:
+    """One network: predicted over found, in X, Y and Z, and the standard error of that by the scatter of the calibrations."""
     rays, base = int(rng.integers(2, 9)), float(rng.choice([0.2, 0.5, 0.8, 1.2, 1.8]))
     f_mm, distance = float(rng.choice([8.0, 12.0, 25.0, 50.0])), float(rng.choice([500.0, 1000.0, 3000.0]))
     model, images, targets, points = (
@@ -84,14 +84,16 @@ def study(rng: np.random.Generator, number: int, repeats: int) -> np.ndarray:
         for _ in range(OBJECTS):
             shots = measuring_shots(rng, rays, base, scenario["count"]["arrangement"], points, distance, 0.8 * half)
             errors.append(measured.points(shots, calibration, rng.standard_normal((2, rays, points))))
-    found = np.sqrt(np.nanmean(np.square(errors), axis=(0, 1)))
+    squares = np.nanmean(np.square(errors).reshape(repeats, -1, 3), axis=1)  # of every calibration: its objects share its errors
+    found = np.sqrt(squares.mean(axis=0))
     ratio = predicted.u_mm / found
+    error = ratio * 0.5 * squares.std(axis=0, ddof=1) / squares.mean(axis=0) / np.sqrt(repeats)
     how, field = scenario["count"]["arrangement"], "flat" if flat else "deep"
     told = (f"{rays} rays {how} {base:g}", f"{points} points", model, f"{images} x {targets} {field}")
     shown = [np.round(1e3 * v, 2) for v in (found, predicted.u_mm, predicted.shared_mm)]
     print(f"{camera.name}, f {f_mm:g} mm, {distance:g} mm, {', '.join(told)}")
-    print(f"  found {shown[0]} µm, predicted {shown[1]} (shared {shown[2]}), ratio {np.round(ratio, 3)}", flush=True)
-    return ratio
+    print(f"  found {shown[0]} µm, predicted {shown[1]} (shared {shown[2]}), ratio {np.round(ratio, 3)} ± {np.round(error, 3)}", flush=True)
+    return ratio, error
 
 
 def main() -> None:
@@ -100,10 +102,11 @@ def main() -> None:
     seed = int(sys.argv[3]) if len(sys.argv) > 3 else np.random.SeedSequence().entropy
     print(f"seed {seed}")
     rng, began = np.random.default_rng(seed), time.perf_counter()
-    ratios = np.array([study(rng, k, repeats) for k in range(networks)])
-    within = 100 * np.mean(np.abs(ratios - 1) <= 0.1)
+    ratios, errors = np.moveaxis([study(rng, k, repeats) for k in range(networks)], 1, 0)
+    within, or_chance = (100 * np.mean(np.abs(ratios - 1) <= 0.1 + more) for more in (0.0, 2 * errors))
     print(f"all: median {np.round(np.median(ratios, axis=0), 3)}, from {ratios.min():.3f} to {ratios.max():.3f}")
-    print(f"{within:.0f} % within 10 %; {time.perf_counter() - began:.0f} s")
+    told = f"{within:.0f} % within 10 %, {or_chance:.0f} % within 10 % and two standard errors"
+    print(f"{told}; {time.perf_counter() - began:.0f} s")
 
 
 if __name__ == "__main__":

@@ -27,7 +27,8 @@ PHOTOGRAMMETRIC = CameraModel.of(
     SENSOR, c=8.0, xp=371.2, yp=297.5, b1=2e-3, b2=-1e-3, p1=3e-5, p2=-4e-5, k1=1e-3, k2=-2e-5, k3=1e-7
 )  # 4 % of distortion in the corners
 VISION = CameraModel.of(SENSOR, "object_to_image", c=8.0, xp=371.2, yp=297.5, b1=2e-3, b2=-1e-3, p1=2e-4, p2=-3e-4, k1=-0.05, k2=0.03)
-MODELS = pytest.mark.parametrize("model", [PHOTOGRAMMETRIC, VISION], ids=["photogrammetric", "vision"])
+FIVE_TERMS = PHOTOGRAMMETRIC.with_values(k4=3e-9, k5=-1e-10)
+MODELS = pytest.mark.parametrize("model", [PHOTOGRAMMETRIC, VISION, FIVE_TERMS], ids=["photogrammetric", "vision", "five terms"])
 
 
 def through_the_sources(seen: Observations, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -90,11 +91,18 @@ def test_a_calibration_of_another_sensor_is_refused() -> None:
         calibrated_camera(load_camera("pulnix_tm6cn"), geometry_of(model, (), np.zeros((0, 0))))
 
 
+def test_a_strong_lens_of_a_vision_program_needs_five_terms() -> None:
+    """The inverse of its polynomial is none; three terms follow it to a pixel or worse, five to 0.05 px."""
+    geometry = geometry_of(CameraModel.of(SENSOR, "object_to_image", c=7.0, k1=-0.3), (), np.zeros((0, 0)))
+    assert geometry.lens["k5_per_mm10"].value != 0
+    assert geometry_of(VISION, (), np.zeros((0, 0))).lens["k5_per_mm10"].value == 0
+
+
 def test_what_the_sources_cannot_hold_is_refused() -> None:
     with pytest.raises(InputError, match="pitch"):
         geometry_of(CameraModel.of(Sensor(752, 582), c=930.0), (), np.zeros((0, 0)))
     with pytest.raises(InputError, match="cannot represent"):
-        geometry_of(PHOTOGRAMMETRIC.with_values(k5=1e-8), (), np.zeros((0, 0)))
+        geometry_of(CameraModel.of(SENSOR, "object_to_image", c=3.2, k1=-0.35, k2=0.12), (), np.zeros((0, 0)))
     with pytest.raises(MeasureError, match="calibrated geometry"):
         distortion.measure(Observations())
 

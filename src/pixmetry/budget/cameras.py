@@ -169,8 +169,8 @@ def _compared(one: Camera, other: Camera) -> list[Disagreement]:
                 continue
             u = float(np.hypot(a[1], b[1]))
             unit = element.source.units[name]
-            origins = (e.known_from or DESCRIBED for e in (element, second))
-            found.append(Disagreement(element.name, name, unit, a[0], b[0], *origins, u))
+            mine, other_one = (e.known_from or DESCRIBED for e in (element, second))
+            found.append(Disagreement(element.name, name, unit, a[0], b[0], mine, other_one, u))
     return found
 
 

@@ -151,6 +151,9 @@ def geometry_of(
         raise InputError("the pixel pitch is not known", where=model.name, remedy="calibrate with pitch_um, so that lengths are in mm")
     high = bool(HIGH & set(names) or any(model[name] for name in HIGH))
     values, largest = _fitted(model, high)
+    if not high and not largest < LARGEST_PX:  # the inverse of a polynomial may need more terms
+        high = True
+        values, largest = _fitted(model, high)
     if not largest < LARGEST_PX:
         what = "the lens of a camera file (K1 to K5, P1, P2, affinity and shear) cannot represent this model"
         raise InputError(what, where=model.name, value=f"up to {largest:.2g} px apart", allowed=f"up to {LARGEST_PX} px")
