@@ -27,6 +27,9 @@ WATCHED = (
     "processing.sharpening.amount",
     "processing.temporal_noise_reduction.alpha",
     "sensor.brighter_fatter.area_loss_per_e",
+    "sensor.bayer_mosaic.green",
+    "electronics.column_noise.gain_rel",
+    "electronics.telegraph_noise.share",
 )
 
 
@@ -49,7 +52,7 @@ def scores_of(kind: str, seed: int, shape: tuple[int, int], levels: int, index: 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--cameras", type=int, default=200, help="of each kind")
-    parser.add_argument("--kinds", nargs="+", default=["none", "sharpening", "blur", "charge", "temporal", "taps", "everything"])
+    parser.add_argument("--kinds", nargs="+", default=list(KINDS))
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--jobs", type=int, default=min(2, os.cpu_count() or 1))
     parser.add_argument("--rows", type=int, default=120)

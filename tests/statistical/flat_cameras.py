@@ -17,8 +17,14 @@ from pixmetry.scene.files import SeriesModel
 from pixmetry.simulate.job import expose_group, plan_series
 
 GAIN = "electronics.gain.gain_dn_per_e"
-KINDS = ("none", "charge", "sharpening", "blur", "temporal", "taps", "everything", "companding", "median", "demosaic")
-OWN = ("brighter_fatter", "sharpening", "temporal_noise_reduction", "tap_gain", "companding", "noise_reduction")
+KINDS = (
+    "none", "charge", "sharpening", "blur", "temporal", "taps", "everything", "companding", "median", "demosaic", "mosaic", "columns",
+    "telegraph",
+)  # fmt: skip
+OWN = (
+    "brighter_fatter", "sharpening", "temporal_noise_reduction", "tap_gain", "companding", "noise_reduction", "bayer_mosaic",
+    "column_noise", "telegraph_noise",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -67,6 +73,15 @@ def flat_case(rng: np.random.Generator, kind: str, shape: tuple[int, int] = (120
         values["processing.demosaic"] = {"method": method, "output": colour, "pattern": pattern}
         shares = {"red": rng.uniform(0.5, 1), "green": 1.0, "blue": rng.uniform(0.4, 1)}
         values["sensor.bayer_mosaic"] = {"pattern": pattern} | shares
+    if kind == "mosaic":
+        order, split = str(rng.choice(["RGGB", "GRBG", "GBRG", "BGGR"])), rng.normal(0, 0.01)
+        shares = {"red": rng.uniform(0.6, 0.9), "green": 1.0, "blue": rng.uniform(0.3, 0.55)}
+        values["sensor.bayer_mosaic"] = {"pattern": order, "green_split_rel": split} | shares
+    if kind in ("columns", "everything"):
+        values["electronics.column_noise"] = {"gain_rel": rng.uniform(2e-4, 2e-3)}
+    if kind == "telegraph":
+        values["electronics.telegraph_noise"] = {"share": rng.uniform(0.005, 0.05), "amplitude_e": noise * rng.uniform(2, 5)}
+        stack = 200
     if kind == "companding":
         values["processing.companding"] = {"law": str(rng.choice(["root", "linear"])), "transport_bits": int(rng.integers(8, 11))}
     if kind in ("taps", "everything"):
@@ -103,7 +118,7 @@ def measured(case: FlatCase, seed: int) -> dict[str, Number]:
 
     seen = observe(groups(), 12)
     found = dict(measure_sources(seen)[0])
-    for name in ("processing.sharpening", "processing.temporal_noise_reduction", "electronics.tap_gain"):
+    for name in ("processing.sharpening", "processing.temporal_noise_reduction", "electronics.tap_gain", "sensor.bayer_mosaic"):
         source = sources()[name]
         if name not in found and source.measure is not None:
             try:

@@ -117,6 +117,19 @@ class CodeHistogram:
 
 
 @dataclass(frozen=True)
+class ColourCells:
+    """Light of the four places of a colour mosaic.
+
+    ``mean``, shape (2, 2), is over the geometric mean; ``log_covariance``, shape (4, 4), is of the logarithms, row by row, with ``dof``
+    degrees of freedom.
+    """
+
+    mean: np.ndarray
+    log_covariance: np.ndarray
+    dof: int
+
+
+@dataclass(frozen=True)
 class CodeErrors:
     """Results of a light sweep on the converter's codes; all arrays have one entry per tested code, or per missing code."""
 
@@ -628,6 +641,7 @@ class Observations:
     defects: DefectList | None = None
     patterns: PatternList | None = None
     code_errors: CodeErrors | None = None
+    colour_cells: ColourCells | None = None  # of a colour mosaic; the bright stack is then balanced
     code_table: CodeTable | None = None  # of companding, where the codes show one
     edges: SlantedEdges | None = None
     light_off: LightSteps | None = None

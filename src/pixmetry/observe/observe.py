@@ -25,6 +25,7 @@ from pixmetry.core.errors import MeasureError
 from pixmetry.core.number import ONE_SIDED_95, Estimates
 from pixmetry.core.threads import single_threaded_blas
 from pixmetry.observe import photon_transfer_model as model
+from pixmetry.observe.colour_cells import balanced, find_colour_cells
 from pixmetry.observe.companding import find_code_table, without_steps
 from pixmetry.observe.defects import find_defects, without_hot_pixels
 from pixmetry.observe.experiment import PictureGroup
@@ -154,6 +155,9 @@ def observe(
     if dark and bright and not same_exposure(dark.moments, bright.moments):
         notes.append(_unpaired(dark, bright))
         bright = bright_stack = None  # a dark map of another exposure holds another dark current: their difference is not the light's
+    cells = None if dark_stack is None or bright_stack is None else find_colour_cells(dark_stack, bright_stack)
+    if dark_stack is not None and bright_stack is not None and cells is not None:
+        bright_stack = balanced(dark_stack, bright_stack, cells)
     dark_spectra, bright_spectra = (None if s is None else s.spectra for s in (dark, bright))
     with single_threaded_blas():
         defects, spatial, patterns = _spatial(dark_stack, bright_stack, dark_spectra, Linearity.of(fit, bits), _dnl_lsb(codes), notes)
@@ -170,6 +174,7 @@ def observe(
         patterns=patterns,
         code_errors=codes,
         code_table=table,
+        colour_cells=cells,
         noise_covariance=noise,
         noise_filter=noise_filter,
         stated=told,

@@ -8,9 +8,17 @@ from collections.abc import Mapping
 import numpy as np
 
 from pixmetry.camera.contribution import Contribution, Probe
+from pixmetry.camera.noise_covariance import CHARGE, WHITE
+from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.errors import MeasureError
+from pixmetry.core.number import ONE_SIDED_95, Estimates
 from pixmetry.core.random import Grid, Stream
+
+LEAST_LEVELS, MOST_CLIPPED, NOT_SIGNIFICANT = 5, 0.002, 3.0
+METHOD = "temporal variance of the column means of flat fields, less that of white noise, against the square of the signal"
+CONFOUNDERS = ("gain of the columns: light that changes its distribution over the frame from frame to frame",)
 
 
 class ColumnNoise(Parameters):
@@ -63,6 +71,61 @@ def truth(params: ColumnNoise, signal: Signal, stream: Stream) -> Mapping[str, n
     return {"column_offset_dn": offset, "column_gain": gain}
 
 
+def measure(observations: Observations) -> Estimates:
+    """Read how the temporal variance of the column means grows with the square of the light: that part is the gain's.
+
+    The constant part is the offsets', which noise of the columns before the gain (``electronics.row_noise``) cannot be told from. A change
+    of the light from frame to frame moves the columns too, in proportion to their own share of the light: that is taken off.
+    """
+    where, series, found = "electronics.column_noise", observations.series, observations.noise_filter
+    remedy = "take pairs of dark frames and of flat fields at five levels or more"
+    if found is not None and found.kind not in (WHITE, CHARGE):
+        what = f"what correlates neighbouring pixels ({found.name}) changes the noise of the columns"
+        raise MeasureError(what, where=where, remedy="switch off every filter in the camera, and take raw frames")
+    dark, light = series.dark, series.bright
+    open_ = light.fraction_max < MOST_CLIPPED if light.mean_dn.size else np.zeros(0, bool)
+    if dark.mean_dn.size == 0 or np.count_nonzero(open_) < LEAST_LEVELS:
+        raise MeasureError("the growth of column noise with the light is not told", where=where, value=int(open_.sum()), remedy=remedy)
+    rows, cols = series.frame_shape
+    black, black_var = float(dark.mean_dn.mean()), float(dark.ms_pixel_dn2.mean())
+
+    def of_levels(name: str) -> np.ndarray:
+        return np.concatenate([getattr(dark, name), getattr(light, name)[open_]])
+
+    white, columns = of_levels("ms_pixel_dn2"), of_levels("ms_col_dn2")
+    dof = (of_levels("n_frames") - 1) * (cols - 1)
+    signal = np.concatenate([np.zeros(dark.mean_dn.size), light.mean_dn[open_] - black])
+    if found is not None and found.kind == CHARGE:  # the mean of a column holds all charge, wherever it was repelled to
+        white = black_var + np.where(signal > 0, found.variance_before(np.maximum(white - black_var, 0)), white - black_var)
+    lamp = np.where(signal > 0, of_levels("ms_frame_dn2") * _column_spread(observations) ** 2, 0.0)
+    excess = columns - white / rows - lamp
+    design = np.stack([np.ones(signal.size), (signal / signal.max()) ** 2], axis=1)
+    expected = columns
+    for _ in range(4):
+        weight = dof / (2 * expected**2)
+        covariance = np.linalg.inv(design.T @ (weight[:, None] * design))
+        fitted = covariance @ (design.T @ (weight * excess))
+        expected = white / rows + lamp + np.maximum(design @ fitted, 0)
+    square, u = float(fitted[1]) / signal.max() ** 2, float(np.sqrt(covariance[1, 1])) / signal.max() ** 2
+    limits, reasons = set(), {"gain_rel": "as new in every frame; what changes more slowly needs stacks taken hours apart"}
+    if square > NOT_SIGNIFICANT * u:
+        gain, u_gain = math.sqrt(square), u / (2 * math.sqrt(square))
+    else:
+        gain = math.sqrt(max(square, 0.0) + ONE_SIDED_95 * u)
+        u_gain, limits = u / (2 * gain), {"gain_rel"}
+        reasons["gain_rel"] = "the noise of the columns does not grow with the light; 95 % upper limit"
+    row = ("gain_rel", gain, u_gain, math.inf, "1")
+    return Estimates.from_rows([row], method=METHOD, confounders=CONFOUNDERS, limits=frozenset(limits), reasons=reasons)
+
+
+def _column_spread(observations: Observations) -> float:
+    """Relative standard deviation of the light of the columns; 0 where there are no stacks to see it by."""
+    if observations.dark_stack is None or observations.bright_stack is None:
+        return 0.0
+    light = (observations.bright_stack.mean_map_dn - observations.dark_stack.mean_map_dn).mean(axis=0)
+    return float(light.std() / light.mean()) if light.mean() > 0 else 0.0
+
+
 def propagate(params: ColumnNoise, probe: Probe) -> Contribution:
     """Propagator P1 with the errors of each column in common: a constant one, and one that grows with the signal.
 
@@ -87,6 +150,7 @@ SOURCE = Source(
     typical=ColumnNoise(offset_dn=0.1, gain_rel=0.0005, wander_frames=100),
     bound=ColumnNoise(offset_dn=0.5, gain_rel=0.002),
     forward=forward,
+    measure=measure,
     propagate=propagate,
     truth=truth,
     gum_class="Tr",
@@ -95,7 +159,6 @@ SOURCE = Source(
     references=("EMVA 1288 R4.0 Linear, §8.2 (row and column split)",),
     advice="Subtract each column's mean over optically black rows of the same frame; renew dark frames often.",
     reasons={
-        "measure": "electronics.row_noise measures the part that is new in every frame; the slow part needs dark stacks taken hours apart",
         "correct": "needs optically black rows above the image, which give each column's offset",
     },
 )

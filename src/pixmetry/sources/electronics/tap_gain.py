@@ -116,7 +116,12 @@ def measure(observations: Observations) -> Estimates:
         odd_even = abs(odd_even) + ONE_SIDED_95 * u_odd_even
         limits.add("odd_even_rel")
         reasons["odd_even_rel"] = "odd and even columns do not differ by more than their own pattern; 95 % limit of its size"
-    rows = [("step_rel", step, u_step, dof, "1"), ("odd_even_rel", odd_even, u_odd_even, float(stripes.size), "1")]
+    rows = [("step_rel", step, u_step, dof, "1")]
+    if observations.colour_cells is None:  # stripes are in the colours of a mosaic
+        rows.append(("odd_even_rel", odd_even, u_odd_even, float(stripes.size), "1"))
+    else:
+        limits.discard("odd_even_rel")
+        reasons.pop("odd_even_rel", None)
     if "step_rel" not in limits:
         rows.append(("taps", float(taps), 0.0, np.inf, "1"))
     return Estimates.from_rows(rows, method=METHOD, confounders=CONFOUNDERS, limits=frozenset(limits), reasons=reasons)

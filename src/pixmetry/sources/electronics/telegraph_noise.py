@@ -9,10 +9,19 @@ from typing import Literal
 import numpy as np
 
 from pixmetry.camera.contribution import Contribution, Probe
+from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
 from pixmetry.core.arrays import Array
+from pixmetry.core.errors import MeasureError
+from pixmetry.core.number import ONE_SIDED_95, Estimates
 from pixmetry.core.random import Grid, Stream
+
+LEAST_FRAMES, LEAST_DN2, CLASSES = 48, 0.3, 240
+FOUND = 14.0  # of the logarithm of the likelihood: false in 1e-6 of cameras for two parameters
+TYPICAL_E = 30.0
+METHOD = "variances in time of the pixels of a dark stack: a mixture of normal noise and exponential steps, by maximum likelihood"
+CONFOUNDERS = ("blinking pixels: pixels that are noisy for another reason, such as a defect transistor or a source follower of 1/f noise",)
 
 
 class TelegraphNoise(Parameters):
@@ -99,6 +108,127 @@ def truth(params: TelegraphNoise, signal: Signal, stream: Stream) -> Mapping[str
     return {"telegraph_step_e": steps, "telegraph_pixels": steps > 0}
 
 
+def measure(observations: Observations) -> Estimates:
+    """Fit the variances in time of the pixels of a dark stack: most scatter as those of normal noise, those of blinking pixels lie higher.
+
+    The variance of a pixel with a step a is that of the others and a² p (1 − p); a is exponential. The share of the time p is not told
+    apart from the size of the steps, and the memory not at all: the step stands for p = ½. Pixels of a high dark value are left out, whose
+    dark current has a shot noise of its own.
+    """
+    where, stack, fit = "electronics.telegraph_noise", observations.dark_stack, observations.photon_transfer_fit
+    if stack is None or stack.n_frames < LEAST_FRAMES:
+        frames = 0 if stack is None else stack.n_frames
+        what = "the variances of single pixels are not known well enough"
+        remedy = "take 200 dark frames, one after the other"
+        raise MeasureError(what, where=where, value=f"{frames} dark frames", allowed=f"{LEAST_FRAMES} or more", remedy=remedy)
+    if fit is None or "gain_dn_per_e" not in fit:
+        raise MeasureError("needs the gain", where=where, remedy="take pairs of flat fields at several levels")
+    gain, mean = fit["gain_dn_per_e"], stack.mean_map_dn
+    middle = float(np.median(mean))
+    spread = 1.4826 * float(np.median(np.abs(mean - middle)))
+    scatter = np.sqrt(spread**2 + stack.var_map_dn2 / stack.n_frames)  # the mean of a blinking pixel is not known well either
+    variances = stack.var_map_dn2[mean < middle + 4 * scatter].astype(float)
+    noise = math.sqrt(float(np.median(variances)))
+    cap = max(middle - 2 * noise, 0.0) ** 2  # larger steps would end below code 0
+    if cap < 4 * noise**2:
+        raise MeasureError("blinking pixels are cut off at code 0", where=where, value=f"{middle:.3g} DN", remedy="raise the black level")
+    if np.median(variances) < LEAST_DN2:
+        raise MeasureError("rounding hides the noise of single pixels", where=where, remedy="set a higher analogue gain")
+    found = _mixture(variances, stack.n_frames - 1, cap)
+    if found is None:
+        at = TYPICAL_E * gain.value
+        share, u = _share_of(variances, stack.n_frames - 1, at**2 / 4)
+        limit = max(share, 0.0) + ONE_SIDED_95 * u
+        why = {"share": f"no pixels stand out by their noise; 95 % upper limit for steps of {TYPICAL_E:g} e-"}
+        row = ("share", min(limit, 0.5), u, math.inf, "1")
+        return Estimates.from_rows([row], method=METHOD, confounders=CONFOUNDERS, limits=frozenset({"share"}), reasons=why)
+    (share, square), covariance = found
+    step = 2 * math.sqrt(square) / gain.value
+    slopes = np.diag([1.0, step / (2 * square)])
+    covariance = slopes @ covariance @ slopes
+    covariance[1, 1] += (step * gain.u / gain.value) ** 2
+    reasons = {"amplitude_e": "as if the traps were filled half of the time: frames tell the step times √(p (1 − p))"}
+    names, units = ("share", "amplitude_e"), ("1", "e-")
+    return Estimates(names, np.array([share, step]), covariance, np.full(2, np.inf), units, METHOD, CONFOUNDERS, reasons=reasons)
+
+
+def _densities(variances: np.ndarray, dof: int, base: float, square: float, law: str = "pdf") -> tuple[np.ndarray, np.ndarray]:
+    """Densities (chances of more, with the law ``"sf"``) of sample variances of quiet pixels, and of those with exponential steps."""
+    from scipy.stats import gamma
+
+    def of(true: np.ndarray) -> np.ndarray:
+        density: np.ndarray = getattr(gamma, law)(variances[..., None], dof / 2, scale=2 * true / dof)
+        return density
+
+    # ∫ e^(−x) f(x²) dx over the steps in units of their mean; in steps of the logarithm, for f is narrow
+    x = np.geomspace(1e-3, 30, 241)
+    weights = np.exp(-x) * x * np.log(x[1] / x[0])
+    weights /= weights.sum()
+    return of(np.array([base]))[..., 0], of(base + square * x**2) @ weights
+
+
+def _binned(variances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Middle and number of the variances in narrow classes of equal ratio."""
+    positive = variances[variances > 0]
+    edges = np.geomspace(positive.min() * 0.999, positive.max() * 1.001, CLASSES + 1)
+    counts = np.histogram(positive, edges)[0].astype(float)
+    return np.sqrt(edges[1:] * edges[:-1])[counts > 0], counts[counts > 0]
+
+
+def _mixture(variances: np.ndarray, dof: int, cap: float) -> tuple[np.ndarray, np.ndarray] | None:
+    """Share and mean a² p (1 − p) in DN² by maximum likelihood, with their covariance; None if none is found.
+
+    Variances above the cap are only counted.
+    """
+    from scipy.optimize import minimize
+
+    middles, counts = _binned(variances[variances < cap])
+    beyond = int(np.count_nonzero(variances >= cap))
+    base = float(np.median(variances)) / (1 - 2 / (9 * dof)) ** 3
+
+    def cost(p: np.ndarray) -> float:
+        share = 0.5 / (1 + math.exp(-float(np.clip(p[0], -40, 40))))
+        sizes = base * math.exp(float(p[1])), base * math.exp(float(np.clip(p[2], -20, 20)))
+        quiet, blinking = _densities(middles, dof, *sizes)
+        told = float(counts @ np.log(np.maximum((1 - share) * quiet + share * blinking, 1e-300)))
+        quiet, blinking = _densities(np.array([cap]), dof, *sizes, law="sf")
+        return -told - beyond * math.log(max(float((1 - share) * quiet[0] + share * blinking[0]), 1e-300))
+
+    options = {"xatol": 1e-4, "fatol": 1e-3, "maxiter": 600}
+    starts = ((-4.0, 0.0, 0.0), (-3.0, 0.0, 2.0), (-5.0, 0.0, 4.0))
+    found = min((minimize(cost, x0, method="Nelder-Mead", options=options) for x0 in starts), key=lambda f: float(f.fun))
+    alone = minimize(lambda p: cost(np.array([-40.0, p[0], 0.0])), [0.0], method="Nelder-Mead")
+    if alone.fun - found.fun < FOUND:
+        return None
+    h = np.diag([0.05, 1e-3, 0.05])
+    hessian = np.array(
+        [
+            [
+                (cost(found.x + a + b) - cost(found.x + a - b) - cost(found.x - a + b) + cost(found.x - a - b)) / (4 * a.sum() * b.sum())
+                for b in h
+            ]
+            for a in h
+        ]
+    )
+    covariance = np.linalg.inv(hessian)[np.ix_([0, 2], [0, 2])]
+    share = 0.5 / (1 + math.exp(-found.x[0]))
+    square = base * math.exp(found.x[2])
+    slopes = np.diag([share * (1 - 2 * share), square])
+    if not (np.diag(covariance) > 0).all() or covariance[0, 0] ** 0.5 * (1 - 2 * share) > 1 / 3:
+        return None
+    return np.array([share, square]), slopes @ covariance @ slopes
+
+
+def _share_of(variances: np.ndarray, dof: int, square: float) -> tuple[float, float]:
+    """Share of pixels whose steps have this mean a² p (1 − p), with u: one step of maximum likelihood from zero."""
+    middles, counts = _binned(variances)
+    base = float(np.median(variances)) / (1 - 2 / (9 * dof)) ** 3
+    quiet, blinking = _densities(middles, dof, base, square)
+    score = np.minimum(blinking / np.maximum(quiet, 1e-300), 1e6) - 1
+    power = float(counts @ score**2)
+    return float(counts @ score) / power, power**-0.5
+
+
 def propagate(params: TelegraphNoise, probe: Probe) -> Contribution:
     """Propagator P1 with the mean variance of a pixel, share · 2 amplitude² · variance of the level; few pixels bear it all."""
     sigma_e = params.amplitude_e * math.sqrt(2 * params.share * level_variance(params))
@@ -119,6 +249,7 @@ SOURCE = Source(
     typical=TelegraphNoise(share=0.01, amplitude_e=30.0, memory_frames=2.0),
     bound=TelegraphNoise(share=0.05, amplitude_e=60.0, levels="cds"),
     forward=forward,
+    measure=measure,
     propagate=propagate,
     truth=truth,
     gum_class="T",
@@ -130,7 +261,6 @@ SOURCE = Source(
     ),
     advice="Mask the pixels whose temporal histogram has two or three peaks, or weight them by their own variance.",
     reasons={
-        "measure": "not measured: needs the kurtosis in time of each pixel of a dark stack of a hundred frames or more",
         "correct": "the state of the trap in a single frame is unknown; mask the pixel",
     },
 )

@@ -8,11 +8,17 @@ from typing import Literal
 import numpy as np
 
 from pixmetry.camera.contribution import Contribution, Probe
+from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.errors import MeasureError
+from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
 
 CHANNELS = "RGB"
+ALIKE = 0.03  # by which the greens of a sound sensor differ at most
+METHOD = "medians of bright less dark stack at the four places of the pattern, in 6 × 6 tiles"
+CONFOUNDERS = ("colours of the mosaic: gains of odd rows or columns, which look like a split of the greens",)
 
 
 class BayerMosaic(Parameters):
@@ -65,6 +71,56 @@ def truth(params: BayerMosaic, signal: Signal, stream: Stream) -> Mapping[str, n
     return {"mosaic_share": factors(params)[row, col], "colour": colour[row, col]}
 
 
+def measure(observations: Observations) -> Estimates:
+    """Read the light of the four places off the stacks of a flat field; the largest counts as 1.
+
+    The two places of green are the diagonal whose pixels differ less; where both differ by less than `ALIKE`, the brighter one. Of the
+    other two the brighter is called red: flat fields of unknown light do not tell red from blue, and the pattern of gains is the same.
+    """
+    where, cells = "sensor.bayer_mosaic", observations.colour_cells
+    if observations.dark_stack is None or observations.bright_stack is None:
+        raise MeasureError("needs a stack of dark and one of bright frames", where=where, remedy="take 16 or more of each")
+    if cells is None:
+        what = "not found: the four places of a pattern of two by two see the same light, or rows or columns alone differ"
+        raise MeasureError(what, where=where)
+    mean = cells.mean
+    apart = [abs(np.log(mean[0, k] / mean[1, 1 - k])) for k in (0, 1)]  # on the diagonals that begin at (0, 0) and at (0, 1)
+    bright = [float(np.sqrt(mean[0, k] * mean[1, 1 - k])) for k in (0, 1)]
+    green = int(np.argmax(bright)) if max(apart) < ALIKE else int(np.argmin(apart))
+    other = [(0, 1 - green), (1, green)]
+    red, blue = sorted(other, key=lambda at: -mean[at])
+    in_red, in_blue = ((at[0], green if at[0] == 0 else 1 - green) for at in (red, blue))
+    pattern = {red: "R", blue: "B", in_red: "G", in_blue: "G"}
+    shares = {"red": _weights(red), "green": 0.5 * (_weights(in_red) + _weights(in_blue)), "blue": _weights(blue)}
+    logs = np.log(mean).ravel()
+    top = max(shares.values(), key=lambda share: float(share @ logs))
+    ratios = {name: share - top for name, share in shares.items()} | {"green_split_rel": _weights(in_blue) - _weights(in_red)}
+    gradients = np.array(list(ratios.values()))
+    values = np.exp(gradients @ logs)
+    covariance = values[:, None] * (gradients @ cells.log_covariance @ gradients.T) * values
+    values[3] -= 1
+    order = "".join(pattern[r, c] for r in (0, 1) for c in (0, 1))
+    named = f"pattern {order}, if the brighter of the two is red: the colour of the light is not known"
+    reasons = {"red": f"in this light; {named}", "blue": f"in this light; {named}", "green": "in this light"}
+    return Estimates(
+        names=tuple(ratios),
+        values=values,
+        covariance=covariance,
+        dof=np.full(4, float(cells.dof)),
+        units=("1",) * 4,
+        method=METHOD,
+        confounders=CONFOUNDERS,
+        reasons=reasons,
+        settings={"pattern": order},
+    )
+
+
+def _weights(at: tuple[int, int]) -> np.ndarray:
+    """1 at a place of the pattern, of four row by row."""
+    weights: np.ndarray = (np.arange(4) == 2 * at[0] + at[1]).astype(float)
+    return weights
+
+
 def propagate(params: BayerMosaic, probe: Probe) -> Contribution:
     """The estimator on the mosaic, with the target at each of the four places in the pattern; its level is brought back to the median's."""
     cell = factors(params)
@@ -91,6 +147,7 @@ SOURCE = Source(
     typical=BayerMosaic(red=0.8, green=0.9, blue=0.6),
     bound=BayerMosaic(red=0.6, green=1.0, blue=0.4, green_split_rel=0.02),
     forward=forward,
+    measure=measure,
     correct=correct,
     propagate=propagate,
     truth=truth,
@@ -101,5 +158,4 @@ SOURCE = Source(
     references=("B. E. Bayer, US patent 3 971 065, 1976", "H. S. Malvar, L. He, R. Cutler, ICASSP 2004 (layout of the mosaic)"),
     leaves="the colour of scenes that are not grey, as a pattern of the mosaic; more noise in the weak colours",
     advice="Use a monochrome sensor. Otherwise balance the colours of the raw mosaic, and locate targets in it without interpolation.",
-    reasons={"measure": "not measured: needs the means of a grey flat field at the four positions of the pattern; the PRNU contains them"},
 )
