@@ -291,7 +291,8 @@ class SlantedEdges:
     x, y : EdgeResponse or None
         Of steps along x (nearly vertical edges) and along y.
     fit : Estimates
-        ``sfr50_x``, ``sfr50_y``, ``asymmetry_x``, ``asymmetry_y``, as far as there are edges for them.
+        ``sfr50_x``, ``sfr50_y``, ``sampling_efficiency_x``, ``sampling_efficiency_y`` (frequency at which the response is 10 %, over 0.5
+        cycles/px, at most 1), ``asymmetry_x``, ``asymmetry_y``, as far as there are edges for them.
     optics : Estimates
         Lens, pixel and optical low-pass filter, fitted together: see `pixmetry.observe.edge_fit`.
     line : Estimates or None

@@ -591,7 +591,7 @@ def _edge_of(region: Region, spread: Spread) -> SlantedEdge:
     middle_row, middle_col = region.first + 0.5 * (region.rows - 1), float(region.line[0])
     x, y = (middle_col, middle_row) if region.across == "x" else (middle_row, middle_col)
     modulus, covariance = spread.modulus, spread.covariance
-    sfr50, u50 = half_frequency(modulus, covariance)
+    sfr50, u50 = frequency_of(0.5, modulus, covariance)
     skew, u_skew = _asymmetry(spread)
     rising = spread.height > 0
     low, high = sorted((spread.low_dn, spread.low_dn + spread.height))
@@ -621,13 +621,13 @@ def _edge_of(region: Region, spread: Spread) -> SlantedEdge:
     )
 
 
-def half_frequency(modulus: Array, covariance: Array) -> tuple[float, float]:
-    """Where a response falls to one half the first time, by a straight line between two frequencies, and its u; NaN where it does not."""
-    below = np.flatnonzero(modulus < 0.5)
+def frequency_of(level: float, modulus: Array, covariance: Array) -> tuple[float, float]:
+    """Where a response falls to a level the first time, by a straight line between two frequencies, and its u; NaN where it does not."""
+    below = np.flatnonzero(modulus < level)
     if not len(below) or below[0] == 0:
         return float("nan"), float("nan")
     k = int(below[0])
-    part = (modulus[k - 1] - 0.5) / (modulus[k - 1] - modulus[k])
+    part = (modulus[k - 1] - level) / (modulus[k - 1] - modulus[k])
     step = FREQUENCY[k] - FREQUENCY[k - 1]
     low, high = max(k - 2, 0), min(k + 1, len(modulus) - 1)
     steep = (modulus[high] - modulus[low]) / (FREQUENCY[high] - FREQUENCY[low])
@@ -685,9 +685,12 @@ def _summary(edges: Iterable[SlantedEdge], responses: dict[str, EdgeResponse | N
             continue
         own = [e for e in edges if e.across == axis]
         dof = float(max(sum(e.rows for e in own) - 4 * len(own), 1))
-        value, u = half_frequency(response.sfr, response.covariance)
+        value, u = frequency_of(0.5, response.sfr, response.covariance)
         if np.isfinite(value) and np.isfinite(u):
             rows.append((f"sfr50_{axis}", value, u, dof, "cycles/px"))
+        value, u = frequency_of(0.1, response.sfr, response.covariance)
+        if np.isfinite(value) and np.isfinite(u):  # over the limit of sampling; detail above it is aliased, and does not count
+            rows.append((f"sampling_efficiency_{axis}", min(2 * value, 1.0), 2 * u, dof, "1"))
         weight = np.array([1 / max(e.u_asymmetry, 1e-9) ** 2 for e in own])
         skew = np.array([e.asymmetry for e in own])
         mean = float((weight * skew).sum() / weight.sum())

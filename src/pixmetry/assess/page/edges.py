@@ -51,6 +51,8 @@ def summary_sentence(found: SlantedEdges) -> str:
     if not counts:
         return f"No edge could be measured; {len(found.refused)} were refused." if found.refused else "No edge was found."
     half = f" The response falls to one half at {' and '.join(halves)}." if halves else ""
+    shares = [f"{100 * found.fit[n].value:.0f} % in {n[-1]}" for n in ("sampling_efficiency_x", "sampling_efficiency_y") if n in found.fit]
+    half += f" Sampling efficiency (frequency of a response of 10 %, over the limit of sampling): {' and '.join(shares)}." if shares else ""
     told = f"{len(found.edges)} edges were measured ({', '.join(counts)}); {len(found.refused)} were refused.{half}"
     return " ".join([told, *_parts_of_blur(found), *_line_words(found)])
 
