@@ -623,6 +623,9 @@ class Storage:
     table: tuple[int, ...] | None = None
 
 
+UNKNOWN_BEND_REL = 0.005  # of a response that is not measured; linear cameras stay below it (EMVA 1288, linearity error)
+
+
 @dataclass(frozen=True)
 class Observations:
     """All reduced data of one campaign; missing data are ``None``.
@@ -766,6 +769,16 @@ class Observations:
             fit = self.lines.taped if taped else self.lines.jitter
         pictures = "upright lines or edges in 4 frames or more" + (", played from tape and once more directly" if taped else "")
         return of_pictures(fit, names, where=where, pictures=pictures, kind="line")
+
+    def bend_rel(self, level_dn: float) -> float:
+        """Relative deviation from a straight response at a level above black: as fitted, with its u, or `UNKNOWN_BEND_REL`."""
+        fit, transfer = self.photon_transfer_fit, self.photon_transfer
+        names = [n for n in ("nonlinearity_a1", "nonlinearity_a2", "nonlinearity_a3") if fit is not None and n in fit]
+        if fit is None or transfer is None or not names:
+            return UNKNOWN_BEND_REL
+        powers = (level_dn / (2**transfer.bits - 1)) ** np.arange(1, len(names) + 1)
+        found = fit.select(names)
+        return float(np.hypot(powers @ found.values, np.sqrt(powers @ found.covariance @ powers)))
 
     def choices(self, source: str) -> Mapping[str, Any]:
         """Parameters of a source that are no numbers, such as words, as the pictures tell them."""

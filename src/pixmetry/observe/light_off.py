@@ -61,7 +61,8 @@ def reduce_light_off(groups: Sequence[PictureGroup], seen: Observations) -> Obse
             steps.append(step_of(group))
         except MeasureError as problem:
             refused.append(f"sequence {number} of {len(groups)}: {problem.what}" + (f" ({problem.remedy})" if problem.remedy else ""))
-    found = LightSteps(tuple(steps), tuple(refused), fit_of_steps(steps, refused))
+    bend = seen.bend_rel(max((s.signal_dn for s in steps), default=0.0))
+    found = LightSteps(tuple(steps), tuple(refused), fit_of_steps(steps, refused, bend))
     return replace(seen, light_off=found, notes=(*seen.notes, *(f"Light that goes off: {why}" for why in refused)))
 
 
@@ -158,8 +159,8 @@ def _not_a_share(steps: Sequence[LightStep]) -> int | None:
     return int(np.argmax(np.abs(excess / u) * wrong)) if wrong.any() else None
 
 
-def fit_of_steps(steps: Sequence[LightStep], refused: Sequence[str]) -> Estimates:
-    """``left_rel``, the share of a frame that the next one shows; without a value the reason."""
+def fit_of_steps(steps: Sequence[LightStep], refused: Sequence[str], bend_rel: float = 0.0) -> Estimates:
+    """``left_rel``, the share of a frame that the next one shows, of a response that bends so much; without a value the reason."""
     from scipy.special import stdtrit
 
     if not steps:
@@ -192,4 +193,5 @@ def fit_of_steps(steps: Sequence[LightStep], refused: Sequence[str]) -> Estimate
         u *= float(np.sqrt(chi2 / (len(steps) - 1)))
         dof = float(len(steps) - 1)
         reasons["left_rel"] = f"the sequences differ, from {first.min():.2g} to {first.max():.2g}: it is no fixed share; u holds that"
+    u, dof = float(np.hypot(u, bend_rel * value)), dof if bend_rel * value < u else np.inf
     return Estimates.from_rows([("left_rel", value, u, dof, "1")], method=METHOD, confounders=tuple(confounders), reasons=reasons)

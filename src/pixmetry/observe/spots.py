@@ -79,6 +79,8 @@ def spots_of(groups: Sequence[PictureGroup], seen: Observations) -> BrightSpots:
     flipped = [replace(e, image_dn=e.image_dn.T) for e in exposures]
     rows = _rest_of_lines(flipped, plain, [_cols_of(found)] * len(exposures), total.T, in_rows, gain)
     fit, smear_rows, store = _fit(columns, rows, shape[0])
+    bend = np.where([name in fit.limits for name in fit.names], 0.0, seen.bend_rel(max(e.peak_dn for e in exposures)) * fit.values)
+    fit = replace(fit, covariance=fit.covariance + np.diag(bend**2))
     if saturated.any():
         reason = {"plateau_dn": "the highest code"} if clipped else {}
         fit = fit.join(Estimates.from_rows([("plateau_dn", plateau, u_plateau, np.inf, "DN")], method=METHOD, reasons=reason))

@@ -91,6 +91,9 @@ def measure(observations: Observations) -> Estimates:
         what = "no streak of a spot that is alone in its columns ends within the frame"
         raise MeasureError(what, where="sensor.blooming", remedy="put the spots in the middle of the frame; add exposures of 2 to 5 times")
     found = _fitted(spots, spots.streaks)
+    scaled = [name in ("full_well_dn", "drain_ratio") for name in found.names]  # by the light, as measured far below saturation
+    bend = np.where(scaled, observations.bend_rel(spots.plateau_dn), 0.0) * found.values
+    found = replace(found, covariance=found.covariance + np.diag(bend**2))
     fit = observations.photon_transfer_fit
     if "full_well_dn" not in found:
         return found

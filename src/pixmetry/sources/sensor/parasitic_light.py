@@ -83,7 +83,8 @@ SOURCE = Source(
     leaves="ghosts of targets that moved while rows waited",
     advice="Use a strobe as the only light, or expose longer.",
     reasons={
-        "measure": "needs frames of the shortest exposure under steady light: their slope along the rows",
+        "measure": "steady light at the shortest exposure shows only sensitivity × row time, as a slope along the rows that uneven light "
+        "leaves too; spots at several exposures show it as a wrong exposure time",
         "propagate": "needs the share of light that falls in the waiting time; under steady light it is a gradient: shift g⟨y²⟩",
     },
 )
