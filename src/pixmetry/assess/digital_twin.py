@@ -26,6 +26,7 @@ from pixmetry.observe.unit_maps import UnitMaps, threshold_errors, unit_maps
 ASSUMED_EXPOSURE_S = 0.01
 ASSUMED_RANGE_E = 5000.0  # electrons for a full range where the gain is not known: the shot noise of most cameras is less
 ALWAYS = ("sensor.quantum_efficiency", "sensor.shot_noise", "grabber.adc")  # what every twin has, measured or not
+OF_STORED_FRAME = ("grabber.window_offset", "grabber.sampling_clock")  # the twin's frame is the stored one: these lie behind it
 SIGNIFICANT_U = 1.96  # below so many u from nothing a value is not simulated
 CORRELATED = 0.5  # values with a larger correlation belong together: one alone may be small and yet needed
 WAVES, NOISE = "grabber.phase_pattern", "electronics.amplifier_noise"
@@ -47,7 +48,7 @@ def digital_twin(campaign: Campaign, estimates: Mapping[str, Estimates], observa
     elements = []
     for source in in_order(s for s in sources().values() if s.forward is not None and applies(s, told)):
         fields = source.parameters.model_fields
-        if source.id not in estimates and source.id not in ALWAYS:
+        if (source.id not in estimates and source.id not in ALWAYS) or source.id in OF_STORED_FRAME:
             continue
         found = replace(estimates.get(source.id, Estimates.empty()), confounders=())  # results.json holds these, once for all
         values = {k: v for k, v in known.items() if k in fields} | best_values(source, found) | dict(observations.choices(source.id))

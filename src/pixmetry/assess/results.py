@@ -12,6 +12,7 @@ from pixmetry.budget.monte_carlo import Crop
 from pixmetry.budget.records import SUM, Budget
 from pixmetry.camera.camera import Camera
 from pixmetry.camera.observations import (
+    ActiveArea,
     BrightSpots,
     DarkTemperatures,
     EdgeResponse,
@@ -113,6 +114,7 @@ class Assessment:
             "light_off": None if self.observations.light_off is None else light_off_record(self.observations.light_off),
             "edges": None if self.observations.edges is None else edges_record(self.observations.edges),
             "blocks": None if self.observations.blocks is None else blocks_record(self.observations.blocks, self.observations.storage),
+            "active_area": None if self.observations.area is None else area_record(self.observations.area),
             "response": None if self.observations.response is None else response_record(self.observations.response),
             "series": None if self.observations.drift is None else drift_record(self.observations.drift),
             "motion": None if self.observations.motion is None else motion_record(self.observations.motion),
@@ -254,6 +256,16 @@ def light_off_record(found: LightSteps) -> dict[str, Any]:
         for s in found.steps
     ]
     return {"values": found.fit.to_records(), "refused": list(found.refused), "sequences": each}
+
+
+def area_record(found: ActiveArea) -> dict[str, Any]:
+    """The plain record of the active area in the stored frames."""
+    sides = {name: getattr(found, name) for name in ("left", "right", "top", "bottom", "beat", "beat_power")}
+    return {
+        "values": found.fit.to_records(),
+        "not_told": {name: why for name, why in found.fit.reasons.items() if name not in found.fit},
+        **{name: float(v) if np.isfinite(v) else None for name, v in sides.items()},
+    }
 
 
 def blocks_record(found: StoredBlocks, storage: Storage) -> dict[str, Any]:

@@ -573,6 +573,43 @@ class CameraGeometry:
 
 
 @dataclass(frozen=True)
+class ActiveArea:
+    """Place of the active area in frames that store more than it.
+
+    Parameters
+    ----------
+    left, right, top, bottom : float
+        First column and row of the active area, and the first behind it, counted from the edge of the first pixel; NaN where the frame
+        shows no black border on that side.
+    rows, cols : int
+        Of the frames.
+    black_dn, bright_dn : float
+    profile_cols_dn, profile_rows_dn : ndarray, shape (cols,), (rows,)
+        Means over the active rows, and over the active columns.
+    beat : float
+        Frequency of a line in the fixed pattern along the rows, cycles per sample; NaN without.
+    beat_power : float
+        Power of the strongest line over the median.
+    fit : Estimates
+        ``row_offset``, ``col_offset``, ``clock_mhz``, ``start_ns``, ``clock_ratio`` as far as they are told; ``reasons`` for the others.
+    """
+
+    left: float
+    right: float
+    top: float
+    bottom: float
+    rows: int
+    cols: int
+    black_dn: float
+    bright_dn: float
+    profile_cols_dn: np.ndarray
+    profile_rows_dn: np.ndarray
+    beat: float
+    beat_power: float
+    fit: Estimates
+
+
+@dataclass(frozen=True)
 class StoredBlocks:
     """Traces of a lossy coder in textured frames.
 
@@ -655,6 +692,7 @@ class Observations:
     response: Response | None = None
     lines: LineRows | None = None
     blocks: StoredBlocks | None = None
+    area: ActiveArea | None = None
     noise_covariance: NoiseCovariance | None = None
     noise_filter: NoiseFilter | None = None
     stated: StatedFacts = StatedFacts()
@@ -711,6 +749,18 @@ class Observations:
         """
         optics = None if self.edges is None or not self.edges.edges else self.edges.optics
         return of_pictures(optics, names, where=where, pictures="slanted edges", kind="edge")
+
+    def border(self, names: Iterable[str], *, where: str) -> Estimates:
+        """Take a frame grabber's set-up out of frames that show the border of the active area.
+
+        Raises
+        ------
+        MeasureError
+            Without such frames, or with the reason why they do not tell any of these.
+        """
+        fit = None if self.area is None else self.area.fit
+        pictures = "bright field with the border of the image"
+        return of_pictures(fit, {n: n for n in names}, where=where, pictures=pictures, kind="border")
 
     def coder(self, names: Iterable[str], *, where: str) -> Estimates:
         """Take a coder's parameters out of what textured frames, or their files, tell.

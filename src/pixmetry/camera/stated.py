@@ -18,6 +18,8 @@ class StatedFacts:
         Of the light.
     f_number : float or None
         Working f-number of the lens.
+    sensor_cols, sensor_rows : int or None
+        Active pixels of the whole sensor.
     """
 
     interface: str = "digital"
@@ -26,3 +28,5 @@ class StatedFacts:
     pitch_y_um: float | None = None
     wavelength_nm: float | None = None
     f_number: float | None = None
+    sensor_cols: int | None = None
+    sensor_rows: int | None = None

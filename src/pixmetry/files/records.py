@@ -27,6 +27,7 @@ TARGETS = (
     "spots",
     "pattern",
     "dark_temperature",
+    "border",
     "series",
     "motion",
 )  # pictures of something to measure; one frame may be enough
@@ -172,6 +173,8 @@ class Campaign:
             pitch_y_um=c.pitch_y_um or c.pitch_x_um,
             wavelength_nm=self.optics.wavelength_nm,
             f_number=self.optics.f_number,
+            sensor_cols=c.sensor_cols,
+            sensor_rows=c.sensor_rows,
         )
 
     @property

@@ -100,7 +100,20 @@ class GroupModel(Model):
     """Frames under one condition."""
 
     # records.KINDS and TARGETS
-    kind: Literal["dark", "bright", "edge", "light_off", "chart", "line", "spots", "pattern", "dark_temperature", "series", "motion"]
+    kind: Literal[
+        "dark",
+        "bright",
+        "edge",
+        "light_off",
+        "chart",
+        "line",
+        "spots",
+        "pattern",
+        "dark_temperature",
+        "border",
+        "series",
+        "motion",
+    ]
     exposure_s: Annotated[float, Field(ge=0)] | None = None
     photons: Annotated[float, Field(ge=0)] | None = None
     irradiance_uw_per_cm2: Positive | None = None

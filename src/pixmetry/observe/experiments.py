@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 from pixmetry.camera.observations import Observations
+from pixmetry.observe.active_area import reduce_borders
 from pixmetry.observe.dark_temperature import reduce_dark_temperatures
 from pixmetry.observe.edge_fit import fit_edges
 from pixmetry.observe.edges import Picture, edge_notes, motion_notes, responses_of, search_edges
@@ -57,6 +58,7 @@ EXPERIMENTS = {
         Experiment("spots", reduce_spots),
         Experiment("pattern", reduce_patterns, FirstFrames),
         Experiment("dark_temperature", reduce_dark_temperatures),
+        Experiment("border", reduce_borders),
     )
 }
 

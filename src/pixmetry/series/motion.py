@@ -197,9 +197,7 @@ def _speed_variance(part: _Followed) -> float:
 
 def _moves(parts: Sequence[_Followed]) -> bool:
     """Whether anything moves from frame to frame."""
-    return any(
-        float(np.nanmax(np.linalg.norm(part.speed, axis=2))) * float(np.median(np.diff(part.time_s))) > LEAST_PX for part in parts
-    )
+    return any(float(np.nanmax(np.linalg.norm(part.speed, axis=2))) * float(np.median(np.diff(part.time_s))) > LEAST_PX for part in parts)
 
 
 def _time(name: str, value: float, u: float, dof: float, first: tuple[str, str, str], why: str) -> Estimates:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
 
 
@@ -25,6 +27,11 @@ def forward(params: SamplingClock, signal: Signal, stream: Stream) -> Signal:
     return signal.with_line(signal.own_line.clocked(clock_hz, params.start_ns * 1e-9, params.samples or signal.frame_shape[1]))
 
 
+def measure(observations: Observations) -> Estimates:
+    """Sampling clock and start, from the width of the active area in samples and the beat of the fixed pattern."""
+    return observations.border(("clock_mhz", "start_ns"), where="grabber.sampling_clock")
+
+
 SOURCE = Source(
     id="grabber.sampling_clock",
     title="Sampling clock",
@@ -41,6 +48,7 @@ SOURCE = Source(
     typical=SamplingClock(clock_mhz=10.0),
     bound=SamplingClock(clock_mhz=10.0, start_ns=500.0),
     forward=forward,
+    measure=measure,
     applies_to=("analogue",),
     gum_class="G",
     equation="t_k = t_0 + (k + ½)/f_s;  x_image = ((x + ½)/f_pixel − t_0) f_s − ½",
@@ -49,7 +57,6 @@ SOURCE = Source(
     advice="Sample with the camera's pixel clock, or take a digital camera. Otherwise multiply the pitch by f_pixel/f_s, and do not "
     "resample.",
     reasons={
-        "measure": "needs targets, or the beat of the two clocks in a flat field with a visible pixel clock",
         "correct": "coordinates are scaled and images are left as they are: the camera's geometry gives the true position",
         "propagate": "a known change of coordinates is not an error; the error by aliasing depends on all filters before it",
     },

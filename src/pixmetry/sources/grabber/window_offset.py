@@ -7,9 +7,11 @@ from dataclasses import replace
 import numpy as np
 from pydantic import model_validator
 
+from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal, Windows
 from pixmetry.camera.source import Parameters, Source, quantity
 from pixmetry.core.errors import ParameterError
+from pixmetry.core.number import Estimates
 from pixmetry.core.random import Grid, Stream
 
 
@@ -87,6 +89,14 @@ def _span(first: np.ndarray, size: int, image: int, offset: int, stored: int) ->
     return begin, int((end - begin).max(initial=1))
 
 
+def measure(observations: Observations) -> Estimates:
+    """Rows and columns in front of the active area, from a frame that shows its border."""
+    found = observations.border(("row_offset", "col_offset"), where="grabber.window_offset")
+    told = "one frame does not tell the step in which the grabber sets its window"
+    steps = {name.replace("offset", "increment"): told for name in found.names}
+    return found.join(Estimates.from_rows([(name, 1.0, 0.0, np.inf, "px") for name in steps], reasons=steps))
+
+
 SOURCE = Source(
     id="grabber.window_offset",
     title="Offsets of the grabber's window",
@@ -103,6 +113,7 @@ SOURCE = Source(
     typical=WindowOffset(row_offset=4, row_increment=4, col_offset=3, inactive_rows=2),
     bound=WindowOffset(row_offset=-8, row_increment=4, col_offset=-5, inactive_rows=4),
     forward=forward,
+    measure=measure,
     reshape=reshape,
     place=place,
     context=context,
@@ -114,7 +125,6 @@ SOURCE = Source(
     advice="Calibrate the principal point with the grabber that measures, and do not change its window. Do not assume the middle of the "
     "stored image.",
     reasons={
-        "measure": "needs the border of the active image, as in a defocused bright field with the whole frame stored",
         "correct": "coordinates are shifted and images are left as they are: the camera's geometry gives the true position",
         "propagate": "an offset of whole pixels moves all targets alike: it belongs to the principal point, not to the error of a target",
     },
