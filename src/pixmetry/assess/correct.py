@@ -13,6 +13,7 @@ import numpy as np
 
 from pixmetry.camera.camera import Camera, Element, load_camera
 from pixmetry.camera.conversions import SAMPLE, LineSources
+from pixmetry.camera.covered import Covered
 from pixmetry.camera.line import Line
 from pixmetry.camera.overrides import changed_camera, with_source
 from pixmetry.camera.provenance import MEASURED, TYPICAL
@@ -26,6 +27,7 @@ from pixmetry.files import InputHashes, provenance_record, read_maps, staged_out
 from pixmetry.files.formats import is_frame
 from pixmetry.files.images import LoadedFrame, check_frame, load_frame, picture_files
 from pixmetry.files.raw_values import RawLayout, layout_of
+from pixmetry.observe.covered import row_and_column_offsets
 from pixmetry.observe.surface import fit_surface
 
 MAP_OF = {"sensor.dsnu": "dark_dn", "sensor.prnu": "prnu_rel", "sensor.defects": "defects"}  # maps in stored pixels and DN above black
@@ -39,6 +41,10 @@ LEAST_RESPONSE = 0.1  # of a pixel that is divided by it; one with less is a def
 MOST_CLIPPED = 0.01  # of the values of dark or flat frames: hot pixels
 BY_VALUE = ("electronics.gamma", "electronics.hdr_gain", "electronics.nonlinearity")  # ask for no place
 HIDDEN_BY = {"sensor.bayer_mosaic": "processing.demosaic"}  # what is not there any more behind another source
+BY_BORDERS = {  # what covered pixels of the same frame tell, by the map of it
+    "electronics.row_noise": ("row_offset_dn", "each row by the covered columns beside it"),
+    "electronics.column_noise": ("column_offset_dn", "each column by the covered rows above and below it"),
+}
 WHOLE_PX = 0.01  # by which a place on the pixel grid may be off
 
 
@@ -112,6 +118,10 @@ def correct_signal(
     for element in reversed(camera.active):
         if element.name == until:
             break
+        if element.source.id in BY_BORDERS and BY_BORDERS[element.source.id][0] in maps and _is_wanted(element, *chosen):
+            signal, step = _without_offsets(element, signal, maps)
+            steps.append(step)
+            continue
         why_not = _reason(element, maps, *chosen)
         if why_not:
             steps.append(FrameCorrection(element.name, element.source.title, False, why_not))
@@ -148,6 +158,21 @@ def _reason(element: Element, maps: Mapping[str, np.ndarray], only: tuple[str, .
     if element.known_from == TYPICAL and needs is None and not named:
         return "not corrected: its parameters are only typical of such a camera; name it under `only` to correct it all the same"
     return ""
+
+
+def _is_wanted(element: Element, only: tuple[str, ...], skip: tuple[str, ...]) -> bool:
+    """Whether a source is among those asked for."""
+    return element.name not in skip and (not only or element.name in only)
+
+
+def _without_offsets(element: Element, signal: Signal, maps: Mapping[str, np.ndarray]) -> tuple[Signal, FrameCorrection]:
+    """A signal without the offsets of its rows, or columns, that the covered pixels of the same frame tell."""
+    name, does = BY_BORDERS[element.source.id]
+    offset = maps[name].astype(np.float32)
+    data = signal.data - (offset[:, None] if name == "row_offset_dn" else offset)
+    leaves = "the noise of the covered pixels' mean, as far as the weight lets it through"
+    text = "corrected by the covered pixels of each frame"
+    return signal.with_data(data), FrameCorrection(element.name, element.source.title, True, text, does, leaves)
 
 
 def _since(camera: Camera, element: Element) -> str:
@@ -366,8 +391,32 @@ class Known:
 
     def corrected(self, frame: np.ndarray, weigh: bool = False) -> tuple[Signal, tuple[FrameCorrection, ...]]:
         """A frame of codes without what is known."""
+        maps = dict(self.maps)
+        if self.covered is not None and frame.shape == self.covered.stored_shape(self.camera.output_shape):
+            sinks = any(e.source.id == "grabber.clamp" and e.params.droop_rel > 0 for e in self.camera.active)
+            maps |= row_and_column_offsets(frame, self.covered, left_alone=sinks)
+            frame = np.ascontiguousarray(frame[self.covered.active(frame.shape)])
         signal = _as_signal(frame, self.camera)
-        return correct_signal(self.camera, signal, self.maps, only=self.only, skip=self.skip, weigh=weigh)
+        return correct_signal(self.camera, signal, maps, only=self.only, skip=self.skip, weigh=weigh)
+
+    @property
+    def covered(self) -> Covered | None:
+        """Covered borders of the stored frames, from the camera's facts."""
+        stated = self.camera.facts.get("covered")
+        return None if stated is None else Covered(**{side: int(count) for side, count in dict(stated).items()})
+
+    def shape_of(self, frame: np.ndarray) -> tuple[int, int]:
+        """The size that a frame must have: that of the light-sensitive area, or with the covered borders where it has these."""
+        shape, covered = self.camera.output_shape, self.covered
+        stored = shape if covered is None else covered.stored_shape(shape)
+        return stored if frame.shape == stored else shape
+
+    def lit(self, stack: np.ndarray) -> np.ndarray:
+        """Frames of shape (n, rows, cols) without covered borders, if they have them."""
+        covered = self.covered
+        if covered is None or stack.shape[1:] != covered.stored_shape(self.camera.output_shape):
+            return stack
+        return stack[(slice(None), *covered.active(stack.shape[1:]))]
 
     def listed(self) -> tuple[FrameCorrection, ...]:
         """What would be done to an even frame at half of the range."""
@@ -549,13 +598,14 @@ def _correct_array(frames: np.ndarray, known: Known) -> Correction:
         raise InputError("values that this camera cannot store", where="frames", value=int(stack.max()), allowed=f"0 to {top}")
     stack = stack.astype(np.uint8 if known.bits <= 8 else np.uint16)
     said: list[tuple[FrameCorrection, ...]] = []
-    out = np.empty(stack.shape, np.float32)
+    active = known.lit(stack)
+    out = np.empty(active.shape, np.float32)
     for i, frame in enumerate(stack):
-        check_frame(frame, f"frames[{i}]", bits=known.bits, shape=known.camera.output_shape)
+        check_frame(frame, f"frames[{i}]", bits=known.bits, shape=known.shape_of(frame))
         corrected, steps = known.corrected(frame, weigh=i == 0)
         out[i] = corrected.data[0]
         said.append(steps)
-    clipped = (stack == 0) | (stack == top)
+    clipped = (active == 0) | (active == top)
     return Correction(_together(said), out, steps=said[0] if said else (), clipped=clipped, clipped_pixels=int(clipped.sum()))
 
 
@@ -572,9 +622,10 @@ def _correct_files(
     def work(path: Path) -> tuple[Path, LoadedFrame, np.ndarray, tuple[FrameCorrection, ...], int]:
         loaded = load_frame(path, raw=layout)
         frame = loaded.array
-        check_frame(frame, str(path), bits=known.bits, shape=known.camera.output_shape)
+        check_frame(frame, str(path), bits=known.bits, shape=known.shape_of(frame))
         corrected, steps = known.corrected(frame, weigh=path == files[0])
-        return path, loaded, corrected.data[0], steps, int(((frame == 0) | (frame == top)).sum())
+        lit = known.lit(frame[None])[0]
+        return path, loaded, corrected.data[0], steps, int(((lit == 0) | (lit == top)).sum())
 
     said: list[tuple[FrameCorrection, ...]] = []
     clipped: dict[str, int] = {}

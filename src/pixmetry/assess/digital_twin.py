@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -73,6 +73,7 @@ def digital_twin(campaign: Campaign, estimates: Mapping[str, Estimates], observa
             "bits": campaign.bits,
             **({} if facts.sensor_shape is None else {"sensor_rows": facts.sensor_rows, "sensor_cols": facts.sensor_cols}),
             **({} if observations.storage.lossless is None else {"lossless": observations.storage.lossless}),
+            **({} if facts.covered is None else {"covered": asdict(facts.covered)}),
             "source": f"assessed from {campaign.source_path.name}",
             "photons": "photons" if photons_known else "electrons: no photon count was given, the quantum efficiency is set to 1",
         },

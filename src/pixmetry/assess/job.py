@@ -42,6 +42,7 @@ from pixmetry.files import (
 )
 from pixmetry.files.records import LOCATED, FrameGroup
 from pixmetry.locate.target_estimator import TargetEstimator, parse_estimator
+from pixmetry.observe.covered import BorderFrames, covered_pixels
 from pixmetry.observe.observe import Group, observe
 from pixmetry.observe.one_pass import without_levels
 from pixmetry.series.job import measure_motion, measure_series
@@ -290,9 +291,18 @@ def observe_campaign(campaign: Campaign, progress: Progress) -> tuple[InputHashe
     note = "edges, lines, spots and charts are not measured through a colour mosaic: a step of brightness looks jagged there"
     left_out = (note,) if len(chosen) < len(shown) else ()
 
+    covered, borders = campaign.camera.covered, list[BorderFrames]()
+
+    def taken(group: FrameGroup) -> Iterator[tuple[Path, Callable[[np.ndarray], object] | None]]:
+        if covered is None:
+            yield from ((path, None) for path in group.paths)
+            return
+        borders.append(BorderFrames(group.kind, group.exposure_s, covered))
+        yield from ((path, partial(borders[-1].add, index)) for index, path in enumerate(group.paths))
+
     def groups() -> Iterator[Group]:
         for g in chosen:
-            yield Group(g.kind, g.role, g.exposure_s, g.photons, [partial(reader.fetch, path) for path in g.paths], g.facts)
+            yield Group(g.kind, g.role, g.exposure_s, g.photons, [partial(reader.fetch, path, put) for path, put in taken(g)], g.facts)
 
     if chosen:
         seen = observe(groups(), campaign.bits, campaign.camera.temperature_c, campaign.stated, on_frames=on_frames)
@@ -303,9 +313,12 @@ def observe_campaign(campaign: Campaign, progress: Progress) -> tuple[InputHashe
         seen = _with_series(seen, campaign, still, reader, on_frames)
     if moving := [g for g in followed if g.kind == "motion"]:
         seen = _with_motion(seen, campaign, moving, reader, on_frames)
-    notes = (*campaign.findings, *left_out, *seen.notes)
+    fit = seen.photon_transfer_fit
+    gain = fit["gain_dn_per_e"].value if fit is not None and "gain_dn_per_e" in fit else None
+    bordered = covered_pixels(borders, campaign.camera.interface == "analogue", gain)
+    notes = (*campaign.findings, *left_out, *seen.notes, *(() if bordered is None else bordered.notes))
     facts = campaign.camera
-    return reader.hashes, replace(seen, storage=reader.storage, sensor=facts.sensor, pixel_clock_mhz=facts.pixel_clock_mhz, notes=notes)
+    return reader.hashes, replace(seen, storage=reader.storage, sensor=facts.sensor, covered=bordered, notes=notes)
 
 
 def _with_series(

@@ -14,6 +14,7 @@ from pixmetry.camera.camera import Camera
 from pixmetry.camera.observations import (
     ActiveArea,
     BrightSpots,
+    CoveredPixels,
     DarkTemperatures,
     EdgeResponse,
     LightSteps,
@@ -118,6 +119,7 @@ class Assessment:
             "response": None if self.observations.response is None else response_record(self.observations.response),
             "series": None if self.observations.drift is None else drift_record(self.observations.drift),
             "motion": None if self.observations.motion is None else motion_record(self.observations.motion),
+            "covered": None if self.observations.covered is None else covered_record(self.observations.covered),
             "lines": None if self.observations.lines is None else lines_record(self.observations.lines),
             "emva1288": {
                 "release": self.standard.release,
@@ -306,6 +308,25 @@ def response_record(found: Response) -> dict[str, Any]:
         "patches": patches,
         "refused": list(found.refused),
     }
+
+
+def covered_record(found: CoveredPixels) -> dict[str, Any]:
+    """The plain record of covered columns and rows."""
+    trails = [
+        {
+            "axis": t.axis,
+            "transfers": t.transfers,
+            "signal_dn": t.signal_dn.tolist(),
+            "first_dn": t.first_dn.tolist(),
+            "u_first_dn": t.u_first_dn.tolist(),
+            "shape": t.shape.tolist(),
+            "u_shape": t.u_shape.tolist(),
+        }
+        for t in found.trails
+    ]
+    noise = [{"exposure_s": exposure_s, "row_noise_dn": value, "u": u} for exposure_s, value, u in found.row_noise]
+    told = {name: why for name, why in found.fit.reasons.items() if name not in found.fit}
+    return {"borders": asdict(found.covered), "values": found.fit.to_records(), "not_told": told, "trails": trails, "row_noise": noise}
 
 
 def lines_record(found: LineRows) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from pixmetry.camera.code_table import CodeTable
+from pixmetry.camera.covered import Covered
 from pixmetry.camera.drift_series import DriftSeries
 from pixmetry.camera.motion_series import MotionSeries
 from pixmetry.camera.noise_covariance import NoiseCovariance, NoiseFilter
@@ -541,6 +542,65 @@ class LineRows:
     notes: tuple[str, ...] = ()
 
 
+@dataclass(frozen=True)
+class Trail:
+    """What covered pixels show behind the lit area of bright frames, in DN above the farther ones.
+
+    Parameters
+    ----------
+    axis : {"columns", "rows"}
+        What is covered.
+    signal_dn, first_dn, u_first_dn : ndarray, shape (levels,)
+        Light beside the border, and the first covered pixel.
+    share, u_share : float
+        The first covered pixel over the light.
+    shape, u_shape : ndarray, shape (pixels,)
+        The same of the covered pixels behind each other, as they were seen.
+    length_px, u_length_px : float
+        Mean distance by which late charge comes.
+    transfers : int
+        To the output from the first covered pixel.
+    bent : float
+        By how many u the share differs between faint and strong light.
+    """
+
+    axis: str
+    signal_dn: np.ndarray
+    first_dn: np.ndarray
+    u_first_dn: np.ndarray
+    share: float
+    u_share: float
+    shape: np.ndarray
+    u_shape: np.ndarray
+    length_px: float
+    u_length_px: float
+    transfers: int
+    bent: float
+
+
+@dataclass(frozen=True)
+class CoveredPixels:
+    """What the covered columns and rows of the stored frames tell.
+
+    Parameters
+    ----------
+    covered : Covered
+    fit : Estimates
+        ``serial_cti``, ``serial_trail_px``, ``parallel_cti``, ``parallel_trail_px`` (per pixel); ``droop_rel`` of a line's length;
+        ``smear_s``: what a row takes up of its column, as a time of moving through all lit rows.
+    trails : tuple of Trail
+    row_noise : tuple of (float, float, float)
+        Exposure of a group, standard deviation of the noise common to a row in DN, its u.
+    notes : tuple of str
+    """
+
+    covered: Covered
+    fit: Estimates
+    trails: tuple[Trail, ...]
+    row_noise: tuple[tuple[float, float, float], ...]
+    notes: tuple[str, ...] = ()
+
+
 LENS, AFFINITY = "optics.distortion", "sensor.affinity"
 TAKEN_UP = (LENS, AFFINITY, "optics.cover_glass", "sensor.pixel_pitch", "sensor.tilt")  # by a calibration, in the first two
 
@@ -693,11 +753,11 @@ class Observations:
     lines: LineRows | None = None
     blocks: StoredBlocks | None = None
     area: ActiveArea | None = None
+    covered: CoveredPixels | None = None
     noise_covariance: NoiseCovariance | None = None
     noise_filter: NoiseFilter | None = None
     stated: StatedFacts = StatedFacts()
     temperature_c: float | None = None
-    pixel_clock_mhz: float | None = None
     geometry: CameraGeometry | None = None
     drift: DriftSeries | None = None
     motion: MotionSeries | None = None
@@ -805,6 +865,19 @@ class Observations:
         fit = None if self.response is None else self.response.fit
         mapping = dict(names) if isinstance(names, Mapping) else {n: n for n in names}
         return of_pictures(fit, mapping, where=where, pictures="patches of known light", kind="chart")
+
+    def by_covered(self, names: Mapping[str, str], *, where: str) -> Estimates:
+        """Take a source's parameters ``{parameter: fitted name}`` that covered columns and rows tell.
+
+        Raises
+        ------
+        MeasureError
+            Without covered pixels, or with the reason why they do not tell any of these.
+        """
+        if self.covered is None:
+            remedy = "state camera.covered in the manifest, as covered: {right: 16, bottom: 8}"
+            raise MeasureError("not measured: needs covered columns or rows", where=where, remedy=remedy)
+        return of_pictures(self.covered.fit, names, where=where, pictures="covered pixels", kind="bright")
 
     def row_jitter(self, names: Mapping[str, str], *, where: str, taped: bool = False) -> Estimates:
         """Take a source's parameters ``{parameter: fitted name}`` that the rows of upright lines tell, in px, with their covariance.

@@ -24,6 +24,7 @@ TARGETS = (
     "light_off",
     "chart",
     "line",
+    "covered",
     "spots",
     "pattern",
     "dark_temperature",

@@ -107,6 +107,7 @@ class GroupModel(Model):
         "light_off",
         "chart",
         "line",
+        "covered",
         "spots",
         "pattern",
         "dark_temperature",

@@ -48,6 +48,11 @@ def reduce_lines(groups: Sequence[PictureGroup], seen: Observations) -> Observat
     return replace(seen, lines=lines, notes=(*seen.notes, *lines.notes))
 
 
+def reduce_covered(groups: Sequence[PictureGroup], seen: Observations) -> Observations:
+    """Nothing by themselves: their covered borders are reduced with those of all other frames (`pixmetry.observe.covered`)."""
+    return seen
+
+
 EXPERIMENTS = {
     e.kind: e
     for e in (
@@ -55,6 +60,7 @@ EXPERIMENTS = {
         Experiment("light_off", reduce_light_off, BlockMeans),
         Experiment("chart", reduce_charts),
         Experiment("line", reduce_lines, LineFrames),
+        Experiment("covered", reduce_covered),
         Experiment("spots", reduce_spots),
         Experiment("pattern", reduce_patterns, FirstFrames),
         Experiment("dark_temperature", reduce_dark_temperatures),

@@ -89,6 +89,7 @@ def _pictures(assessment: Assessment) -> list[Section]:
     """A section for each kind of pictures."""
     from pixmetry.assess.page.active_area import area_section
     from pixmetry.assess.page.blocks import blocks_section
+    from pixmetry.assess.page.covered import covered_section
     from pixmetry.assess.page.dark_temperature import dark_temperature_section
     from pixmetry.assess.page.edges import edges_section
     from pixmetry.assess.page.light_off import light_off_section
@@ -106,6 +107,7 @@ def _pictures(assessment: Assessment) -> list[Section]:
         *([] if seen.blocks is None else [blocks_section(seen.blocks, seen.storage)]),
         *([] if seen.dark_temperatures is None else [dark_temperature_section(seen.dark_temperatures)]),
         *([] if seen.area is None else [area_section(seen.area)]),
+        *([] if seen.covered is None else [covered_section(seen.covered)]),
         *([] if seen.light_off is None else [light_off_section(seen.light_off)]),
         *([] if seen.drift is None else [drift_section(seen.drift)]),
         *([] if seen.motion is None else [motion_section(seen.motion)]),

@@ -159,6 +159,6 @@ SOURCE = Source(
     references=("EMVA 1288 R4.0 Linear, §8.2 (row and column split)",),
     advice="Subtract each column's mean over optically black rows of the same frame; renew dark frames often.",
     reasons={
-        "correct": "needs optically black rows above the image, which give each column's offset",
+        "correct": "needs optically black rows above or below the image (covered in the camera's facts), in frames stored with them",
     },
 )

@@ -63,5 +63,5 @@ SOURCE = Source(
     typical_size="0.0155 px per DN in y on a disc of 7 px in a window of radius 6 px",
     references=("EMVA 1288 R4.0 Linear, §8.2 (row and column split)",),
     advice="Subtract each row's offset, measured in optically black columns, or average frames.",
-    reasons={"correct": "needs optically black columns beside the image, which give each row's offset"},
+    reasons={"correct": "needs optically black columns beside the image (covered in the camera's facts), in frames stored with them"},
 )

@@ -8,8 +8,10 @@ import numpy as np
 
 from pixmetry.camera.contribution import Contribution, Probe
 from pixmetry.camera.line import alike_rows
+from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal, Windows
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
 from pixmetry.sources.grabber._kernels import droop, undroop
 
@@ -99,6 +101,14 @@ def correct(params: Clamp, signal: Signal, maps: Mapping[str, np.ndarray]) -> Si
     return signal.with_data(data)
 
 
+def measure(observations: Observations) -> Estimates:
+    """Read the droop from covered columns at both ends of the line.
+
+    The level of black is in ``grabber.adc``, its noise in ``electronics.row_noise``: one gain does not tell them apart.
+    """
+    return observations.by_covered({"droop_rel": "droop_rel"}, where="grabber.clamp")
+
+
 def propagate(params: Clamp, probe: Probe) -> Contribution:
     """Noise common to each row (P7 for offsets), and the streak behind the target on the slope that the background gets (P2)."""
     u = _noise(params, probe)
@@ -148,6 +158,7 @@ SOURCE = Source(
     typical=Clamp(offset_dn=-3.0, noise_dn=0.3, drift_dn_per_k=0.05, droop_rel=0.01),
     bound=Clamp(offset_dn=-6.0, noise_dn=1.0, drift_dn_per_k=0.2, droop_rel=0.03),
     forward=forward,
+    measure=measure,
     correct=correct,
     propagate=propagate,
     context=context,
@@ -160,7 +171,4 @@ SOURCE = Source(
     references=("EMVA 1288 R4.0 Linear, §6.1 (black level: at most 0.5 % of the pixels at code 0)",),
     leaves="the noise of the lines' black level",
     advice="Set black at least three standard deviations of the noise above code 0. Subtract it, and use a soft threshold.",
-    reasons={
-        "measure": "dark frames show it in the black level of grabber.adc and in electronics.row_noise, and cannot separate it from these"
-    },
 )

@@ -81,7 +81,7 @@ def measure(observations: Observations) -> Estimates:
     names = {"white": "white_ns", "loop": "loop_ns", "settling": "settling_ns"}
     kept = ("loop_rows", "settling_rows", "interlaced")
     found = observations.row_jitter({f"{n}_px": f"{n}_px" for n in names} | {n: n for n in kept}, where="grabber.line_jitter")
-    return delays_ns(found, names, observations.pixel_clock_mhz, where="grabber.line_jitter")
+    return delays_ns(found, names, observations.stated.pixel_clock_mhz, where="grabber.line_jitter")
 
 
 def propagate(params: LineJitter, probe: Probe) -> Contribution:

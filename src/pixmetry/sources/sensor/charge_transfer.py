@@ -20,9 +20,11 @@ from typing import Literal
 import numpy as np
 
 from pixmetry.camera.contribution import Contribution, Probe
+from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal, Windows
 from pixmetry.camera.source import STATED_FRAME, Parameters, Source, quantity
 from pixmetry.core.errors import ParameterError
+from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
 from pixmetry.sources.sensor._charge_kernels import pass_traps, scatter, share_table, transfer_columns, transfer_packets, transfer_rows
 
@@ -202,6 +204,12 @@ def correct(params: ChargeTransfer, signal: Signal, maps: Mapping[str, np.ndarra
     return signal.with_data(x)
 
 
+def measure(observations: Observations) -> Estimates:
+    """Read what covered columns and rows show behind the lit area of bright frames, per pixel; a trail in px for both directions."""
+    names = ("serial_cti", "parallel_cti", "trail_px")
+    return observations.by_covered({name: name for name in names}, where="sensor.charge_transfer")
+
+
 def context(params: ChargeTransfer, windows: Windows, frame_shape: tuple[int, int]) -> Windows:
     """The whole column, and the whole row if the register loses charge."""
     if params.in_columns:
@@ -311,6 +319,7 @@ SOURCE = Source(
     bound=bound_over(STATED_FRAME),
     bound_over=bound_over,
     forward=forward,
+    measure=measure,
     correct=correct,
     propagate=propagate,
     context=context,
@@ -327,5 +336,4 @@ SOURCE = Source(
     ),
     leaves="the noise of the transfer, and traps that the model does not hold",
     advice="Clock more slowly, keep a background of some hundred electrons, and correct with the measured inefficiency.",
-    reasons={"measure": "needs overscan pixels, or one target at many distances from the output: dark and flat frames do not show it"},
 )

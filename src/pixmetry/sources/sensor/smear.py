@@ -14,6 +14,7 @@ from pixmetry.camera.observations import Observations, of_pictures
 from pixmetry.camera.signal import Kind, Signal, Windows
 from pixmetry.camera.source import Parameters, Source, quantity
 from pixmetry.core.arrays import Array
+from pixmetry.core.errors import MeasureError
 from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
 from pixmetry.sources.sensor._readout_kernels import add_column_sums, add_rows_passed
@@ -93,10 +94,26 @@ def truth(params: Smear, signal: Signal, stream: Stream) -> Mapping[str, np.ndar
 
 
 def measure(observations: Observations) -> Estimates:
-    """Product of transfer time and leak, as a time at leak 1, from the streaks of bright spots at several exposures."""
-    spots = observations.spots
-    fit = None if spots is None else spots.fit
-    return of_pictures(fit, {"transfer_s": "smear_s"}, where="sensor.smear", pictures="bright spots on black", kind="spots")
+    """Product of transfer time and leak, as a time at leak 1: from covered rows or streaks of bright spots, whichever tells it better.
+
+    Raises
+    ------
+    MeasureError
+        If neither does.
+    """
+    spots = None if observations.spots is None else observations.spots.fit
+    found, reasons = [], []
+    for ask in (
+        lambda: observations.by_covered({"transfer_s": "smear_s"}, where="sensor.smear"),
+        lambda: of_pictures(spots, {"transfer_s": "smear_s"}, where="sensor.smear", pictures="bright spots on black", kind="spots"),
+    ):
+        try:
+            found.append(ask())
+        except MeasureError as problem:
+            reasons.append(problem)
+    if not found:
+        raise reasons[1] if observations.covered is None or spots is not None else reasons[0]
+    return min(found, key=lambda fit: fit["transfer_s"].u)
 
 
 SOURCE = Source(

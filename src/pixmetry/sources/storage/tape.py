@@ -170,7 +170,7 @@ def measure(observations: Observations) -> Estimates:
         )
     added = added_delays(played, observations.lines.jitter, where="storage.tape")
     return delays_ns(
-        added, {"white": "white_ns", "loop": "wow_ns", "loop_rows": "wow_rows"}, observations.pixel_clock_mhz, where="storage.tape"
+        added, {"white": "white_ns", "loop": "wow_ns", "loop_rows": "wow_rows"}, observations.stated.pixel_clock_mhz, where="storage.tape"
     )
 
 
