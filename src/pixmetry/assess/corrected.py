@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from pixmetry.assess.per_image import MODELS, fit_per_image
+from pixmetry.assess.per_row import PerRow, fit_per_row
 from pixmetry.assess.position_tables import Positions, check_form, mark_of, read_positions
 from pixmetry.budget.changes import changed
 from pixmetry.budget.motion import LOOKS, in_pairs, row_delays
@@ -32,6 +33,7 @@ from pixmetry.core.errors import InputError
 from pixmetry.files.output import Output, check_files, write_together
 
 CORRECTED_SCHEMA = "pixmetry/corrected/1"
+ROWS = "rows"  # the model of a reference that is measured row by row
 NOTHING_PX = 1e-9  # a smaller displacement is none
 NO_TIME_S = 1e-9  # after the time of the frame
 STEP_PX = 0.25  # for derivatives by place
@@ -259,6 +261,12 @@ def corrected(
         Names of the columns.
     origin : {"first_pixel", "corner", "one"}
         What the table calls the centre of the top-left pixel: (0, 0), (0.5, 0.5) or (1, 1).
+    reference : path, mapping of columns, or array_like, optional
+        Where targets should be, by name; or places of a straight line.
+    per_image : {"shift", "scale", "pose", "rows"}
+        What is fitted to the reference in each image; ``rows``: see `pixmetry.assess.per_row.fit_per_row`.
+    match : str, optional
+        The column that names targets in both tables.
 
     Returns
     -------
@@ -287,9 +295,16 @@ def corrected(
     0.051 px
     """
     asked = read_scenario(scenario)
-    case = _Case.of(read_positions(table, x=x, y=y, origin=origin), with_, asked, dict(settings or {}), scenario is not None, dict(u or {}))
+    positions = read_positions(table, x=x, y=y, origin=origin)
+    rows = None
+    if reference is not None and per_image == ROWS:  # they are rows of the frame: first of all
+        rows = fit_per_row(positions, read_positions(reference, origin=origin))
+    seen = positions if rows is None else replace(positions, x_px=positions.x_px - rows.shift_px)
+    case = _Case.of(seen, with_, asked, dict(settings or {}), scenario is not None, dict(u or {}))
     found = _corrected(case, _known_names(case.camera, only), _known_names(case.camera, skip))
-    if reference is not None:
+    if rows is not None:
+        found = _without_jitter(replace(found, measured=positions), rows, case.camera)
+    elif reference is not None:
         found = _fitted(found, read_positions(reference, origin=origin), per_image, case.camera.frame_shape, match)
     if output is not None:
         found.write(output)
@@ -634,6 +649,29 @@ def _fitted(
         image_of=fit.image_of,
         sources=(*found.sources, step),
         notes=(*found.notes, *fit.notes),
+    )
+
+
+def _without_jitter(found: CorrectedPositions, rows: PerRow, camera: Camera) -> CorrectedPositions:
+    """What is said of positions whose rows were put back before all else; their effects are brought to pixels of the sensor."""
+    start, end = (float(camera.layout(at, 0.0)[0][0]) for at in (0.0, 1.0))
+    laid_out = 1.0 if not any(s.applied for s in found.sources) else 1.0 / (end - start)
+    own, shared = (np.stack([laid_out * e, np.zeros_like(e)], axis=-1) for e in (rows.own_effects_px, rows.shared_effects_px))
+    added = _summed(own) + _summed(shared)
+    name = "per row"
+    shift, u = float(np.abs(rows.shift_px).max(initial=0.0)), float(np.sqrt(added[:, 0].max(initial=0.0)))
+    text = f"{rows.corrected} targets by a line in {rows.rows} rows"
+    step = SourceCorrection(name, "Rows displaced along themselves", rows.corrected > 0, text, (shift, 0.0), (u, 0.0))
+    return replace(
+        found,
+        covariance_px2=None if found.covariance_px2 is None else found.covariance_px2 + added,
+        correction_px2=found.correction_px2 + added,
+        effects_px=np.concatenate([found.effects_px, shared]),
+        causes=(*found.causes, *[name] * len(shared)),
+        image_effects_px=own,
+        image_of=rows.image_of,
+        sources=(*found.sources, step),
+        notes=(*found.notes, *rows.notes),
     )
 
 

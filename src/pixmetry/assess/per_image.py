@@ -86,7 +86,7 @@ def fit_per_image(
         raise InputError("no such model", where="per_image", value=model, allowed=", ".join(MODELS))
     aim, aim_px2, place = _aims(table, reference, match)
     known = place >= 0
-    names, image_of = _images(table)
+    names, image_of = images_of(table)
     basis = _basis(at_px, model, frame_shape)
     shift, effects = np.zeros_like(at_px), np.array(effects_px)
     own = np.zeros((len(basis), *at_px.shape))
@@ -135,7 +135,7 @@ def fit_per_image(
     return PerImage(shift, effects, shared, own, image_of, used, fits, tuple(notes))
 
 
-def _images(table: Positions) -> tuple[list[str], np.ndarray]:
+def images_of(table: Positions) -> tuple[list[str], np.ndarray]:
     """How each image is called, and that of each position: by the columns ``image`` and ``frame``, as far as they are there."""
     columns = [(name, [_key(v) for v in table.columns[name]]) for name in ("image", "frame") if name in table.columns]
     if not columns:

@@ -47,10 +47,11 @@ if TYPE_CHECKING:
 @click.option("--reference", type=click.Path(path_type=Path), metavar="FILE", help="Table of where targets should be, by name.")
 @click.option(
     "--per-image",
-    type=click.Choice(["shift", "scale", "pose"]),
+    type=click.Choice(["shift", "scale", "pose", "rows"]),
     default="scale",
     show_default=True,
-    help="What of each image is fitted to the reference: a shift; also scales along the axes; or a shift and a rotation.",
+    help="What of each image is fitted to the reference: a shift; also scales along the axes; or a shift and a rotation. "
+    "rows: the reference is a straight line, x in each row y; jitter of the rows is taken off.",
 )
 @click.option("--match", metavar="COLUMN", help="Column that names targets in both tables. Default: point, name, label, id or target.")
 @click.option("--only", multiple=True, metavar="ID", help="Correct only this source. May be repeated.")
