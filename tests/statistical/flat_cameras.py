@@ -19,11 +19,11 @@ from pixmetry.simulate.job import expose_group, plan_series
 GAIN = "electronics.gain.gain_dn_per_e"
 KINDS = (
     "none", "charge", "sharpening", "blur", "temporal", "taps", "everything", "companding", "median", "demosaic", "mosaic", "columns",
-    "telegraph",
+    "telegraph", "outliers",
 )  # fmt: skip
 OWN = (
     "brighter_fatter", "sharpening", "temporal_noise_reduction", "tap_gain", "companding", "noise_reduction", "bayer_mosaic",
-    "column_noise", "telegraph_noise",
+    "column_noise", "telegraph_noise", "defect_correction",
 )  # fmt: skip
 
 
@@ -82,6 +82,9 @@ def flat_case(rng: np.random.Generator, kind: str, shape: tuple[int, int] = (120
     if kind == "telegraph":
         values["electronics.telegraph_noise"] = {"share": rng.uniform(0.005, 0.05), "amplitude_e": noise * rng.uniform(2, 5)}
         stack = 200
+    if kind == "outliers":  # in units of the noise at half of saturation
+        noise_dn = float(np.sqrt(0.4 * gain * (2**bits - offset)))
+        values["processing.defect_correction"] = {"threshold_dn": int(noise_dn * rng.uniform(0.7, 1.6))}
     if kind == "companding":
         values["processing.companding"] = {"law": str(rng.choice(["root", "linear"])), "transport_bits": int(rng.integers(8, 11))}
     if kind in ("taps", "everything"):

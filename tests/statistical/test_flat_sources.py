@@ -12,11 +12,13 @@ from statistical.flat_cameras import GAIN, flat_case, measured
 from statistical.test_flat_cameras import holds
 
 COLOURS = tuple(f"sensor.bayer_mosaic.{name}" for name in ("red", "green", "blue", "green_split_rel"))
+CUT = "processing.defect_correction.threshold_dn"
 COLUMNS, SHARE, STEP = "electronics.column_noise.gain_rel", "electronics.telegraph_noise.share", "electronics.telegraph_noise.amplitude_e"
 
 
 @pytest.mark.parametrize(
-    ("kind", "cameras", "names"), [("mosaic", 3, (GAIN, *COLOURS)), ("columns", 3, (GAIN, COLUMNS)), ("telegraph", 1, (SHARE, STEP))]
+    ("kind", "cameras", "names"),
+    [("mosaic", 3, (GAIN, *COLOURS)), ("columns", 3, (GAIN, COLUMNS)), ("telegraph", 1, (SHARE, STEP)), ("outliers", 2, (CUT,))],
 )
 def test_blind_estimates_hold(rng, kind, cameras, names):
     for _ in range(cameras):
@@ -33,3 +35,4 @@ def test_cameras_without_them_have_limits(rng):
     assert found[COLUMNS].is_limit or found[COLUMNS].value < 6 * found[COLUMNS].u
     assert found[SHARE].is_limit and found[SHARE].value < 0.01
     assert STEP not in found
+    assert CUT not in found

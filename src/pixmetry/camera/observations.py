@@ -118,6 +118,22 @@ class CodeHistogram:
 
 
 @dataclass(frozen=True)
+class SingleOutliers:
+    """How many pixels of flat fields exceed all eight neighbours, or fall below them, by 0, 1, 2 … DN.
+
+    ``counts`` and what normal noise of ``sigma_dn`` would have, ``expected``, have shape (sizes,); the neighbours are ``step`` pixels away.
+    ``cut_dn`` and ``u_cut_dn``: the size above which they are missing; NaN where none are.
+    """
+
+    counts: np.ndarray
+    expected: np.ndarray
+    sigma_dn: float
+    step: int
+    cut_dn: float = float("nan")
+    u_cut_dn: float = float("nan")
+
+
+@dataclass(frozen=True)
 class ColourCells:
     """Light of the four places of a colour mosaic.
 
@@ -743,6 +759,7 @@ class Observations:
     patterns: PatternList | None = None
     code_errors: CodeErrors | None = None
     colour_cells: ColourCells | None = None  # of a colour mosaic; the bright stack is then balanced
+    outliers: SingleOutliers | None = None  # of the stack of bright frames
     code_table: CodeTable | None = None  # of companding, where the codes show one
     edges: SlantedEdges | None = None
     light_off: LightSteps | None = None

@@ -21,6 +21,7 @@ class LagProducts:
 
     by_pair: dict[int, np.ndarray] = field(default_factory=dict)  # each of shape (2, 2, 5, 9), as `sum_lag_products` has them
     _means: dict[int, float] = field(default_factory=dict)
+    samples: dict[int, np.ndarray] = field(default_factory=dict)  # the first frames of a stack
     margin_px: int = 0
     shape: tuple[int, int] = (0, 0)  # of the frames, without their margin
 

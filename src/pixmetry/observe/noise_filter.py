@@ -545,7 +545,7 @@ def fit_unfiltered(
     if found is None:
         found = NoiseFilter()
     if found.kind == UNKNOWN and abs(found.factor - 1) > SMALL:
-        what = "a median or another noise reduction, a coder such as JPEG, or a demosaicking changed it"
+        what = "a median or another noise reduction, a correction of defects, a coder such as JPEG, or a demosaicking changed it"
         named = np.isinf(found.factor)
         raise MeasureError(
             "the noise of neighbouring pixels is correlated, and not as behind a linear filter: "

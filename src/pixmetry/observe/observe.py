@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,11 +12,13 @@ from pixmetry.camera.noise_covariance import MOSAIC, WHITE, NoiseCovariance, Noi
 from pixmetry.camera.observations import (
     CodeErrors,
     CodeHistogram,
+    ColourCells,
     DefectList,
     LevelMoments,
     Observations,
     PatternList,
     PhotonTransfer,
+    SingleOutliers,
     Spectra,
     StackMoments,
 )
@@ -36,6 +38,7 @@ from pixmetry.observe.moments import LevelSummary
 from pixmetry.observe.noise_covariance import CorrelatedGroup, FrameSuccession, LagProducts, noise_covariance
 from pixmetry.observe.noise_filter import LARGEST_ALPHA, find_noise_filter, fit_unfiltered, unseen_rms
 from pixmetry.observe.one_pass import Group, Level, photon_transfer, reduce_groups, refuse_copies, without_levels
+from pixmetry.observe.outliers import cut_of, single_outliers
 from pixmetry.observe.patterns import find_phase_patterns
 from pixmetry.observe.photon_transfer_levels import (
     MINIMUM_LEVELS,
@@ -47,7 +50,7 @@ from pixmetry.observe.photon_transfer_levels import (
     with_stacks,
 )
 from pixmetry.observe.spatial_fit import fit_dark_pattern, fit_spatial
-from pixmetry.observe.stack import StackAccumulator, choose_stacks, same_exposure
+from pixmetry.observe.stack import SATURATED_FRACTION, StackAccumulator, choose_stacks, same_exposure
 
 __all__ = ["Group", "observe"]
 NOT_SIGNIFICANT = 3.0
@@ -175,6 +178,7 @@ def observe(
         code_errors=codes,
         code_table=table,
         colour_cells=cells,
+        outliers=_outliers(correlated, cells),
         noise_covariance=noise,
         noise_filter=noise_filter,
         stated=told,
@@ -183,6 +187,17 @@ def observe(
     )
     with single_threaded_blas():
         return reduce_pictures(pictures, seen)
+
+
+def _outliers(groups: list[CorrelatedGroup], cells: ColourCells | None) -> SingleOutliers | None:
+    """Single outliers of the bright stack of the most light that is not clipped, with the size above which they are missing."""
+    stacks = [g for g in groups if g.bright and g.products.samples and g.clipped <= SATURATED_FRACTION]
+    if not stacks:
+        return None
+    brightest = max(stacks, key=lambda g: g.mean_dn)
+    found = single_outliers([frame for _, frame in sorted(brightest.products.samples.items())], step=1 if cells is None else 2)
+    cut = None if found is None else cut_of(found)
+    return found if found is None or cut is None else replace(found, cut_dn=cut[0], u_cut_dn=cut[1])
 
 
 def _correlated(group: Group, level: LevelSummary, products: LagProducts, succession: FrameSuccession) -> CorrelatedGroup:

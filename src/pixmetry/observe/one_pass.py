@@ -21,6 +21,7 @@ from pixmetry.observe.noise_covariance import FrameSuccession, LagProducts, lag_
 from pixmetry.observe.stack import GroupReduction, new_group
 
 Frame = np.ndarray | Callable[[], np.ndarray]
+SAMPLES = 8  # frames of a stack, of which every other one is kept
 Part = Callable[[np.ndarray], np.ndarray]
 
 
@@ -136,6 +137,8 @@ class _Sums:
             products, mean = lag_products(own[0], own[1])
             with self._lock:
                 self.products.add(first_index // 2, products, mean, own[0].shape)
+                if self.stack and first_index < SAMPLES:
+                    self.products.samples[first_index] = own[0]
 
     def result(self) -> Reduced:
         if self.summary is not None:
