@@ -9,6 +9,7 @@ import numpy as np
 from pixmetry.core.number import Estimates, Number
 
 CAMERA_MODES = ("shift_x_px", "shift_y_px", "scale_rel", "rotation_rad")
+DIGITAL = "the camera is digital: no frame grabber samples its lines"
 GRABBER_MODES = ("affinity_rel", "shear_rel")  # of the scale along x alone, and of x over y: only analogue cameras have them
 
 

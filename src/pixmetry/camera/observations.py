@@ -966,5 +966,5 @@ def of_pictures(fit: Estimates | None, names: Mapping[str, str], *, where: str, 
     if not known:
         own = [fit.reasons.get(fitted, "") for fitted in names.values()]
         why = next(filter(None, [*own, *fit.reasons.values()]), f"no {pictures} could be measured")
-        raise MeasureError(f"not told by the {pictures}: {why}", where=where)
+        raise MeasureError(f"not told by {pictures}: {why}", where=where)
     return fit.select(known)

@@ -118,7 +118,7 @@ def _follow(images: tuple[Path, ...], output: Path, options: dict[str, Any]) -> 
 def summary_lines(found: Series) -> list[str]:
     """The text for the terminal."""
     from pixmetry.report.numbers import printed_number
-    from pixmetry.series.page import WORDS, stable_sentence
+    from pixmetry.series.page import WORDS, stable_sentence, untold
 
     drift = found.drift
     lines = [f"{len(found.frames)} frames over {(drift.time_s[-1] - drift.time_s[0]) / 60:.1f} min, {drift.targets} targets"]
@@ -126,5 +126,5 @@ def summary_lines(found: Series) -> list[str]:
     for number in drift.fit:
         printed = printed_number(number)
         lines.append(f"{WORDS[number.name]}: {printed.joined()}")
-    lines += [f"{WORDS[name]}: not told: {why}" for name, why in drift.fit.reasons.items() if name not in drift.fit and name in WORDS]
+    lines += [f"{WORDS[name]}: not told: {why}" for name, why in untold(drift.fit).items()]
     return [*lines, *found.notes]

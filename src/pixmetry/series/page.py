@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pixmetry.camera.drift_series import DriftSeries
+from pixmetry.camera.drift_series import DIGITAL, DriftSeries
 from pixmetry.camera.motion_series import MotionSeries
 from pixmetry.core.number import LOWER_LIMIT, Estimates, Number
 from pixmetry.report import Column, Page, Section, Table
@@ -113,9 +113,13 @@ def motion_section(motion: MotionSeries) -> Section:
 def _told(fit: Estimates) -> Table:
     """Values, limits, and why others are not there."""
     rows: list[list[Any]] = [[WORDS[number.name], number, number.reason] for number in fit]
-    gone = {name: why for name, why in fit.reasons.items() if name not in fit and name in WORDS}
-    rows += [[WORDS[name], Number.not_available("1", why), why] for name, why in gone.items()]
+    rows += [[WORDS[name], Number.not_available("1", why), why] for name, why in untold(fit).items()]
     return Table("What the series tells", ["Quantity", Column("Value", "number"), "Note"], rows)
+
+
+def untold(fit: Estimates) -> dict[str, str]:
+    """Why quantities are not told, by name; nothing of a frame grabber that a digital camera has not."""
+    return {name: why for name, why in fit.reasons.items() if name not in fit and name in WORDS and why != DIGITAL}
 
 
 def lag_figure(motion: MotionSeries) -> Figure:

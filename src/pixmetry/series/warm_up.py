@@ -10,7 +10,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.stats import chi2 as chi2_law
 
-from pixmetry.camera.drift_series import CAMERA_MODES, DriftSeries
+from pixmetry.camera.drift_series import CAMERA_MODES, DIGITAL, DriftSeries
 from pixmetry.core.arrays import Array
 from pixmetry.core.errors import MeasureError
 from pixmetry.core.number import LOWER_LIMIT, ONE_SIDED_95, Estimates, Number
@@ -393,6 +393,7 @@ def _estimates(series: Series, fit: Fit, found: Curve, others: Sequence[Fit], u_
     for name, parameter, unit in PARAMETERS:
         of_camera = any(name == row[0] for row in OF_CAMERA)
         if parameter not in fit.names:
+            reasons[name] = DIGITAL
             continue
         value, u = fit[parameter], fit.u(parameter)
         by = np.zeros(len(fit.names))
