@@ -69,7 +69,8 @@ def measure(observations: Observations) -> Estimates:
     """Scatter of the whole image from frame to frame, from a series of a fixed field."""
     names = ("shift_std_px", "roll_std_rad")
     fit = None if observations.drift is None else observations.drift.fit
-    return of_pictures(fit, {name: name for name in names}, where="sensor.stabilisation", pictures="targets that stay in place over time", kind="series")
+    told = {name: name for name in names}
+    return of_pictures(fit, told, where="sensor.stabilisation", pictures="a series of a fixed field", kind="series")
 
 
 SOURCE = Source(
