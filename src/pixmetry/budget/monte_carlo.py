@@ -149,6 +149,15 @@ class Crop:
     y_hat_px: float
 
 
+@dataclass(frozen=True)
+class _Variant:
+    """What all units of a variant of a camera share: the light, what is far from windows, the estimator as it sees its frames."""
+
+    facts: Facts
+    frozen: Frozen
+    estimator: Estimator
+
+
 @dataclass
 class Trials:
     """The design of a Monte Carlo: which target, at which places, in how many units and frames; the same for every set of sources.
@@ -203,26 +212,36 @@ class Trials:
         """Positions found in the frames of a variant of the camera less the true ones: px of the sensor, (units, places, frames)."""
         key = tuple((e.name, e.params) for e in camera.active)
         if key not in self._found:
-            facts = replace(self.facts, dn_per_photon=self.facts.dn_per_photon * passed_light(camera))
-            parts = [self._unit(replace(camera, unit_seed=camera.unit_seed + UNIT_STRIDE * k), k, facts) for k in range(self.units)]
+            variant = self._variant(camera)
+            parts = [self._unit(replace(camera, unit_seed=camera.unit_seed + UNIT_STRIDE * k), k, variant) for k in range(self.units)]
             self._found[key] = np.stack([x for x, _ in parts]), np.stack([y for _, y in parts])
         return self._found[key]
 
     def crop(self) -> Crop:
         """The first target of the first unit, as the camera shows it with all its sources."""
-        facts = replace(self.facts, dn_per_photon=self.facts.dn_per_photon * passed_light(self.camera))
-        windows, (col0, row0), (x, y), (x_hat, y_hat) = self._located(self.camera, 0, facts)
+        windows, (col0, row0), (x, y), (x_hat, y_hat) = self._located(self.camera, 0, self._variant(self.camera))
         at = (float(v[0]) for v in (x - col0, y - row0, x_hat, y_hat))
         return Crop(windows[0].astype(float), *at)
 
-    def _unit(self, camera: Camera, unit: int, facts: Facts) -> tuple[np.ndarray, np.ndarray]:
+    def _variant(self, camera: Camera) -> _Variant:
+        """What all units of a variant of the camera share.
+
+        Who locates targets takes background, threshold and height from the frames, so they follow what the camera does to the light: black
+        level, gain, a curve. Each is the mean of windows of that light, without what lies beyond four standard deviations.
+        """
+        facts = replace(self.facts, dn_per_photon=self.facts.dn_per_photon * passed_light(camera))
+        frozen = camera.freeze(background_of(self.target, facts), **_conditions(facts))
+        seen = self.located.as_seen(lambda light_dn: _level(camera, facts, self.target, self.side, light_dn, frozen))
+        return _Variant(facts, frozen, seen)
+
+    def _unit(self, camera: Camera, unit: int, variant: _Variant) -> tuple[np.ndarray, np.ndarray]:
         """Positions found less the true ones, px of the sensor, each (places, frames)."""
-        _, firsts, belongs, found = self._located(camera, unit, facts)
+        _, firsts, belongs, found = self._located(camera, unit, variant)
         parts = zip(found, firsts, belongs, _layout(camera), strict=True)
         dx, dy = (((hat + first - at) / step).reshape(self.places, self.frames) for hat, first, at, (_, step) in parts)
         return dx, dy
 
-    def _located(self, camera: Camera, unit: int, facts: Facts) -> tuple[np.ndarray, Pair, Pair, Pair]:
+    def _located(self, camera: Camera, unit: int, variant: _Variant) -> tuple[np.ndarray, Pair, Pair, Pair]:
         """Windows of one unit, the first column and row of each, where their targets belong in the frame and are found in the window."""
         n, middle = self.places * self.frames, self.side // 2
         shown = [np.repeat(first[unit] + middle + part[unit], self.frames) for first, part in ((self.col0, self.dx), (self.row0, self.dy))]
@@ -233,19 +252,17 @@ class Trials:
         col0, row0 = (
             np.clip(np.rint(at + by).astype(np.int64) - middle, 0, most) for at, by, most in zip(belongs, moved, last, strict=True)
         )
-        conditions: dict[str, Any] = {"exposure_s": facts.exposure_s, "temperature_c": facts.temperature_c}
-        frozen = camera.freeze(background_of(self.target, facts), **conditions)
         windows = camera.expose_windows(
-            scene_of(self.target, facts, x, y),
+            scene_of(self.target, variant.facts, x, y),
             Grid(np.arange(n), row0, col0, (self.side, self.side)),
             seed=self.seed + UNIT_STRIDE * unit,
             mode=self.mode,
-            background=frozen,
-            **conditions,
+            background=variant.frozen,
+            **_conditions(variant.facts),
         )
         if windows.dtype.kind == "f":  # without a converter in the chain the scale has an end all the same
             windows = np.minimum(windows, np.float32(self.facts.saturation_dn))
-        return windows, (col0, row0), belongs, self._as_seen(camera, facts, frozen).locate(windows)
+        return windows, (col0, row0), belongs, variant.estimator.locate(windows)
 
     def _moved(self, camera: Camera, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """By how much targets are seen elsewhere than they belong (a lens, a drift, a cold clock): windows follow, errors do not."""
@@ -253,15 +270,6 @@ class Trials:
         belongs = camera.layout(x, y)
         dx, dy = (np.nan_to_num(np.broadcast_to(a, np.shape(b)) - b) for a, b in zip(seen, belongs, strict=True))
         return dx, dy
-
-    def _as_seen(self, camera: Camera, facts: Facts, frozen: Frozen) -> Estimator:
-        """Return the estimator with background, threshold and height as this variant of the camera shows them.
-
-        Who locates targets takes them from the frame, so they follow what the camera does to the light: black level, gain, a curve. Each
-        is the mean of windows of that light, without what lies beyond four standard deviations.
-        """
-        seen: Estimator = self.located.as_seen(lambda light_dn: _level(camera, facts, self.target, self.side, light_dn, frozen))
-        return seen
 
     def compare(self, names: Iterable[str], with_it: Camera, without: Camera | None) -> MonteCarlo:
         """Shift of the positions in one variant of the camera against those in another, or (None) against the truth."""
@@ -414,6 +422,10 @@ def monte_carlo(
     return Trials(camera, target, estimator, facts, trials, units, frames, mode, seed).of(only, off)
 
 
+def _conditions(facts: Facts) -> dict[str, Any]:
+    return {"exposure_s": facts.exposure_s, "temperature_c": facts.temperature_c}
+
+
 def _layout(camera: Camera) -> list[tuple[float, float]]:
     """Position of the sensor's pixel (0, 0) in the output frame 0, and output pixels for one sensor pixel; for x and y."""
     return [(float(start), float(end - start)) for start, end in camera.layout([0.0, 1.0], [0.0, 1.0])]
@@ -444,8 +456,7 @@ def _level(camera: Camera, facts: Facts, target: Target, side: int, above_dn: fl
         grid,
         mode="frozen",
         background=frozen,
-        exposure_s=facts.exposure_s,
-        temperature_c=facts.temperature_c,
+        **_conditions(facts),
     ).astype(float)
     middle = float(np.median(data))
     near = np.abs(data - middle) <= 4 * data.std()

@@ -390,7 +390,8 @@ class Probes:
         if source.stage in AHEAD_OF_LINE:
             return whole
         shape = next((e.shape for e in self.camera.links if e.name == name), self.camera.output_shape)
-        pedestal = self._pedestal_without(name) if source.stage == "grabber" else np.inf
+        sets_black = source.stage == "grabber" and "offset_dn" in source.parameters.model_fields
+        pedestal = self._pedestal_without(name) if sets_black else np.inf
         return replace(self._behind(whole), frame_shape=shape, pedestal_dn=pedestal)
 
     def _pedestal_without(self, name: str) -> float:
@@ -400,7 +401,7 @@ class Probes:
         ahead = replace(self.camera, chain=tuple(e for e in active[:last] if e.name != name))
         offset = sum(getattr(e.params, "offset_dn", 0.0) for e in active[last : last + 1] if e.name != name)
         dark = Uniform(0.0)
-        grid = spread_windows(ahead.output_shape, min(8, *ahead.output_shape), 32)
+        grid = spread_windows(ahead.output_shape, min(8, *ahead.output_shape), 8)
         return float(ahead.expose_windows(dark, grid, mode="frozen", background=dark, quiet=True).mean(dtype=float)) + offset
 
     def _make_ahead(self, without: str) -> Probe:

@@ -57,7 +57,7 @@ def row_shifts(probe: Probe, delay_s: np.ndarray) -> np.ndarray:
     return found
 
 
-QUANTILES = 17  # of the normal law of a row's delay
+NODES = 5  # of the Gauss–Hermite quadrature over the normal law of a row's delay
 
 
 def from_row_delays(
@@ -72,16 +72,15 @@ def from_row_delays(
     sigma = float(np.hypot(white_s, alike_s))
     if sigma == 0:
         return (0.0, 0.0), (0.0, 0.0)
-    from scipy.special import ndtri
-
-    delay = sigma * ndtri((np.arange(QUANTILES) + 0.5) / QUANTILES)
-    delay *= sigma / delay.std()
-    shift = row_shifts(probe, delay)
-    mean = shift.mean(axis=1)
-    slope = np.tensordot(shift, delay, axes=(1, 0)) / (delay**2).sum()
+    node, weight = np.polynomial.hermite_e.hermegauss(NODES)
+    weight = weight / weight.sum()
+    shift = row_shifts(probe, sigma * node)
+    mean = np.tensordot(shift, weight, axes=(1, 0))
+    own = np.tensordot(shift**2, weight, axes=(1, 0)) - mean**2
+    slope = np.tensordot(shift, weight * node, axes=(1, 0)) / sigma
     apart = np.arange(mean.shape[2])[:, None] - np.arange(mean.shape[2])
     alike = np.where((apart % stride == 0) & (apart != 0), alike_s**2 * np.exp(-np.abs(apart) / stride / length_rows), 0.0)
-    variance = shift.var(axis=1).sum(axis=2) + np.einsum("apr,rs,aps->ap", slope, alike, slope)
+    variance = own.sum(axis=2) + np.einsum("apr,rs,aps->ap", slope, alike, slope)
     scatter = np.var(mean.sum(axis=2), axis=1)
     u_x, u_y = np.sqrt(variance.mean(axis=1) + scatter).tolist()
     bias_x, bias_y = mean.sum(axis=2).mean(axis=1).tolist()

@@ -83,20 +83,28 @@ def covariance(params: FlickerNoise, lag_px: np.ndarray) -> np.ndarray:
 def propagate(params: FlickerNoise, probe: Probe) -> Contribution:
     """Propagator P1 with the covariance of the window's pixels at their times of read-out: u² = gᵀ C g.
 
-    Of two fields, windows that begin on even and on odd rows weigh the same.
+    The covariance of two pixels hangs on their rows and on how many columns they are apart. Of two fields, windows that begin on even and
+    on odd rows weigh the same.
     """
     rows, cols = probe.gx.shape[1:]
-    flat = [g.reshape(len(g), -1) for g in (probe.gx, probe.gy)]
+    products = [_products_of_rows(g) for g in (probe.gx, probe.gy)]
     squares = np.zeros(2)
     starts = (0, 1) if params.interlaced else (0,)
     for start in starts:
         first = params.clocks(start + np.arange(rows), probe.frame_shape[1])
         table = covariance(params, (first[:, None] - first)[:, :, None] + np.arange(1 - cols, cols))  # two rows, and columns apart
-        apart = np.arange(cols)[:, None] - np.arange(cols) + cols - 1
-        matrix = table[:, :, apart].transpose(0, 2, 1, 3).reshape(rows * cols, rows * cols) * probe.gain_dn_per_e**2
-        squares += [np.mean(np.einsum("pi,pi->p", g @ matrix, g)) / len(starts) for g in flat]
-    u = float(np.sqrt(squares[0])), float(np.sqrt(squares[1]))
-    return probe.contribution(u, "T", model_error=0.12, method="linear response of the estimator to noise along the read-out")
+        squares += [probe.gain_dn_per_e**2 * (p * table).sum() / len(starts) for p in products]
+    u_x, u_y = np.sqrt(np.maximum(squares, 0.0)).tolist()
+    return probe.contribution((u_x, u_y), "T", model_error=0.12, method="linear response of the estimator to noise along the read-out")
+
+
+def _products_of_rows(g: np.ndarray) -> np.ndarray:
+    """Sums of products of two rows of a gradient, columns 1 − cols to cols − 1 apart, mean over the phases; (rows, rows, 2 cols − 1)."""
+    cols = g.shape[2]
+    waves = np.fft.rfft(g, 2 * cols, axis=2)
+    sums = np.fft.irfft(np.einsum("prf,psf->rsf", waves, waves.conj()) / len(g), 2 * cols, axis=2)
+    around: Array = np.roll(sums, cols - 1, axis=2)[:, :, :-1]
+    return around
 
 
 SOURCE = Source(

@@ -21,11 +21,11 @@ from pixmetry.core.random import Grid, Stream
 MOST = 0.1  # share of defects beyond which it is not clear what the good pixels are
 LOOK_BACK = (8, 256)  # frames looked at together for the last draw of a blinking pixel: at first, and at most
 FOUND_95 = 1.645  # standard deviations above the limit at which 95 of 100 defects are found
-PHASES = 6  # places within the pixel at which a defect is tried
+PHASES = 4  # places within the pixel at which a defect is tried
 ROUND_PX = 3  # about the pixels that matter at one place within the pixel, those that may at another
 MOST_TRIED = 2500  # pixels of a window, or clusters, that are tried one by one
 SMALL = 0.01  # of the largest shift: what is left out
-NODES = 7  # of the Gauss–Hermite quadrature over the logarithm of the excess
+NODES = 5  # of the Gauss–Hermite quadrature over the logarithm of the excess
 NEIGHBOURS = [(dr, dc) for dr in (-1, 0, 1) for dc in (-1, 0, 1) if (dr, dc) != (0, 0)]
 Listed = tuple[NonNegativeInt, NonNegativeInt, NonNegativeFloat, float]
 Row = tuple[str, float, float, float, str]
