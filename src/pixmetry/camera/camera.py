@@ -28,6 +28,7 @@ from pixmetry.core.threads import imap_tiles, map_tiles
 
 SCHEMA, SHEET_SCHEMA = "pixmetry/camera/1", "pixmetry/data_sheet/1"
 BATCH_PIXELS = 1 << 18  # of the small windows that are run as one batch: enough that the calls cost little beside the work
+MOST_PIXELS = 1 << 22  # that a batch needs of its frames: windows that need whole frames are run a few at a time, so that memory is bounded
 
 
 @dataclass(frozen=True)
@@ -318,9 +319,13 @@ class Camera:
         if frozen is None and any(e.remembers for e in self.links):
             raise InputError("a source with a memory cannot be run on single windows exactly", remedy="use iter_frames, or mode='frozen'")
         task = _Task(scene, self.streams(seed, quiet), schedule, threads, frozen)
-        step = max(1, BATCH_PIXELS // max(1, grid.shape[0] * grid.shape[1]))
-        groups = _equal_sizes(self._needs(self.links, Windows.of(grid), frozen is not None))
-        spans = [group[a : a + step] for group in groups for a in range(0, len(group), step)]
+        needs = self._needs(self.links, Windows.of(grid), frozen is not None)
+        groups = _equal_sizes(needs)
+        spans = []
+        for group in groups:
+            most = max([int(w.rows[group[0]]) * int(w.cols[group[0]]) for w in needs])
+            step = max(1, min(BATCH_PIXELS // max(1, grid.shape[0] * grid.shape[1]), MOST_PIXELS // max(1, most)))
+            spans += [group[a : a + step] for a in range(0, len(group), step)]
 
         def part(index: np.ndarray) -> np.ndarray:
             return self._run(task.take(index), _sub_grid(grid, index), self.links).data

@@ -15,6 +15,7 @@ from pixmetry.core.number import Estimates
 from pixmetry.core.random import Grid, Stream
 
 ITERATIONS = 6
+NEAR_PX = 16  # about a window: the light of its target
 
 
 class CidReadout(Parameters):
@@ -38,12 +39,12 @@ def start(params: CidReadout) -> np.ndarray | None:
     return np.zeros((1, 1), np.float32) if params.residual else None
 
 
-def crosstalk(params: CidReadout, data: np.ndarray) -> np.ndarray:
-    """Add to whole frames the share of each pixel's row and column mean, in the dtype of the data."""
-    out = data
-    for share, axis in ((params.row_crosstalk, 2), (params.col_crosstalk, 1)):
+def crosstalk(params: CidReadout, data: np.ndarray, frame_shape: tuple[int, int]) -> np.ndarray:
+    """Add the share of each pixel's row and column mean, in the dtype of the data; of a part of a frame, what its own light gives."""
+    out, (rows, cols) = data, frame_shape
+    for share, axis, size in ((params.row_crosstalk, 2, cols), (params.col_crosstalk, 1, rows)):
         if share:
-            out = out + (share * data.mean(axis=axis, keepdims=True, dtype=np.float64)).astype(data.dtype)
+            out = out + (share * (data.sum(axis=axis, keepdims=True, dtype=np.float64) / size)).astype(data.dtype)
     return out
 
 
@@ -56,7 +57,7 @@ def forward(params: CidReadout, signal: Signal, stream: Stream, state: np.ndarra
     data = signal.data
     if state is not None and params.residual:
         data, state = _with_residual(params, signal, state, stream)
-    data = crosstalk(params, data)
+    data = crosstalk(params, data, signal.frame_shape)
     if noise_e(params):
         data = stream.add_normal(data, signal.grid, noise_e(params))
     return signal.with_data(data), state
@@ -83,6 +84,17 @@ def context(params: CidReadout, windows: Windows, frame_shape: tuple[int, int]) 
     return windows.full_frame(frame_shape) if params.row_crosstalk or params.col_crosstalk else windows
 
 
+def near(params: CidReadout) -> tuple[int, int, int, int]:
+    """Pixels about a window whose own light is followed; what the rest of the rows and columns adds is even."""
+    reach = NEAR_PX if params.row_crosstalk or params.col_crosstalk else 0
+    return reach, reach, reach, reach
+
+
+def tail(params: CidReadout) -> float:
+    """Share of a pixel's signal that goes to its row and its column together."""
+    return params.row_crosstalk + params.col_crosstalk
+
+
 def correct(params: CidReadout, signal: Signal, maps: Mapping[str, np.ndarray]) -> Signal:
     """Take the cross-talk of whole frames off, by fixed-point steps x ← y − (F(x) − x).
 
@@ -96,7 +108,7 @@ def correct(params: CidReadout, signal: Signal, maps: Mapping[str, np.ndarray]) 
     y = signal.data.astype(np.float64)
     x = y
     for _ in range(ITERATIONS):
-        x = y - (crosstalk(params, x) - x)
+        x = y - (crosstalk(params, x, signal.frame_shape) - x)
     return signal.with_data(x.astype(np.float32))
 
 
@@ -158,6 +170,8 @@ SOURCE = Source(
     forward=forward,
     start=start,
     context=context,
+    near=near,
+    tail=tail,
     measure=measure,
     correct=correct,
     propagate=propagate,
