@@ -270,6 +270,27 @@ def test_frozen_and_exact_mode_differ_by_no_more_than_the_stated_tail() -> None:
     assert np.abs(exact - without).max() > 50 * np.abs(frozen - exact).max()  # the effect itself is far larger than what frozen loses
 
 
+def test_cross_talk_of_whole_rows_and_columns_is_followed_near_a_window() -> None:
+    source = get_source("sensor.cid_readout")
+    cross = Element(source.id, source, source.make({"row_crosstalk": 0.02, "col_crosstalk": 0.03}))
+    chain = Camera("cross-talk", (300, 400), (TO_ELECTRONS, cross))
+    grid = Grid(np.zeros(1, np.int64), np.array([138]), np.array([188]), (24, 24))
+    exact, frozen, bare = (
+        c.expose_windows(Spot(50.0), grid, mode=m, background=Flat(50.0))
+        for c, m in ((chain, "exact"), (chain, "frozen"), (chain.switched(off=[source.id]), "exact"))
+    )
+    assert np.abs(frozen - exact).max() < 1e-6 * exact.max() < 1e-4 * np.abs(exact - bare).max()
+
+
+def test_batches_are_bounded_by_what_windows_need(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Windows that need whole columns are run a few at a time, and are the same."""
+    chain = camera(TO_ELECTRONS, CTI, TO_DN)
+    grid = Grid(np.arange(40), np.arange(40) % 30, np.arange(40) % 50, (8, 8))
+    together = chain.expose_windows(SCENE, grid)
+    monkeypatch.setattr("pixmetry.camera.camera.MOST_PIXELS", 3 * SHAPE[0] * 8)
+    assert np.array_equal(chain.expose_windows(SCENE, grid), together)
+
+
 def test_frozen_mode_takes_the_far_part_from_the_background() -> None:
     """Half of what lies 10 px to the left is added, of which a near context of 3 px sees nothing: on the background itself it is exact."""
 

@@ -213,13 +213,18 @@ class Trials:
         key = tuple((e.name, e.params) for e in camera.active)
         if key not in self._found:
             variant = self._variant(camera)
-            parts = [self._unit(replace(camera, unit_seed=camera.unit_seed + UNIT_STRIDE * k), k, variant) for k in range(self.units)]
-            self._found[key] = np.stack([x for x, _ in parts]), np.stack([y for _, y in parts])
+            parts, frames = [], self.frames
+            for k in range(self.units):
+                found, steady = self._unit(replace(camera, unit_seed=camera.unit_seed + UNIT_STRIDE * k), k, variant, frames)
+                parts.append(found)
+                frames = 1 if steady else frames  # what is the same in all frames of a place is not exposed again in the next unit
+            x, y = (np.stack([np.broadcast_to(found[axis], (self.places, self.frames)) for found in parts]) for axis in (0, 1))
+            self._found[key] = x, y
         return self._found[key]
 
     def crop(self) -> Crop:
         """The first target of the first unit, as the camera shows it with all its sources."""
-        windows, (col0, row0), (x, y), (x_hat, y_hat) = self._located(self.camera, 0, self._variant(self.camera))
+        windows, (col0, row0), (x, y), (x_hat, y_hat) = self._located(self.camera, 0, self._variant(self.camera), self.frames)
         at = (float(v[0]) for v in (x - col0, y - row0, x_hat, y_hat))
         return Crop(windows[0].astype(float), *at)
 
@@ -234,17 +239,18 @@ class Trials:
         seen = self.located.as_seen(lambda light_dn: _level(camera, facts, self.target, self.side, light_dn, frozen))
         return _Variant(facts, frozen, seen)
 
-    def _unit(self, camera: Camera, unit: int, variant: _Variant) -> tuple[np.ndarray, np.ndarray]:
-        """Positions found less the true ones, px of the sensor, each (places, frames)."""
-        _, firsts, belongs, found = self._located(camera, unit, variant)
+    def _unit(self, camera: Camera, unit: int, variant: _Variant, frames: int) -> tuple[Pair, bool]:
+        """Positions found less the true ones, px of the sensor, each (places, frames); and whether the frames of each place are the same."""
+        windows, firsts, belongs, found = self._located(camera, unit, variant, frames)
         parts = zip(found, firsts, belongs, _layout(camera), strict=True)
-        dx, dy = (((hat + first - at) / step).reshape(self.places, self.frames) for hat, first, at, (_, step) in parts)
-        return dx, dy
+        dx, dy = (((hat + first - at) / step).reshape(self.places, frames) for hat, first, at, (_, step) in parts)
+        alike = windows.reshape(self.places, frames, -1)
+        return (dx, dy), bool((alike == alike[:, :1]).all())
 
-    def _located(self, camera: Camera, unit: int, variant: _Variant) -> tuple[np.ndarray, Pair, Pair, Pair]:
+    def _located(self, camera: Camera, unit: int, variant: _Variant, frames: int) -> tuple[np.ndarray, Pair, Pair, Pair]:
         """Windows of one unit, the first column and row of each, where their targets belong in the frame and are found in the window."""
-        n, middle = self.places * self.frames, self.side // 2
-        shown = [np.repeat(first[unit] + middle + part[unit], self.frames) for first, part in ((self.col0, self.dx), (self.row0, self.dy))]
+        n, middle = self.places * frames, self.side // 2
+        shown = [np.repeat(first[unit] + middle + part[unit], frames) for first, part in ((self.col0, self.dx), (self.row0, self.dy))]
         x, y = ((at - start) / step for at, (start, step) in zip(shown, _layout(self.camera), strict=True))
         belongs = camera.layout(x, y, np.arange(n))
         last = [size - self.side for size in camera.output_shape[::-1]]
