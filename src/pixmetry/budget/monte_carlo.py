@@ -240,7 +240,7 @@ class Trials:
         return _Variant(facts, frozen, seen)
 
     def _unit(self, camera: Camera, unit: int, variant: _Variant, frames: int) -> tuple[Pair, bool]:
-        """Positions found less the true ones, px of the sensor, each (places, frames); and whether the frames of each place are the same."""
+        """Positions found less the true ones, px of the sensor, (places, frames) each; whether the frames of a place are the same."""
         windows, firsts, belongs, found = self._located(camera, unit, variant, frames)
         parts = zip(found, firsts, belongs, _layout(camera), strict=True)
         dx, dy = (((hat + first - at) / step).reshape(self.places, frames) for hat, first, at, (_, step) in parts)
