@@ -275,7 +275,7 @@ class Correction:
     output : Path, optional
         Their folder.
     steps : tuple of FrameCorrection
-        What was done to the first frame, in this order, with what it leaves and what it does to noise.
+        What was done to the first frame (of a sequence, to the second), in this order, with what it leaves and what it does to noise.
     clipped : ndarray of bool, shape (n, rows, cols), or None
         Pixels that were stored at an end of the range: what is behind them is not known, and their values are limits.
     clipped_pixels : int
@@ -312,6 +312,7 @@ def correct(
     only: Iterable[str] = (),
     skip: Iterable[str] = (),
     raw: str | RawLayout | None = None,
+    sequence: bool = False,
     progress: Progress | None = None,
 ) -> Correction:
     """Correct frames with what is known of their camera.
@@ -340,6 +341,9 @@ def correct(
         Names of sources. What is only typical of such a camera is corrected only if it is named; so is the light of a campaign.
     raw : str or RawLayout, optional
         Of files without a header: ``"1920x1200:Mono12p"``.
+    sequence : bool
+        Whether the frames were taken one after the other without a pause, files in the order of their names. Then what a frame leaves in
+        the next one (``sensor.image_lag``) is corrected, from the second frame on.
     progress : callable, optional
         Called with (what, done, of).
 
@@ -373,9 +377,9 @@ def correct(
     layout = layout_of(raw)
     known = known_of(with_, dark=dark, flat=flat, defects=defects, settings=settings, only=only, skip=skip, raw=layout)
     if isinstance(frames, np.ndarray):
-        return _correct_array(frames, known)
+        return _correct_array(frames, known, sequence)
     assert output is not None
-    return _correct_files([frames] if isinstance(frames, str | Path) else frames, known, Path(output), layout, progress)
+    return _correct_files([frames] if isinstance(frames, str | Path) else frames, known, Path(output), layout, progress, sequence)
 
 
 @dataclass(frozen=True)
@@ -389,15 +393,22 @@ class Known:
     skip: tuple[str, ...] = ()
     files: tuple[Path, ...] = ()
 
-    def corrected(self, frame: np.ndarray, weigh: bool = False) -> tuple[Signal, tuple[FrameCorrection, ...]]:
-        """A frame of codes without what is known."""
+    def corrected(
+        self, frame: np.ndarray, weigh: bool = False, before: np.ndarray | None = None
+    ) -> tuple[Signal, tuple[FrameCorrection, ...]]:
+        """A frame of codes without what is known; ``before``: the frame that was taken just before it."""
         maps = dict(self.maps)
         if self.covered is not None and frame.shape == self.covered.stored_shape(self.camera.output_shape):
             sinks = any(e.source.id == "grabber.clamp" and e.params.droop_rel > 0 for e in self.camera.active)
             maps |= row_and_column_offsets(frame, self.covered, left_alone=sinks)
             frame = np.ascontiguousarray(frame[self.covered.active(frame.shape)])
-        signal = _as_signal(frame, self.camera)
-        return correct_signal(self.camera, signal, maps, only=self.only, skip=self.skip, weigh=weigh)
+        if before is None or not any(e.source.start is not None and e.source.correct is not None for e in self.camera.active):
+            signal = _as_signal(frame, self.camera)
+            return correct_signal(self.camera, signal, maps, only=self.only, skip=self.skip, weigh=weigh)
+        stack = np.stack([self.lit(before[None])[0], frame])
+        both = _signal_of(stack, self.camera.output_shape, Kind.CODES, self.camera, first_frame=1)
+        signal, steps = correct_signal(self.camera, both, maps, only=self.only, skip=self.skip, weigh=weigh)
+        return signal.take(np.array([1])), steps
 
     @property
     def covered(self) -> Covered | None:
@@ -588,7 +599,7 @@ def _refuse_clipped(at_top: int, values: int, what: str) -> None:
         )
 
 
-def _correct_array(frames: np.ndarray, known: Known) -> Correction:
+def _correct_array(frames: np.ndarray, known: Known, sequence: bool = False) -> Correction:
     stack = frames[None] if frames.ndim == 2 else frames
     if stack.ndim != 3 or stack.dtype.kind not in "ui":
         allowed = "whole numbers of shape (rows, cols) or (n, rows, cols)"
@@ -598,19 +609,25 @@ def _correct_array(frames: np.ndarray, known: Known) -> Correction:
         raise InputError("values that this camera cannot store", where="frames", value=int(stack.max()), allowed=f"0 to {top}")
     stack = stack.astype(np.uint8 if known.bits <= 8 else np.uint16)
     said: list[tuple[FrameCorrection, ...]] = []
+    shown = 1 if sequence and len(stack) > 1 else 0  # the frame of which the steps are told
     active = known.lit(stack)
     out = np.empty(active.shape, np.float32)
     for i, frame in enumerate(stack):
         check_frame(frame, f"frames[{i}]", bits=known.bits, shape=known.shape_of(frame))
-        corrected, steps = known.corrected(frame, weigh=i == 0)
+        corrected, steps = known.corrected(frame, weigh=i == shown, before=stack[i - 1] if sequence and i else None)
         out[i] = corrected.data[0]
         said.append(steps)
     clipped = (active == 0) | (active == top)
-    return Correction(_together(said), out, steps=said[0] if said else (), clipped=clipped, clipped_pixels=int(clipped.sum()))
+    return Correction(_together(said), out, steps=said[shown] if said else (), clipped=clipped, clipped_pixels=int(clipped.sum()))
 
 
 def _correct_files(
-    frames: Sequence[str | Path], known: Known, output: Path, layout: RawLayout | None, progress: Progress | None
+    frames: Sequence[str | Path],
+    known: Known,
+    output: Path,
+    layout: RawLayout | None,
+    progress: Progress | None,
+    sequence: bool = False,
 ) -> Correction:
     from tifffile import imwrite
 
@@ -618,12 +635,17 @@ def _correct_files(
     hashes = InputHashes(files[0].parent)
     told = progress or no_progress
     top = 2**known.bits - 1
+    shown = 1 if sequence and len(files) > 1 else 0  # the frame of which the steps are told
+    previous = dict(zip(files[1:], files, strict=False)) if sequence else {}
 
     def work(path: Path) -> tuple[Path, LoadedFrame, np.ndarray, tuple[FrameCorrection, ...], int]:
         loaded = load_frame(path, raw=layout)
         frame = loaded.array
         check_frame(frame, str(path), bits=known.bits, shape=known.shape_of(frame))
-        corrected, steps = known.corrected(frame, weigh=path == files[0])
+        before = load_frame(previous[path], raw=layout).array if path in previous else None
+        if before is not None:
+            check_frame(before, str(previous[path]), bits=known.bits, shape=frame.shape)
+        corrected, steps = known.corrected(frame, weigh=path == files[shown], before=before)
         lit = known.lit(frame[None])[0]
         return path, loaded, corrected.data[0], steps, int(((lit == 0) | (lit == top)).sum())
 
@@ -638,7 +660,7 @@ def _correct_files(
             hashes.add(path, loaded.sha256, loaded.size_bytes)
             imwrite(folder / f"{_stem(path)}.tif", data.astype(np.float32))
             told("correcting frames", i + 1, len(files))
-        correction = Correction(_together(said), output=output, steps=said[0], clipped_pixels=sum(clipped.values()))
+        correction = Correction(_together(said), output=output, steps=said[shown], clipped_pixels=sum(clipped.values()))
         record = {
             "schema": "pixmetry/correction/1",
             "unit": "DN above black",
@@ -711,8 +733,12 @@ def _as_signal(frame: np.ndarray, camera: Camera) -> Signal:
     return _signal_of(frame[None], camera.output_shape, Kind.CODES, camera)
 
 
-def _signal_of(data: np.ndarray, shape: tuple[int, int], kind: Kind, camera: Camera | None = None) -> Signal:
+def _signal_of(
+    data: np.ndarray, shape: tuple[int, int], kind: Kind, camera: Camera | None = None, first_frame: int | None = None
+) -> Signal:
+    """Frames as a signal; of a sequence with the number of the first frame, of others all with the number 0."""
     one = np.ones(len(data))
     exposure_s, temperature_c = (0.01, 20.0) if camera is None else (camera.exposure_s, camera.temperature_c)
-    grid = Grid.whole([0] * len(data), data.shape[1:])
+    numbers = [0] * len(data) if first_frame is None else list(range(first_frame, first_frame + len(data)))
+    grid = Grid.whole(numbers, data.shape[1:])
     return Signal(data, kind, grid, shape, exposure_s * one, 0 * one, temperature_c * one)

@@ -41,6 +41,9 @@ IN_POSITIONS = ("positions are", "coordinates are")  # in the reasons of sources
 @click.option("--skip", multiple=True, metavar="ID", help="Do not correct this source. May be repeated.")
 @click.option("--list", "listed", is_flag=True, help="Only list what would be corrected and what not, with the reason.")
 @click.option("--raw", metavar="WxH:FORMAT", help="Layout of files without a header, e.g. 1920x1200:Mono12p (GenICam's names).")
+@click.option(
+    "--sequence", is_flag=True, help="The frames were taken one after the other, without a pause: correct what one leaves in the next."
+)
 @click.option("--threads", type=click.IntRange(1), help="Number of threads. Default: one for each processor.")
 def correct(
     frames: tuple[Path, ...],
@@ -54,6 +57,7 @@ def correct(
     skip: tuple[str, ...],
     listed: bool,
     raw: str | None,
+    sequence: bool,
     threads: int | None,
 ) -> None:
     """Correct frames with what is known of their camera.
@@ -81,7 +85,9 @@ def correct(
         print_steps(known_of(camera, **maps, settings=asked, only=only, skip=skip, raw=layout_of(raw)).listed())
         return
     with shown_progress() as progress:
-        correction = run(frames, camera, output, **maps, settings=asked, only=only, skip=skip, raw=raw, progress=progress)
+        correction = run(
+            frames, camera, output, **maps, settings=asked, only=only, skip=skip, raw=raw, sequence=sequence, progress=progress
+        )
     print_steps(correction.steps, correction.sources)
     if correction.clipped_pixels:
         echo(f"{correction.clipped_pixels} pixels were stored at an end of the range: what is behind them is not known")

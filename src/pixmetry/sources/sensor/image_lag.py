@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,7 @@ from pixmetry.camera.observations import LightSteps, Observations, of_pictures
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
 from pixmetry.core.arrays import Singles
-from pixmetry.core.errors import MeasureError
+from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.core.number import Estimates
 from pixmetry.core.random import Grid, Stream
 
@@ -144,15 +145,40 @@ def _with_pocket(steps: LightSteps, gain_dn_per_e: float) -> Estimates | None:
     return Estimates(names, values, covariance, dof, units, method=method, confounders=steps.fit.confounders)
 
 
+def correct(params: ImageLag, signal: Signal, maps: Mapping[str, np.ndarray]) -> Signal:
+    """Give each frame the charge that it left behind, and take off what the frame before left: both follow from the values read.
+
+    Raises
+    ------
+    InputError
+        If the signal holds no successive frames.
+    """
+    numbers = signal.grid.frame
+    if len(signal) < 2 or np.any(np.diff(numbers) != 1):
+        raise InputError("needs the frame before", remedy="give frames that were taken without a pause, and say so (--sequence)")
+    if params.pocket_e and signal.kind is not Kind.ELECTRONS:
+        raise InputError("a pocket is known in electrons, and the gain is not", remedy="add electronics.gain")
+    held = _held_after(params, signal.data.astype(float))
+    before = np.concatenate([held[:1], held[:-1]])
+    if numbers[0] == 0:
+        before[0] = 0.0  # as `start` has it; of another first frame the one before is not known: it stays as it is
+    return signal.with_data((signal.data + held - before).astype(np.float32))
+
+
+def _held_after(params: ImageLag, read: np.ndarray) -> np.ndarray:
+    """Charge left behind by frames that were read so, same shape; by fixed-point steps, which shrink as the share."""
+    held = np.zeros_like(read, dtype=float)
+    for _ in range(60):
+        held = _left(params, np.maximum(read + held, 0.0))
+    return held
+
+
 def first_dark_frame(params: ImageLag, last_e: np.ndarray) -> np.ndarray:
     """Charge of the first dark frame after frames whose last was read as ``last_e``, same shape.
 
-    Of the charge q, h(q) stays and q − h(q) is read; in the dark h stays alone, and h − h(h) is read. h follows from the reading by
-    fixed-point steps, which shrink as the share.
+    Of the charge q, h(q) stays and q − h(q) is read; in the dark h stays alone, and h − h(h) is read.
     """
-    held = np.zeros_like(last_e, dtype=float)
-    for _ in range(60):
-        held = _left(params, last_e + held)
+    held = _held_after(params, last_e)
     return held - _left(params, held)
 
 
@@ -171,13 +197,14 @@ SOURCE = Source(
     forward=forward,
     start=start,
     measure=measure,
+    correct=correct,
     gum_class="O",
     equation="q_out(t) = q(t) + h(t−1) − h(t);  h(t) ~ Binomial(q(t) + h(t−1) − pocket, λ) + pocket,  pocket = p (1 − e^(−q/p0))",
     typical_size="a target that moves v px a frame is λ v/(1 − λ) behind while its ghost lies in the window: 0.01 px at 1 % and 1 px",
     references=("E. R. Fossum, D. B. Hondongwa, IEEE J. Electron Devices Soc. 2(3), 33, 2014 (pinned photodiodes, lag)",),
+    leaves="the noise of the charge that stays, and the first frame of a sequence",
     advice="Read a dark frame between exposures, or keep the motion per frame small against the size of the target.",
     reasons={
-        "correct": "needs the whole sequence from its first frame on",
         "propagate": "needs the target's speed, which the probe does not contain; a target at rest is not shifted",
     },
 )
