@@ -883,8 +883,10 @@ class Observations:
         mapping = dict(names) if isinstance(names, Mapping) else {n: n for n in names}
         return of_pictures(fit, mapping, where=where, pictures="patches of known light", kind="chart")
 
-    def by_covered(self, names: Mapping[str, str], *, where: str) -> Estimates:
+    def by_covered(self, names: Mapping[str, str], *, where: str, method: str = "") -> Estimates:
         """Take a source's parameters ``{parameter: fitted name}`` that covered columns and rows tell.
+
+        With a ``method`` of its own a source is not taken for what the others could be mistaken for.
 
         Raises
         ------
@@ -894,7 +896,8 @@ class Observations:
         if self.covered is None:
             remedy = "state camera.covered in the manifest, as covered: {right: 16, bottom: 8}"
             raise MeasureError("not measured: needs covered columns or rows", where=where, remedy=remedy)
-        return of_pictures(self.covered.fit, names, where=where, pictures="covered pixels", kind="bright")
+        found = of_pictures(self.covered.fit, names, where=where, pictures="covered pixels", kind="bright")
+        return replace(found, method=method, confounders=()) if method else found
 
     def row_jitter(self, names: Mapping[str, str], *, where: str, taped: bool = False) -> Estimates:
         """Take a source's parameters ``{parameter: fitted name}`` that the rows of upright lines tell, in px, with their covariance.

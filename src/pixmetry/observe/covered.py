@@ -124,19 +124,19 @@ def covered_pixels(groups: Sequence[BorderFrames], analogue: bool, gain_dn_per_e
     lengths = [row for row in found if row[0] in (SERIAL[1], PARALLEL[1])]
     if lengths:
         found.append(("trail_px", *min(lengths, key=lambda row: row[2] / row[1])[1:]))
-    for name, value in (
-        ("droop_rel", _droop(flat, zero, covered, analogue)),
-        ("smear_s", _smear(lit, zero, covered, next((t for t in trails if t.axis == "rows"), None))),
+    for name, unit, value in (
+        ("droop_rel", "1", _droop(flat, zero, covered, analogue)),
+        ("smear_s", "s", _smear(lit, zero, covered, next((t for t in trails if t.axis == "rows"), None))),
     ):
         if isinstance(value, str):
             reasons[name] = value
         else:
             amount, u, why = value
             if amount > NOT_SIGNIFICANT * u:
-                found.append((name, amount, u, np.inf, "1"))
+                found.append((name, amount, u, np.inf, unit))
             else:
                 limit = max(amount, 0.0) + ONE_SIDED_95 * u
-                found.append((name, limit, limit / 12**0.5, np.inf, "1"))
+                found.append((name, limit, limit / 12**0.5, np.inf, unit))
                 limits.add(name)
                 why = f"not significant; 95 % upper limit. {why}".strip()
             if why:

@@ -29,7 +29,7 @@ def covered_section(found: CoveredPixels) -> Section:
         if name in found.fit:
             number = found.fit[name]
             shown = printed_number(number) if number.is_limit else uncertain(number.value, number.u, number.unit)
-            rows.append([title, shown.value, "" if number.is_limit else f"± {shown.u}", number.unit, number.reason])
+            rows.append([title, shown.value, "" if number.is_limit else f"± {shown.u}", shown.unit, number.reason])
         elif why := found.fit.reasons.get(name, ""):
             rows.append([title, "–", "", "", why])
     columns: list[Column | str] = ["Quantity", Column("Value", "right"), Column("± u", "u"), Column("Unit", "unit"), "Note"]

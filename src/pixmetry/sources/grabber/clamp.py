@@ -106,7 +106,9 @@ def measure(observations: Observations) -> Estimates:
 
     The level of black is in ``grabber.adc``, its noise in ``electronics.row_noise``: one gain does not tell them apart.
     """
-    return observations.by_covered({"droop_rel": "droop_rel"}, where="grabber.clamp")
+    return observations.by_covered(
+        {"droop_rel": "droop_rel"}, where="grabber.clamp", method="end of the line against its start, over levels of light"
+    )
 
 
 def propagate(params: Clamp, probe: Probe) -> Contribution:

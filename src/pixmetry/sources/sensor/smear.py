@@ -104,7 +104,9 @@ def measure(observations: Observations) -> Estimates:
     spots = None if observations.spots is None else observations.spots.fit
     found, reasons = [], []
     for ask in (
-        lambda: observations.by_covered({"transfer_s": "smear_s"}, where="sensor.smear"),
+        lambda: observations.by_covered(
+            {"transfer_s": "smear_s"}, where="sensor.smear", method="covered rows over the sums of their columns"
+        ),
         lambda: of_pictures(spots, {"transfer_s": "smear_s"}, where="sensor.smear", pictures="bright spots on black", kind="spots"),
     ):
         try:
