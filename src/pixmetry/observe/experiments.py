@@ -12,6 +12,7 @@ from pixmetry.observe.edge_fit import fit_edges
 from pixmetry.observe.edges import Picture, edge_notes, motion_notes, responses_of, search_edges
 from pixmetry.observe.experiment import Experiment, PictureGroup
 from pixmetry.observe.jpeg_blocks import FirstFrames, reduce_patterns
+from pixmetry.observe.lens_fit import with_other_lens
 from pixmetry.observe.light_off import BlockMeans, reduce_light_off
 from pixmetry.observe.line_fit import fit_line
 from pixmetry.observe.line_jitter import with_jitter
@@ -30,7 +31,10 @@ def reduce_edges(groups: Sequence[PictureGroup], seen: Observations) -> Observat
         line, optics = fit_line(search.measured)
         edges = responses_of(search, optics, line)
     else:
-        edges = responses_of(search, fit_edges(search.measured))
+        optics = fit_edges(search.measured)
+        if seen.stated.pitch_x_um == seen.stated.pitch_y_um:
+            optics = with_other_lens(optics, search.measured)
+        edges = responses_of(search, optics)
     return replace(seen, edges=edges, notes=(*seen.notes, *edge_notes(edges), *motion_notes(pictures, search)))
 
 

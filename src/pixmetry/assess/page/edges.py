@@ -60,10 +60,10 @@ def summary_sentence(found: SlantedEdges) -> str:
 def _parts_of_blur(found: SlantedEdges) -> list[str]:
     """What the joint fit says of lens, pixel and plate, in a sentence; or why it cannot."""
     optics = found.optics
-    if "sigma_px" not in optics:
+    if "airy_px" not in optics and "sigma_px" not in optics:
         why = optics.reasons.get("spread_var_px2", "")
         return [f"Lens and pixel are not told apart: {why}."] if why else []
-    words = {"sigma_px": "lens", "width_x_px": "pixel in x", "width_y_px": "pixel in y"}
+    words = {"sigma_px": "lens", "airy_px": "lens limited by diffraction, λN", "width_x_px": "pixel in x", "width_y_px": "pixel in y"}
     words |= {"separation_x_px": "low-pass filter in x", "separation_y_px": "low-pass filter in y"}
     parts = []
     for name, word in words.items():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 from typing import Literal
 
@@ -12,8 +13,9 @@ from pixmetry.camera.observations import Observations
 from pixmetry.camera.raster import kernel_of, spread_of
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.camera.stated import StatedFacts
 from pixmetry.core.arrays import Array
-from pixmetry.core.errors import ParameterError
+from pixmetry.core.errors import MeasureError, ParameterError
 from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
 
@@ -134,8 +136,27 @@ def forward(params: PointSpread, signal: Signal, stream: Stream) -> Signal:
 
 
 def measure(observations: Observations) -> Estimates:
-    """Standard deviation of a Gaussian lens, from slanted edges."""
+    """Standard deviation of a Gaussian lens, or f-number (and defocus) of one limited by diffraction, from slanted edges."""
+    if observations.edges is not None and "airy_px" in observations.edges.optics:
+        return _limited(observations.edges.optics, observations.stated)
     return observations.edge_optics({"sigma_px": "sigma_px"}, where="optics.point_spread")
+
+
+def _limited(optics: Estimates, stated: StatedFacts) -> Estimates:
+    """f-number from λN over the pitch, which is what edges show."""
+    pitch_um = stated.pitch_x_um
+    if pitch_um is None:
+        told = f"the edges tell λN = {optics['airy_px'].value:.3f} px of a lens that is limited by diffraction, and the pitch is not stated"
+        raise MeasureError(told, where="optics.point_spread", remedy="state pitch_um in the manifest")
+    nm = stated.wavelength_nm or 550.0
+    names = {"f_number": "airy_px", "defocus_waves": "defocus_waves"}
+    lens = optics.select({new: old for new, old in names.items() if old in optics}).scaled({"f_number": (1e3 * pitch_um / nm, "1")})
+    known = Estimates.from_rows([("wavelength_nm", nm, 0.0, np.inf, "nm"), *((f"pitch_{c}_um", pitch_um, 0.0, np.inf, "µm") for c in "xy")])
+    light = "" if stated.wavelength_nm else ": the wavelength is not stated"
+    reasons = {"f_number": f"the edges tell its product with the wavelength, {nm:g} nm{light}"}
+    if "defocus_waves" in lens:
+        reasons["defocus_waves"] = "its size: the sign is not seen"
+    return replace(lens.join(known), reasons=reasons, settings={"model": "diffraction"})
 
 
 SOURCE = Source(
