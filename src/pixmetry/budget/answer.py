@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pixmetry.budget.calibration_noise import CALIBRATION
+from pixmetry.budget.set_ups import FLAT, kind_of
 from pixmetry.budget.table import AT_BOUND, COUNTED, TYPICAL, Pair, Parts, SourceRow
 from pixmetry.camera.catalogue import sources
 
@@ -188,7 +189,9 @@ def how_to_measure(source_id: str) -> str:
     if source is None:
         return ""
     if source.measure is not None:
-        return "`pixmetry assess` measures it."
+        kind = kind_of(source_id)
+        frames = {"": "", FLAT: "From dark and bright frames. "}.get(kind, f"From frames of kind {kind}. ")
+        return f"{frames}`pixmetry assess` measures it."
     reason = source.reasons["measure"].removeprefix("not measured: ")
     return f"{reason[0].upper()}{reason[1:].rstrip('.')}."
 

@@ -40,6 +40,7 @@ COMMANDS = {
     "series": "Follow a fixed field over time: warm-up of camera and frame grabber, when it is stable.",
     "bound": "Compute how well a target can be located (Cramér–Rao bound), and what limits it.",
     "budget": "Budget every error source of a camera for a measurement, before and after calibration.",
+    "shoot-list": "List the frames to take of a camera: set-ups, counts, charts to print, a manifest to fill in.",
     "correct": "Correct frames for what is known of their camera, measured or described.",
     "corrected": "Correct positions for what is known of their camera's geometry.",
     "compare": "Compare measurements with each other, with a fleet of cameras, or with limits.",
