@@ -1,4 +1,4 @@
-"""Shoot lists: set-ups for every kind of frames, a manifest that is read when it is filled in, charts in which their own experiments find what they need."""
+"""Shoot lists: a set-up for every kind of frames, a manifest to fill in, and charts in which experiments find what they need."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from PIL import Image, ImageDraw
 
 from pixmetry.budget.answer import how_to_measure
 from pixmetry.budget.printed_charts import CHARTS, WEDGE_DENSITIES
-from pixmetry.budget.set_ups import FLAT, SET_UPS, kind_of
+from pixmetry.budget.set_ups import FLAT, SET_UPS, kind_of, set_up_of
 from pixmetry.budget.shooting import Shot, manifest_text, scaled_set_up
 from pixmetry.camera.catalogue import sources
 from pixmetry.cli import main
@@ -55,14 +55,15 @@ def _grey(fill: str) -> int:
 
 
 def test_every_kind_of_frames_has_its_set_up() -> None:
-    assert set(SET_UPS) == {FLAT, *TARGETS}
-    for name, s in SET_UPS.items():
-        assert s.kind == name and (not s.chart or s.chart in CHARTS)
+    assert set(SET_UPS) <= {FLAT, *TARGETS}
+    for name in (FLAT, *TARGETS):
+        s = set_up_of(name)
+        assert s.kind == name and s.entries and (not s.chart or s.chart in CHARTS)
 
 
 def test_every_source_that_is_measured_names_a_kind_that_has_a_set_up() -> None:
     kinds = {source_id: kind_of(source_id) for source_id, source in sources().items() if source.measure is not None}
-    assert set(kinds.values()) <= {"", *SET_UPS}
+    assert set(kinds.values()) <= {"", FLAT, *TARGETS}
     assert kinds["optics.olpf"] == "edge" and kinds["sensor.prnu"] == FLAT and kinds["storage.jpeg"] == "pattern"
     assert "frames of kind edge" in how_to_measure("optics.olpf")
 
@@ -79,7 +80,7 @@ def test_the_manifest_is_lawful_when_it_is_filled_in(tmp_path: Path) -> None:
     filled = re.sub(r'"<[^>]*>"', "0.01", text)
     (tmp_path / "campaign.yaml").write_text(filled)
     model = validate(ManifestModel, load_yaml(tmp_path / "campaign.yaml"), "here")
-    assert {g.kind for g in model.frames} >= set(TARGETS) - {"dark_temperature"} | {"dark", "bright"}
+    assert {g.kind for g in model.frames} == set(SET_UPS) - {FLAT} | {"dark", "bright"}
     assert len({g.files for g in model.frames}) == len(model.frames)
 
 

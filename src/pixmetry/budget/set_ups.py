@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
@@ -124,6 +124,14 @@ SET_UPS = {
             tuple(_series("dark", 8, exposure_s=f"<{word}>", temperature_c=f"<T{k}>") for k in range(1, 6) for word in ("short", "long")),
         ),
         SetUp(
+            "covered",
+            "Light and dark bars beside covered pixels",
+            "Any picture with light and dark columns; the covered columns and rows are stored too (camera.covered).",
+            "Light columns at 70 % of saturation.",
+            "time of the transfer times the leak to 1 %",
+            (_series("covered", 4, exposure_s="<t>"),),
+        ),
+        SetUp(
             "border",
             "Bright field with black borders",
             "A defocused even field; the window of the frame grabber larger than the image.",
@@ -151,6 +159,12 @@ SET_UPS = {
         ),
     )
 }
+
+
+def set_up_of(kind: str) -> SetUp:
+    """The set-up of a kind of frames; of one that has none of its own here, how the manifest lists it."""
+    plain = SetUp(kind, f"Frames of kind {kind}", "See the manifest's description.", "As described there.", "as described there", ())
+    return SET_UPS.get(kind) or replace(plain, entries=(_series(kind, 4),))
 
 
 @cache

@@ -13,7 +13,7 @@ from typing import Any
 from pixmetry.budget.answer import answer_of
 from pixmetry.budget.camera_budget import CameraBudget
 from pixmetry.budget.printed_charts import CHARTS
-from pixmetry.budget.set_ups import SET_UPS, SetUp, kind_of
+from pixmetry.budget.set_ups import SetUp, kind_of, set_up_of
 from pixmetry.budget.table import AT_BOUND, DESCRIBED, SHEET, TYPICAL, SourceRow
 from pixmetry.files.output import staged_output
 
@@ -60,10 +60,11 @@ def shots_of(found: CameraBudget, factor: float = 1.0) -> tuple[Shot, ...]:
     count = found.scenario.count
     now = answer_of(found.rows, count.frames, count.targets).most_rms_px
     shots: list[tuple[float, float, Shot]] = []
-    for kind, set_up in SET_UPS.items():
-        own = [r for r in found.rows if kind_of(r.source_id) == kind and r.status in (SHEET, DESCRIBED, TYPICAL, AT_BOUND)]
-        if not own:
+    open_rows = [r for r in found.rows if r.status in (SHEET, DESCRIBED, TYPICAL, AT_BOUND)]
+    for kind in dict.fromkeys(kind_of(r.source_id) for r in open_rows):
+        if not kind:
             continue
+        set_up, own = set_up_of(kind), [r for r in open_rows if kind_of(r.source_id) == kind]
         then = answer_of(
             [replace(r, largest=None) if r in own and r.status in (TYPICAL, AT_BOUND) else r for r in found.rows],
             count.frames,
