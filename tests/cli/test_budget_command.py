@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner, Result
 
+from pixmetry.budget.answer import Answer
+from pixmetry.budget.sweep import Step, Sweep
 from pixmetry.cli import main
 
 SMALL = ("--set", "rows=200", "--set", "cols=240")
@@ -81,3 +83,15 @@ def test_what_cannot_be_used_is_told_in_one_line(arguments: tuple[str, ...], wor
     assert told.exit_code == 2
     lines = [line for line in told.output.splitlines() if line.startswith("error:")]
     assert len(lines) == 1 and words in lines[0], told.output
+
+
+@pytest.mark.parametrize(
+    ("totals", "steady"),
+    [((1.9, 1.0, 0.2, 0.083, 0.082), 4.0), ((1.0, 1.01, 1.02), None), ((3.0, 2.0, 1.0), None), ((2.0, 1.0, 1.05), 2.0)],
+)
+def test_a_sweep_tells_from_where_on_the_total_hardly_changes(totals: tuple[float, ...], steady: float | None) -> None:
+    """As a grabber that warms up: the first value after which nothing changes; none where that is the first or the last."""
+    answers = [Answer(*[(total, total)] * 4) for total in totals]
+    sweep = Sweep("state.grabber_on_min", tuple(Step(k + 1.0, answer, "") for k, answer in enumerate(answers)))
+    assert sweep.steady_from == steady
+    assert sweep.sentence == ("" if steady is None else f"From state.grabber_on_min {steady:g} on, the total changes by less than 10 %.")

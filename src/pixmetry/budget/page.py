@@ -123,10 +123,10 @@ def _many(count: int, what: str) -> str:
 
 
 def _interval(one: Totals) -> str:
-    least, most = rms(one.least_px), rms(one.most_px)
+    after, least, most = (rms(pair) for pair in (one.after_px, one.least_px, one.most_px))
     return (
-        f"Between {length_px(least)} px (only what is known of this camera) and {length_px(most)} px (everything that "
-        "is not measured at the largest of a sound camera), rms of x and y."
+        f"Root mean square of x and y: {length_px(after)} px; between {length_px(least)} px (only what is known of this camera) and "
+        f"{length_px(most)} px (everything that is not measured at the largest of a sound camera)."
     )
 
 
@@ -199,6 +199,8 @@ def _sweep(sweep: Sweep) -> Section:
     low = min(sweep.steps, key=lambda s: rms(s.answer.after_px))
     alt = f"Total after calibration over {sweep.key}; smallest at {low.value:g}."
     section = Section(f"Over {sweep.key}", name="sweep")
+    if sweep.sentence:
+        section.add_text(sweep.sentence)
     section.add(Figure(figure, "sweep", alt, "Line: after the calibration; band: the interval."))
     columns = [
         Column(sweep.key, "right"),

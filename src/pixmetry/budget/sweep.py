@@ -17,6 +17,7 @@ from pixmetry.camera.overrides import parse_override
 from pixmetry.core.errors import InputError
 
 STEPS, MOST = 5, 200
+STEADY = 0.1  # relative change of the total that is none to speak of
 WIDE = 3.0  # ratio of both ends from which on steps are in proportion
 
 
@@ -36,6 +37,19 @@ class Sweep:
 
     key: str
     steps: tuple[Step, ...]
+
+    @property
+    def steady_from(self) -> float | None:
+        """Value from which on the total after the calibration stays within 10 % of the last; None if that is the first or the last one."""
+        totals = [rms(s.answer.after_px) for s in self.steps]
+        away = [k for k, total in enumerate(totals) if abs(total - totals[-1]) > STEADY * totals[-1]]
+        return self.steps[away[-1] + 1].value if away and away[-1] + 2 < len(totals) else None
+
+    @property
+    def sentence(self) -> str:
+        """From where on the total hardly changes any more; empty if there is nothing to say."""
+        at = self.steady_from
+        return "" if at is None else f"From {self.key} {at:g} on, the total changes by less than {100 * STEADY:.0f} %."
 
     def to_record(self) -> dict[str, Any]:
         """Return the plain record for JSON."""

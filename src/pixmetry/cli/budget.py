@@ -171,8 +171,8 @@ def print_budget(found: CameraBudget, console: Console, everything: bool = False
         markup=False,
     )
     console.print(
-        f"between {length_px(rms(one.least_px))} px (only what is known) and {length_px(rms(one.most_px))} px (the rest at its bound); "
-        f"without calibration {length_px(rms(one.before_px))} px",
+        f"rms of x and y {length_px(rms(one.after_px))} px: between {length_px(rms(one.least_px))} px (only what is known) and "
+        f"{length_px(rms(one.most_px))} px (the rest at its bound); without calibration {length_px(rms(one.before_px))} px",
         markup=False,
     )
     count, mean = found.scenario.count, found.answer.after_px
@@ -251,3 +251,5 @@ def print_sweep(sweep: Sweep, console: Console) -> None:
         after, least, most = (length_px(rms(p)) for p in (step.answer.after_px, step.answer.least_px, step.answer.most_px))
         mm = "" if step.after_mm is None else f"  {step.after_mm:.2g} mm"
         console.print(f"  {step.value:<10g} {after} ({least} to {most}){mm}  {step.largest}", markup=False)
+    if sweep.sentence:
+        console.print(sweep.sentence, markup=False)
