@@ -95,8 +95,9 @@ def measure(observations: Observations) -> Estimates:
     white, columns = of_levels("ms_pixel_dn2"), of_levels("ms_col_dn2")
     dof = (of_levels("n_frames") - 1) * (cols - 1)
     signal = np.concatenate([np.zeros(dark.mean_dn.size), light.mean_dn[open_] - black])
-    if found is not None and found.kind == CHARGE:  # the mean of a column holds all charge, wherever it was repelled to
-        white = black_var + np.where(signal > 0, found.variance_before(np.maximum(white - black_var, 0)), white - black_var)
+    if found is not None and found.kind == CHARGE:  # half of what was repelled stays in the column, and so in its mean
+        shot = np.maximum(white - black_var, 0)
+        white = white + np.where(signal > 0, 0.5 * (found.variance_before(shot) - shot), 0.0)
     lamp = np.where(signal > 0, of_levels("ms_frame_dn2") * _column_spread(observations) ** 2, 0.0)
     excess = columns - white / rows - lamp
     design = np.stack([np.ones(signal.size), (signal / signal.max()) ** 2], axis=1)
