@@ -1,10 +1,9 @@
 """Time of a budget on paper: ``python benchmarks/bench_budget.py [--simulate] [PRESET ...]``.
 
 All rows by their fastest way, for a camera of five megapixels, for an analogue one with a frame grabber, and for a frame-transfer CCD. With
-``--simulate`` then
-every source that a simulation of the first one can make, each with 10 000 windows with it and without, beside the Monte Carlo of one source
-in plain NumPy in the same run: discs, photons, a fixed pattern, rounding, and a centroid above a threshold. Goals: 4 s for all rows of five
-megapixels, 60 s for all simulations, on two cores that do nothing else.
+``--simulate`` then every source that a simulation of the first one can make, each with 10 000 windows with it and without, beside the Monte
+Carlo of one source in plain NumPy in the same run: discs, photons, a fixed pattern, rounding, and a centroid above a threshold.
+Goals: 4 s for all rows of five megapixels, 60 s for all simulations, on two cores that do nothing else.
 """
 
 from __future__ import annotations

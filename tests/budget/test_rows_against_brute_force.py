@@ -40,6 +40,7 @@ BY_OTHERS_IN_CHAIN = (  # rows that hang on another source: on the black level, 
     ("grabber.adc", "usual", (ANALOGUE, 28.4, SMALL)),
     ("grabber.clamp", "bound", (ANALOGUE, 28.4, SMALL)),
     ("sensor.smear", "bound", ("dcs420_like", None, SMALL)),
+    ("sensor.smear", "bound", ("sony_xc8500_field", 28.4, SMALL)),
 )
 SCENARIO = {
     "motion": {"speed_px_per_s": 60, "acceleration_px_per_s2": 100, "direction_deg": 30},
@@ -89,11 +90,13 @@ def test_a_row_is_what_brute_force_shows(cell: Callable[[Cell], tuple[Table, Bru
         assert not verdict.wrong, f"{at}, {size}: {verdict.wrong}: {verdict.text}"
 
 
-@pytest.mark.parametrize(("source_id", "size", "at"), BY_OTHERS_IN_CHAIN, ids=[name for name, _, _ in BY_OTHERS_IN_CHAIN])
+@pytest.mark.parametrize(("source_id", "size", "at"), BY_OTHERS_IN_CHAIN, ids=[f"{name}-{at[0]}" for name, _, at in BY_OTHERS_IN_CHAIN])
 def test_a_row_holds_what_the_rest_of_the_chain_makes_of_it(
     cell: Callable[[Cell], tuple[Table, BruteForce]], source_id: str, size: str, at: Cell
 ) -> None:
-    """A line that rings at 28 MHz dips below code 0 unless the clamp lifts it; a mosaic makes a smear's shift half as large again."""
+    """A line that rings at 28 MHz dips below code 0 unless the clamp lifts it; a mosaic makes
+    a smear's shift half as large again, pairs of rows that are summed three times as large.
+    """
     table, brute = cell(at)
     verdict = verdict_of(table, brute, element_of(table, source_id, size), SIGMAS)
     assert not verdict.wrong, f"{at}, {size}: {verdict.wrong}: {verdict.text}"

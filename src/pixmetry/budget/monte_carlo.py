@@ -40,6 +40,7 @@ SHAPES_PICTURE = (  # without noise of their own; a target that they have change
     "sensor.bayer_mosaic",
     "sensor.infrared_diffusion",
     "sensor.pixel_aperture",
+    "sensor.read_out",
     "processing.demosaic",
     "processing.sharpening",
 )
