@@ -87,7 +87,7 @@ def test_bent_edges_are_followed(rng: np.random.Generator):
         (lambda rng: one_edge(rng, high=5000), "clipped"),
         (lambda rng: one_edge(rng, low=-100), "clipped"),
         (lambda rng: one_edge(rng, shape=(24, 100)), "too short"),
-        (lambda rng: one_edge(rng, noise=70.0), "times the noise"),
+        (lambda rng: one_edge(rng, low=600, high=1600, noise=70.0), "times the noise"),
         (lambda rng: one_edge(rng, shape=(120, 20)), "border"),
         (lambda rng: one_edge(rng) + 12 * np.arange(100), "changes by"),
         (lambda rng: one_edge(rng) + 3 * np.arange(120)[:, None], "along the edge"),
