@@ -516,6 +516,51 @@ FAULTS = (
         "tests/assess/test_corrected.py",
     ),
     Fault("estimates of what changed stay", "names if name not in changed", "names if name in changed", "tests/camera/test_provenance.py"),
+    Fault("rotation of a field backwards", '"rotation_rad": (-y, x),', '"rotation_rad": (y, -x),', "tests/series/test_warm_up.py"),
+    Fault(
+        "places of a field weighted by covariance",
+        "weight[seen] = np.linalg.inv(covariance[seen])",
+        "weight[seen] = covariance[seen]",
+        "tests/series",
+    ),
+    Fault(
+        "u of targets that scatter not enlarged",
+        "* max(1.0, motion.location_factor) ** 2\n    least",
+        "\n    least",
+        "tests/series/test_warm_up.py",
+    ),
+    Fault(
+        "clock's warm-up about the first pixel",
+        'arm = series.x0_px + 0.5 + values[at["lock"]]',
+        "arm = series.x0_px + 0.5",
+        "tests/series/test_warm_up.py",
+    ),
+    Fault("a settled share of half", "e2 = np.exp(-time_s / slow)", "e2 = np.exp(-2 * time_s / slow)", "tests/series/test_warm_up.py"),
+    Fault(
+        "scatter from frame to frame of too few frames",
+        "whole = (left**2).sum(axis=0) / (frames - taken)",
+        "whole = (left**2).sum(axis=0) / (2 * frames)",
+        "tests/series/test_warm_up.py",
+    ),
+    Fault(
+        "odd rows of a frame at even places",
+        "found.positions_px * wide + [0.0, parity]",
+        "found.positions_px * wide",
+        "tests/series/test_motion.py",
+    ),
+    Fault(
+        "row time by the wrong sign of the stretch",
+        "shear = motion.values[:, at] * [1.0, -1.0]",
+        "shear = motion.values[:, at] * [1.0, 1.0]",
+        "tests/series/test_motion.py",
+    ),
+    Fault("u of the field period without that of the speed", "+ slope**2 * sum(of_speed)", "", "tests/series/test_motion.py"),
+    Fault(
+        "jitter over half the speed",
+        "weights += float((size**2).sum())",
+        "weights += float((size**2).sum()) / 4",
+        "tests/series/test_motion.py",
+    ),
 )
 
 
