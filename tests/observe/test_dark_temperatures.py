@@ -92,6 +92,9 @@ def test_bad_set_ups_have_their_reason(rng: np.random.Generator):
     assert "does not grow" in why(groups(rng, (20.0, 30.0, 40.0), rate=40.0))
     single = seen_of(groups(rng, (20.0, 30.0, 40.0), times=(1.0,)))
     assert sum("one exposure time" in note for note in single.notes) == 3
+    alone = groups(rng, (20.0, 30.0, 40.0))
+    lonely = seen_of([Frames("dark", f.exposure_s, f.data[:1], facts=f.facts) for f in alone])
+    assert sum("one frame" in note for note in lonely.notes) == 3
     with pytest.raises(InputError, match="temperature_c"):
         campaign_of_arrays([Frames("dark_temperature", 0.1, dark(rng, 20, 0.1))], bits=12)
 

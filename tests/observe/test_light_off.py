@@ -140,6 +140,8 @@ def test_what_cannot_be_measured_has_its_reason(rng: np.random.Generator):
     assert "darker" in steady.refused[0]
     full = seen_of(sequence(rng, 0.02, 30_000.0)).light_off
     assert "saturated" in full.refused[0]
+    quiet = np.repeat(np.array([500] * 2 + [20] * 12, np.uint16), 64 * 64).reshape(14, 64, 64)
+    assert seen_of(quiet).light_off.fit.limits == {"left_rel"}
     assert "one frame" in seen_of(sequence(rng, 0.02)[:1]).light_off.refused[0]
     clipped = sequence(rng, 0.02)
     clipped[4:] -= np.minimum(clipped[4:], 100)

@@ -419,11 +419,6 @@ class BrightSpots:
     fit: Estimates
     frame_rows: int
 
-    @property
-    def choices(self) -> Mapping[str, Mapping[str, str]]:
-        """Parameters that are words, by source."""
-        return {"sensor.smear": {"rows": self.smear_rows, "store": self.smear_store}} if "smear_s" in self.fit else {}
-
 
 @dataclass(frozen=True)
 class DarkTemperatures:
@@ -925,8 +920,7 @@ class Observations:
 
     def choices(self, source: str) -> Mapping[str, Any]:
         """Parameters of a source that are no numbers, such as words, as the pictures tell them."""
-        of_spots = {} if self.spots is None else self.spots.choices.get(source, {})
-        return {**of_spots, **({} if self.response is None else self.response.choices.get(source, {}))}
+        return {} if self.response is None else self.response.choices.get(source, {})
 
     def calibrated(self, names: Mapping[str, str] | Iterable[str], *, where: str) -> Estimates:
         """Take a source's parameters out of the calibrated geometry, with their covariance.

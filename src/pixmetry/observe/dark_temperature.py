@@ -188,7 +188,12 @@ def reduce_dark_temperatures(groups: Sequence[PictureGroup], seen: Observations)
         if group.facts.temperature_c is not None:
             near = next((t for t in by_temperature if abs(t - group.facts.temperature_c) <= DIFFERENT_K), group.facts.temperature_c)
             by_temperature.setdefault(near, []).append(group)
-    for temperature, own in by_temperature.items():
+    for temperature, given in by_temperature.items():
+        own = [g for g in given if g.moments.n_frames > 1]
+        if len(own) < len(given):
+            notes.append(f"dark frames at {temperature:g} °C: {len(given) - len(own)} groups of one frame are left out; take a second one")
+        if not own:
+            continue
         if any(g.moments.counts[0] > CLIPPED * g.moments.counts.sum() for g in own):
             notes.append(f"dark frames at {temperature:g} °C are left out: they are clipped at code 0; raise the black level")
             continue

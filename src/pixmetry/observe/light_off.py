@@ -106,7 +106,8 @@ def step_of(group: PictureGroup) -> LightStep:
     white = float(np.mean(reference[:, lit].var(axis=0, ddof=1)))  # of the mean of a block
     spread = float(weights @ weights)
     common2 = max(float(np.var(shares[SETTLED:], ddof=1)) - white * spread, 0.0)
-    own = [float(np.var(left[k] - shares[k] * signal, ddof=1)) for k in (0, 1)]
+    least = 1 / 12 / BLOCK_PX**2  # of the rounding, where there is no noise
+    own = [max(float(np.var(left[k] - shares[k] * signal, ddof=1)), least) for k in (0, 1)]
     u = [float(np.sqrt(v * spread + common2 * (1 + 1 / n))) for v in own]
     memory, u_memory = _noise_memory(sums, last + 1 + SETTLED, group.moments.shape)
     levels, means, covariance = _levels(signal, left[0], own[0], common2 * (1 + 1 / n) / float(weights.sum()) ** 2)

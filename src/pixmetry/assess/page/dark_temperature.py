@@ -18,7 +18,7 @@ def dark_temperature_section(found: DarkTemperatures) -> Section:
         if np.any(found.rate_dn_per_s > 0):
             section.add(law_figure(found))
         each = zip(found.temperature_c, found.rate_dn_per_s, found.u_rate_dn_per_s, strict=True)
-        rows = [[significant(float(t)), uncertain(float(rate), float(u), "")] for t, rate, u in each]
+        rows = [[significant(float(t)), uncertain(float(rate), float(u), "").joined()] for t, rate, u in each]
         section.add(Table("Dark signal", [Column("Temperature / °C", "right"), Column("Dark signal / DN/s", "right")], rows))
     return section
 
@@ -29,9 +29,8 @@ def summary_sentence(found: DarkTemperatures) -> str:
     if name not in found.fit:
         return f"The temperature step that doubles the dark current is not measured: {found.fit.reasons[name]}."
     value = found.fit[name]
-    number = uncertain(value.value, value.u, "K")
     remark = f" ({value.reason})" if value.reason else ""
-    return f"The dark current doubles every {number.value} ± {number.u} K{remark}."
+    return f"The dark current doubles every {uncertain(value.value, value.u, 'K').joined()}{remark}."
 
 
 def law_figure(found: DarkTemperatures) -> Figure:

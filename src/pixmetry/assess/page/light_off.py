@@ -21,7 +21,11 @@ def light_off_section(found: LightSteps) -> Section:
         columns: list[Column | str] = [Column("Light / DN", "right"), Column("Frames", "right")]
         columns += [Column(f"Share left in the {nth} dark frame", "right") for nth in ("first", "second")]
         rows = [
-            [significant(s.signal_dn), f"{s.bright_frames} + {len(s.shares)}", *(uncertain(s.shares[k], s.u_shares[k], "") for k in (0, 1))]
+            [
+                significant(s.signal_dn),
+                f"{s.bright_frames} + {len(s.shares)}",
+                *(uncertain(float(s.shares[k]), s.u_shares[k], "").joined() for k in (0, 1)),
+            ]
             for s in found.steps
         ]
         section.add(Table("Sequences", columns, rows))
@@ -34,9 +38,8 @@ def summary_sentence(found: LightSteps) -> str:
         return f"What a bright frame leaves in the next one is not measured: {found.fit.reasons['left_rel']}."
     left = found.fit["left_rel"]
     if left.is_limit:
-        return f"The first dark frame shows less than {printed_number(left).value} of the last bright one."
-    number = uncertain(left.value, left.u, "")
-    return f"The first dark frame shows a share of {number.value} ± {number.u} of the last bright one."
+        return f"The share of the last bright frame that the first dark one shows is {printed_number(left).joined()}."
+    return f"The first dark frame shows a share of {printed_number(left).joined()} of the last bright one."
 
 
 def decay_figure(found: LightSteps) -> Figure:

@@ -36,7 +36,7 @@ def spots_section(found: BrightSpots) -> Section:
         if name in found.fit:
             value = found.fit[name]
             number = printed_number(value) if value.is_limit else uncertain(value.value, value.u, unit)
-            rows.append([title, number.value, "" if value.is_limit else f"± {number.u}", unit, value.reason])
+            rows.append([title, number.value, "" if value.is_limit else f"± {number.u}", number.unit, value.reason])
         elif name in found.fit.reasons:
             rows.append([title, "–", "", unit, found.fit.reasons[name]])
     section.add(Table("Values", ["Quantity", Column("Value", "right"), Column("± u", "u"), Column("Unit", "unit"), "Remark"], rows))

@@ -6,6 +6,7 @@ The sum over a column runs from its first row to its last in float64, so a colum
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -115,7 +116,10 @@ def measure(observations: Observations) -> Estimates:
             reasons.append(problem)
     if not found:
         raise reasons[1] if observations.covered is None or spots is not None else reasons[0]
-    return min(found, key=lambda fit: fit["transfer_s"].u)
+    best, seen = min(found, key=lambda fit: fit["transfer_s"].u), observations.spots
+    if seen is None or "smear_s" not in seen.fit or seen.fit["smear_s"].is_limit:
+        return best
+    return replace(best, settings={"rows": seen.smear_rows, "store": seen.smear_store})  # whatever told the amount
 
 
 SOURCE = Source(
