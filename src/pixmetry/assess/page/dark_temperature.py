@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from pixmetry.camera.observations import DarkTemperatures
+from pixmetry.core.number import Number
 from pixmetry.report import Column, Section, Table
 from pixmetry.report.drawing import BLUE, INK, canvas, line
-from pixmetry.report.numbers import significant, uncertain
+from pixmetry.report.numbers import printed_number, significant
 from pixmetry.report.page import Figure
 
 
@@ -18,7 +19,7 @@ def dark_temperature_section(found: DarkTemperatures) -> Section:
         if np.any(found.rate_dn_per_s > 0):
             section.add(law_figure(found))
         each = zip(found.temperature_c, found.rate_dn_per_s, found.u_rate_dn_per_s, strict=True)
-        rows = [[significant(float(t)), uncertain(float(rate), float(u), "").joined()] for t, rate, u in each]
+        rows = [[significant(float(t)), printed_number(Number(float(rate), float(u))).joined()] for t, rate, u in each]
         section.add(Table("Dark signal", [Column("Temperature / °C", "right"), Column("Dark signal / DN/s", "right")], rows))
     return section
 

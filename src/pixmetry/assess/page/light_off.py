@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from pixmetry.camera.observations import LightSteps
+from pixmetry.core.number import Number
 from pixmetry.report import Column, Section, Table
 from pixmetry.report.drawing import BLUE, INK, SOFT, canvas, line
-from pixmetry.report.numbers import printed_number, significant, uncertain
+from pixmetry.report.numbers import printed_number, significant
 from pixmetry.report.page import Figure
 
 SHOWN = 12  # frames after the step
@@ -24,7 +25,7 @@ def light_off_section(found: LightSteps) -> Section:
             [
                 significant(s.signal_dn),
                 f"{s.bright_frames} + {len(s.shares)}",
-                *(uncertain(float(s.shares[k]), s.u_shares[k], "").joined() for k in (0, 1)),
+                *(printed_number(Number(float(s.shares[k]), s.u_shares[k])).joined() for k in (0, 1)),
             ]
             for s in found.steps
         ]
