@@ -31,7 +31,7 @@ def summary_sentence(found: DarkTemperatures) -> str:
         return f"The temperature step that doubles the dark current is not measured: {found.fit.reasons[name]}."
     value = found.fit[name]
     remark = f" ({value.reason})" if value.reason else ""
-    return f"The dark current doubles every {uncertain(value.value, value.u, 'K').joined()}{remark}."
+    return f"The dark current doubles every {printed_number(value).joined()}{remark}."
 
 
 def law_figure(found: DarkTemperatures) -> Figure:
