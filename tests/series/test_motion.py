@@ -125,3 +125,16 @@ def test_the_order_of_the_rows_enters_the_camera(rng: np.random.Generator) -> No
     for name, key, value in (("interlace", "first_field", "odd"), ("rolling_shutter", "first_row", "bottom")):
         source = get_source(f"sensor.{name}")
         assert getattr(with_estimates(source, source.neutral, source.measure(seen)), key) == value
+
+
+def test_a_frame_that_shows_nothing_costs_no_other(rng: np.random.Generator) -> None:
+    empty = FrameTargets("3", 3 * PERIOD_S, np.zeros((0, 2)), np.zeros((0, 2, 2)))
+    runs = [Run((*r.even[:3], empty, *r.even[4:]), (*r.odd[:3], empty, *r.odd[4:])) for r in runs_of(rng, 0.02, 0.0)]
+    found = motion_of(runs, (480, 640))
+    assert found.frames == len(VELOCITIES) * (FRAMES - 1)
+    assert "jitter_s" in found.fit and not found.fit["field_period_s"].is_limit
+    still = [
+        Run(*(tuple(FrameTargets(f.name, 0.0, f.positions_px, f.covariance_px2) for f in side) for side in (r.even, r.odd))) for r in runs
+    ]
+    with pytest.raises(MeasureError, match="same time"):
+        motion_of(still, (480, 640))

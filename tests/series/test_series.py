@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,7 @@ PLACES = np.stack(np.meshgrid(np.linspace(25.2, 143.9, 4), np.linspace(22.4, 97.
 PLACES = PLACES + np.column_stack([np.arange(12) * 0.3 % 1, np.arange(12) * 0.7 % 1])  # at all phases of the pixels
 TIME_S = np.arange(30) * 120.0
 SHIFT = np.array([0.4, -0.25])
+ALL_NAN = "file,time_s\n" + "".join(f"frame_{k:03d}.png,nan\n" for k in range(len(TIME_S)))
 
 
 def frame(k: int, rng: np.random.Generator) -> np.ndarray:
@@ -92,7 +94,7 @@ def test_frames_without_times_are_refused(folder: Path, tmp_path: Path) -> None:
         series(folder)
     table = tmp_path / "times.csv"
     missing = ("file,time_s\nother.png,1\n", "no time for a frame")
-    for text, told in (missing, ("name;t\na;1\n", "not a table"), ("file,time_s\na,x\n", "not a")):
+    for text, told in (missing, ("name;t\na;1\n", "not a table"), ("file,time_s\na,x\n", "not a"), (ALL_NAN, "no time")):
         table.write_text(text)
         with pytest.raises(InputError, match=told):
             series(folder, times=table)
@@ -121,3 +123,33 @@ def test_a_series_in_a_campaign_is_measured(rng: np.random.Generator, tmp_path: 
         campaign_of_arrays([Frames("series", None, frames, facts=GroupFacts(times_s=(0.0, 1.0)))], bits=8)
     with pytest.raises(InputError, match="kind series without times"):
         campaign_of_arrays([Frames("series", None, frames)], bits=8)
+
+
+def test_frames_of_one_name_in_two_folders_are_all_measured(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from pixmetry.series import job
+
+    for k in range(20):
+        (tmp_path / "ab"[k % 2]).mkdir(exist_ok=True)
+        (tmp_path / "ab"[k % 2] / f"{k // 2:02d}.png").write_bytes((folder / f"frame_{k:03d}.png").read_bytes())
+    table = tmp_path / "times.csv"
+    table.write_text("file,time_s\n" + "".join(f"{'ab'[k % 2]}/{k // 2:02d}.png,{TIME_S[k]}\n" for k in range(20)))
+    found = series([tmp_path / "a", tmp_path / "b"], tmp_path / "out", times=table)
+    assert found.frames == tuple(f"{'ab'[k % 2]}/{k // 2:02d}.png" for k in range(20))
+    assert len((tmp_path / "out.frames.jsonl").read_bytes().splitlines()) == 2 + 20
+    fetched: list[Path] = []
+    load = job.load_picture
+    monkeypatch.setattr(job, "load_picture", lambda path, *rest: (fetched.append(path), load(path, *rest))[1])
+    later = (tmp_path / "out.frames.jsonl").stat().st_mtime + 5
+    os.utime(tmp_path / "a" / "03.png", (later, later))  # taken anew
+    series([tmp_path / "a", tmp_path / "b"], tmp_path / "out", times=table)
+    assert fetched == [tmp_path / "a" / "03.png"]
+    shift = found.drift.values[:, 0]
+    assert abs(shift[-1] - shift[0] - SHIFT[0] * (1 - np.exp(-TIME_S[19] / 900.0))) < 0.1
+
+
+def test_frames_of_one_time_are_refused(rng: np.random.Generator) -> None:
+    frames = [frame(k, rng) for k in range(4)]
+    with pytest.raises(MeasureError, match="at the same time"):
+        measure_series([(str(k), 5.0, lambda k=k: frames[k]) for k in range(4)])
+    with pytest.raises(MeasureError, match="4 frames are too few for a curve; allowed: 9 or more"):
+        measure_series([(str(k), TIME_S[k], lambda k=k: frames[k]) for k in range(4)])

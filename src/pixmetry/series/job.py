@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -108,9 +108,12 @@ def series(
         check_output(output, KIND, tuple(map(str, given)), files)
         told = {name: str(value) for name, value in {**options, "noise": model, "raw": layout}.items() if value is not None}
         log = SeriesLog(Path(f"{str(output).rstrip('/')}.frames.jsonl"), told)
+        for path, name in zip(files, names_of(files), strict=True):
+            if _holder(path).stat().st_mtime > log.written_s:  # another frame of the same name
+                log.done.pop(name, None)
     named = [
-        (frame_name(path), on_for_s + time, lambda path=path: load_picture(path, None, layout).array)
-        for path, time in sorted(zip(files, seconds, strict=True), key=lambda pair: pair[1])
+        (name, on_for_s + time, lambda path=path: load_picture(path, None, layout).array)
+        for path, name, time in sorted(zip(files, names_of(files), seconds, strict=True), key=lambda one: one[2])
     ]
     try:
         found = measure_series(
@@ -130,6 +133,16 @@ def series(
     if output is not None:
         write_results(found, output, tuple(map(str, given)), files)
     return found
+
+
+def names_of(files: Sequence[Path]) -> list[str]:
+    """A name for each frame that no other has: with its folder, or whole, where the names of files do not tell them apart."""
+    names = [frame_name(path) for path in files]
+    for longer in ([f"{_holder(path).parent.name}/{name}" for path, name in zip(files, names, strict=True)], [str(path) for path in files]):
+        if len(set(names)) == len(names):
+            break
+        names = longer
+    return names
 
 
 def times_of(files: Sequence[Path], interval_s: float | None, times: str | Path | None) -> tuple[list[float], tuple[str, ...]]:
@@ -164,16 +177,17 @@ def _from_table(files: Sequence[Path], table: Path) -> list[float]:
     try:
         with table.open(newline="", encoding="utf-8-sig") as file:
             rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
-        known = {Path(row["file"]).name: float(row["time_s"]) for row in rows}
+        known = {name: float(row["time_s"]) for row in rows for name in (row["file"], Path(row["file"]).name)}
     except OSError as problem:
         raise InputError("file cannot be read", where=str(table), value=problem.strerror, remedy="check the name") from None
     except (KeyError, ValueError, TypeError, AttributeError, UnicodeDecodeError, csv.Error):
         raise InputError("not a table of times", where=str(table), allowed="CSV with columns file, time_s", remedy="correct it") from None
-    missing = next((path for path in files if path.name not in known), None)
+    names = names_of(files)
+    missing = next((name for name in names if not np.isfinite(known.get(name, np.nan))), None)
     if missing is not None:
-        raise InputError("no time for a frame", where=str(table), value=missing.name, remedy="add its row")
-    first = min(known[path.name] for path in files)
-    return [known[path.name] - first for path in files]
+        raise InputError("no time for a frame", where=str(table), value=missing, remedy="add its row")
+    first = min(known[name] for name in names)
+    return [known[name] - first for name in names]
 
 
 def measure_series(
@@ -198,30 +212,28 @@ def measure_series(
     """
     told, named = progress or no_progress, list(frames)
     shape = None if log is None else log.shape
-    seen: dict[str, FrameTargets] = {} if log is None else dict(log.done)
+    seen = {} if log is None else {k: log.done[name] for k, (name, _, _) in enumerate(named) if name in log.done}
 
-    def work(item: tuple[str, float, Fetch]) -> tuple[FrameTargets, tuple[int, int]]:
-        name, time_s, fetch = item
+    def work(k: int) -> tuple[int, FrameTargets, tuple[int, int]]:
+        name, time_s, fetch = named[k]
         array = fetch()
         if shape is not None and array.shape != shape:
             raise InputError("a frame of another size", where=name, value=array.shape, allowed=str(shape), remedy="leave it out")
-        return find_targets(array, name, time_s, **options), (array.shape[0], array.shape[1])
+        return k, find_targets(array, name, time_s, **options), (array.shape[0], array.shape[1])
 
-    waiting: Iterator[tuple[str, float, Fetch]] = (item for item in named if item[0] not in seen)
-    done = len(named) - sum(item[0] not in seen for item in named)
-    for found, size in imap_tiles(work, waiting):
+    waiting = [k for k in range(len(named)) if k not in seen]
+    for k, found, size in imap_tiles(work, waiting):
         if shape is None:
             shape = size
             if log is not None:
                 log.put_shape(size)
         if log is not None:
             log.put(found)
-        seen[found.name] = found
-        done += 1
-        told("locating", done, len(named))
+        seen[k] = found
+        told("locating", len(seen), len(named))
     if shape is None or not named:
         raise MeasureError("no frames", where="series", remedy="name frames of a fixed field of targets")
-    ordered = [seen[name] for name, _, _ in named]
+    ordered = [seen[k] for k in range(len(named))]
     seconds: Array = np.array([time for _, time, _ in named], float)
     with single_threaded_blas():
         positions, covariance = follow_targets(ordered)

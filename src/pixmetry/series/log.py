@@ -35,6 +35,7 @@ class SeriesLog:
         self.path = path
         self.done: dict[str, FrameTargets] = {}
         self.shape: tuple[int, int] | None = None
+        self.written_s = path.stat().st_mtime if path.exists() else 0.0  # when the last run wrote it
         head = {"schema": LOG_SCHEMA, "options": plain(dict(options))}
         whole = self._read(head) if path.exists() and path.stat().st_size else 0
         try:

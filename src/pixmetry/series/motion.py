@@ -135,7 +135,11 @@ def _followed(run: Run) -> _Followed | None:
     kept = seen.sum(axis=0) >= LEAST_FRAMES
     if kept.sum() < 3:
         return None
-    places, covariance, seen = places[:, kept], covariance[:, kept], seen[:, kept]
+    used = seen[:, kept].any(axis=1)  # a frame that shows none of them tells nothing
+    both = np.ix_(used, kept)
+    time_s, places, covariance, seen = time_s[used], places[both], covariance[both], seen[both]
+    if not np.ptp(time_s) > 0:
+        raise MeasureError("all frames of a run have the same time", where="motion", remedy="correct times_s")
     speed, left = np.full_like(places, np.nan), np.full_like(places, np.nan)
     scaled = (time_s - time_s.mean()) / np.ptp(time_s)
     basis = np.polynomial.polynomial.polyvander(scaled, PATH_DEGREE)
@@ -147,7 +151,7 @@ def _followed(run: Run) -> _Followed | None:
     number = np.maximum(seen.sum(axis=1), 1)[:, None]
     common = np.where(seen[..., None], left, 0).sum(axis=1) / number
     variance = np.where(seen[..., None], np.diagonal(covariance, axis1=2, axis2=3), 0).sum(axis=1) / number**2
-    lag, lag_covariance = (odd - even)[:, kept], (odd_covariance + even_covariance)[:, kept]
+    lag, lag_covariance = (odd - even)[both], (odd_covariance + even_covariance)[both]
     return _Followed(time_s, places, covariance, lag, lag_covariance, speed, common, variance)
 
 

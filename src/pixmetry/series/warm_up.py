@@ -133,8 +133,10 @@ def drift_of(
     time, values = np.asarray(time_s, float)[used], motion.values[used]
     order = np.argsort(time, kind="stable")
     time, values, covariance = time[order], values[order], motion.covariance[used][order] * max(1.0, motion.location_factor) ** 2
-    least = len(motion.modes) + 8
-    if len(time) * len(motion.modes) < 3 * least or np.ptp(time) <= 0:
+    if not np.ptp(time) > 0:
+        raise MeasureError("all frames were taken at the same time", where="series", remedy="correct their times")
+    least = -(-3 * (len(motion.modes) + 8) // len(motion.modes))
+    if len(time) < least:
         raise MeasureError(f"{len(time)} frames are too few for a curve", where="series", allowed=f"{least} or more", remedy="take more")
     single = Series(time, motion.modes, values, covariance, np.ones(len(time)), 0.5 * (frame_shape[1] - 1), clock_mhz)
     series = _binned(single)
