@@ -82,3 +82,9 @@ def test_refusals():
         fit_dark_temperature(T, y, 0 * u, reference_c=25)
     with pytest.raises(InputError):
         fit_dark_temperature(T, y[:3], u, reference_c=25)
+
+
+@pytest.mark.parametrize("currents", [(-1.0, -1.0, 1e4), (0.0, 0.0, 100.0), (1.0, -3.0, -3.0)])
+def test_a_current_at_one_temperature_tells_no_law(currents: tuple[float, ...]):
+    with pytest.raises(MeasureError, match="one temperature only"):
+        fit_dark_temperature(np.array([20.0, 40.0, 55.0]), np.array(currents), np.ones(3), reference_c=20.0)

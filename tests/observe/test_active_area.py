@@ -104,3 +104,12 @@ def test_frame_without_border_is_refused_with_the_reason(rng: np.random.Generato
     _, unmeasured = measure_sources(seen)
     assert "no side of the frame is black" in unmeasured["grabber.window_offset"]
     assert "no side of the frame is black" in unmeasured["grabber.sampling_clock"]
+
+
+@pytest.mark.parametrize("level", [0.0, 200.0])
+def test_even_and_tiny_frames_have_the_reason_and_no_warning(level: float, recwarn: pytest.WarningsRecorder):
+    assert "no side of the frame is black" in active_area(np.full((20, 30), level), 2, StatedFacts()).fit.reasons["clock_mhz"]
+    bright = np.zeros((20, 30))
+    bright[3:-3, 4:-4] = 200.0
+    assert active_area(bright, 2, StatedFacts(sensor_cols=22)).fit["clock_ratio"].value == pytest.approx(1.0)
+    assert not recwarn.list

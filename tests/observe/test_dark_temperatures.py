@@ -105,3 +105,13 @@ def test_the_page_shows_it(rng: np.random.Generator, tmp_path: Path):
     assert "Dark current and temperature" in (tmp_path / "result" / "report.html").read_text()
     assert found.to_record()["dark_temperatures"]["temperature_c"] == [20.0, 30.0, 36.0, 42.0]
     assert found.camera["sensor.dark_current"].params.doubling_c == pytest.approx(7.0, rel=0.1)
+
+
+def test_a_single_frame_is_left_out_and_costs_nothing_else(rng: np.random.Generator):
+    def taken(temperature_c: float, exposure_s: float, count: int) -> Frames:
+        return Frames("dark", exposure_s, dark(rng, temperature_c, exposure_s)[:count], facts=GroupFacts(temperature_c=temperature_c))
+
+    groups = [taken(t, e, 4) for t in (10.0, 30.0, 45.0) for e in (0.01, 2.0)]
+    _, seen = observe_campaign(campaign_of_arrays([*groups, taken(60.0, 0.01, 1)], bits=12), no_progress)
+    assert any("only 1 dark frame at 60 °C, exposure 0.01 s" in note for note in seen.notes)
+    assert seen.dark_temperatures is not None and "doubling_temperature_k" in seen.dark_temperatures.fit

@@ -183,6 +183,12 @@ def test_bad_set_ups_have_their_reason(rng: np.random.Generator):
     assert "same exposure" in why(pictures(rng, (1.0, 1.0)))
 
 
+def test_exposures_that_all_saturate_have_their_reason(rng: np.random.Generator):
+    groups = pictures(rng, (1.75, 4.0, 8.0), bloom={"up": 0.5})  # 0.87 of the well in the shortest
+    _, seen = observe_campaign(campaign_of_arrays(groups, bits=12), no_progress)
+    assert seen.spots is not None and "saturated in the shortest exposure" in seen.spots.fit.reasons["smear_s"]
+
+
 def test_the_page_the_twin_and_the_results_hold_it(rng: np.random.Generator, tmp_path: Path):
     groups = [*pictures(rng, (0.5, 1.0, 2.0, 4.0), smear_s=0.1, passed="above", bloom={"up": 0.45}), *flat_frames(rng)]
     found = assess(campaign_of_arrays(groups, bits=12, name="spotted", sensor="ccd"), tmp_path / "result", trials=0)

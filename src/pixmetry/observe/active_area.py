@@ -57,6 +57,7 @@ def active_area(mean_map: np.ndarray, frames: int, stated: StatedFacts) -> Activ
     black = float(np.percentile(edges, 1))
     lit = data > 0.5 * (black + float(np.percentile(data, 95)))
     bright = float(np.median(data[lit])) if lit.any() else black
+    lit = lit if lit.any() else np.ones_like(lit)
     lit_rows, lit_cols = (lit.mean(axis=axis) > 0.5 * lit.mean(axis=axis).max() for axis in (1, 0))
     of_cols, of_rows = np.median(data[lit_rows], axis=0), np.median(data[:, lit_cols], axis=1)
     noise = float(np.median(np.abs(np.diff(data, axis=1))[lit[:, 1:]])) / 0.6745 / np.sqrt(2) if lit[:, 1:].any() else 0.0
@@ -69,8 +70,8 @@ def active_area(mean_map: np.ndarray, frames: int, stated: StatedFacts) -> Activ
     inside = slice(int(np.nan_to_num(top)) + INNER_PX, int(bottom if np.isfinite(bottom) else rows) - INNER_PX)
     first = int(np.ceil(left if np.isfinite(left) else 0)) + INNER_PX
     last = int(right if np.isfinite(right) else cols) - INNER_PX
-    profile = data[inside, first:last].mean(axis=0)
-    nu, u_nu, power = strongest_line(profile)
+    within = data[inside, first:last]
+    nu, u_nu, power = strongest_line(within.mean(axis=0) if within.size else np.zeros(0))
     area = replace(nowhere, left=left, right=right, top=top, bottom=bottom, beat=nu, beat_power=power)
     return replace(area, fit=_told(area, u_nu, stated))
 

@@ -22,6 +22,7 @@ DIFFERENT_K = 0.5  # temperatures that lie nearer are one
 RESOLVED = 3.0  # u between the growth and zero
 CONTRADICTION_Z = 3.09  # scatter beyond the stated u that is met by chance once in a thousand
 WHERE = "dark current against temperature"
+SINGULAR = 1e-10  # eigenvalue of the correlation, below which one current alone carries the fit
 CLIPPED = 1e-3  # share of pixels at code 0
 GAP_CHI2 = 16.0  # by which the law of the gap must fit better to be named
 METHOD = "weighted least squares of µ_I(T) = µ_ref 2^((T − T_ref)/T_d) (EMVA 1288 R4.0 eq. 31)"
@@ -57,7 +58,8 @@ def fit_dark_temperature(
     InputError
         Arrays of different shapes, values that are not finite, or an u that is not above zero.
     MeasureError
-        Fewer than three temperatures, less than 10 K between them, or a current that does not grow with temperature.
+        Fewer than three temperatures, less than 10 K between them, a current that does not grow with temperature, or one that is
+        seen at one temperature only.
 
     Notes
     -----
@@ -67,7 +69,12 @@ def fit_dark_temperature(
     t, y, s = _checked(temperature_c, dark_current, u)
     log_current, growth = _solve(t - t.mean(), y, s)
     model, jacobian = _model(t - t.mean(), log_current, growth, s)
-    covariance = np.linalg.inv(jacobian.T @ jacobian)
+    normal = jacobian.T @ jacobian
+    size = np.sqrt(np.diag(normal))
+    if not (size > 0).all() or np.linalg.eigvalsh(normal / size / size[:, None])[0] < SINGULAR:
+        what, remedy = "a dark current is seen at one temperature only", "take longer exposures at the others"
+        raise MeasureError(what, where=WHERE, remedy=remedy)
+    covariance = np.linalg.inv(normal)
     nu, dof, reason = t.size - 2, math.inf, ""
     chi2 = float((((y - model) / s) ** 2).sum())
     if chi2 > nu * (1 - 2 / (9 * nu) + CONTRADICTION_Z * math.sqrt(2 / (9 * nu))) ** 3:  # Wilson & Hilferty 1931
@@ -185,7 +192,10 @@ def reduce_dark_temperatures(groups: Sequence[PictureGroup], seen: Observations)
     currents = []
     by_temperature: dict[float, list[PictureGroup]] = {}
     for group in groups:
-        if group.facts.temperature_c is not None:
+        if group.facts.temperature_c is not None and group.moments.n_frames < 2:
+            which = f"{group.facts.temperature_c:g} °C, exposure {group.exposure_s:g} s"
+            notes.append(f"only 1 dark frame at {which}: it is left out, its noise is not told by one")
+        elif group.facts.temperature_c is not None:
             near = next((t for t in by_temperature if abs(t - group.facts.temperature_c) <= DIFFERENT_K), group.facts.temperature_c)
             by_temperature.setdefault(near, []).append(group)
     for temperature, given in by_temperature.items():
@@ -200,8 +210,8 @@ def reduce_dark_temperatures(groups: Sequence[PictureGroup], seen: Observations)
         times = np.array([g.exposure_s for g in own])
         means = [g.moments.frame_means_dn() for g in own]
         levels = np.array([m.mean() for m in means])
-        scatter = float(np.sqrt(np.mean([m.var(ddof=1) for m in means if m.size > 1]))) if any(m.size > 1 for m in means) else 0.0
-        floor = np.sqrt([(g.moments.deviation_map_dn2().mean() / max(g.moments.n_frames - 1, 1) + 1 / 12) / levels.size for g in own])
+        scatter = float(np.sqrt(np.mean([m.var(ddof=1) for m in means])))
+        floor = np.sqrt([(g.moments.deviation_map_dn2().mean() / (g.moments.n_frames - 1) + 1 / 12) / levels.size for g in own])
         u = np.hypot(scatter, floor / np.sqrt(own[0].moments.shape[0] * own[0].moments.shape[1])) / np.sqrt([m.size for m in means])
         slope = _slope(times, levels, u)
         if slope is None:

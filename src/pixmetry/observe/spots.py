@@ -26,6 +26,7 @@ LEAST_LINES = 16  # columns (rows) without spots, and rows (columns) of a column
 MOST_EXPOSURES = 8
 SIGNIFICANT, DIFFERENT, FALLING = 3.3, 4.0, 3.0
 STRAY = "stray light that is even along the rows or columns of the spots is taken for their cross-talk"
+SATURATED, LESS_LIGHT = "spots are saturated in the shortest exposure", "add exposures in which they reach half of saturation"
 METHOD = "level of the columns and rows of spots against those without, at all exposures together"
 
 
@@ -66,6 +67,8 @@ def spots_of(groups: Sequence[PictureGroup], seen: Observations) -> BrightSpots:
     """
     exposures = _exposures(groups, seen)
     saturated, plateau, u_plateau, clipped = _saturation(exposures)
+    if saturated.all():
+        raise MeasureError(SATURATED, remedy=LESS_LIGHT)
     found = _find_spots(exposures, saturated)
     light, u_rel, times = _light(exposures, saturated, plateau, _rows_of(found))
     shape = light.shape
@@ -131,16 +134,12 @@ def _saturation(exposures: Sequence[_Exposure]) -> tuple[np.ndarray, float, floa
     saturated = peaks < LINEAR * expected
     if not saturated.any():
         if first.peak_dn > LINEAR * first.full_dn:
-            raise MeasureError(
-                "spots are saturated in the shortest exposure", remedy="add exposures in which they reach half of saturation"
-            )
+            raise MeasureError(SATURATED, remedy=LESS_LIGHT)
         return saturated, float("inf"), 0.0, False
     longest = exposures[int(np.flatnonzero(saturated)[-1])]
     values = longest.image_dn[longest.image_dn > LINEAR * longest.peak_dn]
     plateau = float(np.median(values))
     u = 1.4826 * float(np.median(np.abs(values - plateau))) / np.sqrt(values.size) + longest.noise_dn / np.sqrt(values.size)
-    if first.peak_dn > LINEAR * plateau:
-        raise MeasureError("spots are saturated in the shortest exposure", remedy="add exposures in which they reach half of saturation")
     saturated = saturated | (peaks > UNSATURATED * plateau)
     return saturated, plateau, float(u), plateau > longest.full_dn - 1
 
