@@ -153,3 +153,20 @@ def test_frames_of_one_time_are_refused(rng: np.random.Generator) -> None:
         measure_series([(str(k), 5.0, lambda k=k: frames[k]) for k in range(4)])
     with pytest.raises(MeasureError, match="4 frames are too few for a curve; allowed: 9 or more"):
         measure_series([(str(k), TIME_S[k], lambda k=k: frames[k]) for k in range(4)])
+
+
+def test_a_frame_that_is_being_written_does_not_end_the_watch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from pixmetry.cli.series import _follow
+    from pixmetry.series import job
+
+    cut, other = InputError("end of the image is missing", where="a.tif"), InputError("no such kind")
+    answers: list[Exception] = [cut, MeasureError("too few"), cut, other, other]
+
+    def run(*_: object, **__: object) -> None:
+        raise answers.pop(0)
+
+    monkeypatch.setattr(job, "series", run)
+    monkeypatch.setattr("time.sleep", lambda _: None)
+    with pytest.raises(InputError, match="no such kind"):
+        _follow((tmp_path,), tmp_path / "out", {})
+    assert not answers

@@ -101,7 +101,8 @@ def _follow(images: tuple[Path, ...], output: Path, options: dict[str, Any]) -> 
             except MeasureError as problem:  # too few frames so far
                 found, told = None, str(problem)
             except InputError as problem:
-                if "no image files" not in problem.what and "no times" not in problem.what:
+                waits = "no image files" in problem.what or "no times" in problem.what
+                if not waits and str(problem) == last:  # seen twice: no frame that is being written
                     raise
                 found, told = None, str(problem)
             if found is not None and len(found.frames) > known:
