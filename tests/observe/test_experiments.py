@@ -9,8 +9,10 @@ from typing import get_args
 import numpy as np
 import pytest
 
+from pixmetry.assess.job import observe_campaign
 from pixmetry.camera.group_facts import GroupFacts
 from pixmetry.core.errors import InputError
+from pixmetry.core.progress import no_progress
 from pixmetry.files.images import write_frame
 from pixmetry.files.in_memory import Frames, campaign_of_arrays
 from pixmetry.files.manifest import load_campaign, write_manifest
@@ -70,3 +72,14 @@ def test_a_fact_of_another_kind_is_refused() -> None:
         for kind in (k for k in (*KINDS, *TARGETS) if name not in FACTS.get(k, ())):
             with pytest.raises(InputError, match=name):
                 campaign_of_arrays([Frames(kind, 0.01, frames, facts=GroupFacts(**{name: STATED[name]}))], bits=8)
+
+
+def test_the_wavelength_of_edges_is_that_of_their_lens(rng: np.random.Generator) -> None:
+    def seen_with(*wavelengths: float | None):
+        frames = [rng.integers(90, 110, (2, 40, 40)).astype(np.uint16) for _ in wavelengths]
+        groups = [Frames("edge", None, f, facts=GroupFacts(wavelength_nm=nm)) for f, nm in zip(frames, wavelengths, strict=True)]
+        return observe_campaign(campaign_of_arrays(groups, bits=8, optics={"wavelength_nm": 550.0}), no_progress)[1]
+
+    assert seen_with(850.0, 850.0).stated.wavelength_nm == 850.0
+    both = seen_with(850.0, None)
+    assert both.stated.wavelength_nm == 550.0 and any("several wavelengths (550 nm, 850 nm)" in note for note in both.notes)

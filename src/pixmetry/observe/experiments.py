@@ -24,6 +24,7 @@ from pixmetry.observe.spots import reduce_spots
 
 def reduce_edges(groups: Sequence[PictureGroup], seen: Observations) -> Observations:
     """Find and fit the slanted edges of pictures."""
+    seen = _with_wavelength(groups, seen)
     pictures = [Picture.of(g.kind, g.moments, g.bits) for g in groups]
     analogue = seen.stated.interface == "analogue"
     search = search_edges(pictures, analogue)
@@ -36,6 +37,16 @@ def reduce_edges(groups: Sequence[PictureGroup], seen: Observations) -> Observat
             optics = with_other_lens(optics, search.measured)
         edges = responses_of(search, optics)
     return replace(seen, edges=edges, notes=(*seen.notes, *edge_notes(edges), *motion_notes(pictures, search)))
+
+
+def _with_wavelength(groups: Sequence[PictureGroup], seen: Observations) -> Observations:
+    """The wavelength of the edges, which are fitted together, in place of that of the campaign; a note if they have several."""
+    told = {g.facts.wavelength_nm or seen.stated.wavelength_nm for g in groups}
+    if len(told) == 1:
+        return replace(seen, stated=replace(seen.stated, wavelength_nm=told.pop()))
+    listed = ", ".join(f"{nm:g} nm" if nm else "not stated" for nm in sorted(told, key=lambda nm: nm or 0.0))
+    what = f"edges in light of several wavelengths ({listed}) are fitted together"
+    return replace(seen, notes=(*seen.notes, f"{what}: take those of one wavelength for the f-number of the lens"))
 
 
 def reduce_charts(groups: Sequence[PictureGroup], seen: Observations) -> Observations:
