@@ -116,6 +116,23 @@ def test_smear_needs_contrast_and_is_told_from_the_slope(rng: np.random.Generato
     assert "light and dark columns" in told(rng, smear=2e-5, levels=(8000,)).fit.reasons["smear_s"]
 
 
+def test_smear_in_covered_rows_without_noise_is_bounded_by_rounding(rng: np.random.Generator, recwarn: pytest.WarningsRecorder):
+    """Rows that all hold one code show no smear below half a code, whatever their scatter says."""
+    held = [BorderFrames(kind, 0.01, BORDERS) for kind in ("dark", "covered")]
+    bars = np.where(np.arange(BORDERS.active_shape((ROWS, COLS))[1]) // 15 % 2, 200.0, 0.0)
+    for group, light in zip(held, (0 * bars, bars), strict=True):
+        for index in range(4):
+            stored = np.full((ROWS, COLS), 100.0)
+            active = BORDERS.active(stored.shape)
+            stored[active] += light + rng.normal(0, 2, stored[active].shape)
+            group.add(index, np.rint(stored).astype(np.uint16))
+    found = covered_pixels(held, False, GAIN)
+    assert found is not None and found.fit["smear_s"].is_limit
+    rows = BORDERS.active_shape((ROWS, COLS))[0]
+    hidden_s = 0.5 / (200.0 * rows) * rows * 0.01  # half a code beside a bright column: not excluded by such rows
+    assert found.fit["smear_s"].value > hidden_s and not recwarn.list
+
+
 def test_noise_common_to_a_row(rng: np.random.Generator):
     found = told(rng, row_noise=0.8)
     for _, noise, u in found.row_noise:

@@ -22,6 +22,7 @@ from pixmetry.core.number import ONE_SIDED_95, Estimates
 LEAST_DEPTH = 6  # covered columns, or rows, behind each other: the farther half is the reference of the nearer one
 LIT = 4  # columns, or rows, whose mean is the light beside the border
 LEAST_FRAMES = 2
+LEAST_NOISE_DN = 0.4  # of covered rows, below which rounding does not average out
 NOT_SIGNIFICANT = 3.0
 CLIPPED_SHARE = 0.01
 LEAST_CONTRAST = 0.05  # of the light, between columns, from which on smear is told from stray light
@@ -356,6 +357,9 @@ def _smear(lit: Sequence[BorderFrames], zero: _Zero, covered: Covered, late: Tra
                 slope = float(x @ y / (x @ x)) / rows
                 left = y - slope * rows * x
                 u = float(np.sqrt((left @ left) / (len(x) - 2) / (x @ x))) / rows
+                if max(float(np.std(getattr(frame, side))) for frame in frames) < LEAST_NOISE_DN:
+                    # rounding hides as much in all columns
+                    u = float(np.hypot(u, np.sqrt(len(x) / 12 / (x @ x)) / rows))
                 if side == "bottom" and late is not None:  # the end of the trail of late charge is in these rows, too
                     end = float(((1 - 1 / late.length_px) ** np.arange(depth // 2 if depth > 3 else 0, depth)).mean()) / rows
                     slope, u = slope - max(late.share, 0.0) * end, float(np.hypot(u, late.u_share * end))
@@ -390,6 +394,8 @@ def _line_noise(group: BorderFrames) -> tuple[float, float, float] | None:
         return None
     change = blocks - blocks.mean(axis=0)
     change = change - change.mean(axis=(1, 2), keepdims=True)
+    if not change.any():
+        return None
     more, n = len(frames) / (len(frames) - 1.0), change.shape[2]
     rows = change.mean(axis=2)
     of_rows = more * n * float((rows**2).mean()) * rows.shape[1] / (rows.shape[1] - 1)

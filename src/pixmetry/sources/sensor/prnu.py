@@ -58,6 +58,9 @@ def measure(observations: Observations) -> Estimates:
     spatial = observations.spatial_fit
     there = {new: old for new, old in names.items() if spatial is None or old in spatial}
     why = "" if spatial is None else spatial.reasons.get("prnu_pixel_rel", "")
+    if "pixel_std_rel" not in there and not why:
+        remedy = "take 16 or more dark and as many bright frames of the same exposure"
+        raise MeasureError("needs a stack of bright frames and one of dark frames", where="sensor.prnu", remedy=remedy)
     if "pixel_std_rel" not in there:
         raise MeasureError(
             "the PRNU of the pixels cannot be determined", where="sensor.prnu", value=why, remedy="check what the frames have in common"
