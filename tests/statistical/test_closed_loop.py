@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from chance import rng_of
 from statistical.closed_loop import Score, failures, planted, run_camera, summarise
@@ -21,6 +22,12 @@ MEASURED = (
     "grabber.adc.offset_dn",
     "sensor.prnu.pixel_std_rel",
     "sensor.dsnu.pixel_std_e",
+    "sensor.quantum_efficiency.quantum_efficiency",
+)
+HOLD_DOUBT = (
+    "electronics.gain.gain_dn_per_e",
+    "electronics.amplifier_noise.white_e",
+    "sensor.dark_current.rate_e_per_s",
     "sensor.quantum_efficiency.quantum_efficiency",
 )
 
@@ -47,10 +54,17 @@ def test_the_main_quantities_are_really_measured(scores):
 
 
 def test_u_is_close_to_the_least_possible(scores):
-    """Median of u over the Cramér–Rao or χ² bound at most 1.15, for every quantity that has one."""
-    for line in summarise(scores[0]):
-        if line.n >= 20 and np.isfinite(line.u_ratio):
-            assert line.u_ratio < 1.15, line
+    """Median of u over the Cramér–Rao or χ² bound: at most 1.15, and 1.25 where u also holds what a filter of the noise, or repelled
+    charge, may do unseen, which the bound leaves out. A larger median fails by a sign test: more cameras above the limit than below it.
+    """
+    ratios: dict[str, list[float]] = {}
+    for s in scores[0]:
+        if s.resolved and s.kind == "value" and np.isfinite(s.u_ratio):
+            ratios.setdefault(s.name, []).append(s.u_ratio)
+    for name, found in ratios.items():
+        limit = 1.25 if name in HOLD_DOUBT else 1.15
+        above, most = int((np.array(found) > limit).sum()), stats.binom.isf(RATE / len(ratios), len(found), 0.5)
+        assert above <= most, (name, len(found), np.median(found))
 
 
 @pytest.mark.parametrize("name", MEASURED)

@@ -41,7 +41,7 @@ from pixmetry.observe.photon_transfer_model import MINIMUM_DARK_VAR_DN2, QUANTIS
 
 MOST_CLIPPED = 0.002  # share of the pixels at the ends of the codes
 FOUND_Z, FOUND_PATTERN_Z = 4.2, 3.5  # of one of the twelve near lags; of the pattern of repelled charge: false in 1e-3 of cameras
-PRESENT = 0.05  # chance, before anything is measured, that a camera has a filter, repelled charge, or temporal noise reduction
+PRESENT = 0.02  # chance, before anything is measured, that a camera has a filter, repelled charge, or temporal noise reduction
 LARGEST_SHARE, LARGEST_LOSS, LARGEST_ALPHA = 0.2, 0.1, 0.9  # if there: all sizes up to this are equally likely
 FIT_LEVEL = 1e-4  # chance of a worse fit below which a family is refused
 NEAR = tuple(k for k, (j, i) in enumerate(LAGS) if 0 < max(abs(j), abs(i)) <= 2)
@@ -347,12 +347,12 @@ def unseen_rms(estimate: float, u: float, largest: float, *, both_signs: bool = 
     -----
     With the chance `PRESENT` that the effect is there, and the likelihoods of the estimate with and without it, Bayes' rule gives the
     chance P of it; the root mean square is √(P ⟨x²⟩) over the posterior of its size x. An estimate of zero leaves next to nothing, one of
-    two u a part, and one of four u all of it: what one camera in twenty has is not taken for what every one has.
+    two u a part, and one of four u all of it: what one camera in fifty has is not taken for what every one has.
 
     Examples
     --------
     >>> [round(unseen_rms(z * 0.004, 0.004, 0.9), 4) for z in (0, 2, 3, 4)]
-    [0.0001, 0.0006, 0.0028, 0.0132]
+    [0.0, 0.0004, 0.0018, 0.0105]
     """
     low = -largest if both_signs else 0.0
     x = np.linspace(max(low, estimate - 8 * u), max(min(largest, estimate + 8 * u), low), 801)
