@@ -18,6 +18,7 @@ from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.files.images import write_frame
 from pixmetry.files.in_memory import Frames
 from pixmetry.series.job import measure_series
+from pixmetry.series.modes import field_motion
 
 SHAPE = (120, 170)
 PLACES = np.stack(np.meshgrid(np.linspace(25.2, 143.9, 4), np.linspace(22.4, 97.3, 3)), axis=-1).reshape(-1, 2)
@@ -153,6 +154,15 @@ def test_frames_of_one_time_are_refused(rng: np.random.Generator) -> None:
         measure_series([(str(k), 5.0, lambda k=k: frames[k]) for k in range(4)])
     with pytest.raises(MeasureError, match="4 frames are too few for a curve; allowed: 9 or more"):
         measure_series([(str(k), TIME_S[k], lambda k=k: frames[k]) for k in range(4)])
+
+
+@pytest.mark.parametrize("line", [(80.0, np.arange(3) * 30.0 + 20), (np.arange(3) * 50.0 + 30, 60.0)])
+def test_targets_on_a_line_do_not_tell_the_motion_behind_a_frame_grabber(line: tuple, rng: np.random.Generator) -> None:
+    places = np.column_stack(np.broadcast_arrays(*line)) + rng.normal(0, 0.01, (10, 3, 2))
+    covariance = np.broadcast_to(np.eye(2) * 1e-4, (10, 3, 2, 2))
+    with pytest.raises(MeasureError, match="on a line"):
+        field_motion(places, covariance, (84.5, 59.5), analogue=True)
+    assert field_motion(places, covariance, (84.5, 59.5)).used.all()
 
 
 def test_a_frame_that_is_being_written_does_not_end_the_watch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

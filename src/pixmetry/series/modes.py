@@ -12,6 +12,7 @@ from pixmetry.core.errors import MeasureError
 
 LEAST_TARGETS = 3  # in a frame, for shift, scale and rotation with a check
 LEAST_SHARE = 0.5  # of the frames in which a target must be seen
+LEAST_SPREAD = 1e-3  # singular value of the modes for a target, with places over the farthest one
 PASSES = 4  # places and modes in turn; targets that are missing in some frames couple them weakly
 
 
@@ -81,7 +82,8 @@ def field_motion(positions_px: Array, covariance_px2: Array, centre_px: tuple[fl
     Raises
     ------
     MeasureError
-        With fewer than three targets that stay, or fewer than three frames that show them.
+        With fewer than three targets that stay, or fewer than three frames that show them; or where the targets lie on a line, so that
+        the modes are not told from each other.
 
     Notes
     -----
@@ -102,6 +104,10 @@ def field_motion(positions_px: Array, covariance_px2: Array, centre_px: tuple[fl
     used = seen.sum(axis=1) >= LEAST_TARGETS
     if used.sum() < 3:
         raise MeasureError(f"only {used.sum()} frames show the targets", where="series", remedy="take more frames")
+    middle = np.nanmean(np.where(seen[..., None], positions, np.nan), axis=0)
+    spread = np.linalg.svd(design_of(middle / np.abs(middle).max(), modes).reshape(-1, len(modes)), compute_uv=False)[-1]
+    if spread < LEAST_SPREAD * np.sqrt(kept.size):
+        raise MeasureError("all targets lie on a line", where="series", allowed="targets all over the frame", remedy="add others beside it")
     weight = np.zeros_like(covariance)
     weight[seen] = np.linalg.inv(covariance[seen])
     filled = np.where(seen[..., None], positions, 0.0)
