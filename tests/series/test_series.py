@@ -180,3 +180,14 @@ def test_a_frame_that_is_being_written_does_not_end_the_watch(tmp_path: Path, mo
     with pytest.raises(InputError, match="no such kind"):
         _follow((tmp_path,), tmp_path / "out", {})
     assert not answers
+
+
+def test_a_series_that_fails_says_why_at_its_sources(rng: np.random.Generator) -> None:
+    flat = [rng.normal(100, 2, (20, *SHAPE)).astype(np.uint8) for _ in range(2)]
+    told = GroupFacts(interval_s=60.0)
+    found = assess(
+        campaign_of_arrays([Frames(kind, None, f, facts=told) for kind, f in zip(("series", "motion"), flat, strict=True)], bits=8),
+        trials=0,
+    )
+    for source in ("sensor.mount_drift", "sensor.rolling_shutter"):
+        assert "not told by" in found.unmeasured[source] and "take frames" not in found.unmeasured[source]

@@ -338,7 +338,8 @@ def _with_series(
             bits=campaign.bits,
         )
     except MeasureError as problem:
-        return replace(seen, notes=(*seen.notes, f"the series of a fixed field tells nothing: {problem}"))
+        note = f"the series of a fixed field tells nothing: {problem}"
+        return replace(seen, failed={**seen.failed, "series": problem.what}, notes=(*seen.notes, note))
     return replace(seen, drift=found.drift, notes=(*seen.notes, *filter(None, (others, *found.notes))))
 
 
@@ -355,7 +356,8 @@ def _with_motion(
     try:
         found = measure_motion(runs, campaign.frame_shape, on_frames=on_frames, bits=campaign.bits)
     except MeasureError as problem:
-        return replace(seen, notes=(*seen.notes, f"the frames of moving targets tell nothing: {problem}"))
+        note = f"the frames of moving targets tell nothing: {problem}"
+        return replace(seen, failed={**seen.failed, "motion": problem.what}, notes=(*seen.notes, note))
     return replace(seen, motion=found)
 
 

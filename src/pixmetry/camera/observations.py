@@ -773,6 +773,7 @@ class Observations:
     geometry: CameraGeometry | None = None
     drift: DriftSeries | None = None
     motion: MotionSeries | None = None
+    failed: Mapping[str, str] = field(default_factory=dict)  # by kind of frames: why they tell nothing
     storage: Storage = Storage()
     notes: tuple[str, ...] = field(default_factory=tuple)
 
@@ -936,7 +937,9 @@ class Observations:
         return self.geometry.lens.select(names)
 
 
-def of_pictures(fit: Estimates | None, names: Mapping[str, str], *, where: str, pictures: str, kind: str) -> Estimates:
+def of_pictures(
+    fit: Estimates | None, names: Mapping[str, str], *, where: str, pictures: str, kind: str, failed: str = ""
+) -> Estimates:
     """Take a source's parameters ``{parameter: fitted name}`` out of what pictures of one kind tell, with their covariance.
 
     Parameters
@@ -950,12 +953,16 @@ def of_pictures(fit: Estimates | None, names: Mapping[str, str], *, where: str, 
         What the pictures show, for the message.
     kind : str
         As in the manifest.
+    failed : str
+        Why the pictures tell nothing at all, where there are some.
 
     Raises
     ------
     MeasureError
         Without pictures, or with the reason why they do not tell any of these.
     """
+    if fit is None and failed:
+        raise MeasureError(f"not told by {pictures}: {failed}", where=where)
     if fit is None:
         remedy = f"take frames of {pictures} (kind: {kind} in the manifest)"
         raise MeasureError(f"not measured: needs {pictures}", where=where, remedy=remedy)

@@ -39,7 +39,7 @@ FACTS = {  # what else may be said of a group, by its kind
     "dark": ("temperature_c",),  # which makes it the next kind
     "dark_temperature": ("temperature_c",),
     "chart": ("densities", "luminances", "u_light_rel", "regions", "white"),
-    "line": ("wavelength_nm", "recorded"),
+    "line": ("recorded",),
     "series": ("times_s", "interval_s", "on_for_s"),
     "motion": ("times_s", "interval_s"),
 }

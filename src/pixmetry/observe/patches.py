@@ -148,7 +148,7 @@ def search_patches(data: np.ndarray, count: int) -> tuple[list[tuple[int, int, i
     best = alike[int(np.argmax(alike.sum(axis=1)))]
     chosen = [box for box, take in zip(boxes, best, strict=True) if take]
     if len(chosen) != count:
-        return [], f"{len(chosen)} even patches of about one size were found, and {count} are listed; give their regions"
+        return [], f"even patches of about one size: {len(chosen)} were found, and {count} are listed; give their regions"
     return chosen, ""
 
 

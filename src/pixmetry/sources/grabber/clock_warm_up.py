@@ -89,7 +89,14 @@ def measure(observations: Observations) -> Estimates:
     """Error and delay of the clock when switched on, from a series of a fixed field; camera and grabber warm up together in it."""
     names = ("scale_error_rel", "scale_tau_s", "delay_ns", "delay_tau_s")
     fit, names_of = None if observations.drift is None else observations.drift.fit, {name: name for name in names}
-    return of_pictures(fit, names_of, where="grabber.clock_warm_up", pictures="a series of a fixed field", kind="series")
+    return of_pictures(
+        fit,
+        names_of,
+        where="grabber.clock_warm_up",
+        pictures="a series of a fixed field",
+        kind="series",
+        failed=observations.failed.get("series", ""),
+    )
 
 
 SOURCE = Source(

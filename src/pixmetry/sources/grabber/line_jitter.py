@@ -13,6 +13,7 @@ from pixmetry.camera.observations import Observations
 from pixmetry.camera.row_delays import delays_ns
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.errors import MeasureError
 from pixmetry.core.number import Estimates
 from pixmetry.core.random import Grid, Stream
 
@@ -78,6 +79,8 @@ def tail(params: LineJitter, pixel_hz: float, row_px: int) -> float:
 
 def measure(observations: Observations) -> Estimates:
     """Read what all upright lines of a row have in common: independent part, loop and settling, from px to ns by the pixel clock."""
+    if observations.stated.interface == "digital":
+        raise MeasureError("the camera is digital: no frame grabber samples its lines", where="grabber.line_jitter")
     names = {"white": "white_ns", "loop": "loop_ns", "settling": "settling_ns"}
     kept = ("loop_rows", "settling_rows", "interlaced")
     found = observations.row_jitter({f"{n}_px": f"{n}_px" for n in names} | {n: n for n in kept}, where="grabber.line_jitter")

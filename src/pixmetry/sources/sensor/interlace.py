@@ -69,7 +69,14 @@ def truth(params: Interlace, signal: Signal, stream: Stream) -> Mapping[str, np.
 def measure(observations: Observations) -> Estimates:
     """Delay of one field against the other, from moving targets; which rows come first is among the settings."""
     fit = None if observations.motion is None else observations.motion.fit
-    found = of_pictures(fit, {"field_period_s": "field_period_s"}, where="sensor.interlace", pictures="moving targets", kind="motion")
+    found = of_pictures(
+        fit,
+        {"field_period_s": "field_period_s"},
+        where="sensor.interlace",
+        pictures="moving targets",
+        kind="motion",
+        failed=observations.failed.get("motion", ""),
+    )
     return replace(found, settings={k: v for k, v in found.settings.items() if k == "first_field"})
 
 

@@ -78,7 +78,14 @@ def measure(observations: Observations) -> Estimates:
     """Shift, scale and rotation of the image and how fast they settle, from a series of a fixed field."""
     names = ("shift_x_px", "shift_y_px", "scale_rel", "rotation_rad", "fast_share", "fast_s", "slow_s")
     fit = None if observations.drift is None else observations.drift.fit
-    return of_pictures(fit, {name: name for name in names}, where="sensor.mount_drift", pictures="a series of a fixed field", kind="series")
+    return of_pictures(
+        fit,
+        {name: name for name in names},
+        where="sensor.mount_drift",
+        pictures="a series of a fixed field",
+        kind="series",
+        failed=observations.failed.get("series", ""),
+    )
 
 
 SOURCE = Source(

@@ -55,7 +55,14 @@ def truth(params: RollingShutter, signal: Signal, stream: Stream) -> Mapping[str
 def measure(observations: Observations) -> Estimates:
     """Time from row to row, from moving targets; where the reading begins is among the settings."""
     fit = None if observations.motion is None else observations.motion.fit
-    found = of_pictures(fit, {"row_time_s": "row_time_s"}, where="sensor.rolling_shutter", pictures="moving targets", kind="motion")
+    found = of_pictures(
+        fit,
+        {"row_time_s": "row_time_s"},
+        where="sensor.rolling_shutter",
+        pictures="moving targets",
+        kind="motion",
+        failed=observations.failed.get("motion", ""),
+    )
     return replace(found, settings={k: v for k, v in found.settings.items() if k == "first_row"})
 
 

@@ -70,7 +70,14 @@ def measure(observations: Observations) -> Estimates:
     names = ("shift_std_px", "roll_std_rad")
     fit = None if observations.drift is None else observations.drift.fit
     told = {name: name for name in names}
-    return of_pictures(fit, told, where="sensor.stabilisation", pictures="a series of a fixed field", kind="series")
+    return of_pictures(
+        fit,
+        told,
+        where="sensor.stabilisation",
+        pictures="a series of a fixed field",
+        kind="series",
+        failed=observations.failed.get("series", ""),
+    )
 
 
 SOURCE = Source(

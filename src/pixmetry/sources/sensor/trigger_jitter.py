@@ -45,7 +45,14 @@ def truth(params: TriggerJitter, signal: Signal, stream: Stream) -> Mapping[str,
 def measure(observations: Observations) -> Estimates:
     """Scatter of the time of exposure, from moving targets about their paths; latency and rate need another clock."""
     fit = None if observations.motion is None else observations.motion.fit
-    found = of_pictures(fit, {"jitter_s": "jitter_s"}, where="sensor.trigger_jitter", pictures="moving targets", kind="motion")
+    found = of_pictures(
+        fit,
+        {"jitter_s": "jitter_s"},
+        where="sensor.trigger_jitter",
+        pictures="moving targets",
+        kind="motion",
+        failed=observations.failed.get("motion", ""),
+    )
     return replace(found, settings={})
 
 
