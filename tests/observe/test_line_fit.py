@@ -142,6 +142,17 @@ def test_what_cannot_be_told_apart_is_named_and_its_delay_is_given(rng: np.rando
         measured("cable.termination", seen)
 
 
+def test_jitter_of_an_unfiltered_line_is_not_taken_for_a_filter(rng: np.random.Generator):
+    """Rows that are read early or late have a share of their neighbours: as after a filter that delays by one pixel."""
+    seen, _ = seen_of(rng, {"grabber.line_jitter": {"white_ns": 2.9}})
+    assert seen.edges is not None and seen.edges.line is not None and not len(seen.edges.line)
+    for source in ("grabber.low_pass", "electronics.video_amplifier", "cable.termination", "cable.t_piece"):
+        with pytest.raises(MeasureError, match=r"rows jitter by 0\.0\d+ px.*take frames with the pixel clock"):
+            measured(source, seen)
+    v = seen.edges.optics["spread_var_px2"]
+    assert abs(v.value - SPREAD) < LIMIT * v.u < LIMIT * 0.006
+
+
 def test_what_the_line_needs_is_asked_for(rng: np.random.Generator):
     picture = stored_squares(rng, OPTICS | {"grabber.low_pass": {"kind": "butterworth"}}, cells=1)
     search = search_edges([picture], analogue=True)

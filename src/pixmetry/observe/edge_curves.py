@@ -79,8 +79,8 @@ def curves_of(measured: Sequence[tuple[Region, Spread]], right_px: float) -> tup
     Notes
     -----
     Each edge is brought to the mean of all by its place and its two levels (linear least squares, two turns). What they have in common is
-    left to the fit. The covariance follows from the variance of the pixels on both sides and the autocorrelation of the noise along the
-    row, up to 6 px.
+    left to the fit. The covariance follows from the variance of the pixels on both sides, the autocorrelation of the noise along the
+    row, up to 6 px, and the jitter of the rows.
     """
     correlation = _correlation_along_rows(measured)
     curves = []
@@ -166,7 +166,11 @@ def _curve(group: Sequence[tuple[Region, Spread]], right_px: float, correlation:
     slope = float(np.average([r.slope for r, _ in kept], weights=[r.rows for r, _ in kept]))
     at = np.asarray(np.flatnonzero(filled), np.int64)
     covariance = _covariance(at, variance[at], correlation, slope if kept[0][0].across == "y" else 1.0)
-    jitter, u_jitter = _jitter(kept, value, correlation) if kept[0][0].across == "x" else (0.0, 0.0)
+    jitter, u_jitter = 0.0, 0.0
+    if kept[0][0].across == "x":
+        jitter, u_jitter = _jitter(kept, value, correlation)
+        moved = _moved_by_rows([r for r, _ in kept], edges, value, half)[at]
+        covariance += jitter * moved @ moved.T
     total_rows = int(sum(r.rows for r, _ in kept))
     return EdgeCurve(kept[0][0].across, slope, place[at], value[at], covariance, len(kept), total_rows, jitter, u_jitter)
 
@@ -225,6 +229,26 @@ def _covariance(at: Ints, variance: Array, correlation: Array, px_per_px: float)
     if lowest < WHITE_SHARE / 2:  # an estimated autocorrelation need not be one of a process
         out[np.diag_indices(n)] += (WHITE_SHARE - lowest) * variance
     return out
+
+
+def _moved_by_rows(regions: Sequence[Region], edges: Sequence[_Binned], value: Array, half: float) -> Array:
+    """Change of the mean curve by 1 px of shift of each row of the pictures, shape (bins, rows); a row moves all edges that it crosses.
+
+    A row has a pixel in every eighth bin alone, so that its shift is noise of these bins, and no blur of the mean.
+    """
+    bins = len(value)
+    number = {key: i for i, key in enumerate(sorted({(r.picture, r.first + k) for r in regions for k in range(r.rows)}))}
+    out, total = np.zeros((bins, len(number))), np.zeros(bins)
+    for region, e in zip(regions, edges, strict=True):
+        weight = e.height**2 / np.mean(e.variances)
+        total += weight * e.count
+        for k, centre in enumerate(region.centre):
+            low, high = max(int(np.ceil(centre - half)), 0), min(int(np.floor(centre + half)), region.frame.shape[1] - 1)
+            b = np.floor((np.arange(low, high + 1) - centre) / BIN_PX + 0.5 * (bins - 1) + 0.5).astype(int)
+            out[b[(b >= 0) & (b < bins)], number[region.picture, region.first + k]] += weight
+    steep = np.gradient(value, BIN_PX)
+    moved: Array = out * (steep / np.maximum(total, 1e-300))[:, None]
+    return moved
 
 
 def _jitter(group: Sequence[tuple[Region, Spread]], value: Array, correlation: Array) -> tuple[float, float]:

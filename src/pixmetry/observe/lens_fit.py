@@ -20,7 +20,7 @@ PERIOD_PX = 128.0  # of the square wave that stands for an edge
 MOST_FREQUENCY = 6.0  # cycles/px
 NODES = 48  # of the integral over the common part of two pupils
 BETTER_CHI2 = 25.0  # by which χ² must be less than that of the Gaussian lens, and fall with a defocus
-LEAST_P = 1e-4  # probability of a larger χ², below which the edges follow neither
+NEAR_PX, MISFIT = 2.0, 6.0  # χ² per bin so near to the edge, from which on they follow neither; below it, u grows with its root
 LARGEST_U_A = 0.2  # of a width of the pixel that is given
 STARTS_AIRY, START_A, START_W = (0.4, 1.2), 0.85, 0.1
 METHOD = "joint fit of a diffraction-limited lens and a rectangular aperture to slanted edges"
@@ -60,6 +60,7 @@ class _LensFit:
     covariance: Array
     chi2: float
     dof: int
+    near: float  # χ² per bin near the edges, where the lens shows
 
 
 class _Drawn:
@@ -73,6 +74,7 @@ class _Drawn:
         ones, value = root @ np.ones(len(curve.value)), root @ curve.value
         basis, size, _ = np.linalg.svd(np.column_stack([drawn, ones]), full_matrices=False)
         basis = basis[:, size > 1e-3]
+        self.basis, self.near = basis, np.abs(curve.place_px) < NEAR_PX
         self.map, self.ones, self.value = basis.T @ drawn, basis.T @ ones, basis.T @ value
         self.rest, self.n = float(value @ value - self.value @ self.value), len(value)
         self.tilt, self.main = abs(curve.slope), 0 if curve.across == "x" else 1
@@ -113,7 +115,10 @@ def _fit(curves: Sequence[_Drawn], lens: Lens, starts: Sequence[Array], low: Seq
     n = sum(c.n for c in curves)
     covariance = np.linalg.pinv(best.jac.T @ best.jac, rcond=1e-14, hermitian=True)[: k + 2, : k + 2]
     chi2 = 2 * float(best.cost) + sum(c.rest for c in curves)
-    return _LensFit(np.asarray(best.x[: k + 2], float), np.asarray(covariance, float), chi2, max(n - len(best.x), 1))
+    ends = np.cumsum([c.basis.shape[1] for c in curves])[:-1]
+    bins = np.concatenate([(c.basis @ r)[c.near] for c, r in zip(curves, np.split(best.fun, ends), strict=True)])
+    near = float(bins @ bins) / max(len(bins) - len(best.x), 1)
+    return _LensFit(np.asarray(best.x[: k + 2], float), np.asarray(covariance, float), chi2, max(n - len(best.x), 1), near)
 
 
 def fit_diffraction(measured: Sequence[tuple[Region, Spread]]) -> Estimates:
@@ -142,9 +147,7 @@ def fit_diffraction(measured: Sequence[tuple[Region, Spread]]) -> Estimates:
     blurred = _fit(drawn, _diffraction, starts, [0.05, 0.0, 0.05, 0.05], [8, 0.5, 1.3, 1.3], 2)
     scale = max(min(f.chi2 / f.dof for f in (gauss, clear, blurred)), 1.0)
     best = blurred if clear.chi2 - blurred.chi2 > BETTER_CHI2 * scale else clear
-    from scipy.special import gammaincc
-
-    if gammaincc(best.dof / 2, best.chi2 / 2) < LEAST_P:
+    if best.near > MISFIT:
         return Estimates.empty()
     if gauss.chi2 - best.chi2 < BETTER_CHI2 * scale:
         alike = best.chi2 - gauss.chi2 < BETTER_CHI2 * scale
@@ -153,7 +156,7 @@ def fit_diffraction(measured: Sequence[tuple[Region, Spread]]) -> Estimates:
         return replace(Estimates.empty(), confounders=(rival,) if alike else ())
     names = ("airy_px", *(("defocus_waves",) if best is blurred else ()), "width_x_px", "width_y_px")
     units = tuple("waves" if name == "defocus_waves" else "px" for name in names)
-    covariance = best.covariance * max(best.chi2 / best.dof, 1.0)
+    covariance = best.covariance * max(best.near, 1.0)
     whole = Estimates(names, best.values, covariance, np.full(len(names), float(best.dof)), units, METHOD)
     hidden = [name for name in names if name.startswith("width") and whole[name].u > LARGEST_U_A]
     why = "the lens hides the aperture: focus better, or take more edges with less noise"

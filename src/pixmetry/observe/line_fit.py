@@ -34,6 +34,7 @@ LARGEST_U_REL = 1 / 3  # of a value that is given
 LARGEST_U_A = 0.2  # of a width of the pixel that is given
 MISFIT_P = 1e-4  # probability of a larger χ², below which the line is another one
 ITERATIONS, CONVERGED = 40, 1e-3  # the last in χ²
+MEAN_OF_GAUSSIAN, LARGEST_MEAN = 0.8, 1.25  # of |d| over the standard deviation of d; the largest leaves room for what 100 rows tell of it
 STEP_REL = 1e-5  # of differences that stand for derivatives
 METHOD = "joint fit of lens, pixel and video line to slanted edges along x and y; the mean of models, by their probability"
 
@@ -43,19 +44,26 @@ METHOD = "joint fit of lens, pixel and video line to slanted edges along x and y
 
 @dataclass(frozen=True)
 class LineModel:
-    """Which parts a line has: a low-pass filter of a kind and order, an amplifier of second order, echoes of a cable or an open branch."""
+    """Which parts a line has: a low-pass filter of a kind and order, an amplifier of second order, echoes of a cable or an open branch.
+
+    The level of a line without a filter goes straight from one pixel to the next. Read d pixels late or early, it is (1 − |d|) of a pixel
+    and |d| of a neighbour: rows that jitter are smoothed at whole pixels by the mean of |d|, which looks like a filter. ``jitter`` is the
+    largest mean that is looked for, 0 if none.
+    """
 
     kind: str = "off"
     order: int = 0
     amplifier: bool = False
     echo: str = ""  # of the cable, within the rise of an edge ("near") or behind it ("far"), or of an open branch ("branch")
+    jitter: float = 0.0
 
     @property
     def names(self) -> tuple[str, ...]:
         """Free parameters: frequencies over the pixel clock, delays in pixel periods."""
         low_pass = ("cutoff_rel",) if self.order else ()
         amplifier = ("natural_rel", "damping") if self.amplifier else ()
-        return low_pass + amplifier + {"": (), "branch": ("branch_px",)}.get(self.echo, ("ghost_rel", "echo_px"))
+        jitter = ("neighbour_rel",) if self.jitter else ()
+        return low_pass + amplifier + jitter + {"": (), "branch": ("branch_px",)}.get(self.echo, ("ghost_rel", "echo_px"))
 
     @property
     def parts(self) -> frozenset[str]:
@@ -66,20 +74,22 @@ class LineModel:
 
     def limits(self, name: str) -> tuple[float, float]:
         """Range in which a parameter is looked for."""
+        if name == "neighbour_rel":
+            return 0.0, self.jitter
         low, high = LINE_LIMITS[name]
         if name == "echo_px":
             return (low, NEAR_PX) if self.echo == "near" else (NEAR_PX, high)
         return low, high
 
     def prior_width(self, name: str, value: float) -> float:
-        """One over the density of the prior: log-uniform within the limits, or uniform where they have both signs."""
+        """One over the density of the prior: log-uniform within the limits, or uniform where they are not above zero."""
         low, high = self.limits(name)
-        return high - low if low < 0 else float(np.log(high / low)) * value
+        return high - low if low <= 0 else float(np.log(high / low)) * value
 
     def holds(self, other: LineModel) -> bool:
         """Whether it is the other model, or that with further parts."""
         same = not other.order or (self.kind, self.order) == (other.kind, other.order)
-        return same and self.amplifier >= other.amplifier and other.echo in ("", self.echo)
+        return same and self.amplifier >= other.amplifier and self.jitter >= other.jitter and other.echo in ("", self.echo)
 
     def poles(self, q: dict[str, float]) -> Array:
         """Of the filters, in radians per pixel period."""
@@ -106,6 +116,12 @@ class LineModel:
         poles = _separated(self.poles(q))
         out = np.zeros(TAPS)
         line_taps(poles, residues_of(poles), delays, amplitudes, out)
+        return out
+
+    def taps_read(self, q: dict[str, float]) -> Array:
+        """h_(−1) … h_(TAPS − 1), smoothed by jitter: rows that are read early have a share of the next pixel."""
+        share, taps = q.get("neighbour_rel", 0.0), np.pad(self.taps(q), 1)
+        out: Array = (1 - share) * taps[:-1] + 0.5 * share * (taps[1:] + np.append(0.0, taps[:-2]))
         return out
 
     def delay_px(self, q: dict[str, float]) -> float:
@@ -187,7 +203,7 @@ class _Seen:
         self.ones, self.value = basis.T @ ones, basis.T @ value
         self.rest = float(value @ value - self.value @ self.value)
         late = 1.0 if curve.across == "x" else -curve.slope
-        self.late = np.exp(-2j * np.pi * np.outer(nu * late, np.arange(TAPS)))
+        self.late = np.exp(-2j * np.pi * np.outer(nu * late, np.arange(-1, TAPS)))
         self.main = 0 if curve.across == "x" else 1
 
     def optics(self, p: Array) -> Array:
@@ -250,10 +266,10 @@ def fit_model(
 
     def normal(p: Array, q: Array, own: Array) -> tuple[float, list[tuple[Array, Array]]]:
         values = dict(zip(names, q, strict=True))
-        taps = [model.taps(values)]
+        taps = [model.taps_read(values)]
         for name, value in values.items():
             step = STEP_REL * max(abs(value), 0.1)
-            taps.append((model.taps(values | {name: value + step}) - taps[0]) / step)
+            taps.append((model.taps_read(values | {name: value + step}) - taps[0]) / step)
         chi2, parts = 0.0, []
         for s, (place, low, height) in zip(seen, own, strict=True):
             nu = _frequencies()
@@ -360,6 +376,7 @@ class LineSearch:
     fits: tuple[LineFit, ...]
     scale: float
     misfit_p: float
+    jitter_px: float  # standard deviation of the rows' places
 
     @cached_property
     def weights(self) -> tuple[tuple[LineFit, float], ...]:
@@ -398,6 +415,13 @@ class LineSearch:
                 break
         return tuple(out)
 
+    @property
+    def jitter_may_smooth(self) -> bool:
+        """Whether jitter may be what a filter seems to be: a line without one needs it, and χ² does not exclude that line."""
+        most = min(f.chi2 for f in self.fits) + FOUND_CHI2 * self.scale
+        unfiltered = [f for f in self.fits if not f.model.order and not f.model.amplifier and f.chi2 < most]
+        return bool(unfiltered) and all(f.model.jitter for f in unfiltered)
+
     def fall(self, part: str) -> float:
         """By how much χ² falls with a part of the line."""
         least = [min(f.chi2 for f in self.fits if (part in f.model.parts) == there) for there in (False, True)]
@@ -416,8 +440,7 @@ def fit_line(measured: Sequence[tuple[Region, Spread]]) -> tuple[Estimates, Esti
     if found is not None:
         return line_estimates(found)
     told = "edges along x and along y are needed: those along y show lens and pixel without the line"
-    line = {name: told for names in OF_PART.values() for name in names} | {"delay_px": told}
-    return replace(Estimates.empty(), reasons=line), replace(Estimates.empty(), reasons={"spread_var_px2": told})
+    return _nothing_of_the_line(told), replace(Estimates.empty(), reasons={"spread_var_px2": told})
 
 
 def search_models(curves: Sequence[EdgeCurve]) -> LineSearch | None:
@@ -440,7 +463,9 @@ def search_models(curves: Sequence[EdgeCurve]) -> LineSearch | None:
     from scipy.special import gammaincc
 
     least = min(found, key=lambda f: f.chi2)
-    return LineSearch(tuple(found), max(least.chi2 / least.dof, 1.0), float(gammaincc(least.dof / 2, least.chi2 / 2)))
+    misfit_p = float(gammaincc(least.dof / 2, least.chi2 / 2))
+    jitter = float(np.sqrt(max(c.jitter_px2 for c in curves)))
+    return LineSearch(tuple(found), max(least.chi2 / least.dof, 1.0), misfit_p, jitter)
 
 
 def _start_variance(curves: Sequence[EdgeCurve]) -> float:
@@ -466,11 +491,12 @@ def _search(seen: Sequence[_Seen], optics: Array, free: Sequence[int]) -> list[L
             return fit_model(seen, fit.model, fit.optics, free, fit.line, fit.own, 1)
         return fit_model(seen, fit.model, fit.optics, free, fit.line, fit.own)
 
+    largest = LARGEST_MEAN * float(np.sqrt(max(s.curve.jitter_px2 + 2 * s.curve.u_jitter_px2 for s in seen)))
     for echo in ("", "near", "far", "branch"):
-        for (kind, order), amplifier in product((("off", 0), *FILTERS), (False, True)):
-            if order == 2 and amplifier:  # two of one kind
+        filtered = [LineModel(kind, order, amplifier, echo) for (kind, order), amplifier in product((("off", 0), *FILTERS), (False, True))]
+        for model in (*filtered, LineModel(echo=echo, jitter=largest)):
+            if model.order == 2 and model.amplifier:  # two of one kind
                 continue
-            model = LineModel(kind, order, amplifier, echo)
             before = next((f.line for f in out if f.model == replace(model, echo="")), None)
             tried = _from_starts(seen, model, optics, before, own)
             out += _distinct([go_on(fit) for fit in tried[: 3 if echo == "far" else 1]])
@@ -496,14 +522,15 @@ def _distinct(fits: Sequence[LineFit]) -> list[LineFit]:
 
 def _parts_left_out(model: LineModel) -> list[LineModel]:
     """The model with one part less."""
-    options = [replace(model, kind="off", order=0), replace(model, amplifier=False), replace(model, echo="")]
+    options = [replace(model, kind="off", order=0), replace(model, amplifier=False), replace(model, echo=""), replace(model, jitter=0.0)]
     return [m for m in options if m != model]
 
 
 def _from_starts(seen: Sequence[_Seen], model: LineModel, optics: Array, before: dict[str, float] | None, own: Array) -> list[LineFit]:
     """Fits after a few steps from each start of the line's parameters, with the optics as they are, the best first."""
     names = model.names
-    options = [[v for v in STARTS[name] if model.limits(name)[0] <= v <= model.limits(name)[1]] for name in names]
+    every = STARTS | {"neighbour_rel": (MEAN_OF_GAUSSIAN * model.jitter / LARGEST_MEAN,)}
+    options = [[v for v in every[name] if model.limits(name)[0] <= v <= model.limits(name)[1]] for name in names]
     starts = [dict(zip(names, s, strict=True)) for s in product(*options)]
     if before is not None:  # without the echo
         starts += [start | before for start in starts[: len(options[-1])]]
@@ -525,10 +552,10 @@ def line_estimates(found: LineSearch) -> tuple[Estimates, Estimates]:
     Returns
     -------
     line : Estimates
-        ``delay_px`` always: how much later the centroid of anything comes. Of a part that every model needs which the edges allow, its
+        ``delay_px``: how much later the centroid of anything comes. Of a part that every model needs which the edges allow, its
         parameters: frequencies over the pixel clock (``cutoff_rel``, ``natural_rel``), ``damping``, ``ghost_rel`` (amplitude of an echo
         over the one before), ``echo_px`` and ``branch_px`` (delays). ``settings`` has kind and order of the filter. ``reasons`` say why
-        others are missing.
+        others are missing. Empty where no line fits, and where jitter of the rows may be what smooths the edges.
     optics : Estimates
         ``spread_var_px2``; ``sigma_px``, ``width_x_px``, ``width_y_px`` and separations as far as they are told.
 
@@ -544,13 +571,18 @@ def line_estimates(found: LineSearch) -> tuple[Estimates, Estimates]:
             f"no line that was tried describes the edges (χ² {best.chi2:.0f} for {best.dof} degrees of freedom): another filter, a grabber "
             "that samples at another rate than the pixel clock, gamma, or a lens that is no Gaussian"
         )
-        every = {name: told for names in OF_PART.values() for name in names} | {"delay_px": told}
-        return replace(Estimates.empty(), reasons=every), replace(Estimates.empty(), reasons={"spread_var_px2": told})
+        return _nothing_of_the_line(told), replace(Estimates.empty(), reasons={"spread_var_px2": told})
     present = [p for p in OF_PART if all(p in f.model.parts for f in found.rivals) and found.fall(p) > FOUND_CHI2]
     kinds = {(f.model.kind, f.model.order) for f in found.rivals}
     names = tuple(name for part in present for name in OF_PART[part])
     values, covariance = _mean_of_models(found, names)
     optics, line = _split(found, names, values, covariance)
+    if found.jitter_may_smooth:
+        told = (
+            f"rows jitter by {found.jitter_px:.3f} px, which smooths edges as a filter does: a line without a filter is not excluded; "
+            "take frames with the pixel clock, or measure the jitter with lines (kind: line)"
+        )
+        return _nothing_of_the_line(told), optics
     delay = line["delay_px"]
     reasons: dict[str, str] = {}
     left_out: list[str] = []
@@ -571,6 +603,11 @@ def line_estimates(found: LineSearch) -> tuple[Estimates, Estimates]:
     line = line.select([name for name in line.names if name not in left_out])
     settings: dict[str, str | int] = {"kind": found.best.model.kind, "order": found.best.model.order} if "cutoff_rel" in line else {}
     return replace(line, reasons=reasons, settings=settings, confounders=_correlated(line)), optics
+
+
+def _nothing_of_the_line(told: str) -> Estimates:
+    every = {name: told for names in OF_PART.values() for name in names} | {"delay_px": told}
+    return replace(Estimates.empty(), reasons=every)
 
 
 NEEDED = "take the same edges with the filter of the grabber switched off"
