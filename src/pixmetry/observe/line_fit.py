@@ -34,7 +34,7 @@ LARGEST_U_REL = 1 / 3  # of a value that is given
 LARGEST_U_A = 0.2  # of a width of the pixel that is given
 MISFIT_P = 1e-4  # probability of a larger χ², below which the line is another one
 ITERATIONS, CONVERGED = 40, 1e-3  # the last in χ²
-MEAN_OF_GAUSSIAN, LARGEST_MEAN = 0.8, 1.25  # of |d| over the standard deviation of d; the largest leaves room for what 100 rows tell of it
+MEAN_OF_GAUSSIAN, LARGEST_MEAN = 0.8, 1.6  # of |d| over the standard deviation of d; the largest leaves room for what 100 rows tell of it
 STEP_REL = 1e-5  # of differences that stand for derivatives
 METHOD = "joint fit of lens, pixel and video line to slanted edges along x and y; the mean of models, by their probability"
 
@@ -617,13 +617,15 @@ def _mean_of_models(found: LineSearch, names: Sequence[str]) -> tuple[Array, Arr
     """Mean and covariance of (free optics, σ, these parameters, delay) over the models."""
     each, covariances, weights = [], [], []
     for fit, weight in found.weights:
+        if not set(names) <= set(fit.model.names):  # improbable: a part that is told is in all rivals
+            continue
         value, jacobian = _values(fit, names)
         each.append(value)
         covariances.append(jacobian @ fit.covariance @ jacobian.T * found.scale)
         weights.append(weight)
     mean = np.average(each, axis=0, weights=weights)
     total = sum(w * (c + np.outer(v - mean, v - mean)) for v, c, w in zip(each, covariances, weights, strict=True))
-    out = np.asarray(total, float)
+    out = np.asarray(total, float) / sum(weights)
     # a simpler line that χ² does not exclude may have another delay: pulses that are one pixel late look like none, of a bare line
     most = min(f.chi2 for f in found.fits) + FOUND_CHI2 * found.scale
     simpler = [f for f in found.fits if f.chi2 < most and len(f.model.names) < len(found.best.model.names)]
