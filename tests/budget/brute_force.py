@@ -553,7 +553,7 @@ def _shift(d: np.ndarray) -> Shift:
 def table_at(brute: BruteForce) -> Table:
     """The budget's table, its fields taken at the same places."""
     table = Table(brute.setting, brute.law, seed=brute.seed)
-    table.__dict__["calibration"] = replace(table.calibration, places=brute.places_of_fields())
+    table.__dict__["calibration"] = replace(table.calibration, places=brute.places_of_fields(), images=None)
     return table
 
 

@@ -12,7 +12,7 @@ from pixmetry.core import compiling
 from pixmetry.core.jit import jit
 from pixmetry.locate.estimators import estimators
 
-WITHOUT_KERNELS = {"sources", "compare", "warm-up"}
+WITHOUT_KERNELS = {"sources", "compare", "shoot-list", "series", "warm-up"}  # of their own; those of `locate` serve a series
 
 
 @pytest.fixture

@@ -94,7 +94,7 @@ def test_bad_set_ups_have_their_reason(rng: np.random.Generator):
     assert sum("one exposure time" in note for note in single.notes) == 3
     alone = groups(rng, (20.0, 30.0, 40.0))
     lonely = seen_of([Frames("dark", f.exposure_s, f.data[:1], facts=f.facts) for f in alone])
-    assert sum("one frame" in note for note in lonely.notes) == 3
+    assert sum("only 1 dark frame" in note for note in lonely.notes) == 6
     with pytest.raises(InputError, match="temperature_c"):
         campaign_of_arrays([Frames("dark_temperature", 0.1, dark(rng, 20, 0.1))], bits=12)
 

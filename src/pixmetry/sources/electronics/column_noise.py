@@ -93,6 +93,8 @@ def measure(observations: Observations) -> Estimates:
         return np.concatenate([getattr(dark, name), getattr(light, name)[open_]])
 
     white, columns = of_levels("ms_pixel_dn2"), of_levels("ms_col_dn2")
+    if not (white > 0).all():
+        raise MeasureError("frames without noise do not tell the noise of the columns", where=where, remedy=remedy)
     dof = (of_levels("n_frames") - 1) * (cols - 1)
     signal = np.concatenate([np.zeros(dark.mean_dn.size), light.mean_dn[open_] - black])
     if found is not None and found.kind == CHARGE:  # half of what was repelled stays in the column, and so in its mean
@@ -101,7 +103,7 @@ def measure(observations: Observations) -> Estimates:
     lamp = np.where(signal > 0, of_levels("ms_frame_dn2") * _column_spread(observations) ** 2, 0.0)
     excess = columns - white / rows - lamp
     design = np.stack([np.ones(signal.size), (signal / signal.max()) ** 2], axis=1)
-    expected = columns
+    expected = np.maximum(columns, 1e-3 * white / rows)
     for _ in range(4):
         weight = dof / (2 * expected**2)
         covariance = np.linalg.inv(design.T @ (weight[:, None] * design))
