@@ -41,7 +41,8 @@ def test_all_sides_of_turned_squares_are_found_and_their_response_is_the_closed_
         assert u[found.frequency == 0.5] < 0.004
         assert np.all(np.abs(mean.sfr - truth)[low] < LIMIT * u[low] + 0.001)
     for e in found.edges:
-        assert abs(abs(e.angle_deg) - 5.0) < LIMIT * e.u_angle_deg
+        limit = LIMIT * e.u_angle_deg if e.order == 1 else 0.05  # a higher order is taken by chance where the middle looks bent
+        assert abs(abs(e.angle_deg) - 5.0) < limit
         assert abs(e.asymmetry) < LIMIT * e.u_asymmetry
         assert abs(e.low_dn - 200) < 3 and abs(e.high_dn - 1200) < 3 and e.noise_dn == pytest.approx(5.0, rel=0.2)
 
@@ -92,7 +93,7 @@ def test_bent_edges_are_followed(rng: np.random.Generator):
         (lambda rng: one_edge(rng) + 12 * np.arange(100), "changes by"),
         (lambda rng: one_edge(rng) + 3 * np.arange(120)[:, None], "along the edge"),
         (lambda rng: one_edge(rng) - np.roll(one_edge(rng, noise=0), 9, axis=1) + 800, "another edge"),
-        (lambda rng: one_edge(rng, angle_deg=np.degrees(np.arctan(0.2))), "parts of a pixel"),
+        (lambda rng: one_edge(rng, angle_deg=np.degrees(np.arctan(0.2)), at_px=49.95), "parts of a pixel"),
     ],
 )
 def test_edges_that_cannot_be_measured_say_why(make, words: str, rng: np.random.Generator):

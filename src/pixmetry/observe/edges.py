@@ -348,8 +348,9 @@ def _refined(region: Region) -> Region:
         line, residual, order = _polynomial(t[good], places[good], most)
         slope = float(line[1] / (0.5 * (region.rows - 1)))
         scatter = float(residual.std(ddof=order + 1))
-        spread = float(np.sqrt(((t[good] - t[good].mean()) ** 2).sum()))
-        region = replace(region, line=line, slope=slope, u_slope=scatter / spread / (0.5 * (region.rows - 1)), scatter_px=scatter)
+        basis = np.polynomial.polynomial.polyvander(t[good], len(line) - 1)
+        u_slope = scatter * float(np.sqrt(np.linalg.inv(basis.T @ basis)[1, 1])) / (0.5 * (region.rows - 1))
+        region = replace(region, line=line, slope=slope, u_slope=u_slope, scatter_px=scatter)
         if not np.isfinite(line).all() or np.abs(places - region.centre).max(initial=0.0) > 8:
             raise _Refused("its rows do not follow a line")
     if scatter > SMOOTH_PX:

@@ -28,6 +28,7 @@ CONFOUNDERS = (
     "expansion or motion of the target field",
     "a change of the focus",
 )
+TOO_SHORT = "the series of {:.0f} s is too short for the slow part: go on until nothing moves"
 METHOD = "positions of a fixed field of targets over time; exponential curves by generalised least squares"
 ROUNDS = 3  # of weights and curve in turn
 FAST = ("ln fast", "share")
@@ -165,7 +166,7 @@ def drift_of(
         targets=len(motion.targets),
         location_factor=motion.location_factor,
         fit=estimates,
-        stable=_stability(fit, series, found, corners, tolerance_px),
+        stable=_stability(fit, series, found, corners, tolerance_px, settles=_differing("ln slow", fit, others) is None),
         tolerance_px=tolerance_px,
     )
 
@@ -308,11 +309,18 @@ def _with_linear(series: Series, curve: Curve, values: Array, scatter: Array) ->
 
 
 def _alternatives(series: Series, fit: Fit, scatter: Array) -> tuple[Fit, list[Fit]]:
-    """The best fit, and others that are not excluded beside it: from starts where the delay decays as one part of the camera does."""
+    """The best fit, and others that are not excluded beside it: from starts where the camera settles long after the series, and where the
+    delay decays as one part of the camera does.
+    """
+    span, fits = float(np.ptp(series.time_s)), [fit]
+    for slow, ratio in ((3 * span, 1 / 20), (3 * span, 1 / 5), (span, 1 / 8), (span / 3, 1 / 8)):
+        start = fit.values.copy()
+        start[fit.names.index("ln slow")], start[fit.names.index("ln fast")] = np.log(slow), np.log(ratio)
+        fits.append(_fitted(series, fit.curve, scatter, [_with_linear(series, fit.curve, start, scatter)]))
     if not fit.curve.grabber:
-        return fit, []
+        best = min(fits, key=lambda one: one.chi2)
+        return best, [one for one in fits if one is not best and one.chi2 < best.chi2 + ALIKE]
     slow, fast = fit["ln slow"], fit["ln slow"] + fit["ln fast"]
-    fits = [fit]
     near, swapped = fit["ln fast"], fit["ln delay"] - slow
     for delay, ratio in ((slow, near), (fast, near), (fast, swapped), (fit["ln scale"], near), (fast, near - 0.7), (fast, near + 0.5)):
         start = fit.values.copy()
@@ -408,10 +416,10 @@ def _estimates(series: Series, fit: Fit, found: Curve, others: Sequence[Fit], u_
             reasons[name] = f"{'the camera' if of_camera else 'the clock'} does not move the image beyond the noise of the positions"
             value = abs(value) + ONE_SIDED_95 * u
         elif other := _differing(parameter, fit, others):
-            reasons[name] = _alike(fit, other)
+            reasons[name] = TOO_SHORT.format(span) if _differing("ln slow", fit, others) else _alike(fit, other)
             continue
         elif of_camera and fit.u("ln slow") > TOLD_U_LN:
-            reasons[name] = f"the series of {span:.0f} s is too short for the slow part: go on until nothing moves"
+            reasons[name] = TOO_SHORT.format(span)
             continue
         elif u > TOLD_SHARE * wide.get(parameter, np.inf):
             reasons[name] = "the series tells it no better than what is known of all cameras"
@@ -532,7 +540,7 @@ def _from_settled(fit: Fit, series: Series, corners: Array, time_s: Array) -> tu
     return size, np.sqrt(np.maximum(np.einsum("ka,kab,kb->k", along, covariance, along), 0.0))
 
 
-def _stability(fit: Fit, series: Series, found: Curve, corners: Array, tolerance_px: float) -> Number:
+def _stability(fit: Fit, series: Series, found: Curve, corners: Array, tolerance_px: float, *, settles: bool) -> Number:
     """Time from which on the farthest corner stays within the tolerance."""
     first, last = float(series.time_s[0]), float(series.time_s[-1])
     method = f"the farthest corner of the frame stays within {tolerance_px:g} px of where it settles, by the fitted curve"
@@ -542,6 +550,8 @@ def _stability(fit: Fit, series: Series, found: Curve, corners: Array, tolerance
         if reach < tolerance_px:
             return Number(first, 0.0, np.inf, "s", method, "nothing moves from the first frame on", name="stable_s")
         return Number.not_available("s", "the positions are too uncertain to tell a motion of this size", method, "stable_s")
+    if found.camera and not settles:
+        return Number(last, np.nan, np.inf, "s", method, "where it settles is not told yet", LOWER_LIMIT, "stable_s")
     times = np.concatenate([np.linspace(first, last, 2000), last + (last - first) * np.geomspace(1e-3, 30, 500)])
     distance, u_distance = _from_settled(fit, series, corners, times)
     outside = np.flatnonzero(distance > tolerance_px)
