@@ -21,6 +21,8 @@ FALSE_ALARM = 1e-4  # that a part of the curve is taken for real where there is 
 TOLD_U_LN = 0.7  # u of the slow time constant's logarithm, beyond which the settled place is not told
 TOLD_SHARE = 0.8  # of the prior's u: what the series narrows less is not told by it
 ALIKE = 25.0  # difference of χ² below which a second solution is not excluded
+CURVES_ALIKE = 6.0  # the same, of a camera that settles much later
+APART = 0.7  # of the logarithms of slow time constants, from which on they are two
 NOT_APART = 0.99  # correlation from which on two parameters are told only as a sum
 SIGNIFICANT = 3.0
 CONFOUNDERS = (
@@ -319,7 +321,8 @@ def _alternatives(series: Series, fit: Fit, scatter: Array) -> tuple[Fit, list[F
         fits.append(_fitted(series, fit.curve, scatter, [_with_linear(series, fit.curve, start, scatter)]))
     if not fit.curve.grabber:
         best = min(fits, key=lambda one: one.chi2)
-        return best, [one for one in fits if one is not best and one.chi2 < best.chi2 + ALIKE]
+        near = [one for one in fits if one.chi2 < best.chi2 + CURVES_ALIKE]
+        return best, [one for one in near if abs(one["ln slow"] - best["ln slow"]) > APART]
     slow, fast = fit["ln slow"], fit["ln slow"] + fit["ln fast"]
     near, swapped = fit["ln fast"], fit["ln delay"] - slow
     for delay, ratio in ((slow, near), (fast, near), (fast, swapped), (fit["ln scale"], near), (fast, near - 0.7), (fast, near + 0.5)):
