@@ -46,9 +46,6 @@ def test_the_shift_of_frames_is_found(rng: np.random.Generator) -> None:
     found = measure_series([(str(k), TIME_S[k], lambda k=k: frames[k]) for k in range(len(frames))]).drift
     assert found.targets == len(PLACES)
     for name, truth in zip(("shift_x_px", "shift_y_px"), SHIFT, strict=True):
-        if name not in found.fit:  # two curves fit alike: the place where it settles is not told
-            assert "too short" in found.fit.reasons[name]
-            continue
         assert abs(found.fit[name].value - truth) < 5.5 * found.fit[name].u < 0.2, name
 
 

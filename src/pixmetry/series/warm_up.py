@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
+from scipy import stats
 from scipy.optimize import least_squares
-from scipy.stats import chi2 as chi2_law
 
 from pixmetry.camera.drift_series import CAMERA_MODES, DIGITAL, DriftSeries
 from pixmetry.core.arrays import Array
@@ -18,10 +18,9 @@ from pixmetry.series.modes import FieldMotion, design_of
 
 MOST_BINS = 400  # means of neighbouring frames beyond that many: shorter than any time constant that the series tells
 FALSE_ALARM = 1e-4  # that a part of the curve is taken for real where there is none
-TOLD_U_LN = 0.7  # u of the slow time constant's logarithm, beyond which the settled place is not told
+TOLD_U_REL = 0.5  # u of the largest motion until it settles, beyond which the settled place is not told
 TOLD_SHARE = 0.8  # of the prior's u: what the series narrows less is not told by it
 ALIKE = 25.0  # difference of χ² below which a second solution is not excluded
-CURVES_ALIKE = 6.0  # the same, of a camera that settles much later
 APART = 0.7  # of the logarithms of slow time constants, from which on they are two
 NOT_APART = 0.99  # correlation from which on two parameters are told only as a sum
 SIGNIFICANT = 3.0
@@ -32,6 +31,8 @@ CONFOUNDERS = (
 )
 TOO_SHORT = "the series of {:.0f} s is too short for the slow part: go on until nothing moves"
 METHOD = "positions of a fixed field of targets over time; exponential curves by generalised least squares"
+DRAWS = 2000  # of time constants: u to some per cent where curves of very different ones fit alike
+WIDER = 1.5  # than a minimum's own u: the draws about it
 ROUNDS = 3  # of weights and curve in turn
 FAST = ("ln fast", "share")
 LOCK_US, U_LOCK_US = 10.5, 1.0  # from the sync edge to the first pixel: CCIR 10.5, EIA 9.4 to 10.9 by the width of the blanking
@@ -126,7 +127,9 @@ def drift_of(
     place x from the lock of a line moves by x δ; the delay of its lines has an amplitude and a time constant of its own. All parts are
     always fitted together, with wide priors on what a series may leave open (`_priors`), so that u holds what it cannot tell apart. A
     camera or a grabber without which χ² grows by no more than chance does once in 10⁴ (likelihood ratio) has limits in place of values.
-    Where two solutions fit alike (a delay that decays as a part of the camera does), what differs between them is not told.
+    The covariance of a camera without a grabber holds all curves that fit, by their probability (`_marginal`): a series that ends before
+    the image settles has a settled place with a large u. With a grabber, where two solutions fit alike (a delay that decays as a part of
+    the camera does), what differs between them is not told.
 
     The weights hold, beside the positions' covariance, what shift and rotation scatter from frame to frame; that scatter is estimated from
     the residuals, and is the result for a stabilised sensor. Where residuals are correlated from frame to frame, all u grow by
@@ -320,9 +323,7 @@ def _alternatives(series: Series, fit: Fit, scatter: Array) -> tuple[Fit, list[F
         start[fit.names.index("ln slow")], start[fit.names.index("ln fast")] = np.log(slow), np.log(ratio)
         fits.append(_fitted(series, fit.curve, scatter, [_with_linear(series, fit.curve, start, scatter)]))
     if not fit.curve.grabber:
-        best = min(fits, key=lambda one: one.chi2)
-        near = [one for one in fits if one.chi2 < best.chi2 + CURVES_ALIKE]
-        return best, [one for one in near if abs(one["ln slow"] - best["ln slow"]) > APART]
+        return _marginal(series, fits, scatter), []
     slow, fast = fit["ln slow"], fit["ln slow"] + fit["ln fast"]
     near, swapped = fit["ln fast"], fit["ln delay"] - slow
     for delay, ratio in ((slow, near), (fast, near), (fast, swapped), (fit["ln scale"], near), (fast, near - 0.7), (fast, near + 0.5)):
@@ -331,6 +332,44 @@ def _alternatives(series: Series, fit: Fit, scatter: Array) -> tuple[Fit, list[F
         fits.append(_fitted(series, fit.curve, scatter, [_with_linear(series, fit.curve, start, scatter)]))
     best = min(fits, key=lambda one: one.chi2)
     return best, [one for one in fits if one is not best and one.chi2 < best.chi2 + ALIKE]
+
+
+def _marginal(series: Series, fits: Sequence[Fit], scatter: Array) -> Fit:
+    """The best fit, with the covariance about it of all curves of a camera by their probability.
+
+    The curve is linear in all but its time constants and their share. Those are drawn about each minimum of χ² and from the prior; what is
+    linear is integrated in closed form; draws weigh by likelihood × prior over the density that they were drawn from (importance sampling).
+    """
+    best = min(fits, key=lambda one: one.chi2)
+    names, white = best.names, _whitening(series, scatter)
+    at, centre, u_prior = _priors(names, series)
+    linear = [k for k in range(len(names)) if k not in at]
+    normal = stats.norm.ppf(stats.qmc.Halton(len(at), scramble=False).random(DRAWS + 1)[1:])
+    prior = np.diag(u_prior**2)
+    proposals = [(centre, prior), *((one.values[at], WIDER**2 * one.covariance[np.ix_(at, at)]) for one in fits)]
+    parts = np.array_split(normal, len(proposals))
+    draws = np.concatenate([c + z @ np.linalg.cholesky(v).T for z, (c, v) in zip(parts, proposals, strict=True)])
+    density = np.mean([stats.multivariate_normal.pdf(draws, c, v, allow_singular=True) for c, v in proposals], axis=0)
+    values = np.tile(best.values, (len(draws), 1))
+    values[:, at] = draws
+    log_weight, inside = np.zeros(len(draws)), np.zeros((len(draws), len(linear), len(linear)))
+    for k, one in enumerate(values):
+        one[linear] = 0
+        found, slope = _curve(best.curve, names, one, series.time_s, series)
+        by = np.einsum("kab,kbp->kap", white, slope[:, :, linear]).reshape(-1, len(linear))
+        left = np.einsum("kab,kb->ka", white, series.values - found).ravel()
+        size = np.linalg.norm(by, axis=0)
+        inverse = np.linalg.pinv((by / size).T @ (by / size), hermitian=True)
+        one[linear] = inverse @ ((by / size).T @ left) / size
+        inside[k] = inverse / size / size[:, None]
+        log_weight[k] = -0.5 * float(((left - by @ one[linear]) ** 2).sum()) + 0.5 * np.linalg.slogdet(inverse)[1] - np.log(size).sum()
+    log_weight += stats.multivariate_normal.logpdf(draws, centre, prior) - np.log(density)
+    weight = np.exp(log_weight - log_weight.max())
+    weight /= weight.sum()
+    away = values - best.values
+    covariance = np.einsum("n,np,nq->pq", weight, away, away)
+    covariance[np.ix_(linear, linear)] += np.einsum("n,npq->pq", weight, inside)
+    return replace(best, covariance=covariance)
 
 
 def _parts(series: Series, fit: Fit, scatter: Array) -> Curve:
@@ -344,7 +383,7 @@ def _parts(series: Series, fit: Fit, scatter: Array) -> Curve:
         names = less.names(series.modes)
         near = np.array([fit[name] for name in names])
         without = _fitted(series, less, scatter, [near, *_starts(series, less, scatter)])
-        found[part] = without.chi2 - fit.chi2 > chi2_law.isf(FALSE_ALARM, len(fit.names) - len(names))
+        found[part] = without.chi2 - fit.chi2 > stats.chi2.isf(FALSE_ALARM, len(fit.names) - len(names))
     return Curve(**found)
 
 
@@ -399,6 +438,7 @@ def _estimates(series: Series, fit: Fit, found: Curve, others: Sequence[Fit], u_
     at, _, u_prior = _priors(fit.names, series)
     wide = {fit.names[k]: u for k, u in zip(at, u_prior, strict=True)}
     span = float(np.ptp(series.time_s))
+    too_short = min(fit.u(mode) / max(abs(fit[mode]), 1e-300) for mode in CAMERA_MODES) > TOLD_U_REL
     reasons: dict[str, str] = {}
     limits: set[str] = set()
     rows: list[tuple[str, str, float]] = []  # name, unit, value
@@ -421,7 +461,7 @@ def _estimates(series: Series, fit: Fit, found: Curve, others: Sequence[Fit], u_
         elif other := _differing(parameter, fit, others):
             reasons[name] = TOO_SHORT.format(span) if _differing("ln slow", fit, others) else _alike(fit, other)
             continue
-        elif of_camera and fit.u("ln slow") > TOLD_U_LN:
+        elif of_camera and too_short:
             reasons[name] = TOO_SHORT.format(span)
             continue
         elif u > TOLD_SHARE * wide.get(parameter, np.inf):
@@ -565,15 +605,16 @@ def _stability(fit: Fit, series: Series, found: Curve, corners: Array, tolerance
             return Number(first, 0.0, np.inf, "s", method, why, name="stable_s")
         return Number.not_available("s", "the distance to where it settles is not told well enough", method, "stable_s")
     k = int(outside[-1])
-    if k + 1 >= len(times) or times[k] > last:
-        if 0 < k + 1 < len(times) and u_distance[k] < tolerance_px / 2:
-            speed = (distance[k] - distance[k + 1]) / (times[k + 1] - times[k])
-            reason = f"extrapolated: the series ends at {last:.0f} s"
-            return Number(float(times[k]), float(u_distance[k] / speed), float(fit.dof), "s", method, reason, name="stable_s")
+    if k + 1 == len(times):
         return Number(last, np.nan, np.inf, "s", method, "not yet stable when the series ends", LOWER_LIMIT, "stable_s")
-    if u_distance[k] > tolerance_px / 2:
-        return Number.not_available("s", "the distance to where it settles is not told well enough", method, "stable_s")
     share = (distance[k] - tolerance_px) / (distance[k] - distance[k + 1])
-    speed = (distance[k] - distance[k + 1]) / (times[k + 1] - times[k])
     at = float(times[k] + share * (times[k + 1] - times[k]))
-    return Number(at, float(u_distance[k] / speed), float(fit.dof), "s", method, name="stable_s")
+    later = int(np.flatnonzero(distance + u_distance > tolerance_px)[-1])  # by one u: the motion slows down, so the time is skewed to later
+    speed = (distance[k] - distance[k + 1]) / (times[k + 1] - times[k])
+    u = max(float(u_distance[k] / speed), float(times[later]) - at)
+    if u_distance[k] > tolerance_px / 2 or later + 1 == len(times):
+        if at > last:
+            return Number(last, np.nan, np.inf, "s", method, "not yet stable when the series ends", LOWER_LIMIT, "stable_s")
+        return Number.not_available("s", "the distance to where it settles is not told well enough", method, "stable_s")
+    reason = f"extrapolated: the series ends at {last:.0f} s" if at > last else ""
+    return Number(at, u, float(fit.dof), "s", method, reason, name="stable_s")
