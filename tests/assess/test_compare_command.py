@@ -424,7 +424,7 @@ def test_bad_input_gives_one_line(tmp_path: Path) -> None:
         ((good, old), "a data sheet and"),
         ((good, good, old), "several kinds"),
         ((good, broken), "damaged results"),
-        ((good, scene), "neither a data sheet nor an assessment"),
+        ((good, scene), "no data sheet, assessment, calibration or series"),
         ((good, limits), "neither JSON nor XML"),
         ((good, pair), "a JSON list"),
         ((good, good, "--level", "95"), "level"),

@@ -34,11 +34,11 @@ class Subject:
     """What one file says, whatever its kind: values by (channel, key)."""
 
     name: str
-    kind: str  # "data sheet" or "assessment"
+    kind: str  # "data sheet", "assessment" …
     release: str
     camera: Mapping[str, Any]
     values: Mapping[tuple[str, str], Number]
-    absent: Mapping[str, str]  # by source of an assessment: why it was not measured
+    absent: Mapping[str, str]  # by value, or by source of an assessment: why it was not measured
     photons_u_rel: float = 0.0
     worth: tuple[Any, Mapping[str, float]] | None = None  # of an assessment: target and estimator; u of a place, px, by end of the key
     how: Mapping[str, str] = field(default_factory=dict)  # of an assessment: what is no number, such as the estimator
@@ -80,7 +80,7 @@ def difference_of(place: tuple[str, str], one: Subject, two: Subject, same_light
         if not is_there(a) and not is_there(b):
             return replace(row, verdict="same", reason="no value in both")
         lacks, value = (two, b) if is_there(a) else (one, a)
-        reason = value.reason if value else lacks.absent.get(key.rpartition(".")[0], "")
+        reason = value.reason if value else lacks.absent.get(key, lacks.absent.get(key.rpartition(".")[0], ""))
         return replace(row, verdict="only A" if is_there(a) else "only B", reason=reason)
     if plain_unit(a.unit) != plain_unit(b.unit):
         return replace(row, reason=f"units differ: {plain_unit(a.unit)}, {plain_unit(b.unit)}")

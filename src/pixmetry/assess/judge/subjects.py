@@ -1,4 +1,4 @@
-"""Values to be compared or checked: those of a data sheet, an assessment or a calibration, read from their files."""
+"""Values to be compared or checked: those of a data sheet, an assessment, a calibration or a series, read from their files."""
 
 from __future__ import annotations
 
@@ -17,13 +17,14 @@ from pixmetry.emva.files.json_format import SCHEMA, WHAT_TO_NAME, is_xml, read_b
 from pixmetry.emva.files.sheets import read_sheet
 from pixmetry.emva.records import MONO, DataSheet
 from pixmetry.files.strict_json import number_in, parse_json
+from pixmetry.series.records import SERIES_SCHEMA
 
-RESULT_FILES = ("results.json", "calibration.json")
+RESULT_FILES = ("results.json", "calibration.json", "series.json")
 CALIBRATED = ".calibrated"  # end of the key of what a calibration leaves
 
 
 def load_subject(source: DataSheet | str | Path, name: str = "") -> Subject:
-    """Read the values to be compared: from a data sheet, its file, or the results of an assessment or calibration, or their folder.
+    """Read the values to be compared: from a data sheet, its file, or the results of an assessment, calibration or series, or their folder.
 
     Raises
     ------
@@ -36,7 +37,7 @@ def load_subject(source: DataSheet | str | Path, name: str = "") -> Subject:
     if path.is_dir():
         path = next((path / file for file in RESULT_FILES if (path / file).is_file()), path)
         if path.is_dir():
-            remedy = "name a data sheet, or the folder of an assessment or of a calibration"
+            remedy = "name a data sheet, or the folder of an assessment, of a calibration or of a series"
             raise InputError(f"folder without {' or '.join(RESULT_FILES)}", where=str(path), remedy=remedy)
     name, raw = name or str(source), read_bytes(path)
     if is_xml(raw):
@@ -48,7 +49,7 @@ def load_subject(source: DataSheet | str | Path, name: str = "") -> Subject:
         return READERS[schema](record, name, str(path))
     if schema != SCHEMA:
         allowed = ", ".join((SCHEMA, *READERS))
-        what = "neither a data sheet nor an assessment nor a calibration"
+        what = "no data sheet, assessment, calibration or series"
         raise InputError(what, where=str(path), value=schema, allowed=allowed, remedy="check the file")
     return _of_sheet(sheet_of_record(record, str(path)), name)
 
@@ -180,6 +181,17 @@ def _of_lines(record: Mapping[str, Any], name: str, where: str) -> Subject:
         raise InputError("a damaged calibration", where=where, remedy="calibrate again") from None
 
 
+def _of_series(record: Mapping[str, Any], name: str, where: str) -> Subject:
+    """How far the image moves while a camera warms up, its time constants, and when it is stable."""
+    try:
+        values = {(MONO, e["name"]): Number.from_record(e) for e in record["estimates"]}
+        values[MONO, "stable_s"] = Number.from_record(record["stable"])
+        facts = {key: record[key] for key in ("cols", "rows", "tolerance_px")}
+        return Subject(name, "series", "", facts, values, dict(record["not_told"]))
+    except (KeyError, IndexError, TypeError, AttributeError, ValueError):
+        raise InputError("a damaged series", where=where, remedy="measure the series again") from None
+
+
 def _float(value: float | None) -> float:
     return math.nan if value is None else float(value)
 
@@ -195,4 +207,5 @@ READERS: dict[str, Callable[[Mapping[str, Any], str, str], Subject]] = {
     RESULTS_SCHEMA: _of_assessment,
     RESULT_SCHEMA: _of_calibration,
     LINES_SCHEMA: _of_lines,
+    SERIES_SCHEMA: _of_series,
 }
