@@ -14,7 +14,7 @@ from pixmetry.cli._json import JsonResult, json_option
 if TYPE_CHECKING:
     from pixmetry.series.records import Series
 
-KINDS = ("disc", "ellipse", "ring", "spot", "cross", "chessboard")
+KINDS = ("disc", "ellipse", "ring", "spot", "cross", "chessboard", "texture")
 WAIT_S = 2.0  # between looks into a folder that fills
 
 
@@ -49,7 +49,9 @@ WAIT_S = 2.0  # between looks into a folder that fills
     metavar="PX",
     help="Displacement within which the image counts as stable.",
 )
-@click.option("--kind", type=click.Choice(KINDS), default="disc", show_default=True, help="Kind of target.")
+@click.option(
+    "--kind", type=click.Choice(KINDS), help="Kind of target; texture: places of the first frame. Default: disc, else texture."
+)
 @click.option(
     "--polarity", type=click.Choice(["auto", "bright", "dark"]), default="auto", show_default=True, help="Of the targets on their ground."
 )
@@ -60,10 +62,10 @@ WAIT_S = 2.0  # between looks into a folder that fills
 @json_option("the result")
 @click.option("--threads", type=click.IntRange(1), help="Number of threads. Default: one for each processor.")
 def series(images: tuple[Path, ...], output: Path, follow: bool, json_file: Path | None, threads: int | None, **options: Any) -> None:
-    """Follow the image of a fixed field of targets over time, as while a camera warms up.
+    """Follow the image of a fixed field over time, as while a camera warms up.
 
-    IMAGES are files or folders of them, in the order of their names. Nine targets or more should be spread over the frame; neither they
-    nor the camera's support may move. Times come from --interval, from --times, or else from when the files were written.
+    IMAGES are files or folders of them, in the order of their names. Nine targets or more, or a texture, should be spread over the frame;
+    neither they nor the camera's support may move. Times come from --interval, from --times, or else from when the files were written.
 
     The targets of every frame are kept in FOLDER.frames.jsonl: a run that was interrupted goes on where it stopped. The folder gets
     report.html and series.json: motion of the image, time constants, and when it is stable.

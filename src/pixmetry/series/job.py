@@ -23,13 +23,15 @@ from pixmetry.files.results import write_record
 from pixmetry.locate.files import frames_inside
 from pixmetry.locate.noise import noise_model
 from pixmetry.series.log import SeriesLog
-from pixmetry.series.modes import field_motion
+from pixmetry.series.modes import LEAST_TARGETS, field_motion
 from pixmetry.series.motion import Run, find_in_fields, motion_of
 from pixmetry.series.records import Series
-from pixmetry.series.track import FrameTargets, find_targets, follow_targets
+from pixmetry.series.texture import texture_of
+from pixmetry.series.track import FrameTargets, find_targets, follow_targets, near_pairs
 from pixmetry.series.warm_up import drift_of
 
 KIND = "series"
+TEXTURE = "texture"
 Fetch = Callable[[], np.ndarray]
 
 
@@ -47,7 +49,7 @@ def series(
     progress: Progress | None = None,
     **options: Any,
 ) -> Series:
-    """Measure how the image moves over a series of frames of a fixed field, as while a camera warms up.
+    """Measure how the image moves over a series of frames of a fixed field of targets, or of any texture, as while a camera warms up.
 
     Parameters
     ----------
@@ -69,7 +71,9 @@ def series(
     tolerance_px : float
         Displacement of the farthest corner within which the camera is called stable.
     raw, **options
-        As of `pixmetry.locate`: ``kind``, ``polarity``, ``noise``, ``bits``, ``estimator``.
+        As of `pixmetry.locate`: ``kind``, ``polarity``, ``noise``, ``bits``, ``estimator``. ``kind`` may be "texture": places of the first
+        frame with gradients along both axes are found again in the others. Without a kind the targets are discs; where the frames show
+        none, the texture is followed.
     progress : callable (what, done, of), optional
 
     Returns
@@ -79,7 +83,7 @@ def series(
     Raises
     ------
     InputError, MeasureError
-        If a file or an option cannot be used, or the frames do not show three targets.
+        If a file or an option cannot be used, or the frames show neither three targets nor three places with a texture.
 
     Examples
     --------
@@ -103,18 +107,18 @@ def series(
     files = picture_files([frames_inside(path) for path in given], PICTURE_ENDINGS, layout)
     model = noise_model(options.pop("noise", None))
     seconds, notes = times_of(files, interval_s, times)
-    log = None
+    named = [
+        (name, on_for_s + time, lambda path=path: load_picture(path, None, layout).array)
+        for path, name, time in sorted(zip(files, names_of(files), seconds, strict=True), key=lambda one: one[2])
+    ]
+    log = SeriesLog()
     if output is not None:
         check_output(output, KIND, tuple(map(str, given)), files)
         told = {name: str(value) for name, value in {**options, "noise": model, "raw": layout}.items() if value is not None}
         log = SeriesLog(Path(f"{str(output).rstrip('/')}.frames.jsonl"), told)
         for path, name in zip(files, names_of(files), strict=True):
             if _holder(path).stat().st_mtime > log.written_s:  # another frame of the same name
-                log.done.pop(name, None)
-    named = [
-        (name, on_for_s + time, lambda path=path: load_picture(path, None, layout).array)
-        for path, name, time in sorted(zip(files, names_of(files), seconds, strict=True), key=lambda one: one[2])
-    ]
+                log.forget(name, named[0][0])
     try:
         found = measure_series(
             named,
@@ -128,8 +132,7 @@ def series(
             **options,
         )
     finally:
-        if log is not None:
-            log.close()
+        log.close()
     if output is not None:
         write_results(found, output, tuple(map(str, given)), files)
     return found
@@ -193,6 +196,7 @@ def _from_table(files: Sequence[Path], table: Path) -> list[float]:
 def measure_series(
     frames: Iterable[tuple[str, float, Fetch]],
     *,
+    kind: str | None = None,
     analogue: bool = False,
     pixel_clock_mhz: float | None = None,
     tolerance_px: float = 0.05,
@@ -211,28 +215,36 @@ def measure_series(
         As of `series`.
     """
     told, named = progress or no_progress, list(frames)
-    shape = None if log is None else log.shape
-    seen = {} if log is None else {k: log.done[name] for k, (name, _, _) in enumerate(named) if name in log.done}
+    if not named:
+        raise MeasureError("no frames", where="series", remedy="name frames of a fixed field of targets, or of a texture")
+    log = SeriesLog() if log is None else log
+    shape = log.shape
+    seen = {k: log.done[name] for k, (name, _, _) in enumerate(named) if name in log.done}
+    textured = kind == TEXTURE or log.textured
+    if not textured and kind is None and not seen:
+        textured = not _shows_targets(named, options)
+    texture = texture_of(named[0][2](), named[0][0]) if textured and len(seen) < len(named) else None
 
     def work(k: int) -> tuple[int, FrameTargets, tuple[int, int]]:
         name, time_s, fetch = named[k]
         array = fetch()
         if shape is not None and array.shape != shape:
             raise InputError("a frame of another size", where=name, value=array.shape, allowed=str(shape), remedy="leave it out")
-        return k, find_targets(array, name, time_s, **options), (array.shape[0], array.shape[1])
+        if texture is not None:
+            found = texture.find(array, name, time_s)
+        else:
+            found = find_targets(array, name, time_s, kind=kind or "disc", **options)
+        return k, found, (array.shape[0], array.shape[1])
 
     waiting = [k for k in range(len(named)) if k not in seen]
     for k, found, size in imap_tiles(work, waiting):
         if shape is None:
             shape = size
-            if log is not None:
-                log.put_shape(size)
-        if log is not None:
-            log.put(found)
+            log.put_shape(size, textured=textured)
+        log.put(found)
         seen[k] = found
         told("locating", len(seen), len(named))
-    if shape is None or not named:
-        raise MeasureError("no frames", where="series", remedy="name frames of a fixed field of targets")
+    assert shape is not None  # every frame has one
     ordered = [seen[k] for k in range(len(named))]
     seconds: Array = np.array([time for _, time, _ in named], float)
     with single_threaded_blas():
@@ -240,9 +252,18 @@ def measure_series(
         motion = field_motion(positions, covariance, (0.5 * (shape[1] - 1), 0.5 * (shape[0] - 1)), analogue=analogue)
         drift = drift_of(motion, seconds, shape, clock_mhz=pixel_clock_mhz, tolerance_px=tolerance_px)
     lost = int((~motion.used).sum())
-    more = (f"{lost} of {len(named)} frames show too few of the targets and are left out.",) if lost else ()
+    what = "places" if textured else "targets"
+    more = [f"{lost} of {len(named)} frames show too few of the {what} and are left out."] if lost else []
+    if textured and kind is None:
+        more.append("No discs are found: places of the texture are followed in their stead.")
     names = tuple(name for name, _, _ in named)
     return Series(drift, names, shape, (*notes, *more), provenance_record(libraries=("numpy", "scipy", "numba")))
+
+
+def _shows_targets(named: Sequence[tuple[str, float, Fetch]], options: dict[str, Any]) -> bool:
+    """Whether the first and the last frame show the same discs, three or more."""
+    ends = [find_targets(fetch(), name, time_s, kind="disc", **options).positions_px for name, time_s, fetch in (named[0], named[-1])]
+    return min(map(len, ends)) >= LEAST_TARGETS and near_pairs(*ends)[0].size >= LEAST_TARGETS
 
 
 def measure_motion(

@@ -6,7 +6,7 @@ import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from pixmetry.core.errors import InputError
 from pixmetry.files.strict_json import plain
@@ -20,8 +20,8 @@ class SeriesLog:
 
     Parameters
     ----------
-    path : Path
-        Made if it does not exist; else the frames in it are taken over.
+    path : Path, optional
+        Made if it does not exist; else the frames in it are taken over. Without one nothing is written.
     options : mapping
         What the positions depend on. A log that was begun with others is refused.
 
@@ -31,12 +31,16 @@ class SeriesLog:
         If it cannot be written, is no log, or was begun with other options.
     """
 
-    def __init__(self, path: Path, options: Mapping[str, Any]) -> None:
-        self.path = path
+    def __init__(self, path: Path | None = None, options: Mapping[str, Any] | None = None) -> None:
         self.done: dict[str, FrameTargets] = {}
         self.shape: tuple[int, int] | None = None
+        self.textured = False  # places of a texture, found by the first frame
+        self._file: BinaryIO | None = None
+        if path is None:
+            return
+        self.path = path
         self.written_s = path.stat().st_mtime if path.exists() else 0.0  # when the last run wrote it
-        head = {"schema": LOG_SCHEMA, "options": plain(dict(options))}
+        head = {"schema": LOG_SCHEMA, "options": plain(dict(options or {}))}
         whole = self._read(head) if path.exists() and path.stat().st_size else 0
         try:
             self._file = path.open("r+b" if whole else "wb")
@@ -62,7 +66,7 @@ class SeriesLog:
                 if number == 0:
                     known = record["schema"] == LOG_SCHEMA
                 elif "rows" in record:
-                    self.shape = (int(record["rows"]), int(record["cols"]))
+                    self.shape, self.textured = (int(record["rows"]), int(record["cols"])), bool(record.get("textured", False))
                     continue
                 else:
                     found = FrameTargets.from_record(record)
@@ -76,22 +80,30 @@ class SeriesLog:
                 raise InputError("the log was begun with other options", where=str(self.path), value=record["options"], remedy=remedy)
         return sum(len(line) for line in lines)
 
-    def put_shape(self, shape: tuple[int, int]) -> None:
-        """Note the size of the frames."""
+    def put_shape(self, shape: tuple[int, int], *, textured: bool) -> None:
+        """Note the size of the frames, and whether places of a texture are followed."""
         if self.shape is None:
-            self.shape = shape
-            self._write({"rows": shape[0], "cols": shape[1]})
+            self.shape, self.textured = shape, textured
+            self._write({"rows": shape[0], "cols": shape[1], "textured": textured})
 
     def put(self, found: FrameTargets) -> None:
         """Add a frame; it is on the disk when this returns."""
         self.done[found.name] = found
         self._write(found.to_record())
 
+    def forget(self, name: str, first: str) -> None:
+        """Forget a frame that was taken anew; all of them where the places of a texture are those of the first one."""
+        if self.textured and name == first:
+            self.done.clear()
+        self.done.pop(name, None)
+
     def _write(self, record: Mapping[str, Any]) -> None:
-        self._file.write(json.dumps(record).encode() + b"\n")
-        self._file.flush()
-        os.fsync(self._file.fileno())
+        if self._file is not None:
+            self._file.write(json.dumps(record).encode() + b"\n")
+            self._file.flush()
+            os.fsync(self._file.fileno())
 
     def close(self) -> None:
         """Close the file."""
-        self._file.close()
+        if self._file is not None:
+            self._file.close()
