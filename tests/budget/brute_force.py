@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from pixmetry.budget.fields import Places
-from pixmetry.budget.monte_carlo import missed, put
+from pixmetry.budget.monte_carlo import missed
 from pixmetry.budget.motion import FRAMES, GHOSTS, LAGS, OF_MOTION, PULSES
-from pixmetry.budget.probe import passed_light, resolve
+from pixmetry.budget.probe import passed_light, put, resolve
 from pixmetry.budget.setting import Setting
 from pixmetry.budget.table import MAP, Parts, SourceRow, Table
 from pixmetry.camera.camera import Camera, Element, load_camera
@@ -489,6 +489,8 @@ class BruteForce:
         keep = self.places
         found = []
         for a, b in zip(*(self.errors(c, element.name, element, on, keep) for c, on in ((whole, True), (without, False))), strict=True):
+            good = np.isfinite(a) & np.isfinite(b)
+            a, b = a[good], b[good]
             bias = a - b
             squares = (a - a.mean()) ** 2 - (b - b.mean()) ** 2
             n = np.sqrt(a.size)
@@ -581,7 +583,8 @@ def verdict_of(table: Table, brute: BruteForce, element: Element, sigmas: float)
         state = table.setting.calibrated if source.gum_class == "G" else table.setting.camera
         less = table._difference(table._with_and_without(state, element, in_camera))[:, 0].reshape(brute.at.shape)
     if row.before is None:  # it says why
-        return Verdict(row, NOTHING, NOTHING, NOT_SEEN, () if row.reason else ("reason",))
+        told = row.reason and not row.reason.startswith(("not computed", "Monte Carlo"))
+        return Verdict(row, NOTHING, NOTHING, NOT_SEEN, () if told else ("reason",))
     seen = brute.of(element, less)
     wrong = []
     for name, u, b, axis in zip("xy", said_u, bias, (seen.x, seen.y), strict=True):

@@ -36,11 +36,28 @@ ANALOGUE = "pulnix_tm6cn_epix_512"
 SMALL = (240, 320)  # frames of cameras of which a window needs whole rows and columns
 SMALLEST = (96, 128)  # for sources that have to see all of a frame, frame after frame
 LOST = ("sensor.log_response",)  # at its bound no target is found
-BY_OTHERS_IN_CHAIN = (  # rows that hang on another source: on the black level, on the mosaic
+FIELD = ("sony_xc8500_field", 28.4, SMALL)  # single fields, of which each row is two of the sensor's
+MOSAIC = ("dcs420_like", None, SMALL)
+BRIGHT = {"target": {"peak_rel": 0.95}}  # green pixels are full, on an average below it
+BY_OTHERS_IN_CHAIN = (  # rows that hang on another source: on the black level, on the mosaic, on the rows of a field
     ("grabber.adc", "usual", (ANALOGUE, 28.4, SMALL)),
     ("grabber.clamp", "bound", (ANALOGUE, 28.4, SMALL)),
-    ("sensor.smear", "bound", ("dcs420_like", None, SMALL)),
-    ("sensor.smear", "bound", ("sony_xc8500_field", 28.4, SMALL)),
+    ("sensor.smear", "bound", MOSAIC),
+    ("sensor.image_lag", "bound", ("dcs420_like", None, SMALLEST)),
+    *(
+        (name, size, FIELD)
+        for name, size in (
+            ("grabber.adc", "usual"),
+            ("sensor.smear", "bound"),
+            ("sensor.prnu", "bound"),
+            ("sensor.pixel_aperture", "bound"),
+            ("sensor.bayer_mosaic", "usual"),
+            ("electronics.amplifier_noise", "bound"),
+            ("electronics.row_noise", "bound"),
+            ("grabber.clamp", "bound"),
+            ("grabber.line_jitter", "usual"),
+        )
+    ),
 )
 SCENARIO = {
     "motion": {"speed_px_per_s": 60, "acceleration_px_per_s2": 100, "direction_deg": 30},
@@ -95,8 +112,19 @@ def test_a_row_holds_what_the_rest_of_the_chain_makes_of_it(
     cell: Callable[[Cell], tuple[Table, BruteForce]], source_id: str, size: str, at: Cell
 ) -> None:
     """A line that rings at 28 MHz dips below code 0 unless the clamp lifts it; a mosaic makes
-    a smear's shift half as large again, pairs of rows that are summed three times as large.
+    a smear's shift half as large again, pairs of rows that are summed three times as large. Noise of summed rows moves
+    a target twice as far in y, and a mosaic of which pairs of rows are summed fifteen times as far.
     """
     table, brute = cell(at)
     verdict = verdict_of(table, brute, element_of(table, source_id, size), SIGMAS)
     assert not verdict.wrong, f"{at}, {size}: {verdict.wrong}: {verdict.text}"
+
+
+@pytest.mark.parametrize("size", ["usual", "bound"])
+def test_pixels_of_one_colour_are_full_first(request: pytest.FixtureRequest, size: str) -> None:
+    """Charge of full green pixels spills along the column, 0.007 px at the bound, while a grey target stays below the full well."""
+    brute = BruteForce(Setting(camera_at(*MOSAIC), read_scenario(BRIGHT)), TargetEstimator(), 16, 4, int(rng_of(request).integers(2**31)))
+    table = table_at(brute)
+    verdict = verdict_of(table, brute, element_of(table, "sensor.blooming", size), SIGMAS)
+    assert not verdict.wrong, f"{verdict.wrong}: {verdict.text}"
+    assert size == "usual" or verdict.said_bias[1] > 0.003

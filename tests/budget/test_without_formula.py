@@ -15,7 +15,8 @@ from budget.cameras import camera, element
 from budget.test_in_the_chain import CASES, LAW, TARGET, chain, known
 from catalogue.support import soft_centroid
 from pixmetry.budget import compute_budget
-from pixmetry.budget.monte_carlo import Trials, put
+from pixmetry.budget.monte_carlo import Trials
+from pixmetry.budget.probe import put
 from pixmetry.camera.camera import Camera, Element, load_camera
 from pixmetry.camera.catalogue import get_source, sources
 from pixmetry.camera.signal import Kind

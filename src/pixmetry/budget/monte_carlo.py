@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from math import comb
 from typing import Any
@@ -17,27 +17,31 @@ from pixmetry.budget.probe import (
     ideal_element,
     passed_light,
     perfect,
+    put,
     resolve,
     scene_of,
     spread_windows,
     window_side,
 )
 from pixmetry.camera.camera import Camera, Element
-from pixmetry.camera.catalogue import STAGES
 from pixmetry.camera.contribution import SMOOTH_ORDER, Contribution, smooth_part
 from pixmetry.camera.conversions import LineSources, Link
 from pixmetry.camera.frozen import Frozen
+from pixmetry.camera.light import Scene
 from pixmetry.camera.signal import Kind
+from pixmetry.camera.source import Source
 from pixmetry.core.errors import ChainError, InputError
 from pixmetry.core.random import Grid, Streams
 from pixmetry.locate.estimator import Estimator
 
 Pair = tuple[np.ndarray, np.ndarray]  # x and y
 UNIT_STRIDE = 1_000_003  # between the unit seeds of cameras of one type
+MOSAIC = "sensor.bayer_mosaic"
+FILLS = ("sensor.blooming", "sensor.full_well")  # do nothing until a pixel is full
 SHAPES_PICTURE = (  # without noise of their own; a target that they have changed answers otherwise to whatever else acts on it
     "optics.olpf",
     "optics.point_spread",
-    "sensor.bayer_mosaic",
+    MOSAIC,
     "sensor.infrared_diffusion",
     "sensor.pixel_aperture",
     "sensor.read_out",
@@ -179,6 +183,8 @@ class Trials:
         Frames of each target at each place, at least 2 to tell temporal from fixed.
     mode : {"frozen", "exact"}
     seed : int
+    scene : callable
+        ``(target, facts, x_px, y_px) -> Scene``: what frame k shows of a target at place k.
     """
 
     camera: Camera
@@ -190,6 +196,7 @@ class Trials:
     frames: int = 2
     mode: str = "frozen"
     seed: int = 0
+    scene: Callable[[Target, Facts, np.ndarray, np.ndarray], Scene] = scene_of
     _found: dict[Any, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
@@ -260,7 +267,7 @@ class Trials:
             np.clip(np.rint(at + by).astype(np.int64) - middle, 0, most) for at, by, most in zip(belongs, moved, last, strict=True)
         )
         windows = camera.expose_windows(
-            scene_of(self.target, variant.facts, x, y),
+            self.scene(self.target, variant.facts, x, y),
             Grid(np.arange(n), row0, col0, (self.side, self.side)),
             seed=self.seed + UNIT_STRIDE * unit,
             mode=self.mode,
@@ -323,31 +330,6 @@ class Trials:
         return self.compare(only, perfect(camera, (*only, *helpers)), perfect(camera, helpers))
 
 
-def put(camera: Camera, element: Element) -> Camera:
-    """The camera with this element on: in place of the element of the same name, otherwise at a place that its stage allows.
-
-    Raises
-    ------
-    ChainError
-        If the chain has no place for it.
-    """
-    if element.name in camera:
-        return replace(camera, chain=tuple(replace(element, on=True) if e.name == element.name else e for e in camera.chain))
-    stages = [STAGES.index(e.source.stage) for e in camera.chain]
-    mine = STAGES.index(element.source.stage)
-
-    def apart(at: int) -> tuple[int, int]:
-        """Number of elements that would be on its wrong side; of equal places, the last."""
-        return sum(s > mine for s in stages[:at]) + sum(s < mine for s in stages[at:]), -at
-
-    for at in sorted(range(len(camera.chain) + 1), key=apart):
-        try:
-            return replace(camera, chain=(*camera.chain[:at], element, *camera.chain[at:]))
-        except ChainError as problem:
-            refused = problem
-    raise refused
-
-
 def missed(camera: Camera, off: Iterable[str]) -> Camera:
     """The camera without some sources; an essential conversion stays, without its own errors, and a converter before what takes codes."""
     off = tuple(off)
@@ -371,6 +353,11 @@ def helpers_of(camera: Camera, names: Iterable[str]) -> tuple[str, ...]:
     except ChainError:
         helpers += [e.name for e in camera.chain if e.source.produces is not None and not e.source.essential]
     return tuple(h for h in dict.fromkeys(helpers) if h not in names)
+
+
+def hangs_on_colours(source: Source, camera: Camera) -> bool:
+    """Whether a closed form, which sees a grey target, misses what a source does: under a mosaic pixels of one colour are full first."""
+    return source.id in FILLS and any(e.source.id == MOSAIC for e in camera.active)
 
 
 def shapes_line(element: Element, camera: Camera) -> bool:

@@ -6,24 +6,28 @@ pulses. A row that looks later by a time τ shows the target farther along its p
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from pixmetry.budget.monte_carlo import put
-from pixmetry.budget.probe import make_probe, seen_at
+from pixmetry.budget.monte_carlo import Trials, helpers_of
+from pixmetry.budget.probe import Facts, Target, make_probe, perfect, put, scene_of, seen_at
 from pixmetry.budget.setting import Setting
 from pixmetry.camera.camera import NOWHERE, Camera, Element
 from pixmetry.camera.contribution import Contribution
+from pixmetry.core.errors import InputError
 from pixmetry.core.random import Grid
 from pixmetry.locate.estimator import Estimator
+from pixmetry.scene.discs import Discs
 
 FRAMES = 256  # for what is drawn anew in every frame
 PULSES = "sensor.light_pulses"
 LOOKS = ("sensor.exposure", "sensor.interlace", PULSES, "sensor.rolling_shutter", "sensor.trigger_jitter")
 LAGS = {"sensor.image_lag": "lag_rel", "processing.temporal_noise_reduction": "alpha"}  # with the share of the frame before
 OF_MOTION = (*LOOKS, *LAGS)
-LAG_PHASES, GHOSTS, SMALLEST_GHOST = 3, 60, 1e-5  # places within the pixel; earlier frames at most, and their smallest share
+LAG_PHASES, LAG_PLACES = 3, 48  # places within the pixel along each axis; places all over the frame
+GHOSTS, SMALLEST_GHOST = 60, 1e-5  # earlier frames at most, and their smallest share
 FLOOR_PX, COMB_REL = 2e-3, 0.05  # of what is told; of the distance between what two rows show
 SHORT_PX, LAG_ERROR, STREAK_ERROR = 0.5, 0.05, 0.6  # shift up to which ghosts overlap the target; relative errors up to it and beyond
 STILL = "nothing moves in this scenario"
@@ -62,23 +66,27 @@ def lag_contribution(element: Element, setting: Setting, estimator: Estimator) -
 
     Notes
     -----
-    The frame shows Σ (1 − q) qᵏ of the target k frames ago. The estimator is asked on that, at phases of the pixel. Ghosts that overlap the
-    target hold it back by v T q/(1 − q), the first moment of the series; those beyond its window do nothing.
+    The frame shows Σ (1 − q) qᵏ of the target k frames ago. The estimator is asked on that, at places all over the frame, as what shapes
+    the picture (lens, pixels, mosaic, fields) shows it. Ghosts that overlap the target hold it back by v T q/(1 − q), the first moment of
+    the series; those beyond its window do nothing.
     """
     share = float(getattr(element.params, LAGS[element.source.id]))
-    probe = make_probe(setting.facts, setting.target, estimator, LAG_PHASES)
-    assert probe.locate is not None
-    v, a, period = setting.velocity_px_per_s, setting.acceleration_px_per_s2, setting.frame_period_s
-    signal, left = np.zeros_like(probe.signal_dn), 1.0  # of the light, what is still to be shown
-    for k in range(GHOSTS):
-        last = left * share < SMALLEST_GHOST or k == GHOSTS - 1
-        ago = v * k * period - 0.5 * a * (k * period) ** 2
-        x, y = probe.x_px - ago[0], probe.y_px - ago[1]
-        signal += (left if last else left * (1 - share)) * seen_at(setting.facts, setting.target, x, y, probe.signal_dn.shape[1:])
-        left *= share
-        if last:
-            break
-    shifts = np.array(probe.moved(signal))
+    count = GHOSTS if share >= 1 else int(np.clip(np.log(SMALLEST_GHOST) / np.log(share) if share else 0, 0, GHOSTS - 1)) + 1
+    ago_s = setting.frame_period_s * np.arange(count)
+    behind = np.outer(setting.velocity_px_per_s, ago_s) - 0.5 * np.outer(setting.acceleration_px_per_s2, ago_s**2)
+    shown = (1 - share) * share ** np.arange(count)
+    shown[-1] = 1 - shown[:-1].sum()
+
+    def ghosts(target: Target, facts: Facts, x_px: np.ndarray, y_px: np.ndarray) -> Discs:
+        one = scene_of(target, facts, x_px, y_px)
+        return replace(one, x_px=one.x_px - behind[0], y_px=one.y_px - behind[1], peak_photons=one.peak_photons * shown)
+
+    camera = perfect(setting.camera, helpers_of(setting.camera, ()))
+    trials = Trials(camera, setting.target, estimator, setting.facts, LAG_PLACES, units=1, frames=1)
+    without, with_it = (np.array(t.errors(camera)).reshape(2, -1) for t in (trials, replace(trials, scene=ghosts, _found={})))
+    shifts = (with_it - without)[:, np.isfinite(with_it - without).all(axis=0)]
+    if not shifts.size:
+        raise InputError("no target is found behind it", where=element.name)
     bias, zero = shifts.mean(axis=1), np.zeros(2)
     method = "the estimator on the target with what stays of earlier frames"
     # of a streak that is longer, what is found hangs on where the search begins

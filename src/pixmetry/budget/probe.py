@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 
 from pixmetry.camera.camera import Camera, Element
+from pixmetry.camera.catalogue import STAGES
 from pixmetry.camera.contribution import Probe
 from pixmetry.camera.conversions import SAMPLE, LineSources, Link
 from pixmetry.camera.line import Held, Line
 from pixmetry.camera.signal import Kind
 from pixmetry.camera.source import Source
-from pixmetry.core.errors import InputError
+from pixmetry.core.errors import ChainError, InputError
 from pixmetry.core.random import Grid
 from pixmetry.locate.estimator import Estimator, KnownTarget
 from pixmetry.locate.noise import split_text
@@ -26,6 +27,7 @@ WINDOW_PX = 24  # side of the windows that are exposed; the estimator's own lies
 PHASES = 8  # per axis
 FEWER_PHASES = 5  # per axis, where the gradient is found by moving pixel after pixel
 ESTIMATOR_ITSELF = "processing.threshold"
+READ_OUT = "sensor.read_out"
 AHEAD_OF_LINE = ("optics", "sensor", "electronics")  # stages whose sources work on pixels, where a camera has a video line
 
 
@@ -116,13 +118,60 @@ class Facts:
     pixel_clock_hz: float = 14.1875e6
 
 
+@dataclass(frozen=True)
+class Raster:
+    """The rows of a frame: all of the sensor's, or of single fields every other one, or sums of a row and the next.
+
+    Parameters
+    ----------
+    step : int
+        Rows of the sensor from row to row of the frame.
+    summed : int
+        Rows of the sensor that a row of the frame holds.
+    """
+
+    step: int = 1
+    summed: int = 1
+
+    def read(self, pixels_dn: np.ndarray) -> np.ndarray:
+        """Rows of the frame of windows of pixels, shape (n, rows, cols) to (n, rows/step, cols)."""
+        n, rows, cols = pixels_dn.shape
+        seen: np.ndarray = pixels_dn[:, : rows // self.step * self.step].reshape(n, -1, self.step, cols)[:, :, : self.summed].sum(axis=2)
+        return seen
+
+    def spread(self, gradient: np.ndarray) -> np.ndarray:
+        """Gradient with respect to the pixels, of one with respect to the rows of the frame."""
+        n, rows, cols = gradient.shape
+        pixels = np.zeros((n, rows, self.step, cols))
+        pixels[:, :, : self.summed] = gradient[:, :, None]
+        return pixels.reshape(n, rows * self.step, cols)
+
+    def sensor_y(self, y: np.ndarray) -> np.ndarray:
+        """Place on the sensor of places in the frame, rows; of the even field."""
+        return np.asarray(self.step * np.asarray(y) + 0.5 * (self.summed - 1))
+
+    def frame_y(self, y: np.ndarray) -> np.ndarray:
+        """Place in the frame of places on the sensor, rows; the inverse of `sensor_y`."""
+        return np.asarray((np.asarray(y) - 0.5 * (self.summed - 1)) / self.step)
+
+
+ALL_ROWS = Raster()
+
+
+def raster_of(camera: Camera) -> Raster:
+    """The rows that a camera's frames show."""
+    modes = (e.params for e in camera.active if e.source.id == READ_OUT)
+    return next((Raster(2, 2 if p.lines == "summed" else 1) for p in modes if p.mode == "field"), ALL_ROWS)
+
+
 def facts_of(camera: Camera, target: Target, known: Mapping[str, Any] | None = None) -> Facts:
     """Read these numbers from a camera's chain; values in ``known`` have priority.
 
     Notes
     -----
-    The linear response is that of the essential conversions alone. Saturation is the smaller of full well and converter's range. The noise
-    is the scatter over 128 windows of the background through the whole chain, without what lies beyond four standard deviations.
+    The linear response is that of the essential conversions alone, of a row of the frame: where two rows of the sensor are summed, of both.
+    Saturation is the smaller of full well and converter's range. The noise is the scatter over 128 windows of the background through the
+    whole chain, without what lies beyond four standard deviations.
 
     Conversions that are not linear (a logarithmic pixel) are counted in DN that would be linear up to the light that saturates: the
     response is that of black to saturation, and the noise is brought there by the local slope at the target's background. So a target of
@@ -186,6 +235,36 @@ def perfect(camera: Camera, on: Iterable[str] = ()) -> Camera:
     return replace(alone, chain=tuple(e if e.name in on else ideal_element(e) for e in alone.chain))
 
 
+def put(camera: Camera, element: Element) -> Camera:
+    """The camera with this element on: in place of the element of the same name, otherwise at a place that its stage allows.
+
+    Raises
+    ------
+    ChainError
+        If the chain has no place for it.
+    """
+    if element.name in camera:
+        return replace(camera, chain=tuple(replace(element, on=True) if e.name == element.name else e for e in camera.chain))
+    stages = [STAGES.index(e.source.stage) for e in camera.chain]
+    mine = STAGES.index(element.source.stage)
+
+    def apart(at: int) -> tuple[int, int]:
+        """Number of elements that would be on its wrong side; of equal places, the last."""
+        return sum(s > mine for s in stages[:at]) + sum(s < mine for s in stages[at:]), -at
+
+    for at in sorted(range(len(camera.chain) + 1), key=apart):
+        try:
+            return replace(camera, chain=(*camera.chain[:at], element, *camera.chain[at:]))
+        except ChainError as problem:
+            refused = problem
+    raise refused
+
+
+def _conversions(camera: Camera) -> Camera:
+    """What makes numbers of light, without errors of its own: the essential conversions, and the rows that are summed."""
+    return perfect(camera, [e.name for e in camera.active if e.source.id == READ_OUT])
+
+
 def ideal_element(element: Element) -> Element:
     """An essential conversion without its errors; any other element unchanged."""
     return element if element.source.ideal is None else replace(element, params=element.source.ideal(element.params))
@@ -193,7 +272,7 @@ def ideal_element(element: Element) -> Element:
 
 def curve_of(camera: Camera, saturation_dn: float) -> Curve | None:
     """The response where it is no straight line; None where it is one."""
-    bare = perfect(camera)
+    bare = _conversions(camera)
 
     def above_black(photons: float) -> float:
         return float(bare.expose(Uniform(photons), window=(0, 0, 1, 1), quiet=True).data[0, 0, 0]) - black
@@ -304,10 +383,10 @@ def seen_at(facts: Facts, target: Target, x: np.ndarray, y: np.ndarray, shape: t
     return photons.astype(float) * facts.dn_per_photon
 
 
-def make_probe(facts: Facts, target: Target, estimator: Estimator, phases: int | None = None) -> Probe:
+def make_probe(facts: Facts, target: Target, estimator: Estimator, phases: int | None = None, raster: Raster = ALL_ROWS) -> Probe:
     """Render the target noise-free at a lattice of ``phases`` × ``phases`` places within the pixel and see it through the estimator.
 
-    By default there are `phases_for` the estimator.
+    By default there are `phases_for` the estimator. The windows are those of a frame with the rows of ``raster``.
 
     Raises
     ------
@@ -318,7 +397,7 @@ def make_probe(facts: Facts, target: Target, estimator: Estimator, phases: int |
     side = window_side(estimator)
     dx, dy = _lattice(phases or phases_for(estimator))
     x, y = side // 2 + dx, side // 2 + dy
-    signal = seen_at(facts, target, x, y, (side, side))
+    signal = raster.read(seen_at(facts, target, x, raster.sensor_y(y), (raster.step * side, side))) / raster.summed
     x_hat, y_hat = estimator.locate(signal)
     gx, gy = estimator.gradient(signal)
     return Probe(
@@ -327,18 +406,28 @@ def make_probe(facts: Facts, target: Target, estimator: Estimator, phases: int |
         x_px=x,
         y_px=y,
         x_hat_px=x_hat,
-        y_hat_px=y_hat,
+        y_hat_px=raster.sensor_y(y_hat),
         gx=gx,
-        gy=gy,
+        gy=gy * raster.step,
         gain_dn_per_e=facts.gain_dn_per_e,
         exposure_s=facts.exposure_s,
         temperature_c=facts.temperature_c,
         bits=facts.bits,
-        frame_shape=facts.frame_shape,
-        locate=estimator.locate,
+        frame_shape=(facts.frame_shape[0] // raster.step, facts.frame_shape[1]),
+        locate=_on_sensor(estimator, raster),
         saturation_dn=facts.saturation_dn,
         pixel_clock_hz=facts.pixel_clock_hz,
     )
+
+
+def _on_sensor(estimator: Estimator, raster: Raster) -> Callable[..., tuple[np.ndarray, np.ndarray]]:
+    """The estimator on windows of a frame, with places on the sensor."""
+
+    def locate(signal_dn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        x_hat, y_hat = estimator.locate(signal_dn)
+        return x_hat, raster.sensor_y(y_hat)
+
+    return estimator.locate if raster == ALL_ROWS else locate
 
 
 MARGIN_S = 1.7e-6  # of the line ahead of a window: what was on it then has died away at the target
@@ -365,7 +454,8 @@ class Probes:
 
     def __init__(self, camera: Camera, facts: Facts, target: Target, estimator: Estimator, phases: int | None = None) -> None:
         self.camera, self.facts, self.target, self.phases = camera, facts, target, phases or phases_for(estimator)
-        self.bare = make_probe(facts, target, estimator, self.phases)
+        self.raster = raster_of(camera)
+        self.bare = make_probe(facts, target, estimator, self.phases, self.raster)
         self.estimator = resolve(estimator, target, facts)
         self.side = window_side(self.estimator)
         self.curve = curve_of(camera, facts.saturation_dn)
@@ -376,10 +466,44 @@ class Probes:
         self._ahead = lru_cache(self._make_ahead)
 
     def of(self, name: str, source: Source) -> Probe:
-        """The probe for a source of this name; for the estimator itself, the probe on the light of the pixels."""
+        """The probe for a source of this name; for the estimator itself, the probe on the light of the pixels.
+
+        That is of all rows, as the row of the read-out has what single fields change.
+        """
+        if source.forward is None and self.raster != ALL_ROWS:
+            return make_probe(self.facts, self.target, self.estimator, self.phases)
         probe = self._of(name, source)
         light = source.ideal is None and not {Kind.DN, Kind.VIDEO, Kind.CODES} & set(source.consumes)
-        return probe if self.curve is None or not light else self._ahead_of_curve(probe)
+        if self.curve is not None and light:
+            probe = self._ahead_of_curve(probe)
+        return self._ahead_of_read_out(probe) if self._sees_all_rows(name, source) else probe
+
+    def _sees_all_rows(self, name: str, source: Source) -> bool:
+        """Whether a source acts on the rows of the sensor, of which the frame shows others."""
+        if self.raster == ALL_ROWS:
+            return False
+        try:
+            ids = [e.source.id for e in put(self.camera, Element(name, source, source.typical)).active]
+        except ChainError:
+            return False
+        return source.id in ids and ids.index(source.id) < ids.index(READ_OUT)
+
+    def _ahead_of_read_out(self, probe: Probe) -> Probe:
+        """The probe on all rows of the sensor, which the read-out makes rows of the frame: it belongs to the estimator then."""
+        raster, locate = self.raster, probe.locate
+        assert locate is not None
+        n, rows, cols = probe.signal_dn.shape
+        y = raster.sensor_y(probe.y_px)
+        return replace(
+            probe,
+            signal_dn=seen_at(self.facts, self.target, probe.x_px, y, (raster.step * rows, cols)) / raster.summed,
+            background_dn=probe.background_dn / raster.summed,
+            y_px=y,
+            gx=raster.spread(probe.gx),
+            gy=raster.spread(probe.gy),
+            frame_shape=self.facts.frame_shape,
+            locate=lambda signal_dn, *phase: locate(raster.read(signal_dn), *phase),
+        )
 
     def _of(self, name: str, source: Source) -> Probe:
         if not self.links or source.id == ESTIMATOR_ITSELF:
@@ -406,7 +530,8 @@ class Probes:
 
     def _make_ahead(self, without: str) -> Probe:
         """Windows of pixels on the line, without one of its sources."""
-        facts, row = self.facts, self.camera.frame_shape[0] // 2 - self.side // 2
+        facts, raster = self.facts, self.raster
+        row = self.camera.frame_shape[0] // raster.step // 2 - self.side // 2
         line, ahead = self._line(without, row + self.side // 2)
         dx, dy = _lattice(self.phases)
         n = len(dx)
@@ -426,14 +551,15 @@ class Probes:
 
         def located(samples_dn: np.ndarray, level: float, which: Any = slice(None)) -> tuple[np.ndarray, np.ndarray]:
             x_hat, y_hat = self._at_level(level).locate(samples_dn)
-            return line.pixels(x_hat + first_sample[which]) - first[which], y_hat
+            return line.pixels(x_hat + first_sample[which]) - first[which], raster.sensor_y(y_hat)
 
         held = Held(line, pixels, samples, nothing, nothing, located, ahead, self._rowsseen_at())
         background = self.bare.background_dn
-        signal = self._curved(seen_at(facts, self.target, x - first, y - row, (self.side, width)))
+        pixels_dn = seen_at(facts, self.target, x - first, raster.sensor_y(y - row), (raster.step * self.side, width)) / raster.summed
+        signal = self._curved(raster.read(pixels_dn))
         seen = held.read(line, signal, background)
         gx, gy = self._at_level(line.level).gradient(seen)
-        held = replace(held, gx=gx / step, gy=gy)
+        held = replace(held, gx=gx / step, gy=gy * raster.step)
         impulses = np.broadcast_to(np.eye(width, dtype=np.float32), (n, width, width))
         answer = line.limited().read(impulses, first, Grid(np.arange(n), rows, first_sample, (width, self.side))).astype(float)
 
@@ -465,9 +591,10 @@ class Probes:
         estimator = self._at_level(line.level)
         step = line.sample_clock_hz / line.pixel_clock_hz
         x, y = estimator.locate(seen)
+        on_sensor = _on_sensor(estimator, self.raster)
 
         def locate(signal_dn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            x_hat, y_hat = estimator.locate(signal_dn)
+            x_hat, y_hat = on_sensor(signal_dn)
             return x_hat / step, y_hat
 
         return replace(
@@ -477,7 +604,7 @@ class Probes:
             x_px=x,
             y_px=y,
             x_hat_px=x / step,
-            y_hat_px=y,
+            y_hat_px=self.raster.sensor_y(y),
             gx=held.gx,
             gy=held.gy,
             locate=locate,
@@ -501,7 +628,14 @@ class Probes:
         x_hat, y_hat = self.estimator.locate(signal)
         gx, gy = self.estimator.gradient(signal)
         return replace(
-            linear, signal_dn=signal, background_dn=level, x_hat_px=x_hat, y_hat_px=y_hat, gx=gx, gy=gy, locate=self.estimator.locate
+            linear,
+            signal_dn=signal,
+            background_dn=level,
+            x_hat_px=x_hat,
+            y_hat_px=self.raster.sensor_y(y_hat),
+            gx=gx,
+            gy=gy * self.raster.step,
+            locate=_on_sensor(self.estimator, self.raster),
         )
 
     def _ahead_of_curve(self, probe: Probe) -> Probe:
@@ -527,11 +661,11 @@ class Probes:
         return self.curve.of(light), light
 
     def _rowsseen_at(self) -> tuple[int, int]:
-        """Rows of the sensor that are put out: those that lie in the frame of the output."""
+        """Rows of the line that are put out: those of which a row of the sensor lies in the frame of the output."""
         rows = self.camera.frame_shape[0]
         _, at = self.camera.layout(np.zeros(rows), np.arange(rows))
-        seen = np.flatnonzero((at > -0.5) & (at < self.camera.output_shape[0] - 0.5))
-        return (int(seen[0]), int(seen[-1]) + 1) if len(seen) else (0, rows)
+        seen = np.flatnonzero((at > -0.5) & (at < self.camera.output_shape[0] - 0.5)) // self.raster.step
+        return (int(seen[0]), int(seen[-1]) + 1) if len(seen) else (0, rows // self.raster.step)
 
     def _line(self, without: str, row: int) -> tuple[Line, int]:
         """The line of all other sources, and how many of its filters stand ahead of the one left out.
@@ -574,7 +708,7 @@ def passed_light(camera: Camera) -> float:
 
 def _electrons_per_photon(camera: Camera) -> float:
     """Signal per photon after the essential conversions in front of the one that makes DN."""
-    bare = perfect(camera)
+    bare = _conversions(camera)
     until = next((i for i, e in enumerate(bare.active) if e.source.produces is Kind.DN), len(bare.active))
     head = replace(bare, chain=bare.active[:until])
     return float(head.expose(Uniform(1000.0), window=(0, 0, 1, 1), quiet=True).data[0, 0, 0]) / 1000.0
@@ -582,7 +716,7 @@ def _electrons_per_photon(camera: Camera) -> float:
 
 def _response(camera: Camera) -> float:
     """DN per photon of the essential conversions, in faint light."""
-    bare = perfect(camera)
+    bare = _conversions(camera)
     level = 1000.0
     out = [float(bare.expose(Uniform(v), window=(0, 0, 1, 1), quiet=True).data[0, 0, 0]) for v in (0.0, level)]
     if not out[1] > out[0]:
@@ -593,7 +727,7 @@ def _response(camera: Camera) -> float:
 def _saturation(camera: Camera, gain_dn_per_e: float, bits: int) -> float:
     well = _parameter(camera, "full_well_e")
     converters = [e for e in camera.chain if e.source.produces is Kind.CODES]
-    limits = [] if well is None else [well * gain_dn_per_e]
+    limits = [] if well is None else [well * gain_dn_per_e * raster_of(camera).summed]
     if converters or "bits" in camera.facts:
         limits.append(2**bits - 1 - max(0.0, sum(getattr(e.params, "offset_dn", 0.0) for e in converters)))
     if not limits:

@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 
 from pixmetry.budget.fields import Calibration, Places, field_of, spread_of
-from pixmetry.budget.monte_carlo import Trials, missed, put
+from pixmetry.budget.monte_carlo import Trials, hangs_on_colours, missed
 from pixmetry.budget.motion import LAGS, OF_MOTION, PULSES, STILL, held_by_pulses, lag_contribution, motion_contribution, pulse_contribution
 from pixmetry.budget.parameters import UNSTATED, applies, assumed_estimates, u_from_parameters, with_estimates
-from pixmetry.budget.probe import Probes
+from pixmetry.budget.probe import Probes, put
 from pixmetry.budget.setting import Setting
 from pixmetry.camera.camera import Camera, Element, pitch_values
 from pixmetry.camera.catalogue import get_source, sources
@@ -412,7 +412,7 @@ class Table:
         if source.propagate is None and (source.forward is None or source.essential and source.ideal is None):
             return replace(row, before=Parts(), after=Parts(), reason=source.reasons["propagate"])
         try:
-            if source.propagate is not None:
+            if source.propagate is not None and not hangs_on_colours(source, self.setting.camera):
                 how = FORMULA
                 found: Contribution | None = source.propagate(element.params, self.probes.of(element.name, source))
             else:
@@ -450,12 +450,15 @@ class Table:
 
     def _of_motion(self, row: SourceRow, element: Element) -> SourceRow:
         s = self.setting
-        if element.source.id in LAGS:
-            found = lag_contribution(element, s, self.estimator)
-        elif element.source.id == PULSES:
-            found = pulse_contribution(element, s, s.camera, self.estimator)
-        else:
-            found = motion_contribution(element, s, s.camera)
+        try:
+            if element.source.id in LAGS:
+                found = lag_contribution(element, s, self.estimator)
+            elif element.source.id == PULSES:
+                found = pulse_contribution(element, s, s.camera, self.estimator)
+            else:
+                found = motion_contribution(element, s, s.camera)
+        except PixmetryError as problem:
+            return replace(row, reason=f"not computed: {problem}")
         return self._with(replace(row, how=TIMES), found, "no target is found behind it")
 
     # ---- maps -----------------------------------------------------------------------------------------------------------------
