@@ -32,8 +32,13 @@ STATED = {  # a lawful value of each fact
     "interval_s": 60.0,
     "on_for_s": 30.0,
     "recorded": True,
+    "pulsed": True,
 }
-WITH = {"regions": {"densities": (0.1, 0.5)}, "on_for_s": {"interval_s": 60.0}}  # facts that another one needs
+WITH = {
+    "regions": {"densities": (0.1, 0.5)},
+    "on_for_s": {"interval_s": 60.0},
+    "pulsed": {"interval_s": 60.0},
+}  # facts that another one needs
 
 
 def test_each_kind_of_the_manifest_has_its_experiment() -> None:

@@ -83,7 +83,8 @@ def test_one_velocity_does_not_tell_the_row_time(rng: np.random.Generator) -> No
 
 def test_targets_at_rest_tell_nothing(rng: np.random.Generator) -> None:
     found = motion_of(runs_of(rng, 0.02, 15e-6, velocities=((0.0, 0.0), (0.0, 0.0))), (480, 640)).fit
-    assert not len(found) and all("move" in why for why in found.reasons.values())
+    assert found.names == ("rows_swapped_px",)
+    assert all("move" in why for name, why in found.reasons.items() if name not in found)
     with pytest.raises(MeasureError, match="no run"):
         motion_of([Run((), ())], (480, 640))
 

@@ -50,6 +50,8 @@ def digital_twin(campaign: Campaign, estimates: Mapping[str, Estimates], observa
         fields = source.parameters.model_fields
         if (source.id not in estimates and source.id not in ALWAYS) or source.id in OF_STORED_FRAME:
             continue
+        if source.id in estimates and estimates[source.id].settings.get("mode") == "field":
+            continue  # the twin's frames are these fields
         found = replace(estimates.get(source.id, Estimates.empty()), confounders=())  # results.json holds these, once for all
         values = {k: v for k, v in known.items() if k in fields} | best_values(source, found) | dict(observations.choices(source.id))
         params = source.make(values, f"digital twin, {source.id}")

@@ -354,7 +354,14 @@ def _with_motion(
     """What frames of moving targets tell; each group is a run of frames that were taken one after the other."""
     runs = [[(path.name, time, partial(reader.fetch, path)) for path, time in zip(g.paths, _times(g), strict=True)] for g in groups]
     try:
-        found = measure_motion(runs, campaign.frame_shape, on_frames=on_frames, bits=campaign.bits)
+        found = measure_motion(
+            runs,
+            campaign.frame_shape,
+            exposures_s=[g.exposure_s for g in groups],
+            pulsed=[bool(g.facts.pulsed) for g in groups],
+            on_frames=on_frames,
+            bits=campaign.bits,
+        )
     except MeasureError as problem:
         note = f"the frames of moving targets tell nothing: {problem}"
         return replace(seen, failed={**seen.failed, "motion": problem.what}, notes=(*seen.notes, note))

@@ -153,8 +153,8 @@ SET_UPS = {
             "Moving targets",
             "The chart on a slide or turntable: 100 to 1000 px/s, along x and y, both ways, and once at rest.",
             "Short enough that a target moves less than 4 px while it is exposed.",
-            "time of a row and between fields to 0.3 %",
-            tuple(_series("motion", 20, interval_s="<time from frame to frame>") for _ in range(4)),
+            "time of a row, between fields and of the exposure to 0.3 %",
+            tuple(_series("motion", 20, interval_s="<time from frame to frame>", exposure_s="<t>") for _ in range(4)),
             "dots",
         ),
     )

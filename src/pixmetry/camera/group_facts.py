@@ -32,7 +32,9 @@ class GroupFacts:
     on_for_s : float or None
         How long the camera had been on when the first frame of a series was taken.
     recorded : bool or None
-        Whether the frames were recorded on video tape and played again.
+        Whether the frames were recorded (on video tape, or as a video file) and played again.
+    pulsed : bool or None
+        Whether moving targets are in the light of two pulses, one for each field.
     """
 
     wavelength_nm: float | None = None
@@ -46,3 +48,4 @@ class GroupFacts:
     interval_s: float | None = None
     on_for_s: float | None = None
     recorded: bool | None = None
+    pulsed: bool | None = None

@@ -24,9 +24,12 @@ class MotionSeries:
     shear : ndarray, shape (frames, 2)
         By how much the picture is sheared along x, and stretched along y, per row.
     u_lag_px, u_shear : ndarray, shape (frames, 2)
+    stated_exposure_s : float
+        The stated exposure that ``exposure_s`` belongs to, the longest of the runs; 0 where none was stated.
     fit : Estimates
-        ``field_period_s`` (between even and odd rows), ``row_time_s`` (from row to row), ``jitter_s``. ``reasons`` say which rows come
-        first, and of names that it does not hold why.
+        ``field_period_s`` (between even and odd rows), ``row_time_s`` (from row to row), ``jitter_s``, ``exposure_s`` (of the even exposure
+        that blurs as much), ``rows_swapped_px`` (odd rows less even ones at rest), ``separation_s`` and ``ambient_share`` of two pulses of
+        light. ``reasons`` say which rows come first, and of names that it does not hold why.
     """
 
     frames: int
@@ -36,4 +39,5 @@ class MotionSeries:
     shear: np.ndarray
     u_lag_px: np.ndarray
     u_shear: np.ndarray
+    stated_exposure_s: float
     fit: Estimates

@@ -919,6 +919,18 @@ class Observations:
         found = fit.select(names)
         return float(np.hypot(powers @ found.values, np.sqrt(powers @ found.covariance @ powers)))
 
+    def moving(self, names: Mapping[str, str], *, where: str, settings: Iterable[str] = ()) -> Estimates:
+        """Take a source's parameters ``{parameter: fitted name}`` that moving targets tell, with those settings that it has.
+
+        Raises
+        ------
+        MeasureError
+            Without frames of moving targets, or with the reason why they do not tell any of these.
+        """
+        fit, failed = None if self.motion is None else self.motion.fit, self.failed.get("motion", "")
+        found = of_pictures(fit, names, where=where, pictures="moving targets", kind="motion", failed=failed)
+        return replace(found, settings={name: found.settings[name] for name in settings if name in found.settings})
+
     def choices(self, source: str) -> Mapping[str, Any]:
         """Parameters of a source that are no numbers, such as words, as the pictures tell them."""
         return {} if self.response is None else self.response.choices.get(source, {})
@@ -937,9 +949,7 @@ class Observations:
         return self.geometry.lens.select(names)
 
 
-def of_pictures(
-    fit: Estimates | None, names: Mapping[str, str], *, where: str, pictures: str, kind: str, failed: str = ""
-) -> Estimates:
+def of_pictures(fit: Estimates | None, names: Mapping[str, str], *, where: str, pictures: str, kind: str, failed: str = "") -> Estimates:
     """Take a source's parameters ``{parameter: fitted name}`` out of what pictures of one kind tell, with their covariance.
 
     Parameters

@@ -41,7 +41,7 @@ FACTS = {  # what else may be said of a group, by its kind
     "chart": ("densities", "luminances", "u_light_rel", "regions", "white"),
     "line": ("recorded",),
     "series": ("times_s", "interval_s", "on_for_s"),
-    "motion": ("times_s", "interval_s"),
+    "motion": ("times_s", "interval_s", "pulsed"),
 }
 
 

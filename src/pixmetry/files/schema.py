@@ -130,6 +130,7 @@ class GroupModel(Model):
     interval_s: Positive | None = None
     on_for_s: Annotated[float, Field(ge=0)] | None = None
     recorded: bool | None = None
+    pulsed: bool | None = None
     files: Names
 
     @model_validator(mode="before")

@@ -22,6 +22,7 @@ from pixmetry.files.raw_values import RawLayout, layout_of
 from pixmetry.files.results import write_record
 from pixmetry.locate.files import frames_inside
 from pixmetry.locate.noise import noise_model
+from pixmetry.series.blur import Cut
 from pixmetry.series.log import SeriesLog
 from pixmetry.series.modes import LEAST_TARGETS, field_motion
 from pixmetry.series.motion import Run, find_in_fields, motion_of
@@ -270,10 +271,14 @@ def measure_motion(
     runs: Iterable[Sequence[tuple[str, float, Fetch]]],
     frame_shape: tuple[int, int],
     *,
+    exposures_s: Sequence[float] = (),
+    pulsed: Sequence[bool] = (),
     on_frames: Callable[[int], object] | None = None,
     **options: Any,
 ) -> MotionSeries:
     """Measure frames of moving targets, given as runs of names, seconds, and functions that return the frames.
+
+    ``exposures_s`` are the stated ones of the runs, 0 where none was; ``pulsed`` says which runs are in the light of two pulses.
 
     Raises
     ------
@@ -281,18 +286,20 @@ def measure_motion(
         If a frame cannot be used, or no run shows targets that can be followed.
     """
 
-    def work(item: tuple[str, float, Fetch]) -> tuple[FrameTargets, FrameTargets]:
+    def work(item: tuple[str, float, Fetch]) -> tuple[FrameTargets, FrameTargets, Cut]:
         name, time_s, fetch = item
         return find_in_fields(fetch(), name, time_s, **options)
 
     found = []
-    for run in runs:
+    for number, run in enumerate(runs):
         fields = []
         for both in imap_tiles(work, sorted(run, key=lambda item: item[1])):
             fields.append(both)
             if on_frames is not None:
                 on_frames(1)
-        found.append(Run(tuple(even for even, _ in fields), tuple(odd for _, odd in fields)))
+        length, flashed = (exposures_s[number] if exposures_s else 0.0), bool(pulsed and pulsed[number])
+        even, odd, cuts = (f[0] for f in fields), (f[1] for f in fields), (f[2] for f in fields)
+        found.append(Run(tuple(even), tuple(odd), tuple(cuts), length, flashed))
     with single_threaded_blas():
         return motion_of(found, frame_shape)
 

@@ -1,14 +1,16 @@
-"""Moving targets: time between the fields of a frame, time from row to row, jitter of the trigger.
+"""Moving targets: time between the fields of a frame and from row to row, length of the exposure, pulses of light, jitter of the trigger.
 
 The two sets of rows of a frame, even and odd, are located apart. Where they are exposed at different times, a target of velocity v lies
 v T_f apart in them. Where rows are exposed one after the other, the picture of a moving plate is sheared by v_x t_row and stretched by
-v_y t_row. Velocities come from the places in successive frames: a wrong time between frames makes all times wrong by the same factor.
+v_y t_row. What the blur along the path tells is in `pixmetry.series.blur`. Targets at rest tell whether the rows of the two fields are
+woven in the right order. Velocities come from the places in successive frames: a wrong time between frames makes all times wrong by the
+same factor.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,6 +20,7 @@ from pixmetry.camera.motion_series import MotionSeries
 from pixmetry.core.arrays import Array
 from pixmetry.core.errors import MeasureError
 from pixmetry.core.number import ONE_SIDED_95, Estimates
+from pixmetry.series.blur import Cut, Look, cut_out, exposure_of, pulses_of, untold
 from pixmetry.series.modes import FieldMotion, field_motion
 from pixmetry.series.track import FrameTargets, find_targets, follow_targets, near_pairs
 
@@ -29,19 +32,29 @@ SPREAD = 20.0  # of the velocities over the u of one, from which on they differ
 PATH_DEGREE = 2  # of the polynomial over time that each run follows
 FIELDS, ROWS = ("first_field", "even", "odd"), ("first_row", "top", "bottom")  # what the sign of a time says
 METHOD = "places of moving targets in even and odd rows, over successive frames; weighted least squares"
+SWAPPED_PX, NEARLY = 2.0, 0.25  # odd rows less even ones where a grabber swaps the rows of every pair; how near to it
+ALTERNATE_PX, FEWEST_STILL = 0.5, 6  # of successive single fields; frames at rest that tell it
+ROW_OFFSET = "rows_swapped_px"
 NOTHING_MOVES = "nothing moves: let the targets move by a pixel or more from frame to frame"
 
 
 @dataclass(frozen=True)
 class Run:
-    """Frames taken one after the other: the targets in even and in odd rows, each in order of time."""
+    """Frames taken one after the other: the targets in even and in odd rows, each in order of time.
+
+    ``cuts`` are windows about the targets of each frame, or nothing; ``exposure_s`` is 0 where it was not stated. ``pulsed``: in the light
+    of two pulses, one for each field.
+    """
 
     even: tuple[FrameTargets, ...]
     odd: tuple[FrameTargets, ...]
+    cuts: tuple[Cut, ...] = ()
+    exposure_s: float = 0.0
+    pulsed: bool = False
 
 
-def find_in_fields(frame: np.ndarray, name: str, time_s: float, **options: Any) -> tuple[FrameTargets, FrameTargets]:
-    """Find the targets in the even and in the odd rows of a frame; places count in rows of the frame.
+def find_in_fields(frame: np.ndarray, name: str, time_s: float, **options: Any) -> tuple[FrameTargets, FrameTargets, Cut]:
+    """Find the targets in the even and in the odd rows of a frame, and cut windows out about them; places count in rows of the frame.
 
     Raises
     ------
@@ -54,7 +67,7 @@ def find_in_fields(frame: np.ndarray, name: str, time_s: float, **options: Any) 
         wide = np.array([1.0, 2.0])
         covariance = found.covariance_px2 * wide[:, None] * wide
         both.append(FrameTargets(name, time_s, found.positions_px * wide + [0.0, parity], covariance))
-    return both[0], both[1]
+    return both[0], both[1], cut_out(frame, both[0].positions_px, options.get("bits"))
 
 
 def motion_of(runs: Sequence[Run], frame_shape: tuple[int, int]) -> MotionSeries:
@@ -87,16 +100,19 @@ def motion_of(runs: Sequence[Run], frame_shape: tuple[int, int]) -> MotionSeries
             where="motion",
             remedy="show a plate of targets that moves",
         )
-    speed = np.concatenate([p.speed for p in parts])
-    seen = np.isfinite(speed).all(axis=2)
-    counted = np.maximum(seen.sum(axis=1), 1)[:, None]
-    mean_speed = np.where(seen[..., None], speed, 0).sum(axis=1) / counted
-    fields, lag, u_lag = _fields(parts)
+    seen = [np.asarray(np.isfinite(p.speed).all(axis=2)) for p in parts]
+    counts = np.concatenate([s.sum(axis=1) for s in seen])
+    sums = np.concatenate([np.where(s[..., None], p.speed, 0).sum(axis=1) for s, p in zip(seen, parts, strict=True)])
+    mean_speed = sums / np.maximum(counts, 1)[:, None]
+    order, parts = _order_of_rows(parts)
+    steady = [p for p in parts if not p.run.pulsed]
+    fields, lag, u_lag = _fields(parts, steady)
     rows, shear, u_shear = _rows(parts, mean_speed, frame_shape)
-    jitter = _jitter(parts)
+    exposure, stated_s = _exposure(steady, rows)
+    fit = fields.join(rows, _jitter(parts), exposure, order, _pulses(parts, fields, exposure))
     return MotionSeries(
-        frames=len(speed), targets=int(seen.sum(axis=1).max()), speed_px_s=mean_speed, lag_px=lag, shear=shear, u_lag_px=u_lag,
-        u_shear=u_shear, fit=fields.join(rows, jitter),
+        frames=len(counts), targets=int(counts.max()), speed_px_s=mean_speed, lag_px=lag, shear=shear, u_lag_px=u_lag,
+        u_shear=u_shear, stated_exposure_s=stated_s, fit=fit,
     )  # fmt: skip
 
 
@@ -112,6 +128,8 @@ class _Followed:
     speed: Array
     common: Array  # of all targets of a frame about the paths, shape (frames, 2)
     common_var: Array
+    run: Run
+    cuts: tuple[Cut, ...]  # of these frames, or nothing
 
 
 def _followed(run: Run) -> _Followed | None:
@@ -152,11 +170,130 @@ def _followed(run: Run) -> _Followed | None:
     common = np.where(seen[..., None], left, 0).sum(axis=1) / number
     variance = np.where(seen[..., None], np.diagonal(covariance, axis1=2, axis2=3), 0).sum(axis=1) / number**2
     lag, lag_covariance = (odd - even)[both], (odd_covariance + even_covariance)[both]
-    return _Followed(time_s, places, covariance, lag, lag_covariance, speed, common, variance)
+    cuts = tuple(run.cuts[k] for k in np.flatnonzero(used)) if run.cuts else ()
+    return _Followed(time_s, places, covariance, lag, lag_covariance, speed, common, variance, run, cuts)
 
 
-def _fields(parts: Sequence[_Followed]) -> tuple[Estimates, Array, Array]:
-    """Time between the fields, and mean lag and its u of every frame."""
+def _order_of_rows(parts: Sequence[_Followed]) -> tuple[Estimates, list[_Followed]]:
+    """How far odd rows lie from even ones without motion, which tells rows that are swapped; and the runs as if they were not.
+
+    The lag of the odd rows is regressed on the velocity: what is left at rest is the order of the rows.
+    """
+    speed, lag = (np.concatenate([v.reshape(-1, 2) for v in both]) for both in zip(*((p.speed, p.lag) for p in parts), strict=True))
+    seen = np.isfinite(speed).all(axis=1) & np.isfinite(lag).all(axis=1)
+    pulsed = np.concatenate([np.full(p.lag[..., 0].size, p.run.pulsed) for p in parts])[seen]
+    v, d = speed[seen, 1], lag[seen, 1]
+    at_rest = np.abs(v) < LEAST_PX * 2 / max(float(np.median(np.diff(parts[0].time_s))), 1e-12)
+    design = np.column_stack([np.ones(v.size), np.where(pulsed, 0.0, v), np.where(pulsed, v, 0.0)])
+    if not at_rest.any() and np.linalg.matrix_rank(design, 1e-3 * float(np.abs(v).max(initial=1e-12))) < design.any(axis=0).sum():
+        why = "all targets move at one speed along y: take a run at rest"
+        return Estimates.from_rows([], reasons={ROW_OFFSET: why}), list(parts)
+    offset = float(np.median(d[at_rest])) if at_rest.any() else float(np.linalg.lstsq(design, d, rcond=None)[0][0])
+    u = STATIC_LAG_PX
+    if abs(offset - SWAPPED_PX) < NEARLY:
+        told = {ROW_OFFSET: "the rows of every pair are swapped: the grabber weaves the fields in the wrong order"}
+        row = (ROW_OFFSET, offset, u, float(v.size), "px")
+        found = Estimates.from_rows([row], method=METHOD, reasons=told, settings={"mode": "woven", "swapped": True})
+        shift = np.array([0.0, SWAPPED_PX])
+        return found, [replace(p, lag=p.lag - shift) for p in parts]
+    if abs(offset) > NEARLY:
+        what = f"odd rows lie {offset:.2f} rows from even ones at rest: the fields are not woven line by line"
+        return Estimates.from_rows([], reasons={ROW_OFFSET: what}), list(parts)
+    single = _alternates(parts)
+    what = "the picture at rest alternates by half a row: single fields, even and odd in turn" if single else "the rows are in order"
+    row = (ROW_OFFSET, abs(offset) + ONE_SIDED_95 * u, u, float(v.size), "px")
+    found = Estimates.from_rows([row], method=METHOD, limits=frozenset([ROW_OFFSET]), reasons={ROW_OFFSET: what})
+    settings: dict[str, str | int] = {"mode": "field", "field": "alternating"} if single else {"mode": "progressive", "swapped": False}
+    return replace(found, settings=settings), list(parts)
+
+
+def _alternates(parts: Sequence[_Followed]) -> bool:
+    """Whether targets at rest go up and down by half a row from frame to frame, and do not move sideways."""
+    for part in parts:
+        if len(part.time_s) < FEWEST_STILL:
+            continue
+        middle = np.nanmean(part.places, axis=1)
+        step = np.diff(middle, axis=0) * (-1.0) ** np.arange(len(middle) - 1)[:, None]
+        mean, scatter = step.mean(axis=0), step.std(axis=0)
+        if abs(abs(mean[1]) - ALTERNATE_PX) < NEARLY * ALTERNATE_PX and abs(mean[0]) < NEARLY * ALTERNATE_PX and scatter[1] < NEARLY:
+            return True
+    return False
+
+
+def _exposure(parts: Sequence[_Followed], rows: Estimates) -> tuple[Estimates, float]:
+    """Length of the exposure by the blur along the motion, and the stated one that it belongs to; 0 where none was stated.
+
+    Runs of different stated exposures are taken together: their velocities count in proportion.
+    """
+    if not _moves(parts):
+        return untold(NOTHING_MOVES), 0.0
+    if not any(p.cuts for p in parts):
+        return untold("the frames themselves are needed, not only places"), 0.0
+    stated = [p.run.exposure_s for p in parts]
+    longest = max(stated) if min(stated) > 0 else 0.0
+    looks: dict[int, list[Look]] = {}
+    for part, own in zip(parts, _known_again(parts), strict=True):
+        share = part.run.exposure_s / longest if longest else 1.0
+        for i, pairs in _looks(part).items():
+            if i in own:
+                both = [look for pair in pairs for look in pair]
+                looks.setdefault(own[i], []).extend(replace(look, speed_px_s=look.speed_px_s * share) for look in both)
+    moving = [np.sqrt(_speed_variance(p)) for p in parts if _moves([p])]
+    u_speed = float(np.sqrt(np.mean(np.square(moving)) / len(moving)))
+    return exposure_of(list(looks.values()), _signed_row_time_s(rows), u_speed), longest
+
+
+def _signed_row_time_s(rows: Estimates) -> float:
+    """Time from row to row, negative from the bottom up; 0 where it is not told."""
+    if "row_time_s" not in rows or rows.limits:
+        return 0.0
+    return rows["row_time_s"].value * (-1.0 if rows.settings.get("first_row") == ROWS[2] else 1.0)
+
+
+def _looks(part: _Followed) -> dict[int, list[tuple[Look, Look]]]:
+    """Pictures of each target of a run in even and in odd rows."""
+    found: dict[int, list[tuple[Look, Look]]] = {}
+    for k, cut in enumerate(part.cuts):
+        for i in np.flatnonzero(np.isfinite(part.lag[k]).all(axis=1)):
+            even, odd = (part.places[k, i] + side * part.lag[k, i] for side in (-0.5, 0.5))
+            at = cut.near(even)
+            if at is not None:
+                found.setdefault(int(i), []).append((cut.look(at, 0, even, part.speed[k, i]), cut.look(at, 1, odd, part.speed[k, i])))
+    return found
+
+
+def _known_again(parts: Sequence[_Followed]) -> list[dict[int, int]]:
+    """For each run, its targets by their numbers in the first run."""
+    first = _reference(parts[0])
+    pairs = [_same_targets(first, _reference(part)) for part in parts]
+    return [dict(zip(other.tolist(), one.tolist(), strict=True)) for one, other in pairs]
+
+
+def _pulses(parts: Sequence[_Followed], fields: Estimates, exposure: Estimates) -> Estimates:
+    """Time between two pulses of light, and the share of steady light; nothing where no run is in such light."""
+    pulsed = [p for p in parts if p.run.pulsed]
+    names = ("separation_s", "ambient_share")
+    if not pulsed:
+        return Estimates.empty()
+    if not _moves(pulsed):
+        return Estimates.from_rows([], reasons=dict.fromkeys(names, NOTHING_MOVES))
+    known = [fit[name].value for fit, name in ((fields, "field_period_s"), (exposure, "exposure_s")) if name in fit and not fit.limits]
+    if len(known) < 2:
+        what = "not separable: pulses farther apart, and steady light; take the same runs without pulses, which tell fields and exposure"
+        return Estimates.from_rows([], reasons=dict.fromkeys(names, what))
+    steady = next(p.run.exposure_s for p in parts if not p.run.pulsed)
+    scale = pulsed[0].run.exposure_s / steady if steady and pulsed[0].run.exposure_s else 1.0
+    first = fields.settings.get("first_field") == FIELDS[2]
+    looks: dict[int, list[tuple[Look, Look]]] = {}
+    for part, own in zip(pulsed, _known_again(pulsed), strict=True):
+        for i, pairs in _looks(part).items():
+            if i in own:
+                looks.setdefault(own[i], []).extend((odd, even) if first else (even, odd) for even, odd in pairs)
+    return pulses_of(list(looks.values()), known[1] * scale, known[0])
+
+
+def _fields(parts: Sequence[_Followed], steady: Sequence[_Followed]) -> tuple[Estimates, Array, Array]:
+    """Time between the fields, by the runs in steady light, and mean lag and its u of every frame."""
     normal, right = np.diag([0.0, STATIC_LAG_PX**-2, STATIC_LAG_PX**-2]), np.zeros(3)
     rows, lags, u_lags, of_speed = [], [], [], []
     for part in parts:
@@ -168,22 +305,24 @@ def _fields(parts: Sequence[_Followed]) -> tuple[Estimates, Array, Array]:
         design[..., 0] = speed
         design[..., 0, 1] = design[..., 1, 2] = 1.0
         own = np.einsum("kiap,kiab,kibq->pq", design, weight, design)
-        normal += own
-        of_speed.append(own[0, 0] ** 2 * _speed_variance(part))
-        right += np.einsum("kiap,kiab,kib->p", design, weight, lag)
-        rows.append((design, weight, lag))
+        if any(part is one for one in steady):
+            normal += own
+            of_speed.append(own[0, 0] ** 2 * _speed_variance(part))
+            right += np.einsum("kiap,kiab,kib->p", design, weight, lag)
+            rows.append((design, weight, lag))
         total = weight.sum(axis=1) + np.eye(2) * 1e-12
         lags.append(np.linalg.solve(total, np.einsum("kiab,kib->ka", weight, lag)[..., None])[..., 0])
         u_lags.append(np.sqrt(np.diagonal(np.linalg.inv(total), axis1=1, axis2=2)))
+    lag, u_lag = np.concatenate(lags), np.concatenate(u_lags)
+    if not _moves(steady):
+        only = "light pulses decide when the fields are exposed: take a run without them" if not steady else NOTHING_MOVES
+        return _untold("field_period_s", only), lag, u_lag
     found = np.linalg.solve(normal, right)
     left = [lag - design @ found for design, _, lag in rows]
     chi2 = sum(float(np.einsum("kia,kiab,kib->", r, w, r)) for r, (_, w, _) in zip(left, rows, strict=True))
     dof = sum(2 * int((w[..., 0, 0] > 0).sum()) for _, w, _ in rows) - 1
     slope = float(found[0]) / max(normal[0, 0], 1e-300)  # change of the result with the relative error of the speed of one run
     u = float(np.sqrt(np.linalg.inv(normal)[0, 0] * max(1.0, chi2 / max(dof, 1)) + slope**2 * sum(of_speed)))
-    lag, u_lag = np.concatenate(lags), np.concatenate(u_lags)
-    if not _moves(parts):
-        return _untold("field_period_s", NOTHING_MOVES), lag, u_lag
     return _time("field_period_s", float(found[0]), u, dof, FIELDS, "even and odd rows are exposed together"), lag, u_lag
 
 

@@ -35,6 +35,10 @@ WORDS = {
     "field_period_s": "Time between even and odd rows",
     "row_time_s": "Time from row to row",
     "jitter_s": "Scatter of the time of exposure",
+    "exposure_s": "Length of the even exposure that blurs as much",
+    "rows_swapped_px": "Odd rows less even rows at rest",
+    "separation_s": "Time between the two pulses of light",
+    "ambient_share": "Share of steady light beside the pulses",
 }
 TITLES = {
     "shift_x_px": "shift x / px",

@@ -78,4 +78,8 @@ def motion_record(motion: MotionSeries) -> dict[str, Any]:
         "u_lag_px": motion.u_lag_px.tolist(),
         "shear": motion.shear.tolist(),
         "u_shear": motion.u_shear.tolist(),
+        "stated_exposure_s": motion.stated_exposure_s,
+        "names_of_covariance": list(motion.fit.names),
+        "covariance": motion.fit.covariance.tolist(),
+        "confounders": list(motion.fit.confounders),
     }

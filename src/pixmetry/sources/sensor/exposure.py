@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import lru_cache
 from typing import Literal
 
 import numpy as np
 
+from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.errors import MeasureError
+from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
 
+MEASURED_NODES = 5  # of a camera whose exposure was measured: paths of four blur radii
 PARTS, POINTS = 50, 40  # of the exposure, and of each part, on which a profile's moments are taken
 
 
@@ -28,18 +33,22 @@ class Exposure(Parameters):
         ge=1,
         le=64,
     )
+    length_rel: float = quantity(
+        1.0, "1", "length of the profile about the middle of the exposure, divided by the stated exposure time", gt=0, le=4
+    )
     ramp_rel: float = quantity(0.1, "1", "share of the exposure in which a trapezoid rises, and again in which it falls", gt=0, le=0.5)
     decay_rel: float = quantity(0.2, "1", "time constant of the decay, divided by the exposure", gt=0.01, le=100)
     width_rel: float = quantity(0.1, "1", "standard deviation of the pulse, divided by the exposure", gt=0.01, le=100)
 
 
 def rule(params: Exposure) -> tuple[np.ndarray, np.ndarray]:
-    """Times (0 to 1) and weights (sum 1), shape (nodes,): the Gauss rule of the profile itself.
+    """Times (0 to 1, or as much shorter or longer about 0.5) and weights (sum 1), shape (nodes,): the Gauss rule of the profile itself.
 
     It gives the moments of the profile up to the power 2 nodes − 1 exactly: the mean time with one node, a constant acceleration
     with two, and the length of the blur.
     """
-    return _rule(params)
+    t, w = _rule(params.model_copy(update={"length_rel": 1.0}))
+    return (t, w) if params.length_rel == 1 else (0.5 + params.length_rel * (t - 0.5), w)
 
 
 @lru_cache(maxsize=64)
@@ -96,6 +105,20 @@ def truth(params: Exposure, signal: Signal, stream: Stream) -> Mapping[str, np.n
     return {"mean_time_s": start + mean * length, "spread_s": spread * length}
 
 
+def measure(observations: Observations) -> Estimates:
+    """Length of an even exposure by the blur of moving targets, over the stated one."""
+    where = "sensor.exposure"
+    found = observations.moving({"length_rel": "exposure_s"}, where=where)
+    stated = 0.0 if observations.motion is None else observations.motion.stated_exposure_s
+    length = found["length_rel"]
+    if length.is_limit:
+        raise MeasureError(f"the exposure is below {length.value:.2g} s (95 %): {length.reason}", where=where, remedy="move faster")
+    if not stated:
+        told = f"the exposure is {length.value:.4g} s ± {length.u:.2g} s; that of the camera's setting is not stated"
+        raise MeasureError(told, where=where, remedy="state exposure_s of the frames of kind motion in the manifest")
+    return replace(found.scaled({"length_rel": (1 / stated, "1")}), settings={"nodes": MEASURED_NODES})
+
+
 SOURCE = Source(
     id="sensor.exposure",
     title="Motion blur",
@@ -114,6 +137,7 @@ SOURCE = Source(
     typical=Exposure(nodes=5),
     bound=Exposure(profile="exponential", nodes=9),
     forward=forward,
+    measure=measure,
     truth=truth,
     gum_class="O",
     equation="I(x) = ∫ w(t) L(x − x(t)) dt;  box: length b = v t_exp, variance b²/12 along the motion;  shift ½ a t_exp²/12",
@@ -124,7 +148,6 @@ SOURCE = Source(
     ),
     advice="Use a shorter exposure or a strobe, and assign the position to the mean time of the light.",
     reasons={
-        "measure": "needs images of a moving target: second moments along and across the motion differ by b²/12",
         "correct": "not needed for a centre: report the mean time of the light; the blur itself needs the target's path",
         "propagate": "needs the target's speed and acceleration, which the probe does not contain",
     },

@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from pixmetry.camera.observations import Observations, of_pictures
+from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
 from pixmetry.core.arrays import Array
@@ -68,16 +68,7 @@ def truth(params: Interlace, signal: Signal, stream: Stream) -> Mapping[str, np.
 
 def measure(observations: Observations) -> Estimates:
     """Delay of one field against the other, from moving targets; which rows come first is among the settings."""
-    fit = None if observations.motion is None else observations.motion.fit
-    found = of_pictures(
-        fit,
-        {"field_period_s": "field_period_s"},
-        where="sensor.interlace",
-        pictures="moving targets",
-        kind="motion",
-        failed=observations.failed.get("motion", ""),
-    )
-    return replace(found, settings={k: v for k, v in found.settings.items() if k == "first_field"})
+    return observations.moving({"field_period_s": "field_period_s"}, where="sensor.interlace", settings=["first_field"])
 
 
 SOURCE = Source(

@@ -8,9 +8,12 @@ from typing import Literal
 import numpy as np
 
 from pixmetry.camera.light import GAUSS
+from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
 from pixmetry.core.arrays import Array
+from pixmetry.core.errors import MeasureError
+from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
 
 
@@ -51,6 +54,16 @@ def truth(params: LightPulses, signal: Signal, stream: Stream) -> Mapping[str, n
     return {"pulse_time_s": (signal.time_s + signal.exposure_s)[:, None] + delay_s(params, signal)}
 
 
+def measure(observations: Observations) -> Estimates:
+    """Time between the pulses and the share of steady light, from moving targets with and without the pulses."""
+    names, where = {n: n for n in ("separation_s", "ambient_share")}, "sensor.light_pulses"
+    motion = observations.motion
+    if motion is not None and not {*names} & {*motion.fit.names, *motion.fit.reasons}:
+        remedy = "take runs of kind motion with pulsed: true, and the same without pulses"
+        raise MeasureError("no frames of moving targets in the light of two pulses", where=where, remedy=remedy)
+    return observations.moving(names, where=where, settings=["first_field"])
+
+
 SOURCE = Source(
     id="sensor.light_pulses",
     title="Two light pulses",
@@ -65,6 +78,7 @@ SOURCE = Source(
     typical=LightPulses(ambient_share=0.05),
     bound=LightPulses(separation_s=1.6e-3, ambient_share=0.2),
     forward=forward,
+    measure=measure,
     truth=truth,
     applies_to=("analogue", "ccd", "cid"),
     option="pulsed light",
@@ -74,7 +88,6 @@ SOURCE = Source(
     references=("M. Raffel et al., Particle Image Velocimetry, Springer 2018 (two pulses astride the transfer)",),
     advice="Place the pulses as close together as the field transfer allows. Block steady light by a filter for the colour of the pulses.",
     reasons={
-        "measure": "needs images of a moving target: the centres of the fields still differ by v δt",
         "correct": "needs the speed of every target; locate targets in each field separately instead",
         "propagate": "needs the target's speed, which the probe does not contain",
     },

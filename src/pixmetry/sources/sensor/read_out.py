@@ -8,8 +8,10 @@ from typing import Literal
 
 import numpy as np
 
+from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal, Windows
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.number import Estimates
 from pixmetry.core.random import Grid, Stream
 
 
@@ -95,6 +97,12 @@ def truth(params: ReadOut, signal: Signal, stream: Stream) -> Mapping[str, np.nd
     return {"sensor_row": row}
 
 
+def measure(observations: Observations) -> Estimates:
+    """Order of the rows, by targets in even and in odd rows at rest: a choice among modes, without a number."""
+    found = observations.moving({"rows_swapped_px": "rows_swapped_px"}, where="sensor.read_out", settings=["mode", "swapped", "field"])
+    return replace(Estimates.empty(), method=found.method, settings=found.settings)
+
+
 SOURCE = Source(
     id="sensor.read_out",
     title="Read-out modes of a progressive sensor",
@@ -109,6 +117,7 @@ SOURCE = Source(
     typical=ReadOut(mode="woven", swapped=True),
     bound=ReadOut(mode="field"),
     forward=forward,
+    measure=measure,
     truth=truth,
     context=context,
     reshape=reshape,
@@ -122,7 +131,6 @@ SOURCE = Source(
     ),
     advice="Use whole frames. If there are only fields, sum the lines, and check the order of the fields on a slanted edge.",
     reasons={
-        "measure": "needs an edge or targets: with rows swapped, neighbouring rows of a slanted edge lie in the wrong order",
         "correct": "rows swapped are swapped back by the same source; rows of the other field are not in the frame",
         "propagate": "needs the target on the raster of the field; the probe has it on the raster of the frame",
     },

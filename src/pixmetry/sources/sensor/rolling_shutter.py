@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Literal
 
 import numpy as np
 
-from pixmetry.camera.observations import Observations, of_pictures
+from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
 from pixmetry.core.number import Estimates
@@ -54,16 +53,7 @@ def truth(params: RollingShutter, signal: Signal, stream: Stream) -> Mapping[str
 
 def measure(observations: Observations) -> Estimates:
     """Time from row to row, from moving targets; where the reading begins is among the settings."""
-    fit = None if observations.motion is None else observations.motion.fit
-    found = of_pictures(
-        fit,
-        {"row_time_s": "row_time_s"},
-        where="sensor.rolling_shutter",
-        pictures="moving targets",
-        kind="motion",
-        failed=observations.failed.get("motion", ""),
-    )
-    return replace(found, settings={k: v for k, v in found.settings.items() if k == "first_row"})
+    return observations.moving({"row_time_s": "row_time_s"}, where="sensor.rolling_shutter", settings=["first_row"])
 
 
 SOURCE = Source(

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 
 import numpy as np
 
-from pixmetry.camera.observations import Observations, of_pictures
+from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
 from pixmetry.core.number import Estimates
@@ -44,16 +43,7 @@ def truth(params: TriggerJitter, signal: Signal, stream: Stream) -> Mapping[str,
 
 def measure(observations: Observations) -> Estimates:
     """Scatter of the time of exposure, from moving targets about their paths; latency and rate need another clock."""
-    fit = None if observations.motion is None else observations.motion.fit
-    found = of_pictures(
-        fit,
-        {"jitter_s": "jitter_s"},
-        where="sensor.trigger_jitter",
-        pictures="moving targets",
-        kind="motion",
-        failed=observations.failed.get("motion", ""),
-    )
-    return replace(found, settings={})
+    return observations.moving({"jitter_s": "jitter_s"}, where="sensor.trigger_jitter")
 
 
 SOURCE = Source(
