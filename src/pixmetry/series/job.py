@@ -263,8 +263,9 @@ def measure_series(
 
 def _shows_targets(named: Sequence[tuple[str, float, Fetch]], options: dict[str, Any]) -> bool:
     """Whether the first and the last frame show the same discs, three or more."""
-    ends = [find_targets(fetch(), name, time_s, kind="disc", **options).positions_px for name, time_s, fetch in (named[0], named[-1])]
-    return min(map(len, ends)) >= LEAST_TARGETS and near_pairs(*ends)[0].size >= LEAST_TARGETS
+    ends = (find_targets(fetch(), name, time_s, kind="disc", **options) for name, time_s, fetch in (named[0], named[-1]))
+    first, last = (end.positions_px for end in ends)
+    return min(len(first), len(last)) >= LEAST_TARGETS and near_pairs(first, last)[0].size >= LEAST_TARGETS
 
 
 def measure_motion(

@@ -86,7 +86,7 @@ class Texture:
             return None
         noise = variance / 2 if variance > SAME * self.variance_dn2 else self.variance_dn2  # the first frame itself, or a copy of it
         normal[[0, 1], [0, 1]] -= GRADIENT_VARIANCE * noise * (2 * HALF_PX + 1) ** 2
-        covariance: Array = np.linalg.inv(normal)[:2, :2] * noise
+        covariance: Array = np.asarray(np.linalg.inv(normal)[:2, :2] * noise, np.float64)
         if not np.all(np.linalg.eigvalsh(covariance) > 0):
             return None
         return moved + near, covariance
