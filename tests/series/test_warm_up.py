@@ -10,7 +10,7 @@ from scipy import stats
 from tests.series.fixed_field import CENTRE, CLOCK_MHZ, PLACES, SHAPE, TIME_S, Warming, camera_of
 
 from pixmetry.core.errors import MeasureError
-from pixmetry.series.modes import field_motion
+from pixmetry.series.modes import field_motion, focus_motion
 from pixmetry.series.warm_up import drift_of
 
 CAMERAS = 24
@@ -138,3 +138,20 @@ def test_too_little_is_refused_with_the_reason(rng: np.random.Generator) -> None
     motion = field_motion(positions[:5], covariance[:5], tuple(CENTRE))
     with pytest.raises(MeasureError, match="5 frames are too few"):
         drift_of(motion, TIME_S[:5], SHAPE)
+
+
+def test_a_focus_that_drifts_is_found(rng: np.random.Generator) -> None:
+    time_s, own = np.arange(40) * 60.0, rng.uniform(0.5, 1.0, 12)
+    change = 0.08 * (1 - np.exp(-time_s / 600.0))
+    blur = np.stack([own + change[:, None] + rng.normal(0, 0.02, (40, 12)), np.full((40, 12), 0.02)], axis=-1)
+    blur[rng.random((40, 12)) < 0.2] = np.nan
+    value, u = focus_motion(blur)
+    scores = (value - change + change.mean()) / u
+    low, high = stats.chi2.ppf([RATE / 2, 1 - RATE / 2], 39)
+    assert low < float(scores @ scores) < high
+    positions, covariance = Warming().positions(rng, 0.01, time_s)
+    found = drift_of(field_motion(positions, covariance, tuple(CENTRE)), time_s, SHAPE, blur_px2=blur).focus
+    truth = change[-8:].mean() - change[:8].mean()
+    assert abs(found.value - truth) < stats.norm.isf(RATE / 2) * found.u < 0.03
+    still = drift_of(field_motion(positions, covariance, tuple(CENTRE)), time_s, SHAPE).focus
+    assert not still.is_available

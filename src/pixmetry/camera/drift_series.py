@@ -42,6 +42,10 @@ class DriftSeries:
     stable : Number
         Time after switching on from which on the farthest corner stays within ``tolerance_px`` of where it settles, s.
     tolerance_px : float
+    blur_px2, u_blur_px2 : ndarray, shape (frames,)
+        Variance of the targets' blur about its mean over the series; NaN where it is not measured.
+    focus : Number
+        Change of that variance from the first fifth of the series to the last one, px².
     """
 
     time_s: np.ndarray
@@ -56,3 +60,6 @@ class DriftSeries:
     fit: Estimates
     stable: Number
     tolerance_px: float
+    blur_px2: np.ndarray
+    u_blur_px2: np.ndarray
+    focus: Number

@@ -121,7 +121,7 @@ def _follow(images: tuple[Path, ...], output: Path, options: dict[str, Any]) -> 
 def summary_lines(found: Series) -> list[str]:
     """The text for the terminal."""
     from pixmetry.report.numbers import printed_number
-    from pixmetry.series.page import WORDS, stable_sentence, untold
+    from pixmetry.series.page import WORDS, focus_sentence, stable_sentence, untold
 
     drift = found.drift
     lines = [f"{len(found.frames)} frames over {(drift.time_s[-1] - drift.time_s[0]) / 60:.1f} min, {drift.targets} targets"]
@@ -130,4 +130,5 @@ def summary_lines(found: Series) -> list[str]:
         printed = printed_number(number)
         lines.append(f"{WORDS[number.name]}: {printed.joined()}")
     lines += [f"{WORDS[name]}: not told: {why}" for name, why in untold(drift.fit).items()]
-    return [*lines, *found.notes]
+    focus = [focus_sentence(drift)] if drift.focus.is_available else []
+    return [*lines, *focus, *found.notes]

@@ -28,7 +28,7 @@ from pixmetry.series.modes import LEAST_TARGETS, field_motion
 from pixmetry.series.motion import Run, find_in_fields, motion_of
 from pixmetry.series.records import Series
 from pixmetry.series.texture import texture_of
-from pixmetry.series.track import FrameTargets, find_targets, follow_targets, near_pairs
+from pixmetry.series.track import FrameTargets, blur_of, find_targets, follow_targets, near_pairs
 from pixmetry.series.warm_up import drift_of
 
 KIND = "series"
@@ -250,8 +250,9 @@ def measure_series(
     seconds: Array = np.array([time for _, time, _ in named], float)
     with single_threaded_blas():
         positions, covariance = follow_targets(ordered)
+        blur = blur_of(ordered, positions)
         motion = field_motion(positions, covariance, (0.5 * (shape[1] - 1), 0.5 * (shape[0] - 1)), analogue=analogue)
-        drift = drift_of(motion, seconds, shape, clock_mhz=pixel_clock_mhz, tolerance_px=tolerance_px)
+        drift = drift_of(motion, seconds, shape, clock_mhz=pixel_clock_mhz, tolerance_px=tolerance_px, blur_px2=blur)
     lost = int((~motion.used).sum())
     what = "places" if textured else "targets"
     more = [f"{lost} of {len(named)} frames show too few of the {what} and are left out."] if lost else []

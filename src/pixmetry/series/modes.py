@@ -132,3 +132,36 @@ def field_motion(positions_px: Array, covariance_px2: Array, centre_px: tuple[fl
     factor = float(np.sqrt(chi2 / dof)) if dof > 0 else 1.0
     cofactor = np.linalg.inv(normal)
     return FieldMotion(modes, values, cofactor, places, used, kept, factor, dof)
+
+
+def focus_motion(blur_px2: Array) -> tuple[Array, Array]:
+    """Change of the blur's variance in each frame, about the mean of the series, and its u, px², shape (frames,).
+
+    Parameters
+    ----------
+    blur_px2 : ndarray, shape (frames, targets, 2)
+        Variance of each target's blur, and its u; NaN where it was not measured.
+
+    Notes
+    -----
+    Each target's own blur is its weighted mean over the frames; the frame's change is the weighted mean over its targets. u grows where
+    single targets scatter more than their u.
+    """
+    value, u = np.moveaxis(blur_px2, 2, 0)
+    good = np.isfinite(value) & (u > 0)
+    good &= good.mean(axis=0) >= LEAST_SHARE
+    if not good.any():
+        return np.full(len(value), np.nan), np.full(len(value), np.nan)
+    weight = np.where(good, 1 / np.where(good, u, 1.0) ** 2, 0.0)
+    filled = np.where(good, value, 0.0)
+    seen = weight.sum(axis=1) > 0
+    change = np.zeros(len(value))
+    for _ in range(PASSES):
+        own = (weight * (filled - change[:, None])).sum(axis=0) / np.maximum(weight.sum(axis=0), 1e-300)
+        change[seen] = (weight * (filled - own)).sum(axis=1)[seen] / weight.sum(axis=1)[seen]
+        change[seen] -= change[seen].mean()
+    left = np.where(good, filled - own - change[:, None], 0.0)
+    dof = int(good.sum() - good.any(axis=0).sum() - seen.sum() + 1)
+    factor = max(1.0, float(np.sqrt((weight * left**2).sum() / dof))) if dof > 0 else 1.0
+    change[~seen] = np.nan
+    return change, np.where(seen, factor / np.sqrt(np.maximum(weight.sum(axis=1), 1e-300)), np.nan)

@@ -11,7 +11,7 @@ from pixmetry.camera.motion_series import MotionSeries
 from pixmetry.core.number import LOWER_LIMIT, Estimates, Number
 from pixmetry.report import Column, Page, Section, Table
 from pixmetry.report.drawing import BLUE, GRID, INK, RED, SOFT, canvas, line
-from pixmetry.report.numbers import significant
+from pixmetry.report.numbers import printed_number, significant
 from pixmetry.report.page import Answer, Figure, Reading, Text
 from pixmetry.report.provenance import provenance_section
 
@@ -48,6 +48,7 @@ TITLES = {
     "affinity_rel": "x scale / 1e-6",
     "shear_rel": "shear / 1e-6",
 }
+SIGNIFICANT = 3.0  # u, from which on a change of focus is told
 FOOTER = "Standard uncertainties (k = 1). x runs along rows, y along columns; the image turns about the frame's centre."
 
 
@@ -88,6 +89,15 @@ def stable_sentence(drift: DriftSeries) -> str:
     return f"{when}, every point stays within {limit} of where it settles{extrapolated}."
 
 
+def focus_sentence(drift: DriftSeries) -> str:
+    """Whether the focus changes, in a sentence."""
+    change = drift.focus
+    told = f"{printed_number(change).joined()} from the first to the last fifth of the frames"
+    if abs(change.value) > SIGNIFICANT * change.u:
+        return f"The focus changes: the variance of the targets' blur grows by {told}. The scale may follow it."
+    return f"No change of focus is seen: the variance of the targets' blur changes by {told}."
+
+
 def drift_section(drift: DriftSeries, *, own_page: bool = False) -> Section:
     """Figure and values of a series."""
     section = Section("Motion of the image while the camera warms up", name="series")
@@ -100,6 +110,8 @@ def drift_section(drift: DriftSeries, *, own_page: bool = False) -> Section:
             style="small soft",
         )
     section.add(motion_figure(drift))
+    if drift.focus.is_available:
+        section.add_text(focus_sentence(drift))
     section.add(_told(drift.fit))
     return section
 

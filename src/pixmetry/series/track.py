@@ -21,25 +21,28 @@ USELESS = Flag.NOT_CONVERGED | Flag.BORDER
 
 @dataclass(frozen=True)
 class FrameTargets:
-    """Targets of one frame: ``positions_px``, shape (n, 2), and ``covariance_px2``, (n, 2, 2)."""
+    """Targets of one frame: ``positions_px``, shape (n, 2), and ``covariance_px2``, (n, 2, 2); ``blur_px`` and its u, (n, 2), or None."""
 
     name: str
     time_s: float
     positions_px: Array
     covariance_px2: Array
+    blur_px: Array | None = None
 
     def to_record(self) -> dict[str, Any]:
         """Plain record, a line of the log."""
         (xx, xy), (_, yy) = np.moveaxis(self.covariance_px2, 0, -1)
-        rows = np.column_stack([self.positions_px, xx, xy, yy])
+        rows = np.column_stack([self.positions_px, xx, xy, yy, *([] if self.blur_px is None else [self.blur_px])])
         return {"frame": self.name, "time_s": self.time_s, "targets": rows.tolist()}
 
     @classmethod
     def from_record(cls, record: dict[str, Any]) -> FrameTargets:
         """The targets of a record; ``KeyError``, ``TypeError`` or ``ValueError`` where it is none."""
-        rows = np.array(record["targets"], float).reshape(-1, 5)
+        rows = np.array(record["targets"], float)
+        rows = rows.reshape(len(rows), -1) if rows.size else np.zeros((0, 5))
         covariance = rows[:, [2, 3, 3, 4]].reshape(-1, 2, 2)
-        return cls(str(record["frame"]), float(record["time_s"]), rows[:, :2], covariance)
+        blur = rows[:, 5:7] if rows.shape[1] == 7 else None
+        return cls(str(record["frame"]), float(record["time_s"]), rows[:, :2], covariance, blur)
 
 
 def find_targets(frame: np.ndarray, name: str, time_s: float, **options: Any) -> FrameTargets:
@@ -55,7 +58,8 @@ def find_targets(frame: np.ndarray, name: str, time_s: float, **options: Any) ->
     positions = np.column_stack([found["x_px"], found["y_px"]]).astype(float)
     good = (np.asarray(found["flags"]).astype(int) & int(USELESS) == 0) & np.isfinite(positions).all(axis=1) & (xx > 0) & (yy > 0)
     covariance = np.stack([xx, xy, xy, yy], axis=1).reshape(-1, 2, 2)
-    return FrameTargets(name, time_s, positions[good], covariance[good])
+    blur = np.column_stack([found[column] for column in ("blur_px", "u_blur_px")]).astype(float)
+    return FrameTargets(name, time_s, positions[good], covariance[good], blur[good])
 
 
 def follow_targets(frames: Sequence[FrameTargets]) -> tuple[Array, Array]:
@@ -103,6 +107,20 @@ def follow_targets(frames: Sequence[FrameTargets]) -> tuple[Array, Array]:
                 last = last + step
                 last[one] = found.positions_px[other]
     return positions, covariance
+
+
+def blur_of(frames: Sequence[FrameTargets], positions_px: Array) -> Array:
+    """Variance of the blur of targets that were followed, and its u, px², shape (frames, targets, 2); NaN where it was not measured."""
+    found = np.full(positions_px.shape, np.nan)
+    for k, frame in enumerate(frames):
+        if frame.blur_px is None:
+            continue
+        at = {tuple(place): row for place, row in zip(frame.positions_px.tolist(), frame.blur_px, strict=True)}
+        for i, place in enumerate(positions_px[k].tolist()):
+            if tuple(place) in at:
+                blur, u = at[tuple(place)]
+                found[k, i] = blur**2, 2 * blur * u
+    return found
 
 
 def near_pairs(known: Array, found: Array, gate: float | None = None) -> tuple[np.ndarray, np.ndarray]:

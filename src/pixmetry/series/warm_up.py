@@ -14,7 +14,7 @@ from pixmetry.camera.drift_series import CAMERA_MODES, DIGITAL, DriftSeries
 from pixmetry.core.arrays import Array
 from pixmetry.core.errors import MeasureError
 from pixmetry.core.number import LOWER_LIMIT, ONE_SIDED_95, Estimates, Number
-from pixmetry.series.modes import FieldMotion, design_of
+from pixmetry.series.modes import FieldMotion, design_of, focus_motion
 
 MOST_BINS = 400  # means of neighbouring frames beyond that many: shorter than any time constant that the series tells
 FALSE_ALARM = 1e-4  # that a part of the curve is taken for real where there is none
@@ -98,6 +98,7 @@ def drift_of(
     *,
     clock_mhz: float | None = None,
     tolerance_px: float = 0.05,
+    blur_px2: Array | None = None,
 ) -> DriftSeries:
     """Fit the warm-up of a camera, and of a frame grabber where the motion has its modes.
 
@@ -111,6 +112,8 @@ def drift_of(
         Pixel clock of an analogue camera's frame grabber; without it the delay is not told in ns.
     tolerance_px : float
         Of the stability time.
+    blur_px2 : ndarray, shape (frames, targets, 2), optional
+        Variance of each target's blur, and its u.
 
     Returns
     -------
@@ -158,6 +161,7 @@ def drift_of(
     widened = _widening(series, fit, scatter)
     fit = replace(fit, covariance=fit.covariance * widened)
     estimates = _estimates(series, fit, found, others, u_scatter)
+    blur, u_blur = focus_motion(np.full((len(time_s), 1, 2), np.nan) if blur_px2 is None else blur_px2)
     corners = _corners(frame_shape)
     distance, u_distance = _from_settled(fit, series, corners, np.asarray(time_s, float))
     return DriftSeries(
@@ -173,7 +177,24 @@ def drift_of(
         fit=estimates,
         stable=_stability(fit, series, found, corners, tolerance_px, settles=_differing("ln slow", fit, others) is None),
         tolerance_px=tolerance_px,
+        blur_px2=blur,
+        u_blur_px2=u_blur,
+        focus=_focus_change(np.asarray(time_s, float), blur, u_blur),
     )
+
+
+def _focus_change(time_s: Array, blur_px2: Array, u_px2: Array) -> Number:
+    """Change of the blur's variance from the first fifth of a series to the last one."""
+    method = "mean variance of the targets' blur in the last fifth of the frames, less that in the first fifth"
+    order = np.argsort(time_s, kind="stable")
+    order = order[np.isfinite(blur_px2[order])]
+    part = len(order) // 5
+    if not part:
+        return Number.not_available("px²", "the blur of the targets is not measured", method, "blur_change_px2")
+    first, last = order[:part], order[-part:]
+    value = float(blur_px2[last].mean() - blur_px2[first].mean())
+    u = float(np.sqrt((u_px2[first] ** 2).sum() + (u_px2[last] ** 2).sum())) / part
+    return Number(value, u, np.inf, "px²", method, name="blur_change_px2")
 
 
 def _binned(series: Series) -> Series:

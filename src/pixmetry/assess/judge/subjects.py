@@ -186,6 +186,8 @@ def _of_series(record: Mapping[str, Any], name: str, where: str) -> Subject:
     try:
         values = {(MONO, e["name"]): Number.from_record(e) for e in record["estimates"]}
         values[MONO, "stable_s"] = Number.from_record(record["stable"])
+        if "focus" in record:
+            values[MONO, "blur_change_px2"] = Number.from_record(record["focus"])
         facts = {key: record[key] for key in ("cols", "rows", "tolerance_px")}
         return Subject(name, "series", "", facts, values, dict(record["not_told"]))
     except (KeyError, IndexError, TypeError, AttributeError, ValueError):
