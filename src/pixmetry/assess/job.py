@@ -287,8 +287,8 @@ def observe_campaign(campaign: Campaign, progress: Progress) -> tuple[InputHashe
 
     followed = [g for g in campaign.groups if g.kind in LOCATED]
     shown = [g for g in campaign.groups if g.kind not in LOCATED]
-    chosen = [g for g in shown if campaign.camera.cfa is None or g.kind not in ("edge", "chart", "line", "spots")]
-    note = "edges, lines, spots and charts are not measured through a colour mosaic: a step of brightness looks jagged there"
+    chosen = [g for g in shown if campaign.camera.cfa is None or g.kind not in ("edge", "chart", "line", "spots", "speckle")]
+    note = "edges, lines, spots, laser light and charts are not measured through a colour mosaic: a step of brightness looks jagged there"
     left_out = (note,) if len(chosen) < len(shown) else ()
 
     covered, borders = campaign.camera.covered, list[BorderFrames]()

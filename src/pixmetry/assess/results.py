@@ -26,6 +26,7 @@ from pixmetry.camera.observations import (
     StoredBlocks,
 )
 from pixmetry.camera.response import Response
+from pixmetry.camera.speckle import SpeckleFrames
 from pixmetry.core.number import Estimates
 from pixmetry.emva.files.json_format import value_record
 from pixmetry.emva.records import Results
@@ -119,6 +120,7 @@ class Assessment:
             "response": None if self.observations.response is None else response_record(self.observations.response),
             "series": None if self.observations.drift is None else drift_record(self.observations.drift),
             "motion": None if self.observations.motion is None else motion_record(self.observations.motion),
+            "speckle": None if self.observations.speckle is None else speckle_record(self.observations.speckle),
             "covered": None if self.observations.covered is None else covered_record(self.observations.covered),
             "lines": None if self.observations.lines is None else lines_record(self.observations.lines),
             "emva1288": {
@@ -327,6 +329,36 @@ def covered_record(found: CoveredPixels) -> dict[str, Any]:
     noise = [{"exposure_s": exposure_s, "row_noise_dn": value, "u": u} for exposure_s, value, u in found.row_noise]
     told = {name: why for name, why in found.fit.reasons.items() if name not in found.fit}
     return {"borders": asdict(found.covered), "values": found.fit.to_records(), "not_told": told, "trails": trails, "row_noise": noise}
+
+
+def speckle_record(found: SpeckleFrames) -> dict[str, Any]:
+    """The plain record of laser spots on a surface that moves: one for each group of frames, and why others were refused."""
+    spots = [
+        {
+            **_joint_record(s.fit),
+            "frames": s.frames,
+            "left_out": s.left_out,
+            "effective_frames": s.effective_frames,
+            "wavelength_nm": s.wavelength_nm,
+            "radius_px": s.radius_px,
+            "u_located_px": s.u_located_px,
+            "scatter_px2": s.scatter_px2.tolist(),
+            "predicted_px2": None if s.predicted_px2 is None else s.predicted_px2.tolist(),
+            "dof": s.dof,
+            "degree_of_path": s.degree,
+            "x_px": s.x_px.tolist(),
+            "y_px": s.y_px.tolist(),
+            "pattern_correlation": s.pattern_correlation.tolist(),
+            "stays_rel": s.stays_rel,
+            "saturated_rel": s.saturated_rel,
+            "noise_rel": s.noise_rel,
+            "lags_px": s.lags_px.tolist(),
+            "covariance_rel": s.covariance_rel.tolist(),
+            "model_rel": s.model_rel.tolist(),
+        }
+        for s in found.spots
+    ]
+    return {"spots": spots, "refused": list(found.refused)}
 
 
 def lines_record(found: LineRows) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Charts to print, as SVG on a sheet of A4: slanted edges, thin lines, a step wedge, bright spots, a plate of dots."""
+"""Charts to print, as SVG on a sheet of A4: slanted edges, thin lines, a step wedge, bright spots, a plate of dots; drawings of set-ups."""
 
 from __future__ import annotations
 
@@ -92,4 +92,22 @@ def dots() -> str:
     return _sheet([f'<circle cx="{x:.3f}" cy="{y:.3f}" r="4" fill="{BLACK}"/>' for x, y in at])
 
 
-CHARTS: dict[str, Callable[[], str]] = {"edges": edges, "lines": lines, "wedge": wedge, "spots": spots, "dots": dots}
+def laser() -> str:
+    """The set-up of a laser spot, seen from above: the surface moves along itself from frame to frame."""
+    x, y = WIDTH_MM / 2, 60.0
+    text = [
+        (x + 62, y + 3, "surface: move it sideways between frames"),
+        (x - 96, y + 100, "laser"),
+        (x + 78, y + 100, "camera, stop as in the measurement"),
+        (x - 118, y - 24, "Nothing else moves. Step: the diameter of the spot or more. 50 frames."),
+    ]
+    shapes = [_rect(x - 60, y, 120, 6, "#888"), _rect(x - 85, y + 90, 30, 12, BLACK), _rect(x + 45, y + 85, 30, 20, BLACK)]
+    rays = [(x - 70, y + 90, x, y + 6, "#c00"), (x, y + 6, x + 60, y + 85, "#888"), (x - 55, y - 8, x + 55, y - 8, BLACK)]
+    shapes += [f'<line x1="{a:.3f}" y1="{b:.3f}" x2="{c:.3f}" y2="{d:.3f}" stroke="{k}" stroke-width="1"/>' for a, b, c, d, k in rays]
+    for end, tip in ((x - 55, x - 62), (x + 55, x + 62)):
+        shapes.append(f'<polygon points="{end:g},{y - 11:g} {end:g},{y - 5:g} {tip:g},{y - 8:g}" fill="{BLACK}"/>')
+    shapes += [f'<text x="{a:.3f}" y="{b:.3f}" font-size="6" fill="{BLACK}">{t}</text>' for a, b, t in text]
+    return _sheet(shapes)
+
+
+CHARTS: dict[str, Callable[[], str]] = {"edges": edges, "lines": lines, "wedge": wedge, "spots": spots, "dots": dots, "laser": laser}

@@ -157,6 +157,16 @@ SET_UPS = {
             tuple(_series("motion", 20, interval_s="<time from frame to frame>", exposure_s="<t>") for _ in range(4)),
             "dots",
         ),
+        SetUp(
+            "speckle",
+            "A laser spot on a surface that moves",
+            "The laser, the lens and its stop as in the measurement; laser and camera at rest. Between two frames move the surface "
+            "sideways, by the size of the spot or more.",
+            "Brightest grains below saturation: the mean spot at a tenth of it.",
+            "scatter of the centre to 10 %, contrast to 0.02",
+            (_series("speckle", 50, wavelength_nm="<nm>"),),
+            "laser",
+        ),
     )
 }
 

@@ -19,6 +19,7 @@ from pixmetry.camera.drift_series import DriftSeries
 from pixmetry.camera.motion_series import MotionSeries
 from pixmetry.camera.noise_covariance import NoiseCovariance, NoiseFilter
 from pixmetry.camera.response import Response
+from pixmetry.camera.speckle import SpeckleFrames
 from pixmetry.camera.stated import StatedFacts
 from pixmetry.core.errors import MeasureError
 from pixmetry.core.number import Estimates
@@ -773,6 +774,7 @@ class Observations:
     geometry: CameraGeometry | None = None
     drift: DriftSeries | None = None
     motion: MotionSeries | None = None
+    speckle: SpeckleFrames | None = None
     failed: Mapping[str, str] = field(default_factory=dict)  # by kind of frames: why they tell nothing
     storage: Storage = Storage()
     notes: tuple[str, ...] = field(default_factory=tuple)

@@ -23,7 +23,8 @@ class Frames:
 
     Parameters
     ----------
-    kind : {"dark", "bright", "edge", "light_off", "chart", "line", "covered", "spots", "pattern", "dark_temperature", "border"}
+    kind : str
+        ``"dark"``, ``"bright"``, or a kind of pictures, as the manifest's ``kind``.
     exposure_s : float, or None of a target
     data : ndarray, shape (frames, rows, cols), or sequence of ndarray of shape (rows, cols)
         Stored values, whole numbers from 0 to 65535, in the order in which the frames were taken. They are not copied.

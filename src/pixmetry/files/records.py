@@ -31,9 +31,10 @@ TARGETS = (
     "border",
     "series",
     "motion",
+    "speckle",
 )  # pictures of something to measure; one frame may be enough
 LOCATED = ("series", "motion")  # kinds whose frames are measured one by one, for their targets
-LOSSY = ("pattern",)  # kinds whose files may be JPEG
+LOSSY = ("pattern", "speckle")  # kinds whose files may be JPEG
 FACTS = {  # what else may be said of a group, by its kind
     "edge": ("wavelength_nm",),
     "dark": ("temperature_c",),  # which makes it the next kind
@@ -42,6 +43,7 @@ FACTS = {  # what else may be said of a group, by its kind
     "line": ("recorded",),
     "series": ("times_s", "interval_s", "on_for_s"),
     "motion": ("times_s", "interval_s", "pulsed"),
+    "speckle": ("wavelength_nm",),
 }
 
 

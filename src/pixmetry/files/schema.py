@@ -114,6 +114,7 @@ class GroupModel(Model):
         "border",
         "series",
         "motion",
+        "speckle",
     ]
     exposure_s: Annotated[float, Field(ge=0)] | None = None
     photons: Annotated[float, Field(ge=0)] | None = None

@@ -12,6 +12,7 @@ from pixmetry.observe.edge_fit import fit_edges
 from pixmetry.observe.edges import Picture, edge_notes, motion_notes, responses_of, search_edges
 from pixmetry.observe.experiment import Experiment, PictureGroup
 from pixmetry.observe.jpeg_blocks import FirstFrames, reduce_patterns
+from pixmetry.observe.laser_spots import SpotCrops, reduce_speckle
 from pixmetry.observe.lens_fit import with_other_lens
 from pixmetry.observe.light_off import BlockMeans, reduce_light_off
 from pixmetry.observe.line_fit import fit_line
@@ -80,6 +81,7 @@ EXPERIMENTS = {
         Experiment("pattern", reduce_patterns, FirstFrames),
         Experiment("dark_temperature", reduce_dark_temperatures),
         Experiment("border", reduce_borders),
+        Experiment("speckle", reduce_speckle, SpotCrops),
     )
 }
 

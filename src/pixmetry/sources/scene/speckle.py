@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from pixmetry.camera.contribution import Contribution, Probe
+from pixmetry.camera.observations import Observations, of_pictures
 from pixmetry.camera.signal import Kind
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.camera.speckle import pixel_covariance
+from pixmetry.core.number import Estimates
 
 
 class Speckle(Parameters):
@@ -23,31 +28,34 @@ class Speckle(Parameters):
         return 1e-3 * self.wavelength_nm * self.f_number / self.pitch_um
 
 
-def correlation(shift_px: np.ndarray, lambda_n_px: float) -> np.ndarray:
-    """Normalised covariance of the intensity at two places so far apart: (2 J₁(πr/λN)/(πr/λN))² of a round pupil."""
-    from scipy.special import j1
-
-    v = np.pi * np.asarray(shift_px, float) / lambda_n_px
-    safe = np.where(v > 1e-6, v, 1.0)
-    return np.asarray(np.where(v > 1e-6, (2 * j1(safe) / safe) ** 2, 1.0))
+LARGEST_U = 4.0  # by which the contrast of light that has 1, the most there is, may come out larger
+REACH = 12.0  # pixels to which the covariance is summed, at least
 
 
-REACH, FINE = 12.0, 8  # pixels to which the covariance is summed, at least; nodes along a pixel for its average
-
-
-def pixel_covariance(lambda_n_px: float, reach_px: int) -> np.ndarray:
-    """Covariance of the light of two pixels that lie up to ``reach_px`` apart in x and y, shape (2 reach + 1,) * 2, for contrast 1.
-
-    The covariance at points, averaged over both pixels: the average over a square is one over the triangle of their separations.
-    """
-    # the separation of two points of two unit squares has a triangular density about that of the squares
-    nodes, weights = np.polynomial.legendre.leggauss(FINE)
-    part = np.concatenate([0.5 * nodes - 0.5, 0.5 * nodes + 0.5])
-    weight = np.concatenate([0.5 * weights, 0.5 * weights]) * (1 - np.abs(part))
-    steps = np.arange(-reach_px, reach_px + 1.0)
-    at = (steps[:, None] + part).ravel()
-    values = correlation(np.hypot(at[:, None], at), lambda_n_px).reshape(len(steps), len(part), len(steps), len(part))
-    return np.einsum("ipjq,p,q->ij", values, weight, weight)
+def measure(observations: Observations) -> Estimates:
+    """Contrast of the light and f-number of the pupil, from frames of a spot on a surface that was moved between them."""
+    found = observations.speckle
+    names = {"contrast_rel": "contrast_rel", "f_number": "airy_px"}
+    fit = of_pictures(
+        None if found is None else found.fit, names, where="scene.speckle", pictures="a laser spot on a moved surface", kind="speckle"
+    )
+    if "contrast_rel" in fit and 1 < fit["contrast_rel"].value < 1 + LARGEST_U * fit["contrast_rel"].u:
+        values = fit.values.copy()
+        values[fit.index("contrast_rel")] = 1.0
+        fit = replace(fit, values=values)
+    stated, usual = observations.stated, Speckle()
+    if found is None or "contrast_rel" not in fit or fit.limits:
+        return fit
+    if "f_number" not in fit:  # grains smaller than a pixel: with what is stated, or a limit of the contrast
+        rows = [("f_number", stated.f_number, "1"), ("wavelength_nm", found.wavelength_nm, "nm"), ("pitch_um", stated.pitch_x_um, "µm")]
+        return fit.join(Estimates.from_rows([(name, value, 0.0, np.inf, unit) for name, value, unit in rows if value is not None]))
+    wavelength_nm, pitch_um = found.wavelength_nm or usual.wavelength_nm, stated.pitch_x_um or usual.pitch_um
+    unknown = " and ".join(n for n, v in (("wavelength", found.wavelength_nm), ("pitch", stated.pitch_x_um)) if v is None)
+    known = Estimates.from_rows([("wavelength_nm", wavelength_nm, 0.0, np.inf, "nm"), ("pitch_um", pitch_um, 0.0, np.inf, "µm")])
+    lens = fit.scaled({"f_number": (1e3 * pitch_um / wavelength_nm, "1")})
+    told = "the grains tell its product with the wavelength over the pitch"
+    with_u = f": {wavelength_nm:g} nm and {pitch_um:g} µm are assumed ({unknown} not stated)" if unknown else ""
+    return replace(lens.join(known), reasons={**lens.reasons, "f_number": told + with_u}, confounders=fit.confounders)
 
 
 def propagate(params: Speckle, probe: Probe) -> Contribution:
@@ -77,6 +85,7 @@ SOURCE = Source(
     neutral=Speckle(),
     typical=Speckle(contrast_rel=0.5),
     bound=Speckle(contrast_rel=1.0, f_number=16.0),
+    measure=measure,
     propagate=propagate,
     option="laser light",
     gum_class="O",
@@ -90,7 +99,6 @@ SOURCE = Source(
     advice="Open the lens, take light of low coherence, move the surface or a diffuser, and average frames with different speckle.",
     reasons={
         "forward": "it belongs to the scene: a `spot` in a scene file is a laser spot with speckle",
-        "measure": "needs frames of a fixed spot on a surface that is moved between them: the scatter of its centre",
         "correct": "the grains cannot be told from the spot; frames with different speckle can be averaged",
     },
 )
