@@ -11,6 +11,7 @@ from pixmetry.assess.self_test import SelfTest
 from pixmetry.budget.monte_carlo import Crop
 from pixmetry.budget.records import SUM, Budget
 from pixmetry.camera.camera import Camera
+from pixmetry.camera.frame_sequence import FrameSequences
 from pixmetry.camera.observations import (
     ActiveArea,
     BrightSpots,
@@ -114,6 +115,7 @@ class Assessment:
             if self.observations.dark_temperatures is None
             else dark_temperatures_record(self.observations.dark_temperatures),
             "light_off": None if self.observations.light_off is None else light_off_record(self.observations.light_off),
+            "sequences": None if self.observations.sequences is None else sequences_record(self.observations.sequences),
             "edges": None if self.observations.edges is None else edges_record(self.observations.edges),
             "blocks": None if self.observations.blocks is None else blocks_record(self.observations.blocks, self.observations.storage),
             "active_area": None if self.observations.area is None else area_record(self.observations.area),
@@ -260,6 +262,30 @@ def light_off_record(found: LightSteps) -> dict[str, Any]:
         for s in found.steps
     ]
     return {"values": found.fit.to_records(), "refused": list(found.refused), "sequences": each}
+
+
+def sequences_record(found: FrameSequences) -> dict[str, Any]:
+    """The plain record of frames in a row: what they tell together, and the gain of each frame."""
+    each = [
+        {
+            "frames": len(s.level_dn),
+            "interval_s": s.interval_s or None,
+            "exposure_s": s.exposure_s or None,
+            "static_share": s.static_share,
+            "changes": s.changes,
+            "gain_rel": s.gain_rel.tolist(),
+            "u_gain_rel": np.sqrt(s.covariance[:, 0, 0]).tolist(),
+            "offset_dn": s.offset_dn.tolist(),
+            "u_offset_dn": np.sqrt(s.covariance[:, 1, 1]).tolist(),
+            "gain_share": s.gain_share if np.isfinite(s.u_gain_share) else None,
+            "u_gain_share": s.u_gain_share if np.isfinite(s.u_gain_share) else None,
+            "black_moves_dn": s.black_moves_dn,
+            "wave": None if s.wave is None else asdict(s.wave),
+            "loop": _joint_record(s.loop),
+        }
+        for s in found.sequences
+    ]
+    return {"loop": _joint_record(found.loop), "lamp": _joint_record(found.lamp), "refused": list(found.refused), "sequences": each}
 
 
 def area_record(found: ActiveArea) -> dict[str, Any]:

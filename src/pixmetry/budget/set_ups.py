@@ -140,6 +140,15 @@ SET_UPS = {
             (_series("border", 8),),
         ),
         SetUp(
+            "sequence",
+            "A bright patch that comes and goes",
+            "Frames in a row without a pause, nothing moves but a bright patch, a quarter of the frame, that comes and goes every 7 to 20 "
+            "frames. Once more at a frame rate that is 1 % off. Of a rolling shutter state line_time_us.",
+            "Brightest parts at 70 % of saturation, at most 4 ms; the camera's automatic gain as it is in use.",
+            "loop of the gain to 1e-3, flicker to 1e-3 of the light",
+            tuple(_series("sequence", 80, exposure_s="<t>", interval_s=f"<time from frame to frame {k}>") for k in (1, 2)),
+        ),
+        SetUp(
             "series",
             "A fixed field over time",
             "The chart, fixed to the camera's base; camera and frame grabber switched on at the first frame.",

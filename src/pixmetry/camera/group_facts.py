@@ -26,9 +26,9 @@ class GroupFacts:
     white : bool or None
         True: the frames show a white sheet in place of the chart, in the same light.
     times_s : tuple of float, or None
-        When each frame of a series was taken.
+        When each frame of a series or sequence was taken.
     interval_s : float or None
-        Time from frame to frame of a series.
+        Time from frame to frame of a series or sequence.
     on_for_s : float or None
         How long the camera had been on when the first frame of a series was taken.
     recorded : bool or None

@@ -16,6 +16,7 @@ import numpy as np
 from pixmetry.camera.code_table import CodeTable
 from pixmetry.camera.covered import Covered
 from pixmetry.camera.drift_series import DriftSeries
+from pixmetry.camera.frame_sequence import FrameSequences
 from pixmetry.camera.motion_series import MotionSeries
 from pixmetry.camera.noise_covariance import NoiseCovariance, NoiseFilter
 from pixmetry.camera.response import Response
@@ -775,6 +776,7 @@ class Observations:
     drift: DriftSeries | None = None
     motion: MotionSeries | None = None
     speckle: SpeckleFrames | None = None
+    sequences: FrameSequences | None = None
     failed: Mapping[str, str] = field(default_factory=dict)  # by kind of frames: why they tell nothing
     storage: Storage = Storage()
     notes: tuple[str, ...] = field(default_factory=tuple)

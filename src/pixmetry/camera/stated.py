@@ -13,6 +13,8 @@ class StatedFacts:
     ----------
     interface : {"digital", "analogue"}
     pixel_clock_mhz : float or None
+    line_time_us : float or None
+        From row to row as they are read; of two fields from line to line.
     pitch_x_um, pitch_y_um : float or None
     wavelength_nm : float or None
         Of the light.
@@ -24,6 +26,7 @@ class StatedFacts:
 
     interface: str = "digital"
     pixel_clock_mhz: float | None = None
+    line_time_us: float | None = None
     pitch_x_um: float | None = None
     pitch_y_um: float | None = None
     wavelength_nm: float | None = None

@@ -32,6 +32,7 @@ TARGETS = (
     "series",
     "motion",
     "speckle",
+    "sequence",
 )  # pictures of something to measure; one frame may be enough
 LOCATED = ("series", "motion")  # kinds whose frames are measured one by one, for their targets
 LOSSY = ("pattern", "speckle")  # kinds whose files may be JPEG
@@ -44,6 +45,7 @@ FACTS = {  # what else may be said of a group, by its kind
     "series": ("times_s", "interval_s", "on_for_s"),
     "motion": ("times_s", "interval_s", "pulsed"),
     "speckle": ("wavelength_nm",),
+    "sequence": ("times_s", "interval_s"),
 }
 
 
@@ -59,6 +61,7 @@ class CameraFacts:
     sensor: str | None = None  # "ccd" or "cmos"
     temperature_c: float | None = None
     pixel_clock_mhz: float | None = None
+    line_time_us: float | None = None  # from row to row as they are read; of two fields from line to line
     cfa: str | None = None  # colour filter of a mosaic: the colours of pixels (0,0), (0,1), (1,0), (1,1), e.g. "RGGB"
     vendor: str | None = None
     model: str | None = None
@@ -172,6 +175,7 @@ class Campaign:
         return StatedFacts(
             interface=c.interface,
             pixel_clock_mhz=c.pixel_clock_mhz,
+            line_time_us=c.line_time_us,
             pitch_x_um=c.pitch_x_um,
             pitch_y_um=c.pitch_y_um or c.pitch_x_um,
             wavelength_nm=self.optics.wavelength_nm,

@@ -55,6 +55,7 @@ class CameraModel(Model):
     sensor: Literal["ccd", "cmos", "cid"] | None = None
     temperature_c: Annotated[float, Field(ge=-273.15)] | None = None
     pixel_clock_mhz: Positive | None = None
+    line_time_us: Annotated[float, Field(gt=0, le=1e5)] | None = None
     cfa: Literal["RGGB", "BGGR", "GRBG", "GBRG"] | None = None
     vendor: Text | None = None
     model: Text | None = None
@@ -115,6 +116,7 @@ class GroupModel(Model):
         "series",
         "motion",
         "speckle",
+        "sequence",
     ]
     exposure_s: Annotated[float, Field(ge=0)] | None = None
     photons: Annotated[float, Field(ge=0)] | None = None
@@ -191,6 +193,8 @@ class GroupModel(Model):
         if self.kind in ("series", "motion") and (self.times_s is None) == (self.interval_s is None):
             what = f"frames of kind {self.kind} without times" if self.times_s is None else "times are given twice"
             raise InputError(what, allowed="times_s (one for each frame) or interval_s", remedy="give one of them")
+        if self.kind == "sequence" and self.times_s is not None and self.interval_s is not None:
+            raise InputError("times are given twice", allowed="times_s or interval_s", remedy="delete one of them")
         return self
 
     def facts(self) -> GroupFacts:

@@ -20,6 +20,7 @@ from pixmetry.observe.line_jitter import with_jitter
 from pixmetry.observe.lines import LineFrames, places_of_rows
 from pixmetry.observe.patches import find_patches
 from pixmetry.observe.response_fit import response_of, with_response
+from pixmetry.observe.sequence import SequenceSums, reduce_sequences
 from pixmetry.observe.spots import reduce_spots
 
 
@@ -82,6 +83,7 @@ EXPERIMENTS = {
         Experiment("dark_temperature", reduce_dark_temperatures),
         Experiment("border", reduce_borders),
         Experiment("speckle", reduce_speckle, SpotCrops),
+        Experiment("sequence", reduce_sequences, SequenceSums),
     )
 }
 

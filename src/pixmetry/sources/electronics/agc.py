@@ -6,9 +6,11 @@ import numpy as np
 from pydantic import model_validator
 
 from pixmetry.camera.contribution import Contribution, Probe
+from pixmetry.camera.observations import Observations, of_pictures
 from pixmetry.camera.signal import Kind, Signal, Windows
 from pixmetry.camera.source import Parameters, Source, quantity
-from pixmetry.core.errors import ParameterError
+from pixmetry.core.errors import MeasureError, ParameterError
+from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
 
 DARKEST_DN = 1e-6  # a frame without light asks for all the gain there is
@@ -58,6 +60,20 @@ def context(params: Agc, windows: Windows, frame_shape: tuple[int, int]) -> Wind
     return windows.full_frame(frame_shape) if params.kappa else windows
 
 
+def measure(observations: Observations) -> Estimates:
+    """Loop gain, target and limits from frames in a row in which a part of the scene changes: see `pixmetry.observe.gain_loop`.
+
+    A gain that is locked has a ``kappa`` of 0.
+    """
+    found = observations.sequences
+    names = ("kappa", "target_dn", "lowest_db", "highest_db")
+    fit = None if found is None else found.loop
+    told = of_pictures(fit, {n: n for n in names}, where="electronics.agc", pictures="a scene that changes, in a row", kind="sequence")
+    if "kappa" not in told:
+        raise MeasureError(found.loop.reasons["kappa"] if found is not None else "no sequence", where="electronics.agc")
+    return told
+
+
 def propagate(params: Agc, probe: Probe) -> Contribution:
     """A common factor moves no centroid whose background and threshold follow it, unless it lifts the target beyond the scale's end.
 
@@ -93,6 +109,7 @@ SOURCE = Source(
     typical=Agc(kappa=0.3, highest_db=16.0),
     bound=Agc(kappa=0.3, highest_db=32.0),
     forward=forward,
+    measure=measure,
     propagate=propagate,
     context=context,
     start=start,
@@ -102,7 +119,6 @@ SOURCE = Source(
     references=("K. J. Åström, R. M. Murray, Feedback Systems, Princeton 2008 (first-order discrete loop)",),
     advice="Switch it off.",
     reasons={
-        "measure": "needs a sequence in which part of the scene changes: frames of steady light do not move the gain",
         "correct": "a frame does not contain its gain; lock the gain, or set the threshold relative to the target's peak",
     },
 )

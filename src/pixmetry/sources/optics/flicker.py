@@ -9,9 +9,12 @@ from typing import Literal
 import numpy as np
 
 from pixmetry.camera.light import Light
+from pixmetry.camera.observations import Observations, of_pictures
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
 from pixmetry.core.arrays import Array
+from pixmetry.core.errors import MeasureError
+from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
 
 
@@ -113,6 +116,20 @@ def forward(params: Flicker, signal: Signal, stream: Stream) -> Signal:
     return signal.with_light(LampLight(**fields, lamps=(params,)))
 
 
+def measure(observations: Observations) -> Estimates:
+    """Depth and frequency from frames in a row: the wave of their light, over what the exposure leaves of it.
+
+    Phase 0 is that of no particular time, and is not measured.
+    """
+    found = observations.sequences
+    fit = None if found is None else found.lamp
+    names, where = {"depth_rel": "depth_rel", "frequency_hz": "frequency_hz"}, "optics.flicker"
+    told = of_pictures(fit, names, where=where, pictures="frames in a row under the lamp", kind="sequence")
+    if "depth_rel" not in told:
+        raise MeasureError(fit.reasons["depth_rel"] if fit is not None else "no sequence", where=where)
+    return told
+
+
 def truth(params: Flicker, signal: Signal, stream: Stream) -> Mapping[str, np.ndarray]:
     """The lamp's light over the exposure of a shutter that opens for all rows at once, shape (n, rows)."""
     level = mean_light(params, signal.time_s, signal.time_s + signal.exposure_s)
@@ -132,13 +149,13 @@ SOURCE = Source(
     bound=Flicker(depth_rel=1.0),
     forward=forward,
     truth=truth,
+    measure=measure,
     gum_class="F",
     equation="E(t) = 1 + d cos(2π f t + φ);  over an exposure d sinc(f t_exp) cos(2π f t_mid + φ), t_mid of each row",
     typical_size="none at 10 ms and 100 Hz; at 1 ms nearly the full modulation of the lamp, in bands with a period of 1/(f t_row) rows",
     references=("IEEE 1789-2015 (modulation of the light of diodes)",),
     advice="Use direct current, or expose for a whole number of the light's periods.",
     reasons={
-        "measure": "needs successive flat frames: the row means over time are a wave with the lamp's frequency",
         "correct": "needs the lamp's phase in every frame: divide rows by their means if the scene is known",
         "propagate": "needs the row times of the camera, which the probe does not contain; a common factor moves no centre",
     },
