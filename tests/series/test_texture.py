@@ -7,11 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from PIL import Image
 from scipy import stats
 
 from pixmetry import series
 from pixmetry.cli import main
-from pixmetry.core.errors import MeasureError
+from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.files.images import write_frame
 from pixmetry.series.job import measure_series
 from pixmetry.series.texture import texture_of
@@ -77,6 +78,17 @@ def test_what_hides_a_place_is_not_taken_for_motion(rng: np.random.Generator) ->
     found = texture.find(frame, "f", 0.0)
     left = found.positions_px[:, 0] < 110
     assert not left.any() and len(found.positions_px) >= 6
+
+
+def test_a_channel_of_colour_frames_is_followed(rng: np.random.Generator, tmp_path: Path) -> None:
+    field = Field(rng)
+    for k in range(12):
+        grey = field.moved(0.02 * k, 0.0)
+        Image.fromarray(np.stack([grey // 2, grey, grey // 3], axis=-1)).save(tmp_path / f"{k:02d}.png")
+    with pytest.raises(InputError, match="--channel green"):
+        series(tmp_path, interval_s=60.0)
+    moved = series(tmp_path, interval_s=60.0, channel="green").drift.values[:, 0]
+    np.testing.assert_allclose(moved - moved[0], 0.02 * np.arange(12), atol=0.02)
 
 
 def test_nothing_to_follow_is_refused(rng: np.random.Generator) -> None:

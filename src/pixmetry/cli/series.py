@@ -56,6 +56,7 @@ WAIT_S = 2.0  # between looks into a folder that fills
     "--polarity", type=click.Choice(["auto", "bright", "dark"]), default="auto", show_default=True, help="Of the targets on their ground."
 )
 @click.option("--noise", metavar="CAMERA|KEY=NUMBER,…", help="Noise of the image, as of locate. Default: estimated from each image.")
+@click.option("--channel", type=click.Choice(["red", "green", "blue"]), help="Channel to use of colour images.")
 @click.option("--bits", type=click.IntRange(1, 16), help="Bits of a stored value. Default: from the image.")
 @click.option("--raw", metavar="WxH:FORMAT", help="Layout of files without a header, e.g. 1920x1200:Mono12p (GenICam's names).")
 @click.option("--follow", is_flag=True, help="Wait for new frames, and tell after each of them; Ctrl-C ends and writes the report.")

@@ -46,6 +46,7 @@ def series(
     interface: str = "digital",
     pixel_clock_mhz: float | None = None,
     tolerance_px: float = 0.05,
+    channel: str | None = None,
     raw: str | RawLayout | None = None,
     progress: Progress | None = None,
     **options: Any,
@@ -71,6 +72,8 @@ def series(
         Of the frame grabber; a delay of the lines in ns needs it.
     tolerance_px : float
         Displacement of the farthest corner within which the camera is called stable.
+    channel : {"red", "green", "blue"}, optional
+        Of colour images.
     raw, **options
         As of `pixmetry.locate`: ``kind``, ``polarity``, ``noise``, ``bits``, ``estimator``. ``kind`` may be "texture": places of the first
         frame with gradients along both axes are found again in the others. Without a kind the targets are discs; where the frames show
@@ -109,13 +112,14 @@ def series(
     model = noise_model(options.pop("noise", None))
     seconds, notes = times_of(files, interval_s, times)
     named = [
-        (name, on_for_s + time, lambda path=path: load_picture(path, None, layout).array)
+        (name, on_for_s + time, lambda path=path: load_picture(path, channel, layout).array)
         for path, name, time in sorted(zip(files, names_of(files), seconds, strict=True), key=lambda one: one[2])
     ]
     log = SeriesLog()
     if output is not None:
         check_output(output, KIND, tuple(map(str, given)), files)
-        told = {name: str(value) for name, value in {**options, "noise": model, "raw": layout}.items() if value is not None}
+        whole = {**options, "noise": model, "raw": layout, "channel": channel}
+        told = {name: str(value) for name, value in whole.items() if value is not None}
         log = SeriesLog(Path(f"{str(output).rstrip('/')}.frames.jsonl"), told)
         for path, name in zip(files, names_of(files), strict=True):
             if _holder(path).stat().st_mtime > log.written_s:  # another frame of the same name
