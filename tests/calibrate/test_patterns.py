@@ -14,6 +14,7 @@ from pixmetry.calibrate.bundle.model import NAMES
 from pixmetry.calibrate.bundle.network import SCALE
 from pixmetry.calibrate.bundle.solve import calibrate_network
 from pixmetry.calibrate.checks.added_terms import AddedTerms, derivatives
+from pixmetry.calibrate.checks.causes import causes_of
 from pixmetry.calibrate.checks.patterns import MEANING, pattern_findings, residual_patterns
 from pixmetry.calibrate.records import Pattern
 from pixmetry.camera.catalogue import sources
@@ -145,6 +146,9 @@ def planted(name: str, rng, simulated: Simulated, exact: np.ndarray) -> tuple[np
     if name == "field":
         step = 0.06 * np.where((x > 700) ^ (y > 900), 1, -1)
         return step, -step, np.nan
+    if name == "seams":
+        step = 0.06 * np.where(x > (SENSOR.cols - 1) / 2, 1, -1)
+        return zero, step, np.nan
     if name == "radius":
         r = np.hypot(x - middle_x, y - middle_y)
         ring = 0.15 * np.sin(2 * np.pi * r / 500) / np.maximum(r, 1)
@@ -218,7 +222,18 @@ def test_findings_come_with_a_source_of_the_catalogue():
     known = set(sources())
     assert {source for _, source, _ in MEANING.values() if source} <= known
     made = [
-        Pattern(name, "a", 0.01, None, p, significant=p < 1e-3, text=name, source=MEANING[name][1], advice="do this")
+        Pattern(
+            name,
+            "a",
+            0.01,
+            None,
+            p,
+            significant=p < 1e-3,
+            text=name,
+            source=MEANING[name][1],
+            advice="do this",
+            causes=tuple(cause.text for cause in causes_of(name, MEANING[name][1], None)),
+        )  # fmt: skip
         for name, p in (("phase_x", 1e-5), ("field", 0.3), ("radius", 1e-9))
     ]
     findings = pattern_findings(made)

@@ -9,19 +9,27 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from pixmetry.calibrate.bundle.model import NAMES, CameraModel
+from pixmetry.calibrate.checks.causes import STRONG
 from pixmetry.calibrate.files.record import StoredCalibration, read_calibration
-from pixmetry.calibrate.records import Calibration
+from pixmetry.calibrate.records import Calibration, FieldSources, HeightMap, ImageScales, Seams
 from pixmetry.camera.camera import Camera, Element
 from pixmetry.camera.catalogue import get_source
+from pixmetry.camera.geometry import corner_px
 from pixmetry.camera.observations import AFFINITY, LENS, TAKEN_UP, CameraGeometry, Observations
 from pixmetry.camera.provenance import MEASURED
 from pixmetry.core.errors import InputError
 from pixmetry.core.number import Estimates
 
+UNFLATNESS, PIXEL_GEOMETRY, CLOCK_WARM_UP = "sensor.unflatness", "sensor.pixel_geometry", "grabber.clock_warm_up"
+HEIGHTS = {(2, 0): "bow_x_um", (0, 2): "bow_y_um", (1, 1): "twist_um", (3, 0): "skew_x_um", (0, 3): "skew_y_um"}
+WITHOUT_LENS = "without what lens and poses take up, as all that depends on the radius alone"
+RARE = 1e-3
+MOST_U_TAU = 0.5  # relative uncertainty above which a decay is not told
 GRID = 25  # places along each side of the frame
 LARGEST_PX = 0.05  # two models that differ by more are not the same camera
 POLYNOMIAL = ("p1_per_mm", "p2_per_mm", "k1_per_mm2", "k2_per_mm4", "k3_per_mm6", "k4_per_mm8", "k5_per_mm10")
@@ -74,6 +82,7 @@ def calibrated_geometry(
         remedy = "name it from Python: assess(…, calibration=calibrated_geometry(file, NAME))"
         raise InputError("the calibration has several cameras", value=camera, allowed=", ".join(names), remedy=remedy)
     k = 0 if camera is None else names.index(camera)
+    by_residuals = (calibration.tests.field_sources or {}).get(names[k])
     record, grid = (calibration.tests.residuals or {}).get(names[k]), (calibration.tests.projection or {}).get(names[k])
     if record is None or grid is None or not record.n:
         raise InputError("no image coordinate of this camera took part", where=names[k], remedy="calibrate it, or name another camera")
@@ -82,12 +91,27 @@ def calibrated_geometry(
     origin = f"calibration of {names[k]}, {sensor.cols} × {sensor.rows} px"
     u = float(np.sqrt(np.nanmean(grid.u_px**2)))
     model, (estimated, covariance) = models[k], covariances[k]
+    if by_residuals is not None and by_residuals.height is not None and by_residuals.height.found:
+        model, covariance = beside_height(model, estimated, covariance, by_residuals.height)
     if sensor.pitch_x_um is None:
         if pitch_um is None:
             remedy = "calibrate with pitch_um, or state the pitch in the campaign"
             raise InputError("a calibration in pixels, and the pixel pitch is not known", where=model.name, remedy=remedy)
         model, covariance = with_pitch(model, estimated, covariance, pitch_um)
-    return geometry_of(model, estimated, covariance, dof=dof, u_px=(u, u), left_px=left, origin=origin)
+    geometry = geometry_of(model, estimated, covariance, dof=dof, u_px=(u, u), left_px=left, origin=origin)
+    told, untold = told_by_residuals(by_residuals, geometry, model) if by_residuals is not None else ({}, {})
+    return replace(geometry, told=told, untold=untold)
+
+
+def beside_height(model: CameraModel, names: tuple[str, ...], covariance: np.ndarray, height: HeightMap) -> tuple[CameraModel, np.ndarray]:
+    """The model, and the covariance of its parameters, of an adjustment that had estimated the height of the sensor too."""
+    change = np.zeros((len(names), len(height.coefficients_px)))
+    for row, name in zip(height.lens_change, height.lens_names, strict=True):
+        if name in names:
+            change[names.index(name)] = row
+    step = change @ height.coefficients_px
+    values = {name: model[name] + float(part) for name, part in zip(names, step, strict=True)}
+    return model.with_values(**values), covariance + change @ height.covariance_px2 @ change.T
 
 
 def with_pitch(
@@ -212,6 +236,117 @@ def _fitted(model: CameraModel, high: bool) -> tuple[np.ndarray, float]:
     return np.concatenate([fit.x, np.zeros(len(scale) - count)]) * scale, float(np.hypot(*misses(fit.x).reshape(2, -1)).max())
 
 
+def told_by_residuals(found: FieldSources, geometry: CameraGeometry, model: CameraModel) -> tuple[dict[str, Estimates], dict[str, str]]:
+    """What the residuals tell, in the parameters of the sources, and why they do not tell the others.
+
+    Parameters
+    ----------
+    found : FieldSources
+    geometry : CameraGeometry
+        With the pitch.
+    model : CameraModel
+    """
+    told: dict[str, Estimates] = {}
+    untold: dict[str, str] = {}
+    for source, made in (
+        (UNFLATNESS, lambda: _unflatness(found.height, geometry, model)),
+        (PIXEL_GEOMETRY, lambda: _pixel_geometry(found.seams, geometry.origin)),
+        (CLOCK_WARM_UP, lambda: _clock_warm_up(found.scales, model.interface, geometry.origin)),
+    ):
+        one = made()
+        if isinstance(one, str):
+            untold[source] = one
+        else:
+            told[source] = one
+    return told, untold
+
+
+def _unflatness(height: HeightMap | None, geometry: CameraGeometry, model: CameraModel) -> Estimates | str:
+    """Bow, twist and skew in µm, for chief rays from the principal distance; a height that was not found is 0 with its uncertainty."""
+    if height is None:
+        return "lens and poses take up all of a height here; take images rolled by 90 degrees, at several angles"
+    if not height.found and height.rivals:
+        return f"other patterns explain its residuals as well: {', '.join(height.rivals)}; two focal lengths tell them apart"
+    if not height.found and height.gain > STRONG:
+        return "displacements that no height makes are found with it; look at the patterns in the residuals"
+    pitch = geometry.lens["pitch_x_um"].value
+    aspect = geometry.lens["pitch_y_um"].value / pitch
+    distance = geometry.lens["principal_distance_mm"]
+    tangent = corner_px((model.sensor.rows, model.sensor.cols), aspect) * pitch / (1000 * distance.value)
+    degrees = list(zip(height.across, height.down, strict=True))
+    rows = [degrees.index(one) for one in HEIGHTS]
+    values, covariance = pitch * height.coefficients_px, pitch**2 * height.covariance_px2
+    settings: dict[str, Any] = {}
+    if not height.found:
+        covariance = covariance + np.outer(values, values)  # as far as the estimate lies from 0, which is taken
+        values = np.zeros_like(values)
+        reason = "no height was found: 0, with what the residuals allow; " + WITHOUT_LENS
+    else:
+        reason = WITHOUT_LENS
+        if len(degrees) > len(HEIGHTS):
+            more = np.zeros((5, 5))
+            for (i, j), value in zip(degrees, values, strict=True):
+                if (i, j) not in HEIGHTS:
+                    more[j, i] = value
+            settings["more_um"] = tuple(map(tuple, more.tolist()))
+            reason += "; the uncertainty of the shapes of the third and fourth degree beside them is not held"
+    n = len(rows)
+    full = np.zeros((n + 3, n + 3))
+    full[:n, :n] = covariance[np.ix_(rows, rows)]
+    chief = float(np.degrees(np.arctan(tangent)))
+    full[n, n] = (np.degrees(tangent / (1 + tangent**2)) * distance.u / distance.value) ** 2
+    names = (*HEIGHTS.values(), "chief_ray_deg", "pitch_x_um", "pitch_y_um")
+    dof = np.full(n + 3, np.inf)
+    dof[:n] = height.dof
+    return Estimates(
+        names, np.array([*values[rows], chief, pitch, aspect * pitch]), full, dof, (*["µm"] * n, "deg", "µm", "µm"),
+        method=f"residuals of the {geometry.origin}, {height.rank} shapes told", confounders=("optics.distortion",),
+        reasons={**dict.fromkeys(HEIGHTS.values(), reason), "chief_ray_deg": "rays from the principal distance are assumed"},
+        settings=settings,
+    )  # fmt: skip
+
+
+def _pixel_geometry(seams: Seams | None, origin: str) -> Estimates | str:
+    if seams is None:
+        return "lens and poses take up all steps between parts of the frame"
+    if seams.gain > STRONG and not seams.found:
+        return "steps between parts of the frame are seen, but other patterns explain them as well; take images rolled by 90 degrees"
+    method = f"steps between {seams.fields_x} × {seams.fields_y} fields in the residuals of the {origin}"
+    if seams.found:
+        fields: dict[str, Any] = {"fields_x": seams.fields_x, "fields_y": seams.fields_y}
+        row = ("field_std_px", seams.std_px, seams.u_std_px, seams.dof, "px")
+        reason = f"of {seams.fields_x} × {seams.fields_y} fields, from their steps; targets average over the places of single pixels"
+        return Estimates.from_rows([row], method=method, settings=fields, reasons={"field_std_px": reason})
+    row = ("field_std_px", seams.limit_px, seams.limit_px / 2, seams.dof, "px")
+    reason = "no step is seen, with up to eight fields; targets average over the places of single pixels"
+    return Estimates.from_rows([row], method=method, limits=frozenset({"field_std_px"}), reasons={"field_std_px": reason})
+
+
+def _clock_warm_up(scales: ImageScales | None, interface: str | None, origin: str) -> Estimates | str:
+    """Scale error of the clock at the first image, and its time constant."""
+    if interface == "digital":
+        return "the camera is digital: no frame grabber samples its lines"
+    if scales is None:
+        return "too few images"
+    if interface is None:
+        return "it is not told whether a frame grabber samples the lines; calibrate with interface: analogue if so"
+    if scales.time_s is None or scales.covariance is None:
+        return "the images have no times (time_s in the table of images)"
+    u = np.sqrt(np.diag(scales.covariance))
+    if scales.gain <= STRONG:
+        size = "differ from image to image, but do not decay: the synchronisation scatters" if scales.p_differ < RARE else "are all alike"
+        return f"the x-scales {size}"
+    if u[1] > MOST_U_TAU * scales.tau_s or u[0] > MOST_U_TAU * abs(scales.start):
+        return "the images end long before the clock has settled; take some an hour and more after switching on"
+    reasons = {"scale_error_rel": "at the first image, which is taken for the time of switching on"}
+    if scales.p_left is not None and scales.p_left < RARE:
+        reasons["scale_tau_s"] = "the x-scales scatter about the decay; its uncertainty holds that"
+    return Estimates(
+        ("scale_error_rel", "scale_tau_s"), np.array([scales.start, scales.tau_s]), scales.covariance, np.full(2, np.inf), ("1", "s"),
+        method=f"x-scales of the images of the {origin}", confounders=("sensor.affinity",), reasons=reasons,
+    )  # fmt: skip
+
+
 def calibrated_camera(camera: Camera, geometry: CameraGeometry) -> Camera:
     """The camera with the calibrated lens and affinity, and without the sources that the calibration includes.
 
@@ -245,5 +380,23 @@ def calibrated_camera(camera: Camera, geometry: CameraGeometry) -> Camera:
         found = source.measure(seen)
         params = source.make({e.name: e.value for e in found}, where=f"{geometry.origin}, {name}")
         chain.insert(at, Element(name, source, params, known_from=MEASURED, estimates=found))
+    for name in geometry.told:
+        chain = _with_told(chain, name, at + 2, seen, geometry.origin)
     facts = {"calibration": geometry.origin, "principal_distance_mm": geometry.lens["principal_distance_mm"].value}
     return replace(camera, chain=tuple(chain), facts={**camera.facts, **facts})
+
+
+def _with_told(chain: list[Element], name: str, at: int, seen: Observations, origin: str) -> list[Element]:
+    """The chain with what the residuals tell of a source; one that they only bound is not put into a camera without it."""
+    found = seen.by_residuals(where=name)
+    there = next((i for i, e in enumerate(chain) if e.source.id == name), None)
+    source = get_source(name, "calibrated camera")
+    if there is None and (name != UNFLATNESS or not found.values[: len(HEIGHTS)].any()):
+        return chain
+    values = {e.name: e.value for e in found if not e.is_limit} | dict(found.settings)
+    before = {} if there is None else chain[there].params.model_dump()
+    if name == UNFLATNESS:
+        before |= {"more_um": ()}
+    params = source.make({**before, **values}, where=f"{origin}, {name}")
+    made = Element(name if there is None else chain[there].name, source, params, known_from=MEASURED, estimates=found)
+    return [*chain[:at], made, *chain[at:]] if there is None else [*chain[:there], made, *chain[there + 1 :]]

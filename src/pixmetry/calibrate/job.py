@@ -31,7 +31,7 @@ __all__ = ["StoredCalibration", "calibrate", "read_calibration"]
 
 PROJECT_ENDINGS = (".yaml", ".yml")
 # What is said with pictures, and the keys of a project's ``cameras`` and ``pictures`` that mean the same.
-CAMERA_KEYS = {"camera": "camera", "direction": "direction", "pixel_um": "pitch_um", "c_mm": "c_mm", "c_px": "c_px"}
+CAMERA_KEYS = {name: name for name in ("camera", "interface", "direction", "c_mm", "c_px")} | {"pixel_um": "pitch_um"}
 PICTURE_KEYS = {
     **{name: name for name in ("kind", "grid", "polarity", "channel", "raw", "noise")},
     **{f"{name}_mm": name for name in ("pitch", "side", "diameter")},
@@ -73,8 +73,9 @@ def calibrate(
     **pictures
         For pictures: ``kind`` ("chessboard", "dots", "coded", "squares" or "lines"), ``grid`` ("9x6"), ``pitch_mm`` (spacing of the
         targets), ``side_mm``, ``diameter_mm`` (of squares and dots), ``polarity``, ``channel``, ``raw`` ("1920x1200:Mono12p", of files
-        without a header), ``noise``; and of the camera: ``camera`` (a preset or camera file, which brings the pitch), ``direction``,
-        ``pixel_um`` (pitch of the pixels), ``c_mm`` or ``c_px``.
+        without a header), ``noise``; and of the camera: ``camera`` (a preset or camera file, which brings the pitch), ``interface``
+        ("digital" or "analogue": whether a frame grabber samples its lines), ``direction``, ``pixel_um`` (pitch of the pixels), ``c_mm``
+        or ``c_px``.
 
     Returns
     -------

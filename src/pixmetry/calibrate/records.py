@@ -689,6 +689,13 @@ class Pattern:
     source : str
         Of the catalogue of error sources; empty: none.
     text, advice : str
+    causes : tuple of str
+        What may have made it, in words; of several one.
+    gain : float
+        What it explains beside the patterns that were chosen before, as a difference of Schwarz's criterion (see
+        `pixmetry.calibrate.checks.causes`); above 10 its cause is named alone if no other explains the same as well.
+    behind : str
+        The pattern beside which it explains nothing more; empty: none.
     """
 
     name: str
@@ -704,11 +711,153 @@ class Pattern:
     source: str = ""
     text: str = ""
     advice: str = ""
+    causes: tuple[str, ...] = ()
+    gain: float = 0.0
+    behind: str = ""
 
     @property
     def alone(self) -> str | None:
         """The one image that differs from all others."""
         return None if self.by_image is None else self.by_image.alone
+
+
+@dataclass(frozen=True)
+class HeightMap:
+    """Height of a sensor's surface over its plane, as the residuals show it: without what lens and poses take up.
+
+    Heights are in pixels along x; positive is farther from the lens. They stand for displacements along the radius from the middle of the
+    frame, as rays from the principal distance make them.
+
+    Parameters
+    ----------
+    across, down : tuple of int, length k
+        Degrees of the Legendre polynomials along x and along y.
+    coefficients_px : ndarray, shape (k,)
+    covariance_px2 : ndarray, shape (k, k)
+        Of the combinations that are told; 0 for the others, whose coefficients are left at 0.
+    told : ndarray, shape (k, k)
+        What is told of any coefficients: this matrix times these.
+    rank : int
+        Number of combinations that are told.
+    dof : float
+    gain : float
+        As of `Pattern`, of the height beside all else.
+    p : float
+        Of an F-test of the height, and
+    p_turned : float
+        of displacements of the same shapes across the radius, which no height makes.
+    scatter_factor : float
+        Scatter of the images' contributions over what independent residuals would give; above 1, u is larger by it.
+    common_px : float
+        What residuals have in common in one cell of the frame; it is in u.
+    effective : float
+        Number of independent residuals that tell as much.
+    lens_names, lens_change : tuple of str, ndarray, shape (names, k)
+        By how much the camera's parameters change for a coefficient of 1 px, because they had taken up a part of the height.
+    x_px, y_px, height_px, u_px : ndarray
+        The map, and its standard uncertainty, shape (rows, cols).
+    found : bool
+        Whether it is what explains the residuals.
+    rivals : tuple of str
+        Patterns that explain them as well.
+    """
+
+    across: tuple[int, ...]
+    down: tuple[int, ...]
+    coefficients_px: np.ndarray
+    covariance_px2: np.ndarray
+    told: np.ndarray
+    rank: int
+    dof: float
+    gain: float
+    p: float
+    p_turned: float
+    scatter_factor: float
+    common_px: float
+    effective: float
+    lens_names: tuple[str, ...]
+    lens_change: np.ndarray
+    x_px: np.ndarray
+    y_px: np.ndarray
+    height_px: np.ndarray
+    u_px: np.ndarray
+    found: bool = False
+    rivals: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Seams:
+    """Steps between equal fields of the frame, as of a sensor that is exposed in several steps.
+
+    Parameters
+    ----------
+    fields_x, fields_y : int
+        Of the partition that explains most.
+    std_px, u_std_px, dof : float
+        Standard deviation of a field's place along each axis.
+    limit_px : float
+        One-sided 95 % limit of it.
+    gain : float
+        As of `Pattern`.
+    found : bool
+        Whether it is what explains the residuals.
+    steps_px, u_steps_px : ndarray, shape (fields, 2)
+        Displacement of each field, row by row, without what lens and poses take up.
+    """
+
+    fields_x: int
+    fields_y: int
+    std_px: float
+    u_std_px: float
+    dof: float
+    limit_px: float
+    gain: float
+    found: bool
+    steps_px: np.ndarray
+    u_steps_px: np.ndarray
+
+
+@dataclass(frozen=True)
+class ImageScales:
+    """Scale of x of each image, less their mean, and its decay with time.
+
+    Parameters
+    ----------
+    images : tuple of str
+    values, u : ndarray, shape (images,)
+    time_s : ndarray, shape (images,), or None
+        After the first image; None where the images have no times.
+    p_differ : float
+        Of an F-test of different scales against one.
+    p_left : float or None
+        Of an F-test of what a decay leaves; None without times.
+    gain : float
+        Of the decay, as of `Pattern`.
+    start, tau_s : float
+        Scale error of the first image, and time constant of its decay.
+    covariance : ndarray, shape (2, 2), or None
+        Of both.
+    """
+
+    images: tuple[str, ...]
+    values: np.ndarray
+    u: np.ndarray
+    time_s: np.ndarray | None
+    p_differ: float
+    p_left: float | None
+    gain: float = 0.0
+    start: float = 0.0
+    tau_s: float = np.nan
+    covariance: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class FieldSources:
+    """What the residuals of a camera tell of its error sources; None: nothing."""
+
+    height: HeightMap | None = None
+    seams: Seams | None = None
+    scales: ImageScales | None = None
 
 
 @dataclass(frozen=True)
@@ -1067,6 +1216,8 @@ class Tests:
     parameter_groups : tuple of GroupTest
     vision, correlations, residuals, f_test, curves, projection, variance_components, residual_grid : mapping
         Of `Vision`, `Correlations`, `CameraResiduals`, `FTest`, `DistortionCurves`, `ProjectionMap`, `CameraComponents`, `ResidualGrid`.
+    field_sources : mapping
+        Of `FieldSources`.
     correlations_with_poses : tuple of PoseCorrelation
     gross_errors : tuple of GrossError
         Largest statistic first.
@@ -1091,6 +1242,7 @@ class Tests:
     f_test: Mapping[str, FTest] | None = _if_made()
     gross_errors: tuple[GrossError, ...] | None = _if_made()
     patterns: tuple[Pattern, ...] | None = _if_made()
+    field_sources: Mapping[str, FieldSources] | None = _if_made()
     images: tuple[ImageRecord, ...] | None = _if_made()
     curves: Mapping[str, DistortionCurves] | None = _if_made()
     projection: Mapping[str, ProjectionMap] | None = _if_made()

@@ -635,6 +635,10 @@ class CameraGeometry:
         Systematic part of the calibration's residuals: what they have in common at one place of the frame.
     origin : str
         Where it comes from.
+    told : mapping
+        By source: its parameters as the residuals of the calibration tell them. Lens and affinity are those beside them.
+    untold : mapping
+        By source: why they tell nothing of it.
     """
 
     lens: Estimates
@@ -643,6 +647,8 @@ class CameraGeometry:
     left_x_px: float
     left_y_px: float
     origin: str
+    told: Mapping[str, Estimates] = field(default_factory=dict)
+    untold: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -938,6 +944,22 @@ class Observations:
     def choices(self, source: str) -> Mapping[str, Any]:
         """Parameters of a source that are no numbers, such as words, as the pictures tell them."""
         return {} if self.response is None else self.response.choices.get(source, {})
+
+    def by_residuals(self, *, where: str) -> Estimates:
+        """Take a source's parameters as the residuals of a calibration tell them, with their covariance.
+
+        Raises
+        ------
+        MeasureError
+            Without a calibration, or with the reason why its residuals do not tell them.
+        """
+        if self.geometry is None:
+            remedy = "calibrate the camera with images of targets and give the calibration"
+            raise MeasureError("not measured: needs the residuals of a calibration", where=where, remedy=remedy)
+        if where not in self.geometry.told:
+            unknown = "they were not examined: a camera needs 200 image points or more"
+            raise MeasureError(f"not told by the residuals of the calibration: {self.geometry.untold.get(where, unknown)}", where=where)
+        return self.geometry.told[where]
 
     def calibrated(self, names: Mapping[str, str] | Iterable[str], *, where: str) -> Estimates:
         """Take a source's parameters out of the calibrated geometry, with their covariance.

@@ -55,6 +55,12 @@ OPTIONS = ("field", "loss", "folds", "residual_grid", "snoop", "a_priori")
     "calibrated lens.",
 )
 @click.option(
+    "--interface",
+    type=click.Choice(["digital", "analogue"]),
+    help="Whether a frame grabber samples the camera's lines (analogue): patterns in the residuals then have other causes. Default: as the "
+    "preset says, else both are named.",
+)
+@click.option(
     "--pixel-um", type=click.FloatRange(0, min_open=True), help="Pixel pitch, µm. Without it, lengths in the camera are in pixels."
 )
 @click.option("--c-px", type=click.FloatRange(0, min_open=True), help="Start value of the principal distance, px.")

@@ -97,6 +97,8 @@ class CameraModel:
     free : ndarray of bool, shape (12,)
         Which of them an adjustment estimates.
     name : str
+    interface : {"digital", "analogue"} or None
+        Whether a frame grabber samples its lines; None: not told.
     """
 
     sensor: Sensor
@@ -104,6 +106,7 @@ class CameraModel:
     values: np.ndarray = field(default_factory=lambda: np.zeros(INTERIOR))
     free: np.ndarray = field(default_factory=lambda: np.isin(NAMES, TEN))
     name: str = "camera"
+    interface: str | None = None
 
     def __post_init__(self) -> None:
         if self.direction not in CODES:

@@ -109,6 +109,74 @@ class Terms:
     variance: float
 
 
+@dataclass(frozen=True)
+class Solved:
+    """Values of terms of least length where they are not determined, their cofactors, what they take from the sum of squares, and how
+    many combinations of them are determined."""
+
+    values: np.ndarray
+    inverse: np.ndarray
+    fall: float
+    rank: int
+
+
+@dataclass(frozen=True)
+class Normals:
+    """Normal equations of terms, whitened.
+
+    Parameters
+    ----------
+    full, left : ndarray, shape (k, k)
+        Gᵀ G of the terms as they are, and of what the estimated parameters leave of them.
+    right : ndarray, shape (k,)
+        Gᵀ v.
+    """
+
+    full: np.ndarray
+    left: np.ndarray
+    right: np.ndarray
+
+    def of(self, which: np.ndarray) -> Normals:
+        """Those of some of the terms alone."""
+        return Normals(self.full[np.ix_(which, which)], self.left[np.ix_(which, which)], self.right[which])
+
+    def combined(self, by: np.ndarray) -> Normals:
+        """Those of combinations of the terms, ``by`` of shape (k, j)."""
+        return Normals(by.T @ self.full @ by, by.T @ self.left @ by, by.T @ self.right)
+
+    def solved(self, weakest: float = WEAKEST) -> Solved:
+        """Solve for the combinations of which the estimated parameters leave at least the share ``weakest``."""
+        lengths = np.sqrt(np.diag(self.full))
+        lengths[lengths == 0] = 1.0  # a term that no observation sees is dropped below
+        values, vectors = np.linalg.eigh(self.left / np.outer(lengths, lengths))
+        good = values > weakest
+        inverse = (vectors[:, good] / values[good]) @ vectors[:, good].T / np.outer(lengths, lengths)
+        found = inverse @ self.right
+        return Solved(found, inverse, float(self.right @ found), int(good.sum()))
+
+
+@dataclass(frozen=True)
+class Beside:
+    """Terms beside the estimated parameters.
+
+    Parameters
+    ----------
+    rest : ndarray, shape (2 m, k)
+        What these leave of the terms, whitened; x, y, x, y, ….
+    length : ndarray, shape (k,)
+        Of the terms before.
+    change : ndarray, shape (estimated interior parameters, k)
+        By how much the cameras' parameters change with a term of size 1, camera by camera in the order of their names.
+    residual : ndarray, shape (2 m,)
+        Whitened.
+    """
+
+    rest: np.ndarray
+    length: np.ndarray
+    change: np.ndarray
+    residual: np.ndarray
+
+
 class AddedTerms:
     """The estimated parameters of an adjustment, ready to be held against terms that it did not estimate.
 
@@ -150,27 +218,44 @@ class AddedTerms:
         ValueError
             If the shape does not fit.
         """
-        from scipy import sparse, stats
+        from scipy import stats
 
-        if not sparse.issparse(terms):
-            terms = np.asarray(terms, float).reshape(2 * len(self.rows), -1)
-        white = self._blocks @ terms
-        full, b = _dense(white.T @ white), white.T @ self._residual
-        left = full - self._taken(white)
+        normals = self.normals(terms)
         if combinations is not None:
-            full, left, b = combinations.T @ full @ combinations, combinations.T @ left @ combinations, combinations.T @ b
-        lengths = np.sqrt(np.diag(full))
-        lengths[lengths == 0] = 1.0  # a term that no observation sees is dropped below
-        values, vectors = np.linalg.eigh(left / np.outer(lengths, lengths))
-        good = values > WEAKEST
-        inverse = (vectors[:, good] / values[good]) @ vectors[:, good].T / np.outer(lengths, lengths)
-        found, k = inverse @ b, int(good.sum())
-        fall, dof = float(b @ found), self.adjustment.dof - k
+            normals = normals.combined(combinations)
+        solved = normals.solved()
+        k, fall = solved.rank, solved.fall
+        dof = self.adjustment.dof - k
         if k == 0 or dof < 1:
-            return Terms(np.zeros(len(b)), np.full(left.shape, np.nan), 0.0, 1.0, 0, float(dof), 0.0, np.nan)
+            return Terms(np.zeros(len(solved.values)), np.full(solved.inverse.shape, np.nan), 0.0, 1.0, 0, float(dof), 0.0, np.nan)
         variance = max((self.adjustment.sigma0**2 * self.adjustment.dof - fall) / dof, 1e-300)
         f = fall / k / variance
-        return Terms(found, inverse * variance, f, float(stats.f.sf(f, k, dof)), k, float(dof), fall, variance)
+        return Terms(solved.values, solved.inverse * variance, f, float(stats.f.sf(f, k, dof)), k, float(dof), fall, variance)
+
+    def as_rows(self, terms: Any) -> Any:
+        """Terms as a matrix of 2 m rows."""
+        from scipy import sparse
+
+        return terms if sparse.issparse(terms) else np.asarray(terms, float).reshape(2 * len(self.rows), -1)
+
+    def normals(self, terms: Any) -> Normals:
+        """The normal equations of terms when the estimated parameters have taken what they can; terms as of `test`."""
+        white = self._blocks @ self.as_rows(terms)
+        full = _dense(white.T @ white)
+        return Normals(full, full - self._taken(white), np.asarray(white.T @ self._residual))
+
+    def beside(self, terms: np.ndarray) -> Beside:
+        """What the estimated parameters leave of terms, row by row, and by how much the terms change the cameras' parameters."""
+        white = self._blocks @ self.as_rows(terms)
+        by_point = self._alone_design.T @ white
+        over_points = self._point_inverse @ by_point
+        right = _dense(self._kept.T @ white - self._cross.T @ over_points) * self._scale[:, None]
+        from scipy import linalg
+
+        kept = linalg.cho_solve(self._factor, right) * self._scale[:, None]
+        points = over_points - self._point_inverse @ (self._cross @ kept)
+        rest = _dense(white) - self._kept @ kept - self._alone_design @ points
+        return Beside(np.asarray(rest), np.linalg.norm(_dense(white), axis=0), -kept[: self._interior], np.asarray(self._residual))
 
     def whitened_squares(self) -> Array:
         """Weighted square of the residual of each of the rows, shape (m,)."""
@@ -197,6 +282,7 @@ class AddedTerms:
             for q in np.flatnonzero(model.free):
                 entries.append((pair[mine].ravel(), np.full(2 * len(mine), column), d.by_interior[rows[mine], :, q].ravel()))
                 column += 1
+        self._interior = column
         kinds = [*range(6), *((SCALE,) if "x_scale" in network.per_image else ()), *((SHIFT,) if "x_shift" in network.per_image else ())]
         for place, kind in enumerate(kinds):
             columns = np.repeat(column + image * len(kinds) + place, 2)

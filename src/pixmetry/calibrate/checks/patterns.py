@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from pixmetry.calibrate.bundle.network import Adjustment
 from pixmetry.calibrate.checks.added_terms import AddedTerms, Terms, whitening
+from pixmetry.calibrate.checks.causes import STRONG, Candidate, Place, causes_of, places_of
+from pixmetry.calibrate.checks.field_sources import LAYOUTS, PLAIN, field_sources, field_terms, height_terms
 from pixmetry.calibrate.checks.quality import p_words, redundancy_of
-from pixmetry.calibrate.records import ByImage, Outstanding, Pattern
+from pixmetry.calibrate.records import ByImage, FieldSources, Outstanding, Pattern
 from pixmetry.core.arrays import Array
 from pixmetry.core.errors import MeasureError
 from pixmetry.core.finding import Finding
@@ -28,6 +30,7 @@ RARE = 0.001
 ALIKE = 0.001  # level at which images differ, but for one of them
 FEW_OF = 3  # they are no more than one image in so many
 NAMED = 5
+ON_DIGITAL_ADVICE = "check that the pictures are as the camera stored them, and that nothing moves while they are taken"
 MANY = 200  # a test needs so many image points of a camera
 
 # what is seen; the error source in the catalogue; what to do
@@ -39,6 +42,11 @@ MEANING = {
         "correct by a residual grid; check with views at other angles whether the shifts grow with the tangent of the chief ray",
     ),
     "field": ("residuals depend on the position in the frame", "sensor.pixel_geometry", "correct by a residual grid"),
+    "seams": (
+        "residuals jump from one part of the frame to the next",
+        "sensor.pixel_geometry",
+        "correct by a residual grid, and keep targets away from the seams",
+    ),
     "rows_x": (
         "x residuals depend on the row",
         "grabber.line_jitter",
@@ -90,19 +98,6 @@ MEANING = {
     "image_rms": ("residuals are larger in some images than in others", "", "check the worst images: focus, movement, light"),
 }
 
-SOURCES = {  # in words
-    "optics.distortion": "lens distortion beyond the terms that were estimated",
-    "sensor.unflatness": "a sensor that is not flat",
-    "sensor.pixel_geometry": "small-scale irregularities of pixels, lens or board",
-    "grabber.line_jitter": "lines that a frame grabber starts at different positions",
-    "grabber.sampling_clock": "samples that are not evenly spaced along a line",
-    "grabber.phase_pattern": "interference from the sampling clock",
-    "sensor.pixel_aperture": "pixels that are too coarse for the images of the targets",
-    "grabber.clock_warm_up": "a frame grabber whose clock warms up",
-    "sensor.mount_drift": "a sensor or lens that moves while it warms up",
-    "sensor.thermal_expansion": "a camera that expands while it warms up",
-}
-
 
 @dataclass(frozen=True)
 class _Seen:
@@ -116,9 +111,12 @@ class _Seen:
     y: np.ndarray
     image: np.ndarray
 
-    def pattern(self, name: str, amplitude_px: float, u_px: float | None, p: float, **more: Any) -> Pattern:
+    def tested(
+        self, name: str, amplitude_px: float, u_px: float | None, p: float, columns: Any = None, *, out_of: int = 1, **more: Any
+    ) -> _Tested:
         """What was found of a pattern, before it is held against a level."""
-        return Pattern(name, self.adjustment.network.cameras[self.camera].name, amplitude_px, u_px, p, **more)
+        pattern = Pattern(name, self.adjustment.network.cameras[self.camera].name, amplitude_px, u_px, p, **more)
+        return _Tested(pattern, None if columns is None else Candidate(name, columns, out_of))
 
     def along(self, x: np.ndarray | None, y: np.ndarray | None) -> np.ndarray:
         """Terms, shape (m, 2, k), from columns, shape (rows of this camera, k), of what they add to x and to y."""
@@ -129,7 +127,29 @@ class _Seen:
         return out
 
 
+@dataclass(frozen=True)
+class _Tested:
+    """A pattern, and the terms that make it; None: it is of no terms."""
+
+    pattern: Pattern
+    candidate: Candidate | None
+
+
+@dataclass(frozen=True)
+class Searched:
+    """Patterns in the residuals, and by camera what they tell of error sources."""
+
+    patterns: tuple[Pattern, ...]
+    sources: Mapping[str, FieldSources] = field(default_factory=dict)
+
+
 def residual_patterns(adjustment: Adjustment, level: float = 0.01) -> tuple[Pattern, ...]:
+    """The patterns of `searched_residuals` alone."""
+    return searched_residuals(adjustment, level).patterns
+
+
+@single_threaded_blas()
+def searched_residuals(adjustment: Adjustment, level: float = 0.01) -> Searched:
     """Test the residuals for patterns, each as if it had been estimated with everything else (see `added_terms`).
 
     Parameters
@@ -145,68 +165,104 @@ def residual_patterns(adjustment: Adjustment, level: float = 0.01) -> tuple[Patt
         curves, fields and images the rms of what the residuals show of them, less the part that noise alone makes; of ``image_rms`` the
         largest rms of an image, in x or in y.
     """
-    with single_threaded_blas():
-        found = _of_cameras(adjustment)
-    return tuple(_worded(replace(one, level=level / len(found), significant=bool(one.p < level / len(found)))) for one in found)
+    terms, network = AddedTerms(adjustment), adjustment.network
+    seen = [one for k in range(len(network.cameras)) if (one := _seen_by(adjustment, terms, k)) is not None]
+    tested = [list(_tests(one)) for one in seen]
+    count = sum(len(found) for found in tested)
+    patterns: list[Pattern] = []
+    sources: dict[str, FieldSources] = {}
+    for one, found in zip(seen, tested, strict=True):
+        camera = network.cameras[one.camera]
+        judged = [replace(t.pattern, level=level / count, significant=bool(t.pattern.p < level / count)) for t in found]
+        shown = [t.candidate for t, p in zip(found, judged, strict=True) if p.significant and t.candidate is not None]
+        places = places_of(terms, shown)
+        patterns += [_worded(p, places, camera.interface) for p in judged]
+        by_name = {candidate.name: candidate for candidate in shown}
+        chosen = {name: (by_name[name], place) for name, place in places.items() if not place.behind}
+        sources[camera.name] = field_sources(terms, one.camera, one.mine, one.x, one.y, one.image, chosen)
+    return Searched(tuple(patterns), sources)
 
 
-def _worded(found: Pattern) -> Pattern:
-    """The pattern with its possible cause, its sentence and its advice."""
+def _seen_by(adjustment: Adjustment, terms: AddedTerms, k: int) -> _Seen | None:
+    """The observations of a camera; None where they are too few."""
+    network, rows = adjustment.network, terms.rows
+    mine = network.camera_of[network.image[rows]] == k
+    if mine.sum() < MANY:
+        return None
+    place = rows[mine]
+    # places are the computed ones: measured ones hold the noise that is tested
+    x, y = network.x_px[place] - adjustment.residual_px[place, 0], network.y_px[place] - adjustment.residual_px[place, 1]
+    return _Seen(adjustment, terms, k, mine, x, y, network.image[place])
+
+
+def _worded(found: Pattern, places: Mapping[str, Place], interface: str | None) -> Pattern:
+    """The pattern with its possible causes, its sentence and its advice."""
     what, source, advice = MEANING[found.name]
     number = f"{found.amplitude_px:.4f} px" if found.u_px is None else f"{found.amplitude_px:.4f} ± {found.u_px:.4f} px"
     period = "" if found.period_px is None else f", period {found.period_px:.3g} px"
+    place = places.get(found.name, Place(0.0))
+    rivals = [cause for name in place.rivals for cause in causes_of(name, MEANING[name][1], interface)]
+    causes = tuple(dict.fromkeys((*causes_of(found.name, source, interface), *rivals)))
+    if interface == "digital" and source.startswith("grabber."):
+        advice = ON_DIGITAL_ADVICE
     if found.alone:
-        what, source = f"{what}, but only that of {found.alone} differs from all others", ""
+        what, causes = f"{what}, but only that of {found.alone} differs from all others", ()
         advice = "check this image: focus, movement, light, names of points"
     text = f"{what}: {number}{period}, {p_words(found.p)}" if found.significant else f"not found: {what} ({p_words(found.p)})"
-    return replace(found, source=source, text=text, advice=advice)
+    return replace(
+        found,
+        source=causes[0].source if causes else "",
+        causes=tuple(cause.text for cause in causes),
+        gain=place.gain,
+        behind=place.behind,
+        text=text,
+        advice=advice,
+    )
 
 
-def patterns_without_bad_images(adjustment: Adjustment, adjust: Callable[..., Adjustment]) -> tuple[Pattern, ...]:
-    """`residual_patterns`; if few images stand out by their residuals, those of an adjustment without them, but for ``image_rms``."""
-    found = residual_patterns(adjustment)
-    bad = [name for one in found if one.significant and one.outstanding for name in one.outstanding.images_out]
+def searched_without_bad_images(adjustment: Adjustment, adjust: Callable[..., Adjustment]) -> Searched:
+    """`searched_residuals`; if few images stand out by their residuals, of an adjustment without them, but for ``image_rms``."""
+    found = searched_residuals(adjustment)
+    bad = [name for one in found.patterns if one.significant and one.outstanding for name in one.outstanding.images_out]
     if not bad:
         return found
     network = adjustment.network
     used = adjustment.used & ~np.isin(network.image, np.flatnonzero(np.isin(network.images, bad)))
     try:
-        again = residual_patterns(adjust(network, adjustment.state, used=used, redundancy=True))
+        again = searched_residuals(adjust(network, adjustment.state, used=used, redundancy=True))
     except MeasureError:  # the network hangs on them
         return found
-    return (*(one for one in again if one.name != "image_rms"), *(one for one in found if one.name == "image_rms"))
-
-
-def _of_cameras(adjustment: Adjustment) -> list[Pattern]:
-    terms = AddedTerms(adjustment)
-    out: list[Pattern] = []
-    network = adjustment.network
-    for k in range(len(network.cameras)):
-        rows = terms.rows
-        mine = network.camera_of[network.image[rows]] == k
-        if mine.sum() < MANY:
-            continue
-        place = rows[mine]
-        # places are the computed ones: measured ones hold the noise that is tested
-        x, y = network.x_px[place] - adjustment.residual_px[place, 0], network.y_px[place] - adjustment.residual_px[place, 1]
-        seen = _Seen(adjustment, terms, k, mine, x, y, network.image[place])
-        out += _tests(seen)
-    return out
+    patterns = (*(p for p in again.patterns if p.name != "image_rms"), *(p for p in found.patterns if p.name == "image_rms"))
+    return replace(again, patterns=patterns)
 
 
 def pattern_findings(patterns: Sequence[Pattern]) -> tuple[Finding, ...]:
-    """A warning for each significant pattern, the surest first."""
+    """A warning for each significant pattern, the surest first; what another one explains is said with that."""
     several = len({one.camera for one in patterns}) > 1
     out = []
-    for one in sorted((one for one in patterns if one.significant), key=lambda one: one.p):
+    significant = sorted((one for one in patterns if one.significant), key=lambda one: one.p)
+    for one in significant:
         where = f"{one.camera}: " if several else ""
-        source = f" (possible cause: {SOURCES[one.source]}, {one.source})" if one.source else ""
         if one.outstanding:
             out.append(_bad_images(one.outstanding, where))
             continue
         kind = "x_scale_drift" if one.name in DRIFT and not one.alone else one.name
-        out.append(Finding(kind, f"{where}{one.text}{source}", one.advice[0].upper() + one.advice[1:] + ".", "warning"))
+        if one.behind and kind != "x_scale_drift":
+            continue
+        caused = f" ({words})" if (words := cause_words(one)) else ""
+        more = [MEANING[p.name][0] for p in significant if p.behind == one.name and p.camera == one.camera and p.name not in DRIFT]
+        also = f". It also explains that {'; that '.join(more)}" if more else ""
+        out.append(Finding(kind, f"{where}{one.text}{caused}{also}", one.advice[0].upper() + one.advice[1:] + ".", "warning"))
     return tuple(out)
+
+
+def cause_words(one: Pattern) -> str:
+    """What may have made a pattern, in words; empty where nothing is known."""
+    if not one.causes:
+        return ""
+    if len(one.causes) > 1:
+        return f"one of: {'; '.join(one.causes)}"
+    return f"{'likely' if one.gain > STRONG else 'possible'} cause: {one.causes[0]}"
 
 
 def _bad_images(bad: Outstanding, where: str) -> Finding:
@@ -228,7 +284,7 @@ def _size(rms_px: Sequence[float], rejected: int, times: float) -> str:
     return f"{size}, {times:.1f} times the median"
 
 
-def _tests(seen: _Seen) -> Iterator[Pattern]:
+def _tests(seen: _Seen) -> Iterator[_Tested]:
     sensor = seen.adjustment.network.cameras[seen.camera].sensor
     xp, yp = seen.adjustment.state.interior[seen.camera, 1:3]
     dx, dy = seen.x - xp, seen.y - yp
@@ -236,11 +292,11 @@ def _tests(seen: _Seen) -> Iterator[Pattern]:
     outward = np.stack([dx, dy], axis=1) / np.maximum(radius, 1e-9)[:, None]
     hats = _hats(radius, 0.0, radius.max(), HATS)
     yield _group(seen, "radius", seen.along(hats * outward[:, :1], hats * outward[:, 1:]))
-    heights = _legendre(seen.x, seen.y, sensor.cols, sensor.rows)
-    yield _group(seen, "unflatness", seen.along(heights * dx[:, None], heights * dy[:, None]))
-    field = _field(seen.x, seen.y, sensor.cols, sensor.rows)
-    nothing = np.zeros_like(field)
-    yield _group(seen, "field", seen.along(np.hstack([field, nothing]), np.hstack([nothing, field])))
+    yield _unflatness(seen, sensor.cols, sensor.rows)
+    cells = _field(seen.x, seen.y, sensor.cols, sensor.rows)
+    nothing = np.zeros_like(cells)
+    yield _group(seen, "field", seen.along(np.hstack([cells, nothing]), np.hstack([nothing, cells])))
+    yield _seams(seen, sensor.cols, sensor.rows)
     yield _group(seen, "rows_x", seen.along(_hats(seen.y, 0, sensor.rows - 1, HATS), None))
     yield _group(seen, "columns_x", seen.along(_hats(seen.x, 0, sensor.cols - 1, HATS), None))
     for name, place, axis, size in (
@@ -266,19 +322,26 @@ def _field(x: Array, y: Array, cols: int, rows: int) -> Array:
     return products.reshape(len(x), -1)
 
 
-def _legendre(x: np.ndarray, y: np.ndarray, cols: int, rows: int) -> np.ndarray:
-    """Products of Legendre polynomials over the frame, of total degrees 2 to 4: shapes of a surface."""
-    degrees = np.arange(5)
-    across = np.polynomial.legendre.legvander(2 * x / (cols - 1) - 1, 4)
-    down = np.polynomial.legendre.legvander(2 * y / (rows - 1) - 1, 4)
-    i, j = (part.ravel() for part in np.meshgrid(degrees, degrees))
-    kept = (i + j >= 2) & (i + j <= 4)
-    return across[:, i[kept]] * down[:, j[kept]]
-
-
-def _group(seen: _Seen, name: str, columns: Any) -> Pattern:
+def _group(seen: _Seen, name: str, columns: Any) -> _Tested:
     found = seen.terms.test(columns)
-    return seen.pattern(name, _visible(seen, found, columns), None, found.p)
+    return seen.tested(name, _visible(seen, found, columns), None, found.p, columns)
+
+
+def _unflatness(seen: _Seen, cols: int, rows: int) -> _Tested:
+    """Shapes of a surface of up to the fourth degree; as an explanation, bow, twist and skew alone where these do."""
+    tested = _group(seen, "unflatness", seen.along(*height_terms(seen.x, seen.y, cols, rows)))
+    few = Candidate("few", seen.along(*height_terms(seen.x, seen.y, cols, rows, PLAIN)))
+    assert tested.candidate is not None
+    if next(iter(places_of(seen.terms, [few, tested.candidate]))) == "few":
+        return replace(tested, candidate=replace(few, name="unflatness"))
+    return tested
+
+
+def _seams(seen: _Seen, cols: int, rows: int) -> _Tested:
+    """The best of all partitions of the frame into equal fields, each displaced as a whole; p is that of the best of so many."""
+    tested = [(seen.terms.test(columns := seen.along(*field_terms(seen.x, seen.y, cols, rows, layout))), columns) for layout in LAYOUTS]
+    found, columns = min(tested, key=lambda one: (one[0].p, -one[0].f))
+    return seen.tested("seams", _visible(seen, found, columns), None, min(1.0, len(LAYOUTS) * found.p), columns, out_of=len(LAYOUTS))
 
 
 def _visible(seen: _Seen, found: Terms, columns: Any) -> float:
@@ -290,16 +353,18 @@ def _visible(seen: _Seen, found: Terms, columns: Any) -> float:
     return float(np.sqrt(max(found.fall - found.k * found.variance, 0.0) / touched.sum() * px2)) if found.k else 0.0
 
 
-def _harmonic(seen: _Seen, name: str, place: np.ndarray, axis: int, per_px: float) -> Pattern:
+def _harmonic(seen: _Seen, name: str, place: np.ndarray, axis: int, per_px: float, out_of: int = 1, **more: Any) -> _Tested:
     angle = 2 * np.pi * per_px * place
     columns = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    found = seen.terms.test(seen.along(columns, None) if axis == 0 else seen.along(None, columns))
+    along = seen.along(columns, None) if axis == 0 else seen.along(None, columns)
+    found = seen.terms.test(along)
     amplitude = float(np.hypot(*found.values))
     unit = found.values / amplitude if amplitude > 0 else np.array([1.0, 0.0])
-    return seen.pattern(name, amplitude, float(np.sqrt(unit @ found.covariance @ unit)), found.p)
+    u, p = float(np.sqrt(unit @ found.covariance @ unit)), min(1.0, found.p * out_of)
+    return seen.tested(name, amplitude, u, p, along, out_of=out_of, **more)
 
 
-def _wave(seen: _Seen, name: str, place: np.ndarray, axis: int, size: int) -> Pattern:
+def _wave(seen: _Seen, name: str, place: np.ndarray, axis: int, size: int) -> _Tested:
     """The strongest of all waves from a period of 2 px to a quarter of the frame; p is that of the best of so many (Bonferroni)."""
     residual = seen.adjustment.residual_px[seen.terms.rows[seen.mine], axis]
     length = 2 * BINS_PER_PX * size
@@ -308,11 +373,10 @@ def _wave(seen: _Seen, name: str, place: np.ndarray, axis: int, size: int) -> Pa
     per_px = np.arange(len(power)) / (2 * size)
     allowed = (per_px <= 0.5) & (per_px >= 1 / (LONGEST_WAVE * size))
     best = per_px[np.argmax(np.where(allowed, power, -1.0))]
-    found = _harmonic(seen, name, place, axis, best)
-    return replace(found, p=min(1.0, found.p * int(allowed.sum())), period_px=float(1 / best))
+    return _harmonic(seen, name, place, axis, best, int(allowed.sum()), period_px=float(1 / best))
 
 
-def _over_images(seen: _Seen, dx: np.ndarray, dy: np.ndarray) -> Iterator[Pattern]:
+def _over_images(seen: _Seen, dx: np.ndarray, dy: np.ndarray) -> Iterator[_Tested]:
     network = seen.adjustment.network
     images = np.unique(seen.image)
     if len(images) < 3:
@@ -337,15 +401,15 @@ def _over_images(seen: _Seen, dx: np.ndarray, dy: np.ndarray) -> Iterator[Patter
     yield _image_rms(seen, images)
 
 
-def _trend(seen: _Seen, name: str, columns: np.ndarray, edge_px: float) -> Pattern:
+def _trend(seen: _Seen, name: str, columns: np.ndarray, edge_px: float) -> _Tested:
     found = seen.terms.test(columns)
     size = float(np.linalg.norm(found.values))
     unit = found.values / size if size > 0 else np.eye(len(found.values))[0]
     u = float(np.sqrt(unit @ found.covariance @ unit)) if found.k else np.inf
-    return seen.pattern(name, size * edge_px, u * edge_px, found.p)
+    return seen.tested(name, size * edge_px, u * edge_px, found.p, columns)
 
 
-def _by_image(seen: _Seen, name: str, images: np.ndarray, x: np.ndarray) -> Pattern:
+def _by_image(seen: _Seen, name: str, images: np.ndarray, x: np.ndarray) -> _Tested:
     """A value for each image, of sum 0: what is common to all belongs to affinity and principal point."""
     from scipy import sparse
 
@@ -357,7 +421,8 @@ def _by_image(seen: _Seen, name: str, images: np.ndarray, x: np.ndarray) -> Patt
     names, values = tuple(seen.adjustment.network.images[i] for i in images), contrasts @ found.values
     alone = int(np.argmax(np.abs(values) / np.maximum(u, 1e-300)))
     by_image = ByImage(names, values, u, names[alone] if _alone(values, u, alone, found.dof) else None)
-    return seen.pattern(name, _visible(seen, found, columns), None, found.p, by_image=by_image)
+    steps = columns[:, :-1] - columns[:, 1:]  # of sum 0 too, and sparse
+    return seen.tested(name, _visible(seen, found, columns), None, found.p, steps, by_image=by_image)
 
 
 def _alone(values: np.ndarray, u: np.ndarray, one: int, dof: float) -> bool:
@@ -381,7 +446,7 @@ def _rejected(seen: _Seen, most: float) -> tuple[np.ndarray, np.ndarray]:
     return np.bincount(image, squares, images), np.bincount(image, count, images)
 
 
-def _image_rms(seen: _Seen, images: np.ndarray) -> Pattern:
+def _image_rms(seen: _Seen, images: np.ndarray) -> _Tested:
     """Bartlett's test of equal variances, with the redundancy of each image (Proc. R. Soc. A 160 (1937) 268–282)."""
     from scipy import stats
 
@@ -397,7 +462,7 @@ def _image_rms(seen: _Seen, images: np.ndarray) -> Pattern:
     p = float(stats.chi2.sf(statistic / correction, len(dof) - 1)) if len(dof) > 1 else 1.0
     residual_px = seen.adjustment.residual_px[seen.terms.rows[seen.mine]]
     rms_px = np.sqrt(np.stack([np.bincount(place, axis**2) / np.bincount(place) for axis in residual_px.T], axis=1))[good]
-    found = seen.pattern("image_rms", float(rms_px.max()), None, p)
+    found = seen.tested("image_rms", float(rms_px.max()), None, p)
     middle = float(np.median(np.sqrt(total / dof)))
     squares, coordinates = (part[images[good]] for part in _rejected(seen, WORST * middle))
     total, dof = total + squares, dof + coordinates
@@ -409,5 +474,6 @@ def _image_rms(seen: _Seen, images: np.ndarray) -> Pattern:
         out = out[np.argsort(-rms[out])]
         names = tuple(seen.adjustment.network.images[i] for i in images[good][out])
         rejected = (coordinates[out] / 2).astype(int).tolist()
-        return replace(found, outstanding=Outstanding(names, rms_px[out].tolist(), rejected, (rms[out] / middle).tolist()))
+        outstanding = Outstanding(names, rms_px[out].tolist(), rejected, (rms[out] / middle).tolist())
+        return replace(found, pattern=replace(found.pattern, outstanding=outstanding))
     return found

@@ -12,7 +12,7 @@ from pixmetry.calibrate.bundle.network import Adjustment, Network
 from pixmetry.calibrate.checks import curves, quality
 from pixmetry.calibrate.checks.known_checks import Kind, KnownFaults, fixed_record
 from pixmetry.calibrate.checks.known_residuals import bar_residuals, control_residuals, group_record
-from pixmetry.calibrate.checks.patterns import patterns_without_bad_images
+from pixmetry.calibrate.checks.patterns import searched_without_bad_images
 from pixmetry.calibrate.checks.residual_grid import systematic_rest
 from pixmetry.calibrate.checks.snooping import Rejected, gross_error_records
 from pixmetry.calibrate.records import (
@@ -54,6 +54,7 @@ def tests_of(
 
     oriented = dict(zip(adjustment.network.images, adjustment.state.posed, strict=True))
     gross = tuple(error for error in gross_error_records(adjustment, alpha, rejected) if oriented[error.image])
+    searched = searched_without_bad_images(adjustment, adjust)
     return Tests(
         parameters=quality.parameter_records(adjustment),
         parameter_groups=quality.group_records(adjustment),
@@ -63,7 +64,8 @@ def tests_of(
         residuals=_with_noise(quality.residual_records(adjustment), adjustment, given),
         f_test=quality.f_test_records(adjustment),
         gross_errors=gross,
-        patterns=patterns_without_bad_images(adjustment, adjust),
+        patterns=searched.patterns,
+        field_sources=searched.sources or None,
         images=quality.image_records(adjustment, Counter(error.image for error in gross)),
         curves=curves.distortion_curves(adjustment),
         projection=curves.projection_maps(adjustment),

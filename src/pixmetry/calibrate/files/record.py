@@ -176,6 +176,7 @@ def camera_record(model: CameraModel, names: tuple[str, ...], covariance: np.nda
         "name": model.name,
         **asdict(model.sensor),
         "direction": model.direction,
+        "interface": model.interface,
         "parameters": [
             {"name": name, "value": value, "u": u.get(name, 0.0), "unit": unit, "free": bool(free)}
             for name, value, unit, free in zip(NAMES, model.values, model.units, model.free, strict=True)
@@ -295,7 +296,9 @@ def _camera(record: Mapping[str, Any]) -> CameraModel:
     parameters = record["parameters"]
     sensor = Sensor(*(record[name] for name in ("cols", "rows", "pitch_x_um", "pitch_y_um")))
     values = np.array([parameter["value"] for parameter in parameters], dtype=float)
-    return CameraModel(sensor, record["direction"], values, np.array([p["free"] for p in parameters], dtype=bool), record["name"])
+    return CameraModel(
+        sensor, record["direction"], values, np.array([p["free"] for p in parameters], dtype=bool), record["name"], record.get("interface")
+    )
 
 
 def _array(rows: list[list[float | None]], width: int) -> np.ndarray:

@@ -152,14 +152,15 @@ def gross_errors(records: Sequence[GrossError]) -> list[list[str]]:
 
 def patterns(records: Sequence[Pattern], several: bool) -> list[dict[str, Any]]:
     """Patterns that were looked for in the residuals, the surest first; with the camera where there are several."""
-    from pixmetry.calibrate.checks.patterns import MEANING, SOURCES
+    from pixmetry.calibrate.checks.patterns import MEANING, cause_words
 
     rows = []
     for r in sorted(records, key=lambda r: r.p):
-        what, source, _ = MEANING.get(r.name, (r.name, "", ""))
+        what, _, _ = MEANING.get(r.name, (r.name, "", ""))
         title = f"{r.camera}: {what}" if several else sentence(what).rstrip(".")
         amplitude = px(r.amplitude_px) + (f" ± {px(r.u_px)}" if r.u_px is not None else "")
-        why = f"Possible cause: {SOURCES[source]} ({source})." if r.significant and source else ""
+        words = "" if not r.significant else f"explained where {MEANING[r.behind][0]}" if r.behind in MEANING else cause_words(r)
+        why = f"{sentence(words)}" if words else ""
         advice = " ".join(part for part in (why, sentence(r.advice)) if part)
         rows.append({"title": title, "amplitude": amplitude, "p": p_text(r.p), "found": r.significant, "advice": advice})
     return sorted(rows, key=lambda r: not r["found"])

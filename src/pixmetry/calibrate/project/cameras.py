@@ -105,7 +105,8 @@ def described(entry: CameraEntry, reader: Reader, k: int, *, straight: bool = Fa
         remedy = "add `pitch_um: ...` (--pixel-um), or give c_px"
         raise InputError("c_mm, but no pitch", where=where, allowed="c_mm with pitch_um, or c_px", remedy=remedy)
     sensor = Sensor(cols or 1, rows or 1, *pitch)  # the size of pictures is told by themselves
-    out = Described(_model(entry, sensor, start, straight, upwards), preset, start, where)
+    model = replace(_model(entry, sensor, start, straight, upwards), interface=entry.interface or _interface_of(preset))
+    out = Described(model, preset, start, where)
     if cols is not None:
         out.check((sensor.cols, sensor.rows), what="the project says")
     if not straight and not out.model["c"] > 0 and not out.model.free[0]:
@@ -124,6 +125,16 @@ def _model(entry: CameraEntry, sensor: Sensor, start: CameraModel | None, straig
     all_values = dict(zip(NAMES, based.values.tolist(), strict=True)) | values | {"c": c}
     free = entry.free if entry.free is not None else FREE if straight else TEN
     return CameraModel.of(sensor, based.direction, free, entry.name, **all_values)
+
+
+def _interface_of(preset: Camera | None) -> str | None:
+    """How the frames of a preset come, where it says so, or has a frame grabber's clock."""
+    if preset is None:
+        return None
+    told = preset.facts.get("interface")
+    if told in ("digital", "analogue"):
+        return str(told)
+    return "analogue" if any("digital" not in e.source.applies_to and "analogue" in e.source.applies_to for e in preset.chain) else None
 
 
 def _preset(name: str, reader: Reader, k: int) -> Camera:

@@ -56,6 +56,7 @@ class CameraEntry(Model):
 
     name: Name = "camera"
     camera: str | None = None
+    interface: Literal["digital", "analogue"] | None = None
     start_from: str | None = None
     cols: Size | None = None
     rows: Size | None = None

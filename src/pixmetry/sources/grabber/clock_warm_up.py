@@ -86,7 +86,10 @@ def propagate(params: ClockWarmUp, probe: Probe) -> Contribution:
 
 
 def measure(observations: Observations) -> Estimates:
-    """Error and delay of the clock when switched on, from a series of a fixed field; camera and grabber warm up together in it."""
+    """Error and delay of the clock when switched on: from a series of a fixed field, in which camera and grabber warm up together; without
+    one, from the x-scales of the images of a calibration, whose poses take up the delay."""
+    if observations.drift is None and observations.geometry is not None and not observations.failed.get("series"):
+        return observations.by_residuals(where="grabber.clock_warm_up")
     names = ("scale_error_rel", "scale_tau_s", "delay_ns", "delay_tau_s")
     fit, names_of = None if observations.drift is None else observations.drift.fit, {name: name for name in names}
     return of_pictures(

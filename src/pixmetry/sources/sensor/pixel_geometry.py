@@ -9,8 +9,10 @@ import numpy as np
 from pixmetry.camera.contribution import Contribution, Probe
 from pixmetry.camera.geometry import image_shift
 from pixmetry.camera.light import Pull
+from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.number import Estimates
 from pixmetry.core.random import Grid, Stream
 
 
@@ -43,6 +45,11 @@ def pull_of(params: PixelGeometry, frame_shape: tuple[int, int], stream: Stream)
         return x + step_x[i, j], y + step_y[i, j]
 
     return pull
+
+
+def measure(observations: Observations) -> Estimates:
+    """Steps between equal fields of the frame, by the residuals of a calibration; targets average over the places of single pixels."""
+    return observations.by_residuals(where="sensor.pixel_geometry")
 
 
 def forward(params: PixelGeometry, signal: Signal, stream: Stream) -> Signal:
@@ -98,8 +105,8 @@ SOURCE = Source(
         "JCGM 100:2008, 5.1.2",
     ),
     advice="Usually nothing: it is far smaller than other errors. Keep targets away from the seams of a stitched sensor.",
+    measure=measure,
     reasons={
-        "measure": "not measured: needs very many target positions per place, from a self-calibrating bundle",
         "correct": "frames are not resampled; positions are corrected instead, by a map of the residuals",
     },
 )

@@ -10,8 +10,10 @@ from numpy.polynomial.legendre import legval
 from pixmetry.camera.contribution import Contribution, Probe
 from pixmetry.camera.geometry import corner_px, frame_centre, image_shift, map_contribution
 from pixmetry.camera.light import Pull
+from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
 
 
@@ -79,6 +81,11 @@ def defocus_px2(params: Unflatness, x: np.ndarray, y: np.ndarray, frame_shape: t
     return (height_um(params, x, y, frame_shape) / (4 * params.f_number)) ** 2 / area
 
 
+def measure(observations: Observations) -> Estimates:
+    """Bow, twist and skew by the residuals of a calibration, without what its lens and poses take up."""
+    return observations.by_residuals(where="sensor.unflatness")
+
+
 def forward(params: Unflatness, signal: Signal, stream: Stream) -> Signal:
     """Move and defocus the light by the height of the surface."""
     if not coefficients_um(params).any():
@@ -122,8 +129,8 @@ SOURCE = Source(
     typical_size="10 µm: 0.42 px at 20°, 0.17 px at 8.2° (8.6 µm pixels)",
     references=("C. S. Fraser, Digital camera self-calibration, ISPRS J. 52 (1997) 149–159", "VDI/VDE 2634-1"),
     advice="Measure the surface separately, use a lens that is telecentric on the image side, or roll the camera in the calibration.",
+    measure=measure,
     reasons={
-        "measure": "needs a separate measurement of the height; the residual grid of a calibration contains its effect",
         "correct": "frames are not resampled; positions are corrected instead, from the height map",
     },
 )

@@ -1,0 +1,436 @@
+"""What the residuals of a calibration tell of error sources, as numbers with their uncertainty: height of the sensor, seams, x-scales.
+
+Terms for these are estimated beside everything that the adjustment estimated, to first order exactly as an adjustment with them would
+(`pixmetry.calibrate.checks.added_terms`). What lens and poses take up of a term is not told: of a height, its mean (principal distance),
+its slope (principal point and poses) and all that depends on the radius alone (radial terms).
+
+Residuals have something in common where a target, or a part of the frame, has an error of its own. The uncertainty holds both: the
+covariance by images, with the scatter of the scores of the images (a jackknife over clusters: A. C. Cameron, D. L. Miller, J. Human
+Resources 50 (2015) 317–372), and what residuals have in common in one cell of the frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pixmetry.calibrate.bundle.model import NAMES
+from pixmetry.calibrate.checks.added_terms import AddedTerms, Beside
+from pixmetry.calibrate.checks.causes import STRONG, Candidate, Place
+from pixmetry.calibrate.records import FieldSources, HeightMap, ImageScales, Seams
+from pixmetry.core.arrays import Array
+
+LAYOUTS = ((2, 1), (1, 2), (2, 2), (3, 1), (1, 3), (4, 1), (3, 2), (4, 2))  # fields side by side, one above the other
+DEGREES = tuple((i, j) for j in range(5) for i in range(5) if 2 <= i + j <= 4)  # of P_i(x) P_j(y): shapes of a surface
+PLAIN = ((2, 0), (0, 2), (1, 1), (3, 0), (0, 3))  # bow, twist and skew
+TOLD = 0.1  # share of a term that must be left when the estimated parameters have taken theirs
+CELLS = (10, 8)  # of the frame, in which residuals have something in common or not
+TURNED = 1e-3  # level at which a pattern that turns is no height
+SIDE = (33, 25)  # of the map that is drawn
+LEAST_IMAGES = 5  # whose scores show their own scatter
+
+
+def height_terms(x: np.ndarray, y: np.ndarray, cols: int, rows: int, degrees: tuple[tuple[int, int], ...] = DEGREES) -> tuple[Array, Array]:
+    """Displacement in x and y, shape (n, terms), by heights P_i(u) P_j(v) of the principal distance's size: along the radius."""
+    x0, y0 = (cols - 1) / 2, (rows - 1) / 2
+    across = np.polynomial.legendre.legvander((x - x0) / (x0 + 0.5), 6)
+    down = np.polynomial.legendre.legvander((y - y0) / (y0 + 0.5), 6)
+    height = np.stack([across[:, i] * down[:, j] for i, j in degrees], axis=1)
+    return height * (x - x0)[:, None], height * (y - y0)[:, None]
+
+
+def field_terms(x: np.ndarray, y: np.ndarray, cols: int, rows: int, layout: tuple[int, int]) -> tuple[Array, Array]:
+    """Displacement in x and y, shape (n, 2 fields), of each field of the frame as a whole: first along x, then along y."""
+    i = np.clip(np.floor((x + 0.5) * layout[0] / cols), 0, layout[0] - 1).astype(int)
+    j = np.clip(np.floor((y + 0.5) * layout[1] / rows), 0, layout[1] - 1).astype(int)
+    one = (np.arange(layout[0] * layout[1]) == (j * layout[0] + i)[:, None]).astype(float)
+    return np.hstack([one, 0 * one]), np.hstack([0 * one, one])
+
+
+@dataclass(frozen=True)
+class _Camera:
+    """The observations of one camera among the rows of the terms."""
+
+    terms: AddedTerms
+    index: int
+    mine: np.ndarray
+    x: np.ndarray
+    y: np.ndarray
+    image: np.ndarray
+
+    @property
+    def size(self) -> tuple[int, int]:
+        sensor = self.terms.adjustment.network.cameras[self.index].sensor
+        return sensor.cols, sensor.rows
+
+    def along(self, parts: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+        out = np.zeros((len(self.mine), 2, parts[0].shape[1]))
+        out[self.mine, 0], out[self.mine, 1] = parts
+        return out
+
+
+def field_sources(
+    terms: AddedTerms,
+    index: int,
+    mine: np.ndarray,
+    x: np.ndarray,
+    y: np.ndarray,
+    image: np.ndarray,
+    chosen: Mapping[str, tuple[Candidate, Place]],
+) -> FieldSources:
+    """What the residuals of one camera tell of its error sources.
+
+    Parameters
+    ----------
+    terms : AddedTerms
+    index : int
+        Of the camera.
+    mine : ndarray of bool, shape (m,)
+        Which of the rows are of this camera.
+    x, y : ndarray, shape (n,)
+        Computed places, px.
+    image : ndarray of int, shape (n,)
+    chosen : mapping
+        Patterns that explain the residuals, with their terms: those of other sources are estimated along.
+
+    Returns
+    -------
+    FieldSources
+    """
+    camera = _Camera(terms, index, mine, x, y, image)
+    beside = {name: candidate for name, (candidate, _) in chosen.items()}
+    place = {name: place for name, (_, place) in chosen.items()}
+    return FieldSources(
+        height=_height(camera, _others(beside, "unflatness", "radius"), place.get("unflatness")),
+        seams=_seams(camera, _others(beside, "seams", "field"), place.get("seams")),
+        scales=_scales(camera, _others(beside, "x_scale_trend", "x_scale_by_image")),
+    )
+
+
+def _others(chosen: Mapping[str, Candidate], *own: str) -> list[Candidate]:
+    """Those that few terms make, of which the radial ones stand for the lens."""
+    return [one for name, one in chosen.items() if name not in (*own, "field", "image_rms")]
+
+
+# ---- height ---------------------------------------------------------------------------------------------------------------------------
+
+
+def _height(camera: _Camera, others: list[Candidate], place: Place | None) -> HeightMap | None:
+    """The height by the few plain shapes, or by all of the fourth degree where these explain more."""
+    few, more = (_height_of(camera, others, degrees) for degrees in (PLAIN, DEGREES))
+    if few is None or more is None:
+        return few
+    found = more if more.gain > few.gain + STRONG else few
+    named = bool(place is not None and not place.rivals and found.gain > STRONG and found.p_turned > TURNED)
+    return replace(found, found=named, rivals=place.rivals if place is not None else ())
+
+
+def _height_of(camera: _Camera, others: list[Candidate], degrees: tuple[tuple[int, int], ...]) -> HeightMap | None:
+    terms = camera.terms
+    shift = height_terms(camera.x, camera.y, *camera.size, degrees)
+    turned = (-shift[1], shift[0])
+    with_others = [_dense(terms, one) for one in others]
+    own = len(degrees)
+    heights = terms.as_rows(camera.along(shift))
+    beside = terms.beside(np.hstack([heights, *with_others]))
+    fit = _fit(camera, beside, own)
+    if fit is None:
+        return None
+    curl = _fit(camera, terms.beside(np.hstack([terms.as_rows(camera.along(turned)), heights, *with_others])), own)
+    c, names, change = _interior(camera, beside.change[:, :own])
+    x = np.linspace(0, camera.size[0] - 1, SIDE[0])
+    y = np.linspace(0, camera.size[1] - 1, SIDE[1])
+    at_x, at_y = (part.ravel() for part in np.meshgrid(x, y))
+    shape = _heights(at_x, at_y, camera.size, degrees)
+    u = np.sqrt(np.maximum(np.einsum("ni,ij,nj->n", shape, fit.covariance, shape), 0))
+    return HeightMap(
+        across=tuple(i for i, _ in degrees),
+        down=tuple(j for _, j in degrees),
+        coefficients_px=c * fit.values,
+        covariance_px2=c**2 * fit.covariance,
+        told=fit.told,
+        rank=fit.rank,
+        dof=fit.dof,
+        gain=fit.gain,
+        p=fit.p,
+        p_turned=1.0 if curl is None else curl.p,
+        scatter_factor=fit.factor,
+        common_px=fit.common_px,
+        effective=fit.effective,
+        lens_names=names,
+        lens_change=change / c,
+        x_px=x,
+        y_px=y,
+        height_px=(shape @ fit.values * c).reshape(len(y), len(x)),
+        u_px=(u * c).reshape(len(y), len(x)),
+    )
+
+
+def _dense(terms: AddedTerms, one: Candidate) -> np.ndarray:
+    from scipy import sparse
+
+    rows = terms.as_rows(one.columns)
+    return rows.toarray() if sparse.issparse(rows) else rows
+
+
+def _heights(x: np.ndarray, y: np.ndarray, size: tuple[int, int], degrees: tuple[tuple[int, int], ...]) -> Array:
+    x0, y0 = (size[0] - 1) / 2, (size[1] - 1) / 2
+    u = np.polynomial.legendre.legvander((x - x0) / (x0 + 0.5), 6)
+    v = np.polynomial.legendre.legvander((y - y0) / (y0 + 0.5), 6)
+    return np.stack([u[:, i] * v[:, j] for i, j in degrees], axis=1)
+
+
+def _interior(camera: _Camera, change: np.ndarray) -> tuple[float, tuple[str, ...], np.ndarray]:
+    """Principal distance in px along x; names of the camera's estimated parameters, and their changes with the terms."""
+    adjustment = camera.terms.adjustment
+    first = 0
+    for model in adjustment.network.cameras[: camera.index]:
+        first += int(model.free.sum())
+    model = adjustment.camera(camera.index)
+    names = tuple(name for name, free in zip(NAMES, model.free, strict=True) if free)
+    return model["c"] / model.sensor.per_px[0], names, change[first : first + len(names)]
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """Terms of one source, of those combinations that are told."""
+
+    values: np.ndarray
+    covariance: np.ndarray
+    told: np.ndarray
+    rank: int
+    dof: float
+    gain: float
+    p: float
+    factor: float
+    common_px: float
+    effective: float
+
+
+def _fit(camera: _Camera, beside: Beside, own: int) -> _Fit | None:
+    """Estimate the first ``own`` terms beside the others; None where nothing of them is told.
+
+    The others are taken out of them first; then the combinations of which the estimated parameters leave little are left at 0.
+    """
+    from scipy import stats
+
+    adjustment = camera.terms.adjustment
+    rest, v = beside.rest[:, :own], beside.residual
+    if beside.rest.shape[1] > own:
+        more = beside.rest[:, own:]
+        inverse = np.linalg.pinv(more.T @ more, rcond=1e-6, hermitian=True)
+        rest, v = rest - more @ (inverse @ (more.T @ rest)), v - more @ (inverse @ (more.T @ v))
+    left = rest.T @ rest
+    size = beside.length[:own]
+    values, vectors = np.linalg.eigh(left / np.outer(size, size))
+    good = values > TOLD**2
+    if not good.any():
+        return None
+    directions = vectors[:, good] / size[:, None]  # terms = directions @ told ones
+    g = rest @ directions
+    normal = g.T @ g
+    inverse = np.linalg.inv(normal)
+    found = inverse @ (g.T @ v)
+    fall, rank = float(found @ normal @ found), int(good.sum())
+    squares = float(adjustment.sigma0**2 * adjustment.dof)
+    nuisance = beside.rest.shape[1] - own
+    before = squares - (float(beside.residual @ beside.residual) - float(v @ v))
+    dof = adjustment.dof - rank - nuisance
+    if dof < 1:
+        return None
+    variance = max((before - fall) / dof, 1e-300)
+    after = v - g @ found
+    covariance = variance * inverse
+    factor, clusters = _scatter_by_image(camera, g, after, covariance, inverse)
+    common, common_px, effective = _common(camera, g, after)
+    covariance = max(factor, 1.0) ** 2 * covariance + common**2 * inverse @ _by_cell(camera, g) @ inverse
+    f = fall / rank / variance / max(factor, 1.0) ** 2
+    gain = dof * np.log(max(before, 1e-300) / max(before - fall, 1e-300)) / max(factor, 1.0) ** 2 - rank * np.log(dof)
+    told = directions @ (vectors[:, good].T * size)
+    return _Fit(
+        directions @ found, directions @ covariance @ directions.T, told, rank, clusters if factor > 1 else float(dof), float(gain),
+        float(stats.f.sf(f, rank, dof)), factor, common_px, effective,
+    )  # fmt: skip
+
+
+def _image_of_rows(camera: _Camera) -> tuple[np.ndarray, int]:
+    """Of each of the 2 m rows the number of its image among those of the camera, and how many there are; other cameras: −1."""
+    images, number = np.unique(camera.image, return_inverse=True)
+    out = np.full(len(camera.mine), -1)
+    out[camera.mine] = number
+    return np.repeat(out, 2), len(images)
+
+
+def _scatter_by_image(
+    camera: _Camera, g: np.ndarray, after: np.ndarray, covariance: np.ndarray, inverse: np.ndarray
+) -> tuple[float, float]:
+    """Scatter of the images' scores over what independent residuals would give (rms over the terms), and its degrees of freedom."""
+    image, count = _image_of_rows(camera)
+    rank = g.shape[1]
+    if count < LEAST_IMAGES:
+        return 1.0, float("inf")
+    scores = np.stack([np.bincount(image[image >= 0], (g[:, k] * after)[image >= 0], count) for k in range(rank)], axis=1)
+    by_image = np.zeros((rank, rank))
+    for i in range(count):  # a jackknife: what an image would move the values by, were it left out
+        mine = image == i
+        own = g[mine].T @ g[mine]
+        moved = np.linalg.lstsq(np.linalg.inv(inverse) - own, scores[i], rcond=None)[0]
+        by_image += np.outer(moved, moved)
+    by_image *= (count - 1) / count
+    ratio = float(np.trace(by_image @ np.linalg.inv(covariance)) / rank)
+    return float(np.sqrt(ratio)), float(rank * (count - 1))
+
+
+def _cells_of_rows(camera: _Camera) -> np.ndarray:
+    """Of each of the camera's observations the number of its cell."""
+    cols, rows = camera.size
+    col = np.clip((camera.x + 0.5) / cols * CELLS[0], 0, CELLS[0] - 1).astype(int)
+    row = np.clip((camera.y + 0.5) / rows * CELLS[1], 0, CELLS[1] - 1).astype(int)
+    return np.asarray(row * CELLS[0] + col)
+
+
+def _common(camera: _Camera, g: np.ndarray, after: np.ndarray) -> tuple[float, float, float]:
+    """What residuals have in common in one cell: in units of their standard deviations, in px, and the effective number of residuals.
+
+    One-way analysis of variance with random effects (Searle, Casella, McCulloch, Variance Components, 1992, 3.6); nothing where an
+    F-test at 1 % does not find it.
+    """
+    from scipy import stats
+
+    _, cell, counts = np.unique(_cells_of_rows(camera), return_inverse=True, return_counts=True)
+    n, cells = len(cell), len(counts)
+    if cells < 3 or n <= 2 * cells:
+        return 0.0, 0.0, float(2 * n)
+    values = after.reshape(-1, 2)[camera.mine]
+    per_cell = (n - (counts**2).sum() / n) / (cells - 1)
+    between = within = 0.0
+    for v in values.T:
+        means = np.bincount(cell, v) / counts
+        between += (counts * (means - v.mean()) ** 2).sum()
+        within += ((v - means[cell]) ** 2).sum()
+    between, within = between / (2 * (cells - 1)), within / (2 * (n - cells))
+    if stats.f.sf(between / within, 2 * (cells - 1), 2 * (n - cells)) > 0.01:
+        return 0.0, 0.0, float(2 * n)
+    square = max(between - within, 0.0) / per_cell
+    rho = square / (square + within)
+    mean_count = float((counts**2).sum() / n)
+    network, rows = camera.terms.adjustment.network, camera.terms.rows[camera.mine]
+    px = float(np.sqrt(square * network.covariance_px2[rows][:, [0, 2]].mean()))
+    return float(np.sqrt(square)), px, float(2 * n / (1 + (mean_count - 1) * rho))
+
+
+def _by_cell(camera: _Camera, g: np.ndarray) -> Array:
+    """Gᵀ Z Zᵀ G with the cells' indicators Z, of x and of y."""
+    _, cell = np.unique(_cells_of_rows(camera), return_inverse=True)
+    own = g.reshape(-1, 2, g.shape[1])[camera.mine]
+    total = np.zeros((g.shape[1], g.shape[1]))
+    for axis in range(2):
+        sums = np.stack([np.bincount(cell, own[:, axis, k]) for k in range(g.shape[1])], axis=1)
+        total += sums.T @ sums
+    return total
+
+
+# ---- seams ----------------------------------------------------------------------------------------------------------------------------
+
+
+def _seams(camera: _Camera, others: list[Candidate], place: Place | None) -> Seams | None:
+    """Steps of the best partition of the frame."""
+    terms = camera.terms
+    with_others = [_dense(terms, one) for one in others]
+    best: tuple[float, tuple[int, int], _Fit] | None = None
+    for layout in LAYOUTS:
+        shift = field_terms(camera.x, camera.y, *camera.size, layout)
+        beside = terms.beside(np.hstack([terms.as_rows(camera.along(shift)), *with_others]))
+        fit = _fit(camera, beside, shift[0].shape[1])
+        if fit is not None and (best is None or fit.gain > best[0]):
+            best = fit.gain, layout, fit
+    if best is None:
+        return None
+    gain, layout, fit = best
+    fields = layout[0] * layout[1]
+    named = place is not None and not place.rivals and gain > STRONG
+    # steps less their mean, of draws of one standard deviation: their squares over what is told of them
+    weight, square = float(np.trace(fit.told @ fit.told.T)), float(fit.values @ fit.values)
+    std = float(np.sqrt(max(square - np.trace(fit.covariance), 0.0) / weight))
+    of_draws = std / np.sqrt(2 * fit.rank)
+    of_noise = float(np.sqrt(fit.values @ fit.covariance @ fit.values)) / (weight * std) if std else 0.0
+    limit = float(np.sqrt(square / weight)) + 1.645 * float(np.sqrt(np.trace(fit.covariance) / weight))
+    return Seams(
+        layout[0], layout[1], std, float(np.hypot(of_draws, of_noise)), float(fit.rank), limit, gain, bool(named),
+        fit.values.reshape(2, fields).T, np.sqrt(np.diag(fit.covariance)).reshape(2, fields).T,
+    )  # fmt: skip
+
+
+# ---- scales of images -----------------------------------------------------------------------------------------------------------------
+
+
+def _scales(camera: _Camera, others: list[Candidate]) -> ImageScales | None:
+    """Whether the scale of x differs from image to image, and whether it decays with time."""
+    from scipy import stats
+
+    adjustment = camera.terms.adjustment
+    network = adjustment.network
+    images = np.unique(camera.image)
+    if len(images) < LEAST_IMAGES:
+        return None
+    contrasts = np.linalg.svd(np.eye(len(images)) - 1 / len(images))[0][:, :-1]
+    if "x_scale" in network.per_image:
+        rows = [adjustment.free_columns.index(f"{network.images[i]}:x_scale") for i in images]
+        y = contrasts.T @ adjustment.state.x_scale[images]
+        v = contrasts.T @ adjustment.covariance[np.ix_(rows, rows)] @ contrasts
+    else:
+        columns = np.zeros((len(camera.x), len(images)))
+        columns[np.arange(len(camera.x)), np.searchsorted(images, camera.image)] = camera.x - network.scale_origin_px
+        terms = [camera.terms.as_rows(camera.along((columns, 0 * columns))), *(_dense(camera.terms, one) for one in others)]
+        own = np.zeros((sum(part.shape[1] for part in terms), len(contrasts.T)))
+        own[: len(images)] = contrasts
+        rest = np.eye(len(own))[:, len(images) :]
+        found = camera.terms.test(np.hstack(terms), np.hstack([own, rest]))
+        k = contrasts.shape[1]
+        y, v = found.values[:k], found.covariance[:k, :k]
+    if not np.isfinite(v).all() or np.linalg.eigvalsh(v)[0] <= 0:
+        return None
+    weight = np.linalg.inv(v)
+    chi2 = float(y @ weight @ y)
+    p_differ = float(stats.f.sf(chi2 / len(y), len(y), adjustment.dof))
+    values, u = contrasts @ y, np.sqrt(np.einsum("ij,jk,ik->i", contrasts, v, contrasts))
+    known = network.time_s is not None and np.isfinite(network.time_s[images]).all() and np.ptp(network.time_s[images]) > 0
+    scales = ImageScales(tuple(network.images[i] for i in images), values, u, None, p_differ, None)
+    if not known or len(images) < LEAST_IMAGES + 1:
+        return scales
+    time_s = network.time_s[images] - network.time_s[images].min()  # type: ignore[index]
+    return _decaying(replace(scales, time_s=time_s), y, weight, contrasts, chi2, adjustment.dof)
+
+
+def _decaying(scales: ImageScales, y: np.ndarray, weight: np.ndarray, contrasts: np.ndarray, chi2: float, dof: float) -> ImageScales:
+    """A decay δ exp(−t/τ) from the first image on; what is common to all images belongs to the affinity."""
+    from scipy import optimize, stats
+
+    time_s = scales.time_s
+    assert time_s is not None
+    span = float(np.ptp(time_s))
+
+    def shape(tau: float) -> Array:
+        return np.asarray(contrasts.T @ np.exp(-time_s / tau))
+
+    def fall(log_tau: float) -> float:
+        a = shape(float(np.exp(log_tau)))
+        return -(float(a @ weight @ y) ** 2) / max(float(a @ weight @ a), 1e-300)
+
+    tries = np.linspace(np.log(span / (3 * len(time_s))), np.log(5 * span), 60)
+    best = int(np.argmin([fall(one) for one in tries]))
+    low, high = tries[max(best - 1, 0)], tries[min(best + 1, len(tries) - 1)]
+    tau = float(np.exp(optimize.minimize_scalar(fall, bounds=(low, high), method="bounded", options={"xatol": 1e-6}).x))
+    a = shape(tau)
+    size = float(a @ weight @ y) / float(a @ weight @ a)
+    slope = size * (contrasts.T @ (time_s / tau * np.exp(-time_s / tau)))  # by ln τ
+    jacobian = np.stack([a, slope], axis=1)
+    left = y - size * a
+    rest, free = float(left @ weight @ left), len(y) - 2
+    p_left = float(stats.f.sf(rest / free, free, dof))
+    covariance = np.linalg.pinv(jacobian.T @ weight @ jacobian, hermitian=True) * max(rest / free, 1.0)
+    gain = (chi2 - rest) / max(rest / free, 1.0) - 2 * np.log(dof)
+    to_tau = np.diag([1.0, tau])
+    return replace(scales, p_left=p_left, gain=gain, start=size, tau_s=tau, covariance=to_tau @ covariance @ to_tau)
