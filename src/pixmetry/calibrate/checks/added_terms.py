@@ -238,15 +238,19 @@ class AddedTerms:
 
         return terms if sparse.issparse(terms) else np.asarray(terms, float).reshape(2 * len(self.rows), -1)
 
+    def whitened(self, terms: Any) -> Any:
+        """The same, whitened."""
+        return self._blocks @ self.as_rows(terms)
+
     def normals(self, terms: Any) -> Normals:
         """The normal equations of terms when the estimated parameters have taken what they can; terms as of `test`."""
-        white = self._blocks @ self.as_rows(terms)
+        white = self.whitened(terms)
         full = _dense(white.T @ white)
         return Normals(full, full - self._taken(white), np.asarray(white.T @ self._residual))
 
     def beside(self, terms: np.ndarray) -> Beside:
         """What the estimated parameters leave of terms, row by row, and by how much the terms change the cameras' parameters."""
-        white = self._blocks @ self.as_rows(terms)
+        white = self.whitened(terms)
         by_point = self._alone_design.T @ white
         over_points = self._point_inverse @ by_point
         right = _dense(self._kept.T @ white - self._cross.T @ over_points) * self._scale[:, None]

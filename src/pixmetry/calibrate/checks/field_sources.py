@@ -13,22 +13,25 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from pixmetry.calibrate.bundle.model import NAMES
-from pixmetry.calibrate.checks.added_terms import AddedTerms, Beside
+from pixmetry.calibrate.checks.added_terms import AddedTerms, Beside, Normals
 from pixmetry.calibrate.checks.causes import STRONG, Candidate, Place
 from pixmetry.calibrate.records import FieldSources, HeightMap, ImageScales, Seams
 from pixmetry.core.arrays import Array
 
-LAYOUTS = ((2, 1), (1, 2), (2, 2), (3, 1), (1, 3), (4, 1), (3, 2), (4, 2))  # fields side by side, one above the other
+LAYOUTS = ((2, 1), (1, 2), (3, 1), (1, 3), (2, 2), (4, 1), (3, 2), (4, 2))  # fields side by side, one above the other
 DEGREES = tuple((i, j) for j in range(5) for i in range(5) if 2 <= i + j <= 4)  # of P_i(x) P_j(y): shapes of a surface
 PLAIN = ((2, 0), (0, 2), (1, 1), (3, 0), (0, 3))  # bow, twist and skew
 TOLD = 0.1  # share of a term that must be left when the estimated parameters have taken theirs
 CELLS = (10, 8)  # of the frame, in which residuals have something in common or not
 TURNED = 1e-3  # level at which a pattern that turns is no height
 SIDE = (33, 25)  # of the map that is drawn
+FINER = 0.03  # of what a partition explains, which a finer one must explain more: terms are linear
 LEAST_IMAGES = 5  # whose scores show their own scatter
 
 
@@ -59,6 +62,20 @@ class _Camera:
     x: np.ndarray
     y: np.ndarray
     image: np.ndarray
+
+    @cached_property
+    def cells(self) -> _Cells:
+        """Those in which residuals have something in common or not."""
+        from scipy import sparse
+
+        cols, rows = self.size
+        col = np.clip((self.x + 0.5) / cols * CELLS[0], 0, CELLS[0] - 1).astype(int)
+        row = np.clip((self.y + 0.5) / rows * CELLS[1], 0, CELLS[1] - 1).astype(int)
+        _, cell = np.unique(row * CELLS[0] + col, return_inverse=True)
+        at = 2 * np.flatnonzero(self.mine)
+        lines, columns = np.concatenate([at, at + 1]), np.concatenate([2 * cell, 2 * cell + 1])
+        terms = sparse.csr_matrix((np.ones(len(lines)), (lines, columns)), shape=(2 * len(self.mine), 2 * (cell.max() + 1)))
+        return _Cells(self.terms.whitened(terms), self.terms.normals(terms))
 
     @property
     def size(self) -> tuple[int, int]:
@@ -203,6 +220,7 @@ class _Fit:
     rank: int
     dof: float
     gain: float
+    evidence: float  # the gain as if residuals were independent: to compare fits with each other
     p: float
     factor: float
     common_px: float
@@ -223,7 +241,7 @@ def _fit(camera: _Camera, beside: Beside, own: int) -> _Fit | None:
         inverse = np.linalg.pinv(more.T @ more, rcond=1e-6, hermitian=True)
         rest, v = rest - more @ (inverse @ (more.T @ rest)), v - more @ (inverse @ (more.T @ v))
     left = rest.T @ rest
-    size = beside.length[:own]
+    size = np.where(beside.length[:own] > 0, beside.length[:own], 1.0)  # a part of the frame may have no image points
     values, vectors = np.linalg.eigh(left / np.outer(size, size))
     good = values > TOLD**2
     if not good.any():
@@ -244,15 +262,28 @@ def _fit(camera: _Camera, beside: Beside, own: int) -> _Fit | None:
     after = v - g @ found
     covariance = variance * inverse
     factor, clusters = _scatter_by_image(camera, g, after, covariance, inverse)
-    common, common_px, effective = _common(camera, g, after)
-    covariance = max(factor, 1.0) ** 2 * covariance + common**2 * inverse @ _by_cell(camera, g) @ inverse
-    f = fall / rank / variance / max(factor, 1.0) ** 2
-    gain = dof * np.log(max(before, 1e-300) / max(before - fall, 1e-300)) / max(factor, 1.0) ** 2 - rank * np.log(dof)
+    whole = camera.cells.normals
+    own_cells = np.asarray(camera.cells.white.T @ beside.rest)
+    common_px, effective = _common(camera, whole, own_cells, beside, after, variance)
+    by_cell = np.asarray(camera.cells.white.T @ g)
+    full = max(factor, 1.0) ** 2 * covariance + common_px**2 * inverse @ (by_cell.T @ by_cell) @ inverse
+    inflated = float(np.trace(full @ np.linalg.inv(covariance)) / rank)
+    f = float(found @ np.linalg.inv(full) @ found) / rank
+    explained, cost = float(dof * np.log(max(before, 1e-300) / max(before - fall, 1e-300))), float(rank * np.log(dof))
     told = directions @ (vectors[:, good].T * size)
     return _Fit(
-        directions @ found, directions @ covariance @ directions.T, told, rank, clusters if factor > 1 else float(dof), float(gain),
-        float(stats.f.sf(f, rank, dof)), factor, common_px, effective,
-    )  # fmt: skip
+        values=directions @ found,
+        covariance=directions @ full @ directions.T,
+        told=told,
+        rank=rank,
+        dof=clusters if factor > 1 else float(dof),
+        gain=explained / inflated - cost,
+        evidence=explained - cost,
+        p=float(stats.f.sf(f, rank, dof)),
+        factor=factor,
+        common_px=common_px,
+        effective=effective,
+    )
 
 
 def _image_of_rows(camera: _Camera) -> tuple[np.ndarray, int]:
@@ -283,53 +314,42 @@ def _scatter_by_image(
     return float(np.sqrt(ratio)), float(rank * (count - 1))
 
 
-def _cells_of_rows(camera: _Camera) -> np.ndarray:
-    """Of each of the camera's observations the number of its cell."""
-    cols, rows = camera.size
-    col = np.clip((camera.x + 0.5) / cols * CELLS[0], 0, CELLS[0] - 1).astype(int)
-    row = np.clip((camera.y + 0.5) / rows * CELLS[1], 0, CELLS[1] - 1).astype(int)
-    return np.asarray(row * CELLS[0] + col)
+@dataclass(frozen=True)
+class _Cells:
+    """Displacements of the cells of a frame, each as a whole along x and along y.
 
-
-def _common(camera: _Camera, g: np.ndarray, after: np.ndarray) -> tuple[float, float, float]:
-    """What residuals have in common in one cell: in units of their standard deviations, in px, and the effective number of residuals.
-
-    One-way analysis of variance with random effects (Searle, Casella, McCulloch, Variance Components, 1992, 3.6); nothing where an
-    F-test at 1 % does not find it.
+    Parameters
+    ----------
+    white : sparse matrix, shape (2 m, 2 cells)
+        Whitened.
+    normals : Normals
+        Beside the estimated parameters.
     """
-    from scipy import stats
 
-    _, cell, counts = np.unique(_cells_of_rows(camera), return_inverse=True, return_counts=True)
-    n, cells = len(cell), len(counts)
-    if cells < 3 or n <= 2 * cells:
-        return 0.0, 0.0, float(2 * n)
-    values = after.reshape(-1, 2)[camera.mine]
-    per_cell = (n - (counts**2).sum() / n) / (cells - 1)
-    between = within = 0.0
-    for v in values.T:
-        means = np.bincount(cell, v) / counts
-        between += (counts * (means - v.mean()) ** 2).sum()
-        within += ((v - means[cell]) ** 2).sum()
-    between, within = between / (2 * (cells - 1)), within / (2 * (n - cells))
-    if stats.f.sf(between / within, 2 * (cells - 1), 2 * (n - cells)) > 0.01:
-        return 0.0, 0.0, float(2 * n)
-    square = max(between - within, 0.0) / per_cell
-    rho = square / (square + within)
-    mean_count = float((counts**2).sum() / n)
+    white: Any
+    normals: Normals
+
+
+def _common(camera: _Camera, whole: Normals, across: np.ndarray, beside: Beside, after: np.ndarray, variance: float) -> tuple[float, float]:
+    """What residuals have in common in one cell, px, and the effective number of residuals.
+
+    By moments of the cells' sums q with the normal matrix L that all estimates leave of the cells, E qᵀq = σ² tr L + σ_c² tr L² (Searle,
+    Casella, McCulloch, Variance Components, 1992, 5.5); nothing where chance makes as much in 1 %.
+    """
+    inverse = np.linalg.pinv(beside.rest.T @ beside.rest, rcond=1e-9, hermitian=True)
+    left = whole.left - across @ inverse @ across.T
+    q = np.asarray(camera.cells.white.T @ after)
+    n = 2.0 * float(camera.mine.sum())
+    square, trace = float((left * left).sum()), float(np.trace(left))
+    excess = float(q @ q) - variance * trace
+    if square <= 0 or excess < 2.33 * variance * np.sqrt(2 * square):
+        return 0.0, n
+    common2 = excess / square
     network, rows = camera.terms.adjustment.network, camera.terms.rows[camera.mine]
-    px = float(np.sqrt(square * network.covariance_px2[rows][:, [0, 2]].mean()))
-    return float(np.sqrt(square)), px, float(2 * n / (1 + (mean_count - 1) * rho))
-
-
-def _by_cell(camera: _Camera, g: np.ndarray) -> Array:
-    """Gᵀ Z Zᵀ G with the cells' indicators Z, of x and of y."""
-    _, cell = np.unique(_cells_of_rows(camera), return_inverse=True)
-    own = g.reshape(-1, 2, g.shape[1])[camera.mine]
-    total = np.zeros((g.shape[1], g.shape[1]))
-    for axis in range(2):
-        sums = np.stack([np.bincount(cell, own[:, axis, k]) for k in range(g.shape[1])], axis=1)
-        total += sums.T @ sums
-    return total
+    px2 = network.covariance_px2[rows][:, [0, 2]].mean()
+    counts = px2 * np.diag(whole.full)
+    rho = common2 / (common2 + px2 * variance)
+    return float(np.sqrt(common2)), n / (1 + ((counts**2).sum() / counts.sum() - 1) * rho)
 
 
 # ---- seams ----------------------------------------------------------------------------------------------------------------------------
@@ -339,16 +359,17 @@ def _seams(camera: _Camera, others: list[Candidate], place: Place | None) -> Sea
     """Steps of the best partition of the frame."""
     terms = camera.terms
     with_others = [_dense(terms, one) for one in others]
-    best: tuple[float, tuple[int, int], _Fit] | None = None
+    best: tuple[tuple[int, int], _Fit] | None = None
     for layout in LAYOUTS:
         shift = field_terms(camera.x, camera.y, *camera.size, layout)
         beside = terms.beside(np.hstack([terms.as_rows(camera.along(shift)), *with_others]))
         fit = _fit(camera, beside, shift[0].shape[1])
-        if fit is not None and (best is None or fit.gain > best[0]):
-            best = fit.gain, layout, fit
+        if fit is not None and (best is None or fit.evidence > FINER * abs(best[1].evidence) + best[1].evidence + STRONG):
+            best = layout, fit
     if best is None:
         return None
-    gain, layout, fit = best
+    layout, fit = best
+    gain = fit.gain
     fields = layout[0] * layout[1]
     named = place is not None and not place.rivals and gain > STRONG
     # steps less their mean, of draws of one standard deviation: their squares over what is told of them

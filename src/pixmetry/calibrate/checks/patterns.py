@@ -39,7 +39,8 @@ MEANING = {
     "unflatness": (
         "radial residuals depend on the position in the frame, not only on the radius",
         "sensor.unflatness",
-        "correct by a residual grid; check with views at other angles whether the shifts grow with the tangent of the chief ray",
+        "correct by the height that camera.yaml then holds, or by a residual grid; with another focal length the shifts must change as "
+        "1 over it",
     ),
     "field": ("residuals depend on the position in the frame", "sensor.pixel_geometry", "correct by a residual grid"),
     "seams": (

@@ -11,6 +11,7 @@ import numpy as np
 
 from pixmetry.calibrate.bundle.model import NAMES
 from pixmetry.calibrate.page import tables
+from pixmetry.calibrate.page.sources import add_sources
 from pixmetry.calibrate.page.text import (
     DIRECTIONS,
     of_camera,
@@ -200,6 +201,9 @@ def _residuals(section: Section, calibration: Calibration, pictures: Sequence[Ma
     if text := _eccentricity(tests.eccentricity):
         section.add_text(text)
     _patterns(section, tables.patterns(tests.patterns or (), len(cameras) > 1))
+    for k, model in enumerate(cameras):
+        if (told := of_camera(tests.field_sources, model.name)) is not None:
+            add_sources(_channel(section, calibration, k), told, calibration.adjustment.camera(k))
     if gross := tables.gross_errors(tests.gross_errors or ()):
         heads = ["Image", "Point", "Residual x / px", "y / px", "Error x / px", "y / px", "Statistic", "Critical"]
         many = f"{len(gross)} image points were" if len(gross) > 1 else "1 image point was"

@@ -87,7 +87,8 @@ SOURCE = Source(
     references=("M. Born, E. Wolf, Principles of Optics, 7th ed. 1999, §1.5 (law of refraction)",),
     advice="Calibrate with the glass in place: K1 includes nearly all of it.",
     reasons={
-        "measure": "a calibration includes it in the radial distortion and cannot separate it",
+        "measure": "coordinates cannot tell it: a plate displaces along the radius by an odd polynomial of the radius, as the lens does; "
+        "take its thickness from the sensor's drawing",
         "correct": "frames are not resampled; positions are corrected instead, by the calibration",
     },
 )

@@ -104,7 +104,8 @@ SOURCE = Source(
     ),
     advice="Calibrate: principal point and principal distance include nearly all of it. Shim the sensor if one side is out of focus.",
     reasons={
-        "measure": "a calibration includes it in the principal point and cannot separate it; the focus over the frame would show it",
+        "measure": "coordinates cannot tell it: a tilted plane is seen by a homography, which is a pose and a principal point; "
+        "the focus over the frame would show it",
         "correct": "frames are not resampled; positions are corrected instead, by the calibration",
     },
 )
