@@ -85,7 +85,8 @@ def main() -> None:
                 untold[name] += 1
                 continue
             found = fit[name]
-            scores[name].append(((found.value - value) / found.u, found.u / value))
+            u = found.u * value / found.value if name.startswith("scatter") else found.u  # χ² of the truth's size
+            scores[name].append(((found.value - value) / u, u / value))
         if "scene.speckle" in estimates:
             if "f_number" in fit or "airy_px" in fit:
                 n = estimates["scene.speckle"]["f_number"]

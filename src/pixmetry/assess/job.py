@@ -46,6 +46,7 @@ from pixmetry.observe.covered import BorderFrames, covered_pixels
 from pixmetry.observe.observe import Group, observe
 from pixmetry.observe.one_pass import without_levels
 from pixmetry.series.job import measure_motion, measure_series
+from pixmetry.series.views import measure_views
 
 KIND = "assessment"
 SPREADING = ("optics.point_spread", "optics.olpf", "sensor.pixel_aperture")
@@ -313,6 +314,8 @@ def observe_campaign(campaign: Campaign, progress: Progress) -> tuple[InputHashe
         seen = _with_series(seen, campaign, still, reader, on_frames)
     if moving := [g for g in followed if g.kind == "motion"]:
         seen = _with_motion(seen, campaign, moving, reader, on_frames)
+    if sides := [g for g in followed if g.kind == "views"]:
+        seen = _with_views(seen, campaign, sides, reader, on_frames)
     fit = seen.photon_transfer_fit
     gain = fit["gain_dn_per_e"].value if fit is not None and "gain_dn_per_e" in fit else None
     bordered = covered_pixels(borders, campaign.camera.interface == "analogue", gain)
@@ -366,6 +369,30 @@ def _with_motion(
         note = f"the frames of moving targets tell nothing: {problem}"
         return replace(seen, failed={**seen.failed, "motion": problem.what}, notes=(*seen.notes, note))
     return replace(seen, motion=found)
+
+
+def _with_views(
+    seen: Observations, campaign: Campaign, groups: Sequence[FrameGroup], reader: FrameReader, on_frames: Callable[[int], object]
+) -> Observations:
+    """What frames of targets that are seen or lit from several sides tell; each frame is a view."""
+    frames = [(path.name, g.exposure_s, partial(reader.fetch, path)) for g in groups for path in g.paths]
+    stated, focal = campaign.stated, campaign.optics.focal_length_mm
+    pitch = stated.pitch_x_um
+    distance = None if pitch is None or focal is None else 1e3 * focal / pitch
+    ratio = 1.0 if pitch is None or stated.pitch_y_um is None else stated.pitch_y_um / pitch
+    try:
+        found = measure_views(frames, distance, ratio, _shading(seen), on_frames=on_frames, bits=campaign.bits)
+    except MeasureError as problem:
+        note = f"the views of targets tell nothing: {problem}"
+        return replace(seen, failed={**seen.failed, "views": problem.what}, notes=(*seen.notes, note))
+    return replace(seen, views=found, notes=(*seen.notes, *(f"Views of targets: {n}" for n in found.notes)))
+
+
+def _shading(seen: Observations) -> float:
+    """Largest relative slope of an even field, 1/px; 0 where it was not measured."""
+    fit = seen.spatial_fit
+    names = [n for n in ("gradient_x_per_px", "gradient_y_per_px") if fit is not None and n in fit]
+    return max((abs(fit[n].value) for n in names), default=0.0) if fit is not None else 0.0
 
 
 def by_the_standard(campaign: Campaign, observations: Observations) -> Results:

@@ -28,6 +28,7 @@ from pixmetry.camera.observations import (
 )
 from pixmetry.camera.response import Response
 from pixmetry.camera.speckle import SpeckleFrames
+from pixmetry.camera.views import TargetViews
 from pixmetry.core.number import Estimates
 from pixmetry.emva.files.json_format import value_record
 from pixmetry.emva.records import Results
@@ -122,6 +123,7 @@ class Assessment:
             "response": None if self.observations.response is None else response_record(self.observations.response),
             "series": None if self.observations.drift is None else drift_record(self.observations.drift),
             "motion": None if self.observations.motion is None else motion_record(self.observations.motion),
+            "views": None if self.observations.views is None else views_record(self.observations.views),
             "speckle": None if self.observations.speckle is None else speckle_record(self.observations.speckle),
             "covered": None if self.observations.covered is None else covered_record(self.observations.covered),
             "lines": None if self.observations.lines is None else lines_record(self.observations.lines),
@@ -355,6 +357,29 @@ def covered_record(found: CoveredPixels) -> dict[str, Any]:
     noise = [{"exposure_s": exposure_s, "row_noise_dn": value, "u": u} for exposure_s, value, u in found.row_noise]
     told = {name: why for name, why in found.fit.reasons.items() if name not in found.fit}
     return {"borders": asdict(found.covered), "values": found.fit.to_records(), "not_told": told, "trails": trails, "row_noise": noise}
+
+
+def views_record(found: TargetViews) -> dict[str, Any]:
+    """The plain record of targets seen or lit from several sides: values, a line for each view and for each target in it."""
+    names = (
+        *("view", "x_px", "y_px", "gradient_x_per_px", "gradient_y_per_px", "u_gradient_x_per_px", "u_gradient_y_per_px"),
+        *("semi_major_px", "semi_minor_px", "centroid_x_px", "centroid_y_px", "predicted_x_px", "predicted_y_px", "amplitude_dn_per_s"),
+    )
+    columns = [getattr(found, name).tolist() for name in names]
+    targets = [
+        {n: None if isinstance(v, float) and not np.isfinite(v) else v for n, v in zip(names, row, strict=True)}
+        for row in zip(*columns, strict=True)
+    ]
+    return {
+        **_joint_record(found.fit),
+        "surface": found.surface,
+        "principal_distance_px": found.principal_distance_px,
+        "angle_deg": found.angle_deg.tolist(),
+        "u_angle_deg": found.u_angle_deg.tolist(),
+        "eccentricity_px": None if found.eccentricity_px is None else found.eccentricity_px.tolist(),
+        "centroids_explained": None if np.isnan(found.slope) else {"value": found.slope, "u": found.u_slope},
+        "targets": targets,
+    }
 
 
 def speckle_record(found: SpeckleFrames) -> dict[str, Any]:

@@ -167,6 +167,15 @@ SET_UPS = {
             "dots",
         ),
         SetUp(
+            "views",
+            "Targets from several sides",
+            "The chart, or the targets of the measurement, from 8 sides up to the most oblique one; or one view, lit from 8 sides.",
+            "Targets at 70 % of saturation, 6 px or more across.",
+            "slope of the light to 15 %",
+            (_series("views", 8, exposure_s="<t>"),),
+            "dots",
+        ),
+        SetUp(
             "speckle",
             "A laser spot on a surface that moves",
             "The laser, the lens and its stop as in the measurement; laser and camera at rest. Between two frames move the surface "

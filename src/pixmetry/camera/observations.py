@@ -22,6 +22,7 @@ from pixmetry.camera.noise_covariance import NoiseCovariance, NoiseFilter
 from pixmetry.camera.response import Response
 from pixmetry.camera.speckle import SpeckleFrames
 from pixmetry.camera.stated import StatedFacts
+from pixmetry.camera.views import TargetViews
 from pixmetry.core.errors import MeasureError
 from pixmetry.core.number import Estimates
 
@@ -783,6 +784,7 @@ class Observations:
     motion: MotionSeries | None = None
     speckle: SpeckleFrames | None = None
     sequences: FrameSequences | None = None
+    views: TargetViews | None = None
     failed: Mapping[str, str] = field(default_factory=dict)  # by kind of frames: why they tell nothing
     storage: Storage = Storage()
     notes: tuple[str, ...] = field(default_factory=tuple)

@@ -33,8 +33,9 @@ TARGETS = (
     "motion",
     "speckle",
     "sequence",
+    "views",
 )  # pictures of something to measure; one frame may be enough
-LOCATED = ("series", "motion")  # kinds whose frames are measured one by one, for their targets
+LOCATED = ("series", "motion", "views")  # kinds whose frames are measured one by one, for their targets
 LOSSY = ("pattern", "speckle")  # kinds whose files may be JPEG
 FACTS = {  # what else may be said of a group, by its kind
     "edge": ("wavelength_nm",),

@@ -117,6 +117,7 @@ class GroupModel(Model):
         "motion",
         "speckle",
         "sequence",
+        "views",
     ]
     exposure_s: Annotated[float, Field(ge=0)] | None = None
     photons: Annotated[float, Field(ge=0)] | None = None

@@ -28,6 +28,7 @@ def locate(
     bits: int | None = None,
     aperture_px: float = 1.0,
     light_on: str = "surface",
+    planes: str | bool = "auto",
     threads: int | None = None,
     name: str = "frame",
 ) -> Located:
@@ -53,6 +54,8 @@ def locate(
         Side of the pixel's light-sensitive square, 0 for point samples.
     light_on : {"surface", "image"}
         Whether light that falls off across a target acts before the lens's blur or after it.
+    planes : {"auto"} or bool
+        Whether slopes of the light on a target and of the ground about it are unknowns of its template.
     threads : int, optional
     name : str
         Of the image, for the table.
@@ -93,7 +96,7 @@ def locate(
     image = checked_frame(frame, name)
     model = noise_model(noise)
     low, high = scale_ends(image, bits, model)
-    task = Task(image, kind, estimator, polarity, grid_size(grid, kind), model, low, high, aperture_px, light_on, threads)
+    task = Task(image, kind, estimator, polarity, grid_size(grid, kind), model, low, high, aperture_px, light_on, threads, planes)
     columns, notes = WORK.get(kind, locate_spots)(task)
     about = {"name": name, "rows": image.shape[0], "cols": image.shape[1], "targets": len(columns["x_px"]), **notes}
     return Located(columns, kind, (about,))

@@ -32,6 +32,7 @@ class Task:
     aperture_px: float
     light_on: str
     threads: int | None
+    planes: str | bool = "auto"
 
 
 def locate_spots(task: Task) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
@@ -47,7 +48,7 @@ def locate_spots(task: Task) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     if estimator == "auto":
         shape = seen
         estimator, reason = chosen_estimator(targets, noise, why)
-    planes: str | bool = False if task.kind == "coded" else "auto"  # the rings would pass for slopes
+    planes = False if task.kind == "coded" else task.planes  # the rings would pass for slopes
     settings = Settings(shape, planes, task.light_on, task.aperture_px, task.threads)
     positions = methods()[estimator].positions(task.frame, targets, noise, settings)
     columns = _columns(positions, estimator if shape == task.kind else f"{estimator} ({shape})", noise)

@@ -98,6 +98,7 @@ def _pictures(assessment: Assessment) -> list[Section]:
     from pixmetry.assess.page.sequence import sequence_section
     from pixmetry.assess.page.speckle import speckle_section
     from pixmetry.assess.page.spots import spots_section
+    from pixmetry.assess.page.views import views_section
     from pixmetry.series.page import drift_section, motion_section
 
     seen = assessment.observations
@@ -115,6 +116,7 @@ def _pictures(assessment: Assessment) -> list[Section]:
         *([] if seen.drift is None else [drift_section(seen.drift)]),
         *([] if seen.motion is None else [motion_section(seen.motion)]),
         *([] if seen.speckle is None else [speckle_section(seen.speckle)]),
+        *([] if seen.views is None else [views_section(seen.views)]),
     ]
 
 

@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from pixmetry.camera.contribution import Contribution, Probe
+from pixmetry.camera.observations import Observations, of_pictures
 from pixmetry.camera.signal import Kind
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.number import Estimates
 
 
 class ViewPoint(Parameters):
@@ -29,6 +31,24 @@ class ViewPoint(Parameters):
         radius, tilt = 0.5 * self.diameter_px, np.radians(self.view_angle_deg)
         c = self.principal_distance_px
         return float(radius**2 * np.sin(tilt) * np.cos(tilt) / (c * (1 - (radius / c * np.sin(tilt)) ** 2)))
+
+
+def measure(observations: Observations) -> Estimates:
+    """Slope of the light, largest angle of view and diameter of the targets, from views of them."""
+    views = observations.views
+    names = {n: n for n in ("gradient_rel_per_px", "view_angle_deg", "diameter_px")}
+    failed = observations.failed.get("views", "")
+    fit = of_pictures(
+        None if views is None else views.fit,
+        names,
+        where="scene.view_point",
+        pictures="targets from several sides",
+        kind="views",
+        failed=failed,
+    )
+    if views is None or views.principal_distance_px is None:
+        return fit
+    return fit.join(Estimates.from_rows([("principal_distance_px", views.principal_distance_px, 0.0, np.inf, "px")]))
 
 
 def propagate(params: ViewPoint, probe: Probe) -> Contribution:
@@ -57,6 +77,7 @@ SOURCE = Source(
     neutral=ViewPoint(),
     typical=ViewPoint(gradient_rel_per_px=0.002),
     bound=ViewPoint(gradient_rel_per_px=0.02, view_angle_deg=45.0),
+    measure=measure,
     propagate=propagate,
     gum_class="O",
     equation="Δ = p g ⟨x²⟩_f for a gradient g of brightness;  e = R² sin α cos α/c for a circle tilted by α",
@@ -69,7 +90,7 @@ SOURCE = Source(
     advice="Light targets from the camera or diffusely, take retro-reflective targets, and fit their edges, not their brightness.",
     reasons={
         "forward": "it belongs to the scene: `lighting` in a scene file makes a gradient, a `plate` is seen in perspective",
-        "measure": "needs images of the same target from several directions: a plane fitted to the logarithm of its pixels",
-        "correct": "the eccentricity is corrected where positions are adjusted; a gradient is fitted with the target",
+        "correct": "the eccentricity is corrected where positions are adjusted; the template fits the gradient with the target "
+        "(planes=True of pixmetry.locate)",
     },
 )
