@@ -173,7 +173,8 @@ class Assessment:
             mask = seen.defects.mask()
             maps["defects"] = mask.astype(np.uint8)
             if seen.dark_stack is not None and seen.bright_stack is not None and seen.spatial_fit is not None:
-                maps["prnu_rel"] = _response_map(seen.dark_stack, seen.bright_stack, mask).astype(np.float32)
+                gain = 1.0 if seen.taps is None else seen.taps.gain  # of the taps: a source of its own
+                maps["prnu_rel"] = _response_map(seen.dark_stack, seen.bright_stack, mask, gain).astype(np.float32)
         return maps
 
 
@@ -437,7 +438,7 @@ def lines_record(found: LineRows) -> dict[str, Any]:
     return {"jitter": fitted(found.jitter), "taped": fitted(found.taped), "refused": [asdict(r) for r in found.refused], "lines": each}
 
 
-def _response_map(dark: StackMoments, bright: StackMoments, mask: np.ndarray) -> np.ndarray:
+def _response_map(dark: StackMoments, bright: StackMoments, mask: np.ndarray, gain: np.ndarray | float) -> np.ndarray:
     """Relative response with the illumination's slow part taken out, shrunk to what is known of it.
 
     A map averaged over L frames still holds noise of variance t/L. What is predicted best from it is the map times
@@ -445,7 +446,7 @@ def _response_map(dark: StackMoments, bright: StackMoments, mask: np.ndarray) ->
     """
     from pixmetry.observe.surface import fill, fit_surface
 
-    light = fill(bright.mean_map_dn - dark.mean_map_dn, mask)
+    light = fill((bright.mean_map_dn - dark.mean_map_dn) / gain, mask)
     surface = fit_surface(light, 4).values
     relative = light / surface - 1.0
     noise = (bright.ms_pixel_dn2 / bright.n_frames + dark.ms_pixel_dn2 / dark.n_frames) / float(surface.mean()) ** 2

@@ -150,6 +150,18 @@ class ColourCells:
 
 
 @dataclass(frozen=True)
+class TapSteps:
+    """Gain of the taps by a flat field.
+
+    ``fit`` has ``step_rel``, ``odd_even_rel`` and, where a border was found, ``taps``; it is empty where the flat field tells nothing.
+    ``gain``, shape (cols,), is that of every column as far as it was found.
+    """
+
+    fit: Estimates
+    gain: np.ndarray
+
+
+@dataclass(frozen=True)
 class CodeErrors:
     """Results of a light sweep on the converter's codes; all arrays have one entry per tested code, or per missing code."""
 
@@ -763,6 +775,7 @@ class Observations:
     patterns: PatternList | None = None
     code_errors: CodeErrors | None = None
     colour_cells: ColourCells | None = None  # of a colour mosaic; the bright stack is then balanced
+    taps: TapSteps | None = None  # the stacks still have them; `spatial_fit` has not
     outliers: SingleOutliers | None = None  # of the stack of bright frames
     code_table: CodeTable | None = None  # of companding, where the codes show one
     edges: SlantedEdges | None = None

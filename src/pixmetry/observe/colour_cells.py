@@ -53,7 +53,7 @@ def _logs(tile: np.ndarray) -> np.ndarray:
         slope_y = np.log(np.median(blocks[-half_y:]) / np.median(blocks[:half_y])) / (2 * (blocks.shape[0] - half_y))
         slope_x = np.log(np.median(blocks[:, -half_x:]) / np.median(blocks[:, :half_x])) / (2 * (blocks.shape[1] - half_x))
         logs = np.log(cells) - slope_y * np.array([[-0.5], [0.5]]) - slope_x * np.array([-0.5, 0.5])
-    centred: np.ndarray = logs - logs.mean()
+        centred: np.ndarray = logs - logs.mean()  # NaN where there is no light
     return centred
 
 

@@ -28,6 +28,10 @@ CLIPPED_SHARE = 0.01
 LEAST_CONTRAST = 0.05  # of the light, between columns, from which on smear is told from stray light
 EPER = "extended pixel edge response: first covered pixel over the light beside it, −ln(1 − x₁/S)/n"
 RISE_SIGMAS = 5.0  # of the scatter of the columns, or rows, beside the border
+AXES = ("columns", "rows")
+MOST_FULL = 0.9  # of the level at which pixels are full, up to which bright frames tell late charge
+LEAST_BEFORE = 2  # covered pixels before the light, from which on what leaks under the cover is told from late charge
+UNLIKE = 0.1  # by how much the leak may differ from border to border
 SAME_BLUR = 0.25  # share of the trail that may also be missing at the near border, where no charge is late
 
 
@@ -75,7 +79,9 @@ class BorderFrames:
         return [self.frames[i] for i in sorted(self.frames)]
 
 
-def covered_pixels(groups: Sequence[BorderFrames], analogue: bool, gain_dn_per_e: float | None) -> CoveredPixels | None:
+def covered_pixels(
+    groups: Sequence[BorderFrames], analogue: bool, gain_dn_per_e: float | None, saturation_dn: float = np.inf
+) -> CoveredPixels | None:
     """What the covered pixels of all groups tell; None without any.
 
     Parameters
@@ -85,6 +91,8 @@ def covered_pixels(groups: Sequence[BorderFrames], analogue: bool, gain_dn_per_e
         Whether a video line is behind the sensor, whose filters have trails of their own along the rows.
     gain_dn_per_e : float or None
         From which the shot noise of late charge follows.
+    saturation_dn : float
+        Level above black at which pixels are full. Full pixels spill charge under the cover.
 
     Returns
     -------
@@ -111,13 +119,14 @@ def covered_pixels(groups: Sequence[BorderFrames], analogue: bool, gain_dn_per_e
     limits: set[str] = set()
     reasons: dict[str, str] = {}
     trails = []
-    for names, depth, axis in ((SERIAL, covered.right, "columns"), (PARALLEL, covered.bottom, "rows")):
-        trail = _trail(flat, zero, depth, axis, gain_dn_per_e)
+    below = [g for g in flat if max(float(_light(g, zero, axis, covered).max()) for axis in AXES) < MOST_FULL * saturation_dn]
+    for names, (axis, (depth, before)) in zip((SERIAL, PARALLEL), _depths(covered).items(), strict=True):
+        trail = _trail(below, zero, depth, before, axis, gain_dn_per_e)
         if isinstance(trail, str):
             reasons |= dict.fromkeys(names, trail)
             continue
         trails.append(trail)
-        doubt = _doubt(trail, flat, zero, covered, analogue)
+        doubt = _doubt(trail, below, zero, covered, analogue)
         if doubt:
             reasons |= dict.fromkeys(names, doubt)
             continue
@@ -175,20 +184,47 @@ class _Zero:
         return self.columns if axis == "columns" else self.rows
 
 
-def _trail(flat: Sequence[BorderFrames], zero: _Zero, depth: int, axis: str, gain: float | None) -> Trail | str:
+def _depths(covered: Covered) -> dict[str, tuple[int, int]]:
+    """Covered pixels behind the light and before it, by axis."""
+    return dict(zip(AXES, ((covered.right, covered.left), (covered.bottom, covered.top)), strict=True))
+
+
+def _light(group: BorderFrames, zero: _Zero, axis: str, covered: Covered) -> Array:
+    """Mean columns or rows of the lit part, above black."""
+    after, before = _depths(covered)[axis]
+    profile = np.mean([getattr(frame, axis) for frame in group.in_order()], axis=0) - zero.along(axis)
+    return np.asarray(profile[before : len(profile) - after], float)
+
+
+def _leak(profiles: Array, before: int) -> Array:
+    """Light of the covered pixel before the lit ones, over the mean of the lit ones beside it; by frame, shape (frames,).
+
+    No charge is late there: it is blur, light under the cover, or charge that the full pixel beside it repels. As much of that is in the
+    first covered pixel behind the light.
+    """
+    own = profiles[:, before - 1] - profiles[:, : before - 1].mean(axis=1)
+    return np.asarray(own / np.maximum(profiles[:, before : before + LIT].mean(), 1e-9), float)
+
+
+def _trail(flat: Sequence[BorderFrames], zero: _Zero, depth: int, before: int, axis: str, gain: float | None) -> Trail | str:
     side = {"columns": "right: 16", "rows": "bottom: 16"}[axis]
     if depth < LEAST_DEPTH:
         return f"needs {LEAST_DEPTH} covered {axis} or more farthest from the output (covered: {{{side}}}); {depth} are stated"
     if not flat:
-        return "needs bright frames, two or more of a level"
+        return "needs bright frames, two or more of a level, whose pixels are not full"
     first = len(zero.along(axis)) - depth
     near = depth // 2
     levels = []
+    leaks = []
     for g in flat:
         profiles = np.array([getattr(frame, axis) for frame in g.in_order()]) - zero.along(axis)
         reference = profiles[:, first + near :].mean(axis=1)
         beside = profiles[:, first - LIT : first].mean(axis=1) - reference
         trail = profiles[:, first : first + near] - reference[:, None]
+        if before >= LEAST_BEFORE:
+            leaked = _leak(profiles, before) * beside.mean()
+            trail[:, 0] -= leaked
+            leaks.append(float(leaked.mean()))
         scatter = trail.std(axis=0, ddof=1) / np.sqrt(len(trail)) if len(trail) > 1 else np.full(near, np.nan)
         levels.append((float(beside.mean()), trail.mean(axis=0), scatter, len(trail)))
     signal = np.array([level[0] for level in levels])
@@ -203,6 +239,10 @@ def _trail(flat: Sequence[BorderFrames], zero: _Zero, depth: int, axis: str, gai
         base = max(float((pooled**2 - shot.mean(axis=0)).mean()), 0.2 * float((pooled**2).mean()))
         pooled = np.full(near, np.sqrt(base))
         each = np.sqrt((base + shot) / np.array([level[3] for level in levels])[:, None])
+    of_dark = 1.0
+    if leaks:  # the noise of two more means in the first pixel
+        each[:, 0] = np.sqrt(each[:, 0] ** 2 + each[:, -1] ** 2 * (1 + 1 / (before - 1)))
+        of_dark = np.sqrt(1 + (1 + 1 / (before - 1)))
     if not (signal > 10 * each[:, 0]).any():
         return "the bright frames have too little light beside the covered border"
     weight = signal / each.T**2
@@ -213,7 +253,10 @@ def _trail(flat: Sequence[BorderFrames], zero: _Zero, depth: int, axis: str, gai
     left = (trails[:, 0] - shape[0] * signal) / each[:, 0]
     strong = signal > np.median(signal)
     bent = float((left[strong].sum() - left[~strong].sum()) / np.sqrt(len(left))) if len(left) > 3 else 0.0
-    u_shape = np.hypot(u_shape, u_dark)
+    u_shape = np.hypot(u_shape, u_dark * np.append(of_dark, np.ones(near - 1)))
+    if leaks:  # the two borders of the cover need not be alike
+        weights = weight[0] * signal
+        u_shape[0] = float(np.hypot(u_shape[0], UNLIKE * float(np.average(np.array(leaks) / signal, weights=weights))))
     length, u_length, whole = _length_of(shape, u_shape, depth)
     share, u_share = float(shape[0]) / whole, float(u_shape[0]) / whole
     return Trail(axis, signal, trails[:, 0], each[:, 0], share, u_share, shape, u_shape, length, u_length, first, bent)
@@ -251,20 +294,22 @@ def _doubt(trail: Trail, flat: Sequence[BorderFrames], zero: _Zero, covered: Cov
     """Why a trail is no charge left behind; empty if nothing speaks against it."""
     if trail.share < NOT_SIGNIFICANT * trail.u_share:
         return ""
-    before = covered.left if trail.axis == "columns" else covered.top
+    before = _depths(covered)[trail.axis][1]
     if before < 1:
         if analogue and trail.axis == "columns":
             return "the filters of a video line have trails too: needs covered columns on the left as well, where no charge is late"
         return ""
     missing, weight, scatter = [], [], []
     for g in flat:
-        profile = np.mean([getattr(frame, trail.axis) for frame in g.in_order()], axis=0) - zero.along(trail.axis)
+        profiles = np.array([getattr(frame, trail.axis) for frame in g.in_order()]) - zero.along(trail.axis)
+        leaked = float(_leak(profiles, before).mean()) if before >= LEAST_BEFORE else 0.0
+        profile = profiles.mean(axis=0)
         own = profile[before : before + 9]
         beyond = np.arange(3, 9)
         line = np.polyfit(beyond, own[3:9], 1)
         expected = float(line[1])
         scatter.append(float(np.std(own[3:9] - np.polyval(line, beyond), ddof=2)) / max(expected, 1e-9))
-        missing.append((expected - own[0]) / max(expected, 1e-9))
+        missing.append((expected - own[0]) / max(expected, 1e-9) - max(leaked, 0.0))
         weight.append(max(expected, 0.0) ** 2)
     share = float(np.average(missing, weights=weight))
     if share > SAME_BLUR * trail.share + RISE_SIGMAS * float(np.median(scatter)):
@@ -348,8 +393,9 @@ def _smear(lit: Sequence[BorderFrames], zero: _Zero, covered: Covered, late: Tra
         slopes: dict[str, tuple[float, float]] = {}
         for side, depth in sides.items():
             if depth:
+                near = max(depth // 2, 1) if side == "top" else depth  # light leaks under the cover beside the lit rows
                 block = np.mean(
-                    [getattr(frame, side)[depth // 2 :] if side == "bottom" and depth > 3 else getattr(frame, side) for frame in frames],
+                    [getattr(frame, side)[depth // 2 :] if side == "bottom" and depth > 3 else getattr(frame, side)[:near] for frame in frames],
                     axis=0,
                 )
                 level = block.mean(axis=0)

@@ -614,7 +614,7 @@ def _edge_of(region: Region, spread: Spread) -> SlantedEdge:
         distance_px=spread.distance_px,
         spread_rel=relative,
         sfr=modulus,
-        u_sfr=np.sqrt(np.diag(covariance)),
+        u_sfr=np.sqrt(np.maximum(np.diag(covariance), 0.0)),
         sfr50=sfr50,
         u_sfr50=u50,
         asymmetry=skew,

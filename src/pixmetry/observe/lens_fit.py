@@ -22,6 +22,7 @@ NODES = 48  # of the integral over the common part of two pupils
 BETTER_CHI2 = 25.0  # by which χ² must be less than that of the Gaussian lens, and fall with a defocus
 NEAR_PX, MISFIT = 2.0, 6.0  # χ² per bin so near to the edge, from which on they follow neither; below it, u grows with its root
 LARGEST_U_A = 0.2  # of a width of the pixel that is given
+STEP = 1e-6  # of differences, px or waves
 STARTS_AIRY, START_A, START_W = (0.4, 1.2), 0.85, 0.1
 METHOD = "joint fit of a diffraction-limited lens and a rectangular aperture to slanted edges"
 
@@ -79,12 +80,16 @@ class _Drawn:
         self.rest, self.n = float(value @ value - self.value @ self.value), len(value)
         self.tilt, self.main = abs(curve.slope), 0 if curve.across == "x" else 1
 
+    def share(self, lens: Array, a: Array, place: float) -> Array:
+        """Part of the step that each value shows, behind a lens and an aperture."""
+        nu = self.nu
+        spectrum = lens * np.sinc(a[self.main] * nu) * np.sinc(a[1 - self.main] * nu * self.tilt) * np.exp(-2j * np.pi * nu * place)
+        out: Array = self.map @ np.concatenate([spectrum.real, spectrum.imag]) + 0.5 * self.ones
+        return out
+
     def residual(self, lens: Array, a: Array, own: Array) -> Array:
         """Of a lens, an aperture, and the edge's own place, level and height."""
-        nu = self.nu
-        spectrum = lens * np.sinc(a[self.main] * nu) * np.sinc(a[1 - self.main] * nu * self.tilt) * np.exp(-2j * np.pi * nu * own[0])
-        share = self.map @ np.concatenate([spectrum.real, spectrum.imag]) + 0.5 * self.ones
-        out: Array = self.value - own[1] * self.ones - own[2] * share
+        out: Array = self.value - own[1] * self.ones - own[2] * self.share(lens, a, float(own[0]))
         return out
 
 
@@ -103,20 +108,37 @@ def _fit(curves: Sequence[_Drawn], lens: Lens, starts: Sequence[Array], low: Seq
     """Least squares from several starts of (lens, aperture); the best."""
     from scipy.optimize import least_squares
 
-    def residuals(p: Array) -> Array:
+    ends = np.cumsum([0, *(c.basis.shape[1] for c in curves)])
+
+    def parts(p: Array) -> list[Array]:
         own = p[k + 2 :].reshape(-1, 3)
-        parts = [c.residual(lens(c.nu * np.hypot(1, c.tilt), p[:k]), p[k : k + 2], o) for c, o in zip(curves, own, strict=True)]
-        return np.concatenate(parts)
+        return [c.residual(lens(c.nu * np.hypot(1, c.tilt), p[:k]), p[k : k + 2], o) for c, o in zip(curves, own, strict=True)]
+
+    def residuals(p: Array) -> Array:
+        return np.concatenate(parts(p))
+
+    def jacobian(p: Array) -> Array:
+        """By differences; place, level and height of a curve concern that curve alone."""
+        now, out = residuals(p), np.zeros((ends[-1], len(p)))
+        for j in range(k + 2):
+            step = STEP if p[j] < highs[j] - STEP else -STEP
+            out[:, j] = (residuals(np.concatenate([p[:j], [p[j] + step], p[j + 1 :]])) - now) / step
+        for i, c in enumerate(curves):
+            rows, (place, _, height) = slice(ends[i], ends[i + 1]), p[k + 2 + 3 * i : k + 5 + 3 * i]
+            light = lens(c.nu * np.hypot(1, c.tilt), p[:k])
+            share, moved = (c.share(light, p[k : k + 2], float(place) + by) for by in (0.0, STEP))
+            out[rows, k + 2 + 3 * i : k + 5 + 3 * i] = np.stack([-height * (moved - share) / STEP, -c.ones, -share], axis=1)
+        return out
 
     each = np.array([0.0, 0.0, 1.0] * len(curves))
     lows, highs = np.append(low, [-3.0, -0.3, 0.5] * len(curves)), np.append(high, [3.0, 0.3, 1.5] * len(curves))
-    found = [least_squares(residuals, np.append(s, each), bounds=(lows, highs), x_scale="jac", max_nfev=60) for s in starts]
+    begins = [np.clip(np.append(s, each), lows, highs) for s in starts]
+    found = [least_squares(residuals, b, jacobian, bounds=(lows, highs), x_scale="jac", max_nfev=60) for b in begins]
     best = min(found, key=lambda f: float(f.cost))
     n = sum(c.n for c in curves)
     covariance = np.linalg.pinv(best.jac.T @ best.jac, rcond=1e-14, hermitian=True)[: k + 2, : k + 2]
     chi2 = 2 * float(best.cost) + sum(c.rest for c in curves)
-    ends = np.cumsum([c.basis.shape[1] for c in curves])[:-1]
-    bins = np.concatenate([(c.basis @ r)[c.near] for c, r in zip(curves, np.split(best.fun, ends), strict=True)])
+    bins = np.concatenate([(c.basis @ r)[c.near] for c, r in zip(curves, np.split(best.fun, ends[1:-1]), strict=True)])
     near = float(bins @ bins) / max(len(bins) - len(best.x), 1)
     return _LensFit(np.asarray(best.x[: k + 2], float), np.asarray(covariance, float), chi2, max(n - len(best.x), 1), near)
 

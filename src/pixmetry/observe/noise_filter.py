@@ -32,7 +32,7 @@ from pixmetry.camera.noise_covariance import (
     unsharp_kernel,
 )
 from pixmetry.camera.observations import LevelMoments, PhotonTransfer, StackMoments
-from pixmetry.core.arrays import Array
+from pixmetry.core.arrays import Array, Flags
 from pixmetry.core.errors import MeasureError
 from pixmetry.core.number import Estimates, effective_dof
 from pixmetry.observe.mosaic import find_mosaic, shot_of_places
@@ -40,6 +40,7 @@ from pixmetry.observe.photon_transfer_fit import fit_photon_transfer
 from pixmetry.observe.photon_transfer_model import MINIMUM_DARK_VAR_DN2, QUANTISATION_DN2
 
 MOST_CLIPPED = 0.002  # share of the pixels at the ends of the codes
+LITTLE_MORE, FALLEN = 1.15, 0.75  # of light and variance from level to level: so much less where pixels are full
 FOUND_Z, FOUND_PATTERN_Z = 4.2, 3.5  # of one of the twelve near lags; of the pattern of repelled charge: false in 1e-3 of cameras
 PRESENT = 0.02  # chance, before anything is measured, that a camera has a filter, repelled charge, or temporal noise reduction
 LARGEST_SHARE, LARGEST_LOSS, LARGEST_ALPHA = 0.2, 0.1, 0.9  # if there: all sizes up to this are equally likely
@@ -89,7 +90,7 @@ class _ShotPart:
 def _shot_part(seen: NoiseCovariance) -> _ShotPart | None:
     pooled, pixels = seen.pooled_dn2(), float(np.prod(seen.frame_shape))
     used = seen.clipped <= MOST_CLIPPED
-    bright, dark = used & seen.bright, used & ~seen.bright
+    bright, dark = used & seen.bright & ~_over_full(seen, pooled[:, 0]), used & ~seen.bright
     if not dark.any() and bright.sum() > 1:  # black is clipped: what the darkest of the light levels has more
         dark = bright & (seen.mean_dn == seen.mean_dn[bright].min())
         bright = bright & ~dark
@@ -129,6 +130,20 @@ def _shot_part(seen: NoiseCovariance) -> _ShotPart | None:
     )
     inner = float(s.sum()) / var * frame / inside
     return _ShotPart(*constant, *growing, both, both_covariance, gain, s, inner, _u_of_border(seen, n.sum()))
+
+
+def _over_full(seen: NoiseCovariance, var_dn2: Array) -> Flags:
+    """Levels from the last before the variance breaks down while the mean hardly rises: pixels are full there, below the last code."""
+    over = np.zeros(len(seen.mean_dn), bool)
+    if seen.bright.all() or not seen.bright.any():
+        return over
+    light, order = seen.mean_dn - seen.mean_dn[~seen.bright].mean(), np.flatnonzero(seen.bright)
+    order = order[np.argsort(light[order])]
+    for low, high in zip(order[:-1], order[1:], strict=True):
+        if light[high] < LITTLE_MORE * light[low] and var_dn2[high] < FALLEN * var_dn2[low]:
+            over = seen.bright & (light >= light[low])
+            break
+    return over
 
 
 def _u_of_border(seen: NoiseCovariance, products: float) -> float:
@@ -460,6 +475,35 @@ def _growth(part: _ShotPart) -> tuple[float, float]:
     near = np.concatenate([np.zeros(len(LAGS) - 1, bool), [max(abs(j), abs(i)) <= 2 for j, i in LAGS[1:]]])
     scale = 2 * float(part.shot_dn2.max())
     return scale * float(part.both[near].sum()), scale * float(np.sqrt(part.both_covariance[np.ix_(near, near)].sum()))
+
+
+def before_repulsion(spatial: Estimates, found: NoiseFilter, shot_dn2: float) -> Estimates:
+    """The response of single pixels as it was before charge repelled charge, which evens a fixed contrast out as it does shot noise.
+
+    Parameters
+    ----------
+    spatial : Estimates
+        Of `pixmetry.observe.spatial_fit.fit_spatial`.
+    found : NoiseFilter
+        Where nothing was found, what may be there adds to u.
+    shot_dn2 : float
+        Shot variance of the stack of bright frames.
+    """
+    if found.kind not in (CHARGE, WHITE) or shot_dn2 <= 0:
+        return spatial
+    scale, u = 1.0, 0.5 * found.u_factor
+    if found.kind == CHARGE:
+        loss, reach = found.fit["loss"], found.fit["field_px"]
+        before = charge_response(loss.value / float(found.shot_dn2.max()), reach.value, np.array([shot_dn2]))[0][0] / shot_dn2
+        scale, u = float(np.sqrt(before)), 0.5 * loss.u * shot_dn2 / float(found.shot_dn2.max())
+    own = np.array([name in ("prnu_pixel_rel", "prnu_total_rel") for name in spatial.names])
+    factor = np.where(own, scale, 1.0)
+    more = np.where(own, spatial.values * u, 0.0)
+    return replace(
+        spatial,
+        values=spatial.values * factor,
+        covariance=spatial.covariance * np.outer(factor, factor) + np.outer(more, more),
+    )
 
 
 L = TypeVar("L", LevelMoments, StackMoments)

@@ -36,7 +36,7 @@ from pixmetry.observe.histogram import HistogramAccumulator, code_errors, sweep_
 from pixmetry.observe.linearity import Linearity
 from pixmetry.observe.moments import LevelSummary
 from pixmetry.observe.noise_covariance import CorrelatedGroup, FrameSuccession, LagProducts, noise_covariance
-from pixmetry.observe.noise_filter import LARGEST_ALPHA, find_noise_filter, fit_unfiltered, unseen_rms
+from pixmetry.observe.noise_filter import LARGEST_ALPHA, before_repulsion, find_noise_filter, fit_unfiltered, unseen_rms
 from pixmetry.observe.one_pass import Group, Level, photon_transfer, reduce_groups, refuse_copies, without_levels
 from pixmetry.observe.outliers import cut_of, single_outliers
 from pixmetry.observe.patterns import find_phase_patterns
@@ -51,6 +51,7 @@ from pixmetry.observe.photon_transfer_levels import (
 )
 from pixmetry.observe.spatial_fit import fit_dark_pattern, fit_spatial
 from pixmetry.observe.stack import SATURATED_FRACTION, StackAccumulator, choose_stacks, same_exposure
+from pixmetry.observe.tap_steps import evened, find_taps, with_steps_in_slope
 
 __all__ = ["Group", "observe"]
 NOT_SIGNIFICANT = 3.0
@@ -162,8 +163,15 @@ def observe(
     if dark_stack is not None and bright_stack is not None and cells is not None:
         bright_stack = balanced(dark_stack, bright_stack, cells)
     dark_spectra, bright_spectra = (None if s is None else s.spectra for s in (dark, bright))
+    both = dark_stack is not None and bright_stack is not None
+    taps = find_taps(dark_stack, bright_stack, cells is not None) if both else None
     with single_threaded_blas():
-        defects, spatial, patterns = _spatial(dark_stack, bright_stack, dark_spectra, Linearity.of(fit, bits), _dnl_lsb(codes), notes)
+        even = bright_stack if taps is None else evened(dark_stack, bright_stack, taps)
+        defects, spatial, patterns = _spatial(dark_stack, even, dark_spectra, Linearity.of(fit, bits), _dnl_lsb(codes), notes)
+    if spatial is not None and taps is not None:
+        spatial = with_steps_in_slope(spatial, taps)
+    if spatial is not None and noise_filter is not None and dark_stack is not None and bright_stack is not None:
+        spatial = before_repulsion(spatial, noise_filter, bright_stack.ms_pixel_dn2 - dark_stack.ms_pixel_dn2)
     seen = Observations(
         photon_transfer=transfer,
         photon_transfer_fit=fit,
@@ -178,6 +186,7 @@ def observe(
         code_errors=codes,
         code_table=table,
         colour_cells=cells,
+        taps=taps,
         outliers=_outliers(correlated, cells),
         noise_covariance=noise,
         noise_filter=noise_filter,

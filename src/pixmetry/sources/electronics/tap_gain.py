@@ -11,15 +11,10 @@ from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
 from pixmetry.core.errors import MeasureError
-from pixmetry.core.number import ONE_SIDED_95, Estimates
+from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
 
-SIDE_COLS = 8  # columns on each side of a border
-LEAST_COLS, MOST_CLIPPED, FOUND_Z = 96, 0.002, 5.0
-TAPS = (2, 3, 4, 6, 8)  # that are looked for
-STRIPE_SUM = 4.0  # at most: the differences of neighbouring columns share them
-METHOD = "column medians of bright less dark stack: steps at the borders of equal parts, and odd columns against even ones"
-CONFOUNDERS = ("gain of the taps: the columns' own pattern (PRNU), which holds the stripes too; a step of the light exactly at a border",)
+LEAST_COLS = 96  # of a frame whose borders are looked for
 
 
 class TapGain(Parameters):
@@ -75,64 +70,20 @@ def truth(params: TapGain, signal: Signal, stream: Stream) -> Mapping[str, np.nd
 
 
 def measure(observations: Observations) -> Estimates:
-    """Read steps at the borders of two, three, four … taps, and stripes of odd columns, off the column means of the stacks' difference.
+    """Read what the columns of the flat field tell, see `pixmetry.observe.tap_steps`.
 
-    A step is what straight lines through `SIDE_COLS` columns on either side leave between them; what the same rule finds at places that are
-    no border is its scatter, so the columns' own patterns and the light's slope are in u.
+    Raises
+    ------
+    MeasureError
+        Without stacks, or if they have few columns or are saturated.
     """
     where = "electronics.tap_gain"
-    dark, bright = observations.stacks
-    light = bright.mean_map_dn - dark.mean_map_dn
-    cols = light.shape[1]
-    if cols < LEAST_COLS or bright.fraction_max > MOST_CLIPPED or np.median(light) <= 0:
-        what = f"needs a stack of bright frames, not saturated, of {LEAST_COLS} columns or more"
-        raise MeasureError(what, where=where, value=f"{cols} columns", remedy="take 16 or more bright frames at half of saturation")
-    means = np.median(light, axis=0)
-    means = means / means.mean()
-    smooth = np.convolve(means, [0.25, 0.5, 0.25], mode="valid")
-    stripes = (means[1:-1] - smooth) * np.where(np.arange(1, cols - 1) % 2, 2.0, -2.0)  # each column's odd-even difference
-    odd_even, u_odd_even = float(stripes.mean()), float(np.sqrt(np.mean((stripes - stripes.mean()) ** 2) * STRIPE_SUM / stripes.size))
-    even = means - odd_even * (np.arange(cols) % 2 - 0.5)
-    at = np.arange(SIDE_COLS, cols - SIDE_COLS + 1)
-    jumps = np.array([_jump(even[c - SIDE_COLS : c + SIDE_COLS]) for c in at])
-    borders = {taps: [-(-k * cols // taps) for k in range(1, taps)] for taps in TAPS if cols // taps >= 3 * SIDE_COLS}
-    near = np.array([min(abs(c - b) for part in borders.values() for b in part) < SIDE_COLS for c in at])
-    quiet = jumps[~near] if np.count_nonzero(~near) > 4 * SIDE_COLS else jumps
-    scatter = 1.4826 * float(np.median(np.abs(quiet - np.median(quiet))))
-    dof = max(quiet.size / (2 * SIDE_COLS), 2.0)
-    found = {}
-    for taps, places in borders.items():
-        signs = np.where(np.arange(len(places)) % 2, -1.0, 1.0)
-        found[taps] = float(np.mean(signs * jumps[np.array(places) - SIDE_COLS])), scatter / float(np.sqrt(len(places)))
-    taps = max(found, key=lambda t: abs(found[t][0]) / found[t][1])
-    limits, reasons = set(), {}
-    step, u_step = found[taps]
-    if abs(step) < FOUND_Z * u_step:
-        taps, (step, u_step) = 2, found[2]
-        step = abs(step) + ONE_SIDED_95 * u_step
-        limits.add("step_rel")
-        reasons["step_rel"] = f"no border of {', '.join(map(str, found))} taps stands out of the columns; 95 % limit for two taps"
-    if abs(odd_even) < FOUND_Z * u_odd_even:
-        odd_even = abs(odd_even) + ONE_SIDED_95 * u_odd_even
-        limits.add("odd_even_rel")
-        reasons["odd_even_rel"] = "odd and even columns do not differ by more than their own pattern; 95 % limit of its size"
-    rows = [("step_rel", step, u_step, dof, "1")]
-    if observations.colour_cells is None:  # stripes are in the colours of a mosaic
-        rows.append(("odd_even_rel", odd_even, u_odd_even, float(stripes.size), "1"))
-    else:
-        limits.discard("odd_even_rel")
-        reasons.pop("odd_even_rel", None)
-    if "step_rel" not in limits:
-        rows.append(("taps", float(taps), 0.0, np.inf, "1"))
-    return Estimates.from_rows(rows, method=METHOD, confounders=CONFOUNDERS, limits=frozenset(limits), reasons=reasons)
-
-
-def _jump(values: np.ndarray) -> float:
-    """What straight lines through the two halves leave between them, over their mean."""
-    half = len(values) // 2
-    x = np.arange(half) - (half - 1) / 2
-    left, right = (part.mean() + (part @ x) / (x @ x) * reach for part, reach in ((values[:half], half / 2), (values[half:], -half / 2)))
-    return float(right - left)
+    dark, _ = observations.stacks
+    taps = observations.taps
+    if taps is None or not len(taps.fit):
+        what, value = f"needs a stack of bright frames, not saturated, of {LEAST_COLS} columns or more", f"{dark.shape[1]} columns"
+        raise MeasureError(what, where=where, value=value, remedy="take 16 or more bright frames at half of saturation")
+    return taps.fit
 
 
 def propagate(params: TapGain, probe: Probe) -> Contribution:
