@@ -2,9 +2,10 @@
 
 Random cameras of five kinds, each with every source of its chain on at sizes of real cameras, take one campaign of all kinds of frames:
 dark and bright series, stacks, dark frames at temperatures, slanted edges, upright lines, covered pixels, a chart, bright spots, a light
-that goes off, and texture. All of it is measured blind, as by `pixmetry.assess`. Each value that its camera was made with is compared with
-what was found: n, mean, standard deviation and largest |z| of z = (value − truth)/u, and the median of u; of a limit, whether it holds; of what is
-not told, the reason. ``--pickle`` keeps the scores of a part of the study, ``--read FILE ...`` prints the table of several parts.
+that goes off, and texture. All of it is measured blind, as by `pixmetry.assess`. Each value that its camera was made with is compared
+with what was found: n, mean, standard deviation and largest |z| of z = (value − truth)/u, and the median of u; of a limit, whether it
+holds; of what is not told, the reason. ``--pickle`` keeps the scores of a part of the study, ``--read FILE ...`` prints the table of
+several parts.
 """
 
 from __future__ import annotations

@@ -318,7 +318,8 @@ def observe_campaign(campaign: Campaign, progress: Progress) -> tuple[InputHashe
         seen = _with_views(seen, campaign, sides, reader, on_frames)
     fit = seen.photon_transfer_fit
     gain = fit["gain_dn_per_e"].value if fit is not None and "gain_dn_per_e" in fit else None
-    full = float("inf") if fit is None or not {"saturation_dn", "offset_dn"} <= set(fit.names) else fit["saturation_dn"].value - fit["offset_dn"].value
+    known = fit is not None and {"saturation_dn", "offset_dn"} <= set(fit.names)
+    full = fit["saturation_dn"].value - fit["offset_dn"].value if fit is not None and known else float("inf")
     bordered = covered_pixels(borders, campaign.camera.interface == "analogue", gain, full)
     notes = (*campaign.findings, *left_out, *seen.notes, *(() if bordered is None else bordered.notes))
     facts = campaign.camera

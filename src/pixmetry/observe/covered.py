@@ -393,11 +393,8 @@ def _smear(lit: Sequence[BorderFrames], zero: _Zero, covered: Covered, late: Tra
         slopes: dict[str, tuple[float, float]] = {}
         for side, depth in sides.items():
             if depth:
-                near = max(depth // 2, 1) if side == "top" else depth  # light leaks under the cover beside the lit rows
-                block = np.mean(
-                    [getattr(frame, side)[depth // 2 :] if side == "bottom" and depth > 3 else getattr(frame, side)[:near] for frame in frames],
-                    axis=0,
-                )
+                far = slice(depth // 2 if depth > 3 else 0, None) if side == "bottom" else slice(None, max(depth // 2, 1))
+                block = np.mean([getattr(frame, side)[far] for frame in frames], axis=0)  # light leaks under the cover beside the light
                 level = block.mean(axis=0)
                 y = level - level.mean()
                 slope = float(x @ y / (x @ x)) / rows
