@@ -96,6 +96,45 @@ def test_charge_left_behind_in_both_directions(rng: np.random.Generator):
     near(found, "trail_px", 2.2, 0.2)
 
 
+def test_light_that_leaks_under_the_cover_is_no_late_charge(rng: np.random.Generator):
+    """A share of 0.3 % of the last lit pixel goes to its covered neighbour at all borders; late charge comes at one alone."""
+    held = []
+    for kind, level in (("dark", 0.0), ("bright", 8000.0), ("bright", 15000.0)):
+        stored = np.zeros((ROWS, COLS))
+        stored[BORDERS.active(stored.shape)] = level
+        leaked = stored.copy()
+        for axis in (0, 1):
+            for by in (-1, 1):
+                leaked += 0.003 * (np.roll(stored, by, axis) - stored)
+        leaked = read_out(read_out(leaked.T, 3e-5, 1.5).T, 3e-5, 1.5)
+        held.append(BorderFrames(kind, 0.01, BORDERS))
+        for index in range(8):
+            noisy = GAIN * rng.poisson(np.maximum(leaked, 0)) + BLACK + rng.normal(0, 1.5, leaked.shape)
+            held[-1].add(index, np.rint(noisy).astype(np.uint16))
+    found = covered_pixels(held, False, GAIN)
+    assert found is not None
+    near(found, "serial_cti", 3e-5, 3e-6)
+    near(found, "parallel_cti", 3e-5, 3e-6)
+
+
+def test_full_pixels_that_spill_under_the_cover_tell_no_late_charge(rng: np.random.Generator):
+    """The brightest level is saturated, and 2 % of its light are in the covered rows."""
+    held = []
+    for kind, level in (("dark", 0.0), ("bright", 6000.0), ("bright", 12000.0), ("bright", 18000.0)):
+        stored = np.zeros((ROWS, COLS))
+        stored[BORDERS.active(stored.shape)] = level
+        if level == 18000.0:
+            stored[ROWS - BORDERS.bottom] = 0.02 * level
+        moved = read_out(stored.T, 3e-5, 1.5).T
+        held.append(BorderFrames(kind, 0.01, BORDERS))
+        for index in range(6):
+            noisy = GAIN * rng.poisson(moved) + BLACK + rng.normal(0, 1.5, moved.shape)
+            held[-1].add(index, np.rint(noisy).astype(np.uint16))
+    found = covered_pixels(held, False, GAIN, saturation_dn=18000.0 * GAIN)
+    assert found is not None
+    near(found, "parallel_cti", 3e-5, 4e-6)
+
+
 def test_absent_effects_are_bounded(rng: np.random.Generator):
     found = told(rng, stripes=True, analogue=True)
     for name, most in (("serial_cti", 3e-6), ("parallel_cti", 1e-5), ("droop_rel", 2e-3), ("smear_s", 1e-5)):

@@ -133,3 +133,43 @@ def test_sum_over_all_lags_is_the_variance_before_charge_was_repelled():
         before, behind = charge_response(2e-5, reach, shot)
         assert shot + 2 * behind.sum(axis=1) == pytest.approx(before, rel=1e-6)
         assert (before / shot - 1) / (2e-5 * shot) == pytest.approx(1, abs=0.1)  # to first order
+
+
+def test_pixels_that_are_full_below_the_last_code_tell_no_filter(rng):
+    """Two of twelve levels are at the full well, where charge that spills into a neighbour correlates them; the others are white."""
+
+    def frame(mean_e: float) -> np.ndarray:
+        electrons = rng.poisson(mean_e, SHAPE).astype(float)
+        over = np.maximum(electrons - 6000.0, 0.0)
+        electrons = np.minimum(electrons - over + 0.5 * np.roll(over, 1, axis=1), 6000.0 + 0.3 * np.roll(over, 1, axis=1))
+        return np.rint(OFFSET + GAIN * (electrons + rng.normal(0, NOISE_E, SHAPE))).astype(np.uint16)
+
+    def groups():
+        for k in range(1, 13):
+            for kind, light in (("dark", 0.0), ("bright", 570.0 * k)):
+                yield Group(kind, "level", 0.01 * k, None, [frame(light) for _ in range(2)])
+
+    seen = observe(groups(), 12)
+    gain = seen.photon_transfer_fit["gain_dn_per_e"]
+    assert seen.noise_filter.kind == "white" and abs(gain.value - GAIN) < Z * gain.u
+    assert gain.u < 0.02 * GAIN
+
+
+def test_jitter_at_the_left_border_is_no_noise_of_the_light(rng):
+    """Behind a filter along the row, rows that move by 0.2 px are noisy where the line rises from black: by the square of the light."""
+
+    def frame(mean_e: float) -> np.ndarray:
+        electrons = rng.poisson(mean_e, SHAPE) + rng.normal(0, NOISE_E, SHAPE)
+        smooth = ndimage.convolve1d(electrons, [0.25, 0.5, 0.25], axis=1, mode="nearest")
+        smooth[:, 0] += 0.2 * mean_e * rng.standard_normal(SHAPE[0])
+        return np.rint(np.clip(400 + GAIN * smooth, 0, TOP)).astype(np.uint16)
+
+    def groups():
+        for k in range(1, 11):
+            for kind, light in (("dark", 0.0), ("bright", 500.0 * k)):
+                yield Group(kind, "level", 0.001 * k, None, [frame(light) for _ in range(2)])
+
+    seen = observe(groups(), 12)
+    gain = seen.photon_transfer_fit["gain_dn_per_e"]
+    assert seen.noise_filter.kind == "linear" and seen.noise_filter.name == "filter along the row"
+    assert abs(gain.value - GAIN) < Z * gain.u and gain.u < 0.1 * GAIN

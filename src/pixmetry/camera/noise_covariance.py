@@ -109,6 +109,9 @@ class NoiseFilter:
         Shot variance of the levels that were used, DN².
     rival : NoiseFilter or None
         Another kind that fits nearly as well.
+    inside : tuple of two ndarray of shape (levels,), or None
+        Of a filter along the row: means of the levels, and variance away from the borders of the frame over that of the whole frame. A line
+        that jitters adds noise where it rises from black, more than in proportion to the light; ``factor`` is then that away from them.
     """
 
     kind: str = WHITE
@@ -126,6 +129,7 @@ class NoiseFilter:
     growth_covariance: np.ndarray = field(default_factory=lambda: np.zeros((len(LAGS) - 1, len(LAGS) - 1)))
     shot_dn2: np.ndarray = field(default_factory=lambda: np.zeros(0))
     rival: NoiseFilter | None = None
+    inside: tuple[np.ndarray, np.ndarray] | None = None
 
     def variance_before(self, shot_dn2: np.ndarray, shift: float = 0.0) -> np.ndarray:
         """Shot variance before the filter from that behind it, DN², any shape; with ``shift`` added to the factor."""

@@ -920,6 +920,15 @@ class Observations:
         found = of_pictures(self.covered.fit, names, where=where, pictures="covered pixels", kind="bright")
         return replace(found, method=method, confounders=()) if method else found
 
+    def moved_charge(self, name: str) -> tuple[float, float]:
+        """Smear (``smear_s``) or loss of a transfer by covered pixels or bright spots, the better of both, with u; zero where unknown."""
+        fits = [None if part is None else part.fit for part in (self.covered, self.spots)]
+        known = [fit[name] for fit in fits if fit is not None and name in fit]
+        if not known:
+            return 0.0, 0.0
+        best = min(known, key=lambda e: e.u)
+        return (0.0, best.u) if best.is_limit else (best.value, best.u)
+
     def row_jitter(self, names: Mapping[str, str], *, where: str, taped: bool = False) -> Estimates:
         """Take a source's parameters ``{parameter: fitted name}`` that the rows of upright lines tell, in px, with their covariance.
 

@@ -345,7 +345,7 @@ def _possible_plates(plain: _Fit, free_a: Sequence[int], scale: float) -> list[_
 def _misfit_text(wrong: float) -> str:
     return (
         f"the edges do not follow a Gaussian lens, a rectangular aperture and a birefringent plate (χ² of the mean residuals {wrong:.0f} "
-        "per bin): another lens, diffraction, sharpening, gamma, or a printed edge that is not sharp"
+        "per bin): another lens, diffraction, sharpening, gamma, charge that is late or repelled, or a printed edge that is not sharp"
     )
 
 

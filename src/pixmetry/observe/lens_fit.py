@@ -21,6 +21,7 @@ MOST_FREQUENCY = 6.0  # cycles/px
 NODES = 48  # of the integral over the common part of two pupils
 BETTER_CHI2 = 25.0  # by which χ² must be less than that of the Gaussian lens, and fall with a defocus
 NEAR_PX, MISFIT = 2.0, 6.0  # χ² per bin so near to the edge, from which on they follow neither; below it, u grows with its root
+WELL_FITTED, BETTER_NEAR = 2.0, 0.5  # above that χ² per bin, diffraction must have less than this part of that of the Gaussian lens
 LARGEST_U_A = 0.2  # of a width of the pixel that is given
 STEP = 1e-6  # of differences, px or waves
 STARTS_AIRY, START_A, START_W = (0.4, 1.2), 0.85, 0.1
@@ -169,8 +170,8 @@ def fit_diffraction(measured: Sequence[tuple[Region, Spread]]) -> Estimates:
     blurred = _fit(drawn, _diffraction, starts, [0.05, 0.0, 0.05, 0.05], [8, 0.5, 1.3, 1.3], 2)
     scale = max(min(f.chi2 / f.dof for f in (gauss, clear, blurred)), 1.0)
     best = blurred if clear.chi2 - blurred.chi2 > BETTER_CHI2 * scale else clear
-    if best.near > MISFIT:
-        return Estimates.empty()
+    if best.near > MISFIT or best.near > max(WELL_FITTED, BETTER_NEAR * gauss.near) and gauss.chi2 > best.chi2:
+        return Estimates.empty()  # neither lens describes the edges, and the one of more parameters comes a little nearer
     if gauss.chi2 - best.chi2 < BETTER_CHI2 * scale:
         alike = best.chi2 - gauss.chi2 < BETTER_CHI2 * scale
         x, y = best.values[-2:]

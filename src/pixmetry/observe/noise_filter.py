@@ -67,6 +67,7 @@ MEDIANS = {
     },
 }  # fmt: skip
 OF_MEDIAN = 0.02  # rounding and the skewness of the shot noise change these
+ALONG_LINE_REL = 0.04  # of a fixed contrast: jitter of the rows in the mean of the frames, echoes later than the lags
 RESOLVED = 10.0  # u of the shot variance of a level that counts
 LEAST_DOUBT = 0.1  # of the gain's u: a smaller part adds less than 0.5 % to it
 
@@ -83,6 +84,7 @@ class _ShotPart:
     both_covariance: np.ndarray
     gain: np.ndarray  # what makes r and q of the levels, shape (2, levels) or (1, levels)
     shot_dn2: np.ndarray  # S of the levels
+    inside: tuple[np.ndarray, np.ndarray]  # means of the levels by rising size, and their variance in the margin over that of the frame
     inner: float  # shot variance inside of the margin over that of the whole frame, at equal light
     u_inner: float
 
@@ -129,7 +131,9 @@ def _shot_part(seen: NoiseCovariance) -> _ShotPart | None:
         for values in (seen.mean_dn, seen.inner_mean_dn, seen.var_dn2)
     )
     inner = float(s.sum()) / var * frame / inside
-    return _ShotPart(*constant, *growing, both, both_covariance, gain, s, inner, _u_of_border(seen, n.sum()))
+    order = np.flatnonzero(used)[np.argsort(seen.mean_dn[used], kind="stable")]
+    by_level = seen.mean_dn[order], pooled[order, 0] / np.maximum(seen.var_dn2[order], 1e-300)
+    return _ShotPart(*constant, *growing, both, both_covariance, gain, s, by_level, inner, _u_of_border(seen, n.sum()))
 
 
 def _over_full(seen: NoiseCovariance, var_dn2: Array) -> Flags:
@@ -426,9 +430,13 @@ def _as_found(plain: NoiseFilter, best: _Match, part: _ShotPart, doubt: float) -
         inner, u_inner = 1.0, 0.0
     else:
         inner, u_inner = part.inner, part.u_inner
+    on_line = best.family.name == LINE
+    if on_line:
+        inner = 1.0
     fit = Estimates(best.family.names, best.values, best.covariance, np.full(best.values.size, np.inf), best.family.units)
     return replace(
         plain,
+        inside=part.inside if on_line else None,
         kind=best.family.kind,
         name=best.family.name,
         fit=fit,
@@ -477,8 +485,10 @@ def _growth(part: _ShotPart) -> tuple[float, float]:
     return scale * float(part.both[near].sum()), scale * float(np.sqrt(part.both_covariance[np.ix_(near, near)].sum()))
 
 
-def before_repulsion(spatial: Estimates, found: NoiseFilter, shot_dn2: float) -> Estimates:
-    """The response of single pixels as it was before charge repelled charge, which evens a fixed contrast out as it does shot noise.
+def before_correlation(spatial: Estimates, found: NoiseFilter, shot_dn2: float) -> Estimates:
+    """The contrasts of single pixels as they were before what correlates neighbours evened them out as it does shot noise.
+
+    Charge that repels charge evens out the response alone, a filter the offsets too.
 
     Parameters
     ----------
@@ -489,14 +499,20 @@ def before_repulsion(spatial: Estimates, found: NoiseFilter, shot_dn2: float) ->
     shot_dn2 : float
         Shot variance of the stack of bright frames.
     """
-    if found.kind not in (CHARGE, WHITE) or shot_dn2 <= 0:
+    if found.kind not in (CHARGE, WHITE, LINEAR) or shot_dn2 <= 0:
         return spatial
     scale, u = 1.0, 0.5 * found.u_factor
     if found.kind == CHARGE:
         loss, reach = found.fit["loss"], found.fit["field_px"]
         before = charge_response(loss.value / float(found.shot_dn2.max()), reach.value, np.array([shot_dn2]))[0][0] / shot_dn2
         scale, u = float(np.sqrt(before)), 0.5 * loss.u * shot_dn2 / float(found.shot_dn2.max())
-    own = np.array([name in ("prnu_pixel_rel", "prnu_total_rel") for name in spatial.names])
+    evened = ["prnu_pixel_rel"]
+    if found.kind == LINEAR:
+        scale, u = float(np.sqrt(found.factor)), 0.5 * found.u_factor / found.factor
+        if found.name == LINE:
+            u = float(np.hypot(u, ALONG_LINE_REL))
+        evened += ["dsnu_pixel_dn", *(("prnu_col_rel", "dsnu_col_dn") if found.name == LINE else ())]
+    own = np.array([name in evened for name in spatial.names])
     factor = np.where(own, scale, 1.0)
     more = np.where(own, spatial.values * u, 0.0)
     return replace(
@@ -538,6 +554,11 @@ def before_filter(
             ms_col_dn2=unfiltered_lines(level.ms_col_dn2, level.ms_pixel_dn2, white_dn2, found.column_factor, rows),
         )
 
+    def away_from_borders(level: LevelMoments | StackMoments) -> Any:
+        if found.inside is None:
+            return level.ms_pixel_dn2
+        return level.ms_pixel_dn2 * np.interp(level.mean_dn, *found.inside)
+
     def unfiltered_dark(var_dn2: np.ndarray) -> np.ndarray:
         if found.kind in (CHARGE, WHITE):
             return var_dn2
@@ -551,11 +572,11 @@ def before_filter(
 
     before = replace(
         series,
-        dark=unfiltered_level(series.dark, unfiltered_dark(series.dark.ms_pixel_dn2)),
-        bright=unfiltered_level(series.bright, unfiltered(series.bright.ms_pixel_dn2)),
+        dark=unfiltered_level(series.dark, unfiltered_dark(away_from_borders(series.dark))),
+        bright=unfiltered_level(series.bright, unfiltered(away_from_borders(series.bright))),
     )
     stacks = [
-        None if stack is None else unfiltered_level(stack, float(law(np.asarray(stack.ms_pixel_dn2))))
+        None if stack is None else unfiltered_level(stack, float(law(np.asarray(away_from_borders(stack)))))
         for stack, law in ((dark, unfiltered_dark), (bright, unfiltered))
     ]
     return before, stacks[0], stacks[1]

@@ -30,13 +30,14 @@ from pixmetry.observe import photon_transfer_model as model
 from pixmetry.observe.colour_cells import balanced, find_colour_cells
 from pixmetry.observe.companding import find_code_table, without_steps
 from pixmetry.observe.defects import find_defects, without_hot_pixels
+from pixmetry.observe.edges import LINE_START_PX
 from pixmetry.observe.experiment import PictureGroup
 from pixmetry.observe.experiments import reduce_pictures
 from pixmetry.observe.histogram import HistogramAccumulator, code_errors, sweep_histogram
 from pixmetry.observe.linearity import Linearity
 from pixmetry.observe.moments import LevelSummary
 from pixmetry.observe.noise_covariance import CorrelatedGroup, FrameSuccession, LagProducts, noise_covariance
-from pixmetry.observe.noise_filter import LARGEST_ALPHA, before_repulsion, find_noise_filter, fit_unfiltered, unseen_rms
+from pixmetry.observe.noise_filter import LARGEST_ALPHA, before_correlation, find_noise_filter, fit_unfiltered, unseen_rms
 from pixmetry.observe.one_pass import Group, Level, photon_transfer, reduce_groups, refuse_copies, without_levels
 from pixmetry.observe.outliers import cut_of, single_outliers
 from pixmetry.observe.patterns import find_phase_patterns
@@ -49,7 +50,7 @@ from pixmetry.observe.photon_transfer_levels import (
     unclipped_bright,
     with_stacks,
 )
-from pixmetry.observe.spatial_fit import fit_dark_pattern, fit_spatial
+from pixmetry.observe.spatial_fit import fit_dark_pattern, fit_spatial, with_shading_of, without_columns, without_defects
 from pixmetry.observe.stack import SATURATED_FRACTION, StackAccumulator, choose_stacks, same_exposure
 from pixmetry.observe.tap_steps import evened, find_taps, with_steps_in_slope
 
@@ -163,15 +164,17 @@ def observe(
     if dark_stack is not None and bright_stack is not None and cells is not None:
         bright_stack = balanced(dark_stack, bright_stack, cells)
     dark_spectra, bright_spectra = (None if s is None else s.spectra for s in (dark, bright))
-    both = dark_stack is not None and bright_stack is not None
-    taps = find_taps(dark_stack, bright_stack, cells is not None) if both else None
+    taps, even = None, bright_stack
+    if dark_stack is not None and bright_stack is not None:
+        taps = find_taps(dark_stack, bright_stack, cells is not None)
+        even = evened(dark_stack, bright_stack, taps)
     with single_threaded_blas():
-        even = bright_stack if taps is None else evened(dark_stack, bright_stack, taps)
-        defects, spatial, patterns = _spatial(dark_stack, even, dark_spectra, Linearity.of(fit, bits), _dnl_lsb(codes), notes)
+        rising = LINE_START_PX if told.interface == "analogue" else 0
+        defects, spatial, patterns = _spatial(dark_stack, even, dark_spectra, Linearity.of(fit, bits), _dnl_lsb(codes), notes, rising)
     if spatial is not None and taps is not None:
         spatial = with_steps_in_slope(spatial, taps)
     if spatial is not None and noise_filter is not None and dark_stack is not None and bright_stack is not None:
-        spatial = before_repulsion(spatial, noise_filter, bright_stack.ms_pixel_dn2 - dark_stack.ms_pixel_dn2)
+        spatial = before_correlation(spatial, noise_filter, bright_stack.ms_pixel_dn2 - dark_stack.ms_pixel_dn2)
     seen = Observations(
         photon_transfer=transfer,
         photon_transfer_fit=fit,
@@ -294,6 +297,7 @@ def _spatial(
     linearity: Linearity | None,
     dnl_lsb: float,
     notes: list[str],
+    rising: int = 0,
 ) -> tuple[DefectList | None, Estimates | None, PatternList | None]:
     if dark is None:
         notes.append(
@@ -305,7 +309,9 @@ def _spatial(
     try:
         if bright is None:
             return defects, fit_dark_pattern(dark, defects, patterns=patterns, dnl_lsb=dnl_lsb), patterns
-        return defects, fit_spatial(dark, bright, defects, linearity=linearity, patterns=patterns, dnl_lsb=dnl_lsb), patterns
+        kept = without_columns(dark, rising), without_columns(bright, rising), without_defects(defects, rising)
+        found = fit_spatial(*kept, linearity=linearity, patterns=patterns, dnl_lsb=dnl_lsb)
+        return defects, with_shading_of(found, dark.shape, rising), patterns
     except MeasureError as problem:
         notes.append(f"DSNU and PRNU are not measured: {problem}")
         return defects, None, patterns

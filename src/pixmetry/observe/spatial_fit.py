@@ -173,6 +173,40 @@ def spatial_maps(
     return SpatialMaps(dark_stack, bright_stack, dark, response - fit_surface(response, surface_degree).values, surface, mask)
 
 
+def without_columns(stack: StackMoments, first: int) -> StackMoments:
+    """A stack less its first columns, where an analogue line rises from black, and where its jitter is noise."""
+    if not first:
+        return stack
+    var_map = stack.var_map_dn2[:, first:]
+    var = float(var_map.mean(dtype=float))
+    white = max(stack.ms_pixel_dn2 + var - stack.var_stack_dn2, 0.0)
+    return replace(stack, mean_map_dn=stack.mean_map_dn[:, first:], var_map_dn2=var_map, var_stack_dn2=var, ms_pixel_dn2=white)
+
+
+def without_defects(defects: DefectList, first: int) -> DefectList:
+    """The defects of the columns that are left."""
+    at = defects.col >= first
+    kinds = tuple(kind for kind, own in zip(defects.kind, at, strict=True) if own)
+    rows, cols = defects.shape
+    excess, gain = defects.dark_excess_dn[at], defects.gain_rel[at]
+    kept = replace(defects, row=defects.row[at], col=defects.col[at] - first, kind=kinds, dark_excess_dn=excess, gain_rel=gain)
+    return replace(kept, shape=(rows, cols - first))
+
+
+def with_shading_of(found: Estimates, shape: tuple[int, int], first: int) -> Estimates:
+    """Gradient and loss to the corners about the centre of the whole frame, from those about that of all but its first columns."""
+    names = ("shading_x_per_px", "shading_corner_rel")
+    if not first or not set(names) <= set(found.names):
+        return found
+    rows, cols = shape
+    whole, own = ((rows - 1) ** 2 + (n - 1) ** 2 for n in (cols, cols - first))
+    change = np.eye(len(found))
+    x, corner = (found.index(name) for name in names)
+    change[x, corner] = 4 * first / own  # 2 c d, with d = first/2 and c = corner/(own/4)
+    change[corner, corner] = whole / own
+    return replace(found, values=change @ found.values, covariance=change @ found.covariance @ change.T)
+
+
 def fit_dark_pattern(
     dark_stack: StackMoments, defects: DefectList | None = None, *, patterns: PatternList | None = None, dnl_lsb: float = 0.0
 ) -> Estimates:

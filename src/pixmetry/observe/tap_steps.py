@@ -14,6 +14,7 @@ from pixmetry.observe.surface import orthonormal_polynomials
 
 SIDE_COLS = 8  # columns on each side of a border
 LEAST_COLS, MOST_CLIPPED, FOUND_Z = 96, 0.002, 5.0
+AT_BORDER_Z, ALIKE_Z = 2.0, 4.0  # u of a step at the borders, and of its difference to that of all columns
 TAPS = (2, 3, 4, 6, 8)  # that are looked for
 LIGHT_DEGREE = 4  # of the light along the columns, as of the surface that is taken from a flat field
 LAGS = 4  # columns over which what is left may be correlated
@@ -36,9 +37,10 @@ def find_taps(dark: StackMoments, bright: StackMoments, mosaic: bool) -> TapStep
 
     Notes
     -----
-    A border is found by what straight lines through `SIDE_COLS` columns on either side leave between them; what the same rule finds at
-    places that are no border is its scatter. The size of a step that was found comes from all columns together: least squares of the
-    steps, the stripes and a polynomial of the light, with the scatter that is left, and its correlation from column to column.
+    The size of a step comes from all columns together: least squares of the steps, the stripes and a polynomial of the light, with the
+    scatter that is left, and its correlation from column to column. A light that is no polynomial could look like steps. So they must
+    also show at the borders themselves: what straight lines through `SIDE_COLS` columns on either side leave between them agrees with
+    the size, within what the same rule finds at places that are no border, and is twice that.
     """
     light = bright.mean_map_dn - dark.mean_map_dn
     cols = light.shape[1]
@@ -52,19 +54,20 @@ def find_taps(dark: StackMoments, bright: StackMoments, mosaic: bool) -> TapStep
     if not mosaic:
         values, covariance = _fitted(means, basis, [parity])
         odd_even, var_odd_even = float(values[0]), float(covariance[0, 0])
-    taps, found, dof = _border(means - odd_even * parity)
+    found, dof = _borders(means - odd_even * parity)
     limits, reasons = set(), {}
-    step, u_step = found[taps]
-    told = abs(step) >= FOUND_Z * u_step
-    if told:
-        side = _sides(cols, taps)
-        patterns = [side] if mosaic else [side, parity]
-        values, covariance = _fitted(means, basis, patterns)
-        step, u_step = float(values[0]), float(np.sqrt(covariance[0, 0]))
-        if not mosaic:
-            odd_even, var_odd_even = float(values[1]), float(covariance[1, 1])
-    else:
-        taps, (step, u_step) = 2, found[2]
+    taps, step, u_step, told = 2, 0.0, 0.0, False
+    for number, (near, u_near) in found.items():
+        side = _sides(cols, number)
+        values, covariance = _fitted(means, basis, [side] if mosaic else [side, parity])
+        size, u = float(values[0]), float(np.sqrt(covariance[0, 0]))
+        seen = abs(near) > AT_BORDER_Z * u_near and abs(near - size) < ALIKE_Z * u_near
+        if seen and abs(size) > FOUND_Z * u and abs(size) * u_step >= abs(step) * u:
+            taps, step, u_step, told = number, size, u, True
+            if not mosaic:
+                odd_even, var_odd_even = float(values[1]), float(covariance[1, 1])
+    if not told:
+        step, u_step = found[2]
         step = abs(step) + ONE_SIDED_95 * u_step
         limits.add("step_rel")
         why = f"no border of {', '.join(map(str, found))} taps stands out of the columns; 95 % limit for two taps"
@@ -113,8 +116,8 @@ def _fitted(means: Array, basis: Array, patterns: Sequence[Array]) -> tuple[Arra
     return np.asarray(values[:k], float), np.asarray(own * var, float)
 
 
-def _border(even: Array) -> tuple[int, dict[int, tuple[float, float]], float]:
-    """The number of taps whose borders stand out most; of each number step and scatter; degrees of freedom of that."""
+def _borders(even: Array) -> tuple[dict[int, tuple[float, float]], float]:
+    """Step at the borders and its scatter, by number of taps; degrees of freedom of that."""
     cols = len(even)
     at = np.arange(SIDE_COLS, cols - SIDE_COLS + 1)
     jumps = np.array([_jump(even[c - SIDE_COLS : c + SIDE_COLS]) for c in at])
@@ -126,8 +129,7 @@ def _border(even: Array) -> tuple[int, dict[int, tuple[float, float]], float]:
     for taps, places in borders.items():
         signs = np.where(np.arange(len(places)) % 2, -1.0, 1.0)
         found[taps] = float(np.mean(signs * jumps[np.array(places) - SIDE_COLS])), scatter / float(np.sqrt(len(places)))
-    best = max(found, key=lambda t: abs(found[t][0]) / found[t][1])
-    return best, found, max(quiet.size / (2 * SIDE_COLS), 2.0)
+    return found, max(quiet.size / (2 * SIDE_COLS), 2.0)
 
 
 def _jump(values: Array) -> float:

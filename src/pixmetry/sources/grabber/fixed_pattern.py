@@ -13,6 +13,9 @@ from pixmetry.core.errors import MeasureError
 from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
 
+FOUND_Z = 5.0  # of a settling: its length is searched for, too
+LAGS = 10  # rows over which noise may be alike
+
 
 class FixedPattern(Parameters):
     """What the grabber adds to every frame alike."""
@@ -84,8 +87,12 @@ def _fit_settling(profile: np.ndarray) -> Estimates:
         chi2 = float(((profile - fit[0][0] * np.exp(-rows / fit[0][1]) - fit[0][2]) ** 2).sum())
         best = (chi2, *fit) if best is None or chi2 < best[0] else best
     dof = len(profile) - 3.0
+    if best is not None:  # rows that are noisy alike, as by flicker, tell less than rows that are independent
+        left = profile - best[1][0] * np.exp(-rows / best[1][1]) - best[1][2]
+        lags = [float(left[k:] @ left[:-k]) / float(left @ left) for k in range(1, min(LAGS, len(left) // 4) + 1)]
+        best = (best[0], best[1], best[2] * max(1 + 2 * sum(lags), 1.0))
     method = "least squares of B exp(−r/r_s) + c over the row means of the mean dark image"
-    if best is not None and np.isfinite(best[2]).all() and abs(best[1][0]) > 4 * np.sqrt(best[2][0, 0]):
+    if best is not None and np.isfinite(best[2]).all() and abs(best[1][0]) > FOUND_Z * np.sqrt(best[2][0, 0]):
         values, covariance = best[1][:2], best[2][:2, :2]
         names, units = ("settling_dn", "settling_rows"), ("DN", "rows")
         confounders = ("dark signal that decreases from row to row, such as amplifier glow at the upper edge",)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -65,12 +66,36 @@ def measure(observations: Observations) -> Estimates:
         raise MeasureError(
             "the PRNU of the pixels cannot be determined", where="sensor.prnu", value=why, remedy="check what the frames have in common"
         )
-    return observations.fitted(
+    found = observations.fitted(
         there,
         "PRNU needs a stack of bright frames and one of dark frames",
         where="sensor.prnu",
         remedy="take at least 16 of each",
     )
+    return _before_transfer(found, observations)
+
+
+def _before_transfer(found: Estimates, observations: Observations) -> Estimates:
+    """The contrasts before smear added light without them, and before late charge took them from pixel to pixel.
+
+    A share n ε of a packet that comes a pixel later leaves 1 − n ε of a contrast of independent pixels, n being half of the transfers from
+    the farthest pixel. Smear s/t of the light adds 1 + s/t to the light of pixels and rows; that of columns is in it.
+    """
+    stack = observations.bright_stack
+    if stack is None:
+        return found
+    smear, serial, parallel = (observations.moved_charge(name) for name in ("smear_s", "serial_cti", "parallel_cti"))
+    more, u_more = (v / stack.exposure_s if stack.exposure_s else 0.0 for v in smear)
+    (late_x, u_x), (late_y, u_y) = ([0.5 * n * v for v in e] for n, e in zip(stack.shape[::-1], (serial, parallel), strict=True))
+    parts = {
+        "pixel_std_rel": ((1 + more) / (1 - late_x) / (1 - late_y), (u_more, u_x, u_y)),
+        "row_std_rel": ((1 + more) / (1 - late_y), (u_more, u_y)),
+        "col_std_rel": (1 / (1 - late_x), (u_x,)),
+    }
+    factor = np.array([parts[name][0] for name in found.names])
+    u = np.array([float(np.linalg.norm(parts[name][1])) for name in found.names])
+    covariance = found.covariance * np.outer(factor, factor) + np.diag((found.values * u) ** 2)
+    return replace(found, values=found.values * factor, covariance=covariance)
 
 
 def correct(params: Prnu, signal: Signal, maps: Mapping[str, np.ndarray]) -> Signal:
